@@ -1,4 +1,4 @@
-//! One running agent: everything put together, and taken apart again in order.
+//! A running agent: starts all its parts, and stops them in order.
 //!
 //! ```text
 //! loop thread ──events──► recorder ──► outbox ──► uploader ─┐
@@ -43,9 +43,9 @@ use crate::safety::Safety;
 use crate::safety::latch_file::LatchFile;
 use crate::supervisor::{PartEnded, Supervisor};
 
-/// Longest time that a stopping agent waits for the server to take its last records.
+/// Longest time that a stopping agent waits for the server to accept its last records.
 const LAST_UPLOAD_MAX: Duration = Duration::from_secs(1);
-/// Pause between two looks at what still waits.
+/// Interval of the checks for records that still wait.
 const LAST_UPLOAD_POLL: Duration = Duration::from_millis(10);
 
 /// Why an agent could not start.
@@ -54,7 +54,7 @@ pub enum StartError {
     /// The robot's model is impossible.
     #[error("the robot's model is impossible")]
     Model(#[from] RobotModelError),
-    /// The server's endpoint, or that of the robot's bus, is none.
+    /// The endpoint of the server or of the robot's bus is invalid.
     #[error(transparent)]
     Link(#[from] LinkError),
     /// The simulated base could not be made.
@@ -66,12 +66,12 @@ pub enum StartError {
     /// The mission memory could not be read.
     #[error(transparent)]
     Memory(#[from] MemoryError),
-    /// The operating system refused a thread.
+    /// A thread could not be started.
     #[error("no thread for the {part}")]
     Thread {
-        /// Which part.
+        /// Name of the part.
         part: &'static str,
-        /// What the operating system said.
+        /// Error of the operating system.
         #[source]
         source: std::io::Error,
     },
@@ -81,7 +81,7 @@ pub enum StartError {
 #[derive(Debug)]
 pub struct Agent;
 
-/// An agent that runs; several may run in one process.
+/// A running agent; several may run in one process.
 #[derive(Debug)]
 pub struct RunningAgent {
     identity: Identity,
@@ -95,10 +95,10 @@ pub struct RunningAgent {
 
 impl Agent {
     /// Starts an agent on the present multi-threaded runtime. It drives and measures at once, and
-    /// connects for as long as it takes.
+    /// connects in the background, retrying until it succeeds.
     ///
     /// # Errors
-    /// [`StartError`]: nothing is left running then.
+    /// [`StartError`]; nothing is left running then.
     pub fn start(config: AgentConfig) -> Result<RunningAgent, StartError> {
         let simulated = config.drive.simulated();
         let ahead = simulated.map_or(0, |simulated| simulated.clock_ahead_s);
@@ -106,7 +106,7 @@ impl Agent {
         Self::start_with_clock(config, Arc::new(SystemClock::new().ahead_by(ahead)))
     }
 
-    /// The same with a clock of the caller's.
+    /// Starts an agent with the caller's clock.
     ///
     /// # Errors
     /// As [`Agent::start`].
@@ -118,8 +118,8 @@ impl Agent {
         fleet::check_endpoint(&config.server)?;
         let base = Base::new(&config.drive, model, &clock)?;
         let boot = BootId::from_uuid(Uuid::new_v4());
-        // Before anything else is left in the folder: what is there tells a first start from a
-        // latch that was lost.
+        // Before anything else is written to the folder, whose files distinguish a first start from
+        // a lost latch.
         let stops = LatchFile::new(&config.data_dir).load(&clock);
         let outbox_folder = config.data_dir.join("outbox");
         let outbox = Outbox::open(&outbox_folder, config.outbox, config.robot.clone(), boot)?;
@@ -221,7 +221,7 @@ impl Agent {
     }
 }
 
-/// The loop as it is configured, and the thread that records it, if that is wanted.
+/// Creates the configured loop, and starts the thread that records it if records are configured.
 fn loop_core(
     config: &AgentConfig,
     boot: BootId,
@@ -248,13 +248,14 @@ fn loop_core(
     Ok((core, Some(writing)))
 }
 
-/// What is heard of whom robots are to trust, and the certificate, which changes with each renewal.
+/// The server's statements on trusted authorities, and the certificate, which changes with each
+/// renewal.
 type Renewing = (
     watch::Sender<ServerTrust>,
     Option<watch::Receiver<Arc<Membership>>>,
 );
 
-/// Begins to renew the certificate, if there is one.
+/// Starts the renewal of the certificate, if there is one.
 fn renew_membership(
     supervisor: &Supervisor,
     config: &AgentConfig,
@@ -275,7 +276,7 @@ fn renew_membership(
     (heard, Some(membership))
 }
 
-/// Reads the mission memory; what was active when the agent died is reported as failed.
+/// Reads the mission memory; a mission that was active when the agent died is reported as failed.
 fn recall_missions(
     config: &AgentConfig,
     outbox: &Outbox,
@@ -314,27 +315,27 @@ fn recall_missions(
 }
 
 impl RunningAgent {
-    /// This run of the agent.
+    /// Returns the identifier of this run of the agent.
     pub fn boot(&self) -> BootId {
         self.identity.boot
     }
 
-    /// The robot and its site.
+    /// Returns the robot and its site.
     pub fn identity(&self) -> &Identity {
         &self.identity
     }
 
-    /// The state as it would be published now.
+    /// Returns the state as it would be published now.
     pub fn state(&self) -> RobotState {
         self.reporter.state()
     }
 
-    /// Both friction estimates as they would be published now.
+    /// Returns both friction estimates as they would be published now.
     pub fn friction(&self) -> FrictionReport {
         self.reporter.friction()
     }
 
-    /// What waits for the server, and what was lost.
+    /// Returns the numbers of records that wait, were dropped and were refused.
     #[cfg(any(test, feature = "testing"))]
     pub fn outbox_status(&self) -> tread_api::robot::OutboxStatus {
         self.outbox.status()
@@ -346,12 +347,13 @@ impl RunningAgent {
         *self.is_connected.borrow()
     }
 
-    /// Waits for the first part of the agent that ends by itself: the agent is no use any more.
+    /// Waits for the first part of the agent that ends unexpectedly, after which the agent must
+    /// end.
     pub async fn failed(&self) -> PartEnded {
         self.supervisor.failed().await
     }
 
-    /// Brakes to standstill, saves and sends what is left, leaves the network, and ends.
+    /// Brakes to zero velocity, saves and sends the remaining records, closes the link, and ends.
     pub async fn stop(mut self) {
         info!("stopping");
         self.supervisor.begin_stop();

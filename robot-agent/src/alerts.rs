@@ -1,7 +1,7 @@
-//! What needs a person's attention, judged from what the agent knows of itself. Pure.
+//! Derives the alerts that need a person's attention from the agent's state. Pure.
 //!
-//! An alert stands as long as its cause does; the server keeps when it came and went. Figures that
-//! waver have two bounds, so that an alert does not flicker.
+//! An alert is raised as long as its cause lasts; the server records its begin and end. Continuous
+//! values have two bounds (hysteresis), so that an alert does not flicker.
 
 use tread_api::ids::AlertCode;
 use tread_api::robot::{ALERT_TEXT_MAX, AlertReport, OutboxStatus, Severity};
@@ -17,37 +17,37 @@ use crate::drive::ros2::notices::{ForeignCommands, Notice, Noticing};
 use crate::drive::ros2::refusal::{Counts, Dropping};
 use crate::outbox::OutboxDamage;
 
-/// Charge below which the battery is low, and above which it no longer is.
+/// Charge below which the battery is low, and charge above which it no longer is.
 const BATTERY_LOW: (f64, f64) = (0.20, 0.25);
-/// Charge below which the robot will soon stop, and above which it no longer will.
+/// Charge below which the battery is critical, and charge above which it no longer is.
 const BATTERY_CRITICAL: (f64, f64) = (0.05, 0.08);
-/// Records that wait for the server and are worth a look, and no longer are.
+/// Number of waiting records above which an alert is raised, and below which it ends.
 const OUTBOX_LONG: (u64, u64) = (50_000, 25_000);
 
-/// What alerts are judged from.
+/// Inputs of the alerts.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Causes<'a> {
     pub(crate) battery: Option<Battery>,
     pub(crate) fault: Option<Fault>,
     pub(crate) is_stopped: bool,
     pub(crate) outbox: OutboxStatus,
-    /// What was lost by damage of the outbox's files.
+    /// Records lost by damage of the outbox's files.
     pub(crate) outbox_damage: Option<&'a OutboxDamage>,
-    /// What of the base's words was dropped.
+    /// Counts of the base's dropped messages.
     pub(crate) base: Option<&'a Counts>,
-    /// Where the ground is not as the map says.
+    /// The comparison that shows that the ground differs from the map.
     pub(crate) surface_change: Option<Comparison>,
-    /// Where the wheels turn without progress.
+    /// Position at which the wheels turn without moving the robot.
     pub(crate) dug_in_at: Option<Point>,
-    /// How far the loop is from its rate, while the robot is held for it.
+    /// Lateness of the loop while the robot is held for it.
     pub(crate) overrun: Option<Overrun>,
-    /// Sensors that contradict each other.
+    /// Contradictions between sensors.
     pub(crate) findings: Findings,
-    /// Whether the robot stands, where it is to.
+    /// Result of the standstill watch.
     pub(crate) standing: StandingReport,
 }
 
-/// Which wavering alerts stand.
+/// State of the alerts with hysteresis.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Alerts {
     battery_low: bool,
@@ -58,7 +58,7 @@ pub(crate) struct Alerts {
     foreign_commands: ForeignCommands,
 }
 
-/// Whether a figure counts as below, with the bound that holds in the present state.
+/// Whether a value counts as below the bound of the present state.
 fn is_below<T: PartialOrd + Copy>(value: T, is_so: bool, (enter, leave): (T, T)) -> bool {
     if is_so { value < leave } else { value < enter }
 }
@@ -91,7 +91,7 @@ fn surface_change(found: &Comparison) -> Option<AlertReport> {
     alert("surface-change", Severity::Warning, text)
 }
 
-/// How a finding is called, how bad it is, and its text.
+/// Returns code, severity and text of a finding.
 fn sensor_alert(finding: &Finding) -> (&'static str, Severity, String) {
     let Finding {
         subject,
@@ -133,7 +133,7 @@ fn sensor_alert(finding: &Finding) -> (&'static str, Severity, String) {
     (code, severity, text)
 }
 
-/// One alert for each code: a robot says each code once.
+/// Returns one alert for each code; findings of the same code are joined.
 fn sensor_alerts<'a>(findings: impl IntoIterator<Item = &'a Finding>) -> Vec<AlertReport> {
     let mut alerts: Vec<AlertReport> = Vec::new();
     for (code, severity, text) in findings.into_iter().map(sensor_alert) {
@@ -151,7 +151,7 @@ fn sensor_alerts<'a>(findings: impl IntoIterator<Item = &'a Finding>) -> Vec<Ale
     alerts
 }
 
-/// A robot that is to stand and moves.
+/// Returns the alert for a robot that moves although commanded to zero.
 fn standing_alert(report: &StandingReport) -> Option<AlertReport> {
     let measured = |shown: Shown| match shown {
         Shown::Speed(speed_m_s) => format!("{speed_m_s:.2} m/s"),
@@ -175,7 +175,7 @@ fn standing_alert(report: &StandingReport) -> Option<AlertReport> {
 }
 
 impl Alerts {
-    /// The alerts that stand now.
+    /// Returns the alerts that are raised now.
     pub(crate) fn judge(&mut self, causes: &Causes<'_>) -> Vec<AlertReport> {
         let charge = causes.battery.map(|battery| battery.charge_ratio);
         self.battery_low =

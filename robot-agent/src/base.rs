@@ -1,4 +1,4 @@
-//! What the agent drives: the base behind the drive interface, and the threads around it.
+//! The robot's base behind the drive interface, and the threads around it.
 
 use std::sync::Arc;
 use std::thread::JoinHandle;
@@ -20,20 +20,20 @@ use crate::drive::simulated::{SimMode, SimulatedDrive, SimulatedDriveError};
 use crate::safety::watchdog;
 use crate::supervisor::Supervisor;
 
-/// A base that nothing drives yet.
+/// A base before its loop is started.
 pub(crate) struct Base {
     drive: Box<dyn Drive>,
-    /// What is spoken with it.
+    /// Bus of a ROS 2 base.
     bus: Option<Bus>,
-    /// What of its words was dropped.
+    /// Counts of the base's dropped messages.
     counts: Option<Arc<Counts>>,
 }
 
 impl Base {
-    /// The base of a configuration.
+    /// Creates the base of a configuration.
     ///
     /// # Errors
-    /// [`StartError`] when the simulated base cannot be made, or the bus's endpoint is none.
+    /// [`StartError`] if the simulated base cannot be made, or the bus's endpoint is invalid.
     pub(crate) fn new(
         config: &DriveConfig,
         model: RobotModel,
@@ -56,20 +56,20 @@ impl Base {
         }
     }
 
-    /// What of its words was dropped, where that is counted.
+    /// Returns the counts of the base's dropped messages, where they are counted.
     pub(crate) fn counts(&self) -> Option<Arc<Counts>> {
         self.counts.clone()
     }
 
-    /// Oldest word with which it does not count as silent.
+    /// Returns the age of the last sample beyond which the base counts as silent.
     pub(crate) fn silent_after(&self) -> Duration {
         self.drive.silent_after()
     }
 
-    /// Starts the loop, what watches it, and what is spoken with the base.
+    /// Starts the threads of the loop, its watchdog and the robot's bus.
     ///
     /// # Errors
-    /// The operating system refused a thread.
+    /// The operating system's error if a thread cannot be started.
     pub(crate) fn spawn(
         self,
         core: LoopCore,
@@ -81,7 +81,7 @@ impl Base {
         let mut threads = Vec::new();
         if let Some(mut bus) = self.bus {
             bus.tell_of(shared, self.counts.unwrap_or_default(), &config.robot);
-            // It ends when the loop lets go of its drive.
+            // It ends when the loop drops its drive.
             threads.push(supervisor.spawn_thread("robot's bus", move || bus.run())?);
         }
         let (drive, period, loop_clock) = (self.drive, config.period(), Arc::clone(clock));

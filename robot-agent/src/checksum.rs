@@ -1,4 +1,4 @@
-//! The checksum of what the agent keeps on its disk: CRC-32 (IEEE 802.3).
+//! CRC-32 (IEEE 802.3), the checksum of the agent's files.
 
 const CRC_TABLE: [u32; 256] = {
     let mut table = [0; 256];
@@ -21,7 +21,7 @@ const CRC_TABLE: [u32; 256] = {
     table
 };
 
-/// The checksum of these bytes; one flipped bit always changes it.
+/// Returns the checksum; a single flipped bit always changes it.
 pub(crate) fn crc32(bytes: &[u8]) -> u32 {
     !bytes.iter().fold(u32::MAX, |crc, &byte| {
         let [low, ..] = crc.to_le_bytes();

@@ -1,6 +1,6 @@
-//! Time, injected: monotonic for ages and deadlines, wall for records.
+//! Injected clocks: monotonic time for ages and deadlines, wall time for records.
 //!
-//! Nothing else in the agent reads the machine's clocks, so that a test can hand in its own.
+//! No other module of the agent reads the machine's clocks, so that a test can inject its own.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
@@ -9,30 +9,30 @@ use jiff::{SignedDuration, Timestamp};
 
 /// A source of both times. Monotonic time counts from the clock's own origin.
 pub trait Clock: std::fmt::Debug + Send + Sync {
-    /// Time since the clock's origin; never falls.
+    /// Returns the time since the clock's origin; never decreases.
     fn monotonic(&self) -> Duration;
-    /// The wall clock; it may jump.
+    /// Returns the wall time; it may jump.
     fn wall(&self) -> Timestamp;
-    /// The machine's own wall clock as it stands now, nanoseconds since 1970: other programs of the
-    /// machine stamp their messages by it, and it may be put right at any time.
+    /// Returns the machine's present wall time, nanoseconds since the Unix epoch, by which other
+    /// programs of the machine stamp their messages; it may be adjusted at any time.
     fn host_wall_ns(&self) -> i64 {
         i64::try_from(self.wall().as_nanosecond()).unwrap_or(i64::MAX)
     }
 
-    /// Blocks a loop until that monotonic time.
+    /// Blocks the thread until that monotonic time.
     fn sleep_until(&self, deadline: Duration) {
         std::thread::sleep(deadline.saturating_sub(self.monotonic()));
     }
 }
 
-/// A clock as it is handed around.
+/// A shared clock.
 pub type SharedClock = Arc<dyn Clock>;
 
-/// The machine's clocks; the origin is when this was made.
+/// The machine's clocks, with the origin at the clock's creation.
 ///
-/// The wall time is that of the origin and the monotonic time since: it never jumps during a run,
-/// even if the machine's clock is put right by days meanwhile. How far it is off is for the
-/// server to measure, and then holds for every record of the run.
+/// The wall time is the one at the origin plus the monotonic time since, so that it never jumps
+/// during a run, even if the machine's clock is adjusted. The server measures its offset, which
+/// holds for every record of the run.
 #[derive(Debug)]
 pub struct SystemClock {
     origin: Instant,
@@ -40,14 +40,14 @@ pub struct SystemClock {
 }
 
 impl SystemClock {
-    /// A clock whose origin is now.
+    /// Creates a clock whose origin is now.
     pub fn new() -> Self {
         #[expect(
             clippy::disallowed_methods,
             reason = "this is the clock that others inject"
         )]
         let (origin, now) = (Instant::now(), SystemTime::now());
-        // A machine whose clock stands outside the years that RFC 3339 knows reads as 1970.
+        // A wall clock outside the years of RFC 3339 reads as 1970.
         let wall_origin = Timestamp::try_from(now).unwrap_or(Timestamp::UNIX_EPOCH);
         Self {
             origin,
@@ -55,7 +55,7 @@ impl SystemClock {
         }
     }
 
-    /// The same, with a wall clock that is ahead by so much; a simulated fault.
+    /// Adds an offset to the wall time; a simulated fault.
     #[must_use]
     pub fn ahead_by(mut self, offset: SignedDuration) -> Self {
         self.wall_origin = self
@@ -65,7 +65,7 @@ impl SystemClock {
         self
     }
 
-    /// The same, ready to be handed around.
+    /// Creates a shared clock.
     pub fn shared() -> SharedClock {
         Arc::new(Self::new())
     }
@@ -83,7 +83,7 @@ impl Clock for SystemClock {
     }
 
     fn wall(&self) -> Timestamp {
-        // Saturates at the last year that RFC 3339 knows.
+        // Saturates at the last year of RFC 3339.
         self.wall_origin
             .checked_add(self.monotonic())
             .unwrap_or(Timestamp::MAX)
@@ -95,7 +95,7 @@ impl Clock for SystemClock {
             reason = "this is the clock that others inject"
         )]
         let since_1970 = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
-        // Before 1970 nothing has a stamp.
+        // A time before 1970 reads as zero.
         since_1970.map_or(0, |since| {
             i64::try_from(since.as_nanos()).unwrap_or(i64::MAX)
         })
@@ -110,7 +110,7 @@ pub struct ManualClock {
 }
 
 impl ManualClock {
-    /// A clock that stands at zero, and at `wall_origin`.
+    /// Creates a clock at monotonic time zero and wall time `wall_origin`.
     pub fn new(wall_origin: Timestamp) -> Self {
         Self {
             elapsed: Mutex::new(Duration::ZERO),
@@ -118,7 +118,7 @@ impl ManualClock {
         }
     }
 
-    /// Moves both times on.
+    /// Advances both times.
     pub fn advance(&self, step: Duration) {
         *self.elapsed.lock().unwrap_or_else(PoisonError::into_inner) += step;
     }
@@ -130,7 +130,7 @@ impl Clock for ManualClock {
     }
 
     fn wall(&self) -> Timestamp {
-        // Saturates at the last year that RFC 3339 knows.
+        // Saturates at the last year of RFC 3339.
         self.wall_origin
             .checked_add(self.monotonic())
             .unwrap_or(Timestamp::MAX)

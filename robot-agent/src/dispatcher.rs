@@ -1,13 +1,13 @@
 //! Answers the server's commands: offers, pauses, cancellations, new definitions of the site.
 //!
-//! One offer after the other, so that one that comes twice finds the first one decided; all other
-//! commands beside them, so that no planning delays a cancellation. Planning and disks are waited
-//! for here, never in the loop.
+//! Offers are processed one after the other, so that a repeated offer finds the first one decided;
+//! all other commands run concurrently, so that planning does not delay a cancellation. Planning
+//! and disk writes are awaited here, never in the loop.
 //!
-//! A new revision of the active mission is planned from where the robot comes to stand:
+//! A new revision of the active mission is planned from where the robot will stop:
 //! ```text
-//! offer ─► loop holds the mission ─► foretell where it stands ─► plan ─► held ─► loop swaps there
-//!                                                                 └ refused: loop lets it go on
+//! offer ─► loop holds the mission ─► predict where it stops ─► plan ─► held ─► loop swaps there
+//!                                                                 └ refused: hold released
 //! ```
 
 mod planning;
@@ -42,20 +42,21 @@ use crate::knowledge::{Missions, SiteCell};
 use crate::missions::{ActiveMission, CancelDecision, OfferDecision};
 use crate::safety::{Safety, answers};
 
-/// Offers that may wait while another is planned; the server asks again for more.
+/// Capacity of the queue of offers; the server repeats an offer that finds it full.
 const OFFERS_MAX: usize = 8;
-/// Stops, leases and limits that may wait while one is written to the disk.
+/// Capacity of the queue of stops, clears, leases and limits.
 const URGENT_MAX: usize = 32;
-/// Farthest that a robot may be from where a paused mission goes on, metres.
+/// Largest distance of a robot from the reference of its paused mission at which it may be resumed,
+/// metres.
 const RESUME_WITHIN_M: f64 = 0.5;
-/// Longest wait until the loop holds a mission for its next revision.
+/// Longest wait for the loop to hold a mission for its next revision.
 const HOLD_WAIT_MAX: Duration = Duration::from_secs(5);
-/// Time between two looks at what the loop does.
+/// Interval of the checks of the loop's snapshot.
 const HOLD_LOOK_EVERY: Duration = Duration::from_millis(5);
-/// A reference slower than this stands as good as, metres per second.
+/// Speed of a reference up to which it counts as stopped, m/s.
 const STANDS_M_S: f64 = 0.02;
 
-/// Who answers commands.
+/// Processes and answers commands.
 #[derive(Debug)]
 pub(crate) struct Dispatcher {
     pub(crate) boot: BootId,
@@ -95,7 +96,7 @@ fn given_of(offer: &Offer, plan: Arc<Plan>) -> GivenPlan {
 }
 
 impl Dispatcher {
-    /// Answers for ever.
+    /// Answers commands until requested to stop.
     pub(crate) async fn run(self: Arc<Self>, mut commands: Commands, stop: CancellationToken) {
         let (to_planner, mut offers) = mpsc::channel(OFFERS_MAX);
         let (to_guard, mut urgent) = mpsc::channel(URGENT_MAX);
@@ -110,7 +111,7 @@ impl Dispatcher {
                     }
                 };
                 if lane.try_send(command).is_err() {
-                    // Dropped: the server sees no reply and asks again.
+                    // Dropped: the server gets no reply and repeats the command.
                     Shared::count(&self.shared.lost_commands);
                 }
             }
@@ -176,7 +177,7 @@ impl Dispatcher {
         }
     }
 
-    /// Reads a command, decides it and answers.
+    /// Decodes a command, decides on it and answers.
     async fn answer<C, T>(
         &self,
         command: IncomingCommand,
@@ -201,7 +202,7 @@ impl Dispatcher {
         command.answer(&Answer { boot, reply }).await;
     }
 
-    /// Refuses a command that does not read.
+    /// Refuses a command that cannot be decoded.
     async fn refuse(&self, command: IncomingCommand, cause: &WireError) {
         Shared::count(&self.shared.commands_refused);
         warn!(
@@ -221,10 +222,11 @@ impl Dispatcher {
         Ok(())
     }
 
-    /// Takes the site of a server's welcome; false if the loop has no room for it now.
+    /// Applies the site definition of a server's welcome; false if the loop's command queue is
+    /// full.
     ///
-    /// A geofence that is larger than a tick can look at is no reason to drive without any: the
-    /// robot then finds no room anywhere until it gets another.
+    /// With a geofence beyond the size that a tick can process the robot does not drive without
+    /// one, but has no room anywhere until it gets another.
     pub(crate) fn take_welcome(&self, definition: SiteDefinition) -> bool {
         match definition.geofence.validate() {
             Ok(()) => self.take_site(definition),
@@ -235,7 +237,7 @@ impl Dispatcher {
         }
     }
 
-    /// Takes a definition of the site; false if the loop has no room for it now.
+    /// Applies a site definition; false if the loop's command queue is full.
     pub(crate) fn take_site(&self, definition: SiteDefinition) -> bool {
         self.take(SiteView::new(definition))
     }
@@ -281,7 +283,7 @@ impl Dispatcher {
                 }
                 let replaced = self.plan_and_replace(offer).await;
                 if replaced.is_err() {
-                    // Should it not arrive, the loop lets go by itself after a while.
+                    // If it does not arrive, the loop ends the hold by itself after a while.
                     self.tell_loop(LoopCommand::Release(mission, Hold::Replacement));
                 }
                 replaced
@@ -315,7 +317,7 @@ impl Dispatcher {
         Ok(())
     }
 
-    /// Whether a paused mission may go on now.
+    /// Checks whether a paused mission may go on.
     fn may_resume(&self) -> Result<(), CommandRefusal> {
         if let Some(latch) = self.safety.latch() {
             let detail = format!("stopped by {}: {}", latch.by, latch.reason);
@@ -363,10 +365,10 @@ impl Dispatcher {
         if start_by.is_some_and(|latest| self.clock.monotonic() > latest) {
             return refused(CommandRefusalCode::TooLate, "its latest start has passed");
         }
-        // Held before the loop has it, so that its end cannot be reported before its begin.
+        // Made active before the loop has it, so that its end cannot be reported before its begin.
         let (mission, plan) = (offer.mission, planned.summary);
         if !self.missions.slot().take(active_of(&offer, plan)) {
-            // What came meanwhile says why: a cancellation, or another mission.
+            // What arrived meanwhile gives the reason: a cancellation, or another mission.
             return match self.missions.slot().offer(&offer) {
                 OfferDecision::Refuse(refusal) => Err(refusal),
                 OfferDecision::Plan | OfferDecision::Replace | OfferDecision::AcceptAgain(_) => {
@@ -379,7 +381,8 @@ impl Dispatcher {
             self.missions.slot().release(mission);
             return Err(loop_is_busy());
         }
-        // The same tick takes both. Without room the server pauses it once it sees it driven.
+        // Both commands reach the same tick. If the queue is full, the server pauses the active
+        // mission.
         if offer.on_hold && !self.tell_loop(LoopCommand::Hold(mission, Hold::Pause)) {
             warn!(mission.id = %mission, "{mission} was to be held, and the control loop is busy");
         }
@@ -393,7 +396,7 @@ impl Dispatcher {
         Ok(plan)
     }
 
-    /// Swaps the active mission for its next revision; the loop holds it already or soon.
+    /// Replaces the active mission by its next revision, once the loop holds it.
     async fn plan_and_replace(&self, offer: Offer) -> Result<PlanSummary, CommandRefusal> {
         let Some(start) = self.rest_of(offer.mission).await else {
             return refused(CommandRefusalCode::NotReady, "the robot could not be held");
@@ -414,14 +417,15 @@ impl Dispatcher {
         Ok(plan)
     }
 
-    /// Where the robot comes to stand, once the loop holds the mission.
+    /// Predicts where the robot stops, once the loop holds the mission; `None` if the mission is
+    /// not held in time.
     async fn rest_of(&self, mission: MissionId) -> Option<Pose> {
         let driving = self.shared.given_plan()?;
         let looking = async {
             loop {
                 let snapshot = self.shared.snapshot();
                 let progress = snapshot.mission.filter(|now| now.id == mission)?;
-                // A revision that was taken a moment ago may still wait for the robot to stand.
+                // A revision that was accepted just before may still wait for the robot to stop.
                 if snapshot.is_on_hold && progress.revision == driving.revision {
                     let governor = snapshot.governor?;
                     let (measured, _) = snapshot.pose?;
@@ -451,7 +455,7 @@ impl Dispatcher {
                     return Err(loop_is_busy());
                 }
                 info!(mission.id = %mission, reason = cancel.reason, "cancelling {mission}");
-                // Once this is answered it is cancelled, even if the agent dies on the way.
+                // Once answered, it stays cancelled even if the agent dies.
                 self.save().await;
                 Ok(())
             }
@@ -469,7 +473,7 @@ impl Dispatcher {
 
     async fn save(&self) {
         let missions = Arc::clone(&self.missions);
-        // Fails only when the runtime goes down.
+        // Fails only when the runtime shuts down.
         let _ = tokio::task::spawn_blocking(move || missions.save()).await;
     }
 }

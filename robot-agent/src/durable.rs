@@ -1,5 +1,4 @@
-//! Small files that are replaced as a whole and outlive a crash, with a checksum where a changed
-//! byte must not pass for another content.
+//! Replaces small files as a whole and crash-safely, with a checksum where damage must be detected.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};
@@ -8,19 +7,19 @@ use std::path::Path;
 
 use crate::checksum::crc32;
 
-/// What stands in front of the checksum, the last field of a file's JSON object.
+/// Text before the checksum, which is the last field of a file's JSON object.
 const SEAL: &str = ",\"crc32\":\"";
-/// What stands behind it.
+/// Text after the checksum.
 const SEAL_END: &str = "\"}";
-/// Length of the field: eight hexadecimal digits are between.
+/// Length of the checksum field, bytes: its eight hexadecimal digits are between the two texts.
 const SEAL_BYTES: usize = SEAL.len() + 8 + SEAL_END.len();
 
-/// The content of a file is not what was written.
+/// The checksum of a file does not match its content.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("its checksum does not fit")]
 pub(crate) struct Damaged;
 
-/// A JSON object with its checksum as one more field, which readers that do not know it ignore.
+/// Returns a JSON object with its checksum as an additional field, which other readers ignore.
 pub(crate) fn sealed(object: &[u8]) -> Vec<u8> {
     let open = object.strip_suffix(b"}").unwrap_or(object);
     let mut sealed = open.to_vec();
@@ -28,11 +27,11 @@ pub(crate) fn sealed(object: &[u8]) -> Vec<u8> {
     sealed
 }
 
-/// The JSON object of a file that was written with its checksum, which it still holds. What an
-/// earlier agent wrote has none and is given as it is.
+/// Returns the JSON object of a file after verifying its checksum. A file of an earlier agent
+/// without a checksum is returned unverified.
 ///
 /// # Errors
-/// [`Damaged`].
+/// [`Damaged`] if the checksum does not match.
 pub(crate) fn unsealed(file: &[u8]) -> Result<&[u8], Damaged> {
     let Some((open, seal)) = file.split_last_chunk::<SEAL_BYTES>() else {
         return Ok(file);
@@ -44,23 +43,22 @@ pub(crate) fn unsealed(file: &[u8]) -> Result<&[u8], Damaged> {
     Ok(file)
 }
 
-/// Replaces a file in a folder and waits until the disk has it; the former content stays when it
-/// refuses. Blocks.
+/// Replaces a file in a folder and waits until it is on disk. Blocks.
 ///
 /// # Errors
-/// What the operating system said.
+/// The operating system's error; the former content is kept.
 pub(crate) fn replace(folder: &Path, name: &str, content: &[u8]) -> io::Result<()> {
     let file = File::create(new_path(folder, name))?;
     put_in_place(folder, name, file, content)
 }
 
-/// The same for a file that only its owner can read.
+/// Replaces a file as [`replace`] does, readable by its owner only.
 ///
 /// # Errors
-/// What the operating system said.
+/// The operating system's error; the former content is kept.
 pub(crate) fn replace_private(folder: &Path, name: &str, content: &[u8]) -> io::Result<()> {
     let new_path = new_path(folder, name);
-    // One that was left behind may have other permissions.
+    // A file left by a crash may have other permissions.
     match fs::remove_file(&new_path) {
         Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
         Ok(()) | Err(_) => {}

@@ -11,7 +11,7 @@ use crate::clock::{Clock as _, SystemClock};
 use crate::config::{Flags, place};
 use crate::membership::{self, Enrolment, Fingerprint, Trust};
 
-/// Longest join token that is read, bytes.
+/// Largest join token that is read, bytes; longer ones are cut off.
 const TOKEN_BYTES_MAX: u64 = 4 * 1024;
 
 /// Arguments of `tread-agent enroll`.
@@ -44,10 +44,10 @@ pub(crate) struct EnrollArgs {
     endpoint: Option<String>,
 }
 
-/// Joins, and says as who.
+/// Joins the fleet and prints the robot's identity.
 ///
 /// # Errors
-/// There is no token, the server does not take it, or the folder cannot be written.
+/// There is no token, the server refuses it, or the folder cannot be written.
 pub(crate) async fn run(args: EnrollArgs) -> anyhow::Result<()> {
     let place = place(&Flags {
         config: args.config,

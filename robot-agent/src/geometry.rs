@@ -1,7 +1,7 @@
-//! Between the words of the wire (`tread-api`) and those of the controller (`tread-control`).
+//! Converts between the types of the wire (`tread-api`) and of the controller (`tread-control`).
 //!
-//! Both crates know nobody, so each has its own points and poses; this is the only place that
-//! turns one into the other.
+//! The two crates are independent and have their own points and poses; only this module converts
+//! them.
 
 use tread_api::{geometry as wire, robot, safety, trajectory};
 use tread_control::excitation::ExcitationSpec;
@@ -11,7 +11,7 @@ use tread_control::plan::PlanOptions;
 use tread_control::robot::{Limits, RobotModel, RobotModelError, RobotModelSpec};
 use tread_control::trajectory as planned;
 
-/// A pose for the wire, its heading within −π to π.
+/// Converts a pose to the wire's, its heading within −π to π.
 pub(crate) fn wire_pose(pose: control::Pose) -> wire::Pose {
     wire::Pose {
         x_m: pose.x_m,
@@ -20,7 +20,7 @@ pub(crate) fn wire_pose(pose: control::Pose) -> wire::Pose {
     }
 }
 
-/// A twist for the wire.
+/// Converts a twist to the wire's.
 pub(crate) fn wire_twist(twist: control::Twist) -> wire::Twist {
     wire::Twist {
         linear_m_s: twist.linear_m_s,
@@ -28,7 +28,7 @@ pub(crate) fn wire_twist(twist: control::Twist) -> wire::Twist {
     }
 }
 
-/// A point of the wire for the controller.
+/// Converts a point to the controller's.
 pub(crate) fn control_point(point: wire::Point) -> control::Point {
     control::Point {
         x_m: point.x_m,
@@ -36,7 +36,7 @@ pub(crate) fn control_point(point: wire::Point) -> control::Point {
     }
 }
 
-/// A geofence for the controller.
+/// Converts a geofence to the controller's.
 pub fn fence_of(geofence: &safety::Geofence) -> Fence {
     let rings = |polygons: &[wire::Polygon]| {
         let corners = |polygon: &wire::Polygon| {
@@ -48,7 +48,7 @@ pub fn fence_of(geofence: &safety::Geofence) -> Fence {
     Fence::new(rings(&geofence.keep_in), rings(&geofence.keep_out))
 }
 
-/// The position of a pose for the wire.
+/// Returns the position of a pose as a point of the wire.
 pub(crate) fn wire_point(pose: control::Pose) -> wire::Point {
     wire::Point {
         x_m: pose.x_m,
@@ -56,10 +56,10 @@ pub(crate) fn wire_point(pose: control::Pose) -> wire::Point {
     }
 }
 
-/// A robot's declared model, checked, for the controller.
+/// Checks a robot's declared model and converts it to the controller's.
 ///
 /// # Errors
-/// [`RobotModelError`] names the figure that is out of its range.
+/// [`RobotModelError`] names the parameter that is out of its range.
 pub fn control_model(model: &robot::RobotModel) -> Result<RobotModel, RobotModelError> {
     let limits = model.limits;
     RobotModel::try_from(RobotModelSpec {
@@ -80,7 +80,7 @@ pub fn control_model(model: &robot::RobotModel) -> Result<RobotModel, RobotModel
     })
 }
 
-/// The paper's robot as it is declared on the wire.
+/// Returns the declared model of the paper's robot.
 pub fn paper_robot() -> robot::RobotModel {
     let model = RobotModel::yi2007();
     let limits = model.limits();
@@ -104,7 +104,7 @@ pub fn paper_robot() -> robot::RobotModel {
     }
 }
 
-/// What a user asked for, in the controller's words.
+/// Converts a requested trajectory to the controller's.
 pub fn control_trajectory(asked: &trajectory::Trajectory) -> planned::Trajectory {
     match asked {
         trajectory::Trajectory::Circle(circle) => {
@@ -133,7 +133,7 @@ pub fn control_trajectory(asked: &trajectory::Trajectory) -> planned::Trajectory
     }
 }
 
-/// What a user allows beside the trajectory, in the controller's words.
+/// Converts the options of a requested trajectory to the controller's.
 pub fn plan_options(asked: &trajectory::Trajectory) -> PlanOptions<'static> {
     let options = asked.options();
     PlanOptions {

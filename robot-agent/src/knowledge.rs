@@ -1,4 +1,4 @@
-//! What several parts of the agent know together: its missions, and its site.
+//! State shared by several parts of the agent: its missions and its site.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -9,7 +9,7 @@ use crate::control_loop::site_view::SiteView;
 use crate::missions::MissionSlot;
 use crate::missions::memory::Memory;
 
-/// The robot's missions, shared by those who answer and those who record.
+/// The robot's missions, shared by dispatcher and recorder.
 #[derive(Debug)]
 pub(crate) struct Missions {
     slot: Mutex<MissionSlot>,
@@ -28,9 +28,9 @@ impl Missions {
         self.slot.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Makes what is known safe from a crash. Blocks.
+    /// Saves the missions on disk. Blocks.
     pub(crate) fn save(&self) {
-        // The lock is not held while the disk is waited for.
+        // The lock is not held during the disk write.
         let slot = self.slot().clone();
         if let Err(cause) = self.memory.save(&slot) {
             error!(
@@ -41,7 +41,7 @@ impl Missions {
     }
 }
 
-/// Where the site's definition is kept for those outside the loop.
+/// The active site definition, for the parts outside the loop.
 #[derive(Debug, Default)]
 pub(crate) struct SiteCell {
     view: Mutex<Option<(SiteDefinition, Arc<SiteView>)>>,
@@ -52,7 +52,7 @@ impl SiteCell {
         self.view.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The view that was last handed to the loop.
+    /// Returns the view that was given to the loop last.
     pub(crate) fn view(&self) -> Option<Arc<SiteView>> {
         self.lock().as_ref().map(|(_, view)| Arc::clone(view))
     }

@@ -1,20 +1,21 @@
 //! Tread's agent: the program on every robot.
 //!
-//! A loop thread drives trajectories with `tread-control` and measures the friction of the ground;
-//! everything around it takes missions from the server, and brings measurements to it without
-//! losing or doubling any.
+//! A loop thread tracks trajectories with `tread-control` and measures the friction of the ground;
+//! the other parts receive missions from the server and upload measurements without loss or
+//! duplication.
 //!
-//! * [`agent`] puts it all together; [`program`] makes a process of it; [`config`] is `robot.toml`.
+//! * [`agent`] starts and stops all parts; [`program`] is the process; [`config`] is `robot.toml`.
 //! * The loop: `control_loop`, the base behind [`drive`], the simulated one in [`sim`].
-//! * Around it: [`missions`] (what is held), `dispatcher` (answers), `alerts`, `recorder` and [`outbox`]
-//!   (what must not be lost), `reporter` (what may), [`fleet`] (the only one that knows zenoh).
-//! * [`membership`]: the robot's certificate, how it gets it and the next one.
-//! * `safety`: what may only slow the robot down, and teleoperation.
-//! * `recording`: what the loop took and gave, in files, and running such files again.
-//! * `testing` steps the loop tick by tick, for tests and figures; no program that ships contains it.
-//! * Below all: [`clock`], `supervisor`, [`geometry`] (between wire and controller).
+//! * Around it: [`missions`] (state of missions), `dispatcher` (answers commands), `alerts`,
+//!   `recorder` and [`outbox`] (durable records), `reporter` (published state), [`fleet`] (the only
+//!   user of zenoh).
+//! * [`membership`]: enrolment and renewal of the robot's certificate.
+//! * `safety`: stops, limits and teleoperation.
+//! * `recording`: records of the loop's inputs and outputs, and their replay.
+//! * `testing` runs the loop tick by tick, for tests and reports; no shipped program contains it.
+//! * Used by all: [`clock`], `supervisor`, [`geometry`] (conversions between wire and controller).
 //!
-//! No module keeps anything global: several agents may run in one process.
+//! No module has global state: several agents may run in one process.
 
 pub mod agent;
 pub mod clock;

@@ -1,5 +1,5 @@
-//! The agent's life on the network: connects, introduces the robot, publishes, uploads, answers;
-//! and opens the link again when there is a new certificate, or other credentials.
+//! The agent's network task: connects, introduces the robot, publishes, uploads and answers
+//! commands; reopens the link for a new certificate or other credentials.
 
 use std::ops::ControlFlow;
 use std::sync::Arc;
@@ -20,13 +20,13 @@ use crate::membership::{Membership, ServerTrust};
 use crate::outbox::Outbox;
 use crate::reporter::{Reporter, every, publish_states};
 
-/// How long the last state has to leave the machine before the session closes.
+/// Time for the last state to be sent before the session closes.
 const LAST_WORD_WAIT: Duration = Duration::from_millis(100);
 
-/// Rest after the link could not be made for a reason of this machine, such as no free port.
+/// Pause after the link failed for a reason of this machine, such as no free port.
 const LINK_FAILED_REST: Duration = Duration::from_secs(1);
 
-/// Waits for the next certificate; for ever where there is none.
+/// Waits for the next certificate; never returns without a membership.
 async fn renewed(membership: &mut Option<watch::Receiver<Arc<Membership>>>) {
     if let Some(membership) = membership
         && membership.changed().await.is_ok()
@@ -36,7 +36,7 @@ async fn renewed(membership: &mut Option<watch::Receiver<Arc<Membership>>>) {
     std::future::pending::<()>().await;
 }
 
-/// Everything that needs the network.
+/// State of the network task.
 pub(crate) struct Online {
     pub(crate) config: AgentConfig,
     pub(crate) identity: Identity,
@@ -45,9 +45,9 @@ pub(crate) struct Online {
     pub(crate) outbox: Outbox,
     pub(crate) stop: CancellationToken,
     pub(crate) connected: watch::Sender<bool>,
-    /// The certificate, which changes with each renewal; `None` where none is wanted.
+    /// Certificate, which changes with each renewal; `None` for a robot without one.
     pub(crate) membership: Option<watch::Receiver<Arc<Membership>>>,
-    /// What was heard of whom robots are to trust.
+    /// The server's statements on the authorities that robots shall trust.
     pub(crate) heard: watch::Sender<ServerTrust>,
 }
 
@@ -56,7 +56,7 @@ fn hear(heard: &watch::Sender<ServerTrust>, trust: ServerTrust) {
 }
 
 impl Online {
-    /// Runs until the stop.
+    /// Runs until requested to stop.
     pub(crate) async fn run(mut self) {
         let (shared, clock) = (&self.dispatcher.shared, &self.dispatcher.clock);
         let (shared, clock) = (Arc::clone(shared), Arc::clone(clock));
@@ -68,7 +68,7 @@ impl Online {
             Noted::Distrusted => hear(&heard, ServerTrust::Distrusted),
         });
         tokio::select! {
-            // Robots that get power together do not come all at once.
+            // Spreads the connections of robots that are switched on together.
             () = tokio::time::sleep(fleet::start_jitter(self.identity.boot)) => {}
             () = self.stop.cancelled() => return,
         }
@@ -87,8 +87,8 @@ impl Online {
         tokio::join!(answering, linking);
     }
 
-    /// One link, until the stop or until it is to be opened again with another certificate. The
-    /// robot drives on in between, as in every outage.
+    /// Runs one link until requested to stop, or until it must be reopened with another
+    /// certificate. The robot goes on driving in between, as in every outage.
     async fn link(
         &self,
         membership: &mut Option<watch::Receiver<Arc<Membership>>>,
@@ -106,7 +106,7 @@ impl Online {
         );
         let connected = tokio::select! {
             connected = connecting => connected,
-            // The one that was shown may be the reason why nobody answers.
+            // The present certificate may be the reason why no server is reached.
             () = renewed(membership) => return ControlFlow::Continue(()),
         };
         let link = match connected {
@@ -159,8 +159,8 @@ impl Online {
         next
     }
 
-    /// Tells the server that the agent ends by itself, so that nobody misses it. A robot of which
-    /// this is lost raises an alert at the server, as any that goes away.
+    /// Publishes that the agent stops on purpose, so that the server raises no alert. If this
+    /// message is lost, the server raises one, as for any robot that disappears.
     async fn take_leave(&self, link: &FleetLink) {
         let mut last = self.reporter.state();
         last.leaving = true;
@@ -168,7 +168,7 @@ impl Online {
         tokio::time::sleep(LAST_WORD_WAIT).await;
     }
 
-    /// Says hello on every new connection until it is answered.
+    /// Sends the introduction on every new connection until it is answered.
     async fn introduce(&self, link: Arc<FleetLink>, welcomed: watch::Sender<bool>) {
         let mut server_seen = link.server_seen();
         loop {

@@ -39,7 +39,7 @@ enum Action {
     Recover(RecoverArgs),
 }
 
-/// The words of the program's command line.
+/// Returns the definition of the program's command line.
 pub fn command_line() -> clap::Command {
     <Words as clap::CommandFactory>::command()
 }
@@ -50,12 +50,12 @@ pub fn command_line() -> clap::Command {
 /// The code is 0 after an orderly stop, 1 when the agent could not start or a part of it died,
 /// and 2 for wrong flags.
 pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
-    // The first call counts; all install the same.
+    // The first call counts; all install the same provider.
     let _first = rustls::crypto::ring::default_provider().install_default();
     let words = match Words::try_parse_from(arguments) {
         Ok(words) => words,
         Err(message) => {
-            // Help and version come this way too; nobody is left to tell if this fails.
+            // Help and version are printed here too; a failure to print cannot be reported.
             let _ = message.print();
             return ExitCode::from(u8::try_from(message.exit_code()).unwrap_or(2));
         }
@@ -65,7 +65,7 @@ pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode 
         Some(Action::Enroll(args)) => run_enroll(args),
         Some(Action::Doctor(args)) => match doctor::run(&args) {
             Ok(true) => Ok(()),
-            // What is wrong has been said.
+            // The findings have been printed.
             Ok(false) => return ExitCode::FAILURE,
             Err(cause) => Err(cause),
         },
@@ -92,7 +92,7 @@ fn init_logging(flags: &Flags) {
         .with_env_filter(filter)
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal());
-    // A process that has a subscriber already keeps it.
+    // A process with a subscriber keeps it.
     let _ = match flags.log_format {
         LogFormat::Human => subscriber.try_init(),
         LogFormat::Json => subscriber.json().try_init(),
@@ -123,12 +123,12 @@ fn run(flags: &Flags) -> anyhow::Result<()> {
         agent.stop().await;
         ended
     });
-    // A thread that still waits for an absent server must not hold the process up.
+    // A thread that waits for an absent server must not block the exit.
     runtime.shutdown_background();
     ended
 }
 
-/// Waits for a signal, or for a part that dies.
+/// Waits for a signal, or for a part that ends unexpectedly.
 async fn wait(agent: &RunningAgent) -> anyhow::Result<()> {
     use tokio::signal::unix::{SignalKind, signal};
     let mut terminate = signal(SignalKind::terminate()).context("no signal handler")?;

@@ -1,6 +1,6 @@
-//! Turns what the loop reports into records of the outbox.
+//! Writes the loop's events to the outbox as records.
 //!
-//! A thread of its own: it may wait for the disk, and frees what the loop hands back.
+//! Runs on a thread of its own, which may block on the disk and deallocates what the loop returns.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -19,12 +19,12 @@ use crate::control_loop::channels::{ClosedSegment, LoopEvent};
 use crate::knowledge::Missions;
 use crate::outbox::Outbox;
 
-/// Pause between two tries on a disk that refuses.
+/// Pause between two attempts after a disk error.
 const RETRY_EVERY: Duration = Duration::from_secs(1);
-/// Records that wait in memory for a disk that refuses.
+/// Number of records that wait in memory for a failing disk; beyond it the oldest are dropped.
 const UNSAVED_MAX: usize = 10_000;
 
-/// Who records.
+/// Writes events to the outbox.
 #[derive(Debug)]
 pub(crate) struct Recorder {
     pub(crate) configuration: ConfigurationId,
@@ -33,7 +33,7 @@ pub(crate) struct Recorder {
 }
 
 impl Recorder {
-    /// Records until the loop has ended and everything it reported is in the outbox.
+    /// Records until the loop has ended and all its events are in the outbox.
     pub(crate) fn run(&self, events: &Receiver<LoopEvent>) {
         let mut unsaved = VecDeque::new();
         loop {
@@ -104,7 +104,8 @@ impl Recorder {
                 report.reason = reason.text().map(str::to_owned);
                 report.quality = Some(job.driven.quality());
                 report.driven = Some(job.driven.path());
-                // First the record, then the memory: a crash between the two reports twice.
+                // The record before the memory: a crash between them repeats the report, and loses
+                // none.
                 unsaved.push_back(RecordContent::Mission(report));
                 self.save(unsaved);
                 self.missions.slot().end(mission, phase);
@@ -121,7 +122,8 @@ impl Recorder {
         }
     }
 
-    /// Appends in order; what a sick disk refuses stays for later, the oldest gives way.
+    /// Appends records in order; those that the disk refuses stay for later, the oldest are
+    /// dropped.
     fn save(&self, unsaved: &mut VecDeque<RecordContent>) {
         while let Some(content) = unsaved.front() {
             if let Err(cause) = self.outbox.append(content) {
@@ -190,7 +192,7 @@ fn segment_of(closed: &ClosedSegment, configuration: ConfigurationId) -> Segment
         }),
         effective_track_ratio: (track.information > 0.0).then_some(track),
         rolling_resistance: (rolling.information > 0.0).then_some(rolling),
-        // The server refuses a segment that names more, which noise alone can show.
+        // The server refuses a segment with a larger value, which noise alone can produce.
         mu_peak_lower_bound: statistics.mu_peak_lower_bound.map(|mu| mu.min(MU_PEAK_MAX)),
         samples: u32::try_from(statistics.samples)
             .unwrap_or(SAMPLES_MAX)

@@ -25,13 +25,12 @@ use crate::knowledge::SiteCell;
 use crate::outbox::Outbox;
 use crate::safety::{Safety, microseconds};
 
-/// Longest wait for the loop before a change is published: two ticks of the slowest one.
+/// Longest wait for the loop before a change is published: two ticks of the slowest loop.
 const TICK_WAIT_MAX: Duration = Duration::from_millis(100);
-/// Time between two looks at its ticks; at the same time the least time between two changes that
-/// are published.
+/// Interval of the checks of the loop's ticks, and the shortest time between two published changes.
 const TICK_LOOK_EVERY: Duration = Duration::from_millis(2);
 
-/// Who tells others how the robot is.
+/// Builds and publishes the robot's state.
 #[derive(Debug)]
 pub(crate) struct Reporter {
     pub(crate) identity: Identity,
@@ -44,11 +43,11 @@ pub(crate) struct Reporter {
     pub(crate) states: AtomicU64,
     pub(crate) frictions: AtomicU64,
     pub(crate) alerts: Mutex<Alerts>,
-    /// What of the base's words was dropped, where that is counted.
+    /// Counts of the base's dropped messages, where they are counted.
     pub(crate) base: Option<Arc<Counts>>,
 }
 
-/// A cause for the wire.
+/// Converts a cause to the wire's.
 fn wire_cause(cause: GateCause) -> safety::GateCause {
     match cause {
         GateCause::Acceleration => safety::GateCause::Acceleration,
@@ -70,7 +69,7 @@ fn wire_cause(cause: GateCause) -> safety::GateCause {
     }
 }
 
-/// Whether the robot stands, for the wire; absent while it may drive.
+/// Converts the result of the standstill watch to the wire's; `None` unless zero is commanded.
 fn wire_standing(report: &StandingReport) -> Option<StandingStatus> {
     let state = if report.does_not_stand.is_some() {
         StandingState::DoesNotStand
@@ -97,7 +96,7 @@ fn aged<T>(value: T, at: Duration, now: Duration) -> Aged<T> {
 }
 
 impl Reporter {
-    /// The state now.
+    /// Returns the present state.
     pub(crate) fn state(&self) -> RobotState {
         let snapshot = self.shared.snapshot();
         let now = self.clock.monotonic();
@@ -185,25 +184,25 @@ impl Reporter {
         }
     }
 
-    /// Waits until the loop has looked at what changed a moment ago, so that its mode says so too.
+    /// Waits until the loop has processed a recent change, so that the published mode includes it.
     async fn loop_has_seen(&self) {
         let ticks = || self.shared.ticks.load(Ordering::Relaxed);
-        // A tick that has begun already may not have seen it.
+        // A tick that has begun may not have read the change.
         let seen = ticks() + 2;
         let ticking = async {
             while ticks() < seen {
                 tokio::time::sleep(TICK_LOOK_EVERY).await;
             }
         };
-        // A loop that stands still is shown as it is.
+        // If the loop does not tick, its last snapshot is published.
         let _ = tokio::time::timeout(TICK_WAIT_MAX, ticking).await;
     }
 
-    /// Both friction estimates now.
+    /// Returns both present friction estimates.
     pub(crate) fn friction(&self) -> FrictionReport {
         let snapshot = self.shared.snapshot();
         let view = self.site.view();
-        // The loop may not have taken the newest definition yet; then the place means nothing.
+        // Without the newest definition in the loop, the index of the terrain is not valid.
         let view = view.filter(|view| Some(view.terrain_revision()) == snapshot.terrain_revision);
         let terrain = view.as_ref().zip(snapshot.terrain);
         FrictionReport {
@@ -225,10 +224,10 @@ impl Reporter {
     }
 }
 
-/// Time between two looks at the counters of what was lost.
+/// Interval of the checks of the loss counters.
 const LOSSES_EVERY: Duration = Duration::from_secs(10);
 
-/// Logs what the loop had to give up, when there is more of it, until requested to stop.
+/// Logs new losses of the loop and the base until requested to stop.
 pub(crate) async fn log_losses(
     shared: Arc<Shared>,
     base: Option<Arc<Counts>>,
@@ -283,8 +282,8 @@ pub(crate) async fn log_losses(
     }
 }
 
-/// Publishes the state at a fixed rate, and at once when a stop or a lease has begun or ended, until
-/// the task is dropped.
+/// Publishes the state at a fixed rate, and at once when a stop or a lease has begun or ended,
+/// until the future is dropped.
 pub(crate) async fn publish_states(rate_hz: f64, link: Arc<FleetLink>, reporter: &Reporter) {
     let mut ticks = tokio::time::interval(Duration::from_secs_f64(rate_hz.recip()));
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);

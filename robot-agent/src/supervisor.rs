@@ -1,4 +1,4 @@
-//! Starts every task and thread of an agent, and notices when one ends that should not.
+//! Starts every task and thread of an agent, and detects those that end unexpectedly.
 //!
 //! A task that ends or panics before the agent is requested to stop is a failure of the whole agent:
 //! [`Supervisor::failed`] names it, and the program ends with a code that makes systemd start it
@@ -11,16 +11,16 @@ use tokio::sync::{Mutex, mpsc};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
-/// Failures that are kept; the first one ends the process.
+/// Number of failures that are kept; the first one ends the process.
 const FAILURES_MAX: usize = 8;
 
-/// A part of the agent has ended by itself.
+/// A part of the agent has ended unexpectedly.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("the {part} has ended by itself: {reason}")]
 pub struct PartEnded {
-    /// Which part.
+    /// Name of the part.
     pub part: &'static str,
-    /// What it left behind.
+    /// Reason: a return or a panic.
     pub reason: String,
 }
 
@@ -28,14 +28,14 @@ pub struct PartEnded {
 #[derive(Debug)]
 pub(crate) struct Supervisor {
     tracker: TaskTracker,
-    /// From here on a part may end without that being a failure.
+    /// Cancelled when parts may end without a failure.
     stopping: CancellationToken,
     stop: CancellationToken,
     failures: mpsc::Sender<PartEnded>,
     first_failure: Mutex<mpsc::Receiver<PartEnded>>,
 }
 
-/// Reports when it is dropped before the stop: a panic drops it as well as a return.
+/// Reports a part's end when dropped before the stop, by a return or a panic.
 struct EndReport {
     part: &'static str,
     stopping: CancellationToken,
@@ -56,7 +56,7 @@ impl Drop for EndReport {
                 part: self.part,
                 reason: self.reason.to_owned(),
             };
-            // A full channel holds earlier failures already; the first is what counts.
+            // A full channel has earlier failures, and only the first counts.
             let _ = self.failures.try_send(ended);
         }
     }
@@ -74,7 +74,7 @@ impl Supervisor {
         }
     }
 
-    /// The token that is cancelled when the tasks are to end.
+    /// Returns the token that is cancelled when the tasks shall end.
     pub(crate) fn stop_token(&self) -> CancellationToken {
         self.stop.clone()
     }
@@ -88,7 +88,7 @@ impl Supervisor {
         }
     }
 
-    /// Runs a task that is to live until the stop.
+    /// Runs a task that shall live until the stop.
     pub(crate) fn spawn(
         &self,
         part: &'static str,
@@ -101,10 +101,10 @@ impl Supervisor {
         });
     }
 
-    /// Runs a thread that is to live until the stop.
+    /// Runs a thread that shall live until the stop.
     ///
     /// # Errors
-    /// The operating system refused a thread.
+    /// The operating system's error if the thread cannot be started.
     pub(crate) fn spawn_thread(
         &self,
         part: &'static str,
@@ -114,29 +114,29 @@ impl Supervisor {
         std::thread::Builder::new()
             .name(part.to_owned())
             .spawn(move || {
-                // The panic hook has printed it; what is left is to tell the others.
+                // The panic hook has printed it; the drop reports it.
                 if std::panic::catch_unwind(AssertUnwindSafe(body)).is_ok() {
                     report.note_return();
                 }
             })
     }
 
-    /// Waits for the first part that ends by itself.
+    /// Waits for the first part that ends unexpectedly.
     pub(crate) async fn failed(&self) -> PartEnded {
         let ended = self.first_failure.lock().await.recv().await;
-        // The supervisor keeps a sender, so the channel cannot close before this answers.
+        // The supervisor keeps a sender, so the channel cannot close before.
         ended.unwrap_or(PartEnded {
             part: "supervisor",
             reason: "it lost its channel".to_owned(),
         })
     }
 
-    /// From now on the end of a part is no failure.
+    /// From now on the end of a part is not a failure.
     pub(crate) fn begin_stop(&self) {
         self.stopping.cancel();
     }
 
-    /// Tells every task to end, and waits until all have.
+    /// Requests all tasks to end, and waits until they have.
     pub(crate) async fn end_tasks(&self) {
         self.begin_stop();
         self.stop.cancel();

@@ -1,4 +1,4 @@
-//! `[estimation]` of `robot.toml`, checked: what is known beforehand of the robot and its tyres.
+//! Checks `[estimation]` of `robot.toml`: the prior of the robot's and the tyres' parameters.
 
 use std::ops::RangeInclusive;
 
@@ -7,28 +7,28 @@ use tread_control::estimation::{EstimatorPrior, ModelUncertainty, TyrePrior};
 use super::file::EstimationFile;
 use super::{ConfigError, DriveConfig};
 
-/// Standard deviations of mass and inertia, shares.
+/// Permitted relative standard deviation of mass and inertia.
 const RATIO_RANGE: RangeInclusive<f64> = 0.0..=1.0;
-/// Curvature of tyres and its standard deviation, per friction coefficient.
+/// Permitted curvature of tyres and standard deviation of it, per friction coefficient.
 const CURVATURE_RANGE: RangeInclusive<f64> = 0.0..=10.0;
-/// Relaxation length of tyres and its standard deviation, metres.
+/// Permitted relaxation length of tyres and standard deviation of it, metres.
 const RELAXATION_RANGE_M: RangeInclusive<f64> = 0.0..=1.0;
-/// Friction coefficient up to which tyres rise as they are known to.
+/// Permitted friction coefficient up to which the tyre curvature is valid.
 const MU_RANGE: RangeInclusive<f64> = 0.05..=10.0;
 
-/// What is known of a base where nothing is said.
+/// Returns the default prior of a base.
 pub(super) fn default_of(drive: &DriveConfig) -> EstimatorPrior {
     match drive {
-        // It is as its model says.
+        // It behaves exactly as its model.
         DriveConfig::Simulated(_) => EstimatorPrior::exact(),
         DriveConfig::Ros2(_) => EstimatorPrior::default(),
     }
 }
 
-/// What is known; defaults where nothing is said.
+/// Returns the prior, with `default` for missing keys.
 ///
 /// # Errors
-/// [`ConfigError::OutOfRange`].
+/// [`ConfigError::OutOfRange`] for a value that is not permitted.
 pub(super) fn checked(
     file: EstimationFile,
     default: EstimatorPrior,

@@ -1,4 +1,4 @@
-//! `robot.toml` as it is written: every key, none of them checked yet but by its type.
+//! The keys of `robot.toml`, checked only by their types.
 
 use std::path::PathBuf;
 
@@ -54,7 +54,7 @@ pub(super) struct RecordingFile {
     pub(super) files: Option<usize>,
 }
 
-/// `[model]` in `robot.toml`; the same words as on the wire, but strict.
+/// `[model]` of `robot.toml`, with the names of the wire; unknown keys are refused.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct ModelFile {
@@ -104,7 +104,7 @@ impl From<ModelFile> for RobotModel {
     }
 }
 
-/// What kind of base there is.
+/// Kind of the base.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(super) enum DriveKind {
@@ -126,7 +126,7 @@ pub(super) struct DriveFile {
     pub(super) clock_ahead_s: Option<i64>,
 }
 
-/// Reads the text of a configuration.
+/// Parses the text of a configuration.
 pub(super) fn parse(text: &str) -> Result<FileConfig, toml::de::Error> {
     toml::from_str(text)
 }

@@ -1,6 +1,6 @@
-//! What an agent must know before it starts: `robot.toml`, and flags that go before it.
+//! Configuration of an agent: `robot.toml`, and flags that override it.
 //!
-//! Everything is read and checked before anything is opened. A mistake names file, line and key.
+//! Everything is read and checked before anything is opened. An error names file, line and key.
 
 mod estimation;
 mod file;
@@ -32,11 +32,11 @@ use crate::sim::faults::Fault;
 use crate::sim::scenario::{BUILT_IN_NAME, Scenario, ScenarioError};
 use crate::sim::trace::Trace;
 
-/// Where the server listens unless said otherwise.
+/// Default endpoint of the server.
 pub const SERVER_DEFAULT: &str = "tcp/127.0.0.1:7447";
-/// Slowest and fastest loop, Hz.
+/// Permitted rate of the loop, Hz.
 pub const RATE_HZ_RANGE: std::ops::RangeInclusive<f64> = 20.0..=200.0;
-/// Slowest and fastest publication, Hz.
+/// Permitted rate of publication, Hz.
 pub const PUBLISH_HZ_RANGE: std::ops::RangeInclusive<f64> = 0.1..=50.0;
 
 /// Why a configuration was refused.
@@ -59,7 +59,7 @@ pub enum ConfigError {
         /// Line, column, key and what is wrong with it.
         problem: String,
     },
-    /// Something that has no default was not given.
+    /// A value without a default is missing.
     #[error("`{key}` is missing: give it in the configuration or as `--{flag}`")]
     Missing {
         /// The key in the file.
@@ -75,19 +75,19 @@ pub enum ConfigError {
         /// What is wrong with it.
         problem: String,
     },
-    /// The robot's membership was refused.
+    /// The robot's membership cannot be used.
     #[error("the robot's place in the fleet is not known")]
     Membership(#[from] MembershipFileError),
-    /// The robot has joined under another name.
+    /// The robot has joined under another identifier.
     #[error("the robot has joined the fleet as `{0}`: give that name, or join again")]
     OtherRobot(String),
-    /// The endpoint wants a certificate, and there is none.
+    /// The endpoint requires a certificate, and the robot has none.
     #[error("`{0}` wants a certificate: join the fleet with `tread-agent enroll`")]
     NotEnrolled(String),
-    /// What is sent there could be read and changed by others.
+    /// The endpoint is another machine without encryption.
     #[error("`{0}` is another machine without TLS: join the fleet with `tread-agent enroll`")]
     ClearText(String),
-    /// The scenario was refused.
+    /// The scenario cannot be used.
     #[error("the simulated drive has no ground")]
     Scenario(#[from] ScenarioError),
 }
@@ -155,28 +155,28 @@ pub enum LogFormat {
     Json,
 }
 
-/// The simulated base.
+/// Settings of the simulated base.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SimulatedConfig {
-    /// The true ground.
+    /// Scenario with the true ground.
     pub scenario: Scenario,
-    /// Where the robot stands at first.
+    /// Start pose in the site frame.
     pub start: Pose,
-    /// What makes its sensors, wheels and tyres its own.
+    /// Individual properties of its sensors, wheels and tyres.
     pub individual: Individual,
     /// Charge of its battery at the start, 0 to 1.
     pub battery_charge_ratio: f64,
-    /// How far its wall clock is ahead, seconds.
+    /// Offset of its wall clock, seconds, positive for ahead.
     pub clock_ahead_s: i64,
-    /// Its fault, if it is to have one.
+    /// A stall of its reads, if any.
     pub stall: Option<Stall>,
-    /// What of its sensors and wheels breaks, as the scenario says.
+    /// Faults of its sensors and wheels, from the scenario.
     pub faults: Vec<Fault>,
-    /// Where it leaves word of what it truly does.
+    /// Recorder of its true state.
     pub trace: Option<Trace>,
 }
 
-/// The base.
+/// Settings of the base.
 #[derive(Debug, Clone, PartialEq)]
 pub enum DriveConfig {
     /// A simulated one.
@@ -186,7 +186,7 @@ pub enum DriveConfig {
 }
 
 impl DriveConfig {
-    /// The simulated base, if it is one.
+    /// Returns the settings of a simulated base; `None` for another one.
     pub fn simulated(&self) -> Option<&SimulatedConfig> {
         match self {
             Self::Simulated(simulated) => Some(simulated),
@@ -194,7 +194,7 @@ impl DriveConfig {
         }
     }
 
-    /// Its kind, as in the file.
+    /// Returns the kind of the base, as in the file.
     pub fn kind(&self) -> &'static str {
         match self {
             Self::Simulated(_) => "simulated",
@@ -202,7 +202,7 @@ impl DriveConfig {
         }
     }
 
-    /// Whether it says how full its battery is.
+    /// Whether the base measures its battery.
     pub fn measures_battery(&self) -> bool {
         match self {
             Self::Simulated(_) => true,
@@ -210,7 +210,7 @@ impl DriveConfig {
         }
     }
 
-    /// Whether it says how its wheels pull.
+    /// Whether the base measures its wheel torques.
     pub fn measures_torque(&self) -> bool {
         match self {
             Self::Simulated(simulated) => simulated.individual.has_torque,
@@ -221,7 +221,7 @@ impl DriveConfig {
         }
     }
 
-    /// The same, to be changed.
+    /// Returns the settings of a simulated base for changes; `None` for another one.
     #[cfg(any(test, feature = "testing"))]
     pub fn simulated_mut(&mut self) -> Option<&mut SimulatedConfig> {
         match self {
@@ -240,9 +240,9 @@ pub struct AgentConfig {
     pub robot: RobotId,
     /// The server's zenoh endpoint.
     pub server: String,
-    /// The robot's certificate, for an endpoint that wants one.
+    /// The robot's certificate, for an endpoint that requires one.
     pub membership: Option<Membership>,
-    /// Where measurements and missions outlive the process.
+    /// Folder of the files that outlive the process.
     pub data_dir: PathBuf,
     /// Rate of the control loop, Hz, within [`RATE_HZ_RANGE`].
     pub rate_hz: f64,
@@ -257,21 +257,21 @@ pub struct AgentConfig {
     /// Owners of external limits whose silence holds the robot, at most
     /// [`LIMITS_MAX`].
     pub required_owners: Vec<OwnerId>,
-    /// Whether the robot may be teleoperated, slowly, within a fence without knowing where it is.
+    /// Whether the robot may be teleoperated, slowly, inside a fence without a known position.
     pub blind_within_fence: bool,
     /// Bounds of the outbox.
     pub outbox: outbox::Limits,
-    /// Where what the loop takes and gives is recorded; absent: nowhere.
+    /// Destination of records of the loop; `None` for no records.
     pub recording: Option<RecordingConfig>,
-    /// What is known beforehand of the robot and its tyres.
+    /// Estimator's prior of the robot's and the tyres' parameters.
     pub prior: EstimatorPrior,
 }
 
 impl AgentConfig {
-    /// A robot of a scenario, everything else as by default.
+    /// Creates the configuration of a robot of a scenario, otherwise with defaults.
     ///
     /// # Errors
-    /// [`ConfigError`] when the scenario has no such robot.
+    /// [`ConfigError`] if the scenario has no such robot.
     pub fn simulated(
         scenario: Scenario,
         robot: RobotId,
@@ -288,7 +288,7 @@ impl AgentConfig {
         assemble(&flags, FileConfig::default(), || Ok(scenario))
     }
 
-    /// Reads the file that the flags name, if any, and lets the flags go before it.
+    /// Reads the file that the flags name, if any; flags override it.
     ///
     /// # Errors
     /// [`ConfigError`] names file, line and key.
@@ -299,7 +299,7 @@ impl AgentConfig {
             None => Scenario::built_in(),
             Some(name) if name == Path::new(BUILT_IN_NAME) => Scenario::built_in(),
             Some(path) => {
-                // Paths in a configuration are meant from where the file is.
+                // Paths in a configuration are relative to its file.
                 let folder = flags.config.as_deref().and_then(Path::parent);
                 let is_from_flag = flags.scenario.is_some();
                 let folder = folder.filter(|_| !is_from_flag).unwrap_or(Path::new(""));
@@ -309,7 +309,7 @@ impl AgentConfig {
         assemble(flags, file, scenario)
     }
 
-    /// Time between two ticks of the loop.
+    /// Returns the period of the loop.
     pub fn period(&self) -> Duration {
         Duration::from_secs_f64(self.rate_hz.recip())
     }
@@ -330,7 +330,7 @@ fn read_file(flags: &Flags) -> Result<FileConfig, ConfigError> {
     })
 }
 
-/// `x,y,heading` of the simulated base.
+/// Parses `x,y,heading` of the simulated base: metres and radians.
 fn parse_start(text: &str) -> Result<Pose, String> {
     let numbers: Result<Vec<f64>, _> = text.split(',').map(|part| part.trim().parse()).collect();
     match numbers.map_err(|refused| refused.to_string())?.as_slice() {
@@ -346,7 +346,7 @@ fn parse_start(text: &str) -> Result<Pose, String> {
     }
 }
 
-/// `after,lasting` of the simulated base's fault, seconds.
+/// Parses `after,lasting` of the simulated base's stall, seconds.
 fn parse_stall(text: &str) -> Result<Stall, String> {
     let span = |part: &str| {
         let number: f64 = part

@@ -1,4 +1,4 @@
-//! A robot's place in the fleet: who it is, where its folder is, and what it shows where.
+//! Reads the robot's identity and folder, and chooses its credentials for an endpoint.
 
 use std::net::IpAddr;
 use std::path::PathBuf;
@@ -8,19 +8,19 @@ use tread_api::ids::{RobotId, SiteId};
 use super::{ConfigError, Flags, read_file};
 use crate::membership::Membership;
 
-/// What a robot must know to join the fleet.
+/// Identity and folder of a robot that joins the fleet.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Place {
     /// The robot, if it is named.
     pub(crate) robot: Option<RobotId>,
-    /// Where what outlives the process is.
+    /// Folder of the files that outlive the process.
     pub(crate) data_dir: PathBuf,
 }
 
-/// Reads who the robot is and where its folder is; flags go before the file.
+/// Reads the robot's identifier and its folder; flags override the file.
 ///
 /// # Errors
-/// [`ConfigError`]: the file does not read, or nobody names the folder.
+/// [`ConfigError`]: the file cannot be read or parsed, or no folder is given.
 pub(crate) fn place(flags: &Flags) -> Result<Place, ConfigError> {
     let file = read_file(flags)?;
     let data_dir = flags.data_dir.clone().or(file.data_dir);
@@ -33,8 +33,8 @@ pub(crate) fn place(flags: &Flags) -> Result<Place, ConfigError> {
     })
 }
 
-/// What the robot shows at an endpoint: its certificate where TLS is spoken, nothing on its own
-/// machine, and elsewhere it does not go.
+/// Returns the credentials for an endpoint: the membership for TLS, none on this machine;
+/// unencrypted endpoints on other machines are refused.
 pub(super) fn place_at(
     server: &str,
     site: &SiteId,
@@ -56,8 +56,8 @@ pub(super) fn place_at(
     Ok(Some(joined))
 }
 
-/// Whether an endpoint in the clear is on this machine. What is no endpoint at all is for zenoh
-/// to refuse.
+/// Whether an unencrypted endpoint is on this machine. True for a text that is no endpoint, which
+/// zenoh refuses.
 pub(super) fn is_here(endpoint: &str) -> bool {
     let Some((_protocol, rest)) = endpoint.split_once('/') else {
         return true;

@@ -1,4 +1,4 @@
-//! `[recording]` of `robot.toml`, checked.
+//! Checks `[recording]` of `robot.toml`.
 
 use std::path::Path;
 
@@ -8,10 +8,10 @@ use crate::recording::{
     FILE_MIB_DEFAULT, FILE_MIB_RANGE, FILES_DEFAULT, FILES_RANGE, RecordingConfig,
 };
 
-/// Where records go; none if nothing is to be recorded.
+/// Returns the destination of records; `None` if recording is off.
 ///
 /// # Errors
-/// [`ConfigError::OutOfRange`], whether it is switched on or not.
+/// [`ConfigError::OutOfRange`] for a value that is not permitted, even if recording is off.
 pub(super) fn checked(
     file: RecordingFile,
     data_dir: &Path,

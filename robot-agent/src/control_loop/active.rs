@@ -1,13 +1,14 @@
-//! The active mission of the loop: driven, held standing, and ended for a reason.
+//! The active mission of the loop: followed, held at zero velocity, replaced, and ended.
 //!
 //! ```text
-//!          hold (pause, revision, outside)    stands
-//! driving ─────────────────────────► braking ────────► standing
+//!          hold (pause, revision, outside)    stopped
+//! driving ─────────────────────────► braking ────────► held at zero velocity
 //!    ▲ └────────────── cancel, silence ──────┴────────────┤ │
 //!    └──────────────────── release ───────────────────────┘ ▼
 //!                                                         ended
 //! ```
-//! While it stands held, the tracking law rests too: nothing winds up, nothing creeps.
+//! While the mission is held at zero velocity, the tracking law is not updated: no integral winds
+//! up and the robot does not creep.
 
 use std::time::Duration;
 
@@ -25,17 +26,17 @@ use super::driven::TickRecord;
 use super::prior::Prior;
 use super::surface::Comparison;
 
-/// Speed below which a held robot counts as standing, m/s; twice that in rad/s.
+/// Speed below which a held robot counts as stopped, m/s; twice the value for the yaw rate, rad/s.
 const HELD_STANDING: f64 = 0.04;
 
-/// What a tick of a mission gives.
+/// Result of one tick of the mission.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Step {
-    /// What the wheels are to do; rest while it stands held.
+    /// Wheel speeds of the tracking law; zero while the robot is stopped on hold.
     pub(super) wanted: WheelSpeeds,
-    /// Why it is over, if it is.
+    /// Reason of the mission's end, if it ended in this tick.
     pub(super) end: Option<EndReason>,
-    /// It has just come to stand by a pause, or has just left that.
+    /// Begin or end of a pause in this tick.
     pub(super) news: Option<News>,
     /// θ̂ of the tracking law.
     pub(super) theta_loop: Option<f64>,
@@ -52,21 +53,21 @@ pub(super) enum News {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum Hold {
-    /// An operator paused it.
+    /// An operator paused the mission.
     Pause,
-    /// Its next revision is being planned from where it comes to stand.
+    /// The next revision is being planned from where the robot stops.
     Replacement,
-    /// Somebody outside holds the robot; it goes on by itself when that ends.
+    /// An external limit holds the robot; the mission goes on when the limit ends.
     Outside,
-    /// The base is silent, or is heard again for too short a time; it goes on by itself.
+    /// The base is silent, or was heard again too recently; the mission goes on by itself.
     Base,
-    /// The control loop does not keep its rate; it goes on by itself.
+    /// The control loop does not keep its rate; the mission goes on when it does.
     Overrun,
-    /// A sensor that it drives by is wrong; it goes on by itself when it is right again.
+    /// A sensor that the mission needs is contradicted; the mission goes on when the finding ends.
     Sensors,
 }
 
-/// What holds a mission now.
+/// The holds that are active.
 #[derive(Debug, Clone, Copy, Default)]
 #[expect(
     clippy::struct_excessive_bools,
@@ -88,15 +89,15 @@ pub(super) struct Active {
     pub(super) progress: MissionProgress,
     pub(super) has_started: bool,
     holds: Holds,
-    /// When the cause that is reported began to pause it, by the monotonic clock.
+    /// Begin of the reported cause of the pause, by the monotonic clock.
     paused_from: Option<Duration>,
     standing_ticks: u32,
     /// Whether the pause was reported to the server.
     is_pause_reported: bool,
     stopped_because: EndReason,
-    /// The revision that takes over once the robot stands.
+    /// Revision that takes over once the robot has stopped.
     next: Option<Box<Job>>,
-    /// Distance from the path in this tick, and whether a wheel was at its limit.
+    /// Signed cross-track error in this tick, metres, and whether a wheel speed was saturated.
     tracked: Option<(f64, bool)>,
 }
 
@@ -129,7 +130,7 @@ impl Active {
         }
     }
 
-    /// Brakes along the path, for good.
+    /// Brakes along the path and ends the mission once the robot has stopped.
     pub(super) fn stop(&mut self, because: EndReason) {
         if self.job.follower.status() != FollowerStatus::Stopping {
             self.stopped_because = because;
@@ -137,7 +138,8 @@ impl Active {
         }
     }
 
-    /// Pauses the mission until somebody resumes it; the strictest cause is the one reported.
+    /// Pauses the mission until it is resumed on request; the cause of the highest rank is
+    /// reported.
     pub(super) fn pause(&mut self, cause: PauseCause, now: Duration) {
         let rank = |cause: PauseCause| match cause {
             PauseCause::Other => 0,
@@ -153,7 +155,7 @@ impl Active {
         }
     }
 
-    /// How long what pauses it of itself has done so; none for a request.
+    /// Returns the duration of a pause for safety; `None` for a requested pause.
     pub(super) fn paused_for(&self, now: Duration) -> Option<Duration> {
         let is_on_hold = self.progress.is_paused_for_safety();
         self.paused_from
@@ -161,7 +163,7 @@ impl Active {
             .map(|from| now.saturating_sub(from))
     }
 
-    /// Holds the mission, or lets it go on.
+    /// Activates or releases one hold; the follower's pace is zero while any hold is active.
     pub(super) fn hold(&mut self, hold: Hold, is_wanted: bool) {
         let present = match hold {
             Hold::Pause => {
@@ -190,7 +192,7 @@ impl Active {
             .set_pace(if is_on_hold { 0.0 } else { 1.0 });
     }
 
-    /// Whether it is held, braking or standing.
+    /// Whether any hold is active, braking or stopped.
     pub(super) fn is_on_hold(&self) -> bool {
         let holds = &self.holds;
         holds.pause
@@ -201,7 +203,8 @@ impl Active {
             || holds.sensors
     }
 
-    /// Whether it leaves the wheels to others: it stands held, or is over but for a revision.
+    /// Whether the mission does not command the wheels: the robot is stopped on hold and the
+    /// mission is not being ended.
     pub(super) fn rests(&self) -> bool {
         self.stands_held() && self.job.follower.status() != FollowerStatus::Stopping
     }
@@ -211,7 +214,7 @@ impl Active {
         self.job.follower.set_speed_limit(limit_m_s);
     }
 
-    /// Holds the law's adaptation.
+    /// Suspends or resumes the adaptation of θ̂ in the tracking law.
     pub(super) fn hold_adaptation(&mut self, is_on_hold: bool) {
         self.job.follower.hold_adaptation(is_on_hold);
     }
@@ -220,14 +223,14 @@ impl Active {
         self.is_on_hold() && self.standing_ticks >= STANDING_TICKS
     }
 
-    /// Puts the next revision in place of this one as soon as the robot stands; hands back one
-    /// that waited for that already.
+    /// Stores the next revision, which replaces the active one when the robot has stopped. Returns
+    /// a revision that was waiting already.
     pub(super) fn replace_at_rest(&mut self, next: Box<Job>) -> Option<Box<Job>> {
         self.hold(Hold::Replacement, true);
         self.next.replace(next)
     }
 
-    /// Whether the next revision is here and the robot stands for it.
+    /// Whether a revision waits and the robot has stopped, or the active revision is done.
     pub(super) fn is_at_rest_for_replacement(&self) -> bool {
         let status = self.job.follower.status();
         let is_stopping = status == FollowerStatus::Stopping;
@@ -235,8 +238,8 @@ impl Active {
         self.next.is_some() && !is_stopping && (is_over || self.stands_held())
     }
 
-    /// Puts the next revision in place of this one and hands the old one back. The record of the
-    /// way goes on.
+    /// Replaces the active revision by the waiting one and returns the old one. The record of the
+    /// driven path continues.
     pub(super) fn replace(&mut self, knowledge: Option<ThetaKnowledge>) -> Option<Box<Job>> {
         let mut next = self.next.take()?;
         std::mem::swap(&mut self.job.driven, &mut next.driven);
@@ -256,7 +259,8 @@ impl Active {
         Some(old)
     }
 
-    /// What the map knows along the path that is driven, or is to be once the robot stands.
+    /// Returns the map's friction along the path of the active revision, or of the waiting one if
+    /// it takes over in this tick.
     pub(super) fn prior(&self) -> &Prior {
         let coming = self
             .next
@@ -265,12 +269,12 @@ impl Active {
         &coming.unwrap_or(&self.job).prior
     }
 
-    /// What is left when the mission ends.
+    /// Returns the active revision and the waiting one, if any.
     pub(super) fn into_jobs(self) -> (Box<Job>, Option<Box<Job>>) {
         (self.job, self.next)
     }
 
-    /// One tick.
+    /// Runs one tick. `command` holds the wheel speeds that the base was commanded last.
     pub(super) fn step(
         &mut self,
         measured: &Measured,
@@ -298,7 +302,7 @@ impl Active {
         self.progress.cross_track_m = output.errors.cross_track_m;
         self.tracked = Some((output.errors.cross_track_m, output.saturated));
         let end = match output.status {
-            // With a revision to come, an end of the old one is not the end.
+            // With a revision to come, the end of the old one does not end the mission.
             FollowerStatus::Done if self.holds.replacement => None,
             FollowerStatus::Done => Some(EndReason::Reached),
             FollowerStatus::Stopped => Some(self.stopped_because),
@@ -350,7 +354,8 @@ impl Active {
             cross_track_m,
             is_saturated: is_saturated.unwrap_or(false),
             is_paused: self.is_pause_reported,
-            // Slowing to rest and speeding up are the gate's usual work while it is held.
+            // While the mission is held, reductions up to the cause `Speed` are expected and not
+            // recorded.
             gate: tick
                 .gate
                 .filter(|cause| !self.is_on_hold() || *cause > GateCause::Speed),
@@ -358,7 +363,7 @@ impl Active {
         });
     }
 
-    /// Notes what a cell has shown beside what the map says of it.
+    /// Records the comparison of a cell's measured θ with the map's.
     pub(super) fn compare(&mut self, comparison: &Comparison) {
         self.job.driven.compare(comparison);
     }

@@ -1,7 +1,8 @@
-//! What passes between the loop thread and the rest of the agent.
+//! The channels and shared cells between the loop thread and the rest of the agent.
 //!
-//! Commands come in and events go out through bounded channels, never waited for by the loop; the
-//! latest snapshot lies in a cell that the loop leaves alone while somebody reads it.
+//! Commands ([`LoopCommand`]) and events ([`LoopEvent`]) pass through bounded channels, on which
+//! the loop never blocks. The latest [`Snapshot`] is in a mutex that the loop skips while it is
+//! locked.
 
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
@@ -33,9 +34,9 @@ use super::surface::Comparison;
 use crate::drive::Battery;
 use crate::safety::SafetyCell;
 
-/// Commands that may wait for the next tick.
+/// Capacity of the command channel, emptied by each tick.
 pub(crate) const COMMANDS_MAX: usize = 16;
-/// Events that may wait for whoever records them; more segments than that are lost and counted.
+/// Capacity of the event channel; segments that find it full are dropped and counted.
 pub(crate) const EVENTS_MAX: usize = 1_024;
 
 /// A planned mission, ready to drive.
@@ -45,32 +46,32 @@ pub(crate) struct Job {
     pub(crate) revision: u32,
     pub(crate) plan_hash: PlanHash,
     pub(crate) follower: Follower,
-    /// What the map knows along the path.
+    /// Friction of the map along the path.
     pub(crate) prior: Prior,
-    /// Past this monotonic time it must not start.
+    /// Latest start, by the monotonic clock; a later start ends the mission as expired.
     pub(crate) start_by: Option<Duration>,
-    /// Longest silence of the server with which it goes on; for ever when absent.
+    /// Longest silence of the server before the mission is stopped; `None` for no limit.
     pub(crate) silence_max: Option<Duration>,
-    /// What it turns out to be.
+    /// Record of the driven path and of the mission's quality.
     pub(crate) driven: Driven,
-    /// What it was made from.
+    /// Inputs from which this job was planned.
     pub(crate) origin: Arc<JobOrigin>,
 }
 
-/// To the loop.
+/// A command to the loop.
 #[derive(Debug)]
 pub(crate) enum LoopCommand {
-    /// Drive this.
+    /// Starts this mission.
     Start(Box<Job>),
-    /// Brake along the path and end the mission, if it is this one.
+    /// Brakes along the path and ends the mission, if it is the active one.
     Cancel(MissionId),
-    /// Hold this mission, standing.
+    /// Stops this mission on its path until the same hold is released.
     Hold(MissionId, Hold),
-    /// Let it go on, if nothing else holds it.
+    /// Ends this hold; the mission goes on if no other hold is active.
     Release(MissionId, Hold),
-    /// Drive this revision instead of the active one, once the robot stands.
+    /// Replaces the active revision by this one once the robot has stopped.
     Replace(Box<Job>),
-    /// The site is like this now.
+    /// Replaces the definition of the site.
     Site(Arc<SiteView>),
 }
 
@@ -101,7 +102,7 @@ impl EndReason {
         }
     }
 
-    /// For people; a success needs no words.
+    /// Description for people; `None` for a success.
     pub(crate) fn text(self) -> Option<&'static str> {
         match self {
             Self::Reached => None,
@@ -116,7 +117,7 @@ impl EndReason {
     }
 }
 
-/// A segment as the loop closed it.
+/// A segment that the loop has closed.
 #[derive(Debug, Clone)]
 pub(crate) struct ClosedSegment {
     pub(crate) site: Arc<SiteView>,
@@ -126,12 +127,12 @@ pub(crate) struct ClosedSegment {
     pub(crate) cell: Cell,
     pub(crate) terrain: Option<usize>,
     pub(crate) distance_m: f64,
-    /// Share of the segment's blocks with a wheel beyond the linear range.
+    /// Fraction of the segment's blocks with a wheel beyond the linear slip range.
     pub(crate) saturation_ratio: f64,
     pub(crate) statistics: SegmentStatistics,
 }
 
-/// From the loop.
+/// An event from the loop.
 #[derive(Debug)]
 pub(crate) enum LoopEvent {
     /// The first wheel command of a mission was given.
@@ -139,7 +140,8 @@ pub(crate) enum LoopEvent {
         at: Timestamp,
         progress: MissionProgress,
     },
-    /// The mission stands paused, by the robot itself since then.
+    /// The robot has stopped for a pause; `since` is when the pause began if the robot paused the
+    /// mission itself, `None` for a requested pause.
     Paused {
         at: Timestamp,
         since: Option<Timestamp>,
@@ -150,15 +152,16 @@ pub(crate) enum LoopEvent {
         at: Timestamp,
         progress: MissionProgress,
     },
-    /// Another revision is driven from now on; the one before is handed back to be freed.
+    /// A new revision is active; `old` is returned for deallocation outside the loop.
     Replaced {
         at: Timestamp,
         progress: MissionProgress,
         old: Box<Job>,
     },
-    /// A revision came when its mission was over, and is handed back to be freed.
+    /// A revision that arrived after its mission had ended, or was replaced before it was driven;
+    /// returned for deallocation outside the loop.
     CameTooLate(Box<Job>),
-    /// A mission ended; what was driven is handed back to be freed elsewhere.
+    /// A mission ended; `job` is returned with its record, for deallocation outside the loop.
     Ended {
         at: Timestamp,
         reason: EndReason,
@@ -167,21 +170,21 @@ pub(crate) enum LoopEvent {
     },
     /// A segment closed with information.
     Segment(ClosedSegment),
-    /// A site that is no longer used, handed back to be freed elsewhere.
+    /// A site definition that is no longer used, returned for deallocation outside the loop.
     Retired(Arc<SiteView>),
 }
 
-/// What is broken.
+/// A fault of the base or of the localisation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Fault {
-    /// The base has not been heard for too long.
+    /// No valid message from the base for too long.
     BaseSilent,
     /// No position fix for too long.
     PositionLost,
 }
 
 impl Fault {
-    /// For people.
+    /// Description for people.
     pub fn text(self) -> &'static str {
         match self {
             Self::BaseSilent => "the base has not been heard for too long",
@@ -190,71 +193,72 @@ impl Fault {
     }
 }
 
-/// What the gate did since the start.
+/// Action of the gate in the last tick, and its counters since the start.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(crate) struct GateSnapshot {
     /// The strictest cause in the last tick.
     pub(crate) cause: Option<GateCause>,
-    /// Whether it was coming to rest, or stood.
+    /// Whether the gate's target in the last tick was zero velocity.
     pub(crate) target_rests: bool,
     /// Ticks in which it reduced a command.
     pub(crate) reduced_ticks: u64,
-    /// How often each cause began, in the order of [`GateCause::ALL`].
+    /// Number of times each cause began, in the order of [`GateCause::ALL`].
     pub(crate) counts: [u64; GateCause::ALL.len()],
 }
 
-/// What the loop last said of itself.
+/// State of the loop after a tick, as published to the rest of the agent.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Snapshot {
-    /// When, by the agent's monotonic clock.
+    /// Time of the tick, by the agent's monotonic clock.
     pub at: Duration,
-    /// What the agent is doing.
+    /// Operating mode.
     pub mode: RobotMode,
-    /// What is broken, if anything.
+    /// Active fault.
     pub fault: Option<Fault>,
-    /// Where the robot is, and when the last fix behind it was measured.
+    /// Pose in the site frame, and the measuring time of the last fix fused into it.
     pub pose: Option<(Pose, Duration)>,
-    /// How it moves, and when the base was last heard.
+    /// Twist in the robot frame, and the time of the last sample of gyro and wheels.
     pub twist: Option<(Twist, Duration)>,
-    /// The mission that is driven.
+    /// Progress of the active mission.
     pub mission: Option<MissionProgress>,
-    /// What walks along its plan.
+    /// Position of the reference on the plan of the active mission.
     pub governor: Option<Governor>,
-    /// What holds the mission.
+    /// Whether a hold stops the active mission.
     pub is_on_hold: bool,
-    /// How far the robot is from where its held mission goes on, metres.
+    /// Distance from the robot to the reference of a held mission, metres.
     pub off_path_m: Option<f64>,
-    /// Whether the wheels are commanded to rest and do.
+    /// Whether the wheels are commanded to zero and are measured near zero.
     pub stands: bool,
-    /// What the gate does.
+    /// Action of the gate.
     pub(crate) gate: GateSnapshot,
-    /// The revision of the geofence that the loop keeps to.
+    /// Revision of the active geofence.
     pub fence_revision: Option<u64>,
     /// The battery, if the base measures it.
     pub battery: Option<Battery>,
-    /// θ̂ of the loop; kept from the last mission, none before the first.
+    /// Adapted θ̂ of the tracking law; that of the last mission between missions, `None` before the
+    /// first.
     pub theta_loop: Option<f64>,
-    /// θ measured on the present ground.
+    /// Measured θ of the ground under the robot.
     pub theta_measured: Option<ThetaEstimate>,
-    /// Whether the motion of late carried information on θ.
+    /// Whether recent motion carried information on θ.
     pub excited: bool,
-    /// Where the ground is not as the map says.
+    /// The comparison that raised the alert that the ground differs from the map.
     pub(crate) surface_change: Option<Comparison>,
-    /// Where the wheels turn without progress.
+    /// Position at which the wheels turn without moving the robot.
     pub dug_in_at: Option<Point>,
-    /// How far the loop is from its rate, while the robot is held for it.
+    /// Lateness of the loop while the robot is held for it.
     pub(crate) overrun: Option<Overrun>,
-    /// Sensors that contradict each other.
+    /// Contradictions between sensors.
     pub(crate) findings: Findings,
-    /// Whether the robot stands, where it is to.
+    /// Result of the standstill watch.
     pub(crate) standing: StandingReport,
-    /// How much the wheels slip along their direction, while they turn.
+    /// Longitudinal slip of each side, while it is defined.
     pub slip: Option<SideSlip>,
-    /// The cell that the robot is in.
+    /// Cell of the open segment.
     pub cell: Option<Cell>,
-    /// The terrain that it is on, by its place in the site's definition.
+    /// Terrain under all wheels, as an index into the site's terrains.
     pub(crate) terrain: Option<usize>,
-    /// The revision of the definition that the loop uses.
+    /// Terrain revision of the active site definition.
     pub terrain_revision: Option<u64>,
     /// Ticks since the start.
     pub ticks: u64,
@@ -293,7 +297,7 @@ impl Default for Snapshot {
     }
 }
 
-/// A plan that was given to the loop.
+/// The plan that was given to the loop last.
 #[derive(Debug, Clone)]
 pub(crate) struct GivenPlan {
     pub(crate) mission: MissionId,
@@ -301,55 +305,55 @@ pub(crate) struct GivenPlan {
     pub(crate) plan: Arc<Plan>,
 }
 
-/// What both sides may look at.
+/// State shared by the loop and the rest of the agent.
 #[derive(Debug, Default)]
 pub(crate) struct Shared {
     snapshot: Mutex<Snapshot>,
-    /// What may only slow the robot down.
+    /// Stops, teleoperation and limits, which can only slow the robot down.
     pub(crate) safety: Arc<SafetyCell>,
-    /// Ticks since the start, for whoever watches the loop.
+    /// Ticks since the start, for the watchdog.
     pub(crate) ticks: AtomicU64,
-    /// Tells the loop to brake and end.
+    /// Requests the loop to brake and end.
     pub(crate) stop: AtomicBool,
     /// Ticks that began more than one period late.
     pub(crate) overruns: AtomicU64,
-    /// Commands refused because they did not parse, or were of another version.
+    /// Refused commands: not parsable, or of another payload version.
     pub(crate) commands_refused: AtomicU64,
-    /// Longest computation of a tick since it was last taken, microseconds.
+    /// Longest computing time of a tick since the last reading, microseconds.
     pub(crate) tick_max_us: AtomicU32,
-    /// Segments that nobody took in time.
+    /// Segments that were dropped because the event channel was full.
     pub(crate) lost_segments: AtomicU64,
-    /// Blocks of measurement that belong to no cell, for want of a site or a position.
+    /// Estimator blocks that belong to no cell, because the site or the position was unknown.
     pub(crate) unplaced_blocks: AtomicU64,
-    /// Samples of the base that gave way to newer ones before a tick took them.
+    /// Samples of the base that newer ones replaced before a tick read them.
     pub(crate) lost_samples: AtomicU64,
-    /// Commands of the server that found no room.
+    /// Server commands that were dropped because the command channel was full.
     pub(crate) lost_commands: AtomicU64,
-    /// The plan that the loop was given last, for whoever shows it; the loop itself never looks.
+    /// Plan that was given to the loop last, for display; the loop does not read it.
     plan: Mutex<Option<GivenPlan>>,
-    /// When the server was last heard, microseconds of the agent's monotonic clock.
+    /// Time of the last message from the server, microseconds of the agent's monotonic clock.
     server_heard_us: AtomicU64,
 }
 
 impl Shared {
-    /// The newest snapshot.
+    /// Returns the newest snapshot.
     pub(crate) fn snapshot(&self) -> Snapshot {
         *self.snapshot.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Leaves a newer one, unless somebody is reading right now: the next tick brings another.
+    /// Publishes a snapshot, unless the cell is locked by a reader; the next tick publishes again.
     pub(crate) fn publish(&self, snapshot: &Snapshot) {
         if let Ok(mut cell) = self.snapshot.try_lock() {
             *cell = *snapshot;
         }
     }
 
-    /// Leaves the plan that the loop was given.
+    /// Publishes the plan that the loop was given.
     pub(crate) fn show_plan(&self, given: GivenPlan) {
         *self.plan.lock().unwrap_or_else(PoisonError::into_inner) = Some(given);
     }
 
-    /// The plan that the loop was given last.
+    /// Returns the plan that the loop was given last.
     pub(crate) fn given_plan(&self) -> Option<GivenPlan> {
         let plan = self.plan.lock();
         plan.unwrap_or_else(PoisonError::into_inner).clone()
@@ -359,29 +363,29 @@ impl Shared {
         counter.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// The server has been heard just now.
+    /// Records a message from the server at `now`.
     pub(crate) fn note_server_heard(&self, now: Duration) {
         let now_us = u64::try_from(now.as_micros()).unwrap_or(u64::MAX);
         self.server_heard_us.fetch_max(now_us, Ordering::Relaxed);
     }
 
-    /// Replaces when the server was heard by what a record says.
+    /// Sets the time of the server's last message to the one in a record.
     pub(crate) fn replay_server_heard(&self, heard: Duration) {
-        // Rounded up: what is kept in whole microseconds is met, and a server heard later than the
-        // tick began stays silent for no time.
+        // Rounded up, so that a silence in whole microseconds is reproduced exactly and a message
+        // after the begin of the tick gives a silence of zero.
         let heard_us = heard.as_nanos().div_ceil(1_000);
         let heard_us = u64::try_from(heard_us).unwrap_or(u64::MAX);
         self.server_heard_us.store(heard_us, Ordering::Relaxed);
     }
 
-    /// How long the server has been silent.
+    /// Returns the time since the last message from the server.
     pub(crate) fn server_silence(&self, now: Duration) -> Duration {
         let heard = Duration::from_micros(self.server_heard_us.load(Ordering::Relaxed));
         now.saturating_sub(heard)
     }
 }
 
-/// The loop's ends of everything.
+/// The loop's ends of the channels.
 #[derive(Debug)]
 pub(crate) struct LoopEnds {
     pub(crate) commands: Receiver<LoopCommand>,
@@ -389,7 +393,7 @@ pub(crate) struct LoopEnds {
     pub(crate) shared: Arc<Shared>,
 }
 
-/// The other ends.
+/// The ends of the rest of the agent.
 #[derive(Debug)]
 pub(crate) struct AgentEnds {
     pub(crate) commands: SyncSender<LoopCommand>,
@@ -397,7 +401,7 @@ pub(crate) struct AgentEnds {
     pub(crate) shared: Arc<Shared>,
 }
 
-/// Everything that passes between the loop and the rest.
+/// Creates the channels between the loop and the rest of the agent.
 pub(crate) fn loop_channels() -> (LoopEnds, AgentEnds) {
     let (command_sender, command_receiver) = sync_channel(COMMANDS_MAX);
     let (event_sender, event_receiver) = sync_channel(EVENTS_MAX);

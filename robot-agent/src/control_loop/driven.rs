@@ -1,9 +1,9 @@
-//! What a mission really was: the driven path, and how well it was driven.
+//! Records the driven path of a mission and its quality.
 //!
-//! All room is taken before the loop has the mission; a full store drops every other entry and
-//! asks for twice the distance between two, so that a mission of any length fits. What is dropped
-//! goes into the tolerance that is stated with the path. [`Driven::quality`] and
-//! [`Driven::path`] are for whoever reports, outside the loop.
+//! All memory is allocated before the mission reaches the loop. When a buffer is full, every other
+//! entry is dropped and the spacing is doubled, so a mission of any length fits; the error of the
+//! dropped points is added to the tolerance reported with the path. [`Driven::quality`] and
+//! [`Driven::path`] allocate and are called outside the loop.
 
 use tread_api::geometry::Point as WirePoint;
 use tread_api::mission::{
@@ -15,50 +15,51 @@ use tread_control::geometry::Point;
 use super::gain::{Gain, GroundRecord};
 use super::surface::Comparison;
 
-/// First distance between two points, metres.
+/// Initial distance between two recorded points, metres.
 const POINT_SPACING_M: f64 = 0.05;
-/// First distance between two samples of θ, metres.
+/// Initial distance between two samples of θ, metres.
 const THETA_SPACING_M: f64 = 0.25;
-/// Deviation that the report may add, to say a straight line by its ends, metres.
+/// Largest distance of a point dropped from the report to the straight line that replaces it,
+/// metres.
 const LINE_TOLERANCE_M: f64 = 0.01;
-/// Coordinates are reported to this, metres.
+/// Resolution of the reported coordinates, metres.
 const RESOLUTION_M: f64 = 1.0e-4;
-/// How far the report may bring the robot from where it was at that time, metres, by saying even
-/// motion by its ends.
+/// Largest distance, metres, of a point dropped from the report to its position at the same time by
+/// constant velocity between the points that are kept.
 const MOTION_TOLERANCE_M: f64 = 0.1;
-/// Times are reported to this, seconds.
+/// Resolution of the reported times, seconds.
 const RESOLUTION_S: f64 = 1.0e-2;
 
-/// Where the robot was, and when, seconds since the begin.
+/// A position in the site frame, and its time since the begin of the mission, seconds.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Passed {
     at: Point,
     time_s: f64,
 }
 
-/// What one tick adds.
+/// Values of one tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct TickRecord {
     pub(crate) dt_s: f64,
-    /// Where the robot is; none while it does not know.
+    /// Position of the robot in the site frame; `None` if unknown.
     pub(crate) at: Option<Point>,
     /// Distance driven in this tick, metres.
     pub(crate) driven_m: f64,
-    /// Distance from the path, metres; none while it turns on the spot or stands held.
+    /// Signed cross-track error, metres; `None` while turning on the spot or stopped on hold.
     pub(crate) cross_track_m: Option<f64>,
-    /// Whether a wheel was at its limit.
+    /// Whether a wheel speed was saturated.
     pub(crate) is_saturated: bool,
-    /// Whether the mission stands paused.
+    /// Whether the mission is paused.
     pub(crate) is_paused: bool,
-    /// Whether a wheel slips beyond the model, or the ground has just changed.
+    /// Whether a wheel slips beyond the model's range, or a change of ground was detected.
     pub(crate) slips: bool,
-    /// Why the gate reduced the command, if it did.
+    /// Cause for which the gate reduced the command.
     pub(crate) gate: Option<GateCause>,
     /// θ̂ of the tracking law.
     pub(crate) theta_loop: Option<f64>,
     /// Measured θ and its standard deviation.
     pub(crate) theta_measured: Option<(f64, f64)>,
-    /// What was known of the ground.
+    /// Knowledge of the ground.
     pub(crate) ground: GroundRecord,
 }
 
@@ -67,7 +68,7 @@ pub(crate) struct TickRecord {
 pub(crate) struct Driven {
     points: Vec<Passed>,
     spacing_m: f64,
-    /// Farthest that the path so far is from the line through the points, metres.
+    /// Largest distance of the driven path to the polyline of the recorded points, metres.
     tolerance_m: f64,
     last: Option<Passed>,
     since_point_m: f64,
@@ -91,7 +92,7 @@ pub(crate) struct Driven {
 }
 
 impl Driven {
-    /// The record of a mission that has not begun, with all the room that it will ever need.
+    /// Creates an empty record with its final capacity.
     pub(crate) fn new() -> Self {
         Self {
             points: Vec::with_capacity(DRIVEN_POINTS_MAX),
@@ -119,7 +120,7 @@ impl Driven {
         }
     }
 
-    /// Notes what a cell has shown beside what the map says of it.
+    /// Records the comparison of a cell's measured θ with the map's.
     pub(crate) fn compare(&mut self, comparison: &Comparison) {
         self.gain.compare(comparison);
     }
@@ -176,7 +177,8 @@ impl Driven {
         if self.since_point_m < self.spacing_m {
             return;
         }
-        // Between two points the path is no longer than this, so it strays by half at the most.
+        // Between two points the path is no longer than this, so its distance to the line is at
+        // most half.
         self.tolerance_m = self.tolerance_m.max(0.5 * self.since_point_m);
         self.since_point_m = 0.0;
         if self.points.len() >= DRIVEN_POINTS_MAX - 1 {
@@ -192,7 +194,7 @@ impl Driven {
             if index % 2 == 1
                 && let Some(&after) = self.points.get(index + 1)
             {
-                // Kept places move up only to where they were already read.
+                // `kept` never exceeds `index`, so only entries already read are overwritten.
                 let (before, at) = (self.points[kept - 1].at, self.points[index].at);
                 let off_m = distance_from_line_m(at, before, after.at);
                 farthest_m = farthest_m.max(off_m);
@@ -233,7 +235,7 @@ impl Driven {
         self.theta_at_m = self.distance_m + self.theta_spacing_m;
     }
 
-    /// How well it was driven.
+    /// Returns the quality of the mission so far.
     pub(crate) fn quality(&self) -> MissionQuality {
         #[expect(
             clippy::cast_precision_loss,
@@ -260,7 +262,7 @@ impl Driven {
         }
     }
 
-    /// Where the robot really was, thinned where it went straight.
+    /// Returns the driven path, thinned within [`LINE_TOLERANCE_M`] and [`MOTION_TOLERANCE_M`].
     pub(crate) fn path(&self) -> DrivenPath {
         let mut whole = self.points.clone();
         if let Some(last) = self.last.filter(|last| whole.last() != Some(last)) {
@@ -282,7 +284,7 @@ impl Driven {
     }
 }
 
-/// Distance of a point from the line between two others, metres.
+/// Returns the distance of a point from the segment between two others, metres.
 fn distance_from_line_m(point: Point, from: Point, to: Point) -> f64 {
     let (along_x, along_y) = (to.x_m - from.x_m, to.y_m - from.y_m);
     let length_squared_m2 = along_x * along_x + along_y * along_y;
@@ -298,9 +300,9 @@ fn distance_from_line_m(point: Point, from: Point, to: Point) -> f64 {
     })
 }
 
-/// By how much more than its tolerance a point is lost when only the ends of its stretch are kept:
-/// from the line through them, and from where even motion between them would have brought the
-/// robot at that time. Above 1 is too much.
+/// Returns the error of dropping a point between two that are kept, as a multiple of the tolerance:
+/// the larger of its distance from their line over [`LINE_TOLERANCE_M`] and of its distance from
+/// uniform motion between them over [`MOTION_TOLERANCE_M`]. Above 1 the point must be kept.
 fn shortfall(passed: Passed, from: Passed, to: Passed) -> f64 {
     let off_line = distance_from_line_m(passed.at, from.at, to.at) / LINE_TOLERANCE_M;
     let lasted_s = to.time_s - from.time_s;
@@ -316,8 +318,8 @@ fn shortfall(passed: Passed, from: Passed, to: Passed) -> f64 {
     off_line.max(passed.at.distance_m(evenly) / MOTION_TOLERANCE_M)
 }
 
-/// The points without those that the others tell well enough: the one that is lost most of each
-/// stretch is kept, and the stretch split there.
+/// Returns the points without those within tolerance of the rest (Douglas–Peucker with
+/// [`shortfall`] as the distance).
 fn thinned(points: &[Passed]) -> Vec<Passed> {
     let Some(last) = points.len().checked_sub(1) else {
         return Vec::new();

@@ -1,20 +1,21 @@
-//! What the map's word was worth on a mission: how long θ was known for it, and how true it was.
+//! Measures the value of the map's prior for a mission: for how long θ was known, and how
+//! accurately.
 
 use tread_api::mission::{PriorGain, THETA_SURE_RATIO};
 use tread_control::tracking::ThetaKnowledge;
 
 use super::surface::Comparison;
 
-/// What was known of the ground in a tick.
+/// Knowledge of the ground in a tick.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(crate) struct GroundRecord {
-    /// Friction coefficient that the plan was made with; none where the map knew nothing.
+    /// Friction coefficient of the plan; `None` where the map had none.
     pub(crate) traction_limit_mu: Option<f64>,
-    /// Whether the map knew this cell.
+    /// Whether the map has an estimate for this cell.
     pub(crate) is_on_the_map: bool,
-    /// What the law was given.
+    /// θ given to the tracking law.
     pub(crate) given: Option<ThetaKnowledge>,
-    /// What the robot has measured by itself.
+    /// θ measured by the robot alone.
     pub(crate) measured: Option<ThetaKnowledge>,
 }
 
@@ -22,7 +23,7 @@ fn is_sure(known: Option<ThetaKnowledge>) -> bool {
     known.is_some_and(|known| known.std_dev <= THETA_SURE_RATIO * known.theta)
 }
 
-/// The sums behind a [`PriorGain`].
+/// Sums from which a [`PriorGain`] is computed.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Gain {
     traction_limit_mu: Option<f64>,
@@ -37,7 +38,7 @@ pub(super) struct Gain {
 }
 
 impl Gain {
-    /// Adds a tick of so many seconds and metres, at a time since the start.
+    /// Adds a tick of `dt_s` seconds and `driven_m` metres, `since_start_s` after the begin.
     pub(super) fn add(
         &mut self,
         ground: &GroundRecord,
@@ -57,7 +58,7 @@ impl Gain {
         }
     }
 
-    /// Adds a cell in which the map's word could be held against a measurement.
+    /// Adds a cell in which both the map and the robot have an estimate.
     pub(super) fn compare(&mut self, comparison: &Comparison) {
         let apart = comparison.z_score();
         if !apart.is_finite() {
@@ -69,7 +70,8 @@ impl Gain {
         self.square_sum += apart * apart;
     }
 
-    /// The report on a path of so many metres; none where the map knew nothing.
+    /// Returns the report for a driven path of `distance_m`; `None` if no tick had a traction limit
+    /// from the map.
     pub(super) fn report(&self, distance_m: f64) -> Option<PriorGain> {
         let traction_limit_mu = self.traction_limit_mu?;
         let mean = |sum: f64| (self.compared > 0).then(|| sum / f64::from(self.compared));

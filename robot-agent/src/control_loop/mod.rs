@@ -1,7 +1,8 @@
-//! The loop thread: a fixed rate, absolute deadlines, and nothing that could hold it up.
+//! The loop thread: runs [`tick::LoopCore`] at a fixed rate with absolute deadlines.
 //!
-//! It owns the drive and all control state ([`tick`]). Comms live elsewhere and talk to it
-//! through [`channels`]: a dead network never stalls it. It does no I/O but the drive's.
+//! It owns the drive and all control state ([`tick`]) and exchanges data with the other threads
+//! through [`channels`] without blocking, so a dead network cannot delay a tick. Its only I/O is
+//! that of the drive.
 
 pub(crate) mod active;
 pub(crate) mod channels;
@@ -30,12 +31,14 @@ use pace::Pace;
 use segments::Moment;
 use tick::LoopCore;
 
-/// Longest time that braking to rest may take; when the loop has to stop, it ends after it, standing or not.
+/// Longest time to wait for zero velocity once the loop is requested to stop; the loop then ends
+/// even if the robot still moves.
 pub(crate) const BRAKING_MAX: Duration = Duration::from_secs(5);
-/// Standing ticks in a row that count as having stopped.
+/// Number of consecutive ticks at zero velocity after which the robot counts as stopped.
 const STANDING_TICKS: u32 = 5;
 
-/// Runs the loop until it is requested to stop and the robot stands.
+/// Runs the loop until it is requested to stop and the robot has stopped, at most [`BRAKING_MAX`]
+/// after the request.
 pub(crate) fn run(
     mut core: LoopCore,
     mut drive: Box<dyn Drive>,

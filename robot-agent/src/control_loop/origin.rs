@@ -1,4 +1,4 @@
-//! What a job is made from: enough to plan the same again, to the bit.
+//! The inputs of a job's planning, from which the same plan is computed again to the bit.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -18,30 +18,30 @@ use super::driven::Driven;
 use super::prior::Prior;
 use crate::geometry::{control_trajectory, plan_options};
 
-/// What was asked for, where the robot stood, and what was known then.
+/// Request, start pose and map data from which a mission was planned.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct JobOrigin {
     pub(crate) mission: MissionId,
     pub(crate) revision: u32,
     pub(crate) plan_hash: PlanHash,
     pub(crate) trajectory: Trajectory,
-    /// Where the plan begins.
+    /// Start pose of the plan, in the site frame.
     pub(crate) start: Pose,
-    /// What the map knows along the path.
+    /// Friction of the map along the path.
     pub(crate) prior: Option<PathPrior>,
     /// The grid of the site for which it was planned.
     pub(crate) grid: Option<Grid>,
-    /// Past this monotonic time it must not start.
+    /// Latest start, by the monotonic clock.
     pub(crate) start_by: Option<Duration>,
-    /// Longest silence of the server with which it goes on; for ever when absent.
+    /// Longest silence of the server before the mission is stopped; `None` for no limit.
     pub(crate) silence_max: Option<Duration>,
 }
 
 impl JobOrigin {
-    /// Plans it for a robot.
+    /// Plans the trajectory for a robot.
     ///
     /// # Errors
-    /// A sentence on why it cannot be driven.
+    /// The reason why the trajectory cannot be planned, as a sentence.
     pub(crate) fn plan(&self, model: &RobotModel) -> Result<Plan, String> {
         let prior = Prior::new(self.prior.as_ref());
         let traction_limit = self.grid.and_then(|grid| prior.traction_limit_map(grid));
@@ -55,10 +55,10 @@ impl JobOrigin {
             .map_err(|refused| refused.to_string())
     }
 
-    /// The job of that plan.
+    /// Creates the job of a plan.
     ///
     /// # Errors
-    /// A sentence on what the tracking law refuses.
+    /// The reason why the tracking law refuses the plan, as a sentence.
     pub(crate) fn job(self, plan: Plan, model: RobotModel) -> Result<Box<Job>, String> {
         let follower = Follower::new(plan, model, FollowerConfig::default())
             .map_err(|refused| refused.to_string())?;

@@ -1,4 +1,4 @@
-//! What the loop reports: handed on without waiting, kept for later where there is no room.
+//! Sends the loop's events without blocking, and keeps mission events for which there is no room.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -6,10 +6,11 @@ use std::sync::mpsc::{SyncSender, TrySendError};
 
 use super::channels::{LoopEvent, Shared};
 
-/// Mission events that may wait for room in the channel; one mission at a time makes a few.
+/// Capacity for mission events that wait for room in the channel; one mission makes a few. Events
+/// beyond it are dropped.
 const UNSENT_MAX: usize = 32;
 
-/// The loop's end of the events.
+/// The loop's end of the event channel.
 #[derive(Debug)]
 pub(super) struct Outgoing {
     events: SyncSender<LoopEvent>,
@@ -26,7 +27,7 @@ impl Outgoing {
         }
     }
 
-    /// Hands on what still waits; false if there was no room for all of it.
+    /// Sends the waiting events; returns false if some still wait.
     pub(super) fn flush(&mut self) -> bool {
         while let Some(event) = self.unsent.pop_front() {
             if let Err(TrySendError::Full(event)) = self.events.try_send(event) {
@@ -37,7 +38,8 @@ impl Outgoing {
         true
     }
 
-    /// Hands an event on. What matters waits for room; a segment is lost and counted instead.
+    /// Sends an event. If the channel is full, a segment is dropped and counted, any other event
+    /// waits.
     pub(super) fn send(&mut self, event: LoopEvent) {
         let refused = if self.unsent.is_empty() {
             match self.events.try_send(event) {

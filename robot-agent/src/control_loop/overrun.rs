@@ -1,4 +1,4 @@
-//! Whether the loop keeps its rate, and what to do when it does not: the robot is held. Pure.
+//! Detects a loop that does not keep its rate; the robot is then held. Pure.
 //!
 //! ```text
 //!           overload: a tick far too late, several late ones in a row, or many of the newest
@@ -6,54 +6,54 @@
 //!    ▲                                                                                        │
 //!    └── for RELEASE_AFTER no overload, and at most LATE_ISOLATED_MAX late ticks ─────────────┘
 //! ```
-//! A late tick or two in a second hold no robot that drives, so they do not keep one from going on.
+//! One or two isolated late ticks per second neither begin nor prolong a hold.
 //!
-//! Every promise on how soon the robot reacts (a silent driver, a stop, a fence) counts on ticks. A
-//! loop that gets no time from its machine cannot keep them, so the robot does not drive on it. How
-//! late a tick is follows from the moments of the ticks alone, so a record gives the same again.
+//! Every bound on the robot's reaction time (to a silent driver, a stop, a fence) assumes that
+//! ticks are on time, so the robot does not drive while they are not. Lateness is computed from the
+//! times of the ticks alone, so a replayed record gives the same result.
 
 use std::time::Duration;
 
-/// Time by which a tick may exceed its period before it counts as late.
+/// Excess of the interval between two ticks over the period from which the tick counts as late.
 pub(crate) const LATE_AFTER: Duration = Duration::from_millis(40);
-/// One tick that exceeds its period by this much holds the robot.
+/// Excess of the interval between two ticks over the period from which one tick holds the robot.
 pub(crate) const LATE_MAX: Duration = Duration::from_millis(120);
-/// So many late ticks in a row hold the robot.
+/// Number of consecutive late ticks that holds the robot.
 pub(crate) const LATE_IN_A_ROW_MAX: u32 = 3;
-/// The newest ticks of which [`LATE_IN_WINDOW_MAX`] is a share: one bit each.
+/// Number of newest ticks in which late ones are counted for [`LATE_IN_WINDOW_MAX`]: one bit each.
 pub(crate) const WINDOW_TICKS: u32 = u64::BITS;
-/// So many late ticks of the newest [`WINDOW_TICKS`] hold the robot: one of eight.
+/// Number of late ticks among the newest [`WINDOW_TICKS`] that holds the robot: one in eight.
 pub(crate) const LATE_IN_WINDOW_MAX: u32 = WINDOW_TICKS / 8;
-/// Time without overload after which the robot is let go.
+/// Time without overload after which the hold ends.
 pub(crate) const RELEASE_AFTER: Duration = Duration::from_secs(1);
-/// Most late ticks within [`RELEASE_AFTER`] that are isolated and do not prolong a hold.
+/// Largest number of late ticks within [`RELEASE_AFTER`] that does not prolong a hold.
 pub(crate) const LATE_ISOLATED_MAX: usize = 2;
 
-/// How far a loop is from its rate.
+/// Lateness of the loop during a hold.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Overrun {
-    /// The most by which a tick exceeded its period since the robot is held.
+    /// Largest excess of an interval between ticks over the period since the hold began.
     pub(crate) late: Duration,
-    /// The most late ticks of [`WINDOW_TICKS`] since then.
+    /// Largest number of late ticks among the newest [`WINDOW_TICKS`] since the hold began.
     pub(crate) late_ticks: u32,
 }
 
-/// Watches the moments of the ticks.
+/// Detects overload from the times of the ticks.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct OverrunWatch {
     period: Duration,
     last_tick: Option<Duration>,
-    /// The newest ticks, the last one lowest; a bit for each late one.
+    /// One bit for each of the newest ticks, set if late; the newest is the lowest bit.
     late: u64,
     in_a_row: u32,
-    /// When the newest late ticks came, the last one first: one more than may be isolated.
+    /// Times of the newest late ticks, newest first; one more than may be isolated.
     late_at: [Option<Duration>; LATE_ISOLATED_MAX + 1],
     overloaded_at: Duration,
     overrun: Option<Overrun>,
 }
 
 impl OverrunWatch {
-    /// A loop of this period that has not ticked yet.
+    /// Creates a watch for a loop of this period, before its first tick.
     pub(crate) fn new(period: Duration) -> Self {
         Self {
             period,
@@ -66,7 +66,7 @@ impl OverrunWatch {
         }
     }
 
-    /// Notes a tick.
+    /// Records a tick at `now`, by the monotonic clock.
     pub(crate) fn note(&mut self, now: Duration) {
         let since = self
             .last_tick
@@ -104,7 +104,7 @@ impl OverrunWatch {
         }
     }
 
-    /// How far the loop is from its rate, while the robot is held for it.
+    /// Returns the lateness of the loop while the robot is held for it.
     pub(crate) fn overrun(&self) -> Option<Overrun> {
         self.overrun
     }

@@ -1,9 +1,9 @@
-//! When the loop ticks: at a fixed rate, or with its base.
+//! Schedules the ticks: at a fixed rate, or triggered by the samples of the base.
 //!
-//! With a base whose samples arrive from elsewhere, a loop at its own phase would leave each sample
-//! lying for up to a period. So a sample brings the tick on, though never sooner than
-//! [`EARLY_SHARE`] of a period after the one before; where none comes, the loop ticks without one
-//! after [`LATE_SHARE`] of a period. The rate stays bounded both ways.
+//! At a free phase, a sample that arrives asynchronously would wait for up to a period. So a sample
+//! triggers the tick, but no sooner than [`EARLY_SHARE`] of a period after the previous one;
+//! without a sample the loop ticks after [`LATE_SHARE`] of a period. The rate stays bounded both
+//! ways.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -11,25 +11,25 @@ use std::time::Duration;
 use crate::clock::SharedClock;
 use crate::drive::Arrivals;
 
-/// Earliest tick after the one before, as a share of the period.
+/// Earliest tick after the previous one, as a fraction of the period.
 const EARLY_SHARE: f64 = 0.5;
-/// Latest tick after the one before, as a share of the period.
+/// Latest tick after the previous one, as a fraction of the period.
 const LATE_SHARE: f64 = 1.5;
-/// Periods by which the loop may lag before it gives up the ticks that it missed.
+/// Lag in periods beyond which missed ticks are skipped.
 const LAG_PERIODS_MAX: u32 = 10;
 
-/// What the loop waits for.
+/// Schedule of the ticks.
 #[derive(Debug)]
 pub(super) struct Pace {
     period: Duration,
     arrivals: Option<Arc<Arrivals>>,
-    /// Samples that the last tick knew of.
+    /// Number of samples that had arrived at the last tick.
     seen: u64,
     deadline: Duration,
 }
 
 impl Pace {
-    /// The pace of the calling thread, from now on.
+    /// Creates the schedule; the calling thread is the one that samples wake.
     pub(super) fn new(period: Duration, arrivals: Option<Arc<Arrivals>>, now: Duration) -> Self {
         if let Some(arrivals) = &arrivals {
             arrivals.attend();
@@ -42,11 +42,11 @@ impl Pace {
         }
     }
 
-    /// Notes that a tick begins; whether it is more than a period late.
+    /// Records the begin of a tick; returns whether it is more than a period late.
     pub(super) fn begin(&mut self, now: Duration) -> bool {
         if let Some(arrivals) = &self.arrivals {
             self.seen = arrivals.count();
-            // Its time is counted from here, for the next sample does not make up for a late one.
+            // Time is counted from here, since the next sample does not make up for a late one.
             let is_late = now > self.deadline + self.period;
             self.deadline = now;
             return is_late;
@@ -60,7 +60,7 @@ impl Pace {
             let now = clock.monotonic();
             self.deadline += self.period;
             if now > self.deadline + LAG_PERIODS_MAX * self.period {
-                // The process slept or starved: what was missed is not made up for.
+                // The process was suspended or starved: missed ticks are skipped.
                 self.deadline = now;
             }
             clock.sleep_until(self.deadline);
@@ -68,7 +68,7 @@ impl Pace {
         };
         let earliest = self.deadline + self.period.mul_f64(EARLY_SHARE);
         let latest = self.deadline + self.period.mul_f64(LATE_SHARE);
-        // Bounded by `latest`; each turn either ends it or waits.
+        // Bounded by `latest`; each iteration ends the loop or waits.
         loop {
             let now = clock.monotonic();
             let has_new = arrivals.count() != self.seen;

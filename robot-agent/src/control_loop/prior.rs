@@ -1,30 +1,30 @@
-//! What the map knows along the path of a mission, for the law and the plan.
+//! The map's friction along the path of a mission, for the tracking law and the plan.
 //!
-//! It stands beside what the robot measures and never goes into it: segments come from the
-//! estimator alone, which does not know this module.
+//! It is kept apart from the robot's measurements: the estimator does not use it, so segments do
+//! not contain it.
 
 use tread_api::site::{Cell, Grid};
 use tread_api::wire::command::{CellTractionLimit, PathPrior};
 use tread_control::plan::{TractionLimitCell, TractionLimitMap};
 use tread_control::tracking::ThetaKnowledge;
 
-/// Standard deviations from which the robot's own measurement is believed alone: the ground is not
-/// as the map has it.
+/// Difference of the robot's and the map's θ, in standard deviations, beyond which the robot's own
+/// measurement is used alone.
 const CONTRADICTION_STD_DEVS: f64 = 4.0;
 
-/// The prior of one mission; empty when the map knows nothing.
+/// Prior of one mission; empty if the map has no data.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(crate) struct Prior {
     grid_revision: u32,
     traction_limit_mu: Option<f64>,
     robot_bias_ratio: f64,
-    /// By row and column.
+    /// Sorted by row, then column.
     cells: Box<[(Cell, ThetaKnowledge)]>,
     traction_limits: Box<[CellTractionLimit]>,
 }
 
 impl Prior {
-    /// Takes what came with an offer, whole or not at all.
+    /// Creates the prior that came with an offer; an empty one if any of its values is impossible.
     pub(crate) fn new(prior: Option<&PathPrior>) -> Self {
         let Some(prior) = prior.filter(|prior| prior.is_possible()) else {
             return Self::default();
@@ -50,12 +50,13 @@ impl Prior {
         }
     }
 
-    /// Friction coefficient to plan with.
+    /// Returns the friction coefficient to plan with.
     pub(crate) fn traction_limit_mu(&self) -> Option<f64> {
         self.traction_limit_mu
     }
 
-    /// The same by place, if it is known for this grid.
+    /// Returns the friction coefficients by cell; `None` if there are none for this revision of the
+    /// grid.
     pub(crate) fn traction_limit_map(&self, grid: Grid) -> Option<TractionLimitMap> {
         let elsewhere_mu = self.traction_limit_mu?;
         if grid.revision != self.grid_revision || self.traction_limits.is_empty() {
@@ -69,12 +70,12 @@ impl Prior {
         TractionLimitMap::new(grid.cell_m, squares.collect(), elsewhere_mu)
     }
 
-    /// Standard deviation of one robot's own θ around the map's, as a share of it.
+    /// Returns the relative standard deviation of one robot's θ around the map's.
     pub(crate) fn robot_bias_ratio(&self) -> f64 {
         self.robot_bias_ratio
     }
 
-    /// What is known of a cell of that grid. Does not allocate.
+    /// Returns the map's θ of a cell; `None` for another revision of the grid. Does not allocate.
     pub(crate) fn at(&self, grid_revision: u32, cell: Cell) -> Option<ThetaKnowledge> {
         if grid_revision != self.grid_revision {
             return None;
@@ -87,7 +88,8 @@ impl Prior {
     }
 }
 
-/// Both estimates of the ground fused; the robot's own alone where they contradict each other.
+/// Fuses both estimates of θ; returns the measured one alone if they differ by more than
+/// [`CONTRADICTION_STD_DEVS`].
 pub(crate) fn fused(
     measured: Option<ThetaKnowledge>,
     prior: Option<ThetaKnowledge>,

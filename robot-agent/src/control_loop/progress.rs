@@ -1,8 +1,8 @@
-//! Whether the wheels take the robot anywhere.
+//! Detects wheels that turn without moving the robot.
 //!
-//! Each [`WINDOW_M`] of wheel travel ahead or back is held against how far position fixes say that
-//! the robot came. Time plays no part, so that a slow robot is judged like a quick one. Fixes are
-//! taken as they come: the fused position follows the wheels while these spin.
+//! Each [`WINDOW_M`] of net wheel travel is compared with the distance between position fixes. Time
+//! plays no part, so that slow and fast robots are judged alike. Raw fixes are used, since the
+//! fused position follows the wheels while these spin.
 //!
 //! ```text
 //!        WINDOWS in a row with less than DUG_IN_RATIO of the distance
@@ -12,39 +12,40 @@
 
 use tread_control::geometry::Point;
 
-/// Wheel travel that is judged at a time, metres: far more than the noise of a fix.
+/// Wheel travel per comparison, metres: far above the noise of a fix.
 const WINDOW_M: f64 = 0.5;
-/// Share of the wheels' distance below which they dig.
+/// Ratio of distance by fixes to wheel travel below which a window indicates digging in.
 const DUG_IN_RATIO: f64 = 0.3;
-/// Share above which they do not.
+/// Ratio of distance by fixes to wheel travel above which a window indicates progress.
 const FREE_RATIO: f64 = 0.6;
-/// Windows in a row that must agree: one wild fix spoils two, the one it ends and the next.
+/// Consecutive windows that change the state: one outlying fix spoils two, the one that it ends and
+/// the next.
 const WINDOWS: u8 = 3;
 
-/// Remembers whether the robot has dug itself in.
+/// State of the detection.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct ProgressWatch {
     from: Option<Point>,
     wheels_m: f64,
     dug_in_at: Option<Point>,
-    /// Windows in a row that say otherwise.
+    /// Consecutive windows that contradict the present state.
     against: u8,
 }
 
 impl ProgressWatch {
-    /// Where the wheels turn without progress, or have stood still since they did.
+    /// Returns the position at which digging in was detected, until progress is detected.
     pub(crate) fn dug_in_at(&self) -> Option<Point> {
         self.dug_in_at
     }
 
-    /// The wheels have turned: their mean forward distance, metres, below zero for back.
+    /// Adds the mean distance of the wheels, metres, negative for backward travel.
     pub(crate) fn note_wheels(&mut self, forward_m: f64) {
         if self.from.is_some() && forward_m.is_finite() {
             self.wheels_m += forward_m;
         }
     }
 
-    /// A position fix has come.
+    /// Adds a position fix, in the site frame; non-finite fixes are ignored.
     pub(crate) fn note_fix(&mut self, at: Point) {
         if !at.is_finite() {
             return;

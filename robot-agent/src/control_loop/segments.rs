@@ -1,13 +1,13 @@
-//! Cuts what is measured into segments: one cell, one ground, one pass.
+//! Cuts the estimator's measurements into segments: one cell, one ground, one pass.
 //!
 //! ```text
 //!              moved to a cell on one ground                 wheels on two grounds, no cell
 //! unplaced ────────────────────────────────► measuring(cell, terrain) ───────► unplaced
 //!                                              └ next cell, other terrain, changed ground,
-//!                                                SEGMENT_MAX over: close, measure on
+//!                                                other mission, SEGMENT_MAX over: close, reopen
 //! ```
-//! A segment is measured since the estimator's last close; what it measured while unplaced is
-//! thrown away. Only what carries information on θ is handed on.
+//! A segment holds what was measured since the estimator's last close; what was measured while
+//! unplaced is discarded. A segment without information on θ is discarded too.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -20,18 +20,18 @@ use tread_control::estimation::Estimator;
 use super::channels::ClosedSegment;
 use super::site_view::SiteView;
 
-/// Longest segment.
+/// Longest duration of a segment; at this age it is closed and the next one opened.
 pub(crate) const SEGMENT_MAX: Duration = Duration::from_secs(30);
 
-/// Where a robot is, for the map.
+/// Cell and terrain at a robot's position.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Place {
     pub(crate) cell: Cell,
-    /// Its place in the site's definition; `None` where none is drawn.
+    /// Index in the site's terrains; `None` where no terrain is drawn.
     pub(crate) terrain: Option<usize>,
 }
 
-/// The moment of a tick, by both clocks.
+/// Time of a tick, by both clocks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Moment {
     pub(crate) monotonic: Duration,
@@ -45,26 +45,27 @@ struct Open {
     distance_m: f64,
 }
 
-/// What a tick means for the segments.
+/// Input of a tick.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct CutInput<'tick> {
     pub(crate) now: Moment,
-    /// Where the robot is; none without a site or with wheels on two grounds.
+    /// Cell and terrain; `None` without a site or a pose, outside the grid, or with wheels on two
+    /// grounds.
     pub(crate) place: Option<Place>,
     pub(crate) site: Option<&'tick Arc<SiteView>>,
     pub(crate) mission: Option<MissionId>,
-    /// Distance driven in this tick, metres.
+    /// Distance travelled in this tick, metres.
     pub(crate) driven_m: f64,
-    /// The estimator says that the ground is another one now.
+    /// Whether the estimator detected a change of ground.
     pub(crate) ground_changed: bool,
 }
 
-/// What became of it.
+/// Result of a tick.
 #[derive(Debug, Default)]
 pub(crate) struct Cut {
-    /// A segment for the map; none if nothing was closed, or what was closed says nothing on θ.
+    /// Closed segment with information on θ.
     pub(crate) segment: Option<ClosedSegment>,
-    /// The estimator has begun anew on other ground.
+    /// Whether the estimator was reset for other ground.
     pub(crate) is_new_ground: bool,
 }
 
@@ -76,12 +77,12 @@ pub(crate) struct SegmentCutter {
 }
 
 impl SegmentCutter {
-    /// The cell of the open segment.
+    /// Returns the cell of the open segment.
     pub(crate) fn cell(&self) -> Option<Cell> {
         self.open.map(|open| open.place.cell)
     }
 
-    /// One tick, after the estimator has taken its samples.
+    /// Processes one tick, after the estimator has taken its samples.
     pub(crate) fn step(&mut self, input: CutInput<'_>, estimator: &mut Estimator) -> Cut {
         let Some(open) = &mut self.open else {
             return self.start_at(input, estimator);
@@ -117,7 +118,7 @@ impl SegmentCutter {
 
     fn start_at(&mut self, input: CutInput<'_>, estimator: &mut Estimator) -> Cut {
         if let Some(place) = input.place {
-            // What was measured on the way here belongs to no place.
+            // What was measured before belongs to no cell.
             estimator.begin_ground();
             self.open = Some(Open {
                 place,
@@ -132,7 +133,7 @@ impl SegmentCutter {
         }
     }
 
-    /// Closes what is open without using it, where the site itself has changed.
+    /// Discards the open segment, because the site definition was replaced.
     pub(crate) fn abandon(&mut self, estimator: &mut Estimator) {
         self.open = None;
         estimator.begin_ground();
@@ -157,7 +158,7 @@ fn close(
         site: Arc::clone(site),
         mission,
         started_at: open.since.wall,
-        // By the monotonic clock: a wall clock may be set meanwhile, back or on by years.
+        // By the monotonic clock: the wall clock may be set meanwhile, by any amount.
         ended_at: open
             .since
             .wall

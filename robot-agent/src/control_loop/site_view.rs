@@ -1,4 +1,4 @@
-//! The site as the loop sees it: which cell and which terrain is under the robot, without
+//! The site definition prepared for the loop: finds cell and terrain of a position without
 //! allocating.
 
 use tread_api::geometry::Point;
@@ -11,8 +11,8 @@ use tread_control::robot::RobotModel;
 
 use crate::geometry::fence_of;
 
-/// How far a robot must be outside a cell before it counts as having left it, metres: more than
-/// the noise of its position, so that a path along a border does not chop its segments.
+/// Distance outside its cell up to which a robot keeps it, metres: more than the position noise, so
+/// that a path along a border does not split its segments.
 const CELL_MARGIN_M: f64 = 0.05;
 
 #[derive(Debug, Clone, Copy)]
@@ -51,24 +51,24 @@ impl Bounds {
     }
 }
 
-/// What a robot stands on.
+/// Ground under the wheels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Footing {
-    /// All wheels on the same terrain, by its place in the definition; `None` where none is drawn.
+    /// All wheels on one terrain, as its index in the definition; `None` where no terrain is drawn.
     Whole(Option<usize>),
-    /// Wheels on different ground.
+    /// Wheels on different terrains.
     Mixed,
 }
 
-/// A site's definition, prepared for looking up.
+/// A site definition prepared for look-ups.
 #[derive(Debug)]
 pub(crate) struct SiteView {
     definition: SiteDefinition,
     fence: Fence,
     bounds: Vec<Bounds>,
-    /// Places in the definition, the one that counts first.
+    /// Indices of the terrains: highest layer first, then by identifier.
     order: Vec<usize>,
-    /// Whether the fence leaves no room anywhere, whatever the definition says.
+    /// Whether the fence leaves no room anywhere, regardless of the definition.
     is_without_room: bool,
 }
 
@@ -97,7 +97,7 @@ impl SiteView {
         }
     }
 
-    /// The same, but with no room for a robot anywhere: its geofence cannot be kept.
+    /// Creates a view without room for a robot anywhere, for a geofence that cannot be applied.
     pub(crate) fn without_room(mut definition: SiteDefinition) -> Self {
         let revision = std::mem::take(&mut definition.geofence).revision;
         let mut view = Self::new(definition);
@@ -107,7 +107,7 @@ impl SiteView {
         view
     }
 
-    /// Whether it was made by [`SiteView::without_room`].
+    /// Whether the view was made by [`SiteView::without_room`].
     pub(crate) fn is_without_room(&self) -> bool {
         self.is_without_room
     }
@@ -124,7 +124,7 @@ impl SiteView {
         self.definition.terrain_revision
     }
 
-    /// Where the robot may be.
+    /// Returns the geofence, the area in which the robot may be.
     pub(crate) fn fence(&self) -> &Fence {
         &self.fence
     }
@@ -133,7 +133,7 @@ impl SiteView {
         self.definition.geofence.revision
     }
 
-    /// The terrain at a place in the definition.
+    /// Returns the terrain at an index of the definition.
     pub(crate) fn terrain(&self, place: usize) -> Option<&TerrainRef> {
         self.definition
             .terrains
@@ -148,7 +148,7 @@ impl SiteView {
         })
     }
 
-    /// What the four wheels of a robot stand on.
+    /// Returns the terrain under the four wheels.
     pub(crate) fn footing(&self, pose: Pose, model: &RobotModel) -> Footing {
         let (sin, cos) = pose.heading_rad.sin_cos();
         let (forward_m, left_m) = (0.5 * model.wheelbase_m(), 0.5 * model.track_width_m());
@@ -174,7 +174,7 @@ impl SiteView {
         }
     }
 
-    /// The cell of a position; the former one while the robot is hardly outside it.
+    /// Returns the cell of a position; the former cell within [`CELL_MARGIN_M`] of it.
     pub(crate) fn cell(&self, position: Point, former: Option<Cell>) -> Option<Cell> {
         let grid = self.grid();
         let is_near = |cell: &Cell| {

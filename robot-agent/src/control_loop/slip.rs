@@ -1,34 +1,35 @@
-//! How much the wheels slip along their way, for people to look at; nothing is controlled by it.
+//! Computes the longitudinal slip of each side for display; the control law does not use it.
 //!
-//! Equation (3) of the paper for each side, `λ = (rω − v)/(rω)`, smoothed over [`MEMORY_S`]. While
-//! a base without a sensor for its own speed gains or loses speed, its fixes lag behind its wheels,
-//! which would look like slip: then nothing is said.
+//! Equation (3) of the paper for each side, `λ = (rω − v)/(rω)`, low-pass filtered over
+//! [`MEMORY_S`]. While the wheels of a base without a speed sensor accelerate, the speed from fixes
+//! lags behind the wheels, which would look like slip; the slip is undefined then.
 
 use tread_api::friction::SideSlip;
 use tread_control::measured::WheelSpeeds;
 use tread_control::robot::RobotModel;
 use tread_control::slip::{BodyVelocity, SideSlips};
 
-/// Time over which it is smoothed, seconds: a few strides of the sensors' noise, far less than the
-/// ground needs to change.
+/// Time constant of the low-pass filter, seconds: several samples of sensor noise, far less than
+/// the time in which the ground changes.
 const MEMORY_S: f64 = 0.5;
-/// Slowest rim at which the slip says anything, metres per second; it is not defined at rest.
+/// Smallest rim speed at which the slip is defined, m/s.
 const RIM_MIN_M_S: f64 = 0.05;
 
-/// Farthest that a rim's speed may be from its own mean of late, metres per second: what changes
-/// faster is not reported.
+/// Largest difference of a rim's speed from its filtered value, m/s, up to which the slip is
+/// defined.
 const STEADY_M_S: f64 = 0.06;
 
-/// The slip of both sides, smoothed.
+/// Filtered slip of both sides.
 #[derive(Debug, Default)]
 pub(crate) struct SlipMeter {
     smooth: Option<SideSlips>,
-    /// Mean of the wheels' speeds of late.
+    /// Filtered wheel speeds.
     wheels: WheelSpeeds,
 }
 
 impl SlipMeter {
-    /// Adds one tick: how body and wheels move, none while the base is silent.
+    /// Processes one tick of `dt_s`: velocity of the body and wheel speeds, `None` while the base
+    /// is silent.
     pub(crate) fn step(
         &mut self,
         heard: Option<(BodyVelocity, WheelSpeeds)>,
@@ -60,7 +61,7 @@ impl SlipMeter {
         };
     }
 
-    /// The slip now.
+    /// Returns the filtered slip; `None` while it is undefined.
     pub(crate) fn slip(&self) -> Option<SideSlip> {
         self.smooth.map(|slips| SideSlip {
             left_ratio: slips.left,

@@ -1,55 +1,58 @@
-//! Whether a robot that is to stand does: seen in wheels, odometry, gyro and position, not in commands.
+//! Detects from wheels, odometry, gyro and position fixes, not from commands, whether the robot has
+//! stopped when zero velocity is commanded.
 //!
 //! ```text
-//!            rest is commanded              measured at rest for STANDS_FOR
-//! driving ───────────────────────► stopping ────────────────────────────────► standing
+//!            zero is commanded              at zero velocity for STANDS_FOR
+//! driving ───────────────────────► stopping ────────────────────────────────► stopped
 //!    ▲                                │ braking time and MARGIN are over          │ moves for MOVES_FOR
 //!    │                                ▼                                          ▼
-//!    └─── rest is over ──── does not stand ◄──────────────────────────── moves while stopped
+//!    └─ zero is not commanded ─ does not stand ◄────────────────────────── moves while stopped
 //! ```
-//! Both alerts end when it stands, or when it may drive again.
+//! Both alerts end when the robot has stopped, or when zero velocity is no longer commanded.
 
 use std::time::Duration;
 
 use tread_control::geometry::Point;
 
-/// Slowest wheel, odometry and position that count as motion, metres per second; encoders count and
-/// odometry is noisy.
+/// Smallest speed of wheels or odometry that counts as motion, m/s; above encoder resolution and
+/// odometry noise.
 const SPEED_MIN_M_S: f64 = 0.1;
-/// Slowest turn by the gyro, radians per second, above its offset.
+/// Smallest yaw rate of the gyro that counts as motion, rad/s; above the gyro's offset.
 const TURN_MIN_RAD_S: f64 = 0.15;
-/// Distance from where it came to stand that shows motion in position fixes, metres.
+/// Smallest distance of a position fix from the position at standstill that counts as motion,
+/// metres.
 const DISTANCE_MIN_M: f64 = 0.3;
-/// Fixes in a row that must show it.
+/// Number of consecutive fixes beyond [`DISTANCE_MIN_M`] that shows motion.
 const FIXES: u32 = 3;
-/// How long it must be at rest until it counts as standing.
+/// Time without motion after which the robot counts as stopped.
 const STANDS_FOR: Duration = Duration::from_millis(300);
-/// How long fixes alone must stay at one place: a robot that creeps leaves it meanwhile.
+/// Time for which fixes must stay within [`DISTANCE_MIN_M`] where they are the only evidence of
+/// standstill: a creeping robot leaves that circle meanwhile.
 const FIXES_STAY_FOR: Duration = Duration::from_secs(3);
-/// How long it must move until it counts as moving.
+/// Duration of motion from which it is reported.
 const MOVES_FOR: Duration = Duration::from_millis(300);
-/// Weakest braking that is expected, metres per second squared: half of what unknown ground gives.
+/// Smallest deceleration assumed for the braking time, m/s²: half of that on unknown ground.
 const BRAKING_M_S2: f64 = 0.7;
-/// Longest braking that is waited for.
+/// Upper bound of the assumed braking time.
 const EXPECTED_BRAKING_MAX: Duration = Duration::from_secs(4);
-/// Added to it: lag of the base, and ramps with a jerk limit.
+/// Margin on the assumed braking time for the lag of the base and jerk-limited ramps.
 const MARGIN: Duration = Duration::from_millis(700);
 
-/// What was measured in a tick; absent where nothing trustworthy was said of late.
+/// Motion measured in a tick; `None` where there is no recent trustworthy value.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(crate) struct Motion {
-    /// Fastest rim, metres per second.
+    /// Speed of the fastest wheel rim, m/s.
     pub(crate) wheels_m_s: Option<f64>,
-    /// Odometry over ground, metres per second.
+    /// Speed over ground by odometry, m/s.
     pub(crate) odometry_m_s: Option<f64>,
-    /// Gyro, radians per second.
+    /// Yaw rate by gyro, rad/s.
     pub(crate) turn_rad_s: Option<f64>,
-    /// A position fix of this tick.
+    /// Position fix of this tick, in the site frame.
     pub(crate) fix: Option<Point>,
 }
 
 impl Motion {
-    /// The faster one of wheels and odometry.
+    /// Returns the larger of the speeds by wheels and odometry, m/s.
     fn speed_m_s(&self) -> Option<f64> {
         let odometry_m_s = self.odometry_m_s.map(f64::abs);
         self.wheels_m_s
@@ -59,37 +62,37 @@ impl Motion {
     }
 }
 
-/// Which channel shows motion, and how fast.
+/// The channel that shows motion, with its value.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Shown {
-    /// Wheels or odometry, metres per second.
+    /// Wheels or odometry, m/s.
     Speed(f64),
-    /// Gyro, radians per second.
+    /// Gyro, rad/s.
     Turn(f64),
-    /// Position, metres from where it was.
+    /// Position fix, metres from the position at standstill.
     Distance(f64),
 }
 
-/// What is said of it.
+/// Result of the standstill watch.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(crate) struct StandingReport {
-    /// Whether rest is commanded.
+    /// Whether zero velocity is commanded.
     pub(crate) is_to_stand: bool,
-    /// Since when it stands, and how long after the command of rest that was.
+    /// Begin of the standstill by the monotonic clock, and its delay after the command.
     pub(crate) stands: Option<(Duration, Duration)>,
-    /// It should stand and does not.
+    /// Motion beyond the assumed braking time, if the robot has not stopped.
     pub(crate) does_not_stand: Option<Shown>,
-    /// It stood and moves again.
+    /// Motion after the robot had stopped.
     pub(crate) moves: Option<Shown>,
 }
 
-/// Watches it.
+/// Watches a robot that is commanded to zero velocity.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(crate) struct StandingWatch {
-    /// When rest was commanded, and when it should be met.
+    /// Time of the command of zero velocity, and the time by which the robot shall have stopped.
     commanded: Option<(Duration, Duration)>,
     still_since: Option<Duration>,
-    /// The first of the fixes that stay at one place.
+    /// First of the fixes that stay within [`DISTANCE_MIN_M`], with its time.
     first_fix: Option<(Duration, Point)>,
     moving_since: Option<Duration>,
     stands: Option<(Duration, Duration)>,
@@ -100,7 +103,7 @@ pub(crate) struct StandingWatch {
 }
 
 impl StandingWatch {
-    /// Takes one tick.
+    /// Processes one tick. `is_to_stand` is whether zero velocity is commanded.
     pub(crate) fn step(&mut self, now: Duration, is_to_stand: bool, motion: &Motion) {
         if !is_to_stand {
             *self = Self::default();
@@ -116,7 +119,7 @@ impl StandingWatch {
         });
         let Some(shown) = self.shown(motion) else {
             self.moving_since = None;
-            // Without wheels or odometry that can be believed only fixes show that it stands.
+            // Without trustworthy wheels or odometry only fixes show standstill.
             let since = if motion.speed_m_s().is_some() {
                 *self.still_since.get_or_insert(now)
             } else {
@@ -148,7 +151,8 @@ impl StandingWatch {
         }
     }
 
-    /// Since when position fixes have stayed at one place, if that is long enough.
+    /// Returns since when position fixes have stayed within [`DISTANCE_MIN_M`], once that has
+    /// lasted [`FIXES_STAY_FOR`].
     fn stays_since(&mut self, now: Duration, fix: Option<Point>) -> Option<Duration> {
         let fix = fix?;
         let (since, first) = *self.first_fix.get_or_insert((now, fix));
@@ -159,7 +163,8 @@ impl StandingWatch {
         (now.saturating_sub(since) >= FIXES_STAY_FOR).then_some(since)
     }
 
-    /// Nothing is heard of the robot any more: whether it stands is not known until it is.
+    /// Resets the watch except for the time of the command, because no sensor is heard: whether the
+    /// robot has stopped is unknown until one is.
     pub(crate) fn forget(&mut self) {
         *self = Self {
             commanded: self.commanded,
@@ -167,7 +172,7 @@ impl StandingWatch {
         };
     }
 
-    /// What shows motion.
+    /// Returns the channel that shows motion in this tick, if any.
     fn shown(&mut self, motion: &Motion) -> Option<Shown> {
         if let (Some(anchor), Some(fix)) = (self.anchor, motion.fix) {
             let is_away = anchor.distance_m(fix) > DISTANCE_MIN_M;
@@ -184,7 +189,8 @@ impl StandingWatch {
             return Some(Shown::Turn(turn_rad_s));
         }
         if self.away >= FIXES {
-            // From here on it is where it is now; otherwise a robot that was pushed once moved for ever.
+            // The new position becomes the anchor; otherwise one push would count as motion for
+            // ever.
             let distance_m = self
                 .anchor
                 .zip(motion.fix)
@@ -199,7 +205,7 @@ impl StandingWatch {
         None
     }
 
-    /// What is said of it.
+    /// Returns the result of the watch.
     pub(crate) fn report(&self) -> StandingReport {
         StandingReport {
             is_to_stand: self.commanded.is_some(),

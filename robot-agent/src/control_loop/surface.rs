@@ -1,8 +1,9 @@
-//! Whether the ground is as the map says: each cell's own measurement against the map's word on it.
+//! Detects ground that differs from the map: compares each cell's own measurement with the map's
+//! estimate.
 //!
-//! `z = (θ − θ_map)/√(σ² + σ_map² + (s_b·θ_map)²)`: the segment's standard deviation, the map's,
-//! and how much one robot differs from all others (`s_b`). The segment never contains the map's
-//! word, so z is standard normal where nothing has changed.
+//! `z = (θ − θ_map)/√(σ² + σ_map² + (s_b·θ_map)²)`, with the standard deviations of the segment, of
+//! the map, and the relative one of a robot's bias (`s_b`). The segment does not contain the map's
+//! estimate, so z is standard normal where the ground has not changed.
 //!
 //! ```text
 //!        |z| ≥ RAISE_STD_DEVS in two cells in a row, the same way
@@ -13,34 +14,33 @@
 use tread_api::site::Cell;
 use tread_control::tracking::ThetaKnowledge;
 
-/// Standard deviations from which a cell's ground is another one than the map's. By chance, one
-/// cell in 147 000 is as far off, and two in a row at the most as often:
-/// a robot that drives 2 000 cells an hour gives at most one false alarm in 73 hours of driving
-/// over ground that the map knows. The second cell is asked for since a single wrong word, of the
-/// map or of a robot without torque, is likelier than chance has it.
+/// |z| from which a cell contradicts the map. By chance this happens in one cell in 147 000, and in
+/// two in a row at most as often: at 2 000 cells an hour, at most one false alarm in 73 hours of
+/// driving over mapped ground. A second cell is required since a single wrong estimate, of the map
+/// or of a robot without torque sensors, is more likely than chance.
 pub(crate) const RAISE_STD_DEVS: f64 = 4.5;
-/// The probability of a false alarm in a cell: both tails of the standard normal distribution.
+/// Probability of a false alarm in a cell: both tails of the standard normal distribution.
 #[cfg(test)]
 const FALSE_ALARM_PROBABILITY: f64 = 6.8e-6;
-/// Standard deviations within which a cell agrees with the map.
+/// |z| up to which a cell agrees with the map.
 const AGREE_DEVIATIONS: f64 = 2.5;
-/// Cells in a row that must agree until the alert is over.
+/// Number of consecutive agreeing cells after which the alert ends.
 const AGREE_CELLS: u8 = 3;
 
-/// What was measured in a cell beside what the map says of it.
+/// θ measured in a cell and θ of the map there.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Comparison {
     pub(crate) cell: Cell,
-    /// By the robot alone, in this cell alone.
+    /// Measured by the robot alone, in this cell alone.
     pub(crate) measured: ThetaKnowledge,
-    /// By the map.
+    /// Estimate of the map.
     pub(crate) expected: ThetaKnowledge,
-    /// Standard deviation of one robot's own bias as a share of θ.
+    /// Relative standard deviation of one robot's bias of θ.
     pub(crate) robot_bias_ratio: f64,
 }
 
 impl Comparison {
-    /// How far apart they are, in standard deviations; above zero where the ground slips more.
+    /// Returns z; positive where the measured θ exceeds the map's.
     pub(crate) fn z_score(&self) -> f64 {
         let (measured, expected) = (self.measured, self.expected);
         let bias = self.robot_bias_ratio * expected.theta;
@@ -48,33 +48,33 @@ impl Comparison {
         (measured.theta - expected.theta) / std_dev
     }
 
-    /// How far apart they are, as a share of what was expected.
+    /// Returns the relative difference, θ/θ_map − 1.
     pub(crate) fn difference_ratio(&self) -> f64 {
         self.measured.theta / self.expected.theta - 1.0
     }
 
-    /// Whether the ground is another one.
+    /// Whether |z| reaches [`RAISE_STD_DEVS`].
     pub(crate) fn contradicts(&self) -> bool {
         self.z_score().abs() >= RAISE_STD_DEVS
     }
 }
 
-/// Remembers whether the ground is as the map says.
+/// State of the detection.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct SurfaceWatch {
     raised: Option<Comparison>,
-    /// Whether the last cell contradicted the map, and if so whether it slips more.
+    /// Whether the last cell contradicted the map; true if its θ exceeds the map's.
     suspects_slip: Option<bool>,
     agreed: u8,
 }
 
 impl SurfaceWatch {
-    /// The newest cell that contradicted the map, while the alert stands.
+    /// Returns the newest cell that contradicted the map, while the alert is raised.
     pub(crate) fn raised(&self) -> Option<Comparison> {
         self.raised
     }
 
-    /// Takes what a cell has shown.
+    /// Processes the comparison of one cell.
     pub(crate) fn note(&mut self, comparison: Comparison) {
         let apart = comparison.z_score().abs();
         if !apart.is_finite() {
@@ -97,7 +97,8 @@ impl SurfaceWatch {
         }
     }
 
-    /// Another mission brings the map's newest word, in which what was found is contained.
+    /// Resets the detection: a new mission brings the map's newest estimates, which include what
+    /// was measured before.
     pub(crate) fn begin_mission(&mut self) {
         *self = Self::default();
     }
@@ -112,7 +113,7 @@ mod tests {
 
     use super::*;
 
-    /// Cells of which as many raise a false alarm as chance lets them.
+    /// Number of simulated cells, enough to measure the false-alarm rate.
     const CELLS: u32 = 3_000_000;
 
     fn seen(theta: f64) -> Comparison {

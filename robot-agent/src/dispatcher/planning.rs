@@ -1,4 +1,4 @@
-//! Plans what is offered, off the loop thread and off the runtime's.
+//! Plans offers on the blocking pool, outside the loop thread and the runtime's threads.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -14,14 +14,14 @@ use crate::control_loop::channels::Job;
 use crate::control_loop::origin::JobOrigin;
 use crate::geometry::wire_pose;
 
-/// A plan that can be driven.
+/// A plan, its summary, and the job that tracks it.
 pub(super) struct Planned {
     pub(super) summary: PlanSummary,
     pub(super) plan: Arc<Plan>,
     pub(super) job: Box<Job>,
 }
 
-/// Longest silence of the server that a mission bears.
+/// Returns the longest silence of the server for a link policy; `None` for no limit.
 fn silence_max(policy: LinkPolicy) -> Result<Option<Duration>, String> {
     policy.validate()?;
     Ok(match policy {

@@ -1,4 +1,4 @@
-//! What was commanded and said during one motion, summed up. Pure.
+//! Summarises the commands and messages of one motion of the examined robot. Pure.
 
 use tread_control::geometry::wrap_angle_rad;
 use tread_control::measured::{WheelSpeeds, WheelTorques};
@@ -11,46 +11,47 @@ use crate::drive::ros2::reading::{Content, Position, Wheels, wheels_of};
 use crate::drive::ros2::refusal::Source;
 use crate::drive::ros2::settings::{MotionOf, Ros2Settings};
 
-/// Least spread of the places' times for a speed, seconds squared: ten over a second.
+/// Smallest sum of squared deviations of the positions' times for a speed, s²: ten fixes in a
+/// second.
 const PLACES_SPREAD_MIN_S2: f64 = 0.8;
-/// Messages of the wheels whose mean is the speed that they gained.
+/// Number of the last wheel messages whose mean is the speed gained.
 const LAST_SPEEDS: usize = 10;
-/// Parts into which the steady part of a motion is cut, so that means have a standard error.
+/// Number of blocks into which the steady part of a motion is divided, to give means a standard
+/// error.
 const BLOCKS: usize = 8;
-/// The same as a figure.
+/// [`BLOCKS`] as a floating-point number.
 const BLOCKS_COUNT: f64 = 8.0;
-/// Messages after which a figure that never changed counts as frozen.
+/// Number of messages after which a value that never changed counts as frozen.
 const FROZEN_MIN: u32 = 10;
 
-/// What was commanded and said over the second half of a motion.
+/// Summary of the steady second half of a motion.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(super) struct Drove {
-    /// What the wheels were commanded.
+    /// Commanded wheel speeds.
     pub(super) commanded: WheelSpeeds,
-    /// What they said; none if they said nothing.
+    /// Measured wheel speeds, if any.
     pub(super) wheels: Option<WheelSpeeds>,
-    /// How the robot turned, radians per second.
+    /// Mean yaw rate, rad/s.
     pub(super) turn_rad_s: Option<f64>,
-    /// How fast it went ahead by its positions, metres per second.
+    /// Forward speed by position fixes, m/s.
     pub(super) places_m_s: Option<f64>,
-    /// The same as its odometry says, where that is of the ground.
+    /// Forward speed by the odometry, m/s, if it measures the ground.
     pub(super) odometry_m_s: Option<f64>,
-    /// The odometry's motion, and where its pose heads.
+    /// Mean odometry twist, and the heading of its pose.
     pub(super) twist: Option<PlanarTwist>,
-    /// Difference of the wheels' speeds, right minus left, and turn rate: means of parts of the
-    /// motion.
+    /// Block means of the wheel-speed difference, right minus left, and of the yaw rate.
     pub(super) turn_blocks: Vec<TurnBlock>,
-    /// Between which bounds each figure lay, from setting off to the end.
+    /// Ranges of the measured values, from the begin of the motion to its end.
     pub(super) ranges: Ranges,
-    /// How they pulled; none if that is not known.
+    /// Mean wheel torques, if measured.
     pub(super) torques: Option<WheelTorques>,
-    /// How both sides together pulled while the robot set off.
+    /// Torque of both sides while the robot accelerated.
     pub(super) set_off: Option<SetOff>,
-    /// Whether the base was heard all the while.
+    /// Whether the base was heard during the whole motion.
     pub(super) is_heard: bool,
 }
 
-/// The motion that odometry says, as it is written in the message, and the heading of its pose.
+/// Linear velocity as written in the odometry message, and the heading of its pose.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct PlanarTwist {
     pub(super) x_m_s: f64,
@@ -58,14 +59,14 @@ pub(super) struct PlanarTwist {
     pub(super) heading_rad: f64,
 }
 
-/// Means of a part of a motion.
+/// Means over one block of a motion.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct TurnBlock {
     pub(super) difference_rad_s: f64,
     pub(super) turn_rad_s: f64,
 }
 
-/// Least and greatest of a figure, and how often it was said.
+/// Smallest and largest value, and the number of values.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Range {
     least: f64,
@@ -98,7 +99,7 @@ impl Range {
         }
     }
 
-    /// How far it went; nothing of a figure that was not said.
+    /// Returns the difference of the largest and the smallest value; 0 without values.
     pub(super) fn span(&self) -> f64 {
         if self.count == 0 {
             0.0
@@ -107,13 +108,13 @@ impl Range {
         }
     }
 
-    /// Whether it was said often enough and never changed by the least bit: what is measured does.
+    /// Whether there were enough values and all are equal to the bit, unlike measured ones.
     pub(super) fn is_frozen(&self) -> bool {
         self.count >= FROZEN_MIN && self.span() <= 0.0
     }
 }
 
-/// Between which bounds each figure lay.
+/// Ranges of the measured values.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Ranges {
     pub(super) left: Range,
@@ -127,7 +128,7 @@ pub(super) struct Ranges {
 }
 
 impl Ranges {
-    /// Both motions together.
+    /// Joins the ranges of two motions.
     pub(super) fn with(&self, other: &Self) -> Self {
         Self {
             left: self.left.with(other.left),
@@ -172,25 +173,25 @@ impl Ranges {
     }
 }
 
-/// How the wheels of both sides pulled from rest to the whole speed.
+/// Torque of the wheels during the acceleration from zero.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct SetOff {
-    /// Their mean torque together, newton metres.
+    /// Mean torque of both sides together, N m.
     pub(super) torque_n_m: f64,
-    /// How long that took, by the messages' stamps.
+    /// Duration of the acceleration by the messages' stamps, seconds.
     pub(super) span_s: f64,
-    /// How fast they turned at its end.
+    /// Wheel speed at its end, rad/s.
     pub(super) gained_rad_s: f64,
 }
 
 impl Drove {
-    /// How fast the robot went over ground, metres per second: by its positions where it has them.
+    /// Returns the speed over ground, m/s: by position fixes if available, else by odometry.
     pub(super) fn ground_m_s(&self) -> Option<f64> {
         self.places_m_s.or(self.odometry_m_s)
     }
 }
 
-/// A mean that grows.
+/// Running mean.
 #[derive(Debug, Clone, Copy, Default)]
 struct Mean {
     sum: f64,
@@ -208,7 +209,7 @@ impl Mean {
     }
 }
 
-/// Sums up what was said while the robot set off, and when its speed was steady.
+/// Summarises the messages of the acceleration (`starting`) and of the steady part (`messages`).
 pub(super) fn drove(
     commanded: WheelSpeeds,
     settings: &Ros2Settings,
@@ -289,7 +290,7 @@ pub(super) fn drove(
     }
 }
 
-/// Means of the parts of a motion in which wheels and turn rate were said.
+/// Returns the block means of a motion in which wheel speeds and yaw rate were measured.
 fn turn_blocks(settings: &Ros2Settings, messages: &[Message]) -> Vec<TurnBlock> {
     let (Some(first), Some(last)) = (messages.first(), messages.last()) else {
         return Vec::new();
@@ -307,7 +308,7 @@ fn turn_blocks(settings: &Ros2Settings, messages: &[Message]) -> Vec<TurnBlock> 
             .monotonic
             .saturating_sub(began)
             .as_secs_f64();
-        // The last bound that it has reached; there are few.
+        // Index of the last block that has begun.
         let index = (1..BLOCKS).rev().find(|index| {
             let share = f64::from(u32::try_from(*index).unwrap_or(0)) / BLOCKS_COUNT;
             at_s >= share * span_s
@@ -339,7 +340,7 @@ fn turn_blocks(settings: &Ros2Settings, messages: &[Message]) -> Vec<TurnBlock> 
     sums.into_iter().filter_map(block).collect()
 }
 
-/// The mean motion of the odometry's messages, in whatever frame they have it.
+/// Returns the mean odometry twist, in the frame of the messages.
 fn planar_twist(messages: &[Message]) -> Option<PlanarTwist> {
     let (mut x, mut y, mut sin, mut cos) = <(Mean, Mean, Mean, Mean)>::default();
     for message in messages.iter().filter(|it| it.source == Source::Odometry) {
@@ -361,7 +362,7 @@ fn planar_twist(messages: &[Message]) -> Option<PlanarTwist> {
     })
 }
 
-/// Where the newest odometry heads in its own frame.
+/// Returns the heading of the newest odometry pose in its own frame.
 pub(super) fn newest_heading_rad(settings: &Ros2Settings, messages: &[Message]) -> Option<f64> {
     settings.odometry.as_ref()?;
     let mut newest = messages.iter().rev();
@@ -370,7 +371,7 @@ pub(super) fn newest_heading_rad(settings: &Ros2Settings, messages: &[Message]) 
     read.pose.pose.orientation.yaw_rad()
 }
 
-/// How the wheels pulled in all of these messages.
+/// Returns the torque during the acceleration.
 fn set_off(settings: &Ros2Settings, messages: &[Message]) -> Option<SetOff> {
     let mut torque = Mean::default();
     let mut said = Vec::with_capacity(messages.len());
@@ -397,7 +398,7 @@ fn set_off(settings: &Ros2Settings, messages: &[Message]) -> Option<SetOff> {
     let gained_rad_s = gained.value()?;
     (intervals > 0.0).then(|| SetOff {
         torque_n_m: torque.sum / torque.count,
-        // Each message stands for the time since the one before it.
+        // Each message accounts for the time since the previous one.
         span_s: (last_s - first_s) * torque.count / intervals,
         gained_rad_s,
     })
@@ -407,7 +408,7 @@ fn seconds(stamp: Time) -> f64 {
     f64::from(stamp.sec) + 1.0e-9 * f64::from(stamp.nanosec)
 }
 
-/// How fast the places went ahead: the slope of the line through all of them.
+/// Returns the forward speed of the positions: the slope of their regression line, m/s.
 fn speed_of(places: &[(f64, Position)]) -> Option<f64> {
     let (first_s, first) = places.first()?;
     let (sin, cos) = first.pose.heading_rad.sin_cos();

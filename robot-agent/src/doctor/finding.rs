@@ -1,4 +1,4 @@
-//! What was found on one question, and the lines of `robot.toml` that mend it.
+//! Findings of the doctor, each on one question, with the lines of `robot.toml` that correct them.
 
 use std::fmt::Write as _;
 
@@ -15,20 +15,20 @@ pub(crate) struct Line {
     pub(crate) value: String,
 }
 
-/// What was found on one question.
+/// Finding on one question.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub(crate) struct Finding {
     /// The question.
     pub(crate) name: &'static str,
-    /// Whether nothing is wrong, as far as it was examined.
+    /// Whether no problem was found.
     pub(crate) holds: bool,
-    /// Whether it could not be examined.
+    /// Whether the question could not be examined.
     pub(crate) is_skipped: bool,
-    /// The key of `robot.toml` to look at, where all is not.
+    /// Key of `robot.toml` that is likely wrong, if a problem was found.
     pub(crate) key: Option<&'static str>,
-    /// In words.
+    /// Description for people.
     pub(crate) text: String,
-    /// What to write into `robot.toml`, where that mends it.
+    /// Lines of `robot.toml` that correct the problem, if any.
     pub(crate) lines: Vec<Line>,
 }
 
@@ -60,7 +60,7 @@ impl Finding {
         }
     }
 
-    /// The same with a line that mends it.
+    /// Adds a line that corrects the problem.
     pub(super) fn with_line(
         mut self,
         table: &'static str,
@@ -84,13 +84,13 @@ impl Finding {
     }
 }
 
-/// A list of names as TOML.
+/// Formats a list of names as TOML.
 pub(super) fn list(names: &[String]) -> String {
     let quoted: Vec<String> = names.iter().map(|name| format!("{name:?}")).collect();
     format!("[{}]", quoted.join(", "))
 }
 
-/// All lines that the findings want, as a part of `robot.toml`: each table once.
+/// Formats the lines of all findings as a part of `robot.toml`, each table once.
 pub(super) fn robot_toml(findings: &[Finding]) -> String {
     let lines: Vec<&Line> = findings.iter().flat_map(|finding| &finding.lines).collect();
     let mut text = String::new();

@@ -1,23 +1,23 @@
-//! Sensors that froze: their messages come, and their figures never change while the robot moves.
-//! Pure.
+//! Detects frozen sensors: their messages arrive, but their values never change while the robot
+//! moves. Pure.
 //!
-//! The robot turned and drove, so everything that measures motion must have changed by some bit. A
-//! frozen sensor differs from a robot that stood: another sensor saw it move.
+//! The robot turned and drove, so every value that depends on motion must have changed. A frozen
+//! sensor differs from a robot that did not move in that another sensor measured the motion.
 
 use super::drove::{Drove, Ranges};
 use super::finding::Finding;
 use crate::drive::ros2::settings::Ros2Settings;
 
-/// Turn rate that shows that the robot turned, radians per second.
+/// Yaw rate that shows that the robot turned, rad/s.
 const TURNED_RAD_S: f64 = 0.1;
-/// Way by position that shows that it moved, metres.
+/// Distance by position fixes that shows that the robot moved, metres.
 const MOVED_M: f64 = 0.15;
-/// Speed over ground that shows it, metres per second.
+/// Speed over ground that shows that the robot moved, m/s.
 const MOVED_M_S: f64 = 0.05;
-/// Share of its command by which a wheel's speed changed where it turned.
+/// Change of a wheel's speed that shows that it turned, as a fraction of its command.
 const TURNED_SHARE: f64 = 0.2;
 
-/// Which sensors froze.
+/// Frozen sensors.
 #[expect(
     clippy::struct_excessive_bools,
     reason = "one of each sensor, and any may be"
@@ -32,7 +32,8 @@ pub(super) struct Frozen {
 }
 
 impl Frozen {
-    /// Which sensors froze during both motions of a robot whose gyro has this bias.
+    /// Detects the sensors that were frozen during both motions; `gyro_bias_rad_s` is the gyro's
+    /// offset.
     pub(super) fn of(turned: &Drove, forward: &Drove, gyro_bias_rad_s: f64) -> Self {
         let ranges = turned.ranges.with(&forward.ranges);
         let turn_rad_s = turned.turn_rad_s.unwrap_or(gyro_bias_rad_s) - gyro_bias_rad_s;
@@ -62,7 +63,7 @@ impl Frozen {
         self.left || self.right
     }
 
-    /// What was found of every sensor that froze.
+    /// Returns a finding for each frozen sensor.
     pub(super) fn findings(
         self,
         settings: &Ros2Settings,
@@ -92,7 +93,7 @@ impl Frozen {
                 "the gyro says the same turn rate all the time, though the wheels turned: it froze";
             findings.push(Finding::wrong("imu", "drive.ros2.imu.topic", text));
         }
-        // Where the odometry gives the wheels' speeds it has been named above.
+        // If the odometry gives the wheel speeds, the finding on the wheels covers it.
         if self.odometry && (settings.joints.is_some() || !self.joints()) {
             let text =
                 "the odometry says the same motion all the time, though the robot moved: it froze";
@@ -115,7 +116,7 @@ impl Frozen {
     }
 }
 
-/// How the robot moved by everything but its wheels, for people.
+/// Describes the motion measured by all sensors but the wheels, for people.
 fn moved(turned: &Drove, forward: &Drove) -> String {
     let mut parts = Vec::new();
     if let Some(turn_rad_s) = turned.turn_rad_s {
@@ -127,7 +128,7 @@ fn moved(turned: &Drove, forward: &Drove) -> String {
     parts.join(", ")
 }
 
-/// Which sensors saw the robot move.
+/// Sensors of which others have shown that they should have measured motion.
 #[expect(
     clippy::struct_excessive_bools,
     reason = "one of each sensor, and any may be"

@@ -1,4 +1,4 @@
-//! Every message as it came, for a while.
+//! Stores the received messages for a while.
 
 use std::sync::{Mutex, PoisonError};
 
@@ -8,10 +8,10 @@ use crate::drive::ros2::inlet::Tap;
 use crate::drive::ros2::refusal::Source;
 use crate::drive::ros2::stamps::Arrival;
 
-/// Most messages that are kept; five topics of 200 Hz for ten seconds.
+/// Largest number of stored messages: five topics of 200 Hz for ten seconds.
 const MESSAGES_MAX: usize = 10_000;
 
-/// A message as it came.
+/// A message as received.
 #[derive(Debug, Clone)]
 pub(super) struct Message {
     pub(super) source: Source,
@@ -21,7 +21,7 @@ pub(super) struct Message {
     pub(super) payload: Vec<u8>,
 }
 
-/// What was heard.
+/// The stored messages.
 #[derive(Debug, Default)]
 pub(super) struct Heard(Mutex<Vec<Message>>);
 
@@ -30,17 +30,17 @@ impl Heard {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Whether nothing was heard yet.
+    /// Whether no message is stored.
     pub(super) fn is_empty(&self) -> bool {
         self.messages().is_empty()
     }
 
-    /// Begins afresh.
+    /// Removes all messages.
     pub(super) fn forget(&self) {
         self.messages().clear();
     }
 
-    /// All that was heard since; begins afresh.
+    /// Returns all messages and removes them.
     pub(super) fn taken(&self) -> Vec<Message> {
         std::mem::take(&mut self.messages())
     }

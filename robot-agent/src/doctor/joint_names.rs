@@ -1,18 +1,17 @@
-//! Which joints are heard, and which of them are likely to be those of the left and the right wheels.
-//! Pure.
+//! Collects joint names, and guesses which are those of the left and the right wheels. Pure.
 
 use super::finding::{Finding, list};
 use crate::drive::ros2::settings::JointSettings;
 
-/// Names that are shown at the most.
+/// Largest number of names that are printed.
 const SHOWN_MAX: usize = 24;
 
-/// The names that are heard, each once, in the order in which they came.
+/// Names in the received messages, each once, in order of arrival.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub(super) struct JointNames(Vec<String>);
 
 impl JointNames {
-    /// Adds those of a message.
+    /// Adds the names of a message.
     pub(super) fn add<'a>(&mut self, names: impl Iterator<Item = &'a str>) {
         for name in names {
             if !self.0.iter().any(|known| known == name) {
@@ -21,7 +20,7 @@ impl JointNames {
         }
     }
 
-    /// For people.
+    /// Lists the names, for people.
     pub(super) fn text(&self) -> String {
         let shown: Vec<_> = self
             .0
@@ -37,7 +36,7 @@ impl JointNames {
         }
     }
 
-    /// What is wrong with the configured names; none if all are heard.
+    /// Returns the finding on the configured names; `None` if all were received.
     pub(super) fn finding(&self, joints: &JointSettings) -> Option<Finding> {
         let missing = |names: &[String]| -> Vec<String> {
             let is_missing = |name: &&String| !self.0.contains(name);
@@ -69,7 +68,7 @@ impl JointNames {
         })
     }
 
-    /// The wheels' joints by their names, if those say their sides.
+    /// Returns the wheel joints of each side, `(left, right)`, if their names show the side.
     fn sides(&self) -> Option<(Vec<String>, Vec<String>)> {
         let is_wheel = |name: &&String| name.to_lowercase().contains("wheel");
         let wheels: Vec<&String> = self.0.iter().filter(is_wheel).collect();
@@ -93,7 +92,7 @@ enum Side {
     Right,
 }
 
-/// The side that a joint's name says, by a word such as `left`, `l`, `fl` or `rear_r`.
+/// Returns the side in a joint's name, by a word such as `left`, `l`, `fl` or `rear_r`.
 fn side_of(name: &str) -> Option<Side> {
     let name = name.to_lowercase();
     match (name.contains("left"), name.contains("right")) {

@@ -1,4 +1,4 @@
-//! What a standing robot's messages say: topics, types, rates, gaps, delays, frames, effort.
+//! Examines the messages of a stopped robot: topics, types, rates, gaps, delays, frames, effort.
 
 use std::time::Duration;
 
@@ -14,26 +14,26 @@ use crate::drive::ros2::reading::Content;
 use crate::drive::ros2::refusal::{Refusal, Source};
 use crate::drive::ros2::settings::{Effort, Ros2Settings, Scheme, StampClock};
 
-/// Slowest messages of wheels and inertial unit, Hz.
+/// Smallest rate of the messages of wheels and inertial unit, Hz.
 const RATE_MIN_HZ: f64 = 20.0;
-/// Oldest that a message of the base may be when it comes, milliseconds.
+/// Largest age of a message of the base at its arrival, milliseconds.
 const AGE_MAX_MS: f64 = 50.0;
-/// From here on an age is of another clock, milliseconds.
+/// Age from which a stamp is assumed to be of another clock, milliseconds.
 const CLOCK_MIN_MS: f64 = 2_000.0;
-/// Share of messages that may be bad.
+/// Largest fraction of invalid messages.
 const BAD_SHARE_MAX: f64 = 0.02;
-/// Share of messages that may come twice.
+/// Largest fraction of repeated messages.
 const REPEATED_SHARE_MAX: f64 = 0.02;
-/// Messages among which one is looked for that came already.
+/// Number of previous messages among which a repetition is searched.
 const REPEATED_AMONG: usize = 32;
-/// Messages after which a stamp that never changed stands still.
+/// Number of messages after which a stamp that never changed counts as constant.
 const STANDING_STAMPS_MIN: usize = 5;
-/// Largest turn rate that the gyro of a standing robot may say on average, radians per second.
+/// Largest mean yaw rate of the gyro of a stopped robot, rad/s.
 const GYRO_BIAS_MAX_RAD_S: f64 = 0.01;
-/// Speed up to which a wheel counts as standing, radians per second.
+/// Speed up to which a wheel counts as stopped, rad/s.
 const WHEEL_STANDING_RAD_S: f64 = 0.1;
 
-/// The finding's name and the key of a source's section.
+/// Returns the finding's name and the key of a source's section.
 fn names(source: Source) -> (&'static str, &'static str) {
     match source {
         Source::Odometry => ("odometry", "drive.ros2.odometry.topic"),
@@ -44,7 +44,7 @@ fn names(source: Source) -> (&'static str, &'static str) {
     }
 }
 
-/// Whether the base cannot be driven without it at a good rate.
+/// Whether driving needs a high rate of this source.
 fn is_fast(settings: &Ros2Settings, source: Source) -> bool {
     match source {
         Source::Joints | Source::Imu => true,
@@ -53,7 +53,7 @@ fn is_fast(settings: &Ros2Settings, source: Source) -> bool {
     }
 }
 
-/// What was found, topic by topic.
+/// Returns the findings for each topic.
 pub(super) fn findings(
     settings: &Ros2Settings,
     messages: &[Message],
@@ -69,7 +69,7 @@ pub(super) fn findings(
             .filter(|message| message.source == source)
             .collect();
         if of_source.is_empty() {
-            // A battery may speak so seldom that it was not heard.
+            // A battery may publish too seldom to be received.
             if source != Source::Battery {
                 let (name, key) = names(source);
                 let text = format!("nothing was heard on `{topic}`");

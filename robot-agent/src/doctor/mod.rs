@@ -176,7 +176,7 @@ impl Hands {
         })
     }
 
-    /// Turns and drives the robot, unless what was found before forbids it; all findings.
+    /// Turns and drives the robot, unless a finding forbids it; returns all findings.
     fn move_about(
         &mut self,
         settings: &Ros2Settings,
@@ -206,13 +206,13 @@ impl Hands {
         };
         heard.forget();
         let mut turned = self.drive_for(speeds(-1.0, 1.0), settings, heard);
-        // Along the x axis of its odometry's frame a twist of that frame looks like one of the
-        // robot.
+        // Along the x axis of the odometry's frame, a twist in that frame equals one in the robot
+        // frame.
         if turned.twist.is_some() && heads_along_x(settings, heard) {
             turned = self.drive_for(speeds(-1.0, 1.0), settings, heard);
         }
         let forward = self.drive_for(speeds(1.0, 1.0), settings, heard);
-        // What two nodes command says nothing of signs and tracks.
+        // Motion commanded by two nodes shows nothing about signs and tracks.
         if let Some(finding) = self.other_commander(settings) {
             findings.push(finding);
             return findings;
@@ -223,12 +223,12 @@ impl Hands {
         findings
     }
 
-    /// Commands this for so long, whatever the base says.
+    /// Commands these wheel speeds for `span`, even if the base is silent.
     fn hold(&mut self, command: WheelSpeeds, span: Duration) {
         self.go(command, span, |_| true);
     }
 
-    /// Commands this for so long while the base is heard; whether it was all the while.
+    /// Commands these wheel speeds for `span`; returns false at once if the base falls silent.
     fn hold_heard(&mut self, command: WheelSpeeds, span: Duration) -> bool {
         self.go(command, span, |drive| !drive.must_rest())
     }
@@ -246,7 +246,7 @@ impl Hands {
                 command: Some(command),
                 previous: self.said,
                 stop: false,
-                // The drive itself lets a silent base rest.
+                // The drive itself commands zero to a silent base.
                 feedback_age_s: 0.0,
                 dt_s: PERIOD.as_secs_f64(),
             };
@@ -260,8 +260,7 @@ impl Hands {
         true
     }
 
-    /// Goes from what was commanded to this, evenly, while the base is heard; whether it was all
-    /// the while.
+    /// Changes the command linearly to `to`; returns false at once if the base falls silent.
     fn ramp(&mut self, to: WheelSpeeds) -> bool {
         let from = self.said;
         let steps = u32::try_from(RAMP.as_millis() / PERIOD.as_millis()).unwrap_or(1);
@@ -276,8 +275,8 @@ impl Hands {
         })
     }
 
-    /// Drives like this for a while, and says what was said meanwhile. A base that falls silent is
-    /// at rest then, and the motion is tried again.
+    /// Drives with these wheel speeds and summarises the messages. If the base falls silent, it is
+    /// commanded to zero and the motion is repeated, at most [`TRIES_MAX`] times.
     fn drive_for(&mut self, command: WheelSpeeds, settings: &Ros2Settings, heard: &Heard) -> Drove {
         for _ in 0..TRIES_MAX {
             let messages = self.try_to_drive(command, heard);
@@ -290,8 +289,8 @@ impl Hands {
         Drove::default()
     }
 
-    /// What was said while the robot set off, and when its speed was steady; none of a base that
-    /// fell silent.
+    /// Returns the messages of the acceleration and of the steady motion; `None` if the base fell
+    /// silent.
     fn try_to_drive(&mut self, command: WheelSpeeds, heard: &Heard) -> Option<[Vec<Message>; 2]> {
         heard.forget();
         let mut is_heard = self.ramp(command) && self.hold_heard(command, SETTLE);
@@ -303,7 +302,7 @@ impl Hands {
     }
 }
 
-/// Whether the newest word of the odometry heads along the x axis of its frame.
+/// Whether the newest odometry pose heads along the x axis of its frame.
 fn heads_along_x(settings: &Ros2Settings, heard: &Heard) -> bool {
     let heading_rad = drove::newest_heading_rad(settings, &heard.taken());
     heading_rad.is_some_and(twist_frame::is_along_x)

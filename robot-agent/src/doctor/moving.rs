@@ -1,8 +1,8 @@
-//! What a moving robot's messages say: frozen sensors, wheel directions, sides, signs, the frame of
-//! the twist, radius, track and torque.
+//! Examines the messages of a moving robot: frozen sensors, wheel directions, sides, signs, the
+//! frame of the twist, radius, track and torque.
 //!
-//! Pure: from what was commanded and what was said while the robot turned to the left on the spot,
-//! and while it drove ahead. A question whose answer another finding spoils is not asked.
+//! Pure: from the commands and messages of a turn on the spot to the left, and of a drive forward.
+//! A question is not examined if another finding makes its answer meaningless.
 
 use tread_control::measured::WheelSpeeds;
 use tread_control::robot::RobotModel;
@@ -14,16 +14,16 @@ use super::signs::{self, Answers};
 use super::{pulling, track, twist_frame};
 use crate::drive::ros2::settings::Ros2Settings;
 
-/// Speed below which a wheel counts as standing, as a share of its command.
+/// Ratio to its command below which a wheel's speed counts as standstill.
 const STANDING_SHARE: f64 = 0.2;
-/// Turn rate below which a robot does not turn, radians per second.
+/// Smallest yaw rate of a robot that turns, rad/s.
 const TURNING_RAD_S: f64 = 0.05;
-/// Share of the wheels' speed below which a robot does not go over ground.
+/// Ratio to the wheels' speed below which a robot counts as not moving over ground.
 const GOING_SHARE: f64 = 0.3;
-/// Error of a radius that is borne, as a share.
+/// Largest accepted relative error of the wheel radius.
 const RADIUS_SHARE: f64 = 0.06;
 
-/// 1, -1, or 0 for a wheel that stands.
+/// Returns the sign of a wheel's speed, 0 if it stands still.
 fn direction(said: f64, commanded: f64) -> i8 {
     if said.abs() < STANDING_SHARE * commanded.abs() {
         0
@@ -41,7 +41,7 @@ fn directions(said: WheelSpeeds, drove: &Drove) -> [i8; 2] {
     ]
 }
 
-/// What was found. The gyro's bias is what it said while the robot stood.
+/// Returns the findings; `gyro_bias_rad_s` is the mean of the gyro while the robot stood still.
 pub(super) fn findings(
     settings: &Ros2Settings,
     model: &RobotModel,
@@ -72,7 +72,7 @@ pub(super) fn findings(
         return findings;
     }
     let (of_turn, of_forward) = (directions(turning, turned), directions(going, forward));
-    // By the command, for joints that disagree have no mean.
+    // By the command, since joints that disagree have no meaningful mean.
     let commanded_rad_s = 0.5 * (forward.commanded.left_rad_s + forward.commanded.right_rad_s);
     let rim_m_s = model.wheel_radius_m() * commanded_rad_s;
     let twist = forward.twist.filter(|_| !frozen.odometry);
@@ -131,7 +131,7 @@ pub(super) fn findings(
     findings
 }
 
-/// 1, -1, or 0 for what is too little to have a direction.
+/// Returns the sign of a value, 0 if its magnitude is at most `least`.
 fn way(value: f64, least: f64) -> i8 {
     if value > least {
         1
@@ -142,7 +142,7 @@ fn way(value: f64, least: f64) -> i8 {
     }
 }
 
-/// Wheels that stand though they are commanded to turn.
+/// Returns the finding on wheels that stand still though commanded to turn.
 fn of_standing(of_turn: [i8; 2], of_forward: [i8; 2]) -> Option<Finding> {
     let stands = |side: usize| of_turn[side] == 0 && of_forward[side] == 0;
     let text = match (stands(0), stands(1)) {
@@ -159,7 +159,8 @@ fn of_standing(of_turn: [i8; 2], of_forward: [i8; 2]) -> Option<Finding> {
     Some(Finding::wrong("wheels", "drive.ros2.command.topic", text))
 }
 
-/// A body that stands though its wheels turn, by a sensor that did not freeze.
+/// Returns the finding on a robot that does not move though its wheels turn, by a sensor that is
+/// not frozen.
 fn of_still_body(
     turn_rad_s: Option<f64>,
     ground_m_s: Option<f64>,
@@ -188,7 +189,7 @@ fn of_still_body(
     })
 }
 
-/// The wheels' radius against the distance over ground.
+/// Compares the wheel radius with the distance over ground.
 fn of_radius(model: &RobotModel, radius_m: f64) -> Finding {
     let model_m = model.wheel_radius_m();
     if (radius_m / model_m - 1.0).abs() <= RADIUS_SHARE {

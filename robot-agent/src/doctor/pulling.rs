@@ -1,11 +1,13 @@
-//! Whether the joints' effort can be the torque of the wheels: its signs, gear and torque constant.
+//! Checks whether the joints' effort can be the wheels' torque: its signs, gear ratio and torque
+//! constant.
 //!
-//! Pure. Nothing measures a torque directly here, but two things bound it. Wheels that scrub in a
-//! turn on the spot work against the ground, so each side pulls the way it turns, and as hard as a
-//! friction coefficient that grounds have: by the balance of moments of four equal contacts a side
-//! pulls `μ·(m·g/2)·L/√(L² + W²)`. And what the wheels pull to set off ahead, above what keeps the
-//! robot going, is its momentum `m·v`, whatever the ground and its slope; the motors' own inertia
-//! behind the gear comes on top. A factor of some four is found, one of two is not.
+//! Pure. No sensor measures torque independently, but two bounds hold. In a turn on the spot the
+//! wheels scrub against the ground, so each side's torque has the sign of its rotation and
+//! corresponds to a realistic friction coefficient: by the balance of moments of four equal
+//! contacts, the force of a side is `μ·(m·g/2)·L/√(L² + W²)`. And the impulse of the wheels during
+//! acceleration, above that of steady driving, is the momentum `m·v`, on any ground and slope, plus
+//! that of the motors' inertia behind the gear. Errors by a factor of about four are found, of two
+//! are not.
 
 use tread_control::robot::RobotModel;
 
@@ -13,27 +15,27 @@ use super::drove::{Drove, SetOff};
 use super::finding::Finding;
 use crate::drive::ros2::settings::{Effort, JointSettings, Ros2Settings};
 
-/// Share of a side's load below which a pull against the motion counts as none.
+/// Ratio to a side's load below which a force against the motion counts as none.
 const AGAINST_MIN: f64 = 0.02;
-/// Friction coefficients that grounds have for scrubbing wheels, drive train included.
+/// Realistic friction coefficients of scrubbing wheels, drive train included.
 const FRICTION: std::ops::RangeInclusive<f64> = 0.1..=1.5;
-/// Momentum that the wheels gave as a share of the robot's. Heavy rotors behind a high gear can
-/// make it several times as much, nothing can make it a third.
+/// Ratio of the wheels' impulse to the robot's momentum. Heavy rotors behind a high gear ratio can
+/// multiply it; nothing can reduce it to a third.
 const MOMENTUM_RATIO: std::ops::RangeInclusive<f64> = 0.4..=8.0;
-/// Least speed that the robot must have gained, as a share of its command.
+/// Smallest speed gained, as a ratio to the command.
 const GAINED_MIN: f64 = 0.5;
 
-/// What the wheels pulled, beside what they can have pulled.
+/// Measured effort, expressed in the quantities that are bounded.
 #[derive(Debug, Clone, Copy)]
 struct Pull {
-    /// Friction coefficients that a side's pull in the turn needs, left and right; negative against
-    /// the motion.
+    /// Friction coefficients that correspond to each side's force in the turn, `[left, right]`;
+    /// negative against the motion.
     friction: [f64; 2],
-    /// Momentum that the wheels gave over the robot's own, if it gained enough speed.
+    /// Ratio of the wheels' impulse to the robot's momentum, if it gained enough speed.
     momentum_ratio: Option<f64>,
 }
 
-/// What was found; nothing of joints that say no torque.
+/// Returns the finding; `None` for joints without a torque.
 pub(super) fn findings(
     settings: &Ros2Settings,
     model: &RobotModel,
@@ -76,7 +78,7 @@ fn momentum_ratio(
     Some(given_n_s / (model.mass_kg() * gained_m_s))
 }
 
-/// Effort that points against the motion.
+/// Returns the finding on an effort with the wrong sign.
 fn of_signs(pull: &Pull, joints: &JointSettings) -> Option<Finding> {
     let [is_left, is_right] = pull.friction.map(|friction| friction < -AGAINST_MIN);
     let (key, text) = match (is_left, is_right) {
@@ -111,7 +113,7 @@ fn of_signs(pull: &Pull, joints: &JointSettings) -> Option<Finding> {
     ))
 }
 
-/// Effort that is too great or too small.
+/// Returns the finding on the size of the effort.
 fn of_size(pull: &Pull, effort: Effort, model: &RobotModel) -> Finding {
     let [least, most] = [
         pull.friction.into_iter().fold(f64::INFINITY, f64::min),

@@ -1,22 +1,23 @@
-//! Which signs and sides explain how wheels, gyro and ground answer two commands. Pure.
+//! Finds the wrong signs and sides that explain the responses of wheels, gyro and ground to two
+//! commands. Pure.
 //!
-//! The robot is commanded to turn left on the spot, and then to drive ahead. Each of the flips of
-//! [`Flip`] changes some of the answers. Every set of flips is tried, and the smallest one that
-//! explains all answers is what is wrong: one flip rather than two, and two rather than three.
+//! The robot is commanded to turn left on the spot, and then to drive forward. Each flip of
+//! [`Flip`] changes some of the responses. Every set of flips is tried, and the smallest set that
+//! explains all responses is reported.
 
 use super::finding::{Finding, list};
 use crate::drive::ros2::settings::Ros2Settings;
 
-/// How the robot answered: 1 or -1 for a direction.
+/// Responses of the robot, 1 or -1 for a direction.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Answers {
-    /// How the left and the right joints turned when a turn to the left was commanded.
+    /// Directions of the joints for the turn to the left, `[left, right]`.
     pub(super) turn: [i8; 2],
-    /// The same when it was commanded to drive ahead.
+    /// Directions of the joints for the drive forward, `[left, right]`.
     pub(super) forward: [i8; 2],
-    /// Whether the robot turned to the left then, by its gyro; 0 where that is not known.
+    /// Direction of the turn by the gyro, 1 to the left; 0 if unknown.
     pub(super) turned: i8,
-    /// Whether it went ahead, by its position or its speed over ground; 0 where that is not known.
+    /// Direction of the drive by position or speed over ground, 1 forward; 0 if unknown.
     pub(super) went: i8,
 }
 

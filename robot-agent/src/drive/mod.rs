@@ -15,47 +15,47 @@ use tread_control::geometry::Pose;
 use tread_control::localisation::FixNoise;
 use tread_control::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
 
-/// Most samples of one tick: a 20 Hz loop with 200 Hz sensors, with room for jitter.
+/// Largest number of samples per tick: a 20 Hz loop with 200 Hz sensors, with room for jitter.
 pub const SAMPLES_MAX: usize = 16;
 
-/// Longest silence of any base with which it does not count as silent.
+/// Largest age of a base's last sample at which it does not count as silent yet, for any base.
 pub const SILENT_AFTER_MAX: Duration = Duration::from_millis(200);
 
-/// What the base's sensors said at one moment; absent where a sensor said nothing then.
+/// Sensor values measured at one time; `None` where a sensor has no value for it.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct SensorSample {
-    /// When it was measured, by the agent's monotonic clock.
+    /// Time of measurement, by the agent's monotonic clock.
     pub at: Duration,
-    /// Turn rate from the gyro, radians per second.
+    /// Yaw rate of the gyro, rad/s, positive to the left.
     pub yaw_rate_rad_s: Option<f64>,
-    /// Acceleration without gravity.
+    /// Acceleration without gravity, in the robot frame.
     pub acceleration: Option<BodyAcceleration>,
     /// Wheel speeds as measured, never as commanded.
     pub wheel_speeds: Option<WheelSpeeds>,
-    /// Drive torques.
+    /// Drive torques of the wheels.
     pub wheel_torques: Option<WheelTorques>,
-    /// Speed of the body over ground, ahead, metres per second.
+    /// Forward speed of the body over ground, m/s.
     pub body_speed_m_s: Option<f64>,
-    /// How far the robot leans from level, radians.
+    /// Tilt of the robot against the vertical, radians.
     pub tilt_rad: Option<f64>,
     /// A position fix in the site's frame.
     pub position: Option<Pose>,
-    /// How good that fix is, where the base says so.
+    /// Standard deviations of the fix, where the base states them.
     pub position_noise: Option<FixNoise>,
 }
 
-/// How good the base says that its sensors are: one standard deviation each, where it says so.
+/// Standard deviations of the sensors' noise, where the base states them.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct StatedNoise {
-    /// Gyro, radians per second.
+    /// Gyro, rad/s.
     pub gyro_rad_s: Option<f64>,
-    /// Accelerometer, metres per second squared.
+    /// Accelerometer, m/s².
     pub accelerometer_m_s2: Option<f64>,
-    /// Speed of the body over ground, metres per second.
+    /// Speed of the body over ground, m/s.
     pub body_speed_m_s: Option<f64>,
 }
 
-/// Word of new samples, for a loop that waits for them.
+/// Signals new samples to a loop that waits for them.
 #[derive(Debug, Default)]
 pub struct Arrivals {
     count: AtomicU64,
@@ -63,13 +63,13 @@ pub struct Arrivals {
 }
 
 impl Arrivals {
-    /// From now on the calling thread is woken.
+    /// Makes [`Arrivals::ring`] wake the calling thread.
     pub fn attend(&self) {
-        // A second thread would be a mistake of the program's; the first goes on.
+        // A second thread would be a programming error; the first one stays registered.
         let _ = self.waiting.set(std::thread::current());
     }
 
-    /// A sample has come.
+    /// Counts a new sample and wakes the waiting thread.
     pub fn ring(&self) {
         self.count.fetch_add(1, Ordering::Release);
         if let Some(waiting) = self.waiting.get() {
@@ -77,13 +77,13 @@ impl Arrivals {
         }
     }
 
-    /// How many have come.
+    /// Returns the number of samples so far.
     pub fn count(&self) -> u64 {
         self.count.load(Ordering::Acquire)
     }
 }
 
-/// Everything that the base said since the last tick, oldest first.
+/// Samples of the base since the last tick, oldest first.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Feedback {
     samples: [SensorSample; SAMPLES_MAX],
@@ -92,7 +92,7 @@ pub struct Feedback {
 }
 
 impl Feedback {
-    /// Adds a sample; the oldest gives way when there are too many.
+    /// Adds a sample; drops and counts the oldest one above [`SAMPLES_MAX`].
     pub fn push(&mut self, sample: SensorSample) {
         if self.count == SAMPLES_MAX {
             self.samples.rotate_left(1);
@@ -103,24 +103,24 @@ impl Feedback {
         self.count += 1;
     }
 
-    /// The same with so many more samples that gave way.
+    /// Adds to the number of dropped samples.
     #[must_use]
     pub fn with_lost(mut self, lost: u32) -> Self {
         self.lost = self.lost.saturating_add(lost);
         self
     }
 
-    /// The samples, oldest first.
+    /// Returns the samples, oldest first.
     pub fn samples(&self) -> &[SensorSample] {
         &self.samples[..self.count]
     }
 
-    /// Takes the newest back.
+    /// Removes the newest sample.
     pub fn pop(&mut self) {
         self.count = self.count.saturating_sub(1);
     }
 
-    /// Samples that gave way.
+    /// Returns the number of dropped samples.
     pub fn lost(&self) -> u32 {
         self.lost
     }
@@ -135,36 +135,36 @@ pub struct Battery {
     pub voltage_v: f64,
 }
 
-/// A base.
+/// A robot base.
 pub trait Drive: Send {
-    /// Everything that the sensors said since the last call.
+    /// Returns the samples since the last call. Must not block or allocate.
     fn read(&mut self, now: Duration) -> Feedback;
 
-    /// Commands the wheels; the base keeps this until the next call.
+    /// Commands the wheel speeds, in force until the next call. Must not block or allocate.
     fn write(&mut self, command: WheelSpeeds);
 
-    /// The battery; none if the base does not measure it.
+    /// Returns the battery; `None` if the base does not measure it.
     fn battery(&self) -> Option<Battery> {
         None
     }
 
-    /// How good the sensors are, as far as the base says so.
+    /// Returns the standard deviations of the sensors, as far as the base states them.
     fn noise(&self) -> StatedNoise {
         StatedNoise::default()
     }
 
-    /// Oldest word of the base with which it does not count as silent, at most
+    /// Returns the age of the last sample beyond which the base counts as silent, at most
     /// [`SILENT_AFTER_MAX`].
     fn silent_after(&self) -> Duration {
         SILENT_AFTER_MAX
     }
 
-    /// Whether the base itself is commanded to rest, because no message of it arrives.
+    /// Whether the drive itself commands zero because no sample of the base arrives.
     fn is_silent(&self) -> bool {
         false
     }
 
-    /// What tells of new samples, if they are to set the loop's pace.
+    /// Returns the signal of new samples, if they shall trigger the loop's ticks.
     fn arrivals(&self) -> Option<Arc<Arrivals>> {
         None
     }

@@ -1,7 +1,7 @@
 //! A simulated base behind the drive interface.
 //!
-//! It has no thread of its own: reading moves it on to the present time in steps of its sensors'
-//! period, under the last command, so that a loop that comes late finds the robot farther on.
+//! It has no thread of its own: a read advances it to the present time in steps of its sensors'
+//! period, under the last command, so that the robot moves on while a loop is late.
 
 use std::time::Duration;
 
@@ -18,40 +18,39 @@ use crate::sim::scenario::{Scenario, ScenarioError};
 use crate::sim::sensors::{SAMPLE_PERIOD, SensorSpec, Sensors};
 use crate::sim::trace::{Trace, TruthSample};
 
-/// Most simulated time of one call; a process that slept longer finds its robot paused.
+/// Largest simulated time of one call; beyond it, as after a suspended process, time is skipped.
 const CATCH_UP_MAX: Duration = Duration::from_secs(1);
 
-/// Longest time that the base drives on without a new command; then it stops its wheels, as every
-/// base must.
+/// Time without a new command after which the base stops its wheels, as every base must.
 pub const COMMAND_TIMEOUT: Duration = Duration::from_millis(300);
 
-/// What moves the simulated time.
+/// What advances the simulated time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum SimMode {
-    /// Reading moves it on to the time of the call.
+    /// A read advances it to the time of the call.
     #[default]
     Auto,
-    /// Only [`SimulatedDrive::advance`] moves it; for tests.
+    /// Only [`SimulatedDrive::advance`] advances it; for tests.
     Explicit,
 }
 
 /// Why a simulated base could not be made.
 #[derive(Debug, thiserror::Error)]
 pub enum SimulatedDriveError {
-    /// The plant refused a figure.
+    /// A parameter of the plant is out of its range.
     #[error("the simulated base cannot be made")]
     Plant(#[from] PlantError),
-    /// The scenario's ground was refused.
+    /// The scenario's ground is invalid.
     #[error("the simulated ground cannot be made")]
     Ground(#[from] ScenarioError),
 }
 
-/// A fault of the base: reading it blocks once, as a stuck bus would.
+/// A fault of the base: a read blocks once, as with a stuck bus.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Stall {
-    /// When, from the first reading on.
+    /// Time after the first read at which the fault begins.
     pub after: Duration,
-    /// For how long.
+    /// Duration for which the read blocks.
     pub lasting: Duration,
 }
 
@@ -66,11 +65,11 @@ pub struct SimulatedDrive {
     track_width_m: f64,
     battery: SimulatedBattery,
     command: WheelSpeeds,
-    /// When the command came, in simulated time.
+    /// Simulated time of the command.
     commanded_at: Duration,
     tilt_rad: f64,
     waiting: Feedback,
-    /// Up to when it has been simulated; none before the first call.
+    /// Time up to which the base is simulated; `None` before the first call.
     simulated_to: Option<Duration>,
     stall: Option<Stall>,
     first_read_at: Option<Duration>,
@@ -78,19 +77,19 @@ pub struct SimulatedDrive {
     trace: Option<Trace>,
 }
 
-/// What makes one base differ from others of its model.
+/// Properties in which one base differs from others of its model.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Individual {
-    /// What makes its noise, offsets and rolling radii its own.
+    /// Seed of its sensor noise, offsets and rolling radii.
     pub seed: u64,
-    /// How much stiffer any ground is on its tyres than the scenario says.
+    /// Ratio of the friction stiffness on its tyres to that of the scenario.
     pub stiffness_ratio: f64,
     /// Whether it measures wheel torque.
     pub has_torque: bool,
 }
 
 impl Individual {
-    /// One with usual tyres and a torque sensor.
+    /// Creates properties with a stiffness ratio of 1 and a torque sensor.
     pub fn of_seed(seed: u64) -> Self {
         Self {
             seed,
@@ -101,10 +100,10 @@ impl Individual {
 }
 
 impl SimulatedDrive {
-    /// A base at rest at a pose on a scenario's ground.
+    /// Creates a stopped base at a pose on a scenario's ground.
     ///
     /// # Errors
-    /// [`SimulatedDriveError`] when a figure is out of its range.
+    /// [`SimulatedDriveError`] if a parameter of the plant or the ground is out of its range.
     pub fn new(
         scenario: &Scenario,
         model: RobotModel,
@@ -144,47 +143,47 @@ impl SimulatedDrive {
         })
     }
 
-    /// The same base with another charge of its battery, 0 to 1.
+    /// Sets the charge of the battery, 0 to 1.
     #[must_use]
     pub fn with_charge(mut self, charge_ratio: f64) -> Self {
         self.battery = SimulatedBattery::new(charge_ratio);
         self
     }
 
-    /// The same base with a fault.
+    /// Adds a stall.
     #[must_use]
     pub fn with_stall(mut self, stall: Option<Stall>) -> Self {
         self.stall = stall;
         self
     }
 
-    /// The same base with these faults.
+    /// Sets the faults.
     #[must_use]
     pub fn with_faults(mut self, faults: Vec<Fault>) -> Self {
         self.faults = Faults::new(faults);
         self
     }
 
-    /// The same base, which leaves word of what it truly does.
+    /// Records the true state in a trace.
     #[must_use]
     pub fn with_trace(mut self, trace: Option<Trace>) -> Self {
         self.trace = trace;
         self
     }
 
-    /// Leans the base from level, radians; a simulated fault.
+    /// Sets the measured tilt, radians; a simulated fault.
     #[cfg(any(test, feature = "testing"))]
     pub fn lean(&mut self, tilt_rad: f64) {
         self.tilt_rad = tilt_rad;
     }
 
-    /// The true state, for tests and figures.
+    /// Returns the true state.
     #[cfg(any(test, feature = "testing"))]
     pub fn truth(&self) -> &tread_control::plant::PlantState {
         self.plant.state()
     }
 
-    /// The true ground under the robot's left side.
+    /// Returns the true ground under the robot's centre.
     #[cfg(any(test, feature = "testing"))]
     pub fn ground_truth(&self) -> crate::sim::scenario::GroundSpec {
         let at = self.simulated_to.unwrap_or_default();
@@ -196,7 +195,7 @@ impl SimulatedDrive {
         }
     }
 
-    /// Moves the simulated time on to `now`.
+    /// Advances the simulated time to `now`.
     pub fn advance(&mut self, now: Duration) {
         let from = self
             .simulated_to

@@ -1,4 +1,4 @@
-//! A command that came in, and its answer.
+//! A received command, and its answer.
 
 use serde::Serialize;
 use tracing::warn;
@@ -11,15 +11,15 @@ use zenoh::query::Query;
 /// A command that waits for its answer.
 #[derive(Debug)]
 pub struct IncomingCommand {
-    /// What is asked.
+    /// Verb of the command.
     pub verb: Verb,
-    /// The payload as it came.
+    /// Payload as received.
     pub payload: Vec<u8>,
     pub(super) query: Query,
 }
 
 impl IncomingCommand {
-    /// Answers; a failure is logged, for the server asks again.
+    /// Sends the answer; a failure is logged, since the server repeats the command.
     pub async fn answer<R: Serialize>(self, answer: &Answer<R>) {
         match wire::encode(answer) {
             Ok(payload) => self.reply(payload, false).await,
@@ -30,7 +30,7 @@ impl IncomingCommand {
         }
     }
 
-    /// Refuses the message as a whole.
+    /// Refuses the whole message by an error reply.
     pub async fn refuse(self, refusal: &Refusal) {
         if let Ok(payload) = wire::encode(refusal) {
             self.reply(payload, true).await;

@@ -1,30 +1,30 @@
-//! Why the link could not be made, and why a question went without an answer.
+//! Errors of the link and of queries to the server.
 
 use tread_api::wire::{self, Refusal, RefusalCode, WireError};
 
-/// Why the link could not be made.
+/// Why the link could not be opened.
 #[derive(Debug, thiserror::Error)]
 pub enum LinkError {
-    /// An endpoint is none.
+    /// The endpoint is invalid.
     #[error("`{endpoint}` is no zenoh endpoint: {problem}")]
     Endpoint {
-        /// What was given.
+        /// The text given as the endpoint.
         endpoint: String,
-        /// What is wrong with it.
+        /// The problem with it.
         problem: String,
     },
     /// The robot's certificate, its key or the fleet's authority cannot be used.
     #[error("the robot's certificate cannot be used; join the fleet again")]
     Certificate(#[source] rustls::Error),
-    /// The machine gives no port on the loopback.
+    /// No port on the loopback interface can be opened.
     #[error("the tunnel's local port cannot be opened")]
     LocalPort(#[source] std::io::Error),
-    /// zenoh refused.
+    /// A call of zenoh failed.
     #[error("zenoh could not {action}: {problem}")]
     Zenoh {
-        /// What was tried.
+        /// The action that failed.
         action: &'static str,
-        /// What zenoh said.
+        /// The error message of zenoh.
         problem: String,
     },
 }
@@ -36,10 +36,10 @@ pub(crate) fn zenoh_failed(action: &'static str) -> impl FnOnce(zenoh::Error) ->
     }
 }
 
-/// Why a question to the server went without an answer.
+/// Why a query to the server has no usable answer.
 #[derive(Debug, thiserror::Error)]
 pub enum AskError {
-    /// Nobody answered: the server is not there, or too slow.
+    /// No answer in time: the server is unreachable or too slow.
     #[error("the server did not answer")]
     NoAnswer,
     /// The server refused the whole message.
@@ -48,10 +48,10 @@ pub enum AskError {
     /// The answer cannot be read.
     #[error("the server's answer cannot be read")]
     Unreadable(#[source] WireError),
-    /// The question cannot be written.
+    /// The query cannot be encoded.
     #[error("the message cannot be written as JSON")]
     Unwritable(#[source] serde_json::Error),
-    /// zenoh refused.
+    /// A call of zenoh failed.
     #[error(transparent)]
     Link(#[from] LinkError),
 }
@@ -62,13 +62,13 @@ impl AskError {
         match wire::decode::<Refusal>(payload) {
             Ok(refusal) => Self::Refused(refusal),
             Err(other @ WireError::Version(_)) => Self::Unreadable(other),
-            // zenoh itself reports a timeout as an error reply of its own.
+            // zenoh itself reports a timeout as an error reply.
             Err(WireError::TooLarge(_) | WireError::Malformed(_)) => Self::NoAnswer,
         }
     }
 }
 
-/// Whether sending the same again to the same server may help.
+/// Whether repeating the same query may succeed.
 pub fn may_pass_later(error: &AskError) -> bool {
     match error {
         AskError::Refused(refusal) => refusal.code != RefusalCode::Malformed,

@@ -1,10 +1,9 @@
 //! The link to the fleet's server: the only module that calls zenoh.
 //!
-//! The session is a client that connects for ever; a robot that has joined a fleet connects through
-//! the [`tunnel`]. Calls of zenoh block the thread that makes
-//! them, so all but the cheapest are made on the blocking pool; what comes in is handed over by
-//! callbacks that never wait. Nothing here knows of loops, missions or disks: [`uploader`] alone
-//! knows the outbox.
+//! The session is a zenoh client that reconnects without end; a robot that has joined a fleet
+//! connects through the [`tunnel`]. Calls of zenoh block their thread, so all but the cheapest run
+//! on the blocking pool. Callbacks hand over what arrives and never block. This module is
+//! independent of the loop, missions and storage, except that [`uploader`] uses the outbox.
 
 mod command;
 mod error;
@@ -40,20 +39,21 @@ pub use self::session::{session_config, start_jitter};
 pub use self::tunnel::{DialError, Tunnel};
 use crate::membership::Membership;
 
-/// Commands that may wait to be answered; more are dropped, and the server asks again.
+/// Capacity of the queue of commands to answer; a command that finds it full is dropped, and the
+/// server repeats it.
 pub const COMMANDS_MAX: usize = 64;
-/// Longest wait for the server's answer to an introduction.
+/// Longest wait for the server's answer to the introduction ([`Hello`]).
 pub const HELLO_TIMEOUT: Duration = Duration::from_secs(2);
-/// Longest wait for the server's receipt.
+/// Longest wait for the server's receipt of an upload.
 pub const UPLOAD_TIMEOUT: Duration = Duration::from_secs(10);
 /// Longest wait for a session to close.
 pub const CLOSE_MAX: Duration = Duration::from_secs(3);
-/// Rest after a row of tries to connect.
+/// Pause after a failed attempt to open a session.
 const OPEN_REST: Duration = Duration::from_millis(100);
-/// Replies to one query that may wait; there is one server.
+/// Capacity for replies to one query; there is one server.
 const REPLIES_MAX: usize = 4;
 
-/// Who speaks.
+/// Identity with which the agent addresses the server.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct Identity {
     /// The site.
@@ -64,23 +64,23 @@ pub struct Identity {
     pub boot: BootId,
 }
 
-/// What the link notices, for those who count and watch.
+/// An event on the link, for counters and watches.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Noted {
-    /// The server was heard: its pulse, or a command.
+    /// A message of the server arrived: its pulse, or a command.
     ServerHeard,
-    /// A command found no room; the server asks again.
+    /// A command was dropped because the queue was full; the server repeats it.
     CommandLost,
-    /// The server said which authorities robots are to trust.
+    /// The server stated which authorities robots shall trust.
     Trust(TrustId),
     /// The server's robot port shows a certificate of an authority that this robot does not trust.
     Distrusted,
 }
 
-/// Callback for what the link notices; must not wait.
+/// Callback for events on the link; must not block.
 pub type Note = Arc<dyn Fn(Noted) + Send + Sync>;
 
-/// What must not wait in any queue, as it came.
+/// A message that must not wait in any queue, with its payload as received.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Urgent<'payload> {
     /// A stop; it is answered later, as a command.
@@ -91,17 +91,18 @@ pub enum Urgent<'payload> {
     Limit(&'payload OwnerId, &'payload [u8]),
 }
 
-/// Who takes what must not wait; must not wait either.
+/// Callback for urgent messages; must not block.
 pub type TakeUrgent = Arc<dyn Fn(Urgent<'_>) + Send + Sync>;
 
-/// Who hears what comes in besides commands.
+/// Receivers of what arrives on the link.
 #[derive(Clone)]
 pub struct Listeners {
-    /// Takes what the link notices.
+    /// Called for each event on the link.
     pub note: Note,
-    /// Takes what must not wait.
+    /// Called for each urgent message.
     pub urgent: TakeUrgent,
-    /// Takes commands; what finds no room is dropped, and the server asks again.
+    /// Receives commands; a command that finds the queue full is dropped, and the server repeats
+    /// it.
     pub commands: mpsc::Sender<IncomingCommand>,
 }
 
@@ -122,15 +123,15 @@ pub struct FleetLink {
     ingest: Querier<'static>,
     _alive: LivelinessToken,
     server_seen: watch::Receiver<u64>,
-    /// What the session connects through; it must outlive the session.
+    /// Tunnel of the session; must outlive it.
     tunnel: Option<Tunnel>,
 }
 
-/// Commands that wait to be answered. They outlive a link: what came by one is answered though
-/// another has been opened meanwhile.
+/// Queue of commands to answer. It outlives a link: a command that arrived by one link is answered
+/// even after another one has been opened.
 pub type Commands = mpsc::Receiver<IncomingCommand>;
 
-/// Opens a session, however long that takes; `None` once it was given up. Blocks its thread.
+/// Opens a session, retrying until it succeeds; `None` once cancelled. Blocks its thread.
 fn open(config: &zenoh::Config, given_up: &CancellationToken) -> Option<zenoh::Session> {
     while !given_up.is_cancelled() {
         match zenoh::open(config.clone()).wait() {
@@ -147,8 +148,8 @@ fn open(config: &zenoh::Config, given_up: &CancellationToken) -> Option<zenoh::S
     None
 }
 
-/// Opens a session on a thread of its own, which can be left behind: opening blocks until the
-/// server is there. `None` once requested to stop.
+/// Opens a session on a thread of its own, which can be abandoned, since opening blocks until the
+/// server is reachable. `None` once requested to stop.
 async fn open_session(
     config: zenoh::Config,
     stop: &CancellationToken,
@@ -160,7 +161,7 @@ async fn open_session(
         .name("fleet-connect".to_owned())
         .spawn(move || {
             let session = open(&config, &given_up);
-            // Nobody may wait any more: the session closes by being dropped.
+            // Without a receiver the session is closed by being dropped.
             let _ = opened.send(session);
         })
         .map_err(|cause| LinkError::Zenoh {
@@ -190,11 +191,11 @@ pub fn check_endpoint(server: &str) -> Result<(), LinkError> {
 }
 
 impl FleetLink {
-    /// Connects, however long that takes, and declares everything; `None` once requested to stop.
-    /// Dropped before it is done, it leaves nothing behind for long.
+    /// Connects, retrying until it succeeds, and declares all publishers, queriers and subscribers;
+    /// `None` once requested to stop. If the future is dropped, its thread ends soon.
     ///
     /// # Errors
-    /// [`LinkError`] for an endpoint that is none, or when zenoh refuses a declaration.
+    /// [`LinkError`] for an invalid endpoint or certificate, or when zenoh refuses a declaration.
     pub async fn connect(
         server: &str,
         membership: Option<&Membership>,
@@ -219,7 +220,7 @@ impl FleetLink {
         }
     }
 
-    /// Declares everything on an open session; `None` if there is none.
+    /// Declares all publishers, queriers and subscribers; `None` without a session.
     async fn introduce(
         session: Option<zenoh::Session>,
         server: &str,
@@ -250,7 +251,7 @@ impl FleetLink {
         let (noted, urgent) = (Arc::clone(&listeners.note), Arc::clone(&listeners.urgent));
         let own_run = identity.boot.to_string();
         let take_query = move |query: Query| {
-            // For another agent under this robot's name: no reply from here.
+            // Addressed to another run of the agent: no reply.
             if query
                 .parameters()
                 .get(keys::RUN)
@@ -260,7 +261,7 @@ impl FleetLink {
             }
             noted(Noted::ServerHeard);
             let Some(Key::Command(_, _, verb)) = Key::parse(query.key_expr().as_str()) else {
-                // A wildcard or an unknown verb: no reply means not delivered.
+                // A wildcard or an unknown verb: no reply, which means not delivered.
                 return;
             };
             let payload = query.payload().map_or(0, zenoh::bytes::ZBytes::len);
@@ -277,7 +278,7 @@ impl FleetLink {
                 payload: payload.unwrap_or_default(),
                 query,
             };
-            // Full: the query is dropped, the server sees no reply and asks again.
+            // Queue full: the query is dropped, the server gets no reply and repeats it.
             if command_sender.try_send(command).is_err() {
                 noted(Noted::CommandLost);
             }
@@ -291,7 +292,7 @@ impl FleetLink {
             .map_err(zenoh_failed("declare the commands"))?;
         Self::listen_urgently(&session, site, robot, &listeners.urgent)?;
         Self::listen_to_pulse(&session, site, &listeners.note)?;
-        // The heartbeat goes before all else that the robot says, the bulk of records after it.
+        // The state has priority over everything else that the robot sends, records have the least.
         let publisher = |key: String, priority: Priority| {
             let publisher = session.declare_publisher(key).priority(priority);
             publisher.congestion_control(CongestionControl::Drop).wait()
@@ -340,7 +341,7 @@ impl FleetLink {
         })
     }
 
-    /// The server's pulse, which also tells whom robots are to trust.
+    /// Subscribes to the server's pulse, which also states which authorities robots shall trust.
     fn listen_to_pulse(
         session: &zenoh::Session,
         site: &SiteId,
@@ -361,7 +362,8 @@ impl FleetLink {
             .map_err(zenoh_failed("listen for the server's pulse"))
     }
 
-    /// Drive commands and limits: the latest counts, so each is taken in its callback.
+    /// Subscribes to drive commands and limits. Only the latest counts, so each is processed in its
+    /// callback.
     fn listen_urgently(
         session: &zenoh::Session,
         site: &SiteId,
@@ -390,17 +392,17 @@ impl FleetLink {
             .map_err(zenoh_failed("listen for limits"))
     }
 
-    /// Counts how often the server has come into reach; changes with each (re)connection.
+    /// Returns a counter that increases whenever the server becomes reachable.
     pub fn server_seen(&self) -> watch::Receiver<u64> {
         self.server_seen.clone()
     }
 
-    /// Who this is.
+    /// Returns the identity of this agent.
     pub fn identity(&self) -> &Identity {
         &self.identity
     }
 
-    /// Publishes the state, or loses it where the network is slow.
+    /// Publishes the state; it is dropped if the network is congested.
     pub fn publish_state(&self, state: &RobotState) {
         match wire::encode(state) {
             Ok(payload) => log_failed(self.state.put(payload).wait(), "state"),
@@ -408,7 +410,7 @@ impl FleetLink {
         }
     }
 
-    /// Publishes both friction estimates, or loses them where the network is slow.
+    /// Publishes both friction estimates; they are dropped if the network is congested.
     pub fn publish_friction(&self, report: &FrictionReport) {
         match wire::encode(report) {
             Ok(payload) => log_failed(self.friction.put(payload).wait(), "friction"),
@@ -416,20 +418,20 @@ impl FleetLink {
         }
     }
 
-    /// Introduces the robot to the server.
+    /// Introduces the robot to the server, and returns its answer.
     ///
     /// # Errors
-    /// [`AskError`] when there is no welcome.
+    /// [`AskError`] if there is no readable answer.
     pub async fn hello(self: &Arc<Self>, hello: &Hello) -> Result<Welcome, AskError> {
         let payload = wire::encode(hello).map_err(AskError::Unwritable)?;
         let answer = self.ask(Question::Hello, payload).await?;
         wire::decode(&answer).map_err(AskError::Unreadable)
     }
 
-    /// Uploads a batch; a receipt comes after the server's commit.
+    /// Uploads a batch; the receipt is sent after the server's commit.
     ///
     /// # Errors
-    /// [`AskError`] when there is no receipt: the batch may or may not have been taken.
+    /// [`AskError`] if there is no readable receipt: the batch may or may not have been stored.
     pub async fn upload(self: &Arc<Self>, batch: &Batch) -> Result<Receipt, AskError> {
         let payload = wire::encode(batch).map_err(AskError::Unwritable)?;
         let answer = self.ask(Question::Ingest, payload).await?;
@@ -442,7 +444,7 @@ impl FleetLink {
         payload: Vec<u8>,
     ) -> Result<Vec<u8>, AskError> {
         let link = Arc::clone(self);
-        // Sending blocks where the network is slow.
+        // Sending blocks while the network is slow.
         let sending = tokio::task::spawn_blocking(move || {
             let querier = match question {
                 Question::Hello => &link.hello,
@@ -468,7 +470,7 @@ impl FleetLink {
         }
     }
 
-    /// Waits until the session can no longer reconnect, and the link is to be opened again.
+    /// Waits until the session can no longer reconnect, so that the link must be opened again.
     pub async fn lost_for_good(&self) {
         match &self.tunnel {
             Some(tunnel) => tunnel.stale().await,
@@ -476,7 +478,7 @@ impl FleetLink {
         }
     }
 
-    /// Closes the session: the token goes, the server sees the robot leave.
+    /// Closes the session; the server sees the robot's liveliness token disappear.
     pub async fn close(&self) {
         let session = self.session.clone();
         let closing = tokio::task::spawn_blocking(move || session.close().wait());
@@ -488,7 +490,7 @@ impl FleetLink {
     }
 }
 
-/// The bytes of a small payload; a larger one becomes nothing, which does not parse.
+/// Returns the bytes of a small payload; those of a larger one are empty, which does not parse.
 fn small(payload: &zenoh::bytes::ZBytes) -> Vec<u8> {
     if payload.len() > SMALL_PAYLOAD_MAX {
         return Vec::new();

@@ -1,4 +1,5 @@
-//! How the robot's session is opened: a client that connects for ever, with short queues below.
+//! Configuration of the robot's zenoh session: a client that reconnects without end, with short
+//! queues below zenoh.
 
 use std::net::SocketAddr;
 use std::str::FromStr;
@@ -9,33 +10,33 @@ use tread_api::wire::{BATCH_BYTES, SESSION_LEASE_MS};
 
 use super::{LinkError, zenoh_failed};
 
-/// First pause before a lost connection is tried again, milliseconds.
+/// First pause before a lost connection is retried, milliseconds.
 const RETRY_FIRST_MS: u32 = 100;
-/// Longest pause between tries, milliseconds.
+/// Longest pause between attempts, milliseconds.
 const RETRY_MAX_MS: u32 = 300;
-/// Longest try to connect, milliseconds. The kernel repeats its first packet every second, so a
-/// healed network is found within that, and this lies between two repetitions. It is also the time
-/// that a far and narrow link has for all the round trips of TCP, TLS and zenoh.
+/// Timeout of one attempt to connect, milliseconds. The kernel repeats its first packet every
+/// second, so a restored network is found within that; this value lies between two repetitions. It
+/// also bounds all round trips of TCP, TLS and zenoh on a link of high delay.
 const OPEN_TIMEOUT_MS: u32 = 2_500;
-/// Longest row of tries to connect before the configuration is looked at again, milliseconds.
+/// Timeout of a series of attempts before zenoh is opened again, milliseconds.
 const CONNECT_TIMEOUT_MS: u32 = 5_000;
 /// Send buffer of the kernel, bytes.
 const SEND_BUFFER_BYTES: u32 = 32_768;
-/// Send buffer of the kernel towards the tunnel, bytes; another one follows it.
+/// Kernel send buffer towards the tunnel, bytes; the tunnel has another one.
 const TUNNEL_SEND_BUFFER_BYTES: u32 = 4 * 1024;
 
-/// Longest pause before an agent first looks for its server.
+/// Longest pause before the first attempt to connect.
 const START_JITTER_MAX: Duration = Duration::from_millis(300);
 
-/// The pause before an agent first looks for its server, one of its own for each run: the boot is
-/// random already.
+/// Returns the pause before the first attempt to connect, from 0 to `START_JITTER_MAX`, derived
+/// from the random boot identifier.
 pub fn start_jitter(boot: BootId) -> Duration {
     let share = f64::from(boot.as_uuid().as_fields().0) / f64::from(u32::MAX);
     START_JITTER_MAX.mul_f64(share)
 }
 
-/// The endpoint with a small send buffer of the kernel, unless it names one: priorities act only
-/// above that buffer, so on a slow link a large one makes everything wait behind the bulk.
+/// Returns the endpoint with a small kernel send buffer, unless it names one: priorities act only
+/// above that buffer, so on a slow link a large one delays urgent messages behind bulk data.
 fn with_small_buffer(server: &str) -> String {
     if !server.starts_with("tcp/") || server.contains("so_sndbuf") {
         return server.to_owned();
@@ -44,10 +45,10 @@ fn with_small_buffer(server: &str) -> String {
     format!("{server}{joint}so_sndbuf={SEND_BUFFER_BYTES}")
 }
 
-/// What a session shows to the router.
+/// Credentials of a session at the router.
 #[derive(Clone)]
 pub(super) struct SessionUser {
-    /// The session's zenoh id, as zenoh's configuration has it.
+    /// zenoh id of the session, in hexadecimal.
     pub(super) session_id: String,
     /// The user name.
     pub(super) user: String,
@@ -64,10 +65,10 @@ impl std::fmt::Debug for SessionUser {
     }
 }
 
-/// How the robot's session through a tunnel is opened.
+/// Creates the configuration of a session through a tunnel.
 ///
 /// # Errors
-/// [`LinkError`]: zenoh refuses its configuration.
+/// [`LinkError`] if zenoh refuses a setting.
 pub(super) fn through_tunnel(
     local: SocketAddr,
     user: &SessionUser,
@@ -87,10 +88,10 @@ pub(super) fn through_tunnel(
     Ok(config)
 }
 
-/// How the robot's session in the clear is opened.
+/// Creates the configuration of an unencrypted session.
 ///
 /// # Errors
-/// [`LinkError`] for an endpoint that is none.
+/// [`LinkError`] for an invalid endpoint, or if zenoh refuses a setting.
 pub fn session_config(server: &str) -> Result<zenoh::Config, LinkError> {
     let endpoint_failed = |problem: String| LinkError::Endpoint {
         endpoint: server.to_owned(),

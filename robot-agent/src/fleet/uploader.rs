@@ -1,4 +1,4 @@
-//! Brings the outbox to the server: one batch at a time, oldest first, again until answered.
+//! Uploads the outbox to the server: one batch at a time, oldest first, repeated until answered.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -14,13 +14,13 @@ use crate::outbox::{Outbox, OutboxError, PendingBatch};
 
 /// First pause after a failure.
 pub const BACKOFF_FIRST: Duration = Duration::from_millis(100);
-/// Longest pause between two tries.
+/// Longest pause between two attempts.
 pub const BACKOFF_MAX: Duration = Duration::from_secs(5);
 
-/// How long one upload is to take, receipt and all.
+/// Target duration of one upload including its receipt.
 const UPLOAD_AIM: Duration = Duration::from_secs(1);
 
-/// Pauses that grow with each failure in a row.
+/// Pauses that double with each consecutive failure, up to [`BACKOFF_MAX`].
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Backoff {
     next: Duration,
@@ -40,8 +40,8 @@ impl Backoff {
     }
 }
 
-/// How many records go into one upload: about as many as the link carries in [`UPLOAD_AIM`]. On a
-/// narrow link a full batch would take longer than anybody waits for its receipt, for ever.
+/// Number of records per upload, adapted so that an upload takes about [`UPLOAD_AIM`]. On a slow
+/// link a full batch would exceed the timeout of its receipt every time.
 #[derive(Debug, Clone, Copy)]
 struct BatchSize {
     records_max: usize,
@@ -54,7 +54,7 @@ impl BatchSize {
         }
     }
 
-    /// A batch was answered for after that time.
+    /// Adapts the size to a batch that was answered after `took`.
     fn settled(&mut self, took: Duration) {
         if took > 2 * UPLOAD_AIM {
             self.halve();
@@ -63,7 +63,8 @@ impl BatchSize {
         }
     }
 
-    /// A batch was not answered for; an absent server does so at once, a narrow link late.
+    /// Adapts the size to a batch that was not answered: an absent server fails at once, a slow
+    /// link late.
     fn failed(&mut self, took: Duration) {
         if took > UPLOAD_AIM {
             self.halve();
@@ -75,7 +76,7 @@ impl BatchSize {
     }
 }
 
-/// Uploads for ever, once the server has welcomed the robot.
+/// Uploads until requested to stop, once the server has welcomed the robot.
 pub async fn run(
     link: Arc<FleetLink>,
     outbox: Outbox,
@@ -105,7 +106,7 @@ pub async fn run(
                     size.failed(took);
                     tokio::select! {
                         () = tokio::time::sleep(backoff.grow()) => {}
-                        // The server is back: no need to sit the pause out.
+                        // The server is reachable again: the pause ends.
                         changed = server_seen.changed() => if changed.is_err() { return },
                     }
                 }
@@ -146,7 +147,7 @@ async fn upload_next(
     let Some(mut sent) = pending? else {
         return Ok(Next::Empty);
     };
-    // The server puts the records' times right by it, should this clock be wrong.
+    // The server corrects the records' times by it, should this clock be wrong.
     sent.batch.robot_time = Some(clock.wall());
     match link.upload(&sent.batch).await {
         Ok(receipt) => {
@@ -165,8 +166,8 @@ async fn upload_next(
             log_refused(&cause);
             Ok(Next::TryLater)
         }
-        // The server cannot read the batch. Find the record that it stumbles over, so that the
-        // others pass, and move it to the dead letters.
+        // The server cannot read the batch. Halve it until the unreadable record is alone, and move
+        // that to the dead letters.
         Err(cause) => match sent.batch.records.as_slice() {
             [only] => {
                 let refusal = RefusedRecord {
@@ -189,13 +190,13 @@ async fn upload_next(
 async fn settle(outbox: &Outbox, sent: PendingBatch, receipt: Receipt) -> Result<(), OutboxError> {
     let outbox = outbox.clone();
     let settling = tokio::task::spawn_blocking(move || outbox.settle(&sent, &receipt));
-    // An aborted settlement leaves the batch where it was.
+    // An aborted settlement leaves the batch in the outbox.
     settling.await.unwrap_or(Ok(()))
 }
 
 fn log_refused(cause: &AskError) {
     match cause {
-        // What an absent server looks like; the link logs that.
+        // The usual result of an absent server, which the link logs.
         AskError::NoAnswer => {}
         AskError::Refused(refusal) => {
             warn!(code = ?refusal.code, "the server refused an upload: {}", refusal.detail);

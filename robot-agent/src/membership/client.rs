@@ -1,9 +1,8 @@
 //! Joins the fleet and renews the certificate over the server's REST API.
 //!
-//! A renewal is proved by a signature with the present key over the request for the next, which
-//! is itself signed with the next key. So it needs no TLS with certificates of clients, works
-//! through any proxy, and what is overheard is of no use: the answer fits a key that only the
-//! robot has.
+//! A renewal is authenticated by a signature with the present key over the request for the next
+//! certificate, which is signed with the next key. It needs no TLS client certificates and passes
+//! any proxy, and an eavesdropper cannot use the answer, which fits a key that only the robot has.
 
 use std::net::IpAddr;
 use std::time::Duration;
@@ -28,52 +27,52 @@ const CONNECT_WAIT_MAX: Duration = Duration::from_secs(5);
 /// Why a robot got no certificate.
 #[derive(Debug, thiserror::Error)]
 pub enum MembershipError {
-    /// The address is not one.
+    /// The address is not a valid URL.
     #[error("`{0}` is not the address of a server: use one like https://tread.example:8420")]
     Address(String),
-    /// Everybody could read and change what is sent.
+    /// The connection to another machine would not be encrypted.
     #[error("`{0}` is another machine without TLS: use https")]
     ClearText(String),
-    /// The authority to trust does not read.
+    /// The certificate of the authority cannot be parsed.
     #[error("the authority to trust cannot be used")]
     Trust(#[source] rustls::Error),
     /// No key could be made.
     #[error("no key could be made, or it could not sign")]
     Key(#[source] rcgen::Error),
-    /// Nothing answers there.
+    /// No server answers at the address.
     #[error("no server answers at `{server}`")]
     Unreachable {
-        /// Where.
+        /// Address of the server.
         server: String,
-        /// Why.
+        /// Error of the request.
         #[source]
         source: reqwest::Error,
     },
     /// The server refused.
     #[error("the server refused ({status}): {detail}")]
     Refused {
-        /// How.
+        /// HTTP status of the answer.
         status: StatusCode,
-        /// What it says.
+        /// Detail of the answer.
         detail: String,
     },
-    /// The answer does not read.
+    /// The answer cannot be parsed.
     #[error("the answer of `{0}` does not read: is it a Tread server?")]
     NotUnderstood(String),
 }
 
-/// What a robot needs to join.
+/// Parameters of an enrolment.
 #[derive(Clone)]
 pub struct Enrolment {
-    /// Where the REST API is.
+    /// Address of the REST API.
     pub server: String,
-    /// Whom it must show to be signed by.
+    /// How the REST API is authenticated.
     pub trust: Trust,
     /// The secret of a join token.
     pub token: String,
-    /// Who the robot is; may be left out if the token names it.
+    /// The robot; not needed if the token names it.
     pub robot: Option<RobotId>,
-    /// The robots' port, as zenoh writes it, if it is not on the server's own address.
+    /// Endpoint of the robots' port in zenoh's notation, if it is not on the server's address.
     pub endpoint: Option<String>,
 }
 
@@ -87,10 +86,10 @@ impl std::fmt::Debug for Enrolment {
     }
 }
 
-/// Joins the fleet: makes a key, which stays here, and gets a certificate for it.
+/// Joins the fleet: makes a key, which never leaves the robot, and requests a certificate for it.
 ///
 /// # Errors
-/// [`MembershipError`].
+/// [`MembershipError`]; nothing is saved.
 pub async fn enrol(enrolment: &Enrolment, now: Timestamp) -> Result<Membership, MembershipError> {
     let url = parse(&enrolment.server)?;
     let (key, request) = new_key()?;
@@ -118,10 +117,10 @@ pub async fn enrol(enrolment: &Enrolment, now: Timestamp) -> Result<Membership, 
 }
 
 impl Membership {
-    /// Gets the next certificate, for a new key.
+    /// Requests the next certificate, for a new key.
     ///
     /// # Errors
-    /// [`MembershipError`]; the present one stays good.
+    /// [`MembershipError`]; the present certificate stays valid.
     pub(super) async fn renewed(&self, now: Timestamp) -> Result<Self, MembershipError> {
         let url = parse(&self.server)?;
         let present = KeyPair::from_pem(&self.key).map_err(MembershipError::Key)?;
@@ -146,7 +145,7 @@ impl Membership {
     }
 }
 
-/// A new key, and a request for a certificate. Names in it would count for nothing.
+/// Makes a key, and a certificate request without names, which the server would ignore.
 fn new_key() -> Result<(KeyPair, String), MembershipError> {
     let key = KeyPair::generate().map_err(MembershipError::Key)?;
     let mut params = CertificateParams::default();
@@ -198,7 +197,7 @@ async fn post<B: Serialize + Sync>(
     builder = match trust.client_config().map_err(MembershipError::Trust)? {
         Some(config) => builder.tls_backend_preconfigured(config),
         None if url.scheme() == "https" => builder,
-        // Nobody is trusted, so that no machine's certificates need be read.
+        // No roots are trusted, so that the machine's certificates are not read.
         None => builder.tls_certs_only([]),
     };
     let client = builder.build().map_err(unreachable)?;

@@ -1,4 +1,4 @@
-//! A robot's place in the fleet: its certificate and key, and where it gets the next one.
+//! A robot's membership in the fleet: its certificate and key, and their renewal.
 //!
 //! ```text
 //!  none ──enroll, with a join token──► member ──two thirds of the certificate's time──► renews
@@ -6,11 +6,11 @@
 //!                                         └───────────────────────────────────────────────┘
 //! ```
 //!
-//! When the server says that robots are to trust other authorities than this one does, it renews at
-//! once: the answer brings them, and a certificate of the one that signs now.
+//! When the server states that robots shall trust other authorities than this one does, it renews
+//! at once: the answer contains them, and a certificate of the present authority.
 //!
-//! All of it is one file that only its owner can read, replaced as a whole: there is no moment at
-//! which key and certificate do not belong together.
+//! A membership is one file, readable by its owner only and replaced as a whole, so key and
+//! certificate always belong together.
 
 mod client;
 mod renewal;
@@ -30,9 +30,9 @@ pub(crate) use self::renewal::{Renewal, ServerTrust};
 pub use self::trust::{Fingerprint, InvalidFingerprint, Trust};
 use crate::durable;
 
-/// The file in the robot's folder.
+/// Name of the file in the robot's folder.
 pub const FILE: &str = "membership.json";
-/// The share of a certificate's time after which it is renewed.
+/// Fraction of a certificate's lifetime after which it is renewed.
 const RENEW_AFTER: f64 = 2.0 / 3.0;
 
 /// A robot's place in the fleet.
@@ -42,23 +42,23 @@ pub struct Membership {
     pub site: SiteId,
     /// The robot.
     pub robot: RobotId,
-    /// How often it has joined.
+    /// Number of the robot's enrolments.
     pub enrolment: u32,
     /// Its certificate, PEM.
     pub certificate: String,
     /// Its key, PEM; it never leaves the robot.
     pub(crate) key: String,
-    /// Whom the robots' port may show to be signed by, PEM; two during a rotation.
+    /// Authorities that the robots' port is verified against, PEM; two during a rotation.
     pub authority: String,
-    /// Where the REST API is, for renewals.
+    /// Address of the REST API, for renewals.
     pub server: String,
-    /// Whom the REST API must show to be signed by.
+    /// How the REST API is authenticated.
     pub trust: Trust,
-    /// The robots' port, as zenoh writes it.
+    /// Endpoint of the robots' port in zenoh's notation.
     pub endpoint: String,
-    /// When the certificate came, by the robot's own clock.
+    /// Time of receipt of the certificate, by the robot's clock.
     pub issued_at: Timestamp,
-    /// How long it is good for from then on, seconds.
+    /// Lifetime of the certificate from `issued_at`, seconds.
     pub lifetime_s: u64,
 }
 
@@ -80,19 +80,19 @@ pub enum MembershipFileError {
     /// It cannot be read.
     #[error("`{}` cannot be read", path.display())]
     Unreadable {
-        /// Which file.
+        /// The file.
         path: PathBuf,
-        /// Why.
+        /// Error of the operating system.
         #[source]
         source: io::Error,
     },
-    /// It is not as it was written.
+    /// Its checksum does not match.
     #[error("`{}` is damaged; join the fleet again", path.display())]
     Damaged {
         /// Which file.
         path: PathBuf,
     },
-    /// It does not say what it should.
+    /// It is not valid JSON of a [`Membership`].
     #[error("`{}` does not read; join the fleet again", path.display())]
     Malformed {
         /// Which file.
@@ -113,10 +113,10 @@ pub enum MembershipFileError {
 }
 
 impl Membership {
-    /// Reads the file in a robot's folder; `None` if it has not joined. Blocks.
+    /// Reads the file in a robot's folder; `None` if it does not exist. Blocks.
     ///
     /// # Errors
-    /// [`MembershipFileError`]: it cannot be read.
+    /// [`MembershipFileError`] if the file cannot be read, is damaged or does not parse.
     pub fn load(folder: &Path) -> Result<Option<Self>, MembershipFileError> {
         let path = folder.join(FILE);
         let file = match std::fs::read(&path) {
@@ -132,10 +132,10 @@ impl Membership {
             .map_err(|source| MembershipFileError::Malformed { path, source })
     }
 
-    /// Replaces the file in a robot's folder, which is made if it is missing. Blocks.
+    /// Replaces the file in a robot's folder, which is created if missing. Blocks.
     ///
     /// # Errors
-    /// [`MembershipFileError::Unwritable`]; the former file stays then.
+    /// [`MembershipFileError::Unwritable`]; the former file is kept.
     pub fn save(&self, folder: &Path) -> Result<(), MembershipFileError> {
         let path = folder.join(FILE);
         let written = serde_json::to_vec_pretty(self)
@@ -147,19 +147,19 @@ impl Membership {
         written.map_err(|source| MembershipFileError::Unwritable { path, source })
     }
 
-    /// The name of the authorities that it trusts; `None` if they do not read.
+    /// Returns the identifier of the trusted authorities; `None` if they cannot be parsed.
     pub(crate) fn trust_id(&self) -> Option<TrustId> {
         let trusted = trust::certificates(&self.authority).ok()?;
         Some(TrustId::of(trusted.iter().map(AsRef::as_ref)))
     }
 
-    /// How long from now until the certificate is to be renewed, by the robot's own clock alone,
-    /// which may be wrong: it is asked how long ago the certificate came, nothing else.
+    /// Returns the time until the renewal is due, zero if it is due now, computed from the
+    /// certificate's age by the robot's clock, which may be wrong.
     pub(crate) fn renewal_due_in(&self, now: Timestamp) -> Duration {
         let after = Duration::from_secs(self.lifetime_s).mul_f64(RENEW_AFTER);
         let age = now.duration_since(self.issued_at);
         if age < SignedDuration::ZERO {
-            // The clock was set back; nobody knows how old it is.
+            // The clock was set back, so the certificate's age is unknown.
             return Duration::ZERO;
         }
         after.saturating_sub(age.unsigned_abs())

@@ -1,5 +1,5 @@
-//! Renews the certificate when two thirds of its time are over, or at once when the server says that
-//! robots are to trust other authorities than this one does; and again until it is renewed.
+//! Renews the certificate after two thirds of its lifetime, or at once when the server states that
+//! robots shall trust other authorities than this one does; retries until it succeeds.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -16,37 +16,37 @@ use crate::clock::SharedClock;
 
 /// First pause after a renewal that failed.
 const RETRY_FIRST: Duration = Duration::from_secs(1);
-/// Longest pause between two tries. A robot that was put out asks no more often either.
+/// Longest pause between two attempts, also for a robot that was removed from the fleet.
 const RETRY_MAX: Duration = Duration::from_mins(5);
-/// Longest sleep at once: the wall clock may be set meanwhile.
+/// Longest uninterrupted wait, since the wall clock may be set meanwhile.
 const LOOK_EVERY: Duration = Duration::from_mins(10);
-/// The time over which the robots of a fleet spread when all of them are to renew at once.
+/// Time over which the renewals of a fleet are spread when all robots must renew at once.
 const SPREAD_MAX: Duration = Duration::from_secs(5);
 
-/// What was heard of whom robots are to trust.
+/// The server's statement on the authorities that robots shall trust.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(crate) enum ServerTrust {
-    /// Nothing.
+    /// None so far.
     #[default]
     Unheard,
-    /// The server said so, over a link that both sides have authenticated.
+    /// Identifier stated by the server, over a mutually authenticated link.
     Is(TrustId),
     /// The robots' port shows a certificate of an authority that this robot does not trust.
     Distrusted,
 }
 
-/// What is to be done.
+/// Next action of the renewal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Due {
-    /// Nothing for so long.
+    /// None for this time.
     In(Duration),
-    /// The certificate's time has come.
+    /// Renew, because the certificate's time is over.
     Now,
-    /// The server trusts others.
+    /// Renew, because the server states other authorities.
     OtherTrust,
 }
 
-/// Decides what is to be done about a membership.
+/// Decides the next action.
 fn due(present: &Membership, heard: ServerTrust, now: Timestamp) -> Due {
     let left = present.renewal_due_in(now);
     if left == Duration::ZERO {
@@ -59,7 +59,7 @@ fn due(present: &Membership, heard: ServerTrust, now: Timestamp) -> Due {
     }
 }
 
-/// The pause of one robot before it renews with all others, the same each time.
+/// Returns the pause of a robot before a renewal of the whole fleet, the same each time.
 fn spread(present: &Membership) -> Duration {
     let names = [present.site.as_str(), present.robot.as_str()];
     let bits = TrustId::of(names.map(str::as_bytes)).bits();
@@ -67,7 +67,7 @@ fn spread(present: &Membership) -> Duration {
     SPREAD_MAX.mul_f64(share)
 }
 
-/// What renewing works on.
+/// State of the renewal task.
 pub(crate) struct Renewal {
     pub(crate) folder: PathBuf,
     pub(crate) clock: SharedClock,
@@ -76,7 +76,7 @@ pub(crate) struct Renewal {
 }
 
 impl Renewal {
-    /// Renews until the stop.
+    /// Renews until requested to stop.
     pub(crate) async fn run(self, stop: CancellationToken) {
         tokio::select! {
             () = stop.cancelled() => {}
@@ -87,7 +87,7 @@ impl Renewal {
     async fn renew_for_ever(&self) {
         let mut pause = RETRY_FIRST;
         let mut is_first = true;
-        // Whatever shows another certificate at the port may do so for ever.
+        // An impostor at the port may show another certificate indefinitely.
         let mut distrust_backoff = Duration::ZERO;
         let mut news = self.heard.subscribe();
         loop {
@@ -115,7 +115,7 @@ impl Renewal {
             }
             match self.renew(&present).await {
                 Ok(()) => {
-                    // What the port showed was shown to the former one.
+                    // The port's certificate was checked against the former membership.
                     self.heard.send_if_modified(|heard| {
                         let was_distrusted = *heard == ServerTrust::Distrusted;
                         if was_distrusted {
@@ -123,7 +123,7 @@ impl Renewal {
                         }
                         was_distrusted
                     });
-                    // The answer may come from before what was heard, so it may be due once more.
+                    // The answer may be older than the statement, so the renewal may be due again.
                     let trust_before = present.trust_id();
                     let present = Arc::clone(&self.present.borrow());
                     distrust_backoff = if present.trust_id() == trust_before {
@@ -166,7 +166,7 @@ impl Renewal {
         let next: Result<Membership, MembershipError> = present.renewed(now).await;
         let (next, folder) = (Arc::new(next?), self.folder.clone());
         let saved = Arc::clone(&next);
-        // On the disk first: a restart in between must find what the link uses.
+        // On disk first, so that a restart finds the certificate that the link uses.
         tokio::task::spawn_blocking(move || saved.save(&folder)).await??;
         info!("the certificate was renewed, for {} s", next.lifetime_s);
         self.present.send_replace(next);
@@ -174,7 +174,7 @@ impl Renewal {
     }
 }
 
-/// Whether the server itself said no.
+/// Whether the server itself refused.
 fn is_refusal(cause: &(dyn std::error::Error + Send + Sync + 'static)) -> bool {
     let cause = cause.downcast_ref::<MembershipError>();
     matches!(cause, Some(MembershipError::Refused { .. }))

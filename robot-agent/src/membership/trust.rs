@@ -1,4 +1,4 @@
-//! Whom the REST API must show to be signed by when a robot joins and renews.
+//! Authentication of the REST API when a robot joins and renews.
 
 use std::fmt;
 use std::str::FromStr;
@@ -15,24 +15,24 @@ use rustls::{
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 
-/// Whom the REST API must show to be signed by.
+/// How the REST API's certificate is verified.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Trust {
-    /// By an authority that the machine knows.
+    /// By the machine's authorities.
     Machine,
-    /// By this one, PEM.
+    /// By this authority, PEM.
     Authority(String),
-    /// Its own certificate, or that of its authority, has this fingerprint.
+    /// By the SHA-256 fingerprint of its own certificate or of its authority's.
     Fingerprint(Fingerprint),
 }
 
-/// The SHA-256 of a certificate.
+/// SHA-256 of a certificate.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct Fingerprint([u8; 32]);
 
-/// Why a text is no fingerprint.
+/// The text is not a fingerprint.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("a fingerprint is the 64 hex digits of a certificate's SHA-256, with or without colons")]
 pub struct InvalidFingerprint;
@@ -90,10 +90,10 @@ fn provider() -> Arc<CryptoProvider> {
     Arc::new(rustls::crypto::ring::default_provider())
 }
 
-/// The certificates in a PEM text.
+/// Parses the certificates of a PEM text.
 ///
 /// # Errors
-/// There is none, or one does not read.
+/// There is none, or one cannot be parsed.
 pub(super) fn certificates(pem: &str) -> Result<Vec<CertificateDer<'static>>, rustls::Error> {
     let unreadable = |_| rustls::Error::General("a certificate does not read".to_owned());
     let found: Vec<_> = CertificateDer::pem_slice_iter(pem.as_bytes())
@@ -106,10 +106,10 @@ pub(super) fn certificates(pem: &str) -> Result<Vec<CertificateDer<'static>>, ru
 }
 
 impl Trust {
-    /// How to connect; `None` for what the machine knows.
+    /// Returns the TLS configuration; `None` for the machine's authorities.
     ///
     /// # Errors
-    /// The authority does not read.
+    /// The authority's certificate cannot be parsed.
     pub(super) fn client_config(&self) -> Result<Option<ClientConfig>, rustls::Error> {
         let builder = ClientConfig::builder_with_provider(provider());
         let builder = builder.with_safe_default_protocol_versions()?;
@@ -136,7 +136,7 @@ impl Trust {
     }
 }
 
-/// Takes one certificate, or what one authority has signed.
+/// Accepts one certificate, or those that one authority has signed.
 #[derive(Debug)]
 struct Pinned {
     fingerprint: Fingerprint,

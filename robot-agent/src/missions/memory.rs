@@ -1,4 +1,4 @@
-//! What the robot knows of missions, on its disk: one JSON file, replaced as a whole.
+//! Stores the state of missions on disk: one JSON file, replaced as a whole.
 
 use std::fs;
 use std::io;
@@ -12,52 +12,52 @@ const FILE_NAME: &str = "missions.json";
 /// Why the memory could not be read or written.
 #[derive(Debug, thiserror::Error)]
 pub enum MemoryError {
-    /// The file failed.
+    /// A file operation failed.
     #[error("the mission memory `{}` cannot be {action}", path.display())]
     File {
-        /// What was tried.
+        /// The operation that failed.
         action: &'static str,
-        /// On which file.
+        /// The file.
         path: PathBuf,
-        /// What the operating system said.
+        /// Error of the operating system.
         #[source]
         source: io::Error,
     },
-    /// The file is not as it was written.
+    /// The checksum of the file does not match.
     #[error("the mission memory `{}` is damaged; move it away to start afresh", path.display())]
     Damaged {
         /// The file.
         path: PathBuf,
     },
-    /// The file does not hold what it should.
+    /// The file is not valid JSON of a [`MissionSlot`].
     #[error("the mission memory `{}` does not parse; move it away to start afresh", path.display())]
     Malformed {
         /// The file.
         path: PathBuf,
-        /// Where the parser stopped.
+        /// Error of the parser.
         #[source]
         source: serde_json::Error,
     },
 }
 
-/// The file in which a [`MissionSlot`] outlives the process.
+/// The file that keeps a [`MissionSlot`] over restarts.
 #[derive(Debug, Clone)]
 pub struct Memory {
     folder: PathBuf,
 }
 
 impl Memory {
-    /// The memory in a folder, which must exist.
+    /// Creates the handle of the file in a folder, which must exist.
     pub fn new(folder: &Path) -> Self {
         Self {
             folder: folder.to_owned(),
         }
     }
 
-    /// Reads it; a robot's first start finds nothing.
+    /// Reads the file; empty at a robot's first start.
     ///
     /// # Errors
-    /// [`MemoryError`] when the file cannot be read or does not parse.
+    /// [`MemoryError`] if the file cannot be read, is damaged or does not parse.
     pub fn load(&self) -> Result<MissionSlot, MemoryError> {
         let path = self.folder.join(FILE_NAME);
         match fs::read(&path) {
@@ -77,10 +77,10 @@ impl Memory {
         }
     }
 
-    /// Writes it and waits until the disk has it. Blocks.
+    /// Writes the file and waits until it is on disk. Blocks.
     ///
     /// # Errors
-    /// [`MemoryError`] when the disk refuses; the former content stays then.
+    /// [`MemoryError`] if the disk fails; the former content is kept.
     pub fn save(&self, slot: &MissionSlot) -> Result<(), MemoryError> {
         let text = serde_json::to_vec(slot).map_err(io::Error::from);
         let written = text

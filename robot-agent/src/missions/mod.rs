@@ -1,4 +1,5 @@
-//! Missions on the robot: what is active, what has ended, and what to answer.
+//! State of the robot's missions: the active one, those that have ended, and the answers to
+//! commands.
 //!
 //! ```text
 //!            offer                    report of the loop
@@ -8,8 +9,8 @@
 //!     └ cancel ────────────────────────────────────────────┘
 //! ```
 //!
-//! [`MissionSlot`] is pure: it decides, others act. An ended mission never comes back, whatever is
-//! offered late; [`memory`] keeps that over a restart of the agent.
+//! [`MissionSlot`] is pure: it decides, its callers act. An ended mission never becomes active
+//! again, even by a late offer; [`memory`] keeps that over restarts of the agent.
 
 pub mod memory;
 
@@ -22,26 +23,26 @@ use tread_api::wire::command::Offer;
 use tread_api::wire::ingest::MissionPhase;
 use tread_api::wire::reply::{CommandRefusal, CommandRefusalCode};
 
-/// Ended missions that are remembered; the oldest is forgotten first.
+/// Number of ended missions that are remembered; the oldest is dropped first.
 pub const ENDED_MAX: usize = 1_000;
 
-/// A mission that the robot has taken and not ended.
+/// A mission that the robot has accepted and that has not ended.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ActiveMission {
     /// The mission.
     pub mission: MissionId,
     /// Its revision.
     pub revision: u32,
-    /// What exactly is driven.
+    /// Hash of the plan that is driven.
     pub plan_hash: PlanHash,
-    /// What was planned.
+    /// Summary of the plan.
     pub plan: PlanSummary,
-    /// Whether its cancellation was reported to the server; then it ends as that and nothing else.
+    /// Whether its cancellation was answered to the server; it then ends as cancelled.
     #[serde(default)]
     pub is_cancelled: bool,
 }
 
-/// A mission that has ended here.
+/// A mission that has ended on this robot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Ended {
     /// The mission.
@@ -50,51 +51,51 @@ pub struct Ended {
     pub phase: MissionPhase,
 }
 
-/// What the robot knows of missions.
+/// The active mission and the ended ones.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct MissionSlot {
     #[serde(alias = "held")]
     active: Option<ActiveMission>,
     ended: VecDeque<Ended>,
-    /// How the active mission ends, while that is being written.
+    /// Phase of the active mission's end, while that is being recorded.
     #[serde(skip)]
     ending: Option<MissionPhase>,
 }
 
-/// What to do about an offer.
+/// Decision on an offer.
 #[derive(Debug, Clone, PartialEq)]
 pub enum OfferDecision {
-    /// It is new: plan it, hand it to the loop, then [`MissionSlot::take`] it.
+    /// It is new: plan it, send it to the loop, then [`MissionSlot::take`] it.
     Plan,
-    /// It is a new revision of what is active: plan it from where the robot comes to stand, then
-    /// [`MissionSlot::replace`] the old one and hand it to the loop.
+    /// It is a new revision of the active mission: plan it from where the robot stops, then
+    /// [`MissionSlot::replace`] the old one and send it to the loop.
     Replace,
-    /// It is active already: say so again.
+    /// It is active already: answer with the same plan.
     AcceptAgain(PlanSummary),
-    /// No, and why.
+    /// It is refused, with the reason.
     Refuse(CommandRefusal),
 }
 
-/// What to do about a cancellation.
+/// Decision on a cancellation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum CancelDecision {
-    /// It is active: brake, along its path.
+    /// The mission is active: brake along its path.
     Brake,
     /// It was cancelled before.
     CancelledBefore,
-    /// It ended otherwise before.
+    /// It ended in another phase before.
     EndedBefore(MissionPhase),
-    /// It was never seen here; should its offer still come, it is refused.
+    /// It was never offered here; a later offer of it is refused.
     Unknown,
 }
 
 impl MissionSlot {
-    /// The active mission.
+    /// Returns the active mission.
     pub fn active(&self) -> Option<&ActiveMission> {
         self.active.as_ref()
     }
 
-    /// The missions that have ended here, oldest first.
+    /// Returns the missions that have ended here, oldest first.
     pub fn ended(&self) -> impl Iterator<Item = &Ended> {
         self.ended.iter()
     }
@@ -106,7 +107,7 @@ impl MissionSlot {
             .map(|ended| ended.phase)
     }
 
-    /// What to do about an offer.
+    /// Decides on an offer; changes nothing.
     pub fn offer(&self, offer: &Offer) -> OfferDecision {
         let refuse =
             |code, detail: String| OfferDecision::Refuse(CommandRefusal::new(code, detail));
@@ -144,8 +145,8 @@ impl MissionSlot {
         }
     }
 
-    /// Makes a mission the active one; false, and nothing changes, where [`MissionSlot::offer`]
-    /// would not say [`OfferDecision::Plan`].
+    /// Makes a mission the active one; false, without a change, if a mission is active or this one
+    /// has ended.
     #[must_use]
     pub fn take(&mut self, active: ActiveMission) -> bool {
         let is_free = self.active.is_none() && self.ended_phase(active.mission).is_none();
@@ -155,8 +156,8 @@ impl MissionSlot {
         is_free
     }
 
-    /// Puts a higher revision in place of the active one and gives the old one back; `None`, and
-    /// nothing changes, where [`MissionSlot::offer`] would not say [`OfferDecision::Replace`].
+    /// Replaces the active revision by a higher one and returns the old one; `None`, without a
+    /// change, if the mission is not active, is cancelled or is ending.
     #[must_use]
     pub fn replace(&mut self, next: ActiveMission) -> Option<ActiveMission> {
         let active = self.active.as_mut()?;
@@ -167,7 +168,7 @@ impl MissionSlot {
         is_next.then(|| std::mem::replace(active, next))
     }
 
-    /// Goes back to a former revision, if the later one could not be handed to the loop.
+    /// Restores a former revision, if the later one could not be sent to the loop.
     pub fn restore(&mut self, former: ActiveMission) {
         if let Some(active) = self
             .active
@@ -178,10 +179,10 @@ impl MissionSlot {
         }
     }
 
-    /// Whether a mission is active in this revision, to be paused or resumed.
+    /// Checks whether a mission is active in this revision, to be paused or resumed.
     ///
     /// # Errors
-    /// Why not, for the server.
+    /// The refusal for the server.
     pub fn check_active(&self, mission: MissionId, revision: u32) -> Result<(), CommandRefusal> {
         let refuse = |code, detail: String| Err(CommandRefusal::new(code, detail));
         if let Some(phase) = self.ended_phase(mission) {
@@ -205,12 +206,12 @@ impl MissionSlot {
         }
     }
 
-    /// Lets go of a mission that was taken but could not be handed to the loop.
+    /// Removes a mission that was accepted but could not be sent to the loop.
     pub fn release(&mut self, mission: MissionId) {
         self.active.take_if(|active| active.mission == mission);
     }
 
-    /// What to do about a cancellation; one that comes before its offer is remembered.
+    /// Decides on a cancellation; one that arrives before its offer is remembered.
     pub fn cancel(&mut self, mission: MissionId) -> CancelDecision {
         if let Some(active) = self
             .active
@@ -236,8 +237,9 @@ impl MissionSlot {
         }
     }
 
-    /// How the active mission ends, before that is reported; from here on it can no longer be
-    /// cancelled. One that the server believes cancelled ends as that, whatever came in between.
+    /// Begins the end of the active mission, before it is reported; from now on it cannot be
+    /// cancelled. Returns the phase, which is cancelled for a mission whose cancellation was
+    /// answered.
     pub fn begin_end(&mut self, mission: MissionId, phase: MissionPhase) -> MissionPhase {
         let Some(active) = self
             .active

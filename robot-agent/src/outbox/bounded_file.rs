@@ -1,5 +1,4 @@
-//! A file that is only appended to and bounded: one that is full becomes the old one, and the old
-//! one before it is removed.
+//! An append-only file of bounded size: a full file replaces the old one, whose content is lost.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write as _};
@@ -7,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use super::store::{StoreError, failure, size};
 
-/// A file that has grown past this becomes the old one; there are at most two.
+/// Size above which a file becomes the old one, bytes; there are at most two files.
 pub(super) const FILE_BYTES_MAX: u64 = 1024 * 1024;
 
 /// The two files.
@@ -18,7 +17,8 @@ pub(super) struct BoundedFile {
 }
 
 impl BoundedFile {
-    /// The files `<stem>.<ending>` and `<stem>.old.<ending>` in a folder; neither need be there.
+    /// Creates the handle of `<stem>.<ending>` and `<stem>.old.<ending>` in a folder; neither need
+    /// exist.
     pub(super) fn new(folder: &Path, stem: &str, ending: &str) -> Self {
         Self {
             path: folder.join(format!("{stem}.{ending}")),
@@ -26,17 +26,17 @@ impl BoundedFile {
         }
     }
 
-    /// The file that is written.
+    /// Returns the path of the file that is written.
     pub(super) fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Whether anything is kept.
+    /// Whether any of the two files exists.
     pub(super) fn is_present(&self) -> bool {
         self.path.exists() || self.old_path.exists()
     }
 
-    /// Appends one piece, on lines of its own, and waits until the disk has it.
+    /// Appends one entry, on lines of its own, and waits until it is on disk.
     pub(super) fn append(&mut self, piece: &[u8]) -> Result<(), StoreError> {
         let path = &self.path;
         let is_full = fs::metadata(path)
@@ -51,7 +51,7 @@ impl BoundedFile {
             .open(path)
             .map_err(failure("open", path))?;
         let mut whole = Vec::with_capacity(piece.len() + 2);
-        // A crash may have left half a line.
+        // A crash may have left an incomplete line.
         if !ends_a_line(&file).map_err(failure("read", path))? {
             whole.push(b'\n');
         }

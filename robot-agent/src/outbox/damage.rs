@@ -1,6 +1,6 @@
-//! Damaged bytes of the outbox's files, kept for people.
+//! Keeps damaged bytes of the outbox's files for inspection.
 //!
-//! Each piece is a line of JSON that says where the bytes were, and then the bytes themselves.
+//! Each entry is a line of JSON with the position of the bytes, followed by the bytes themselves.
 
 use std::io;
 use std::ops::Range;
@@ -11,7 +11,7 @@ use serde::Serialize;
 use super::bounded_file::BoundedFile;
 use super::store::{StoreError, failure};
 
-/// Most bytes that are kept of one damaged place.
+/// Largest number of bytes kept of one damaged range; the rest is dropped.
 const PIECE_BYTES_MAX: usize = 256 * 1024;
 
 #[derive(Serialize)]
@@ -22,7 +22,7 @@ struct Place<'path> {
     kept: usize,
 }
 
-/// The file of one outbox's damaged bytes.
+/// The file of an outbox's damaged bytes.
 #[derive(Debug)]
 pub(super) struct DamagedBytes(BoundedFile);
 
@@ -31,17 +31,17 @@ impl DamagedBytes {
         Self(BoundedFile::new(folder, "damaged", "bin"))
     }
 
-    /// Whether anything is kept; it stays until a person removes it.
+    /// Whether damaged bytes are kept; the file stays until a person removes it.
     pub(super) fn is_present(&self) -> bool {
         self.0.is_present()
     }
 
-    /// Where the newest are.
+    /// Returns the path of the newest damaged bytes.
     pub(super) fn path(&self) -> PathBuf {
         self.0.path().to_owned()
     }
 
-    /// Keeps the bytes of one place in a file, and waits until the disk has them.
+    /// Keeps the damaged bytes of a range of a file, and waits until they are on disk.
     pub(super) fn keep(
         &mut self,
         file: &Path,

@@ -1,4 +1,4 @@
-//! Records that the server will never take, kept for people: one JSON object a line.
+//! Keeps records that the server refuses for good, for inspection: one JSON object per line.
 
 use std::io;
 use std::path::Path;
@@ -18,7 +18,7 @@ struct DeadLetter<'record> {
     boot: BootId,
     seq: u64,
     reason: &'record str,
-    /// The record's content as it stood in the outbox, JSON in a string.
+    /// Content of the record in the outbox, as a JSON string.
     content: &'record str,
 }
 
@@ -27,7 +27,7 @@ impl DeadLetters {
         Self(BoundedFile::new(folder, "dead-letters", "jsonl"))
     }
 
-    /// Writes one record and waits until the disk has it.
+    /// Writes one record and waits until it is on disk.
     pub(super) fn write(
         &mut self,
         boot: BootId,

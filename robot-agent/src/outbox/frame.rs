@@ -1,4 +1,4 @@
-//! Frames of the outbox's files: what is on the disk, byte by byte.
+//! The binary format of the outbox's files.
 //!
 //! | bytes | what |
 //! |---|---|
@@ -7,13 +7,13 @@
 //! | … | the body: 1 byte kind, then its fields, integers little-endian |
 //!
 //! Kind 1 is a record: 8 ordinal, 16 boot id, 8 seq, then its content as JSON. Kind 2 is the head:
-//! 8 ordinal of the first record that still waits, 8 records dropped and 8 refused since ever, 8 of
-//! the dropped ones lost by damage, 8 ordinal of the next record, 8 records that wait. Earlier
-//! agents wrote heads without the last three.
+//! 8 ordinal of the first record that waits, 8 records dropped and 8 refused since the store was
+//! made, 8 of the dropped ones lost by damage, 8 ordinal of the next record, 8 records that wait.
+//! Earlier agents wrote heads without the last three.
 //!
-//! A damaged frame hides its own end, so [`find`] looks for the next intact one byte by byte. No
-//! frame is found inside the content of another: a frame begins with a length below 16 MiB, so its
-//! fourth byte is 0, which JSON never contains.
+//! The end of a damaged frame is unknown, so [`find`] searches the next intact frame byte by byte.
+//! It finds no frame inside the content of another: a frame begins with a length below 16 MiB, so
+//! its fourth byte is 0, which JSON never contains.
 
 use std::ops::Range;
 
@@ -22,15 +22,15 @@ use uuid::Uuid;
 
 use crate::checksum::crc32;
 
-/// Length and checksum in front of a body.
+/// Size of the length and checksum before a body, bytes.
 pub(super) const HEADER_BYTES: usize = 8;
-/// Fields of a record in front of its content.
+/// Size of a record's fields before its content, bytes.
 const RECORD_FIELDS_BYTES: usize = 1 + 8 + 16 + 8;
-/// Length of a head's body as earlier agents wrote it, and as it is written now.
+/// Sizes of a head's body in earlier agents and in this one, bytes.
 const HEAD_BYTES: [usize; 2] = [1 + 3 * 8, 1 + 6 * 8];
-/// Length of a head's whole frame.
+/// Size of a head's whole frame, bytes.
 pub(super) const HEAD_FRAME_BYTES: usize = HEADER_BYTES + HEAD_BYTES[1];
-/// Largest body; a length above it is damage.
+/// Largest body, bytes; a larger length is damage.
 pub(super) const BODY_BYTES_MAX: usize = 1024 * 1024;
 /// Largest content of a record, bytes.
 pub const CONTENT_BYTES_MAX: usize = BODY_BYTES_MAX - RECORD_FIELDS_BYTES;
@@ -38,7 +38,7 @@ pub const CONTENT_BYTES_MAX: usize = BODY_BYTES_MAX - RECORD_FIELDS_BYTES;
 const KIND_RECORD: u8 = 1;
 const KIND_HEAD: u8 = 2;
 
-/// Where the outbox stands: what has been settled, and what was lost on the way.
+/// State of the store: what is settled, and what was lost.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct Head {
     /// Ordinal of the first record that still waits.
@@ -57,10 +57,10 @@ pub(super) struct Head {
 }
 
 impl Head {
-    /// What two heads of one store say together: their counters only rise.
+    /// Joins two heads of one store, whose counters never decrease.
     ///
-    /// An agent of an earlier version, which ran in between, settles and drops records without saying
-    /// which wait behind them: its head may be ahead in that and behind in the next ordinal.
+    /// An agent of an earlier version that ran in between settles and drops records without stating
+    /// which ones wait, so its head may have the higher first ordinal and the lower next one.
     pub(super) fn joined(self, other: Self) -> Self {
         let age = |head: &Self| (head.next_ordinal, head.first_pending);
         let (newer, older) = if age(&other) > age(&self) {
@@ -69,8 +69,8 @@ impl Head {
             (self, other)
         };
         let first_pending = newer.first_pending.max(older.first_pending);
-        // What was settled since does not wait, though some of it may have been lost before: rather
-        // a loss that is not counted than a record that was sent and counts as lost.
+        // Records settled since do not wait, though some may have been lost before: a loss may
+        // remain uncounted, but no record that was sent counts as lost.
         let settled_since = first_pending - newer.first_pending;
         Self {
             first_pending,
@@ -83,18 +83,18 @@ impl Head {
     }
 }
 
-/// A record's name and place in the order of all.
+/// Identity of a record, and its position in the order of all records.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct RecordName {
-    /// Counts all records of this store.
+    /// Number of the record in this store, from 0.
     pub(super) ordinal: u64,
-    /// The agent's run that made it.
+    /// Run of the agent that made the record.
     pub(super) boot: BootId,
-    /// Its number within that run.
+    /// Number of the record within that run.
     pub(super) seq: u64,
 }
 
-/// One frame, read.
+/// A decoded frame.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Frame<'file> {
     Record(RecordName, &'file [u8]),
@@ -152,7 +152,8 @@ fn take<const N: usize>(bytes: &mut &[u8]) -> Option<[u8; N]> {
     Some(*field)
 }
 
-/// Reads the frame at the start of `bytes`, and its whole length; `None` if it is torn or damaged.
+/// Decodes the frame at the start of `bytes`; returns it and its size in bytes, `None` if it is
+/// torn or damaged.
 pub(super) fn read(bytes: &[u8]) -> Option<(Frame<'_>, usize)> {
     let mut rest = bytes;
     let length = usize::try_from(u32::from_le_bytes(take(&mut rest)?)).ok()?;
@@ -194,7 +195,7 @@ fn read_head(fields: &mut &[u8]) -> Option<Head> {
             waiting,
             ..head
         },
-        // Of an earlier agent: it says nothing of records behind the first that waits.
+        // Of an earlier agent, without the number of waiting records.
         _ => Head {
             next_ordinal: head.first_pending,
             ..head
@@ -202,7 +203,7 @@ fn read_head(fields: &mut &[u8]) -> Option<Head> {
     })
 }
 
-/// Whether a frame may begin here, judged without its checksum: a cheap look before a costly one.
+/// Whether a frame may begin here, by a cheap check without its checksum.
 fn may_begin(bytes: &[u8], ordinals: &Range<u64>) -> bool {
     let mut rest = bytes;
     let (Some(length), Some(_), Some([kind])) = (
@@ -224,8 +225,8 @@ fn may_begin(bytes: &[u8], ordinals: &Range<u64>) -> bool {
     }
 }
 
-/// The first intact frame at or behind `from` that is a head or a record with one of these
-/// ordinals: where it begins, what it is, and its whole length.
+/// Finds the first intact frame at or after `from` that is a head or a record with one of these
+/// ordinals. Returns its position, the frame, and its size in bytes.
 pub(super) fn find<'file>(
     bytes: &'file [u8],
     from: usize,

@@ -1,8 +1,8 @@
-//! A second copy of the head, and how far records were safe on the disk: one file with two places
-//! that are written in turn, so that a torn or damaged one leaves the other.
+//! A second copy of the head: one file with two slots that are written in turn, so that a torn or
+//! damaged slot leaves the other.
 //!
-//! The heads among the records are lost with the file that they stand in. And a file whose end is
-//! cut off does not say that anything is missing: this one does.
+//! The heads among the records are lost with the file that contains them, and a truncated file does
+//! not show that records are missing. The head in this file does.
 
 use std::fs::{File, OpenOptions};
 use std::io;
@@ -13,7 +13,7 @@ use super::frame::{self, Frame, HEAD_FRAME_BYTES, Head};
 use super::store::{StoreError, failure};
 
 const FILE_NAME: &str = "head";
-/// Where the two places begin.
+/// Offsets of the two slots, bytes.
 const PLACES: [u64; 2] = [0, 64];
 
 /// The file, open.
@@ -24,7 +24,7 @@ pub(super) struct HeadFile {
     next_place: usize,
 }
 
-/// A head to be written, without holding the store.
+/// A write of a head that runs without locking the store.
 #[derive(Debug)]
 pub(super) struct HeadWrite {
     path: PathBuf,
@@ -34,7 +34,7 @@ pub(super) struct HeadWrite {
 }
 
 impl HeadFile {
-    /// Opens the file, which is made if it is not there, and reads the newest head of it.
+    /// Opens the file, creating it if missing, and reads its newest head.
     pub(super) fn open(folder: &Path) -> Result<(Self, Option<Head>), StoreError> {
         let path = folder.join(FILE_NAME);
         let mut options = OpenOptions::new();
@@ -45,7 +45,7 @@ impl HeadFile {
             *head = read_at(&file, place).map_err(failure("read", &path))?;
         }
         let newest = heads.into_iter().flatten().reduce(Head::joined);
-        // The newest one is not written over.
+        // The newest head is not overwritten.
         let next_place = usize::from(heads[0].is_some() && heads[0] == newest);
         let opened = Self {
             path,
@@ -55,7 +55,7 @@ impl HeadFile {
         Ok((opened, newest))
     }
 
-    /// What has to be done to replace the older head by this one.
+    /// Prepares the write that replaces the older head by this one.
     pub(super) fn write(&self, head: Head) -> Result<HeadWrite, StoreError> {
         let file = self.file.try_clone().map_err(failure("open", &self.path))?;
         let mut frame = Vec::with_capacity(HEAD_FRAME_BYTES);
@@ -68,15 +68,15 @@ impl HeadFile {
         })
     }
 
-    /// The disk has what was to be written: the other place is the older one now. A place whose
-    /// writing failed is written again, and the other keeps the last head that is safe.
+    /// Records a completed write: the other slot is the older one now. Without this call, after a
+    /// failed write, the same slot is written again and the other one keeps the last durable head.
     pub(super) fn finish(&mut self, written: &HeadWrite) {
         self.next_place = (written.place + 1) % PLACES.len();
     }
 }
 
 impl HeadWrite {
-    /// Waits until the disk has it.
+    /// Writes the head and waits until it is on disk.
     pub(super) fn run(&self) -> Result<(), StoreError> {
         let written = self.file.write_all_at(&self.frame, PLACES[self.place]);
         written.map_err(failure("write", &self.path))?;

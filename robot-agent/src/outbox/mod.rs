@@ -1,4 +1,4 @@
-//! The outbox: what must not be lost, on the robot's disk until the server has answered for it.
+//! The outbox: durable records on the robot's disk until the server has acknowledged them.
 //!
 //! ```text
 //! append → pending → (server's receipt) → settled
@@ -6,9 +6,9 @@
 //!             └─ store full, or damaged on the disk → dropped, counted
 //! ```
 //!
-//! Records are named `(robot, boot, seq)`; the server counts none twice, so a record may be sent
-//! again whenever an answer was lost. Syncing is batched: a crash loses at most what was appended
-//! within [`SYNC_DELAY`]. The outbox knows nothing of zenoh.
+//! Records are identified by `(robot, boot, seq)`; the server ignores duplicates, so a record is
+//! sent again whenever its receipt was lost. Syncs are batched: a crash loses at most what was
+//! appended within [`SYNC_DELAY`]. This module is independent of zenoh.
 
 mod bounded_file;
 mod damage;
@@ -35,15 +35,15 @@ pub use frame::CONTENT_BYTES_MAX;
 pub use store::{Limits, StoreError};
 use store::{Settled, Store};
 
-/// Longest time that an appended record waits for the disk to have it.
+/// Longest delay between appending a record and syncing it to disk.
 pub const SYNC_DELAY: Duration = Duration::from_millis(100);
-/// Most bytes of contents in one batch.
+/// Largest content of one batch, bytes.
 pub const BATCH_BYTES_MAX: u64 = 1024 * 1024;
 
-/// Why the outbox could not do what it was asked.
+/// Errors of the outbox.
 #[derive(Debug, thiserror::Error)]
 pub enum OutboxError {
-    /// The files failed.
+    /// A file operation failed.
     #[error(transparent)]
     Store(#[from] StoreError),
     /// Another agent uses the same folder.
@@ -54,7 +54,7 @@ pub enum OutboxError {
     Lock {
         /// The lock file.
         path: PathBuf,
-        /// What the operating system said.
+        /// Error of the operating system.
         #[source]
         source: std::io::Error,
     },
@@ -63,10 +63,10 @@ pub enum OutboxError {
     Content(#[source] serde_json::Error),
 }
 
-/// The oldest records that wait, ready to be sent.
+/// The oldest waiting records of one run, ready to be sent.
 #[derive(Debug, Clone)]
 pub struct PendingBatch {
-    /// What goes on the wire.
+    /// The message to the server.
     pub batch: Batch,
     through_ordinal: u64,
 }
@@ -74,13 +74,13 @@ pub struct PendingBatch {
 /// Damage of the outbox's files.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct OutboxDamage {
-    /// Records lost by it since the store was made.
+    /// Number of records lost by damage since the store was made.
     pub lost_records: u64,
-    /// Where the damaged bytes are, until a person has removed them and the agent has started again.
+    /// File of the damaged bytes, until a person has removed it and the agent has restarted.
     pub kept_in: Option<PathBuf>,
 }
 
-/// A handle to one robot's outbox; clones share it.
+/// Handle to one robot's outbox; clones share it.
 #[derive(Debug, Clone)]
 pub struct Outbox {
     shared: Arc<Shared>,
@@ -91,27 +91,27 @@ struct Shared {
     robot: RobotId,
     folder: PathBuf,
     store: Mutex<Store>,
-    /// One sync runs at a time, so that no older head is written over a newer one.
+    /// Serialises syncs, so that no older head overwrites a newer one.
     syncing: Mutex<()>,
     dead_letters: Mutex<DeadLetters>,
-    /// Something new waits for the server.
+    /// Notified when a record is appended, for the uploader.
     arrived: Notify,
-    /// Something waits for the disk.
+    /// Notified when a change must be synced.
     unsynced: Notify,
-    /// Held for as long as the outbox lives, so that no second agent writes here.
+    /// Lock held while the outbox is open, so that no second agent writes here.
     _lock: File,
 }
 
 fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    // The stores leave no half-done state behind between two of their steps.
+    // Each step of the store leaves it consistent.
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl Outbox {
-    /// Opens the outbox in a folder, which is made if needed; repairs what a crash left torn.
+    /// Opens the outbox in a folder, creating it if missing; repairs files that a crash left torn.
     ///
     /// # Errors
-    /// [`OutboxError`] when the folder cannot be used or another agent uses it.
+    /// [`OutboxError`] if the folder cannot be used or another agent uses it.
     pub fn open(
         folder: &Path,
         limits: Limits,
@@ -162,7 +162,7 @@ impl Outbox {
     /// Appends a record and returns its number within this run.
     ///
     /// # Errors
-    /// [`OutboxError`] when the disk refuses it; the record is not kept then.
+    /// [`OutboxError`] if the record cannot be written or is too large; it is not kept then.
     pub fn append(&self, content: &RecordContent) -> Result<u64, OutboxError> {
         let content = serde_json::to_vec(content).map_err(OutboxError::Content)?;
         let name = locked(&self.shared.store).append(&content)?;
@@ -171,10 +171,10 @@ impl Outbox {
         Ok(name.seq)
     }
 
-    /// The oldest records of one run that wait, at most `records_max` of them.
+    /// Returns the oldest waiting records of one run, at most `records_max`; `None` if none waits.
     ///
     /// # Errors
-    /// [`OutboxError`] when the files cannot be read.
+    /// [`OutboxError`] if the files cannot be read.
     pub fn pending(&self, records_max: usize) -> Result<Option<PendingBatch>, OutboxError> {
         let records_max = records_max.clamp(1, BATCH_RECORDS_MAX);
         loop {
@@ -199,7 +199,8 @@ impl Outbox {
                 through_ordinal = name.ordinal;
             }
             if let Some((name, content, cause)) = unreadable.filter(|_| records.is_empty()) {
-                // Written by another version of the agent: moved to the dead letters, so that the head moves on.
+                // Not readable by this version: moved to the dead letters, so that the records
+                // behind it are sent.
                 let text = String::from_utf8_lossy(&content);
                 self.dead_letter(name.boot, name.seq, &cause, &text)?;
                 locked(&self.shared.store).settle(Settled {
@@ -221,10 +222,10 @@ impl Outbox {
         }
     }
 
-    /// Settles a batch by the server's receipt; what it refused goes to the dead-letter file.
+    /// Settles a batch by the server's receipt; refused records go to the dead-letter file.
     ///
     /// # Errors
-    /// [`OutboxError`] when the dead-letter file cannot be written; nothing is settled then.
+    /// [`OutboxError`] if the dead-letter file cannot be written; nothing is settled then.
     pub fn settle(&self, sent: &PendingBatch, receipt: &Receipt) -> Result<(), OutboxError> {
         let mut refused = 0;
         for refusal in &receipt.refused {
@@ -260,7 +261,7 @@ impl Outbox {
         Ok(())
     }
 
-    /// What waits, and what was lost.
+    /// Returns the numbers of records that wait, were dropped and were refused.
     pub fn status(&self) -> OutboxStatus {
         let store = locked(&self.shared.store);
         let head = store.head();
@@ -271,7 +272,7 @@ impl Outbox {
         }
     }
 
-    /// What was lost by damage of the files.
+    /// Returns the damage of the files.
     pub fn damage(&self) -> OutboxDamage {
         let store = locked(&self.shared.store);
         OutboxDamage {
@@ -280,24 +281,24 @@ impl Outbox {
         }
     }
 
-    /// How many records this folder has ever taken, over all runs.
+    /// Returns the number of records ever appended in this folder, over all runs.
     pub fn appended(&self) -> u64 {
         locked(&self.shared.store).appended()
     }
 
-    /// Waits until something has been appended since the last call.
+    /// Waits until a record has been appended since the last call.
     pub async fn arrived(&self) {
         self.shared.arrived.notified().await;
     }
 
-    /// Makes everything that was appended and settled so far safe from a crash. Blocks.
+    /// Syncs all appended and settled records to disk. Blocks.
     ///
     /// # Errors
-    /// [`OutboxError`] when the disk refuses.
+    /// [`OutboxError`] if the disk fails.
     pub fn sync(&self) -> Result<(), OutboxError> {
         let _syncing = locked(&self.shared.syncing);
         let ticket = locked(&self.shared.store).begin_sync()?;
-        // The slow part, while others may append.
+        // The slow part, without the lock.
         ticket.run()?;
         Ok(locked(&self.shared.store).finish_sync(&ticket)?)
     }
@@ -309,7 +310,7 @@ impl Outbox {
                 () = self.shared.unsynced.notified() => {}
                 () = stop.cancelled() => {}
             }
-            // Changes gather meanwhile; the wait and the sync itself bound what a crash can take.
+            // Collects further changes; this pause and the sync itself bound what a crash can lose.
             tokio::select! {
                 () = tokio::time::sleep(SYNC_DELAY / 2) => {}
                 () = stop.cancelled() => {}
@@ -324,10 +325,10 @@ impl Outbox {
                         "cannot sync `{folder}`"
                     );
                     self.shared.unsynced.notify_one();
-                    // A sick disk is asked again, but not in a busy loop.
+                    // Retry on a failing disk, but not in a busy loop.
                     tokio::time::sleep(SYNC_DELAY).await;
                 }
-                // Only when the runtime goes down.
+                // Only when the runtime shuts down.
                 Err(_) => return,
             }
         }

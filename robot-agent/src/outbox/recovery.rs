@@ -1,12 +1,11 @@
-//! Reads the store's files after a start, and repairs what a crash or a failing disk left of them.
+//! Reads the store's files at the start, and repairs them after a crash or disk damage.
 //!
-//! | what stands behind the last intact frame | it is |
-//! |---|---|
-//! | bytes at the end of a file, and no record is missing | torn by a crash: cut off |
-//! | anything else | damage: the bytes are kept, intact frames behind it are read |
+//! | bytes after the last intact frame | meaning | |---|---| | at the end of a file, and no record
+//! is missing | torn by a crash: cut off | | anything else | damage: the bytes are kept, intact
+//! frames behind them are read |
 //!
-//! What is missing is counted by ordinals: a head says how many records waited when it was written,
-//! and ordinals have no gap behind that.
+//! Missing records are counted by ordinals: a head states how many records waited when it was
+//! written, and later ordinals have no gap.
 
 use std::fs::{self, File};
 use std::io;
@@ -19,28 +18,28 @@ use super::frame::{self, Frame, Head, RecordName};
 use super::store::{StoreError, failure, file_path, size};
 use crate::durable;
 
-/// Bytes that are read at a time, so that a sector that cannot be read costs no more than those.
+/// Bytes per read, so that an unreadable sector costs no more than these.
 const BLOCK_BYTES: usize = 4096;
-/// What the operating system says of a sector that cannot be read.
+/// Error code of the operating system for an unreadable sector.
 const EIO: i32 = 5;
 
-/// What was found when the store was opened.
+/// Findings at the opening of the store.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct Recovery {
-    /// Bytes of a frame that a crash left unfinished, cut off.
+    /// Bytes of incomplete frames, which were cut off.
     pub(super) torn_bytes: u64,
-    /// Bytes that are damaged, kept for people.
+    /// Damaged bytes, which are kept for inspection.
     pub(super) damaged_bytes: u64,
-    /// Records that should be there and are not.
+    /// Number of missing records.
     pub(super) lost_records: u64,
 }
 
-/// Whether an error says that a place of the disk cannot be read.
+/// Whether the error means that a part of the disk is unreadable.
 pub(super) fn is_unreadable(cause: &io::Error) -> bool {
     cause.raw_os_error() == Some(EIO) || cause.kind() == io::ErrorKind::UnexpectedEof
 }
 
-/// A record where it is in its file.
+/// A record and its position in its file.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Found {
     pub(super) name: RecordName,
@@ -49,19 +48,19 @@ pub(super) struct Found {
     pub(super) content_bytes: usize,
 }
 
-/// What one file holds.
+/// Content of one file.
 #[derive(Debug)]
 pub(super) struct Scan {
-    /// The ordinal after which the file is named.
+    /// Ordinal in the file's name.
     pub(super) first_ordinal: u64,
     pub(super) path: PathBuf,
     pub(super) records: Vec<Found>,
-    /// What the heads in it say together.
+    /// All heads in the file, joined.
     head: Option<Head>,
-    /// The ordinal that a record behind it has at least.
+    /// Smallest ordinal that a record after this file can have.
     next_ordinal: u64,
     bytes: usize,
-    /// Where no intact frame is.
+    /// Ranges without an intact frame.
     spoilt: Vec<Range<usize>>,
 }
 
@@ -107,7 +106,7 @@ impl Scan {
         Ok(scan)
     }
 
-    /// Makes the file hold its intact frames alone and nothing else; its length then.
+    /// Rewrites the file with its intact frames alone; returns its new length, bytes.
     fn repair(
         &mut self,
         is_tail_torn: bool,
@@ -130,7 +129,7 @@ impl Scan {
                 span.clone(),
                 bytes.get(span.clone()).unwrap_or_default(),
             );
-            // A full disk must not keep what is intact behind it.
+            // A full disk must not block the intact records.
             if let Err(cause) = kept {
                 tracing::error!("the damaged bytes are not kept: {cause}");
             }
@@ -170,20 +169,20 @@ impl Scan {
     }
 }
 
-/// What all files hold together.
+/// Content of all files.
 #[derive(Debug)]
 pub(super) struct Recovered {
-    /// The files that hold anything, oldest first, and their lengths.
+    /// Files with any content, oldest first, and their lengths, bytes.
     pub(super) files: Vec<(Scan, u64)>,
-    /// Where the store stands; lost records are counted in it.
+    /// Joined head, with lost records counted.
     pub(super) head: Head,
-    /// The ordinal of the next record.
+    /// Ordinal of the next record.
     pub(super) next_ordinal: u64,
     pub(super) recovery: Recovery,
 }
 
-/// Reads the files of these names, in order, and repairs them. `known` is what is known of the head
-/// from elsewhere.
+/// Reads the files of these names, in order, and repairs them. `known` is the head in the separate
+/// head file.
 pub(super) fn recover(
     folder: &Path,
     names: &[u64],
@@ -207,7 +206,7 @@ pub(super) fn recover(
     };
     let mut next_ordinal = end;
     let mut files = Vec::with_capacity(scans.len());
-    // From the newest on, so that of each it is known what follows.
+    // From the newest file on, so that the next ordinal after each file is known.
     let mut follows = end;
     while let Some(mut scan) = scans.pop() {
         let is_tail_torn = follows <= scan.next_ordinal.max(head.first_pending);
@@ -220,7 +219,7 @@ pub(super) fn recover(
             next_ordinal = next_ordinal.max(scan.first_ordinal);
             files.push((scan, bytes));
         } else if scan.bytes == 0 {
-            // Its name had reached the disk when the machine died, and nothing else.
+            // Only the file's name reached the disk before a crash.
             fs::remove_file(&scan.path).map_err(failure("remove", &scan.path))?;
         }
     }
@@ -233,8 +232,8 @@ pub(super) fn recover(
     })
 }
 
-/// How many records should be in these files and are not, and the ordinal behind the last that is
-/// known of.
+/// Returns the number of records that are missing in these files, and the ordinal after the last
+/// known one.
 fn lost(scans: &[Scan], head: Head) -> (u64, u64) {
     let written = head.next_ordinal.max(head.first_pending);
     let ordinals = scans.iter().flat_map(|scan| &scan.records);
@@ -250,14 +249,14 @@ fn lost(scans: &[Scan], head: Head) -> (u64, u64) {
         }
         end = end.max(ordinal + 1);
     }
-    // Files in front of the first were settled and removed, even if no head is left to say so.
+    // Files before the first were settled and removed, even if no head shows it.
     let oldest = scans.first().map_or(0, |scan| scan.first_ordinal);
     let written = written.max(oldest).min(end);
     let lost = head.waiting.saturating_sub(before) + (end - written).saturating_sub(behind);
     (lost, end)
 }
 
-/// Reads a whole file; what cannot be read of it is zeros.
+/// Reads a whole file; unreadable blocks are zeros.
 fn read_file(path: &Path) -> io::Result<Vec<u8>> {
     let file = File::open(path)?;
     let length = usize::try_from(file.metadata()?.len()).map_err(io::Error::other)?;

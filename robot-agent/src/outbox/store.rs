@@ -1,11 +1,11 @@
-//! The outbox's files: appended to, synced in batches, removed once everything in them is settled.
+//! The outbox's files: appended to, synced in batches, removed once all their records are settled.
 //!
-//! Records are counted by *ordinals* over the life of the store. A file is named after the first
-//! ordinal that it may hold, so a file is settled as soon as the next file's name is not above the
-//! head. The head (how far everything is settled) is a frame among the records; it is written with
-//! the next sync, and each sync leaves a copy of it in a file of its own. Damage costs the records
-//! that it hits and no others ([`recovery`]). After a crash, whatever was synced is as it was; of what was not, a prefix may
-//! survive: a record that was settled a moment before may show up again, and the server knows it.
+//! Records are numbered by *ordinals* over the life of the store. A file is named after the first
+//! ordinal that it may contain, so it is settled once the next file's name is not above the head's
+//! first waiting ordinal. The head is a frame among the records, written with the next sync, and
+//! each sync writes a copy of it to a separate file. Damage costs only the records it hits
+//! ([`recovery`]). After a crash all synced data are intact; of unsynced data a prefix may survive,
+//! so a record settled just before may reappear, and the server recognises it.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fs::{self, File, OpenOptions};
@@ -21,17 +21,17 @@ use super::frame::{self, CONTENT_BYTES_MAX, Frame, Head, RecordName};
 use super::head_file::{HeadFile, HeadWrite};
 use super::recovery::{self, Recovery, Scan};
 
-/// The ending of the store's files.
+/// Extension of the store's files.
 const FILE_ENDING: &str = "log";
 
-/// How much a store may hold.
+/// Capacity of a store.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Limits {
-    /// Most bytes of records that wait; beyond it the oldest are dropped.
+    /// Largest total of waiting records, bytes; beyond it the oldest are dropped.
     pub pending_bytes_max: u64,
-    /// Most records that wait; beyond it the oldest are dropped.
+    /// Largest number of waiting records; beyond it the oldest are dropped.
     pub pending_records_max: usize,
-    /// A file that has grown past this is followed by the next one.
+    /// Size of a file above which the next one is begun, bytes.
     pub file_bytes: u64,
 }
 
@@ -45,17 +45,17 @@ impl Default for Limits {
     }
 }
 
-/// Why the store could not do what it was asked.
+/// Errors of the store.
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
     /// A file could not be read, written or removed.
     #[error("the outbox could not {action} `{}`", path.display())]
     File {
-        /// What was tried.
+        /// The operation that failed.
         action: &'static str,
-        /// On which file.
+        /// The file.
         path: PathBuf,
-        /// What the operating system said.
+        /// Error of the operating system.
         #[source]
         source: io::Error,
     },
@@ -92,7 +92,7 @@ struct Entry {
     content_bytes: usize,
 }
 
-/// The files and what they hold. Every call may touch the disk.
+/// The files and their records. Every call may access the disk.
 #[derive(Debug)]
 pub(super) struct Store {
     folder: PathBuf,
@@ -110,16 +110,16 @@ pub(super) struct Store {
     has_damage: bool,
 }
 
-/// What a receipt settles.
+/// Records settled by a receipt.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Settled {
-    /// Ordinal of the last record of it.
+    /// Ordinal of the last settled record.
     pub(super) through_ordinal: u64,
-    /// How many of the records were refused.
+    /// Number of refused ones among them.
     pub(super) refused: u64,
 }
 
-/// Files to sync without holding the store, and the head that is safe once that is done.
+/// Files to sync without locking the store, and the head that is durable afterwards.
 #[derive(Debug)]
 pub(super) struct SyncTicket {
     files: Vec<(u64, PathBuf, File, u64)>,
@@ -128,18 +128,18 @@ pub(super) struct SyncTicket {
 }
 
 impl SyncTicket {
-    /// Waits until the disk has it.
+    /// Syncs the files and writes the head; waits until both are on disk.
     pub(super) fn run(&self) -> Result<(), StoreError> {
         for (_, path, file, _) in &self.files {
             file.sync_data().map_err(failure("sync", path))?;
         }
-        // Afterwards: it says that those are safe.
+        // Last, since the head states that the files are synced.
         self.head_write.run()
     }
 }
 
 impl Store {
-    /// Opens the store in a folder, which is made if it is not there; repairs torn files.
+    /// Opens the store in a folder, creating it if missing; repairs torn files.
     pub(super) fn open(
         folder: &Path,
         limits: Limits,
@@ -172,13 +172,13 @@ impl Store {
         for (scan, bytes) in found.files {
             store.take_file(&scan, bytes)?;
         }
-        // Records that were dropped just before a crash may be back.
+        // Records dropped just before a crash may have reappeared.
         store.make_room(0, 0);
         if store.files.is_empty() {
             store.start_file()?;
         }
         if recovery.lost_records > 0 {
-            // At once, so that they are counted once whatever comes.
+            // At once, so that they are counted only once.
             let ticket = store.begin_sync()?;
             ticket.run()?;
             store.finish_sync(&ticket)?;
@@ -186,7 +186,7 @@ impl Store {
         Ok((store, recovery))
     }
 
-    /// Takes over a file of an earlier run, which has been repaired.
+    /// Adds a repaired file of an earlier run.
     fn take_file(&mut self, scan: &Scan, bytes: u64) -> Result<(), StoreError> {
         let first_pending = self.head.first_pending;
         for record in &scan.records {
@@ -230,7 +230,7 @@ impl Store {
         Ok(())
     }
 
-    /// Writes one frame behind the newest file; what could be written of a failed one is cut off.
+    /// Appends one frame to the newest file; the rest of a failed write is cut off.
     fn write(&mut self, frame: &[u8]) -> Result<(u64, u64), StoreError> {
         let newest_is_full = self
             .files
@@ -250,7 +250,7 @@ impl Store {
         log.is_dirty = true;
         if let Err(source) = log.file.write_all(frame) {
             if log.file.set_len(at).is_err() {
-                // Nothing may follow a torn frame: the next write starts another file.
+                // Nothing may follow a torn frame: the next write begins another file.
                 log.bytes = log.bytes.max(self.limits.file_bytes);
             }
             return Err(failure("write", &log.path)(source));
@@ -259,13 +259,13 @@ impl Store {
         Ok((first_ordinal, at))
     }
 
-    /// How many records were ever appended: ordinals begin with 0 and have no gap.
+    /// Returns the number of records ever appended: ordinals begin with 0 and have no gap.
     pub(super) fn appended(&self) -> u64 {
         self.next_ordinal
     }
 
-    /// Appends a record; it is safe from a crash after the next sync. A full store drops its
-    /// oldest records for it.
+    /// Appends a record, which is durable after the next sync. A full store drops its oldest
+    /// records.
     pub(super) fn append(&mut self, content: &[u8]) -> Result<RecordName, StoreError> {
         let bytes = size(content.len());
         if content.len() > CONTENT_BYTES_MAX || bytes > self.limits.pending_bytes_max {
@@ -293,7 +293,7 @@ impl Store {
         Ok(name)
     }
 
-    /// Drops the oldest records until so many more fit.
+    /// Drops the oldest records until `records` more with `bytes` of content fit.
     fn make_room(&mut self, records: usize, bytes: u64) {
         while self.pending.len() + records > self.limits.pending_records_max
             || self.pending_bytes + bytes > self.limits.pending_bytes_max
@@ -313,8 +313,8 @@ impl Store {
         Some(entry)
     }
 
-    /// The oldest records of one run, read from the disk: at least one if any waits. One that has
-    /// been damaged since it was written is lost and counted.
+    /// Reads the oldest waiting records of one run, at least one if any waits. A record that was
+    /// damaged after it was written is lost and counted.
     pub(super) fn oldest(
         &mut self,
         records_max: usize,
@@ -330,7 +330,7 @@ impl Store {
         Ok(Vec::new())
     }
 
-    /// The oldest records of one run up to the first that is damaged.
+    /// Reads the oldest waiting records of one run up to the first damaged one.
     fn intact_oldest(
         &self,
         records_max: usize,
@@ -354,18 +354,18 @@ impl Store {
         Ok(records)
     }
 
-    /// Gives up the oldest record, whose frame is damaged.
+    /// Drops the oldest record, whose frame is damaged, and counts it.
     fn lose_oldest(&mut self) {
         let Some(&entry) = self.pending.front() else {
             return;
         };
         let log = &self.files[&entry.file];
         let mut bytes = vec![0; entry.frame_bytes];
-        // What cannot be read any more is zeros.
+        // Unreadable bytes stay zero.
         let _ = log.file.read_exact_at(&mut bytes, entry.frame_at);
         let at = usize::try_from(entry.frame_at).unwrap_or(usize::MAX);
         let place = at..at.saturating_add(entry.frame_bytes);
-        // A full disk must not keep what is intact behind it.
+        // A full disk must not block the intact records.
         if let Err(cause) = self.damaged.keep(&log.path, place, &bytes) {
             error!("the damaged bytes are not kept: {cause}");
         }
@@ -377,7 +377,7 @@ impl Store {
         self.has_damage = true;
     }
 
-    /// A record's content as it was written; none if its frame is damaged.
+    /// Reads a record's content; `None` if its frame is damaged.
     fn content(&self, entry: &Entry) -> Result<Option<Vec<u8>>, StoreError> {
         let log = &self.files[&entry.file];
         let mut bytes = vec![0; entry.frame_bytes];
@@ -391,7 +391,7 @@ impl Store {
         })
     }
 
-    /// Removes what is settled.
+    /// Removes settled records.
     pub(super) fn settle(&mut self, settled: Settled) {
         let Settled {
             through_ordinal,
@@ -408,7 +408,7 @@ impl Store {
         self.head_is_dirty |= refused > 0;
     }
 
-    /// Writes the head if it has moved, and names the files to be synced.
+    /// Writes the head if it has changed, and returns the files to sync.
     pub(super) fn begin_sync(&mut self) -> Result<SyncTicket, StoreError> {
         self.head.next_ordinal = self.next_ordinal;
         self.head.waiting = size(self.pending.len());
@@ -430,7 +430,7 @@ impl Store {
         })
     }
 
-    /// Takes note of a sync that has run: settled files are removed.
+    /// Completes a sync: removes settled files.
     pub(super) fn finish_sync(&mut self, ticket: &SyncTicket) -> Result<(), StoreError> {
         self.head_file.finish(&ticket.head_write);
         for (first_ordinal, _, _, bytes) in &ticket.files {
@@ -450,7 +450,7 @@ impl Store {
         Ok(())
     }
 
-    /// Records that wait.
+    /// Returns the number of waiting records.
     pub(super) fn pending_records(&self) -> usize {
         self.pending.len()
     }
@@ -479,19 +479,19 @@ impl Store {
         self.head_is_dirty || self.files.values().any(|log| log.is_dirty)
     }
 
-    /// Bytes of the records that wait.
+    /// Returns the total content of waiting records, bytes.
     #[cfg(test)]
     pub(super) fn pending_bytes(&self) -> u64 {
         self.pending_bytes
     }
 
-    /// Where the store stands.
+    /// Returns the state of the store.
     pub(super) fn head(&self) -> Head {
         self.head
     }
 
-    /// Where damaged bytes are kept, if anything was found damaged in this run, or was before and
-    /// nobody has removed what was kept of it.
+    /// Returns the file of damaged bytes, if damage was found in this run, or in an earlier one and
+    /// the file has not been removed.
     pub(super) fn damage(&self) -> Option<PathBuf> {
         self.has_damage.then(|| self.damaged.path())
     }
@@ -531,7 +531,7 @@ fn open_for_append(path: &Path) -> Result<File, StoreError> {
         .map_err(failure("open", path))
 }
 
-/// Makes new names in a folder safe from a crash.
+/// Syncs a folder, so that its new names survive a crash.
 fn sync_folder(folder: &Path) -> Result<(), StoreError> {
     let open = File::open(folder).map_err(failure("open", folder))?;
     open.sync_all().map_err(failure("sync", folder))

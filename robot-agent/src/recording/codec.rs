@@ -1,4 +1,4 @@
-//! A tick between the loop's own types and the message in which a record holds it, to the bit.
+//! Converts ticks between the loop's types and the recorded message, to the bit.
 
 use std::time::Duration;
 
@@ -16,12 +16,12 @@ use super::replay::Difference;
 use crate::control_loop::channels::Fault;
 use crate::drive::{Battery, Feedback, SAMPLES_MAX, SensorSample, StatedNoise};
 
-/// Largest text that is read: a site of many polygons, a prior of many cells.
+/// Largest text that is decoded, bytes: a site of many polygons, a prior of many cells.
 const TEXT_BYTES_MAX: usize = 64 * 1024 * 1024;
-/// What stands where there is nothing.
+/// Recorded in fields of absent values, whose bit in `present` is zero.
 const NONE: f64 = f64::NAN;
 
-/// Nanoseconds, up to 584 years.
+/// Returns whole nanoseconds; saturates at 584 years.
 pub(super) fn nanoseconds(time: Duration) -> u64 {
     u64::try_from(time.as_nanos()).unwrap_or(u64::MAX)
 }
@@ -30,7 +30,7 @@ fn bit(bit: u32, is_set: bool) -> u32 {
     if is_set { bit } else { 0 }
 }
 
-/// A sample as it is recorded.
+/// Converts a sample to its recorded message.
 pub(super) fn sample_message(sample: &SensorSample) -> LoopSample {
     let acceleration = sample.acceleration;
     let (wheels, torques) = (sample.wheel_speeds, sample.wheel_torques);
@@ -62,7 +62,7 @@ pub(super) fn sample_message(sample: &SensorSample) -> LoopSample {
     }
 }
 
-/// The sample of a record.
+/// Converts a recorded message to a sample.
 fn sample_of(message: &LoopSample) -> SensorSample {
     let has = |bit: u32| message.present & bit != 0;
     SensorSample {
@@ -94,7 +94,7 @@ fn sample_of(message: &LoopSample) -> SensorSample {
     }
 }
 
-/// What the base said, of a record; none if there are more samples than one tick takes.
+/// Returns the samples of a recorded tick; `None` if there are more than [`SAMPLES_MAX`].
 pub(super) fn feedback_of(message: &LoopTick<'_>) -> Option<Feedback> {
     if message.samples.len() > SAMPLES_MAX {
         return None;
@@ -106,7 +106,7 @@ pub(super) fn feedback_of(message: &LoopTick<'_>) -> Option<Feedback> {
     Some(feedback.with_lost(message.lost_samples))
 }
 
-/// What the base said of its noise, of a record.
+/// Returns the sensor noise that the base stated, of a recorded tick.
 pub(super) fn noise_of(message: &LoopTick<'_>) -> StatedNoise {
     let has = |bit: u32| message.present & bit != 0;
     StatedNoise {
@@ -117,7 +117,7 @@ pub(super) fn noise_of(message: &LoopTick<'_>) -> StatedNoise {
     }
 }
 
-/// The battery of a record.
+/// Returns the battery of a recorded tick.
 pub(super) fn battery_of(message: &LoopTick<'_>) -> Option<Battery> {
     (message.present & tick_bits::BATTERY != 0).then_some(Battery {
         charge_ratio: message.battery_charge_ratio,
@@ -135,7 +135,8 @@ fn mode_number(mode: RobotMode) -> u8 {
     }
 }
 
-/// The number of a cause in records, which never changes; its place in the list of causes may.
+/// Returns the number of a cause in records, which never changes, unlike its position in
+/// [`GateCause::ALL`].
 fn gate_number(cause: GateCause) -> u8 {
     match cause {
         GateCause::Acceleration => 0,
@@ -157,10 +158,10 @@ fn gate_number(cause: GateCause) -> u8 {
     }
 }
 
-/// Where the part of a tick that format 1 lacks has its place, behind the encapsulation.
+/// Alignment of `judged_ns`, the last field of a tick, which format 1 lacks, bytes.
 const JUDGED_ALIGNED: usize = 8;
 
-/// A tick of format 1 as one of the present format, judged at its begin.
+/// Converts a tick of format 1 to the present format, judged at its begin.
 pub(super) fn from_format_1(tick: &[u8]) -> Result<Vec<u8>, CdrError> {
     let mut padded = tick.to_vec();
     let body = tick.len().saturating_sub(ENCAPSULATION_BYTES);
@@ -173,18 +174,18 @@ pub(super) fn from_format_1(tick: &[u8]) -> Result<Vec<u8>, CdrError> {
     Ok(bytes)
 }
 
-/// A text as it is recorded.
+/// Encodes a text as a recorded message.
 pub(super) fn text_message(text: &str, into: &mut Vec<u8>) {
     encode(&Text { data: text }, into);
 }
 
-/// The text of a record.
+/// Decodes the text of a recorded message.
 pub(super) fn text_of(message: &[u8]) -> Result<&str, CdrError> {
     let text: Text<'_> = decode_up_to(message, TEXT_BYTES_MAX)?;
     Ok(text.data)
 }
 
-/// A tick as it is recorded; `samples` is room for those of the base.
+/// Converts a tick to its recorded message; `samples` is the buffer of the samples.
 pub(super) fn tick_message<'room>(
     frame: &TickFrame,
     samples: &'room mut Vec<LoopSample>,
@@ -255,7 +256,7 @@ pub(super) fn tick_message<'room>(
     }
 }
 
-/// What of a replayed tick is not as it was recorded.
+/// Returns the outputs of a replayed tick that differ in any bit from the recorded ones.
 pub(super) fn differences(recorded: &LoopTick<'_>, replayed: &LoopTick<'_>) -> Vec<Difference> {
     let numbers = |tick: &LoopTick<'_>| {
         [

@@ -1,4 +1,4 @@
-//! What the loop notes of a tick, in room of its own: it waits for nobody and allocates nothing.
+//! The notes that the loop makes of a tick, sent to the recorder without blocking or allocating.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -20,17 +20,17 @@ use crate::control_loop::site_view::SiteView;
 use crate::drive::{Battery, Feedback, StatedNoise};
 use crate::safety::LoopView;
 
-/// Notes that may wait for whoever writes them: 2.5 s of a loop of 200 Hz, less than 3 MB.
+/// Capacity of the queue of notes: 2.5 s of a loop at 200 Hz, less than 3 MB.
 pub(crate) const NOTES_MAX: usize = 512;
 
-/// Everything that a tick took.
+/// Inputs of a tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct TickInputs {
     pub(crate) now: Moment,
-    /// When what a driver wants was judged, and what else carries its own end.
+    /// Time by which inputs with an expiry, such as drive commands, were judged; monotonic clock.
     pub(crate) judged: Duration,
     pub(crate) stop_requested: bool,
-    /// Commands that it took, noted before it.
+    /// Number of commands that the tick took; they are noted before it.
     pub(crate) commands: u32,
     pub(crate) feedback: Feedback,
     pub(crate) is_base_silent: bool,
@@ -41,7 +41,7 @@ pub(crate) struct TickInputs {
     pub(crate) view: LoopView,
 }
 
-/// What it gave.
+/// Outputs of a tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct TickOutputs {
     pub(crate) wanted: WheelSpeeds,
@@ -49,28 +49,28 @@ pub(crate) struct TickOutputs {
     pub(crate) pose: Option<Pose>,
     pub(crate) twist: Twist,
     pub(crate) theta_loop: Option<f64>,
-    /// θ as measured, and its standard deviation.
+    /// Measured θ and its standard deviation.
     pub(crate) theta: Option<(f64, f64)>,
-    /// Distance along the path and from it, metres.
+    /// Distance driven along the path and cross-track error, metres.
     pub(crate) mission: Option<(f64, f64)>,
     pub(crate) slip: Option<SideSlip>,
-    /// Information on θ of a closed segment, and the same weighted by θ.
+    /// θ information of the segment that was closed, and θ weighted by it.
     pub(crate) segment: Option<(f64, f64)>,
     pub(crate) mode: RobotMode,
     pub(crate) fault: Option<Fault>,
     pub(crate) gate: Option<GateCause>,
 }
 
-/// One tick.
+/// Inputs and outputs of one tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct TickFrame {
-    /// Its number since the loop's start, from one on.
+    /// Number of the tick since the loop's start, from 1.
     pub(crate) number: u64,
     pub(crate) inputs: TickInputs,
     pub(crate) outputs: TickOutputs,
 }
 
-/// A command as the loop took it.
+/// A command that the loop took.
 #[derive(Debug, Clone)]
 pub(crate) enum NotedCommand {
     Start(Arc<JobOrigin>),
@@ -82,7 +82,7 @@ pub(crate) enum NotedCommand {
 }
 
 impl NotedCommand {
-    /// Shares what the command carries; copies nothing.
+    /// Creates the note by sharing the command's data; copies nothing.
     pub(crate) fn of(command: &LoopCommand) -> Self {
         match command {
             LoopCommand::Start(job) => Self::Start(Arc::clone(&job.origin)),
@@ -95,19 +95,19 @@ impl NotedCommand {
     }
 }
 
-/// From the loop to whoever writes.
+/// A note from the loop to the recorder.
 #[derive(Debug)]
 #[expect(
     clippy::large_enum_variant,
     reason = "a box for ticks would be allocated in each of them"
 )]
 pub(crate) enum Note {
-    /// A command, taken by the tick of that number.
+    /// A command, with the number of the tick that took it.
     Command(u64, NotedCommand),
     Tick(TickFrame),
 }
 
-/// The loop's end.
+/// The loop's end of the queue of notes.
 #[derive(Debug)]
 pub(crate) struct NoteTaker {
     notes: SyncSender<Note>,
@@ -116,13 +116,13 @@ pub(crate) struct NoteTaker {
 }
 
 impl NoteTaker {
-    /// Notes a command of the tick of that number.
+    /// Notes a command taken by tick number `tick`.
     pub(crate) fn command(&mut self, tick: u64, command: &LoopCommand) {
         self.commands += 1;
         self.send(Note::Command(tick, NotedCommand::of(command)));
     }
 
-    /// Commands since the last tick that was noted.
+    /// Returns the number of commands since the last noted tick.
     pub(crate) fn commands(&self) -> u32 {
         self.commands
     }
@@ -133,8 +133,8 @@ impl NoteTaker {
         self.send(Note::Tick(*frame));
     }
 
-    /// What finds no room is lost and counted; what it shares is held by the loop as well, so that
-    /// nothing is freed here.
+    /// Sends a note, or counts it as lost if the queue is full. Its shared data are also owned by
+    /// the loop, so that dropping it deallocates nothing.
     fn send(&self, note: Note) {
         if self.notes.try_send(note).is_err() {
             self.lost.fetch_add(1, Ordering::Relaxed);
@@ -142,15 +142,15 @@ impl NoteTaker {
     }
 }
 
-/// The other end.
+/// The recorder's end of the queue of notes.
 #[derive(Debug)]
 pub(crate) struct Notes {
     pub(crate) notes: Receiver<Note>,
-    /// Notes that found no room.
+    /// Number of notes that found the queue full.
     pub(crate) lost: Arc<AtomicU64>,
 }
 
-/// Both ends of what the loop notes.
+/// Creates both ends of the queue of notes.
 pub(crate) fn notes() -> (NoteTaker, Notes) {
     let (sender, receiver) = sync_channel(NOTES_MAX);
     let lost = Arc::new(AtomicU64::new(0));

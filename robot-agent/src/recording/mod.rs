@@ -1,11 +1,11 @@
-//! Records what the control loop takes and gives, and runs records again.
+//! Records the inputs and outputs of the control loop in MCAP files, and replays such records.
 //!
 //! ```text
-//! loop ──notes (bounded, never waited for)──► thread ──► run-….mcap, the oldest gives way
+//! loop ──notes (bounded, non-blocking)──► thread ──► tread-….mcap, the oldest file is removed
 //! ```
-//! A record holds the loop's own values to the bit ([`codec`]), so that `tread-agent replay` can run
-//! controller and estimator on it again, and beside them the same in messages of ROS ([`views`]),
-//! for Foxglove and ROS's tools. A disk that is full or dead costs the record alone.
+//! A record holds the loop's own values to the bit ([`codec`]), so that `tread-agent replay` can
+//! run controller and estimator on it again, and the same data as ROS messages ([`views`]) for
+//! Foxglove and ROS tools. A disk that is full or fails costs only the record.
 
 mod codec;
 pub(crate) mod frame;
@@ -32,86 +32,86 @@ use crate::safety::LoopView;
 use frame::NotedCommand;
 pub(crate) use writer::RecordWriter;
 
-/// The version of what is written here. Format 1 had JSON messages, a tick without
-/// [`LoopTick::judged_ns`](tread_ros2::messages::tread::LoopTick), and a loop that did not watch its
-/// own rate.
+/// Version of the record format. Format 1 had JSON messages, a tick without
+/// [`LoopTick::judged_ns`](tread_ros2::messages::tread::LoopTick), and a loop that did not watch
+/// its own rate.
 pub(crate) const FORMAT: u32 = 2;
-/// Versions that are read.
+/// Versions of the record format that this agent reads.
 pub(crate) const FORMATS_READ: std::ops::RangeInclusive<u32> = 1..=FORMAT;
-/// The version of this agent.
+/// Version of this agent.
 pub(crate) const VERSION: &str = env!("CARGO_PKG_VERSION");
-/// Smallest and largest file, MiB.
+/// Permitted size of a file, MiB.
 pub const FILE_MIB_RANGE: std::ops::RangeInclusive<u64> = 1..=4_096;
-/// Fewest and most files.
+/// Permitted number of files.
 pub const FILES_RANGE: std::ops::RangeInclusive<usize> = 2..=1_000;
-/// A file unless it is said otherwise, MiB.
+/// Default size of a file, MiB.
 pub(crate) const FILE_MIB_DEFAULT: u64 = 64;
-/// Files unless it is said otherwise.
+/// Default number of files.
 pub(crate) const FILES_DEFAULT: usize = 16;
 
 /// Topics of a record.
 pub(crate) mod topics {
-    /// Once at the head of each file: see [`super::RunHead`].
+    /// [`super::RunHead`], once at the head of each file.
     pub(crate) const RUN: &str = "/tread/run";
-    /// Commands that the loop took.
+    /// Commands to the loop.
     pub(crate) const COMMAND: &str = "/tread/command";
-    /// Leases, teleoperation commands, limits from outside; when they change.
+    /// Leases, drive commands and external limits, when they change.
     pub(crate) const SAFETY: &str = "/tread/safety";
     /// Ticks.
     pub(crate) const TICK: &str = "/tread/tick";
-    /// Where the robot is believed to be.
+    /// Estimated pose in the site frame, and twist.
     pub(crate) const ODOMETRY: &str = "/tread/odometry";
-    /// What is commanded.
+    /// Twist of the commanded wheel speeds without slip.
     pub(crate) const COMMANDED: &str = "/tread/cmd_vel";
-    /// What the inertial unit said.
+    /// Samples of the inertial measurement unit.
     pub(crate) const IMU: &str = "/tread/imu";
-    /// What the wheels said.
+    /// Samples of wheel speeds and torques.
     pub(crate) const JOINTS: &str = "/tread/joint_states";
     /// Position fixes.
     pub(crate) const POSE: &str = "/tread/pose";
     /// Plans, when they begin.
     pub(crate) const PLAN: &str = "/tread/plan";
-    /// How the agent is.
+    /// State of the loop, once a second.
     pub(crate) const DIAGNOSTICS: &str = "/tread/diagnostics";
 }
 
-/// Where records go, and how many.
+/// Destination and size of records.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RecordingConfig {
-    /// The folder.
+    /// Folder of the files.
     pub folder: PathBuf,
-    /// Size from which a file is followed by the next, bytes.
+    /// Size at which a file is closed and the next one begun, bytes.
     pub file_bytes: u64,
-    /// Files that are kept, of all runs together.
+    /// Number of files that are kept, of all runs together.
     pub files: usize,
 }
 
-/// What a file begins with.
+/// Head of a file: the run, and the configuration of its loop.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct RunHead {
-    /// See [`FORMAT`].
+    /// Format of the record, see [`FORMAT`].
     pub(crate) format: u32,
     /// Version of the agent.
     pub(crate) version: String,
     pub(crate) boot: BootId,
     pub(crate) site: SiteId,
     pub(crate) robot: RobotId,
-    /// Number of the file within the run, from zero on.
+    /// Number of the file within the run, from zero.
     pub(crate) part: u32,
     pub(crate) model: RobotModel,
     pub(crate) blind_within_fence: bool,
-    /// Oldest word of the base with which it does not count as silent.
+    /// Age of the last sample beyond which the base counts as silent.
     pub(crate) silent_after: Duration,
     /// Rate of the loop, Hz.
     pub(crate) rate_hz: f64,
-    /// What was known beforehand of the robot; records without it are of agents that took it for
-    /// exactly as its model says.
+    /// Estimator's prior of the robot's parameters; records without it are of agents that assumed
+    /// the model to be exact.
     #[serde(default = "EstimatorPrior::exact")]
     pub(crate) prior: EstimatorPrior,
 }
 
 impl RunHead {
-    /// The first file of a run, and where it goes; none if nothing is to be recorded.
+    /// Returns the destination and the head of a run's first file; `None` if recording is off.
     pub(crate) fn of(
         config: &AgentConfig,
         boot: BootId,
@@ -134,24 +134,24 @@ impl RunHead {
     }
 }
 
-/// A command in a record.
+/// A command to the loop, as recorded.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum CommandRecord {
-    /// Drive this.
+    /// Starts a mission, planned from this origin.
     Start(JobOrigin),
-    /// End this mission.
+    /// Ends a mission.
     Cancel { mission: MissionId },
-    /// Hold it.
+    /// Activates a hold of a mission.
     Hold { mission: MissionId, hold: Hold },
-    /// Let it go on.
+    /// Releases a hold of a mission.
     Release { mission: MissionId, hold: Hold },
-    /// Drive this revision instead.
+    /// Replaces the active revision by this one.
     Replace(JobOrigin),
-    /// The site is like this.
+    /// Replaces the definition of the site.
     Site {
         definition: SiteDefinition,
-        /// Whether its fence leaves no room.
+        /// Whether the fence leaves no room anywhere.
         is_without_room: bool,
     },
 }
@@ -178,18 +178,18 @@ impl From<&NotedCommand> for CommandRecord {
     }
 }
 
-/// On [`topics::COMMAND`].
+/// Message on [`topics::COMMAND`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct CommandMessage {
-    /// The tick that took it.
+    /// Number of the tick that took the command.
     pub(crate) tick: u64,
     pub(crate) command: CommandRecord,
 }
 
-/// On [`topics::SAFETY`].
+/// Message on [`topics::SAFETY`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub(crate) struct SafetyMessage {
-    /// The first tick that saw it.
+    /// Number of the first tick with this view.
     pub(crate) tick: u64,
     pub(crate) view: LoopView,
 }

@@ -1,4 +1,4 @@
-//! Reads records: the files of one run, in order, up to where they are torn.
+//! Reads the files of one recorded run, in order, up to where a file is torn.
 
 use std::fs::File;
 use std::io::BufReader;
@@ -12,12 +12,12 @@ use tread_api::ids::BootId;
 
 use super::{CommandMessage, FORMAT, FORMATS_READ, RunHead, SafetyMessage, codec, topics};
 
-/// Largest piece of a file that is looked at, bytes.
+/// Largest MCAP record that is read, bytes.
 const PIECE_BYTES_MAX: usize = 256 * 1024 * 1024;
-/// The encoding of messages that are JSON.
+/// Message encoding of JSON in MCAP.
 const JSON: &str = "json";
 
-/// Why a record cannot be run again at all.
+/// Why a record cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum ReadError {
     #[error("there is no file to replay")]
@@ -62,11 +62,11 @@ pub(crate) enum ReadError {
     },
 }
 
-/// What a record says, in the order in which it was written.
+/// An entry of a record, in the order of writing.
 pub(crate) enum Entry {
     Command(Box<CommandMessage>),
     Safety(Box<SafetyMessage>),
-    /// A tick as it is encoded.
+    /// A tick in its recorded encoding.
     Tick(Vec<u8>),
 }
 
@@ -75,7 +75,7 @@ pub(crate) struct Run {
     pub(crate) head: RunHead,
     parts: std::vec::IntoIter<(PathBuf, RunHead)>,
     present: Option<Part>,
-    /// What is wrong with the end of a file, in words; nothing is read behind it.
+    /// Description of a torn file; nothing behind that position is read.
     pub(crate) torn: Option<String>,
 }
 
@@ -85,16 +85,16 @@ struct Part {
     messages: MessageReader<BufReader<File>>,
 }
 
-/// A message as it is in the file.
+/// A message as stored in the file.
 struct Raw {
     topic: String,
     bytes: Vec<u8>,
-    /// Whether it is JSON itself, as in format 1, and not a text of ROS.
+    /// Whether the message itself is JSON, as in format 1, and not a ROS text that contains JSON.
     is_json: bool,
 }
 
 impl Raw {
-    /// The JSON in it.
+    /// Parses the message's JSON.
     fn json<T: DeserializeOwned>(&self, part: &Part) -> Result<T, ReadError> {
         let json = if self.is_json {
             &self.bytes[..]
@@ -138,7 +138,7 @@ impl Part {
         }
     }
 
-    /// What the file says of itself.
+    /// Reads the head of the file's run.
     fn head(&mut self) -> Result<RunHead, ReadError> {
         let mut has_message = false;
         loop {
@@ -159,7 +159,7 @@ impl Part {
     }
 
     fn read_head(&self, raw: &Raw) -> Result<RunHead, ReadError> {
-        // The format first: of another one nothing else is known.
+        // The format first: the fields of another format are unknown.
         let spelled: serde_json::Value = raw.json(self)?;
         let found = spelled.get("format").and_then(serde_json::Value::as_u64);
         let found = found.and_then(|found| u32::try_from(found).ok());
@@ -175,7 +175,7 @@ impl Part {
         raw.json(self)
     }
 
-    /// Whether a channel was met so far.
+    /// Whether the file has defined a channel of this topic so far.
     fn knows(&self, topic: &str) -> bool {
         (0..=u16::MAX)
             .filter_map(|number| self.messages.get_channel(number))
@@ -187,7 +187,8 @@ impl Run {
     /// Opens the files of a run, given in any order.
     ///
     /// # Errors
-    /// [`ReadError`] when they are not all parts of one run from its begin on.
+    /// [`ReadError`] if a file is no readable record, or if the files are not all parts of one run
+    /// from its first part on.
     pub(crate) fn open(files: &[PathBuf]) -> Result<Self, ReadError> {
         let mut parts = Vec::with_capacity(files.len());
         for file in files {
@@ -219,10 +220,10 @@ impl Run {
         })
     }
 
-    /// What comes next; none at the end, or where a file is torn.
+    /// Returns the next entry; `None` at the end, or where a file is torn.
     ///
     /// # Errors
-    /// [`ReadError`] for a message that is none.
+    /// [`ReadError`] for a malformed message or a file without ticks.
     pub(crate) fn next(&mut self) -> Result<Option<Entry>, ReadError> {
         while self.torn.is_none() {
             let Some(part) = &mut self.present else {
@@ -257,7 +258,7 @@ fn entry_of(part: &Part, raw: Raw) -> Result<Option<Entry>, ReadError> {
         topics::COMMAND => Some(Entry::Command(Box::new(raw.json(part)?))),
         topics::SAFETY => Some(Entry::Safety(Box::new(raw.json(part)?))),
         topics::TICK => Some(Entry::Tick(raw.bytes)),
-        // The rest is for people.
+        // The other topics are for display only.
         _ => None,
     })
 }

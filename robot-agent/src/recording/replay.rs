@@ -1,8 +1,8 @@
-//! Runs controller and estimator on a record again, and says where they differ from it.
+//! Replays a record: runs controller and estimator on it again and reports where they differ.
 //!
-//! The loop's own core is fed through the loop's own seams: commands through its channel, what the
-//! base said through a drive that reads the record, stops, leases and limits through their cell. What
-//! it notes of itself then is held against what is in the record, to the bit.
+//! The loop's own core ([`LoopCore`]) is fed through its usual interfaces: commands through its
+//! channel, samples through a drive that reads the record, stops, leases and limits through their
+//! cell. Its notes are compared with the recorded ones to the bit.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -27,10 +27,10 @@ use crate::drive::{Battery, Drive, Feedback, StatedNoise};
 use crate::geometry::control_model;
 use crate::safety::LoopView;
 
-/// Differing ticks that are reported one by one.
+/// Largest number of differing ticks that are reported individually.
 pub(crate) const REPORTED_MAX: usize = 10;
 
-/// Why a record could not be run again to its end.
+/// Why a record cannot be replayed to its end.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum ReplayError {
     #[error(transparent)]
@@ -41,7 +41,7 @@ pub(crate) enum ReplayError {
     Malformed { tick: u64, problem: String },
 }
 
-/// A figure that is not as it was recorded.
+/// An output that differs from the recorded one.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Difference {
     pub(crate) name: &'static str,
@@ -49,43 +49,43 @@ pub(crate) struct Difference {
     pub(crate) replayed: f64,
 }
 
-/// A tick that went otherwise.
+/// A tick with outputs that differ.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct DifferingTick {
     pub(crate) tick: u64,
-    /// Since the first tick, seconds.
+    /// Time since the first tick, seconds.
     pub(crate) after_s: f64,
     pub(crate) differences: Vec<Difference>,
 }
 
-/// What a replay found.
+/// Result of a replay.
 #[derive(Debug)]
 pub(crate) struct Replayed {
     pub(crate) head: RunHead,
-    /// Ticks that were run again.
+    /// Ticks that were replayed.
     pub(crate) ticks: u64,
-    /// Time between the first and the last of them.
+    /// Time between the first and the last replayed tick.
     pub(crate) lasting: Duration,
-    /// Ticks of them in which something was commanded.
+    /// Replayed ticks in which the wheels were commanded to turn.
     pub(crate) driving_ticks: u64,
-    /// Ticks of them that went otherwise.
+    /// Replayed ticks that differ.
     pub(crate) differing: u64,
-    /// The first of those.
+    /// The first differing ticks, at most [`REPORTED_MAX`].
     pub(crate) first_differing: Vec<DifferingTick>,
-    /// What is missing from the record, so that nothing behind it could be run again.
+    /// What is missing in the record; nothing after it could be replayed.
     pub(crate) gap: Option<String>,
-    /// Where the record is torn; nothing is missing before.
+    /// Where the record is torn; the replay ends there.
     pub(crate) torn: Option<String>,
 }
 
 impl Replayed {
-    /// Whether the record is of another version of the agent.
+    /// Whether the record is of another version of the agent or an older format.
     pub(crate) fn is_of_another_version(&self) -> bool {
         self.head.version != VERSION || self.head.format < FORMAT
     }
 }
 
-/// A base that says what a record holds.
+/// A drive that returns the recorded samples.
 #[derive(Default)]
 struct RecordedBase {
     feedback: Feedback,
@@ -114,7 +114,7 @@ impl Drive for RecordedBase {
     }
 }
 
-/// A loop that lives through a record.
+/// A loop that replays a record.
 struct Player {
     model: RobotModel,
     core: LoopCore,
@@ -129,10 +129,10 @@ struct Player {
     found: Replayed,
 }
 
-/// Runs the files of one run again, given in any order.
+/// Replays the files of one run, given in any order.
 ///
 /// # Errors
-/// [`ReplayError`] when there is nothing that could be run.
+/// [`ReplayError`] if the record cannot be read, its model is impossible, or a tick is malformed.
 pub(crate) fn replay(files: &[PathBuf]) -> Result<Replayed, ReplayError> {
     let mut run = Run::open(files)?;
     let mut player = Player::new(run.head.clone())?;
@@ -188,7 +188,7 @@ impl Player {
         })
     }
 
-    /// Takes a tick as it is in the record.
+    /// Processes a tick as it is in the record.
     fn take(&mut self, bytes: &[u8]) -> Result<(), ReplayError> {
         if self.found.head.format >= FORMAT {
             return self.tick(bytes);
@@ -239,7 +239,7 @@ impl Player {
         let judged = Duration::from_nanos(recorded.judged_ns);
         let stop = has(tick_bits::STOP_REQUESTED);
         self.core.tick_by(now, &|| judged, stop, &mut base);
-        // What the loop hands back is freed.
+        // Events are dropped.
         self.ends.events.try_iter().for_each(drop);
         if let Some(frame) = self.noted() {
             self.compare(&recorded, recorded_bytes, &frame);
@@ -248,7 +248,7 @@ impl Player {
         Ok(())
     }
 
-    /// Hands the loop what it took in that tick.
+    /// Sends the loop the commands that this tick took.
     fn command(&mut self, recorded: &LoopTick<'_>) -> Result<(), String> {
         let tick = recorded.number;
         let noted = self.waiting.len();
@@ -270,7 +270,7 @@ impl Player {
         Ok(())
     }
 
-    /// What the loop noted of its tick.
+    /// Returns the loop's note of its tick.
     fn noted(&mut self) -> Option<TickFrame> {
         loop {
             match self.notes.notes.try_recv() {

@@ -1,4 +1,4 @@
-//! `tread-agent replay`: what a replay found, for people and for programs.
+//! `tread-agent replay`: prints the result of a replay, as text or JSON.
 
 use std::io::Write;
 use std::path::PathBuf;
@@ -20,10 +20,11 @@ pub(crate) struct ReplayArgs {
     json: bool,
 }
 
-/// Runs a record again and says where it differs; whether it does not.
+/// Replays a record and prints the result. Returns whether it equals the record.
 ///
 /// # Errors
-/// The record cannot be read at all, and no JSON is wanted to say so in; or nothing can be written.
+/// The record cannot be read, unless JSON is printed, which then contains the error; or the output
+/// cannot be written.
 pub(crate) fn run(args: &ReplayArgs) -> anyhow::Result<bool> {
     let replayed = replay(&args.files);
     let mut out = std::io::stdout().lock();
@@ -64,7 +65,7 @@ fn check(name: &str, goal: &str, value: &Value, holds: bool) -> Value {
     json!({ "name": name, "goal": goal, "value": value, "holds": holds })
 }
 
-/// Whether all was run again as it was recorded; a torn end is no difference.
+/// Whether at least one tick was replayed and none differs or is missing; a torn end is allowed.
 pub(crate) fn holds(found: &Replayed) -> bool {
     checks(found).iter().all(|(_, _, _, holds)| *holds)
 }
@@ -78,7 +79,7 @@ fn tick_json(tick: &DifferingTick) -> Value {
     json!({ "tick": tick.tick, "after_s": tick.after_s, "differences": differences })
 }
 
-/// For programs.
+/// Returns the result as JSON.
 pub(crate) fn object(found: &Replayed) -> Value {
     let checks: Vec<Value> = checks(found)
         .into_iter()
@@ -98,7 +99,7 @@ pub(crate) fn object(found: &Replayed) -> Value {
     })
 }
 
-/// For programs, of a record that cannot be read or run at all.
+/// Returns the JSON for a record that cannot be read or replayed.
 fn unread(refused: &anyhow::Error) -> Value {
     json!({
         "replayed_by": VERSION,
@@ -107,7 +108,7 @@ fn unread(refused: &anyhow::Error) -> Value {
     })
 }
 
-/// For people.
+/// Returns the result as text.
 pub(crate) fn text(found: &Replayed) -> String {
     let mut lines = vec![format!(
         "{} of `{}`: {} ticks over {:.1} s, {} of them driving",

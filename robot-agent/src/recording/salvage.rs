@@ -1,8 +1,8 @@
-//! `tread-agent recover`: copies what is readable of a damaged or torn record into a whole one.
+//! `tread-agent recover`: copies the readable part of a damaged or torn record to a new record.
 //!
-//! A record consists of chunks, each with a checksum and found by its own head, so that damage costs
-//! the chunk that it hits: about a second. Definitions of channels stand in the first chunk and once
-//! more at the file's end; where both are lost they are those that this agent writes itself.
+//! A record consists of chunks, each with a header and a checksum, so damage costs only the chunks
+//! it hits, about a second each. Channels are defined in the first chunk and again at the file's
+//! end; where both are lost, this agent's own definitions are used.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -24,11 +24,11 @@ use tread_ros2::messages::tread::LoopTick;
 use super::writer::{channel_numbered, options, ros_channel};
 use super::{codec, topics};
 
-/// Length of the magic at a file's begin and end.
+/// Length of the magic at the begin and end of a file, bytes.
 const MAGIC_BYTES: usize = 8;
-/// Length of what stands in front of a record's content: what it is, and its length.
+/// Length of the head of an MCAP record, bytes: opcode and content length.
 const RECORD_HEAD_BYTES: usize = 9;
-/// Largest chunk that is looked at once it is unpacked, bytes.
+/// Largest uncompressed size of a chunk that is read, bytes.
 const CHUNK_BYTES_MAX: u64 = 256 * 1024 * 1024;
 
 /// Arguments of `tread-agent recover`.
@@ -63,13 +63,13 @@ pub(crate) enum SalvageError {
     },
 }
 
-/// What was recovered.
+/// Result of a recovery.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub(crate) struct Salvaged {
     pub(crate) chunks: u64,
     pub(crate) messages: u64,
     pub(crate) ticks: u64,
-    /// Ticks that are missing between others, each run of them with its first and last number.
+    /// First and last number of each run of ticks that is missing between recovered ones.
     pub(crate) missing: Vec<(u64, u64)>,
 }
 
@@ -91,7 +91,7 @@ struct Message {
     data: Vec<u8>,
 }
 
-/// What a chunk holds.
+/// Content of a chunk.
 #[derive(Default)]
 struct Chunk {
     schemas: Vec<(SchemaHeader, Vec<u8>)>,
@@ -99,10 +99,10 @@ struct Chunk {
     messages: Vec<Message>,
 }
 
-/// Copies what is readable and says how much that is.
+/// Copies the readable part and prints its size.
 ///
 /// # Errors
-/// Nothing could be recovered, or nothing can be said.
+/// [`SalvageError`], or the output cannot be written.
 pub(crate) fn run(args: &RecoverArgs) -> anyhow::Result<()> {
     let found = salvage(&args.file, &args.into)?;
     let mut out = io::stdout().lock();
@@ -131,10 +131,11 @@ fn object(found: &Salvaged) -> Value {
     })
 }
 
-/// Copies what is readable of a file into another one.
+/// Copies the readable part of `file` into a new file.
 ///
 /// # Errors
-/// [`SalvageError`].
+/// [`SalvageError`]: `file` is unreadable or without an undamaged chunk, or `into` cannot be
+/// written.
 pub(crate) fn salvage(file: &Path, into: &Path) -> Result<Salvaged, SalvageError> {
     let bytes = fs::read(file).map_err(|source| SalvageError::Unreadable {
         path: file.to_owned(),
@@ -144,7 +145,7 @@ pub(crate) fn salvage(file: &Path, into: &Path) -> Result<Salvaged, SalvageError
     let mut places = Vec::new();
     let mut at = MAGIC_BYTES.min(bytes.len());
     while at < bytes.len() {
-        // Whatever lies between two chunks is no message.
+        // Bytes between two chunks contain no messages.
         match chunk_at(&bytes, at) {
             Some((place, chunk)) => {
                 chunk.note_channels(&mut known);
@@ -171,7 +172,8 @@ pub(crate) fn salvage(file: &Path, into: &Path) -> Result<Salvaged, SalvageError
     })
 }
 
-/// The chunk that begins there, if one does and is whole: where it is, and what is in it.
+/// Returns position and content of the chunk that begins at `at`; `None` if none does or it is
+/// damaged.
 fn chunk_at(bytes: &[u8], at: usize) -> Option<(Range<usize>, Chunk)> {
     let rest = bytes.get(at..)?;
     let (head, rest) = rest.split_at_checked(RECORD_HEAD_BYTES)?;
@@ -193,7 +195,7 @@ fn chunk_at(bytes: &[u8], at: usize) -> Option<(Range<usize>, Chunk)> {
     let options = LinearReaderOptions::default()
         .with_skip_start_magic(true)
         .with_skip_end_magic(true)
-        // Before anything in it is read: what a damaged chunk says of lengths is not to be believed.
+        // Checked before the content is parsed: lengths in a damaged chunk are not trustworthy.
         .with_prevalidate_chunk_crcs(true)
         .with_record_length_limit(largest);
     let mut reader = LinearReader::new_with_options(options);
@@ -227,7 +229,7 @@ impl Chunk {
         }
     }
 
-    /// Notes the channels that it defines; what contradicts an earlier definition is left out.
+    /// Adds the chunk's channel definitions; one that contradicts an earlier one is ignored.
     fn note_channels(self, known: &mut ChannelAccumulator<'static>) {
         for (header, data) in self.schemas {
             let _ = known.add_schema(header, Cow::Owned(data));
@@ -238,7 +240,7 @@ impl Chunk {
     }
 }
 
-/// Writes a record of its own.
+/// Writes the new record.
 fn write(
     chunks: impl Iterator<Item = Vec<Message>>,
     known: &ChannelAccumulator<'static>,
@@ -272,7 +274,7 @@ fn write(
     Ok(found)
 }
 
-/// The number of a tick, which is its first field in any format.
+/// Returns the number of a tick, its first field in every format.
 fn tick_number(data: &[u8]) -> Option<u64> {
     let tick: Result<LoopTick<'_>, _> = decode(data);
     tick.map(|tick| tick.number).ok().or_else(|| {
@@ -282,8 +284,8 @@ fn tick_number(data: &[u8]) -> Option<u64> {
     })
 }
 
-/// Makes a channel of the record that is read one of the record that is written; none for one that
-/// nobody knows.
+/// Adds the channel with this number to the new record; `None` if it is defined neither in the old
+/// record nor by this agent.
 fn channel(
     writer: &mut Writer<BufWriter<File>>,
     known: &ChannelAccumulator<'static>,

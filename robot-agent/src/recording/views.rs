@@ -1,6 +1,7 @@
-//! What was recorded, once more in messages of ROS, for programs that know no others.
+//! Writes the recorded data as standard ROS messages, for programs that do not read the agent's
+//! own.
 //!
-//! Nothing here is read again: what the loop took and gave to the bit is in `words`.
+//! A replay does not read these messages; it reads those of [`super::codec`].
 
 use std::time::Duration;
 
@@ -19,18 +20,18 @@ use super::frame::TickFrame;
 use crate::control_loop::channels::Fault;
 use crate::drive::SensorSample;
 
-/// The frame of everything that has a place.
+/// Frame of positions and poses.
 pub(crate) const SITE_FRAME: &str = "site";
-/// The robot's own frame.
+/// Frame of the robot.
 pub(crate) const BASE_FRAME: &str = "base_link";
-/// The wheels of both sides, as joints.
+/// Joint names of the wheels of each side, `[left, right]`.
 const JOINTS: [&str; 2] = ["left_wheels", "right_wheels"];
-/// Most points of a path.
+/// Largest number of points of a path.
 pub(crate) const PATH_POINTS_MAX: u32 = 500;
-/// Distance between two points of a path, unless there would be too many.
+/// Distance between two points of a path, metres, larger if [`PATH_POINTS_MAX`] would be exceeded.
 const PATH_SPACING_M: f64 = 0.1;
 
-/// A pose on the plane.
+/// Converts a planar pose.
 pub(crate) fn pose_message(pose: PlanePose) -> Pose {
     let (sin, cos) = (0.5 * pose.heading_rad).sin_cos();
     Pose {
@@ -61,7 +62,7 @@ fn twist_message(twist: PlaneTwist) -> Twist {
     }
 }
 
-/// The head of a message of that moment.
+/// Returns the header of a message at `wall_ns`, nanoseconds since the Unix epoch.
 pub(crate) fn header(wall_ns: i64, frame_id: &str) -> Header<'_> {
     Header {
         stamp: Time::from_nanoseconds(wall_ns),
@@ -69,13 +70,14 @@ pub(crate) fn header(wall_ns: i64, frame_id: &str) -> Header<'_> {
     }
 }
 
-/// When a sample was measured, by the wall clock of the tick that took it.
+/// Returns the measuring time of a sample by the wall clock of its tick, nanoseconds since the Unix
+/// epoch.
 pub(super) fn sample_wall_ns(frame: &TickFrame, wall_ns: i64, sample: &SensorSample) -> i64 {
     let age = frame.inputs.now.monotonic.saturating_sub(sample.at);
     wall_ns.saturating_sub(i64::try_from(age.as_nanos()).unwrap_or(i64::MAX))
 }
 
-/// Where the robot is believed to be; false if that is not known.
+/// Encodes the estimated pose and twist; false if the pose is unknown.
 pub(super) fn odometry(frame: &TickFrame, wall_ns: i64, into: &mut Vec<u8>) -> bool {
     let Some(pose) = frame.outputs.pose else {
         return false;
@@ -96,7 +98,7 @@ pub(super) fn odometry(frame: &TickFrame, wall_ns: i64, into: &mut Vec<u8>) -> b
     true
 }
 
-/// What the wheels were commanded, as a motion without slip.
+/// Encodes the twist of the commanded wheel speeds without slip.
 pub(super) fn commanded(twist: PlaneTwist, wall_ns: i64, into: &mut Vec<u8>) {
     let message = TwistStamped {
         header: header(wall_ns, BASE_FRAME),
@@ -105,7 +107,7 @@ pub(super) fn commanded(twist: PlaneTwist, wall_ns: i64, into: &mut Vec<u8>) {
     encode(&message, into);
 }
 
-/// What the inertial unit said; false if it said nothing.
+/// Encodes yaw rate and acceleration; false if the sample has neither.
 pub(super) fn imu(sample: &SensorSample, wall_ns: i64, into: &mut Vec<u8>) -> bool {
     if sample.yaw_rate_rad_s.is_none() && sample.acceleration.is_none() {
         return false;
@@ -136,7 +138,7 @@ pub(super) fn imu(sample: &SensorSample, wall_ns: i64, into: &mut Vec<u8>) -> bo
     true
 }
 
-/// What the wheels said; false if they said nothing.
+/// Encodes wheel speeds and torques; false if the sample has neither.
 pub(super) fn joints(sample: &SensorSample, wall_ns: i64, into: &mut Vec<u8>) -> bool {
     let velocity = sample
         .wheel_speeds
@@ -158,7 +160,7 @@ pub(super) fn joints(sample: &SensorSample, wall_ns: i64, into: &mut Vec<u8>) ->
     true
 }
 
-/// A position fix; false if there is none.
+/// Encodes the position fix; false if the sample has none.
 pub(super) fn fix(sample: &SensorSample, wall_ns: i64, into: &mut Vec<u8>) -> bool {
     let Some(pose) = sample.position else {
         return false;
@@ -180,7 +182,7 @@ pub(super) fn fix(sample: &SensorSample, wall_ns: i64, into: &mut Vec<u8>) -> bo
     true
 }
 
-/// A way, at most [`PATH_POINTS_MAX`] points of it.
+/// Encodes a path of at most [`PATH_POINTS_MAX`] points; the rest is dropped.
 pub(crate) fn path(poses: &[PlanePose], frame: &str, wall_ns: i64, into: &mut Vec<u8>) {
     let head = header(wall_ns, frame);
     let poses: Vec<PoseStamped<'_>> = poses
@@ -198,11 +200,11 @@ pub(crate) fn path(poses: &[PlanePose], frame: &str, wall_ns: i64, into: &mut Ve
     encode(&message, into);
 }
 
-/// Points along a plan, close enough to draw it.
+/// Returns equally spaced poses along a plan, at most [`PATH_POINTS_MAX`], including its end.
 pub(crate) fn poses_of(plan: &Plan) -> Vec<PlanePose> {
     let length_m = plan.length_m();
     let spacing_m = PATH_SPACING_M.max(length_m / f64::from(PATH_POINTS_MAX - 1));
-    // The last one is the plan's own end.
+    // The last point is the end of the plan.
     let inner = (0..PATH_POINTS_MAX - 1).map(|step| f64::from(step) * spacing_m);
     inner
         .take_while(|arc_m| *arc_m < length_m)
@@ -211,12 +213,12 @@ pub(crate) fn poses_of(plan: &Plan) -> Vec<PlanePose> {
         .collect()
 }
 
-/// A figure in words.
+/// Creates a key–value pair of a diagnostic status.
 fn value<'text>(key: &'text str, value: &'text str) -> KeyValue<'text> {
     KeyValue { key, value }
 }
 
-/// How bad a state is, and what it is.
+/// Returns the diagnostic level and the description of a state.
 pub(crate) fn state(mode: RobotMode, fault: Option<Fault>) -> (Level, &'static str) {
     match (mode, fault) {
         (_, Some(fault)) => (Level::Error, fault.text()),
@@ -227,7 +229,7 @@ pub(crate) fn state(mode: RobotMode, fault: Option<Fault>) -> (Level, &'static s
     }
 }
 
-/// How the loop is, of a tick.
+/// Encodes the diagnostics of a tick; `lost` is the number of notes lost so far.
 pub(super) fn diagnostics(frame: &TickFrame, robot: &str, lost: u64, into: &mut Vec<u8>) {
     let outputs = &frame.outputs;
     let (level, text) = state(outputs.mode, outputs.fault);

@@ -1,9 +1,9 @@
-//! The thread that writes records: files of bounded size, and not too many of them.
+//! The thread that writes records: files of bounded size and bounded number.
 //!
-//! Each second what is under way is closed and handed to the operating system, so that a file that
-//! is torn by a crash is good up to there. All is as ROS 2 wants it of an MCAP file: its profile,
-//! messages in CDR with their definitions, and each channel's quality of service. A disk that refuses costs the record: it is said once,
-//! and a new file is tried after a while.
+//! Each second the open chunk is closed and handed to the operating system, so that a file torn by
+//! a crash is readable up to there. The files follow ROS 2's conventions for MCAP: profile, CDR
+//! messages with their definitions, and the quality of service of each channel. A disk error ends
+//! the file; it is logged, and a new file is tried after [`RETRY_EVERY`].
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -37,16 +37,16 @@ use crate::clock::SharedClock;
 use crate::control_loop::origin::JobOrigin;
 use crate::safety::LoopView;
 
-/// Time after which what was written is handed to the operating system.
+/// Interval at which written data are handed to the operating system.
 const FLUSH_EVERY: Duration = Duration::from_secs(1);
-/// Time between two tries on a disk that refuses.
+/// Pause after a disk error.
 const RETRY_EVERY: Duration = Duration::from_secs(10);
-/// Time between two words on how the agent is.
+/// Interval of the diagnostics messages.
 const DIAGNOSTICS_EVERY: Duration = Duration::from_secs(1);
-/// How names of records begin and end.
+/// Prefix and suffix of the records' file names.
 const NAME: (&str, &str) = ("tread-", ".mcap");
 
-/// A file that knows how much was written to it.
+/// A file that counts the bytes written to it.
 #[derive(Debug)]
 struct Counted {
     file: BufWriter<File>,
@@ -73,13 +73,13 @@ struct OpenRecord {
     flushed: Duration,
 }
 
-/// The profile of files that ROS 2 tools read.
+/// MCAP profile of ROS 2 tools.
 const PROFILE: &str = "ros2";
-/// The key of a channel's metadata that says with which quality of service it was published, which
-/// ROS 2 tools require.
+/// Key of the channel metadata with the quality of service of the publisher, which ROS 2 tools
+/// require.
 const QOS_KEY: &str = "offered_qos_profiles";
-/// Reliable, volatile, the last ten: what a publisher offers unless it says otherwise. In the notation
-/// of recordings, with numbers for names; times without end are the largest that can be written.
+/// Default quality of service of a ROS 2 publisher: reliable, volatile, keep last ten. In the
+/// numeric notation of recordings; infinite durations are the largest representable ones.
 const QOS: &str = "- history: 1
   depth: 10
   reliability: 1
@@ -96,14 +96,14 @@ const QOS: &str = "- history: 1
     nsec: 854775807
   avoid_ros_namespace_conventions: false";
 
-/// Package and name of a message.
+/// Package and name of a message type.
 type Kind = (&'static str, &'static str);
 
 const fn kind<'a, T: Message<'a>>() -> Kind {
     (T::TYPE.package, T::TYPE.name)
 }
 
-/// The channels of a record in the order of their numbers.
+/// Channels of a record, in the order of their numbers, from 1.
 const CHANNELS: [(&str, Kind); 11] = [
     (topics::RUN, kind::<Text<'_>>()),
     (topics::COMMAND, kind::<Text<'_>>()),
@@ -118,13 +118,13 @@ const CHANNELS: [(&str, Kind); 11] = [
     (topics::DIAGNOSTICS, kind::<DiagnosticArray<'_>>()),
 ];
 
-/// The channel that a record of this agent has under a number: its topic and what it carries.
+/// Returns topic and message type of a channel number in records of this agent.
 pub(super) fn channel_numbered(number: u16) -> Option<(&'static str, Kind)> {
-    // Numbers begin with one.
+    // Numbers begin with 1.
     CHANNELS.get(usize::from(number).checked_sub(1)?).copied()
 }
 
-/// How records are written.
+/// Returns the options of the MCAP writer.
 pub(super) fn options() -> WriteOptions {
     WriteOptions::new()
         .profile(PROFILE)
@@ -134,7 +134,7 @@ pub(super) fn options() -> WriteOptions {
         .disable_seeking(true)
 }
 
-/// Adds a channel of ROS to a record.
+/// Adds a channel with ROS messages to a record.
 pub(super) fn ros_channel<W: Write + Seek>(
     writer: &mut Writer<W>,
     topic: &str,
@@ -196,20 +196,21 @@ impl OpenRecord {
     }
 }
 
-/// Who writes.
+/// Writes the records of one run.
 pub(crate) struct RecordWriter {
     config: RecordingConfig,
     head: RunHead,
     model: RobotModel,
     clock: SharedClock,
     open: Option<OpenRecord>,
-    /// Before then no file is tried again.
+    /// Time before which no new file is tried.
     retry_at: Duration,
     view: Option<LoopView>,
-    /// The newest tick's time, for what has none of its own.
+    /// Wall-clock time of the newest tick, nanoseconds since the Unix epoch, for messages without a
+    /// time.
     wall_ns: i64,
     diagnosed: Option<Duration>,
-    /// Notes that were lost when it was last said, and when that was.
+    /// Number of lost notes when it was last logged.
     lost: u64,
     said_lost_at: Option<Duration>,
     bytes: Vec<u8>,
@@ -227,7 +228,7 @@ impl fmt::Debug for RecordWriter {
 }
 
 impl RecordWriter {
-    /// Nothing is written yet; `model` is the head's, checked.
+    /// Creates the writer without opening a file; `model` is the checked model of `head`.
     pub(crate) fn new(
         config: RecordingConfig,
         head: RunHead,
@@ -264,7 +265,7 @@ impl RecordWriter {
         self.close();
     }
 
-    /// Writes what waits.
+    /// Writes all waiting notes.
     #[cfg(any(test, feature = "testing"))]
     pub(crate) fn drain(&mut self, notes: &Notes) {
         for note in notes.notes.try_iter() {
@@ -295,7 +296,7 @@ impl RecordWriter {
         self.clock.monotonic().saturating_sub(since) >= time
     }
 
-    /// Does something with the open record, which is opened before and given up after an error.
+    /// Runs `work` on the open record, opening one if necessary; closes it after an error.
     fn guarded(&mut self, work: impl FnOnce(&mut Self, &mut OpenRecord) -> Result<(), McapError>) {
         let now = self.clock.monotonic();
         let mut open = match self.open.take() {
@@ -319,7 +320,7 @@ impl RecordWriter {
         self.head.part += 1;
     }
 
-    /// Makes room and begins the next file.
+    /// Removes the oldest files in excess and begins the next file.
     fn begin(&mut self, now: Duration) -> Result<OpenRecord, McapError> {
         let folder = &self.config.folder;
         fs::create_dir_all(folder)?;
@@ -340,7 +341,7 @@ impl RecordWriter {
             self.wall_ns = i64::try_from(wall.as_nanosecond()).unwrap_or_default();
         }
         open.write_text(topics::RUN, self.wall_ns, head)?;
-        // Each file says by itself what was allowed when it began.
+        // Each file begins with the view of its first tick.
         self.view = None;
         info!("recording to `{}`", path.display());
         Ok(open)
@@ -359,7 +360,7 @@ impl RecordWriter {
         tick: u64,
         noted: &NotedCommand,
     ) -> Result<(), McapError> {
-        // Not behind the tick that took it.
+        // Not later than the tick that took the command.
         let wall_ns = self.wall_ns;
         let message = CommandMessage {
             tick,
@@ -383,7 +384,7 @@ impl RecordWriter {
         wall_ns: i64,
         origin: &JobOrigin,
     ) -> Result<(), McapError> {
-        // It could be planned before, so it can be again.
+        // The plan was computed from the same origin before, so this does not fail in practice.
         let Ok(plan) = origin.plan(&self.model) else {
             return Ok(());
         };
@@ -465,7 +466,7 @@ impl RecordWriter {
         }
     }
 
-    /// Ends a file that is full; the next note begins another.
+    /// Closes a file that has reached its size; the next note begins another.
     fn turn_over(&mut self) {
         let is_full =
             |open: &OpenRecord| open.bytes.load(Ordering::Relaxed) >= self.config.file_bytes;
@@ -475,7 +476,7 @@ impl RecordWriter {
         }
     }
 
-    /// Ends the record.
+    /// Closes the record.
     pub(crate) fn close(&mut self) {
         if let Some(mut open) = self.open.take()
             && let Err(cause) = open.writer.finish()
@@ -485,7 +486,7 @@ impl RecordWriter {
     }
 }
 
-/// Removes the oldest records until there are no more than so many.
+/// Removes the oldest records until at most `most` are left.
 fn make_room(folder: &Path, most: usize) -> io::Result<()> {
     let (begin, end) = NAME;
     let mut records = Vec::new();

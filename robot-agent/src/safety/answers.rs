@@ -14,15 +14,15 @@ use super::{NotCleared, Safety};
 use crate::clock::SharedClock;
 use crate::control_loop::channels::Shared;
 
-/// Oldest word of the loop by which a robot counts as standing.
+/// Largest age of the loop's snapshot by which the robot may count as stopped.
 const STANDS_AGE_MAX: Duration = Duration::from_millis(500);
 
-/// Stops; done once the target is zero and the disk has the latch.
+/// Puts a stop in force; returns once the loop's target is zero and the latch is on disk.
 pub(crate) async fn stop(safety: &Arc<Safety>, stop: &Stop) -> Result<(), CommandRefusal> {
     let confirmed = safety.confirm_stop(stop).await;
     confirmed.map_err(|cause| not_ready(cause.to_string()))?;
-    // Stops may come in another order than they were asked for in, and the clear of the one
-    // that came last ends all that came before.
+    // Stops may arrive in another order than they were sent, and clearing the one that arrived last
+    // ends all before it.
     if safety.latch().is_none() {
         let detail = "this stop was in force, and was cleared";
         return Err(CommandRefusal::new(CommandRefusalCode::Ended, detail));
@@ -30,7 +30,7 @@ pub(crate) async fn stop(safety: &Arc<Safety>, stop: &Stop) -> Result<(), Comman
     Ok(())
 }
 
-/// Ends a stop, if the robot stands.
+/// Clears a stop, if the robot has stopped.
 pub(crate) async fn clear(
     safety: &Arc<Safety>,
     shared: &Shared,
@@ -60,7 +60,7 @@ pub(crate) async fn clear(
     })
 }
 
-/// Gives the lease.
+/// Grants the lease.
 pub(crate) fn acquire_lease(
     safety: &Safety,
     command: &AcquireLease,
@@ -75,13 +75,13 @@ pub(crate) fn acquire_lease(
         })
 }
 
-/// Takes the lease back.
+/// Ends the lease.
 pub(crate) fn release_lease(safety: &Safety, command: &ReleaseLease) -> Result<(), CommandRefusal> {
     let released = safety.release_lease(command);
     released.map_err(|driver| leased_by(&driver))
 }
 
-/// Takes a limit.
+/// Applies a limit.
 pub(crate) fn limit(safety: &Safety, limit: &ExternalLimit) -> Result<(), CommandRefusal> {
     safety.limit(limit).map_err(|refused| match refused {
         LimitRefusal::Foreign => CommandRefusal::new(
@@ -106,7 +106,7 @@ pub(crate) fn limit(safety: &Safety, limit: &ExternalLimit) -> Result<(), Comman
     })
 }
 
-/// A refusal because of who teleoperates.
+/// Creates the refusal for a robot that this driver teleoperates.
 pub(crate) fn leased_by(driver: &Driver) -> CommandRefusal {
     let detail = format!("{} teleoperates the robot", driver.name);
     CommandRefusal::new(CommandRefusalCode::Leased, detail)

@@ -1,8 +1,8 @@
-//! The stop latch on the disk. An agent that cannot read it, or finds it damaged, starts stopped.
+//! Stores the stop latch on disk. An agent whose latch is unreadable or damaged starts stopped.
 //!
-//! The first start writes a latch that stops nothing, before it leaves anything else in the folder. So
-//! a latch that is missing beside what an agent leaves has been lost, and nobody knows whether it
-//! stopped the robot: the agent starts stopped then too.
+//! The first start writes a latch without a stop before anything else in the folder. So a missing
+//! latch beside other files of an agent was lost and may have held a stop: the agent then starts
+//! stopped too.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -15,29 +15,29 @@ use crate::clock::SharedClock;
 use crate::durable;
 
 const FILE_NAME: &str = "stop.json";
-/// What an agent that ran leaves beside it.
+/// Files of an agent that has run, in the folder of the latch.
 const TRACES: [&str; 2] = ["outbox", "missions.json"];
 
 const UNREADABLE: &str = "the stop latch on the robot's disk cannot be read";
 const MISSING: &str = "the stop latch on the robot's disk is missing though an agent ran there before, \
      so nobody knows whether a stop was in force";
 
-/// The file in which the latch outlives the process.
+/// The file that keeps the latch across restarts.
 #[derive(Debug, Clone)]
 pub(crate) struct LatchFile {
     folder: PathBuf,
 }
 
 impl LatchFile {
-    /// The latch in a folder, which must exist.
+    /// Creates the file's handle; the folder must exist.
     pub(crate) fn new(folder: &Path) -> Self {
         Self {
             folder: folder.to_owned(),
         }
     }
 
-    /// Reads it; a robot's first start finds nothing and is free. What cannot be read stops, and so
-    /// does a latch that is missing though an agent ran here before.
+    /// Reads the latch. Returns no stop at a robot's first start, and a stop of the agent's own if
+    /// the file is unreadable, or missing though an agent has run in this folder.
     pub(crate) fn load(&self, clock: &SharedClock) -> StopState {
         let path = self.folder.join(FILE_NAME);
         let (problem, reason) = match std::fs::read(&path) {
@@ -69,13 +69,13 @@ impl LatchFile {
         StopState::latched(stop)
     }
 
-    /// Whether an agent ran here before. What cannot be looked at may be a trace.
+    /// Whether an agent has run in this folder; true if that cannot be checked.
     fn has_traces(&self) -> bool {
         let is_there = |name: &&str| self.folder.join(name).try_exists().unwrap_or(true);
         TRACES.iter().any(is_there)
     }
 
-    /// The first start: the latch is there from now on.
+    /// Writes a latch without a stop at the first start.
     fn begin(&self) -> StopState {
         let state = StopState::default();
         let made = std::fs::create_dir_all(&self.folder);
@@ -85,10 +85,10 @@ impl LatchFile {
         state
     }
 
-    /// Writes it and waits until the disk has it. Blocks.
+    /// Writes the latch and waits until it is on disk. Blocks.
     ///
     /// # Errors
-    /// What the operating system said; the former content stays then.
+    /// The error of the operating system; the former content is kept.
     pub(crate) fn save(&self, state: &StopState) -> io::Result<()> {
         let text = serde_json::to_vec(state)?;
         durable::replace(&self.folder, FILE_NAME, &durable::sealed(&text))

@@ -1,7 +1,7 @@
-//! What programs outside allow: holds and speed limits, each with its owner and end. Pure.
+//! External limits: holds and speed limits of other programs, each with its owner and expiry. Pure.
 //!
-//! The newest limit of an owner counts until its end. An owner that the configuration calls
-//! required holds the robot while it is silent; of any other an ended limit has no effect.
+//! The newest limit of an owner applies until its expiry. An owner that the configuration requires
+//! holds the robot while it has no valid limit; an expired limit of any other owner has no effect.
 
 use serde::{Deserialize, Serialize};
 use tread_api::ids::{BootId, OwnerId};
@@ -11,19 +11,19 @@ use tread_api::wire::safety::ExternalLimit;
 /// Why a limit is refused.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum LimitRefusal {
-    /// It is for another run of the agent.
+    /// It names another run of the agent.
     Foreign,
-    /// It is not newer than one that was taken before.
+    /// Its sequence number is not above that of a limit accepted before.
     OutOfOrder,
-    /// Its end is too far ahead.
+    /// Its expiry is too far in the future.
     TooLong,
-    /// Its speed is none.
+    /// Its speed is negative or not finite.
     Invalid(String),
     /// There are too many owners.
     TooMany,
 }
 
-/// One owner's limit as the loop sees it.
+/// Limit of one owner as the loop reads it.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 struct Entry {
     is_required: bool,
@@ -46,7 +46,7 @@ impl Entry {
     }
 }
 
-/// All limits, to be looked at in a tick.
+/// All limits, as the loop reads them in a tick.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(from = "Vec<Entry>", into = "Vec<Entry>")]
 pub(crate) struct LimitsView {
@@ -54,14 +54,14 @@ pub(crate) struct LimitsView {
     count: usize,
 }
 
-/// In a record.
+/// Conversion for a record.
 impl From<LimitsView> for Vec<Entry> {
     fn from(view: LimitsView) -> Self {
         view.present().to_vec()
     }
 }
 
-/// From a record; more than there can be are left out.
+/// Conversion from a record; entries beyond [`LIMITS_MAX`] are dropped.
 impl From<Vec<Entry>> for LimitsView {
     fn from(entries: Vec<Entry>) -> Self {
         let mut view = Self::default();
@@ -78,12 +78,12 @@ impl LimitsView {
         &self.entries[..self.count]
     }
 
-    /// Whether the robot is held.
+    /// Whether any owner holds the robot at `now_us`.
     pub(crate) fn holds(&self, now_us: u64) -> bool {
         self.present().iter().any(|entry| entry.holds(now_us))
     }
 
-    /// The lowest limit of the speed, metres per second.
+    /// Returns the lowest speed limit in force, m/s.
     pub(crate) fn linear_max_m_s(&self, now_us: u64) -> Option<f64> {
         let limits = self.present().iter();
         limits
@@ -97,11 +97,11 @@ struct Owner {
     id: OwnerId,
     entry: Entry,
     seq: Option<u64>,
-    /// Up to here an older limit, come late, could still be in time.
+    /// Latest expiry of this owner's limits; until then a repeated or older limit must be refused.
     guarded_until_us: u64,
 }
 
-/// The limits that are known.
+/// The owners and their limits.
 #[derive(Debug, Clone)]
 pub(crate) struct ExternalLimits {
     boot: BootId,
@@ -110,7 +110,7 @@ pub(crate) struct ExternalLimits {
 }
 
 impl ExternalLimits {
-    /// Nothing but the owners that are required, at most [`LIMITS_MAX`]; they are silent.
+    /// Creates the required owners, at most [`LIMITS_MAX`], without a limit.
     pub(crate) fn new(boot: BootId, required: &[OwnerId]) -> Self {
         let mut owners = Vec::with_capacity(LIMITS_MAX);
         let required = required.iter().take(LIMITS_MAX).map(|id| Owner {
@@ -130,10 +130,10 @@ impl ExternalLimits {
         }
     }
 
-    /// Takes a limit.
+    /// Applies a limit.
     ///
     /// # Errors
-    /// [`LimitRefusal`]; it is counted, and nothing changes.
+    /// [`LimitRefusal`]: the limit is counted as refused and nothing changes.
     pub(crate) fn take(&mut self, limit: &ExternalLimit, now_us: u64) -> Result<(), LimitRefusal> {
         let taken = self.try_take(limit, now_us);
         if taken.is_err() {
@@ -188,17 +188,17 @@ impl ExternalLimits {
         Ok(self.owners.len() - 1)
     }
 
-    /// Counts one that does not parse, or is too large.
+    /// Counts a limit that does not parse or is too large.
     pub(crate) fn note_malformed(&mut self) {
         self.refused += 1;
     }
 
-    /// How many were refused.
+    /// Returns the number of refused limits.
     pub(crate) fn refused(&self) -> u64 {
         self.refused
     }
 
-    /// What the loop needs.
+    /// Returns the limits as the loop reads them.
     pub(crate) fn view(&self) -> LimitsView {
         let mut view = LimitsView {
             count: self.owners.len(),
@@ -210,7 +210,7 @@ impl ExternalLimits {
         view
     }
 
-    /// For the robot's state: limits in force, and required owners.
+    /// Returns the limits in force and the required owners, for the robot's state message.
     pub(crate) fn status(&self, now_us: u64) -> Vec<LimitStatus> {
         let of_note = self
             .owners

@@ -1,13 +1,14 @@
-//! What may only slow the robot down: stops, teleoperation, limits from outside.
+//! Stops, teleoperation and external limits: everything outside the loop that can only slow the
+//! robot.
 //!
-//! [`stop`], [`operator`] and [`limits`] are pure and decide; [`Safety`] owns them, keeps the stop
-//! on the disk ([`latch_file`]), and leaves what the loop needs in a cell that the loop never waits
-//! for. What the loop has once seen carries its own end, so that a cell that it cannot read for a
-//! moment makes nothing last longer. [`watchdog`] looks after the loop itself.
+//! [`stop`], [`operator`] and [`limits`] are pure state machines. [`Safety`] owns them, stores the
+//! stop latch on disk ([`latch_file`]) and publishes what the loop needs in a [`SafetyCell`], which
+//! the loop reads without blocking. Every entry in the cell carries its expiry, so a tick that
+//! cannot read the cell prolongs nothing. [`watchdog`] watches the loop itself.
 //!
-//! A stop counts from the moment its message arrives: [`Safety::stop_now`] is called before it
-//! waits in any queue. It is answered when the loop has set its target to zero under it
-//! ([`Safety::confirm_stop`]) and the disk has it.
+//! A stop takes effect when its message arrives: [`Safety::stop_now`] is called before the message
+//! enters any queue. It is answered once the loop has set its target to zero under it
+//! ([`Safety::confirm_stop`]) and the latch is on disk.
 
 pub(crate) mod answers;
 pub(crate) mod latch_file;
@@ -37,17 +38,17 @@ use limits::{ExternalLimits, LimitRefusal, LimitsView};
 use operator::{LeaseRefusal, Operator, TeleoperationView, Verdict};
 use stop::{ClearRefusal, StopState};
 
-/// Longest wait until the loop has set its target to zero.
+/// Longest wait for the loop to set its target to zero; the stop is then answered as unconfirmed.
 pub(crate) const ZERO_WAIT_MAX: Duration = Duration::from_millis(500);
-/// Time between two looks at whether it has.
+/// Interval of the checks whether the loop has set its target to zero.
 const ZERO_LOOK_EVERY: Duration = Duration::from_millis(1);
 
-/// Microseconds of the agent's monotonic clock.
+/// Returns the time in whole microseconds.
 pub(crate) fn microseconds(at: Duration) -> u64 {
     u64::try_from(at.as_micros()).unwrap_or(u64::MAX)
 }
 
-/// Why a stop is not confirmed; it is in force all the same.
+/// Why a stop is not confirmed; it is in force regardless.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum Unconfirmed {
     #[error("the control loop has not set its target to zero")]
@@ -58,49 +59,49 @@ pub(crate) enum Unconfirmed {
     Ending,
 }
 
-/// Why a stop stays in force.
+/// Why a stop stays in force after a request to clear it.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum NotCleared {
     Refused(ClearRefusal),
     Disk(String),
 }
 
-/// What the loop looks at in a tick.
+/// Teleoperation and limits as the loop reads them in a tick.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(crate) struct LoopView {
-    // Earlier records say `hand`.
+    // Older records name the field `hand`.
     #[serde(alias = "hand")]
     pub(crate) teleoperation: TeleoperationView,
     pub(crate) limits: LimitsView,
 }
 
-/// What passes between [`Safety`] and the loop.
+/// Cell shared by [`Safety`] and the loop.
 #[derive(Debug, Default)]
 pub(crate) struct SafetyCell {
     view: Mutex<LoopView>,
     /// The number of the newest stop in force; 0 for none.
     stop: AtomicU64,
-    /// The newest stop under which the loop has set its target to zero.
+    /// Number of the newest stop under which the loop has set its target to zero.
     zeroed: AtomicU64,
 }
 
 impl SafetyCell {
-    /// The newest view, unless somebody is writing right now.
+    /// Returns the newest view, unless it is being written.
     pub(crate) fn try_view(&self) -> Option<LoopView> {
         self.view.try_lock().ok().map(|view| *view)
     }
 
-    /// The number of the stop in force; 0 for none.
+    /// Returns the number of the stop in force; 0 for none.
     pub(crate) fn stop(&self) -> u64 {
         self.stop.load(Ordering::Acquire)
     }
 
-    /// The loop has set its target to zero under this stop.
+    /// Records that the loop has set its target to zero under this stop.
     pub(crate) fn note_zeroed(&self, stop: u64) {
         self.zeroed.fetch_max(stop, Ordering::Release);
     }
 
-    /// Shows the loop what a record says that it saw.
+    /// Sets stop and view to those of a recorded tick, for a replay.
     pub(crate) fn show(&self, stop: u64, view: &LoopView) {
         self.stop.store(stop, Ordering::Release);
         self.publish(|shown| *shown = *view);
@@ -114,22 +115,22 @@ impl SafetyCell {
 #[derive(Debug)]
 struct Stops {
     state: StopState,
-    /// Counts the stops of this run.
+    /// Number of stops of this run of the agent.
     number: u64,
 }
 
-/// Everything that may only slow the robot down.
+/// State of stops, teleoperation and limits.
 #[derive(Debug)]
 pub(crate) struct Safety {
     clock: SharedClock,
     cell: Arc<SafetyCell>,
     stops: Mutex<Stops>,
     file: LatchFile,
-    /// One writes the latch at a time, and always what is newest then.
+    /// Serialises the writes of the latch file; each writes the newest state.
     writing: tokio::sync::Mutex<()>,
     operator: Mutex<Operator>,
     limits: Mutex<ExternalLimits>,
-    /// Woken when a stop or a lease begins or ends.
+    /// Notified when a stop or a lease begins or ends.
     changed: Notify,
 }
 
@@ -138,9 +139,10 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl Safety {
-    /// What the disk says of stops, nobody driving, and the required owners silent.
+    /// Creates the state at the agent's start: the stop from the disk, no lease, and every required
+    /// owner silent.
     ///
-    /// `state` is what the latch file of this folder said when the agent started.
+    /// `state` is the content of the latch file of `folder`.
     pub(crate) fn open(
         folder: &Path,
         state: StopState,
@@ -178,12 +180,13 @@ impl Safety {
         microseconds(self.clock.monotonic())
     }
 
-    /// The stop in force.
+    /// Returns the stop in force.
     pub(crate) fn latch(&self) -> Option<StopLatch> {
         lock(&self.stops).state.latch().cloned()
     }
 
-    /// Stops, at once and in memory; gives the number under which the loop confirms it.
+    /// Puts a stop in force at once, in memory. Returns the number under which the loop confirms
+    /// it.
     pub(crate) fn stop_now(&self, stop: &Stop) -> u64 {
         let mut stops = lock(&self.stops);
         if stops.state.stop(stop, self.clock.wall()) {
@@ -196,14 +199,15 @@ impl Safety {
         stops.number
     }
 
-    /// Stops, waits until the loop's target is zero and the disk has the latch.
+    /// Puts a stop in force, and waits until the loop's target is zero and the latch is on disk.
     ///
     /// # Errors
-    /// [`Unconfirmed`]: the robot is stopped as well as it can be, and the sender asks again.
+    /// [`Unconfirmed`]: the stop is in force, but the loop or the disk has not confirmed it; the
+    /// sender repeats it.
     pub(crate) async fn confirm_stop(self: &Arc<Self>, stop: &Stop) -> Result<(), Unconfirmed> {
         let number = self.stop_now(stop);
         let zeroing = async {
-            // A stop that was cleared since is confirmed by that.
+            // A stop that was cleared meanwhile counts as confirmed.
             while self.cell.stop() != 0 && self.cell.zeroed.load(Ordering::Acquire) < number {
                 tokio::time::sleep(ZERO_LOOK_EVERY).await;
             }
@@ -230,7 +234,7 @@ impl Safety {
         })
     }
 
-    /// Ends a stop, on the disk first; that the robot stands is for the caller to check.
+    /// Clears a stop, on disk first. The caller must check that the robot has stopped.
     ///
     /// # Errors
     /// [`NotCleared`]: the stop stays.
@@ -243,7 +247,7 @@ impl Safety {
         let written = self.write(next).await;
         written.map_err(|cause| NotCleared::Disk(cause.to_string()))?;
         let mut stops = lock(&self.stops);
-        // A stop that came meanwhile stays; it is written by whoever brought it.
+        // A newer stop stays in force; whoever sent it has it written.
         if let Some(next) = stops.state.cleared(stop).map_err(NotCleared::Refused)? {
             stops.state = next;
             self.cell.stop.store(0, Ordering::Release);
@@ -253,18 +257,19 @@ impl Safety {
         Ok(())
     }
 
-    /// Gives the lease of teleoperation, and says its epoch.
+    /// Grants the lease of teleoperation and returns its epoch.
     ///
     /// # Errors
-    /// [`LeaseRefusal`].
+    /// [`LeaseRefusal`]: another driver has the lease, or the lease granted to this request is
+    /// over.
     pub(crate) fn acquire_lease(&self, command: &AcquireLease) -> Result<u64, LeaseRefusal> {
         self.operate(|operator, now_us| operator.acquire(command, now_us))
     }
 
-    /// Takes the lease of teleoperation back.
+    /// Ends the lease of teleoperation.
     ///
     /// # Errors
-    /// Who has it, if it is somebody else.
+    /// The driver who has the lease, if it is another one.
     pub(crate) fn release_lease(&self, command: &ReleaseLease) -> Result<(), Driver> {
         self.operate(|operator, now_us| operator.release(command, now_us))
     }
@@ -280,20 +285,21 @@ impl Safety {
         answer
     }
 
-    /// Waits until a stop or a lease has begun or ended since the last call; for one who waits.
+    /// Waits until a stop or a lease has begun or ended since the last call. For a single waiting
+    /// task.
     pub(crate) async fn changed(&self) {
         self.changed.notified().await;
     }
 
-    /// Who teleoperates.
+    /// Returns the lease in force.
     pub(crate) fn lease_now(&self) -> Option<Lease> {
         lock(&self.operator).lease_at(self.now_us()).cloned()
     }
 
-    /// Takes what must not wait in any queue, as it came.
+    /// Processes an urgent message at once.
     pub(crate) fn take_urgent(&self, urgent: Urgent<'_>) {
         match urgent {
-            // What does not parse is answered, and counted, where commands are.
+            // A stop that does not parse is answered and counted where commands are.
             Urgent::Stop(payload) => {
                 if let Ok(stop) = wire::decode::<Stop>(payload) {
                     self.stop_now(&stop);
@@ -304,7 +310,7 @@ impl Safety {
         }
     }
 
-    /// Takes a drive command as it came; never waits for more than another one.
+    /// Processes a drive command; blocks at most for another command.
     pub(crate) fn take_drive(&self, payload: &[u8]) {
         let command = (payload.len() <= SMALL_PAYLOAD_MAX)
             .then(|| wire::decode::<DriveCommand>(payload).ok())
@@ -321,23 +327,24 @@ impl Safety {
         }
     }
 
-    /// Takes a published limit as it came; `owner` is the one in its key.
+    /// Processes a published limit; `owner` is the owner in its key, which must be that of the
+    /// payload.
     pub(crate) fn take_published_limit(&self, owner: &OwnerId, payload: &[u8]) {
         let limit = (payload.len() <= SMALL_PAYLOAD_MAX)
             .then(|| wire::decode::<ExternalLimit>(payload).ok())
             .flatten()
             .filter(|limit| limit.owner == *owner);
         match limit {
-            // What is refused is counted.
+            // A refused limit is counted.
             Some(limit) => drop(self.limit(&limit)),
             None => lock(&self.limits).note_malformed(),
         }
     }
 
-    /// Takes a limit.
+    /// Applies a limit.
     ///
     /// # Errors
-    /// [`LimitRefusal`].
+    /// [`LimitRefusal`]: the limit is not applied.
     pub(crate) fn limit(&self, limit: &ExternalLimit) -> Result<(), LimitRefusal> {
         let mut limits = lock(&self.limits);
         limits.take(limit, self.now_us())?;
@@ -345,12 +352,12 @@ impl Safety {
         Ok(())
     }
 
-    /// Teleoperation, for the state.
+    /// Returns the state of teleoperation for the robot's state message.
     pub(crate) fn drive_status(&self) -> Option<DriveStatus> {
         lock(&self.operator).status()
     }
 
-    /// Limits for the state, and how many were refused.
+    /// Returns the limits for the robot's state message, and the number refused.
     pub(crate) fn limits_status(&self) -> (Vec<LimitStatus>, u64) {
         let limits = lock(&self.limits);
         (limits.status(self.now_us()), limits.refused())

@@ -1,4 +1,4 @@
-//! Teleoperation on the robot: who has the lease, and which commands count. Pure.
+//! Teleoperation on the robot: the lease, and the acceptance of drive commands. Pure.
 //!
 //! ```text
 //!            acquire, take                 release, silence of 5 s
@@ -6,9 +6,9 @@
 //!                            │         ▲
 //!                            └─────────┘ take: another driver, the next epoch
 //! ```
-//! A command counts if it names this run and this lease, is newer than all before, is a number, and
-//! ends within the second to come. All else changes nothing and is counted. What is wanted lasts
-//! until the end of the last command and not a tick longer, whoever holds the lease.
+//! A command is accepted if it names this run and the epoch of the lease, has a higher sequence
+//! number than all before, is finite, and expires within the coming second. Any other is counted
+//! and changes nothing. The commanded twist applies until the expiry of the last accepted command.
 
 use std::collections::VecDeque;
 
@@ -23,19 +23,19 @@ use tread_control::geometry::Twist;
 use tread_control::robot::RobotModel;
 use uuid::Uuid;
 
-/// Requests for a lease whose answers are remembered.
+/// Number of answered lease requests that are remembered, to answer a repetition alike.
 const ANSWERED_MAX: usize = 64;
 
 /// Why a lease is refused.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum LeaseRefusal {
-    /// Somebody else has it.
+    /// Another driver has the lease.
     Taken(Driver),
-    /// The same request was granted before, and the lease has gone on since.
+    /// The same request was granted before, and that lease has ended.
     Over,
 }
 
-/// What became of a command.
+/// Result of the check of a drive command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Verdict {
     Accepted,
@@ -50,7 +50,7 @@ pub(crate) enum Verdict {
 enum Granted {
     /// The lease of this epoch.
     Lease(u64),
-    /// The lease was given back.
+    /// The end of the lease.
     Release,
 }
 
@@ -61,30 +61,30 @@ struct ActiveLease {
     last_seq: Option<u64>,
 }
 
-/// What the loop needs to know of it.
+/// State of teleoperation as the loop reads it.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(crate) struct TeleoperationView {
-    /// The lease in force, and until when without another command.
+    /// Epoch of the lease, and its end without another command, microseconds.
     pub(crate) lease: Option<(u64, u64)>,
-    /// What is wanted, and until when.
+    /// Commanded twist, and its expiry, microseconds.
     pub(crate) wanted: Option<(Twist, u64)>,
-    /// Share of the speed that the age of commands allows.
+    /// Fraction of the maximum speed that the age of the commands allows, 0 to 1.
     pub(crate) speed_share: f64,
 }
 
 impl TeleoperationView {
-    /// Whether somebody teleoperates.
+    /// Whether the lease is in force at `now_us`.
     pub(crate) fn is_leased(&self, now_us: u64) -> bool {
         self.lease.is_some_and(|(_, until_us)| now_us < until_us)
     }
 
-    /// What is wanted now; none once its end has passed.
+    /// Returns the commanded twist; `None` after its expiry.
     pub(crate) fn wanted_at(&self, now_us: u64) -> Option<Twist> {
         let (twist, until_us) = self.wanted?;
         (now_us < until_us && self.is_leased(now_us)).then_some(twist)
     }
 
-    /// Whether what is wanted ends so soon that it speeds the robot up no more.
+    /// Whether the commanded twist expires so soon that the robot must not accelerate any more.
     pub(crate) fn ends_soon(&self, now_us: u64) -> bool {
         let left = |(_, until_us): (Twist, u64)| seconds_of(until_us.saturating_sub(now_us));
         self.wanted
@@ -153,7 +153,7 @@ impl Operator {
         self.epoch
     }
 
-    /// Who has the lease, if it is somebody else.
+    /// Returns the driver who has the lease, if it is another one.
     fn other_driver(&self, own: &Driver) -> Option<&Driver> {
         let driver = self.active.as_ref().map(|active| &active.lease.driver);
         driver.filter(|driver| driver.client != own.client)
@@ -166,10 +166,11 @@ impl Operator {
         self.answered.push_back((request, granted));
     }
 
-    /// Gives the lease, and says its epoch.
+    /// Grants the lease and returns its epoch.
     ///
     /// # Errors
-    /// [`LeaseRefusal`].
+    /// [`LeaseRefusal`]: another driver has the lease, or the lease granted to this request is
+    /// over.
     pub(crate) fn acquire(
         &mut self,
         command: &AcquireLease,
@@ -201,10 +202,10 @@ impl Operator {
         Ok(epoch)
     }
 
-    /// Takes the lease back.
+    /// Ends the lease.
     ///
     /// # Errors
-    /// Who has it, if it is somebody else.
+    /// The driver who has the lease, if it is another one.
     pub(crate) fn release(&mut self, command: &ReleaseLease, now_us: u64) -> Result<(), Driver> {
         self.free_if_silent(now_us);
         let answer = (command.request, Granted::Release);
@@ -219,7 +220,7 @@ impl Operator {
         Ok(())
     }
 
-    /// Takes a command, if it counts.
+    /// Checks a drive command, and applies it if accepted.
     pub(crate) fn drive(&mut self, command: &DriveCommand, now_us: u64) -> Verdict {
         self.free_if_silent(now_us);
         let verdict = self.judge(command, now_us);
@@ -270,12 +271,12 @@ impl Operator {
         }
     }
 
-    /// Counts a command that does not parse, or is too large.
+    /// Counts a drive command that does not parse or is too large.
     pub(crate) fn note_malformed(&mut self) {
         self.counts.malformed += 1;
     }
 
-    /// What the loop needs.
+    /// Returns the state as the loop reads it.
     pub(crate) fn view(&self) -> TeleoperationView {
         TeleoperationView {
             lease: self.active.as_ref().map(|active| {
@@ -287,14 +288,14 @@ impl Operator {
         }
     }
 
-    /// The lease in force.
+    /// Returns the lease in force at `now_us`.
     pub(crate) fn lease_at(&self, now_us: u64) -> Option<&Lease> {
         let active = self.active.as_ref()?;
         let until_us = active.heard_us.saturating_add(LEASE_SILENCE_MAX_US);
         (now_us < until_us).then_some(&active.lease)
     }
 
-    /// For the robot's state; none before the first lease.
+    /// Returns the state for the robot's state message; `None` before the first lease or command.
     pub(crate) fn status(&self) -> Option<DriveStatus> {
         let is_silent = self.counts == DriveCounts::default();
         (self.epoch > 0 || !is_silent).then(|| DriveStatus {
@@ -305,7 +306,7 @@ impl Operator {
     }
 }
 
-/// Microseconds as seconds.
+/// Converts microseconds to seconds.
 fn seconds_of(time_us: u64) -> f64 {
     std::time::Duration::from_micros(time_us).as_secs_f64()
 }

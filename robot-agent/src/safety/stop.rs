@@ -1,12 +1,13 @@
-//! The stop latch: what stops the robot until an operator clears it. Pure.
+//! The stop latch: stops the robot until an operator clears it. Pure.
 //!
 //! ```text
-//!          stop                     clear of the newest stop, while standing
+//!          stop                     clear of the newest stop, at zero velocity
 //! free ─────────► latched ──────────────────────────────────────────────► free
 //!                  │    ▲
 //!                  └────┘ another stop: it is the newest now
 //! ```
-//! A stop that comes twice is one stop, also after it was cleared: the sender missed the answer.
+//! A stop with an identifier seen before changes nothing, even after it was cleared: it is a
+//! repetition by a sender that missed the answer.
 
 use std::collections::VecDeque;
 
@@ -16,13 +17,13 @@ use tread_api::mission::REASON_LENGTH_MAX;
 use tread_api::safety::{BY_LENGTH_MAX, StopLatch};
 use tread_api::wire::safety::Stop;
 
-/// Stops that are remembered as seen, in force or cleared; the oldest is forgotten first.
+/// Number of stops remembered as seen, in force or cleared; the oldest is dropped first.
 pub(crate) const SEEN_MAX: usize = 256;
 
-/// Whether a stop is in force, and which were seen before.
+/// The stop in force and the identifiers of those seen.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub(crate) struct StopState {
-    /// None is written as such: a file that does not name it says nothing.
+    /// `None` is written as such; a file without this field is rejected.
     #[serde(deserialize_with = "Option::deserialize")]
     latch: Option<StopLatch>,
     seen: VecDeque<StopId>,
@@ -33,7 +34,7 @@ pub(crate) struct StopState {
 pub(crate) enum ClearRefusal {
     /// A newer stop is in force.
     Newer(StopLatch),
-    /// It was never seen here.
+    /// A stop with this identifier was never seen here, or is no longer remembered.
     Unknown,
 }
 
@@ -42,7 +43,7 @@ fn shortened(text: &str, most: usize) -> String {
 }
 
 impl StopState {
-    /// Stopped, for a reason of the agent's own.
+    /// Creates a state stopped by the agent itself.
     pub(crate) fn latched(latch: StopLatch) -> Self {
         Self {
             seen: VecDeque::from([latch.id]),
@@ -50,12 +51,12 @@ impl StopState {
         }
     }
 
-    /// The stop in force.
+    /// Returns the stop in force.
     pub(crate) fn latch(&self) -> Option<&StopLatch> {
         self.latch.as_ref()
     }
 
-    /// Takes a stop; false if it was seen before and changes nothing.
+    /// Applies a stop; false if it was seen before and changes nothing.
     pub(crate) fn stop(&mut self, stop: &Stop, now: jiff::Timestamp) -> bool {
         if self.seen.contains(&stop.stop) {
             return false;
@@ -73,10 +74,11 @@ impl StopState {
         true
     }
 
-    /// What it is like without this stop; `None` if nothing is in force and it was seen before.
+    /// Returns the state without this stop; `None` if no stop is in force and this one was seen
+    /// before.
     ///
     /// # Errors
-    /// [`ClearRefusal`]: a clear never ends a stop that its sender does not know of.
+    /// [`ClearRefusal`]: another stop is in force, or this one is unknown.
     pub(crate) fn cleared(&self, stop: StopId) -> Result<Option<Self>, ClearRefusal> {
         match &self.latch {
             Some(latch) if latch.id == stop => Ok(Some(Self {

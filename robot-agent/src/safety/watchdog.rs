@@ -1,8 +1,9 @@
-//! Watches the loop: one whose ticks stand still is said so, and soon ends the whole agent.
+//! Watchdog of the loop: logs when no tick has run for [`SAY_AFTER`], and ends the agent after
+//! [`END_AFTER`].
 //!
-//! The base has a watchdog of its own and stops the wheels when no command comes; ending the
-//! process lets the service manager start a loop that ticks. A thread, because a starved runtime
-//! must not silence it.
+//! The base has a watchdog of its own and stops the wheels without commands; ending the process
+//! makes the service manager start a new one. Runs on its own thread, independent of a starved
+//! async runtime.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -13,30 +14,30 @@ use tracing::{error, info};
 use crate::clock::SharedClock;
 use crate::control_loop::channels::Shared;
 
-/// Time between two looks.
+/// Interval of the checks.
 pub(crate) const LOOK_EVERY: Duration = Duration::from_millis(100);
-/// Standstill after which it is said.
+/// Time without a tick after which it is logged.
 pub(crate) const SAY_AFTER: Duration = Duration::from_millis(500);
-/// Standstill after which the agent ends.
+/// Time without a tick after which the agent ends.
 pub(crate) const END_AFTER: Duration = Duration::from_secs(2);
 
-/// Longest time between two looks by which the loop is judged.
+/// Longest interval between two checks by which the loop is judged.
 pub(crate) const OWN_GAP_MAX: Duration = Duration::from_millis(300);
 
-/// What a look finds.
+/// Result of a check.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Finding {
-    /// It ticks.
+    /// The loop ticks, or its silence is too short or logged already.
     Fine,
-    /// It has just stood still for [`SAY_AFTER`].
+    /// No tick for [`SAY_AFTER`], found for the first time.
     StandsStill,
-    /// It ticks again.
+    /// The loop ticks again after it was reported.
     TicksAgain,
-    /// It has stood still for [`END_AFTER`].
+    /// No tick for [`END_AFTER`].
     GiveUp,
 }
 
-/// Judges by the number of ticks. Pure.
+/// Judges the loop by its number of ticks. Pure.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct TickWatch {
     ticks: u64,
@@ -55,8 +56,8 @@ impl TickWatch {
         }
     }
 
-    /// One look. After a gap in its own looks it begins anew: then the whole process was frozen or
-    /// starved, and the loop must get its chance to tick first.
+    /// Runs one check. After an interval above [`OWN_GAP_MAX`] the time without ticks restarts: the
+    /// whole process was suspended or starved, and the loop must have the chance to tick first.
     pub(crate) fn look(&mut self, ticks: u64, now: Duration) -> Finding {
         let gap = now.saturating_sub(std::mem::replace(&mut self.looked, now));
         if gap > OWN_GAP_MAX {
@@ -88,7 +89,8 @@ impl TickWatch {
     }
 }
 
-/// Watches until the loop is requested to stop, or returns early when it stands still.
+/// Runs until the loop is requested to stop; returns early when the loop has not ticked for
+/// [`END_AFTER`].
 pub(crate) fn run(shared: &Arc<Shared>, clock: &SharedClock) {
     let mut watch = TickWatch::new(clock.monotonic());
     while !shared.stop.load(Ordering::Relaxed) {

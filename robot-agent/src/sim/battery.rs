@@ -1,4 +1,4 @@
-//! The simulated robot's battery: the work of the wheels and a constant draw empty it.
+//! Battery of the simulated robot, discharged by the work of the wheels and a constant load.
 
 use std::time::Duration;
 
@@ -6,35 +6,35 @@ use crate::drive::Battery;
 
 /// Energy of a full battery, joules: 150 Wh.
 const CAPACITY_J: f64 = 150.0 * 3_600.0;
-/// Draw of computer and sensors, watts.
+/// Load of computer and sensors, watts.
 const IDLE_W: f64 = 12.0;
-/// Share of the electrical power that reaches the wheels.
+/// Fraction of the electrical power that reaches the wheels.
 const EFFICIENCY_RATIO: f64 = 0.7;
 /// Voltage of an empty battery, and of a full one, volts.
 const VOLTAGE_V: (f64, f64) = (20.0, 25.2);
 
-/// A battery that nobody charges.
+/// A battery that is never charged.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SimulatedBattery {
     charge_j: f64,
 }
 
 impl SimulatedBattery {
-    /// A battery with a charge, 0 to 1.
+    /// Creates a battery with a charge, 0 to 1.
     pub fn new(charge_ratio: f64) -> Self {
         Self {
             charge_j: CAPACITY_J * charge_ratio.clamp(0.0, 1.0),
         }
     }
 
-    /// Takes what some time of work needs; `wheels_w` is the wheels' mechanical power, and what they
-    /// give back while braking is lost.
+    /// Discharges the battery for `time`; `wheels_w` is the wheels' mechanical power, watts.
+    /// Negative power of braking wheels is not recovered.
     pub fn step(&mut self, wheels_w: f64, time: Duration) {
         let power_w = IDLE_W + wheels_w.max(0.0) / EFFICIENCY_RATIO;
         self.charge_j = (self.charge_j - power_w * time.as_secs_f64()).max(0.0);
     }
 
-    /// What its gauge shows.
+    /// Returns charge and voltage.
     pub fn reading(&self) -> Battery {
         let charge_ratio = self.charge_j / CAPACITY_J;
         let (empty_v, full_v) = VOLTAGE_V;

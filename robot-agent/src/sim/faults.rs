@@ -1,5 +1,5 @@
-//! Faults of a simulated base: channels that freeze, turn over, scale, drift off or leap, wheels
-//! that lock, and a base that ignores its commands.
+//! Faults of a simulated base: channels that freeze, change sign, scale, have an offset or jump,
+//! wheels that lock, and a base that ignores its commands.
 
 use std::time::Duration;
 
@@ -9,49 +9,49 @@ use tread_control::measured::{BodyAcceleration, WheelSpeeds};
 
 use crate::drive::SensorSample;
 
-/// Most faults of one robot.
+/// Largest number of faults of one robot.
 pub const FAULTS_MAX: usize = 16;
 /// Latest begin and end of a fault, seconds.
 pub const FAULT_AFTER_MAX_S: f64 = 1.0e6;
 /// Largest factor, offset or jump of a fault.
 pub const FAULT_BY_MAX: f64 = 1.0e3;
 
-/// What is wrong.
+/// Kind of a fault.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
 pub enum FaultKind {
-    /// A channel repeats its last word, with fresh stamps.
+    /// A channel repeats its last value, with new stamps.
     Frozen {
-        /// Which.
+        /// The channel.
         channel: Channel,
     },
-    /// A channel has the other sign.
+    /// A channel has the opposite sign.
     Inverted {
-        /// Which.
+        /// The channel.
         channel: Channel,
     },
-    /// A channel says too much or too little.
+    /// A channel is scaled.
     Scaled {
-        /// Which.
+        /// The channel.
         channel: Channel,
-        /// By so much.
+        /// The factor.
         factor: f64,
     },
-    /// A channel is off by a constant, in its own unit.
+    /// A channel has a constant offset.
     Biased {
-        /// Which.
+        /// The channel.
         channel: Channel,
-        /// By so much.
+        /// The offset, in the channel's unit.
         by: f64,
     },
-    /// The position leaps along x, metres.
+    /// The position jumps along the site's x axis.
     PositionJumped {
-        /// By so much.
+        /// The jump, metres.
         by_m: f64,
     },
-    /// The position turns about the site's origin by a quarter.
+    /// The position is rotated about the site's origin by a quarter turn.
     PositionRotated,
-    /// Odometry's speed is that along the site's x.
+    /// The odometry's speed is the component along the site's x axis.
     OdometryInWorldFrame,
     /// The left wheels do not turn, whatever is commanded.
     LeftWheelsLocked,
@@ -73,28 +73,28 @@ pub enum Channel {
     Odometry,
     /// The position fixes.
     Position,
-    /// All of them: one source that says the same for ever.
+    /// All channels.
     All,
 }
 
-/// A fault and its time.
+/// A fault and its time span.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Fault {
-    /// From when on, seconds of the robot's clock: since its agent was started.
+    /// Begin, seconds of the robot's clock since its agent's start.
     pub after_s: f64,
-    /// Until when; for ever when absent.
+    /// End, seconds of the robot's clock; `None` for no end.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub until_s: Option<f64>,
-    /// What is wrong.
+    /// Kind of the fault.
     #[serde(flatten)]
     pub kind: FaultKind,
 }
 
 impl Fault {
-    /// Checks its figures.
+    /// Checks the values.
     ///
     /// # Errors
-    /// A sentence that names the figure.
+    /// A sentence that names the value.
     pub fn check(&self) -> Result<(), String> {
         let until_s = self.until_s.unwrap_or(FAULT_AFTER_MAX_S);
         let is_span = (0.0..=FAULT_AFTER_MAX_S).contains(&self.after_s)
@@ -134,14 +134,14 @@ impl Fault {
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Faults {
     list: Vec<Fault>,
-    /// The last word of each channel before it froze.
+    /// Last value of each channel before it froze.
     held: SensorSample,
-    /// The last command that was obeyed.
+    /// Last command that was executed.
     obeyed: WheelSpeeds,
 }
 
 impl Faults {
-    /// These faults.
+    /// Creates the state of these faults.
     pub fn new(list: Vec<Fault>) -> Self {
         Self {
             list,
@@ -149,7 +149,7 @@ impl Faults {
         }
     }
 
-    /// What the wheels do instead of a command.
+    /// Returns the command that the wheels execute instead of `command`.
     pub fn command(&mut self, at: Duration, command: WheelSpeeds) -> WheelSpeeds {
         let is_on = |kind: FaultKind| {
             let mut faults = self.list.iter();
@@ -165,7 +165,7 @@ impl Faults {
         command
     }
 
-    /// What the sensors say instead.
+    /// Returns the sample with the active faults applied.
     pub fn sample(&mut self, mut sample: SensorSample, heading_rad: f64) -> SensorSample {
         let at = sample.at;
         let mut frozen = [false; 5];
@@ -233,7 +233,7 @@ impl Faults {
     }
 }
 
-/// Each single one.
+/// The channels except [`Channel::All`].
 const CHANNELS: [Channel; 5] = [
     Channel::Gyro,
     Channel::Wheels,
@@ -242,7 +242,7 @@ const CHANNELS: [Channel; 5] = [
     Channel::Position,
 ];
 
-/// The channel says what it said before, when it says anything.
+/// Replaces the channel's value, if present, by the held one.
 fn freeze(sample: &mut SensorSample, channel: Channel, held: &SensorSample) {
     match channel {
         Channel::Gyro => sample.yaw_rate_rad_s = sample.yaw_rate_rad_s.and(held.yaw_rate_rad_s),
@@ -254,7 +254,7 @@ fn freeze(sample: &mut SensorSample, channel: Channel, held: &SensorSample) {
     }
 }
 
-/// Every number of the channel becomes another one.
+/// Applies a function to every value of the channel.
 fn change(sample: &mut SensorSample, channel: Channel, to: impl Fn(f64) -> f64) {
     let is = |one: Channel| channel == one || channel == Channel::All;
     if is(Channel::Gyro) {

@@ -1,4 +1,4 @@
-//! The true ground under a simulated robot: each side stands on the terrain under it, as it is then.
+//! The true ground under a simulated robot: the terrain under each side, as a function of time.
 
 use std::time::Duration;
 
@@ -13,7 +13,7 @@ use super::scenario::{GroundSpec, Scenario, ScenarioError};
 struct Patch {
     outline: Polygon,
     curve: FrictionCurve,
-    /// From when on it is another one, in the order of time.
+    /// Later friction curves with the time of each change, in order of time.
     then: Vec<(Duration, FrictionCurve)>,
 }
 
@@ -28,16 +28,17 @@ impl Patch {
 /// The friction everywhere on a site.
 #[derive(Debug, Clone)]
 pub struct GroundMap {
-    /// Highest layer first, of equal ones the smaller identifier: the first hit counts.
+    /// Highest layer first, then by identifier; the first patch that contains a point applies.
     patches: Vec<Patch>,
     elsewhere: FrictionCurve,
 }
 
 impl GroundMap {
-    /// The true ground of a scenario for a robot on whose tyres it is stiffer by `stiffness_ratio`.
+    /// Creates the true ground of a scenario for a robot whose tyres multiply the friction
+    /// stiffness by `stiffness_ratio`.
     ///
     /// # Errors
-    /// [`ScenarioError`] for figures that a parsed scenario cannot have.
+    /// [`ScenarioError`] for values that a parsed scenario cannot have.
     pub fn new(scenario: &Scenario, stiffness_ratio: f64) -> Result<Self, ScenarioError> {
         let malformed = |problem: String| ScenarioError::Malformed {
             file: scenario.site.to_string(),
@@ -90,8 +91,8 @@ impl GroundMap {
         hit.map_or(self.elsewhere, |patch| patch.curve(at))
     }
 
-    /// The ground under both sides of a robot at a time of its clock, taken half a track width left
-    /// and right of it.
+    /// Returns the ground under both sides of a robot at a time of its clock, half a track width to
+    /// the left and to the right of the centre.
     pub fn under(&self, pose: Pose, track_width_m: f64, at: Duration) -> Ground {
         let (sin, cos) = pose.heading_rad.sin_cos();
         let half_m = 0.5 * track_width_m;

@@ -1,8 +1,8 @@
 //! The simulated robot: the free four-wheel plant on a scenario's ground, with its sensors.
 //!
-//! It stands where a real base would: behind [`crate::drive::Drive`]. Nothing of the truth passes
-//! that interface except through the sensors; [`trace`] keeps it for reports. [`time`] lets several
-//! robots of one process go through a time of their own.
+//! It is a base behind [`crate::drive::Drive`]. The true state passes that interface only through
+//! the sensors; [`trace`] records it for reports. [`time`] gives several robots of one process a
+//! common simulated time.
 
 pub mod battery;
 pub mod faults;

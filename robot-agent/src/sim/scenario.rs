@@ -1,7 +1,7 @@
 //! Scenario files: the true ground of a simulated site, its robots, and missions to show.
 //!
-//! TOML. The simulated base takes the true friction from here; no other part of the agent may
-//! look, it has to measure. `tread demo` also takes terrains' shapes and missions from it.
+//! TOML. The simulated base takes the true friction from here; no other part of the agent reads it,
+//! but has to measure. `tread demo` also takes terrains' shapes and missions from it.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -17,9 +17,9 @@ use super::faults::{FAULTS_MAX, Fault};
 
 /// The scenario that comes with the agent.
 pub const BUILT_IN: &str = include_str!("../../scenarios/yard.toml");
-/// What [`BUILT_IN`] is called in error messages and on the command line.
+/// Name of [`BUILT_IN`] in error messages and on the command line.
 pub const BUILT_IN_NAME: &str = "yard";
-/// How much tyres may differ from what the scenario says of the ground.
+/// Permitted ratio of a robot's friction stiffness to that of the scenario.
 pub const STIFFNESS_RATIO_RANGE: std::ops::RangeInclusive<f64> = 0.2..=5.0;
 /// Latest change of the ground, seconds.
 const CHANGE_AFTER_MAX_S: f64 = 1.0e6;
@@ -54,16 +54,16 @@ pub enum ScenarioError {
     },
 }
 
-/// The text of a scenario, and where it is from.
+/// Text of a scenario, and its source.
 #[derive(Debug, Clone, Copy)]
 pub struct ScenarioText<'text> {
     /// The file's name in errors.
     pub file: &'text str,
-    /// What is read.
+    /// The text.
     pub text: &'text str,
 }
 
-/// A site as it truly is.
+/// True description of a site.
 #[derive(Debug, Clone, PartialEq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct Scenario {
@@ -74,9 +74,9 @@ pub struct Scenario {
     /// The ground outside all terrains.
     #[serde(default)]
     pub ground: GroundSpec,
-    /// The ground within polygons.
+    /// Ground within polygons.
     pub terrains: Vec<ScenarioTerrain>,
-    /// The robots, where they start and how they differ.
+    /// Robots, with their start poses and individual properties.
     pub robots: Vec<ScenarioRobot>,
     /// Missions to show, in the order in which each robot drives its own.
     #[serde(default)]
@@ -92,7 +92,7 @@ pub struct GroundSpec {
     /// Slip at the peak of friction, `λ_m`, within 0 to 1.
     #[serde(default = "default_peak_slip")]
     pub peak_slip: f64,
-    /// Share of the peak friction that is left at full sliding, α, within 0 to 1.
+    /// Fraction of the peak friction that is left at full sliding, α, within 0 to 1.
     #[serde(default = "default_sliding_ratio")]
     pub sliding_ratio: f64,
 }
@@ -116,10 +116,10 @@ impl Default for GroundSpec {
 }
 
 impl GroundSpec {
-    /// The friction curve, checked.
+    /// Checks the values and returns the friction curve.
     ///
     /// # Errors
-    /// A sentence that names the figure.
+    /// A sentence that names the value.
     pub fn curve(&self) -> Result<FrictionCurve, String> {
         let spec = FrictionSpec {
             stiffness: self.stiffness,
@@ -142,7 +142,7 @@ pub struct ScenarioTerrain {
     pub class: TerrainClass,
     /// Corners `[x, y]` in metres.
     pub polygon: Vec<[f64; 2]>,
-    /// Where terrains overlap the higher layer counts.
+    /// Layer; where terrains overlap, the highest applies.
     #[serde(default)]
     pub layer: i32,
     /// Friction stiffness K = 1/θ.
@@ -150,32 +150,32 @@ pub struct ScenarioTerrain {
     /// Slip at the peak of friction, `λ_m`.
     #[serde(default = "default_peak_slip")]
     pub peak_slip: f64,
-    /// Share of the peak friction that is left at full sliding, α.
+    /// Fraction of the peak friction that is left at full sliding, α.
     #[serde(default = "default_sliding_ratio")]
     pub sliding_ratio: f64,
-    /// What becomes of it, in the order of time.
+    /// Later changes, in order of time.
     #[serde(default)]
     pub then: Vec<GroundChange>,
 }
 
-/// Ground that is another one from some time on.
+/// A change of the ground at a time.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct GroundChange {
-    /// From when on, seconds of the robot's clock: since its agent was started.
+    /// Time of the change, seconds of the robot's clock since its agent's start.
     pub after_s: f64,
     /// Friction stiffness K = 1/θ from then on.
     pub stiffness: f64,
     /// Slip at the peak of friction, `λ_m`.
     #[serde(default = "default_peak_slip")]
     pub peak_slip: f64,
-    /// Share of the peak friction that is left at full sliding, α.
+    /// Fraction of the peak friction that is left at full sliding, α.
     #[serde(default = "default_sliding_ratio")]
     pub sliding_ratio: f64,
 }
 
 impl GroundChange {
-    /// The friction from then on, not yet checked.
+    /// Returns the friction after the change, unchecked.
     pub fn ground(&self) -> GroundSpec {
         GroundSpec {
             stiffness: self.stiffness,
@@ -186,7 +186,7 @@ impl GroundChange {
 }
 
 impl ScenarioTerrain {
-    /// The terrain's outline, checked.
+    /// Checks the corners and returns the terrain's outline.
     ///
     /// # Errors
     /// A sentence that names the corner.
@@ -199,7 +199,7 @@ impl ScenarioTerrain {
         Polygon::new(corners).map_err(|refused| refused.to_string())
     }
 
-    /// The terrain's friction, not yet checked.
+    /// Returns the terrain's friction, unchecked.
     pub fn ground(&self) -> GroundSpec {
         GroundSpec {
             stiffness: self.stiffness,
@@ -215,22 +215,22 @@ impl ScenarioTerrain {
 pub struct ScenarioRobot {
     /// The robot.
     pub id: RobotId,
-    /// Where it starts, metres.
+    /// Start position, x in the site frame, metres.
     pub x_m: f64,
-    /// Where it starts, metres.
+    /// Start position, y in the site frame, metres.
     pub y_m: f64,
-    /// How it stands, radians.
+    /// Start heading, radians, counter-clockwise from x.
     pub heading_rad: f64,
-    /// What makes its noise, offsets and rolling radii its own.
+    /// Seed of its sensor noise, offsets and rolling radii.
     pub seed: u64,
-    /// How much stiffer any ground is on its tyres than the scenario says, within
+    /// Ratio of the friction stiffness on its tyres to that of the scenario, within
     /// [`STIFFNESS_RATIO_RANGE`].
     #[serde(default = "default_stiffness_ratio", alias = "grip_ratio")]
     pub stiffness_ratio: f64,
     /// Whether its base measures wheel torque.
     #[serde(default = "default_wheel_torque")]
     pub wheel_torque: bool,
-    /// What breaks on it, at most [`FAULTS_MAX`].
+    /// Its faults, at most [`FAULTS_MAX`].
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub faults: Vec<Fault>,
 }
@@ -247,9 +247,9 @@ fn default_wheel_torque() -> bool {
 #[derive(Debug, Clone, PartialEq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct ScenarioMission {
-    /// Who drives it.
+    /// Robot of the mission.
     pub robot: RobotId,
-    /// What to drive.
+    /// Trajectory of the mission.
     pub trajectory: Trajectory,
 }
 
@@ -300,12 +300,12 @@ impl Scenario {
         Ok(scenario)
     }
 
-    /// The robot of that name.
+    /// Returns the robot with this identifier.
     pub fn robot(&self, id: &RobotId) -> Option<&ScenarioRobot> {
         self.robots.iter().find(|robot| robot.id == *id)
     }
 
-    /// What types alone cannot say. `text` is only searched for line numbers.
+    /// Checks what the types do not. `text` is only searched for line numbers.
     fn check(&self, text: &str) -> Result<(), String> {
         let at = |table: &str, index: usize, problem: String| {
             format!(
@@ -386,7 +386,7 @@ impl Scenario {
     }
 }
 
-/// The line of the `index`-th `[[table]]`; the first line of the file for inline tables.
+/// Returns the line of the `index`-th `[[table]]`; 1 for inline tables.
 fn line_of(text: &str, table: &str, index: usize) -> usize {
     let header = format!("[[{table}]]");
     let mut headers = text

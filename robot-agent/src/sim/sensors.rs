@@ -11,14 +11,14 @@ use tread_control::robot::RobotModel;
 
 use crate::drive::SensorSample;
 
-/// Time between two samples of the fast sensors: 200 Hz.
+/// Sampling period of the fast sensors: 200 Hz.
 pub const SAMPLE_PERIOD: Duration = Duration::from_millis(5);
-/// A body speed with each so many samples: 10 Hz.
+/// Samples per body speed: 10 Hz.
 const SAMPLES_PER_BODY_SPEED: u64 = 20;
-/// A position fix with each so many samples: 20 Hz.
+/// Samples per position fix: 20 Hz.
 const SAMPLES_PER_POSITION: u64 = 10;
 
-/// How good the sensors are; standard deviations of white noise unless said otherwise.
+/// Accuracy of the sensors; standard deviations of white noise unless stated otherwise.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SensorSpec {
     /// Gyro, rad/s.
@@ -35,11 +35,11 @@ pub struct SensorSpec {
     pub position_m: f64,
     /// Heading of a position fix, radians.
     pub heading_rad: f64,
-    /// Largest constant error of the torque's scale, as a share.
+    /// Largest constant relative error of the torque's scale.
     pub torque_scale_ratio: f64,
     /// Torque, as a friction coefficient of one side.
     pub torque_mu: f64,
-    /// Largest difference of a side's rolling radius from the model's, as a share.
+    /// Largest relative difference of a side's rolling radius from the model's.
     pub radius_ratio: f64,
 }
 
@@ -60,7 +60,7 @@ impl Default for SensorSpec {
     }
 }
 
-/// What a robot's seed makes of it: constant errors, and the source of its noise.
+/// Sensors of one robot: its constant errors, and the source of its noise.
 #[derive(Debug, Clone)]
 pub struct Sensors {
     spec: SensorSpec,
@@ -73,7 +73,7 @@ pub struct Sensors {
 }
 
 impl Sensors {
-    /// The sensors of one robot; equal seeds give equal sensors.
+    /// Creates the sensors of one robot; equal seeds give equal sensors.
     pub fn new(spec: SensorSpec, model: &RobotModel, seed: u64) -> Self {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         let mut within = |most: f64| most * (2.0 * random.random::<f64>() - 1.0);
@@ -98,7 +98,7 @@ impl Sensors {
         }
     }
 
-    /// True rolling radii over the model's, left and right.
+    /// Returns the ratio of the true rolling radii to the model's, as `(left, right)`.
     pub fn radius_ratios(&self) -> (f64, f64) {
         self.radius_ratios
     }
@@ -114,11 +114,11 @@ impl Sensors {
         value + std_dev * self.normal()
     }
 
-    /// What the sensors say of the base now.
+    /// Samples the sensors of the base.
     pub fn sample(&mut self, plant: &Plant, at: Duration) -> SensorSample {
         let spec = self.spec;
         let state = *plant.state();
-        // Encoders count and inertial sensors integrate: each gives its mean since the last sample.
+        // Encoders count and inertial sensors integrate: each gives the mean since the last sample.
         let means = *plant.means();
         let (acceleration, torques) = (means.acceleration, plant.wheel_torques());
         let index = self.samples;

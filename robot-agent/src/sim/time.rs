@@ -1,9 +1,9 @@
-//! Simulated time that several loops go through together, as fast as the machine lets them.
+//! Simulated time that several loops share, as fast as the machine allows.
 //!
-//! Each loop has a [`PacedClock`] of one [`PacedTime`]. Time stands while any of them computes; when
-//! all wait, it leaps to the earliest deadline. So no loop ever comes late, however slow or busy the
-//! machine is, and what a run shows does not depend on it. A pace bounds how much faster than real
-//! time it goes, so that networks and disks, which live in real time, keep up.
+//! Each loop has a [`PacedClock`] of one [`PacedTime`]. Time stands still while any of them
+//! computes; when all wait, it jumps to the earliest deadline. So no loop is ever late, and the
+//! result of a run does not depend on the machine's speed or load. A pace limits the ratio of
+//! simulated to real time, so that networks and disks, which work in real time, keep up.
 
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -12,7 +12,7 @@ use jiff::Timestamp;
 
 use crate::clock::Clock;
 
-/// Slowest and fastest pace, simulated over real time.
+/// Permitted ratio of simulated to real time.
 pub const PACE_RANGE: std::ops::RangeInclusive<f64> = 0.01..=1_000.0;
 
 #[derive(Debug)]
@@ -20,11 +20,11 @@ struct State {
     now: Duration,
     pace: f64,
     loops: usize,
-    /// Deadlines of the loops that wait.
+    /// Deadlines of the waiting loops.
     waiting: Vec<Duration>,
-    /// One of them waits for the pace, and then lets time go on.
+    /// Whether a loop waits for the pace before it advances the time.
     is_leaping: bool,
-    /// When time last went on.
+    /// Real time of the last advance.
     leapt_at: Option<Instant>,
 }
 
@@ -41,20 +41,20 @@ impl Inner {
     }
 
     fn wall(&self, now: Duration) -> Timestamp {
-        // Saturates at the last year that RFC 3339 knows.
+        // Saturates at the last year of RFC 3339.
         self.wall_origin.checked_add(now).unwrap_or(Timestamp::MAX)
     }
 }
 
-/// The time of a simulated site.
+/// Common time of the loops of a simulated site.
 #[derive(Debug, Clone)]
 pub struct PacedTime {
     inner: Arc<Inner>,
 }
 
 impl PacedTime {
-    /// Time that stands at zero, and at `wall_origin`, until loops wait for it. Goes at most `pace`
-    /// times as fast as real time, which is kept within [`PACE_RANGE`].
+    /// Creates a time that stays at zero, and at `wall_origin`, until loops wait for it. `pace` is
+    /// the largest ratio of simulated to real time, clamped to [`PACE_RANGE`].
     pub fn new(wall_origin: Timestamp, pace: f64) -> Self {
         let state = State {
             now: Duration::ZERO,
@@ -73,22 +73,23 @@ impl PacedTime {
         }
     }
 
-    /// Time since the origin.
+    /// Returns the time since the origin.
     pub fn now(&self) -> Duration {
         self.inner.state().now
     }
 
-    /// The wall clock of the site.
+    /// Returns the wall time.
     pub fn wall(&self) -> Timestamp {
         self.inner.wall(self.now())
     }
 
-    /// From now on, goes at most so many times as fast as real time.
+    /// Sets the largest ratio of simulated to real time, clamped to [`PACE_RANGE`].
     pub fn set_pace(&self, pace: f64) {
         self.inner.state().pace = bounded(pace);
     }
 
-    /// A clock for one more loop. From now on time waits for that loop, until the clock is dropped.
+    /// Creates a clock for one more loop. Until the clock is dropped, time advances only while that
+    /// loop waits.
     pub fn clock(&self) -> PacedClock {
         self.inner.state().loops += 1;
         PacedClock {
@@ -108,7 +109,7 @@ pub struct PacedClock {
 }
 
 impl PacedClock {
-    /// Lets time go on to the earliest deadline, once the pace allows it.
+    /// Advances time to the earliest deadline, once the pace allows it.
     fn leap<'state>(
         &'state self,
         mut state: MutexGuard<'state, State>,
@@ -129,7 +130,7 @@ impl PacedClock {
             state = self.inner.state();
             state.is_leaping = false;
         }
-        // A loop that came meanwhile computes: time waits for it too.
+        // A loop that was added meanwhile computes: time waits for it too.
         if state.waiting.len() == state.loops {
             state.now = state.now.max(next);
             let now = state.now;

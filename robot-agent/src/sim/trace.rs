@@ -1,4 +1,4 @@
-//! What a simulated base truly did, for reports on a run: nothing in the agent may look.
+//! Records the true state of a simulated base, for reports on a run; the agent does not read it.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -6,16 +6,16 @@ use std::time::Duration;
 use tread_control::measured::WheelSpeeds;
 use tread_control::plant::PlantState;
 
-/// The truth at one moment.
+/// True state at one time.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TruthSample {
-    /// When, by the agent's monotonic clock.
+    /// Time, by the agent's monotonic clock.
     pub at: Duration,
     /// The true state of the base.
     pub state: PlantState,
-    /// What its wheels were commanded.
+    /// Commanded wheel speeds.
     pub command: WheelSpeeds,
-    /// True θ under its middle, with its own tyres.
+    /// True θ under its centre, with its own tyres.
     pub theta: f64,
 }
 
@@ -26,15 +26,15 @@ struct Store {
     missed: u64,
 }
 
-/// A store of samples, shared by the base that fills it and whoever reads it. All its room is taken
-/// at the start; what comes beyond is counted.
+/// Shared store of samples. All its memory is allocated at the start; samples beyond it are
+/// counted.
 #[derive(Debug, Clone)]
 pub struct Trace {
     store: Arc<Mutex<Store>>,
 }
 
 impl Trace {
-    /// An empty one for a sample each `every`, `samples_max` at the most.
+    /// Creates an empty store with one sample per `every`, at most `samples_max`.
     pub fn new(every: Duration, samples_max: usize) -> Self {
         let store = Store {
             every,
@@ -50,14 +50,14 @@ impl Trace {
         self.store.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Whether a sample is due at that time.
+    /// Whether a sample is due at `at`.
     pub(crate) fn is_due(&self, at: Duration) -> bool {
         let store = self.store();
         let last = store.samples.last();
         last.is_none_or(|last| at.saturating_sub(last.at) >= store.every)
     }
 
-    /// Adds a sample, or counts that there was no room.
+    /// Adds a sample, or counts it as missed if the store is full.
     pub(crate) fn add(&self, sample: TruthSample) {
         let mut store = self.store();
         if store.samples.len() < store.samples.capacity() {
@@ -67,23 +67,23 @@ impl Trace {
         }
     }
 
-    /// The samples so far, oldest first.
+    /// Returns the samples so far, oldest first.
     pub fn samples(&self) -> Vec<TruthSample> {
         self.store().samples.clone()
     }
 
-    /// The newest sample.
+    /// Returns the newest sample.
     pub fn last(&self) -> Option<TruthSample> {
         self.store().samples.last().copied()
     }
 
-    /// Samples for which there was no room.
+    /// Returns the number of samples that found the store full.
     pub fn missed(&self) -> u64 {
         self.store().missed
     }
 }
 
-/// Two are the same if they share their samples.
+/// Two traces are equal if they share their samples.
 impl PartialEq for Trace {
     fn eq(&self, other: &Self) -> bool {
         Arc::ptr_eq(&self.store, &other.store)

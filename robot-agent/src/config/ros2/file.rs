@@ -1,4 +1,4 @@
-//! `[drive.ros2]` as it is written: every key, none of them checked yet but by its type.
+//! The keys of `[drive.ros2]`, checked only by their types.
 
 use serde::Deserialize;
 

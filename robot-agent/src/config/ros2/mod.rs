@@ -1,4 +1,4 @@
-//! `[drive.ros2]` in `robot.toml`: what makes it a [`Ros2Settings`].
+//! Checks `[drive.ros2]` of `robot.toml` and converts it to [`Ros2Settings`].
 
 mod file;
 mod outward;
@@ -27,17 +27,17 @@ use crate::drive::ros2::settings::{
     StampClock, Timing,
 };
 
-/// Where a robot's own router listens unless said otherwise.
+/// Default endpoint of the robot's own router.
 const ENDPOINT_DEFAULT: &str = "tcp/127.0.0.1:7447";
-/// Highest domain of ROS 2.
+/// Largest ROS 2 domain.
 const DOMAIN_MAX: u32 = 232;
-/// Least silence of a base that counts, milliseconds.
+/// Smallest permitted `silent_after`, milliseconds.
 const SILENT_AFTER_MIN_MS: f64 = 30.0;
-/// Latest pose that is used, milliseconds: localisation carries none on for longer.
+/// Largest permitted age of a pose, milliseconds: localisation propagates none for longer.
 const POSE_LATE_AFTER_MAX_MS: f64 = 1_000.0;
-/// Range of gears and constants.
+/// Permitted gear ratios and torque constants.
 const RATIO_RANGE: std::ops::RangeInclusive<f64> = 1.0e-3..=1.0e4;
-/// Range of a base's own radius and track, metres.
+/// Permitted wheel radius and track width of the base, metres.
 const LENGTH_RANGE_M: std::ops::RangeInclusive<f64> = 1.0e-3..=100.0;
 
 fn refused(key: &'static str, problem: impl Into<String>) -> ConfigError {
@@ -84,7 +84,7 @@ fn place(key: &'static str, [x_m, y_m, heading_rad]: [f64; 3]) -> Result<Pose, C
     }
 }
 
-/// Makes the names of topics; the key is for errors.
+/// Resolves the names of topics; the key is for errors.
 struct Topics {
     namespace: Name,
 }
@@ -105,7 +105,7 @@ fn text(given: Option<&str>, default: &str) -> String {
 }
 
 impl Ros2File {
-    /// Checks everything.
+    /// Checks all keys and returns the settings.
     ///
     /// # Errors
     /// [`ConfigError::OutOfRange`] names the key.
@@ -115,7 +115,7 @@ impl Ros2File {
     ) -> Result<Ros2Settings, ConfigError> {
         let bus = self.bus()?;
         let topics = Topics {
-            // The bridge's namespace is before every topic; a node's is before relative ones.
+            // The bridge's namespace precedes every topic, a node's only relative ones.
             namespace: match bus.scheme {
                 Scheme::RmwZenoh(_) => bus.namespace.clone(),
                 Scheme::Ros2Dds => Name::default(),
@@ -213,7 +213,7 @@ impl Ros2File {
     }
 }
 
-/// What no section can say for itself.
+/// Checks conditions that involve several sections.
 fn check_whole(settings: &Ros2Settings) -> Result<(), ConfigError> {
     let odometry = settings.odometry.as_ref();
     let is_of_wheels = odometry.is_some_and(|odometry| odometry.motion_of == MotionOf::Wheels);
@@ -375,7 +375,7 @@ impl CommandFile {
             base_track_m,
             &LENGTH_RANGE_M,
         )?;
-        // Without joints there is one of each side, and nothing is written to them.
+        // Without joints one per side is assumed; no joint command is written then.
         let ratio = |side: &SideJoints, gear_ratio: f64| gear_ratio * side.sign;
         let (joints, joint_ratios) = joints.map_or(([1, 1], [1.0, 1.0]), |joints| {
             let (left, right, gear_ratio) = (&joints.left, &joints.right, joints.gear_ratio);

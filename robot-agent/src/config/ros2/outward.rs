@@ -1,4 +1,4 @@
-//! `[drive.ros2.outward]`: what the agent says to the rest of the robot, and where.
+//! Checks `[drive.ros2.outward]`: the topics on which the agent publishes its state.
 
 use tread_control::geometry::Pose;
 
@@ -8,7 +8,7 @@ use crate::config::ConfigError;
 use crate::drive::ros2::outward::Word;
 use crate::drive::ros2::settings::{OutwardSettings, Ros2Settings};
 
-/// The frame of whatever gives the position, and where it lies in the site.
+/// Returns the frame of the topic that gives the position, and its pose in the site.
 fn frame(read: &Ros2Settings) -> Option<(String, Pose)> {
     if let Some(pose) = &read.pose {
         return Some((pose.frame.clone(), pose.site_from_map));
@@ -18,7 +18,7 @@ fn frame(read: &Ros2Settings) -> Option<(String, Pose)> {
 }
 
 impl OutwardFile {
-    /// What is said, beside everything that is read and commanded.
+    /// Checks the topics against all that are read or commanded; `None` if switched off.
     pub(super) fn checked(
         &self,
         topics: &Topics,
@@ -27,7 +27,7 @@ impl OutwardFile {
         if self.enabled == Some(false) {
             return Ok(None);
         }
-        // Where nothing gives a position both ways stay empty.
+        // Without a source of positions both paths stay empty.
         let (frame, site_from_frame) = frame(others).unwrap_or_default();
         let name = |word, given: &Option<String>, default| {
             topics.name(key(word), given.as_deref(), default)
@@ -40,7 +40,7 @@ impl OutwardFile {
             frame,
             site_from_frame,
         };
-        // A base that takes lists of numbers would drive by θ.
+        // A base commanded by lists of numbers would execute θ as a command.
         let mut taken = others.topics();
         for word in Word::ALL {
             let topic = word.topic(&settings);

@@ -1,7 +1,7 @@
-//! What stops, leases, limits and the loop's rate ask for in a tick.
+//! Reads the demands of stops, leases, limits and the loop's rate once in each tick.
 //!
-//! The view of [`crate::safety`] is copied once in each tick, if nobody is writing it; the last copy
-//! carries its own ends, so that nothing lasts longer for being read late.
+//! The view of [`crate::safety`] is copied unless it is being written; otherwise the last copy is
+//! used, whose entries carry their expiry, so that reading late prolongs nothing.
 
 use std::time::Duration;
 
@@ -9,15 +9,15 @@ use crate::control_loop::channels::Shared;
 use crate::control_loop::overrun::{Overrun, OverrunWatch};
 use crate::safety::LoopView;
 
-/// What is asked for in this tick.
+/// Demands in this tick.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Demands {
     /// The number of the stop in force; 0 for none.
     pub(super) stop: u64,
-    /// How long the server has been silent.
+    /// Time since the last message from the server.
     pub(super) server_silence: Duration,
     pub(super) view: LoopView,
-    /// How far the loop is from its rate, while the robot is held for it.
+    /// Lateness of the loop while the robot is held for it.
     pub(super) overrun: Option<Overrun>,
 }
 
@@ -27,17 +27,17 @@ impl Demands {
         self.stop != 0
     }
 
-    /// Whether somebody has the lease of teleoperation.
+    /// Whether the lease of teleoperation is taken.
     pub(super) fn is_leased(&self, now_us: u64) -> bool {
         self.view.teleoperation.is_leased(now_us)
     }
 }
 
-/// Reads them.
+/// Reads the demands of each tick.
 #[derive(Debug, Default)]
 pub(super) struct DemandReader {
     view: LoopView,
-    /// Whether the loop keeps its rate, where that is known.
+    /// Watch of the loop's rate, if its period is set.
     overrun: Option<OverrunWatch>,
 }
 
@@ -47,7 +47,7 @@ impl DemandReader {
         self.overrun = Some(OverrunWatch::new(period));
     }
 
-    /// Reads what is asked for now.
+    /// Reads the demands at `now`, by the monotonic clock.
     pub(super) fn read(&mut self, now: Duration, shared: &Shared) -> Demands {
         if let Some(watch) = &mut self.overrun {
             watch.note(now);

@@ -1,4 +1,4 @@
-//! Second stage: where the robot is, and the friction of the ground that it is on.
+//! Second stage: localises the robot, estimates the friction of the ground, and cuts segments.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -26,79 +26,80 @@ use crate::control_loop::slip::SlipMeter;
 use crate::drive::{SILENT_AFTER_MAX, StatedNoise};
 use crate::geometry::wire_point;
 
-/// Range within which a base's own word on its noise is believed, as a multiple of the default.
+/// Range of the noise that a base states for its sensors, as a multiple of the default; values
+/// outside are clamped.
 const NOISE_RANGE: std::ops::RangeInclusive<f64> = 0.1..=30.0;
-/// Oldest position fix with which the position does not count as lost.
+/// Age of the last fused position fix beyond which the position counts as lost.
 const POSITION_LOST_AFTER: Duration = Duration::from_secs(3);
 
-/// What the stage takes.
+/// Input of the stage.
 #[derive(Debug)]
 pub(super) struct EstimationInput<'tick> {
     pub(super) tick: Tick,
     pub(super) sensed: &'tick Sensed,
-    /// What the base says of its sensors' noise.
+    /// Noise that the base states for its sensors.
     pub(super) noise: StatedNoise,
     /// A new definition of the site.
     pub(super) site: Option<Arc<SiteView>>,
-    /// The mission to which a segment that opens now belongs.
+    /// Active mission, to which a segment that opens in this tick belongs.
     pub(super) mission: Option<MissionId>,
 }
 
-/// What the stage gives.
+/// Output of the stage.
 #[derive(Debug)]
 pub(super) struct Estimated<'tick> {
     pub(super) pose: Option<Pose>,
     pub(super) twist: Twist,
     pub(super) position_std_dev_m: f64,
-    /// When the last fix behind the pose was measured.
+    /// Measuring time of the last fix fused into the pose.
     pub(super) last_fix: Option<Duration>,
-    /// The robot as the tracking law sees it.
+    /// Robot state for the tracking law.
     pub(super) measured: Measured,
-    /// What is broken.
+    /// Active fault of the base or the localisation.
     pub(super) fault: Option<Fault>,
-    /// What is known of the ground.
+    /// State of the estimator, with measured θ.
     pub(super) estimate: Estimate,
-    /// What is known of it beside a map.
+    /// The robot's own knowledge of the ground, without a map.
     pub(super) ground: Ground,
-    /// The same before this tick's segment was closed, for a mission that begins in this tick.
+    /// `ground` before this tick's segment was closed, for a mission that begins in this tick.
     pub(super) ground_at_begin: Ground,
-    /// Whether the estimator found the ground changed.
+    /// Whether the estimator detected a change of ground.
     pub(super) ground_changed: bool,
-    /// Whether a wheel slips beyond the model.
+    /// Whether a wheel slips beyond the model's range.
     pub(super) slips: bool,
-    /// How much they slip.
+    /// Longitudinal slip of each side.
     pub(super) slip: Option<SideSlip>,
-    /// Where the wheels turn without progress.
+    /// Position at which the wheels turn without moving the robot.
     pub(super) dug_in_at: Option<Point>,
-    /// The site as it is now.
+    /// The active site definition.
     pub(super) site: Option<&'tick SiteView>,
-    /// The cell that is measured, and the terrain under all wheels.
+    /// Cell of the open segment, and the terrain under all wheels.
     pub(super) cell: Option<Cell>,
     pub(super) terrain: Option<usize>,
-    /// Sums on θ of the segment that was closed.
+    /// θ information and θ-weighted sum of the segment that was closed.
     pub(super) closed: Option<(f64, f64)>,
-    /// Blocks of measurement in this tick that belong to no cell.
+    /// Estimator blocks of this tick that belong to no cell.
     pub(super) unplaced_blocks: u64,
 }
 
-/// What leaves the loop with this stage.
+/// Objects that leave the loop after this stage.
 #[derive(Debug, Default)]
 pub(super) struct Released {
     /// A segment that was closed with information.
     pub(super) segment: Option<ClosedSegment>,
-    /// A site that is no longer used.
+    /// A site definition that was replaced.
     pub(super) site: Option<Arc<SiteView>>,
 }
 
-/// What is known of the ground where the robot is, without any map.
+/// The robot's own knowledge of the ground at its position, without a map.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Ground {
     measured: Option<ThetaKnowledge>,
-    /// The cell, and the revision of its grid.
+    /// Revision of the grid, and the cell.
     cell: Option<(u32, Cell)>,
 }
 
-/// What became of this tick's samples.
+/// Effects of this tick's samples.
 #[derive(Debug, Default)]
 struct Taken {
     ground_changed: bool,
@@ -117,11 +118,11 @@ pub(super) struct Estimation {
     site: Option<Arc<SiteView>>,
     footing: Option<Footing>,
     last_fix: Option<Duration>,
-    /// Until when the localisation has accounted for the robot's motion.
+    /// Time up to which the localisation has integrated the robot's motion.
     integrated_to: Option<Duration>,
-    /// Oldest word of the base with which it does not count as silent.
+    /// Age of the last sample beyond which the base counts as silent.
     silent_after: Duration,
-    /// What the base says of its sensors' noise.
+    /// Noise that the base states for its sensors.
     stated_noise: StatedNoise,
     slips: bool,
     slip: SlipMeter,
@@ -150,18 +151,18 @@ impl Estimation {
         }
     }
 
-    /// A base counts as silent after this.
+    /// Sets the time after which the base counts as silent.
     pub(super) fn set_silent_after(&mut self, silent_after: Duration) {
         self.silent_after = silent_after;
     }
 
-    /// Begins with what is known of the robot.
+    /// Sets the estimator's prior of the robot's parameters.
     pub(super) fn set_prior(&mut self, prior: EstimatorPrior) {
         self.estimator = Estimator::with_prior(self.model, SensorNoise::default(), prior);
         self.estimate = self.estimator.estimate();
     }
 
-    /// Localises the robot, measures the ground, and closes what is measured of a cell.
+    /// Localises the robot, updates the estimator, and closes the segment where required.
     pub(super) fn step(&mut self, input: EstimationInput<'_>) -> (Estimated<'_>, Released) {
         let (tick, sensed) = (input.tick, input.sensed);
         let now = tick.now.monotonic;
@@ -213,7 +214,7 @@ impl Estimation {
         (estimated, released)
     }
 
-    /// Weighs samples by what the base says of its sensors, as far as that can be.
+    /// Sets the estimator's noise to that stated by the base, clamped to [`NOISE_RANGE`].
     fn take_noise(&mut self, stated: StatedNoise) {
         if self.stated_noise == stated {
             return;
@@ -267,7 +268,7 @@ impl Estimation {
         let forward_m_s = self.model.twist_from_wheel_speeds(wheel_speeds).linear_m_s;
         self.progress.note_wheels(forward_m_s * dt_s);
         self.localisation.predict(gyro_rad_s, wheel_speeds, dt_s);
-        // With wheels on two grounds there is no one θ to learn.
+        // With wheels on two kinds of ground there is no single θ to estimate.
         if self.footing == Some(Footing::Mixed) || !sample.may_learn {
             return;
         }
@@ -280,8 +281,8 @@ impl Estimation {
         }
     }
 
-    /// Where the robot went while its wheels were not heard, nobody knows: without this, what its
-    /// position says afterwards would be refused as a jump.
+    /// Increases the localisation's uncertainty for a gap without wheel samples; otherwise the next
+    /// fix would be rejected as a jump.
     fn check_gap(&mut self, at: Duration) {
         let Some(integrated_to) = self.integrated_to else {
             return;
@@ -293,7 +294,7 @@ impl Estimation {
         }
     }
 
-    /// How much the wheels slip; nothing is known of a base that is silent.
+    /// Updates the slip of each side; undefined while the base is silent.
     fn measure_slip(&mut self, sensed: &Sensed, tick: Tick) {
         let now = tick.now.monotonic;
         let is_silent = sensed.is_base_silent
@@ -308,7 +309,7 @@ impl Estimation {
         self.slip.step(heard, &self.model, tick.dt_s);
     }
 
-    /// Takes another definition of the site and gives the former one back.
+    /// Replaces the site definition and returns the former one.
     fn replace_site(&mut self, site: Arc<SiteView>) -> Option<Arc<SiteView>> {
         self.cutter.abandon(&mut self.estimator);
         self.estimate = self.estimator.estimate();
@@ -316,8 +317,8 @@ impl Estimation {
     }
 
     fn ground(&self) -> Ground {
-        // What is wrong in all that this robot measures is right for itself: its law feeds slip
-        // forward by the same mass, inertia and tyres.
+        // A bias common to all measurements of this robot does not matter here: its tracking law
+        // feeds slip forward with the same mass, inertia and tyres.
         let measured = self.estimate.theta.map(|measured| ThetaKnowledge {
             theta: measured.theta,
             std_dev: measured.own_std_dev,
@@ -363,7 +364,7 @@ impl Estimation {
         };
         let cut = self.cutter.step(input, &mut self.estimator);
         if cut.is_new_ground {
-            // What was known of the ground before says nothing here.
+            // What was estimated on the former ground does not apply here.
             self.estimate = self.estimator.estimate();
         }
         cut.segment
@@ -384,7 +385,8 @@ impl Estimation {
 }
 
 impl Ground {
-    /// What is known with what the map says of the cell. The estimator itself never hears of it.
+    /// Fuses the robot's own knowledge with the map's of the same cell; the estimator does not use
+    /// the result.
     pub(super) fn with(&self, prior: &Prior) -> GroundRecord {
         let mapped = self
             .cell
@@ -398,8 +400,9 @@ impl Ground {
     }
 }
 
-/// How fast the robot really goes along its path, as well as it is known: slip tells wheels and
-/// robot apart, and position fixes tell of it only after a while.
+/// Returns the best known speed along the path, m/s: odometry over ground if recent and
+/// uncontradicted, otherwise the localisation's, which is wrong under slip until position fixes
+/// correct it.
 pub(super) fn real_m_s(sensed: &Sensed, twist: Twist, now: Duration) -> f64 {
     sensed.odometry_m_s(now).unwrap_or(twist.linear_m_s)
 }

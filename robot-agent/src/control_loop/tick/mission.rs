@@ -1,4 +1,4 @@
-//! Third stage: the mission is begun, held, replaced, followed and ended.
+//! Third stage: begins, holds, replaces, follows and ends the mission.
 
 mod holds;
 
@@ -29,9 +29,9 @@ use crate::control_loop::segments::Moment;
 use crate::control_loop::site_view::SiteView;
 use crate::control_loop::surface::{Comparison, SurfaceWatch};
 
-/// Longest that a mission is held for a revision that does not come.
+/// Longest hold for a revision that does not arrive; the mission then goes on.
 const REPLACEMENT_MAX: Duration = Duration::from_secs(10);
-/// What the commands of a tick mean for the other stages.
+/// Effects of a tick's commands on the other stages.
 #[derive(Debug, Default)]
 pub(super) struct Orders {
     /// A new definition of the site.
@@ -40,7 +40,7 @@ pub(super) struct Orders {
     pub(super) has_begun: bool,
 }
 
-/// What the stage takes.
+/// Input of the stage.
 #[derive(Debug)]
 pub(super) struct MissionInput<'tick> {
     pub(super) tick: Tick,
@@ -49,45 +49,45 @@ pub(super) struct MissionInput<'tick> {
     pub(super) demands: &'tick Demands,
     /// Whether the mission began in this tick.
     pub(super) has_begun: bool,
-    /// What the base was commanded by the last tick.
+    /// Wheel speeds that the last tick commanded.
     pub(super) commanded: WheelSpeeds,
 }
 
-/// What the stage gives.
+/// Output of the stage.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Followed {
-    /// The wheel speeds that the mission wants; none without one that may drive.
+    /// Wheel speeds of the mission; `None` without a mission or while the base is silent.
     pub(super) wanted: Option<WheelSpeeds>,
     /// Whether there is a mission.
     pub(super) is_active: bool,
-    /// Whether it leaves the wheels to others.
+    /// Whether the mission does not command the wheels.
     pub(super) rests: bool,
-    /// Whether it should long have ended for the server's silence.
+    /// Whether the server has been silent for so long that the mission's braking should be over.
     pub(super) is_long_silent: bool,
 }
 
-/// What the stage takes once the command is known.
+/// Input of the stage once the command is known.
 #[derive(Debug)]
 pub(super) struct RecordInput<'tick> {
     pub(super) tick: Tick,
     pub(super) sensed: &'tick Sensed,
     pub(super) estimated: &'tick Estimated<'tick>,
-    /// Why the gate reduced the command.
+    /// Cause for which the gate reduced the command.
     pub(super) gate: Option<GateCause>,
 }
 
-/// What is said of the mission at the end of a tick.
+/// State of the mission at the end of a tick.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct MissionStatus {
     pub(super) progress: Option<MissionProgress>,
-    /// What walks along its plan.
+    /// Position of the reference on the plan.
     pub(super) governor: Option<Governor>,
     pub(super) is_on_hold: bool,
-    /// How far the robot is from where its held mission goes on, metres.
+    /// Distance from the robot to the reference of a held mission, metres.
     pub(super) off_path_m: Option<f64>,
-    /// θ̂ of the law; kept from the last mission.
+    /// Adapted θ̂ of the tracking law; that of the last mission between missions.
     pub(super) theta_loop: Option<f64>,
-    /// Where the ground is not as the map says.
+    /// The comparison that raised the alert that the ground differs from the map.
     pub(super) surface_change: Option<Comparison>,
 }
 
@@ -97,14 +97,14 @@ pub(super) struct MissionStage {
     model: RobotModel,
     active: Option<Active>,
     theta_loop: Option<f64>,
-    /// What was known of the ground in this tick of a mission.
+    /// Knowledge of the ground in this tick of a mission.
     known: GroundRecord,
     surface: SurfaceWatch,
-    /// When the base was last silent, if the mission is held for that.
+    /// Time of the last silence of the base, while the mission is held for it.
     base_silent_at: Option<Duration>,
-    /// Since when sensors hold the mission.
+    /// Begin of the hold for sensors.
     sensors_hold_since: Option<Duration>,
-    /// Until when the mission is held for its next revision.
+    /// End of the hold for the next revision.
     replacement_until: Option<Duration>,
 }
 
@@ -122,7 +122,7 @@ impl MissionStage {
         }
     }
 
-    /// Takes one command of the rest of the agent.
+    /// Processes one command of the rest of the agent.
     pub(super) fn take(
         &mut self,
         command: LoopCommand,
@@ -152,7 +152,7 @@ impl MissionStage {
             }
             LoopCommand::Replace(job) => match self.of(job.mission) {
                 Some(active) => {
-                    // The room of one revision that is replaced before it was driven.
+                    // A waiting revision that was replaced before it was driven.
                     if let Some(unused) = active.replace_at_rest(job) {
                         events.send(LoopEvent::CameTooLate(unused));
                     }
@@ -168,19 +168,19 @@ impl MissionStage {
         }
     }
 
-    /// The active mission.
+    /// Returns the active mission.
     pub(super) fn active(&self) -> Option<MissionId> {
         self.active.as_ref().map(|active| active.job.mission)
     }
 
-    /// The active mission, if it is this one.
+    /// Returns the active mission if it has this identifier.
     fn of(&mut self, mission: MissionId) -> Option<&mut Active> {
         self.active
             .as_mut()
             .filter(|active| active.job.mission == mission)
     }
 
-    /// Makes a mission the active one; false if it is refused.
+    /// Makes a mission the active one; returns false if it is refused, which ends it.
     fn begin(&mut self, tick: Tick, job: Box<Job>, events: &mut Outgoing) -> bool {
         let is_too_late = |latest: Duration| tick.now.monotonic > latest;
         let refusal = if tick.stop {
@@ -206,7 +206,7 @@ impl MissionStage {
         true
     }
 
-    /// Holds the mission where anything asks for it, and follows it.
+    /// Applies the holds and follows the mission.
     pub(super) fn step(
         &mut self,
         input: &MissionInput<'_>,
@@ -235,7 +235,7 @@ impl MissionStage {
         }
     }
 
-    /// Gives the law what is known of the ground where the mission begins.
+    /// Initialises the tracking law with the knowledge of the ground where the mission begins.
     fn warm_start(&mut self, estimated: &Estimated<'_>) {
         if let Some(active) = &mut self.active
             && let Some(knowledge) = estimated.ground_at_begin.with(&active.job.prior).given
@@ -254,7 +254,7 @@ impl MissionStage {
         }
     }
 
-    /// Holds what a closed segment says against what the map says of its cell.
+    /// Compares the θ of a closed segment with the map's for its cell.
     fn compare(&mut self, segment: &ClosedSegment) {
         let active = self.active.as_mut();
         let Some(active) = active.filter(|active| segment.mission == Some(active.job.mission))
@@ -282,7 +282,8 @@ impl MissionStage {
         self.surface.note(comparison);
     }
 
-    /// The wheel speeds that the mission wants; none without one.
+    /// Runs the active mission; returns its wheel speeds, `None` without a mission or while the
+    /// base is silent.
     fn follow(&mut self, input: &MissionInput<'_>, events: &mut Outgoing) -> Option<WheelSpeeds> {
         let (now, estimated) = (input.tick.now, input.estimated);
         let active = self.active.as_mut()?;
@@ -324,8 +325,8 @@ impl MissionStage {
             self.end(now, reason, events);
             return None;
         }
-        // The gate would brake anyway; a follower that hears of it does not wind up meanwhile. A base
-        // that is heard again after a silence comes to rest first.
+        // The gate would brake anyway; without a command the follower does not wind up. A base that
+        // is heard again after a silence stops first.
         let is_heard = estimated.fault.is_none() && self.base_silent_at.is_none();
         is_heard.then_some(step.wanted)
     }
@@ -350,8 +351,8 @@ impl MissionStage {
         });
     }
 
-    /// Records the tick on the driven path, reports the begin of a mission, and ends it with the
-    /// agent.
+    /// Records the tick on the driven path, reports the begin of the mission, and ends the mission
+    /// if the agent stops.
     pub(super) fn record(
         &mut self,
         input: &RecordInput<'_>,
@@ -362,7 +363,7 @@ impl MissionStage {
         if input.tick.stop {
             self.end(now, EndReason::AgentStopped, events);
         }
-        // The first tick of a mission has given its first wheel command by now.
+        // By now the mission's first tick has commanded the wheels.
         if let Some(active) = self.active.as_mut().filter(|active| !active.has_started) {
             active.has_started = true;
             let (at, progress) = (now.wall, active.progress);
@@ -378,7 +379,7 @@ impl MissionStage {
         let (estimated, gate) = (input.estimated, input.gate);
         let speed_m_s = estimated.twist.linear_m_s.abs();
         let measured = estimated.estimate.theta;
-        // While something cuts the command, errors say nothing on the ground.
+        // While the command is reduced, tracking errors carry no information on the ground.
         let may_learn = input.sensed.findings.consequence().is_none();
         active.hold_adaptation(
             !may_learn || gate.is_some_and(|cause| cause > GateCause::Acceleration),
@@ -412,7 +413,7 @@ impl MissionStage {
     }
 }
 
-/// How far the robot is from a mission's reference, metres.
+/// Returns the distance from the robot to the mission's reference, metres.
 fn off_path_m(active: &Active, measured: &Measured) -> f64 {
     let follower = &active.job.follower;
     let reference = follower.governor().sample(follower.plan());

@@ -6,15 +6,14 @@
 //!                      ▼          ▼      ▼
 //! base ─► sensing ─► estimation ─► mission ─► safety ─► base, output
 //! ```
-//! Each stage takes a named input and gives a named output, from which the next ones are made: the
-//! compiler keeps their order. [`sensing`] says whether what comes from the base can be true,
-//! [`estimation`] where the robot is and on what ground, [`demands`] what stops, leases and limits
-//! ask for, [`mission`] what the mission wants, [`safety`] what of that the base is commanded,
-//! [`output`] what the loop says of itself.
+//! Each stage takes a named input and returns a named output, from which the inputs of the later
+//! stages are made, so the compiler enforces their order. [`sensing`] checks the samples of the
+//! base for consistency, [`estimation`] computes the pose and the friction of the ground,
+//! [`demands`] reads stops, leases and limits, [`mission`] computes the mission's wheel speeds,
+//! [`safety`] computes the command to the base, and [`output`] publishes the state of the loop.
 //!
-//! Pure but for the drive and the channels' ends; nothing here waits, allocates or looks at a
-//! clock but the one that it is handed. What has to be freed goes out with an event, to be freed by
-//! somebody else.
+//! Pure except for the drive and the ends of the channels: no stage blocks, allocates, or reads a
+//! clock other than the one passed in. What must be deallocated is sent out with an event.
 
 mod demands;
 mod estimation;
@@ -44,18 +43,19 @@ use output::{Output, OutputInput};
 use safety::{Safety, SafetyInput};
 use sensing::{Sensing, SensingInput};
 
-/// Longest time that one tick is taken to have lasted, seconds; a loop that slept does not leap.
+/// Upper bound of the time step of a tick, seconds; a longer gap, such as a suspended process, is
+/// integrated as this.
 const TICK_MAX_S: f64 = 0.2;
-/// Speed below which the robot counts as standing, m/s and rad/s.
+/// Speed below which the robot counts as stopped: m/s for speeds, rad/s for rates.
 const STANDING: f64 = 0.02;
 
-/// What all stages know of a tick.
+/// Times and stop request of a tick, common to all stages.
 #[derive(Debug, Clone, Copy)]
 struct Tick {
     now: Moment,
-    /// Time since the tick before, seconds.
+    /// Time since the previous tick, seconds; at most [`TICK_MAX_S`].
     dt_s: f64,
-    /// Whether the robot is to brake and its mission to end.
+    /// Whether the robot shall brake and its mission end.
     stop: bool,
 }
 
@@ -88,15 +88,14 @@ impl LoopCore {
         }
     }
 
-    /// The same loop with the configuration's word on teleoperation within a fence without
-    /// knowing where the robot is.
+    /// Sets whether the robot may be teleoperated inside a fence without a known position.
     #[must_use]
     pub(crate) fn with_blind_within_fence(mut self, may: bool) -> Self {
         self.safety.set_blind_within_fence(may);
         self
     }
 
-    /// The same loop with a base that counts as silent earlier.
+    /// Sets the time after which the base counts as silent, at most [`SILENT_AFTER_MAX`].
     #[must_use]
     pub(crate) fn with_silent_after(mut self, silent_after: Duration) -> Self {
         let silent_after = silent_after.min(SILENT_AFTER_MAX);
@@ -105,39 +104,39 @@ impl LoopCore {
         self
     }
 
-    /// The same loop with what is known beforehand of its robot.
+    /// Sets the estimator's prior of the robot's parameters.
     #[must_use]
     pub(crate) fn with_prior(mut self, prior: EstimatorPrior) -> Self {
         self.estimation.set_prior(prior);
         self
     }
 
-    /// The same loop, which holds the robot when it does not keep this period.
+    /// Holds the robot whenever the loop does not keep this period.
     #[must_use]
     pub(crate) fn with_period(mut self, period: Duration) -> Self {
         self.demands.set_period(period);
         self
     }
 
-    /// From now on it notes what it takes and gives, or no longer.
+    /// Starts recording the inputs and outputs of ticks; `None` stops it.
     pub(crate) fn record_to(&mut self, notes: Option<NoteTaker>) {
         self.output.record_to(notes);
     }
 
-    /// What the base was commanded last.
+    /// Returns the wheel speeds that the base was commanded last; zero before the first tick.
     #[cfg(test)]
     pub(crate) fn command(&self) -> WheelSpeeds {
         self.safety.commanded().unwrap_or_default()
     }
 
-    /// Whether the wheels are commanded to rest and do.
+    /// Whether the wheels are commanded to zero and are measured near zero.
     pub(crate) fn stands(&self) -> bool {
         self.output.stands()
     }
 
-    /// One tick that begins at `now`. With `stop`, the robot brakes and its mission ends. What carries
-    /// its own end, such as a driver's command, is judged by the clock right before the gate: a tick
-    /// that was interrupted lets nothing last longer.
+    /// Runs one tick that begins at `now`. With `stop`, the robot brakes and its mission ends.
+    /// Inputs with an expiry, such as a drive command, are judged by `clock` right before the gate,
+    /// so that a tick that was interrupted does not prolong them.
     pub(crate) fn tick_by(
         &mut self,
         now: Moment,
@@ -184,7 +183,7 @@ impl LoopCore {
         });
         drive.write(gated.output.wheel_speeds);
         if demands.is_stopped() {
-            // The base has the command: a stop that the gate knew of has set the target to zero.
+            // The base has the command, and the gate's target was zero under this stop.
             self.ends.shared.safety.note_zeroed(demands.stop);
         }
         let recorded = RecordInput {
@@ -212,10 +211,10 @@ impl LoopCore {
         now.saturating_sub(before).as_secs_f64().min(TICK_MAX_S)
     }
 
-    /// Takes what the rest of the agent asks for.
+    /// Takes the commands of the rest of the agent.
     fn take_orders(&mut self, tick: Tick) -> Orders {
         let mut orders = Orders::default();
-        // Bounded: the channel holds a few, and whoever refills it waits for the network.
+        // Bounded: a tick takes at most the capacity of the channel.
         for _ in 0..COMMANDS_MAX {
             let Ok(command) = self.ends.commands.try_recv() else {
                 break;
@@ -227,7 +226,7 @@ impl LoopCore {
         orders
     }
 
-    /// Notes how long a tick computed.
+    /// Records the computing time of a tick.
     pub(crate) fn note_tick_time(&self, took: Duration) {
         let microseconds = u32::try_from(took.as_micros()).unwrap_or(u32::MAX);
         self.ends
@@ -236,23 +235,23 @@ impl LoopCore {
             .fetch_max(microseconds, Ordering::Relaxed);
     }
 
-    /// Notes a tick that began more than one period late.
+    /// Counts a tick that began more than one period late.
     pub(crate) fn note_overrun(&self) {
         Shared::count(&self.ends.shared.overruns);
     }
 
-    /// Whether the rest of the agent wants the loop to end.
+    /// Whether the rest of the agent has requested the loop to end.
     pub(crate) fn stop_requested(&self) -> bool {
         self.ends.shared.stop.load(Ordering::Relaxed)
     }
 
-    /// Hands out what still waits; false if there was no room for all of it.
+    /// Sends the events that wait for room; false if some still wait.
     pub(crate) fn flush(&mut self) -> bool {
         self.events.flush()
     }
 }
 
-/// Age of something, seconds; infinite for what never was.
+/// Returns the age of `at` in seconds; infinite for `None`.
 fn age_s(now: Duration, at: Option<Duration>) -> f64 {
     at.map_or(f64::INFINITY, |at| now.saturating_sub(at).as_secs_f64())
 }

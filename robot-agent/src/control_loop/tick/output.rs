@@ -1,8 +1,7 @@
-//! Last stage: whether the robot stands where it is to, what the loop says of itself, and what a
-//! record holds of the tick.
+//! Last stage: checks standstill, publishes the snapshot, and records the tick.
 //!
-//! The watch over standstill is [`crate::control_loop::standing`]. A record holds enough to run the
-//! tick again, and to see whether that gives the same.
+//! Standstill is detected by [`crate::control_loop::standing`]. A record holds the inputs and
+//! outputs of a tick, so that the tick can be run again and the results compared.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -26,7 +25,7 @@ use crate::control_loop::standing::{Motion, StandingWatch};
 use crate::drive::{Battery, Feedback, StatedNoise};
 use crate::recording::frame::{NoteTaker, TickFrame, TickInputs, TickOutputs};
 
-/// What the stage takes.
+/// Input of the stage.
 #[derive(Debug)]
 pub(super) struct OutputInput<'tick> {
     pub(super) tick: Tick,
@@ -46,12 +45,12 @@ pub(super) struct Output {
     model: RobotModel,
     shared: Arc<Shared>,
     standing: StandingWatch,
-    /// What was measured for that.
+    /// Latest measurements for the standstill watch.
     motion: Motion,
-    /// Whether the wheels are commanded to rest and do.
+    /// Whether the wheels are commanded to zero and are measured near zero.
     stands: bool,
     ticks: u64,
-    /// Where ticks are noted, if they are recorded.
+    /// Recorder of ticks, if they are recorded.
     notes: Option<NoteTaker>,
 }
 
@@ -68,24 +67,24 @@ impl Output {
         }
     }
 
-    /// From now on ticks are noted, or no longer.
+    /// Starts recording ticks; `None` stops it.
     pub(super) fn record_to(&mut self, notes: Option<NoteTaker>) {
         self.notes = notes;
     }
 
-    /// Whether the wheels were commanded to rest by the last tick, and did.
+    /// Whether the last tick commanded the wheels to zero and measured them near zero.
     pub(super) fn stands(&self) -> bool {
         self.stands
     }
 
-    /// Notes a command that the tick takes.
+    /// Records a command that the tick takes.
     pub(super) fn note_command(&mut self, command: &LoopCommand) {
         if let Some(notes) = &mut self.notes {
             notes.command(self.ticks + 1, command);
         }
     }
 
-    /// Says what became of the tick.
+    /// Updates the standstill watch, the counters and the snapshot, and records the tick.
     pub(super) fn step(&mut self, input: &OutputInput<'_>) {
         self.check_standstill(input);
         let command = input.gated.output.wheel_speeds;
@@ -112,7 +111,7 @@ impl Output {
         shared.ticks.store(self.ticks, Ordering::Relaxed);
     }
 
-    /// Looks whether a robot that is to stand does.
+    /// Updates the standstill watch.
     fn check_standstill(&mut self, input: &OutputInput<'_>) {
         let (sensed, now) = (input.sensed, input.tick.now.monotonic);
         let is_heard = sensed.is_heard(now);
@@ -126,7 +125,7 @@ impl Output {
             .then(|| self.fastest_rim_m_s(sensed.wheel_speeds));
         self.motion.odometry_m_s = sensed.odometry_m_s(now);
         self.motion.fix = sensed.fix.filter(|_| !sensed.is_position_doubted());
-        // What is not heard does not stand: it is not known.
+        // Without any measurement it is unknown whether the robot has stopped.
         let is_to_stand = input.gated.output.target == WheelSpeeds::default();
         if is_heard || self.motion.odometry_m_s.is_some() || self.motion.fix.is_some() {
             self.standing.step(now, is_to_stand, &self.motion);
@@ -176,7 +175,7 @@ impl Output {
         }
     }
 
-    /// Notes the tick that ends, if it is to be recorded.
+    /// Records the tick that ends, if ticks are recorded.
     fn note(&mut self, input: &OutputInput<'_>, snapshot: &Snapshot) {
         let Some(notes) = &mut self.notes else {
             return;

@@ -1,4 +1,4 @@
-//! Fourth stage: what of a command the base is given: who drives, how fast at most, and the gate.
+//! Fourth stage: chooses the driver, applies the speed limits and the gate, and gives the command.
 
 use std::time::Duration;
 
@@ -17,11 +17,11 @@ use super::{Tick, age_s};
 use crate::control_loop::channels::{Fault, GateSnapshot};
 use crate::safety::microseconds;
 
-/// What the stage takes.
+/// Input of the stage.
 #[derive(Debug)]
 pub(super) struct SafetyInput<'tick> {
     pub(super) tick: Tick,
-    /// The time by which is judged what carries its own end.
+    /// Time by which inputs with an expiry are judged, by the monotonic clock.
     pub(super) judged: Duration,
     pub(super) sensed: &'tick Sensed,
     pub(super) estimated: &'tick Estimated<'tick>,
@@ -29,22 +29,22 @@ pub(super) struct SafetyInput<'tick> {
     pub(super) followed: Followed,
 }
 
-/// What the stage gives.
+/// Output of the stage.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Gated {
-    /// The time by which was judged what carries its own end.
+    /// Time by which inputs with an expiry were judged, by the monotonic clock.
     pub(super) judged: Duration,
-    /// What the mission or the teleoperator wants.
+    /// Wheel speeds of the mission or the teleoperator, before the gate.
     pub(super) wanted: WheelSpeeds,
-    /// What the gate lets through.
+    /// Output of the gate.
     pub(super) output: GateOutput,
-    /// What the gate did so far.
+    /// Action of the gate and its counters.
     pub(super) gate: GateSnapshot,
-    /// Whether somebody has the lease of teleoperation.
+    /// Whether the lease of teleoperation is taken.
     pub(super) is_leased: bool,
 }
 
-/// What drives in this tick.
+/// Wheel speeds before the gate, and their source.
 #[derive(Debug, Clone, Copy)]
 struct Wanted {
     wheels: WheelSpeeds,
@@ -57,9 +57,9 @@ struct Wanted {
 pub(super) struct Safety {
     model: RobotModel,
     limits: GateLimits,
-    /// Whether the robot may be teleoperated within a fence without knowing where it is.
+    /// Whether the robot may be teleoperated inside a fence without a known position.
     blind_within_fence: bool,
-    /// What the base was commanded last.
+    /// Wheel speeds that the base was commanded last.
     command: Option<WheelSpeeds>,
     gate: GateSnapshot,
     last_cause: Option<GateCause>,
@@ -77,29 +77,29 @@ impl Safety {
         }
     }
 
-    /// Whether the robot may be teleoperated within a fence without knowing where it is.
+    /// Sets whether the robot may be teleoperated inside a fence without a known position.
     pub(super) fn set_blind_within_fence(&mut self, may: bool) {
         self.blind_within_fence = may;
     }
 
-    /// A base counts as silent after this.
+    /// Sets the time after which the base counts as silent.
     pub(super) fn set_silent_after(&mut self, silent_after: Duration) {
         self.limits.feedback_age_max_s = silent_after.as_secs_f64();
     }
 
-    /// What the base was commanded last; none before the first tick.
+    /// Returns the wheel speeds that the base was commanded last; `None` before the first tick.
     pub(super) fn commanded(&self) -> Option<WheelSpeeds> {
         self.command
     }
 
-    /// Chooses who drives, and lets through what may be, reduced.
+    /// Chooses mission or teleoperator, and passes the wheel speeds through the gate.
     pub(super) fn step(&mut self, input: &SafetyInput<'_>) -> Gated {
         let wanted = self.choose(input);
         let reasons = self.reasons(input, &wanted);
         let sensed = input.sensed;
         let output = gate_with(
             &GateInput {
-                // A robot without a mission holds still: that is a command, not the lack of one.
+                // A robot without a mission is commanded to zero, which is not a missing command.
                 command: Some(wanted.wheels),
                 previous: self.command.unwrap_or_default(),
                 stop: input.tick.stop,
@@ -135,11 +135,11 @@ impl Safety {
         self.last_cause = cause;
     }
 
-    /// What the wheels are to do: what the teleoperator wants, or what the mission wants.
+    /// Returns the wheel speeds of the teleoperator or of the mission.
     fn choose(&self, input: &SafetyInput<'_>) -> Wanted {
         let judged_us = microseconds(input.judged);
         let teleoperation = &input.demands.view.teleoperation;
-        // A mission that is still braking for the lease comes to rest first.
+        // A mission that is still braking for the lease stops first.
         if !(teleoperation.is_leased(judged_us) && input.followed.rests) {
             return Wanted {
                 wheels: input.followed.wanted.unwrap_or_default(),
@@ -166,13 +166,12 @@ impl Safety {
         }
     }
 
-    /// The fastest speed within the fence; none where there is no fence, or nobody knows where the
-    /// robot is.
+    /// Returns the largest speed allowed by the fence, m/s; `None` without a fence or a pose.
     fn fence_max_m_s(&self, estimated: &Estimated<'_>, wanted: Twist) -> Option<f64> {
         let site = estimated.site.filter(|site| !site.fence().is_empty())?;
         let pose = estimated.pose?;
         let seen = estimated.estimate.mu_peak_lower_bound;
-        // Ground that has not slipped yet is taken for no worse than unknown ground.
+        // Ground without slip so far is assumed to be at least as good as unknown ground.
         let mu_lower = if estimated.slips {
             seen
         } else {
@@ -188,10 +187,11 @@ impl Safety {
         site.fence().judge(&input, &self.model).speed_max_m_s
     }
 
-    /// Whether the robot must stand for not knowing where it is, or else how fast it may be driven.
+    /// Returns whether the robot must stop because its position is unknown, and otherwise the speed
+    /// limit, m/s.
     ///
-    /// A mission needs a position. A teleoperator sees where the robot is: it goes slowly, and
-    /// within a fence only if its configuration says so.
+    /// A mission needs a position. A teleoperator sees the robot and may drive it slowly, inside a
+    /// fence only if the agent's configuration allows it.
     fn blindness(&self, input: &SafetyInput<'_>, wanted: &Wanted) -> (bool, Option<f64>) {
         let estimated = input.estimated;
         let is_lost = estimated.fault == Some(Fault::PositionLost)

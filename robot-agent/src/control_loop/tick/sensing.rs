@@ -1,7 +1,7 @@
-//! First stage: what the base says, and whether it can be true.
+//! First stage: reads the samples of the base and checks them for consistency.
 //!
-//! A channel that contradicts the others holds or slows whatever depends on it; the monitor itself
-//! is [`tread_control::consistency`].
+//! A channel that contradicts the others holds or slows the robot; the checks are in
+//! [`tread_control::consistency`].
 
 use std::time::Duration;
 
@@ -16,53 +16,54 @@ use tread_control::robot::RobotModel;
 use super::TICK_MAX_S;
 use crate::drive::{self, Feedback, SAMPLES_MAX};
 
-/// Oldest word of a sensor of the robot's own speed that says how fast it is now.
+/// Largest age of a measurement at which it counts as recent.
 const BODY_SPEED_AGE_MAX: Duration = Duration::from_millis(150);
-/// Fastest speed of a robot whose sensors contradict each other.
+/// Speed limit of a robot whose sensors contradict each other, m/s.
 const DOUBT_MAX_M_S: f64 = BLIND_MAX_M_S;
 
-/// What the stage takes.
+/// Input of the stage.
 #[derive(Debug)]
 pub(super) struct SensingInput<'tick> {
-    /// What the base has said since the last tick.
+    /// Samples of the base since the last tick.
     pub(super) feedback: &'tick Feedback,
-    /// Whether the drive says that the base is silent.
+    /// Whether the drive reports the base as silent.
     pub(super) is_base_silent: bool,
-    /// What the base was commanded by the last tick; none before the first.
+    /// Wheel speeds that the last tick commanded; `None` before the first.
     pub(super) commanded: Option<WheelSpeeds>,
 }
 
-/// One sample, as the estimation takes it.
+/// One checked sample, for the estimation stage.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct CheckedSample {
     /// When it was measured.
     pub(super) at: Duration,
-    /// Gyro and wheels with the rest, and the seconds since they were heard before.
+    /// Motion measured by gyro and wheels with the other sensors, and the time since the previous
+    /// motion sample, seconds.
     pub(super) motion: Option<(SensorSample, f64)>,
-    /// A position, finite or not.
+    /// Position fix; may be non-finite.
     pub(super) fix: Option<PositionFix>,
-    /// Whether no sensor contradicts another, so that something may be learned of the ground.
+    /// Whether no sensor contradicts another, so that the estimator may use the sample.
     pub(super) may_learn: bool,
 }
 
-/// What the stage gives.
+/// Output of the stage.
 #[derive(Debug)]
 pub(super) struct Sensed {
     samples: [CheckedSample; SAMPLES_MAX],
     count: usize,
-    /// Samples that gave way to newer ones.
+    /// Samples that newer ones replaced before this tick.
     pub(super) lost_samples: u32,
     /// Sensors that contradict each other.
     pub(super) findings: Findings,
-    /// Whether the drive says that the base is silent.
+    /// Whether the drive reports the base as silent.
     pub(super) is_base_silent: bool,
-    /// When gyro and wheels were measured last.
+    /// Time of the last valid sample of gyro and wheels.
     pub(super) last_sample: Option<Duration>,
-    /// Wheel speeds as measured last.
+    /// Last valid wheel speeds.
     pub(super) wheel_speeds: WheelSpeeds,
-    /// How far the robot leans, if the base measures it.
+    /// Tilt against the vertical, if the base measures it.
     pub(super) tilt_rad: Option<f64>,
-    /// What the gyro said last in this tick, finite or not.
+    /// Last yaw rate of the gyro in this tick; may be non-finite.
     pub(super) turn_rad_s: Option<f64>,
     /// The newest position of this tick.
     pub(super) fix: Option<Point>,
@@ -77,7 +78,7 @@ pub(super) struct Sensing {
     last_sample: Option<Duration>,
     wheel_speeds: WheelSpeeds,
     tilt_rad: Option<f64>,
-    /// How fast the robot went by a sensor of its own, m/s, and when.
+    /// Speed by odometry over ground, m/s, and its measuring time.
     body_speed: Option<(f64, Duration)>,
 }
 
@@ -93,7 +94,7 @@ impl Sensing {
         }
     }
 
-    /// Takes and checks what the base said.
+    /// Reads and checks the samples of this tick.
     pub(super) fn step(&mut self, input: &SensingInput<'_>) -> Sensed {
         if let Some(commanded) = input.commanded {
             self.monitor.command(commanded);
@@ -141,7 +142,7 @@ impl Sensing {
             self.body_speed = Some((speed_m_s, sample.at));
         }
         let motion = self.motion_of(sample);
-        // A position takes longer to be found than the motion since.
+        // A position fix is older than the motion measured since.
         let age_s = self
             .last_sample
             .map_or(0.0, |last| last.saturating_sub(sample.at).as_secs_f64());
@@ -157,8 +158,8 @@ impl Sensing {
         }
     }
 
-    /// Only what can be used counts as a word of the base: one that says nothing but nonsense is as
-    /// good as silent.
+    /// Returns the sample's motion, if gyro and wheels are finite. Only such a sample counts as a
+    /// message of the base: one that sends only non-finite values becomes silent.
     fn motion_of(&mut self, sample: &drive::SensorSample) -> Option<(SensorSample, f64)> {
         let gyro_rad_s = sample.yaw_rate_rad_s.filter(|rate| rate.is_finite())?;
         let wheel_speeds = sample.wheel_speeds.filter(|speeds| speeds.is_finite())?;
@@ -180,12 +181,12 @@ impl Sensing {
 }
 
 impl Sensed {
-    /// The samples of this tick, oldest first.
+    /// Returns the samples of this tick, oldest first.
     pub(super) fn samples(&self) -> &[CheckedSample] {
         &self.samples[..self.count]
     }
 
-    /// Whether nothing is wrong about a subject.
+    /// Whether there is no finding about a subject.
     pub(super) fn is_right(&self, subject: Subject) -> bool {
         self.findings.about(subject).is_none()
     }
@@ -195,23 +196,23 @@ impl Sensed {
         !(self.is_right(Subject::Position) && self.is_right(Subject::Motion))
     }
 
-    /// Whether the robot must not drive by itself.
+    /// Whether the findings hold a robot on a mission.
     pub(super) fn must_hold(&self) -> bool {
         self.findings.consequence() == Some(Consequence::Hold)
     }
 
-    /// How fast a robot with these findings may be.
+    /// Returns the speed limit for these findings, m/s.
     pub(super) fn sensors_max_m_s(&self) -> Option<f64> {
         let consequence = self.findings.consequence()?;
         (consequence >= Consequence::Slow).then_some(DOUBT_MAX_M_S)
     }
 
-    /// Whether gyro and wheels were heard of late.
+    /// Whether gyro and wheels were measured within [`BODY_SPEED_AGE_MAX`].
     pub(super) fn is_heard(&self, now: Duration) -> bool {
         !self.is_base_silent && self.last_sample.is_some_and(|at| is_new(at, now))
     }
 
-    /// How fast the robot goes by a sensor of its own that is believed, m/s.
+    /// Returns the speed by odometry over ground, m/s, if recent and without a finding.
     pub(super) fn odometry_m_s(&self, now: Duration) -> Option<f64> {
         let (speed_m_s, at) = self.body_speed?;
         (is_new(at, now) && self.is_right(Subject::Odometry)).then_some(speed_m_s)

@@ -1,4 +1,5 @@
-//! From messages to the loop's samples: the wheels' messages set the pace, the others go with them.
+//! Assembles messages to the loop's samples: one sample per message of the wheels, with the others'
+//! latest values.
 //!
 //! Pure, and without allocation: it runs in the loop.
 
@@ -10,19 +11,19 @@ use super::reading::{Content, Inertial, Motion, Position, Wheels, wheels_of};
 use super::settings::{MotionOf, Ros2Settings};
 use crate::drive::{Battery, Feedback, SensorSample, StatedNoise};
 
-/// Oldest word of the inertial unit or the odometry that goes with one of the wheels.
+/// Largest time between a sample of the wheels and the value of another sensor that is added to it.
 const COMPANION_AGE_MAX: Duration = Duration::from_millis(60);
 
-/// A message as it comes to the loop.
+/// A message in the queue to the loop.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Arrived {
-    /// When it was measured, by the agent's monotonic clock.
+    /// Time of measurement, by the agent's monotonic clock.
     pub at: Duration,
-    /// What it says.
+    /// Content of the message.
     pub content: Content,
 }
 
-/// Sums of what the inertial unit said since the last word of the wheels.
+/// Sums over the inertial samples since the last message of the wheels.
 #[derive(Debug, Clone, Copy, Default)]
 struct InertialSums {
     count: f64,
@@ -31,7 +32,7 @@ struct InertialSums {
     felt: BodyAcceleration,
 }
 
-/// What is remembered from one sample to the next.
+/// State between two samples.
 #[derive(Debug, Clone)]
 pub struct Assembler {
     has_imu: bool,
@@ -48,7 +49,7 @@ pub struct Assembler {
 }
 
 impl Assembler {
-    /// An assembler of a robot of which nothing was heard yet.
+    /// Creates an assembler before the first message.
     pub fn new(settings: &Ros2Settings) -> Self {
         let odometry = settings.odometry.as_ref();
         Self {
@@ -66,17 +67,17 @@ impl Assembler {
         }
     }
 
-    /// The battery, as it was last said to be.
+    /// Returns the battery as last reported.
     pub fn battery(&self) -> Option<Battery> {
         self.battery
     }
 
-    /// What the covariances said of late.
+    /// Returns the noise as last stated by covariances.
     pub fn noise(&self) -> StatedNoise {
         self.noise
     }
 
-    /// When the newest turn rate was measured.
+    /// Returns the time of the newest yaw rate.
     pub fn turned_at(&self) -> Option<Duration> {
         if self.has_imu {
             self.last_inertial.map(|(at, _)| at)
@@ -85,7 +86,7 @@ impl Assembler {
         }
     }
 
-    /// Takes a message; the wheels' speeds if it was of them.
+    /// Processes a message; returns the wheel speeds if it completes a sample of them.
     pub fn take(&mut self, arrived: &Arrived, feedback: &mut Feedback) -> Option<WheelSpeeds> {
         match arrived.content {
             Content::Battery(battery) => self.battery = Some(battery),
@@ -142,7 +143,7 @@ impl Assembler {
         let sums = std::mem::take(&mut self.sums);
         let mean = |sum: f64, count: f64| (count > 0.0).then(|| sum / count);
         let (yaw_rate_rad_s, acceleration) = if self.has_imu {
-            // Means since the last sample; where nothing came since, what was last said.
+            // Means since the last sample; without new values the last one.
             let yaw_rate = mean(sums.yaw_rad_s, sums.count);
             let felt = mean(sums.felt.forward_m_s2, sums.felt_count)
                 .zip(mean(sums.felt.left_m_s2, sums.felt_count))
@@ -152,7 +153,7 @@ impl Assembler {
                 });
             let last = inertial.map(|inertial| inertial.yaw_rate_rad_s);
             let felt = felt.or(inertial.and_then(|inertial| inertial.acceleration));
-            // An inertial unit that is silent is silent, whatever is left in the sums.
+            // A silent inertial unit gives no value, whatever is left in the sums.
             (last.and(yaw_rate.or(last)), felt.filter(|_| last.is_some()))
         } else {
             let motion = self.last_motion.filter(|(other, _)| is_near(*other));

@@ -1,8 +1,8 @@
 //! The robot's own bus: a second zenoh session, on this machine alone.
 //!
-//! The fleet's session and this one never meet: what is said on the bus stays on the robot. One
-//! thread opens the session, however long that takes, announces the agent's node in the ROS graph,
-//! listens, and writes the loop's commands; a second one tells the robot how the agent is.
+//! It is separate from the fleet's session, so messages of the bus stay on the robot. One thread
+//! opens the session, retrying until it succeeds, announces the agent's node in the ROS graph,
+//! subscribes, and writes the loop's commands; a second one publishes the agent's state.
 
 use std::str::FromStr as _;
 use std::sync::Arc;
@@ -32,24 +32,25 @@ use crate::clock::SharedClock;
 use crate::control_loop::channels::Shared;
 use crate::fleet::{LinkError, zenoh_failed};
 
-/// Longest row of tries to connect before the thread looks whether it is to end, milliseconds.
+/// Timeout of a series of attempts to connect, after which the thread checks whether it shall end,
+/// milliseconds.
 const CONNECT_TIMEOUT_MS: u32 = 1_000;
-/// First and longest pause between tries, milliseconds: a router that is started again is found at
+/// First and longest pause between attempts, milliseconds; short, to find a restarted router at
 /// once.
 const RETRY_MS: (u32, u32) = (50, 200);
-/// Rest after a row of tries.
+/// Pause after a failed series of attempts.
 const OPEN_REST: Duration = Duration::from_millis(100);
-/// After this silence a router takes the agent for gone, milliseconds.
+/// Silence after which a router drops the agent's session, milliseconds.
 const BUS_LEASE_MS: u32 = 3_000;
-/// Largest payload that is looked at, bytes.
+/// Largest payload that is read, bytes.
 const PAYLOAD_BYTES_MAX: usize = tread_ros2::cdr::MESSAGE_BYTES_MAX;
-/// The agent's only node.
+/// Number of the agent's only node.
 const NODE_NUMBER: u32 = 0;
 
-/// How the session on the bus is opened.
+/// Creates the configuration of the session on the bus.
 ///
 /// # Errors
-/// [`LinkError::Endpoint`].
+/// [`LinkError::Endpoint`] for an invalid endpoint.
 pub fn session_config(bus: &BusSettings) -> Result<zenoh::Config, LinkError> {
     zenoh::config::EndPoint::from_str(&bus.endpoint).map_err(|problem| LinkError::Endpoint {
         endpoint: bus.endpoint.clone(),
@@ -76,7 +77,7 @@ pub fn session_config(bus: &BusSettings) -> Result<zenoh::Config, LinkError> {
         ("scouting/multicast/enabled", "false".to_owned()),
         ("scouting/gossip/enabled", "false".to_owned()),
         ("transport/link/tx/lease", BUS_LEASE_MS.to_string()),
-        // A router with a clock of its own holds the time of every message against it, and logs an
+        // A router with timestamping compares the time of every message with its clock, and logs an
         // error for each one once the machine's clock was set back. Stamps are in the messages.
         ("timestamping/enabled", "false".to_owned()),
     ];
@@ -89,7 +90,7 @@ pub fn session_config(bus: &BusSettings) -> Result<zenoh::Config, LinkError> {
     Ok(config)
 }
 
-/// What the bus's thread works with.
+/// The bus's session, its inlets and its outlet.
 #[derive(Debug)]
 pub struct Bus {
     config: zenoh::Config,
@@ -101,7 +102,7 @@ pub struct Bus {
     command_watch: Arc<CommandWatch>,
 }
 
-/// Everything that lives as long as the session.
+/// Declarations that live as long as the session.
 #[derive(Debug)]
 struct Declared {
     commands: Writer,
@@ -109,11 +110,11 @@ struct Declared {
     _tokens: Vec<LivelinessToken>,
 }
 
-/// One topic that is written.
+/// Writer of one topic.
 #[derive(Debug)]
 struct Writer {
     publisher: Publisher<'static>,
-    /// The writer's name in its attachments; none where messages have no attachment.
+    /// Writer's identifier in its attachments; `None` where messages have no attachment.
     gid: Option<[u8; rmw::GID_BYTES]>,
     numbering: Numbering,
 }
@@ -135,7 +136,7 @@ impl Writer {
     }
 }
 
-/// A topic as the agent reads or writes it.
+/// A topic that the agent reads or writes.
 struct Topic<'a> {
     role: Role,
     number: u32,
@@ -145,10 +146,10 @@ struct Topic<'a> {
 }
 
 impl Bus {
-    /// A bus that nobody speaks on yet.
+    /// Creates a bus without opening its session.
     ///
     /// # Errors
-    /// [`LinkError::Endpoint`].
+    /// [`LinkError::Endpoint`] for an invalid endpoint.
     pub fn new(
         settings: Arc<Ros2Settings>,
         inlets: Vec<Inlet>,
@@ -168,14 +169,14 @@ impl Bus {
         })
     }
 
-    /// Lets it tell the rest of the robot how the agent is, if its settings want that.
+    /// Enables publishing the agent's state, if the settings name its topics.
     pub(crate) fn tell_of(&mut self, shared: &Arc<Shared>, counts: Arc<Counts>, robot: &RobotId) {
         let settings = self.settings.outward.clone();
         self.outward = settings
             .map(|settings| Outward::new(settings, Arc::clone(shared), counts, robot.to_string()));
     }
 
-    /// Speaks on the bus until the loop's end of the outlet is closed. For a thread of its own.
+    /// Runs the session until the loop's end of the outlet is closed. For a thread of its own.
     pub fn run(mut self) {
         self.outlet.attend();
         let mut outward = self.outward.take();
@@ -284,7 +285,7 @@ impl Bus {
                         depth: 1,
                     },
                 };
-                // A way of hundreds of points must not go before a command or a sensor's message.
+                // A path of hundreds of points must not delay a command or a sensor's message.
                 let writer =
                     self.writer(session, &node, &topic, Priority::Background, &mut tokens)?;
                 words.push((word, writer));
@@ -297,7 +298,7 @@ impl Bus {
         })
     }
 
-    /// Announces a topic that is written, and makes it ready.
+    /// Announces a topic that is written, and declares its publisher.
     fn writer(
         &self,
         session: &zenoh::Session,
@@ -369,7 +370,7 @@ impl Bus {
         }
     }
 
-    /// Hears who else commands the base. No token announces it: the graph shows who obeys commands.
+    /// Subscribes to the command topic to detect other writers, unannounced in the ROS graph.
     fn watch_commands(&self, session: &zenoh::Session) -> Result<(), LinkError> {
         let watch = Arc::clone(&self.command_watch);
         session
@@ -383,8 +384,8 @@ impl Bus {
             .map_err(zenoh_failed("listen to the command topic"))
     }
 
-    /// Writes commands, and what there is to say from a thread of its own, so that no command waits
-    /// for a path of hundreds of points.
+    /// Writes commands, and publishes the agent's state on a thread of its own, so that no command
+    /// waits for a path of hundreds of points.
     fn speak(&self, declared: &Declared, outward: Option<&mut Outward>) {
         std::thread::scope(|scope| {
             let telling = outward.and_then(|outward| {
@@ -402,7 +403,7 @@ impl Bus {
         });
     }
 
-    /// Tells the rest of the robot what is due, until the loop's end of the outlet is closed.
+    /// Publishes the agent's state when due, until the loop's end of the outlet is closed.
     fn tell(&self, words: &[(Word, Writer)], outward: &mut Outward) {
         while !self.outlet.is_closed() {
             let (now, wall_ns) = (self.clock.monotonic(), self.clock.host_wall_ns());
@@ -416,7 +417,7 @@ impl Bus {
         }
     }
 
-    /// Writes each command once, and rest when there is none for too long.
+    /// Writes each command once, and zero after [`COMMAND_SILENCE_MAX`] without a command.
     fn write_commands(&self, writer: &Writer) {
         let (mut number, mut written_at) = (0, self.clock.monotonic());
         let mut bytes = Vec::new();
@@ -454,11 +455,11 @@ fn declare_token(session: &zenoh::Session, token: String) -> Result<LivelinessTo
     declaring.wait().map_err(zenoh_failed("announce the node"))
 }
 
-/// Hands a sample over by its key, its attachment and its payload.
+/// Passes a sample's key, attachment and payload to `take`.
 fn hand_over(sample: &zenoh::sample::Sample, take: impl FnOnce(&str, Option<&[u8]>, &[u8])) {
     let attachment = sample.attachment().map(small);
     let payload = sample.payload();
-    // What is too large is not even put together.
+    // A payload above the limit is not assembled.
     let bytes = if payload.len() > PAYLOAD_BYTES_MAX {
         std::borrow::Cow::Borrowed(&[] as &[u8])
     } else {
@@ -467,7 +468,7 @@ fn hand_over(sample: &zenoh::sample::Sample, take: impl FnOnce(&str, Option<&[u8
     take(sample.key_expr().as_str(), attachment.as_deref(), &bytes);
 }
 
-/// An attachment, if it is no larger than one of ROS.
+/// Returns an attachment of the size that ROS uses; one of another size is returned empty.
 fn small(attachment: &zenoh::bytes::ZBytes) -> std::borrow::Cow<'_, [u8]> {
     if attachment.len() == rmw::ATTACHMENT_BYTES {
         attachment.to_bytes()

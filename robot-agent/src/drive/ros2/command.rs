@@ -1,4 +1,4 @@
-//! From wheel speeds to the message that makes the base turn its wheels so.
+//! Converts wheel speeds to the base's command message.
 
 use tread_control::measured::WheelSpeeds;
 use tread_ros2::cdr::{Sequence, encode};
@@ -9,7 +9,7 @@ use tread_ros2::messages::{
 
 use super::settings::{CommandKind, CommandSettings, JOINTS_MAX};
 
-/// The type of the command's messages.
+/// Returns the message type of the command.
 pub(super) fn message_type(kind: CommandKind) -> MessageType {
     match kind {
         CommandKind::Twist => Twist::TYPE,
@@ -18,8 +18,8 @@ pub(super) fn message_type(kind: CommandKind) -> MessageType {
     }
 }
 
-/// The motion by which the base, with the radius and track that it assumes, turns its wheels
-/// so.
+/// Returns the twist for which the base, with the wheel radius and track that it assumes, commands
+/// these wheel speeds.
 fn twist(command: WheelSpeeds, settings: &CommandSettings) -> Twist {
     let half_radius_m = 0.5 * settings.base_radius_m;
     let forward_m_s = half_radius_m * (command.left_rad_s + command.right_rad_s);
@@ -37,7 +37,7 @@ fn twist(command: WheelSpeeds, settings: &CommandSettings) -> Twist {
     }
 }
 
-/// Writes a command in place of what `into` holds.
+/// Encodes a command into `into`, replacing its content.
 pub(super) fn write(
     command: WheelSpeeds,
     wall_ns: i64,

@@ -1,12 +1,12 @@
-//! Whether somebody else writes on the command topic.
+//! Detects other nodes that write on the command topic.
 //!
-//! The agent hears its own command topic. Over `rmw_zenoh` each message names its writer. Over
-//! `zenoh-bridge-ros2dds` none does: what the agent did not write itself of late is another's. The
-//! bridge never hands back what it wrote on DDS itself, and commands that equal one of ours of
-//! late, such as rest while we command rest, do no harm.
+//! The agent subscribes to its own command topic. Over `rmw_zenoh` each message identifies its
+//! writer. Over `zenoh-bridge-ros2dds` none does: a message that the agent has not written recently
+//! is another's. The bridge never returns what it wrote on DDS itself, and a foreign command that
+//! equals a recent one of the agent, such as zero while the agent commands zero, is harmless.
 //!
-//! A base that obeys two nodes follows nobody's path, so while others write ([`Contest`]) the wheels are
-//! not believed, and nothing but rest is commanded.
+//! A base that follows two nodes tracks neither path, so while others write ([`Contest`]) the
+//! samples of the wheels are refused and only zero is commanded.
 
 use std::hash::{DefaultHasher, Hash as _, Hasher as _};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -18,25 +18,28 @@ use tread_ros2::rmw::{Attachment, GID_BYTES, check_key};
 use super::refusal::Counts;
 use super::settings::Scheme;
 
-/// Newest commands of our own that are known again, more than half a second of them.
+/// Number of the agent's newest commands that are recognised, more than half a second of them.
 const REMEMBERED: usize = 64;
 
-/// Commands of others within [`CONTEST_SPAN`] that make a contest; a node that ends often writes one.
+/// Number of foreign commands within [`CONTEST_SPAN`] that begins a contest; a node that ends often
+/// writes one.
 const CONTEST_MIN: usize = 3;
-/// The time within which they come, and after which the last one is past.
+/// Time within which [`CONTEST_MIN`] foreign commands begin a contest, and after the last of which
+/// it ends.
 const CONTEST_SPAN: Duration = Duration::from_millis(500);
 
-/// Whether another node commands the base while the agent drives it. Pure.
+/// Detects whether another node commands the base while the agent drives it. Pure.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Contest {
     heard: u64,
-    /// When the newest commands of others came, the oldest first.
+    /// Times of the newest foreign commands, oldest first.
     newest: [Option<Duration>; CONTEST_MIN],
     is_contested: bool,
 }
 
 impl Contest {
-    /// Looks at how many commands others wrote so far, and whether the agent drives.
+    /// Updates the state with the total number of foreign commands and whether the agent drives;
+    /// returns whether the base is contested.
     pub(super) fn look(&mut self, now: Duration, foreign_commands: u64, drives: bool) -> bool {
         let new = foreign_commands.saturating_sub(self.heard);
         self.heard = foreign_commands;
@@ -46,7 +49,7 @@ impl Contest {
         }
         let is_late =
             |at: &Option<Duration>| at.is_some_and(|at| now.saturating_sub(at) <= CONTEST_SPAN);
-        // Once there is a contest each further command keeps it up.
+        // During a contest a single further command prolongs it.
         self.is_contested = if self.is_contested {
             self.newest.last().is_some_and(is_late)
         } else {
@@ -56,7 +59,7 @@ impl Contest {
     }
 }
 
-/// Hears the command topic.
+/// Observer of the command topic.
 #[derive(Debug)]
 pub(super) struct CommandWatch {
     scheme: Scheme,
@@ -65,7 +68,7 @@ pub(super) struct CommandWatch {
     written: Mutex<Written>,
 }
 
-/// What the agent wrote itself.
+/// Identifier and recent commands of the agent itself.
 #[derive(Debug)]
 struct Written {
     gid: Option<[u8; GID_BYTES]>,
@@ -80,7 +83,7 @@ fn digest(payload: &[u8]) -> u64 {
 }
 
 impl CommandWatch {
-    /// A watch of a topic on which nothing was written yet.
+    /// Creates a watch before the first command.
     pub(super) fn new(scheme: Scheme, message_type: MessageType, counts: Arc<Counts>) -> Self {
         Self {
             scheme,
@@ -98,12 +101,12 @@ impl CommandWatch {
         self.written.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// From now on the agent writes under this identifier.
+    /// Sets the identifier under which the agent writes.
     pub(super) fn write_as(&self, gid: Option<[u8; GID_BYTES]>) {
         self.written().gid = gid;
     }
 
-    /// The agent writes this.
+    /// Records a command of the agent.
     pub(super) fn wrote(&self, payload: &[u8]) {
         let mut written = self.written();
         let place = written.count % REMEMBERED;
@@ -111,7 +114,7 @@ impl CommandWatch {
         written.count = written.count.wrapping_add(1);
     }
 
-    /// A message came on the command topic. What no base would take for a command is passed over.
+    /// Processes a message on the command topic; one that no base accepts as a command is ignored.
     pub(super) fn hear(&self, key: &str, attachment: Option<&[u8]>, payload: &[u8]) {
         let is_ours = match self.scheme {
             Scheme::RmwZenoh(generation) => {

@@ -1,4 +1,5 @@
-//! What comes in on one topic: looked at in zenoh's callback, which never waits, and handed over.
+//! Receives the messages of one topic: checks them in zenoh's non-blocking callback and queues them
+//! for the loop.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::SyncSender;
@@ -20,12 +21,13 @@ use super::writer_watch::{Order, WriterWatch};
 use crate::clock::SharedClock;
 use crate::drive::Arrivals;
 
-/// Messages that may wait for the loop; at 20 Hz and 200 messages a second of each kind.
+/// Capacity of the queue to the loop: enough for a 20 Hz loop and 200 messages a second of each
+/// topic.
 pub const WAITING_MAX: usize = 128;
 
-/// Somebody who hears every message as it came, besides the loop; must not wait.
+/// Receiver of every message as it arrived, besides the loop; must not block.
 pub trait Tap: std::fmt::Debug + Send + Sync {
-    /// A message came.
+    /// Called for each message, before any check.
     fn hear(
         &self,
         source: Source,
@@ -36,7 +38,7 @@ pub trait Tap: std::fmt::Debug + Send + Sync {
     );
 }
 
-/// What is known of a topic between two messages.
+/// State of a topic between two messages.
 #[derive(Debug, Clone, Copy)]
 struct Watched {
     writer: WriterWatch,
@@ -52,14 +54,14 @@ pub struct Inlet {
     counts: Arc<Counts>,
     to_loop: SyncSender<Arrived>,
     arrivals: Arc<Arrivals>,
-    /// Whether its messages set the loop's pace.
+    /// Whether the topic's messages trigger the loop's ticks.
     is_pace: bool,
     clock: SharedClock,
     tap: Option<Arc<dyn Tap>>,
 }
 
 impl Inlet {
-    /// The receiving ends of all topics that the settings name.
+    /// Creates the inlets of all topics that the settings name.
     pub fn all(
         settings: &Arc<Ros2Settings>,
         counts: &Arc<Counts>,
@@ -101,34 +103,35 @@ impl Inlet {
             .collect()
     }
 
-    /// The same, with somebody else who hears its messages.
+    /// Sets a receiver of every message.
     #[must_use]
     pub fn with_tap(mut self, tap: Option<Arc<dyn Tap>>) -> Self {
         self.tap = tap;
         self
     }
 
-    /// Which topic it is.
+    /// Returns the kind of topic.
     pub fn source(&self) -> Source {
         self.source
     }
 
-    /// The topic's name.
+    /// Returns the topic's name.
     pub fn topic(&self) -> Option<&Name> {
         topic_of(&self.settings, self.source)
     }
 
-    /// The type of its messages.
+    /// Returns the type of the topic's messages.
     pub fn message_type(&self) -> MessageType {
         type_of(self.source)
     }
 
-    /// Takes a message, or counts why not.
+    /// Checks a message and queues it, or counts the reason for which it is dropped.
     pub fn take(&self, key: &str, attachment: Option<&[u8]>, payload: &[u8]) {
         match self.read(key, attachment, payload) {
             Ok(None) => {}
             Ok(Some(arrived)) => {
-                // The count goes first: whoever sees what the loop made of it sees it counted.
+                // The message is counted first, so that whoever sees its effect also sees the
+                // count.
                 self.counts.take(self.source);
                 if self.to_loop.try_send(arrived).is_err() {
                     self.counts.refuse(self.source, Refusal::Overflow);
@@ -179,7 +182,8 @@ impl Inlet {
             }
             placed
         };
-        // Only what is usable is followed: repeated data is no writer that started again.
+        // The watch follows only valid messages, so that repeated data never count as a restarted
+        // writer.
         if let Some((message, order)) = writer.zip(order) {
             watched.writer.follow(&message, order, arrival.monotonic);
             match order {
@@ -192,10 +196,10 @@ impl Inlet {
     }
 }
 
-/// What a message of a source says; none for one that is of no concern.
+/// Decodes a message of a topic; `None` for one that does not concern the robot.
 ///
 /// # Errors
-/// [`Refusal`].
+/// [`Refusal`]: the reason why the message is not valid.
 pub fn decoded(
     settings: &Ros2Settings,
     source: Source,
@@ -224,7 +228,7 @@ pub fn decoded(
     }
 }
 
-/// The topic of a source, if it is read.
+/// Returns the name of a topic, if it is read.
 pub fn topic_of(settings: &Ros2Settings, source: Source) -> Option<&Name> {
     match source {
         Source::Odometry => settings.odometry.as_ref().map(|odometry| &odometry.topic),
@@ -235,7 +239,7 @@ pub fn topic_of(settings: &Ros2Settings, source: Source) -> Option<&Name> {
     }
 }
 
-/// The type of a source's messages.
+/// Returns the type of a topic's messages.
 pub fn type_of(source: Source) -> MessageType {
     match source {
         Source::Odometry => Odometry::TYPE,
@@ -246,12 +250,12 @@ pub fn type_of(source: Source) -> MessageType {
     }
 }
 
-/// Numbers the messages of one writer.
+/// Sequence numbers of one writer's messages.
 #[derive(Debug, Default)]
 pub struct Numbering(AtomicU64);
 
 impl Numbering {
-    /// The next number, from one on.
+    /// Returns the next number, from 1.
     pub fn next(&self) -> i64 {
         let number = self.0.fetch_add(1, Ordering::Relaxed).saturating_add(1);
         i64::try_from(number).unwrap_or(i64::MAX)

@@ -6,9 +6,9 @@
 //! bus ◄─thread─── command ◄──────────── outlet ◄──────────────────────────────────── loop
 //! bus ◄─thread─── outward (plan, driven path, θ, diagnostics) ◄─── newest snapshot ◄─── loop
 //! ```
-//! A message that is not wholly good is dropped and counted by its reason. A base that is not
-//! heard for [`Timing::silent_after`](settings::Timing) is commanded to rest at once; it gets nothing
-//! else until the loop itself has come to rest, so that no command leaps.
+//! A message that is not entirely valid is dropped and counted by its reason. A base without a
+//! valid sample for [`Timing::silent_after`](settings::Timing) is commanded to zero at once, and
+//! until the loop itself commands zero, so that the command does not jump.
 
 pub mod assemble;
 pub mod bus;

@@ -1,19 +1,19 @@
-//! What happened on the bus and was dealt with, for people: writers that started again, clocks that
-//! leapt, and commands that somebody else writes.
+//! Reports events on the bus that need no action: restarted writers, clock jumps, and commands
+//! written by other nodes.
 
 use super::refusal::{Counts, QUIET_LOOKS, Source};
 
-/// Something that happened on a topic that is read.
+/// An event on a topic that is read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Notice {
-    /// Its writer started again, or another writer took over from one that fell silent.
+    /// The topic's writer restarted, or another writer replaced a silent one.
     Restarted,
-    /// The stamps leapt, and the new ones are believed.
+    /// The message stamps jumped, and the new ones are accepted.
     ClockLeapt,
 }
 
 impl Notice {
-    /// Each.
+    /// All events.
     pub const ALL: [Self; 2] = [Self::Restarted, Self::ClockLeapt];
 
     fn text(self) -> &'static str {
@@ -23,7 +23,7 @@ impl Notice {
         }
     }
 
-    /// For programs, as an alert's code.
+    /// Returns the alert code, for programs.
     pub fn code(self) -> &'static str {
         match self {
             Self::Restarted => "base-restarted",
@@ -32,16 +32,16 @@ impl Notice {
     }
 }
 
-/// What happened of late, for whoever looks at the counts from time to time.
+/// Detects recent events by comparing the counts at intervals.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Noticing {
     before: [[u64; Notice::ALL.len()]; Source::ALL.len()],
-    /// Looks for which it is still said.
+    /// Number of further checks for which the event is reported.
     left: [[u32; Notice::ALL.len()]; Source::ALL.len()],
 }
 
 impl Noticing {
-    /// Looks again: for people, on which topics that happened of late.
+    /// Runs one check; returns a description of the topics with recent events, for people.
     pub fn look(&mut self, counts: &Counts, notice: Notice) -> Option<String> {
         let mut sections = Vec::new();
         for source in Source::ALL {
@@ -63,7 +63,7 @@ impl Noticing {
     }
 }
 
-/// Commands of others of late.
+/// Detects recent commands of other nodes by comparing the count at intervals.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct ForeignCommands {
     before: u64,
@@ -71,7 +71,7 @@ pub struct ForeignCommands {
 }
 
 impl ForeignCommands {
-    /// Looks again: for people, that somebody else commands the base.
+    /// Runs one check; returns a description while another node has commanded the base recently.
     pub fn look(&mut self, counts: &Counts) -> Option<String> {
         let times = counts.foreign_commands();
         self.left = if times > std::mem::replace(&mut self.before, times) {

@@ -1,41 +1,42 @@
-//! Whether the wheels follow their command, or a fault shows: stuck encoders, swapped sides, a
-//! drive that was switched off, another node that commands the base too.
+//! Detects wheels that do not follow their command: stuck encoders, swapped sides, a drive that was
+//! switched off, another node that commands the base too.
 //!
-//! A wheel's speed must lie between the least and the greatest command of the last
-//! [`MEMORY`], widened by a tolerance: no lag within that time is taken for disobedience. Slip does
-//! not matter, for it parts the robot from its wheels and not the wheels from their command.
-//! Nothing is judged while the robot is to stand, for others may move it then.
+//! A wheel's speed must lie between the smallest and the largest command of the last [`MEMORY`],
+//! widened by a tolerance, so that a lag within that time is accepted. Slip does not matter: it
+//! moves the robot against its wheels, not the wheels against their command. Nothing is judged
+//! while only zero was commanded, since the robot may be moved by others then.
 //!
-//! Two nodes that command one base take turns, so its wheels obey ours some of the time. The time
-//! for which they do not is therefore summed up, and what they obey takes [`PARDON`] of itself off.
-//! Wheels whose encoders are stuck, or whose drive is off, stand without a break instead: that shows
-//! in the time since they last did anything else, whatever came before.
+//! Two nodes that command one base alternate, so its wheels follow the agent's commands part of the
+//! time. The time for which they do not is therefore summed up, and reduced by [`PARDON`] of the
+//! time for which they do. Wheels with stuck encoders or a drive that is off stand still without
+//! interruption, which is measured by the time since they last did otherwise.
 
 use std::time::Duration;
 
 use tread_control::measured::WheelSpeeds;
 
-/// How long a command counts.
+/// Time for which a command is remembered.
 const MEMORY: Duration = Duration::from_millis(600);
-/// Spans into which it is parted.
+/// Number of spans into which [`MEMORY`] is divided.
 const SPANS: usize = 12;
-/// How long the wheels must disobey, in all.
+/// Summed time without obedience after which the wheels are refused.
 const FOR: Duration = Duration::from_millis(500);
-/// Share of the time of obedience that is taken off that: wheels may disobey a third of the time.
+/// Fraction of the time of obedience that is subtracted: the wheels may disobey a third of the
+/// time.
 const PARDON: f64 = 0.5;
-/// Longest time for which one word of the wheels stands.
+/// Longest time that one sample of the wheels accounts for.
 const WORD_MAX: Duration = Duration::from_millis(100);
-/// How long wheels must stand without a break, so that it is no drive which another node halts now
-/// and then.
+/// Time for which wheels must stand still without interruption to count as stuck; longer than the
+/// interruptions by another node that halts the drive now and then.
 const STANDS_FOR: Duration = Duration::from_millis(350);
-/// Share of its command below which a wheel counts as standing.
+/// Ratio to its command below which a wheel's speed counts as standstill.
 const STANDING_SHARE: f64 = 0.1;
-/// How long they must obey again.
+/// Time of obedience after which the wheels are accepted again.
 const AGAIN_FOR: Duration = Duration::from_secs(1);
-/// Tolerance: a part of its own, radians per second, and a share of the command.
+/// Tolerance of a wheel's speed: absolute, rad/s, and relative to the command.
 const TOLERANCE: (f64, f64) = (1.0, 0.25);
 
-/// Least and greatest command within a span.
+/// Smallest and largest command within a span.
 #[derive(Debug, Clone, Copy)]
 struct Envelope {
     least: WheelSpeeds,
@@ -86,7 +87,7 @@ impl Envelope {
         )
     }
 
-    /// Whether every wheel that is commanded to turn stands.
+    /// Whether both sides stand still although commanded to turn.
     fn stands(&self, measured: WheelSpeeds) -> bool {
         let stands = |measured: f64, least: f64, most: f64| {
             measured.abs() <= STANDING_SHARE * least.abs().max(most.abs())
@@ -102,7 +103,7 @@ impl Envelope {
         )
     }
 
-    /// Whether all of it is rest, or there is nothing.
+    /// Whether the envelope contains only zero commands or none.
     fn is_rest(&self) -> bool {
         let fastest = self
             .least
@@ -112,28 +113,29 @@ impl Envelope {
     }
 }
 
-/// What is to be thought of the wheels' word.
+/// Result of the check of the wheels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Verdict {
-    /// They obey, as far as is known.
+    /// They follow their command, as far as known.
     Obeys,
-    /// They say that they stand: their encoders are stuck, or the drive is off.
+    /// They report standstill: their encoders are stuck, or the drive is off.
     Stands,
-    /// They turn, but otherwise than commanded: somebody else commands them, or sides are mixed up.
+    /// They turn differently from their command: another node commands them, or the sides are
+    /// swapped.
     MovesOtherwise,
 }
 
-/// The wheels' obedience.
+/// State of the check.
 #[derive(Debug, Clone, Copy)]
 pub struct Obedience {
     spans: [Envelope; SPANS],
-    /// The span that is being filled, and when it began.
+    /// Index and begin of the span that is being filled.
     present: (usize, Duration),
-    /// For how long the wheels did not obey of late.
+    /// Summed time without obedience, reduced by obedience.
     disobeyed: Duration,
-    /// For how long they have stood without a break.
+    /// Time of uninterrupted standstill.
     stood: Duration,
-    /// Since when the wheels obey again.
+    /// Time since which the wheels obey again.
     obeys_since: Option<Duration>,
     judged_at: Option<Duration>,
     verdict: Verdict,
@@ -154,11 +156,11 @@ impl Default for Obedience {
 }
 
 impl Obedience {
-    /// Notes a command that was given.
+    /// Records a command.
     pub fn command(&mut self, now: Duration, command: WheelSpeeds) {
         let span = MEMORY / u32::try_from(SPANS).unwrap_or(1);
         let (mut index, mut began) = self.present;
-        // Bounded: after a longer pause every span has been emptied.
+        // Bounded: after a longer pause all spans are cleared.
         for _ in 0..SPANS {
             if now < began + span {
                 break;
@@ -178,7 +180,7 @@ impl Obedience {
         self.spans[index] = self.spans[index].with(&one);
     }
 
-    /// Whether what the wheels are said to do can be believed.
+    /// Checks measured wheel speeds against the recent commands.
     pub fn judge(&mut self, now: Duration, measured: WheelSpeeds) -> Verdict {
         let spans = self.spans.iter();
         let all = spans.fold(Envelope::NONE, Envelope::with);

@@ -1,8 +1,8 @@
-//! The newest command, on its way from the loop to the thread that speaks zenoh.
+//! Passes the newest command from the loop to the thread that writes it on the bus.
 //!
-//! The loop leaves it here and never waits; the thread writes each once. A loop that leaves none
-//! for [`COMMAND_SILENCE_MAX`] is taken for stuck: the thread writes rest then, and no command is
-//! ever repeated.
+//! The loop stores it without blocking, and the thread writes each command once. If the loop stores
+//! none for [`COMMAND_SILENCE_MAX`], it is assumed to be stuck and the thread writes zero; no
+//! command is ever repeated.
 
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -11,13 +11,14 @@ use std::time::Duration;
 
 use tread_control::measured::WheelSpeeds;
 
-/// Longest time without a new command after which the base is commanded to rest.
+/// Longest time without a new command; after it the base is commanded to zero.
 pub const COMMAND_SILENCE_MAX: Duration = Duration::from_millis(100);
 
-/// The place where the newest command lies.
+/// Cell of the newest command.
 #[derive(Debug, Default)]
 pub struct Outlet {
-    /// Both speeds as single-precision numbers, so that they are read as they were written.
+    /// Left and right speed as single-precision numbers in one word, so that both are read
+    /// consistently.
     speeds: AtomicU64,
     number: AtomicU64,
     is_closed: AtomicBool,
@@ -25,13 +26,13 @@ pub struct Outlet {
 }
 
 impl Outlet {
-    /// From now on the calling thread is woken by each command.
+    /// Makes each command wake the calling thread.
     pub fn attend(&self) {
-        // A second thread would be a mistake of the program's; the first goes on.
+        // A second thread would be a programming error; the first one stays registered.
         let _ = self.thread.set(std::thread::current());
     }
 
-    /// Leaves a command.
+    /// Stores a command.
     #[expect(
         clippy::cast_possible_truncation,
         reason = "a wheel's speed needs no more than seven digits"
@@ -44,7 +45,7 @@ impl Outlet {
         self.wake();
     }
 
-    /// There will be no more commands.
+    /// Closes the outlet: no more commands follow.
     pub fn close(&self) {
         self.is_closed.store(true, Ordering::Release);
         self.wake();
@@ -56,12 +57,12 @@ impl Outlet {
         }
     }
 
-    /// Whether there will be no more.
+    /// Whether the outlet is closed.
     pub fn is_closed(&self) -> bool {
         self.is_closed.load(Ordering::Acquire)
     }
 
-    /// The newest command, if it is not the one of that number; with its own number.
+    /// Returns the newest command with its number, unless that is `number`.
     pub fn newer_than(&self, number: u64) -> Option<(u64, WheelSpeeds)> {
         let newest = self.number.load(Ordering::Acquire);
         if newest == number {

@@ -1,9 +1,8 @@
-//! What the agent says to the rest of the robot: plan, driven path, friction, and how it is.
+//! Publishes the agent's plan, driven path, friction and diagnostics to the rest of the robot.
 //!
-//! It looks at what the loop and the dispatcher leave for everybody, and makes messages of it, once
-//! a second and when a mission begins or ends. It has a thread of its own, so nothing waits for it:
-//! the loop passes a snapshot by while it is being read, and commands are written by another
-//! thread.
+//! It reads the shared snapshot and plan, and publishes once a second and when a mission begins or
+//! ends. It runs on a thread of its own and delays nobody: the loop skips a snapshot that is being
+//! read, and commands are written by another thread.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -22,35 +21,35 @@ use super::settings::OutwardSettings;
 use crate::control_loop::channels::{GivenPlan, Shared, Snapshot};
 use crate::recording::views::{PATH_POINTS_MAX, header, path, poses_of, state};
 
-/// Time between two looks.
+/// Interval of the checks.
 pub(crate) const LOOK_EVERY: Duration = Duration::from_millis(100);
-/// Time between two words.
+/// Interval of the messages.
 const SAY_EVERY: Duration = Duration::from_secs(1);
-/// Silence of the server that is worth a warning.
+/// Silence of the server from which the diagnostics have the level of a warning.
 const SILENT_SERVER: Duration = Duration::from_secs(5);
 /// Distance between two points of the driven path, metres.
 const SPACING_M: f64 = 0.1;
-/// What the numbers of friction are, in their order; what is not known is NaN.
+/// Values of the friction message, in this order; unknown ones are NaN.
 const THETA_LABEL: &str = "theta,theta_std_dev,theta_loop";
 
-/// One of the topics.
+/// A published topic.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Word {
-    /// The plan of the active mission; empty without one.
+    /// Plan of the active mission; empty without one.
     Plan,
-    /// The driven path since the last mission began, the newest [`PATH_POINTS_MAX`] points.
+    /// Driven path since the last mission began, the newest [`PATH_POINTS_MAX`] points.
     Driven,
-    /// θ as measured, its standard deviation, and θ̂ of the law.
+    /// Measured θ, its standard deviation, and θ̂ of the tracking law.
     Theta,
-    /// How the agent is.
+    /// State of the agent.
     Diagnostics,
 }
 
 impl Word {
-    /// Every topic.
+    /// All topics.
     pub(crate) const ALL: [Self; 4] = [Self::Plan, Self::Driven, Self::Theta, Self::Diagnostics];
 
-    /// Its name.
+    /// Returns the topic's name.
     pub(crate) fn topic(self, settings: &OutwardSettings) -> &Name {
         match self {
             Self::Plan => &settings.plan,
@@ -60,7 +59,7 @@ impl Word {
         }
     }
 
-    /// Its messages.
+    /// Returns the type of the topic's messages.
     pub(crate) fn message_type(self) -> MessageType {
         match self {
             Self::Plan | Self::Driven => Path::TYPE,
@@ -70,7 +69,7 @@ impl Word {
     }
 }
 
-/// What is said of one part.
+/// Diagnostic status of one part of the agent.
 #[derive(Debug)]
 struct Part {
     name: &'static str,
@@ -79,23 +78,23 @@ struct Part {
     values: Vec<(String, String)>,
 }
 
-/// Who says it.
+/// Publisher of the agent's state on the robot's bus.
 #[derive(Debug)]
 pub(crate) struct Outward {
     settings: OutwardSettings,
     shared: Arc<Shared>,
     counts: Arc<Counts>,
     robot: String,
-    /// When it last spoke, by the agent's monotonic clock.
+    /// Time of the last messages, by the agent's monotonic clock.
     said: Option<Duration>,
-    /// Mission and revision whose plan is shown.
+    /// Mission and revision of the published plan.
     mission: Option<(MissionId, u32)>,
-    /// Both in the robot's frame.
+    /// Poses of the plan, in the frame of the settings, as those of `driven`.
     plan: Vec<Pose>,
     driven: Vec<Pose>,
-    /// Messages that had been dropped when it was last said.
+    /// Number of dropped messages at the last diagnostics.
     dropped: u64,
-    /// Commands of other nodes, when it was last said.
+    /// Number of other nodes' commands at the last diagnostics.
     foreign_commands: u64,
 }
 
@@ -120,7 +119,7 @@ impl Outward {
         }
     }
 
-    /// Says what is due to be said.
+    /// Publishes what is due.
     pub(crate) fn step(&mut self, now: Duration, wall_ns: i64, mut say: impl FnMut(Word, &[u8])) {
         let snapshot = self.shared.snapshot();
         let is_new = self.update_mission(&snapshot);
@@ -142,7 +141,7 @@ impl Outward {
         say(Word::Diagnostics, &bytes);
     }
 
-    /// Whether another plan is driven than before.
+    /// Updates the plan; returns whether it has changed.
     fn update_mission(&mut self, snapshot: &Snapshot) -> bool {
         let driven = snapshot.mission.map(|now| (now.id, now.revision));
         if driven == self.mission {
@@ -153,7 +152,7 @@ impl Outward {
             self.plan.clear();
             return true;
         };
-        // The loop may have begun before the dispatcher has left the plan for others.
+        // The loop may begin a mission before the dispatcher has published its plan.
         let given = self.shared.given_plan();
         let is_it = |given: &GivenPlan| (given.mission, given.revision) == (mission, revision);
         let Some(given) = given.filter(is_it) else {
@@ -223,7 +222,7 @@ impl Outward {
     }
 }
 
-/// A pose of the site as it is in a frame that lies in it.
+/// Transforms a pose from the site frame to a frame whose pose in the site is given.
 fn seen_from(site_from_frame: Pose, pose: Pose) -> Pose {
     let point = site_from_frame.body_from_site(pose.point());
     Pose {

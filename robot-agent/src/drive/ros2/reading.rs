@@ -1,6 +1,6 @@
-//! What a message says in the agent's own terms: decoded, checked, turned into the base's frame.
+//! Decodes ROS messages, checks their values, and converts them to the agent's types and frames.
 //!
-//! Pure. A message that is not wholly usable is refused whole, with the reason.
+//! Pure. A message that is not entirely valid is refused as a whole, with the reason.
 
 use tread_control::geometry::{Pose, wrap_angle_rad};
 use tread_control::localisation::FixNoise;
@@ -17,87 +17,87 @@ use super::settings::{
 };
 use crate::drive::Battery;
 
-/// Fastest motion that is believed, metres or radians per second.
+/// Largest accepted speed or rate, m/s or rad/s.
 const RATE_MAX: f64 = 100.0;
-/// Largest acceleration that is believed, metres per second squared.
+/// Largest accepted acceleration, m/s².
 const ACCELERATION_MAX_M_S2: f64 = 200.0;
-/// Largest torque that is believed, newton metres.
+/// Largest accepted torque, N m.
 const TORQUE_MAX_N_M: f64 = 1.0e5;
-/// Farthest place that is believed, metres.
+/// Largest accepted coordinate, metres.
 const PLACE_MAX_M: f64 = 1.0e6;
-/// Largest standard deviations that a covariance may state: metres (or metres per second), radians.
+/// Largest accepted standard deviation: metres (or m/s), radians.
 const DEVIATION_MAX: f64 = 10.0;
-/// Smallest standard deviations of a fix that are believed, metres and radians.
+/// Lower bounds of a fix's standard deviations, metres and radians; smaller ones are raised to
+/// these.
 const FIX_DEVIATION_MIN: (f64, f64) = (0.002, 0.001);
 
-/// What a message said.
+/// Content of a message.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Content {
-    /// The wheels.
+    /// Wheel speeds and torques.
     Wheels(Wheels),
-    /// The inertial unit.
+    /// Sample of the inertial measurement unit.
     Inertial(Inertial),
     /// Odometry.
     Motion(Motion),
-    /// A position.
+    /// Position fix.
     Position(Position),
     /// The battery.
     Battery(Battery),
 }
 
-/// The wheels.
+/// Wheel speeds and torques.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Wheels {
-    /// How they turn.
+    /// Wheel speeds.
     pub speeds: WheelSpeeds,
-    /// How they pull, if that is known.
+    /// Wheel torques, if measured.
     pub torques: Option<WheelTorques>,
 }
 
-/// The inertial unit.
+/// Sample of the inertial measurement unit, in the robot frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Inertial {
-    /// Turn rate, radians per second.
+    /// Yaw rate, rad/s, positive to the left.
     pub yaw_rate_rad_s: f64,
-    /// Its standard deviation, if it is stated.
+    /// Standard deviation of the yaw rate, rad/s, if stated.
     pub yaw_rate_std_dev: Option<f64>,
-    /// Acceleration without gravity, if it is measured.
+    /// Acceleration without gravity, if measured.
     pub acceleration: Option<BodyAcceleration>,
-    /// Its standard deviation, if it is stated.
+    /// Standard deviation of the acceleration, m/s², if stated.
     pub acceleration_std_dev: Option<f64>,
-    /// How far the robot leans, radians, if that is known.
+    /// Tilt against the vertical, radians, if the orientation is measured.
     pub tilt_rad: Option<f64>,
 }
 
 /// Odometry.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Motion {
-    /// Speed ahead, metres per second.
+    /// Forward speed, m/s.
     pub forward_m_s: f64,
-    /// Its standard deviation, if it is stated.
+    /// Standard deviation of the forward speed, m/s, if stated.
     pub forward_std_dev: Option<f64>,
-    /// Turn rate, radians per second.
+    /// Yaw rate, rad/s, positive to the left.
     pub yaw_rate_rad_s: f64,
-    /// Where the robot is, if the odometry may say so.
+    /// Position fix, if the settings use the odometry's pose as one.
     pub position: Option<Position>,
 }
 
-/// A position in the site's frame.
+/// Position fix in the site frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Position {
-    /// Where.
+    /// Pose in the site frame.
     pub pose: Pose,
-    /// How good it is, if that is stated.
+    /// Standard deviations, if stated.
     pub noise: Option<FixNoise>,
 }
 
-/// A message, and when it was measured by its own word; none for the rare kinds whose age does not
-/// matter.
+/// Stamp and content of a message. The stamp is not used for a battery.
 pub type Reading = (Time, Content);
 
-/// A number within a bound.
+/// Returns the value if its magnitude is at most `most`.
 fn bounded(value: f64, most: f64) -> Result<f64, Refusal> {
-    // What is no number is within no bound.
+    // NaN fails every comparison.
     if value.abs() <= most {
         Ok(value)
     } else {
@@ -105,7 +105,7 @@ fn bounded(value: f64, most: f64) -> Result<f64, Refusal> {
     }
 }
 
-/// The standard deviation of a variance; none for zero, by which ROS says that it is not known.
+/// Returns the standard deviation of a variance; `None` for zero, which means unknown in ROS.
 fn std_dev(variance: f64) -> Result<Option<f64>, Refusal> {
     if variance == 0.0 {
         return Ok(None);
@@ -116,7 +116,7 @@ fn std_dev(variance: f64) -> Result<Option<f64>, Refusal> {
         .ok_or(Refusal::Covariance)
 }
 
-/// Whether a three-by-three covariance says that its value is not measured.
+/// Whether a 3 × 3 covariance states that its value is not measured (first element −1).
 fn is_unmeasured(covariance: &[f64; 9]) -> bool {
     (covariance[0] + 1.0).abs() < f64::EPSILON
 }
@@ -130,7 +130,7 @@ fn check_frame(frame: &str, expected: &str) -> Result<(), Refusal> {
     }
 }
 
-/// A pose of ROS in the plane.
+/// Converts a ROS pose to a planar pose.
 fn flat(pose: &messages::Pose) -> Result<Pose, Refusal> {
     Ok(Pose {
         x_m: bounded(pose.position.x, PLACE_MAX_M)?,
@@ -139,7 +139,7 @@ fn flat(pose: &messages::Pose) -> Result<Pose, Refusal> {
     })
 }
 
-/// A pose in an inner frame as seen from the outer one.
+/// Transforms a pose from an inner frame to the outer one.
 fn within(outer_from_inner: Pose, pose: Pose) -> Pose {
     let (sin, cos) = outer_from_inner.heading_rad.sin_cos();
     Pose {
@@ -161,7 +161,7 @@ fn position(
     {
         return Err(Refusal::Covariance);
     }
-    // Of x, y and the turn about z: their places on the diagonal.
+    // Diagonal indices of x, y and the rotation about z.
     let [x_m, y_m, heading_rad] = [0, 1, 5].map(|at: usize| std_dev(covariance[at][at]));
     let (place_min_m, heading_min_rad) = FIX_DEVIATION_MIN;
     let noise = match (x_m?, y_m?, heading_rad?) {
@@ -177,10 +177,10 @@ fn position(
     })
 }
 
-/// Reads `sensor_msgs/JointState`; none where it is of other joints.
+/// Reads `sensor_msgs/JointState`; `None` if it has none of the robot's joints.
 ///
 /// # Errors
-/// [`Refusal`].
+/// [`Refusal`]: the reason why the message is not valid.
 pub fn joints(bytes: &[u8], settings: &JointSettings) -> Result<Option<Reading>, Refusal> {
     let message: JointState<'_> = decode(bytes)?;
     let count = message.name.len();
@@ -208,7 +208,7 @@ pub fn joints(bytes: &[u8], settings: &JointSettings) -> Result<Option<Reading>,
             torque_n_m = match (settings.effort.torque_n_m(), effort) {
                 (Some(constant), Some(effort)) => {
                     let pulled = effort * constant * joints.effort_sign * settings.gear_ratio;
-                    // Some bases write no number for an effort that they do not measure.
+                    // Some bases write NaN for an effort that they do not measure.
                     torque_n_m
                         .filter(|_| pulled.abs() <= TORQUE_MAX_N_M)
                         .map(|sum| sum + pulled)
@@ -242,14 +242,14 @@ pub fn joints(bytes: &[u8], settings: &JointSettings) -> Result<Option<Reading>,
 /// Reads `sensor_msgs/Imu`.
 ///
 /// # Errors
-/// [`Refusal`].
+/// [`Refusal`]: the reason why the message is not valid.
 pub fn imu(bytes: &[u8], settings: &ImuSettings) -> Result<Reading, Refusal> {
     let message: Imu<'_> = decode(bytes)?;
     check_frame(message.header.frame_id, &settings.frame)?;
     if is_unmeasured(&message.angular_velocity_covariance) {
         return Err(Refusal::Value);
     }
-    // Upside down, turned about x: y and z change their signs.
+    // Mounted upside down, rotated about x: y and z change their signs.
     let flip = if settings.is_upside_down { -1.0 } else { 1.0 };
     let up = if is_unmeasured(&message.orientation_covariance) {
         None
@@ -262,7 +262,7 @@ pub fn imu(bytes: &[u8], settings: &ImuSettings) -> Result<Reading, Refusal> {
     } else {
         let felt = message.linear_acceleration;
         let most = ACCELERATION_MAX_M_S2;
-        // Without a word on how it stands it is taken for level.
+        // Without an orientation the unit is assumed to be level.
         let up = up.unwrap_or_default();
         let x = bounded(felt.x, most)? - GRAVITY_M_S2 * up.x;
         let y = flip * (bounded(felt.y, most)? - GRAVITY_M_S2 * up.y);
@@ -289,7 +289,7 @@ pub fn imu(bytes: &[u8], settings: &ImuSettings) -> Result<Reading, Refusal> {
 /// Reads `nav_msgs/Odometry`.
 ///
 /// # Errors
-/// [`Refusal`].
+/// [`Refusal`]: the reason why the message is not valid.
 pub fn odometry(bytes: &[u8], settings: &OdometrySettings) -> Result<Reading, Refusal> {
     let message: Odometry<'_> = decode(bytes)?;
     check_frame(message.header.frame_id, &settings.frame)?;
@@ -311,7 +311,7 @@ pub fn odometry(bytes: &[u8], settings: &OdometrySettings) -> Result<Reading, Re
 /// Reads `geometry_msgs/PoseWithCovarianceStamped`.
 ///
 /// # Errors
-/// [`Refusal`].
+/// [`Refusal`]: the reason why the message is not valid.
 pub fn pose(bytes: &[u8], settings: &PoseSettings) -> Result<Reading, Refusal> {
     let message: PoseWithCovarianceStamped<'_> = decode(bytes)?;
     check_frame(message.header.frame_id, &settings.frame)?;
@@ -319,10 +319,10 @@ pub fn pose(bytes: &[u8], settings: &PoseSettings) -> Result<Reading, Refusal> {
     Ok((message.header.stamp, Content::Position(position)))
 }
 
-/// Reads `sensor_msgs/BatteryState`; none where there is none.
+/// Reads `sensor_msgs/BatteryState`; `None` if no battery is present.
 ///
 /// # Errors
-/// [`Refusal`].
+/// [`Refusal`]: the reason why the message is not valid.
 pub fn battery(bytes: &[u8]) -> Result<Option<Reading>, Refusal> {
     let message: BatteryState<'_> = decode(bytes)?;
     if !message.present {
@@ -340,7 +340,7 @@ pub fn battery(bytes: &[u8]) -> Result<Option<Reading>, Refusal> {
     Ok(Some((message.header.stamp, Content::Battery(battery))))
 }
 
-/// The wheels' speeds behind a motion that the base computed from them.
+/// Computes the wheel speeds from which the base computed this motion.
 pub fn wheels_of(motion: &Motion, command: &CommandSettings) -> WheelSpeeds {
     let turn_m_s = 0.5 * command.base_track_m * motion.yaw_rate_rad_s;
     WheelSpeeds {

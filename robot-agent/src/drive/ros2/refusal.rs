@@ -1,4 +1,4 @@
-//! Why messages of the base were dropped, how often, and of late.
+//! Reasons for which messages of the base are dropped, with their counts and recent changes.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -7,46 +7,46 @@ use tread_ros2::rmw::KeyMismatch;
 
 use super::notices::Notice;
 
-/// Why a message was dropped. What is dropped is no word of the base: one that says nothing else is
-/// silent.
+/// Why a message was dropped. A dropped message does not count as a sign of life: a base that sends
+/// no other counts as silent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Refusal {
     /// A message of another type on the topic.
     WrongType,
-    /// The same type by name, defined otherwise.
+    /// The type has the expected name but another definition.
     WrongHash,
-    /// No attachment, or none of the right form.
+    /// No attachment, or one of invalid form.
     NoAttachment,
-    /// Too short, too long, or not what its type says.
+    /// Too short, too long, or inconsistent with its type.
     Malformed,
-    /// Another frame than the configuration says.
+    /// Another frame than the configured one.
     WrongFrame,
-    /// None of the joints, not all of them, or lists of unequal lengths.
+    /// Some of the robot's joints are missing, or the lists have unequal lengths.
     Joints,
-    /// What is no number, no rotation, or beyond what any robot does.
+    /// A value that is not finite, not a rotation, or physically impossible.
     Value,
-    /// A covariance that is none.
+    /// An invalid covariance.
     Covariance,
-    /// A stamp that is none, or leapt.
+    /// An invalid stamp, or one that jumped.
     Stamp,
-    /// Older than what is used.
+    /// Older than the configured limit.
     Late,
-    /// Not newer than the one before.
+    /// Not newer than the previous message.
     OutOfOrder,
-    /// Another writer on a topic whose writer is heard.
+    /// Another writer on a topic whose writer is active.
     SecondWriter,
-    /// The wheels do not follow their command.
+    /// The wheels stand still although commanded to turn.
     Disobedient,
-    /// The wheels turn, and otherwise than commanded: somebody else may command them.
+    /// The wheels turn differently from their command: another node may command them.
     OtherMotion,
     /// Another node commands the base while the agent drives it.
     Contested,
-    /// More messages than the loop takes.
+    /// The queue to the loop was full.
     Overflow,
 }
 
 impl Refusal {
-    /// Every reason.
+    /// All reasons.
     pub const ALL: [Self; 16] = [
         Self::WrongType,
         Self::WrongHash,
@@ -66,7 +66,7 @@ impl Refusal {
         Self::Overflow,
     ];
 
-    /// For people.
+    /// Description for people.
     pub fn text(self) -> &'static str {
         match self {
             Self::WrongType => "messages of another type",
@@ -93,7 +93,7 @@ impl Refusal {
 }
 
 impl Refusal {
-    /// For programs, as part of an alert's code.
+    /// Part of an alert's code, for programs.
     pub fn code(self) -> &'static str {
         match self {
             Self::WrongType => "type",
@@ -131,12 +131,12 @@ impl From<KeyMismatch> for Refusal {
     }
 }
 
-/// The topics that are read.
+/// A topic that is read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Source {
     /// Odometry.
     Odometry,
-    /// The inertial unit.
+    /// The inertial measurement unit.
     Imu,
     /// The joints.
     Joints,
@@ -147,7 +147,7 @@ pub enum Source {
 }
 
 impl Source {
-    /// Each.
+    /// All topics.
     pub const ALL: [Self; 5] = [
         Self::Odometry,
         Self::Imu,
@@ -156,7 +156,7 @@ impl Source {
         Self::Battery,
     ];
 
-    /// The name of its section in `robot.toml`.
+    /// Returns the name of the topic's section in `robot.toml`.
     pub fn section(self) -> &'static str {
         match self {
             Self::Odometry => "odometry",
@@ -168,7 +168,7 @@ impl Source {
     }
 }
 
-/// How many messages came, and were dropped for which reason, by topic.
+/// Numbers of messages used and dropped, by topic and reason, and of other events on the bus.
 #[derive(Debug, Default)]
 pub struct Counts {
     taken: [AtomicU64; Source::ALL.len()],
@@ -178,47 +178,47 @@ pub struct Counts {
 }
 
 impl Counts {
-    /// One message was used.
+    /// Counts a message that was used.
     pub fn take(&self, source: Source) {
         self.taken[source as usize].fetch_add(1, Ordering::Relaxed);
     }
 
-    /// One message was dropped.
+    /// Counts a message that was dropped.
     pub fn refuse(&self, source: Source, refusal: Refusal) {
         self.dropped[source as usize][refusal as usize].fetch_add(1, Ordering::Relaxed);
     }
 
-    /// Messages of a topic that were used.
+    /// Returns the number of messages of a topic that were used.
     pub fn taken(&self, source: Source) -> u64 {
         self.taken[source as usize].load(Ordering::Relaxed)
     }
 
-    /// Messages of a topic that were dropped for a reason.
+    /// Returns the number of messages of a topic that were dropped for a reason.
     pub fn dropped(&self, source: Source, refusal: Refusal) -> u64 {
         self.dropped[source as usize][refusal as usize].load(Ordering::Relaxed)
     }
 
-    /// Something happened on a topic that people should know of.
+    /// Counts an event on a topic.
     pub fn note(&self, source: Source, notice: Notice) {
         self.noted[source as usize][notice as usize].fetch_add(1, Ordering::Relaxed);
     }
 
-    /// How often that happened.
+    /// Returns the number of these events on a topic.
     pub fn noted(&self, source: Source, notice: Notice) -> u64 {
         self.noted[source as usize][notice as usize].load(Ordering::Relaxed)
     }
 
-    /// Somebody else wrote a command.
+    /// Counts a command of another node.
     pub fn note_foreign_command(&self) {
         self.foreign_commands.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// Commands that somebody else wrote on the command topic.
+    /// Returns the number of commands that other nodes wrote on the command topic.
     pub fn foreign_commands(&self) -> u64 {
         self.foreign_commands.load(Ordering::Relaxed)
     }
 
-    /// Every topic and reason for which messages were dropped, with how many.
+    /// Returns each topic and reason with dropped messages, and their number.
     pub fn drops(&self) -> impl Iterator<Item = (Source, Refusal, u64)> + '_ {
         Source::ALL
             .into_iter()
@@ -228,10 +228,10 @@ impl Counts {
     }
 }
 
-/// Looks without a new drop after which dropping is over.
+/// Number of checks without a new event after which it is no longer reported.
 pub(super) const QUIET_LOOKS: u32 = 10;
 
-/// What was dropped of late, for whoever looks at the counts from time to time.
+/// Detects recently dropped messages by comparing the counts at intervals.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Dropping {
     before: [[u64; Refusal::ALL.len()]; Source::ALL.len()],
@@ -240,7 +240,8 @@ pub struct Dropping {
 }
 
 impl Dropping {
-    /// Looks again: for people, what is dropped most; none while nothing is.
+    /// Runs one check; returns the most frequent recent reason and its description for people,
+    /// `None` if nothing was dropped recently.
     pub fn look(&mut self, counts: &Counts) -> Option<(Refusal, String)> {
         let mut most = 0;
         for (source, refusal, times) in counts.drops() {

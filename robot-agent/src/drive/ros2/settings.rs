@@ -1,4 +1,4 @@
-//! What must be known of a ROS 2 robot, checked; `[drive.ros2]` in `robot.toml` says it.
+//! Checked settings of a ROS 2 robot, from `[drive.ros2]` of `robot.toml`.
 
 use std::time::Duration;
 
@@ -6,33 +6,33 @@ use tread_control::geometry::Pose;
 use tread_ros2::names::Name;
 use tread_ros2::rmw::Generation;
 
-/// Most joints of one side.
+/// Largest number of joints of one side.
 pub const JOINTS_MAX: usize = 8;
 
-/// A ROS 2 robot.
+/// Settings of a ROS 2 robot.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Ros2Settings {
-    /// How its bus is reached.
+    /// Access to the robot's bus.
     pub bus: BusSettings,
-    /// What is fresh and what is late.
+    /// Limits on the age of messages.
     pub timing: Timing,
     /// Odometry, if it is read.
     pub odometry: Option<OdometrySettings>,
-    /// The inertial unit, if it is read; else the odometry gives the turn rate.
+    /// Inertial measurement unit, if it is read; otherwise the odometry gives the yaw rate.
     pub imu: Option<ImuSettings>,
-    /// The joints, if they are read; else the odometry gives the wheels' speeds.
+    /// Joints, if they are read; otherwise the odometry gives the wheel speeds.
     pub joints: Option<JointSettings>,
-    /// Where a pose comes from that is better than odometry, if there is such.
+    /// Source of a pose that is better than odometry, if any.
     pub pose: Option<PoseSettings>,
     /// The battery's topic, if it is read.
     pub battery: Option<Name>,
-    /// What is written.
+    /// Command of the base.
     pub command: CommandSettings,
-    /// What is said to the rest of the robot, if anything is.
+    /// Topics on which the agent publishes its state, if any.
     pub outward: Option<OutwardSettings>,
 }
 
-/// How ROS 2 is spoken over zenoh.
+/// Mapping of ROS 2 topics to zenoh.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Scheme {
     /// As by `rmw_zenoh_cpp`.
@@ -41,60 +41,60 @@ pub enum Scheme {
     Ros2Dds,
 }
 
-/// Who is the robot's router.
+/// Router of the robot's bus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum BusMode {
-    /// Somebody else: `rmw_zenohd`, or the bridge.
+    /// Another program: `rmw_zenohd`, or the bridge.
     Client,
-    /// The agent itself; nodes come to it.
+    /// The agent itself; nodes connect to it.
     Router,
 }
 
-/// How the robot's bus is reached.
+/// Access to the robot's bus.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct BusSettings {
-    /// How ROS 2 is spoken on it.
+    /// Mapping of ROS 2 topics to zenoh.
     pub scheme: Scheme,
-    /// Who is its router.
+    /// Router of the bus.
     pub mode: BusMode,
-    /// A zenoh endpoint on this machine.
+    /// zenoh endpoint on this machine.
     pub endpoint: String,
-    /// The domain of `rmw_zenoh_cpp`.
+    /// ROS domain, used with `rmw_zenoh_cpp`.
     pub domain: u32,
-    /// The namespace of the bridge, or of the agent's node.
+    /// Namespace of the bridge, or of the agent's node.
     pub namespace: Name,
-    /// The agent's node.
+    /// Name of the agent's node.
     pub node: Name,
 }
 
-/// Whose clock the messages' stamps are of.
+/// Clock of the messages' stamps.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum StampClock {
-    /// This machine's: a message is as old as its stamp says.
+    /// Clock of this machine: a message's age is the difference to it.
     Host,
-    /// One of the base's own, or simulated time: the least delay seen is taken for none.
+    /// Clock of the base, or simulated time: the smallest delay seen is assumed to be zero.
     Base,
 }
 
-/// What is fresh and what is late.
+/// Limits on the age of messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Timing {
-    /// Whose clock the stamps are of.
+    /// Clock of the messages' stamps.
     pub stamps: StampClock,
-    /// Oldest word of the base with which it does not count as silent.
+    /// Age of the last valid sample beyond which the base counts as silent.
     pub silent_after: Duration,
-    /// Oldest message that is used.
+    /// Largest age of a message that is used.
     pub late_after: Duration,
-    /// The same for a pose, which takes longer to find.
+    /// Largest age of a pose that is used, which takes longer to compute.
     pub pose_late_after: Duration,
 }
 
-/// What the odometry's motion is the motion of.
+/// What the odometry's twist describes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MotionOf {
-    /// The wheels: it was computed from them, by the base's own radius and track.
+    /// The wheels: it is computed from them, with the base's own radius and track.
     Wheels,
-    /// The body over ground: by camera, laser or satellite.
+    /// The body over ground: it is measured by camera, laser or satellite.
     Ground,
 }
 
@@ -103,42 +103,42 @@ pub enum MotionOf {
 pub struct OdometrySettings {
     /// The topic.
     pub topic: Name,
-    /// The frame of its pose.
+    /// Frame of its pose.
     pub frame: String,
-    /// The frame of its motion.
+    /// Frame of its twist.
     pub child_frame: String,
-    /// What its motion is the motion of.
+    /// What its twist describes.
     pub motion_of: MotionOf,
-    /// Where its frame lies in the site, if its pose is to count as a position.
+    /// Pose of its frame in the site, if its pose shall be used as a position fix.
     pub site_from_odom: Option<Pose>,
 }
 
-/// An inertial unit, level, turned about its z axis against the base.
+/// Inertial measurement unit, mounted level, rotated about its z axis against the base.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ImuSettings {
     /// The topic.
     pub topic: Name,
     /// Its frame.
     pub frame: String,
-    /// How far its x axis is turned from the base's, radians, to the left.
+    /// Angle of its x axis against the base's, radians, positive to the left.
     pub yaw_rad: f64,
-    /// Whether it hangs upside down, turned about its x axis.
+    /// Whether it is mounted upside down, rotated about its x axis.
     pub is_upside_down: bool,
 }
 
-/// What a joint's effort is.
+/// Quantity in a joint's effort.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Effort {
-    /// Nothing that can be used.
+    /// Not usable.
     None,
-    /// Newton metres of the joint.
+    /// Torque at the joint, N m.
     Torque,
-    /// Amperes, each so many newton metres of the joint.
+    /// Current, A, with the torque constant of the joint, N m/A.
     Current(f64),
 }
 
 impl Effort {
-    /// Newton metres of the joint for one of its effort; none where it is of no use.
+    /// Returns the joint's torque per unit of effort, N m; `None` if it is not usable.
     pub const fn torque_n_m(self) -> Option<f64> {
         match self {
             Self::None => None,
@@ -151,41 +151,41 @@ impl Effort {
 /// The joints of one side.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SideJoints {
-    /// Their names, 1 to [`JOINTS_MAX`].
+    /// Names of the joints, 1 to [`JOINTS_MAX`].
     pub names: Vec<String>,
-    /// 1.0, or -1.0 where they turn backwards when the robot goes ahead.
+    /// 1.0, or -1.0 if the joints turn backwards when the robot moves forward.
     pub sign: f64,
-    /// 1.0, or -1.0 where their effort is positive against the way they turn.
+    /// 1.0, or -1.0 if a positive effort acts against a positive rotation.
     pub effort_sign: f64,
 }
 
-/// The joints that drive.
+/// Driven joints.
 #[derive(Debug, Clone, PartialEq)]
 pub struct JointSettings {
     /// The topic.
     pub topic: Name,
-    /// The left ones.
+    /// Joints of the left side.
     pub left: SideJoints,
-    /// The right ones.
+    /// Joints of the right side.
     pub right: SideJoints,
-    /// Turns of a joint for one turn of its wheel.
+    /// Joint revolutions per wheel revolution.
     pub gear_ratio: f64,
-    /// What the effort is.
+    /// Quantity in the effort.
     pub effort: Effort,
 }
 
-/// A pose that was found by a map, a satellite or a beacon.
+/// Pose from a map, a satellite or a beacon.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PoseSettings {
     /// The topic.
     pub topic: Name,
     /// Its frame.
     pub frame: String,
-    /// Where that frame lies in the site.
+    /// Pose of that frame in the site.
     pub site_from_map: Pose,
 }
 
-/// What kind of message commands the base.
+/// Message type of the command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum CommandKind {
     /// `geometry_msgs/Twist`.
@@ -196,31 +196,31 @@ pub enum CommandKind {
     JointSpeeds,
 }
 
-/// What is written.
+/// Command of the base.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CommandSettings {
     /// The topic.
     pub topic: Name,
-    /// The kind of message.
+    /// Message type.
     pub kind: CommandKind,
     /// The frame of a stamped command.
     pub frame: String,
-    /// The wheels' radius that the base assumes, metres.
+    /// Wheel radius that the base assumes, metres.
     pub base_radius_m: f64,
-    /// The track that the base assumes, metres: its separation times its multiplier.
+    /// Track width that the base assumes, metres: its wheel separation times its multiplier.
     pub base_track_m: f64,
-    /// 1.0, or -1.0 where the base takes a turn to the right for positive.
+    /// 1.0, or -1.0 if a positive turn is to the right for the base.
     pub turn_sign: f64,
-    /// 1.0, or -1.0 where the base takes backwards for positive.
+    /// 1.0, or -1.0 if a positive speed is backwards for the base.
     pub forward_sign: f64,
-    /// Joints of the left and of the right side in [`CommandKind::JointSpeeds`].
+    /// Number of joints of each side, `[left, right]`, in [`CommandKind::JointSpeeds`].
     pub joints: [usize; 2],
-    /// Turns of a joint for one turn of its wheel, each side with its sign.
+    /// Joint revolutions per wheel revolution with sign, `[left, right]`.
     pub joint_ratios: [f64; 2],
 }
 
 impl Ros2Settings {
-    /// Every topic that is read or commanded.
+    /// Returns every topic that is read or commanded.
     pub(crate) fn topics(&self) -> Vec<&Name> {
         let read = [
             self.odometry.as_ref().map(|odometry| &odometry.topic),
@@ -234,19 +234,19 @@ impl Ros2Settings {
     }
 }
 
-/// What is said to the rest of the robot.
+/// Topics on which the agent publishes its state.
 #[derive(Debug, Clone, PartialEq)]
 pub struct OutwardSettings {
-    /// The plan of the active mission, `nav_msgs/Path`.
+    /// Plan of the active mission, `nav_msgs/Path`.
     pub plan: Name,
-    /// The driven path, `nav_msgs/Path`.
+    /// Driven path, `nav_msgs/Path`.
     pub driven: Name,
     /// θ, its standard deviation and θ̂ of the law, `std_msgs/Float64MultiArray`.
     pub theta: Name,
-    /// How the agent is, `diagnostic_msgs/DiagnosticArray`.
+    /// State of the agent, `diagnostic_msgs/DiagnosticArray`.
     pub diagnostics: Name,
-    /// The frame of both ways: that of the topic which gives the position.
+    /// Frame of both paths: that of the topic which gives the position.
     pub frame: String,
-    /// Where that frame lies in the site.
+    /// Pose of that frame in the site.
     pub site_from_frame: Pose,
 }

@@ -1,53 +1,54 @@
-//! When a message was measured, by the agent's monotonic clock, from the stamp that it carries.
+//! Computes the time of a measurement by the agent's monotonic clock from the stamp of its message.
 //!
-//! By [`StampClock::Host`] the stamp is of this machine's wall clock: its age is the difference to
-//! that clock at its arrival, whatever steps the clock makes. By [`StampClock::Base`] the least
-//! delay of late is taken for none, and slowly forgotten, so that a clock that runs otherwise is
-//! followed; where the stamps leap for good, that is believed after [`AGREE_MIN`] messages. Until
-//! then the base is as good as silent. A leap is more than a second, or any step back: no delay
-//! makes a writer's later stamp lower than its earlier one.
+//! With [`StampClock::Host`] the stamp is of this machine's wall clock, and the age is the
+//! difference to that clock at the arrival, regardless of steps of the clock. With
+//! [`StampClock::Base`] the smallest recent delay is assumed to be zero, and forgotten slowly, so
+//! that clock drift is followed; a jump of the stamps is accepted after [`AGREE_MIN`] consistent
+//! messages, and until then all are refused. A jump is a change of more than a second, or any step
+//! back, since no delay lowers a writer's stamps.
 
 use std::time::Duration;
 
 use super::refusal::Refusal;
 use super::settings::StampClock;
 
-/// A stamp may lie so far ahead: two clocks of one machine read one after the other.
+/// Largest amount by which a stamp may be in the future, nanoseconds: two readings of clocks of one
+/// machine.
 const AHEAD_MAX_NS: i64 = 5_000_000;
-/// Two stamps nearer than that are the same.
+/// Largest difference of two stamps that count as equal, nanoseconds.
 const SAME_NS: i64 = 20_000;
-/// From here on an age is no delay but a leap of the clock.
+/// Smallest age that counts as a jump of the clock instead of a delay, nanoseconds.
 const LEAP_NS: i64 = 1_000_000_000;
-/// Messages that must agree on a leap before it is believed.
+/// Number of consistent messages after which a jump is accepted.
 pub const AGREE_MIN: u32 = 10;
-/// How far they may differ.
+/// Largest difference of consistent messages, nanoseconds.
 const AGREE_NS: i64 = 50_000_000;
-/// Share of the time by which the least delay seen is forgotten: no clock is so bad.
+/// Ratio of elapsed time by which the smallest delay is forgotten; above the drift of any clock.
 const FORGET_SHARE: f64 = 5.0e-4;
 
-/// When a message came.
+/// Time of a message's arrival.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Arrival {
     /// By the agent's monotonic clock.
     pub monotonic: Duration,
-    /// By this machine's wall clock, as it stands now.
+    /// By this machine's wall clock at that time, nanoseconds since the Unix epoch.
     pub wall_ns: i64,
 }
 
-/// The stamps of one topic.
+/// State of the stamps of one topic.
 #[derive(Debug, Clone, Copy)]
 pub struct Stamps {
     clock: StampClock,
     late_after_ns: i64,
     /// Monotonic time minus stamp, for the base's clock.
     offset_ns: Option<i64>,
-    /// What the last messages agree on, and how many do.
+    /// Offset of the last messages after a jump, and the number of consistent ones.
     leap: Option<(i64, u32)>,
     last_arrival: Duration,
     last_ns: Option<i64>,
-    /// The stamp of the last message that was placed.
+    /// Stamp of the last message that was accepted.
     last_stamp_ns: Option<i64>,
-    /// Leaps that were believed.
+    /// Number of jumps that were accepted.
     leaps: u32,
 }
 
@@ -56,7 +57,7 @@ fn nanoseconds(span: Duration) -> i64 {
 }
 
 impl Stamps {
-    /// The stamps of a topic of which nothing was heard yet.
+    /// Creates the state before the first message.
     pub fn new(clock: StampClock, late_after: Duration) -> Self {
         Self {
             clock,
@@ -70,15 +71,15 @@ impl Stamps {
         }
     }
 
-    /// How many leaps of the base's clock were believed.
+    /// Returns the number of jumps of the base's clock that were accepted.
     pub fn leaps(&self) -> u32 {
         self.leaps
     }
 
-    /// When the message was measured.
+    /// Returns the time of measurement by the agent's monotonic clock.
     ///
     /// # Errors
-    /// [`Refusal::Stamp`] for a stamp that leapt, [`Refusal::Late`] for an old one, and
+    /// [`Refusal::Stamp`] for a stamp that jumped, [`Refusal::Late`] for an old one, and
     /// [`Refusal::OutOfOrder`] for one that is not newer than the last.
     pub fn place(&mut self, stamp_ns: i64, arrival: Arrival) -> Result<Duration, Refusal> {
         let now_ns = nanoseconds(arrival.monotonic);
@@ -119,7 +120,7 @@ impl Stamps {
         }
         let is_back = |last_ns: i64| stamp_ns < last_ns.saturating_sub(SAME_NS);
         if self.last_stamp_ns.is_some_and(is_back) {
-            // One such message is out of order; many are of a clock that was put back.
+            // A single such message is out of order; many mean that the clock was set back.
             return self.leapt(seen_ns, Refusal::OutOfOrder);
         }
         self.leap = None;

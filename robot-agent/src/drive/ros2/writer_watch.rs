@@ -1,17 +1,16 @@
-//! Who writes on a topic: one writer, its messages in order.
+//! Checks that the messages of a topic are of one writer and in order.
 //!
-//! A writer that starts again numbers its messages from the beginning. Under another identifier it
-//! takes the topic over once the former writer has been silent. Under the same identifier its low
-//! numbers look like messages that were heard before, and two things tell them apart:
+//! A writer that restarts numbers its messages from the beginning. Under another identifier it
+//! replaces the former writer once that has been silent for [`SILENT_AFTER`]. Under the same
+//! identifier its low numbers look like repeated messages; it is accepted as restarted in two
+//! cases:
 //!
-//! * their source times are newer than any that was heard: the writer's clock went on, and
-//!   [`AGREE_MIN`] messages in a row are enough;
-//! * else, where the writer's clock began again too, the writer has been silent for
-//!   [`SILENT_AFTER`], none of the messages is one of the last [`REMEMBERED`], and
-//!   [`AGREE_WITHOUT_CLOCK_MIN`] of them come in a row.
+//! * its source times are newer than all before, in [`AGREE_MIN`] consecutive messages;
+//! * its clock restarted too, the writer had been silent for [`SILENT_AFTER`], and
+//!   [`AGREE_WITHOUT_CLOCK_MIN`] consecutive messages are none of the last [`REMEMBERED`].
 //!
-//! The caller looks at a message first and follows it only if its content is usable as well, so that
-//! old data which is repeated never counts as a writer that starts again.
+//! The caller checks a message by [`WriterWatch::look`], and calls [`WriterWatch::follow`] only if
+//! its content is valid, so that repeated old data never count as a restarted writer.
 
 use std::time::Duration;
 
@@ -19,23 +18,23 @@ use tread_ros2::rmw::{Attachment, GID_BYTES};
 
 use super::refusal::Refusal;
 
-/// Silence after which another writer may take the topic over: a node that was started again.
+/// Silence of a writer after which another one may replace it, such as a restarted node.
 const SILENT_AFTER: Duration = Duration::from_millis(200);
-/// Messages in a row that show that a writer started again.
+/// Number of consecutive messages that show a restart by their source times.
 pub const AGREE_MIN: u32 = 3;
-/// The same where the writer's clock does not show it.
+/// Number of consecutive messages that show a restart where the source times do not.
 pub const AGREE_WITHOUT_CLOCK_MIN: u32 = 10;
-/// Newest messages that are known again when they are repeated.
+/// Number of newest messages that are recognised when repeated.
 const REMEMBERED: usize = 64;
 
-/// How a message follows those before it.
+/// Relation of a message to those before it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Order {
-    /// It is the first, or a later one of the same writer.
+    /// The first message, or a later one of the same writer.
     Continues,
-    /// The writer started again, or another took over from one that fell silent.
+    /// The writer restarted, or another one replaced a silent one.
     Restarted,
-    /// The writer may have started again; more messages must agree.
+    /// The writer may have restarted; more messages are needed.
     MayHaveRestarted,
 }
 
@@ -50,16 +49,16 @@ pub struct WriterWatch {
 struct Heard {
     gid: [u8; GID_BYTES],
     sequence: i64,
-    /// The newest source time of all its messages.
+    /// Newest source time of all its messages, nanoseconds.
     source_time_ns: i64,
     at: Duration,
-    /// Numbers and source times of the newest messages, in a ring.
+    /// Sequence numbers and source times of the newest messages, in a ring buffer.
     recent: [(i64, i64); REMEMBERED],
-    /// How many there were.
+    /// Number of messages so far.
     count: usize,
 }
 
-/// Messages that look like those of a writer that started again.
+/// Newest message and number of messages that look like those of a restarted writer.
 #[derive(Debug, Clone, Copy)]
 struct Restart {
     sequence: i64,
@@ -75,10 +74,11 @@ impl Heard {
 }
 
 impl WriterWatch {
-    /// Looks whether a message is the next one of the topic's writer.
+    /// Checks whether a message follows those before it; changes nothing.
     ///
     /// # Errors
-    /// [`Refusal::OutOfOrder`] for one that came already, [`Refusal::SecondWriter`] for another's.
+    /// [`Refusal::OutOfOrder`] for a repeated or older message, [`Refusal::SecondWriter`] for one
+    /// of another writer while the topic's writer is active.
     pub fn look(&self, message: &Attachment, now: Duration) -> Result<Order, Refusal> {
         let Some(heard) = &self.writer else {
             return Ok(Order::Continues);
@@ -117,7 +117,7 @@ impl WriterWatch {
         })
     }
 
-    /// Follows a message that was looked at and whose content is usable.
+    /// Records a message that was checked and has valid content.
     pub fn follow(&mut self, message: &Attachment, order: Order, now: Duration) {
         if order == Order::MayHaveRestarted {
             let before = self.restart.filter(|restart| is_after(message, restart));
@@ -154,7 +154,7 @@ impl WriterWatch {
     }
 }
 
-/// Whether a message comes after the newest of a writer that may have started again.
+/// Whether a message follows the newest one of a writer that may have restarted.
 fn is_after(message: &Attachment, restart: &Restart) -> bool {
     message.sequence > restart.sequence && message.source_time_ns >= restart.source_time_ns
 }

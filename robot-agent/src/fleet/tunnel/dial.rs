@@ -1,4 +1,5 @@
-//! One connection to the robots' port: TCP, TLS with the robot's certificate, and the credentials.
+//! One connection to the robots' port: TCP, TLS with the robot's certificate, and the router's
+//! credentials.
 
 use std::io;
 use std::str::FromStr as _;
@@ -21,33 +22,33 @@ use zenoh::config::EndPoint;
 use crate::fleet::LinkError;
 use crate::membership::Membership;
 
-/// Longest try to connect. The kernel repeats its first packet every second, so a healed network is
-/// found within that, and this lies between two repetitions. It is also the time that a far and
-/// narrow link has for the round trips of TCP and TLS.
+/// Timeout of one attempt to connect. The kernel repeats its first packet every second, so a
+/// restored network is found within that; this value lies between two repetitions. It also bounds
+/// the round trips of TCP and TLS on a link of high delay.
 const DIAL_TIMEOUT: Duration = Duration::from_millis(2_500);
-/// Send buffer of the kernel, bytes, unless the endpoint names one: priorities act only above that
-/// buffer, so on a slow link a large one makes everything wait behind the bulk.
+/// Kernel send buffer, bytes, unless the endpoint names one: priorities act only above that buffer,
+/// so on a slow link a large one delays urgent messages behind bulk data.
 const SEND_BUFFER_BYTES: u32 = 24 * 1024;
-/// What rustls takes of what the socket cannot, bytes.
+/// Data that rustls buffers when the socket's buffer is full, bytes.
 const TLS_BUFFER_BYTES: usize = 4 * 1024;
-/// The protocol that an endpoint through the tunnel names.
+/// Protocol name of an endpoint that is reached through the tunnel.
 const PROTOCOL: &str = "tls";
-/// The setting of an endpoint for the size of the send buffer, as zenoh calls it.
+/// Key of the send buffer's size in an endpoint, as in zenoh.
 const SEND_BUFFER_KEY: &str = "so_sndbuf";
 
-/// Why a connection could not be made; another try may.
+/// Why a connection could not be made; another attempt may succeed.
 #[derive(Debug, thiserror::Error)]
 pub enum DialError {
-    /// The name is not known, nobody listens there, or the handshake failed.
+    /// The name cannot be resolved, no process listens there, or the handshake failed.
     #[error("the server's robot port cannot be reached")]
     Unreachable(#[source] io::Error),
-    /// The server shows a certificate of an authority that this robot does not trust.
+    /// The server's certificate is of an authority that this robot does not trust.
     #[error("the server's robot port is of another authority than this robot trusts")]
     Distrusted(#[source] io::Error),
-    /// It took too long.
+    /// The connection was not made in time.
     #[error("the server's robot port did not answer in time")]
     TooSlow,
-    /// What the server sent is not what a server of this version sends.
+    /// The server's protocol or credentials are not those of this version.
     #[error("the server's robot port does not speak this version of the protocol")]
     NotUnderstood,
 }
@@ -56,7 +57,7 @@ impl From<io::Error> for DialError {
     fn from(cause: io::Error) -> Self {
         let tls = cause.get_ref().and_then(|cause| cause.downcast_ref());
         match tls {
-            // Two authorities may have the same name, and then it is the signature that is wrong.
+            // Two authorities may have the same name; then the signature is wrong.
             Some(rustls::Error::InvalidCertificate(
                 CertificateError::UnknownIssuer | CertificateError::BadSignature,
             )) => Self::Distrusted(cause),
@@ -65,7 +66,7 @@ impl From<io::Error> for DialError {
     }
 }
 
-/// Where the robots' port is.
+/// Address of the robots' port.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct PortAddress {
     host: String,
@@ -74,7 +75,7 @@ struct PortAddress {
 }
 
 impl PortAddress {
-    /// Reads an endpoint such as `tls/tread.example:7447`.
+    /// Parses an endpoint such as `tls/tread.example:7447`.
     fn read(endpoint: &str) -> Result<Self, LinkError> {
         let failed = |problem: &str| LinkError::Endpoint {
             endpoint: endpoint.to_owned(),
@@ -114,7 +115,7 @@ pub(super) struct Dialer {
     connector: TlsConnector,
 }
 
-/// A connection on which the robot has shown its certificate.
+/// A TLS connection on which the robot has presented its certificate.
 pub(super) type Connection = TlsStream<TcpStream>;
 
 /// Checks that a text is an endpoint of the robots' port.
@@ -134,8 +135,10 @@ fn server_name(address: &PortAddress, endpoint: &str) -> Result<ServerName<'stat
 }
 
 impl Dialer {
+    /// Creates a dialer.
+    ///
     /// # Errors
-    /// [`LinkError`]: the endpoint is none, or the certificate cannot be used.
+    /// [`LinkError`]: the endpoint is invalid, or the certificate cannot be used.
     pub(super) fn new(endpoint: &str, membership: &Membership) -> Result<Self, LinkError> {
         let address = PortAddress::read(endpoint)?;
         let name = server_name(&address, endpoint)?;
@@ -147,14 +150,16 @@ impl Dialer {
         })
     }
 
-    /// Connects; `first` is sent as soon as the server has shown who it is.
+    /// Connects; `first` is sent as soon as the server is authenticated. Returns the connection and
+    /// the router's credentials.
     pub(super) async fn dial(
         &self,
         first: &[u8],
     ) -> Result<(Connection, RouterCredentials), DialError> {
         let dialling = async {
             let stream = self.connect().await?;
-            // rustls would take 64 KiB of what the socket cannot, below all priorities.
+            // Otherwise rustls would buffer 64 KiB when the socket is full, regardless of
+            // priorities.
             let bound = |tls: &mut ClientConnection| tls.set_buffer_limit(Some(TLS_BUFFER_BYTES));
             let connecting = self
                 .connector
@@ -175,7 +180,7 @@ impl Dialer {
             .unwrap_or(Err(DialError::TooSlow))
     }
 
-    /// Connects to the first address of the name that answers.
+    /// Connects to the first address of the name that accepts.
     async fn connect(&self) -> io::Result<TcpStream> {
         let mut failed = io::Error::from(io::ErrorKind::NotFound);
         for address in lookup_host((&*self.address.host, self.address.port)).await? {
@@ -210,7 +215,8 @@ async fn read_credentials(stream: &mut Connection) -> Result<RouterCredentials, 
     serde_json::from_slice(&json).map_err(|_| DialError::NotUnderstood)
 }
 
-/// TLS both ways: the robot shows its certificate, and takes only the fleet's server.
+/// Creates the configuration of mutual TLS 1.3: the robot's certificate, and the fleet's
+/// authorities.
 fn client_config(membership: &Membership) -> Result<ClientConfig, rustls::Error> {
     let unreadable = |_| rustls::Error::General("it does not read as PEM".to_owned());
     let mut roots = RootCertStore::empty();

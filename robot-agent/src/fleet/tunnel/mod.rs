@@ -5,11 +5,11 @@
 //! ```
 //!
 //! zenoh's own TLS link reads and writes one rustls stream from two tasks at once, which is
-//! undefined behaviour. So zenoh speaks plain TCP to a port of this process, and each of its
+//! undefined behaviour. So zenoh uses plain TCP to a port of this process, and each of its
 //! connections is joined to a TLS connection of its own. Other programs on the robot can reach the
-//! local port too: nothing is dialled for a connection that does not begin with the session id,
-//! whose lower half is random and known to this process alone, and the router asks for a password.
-//! Connections that have not shown it have places of their own.
+//! local port too: no connection to the server is made for one that does not begin with the session
+//! id, whose lower half is random and known to this process alone, and the router requires a
+//! password. Connections that have not sent the id count against a limit of their own.
 
 mod dial;
 #[cfg(test)]
@@ -35,36 +35,36 @@ use super::session::{self, SessionUser};
 use super::{LinkError, Note, Noted};
 use crate::membership::Membership;
 
-/// How long a local connection may take to send its first message; zenoh sends it at once.
+/// Timeout of the first message on a local connection; zenoh sends it at once.
 const FIRST_MESSAGE_TIMEOUT: Duration = Duration::from_millis(500);
-/// Most bytes of the first message.
+/// Largest size of the first message, bytes.
 const FIRST_MESSAGE_BYTES_MAX: u16 = 1_024;
-/// Bytes of the length in front of zenoh's messages on a stream.
+/// Size of the length prefix of zenoh's messages on a stream, bytes.
 const MESSAGE_LENGTH_BYTES: usize = 2;
-/// Most connections of the session at a time. It has one, and for a moment a second.
+/// Largest number of simultaneous connections of the session, which needs one, briefly two.
 const CONNECTIONS_MAX: usize = 16;
-/// Most local connections at a time that have not shown the session id yet; the newest stay. They
-/// have their places apart, so that no other program on the robot takes those of the session.
+/// Largest number of simultaneous local connections that have not sent the session id; the oldest
+/// is closed. They are counted apart, so that other programs cannot use up the session's
+/// connections.
 const STRANGERS_MAX: usize = 16;
-/// Time between two lines of the log about other programs at the local port, which say how many
-/// came.
+/// Interval of the log lines that count other programs at the local port.
 const STRANGERS_LOG_EVERY: Duration = Duration::from_mins(1);
-/// Connections that the kernel keeps until they are accepted.
+/// Connections that the kernel queues until they are accepted.
 const BACKLOG: u32 = 16;
-/// Receive buffer of the local port, and bytes on their way within the tunnel, each way: what
-/// stands in them has lost its priority.
+/// Receive buffer of the local port, and buffer of the tunnel per direction, bytes; data in them
+/// are sent regardless of priority.
 const RECEIVE_BUFFER_BYTES: u32 = 4 * 1024;
 const COPY_BUFFER_BYTES: usize = 4 * 1024;
-/// First pause after a failed try to connect, and the longest.
+/// First and longest pause after a failed attempt to connect.
 const RETRY_FIRST: Duration = Duration::from_millis(100);
 const RETRY_MAX: Duration = Duration::from_millis(300);
-/// The longest pause while the server's authority is one that this robot does not trust. Each try
-/// counts as a failure of its address at the server, which other robots may share.
+/// Longest pause while the robot does not trust the server's authority. The server counts each
+/// attempt as a failure of its address, which other robots may share.
 const DISTRUSTED_RETRY_MAX: Duration = Duration::from_secs(10);
-/// Rest after the machine refused to accept a connection.
+/// Pause after the machine failed to accept a connection.
 const ACCEPT_REST: Duration = Duration::from_millis(100);
 
-/// An open tunnel. It closes when it is dropped.
+/// An open tunnel; dropping it closes it.
 #[derive(Debug)]
 pub struct Tunnel {
     local: SocketAddr,
@@ -73,21 +73,21 @@ pub struct Tunnel {
     _tasks: JoinSet<()>,
 }
 
-/// What the connections of one tunnel share.
+/// State shared by the connections of one tunnel.
 struct Shared {
     dialer: Dialer,
     credentials: RouterCredentials,
-    /// The session id as it stands in the session's first message.
+    /// Session id in the byte order of the session's first message.
     session_id: [u8; 16],
-    /// The connection by which the credentials came; the first one of the session takes it.
+    /// Connection by which the credentials were received; the session's first connection uses it.
     ready: Mutex<Option<Connection>>,
-    /// Places of the session's connections.
+    /// Permits for the session's connections.
     places: Semaphore,
     strangers: StrangersLog,
     stale: CancellationToken,
 }
 
-/// Counts other programs at the local port, and says now and then how many came.
+/// Counts other programs at the local port, and logs the number at intervals.
 #[derive(Default)]
 struct StrangersLog(std::sync::Mutex<StrangersCount>);
 
@@ -98,7 +98,7 @@ struct StrangersCount {
 }
 
 impl StrangersLog {
-    /// Another one came; how many since the last line, if one is due.
+    /// Counts one more; returns the number since the last log line if one is due.
     fn came(&self, now: tokio::time::Instant) -> Option<u64> {
         let mut counted = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         counted.count += 1;
@@ -131,17 +131,18 @@ pub(super) fn check_endpoint(endpoint: &str) -> Result<(), LinkError> {
 }
 
 impl Tunnel {
-    /// Connects, however long that takes. Dropped before it is done, it leaves nothing behind.
+    /// Connects, retrying until it succeeds. If the future is dropped, nothing is left behind.
     ///
     /// # Errors
-    /// [`LinkError`]: the endpoint is none, the certificate cannot be used, or the machine gives
-    /// no port or random numbers.
+    /// [`LinkError`]: the endpoint is invalid, the certificate cannot be used, or no local port can
+    /// be opened.
     pub async fn open(endpoint: &str, membership: &Membership) -> Result<Self, LinkError> {
         let nobody: Note = Arc::new(|_noted| {});
         Self::open_noting(endpoint, membership, &nobody).await
     }
 
-    /// The same, and notes when the server shows a certificate that the robot does not trust.
+    /// Connects as [`Tunnel::open`] does, and notes a server whose certificate the robot does not
+    /// trust.
     ///
     /// # Errors
     /// As [`Tunnel::open`].
@@ -203,23 +204,23 @@ impl Tunnel {
         })
     }
 
-    /// How a session through this tunnel is opened.
+    /// Creates the configuration of a session through this tunnel.
     ///
     /// # Errors
-    /// zenoh refuses its configuration.
+    /// [`LinkError`] if zenoh refuses a setting.
     pub fn session_config(&self) -> Result<zenoh::Config, LinkError> {
         session::through_tunnel(self.local, &self.user)
     }
 
     /// Waits until a session through this tunnel can no longer connect: the server has other
-    /// credentials for this robot, or shows a certificate that the robot does not trust. Another
-    /// tunnel gets them, or tells of it.
+    /// credentials for this robot, or a certificate that the robot does not trust. A new tunnel
+    /// must then be opened.
     pub async fn stale(&self) {
         self.stale.cancelled().await;
     }
 }
 
-/// The pause after another failed try.
+/// Returns the pause after another failed attempt.
 fn next_pause(pause: Duration, cause: &DialError) -> Duration {
     let longest = match cause {
         DialError::Distrusted(_) => DISTRUSTED_RETRY_MAX,
@@ -237,10 +238,10 @@ fn listen() -> io::Result<TcpListener> {
 }
 
 async fn serve(listener: TcpListener, shared: Arc<Shared>) {
-    // However this ends, the owner opens another tunnel.
+    // However this task ends, the owner opens another tunnel.
     let _stale = shared.stale.clone().drop_guard();
     let mut connections = JoinSet::new();
-    // Those that have not shown the session id, the oldest first.
+    // Connections that have not sent the session id, oldest first.
     let mut strangers: VecDeque<CancellationToken> = VecDeque::new();
     while !shared.stale.is_cancelled() {
         let accepted = tokio::select! {
@@ -268,8 +269,9 @@ async fn serve(listener: TcpListener, shared: Arc<Shared>) {
     }
 }
 
-/// Takes a local connection: the session's is joined with the server, any other closed. `known` is
-/// cancelled when its place among those that have shown nothing is free, or is taken from it.
+/// Reads the first message of a local connection; joins one with the session id to the server,
+/// closes any other. `known` is cancelled when the connection has sent its first message, or is
+/// closed for a newer one.
 async fn take(mut local: TcpStream, shared: Arc<Shared>, known: CancellationToken) {
     if let Err(cause) = local.set_nodelay(true) {
         debug!("cannot send at once: {cause}");
@@ -291,7 +293,7 @@ async fn take(mut local: TcpStream, shared: Arc<Shared>, known: CancellationToke
     join(local, &shared, first).await;
 }
 
-/// Joins one connection of the session with one to the server, until either of them ends.
+/// Joins one connection of the session to one to the server, until either ends.
 async fn join(local: TcpStream, shared: &Shared, first: Vec<u8>) {
     let ready = shared.ready.lock().await.take();
     let connected = match ready {
@@ -316,12 +318,14 @@ async fn join(local: TcpStream, shared: &Shared, first: Vec<u8>) {
     }
 }
 
-/// Connects again; the first message is sent along, since the credentials are most likely the same.
+/// Connects again; the first message is sent along, since the credentials are most likely
+/// unchanged.
 async fn reconnect(shared: &Shared, first: &[u8]) -> Result<Connection, DialError> {
     let dialled = shared.dialer.dial(first).await;
     if matches!(dialled, Err(DialError::Distrusted(_))) {
-        // The session cannot come back by what this tunnel trusts. Opening another one tells of it,
-        // so that the robot asks for a certificate of the authority that there is now.
+        // The session cannot reconnect with the authorities that this tunnel trusts. Opening
+        // another tunnel notes it, so that the robot requests a certificate of the present
+        // authority.
         shared.stale.cancel();
     }
     let (connection, credentials) = dialled?;
@@ -332,7 +336,7 @@ async fn reconnect(shared: &Shared, first: &[u8]) -> Result<Connection, DialErro
     Ok(connection)
 }
 
-/// The first message, with its length in front.
+/// Reads the first message, including its length prefix.
 async fn read_message(local: &mut TcpStream) -> io::Result<Vec<u8>> {
     let length = local.read_u16_le().await?;
     if length > FIRST_MESSAGE_BYTES_MAX {

@@ -1,4 +1,4 @@
-//! What holds a mission: stops, leases, limits, a silent base, sensors, and what bounds a hold.
+//! Holds the mission for stops, leases, limits, a silent base or sensors, and bounds these holds.
 
 use std::time::Duration;
 
@@ -14,16 +14,17 @@ use crate::control_loop::tick::STANDING;
 use crate::control_loop::tick::sensing::Sensed;
 use crate::safety::microseconds;
 
-/// How long a base that was silent must be heard before its mission goes on.
+/// Time for which a base that was silent must be heard before its mission goes on.
 const HEARD_AGAIN_FOR: Duration = Duration::from_millis(500);
-/// Longest time that a mission is held for sensors; then it fails. A finding on the place that ends
-/// at rest, after 10 s, leaves time for the mission to go on.
+/// Longest hold for sensors, after which the mission fails. A position finding that ends at
+/// standstill, after 10 s, leaves time for the mission to go on.
 const SENSORS_HOLD_MAX: Duration = Duration::from_secs(15);
-/// The same where the position leapt: nobody drives on by a place that was believed meanwhile.
+/// Longest hold for sensors where the position jumped, after which the mission fails: it must not
+/// go on from a position that was accepted meanwhile.
 const LEAPT_HOLD_MAX: Duration = Duration::from_secs(10);
 
 impl MissionStage {
-    /// Pauses, holds or slows the mission where stops, leases, limits or sensors ask for it.
+    /// Pauses, holds or slows the mission for stops, leases, limits, a late loop and sensors.
     pub(super) fn hold_for_demands(&mut self, input: &MissionInput<'_>) {
         let now = input.tick.now.monotonic;
         let now_us = microseconds(now);
@@ -46,7 +47,8 @@ impl MissionStage {
         active.limit_speed(most_m_s);
     }
 
-    /// What must not last for ever: the server's silence, and waiting for a revision.
+    /// Ends the mission after the longest silence of the server, and the hold for a revision after
+    /// its bound.
     pub(super) fn check_bounds(&mut self, now: Duration, server_silence: Duration) {
         let Some(active) = &mut self.active else {
             self.replacement_until = None;
@@ -61,8 +63,7 @@ impl MissionStage {
         }
     }
 
-    /// Holds the mission of a base that is silent, and lets it go on when that is heard again for a
-    /// while.
+    /// Holds the mission while the base is silent and for [`HEARD_AGAIN_FOR`] afterwards.
     pub(super) fn hold_for_base(&mut self, now: Duration, fault: Option<Fault>) {
         if fault == Some(Fault::BaseSilent) {
             self.base_silent_at = Some(now);
@@ -78,9 +79,11 @@ impl MissionStage {
         }
     }
 
-    /// Holds the mission while a sensor that it drives by is wrong, and ends it when that lasts.
+    /// Holds the mission while a sensor that it needs is contradicted, and fails it when that
+    /// lasts.
     ///
-    /// A faulty base may never be seen to stand, so that the mission ends as it is.
+    /// The mission ends without braking along the path, since a faulty base may never be measured
+    /// at standstill.
     pub(super) fn hold_for_sensors(&mut self, at: Moment, sensed: &Sensed, events: &mut Outgoing) {
         let now = at.monotonic;
         let is_on_hold = sensed.must_hold() && self.active.is_some();
