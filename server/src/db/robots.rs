@@ -39,7 +39,7 @@ pub struct RobotRow {
     pub first_seen_at: Timestamp,
     /// Last hello.
     pub last_hello_at: Timestamp,
-    /// Counts of its uploaded measurements.
+    /// Counts of its refused and deferred measurements.
     pub measurements: MeasurementsTaken,
 }
 
