@@ -1,8 +1,8 @@
-//! Alerts: what robots say needs a person's attention, kept with its history.
+//! Alerts: conditions that robots report for a person's attention, stored with their history.
 //!
-//! A robot says all its alerts in each state; the difference to what is raised here raises and
-//! clears. A robot that is not heard clears nothing. Alerts about the server itself are those of
-//! [`super::storage`].
+//! Each state message lists all alerts of its robot. Comparing that list with the alerts that are
+//! raised here raises and clears alerts; a robot that is offline clears none. Alerts about the
+//! server itself are in [`super::storage`].
 
 use jiff::Timestamp;
 use tread_api::ids::{AlertCode, AlertId, MissionId};
@@ -20,11 +20,11 @@ use crate::app::presence::RobotKey;
 pub use crate::db::alerts::AlertFilter;
 use crate::db::{self, DbError, Outcome};
 
-/// The alert of a mission that failed.
+/// Code of the alert about a mission that failed.
 pub(super) const MISSION_FAILED_ALERT: &str = "mission-failed";
-/// Alerts of one robot that are kept; the oldest that have cleared go first.
+/// Maximum number of alerts stored per robot. Beyond it the oldest cleared ones are deleted first.
 const KEPT_MAX: u32 = 500;
-/// Alerts that the server raises and ends, whatever the robot says.
+/// Codes of alerts that the server itself raises and clears, independently of the robot's reports.
 const OWN_ALERTS: [&str; 6] = [
     UNCONFIRMED_ALERT,
     REVOKED_ALERT,
@@ -35,7 +35,7 @@ const OWN_ALERTS: [&str; 6] = [
 ];
 
 impl App {
-    /// Alerts, newest first.
+    /// Returns a page of alerts, newest first.
     pub async fn alerts(&self, filter: &AlertFilter, limit: u32) -> Result<Page<Alert>, AppError> {
         let mut tx = self.db().read("alerts").await?;
         check_named(
@@ -51,14 +51,15 @@ impl App {
         Ok(page(alerts, limit, |alert: &Alert| alert.id.to_string()))
     }
 
-    /// Whose alert it is; `None` for one about the server itself, and if it is not known.
+    /// Returns the robot that an alert is about; `None` for one about the server itself or an
+    /// unknown identifier.
     pub async fn alert_place(&self, id: AlertId) -> Result<Option<RobotKey>, AppError> {
         let mut tx = self.db().read("alerts").await?;
         let found = db::alerts::find(&mut tx, id).await?;
         Ok(found.and_then(|alert| alert.robot_key()))
     }
 
-    /// Notes that a person has seen an alert. One that tells of something past is cleared by that.
+    /// Marks an alert as acknowledged by a person. This also clears the alert of a failed mission.
     pub async fn acknowledge_alert(&self, id: AlertId) -> Result<Alert, AppError> {
         if let Some(alert) = self.storage().acknowledge(id, self.clock().now()) {
             self.hub().alert(&alert);
@@ -83,12 +84,12 @@ impl App {
         Ok(alert)
     }
 
-    /// Writes down what robots have begun or ceased to say.
+    /// Stores the alerts that robots have raised or cleared in their reports since the last call.
     pub(super) async fn sync_alerts(&self) -> Result<(), AppError> {
         for (key, said) in self.presences().take_alert_changes() {
             match self.sync_alerts_of(&key, &said).await {
                 Ok(true) => {}
-                // A robot may speak before it has introduced itself.
+                // A robot may report alerts before its hello.
                 Ok(false) => self.presences().return_alert_change(&key),
                 Err(error) => {
                     self.presences().return_alert_change(&key);
@@ -99,7 +100,8 @@ impl App {
         Ok(())
     }
 
-    /// False for a robot that is not known yet, or that raises too many of late.
+    /// Returns false if the robot is not known yet, or if its allowance did not cover all new
+    /// alerts.
     async fn sync_alerts_of(&self, key: &RobotKey, said: &[AlertReport]) -> Result<bool, AppError> {
         let said = &said[..said.len().min(ALERTS_MAX)];
         let mut tx = self.db().read("alerts").await?;
@@ -114,11 +116,11 @@ impl App {
         let now = self.clock().now();
         let has = |alert: &Alert| said.iter().any(|report| report.code == alert.code);
         let is_new = |report: &&AlertReport| !raised.iter().any(|alert| alert.code == report.code);
-        // What the server itself has raised is not for the robot to end.
+        // A robot cannot clear an alert that the server itself raised.
         let own = |alert: &&Alert| OWN_ALERTS.contains(&alert.code.as_str());
         let gone = raised.iter().filter(|alert| !has(alert) && !own(alert));
         let gone: Vec<&Alert> = gone.collect();
-        // What may not be raised now is looked at again, until it may or is no longer said.
+        // An alert beyond the allowance is tried again until it is raised or no longer reported.
         let (mut new, mut has_all) = (Vec::new(), true);
         for report in said.iter().filter(is_new) {
             let elapsed = self.clock().elapsed();
@@ -149,8 +151,8 @@ impl App {
         Ok(has_all)
     }
 
-    /// Raises the alert of a mission that failed, and ends that of an earlier one; a mission that
-    /// succeeds ends it too.
+    /// Raises the alert of a mission that failed and clears that of an earlier one. A mission that
+    /// succeeds clears it too.
     pub(super) async fn alert_mission_end(
         &self,
         tx: &mut db::Tx,
@@ -170,7 +172,7 @@ impl App {
         Ok(changed)
     }
 
-    /// The same for a report that was taken.
+    /// Raises or clears the alert of a failed mission after a robot's mission report was accepted.
     pub(super) async fn alert_report(
         &self,
         tx: &mut db::Tx,
@@ -185,7 +187,7 @@ impl App {
         self.alert_mission_end(tx, robot_pk, ended).await
     }
 
-    /// Raises an alert of the server's own about a robot, unless it is raised already.
+    /// Raises one of the server's own alerts about a robot, unless it is raised already.
     pub(super) async fn begin_alert(
         &self,
         tx: &mut db::Tx,
@@ -210,7 +212,7 @@ impl App {
         db::alerts::find(tx, id).await
     }
 
-    /// Ends an alert of the server's own.
+    /// Clears one of the server's own alerts about a robot.
     pub(super) async fn end_alert(
         &self,
         tx: &mut db::Tx,
@@ -225,7 +227,7 @@ impl App {
         db::alerts::find(tx, alert.id).await
     }
 
-    /// Commits, and then shows alerts that were written, whether or not anybody waits for it.
+    /// Commits, and then publishes the alerts that were written, even if the caller is cancelled.
     pub(super) async fn commit_alerts(
         &self,
         tx: db::Tx,
@@ -240,7 +242,7 @@ impl App {
         Ok(committed.await?)
     }
 
-    /// Shows alerts that were written.
+    /// Publishes alerts that were written to the feed of events.
     pub(super) fn show_alerts(&self, alerts: &[Alert]) {
         if !alerts.is_empty() {
             self.robots_changed();

@@ -1,7 +1,7 @@
-//! How often a robot may have something written down that nobody asked for.
+//! Rate limits on what robots make the server store unasked.
 //!
-//! What a robot makes the server keep is bounded in number, and here in time: some at once, then
-//! one in a while. In memory; a restart of the server begins anew.
+//! What is stored for one robot is bounded in number; the limits here bound its rate, each with a
+//! burst and an interval. They are in memory, so a restart of the server resets them.
 
 use std::collections::HashMap;
 use std::hash::Hash;
@@ -13,26 +13,26 @@ use tread_api::ids::AlertCode;
 use crate::app::presence::RobotKey;
 use crate::rate_limit::{Bucket, RateLimit};
 
-/// Alerts of one code: a robot that raises and ends one all the time leaves room for the others.
+/// Limit for alerts of one code: a robot that raises and clears one alert all the time leaves room
+/// for its others.
 const ALERTS_OF_ONE_CODE: RateLimit = RateLimit {
     burst: 10,
     interval: Duration::from_secs(30),
 };
 
-/// Robots and kinds that are kept track of before those that have their whole allowance again are
-/// forgotten.
+/// Number of entries (robot and kind) above which those with a full allowance are forgotten.
 const KEPT_MAX: usize = 50_000;
 
-/// What a robot makes the server write down.
+/// Kind of record that a robot makes the server store.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) enum Kind {
     /// A run of its agent.
     Run,
     /// Another configuration than before.
     Configuration,
-    /// An alert.
+    /// An alert that the robot raises.
     Alert,
-    /// A stop of its own.
+    /// A stop that the robot caused itself.
     Stop,
 }
 
@@ -54,7 +54,7 @@ struct Taken {
     by_code: HashMap<(RobotKey, AlertCode), Bucket>,
 }
 
-/// What all robots have taken of their allowances.
+/// Allowances used so far, by robot.
 #[derive(Debug, Default)]
 pub(super) struct Allowances(Mutex<Taken>);
 
@@ -63,13 +63,14 @@ impl Allowances {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Takes one, if there is one left.
+    /// Takes one unit of the robot's allowance of this kind; false if none is left at `now`.
     pub(super) fn take(&self, robot: &RobotKey, kind: Kind, now: Duration) -> bool {
         let key = (robot.clone(), kind);
         take_of(&mut self.lock().by_kind, key, kind.limit(), now)
     }
 
-    /// Takes an alert of that code, if the robot may raise one and has not raised this one too often.
+    /// Takes one alert of this code; false if the allowance of the robot's alerts or of this code
+    /// is used up.
     pub(super) fn take_alert(&self, robot: &RobotKey, code: &AlertCode, now: Duration) -> bool {
         let mut taken = self.lock();
         let of_code = (robot.clone(), code.clone());
@@ -124,7 +125,7 @@ mod tests {
         let raised = (0..1_000).filter(|_| take(&flapping, Duration::ZERO));
         assert_eq!(raised.count(), 10);
         assert!(take(&code("does-not-stand"), Duration::ZERO));
-        // Of ever new codes there are as many as alerts in all.
+        // Alerts of ever new codes are limited by the allowance of all alerts of the robot.
         let others = (0..1_000).map(|number| code(&format!("code-{number}")));
         let raised = others.filter(|code| take(code, Duration::ZERO)).count();
         assert_eq!(raised, 40 - 11);

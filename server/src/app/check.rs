@@ -1,4 +1,4 @@
-//! Dry runs: what a trajectory would ask of a robot, planned by the robot's own planner.
+//! Dry runs: plans a trajectory with the robot's own planner, without moving the robot.
 
 mod drawn;
 mod start;
@@ -27,18 +27,19 @@ use self::start::{Start, after, earlier};
 use super::{App, AppError, site_row};
 use crate::db;
 
-/// Dry runs that may be planned at once: a long path keeps a core busy.
+/// Maximum number of dry runs planned at once: a long path keeps a processor core busy.
 pub const CHECKS_MAX: usize = 2;
-/// θ that may be assumed: from K 1000 to K 0.1.
+/// Range of θ that a dry run may assume: K from 1000 down to 0.1.
 const THETA_RANGE: RangeInclusive<f64> = 0.001..=10.0;
 /// Least step in which a path is compared with a geofence, metres.
 const FENCE_STEP_M: f64 = 0.02;
-/// Most steps of that; the least one grows with longer paths.
+/// Maximum number of steps per path in the geofence comparison; longer paths use a longer least
+/// step.
 const FENCE_STEPS_MAX: f64 = 500_000.0;
 
 impl App {
-    /// Plans a trajectory for a robot without moving anything: from where the robot will be after
-    /// what it drives and what is queued before, unless the request says from where.
+    /// Plans a trajectory for a robot without moving it. Planning begins at the pose expected after
+    /// the robot's active and queued missions, unless the request gives a pose.
     ///
     /// # Errors
     /// [`AppError::Impossible`] names place and reason; site and robot must be known.
@@ -114,12 +115,12 @@ impl App {
 }
 
 impl App {
-    /// Refuses a trajectory that leaves the site's geofence, on it or on the approach to its begin
-    /// from where the robot will be after what it drives and what is queued before. Without a
-    /// geofence it costs nothing.
+    /// Refuses a trajectory that leaves the site's geofence, on its path or on the approach from
+    /// the pose expected after the robot's active and queued missions. Does nothing if the site has
+    /// no geofence.
     ///
     /// # Errors
-    /// [`AppError::CrossesGeofence`] names the place.
+    /// [`AppError::CrossesGeofence`] gives the place.
     pub(super) async fn check_fence(
         &self,
         (site, robot): (&SiteId, &RobotId),
@@ -144,7 +145,7 @@ impl App {
             let start = after(first, &before, &row.model);
             match planned(&row.model, &trajectory, start.pose) {
                 Ok(planned) => fenced(&planned, &trajectory, &fence),
-                // What cannot be planned is the robot's to refuse.
+                // A trajectory that cannot be planned is refused by the robot.
                 Err(_impossible) => Ok(()),
             }
         };
@@ -154,7 +155,7 @@ impl App {
         }
     }
 
-    /// Where a robot is now, before whatever it has to drive first.
+    /// Returns the robot's present pose, or, if it shows none, the begin of the trajectory.
     fn expected_start(&self, (site, robot): (&SiteId, &RobotId), trajectory: &Trajectory) -> Start {
         let presence = self.presences().get(&(site.clone(), robot.clone()));
         let shown = presence.state().and_then(|state| state.pose);
@@ -170,7 +171,7 @@ impl App {
     }
 }
 
-/// The begin of the path, in its direction.
+/// Returns the first pose of the path; its heading is along the path unless the waypoint gives one.
 pub(super) fn begin_of(trajectory: &Trajectory) -> Pose {
     match trajectory {
         Trajectory::Circle(circle) => Pose {
@@ -201,18 +202,18 @@ pub(super) fn begin_of(trajectory: &Trajectory) -> Pose {
     }
 }
 
-/// What is assumed of the ground and of the base's sensors.
+/// Assumptions about the ground and the base's sensors.
 #[derive(Debug, Clone, Copy)]
 struct AssumedGround {
     theta: f64,
     has_torque: bool,
 }
 
-/// Why a trajectory cannot be driven, and where.
+/// Reason why a trajectory cannot be driven, and the place.
 pub(super) struct Refused {
     detail: String,
     place: Option<Place>,
-    /// Whether it leaves the geofence.
+    /// Whether the reason is that it leaves the geofence.
     crosses: bool,
 }
 
@@ -238,7 +239,7 @@ impl Refused {
     }
 }
 
-/// A plan with the model that it was made for.
+/// A plan and the robot model that it was made for.
 pub(super) struct Planned {
     model: robot::RobotModel,
     pub(super) plan: Plan,
@@ -306,7 +307,7 @@ fn check(
     })
 }
 
-/// Length of a path without what goes where it went before: further turns of a circle, metres.
+/// Length of a path in metres, with its approach; of a circle only the first turn counts.
 pub(super) fn once_m(plan: &Plan, trajectory: &Trajectory) -> f64 {
     match trajectory {
         Trajectory::Circle(circle) => {
@@ -317,7 +318,8 @@ pub(super) fn once_m(plan: &Plan, trajectory: &Trajectory) -> f64 {
     }
 }
 
-/// Walks the path in steps of the clearance that is left, so that no crossing is stepped over.
+/// Checks a plan against the geofence in steps of the remaining clearance, so that no crossing is
+/// missed.
 fn fenced(
     Planned { model, plan }: &Planned,
     trajectory: &Trajectory,
@@ -362,7 +364,7 @@ fn fenced(
     Ok(())
 }
 
-/// A geofence as the planner sees it.
+/// Converts a geofence to the planner's type.
 pub(super) fn control_fence(geofence: &Geofence) -> Fence {
     let rings = |polygons: &[Polygon]| {
         let ring = |polygon: &Polygon| {
@@ -483,7 +485,7 @@ fn control_trajectory(asked: &Trajectory) -> planned::Trajectory {
     }
 }
 
-/// What a user allows beside the trajectory, in the controller's words.
+/// Converts the limits that the request gives beside the trajectory to the planner's options.
 fn plan_options(asked: &Trajectory) -> PlanOptions<'static> {
     let options = asked.options();
     PlanOptions {

@@ -1,5 +1,5 @@
-//! Brings the database's log into its file a little at a time, so that no commit has to bring in
-//! much of it, and nobody who waits for a receipt waits for that.
+//! Checkpoints the database's write-ahead log in small steps, so that no commit, and no receipt
+//! that depends on one, waits for a large checkpoint.
 
 use std::time::Duration;
 
@@ -8,10 +8,10 @@ use tokio_util::sync::CancellationToken;
 use super::App;
 use crate::db;
 
-/// Time between two looks at the log.
+/// Interval between two checkpoints.
 const LOOK_EVERY: Duration = Duration::from_millis(250);
 
-/// Brings the log in now and then until the stop.
+/// Checkpoints the log periodically until the stop.
 pub async fn run(app: App, stop: CancellationToken) {
     while !stop.is_cancelled() {
         if let Err(cause) = db::limited(app.db().checkpoint()).await {

@@ -1,4 +1,4 @@
-//! Why a use case did not do it, in the words of the domain.
+//! Errors of use cases, in terms of the domain.
 
 use tread_api::geometry::Point;
 use tread_api::ids::{
@@ -10,7 +10,7 @@ use tread_api::trajectory::Place;
 use crate::authority::{AuthorityError, RotationRefused};
 use crate::db::DbError;
 
-/// Why a use case did not do it.
+/// Reason why a use case failed.
 #[derive(Debug, thiserror::Error)]
 pub enum AppError {
     /// No site of that name.
@@ -25,7 +25,7 @@ pub enum AppError {
     /// No mission of that identifier.
     #[error("mission `{0}` is not known")]
     UnknownMission(MissionId),
-    /// The identifier is in use.
+    /// The identifier is already in use.
     #[error("{what} `{id}` exists already")]
     AlreadyExists {
         /// What kind of thing.
@@ -33,7 +33,7 @@ pub enum AppError {
         /// Its identifier.
         id: String,
     },
-    /// The robot cannot do what is asked.
+    /// The request exceeds a limit of the robot.
     #[error("robot `{robot}` cannot do this: {detail}")]
     BeyondLimits {
         /// The robot.
@@ -54,30 +54,30 @@ pub enum AppError {
     MissionState {
         /// The mission.
         id: MissionId,
-        /// Where it stands.
+        /// Its present state.
         state: MissionState,
-        /// What was asked.
+        /// The requested change.
         asked: &'static str,
     },
-    /// The robot has another mission, and the new one was not to wait.
+    /// The robot has another open mission, and the start policy does not allow to wait.
     #[error("robot `{robot}` has mission `{mission}`, which is {}", state.as_str())]
     RobotBusy {
         /// The robot.
         robot: RobotId,
         /// The other mission.
         mission: MissionId,
-        /// Where it stands.
+        /// The state of that mission.
         state: MissionState,
     },
     /// The robot is retired.
     #[error("robot `{0}` is retired and gets no missions")]
     RobotRetired(RobotId),
-    /// The robot has no such ability.
+    /// The robot lacks a capability.
     #[error("robot `{robot}` does not say that it can {what}")]
     RobotCannot {
         /// The robot.
         robot: RobotId,
-        /// Which ability.
+        /// The capability.
         what: &'static str,
     },
     /// The trajectory cannot be driven.
@@ -102,16 +102,16 @@ pub enum AppError {
     /// No join token of that identifier.
     #[error("join token `{0}` is not known")]
     UnknownJoinToken(JoinTokenId),
-    /// It is about a site or robot that the token is not for.
+    /// The request concerns a site or robot outside the token's scope.
     #[error("{0}")]
     OutsideScope(String),
-    /// Somebody would give more than he has.
+    /// The request would grant rights that its sender does not have.
     #[error("{0}")]
     BeyondRights(String),
-    /// Robots do not join this server.
+    /// This server has no authority, so robots cannot join it.
     #[error("robots do not join this server: its configuration has no `[robots]`")]
     NoAuthority,
-    /// A rotation of the authority is under way, or none is.
+    /// The state of the rotation forbids the request.
     #[error(transparent)]
     Rotation(RotationRefused),
     /// Robots still hold certificates of the authority that is to be retired.
@@ -128,7 +128,7 @@ pub enum AppError {
     /// The authority's files cannot be written.
     #[error("the files of the fleet's authority cannot be written: {}", .0.what_became())]
     AuthorityFiles(#[source] AuthorityError),
-    /// The operating system gives no random numbers.
+    /// The operating system provides no random numbers.
     #[error("the operating system gives no random numbers: {0}")]
     NoRandomness(String),
     /// No stop of that identifier.
@@ -145,7 +145,7 @@ pub enum AppError {
     /// The robot does not answer.
     #[error("robot `{0}` does not answer; nobody knows whether it has heard")]
     RobotUnreachable(RobotId),
-    /// The robot will not.
+    /// The robot refused the command.
     #[error("robot `{robot}` refuses: {detail}")]
     RobotRefused {
         /// The robot.
@@ -153,7 +153,7 @@ pub enum AppError {
         /// Why.
         detail: String,
     },
-    /// The path leaves where robots of the site may be.
+    /// The path leaves the area that the site's geofence allows.
     #[error("robot `{robot}` may not drive this: {detail}")]
     CrossesGeofence {
         /// The robot.
@@ -163,7 +163,7 @@ pub enum AppError {
         /// Where.
         place: Place,
     },
-    /// A geofence would leave a robot outside.
+    /// A robot would be outside a new geofence.
     #[error(
         "robot `{robot}` stands at {point} and reaches {reach_m:.2} m around it: {depth_m:.2} m \
          beyond the border of {polygon} at {border}"
@@ -171,42 +171,42 @@ pub enum AppError {
     OutsideGeofence {
         /// The robot.
         robot: RobotId,
-        /// Where it stands.
+        /// Position of the robot's centre in the site frame.
         point: Point,
         /// Half the diagonal of its outline, metres.
         reach_m: f64,
-        /// The polygon that forbids it, as in the request.
+        /// The violated polygon, named as in the request.
         polygon: String,
-        /// The point of its border that is nearest.
+        /// Nearest point of that polygon's border, in the site frame.
         border: Point,
-        /// How far the robot reaches over it, metres.
+        /// Distance by which the robot's disc crosses that border, metres.
         depth_m: f64,
     },
-    /// Somebody else changed it first.
+    /// The object was changed meanwhile: its revision is not the expected one.
     #[error("the {what} is at revision {present} now, not {expected}")]
     ChangedMeanwhile {
-        /// What was to be changed.
+        /// The kind of object.
         what: &'static str,
         /// Its revision.
         present: u64,
         /// The revision that was named.
         expected: u64,
     },
-    /// A request with the same key is being answered.
+    /// A request with the same idempotency key is being answered.
     #[error("a request with this idempotency key is being answered; ask again in a moment")]
     KeyInFlight,
-    /// The key was used for another request.
+    /// The idempotency key was used for another request.
     #[error("this idempotency key was used for another request; take a new one")]
     KeyReused,
-    /// A bound on how many there may be is reached.
+    /// A limit on a number is reached.
     #[error("there are already {count} {what}; that is the most")]
     TooMany {
-        /// What there are too many of.
+        /// What is counted.
         what: &'static str,
-        /// The bound.
+        /// The limit.
         count: usize,
     },
-    /// A field of the request says something impossible.
+    /// A field of the request has an impossible value.
     #[error("{detail}")]
     Invalid {
         /// Which field.
@@ -214,7 +214,7 @@ pub enum AppError {
         /// What is wrong.
         detail: String,
     },
-    /// A parameter of the query says something impossible.
+    /// A query parameter has an impossible value.
     #[error("{detail}")]
     InvalidQuery {
         /// Which parameter.
@@ -222,7 +222,7 @@ pub enum AppError {
         /// What is wrong.
         detail: String,
     },
-    /// An answer cannot be written in its format.
+    /// The answer cannot be encoded in the requested format.
     #[error("the answer cannot be written: {0}")]
     Unwritable(String),
     /// The database failed.
@@ -231,7 +231,7 @@ pub enum AppError {
 }
 
 impl AppError {
-    /// The mission's state that forbids what is asked.
+    /// Returns the state of the mission that forbids the request.
     pub fn state(&self) -> Option<MissionState> {
         if let Self::MissionEnded { state, .. }
         | Self::MissionState { state, .. }
@@ -243,7 +243,7 @@ impl AppError {
         }
     }
 
-    /// Where along the path it cannot be driven.
+    /// Returns the place on the path that cannot be driven.
     pub fn place(&self) -> Option<Place> {
         if let Self::Impossible { place, .. } = *self {
             place
@@ -260,7 +260,7 @@ impl AppError {
         }
     }
 
-    /// The field or parameter that says something impossible.
+    /// Returns the field or parameter with an impossible value.
     pub fn field(&self) -> Option<&'static str> {
         match self {
             Self::Invalid { field, .. } => Some(field),

@@ -1,10 +1,10 @@
-//! The feed of events: what changes, in one order, to every client that asked for it.
+//! The feed of events: publishes changes in one order to all subscribed clients.
 //!
-//! One task reads the steps of missions from the database, in their order, and what is new of
-//! robots from memory; alerts come from where they are written. Each event is written as JSON once
-//! and goes to all clients through bounded buffers. A client whose buffer is full is dropped: it
-//! gets what it has, an `end`, and if it does not even read that, its connection is cut. The
-//! newest events are kept, so that a client that comes back soon misses nothing.
+//! One task reads the transitions of missions from the database, in order, and changes of robots
+//! from memory; alerts are published where they are written. Each event is encoded as JSON once and
+//! goes to all clients through bounded buffers. A client whose buffer is full is dropped: it gets
+//! the buffered events and an `end`; if it does not read those either, its connection is closed.
+//! The newest events are kept, so that a client that reconnects soon misses nothing.
 
 mod feed;
 mod hub;
@@ -34,31 +34,31 @@ use super::{App, AppError};
 use crate::db;
 use crate::db::robots::RobotRow;
 
-/// Most clients at once.
+/// Maximum number of clients at once.
 pub const CLIENTS_MAX: usize = 1_500;
-/// Most of one token, with its sessions.
+/// Maximum number of clients of one token, with its sessions.
 pub const CLIENTS_PER_IDENTITY_MAX: usize = 1_100;
-/// Those that viewers leave to operators and admins.
+/// Number of clients reserved for operators and admins.
 const CLIENTS_AT_WORK: usize = 200;
-/// How they are shared out.
+/// Limits on clients: in all, of viewers, and of each token or person.
 pub(super) const SHARES: Bounds = Bounds {
     all: CLIENTS_MAX,
     viewers: CLIENTS_MAX - CLIENTS_AT_WORK,
     each: CLIENTS_PER_IDENTITY_MAX,
 };
-/// Most raised alerts in a snapshot.
+/// Maximum number of raised alerts in a snapshot.
 const ALERTS_MAX: u32 = 10_000;
 
-/// A client's end of its buffer; dropping it ends the subscription.
+/// The receiving end of a client's buffer; dropping it ends the subscription.
 #[derive(Debug)]
 pub struct Subscription {
     app: App,
     id: u64,
     events: mpsc::Receiver<Arc<Sent>>,
     waiting: Arc<AtomicUsize>,
-    /// What comes first of all, unless only little was missed.
+    /// Snapshot to send first; `None` if the events kept are enough.
     snapshot: Option<Reading>,
-    /// What was missed, or has happened since the snapshot.
+    /// Events that the client missed, or that were published since the snapshot.
     first: VecDeque<Arc<Sent>>,
     has_begun: Arc<AtomicBool>,
     covered: u64,
@@ -72,12 +72,12 @@ impl Drop for Subscription {
 }
 
 impl Subscription {
-    /// The next event; `None` after the end.
+    /// Returns the next event; `None` after the end.
     pub async fn next(&mut self) -> Option<Arc<Sent>> {
         if let Some(event) = self.snapshot.as_mut().and_then(Reading::next) {
             return Some(event);
         }
-        // Let go as soon as it is read: others may want the room.
+        // Released as soon as it is read: the memory of all snapshots is bounded.
         self.snapshot = None;
         self.has_begun.store(true, Ordering::Relaxed);
         if let Some(first) = self.first.pop_front() {
@@ -92,7 +92,7 @@ impl Subscription {
                 self.waiting.fetch_sub(event.text.len(), Ordering::Relaxed);
             }
             match event {
-                // The snapshot holds it already.
+                // The snapshot includes this event already.
                 Some(event) if event.seq <= self.covered => {}
                 Some(event) => return Some(event),
                 None => {
@@ -110,11 +110,11 @@ impl Subscription {
 }
 
 impl App {
-    /// A place for one more stream of events of somebody.
+    /// Takes a place for one more event stream of this credential.
     ///
     /// # Errors
-    /// There are [`CLIENTS_MAX`] already, too many of viewers, or [`CLIENTS_PER_IDENTITY_MAX`] of
-    /// this token's.
+    /// [`AppError::TooMany`]: all [`CLIENTS_MAX`] are taken, or those for viewers, or the
+    /// [`CLIENTS_PER_IDENTITY_MAX`] of this token.
     pub fn event_place(&self, of: &Credential) -> Result<Place, AppError> {
         self.inner.event_shares.take(of, "event clients")
     }
@@ -171,18 +171,18 @@ impl App {
             missed
         } else {
             let (snapshot, since) = self.snapshot_for(&filter).await?;
-            // The buffer may hold what is older than a snapshot that was built just now.
+            // The buffer may hold events that the snapshot includes already.
             subscription.covered = snapshot.covered();
             subscription.snapshot = Some(snapshot);
             since
         };
-        // Published between the subscription and now: in the buffer too.
+        // Events published since the subscription are also in the buffer.
         let newest = subscription.first.back().map_or(0, |event| event.seq);
         subscription.covered = subscription.covered.max(newest);
         Ok(subscription)
     }
 
-    /// The first name of a filter that nothing has, with the parameter that it stands in.
+    /// Returns the first name in a filter that is not known, with its query parameter.
     pub async fn unknown_in(
         &self,
         filter: &EventFilter,

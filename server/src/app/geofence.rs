@@ -1,4 +1,5 @@
-//! Geofences: where the robots of a site may be. A change reaches the robots by the reconciler.
+//! Geofences: the areas in which the robots of a site may drive. The reconciler sends changes to
+//! the robots.
 
 use tread_api::geometry::Point;
 use tread_api::ids::SiteId;
@@ -13,7 +14,7 @@ use crate::db;
 use crate::db::robots::RobotRow;
 
 impl App {
-    /// A site's geofence.
+    /// Returns a site's geofence.
     pub async fn geofence(&self, site: &SiteId) -> Result<Geofence, AppError> {
         let mut tx = self.db().read("geofence").await?;
         let site_pk = site_row(&mut tx, site).await?.pk;
@@ -23,8 +24,8 @@ impl App {
     /// Replaces the whole of a site's geofence.
     ///
     /// # Errors
-    /// It is too large, a robot that was heard stands outside of it, or it is no longer at the
-    /// `expected` revision.
+    /// The geofence is invalid, a robot with a known pose would be outside of it, or its present
+    /// revision is not `expected`.
     pub async fn replace_geofence(
         &self,
         site: &SiteId,
@@ -66,10 +67,10 @@ impl App {
     }
 }
 
-/// Checks that the whole of a robot is where it may be, without the margin that it keeps on the
-/// move.
+/// Checks that the whole robot is inside the geofence, without the additional margin for driving
+/// robots.
 fn refuse_outside(fence: &Fence, row: RobotRow, point: Point) -> Result<(), AppError> {
-    // A model that is none was never let in; its centre is looked at all the same.
+    // A robot with an invalid model is checked by its centre alone.
     let reach_m = control_model(&row.model).map_or(0.0, |model| disc_radius_m(&model));
     let center = control::Point {
         x_m: point.x_m,

@@ -1,9 +1,9 @@
 //! The ingest writer: one task that stores what robots upload, many batches in one commit.
 //!
-//! Transactions begin at least [`GROUP_INTERVAL`] apart; what arrives meanwhile goes into the next
-//! one, up to a bound. So one fsync serves many robots, and a lone upload waits for nobody. Only
-//! newly inserted segments are folded into the cell sums, in the
-//! same transaction, and the answer goes out after the commit. Sent twice is counted once.
+//! Transactions begin at least [`GROUP_INTERVAL`] apart; uploads that arrive meanwhile go into the
+//! next one, up to a limit. One fsync thus serves many robots, and a single upload does not wait
+//! for others. Only newly inserted segments are added to the cell sums, in the same transaction;
+//! the answer is sent after the commit. A segment that is sent twice counts once.
 
 mod keys;
 mod prepared;
@@ -39,32 +39,32 @@ use crate::db::withdrawals::WithdrawalRow;
 use crate::db::{self, DbError, Tx};
 use crate::friction::epoch_h;
 
-/// Uploads that wait for the writer.
+/// Maximum number of uploads that wait for the writer.
 pub const UPLOADS_WAITING_MAX: usize = 256;
-/// Records of one transaction beyond which no further batch is taken in.
+/// Number of records in a transaction beyond which it takes no further batch.
 const GROUP_RECORDS_MAX: usize = 2_000;
-/// Least time from the begin of one transaction to the begin of the next, while uploads come in
-/// faster: a transaction has a price of its own, in processor time as well as on the disk.
+/// Minimum interval between the beginnings of two transactions while uploads keep arriving: each
+/// transaction has a cost of its own, in processor time and on the disk.
 const GROUP_INTERVAL: Duration = Duration::from_millis(40);
-/// Integers on the wire and in JSON stay exact below this.
+/// Limit of sequence numbers; integers below it are exact in JSON.
 const SEQ_MAX: u64 = 1 << 53;
-/// Measurements of one robot that may wait for the clock of their run.
+/// Maximum number of one robot's measurements that may wait until the clock of their run is known.
 const DEFERRED_MAX: u64 = 10_000;
-/// Measurements that one upload may take out of waiting.
+/// Maximum number of deferred measurements that one upload may release.
 const RELEASED_MAX: u32 = 500;
 
-/// One batch of one robot, and where its answer goes.
+/// One batch of one robot, with the channel for its answer.
 #[derive(Debug)]
 pub struct Upload {
-    /// The site of the key that it came on.
+    /// The site in the key expression of the upload.
     pub site: SiteId,
-    /// The batch; its robot is the one of the key.
+    /// The batch; its robot is checked to be that of the key expression.
     pub batch: Batch,
-    /// Where the answer goes.
+    /// Channel for the answer.
     pub answer: oneshot::Sender<Result<Receipt, Refusal>>,
 }
 
-/// Stores uploads until the stop, then those that already wait.
+/// Stores uploads until the stop, then those that are already queued.
 pub async fn run(app: App, mut uploads: mpsc::Receiver<Upload>, stop: CancellationToken) {
     let mut writer = Writer::new(app);
     let mut next_begin = Instant::now();
@@ -77,7 +77,7 @@ pub async fn run(app: App, mut uploads: mpsc::Receiver<Upload>, stop: Cancellati
             }
             upload = uploads.recv() => upload,
         };
-        // Without the stop the queue never closes: its senders live as long as the network.
+        // The queue does not close before the stop: the network holds its senders.
         let Some(first) = first else { break };
         let mut records = first.batch.records.len();
         let mut group = vec![first];
@@ -100,9 +100,9 @@ pub struct Writer {
     keys: Keys,
 }
 
-/// A segment on its way into the database.
+/// A segment to be stored.
 struct Candidate<'group> {
-    /// The upload whose receipt counts it; `None` for one that had waited.
+    /// Index of the upload whose receipt counts it; `None` for a segment that was deferred.
     upload: Option<usize>,
     keys: (i64, i64),
     site_pk: i64,
@@ -116,21 +116,22 @@ struct Candidate<'group> {
 struct Admitted {
     of: RobotKeys,
     boot_pk: i64,
-    /// The configurations that it measured with; those that are missing are too many.
+    /// Database keys of the configurations that it measured with; those beyond the limit are
+    /// missing.
     configurations: HashMap<ConfigurationId, i64>,
 }
 
-/// What became of one batch.
+/// Result of one batch.
 type Outcome = Result<Receipt, Refusal>;
 
-/// What a transaction did beyond its answers.
+/// Counts of a transaction, for the server's counters.
 #[derive(Debug, Default)]
 struct Tally {
     segments: u64,
     reports: u64,
     foreign: u64,
     deferred: u64,
-    /// Alerts that began or ended with missions.
+    /// Alerts that were raised or cleared by mission reports.
     alerts: Vec<Alert>,
 }
 
@@ -156,7 +157,7 @@ impl Tally {
 }
 
 impl Writer {
-    /// A writer that remembers no keys yet.
+    /// Creates a writer with an empty cache of keys.
     pub fn new(app: App) -> Self {
         Self {
             app,
@@ -164,7 +165,8 @@ impl Writer {
         }
     }
 
-    /// Stores a group, or, if that fails, each of its batches alone; then answers.
+    /// Stores a group in one transaction, or, if that fails, each batch in one of its own; then
+    /// answers all.
     pub async fn store(&mut self, group: Vec<Upload>) {
         let outcomes = match self.commit(&group).await {
             Ok(outcomes) => outcomes,
@@ -197,7 +199,8 @@ impl Writer {
                 }
             }
             counters.batches_answered.one();
-            // Who asked may have gone; the robot will ask again and hear of duplicates.
+            // Fails if the requester is gone; the robot then sends again, and the records are
+            // duplicates.
             let _ = upload.answer.send(outcome);
         }
     }
@@ -206,7 +209,7 @@ impl Writer {
         self.keys.bound();
         let result = db::limited(self.commit_once(group)).await;
         if result.is_err() {
-            // Keys of a transaction that was rolled back name nothing.
+            // Keys of a transaction that was rolled back are invalid.
             self.keys.forget();
         }
         let (outcomes, tally) = result?;
@@ -222,7 +225,8 @@ impl Writer {
         Ok(outcomes)
     }
 
-    /// A time of a robot's clock by ours, to a few milliseconds, from the run that is heard now.
+    /// Converts a time of the robot's wall clock to the server's, accurate to a few milliseconds;
+    /// `None` unless the batch is of the robot's present run.
     fn heard_of(&self, upload: &Upload, at: Timestamp) -> Option<Timestamp> {
         let key = (upload.site.clone(), upload.batch.robot.clone());
         let presence = self.app.presences().get(&key);
@@ -233,7 +237,7 @@ impl Writer {
             .flatten()
     }
 
-    /// Who reports on a mission, and when, with how far the robot showed last that it had come.
+    /// Returns who reports on a mission and when, with the progress that the robot showed last.
     fn reporting(
         &self,
         upload: &Upload,
@@ -288,7 +292,7 @@ impl Writer {
             };
             if batch.robot_time.is_some() {
                 for (keys, ready) in released(&mut tx, boot_pk, &grid, skew).await? {
-                    // It was noted when the segment came.
+                    // The key was cached when the segment was deferred.
                     let id = ready.segment.configuration;
                     let found = db::robots::note_measured(&mut tx, robot_pk, id).await?;
                     candidates.push(candidate(None, keys, found, ready));
@@ -356,7 +360,7 @@ impl Writer {
         Ok((outcomes, tally))
     }
 
-    /// Finds out whose a batch is, or why it is refused whole.
+    /// Returns the database keys of a batch, or the reason why all of it is refused.
     async fn admit(
         &mut self,
         tx: &mut Tx,
@@ -395,8 +399,8 @@ impl Writer {
         }))
     }
 
-    /// Which of these were stored once and removed after their time. Only runs of which anything
-    /// was removed are asked for, so this costs nothing for all others.
+    /// Returns those of the candidates that were stored before and removed at the end of their
+    /// retention. Queries only runs with removed measurements, so that all others cost nothing.
     async fn removed_before(
         &self,
         tx: &mut Tx,
@@ -421,7 +425,7 @@ impl Writer {
         Ok(removed)
     }
 
-    /// Stores segments and folds those that are new and not withdrawn.
+    /// Stores segments, and adds to the sums those that are new and not withdrawn.
     async fn insert(
         &self,
         tx: &mut Tx,
@@ -440,7 +444,7 @@ impl Writer {
         let withdrawals = db::withdrawals::all(tx).await?;
         let mut folded: HashMap<SumKey, Folded> = HashMap::new();
         for candidate in candidates {
-            // One that stands twice in this very group is new once.
+            // A segment that occurs twice in this group is new once.
             let is_new = !removed.contains(&candidate.keys)
                 && new.as_mut().is_none_or(|new| new.remove(&candidate.keys));
             let upload = candidate.upload.and_then(|upload| outcomes.get_mut(upload));
@@ -482,7 +486,7 @@ impl Writer {
                 }
             }
         }
-        // In the order of the table, so that neighbours share their pages.
+        // In the order of the table, so that neighbours share database pages.
         let mut folded: Vec<Folded> = folded.into_values().collect();
         folded.sort_unstable_by_key(|Folded { key, .. }| {
             (key.robot_pk, key.epoch_h, key.cell.iy, key.cell.ix)
@@ -510,7 +514,7 @@ fn rows<'group>(
     kept.map(row).collect()
 }
 
-/// The configurations that a batch measured with.
+/// Returns the configurations that a batch measured with.
 fn measured_with(batch: &Batch) -> HashSet<ConfigurationId> {
     let records = batch.records.iter();
     let configurations = records.filter_map(|record| match &record.content {
@@ -520,7 +524,7 @@ fn measured_with(batch: &Batch) -> HashSet<ConfigurationId> {
     configurations.collect()
 }
 
-/// A segment that is possible, with the key of its configuration, or why it is not.
+/// Checks a segment. Returns it with the key of its configuration, or the reason why it is refused.
 fn possible(
     segment: &Segment,
     grid: &Grid,
@@ -545,7 +549,7 @@ fn refusal(code: RefusalCode, detail: &str) -> Refusal {
     }
 }
 
-/// Shows on a robot what can never be taken of it.
+/// Counts on the robot's row the records that were refused for ever.
 async fn count_refused(tx: &mut Tx, robot_pk: i64, receipt: &Receipt) -> Result<(), DbError> {
     let Some(last) = receipt.refused.last() else {
         return Ok(());
@@ -554,7 +558,7 @@ async fn count_refused(tx: &mut Tx, robot_pk: i64, receipt: &Receipt) -> Result<
     db::robots::count_refused(tx, robot_pk, count, &last.reason).await
 }
 
-/// The answer to a batch that is taken whole or not at all.
+/// Returns the refusal of a whole batch; `None` if its records are to be checked one by one.
 fn refused_whole(group: &Upload, is_known: bool) -> Option<Refusal> {
     if group.batch.records.len() > BATCH_RECORDS_MAX {
         let detail = format!("a batch has at most {BATCH_RECORDS_MAX} records");
@@ -564,7 +568,7 @@ fn refused_whole(group: &Upload, is_known: bool) -> Option<Refusal> {
     (!is_known).then(|| refusal(RefusalCode::Busy, detail))
 }
 
-/// What has waited for the clock of a run that tells it now.
+/// Takes the deferred segments of a run whose clock is known now.
 async fn released(
     tx: &mut Tx,
     boot_pk: i64,
@@ -578,14 +582,14 @@ async fn released(
         skew,
     ) {
         Ok(Prepared::Ready(ready)) => Some(((boot_pk, waiting.seq), ready)),
-        // It was possible when it came, and its time is none of the future now.
+        // It was valid when it arrived, and its time is no longer in the future.
         Ok(Prepared::Ahead(_)) | Err(_) => None,
     };
     Ok(waiting.into_iter().filter_map(ready).collect())
 }
 
-/// Keeps a segment from the future until the clock of its run is known; whether it is new, or why
-/// it cannot be kept.
+/// Defers a segment with a time in the future until the clock of its run is known. Returns whether
+/// it is new, or the reason why it cannot be deferred.
 async fn defer(
     tx: &mut Tx,
     origin: Origin,
@@ -607,7 +611,7 @@ async fn defer(
     .await?))
 }
 
-/// Takes a report unless it was taken before; `None` says that it was.
+/// Applies a report, unless it was applied before; then it returns `None`.
 async fn take_new_report(
     tx: &mut Tx,
     reporting: Reporting,
@@ -618,7 +622,7 @@ async fn take_new_report(
         return Ok(None);
     }
     let taken = take_report(tx, reporting, report).await?;
-    // A report that is refused is refused again, not called a duplicate.
+    // A refused report is not recorded, so that it is refused again and not counted as a duplicate.
     if taken.is_ok() {
         db::history::note_report(tx, boot_pk, seq).await?;
     }

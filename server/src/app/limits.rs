@@ -1,7 +1,7 @@
-//! External limits over REST: another program holds or slows a robot for a while.
+//! External limits over REST: another program stops or slows a robot for a limited time.
 //!
-//! The server only passes them on; the robot keeps them, and what ends there ends. A program that
-//! speaks zenoh publishes them itself.
+//! The server forwards limits and does not store them: the robot enforces and ends them. A program
+//! that speaks zenoh publishes its limits itself.
 
 use std::time::Duration;
 
@@ -14,11 +14,11 @@ use super::{App, AppError, site_row};
 use crate::app::presence::RobotKey;
 use crate::db;
 
-/// Longest limit, milliseconds.
+/// Maximum duration of a limit, milliseconds.
 const FOR_MAX_MS: u64 = LIMIT_AHEAD_MAX_US / 1_000;
 
 impl App {
-    /// The external limits that a robot says it has.
+    /// Returns the external limits that a robot reports.
     pub async fn limits(
         &self,
         site: &SiteId,
@@ -33,10 +33,10 @@ impl App {
         })
     }
 
-    /// Limits a robot for a while.
+    /// Sets a limit on a robot for a while.
     ///
     /// # Errors
-    /// The figures are impossible, or the robot does not answer or refuses.
+    /// The values are invalid, or the robot does not answer or refuses.
     pub async fn set_limit(
         &self,
         (site, robot): (&SiteId, &RobotId),
@@ -52,7 +52,8 @@ impl App {
         self.send_limit((site, robot), owner, Some(limit)).await
     }
 
-    /// Ends an owner's limit of a robot. An owner that the robot must hear holds it from then on.
+    /// Ends an owner's limit of a robot. If the robot is configured to require limits of this
+    /// owner, it stops from then on.
     ///
     /// # Errors
     /// The robot does not answer, or refuses.
@@ -82,7 +83,7 @@ impl App {
             owner,
             boot,
             until_us: limit.map_or(0, |_| clock_us.saturating_add(lasting_us)),
-            // The wall clock orders the limits of one owner also over a restart of the server.
+            // The wall clock orders the limits of one owner, also after a restart of the server.
             seq: u64::try_from(self.clock().now().as_microsecond()).unwrap_or(0),
             hold: limit.is_some_and(|limit| limit.hold),
             linear_max_m_s: limit.and_then(|limit| limit.linear_max_m_s),

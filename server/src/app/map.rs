@@ -1,8 +1,10 @@
-//! The map in memory, beside the database: loaded at the start, changed with each commit.
+//! The friction map in memory, a copy of the sums in the database: loaded at the start and changed
+//! with each commit.
 //!
-//! Whoever changes sums takes the turn, writes, and commits with [`MapTurn::commit`]: commit and
-//! change of memory are one task, which nobody who goes away interrupts. After a commit of which
-//! nobody knows what became there is no turn until memory was read again (see [`super::memory`]).
+//! To change sums, a task takes the [`MapTurn`], writes, and commits with [`MapTurn::commit`]:
+//! commit and change in memory are one task, which cancellation of the caller does not interrupt.
+//! After a commit of unknown outcome no turn is given until memory was read again (see
+//! [`super::memory`]).
 
 use std::collections::HashMap;
 use std::sync::{Arc, PoisonError, RwLock};
@@ -23,13 +25,13 @@ use crate::friction::index::{Labelled, SiteMap};
 #[derive(Debug, Default)]
 pub(super) struct Maps {
     sites: RwLock<HashMap<i64, SiteMap>>,
-    /// Held from before a transaction that changes sums until memory shows it, so that both see
-    /// the same changes in the same order. It holds how many commits of unknown outcome there were
-    /// when memory was read last.
+    /// Held from before a transaction that changes sums until memory shows the change, so that
+    /// database and memory change in the same order. Its value is the number of commits of unknown
+    /// outcome at the last reading of memory.
     order: Arc<Mutex<u64>>,
 }
 
-/// The turn to change sums, in the database and then in memory.
+/// Exclusive right to change sums, in the database and then in memory.
 #[derive(Debug)]
 pub(super) struct MapTurn {
     app: App,
@@ -39,19 +41,19 @@ pub(super) struct MapTurn {
 /// What a transaction changes in memory once it is committed.
 #[derive(Debug)]
 pub(super) enum MapChange {
-    /// Nothing: it says the same in another form.
+    /// No change: the same sums in another form.
     Nothing,
     /// Sums are added.
     Add(Vec<Folded>),
-    /// What a robot measured from one hour to another goes, both included.
+    /// Sums of a robot's measurements between two hours, both included, are removed.
     Withdraw(Box<SiteRow>, RobotId, (i64, i64)),
-    /// Hours before this one are read as days.
+    /// Hours before this one are merged into days.
     MergeBefore(Box<SiteRow>, i64),
     /// Raw measurements of these runs were removed.
     Remove(Vec<i64>),
 }
 
-/// Sums on their way into memory.
+/// Sums to be added to the map.
 #[derive(Debug, Clone)]
 pub(super) struct Folded {
     pub(super) key: SumKey,
@@ -61,8 +63,8 @@ pub(super) struct Folded {
 }
 
 impl MapTurn {
-    /// Commits, and then changes memory and shows alerts that were written, or has memory read again
-    /// if nobody knows what became of the commit.
+    /// Commits, and then changes memory and publishes the alerts that were written. After an
+    /// outcome that is unknown, memory is read again.
     ///
     /// # Errors
     /// As [`Tx::commit`].
@@ -85,7 +87,7 @@ impl MapTurn {
 }
 
 impl Maps {
-    /// Makes room for a site's map.
+    /// Creates a site's map if it does not exist.
     pub(super) fn ensure(&self, row: &SiteRow) {
         let mut sites = self.sites.write().unwrap_or_else(PoisonError::into_inner);
         ensure(&mut sites, row);
@@ -97,7 +99,7 @@ impl Maps {
         change(ensure(&mut sites, row));
     }
 
-    /// Looks at a site's map.
+    /// Reads a site's map; an empty one if it does not exist.
     pub(super) fn look<T>(&self, row: &SiteRow, look: impl FnOnce(&SiteMap) -> T) -> T {
         let sites = self.sites.read().unwrap_or_else(PoisonError::into_inner);
         match sites.get(&row.pk) {
@@ -106,7 +108,7 @@ impl Maps {
         }
     }
 
-    /// Takes what was read from the database in place of what there is.
+    /// Replaces the maps by those read from the database.
     fn replace(&self, mut read: HashMap<i64, SiteMap>) {
         let mut sites = self.sites.write().unwrap_or_else(PoisonError::into_inner);
         for (pk, before) in sites.drain() {
@@ -151,10 +153,10 @@ fn add(sites: &mut HashMap<i64, SiteMap>, folded: &[Folded]) {
 }
 
 impl App {
-    /// The turn to change sums.
+    /// Waits for the exclusive right to change sums.
     ///
     /// # Errors
-    /// [`DbError::Unsettled`] until memory was read again after a commit of unknown outcome.
+    /// [`DbError::Unsettled`] after a commit of unknown outcome, until memory was read again.
     pub(super) async fn map_turn_to_change(&self) -> Result<MapTurn, DbError> {
         let order = Arc::clone(&self.maps().order).lock_owned().await;
         if *order != self.db().unknown_outcomes() {
@@ -183,7 +185,7 @@ impl App {
         }
     }
 
-    /// Reads all sums into memory, and of which runs raw measurements were removed.
+    /// Reads all sums into memory, and the runs of which raw measurements were removed.
     ///
     /// # Errors
     /// The database failed.
@@ -191,11 +193,11 @@ impl App {
         self.load_map_again(self.db().unknown_outcomes()).await
     }
 
-    /// The same in place of what is there, when so many commits of unknown outcome have ended. Nobody
-    /// changes sums meanwhile.
+    /// Reads everything again when `ended` commits of unknown outcome have ended. No sums change
+    /// meanwhile.
     ///
     /// # Errors
-    /// The database failed; memory is as it was.
+    /// The database failed; memory is unchanged.
     pub(super) async fn load_map_again(&self, ended: u64) -> Result<(), DbError> {
         let mut order = Arc::clone(&self.maps().order).lock_owned().await;
         let mut tx = self.db().read("map").await?;
@@ -223,7 +225,7 @@ async fn read_maps(tx: &mut Tx) -> Result<HashMap<i64, SiteMap>, DbError> {
     let configurations = db::robots::configurations_by_key(tx).await?;
     db::sums::each(tx, |row| {
         let key = row.key;
-        // A sum refers to both, so neither is ever missing.
+        // The foreign keys of a sum guarantee both.
         if let (Some(robot), Some(&configuration)) = (
             robots.get(&key.robot_pk),
             configurations.get(&key.configuration_pk),

@@ -1,4 +1,4 @@
-//! What memory mirrors of the database, read again after a commit of which nobody knows what became.
+//! Reads the copies of the database in memory again after a commit of unknown outcome.
 //!
 //! ```text
 //!  commit ─► written ──────────────────► memory changes, in the same task
@@ -13,12 +13,12 @@ use tokio_util::sync::CancellationToken;
 
 use super::{App, AppError};
 
-/// How long after a failure memory is read again.
+/// Delay before memory is read again after a failure.
 const RETRY: Duration = Duration::from_secs(1);
-/// How long reading it may take.
+/// Maximum time for reading memory.
 const READ_MAX: Duration = Duration::from_mins(10);
 
-/// Reads memory again when it must be, until the stop.
+/// Reads memory again whenever needed, until the stop.
 pub async fn run(app: App, stop: CancellationToken) {
     loop {
         tokio::select! {
@@ -45,12 +45,12 @@ pub async fn run(app: App, stop: CancellationToken) {
 }
 
 impl App {
-    /// Waits until every commit before has ended, and reads again what memory mirrors.
+    /// Waits until all commits of unknown outcome have ended, and reads again what memory copies.
     ///
-    /// Of tokens and sessions memory keeps nothing that it does not look up again by itself.
+    /// Tokens and sessions are not included: their cache reads the database periodically.
     ///
     /// # Errors
-    /// The database failed, or such a commit goes on.
+    /// The database failed, or such a commit is still under way.
     pub async fn settle_outcomes(&self) -> Result<(), AppError> {
         let unknown = self.db().unknown_outcomes();
         self.db().await_commits().await?;

@@ -1,8 +1,8 @@
-//! Old hours of measuring are merged into days, so that the map does not grow for ever.
+//! Merges old hours of measurements into days, so that the map does not grow for ever.
 //!
-//! First a site's horizon moves: hours before it are *read* as days from then on, in memory and
-//! after any restart. Then the rows follow, some at a time, each time in one transaction that
-//! removes hours and adds them to their day. Whenever this is killed, the map says the same.
+//! First a site's horizon is moved: from then on, hours before it are *read* as days, in memory and
+//! after a restart. Then the rows are merged a few at a time, each time in one transaction that
+//! removes hours and adds them to their day. If this is interrupted, the map stays the same.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -18,14 +18,14 @@ use crate::db::sums::SumKey;
 use crate::friction::sums::DAY_H;
 use crate::friction::{Sums, bucket_h, epoch_h};
 
-/// Hours that are kept by themselves before their day is merged.
+/// Number of hours that are kept separately before their day is merged.
 pub const HOURS_KEPT: i64 = 7 * DAY_H;
-/// How often the server looks for hours to merge.
+/// Interval at which the server checks for hours to merge.
 const MERGE_EVERY: Duration = Duration::from_mins(10);
-/// Rows that one transaction merges; others write in between.
+/// Maximum number of rows merged in one transaction; other writers proceed in between.
 const ROWS_MERGED_MAX: u32 = 500;
 
-/// Merges now and then until the stop.
+/// Merges periodically until the stop.
 pub async fn run(app: App, stop: CancellationToken) {
     loop {
         if let Err(cause) = merge_all(&app, &stop).await {
@@ -45,7 +45,8 @@ async fn merge_all(app: &App, stop: &CancellationToken) -> Result<(), AppError> 
 }
 
 impl App {
-    /// Has every site read days that are older than [`HOURS_KEPT`] as one epoch each.
+    /// Moves the horizon of every site, so that days older than [`HOURS_KEPT`] are read as one
+    /// epoch each.
     ///
     /// # Errors
     /// The database failed.
@@ -67,7 +68,7 @@ impl App {
         Ok(())
     }
 
-    /// Merges some rows of hours before the horizon; whether there may be more.
+    /// Merges some rows of hours before the horizon. Returns whether there may be more.
     ///
     /// # Errors
     /// The database failed.

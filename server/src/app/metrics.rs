@@ -1,5 +1,5 @@
-//! All metrics of the server in the OpenMetrics format: what was recorded while it worked
-//! ([`crate::metrics`]), and what is looked up when somebody asks.
+//! All metrics of the server in the OpenMetrics format: those recorded continuously
+//! ([`crate::metrics`]), and those read at the time of the request.
 
 use std::sync::atomic::AtomicU64;
 use std::time::Duration;
@@ -18,12 +18,12 @@ use crate::db;
 use crate::db::failure::{self, StorageFailure};
 use crate::metrics::Refusal;
 
-/// The media type of the text.
+/// Media type of the OpenMetrics text format.
 pub const MEDIA_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
-/// Most terrains and robot models that have series of their own.
+/// Maximum number of pairs of terrain and robot model with their own time series.
 pub const TERRAIN_SERIES_MAX: usize = 500;
 
-/// Reasons to refuse whoever asks over HTTP, before the request is looked at.
+/// Reasons for which HTTP requests are refused before a handler runs.
 const OF_CLIENTS: [&str; 11] = [
     "host",
     "locked",
@@ -38,12 +38,12 @@ const OF_CLIENTS: [&str; 11] = [
     "too_long",
 ];
 
-/// Values that are looked up, by one label.
+/// Gauges with one label, filled at the time of the request.
 type Gauges<V = &'static str> = Family<[(&'static str, V); 1], Gauge<u64, AtomicU64>>;
-/// Counts that are looked up, by one label.
+/// Counters with one label, filled at the time of the request.
 type Counts = Family<[(&'static str, &'static str); 1], Counter>;
 
-/// A terrain and a robot model.
+/// Labels of a terrain and a robot model.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
 struct OfTerrain {
     site: String,
@@ -51,7 +51,7 @@ struct OfTerrain {
     configuration: String,
 }
 
-/// One number of what is known of a terrain.
+/// Selects one value of a terrain's friction.
 type NumberOf = fn(&KnownGround) -> f64;
 
 fn count(of: usize) -> u64 {
@@ -59,11 +59,11 @@ fn count(of: usize) -> u64 {
 }
 
 impl App {
-    /// All metrics as text; those that come from the database are missing while it cannot be read.
+    /// Returns all metrics as text; without those from the database while it cannot be read.
     pub async fn metrics_text(&self) -> String {
         let mut registry = Registry::default();
         self.register_storage(&mut registry);
-        // What is in memory is shown also while the database cannot be read.
+        // Metrics from memory are shown also while the database cannot be read.
         for registered in [
             self.register_fleet(&mut registry).await,
             self.register_terrains(&mut registry).await,
@@ -87,7 +87,7 @@ impl App {
         text
     }
 
-    /// Records how long a mission took that has ended; one that never began has no duration.
+    /// Records the duration of a mission that has ended; none if it never began.
     pub(super) fn record_duration(&self, mission: &Mission) {
         if let (Some(began), Some(ended)) = (mission.started_at, mission.ended_at) {
             let took = Duration::try_from(ended.duration_since(began)).unwrap_or_default();
@@ -95,7 +95,7 @@ impl App {
         }
     }
 
-    /// What the storage was found to be.
+    /// Registers the state of the storage.
     fn register_storage(&self, registry: &mut Registry) {
         let condition = self.storage_condition();
         let gauges = [
@@ -134,9 +134,9 @@ impl App {
         registry.register("tread_storage_failures", help, failures);
     }
 
-    /// What the machine's clock did.
+    /// Registers the steps of the machine's clock.
     fn register_clock(&self, registry: &mut Registry) {
-        // So that a step shows although nothing else asked for the time.
+        // Read here, so that a step shows even if nothing else reads the clock.
         self.clock().now();
         let steps = self.clock().steps();
         let counts = Counts::default();
@@ -152,7 +152,7 @@ impl App {
         registry.register_with_unit("tread_clock_ahead", help, Unit::Seconds, ahead);
     }
 
-    /// Missions, robots and stops.
+    /// Registers missions, robots and stops.
     async fn register_fleet(&self, registry: &mut Registry) -> Result<(), AppError> {
         let now = self.clock().elapsed();
         let robots = Gauges::default();
@@ -198,7 +198,7 @@ impl App {
         Ok(())
     }
 
-    /// What is known of terrains.
+    /// Registers the friction of terrains.
     async fn register_terrains(&self, registry: &mut Registry) -> Result<(), AppError> {
         let (known, left_out) = self.known_of_terrains(TERRAIN_SERIES_MAX).await?;
         let gauges: [(&str, NumberOf, &str); 3] = [
@@ -236,7 +236,7 @@ impl App {
         Ok(())
     }
 
-    /// Those who teleoperate and those who read events.
+    /// Registers the numbers of teleoperation and event clients.
     fn register_clients(&self, registry: &mut Registry) {
         let gauges = [
             (
@@ -263,7 +263,7 @@ impl App {
         registry.register("tread_event_clients_dropped", help, dropped);
     }
 
-    /// The counters of `GET /v1/server`; returns those that count what was refused.
+    /// Registers the counters of `GET /v1/server`; returns those of refusals.
     fn register_counters(&self, registry: &mut Registry) -> Vec<(Refusal, u64)> {
         let counters = serde_json::to_value(self.counters().values()).unwrap_or_default();
         let mut refusals = Vec::new();

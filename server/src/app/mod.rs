@@ -1,4 +1,4 @@
-//! What the server can do: use cases and their transactions. No HTTP, no SQL text.
+//! The server's use cases and their transactions. Contains no HTTP and no SQL text.
 
 pub mod alerts;
 mod allowance;
@@ -66,7 +66,7 @@ use crate::friction::index::Normalisation;
 use crate::metrics::Metrics;
 use crate::supervisor::Supervisor;
 
-/// Everything that use cases work on; clones are handles to the same.
+/// State shared by all use cases; clones share the same state.
 #[derive(Debug, Clone)]
 pub struct App {
     inner: Arc<Inner>,
@@ -81,7 +81,7 @@ struct Inner {
     presences: Arc<Presences>,
     robots: RobotLink,
     commands: Commands,
-    /// Wakes the reconciler: what is wanted, or what is, has changed.
+    /// Wakes the reconciler after a change of what is wanted or of what robots report.
     changed: Notify,
     /// Wakes the feed of events.
     announced: Notify,
@@ -92,9 +92,9 @@ struct Inner {
     maps: Maps,
     membership: Membership,
     metrics: Metrics,
-    /// Counts changes of what is kept of robots.
+    /// Incremented with each change of robots' rows.
     robots_generation: AtomicU64,
-    /// Tells this run of the server from any other.
+    /// Identifier of this run of the server.
     run_id: Uuid,
     started_at: Duration,
     normalisations: Vec<Arc<Normalisation>>,
@@ -111,27 +111,27 @@ struct Inner {
     event_shares: Shares,
 }
 
-/// What use cases work with.
+/// Dependencies of use cases.
 #[derive(Debug)]
 pub struct Dependencies {
     /// The database.
     pub db: Db,
     /// The clock.
     pub clock: Clock,
-    /// How measurements are fused.
+    /// Settings of the fusion of measurements.
     pub friction: FrictionConfig,
-    /// When the storage counts as failing.
+    /// Limits beyond which the storage counts as failing.
     pub storage: StorageConfig,
-    /// How robot models may be joined.
+    /// Declared normalisations, which join robot models.
     pub normalisations: Vec<Normalisation>,
-    /// How robots are reached.
+    /// Connections to the robots.
     pub robots: RobotLink,
-    /// By what robots join; without it whoever reaches the network may speak.
+    /// Service by which robots join; without it any client on the network may act as a robot.
     pub enrolment: Option<EnrolmentService>,
 }
 
 impl App {
-    /// The server's use cases.
+    /// Creates the server's use cases.
     pub fn new(dependencies: Dependencies) -> Self {
         let Dependencies {
             db,
@@ -190,7 +190,8 @@ impl App {
         }
     }
 
-    /// Use cases that reach no robot, for programs that work on the database alone.
+    /// Creates use cases without a connection to robots, for programs that work on the database
+    /// alone.
     pub fn without_robots(
         db: Db,
         clock: Clock,
@@ -212,47 +213,47 @@ impl App {
         &self.inner.normalisations
     }
 
-    /// Sends commands to robots.
+    /// Returns the sender of commands to robots.
     fn commands(&self) -> &Commands {
         &self.inner.commands
     }
 
-    /// How robots are reached.
+    /// Returns the connections to the robots.
     fn robot_link(&self) -> &RobotLink {
         &self.inner.robots
     }
 
-    /// Starts something that ends by itself, beside a request.
+    /// Starts a background task beside a request; it must end by itself.
     pub fn pass_by(&self, name: &'static str, task: impl Future<Output = ()> + Send + 'static) {
         self.supervisor().spawn_passing(name, task);
     }
 
-    /// Runs what goes on after a request was answered.
+    /// Returns the supervisor of tasks that outlive their request.
     fn supervisor(&self) -> &Supervisor {
         &self.inner.robots.supervisor
     }
 
-    /// The database.
+    /// Returns the database.
     pub fn db(&self) -> &Db {
         &self.inner.db
     }
 
-    /// The clock.
+    /// Returns the clock.
     pub fn clock(&self) -> &Clock {
         &self.inner.clock
     }
 
-    /// What the server counts about itself.
+    /// Returns the server's counters.
     pub fn counters(&self) -> &Counters {
         &self.inner.counters
     }
 
-    /// Who is on the network now.
+    /// Returns the presence of all robots.
     pub fn presences(&self) -> &Arc<Presences> {
         &self.inner.presences
     }
 
-    /// Time since the start.
+    /// Returns the time since the start of the server.
     pub fn uptime(&self) -> Duration {
         self.inner
             .clock
@@ -266,7 +267,7 @@ impl App {
         self.announce();
     }
 
-    /// Wakes the feed of events alone.
+    /// Wakes only the feed of events.
     fn announce(&self) {
         self.inner.announced.notify_one();
     }
@@ -275,12 +276,12 @@ impl App {
         self.inner.announced.notified().await;
     }
 
-    /// Where event clients subscribe.
+    /// Returns the hub to which event clients subscribe.
     pub fn hub(&self) -> &Hub {
         &self.inner.hub
     }
 
-    /// Where durations, refusals and queues are recorded.
+    /// Returns the metrics of durations, refusals and queues.
     pub fn metrics(&self) -> &Metrics {
         &self.inner.metrics
     }
@@ -301,12 +302,12 @@ impl App {
         &self.inner.keys_in_flight
     }
 
-    /// Waits for a turn to plan; `None` never comes, since nobody closes the semaphore.
+    /// Waits for a turn to plan. `None` cannot occur, since the semaphore is never closed.
     async fn check_turn(&self) -> Option<SemaphorePermit<'_>> {
         self.inner.checks.acquire().await.ok()
     }
 
-    /// Waits for a turn to read the map; `None` never comes, since nobody closes the semaphore.
+    /// Waits for a turn to read the map. `None` cannot occur, since the semaphore is never closed.
     async fn map_turn(&self) -> Option<SemaphorePermit<'_>> {
         self.inner.map_readers.acquire().await.ok()
     }
@@ -343,7 +344,7 @@ impl App {
         &self.inner.allowances
     }
 
-    /// A name of this run of the server: counts in memory begin anew with each.
+    /// Returns an identifier of this run of the server: counts in memory restart with each run.
     fn run_id(&self) -> String {
         self.inner.run_id.to_string()
     }
@@ -364,8 +365,8 @@ impl App {
         &self.inner.friction
     }
 
-    /// Has the clock take up where the database left off, so that time does not go back over a
-    /// restart either.
+    /// Continues the clock after the newest time in the database, so that time does not go back
+    /// over a restart either.
     ///
     /// # Errors
     /// The database failed.
@@ -378,7 +379,7 @@ impl App {
     }
 }
 
-/// Refuses a filter that names what is not known here.
+/// Refuses a filter that names an unknown site or robot.
 async fn check_named(
     tx: &mut Tx,
     site: Option<&SiteId>,
@@ -402,7 +403,8 @@ async fn check_named(
     }
 }
 
-/// Whether a robot of a name is known in a site, or without one in a site of a scope.
+/// Returns whether a robot of this name is known in a site, or, without one, in any site of a
+/// scope.
 async fn is_known(
     tx: &mut Tx,
     site: Option<&SiteId>,
@@ -427,7 +429,7 @@ async fn site_row(tx: &mut Tx, site: &SiteId) -> Result<SiteRow, AppError> {
         .ok_or_else(|| AppError::UnknownSite(site.clone()))
 }
 
-/// Cuts a list that was read one entry too long, and says where the next page begins.
+/// Truncates a list that was read one entry too long, and sets the cursor of the next page.
 fn page<T>(
     mut items: Vec<T>,
     limit: u32,
@@ -440,7 +442,7 @@ fn page<T>(
     tread_api::page::Page { items, next_cursor }
 }
 
-/// A name for people: what was given, without blanks around it, or the identifier.
+/// Returns a display name: the given one, trimmed, or else the identifier.
 fn name_or(name: Option<String>, id: &str) -> Result<String, AppError> {
     let Some(name) = name else {
         return Ok(id.to_owned());
@@ -448,7 +450,7 @@ fn name_or(name: Option<String>, id: &str) -> Result<String, AppError> {
     people_line("name", &name, tread_api::site::NAME_LENGTH_MAX)
 }
 
-/// A line that people gave for people, without blanks around it.
+/// Checks and trims a line of text for people.
 fn people_line(field: &'static str, given: &str, length_max: usize) -> Result<String, AppError> {
     let line = tread_api::text::line(given, length_max);
     line.map(str::to_owned).map_err(|wrong| AppError::Invalid {

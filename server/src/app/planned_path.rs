@@ -1,4 +1,4 @@
-//! Where the planner lays a mission's path, for people to see before and after it was driven.
+//! Planned paths of missions, for display before and after they are driven.
 
 use tread_api::ids::MissionId;
 use tread_api::trajectory::PlannedPath;
@@ -8,12 +8,12 @@ use super::{App, AppError};
 use crate::db;
 
 impl App {
-    /// The smooth path of a mission's present revision: from where its robot planned it, once it
-    /// has taken it, and from the begin of the trajectory before.
+    /// Returns the smooth path of a mission's present revision. It begins where its robot planned
+    /// it, once the robot has accepted it, and at the begin of the trajectory before that.
     ///
     /// # Errors
-    /// [`AppError::UnknownMission`]; [`AppError::Impossible`] for what its robot has refused or
-    /// will refuse.
+    /// [`AppError::UnknownMission`]; [`AppError::Impossible`] for a trajectory that cannot be
+    /// planned, which its robot refuses too.
     pub async fn planned_path(&self, id: MissionId) -> Result<PlannedPath, AppError> {
         let mut tx = self.db().read("planned_path").await?;
         let row = db::missions::find(&mut tx, id)

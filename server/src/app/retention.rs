@@ -1,9 +1,9 @@
-//! Raw measurements are kept for a time and up to a number; their sums, and with them the map, for
-//! ever.
+//! Retention of raw measurements, limited in age and number; their sums, and with them the map, are
+//! kept for ever.
 //!
-//! The oldest go first, some at a time, each time in one transaction that removes them and notes
-//! their names (`boot`, `seq`), so that one that is sent again after years is still known and
-//! counted once. Whenever this is killed, the map says the same.
+//! The oldest are removed first, a few at a time. Each transaction removes some and records their
+//! names (`boot`, `seq`), so that one that is sent again after years is still recognised. If this
+//! is interrupted, the map stays the same.
 
 use std::collections::HashSet;
 use std::sync::{Mutex, PoisonError};
@@ -18,12 +18,12 @@ use crate::config::RetentionConfig;
 use crate::db;
 use crate::friction::sums::DAY_H;
 
-/// How often the server looks for what is over its time.
+/// Interval at which the server checks for measurements to remove.
 const LOOK_EVERY: Duration = Duration::from_mins(10);
-/// Measurements that one transaction removes; others write in between.
+/// Maximum number of measurements removed in one transaction; other writers proceed in between.
 const REMOVED_MAX: u32 = 2_000;
 
-/// Runs of agents of which anything was removed: only their uploads are held against the names.
+/// Runs with removed measurements: only their uploads are compared with the recorded names.
 #[derive(Debug, Default)]
 pub(super) struct Removed {
     boots: Mutex<HashSet<i64>>,
@@ -41,7 +41,7 @@ impl Removed {
     }
 }
 
-/// Removes now and then until the stop.
+/// Removes measurements periodically until the stop.
 pub async fn run(app: App, config: RetentionConfig, stop: CancellationToken) {
     loop {
         if let Err(cause) = remove_all(&app, &config, &stop).await {
@@ -74,10 +74,11 @@ async fn remove_all(
 }
 
 impl App {
-    /// Removes some raw measurements that are over their time or too many; how many.
+    /// Removes at most `limit` raw measurements beyond the limits of age or number. Returns how
+    /// many.
     ///
     /// # Errors
-    /// The database failed; nothing is removed then.
+    /// The database failed; nothing is removed.
     pub async fn remove_some(&self, config: &RetentionConfig, limit: u32) -> Result<u64, AppError> {
         let now = self.clock().now();
         let kept = SignedDuration::from_hours(i64::from(config.segments_days) * DAY_H);
@@ -86,16 +87,16 @@ impl App {
         let Some(last) = db::removed::last_key(&mut tx).await? else {
             return Ok(0);
         };
-        // Keys leave no gaps, since only the first ones are ever removed.
+        // Keys have no gaps, since only the first ones are ever removed.
         let before_pk = last.saturating_sub(config.segments_max) + 1;
         let mut rows = db::removed::oldest(&mut tx, before, before_pk, limit).await?;
-        // The last one stays, so that keys, which are cursors of lists, never begin anew.
+        // The last row stays, so that keys, which are cursors of lists, never restart.
         rows.retain(|row| row.pk < last);
         drop(tx);
         if rows.is_empty() {
             return Ok(0);
         }
-        // Uploads wait their turn: none is between its look at the names and its commit.
+        // Uploads wait meanwhile: none is between checking the names and its commit.
         let turn = self.map_turn_to_change().await?;
         let mut tx = self.db().write("retention").await?;
         db::removed::remove(&mut tx, &rows).await?;

@@ -1,4 +1,4 @@
-//! Robots: who they are, who is here, and what happens when one introduces itself.
+//! Robots: listing, changes, and their hello.
 
 use tracing::info;
 use tread_api::ids::{RobotId, SiteId};
@@ -22,23 +22,25 @@ use crate::app::presence::RobotKey;
 use crate::db::robots::{Introduction, RobotRow};
 use crate::db::{self, Outcome};
 
-/// Runs of one robot's agent that are kept; older ones only as long as their raw measurements are.
+/// Number of runs of one robot's agent that are kept; older ones only as long as their raw
+/// measurements are.
 pub(super) const RUNS_KEPT_MAX: u32 = 500;
 
 impl App {
-    /// Whether a robot's agent may begin another run now.
+    /// Returns whether the allowance of a robot's agent permits another run now; takes one unit of
+    /// it.
     pub(super) fn may_begin_run(&self, robot: &RobotKey) -> bool {
         let now = self.clock().elapsed();
         self.allowances().take(robot, Kind::Run, now)
     }
 
-    /// Whether a robot may have another configuration now.
+    /// Returns whether a robot's allowance permits another configuration now; takes one unit of it.
     pub(super) fn may_change_configuration(&self, robot: &RobotKey) -> bool {
         let now = self.clock().elapsed();
         self.allowances().take(robot, Kind::Configuration, now)
     }
 
-    /// Robots of a site in a scope after a cursor.
+    /// Returns a page of the robots of a site in a scope, after a cursor.
     pub async fn robots(
         &self,
         (site, within): (&SiteId, &Scope),
@@ -65,7 +67,7 @@ impl App {
         Ok(page(robots, limit, |robot: &Robot| robot.id.to_string()))
     }
 
-    /// One robot with its live state.
+    /// Returns one robot with its live state.
     pub async fn robot(&self, site: &SiteId, id: &RobotId) -> Result<Robot, AppError> {
         let mut tx = self.db().read("robots").await?;
         let site_pk = site_row(&mut tx, site).await?.pk;
@@ -76,7 +78,8 @@ impl App {
         Ok(self.with_live(row, alerts))
     }
 
-    /// Renames a robot for people, retires it or takes it back. Retiring cancels all its missions.
+    /// Changes a robot's display name, retires it or ends its retirement. Retiring cancels all its
+    /// missions.
     pub async fn change_robot(
         &self,
         site: &SiteId,
@@ -144,8 +147,8 @@ impl App {
         }
     }
 
-    /// Learns from the database which robots have said hello before, so that they need not say it
-    /// again to be heard.
+    /// Loads from the database the robots that have sent a hello before, so that their messages are
+    /// accepted without another one.
     ///
     /// # Errors
     /// The database failed.
@@ -157,14 +160,14 @@ impl App {
         Ok(())
     }
 
-    /// Takes a robot's introduction and answers with its site.
+    /// Processes a robot's hello and returns the definition of its site.
     ///
     /// # Errors
-    /// The refusal that the robot gets: its site is not known, its model is not possible, or the server
+    /// The refusal that the robot gets: its site is not known, its model is invalid, or the server
     /// cannot write now.
     pub async fn hello(&self, site: &SiteId, hello: &Hello) -> Result<Welcome, Refusal> {
         check_model(hello).map_err(|detail| refusal(RefusalCode::Malformed, detail))?;
-        // The states of a robot that is known count at once, whether or not it can be written down.
+        // The states of a known robot are accepted at once, even if the hello cannot be stored.
         let key = (site.clone(), hello.robot.clone());
         if self.presences().is_known(&key) {
             self.presences()
@@ -194,7 +197,8 @@ impl App {
         Ok(welcome)
     }
 
-    /// `None` if the site is not known; what the robot has done too often, if anything.
+    /// Returns `None` if the site is not known, and what exceeded the robot's allowance, if
+    /// anything.
     async fn introduce(
         &self,
         site: &SiteId,

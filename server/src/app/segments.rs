@@ -1,4 +1,4 @@
-//! Raw measurements as they were committed.
+//! Raw measurements in the order of their commits.
 
 use tread_api::friction::StoredSegment;
 use tread_api::ids::SiteId;
@@ -9,7 +9,7 @@ use crate::db;
 pub use crate::db::segments::SegmentFilter;
 
 impl App {
-    /// Measurements of a site in the order of their commits.
+    /// Returns a page of the measurements of a site, in the order of their commits.
     pub async fn segments(
         &self,
         site: &SiteId,

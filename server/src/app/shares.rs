@@ -1,4 +1,4 @@
-//! Places of which there are only so many, each identity its share, so that nobody takes them all.
+//! Limited numbers of connections, with a maximum per identity, so that nobody uses them all.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -9,14 +9,15 @@ use super::AppError;
 use super::identity::Credential;
 use crate::identity::subject::SubjectId;
 
-/// How many places there are.
+/// Limits on places.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Bounds {
     /// In all.
     pub all: usize,
-    /// For those who may only watch and stop, all together: the rest is for those who work.
+    /// Maximum for viewers, who may only watch and stop, all together: the rest is for operators
+    /// and admins.
     pub viewers: usize,
-    /// For one token or person, with their sessions.
+    /// Maximum for one token or person, with their sessions.
     pub each: usize,
 }
 
@@ -27,7 +28,7 @@ struct Taken {
     by_subject: HashMap<SubjectId, usize>,
 }
 
-/// Who has how many places.
+/// Places taken, by identity.
 #[derive(Debug, Clone)]
 pub struct Shares {
     bounds: Bounds,
@@ -35,7 +36,7 @@ pub struct Shares {
 }
 
 impl Shares {
-    /// Nobody has any.
+    /// Creates shares of which none is taken.
     pub fn new(bounds: Bounds) -> Self {
         let taken = Arc::default();
         Self { bounds, taken }
@@ -45,7 +46,7 @@ impl Shares {
         self.taken.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// How many are taken.
+    /// Returns the number of places taken.
     pub fn taken(&self) -> usize {
         self.lock().all
     }
@@ -53,7 +54,8 @@ impl Shares {
     /// Takes a place until the result is dropped.
     ///
     /// # Errors
-    /// [`AppError::TooMany`] if all are taken, those for viewers are, or this token or person has its share.
+    /// [`AppError::TooMany`] if all places are taken, or those of viewers, or those of this token
+    /// or person.
     pub fn take(&self, of: &Credential, what: &'static str) -> Result<Place, AppError> {
         self.place(of.subject, of.rights, what)
     }
@@ -86,7 +88,7 @@ impl Shares {
     }
 }
 
-/// One place, taken.
+/// One place; dropping it frees the place.
 #[derive(Debug)]
 pub struct Place {
     shares: Shares,

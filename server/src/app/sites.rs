@@ -1,4 +1,4 @@
-//! Sites: list, read, create.
+//! Sites: listing and creation.
 
 use tread_api::ids::SiteId;
 use tread_api::page::Page;
@@ -8,13 +8,13 @@ use tread_api::site::{CELL_MAX_M, CELL_MIN_M, CreateSite, GeoOrigin, Grid, Site}
 use super::{App, AppError, name_or, page, site_row};
 use crate::db;
 
-/// Most sites of one server.
+/// Maximum number of sites of one server.
 pub(super) const SITES_MAX: u32 = 1_000;
-/// Side of a cell when nothing is said, metres.
+/// Default side of a cell, metres.
 const CELL_DEFAULT_M: f64 = 1.0;
 
 impl App {
-    /// Sites of a scope after a cursor.
+    /// Returns a page of the sites of a scope, after a cursor.
     pub async fn sites(
         &self,
         within: &Scope,
@@ -27,20 +27,20 @@ impl App {
         Ok(page(sites, limit, |site: &Site| site.id.to_string()))
     }
 
-    /// The names of all sites.
+    /// Returns the names of all sites.
     pub(crate) async fn all_sites(&self) -> Result<Vec<SiteId>, AppError> {
         let mut tx = self.db().read("sites").await?;
         let rows = db::sites::list(&mut tx, &Scope::EVERYWHERE, "", SITES_MAX).await?;
         Ok(rows.into_iter().map(|row| row.site.id).collect())
     }
 
-    /// One site.
+    /// Returns one site.
     pub async fn site(&self, id: &SiteId) -> Result<Site, AppError> {
         let mut tx = self.db().read("sites").await?;
         Ok(site_row(&mut tx, id).await?.site)
     }
 
-    /// Makes a site.
+    /// Creates a site.
     pub async fn create_site(&self, request: CreateSite) -> Result<Site, AppError> {
         let CreateSite {
             id,
@@ -88,7 +88,7 @@ impl App {
         Ok(site)
     }
 
-    /// Says where on the earth a site lies, or that nobody knows.
+    /// Sets the position of a site's origin on the earth (WGS 84), or removes it.
     pub async fn tie_site(&self, id: &SiteId, origin: Option<GeoOrigin>) -> Result<Site, AppError> {
         let mut tx = self.db().write("sites").await?;
         let row = site_row(&mut tx, id).await?;
@@ -97,7 +97,7 @@ impl App {
         Ok(Site { origin, ..row.site })
     }
 
-    /// Makes a site unless it exists.
+    /// Creates a site unless it exists.
     pub async fn ensure_site(&self, id: &SiteId) -> Result<(), AppError> {
         let request = CreateSite {
             id: id.clone(),

@@ -1,4 +1,4 @@
-//! Stops: of one robot, of a fleet, in any state, by anybody, and their clearing.
+//! Stops: of one robot or of a fleet, and their clearing.
 //!
 //! ```text
 //! asked ─┬─► every robot at once ─► confirmed ──────────────┐
@@ -8,14 +8,14 @@
 //! clear ──► the database ─► the robot ─► cleared, or refused: a newer stop, or it still moves
 //! ```
 //!
-//! An open stop is state of a robot: it has one or none, and the newest takes the place of the one
-//! before, which is history then. So what is sent again is bounded by the number of robots.
+//! An open stop belongs to a robot: a robot has at most one, and a new one replaces the one before,
+//! which stays in the history. The stops that are sent again are thus limited by the number of
+//! robots.
 //!
-//! The robot is the truth of what is in force, in the order in which stops came to it: the clear of
-//! the last one ends those before. A robot that does not show a stop which it had confirmed and
-//! which nobody asked to clear gets it again, and may answer that it was cleared (`judge`).
-//! Everything of a stopped robot that was active or queued is held, and goes on only when a
-//! person says so.
+//! The robot decides which stop is in force, in the order in which stops reached it: clearing the
+//! last one ends those before. A robot that no longer shows a stop that it had confirmed, and that
+//! nobody cleared, gets it again, and may answer that it was cleared (`judge`). All active and
+//! queued missions of a stopped robot are held, and only a person resumes them.
 
 mod delivery;
 mod judge;
@@ -46,23 +46,23 @@ use crate::app::presence::RobotKey;
 pub use crate::db::stops::StopFilter;
 use crate::db::{self, Tx};
 
-/// How long a robot may take to confirm before the stop is shown as unconfirmed.
+/// Time within which a robot must confirm a stop; later it is shown as unconfirmed.
 pub const STOP_CONFIRM_MAX: Duration = Duration::from_millis(STOP_CONFIRM_MAX_MS);
-/// Stops of a robot that are kept; the oldest that are over go first.
+/// Maximum number of stops stored per robot; the oldest that are over are deleted first.
 const KEPT_MAX: u32 = 200;
-/// How long a stop of a robot that nobody has heard of yet may wait for the database to know it.
+/// Maximum time for looking up a robot that is not known in memory, when it is stopped.
 const LOOK_UP_MAX: Duration = Duration::from_secs(2);
-/// The alert of a robot that has not confirmed a stop.
+/// Code of the alert about a robot that has not confirmed a stop.
 pub(super) const UNCONFIRMED_ALERT: &str = "stop-unconfirmed";
-/// Who stopped, when nobody said.
+/// Author of a stop if none was given.
 const SOMEBODY: &str = "somebody";
 
-/// Who stops, and why, for people.
+/// Author and reason of a stop, for people.
 #[derive(Debug, Clone, Default)]
 pub struct StopWords {
-    /// Who.
+    /// The author.
     pub by: Option<String>,
-    /// Why.
+    /// The reason.
     pub reason: Option<String>,
 }
 
@@ -82,24 +82,24 @@ fn words(text: Option<String>, otherwise: &str) -> String {
     }
 }
 
-/// Robots of which it is said that they have not confirmed a stop.
+/// Returns the robots with a raised alert about an unconfirmed stop.
 async fn alerted(tx: &mut Tx) -> Result<HashSet<RobotKey>, AppError> {
     let alerted = db::alerts::raised_about(tx, UNCONFIRMED_ALERT).await?;
     Ok(alerted.into_iter().collect())
 }
 
-/// Waits for the database as long as somebody who stops a robot may have to.
+/// Runs a look-up for at most [`LOOK_UP_MAX`].
 async fn looked_up(looking_up: impl Future<Output = Result<(), AppError>>) -> Result<(), AppError> {
     let looked_up = tokio::time::timeout(LOOK_UP_MAX, looking_up).await;
     looked_up.unwrap_or_else(|_elapsed| Err(sqlx::Error::PoolTimedOut.into()))
 }
 
 impl App {
-    /// Stops one robot. Gives the stop when the robot has confirmed it, or after
+    /// Stops one robot. Returns the stop when the robot has confirmed it, or after
     /// [`STOP_CONFIRM_MAX`]; it is sent again until it is confirmed.
     ///
     /// # Errors
-    /// The robot has never said hello.
+    /// The robot has never sent a hello.
     pub async fn stop_robot(
         &self,
         site: &SiteId,
@@ -107,7 +107,7 @@ impl App {
         words: StopWords,
     ) -> Result<Stop, AppError> {
         let key = (site.clone(), robot.clone());
-        // What is in memory decides, so that a slow database does not delay a stop.
+        // Memory decides, so that a slow database does not delay a stop.
         if !self.presences().is_known(&key) {
             let looking_up = async {
                 let mut tx = self.db().read("stops").await?;
@@ -123,10 +123,10 @@ impl App {
         stops.into_iter().next().ok_or_else(unknown)
     }
 
-    /// Stops every robot of a scope that has ever said hello, of all its sites or of one.
+    /// Stops every robot of a scope that has ever sent a hello, in all its sites or in one.
     ///
     /// # Errors
-    /// There is no such site.
+    /// The site is not known.
     pub async fn stop_fleet(
         &self,
         within: &Scope,
@@ -200,7 +200,7 @@ impl App {
         };
         let settling = settling.run(confirmations, shown, recorded);
         self.supervisor().spawn_passing("stops", settling);
-        // It answers within the bound; without it nothing is confirmed.
+        // The task answers within the limit; if it is gone, nothing is confirmed.
         let confirmed = seen.await.unwrap_or_default();
         for stop in &mut stops {
             let found = confirmed.iter().find(|(id, _)| *id == stop.id);
@@ -210,7 +210,8 @@ impl App {
         stops
     }
 
-    /// Clears a stop, if it is the robot's newest and the robot stands. Nothing starts by it.
+    /// Clears a stop, if it is the robot's newest and the robot is stopped. This does not start
+    /// anything.
     ///
     /// # Errors
     /// The stop is not known, the robot does not answer, or it refuses.
@@ -264,7 +265,7 @@ impl App {
     /// Stops, newest first.
     pub async fn stops(&self, filter: &StopFilter, limit: u32) -> Result<Page<Stop>, AppError> {
         let mut tx = self.db().read("stops").await?;
-        // Looked at first: one that is written down meanwhile is in both.
+        // Read first: a stop that is stored meanwhile is then in both lists.
         let mut stops = self.unrecorded().list(filter);
         for mut stop in db::stops::list(&mut tx, filter, limit + 1).await? {
             stops.retain(|unrecorded| unrecorded.id != stop.id);
@@ -282,7 +283,7 @@ impl App {
         }))
     }
 
-    /// The open stop of each robot that has one.
+    /// Returns the open stop of each robot that has one.
     pub(crate) async fn stops_in_force(&self) -> Result<Vec<Stop>, AppError> {
         let mut tx = self.db().read("stops").await?;
         let stops = db::stops::in_force(&mut tx).await?;
@@ -303,8 +304,8 @@ impl App {
         presence.state().and_then(|state| state.safety.stop.clone())
     }
 
-    /// Makes the stop that a robot shows its open one. It stopped by itself, was stopped by another
-    /// program, or has another order of its stops.
+    /// Makes the stop that a robot shows its open one: it stopped by itself, was stopped by another
+    /// program, or received the stops in another order.
     async fn adopt_shown_stop(&self, tx: &mut Tx, key: &RobotKey) -> Result<(), AppError> {
         let Some(latch) = self.shown_latch(key) else {
             return Ok(());
@@ -312,8 +313,8 @@ impl App {
         let Some(robot_pk) = db::robots::pk_of(tx, &key.0, &key.1).await? else {
             return Ok(());
         };
-        // A stop that the robot has not confirmed yet is newer than what it shows, and is still to be
-        // sent; so is one that is not written down.
+        // An unconfirmed stop is newer than what the robot shows, and is still to be sent; so is
+        // one that is not stored yet.
         let open = db::stops::in_force_of(tx, robot_pk).await?;
         let is_pending =
             open.is_some_and(|open| open.id != latch.id && open.confirmed_at.is_none());
@@ -346,12 +347,12 @@ impl App {
         Ok(())
     }
 
-    /// Writes stops down, and holds everything of their robots that is active.
+    /// Stores stops, and holds all active missions of their robots.
     async fn record_stops(&self, tx: &mut Tx, stops: &[Stop]) -> Result<(), AppError> {
         db::stops::insert(tx, stops, KEPT_MAX).await?;
         let mut busy = None;
         if stops.len() > 1 {
-            // Of a whole fleet most robots may have nothing to hold.
+            // Most robots of a fleet may have nothing to hold.
             let mut missions = db::missions::in_progress(tx).await?;
             missions.extend(db::missions::next_in_queues(tx).await?);
             let keys = missions
@@ -371,7 +372,7 @@ impl App {
         Ok(())
     }
 
-    /// Writes down that robots have confirmed, and ends the alerts on it.
+    /// Stores the confirmations of robots, and clears the alerts about these stops.
     pub(super) async fn note_confirmed(
         &self,
         stops: &[Stop],
@@ -389,8 +390,8 @@ impl App {
         Ok(self.commit_alerts(tx, alerts).await?)
     }
 
-    /// Writes down that a stop was in force on its robot and has been cleared there, with one that
-    /// came later there.
+    /// Stores that a stop was in force on its robot and has been cleared there, or that a later one
+    /// was.
     pub(super) async fn note_over(&self, stop: &Stop) -> Result<(), AppError> {
         let mut tx = self.db().write("stops").await?;
         db::stops::end(&mut tx, stop.id, self.clock().now()).await?;
@@ -400,14 +401,14 @@ impl App {
         Ok(())
     }
 
-    /// Raises the alert of robots that have not confirmed.
+    /// Raises the alerts of robots that have not confirmed a stop.
     pub(super) async fn note_unconfirmed(&self, stops: &[&Stop]) -> Result<(), AppError> {
         let mut tx = self.db().read("stops").await?;
         let open = db::stops::in_force(&mut tx).await?;
         let open: HashSet<StopId> = open.into_iter().map(|stop| stop.id).collect();
         let alerted = alerted(&mut tx).await?;
         drop(tx);
-        // Most may have been replaced, where somebody stops a fleet again and again.
+        // Most stops may have been replaced, if a fleet is stopped repeatedly.
         let is_missing =
             |stop: &&&Stop| open.contains(&stop.id) && !alerted.contains(&key_of(stop));
         let missing: Vec<&&Stop> = stops.iter().filter(is_missing).collect();
@@ -422,8 +423,8 @@ impl App {
         Ok(self.commit_alerts(tx, alerts).await?)
     }
 
-    /// Ends the alert of a robot that has no unconfirmed stop, or raises that of one that has, if it
-    /// `is_overdue`.
+    /// Clears the alert of a robot without an unconfirmed stop, or raises that of a robot with one
+    /// if `is_overdue`.
     async fn settle_alert(
         &self,
         tx: &mut Tx,

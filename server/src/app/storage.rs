@@ -1,4 +1,4 @@
-//! Whether the storage works: checked all the time, and shown by `/readyz`, metrics and alerts.
+//! State of the storage: checked periodically, and shown by `/readyz`, metrics and alerts.
 //!
 //! ```text
 //! every 5 s, and when somebody asks ─► a real write, the root page of every table, the free disk
@@ -7,7 +7,7 @@
 //! ```
 //!
 //! These alerts are about the server and no robot. They are kept in memory and in the log, because
-//! what they say is that nothing can be stored.
+//! they report that nothing can be stored.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -25,64 +25,65 @@ use crate::db::DbError;
 use crate::db::alerts::AlertFilter;
 use crate::db::failure::{self, StorageFailure};
 
-/// How often the storage is checked although nobody asks.
+/// Interval between checks of the storage.
 const CHECK_EVERY: Duration = Duration::from_secs(5);
-/// How old a check may be that answers a question about readiness: anybody may ask, and each check
-/// costs a write that is synced.
+/// Maximum age of a check that answers a request for readiness: anybody may send one, and each
+/// check costs a synced write.
 const CHECK_SHARED_FOR: Duration = Duration::from_secs(1);
-/// How long one part of a check may take before it counts as failed.
+/// Maximum time for one part of a check before it counts as failed.
 const CHECK_TIMEOUT: Duration = Duration::from_secs(5);
-/// How long nothing may have failed before the storage counts as working again.
+/// Time without a failure after which the storage counts as working again.
 const RECOVERED_AFTER: Duration = Duration::from_secs(10);
-/// How often a damaged database is examined again.
+/// Interval between examinations of a damaged database.
 const EXAMINE_EVERY: Duration = Duration::from_mins(10);
-/// How long after an examination that found nothing the next report of damage has it done again.
+/// Minimum time between an examination without findings and one caused by the next report of
+/// damage.
 const EXAMINE_REST: Duration = Duration::from_mins(1);
-/// How long an examination may take.
+/// Maximum time for an examination.
 const EXAMINE_MAX: Duration = Duration::from_mins(10);
-/// Free space above the limit, as a share of it, at which the alert ends.
+/// Free space above the limit, as a fraction of the limit, at which the alert is cleared.
 const DISK_LOW_HYSTERESIS: f64 = 0.1;
-/// Alerts about the server that are kept after they have cleared.
+/// Maximum number of cleared alerts about the server that are kept.
 const CLEARED_KEPT_MAX: usize = 100;
-/// How often the failure of one and the same thing is logged: a full disk fails the same
+/// Minimum interval between log entries about the same failure: a full disk fails the same
 /// transactions many times a second.
 const LOG_EVERY: Duration = Duration::from_secs(30);
-/// Characters of SQLite's finding that an alert shows.
+/// Maximum length of SQLite's finding in an alert, characters.
 const FINDING_MAX: usize = 200;
 
-/// The alert of a database that cannot be written.
+/// Code of the alert about a database that cannot be written.
 pub const UNWRITABLE_ALERT: &str = "storage-unwritable";
-/// The alert of a database that is damaged.
+/// Code of the alert about a damaged database.
 pub const DAMAGED_ALERT: &str = "database-damaged";
-/// The alert of a disk that is nearly full.
+/// Code of the alert about a disk that is nearly full.
 pub const DISK_LOW_ALERT: &str = "disk-low";
 
-/// What the last check found.
+/// Result of the last check.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct StorageCondition {
-    /// Why nothing can be written, if that is so.
+    /// Reason why nothing can be written, if so.
     pub unwritable: Option<String>,
     /// What is damaged, if anything is.
     pub damaged: Option<String>,
-    /// Free bytes on the disk of the database, if the operating system tells.
+    /// Free bytes on the database's disk; `None` if the operating system does not report them.
     pub disk_free_bytes: Option<u64>,
-    /// Whether that is below the configured limit.
+    /// Whether the free space is below the configured limit.
     pub is_disk_low: bool,
 }
 
 impl StorageCondition {
-    /// Why the server cannot do its work, if that is so.
+    /// Returns the reason why the server cannot work, if there is one.
     pub fn problem(&self) -> Option<&str> {
         let damaged = self.damaged.as_deref();
         damaged.or(self.unwritable.as_deref())
     }
 }
 
-/// The last check, and the alerts about the server.
+/// Result of the last check, and the alerts about the server.
 #[derive(Debug)]
 pub(super) struct Storage {
     config: StorageConfig,
-    /// Held by whoever checks.
+    /// Locked during a check.
     checking: tokio::sync::Mutex<()>,
     inner: Mutex<Inner>,
 }
@@ -91,12 +92,12 @@ pub(super) struct Storage {
 struct Inner {
     condition: StorageCondition,
     checked_at: Option<Duration>,
-    /// When the database was examined last, and how many reports of damage there were by then.
+    /// Time of the last examination, and the number of damage reports at that time.
     examined: Option<(Duration, u64)>,
-    /// When each failure was logged last, and how often it was left out since.
+    /// Time of the last log entry of each failure, and the number of those suppressed since.
     logged: HashMap<&'static str, (Duration, u64)>,
     raised: Vec<Alert>,
-    /// Newest last.
+    /// Cleared alerts, newest last.
     cleared: VecDeque<Alert>,
 }
 
@@ -113,7 +114,7 @@ impl Storage {
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Alerts about the server that a filter lets through, newest first.
+    /// Returns the alerts about the server that a filter lets through, newest first.
     pub(super) fn alerts(&self, filter: &AlertFilter) -> Vec<Alert> {
         // They concern every site, and no robot.
         if filter.robot.is_some() {
@@ -128,8 +129,7 @@ impl Storage {
         alerts
     }
 
-    /// Notes that a person has seen an alert about the server; `None` if there is none of that
-    /// identifier.
+    /// Acknowledges an alert about the server; `None` if there is none with this identifier.
     pub(super) fn acknowledge(&self, id: AlertId, now: Timestamp) -> Option<Alert> {
         let mut inner = self.lock();
         let Inner {
@@ -143,7 +143,7 @@ impl Storage {
 }
 
 impl App {
-    /// Logs that something failed in the background and will be tried again; repeats are counted.
+    /// Logs that a background task failed and will be repeated; repeats are counted.
     pub(crate) fn log_failure(&self, what: &'static str, cause: &dyn std::error::Error) {
         let now = self.clock().elapsed();
         let left_out = {
@@ -153,7 +153,7 @@ impl App {
                     *left_out += 1;
                     return;
                 }
-                // As many as there are places that call this.
+                // There are only as many keys as callers of this function.
                 Some(_) | None => inner.logged.insert(what, (now, 0)),
             }
         };
@@ -161,12 +161,12 @@ impl App {
         error!(repeats, "cannot {what}: {}", chain(cause));
     }
 
-    /// What the last check found.
+    /// Returns the result of the last check.
     pub fn storage_condition(&self) -> StorageCondition {
         self.storage().lock().condition.clone()
     }
 
-    /// Whether the server can do its work now; checks, unless that was done a moment ago.
+    /// Returns whether the server can work now; checks unless the last check is recent.
     pub async fn ready(&self) -> StorageCondition {
         self.check_storage(CHECK_SHARED_FOR).await
     }
@@ -201,13 +201,13 @@ impl App {
         condition
     }
 
-    /// Examines the whole file, if there is a reason to and it was not done a moment ago.
+    /// Examines the whole file, if there is a reason and the last examination is not too recent.
     async fn examine_database(&self) {
         let reports = failure::count(StorageFailure::Damaged);
         let now = self.clock().elapsed();
         {
             let inner = self.storage().lock();
-            // What keeps touching the damage must not have the whole file read all the time.
+            // Repeated access to the damage must not cause the whole file to be read all the time.
             let every = match inner.condition.damaged {
                 Some(_) => EXAMINE_EVERY,
                 None => EXAMINE_REST,
@@ -224,7 +224,7 @@ impl App {
         let found = found.unwrap_or_else(|_elapsed| Err(sqlx::Error::WorkerCrashed.into()));
         let condition = {
             let mut inner = self.storage().lock();
-            // What this very examination met is no news.
+            // Damage found by this examination itself is not new.
             let reports = failure::count(StorageFailure::Damaged).max(reports);
             inner.examined = Some((self.clock().elapsed(), reports));
             inner.condition.damaged = match found {
@@ -315,14 +315,14 @@ impl App {
 }
 
 impl Inner {
-    /// Whether SQLite has met damage since the whole file was examined.
+    /// Returns whether SQLite has reported damage since the last examination.
     fn has_new_damage(&self) -> bool {
         let examined = self.examined.map_or(0, |(_, reports)| reports);
         failure::count(StorageFailure::Damaged) > examined
     }
 }
 
-/// An error with the causes behind it, on one line.
+/// Formats an error with its causes on one line.
 fn chain(error: &dyn std::error::Error) -> String {
     let mut text = error.to_string();
     let mut cause = error.source();
@@ -334,7 +334,7 @@ fn chain(error: &dyn std::error::Error) -> String {
     text
 }
 
-/// Runs a check within its time; what failed, for people.
+/// Runs a check with a time limit; on failure returns the reason, for people.
 async fn limited(probe: impl Future<Output = Result<(), DbError>>) -> Result<(), &'static str> {
     match tokio::time::timeout(CHECK_TIMEOUT, probe).await {
         Ok(Ok(())) => Ok(()),
@@ -347,11 +347,11 @@ async fn limited(probe: impl Future<Output = Result<(), DbError>>) -> Result<(),
     }
 }
 
-/// Why nothing can be stored, by the checks and by what has failed of late.
+/// Returns why nothing can be stored, from the checks and from recent failures.
 fn unwritable(found: Option<&'static str>) -> Option<String> {
     let recent = || {
         let (failure, since) = failure::last()?;
-        // Damage has an alert of its own: what does not touch it goes on.
+        // Damage has an alert of its own: writes elsewhere succeed.
         let counts = failure != StorageFailure::Damaged && since < RECOVERED_AFTER;
         counts.then(|| failure.explanation())
     };
@@ -370,7 +370,7 @@ fn is_low(free_bytes: Option<u64>, limit_bytes: u64, was_low: bool) -> bool {
     free_bytes.is_some_and(|free| free < bound)
 }
 
-/// Checks until the stop.
+/// Checks periodically until the stop.
 pub async fn run(app: App, stop: CancellationToken) {
     while !stop.is_cancelled() {
         app.check_storage(CHECK_SHARED_FOR).await;

@@ -1,9 +1,9 @@
 //! Teleoperation: one session for each connection, of which at most one has a robot's lease.
 //!
-//! The robot gives the lease and is the truth of it. A session only passes on: it puts the
-//! robot's own time and the lease's epoch into commands, so that whatever comes late, from an old
-//! lease or from another run of the agent is refused there. A session that ends in any way while
-//! it has the lease tells the robot to stand at once and gives the lease back.
+//! The robot grants the lease and decides who has it. A session only forwards: it puts the robot's
+//! own time and the lease's epoch into commands, so that the robot refuses late commands of an old
+//! lease or of another run of the agent. A session that ends in any way while it has the lease
+//! commands the robot to stop at once and releases the lease.
 
 use std::collections::HashMap;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -34,33 +34,34 @@ use super::{App, AppError};
 use crate::app::presence::RobotKey;
 use crate::db;
 
-/// Most drive connections at once.
+/// Maximum number of drive connections at once.
 pub const SESSIONS_MAX: usize = 512;
-/// Most of them of those who may watch and stop, not drive.
+/// Maximum number of drive connections of viewers, who may watch and stop but not drive.
 pub const WATCHERS_MAX: usize = 256;
-/// Most of one token, with its sessions.
+/// Maximum number of drive connections of one token, with its sessions.
 pub const SESSIONS_PER_IDENTITY_MAX: usize = 64;
-/// How they are shared out.
+/// Limits on drive connections.
 pub(super) const SHARES: Bounds = Bounds {
     all: SESSIONS_MAX,
     viewers: WATCHERS_MAX,
     each: SESSIONS_PER_IDENTITY_MAX,
 };
-/// Tries to give a lease back after its connection was lost; the robot frees it by itself.
+/// Number of attempts to release a lease after its connection was lost; the robot frees it by
+/// itself.
 const RELEASE_TRIES: u32 = 5;
-/// Wait between two of them.
+/// Wait between two attempts.
 const RELEASE_RETRY: Duration = Duration::from_millis(300);
-/// How long a command to stand lasts: as long as the robot would need to do it by itself.
+/// Validity of a command with zero velocity: as long as the robot would take to stop by itself.
 const STAND_FOR: Duration = Duration::from_millis(250);
-/// How long a new driver waits until the database has that missions are held.
+/// Maximum time that a new driver waits until holding the missions is stored.
 const HOLD_WAIT_MAX: Duration = Duration::from_millis(300);
-/// Wait between two tries of that.
+/// Wait between two attempts to store it.
 const HOLD_RETRY: Duration = Duration::from_millis(500);
-/// How long the robot's states may still show another lease after one was given: they are on
-/// their way while the answer comes.
+/// Time after a lease was given in which the robot's states may still show another one: they were
+/// sent before the answer.
 const LEASE_GRACE: Duration = Duration::from_secs(1);
 
-/// Why something was not done, for programs and for people.
+/// Reason why a request of a session was refused.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Refused {
     /// For programs.
@@ -87,11 +88,11 @@ fn refused_by_robot(refusal: CommandRefusal) -> Refused {
     refused(cause, refusal.detail)
 }
 
-/// Robots whose missions are being held for a driver, until that is written down: at most one task
-/// for each robot.
+/// Robots whose missions are being held for a driver, until that is stored: at most one task per
+/// robot.
 #[derive(Debug, Default)]
 pub(super) struct Holds {
-    /// Whether it was asked for again since the last try began.
+    /// Whether holding was requested again since the last attempt began.
     asked: Mutex<HashMap<RobotKey, bool>>,
 }
 
@@ -100,12 +101,12 @@ impl Holds {
         self.asked.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Asks for it; whether nobody is at it.
+    /// Requests holding; returns true if no task is working on it.
     fn ask(&self, key: &RobotKey) -> bool {
         self.lock().insert(key.clone(), true).is_none()
     }
 
-    /// Whether it was asked for since the last try; if not, nobody is at it any more.
+    /// Returns whether holding was requested since the last attempt; if not, removes the robot.
     fn is_asked(&self, key: &RobotKey) -> bool {
         let mut asked = self.lock();
         match asked.get_mut(key) {
@@ -121,7 +122,7 @@ impl Holds {
     }
 }
 
-/// A lease that the robot gave to this session.
+/// A lease that the robot granted to this session.
 #[derive(Debug)]
 struct ActiveLease {
     lease: Lease,
@@ -131,14 +132,14 @@ struct ActiveLease {
     next_seq: u64,
 }
 
-/// One connection to one robot.
+/// One teleoperation connection to one robot.
 #[derive(Debug)]
 pub struct Session {
     app: App,
     key: RobotKey,
     client: Uuid,
     active: Option<ActiveLease>,
-    /// The server's stop waits until the session has commanded the robot to stand; dropped last.
+    /// The server's stop waits until the session has commanded the robot to stop; dropped last.
     _attended: TaskTrackerToken,
 }
 
@@ -146,7 +147,7 @@ impl App {
     /// Begins a session that only observes.
     ///
     /// # Errors
-    /// The robot has never said hello, or the network is not open.
+    /// The robot has never sent a hello, or the network is not open.
     pub async fn begin_drive(&self, site: &SiteId, robot: &RobotId) -> Result<Session, AppError> {
         self.known_robot(site, robot).await?;
         Ok(Session {
@@ -158,21 +159,21 @@ impl App {
         })
     }
 
-    /// How many drive connections there are.
+    /// Returns the number of drive connections.
     pub(crate) fn drive_clients(&self) -> usize {
         self.inner.drive_shares.taken()
     }
 
-    /// A place for one more drive connection of somebody.
+    /// Takes a place for one more drive connection of this credential.
     ///
     /// # Errors
-    /// There are [`SESSIONS_MAX`] already, [`WATCHERS_MAX`] of those who may not drive, or
-    /// [`SESSIONS_PER_IDENTITY_MAX`] of this token's.
+    /// [`AppError::TooMany`]: all [`SESSIONS_MAX`] are taken, or the [`WATCHERS_MAX`] of viewers,
+    /// or the [`SESSIONS_PER_IDENTITY_MAX`] of this token.
     pub fn drive_slot(&self, of: &Credential) -> Result<Place, AppError> {
         self.inner.drive_shares.take(of, "drive connections")
     }
 
-    /// Holds everything of a robot that is active or queued while somebody drives it.
+    /// Holds all active and queued missions of a robot while somebody teleoperates it.
     async fn hold_for_driver(&self, key: &RobotKey, name: &str) -> Result<(), AppError> {
         let mut tx = self.db().write("teleop").await?;
         if let Some(robot_pk) = db::robots::pk_of(&mut tx, &key.0, &key.1).await? {
@@ -186,17 +187,18 @@ impl App {
 }
 
 impl Session {
-    /// The session's name in leases.
+    /// Returns the session's identifier in leases.
     pub fn client(&self) -> Uuid {
         self.client
     }
 
-    /// Cancelled when the server stops.
+    /// Returns a token that is cancelled when the server stops.
     pub fn stop_token(&self) -> CancellationToken {
         self.app.supervisor().stop_token()
     }
 
-    /// Ends the session: a robot that it drives is commanded to rest, and the lease is released.
+    /// Ends the session: a robot that it teleoperates is commanded to stop, and the lease is
+    /// released.
     pub fn end(&mut self) {
         if self.active.is_some() {
             let robot = &self.key.1;
@@ -206,10 +208,11 @@ impl Session {
         }
     }
 
-    /// Asks the robot for the lease; `take` has it whoever has it now.
+    /// Requests the lease from the robot; with `take` even if somebody else has it.
     ///
     /// # Errors
-    /// [`DriveRefusal::Leased`] names who has it; or the robot does not answer, or will not.
+    /// [`DriveRefusal::Leased`] names the driver who has it; other causes if the robot does not
+    /// answer or refuses.
     pub async fn acquire(&mut self, name: &str, take: bool) -> Result<Lease, Refused> {
         let name: String = name.trim().chars().take(BY_LENGTH_MAX).collect();
         if name.is_empty() {
@@ -230,7 +233,7 @@ impl Session {
             .map_err(|undelivered| refused(DriveRefusal::Unreachable, undelivered.to_string()))?;
         let epoch = answer.reply.into_result().map_err(refused_by_robot)?;
         let lease = Lease { epoch, driver };
-        // The same lease again goes on where it was.
+        // The same lease continues with its sequence numbers.
         let is_same =
             |active: &&mut ActiveLease| (active.lease.epoch, active.boot) == (epoch, answer.boot);
         if let Some(active) = self.active.as_mut().filter(is_same) {
@@ -256,13 +259,13 @@ impl Session {
         Ok(lease)
     }
 
-    /// Writes down that missions are held for a driver, who waits for it no longer than
+    /// Stores in the background that missions are held for a driver, and waits for it at most
     /// [`HOLD_WAIT_MAX`].
     async fn hold_missions(&self, name: String) {
         let (app, key) = (self.app.clone(), self.key.clone());
         let (written, is_written) = oneshot::channel();
         let ending = self.app.supervisor().stop_token();
-        // Whoever tries already does it once more.
+        // The task that is working on it does it once more.
         if !app.holds().ask(&key) {
             return;
         }
@@ -277,13 +280,13 @@ impl Session {
                     }
                 }
             }
-            // The driver may have ceased to wait.
+            // Fails if the driver no longer waits.
             let _ = written.send(());
         });
         let _ = tokio::time::timeout(HOLD_WAIT_MAX, is_written).await;
     }
 
-    /// Passes one command on; it lasts as long as it says, and no longer than the bound.
+    /// Forwards one command, valid for its own duration limited to the allowed range.
     ///
     /// # Errors
     /// This session has no lease, the robot is stopped, or its clock is not known.
@@ -297,7 +300,7 @@ impl Session {
         self.send(twist, Duration::from_millis(for_ms))?;
         let presence = self.app.presences().get(&self.key);
         let stop = presence.state().and_then(|state| state.safety.stop.clone());
-        // The robot would not move, and its driver is to know why.
+        // The robot would not move, and the driver must see why.
         stop.map_or(Ok(()), |stop| {
             let detail = format!("stopped by {}: {}", stop.by, stop.reason);
             Err(refused(DriveRefusal::Stopped, detail))
@@ -337,9 +340,9 @@ impl Session {
         }
     }
 
-    /// Gives the lease back; the robot's target is zero at once.
+    /// Releases the lease, after a command with zero velocity. Returns whether the session had one.
     pub fn release(&mut self) -> bool {
-        // Without the robot's clock it stands when its last command ends.
+        // If the robot's clock is not known, the robot stops when its last command ends.
         let _ = self.send(Twist::default(), STAND_FOR);
         match self.active.take() {
             Some(active) => {
@@ -350,7 +353,7 @@ impl Session {
         }
     }
 
-    /// Tells the robot in the background that a lease is over.
+    /// Releases a lease on the robot in the background.
     fn give_back(&self, lease: Lease) {
         let (app, key) = (self.app.clone(), self.key.clone());
         let ending = app.supervisor().stop_token();
@@ -387,8 +390,8 @@ impl Session {
         self.app.stop_robot(site, robot, words).await
     }
 
-    /// Whether the robot's states say that this session's lease is over; the session has none
-    /// then.
+    /// Returns why this session's lease is over according to the robot's states, and drops it;
+    /// `None` while it is valid.
     pub fn lost_lease(&mut self) -> Option<(ReleaseCause, String)> {
         let active = self.active.as_ref()?;
         let now = self.app.clock().elapsed();
@@ -418,7 +421,7 @@ impl Session {
         Some(lost)
     }
 
-    /// The robot as it was heard last; `socket` is the connection's way there and back.
+    /// Returns the robot's last state; `socket` is the round-trip time of the connection.
     pub fn view(&self, socket: Option<Duration>) -> DriveView {
         let now = self.app.clock().elapsed();
         let presence = self.app.presences().get(&self.key);

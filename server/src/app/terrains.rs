@@ -1,4 +1,5 @@
-//! Terrains: draw, list, replace, delete. Every change reaches the robots by the reconciler.
+//! Terrains: creation, listing, replacement and deletion. The reconciler sends every change to the
+//! robots.
 
 use tread_api::ids::{SiteId, TerrainId};
 use tread_api::page::Page;
@@ -11,7 +12,7 @@ use super::{App, AppError, name_or, page, site_row};
 use crate::db::{self, DbError, Tx};
 
 impl App {
-    /// Terrains of a site after a cursor.
+    /// Returns a page of the terrains of a site, after a cursor.
     pub async fn terrains(
         &self,
         site: &SiteId,
@@ -25,7 +26,7 @@ impl App {
         Ok(page(terrains, limit, |terrain| terrain.id.to_string()))
     }
 
-    /// One terrain.
+    /// Returns one terrain.
     pub async fn terrain(&self, site: &SiteId, id: &TerrainId) -> Result<Terrain, AppError> {
         let mut tx = self.db().read("terrains").await?;
         let site_pk = site_row(&mut tx, site).await?.pk;
@@ -33,7 +34,7 @@ impl App {
         terrain.ok_or_else(|| AppError::UnknownTerrain(site.clone(), id.clone()))
     }
 
-    /// Draws a terrain.
+    /// Creates a terrain.
     pub async fn create_terrain(
         &self,
         site: &SiteId,
@@ -75,7 +76,7 @@ impl App {
         self.put_terrain(tx, site_pk, terrain).await
     }
 
-    /// Replaces everything of a terrain but its identifier.
+    /// Replaces all of a terrain except its identifier.
     pub async fn replace_terrain(
         &self,
         site: &SiteId,
@@ -121,7 +122,7 @@ impl App {
         Ok(terrain)
     }
 
-    /// Removes a terrain; what was measured on it stays.
+    /// Deletes a terrain; measurements made on it are kept.
     pub async fn delete_terrain(&self, site: &SiteId, id: &TerrainId) -> Result<(), AppError> {
         let mut tx = self.db().write("terrains").await?;
         let site_pk = site_row(&mut tx, site).await?.pk;
@@ -135,7 +136,7 @@ impl App {
     }
 }
 
-/// A site as robots must know it; `None` if there is no such site.
+/// Returns the definition of a site for its robots; `None` if there is no such site.
 pub(super) async fn site_definition(
     tx: &mut Tx,
     site: &SiteId,

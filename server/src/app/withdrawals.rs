@@ -1,7 +1,7 @@
-//! Withdrawing what a robot measured: the map is then as if it had never come.
+//! Withdrawal of a robot's measurements: the map is then as if they had never arrived.
 //!
-//! The sums of the hours go, and what comes late of them does not count either. Raw segments stay
-//! where they are. Hours that are merged into days can only be withdrawn by whole days.
+//! The sums of the withdrawn hours are removed, and later uploads of these hours are not added. Raw
+//! segments are kept. Hours that are merged into days can only be withdrawn by whole days.
 
 use jiff::Timestamp;
 use tread_api::friction::{CreateWithdrawal, Withdrawal};
@@ -17,14 +17,14 @@ use crate::db::withdrawals::WithdrawalRow;
 use crate::friction::sums::{DAY_H, HOUR_S};
 use crate::friction::{bucket_h, epoch_h};
 
-/// Most withdrawals of one server; each segment that comes is held against them.
+/// Maximum number of withdrawals of one server; each new segment is compared with all of them.
 const WITHDRAWALS_MAX: usize = 1_000;
 
 impl App {
-    /// Withdraws what a robot measured in whole hours, from all sites' maps that it is on.
+    /// Withdraws what a robot measured in whole hours, on its site's map.
     ///
     /// # Errors
-    /// Site or robot is not known, the hours are none, or they cut through a merged day.
+    /// Site or robot is not known, the hours are invalid, or they cut through a merged day.
     pub async fn withdraw(
         &self,
         (site, robot): (&SiteId, &RobotId),
@@ -68,7 +68,7 @@ impl App {
         Ok(to_api(row, robot.clone()))
     }
 
-    /// Withdrawals of a site's robots in a scope, the oldest first, after a cursor.
+    /// Returns the withdrawals of a site's robots in a scope, oldest first, after a cursor.
     pub async fn withdrawals(
         &self,
         (site, within): (&SiteId, &Scope),

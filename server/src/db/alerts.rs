@@ -67,13 +67,13 @@ pub struct AlertFilter {
     pub robot: Option<RobotId>,
     /// Only those that have not cleared.
     pub raised: bool,
-    /// Only those older than this one.
+    /// Only those older than this one (cursor).
     pub before: Option<AlertId>,
-    /// Only those of what is in this scope.
+    /// Only those about sites and robots in this scope.
     pub within: Scope,
 }
 
-/// Alerts, newest first.
+/// Returns alerts, newest first.
 pub async fn list(
     db: &mut SqliteConnection,
     filter: &AlertFilter,
@@ -101,7 +101,7 @@ pub async fn list(
     rows(raw)
 }
 
-/// All alerts that have not cleared, oldest first, at most `limit`.
+/// Returns the alerts that are not cleared, oldest first, at most `limit`.
 pub async fn raised(db: &mut SqliteConnection, limit: u32) -> Result<Vec<Alert>, DbError> {
     let raw = alerts!(
         "WHERE alerts.cleared_at_us IS NULL ORDER BY alerts.id LIMIT ?",
@@ -112,7 +112,7 @@ pub async fn raised(db: &mut SqliteConnection, limit: u32) -> Result<Vec<Alert>,
     rows(raw)
 }
 
-/// The robots of which that alert is raised.
+/// Returns the robots about which this alert is raised.
 pub async fn raised_about(
     db: &mut SqliteConnection,
     code: &str,
@@ -132,7 +132,7 @@ pub async fn raised_about(
         .collect()
 }
 
-/// A robot's alerts that have not cleared, oldest first.
+/// Returns a robot's alerts that are not cleared, oldest first.
 pub async fn raised_of(db: &mut SqliteConnection, robot_pk: i64) -> Result<Vec<Alert>, DbError> {
     let raw = alerts!(
         "WHERE alerts.robot_pk = ? AND alerts.cleared_at_us IS NULL ORDER BY alerts.id",
@@ -143,7 +143,7 @@ pub async fn raised_of(db: &mut SqliteConnection, robot_pk: i64) -> Result<Vec<A
     rows(raw)
 }
 
-/// The alert of that identifier.
+/// Returns an alert by its identifier.
 pub async fn find(db: &mut SqliteConnection, id: AlertId) -> Result<Option<Alert>, DbError> {
     let id = id.to_string();
     let raw = alerts!("WHERE alerts.id = ?", id)
@@ -152,7 +152,7 @@ pub async fn find(db: &mut SqliteConnection, id: AlertId) -> Result<Option<Alert
     raw.map(Alert::try_from).transpose()
 }
 
-/// Raises an alert; nothing happens if its code is raised already.
+/// Raises an alert; has no effect if the robot's alert of this code is raised already.
 pub async fn raise(
     db: &mut SqliteConnection,
     robot_pk: i64,
@@ -181,7 +181,7 @@ pub async fn raise(
     Ok(())
 }
 
-/// Removes a robot's oldest alerts beyond so many; those that are raised stay.
+/// Deletes a robot's oldest cleared alerts beyond `kept` alerts.
 pub async fn forget(db: &mut SqliteConnection, robot_pk: i64, kept: u32) -> Result<(), DbError> {
     sqlx::query!(
         "DELETE FROM alerts
@@ -196,7 +196,7 @@ pub async fn forget(db: &mut SqliteConnection, robot_pk: i64, kept: u32) -> Resu
     Ok(())
 }
 
-/// Clears a robot's alert of that code, not before it was raised or acknowledged.
+/// Clears a robot's alert of this code, with a time not before it was raised or acknowledged.
 pub async fn clear(
     db: &mut SqliteConnection,
     robot_pk: i64,
@@ -217,7 +217,7 @@ pub async fn clear(
     Ok(())
 }
 
-/// Notes that a person has seen an alert; a first time counts.
+/// Marks an alert as acknowledged; only the first time counts.
 pub async fn acknowledge(
     db: &mut SqliteConnection,
     id: AlertId,

@@ -1,24 +1,24 @@
-//! Which robots are expected on the network.
+//! Attendance of robots: which ones were on the network and have not left by themselves.
 
 use sqlx::SqliteConnection;
 use tread_api::ids::{RobotId, SiteId};
 
 use super::{DbError, parse};
 
-/// Whether a robot is expected on the network.
+/// Attendance of one robot.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Expected {
     /// The robot's site.
     pub site: SiteId,
     /// The robot.
     pub robot: RobotId,
-    /// Whether it was there and has not left by itself.
+    /// Whether it was on the network and has not left by itself.
     pub is_present: bool,
-    /// Whether an alert of that code is raised.
+    /// Whether the requested alert is raised about it.
     pub is_alerted: bool,
 }
 
-/// All robots, and whether each has an alert of that code.
+/// Returns the attendance of all robots, with whether their alert of this code is raised.
 pub async fn all(db: &mut SqliteConnection, code: &str) -> Result<Vec<Expected>, DbError> {
     let rows = sqlx::query!(
         r#"SELECT sites.id AS site, robots.id AS robot, robots.is_present AS "is_present: bool",
@@ -40,7 +40,7 @@ pub async fn all(db: &mut SqliteConnection, code: &str) -> Result<Vec<Expected>,
         .collect()
 }
 
-/// Notes whether a robot is on the network.
+/// Stores whether a robot is on the network.
 pub async fn set_present(
     db: &mut SqliteConnection,
     robot_pk: i64,

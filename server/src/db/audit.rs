@@ -61,20 +61,20 @@ impl TryFrom<Raw> for AuditEntry {
     }
 }
 
-/// Which entries to list.
+/// Filter and order of a list of entries.
 #[derive(Debug, Clone, Default)]
 pub struct AuditFilter {
-    /// Only those of the token of this name.
+    /// Only those of the token or person of this name.
     pub who: Option<String>,
-    /// Only those that were refused.
+    /// Only those of refused requests.
     pub refused: bool,
-    /// Which come first.
+    /// Order of the list.
     pub order: AuditOrder,
-    /// Only those that come after this one in that order.
+    /// Only those after this one in that order (cursor).
     pub beyond: Option<u64>,
 }
 
-/// Entries in the order that is asked for.
+/// Returns entries in the requested order.
 pub async fn list(
     db: &mut SqliteConnection,
     filter: &AuditFilter,
@@ -118,7 +118,7 @@ pub async fn list(
     raw.into_iter().map(AuditEntry::try_from).collect()
 }
 
-/// What frames the chain; `None` if somebody has removed it.
+/// Returns the data that anchors the chain; `None` if it was removed.
 pub async fn chain(db: &mut SqliteConnection) -> Result<Option<AuditChain>, DbError> {
     let row = sqlx::query!(
         "SELECT before_id, before_hash, last_id, last_hash FROM audit_chain WHERE id = 1"
@@ -136,8 +136,8 @@ pub async fn chain(db: &mut SqliteConnection) -> Result<Option<AuditChain>, DbEr
     .transpose()
 }
 
-/// Writes entries in their order, none before the one that precedes it; their numbers and hashes are
-/// made here, and they are given back with them.
+/// Appends entries in their order, each with a time not before its predecessor's. Assigns their
+/// numbers and hashes, and returns the entries with them.
 pub async fn append(
     db: &mut SqliteConnection,
     entries: &[AuditEntry],
@@ -146,14 +146,15 @@ pub async fn append(
         .fetch_optional(&mut *db)
         .await?;
     let mut newest_us = newest.as_ref().map_or(i64::MIN, |newest| newest.at_us);
-    // A chain that somebody removed begins anew after what there is, which shows.
+    // A chain whose anchor was removed restarts after the present entries, which verification
+    // detects.
     let head = chain(&mut *db).await?;
     let (mut last_id, mut last_hash) = match head {
         Some(head) => (head.last_id, head.last_hash),
         None => (0, FIRST_PREVIOUS_HASH.to_owned()),
     };
     if let Some(newest) = newest {
-        // A number is not used again, whatever the record says.
+        // Numbers are not reused, whatever the anchor contains.
         last_id = last_id.max(unsigned("number", newest.id)?);
     }
     let mut written = Vec::with_capacity(entries.len());
@@ -225,8 +226,8 @@ async fn insert(db: &mut SqliteConnection, entry: &AuditEntry) -> Result<(), DbE
     Ok(())
 }
 
-/// Forgets the oldest entries, those older than a time or beyond the newest `kept`, at most `limit`.
-/// Number and hash of the last one stay, so that the rest can be verified.
+/// Deletes at most `limit` of the oldest entries: those older than a time, or beyond the newest
+/// `kept`. Keeps number and hash of the last one deleted, so that the rest can be verified.
 pub async fn forget(
     db: &mut SqliteConnection,
     before: Timestamp,
@@ -250,7 +251,7 @@ pub async fn forget(
     sqlx::query!("DELETE FROM audit WHERE id <= ?", last.id)
         .execute(&mut *db)
         .await?;
-    // One without a hash is of before the chain.
+    // An entry without a hash is from before the chain was introduced.
     if let Some(hash) = last.hash {
         sqlx::query!(
             "UPDATE audit_chain SET before_id = ?1, before_hash = ?2 WHERE id = 1 AND before_id < ?1",

@@ -1,13 +1,13 @@
-//! A few connections to the database, lent for one transaction each.
+//! A small pool of database connections, lent for one transaction each.
 //!
-//! This is no general pool, because what matters here is that no failure is final. A connection
-//! comes back only after a commit or a rollback that succeeded; otherwise it is closed, and the next
-//! transaction opens another. Nothing waits without a bound: when the library's thread of a
-//! connection ends without memory, what is sent to it meanwhile is never answered.
+//! Unlike a general pool it makes no failure permanent. A connection is returned only after a
+//! successful commit or rollback; otherwise it is closed, and the next transaction opens another.
+//! Every wait is bounded: when the library's thread of a connection ends for lack of memory,
+//! statements sent to it are never answered.
 //!
-//! Each connection has a thread, which a disk that hangs keeps: one that is being opened or that was
-//! given up counts until its thread has ended, and there are [`SPARE_MAX`] more of them than may
-//! work. Beyond, nothing is opened.
+//! Each connection has a thread, which a hanging disk can block. A connection that is being opened
+//! or was given up counts until its thread has ended. There may be [`SPARE_MAX`] more threads than
+//! working connections; beyond that no connection is opened.
 
 use std::ops::{Deref, DerefMut};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -21,22 +21,22 @@ use tokio::time::{Instant, timeout};
 
 use super::failure;
 
-/// How long a request waits for a connection.
+/// Maximum time that a request waits for a connection.
 pub(super) const ACQUIRE_TIMEOUT: Duration = Duration::from_secs(10);
-/// How long whoever opens a connection waits for one that is being closed.
+/// Maximum time that opening a connection waits for the thread of one that is being closed.
 const THREAD_TIMEOUT: Duration = Duration::from_secs(1);
-/// How long a transaction may take to begin: longer than SQLite waits for another process's lock.
+/// Maximum time for beginning a transaction: longer than SQLite waits for another process's lock.
 const BEGIN_TIMEOUT: Duration = Duration::from_secs(10);
-/// How long a commit may take, with its sync.
+/// Maximum time for a commit, with its sync.
 pub(super) const COMMIT_TIMEOUT: Duration = Duration::from_secs(15);
-/// How long a rollback may take before its connection is closed instead.
+/// Maximum time for a rollback; beyond it the connection is closed instead.
 const ROLLBACK_TIMEOUT: Duration = Duration::from_secs(2);
-/// Connections whose threads may hang, beside those that work.
+/// Maximum number of connections with hanging threads, in addition to the working ones.
 const SPARE_MAX: u32 = 4;
-/// How long connections may take to come back and to close.
+/// Maximum time for connections to be returned and closed.
 const CLOSE_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Connections with the same options; clones are handles to the same.
+/// A pool of connections with the same options; clones share it.
 #[derive(Debug, Clone)]
 pub(super) struct Connections {
     inner: Arc<Inner>,
@@ -48,16 +48,16 @@ struct Inner {
     connections_max: u32,
     commit_max: Duration,
     permits: Arc<Semaphore>,
-    /// One for each thread that there may be.
+    /// One permit for each thread that may exist.
     threads: Arc<Semaphore>,
     idle: Mutex<Vec<Opened>>,
 }
 
 #[derive(Debug)]
 struct Opened {
-    /// There until it is dropped.
+    /// `Some` until it is dropped.
     connection: Option<SqliteConnection>,
-    /// Given back when the connection's thread has ended.
+    /// Released when the connection's thread has ended.
     thread: Option<OwnedSemaphorePermit>,
     at: Instant,
 }
@@ -67,15 +67,15 @@ impl Opened {
         self.connection.as_mut().ok_or(sqlx::Error::WorkerCrashed)
     }
 
-    /// Closes it, and waits until its thread has ended.
+    /// Closes the connection, and waits until its thread has ended.
     async fn close(mut self) {
         if let Some(connection) = self.connection.take() {
-            // It is gone either way.
+            // The connection is closed even after an error.
             let _ = connection.close().await;
         }
     }
 
-    /// Whether a failure since it was opened may have spoiled it.
+    /// Returns whether a failure since it was opened may have spoiled it.
     fn is_spoiled(&self) -> bool {
         failure::is_older_than_last(self.at.elapsed())
     }
@@ -86,10 +86,10 @@ impl Drop for Opened {
         let (Some(connection), Some(thread)) = (self.connection.take(), self.thread.take()) else {
             return;
         };
-        // Without a runtime the process ends, and its threads with it.
+        // Without a runtime the process is ending, and its threads with it.
         if let Ok(runtime) = Handle::try_current() {
             runtime.spawn(async move {
-                // It is gone either way.
+                // The connection is closed even after an error.
                 let _ = connection.close().await;
                 drop(thread);
             });
@@ -106,7 +106,7 @@ pub(super) struct Lent {
 }
 
 impl Connections {
-    /// Opens the first of at most so many connections.
+    /// Creates a pool of at most `connections_max` connections, and opens the first.
     pub(super) async fn open(
         options: SqliteConnectOptions,
         connections_max: u32,
@@ -124,7 +124,7 @@ impl Connections {
         };
         let first = inner.connect().await?;
         inner.idle().push(first);
-        // A file that is gone later, as with its disk, is not made anew.
+        // A file that disappears later, as with its disk, is not created again.
         let options = inner.options.create_if_missing(false);
         Ok(Self {
             inner: Arc::new(Inner { options, ..inner }),
@@ -145,7 +145,7 @@ impl Connections {
             Some(opened) => opened,
             None => self.inner.connect().await?,
         };
-        // Whoever goes away meanwhile takes the connection along.
+        // If the caller is cancelled here, the connection is closed.
         let beginning = sqlx::query(statement).execute(opened.connection()?);
         timeout(BEGIN_TIMEOUT, beginning)
             .await
@@ -172,11 +172,11 @@ impl Connections {
             None => self.inner.connect().await?,
         };
         let ran = sqlx::query(statement).execute(opened.connection()?).await;
-        // SQLite has answered, so the connection goes on.
+        // SQLite has answered, so the connection can be used further.
         if matches!(ran, Ok(_) | Err(sqlx::Error::Database(_))) {
             self.inner.give_back(opened);
         } else if !is_new {
-            // Its thread had ended after the statement before.
+            // The connection's thread had ended after the statement before.
             let mut opened = self.inner.connect().await?;
             sqlx::query(statement).execute(opened.connection()?).await?;
             self.inner.give_back(opened);
@@ -185,7 +185,7 @@ impl Connections {
         ran.map(|_done| ())
     }
 
-    /// Works with one connection before there are any transactions.
+    /// Runs work on one connection before any transaction begins.
     pub(super) async fn with_first<T>(
         &self,
         work: impl AsyncFnOnce(&mut SqliteConnection) -> T,
@@ -200,7 +200,7 @@ impl Connections {
         Ok(worked)
     }
 
-    /// Closes all connections after what they are doing, if that ends.
+    /// Closes all connections after their present work, waiting at most [`CLOSE_TIMEOUT`].
     pub(super) async fn close(&self) {
         let Inner {
             connections_max,
@@ -208,14 +208,14 @@ impl Connections {
             threads,
             ..
         } = &*self.inner;
-        // What does not come back is closed by whoever has it.
+        // A connection that is not returned in time is closed by its user.
         let _ = timeout(CLOSE_TIMEOUT, permits.acquire_many(*connections_max)).await;
         permits.close();
         let idle = std::mem::take(&mut *self.inner.idle());
         for opened in idle {
             let _ = timeout(CLOSE_TIMEOUT, opened.close()).await;
         }
-        // The last one that closes brings the log into the file.
+        // Closing the last connection checkpoints the write-ahead log.
         let all = threads.acquire_many(connections_max.saturating_add(SPARE_MAX));
         let _ = timeout(CLOSE_TIMEOUT, all).await;
         threads.close();
@@ -233,7 +233,7 @@ impl Inner {
         idle.pop()
     }
 
-    /// Takes a connection back that works.
+    /// Takes back a connection that works.
     fn give_back(&self, opened: Opened) {
         if !self.permits.is_closed() {
             self.idle().push(opened);
@@ -246,7 +246,7 @@ impl Inner {
             .await
             .map_err(|_elapsed| sqlx::Error::PoolTimedOut)?
             .map_err(|_closed| sqlx::Error::PoolClosed)?;
-        // It is as old as what it has read while it was opened.
+        // Its age counts from before it was opened: it reads the file while opening.
         let at = Instant::now();
         let options = self.options.clone();
         #[expect(
@@ -269,11 +269,11 @@ impl Inner {
 }
 
 impl Lent {
-    /// Commits.
+    /// Commits the transaction.
     ///
     /// # Errors
-    /// SQLite failed; the connection is closed, and nothing is written. After a commit that did not
-    /// end in time nobody knows.
+    /// SQLite failed; the connection is closed, and nothing is written. After a timeout the outcome
+    /// is unknown.
     pub(super) async fn commit(mut self) -> Result<(), sqlx::Error> {
         let Some(mut opened) = self.opened.take() else {
             return Err(sqlx::Error::WorkerCrashed);
@@ -292,7 +292,7 @@ impl Drop for Lent {
         let Some(mut opened) = self.opened.take() else {
             return;
         };
-        // Without a runtime the connection is closed, which rolls back too.
+        // Without a runtime the connection is closed, which also rolls back.
         let Ok(runtime) = Handle::try_current() else {
             return;
         };

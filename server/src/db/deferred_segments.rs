@@ -1,4 +1,5 @@
-//! Measurements from a time that has not come, kept until the clock of their run is known.
+//! Deferred segments: measurements with times in the future, kept until the clock of their run is
+//! known.
 
 use serde_json::value::RawValue;
 use sqlx::SqliteConnection;
@@ -6,21 +7,21 @@ use tread_api::friction::Segment;
 
 use super::{DbError, from_json, unsigned};
 
-/// A measurement that waits.
+/// A deferred segment.
 #[derive(Debug, Clone)]
 pub struct DeferredSegment {
-    /// Its number within its run.
+    /// Its sequence number within its run.
     pub seq: i64,
-    /// The measurement, with the times of the robot's clock.
+    /// The segment, with the times of the robot's clock.
     pub segment: Segment,
 }
 
-/// Where a measurement comes from.
+/// Origin of a segment.
 #[derive(Debug, Clone, Copy)]
 pub struct Origin {
     /// Key of the run of the agent.
     pub boot_pk: i64,
-    /// Its number within that run.
+    /// Sequence number within that run.
     pub seq: i64,
     /// Key of the site.
     pub site_pk: i64,
@@ -28,7 +29,7 @@ pub struct Origin {
     pub robot_pk: i64,
 }
 
-/// Defers a measurement; `false` if it is there or on the map already.
+/// Defers a segment; `false` if it is deferred or on the map already.
 pub async fn put(
     db: &mut SqliteConnection,
     origin: Origin,
@@ -63,7 +64,7 @@ pub async fn put(
     Ok(done.rows_affected() == 1)
 }
 
-/// How many of a robot's measurements wait.
+/// Returns the number of a robot's deferred segments.
 pub async fn count(db: &mut SqliteConnection, robot_pk: i64) -> Result<u64, DbError> {
     let count = sqlx::query_scalar!(
         r#"SELECT COUNT(*) AS "count!: i64" FROM deferred_segments WHERE robot_pk = ?"#,
@@ -72,7 +73,8 @@ pub async fn count(db: &mut SqliteConnection, robot_pk: i64) -> Result<u64, DbEr
     unsigned("count", count.fetch_one(db).await?)
 }
 
-/// Takes out what waits of a run and ended before a time of its own clock, at most `limit`.
+/// Removes and returns at most `limit` deferred segments of a run that ended before a time of its
+/// robot's clock.
 pub async fn take(
     db: &mut SqliteConnection,
     boot_pk: i64,

@@ -1,4 +1,4 @@
-//! Which robots have joined, and how often.
+//! Enrolments of robots, and the certificates that count for a renewal.
 
 use std::collections::BTreeSet;
 
@@ -54,7 +54,7 @@ macro_rules! enrolments {
     };
 }
 
-/// The newest enrolment of every robot of all sites.
+/// Returns the newest enrolment of every robot of all sites.
 pub async fn all_newest(db: &mut SqliteConnection) -> Result<Vec<Enrolment>, DbError> {
     let raw = enrolments!(
         "AS present WHERE number = (SELECT MAX(number) FROM enrolments AS other
@@ -66,8 +66,8 @@ pub async fn all_newest(db: &mut SqliteConnection) -> Result<Vec<Enrolment>, DbE
     raw.into_iter().map(Enrolment::try_from).collect()
 }
 
-/// The newest enrolments of a site after a robot, by its name, only of those that are named if any
-/// are.
+/// Returns the newest enrolments of a site's robots after a name, ordered by name; with a list of
+/// robots only theirs.
 pub async fn list(
     db: &mut SqliteConnection,
     (site, named): (&SiteId, Option<&BTreeSet<RobotId>>),
@@ -92,7 +92,7 @@ pub async fn list(
     raw.into_iter().map(Enrolment::try_from).collect()
 }
 
-/// A robot's newest enrolment.
+/// Returns a robot's newest enrolment.
 pub async fn newest(
     db: &mut SqliteConnection,
     site: &SiteId,
@@ -109,7 +109,7 @@ pub async fn newest(
     raw.map(Enrolment::try_from).transpose()
 }
 
-/// How many robots have ever joined.
+/// Returns the number of robots that have ever joined.
 pub async fn robot_count(db: &mut SqliteConnection) -> Result<i64, DbError> {
     let row = sqlx::query!(
         r#"SELECT COUNT(*) AS "count!: i64" FROM (SELECT DISTINCT site, robot FROM enrolments)"#
@@ -119,7 +119,7 @@ pub async fn robot_count(db: &mut SqliteConnection) -> Result<i64, DbError> {
     Ok(row.count)
 }
 
-/// Writes an enrolment down, with the certificate that the robot gets.
+/// Stores an enrolment, with the certificate that the robot gets.
 pub async fn insert(
     db: &mut SqliteConnection,
     enrolment: &Enrolment,
@@ -150,18 +150,18 @@ pub async fn insert(
     Ok(())
 }
 
-/// Which certificates of an enrolment count for a renewal.
+/// Certificates of an enrolment that are accepted for a renewal.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Counting {
     /// None: the enrolment is not in force.
     None,
-    /// Any of an authority that is trusted: nothing is kept of them.
+    /// Any certificate of a trusted authority: none are recorded.
     Any,
-    /// These.
+    /// These certificates.
     These(Issued),
 }
 
-/// Which certificates of an enrolment count for a renewal.
+/// Returns which certificates of an enrolment are accepted for a renewal.
 pub async fn counting(
     db: &mut SqliteConnection,
     (site, robot, number): (&SiteId, &RobotId, u32),
@@ -183,8 +183,9 @@ pub async fn counting(
     })
 }
 
-/// Forgets which certificates count for a renewal: the next one of each robot does, as long as an
-/// authority that is trusted has signed it. How many enrolments that changed.
+/// Deletes the record of the certificates that are accepted for a renewal: the next one of each
+/// robot is accepted if a trusted authority has signed it. Returns the number of enrolments
+/// changed.
 pub async fn forget_certificates(db: &mut SqliteConnection) -> Result<u64, DbError> {
     let done = sqlx::query!(
         "UPDATE enrolments SET certificates = NULL
@@ -198,17 +199,17 @@ pub async fn forget_certificates(db: &mut SqliteConnection) -> Result<u64, DbErr
 /// A renewal.
 #[derive(Debug, Clone, Copy)]
 pub struct Renewal<'renewal> {
-    /// When it was asked for.
+    /// Time of the request.
     pub at: Timestamp,
-    /// When the next certificate ends.
+    /// Expiry of the next certificate.
     pub expires_at: Timestamp,
-    /// The fingerprint of the authority that signed the certificate which was shown for it.
+    /// Fingerprint of the authority that signed the certificate shown for the renewal.
     pub authority: &'renewal str,
-    /// The certificates that count from now on.
+    /// Certificates that are accepted from now on.
     pub issued: &'renewal Issued,
 }
 
-/// Notes a renewal of an enrolment that is in force; false if it no longer is.
+/// Stores a renewal of an enrolment that is in force; false if it no longer is.
 pub async fn renew(
     db: &mut SqliteConnection,
     (site, robot, number): (&SiteId, &RobotId, u32),
@@ -234,7 +235,7 @@ pub async fn renew(
     Ok(done.rows_affected() == 1)
 }
 
-/// Notes who signed the certificate that a robot has shown, if its enrolment is in force.
+/// Stores the authority of the certificate that a robot has shown, if its enrolment is in force.
 pub async fn note_authority(
     db: &mut SqliteConnection,
     (site, robot, number): (&SiteId, &RobotId, u32),
@@ -254,7 +255,7 @@ pub async fn note_authority(
     Ok(())
 }
 
-/// Ends the enrolment that is in force, if one is.
+/// Revokes the robot's enrolment that is in force, if there is one.
 pub async fn revoke(
     db: &mut SqliteConnection,
     (site, robot): (&SiteId, &RobotId),

@@ -1,9 +1,9 @@
-//! Failures of the storage itself, as distinct from answers such as a violated constraint.
+//! Failures of the storage itself, as opposed to errors such as a violated constraint.
 //!
-//! After some errors (a full disk, a failed read or write, no memory) SQLite rolls a transaction
-//! back by itself, and the library's count of open transactions no longer fits the connection. A
-//! damaged page may also stay in a connection's cache. So every connection that is older than the
-//! last failure is replaced before it is used again: [`is_older_than_last`].
+//! After some errors (a full disk, a failed read or write, lack of memory) SQLite rolls a
+//! transaction back by itself, and the library's count of open transactions no longer matches the
+//! connection. A damaged page may also stay in a connection's cache. Therefore every connection
+//! that is older than the last failure is replaced before it is used again: [`is_older_than_last`].
 
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
@@ -11,20 +11,20 @@ use std::time::Duration;
 
 use tokio::time::Instant;
 
-/// What failed.
+/// Kind of storage failure.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum StorageFailure {
     /// The disk is full.
     Full,
     /// The operating system could not open, read, write or sync the file.
     Io,
-    /// There was no memory.
+    /// Memory allocation failed.
     Memory,
-    /// The file is damaged, or is no database.
+    /// The file is damaged, or is not a database.
     Damaged,
     /// Another process holds the file's lock, or no connection became free in time.
     Busy,
-    /// The connection is in a state in which it cannot go on.
+    /// The connection is in an unusable state.
     Connection,
 }
 
@@ -39,7 +39,7 @@ impl StorageFailure {
         Self::Connection,
     ];
 
-    /// Its name in metrics.
+    /// Returns its name in metrics.
     pub const fn as_str(self) -> &'static str {
         match self {
             Self::Full => "full",
@@ -51,7 +51,7 @@ impl StorageFailure {
         }
     }
 
-    /// What an operator should know of it.
+    /// Returns its explanation for operators.
     pub const fn explanation(self) -> &'static str {
         match self {
             Self::Full => "the disk is full",
@@ -63,7 +63,7 @@ impl StorageFailure {
         }
     }
 
-    /// The failure behind an error; `None` for an error of the statement or its values.
+    /// Returns the failure behind an error; `None` for an error of the statement or its values.
     #[expect(
         clippy::wildcard_enum_match_arm,
         reason = "whatever else there is or will be says nothing of the storage"
@@ -80,14 +80,14 @@ impl StorageFailure {
             | sqlx::Error::PoolClosed
             | sqlx::Error::BeginFailed
             | sqlx::Error::InvalidSavePointStatement
-            // The library's thread ended without memory for a value: what must give a row, as a
-            // count, gave none.
+            // The library's thread ended for lack of memory: a query that always returns a row, as
+            // a count, returned none.
             | sqlx::Error::RowNotFound => Some(Self::Connection),
             _ => None,
         }
     }
 
-    /// By SQLite's extended result code.
+    /// Returns the failure of an extended result code of SQLite.
     const fn of_code(extended: u32) -> Option<Self> {
         /// `SQLITE_IOERR_NOMEM`.
         const IO_NO_MEMORY: u32 = 0x0c0a;
@@ -105,14 +105,13 @@ impl StorageFailure {
     }
 }
 
-/// Failures since the start of the process, whichever database had them: to replace a connection
-/// too many costs a millisecond.
+/// Failures since the start of the process, of all its databases: replacing a connection needlessly
+/// costs only a millisecond.
 struct FailureLog {
     counts: [AtomicU64; StorageFailure::ALL.len()],
-    /// When the last one that spoils connections was seen, microseconds after [`origin`]; 0 for
-    /// never.
+    /// Time of the last failure that spoils connections, microseconds after [`origin`]; 0 for none.
     last_us: AtomicU64,
-    /// Which one that was, as its place in [`StorageFailure::ALL`].
+    /// Its index in [`StorageFailure::ALL`].
     last: AtomicUsize,
 }
 
@@ -131,7 +130,7 @@ fn now_us() -> u64 {
     u64::try_from(origin().elapsed().as_micros()).unwrap_or(u64::MAX)
 }
 
-/// Takes note of an error.
+/// Records an error.
 pub(super) fn note(error: &sqlx::Error) {
     let Some(failure) = StorageFailure::of(error) else {
         return;
@@ -143,12 +142,12 @@ pub(super) fn note(error: &sqlx::Error) {
     }
 }
 
-/// How often it was seen since the start of the process.
+/// Returns the number of failures of this kind since the start of the process.
 pub fn count(failure: StorageFailure) -> u64 {
     FAILURES.counts[failure as usize].load(Ordering::Acquire)
 }
 
-/// The last failure that was more than a lock, and the time since.
+/// Returns the last failure other than a lock, and the time since.
 pub fn last() -> Option<(StorageFailure, Duration)> {
     let last_us = FAILURES.last_us.load(Ordering::Acquire);
     let failure = StorageFailure::ALL.get(FAILURES.last.load(Ordering::Acquire))?;
@@ -156,7 +155,7 @@ pub fn last() -> Option<(StorageFailure, Duration)> {
     (last_us > 0).then_some((*failure, since))
 }
 
-/// Whether a connection of that age may have been spoiled by the last failure.
+/// Returns whether a connection of this age may have been spoiled by the last failure.
 pub(super) fn is_older_than_last(age: Duration) -> bool {
     last().is_some_and(|(_, since)| age >= since)
 }
@@ -177,7 +176,7 @@ mod tests {
             (26, Some(StorageFailure::Damaged)),
             (0x0205, Some(StorageFailure::Busy)),
             (14, Some(StorageFailure::Io)),
-            // A violated constraint and a misuse are errors of whoever wrote the statement.
+            // A violated constraint and a misuse are programming errors of the statement.
             (0x0813, None),
             (1, None),
             (21, None),

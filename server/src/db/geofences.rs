@@ -6,7 +6,7 @@ use tread_api::safety::Geofence;
 
 use super::{DbError, from_json, to_json, to_us, unsigned};
 
-/// The geofence of a site that counts now; the empty one of revision 0 if there never was any.
+/// Returns a site's present geofence; an empty one of revision 0 if there never was one.
 pub async fn present(db: &mut SqliteConnection, site_pk: i64) -> Result<Geofence, DbError> {
     let raw = sqlx::query!(
         "SELECT revision, keep_in, keep_out FROM geofences WHERE site_pk = ?
@@ -25,7 +25,7 @@ pub async fn present(db: &mut SqliteConnection, site_pk: i64) -> Result<Geofence
     })
 }
 
-/// Adds a revision; `false` if that one is there already.
+/// Adds a revision; `false` if it exists already.
 pub async fn insert(
     db: &mut SqliteConnection,
     site_pk: i64,

@@ -1,4 +1,4 @@
-//! What happened to missions, and which reports of robots have been taken.
+//! Histories of missions, and the reports of robots that were applied.
 
 use sqlx::SqliteConnection;
 use tread_api::event::MissionStep;
@@ -8,7 +8,7 @@ use tread_api::mission::{Actor, MissionEvent, MissionState};
 use super::missions::{cause, state};
 use super::{DbError, corrupt, from_us, parse, to_us, unsigned};
 
-/// Writes a step into a mission's history, not before the step that precedes it there.
+/// Adds an event to a mission's history, with a time not before the preceding event's.
 pub async fn add_event(
     db: &mut SqliteConnection,
     id: MissionId,
@@ -35,7 +35,7 @@ pub async fn add_event(
     Ok(())
 }
 
-/// A mission's history, oldest first, at most `limit` steps.
+/// Returns a mission's history, oldest first, at most `limit` events.
 pub async fn events(
     db: &mut SqliteConnection,
     id: MissionId,
@@ -78,7 +78,7 @@ impl TryFrom<RawEvent> for MissionEvent {
     }
 }
 
-/// How many steps a mission's history has.
+/// Returns the number of events in a mission's history.
 pub async fn event_count(db: &mut SqliteConnection, id: MissionId) -> Result<u32, DbError> {
     let id = id.to_string();
     let count = sqlx::query_scalar!(
@@ -90,7 +90,7 @@ pub async fn event_count(db: &mut SqliteConnection, id: MissionId) -> Result<u32
     unsigned("count", count)
 }
 
-/// Whether a report has been taken before.
+/// Returns whether a report was applied before.
 pub async fn has_report(
     db: &mut SqliteConnection,
     boot_pk: i64,
@@ -105,7 +105,7 @@ pub async fn has_report(
     Ok(found.fetch_one(db).await?)
 }
 
-/// Notes that a report has been taken.
+/// Records that a report was applied.
 pub async fn note_report(db: &mut SqliteConnection, boot_pk: i64, seq: i64) -> Result<(), DbError> {
     sqlx::query!(
         "INSERT INTO reports_seen (boot_pk, seq) VALUES (?, ?)",
@@ -117,7 +117,7 @@ pub async fn note_report(db: &mut SqliteConnection, boot_pk: i64, seq: i64) -> R
     Ok(())
 }
 
-/// The newest step of all histories; 0 if there is none.
+/// Returns the key of the newest event of all histories; 0 if there is none.
 pub async fn newest_step(db: &mut SqliteConnection) -> Result<i64, DbError> {
     let newest =
         sqlx::query_scalar!(r#"SELECT COALESCE(MAX(pk), 0) AS "newest!: i64" FROM mission_events"#);
@@ -137,7 +137,7 @@ struct RawStep {
     reason: Option<String>,
 }
 
-/// Steps of all histories after one, in their order, at most `limit`; each with its key.
+/// Returns at most `limit` events of all histories after a key, in order, each with its key.
 pub async fn steps_after(
     db: &mut SqliteConnection,
     after: i64,

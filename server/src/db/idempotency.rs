@@ -7,20 +7,20 @@ use uuid::Uuid;
 use super::{DbError, parse, to_us};
 use crate::identity::subject::SubjectId;
 
-/// An answer that was given under a key.
+/// An answer that was given under an idempotency key.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Given {
-    /// The hash of the request that it answered.
+    /// Hash of the request that was answered.
     pub request_hash: Uuid,
     /// The answer, JSON.
     pub answer: String,
 }
 
-/// A key, with whoever sends it.
+/// An idempotency key with its sender.
 pub type OwnKey<'key> = (SubjectId, &'key str);
 
-/// What was answered to somebody under a key; or to whoever sent the same request under it, before keys
-/// had owners.
+/// Returns the answer given to this sender under a key, or to the same request before keys had
+/// owners.
 pub async fn find(
     db: &mut SqliteConnection,
     (owner, key): OwnKey<'_>,
@@ -46,7 +46,7 @@ pub async fn find(
     .transpose()
 }
 
-/// Keeps an answer under its key.
+/// Stores an answer under its key.
 pub async fn insert(
     db: &mut SqliteConnection,
     (owner, key): OwnKey<'_>,
@@ -69,7 +69,7 @@ pub async fn insert(
     Ok(())
 }
 
-/// Forgets keys that are older than a time, at most `limit`.
+/// Deletes at most `limit` keys that are older than a time.
 pub async fn forget_before(
     db: &mut SqliteConnection,
     before: Timestamp,

@@ -1,4 +1,4 @@
-//! Tokens by which robots join. What is kept of a secret is its hash.
+//! Join tokens of robots. Only the hash of a secret is stored.
 
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
@@ -56,7 +56,8 @@ macro_rules! join_tokens {
     };
 }
 
-/// Join tokens older than one for what is in a scope, newest first; dead ones too.
+/// Returns the join tokens of a scope that are older than one, newest first, with used, revoked and
+/// expired ones.
 pub async fn list(
     db: &mut SqliteConnection,
     within: &Scope,
@@ -87,7 +88,7 @@ look_up_tokens!(
     JoinToken
 );
 
-/// How many could be used at a time.
+/// Returns the number of join tokens that are valid at a time.
 pub async fn valid_count(db: &mut SqliteConnection, at: Timestamp) -> Result<i64, DbError> {
     let at_us = to_us(at);
     let row = sqlx::query!(
@@ -100,7 +101,7 @@ pub async fn valid_count(db: &mut SqliteConnection, at: Timestamp) -> Result<i64
     Ok(row.count)
 }
 
-/// How many could be used at a time that are for what is in a scope.
+/// Returns the number of join tokens of a scope that are valid at a time.
 pub async fn valid_count_within(
     db: &mut SqliteConnection,
     within: &Scope,
@@ -120,7 +121,7 @@ pub async fn valid_count_within(
     Ok(row.count)
 }
 
-/// Keeps a new join token.
+/// Stores a new join token.
 pub async fn insert(
     db: &mut SqliteConnection,
     token: &JoinToken,
@@ -148,7 +149,7 @@ pub async fn insert(
     Ok(())
 }
 
-/// Uses a join token up; false if it was used before.
+/// Marks a join token as used; false if it was used before.
 pub async fn use_up(
     db: &mut SqliteConnection,
     id: JoinTokenId,
@@ -168,7 +169,7 @@ pub async fn use_up(
     Ok(done.rows_affected() == 1)
 }
 
-/// Revokes a join token; a first time counts.
+/// Revokes a join token; only the first time counts.
 pub async fn revoke(
     db: &mut SqliteConnection,
     id: JoinTokenId,
@@ -187,7 +188,7 @@ pub async fn revoke(
     Ok(())
 }
 
-/// Forgets join tokens that were over before a time, at most `limit`.
+/// Deletes at most `limit` join tokens that ended before a time.
 pub async fn forget_dead(
     db: &mut SqliteConnection,
     before: Timestamp,

@@ -1,9 +1,9 @@
-//! The lock of a database: one server at a time.
+//! Lock of a database: allows one server at a time.
 //!
-//! SQLite lets any number of processes share a file, but a server keeps the map in memory and
-//! decides by itself what its robots do. The lock is held on a file beside the database and goes
-//! with its process, however that ends. What only reads or repairs (`init`, a backup, a check)
-//! does not take it.
+//! SQLite lets any number of processes share a file, but a server keeps the map in memory and alone
+//! decides what its robots do. The lock is on a file beside the database and is released when its
+//! process ends, in whatever way. Programs that only read or repair (`init`, a backup, a check) do
+//! not take it.
 
 use std::ffi::OsString;
 use std::fs::{self, File, OpenOptions, TryLockError};
@@ -11,61 +11,62 @@ use std::io::{self, Read as _, Seek as _, Write as _};
 use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _};
 use std::path::{Path, PathBuf};
 
-/// What is added to the name of the database.
+/// Suffix of the lock file's name, after that of the database.
 const LOCK_ENDING: &str = ".lock";
-/// Most links that are followed to a file: as many as Linux follows.
+/// Maximum number of symbolic links followed: as many as Linux follows.
 const LINKS_MAX: u32 = 40;
-/// Most bytes that are read of whom holds the lock.
+/// Maximum number of bytes read from the lock file.
 const HOLDER_BYTES_MAX: u64 = 32;
 
-/// Why a server may not use a database.
+/// Reason why a server may not use a database.
 #[derive(Debug, thiserror::Error)]
 pub enum LockError {
-    /// Another server is at work on it.
+    /// Another server uses it.
     #[error(
         "the database `{}` is used by another server{holder}: stop that one first, or give this \
          one a database of its own", path.display()
     )]
     InUse {
-        /// Which database.
+        /// The database.
         path: PathBuf,
-        /// ` (process N)`, if it is known.
+        /// ` (process N)`, or empty if the process is not known.
         holder: String,
     },
-    /// The file has other names, of which nobody knows who uses it by them. SQLite's log is beside
-    /// one of them only, so whoever opens another one damages it.
+    /// The file has several hard links. SQLite's log is beside only one of them, so a process that
+    /// opens another one damages the database.
     #[error(
         "the database `{}` has {names} names (hard links), which damages it when it is used by \
          two of them: remove the others, and copy it with `VACUUM INTO` instead", path.display()
     )]
     HardLinks {
-        /// Which database.
+        /// The database.
         path: PathBuf,
-        /// How many names it has.
+        /// Number of its hard links.
         names: u64,
     },
-    /// The lock's file cannot be made.
+    /// The lock file cannot be created.
     #[error("cannot lock the database with `{}`", path.display())]
     File {
-        /// Which file.
+        /// The lock file.
         path: PathBuf,
-        /// What the operating system said.
+        /// Error of the operating system.
         #[source]
         source: io::Error,
     },
 }
 
-/// A database that is this process's alone, until it is dropped.
+/// Exclusive use of a database by this process, until it is dropped.
 #[derive(Debug)]
 pub struct DatabaseLock {
     _file: File,
 }
 
 impl DatabaseLock {
-    /// Locks a database, which need not exist yet.
+    /// Locks a database, which may not exist yet.
     ///
     /// # Errors
-    /// [`LockError::InUse`] names the process that has it; [`LockError::HardLinks`].
+    /// [`LockError::InUse`] names the process that holds the lock; [`LockError::HardLinks`]; or
+    /// [`LockError::File`].
     pub fn take(database: &Path) -> Result<Self, LockError> {
         let names = fs::metadata(database).map_or(1, |there| there.nlink());
         if names > 1 {
@@ -84,7 +85,7 @@ impl DatabaseLock {
             .write(true)
             .create(true)
             .truncate(false)
-            // Whoever could open it could hold it.
+            // Any user who could open the file could lock it.
             .mode(0o600)
             .open(&path)
             .map_err(failed)?;
@@ -98,7 +99,7 @@ impl DatabaseLock {
             }
             Err(TryLockError::Error(source)) => return Err(failed(source)),
         }
-        // Who holds it is only for the message; on a full disk the lock counts all the same.
+        // The content is only for the error message; on a full disk the lock holds without it.
         let _ = file
             .set_len(0)
             .and_then(|()| file.rewind())
@@ -107,7 +108,7 @@ impl DatabaseLock {
     }
 }
 
-/// Beside the file itself, wherever links lead to it, also when it does not exist yet.
+/// Returns the path beside the file itself, after following links, also if it does not exist yet.
 fn lock_path(database: &Path) -> PathBuf {
     let file = behind_links(database);
     let folder = file.parent().filter(|it| !it.as_os_str().is_empty());
@@ -121,7 +122,7 @@ fn lock_path(database: &Path) -> PathBuf {
     PathBuf::from(name)
 }
 
-/// What a chain of symbolic links leads to.
+/// Returns the target of a chain of symbolic links.
 fn behind_links(path: &Path) -> PathBuf {
     let mut path = path.to_owned();
     for _ in 0..LINKS_MAX {
@@ -179,7 +180,7 @@ mod tests {
         assert!(DatabaseLock::take(&link).is_err());
         drop(by_link);
         DatabaseLock::take(&database).unwrap();
-        // A link that leads to itself is no database, and no endless search.
+        // A link to itself must not cause an endless search.
         let round = folder.path().join("round.db");
         std::os::unix::fs::symlink(&round, &round).unwrap();
         assert!(DatabaseLock::take(&round).is_ok());

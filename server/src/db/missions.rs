@@ -1,4 +1,4 @@
-//! Missions and their histories.
+//! Missions: their content, state and outcome.
 
 mod standing;
 
@@ -15,12 +15,12 @@ use tread_api::robot::MissionProgress;
 pub use self::standing::{Standing, in_progress, next_in_queues, open_of_robot, overdue};
 use super::{DbError, corrupt, from_json, from_us, parse, scope_text, to_json, to_us, unsigned};
 
-/// A mission with the key of its robot.
+/// A mission with the database key of its robot.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MissionRow {
-    /// The robot's key.
+    /// Database key of the robot.
     pub robot_pk: i64,
-    /// The mission; its progress is the last one that was reported durably.
+    /// The mission, with the progress that was last reported durably.
     pub mission: Mission,
 }
 
@@ -160,7 +160,7 @@ pub async fn insert(db: &mut SqliteConnection, row: &MissionRow) -> Result<(), D
     Ok(())
 }
 
-/// The mission of that identifier.
+/// Returns a mission by its identifier.
 pub async fn find(db: &mut SqliteConnection, id: MissionId) -> Result<Option<MissionRow>, DbError> {
     let id = id.to_string();
     let raw = missions!("WHERE missions.id = ?", id)
@@ -169,7 +169,7 @@ pub async fn find(db: &mut SqliteConnection, id: MissionId) -> Result<Option<Mis
     raw.map(MissionRow::try_from).transpose()
 }
 
-/// Which missions to list.
+/// Filter of a list of missions.
 #[derive(Debug, Clone, Default)]
 pub struct MissionFilter {
     /// Only those of this site.
@@ -178,14 +178,14 @@ pub struct MissionFilter {
     pub robot: Option<RobotId>,
     /// Only those in this state.
     pub state: Option<MissionState>,
-    /// Only those older than this one.
+    /// Only those older than this one (cursor).
     pub before: Option<MissionId>,
-    /// Only those of what is in this scope.
+    /// Only those of sites and robots in this scope.
     pub within: Scope,
 }
 
-/// Missions, newest first, until there are `limit` or their trajectories pass `bytes_max`; and
-/// whether there are more.
+/// Returns missions, newest first, until there are `limit` or their trajectories exceed `bytes_max`
+/// bytes; and whether there are more.
 pub async fn list(
     db: &mut SqliteConnection,
     filter: &MissionFilter,
@@ -224,7 +224,7 @@ pub async fn list(
     Ok((rows, false))
 }
 
-/// How many missions of a robot wait.
+/// Returns the number of a robot's queued missions.
 pub async fn queued_count(db: &mut SqliteConnection, robot_pk: i64) -> Result<usize, DbError> {
     let count = sqlx::query_scalar!(
         r#"SELECT COUNT(*) AS "count!: i64" FROM missions
@@ -236,7 +236,7 @@ pub async fn queued_count(db: &mut SqliteConnection, robot_pk: i64) -> Result<us
     unsigned("count", count)
 }
 
-/// Moves a mission from one state to another; `false` if it did not stand there any more.
+/// Changes a mission's state; `false` if it is no longer in the expected state.
 pub async fn compare_and_set(
     db: &mut SqliteConnection,
     id: MissionId,
@@ -260,18 +260,18 @@ pub async fn compare_and_set(
     Ok(result.rows_affected() == 1)
 }
 
-/// What a robot's answer or report adds to a mission; what is `None` stays as it is.
+/// Facts from a robot's answer or report; `None` leaves the stored value unchanged.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Facts {
-    /// The run of the agent that took it.
+    /// Run of the agent that accepted it.
     pub boot: Option<BootId>,
-    /// What the robot planned.
+    /// Summary of the robot's plan.
     pub plan: Option<PlanSummary>,
-    /// How far it has come.
+    /// Progress.
     pub progress: Option<MissionProgress>,
-    /// When it began; a first word counts.
+    /// Time at which it began; only the first value counts.
     pub started_at: Option<Timestamp>,
-    /// When it ended; a first word counts.
+    /// Time at which it ended; only the first value counts.
     pub ended_at: Option<Timestamp>,
 }
 
@@ -310,7 +310,7 @@ pub async fn add_facts(
     Ok(())
 }
 
-/// Wants an open mission paused or not; `false` if it has ended.
+/// Sets whether an open mission is to be paused; `false` if it has ended.
 pub async fn want_pause(
     db: &mut SqliteConnection,
     id: MissionId,
@@ -328,7 +328,7 @@ pub async fn want_pause(
     Ok(result.rows_affected() == 1)
 }
 
-/// Sets or drops the revision that the robot does not hold whole yet.
+/// Sets or removes the revision that the robot does not have completely yet.
 pub async fn set_replacement(
     db: &mut SqliteConnection,
     id: MissionId,
@@ -348,7 +348,7 @@ pub async fn set_replacement(
     Ok(())
 }
 
-/// Makes another revision the one that counts; `false` if another one than `from` counted.
+/// Makes another revision the present one; `false` if the present one is not `from`.
 pub async fn swap_content(
     db: &mut SqliteConnection,
     id: MissionId,
@@ -375,7 +375,7 @@ pub async fn swap_content(
     Ok(result.rows_affected() == 1)
 }
 
-/// Notes since when a mission's robot has not been heard, or that it is heard.
+/// Stores since when a mission's robot has not been heard; `None` if it is heard.
 pub async fn set_silence(
     db: &mut SqliteConnection,
     id: MissionId,
@@ -392,7 +392,7 @@ pub async fn set_silence(
     Ok(())
 }
 
-/// Keeps how a mission was driven; a first word counts.
+/// Stores how a mission was driven; only the first value counts.
 pub async fn add_outcome(
     db: &mut SqliteConnection,
     id: MissionId,
@@ -418,7 +418,7 @@ pub async fn add_outcome(
     Ok(())
 }
 
-/// How a mission was driven, as far as its robot has said so.
+/// Returns how a mission was driven, as far as its robot has reported it.
 pub async fn outcome(
     db: &mut SqliteConnection,
     id: MissionId,
@@ -442,7 +442,7 @@ pub async fn outcome(
     ))
 }
 
-/// How many missions stand in each state.
+/// Returns the number of missions in each state.
 pub async fn counts(db: &mut SqliteConnection) -> Result<Vec<(MissionState, u64)>, DbError> {
     let rows =
         sqlx::query!(r#"SELECT state, COUNT(*) AS "count!: i64" FROM missions GROUP BY state"#)

@@ -1,4 +1,4 @@
-//! The database: SQLite in one file. Knows SQL, decides nothing.
+//! The database: SQLite in one file. Contains SQL and no decisions.
 //!
 //! There is one writer connection ([`Db::write`], `BEGIN IMMEDIATE`) and a pool of readers
 //! ([`Db::read`], each transaction a snapshot). `synchronous=FULL`: a commit that returned
@@ -56,21 +56,21 @@ use self::connections::{COMMIT_TIMEOUT, Connections, Lent};
 use self::failure::StorageFailure;
 use crate::metrics::DatabaseMetrics;
 
-/// Oldest SQLite that is free of the bug that can lose a WAL.
+/// Minimum version of SQLite: earlier ones have a bug that can lose a write-ahead log.
 pub const SQLITE_VERSION_MIN: (u32, u32, u32) = (3, 51, 3);
-/// Connections that read at the same time.
+/// Number of connections that read at the same time.
 const READERS_MAX: u32 = 4;
-/// Pages of the write-ahead log, 64 MiB in all, at which a commit also brings them into the file,
-/// if [`Db::checkpoint`] has not done so.
+/// Pages of the write-ahead log (64 MiB) at which a commit also checkpoints it, if
+/// [`Db::checkpoint`] has not.
 const WAL_PAGES: u32 = 16_384;
-/// Memory for the writer's pages, KiB: what robots drive over now is read once.
+/// Page cache of the writer, KiB: holds the cells that robots drive over now.
 const WRITER_CACHE_KIB: u32 = 32 * 1_024;
-/// How long work in the background may take. It is far longer than any takes, but the library never
-/// answers a statement that is sent while its thread ends without memory.
+/// Maximum time for background work. It exceeds any real duration; the library never answers a
+/// statement that is sent while its thread ends for lack of memory.
 const WORK_MAX: Duration = Duration::from_secs(30);
-/// How long the operating system may take to tell how much of a disk is free.
+/// Maximum time for the operating system to report the free space of a disk.
 const DISK_TIMEOUT: Duration = Duration::from_secs(2);
-/// How long SQLite waits for a lock that another process holds.
+/// Maximum time that SQLite waits for a lock of another process.
 const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// A transaction on the database, rolled back unless it is committed.
@@ -79,18 +79,18 @@ pub struct Tx {
     inner: Lent,
     noted: Noted,
     commits: Arc<Commits>,
-    /// Whether its commit counts as a generation.
+    /// Whether its commit increments the generation.
     is_counted: bool,
 }
 
-/// How a commit ended.
+/// Outcome of a commit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Outcome {
-    /// Everything is written, and lasts.
+    /// Everything is written durably.
     Written,
     /// Nothing is written.
     Nothing,
-    /// Nobody knows: SQLite did not answer in time, and may still write everything.
+    /// Unknown: SQLite did not answer in time, and may still write everything.
     Unknown,
 }
 
@@ -98,14 +98,14 @@ impl Outcome {
     fn of(committed: &Result<(), sqlx::Error>) -> Self {
         match committed {
             Ok(()) => Self::Written,
-            // SQLite itself says that it did not commit.
+            // SQLite itself reports that it did not commit.
             Err(sqlx::Error::Database(_)) => Self::Nothing,
             Err(_) => Self::Unknown,
         }
     }
 }
 
-/// What is counted of commits.
+/// Counts of commits.
 #[derive(Debug, Default)]
 struct Commits {
     generation: AtomicU64,
@@ -113,7 +113,7 @@ struct Commits {
     became_unknown: Notify,
 }
 
-/// Notes how long a transaction took when it is over.
+/// Records the duration of a transaction when it ends.
 #[derive(Debug)]
 struct Noted {
     metrics: DatabaseMetrics,
@@ -130,16 +130,16 @@ impl Drop for Noted {
 }
 
 impl Tx {
-    /// Makes what was written last.
+    /// Commits the transaction.
     ///
     /// # Errors
-    /// SQLite failed; nothing is written then, or nobody knows.
+    /// SQLite failed; nothing is written, or the outcome is unknown.
     pub async fn commit(self) -> Result<(), sqlx::Error> {
         self.commit_then(|_outcome| {}).await
     }
 
-    /// The same, and then does what follows from how it ended. Both are one task of their own, so
-    /// neither is left out if whoever waits goes away.
+    /// Commits the transaction and then calls `then` with the outcome. Both are one task of its
+    /// own, so cancellation of the caller interrupts neither.
     ///
     /// # Errors
     /// As [`Tx::commit`].
@@ -191,24 +191,24 @@ impl DerefMut for Tx {
     }
 }
 
-/// Why the database did not do it.
+/// Error of the database.
 #[derive(Debug, thiserror::Error)]
 pub enum DbError {
-    /// SQLite or its pool failed.
+    /// SQLite or the pool of connections failed.
     #[error("the database failed")]
     Sqlite(#[source] sqlx::Error),
-    /// A stored value does not read back.
+    /// A stored value cannot be parsed.
     #[error("the database holds a {what} that does not read back: `{value}`")]
     Corrupt {
-        /// What it should be.
+        /// The expected kind of value.
         what: &'static str,
-        /// What it is.
+        /// The stored value.
         value: String,
     },
-    /// A value does not fit into the database.
+    /// A value is out of the range that the database can store.
     #[error("a {0} does not fit into the database")]
     DoesNotFit(&'static str),
-    /// A commit ended of which nobody knows what became, and memory has not been read again since.
+    /// The outcome of a commit is unknown, and memory has not been read again since.
     #[error("what became of a commit is not known yet")]
     Unsettled,
 }
@@ -221,7 +221,7 @@ impl From<sqlx::Error> for DbError {
 }
 
 impl DbError {
-    /// What failed, unless it is the statement or what is stored.
+    /// Returns the storage failure; `None` for an error of the statement or of the stored data.
     pub fn failure(&self) -> Option<StorageFailure> {
         match self {
             Self::Sqlite(error) => StorageFailure::of(error),
@@ -230,7 +230,7 @@ impl DbError {
         }
     }
 
-    /// Whether a rule of uniqueness refused the write.
+    /// Returns whether a unique constraint refused the write.
     pub fn is_unique_violation(&self) -> bool {
         match self {
             Self::Sqlite(sqlx::Error::Database(error)) => error.is_unique_violation(),
@@ -239,7 +239,7 @@ impl DbError {
     }
 }
 
-/// Why the database cannot be used.
+/// Reason why the database cannot be opened.
 #[derive(Debug, thiserror::Error)]
 pub enum OpenError {
     /// The folder of the file is missing.
@@ -248,43 +248,43 @@ pub enum OpenError {
     /// The file cannot be opened.
     #[error("cannot open the database `{}`", path.display())]
     Open {
-        /// Which file.
+        /// The file.
         path: PathBuf,
-        /// Why.
+        /// The cause.
         #[source]
         cause: sqlx::Error,
     },
     /// A migration failed, or the file is of a newer version.
     #[error("cannot bring the database `{}` up to date", path.display())]
     Migrate {
-        /// Which file.
+        /// The file.
         path: PathBuf,
-        /// Why.
+        /// The cause.
         #[source]
         cause: sqlx::migrate::MigrateError,
     },
-    /// SQLite is too old to be trusted.
+    /// The version of SQLite is too old.
     #[error("SQLite {0} may lose data; 3.51.3 or newer is needed")]
     TooOld(String),
 }
 
-/// The open database; clones are handles to the same.
+/// The open database; clones share it.
 #[derive(Debug, Clone)]
 pub struct Db {
     writer: Connections,
     readers: Connections,
     path: PathBuf,
-    /// Brings the log into the file beside the writer.
+    /// Connection that checkpoints the log, beside the writer.
     checkpoints: Connections,
     version: String,
     metrics: DatabaseMetrics,
     commits: Arc<Commits>,
-    /// Held by whoever asks the operating system about the disk.
+    /// One permit, held while the operating system is asked about the disk.
     asking_disk: Arc<Semaphore>,
 }
 
 impl Db {
-    /// Opens the file, creates it if it is missing, and brings it up to date.
+    /// Opens the file, creates it if it is missing, and applies migrations.
     ///
     /// # Errors
     /// [`OpenError`] names file or folder.
@@ -292,7 +292,7 @@ impl Db {
         Self::open_with(path, COMMIT_TIMEOUT).await
     }
 
-    /// The same, with a bound of one's own on how long a commit may take.
+    /// As [`Db::open`], with a given maximum time for a commit.
     ///
     /// # Errors
     /// As [`Db::open`].
@@ -341,8 +341,8 @@ impl Db {
                 path: path.to_owned(),
                 cause,
             })?;
-        // It has no transactions that could be left open, and is never replaced: while one
-        // connection is open the log's index exists, which a full disk has no room for.
+        // This connection has no transactions that could stay open, and is never replaced: while
+        // one connection is open the log's index exists, for which a full disk has no room.
         let checkpoints = Connections::open(options.clone(), 1, commit_max)
             .await
             .map_err(failed)?;
@@ -361,44 +361,46 @@ impl Db {
         })
     }
 
-    /// Counts what was committed, but for uploads: what was read at a generation is as it was while
-    /// that is the present one, if no upload changes it.
+    /// Returns the generation: a counter of commits other than uploads. Data that uploads do not
+    /// change are unchanged while it is the same.
     pub fn generation(&self) -> u64 {
         self.commits.generation.load(Ordering::Acquire)
     }
 
-    /// How many commits ended of which nobody knows what became.
+    /// Returns the number of commits of unknown outcome.
     pub fn unknown_outcomes(&self) -> u64 {
         self.commits.unknown.load(Ordering::Acquire)
     }
 
-    /// Waits for the next commit of which nobody knows what became.
+    /// Waits for the next commit of unknown outcome.
     pub async fn outcome_unknown(&self) {
         self.commits.became_unknown.notified().await;
     }
 
-    /// Waits until every commit before has ended, in whatever way, and counts a generation: what was
-    /// read meanwhile may be of before.
+    /// Waits until every earlier commit has ended, in whatever way, and increments the generation:
+    /// data read meanwhile may be from before.
     ///
     /// # Errors
-    /// The turn to write did not come in time, since one of them goes on or another process writes.
+    /// The writing connection did not become free in time: such a commit goes on, or another
+    /// process writes.
     pub async fn await_commits(&self) -> Result<(), DbError> {
-        // SQLite lets nobody else begin to write as long as a transaction may still be committed.
+        // SQLite lets nobody begin to write as long as an earlier transaction may still be
+        // committed.
         drop(self.write("refresh").await?);
         self.commits.generation.fetch_add(1, Ordering::AcqRel);
         Ok(())
     }
 
-    /// Version of the SQLite library.
+    /// Returns the version of the SQLite library.
     pub fn sqlite_version(&self) -> &str {
         &self.version
     }
 
-    /// Begins to write; waits for its turn. Await nothing but the database before the commit.
-    /// `kind` names the use case in the metrics.
+    /// Begins a write transaction; waits for the writing connection. Await nothing but the database
+    /// before the commit. `kind` names the use case in the metrics.
     ///
     /// # Errors
-    /// The turn did not come in time, or SQLite failed.
+    /// The connection did not become free in time, or SQLite failed.
     pub async fn write(&self, kind: &'static str) -> Result<Tx, DbError> {
         let asked_at = Instant::now();
         let inner = self.writer.begin("BEGIN IMMEDIATE").await?;
@@ -410,11 +412,11 @@ impl Db {
         })
     }
 
-    /// The same for what robots upload, measurements and reports of missions, which
+    /// Begins a write transaction for uploads of robots (measurements and mission reports), which
     /// [`Db::generation`] does not count.
     ///
     /// # Errors
-    /// The turn did not come in time, or SQLite failed.
+    /// The connection did not become free in time, or SQLite failed.
     pub async fn write_uploads(&self, kind: &'static str) -> Result<Tx, DbError> {
         Ok(Tx {
             is_counted: false,
@@ -437,7 +439,7 @@ impl Db {
         }
     }
 
-    /// What the database measures of itself.
+    /// Returns the metrics of the database.
     pub fn metrics(&self) -> &DatabaseMetrics {
         &self.metrics
     }
@@ -451,30 +453,29 @@ impl Db {
         Ok(self.timed(inner, kind, false))
     }
 
-    /// Brings what is in the log into the file, as far as nobody reads it there; whoever writes
-    /// meanwhile does not wait for it.
+    /// Checkpoints the write-ahead log, as far as no reader needs it; writers do not wait for it.
     ///
     /// # Errors
-    /// SQLite failed, as on a full disk; the log has it all the same.
+    /// SQLite failed, for instance on a full disk; the log remains valid.
     pub async fn checkpoint(&self) -> Result<(), DbError> {
         let checkpoint = self.checkpoints.run("PRAGMA wal_checkpoint(PASSIVE)");
         Ok(checkpoint.await?)
     }
 
-    /// Writes something that says nothing, as durably as everything else.
+    /// Makes a write without effect, as durable as any other.
     ///
     /// # Errors
     /// The database cannot be written.
     pub async fn probe_write(&self) -> Result<(), DbError> {
         let mut tx = self.write_uploads("storage").await?;
-        // A number in the file's header that nobody else uses; the page is written each time.
+        // A number in the file's header that is not used otherwise; its page is written each time.
         sqlx::query("PRAGMA user_version = 1")
             .execute(&mut *tx)
             .await?;
         Ok(tx.commit().await?)
     }
 
-    /// Reads from every table: a damaged root page, or a lost one, is found.
+    /// Reads from every table, which detects a damaged or lost root page.
     ///
     /// # Errors
     /// A table cannot be read.
@@ -485,7 +486,7 @@ impl Db {
                 .fetch_all(&mut *tx)
                 .await?;
         if tables.is_empty() {
-            // The file was taken away; whatever connections have open is of no use.
+            // The file was removed, so the open connections are useless.
             failure::note(&sqlx::Error::WorkerCrashed);
             return Err(corrupt("schema", "no tables"));
         }
@@ -496,7 +497,7 @@ impl Db {
         Ok(())
     }
 
-    /// Checks the structure of the whole file; what is wrong, if anything is. Takes its time.
+    /// Checks the structure of the whole file, which is slow. Returns the first finding, if any.
     ///
     /// # Errors
     /// The database cannot be read.
@@ -508,9 +509,10 @@ impl Db {
         Ok((finding != "ok").then_some(finding))
     }
 
-    /// Free bytes on the disk of the file, if the operating system tells.
+    /// Returns the free bytes on the database's disk; `None` if the operating system does not
+    /// report them.
     pub async fn disk_free_bytes(&self) -> Option<u64> {
-        // It may wait for a disk that hangs: then nobody asks again until it has answered.
+        // A hanging disk may block this; meanwhile no further request is made.
         let asking = Arc::clone(&self.asking_disk).try_acquire_owned().ok()?;
         let path = self.path.clone();
         let asked = tokio::task::spawn_blocking(move || {
@@ -527,7 +529,7 @@ impl Db {
         )
     }
 
-    /// Closes all connections after what they are doing; the file is whole then.
+    /// Closes all connections after their present work; the file is complete then.
     pub async fn close(&self) {
         self.readers.close().await;
         self.checkpoints.close().await;
@@ -535,10 +537,10 @@ impl Db {
     }
 }
 
-/// Ends work on the database that takes too long, for whatever has no limit of its own.
+/// Runs work on the database with a maximum time of [`WORK_MAX`].
 ///
 /// # Errors
-/// As the work; [`sqlx::Error::WorkerCrashed`] after [`WORK_MAX`].
+/// Those of the work; [`sqlx::Error::WorkerCrashed`] after [`WORK_MAX`].
 pub async fn limited<T, E: From<sqlx::Error>>(
     work: impl Future<Output = Result<T, E>>,
 ) -> Result<T, E> {
@@ -553,7 +555,7 @@ fn is_new_enough(version: &str) -> bool {
     (next(), next(), next()) >= SQLITE_VERSION_MIN
 }
 
-/// A time as the database keeps it.
+/// Converts a time to microseconds since 1970, as stored.
 fn to_us(time: Timestamp) -> i64 {
     time.as_microsecond()
 }
@@ -581,13 +583,13 @@ fn from_json<T: DeserializeOwned>(what: &'static str, text: &str) -> Result<T, D
     serde_json::from_str(text).map_err(|_error| corrupt(what, text))
 }
 
-/// What statements compare sites and robots with: `NULL` for everywhere.
+/// Converts a scope to the parameter of statements: `NULL` for everywhere.
 fn scope_text(scope: &Scope) -> Result<Option<String>, DbError> {
     let names = scope.names();
     names.map(|names| to_json("scope", &names)).transpose()
 }
 
-/// What statements compare robots of one site with: `NULL` for all.
+/// Converts a list of robots to the parameter of statements: `NULL` for all.
 fn robots_text(robots: Option<&BTreeSet<RobotId>>) -> Result<Option<String>, DbError> {
     robots.map(|robots| to_json("robots", robots)).transpose()
 }

@@ -1,5 +1,5 @@
-//! The files of the database are its owner's alone: whoever reads them sees what the fleet does, and
-//! whoever writes them makes tokens.
+//! File permissions: only the owner may access the database's files, since reading them reveals
+//! what the fleet does, and writing them allows to create tokens.
 
 use std::ffi::OsString;
 use std::fs::{self, OpenOptions, Permissions};
@@ -9,12 +9,11 @@ use std::path::{Path, PathBuf};
 
 use tracing::warn;
 
-/// Read and written by its owner.
+/// Mode: read and write for the owner alone.
 const OWNERS: u32 = 0o600;
-/// What of a mode concerns others.
+/// Mask of the permissions of group and others.
 const OF_OTHERS: u32 = 0o077;
-/// What SQLite adds to the name of the database for the files beside it. It gives them the mode of
-/// the database.
+/// Suffixes of the database's files. SQLite gives those beside it the mode of the database.
 const ENDINGS: [&str; 4] = ["", "-wal", "-shm", "-journal"];
 
 fn beside(path: &Path, ending: &str) -> PathBuf {
@@ -23,11 +22,11 @@ fn beside(path: &Path, ending: &str) -> PathBuf {
     name.into()
 }
 
-/// Makes the file of the database if it is missing, for its owner alone, and takes the files that
-/// there are away from others.
+/// Creates the database's file if it is missing, for its owner alone, and removes the permissions
+/// of others from existing files.
 ///
 /// # Errors
-/// The file cannot be made.
+/// The file cannot be created.
 pub(super) fn keep(path: &Path) -> io::Result<()> {
     let mut options = OpenOptions::new();
     options
@@ -44,7 +43,7 @@ pub(super) fn keep(path: &Path) -> io::Result<()> {
         if found.permissions().mode() & OF_OTHERS == 0 {
             continue;
         }
-        // A file that is another user's works all the same.
+        // A file of another user can be used nevertheless.
         match fs::set_permissions(&file, Permissions::from_mode(OWNERS)) {
             Ok(()) => warn!(
                 "others could use `{}`; now its owner alone can",

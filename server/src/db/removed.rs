@@ -1,4 +1,5 @@
-//! Raw measurements that are removed after their time; their names stay, as ranges of numbers.
+//! Raw measurements that were removed after their retention; their names (`boot`, `seq`) are kept
+//! as ranges.
 
 use std::collections::{BTreeMap, HashSet};
 
@@ -8,22 +9,23 @@ use sqlx::SqliteConnection;
 
 use super::{DbError, to_us};
 
-/// A raw measurement as removing it needs to know it.
+/// A raw measurement to be removed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Oldest {
-    /// Its key; in the order of the commits.
+    /// Its key; keys are in the order of commits.
     pub pk: i64,
     /// Key of the run of the agent.
     pub boot_pk: i64,
-    /// Its number within that run.
+    /// Its sequence number within that run.
     pub seq: i64,
-    /// When it came, microseconds since 1970.
+    /// Time at which it was received, microseconds since 1970.
     pub received_at_us: i64,
 }
 
-/// The oldest measurements that came before a time or lie before a key, at most `limit`.
+/// Returns at most `limit` of the oldest measurements that were received before a time or lie
+/// before a key.
 ///
-/// Keys rise with the commits, so whatever came later lies behind.
+/// Keys increase with commits, so later measurements have larger ones.
 pub async fn oldest(
     db: &mut SqliteConnection,
     before: Timestamp,
@@ -44,13 +46,13 @@ pub async fn oldest(
     Ok(rows)
 }
 
-/// The last key; `None` when there are no measurements.
+/// Returns the last key; `None` without measurements.
 pub async fn last_key(db: &mut SqliteConnection) -> Result<Option<i64>, DbError> {
     let last = sqlx::query_scalar!(r#"SELECT MAX(pk) AS "last: i64" FROM segments"#);
     Ok(last.fetch_one(db).await?)
 }
 
-/// Removes measurements, and keeps their names.
+/// Removes measurements, and records their names.
 pub async fn remove(db: &mut SqliteConnection, rows: &[Oldest]) -> Result<(), DbError> {
     let Some(last) = rows.last() else {
         return Ok(());
@@ -73,7 +75,7 @@ pub async fn remove(db: &mut SqliteConnection, rows: &[Oldest]) -> Result<(), Db
     Ok(())
 }
 
-/// Notes a range, joined with those that it touches.
+/// Records a range, joined with the ranges that it touches.
 async fn note(
     db: &mut SqliteConnection,
     boot_pk: i64,
@@ -102,19 +104,20 @@ async fn note(
     Ok(())
 }
 
-/// Runs of agents of which anything was removed.
+/// Returns the runs of agents with removed measurements.
 pub async fn boots(db: &mut SqliteConnection) -> Result<HashSet<i64>, DbError> {
     let rows = sqlx::query_scalar!(r#"SELECT DISTINCT boot_pk AS "pk!" FROM segments_removed"#);
     Ok(rows.fetch_all(db).await?.into_iter().collect())
 }
 
-/// Ranges of numbers of a run that were removed and touch a range, both ends included.
+/// Returns the removed ranges of a run's sequence numbers that touch a range, both ends included.
 pub async fn within(
     db: &mut SqliteConnection,
     boot_pk: i64,
     (from, to): (i64, i64),
 ) -> Result<Vec<(i64, i64)>, DbError> {
-    // From the newest back: the ranges do not overlap, so none behind one that ends too early counts.
+    // In descending order: the ranges do not overlap, so the search ends at the first that ends too
+    // early.
     let mut rows = sqlx::query!(
         "SELECT from_seq, to_seq FROM segments_removed WHERE boot_pk = ? AND from_seq <= ?
          ORDER BY from_seq DESC",

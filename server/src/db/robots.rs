@@ -9,13 +9,13 @@ use tread_api::robot::{Capabilities, MeasurementsTaken, RobotModel};
 
 use super::{DbError, from_json, from_us, parse, robots_text, to_json, to_us, unsigned};
 
-/// Runs of agents that are removed with each new one.
+/// Maximum number of runs removed with each new one.
 const FORGET_MAX: u32 = 50;
 
-/// A robot as the database keeps it.
+/// A robot as stored.
 #[derive(Debug, Clone)]
 pub struct RobotRow {
-    /// The key of other tables.
+    /// Its database key.
     pub pk: i64,
     /// Its site.
     pub site: SiteId,
@@ -23,11 +23,11 @@ pub struct RobotRow {
     pub id: RobotId,
     /// Model and tyres as last declared.
     pub model: RobotModel,
-    /// The identifier of that model and those tyres.
+    /// Identifier of this model with these tyres.
     pub configuration: ConfigurationId,
     /// Display name; the identifier until it is renamed.
     pub name: String,
-    /// When it was retired, if it was.
+    /// Time at which it was retired; `None` if it is not.
     pub retired_at: Option<Timestamp>,
     /// What the base and its agent can do.
     pub capabilities: Capabilities,
@@ -39,7 +39,7 @@ pub struct RobotRow {
     pub first_seen_at: Timestamp,
     /// Last hello.
     pub last_hello_at: Timestamp,
-    /// What became of its measurements.
+    /// Counts of its refused and deferred measurements.
     pub measurements: MeasurementsTaken,
 }
 
@@ -107,7 +107,7 @@ macro_rules! robots {
     };
 }
 
-/// The robot of that name.
+/// Returns a robot by its site and identifier.
 pub async fn find(
     db: &mut SqliteConnection,
     site_pk: i64,
@@ -120,7 +120,7 @@ pub async fn find(
     raw.map(RobotRow::try_from).transpose()
 }
 
-/// Whether any robot has that name, in that site if one is given.
+/// Returns whether a robot of this identifier exists, in the given site or, with `None`, in any.
 pub async fn is_known(
     db: &mut SqliteConnection,
     site: Option<&SiteId>,
@@ -137,7 +137,7 @@ pub async fn is_known(
     Ok(found.fetch_one(db).await?)
 }
 
-/// The key of the robot of that name in that site.
+/// Returns the key of a robot by its site and identifier.
 pub async fn pk_of(
     db: &mut SqliteConnection,
     site: &SiteId,
@@ -155,8 +155,8 @@ pub async fn pk_of(
     Ok(pk)
 }
 
-/// Robots of a site after an identifier, in alphabetical order, only those that are named if any are;
-/// retired ones too if asked for.
+/// Returns the robots of a site after an identifier, in alphabetical order; with a list of robots
+/// only these, and retired ones only if requested.
 pub async fn list(
     db: &mut SqliteConnection,
     (site_pk, named): (i64, Option<&BTreeSet<RobotId>>),
@@ -180,7 +180,7 @@ pub async fn list(
     rows.into_iter().map(RobotRow::try_from).collect()
 }
 
-/// What a robot says of itself.
+/// Content of a robot's hello.
 #[derive(Debug, Clone, Copy)]
 pub struct Introduction<'hello> {
     /// The robot.
@@ -193,11 +193,11 @@ pub struct Introduction<'hello> {
     pub model: &'hello RobotModel,
     /// What the base and its agent can do.
     pub capabilities: &'hello Capabilities,
-    /// When it said so.
+    /// Time of the hello.
     pub at: Timestamp,
 }
 
-/// Writes down what a robot says of itself, and the run of its agent, of which so many are kept.
+/// Stores a robot's hello and the run of its agent; keeps `runs_kept` runs.
 pub async fn introduce(
     db: &mut SqliteConnection,
     site_pk: i64,
@@ -246,7 +246,7 @@ pub async fn introduce(
     Ok(())
 }
 
-/// The key of one run of an agent, if it is known.
+/// Returns the key of one run of an agent, if it is known.
 pub async fn find_boot(
     db: &mut SqliteConnection,
     robot_pk: i64,
@@ -261,8 +261,8 @@ pub async fn find_boot(
     Ok(found.fetch_optional(db).await?)
 }
 
-/// The key of one run of an agent, written down if it is new; of each robot so many are kept, and
-/// those of which raw measurements are kept.
+/// Returns the key of one run of an agent, after storing it if it is new. Of each robot a limited
+/// number of runs is kept, and those with raw measurements.
 pub async fn boot_key(
     db: &mut SqliteConnection,
     robot_pk: i64,
@@ -283,8 +283,8 @@ pub async fn boot_key(
     Ok(pk)
 }
 
-/// Removes the oldest runs of a robot beyond so many, with what says which of their records came;
-/// runs of which measurements are kept stay, as does the one that said hello last.
+/// Removes the oldest runs of a robot beyond `kept`, with the record of their uploads. Runs with
+/// measurements stay, as does the one of the last hello.
 async fn forget_runs(db: &mut SqliteConnection, robot_pk: i64, kept: u32) -> Result<(), DbError> {
     let over = sqlx::query_scalar!(
         r#"SELECT boots.pk AS "pk!" FROM boots
@@ -326,8 +326,8 @@ async fn forget_runs(db: &mut SqliteConnection, robot_pk: i64, kept: u32) -> Res
     Ok(())
 }
 
-/// The key of a configuration, written down without its model if it is new. It takes the place of
-/// one that no robot has and that nobody measured with, if there is one.
+/// Returns the key of a configuration, after storing it without its model if it is new. A new one
+/// replaces an unused one, which no robot has and with which nobody measured, if there is one.
 pub async fn configuration_key(db: &mut SqliteConnection, id: &str) -> Result<i64, DbError> {
     let found = sqlx::query_scalar!(r#"SELECT pk AS "pk!" FROM configurations WHERE id = ?"#, id);
     if let Some(found) = found.fetch_optional(&mut *db).await? {
@@ -353,7 +353,7 @@ pub async fn configuration_key(db: &mut SqliteConnection, id: &str) -> Result<i6
     Ok(new.fetch_one(db).await?)
 }
 
-/// The key of a configuration that a robot has measured with.
+/// Returns the key of a configuration that a robot has measured with.
 pub async fn measured_configuration(
     db: &mut SqliteConnection,
     robot_pk: i64,
@@ -370,7 +370,7 @@ pub async fn measured_configuration(
     Ok(found.fetch_optional(db).await?)
 }
 
-/// With how many configurations a robot has measured.
+/// Returns the number of configurations that a robot has measured with.
 pub async fn measured_count(db: &mut SqliteConnection, robot_pk: i64) -> Result<i64, DbError> {
     let count = sqlx::query_scalar!(
         r#"SELECT COUNT(*) AS "count!: i64" FROM measured_configurations WHERE robot_pk = ?"#,
@@ -379,7 +379,7 @@ pub async fn measured_count(db: &mut SqliteConnection, robot_pk: i64) -> Result<
     Ok(count.fetch_one(db).await?)
 }
 
-/// Notes that a robot measures with a configuration; the key of the configuration.
+/// Records that a robot measures with a configuration; returns the configuration's key.
 pub async fn note_measured(
     db: &mut SqliteConnection,
     robot_pk: i64,
@@ -397,7 +397,7 @@ pub async fn note_measured(
     Ok(configuration_pk)
 }
 
-/// The names of all robots of all sites.
+/// Returns the sites and identifiers of all robots.
 pub async fn names(db: &mut SqliteConnection) -> Result<Vec<(SiteId, RobotId)>, DbError> {
     let raw = sqlx::query!(
         "SELECT sites.id AS site, robots.id AS robot
@@ -410,7 +410,7 @@ pub async fn names(db: &mut SqliteConnection) -> Result<Vec<(SiteId, RobotId)>, 
         .collect()
 }
 
-/// Renames a robot for people.
+/// Changes a robot's display name.
 pub async fn rename(db: &mut SqliteConnection, robot_pk: i64, name: &str) -> Result<(), DbError> {
     sqlx::query!("UPDATE robots SET name = ? WHERE pk = ?", name, robot_pk)
         .execute(db)
@@ -418,7 +418,7 @@ pub async fn rename(db: &mut SqliteConnection, robot_pk: i64, name: &str) -> Res
     Ok(())
 }
 
-/// Retires a robot, or takes it back.
+/// Retires a robot, or ends its retirement.
 pub async fn set_retired(
     db: &mut SqliteConnection,
     robot_pk: i64,
@@ -435,7 +435,7 @@ pub async fn set_retired(
     Ok(())
 }
 
-/// All robots of all sites, at most `limit`.
+/// Returns at most `limit` robots of all sites.
 pub async fn all(db: &mut SqliteConnection, limit: u32) -> Result<Vec<RobotRow>, DbError> {
     let rows = robots!("ORDER BY robots.pk LIMIT ?", limit)
         .fetch_all(db)
@@ -443,7 +443,7 @@ pub async fn all(db: &mut SqliteConnection, limit: u32) -> Result<Vec<RobotRow>,
     rows.into_iter().map(RobotRow::try_from).collect()
 }
 
-/// Names of all robots by their keys.
+/// Returns the identifiers of all robots by their keys.
 pub async fn ids_by_key(db: &mut SqliteConnection) -> Result<HashMap<i64, RobotId>, DbError> {
     let rows = sqlx::query!(r#"SELECT pk AS "pk!", id FROM robots"#);
     let rows = rows.fetch_all(db).await?;
@@ -451,7 +451,7 @@ pub async fn ids_by_key(db: &mut SqliteConnection) -> Result<HashMap<i64, RobotI
     rows.iter().map(|row| named(row.pk, &row.id)).collect()
 }
 
-/// Names of a site's robots by their keys.
+/// Returns the identifiers of a site's robots by their keys.
 pub async fn of_site_by_key(
     db: &mut SqliteConnection,
     site_pk: i64,
@@ -465,7 +465,7 @@ pub async fn of_site_by_key(
     rows.iter().map(|row| named(row.pk, &row.id)).collect()
 }
 
-/// Identifiers of all configurations by their keys.
+/// Returns the identifiers of all configurations by their keys.
 pub async fn configurations_by_key(
     db: &mut SqliteConnection,
 ) -> Result<HashMap<i64, ConfigurationId>, DbError> {
@@ -475,7 +475,7 @@ pub async fn configurations_by_key(
     rows.iter().map(|row| named(row.pk, &row.id)).collect()
 }
 
-/// Names of the models of those configurations that a robot has declared.
+/// Returns the model names of the configurations that a robot has declared.
 pub async fn model_names(
     db: &mut SqliteConnection,
 ) -> Result<HashMap<ConfigurationId, String>, DbError> {
@@ -490,7 +490,7 @@ pub async fn model_names(
         .collect()
 }
 
-/// Counts measurements of a robot that can never be taken, and says why the last one cannot.
+/// Counts measurements of a robot that are refused for ever, with the reason of the last.
 pub async fn count_refused(
     db: &mut SqliteConnection,
     pk: i64,

@@ -1,8 +1,8 @@
 //! Statements that write many rows at once, with every value bound.
 //!
-//! Each way of writing has one text per number of rows of [`CHUNKS`], so that a connection prepares
-//! it once and a few executions write any number of rows. That is a third cheaper than rows as JSON,
-//! which SQLite has to read and to take apart again.
+//! Each statement has one text per number of rows in [`CHUNKS`], so that a connection prepares it
+//! once and a few executions write any number of rows. That takes a third less time than rows as
+//! JSON, which SQLite has to parse.
 
 use sqlx::encode::Encode;
 use sqlx::sqlite::SqliteArguments;
@@ -10,7 +10,7 @@ use sqlx::{Arguments as _, Sqlite, SqliteConnection, Type};
 
 use super::DbError;
 
-/// Rows of one execution, most first; the last makes every number possible.
+/// Numbers of rows per execution, largest first; the last makes every number possible.
 const CHUNKS: [usize; 3] = [100, 10, 1];
 
 /// A statement for any number of rows.
@@ -36,8 +36,8 @@ impl Row<'_> {
 }
 
 impl RowsStatement {
-    /// `into` is everything before `VALUES` and names that many columns; `then` is what follows the
-    /// rows.
+    /// Makes a statement from `into`, everything before `VALUES` with as many columns as `columns`,
+    /// and `then`, which follows the rows.
     pub(super) fn new(into: &str, columns: usize, then: &str) -> Self {
         let row = format!("({})", vec!["?"; columns].join(","));
         let text = |rows| {
@@ -52,7 +52,7 @@ impl RowsStatement {
         }
     }
 
-    /// Writes the rows in their order and says how many the statement has changed.
+    /// Writes the rows in their order and returns the number of rows changed.
     pub(super) async fn execute<R>(
         &'static self,
         db: &mut SqliteConnection,

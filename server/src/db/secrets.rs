@@ -1,4 +1,4 @@
-//! Rows of tokens, which keep the hash of a secret and never the secret.
+//! Rows of tokens, which contain the hash of a secret and never the secret.
 
 /// A token as it is stored.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -9,18 +9,18 @@ pub struct TokenRow<T> {
     pub token: T,
 }
 
-/// Looks tokens up in a table: by their identifiers, and by what the hashes of their secrets begin with.
+/// Defines look-ups of tokens: by identifier, and by the first bytes of the hash of the secret.
 /// `$rows!` selects the columns of a token.
 macro_rules! look_up_tokens {
     ($table:tt, $rows:ident, $what:tt, $id:ty, $token:ty) => {
-        /// The one of that identifier.
+        /// Returns a token by its identifier.
         pub async fn find(db: &mut SqliteConnection, id: $id) -> Result<Option<$token>, DbError> {
             let id = id.to_string();
             let raw = $rows!("WHERE id = ?", id).fetch_optional(db).await?;
             raw.map(<$token>::try_from).transpose()
         }
 
-        /// The one whose hash begins like this one.
+        /// Returns the token whose hash has the same first bytes.
         pub async fn by_lookup(
             db: &mut SqliteConnection,
             fingerprint: &Fingerprint,

@@ -12,24 +12,24 @@ use tread_api::ids::{RobotId, TerrainId};
 use super::rows::{Row, RowsStatement};
 use super::{DbError, from_json, from_us, parse, robots_text, to_us, unsigned};
 
-/// A measurement on its way into the database.
+/// A measurement to be stored.
 #[derive(Debug)]
 pub struct NewSegment<'segment>(
     /// Key of the run of the agent.
     pub i64,
-    /// Its number within that run.
+    /// Its sequence number within that run.
     pub i64,
     /// Key of the robot.
     pub i64,
     /// Key of the site.
     pub i64,
-    /// The terrain, `""` where none is drawn.
+    /// Identifier of the terrain; `""` for none.
     pub &'segment str,
     /// The measurement as JSON.
     pub &'segment RawValue,
 );
 
-/// Columns of a measurement.
+/// Number of columns of a measurement.
 const COLUMNS: usize = 7;
 
 static INSERT: LazyLock<RowsStatement> = LazyLock::new(|| {
@@ -41,16 +41,16 @@ static INSERT: LazyLock<RowsStatement> = LazyLock::new(|| {
     )
 });
 
-/// Which of the offered measurements were new.
+/// Those of the given measurements that were new.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Inserted {
     /// All of them.
     All,
-    /// Those with these keys of boot and number, in the order in which they were offered.
+    /// Those with these keys (run and sequence number), in the given order.
     Only(Vec<(i64, i64)>),
 }
 
-/// Stores those measurements that are not there yet.
+/// Stores the measurements that are not stored yet.
 pub async fn insert_new(
     db: &mut SqliteConnection,
     segments: &[NewSegment<'_>],
@@ -64,7 +64,7 @@ pub async fn insert_new(
     );
     let last = last.fetch_optional(&mut *db).await?;
     let (last, last_us) = last.map_or((0, i64::MIN), |row| (row.pk, row.received_at_us));
-    // In the order of their commits, whatever the clock did.
+    // Times are in the order of commits, whatever the clock did.
     let received_at_us = to_us(received_at).max(last_us);
     let bind = |row: &mut Row<'_>, segment: &NewSegment<'_>| {
         let NewSegment(boot_pk, seq, robot_pk, site_pk, terrain, measurement) = *segment;
@@ -81,7 +81,7 @@ pub async fn insert_new(
     if usize::try_from(inserted) == Ok(segments.len()) {
         return Ok(Inserted::All);
     }
-    // The one writer gives rising keys, so what was added now lies behind what was there.
+    // The one writer assigns increasing keys, so the rows added now follow the earlier ones.
     let added = sqlx::query!(
         "SELECT boot_pk, seq FROM segments WHERE pk > ? ORDER BY pk",
         last
@@ -96,7 +96,7 @@ pub async fn insert_new(
     ))
 }
 
-/// Which measurements to list.
+/// Filter of a list of measurements.
 #[derive(Debug, Clone, Default)]
 pub struct SegmentFilter {
     /// Only those of this robot.
@@ -105,7 +105,7 @@ pub struct SegmentFilter {
     pub terrain: Option<TerrainId>,
     /// Only those of these robots.
     pub robots: Option<BTreeSet<RobotId>>,
-    /// Only those after this one.
+    /// Only those with a larger key (cursor).
     pub after: i64,
 }
 
@@ -147,19 +147,20 @@ macro_rules! segments {
     };
 }
 
-/// Which measurements there are: none can be added or removed that leaves this as it is.
+/// Range of stored measurements; it changes whenever one is added or removed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Extent {
-    /// Key of the oldest one; the oldest are removed first.
+    /// Key of the oldest one; measurements are removed from the oldest on.
     pub first: Option<i64>,
     /// Key of the newest one.
     pub last: Option<i64>,
-    /// When the newest one came, microseconds since 1970: keys may begin anew after all were removed.
+    /// Time at which the newest one was received, microseconds since 1970: keys may restart after
+    /// all were removed.
     pub last_at_us: Option<i64>,
 }
 
-/// Which measurements of a robot or terrain there are; of all sites without a filter, since one
-/// more look than needed at a list costs less than an index.
+/// Returns the range of measurements of a robot or terrain; without a filter of all sites, since a
+/// needless reload of a list costs less than an index.
 pub async fn extent(
     db: &mut SqliteConnection,
     site_pk: i64,
@@ -217,7 +218,7 @@ pub async fn extent(
     })
 }
 
-/// Measurements of a site in the order of their commits.
+/// Returns a site's measurements in the order of their commits.
 pub async fn list(
     db: &mut SqliteConnection,
     site_pk: i64,
@@ -227,8 +228,8 @@ pub async fn list(
     let robot = filter.robot.as_ref().map(RobotId::as_str);
     let terrain = filter.terrain.as_ref().map(TerrainId::as_str);
     let named = robots_text(filter.robots.as_ref())?;
-    // One statement per kind of filter, so that each uses its own index. A plus sign keeps a
-    // column out of the choice of index.
+    // One statement per kind of filter, so that each uses its own index. A plus sign excludes a
+    // column from the choice of index.
     let raw = match (robot, terrain) {
         (Some(robot), _) => {
             segments!(

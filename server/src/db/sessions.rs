@@ -1,4 +1,5 @@
-//! Sessions of browsers, each of a token, or of a person who signed in at an OpenID provider.
+//! Sessions of browsers, each belonging to a token or to a person who signed in at an OpenID
+//! provider.
 
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
@@ -8,23 +9,23 @@ use tread_api::ids::{PersonId, SessionId, TokenId};
 use super::{DbError, corrupt, from_json, from_us, parse, to_json, to_us};
 use crate::identity::secret::Fingerprint;
 
-/// A person as a session keeps them.
+/// A person as stored with a session.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SignedIn {
-    /// Who it is.
+    /// Identity at the provider.
     pub person: Person,
-    /// Their name when they signed in.
+    /// Name at the time of sign-in.
     pub name: String,
-    /// The groups that gave them rights then.
+    /// Groups at the time of sign-in that had a grant.
     pub groups: Vec<String>,
 }
 
-/// Whose a session is.
+/// Owner of a session.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Owner {
-    /// Of the token that it was opened with.
+    /// The token that it was opened with.
     Token(TokenId),
-    /// Of a person.
+    /// A person.
     Person(SignedIn),
 }
 
@@ -33,30 +34,30 @@ pub enum Owner {
 pub struct SessionRow {
     /// The session.
     pub id: SessionId,
-    /// Whose it is.
+    /// Its owner.
     pub owner: Owner,
     /// The hash of its secret.
     pub hash: Vec<u8>,
     /// When it was opened.
     pub created_at: Timestamp,
-    /// From when on it is refused.
+    /// Time from which it is refused.
     pub expires_at: Timestamp,
-    /// When a person's was used last.
+    /// Time of its last use; only for a person's session.
     pub last_used_at: Option<Timestamp>,
 }
 
-/// A session about to be kept.
+/// A session to be stored.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NewSession {
     /// The session.
     pub id: SessionId,
-    /// Whose it is.
+    /// Its owner.
     pub owner: Owner,
     /// The hash of its secret.
     pub fingerprint: Fingerprint,
     /// When it was opened.
     pub created_at: Timestamp,
-    /// From when on it is refused.
+    /// Time from which it is refused.
     pub expires_at: Timestamp,
 }
 
@@ -118,7 +119,7 @@ macro_rules! sessions {
     };
 }
 
-/// Keeps a new session.
+/// Stores a new session.
 pub async fn insert(db: &mut SqliteConnection, session: &NewSession) -> Result<(), DbError> {
     let id = session.id.to_string();
     let (token, signed_in) = match &session.owner {
@@ -154,7 +155,7 @@ pub async fn insert(db: &mut SqliteConnection, session: &NewSession) -> Result<(
     Ok(())
 }
 
-/// The session whose hash begins like this one.
+/// Returns the session whose hash has the same first bytes.
 pub async fn by_lookup(
     db: &mut SqliteConnection,
     fingerprint: &Fingerprint,
@@ -166,23 +167,23 @@ pub async fn by_lookup(
     raw.map(SessionRow::try_from).transpose()
 }
 
-/// The session of that identifier.
+/// Returns a session by its identifier.
 pub async fn find(db: &mut SqliteConnection, id: SessionId) -> Result<Option<SessionRow>, DbError> {
     let id = id.to_string();
     let raw = sessions!("WHERE id = ?", id).fetch_optional(db).await?;
     raw.map(SessionRow::try_from).transpose()
 }
 
-/// Which sessions of people to list.
+/// Filter of a list of people's sessions.
 #[derive(Debug, Clone)]
 pub struct OfPeople<'filter> {
     /// Those of this provider.
     pub issuer: &'filter str,
-    /// Groups that give rights within the places that are looked at.
+    /// Groups whose grants are within the requested scope.
     pub within: &'filter [&'filter str],
-    /// Groups that give rights elsewhere: none of whom is in one of them.
+    /// Groups whose grants are not within it; sessions with one of them are left out.
     pub elsewhere: &'filter [&'filter str],
-    /// Also those who are in no group that gives rights any more.
+    /// Whether to include sessions whose groups have no grant any more.
     pub any: bool,
     /// Only those that are valid at this time.
     pub at: Timestamp,
@@ -190,7 +191,7 @@ pub struct OfPeople<'filter> {
     pub before: Option<SessionId>,
 }
 
-/// Sessions of people, newest first.
+/// Returns sessions of people, newest first.
 pub async fn list(
     db: &mut SqliteConnection,
     filter: &OfPeople<'_>,
@@ -222,7 +223,7 @@ pub async fn list(
     raw.into_iter().map(SessionRow::try_from).collect()
 }
 
-/// How many sessions people have that are valid at a time.
+/// Returns the number of people's sessions that are valid at a time.
 pub async fn count_of_people(db: &mut SqliteConnection, at: Timestamp) -> Result<i64, DbError> {
     let at_us = to_us(at);
     let row = sqlx::query!(
@@ -235,7 +236,7 @@ pub async fn count_of_people(db: &mut SqliteConnection, at: Timestamp) -> Result
     Ok(row.count)
 }
 
-/// Every session that is valid at a time.
+/// Returns every session that is valid at a time.
 pub async fn all_valid(
     db: &mut SqliteConnection,
     at: Timestamp,
@@ -247,7 +248,7 @@ pub async fn all_valid(
     ids.iter().map(|id| parse("session", id)).collect()
 }
 
-/// Notes when a person's session was used last.
+/// Stores the last use of a person's session.
 pub async fn touch(db: &mut SqliteConnection, id: SessionId, at: Timestamp) -> Result<(), DbError> {
     let (id, at_us) = (id.to_string(), to_us(at));
     sqlx::query!(
@@ -262,7 +263,7 @@ pub async fn touch(db: &mut SqliteConnection, id: SessionId, at: Timestamp) -> R
     Ok(())
 }
 
-/// Ends a session.
+/// Deletes a session.
 pub async fn delete(db: &mut SqliteConnection, id: SessionId) -> Result<(), DbError> {
     let id = id.to_string();
     sqlx::query!("DELETE FROM sessions WHERE id = ?", id)
@@ -271,7 +272,7 @@ pub async fn delete(db: &mut SqliteConnection, id: SessionId) -> Result<(), DbEr
     Ok(())
 }
 
-/// Forgets sessions that have ended.
+/// Deletes sessions that have expired.
 pub async fn forget_expired(db: &mut SqliteConnection, at: Timestamp) -> Result<(), DbError> {
     let at_us = to_us(at);
     sqlx::query!("DELETE FROM sessions WHERE expires_at_us <= ?", at_us)
@@ -280,7 +281,7 @@ pub async fn forget_expired(db: &mut SqliteConnection, at: Timestamp) -> Result<
     Ok(())
 }
 
-/// The oldest sessions of a token or person beyond the newest `kept`.
+/// Returns the oldest sessions of a token or person beyond the newest `kept`.
 pub async fn surplus(
     db: &mut SqliteConnection,
     (token, person): (Option<TokenId>, Option<PersonId>),
@@ -392,7 +393,7 @@ mod tests {
             };
             insert(&mut tx, &session).await.unwrap();
         }
-        // `night` was taken out of the table.
+        // The group `night` was removed from the configuration.
         for (within, elsewhere, any, expected) in [
             (&["admins", "yard"][..], &[][..], true, &[3, 2, 1][..]),
             (&["yard"], &["admins"], false, &[3]),

@@ -1,4 +1,4 @@
-//! Sites.
+//! Sites and the horizons of their maps.
 
 use sqlx::SqliteConnection;
 use tread_api::ids::SiteId;
@@ -10,11 +10,11 @@ use super::{DbError, from_json, from_us, parse, scope_text, to_json, to_us, unsi
 /// A site with its key in the database.
 #[derive(Debug, Clone)]
 pub struct SiteRow {
-    /// The key of other tables.
+    /// Its database key.
     pub pk: i64,
     /// The site.
     pub site: Site,
-    /// Hours of measuring before this one are read as days.
+    /// Hour since 1970 before which hours are read as days.
     pub merged_before_h: i64,
 }
 
@@ -81,7 +81,7 @@ fn origin_text(origin: Option<GeoOrigin>) -> Result<Option<String>, DbError> {
     origin.map(|origin| to_json("origin", &origin)).transpose()
 }
 
-/// Says where on the earth a site lies.
+/// Sets the position of a site's origin on the earth.
 pub async fn set_origin(
     db: &mut SqliteConnection,
     pk: i64,
@@ -94,7 +94,7 @@ pub async fn set_origin(
     Ok(())
 }
 
-/// The site of that name.
+/// Returns a site by its identifier.
 pub async fn find(db: &mut SqliteConnection, id: &SiteId) -> Result<Option<SiteRow>, DbError> {
     let id = id.as_str();
     let raw = sqlx::query_as!(
@@ -111,7 +111,7 @@ pub async fn find(db: &mut SqliteConnection, id: &SiteId) -> Result<Option<SiteR
     raw.map(SiteRow::try_from).transpose()
 }
 
-/// Sites of a scope after an identifier, in alphabetical order.
+/// Returns the sites of a scope after an identifier, in alphabetical order.
 pub async fn list(
     db: &mut SqliteConnection,
     within: &Scope,
@@ -138,7 +138,7 @@ pub async fn list(
     rows.into_iter().map(SiteRow::try_from).collect()
 }
 
-/// Counts a change of the site's terrains.
+/// Increments the revision of the site's terrains.
 pub async fn count_terrain_change(db: &mut SqliteConnection, pk: i64) -> Result<(), DbError> {
     sqlx::query!(
         "UPDATE sites SET terrain_revision = terrain_revision + 1 WHERE pk = ?",
@@ -149,7 +149,7 @@ pub async fn count_terrain_change(db: &mut SqliteConnection, pk: i64) -> Result<
     Ok(())
 }
 
-/// Has hours before this one, a multiple of 24, read as days from now on; never takes it back.
+/// Sets the hour, a multiple of 24, before which hours are read as days; never moves it back.
 pub async fn merge_before(
     db: &mut SqliteConnection,
     pk: i64,

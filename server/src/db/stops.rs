@@ -1,6 +1,7 @@
-//! Stops of robots: wanted, confirmed, cleared or replaced.
+//! Stops of robots: requested, confirmed, cleared or replaced.
 //!
-//! A robot has at most one open stop, which is neither; a unique index says so.
+//! A stop is open while it is neither cleared nor replaced. A robot has at most one open stop,
+//! which a unique index enforces.
 
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
@@ -38,7 +39,7 @@ impl TryFrom<Raw> for Stop {
             wanted_at: from_us(raw.wanted_at_us)?,
             confirmed_at: raw.confirmed_at_us.map(from_us).transpose()?,
             standing_at: raw.standing_at_us.map(from_us).transpose()?,
-            // Whoever shows it knows the time.
+            // Derived from the present time when it is shown.
             unconfirmed: false,
             clear_asked_by: raw.clear_asked_by,
             clear_asked_at: raw.clear_asked_at_us.map(from_us).transpose()?,
@@ -68,7 +69,7 @@ fn rows(raw: Vec<Raw>) -> Result<Vec<Stop>, DbError> {
     raw.into_iter().map(Stop::try_from).collect()
 }
 
-/// Which stops to list.
+/// Filter of a list of stops.
 #[derive(Debug, Clone, Default)]
 pub struct StopFilter {
     /// Only those of this site.
@@ -77,13 +78,13 @@ pub struct StopFilter {
     pub robot: Option<RobotId>,
     /// Only open ones, at most one of each robot.
     pub in_force: bool,
-    /// Only those older than this one.
+    /// Only those older than this one (cursor).
     pub before: Option<StopId>,
-    /// Only those of what is in this scope.
+    /// Only those of sites and robots in this scope.
     pub within: Scope,
 }
 
-/// Stops, newest first.
+/// Returns stops, newest first.
 pub async fn list(
     db: &mut SqliteConnection,
     filter: &StopFilter,
@@ -112,7 +113,7 @@ pub async fn list(
     rows(raw)
 }
 
-/// The open stop of each robot that has one and is not retired, oldest first.
+/// Returns the open stop of each robot that has one and is not retired, oldest first.
 pub async fn in_force(db: &mut SqliteConnection) -> Result<Vec<Stop>, DbError> {
     let raw = stops!(
         "WHERE stops.cleared_at_us IS NULL AND stops.replaced_by IS NULL
@@ -124,7 +125,7 @@ pub async fn in_force(db: &mut SqliteConnection) -> Result<Vec<Stop>, DbError> {
     rows(raw)
 }
 
-/// A robot's open stop, unless it is retired.
+/// Returns a robot's open stop; `None` also for a retired robot.
 pub async fn in_force_of(
     db: &mut SqliteConnection,
     robot_pk: i64,
@@ -139,7 +140,7 @@ pub async fn in_force_of(
     raw.map(Stop::try_from).transpose()
 }
 
-/// Whether a robot has an open stop.
+/// Returns whether a robot has an open stop.
 pub async fn is_stopped(
     db: &mut SqliteConnection,
     site: &SiteId,
@@ -162,17 +163,17 @@ pub async fn is_stopped(
     Ok(found)
 }
 
-/// The stop of that identifier.
+/// Returns a stop by its identifier.
 pub async fn find(db: &mut SqliteConnection, id: StopId) -> Result<Option<Stop>, DbError> {
     let id = id.to_string();
     let raw = stops!("WHERE stops.id = ?", id).fetch_optional(db).await?;
     raw.map(Stop::try_from).transpose()
 }
 
-/// Writes stops down, at most one of each robot, and keeps so many of each robot; those of robots
-/// that are not known, and those that are there, are left out.
+/// Stores stops, at most one of each robot, and keeps `kept` of each robot. Stops of unknown
+/// robots, and those stored before, are left out.
 ///
-/// The newest of a robot is open, in whatever order they are written down.
+/// The newest stop of a robot is the open one, in whatever order they are stored.
 pub async fn insert(db: &mut SqliteConnection, stops: &[Stop], kept: u32) -> Result<(), DbError> {
     let entry = |stop: &Stop| {
         (
@@ -222,7 +223,7 @@ pub async fn insert(db: &mut SqliteConnection, stops: &[Stop], kept: u32) -> Res
     forget(db, &entries, kept).await
 }
 
-/// Removes the oldest stops of robots beyond so many; open ones stay.
+/// Deletes the oldest stops of robots beyond `kept`; open ones stay.
 async fn forget(db: &mut SqliteConnection, entries: &str, kept: u32) -> Result<(), DbError> {
     sqlx::query!(
         "DELETE FROM stops WHERE id IN (
@@ -243,8 +244,8 @@ async fn forget(db: &mut SqliteConnection, entries: &str, kept: u32) -> Result<(
     Ok(())
 }
 
-/// Makes the stop that a robot shows its open one, whatever was open before: what is known of it
-/// stays, but that it had ended. One that is another robot's is left alone.
+/// Makes the stop that a robot shows its open one, whatever was open before; keeps its stored data,
+/// except that it had ended. A stop of another robot is left alone.
 pub async fn adopt(
     db: &mut SqliteConnection,
     robot_pk: i64,
@@ -283,7 +284,7 @@ pub async fn adopt(
     forget(db, &named, kept).await
 }
 
-/// Notes that robots have confirmed; the first time counts.
+/// Stores the confirmations of robots; only the first time counts.
 pub async fn confirm(
     db: &mut SqliteConnection,
     ids: &[StopId],
@@ -301,7 +302,8 @@ pub async fn confirm(
     Ok(())
 }
 
-/// Notes that a robot was measured to stand, not before it confirmed; the first time counts.
+/// Stores that a robot was measured to be stopped, with a time not before its confirmation; only
+/// the first time counts.
 pub async fn stand(db: &mut SqliteConnection, id: StopId, at: Timestamp) -> Result<(), DbError> {
     let (id, at_us) = (id.to_string(), to_us(at));
     sqlx::query!(
@@ -316,8 +318,7 @@ pub async fn stand(db: &mut SqliteConnection, id: StopId, at: Timestamp) -> Resu
     Ok(())
 }
 
-/// Takes a confirmation back: the robot shows that the stop is not in force, and nobody asked to
-/// clear it.
+/// Removes a confirmation: the robot shows that the stop is not in force, and nobody cleared it.
 pub async fn unconfirm(db: &mut SqliteConnection, id: StopId) -> Result<(), DbError> {
     let id = id.to_string();
     sqlx::query!(
@@ -330,7 +331,7 @@ pub async fn unconfirm(db: &mut SqliteConnection, id: StopId) -> Result<(), DbEr
     Ok(())
 }
 
-/// Notes that somebody asks to clear a stop.
+/// Stores a request to clear a stop.
 pub async fn ask_clear(
     db: &mut SqliteConnection,
     id: StopId,
@@ -351,7 +352,7 @@ pub async fn ask_clear(
     Ok(())
 }
 
-/// Forgets that somebody asked: the robot refused.
+/// Removes the request to clear a stop, because the robot refused.
 pub async fn refuse_clear(db: &mut SqliteConnection, id: StopId) -> Result<(), DbError> {
     let id = id.to_string();
     sqlx::query!(
@@ -364,7 +365,7 @@ pub async fn refuse_clear(db: &mut SqliteConnection, id: StopId) -> Result<(), D
     Ok(())
 }
 
-/// Notes that a robot has cleared a stop.
+/// Stores that a robot has cleared a stop.
 pub async fn clear(db: &mut SqliteConnection, id: StopId, at: Timestamp) -> Result<(), DbError> {
     let (id, at_us) = (id.to_string(), to_us(at));
     sqlx::query!(
@@ -379,7 +380,7 @@ pub async fn clear(db: &mut SqliteConnection, id: StopId, at: Timestamp) -> Resu
     Ok(())
 }
 
-/// Notes that a stop was in force and has ended, whoever cleared it.
+/// Stores that a stop was in force and has ended, whoever cleared it.
 pub async fn end(db: &mut SqliteConnection, id: StopId, at: Timestamp) -> Result<(), DbError> {
     let (id, at_us) = (id.to_string(), to_us(at));
     sqlx::query!(

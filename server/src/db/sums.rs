@@ -14,18 +14,18 @@ use crate::friction::Sums;
 use crate::friction::fixed::Fixed;
 use crate::friction::sums::{Pair, Pass, TELLING_DEVIATIONS};
 
-/// What one sum is about.
+/// Key of one sum.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct SumKey {
     /// Key of the robot.
     pub robot_pk: i64,
-    /// Hours since 1970 at the end of the measurement.
+    /// Time of the measurement's end, hours since 1970.
     pub epoch_h: i64,
     /// The cell.
     pub cell: Cell,
-    /// The ground, if any is drawn.
+    /// The terrain; `None` outside of all terrains.
     pub terrain: Option<TerrainRef>,
-    /// The grid that cut the cell.
+    /// Revision of the grid of the cell.
     pub grid_revision: u32,
     /// Key of the site.
     pub site_pk: i64,
@@ -33,7 +33,7 @@ pub struct SumKey {
     pub configuration_pk: i64,
 }
 
-/// Numbers of a row.
+/// Number of columns.
 const COLUMNS: usize = 35;
 
 static ADD: LazyLock<RowsStatement> = LazyLock::new(|| {
@@ -50,7 +50,7 @@ static ADD: LazyLock<RowsStatement> = LazyLock::new(|| {
     )
 });
 
-/// Numbers in fixed point, each in two halves.
+/// Fixed-point numbers, each in two columns.
 const FIXED: [&str; 9] = [
     "information",
     "weighted",
@@ -62,7 +62,7 @@ const FIXED: [&str; 9] = [
     "robot_error",
     "tyre_error",
 ];
-/// What is kept of the pass that is kept by itself.
+/// Columns of the pass that is kept separately.
 const PASS: [&str; 4] = [
     "newest_information",
     "newest_weighted",
@@ -70,7 +70,7 @@ const PASS: [&str; 4] = [
     "pass_at_us",
 ];
 
-/// How a sum is added to one that is there: the same as [`Sums::add`].
+/// Returns the SQL that adds a sum to a stored one, equal to [`Sums::add`].
 fn added() -> String {
     let fixed = FIXED.map(|name| {
         format!(
@@ -79,8 +79,8 @@ fn added() -> String {
              {name}_lo = ({name}_lo + excluded.{name}_lo) & 4294967295,"
         )
     });
-    // Of two passes the one that tells something counts, of two such the later, of equally late ones
-    // the one with larger numbers; NULL is smaller than any, and nothing is smaller than -1 here.
+    // Of two passes an informative one counts, of two such the later one, of equally late ones the
+    // one with larger numbers; NULL is smaller than any number, and none is smaller than -1 here.
     let least = TELLING_DEVIATIONS * TELLING_DEVIATIONS;
     let order = |of: &str| {
         format!(
@@ -148,7 +148,7 @@ fn bind(row: &mut Row<'_>, (key, sums): &(&SumKey, &Sums)) -> Result<(), DbError
     Ok(())
 }
 
-/// Adds sums to those that are there.
+/// Adds sums to the stored ones.
 pub async fn add<'sums>(
     db: &mut SqliteConnection,
     sums: impl Iterator<Item = (&'sums SumKey, &'sums Sums)>,
@@ -158,10 +158,10 @@ pub async fn add<'sums>(
     Ok(())
 }
 
-/// A sum of one robot, configuration and hour in one cell, as it is stored.
+/// A stored sum of one robot, configuration and hour in one cell.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SumRow {
-    /// What it is about.
+    /// Its key.
     pub key: SumKey,
     /// The sums.
     pub sums: Sums,
@@ -265,7 +265,7 @@ impl TryFrom<Raw> for SumRow {
     }
 }
 
-/// Gives every sum to `take`, in no order, without holding them all.
+/// Calls `take` with every sum, in no particular order, one at a time.
 pub async fn each(db: &mut SqliteConnection, mut take: impl FnMut(SumRow)) -> Result<(), DbError> {
     let mut rows = sqlx::query_as!(
         Raw,
@@ -285,7 +285,7 @@ pub async fn each(db: &mut SqliteConnection, mut take: impl FnMut(SumRow)) -> Re
     Ok(())
 }
 
-/// A robot with hours to merge, and the horizon of its site; `None` when there are none.
+/// Returns a robot with hours to merge, and the horizon of its site; `None` if there are none.
 pub async fn one_unmerged(db: &mut SqliteConnection) -> Result<Option<(i64, i64)>, DbError> {
     let row = sqlx::query!(
         r#"SELECT robots.pk AS "pk!", sites.merged_before_h FROM robots
@@ -298,8 +298,8 @@ pub async fn one_unmerged(db: &mut SqliteConnection) -> Result<Option<(i64, i64)
     Ok(row.map(|row| (row.pk, row.merged_before_h)))
 }
 
-/// Sums of one robot whose hours are before `before_h` and not the first of their day, at most
-/// `limit`, in the order of the table.
+/// Returns at most `limit` sums of one robot whose hours are before `before_h` and not the first of
+/// their day, in the order of the table.
 pub async fn unmerged(
     db: &mut SqliteConnection,
     robot_pk: i64,
@@ -326,7 +326,7 @@ pub async fn unmerged(
     raw.into_iter().map(SumRow::try_from).collect()
 }
 
-/// Removes one sum; `false` if it is not there.
+/// Removes one sum; `false` if it does not exist.
 pub async fn remove(db: &mut SqliteConnection, key: &SumKey) -> Result<bool, DbError> {
     let terrain = key.terrain.as_ref();
     let id = terrain.map_or("", |terrain| terrain.id.as_str());
@@ -359,7 +359,7 @@ pub async fn remove(db: &mut SqliteConnection, key: &SumKey) -> Result<bool, DbE
     Ok(done.rows_affected() == 1)
 }
 
-/// Removes the sums of a robot from one hour to another, both included; how many there were.
+/// Removes the sums of a robot between two hours, both included. Returns their number.
 pub async fn remove_hours(
     db: &mut SqliteConnection,
     robot_pk: i64,

@@ -1,4 +1,4 @@
-//! Terrains as they are drawn now, and every revision that ever was.
+//! Present terrains, and all their revisions.
 
 use std::collections::HashMap;
 
@@ -34,7 +34,7 @@ impl TryFrom<Raw> for Terrain {
     }
 }
 
-/// All terrains of a site, in alphabetical order; there are at most
+/// Returns all terrains of a site, in alphabetical order; at most
 /// [`tread_api::terrain::TERRAINS_MAX`].
 pub async fn list(db: &mut SqliteConnection, site_pk: i64) -> Result<Vec<Terrain>, DbError> {
     let rows = sqlx::query_as!(
@@ -48,7 +48,7 @@ pub async fn list(db: &mut SqliteConnection, site_pk: i64) -> Result<Vec<Terrain
     rows.into_iter().map(Terrain::try_from).collect()
 }
 
-/// The terrain of that name.
+/// Returns a terrain by its identifier.
 pub async fn find(
     db: &mut SqliteConnection,
     site_pk: i64,
@@ -67,7 +67,7 @@ pub async fn find(
     raw.map(Terrain::try_from).transpose()
 }
 
-/// How many terrains a site has.
+/// Returns the number of a site's terrains.
 pub async fn count(db: &mut SqliteConnection, site_pk: i64) -> Result<usize, DbError> {
     let count = sqlx::query_scalar!(
         r#"SELECT COUNT(*) AS "count!: i64" FROM terrains WHERE site_pk = ?"#,
@@ -78,7 +78,7 @@ pub async fn count(db: &mut SqliteConnection, site_pk: i64) -> Result<usize, DbE
     unsigned("count", count)
 }
 
-/// The newest revision that a name ever had, also of a terrain that is gone; 0 for none.
+/// Returns the newest revision of an identifier, also of a deleted terrain; 0 for none.
 pub async fn last_revision(
     db: &mut SqliteConnection,
     site_pk: i64,
@@ -96,8 +96,8 @@ pub async fn last_revision(
     unsigned("terrain revision", revision)
 }
 
-/// Of each terrain of a site, the revisions that are the same ground as the present one: its
-/// polygon and class. A new name changes no ground.
+/// Returns, for each terrain of a site, the revisions with the same polygon and class as the
+/// present one. A new display name does not change the ground.
 pub async fn same_ground(
     db: &mut SqliteConnection,
     site_pk: i64,
@@ -119,7 +119,7 @@ pub async fn same_ground(
     Ok(revisions)
 }
 
-/// Writes a terrain's present revision and keeps it in the history.
+/// Stores a terrain's present revision, also in the history.
 pub async fn put(
     db: &mut SqliteConnection,
     site_pk: i64,
@@ -165,7 +165,7 @@ pub async fn put(
     Ok(())
 }
 
-/// Removes a terrain; its history stays. `false` if there was none.
+/// Deletes a terrain; its history stays. `false` if there was none.
 pub async fn delete(
     db: &mut SqliteConnection,
     site_pk: i64,

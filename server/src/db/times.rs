@@ -6,11 +6,11 @@ use uuid::Uuid;
 
 use super::{DbError, from_us, parse};
 
-/// Rows of a long table that are looked through, from the newest back: a robot's word of an earlier
-/// time may have come last.
+/// Number of rows read from the end of a long table: a robot's report of an earlier time may have
+/// been stored last.
 const NEWEST_ROWS: i64 = 100;
 
-/// The newest time at which something was written down, by the server's clock.
+/// Returns the newest time in the database, by the server's clock.
 pub async fn newest(db: &mut SqliteConnection) -> Result<Option<Timestamp>, DbError> {
     let newest_us = sqlx::query_scalar!(
         r#"SELECT MAX(at_us) AS "newest: i64" FROM (
@@ -33,7 +33,7 @@ pub async fn newest(db: &mut SqliteConnection) -> Result<Option<Timestamp>, DbEr
     newest_us.fetch_one(db).await?.map(from_us).transpose()
 }
 
-/// The newest identifier of the server's own: they sort by creation.
+/// Returns the newest identifier made by the server; identifiers sort by creation.
 pub async fn newest_id(db: &mut SqliteConnection) -> Result<Option<Uuid>, DbError> {
     let newest = sqlx::query_scalar!(
         r#"SELECT MAX(id) AS "newest: String" FROM (

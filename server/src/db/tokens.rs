@@ -1,4 +1,4 @@
-//! Tokens of people and programs. What is kept of a secret is its hash.
+//! Tokens of people and programs. Only the hash of a secret is stored.
 
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
@@ -73,7 +73,8 @@ macro_rules! tokens {
     };
 }
 
-/// Tokens older than one that hold nowhere outside a scope, newest first; dead ones too.
+/// Returns the tokens within a scope that are older than one, newest first, with expired and
+/// revoked ones.
 pub async fn list(
     db: &mut SqliteConnection,
     within: &Scope,
@@ -101,7 +102,7 @@ pub async fn list(
 
 look_up_tokens!("tokens", tokens, "token", TokenId, Token);
 
-/// The token that is valid at a time under a name.
+/// Returns the token of a name that is valid at a time.
 pub async fn valid_by_name(
     db: &mut SqliteConnection,
     name: &str,
@@ -118,7 +119,8 @@ pub async fn valid_by_name(
     raw.map(Token::try_from).transpose()
 }
 
-/// How many tokens are valid at a time, all and those of admins everywhere.
+/// Returns the numbers of tokens that are valid at a time: of all, and of admins of the whole
+/// server.
 pub async fn valid_counts(db: &mut SqliteConnection, at: Timestamp) -> Result<(i64, i64), DbError> {
     let at_us = to_us(at);
     let row = sqlx::query!(
@@ -132,7 +134,7 @@ pub async fn valid_counts(db: &mut SqliteConnection, at: Timestamp) -> Result<(i
     Ok((row.all_count, row.admin_count))
 }
 
-/// How many tokens are valid at a time that hold nowhere outside a scope.
+/// Returns the number of tokens within a scope that are valid at a time.
 pub async fn valid_count_within(
     db: &mut SqliteConnection,
     within: &Scope,
@@ -155,7 +157,7 @@ pub async fn valid_count_within(
     Ok(row.count)
 }
 
-/// Keeps a new token.
+/// Stores a new token.
 pub async fn insert(
     db: &mut SqliteConnection,
     token: &Token,
@@ -189,7 +191,7 @@ pub async fn insert(
     Ok(())
 }
 
-/// Revokes a token and ends its sessions; a first time counts.
+/// Revokes a token and ends its sessions; only the first time counts.
 pub async fn revoke(db: &mut SqliteConnection, id: TokenId, at: Timestamp) -> Result<(), DbError> {
     let (id, at_us) = (id.to_string(), to_us(at));
     sqlx::query!(
@@ -207,7 +209,7 @@ pub async fn revoke(db: &mut SqliteConnection, id: TokenId, at: Timestamp) -> Re
     Ok(())
 }
 
-/// Notes when a token was used last.
+/// Stores the last use of a token.
 pub async fn touch(db: &mut SqliteConnection, id: TokenId, at: Timestamp) -> Result<(), DbError> {
     let (id, at_us) = (id.to_string(), to_us(at));
     sqlx::query!(
@@ -222,7 +224,7 @@ pub async fn touch(db: &mut SqliteConnection, id: TokenId, at: Timestamp) -> Res
     Ok(())
 }
 
-/// Forgets tokens that have been dead since before a time, and their sessions, at most `limit`.
+/// Deletes at most `limit` tokens that expired or were revoked before a time, and their sessions.
 pub async fn forget_dead(
     db: &mut SqliteConnection,
     before: Timestamp,
@@ -252,7 +254,7 @@ pub async fn forget_dead(
     Ok(())
 }
 
-/// Every token that is valid at a time; [`super::DbError`] of one row is that of all.
+/// Returns every token that is valid at a time; fails if one row cannot be read.
 pub async fn all_valid(
     db: &mut SqliteConnection,
     at: Timestamp,

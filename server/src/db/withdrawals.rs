@@ -1,30 +1,30 @@
-//! Whose measurements of which hours do not count.
+//! Withdrawals: hours of robots whose measurements are not on the map.
 
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
 
 use super::{DbError, from_us, to_us, unsigned};
 
-/// Hours of a robot that do not count, both ends included.
+/// Withdrawn hours of a robot, both ends included.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct WithdrawalRow {
     /// Its number.
     pub pk: i64,
     /// Key of the robot.
     pub robot_pk: i64,
-    /// The first hour.
+    /// First hour, since 1970.
     pub from_h: i64,
-    /// The last hour.
+    /// Last hour, since 1970.
     pub to_h: i64,
-    /// Why.
+    /// Reason.
     pub reason: String,
-    /// Who said so.
+    /// Author.
     pub by: String,
-    /// When.
+    /// Time of the withdrawal.
     pub at: Timestamp,
 }
 
-/// All of them, the oldest first.
+/// Returns all withdrawals, oldest first.
 pub async fn all(db: &mut SqliteConnection) -> Result<Vec<WithdrawalRow>, DbError> {
     let rows = sqlx::query!(
         r#"SELECT pk AS "pk!", robot_pk, from_h, to_h, reason, withdrawn_by, withdrawn_at_us
@@ -46,13 +46,13 @@ pub async fn all(db: &mut SqliteConnection) -> Result<Vec<WithdrawalRow>, DbErro
         .collect()
 }
 
-/// How many there are.
+/// Returns the number of withdrawals.
 pub async fn count(db: &mut SqliteConnection) -> Result<usize, DbError> {
     let count = sqlx::query_scalar!(r#"SELECT COUNT(*) AS "count!: i64" FROM withdrawals"#);
     unsigned("count", count.fetch_one(db).await?)
 }
 
-/// Adds one; its number.
+/// Adds a withdrawal; returns its number.
 pub async fn insert(db: &mut SqliteConnection, row: &WithdrawalRow) -> Result<i64, DbError> {
     let at_us = to_us(row.at);
     let done = sqlx::query!(

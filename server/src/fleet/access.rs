@@ -1,10 +1,10 @@
-//! The access control of a router, made from the table of what robots do with which keys.
+//! Access control of a router, made from the table of what robots may do with which keys.
 //!
-//! A robot is who its certificate says; the gate lets no session pass whose user name is another.
-//! It may do with its own keys what the table says, hear
-//! what is for all robots of its site, and nothing else. Zenoh's rules match a message if their
-//! expression includes the message's key; so the server's own wildcards are let out to all, or
-//! else a robot would not know that somebody wants what it publishes, and would not send it.
+//! A robot is identified by its certificate; the gate rejects sessions with another user name. With
+//! its own keys a robot may do what the table says, it may receive what is for all robots of its
+//! site, and nothing else. Zenoh's rules match a message if their expression includes the message's
+//! key. The server's own wildcard declarations are therefore sent to all robots; otherwise a robot
+//! would not learn that somebody subscribes to its keys, and would not publish.
 
 use serde_json::{Value, json};
 use tread_api::access::{Act, Owner, ROBOT_KEYS, RobotKeys};
@@ -14,7 +14,7 @@ use super::credentials::{PROBE_USER, user_of};
 use super::probe::PROBE_KEY;
 use crate::app::presence::RobotKey;
 
-/// What is let in from a robot and out to it for one act, by zenoh's names.
+/// Returns the zenoh names of the messages allowed for one act: from the robot, and to it.
 const fn messages(act: Act) -> (&'static [&'static str], &'static [&'static str]) {
     match act {
         Act::Publish => (&["put"], &[]),
@@ -25,7 +25,8 @@ const fn messages(act: Act) -> (&'static [&'static str], &'static [&'static str]
     }
 }
 
-/// What is let out to everybody: that the server listens, and answers.
+/// Returns the zenoh names of the declarations sent to every robot, which show that the server
+/// subscribes or answers.
 const fn announcements(act: Act) -> &'static [&'static str] {
     match act {
         Act::Publish => &["declare_subscriber"],
@@ -34,7 +35,7 @@ const fn announcements(act: Act) -> &'static [&'static str] {
     }
 }
 
-/// Rules as they are collected.
+/// Rules being collected.
 #[derive(Default)]
 struct Rules {
     rules: Vec<Value>,
@@ -54,20 +55,20 @@ impl Rules {
         self.ids.push(id);
     }
 
-    /// The rules of one act on several keys.
+    /// Adds the rules of one act on several keys.
     fn add_act(&mut self, act: Act, keys: &[String]) {
         let (inward, outward) = messages(act);
         self.add("ingress", inward, keys);
         self.add("egress", outward, keys);
     }
 
-    /// The rules since the last time.
+    /// Returns the identifiers of the rules added since the last call.
     fn take_ids(&mut self) -> Vec<String> {
         std::mem::take(&mut self.ids)
     }
 }
 
-/// The rules for these robots, as zenoh's configuration has them.
+/// Returns the rules for these robots, in the format of zenoh's configuration.
 pub(super) fn control(robots: &[RobotKey]) -> Value {
     let mut rules = Rules::default();
     let (mut subjects, mut policies) = (Vec::new(), Vec::new());

@@ -1,4 +1,4 @@
-//! Publishes where friction maps change, for programs that listen on the network.
+//! Publishes the areas in which friction maps change, for programs on the network.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -19,7 +19,7 @@ use crate::app::App;
 pub(super) async fn run(app: App, routers: Arc<Routers>, stop: CancellationToken) {
     let mut news = app.map_news();
     let mut publishers = Publishers::new(keys::map);
-    // Changes that were missed, and how many of them were published for each site.
+    // Number of changes that were missed, and number published by site.
     let mut missed: u64 = 0;
     let mut announced: HashMap<SiteId, u64> = HashMap::new();
     loop {

@@ -1,4 +1,4 @@
-//! Commands to robots: zenoh queries with an application answer.
+//! Commands to robots, sent as zenoh queries; the reply is the robot's answer.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -18,9 +18,9 @@ use crate::app::presence::RobotKey;
 use crate::app::robot_link::{Answering, CommandTransport, Undelivered};
 use crate::supervisor::Supervisor;
 
-/// How long a robot may take to answer.
+/// Maximum time for a robot's answer.
 const COMMAND_TIMEOUT: Duration = Duration::from_millis(800);
-/// How long the query itself may take beyond that before it counts as not delivered.
+/// Additional time of the query beyond that, after which it counts as not delivered.
 const MARGIN: Duration = Duration::from_millis(200);
 
 /// Sends commands as queries through all routers of this server.
@@ -42,7 +42,7 @@ impl CommandTransport for ZenohCommands {
         if let Some(boot) = run {
             key = keys::to_run(&key, boot);
         }
-        // A robot is on one of them; the others know nobody of its name and say nothing.
+        // A robot is connected to one of them; on the others the query gets no reply.
         let routers = self.routers.all();
         let sessions = routers.iter().map(|router| router.session.clone());
         let sessions: Vec<Session> = sessions.collect();
@@ -56,7 +56,7 @@ impl CommandTransport for ZenohCommands {
     }
 }
 
-/// What slows a robot down goes before everything else on its link.
+/// Commands that slow a robot down have priority over everything else on its link.
 const fn priority_of(verb: Verb) -> Priority {
     match verb {
         Verb::Stop => Priority::RealTime,
@@ -85,7 +85,7 @@ async fn query(
                 .payload(payload.clone())
                 .priority(priority)
                 .express(priority == Priority::RealTime)
-                // A second agent under the same name must not swallow what is for the first.
+                // A second agent under the same name must not take the query from the first.
                 .target(QueryTarget::All)
                 .consolidation(ConsolidationMode::None)
                 .timeout(COMMAND_TIMEOUT)
@@ -118,7 +118,7 @@ fn payload_of(key: &str, reply: &Reply) -> Result<Vec<u8>, Undelivered> {
     match reply.result() {
         Ok(sample) => Ok(sample.payload().to_bytes().into_owned()),
         Err(error) => {
-            // A robot's refusal to read, or the plain text with which zenoh says "timeout".
+            // Either a refusal by the robot, or the plain text "timeout" by zenoh.
             match wire::decode::<Refusal>(&error.payload().to_bytes()) {
                 Ok(refusal) => {
                     warn!("`{key}` could not be read there: {}", refusal.detail);

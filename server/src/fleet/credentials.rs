@@ -1,10 +1,10 @@
-//! Users and passwords of the routers inside.
+//! User names and passwords of the internal routers.
 //!
-//! A router cannot see a robot's certificate: TLS ends at the gate. It knows robots by user name and
-//! password. Both derive from the key of the authority that signs, so that they stay the same when the
-//! server starts again; a robot's session then comes back by itself. A rotation of the authority opens
-//! another router, whose passwords derive from the new key from its start on. The gate hands those of
-//! the router to a robot that has shown its certificate.
+//! TLS ends at the gate, so a router cannot see a robot's certificate; it identifies robots by user
+//! name and password. Passwords derive from the key of the signing authority, so they are the same
+//! after a restart of the server, and a robot's session recovers by itself. A rotation of the
+//! authority opens another router, whose passwords derive from the new key. The gate sends a robot
+//! that has shown its certificate the credentials of its router.
 
 use std::fmt::Write as _;
 use std::fs::File;
@@ -18,14 +18,14 @@ use tread_api::tunnel::{RouterCredentials, SessionPrefix};
 use crate::app::presence::RobotKey;
 use crate::authority::Authority;
 
-/// The user of the server's own look at its router. No robot's has no dot.
+/// User name of the server's own probe of its router. It contains no dot, unlike those of robots.
 pub(super) const PROBE_USER: &str = "tread-probe";
-/// What the key of the passwords is derived for.
+/// Purpose of the key from which passwords derive.
 const PASSWORDS: &str = "zenoh router password";
-/// What the key of the session prefixes is derived for.
+/// Purpose of the key from which session prefixes derive.
 const PREFIXES: &str = "zenoh session prefix";
 
-/// The user name of a robot.
+/// Returns the user name of a robot.
 pub(super) fn user_of((site, robot): &RobotKey) -> String {
     format!("{robot}.{site}")
 }
@@ -47,17 +47,17 @@ impl CredentialDerivation {
         }
     }
 
-    /// The fingerprint of the authority from whose key they derive.
+    /// Returns the fingerprint of the authority from whose key the credentials derive.
     pub(super) fn authority(&self) -> &str {
         &self.authority
     }
 
-    /// What a robot's session has to show.
+    /// Returns the credentials of a robot's session.
     pub(super) fn of_robot(&self, robot: &RobotKey) -> RouterCredentials {
         self.of_user(user_of(robot))
     }
 
-    /// What the session of the server's own look shows.
+    /// Returns the credentials of the server's own probe.
     pub(super) fn of_probe(&self) -> RouterCredentials {
         self.of_user(PROBE_USER.to_owned())
     }
@@ -77,17 +77,17 @@ impl CredentialDerivation {
         let tag = hmac::sign(&self.passwords, user.as_bytes());
         let mut text = String::with_capacity(2 * tag.as_ref().len());
         for byte in tag.as_ref() {
-            // Writing to a text cannot fail.
+            // Writing to a string cannot fail.
             let _ = write!(text, "{byte:02x}");
         }
         text
     }
 
-    /// All users and passwords of a router. There is always the server's own: without any user,
-    /// zenoh would ask nobody for a password.
+    /// Returns all users and passwords of a router. The probe's user is always among them: without
+    /// any user zenoh would not demand passwords.
     ///
     /// # Errors
-    /// The operating system gives no memory for it.
+    /// The operating system cannot allocate the file in memory.
     pub(super) fn dictionary(&self, robots: &[RobotKey]) -> io::Result<Dictionary> {
         let users = robots.iter().map(user_of);
         let mut text = String::new();
@@ -98,8 +98,8 @@ impl CredentialDerivation {
     }
 }
 
-/// The users and passwords as the file that zenoh reads them from, which is in memory only and has
-/// no name that another process could open it by.
+/// File with the users and passwords for zenoh. It is in memory only, without a name by which
+/// another process could open it.
 #[derive(Debug)]
 pub(super) struct Dictionary(OwnedFd);
 
@@ -111,7 +111,7 @@ impl Dictionary {
         Ok(Self(file.into()))
     }
 
-    /// Where this process reads it.
+    /// Returns the path by which this process reads it.
     pub(super) fn path(&self) -> String {
         format!("/proc/self/fd/{}", self.0.as_raw_fd())
     }

@@ -1,4 +1,4 @@
-//! What robots send: zenoh's callbacks on one side, our tasks on the other.
+//! Messages from robots: zenoh's callbacks put them into channels, tasks process them.
 
 use std::time::Duration;
 
@@ -23,20 +23,20 @@ use crate::app::presence::{Heard, RobotKey};
 use crate::counters::Counter;
 use crate::supervisor::Supervisor;
 
-/// Changes of presence that wait; all robots of a full server may come at once.
+/// Maximum number of waiting presence changes; all robots of a full server may connect at once.
 const PRESENCE_WAITING_MAX: usize = 32_768;
-/// States and friction reports that wait: a second of a thousand robots at 10 Hz.
+/// Maximum number of waiting states and friction reports: one second of a thousand robots at 10 Hz.
 const STATES_WAITING_MAX: usize = 10_000;
-/// Introductions that wait.
+/// Maximum number of waiting hellos.
 const HELLOS_WAITING_MAX: usize = 8_192;
-/// Most bytes of a state or a friction report.
+/// Maximum size of a state or a friction report, bytes.
 pub(super) const STATE_BYTES_MAX: usize = 256 * 1024;
-/// Time between two looks for tokens that came too fast.
+/// Interval of checks for tokens that came too fast.
 const LATE_TOKENS_EVERY: Duration = Duration::from_secs(1);
-/// Uploads that wait to be read.
+/// Maximum number of uploads that wait to be parsed.
 const UPLOADS_WAITING_MAX: usize = 512;
 
-/// The sending ends of the channels, for zenoh's callbacks.
+/// Senders of the channels, for zenoh's callbacks.
 #[derive(Debug, Clone)]
 pub(super) struct Channels {
     app: App,
@@ -45,19 +45,19 @@ pub(super) struct Channels {
     hellos: mpsc::Sender<Asked>,
     uploads: mpsc::Sender<Asked>,
     limits: RateLimits,
-    /// Robots' links, where they come through the gate.
+    /// Links of the robots; `None` without a gate.
     links: Option<Links>,
 }
 
 #[derive(Debug)]
 enum TokenChange {
-    /// A token appeared on a router, or went.
+    /// A liveliness token appeared on a router or vanished.
     Token {
         key: String,
         router: u64,
         appeared: bool,
     },
-    /// A router was closed, and with it all that was on it.
+    /// A router was closed, and with it all tokens on it.
     RouterClosed(u64),
 }
 
@@ -69,7 +69,7 @@ struct Published {
 }
 
 impl Channels {
-    /// Makes the channels and starts the tasks at their other ends.
+    /// Creates the channels and starts the tasks that read them.
     pub(super) fn new(
         supervisor: &Supervisor,
         app: &App,
@@ -112,7 +112,7 @@ impl Channels {
 }
 
 impl Channels {
-    /// Takes a place for a message on a key; without one it is dropped and counted.
+    /// Takes a place for a message on a key; `None` if the message is dropped and counted.
     fn admit(&self, key: &str, kind: Kind) -> Option<Place> {
         let now = self.app.clock().elapsed();
         let Some((site, robot)) = robot_of(key) else {
@@ -135,7 +135,7 @@ impl Channels {
         }
     }
 
-    /// A liveliness token appeared or is gone.
+    /// Handles a liveliness token that appeared or vanished.
     fn token(&self, key: &str, router: u64, appeared: bool) {
         let Some(robot) = robot_of(key) else {
             return refuse_key(&self.app, key);
@@ -167,7 +167,7 @@ impl Channels {
         }
     }
 
-    /// The router keeps every token, and gets slow for all robots.
+    /// The router keeps every token, which slows it down for all robots.
     fn cut_off(&self, robot: &RobotKey, now: Duration) {
         let links = self.links.as_ref();
         if links.is_some_and(|links| links.cut_off(robot, now)) {
@@ -180,7 +180,7 @@ impl Channels {
         }
     }
 
-    /// Tells that a router is gone.
+    /// Reports that a router was closed.
     pub(super) fn router_closed(&self, router: u64) {
         self.limits.router_closed(router);
         let change = TokenChange::RouterClosed(router);
@@ -193,13 +193,13 @@ impl Channels {
 }
 
 fn hand_over<T>(channel: &mpsc::Sender<T>, message: T, dropped: &Counter) {
-    // A closed channel means that the server stops; nothing is lost that matters then.
+    // A closed channel means that the server is stopping; nothing important is lost then.
     if let Err(TrySendError::Full(_)) = channel.try_send(message) {
         dropped.one();
     }
 }
 
-/// Declares everything that the server listens to. Blocks its thread.
+/// Declares all subscriptions and queryables of the server. Blocks its thread.
 pub(super) fn declare(session: &Session, channels: &Channels, router: u64) -> zenoh::Result<()> {
     let to = channels.clone();
     session
@@ -396,7 +396,7 @@ fn read<T: serde::de::DeserializeOwned>(
     None
 }
 
-/// The robot whose key it is.
+/// Returns the robot to which a key belongs.
 fn robot_of(key: &str) -> Option<RobotKey> {
     match Key::parse(key)? {
         Key::State(site, robot)
@@ -408,7 +408,7 @@ fn robot_of(key: &str) -> Option<RobotKey> {
     }
 }
 
-/// Counts and logs a message of a robot that is not known.
+/// Counts and logs a message of an unknown robot.
 fn refuse_stranger(app: &App, (site, robot): &RobotKey) {
     app.counters().refused_unknown_robot.one();
     debug!("a message of robot `{robot}` of site `{site}` was refused: it has not said hello");

@@ -55,58 +55,59 @@ use crate::clock::Clock;
 use crate::rate_limit::RateLimit;
 use crate::supervisor::Supervisor;
 
-/// Most robots that may be connected; zenoh's own default is 1000.
+/// Maximum number of connected robots; zenoh's default is 1000.
 const SESSIONS_MAX: u32 = FLEET_ROBOTS_MAX;
-/// Most connections that may be in the middle of their opening.
+/// Maximum number of connections that are being opened.
 const ACCEPT_PENDING_MAX: u32 = 1_000;
-/// What the system may keep of what is sent to one robot, bytes. Priorities act only above it: on
-/// a narrow link a larger one would let drive commands wait behind everything else.
+/// Send buffer of the system per robot, bytes. Priorities have no effect within it: a larger one
+/// would delay drive commands on a narrow link.
 const SEND_BUFFER_BYTES: u32 = 16 * 1024;
-/// Most bytes of a message that is put together of fragments, with its key; zenoh would take 1 GiB.
+/// Maximum size of a message reassembled from fragments, with its key, bytes; zenoh's default is 1
+/// GiB.
 const MESSAGE_BYTES_MAX: usize = PAYLOAD_BYTES_MAX + 64 * 1024;
-/// How long the session may take to open, and to close.
+/// Maximum time for the session to open, and to close.
 const SESSION_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// Why the network cannot be opened.
+/// Reason why the network cannot be opened.
 #[derive(Debug, thiserror::Error)]
 pub enum FleetError {
     /// Zenoh refused.
     #[error("cannot open the zenoh router on {address}: {reason}")]
     Open {
-        /// Where.
+        /// The address.
         address: SocketAddr,
-        /// What zenoh says.
+        /// Zenoh's error.
         reason: String,
     },
     /// The certificates of the robots' port cannot be used.
     #[error("cannot use the certificates of the robots' port")]
     Certificates(#[source] anyhow::Error),
-    /// Another program listens there.
+    /// Another program listens on the address.
     #[error("cannot listen for robots on {address}")]
     InUse {
-        /// Where.
+        /// The address.
         address: SocketAddr,
-        /// Why.
+        /// The cause.
         #[source]
         cause: std::io::Error,
     },
     /// No port is free.
     #[error("no port is free on {address}")]
     NoPort {
-        /// Where.
+        /// The address.
         address: SocketAddr,
-        /// Why.
+        /// The cause.
         #[source]
         cause: std::io::Error,
     },
 }
 
-/// What the robots' port shows, and demands.
+/// Certificates of the robots' port.
 #[derive(Debug, Clone)]
 pub struct Security {
-    /// Who must have signed a robot's certificate, and signs the port's.
+    /// Authorities that sign robots' certificates and the port's.
     pub authorities: Arc<Authorities>,
-    /// The names that robots know the port by.
+    /// Host names of the port, for its certificate.
     pub names: Vec<String>,
 }
 
@@ -120,13 +121,13 @@ pub struct Fleet {
     address: SocketAddr,
     is_tls: bool,
     probe_period: Duration,
-    /// How fast the bytes of one robot are read.
+    /// Limit of the bytes read from one robot.
     byte_rate: RateLimit,
 }
 
 impl Fleet {
-    /// Takes the address that robots connect to; port 0 takes a free one. Without security it is
-    /// in the clear, and everybody who reaches it may be any robot.
+    /// Binds the address that robots connect to; port 0 takes a free one. Without `security`
+    /// connections are unencrypted, and any client may act as any robot.
     ///
     /// # Errors
     /// [`FleetError`]: the address is in use, or the certificates cannot be used.
@@ -141,7 +142,7 @@ impl Fleet {
         let (address, authorities, gate) = match security {
             None => {
                 let address = with_free_port(address)?;
-                // Asked here because the operating system's own words are clearer than zenoh's.
+                // Checked here because the operating system's error is clearer than zenoh's.
                 let in_use = |cause| FleetError::InUse { address, cause };
                 drop(TcpListener::bind(address).map_err(in_use)?);
                 (address, None, None)
@@ -169,18 +170,18 @@ impl Fleet {
         })
     }
 
-    /// Where robots connect.
+    /// Returns the address that robots connect to.
     pub fn address(&self) -> SocketAddr {
         self.address
     }
 
-    /// Where robots connect, as zenoh writes it.
+    /// Returns that address as a zenoh endpoint.
     pub fn endpoint(&self) -> String {
         let protocol = if self.is_tls { "tls" } else { "tcp" };
         format!("{protocol}/{}", self.address)
     }
 
-    /// How use cases reach the robots of this network; they do as soon as it listens.
+    /// Returns the connections to the robots of this network; they work as soon as it listens.
     pub fn robot_link(&self) -> RobotLink {
         let (routers, supervisor) = (&self.routers, &self.supervisor);
         RobotLink {
@@ -197,8 +198,8 @@ impl Fleet {
         }
     }
 
-    /// Opens the router and begins to listen to robots, to beat the pulse and to look after the
-    /// router. Only the first call does.
+    /// Opens the router and starts the tasks of the network: listening to robots, the heartbeat of
+    /// the server, and the watch of the router. Only the first call has an effect.
     ///
     /// # Errors
     /// [`FleetError::Open`] if zenoh refuses.

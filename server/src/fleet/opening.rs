@@ -1,9 +1,9 @@
-//! How a router is opened: in the clear on this machine alone, or behind the gate.
+//! Opens routers: unencrypted on the loopback, or behind the gate.
 //!
-//! Behind the gate the router listens on the loopback and demands a user name and a password of
-//! every session, and its rules go by the user name. TLS ends at the gate and begins in the agent:
-//! zenoh's own TLS link reads and writes one rustls stream from two tasks at once, which is
-//! undefined behaviour, and is not compiled in.
+//! Behind the gate a router listens on the loopback and demands a user name and a password of every
+//! session; its access rules are by user name. TLS connects agent and gate. Zenoh's own TLS link,
+//! which is not compiled in, reads and writes one rustls stream from two tasks at once, which is
+//! undefined behaviour.
 
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 use std::ops::Range;
@@ -32,16 +32,16 @@ use crate::supervisor::Supervisor;
 /// Opens routers.
 #[derive(Debug)]
 pub(super) struct Opener {
-    /// Where a router in the clear listens.
+    /// Address of a router without a gate.
     pub(super) address: SocketAddr,
-    /// Behind the gate, whose key the passwords of robots derive from.
+    /// Authorities, from whose keys the passwords of robots derive; `None` without a gate.
     pub(super) authorities: Option<Arc<Authorities>>,
     pub(super) supervisor: Supervisor,
     pub(super) next: AtomicU64,
 }
 
 impl Opener {
-    /// Opens a router whose rules know these robots.
+    /// Opens a router whose rules include these robots.
     ///
     /// # Errors
     /// [`FleetError`].
@@ -51,7 +51,8 @@ impl Opener {
             None => self.address,
         };
         let failed = |reason: String| FleetError::Open { address, reason };
-        // Of the authority that signs now: what derives from a former one's key goes with its routers.
+        // Passwords derive from the authority that signs now; those of a former one end with its
+        // routers.
         let signing = self
             .authorities
             .as_ref()
@@ -59,10 +60,10 @@ impl Opener {
         let credentials = signing.map(|signing| Arc::new(CredentialDerivation::new(&signing)));
         let (needed, supervisor) = (credentials.clone(), &self.supervisor);
         let known = robots.clone();
-        // Many rules take a while to read.
+        // Parsing many rules takes a while.
         let opening = supervisor.blocking(move || -> zenoh::Result<Session> {
             let mut config = config(address)?;
-            // The dictionary lives until the router has read it.
+            // The file of passwords must exist until the router has read it.
             let _dictionary = match &needed {
                 Some(credentials) => Some(demand(&mut config, credentials, &known)?),
                 None => None,
@@ -83,7 +84,7 @@ impl Opener {
         }))
     }
 
-    /// Declares on a router what the server listens to.
+    /// Declares the server's subscriptions and queryables on a router.
     ///
     /// # Errors
     /// [`FleetError::Open`] if zenoh refuses a declaration.
@@ -107,12 +108,12 @@ impl Opener {
     }
 }
 
-/// Ports of which one is taken where any will do: below those of outgoing connections.
+/// Range for free ports, below those that the system uses for outgoing connections.
 const PORTS: Range<u16> = 20_000..32_768;
-/// Ports that are tried before the system is asked for one.
+/// Number of ports that are tried before the system is asked for one.
 const PORT_TRIES_MAX: u32 = 32;
 
-/// Closes a session, as far as it lets itself be closed.
+/// Closes a session; gives up after a timeout.
 pub(super) async fn close(session: Session) {
     let closing = tokio::task::spawn_blocking(move || session.close().wait());
     match tokio::time::timeout(SESSION_TIMEOUT, closing).await {
@@ -123,8 +124,9 @@ pub(super) async fn close(session: Session) {
     }
 }
 
-/// Zenoh does not say which port it took for 0, so a free one is looked for first: where the system
-/// takes none for outgoing connections, so that nobody has it when zenoh listens.
+/// Finds a free port, since zenoh does not report the one it chose for 0. The range is one from
+/// which the system takes no ports for outgoing connections, so that the port is still free when
+/// zenoh listens.
 pub(super) fn with_free_port(address: SocketAddr) -> Result<SocketAddr, FleetError> {
     if address.port() != 0 {
         return Ok(address);
@@ -135,13 +137,13 @@ pub(super) fn with_free_port(address: SocketAddr) -> Result<SocketAddr, FleetErr
         SocketAddr::new(address.ip(), port)
     };
     let free = (0..PORT_TRIES_MAX).find_map(|_| TcpListener::bind(somewhere()).ok());
-    // The system's own choice otherwise, or its reason.
+    // Otherwise the system chooses, or gives the error.
     free.map_or_else(|| TcpListener::bind(address), Ok)
         .and_then(|listener| listener.local_addr())
         .map_err(|cause| FleetError::NoPort { address, cause })
 }
 
-/// Makes a router demand users and passwords, and hold robots to their own keys.
+/// Configures a router to demand passwords and to restrict robots to their own keys.
 fn demand(
     config: &mut Config,
     credentials: &CredentialDerivation,
@@ -168,11 +170,11 @@ fn config(address: SocketAddr) -> zenoh::Result<Config> {
             "transport/link/rx/max_message_size",
             MESSAGE_BYTES_MAX.to_string(),
         ),
-        // Nothing is discovered and nothing is advertised.
+        // Discovery and advertising are disabled.
         ("scouting/multicast/enabled", "false".to_owned()),
         ("scouting/gossip/enabled", "false".to_owned()),
-        // A router with a clock of its own holds the time of every message against it, and logs an
-        // error for each one once the machine's clock was set back. Nobody reads these times.
+        // A router with timestamping compares the time of every message with its clock, and logs an
+        // error for each after the machine's clock was set back. These times are not used.
         ("timestamping/enabled", "false".to_owned()),
         ("transport/unicast/max_sessions", SESSIONS_MAX.to_string()),
         (
@@ -186,10 +188,10 @@ fn config(address: SocketAddr) -> zenoh::Result<Config> {
     Ok(config)
 }
 
-/// How a client on this machine connects to a router to look whether it answers.
+/// Returns the configuration of a local client that probes a router.
 ///
 /// # Errors
-/// Zenoh refuses a setting.
+/// Zenoh rejects a setting.
 pub(super) fn client_config(
     address: SocketAddr,
     credentials: Option<&RouterCredentials>,

@@ -1,4 +1,4 @@
-//! What the server publishes for each site, on every router that is open.
+//! Publishers of the server for each site, on every open router.
 
 use std::collections::HashMap;
 
@@ -10,16 +10,17 @@ use zenoh::qos::CongestionControl;
 
 use super::routers::Routers;
 
-/// Declared publishers of one kind of key: publishing without costs more with every key there is.
+/// Declared publishers of one kind of key; publishing without a declaration becomes slower with the
+/// number of keys.
 pub(super) struct Publishers {
     key_of: fn(&SiteId) -> String,
     version: Option<u64>,
-    /// By router and site; publishers belong to one router.
+    /// Publishers by router and site.
     declared: HashMap<u64, HashMap<SiteId, Publisher<'static>>>,
 }
 
 impl Publishers {
-    /// None yet.
+    /// Creates an empty set.
     pub(super) fn new(key_of: fn(&SiteId) -> String) -> Self {
         Self {
             key_of,
@@ -28,7 +29,7 @@ impl Publishers {
         }
     }
 
-    /// Forgets routers that are no more; whether there are others than before.
+    /// Forgets closed routers; returns whether the list of routers has changed.
     pub(super) fn look_again(&mut self, routers: &Routers) -> bool {
         if self.version == Some(routers.version()) {
             return false;
@@ -40,7 +41,7 @@ impl Publishers {
         true
     }
 
-    /// Declares those of these sites that are missing.
+    /// Declares the missing publishers of these sites.
     pub(super) fn declare(&mut self, routers: &Routers, sites: &[SiteId]) {
         for router in routers.all() {
             let of_router = self.declared.entry(router.number).or_default();
@@ -49,7 +50,8 @@ impl Publishers {
                     continue;
                 }
                 let key = (self.key_of)(site);
-                // What does not fit on a link is dropped: the next word comes soon.
+                // A message that does not fit on a link is dropped, since the next one follows
+                // soon.
                 let declared = router
                     .session
                     .declare_publisher(key.clone())
@@ -65,12 +67,12 @@ impl Publishers {
         }
     }
 
-    /// Those of all sites.
+    /// Returns the publishers of all sites.
     pub(super) fn all(&self) -> impl Iterator<Item = &Publisher<'static>> {
         self.declared.values().flat_map(HashMap::values)
     }
 
-    /// Those of one site.
+    /// Returns the publishers of one site.
     pub(super) fn of(&self, site: &SiteId) -> impl Iterator<Item = &Publisher<'static>> {
         let routers = self.declared.values();
         routers.filter_map(move |of_router| of_router.get(site))

@@ -1,4 +1,5 @@
-//! The server's pulse: robots measure by it how long they have not heard the server.
+//! Heartbeat of the server, by which robots measure how long they have not received anything from
+//! it.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -13,10 +14,10 @@ use super::publishers::Publishers;
 use super::routers::Routers;
 use crate::app::App;
 
-/// Beats after which the sites are read afresh.
+/// Number of heartbeats after which the list of sites is read again.
 const SITES_EVERY: u64 = 20;
 
-/// Beats until the stop.
+/// Publishes heartbeats until the stop.
 pub(super) async fn run(app: App, routers: Arc<Routers>, stop: CancellationToken) {
     let mut publishers = Publishers::new(keys::pulse);
     let mut beat: u64 = 0;

@@ -1,11 +1,12 @@
-//! Rate limits of each robot on what all robots go through: queues, answers, the log.
+//! Limits of each robot's messages, which share queues, replies and the log with those of all
+//! others.
 //!
-//! A robot that sends more than its limit loses its own messages, before they take room from
-//! anybody else's. A limit is a rate with a burst, and a number of messages that may wait or be
-//! answered at the same time. Liveliness tokens are bounded in number too; of those that come too
-//! fast the newest few are taken up later, so that a robot that calms down is seen. The router keeps
-//! every token all the same, and thousands of them slow every robot's messages down: a robot with
-//! far too many loses its link.
+//! A robot that exceeds a limit loses its own messages, before they take room from others. A limit
+//! is a rate with a burst, and a maximum number of messages that wait or are being answered. The
+//! number of liveliness tokens is limited too; of those that come too fast the newest few are
+//! processed later, so that a robot that calms down is seen. The router keeps every token
+//! nevertheless, and thousands of them delay every robot's messages: a robot with far too many
+//! loses its links.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -15,30 +16,30 @@ use super::tokens::CLOSED_MAX;
 use crate::app::presence::RobotKey;
 use crate::rate_limit::{Bucket, RateLimit};
 
-/// Robots that are kept track of; those that have been quiet are forgotten first.
+/// Maximum number of robots tracked; idle ones are forgotten first.
 const TRACKED_ROBOTS_MAX: usize = 50_000;
-/// Tokens of one robot that are known on all routers: a few runs of its agent.
+/// Maximum number of tokens processed per robot, on all routers: a few runs of its agent.
 const TOKENS_MAX: usize = 16;
-/// Tokens of one robot that are taken up later.
+/// Maximum number of tokens per robot kept for later.
 const LATE_TOKENS_MAX: usize = 4;
-/// Tokens of one robot that one router may have, and that may appear at once; one more each second.
-/// An agent declares one each time it connects.
+/// Maximum number of tokens of one robot on one router, and burst of appearing ones; one more per
+/// second. An agent declares one each time it connects.
 const DECLARED_TOKENS_MAX: u32 = 128;
 const DECLARED_TOKENS_RATE: RateLimit = RateLimit {
     burst: DECLARED_TOKENS_MAX,
     interval: Duration::from_secs(1),
 };
-/// Least time between two log lines on one robot's refused messages.
+/// Minimum interval between two log entries about one robot's refused messages.
 const LOG_EVERY: Duration = Duration::from_secs(10);
 
-/// What a robot sends.
+/// Kind of a robot's message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Kind {
     /// Its state.
     State,
     /// Its friction report.
     Friction,
-    /// Its introduction.
+    /// Its hello.
     Hello,
     /// A batch of records.
     Upload,
@@ -46,7 +47,7 @@ pub(super) enum Kind {
     Token,
 }
 
-/// The limit of one kind.
+/// Limit of one kind of message.
 #[derive(Debug, Clone, Copy)]
 struct Limit {
     rate: RateLimit,
@@ -83,14 +84,14 @@ impl Kind {
             // Agents publish states at 5 Hz and friction at 2 Hz by default.
             Self::State | Self::Friction => Limit::new(200, 10, 32),
             Self::Hello => Limit::new(20, 200, 4),
-            // An agent sends the next batch when it has the receipt for the one before.
+            // An agent sends the next batch after the receipt for the preceding one.
             Self::Upload => Limit::new(400, 5, 8),
             Self::Token => Limit::new(40, 1_000, u32::MAX),
         }
     }
 }
 
-/// What one robot uses of its limit of one kind.
+/// Used part of one robot's limit of one kind.
 #[derive(Debug, Clone, Copy, Default)]
 struct Used {
     bucket: Bucket,
@@ -103,17 +104,17 @@ impl Used {
     }
 }
 
-/// A token on a router.
+/// A token (its key) on a router (its number).
 pub(super) type TokenPlace = (String, u64);
 
-/// What becomes of a token that appeared.
+/// Result for a token that appeared.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Appeared {
-    /// It is taken up.
+    /// Processed.
     Taken,
-    /// It is not, or later.
+    /// Not processed, or only later.
     Refused,
-    /// It is not, and its robot has so many that others suffer: its links are to be cut.
+    /// Not processed, and its robot has so many that others are affected: its links must be cut.
     Excessive,
 }
 
@@ -121,7 +122,7 @@ pub(super) enum Appeared {
 struct Robot {
     used: [Used; Kind::COUNT],
     tokens: Vec<TokenPlace>,
-    /// How many each router has, whether taken up or not.
+    /// Number of tokens by router, processed or not.
     declared: HashMap<u64, u32>,
     appearing: Bucket,
     late: VecDeque<TokenPlace>,
@@ -134,7 +135,7 @@ impl Robot {
         self.used[kind.index()].take(kind.limit(), now)
     }
 
-    /// Whether all is as if it had never been heard.
+    /// Returns whether the robot uses nothing of its limits.
     fn is_quiet(&self, now: Duration) -> bool {
         let is_idle = |used: &Used| used.waiting == 0 && used.bucket.is_full(now);
         let logs_again = |at| now.saturating_sub(at) >= LOG_EVERY;
@@ -146,14 +147,14 @@ impl Robot {
             && self.used.iter().all(is_idle)
     }
 
-    /// Counts a token that is on a router, and says whether that is more than others can bear.
+    /// Counts a token on a router; returns whether there are too many.
     fn declared(&mut self, router: u64, now: Duration) -> bool {
         let there = self.declared.entry(router).or_default();
         *there += 1;
         *there > DECLARED_TOKENS_MAX || !self.appearing.take(DECLARED_TOKENS_RATE, now)
     }
 
-    /// Takes a token up, if there is room and it does not come too fast.
+    /// Processes a token if there is room and it does not come too fast; returns whether it did.
     fn take_token(&mut self, place: &TokenPlace, now: Duration) -> bool {
         let is_taken = self.tokens.len() < TOKENS_MAX && self.take(Kind::Token, now);
         if is_taken {
@@ -163,15 +164,15 @@ impl Robot {
     }
 }
 
-/// All robots' limits.
+/// Limits of all robots.
 #[derive(Debug, Clone, Default)]
 pub(super) struct RateLimits {
     robots: Arc<Mutex<HashMap<RobotKey, Robot>>>,
-    /// Routers that were closed; held before the robots.
+    /// Routers that were closed; locked before the robots.
     closed: Arc<Mutex<VecDeque<u64>>>,
 }
 
-/// A message's place among those of its robot that wait or are being answered; free when dropped.
+/// Place of one message that waits or is being answered; dropping it frees the place.
 #[derive(Debug)]
 pub(super) struct Place {
     limits: RateLimits,
@@ -193,7 +194,7 @@ impl RateLimits {
         self.robots.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Does something with what a robot uses; nothing if too many others are busy.
+    /// Calls `act` with a robot's used limits; `None` if too many other robots are busy.
     fn with<T>(
         &self,
         key: &RobotKey,
@@ -214,7 +215,7 @@ impl RateLimits {
         Some(act(robot))
     }
 
-    /// Takes a place for a message of a robot; `None` if that is more than its limit.
+    /// Takes a place for a message of a robot; `None` beyond its limit.
     pub(super) fn admit(&self, robot: RobotKey, kind: Kind, now: Duration) -> Option<Place> {
         let is_admitted = self.with(&robot, now, |known| {
             let is_admitted = known.take(kind, now);
@@ -228,7 +229,7 @@ impl RateLimits {
         })
     }
 
-    /// A token of a robot appeared.
+    /// Handles a robot's token that appeared.
     pub(super) fn token_appeared(
         &self,
         robot: &RobotKey,
@@ -237,7 +238,7 @@ impl RateLimits {
     ) -> Appeared {
         let closed = self.closed.lock().unwrap_or_else(PoisonError::into_inner);
         if closed.contains(&place.1) {
-            // It was on its way when the router closed, and would keep its place for ever.
+            // It was under way when the router closed, and would otherwise stay for ever.
             return Appeared::Refused;
         }
         let appeared = self.with(robot, now, |known| {
@@ -258,7 +259,7 @@ impl RateLimits {
         appeared.unwrap_or(Appeared::Refused)
     }
 
-    /// A token of a robot is gone; whether it had been taken up.
+    /// Handles a robot's token that vanished; returns whether it had been processed.
     pub(super) fn token_gone(&self, robot: &RobotKey, place: &TokenPlace) -> bool {
         let mut robots = self.lock();
         let Some(known) = robots.get_mut(robot) else {
@@ -276,7 +277,7 @@ impl RateLimits {
         known.tokens.len() < before
     }
 
-    /// A router is closed, and with it the tokens on it.
+    /// Forgets a closed router and the tokens on it.
     pub(super) fn router_closed(&self, router: u64) {
         let mut closed = self.closed.lock().unwrap_or_else(PoisonError::into_inner);
         if closed.len() >= CLOSED_MAX {
@@ -290,7 +291,7 @@ impl RateLimits {
         }
     }
 
-    /// Tokens that came too fast and are taken up now.
+    /// Returns tokens that came too fast and are processed now.
     pub(super) fn late_tokens(&self, now: Duration) -> Vec<TokenPlace> {
         let mut taken = Vec::new();
         for known in self.lock().values_mut() {
@@ -305,7 +306,8 @@ impl RateLimits {
         taken
     }
 
-    /// Whether a refused message of a robot is to be logged: with how many were not, before it.
+    /// Decides whether a refused message is logged; returns the number of those not logged before
+    /// it.
     pub(super) fn log_refused(&self, robot: &RobotKey, now: Duration) -> Option<u64> {
         let due = self.with(robot, now, |known| {
             let is_due = known

@@ -1,5 +1,5 @@
-//! What is common to everything that robots send: queries with their place, the next message, and
-//! what is said of a message that is refused.
+//! Common parts of receiving robots' messages: queries with their place, the next message of a
+//! channel, and logging of refusals.
 
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
@@ -11,14 +11,14 @@ use super::rate_limits::{Place, RateLimits};
 use crate::app::App;
 use crate::app::presence::RobotKey;
 
-/// A query with its place among those of its robot, which it keeps until it is answered.
+/// A query with its place in the robot's limits, held until it is answered.
 #[derive(Debug)]
 pub(super) struct Asked {
     pub(super) query: Query,
     pub(super) place: Place,
 }
 
-/// The next message, until the stop.
+/// Returns the next message; `None` at the stop.
 pub(super) async fn next<T>(
     channel: &mut mpsc::Receiver<T>,
     stop: &CancellationToken,
@@ -30,14 +30,14 @@ pub(super) async fn next<T>(
     }
 }
 
-/// Logs that a message was refused, now and then for each robot, with how often since.
+/// Logs a refused message, at a limited rate per robot, with the number of those not logged.
 pub(super) fn log_refusal(app: &App, limits: &RateLimits, robot: &RobotKey, key: &str, why: &str) {
     if let Some(repeats) = limits.log_refused(robot, app.clock().elapsed()) {
         warn!(repeats, "a message on `{key}` was refused: {why}");
     }
 }
 
-/// Counts what does not read.
+/// Counts a message that cannot be parsed.
 pub(super) fn count_refusal(app: &App, error: &WireError) {
     match error {
         WireError::TooLarge(_) | WireError::Malformed(_) => app.counters().refused_malformed.one(),
@@ -45,12 +45,12 @@ pub(super) fn count_refusal(app: &App, error: &WireError) {
     }
 }
 
-/// An error with its cause, on one line.
+/// Formats an error with its cause on one line.
 pub(super) fn explained(error: &WireError) -> String {
     wire::Refusal::from(error).detail
 }
 
-/// Counts and logs a key that is none of ours.
+/// Counts and logs an invalid key.
 pub(super) fn refuse_key(app: &App, key: &str) {
     app.counters().refused_key.one();
     let key: String = key.chars().take(200).collect();

@@ -1,4 +1,4 @@
-//! Queries of robots that want an answer: introductions and uploads.
+//! Queries of robots that expect an answer: hellos and uploads.
 
 use std::sync::Arc;
 
@@ -21,10 +21,10 @@ use crate::app::App;
 use crate::app::ingest::Upload;
 use crate::supervisor::Supervisor;
 
-/// Replies that may be on their way at once; each may block a thread on a full link.
+/// Maximum number of replies under way; each may block a thread on a full link.
 const REPLIES_MAX: usize = 384;
 
-/// Sends answers without ever holding up who reads the queries.
+/// Sends replies without blocking the task that reads the queries.
 #[derive(Debug, Clone)]
 pub(super) struct Replies {
     app: App,
@@ -43,8 +43,8 @@ impl Replies {
         }
     }
 
-    /// Waits for the answer in a task of its own and sends it. Without a free slot the query is
-    /// dropped: its robot sees no reply and asks again.
+    /// Awaits the answer in a task and sends it. Without a free slot the query is dropped: its
+    /// robot gets no reply and asks again.
     fn answer<T, F>(&self, Asked { query, place }: Asked, answering: F)
     where
         T: Serialize + Send + 'static,
@@ -63,8 +63,8 @@ impl Replies {
         });
     }
 
-    /// Reads a query's body, and checks that it names the robot of its key, and that this one may
-    /// speak.
+    /// Parses a query's body, and checks that it names the robot of its key and that messages of
+    /// this robot are accepted.
     fn read<T: DeserializeOwned>(
         &self,
         query: &Query,
@@ -75,7 +75,7 @@ impl Replies {
             refuse_key(&self.app, key);
             return None;
         };
-        // No reply is no delivery: a robot that joins again has lost nothing.
+        // No reply means not delivered: a robot that joins again has lost nothing.
         let of = (site.clone(), robot.clone());
         if !self.app.admits(&of) {
             return None;
@@ -134,7 +134,7 @@ fn send<T: Serialize>(query: &Query, answer: &Result<T, Refusal>) {
     }
 }
 
-/// Answers introductions until the stop.
+/// Answers hellos until the stop.
 pub(super) async fn serve_hellos(
     replies: Replies,
     mut queries: mpsc::Receiver<Asked>,
@@ -153,7 +153,7 @@ pub(super) async fn serve_hellos(
     }
 }
 
-/// Hands uploads to the writer, and its answers back, until the stop.
+/// Passes uploads to the writer and its answers to the robots, until the stop.
 pub(super) async fn serve_uploads(
     replies: Replies,
     mut queries: mpsc::Receiver<Asked>,

@@ -1,7 +1,7 @@
-//! Looks after the router: a client of its own asks it something, as a robot would, and when it
-//! does not answer for long the router is closed and opened again.
+//! Watches the router: a client queries it, as a robot would, and if several queries fail the
+//! router is closed and opened again.
 //!
-//! A router may cease to accept connections without any error. Only a client can see that.
+//! A router may stop accepting connections without any error, which only a client can detect.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -17,23 +17,23 @@ use super::router_pool::{RouterPool, robots_on};
 use super::routers::Router;
 use crate::supervisor::Supervisor;
 
-/// Time between two looks.
+/// Interval between two probes.
 pub(super) const PROBE_PERIOD: Duration = Duration::from_secs(10);
-/// How long one look may take, connection and all.
+/// Maximum time for one probe, with its connection.
 const PROBE_TIMEOUT: Duration = Duration::from_secs(3);
-/// Looks in a row without an answer after which the router is opened again.
+/// Number of consecutive failed probes after which the router is opened again.
 const FAILURES_MAX: u32 = 3;
 
-/// What the watch works on.
+/// State of the watch.
 pub(super) struct Watch {
     pub(super) pool: Arc<RouterPool>,
     pub(super) supervisor: Supervisor,
-    /// Time between two looks.
+    /// Interval between two probes.
     pub(super) period: Duration,
     pub(super) stop: CancellationToken,
 }
 
-/// Watches the router that new connections go to until the stop.
+/// Probes the router of new connections until the stop.
 pub(super) async fn watch(watch: Watch) {
     let mut failures = 0;
     let mut seen = None;
@@ -76,9 +76,9 @@ async fn looked_at(watch: &Watch, router: Option<&Arc<Router>>) -> bool {
     matches!(looked, Ok(Some(true)))
 }
 
-/// Opens another router in the place of one that does not answer. One that still carries robots stays:
-/// behind the gate beside the new one, until they have left it; in the clear, where there is but one
-/// address, as long as it carries them.
+/// Opens a router in place of one that does not answer. One that still has robots stays open:
+/// behind the gate beside the new one, until they have left it; without a gate, where there is only
+/// one address, as long as it has robots.
 async fn reopen(pool: &RouterPool, former: Option<&Arc<Router>>) {
     let _turn = pool.turn.lock().await;
     if let Some(former) = former {
@@ -96,12 +96,12 @@ async fn reopen(pool: &RouterPool, former: Option<&Arc<Router>>) {
             pool.app.counters().router_reopened.one();
             warn!("the zenoh router was opened again");
         }
-        // There is none now, so the next looks fail too and it is tried again.
+        // There is no router now, so the next probes fail too and this is repeated.
         Err(failed) => error!("cannot open the zenoh router again: {failed}"),
     }
 }
 
-/// Asks the router something over a connection of its own. Blocks its thread.
+/// Queries the router over a connection of its own; returns whether it answered. Blocks its thread.
 fn probe(router: &Router, credentials: Option<&RouterCredentials>) -> bool {
     let asked = || -> zenoh::Result<bool> {
         let config = client_config(router.address, credentials, PROBE_TIMEOUT.as_millis())?;

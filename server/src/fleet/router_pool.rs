@@ -1,4 +1,4 @@
-//! Keeps a router open that knows every robot of the fleet, and closes those that nobody needs.
+//! Keeps a router open whose rules include every robot of the fleet, and closes unused ones.
 //!
 //! ```text
 //!  a robot joins, or another authority signs
@@ -23,19 +23,19 @@ use crate::app::App;
 use crate::app::presence::RobotKey;
 use crate::authority::Trusted;
 
-/// Most routers at a time.
+/// Maximum number of routers.
 const ROUTERS_MAX: usize = 4;
-/// Time between two looks for routers that nobody needs.
+/// Interval of checks for unused routers.
 const LOOK_EVERY: Duration = Duration::from_secs(5);
 
-/// What opening, replacing and closing routers works on.
+/// State for opening, replacing and closing routers.
 #[derive(Debug)]
 pub(super) struct RouterPool {
     pub(super) app: App,
     pub(super) routers: Arc<Routers>,
     pub(super) opener: Opener,
     pub(super) channels: Channels,
-    /// One change at a time.
+    /// Locked during a change.
     pub(super) turn: Mutex<()>,
 }
 
@@ -55,7 +55,7 @@ impl RouterPool {
         Ok(())
     }
 
-    /// Closes a router; its robots come back to another.
+    /// Closes a router; its robots reconnect to another.
     pub(super) async fn close(&self, number: u64) {
         if let Some(router) = self.routers.remove(number) {
             opening::close(router.session.clone()).await;
@@ -63,7 +63,7 @@ impl RouterPool {
         }
     }
 
-    /// Keeps the routers in order until the stop.
+    /// Opens and closes routers as needed until the stop.
     pub(super) async fn run(self: Arc<Self>, stop: CancellationToken) {
         let mut joined = self.app.enrolment_registry().changes();
         let mut rotated = self.opener.authorities.as_ref().map(|it| it.changes());
@@ -106,7 +106,7 @@ impl RouterPool {
                 self.app.counters().routers_opened.one();
                 info!("another zenoh router was opened");
             }
-            // The next look tries again.
+            // The next check tries again.
             Err(failed) => error!("cannot open another router: {failed}"),
         }
     }
@@ -135,7 +135,7 @@ impl RouterPool {
 }
 
 impl RouterPool {
-    /// Whether a router's passwords derive from the key of an authority that was retired.
+    /// Returns whether a router's passwords derive from the key of a retired authority.
     fn is_of_retired(&self, router: &Router) -> bool {
         let trusted = self.opener.authorities.as_ref().map(|it| it.present());
         trusted.is_some_and(|trusted| {
@@ -155,7 +155,7 @@ async fn changed(rotated: &mut Option<watch::Receiver<Arc<Trusted>>>) {
     std::future::pending::<()>().await;
 }
 
-/// How many sessions a router has.
+/// Returns the number of a router's sessions.
 pub(super) async fn robots_on(router: &Arc<Router>) -> usize {
     let router = Arc::clone(router);
     let counting = tokio::task::spawn_blocking(move || router.session_count());

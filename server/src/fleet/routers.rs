@@ -1,9 +1,9 @@
-//! The routers that are open now.
+//! The open routers.
 //!
-//! The access control of a zenoh router is fixed when it opens, so a router cannot let in a robot
-//! that joins later. Instead another one is opened beside it, whose rules know the newcomer too;
-//! connections that come from then on are the newest router's, and those that there are stay
-//! where they are, undisturbed. The server listens to all of them, and speaks to all of them.
+//! The access control of a zenoh router is fixed when it opens, so a router cannot accept a robot
+//! that joins later. Another router is then opened beside it, whose rules include the new robot.
+//! Later connections go to the newest router; existing ones stay undisturbed. The server receives
+//! from and sends to all of them.
 
 use std::collections::HashSet;
 use std::net::SocketAddr;
@@ -18,39 +18,39 @@ use crate::app::presence::RobotKey;
 /// One router.
 #[derive(Debug)]
 pub(super) struct Router {
-    /// Its number; the newest has the highest.
+    /// Number of the router; the newest has the highest.
     pub(super) number: u64,
-    /// The server's own session, which is the router.
+    /// The server's zenoh session, which is the router.
     pub(super) session: Session,
-    /// Where it listens.
+    /// Address on which it listens.
     pub(super) address: SocketAddr,
-    /// Behind the gate, what robots have to show.
+    /// Credentials of robots; `None` without a gate.
     pub(super) credentials: Option<Arc<CredentialDerivation>>,
-    /// Whom its rules know.
+    /// Robots that its rules include.
     pub(super) robots: HashSet<RobotKey>,
 }
 
 impl Router {
-    /// The fingerprint of the authority from whose key its passwords derive.
+    /// Returns the fingerprint of the authority from whose key its passwords derive.
     pub(super) fn authority(&self) -> Option<&str> {
         self.credentials
             .as_ref()
             .map(|derivation| derivation.authority())
     }
 
-    /// How many sessions it has. Blocks its thread.
+    /// Returns the number of its sessions. Blocks its thread.
     pub(super) fn session_count(&self) -> usize {
         self.session.info().transports().wait().count()
     }
 
-    /// Whether it has a session of this id. Blocks its thread.
+    /// Returns whether it has a session of this identifier. Blocks its thread.
     pub(super) fn has_session(&self, session_id: u128) -> bool {
         let mut transports = self.session.info().transports().wait();
         transports.any(|one| u128::from_le_bytes(one.zid().to_le_bytes()) == session_id)
     }
 }
 
-/// All routers, the newest last.
+/// List of the routers, newest last.
 #[derive(Debug)]
 pub(super) struct Routers {
     open: Mutex<Vec<Arc<Router>>>,
@@ -71,23 +71,23 @@ impl Routers {
         self.open.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// All of them, the newest last.
+    /// Returns all routers, newest last.
     pub(super) fn all(&self) -> Vec<Arc<Router>> {
         self.lock().clone()
     }
 
-    /// The newest.
+    /// Returns the newest router.
     pub(super) fn newest(&self) -> Option<Arc<Router>> {
         self.lock().last().cloned()
     }
 
-    /// Adds one that was opened.
+    /// Adds an opened router.
     pub(super) fn add(&self, router: Arc<Router>) {
         self.lock().push(router);
         self.changes.send_modify(|count| *count += 1);
     }
 
-    /// Takes one away; whoever does closes it.
+    /// Removes a router from the list; the caller closes it.
     pub(super) fn remove(&self, number: u64) -> Option<Arc<Router>> {
         let mut open = self.lock();
         let index = open.iter().position(|router| router.number == number)?;
@@ -97,12 +97,12 @@ impl Routers {
         Some(router)
     }
 
-    /// Changes whenever one is added or taken away.
+    /// Returns a receiver of a counter that increases whenever a router is added or removed.
     pub(super) fn changes(&self) -> watch::Receiver<u64> {
         self.changes.subscribe()
     }
 
-    /// How often that has happened.
+    /// Returns the present value of that counter.
     pub(super) fn version(&self) -> u64 {
         *self.changes.borrow()
     }

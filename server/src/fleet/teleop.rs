@@ -1,5 +1,5 @@
-//! Drive commands to robots: published, the newest counts, and what does not fit on a link at
-//! once is dropped, since the next comes soon.
+//! Publishes drive commands to robots: only the newest counts, and a command that does not fit on a
+//! link at once is dropped, since the next one follows soon.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -23,7 +23,7 @@ pub(super) struct ZenohDrive {
     pub(super) supervisor: Supervisor,
 }
 
-/// Publishes to one robot, by whichever router it comes to be on.
+/// Publisher to one robot, on whichever router it is connected to.
 #[derive(Debug)]
 struct RobotPublisher {
     routers: Arc<Routers>,
@@ -31,7 +31,7 @@ struct RobotPublisher {
     declared: Mutex<Declared>,
 }
 
-/// One publisher on each router that was open at some version of their list.
+/// One publisher on each router of one version of their list.
 #[derive(Debug)]
 struct Declared {
     version: u64,
@@ -90,7 +90,7 @@ impl DriveTransport for ZenohDrive {
 }
 
 impl DrivePublisher for RobotPublisher {
-    /// Takes a millisecond at most, a few when there is a new router.
+    /// Takes at most a millisecond, a few when there is a new router.
     fn publish(&self, command: &DriveCommand) -> bool {
         let Ok(payload) = wire::encode(command) else {
             return false;

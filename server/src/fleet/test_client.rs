@@ -1,4 +1,4 @@
-//! A robot's link for tests, which shows what it likes: TLS outside, zenoh inside.
+//! A robot's link for tests with arbitrary credentials: TLS outside, zenoh inside.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
@@ -16,10 +16,10 @@ use tokio_rustls::client::TlsStream;
 use tread_api::tunnel::{ALPN, RouterCredentials};
 use zenoh::{Config, Session, Wait as _};
 
-/// How long a link may take to end.
+/// Maximum time for a link to end.
 const END_TIMEOUT: Duration = Duration::from_secs(15);
 
-/// What a session shows instead of what it was given.
+/// Values that a session shows instead of its own.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Shown {
     pub(super) user: Option<String>,
@@ -29,7 +29,7 @@ pub(super) struct Shown {
     pub(super) is_anonymous: bool,
 }
 
-/// What connects to the robots' port.
+/// Client of the robots' port.
 pub(super) struct TestClient {
     address: SocketAddr,
     roots: RootCertStore,
@@ -37,7 +37,7 @@ pub(super) struct TestClient {
     pub(super) protocols: Vec<Vec<u8>>,
 }
 
-/// An open session and what it goes through.
+/// An open session with its link.
 pub(super) struct TestSession {
     pub(super) zenoh: Session,
     tunnel: JoinSet<()>,
@@ -100,17 +100,18 @@ impl TestClient {
         Some((stream, serde_json::from_slice(&json).unwrap()))
     }
 
-    /// What the server tells this certificate, if anything.
+    /// Returns the credentials that the server sends to this certificate; `None` if it sends none.
     pub(super) async fn credentials(&self) -> Option<RouterCredentials> {
         self.dial().await.map(|(_stream, credentials)| credentials)
     }
 
-    /// A link on which nothing is said after the handshake.
+    /// Opens a link that sends nothing after the handshake.
     pub(super) async fn silent(&self) -> Option<TlsStream<TcpStream>> {
         self.dial().await.map(|(stream, _credentials)| stream)
     }
 
-    /// Says these bytes where a session would open; whether the server ends the link.
+    /// Sends these bytes in place of a session's opening; returns whether the server closes the
+    /// link.
     pub(super) async fn says_instead(&self, bytes: &[u8]) -> bool {
         let (mut stream, _credentials) = self.dial().await.unwrap();
         stream.write_all(bytes).await.unwrap();
@@ -120,7 +121,7 @@ impl TestClient {
             .is_ok()
     }
 
-    /// Opens a session, if it is let to the router.
+    /// Opens a session; `None` if the gate or router rejects it.
     pub(super) async fn open(&self, shown: &Shown, wait_ms: u32) -> Option<TestSession> {
         let (mut remote, credentials) = self.dial().await?;
         let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).await.unwrap();

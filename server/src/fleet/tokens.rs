@@ -1,15 +1,15 @@
-//! Which liveliness tokens are there, on which routers. A robot that goes from one router to
-//! another may be seen on the second before it is gone from the first: it never was away.
+//! Liveliness tokens by router. A robot that moves to another router may appear there before its
+//! token vanishes from the first; it then counts as present all the time.
 
 use std::collections::{HashMap, HashSet, VecDeque};
 
-/// Most tokens that are remembered: many runs of many robots.
+/// Maximum number of tokens tracked: many runs of many robots.
 const TOKENS_MAX: usize = 32_768;
 
-/// Closed routers that are remembered: what was on its way is there long before so many more close.
+/// Number of closed routers remembered; messages of a router arrive long before so many more close.
 pub(super) const CLOSED_MAX: usize = 64;
 
-/// The tokens that are there.
+/// The present tokens.
 #[derive(Debug, Default)]
 pub(super) struct Tokens {
     there: HashMap<String, HashSet<u64>>,
@@ -17,10 +17,10 @@ pub(super) struct Tokens {
 }
 
 impl Tokens {
-    /// A token appeared on a router. Whether it was nowhere before.
+    /// Adds a token on a router. Returns whether it was on none before.
     pub(super) fn appeared(&mut self, token: &str, router: u64) -> bool {
         if self.closed.contains(&router) {
-            // It was on its way when the router closed. Nobody would ever say that it is gone.
+            // It was under way when the router closed, and would never be removed.
             return false;
         }
         if let Some(routers) = self.there.get_mut(token) {
@@ -34,7 +34,7 @@ impl Tokens {
         true
     }
 
-    /// A token is gone from a router. Whether it is nowhere now.
+    /// Removes a token from a router. Returns whether it is on none now.
     pub(super) fn gone(&mut self, token: &str, router: u64) -> bool {
         let Some(routers) = self.there.get_mut(token) else {
             return false;
@@ -47,7 +47,7 @@ impl Tokens {
         is_nowhere
     }
 
-    /// A router is gone. The tokens that are nowhere now.
+    /// Removes a router. Returns the tokens that are on none now.
     pub(super) fn router_closed(&mut self, router: u64) -> Vec<String> {
         if self.closed.len() >= CLOSED_MAX {
             self.closed.pop_front();

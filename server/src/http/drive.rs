@@ -42,17 +42,19 @@ use crate::app::stops::StopWords;
 use crate::app::teleop::{Refused, Session};
 use crate::connections::Slot;
 
-/// Time between two pings.
+/// Interval between two pings.
 const PING_PERIOD: Duration = Duration::from_secs(1);
-/// How long a client may say nothing, not even a pong, before its socket counts as lost.
+/// Maximum time without any frame from a client, not even a pong; beyond it the socket counts as
+/// lost.
 const SILENCE_MAX: Duration = Duration::from_secs(3);
-/// How long a frame to a client may take; one that does not read is lost.
+/// Maximum time for sending a frame; a client that does not read is lost.
 const SEND_MAX: Duration = Duration::from_secs(1);
-/// How long a socket that the server closes waits for its client to close it too.
+/// Maximum time that a socket closed by the server waits for its client to close it too.
 const GOODBYE_MAX: Duration = Duration::from_millis(500);
-/// Frames that are read before they are acted on, so that the newest drive command counts.
+/// Maximum number of frames read before they are processed, so that the newest drive command
+/// counts.
 const DRAIN_MAX: usize = 64;
-/// Least time between two refusals of drive commands for the same cause: a driver sends many.
+/// Minimum interval between two refusals of drive commands for the same cause: a driver sends many.
 const REFUSAL_PERIOD: Duration = Duration::from_millis(500);
 
 /// Watch and drive a robot over a WebSocket.
@@ -78,7 +80,7 @@ pub(super) async fn drive(
     })?;
     let session = app.begin_drive(&site, &robot).await?;
     let slot = app.drive_slot(&subject)?;
-    // A socket is no idle connection that gives way to new ones.
+    // A socket is never closed as an idle connection in favour of new ones.
     let at_work = place.map(|Extension(place)| place.hold());
     let stop = session.stop_token();
     let upgrade = upgrade
@@ -103,9 +105,9 @@ pub(super) async fn drive(
     }))
 }
 
-/// How a socket ends.
+/// Reason why a socket ends.
 enum End {
-    /// The client closed it, or it is lost.
+    /// The client closed it, or the connection is lost.
     Gone,
     /// The server closes it.
     Closed { code: u16, detail: String },
@@ -119,9 +121,9 @@ struct Connection {
     robot: (SiteId, RobotId),
     heard_at: Instant,
     ping_due: Instant,
-    /// When the ping went out that is not answered yet.
+    /// Time of the ping that is not answered yet.
     pinged_at: Option<Instant>,
-    /// The way to the client and back, as the last pong showed.
+    /// Round-trip time to the client, from the last pong.
     socket_delay: Option<Duration>,
     refused_at: Option<(DriveRefusal, Instant)>,
 }
@@ -152,7 +154,8 @@ impl Connection {
         }
     }
 
-    /// Reads what has come, and acts on it; of drive commands in a row the last one counts.
+    /// Reads the waiting frames and processes them; of consecutive drive commands only the last
+    /// counts.
     async fn receive(&mut self, frame: Option<Result<Message, axum::Error>>) -> Result<(), End> {
         let mut requests = Vec::new();
         let mut next = Some(frame);
@@ -172,7 +175,7 @@ impl Connection {
             };
         }
         if let Some(End::Closed { .. }) = refused {
-            // What came with a frame that makes no sense is not driven either.
+            // Drive commands received with an invalid frame are dropped.
             requests.retain(|request| matches!(request, DriveRequest::Stop(_)));
         }
         let newer: Vec<bool> = requests
@@ -226,7 +229,7 @@ impl Connection {
                     if let Some(words) = stop_of(&text) {
                         return Ok(Some(DriveRequest::Stop(words)));
                     }
-                    // A variant that is not known is a syntax error to the parser.
+                    // The parser reports an unknown variant as a syntax error.
                     let is_json = serde_json::from_str::<serde::de::IgnoredAny>(&text).is_ok();
                     let code = if is_json {
                         close_code::POLICY
@@ -305,7 +308,7 @@ impl Connection {
         self.send(&update).await
     }
 
-    /// Shows the robot, pings, and looks whether the lease and the client are still there.
+    /// Sends the robot's state and pings, and checks that the lease and the client are still there.
     async fn show(&mut self) -> Result<(), End> {
         if self.heard_at.elapsed() > SILENCE_MAX {
             return Err(End::Closed {
@@ -341,7 +344,7 @@ impl Connection {
         }
     }
 
-    /// Lets the robot stand first, then says why the socket ends.
+    /// Commands the robot to stop first, then sends the reason and closes the socket.
     async fn end(mut self, end: End) {
         self.session.end();
         if let End::Closed { code, detail } = end {
@@ -363,15 +366,15 @@ impl Connection {
         }
     }
 
-    /// Keeps the socket until the client has closed it too: one that writes into a socket that is
-    /// gone never reads why.
+    /// Keeps the socket open until the client has closed it too: a client that writes into a closed
+    /// socket never reads the reason.
     async fn let_it_be_read(&mut self) {
         let answered = async {
             loop {
                 match self.socket.recv().await {
                     Some(Ok(Message::Close(_))) => return,
                     Some(Ok(_)) => {}
-                    // After a frame that could not be read there is no more reading.
+                    // After a frame that could not be read nothing more can be read.
                     Some(Err(_)) | None => std::future::pending().await,
                 }
             }
@@ -381,8 +384,7 @@ impl Connection {
     }
 }
 
-/// What can be read of a frame that asks for a stop, whatever else is wrong with it: a stop is not
-/// refused for its words.
+/// Parses what it can of a frame that requests a stop: a stop is not refused for its other content.
 fn stop_of(text: &str) -> Option<drive::StopWords> {
     let frame: serde_json::Map<String, Value> = serde_json::from_str(text).ok()?;
     let words = frame.get("stop")?;
@@ -403,7 +405,7 @@ fn signed_out() -> End {
     }
 }
 
-/// The close code for what a client did; `None` if the connection is just gone.
+/// Returns the close code and text for a client's error; `None` if the connection is lost.
 fn fault(error: &axum::Error) -> Option<(u16, String)> {
     use tokio_tungstenite::tungstenite::Error;
     let cause = error.source()?.downcast_ref::<Error>()?;

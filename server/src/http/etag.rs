@@ -1,4 +1,4 @@
-//! Answers that a client need not fetch again while they are the same.
+//! Responses with an `ETag`, which a client need not fetch again while they are unchanged.
 
 use std::hash::{DefaultHasher, Hash, Hasher as _};
 
@@ -10,7 +10,7 @@ use tread_api::problem::ProblemType;
 
 use super::problem::Problem;
 
-/// JSON with an `ETag` of its content; 304 without a body to who has it already.
+/// Returns JSON with an `ETag` of its content; 304 without a body if the client has it already.
 pub(super) fn json<T: Serialize>(headers: &HeaderMap, answer: &T) -> Response {
     match serde_json::to_vec(answer) {
         Ok(text) => bytes(headers, "application/json", text.into()),
@@ -21,7 +21,7 @@ pub(super) fn json<T: Serialize>(headers: &HeaderMap, answer: &T) -> Response {
     }
 }
 
-/// A body of any kind, likewise.
+/// Returns a body with an `ETag` of its content; 304 without a body if the client has it already.
 pub(super) fn bytes(headers: &HeaderMap, media_type: &'static str, body: Bytes) -> Response {
     let mut hasher = DefaultHasher::new();
     media_type.hash(&mut hasher);
@@ -34,8 +34,8 @@ pub(super) fn bytes(headers: &HeaderMap, media_type: &'static str, body: Bytes) 
     tagged(headers, tag, make)
 }
 
-/// An answer that is sent while it is made, with a weak `ETag` of what it is made from: whatever
-/// changes it changes `state`. 304 without a body to who has it already.
+/// Returns a streamed response with a weak `ETag` of `state`, which must change whenever the
+/// response does; 304 without a body if the client has it already.
 pub(super) fn streamed(
     headers: &HeaderMap,
     media_type: &'static str,
@@ -57,13 +57,13 @@ fn tagged(headers: &HeaderMap, tag: String, make: impl FnOnce() -> Response) -> 
     if let Ok(tag) = HeaderValue::try_from(tag) {
         said.insert(header::ETAG, tag);
     }
-    // Held, but asked for again each time: the map changes while robots drive.
+    // Cached, but revalidated each time: the map changes while robots drive.
     let held = HeaderValue::from_static("private, no-cache");
     said.insert(header::CACHE_CONTROL, held);
     response
 }
 
-/// Whether the client says that it has this.
+/// Returns whether `If-None-Match` contains this tag.
 fn is_held(headers: &HeaderMap, tag: &str) -> bool {
     let held = headers.get_all(header::IF_NONE_MATCH).into_iter();
     let mut listed = held

@@ -1,4 +1,4 @@
-//! What is taken from a request, with problems for what is wrong with it.
+//! Extractors of bodies, paths and queries, whose rejections are problems.
 //!
 //! `Json` refuses unknown fields: a client that misspells one wants to know. (Payloads of robots
 //! ignore them, so that old and new versions work together; the types are the same.)
@@ -21,23 +21,23 @@ use tread_api::problem::ProblemType;
 use super::problem::Problem;
 use super::subject::{AuditSlot, Subject};
 
-/// Fields that are not known and are named in the answer.
+/// Maximum number of unknown fields named in a response.
 const UNKNOWN_FIELDS_NAMED_MAX: usize = 5;
 
-/// How long the body of a request with a credential may take to arrive.
+/// Maximum time for the body of a request with a credential to arrive.
 pub const BODY_TIMEOUT: Duration = Duration::from_secs(10);
-/// How long the body of anybody else may take.
+/// Maximum time for the body of a request without a credential to arrive.
 pub const STRANGER_BODY_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// Bytes of a body over the limit that are read and thrown away, so that a client that is still
-/// sending gets the answer instead of a broken connection.
+/// Maximum number of bytes beyond the limit of a body that are read and discarded, so that a client
+/// that is still sending gets the response instead of a broken connection.
 const DISCARDED_BYTES_MAX: usize = 64 * 1024 * 1024;
 
-/// The largest body that a route takes, in bytes; a request extension, set by a layer.
+/// Maximum size of a route's body, bytes; a request extension set by a layer.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct BodyLimit(pub(super) usize);
 
-/// A JSON body, in and out.
+/// A JSON body of a request or response.
 #[derive(Debug, Clone)]
 pub struct Json<T>(pub T);
 
@@ -97,7 +97,7 @@ fn is_json(headers: &HeaderMap) -> bool {
     essence.is_some_and(|essence| essence.eq_ignore_ascii_case("application/json"))
 }
 
-/// Reads a whole body, or what there is to discard of one that is too large.
+/// Reads a whole body, or discards one that is too large.
 pub(super) async fn read(body: Body, BodyLimit(limit): BodyLimit) -> Result<Vec<u8>, Problem> {
     let mut chunks = body.into_data_stream();
     let mut text = Vec::new();
@@ -135,7 +135,7 @@ fn parse<T: DeserializeOwned + Serialize>(body: &[u8]) -> Result<T, Problem> {
     let parsed: T = serde_path_to_error::deserialize(watched).map_err(|error| {
         let path = error.path().to_string();
         let cause = error.inner();
-        // An enum of no known variant is a syntax error to the parser, though the text is JSON.
+        // The parser reports an unknown enum variant as a syntax error, although the text is JSON.
         let is_json = serde_json::from_slice::<serde::de::IgnoredAny>(body).is_ok();
         let (kind, detail) = if cause.is_data() || is_json {
             (
@@ -146,7 +146,7 @@ fn parse<T: DeserializeOwned + Serialize>(body: &[u8]) -> Result<T, Problem> {
             (ProblemType::MalformedBody, cause.to_string())
         };
         let problem = Problem::new(kind).detail(detail);
-        // A question mark is what the path has for a place without a name.
+        // `serde_ignored` writes a question mark for a step without a name.
         if path == "." || path.contains('?') {
             problem
         } else {
@@ -170,15 +170,15 @@ fn parse<T: DeserializeOwned + Serialize>(body: &[u8]) -> Result<T, Problem> {
     })
 }
 
-/// A message of the parser without its line and column, which say nothing in a one-line body.
+/// Returns a parser's message without line and column, which are useless in a one-line body.
 fn without_place(message: &str) -> &str {
     message.split(" at line ").next().unwrap_or(message)
 }
 
-/// Reads a frame of a socket: as a body, and a list where an object belongs is refused.
+/// Parses a frame of a socket; as in bodies, a list in place of an object is refused.
 ///
 /// # Errors
-/// The parser's, or a sentence about the list.
+/// [`BadFrame`].
 pub(super) fn parse_frame<T: DeserializeOwned + Serialize>(text: &str) -> Result<T, BadFrame> {
     let parsed: T = serde_json::from_str(text).map_err(BadFrame::Parser)?;
     let meant = serde_json::to_vec(&parsed).unwrap_or_default();
@@ -188,19 +188,19 @@ pub(super) fn parse_frame<T: DeserializeOwned + Serialize>(text: &str) -> Result
     }
 }
 
-/// Why a frame cannot be taken.
+/// Reason why a frame is refused.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum BadFrame {
-    /// It does not parse.
+    /// It cannot be parsed.
     #[error("{0}")]
     Parser(serde_json::Error),
-    /// The parser would take it.
+    /// It has a list in place of an object, which the parser would accept.
     #[error("a list stands where an object belongs")]
     List,
 }
 
-/// Refuses a list where an object belongs: the parser would take its entries for the fields in
-/// their order, past the check for unknown ones.
+/// Refuses a list in place of an object: the parser would assign its entries to the fields in
+/// order, bypassing the check for unknown fields.
 fn refuse_lists_for_objects<T: Serialize>(parsed: &T, body: &[u8]) -> Result<(), Problem> {
     let meant = serde_json::to_vec(parsed).unwrap_or_default();
     match list_for_object(body, &meant) {
@@ -217,10 +217,10 @@ fn refuse_lists_for_objects<T: Serialize>(parsed: &T, body: &[u8]) -> Result<(),
     }
 }
 
-/// The path of the first list that was read as an object.
+/// Returns the path of the first list that was parsed as an object.
 ///
-/// Reads one level of both texts at a time, so that a path of many thousand points costs a pointer
-/// each and no tree.
+/// Compares one level of both texts at a time, so that a path of many thousand points needs a
+/// pointer each and no tree.
 fn list_for_object(sent: &[u8], meant: &[u8]) -> Option<String> {
     let within = |name: &str, place: String| match place.as_str() {
         "" => name.to_owned(),
@@ -249,8 +249,8 @@ fn list_for_object(sent: &[u8], meant: &[u8]) -> Option<String> {
     }
 }
 
-/// The path of an unknown field with the names of enum variants, for which `serde_ignored` only
-/// has a `?`.
+/// Returns the path of an unknown field with the names of enum variants, for which `serde_ignored`
+/// writes only `?`.
 fn spelt_out(path: &str, body: &[u8]) -> String {
     let whole: serde_json::Value = serde_json::from_slice(body).unwrap_or_default();
     let mut place = &whole;
@@ -264,7 +264,7 @@ fn spelt_out(path: &str, body: &[u8]) -> String {
                 .filter(|object| !object.contains_key(following));
             match variant.and_then(|object| object.keys().next()) {
                 Some(name) => name.as_str(),
-                // An optional value, which is no step in JSON.
+                // An optional value, which has no step of its own in JSON.
                 None => continue,
             }
         } else {
@@ -282,7 +282,7 @@ fn spelt_out(path: &str, body: &[u8]) -> String {
     names.join(".")
 }
 
-/// The parts of a path.
+/// The parameters of a path.
 #[derive(Debug, Clone)]
 pub struct Path<T>(pub T);
 
@@ -317,7 +317,7 @@ impl<S: Send + Sync, T: DeserializeOwned> FromRequestParts<S> for Query<T> {
     }
 }
 
-/// How many entries a page has.
+/// Returns the number of entries of a page, within its limits.
 pub(super) fn page_limit(limit: Option<u32>) -> Result<u32, Problem> {
     let limit = limit.unwrap_or(PAGE_LIMIT_DEFAULT);
     if (1..=PAGE_LIMIT_MAX).contains(&limit) {
@@ -330,7 +330,7 @@ pub(super) fn page_limit(limit: Option<u32>) -> Result<u32, Problem> {
     }
 }
 
-/// A cursor that is an identifier of that type.
+/// Parses a cursor that is an identifier.
 pub(super) fn cursor<T: std::str::FromStr>(cursor: Option<&str>) -> Result<Option<T>, Problem> {
     let bad = |_error| {
         Problem::new(ProblemType::InvalidQuery)

@@ -1,4 +1,4 @@
-//! An answer's body that holds something until it was given to the client, or given up.
+//! A response body that holds a guard until it was sent to the client, or abandoned.
 
 use std::pin::Pin;
 use std::task::{Context, Poll};
@@ -6,14 +6,14 @@ use std::task::{Context, Poll};
 use axum::body::{Body, Bytes, HttpBody};
 use hyper::body::{Frame, SizeHint};
 
-/// A body with what is dropped at its end.
+/// A body with a guard that is dropped at its end.
 pub(super) struct Guarded<G> {
     body: Body,
     _guard: G,
 }
 
 impl<G: Send + Unpin + 'static> Guarded<G> {
-    /// The same body; the guard is dropped with it.
+    /// Wraps a body; the guard is dropped with it.
     pub(super) fn body(body: Body, guard: G) -> Body {
         Body::new(Self {
             body,

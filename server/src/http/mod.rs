@@ -58,17 +58,17 @@ use crate::app::App;
 use crate::app::metrics::MEDIA_TYPE;
 use crate::identity::origin::Names;
 
-/// Largest body of `POST /v1/missions`: a path of the most waypoints.
+/// Maximum size of the body of `POST /v1/missions`, bytes: the longest waypoint path.
 pub const MISSION_BODY_MAX: usize = 16 * 1024 * 1024;
-/// Largest body of a sign-in, which anybody may send.
+/// Maximum size of the body of a sign-in, bytes; it needs no credential.
 pub const SIGN_IN_BODY_MAX: usize = 4 * 1024;
-/// Largest body of a robot that joins or renews, which anybody may send.
+/// Maximum size of the body of a robot that joins or renews, bytes; it needs no credential.
 pub const ENROLMENT_BODY_MAX: usize = 16 * 1024;
-/// Largest body of all other requests.
+/// Maximum size of the body of other requests, bytes.
 pub const BODY_MAX: usize = 1024 * 1024;
-/// How long a request may take.
+/// Maximum duration of a request.
 pub const REQUEST_TIMEOUT: Duration = Duration::from_secs(15);
-/// The header that names a request, in the answer and in the log.
+/// Header with the identifier of a request, in the response and the log.
 const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
 
 #[derive(utoipa::OpenApi)]
@@ -157,12 +157,12 @@ fn routes() -> OpenApiRouter<App> {
         .merge(joining)
 }
 
-/// The description of the API.
+/// Returns the OpenAPI description.
 pub fn openapi() -> OpenApi {
     with_problems(routes().to_openapi())
 }
 
-/// What every route needs, from the description of the API.
+/// Returns the requirements of every route, from the description.
 pub fn access() -> Access {
     Access::of(&openapi())
 }
@@ -201,7 +201,7 @@ fn with_problems(mut openapi: OpenApi) -> OpenApi {
     openapi
 }
 
-/// The whole API on these use cases, for a server that goes by these names.
+/// Creates the router of the whole API, for a server with these host names.
 pub fn router(app: App, names: Names) -> Router {
     let (router, openapi) = routes().split_for_parts();
     let openapi = with_problems(openapi);
@@ -235,7 +235,7 @@ pub fn router(app: App, names: Names) -> Router {
         .with_state(app)
 }
 
-/// The page for Prometheus, on an address of its own.
+/// Creates the router of the Prometheus metrics, for an address of its own.
 pub fn metrics_router(app: App) -> Router {
     let guard = Guard::new(app.clone(), Access::open("/metrics"), Arc::default());
     Router::new()
@@ -251,7 +251,7 @@ async fn metrics(State(app): State<App>) -> Result<Response, Problem> {
     Ok(([(axum::http::header::CONTENT_TYPE, MEDIA_TYPE)], text).into_response())
 }
 
-/// Notes how long each route takes.
+/// Records the duration of each request by route.
 async fn measure(State(app): State<App>, request: Request, next: Next) -> Response {
     let route = request.extensions().get::<MatchedPath>();
     let route = route.map_or("none", MatchedPath::as_str).to_owned();

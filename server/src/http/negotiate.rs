@@ -1,22 +1,22 @@
-//! Which of several formats an answer has: `format=` says so, or else the `Accept` header.
+//! Chooses the format of a response: by `format=`, or else by the `Accept` header.
 
 use axum::http::{HeaderMap, header};
 use tread_api::problem::ProblemType;
 
 use super::problem::Problem;
 
-/// A format that a route can answer in.
+/// A format that a route offers.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Offered<T> {
     /// Its name in `format=`.
     pub(super) name: &'static str,
     /// Its media type.
     pub(super) media_type: &'static str,
-    /// What the route calls it.
+    /// The route's own value for it.
     pub(super) format: T,
 }
 
-/// A format with its name in `format=` and its media type.
+/// Makes an offered format.
 pub(super) const fn offered<T: Copy>(
     name: &'static str,
     media_type: &'static str,
@@ -29,7 +29,7 @@ pub(super) const fn offered<T: Copy>(
     }
 }
 
-/// The format that is asked for; the first one when nothing is said.
+/// Returns the requested format; the first offered one by default.
 pub(super) fn choose<T: Copy>(
     offered: &[Offered<T>],
     format: Option<&str>,
@@ -57,7 +57,7 @@ pub(super) fn choose<T: Copy>(
     let weighed = offered
         .iter()
         .map(|one| (one, weight(&accepted, one.media_type)));
-    // Of equally welcome ones the first.
+    // Of equal weights the first.
     let best = weighed.filter(|(_, weight)| *weight > 0.0).fold(
         None::<(&Offered<T>, f64)>,
         |best, next| match best {
@@ -71,7 +71,7 @@ pub(super) fn choose<T: Copy>(
     })
 }
 
-/// How welcome a media type is, 0 to 1: the entry that says most of it counts.
+/// Returns the weight of a media type, 0 to 1: the most specific entry counts.
 fn weight(accepted: &[&str], media_type: &str) -> f64 {
     if accepted.is_empty() {
         return 1.0;

@@ -30,7 +30,7 @@ const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; i
     connect-src 'self'; manifest-src 'self'; base-uri 'none'; form-action 'none'; \
     frame-ancestors 'none'";
 
-/// One file with everything that is said of it.
+/// One file with its headers.
 struct File {
     name: &'static str,
     media_type: &'static str,
@@ -62,7 +62,7 @@ static DIST: LazyLock<[File; 4]> = LazyLock::new(|| {
 impl File {
     fn new(name: &'static str, media_type: &'static str, plain: &'static [u8]) -> Self {
         let mut encoder = GzEncoder::new(Vec::new(), Compression::best());
-        // Writing into memory does not fail; an empty answer would show at once.
+        // Writing into memory does not fail.
         let zipped = encoder.write_all(plain).and_then(|()| encoder.finish());
         let hash = Sha256::digest(plain);
         let head = hash.first_chunk().copied().unwrap_or_default();
@@ -78,7 +78,7 @@ impl File {
 
     fn answer(&self, headers: &HeaderMap) -> Response {
         let zips = takes_gzip(headers) && !self.zipped.is_empty();
-        // A packed file is another representation and has a tag of its own.
+        // The compressed file is another representation with a tag of its own.
         let tag = format!("\"{}{}\"", self.tag, if zips { "-gz" } else { "" });
         let is_known = headers
             .get_all(header::IF_NONE_MATCH)
@@ -115,7 +115,7 @@ impl File {
     }
 }
 
-/// Whether an asker names gzip and does not rule it out with `q=0`.
+/// Returns whether `Accept-Encoding` names gzip without `q=0`.
 fn takes_gzip(headers: &HeaderMap) -> bool {
     headers
         .get_all(header::ACCEPT_ENCODING)
@@ -151,7 +151,7 @@ async fn file(request: Request) -> Response {
     )
 }
 
-/// A refusal as a page for people: no style and no script, and a way back.
+/// Returns a refusal as a page for people, without styles and scripts, with a link back.
 pub(in crate::http) fn plain(response: Response, title: &str, detail: &str) -> Response {
     let (title, detail) = (escaped(title), escaped(detail));
     let text = format!(

@@ -9,10 +9,10 @@ use tread_api::problem::{PROBLEM_MEDIA_TYPE, ProblemBody, ProblemType};
 use crate::app::AppError;
 use crate::app::DbError;
 
-/// When a client should ask again after the server could not do its work, seconds.
+/// `Retry-After` of responses when the server could not do its work, seconds.
 const RETRY_AFTER_S: u32 = 5;
 
-/// An error answer on its way out.
+/// An error response.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Problem {
     body: Box<ProblemBody>,
@@ -23,7 +23,7 @@ pub struct Problem {
 pub(super) struct Refused(pub(super) ProblemType);
 
 impl Problem {
-    /// A problem of that kind.
+    /// Creates a problem of a type.
     pub fn new(kind: ProblemType) -> Self {
         let body = Box::new(ProblemBody {
             kind,
@@ -37,7 +37,7 @@ impl Problem {
         Self { body }
     }
 
-    /// The database did not do it. The cause is for the log alone, and is logged here once.
+    /// Creates the problem of a database error, and logs the cause, which is not in the response.
     pub(super) fn storage(cause: &DbError) -> Self {
         error!("a request failed: {cause:?}");
         match cause.failure() {
@@ -50,14 +50,14 @@ impl Problem {
         }
     }
 
-    /// Says what is wrong here, for people.
+    /// Sets the explanation for people.
     #[must_use]
     pub fn detail(mut self, detail: impl Into<String>) -> Self {
         self.body.detail = Some(detail.into());
         self
     }
 
-    /// Says where in the body or query.
+    /// Sets the field of the body or query.
     #[must_use]
     pub fn field(mut self, field: impl Into<String>) -> Self {
         self.body.field = Some(field.into());

@@ -28,17 +28,17 @@ use crate::connections::{ACCEPT_REST, BOUNDS, Connections, Slot};
 use crate::identity::address::TrustedProxies;
 use crate::supervisor::Supervisor;
 
-/// How long the first byte of a connection may take to arrive.
+/// Maximum time until the first byte of a connection.
 pub const FIRST_BYTE_TIMEOUT: Duration = Duration::from_secs(5);
-/// How long a TLS handshake may take.
+/// Maximum time for a TLS handshake.
 pub const TLS_TIMEOUT: Duration = Duration::from_secs(5);
-/// How long the headers of a request may take to arrive, and how long a connection may be idle.
+/// Maximum time for a request's headers to arrive, and for a connection to be idle.
 pub const HEADER_TIMEOUT: Duration = Duration::from_secs(10);
-/// Most bytes of a request's head.
+/// Maximum size of a request's head, bytes.
 const HEAD_MAX: usize = 64 * 1024;
-/// How long open requests may take after the stop.
+/// Maximum time for open requests after the stop.
 const DRAIN_TIMEOUT: Duration = Duration::from_secs(5);
-/// Where proxies say whom they ask for.
+/// Header in which proxies name their client.
 const FORWARDED_FOR: HeaderName = HeaderName::from_static("x-forwarded-for");
 /// Connections that the system may keep until they are accepted: as many as may be open. One that finds
 /// no room there tries again after a second.
@@ -56,7 +56,7 @@ pub struct Serving {
     pub router: Router,
     /// TLS on it, if any.
     pub tls: Option<Arc<Tls>>,
-    /// Whose word on where a request comes from counts.
+    /// Proxies whose header is trusted.
     pub proxies: Arc<TrustedProxies>,
 }
 
@@ -70,7 +70,7 @@ pub fn listen(address: SocketAddr) -> std::io::Result<TcpListener> {
     } else {
         TcpSocket::new_v6()?
     };
-    // A server that starts again may find connections of its former self.
+    // After a restart, connections of the former process may still exist.
     socket.set_reuseaddr(true)?;
     socket.bind(address)?;
     socket.listen(BACKLOG)
@@ -230,7 +230,7 @@ impl Connection {
 /// Where a request comes from, as far as the proxies before this server are believed.
 fn client_of(request: &Request<Incoming>, peer: IpAddr, proxies: &TrustedProxies) -> IpAddr {
     let forwarded = request.headers().get_all(FORWARDED_FOR).iter();
-    // What is no text is no address.
+    // A value that is not text is not an address.
     let forwarded: Vec<&str> = forwarded
         .map(|value| value.to_str().unwrap_or("?"))
         .collect();

@@ -37,10 +37,10 @@ use crate::app::identity::Credential;
 use crate::app::stops::StopFilter;
 use crate::app::stops::StopWords;
 
-/// How long the body of a stop may take to arrive; then the stop goes without it.
+/// Maximum time for the body of a stop to arrive; after it the stop is executed without the body.
 const STOP_BODY_TIMEOUT: Duration = Duration::from_millis(500);
 
-/// What can be read of the body of a stop.
+/// The part of a stop's body that could be parsed.
 pub(super) struct StopBody(Map<String, Value>);
 
 impl<S: Send + Sync> FromRequest<S> for StopBody {
@@ -67,7 +67,7 @@ impl StopBody {
         Some(cleaned(text, STOP_TEXT_MAX))
     }
 
-    /// Who stops and why; the token's name stands before whatever name is given.
+    /// Returns author and reason; the token's name precedes any name given in the body.
     fn words(&self, subject: &Credential) -> StopWords {
         StopWords {
             by: Some(subject.said_by(self.text("by").as_deref())),
@@ -75,7 +75,7 @@ impl StopBody {
         }
     }
 
-    /// The one site whose robots are meant, if it is not all of them.
+    /// Returns the site whose robots are to stop; `None` for all sites.
     fn site(&self) -> Result<Option<SiteId>, Problem> {
         let site = match self.0.get("site") {
             None | Some(Value::Null) => return Ok(None),

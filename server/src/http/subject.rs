@@ -1,4 +1,5 @@
-//! What the guard leaves with a request: who asks, and where the body goes for the audit log.
+//! Extensions of a request from the guard: the authenticated caller, and the slot of the body for
+//! the audit log.
 
 use std::sync::{Arc, OnceLock};
 
@@ -11,7 +12,7 @@ use super::problem::Problem;
 use crate::app::identity::Credential;
 use crate::identity::redact::redacted_text;
 
-/// Who asks: behind the guard there is always one, on all but the public routes.
+/// The authenticated caller; present on all but the public routes.
 #[derive(Debug, Clone)]
 pub(super) struct Subject(pub(super) Arc<Credential>);
 
@@ -24,18 +25,18 @@ impl<S: Send + Sync> FromRequestParts<S> for Subject {
     }
 }
 
-/// Where the body of a change is left for the audit log.
+/// Slot for the body of a change, for the audit log.
 #[derive(Debug, Clone, Default)]
 pub(super) struct AuditSlot(Arc<OnceLock<Value>>);
 
 impl AuditSlot {
-    /// Leaves a body, without its secrets.
+    /// Stores a body, without its secrets.
     pub(super) fn leave(&self, body: &[u8]) {
         // The first one is the request's; there is no second.
         let _ = self.0.set(redacted_text(body));
     }
 
-    /// What was left.
+    /// Returns the stored body.
     pub(super) fn left(&self) -> Option<&Value> {
         self.0.get()
     }

@@ -13,24 +13,24 @@ use tracing::{info, warn};
 
 use crate::config::TlsFiles;
 
-/// How often the files are looked at.
+/// Interval of checks whether the files have changed.
 pub const LOOK_EVERY: Duration = Duration::from_mins(1);
 
-/// Why certificate and key cannot be used.
+/// Reason why certificate and key cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum TlsError {
-    /// A file cannot be read, or holds no such thing.
+    /// A file cannot be read, or does not contain what it should.
     #[error("cannot read the {what} in `{file}`")]
     Unreadable {
         /// What it should hold.
         what: &'static str,
-        /// Which file.
+        /// The file.
         file: String,
-        /// Why.
+        /// The cause.
         #[source]
         cause: rustls::pki_types::pem::Error,
     },
-    /// They do not go together, or are of a kind that is not known.
+    /// They do not match, or are of an unsupported kind.
     #[error("certificate and key cannot be used")]
     Unusable(#[source] rustls::Error),
 }
@@ -52,7 +52,7 @@ impl Tls {
         Ok(Self { files, config })
     }
 
-    /// What makes TLS of a connection, with the present certificate.
+    /// Returns the TLS acceptor with the present certificate.
     pub fn acceptor(&self) -> TlsAcceptor {
         let config = self.config.read().unwrap_or_else(PoisonError::into_inner);
         TlsAcceptor::from(Arc::clone(&config))
@@ -95,7 +95,7 @@ pub async fn watch(tls: Arc<Tls>, stop: CancellationToken) {
                 info!("the REST API has a new certificate");
                 seen = now;
             }
-            // The other file may not be written yet; it is tried again.
+            // The other file may not be written yet; the next check tries again.
             Err(error) => warn!("{error}; the REST API keeps the certificate that it has"),
         }
     }

@@ -1,4 +1,4 @@
-//! A plan's path as points, for people to see.
+//! Samples a plan's path as points for display.
 
 use tread_api::geometry::Point;
 use tread_api::trajectory::{PLANNED_POINTS_MAX, PlannedPath, Trajectory};
@@ -6,7 +6,7 @@ use tread_control::plan::Plan;
 
 use super::once_m;
 
-/// Smallest distance between two points, metres; it grows with long paths.
+/// Minimum distance between two points, metres; it is larger for long paths.
 const STEP_MIN_M: f64 = 0.1;
 
 /// Points along a plan, evenly spaced, at most [`PLANNED_POINTS_MAX`].

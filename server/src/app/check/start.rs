@@ -1,5 +1,5 @@
-//! From where a robot will start a mission that is asked for now: the expected end of what it drives
-//! and of what is queued before it.
+//! Predicts the pose from which a robot will start a new mission: the expected end of its active
+//! and queued missions.
 
 use tread_api::geometry::Pose;
 use tread_api::ids::MissionId;
@@ -12,11 +12,11 @@ use crate::app::AppError;
 use crate::db::missions::Standing;
 use crate::db::{self, Tx};
 
-/// Most missions before it whose ends are planned; waypoints end where they say, whatever was
-/// before, so more are only needed after as many circles.
+/// Maximum number of earlier missions whose ends are planned. The end of a waypoint mission does
+/// not depend on earlier ones, so more would only matter after as many circles.
 const CHAIN_MAX: usize = 100;
 
-/// Where planning begins, and why there.
+/// Pose at which planning begins, and what it is derived from.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Start {
     pub(super) pose: Pose,
@@ -24,33 +24,33 @@ pub(super) struct Start {
     pub(super) after_mission: Option<MissionId>,
 }
 
-/// Where a mission would stand among those of its robot.
+/// Position of a mission in its robot's queue.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::app) struct Place {
     pub(in crate::app) priority: i32,
     pub(in crate::app) policy: StartPolicy,
-    /// The mission whose place it takes, if any.
+    /// The mission that it replaces, if any.
     pub(in crate::app) replaces: Option<MissionId>,
 }
 
-/// A mission that is driven before.
+/// A mission that the robot drives before the new one.
 #[derive(Debug)]
 pub(super) struct Earlier {
     id: MissionId,
     trajectory: Trajectory,
-    /// From where its robot planned it, once it has taken it.
+    /// Pose from which its robot planned it; `None` until the robot has accepted it.
     begin: Option<Pose>,
 }
 
-/// Whether this open mission is driven before one of that place.
+/// Returns whether this open mission is driven before one at `place`.
 fn is_before(open: &Standing, place: Place) -> bool {
     match open.state {
         MissionState::Offered | MissionState::Active | MissionState::Paused => true,
-        // What is held in the queue is passed over.
+        // A mission that is held in the queue is skipped.
         MissionState::Queued => {
             !open.pause_wanted && (place.replaces.is_some() || open.priority >= place.priority)
         }
-        // It ends where the robot comes to rest now.
+        // A mission that is being cancelled ends where the robot stops now.
         MissionState::Cancelling
         | MissionState::Succeeded
         | MissionState::Failed
@@ -60,7 +60,8 @@ fn is_before(open: &Standing, place: Place) -> bool {
     }
 }
 
-/// Of a robot's open missions, which are in the order of driving, those before one of that place.
+/// Returns those of a robot's open missions, given in driving order, that are driven before one at
+/// `place`.
 fn before(open: &[Standing], place: Place) -> Vec<MissionId> {
     if place.policy == StartPolicy::Replace {
         return Vec::new();
@@ -72,7 +73,7 @@ fn before(open: &[Standing], place: Place) -> Vec<MissionId> {
     before.map(|open| open.id).collect()
 }
 
-/// The missions on whose ends the start of a new one depends, in the order in which they are driven.
+/// Returns the missions whose ends determine the start of a new one, in driving order.
 pub(super) async fn earlier(
     tx: &mut Tx,
     robot_pk: i64,
@@ -99,7 +100,7 @@ impl Earlier {
     fn of(mission: Mission) -> Self {
         let begin = mission.plan.and_then(|plan| plan.begin);
         match mission.replacement {
-            // It will be driven from wherever the robot is then.
+            // Its replacement is driven from wherever the robot is then.
             Some(replacement) => Self {
                 id: mission.id,
                 trajectory: replacement.trajectory,
@@ -114,8 +115,8 @@ impl Earlier {
     }
 }
 
-/// Where the robot will be after those missions. What cannot be planned is left out: its robot will
-/// refuse it and stay where it is.
+/// Returns the pose after those missions. Missions that cannot be planned are skipped: the robot
+/// will refuse them and stay where it is.
 pub(super) fn after(first: Start, earlier: &[Earlier], model: &RobotModel) -> Start {
     earlier.iter().fold(first, |start, mission| {
         let from = mission.begin.unwrap_or(start.pose);

@@ -1,4 +1,5 @@
-//! A robot joins: one transaction uses its join token up and writes its enrolment down, or does neither.
+//! Joining: one transaction consumes a robot's join token and stores its enrolment, or does
+//! neither.
 //!
 //! ```text
 //!  token looked at ─► certificate signed ─► token used up, enrolment written, committed
@@ -9,8 +10,8 @@
 //!            refused                        answer
 //! ```
 //!
-//! No transaction holds the fleet's authority, which may be replaced at any moment: the certificate is held
-//! against it last of all, so that no robot gets one that opens nothing.
+//! No transaction locks the fleet's authority, which may be replaced at any moment. The certificate
+//! is checked against the trusted authorities last, so that no robot gets one that is not accepted.
 
 use std::net::IpAddr;
 use std::sync::Arc;
@@ -28,11 +29,12 @@ use crate::db::enrolments::Renewal;
 use crate::identity::attempts::Source;
 use crate::identity::secret::{Kind, Secret};
 
-/// How often a certificate is signed again, since the authority was replaced meanwhile.
+/// Maximum number of times that a certificate is signed again because the authority was replaced
+/// meanwhile.
 const SIGN_AGAIN_MAX: u32 = 5;
 
 impl App {
-    /// A robot joins: its join token is used up, and whatever it had before counts no more.
+    /// Enrols a robot: consumes its join token and revokes its earlier enrolment.
     ///
     /// # Errors
     /// [`EnrolError`]; all but `Request`, `Locked`, `Closed` and `App` look the same from outside.
@@ -42,7 +44,7 @@ impl App {
         request: &EnrolRobot,
     ) -> Result<Enrolled, EnrolError> {
         let service = self.service().ok_or(EnrolError::Closed)?;
-        // Whether the request reads says nothing about the token, so it is looked at first.
+        // A malformed request reveals nothing about the token, so it is checked first.
         let key = RobotRequest::read(&request.certificate_request).map_err(EnrolError::Request)?;
         let secret = Secret::read(&request.token).filter(|secret| secret.kind() == Kind::Join);
         let mut sources = vec![Source::of_address(address)];
@@ -70,8 +72,8 @@ impl App {
         enrolled
     }
 
-    /// Whether a secret is a join token's, valid or not. What is none takes no turn of those who
-    /// write.
+    /// Returns whether a secret is that of a join token, valid or not. Other secrets do not wait
+    /// for the writing connection.
     async fn is_join_token(&self, secret: &Secret) -> Result<bool, AppError> {
         let _turn = self.look_up_turn(Purpose::Other).await?;
         let mut tx = self.db().read("enrolment").await?;
@@ -163,9 +165,9 @@ impl App {
         })
     }
 
-    /// The certificate of an enrolment that was written down, by an authority that is trusted now: the one
-    /// that signed it may have been replaced or retired meanwhile. After [`SIGN_AGAIN_MAX`] more of those
-    /// the robot gets none.
+    /// Returns the certificate of a stored enrolment, signed by an authority that is trusted now.
+    /// If the signing authority was replaced or retired meanwhile it signs again, at most
+    /// [`SIGN_AGAIN_MAX`] times; after that the robot gets no certificate.
     async fn signed_by_trusted(
         &self,
         service: &EnrolmentService,
@@ -202,7 +204,7 @@ impl App {
 }
 
 impl EnrolmentService {
-    /// Signs a certificate, and says its fingerprint.
+    /// Signs a certificate and returns it with its fingerprint.
     pub(super) fn sign(
         &self,
         trusted: &Trusted,

@@ -1,4 +1,4 @@
-//! Robots join the fleet, stay in it, and are put out of it.
+//! Enrolment of robots: joining, renewal of certificates, and revocation.
 //!
 //! ```text
 //!  join token ──made──► valid ──used by one robot──► used
@@ -9,7 +9,7 @@
 //!                      └──joins again──► revoked, and in force under the next number
 //! ```
 //!
-//! Every failure gets the same answer, whatever the cause; the cause is for the audit log and the counters.
+//! Every failure gets the same answer; the cause is only in the audit log and the counters.
 
 mod joining;
 pub mod registry;
@@ -43,28 +43,28 @@ use crate::db::enrolments::{Counting, Renewal};
 use crate::db::{self, DbError, Outcome, Tx};
 use crate::identity::secret::Kind;
 
-/// Most join tokens that can be used at once.
+/// Maximum numbers of join tokens that are valid at once.
 const JOIN_TOKENS: Quota = Quota {
     what: "valid join tokens",
     all: 1_000,
     reserved: 100,
     share: 300,
 };
-/// Most robots that may ever join.
+/// Maximum number of robots that may ever join.
 pub const FLEET_ROBOTS_MAX: u32 = 10_000;
 
-/// What the server signs robots' certificates with.
+/// What the server needs to sign robots' certificates.
 #[derive(Debug)]
 pub struct EnrolmentService {
-    /// The fleet's authority, and during a rotation two.
+    /// The fleet's authority; during a rotation also the former one.
     pub authorities: Arc<Authorities>,
-    /// How long a robot's certificate is good for.
+    /// Validity of a robot's certificate.
     pub lifetime: SignedDuration,
     /// The port that robots connect to.
     pub port: u16,
 }
 
-/// What is known of robots that have joined.
+/// Membership of the fleet in memory.
 #[derive(Debug)]
 pub(super) struct Membership {
     pub(super) registry: Arc<EnrolmentRegistry>,
@@ -74,7 +74,7 @@ pub(super) struct Membership {
 }
 
 impl Membership {
-    /// With an authority only robots that have joined may speak.
+    /// With a service (an authority), only messages of robots that have joined are accepted.
     pub(super) fn new(service: Option<EnrolmentService>) -> Self {
         let registry = Arc::<EnrolmentRegistry>::default();
         if service.is_some() {
@@ -89,55 +89,56 @@ impl Membership {
     }
 }
 
-/// Why a robot gets no certificate. The answer says no more than that.
+/// Reason why a robot gets no certificate. The answer to the robot does not contain it.
 #[derive(Debug, thiserror::Error)]
 pub enum EnrolError {
-    /// The request for a certificate is none, whoever sends it.
+    /// The certificate request cannot be parsed, independently of its sender.
     #[error(transparent)]
     Request(CertificateError),
     /// Neither the token nor the request names the robot.
     #[error("nobody names the robot")]
     Nameless(JoinTokenId),
-    /// The join token cannot be one.
+    /// The join token is malformed.
     #[error("malformed")]
     Malformed,
-    /// Nothing is kept of the join token.
+    /// The join token is not in the database.
     #[error("unknown")]
     Unknown,
-    /// Its time is over.
+    /// The join token has expired.
     #[error("expired")]
     Expired(JoinTokenId),
-    /// A robot joined by it before.
+    /// The join token was used by a robot before.
     #[error("used")]
     Used(JoinTokenId),
-    /// It was revoked.
+    /// The join token was revoked.
     #[error("revoked")]
     Revoked(JoinTokenId),
-    /// It is for another robot.
+    /// The join token is for another robot.
     #[error("for another robot")]
     OtherRobot(JoinTokenId),
-    /// The robot is known, and the join token does not name it.
+    /// A robot of this name exists, and the join token does not name it.
     #[error("the robot is known and the join token does not name it")]
     KnownRobot(JoinTokenId),
-    /// The certificate, or the proof that its key is at hand, does not count.
+    /// The certificate, or the proof of possession of its key, is invalid.
     #[error("bad certificate")]
     Certificate(#[source] CertificateError),
-    /// The robot was put out of the fleet, or joined again.
+    /// The robot's enrolment was revoked, or replaced by a later one.
     #[error("the enrolment was revoked")]
     Ended(RobotName),
     /// The authority that signed its certificate was retired.
     #[error("the authority of the certificate was retired")]
     Retired(RobotName),
-    /// This server has not given the certificate, or has given others since.
+    /// This server did not issue the certificate, or has issued newer ones since.
     #[error("this server did not give the certificate, or gave it long ago")]
     NotIssued(RobotName),
-    /// There were too many failures; nothing was looked up.
+    /// Too many failures; the request is refused without a look-up. Holds the time until the next
+    /// attempt.
     #[error("there were too many failed attempts; try again in {} s", .0.as_secs() + 1)]
     Locked(Duration),
-    /// Robots do not join this server.
+    /// This server has no authority, so robots cannot join it.
     #[error("robots do not join this server")]
     Closed,
-    /// Something else failed.
+    /// Another error.
     #[error("the server failed")]
     App(#[from] AppError),
 }
@@ -155,7 +156,7 @@ impl From<sqlx::Error> for EnrolError {
 }
 
 impl EnrolError {
-    /// The join token that was shown, if it is one.
+    /// Returns the identifier of the join token that was shown, if it is known.
     pub fn join_token(&self) -> Option<JoinTokenId> {
         match self {
             Self::Expired(id)
@@ -178,17 +179,17 @@ impl EnrolError {
     }
 }
 
-/// What became of a robot's request, for the audit log.
+/// Result of a robot's enrolment request, with what the audit log needs.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Enrolled {
-    /// What the robot gets.
+    /// Certificate that the robot gets.
     pub certificate: RobotCertificate,
-    /// The join token that it came with.
+    /// The join token that the robot used.
     pub join_token: JoinTokenId,
 }
 
 impl App {
-    /// Which robots are of the fleet.
+    /// Returns the registry of robots that have joined.
     pub fn enrolment_registry(&self) -> &Arc<EnrolmentRegistry> {
         &self.membership().registry
     }
@@ -197,7 +198,7 @@ impl App {
         self.membership().service.as_ref()
     }
 
-    /// Learns from the database who has joined.
+    /// Loads the enrolments of all robots from the database.
     ///
     /// # Errors
     /// The database failed.
@@ -209,10 +210,11 @@ impl App {
         Ok(())
     }
 
-    /// Makes a join token.
+    /// Creates a join token.
     ///
     /// # Errors
-    /// Robots do not join this server, the site is not known, an impossible time, or too many.
+    /// This server has no authority, the site is not known, the validity is impossible, or there
+    /// are too many join tokens.
     pub async fn create_join_token(
         &self,
         request: CreateJoinToken,
@@ -263,7 +265,7 @@ impl App {
         })
     }
 
-    /// Join tokens for what is in a scope, newest first; dead ones too.
+    /// Returns the join tokens of a scope, newest first, with used, revoked and expired ones.
     pub async fn join_tokens(
         &self,
         within: &Scope,
@@ -275,7 +277,7 @@ impl App {
         Ok(page(tokens, limit, |token| token.id.to_string()))
     }
 
-    /// What a join token is for; `None` if it is not known.
+    /// Returns the site and robot that a join token is for; `None` if it is not known.
     pub async fn join_token_place(
         &self,
         id: JoinTokenId,
@@ -298,7 +300,7 @@ impl App {
         Ok(token)
     }
 
-    /// The newest enrolment of each robot of a site in a scope, by name.
+    /// Returns the newest enrolment of each robot of a site within a scope, ordered by name.
     pub async fn enrolments(
         &self,
         (site, within): (&SiteId, &Scope),
@@ -312,8 +314,8 @@ impl App {
         Ok(page(found, limit, |enrolment| enrolment.robot.to_string()))
     }
 
-    /// Puts a robot out of the fleet: from now on nothing that it says counts, its link is cut,
-    /// and it gets no certificate until it joins again by a token that names it.
+    /// Revokes a robot: its messages are refused, its link is closed, and it gets no certificate
+    /// until it joins again with a token that names it.
     ///
     /// # Errors
     /// [`AppError::UnknownRobot`] if it has never joined.
@@ -330,7 +332,7 @@ impl App {
         let enrolment = found.ok_or_else(unknown)?;
         let mut ended = None;
         if let Some(robot_pk) = db::robots::pk_of(&mut tx, site, robot).await? {
-            // Nobody misses it any more.
+            // A revoked robot is not reported as lost.
             ended = self.end_alert(&mut tx, robot_pk, ROBOT_LOST_ALERT).await?;
         }
         self.commit_enrolment(tx, &enrolment, ended.into_iter().collect())
@@ -339,7 +341,7 @@ impl App {
         Ok(enrolment)
     }
 
-    /// Commits, and then lets the registry and the events show it.
+    /// Commits, and then updates the registry and publishes the events.
     async fn commit_enrolment(
         &self,
         tx: Tx,
@@ -356,7 +358,7 @@ impl App {
         Ok(committed.await?)
     }
 
-    /// A robot of the fleet gets its next certificate.
+    /// Renews the certificate of a robot that has joined.
     ///
     /// # Errors
     /// [`EnrolError`]; all but `Request`, `Closed` and `App` look the same from outside.

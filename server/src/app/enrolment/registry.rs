@@ -1,4 +1,4 @@
-//! Which robots are of the fleet, in memory: asked for every message and every connection.
+//! In-memory registry of the robots that have joined, checked for every message and connection.
 
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -9,12 +9,12 @@ use tread_api::enrolment::Enrolment;
 
 use crate::app::presence::RobotKey;
 
-/// What a robot's newest enrolment says of it.
+/// State of a robot's newest enrolment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Standing {
-    /// It is of the fleet by this enrolment.
+    /// In force, with the enrolment's number.
     Enrolled(u32),
-    /// It was put out of the fleet; the number is that of the enrolment that ended.
+    /// Revoked, with the number of the enrolment that ended.
     Revoked(u32),
 }
 
@@ -30,7 +30,7 @@ impl Standing {
 #[derive(Debug)]
 pub struct EnrolmentRegistry {
     robots: RwLock<HashMap<RobotKey, Standing>>,
-    /// Whether only robots that have joined may speak.
+    /// Whether messages of robots that have not joined are refused.
     is_closed: AtomicBool,
     changes: watch::Sender<u64>,
 }
@@ -46,12 +46,13 @@ impl Default for EnrolmentRegistry {
 }
 
 impl EnrolmentRegistry {
-    /// From now on only robots that have joined may speak.
+    /// From now on refuses messages of robots that have not joined.
     pub(super) fn close(&self) {
         self.is_closed.store(true, Ordering::Relaxed);
     }
 
-    /// Takes in what the database says of a robot. What an earlier enrolment says comes too late.
+    /// Records an enrolment read from the database; ignored if a newer one, or its end, is recorded
+    /// already.
     pub(crate) fn note(&self, enrolment: &Enrolment) {
         let standing = match enrolment.revoked_at {
             None => Standing::Enrolled(enrolment.number),
@@ -71,13 +72,13 @@ impl EnrolmentRegistry {
         }
     }
 
-    /// How a robot stands; `None` if it has never joined.
+    /// Returns the state of a robot's enrolment; `None` if it has never joined.
     pub fn standing(&self, key: &RobotKey) -> Option<Standing> {
         let robots = self.robots.read().unwrap_or_else(PoisonError::into_inner);
         robots.get(key).copied()
     }
 
-    /// Whether a robot may speak, by whatever link.
+    /// Returns whether messages of a robot are accepted, over any link.
     pub fn may_speak(&self, key: &RobotKey) -> bool {
         match self.standing(key) {
             Some(Standing::Enrolled(_)) => true,
@@ -86,18 +87,18 @@ impl EnrolmentRegistry {
         }
     }
 
-    /// Whether a certificate of that enrolment still counts.
+    /// Returns whether this enrolment of the robot is in force.
     pub fn is_in_force(&self, key: &RobotKey, enrolment: u32) -> bool {
         self.standing(key) == Some(Standing::Enrolled(enrolment))
     }
 
-    /// Every robot that has ever joined.
+    /// Returns every robot that has ever joined.
     pub fn robots(&self) -> Vec<RobotKey> {
         let robots = self.robots.read().unwrap_or_else(PoisonError::into_inner);
         robots.keys().cloned().collect()
     }
 
-    /// Changes whenever a robot joins or is put out.
+    /// Returns a receiver of a counter that increases whenever a robot joins or is revoked.
     pub fn changes(&self) -> watch::Receiver<u64> {
         self.changes.subscribe()
     }

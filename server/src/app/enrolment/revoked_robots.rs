@@ -1,4 +1,4 @@
-//! Revoked robots that go on trying to connect: they raise alerts, not too often.
+//! Alerts about revoked robots that continue to connect, at a limited rate.
 
 use std::collections::HashMap;
 use std::sync::{Mutex, PoisonError};
@@ -13,16 +13,18 @@ use crate::app::{App, AppError};
 use crate::authority::RobotName;
 use crate::db::{self, Tx};
 
-/// What is raised about a robot that was put out and is still there.
+/// Code of the alert about a revoked robot that still tries to connect.
 pub(in crate::app) const REVOKED_ALERT: &str = "revoked-robot";
-/// What is raised about a robot whose certificate is of an authority that was retired.
+/// Code of the alert about a robot whose certificate was signed by a retired authority.
 pub(in crate::app) const RETIRED_ALERT: &str = "retired-authority";
-/// What is raised about a robot as which a certificate was shown that this server did not give.
+/// Code of the alert about a robot for which a certificate was shown that this server did not
+/// issue.
 pub(in crate::app) const UNISSUED_ALERT: &str = "unknown-certificate";
-/// How often one robot is looked at, at the most.
+/// Minimum interval between two notes about one robot.
 const NOTED_EVERY: Duration = Duration::from_mins(1);
 
-/// When each was noted last; no more than robots have ever joined.
+/// Time of the last note by robot, since the start of the server. At most one entry for each robot
+/// that has ever joined.
 #[derive(Debug, Default)]
 pub(super) struct RevokedRobots(Mutex<HashMap<RobotKey, Duration>>);
 
@@ -44,7 +46,8 @@ impl RevokedRobots {
 }
 
 impl App {
-    /// Whether a message of a robot counts; counts and tells of it if not.
+    /// Returns whether a robot's messages are accepted. If not, counts the refusal, and raises an
+    /// alert for a revoked robot.
     pub fn admits(&self, key: &RobotKey) -> bool {
         if self.enrolment_registry().may_speak(key) {
             return true;
@@ -59,7 +62,7 @@ impl App {
         false
     }
 
-    /// Tells of a robot that was put out and is still there.
+    /// Raises an alert if the robot is revoked and still tries to connect.
     pub fn note_outsider(&self, key: &RobotKey) {
         let is_out = matches!(
             self.enrolment_registry().standing(key),
@@ -71,7 +74,7 @@ impl App {
         }
     }
 
-    /// Tells of a robot whose certificate is of an authority that was retired.
+    /// Raises an alert that the robot's certificate was signed by a retired authority.
     pub(super) fn note_retired(&self, name: &RobotName) {
         let key = (name.site.clone(), name.robot.clone());
         if self.enrolment_registry().is_in_force(&key, name.enrolment) {
@@ -83,8 +86,8 @@ impl App {
         }
     }
 
-    /// Tells of a certificate that this server did not give: somebody else can sign, or somebody has an
-    /// old copy of what the robot has.
+    /// Raises an alert about a certificate that this server did not issue: somebody else has the
+    /// authority's key, or an old copy of the robot's data is in use.
     pub(super) fn note_unissued(&self, name: &RobotName) {
         let key = (name.site.clone(), name.robot.clone());
         let text = "a certificate was shown for a renewal that this server did not give, or gave long ago: \
@@ -94,7 +97,7 @@ impl App {
         self.tell(&key, UNISSUED_ALERT, text);
     }
 
-    /// Ends the alert about such a certificate of a robot.
+    /// Clears a robot's alert about an unissued certificate.
     pub(super) async fn end_unissued(
         &self,
         tx: &mut Tx,
@@ -108,7 +111,8 @@ impl App {
         Ok(ended.into_iter().collect())
     }
 
-    /// Logs what is said of a robot and raises an alert, not too often.
+    /// Logs a warning about a robot and raises its alert in the background, at most once per
+    /// interval.
     fn tell(&self, key: &RobotKey, code: &'static str, text: String) {
         let revoked_robots = &self.membership().revoked_robots;
         if !revoked_robots.is_due(key, self.clock().elapsed()) {
@@ -122,7 +126,7 @@ impl App {
                 app.log_failure("raise an alert about a robot that may not connect", &error);
             }
         };
-        // Whoever reads the messages of all robots does not wait for the database.
+        // The task that reads all robots' messages must not wait for the database.
         self.supervisor().spawn_passing("outsider", raising);
     }
 
@@ -141,7 +145,7 @@ impl App {
         Ok(self.commit_alerts(tx, raised.into_iter().collect()).await?)
     }
 
-    /// Ends the alerts of a robot that has joined again.
+    /// Clears the alerts of a robot that has joined again.
     pub(super) async fn end_outsider(
         &self,
         tx: &mut Tx,

@@ -1,9 +1,9 @@
-//! The rotation of the fleet's authority, as far as the fleet's robots are concerned: who was brought
-//! over, who is left, and who comes too late.
+//! Rotation of the fleet's authority: which robots have moved to the new authority, which are left,
+//! and which must join again.
 //!
-//! A robot counts as brought over when it has shown a certificate of the new authority at the robots'
-//! port, or for a renewal. That one was signed for it is not enough: the answer may have been lost.
-//! What it has shown says too which robots must join again after their authority was retired.
+//! A robot has moved once it has shown a certificate of the new authority at the robots' port or
+//! for a renewal. Signing one is not enough, since the answer may have been lost. The authority
+//! shown last also decides which robots must join again after the former authority was retired.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -21,14 +21,15 @@ use crate::app::{App, AppError};
 use crate::authority::{Authorities, RotationError, Trusted};
 use crate::db;
 
-/// Most robots that are listed as left.
+/// Maximum number of remaining robots in a list.
 const LEFT_LISTED_MAX: usize = 1_000;
-/// Most robots that a refusal names.
+/// Maximum number of remaining robots named in a refusal.
 const LEFT_NAMED_MAX: usize = 10;
-/// How often the disk is asked again whether it has what was decided.
+/// Interval at which an unconfirmed write of the authorities' files is tried again.
 const SETTLE_EVERY: Duration = Duration::from_secs(5);
 
-/// Whose certificate each robot showed last, as far as it is written down; so that it is written once.
+/// Enrolment and authority of the certificate that each robot showed last, as stored; avoids
+/// writing the same again.
 #[derive(Debug, Default)]
 pub(super) struct Shown(Mutex<HashMap<RobotKey, (u32, String)>>);
 
@@ -44,7 +45,7 @@ impl Shown {
         shown.insert(robot, (enrolment, authority.to_owned()));
     }
 
-    /// Something else was written.
+    /// Forgets a robot, because its row was changed otherwise.
     pub(super) fn forget(&self, robot: &RobotKey) {
         let mut shown = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         shown.remove(robot);
@@ -58,15 +59,15 @@ impl App {
             .ok_or(AppError::NoAuthority)
     }
 
-    /// Which authorities robots are to trust; `None` where they need no certificates.
+    /// Returns the identifier of the trusted authorities; `None` where robots need no certificates.
     pub fn trust_id(&self) -> Option<TrustId> {
         self.authorities().ok().map(|it| it.present().id())
     }
 
-    /// The fleet's authority, and how far its rotation is.
+    /// Returns the fleet's authority and the progress of its rotation.
     ///
     /// # Errors
-    /// Robots do not join this server, or the database failed.
+    /// This server has no authority, or the database failed.
     pub async fn fleet_authority(&self) -> Result<FleetAuthority, AppError> {
         let trusted = self.authorities()?.present();
         self.describe(&trusted).await
@@ -107,7 +108,7 @@ impl App {
         Ok(described)
     }
 
-    /// The enrolments that are in force.
+    /// Returns the enrolments that are in force.
     async fn in_force(&self) -> Result<Vec<Enrolment>, AppError> {
         let mut tx = self.db().read("enrolment").await?;
         let mut newest = db::enrolments::all_newest(&mut tx).await?;
@@ -115,7 +116,8 @@ impl App {
         Ok(newest)
     }
 
-    /// How many robots have shown a certificate of the authority that signs, and who has not.
+    /// Returns how many robots have shown a certificate of the signing authority, and the robots
+    /// that have not.
     fn moved_and_left(&self, in_force: &[Enrolment], trusted: &Trusted) -> (usize, Vec<RobotLeft>) {
         let signing = Some(trusted.signing().fingerprint());
         let has_moved = |enrolment: &&Enrolment| enrolment.authority.as_deref() == signing;
@@ -139,7 +141,7 @@ impl App {
     /// Starts a rotation of the fleet's authority.
     ///
     /// # Errors
-    /// Robots do not join this server, one is under way, or the files cannot be written.
+    /// This server has no authority, a rotation is under way, or the files cannot be written.
     pub async fn start_rotation(&self, by: &str) -> Result<FleetAuthority, AppError> {
         let (authorities, by) = (Arc::clone(self.authorities()?), by.to_owned());
         let now = self.clock().machine_time();
@@ -151,12 +153,12 @@ impl App {
         self.describe(&trusted).await
     }
 
-    /// Finishes the rotation of the fleet's authority: the former one is no longer trusted, and who has
-    /// no certificate of the new one must join again.
+    /// Finishes the rotation of the fleet's authority: the former authority is no longer trusted,
+    /// and robots without a certificate of the new one must join again.
     ///
     /// # Errors
-    /// None is under way or another one, robots are left and it is not forced, or the files cannot be
-    /// written.
+    /// No rotation or another one is under way, robots are left and `force` is not set, or the
+    /// files cannot be written.
     pub async fn finish_rotation(
         &self,
         request: &FinishRotation,
@@ -183,12 +185,12 @@ impl App {
         self.describe(&trusted).await
     }
 
-    /// Puts another authority in the place of all that are trusted: no certificate of before opens
-    /// anything from now on, and every robot must join again.
+    /// Replaces all trusted authorities by a new one: no earlier certificate is accepted from now
+    /// on, and every robot must join again.
     ///
     /// # Errors
-    /// Robots do not join this server, another authority than was named signs, or the files cannot be
-    /// written.
+    /// This server has no authority, the signing authority is not the one named, or the files
+    /// cannot be written.
     pub async fn replace_authority(
         &self,
         request: &ReplaceAuthority,
@@ -206,7 +208,7 @@ impl App {
         self.describe(&trusted).await
     }
 
-    /// Asks the disk again and again for what it has not confirmed, until it does.
+    /// Retries the write of the authorities' files in the background until the disk confirms it.
     fn settle_authorities(&self) {
         let Ok(authorities) = self.authorities() else {
             return;
@@ -237,7 +239,7 @@ impl App {
         });
     }
 
-    /// Notes whose certificate a robot has shown at the robots' port, once there was a rotation.
+    /// Records whose certificate a robot has shown at the robots' port, once there was a rotation.
     pub async fn note_shown(&self, robot: &RobotKey, enrolment: u32, authority: &str) {
         let matters = self.authorities().is_ok_and(|authorities| {
             let present = authorities.present();
@@ -249,7 +251,8 @@ impl App {
         }
         let writing = async {
             let one = (&robot.0, &robot.1, enrolment);
-            // All robots come back after a restart, and few of them show anything new.
+            // All robots reconnect after a restart, and few of them show another authority than
+            // before.
             let mut tx = self.db().read("enrolment").await?;
             let newest = db::enrolments::newest(&mut tx, &robot.0, &robot.1).await?;
             drop(tx);
@@ -267,7 +270,7 @@ impl App {
                 let (site, robot) = robot;
                 info!(robot.id = %robot, "robot `{robot}` of site `{site}` shows a certificate of `{authority}`");
             }
-            // Its next connection or renewal tells it again.
+            // The robot's next connection or renewal records it again.
             Err::<(), AppError>(error) => {
                 self.log_failure("note whose certificate a robot shows", &error);
             }
@@ -287,7 +290,7 @@ fn ended(
     }
 }
 
-/// Whether a robot must join again. One that has shown nothing since that is noted has not shown a
+/// Returns whether a robot must join again. A robot without a recorded authority has not shown a
 /// certificate of the new authority before the former one was retired.
 fn must_join(enrolment: &Enrolment, trusted: &Trusted) -> bool {
     match &enrolment.authority {
@@ -296,14 +299,14 @@ fn must_join(enrolment: &Enrolment, trusted: &Trusted) -> bool {
     }
 }
 
-/// How many there are, and the first of them.
+/// Returns the number of robots and the first of them.
 fn counted(mut robots: Vec<RobotLeft>) -> (u32, Vec<RobotLeft>) {
     let count = u32::try_from(robots.len()).unwrap_or(u32::MAX);
     robots.truncate(LEFT_LISTED_MAX);
     (count, robots)
 }
 
-/// The first of those that are left, for people.
+/// Formats the first of the remaining robots for people.
 fn named(left: &[RobotLeft]) -> String {
     let names = left.iter().take(LEFT_NAMED_MAX);
     let names: Vec<String> = names

@@ -1,4 +1,4 @@
-//! The one task that looks for what is new, and publishes it.
+//! The task that collects changes and publishes them.
 
 use std::collections::{HashMap, HashSet};
 use std::time::Duration;
@@ -15,11 +15,11 @@ use crate::app::presence::RobotKey;
 use crate::db::robots::RobotRow;
 use crate::db::{self, DbError};
 
-/// How often robots are looked at.
+/// Polling interval for changes of robots.
 pub const FEED_PERIOD: Duration = Duration::from_millis(100);
-/// Steps of missions in one look.
+/// Maximum number of mission transitions per poll.
 const STEPS_MAX: u32 = 500;
-/// Robots whose rows are read afresh at most this often.
+/// Minimum interval between two reads of the robots' rows.
 const ROWS_PERIOD: Duration = Duration::from_secs(1);
 
 /// Publishes until the stop.
@@ -45,24 +45,24 @@ pub async fn run(app: App, stop: CancellationToken) {
     app.hub().close();
 }
 
-/// Robots with the alerts that are raised about them.
+/// Robots' rows, with the alerts that are raised about each.
 type Rows = HashMap<RobotKey, (RobotRow, Vec<Alert>)>;
 
 struct Feed {
     app: App,
     last_step: Option<i64>,
-    /// Missions that have moved and have not been published since, and whether they have ended; at
-    /// most [`STEPS_MAX`] more than those of the last look.
+    /// Missions that changed state and are not published yet, and whether they have ended; at most
+    /// [`STEPS_MAX`] more than after the poll before.
     moved: HashMap<MissionId, bool>,
     rows: Rows,
-    /// The generation of the rows, and when they were read.
+    /// Generation of the rows, and when they were read (time since the start).
     rows_of: (u64, Option<Duration>),
 }
 
 impl Feed {
     async fn look(&mut self) -> Result<(), AppError> {
         let now = self.app.clock().elapsed();
-        // What robots say of themselves goes on while the database does not.
+        // Live states of robots are published also while the database fails.
         let steps = self.steps().await;
         let robots = self.robots(now).await;
         self.app.hub().sweep(now);
@@ -72,11 +72,11 @@ impl Feed {
     async fn steps(&mut self) -> Result<(), AppError> {
         let mut tx = self.app.db().read("events").await?;
         let Some(mut last) = self.last_step else {
-            // What was before the start is in every snapshot.
+            // Transitions before the start are in every snapshot.
             self.last_step = Some(db::history::newest_step(&mut tx).await?);
             return Ok(());
         };
-        // Those that could not be read before come first.
+        // Transitions that could not be read before are published first.
         let room = if self.moved.is_empty() { STEPS_MAX } else { 0 };
         let steps = db::history::steps_after(&mut tx, last, room).await?;
         if u32::try_from(steps.len()).is_ok_and(|count| count >= STEPS_MAX) {
@@ -90,13 +90,14 @@ impl Feed {
             let event = Event::Step(Box::new(step));
             self.app.hub().publish(&event, Topic::Missions, robot);
         }
-        // Published once, whatever becomes of the rest.
+        // Each transition is published once, even if the rest fails.
         self.last_step = Some(last);
         let moved: Vec<MissionId> = self.moved.keys().copied().collect();
         for id in moved {
             let row = match db::missions::find(&mut tx, id).await {
                 Ok(row) => row,
-                // It will not read later either; its steps are sent all the same.
+                // A corrupt row stays unreadable; the mission's transitions are published all the
+                // same.
                 Err(cause @ DbError::Corrupt { .. }) => {
                     self.app
                         .log_failure("read a mission that has moved", &cause);
@@ -142,7 +143,7 @@ impl Feed {
                 }
             }
             self.rows = rows;
-            // After a failure they are read again when they are due.
+            // After a failure the rows are read again when the interval has passed.
             let read = if failed.is_some() {
                 self.rows_of.0
             } else {

@@ -1,4 +1,4 @@
-//! The clients of the feed with their bounded buffers, and the newest events.
+//! Clients of the feed with their bounded buffers, and the newest events.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -17,13 +17,13 @@ use super::sent::{About, EventFilter, Sent, unnumbered};
 use super::snapshot::{SNAPSHOT_READ_MAX, Snapshots};
 use crate::app::presence::RobotKey;
 
-/// Events that wait for one client.
+/// Maximum number of events buffered for one client.
 pub const CLIENT_BUFFER: usize = 4_096;
-/// Bytes of events that wait for one client; a single event may be larger.
+/// Maximum number of bytes buffered for one client; a single event may be larger.
 pub const CLIENT_BYTES_MAX: usize = 4 * 1024 * 1024;
-/// Newest events that are kept for clients that come back.
+/// Maximum number of recent events kept for clients that reconnect.
 pub const KEPT_EVENTS_MAX: usize = 8_192;
-/// Bytes of them.
+/// Maximum number of bytes of those recent events.
 pub const KEPT_BYTES_MAX: usize = 32 * 1024 * 1024;
 /// How long a client that was dropped may take to read its end.
 const LINGER: Duration = Duration::from_secs(5);
@@ -31,7 +31,7 @@ const LINGER: Duration = Duration::from_secs(5);
 /// The clients, and the newest events.
 #[derive(Debug)]
 pub struct Hub {
-    /// Tells the events of one run of the server from those of another.
+    /// Identifier of this run of the server, part of event identifiers.
     pub(super) run: String,
     pub(super) state: Mutex<HubState>,
     pub(super) snapshots: Snapshots,
@@ -46,7 +46,7 @@ pub(super) struct HubState {
     pub(super) dropped: Vec<(Option<Duration>, CancellationToken)>,
     pub(super) next_client: u64,
     pub(super) dropped_count: u64,
-    /// Goes up whenever the last client leaves.
+    /// Incremented whenever the last client leaves.
     gathering: u64,
 }
 
@@ -57,7 +57,7 @@ impl HubState {
         Some(client)
     }
 
-    /// Drops clients that read too slowly: they get what waits for them, and an end.
+    /// Drops clients that read too slowly: they get the buffered events and an end.
     fn drop_slow(&mut self, slow: Vec<u64>) {
         for id in slow {
             if let Some(client) = self.remove(id) {
@@ -73,17 +73,17 @@ impl HubState {
 pub(super) struct Client {
     pub(super) filter: EventFilter,
     pub(super) buffer: mpsc::Sender<Arc<Sent>>,
-    /// Bytes that wait in the buffer.
+    /// Bytes in the buffer.
     pub(super) waiting: Arc<AtomicUsize>,
     pub(super) cut: CancellationToken,
-    /// Since when it is subscribed.
+    /// Time of subscription, since the start of the server.
     pub(super) since: Duration,
     /// Whether it has read its snapshot.
     pub(super) has_begun: Arc<AtomicBool>,
 }
 
 impl Client {
-    /// Puts an event into the buffer; false if it is full.
+    /// Puts an event into the buffer; returns false if the buffer is full.
     fn take(&self, event: &Arc<Sent>) -> bool {
         let bytes = event.text.len();
         let before = self.waiting.fetch_add(bytes, Ordering::Relaxed);
@@ -93,7 +93,7 @@ impl Client {
 }
 
 impl Hub {
-    /// No clients and no events yet.
+    /// Creates a hub without clients or events.
     pub(in crate::app) fn new(started_at: Timestamp) -> Self {
         Self {
             run: format!("{:x}", started_at.as_microsecond()),
@@ -106,29 +106,29 @@ impl Hub {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// How many clients there are.
+    /// Returns the number of clients.
     pub fn client_count(&self) -> usize {
         self.lock().clients.len()
     }
 
-    /// How many clients were dropped because they read too slowly.
+    /// Returns the number of clients that were dropped because they read too slowly.
     pub fn dropped_count(&self) -> u64 {
         self.lock().dropped_count
     }
 
-    /// The most events that wait for any client.
+    /// Returns the largest number of events buffered for any client.
     pub fn longest_buffer(&self) -> usize {
         let state = self.lock();
         let waiting = |client: &Client| CLIENT_BUFFER - client.buffer.capacity();
         state.clients.values().map(waiting).max().unwrap_or(0)
     }
 
-    /// The newest event.
+    /// Returns the sequence number of the newest event.
     pub(super) fn newest(&self) -> u64 {
         self.lock().seq
     }
 
-    /// A number of the present clients, which another one gets when all of them have left.
+    /// Returns a number that changes whenever the last client has left.
     pub(super) fn gathering(&self) -> u64 {
         self.lock().gathering
     }
@@ -137,7 +137,7 @@ impl Hub {
         self.lock().next_client == u64::MAX
     }
 
-    /// Ends all streams; no further client is taken.
+    /// Ends all streams and accepts no further client.
     pub(super) fn close(&self) {
         let mut state = self.lock();
         state.next_client = u64::MAX;
@@ -148,7 +148,7 @@ impl Hub {
         self.publish_about(event, topic, Some((site, Some(robot))));
     }
 
-    /// Publishes what is about a robot, a site, or, without either, the server.
+    /// Publishes an event about a robot, a site, or, with neither, the server.
     fn publish_about(&self, event: &Event, topic: Topic, about: Option<About>) {
         let mut state = self.lock();
         state.seq += 1;
@@ -176,22 +176,22 @@ impl Hub {
         state.drop_slow(slow);
     }
 
-    /// Publishes where the map of a site has changed.
+    /// Publishes the areas of a site in which the map has changed.
     pub(in crate::app) fn map(&self, change: &MapChange) {
         let about = (change.site.clone(), None);
         let event = Event::Map(Box::new(change.clone()));
         self.publish_about(&event, Topic::Map, Some(about));
     }
 
-    /// Publishes an alert as it is now.
+    /// Publishes the present state of an alert.
     pub(in crate::app) fn alert(&self, alert: &Alert) {
         let about = alert.robot_key().map(|(site, robot)| (site, Some(robot)));
         let event = Event::Alert(Box::new(alert.clone()));
         self.publish_about(&event, Topic::Alerts, about);
     }
 
-    /// Drops clients that do not read their snapshot in time, and cuts the connections of those
-    /// that did not even read their end.
+    /// Drops clients that do not read their snapshot in time, and closes the connections of those
+    /// that did not read their end either.
     pub(super) fn sweep(&self, now: Duration) {
         let mut state = self.lock();
         let late = state.clients.iter().filter(|(_, client)| {
@@ -210,7 +210,7 @@ impl Hub {
         });
     }
 
-    /// What a client missed since an event; `None` if that is out of reach.
+    /// Returns the events that a client missed since `last`; `None` if they are no longer kept.
     pub(super) fn missed(&self, last: &str, filter: &EventFilter) -> Option<VecDeque<Arc<Sent>>> {
         let (run, seq) = last.rsplit_once('-')?;
         let seq: u64 = seq.parse().ok()?;
@@ -220,7 +220,7 @@ impl Hub {
         self.since(seq, filter)
     }
 
-    /// What a client wants of what was published since an event; `None` if that is out of reach.
+    /// Returns the events since `seq` that pass a filter; `None` if they are no longer kept.
     pub(super) fn since(&self, seq: u64, filter: &EventFilter) -> Option<VecDeque<Arc<Sent>>> {
         let state = self.lock();
         let oldest = state.kept.front().map_or(state.seq + 1, |event| event.seq);

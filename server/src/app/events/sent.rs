@@ -1,4 +1,4 @@
-//! Events as they are sent, and which of them a client wants.
+//! Encoded events, and the filter of a client.
 
 use std::collections::HashSet;
 
@@ -6,10 +6,10 @@ use tread_api::event::{Event, Topic};
 use tread_api::ids::{RobotId, SiteId};
 use tread_api::rights::Scope;
 
-/// One event, ready to be sent.
+/// One encoded event.
 #[derive(Debug)]
 pub struct Sent {
-    /// What a client gives back as `Last-Event-ID`; `None` within a snapshot.
+    /// Identifier that a client returns as `Last-Event-ID`; `None` within a snapshot.
     pub id: Option<String>,
     /// Its name.
     pub name: &'static str,
@@ -20,10 +20,10 @@ pub struct Sent {
     pub(super) about: Option<About>,
 }
 
-/// What an event is about: a robot of a site, or the site as a whole.
+/// Subject of an event: a robot of a site, or, with `None`, the site as a whole.
 pub(super) type About = (SiteId, Option<RobotId>);
 
-/// What a client wants to hear of; what is empty lets everything through.
+/// Filter of a client; an empty field lets everything through.
 #[derive(Debug, Clone, Default)]
 pub struct EventFilter {
     /// Only these topics.
@@ -32,7 +32,7 @@ pub struct EventFilter {
     pub site: Option<SiteId>,
     /// Only these robots.
     pub robots: HashSet<RobotId>,
-    /// Only what is in this scope, and what is about the server.
+    /// Only events within this scope, and those about the server.
     pub within: Scope,
 }
 
@@ -41,7 +41,7 @@ impl EventFilter {
         let of_topic = topic.is_none_or(|topic| self.wants(topic));
         let is_about = |about: &About| match about {
             (site, Some(robot)) => self.wants_robot(site, robot),
-            // What is no robot's is of whoever asks for its topic or for everything.
+            // A filter on robots does not exclude events about a whole site.
             (site, None) => {
                 self.site.as_ref().is_none_or(|wanted| wanted == site)
                     && self.within.includes_site(site)

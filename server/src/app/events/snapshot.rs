@@ -1,8 +1,9 @@
-//! What a client gets first: everything as it stands now.
+//! Snapshots: the present state of everything, sent to a client first.
 //!
-//! Clients often come together, after a restart or a cut, so they share what was built within
-//! [`SHARED_FOR`]; what happened since is in the events that are kept. One that is still being read
-//! stays in memory: all of them together are bounded, and each must be read in time.
+//! Clients often connect together, after a restart or an outage, so they share a snapshot built
+//! within the last [`SHARED_FOR`]; later events come from those that are kept. A snapshot stays in
+//! memory while a client reads it: the bytes of all snapshots are bounded, and each must be read in
+//! time.
 
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::{Arc, Weak};
@@ -23,27 +24,27 @@ use crate::db;
 use crate::db::alerts::AlertFilter;
 use crate::db::missions::MissionFilter;
 
-/// How old a snapshot may be that another client gets too.
+/// Maximum age of a snapshot that is shared with another client.
 const SHARED_FOR: Duration = Duration::from_millis(100);
-/// Bytes of snapshots that are being read beyond which none is built.
+/// Maximum number of bytes of snapshots being read; beyond it no further one is built.
 pub const SNAPSHOT_BYTES_MAX: usize = 128 * 1024 * 1024;
-/// How long a client may take to read its snapshot.
+/// Maximum time in which a client must read its snapshot.
 pub(super) const SNAPSHOT_READ_MAX: Duration = Duration::from_mins(1);
 /// Missions in a snapshot: all that are open, and the newest.
 const MISSIONS_MAX: u32 = 1_000;
-/// Bytes of trajectories at which a snapshot stops naming ended missions.
+/// Bytes of trajectories beyond which a snapshot leaves out ended missions.
 const MISSIONS_BYTES_MAX: usize = 4 * 1024 * 1024;
 
-/// Everything as it stood at one event, for all clients of the same topics, site and scope.
+/// Present state at one event, for all clients of the same topics, site and scope.
 #[derive(Debug)]
 pub(super) struct Snapshot {
-    /// The newest event that it holds already.
+    /// Sequence number of the newest event that is included.
     covered: u64,
     events: Vec<Arc<Sent>>,
     bytes: usize,
 }
 
-/// A client's place in a snapshot.
+/// A client's reading position in a snapshot.
 #[derive(Debug)]
 pub(super) struct Reading {
     snapshot: Arc<Snapshot>,
@@ -52,12 +53,12 @@ pub(super) struct Reading {
 }
 
 impl Reading {
-    /// The newest event that the snapshot holds already.
+    /// Returns the sequence number of the newest event that the snapshot includes.
     pub(super) fn covered(&self) -> u64 {
         self.snapshot.covered
     }
 
-    /// The next event that the client wants; `None` after the last.
+    /// Returns the next event that passes the client's filter; `None` after the last.
     pub(super) fn next(&mut self) -> Option<Arc<Sent>> {
         let rest = self.snapshot.events.get(self.next..)?;
         let wanted =
@@ -68,7 +69,7 @@ impl Reading {
     }
 }
 
-/// For whom a snapshot was built.
+/// Filter for which a snapshot was built.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Scope {
     topics: HashSet<Topic>,
@@ -76,22 +77,22 @@ struct Scope {
     within: rights::Scope,
 }
 
-/// A snapshot that somebody may be reading.
+/// A snapshot that clients may be reading.
 #[derive(Debug)]
 struct Built {
     scope: Scope,
     at: Duration,
-    /// Of the clients: what happens while there is none is not published.
+    /// Gathering of clients: nothing is published while there is no client.
     gathering: u64,
     snapshot: Weak<Snapshot>,
 }
 
-/// The snapshots that are being read, oldest first; who builds one holds it.
+/// Snapshots being read, oldest first; locked while one is built.
 #[derive(Debug, Default)]
 pub(super) struct Snapshots(tokio::sync::Mutex<Vec<Built>>);
 
 impl App {
-    /// A snapshot for a client that is subscribed already, and what has happened since.
+    /// Returns a snapshot for a client that is already subscribed, and the events since.
     pub(super) async fn snapshot_for(
         &self,
         filter: &EventFilter,
@@ -106,7 +107,8 @@ impl App {
         let alive = all.iter().filter_map(|built| built.snapshot.upgrade());
         let is_full = alive.map(|snapshot| snapshot.bytes).sum::<usize>() >= SNAPSHOT_BYTES_MAX;
         let (now, gathering) = (self.clock().elapsed(), self.hub().gathering());
-        // Where no further one may be built, an older one and what is kept do as well.
+        // If the memory for a further snapshot is missing, an older one and the kept events are
+        // used.
         let usable = all.iter().rev().filter(|built| {
             let young = now.saturating_sub(built.at) <= SHARED_FOR;
             built.scope == scope && built.gathering == gathering && (young || is_full)
@@ -132,7 +134,7 @@ impl App {
                     gathering,
                     snapshot: Arc::downgrade(&snapshot),
                 });
-                // What was not kept since is in the client's own buffer.
+                // Events that are no longer kept are in the client's own buffer.
                 let since = self.hub().since(snapshot.covered, filter);
                 (snapshot, since.unwrap_or_default())
             }
@@ -213,7 +215,7 @@ impl App {
         })
     }
 
-    /// The newest missions, and older ones that have not ended; oldest first.
+    /// Returns the newest missions and older open ones, oldest first.
     async fn missions_to_show(
         &self,
         tx: &mut db::Tx,

@@ -1,4 +1,4 @@
-//! Where a visit would teach most, and what each robot has put in.
+//! Cells whose measurement would improve the map most, and each robot's contribution to the map.
 
 use std::collections::BTreeMap;
 
@@ -17,16 +17,18 @@ use crate::friction::Ground;
 use crate::friction::index::{Contribution, SiteMap};
 use crate::friction::sums::HOUR_S;
 
-/// Most cells that one question about visits looks at.
+/// Maximum number of cells that one request for visits may cover.
 const LOOKED_AT_MAX: f64 = 262_144.0;
-/// Standard deviation of θ over θ of one ordinary visit by one robot, with the robot's own bias.
+/// Relative standard deviation of θ (σ/θ) of one ordinary visit by one robot, including the robot's
+/// own bias.
 const VISIT_DEVIATION_RATIO: f64 = 0.13;
-/// The same of ground of which nothing is known: a factor of three either way.
+/// Relative standard deviation of θ assumed for unmeasured ground: about a factor of three either
+/// way.
 const UNKNOWN_DEVIATION_RATIO: f64 = 1.1;
 
 impl App {
-    /// Cells of a box in which a visit would shrink the standard deviation of θ most, the best
-    /// first.
+    /// Returns the cells of a box in which a visit would reduce the standard deviation of θ most,
+    /// best first.
     pub async fn visits_worth_most(
         &self,
         site: &SiteId,
@@ -72,7 +74,7 @@ impl App {
         })
     }
 
-    /// What each robot has put into the map of a site, by name.
+    /// Returns each robot's contribution to the map of a site, ordered by name.
     pub async fn contributions(
         &self,
         (site, within): (&SiteId, &Scope),
@@ -126,13 +128,13 @@ fn suggested(
         .filter(|group| group.terrain.map(|found| &found.id) == terrain.map(|found| &found.id))
         .filter_map(|group| reading.fused(group, Ground::Cell))
         .min_by(|left, right| left.std_dev.total_cmp(&right.std_dev));
-    // Nobody is sent to where nothing is drawn and nobody has been.
+    // Unvisited ground outside every terrain is not suggested.
     if terrain.is_none() && known.is_none() {
         return None;
     }
     let relative = known.map(|known| known.std_dev / known.theta);
     let now = relative.unwrap_or(UNKNOWN_DEVIATION_RATIO);
-    // Two words on the same value: 1/σ'² = 1/σ² + 1/σ_v².
+    // Two independent measurements of the same value: 1/σ'² = 1/σ² + 1/σ_v².
     let gain = 0.5 * (now / VISIT_DEVIATION_RATIO).powi(2).ln_1p();
     Some(VisitSuggestion {
         cell,
@@ -145,7 +147,8 @@ fn suggested(
     })
 }
 
-/// Each robot's θ over the one of all robots of its model, the median over terrains.
+/// Returns, for each robot, the median over terrains of its θ divided by the θ of all robots of its
+/// model.
 fn biases(map: &SiteMap, view: &SiteView, reading: &Reading) -> BTreeMap<RobotId, f64> {
     let mut ratios: BTreeMap<RobotId, Vec<f64>> = BTreeMap::new();
     for terrain in &view.terrains {

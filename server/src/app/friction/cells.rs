@@ -1,4 +1,4 @@
-//! What is known of places: a point, the cells of a box, and how they differ between two times.
+//! Friction at places: at a point, in the cells of a box, and its change between two times.
 
 use std::collections::BTreeMap;
 
@@ -15,10 +15,10 @@ use super::{App, AppError, Asked, Reading, SiteView, page, site_row, terrain_ref
 use crate::friction::Ground;
 use crate::friction::index::{Group, SiteMap};
 
-/// Most cells that a box with a resolution may have.
+/// Maximum number of squares that a box with a resolution may have.
 pub const CELLS_MAX: f64 = 4_194_304.0;
 
-/// A rectangle of a site.
+/// An axis-aligned rectangle in the site frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Area {
     /// The corner with the lowest coordinates.
@@ -28,10 +28,10 @@ pub struct Area {
 }
 
 impl Area {
-    /// From bounds that may be left out: the whole map then.
+    /// Makes an area from bounds in metres; without any it is the whole map.
     ///
     /// # Errors
-    /// A bound that is no place, or a box that is inside out.
+    /// A bound is not on the map, or a lower bound is above the upper one.
     pub fn new(
         min: (Option<f64>, Option<f64>),
         max: (Option<f64>, Option<f64>),
@@ -76,29 +76,30 @@ impl Area {
         Ok((cell(self.min)?, cell(self.max)?))
     }
 
-    /// How many cells of this size it has, as a number that may be large.
+    /// Returns the number of squares of side `size_m` in the area; a float, since it may be very
+    /// large.
     pub(super) fn count(&self, size_m: f64) -> f64 {
         let count = |low: f64, high: f64| ((high - low) / size_m).floor() + 1.0;
         count(self.min.x_m, self.max.x_m) * count(self.min.y_m, self.max.y_m)
     }
 }
 
-/// Which cells are asked for.
+/// The cells that a request asks for.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CellsAsked<'query> {
     /// Where.
     pub area: Area,
-    /// Side of the squares that cells are put together to, metres; the grid's own when absent.
+    /// Side of the squares into which cells are joined, metres; `None` for the grid's own cells.
     pub resolution_m: Option<f64>,
-    /// The last cell of the page before.
+    /// Last cell of the preceding page.
     pub cursor: Option<&'query str>,
-    /// Most cells.
+    /// Maximum number of cells.
     pub limit: u32,
 }
 
 impl App {
-    /// The friction of the cells in an area, row by row. The limit counts cells; a cell gives one
-    /// entry per terrain and robot model.
+    /// Returns the friction of the cells in an area, row by row. The limit counts cells; a cell
+    /// gives one entry per terrain and robot model.
     pub async fn friction_of_cells(
         &self,
         site: &SiteId,
@@ -142,7 +143,7 @@ impl App {
         Ok(self.off_thread(looking).await)
     }
 
-    /// What is known of the ground at a point: only what was measured on the terrain under it.
+    /// Returns the friction at a point, from measurements on the terrain at this point alone.
     pub async fn friction_at(
         &self,
         site: &SiteId,
@@ -181,7 +182,7 @@ impl App {
             });
             models.collect::<Vec<_>>()
         });
-        // What the class is like elsewhere is asked only where nothing was measured.
+        // The prior of the terrain's class is needed only where nothing was measured.
         let models = match terrain {
             Some(terrain) if measured.is_empty() => {
                 let classes = self.classes(view, reading);
@@ -203,7 +204,8 @@ impl App {
         }
     }
 
-    /// How cells that were measured between two times differ from before to after.
+    /// Returns the differences of friction between two times, for cells that were measured in
+    /// between.
     pub async fn friction_difference(
         &self,
         site: &SiteId,
@@ -254,7 +256,7 @@ impl App {
     }
 }
 
-/// What is known of a square, per terrain and configuration.
+/// Returns the friction of a square, per terrain and configuration.
 pub(super) fn of_square(
     map: &SiteMap,
     reading: &Reading,
@@ -308,7 +310,7 @@ fn differences(map: &SiteMap, cell: Cell, early: &Reading, late: &Reading) -> Ve
     both.collect()
 }
 
-/// Revisions that are the same ground, together.
+/// Joins groups of the same configuration, measured on several revisions of the same ground.
 pub(super) fn same_ground<'map>(groups: impl Iterator<Item = Group<'map>>) -> Vec<Group<'map>> {
     let mut joined: Vec<Group<'map>> = Vec::new();
     for group in groups {
@@ -326,7 +328,7 @@ pub(super) fn same_ground<'map>(groups: impl Iterator<Item = Group<'map>>) -> Ve
     joined
 }
 
-/// Cells of the grid along a side of a square of this resolution.
+/// Returns the number of grid cells along the side of a square of this resolution.
 pub(super) fn factor(grid: &Grid, resolution_m: Option<f64>) -> Result<i32, AppError> {
     let Some(resolution_m) = resolution_m else {
         return Ok(1);
@@ -361,10 +363,10 @@ fn check_count(area: &Area, resolution_m: Option<f64>) -> Result<(), AppError> {
     Ok(())
 }
 
-/// A square and the cells of the grid in it that hold anything; none where it is a cell itself.
+/// A square and those grid cells in it that hold measurements; `None` where the square is one cell.
 pub(super) type CellGroup = (Cell, Option<Vec<Cell>>);
 
-/// Squares that hold anything, row by row.
+/// Returns the squares that hold measurements, row by row.
 pub(super) fn squares(
     map: &SiteMap,
     factor: i32,
@@ -387,7 +389,7 @@ pub(super) fn squares(
     let mut found: Vec<CellGroup> = Vec::new();
     let mut row = after.map_or(min.iy, |after| after.iy.max(min.iy));
     while row <= max.iy && found.len() < wanted {
-        // The next row of the grid with anything in it tells the next row of squares.
+        // The next grid row with measurements determines the next row of squares.
         let low = first(Cell {
             ix: min.ix,
             iy: row,

@@ -1,5 +1,5 @@
-//! The terrains as they are drawn: which ground lies under a point, and whether what was measured on
-//! a ground counts there.
+//! The terrains in their present shape: finds the terrain at a point, and whether a measurement
+//! applies to it.
 
 use tread_api::geometry::Point;
 use tread_api::ids::TerrainId;
@@ -8,7 +8,7 @@ use tread_api::terrain::{Terrain, TerrainRef, TerrainShape, terrain_at};
 use super::{SiteView, terrain_ref};
 use crate::friction::index::GROUND_NONE;
 
-/// Whether what was measured on a ground counts where this terrain is drawn now.
+/// Returns whether a measurement on a ground applies where this terrain is drawn now.
 pub(super) fn is_here(
     view: &SiteView,
     measured_on: Option<&TerrainRef>,
@@ -21,7 +21,7 @@ pub(super) fn is_here(
     }
 }
 
-/// The terrains as they are drawn, to find the one under a point.
+/// The terrains in their present shape, for finding the one at a point.
 pub(super) struct Drawn<'view> {
     pub(super) terrains: &'view [Terrain],
     shapes: Vec<TerrainShape>,
@@ -47,7 +47,8 @@ impl<'view> Drawn<'view> {
             .find(|terrain| terrain.id == shape.terrain.id)
     }
 
-    /// The number of a ground that measurements name; `None` where it is drawn no more.
+    /// Returns the number of the ground on which a measurement was made; `None` if that ground is
+    /// no longer on the map.
     pub(super) fn ground_of(&self, view: &SiteView, found: Option<&TerrainRef>) -> Option<u16> {
         let Some(found) = found else {
             return Some(GROUND_NONE);
@@ -56,13 +57,13 @@ impl<'view> Drawn<'view> {
         view.is_present(found).then_some(place)
     }
 
-    /// The number of a terrain, from 1.
+    /// Returns the number of a terrain, from 1, in the order of the list.
     fn place(&self, id: &TerrainId) -> Option<u16> {
         let place = self.terrains.iter().position(|terrain| terrain.id == *id)?;
         u16::try_from(place + 1).ok()
     }
 
-    /// Terrains whose outlines come near a box.
+    /// Returns the terrains whose bounding boxes touch a box.
     pub(super) fn near(&self, low: Point, high: Point) -> Near<'view> {
         let touches = |terrain: &Terrain| {
             let corners = terrain.polygon.corners();
@@ -78,7 +79,7 @@ impl<'view> Drawn<'view> {
             .zip(self.terrains)
             .filter(|(_, terrain)| touches(terrain))
             .collect();
-        // As `terrain_at` has it: the higher layer counts, of equal ones the smaller identifier.
+        // Same order as in `terrain_at`: highest layer first, then smallest identifier.
         found.sort_by(|(_, left), (_, right)| {
             let by_layer = right.layer.cmp(&left.layer);
             by_layer.then_with(|| left.id.cmp(&right.id))
@@ -87,13 +88,13 @@ impl<'view> Drawn<'view> {
     }
 }
 
-/// Terrains that a box touches, in the order in which they count.
+/// Terrains whose bounding boxes touch a box, in order of precedence.
 pub(super) struct Near<'view> {
     found: Vec<(u16, &'view Terrain)>,
 }
 
 impl Near<'_> {
-    /// The number of the ground at a point.
+    /// Returns the number of the ground at a point.
     pub(super) fn ground_at(&self, point: Point) -> u16 {
         let mut here = self.found.iter();
         here.find(|(_, terrain)| terrain.polygon.contains(point))

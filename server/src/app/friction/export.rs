@@ -1,4 +1,4 @@
-//! Everything that is known, or was measured, piece by piece: only one piece is ever held.
+//! Exports of the friction map and of raw measurements, in chunks; only one chunk is in memory.
 
 use std::hash::Hash;
 
@@ -16,9 +16,9 @@ use crate::db::segments::SegmentFilter;
 use crate::db::sites::SiteRow;
 use crate::formats::table::{TableError, Writer};
 
-/// Cells of one piece.
+/// Number of cells per chunk.
 const CELLS_PIECE: usize = 4_096;
-/// Measurements of one piece; a group of rows of a Parquet file.
+/// Number of measurements per chunk, which is a row group of a Parquet file.
 const SEGMENTS_PIECE: u32 = 4_096;
 
 impl From<TableError> for AppError {
@@ -27,7 +27,7 @@ impl From<TableError> for AppError {
     }
 }
 
-/// Where an export stands.
+/// Progress of an export.
 enum Stage {
     Begin,
     Entries,
@@ -35,7 +35,7 @@ enum Stage {
     Over,
 }
 
-/// All cells of a box, in some format.
+/// Export of all cells of a box, in one table format.
 pub struct CellExport {
     app: App,
     row: SiteRow,
@@ -49,11 +49,11 @@ pub struct CellExport {
 }
 
 impl App {
-    /// Begins an export of the cells of a site that know anything, row by row. Each piece is what
-    /// is known when it is made, with the ages of the beginning.
+    /// Begins an export of the measured cells of a site, row by row. Each chunk holds the values
+    /// known when it is made; ages refer to the beginning of the export.
     ///
     /// # Errors
-    /// The site is not known, or the question is none.
+    /// The site is not known, or the request is invalid.
     pub async fn export_cells(
         &self,
         site: &SiteId,
@@ -76,7 +76,7 @@ impl App {
             cell_m: grid.cell_m * f64::from(factor),
             ..grid
         };
-        // Looked at before anything is made: what changes meanwhile makes another state.
+        // Read before any chunk is made, so that later changes give another state.
         let state = self.state_of(&row, &reading, asked);
         let state = (self.run_id(), format!("{state:?} {:?} {asked:?}", row.site));
         let as_of = reading.as_of;
@@ -93,7 +93,7 @@ impl App {
         })
     }
 
-    /// Begins an export of the measurements of a site, in the order of their commits.
+    /// Begins an export of a site's raw measurements, in the order of their commits.
     ///
     /// # Errors
     /// The site is not known.
@@ -119,21 +119,22 @@ impl App {
 }
 
 impl CellExport {
-    /// What the export is made from: another state of the map, another minute in which ages are
-    /// counted, or another run of the server give another one.
+    /// Returns a hashable state of what is exported. It differs after a change of the map, in
+    /// another minute (ages are rounded to minutes) and in another run of the server.
     pub fn state(&self) -> impl Hash + use<> {
         self.state.clone()
     }
 
-    /// As of when it is: all that counts was measured before. `None` when no time was asked for.
+    /// Returns the time before which all exported measurements were made; `None` when the request
+    /// gave no time.
     pub fn as_of(&self) -> Option<Timestamp> {
         self.reading.as_of
     }
 
-    /// The next piece, and what comes after it; `None` at the end.
+    /// Returns the next chunk and the rest of the export; `None` at the end.
     ///
     /// # Errors
-    /// A piece cannot be written.
+    /// A chunk cannot be encoded.
     pub async fn next(self) -> Result<Option<(Vec<u8>, Self)>, AppError> {
         let app = self.app.clone();
         app.off_thread(move |app| self.step(app)).await
@@ -171,7 +172,7 @@ impl CellExport {
     }
 }
 
-/// All measurements of a site, in some format.
+/// Export of all raw measurements of a site, in one table format.
 pub struct SegmentExport {
     app: App,
     site_pk: i64,
@@ -182,15 +183,16 @@ pub struct SegmentExport {
 }
 
 impl SegmentExport {
-    /// What the export is made from: measurements that are added or removed give another state.
+    /// Returns a hashable state of what is exported; it differs after measurements are added or
+    /// removed.
     pub fn state(&self) -> impl Hash + use<> {
         self.state.clone()
     }
 
-    /// The next piece, and what comes after it; `None` at the end.
+    /// Returns the next chunk and the rest of the export; `None` at the end.
     ///
     /// # Errors
-    /// The database failed, or a piece cannot be written.
+    /// The database failed, or a chunk cannot be encoded.
     pub async fn next(self) -> Result<Option<(Vec<u8>, Self)>, AppError> {
         let mut found = Vec::new();
         if matches!(self.stage, Stage::Entries) {

@@ -1,7 +1,7 @@
-//! Publishes where maps change: on the feed of events, and to whoever publishes it on the network.
+//! Publishes the changed areas of maps, on the feed of events and to subscribers on the network.
 //!
-//! Changes are put together to the squares of cells in which they are counted, and published once a
-//! period: an event is as long however fast robots drive.
+//! Changes are collected per block of cells and published once per period, so the size of an event
+//! does not depend on the robots' speed.
 
 use std::collections::HashMap;
 use std::time::Duration;
@@ -16,14 +16,16 @@ use crate::app::sites::SITES_MAX;
 use crate::db;
 use crate::db::sites::SiteRow;
 
-/// Least time from one word about a site to the next.
+/// Minimum interval between two messages about one site.
 pub const PERIOD: Duration = Duration::from_secs(1);
-/// Most boxes of one word; where more have changed, everything may have.
+/// Maximum number of boxes in one message; beyond it the message says that everything may have
+/// changed.
 pub const BOXES_MAX: usize = 256;
-/// Words that wait for a listener on the network; one that misses some hears that it did.
+/// Number of messages buffered for a subscriber on the network; one that falls behind is notified
+/// that it missed some.
 const WAITING_MAX: usize = 64;
 
-/// Where words about maps go besides the feed of events.
+/// Channel for messages about maps to subscribers other than the feed of events.
 #[derive(Debug)]
 pub(in crate::app) struct MapNews(broadcast::Sender<MapChange>);
 
@@ -33,14 +35,14 @@ impl Default for MapNews {
     }
 }
 
-/// What was published last of a site.
+/// State of a site's map that was published last.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Announced {
     change: u64,
     terrain_revision: u64,
 }
 
-/// Tells until the stop.
+/// Publishes changes of maps until the stop.
 pub async fn run(app: App, stop: CancellationToken) {
     let mut announced = HashMap::new();
     loop {
@@ -55,7 +57,7 @@ pub async fn run(app: App, stop: CancellationToken) {
 }
 
 impl App {
-    /// Hears where maps change from now on.
+    /// Subscribes to changes of maps from now on.
     pub fn map_news(&self) -> broadcast::Receiver<MapChange> {
         self.news().0.subscribe()
     }
@@ -75,7 +77,7 @@ impl App {
             if before != present {
                 let change = self.change_since(&row, before);
                 self.hub().map(&change);
-                // Nobody need listen.
+                // Fails only without subscribers.
                 let _ = self.news().0.send(change);
             }
         }

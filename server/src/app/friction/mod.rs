@@ -1,4 +1,4 @@
-//! What the map says, made from the sums at the time of reading.
+//! The friction map's answers, computed from the stored sums at the time of the request.
 
 mod advice;
 mod cells;
@@ -35,19 +35,19 @@ use crate::db::sites::SiteRow;
 use crate::db::{self, Tx};
 use crate::friction::Ground;
 
-/// The model's name while only measurements have named the configuration.
+/// Model name shown for a configuration that no robot has declared.
 const UNKNOWN_MODEL: &str = "not declared";
-/// Most times of one history.
+/// Maximum number of times in one history.
 const TIMES_MAX: i64 = 1_000;
-/// Questions about the map that are worked on at once; further ones wait for their turn.
+/// Maximum number of map requests that are worked on at once; further ones wait.
 pub(in crate::app) const MAP_READERS_MAX: usize = 4;
 
-/// Everything that answers about a site's terrains need from the database.
+/// A site with its terrains and model names, as read from the database for the map's answers.
 #[derive(Debug)]
 pub(in crate::app) struct SiteView {
     pub(super) row: SiteRow,
     pub(super) terrains: Vec<Terrain>,
-    /// Of each terrain, the revisions that are the same ground as the present one.
+    /// For each terrain, the revisions whose ground is the same as the present one.
     revisions: HashMap<TerrainId, Vec<u32>>,
     models: HashMap<ConfigurationId, String>,
 }
@@ -66,7 +66,7 @@ impl SiteView {
         })
     }
 
-    /// Whether a measurement on this revision is one of the ground as it is drawn now.
+    /// Returns whether a measurement on this revision applies to the terrain in its present shape.
     pub(super) fn is_present(&self, found: &TerrainRef) -> bool {
         let revisions = self.revisions.get(&found.id);
         revisions.is_some_and(|revisions| revisions.contains(&found.revision))
@@ -87,8 +87,8 @@ impl SiteView {
 }
 
 impl App {
-    /// Works on the map on a thread that may be kept busy: a lock that is held while something is
-    /// computed keeps no other request waiting for its thread.
+    /// Runs work on the map on a blocking thread, so that computing under the map's lock does not
+    /// block other requests.
     pub(in crate::app) async fn off_thread<T: Send + 'static>(
         &self,
         work: impl FnOnce(&Self) -> T + Send + 'static,
@@ -99,13 +99,13 @@ impl App {
             Ok(done) => done,
             Err(broken) => match broken.try_into_panic() {
                 Ok(panic) => std::panic::resume_unwind(panic),
-                // The runtime is ending, and this task with it.
+                // The runtime is shutting down, and this task with it.
                 Err(_cancelled) => std::future::pending().await,
             },
         }
     }
 
-    /// The friction of every terrain of a site, after a cursor.
+    /// Returns the friction of each terrain of a site, after a cursor.
     pub async fn friction_of_terrains(
         &self,
         site: &SiteId,
@@ -138,7 +138,7 @@ impl App {
         Ok(self.off_thread(listing).await)
     }
 
-    /// The friction of one terrain.
+    /// Returns the friction of one terrain.
     pub async fn friction_of_terrain(
         &self,
         site: &SiteId,
@@ -158,7 +158,8 @@ impl App {
         Ok(self.off_thread(looking).await)
     }
 
-    /// The friction of one terrain as it was known at equally spaced times, the last of them `to`.
+    /// Returns the friction of one terrain as known at equally spaced times, the last of which is
+    /// `to`.
     pub async fn history_of_terrain(
         &self,
         (site, id): (&SiteId, &TerrainId),
@@ -195,7 +196,7 @@ impl App {
                 |index| step.saturating_mul(i32::try_from(steps - index).unwrap_or(i32::MAX));
             let times = (0..=steps).map(|index| to.checked_sub(back(index)).unwrap_or(from));
             let known = |at| {
-                // Now is asked without a time, so that all that has come counts.
+                // The present is read without a time, so that all received measurements count.
                 let reading = if is_to_now && at == to {
                     reading.clone()
                 } else {
@@ -215,7 +216,7 @@ impl App {
         Ok(self.off_thread(looking).await)
     }
 
-    /// What was measured of a terrain, per robot model.
+    /// Returns the measured friction of a terrain, per robot model.
     fn measured_models(
         &self,
         view: &SiteView,
@@ -245,7 +246,7 @@ impl App {
     }
 }
 
-/// What is known of a terrain for one robot model, in numbers for a gauge.
+/// Friction of a terrain for one robot model, as values of gauges.
 #[derive(Debug, Clone, PartialEq)]
 pub struct KnownGround {
     /// The site.
@@ -256,14 +257,15 @@ pub struct KnownGround {
     pub configuration: ConfigurationId,
     /// θ.
     pub theta: f64,
-    /// Its standard deviation.
+    /// Standard deviation of θ.
     pub std_dev: f64,
     /// Age of the newest measurement, seconds.
     pub age_s: f64,
 }
 
 impl App {
-    /// What was measured of all terrains, at most `limit`, and how many more there are.
+    /// Returns the measured friction of at most `limit` terrains and models, and the number of
+    /// those left out.
     ///
     /// # Errors
     /// The database failed.

@@ -1,9 +1,9 @@
-//! What is known along a path, and the speed that follows.
+//! Friction along a path, and the speeds that follow from it.
 //!
-//! Curves are driven with `v² ≤ lateral_acceleration/κ`, and the robot must be able to stand at the
-//! end and to be as slow as each later piece asks: `v² ≤ v_next² + 2·longitudinal_acceleration·Δs`.
-//! Both accelerations come from the traction limit of the piece, a lower bound, through the shares
-//! that the robot's own planner uses.
+//! A curve of curvature κ allows `v² ≤ lateral_acceleration/κ`. To stop at the end and to slow down
+//! in time for each later segment, `v² ≤ v_next² + 2·longitudinal_acceleration·Δs`. Both
+//! accelerations are the fractions of the segment's traction limit (a lower bound) that the robot's
+//! own planner uses.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -21,26 +21,27 @@ use super::{App, AppError, Asked, Reading, SiteView};
 use crate::friction::index::{Lens, Room, SiteMap};
 use crate::friction::traction_limit;
 
-/// Longest path, metres.
+/// Maximum length of a path, metres.
 const LENGTH_MAX_M: f64 = 10_000.0;
-/// Fewest and most corners.
+/// Allowed number of points of a path.
 const POINTS: std::ops::RangeInclusive<usize> = 2..=10_000;
-/// Most pieces, however small the cells are.
+/// Maximum number of path segments, however small the cells are.
 const PIECES_MAX: usize = 100_000;
-/// Corners that a circle is looked at with.
+/// Number of sides of the polygon by which a circle is approximated.
 const CIRCLE_CORNERS: u32 = 256;
-/// Relative standard deviation of θ above which a place counts as unknown; the estimator's own.
+/// Relative standard deviation of θ (σ/θ) above which a place counts as unmeasured; the same as the
+/// estimator's.
 const DEVIATION_RATIO_MAX: f64 = 0.5;
-/// Cells to either side of a path that say something of the ground under it.
+/// Number of cells to either side of a path whose measurements also count for the ground under it.
 const NEAR_CELLS: i32 = 2;
-/// Most cells near a path that are looked at.
+/// Maximum number of cells near a path that are read; beyond it only the path's own cells count.
 const NEAR_MAX: usize = 20_000;
 
 impl App {
-    /// What is known along a path, for a robot.
+    /// Returns the friction along a path, for a robot.
     ///
     /// # Errors
-    /// Site or robot is not known, or the path is none.
+    /// Site or robot is not known, or the points do not form a path.
     pub async fn friction_along(
         &self,
         site: &SiteId,
@@ -93,11 +94,13 @@ impl App {
 }
 
 impl App {
-    /// The prior of the ground along a trajectory that a robot gets; `None` when nothing is known of it.
+    /// Returns the prior of the ground along a trajectory, for the robot that drives it; `None`
+    /// when nothing is known.
     ///
-    /// Cells with several grounds are left out: the robot could not distinguish them. A terrain has
-    /// no higher traction limit on the path than where it is known to be lowest, there or near it:
-    /// ground that has frozen in one cell may have in the next, where nobody has been since.
+    /// No θ is given for cells with several grounds, which the robot could not distinguish. The
+    /// traction limit of a ground is nowhere above its lowest known value on or near the path:
+    /// ground that is frozen in one cell may be frozen in the next, where nobody has measured
+    /// since.
     pub(in crate::app) async fn prior_along(
         &self,
         (site, robot): (&SiteId, &RobotId),
@@ -112,7 +115,7 @@ impl App {
         };
         let reading = Reading::new(self, &asked)?;
         let points = corners(trajectory);
-        // What is too long to look at in one go is driven as before there was a map.
+        // A path that is too long to be read gets no prior.
         let Ok(cut) = checked_length(&points).and_then(|_| cut(&points, &view.row.site.grid))
         else {
             return Ok(None);
@@ -149,7 +152,8 @@ impl App {
                     .or_insert(CellTractionLimit { cell, mu });
                 limit.mu = limit.mu.min(mu);
             }
-            // A robot drives smoothly from corner to corner, so a little beside the path, too.
+            // The smoothed path may leave the straight line between corners, so the cells beside it
+            // are included.
             for place in cut.iter().chain(&near) {
                 let cell = place.cell;
                 let key = (cell.iy, cell.ix);
@@ -188,7 +192,7 @@ impl App {
     }
 }
 
-/// Points along a trajectory, near enough to know its cells.
+/// Returns points along a trajectory, dense enough to determine its cells.
 fn corners(trajectory: &Trajectory) -> Vec<Point> {
     match trajectory {
         Trajectory::Circle(circle) => (0..=CIRCLE_CORNERS)
@@ -207,13 +211,13 @@ fn corners(trajectory: &Trajectory) -> Vec<Point> {
     }
 }
 
-/// Whether a place is known well enough to have a traction limit: the upper bound of a θ that
-/// is hardly known is no reason to creep.
+/// Returns whether θ is known well enough to derive a traction limit from it; the upper bound of a
+/// poorly known θ would make the robot needlessly slow.
 fn is_measured(known: &FusedFriction) -> bool {
     known.std_dev <= DEVIATION_RATIO_MAX * known.theta
 }
 
-/// The planner's friction coefficient.
+/// Returns the friction coefficient that a plan may use.
 pub(in crate::app) fn traction_limit_mu(known: Option<&FusedFriction>) -> f64 {
     traction_limit::traction_limit_mu(
         known.and_then(|known| known.mu_peak_lower_bound),
@@ -265,18 +269,18 @@ fn checked_length(points: &[Point]) -> Result<f64, AppError> {
     Ok(length_m)
 }
 
-/// A piece of a side of the path, in one cell.
+/// Section of a straight side of the path within one cell.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(in crate::app) struct Cut {
     pub(in crate::app) from_m: f64,
     pub(in crate::app) length_m: f64,
     pub(in crate::app) cell: Cell,
     pub(in crate::app) middle: Point,
-    /// Curvature at its begin, where that is a corner of the path; per metre.
+    /// Curvature at its begin, per metre; nonzero only where the begin is a corner of the path.
     curvature_1_m: f64,
 }
 
-/// Cuts a path where it passes from cell to cell.
+/// Splits a path at the borders of cells.
 fn cut(points: &[Point], grid: &Grid) -> Result<Vec<Cut>, AppError> {
     let mut pieces: Vec<Cut> = Vec::new();
     let mut from_m = 0.0;
@@ -322,7 +326,7 @@ fn cut(points: &[Point], grid: &Grid) -> Result<Vec<Cut>, AppError> {
     Ok(pieces)
 }
 
-/// Places around a path whose ground may be like that of the path: middles of cells, each once.
+/// Returns the centres of the cells near a path, each once.
 fn near(cut: &[Cut], grid: &Grid) -> Vec<Cut> {
     let around = |index: i32| index.saturating_sub(NEAR_CELLS)..=index.saturating_add(NEAR_CELLS);
     let mut cells: BTreeSet<(i32, i32)> = BTreeSet::new();
@@ -331,7 +335,7 @@ fn near(cut: &[Cut], grid: &Grid) -> Vec<Cut> {
             cells.extend(around(cut.cell.ix).map(|ix| (iy, ix)));
         }
         if cells.len() > NEAR_MAX {
-            // Of a path as long as this, its own cells say enough.
+            // For a path this long its own cells suffice.
             return Vec::new();
         }
     }
@@ -345,7 +349,7 @@ fn near(cut: &[Cut], grid: &Grid) -> Vec<Cut> {
     cells.into_iter().map(place).collect()
 }
 
-/// Shares of a side at which one coordinate passes a border between cells.
+/// Returns the fractions of a side (0 to 1) at which one coordinate crosses a border between cells.
 fn crossings((from_m, to_m): (f64, f64), cell_m: f64) -> Vec<f64> {
     let (low, high) = (from_m.min(to_m) / cell_m, from_m.max(to_m) / cell_m);
     let mut border = low.floor() + 1.0;
@@ -357,7 +361,7 @@ fn crossings((from_m, to_m): (f64, f64), cell_m: f64) -> Vec<f64> {
     shares
 }
 
-/// Curvature of the circle through three points, per metre; a turn back is as sharp as can be.
+/// Returns the curvature of the circle through three points, per metre; infinite for a reversal.
 fn curvature(a: Point, b: Point, c: Point) -> f64 {
     let (ab, bc, ca) = (a.distance_m(b), b.distance_m(c), c.distance_m(a));
     let doubled_area =
@@ -375,7 +379,7 @@ fn curvature(a: Point, b: Point, c: Point) -> f64 {
     }
 }
 
-/// The terrains that come near places.
+/// Returns the terrains whose bounding boxes touch that of the places.
 fn drawn_near<'view, 'cut>(
     drawn: &Drawn<'view>,
     places: impl IntoIterator<Item = &'cut Cut>,
@@ -397,7 +401,7 @@ fn drawn_near<'view, 'cut>(
     drawn.near(low, high)
 }
 
-/// Looks at one place of the map after another.
+/// Reads the map at one place after another.
 struct CellReader<'map> {
     map: &'map SiteMap,
     near: &'map Near<'map>,
@@ -422,7 +426,7 @@ impl<'map> CellReader<'map> {
         }
     }
 
-    /// What is known of the ground that is drawn at the middle of a place.
+    /// Returns the friction of the ground that is drawn at the centre of a cell.
     fn known_at(&mut self, place: &Cut) -> Option<FusedFriction> {
         let ground = self.near.ground_at(place.middle);
         let (which, at) = ((ground, &self.lens), self.reading.fused_at());
@@ -445,7 +449,7 @@ fn described(cut: &Cut, known: Option<&FusedFriction>) -> PathPiece {
     }
 }
 
-/// From the end, where the robot stands, back to the begin.
+/// Sets the speeds backwards from the end, where the robot stops.
 fn set_speeds(pieces: &mut [PathPiece], cut: &[Cut], length_m: f64, model: &RobotModel) {
     let limits = model.limits;
     let mut next_m_s = 0.0_f64;

@@ -1,4 +1,4 @@
-//! Pictures of the map, written in one of the formats and kept for as long as they are right.
+//! Pictures of the map in several formats, cached as long as the map is unchanged.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -11,24 +11,24 @@ use crate::db::sites::SiteRow;
 use crate::friction::Raster;
 use crate::friction::index::Block;
 
-/// Bytes of pictures that are kept.
+/// Maximum number of bytes of cached pictures.
 const KEPT_BYTES_MAX: usize = 64 * 1024 * 1024;
-/// Pictures that are kept.
+/// Maximum number of cached pictures.
 const KEPT_MAX: usize = 1_024;
 
-/// A picture in one of the formats, with what it shows.
+/// An encoded picture with a description of its content.
 #[derive(Debug, Clone)]
 pub struct Picture {
     /// The picture itself.
     pub bytes: Arc<[u8]>,
-    /// What it was made from, without the squares.
+    /// The raster that it was made from, without its squares.
     pub of: Arc<Raster>,
 }
 
-/// What makes a picture another one.
+/// State of the map; a picture is up to date if its state is the present one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) struct State {
-    /// Newest change of the cells that it shows.
+    /// Number of the newest change in the cells shown.
     change: u64,
     terrain_revision: u64,
     now_us: i64,
@@ -48,7 +48,7 @@ struct Shelf {
     kept: HashMap<String, Kept>,
 }
 
-/// Pictures and parts of pictures that are kept.
+/// Cache of pictures and of fused blocks.
 #[derive(Debug, Default)]
 pub(in crate::app) struct Pictures {
     pub(super) blocks: Blocks,
@@ -94,11 +94,11 @@ impl Pictures {
 }
 
 impl App {
-    /// A picture of a site's map. `format` names how `write` writes it, with all that `write`
-    /// depends on besides the map.
+    /// Returns a picture of a site's map. `format` identifies the encoding by `write`, with
+    /// everything besides the map that `write` depends on.
     ///
     /// # Errors
-    /// The site is not known, or the question is none.
+    /// The site is not known, or the request is invalid.
     pub async fn picture(
         &self,
         site: &SiteId,
@@ -111,7 +111,7 @@ impl App {
         let reading = reading.of_site(self, &view.row);
         let drawing = move |app: &Self| {
             let key = format!("{}/{format}/{asked:?}", view.row.pk);
-            // Looked at before the squares are made: what changes meanwhile makes it stale.
+            // Read before the squares are made, so that a change meanwhile makes the picture stale.
             let state = app.state_of(&view.row, &reading, &asked);
             if let Some(picture) = app.pictures().find(&key, state) {
                 return Ok(picture);
@@ -132,7 +132,7 @@ impl App {
         let bounds = asked.area.and_then(|area| area.cells(&grid).ok());
         let bounds = bounds.map(|(min, max)| (Block::of(min), Block::of(max)));
         let change = self.maps().look(row, |map| match bounds {
-            // Which model most have driven, for who asks for none, is of the whole map.
+            // The default model, the one driven most, depends on the whole map.
             Some((low, high)) if reading.reference().is_some() => {
                 map.changes().newest_in(low, high)
             }

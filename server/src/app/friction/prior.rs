@@ -1,6 +1,6 @@
-//! What to expect of ground that nobody has measured: the same class elsewhere on the site.
+//! Prior of unmeasured ground, from terrains of the same class elsewhere on the site.
 //!
-//! It stands beside what was measured, marked as what it is, and never goes into it.
+//! It is returned separately from measurements, is marked as a prior, and never enters them.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -10,12 +10,12 @@ use tread_api::terrain::{Terrain, TerrainClass};
 
 use super::{Reading, SiteView};
 
-/// How terrains of one class differ, as a share of θ, while few of them are known.
+/// Assumed spread of θ between terrains of one class, as a fraction of θ, while few are measured.
 const SPREAD_RATIO: f64 = 0.4;
-/// Terrains that this assumption counts as.
+/// Number of terrains by which this assumption is weighted.
 const SPREAD_TERRAINS: f64 = 2.0;
 
-/// What was measured of every terrain of a site.
+/// Measured friction of every terrain of a site.
 pub(super) struct Classes {
     terrains: Vec<(TerrainId, TerrainClass, Vec<ModelFriction>)>,
 }
@@ -25,8 +25,8 @@ impl Classes {
         Self { terrains }
     }
 
-    /// What is known of a terrain per robot model; an expectation for those that know nothing of it
-    /// and something of its class.
+    /// Returns the friction of a terrain per robot model; a model without a measurement here gets
+    /// the prior of the class, if there is one.
     pub(super) fn models(
         &self,
         view: &SiteView,
@@ -68,7 +68,8 @@ impl Classes {
             .filter(|model| model.friction.is_some())
     }
 
-    /// The mean of the class's other terrains, with how much they differ and how sure each is.
+    /// Returns the mean θ of the class's other terrains, weighted by their spread and standard
+    /// deviations.
     pub(super) fn prior(
         &self,
         terrain: &Terrain,

@@ -1,8 +1,8 @@
-//! The map as squares, row by row, one robot model, for pictures of any kind.
+//! Rasters of the map, row by row, for one robot model, from which pictures are made.
 //!
-//! Blocks of cells are fused once and kept: those that changed since are fused again, cell by cell,
-//! and all of them when the minute in which ages are counted is over. The lock of the map is held
-//! for one block at a time, so that what robots upload never waits for long.
+//! Blocks of cells are fused once and cached. Cells that changed are fused again one by one; all
+//! are fused again when the minute to which ages are rounded is over. The map's lock is held for
+//! one block at a time, so that uploads never wait long.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -17,23 +17,23 @@ use super::{App, AppError, Asked, Reading, SiteView};
 use crate::friction::Raster;
 use crate::friction::index::{Block, CELLS_PER_BLOCK, CellSummary, Lens, Room, SiteMap};
 
-/// Most squares of one picture.
+/// Maximum number of squares in one picture.
 pub const SQUARES_MAX: u64 = 1 << 20;
-/// Blocks that are kept fused, of all sites and models: 72 KiB each.
+/// Maximum number of cached blocks, of all sites and models; 72 KiB each.
 const BLOCKS_MAX: usize = 1_024;
 
-/// What a picture of the map is to show.
+/// The content of a requested picture.
 #[derive(Debug, Clone, Default)]
 pub struct PictureAsked {
-    /// Whose measurements, as of when.
+    /// Configuration, normalisation and time.
     pub asked: Asked,
-    /// Where; everywhere that anybody has driven when absent.
+    /// The area; `None` for everything that was driven on.
     pub area: Option<Area>,
-    /// Side of the squares, metres; the grid's own when absent.
+    /// Side of the squares, metres; `None` for the grid's own cells.
     pub resolution_m: Option<f64>,
 }
 
-/// Of which squares: everything that says so but the time.
+/// Key of a cached block: everything that determines its squares except the time.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 struct BlockKey {
     site_pk: i64,
@@ -42,7 +42,7 @@ struct BlockKey {
     normalisation: Option<String>,
 }
 
-/// A block as it was fused.
+/// A cached block.
 #[derive(Debug, Clone)]
 struct Kept {
     change: u64,
@@ -53,7 +53,7 @@ struct Kept {
     used: u64,
 }
 
-/// Blocks that are kept fused.
+/// Cache of fused blocks.
 #[derive(Debug, Default)]
 pub(in crate::app) struct Blocks {
     inner: Mutex<(u64, HashMap<BlockKey, Kept>)>,
@@ -73,7 +73,7 @@ impl Blocks {
         let mut inner = self.inner.lock().unwrap_or_else(PoisonError::into_inner);
         let (_, blocks) = &mut *inner;
         if blocks.len() >= BLOCKS_MAX && !blocks.contains_key(&key) {
-            // The half that was looked at longest ago goes at once, so that this is rare.
+            // The least recently used half is removed at once, so that this is rare.
             let mut used: Vec<u64> = blocks.values().map(|kept| kept.used).collect();
             let middle = used.len() / 2;
             let (_, &mut bound, _) = used.select_nth_unstable(middle);
@@ -83,7 +83,7 @@ impl Blocks {
     }
 }
 
-/// Everything that squares of one picture have in common.
+/// What the squares of one picture have in common.
 pub(super) struct Frame<'view> {
     view: &'view SiteView,
     reading: &'view Reading,
@@ -112,7 +112,7 @@ impl Frame<'_> {
 
     fn block(&self, app: &App, block: Block) -> Arc<Vec<CellSummary>> {
         let (row, reading) = (&self.view.row, self.reading);
-        // What is asked of another time is made for this once.
+        // Blocks as of a past time are not cached.
         let key = reading.as_of.is_none().then(|| BlockKey {
             site_pk: row.pk,
             block,
@@ -162,7 +162,7 @@ impl Frame<'_> {
         squares
     }
 
-    /// The squares of a box of cells, row by row.
+    /// Returns the squares of a box of single cells, row by row.
     fn cells(&self, app: &App, (min, max): (Cell, Cell)) -> Vec<CellSummary> {
         let columns = usize::try_from(max.ix - min.ix + 1).unwrap_or_default();
         let rows = usize::try_from(max.iy - min.iy + 1).unwrap_or_default();
@@ -186,7 +186,8 @@ impl Frame<'_> {
         squares
     }
 
-    /// The same of squares of several cells, which are made for this once.
+    /// Returns the squares of a box, each of `factor` × `factor` cells, row by row; these are not
+    /// cached.
     fn merged(&self, app: &App, (min, max): (Cell, Cell), factor: i32) -> Vec<CellSummary> {
         let grid = self.view.row.site.grid;
         let coarse = Grid {
@@ -199,7 +200,7 @@ impl Frame<'_> {
         let mut room = Room::default();
         let mut squares = Vec::new();
         for iy in min.iy..=max.iy {
-            // The lock is let go after each row.
+            // The lock is released after each row.
             app.maps().look(&self.view.row, |map| {
                 let lens = self.lens(map);
                 for ix in min.ix..=max.ix {
@@ -223,7 +224,7 @@ impl Frame<'_> {
 }
 
 impl App {
-    /// The map of a site as squares, on the thread that asks.
+    /// Returns the map of a site as squares; runs on the calling thread.
     pub(super) fn raster(
         &self,
         view: &SiteView,

@@ -1,4 +1,4 @@
-//! What a question about the map asks for besides the place: whose measurements, as of when.
+//! Parameters of a map request besides the place: configuration, normalisation and time.
 
 use std::sync::Arc;
 
@@ -15,10 +15,10 @@ use crate::friction::{Ground, fuse};
 /// Microseconds of a minute.
 const MINUTE_US: i64 = 60_000_000;
 
-/// What is asked for besides the place.
+/// Parameters of a map request besides the place.
 #[derive(Debug, Clone, Default)]
 pub struct Asked {
-    /// As of when; now when absent.
+    /// Only measurements made before this time; `None` for all.
     pub as_of: Option<Timestamp>,
     /// Only measurements of this configuration.
     pub configuration: Option<ConfigurationId>,
@@ -26,16 +26,16 @@ pub struct Asked {
     pub normalisation: Option<String>,
 }
 
-/// The same, checked.
+/// Checked parameters of a map request.
 #[derive(Debug, Clone)]
 pub(in crate::app) struct Reading {
-    /// As of when; `None` for all that has come.
+    /// Only measurements made before this time; `None` for all that were received.
     pub(in crate::app) as_of: Option<Timestamp>,
     configuration: Option<ConfigurationId>,
     normalisation: Option<Arc<Normalisation>>,
     config: FrictionConfig,
-    /// The time at which ages are counted, microseconds since 1970. Now is rounded to whole minutes,
-    /// so that an answer stays the same for as long as its parts do.
+    /// Time to which ages refer, microseconds since 1970. The present is rounded down to whole
+    /// minutes, so that equal requests within a minute get equal answers.
     pub(in crate::app) now_us: i64,
 }
 
@@ -66,16 +66,15 @@ impl Reading {
         })
     }
 
-    /// The same as of the newest time, not after the one that was asked for, at which an epoch of
-    /// this site's map was over. Sums are kept per epoch, and nothing tells which part of one was
-    /// measured before a time within it.
+    /// Returns these parameters with `as_of` moved back to the end of an epoch of this site's map.
+    /// Sums are stored per epoch, so an epoch cannot be split at a time within it.
     pub(in crate::app) fn of_site(self, app: &App, row: &SiteRow) -> Self {
         let Some(as_of) = self.as_of else { return self };
         let effective = app.maps().look(row, |map| map.effective_as_of(as_of));
         self.at(effective)
     }
 
-    /// The same as of another time.
+    /// Returns these parameters as of another time.
     pub(in crate::app) fn at(&self, at: Timestamp) -> Self {
         Self {
             as_of: Some(at),
@@ -98,14 +97,14 @@ impl Reading {
         normalisation.map(|normalisation| normalisation.name.clone())
     }
 
-    /// The configuration in whose θ the answer is, if it is one.
+    /// Returns the configuration to which θ of the answer refers; `None` if there are several.
     pub(in crate::app) fn reference(&self) -> Option<ConfigurationId> {
         let normalisation = self.normalisation.as_ref();
         let reference = normalisation.map(|normalisation| normalisation.reference);
         self.configuration.or(reference)
     }
 
-    /// How measurements are weighed, and the time of it.
+    /// Returns the fusion's settings and the time to which ages refer.
     pub(in crate::app) fn fused_at(&self) -> At<'_> {
         At {
             config: &self.config,
@@ -113,7 +112,7 @@ impl Reading {
         }
     }
 
-    /// What a group says together.
+    /// Fuses a group of measurements; `None` if they give no estimate.
     pub(in crate::app) fn fused(
         &self,
         mut group: Group<'_>,

@@ -1,5 +1,5 @@
-//! What every answer about the map needs from the database, kept until something but an upload is
-//! written: a question about the map then waits for no connection.
+//! Cache of the sites and robots that map requests need from the database, valid until something
+//! other than an upload is committed. Requests then need no database connection.
 
 use std::collections::HashMap;
 use std::hash::Hash;
@@ -11,17 +11,17 @@ use super::{App, AppError, SiteView};
 use crate::db;
 use crate::db::robots::RobotRow;
 
-/// Sites, and robots, that are kept; beyond, all are read again.
+/// Maximum number of cached sites, and of cached robots; beyond it that cache is emptied.
 const KEPT_MAX: usize = 1_000;
 
-/// What is kept.
+/// The cache.
 #[derive(Debug, Default)]
 pub(in crate::app) struct Views {
     sites: Kept<SiteId, SiteView>,
     robots: Kept<(i64, RobotId), RobotRow>,
 }
 
-/// Things that were read at one generation of the database.
+/// Values read at one generation of the database.
 #[derive(Debug)]
 struct Kept<K, V> {
     of: Mutex<(u64, HashMap<K, Arc<V>>)>,
@@ -41,7 +41,7 @@ impl<K: Eq + Hash, V> Kept<K, V> {
         (of.0 == generation).then(|| of.1.get(key).cloned())?
     }
 
-    /// Keeps what was read when the generation was this or a later one.
+    /// Caches a value read at `generation`, unless values of a later generation are cached.
     fn keep(&self, generation: u64, key: K, value: V) -> Arc<V> {
         let value = Arc::new(value);
         let mut of = self.of.lock().unwrap_or_else(PoisonError::into_inner);
@@ -57,7 +57,7 @@ impl<K: Eq + Hash, V> Kept<K, V> {
 }
 
 impl App {
-    /// A site as answers about its map need it.
+    /// Returns a site with what map requests need.
     pub(in crate::app) async fn site_view(&self, site: &SiteId) -> Result<Arc<SiteView>, AppError> {
         let generation = self.db().generation();
         if let Some(view) = self.views().sites.find(generation, site) {
@@ -67,7 +67,7 @@ impl App {
         Ok(self.views().sites.keep(generation, site.clone(), view))
     }
 
-    /// A robot of a site, if there is one.
+    /// Returns a robot of a site; `None` if there is none.
     pub(in crate::app) async fn robot_of(
         &self,
         site_pk: i64,

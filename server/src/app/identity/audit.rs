@@ -1,4 +1,4 @@
-//! The audit log: written by one task beside the requests, so that none of them waits for it.
+//! The audit log, written by a background task so that no request waits for it.
 //!
 //! ```text
 //!                   ┌─ within the author's share ─► an entry of its own ─┐
@@ -6,11 +6,11 @@
 //!                   └─ beyond it ─► counted with its repeats ─ in time ──┘
 //! ```
 //!
-//! Nobody pushes what others did out of the log, and nobody fills the disk with it: each author has a
-//! share of entries, by the token or the person; what is beyond it is not lost but counted, in one entry for all
-//! repeats of the same request in the same way answered. What is the same depends on what it is: of
-//! tokens, robots that join and sites each body is another request; of all else that succeeded each
-//! path is; refusals and sign-ins are the same when their route is.
+//! No author can push others' entries out of the log or fill the disk: each author, a token or a
+//! person, has an allowance of entries. Requests beyond it are not lost but counted, in one entry
+//! for all repeats of the same kind with the same status. Successful requests are of the same kind
+//! if their paths are equal, and for tokens, joining and sites also their bodies; refusals and
+//! sign-ins if their routes are equal.
 
 use std::collections::{HashMap, VecDeque};
 use std::fmt::Write as _;
@@ -33,50 +33,52 @@ use crate::db;
 pub use crate::db::audit::AuditFilter;
 use crate::rate_limit::{Bucket, RateLimit};
 
-/// Entries that may wait for the writer.
+/// Maximum number of entries that wait for the writer.
 pub const WAITING_MAX: usize = 2_048;
-/// Most of them of one author.
+/// Maximum number of waiting entries of one author.
 const WAITING_PER_AUTHOR_MAX: usize = 512;
-/// Entries that are written at once.
+/// Maximum number of entries written at once.
 const BATCH_MAX: usize = 256;
-/// How long the writer waits for more before it writes.
+/// Time for which the writer collects entries before it writes.
 const GATHER: Duration = Duration::from_millis(100);
-/// How often the writer looks for repeats that are due.
+/// Interval at which the writer checks for repeats that are due.
 const LOOK_FOR_REPEATS: Duration = Duration::from_secs(1);
-/// How long the last entries may take when the server stops.
+/// Maximum time for writing the last entries when the server stops.
 const FINISH_MAX: Duration = Duration::from_secs(5);
-/// Rest after the database failed.
+/// Delay before the next attempt after the database failed.
 const RETRY_REST: Duration = Duration::from_secs(1);
-/// Entries that are kept. Somebody who asks for as much as possible all the time has 2 880 of his
-/// own in a day, and needs half a year to push out what others did.
+/// Maximum number of entries stored. An author who sends as many requests as possible gets 2 880
+/// entries of its own per day, and needs half a year to push out those of others.
 pub const ENTRIES_MAX: u32 = 500_000;
-/// How long entries are kept.
+/// Time for which entries are stored.
 pub const KEPT: SignedDuration = SignedDuration::from_hours(400 * 24);
-/// Old entries that are forgotten with each batch.
+/// Maximum number of old entries deleted with each batch.
 const FORGET_MAX: u32 = 1_000;
-/// Entries of its own that an author may have at once.
+/// Number of own entries that an author may write in a burst.
 pub const SHARE_BURST: u32 = 600;
-/// The same of all who have shown nothing valid, together.
+/// The same number for all requests without a valid credential, together.
 const STRANGERS_BURST: u32 = 60;
-/// The interval in which each may have one more.
+/// Interval after which an author may write one more entry.
 const SHARE_INTERVAL: Duration = Duration::from_secs(30);
-/// Authors whose shares are remembered; those beyond have what the ones forgotten had.
+/// Maximum number of authors whose allowances are tracked; beyond it the one with the fullest
+/// allowance is forgotten.
 const AUTHORS_MAX: usize = 4_096;
-/// How long repeats are counted before they are written, at first; then twice as long each time.
+/// Time for which repeats are first counted before they are written; it doubles each time.
 pub const REPEATS_FIRST: Duration = Duration::from_mins(1);
-/// How long they are counted at the most.
+/// Maximum time for which repeats are counted before they are written.
 pub const REPEATS_MAX: Duration = Duration::from_hours(1);
-/// Kinds of requests of one author whose repeats are counted apart; of more only the route counts.
+/// Maximum number of kinds of requests counted separately per author; further ones are counted by
+/// route alone.
 const KINDS_PER_AUTHOR_MAX: usize = 256;
-/// Kinds of requests in all whose repeats are counted.
+/// Maximum number of kinds of requests whose repeats are counted, of all authors.
 const KINDS_MAX: usize = 16_384;
 
-/// Who is behind an entry, as far as shares are concerned.
+/// Author of an entry, to whom its allowance belongs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 enum Author {
     Token(TokenId),
     Person(PersonId),
-    /// Robots that join or renew: they have shown something valid.
+    /// Robots that joined or renewed a certificate, all together.
     Joining,
     Stranger,
 }
@@ -103,20 +105,20 @@ impl Author {
     }
 }
 
-/// What repeats have in common.
+/// What repeats of a request have in common.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 struct RequestKind {
     author: Author,
     method: String,
     route: String,
     status: u16,
-    /// The path, where it says what was changed.
+    /// The path, for a successful change.
     path: Option<String>,
-    /// A hash of the body, where it does.
+    /// A hash of the body, for a successful change on a route that concerns rights.
     what: Option<u64>,
 }
 
-/// Routes whose bodies say who may do what.
+/// Returns whether the bodies of a route concern rights.
 fn is_of_rights(route: &str) -> bool {
     let begins = [
         "/v1/tokens",
@@ -127,13 +129,13 @@ fn is_of_rights(route: &str) -> bool {
     begins.iter().any(|begin| route.starts_with(begin)) || route == "/v1/sites"
 }
 
-/// Routes by which people sign in and out.
+/// Returns whether people sign in or out by a route.
 fn is_sign_in(route: &str) -> bool {
     route == "/v1/session" || route.starts_with("/v1/sign-in")
 }
 
 impl RequestKind {
-    /// As much as tells requests of this kind apart.
+    /// Returns the kind of this request.
     fn of(entry: &AuditEntry) -> Self {
         let is_change = entry.status < 400 && !is_sign_in(&entry.route);
         let what = (is_change && is_of_rights(&entry.route)).then(|| {
@@ -149,7 +151,7 @@ impl RequestKind {
         }
     }
 
-    /// The author, the route, and how it was answered.
+    /// Returns the coarser kind of this request: author, method, route and status alone.
     fn of_route(entry: &AuditEntry) -> Self {
         Self {
             author: Author::of(entry),
@@ -162,20 +164,20 @@ impl RequestKind {
     }
 }
 
-/// Repeats that are being counted.
+/// Repeats of one kind that are being counted.
 #[derive(Debug)]
 struct Repeats {
-    /// The newest of them.
+    /// The newest repeat.
     newest: AuditEntry,
     since: Timestamp,
     count: u64,
-    /// When they are written.
+    /// Time at which the count is written, since the start of the server.
     due_at: Duration,
-    /// How long they are counted.
+    /// Period for which repeats are counted.
     span: Duration,
 }
 
-/// What an author may still have of its own, and has waiting.
+/// Allowance of an author, with the number of its waiting entries and counted kinds.
 #[derive(Debug, Default)]
 struct Share {
     bucket: Bucket,
@@ -189,14 +191,14 @@ impl Share {
     }
 }
 
-/// What notes when it was used last.
+/// A token or session whose last use is stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) enum Used {
     Token(TokenId),
     Session(SessionId),
 }
 
-/// What waits for the writer, and what is counted.
+/// Entries that wait for the writer, and repeats that are being counted.
 #[derive(Debug, Default)]
 struct Waiting {
     entries: VecDeque<AuditEntry>,
@@ -205,7 +207,7 @@ struct Waiting {
     uses: HashMap<Used, Timestamp>,
 }
 
-/// What became of an entry.
+/// What was done with an entry.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Taken {
     Own,
@@ -238,7 +240,7 @@ impl Waiting {
         self.count(entry, author, now)
     }
 
-    /// Counts an entry with its repeats.
+    /// Counts an entry as a repeat of its kind.
     fn count(&mut self, entry: AuditEntry, author: Author, now: Duration) -> Taken {
         let mut kind = RequestKind::of(&entry);
         let is_new = !self.repeats.contains_key(&kind);
@@ -268,7 +270,8 @@ impl Waiting {
         Taken::Counted
     }
 
-    /// The next entries to write: those that wait, then repeats that are due, or all of them.
+    /// Takes the next entries to write: those waiting, then repeats that are due, or with `all`
+    /// every counted one.
     fn next(&mut self, now: Duration, all: bool) -> Vec<AuditEntry> {
         let mut next: Vec<AuditEntry> = Vec::new();
         while next.len() < BATCH_MAX {
@@ -309,7 +312,7 @@ impl Waiting {
     }
 }
 
-/// Where entries wait for the writer.
+/// Queue of entries for the writer.
 #[derive(Debug, Default)]
 pub(super) struct AuditLog {
     waiting: Mutex<Waiting>,
@@ -324,7 +327,7 @@ impl AuditLog {
 }
 
 impl App {
-    /// Puts an entry into the audit log, soon and without waiting.
+    /// Queues an entry for the audit log without waiting.
     pub fn audit(&self, entry: AuditEntry) {
         let log = &self.identity().audit;
         let taken = log.lock().add(entry, self.clock().elapsed());
@@ -341,13 +344,13 @@ impl App {
         log.added.notify_one();
     }
 
-    /// Whether each entry that is written from now on is a line of the server's log too.
+    /// Sets whether each entry written from now on is also logged as a line of the server's log.
     pub fn log_audit(&self, is_logged: bool) {
         let log = &self.identity().audit;
         log.is_logged.store(is_logged, Ordering::Relaxed);
     }
 
-    /// Entries of the audit log.
+    /// Returns a page of the audit log.
     pub async fn audit_log(
         &self,
         filter: &AuditFilter,
@@ -358,7 +361,7 @@ impl App {
         Ok(page(entries, limit, |entry| entry.id.to_string()))
     }
 
-    /// What frames the chain of the audit log; `None` if it was removed.
+    /// Returns the data that anchors the chain of the audit log; `None` if it was removed.
     pub async fn audit_chain(&self) -> Result<Option<AuditChain>, AppError> {
         let mut tx = self.db().read("identity").await?;
         Ok(db::audit::chain(&mut tx).await?)
@@ -391,13 +394,14 @@ impl App {
     }
 }
 
-/// Writes an entry as one line of the server's log.
+/// Logs an entry as one line of the server's log.
 fn log_entry(entry: &AuditEntry) {
     let hash = entry.hash.as_deref().unwrap_or_default();
     info!(target: "tread_audit", entry = entry.id, hash, "{}", ascii_json(entry));
 }
 
-/// An entry as JSON in printable ASCII alone, so that nothing in it moves a terminal's cursor.
+/// Formats an entry as JSON in printable ASCII, so that it cannot contain control sequences of
+/// terminals.
 fn ascii_json(entry: &AuditEntry) -> String {
     let text = serde_json::to_string(entry).unwrap_or_default();
     let mut ascii = String::with_capacity(text.len());
@@ -406,7 +410,7 @@ fn ascii_json(entry: &AuditEntry) -> String {
             ascii.push(letter);
         } else {
             for unit in letter.encode_utf16(&mut [0; 2]) {
-                // Writing into a text cannot fail.
+                // Writing to a string cannot fail.
                 let _ = write!(ascii, "\\u{unit:04x}");
             }
         }
@@ -433,7 +437,7 @@ pub async fn run(app: App, stop: CancellationToken) {
     }
 }
 
-/// Writes what still waits and what is being counted, when nothing is answered any more.
+/// Writes the remaining entries and counts, after the last request was answered.
 pub async fn finish(app: &App) {
     let stop = CancellationToken::new();
     stop.cancel();
@@ -448,7 +452,7 @@ pub async fn finish(app: &App) {
     }
 }
 
-/// Writes what waits and is due; after the stop all that there is, as far as the database takes it.
+/// Writes waiting entries and due repeats; after the stop everything, unless the database fails.
 async fn write_waiting(app: &App, stop: &CancellationToken) {
     let log = &app.identity().audit;
     loop {

@@ -1,21 +1,22 @@
-//! ID tokens of people's sessions, for signing out at the provider: in memory alone, and not too many.
+//! ID tokens of people's sessions, needed for signing out at the provider; in memory only, bounded
+//! in number.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use tread_api::ids::SessionId;
 
-/// Most that are kept.
+/// Maximum number of ID tokens kept.
 const ID_TOKENS_MAX: usize = 1_000;
 
-/// ID tokens of sessions.
+/// ID tokens by session.
 #[derive(Debug, Default)]
 pub(super) struct IdTokens(Mutex<Kept>);
 
 #[derive(Debug, Default)]
 struct Kept {
     of: HashMap<SessionId, String>,
-    /// The oldest first.
+    /// Sessions, oldest first.
     order: VecDeque<SessionId>,
 }
 
@@ -24,7 +25,7 @@ impl IdTokens {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Keeps a session's; the oldest goes if there are too many.
+    /// Keeps a session's ID token; beyond the maximum the oldest is dropped.
     pub(super) fn keep(&self, session: SessionId, id_token: String) {
         let mut kept = self.lock();
         kept.of.insert(session, id_token);
@@ -36,7 +37,7 @@ impl IdTokens {
         }
     }
 
-    /// Forgets those of sessions that have ended.
+    /// Forgets the ID tokens of sessions that have ended.
     pub(super) fn forget(&self, sessions: &[SessionId]) {
         let mut kept = self.lock();
         for session in sessions {
@@ -45,7 +46,7 @@ impl IdTokens {
         kept.order.retain(|session| !sessions.contains(session));
     }
 
-    /// A session's, if it is kept.
+    /// Returns a session's ID token, if it is kept.
     pub(super) fn of(&self, session: SessionId) -> Option<String> {
         self.lock().of.get(&session).cloned()
     }

@@ -1,8 +1,9 @@
-//! Who has shown a good secret, in memory: looked up once, then known until it expires or is
-//! ended, and looked up again now and then, since `tread-server init` may have replaced it.
+//! Cache of credentials by the secret that was shown. A credential is cached until it expires or is
+//! ended, and checked in the database from time to time, since `tread-server init` may have
+//! replaced it.
 //!
-//! A look-up that began before something was ended must not be kept after it: each end raises the
-//! generation, and only what was looked up within the present one is kept.
+//! A look-up that began before something was ended must not be cached afterwards: each end
+//! increments the generation, and a look-up is cached only if the generation is unchanged.
 
 use std::collections::{HashMap, HashSet};
 use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
@@ -21,39 +22,39 @@ use crate::identity::grants::Grants;
 use crate::identity::secret::Fingerprint;
 use crate::identity::subject::{SubjectId, name_of_person};
 
-/// Above so many, expired ones are dropped before another is kept. What is valid is bounded by
-/// the bounds on tokens and sessions.
+/// Number of cached credentials above which expired ones are removed before another is added. The
+/// number of valid ones is bounded by the limits on tokens and sessions.
 const KNOWN_MAX: usize = 4_096;
-/// A token's last use is noted this often at the most.
+/// Minimum interval at which the last use of a token is stored.
 const TOUCH_EVERY: SignedDuration = SignedDuration::from_mins(10);
 
-/// How long who is known is not looked up again.
+/// Time for which a cached credential is used without another check in the database.
 const FRESH: Duration = Duration::from_secs(5);
 
-/// Somebody who has shown a good secret.
+/// A token or session whose valid secret was shown.
 #[derive(Debug)]
 pub struct Credential {
     /// The token that was shown or that the session was opened with, or the person.
     pub subject: SubjectId,
-    /// Who signed in at the provider, if it is no token.
+    /// The person who signed in at the provider; `None` for a token.
     pub person: Option<Person>,
-    /// The token's name, or the person's with what tells it from any token's.
+    /// The token's name, or the person's name in a form that no token can have.
     pub name: String,
-    /// Its role, if it has no rights of its own.
+    /// Its role; `None` if it has rights of its own.
     pub role: Option<Role>,
-    /// What it may do: at all of `scope`, see [`Self::for_right`].
+    /// Rights that hold everywhere in `scope`; see [`Self::for_right`].
     pub rights: Rights,
-    /// Where it may do that.
+    /// Sites and robots for which `rights` hold.
     pub scope: Scope,
-    /// All that it may do.
+    /// All its grants.
     grants: Grants,
-    /// The browser's session, if it is one.
+    /// The browser's session; `None` if a token was shown directly.
     pub session: Option<SessionId>,
-    /// From when on it is refused.
+    /// Time from which it is refused.
     pub expires_at: Timestamp,
     ended: CancellationToken,
     touched_us: AtomicI64,
-    /// When it was looked up last, on the monotonic clock.
+    /// Time of the last check in the database, milliseconds of the monotonic clock.
     checked_ms: AtomicU64,
 }
 
@@ -82,7 +83,7 @@ impl Credential {
         }
     }
 
-    /// A person's session.
+    /// Makes the credential of a person's session.
     pub(super) fn of_person(
         signed_in: SignedIn,
         grants: Grants,
@@ -106,8 +107,9 @@ impl Credential {
         }
     }
 
-    /// Whoever it is, as far as a request goes that needs a right: with the places of the grants
-    /// that have this right, and the rights that hold at all of these. `None` if no grant has it.
+    /// Returns this credential for a request that needs a right: `scope` covers the grants that
+    /// include the right, and `rights` those that hold in all of it. `None` if no grant includes
+    /// the right.
     pub fn for_right(self: &Arc<Self>, right: Right) -> Option<Arc<Self>> {
         if !self.grants.are_several() {
             return self.rights.includes(right).then(|| Arc::clone(self));
@@ -129,40 +131,41 @@ impl Credential {
         }))
     }
 
-    /// Whether it may do something to a robot, whatever the right of the request.
+    /// Returns whether one of its grants gives the right for this robot, whatever right the request
+    /// needs.
     pub fn may_at(&self, right: Right, site: &SiteId, robot: &RobotId) -> bool {
         self.grants.includes_at(right, site, robot)
     }
 
-    /// All rights that it has somewhere, for people.
+    /// Returns the union of the rights of all its grants, for display.
     pub fn all_rights(&self) -> Rights {
         let grants = self.grants.as_slice().iter();
         grants.fold(Rights::default(), |all, grant| all.union(grant.rights))
     }
 
-    /// Whether it was looked up a moment ago.
+    /// Returns whether it was checked in the database within [`FRESH`].
     pub(super) fn is_fresh(&self, now: Duration) -> bool {
         let checked_ms = self.checked_ms.load(Ordering::Relaxed);
         to_ms(now).saturating_sub(checked_ms) < to_ms(FRESH)
     }
 
-    /// Whether it was looked up last before a time.
+    /// Returns whether its last check in the database was before a time.
     fn is_older(&self, than: Duration) -> bool {
         self.checked_ms.load(Ordering::Relaxed) < to_ms(than)
     }
 
-    /// Notes that it was looked up and still holds.
+    /// Records that it was checked in the database and is valid.
     pub(super) fn checked(&self, now: Duration) {
         self.checked_ms.store(to_ms(now), Ordering::Relaxed);
     }
 
-    /// Cancelled when the token is revoked or the session ended; whatever stays open for long
-    /// (streams, sockets) must watch it, and [`Self::expires_at`].
+    /// Returns a token that is cancelled when the credential is revoked or its session ends.
+    /// Long-lived connections (streams, sockets) must watch it, and [`Self::expires_at`].
     pub fn ended(&self) -> CancellationToken {
         self.ended.clone()
     }
 
-    /// As the API shows it.
+    /// Returns its description for the API.
     pub fn session(&self) -> Session {
         Session {
             name: self.name.clone(),
@@ -177,17 +180,17 @@ impl Credential {
         }
     }
 
-    /// Refuses a robot that it is not for.
+    /// Refuses a robot outside its scope.
     ///
     /// # Errors
-    /// [`AppError::OutsideScope`], as all of these.
+    /// [`AppError::OutsideScope`].
     pub fn check_robot(&self, site: &SiteId, robot: &RobotId) -> Result<(), AppError> {
         self.check_in(self.scope.includes_robot(site, robot), || {
             format!("is about robot `{robot}` of site `{site}`")
         })
     }
 
-    /// Refuses a name that no robot has that it is for.
+    /// Refuses a robot's name if no robot of that name can be in its scope.
     ///
     /// # Errors
     /// As [`Self::check_robot`].
@@ -197,7 +200,7 @@ impl Credential {
         })
     }
 
-    /// Refuses a site of which nothing is in its scope.
+    /// Refuses a site if nothing of it is in its scope.
     ///
     /// # Errors
     /// As [`Self::check_robot`].
@@ -207,7 +210,7 @@ impl Credential {
         })
     }
 
-    /// Refuses a site of which not all is in its scope.
+    /// Refuses a site unless all of it is in its scope.
     ///
     /// # Errors
     /// As [`Self::check_robot`].
@@ -225,7 +228,7 @@ impl Credential {
         self.check_in(self.scope.includes(scope), || format!("is about {scope}"))
     }
 
-    /// Refuses unless it is for everything.
+    /// Refuses unless its scope is the whole server.
     ///
     /// # Errors
     /// As [`Self::check_robot`].
@@ -244,15 +247,15 @@ impl Credential {
         Err(AppError::OutsideScope(detail))
     }
 
-    /// Whether it may set and end the limits of an owner: of its own, or of any with the right to
-    /// release what others hold.
+    /// Returns whether it may set and end the limits of an owner: its own limits, or all with
+    /// [`Right::ReleaseHold`].
     pub fn may_hold_as(&self, owner: &OwnerId) -> bool {
         self.rights.includes(Right::ReleaseHold)
             || (self.rights.includes(Right::Hold) && self.own_name() == owner.as_str())
     }
 
-    /// The name of its own limits: a token's name. A person may be called like a token, so it is
-    /// their identifier.
+    /// Returns the owner of its own limits: a token's name, or a person's identifier, since a
+    /// person's name may equal a token's.
     pub fn own_name(&self) -> String {
         match &self.person {
             None => self.name.clone(),
@@ -260,8 +263,8 @@ impl Credential {
         }
     }
 
-    /// Who does something, for people: this token's name always, and behind it the name that
-    /// whoever shows it gave, if it is another one. Nobody acts under a name alone that is not his token's.
+    /// Returns the author of a request, for display: this credential's name, followed by the name
+    /// claimed in the request if that differs. A claimed name never stands alone.
     pub fn said_by(&self, claimed: Option<&str>) -> String {
         match claimed.map(str::trim) {
             None | Some("") => self.name.clone(),
@@ -273,7 +276,7 @@ impl Credential {
         }
     }
 
-    /// Whether this use is to be noted.
+    /// Returns whether this use is to be stored as the last one.
     pub(super) fn touch(&self, now: Timestamp) -> bool {
         let now_us = now.as_microsecond();
         let every_us = i64::try_from(TOUCH_EVERY.as_micros()).unwrap_or(i64::MAX);
@@ -289,11 +292,10 @@ fn to_ms(time: Duration) -> u64 {
     u64::try_from(time.as_millis()).unwrap_or(u64::MAX)
 }
 
-/// First and longest wait after a look-up of who is known that failed or took too long; it doubles
-/// each time.
+/// First wait after a failed or slow check in the database; it doubles with each failure.
 const BACK_OFF_MIN: Duration = Duration::from_millis(500);
 const BACK_OFF_MAX: Duration = Duration::from_secs(16);
-/// What the database says is valid.
+/// Tokens and sessions that are valid according to the database.
 #[derive(Debug, Default)]
 pub(super) struct Valid {
     pub(super) tokens: Vec<(Fingerprint, Credential)>,
@@ -302,7 +304,7 @@ pub(super) struct Valid {
 }
 
 impl Valid {
-    /// Takes in what another reading says is valid.
+    /// Adds what another read found valid.
     pub(super) fn join(&mut self, other: Self) {
         self.tokens.extend(other.tokens);
         self.token_ids.extend(other.token_ids);
@@ -316,14 +318,14 @@ impl Valid {
     }
 }
 
-/// All who are known.
+/// Cache of credentials.
 #[derive(Debug, Default)]
 pub(super) struct Known {
     inner: Mutex<Inner>,
     rechecks: Mutex<Rechecks>,
 }
 
-/// Look-ups of who is known already: one at a time, and fewer while they fail.
+/// Checks of cached credentials in the database: one at a time, with back-off after failures.
 #[derive(Debug, Default)]
 struct Rechecks {
     is_under_way: bool,
@@ -331,8 +333,8 @@ struct Rechecks {
     wait: Duration,
 }
 
-/// The turn to look somebody up again; given back when it is dropped, as one that failed unless
-/// [`Recheck::succeeded`].
+/// Permission to check a credential in the database. Dropping it counts as a failure, unless
+/// [`Recheck::succeeded`] was called.
 #[derive(Debug)]
 pub(super) struct Recheck<'known> {
     known: &'known Known,
@@ -341,7 +343,7 @@ pub(super) struct Recheck<'known> {
 }
 
 impl Recheck<'_> {
-    /// The database has answered.
+    /// Ends the check as a success.
     pub(super) fn succeeded(mut self) {
         self.has_succeeded = true;
     }
@@ -378,8 +380,8 @@ impl Known {
         self.rechecks.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The turn to look up again who is known; `None` while somebody else does, or for a while
-    /// after it failed.
+    /// Returns permission to check a credential; `None` while another check is under way or during
+    /// back-off.
     pub(super) fn recheck(&self, now: Duration) -> Option<Recheck<'_>> {
         let mut rechecks = self.rechecks();
         if rechecks.is_under_way || now < rechecks.not_before {
@@ -397,7 +399,7 @@ impl Known {
         self.lock().generation
     }
 
-    /// Who is known by a secret that is still valid.
+    /// Returns the credential of a secret, if it is cached and has not expired.
     pub(super) fn find(&self, secret: &Fingerprint, now: Timestamp) -> Option<Arc<Credential>> {
         let mut inner = self.lock();
         let found = inner.credentials.get(secret)?;
@@ -409,8 +411,8 @@ impl Known {
         None
     }
 
-    /// Keeps who was looked up within a generation; `None` if it is over, and the look-up is to
-    /// be repeated.
+    /// Caches a credential looked up at `generation`. Returns `None` if the generation has changed
+    /// since; the look-up must be repeated.
     pub(super) fn keep(
         &self,
         secret: Fingerprint,
@@ -429,15 +431,16 @@ impl Known {
         Some(Arc::clone(kept.or_insert_with(|| Arc::new(credential))))
     }
 
-    /// Whether somebody who was known before a time is no longer valid.
+    /// Returns whether a credential checked last before a time is no longer valid.
     pub(super) fn any_gone(&self, valid: &Valid, before: Duration) -> bool {
         let inner = self.lock();
         let is_gone = |known: &Arc<Credential>| !valid.contains(known) && known.is_older(before);
         inner.credentials.values().any(is_gone)
     }
 
-    /// Knows what was read within a generation, from a time on: who is valid is known, who is not
-    /// is ended. What was read beside an end says nothing, and is read again soon.
+    /// Updates the cache with what was read from `began_at` on: adds valid tokens, and ends
+    /// credentials that are no longer valid. Ignored if the generation has changed since; the next
+    /// read follows soon.
     pub(super) fn read_again(&self, valid: Valid, generation: u64, began_at: Duration) {
         let mut inner = self.lock();
         if inner.generation != generation {
@@ -460,8 +463,8 @@ impl Known {
         }
     }
 
-    /// Ends everybody of whom something holds: nothing they ask from now on is answered, and
-    /// what they have open closes.
+    /// Ends all credentials that match: their requests are refused from now on, and their open
+    /// connections close.
     pub(super) fn end(&self, whom: impl Fn(&Credential) -> bool) {
         let mut inner = self.lock();
         inner.generation += 1;

@@ -1,4 +1,4 @@
-//! Who asks: tokens and sessions recognised, browser sessions opened and ended.
+//! Authentication: recognises tokens and sessions, and opens and ends browser sessions.
 //!
 //! ```text
 //!  secret shown ─► known in memory? ─yes────────────────────────────────────► who it is
@@ -9,9 +9,10 @@
 //!                     └─► refused, the same for every cause; while locked: come back later
 //! ```
 //!
-//! What is valid is known from the start of the server, and read again every few seconds, so that
-//! what `tread-server init` revokes in its own process ends here too. So nobody who may come in
-//! needs a look-up but after `init`; look-ups take turns, of which a Stop has one of its own.
+//! Valid tokens are cached at the start of the server and read again every few seconds, so that
+//! tokens revoked by `tread-server init` in its own process are refused here too. A token holder
+//! therefore needs a look-up only after `init`. Look-ups are limited in number, with a separate
+//! limit for Stop requests.
 
 pub mod audit;
 mod id_tokens;
@@ -43,24 +44,24 @@ use crate::identity::attempts::{Attempts, Source};
 use crate::identity::secret::{Fingerprint, Kind, SECRET_RANDOM_BYTES, Secret};
 use crate::identity::subject::SubjectId;
 
-/// Most sessions of one token or person; the oldest ends when another begins.
+/// Maximum number of sessions of one token or person; opening another ends the oldest.
 pub const SESSIONS_EACH_MAX: u32 = 20;
-/// How long a session lasts, at the most as long as its token.
+/// Maximum duration of a session; it also ends with its token.
 pub const SESSION_LASTS: SignedDuration = SignedDuration::from_hours(12);
-/// How long a request waits for whoever is known to be looked up again.
+/// Maximum time that a request waits for the check of a cached credential.
 const RECHECK_MAX: Duration = Duration::from_millis(250);
-/// How often a look-up is repeated that something was ended during.
+/// Maximum number of repetitions of a look-up during which something was ended.
 const LOOK_UPS_MAX: u32 = 5;
-/// Secrets that are looked up at once: of four connections that read, strangers get two.
+/// Maximum number of look-ups at once: two of the four reading connections.
 const LOOK_UP_TURNS: usize = 2;
-/// The same of those who ask for a Stop.
+/// Maximum number of look-ups at once for Stop requests.
 const STOP_LOOK_UP_TURNS: usize = 1;
-/// How long a secret waits for its turn to be looked up.
+/// Maximum time that a look-up waits for its turn.
 const LOOK_UP_WAIT_MAX: Duration = Duration::from_secs(5);
-/// How often what is valid is read again.
+/// Interval at which valid tokens and sessions are read again.
 const READ_AGAIN: Duration = Duration::from_secs(2);
 
-/// What is remembered of who asks.
+/// State of authentication in memory.
 #[derive(Debug)]
 pub(super) struct Identity {
     known: Known,
@@ -93,22 +94,22 @@ pub enum Shown {
     Session,
 }
 
-/// Why a secret opens nothing. The answer says no more than that; the rest is for the counters.
+/// Reason why a secret is refused. The answer does not contain it; it is only counted.
 #[derive(Debug, thiserror::Error)]
 pub enum SignInError {
-    /// It cannot be one: a digit is wrong.
+    /// The secret is malformed, for instance by a wrong check digit.
     #[error("the token is not valid")]
     Malformed,
-    /// Nothing is kept of it.
+    /// The secret is not in the database.
     #[error("the token is not valid")]
     Unknown,
-    /// Its time is over.
+    /// The token or session has expired.
     #[error("the token is not valid")]
     Expired,
-    /// It was revoked.
+    /// The token was revoked.
     #[error("the token is not valid")]
     Revoked,
-    /// It opens nothing, and there were too many such before.
+    /// The secret is invalid, after too many failures. Holds the time until the next attempt.
     #[error("there were too many failed attempts; try again in {} s", .0.as_secs() + 1)]
     Locked(Duration),
     /// The database failed.
@@ -117,7 +118,7 @@ pub enum SignInError {
 }
 
 impl App {
-    /// Who shows a secret.
+    /// Returns the credential of a secret.
     ///
     /// # Errors
     /// [`SignInError`]; all but its kinds `Locked` and `Storage` look the same from outside.
@@ -168,7 +169,7 @@ impl App {
         }
     }
 
-    /// Waits until a secret that is not known may be looked up.
+    /// Waits for permission to look up a secret that is not cached.
     pub(super) async fn look_up_turn(
         &self,
         purpose: Purpose,
@@ -182,17 +183,17 @@ impl App {
         turn.ok_or(DbError::Sqlite(sqlx::Error::PoolTimedOut))
     }
 
-    /// Reads which tokens and sessions are valid: tokens are known from now on, and who is known
-    /// and no longer valid is ended with what they have open.
+    /// Reads the valid tokens and sessions from the database: caches all valid tokens, and ends
+    /// cached credentials that are no longer valid.
     ///
     /// # Errors
-    /// The database failed; everything stays as it was.
+    /// The database failed; the cache is unchanged.
     pub async fn know_tokens(&self) -> Result<(), AppError> {
         let known = &self.identity().known;
         let (generation, began_at) = (known.generation(), self.clock().elapsed());
         let mut valid = self.valid().await?;
         if known.any_gone(&valid, began_at) {
-            // A row that was lost for want of memory reads as none, but not twice.
+            // SQLite can return no row for lack of memory, but not twice in a row.
             valid.join(self.valid().await?);
         }
         known.read_again(valid, generation, began_at);
@@ -217,22 +218,23 @@ impl App {
         Ok(valid)
     }
 
-    /// Who is known in memory, and still holds.
+    /// Returns the cached credential of a secret, if it is still valid.
     async fn known(&self, secret: &Secret) -> Option<Arc<Credential>> {
         let known = &self.identity().known;
         let credential = known.find(&secret.fingerprint(), self.clock().now())?;
         if credential.is_fresh(self.clock().elapsed()) {
             return Some(credential);
         }
-        // Who was let in before is let in while the database fails or is slow, for a Stop above
-        // all: what is revoked here ends in memory, and elsewhere as soon as it can be read.
+        // A cached credential remains valid while the database fails or is slow, above all for a
+        // Stop. Revocations of this process take effect in memory, those of others as soon as they
+        // can be read.
         let Some(recheck) = known.recheck(self.clock().elapsed()) else {
             return Some(credential);
         };
         let check = || tokio::time::timeout(RECHECK_MAX, self.kept(secret));
         let mut checked = check().await;
         if matches!(&checked, Ok(Err(gone)) if !matches!(gone, SignInError::Storage(_))) {
-            // A row that was lost for want of memory reads as none, but not twice.
+            // SQLite can return no row for lack of memory, but not twice in a row.
             checked = check().await;
         }
         match checked {
@@ -253,7 +255,7 @@ impl App {
         Some(credential)
     }
 
-    /// What the database says of a secret.
+    /// Looks up the credential of a secret in the database.
     async fn kept(&self, secret: &Secret) -> Result<Credential, SignInError> {
         let (now, elapsed) = (self.clock().now(), self.clock().elapsed());
         let fingerprint = secret.fingerprint();
@@ -278,7 +280,7 @@ impl App {
                     }
                 }
             }
-            // It lets robots join and opens nothing.
+            // A join token gives no access.
             Kind::Join => return Err(SignInError::Unknown),
         };
         if token.revoked_at.is_some() {
@@ -334,7 +336,7 @@ impl App {
     }
 }
 
-/// Reads again and again what is valid, until the stop.
+/// Reads the valid tokens and sessions periodically until the stop.
 pub async fn run(app: App, stop: CancellationToken) {
     loop {
         tokio::select! {
@@ -347,7 +349,7 @@ pub async fn run(app: App, stop: CancellationToken) {
     }
 }
 
-/// The token of a secret, and when it expires.
+/// Returns the token of a secret and its expiry.
 async fn token_of(
     tx: &mut Tx,
     fingerprint: &Fingerprint,
@@ -359,7 +361,7 @@ async fn token_of(
     Ok((token, None, expires_at))
 }
 
-/// A new secret of the operating system's random numbers: the only place that makes one.
+/// Returns a new secret from the operating system's random numbers; all secrets are made here.
 pub(super) fn new_secret(kind: Kind) -> Result<Secret, AppError> {
     let mut random = [0; SECRET_RANDOM_BYTES];
     getrandom::fill(&mut random).map_err(|error| AppError::NoRandomness(error.to_string()))?;

@@ -1,4 +1,4 @@
-//! People who sign in at an OpenID provider: sent there, taken back, given what their groups give.
+//! Sign-in of people at an OpenID provider, and the rights that their groups give.
 //!
 //! ```text
 //!  browser ─► begin ─► provider ─► browser ─► finish ─► code for ID token ─► groups ─► session
@@ -7,8 +7,8 @@
 //!                                                             not believed    refused
 //! ```
 //!
-//! Nothing is kept of a sign-in that is under way ([`crate::identity::pending`]). The provider is asked
-//! only by browsers in which one began, and by few at a time.
+//! No state of a pending sign-in is kept on the server ([`crate::identity::pending`]). Requests to
+//! the provider are made only for browsers in which a sign-in began, and few at a time.
 
 use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::net::IpAddr;
@@ -39,68 +39,68 @@ use crate::identity::secret::Secret;
 use crate::identity::subject::name_of_person;
 use crate::oidc::{ExchangeError, Provider, SignedInThere};
 
-/// Where a browser is sent to sign in.
+/// Path at which a browser begins a sign-in.
 pub const BEGIN: &str = "/v1/sign-in/oidc";
-/// Codes that the provider is asked about at once.
+/// Maximum number of codes exchanged with the provider at once.
 const EXCHANGES_MAX: usize = 16;
-/// The same of one address; a whole /64 for IPv6.
+/// Maximum number of codes exchanged at once for one address (a whole /64 of IPv6).
 const EXCHANGES_PER_NETWORK_MAX: usize = 4;
-/// How long a code waits for its turn.
+/// Maximum time that a code waits for its exchange.
 const EXCHANGE_WAIT_MAX: Duration = Duration::from_secs(2);
-/// Longest code that is taken, bytes.
+/// Maximum length of a code, bytes.
 const CODE_MAX: usize = 2_048;
-/// Longest name of a host in the log.
+/// Maximum length of a host name in the log, characters.
 const HOST_SHOWN_MAX: usize = 80;
-/// Sign-ins that succeeded and are remembered, so that none does so twice. A provider takes a code once;
-/// this is for one that does not.
+/// Number of completed sign-ins that are remembered, so that none can be used twice. A provider
+/// should accept a code once; this covers one that does not.
 const USED_MAX: usize = 4_096;
-/// First and longest rest between attempts to find the provider.
+/// First wait between attempts to reach the provider; it doubles up to a maximum.
 const FIND_AGAIN_MIN: Duration = Duration::from_secs(1);
 const FIND_AGAIN_MAX: Duration = Duration::from_secs(30);
-/// How often a provider that is known is asked again who it is.
+/// Interval at which the metadata of a known provider are read again.
 const LOOK_AGAIN: Duration = Duration::from_hours(1);
 
-/// Why somebody is not signed in.
+/// Reason why a person is not signed in.
 #[derive(Debug, thiserror::Error)]
 pub enum PersonError {
-    /// There is no provider.
+    /// No provider is configured.
     #[error("people sign in with tokens here: the configuration has no `[oidc]`")]
     NotConfigured,
-    /// The provider does not answer.
+    /// The provider cannot be reached.
     #[error("the provider cannot be asked now; try again later, or sign in with a token")]
     Unavailable,
-    /// Too many are being signed in.
+    /// Too many people are being signed in at once.
     #[error("too many people are being signed in; try again")]
     Busy,
-    /// It did not begin here.
+    /// The sign-in did not begin in this browser, is too old, or was used.
     #[error(
         "this sign-in did not begin in this browser, or began more than 10 minutes ago, or has been \
          used; begin it again"
     )]
     NotBegun,
-    /// The provider signs them in no further.
+    /// The provider declined the sign-in.
     #[error("the provider has not signed you in: {0}")]
     Declined(String),
-    /// The provider's answer is not believed. Why is in the log alone.
+    /// The provider's answer failed verification; the reason is only in the log.
     #[error("the provider's answer cannot be used; the server's log says why")]
     NotBelieved,
-    /// They are in no group that gives anything.
+    /// None of the person's groups has a grant.
     #[error(
         "`{name}` is signed in at the provider, but is in no group that may do anything here; ask \
          whoever runs this server"
     )]
     NoGroup {
-        /// What they are called.
+        /// The person's name.
         name: String,
-        /// Who they are.
+        /// The person's identity at the provider.
         person: Box<Person>,
     },
-    /// It failed here.
+    /// An error of this server.
     #[error(transparent)]
     Failed(#[from] AppError),
 }
 
-/// A browser begins a sign-in at another name of this server than the one that the provider knows.
+/// A browser begins a sign-in at a host name other than that of `public_url`.
 #[derive(Debug, thiserror::Error)]
 #[error(
     "a browser asks for it at `{asked}`, and is sent to `public_url`, {home}; if it asked for that, a proxy \
@@ -111,33 +111,33 @@ struct OtherHost {
     home: Origin,
 }
 
-/// The beginning of a sign-in.
+/// Response to a browser that begins a sign-in.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Begun {
-    /// Where the browser is sent.
+    /// URL to which the browser is redirected.
     pub location: String,
-    /// What it keeps; `None` if it is sent to the page first.
+    /// Cookie of the pending sign-in; `None` if the browser is redirected to the page first.
     pub cookie: Option<String>,
 }
 
-/// What the provider sends a browser back with.
+/// Query parameters with which the provider redirects a browser back.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Answer {
-    /// The state of the sign-in.
+    /// State of the sign-in.
     pub state: String,
-    /// The code, if it signed them in.
+    /// Authorisation code, if the sign-in succeeded.
     pub code: Option<String>,
-    /// Why not, if it did not.
+    /// Error, if it did not.
     pub error: Option<String>,
-    /// The provider that says so (RFC 9207), if it does.
+    /// Issuer (RFC 9207), if the provider sends it.
     pub issuer: Option<String>,
 }
 
-/// The sign-in at a provider, as configured.
+/// Sign-in at a provider, as configured.
 #[derive(Debug)]
 pub struct People {
     provider: Provider,
-    /// Where browsers find this server: the one place to which the provider sends them back.
+    /// Public URL of this server, to which the provider redirects browsers.
     home: Origin,
     grants: BTreeMap<String, Grant>,
     groups_claim: String,
@@ -149,11 +149,11 @@ pub struct People {
     networks: Mutex<HashMap<IpAddr, Arc<Semaphore>>>,
     used: Mutex<Used>,
     pub(super) id_tokens: IdTokens,
-    /// Somebody wants to sign in, and the provider is not known.
+    /// Notified when somebody wants to sign in while the provider is not known.
     wanted: Notify,
 }
 
-/// States of sign-ins that succeeded, the oldest first.
+/// States of completed sign-ins, with the oldest first in `order`.
 #[derive(Debug, Default)]
 struct Used {
     states: HashSet<String>,
@@ -181,12 +181,12 @@ impl People {
         })
     }
 
-    /// The provider, as it names itself.
+    /// Returns the provider's issuer identifier.
     pub(super) fn issuer(&self) -> &str {
         self.provider.issuer()
     }
 
-    /// The groups that give nothing outside a scope, and those that do.
+    /// Returns the groups whose grants are within a scope, and those whose grants are not.
     pub(super) fn groups_by_scope(&self, within: &Scope) -> (Vec<&str>, Vec<&str>) {
         let is_within = |name: &&str| {
             let grant = self
@@ -199,8 +199,8 @@ impl People {
         names.partition(is_within)
     }
 
-    /// What somebody's groups give by the configuration in force; `None` if that is nothing, or another
-    /// provider signed them in.
+    /// Returns the grants of a person's groups by the present configuration; `None` if there are
+    /// none, or if the person signed in at another provider.
     pub(super) fn grants_of(&self, signed_in: &SignedIn) -> Option<Grants> {
         if signed_in.person.issuer != self.issuer() {
             return None;
@@ -209,11 +209,12 @@ impl People {
         Grants::of_groups(groups.filter_map(|group| self.grants.get(group)))
     }
 
-    /// The turn to ask the provider about a code, of which each address has a few.
+    /// Waits for permission to exchange a code; `None` after [`EXCHANGE_WAIT_MAX`]. The number is
+    /// limited in all and per address.
     async fn turn(&self, address: IpAddr) -> Option<[OwnedSemaphorePermit; 2]> {
         let own = {
             let mut networks = self.networks.lock().unwrap_or_else(PoisonError::into_inner);
-            // Whoever holds or awaits a turn has a handle; the others need no memory.
+            // Semaphores that nobody holds or awaits are removed.
             networks.retain(|_, turns| Arc::strong_count(turns) > 1);
             let own = networks.entry(network_of(address));
             let new = || Arc::new(Semaphore::new(EXCHANGES_PER_NETWORK_MAX));
@@ -228,7 +229,7 @@ impl People {
         turns.ok().flatten()
     }
 
-    /// Whether the provider is known; if not, it is looked for soon.
+    /// Returns whether the provider is known; if not, triggers the next attempt to reach it.
     fn is_found(&self) -> bool {
         let is_known = self.provider.is_known();
         if !is_known {
@@ -242,7 +243,7 @@ impl People {
         used.states.contains(state)
     }
 
-    /// Notes that a sign-in succeeded; whether it is the first time.
+    /// Records a completed sign-in; returns false if its state was used before.
     fn use_up(&self, state: &str) -> bool {
         let mut used = self.used.lock().unwrap_or_else(PoisonError::into_inner);
         if !used.states.insert(state.to_owned()) {
@@ -286,7 +287,7 @@ impl People {
 }
 
 impl App {
-    /// Lets people sign in at a provider; the first time counts.
+    /// Enables sign-in at a provider; only the first call has an effect.
     ///
     /// # Errors
     /// A file that the configuration names cannot be used.
@@ -300,7 +301,7 @@ impl App {
         self.identity().people.get()
     }
 
-    /// How people sign in at a provider, if they can.
+    /// Returns how people sign in at a provider; `None` if no provider is configured.
     pub fn oidc_sign_in(&self) -> Option<OidcSignIn> {
         let people = self.people()?;
         Some(OidcSignIn {
@@ -310,7 +311,7 @@ impl App {
         })
     }
 
-    /// A person's session as whoever shows its secret; `None` if its groups give nothing.
+    /// Returns the credential of a person's session; `None` if its groups have no grant.
     pub(super) fn person_of(&self, kept: SessionRow, checked_at: Duration) -> Option<Credential> {
         let Owner::Person(signed_in) = kept.owner else {
             return None;
@@ -321,15 +322,16 @@ impl App {
         Some(Credential::of_person(signed_in, grants, session, times))
     }
 
-    /// Begins a sign-in at the provider, or sends the browser to the page first, where the person does:
+    /// Begins a sign-in at the provider. The browser is redirected to the page instead, where the
+    /// person begins the sign-in:
     ///
-    /// * if it asks by another name of this server than the one that the provider sends it back to, since
-    ///   cookies are of one name alone;
-    /// * if a foreign page makes it ask. Whoever is signed in at the provider would be here without having
-    ///   wished it, in place of the session that there is.
+    /// * if it uses a host name other than that of `public_url`, since cookies belong to one host
+    ///   name;
+    /// * if the request comes from a foreign page, which could otherwise replace the present
+    ///   session by one of whoever is signed in at the provider.
     ///
     /// # Errors
-    /// There is no provider, or it is not known yet.
+    /// No provider is configured, or it is not known yet.
     pub fn begin_sign_in(&self, asked: &Provenance<'_>) -> Result<Begun, PersonError> {
         let people = self.people().ok_or(PersonError::NotConfigured)?;
         let is_at_home = asked.is_at(&people.home);
@@ -358,7 +360,7 @@ impl App {
         Ok(Begun { location, cookie })
     }
 
-    /// Ends a sign-in: the browser comes back from the provider with what it kept.
+    /// Completes a sign-in when the provider redirects the browser back with its cookie.
     ///
     /// # Errors
     /// [`PersonError`].
@@ -412,8 +414,8 @@ impl App {
         Ok((credential, secret))
     }
 
-    /// A name by which the person is called like no valid token. None is made with such a name any more, but
-    /// one of an earlier version may have it.
+    /// Returns a name for the person that differs from the name of every valid token. New tokens
+    /// cannot have such a name, but those of earlier versions may.
     async fn unlike_tokens(&self, name: String, subject: &str) -> Result<String, AppError> {
         let mut tx = self.db().read("identity").await?;
         let called = name_of_person(&name);
@@ -424,7 +426,8 @@ impl App {
         })
     }
 
-    /// Where a browser is sent to sign out at the provider too, for a person's session that is about to end.
+    /// Returns the URL for signing out at the provider, for a person's session that is about to
+    /// end.
     pub fn sign_out_at_provider(&self, who: &Credential) -> Option<String> {
         let (people, session) = (self.people()?, who.session?);
         who.person.as_ref()?;
@@ -433,7 +436,7 @@ impl App {
     }
 }
 
-/// Finds the provider, and looks now and then whether it says something else, until the stop.
+/// Reads the provider's metadata, and reads them again at intervals, until the stop.
 pub async fn run(app: App, stop: CancellationToken) {
     let Some(people) = app.people() else {
         return stop.cancelled().await;
@@ -461,7 +464,7 @@ pub async fn run(app: App, stop: CancellationToken) {
             }
         };
         let wanted = async {
-            // Never without a rest, however many want to.
+            // Waits at least this long, however many people want to sign in.
             tokio::time::sleep(FIND_AGAIN_MIN).await;
             people.wanted.notified().await;
         };

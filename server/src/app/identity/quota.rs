@@ -1,40 +1,40 @@
-//! How many there may be of what admins make: in all, and of those who administer some sites alone each
-//! a share, so that none of them uses up what the others need.
+//! Quotas on objects that admins create, such as tokens: a total, and for admins of some sites
+//! alone a share, so that none uses up what others need.
 //!
-//! The share goes by what a maker administers and not by his token: whoever may make tokens could make
-//! more makers.
+//! The share belongs to the scope that the creator administers and not to the creator's token: an
+//! admin could otherwise create more admins to get more shares.
 
 use tread_api::rights::Scope;
 
 use crate::app::AppError;
 
-/// How many there may be.
+/// Limits on the number of objects of one kind.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::app) struct Quota {
-    /// What is counted.
+    /// Name of the objects.
     pub(in crate::app) what: &'static str,
-    /// In all.
+    /// Maximum number in all.
     pub(in crate::app) all: usize,
-    /// Those of them that only admins of the whole server make.
+    /// Number of these reserved for admins of the whole server.
     pub(in crate::app) reserved: usize,
-    /// For what one admin of some sites administers, whoever has made them.
+    /// Maximum number within the scope of one admin of some sites, by any creator.
     pub(in crate::app) share: usize,
 }
 
-/// How many there are.
+/// Present number of objects.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::app) struct Count {
-    /// In all.
+    /// Number in all.
     pub(in crate::app) all: i64,
-    /// Of them those for what the maker administers.
+    /// Number within the scope that the creator administers.
     pub(in crate::app) within_scope: i64,
 }
 
 impl Quota {
-    /// Refuses another one of a maker.
+    /// Checks that the quota allows `maker` one more object.
     ///
     /// # Errors
-    /// [`AppError::TooMany`].
+    /// [`AppError::TooMany`] at the limit.
     pub(in crate::app) fn check(&self, maker: &Scope, count: Count) -> Result<(), AppError> {
         let is_limited = !maker.is_everywhere();
         let most = self.all - if is_limited { self.reserved } else { 0 };

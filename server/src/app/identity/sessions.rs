@@ -1,4 +1,4 @@
-//! Sessions of browsers: opened, listed and ended.
+//! Browser sessions: opening, listing and ending.
 
 use std::sync::Arc;
 
@@ -15,14 +15,14 @@ use crate::db::{self, DbError, Tx};
 use crate::identity::secret::{Kind, Secret};
 use crate::identity::subject::SubjectId;
 
-/// Most sessions that people have at once, all together.
+/// Maximum number of sessions of all people together.
 pub const SESSIONS_OF_PEOPLE_MAX: usize = 10_000;
 
 impl App {
-    /// Opens a session for a browser that has shown a token, and tells its secret.
+    /// Opens a session for a browser that has shown a token, and returns the session's secret.
     ///
     /// # Errors
-    /// The database failed, or the operating system gives no random numbers.
+    /// The database failed, or the operating system provides no random numbers.
     pub async fn open_session(
         &self,
         credential: &Credential,
@@ -38,7 +38,7 @@ impl App {
         opened.await?.ok_or(AppError::UnknownToken(token))
     }
 
-    /// Opens a session of a token or person; `None` if they hold no longer.
+    /// Opens a session of a token or person; `None` if the token or person is no longer valid.
     pub(super) async fn open_session_of(
         &self,
         owner: Owner,
@@ -81,7 +81,7 @@ impl App {
         }
         let app = self.clone();
         let ending = move |_outcome| {
-            // To end nobody would only have look-ups repeated.
+            // Ending no session would only cause look-ups to be repeated.
             if !surplus.is_empty() {
                 app.end_known_sessions(&surplus);
             }
@@ -100,7 +100,8 @@ impl App {
         }
     }
 
-    /// Ends a browser's session: from now on it is refused, and what it has open closes.
+    /// Ends a browser's session: its requests are refused from now on, and its open connections
+    /// close.
     pub async fn end_session(&self, id: SessionId) -> Result<(), AppError> {
         let mut tx = self.db().write("identity").await?;
         db::sessions::delete(&mut tx, id).await?;
@@ -119,7 +120,7 @@ impl App {
         }
     }
 
-    /// Sessions of people that hold nowhere outside a scope, newest first.
+    /// Returns the sessions of people whose grants are within a scope, newest first.
     pub async fn sessions_of_people(
         &self,
         within: &Scope,
@@ -134,7 +135,8 @@ impl App {
             issuer: people.issuer(),
             within: &groups,
             elsewhere: &elsewhere,
-            // Whoever administers everything sees those too whose groups were taken out of the table.
+            // An admin of the whole server also sees sessions whose groups are no longer
+            // configured.
             any: within.is_everywhere(),
             at: self.clock().now(),
             before,
@@ -164,7 +166,7 @@ impl App {
         })
     }
 
-    /// Ends somebody's session for him.
+    /// Ends another person's session.
     ///
     /// # Errors
     /// [`AppError::UnknownSession`].
@@ -177,7 +179,7 @@ impl App {
         self.end_session(id).await
     }
 
-    /// Where a session holds; `None` if it is not known.
+    /// Returns the scope of a session; `None` if it is not known.
     pub async fn session_scope(&self, id: SessionId) -> Result<Option<Scope>, AppError> {
         let mut tx = self.db().read("identity").await?;
         let Some(kept) = db::sessions::find(&mut tx, id).await? else {
@@ -191,7 +193,7 @@ impl App {
             Owner::Person(signed_in) => {
                 let people = self.people();
                 let grants = people.and_then(|people| people.grants_of(&signed_in));
-                // One that holds nowhere is a matter for whoever holds everywhere.
+                // A session without any grant belongs to admins of the whole server.
                 let scope = grants.map_or(Scope::EVERYWHERE, |grants| grants.scope());
                 Ok(Some(scope))
             }
@@ -199,7 +201,7 @@ impl App {
     }
 }
 
-/// Whether somebody whose request began a while ago still holds.
+/// Returns whether a credential is still valid in the database at `now`.
 pub(super) async fn still_holds(
     tx: &mut Tx,
     who: &Credential,

@@ -1,4 +1,4 @@
-//! Tokens: made, listed and revoked.
+//! Tokens: creation, listing and revocation.
 
 use jiff::{SignedDuration, Timestamp};
 use tread_api::identity::{
@@ -17,20 +17,20 @@ use crate::db::{self, Tx};
 use crate::identity::secret::Kind;
 use crate::identity::subject::{SubjectId, may_name_token};
 
-/// Most tokens that are valid at once.
+/// Maximum numbers of valid tokens.
 const TOKENS: Quota = Quota {
     what: "valid tokens",
     all: 1_000,
     reserved: 100,
     share: 100,
 };
-/// How long dead tokens are listed, join tokens too.
+/// Time for which expired and revoked tokens and join tokens are listed.
 pub(in crate::app) const DEAD_KEPT: SignedDuration = SignedDuration::from_hours(400 * 24);
-/// Dead tokens that are forgotten with each new one.
+/// Maximum number of expired or revoked tokens deleted with each new one.
 pub(in crate::app) const FORGET_MAX: u32 = 10;
 
-/// Ends in memory whoever is known by a token, when it is dropped: after a commit, or when there is
-/// none. Whoever is not revoked in the database is known again once it was looked up.
+/// Ends a token's cached credentials when it is dropped: after a commit, or if there is none. A
+/// token that is still valid in the database is cached again at its next look-up.
 struct Ending(App, TokenId);
 
 impl Drop for Ending {
@@ -41,22 +41,23 @@ impl Drop for Ending {
     }
 }
 
-/// Asks for the first token of a server.
+/// Request for the first token of a server.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct FirstAdmin {
-    /// What people call it.
+    /// The token's name, for people.
     pub name: String,
-    /// Days until it is refused.
+    /// Validity, days.
     pub valid_days: u32,
-    /// Make it even if there is an admin, in place of a valid token of the same name.
+    /// Whether to create it even if a valid admin's token exists, replacing a valid token of the
+    /// same name.
     pub force: bool,
 }
 
 impl App {
-    /// Makes a token for somebody, who gives no rights that he has not himself.
+    /// Creates a token whose rights are within those of its creator.
     ///
     /// # Errors
-    /// It would have more rights than its maker, or hold where he has none; and those of
+    /// The token would have rights or a scope that its creator does not have; and the errors of
     /// [`Self::create_token`].
     pub async fn give_token(
         &self,
@@ -87,7 +88,7 @@ impl App {
             return Err(AppError::BeyondRights(detail));
         }
         let mut tx = self.db().write("identity").await?;
-        // His own may have been revoked since his request began.
+        // The creator's token may have been revoked since the request began.
         let now = self.clock().now();
         let holds = still_holds(&mut tx, giver, now).await?;
         if !holds || giver.ended().is_cancelled() {
@@ -102,11 +103,11 @@ impl App {
         Ok(created)
     }
 
-    /// Makes a token.
+    /// Creates a token.
     ///
     /// # Errors
-    /// An impossible name or time, a name that is taken, a site that is not known, or too many
-    /// tokens.
+    /// The name or validity is impossible, the name is taken, a site is not known, or there are too
+    /// many tokens.
     pub async fn create_token(
         &self,
         request: CreateToken,
@@ -119,10 +120,10 @@ impl App {
         Ok(created)
     }
 
-    /// Makes an admin's token where nobody is there to ask for it.
+    /// Creates an admin's token without a request, for `tread-server init`.
     ///
     /// # Errors
-    /// There is a valid admin's token, unless it is forced.
+    /// A valid admin's token exists and `force` is not set.
     pub async fn create_first_admin(&self, first: FirstAdmin) -> Result<CreatedToken, AppError> {
         let now = self.clock().now();
         let mut tx = self.db().write("identity").await?;
@@ -169,7 +170,7 @@ impl App {
         Ok(created)
     }
 
-    /// How many admins' tokens are valid.
+    /// Returns the number of valid admins' tokens.
     pub async fn admin_count(&self) -> Result<i64, AppError> {
         let mut tx = self.db().read("identity").await?;
         let counts = db::tokens::valid_counts(&mut tx, self.clock().now()).await?;
@@ -233,7 +234,8 @@ impl App {
         })
     }
 
-    /// Tokens that hold nowhere outside a scope, newest first; dead ones too.
+    /// Returns the tokens whose scope is within a scope, newest first, with expired and revoked
+    /// ones.
     pub async fn tokens(
         &self,
         within: &Scope,
@@ -245,7 +247,7 @@ impl App {
         Ok(page(tokens, limit, |token: &Token| token.id.to_string()))
     }
 
-    /// Where a token holds; `None` if it is not known.
+    /// Returns the scope of a token; `None` if it is not known.
     pub async fn token_scope(&self, id: TokenId) -> Result<Option<Scope>, AppError> {
         let mut tx = self.db().read("identity").await?;
         Ok(db::tokens::find(&mut tx, id)
@@ -253,11 +255,12 @@ impl App {
             .map(|token| token.sites))
     }
 
-    /// Revokes a token: from now on it is refused, its sessions end, and what it has open closes.
+    /// Revokes a token: it is refused from now on, its sessions end, and its open connections
+    /// close.
     ///
     /// # Errors
-    /// [`AppError::UnknownToken`]. Whatever fails, what the token has open closes, and it is looked
-    /// up again.
+    /// [`AppError::UnknownToken`]. After any error the token's open connections close, and it is
+    /// looked up again.
     pub async fn revoke_token(&self, id: TokenId) -> Result<Token, AppError> {
         let ending = Ending(self.clone(), id);
         let mut tx = self.db().write("identity").await?;
@@ -269,7 +272,7 @@ impl App {
     }
 }
 
-/// What a token is to do.
+/// Returns the rights that a new token is to have.
 fn rights_of(request: &CreateToken) -> Result<Rights, AppError> {
     let wrong = |detail: &str| AppError::Invalid {
         field: "rights",
@@ -284,7 +287,7 @@ fn rights_of(request: &CreateToken) -> Result<Rights, AppError> {
     }
 }
 
-/// Where a token is to hold.
+/// Returns the scope that a new token is to have.
 fn sites_of(request: &CreateToken) -> Result<Scope, AppError> {
     Scope::try_from(request.sites.clone()).map_err(|invalid| AppError::Invalid {
         field: "sites",

@@ -1,4 +1,4 @@
-//! Keys of the database that the ingest writer remembers.
+//! Cache of the database keys that the ingest writer uses.
 
 use std::collections::HashMap;
 
@@ -11,24 +11,25 @@ use crate::app::presence::RobotKey;
 use crate::app::robots::RUNS_KEPT_MAX;
 use crate::db::{self, DbError, Tx};
 
-/// Keys kept in memory before they are looked up afresh.
+/// Number of cached keys above which the cache is emptied.
 const KEYS_MAX: usize = 100_000;
 
-/// Configurations that one robot may measure with: their sums are kept for ever.
+/// Maximum number of configurations that one robot may measure with, since their sums are kept for
+/// ever.
 pub(super) const CONFIGURATIONS_MAX: i64 = 100;
 
-/// Whether a robot may measure with a configuration.
+/// Whether a robot may upload measurements of a configuration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Configured {
-    /// It may, and this is the configuration's key.
+    /// Allowed, with the key of the configuration.
     As(i64),
-    /// Not now: it had another new one a moment ago.
+    /// Refused for now: the robot had too many new configurations of late.
     Later,
-    /// Never: it has measured with [`CONFIGURATIONS_MAX`] others.
+    /// Refused for ever: the robot has measured with [`CONFIGURATIONS_MAX`] others.
     Never,
 }
 
-/// Keys of the database that do not change once they are written.
+/// Database keys, which do not change once they are written.
 #[derive(Debug, Default)]
 pub(super) struct Keys {
     robots: HashMap<(SiteId, RobotId), RobotKeys>,
@@ -80,7 +81,7 @@ impl Keys {
         Ok(found)
     }
 
-    /// The key of a run; `None` while the robot begins too many.
+    /// Returns the key of a run; `None` while the robot's allowance of new runs is used up.
     pub(super) async fn boot(
         &mut self,
         app: &App,
@@ -102,7 +103,7 @@ impl Keys {
         Ok(Some(key))
     }
 
-    /// The key of a configuration that a robot measures with.
+    /// Returns the key of a configuration that a robot measures with, or why it is refused.
     pub(super) async fn configuration(
         &mut self,
         app: &App,

@@ -1,4 +1,4 @@
-//! A segment before it is stored: possible or not, and when it was measured.
+//! Validation of a segment, and correction of its times, before it is stored.
 
 use jiff::{SignedDuration, Timestamp};
 use serde_json::value::{RawValue, to_raw_value};
@@ -7,18 +7,18 @@ use tread_api::site::Grid;
 
 use crate::friction::Sums;
 
-/// How wrong a robot's clock is, from the time that it wrote on what it sent.
+/// Offset of a robot's wall clock from the server's, from the time stamp of its message.
 ///
-/// Small differences are the network's and are left alone, so that a segment has the same epoch
-/// whenever it arrives. With a clock that is wrong by more, the spans are right and the date is
-/// not; the server's date counts then.
+/// Offsets up to [`SKEW_MIN`] are attributed to the network and ignored, so that a segment has the
+/// same epoch whenever it arrives. Beyond that the segment's duration is kept and its date is
+/// corrected by the offset.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Skew {
     ahead: SignedDuration,
     now: Timestamp,
 }
 
-/// Differences that count as the network's.
+/// Maximum offset that is ignored.
 const SKEW_MIN: SignedDuration = SignedDuration::from_secs(30);
 
 impl Skew {
@@ -36,8 +36,8 @@ impl Skew {
         at.checked_sub(self.ahead).unwrap_or(at)
     }
 
-    /// The time of a mission report. One from the future all the same is of an earlier run, whose
-    /// clock was wrong and can no longer be asked; what has arrived cannot be later than now.
+    /// Corrects the time of a mission report. A time that is still in the future is of an earlier
+    /// run with a wrong clock; it is replaced by the present.
     pub(super) fn put_right(self, at: Timestamp) -> Timestamp {
         let at = self.shifted(at);
         if at.duration_since(self.now) > SKEW_MIN {
@@ -47,23 +47,24 @@ impl Skew {
         }
     }
 
-    /// The latest time of the robot's clock that is no future, microseconds since 1970.
+    /// Returns the latest time of the robot's clock that is not in the future, microseconds since
+    /// 1970.
     pub(super) fn latest_us(self) -> i64 {
         let latest = self.now.checked_add(SKEW_MIN + self.ahead);
         latest.unwrap_or(self.now).as_microsecond()
     }
 }
 
-/// What a segment is to the server.
+/// Result of checking a segment.
 #[derive(Debug)]
 pub(super) enum Prepared {
-    /// A measurement with its times put right.
+    /// A measurement with corrected times.
     Ready(Box<Ready>),
-    /// One from a time that has not come: its run's clock is not known.
+    /// A measurement with a time in the future: the clock of its run is not known.
     Ahead(Box<RawValue>),
 }
 
-/// A segment that is possible, ready to be stored.
+/// A valid segment, ready to be stored.
 #[derive(Debug)]
 pub(super) struct Ready {
     pub(super) segment: Segment,
@@ -71,10 +72,10 @@ pub(super) struct Ready {
     pub(super) measurement: Box<RawValue>,
 }
 
-/// Checks a segment and puts its times right.
+/// Checks a segment and corrects its times.
 ///
 /// # Errors
-/// Why it is not possible, for people.
+/// The reason why it is invalid, for people.
 pub(super) fn prepared(segment: &Segment, grid: &Grid, skew: Skew) -> Result<Prepared, String> {
     segment.validate().map_err(|invalid| invalid.to_string())?;
     if segment.grid_revision > grid.revision {

@@ -1,7 +1,7 @@
-//! What a person may want of a mission that is there: pause, resume, replace, cancel.
+//! Requests on an existing mission: pause, resume, replace, cancel.
 //!
-//! Each only writes what is wanted; the reconciler brings it to the robot, and the robot's answer
-//! moves the mission. Wanted twice is wanted once.
+//! Each only stores the wanted state; the reconciler sends it to the robot, and the robot's answer
+//! changes the mission's state. All are idempotent.
 
 use jiff::Timestamp;
 use tread_api::ids::MissionId;
@@ -20,7 +20,8 @@ use crate::db::robots::RobotRow;
 use crate::db::{self, DbError, Tx};
 
 impl App {
-    /// Wants a mission to end: one that waits ends at once, an active one when its robot says so.
+    /// Requests the end of a mission. A queued mission ends at once, an active one when its robot
+    /// confirms.
     pub async fn cancel_mission(&self, id: MissionId) -> Result<MissionDetail, AppError> {
         let mut tx = self.db().write("missions").await?;
         let row = open_row(&mut tx, id).await?;
@@ -37,12 +38,12 @@ impl App {
         self.written(tx, id).await
     }
 
-    /// Wants an active mission to be held, the robot standing.
+    /// Requests that an active mission is paused, with the robot stopped.
     pub async fn pause_mission(&self, id: MissionId) -> Result<MissionDetail, AppError> {
         self.want_pause(id, true).await
     }
 
-    /// Wants a paused mission to go on.
+    /// Requests that a paused mission is resumed.
     pub async fn resume_mission(&self, id: MissionId) -> Result<MissionDetail, AppError> {
         self.want_pause(id, false).await
     }
@@ -57,7 +58,8 @@ impl App {
         let row = open_row(&mut tx, id).await?;
         let mission = &row.mission;
         let state = mission.state;
-        // One that waits and was held, because its robot was stopped or teleoperated, waits on.
+        // A queued mission that was held because its robot was stopped or teleoperated can be
+        // resumed.
         let held_in_queue = state == MissionState::Queued && mission.pause_wanted && !wanted;
         let in_progress = matches!(
             state,
@@ -83,8 +85,8 @@ impl App {
         self.written(tx, id).await
     }
 
-    /// Refuses to let a mission go on while its robot is stopped or teleoperated: it would start
-    /// by itself afterwards.
+    /// Refuses to resume a mission while its robot is stopped or teleoperated: the robot would
+    /// start by itself afterwards.
     async fn check_free(&self, tx: &mut Tx, mission: &Mission) -> Result<(), AppError> {
         let (site, robot) = (&mission.site, &mission.robot);
         let presence = self.presences().get(&(site.clone(), robot.clone()));
@@ -102,8 +104,9 @@ impl App {
         Err(AppError::RobotRefused { robot, detail })
     }
 
-    /// Wants a mission to be another trajectory. What waits is changed at once; what is active
-    /// when its robot holds the new revision whole, and until then the old one is driven.
+    /// Requests that a mission gets another trajectory. A queued mission changes at once. An active
+    /// one changes when its robot has the complete new revision; until then the robot drives the
+    /// old one.
     pub async fn replace_mission(
         &self,
         id: MissionId,
@@ -136,7 +139,8 @@ impl App {
         let state = mission.state;
         let in_progress = matches!(state, MissionState::Active | MissionState::Paused);
         if state == MissionState::Queued && mission.boot.is_none() {
-            // Nobody drives it yet; a robot that has it all the same takes the new revision.
+            // The robot does not drive it yet; if it has it nevertheless, it takes the new
+            // revision.
             db::missions::swap_content(&mut tx, id, mission.revision, &replacement).await?;
         } else if in_progress && mission.replacement.is_none() {
             if !robot.capabilities.replace {
@@ -162,8 +166,8 @@ impl App {
     }
 }
 
-/// Holds everything of a robot that is active or that waits for it, because somebody stopped it or
-/// teleoperates it: nothing of it goes on until a person says so.
+/// Holds all active and queued missions of a robot, because it was stopped or is teleoperated. They
+/// are resumed only by a person.
 pub(in crate::app) async fn hold_all(
     tx: &mut Tx,
     robot_pk: i64,

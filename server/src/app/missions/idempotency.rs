@@ -1,8 +1,7 @@
 //! `Idempotency-Key`: the same request under the same key gets the same answer, also after a
 //! restart of the server. A key belongs to the token or person that sends it.
-//!
-//! The answer is written in the transaction of the mission that it tells of, so there is never
-//! one without the other. Keys are kept for [`KEPT`].
+//! An answer is stored in the same transaction as its mission, so neither exists without the other.
+//! Keys are kept for [`KEPT`].
 
 use std::collections::HashSet;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -17,16 +16,16 @@ use crate::db;
 use crate::db::idempotency::{Given, OwnKey};
 use crate::identity::subject::SubjectId;
 
-/// Longest key, in characters.
+/// Maximum length of a key, characters.
 pub const KEY_LENGTH_MAX: usize = 200;
-/// How long a key is kept.
+/// Time for which a key is kept.
 pub const KEPT: Duration = Duration::from_hours(7 * 24);
-/// Old keys that are forgotten with each new one.
+/// Maximum number of old keys deleted with each new one.
 const FORGET_MAX: u32 = 10;
-/// The name space of request hashes.
+/// Namespace of the UUIDs that are hashes of requests.
 const REQUESTS: Uuid = Uuid::from_u128(0x2d6c_35ab_0f1e_4a8e_9f64_7a0c_9b5e_11d3);
 
-/// The keys whose requests are being answered.
+/// The keys of requests that are being processed.
 #[derive(Debug, Default)]
 pub(in crate::app) struct InFlight {
     keys: Mutex<HashSet<(SubjectId, String)>>,
@@ -38,7 +37,7 @@ impl InFlight {
     }
 }
 
-/// Holds a key while its request is being answered.
+/// Marks a key as in use while its request is processed; dropping it ends that.
 struct Holding<'app> {
     in_flight: &'app InFlight,
     key: (SubjectId, String),
@@ -59,11 +58,12 @@ impl Drop for Holding<'_> {
 }
 
 impl App {
-    /// Asks a robot to drive something, once for each key of a token or person.
+    /// Creates a mission, once per idempotency key of a token or person.
     ///
     /// # Errors
-    /// [`AppError::KeyInFlight`] while the same key is being answered, [`AppError::KeyReused`] if
-    /// it was used for another request, and all of [`App::create_mission`].
+    /// [`AppError::KeyInFlight`] while a request with the same key is processed,
+    /// [`AppError::KeyReused`] if the key was used for another request, and all errors of
+    /// [`App::create_mission`].
     pub async fn create_mission_once(
         &self,
         key: OwnKey<'_>,

@@ -1,6 +1,6 @@
-//! Missions: what is asked for, and what robots report of it.
+//! Missions: creation, listing, and transitions of their state.
 //!
-//! A request writes what is wanted and returns; [`super::reconciler`] makes it so.
+//! A request stores the wanted state and returns; [`super::reconciler`] sends it to the robot.
 
 pub mod control;
 pub mod idempotency;
@@ -25,15 +25,15 @@ pub use crate::db::missions::MissionFilter;
 use crate::db::missions::{Facts, MissionRow, Standing};
 use crate::db::{self, DbError, Tx};
 
-/// Bytes of trajectories after which a page of missions ends, however many it has.
+/// Number of bytes of trajectories after which a page of missions ends, whatever its limit.
 const PAGE_BYTES_MAX: usize = 4 * 1024 * 1024;
-/// Most missions that wait for one robot.
+/// Maximum number of missions queued for one robot.
 pub const QUEUE_MAX: usize = 1_000;
-/// Most steps of one mission's history; what only notes something is left out beyond half of it.
+/// Maximum number of events in one mission's history; mere notes are dropped beyond half of it.
 const EVENTS_MAX: u32 = 1_000;
 
 impl App {
-    /// Asks a robot to drive something.
+    /// Creates a mission.
     pub async fn create_mission(&self, request: CreateMission) -> Result<Mission, AppError> {
         self.check_new(&request).await?;
         let mut tx = self.db().write("missions").await?;
@@ -43,7 +43,8 @@ impl App {
         Ok(mission)
     }
 
-    /// Refuses a new mission that leaves the geofence from where its robot will begin it.
+    /// Refuses a new mission that leaves the geofence, from the pose at which its robot is expected
+    /// to begin it.
     async fn check_new(&self, request: &CreateMission) -> Result<(), AppError> {
         let place = StartPlace {
             priority: request.priority,
@@ -54,7 +55,7 @@ impl App {
         self.check_fence(robot, &request.trajectory, place).await
     }
 
-    /// Writes a mission into its robot's queue, as its start policy says.
+    /// Inserts a mission into its robot's queue, according to its start policy.
     async fn enqueue(&self, tx: &mut Tx, request: CreateMission) -> Result<Mission, AppError> {
         check_figures(&request)?;
         let CreateMission {
@@ -152,7 +153,7 @@ impl App {
         Ok(row.mission)
     }
 
-    /// Whether a mission's robot is stopped, or teleoperated.
+    /// Returns whether a mission's robot is stopped or teleoperated.
     async fn is_operator_controlled(
         &self,
         tx: &mut Tx,
@@ -185,7 +186,7 @@ impl App {
         Ok(Page { items, next_cursor })
     }
 
-    /// Whose mission it is; `None` if it is not known.
+    /// Returns the site and robot of a mission; `None` if it is not known.
     pub async fn mission_place(
         &self,
         id: MissionId,
@@ -215,7 +216,7 @@ impl App {
         })
     }
 
-    /// The robot's last word on how far it has come, while it still drives this mission.
+    /// Adds the progress that the robot shows, while it drives this mission.
     pub(super) fn with_progress(&self, mut mission: Mission) -> Mission {
         if !mission.state.is_terminal() {
             let presence = self
@@ -256,7 +257,7 @@ fn check_figures(request: &CreateMission) -> Result<(), AppError> {
     }
 }
 
-/// Wants every open mission of a robot to end.
+/// Requests the end of all open missions of a robot.
 pub(super) async fn end_all(
     tx: &mut Tx,
     robot_pk: i64,
@@ -302,7 +303,7 @@ pub(super) fn check_limits(
     Ok(())
 }
 
-/// One step of a mission, with what is learned by it.
+/// One transition of a mission, with the facts learned from it.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Step<'step> {
     pub(super) change: Change,
@@ -312,9 +313,9 @@ pub(super) struct Step<'step> {
     pub(super) facts: Facts,
 }
 
-/// Takes a step if the table allows it and the mission still stands where it was read.
+/// Applies a transition if the table allows it and the mission is still in the state that was read.
 ///
-/// Gives the new state; `None` if nothing moved.
+/// Returns the new state; `None` if nothing changed.
 pub(super) async fn take_step(
     tx: &mut Tx,
     standing: &Standing,
@@ -358,7 +359,7 @@ pub(super) async fn take_step(
     Ok(Some(to))
 }
 
-/// Notes something in a mission's history without moving it.
+/// Adds a note to a mission's history without a transition.
 pub(super) async fn note(
     tx: &mut Tx,
     row: &MissionRow,
@@ -369,7 +370,7 @@ pub(super) async fn note(
     add_note(tx, &row.mission, (actor, Cause::Noted), at, reason).await
 }
 
-/// Notes something with its cause.
+/// Adds a note with its cause.
 pub(super) async fn add_note(
     tx: &mut Tx,
     mission: &Mission,
@@ -377,7 +378,7 @@ pub(super) async fn add_note(
     at: Timestamp,
     reason: &str,
 ) -> Result<(), DbError> {
-    // A robot that repeats itself for ever does not fill the disk.
+    // Limits the notes of a robot that repeats a report for ever.
     if db::history::event_count(tx, mission.id).await? < EVENTS_MAX / 2 {
         let event = MissionEvent {
             at,

@@ -1,4 +1,4 @@
-//! What robots report of their missions, durably, and what the server makes of it.
+//! Durable reports of robots on their missions, and the transitions that follow from them.
 
 use jiff::Timestamp;
 use tread_api::ids::{BootId, MissionId};
@@ -13,41 +13,42 @@ use super::{EVENTS_MAX, Step, note, take_step};
 use crate::db::missions::{Facts, MissionRow};
 use crate::db::{self, DbError, Tx};
 
-/// Who reports, and when.
+/// Origin and times of a report.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Reporting {
     /// The robot's key.
     pub(crate) robot_pk: i64,
     /// The run of the agent that made the report.
     pub(crate) boot: BootId,
-    /// The server's time.
+    /// Present time of the server.
     pub(crate) now: Timestamp,
-    /// When it happened, put right by the offset of the robot's clock.
+    /// Time of the reported event, corrected by the offset of the robot's clock.
     pub(crate) at: Timestamp,
-    /// When what paused the mission began, by the server's clock; `at` if that is not known.
+    /// Time at which the cause of a pause began, by the server's clock; `at` if it is not known.
     pub(crate) since: Timestamp,
-    /// How far the robot showed last that it had come with this mission.
+    /// Progress of this mission that the robot showed last.
     pub(crate) shown: Option<MissionProgress>,
 }
 
-/// What became of a report that was taken: the state in which it ended the mission, and why.
+/// Effect of an accepted report: the state in which it ended the mission and the reason, if it did.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Taken {
     pub(crate) ended: Option<(MissionState, String)>,
 }
 
-/// A report that ended nothing.
+/// A report that did not end the mission.
 const NOTED: Taken = Taken { ended: None };
 
-/// Why a report can never be taken.
+/// Reason why a report is refused for ever.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Foreign(pub(crate) String);
 
-/// Takes a robot's durable report on a mission of its own, once; the caller has seen to that.
+/// Applies a robot's durable report on one of its own missions. The caller ensures that each report
+/// is applied once.
 ///
-/// A report of the revision that was on its way shows that the robot holds it: it counts from
-/// here on. An end under an earlier revision is the mission's end all the same: the robot had
-/// finished before the new one came.
+/// A report on a revision that was being sent shows that the robot has it: that revision becomes
+/// the present one. An end under an earlier revision ends the mission all the same: the robot had
+/// finished before the new one arrived.
 pub(crate) async fn take_report(
     tx: &mut Tx,
     reporting: Reporting,
@@ -86,7 +87,7 @@ pub(crate) async fn take_report(
     if is_end(report.phase) {
         let (quality, driven) = (report.quality.as_ref(), report.driven.as_ref());
         db::missions::add_outcome(tx, id, quality, driven).await?;
-        // The robot's own word is final, also of a mission that was settled without it.
+        // The robot's report is final, also for a mission that was ended without it.
         if report.progress.is_some() {
             let facts = Facts {
                 progress: report.progress,
@@ -132,7 +133,7 @@ const fn is_end(phase: MissionPhase) -> bool {
     }
 }
 
-/// What no agent of ours would send: more than the bounds allow.
+/// Returns why a report exceeds the limits that agents observe; `None` if it does not.
 fn impossible(report: &MissionReport) -> Option<String> {
     let samples = report.quality.as_ref().map_or(0, |said| said.theta.len());
     let points = report.driven.as_ref().map_or(0, |said| said.points.len());
@@ -208,7 +209,7 @@ async fn take_phase(
         note(tx, row, Actor::Robot, reporting.now, text).await?;
         return Ok(None);
     }
-    // The robot says what its answer to the command had said before.
+    // The robot's answer to the command has caused this transition already.
     let is_known = open && next_is_reached(change, mission);
     if is_known {
         return Ok(None);
@@ -221,8 +222,8 @@ async fn take_phase(
     Ok(None)
 }
 
-/// What the robot showed last of the mission that it ends without saying how far it came, as after
-/// a restart of its agent.
+/// Returns the progress that the robot showed last, for a report that ends the mission without
+/// giving any, as after a restart of its agent.
 fn shown_of(reporting: Reporting, report: &MissionReport) -> Option<MissionProgress> {
     let is_same = |shown: &MissionProgress| {
         (shown.id, shown.revision, shown.plan_hash)
@@ -234,10 +235,10 @@ fn shown_of(reporting: Reporting, report: &MissionReport) -> Option<MissionProgr
         .filter(|_| is_end(report.phase))
 }
 
-/// Whether a person let a mission go on after this: then a pause from before, reported late, is not
-/// what is wanted any more. A stop or a lease has to end before anybody can resume, so the time when
-/// it began tells the two orders apart, by far more than clocks are off; the time when the robot
-/// stood does not.
+/// Returns whether a person resumed a mission after `at`: a pause from before that, reported late,
+/// is then no longer wanted. `at` is the time at which the stop or lease began. It must end before
+/// anybody can resume, so this time tells both orders apart with a margin larger than clock errors;
+/// the time at which the robot stopped does not.
 async fn was_resumed_since(tx: &mut Tx, id: MissionId, at: Timestamp) -> Result<bool, DbError> {
     let events = db::history::events(tx, id, EVENTS_MAX).await?;
     let mut newest_first = events.iter().rev();
@@ -253,7 +254,7 @@ fn next_is_reached(change: Change, mission: &Mission) -> bool {
     )
 }
 
-/// Makes the revision that was on its way the one that counts.
+/// Makes the revision that was being sent the present one.
 pub(crate) async fn adopt(
     tx: &mut Tx,
     row: &MissionRow,

@@ -1,5 +1,5 @@
-//! Where a mission can go. One pure table with a cause on every edge; the database enforces it by
-//! compare-and-set.
+//! State machine of missions: one pure table with a cause on every transition; the database applies
+//! it by compare-and-set.
 //!
 //! ```text
 //!                      offer               accept                 pause
@@ -14,15 +14,16 @@
 //!          └─ cancel wanted ──► cancelled    succeeded | failed | cancelled | expired
 //! ```
 //!
-//! * What the *robot* says of an end (`succeed`, `fail`, `cancel`, `expire`) is taken from every
-//!   open state, also from `queued`: a robot may have driven what its server believes returned.
-//! * A *cancel wanted*, by a person, by another mission that takes its place or by the robot's
-//!   retirement, ends what waits at once; what is active becomes `cancelling` until the robot has
-//!   answered, or is lost.
-//! * What is active fails when its robot is *lost*, when its agent *restarted* without it, or when
-//!   the robot *forgot* it; one that was being cancelled is cancelled then, unless it was lost.
+//! * An end that the *robot* reports (`succeed`, `fail`, `cancel`, `expire`) is accepted in every
+//!   open state, also in `queued`: a robot may have driven what the server recorded as returned.
+//! * *Cancel wanted*, by a person, by another mission that replaces it or by the robot's
+//!   retirement, ends a waiting mission at once; an active one becomes `cancelling` until the robot
+//!   has answered or is lost.
+//! * An active mission fails when its robot is *lost*, when its agent *restarted* without it, or
+//!   when the robot *forgot* it. One that was being cancelled ends as cancelled then, unless it was
+//!   lost.
 //!
-//! The states in the last row are terminal: nothing leads out of them, whatever arrives late.
+//! The states in the last row are terminal: no transition leaves them.
 
 use tread_api::mission::{Cause, MissionState};
 
@@ -31,35 +32,35 @@ use tread_api::mission::{Cause, MissionState};
 pub enum Change {
     /// The server offers it to its robot.
     Offer,
-    /// The robot cannot take it now; it waits again.
+    /// The robot cannot take it now; it is queued again.
     Return,
-    /// The robot has taken it, or has begun to drive.
+    /// The robot has accepted it, or has begun to drive.
     Accept,
-    /// The robot will never take it.
+    /// The robot rejects it for ever.
     Reject,
-    /// The robot holds it, standing.
+    /// The robot has paused it and is stopped.
     Pause,
     /// The robot drives it again.
     Resume,
-    /// Somebody wants it to end.
+    /// A client requests its end.
     RequestCancel,
-    /// Another mission is to be driven in its place.
+    /// Another mission replaces it.
     Supersede,
     /// Its robot is retired.
     Retire,
-    /// It ended by request.
+    /// It ended on request.
     Cancel,
     /// It was driven to its end.
     Succeed,
-    /// Something went wrong.
+    /// It failed.
     Fail,
     /// Its latest start passed before it began.
     Expire,
-    /// Its robot stayed away past the bound.
+    /// Its robot was not heard for longer than the limit.
     LoseRobot,
-    /// Its agent began a new run without it.
+    /// Its agent was restarted without it.
     LoseRun,
-    /// Its robot is there, does not have it, and has not said how it ended.
+    /// Its robot is heard, does not have it, and has not reported how it ended.
     Forget,
 }
 
@@ -84,7 +85,7 @@ impl Change {
         Self::Forget,
     ];
 
-    /// The cause that its edges carry.
+    /// Returns the cause that is recorded with this change.
     pub const fn cause(self) -> Cause {
         match self {
             Self::Offer => Cause::Offered,
@@ -106,7 +107,7 @@ impl Change {
         }
     }
 
-    /// Why, for people, when nobody said it in other words.
+    /// Returns the reason shown to people if none was given.
     pub const fn reason(self) -> &'static str {
         match self {
             Self::Offer => "offered to the robot",
@@ -129,7 +130,7 @@ impl Change {
     }
 }
 
-/// Where a change leads; `None` if it is not for this state.
+/// Returns the state after a change; `None` if the change is not allowed in this state.
 pub const fn next(state: MissionState, change: Change) -> Option<MissionState> {
     use MissionState as S;
     match (state, change) {

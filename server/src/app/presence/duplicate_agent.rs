@@ -1,7 +1,8 @@
-//! Two agents under one robot's name.
+//! Detects two agents that run under one robot's name.
 //!
-//! The newest hello is the robot. What another run says meanwhile is refused; when it goes on
-//! saying so, it is a second agent: an alert names both, and it gets a cancel for what it drives.
+//! The run with the newest hello counts as the robot; messages of other runs are refused. If
+//! another run keeps sending, it is a second agent: an alert names both runs, and the second one
+//! gets a cancel for the mission that it drives.
 
 use std::time::Duration;
 
@@ -11,35 +12,35 @@ use tread_api::wire::state::RobotState;
 
 use super::{Presence, Presences, RobotKey};
 
-/// How long two agents must have spoken under one name before that is said aloud: what was under
-/// way when an agent was replaced has long arrived then.
+/// Minimum time for which another run must keep sending before it counts as a second agent: longer
+/// than messages of a replaced agent can be under way.
 const DUPLICATE_AFTER: Duration = Duration::from_secs(1);
-/// How long after its last heartbeat a second agent under a robot's name counts as gone.
+/// Time without a heartbeat after which a second agent counts as gone.
 const DUPLICATE_GONE: Duration = Duration::from_secs(3);
-/// The code of the alert of two agents under one name.
+/// Code of the alert about two agents under one name.
 const DUPLICATE_ALERT: &str = "two-agents";
 
-/// A second agent that speaks under a robot's name.
+/// A second agent that runs under a robot's name.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DuplicateAgent {
-    /// Whose name it has.
+    /// The robot's name.
     pub key: RobotKey,
-    /// Its run.
+    /// The second agent's run.
     pub boot: BootId,
-    /// The mission that it says it drives.
+    /// The mission that it reports.
     pub mission: Option<MissionId>,
 }
 
-/// What is known of a run that speaks beside the present one.
+/// A run that sends beside the present one.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct OtherRun {
     pub(super) boot: BootId,
     since: Duration,
-    /// When its control loop's ticks went on last.
+    /// Time of its last heartbeat, since the start of the server.
     heard_at: Duration,
     ticks: u64,
     mission: Option<MissionId>,
-    /// Whether it has spoken for longer than what may have been under way.
+    /// Whether it has been sending for at least [`DUPLICATE_AFTER`].
     is_duplicate: bool,
 }
 
@@ -49,7 +50,7 @@ impl Presence {
         self.alerts_changed |= other.is_some_and(|other| other.is_duplicate);
     }
 
-    /// Notes a state of another run than the present one, while that is alive.
+    /// Records a state of another run, while the present one is on the network.
     pub(super) fn note_other(&mut self, state: &RobotState, now: Duration) {
         let ticks = state.control_loop.ticks;
         let fresh = OtherRun {
@@ -73,13 +74,13 @@ impl Presence {
                     ..fresh
                 };
             }
-            // One at a time; the next is noted when this one has gone.
+            // Only one other run is tracked; the next one after this has gone.
             Some(_) => {}
             None => self.other = Some(fresh),
         }
     }
 
-    /// What the server itself says needs attention.
+    /// Returns the server's own alert about a second agent, if there is one.
     pub(super) fn duplicate_agent_alert(&self) -> Option<AlertReport> {
         let other = self.other.filter(|other| other.is_duplicate)?;
         let (present, _since) = self.boot?;
@@ -96,8 +97,7 @@ impl Presence {
 }
 
 impl Presences {
-    /// The agents that speak under the name of another one, after those that have gone silent are
-    /// forgotten.
+    /// Returns the second agents, after forgetting those that have gone.
     pub fn take_duplicate_agents(&self, now: Duration) -> Vec<DuplicateAgent> {
         let mut robots = self.lock();
         let mut duplicates = Vec::new();
@@ -136,7 +136,7 @@ mod tests {
         says(2, 1, SECOND);
         presences.take_alert_changes();
         assert_eq!(says(1, 8, SECOND), Heard::Other);
-        // A straggler that is heard twice is no second agent.
+        // A repeated late message is no second agent.
         assert_eq!(says(1, 8, 3 * SECOND), Heard::Other);
         assert!(presences.take_duplicate_agents(3 * SECOND).is_empty());
         assert_eq!(says(1, 9, 3 * SECOND), Heard::Other);

@@ -1,4 +1,4 @@
-//! What is asked of all robots at once.
+//! Queries over all robots. A robot is heard while its link is online or stale.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -9,37 +9,37 @@ use tread_api::robot::{LinkCause, LinkState};
 
 use super::{Presence, Presences, RobotKey, stop_of};
 
-/// What a robot holds of its site.
+/// Revisions of a site's data that a robot reports.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Held {
-    /// The revision of its terrains.
+    /// Revision of the terrains.
     pub terrains: Option<u64>,
-    /// The revision of its geofence; `None` also of a robot that knows no geofences.
+    /// Revision of the geofence; `None` also for a robot without support for geofences.
     pub fence: Option<u64>,
 }
 
-/// Whether a robot is there.
+/// Link of one robot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Attending {
-    /// Whether it is heard now.
+    /// Whether its link is online or stale.
     pub is_heard: bool,
-    /// Whether its agent said that it leaves.
+    /// Whether its agent reported that it leaves.
     pub has_left: bool,
     /// Time since its last heartbeat; `None` if there was none.
     pub silent_for: Option<Duration>,
-    /// Why it is not heard; `None` while it is online.
+    /// Cause of a link that is not online; `None` while it is.
     pub cause: Option<LinkCause>,
 }
 
 impl Presences {
-    /// Every robot that has ever said hello.
+    /// Returns every robot that has ever sent a hello.
     pub fn known(&self) -> Vec<RobotKey> {
         let robots = self.lock();
         let known = robots.iter().filter(|(_, presence)| presence.welcomed);
         known.map(|(key, _)| key.clone()).collect()
     }
 
-    /// Every robot that has ever said hello, and whether it is there now.
+    /// Returns the link of every robot that has ever sent a hello.
     pub fn attending(&self, now: Duration) -> Vec<(RobotKey, Attending)> {
         let robots = self.lock();
         let known = robots.iter().filter(|(_, presence)| presence.welcomed);
@@ -54,7 +54,7 @@ impl Presences {
             .collect()
     }
 
-    /// The stops that robots show to be in force.
+    /// Returns the stop that each robot reports as in force.
     pub fn shown_stops(&self) -> Vec<(RobotKey, StopId)> {
         let robots = self.lock();
         let shown = |(key, presence): (&RobotKey, &Presence)| {
@@ -63,7 +63,8 @@ impl Presences {
         robots.iter().filter_map(shown).collect()
     }
 
-    /// The robots that are heard now, with the revisions of terrains and geofence that each holds.
+    /// Returns the robots online at `now`, with the revisions of terrains and geofence that each
+    /// reports.
     pub fn online(&self, now: Duration) -> Vec<(RobotKey, Held)> {
         let robots = self.lock();
         let online = robots
@@ -81,7 +82,7 @@ impl Presences {
             .collect()
     }
 
-    /// The missions that robots which are heard now say they drive.
+    /// Returns, for each robot heard at `now` that reports a mission, the robot and that mission.
     pub fn shown_missions(&self, now: Duration) -> Vec<(RobotKey, MissionId)> {
         let robots = self.lock();
         let heard = robots
@@ -93,7 +94,8 @@ impl Presences {
             .collect()
     }
 
-    /// How many robots that are heard are slowed down, by the name of the strictest cause.
+    /// Returns the number of robots, by the name of the cause that limits their speed most, of
+    /// those heard at `now`.
     pub fn gate_causes(&self, now: Duration) -> BTreeMap<String, usize> {
         let robots = self.lock();
         let mut causes = BTreeMap::new();
@@ -102,7 +104,7 @@ impl Presences {
                 .state()
                 .filter(|_| presence.link(now) != LinkState::Offline);
             let cause = state.and_then(|state| state.safety.gate.cause);
-            // A cause's name is that on the wire.
+            // The name of a cause in JSON.
             if let Some(serde_json::Value::String(name)) =
                 cause.and_then(|cause| serde_json::to_value(cause).ok())
             {
@@ -112,7 +114,7 @@ impl Presences {
         causes
     }
 
-    /// How many robots have each link state.
+    /// Returns the number of robots in each link state.
     pub fn link_counts(&self, now: Duration) -> [(LinkState, usize); 3] {
         let robots = self.lock();
         LinkState::ALL.map(|link| {
@@ -121,7 +123,7 @@ impl Presences {
         })
     }
 
-    /// How many robots of a scope are on the network.
+    /// Returns the number of robots of a scope with a liveliness token on the network.
     pub fn present_count(&self, within: &Scope) -> usize {
         self.lock()
             .iter()

@@ -1,4 +1,5 @@
-//! Who is on the network now, and what each robot said last. In memory; ages by our own clock.
+//! Presence of robots on the network, with each robot's last messages. In memory; ages are by the
+//! server's monotonic clock.
 
 mod duplicate_agent;
 mod looks;
@@ -20,63 +21,66 @@ use self::duplicate_agent::OtherRun;
 pub use self::looks::{Attending, Held};
 use self::news::Shown;
 
-/// How long after its last heartbeat a robot counts as online: three of them at 5 Hz.
+/// Maximum age of the last heartbeat of an online robot: three periods at 5 Hz.
 pub const ONLINE_TIMEOUT: Duration = Duration::from_millis(700);
-/// How long after its last heartbeat a robot counts as offline, whatever its token says.
+/// Age of the last heartbeat beyond which a robot is offline, whether or not its liveliness token
+/// is there.
 pub const OFFLINE_TIMEOUT: Duration = Duration::from_millis(1_400);
-/// A token that goes within this time of a heartbeat was taken away by its robot or by the end of
-/// its process; a network that is down makes the heartbeats stop long before.
+/// Maximum age of the last heartbeat at which a vanished liveliness token means that its process
+/// ended. If the network is down, heartbeats stop long before the token vanishes.
 const SUDDEN: Duration = Duration::from_secs(1);
 
-/// Most robots that are kept track of before they have said hello.
+/// Maximum number of robots in memory; beyond it no further robot is added for its token alone.
 const STRANGERS_MAX: usize = 20_000;
 
-/// What became of a robot's message.
+/// Result of a robot's message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Heard {
-    /// It tells nothing that lets a mission go on.
+    /// Nothing that could let a mission proceed.
     Nothing,
-    /// It may let a mission go on: another mode or mission, another revision of the terrains, a
-    /// store that became empty, or a robot heard again.
+    /// A change that may let a mission proceed: of mode, mission, stop, lease or revisions, an
+    /// outbox that became empty, or a robot that is online again.
     News,
-    /// The robot has not said hello; nothing of it is kept.
+    /// The robot has sent no hello; the message is dropped.
     Stranger,
-    /// It is of another run of the agent than the present one; nothing of it is shown.
+    /// The message is of another run of the agent than the present one; it is not shown.
     Other,
 }
 
 /// A robot's name with its site.
 pub type RobotKey = (SiteId, RobotId);
 
-/// What is known of one robot now.
+/// Presence of one robot.
 #[derive(Debug, Clone, Default)]
 pub struct Presence {
     welcomed: bool,
     tokens: BTreeSet<BootId>,
     boot: Option<(BootId, Duration)>,
-    /// When the last heartbeat came: a state in which the control loop's ticks had gone on.
+    /// Time of the last heartbeat: a state in which the tick count of the control loop had
+    /// increased.
     heard_at: Option<Duration>,
-    /// When the last word of any kind came.
+    /// Time of the last message of any kind.
     spoken_at: Option<Duration>,
-    /// Whether the last token went away while the robot was heard.
+    /// Whether the last token vanished shortly after a heartbeat.
     went_suddenly: bool,
-    /// How far the robot's wall clock is ahead, milliseconds: the largest of the last states,
-    /// which had the shortest way.
+    /// Offsets of the robot's wall clock, robot minus server, milliseconds, of the last states. The
+    /// largest is of the state with the shortest delay.
     clock_offsets_ms: VecDeque<i64>,
-    /// How far the robot's monotonic clock is ahead of ours, microseconds, likewise.
+    /// Offsets of the robot's monotonic clock, robot minus server, microseconds, of the last
+    /// states.
     monotonic_offsets_us: VecDeque<i64>,
     alerts_changed: bool,
     other: Option<OtherRun>,
     shown: Option<Shown>,
     state: Option<(RobotState, Duration)>,
-    /// The last mission that it showed, whatever run of the agent drove it.
+    /// Progress of the mission that it showed last, of any run of the agent.
     progress: Option<MissionProgress>,
     friction: Option<(LiveFriction, Duration)>,
 }
 
 impl Presence {
-    /// Whether the server hears the robot. Its token is a hint: one that is gone shows the end of
-    /// a process at once. Without it, or without heartbeats, a robot is offline.
+    /// Returns the state of the link, by the age of the last heartbeat. A robot without a
+    /// liveliness token is offline: a token vanishes at once when its process ends.
     pub fn link(&self, now: Duration) -> LinkState {
         let within = |limit: Duration| self.silent_for(now).is_some_and(|silent| silent <= limit);
         if self.tokens.is_empty() || !within(OFFLINE_TIMEOUT) {
@@ -88,7 +92,7 @@ impl Presence {
         }
     }
 
-    /// Why the robot is not heard; `None` while it is online.
+    /// Returns why the robot is not online; `None` while it is.
     pub fn link_cause(&self, now: Duration) -> Option<LinkCause> {
         if self.link(now) == LinkState::Online {
             return None;
@@ -109,13 +113,13 @@ impl Presence {
         })
     }
 
-    /// Whether the agent said that it leaves, and has not come back.
+    /// Returns whether the agent's last state says that it leaves.
     pub fn has_left(&self) -> bool {
         self.state().is_some_and(|state| state.leaving)
     }
 
-    /// How far the robot had come with a mission when it showed it last, also before it was off
-    /// the network or its agent began another run.
+    /// Returns the progress of a mission as the robot showed it last, also before it went offline
+    /// or its agent was restarted.
     pub fn progress_of(&self, mission: MissionId) -> Option<MissionProgress> {
         self.progress.filter(|progress| progress.id == mission)
     }
@@ -125,14 +129,15 @@ impl Presence {
         self.heard_at.map(|at| now.saturating_sub(at))
     }
 
-    /// How far the robot's wall clock is ahead of the server's, milliseconds.
+    /// Returns the offset of the robot's wall clock, robot minus server, milliseconds; 0 if it is
+    /// not known.
     pub fn clock_offset_ms(&self) -> i64 {
         self.clock_offsets_ms.iter().copied().max().unwrap_or(0)
     }
 
-    /// The robot's monotonic clock now, microseconds, by the state that had the shortest
-    /// way: it lags by that way, so an end that is written with it comes too early, never too
-    /// late. With the run that it belongs to; `None` for a robot that does not say.
+    /// Returns the robot's monotonic clock at `now`, microseconds, with the run that it belongs to.
+    /// The estimate is late by the shortest network delay seen, so a deadline derived from it is
+    /// never too late. `None` for a robot that does not send its clock.
     pub fn robot_clock_us(&self, now: Duration) -> Option<(BootId, u64)> {
         let (boot, _since) = self.boot?;
         let ahead_us = self.monotonic_offsets_us.iter().copied().max()?;
@@ -141,13 +146,13 @@ impl Presence {
         Some((boot, clock_us))
     }
 
-    /// Whether a stop is in force on the robot, or a person drives it.
+    /// Returns whether a stop is in force on the robot, or a person teleoperates it.
     pub fn is_operator_controlled(&self) -> bool {
         let safety = self.state().map(|state| &state.safety);
         safety.is_some_and(|safety| safety.stop.is_some() || safety.lease.is_some())
     }
 
-    /// Whether anything was heard of the robot of late, or its token is there.
+    /// Returns whether a message came within [`OFFLINE_TIMEOUT`], or a liveliness token is there.
     pub fn is_there(&self, now: Duration) -> bool {
         let spoke = self
             .spoken_at
@@ -155,27 +160,27 @@ impl Presence {
         spoke || !self.tokens.is_empty()
     }
 
-    /// Time since the last state came.
+    /// Returns the time since the last state arrived.
     pub fn state_age(&self, now: Duration) -> Option<Duration> {
         self.state.as_ref().map(|(_, at)| now.saturating_sub(*at))
     }
 
-    /// The present run of the agent, and since when it is known.
+    /// Returns the present run of the agent, and the time at which it was first seen.
     pub fn boot(&self) -> Option<(BootId, Duration)> {
         self.boot
     }
 
-    /// The last state of the present run.
+    /// Returns the last state of the present run.
     pub fn state(&self) -> Option<&RobotState> {
         self.state.as_ref().map(|(state, _at)| state)
     }
 
-    /// Both friction estimates that the robot sent last.
+    /// Returns the adapted and the measured θ that the robot sent last.
     pub fn friction(&self) -> Option<LiveFriction> {
         self.friction.map(|(friction, _at)| friction)
     }
 
-    /// What the robot said last, every age grown by the time since.
+    /// Returns the robot's last state, with each age increased by the time since its arrival.
     pub fn live(&self, now: Duration) -> Option<RobotLive> {
         let (state, at) = self.state.as_ref()?;
         let since_ms =
@@ -203,7 +208,7 @@ impl Presence {
         })
     }
 
-    /// A robot that starts again forgets what its earlier run said.
+    /// Makes a run the present one, and drops the data of the run before.
     fn enter_boot(&mut self, boot: BootId, now: Duration) {
         if self.boot.is_none_or(|(present, _since)| present != boot) {
             self.boot = Some((boot, now));
@@ -217,11 +222,12 @@ impl Presence {
         }
     }
 
-    /// Whether a message of that run is of the present one, or shows that a new one began.
+    /// Returns whether a message's run is the present one, after making a newly seen run the
+    /// present one.
     fn takes(&mut self, boot: BootId, now: Duration) -> bool {
         match self.boot {
             Some((present, _since)) if present == boot => true,
-            // A straggler of an earlier run, while the present one is known to be alive.
+            // A late message of an earlier run, while the present one is on the network.
             Some((present, _since)) if self.tokens.contains(&present) => false,
             Some(_) | None => {
                 self.enter_boot(boot, now);
@@ -231,10 +237,10 @@ impl Presence {
     }
 }
 
-/// States of which the clock's offset is kept.
+/// Number of states of which the clocks' offsets are kept.
 const OFFSETS_MAX: usize = 16;
 
-/// All robots.
+/// Presence of all robots.
 #[derive(Debug, Default)]
 pub struct Presences {
     robots: Mutex<HashMap<RobotKey, Presence>>,
@@ -245,19 +251,19 @@ impl Presences {
         self.robots.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// What is known of a robot.
+    /// Returns a copy of a robot's presence; an empty one if it is not known.
     pub fn get(&self, key: &RobotKey) -> Presence {
         self.lock().get(key).cloned().unwrap_or_default()
     }
 
-    /// Whether a robot has ever said hello.
+    /// Returns whether a robot has ever sent a hello.
     pub fn is_known(&self, key: &RobotKey) -> bool {
         self.lock()
             .get(key)
             .is_some_and(|presence| presence.welcomed)
     }
 
-    /// A robot has answered that it cleared a stop; its next state will say so too.
+    /// Removes a stop from a robot's last state, after the robot has answered that it cleared it.
     pub fn stop_cleared(&self, key: &RobotKey, id: StopId) {
         if let Some((state, _at)) = self
             .lock()
@@ -271,10 +277,10 @@ impl Presences {
         }
     }
 
-    /// A robot's token appeared.
+    /// Records that a robot's liveliness token appeared.
     pub fn token_appeared(&self, key: RobotKey, boot: BootId, now: Duration) {
         let mut robots = self.lock();
-        // A token may come before its robot's hello; only so many of them are remembered.
+        // A token may come before its robot's hello; the number of such robots is limited.
         if !robots.contains_key(&key) && robots.len() >= STRANGERS_MAX {
             return;
         }
@@ -283,7 +289,7 @@ impl Presences {
         presence.enter_boot(boot, now);
     }
 
-    /// A robot's token is gone.
+    /// Records that a robot's liveliness token vanished.
     pub fn token_gone(&self, key: &RobotKey, boot: BootId, now: Duration) {
         let mut robots = self.lock();
         if let Some(presence) = robots.get_mut(key) {
@@ -296,12 +302,12 @@ impl Presences {
         }
     }
 
-    /// A robot that said hello to an earlier run of this server.
+    /// Records a robot that sent a hello to an earlier run of this server.
     pub fn know(&self, key: RobotKey) {
         self.lock().entry(key).or_default().welcomed = true;
     }
 
-    /// A robot introduced itself.
+    /// Records a robot's hello.
     pub fn hello(&self, key: RobotKey, boot: BootId, now: Duration) {
         let mut robots = self.lock();
         let presence = robots.entry(key).or_default();
@@ -310,7 +316,7 @@ impl Presences {
         presence.spoken_at = Some(now);
     }
 
-    /// A robot sent its state.
+    /// Records a robot's state, received at `now`.
     pub fn state(
         &self,
         key: &RobotKey,
@@ -337,7 +343,7 @@ impl Presences {
                 || before.terrain_revision != state.terrain_revision
                 || (before.outbox.pending == 0) != (state.outbox.pending == 0)
         });
-        // States come late and in another order too; a tick that was seen is no heartbeat.
+        // States may arrive late or out of order; only an increased tick count is a heartbeat.
         let beats = presence
             .state()
             .is_none_or(|before| state.control_loop.ticks > before.control_loop.ticks);
@@ -374,7 +380,7 @@ impl Presences {
         }
     }
 
-    /// A robot sent both of its friction estimates.
+    /// Records a robot's adapted and measured θ.
     pub fn friction(&self, key: &RobotKey, report: &FrictionReport, now: Duration) -> Heard {
         let mut robots = self.lock();
         let Some(presence) = robots.get_mut(key).filter(|presence| presence.welcomed) else {
@@ -388,7 +394,8 @@ impl Presences {
     }
 }
 
-/// How far a robot's monotonic clock is ahead of ours, less the way of this state.
+/// Returns the offset of a robot's monotonic clock, robot minus server, in microseconds. It is too
+/// small by the delay of this state.
 fn monotonic_offset_us(state: &RobotState, now: Duration) -> Option<i64> {
     let robot_us = i64::try_from(state.monotonic_us?).ok()?;
     let now_us = i64::try_from(now.as_micros()).ok()?;
@@ -407,7 +414,7 @@ fn lease_of(state: &RobotState) -> Option<u64> {
     state.safety.lease.as_ref().map(|lease| lease.epoch)
 }
 
-/// What of a robot's mission decides what it needs.
+/// Returns the part of a robot's mission that determines what the mission needs.
 fn content(state: &RobotState) -> Option<(MissionId, u32, bool)> {
     let mission = state.mission?;
     Some((mission.id, mission.revision, mission.paused))

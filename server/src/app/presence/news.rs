@@ -1,4 +1,4 @@
-//! What of robots is new: for event clients, and for the alerts that are written down.
+//! Changes of robots, for event clients and for stored alerts.
 
 use std::time::Duration;
 
@@ -7,7 +7,7 @@ use tread_api::robot::{AlertReport, LinkCause, LinkState, RobotMode};
 
 use super::{Presences, RobotKey, content, lease_of, stop_of};
 
-/// What of a robot was shown to event clients last.
+/// What event clients were shown last of a robot.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Shown {
     at: Duration,
@@ -20,22 +20,21 @@ pub(super) struct Shown {
     seq: Option<u64>,
 }
 
-/// Least time between two events on a robot whose state only moved on.
+/// Minimum interval between two events about a robot of which only measured values changed.
 const SHOW_PERIOD: Duration = Duration::from_secs(1);
 
-/// Robots that are shown afresh at a time.
+/// Maximum number of robots per call.
 const NEWS_MAX: usize = 500;
 
 impl Presences {
-    /// What robots say needs attention, of those that said something else before; each is given
-    /// once.
+    /// Returns the alerts of each robot whose alerts changed since the last call.
     pub fn take_alert_changes(&self) -> Vec<(RobotKey, Vec<AlertReport>)> {
         let mut robots = self.lock();
         let changed = robots
             .iter_mut()
             .filter(|(_, presence)| presence.alerts_changed);
         let taken = changed.filter_map(|(key, presence)| {
-            // Without a state of the present run nobody knows what the robot itself says.
+            // Without a state of the present run, the robot's own alerts are not known.
             let own = presence.state()?.alerts.clone();
             let alerts = presence
                 .duplicate_agent_alert()
@@ -48,17 +47,18 @@ impl Presences {
         taken.collect()
     }
 
-    /// Gives what could not be written down again.
+    /// Marks a robot's alerts as changed again, because they could not be stored.
     pub fn return_alert_change(&self, key: &RobotKey) {
         if let Some(presence) = self.lock().get_mut(key) {
             presence.alerts_changed = true;
         }
     }
 
-    /// The robots of which event clients have not seen the present state: at once when link, mode
-    /// or mission changed, and once a second while only figures move on.
+    /// Returns the robots whose present state event clients have not seen: at once after a change
+    /// of link, mode, mission, stop or lease, and once a second while only measured values change.
     ///
-    /// At most [`NEWS_MAX`] at a time, so that no client is swamped; the rest comes next.
+    /// At most [`NEWS_MAX`] per call, so that clients are not overloaded; the others follow in
+    /// later calls.
     pub fn take_news(&self, now: Duration) -> Vec<RobotKey> {
         let mut robots = self.lock();
         let mut news = Vec::new();

@@ -1,4 +1,5 @@
-//! Robots that were on the network and are no longer: each raises an alert after a bound.
+//! Attendance: raises an alert for each robot that was on the network and is no longer heard for a
+//! time.
 //!
 //! ```text
 //!              heard                 not heard for LOST_AFTER
@@ -8,8 +9,8 @@
 //!        leaves by itself
 //! ```
 //!
-//! Where a robot stands is in the database, so a restart of the server changes nothing but that it
-//! waits for [`START_GRACE`] until robots have found it again.
+//! The state of each robot is in the database, so a restart of the server changes nothing, except
+//! that it waits for [`START_GRACE`] until robots have connected again.
 
 use std::collections::HashMap;
 use std::time::Duration;
@@ -20,28 +21,29 @@ use crate::app::presence::RobotKey;
 use crate::app::{App, AppError};
 use crate::db;
 
-/// The alert of a robot that was present and is no longer.
+/// Code of the alert about a robot that was present and is no longer heard.
 pub(in crate::app) const ROBOT_LOST_ALERT: &str = "robot-lost";
-/// How long a robot that was present may not be heard before its alert is raised: longer than links
-/// take to heal.
+/// Time for which a present robot may be unheard before its alert is raised: longer than links take
+/// to recover.
 pub(in crate::app) const LOST_AFTER: Duration = Duration::from_secs(15);
-/// How long a robot must be heard again before its alert is cleared.
+/// Time for which a robot must be heard again before its alert is cleared.
 pub(in crate::app) const BACK_AFTER: Duration = Duration::from_secs(3);
-/// Least time between two looks: the reconciler is woken far more often in a large fleet.
+/// Minimum interval between two checks: in a large fleet the reconciler is woken far more often.
 const LOOK_EVERY: Duration = Duration::from_millis(500);
-/// After a start of the server no robot counts as lost for so long: all of them come at once.
+/// Time after the start of the server in which no robot counts as lost, since all of them must
+/// reconnect.
 pub(in crate::app) const START_GRACE: Duration = Duration::from_secs(30);
 
-/// Where a robot stands.
+/// Attendance of one robot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 struct Seen {
     is_present: bool,
     is_lost: bool,
-    /// Since when it has been heard without a gap.
+    /// Time since which it has been heard without interruption.
     heard_since: Option<Duration>,
 }
 
-/// What is to be written down of a robot.
+/// Transition of a robot's attendance, to be stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Turn {
     Came,
@@ -50,7 +52,7 @@ enum Turn {
     Back,
 }
 
-/// What is heard of a robot now.
+/// Link of a robot at a check.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Look {
     is_heard: bool,
@@ -58,7 +60,7 @@ struct Look {
     silent: Duration,
 }
 
-/// Both times of a look.
+/// Times of a check.
 #[derive(Debug, Clone, Copy)]
 struct Now {
     elapsed: Duration,
@@ -66,7 +68,7 @@ struct Now {
 }
 
 impl Seen {
-    /// What follows from a look; applied when it is written down.
+    /// Returns the transition that follows from a check; the caller applies it once it is stored.
     fn judge(&mut self, look: Look, now: Now) -> Option<Turn> {
         if !look.is_heard {
             self.heard_since = None;
@@ -93,7 +95,7 @@ impl Seen {
     }
 }
 
-/// Where all robots stand, as the database has it.
+/// Attendance of all robots, as stored in the database.
 #[derive(Debug, Default)]
 pub(super) struct Attendance {
     robots: Option<HashMap<RobotKey, Seen>>,
@@ -101,10 +103,10 @@ pub(super) struct Attendance {
 }
 
 impl Attendance {
-    /// Raises and clears the alerts of robots that are lost or back.
+    /// Checks all robots, and raises and clears the alerts of those that are lost or back.
     ///
     /// # Errors
-    /// The database failed; the next look does what this one did not.
+    /// The database failed; the next check repeats this one.
     pub(super) async fn look(&mut self, app: &App) -> Result<(), AppError> {
         let elapsed = app.clock().elapsed();
         let is_early = |looked_at: Duration| elapsed.saturating_sub(looked_at) < LOOK_EVERY;
@@ -124,7 +126,7 @@ impl Attendance {
             let look = Look {
                 is_heard: attending.is_heard,
                 has_left: attending.has_left,
-                // One that was never heard has been silent at least since the start.
+                // A robot that was never heard has been silent at least since the start.
                 silent: attending.silent_for.unwrap_or(now.uptime),
             };
             if let Some(turn) = seen.judge(look, now) {
@@ -167,7 +169,7 @@ async fn write_down(
     };
     let is_there = matches!(turn, Turn::Came | Turn::Back);
     db::attendance::set_present(&mut tx, row.pk, is_there).await?;
-    // Nobody misses a robot that was retired or put out of the fleet.
+    // No alert for a robot that was retired or revoked.
     let is_missed = row.retired_at.is_none() && app.enrolment_registry().may_speak(key);
     let alert = match turn {
         Turn::Lost if is_missed => {
@@ -234,7 +236,7 @@ mod tests {
         assert_eq!(step(&mut seen, silent(14), at(114)), None);
         assert_eq!(step(&mut seen, silent(15), at(115)), Some(Turn::Lost));
         assert_eq!(step(&mut seen, silent(500), at(600)), None);
-        // A link that comes and goes neither clears nor raises it.
+        // A link that goes up and down neither clears nor raises the alert.
         for cycle in 0..20 {
             assert_eq!(step(&mut seen, HEARD, at(700 + 4 * cycle)), None);
             assert_eq!(step(&mut seen, HEARD, at(702 + 4 * cycle)), None);
@@ -255,7 +257,7 @@ mod tests {
         };
         assert_eq!(step(&mut seen, left, at(101)), Some(Turn::Left));
         assert_eq!(step(&mut seen, silent(60), at(160)), None);
-        // The server starts again: the robot was there before.
+        // After a restart of the server: the robot was present before.
         let mut seen = Seen {
             is_present: true,
             ..Seen::default()

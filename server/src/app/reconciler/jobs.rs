@@ -1,4 +1,4 @@
-//! Commands to robots on behalf of missions, and what their answers change.
+//! Commands that the reconciler sends to robots, and the changes that follow from the answers.
 
 use tracing::warn;
 use tread_api::ids::MissionId;
@@ -18,22 +18,22 @@ use crate::app::{App, AppError};
 use crate::db;
 use crate::db::missions::{Facts, MissionRow, Standing};
 
-/// How a command went.
+/// Result of a command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Finished {
-    /// It needs no repetition.
+    /// Done; no repetition is needed.
     Settled,
-    /// The robot will do it, and says so when it has; repeated only if it does not for long.
+    /// The robot accepted it and will report when it is done; repeated only if that takes long.
     Delivered,
-    /// It was not delivered, or the robot cannot yet.
+    /// It was not delivered, or the robot cannot execute it yet.
     Again,
-    /// The robot says that the mission has ended there.
+    /// The robot reports that the mission has already ended.
     EndedThere,
 }
 
-/// Moves a mission without its robot.
+/// Changes a mission's state without its robot.
 pub(super) async fn settle(app: &App, mission: &Standing, change: Change) -> Result<(), AppError> {
-    // A robot that shows a mission is the run that took it.
+    // A robot that shows a mission is in the run that took it.
     let taken_by = || app.presences().get(&key_of(mission)).boot();
     let facts = Facts {
         boot: (change == Change::Accept)
@@ -53,13 +53,13 @@ pub(super) async fn settle(app: &App, mission: &Standing, change: Change) -> Res
         alerts = app.alert_mission_end(&mut tx, robot_pk, ended).await?;
     }
     app.commit_alerts(tx, alerts).await?;
-    // The robot's next mission may go now.
+    // The robot's next mission may be offered now.
     app.wake();
     Ok(())
 }
 
-/// How far the robot said last that it had come with what counts of this mission now: true also
-/// when it never reports an end.
+/// Returns the progress of the mission's present revision that the robot showed last; it stays true
+/// if the robot never reports an end.
 fn last_progress(app: &App, mission: &Standing) -> Option<MissionProgress> {
     let progress = app
         .presences()
@@ -72,7 +72,8 @@ fn key_of(mission: &Standing) -> RobotKey {
     (mission.site.clone(), mission.robot.clone())
 }
 
-/// A step of the server's; made within the transaction, so that times are in the order of commits.
+/// Makes a transition caused by the server. Called within the transaction, so that times are in the
+/// order of commits.
 fn server_step<'step>(
     app: &App,
     change: Change,
@@ -88,7 +89,8 @@ fn server_step<'step>(
     }
 }
 
-/// How long from now a mission may still start, by the robot's own clock from then on.
+/// Returns the time left until the mission's latest start, milliseconds, which the robot then
+/// measures by its own clock.
 fn start_within_ms(app: &App, row: &MissionRow) -> Option<u64> {
     row.mission.latest_start.map(|latest| {
         let left_ms = latest.duration_since(app.clock().now()).as_millis();
@@ -96,7 +98,7 @@ fn start_within_ms(app: &App, row: &MissionRow) -> Option<u64> {
     })
 }
 
-/// Offers a mission and writes down the answer.
+/// Offers a mission to its robot and stores the answer.
 pub(super) async fn offer(app: App, standing: Standing) -> Result<Finished, AppError> {
     if standing.state == MissionState::Queued {
         let mut tx = app.db().write("reconciler").await?;
@@ -106,7 +108,7 @@ pub(super) async fn offer(app: App, standing: Standing) -> Result<Finished, AppE
                 tx.commit().await?;
                 app.announce();
             }
-            // Cancelled meanwhile, or the robot has another an active one.
+            // It was cancelled meanwhile, or the robot has another active mission.
             Ok(None) => return Ok(Finished::Settled),
             Err(error) if error.is_unique_violation() => return Ok(Finished::Again),
             Err(error) => return Err(error.into()),
@@ -115,7 +117,7 @@ pub(super) async fn offer(app: App, standing: Standing) -> Result<Finished, AppE
     let mut tx = app.db().read("reconciler").await?;
     let row = db::missions::find(&mut tx, standing.id).await?;
     drop(tx);
-    // Cancelled meanwhile.
+    // It was cancelled meanwhile.
     let Some(row) = row.filter(|row| row.mission.state == MissionState::Offered) else {
         return Ok(Finished::Settled);
     };
@@ -154,7 +156,7 @@ async fn take_offer_answer(
             facts.plan = *plan;
             (Change::Accept, None, Finished::Settled)
         }
-        // How it ended is in the robot's store and on its way.
+        // The report of how it ended is in the robot's outbox.
         OfferReply::Refused(refusal) if refusal.code == CommandRefusalCode::Ended => {
             return Ok(Finished::EndedThere);
         }
@@ -171,7 +173,7 @@ async fn take_offer_answer(
         }
     };
     let mut tx = app.db().write("reconciler").await?;
-    // Read afresh: the robot's own report or a cancellation may have come first.
+    // Read again: the robot's own report or a cancellation may have come first.
     if let Some(row) = db::missions::find(&mut tx, id).await? {
         let step = Step {
             actor: Actor::Robot,
@@ -187,7 +189,7 @@ async fn take_offer_answer(
     Ok(how)
 }
 
-/// Offers a new revision of an active mission and writes down the answer.
+/// Sends a new revision of an active mission and stores the answer.
 pub(super) async fn replace(app: App, standing: Standing) -> Result<Finished, AppError> {
     let mut tx = app.db().read("reconciler").await?;
     let row = db::missions::find(&mut tx, standing.id).await?;
@@ -206,7 +208,7 @@ pub(super) async fn replace(app: App, standing: Standing) -> Result<Finished, Ap
         revision: replacement.revision,
         plan_hash: replacement.plan_hash,
         trajectory: replacement.trajectory.clone(),
-        // It has begun, so its latest start is behind it.
+        // It has begun, so its latest start no longer applies.
         start_within_ms: None,
         link_policy: row.mission.link_policy,
         on_hold: row.mission.pause_wanted,
@@ -250,7 +252,7 @@ pub(super) async fn replace(app: App, standing: Standing) -> Result<Finished, Ap
     Ok(Finished::Settled)
 }
 
-/// Makes the revision that the robot shows the one that counts.
+/// Makes the revision that the robot shows the present one.
 pub(super) async fn adopt_shown(app: &App, standing: &Standing) -> Result<(), AppError> {
     let mut tx = app.db().write("reconciler").await?;
     if let Some(row) = db::missions::find(&mut tx, standing.id).await? {
@@ -261,7 +263,7 @@ pub(super) async fn adopt_shown(app: &App, standing: &Standing) -> Result<(), Ap
     Ok(())
 }
 
-/// Tells a robot to hold a mission or to drive on.
+/// Commands a robot to pause or to resume a mission.
 pub(super) async fn hold(app: App, standing: Standing, held: bool) -> Result<Finished, AppError> {
     let (mission, (revision, _)) = (standing.id, standing.content);
     let key = (standing.site.clone(), standing.robot.clone());
@@ -276,8 +278,8 @@ pub(super) async fn hold(app: App, standing: Standing, held: bool) -> Result<Fin
         return Ok(Finished::Again);
     };
     match answer.reply {
-        // It brakes or speeds up now. The mission moves when the robot says that it stands, or
-        // that it drives on.
+        // The robot now brakes or accelerates. The mission changes when the robot reports that it
+        // is stopped, or that it drives again.
         Acknowledgement::Done => Ok(Finished::Delivered),
         Acknowledgement::Refused(refusal) if refusal.code == CommandRefusalCode::Ended => {
             Ok(Finished::EndedThere)
@@ -291,7 +293,7 @@ pub(super) async fn hold(app: App, standing: Standing, held: bool) -> Result<Fin
     }
 }
 
-/// Tells a robot to end a mission and writes down the answer.
+/// Commands a robot to end a mission and stores the answer.
 pub(super) async fn cancel(app: App, mission: Standing) -> Result<Finished, AppError> {
     let command = Cancel {
         mission: mission.id,
@@ -306,7 +308,7 @@ pub(super) async fn cancel(app: App, mission: Standing) -> Result<Finished, AppE
         Acknowledgement::Refused(refusal) if refusal.code == CommandRefusalCode::Unknown => {
             Some("it had not reached the robot")
         }
-        // How it ended is in the robot's store and on its way.
+        // The report of how it ended is in the robot's outbox.
         Acknowledgement::Refused(refusal) if refusal.code == CommandRefusalCode::Ended => {
             return Ok(Finished::EndedThere);
         }
@@ -340,7 +342,7 @@ pub(super) async fn cancel(app: App, mission: Standing) -> Result<Finished, AppE
     Ok(Finished::Settled)
 }
 
-/// Tells a robot to end a mission that is none of its open ones here.
+/// Commands a robot to end a mission that is not among its open ones in the database.
 pub(super) async fn disown(
     app: App,
     key: RobotKey,
@@ -365,12 +367,13 @@ pub(super) async fn disown(
     );
     app.counters().missions_disowned.one();
     let command = Cancel { mission, reason };
-    // Whatever it answers, its next states show whether it has ended; if not, the cancel is sent again.
+    // The answer is ignored: the robot's next states show whether it has ended; if not, the cancel
+    // is sent again.
     let _ = app.commands().send(&key, &command).await;
     Ok(Finished::Again)
 }
 
-/// Tells an agent that runs under another one's name to end the mission that it drives.
+/// Commands a second agent under a robot's name to end the mission that it drives.
 pub(super) async fn end_duplicate_agent(app: App, duplicate: DuplicateAgent) -> Finished {
     let DuplicateAgent { key, boot, mission } = duplicate;
     let Some(mission) = mission else {
@@ -384,12 +387,13 @@ pub(super) async fn end_duplicate_agent(app: App, duplicate: DuplicateAgent) -> 
     app.counters().missions_disowned.one();
     let reason = "another agent has taken this robot's name".to_owned();
     let command = Cancel { mission, reason };
-    // Whatever it answers, its next states show whether it has ended; if not, the cancel is sent again.
+    // The answer is ignored: the agent's next states show whether it has ended; if not, the cancel
+    // is sent again.
     let _ = app.commands().send_to(&key, Some(boot), &command).await;
     Finished::Again
 }
 
-/// Sends a stop again, and records that the robot has confirmed it.
+/// Sends a stop again, and stores the robot's confirmation.
 pub(super) async fn stop_again(app: App, stop: Stop) -> Result<Finished, AppError> {
     match send_stop(&app, &stop).await {
         StopDelivery::Confirmed => {
@@ -405,7 +409,7 @@ pub(super) async fn stop_again(app: App, stop: Stop) -> Result<Finished, AppErro
     Ok(Finished::Settled)
 }
 
-/// Brings a robot its site's terrains.
+/// Sends a robot the terrains and the geofence of its site.
 pub(super) async fn push_site(app: App, key: RobotKey) -> Result<Finished, AppError> {
     let mut tx = app.db().read("reconciler").await?;
     let definition = site_definition(&mut tx, &key.0).await?;

@@ -1,9 +1,10 @@
-//! Makes what is wanted so: offers missions, sends cancellations, brings terrains to robots.
+//! The reconciler: brings robots to the state that the database wants. It offers missions, sends
+//! cancellations, and sends terrains.
 //!
-//! Woken by every change and by a timer, it reads the database afresh and compares it with who is
-//! on the network. It takes no other input, so it is right after any restart. What it decides for
-//! one mission is pure (`needs`); commands to different robots are under way at the same time,
-//! at most one of a kind per robot.
+//! Woken by every change and by a timer, it reads the database anew and compares it with the
+//! presence of robots. It has no other input, so it is correct after any restart. The decision for
+//! one mission is pure (`needs`). Commands to different robots run concurrently, at most one of a
+//! kind per robot.
 
 pub(super) mod attendance;
 mod jobs;
@@ -34,22 +35,22 @@ use crate::app::presence::{DuplicateAgent, RobotKey};
 use crate::db;
 use crate::db::missions::Standing;
 
-/// How often it looks although nothing woke it.
+/// Interval between passes when nothing wakes it.
 pub const PERIOD: Duration = Duration::from_millis(500);
-/// Commands that may be under way at once.
+/// Maximum number of commands under way at once.
 const COMMANDS_MAX: usize = 64;
-/// Stops that may be under way at once, beside all other commands.
+/// Maximum number of stops under way at once, in addition to other commands.
 const STOPS_UNDER_WAY_MAX: usize = 256;
-/// Longest wait before a stop is repeated.
+/// Maximum wait before a stop is repeated.
 const STOP_RETRY_MAX: Duration = Duration::from_millis(400);
-/// First wait before a command is repeated; it doubles each time.
+/// First wait before a command is repeated; it doubles each time up to [`RETRY_MAX`].
 const RETRY_MIN: Duration = Duration::from_millis(100);
-/// Longest wait before a command is repeated.
+/// Maximum wait before a command is repeated.
 const RETRY_MAX: Duration = Duration::from_secs(2);
-/// Missions that expire in one pass.
+/// Maximum number of missions that expire in one pass.
 const EXPIRE_MAX: u32 = 1_000;
-/// How long a robot may show a mission that is none of its open ones before it gets a cancel: its
-/// report of the end may be on its way.
+/// Time for which a robot may show a mission that is not among its open ones before it gets a
+/// cancel: its report of the end may be under way.
 const FOREIGN_GRACE: Duration = Duration::from_millis(1_500);
 
 /// A command that is under way or waits to be repeated.
@@ -58,7 +59,7 @@ enum Job {
     Stop(StopId),
     Offer(MissionId),
     Replace(MissionId),
-    /// To pause it, or to let it go on.
+    /// Pauses it (true) or resumes it.
     Hold(MissionId, bool),
     Cancel(MissionId),
     Disown(RobotKey),
@@ -91,7 +92,7 @@ pub async fn run(app: App, stop: CancellationToken) {
     }
 }
 
-/// Compares what is wanted with what is, one pass at a time.
+/// Compares the wanted state with the robots' state, one pass at a time.
 #[derive(Debug)]
 pub struct Reconciler {
     app: App,
@@ -100,15 +101,15 @@ pub struct Reconciler {
     under_way: HashSet<Job>,
     retries: HashMap<Job, Retry>,
     memories: HashMap<MissionId, Memory>,
-    /// Stops to be sent again, as they were read last.
+    /// Stops to be sent again, as read last.
     stops: Vec<Stop>,
-    /// Missions that robots show and that are none of their open ones here, and since when.
+    /// Missions that robots show and that are not among their open ones, with the time since which.
     foreign: HashMap<RobotKey, (MissionId, Duration)>,
     attendance: Attendance,
 }
 
 impl Reconciler {
-    /// A reconciler that remembers nothing yet.
+    /// Creates a reconciler.
     pub fn new(app: App) -> Self {
         let (finished, finishing) = mpsc::channel(COMMANDS_MAX + STOPS_UNDER_WAY_MAX);
         Self {
@@ -124,7 +125,7 @@ impl Reconciler {
         }
     }
 
-    /// Waits until no command is under way any more.
+    /// Waits until no command is under way.
     pub async fn rest(&mut self) {
         while !self.under_way.is_empty() {
             match self.finishing.recv().await {
@@ -140,7 +141,7 @@ impl Reconciler {
         }
     }
 
-    /// How long until something is due.
+    /// Returns the time until something is due.
     fn pause(&self) -> Duration {
         let now = self.app.clock().elapsed();
         let until = |retry: &Retry| retry.due.saturating_sub(now);
@@ -196,10 +197,11 @@ impl Reconciler {
         }
     }
 
-    /// One pass: reads the database and who is there, and starts what is missing.
+    /// Runs one pass: reads the database and the presence of robots, and starts the missing
+    /// commands.
     ///
     /// # Errors
-    /// The database failed; the next pass does what this one did not.
+    /// The database failed; the next pass repeats this one.
     pub async fn pass(&mut self) -> Result<(), AppError> {
         self.stop_again().await;
         self.expire().await?;
@@ -224,10 +226,10 @@ impl Reconciler {
             })
             .collect();
         for (key, held) in self.app.presences().online(self.app.clock().elapsed()) {
-            // Without any definition the robot will say hello, and gets one.
+            // A robot without any definition of its site sends a hello and gets one.
             let lags = wanted.get(&key.0).is_some_and(|&(terrains, fence)| {
                 held.terrains.is_some_and(|held| held != terrains)
-                    // A robot that knows no geofences says nothing of them.
+                    // A robot without support for geofences reports no revision.
                     || held.fence.is_some_and(|held| held != fence)
             });
             let job = Job::Site(key.clone());
@@ -241,11 +243,11 @@ impl Reconciler {
         Ok(())
     }
 
-    /// Tells robots again what they have not confirmed. Whatever else fails, this goes on.
+    /// Sends unconfirmed stops again. Continues even if everything else fails.
     async fn stop_again(&mut self) {
         match self.app.tend_stops().await {
             Ok(again) => self.stops = again,
-            // Those that were known go on.
+            // The stops read before are still sent.
             Err(error) => self.app.log_failure("look after stops", &error),
         }
         let again = self.stops.clone();
@@ -256,7 +258,7 @@ impl Reconciler {
             let key = (stop.site.clone(), stop.robot.clone());
             let presence = self.app.presences().get(&key);
             let job = Job::Stop(stop.id);
-            // Any sign of life will do, also that of an agent whose loop stands still.
+            // Any sign of the agent suffices, even if its control loop has stopped.
             let is_there = presence.is_there(self.app.clock().elapsed());
             if is_there && self.is_due(&job) {
                 let app = self.app.clone();
@@ -276,7 +278,7 @@ impl Reconciler {
         Ok(())
     }
 
-    /// Drops what is remembered of missions that need nothing any more.
+    /// Forgets everything about missions that are no longer open.
     fn forget_all_but(&mut self, missions: &[Standing]) {
         let open: HashSet<MissionId> = missions.iter().map(|mission| mission.id).collect();
         self.memories.retain(|id, _| open.contains(id));
@@ -288,7 +290,7 @@ impl Reconciler {
         });
     }
 
-    /// Finds agents that drive a mission under the name of another one, and tells them to end it.
+    /// Finds second agents that drive a mission, and commands them to end it.
     fn end_duplicate_agents(&mut self) {
         let duplicates = self
             .app
@@ -321,7 +323,8 @@ impl Reconciler {
         }
     }
 
-    /// Finds robots that drive what is none of their open missions here, and tells them.
+    /// Finds robots that drive a mission that is not among their open ones, and commands them to
+    /// end it.
     fn disown_foreign(&mut self, open: &[Standing]) {
         let now = self.app.clock().elapsed();
         let shown = self.app.presences().shown_missions(now);
@@ -365,7 +368,7 @@ impl Reconciler {
         });
     }
 
-    /// Keeps since when a mission's robot has not been heard.
+    /// Stores since when a mission's robot has not been heard.
     async fn note_silence(&self, mission: &mut Standing, heard: bool) -> Result<(), AppError> {
         if heard == mission.silent_since.is_none() || mission.state == MissionState::Queued {
             return Ok(());
@@ -400,7 +403,7 @@ impl Reconciler {
         let memory = *memory;
         let app = self.app.clone();
         let need = decide(&mission, &presence, memory, now);
-        // What is wanted anew later does not wait for what was wanted before.
+        // A command that is wanted again later does not inherit the back-off of the earlier one.
         for (held, wanted) in [(true, Need::Pause), (false, Need::Resume)] {
             if need != wanted {
                 self.retries.remove(&Job::Hold(mission.id, held));
@@ -431,7 +434,7 @@ impl Reconciler {
             }
             Need::Cancel => {
                 let job = Job::Cancel(mission.id);
-                // What is under way is answered first, so that the order is kept.
+                // The command under way is answered first, which keeps the order.
                 let id = mission.id;
                 let before = [
                     Job::Offer(id),
@@ -485,7 +488,7 @@ impl Reconciler {
     }
 }
 
-/// Tells the reconciler how a command went, when it is dropped.
+/// Reports the result of a command to the reconciler when it is dropped.
 struct Report {
     job: Job,
     how: Finished,
@@ -494,7 +497,7 @@ struct Report {
 
 impl Drop for Report {
     fn drop(&mut self) {
-        // There are never more commands under way than the channel has places.
+        // The channel has room for every command that can be under way.
         if self
             .finished
             .try_send((self.job.clone(), self.how))

@@ -1,4 +1,4 @@
-//! What an open mission needs, from where it stands and what its robot says. Pure.
+//! Decides what an open mission needs, from its state and its robot's last state. Pure functions.
 
 use std::time::Duration;
 
@@ -10,57 +10,58 @@ use crate::app::missions::transitions::Change;
 use crate::app::presence::Presence;
 use crate::db::missions::Standing;
 
-/// How long the records of an earlier run may take to arrive before a mission counts as lost.
+/// Time for which the records of an earlier run may be under way before a mission counts as lost.
 pub(super) const RESTART_GRACE: Duration = Duration::from_secs(3);
-/// How long a robot may be there without its mission, and without anything left to report, before
-/// the mission counts as forgotten.
+/// Time for which a heard robot may lack its mission, with an empty outbox, before the mission
+/// counts as forgotten.
 pub(super) const FORGET_GRACE: Duration = Duration::from_secs(5);
-/// How long a robot may show a mission as paused, or as driven, before that counts although its
-/// record has not come; the other way round, before the command is sent again.
+/// Time for which a robot may show a mission as paused or driven before that counts although its
+/// record has not come; if the mission is wanted otherwise, before the command is sent again.
 pub(super) const HOLD_GRACE: Duration = Duration::from_secs(1);
-/// How long a robot may stay away beyond what was left of its plan, seconds.
+/// Time for which a robot may be unheard beyond the remaining duration of its plan, seconds.
 pub const LOST_MARGIN_S: f64 = 60.0;
-/// How long a robot may stay away when nobody knows how long its plan is, seconds.
+/// Time for which a robot may be unheard if the duration of its plan is not known, seconds.
 pub const LOST_UNPLANNED_S: f64 = 300.0;
-/// How long a robot may stay away beyond the silence after which it stops by itself, seconds.
+/// Time for which a robot may be unheard beyond the silence after which it stops by itself,
+/// seconds.
 pub const LOST_STOPPED_MARGIN_S: f64 = 30.0;
 
-/// What a mission needs now.
+/// Next action for a mission.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Need {
-    /// Nothing but time.
+    /// No action.
     Wait,
     /// Offer it to its robot.
     Offer,
     /// Offer its new revision to its robot.
     Replace,
-    /// The robot holds the new revision: it counts.
+    /// Make the new revision the present one: the robot has it.
     Adopt,
-    /// Tell its robot to hold it.
+    /// Command its robot to pause it.
     Pause,
-    /// Tell its robot to drive on.
+    /// Command its robot to resume it.
     Resume,
-    /// Tell its robot to end it.
+    /// Command its robot to end it.
     Cancel,
-    /// Settle it here.
+    /// Change its state without its robot.
     Settle(Change),
 }
 
-/// What the reconciler remembers of a mission while it is open; losing it does no harm.
+/// What the reconciler remembers of an open mission; it may be lost in a restart without harm.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Memory {
-    /// Since when the robot says that the mission has ended there.
+    /// Time since which the robot has reported that the mission has ended.
     pub(super) ended_since: Option<Duration>,
-    /// Since when the robot has been there without the mission and with nothing left to report.
+    /// Time since which the robot has been heard without the mission and with an empty outbox.
     pub(super) absent_since: Option<Duration>,
-    /// Since when the robot has shown it as paused while it is not, or the other way round.
+    /// Time since which the robot has shown it as paused while it is active here, or the reverse.
     pub(super) differs_from: Option<Duration>,
-    /// How long the robot has not been heard.
+    /// Silence of the robot; `None` while it is heard.
     pub(super) silence: Option<Silence>,
 }
 
-/// A robot's silence: by the wall clock as far as it lies before the first look of this process, by
-/// the monotonic clock from then on, so that a step of the wall clock loses no robot.
+/// Silence of a robot. Its part before the first check of this process is by the wall clock, the
+/// rest by the monotonic clock, so that a step of the wall clock makes no robot lost.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Silence {
     before: Duration,
@@ -68,7 +69,7 @@ pub(super) struct Silence {
 }
 
 impl Silence {
-    /// The silence of a mission's robot, which goes on if it was there before; `None` while the
+    /// Returns the silence of a mission's robot, continuing `before` if given; `None` while the
     /// robot is heard.
     pub(super) fn of(mission: &Standing, before: Option<Self>, now: Now) -> Option<Self> {
         let since = mission.silent_since?;
@@ -84,28 +85,28 @@ impl Silence {
     }
 }
 
-/// The two clocks.
+/// Times of a check.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Now {
-    /// For ages.
+    /// Monotonic time since the start, for ages.
     pub(super) elapsed: Duration,
-    /// For what must hold over a restart.
+    /// Wall-clock time, for what must survive a restart.
     pub(super) wall: Timestamp,
 }
 
-/// Whether a robot is heard well enough to be commanded.
+/// Returns whether a robot's link is online or stale, so that it can be commanded.
 pub(super) fn is_heard(presence: &Presence, now: Duration) -> bool {
     presence.link(now) != LinkState::Offline
 }
 
-/// What a robot says of a mission.
+/// Returns the progress of a mission that its robot shows; `None` if it shows another or none.
 pub(super) fn driven(mission: &Standing, presence: &Presence) -> Option<MissionProgress> {
     let said = presence.state().and_then(|state| state.mission);
     said.filter(|driven| driven.id == mission.id)
 }
 
-/// Whether a robot is there without a mission that it took, and with nothing left to report. While
-/// it thinks about an offer, however long, it has not taken it.
+/// Returns whether a robot is heard without a mission that it had accepted, and with an empty
+/// outbox. An offer that it still considers, however long, is not yet accepted.
 pub(super) fn is_absent(mission: &Standing, presence: &Presence, now: Duration) -> bool {
     let is_taken = match mission.state {
         MissionState::Active | MissionState::Paused | MissionState::Cancelling => true,
@@ -118,7 +119,7 @@ pub(super) fn is_absent(mission: &Standing, presence: &Presence, now: Duration) 
         | MissionState::Expired => false,
     };
     let nothing_left = |state: &tread_api::wire::state::RobotState| {
-        // A mission that only the robot's state showed as taken has no run yet.
+        // A mission whose acceptance is only known from the robot's state has no run yet.
         mission.boot.is_none_or(|boot| boot == state.boot) && state.outbox.pending == 0
     };
     is_taken
@@ -127,7 +128,7 @@ pub(super) fn is_absent(mission: &Standing, presence: &Presence, now: Duration) 
         && presence.state().is_some_and(nothing_left)
 }
 
-/// Whether a robot shows a mission as paused that is active here, or the other way round.
+/// Returns whether a robot shows a mission as paused that is active here, or the reverse.
 pub(super) fn is_held_otherwise(mission: &Standing, presence: &Presence) -> bool {
     let here = match mission.state {
         MissionState::Active => false,
@@ -144,7 +145,7 @@ pub(super) fn is_held_otherwise(mission: &Standing, presence: &Presence) -> bool
     driven(mission, presence).is_some_and(|said| said.paused != here)
 }
 
-/// Decides what a mission needs, from where it stands and what its robot says.
+/// Decides what a mission needs, from its state and its robot's last state.
 pub(super) fn decide(mission: &Standing, presence: &Presence, memory: Memory, now: Now) -> Need {
     let heard = is_heard(presence, now.elapsed);
     if !heard && mission.state != MissionState::Queued {
@@ -183,7 +184,7 @@ pub(super) fn decide(mission: &Standing, presence: &Presence, memory: Memory, no
         MissionState::Active | MissionState::Paused => {
             let differs = memory.differs_from.is_some_and(longer_than(HOLD_GRACE));
             let need = in_progress(mission, said, differs);
-            // Whoever stopped it or teleoperates it has written down that it is to be held.
+            // A stop or a teleoperation is recorded with the wish to hold the mission.
             if need == Need::Resume && presence.is_operator_controlled() {
                 Need::Wait
             } else {
@@ -206,8 +207,8 @@ fn of_present(mission: &Standing) -> impl Fn(MissionProgress) -> bool {
     move |said| (said.revision, said.plan_hash) == content
 }
 
-/// What a mission needs that its robot drives or holds; `differs` when the robot has shown it as
-/// paused for a while and the server has not, or the other way round.
+/// Decides what a mission needs that its robot drives or holds; `differs` when the robot has shown
+/// it as paused for [`HOLD_GRACE`] while it is active here, or the reverse.
 fn in_progress(mission: &Standing, said: Option<MissionProgress>, differs: bool) -> Need {
     let content = said.map(|said| (said.revision, said.plan_hash));
     if mission.replacement.is_some() {
@@ -218,22 +219,22 @@ fn in_progress(mission: &Standing, said: Option<MissionProgress>, differs: bool)
         };
     }
     match (mission.state == MissionState::Paused, mission.pause_wanted) {
-        // The robot's record says so at once; its state, when that is slow.
+        // The robot's record normally comes first; its state counts if the record is slow.
         (false, true) if differs => Need::Settle(Change::Pause),
         (true, false) if differs => Need::Settle(Change::Resume),
         (false, true) => Need::Pause,
         (true, false) => Need::Resume,
-        // Whoever stopped the robot, or teleoperated it: only a person lets the mission go on. The
-        // robot's report of the pause makes that what is wanted here too.
+        // The robot paused it because of a stop or a teleoperation: only a person resumes it. The
+        // robot's report of the pause will set what is wanted here accordingly.
         (false, false) if said.is_some_and(|said| said.is_paused_for_safety()) => Need::Wait,
-        // A command that came late or twice had its way on the robot: once more.
+        // A late or repeated command has taken effect on the robot; the wanted one is sent again.
         (false, false) if differs => Need::Resume,
         (true, true) if differs => Need::Pause,
         (false, false) | (true, true) => Need::Wait,
     }
 }
 
-/// How long a robot may stay away from a mission.
+/// Returns the time for which a robot may be unheard before its mission counts as lost, seconds.
 pub(super) fn lost_after_s(mission: &Standing, said: Option<MissionProgress>) -> f64 {
     match (mission.lost_after_s, mission.link_policy) {
         (Some(lost_after_s), _) => lost_after_s,
@@ -250,7 +251,7 @@ pub(super) fn lost_after_s(mission: &Standing, said: Option<MissionProgress>) ->
     }
 }
 
-/// Whether a mission's robot has stayed away past its bound.
+/// Returns whether a mission's robot was unheard for longer than [`lost_after_s`].
 fn is_lost(mission: &Standing, presence: &Presence, memory: Memory, now: Now) -> bool {
     let bound_s = lost_after_s(mission, driven(mission, presence));
     memory
@@ -258,8 +259,8 @@ fn is_lost(mission: &Standing, presence: &Presence, memory: Memory, now: Now) ->
         .is_some_and(|silence| silence.lasts(now).as_secs_f64() > bound_s)
 }
 
-/// Whether the agent that took a mission is gone, its records have had their say, and its
-/// successor does not drive the mission.
+/// Returns whether the agent's run that took a mission has ended, its records have arrived or are
+/// overdue, and its successor does not drive the mission.
 fn is_lost_by_restart(
     mission: &Standing,
     presence: &Presence,

@@ -13,27 +13,27 @@ use super::Unconnected;
 use crate::app::presence::{Presences, RobotKey};
 use crate::counters::Counters;
 
-/// Why it is not known what a robot says to a command. The same may be sent again without harm.
+/// Reason why the answer to a command is not known. The same command may be sent again without
+/// harm.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum Undelivered {
-    /// It could not be sent.
+    /// The command could not be sent.
     #[error("the network to the robot is not open")]
     Unreachable,
-    /// Nobody of the robot's name answered in time.
+    /// No agent of this robot answered in time.
     #[error("the robot does not answer")]
     NoAnswer,
-    /// The robot could not read the command, or its answer does not read.
+    /// The robot could not parse the command, or its answer cannot be parsed.
     #[error("robot and server do not understand each other")]
     Unreadable,
 }
 
-/// The payload of an answer that is awaited.
+/// Future of the payload of an answer.
 pub type Answering = Pin<Box<dyn Future<Output = Result<Vec<u8>, Undelivered>> + Send>>;
 
-/// Carries one command to a robot and its answer back.
+/// Sends one command to a robot and returns its answer.
 pub trait CommandTransport: std::fmt::Debug + Send + Sync {
-    /// Sends a payload to a robot's verb: to one run of its agent, or to whatever runs under its
-    /// name.
+    /// Sends a payload for a robot's verb: to one run of its agent, or to any run under its name.
     fn send(
         &self,
         robot: &RobotKey,
@@ -58,8 +58,8 @@ pub struct Commands {
 }
 
 impl Commands {
-    /// Commands through a transport; `presences` tell which run of an agent is the present one.
-    /// Those that are not delivered are counted.
+    /// Creates a sender through a transport; `presences` give the present run of each agent.
+    /// Undelivered commands are counted.
     pub(in crate::app) fn new(
         transport: Arc<dyn CommandTransport>,
         presences: Arc<Presences>,
@@ -75,7 +75,7 @@ impl Commands {
     /// Sends one command to a robot's present run and waits for its answer.
     ///
     /// # Errors
-    /// [`Undelivered`], as far as anyone knows.
+    /// [`Undelivered`]: the robot may have received the command nevertheless.
     pub async fn send<C: Command>(
         &self,
         robot: &RobotKey,
@@ -86,11 +86,11 @@ impl Commands {
         self.send_to(robot, run, command).await
     }
 
-    /// Sends one command to one run of a robot's agent, or to all under its name, and waits for
-    /// the first answer.
+    /// Sends one command to one run of a robot's agent, or to all under its name, and waits for the
+    /// first answer.
     ///
     /// # Errors
-    /// [`Undelivered`], as far as anyone knows.
+    /// [`Undelivered`]: the robot may have received the command nevertheless.
     pub async fn send_to<C: Command>(
         &self,
         robot: &RobotKey,

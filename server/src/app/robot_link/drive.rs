@@ -1,4 +1,4 @@
-//! Drive commands of teleoperation: the newest counts, and none is answered.
+//! Transport of teleoperation commands: only the newest counts, and none is answered.
 
 use std::pin::Pin;
 

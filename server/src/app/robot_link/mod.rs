@@ -1,5 +1,5 @@
-//! What use cases need of the network to the robots: two ports, which `fleet` implements with
-//! zenoh and a test with a simulated network.
+//! Interface of the use cases to the robots' network: two traits, which `fleet` implements with
+//! zenoh and tests with a simulated network.
 
 mod commands;
 mod drive;
@@ -12,22 +12,22 @@ pub use self::drive::{DrivePublisher, DriveTransport, Opening};
 use super::stops::STOP_CONFIRM_MAX;
 use crate::supervisor::Supervisor;
 
-/// How use cases reach robots; clones reach them through the same network.
+/// Connections to the robots; clones share them.
 #[derive(Debug, Clone)]
 pub struct RobotLink {
-    /// Carries commands, which are answered.
+    /// Transport of commands, which are answered.
     pub commands: Arc<dyn CommandTransport>,
-    /// Carries drive commands, which are not.
+    /// Transport of drive commands, which are not answered.
     pub drive: Arc<dyn DriveTransport>,
-    /// Runs what goes on after a request was answered.
+    /// Supervisor of tasks that outlive their request.
     pub supervisor: Supervisor,
-    /// How long whoever asked for a stop waits for its confirmation: [`STOP_CONFIRM_MAX`],
-    /// but where time is simulated.
+    /// Maximum time that a stop request waits for its confirmation: [`STOP_CONFIRM_MAX`], except in
+    /// simulated time.
     pub stop_confirm_max: Duration,
 }
 
 impl RobotLink {
-    /// A link over which no robot is reached, for programs that work on the database alone.
+    /// Creates a link that reaches no robot, for programs that work on the database alone.
     pub fn unconnected(supervisor: Supervisor) -> Self {
         Self {
             commands: Arc::new(Unconnected),
@@ -38,6 +38,6 @@ impl RobotLink {
     }
 }
 
-/// Delivers nothing.
+/// A transport that delivers nothing.
 #[derive(Debug)]
 pub struct Unconnected;

@@ -1,4 +1,4 @@
-//! The way of stops to their robots, and what becomes of them.
+//! Delivery of stops to robots, and storage of the results.
 
 use std::time::Duration;
 
@@ -14,18 +14,18 @@ use tread_api::wire::safety::Stop as StopCommand;
 use super::super::{App, AppError};
 use crate::db;
 
-/// What a robot has answered to a stop.
+/// A robot's answer to a stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::app) enum StopDelivery {
-    /// It is in force, or was replaced by one that came later.
+    /// It is in force, or was replaced by a later one.
     Confirmed,
-    /// It was in force and has been cleared since, perhaps with one that came later.
+    /// It was in force and has been cleared since, possibly by clearing a later one.
     Over,
-    /// Nothing, or not what was hoped for.
+    /// No answer, or one that confirms nothing.
     Unconfirmed,
 }
 
-/// Sends a stop to its robot.
+/// Sends a stop to its robot and returns the result.
 pub(in crate::app) async fn send_stop(app: &App, stop: &Stop) -> StopDelivery {
     let command = StopCommand {
         stop: stop.id,
@@ -35,7 +35,7 @@ pub(in crate::app) async fn send_stop(app: &App, stop: &Stop) -> StopDelivery {
     };
     let key = (stop.site.clone(), stop.robot.clone());
     app.counters().stops_sent.one();
-    // Whatever runs under the robot's name stops; only its present run can confirm.
+    // Every agent under the robot's name stops; only the present run can confirm.
     let present = app.presences().get(&key).boot().map(|(boot, _since)| boot);
     let Ok(answer) = app.commands().send_to(&key, None, &command).await else {
         return StopDelivery::Unconfirmed;
@@ -57,7 +57,7 @@ pub(in crate::app) async fn send_stop(app: &App, stop: &Stop) -> StopDelivery {
     }
 }
 
-/// A stop on its way to its robot.
+/// A stop to be delivered to its robot.
 pub(super) struct Outgoing {
     pub(super) app: App,
     pub(super) stop: Stop,
@@ -65,16 +65,16 @@ pub(super) struct Outgoing {
 }
 
 impl Outgoing {
-    /// Sends until the robot has confirmed, or the database has the stop: then the reconciler goes
-    /// on.
+    /// Sends the stop until the robot has confirmed it, until a newer one replaces it, or until the
+    /// database has it: then the reconciler continues.
     pub(super) async fn deliver(self, tell_of: mpsc::Sender<(StopId, Timestamp)>) {
         let ending = self.app.supervisor().stop_token();
         let unrecorded = self.app.unrecorded();
         loop {
             let delivery = send_stop(&self.app, &self.stop).await;
             if delivery != StopDelivery::Unconfirmed {
-                // What is over was in force; the reconciler hears that it is over. Nobody listens
-                // only when the server stops.
+                // A stop that is over was in force; the reconciler learns that it is over. Sending
+                // fails only when the server stops.
                 let _ = tell_of.send((self.stop.id, self.app.clock().now())).await;
                 return;
             }
@@ -92,7 +92,7 @@ impl Outgoing {
     }
 }
 
-/// Stops that were sent: what becomes of them, and the database.
+/// Stops that were sent, to be confirmed and stored.
 pub(super) struct Settling {
     pub(super) app: App,
     pub(super) stops: Vec<Stop>,
@@ -114,7 +114,8 @@ impl Settling {
                     () = self.stop.cancelled() => return,
                     () = tokio::time::sleep(UNRECORDED_RETRY) => {}
                 }
-                // A newer stop of a robot has replaced this one there, and need alone be kept.
+                // A newer stop has replaced this one on its robot, and only the newer one must be
+                // stored.
                 waiting = self.app.unrecorded().newest_of(&self.stops);
             }
             recorded.send_replace(true);
@@ -127,7 +128,7 @@ impl Settling {
         let collecting = async {
             let mut confirmed = self.collect(&mut confirmations, shown).await;
             self.app.unrecorded().confirm(&confirmed);
-            // Shown also as long as the database does not take it.
+            // Confirmations are shown also while the database does not store them.
             loop {
                 tokio::select! {
                     biased;
@@ -157,7 +158,7 @@ impl Settling {
         }
     }
 
-    /// Writes stops down; whether that is done.
+    /// Stores stops; returns whether that succeeded.
     async fn record(&self, stops: &[Stop]) -> bool {
         if stops.is_empty() {
             return true;
@@ -181,7 +182,7 @@ impl Settling {
         }
     }
 
-    /// Waits until all robots have confirmed or the bound has passed, and says which have.
+    /// Waits until all robots have confirmed or the limit has passed; returns the confirmations.
     async fn collect(
         &self,
         confirmations: &mut mpsc::Receiver<(StopId, Timestamp)>,
@@ -197,7 +198,7 @@ impl Settling {
                 else => break,
             }
         }
-        // Whoever asked may be gone.
+        // Fails if the requester is gone.
         let _ = shown.send(confirmed.clone());
         confirmed
     }
@@ -209,12 +210,12 @@ impl Settling {
         self.app.unrecorded().confirm(confirmed);
         let noting = self.app.note_confirmed(&self.stops, confirmed);
         if let Err(error) = db::limited(noting).await {
-            // The reconciler asks the robot again, which says the same.
+            // The reconciler sends it again, and the robot gives the same answer.
             self.app
                 .log_failure("write down that stops are confirmed", &error);
         }
     }
 }
 
-/// Wait between two tries of a stop that could not be written down, so that nobody else repeats it.
+/// Wait between two attempts with a stop that is not stored yet, which nobody else repeats.
 const UNRECORDED_RETRY: Duration = Duration::from_millis(250);

@@ -1,4 +1,4 @@
-//! What is to be done about a robot's open stop, by what the robot shows. Pure.
+//! Decides what to do about a robot's open stop, from the stop that the robot shows. Pure.
 //!
 //! ```text
 //!          asked for, in place of what was open        confirmed
@@ -11,47 +11,47 @@
 //!  another one is shown, in place of what was open: confirmed ◄─────────┘
 //! ```
 //!
-//! The newest that was asked for counts until the robot has confirmed it; then the robot's own order
-//! counts, in which the stops came to it.
+//! Until the robot has confirmed it, the newest requested stop counts; afterwards the order in
+//! which stops reached the robot does.
 
 use jiff::{SignedDuration, Timestamp};
 use tread_api::ids::StopId;
 
-/// How old a confirmation must be before a robot's state that does not show the stop counts
-/// against it: states overtake answers.
+/// Minimum age of a confirmation before a state without the stop contradicts it: states may
+/// overtake answers.
 pub(super) const SHOWN_GRACE: SignedDuration = SignedDuration::from_secs(2);
 
 /// A robot's open stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Open {
     pub(super) id: StopId,
-    /// Whether the robot had its time to confirm.
+    /// Whether the robot's time to confirm has passed.
     pub(super) is_overdue: bool,
     pub(super) confirmed_at: Option<Timestamp>,
     pub(super) clear_asked_at: Option<Timestamp>,
 }
 
-/// What a robot showed last.
+/// The stop that a robot showed last.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Shown {
     pub(super) latch: Option<StopId>,
-    /// When the latch ended as a stop, as far as the server knows.
+    /// Time at which the shown latch was cleared, as far as the server knows.
     pub(super) ended_at: Option<Timestamp>,
-    /// When the robot's state came.
+    /// Time at which the robot's state arrived.
     pub(super) at: Timestamp,
 }
 
-/// What is to be done.
+/// Action for a robot's stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Verdict {
     Nothing,
-    /// The stop is sent.
+    /// Send the stop.
     Tell,
-    /// The robot does not show what it confirmed: the stop is sent again.
+    /// Send the stop again: the robot does not show what it confirmed.
     Lost,
-    /// The robot has cleared it, as somebody asked.
+    /// Record that the robot has cleared it, as requested.
     Cleared,
-    /// What the robot shows is its open stop from now on.
+    /// Make the stop that the robot shows its open one.
     Adopt,
 }
 

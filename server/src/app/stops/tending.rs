@@ -1,4 +1,4 @@
-//! Open stops, held against what robots show, in each pass of the reconciler.
+//! Compares open stops with those that robots show, in each pass of the reconciler.
 
 use std::collections::BTreeMap;
 
@@ -16,22 +16,22 @@ use crate::app::presence::{Presence, RobotKey};
 use crate::app::{App, AppError};
 use crate::db::{self, Tx};
 
-/// What is to be done about stops.
+/// Actions for all stops.
 #[derive(Debug, Default)]
 struct Tending {
     again: Vec<Stop>,
-    /// Those of `again` that their robots had confirmed.
+    /// Those in `again` that their robots had confirmed.
     lost: Vec<Stop>,
     cleared: Vec<StopId>,
     standing: Vec<StopId>,
     /// Robots whose own stop becomes the open one.
     adopted: Vec<RobotKey>,
-    /// Robots whose alert may be over, or is missing.
+    /// Robots whose alert may have to be raised or cleared.
     alerts: Vec<RobotKey>,
 }
 
 impl App {
-    /// Compares open stops with what robots show, and gives those to be sent again.
+    /// Compares open stops with those that robots show; returns the ones to be sent again.
     pub(in crate::app) async fn tend_stops(&self) -> Result<Vec<Stop>, AppError> {
         let Tending {
             lost,
@@ -47,7 +47,7 @@ impl App {
         }
         let writing = async {
             let mut tx = self.db().write("stops").await?;
-            // Not before: the turn to write may have come late.
+            // Read here, since the turn to write may have come late.
             let now = self.clock().now();
             for stop in &lost {
                 db::stops::unconfirm(&mut tx, stop.id).await?;
@@ -73,7 +73,7 @@ impl App {
             }
             Ok::<(), AppError>(())
         };
-        // Stops are sent again also while nothing can be written.
+        // Stops are sent again even if nothing can be stored.
         if let Err(error) = writing.await {
             self.log_failure("write down what became of stops", &error);
         }
@@ -123,7 +123,8 @@ impl App {
             }
             match verdict {
                 Verdict::Tell => {
-                    // A robot that is there gets the stop, and raises the alert if it does not confirm.
+                    // A robot that is on the network gets the stop, and an alert if it does not
+                    // confirm.
                     if !is_alerted && !presence.is_there(self.clock().elapsed()) {
                         tending.alerts.push(key);
                     }
@@ -138,7 +139,7 @@ impl App {
                 Verdict::Nothing | Verdict::Adopt => {}
             }
         }
-        // Robots of which nothing is open any more.
+        // Robots without an open stop.
         tending.alerts.extend(alerted);
         tending.again.sort_by_key(|stop| stop.id);
         Ok(tending)
@@ -149,7 +150,7 @@ impl App {
         self.allowances().take(key, Kind::Stop, now)
     }
 
-    /// What a robot shows of stops; `None` if that says nothing.
+    /// Returns the stop that a robot shows; `None` if that allows no conclusion.
     async fn shown(
         &self,
         tx: &mut Tx,

@@ -1,7 +1,7 @@
-//! Stops that were sent and are not in the database yet: usually for milliseconds, and for as long
-//! as the storage fails.
+//! Stops that were sent and are not stored yet: usually for milliseconds, and as long as the
+//! storage fails.
 //!
-//! They are listed like all others. At most one waits for each robot: a newer one replaces it, as it
+//! They are listed like stored ones. There is at most one per robot: a newer one replaces it, as it
 //! does on the robot.
 
 use std::collections::HashMap;
@@ -15,7 +15,7 @@ use super::key_of;
 use crate::app::presence::RobotKey;
 use crate::db::stops::StopFilter;
 
-/// The newest unrecorded stop of each robot.
+/// The newest unstored stop of each robot.
 #[derive(Debug, Default)]
 pub(in crate::app) struct Unrecorded {
     stops: Mutex<HashMap<RobotKey, Stop>>,
@@ -31,7 +31,7 @@ impl Unrecorded {
         self.lock().extend(new);
     }
 
-    /// Those of these that are their robot's newest, as they stand now.
+    /// Returns those of `stops` that are the newest of their robot, in their present state.
     pub(super) fn newest_of(&self, stops: &[Stop]) -> Vec<Stop> {
         let kept = self.lock();
         let newest = stops.iter().filter_map(|stop| {
@@ -41,12 +41,12 @@ impl Unrecorded {
         newest.collect()
     }
 
-    /// Whether a stop of a robot waits to be written down.
+    /// Returns whether a stop of a robot is not stored yet.
     pub(super) fn has_of(&self, key: &RobotKey) -> bool {
         self.lock().contains_key(key)
     }
 
-    /// The stop that will take the place of this one once it is written down.
+    /// Returns the stop that will replace this one once it is stored.
     pub(super) fn successor_of(&self, stop: &Stop) -> Option<StopId> {
         let kept = self.lock();
         let newest = kept.get(&key_of(stop))?;
@@ -54,7 +54,7 @@ impl Unrecorded {
         is_newer.then_some(newest.id)
     }
 
-    /// Notes that robots have confirmed.
+    /// Records confirmations of robots.
     pub(super) fn confirm(&self, confirmed: &[(StopId, Timestamp)]) {
         let mut kept = self.lock();
         for stop in kept.values_mut() {
@@ -64,7 +64,7 @@ impl Unrecorded {
         }
     }
 
-    /// Forgets what is written down.
+    /// Removes stops that were stored.
     pub(super) fn remove(&self, stops: &[Stop]) {
         let mut kept = self.lock();
         for stop in stops {
@@ -75,7 +75,7 @@ impl Unrecorded {
         }
     }
 
-    /// Those that a filter lets through.
+    /// Returns the stops that a filter lets through.
     pub(super) fn list(&self, filter: &StopFilter) -> Vec<Stop> {
         let kept = self.lock();
         let wanted = kept.values().filter(|stop| {
@@ -126,7 +126,7 @@ mod tests {
                 .newest_of(std::slice::from_ref(&first))
                 .is_empty()
         );
-        // Who wrote the older one down must not forget the newer one.
+        // Storing the older one must not remove the newer one.
         unrecorded.remove(&[first]);
         unrecorded.confirm(&[(second.id, Timestamp::UNIX_EPOCH)]);
         let of_robot = StopFilter {

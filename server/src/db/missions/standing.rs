@@ -1,4 +1,4 @@
-//! Where open missions stand, without what is to be driven: what the reconciler reads.
+//! States of open missions without their trajectories, for the reconciler.
 
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
@@ -8,7 +8,7 @@ use tread_api::mission::{LinkPolicy, Mission, MissionState};
 use super::super::{DbError, corrupt, from_json, from_us, parse, to_us, unsigned};
 use super::state;
 
-/// Where an open mission stands, without what is to be driven, which may be long.
+/// State of an open mission, without its trajectory, which may be long.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Standing {
     /// The mission.
@@ -17,27 +17,28 @@ pub struct Standing {
     pub site: SiteId,
     /// The robot.
     pub robot: RobotId,
-    /// Where it stands.
+    /// Its state.
     pub state: MissionState,
-    /// Why it stands there.
+    /// Reason of that state.
     pub reason: Option<String>,
-    /// The run of the agent that took it.
+    /// Run of the agent that accepted it.
     pub boot: Option<BootId>,
     /// Whether it is to be paused.
     pub pause_wanted: bool,
-    /// Those of a higher one are driven first.
+    /// Priority; higher ones are driven first.
     pub priority: i32,
-    /// The revision and hash that count now.
+    /// Present revision and its plan hash.
     pub content: (u32, PlanHash),
-    /// The revision and hash that the robot does not hold whole yet.
+    /// Revision that the robot does not have completely yet, and its plan hash.
     pub replacement: Option<(u32, PlanHash)>,
-    /// Since when its robot has not been heard.
+    /// Time since which its robot has not been heard; `None` while it is heard.
     pub silent_since: Option<Timestamp>,
-    /// How long its robot may stay away, seconds, if that was said.
+    /// Time for which its robot may be unheard before the mission is lost, seconds; `None` for the
+    /// default.
     pub lost_after_s: Option<f64>,
-    /// What its robot does when it no longer hears the server.
+    /// Behaviour of its robot without a connection to the server.
     pub link_policy: LinkPolicy,
-    /// The time that the robot planned for it, seconds.
+    /// Duration of the robot's plan, seconds.
     pub duration_s: Option<f64>,
 }
 
@@ -146,7 +147,7 @@ fn standings(raw: Vec<RawStanding>) -> Result<Vec<Standing>, DbError> {
     raw.into_iter().map(Standing::try_from).collect()
 }
 
-/// All missions in progress: active ones, and those that wait for their robot's answer.
+/// Returns all missions in progress: active ones, and those that await their robot's answer.
 pub async fn in_progress(db: &mut SqliteConnection) -> Result<Vec<Standing>, DbError> {
     let raw = standings!("WHERE missions.state IN ('offered', 'active', 'paused', 'cancelling')")
         .fetch_all(db)
@@ -154,8 +155,7 @@ pub async fn in_progress(db: &mut SqliteConnection) -> Result<Vec<Standing>, DbE
     standings(raw)
 }
 
-/// The mission that is next in the queue of each robot that has no active mission; one that is held
-/// is passed over.
+/// Returns the first queued mission of each robot without an active one; held missions are skipped.
 pub async fn next_in_queues(db: &mut SqliteConnection) -> Result<Vec<Standing>, DbError> {
     let raw = standings!(
         "WHERE missions.id IN (
@@ -173,7 +173,7 @@ pub async fn next_in_queues(db: &mut SqliteConnection) -> Result<Vec<Standing>, 
     standings(raw)
 }
 
-/// Queued missions whose latest start has passed.
+/// Returns the queued missions whose latest start has passed.
 pub async fn overdue(
     db: &mut SqliteConnection,
     now: Timestamp,
@@ -190,7 +190,7 @@ pub async fn overdue(
     standings(raw)
 }
 
-/// All missions of a robot that have not ended, the active one first, then as they are queued.
+/// Returns a robot's open missions, the active one first, then in the order of the queue.
 pub async fn open_of_robot(
     db: &mut SqliteConnection,
     robot_pk: i64,

@@ -1,9 +1,9 @@
-//! How often connections from one address have failed, and when that is too often.
+//! Limits failed connections per address.
 //!
-//! Each address may fail some times at once and slowly for ever; above that its connections are
-//! refused before anything is read of them. Only failures count, so that a whole fleet behind one
-//! address may come back at once; and they must be many, so that a stranger behind the same
-//! address does not lock it out with little effort.
+//! Each address may have a burst of failures and a slow rate of further ones; beyond that its
+//! connections are refused before anything is read. Only failures count, so a whole fleet behind
+//! one address may reconnect at once. The limit is high, so that a stranger behind the same address
+//! cannot easily lock the fleet out.
 
 use std::collections::HashMap;
 use std::net::IpAddr;
@@ -11,27 +11,26 @@ use std::time::Duration;
 
 use crate::rate_limit::{Bucket, RateLimit};
 
-/// Failures that an address may have.
+/// Limit of failures per address.
 const LIMIT: RateLimit = RateLimit {
     burst: 200,
     interval: Duration::from_millis(50),
 };
-/// Addresses that are remembered.
+/// Maximum number of addresses tracked.
 const ADDRESSES_MAX: usize = 4_096;
 
-/// What is remembered of failures. Those from this machine do not count: whoever is on it has
-/// other means.
+/// Failures by address. Those from the loopback do not count: a local attacker has other means.
 #[derive(Debug, Default)]
 pub(super) struct Failures(HashMap<IpAddr, Bucket>);
 
 impl Failures {
-    /// Whether an address has failed too often.
+    /// Returns whether an address has exceeded its limit of failures.
     pub(super) fn is_blocked(&self, address: IpAddr, now: Duration) -> bool {
         let bucket = self.0.get(&address.to_canonical());
         bucket.is_some_and(|bucket| !bucket.has_one(LIMIT, now))
     }
 
-    /// A connection from an address has failed.
+    /// Records a failed connection from an address.
     pub(super) fn failed(&mut self, address: IpAddr, now: Duration) {
         let address = address.to_canonical();
         if address.is_loopback() {
@@ -40,8 +39,8 @@ impl Failures {
         if !self.0.contains_key(&address) && self.0.len() >= ADDRESSES_MAX {
             self.0.retain(|_, bucket| !bucket.is_full(now));
             if self.0.len() >= ADDRESSES_MAX {
-                // So many at once are no neighbours with a bad cable; the bounds on open
-                // connections hold against them.
+                // So many addresses at once are an attack; the limits on open connections apply to
+                // it.
                 return;
             }
         }

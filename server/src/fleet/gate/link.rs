@@ -25,24 +25,25 @@ use crate::connections::Slot;
 use crate::fleet::SEND_BUFFER_BYTES;
 use crate::fleet::routers::{Router, Routers};
 
-/// How long the first byte may take.
+/// Maximum time until the first byte.
 const FIRST_BYTE_TIMEOUT: Duration = Duration::from_secs(2);
-/// How long the handshake may take.
+/// Maximum time for the TLS handshake.
 const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(5);
-/// How long a robot that has just joined waits for the router that will know it.
+/// Maximum time that a robot that has just joined waits for a router whose rules include it.
 const ROUTER_TIMEOUT: Duration = Duration::from_secs(10);
-/// How long the router may take to take a connection.
+/// Maximum time until the router accepts a connection.
 const INSIDE_TIMEOUT: Duration = Duration::from_secs(5);
-/// How long the opening of a robot's session may take.
+/// Maximum time for opening a robot's session.
 const OPENING_TIMEOUT: Duration = Duration::from_secs(5);
-/// Time between two looks whether the router has let go of a session.
+/// Polling interval until the router has closed a session.
 const SESSION_GONE_EVERY: Duration = Duration::from_millis(5);
-/// Bytes on their way within the gate, each way: what stands here has lost its priority.
+/// Bytes buffered within the gate, in each direction; buffered bytes are no longer ordered by
+/// priority.
 const BUFFER_BYTES: usize = 4 * 1024;
-/// Bytes of a connection that are looked at before anything else is done.
+/// Number of bytes of a connection that are inspected first.
 const LOOKED_AT_BYTES: usize = 6;
 
-/// A connection and what it needs.
+/// A connection with what it needs.
 pub(super) struct Link {
     pub(super) app: App,
     pub(super) peer: SocketAddr,
@@ -54,8 +55,8 @@ pub(super) struct Link {
     pub(super) links: Links,
 }
 
-/// Whether a connection may be the begin of TLS: a record of a handshake, whose first message is
-/// a client's hello.
+/// Returns whether a connection may begin with TLS: a handshake record whose first message is a
+/// ClientHello.
 fn may_be_tls(begin: &[u8]) -> bool {
     let fits = |at: usize, is_right: fn(u8) -> bool| begin.get(at).copied().is_none_or(is_right);
     !begin.is_empty()
@@ -71,15 +72,15 @@ struct Admitted {
     name: RobotName,
     /// Hash of the certificate.
     certificate: CertificateHash,
-    /// The fingerprint of the authority that signed it.
+    /// Fingerprint of the authority that signed the certificate.
     issuer: String,
-    /// How long the certificate is good for.
+    /// Remaining validity of the certificate.
     left: Duration,
     stream: server::TlsStream<TcpStream>,
 }
 
 impl Link {
-    /// Serves the connection to its end.
+    /// Serves the connection until its end.
     pub(super) async fn serve(self, stream: TcpStream) {
         let socket = SockRef::from(&stream);
         let set = socket
@@ -93,7 +94,7 @@ impl Link {
             return;
         };
         let (robot, name, issuer) = (&admitted.robot, &admitted.name, &admitted.issuer);
-        // From here on it is a robot's, and not displaced for others.
+        // From here on it counts as a robot's connection and is not displaced by others.
         let _at_work = self.slot.work();
         let counters = self.app.counters();
         let now = self.app.clock().elapsed();
@@ -138,7 +139,7 @@ impl Link {
         }
     }
 
-    /// Checks who it is: whom, and for how long.
+    /// Authenticates the client; `None` if it is rejected.
     async fn let_in(&self, stream: TcpStream) -> Option<Admitted> {
         let counters = self.app.counters();
         let mut begin = [0; LOOKED_AT_BYTES];
@@ -153,7 +154,7 @@ impl Link {
             self.failed();
             return None;
         }
-        // rustls would take 64 KiB of what the socket cannot, below all priorities.
+        // rustls would otherwise buffer 64 KiB beyond the socket, unordered by priority.
         let bound = |tls: &mut ServerConnection| tls.set_buffer_limit(Some(BUFFER_BYTES));
         let handshake = self.acceptor.accept_with(stream, bound);
         let stream = match tokio::time::timeout(HANDSHAKE_TIMEOUT, handshake).await {
@@ -182,7 +183,7 @@ impl Link {
         self.identify(stream)
     }
 
-    /// Whose certificate was shown, if it counts.
+    /// Returns the robot of the certificate that was shown, if the certificate counts.
     fn identify(&self, stream: server::TlsStream<TcpStream>) -> Option<Admitted> {
         let counters = self.app.counters();
         let now = self.app.clock().now();
@@ -209,7 +210,7 @@ impl Link {
                 "{} showed a certificate that is no longer in force",
                 self.peer
             );
-            // Its successor may be well; only one that has none raises an alert.
+            // A renewed certificate may be valid; only a robot without one raises an alert.
             if self.app.enrolment_registry().standing(&robot)
                 == Some(Standing::Revoked(name.enrolment))
             {
@@ -233,8 +234,8 @@ impl Link {
         failures.failed(self.peer.ip(), self.app.clock().elapsed());
     }
 
-    /// Sends the robot its credentials and lets its session open at the newest router, as that robot:
-    /// the connection inside.
+    /// Sends the robot its credentials and opens its session at the newest router; returns the
+    /// internal connection.
     async fn open(
         &self,
         robot: &RobotKey,
@@ -283,7 +284,7 @@ impl Link {
         None
     }
 
-    /// Waits for a router whose rules know the robot, and says what the robot has to show there.
+    /// Waits for a router whose rules include the robot; returns it with the robot's credentials.
     async fn router_of(&self, robot: &RobotKey) -> (Arc<Router>, RouterCredentials) {
         let mut changes = self.routers.changes();
         loop {
@@ -296,13 +297,13 @@ impl Link {
                 return (router, credentials);
             }
             if changes.changed().await.is_err() {
-                // The routers outlive every link; there is nothing to wait for.
+                // Not reached: the routers outlive every link.
                 std::future::pending::<()>().await;
             }
         }
     }
 
-    /// Waits until the robot is put out, or has joined again.
+    /// Waits until the robot is revoked or has joined again.
     async fn put_out(&self, robot: &RobotKey, enrolment: u32) {
         let mut changes = self.app.enrolment_registry().changes();
         while self.app.enrolment_registry().is_in_force(robot, enrolment) {
@@ -323,7 +324,7 @@ impl Link {
     }
 }
 
-/// Whether the other side does not trust the port's authority.
+/// Returns whether the other side does not trust the port's authority.
 fn is_distrust(error: &std::io::Error) -> bool {
     let cause = error.get_ref().and_then(|cause| cause.downcast_ref());
     matches!(
@@ -332,7 +333,7 @@ fn is_distrust(error: &std::io::Error) -> bool {
     )
 }
 
-/// Sends the credentials and reads the begin of the session.
+/// Sends the credentials and reads the first message of the session.
 async fn begin(
     outside: &mut server::TlsStream<TcpStream>,
     credentials: &RouterCredentials,
@@ -350,7 +351,7 @@ async fn connect(router: &Router) -> anyhow::Result<TcpStream> {
     Ok(stream)
 }
 
-/// Waits until a router has let go of a session whose link has ended.
+/// Waits until a router has closed a session whose link has ended.
 async fn session_gone(router: &Arc<Router>, session_id: u128) {
     loop {
         let asked = Arc::clone(router);

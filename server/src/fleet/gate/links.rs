@@ -1,8 +1,9 @@
-//! The links of each robot, of which the newest few stay.
+//! Links of each robot, limited to the newest few.
 //!
-//! A robot has one session and for a moment a second. Without a bound one robot's certificate would
-//! open as many links as there is room for, and lock the others out. A robot that burdens the router
-//! with what cannot be refused there is cut off for a while. All links of a robot have one rate of bytes.
+//! A robot has one session, and for a moment a second. Without a limit one robot's certificate
+//! could open all available links and lock the others out. A robot that overloads the router by
+//! messages that cannot be refused there is cut off for a while. All links of a robot share one
+//! byte rate.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -14,11 +15,11 @@ use super::throttle::{BYTE_RATE, ByteRate};
 use crate::app::presence::RobotKey;
 use crate::rate_limit::RateLimit;
 
-/// Most links of one robot. Two agents under one name are noticed and shown, so both get in.
+/// Maximum number of links of one robot. It admits two agents under one name, so that they are
+/// detected and shown.
 pub(in crate::fleet) const LINKS_PER_ROBOT_MAX: usize = 4;
 
-/// How long a robot that was cut off stays out: its session ends meanwhile, and what it had declared
-/// goes.
+/// Time for which a robot stays cut off: its session and its declarations end meanwhile.
 pub(in crate::fleet) const CUT_OFF: Duration = Duration::from_secs(10);
 
 /// The SHA-256 of a certificate.
@@ -34,11 +35,11 @@ pub(in crate::fleet) struct Links(Arc<Mutex<Table>>);
 struct Table {
     next: u64,
     byte_limit: RateLimit,
-    /// What each robot that was ever here uses of it: a new link is no new rate. Only robots that have
-    /// joined come this far, and their number is bounded.
+    /// Byte rates by robot; a new link continues the rate of the earlier ones. Only robots that
+    /// have joined are in it, so its size is bounded.
     byte_rates: HashMap<RobotKey, Arc<ByteRate>>,
     of_robots: OfRobots,
-    /// Robots that were cut off, and until when.
+    /// Robots that are cut off, with the time at which that ends.
     cut_off: HashMap<RobotKey, Duration>,
 }
 
@@ -52,14 +53,14 @@ impl Default for Links {
 struct OneLink {
     number: u64,
     certificate: CertificateHash,
-    /// The zenoh session on it, once it has begun to open.
+    /// The zenoh session on this link; `None` until it begins to open.
     session_id: Option<u128>,
     displaced: CancellationToken,
     cut_off: CancellationToken,
     ended: CancellationToken,
 }
 
-/// A link among those of its robot; it leaves when it is dropped.
+/// Registration of a link; dropping it removes the link.
 #[derive(Debug)]
 pub(super) struct Entry {
     links: Links,
@@ -72,7 +73,7 @@ pub(super) struct Entry {
 }
 
 impl Links {
-    /// None yet; all links of a robot together are read at that rate.
+    /// Creates an empty table; all links of a robot together are read at `byte_limit`.
     pub(in crate::fleet) fn new(byte_limit: RateLimit) -> Self {
         Self(Arc::new(Mutex::new(Table {
             next: 0,
@@ -87,7 +88,8 @@ impl Links {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Cuts a robot's links, and keeps it out for [`CUT_OFF`]; whether it was not out already.
+    /// Cuts a robot's links, and refuses new ones for [`CUT_OFF`]. Returns false if it was cut off
+    /// already.
     pub(in crate::fleet) fn cut_off(&self, robot: &RobotKey, now: Duration) -> bool {
         let mut table = self.lock();
         table.cut_off.retain(|_, until| *until > now);
@@ -98,7 +100,7 @@ impl Links {
         is_news
     }
 
-    /// Adds a link of a robot; its oldest one goes if it has too many.
+    /// Adds a link of a robot; its oldest one is closed if it has too many.
     pub(super) fn enter(
         &self,
         robot: RobotKey,
@@ -154,20 +156,20 @@ impl Entry {
         self.cut_off.cancelled().await;
     }
 
-    /// What its robot uses of its rate of bytes.
+    /// Returns the byte rate of the robot.
     pub(super) fn byte_rate(&self) -> &ByteRate {
         &self.byte_rate
     }
 
-    /// Waits until newer links of the robot have taken its place.
+    /// Waits until newer links of the robot have displaced this one.
     pub(super) async fn displaced(&self) {
         self.displaced.cancelled().await;
     }
 
-    /// Takes a session over from older links: a robot whose network failed comes back before the
-    /// server misses it, and the router would refuse a second link of the same session. They end, and
-    /// are waited for. Only links of the very same certificate count: whoever shows another one is
-    /// another agent, whatever it says. Whether there was one.
+    /// Takes a session over from older links, and returns whether there was one. A robot whose
+    /// network failed reconnects before the server notices, and the router would refuse a second
+    /// link of the same session, so the older ones are ended and awaited. Only links with the very
+    /// same certificate count: a client with another one is another agent.
     pub(super) async fn take_over(&self, session_id: u128) -> bool {
         let mut older = Vec::new();
         {

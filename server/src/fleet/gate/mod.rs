@@ -1,4 +1,4 @@
-//! The gate: robots' TLS port.
+//! The gate: TLS port of the robots.
 //!
 //! ```text
 //!  connection ─► its address failed too often? ─► refused
@@ -58,18 +58,18 @@ use crate::clock::Clock;
 use crate::connections::{ACCEPT_REST, Bounds, Connections};
 use crate::supervisor::Supervisor;
 
-/// The bounds of the robots' port. A robot that has shown its certificate counts as at work, and
-/// is never displaced.
+/// Limits on connections to the robots' port. A robot that has shown its certificate counts as at
+/// work, and is never displaced.
 const BOUNDS: Bounds = Bounds {
     all: SESSIONS_MAX as usize,
     per_address: 4_096,
     unproven: 1_024,
     unproven_per_address: 256,
 };
-/// Connections that the system may keep until they are accepted.
+/// Number of connections that the system queues until they are accepted.
 const BACKLOG: u32 = 1_024;
 
-/// The robots' port, open.
+/// The open port of the robots.
 #[derive(Debug)]
 pub(super) struct Gate {
     listener: TcpListener,
@@ -77,7 +77,7 @@ pub(super) struct Gate {
     door: Door,
 }
 
-/// What the port shows.
+/// Certificate of the port and trusted authorities.
 struct Door {
     security: Security,
     clock: Clock,
@@ -112,8 +112,8 @@ impl Door {
         })
     }
 
-    /// What makes TLS of a connection; the certificate is made anew in time, and at once when another
-    /// authority is trusted or one no more. What a client kept of a session before is of no use then.
+    /// Returns the TLS acceptor. The port's certificate is renewed in time, and at once after a
+    /// change of the trusted authorities; TLS sessions from before then cannot be resumed.
     fn acceptor(&self) -> TlsAcceptor {
         let now = self.clock.machine_time();
         let mut present = self.present.lock().unwrap_or_else(PoisonError::into_inner);
@@ -136,7 +136,7 @@ impl Door {
     }
 }
 
-/// Certificates of robots are judged by the server's time: one that was made shortly before the
+/// Verifies robots' certificates by the server's clock, so that one made shortly before the
 /// machine's clock was set back stays valid.
 #[derive(Debug)]
 struct ServerTime(Clock);
@@ -173,10 +173,10 @@ fn server_config(
 }
 
 impl Gate {
-    /// Takes the port.
+    /// Opens the port.
     ///
     /// # Errors
-    /// It is in use, or the certificates cannot be used.
+    /// The address is in use, or the certificates cannot be used.
     pub(super) fn open(
         address: SocketAddr,
         security: Security,
@@ -194,12 +194,12 @@ impl Gate {
         })
     }
 
-    /// Where it is.
+    /// Returns the address of the port.
     pub(super) fn address(&self) -> SocketAddr {
         self.address
     }
 
-    /// Lets robots in until the stop.
+    /// Accepts robots' connections until the stop.
     pub(super) async fn run(
         self,
         app: App,
@@ -264,18 +264,18 @@ fn is_blocked(failures: &Mutex<Failures>, address: IpAddr, now: Duration) -> boo
     failures.is_blocked(address, now)
 }
 
-/// Bytes of a robot that stand in the kernel at most: what stands there has lost its priority, so a
-/// robot whose outbox is long would confirm a Stop late.
+/// Receive buffer of the kernel per robot, bytes. Buffered bytes are no longer ordered by priority:
+/// with a larger buffer a robot with a long outbox would confirm a Stop late.
 const RECEIVE_BUFFER_BYTES: u32 = 64 * 1024;
 
-/// Listens with small buffers: what stands in them has lost its priority.
+/// Listens with small buffers, since buffered bytes are no longer ordered by priority.
 fn listen(address: SocketAddr) -> std::io::Result<TcpListener> {
     let socket = if address.is_ipv4() {
         TcpSocket::new_v4()?
     } else {
         TcpSocket::new_v6()?
     };
-    // A server that starts again may find connections of its former self.
+    // After a restart, connections of the former process may still exist.
     socket.set_reuseaddr(true)?;
     socket.set_send_buffer_size(SEND_BUFFER_BYTES)?;
     socket.set_recv_buffer_size(RECEIVE_BUFFER_BYTES)?;

@@ -1,4 +1,4 @@
-//! What the gate demands of the opening of a zenoh session before it lets the rest pass unread.
+//! Checks the opening of a zenoh session; the gate forwards the rest of the session unread.
 //!
 //! ```text
 //!  robot ── InitSyn: client, own session id ──► router
@@ -6,9 +6,9 @@
 //!        ── OpenSyn: own user name ───────────►
 //! ```
 //!
-//! Each message is one frame: its length (two bytes, little-endian) and its bytes. The router reads
-//! one message of each of the first two frames with the same codec that is used here, so it sees
-//! what was checked. It checks the password itself.
+//! Each frame has a length (two bytes, little-endian) and its bytes. The router reads one message
+//! of each of the first two frames with the same codec as this module, so it sees exactly what was
+//! checked. The router itself checks the password.
 
 use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _};
 use tread_api::tunnel::RouterCredentials;
@@ -20,35 +20,35 @@ use zenoh_protocol::common::iext::ID_MASK;
 use zenoh_protocol::core::WhatAmI;
 use zenoh_protocol::transport::{InitSyn, OpenSyn, TransportBody, TransportMessage};
 
-/// Most bytes of a frame in the opening. The largest is the router's, with its cookie.
+/// Maximum size of a frame in the opening, bytes. The largest one is the router's, with its cookie.
 const FRAME_BYTES_MAX: u16 = 4 * 1024;
-/// Zenoh's number of user name and password among the ways to authenticate.
+/// Zenoh's number of the authentication method by user name and password.
 const USER_PASSWORD_ID: u8 = 0x2;
 
-/// Why a session is not let to the router.
+/// Reason why a session is rejected.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum OpeningRefused {
-    /// The link broke, or its other end closed it.
+    /// The link broke or was closed by the client.
     #[error("the link ended while the session opened")]
     Ended(#[from] std::io::Error),
-    /// A frame is longer than any of an opening.
+    /// A frame is too long for an opening; holds its length in bytes.
     #[error("a frame of {0} bytes is no part of an opening")]
     TooLong(u16),
-    /// Another message stands where one was due.
+    /// Another message arrived than the expected one.
     #[error("the message is not the {0} that is due")]
     NotDue(&'static str),
-    /// It says to be a router or a peer.
+    /// The client declares itself a router or a peer.
     #[error("a session that opens as {0} and not as client")]
     NotClient(WhatAmI),
-    /// The id of the session is not one of this robot.
+    /// The session's identifier does not belong to this robot.
     #[error("a session id that is not this robot's")]
     ForeignId,
-    /// The user is not this robot.
+    /// The user name is not that of this robot.
     #[error("a user name that is not this robot's")]
     ForeignUser,
 }
 
-/// The first message of a session, checked.
+/// The checked first message of a session.
 #[derive(Debug)]
 pub(super) struct Init {
     /// The session's id.
@@ -56,8 +56,8 @@ pub(super) struct Init {
     frame: Vec<u8>,
 }
 
-/// Reads and checks the first message of a session. Nothing is asked of the router before it is there:
-/// it has few places for sessions that are about to open.
+/// Reads and checks the first message of a session. The router is contacted only afterwards, since
+/// it has few places for opening sessions.
 ///
 /// # Errors
 /// [`OpeningRefused`].
@@ -70,10 +70,10 @@ pub(super) async fn read_init(
     Ok(Init { session_id, frame })
 }
 
-/// Lets the opening of a session pass between robot and router.
+/// Forwards and checks the opening of a session between robot and router.
 ///
 /// # Errors
-/// [`OpeningRefused`]; what the router has seen by then does not open a session.
+/// [`OpeningRefused`]; the messages that the router has received by then do not open a session.
 pub(super) async fn pass_opening(
     robot: &mut (impl AsyncRead + AsyncWrite + Unpin),
     router: &mut (impl AsyncRead + AsyncWrite + Unpin),
@@ -102,7 +102,7 @@ async fn write_frame(
     to: &mut (impl AsyncWrite + Unpin),
     frame: &[u8],
 ) -> Result<(), OpeningRefused> {
-    // It was read with a length of two bytes.
+    // Cannot fail: the length was read from two bytes.
     let length = u16::try_from(frame.len()).unwrap_or(u16::MAX);
     let whole = [&length.to_le_bytes()[..], frame].concat();
     to.write_all(&whole).await?;
@@ -110,7 +110,7 @@ async fn write_frame(
     Ok(())
 }
 
-/// The one message of a frame.
+/// Returns the only message of a frame; `None` unless there is exactly one.
 fn message(frame: &[u8]) -> Option<TransportBody> {
     let mut reader = frame.reader();
     let message: TransportMessage = Zenoh080::new().read(&mut reader).ok()?;
@@ -141,7 +141,7 @@ fn check_open(frame: &[u8], credentials: &RouterCredentials) -> Result<(), Openi
     }
 }
 
-/// The user that a session opens as; `None` unless it shows exactly one.
+/// Returns the user name in an opening message; `None` unless there is exactly one.
 fn user_in(open: &OpenSyn) -> Option<Vec<u8>> {
     let shown = open.ext_auth.as_ref()?;
     let codec = Zenoh080::new();

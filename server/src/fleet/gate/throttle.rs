@@ -1,7 +1,7 @@
-//! How fast a robot's bytes are read, over all its links together.
+//! Limits the rate at which a robot's bytes are read, over all its links together.
 //!
-//! What comes faster is not lost and ends no link: it is read later. So the buffers on the way fill, and
-//! the robot's own TCP waits.
+//! Excess bytes are not lost and end no link: they are read later. The buffers on the way fill, and
+//! the robot's TCP waits.
 
 use std::io;
 use std::pin::Pin;
@@ -15,22 +15,22 @@ use tokio::time::Sleep;
 use crate::clock::Clock;
 use crate::rate_limit::{Bucket, RateLimit};
 
-/// Bytes of one robot that are read in a second. Its state, friction report and measurements take some tens
-/// of KiB a second; what waited on its disk during an outage comes as fast as receipts do.
+/// Bytes read from one robot per second. State, friction report and measurements need some tens of
+/// KiB per second; the outbox after an outage is sent as fast as receipts arrive.
 pub(in crate::fleet) const BYTES_PER_S: u32 = 8 * 1024 * 1024;
-/// Bytes of one robot that are read at once: two of the largest payloads.
+/// Bytes read from one robot in a burst: two of the largest payloads.
 const BURST_BYTES: u32 = 32 * 1024 * 1024;
-/// The rate of all links of one robot together.
+/// Byte rate of all links of one robot together.
 pub(in crate::fleet) const BYTE_RATE: RateLimit = RateLimit {
     burst: BURST_BYTES,
     interval: Duration::from_nanos(1_000_000_000 / BYTES_PER_S as u64),
 };
-/// Shortest pause: what is read in small pieces does not pause after each.
+/// Minimum pause, so that reading small chunks does not pause after each.
 const PAUSE_MIN: Duration = Duration::from_millis(10);
-/// Least time between two log lines on one robot's pauses.
+/// Minimum interval between two log entries about one robot's pauses.
 const LOG_EVERY: Duration = Duration::from_secs(10);
 
-/// What of the rate one robot uses.
+/// Used part of one robot's byte rate.
 #[derive(Debug)]
 pub(super) struct ByteRate {
     limit: RateLimit,
@@ -44,7 +44,7 @@ struct Used {
 }
 
 impl ByteRate {
-    /// Nothing of a rate is used.
+    /// Creates a rate of which nothing is used.
     pub(super) fn new(limit: RateLimit) -> Self {
         Self {
             limit,
@@ -56,13 +56,13 @@ impl ByteRate {
         self.used.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Takes bytes that were read: how long to read no more.
+    /// Takes bytes that were read; returns the time to wait before reading on.
     fn take(&self, bytes: usize, now: Duration) -> Duration {
         let bytes = u32::try_from(bytes).unwrap_or(u32::MAX);
         self.lock().bucket.charge(self.limit, now, bytes)
     }
 
-    /// Whether it is time for a log line on pauses.
+    /// Returns whether a log entry about pauses is due.
     pub(super) fn is_to_be_logged(&self, now: Duration) -> bool {
         let mut used = self.lock();
         let is_due = |at| now.saturating_sub(at) >= LOG_EVERY;
@@ -74,18 +74,18 @@ impl ByteRate {
     }
 }
 
-/// A stream that is read no faster than a rate, and written as before.
+/// A stream whose reading is limited to a rate; writing is not limited.
 pub(super) struct Throttled<'rate, S, P> {
     stream: S,
     rate: &'rate ByteRate,
     clock: &'rate Clock,
-    /// Called at each pause, with the time.
+    /// Called with the duration of each pause.
     paused: P,
     pause: Option<Pin<Box<Sleep>>>,
 }
 
 impl<'rate, S, P: Fn(Duration)> Throttled<'rate, S, P> {
-    /// A stream of whoever has that rate.
+    /// Wraps a stream of the robot with this rate.
     pub(super) fn new(stream: S, rate: &'rate ByteRate, clock: &'rate Clock, paused: P) -> Self {
         Self {
             stream,
@@ -165,7 +165,7 @@ mod tests {
             let sent = vec![byte; 10 * 1024];
             let sending = async {
                 robot.write_all(&sent).await.unwrap();
-                // What goes to the robot does not wait.
+                // Writing to the robot is not delayed.
                 assert_eq!(robot.read_u8().await.unwrap(), byte);
                 robot.shutdown().await.unwrap();
             };
@@ -180,7 +180,7 @@ mod tests {
         };
         let begun = clock.elapsed();
         tokio::join!(one(1), one(2));
-        // 16 KiB are beyond the burst; the last piece is read before it is paid for.
+        // 16 KiB exceed the burst; the last chunk is read before its bytes are counted.
         let took = clock.elapsed().saturating_sub(begun);
         assert!(took >= Duration::from_millis(200), "{took:?}");
         let pauses = pauses.load(Ordering::Relaxed);

@@ -26,26 +26,26 @@ use crate::http::extract::{Path, Query};
 use crate::http::negotiate::{Offered, choose, offered};
 use crate::http::problem::Problem;
 
-/// The robot model whose θ an answer has.
+/// Header: robot model (configuration) to which θ of a response refers.
 const CONFIGURATION: HeaderName = HeaderName::from_static("tread-configuration");
-/// The normalisation that was used.
+/// Header: normalisation that was used.
 const NORMALISATION: HeaderName = HeaderName::from_static("tread-normalisation");
-/// The time at which ages are counted; where `as_of` was asked for, nothing that counts was measured
-/// later.
+/// Header: time to which ages refer; with `as_of` in the request, all measurements included were
+/// made before it.
 const AS_OF: HeaderName = HeaderName::from_static("tread-as-of");
-/// Speed of a hundred in a speed mask when nothing is said, metres per second.
+/// Default speed of the value 100 in a speed mask, metres per second.
 const SPEED_MAX_DEFAULT_M_S: f64 = 2.0;
-/// Distance to stop within when nothing is said, metres.
+/// Default stopping distance, metres.
 const STOPPING_DEFAULT_M: f64 = 1.0;
 
-/// What the map can be given as.
+/// Formats of the map.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Format {
     Picture(PictureFormat),
     List(ListFormat),
 }
 
-/// What shows one value of each square.
+/// Formats that show one value of each square.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum PictureFormat {
     Png,
@@ -54,7 +54,7 @@ enum PictureFormat {
     Pgm,
 }
 
-/// What has everything that is known of each square.
+/// Formats that list all values of each square.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum ListFormat {
     Json,
@@ -190,7 +190,7 @@ impl MapQuery {
     }
 }
 
-/// Writes a raster in a format.
+/// Encodes a raster in a format.
 type Write = Box<dyn FnOnce(&Raster) -> Result<Vec<u8>, AppError> + Send>;
 
 fn writer(
@@ -304,7 +304,7 @@ fn list_writer(
     })
 }
 
-/// Says as of when an answer is, where a time was asked for.
+/// Adds the header with the time of the map, if the request gave one.
 pub(super) fn say_as_of(mut response: Response, as_of: Option<Timestamp>) -> Response {
     let as_of = as_of.and_then(|as_of| HeaderValue::try_from(as_of.to_string()).ok());
     if let Some(as_of) = as_of {
@@ -317,7 +317,7 @@ fn answer(headers: &HeaderMap, media_type: &'static str, picture: Picture) -> Re
     let of = picture.of;
     let mut response = etag::bytes(headers, media_type, Bytes::from_owner(picture.bytes));
     let said = response.headers_mut();
-    // So that a cache between does not give one format for another.
+    // A cache must not return one format for another.
     said.insert(axum::http::header::VARY, HeaderValue::from_static("accept"));
     let as_of = Timestamp::from_microsecond(of.as_of_us).unwrap_or(Timestamp::MAX);
     let mut say = |name: HeaderName, value: Option<String>| {

@@ -1,4 +1,4 @@
-//! What is known of a point, a box and a path.
+//! Friction at a point, in the cells of a box and along a path.
 
 use axum::extract::State;
 use axum::http::HeaderMap;

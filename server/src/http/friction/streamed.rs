@@ -1,4 +1,4 @@
-//! Answers that are sent while they are made.
+//! Streamed responses.
 
 use std::io;
 
@@ -16,10 +16,10 @@ pub(super) const CSV_MEDIA_TYPE: &str = "text/csv";
 /// The media type of Parquet.
 pub(super) const PARQUET_MEDIA_TYPE: &str = "application/vnd.apache.parquet";
 
-/// An answer out of pieces, each made when the one before has gone.
+/// Streams a response in chunks, each made when the preceding one was sent.
 ///
-/// Where a piece cannot be made the connection breaks off, so that nobody takes a part for the
-/// whole; the cause goes to the log.
+/// If a chunk cannot be made the connection is broken, so that a client does not take a part for
+/// the whole; the cause is logged.
 pub(super) fn streamed<E: Send + 'static, F>(
     media_type: &'static str,
     export: E,

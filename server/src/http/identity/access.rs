@@ -1,4 +1,4 @@
-//! The table of rights: method and route to what they need, read from the API's description.
+//! Table of rights: maps method and route to the required right, read from the OpenAPI description.
 
 use std::collections::HashMap;
 
@@ -11,7 +11,7 @@ use utoipa::openapi::security::{ApiKey, ApiKeyValue, HttpAuthScheme, HttpBuilder
 use super::browser::COOKIE;
 use crate::http::page;
 
-/// What anybody may ask for: this list and nothing else.
+/// All routes that need no credential.
 pub const PUBLIC: [(&str, &str); 14] = [
     ("GET", page::ROOT),
     ("GET", page::FILES),
@@ -28,29 +28,29 @@ pub const PUBLIC: [(&str, &str); 14] = [
     ("GET", "/docs/"),
     ("GET", "/docs/{*rest}"),
 ];
-/// The scheme that each route names with its right.
+/// Security scheme by which each route names its right.
 const TOKEN_SCHEME: &str = "token";
-/// The same by a browser's cookie, added here.
+/// Security scheme of a browser's cookie, added here to each route with a right.
 const SESSION_SCHEME: &str = "session";
 
-/// What a route needs.
+/// Requirement of a route.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Needed {
-    /// Nothing.
+    /// No credential.
     Nothing,
     /// A token with this right.
     Right(Right),
 }
 
-/// What every route needs.
+/// Requirements of all routes.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Access {
     routes: HashMap<String, Vec<(Method, Needed)>>,
 }
 
 impl Access {
-    /// Reads the table from the description. An operation that names no right and is not public
-    /// is left out, and so refused.
+    /// Reads the table from the description. An operation that names no right and is not public is
+    /// left out, and its requests are refused.
     pub fn of(openapi: &OpenApi) -> Self {
         let mut access = Self::default();
         for (method, path) in PUBLIC {
@@ -74,7 +74,7 @@ impl Access {
         access
     }
 
-    /// A table of one route that anybody may read.
+    /// Returns a table of one route that needs no credential.
     pub(in crate::http) fn open(path: &str) -> Self {
         let mut access = Self::default();
         access.insert(path, "GET", Needed::Nothing);
@@ -88,9 +88,9 @@ impl Access {
         }
     }
 
-    /// What a route needs; `None` for a method that it does not have.
+    /// Returns the requirement of a route; `None` for a method that it does not have.
     pub fn needed(&self, method: &Method, route: &str) -> Option<Needed> {
-        // Whoever may read something may ask for its headers alone.
+        // HEAD needs the same right as GET.
         let method = if method == Method::HEAD {
             &Method::GET
         } else {
@@ -103,7 +103,7 @@ impl Access {
             .map(|(_, needed)| *needed)
     }
 
-    /// The methods of a route, as the `Allow` header lists them; `None` for an unknown route.
+    /// Returns the methods of a route as in the `Allow` header; `None` for an unknown route.
     pub fn methods(&self, route: &str) -> Option<String> {
         let methods = self.routes.get(route)?.iter();
         let mut names: Vec<&str> = methods.map(|(method, _)| method.as_str()).collect();
@@ -115,7 +115,7 @@ impl Access {
     }
 }
 
-/// The right that an operation names; `None` unless it names exactly one that exists.
+/// Returns the right that an operation names; `None` unless it names exactly one existing right.
 fn right_of(operation: &Value) -> Option<Right> {
     let requirements = operation["security"].as_array()?;
     let rights = requirements
@@ -127,7 +127,7 @@ fn right_of(operation: &Value) -> Option<Right> {
     }
 }
 
-/// Describes the schemes, and lets each route that takes a token take a session too.
+/// Describes the security schemes, and allows sessions on each route that takes a token.
 pub(in crate::http) fn describe(openapi: &mut OpenApi) {
     let bearer = HttpBuilder::new()
         .scheme(HttpAuthScheme::Bearer)

@@ -1,5 +1,5 @@
-//! What browsers are sent: the session's cookie, headers that keep pages apart, and which foreign
-//! pages may ask at all.
+//! Sets the session cookie and security headers of responses to browsers, and the CORS rules for
+//! foreign pages.
 
 use std::sync::Arc;
 
@@ -11,22 +11,22 @@ use tower_http::cors::{AllowOrigin, CorsLayer};
 
 use crate::identity::origin::{Names, Origin};
 
-/// Name of the session's cookie; under TLS with `__Host-` before it, which browsers take from
+/// Name of the session cookie; under TLS it has the prefix `__Host-`, which browsers accept from
 /// this host over TLS alone.
 pub(super) const COOKIE: &str = "tread_session";
-/// Longest that a browser keeps an answer to its question what it may ask, seconds.
+/// Maximum time that a browser caches a CORS preflight response, seconds.
 const PREFLIGHT_KEPT_S: u64 = 600;
-/// For answers that are no pages: nothing of them may run or be framed.
+/// Content security policy of responses that are no pages: nothing may run or be framed.
 const POLICY_OF_DATA: &str = "default-src 'none'; frame-ancestors 'none'";
-/// For pages: only what this server serves itself.
+/// Content security policy of pages: only resources of this server.
 const POLICY_OF_PAGES: &str = "default-src 'none'; script-src 'self'; \
     style-src 'self' 'unsafe-inline'; img-src 'self' data:; font-src 'self'; \
     connect-src 'self'; manifest-src 'self'; base-uri 'none'; form-action 'none'; \
     frame-ancestors 'none'";
-/// For how long browsers are to come by TLS only: a year.
+/// `Strict-Transport-Security`: a year.
 const ONLY_TLS: &str = "max-age=31536000";
 
-/// Name of the cookie of a sign-in that is under way at the provider.
+/// Name of the cookie of a pending sign-in at the provider.
 const SIGN_IN_COOKIE: &str = "tread_sign_in";
 
 fn name_of(cookie: &str, is_tls: bool) -> String {
@@ -40,23 +40,23 @@ fn cookie((name, same_site): (&str, &str), is_tls: bool, value: &str, lasts_s: i
     let text = format!(
         "{name}={value}; Path=/; HttpOnly; SameSite={same_site}; Max-Age={lasts_s}{secure}"
     );
-    // Names and secrets are letters and digits.
+    // Names and secrets consist of letters and digits.
     HeaderValue::try_from(text).unwrap_or_else(|_| HeaderValue::from_static(""))
 }
 
-/// Gives a browser its session.
+/// Sets the session cookie, for `lasts_s` seconds.
 pub(super) fn give_cookie(headers: &mut HeaderMap, is_tls: bool, secret: &str, lasts_s: i64) {
     let session = cookie((COOKIE, "Strict"), is_tls, secret, lasts_s);
     headers.append(header::SET_COOKIE, session);
 }
 
-/// Takes a browser's session away.
+/// Removes the session cookie.
 pub(super) fn take_cookie(headers: &mut HeaderMap, is_tls: bool) {
     give_cookie(headers, is_tls, "", 0);
 }
 
-/// Gives a browser what it shows when it comes back from the provider. That is a navigation from
-/// another site, with which browsers send no `Strict` cookie.
+/// Sets the cookie of a pending sign-in. The browser returns from the provider by a navigation from
+/// another site, with which `Strict` cookies are not sent.
 pub(super) fn give_sign_in_cookie(
     headers: &mut HeaderMap,
     is_tls: bool,
@@ -67,12 +67,12 @@ pub(super) fn give_sign_in_cookie(
     headers.append(header::SET_COOKIE, pending);
 }
 
-/// The session that a browser shows.
+/// Returns the session cookie of a request.
 pub(super) fn shown_cookie(headers: &HeaderMap, is_tls: bool) -> Option<&str> {
     shown(COOKIE, headers, is_tls)
 }
 
-/// What a browser shows that comes back from the provider.
+/// Returns the cookie of a pending sign-in of a request.
 pub(super) fn shown_sign_in_cookie(headers: &HeaderMap, is_tls: bool) -> Option<&str> {
     shown(SIGN_IN_COOKIE, headers, is_tls)
 }
@@ -91,7 +91,7 @@ fn shown<'headers>(
         .find_map(|(of, value)| (of == name).then_some(value))
 }
 
-/// Sets what keeps pages apart, on every answer.
+/// Sets the security headers of every response.
 pub(in crate::http) async fn set_headers(
     State(names): State<Arc<Names>>,
     request: Request,
@@ -136,8 +136,8 @@ pub(in crate::http) async fn set_headers(
     response
 }
 
-/// Lets pages of these origins ask with a token of their own; `None` if there are none. Cookies
-/// are never taken from them.
+/// Returns the CORS layer that allows pages of these origins to use a token of their own; `None`
+/// without origins. Cookies are never accepted from them.
 pub(in crate::http) fn foreign_pages(allowed: &[Origin]) -> Option<CorsLayer> {
     if allowed.is_empty() {
         return None;

@@ -1,7 +1,7 @@
 //! The guard before every route: host, origin, token, right, site and robot; then the audit log.
 //!
-//! It works on what the router matched, so no handler can be reached past it. The answer to a
-//! token that is wrong, expired or revoked is one and the same.
+//! The guard works on the matched route, so no handler can be reached without it. A token that is
+//! wrong, expired or revoked gets the same response.
 
 use std::net::{IpAddr, Ipv4Addr};
 use std::sync::Arc;
@@ -31,18 +31,18 @@ use crate::http::problem::Problem;
 use crate::http::subject::{AuditSlot, Subject};
 use crate::identity::origin::{Names, Provenance};
 
-/// The routes that stop robots.
+/// Route that stops all robots.
 const STOP_ALL: &str = "/v1/stop";
 const STOP_ONE: &str = "/v1/sites/{site}/robots/{robot}/stop";
-/// Longest query of a request, bytes.
+/// Maximum length of a request's query, bytes.
 const QUERY_MAX: usize = 4_096;
-/// Longest path of a request, bytes.
+/// Maximum length of a request's path, bytes.
 const PATH_MAX: usize = 2_048;
-/// Longest path and request id that the audit log keeps, in characters.
+/// Maximum length of path and request id in the audit log, characters.
 const AUDIT_TEXT_MAX: usize = 200;
 
-/// Where a request came from, an extension set by the accept loop: the address of the other side,
-/// or of the client that a trusted proxy names.
+/// Source address of a request, an extension set by the accept loop: that of the peer, or of the
+/// client that a trusted proxy names.
 #[derive(Debug, Clone, Copy)]
 pub(in crate::http) struct Peer(pub(in crate::http) IpAddr);
 
@@ -54,7 +54,7 @@ pub(super) struct SignedIn(pub(super) Arc<Credential>);
 #[derive(Debug, Clone)]
 pub(super) struct Audited(pub(super) Value);
 
-/// What the guard knows.
+/// State of the guard.
 #[derive(Debug, Clone)]
 pub(in crate::http) struct Guard {
     app: App,
@@ -62,7 +62,7 @@ pub(in crate::http) struct Guard {
     names: Arc<Names>,
 }
 
-/// A refusal: what is answered, and what is counted.
+/// A refusal: the response, and the counter.
 struct Refusal {
     response: Box<Response>,
     who: Option<Arc<Credential>>,
@@ -90,7 +90,7 @@ impl Guard {
         Self { app, access, names }
     }
 
-    /// Refuses what is wrong before anybody is asked who they are.
+    /// Refuses malformed requests before authentication.
     fn check_form(&self, request: &Request) -> Result<(), Refusal> {
         let counters = self.app.counters();
         let uri = request.uri();
@@ -120,12 +120,12 @@ impl Guard {
         let is_browser = from.origin.is_some() || from.fetch_site.is_some();
         let is_upgrade = headers.contains_key(header::UPGRADE);
         let may = match by {
-            // A browser sends its cookie whoever's page asks.
+            // A browser sends its cookie with requests of any page.
             Some(Shown::Session) if is_upgrade || is_change(method) => {
                 self.names.is_own_page(&from)
             }
             _ if is_upgrade => self.names.may_open_socket(&from),
-            // The sign-in: a stranger's page must not sign a person in as somebody else.
+            // For the sign-in: a foreign page must not sign a person in as somebody else.
             None if is_browser && is_change(method) => self.names.is_own_page(&from),
             None | Some(_) => true,
         };
@@ -161,7 +161,7 @@ impl Guard {
         let credential = found.map_err(|error| {
             let mut response = sign_in_problem(&self.app, &error);
             if shown == Shown::Session && response.status() == 401 {
-                // So that the browser ceases to show what is over.
+                // Makes the browser drop a cookie that is no longer valid.
                 browser::take_cookie(response.headers_mut(), self.names.is_tls);
             }
             Refusal::of(response)
@@ -184,7 +184,7 @@ impl Guard {
         refusal
     }
 
-    /// Refuses what is about something that the token is not for.
+    /// Refuses a request for a site or robot outside the token's scope.
     async fn check_place(
         &self,
         request: &mut Request,
@@ -267,7 +267,7 @@ fn asked(request: &Request, route: &str) -> Asked {
     }
 }
 
-/// Lets through who may.
+/// Middleware that lets permitted requests through.
 pub(in crate::http) async fn stand(
     State(guard): State<Guard>,
     mut request: Request,
@@ -279,7 +279,7 @@ pub(in crate::http) async fn stand(
     let admitted = match guard.check_form(&request) {
         Ok(()) => match &route {
             Some(route) => guard.admit(&mut request, route).await,
-            // What matches nothing is answered by the fallback, which knows nothing either.
+            // An unmatched path is answered by the fallback.
             None => return next.run(request).await,
         },
         Err(refusal) => Err(refusal),
@@ -300,10 +300,10 @@ pub(in crate::http) async fn stand(
     }
     let response = next.run(request).await;
     if response.status() == StatusCode::FORBIDDEN && subject.is_some() {
-        // A handler has held the body against where the token's rights hold.
+        // The handler has compared the body with the token's scope.
         guard.app.counters().refused_scope.one();
     }
-    // Who comes back from the provider is signed in without a change being asked for.
+    // A sign-in that returns from the provider is audited, although it is no change.
     let is_audited = response.extensions().get::<Audited>().is_some();
     if is_change || is_audited {
         let signed_in = response.extensions().get::<SignedIn>().cloned();
@@ -317,7 +317,7 @@ pub(in crate::http) async fn stand(
 }
 
 impl Guard {
-    /// Who is let through to a route; nobody in particular to a public one.
+    /// Authenticates and authorises a request; `None` for the identity on a public route.
     async fn admit(
         &self,
         request: &mut Request,
@@ -334,7 +334,7 @@ impl Guard {
                 let purpose = purpose(method, route);
                 let checked = self.check_subject(method, headers, address, (needed, purpose));
                 let credential = checked.await?;
-                // From here on the connection is at work, whatever its body takes.
+                // From here on the connection counts as at work, however long its body takes.
                 if let Some(slot) = request.extensions().get::<Arc<Slot>>()
                     && let Err(full) = slot.prove(credential.subject, purpose)
                 {
@@ -371,13 +371,12 @@ impl Guard {
     }
 }
 
-/// Ends what goes on after the head of the answer with the token or session that asked for it: a
-/// stream of events closes, and the connection of a download is cut, so that nobody takes a part
-/// for the whole.
+/// Ends the body of a response when its token or session ends: a stream of events closes, and the
+/// connection of a download is cut, so that a client does not take a part for the whole.
 fn end_with(app: &App, subject: Arc<Credential>, cut: Option<Cut>, response: Response) -> Response {
     let body = response.body();
     if body.is_end_stream() || body.size_hint().exact().is_some() {
-        // It was made as a whole before.
+        // The body is complete already.
         return response;
     }
     let left = subject.expires_at.duration_since(app.clock().now());
@@ -394,7 +393,7 @@ fn end_with(app: &App, subject: Arc<Credential>, cut: Option<Cut>, response: Res
         let until = |body: Body| body.into_data_stream().take_until(Box::pin(over));
         return response.map(|body| Body::from_stream(until(body)));
     }
-    // Whoever reads slowly has nothing asked of the body meanwhile, so it is watched from beside.
+    // A body is not polled while the client reads slowly, so a separate task watches.
     let given = CancellationToken::new();
     let guard = given.clone().drop_guard();
     app.pass_by("download", async move {
@@ -410,7 +409,7 @@ fn end_with(app: &App, subject: Arc<Credential>, cut: Option<Cut>, response: Res
     response.map(|body| Guarded::body(body, guard))
 }
 
-/// The answer to a secret that opens nothing; counts the cause.
+/// Returns the response to an invalid secret; counts the cause.
 pub(super) fn sign_in_problem(app: &App, error: &SignInError) -> Response {
     let counters = app.counters();
     let counter = match error {
@@ -429,7 +428,7 @@ pub(super) fn sign_in_problem(app: &App, error: &SignInError) -> Response {
     response
 }
 
-/// The answer after too many failures.
+/// Returns the response after too many failures.
 pub(super) fn locked(app: &App, left: std::time::Duration, detail: String) -> Response {
     app.counters().refused_locked.one();
     let problem = Problem::new(ProblemType::TooManyAttempts).detail(detail);
@@ -449,7 +448,7 @@ fn say_how(response: &mut Response) {
     response.headers_mut().insert(header::WWW_AUTHENTICATE, how);
 }
 
-/// The secret that a request shows, and how; a header counts before a cookie.
+/// Returns the secret in a request, and how it was shown; a header takes precedence over a cookie.
 fn shown(headers: &HeaderMap, is_tls: bool) -> Option<(&str, Shown)> {
     if let Some(value) = headers.get(header::AUTHORIZATION) {
         let text = value.to_str().unwrap_or_default();
@@ -461,13 +460,13 @@ fn shown(headers: &HeaderMap, is_tls: bool) -> Option<(&str, Shown)> {
     browser::shown_cookie(headers, is_tls).map(|secret| (secret, Shown::Session))
 }
 
-/// The address that a request came from.
+/// Returns the source address of a request.
 pub(super) fn address(request: &Request) -> IpAddr {
     let peer = request.extensions().get::<Peer>();
     peer.map_or(IpAddr::V4(Ipv4Addr::UNSPECIFIED), |Peer(address)| *address)
 }
 
-/// The same, before the router has matched: by the path alone.
+/// Returns the purpose of a request before routing, from its path alone.
 pub(in crate::http) fn purpose_of_path(method: &Method, path: &str) -> Purpose {
     if method == Method::POST && path.starts_with("/v1/") && path.ends_with("/stop") {
         Purpose::Stop
@@ -476,7 +475,7 @@ pub(in crate::http) fn purpose_of_path(method: &Method, path: &str) -> Purpose {
     }
 }
 
-/// Whether a request is for a Stop, which has room of its own wherever others compete.
+/// Returns whether a request is for a Stop, which has reserved capacity.
 fn purpose(method: &Method, route: &str) -> Purpose {
     let is_stop = method == Method::POST && (route == STOP_ALL || route == STOP_ONE);
     if is_stop {
@@ -490,12 +489,12 @@ fn is_change(method: &Method) -> bool {
     !(method == Method::GET || method == Method::HEAD || method == Method::OPTIONS)
 }
 
-/// What a request says about where it comes from.
+/// Returns the headers that tell where a request comes from.
 pub(super) fn provenance(headers: &HeaderMap) -> Provenance<'_> {
     let text = |name: &str| {
         let mut values = headers.get_all(name).iter();
         let first = values.next()?;
-        // Two of them are one too many: which one counts would be a matter of taste.
+        // With two values of a header neither counts.
         let only = if values.next().is_some() {
             None
         } else {

@@ -1,4 +1,4 @@
-//! What a request is about, held against where a token's rights hold.
+//! Compares the site and robot of a request with the scope of its token.
 //!
 //! | the route names | a token that is limited to sites or robots needs |
 //! |---|---|
@@ -22,8 +22,8 @@ use crate::app::identity::Credential;
 use crate::app::{App, AppError};
 use crate::http::extract::Query;
 
-/// Routes without a site that show or do only what is in the scope of whoever asks: their handlers
-/// see to that.
+/// Routes without a site that show or do only what is in the caller's scope, which their handlers
+/// ensure.
 pub(super) const CHECKED_BY_HANDLERS: [(&str, &str); 16] = [
     ("GET", "/v1/alerts"),
     ("GET", "/v1/events"),
@@ -43,7 +43,7 @@ pub(super) const CHECKED_BY_HANDLERS: [(&str, &str); 16] = [
     ("POST", "/v1/trajectories/check"),
 ];
 
-/// The parameters of a path that name what a request is about.
+/// Path parameters that name the object of a request.
 #[derive(Debug, Default)]
 struct Named {
     site: Option<SiteId>,
@@ -54,7 +54,7 @@ struct Named {
     session: Option<SessionId>,
 }
 
-/// Refuses what is outside a token's scope.
+/// Refuses a request outside the token's scope.
 ///
 /// # Errors
 /// [`AppError::OutsideScope`], or the database failed.
@@ -86,7 +86,7 @@ pub(super) async fn check(
             ..
         } => match app.mission_place(mission).await? {
             Some((site, robot)) => who.check_robot(&site, &robot),
-            // Not known: the handler says so.
+            // An unknown object is refused by the handler.
             None => Ok(()),
         },
         Named {
@@ -111,7 +111,7 @@ pub(super) async fn check(
 }
 
 fn is_held_by_handler(method: &Method, route: &str) -> bool {
-    // Whoever may read something may ask for its headers alone.
+    // HEAD needs the same scope as GET.
     let method = if method == Method::HEAD {
         Method::GET.as_str()
     } else {
@@ -122,7 +122,7 @@ fn is_held_by_handler(method: &Method, route: &str) -> bool {
 
 async fn named(request: &mut Request) -> Named {
     let mut named = Named::default();
-    // A path that cannot be read names nothing, and its handler refuses it.
+    // An invalid path names nothing, and its handler refuses it.
     let Ok(params) = request.extract_parts::<RawPathParams>().await else {
         return named;
     };
@@ -140,7 +140,7 @@ async fn named(request: &mut Request) -> Named {
     named
 }
 
-/// The owner whose limit a request sets or ends, if that is not for whoever asks.
+/// Returns the owner whose limit a request sets or ends, if the caller may not do that.
 pub(super) async fn foreign_owner(
     request: &mut Request,
     right: Right,
@@ -166,7 +166,7 @@ async fn check_query(
     let pairs = request
         .extract_parts::<Query<Vec<(String, String)>>>()
         .await;
-    // A query that cannot be read is refused by its handler.
+    // An invalid query is refused by its handler.
     let Ok(Query(pairs)) = pairs else {
         return Ok(());
     };
