@@ -48,7 +48,7 @@ impl Comparison {
         (measured.theta - expected.theta) / std_dev
     }
 
-    /// Returns the relative difference, θ/θ_map − 1.
+    /// Returns the relative difference, `θ/θ_map` − 1.
     pub(crate) fn difference_ratio(&self) -> f64 {
         self.measured.theta / self.expected.theta - 1.0
     }

@@ -56,7 +56,7 @@ pub(super) struct Link {
 }
 
 /// Returns whether a connection may begin with TLS: a handshake record whose first message is a
-/// ClientHello.
+/// `ClientHello`.
 fn may_be_tls(begin: &[u8]) -> bool {
     let fits = |at: usize, is_right: fn(u8) -> bool| begin.get(at).copied().is_none_or(is_right);
     !begin.is_empty()
