@@ -10,10 +10,11 @@
 
 use nalgebra::{Matrix3, Vector3};
 use tread_control::geometry::{Pose, wrap_angle_rad};
-use tread_control::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
+use tread_control::measured::WheelSpeeds;
 use tread_control::robot::{GRAVITY_M_S2, RobotModel};
 
 use super::curve::{Curve, Shape};
+use super::means::{Means, Moment, Sums};
 use super::spec::Deviations;
 
 /// Integration step, seconds: a hundredth of the fastest oscillation of a contact.
@@ -66,19 +67,6 @@ pub struct Truth {
     pub torque_scale: [f64; 2],
     /// How far it leans from level, radians.
     pub tilt_rad: f64,
-}
-
-/// Means over one call of [`Plant::advance`].
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Means {
-    /// Turn rate, radians per second.
-    pub yaw_rate_rad_s: f64,
-    /// Acceleration of the centre of mass, without gravity.
-    pub acceleration: BodyAcceleration,
-    /// Wheel speeds.
-    pub wheel_speeds: WheelSpeeds,
-    /// Torques of the motors, per side.
-    pub torques: WheelTorques,
 }
 
 /// What turns the wheels in a step, left and right.
@@ -384,7 +372,12 @@ impl Plant {
             y_m: self.pose.y_m + STEP_S * (sin * forward + cos * left),
             heading_rad: wrap_angle_rad(self.pose.heading_rad + STEP_S * self.yaw_rate_rad_s),
         };
-        sums.add(self, acceleration);
+        sums.add(&Moment {
+            yaw_rate_rad_s: self.yaw_rate_rad_s,
+            acceleration_m_s2: acceleration,
+            wheels_rad_s: self.wheels_rad_s,
+            motor_n_m: self.motor_n_m,
+        });
     }
 
     fn deflect(&mut self) {
@@ -444,49 +437,6 @@ fn slip_velocity(contact: &Contact, speed: [f64; 2], yaw_rate: f64, rim_m_s: f64
         rim_m_s - (speed[0] - yaw_rate * contact.y_m),
         -(speed[1] + yaw_rate * contact.x_m),
     ]
-}
-
-#[derive(Debug, Default)]
-struct Sums {
-    count: f64,
-    yaw_rate: f64,
-    acceleration: [f64; 2],
-    wheels: [f64; 2],
-    torques: [f64; 2],
-}
-
-impl Sums {
-    fn add(&mut self, plant: &Plant, acceleration: [f64; 2]) {
-        self.count += 1.0;
-        self.yaw_rate += plant.yaw_rate_rad_s;
-        let add = |sums: &mut [f64; 2], values: [f64; 2]| {
-            for (sum, value) in sums.iter_mut().zip(values) {
-                *sum += value;
-            }
-        };
-        add(&mut self.acceleration, acceleration);
-        add(&mut self.wheels, plant.wheels_rad_s);
-        add(&mut self.torques, plant.motor_n_m);
-    }
-
-    fn means(&self) -> Means {
-        let count = self.count.max(1.0);
-        Means {
-            yaw_rate_rad_s: self.yaw_rate / count,
-            acceleration: BodyAcceleration {
-                forward_m_s2: self.acceleration[0] / count,
-                left_m_s2: self.acceleration[1] / count,
-            },
-            wheel_speeds: WheelSpeeds {
-                left_rad_s: self.wheels[0] / count,
-                right_rad_s: self.wheels[1] / count,
-            },
-            torques: WheelTorques {
-                left_n_m: self.torques[0] / count,
-                right_n_m: self.torques[1] / count,
-            },
-        }
-    }
 }
 
 #[cfg(test)]

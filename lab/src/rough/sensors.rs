@@ -12,7 +12,8 @@ use tread_control::geometry::{Pose, wrap_angle_rad};
 use tread_control::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
 use tread_control::robot::{GRAVITY_M_S2, RobotModel};
 
-use super::plant::{Means, Truth};
+use super::means::Means;
+use super::plant::Truth;
 use crate::random::Random;
 
 /// Time between two samples of the fast sensors.

@@ -20,7 +20,8 @@ use tread_control::reference::{Governor, GovernorInput, ReferenceSample};
 use tread_control::robot::RobotModel;
 use tread_control::tracking::{ThetaKnowledge, TrackerConfig, TrackingErrors};
 
-use super::plant::{Means, Plant, STEP_S, State, Truth};
+use super::means::Means;
+use super::plant::{Plant, STEP_S, State, Truth};
 use super::sensors::{SAMPLE_PERIOD, SensorSpec, Sensors};
 use super::spec::{Deviations, Make};
 use crate::bench::{Course, Driver, Law, LawInput};

@@ -9,7 +9,7 @@ use tread_lab::rough::run::{ASKED_AT_S, Outcome, Trial};
 
 /// Half-width over value above which an interval counts as none.
 const WIDE_RATIO: f64 = 0.6;
-/// Coverage that one deviation, or one stratum of the population, must have.
+/// Coverage that a line with a single difference, or a stratum of the population, must have.
 const LINE_GOAL: RangeInclusive<f64> = 0.9..=1.0;
 /// Coverage that the population must have.
 const POPULATION_GOAL: RangeInclusive<f64> = 0.93..=0.975;
