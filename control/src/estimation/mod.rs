@@ -31,6 +31,7 @@ mod contacts;
 mod curved;
 mod excitation;
 mod expectation;
+mod identification;
 mod longitudinal;
 mod offsets;
 mod regression;
@@ -48,6 +49,7 @@ use block::{Block, BlockBuilder, BlockContext, ThetaBound};
 use change::ChangeDetector;
 use excitation::Excitation;
 pub use expectation::{ExpectedAccuracy, expected_accuracy};
+use identification::{Identification, Identified};
 use longitudinal::{LongitudinalFilter, SlipBound};
 use offsets::OffsetKnowledge;
 use regression::{Shared, Solution, SolveInput, solve};
@@ -127,6 +129,8 @@ pub struct Estimator {
     skipped_s: f64,
     leaps_in_a_row: u32,
     dropped_samples: u64,
+    /// θ of a robot whose model is not exact.
+    identification: Option<Box<Identification>>,
 }
 
 impl Estimator {
@@ -169,6 +173,7 @@ impl Estimator {
             skipped_s: 0.0,
             leaps_in_a_row: 0,
             dropped_samples: 0,
+            identification: Identification::new(model, &noise, &prior).map(Box::new),
         };
         estimator.refresh();
         estimator
@@ -199,9 +204,15 @@ impl Estimator {
             self.apparent_mass.interrupt();
             self.turning_before = None;
             self.longitudinal = LongitudinalFilter::new();
+            if let Some(identification) = &mut self.identification {
+                identification.interrupt();
+            }
             return UpdateOutcome::default();
         }
         self.step_longitudinal(sample, dt_s);
+        if let Some(identification) = &mut self.identification {
+            identification.update(sample, &self.noise, dt_s);
+        }
         self.apparent_mass
             .add(sample, &self.model, &self.noise, dt_s);
         self.block.add(sample, &self.model, dt_s);
@@ -319,7 +330,7 @@ impl Estimator {
         let sums = self.ground.plus(&self.segment).plus(&self.pending);
         let solution = self.solve(&sums, None);
         self.measured = solution.filter(|solution| self.is_measurement(solution, &sums));
-        let theta = self.measured.map(|solution| {
+        let of_rows = self.measured.map(|solution| {
             let scale = self.load_scale(&sums);
             let robot = self.gain_ratio(&sums) * solution.theta;
             ThetaMeasurement {
@@ -334,6 +345,10 @@ impl Estimator {
                 duration_s: sums.duration_s,
             }
         });
+        let theta = match &self.identification {
+            Some(identification) => identification.identified().and_then(measurement),
+            None => of_rows,
+        };
         let most = solution.map_or(THETA_MOST_FIRST, |found| {
             found.theta.max(0.0) + 2.0 * found.variance.max(0.0).sqrt()
         });
@@ -348,7 +363,7 @@ impl Estimator {
                     found.theta.clamp(*THETA_RANGE.start(), *THETA_RANGE.end())
                 }),
             // A measured θ may be beyond what is assumed at first.
-            theta_most: if theta.is_some() {
+            theta_most: if of_rows.is_some() {
                 most
             } else {
                 most.min(THETA_MOST_FIRST)
@@ -537,8 +552,31 @@ impl Estimator {
         self.block = BlockBuilder::default();
         self.longitudinal = LongitudinalFilter::new();
         self.excitation = Excitation::default();
+        if let Some(identification) = &mut self.identification {
+            identification.begin_ground();
+        }
         self.refresh();
     }
+}
+
+/// What was identified as a measurement, if it is one.
+fn measurement(found: Identified) -> Option<ThetaMeasurement> {
+    let own_std_dev = found.theta * found.own_ratio;
+    let common = CommonError {
+        robot: found.theta * found.robot_ratio,
+        tyres: found.theta * found.tyres_ratio,
+    };
+    let std_dev = own_std_dev.hypot(common.std_dev());
+    let is_measurement =
+        THETA_RANGE.contains(&found.theta) && std_dev < RELATIVE_STD_DEV_MAX * found.theta;
+    is_measurement.then_some(ThetaMeasurement {
+        theta: found.theta,
+        std_dev,
+        own_std_dev,
+        common,
+        effective_samples: found.duration_s / BLOCK_S,
+        duration_s: found.duration_s,
+    })
 }
 
 /// Rim speeds of the two sides as a robot driving ahead has them.

@@ -1,0 +1,222 @@
+//! Forward-mode automatic differentiation: values with their derivatives by all parameters.
+//!
+//! Arrays of fixed size, so that the control loop allocates nothing and the compiler can vectorise.
+
+use std::ops::{Add, Div, Mul, Neg, Sub};
+
+/// Numbers with which the robot is modelled: plain ones, or [`Dual`] ones.
+pub(super) trait Real:
+    Copy
+    + Add<Output = Self>
+    + Sub<Output = Self>
+    + Mul<Output = Self>
+    + Div<Output = Self>
+    + Neg<Output = Self>
+    + Add<f64, Output = Self>
+    + Sub<f64, Output = Self>
+    + Mul<f64, Output = Self>
+{
+    /// A constant.
+    fn constant(value: f64) -> Self;
+    /// The value without its derivatives.
+    fn value(&self) -> f64;
+    /// e to this power.
+    fn exp(self) -> Self;
+    /// Natural logarithm, of a value above 0.
+    fn ln(self) -> Self;
+    /// Square root, of a value above 0.
+    fn sqrt(self) -> Self;
+    /// Reciprocal, of a value other than 0.
+    fn recip(self) -> Self;
+
+    /// Magnitude.
+    fn abs(self) -> Self {
+        if self.value() < 0.0 { -self } else { self }
+    }
+}
+
+impl Real for f64 {
+    fn constant(value: f64) -> Self {
+        value
+    }
+
+    fn value(&self) -> f64 {
+        *self
+    }
+
+    fn exp(self) -> Self {
+        self.exp()
+    }
+
+    fn ln(self) -> Self {
+        self.ln()
+    }
+
+    fn sqrt(self) -> Self {
+        self.sqrt()
+    }
+
+    fn recip(self) -> Self {
+        self.recip()
+    }
+}
+
+/// A value and its derivatives by `N` parameters.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Dual<const N: usize> {
+    pub(super) value: f64,
+    pub(super) derivatives: [f64; N],
+}
+
+impl<const N: usize> Dual<N> {
+    /// The parameter of this index.
+    pub(super) fn parameter(value: f64, index: usize) -> Self {
+        let mut derivatives = [0.0; N];
+        derivatives[index] = 1.0;
+        Self { value, derivatives }
+    }
+
+    /// A function of this value: its value and its slope.
+    fn function(mut self, value: f64, slope: f64) -> Self {
+        for derivative in &mut self.derivatives {
+            *derivative *= slope;
+        }
+        Self { value, ..self }
+    }
+
+    fn zip(self, other: Self, value: f64, combine: impl Fn(f64, f64) -> f64) -> Self {
+        let mut derivatives = self.derivatives;
+        for (own, other) in derivatives.iter_mut().zip(other.derivatives) {
+            *own = combine(*own, other);
+        }
+        Self { value, derivatives }
+    }
+}
+
+impl<const N: usize> Add for Dual<N> {
+    type Output = Self;
+
+    fn add(self, other: Self) -> Self {
+        self.zip(other, self.value + other.value, |own, other| own + other)
+    }
+}
+
+impl<const N: usize> Sub for Dual<N> {
+    type Output = Self;
+
+    fn sub(self, other: Self) -> Self {
+        self.zip(other, self.value - other.value, |own, other| own - other)
+    }
+}
+
+impl<const N: usize> Mul for Dual<N> {
+    type Output = Self;
+
+    fn mul(self, other: Self) -> Self {
+        let (a, b) = (self.value, other.value);
+        self.zip(other, a * b, |own, other| own * b + a * other)
+    }
+}
+
+impl<const N: usize> Div for Dual<N> {
+    type Output = Self;
+
+    fn div(self, other: Self) -> Self {
+        let (ratio, recip) = (self.value / other.value, other.value.recip());
+        self.zip(other, ratio, |own, other| (own - ratio * other) * recip)
+    }
+}
+
+impl<const N: usize> Neg for Dual<N> {
+    type Output = Self;
+
+    fn neg(self) -> Self {
+        self.function(-self.value, -1.0)
+    }
+}
+
+impl<const N: usize> Add<f64> for Dual<N> {
+    type Output = Self;
+
+    fn add(mut self, other: f64) -> Self {
+        self.value += other;
+        self
+    }
+}
+
+impl<const N: usize> Sub<f64> for Dual<N> {
+    type Output = Self;
+
+    fn sub(mut self, other: f64) -> Self {
+        self.value -= other;
+        self
+    }
+}
+
+impl<const N: usize> Mul<f64> for Dual<N> {
+    type Output = Self;
+
+    fn mul(self, other: f64) -> Self {
+        self.function(self.value * other, other)
+    }
+}
+
+impl<const N: usize> Real for Dual<N> {
+    fn constant(value: f64) -> Self {
+        Self {
+            value,
+            derivatives: [0.0; N],
+        }
+    }
+
+    fn value(&self) -> f64 {
+        self.value
+    }
+
+    fn exp(self) -> Self {
+        let exp = self.value.exp();
+        self.function(exp, exp)
+    }
+
+    fn ln(self) -> Self {
+        self.function(self.value.ln(), self.value.recip())
+    }
+
+    fn sqrt(self) -> Self {
+        let sqrt = self.value.sqrt();
+        self.function(sqrt, 0.5 / sqrt)
+    }
+
+    fn recip(self) -> Self {
+        let recip = self.value.recip();
+        self.function(recip, -recip * recip)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn of<T: Real>(x: T, y: T) -> T {
+        let root = (x * x + y * y + 1.0).sqrt();
+        (x.exp() * 0.5 - y.ln() / root + (-x).abs() - 2.0) * y.recip()
+    }
+
+    proptest! {
+        #[test]
+        fn derivatives_are_those_of_finite_differences(x in 0.1..2.0_f64, y in 0.2..3.0_f64) {
+            let found = of(Dual::<2>::parameter(x, 0), Dual::parameter(y, 1));
+            let step = 1.0e-6;
+            let slopes = [
+                (of(x + step, y) - of(x - step, y)) / (2.0 * step),
+                (of(x, y + step) - of(x, y - step)) / (2.0 * step),
+            ];
+            prop_assert!((found.value - of(x, y)).abs() < 1.0e-12);
+            for (found, slope) in found.derivatives.into_iter().zip(slopes) {
+                prop_assert!((found - slope).abs() < 1.0e-5 * (1.0 + slope.abs()));
+            }
+        }
+    }
+}

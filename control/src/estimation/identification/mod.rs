@@ -1,0 +1,409 @@
+//! Grey-box identification of a robot whose model is not exact: θ with everything that is
+//! unknown beside it.
+//!
+//! The rows of the other modules are linear in θ for small slip and average over blocks. That is
+//! exact for a robot that is as its model says. Of other robots it uses a small part of what sensors
+//! tell, and it must be silent where tyres slip more. Here the equations of motion run beside the
+//! robot ([`model`]), with the wheels' measured speeds, and all 23 unknown parameters
+//! ([`parameters`]) follow from the other sensors together ([`hypothesis`]). Since that is not
+//! linear, it begins at three values of K; those that fit worse are discarded.
+
+mod dual;
+mod hypothesis;
+mod model;
+mod parameters;
+
+use super::{EstimatorPrior, GAP_MAX_S, SensorNoise, SensorSample};
+use crate::robot::RobotModel;
+
+use hypothesis::{CHANNELS, Hypothesis, Measured, Prior};
+use model::{Input, State};
+use parameters::index;
+
+/// Values of ln K at which it begins: K 1, 3.3 and 11.
+const STARTS: [f64; 3] = [0.0, 1.2, 2.4];
+/// Time over which outputs and measurements are averaged before they are compared, seconds.
+const COMPARED_S: f64 = 0.05;
+/// Time of a block, seconds.
+const BLOCK_S: f64 = 1.0;
+/// Blocks before which nothing is discarded and nothing is known.
+const BLOCKS_MIN: u32 = 5;
+/// Cost by which a hypothesis may exceed the best one and stay.
+const COST_MARGIN: f64 = 60.0;
+/// Cost by which it may do so and count e⁻¹ times as much.
+const COST_SCALE: f64 = 10.0;
+/// Difference of ln K below which two hypotheses are one.
+const SAME: f64 = 0.03;
+/// Rim speed below which torques are not compared: friction at rest is undetermined, metres per
+/// second.
+const TORQUE_FROM_M_S: f64 = 0.1;
+/// Rim speed below which a robot stands, metres per second.
+const STANDING_M_S: f64 = 0.02;
+/// Share of a new acceleration in the smoothed one, per second.
+const SMOOTHED_PER_S: f64 = 35.0;
+/// What the equations leave out, one standard deviation of a mean over [`COMPARED_S`]: turn rate
+/// in radians per second, acceleration in metres per second squared, torque as a friction
+/// coefficient.
+const MODEL_TURN_RAD_S: f64 = 7.5e-3;
+const MODEL_ACCELERATION_M_S2: f64 = 0.075;
+const MODEL_TORQUE_MU: f64 = 0.025;
+/// Error of ln θ that all estimates share, since the equations are not those of the true contacts.
+const MODEL_STD_DEV: f64 = 0.06;
+/// Mean square of standardised residuals beyond which the robot does not move as the model can.
+const SQUARE_MAX: f64 = 30.0;
+
+/// What was identified.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Identified {
+    /// θ = 1/K.
+    pub(super) theta: f64,
+    /// Its relative standard deviation by the drive: noise, and what scattered.
+    pub(super) own_ratio: f64,
+    /// By what was known of the robot beforehand.
+    pub(super) robot_ratio: f64,
+    /// By what the equations miss of tyres and ground.
+    pub(super) tyres_ratio: f64,
+    /// Time that counts, seconds.
+    pub(super) duration_s: f64,
+}
+
+/// Identifies a robot and its ground.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Identification {
+    model: RobotModel,
+    prior: Prior,
+    hypotheses: Vec<Hypothesis>,
+    heading_rad: f64,
+    acceleration_m_s2: [f64; 2],
+    /// The sample that waits for the next one, and the wheel speeds before it.
+    waiting: Option<Waiting>,
+    /// Sums of measurements by time since the last comparison, and for how long each channel.
+    sums: [f64; CHANNELS - 1],
+    measured_s: [f64; CHANNELS - 1],
+    samples: f64,
+    compared_s: f64,
+    block_s: f64,
+    is_moving: bool,
+    has_torque: bool,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Waiting {
+    sample: SensorSample,
+    time_s: f64,
+    before_rad_s: Option<([f64; 2], f64)>,
+}
+
+impl Identification {
+    /// None for a robot that is exactly as its model says: rows on means serve it better.
+    pub(super) fn new(
+        model: RobotModel,
+        noise: &SensorNoise,
+        prior: &EstimatorPrior,
+    ) -> Option<Self> {
+        let is_uncertain = prior.tyres.unexplained_ratio > 0.0 && prior.tyres.relaxation_m > 0.0;
+        if !is_uncertain {
+            return None;
+        }
+        let (mean, std_devs) = parameters::prior(prior, noise);
+        let mut identification = Self {
+            model,
+            prior: Prior::new(mean, std_devs),
+            hypotheses: Vec::with_capacity(STARTS.len()),
+            heading_rad: 0.0,
+            acceleration_m_s2: [0.0; 2],
+            waiting: None,
+            sums: [0.0; CHANNELS - 1],
+            measured_s: [0.0; CHANNELS - 1],
+            samples: 0.0,
+            compared_s: 0.0,
+            block_s: 0.0,
+            is_moving: false,
+            has_torque: false,
+        };
+        identification.begin(&State::rolling(0.0, 0.0));
+        Some(identification)
+    }
+
+    fn begin(&mut self, state: &State<f64>) {
+        self.hypotheses.clear();
+        for start in STARTS {
+            self.hypotheses
+                .push(Hypothesis::new(&self.prior, start, *state));
+        }
+    }
+
+    /// Starts on new ground, of which nothing is known; what was identified of the robot stays.
+    pub(super) fn begin_ground(&mut self) {
+        let best = self.best().filter(|best| best.age() >= BLOCKS_MIN);
+        if let Some(prior) = best.and_then(|best| best.prior_on_new_ground(&self.prior)) {
+            self.prior = prior;
+        }
+        let state = self.state();
+        self.begin(&state);
+        self.interrupt();
+    }
+
+    /// The state of motion that a robot without slip has at the waiting sample.
+    fn state(&self) -> State<f64> {
+        self.waiting.map_or(State::rolling(0.0, 0.0), |waiting| {
+            let wheels = waiting.sample.wheel_speeds;
+            let mean_rad_s = 0.5 * (wheels.left_rad_s + wheels.right_rad_s);
+            State::rolling(
+                mean_rad_s * self.model.wheel_radius_m(),
+                waiting.sample.gyro_rad_s,
+            )
+        })
+    }
+
+    /// Nothing is known of the time before the next sample.
+    pub(super) fn interrupt(&mut self) {
+        let state = self.state();
+        for hypothesis in &mut self.hypotheses {
+            hypothesis.restart(state);
+        }
+        self.waiting = None;
+        self.clear_sums();
+        self.block_s = 0.0;
+        self.is_moving = false;
+    }
+
+    fn clear_sums(&mut self) {
+        self.sums = [0.0; CHANNELS - 1];
+        self.measured_s = [0.0; CHANNELS - 1];
+        self.samples = 0.0;
+        self.compared_s = 0.0;
+    }
+
+    /// Takes a sample that came `time_s` after the one before.
+    pub(super) fn update(&mut self, sample: &SensorSample, noise: &SensorNoise, time_s: f64) {
+        if time_s > GAP_MAX_S {
+            self.interrupt();
+        }
+        let before_rad_s = self
+            .waiting
+            .map(|waiting| (rates(&waiting.sample), waiting.time_s));
+        let waiting = self.waiting.replace(Waiting {
+            sample: *sample,
+            time_s,
+            before_rad_s,
+        });
+        if let Some(waiting) = waiting {
+            self.advance(&waiting, (rates(sample), time_s), noise);
+        }
+    }
+
+    fn advance(
+        &mut self,
+        now: &Waiting,
+        (after_rad_s, after_s): ([f64; 2], f64),
+        noise: &SensorNoise,
+    ) {
+        let (sample, time_s) = (&now.sample, now.time_s);
+        let wheels_rad_s = rates(sample);
+        // Central difference of means over neighbouring samples.
+        let (before_rad_s, before_s) = now.before_rad_s.unwrap_or((wheels_rad_s, time_s));
+        let apart_s = 0.5 * (before_s + after_s) + time_s;
+        let wheels_rad_s2 = [0, 1].map(|side| (after_rad_s[side] - before_rad_s[side]) / apart_s);
+        self.heading_rad += sample.gyro_rad_s * time_s;
+        let measured = sample
+            .acceleration
+            .map(|acceleration| [acceleration.forward_m_s2, acceleration.left_m_s2]);
+        if let Some(measured) = measured {
+            let share = (SMOOTHED_PER_S * time_s).min(1.0);
+            for (smooth, value) in self.acceleration_m_s2.iter_mut().zip(measured) {
+                *smooth += share * (value - *smooth);
+            }
+        }
+        let input = Input {
+            wheels_rad_s,
+            wheels_rad_s2,
+            heading_rad: self.heading_rad,
+            acceleration_m_s2: self.acceleration_m_s2,
+            time_s,
+        };
+        let rims_m_s = wheels_rad_s.map(|speed| speed.abs() * self.model.wheel_radius_m());
+        self.is_moving |= rims_m_s[0].max(rims_m_s[1]) > STANDING_M_S;
+        self.add(sample, measured, rims_m_s, time_s);
+        let share = time_s / COMPARED_S;
+        let speed = sample.body_speed_m_s.map(|value| Measured {
+            channel: CHANNELS - 1,
+            value,
+            std_dev: noise.body_speed_m_s,
+        });
+        for hypothesis in &mut self.hypotheses {
+            let forward = hypothesis.advance(&self.model, &input, share);
+            if let Some(speed) = speed {
+                hypothesis.compare(&forward, speed);
+            }
+        }
+        if self.compared_s >= COMPARED_S - 1.0e-6 {
+            self.compare(noise);
+        }
+    }
+
+    /// Adds a sample's measurements to their means.
+    fn add(
+        &mut self,
+        sample: &SensorSample,
+        acceleration: Option<[f64; 2]>,
+        rims_m_s: [f64; 2],
+        time_s: f64,
+    ) {
+        self.compared_s += time_s;
+        self.samples += 1.0;
+        let mut add = |channel: usize, value: f64| {
+            self.sums[channel] += value * time_s;
+            self.measured_s[channel] += time_s;
+        };
+        add(0, sample.gyro_rad_s);
+        if let Some([forward, left]) = acceleration {
+            add(1, forward);
+            add(2, left);
+        }
+        let is_rolling = rims_m_s[0].min(rims_m_s[1]) > TORQUE_FROM_M_S;
+        if let Some(torques) = sample.wheel_torques.filter(|_| is_rolling) {
+            add(3, torques.left_n_m);
+            add(4, torques.right_n_m);
+            self.has_torque = true;
+        }
+    }
+
+    /// Compares the means over [`COMPARED_S`], and ends the block where it is full.
+    fn compare(&mut self, noise: &SensorNoise) {
+        let torque_n_m = self.model.side_load_n() * self.model.wheel_radius_m();
+        let root = self.samples.max(1.0).sqrt();
+        let with_model = |sensor: f64, model: f64| (sensor / root).hypot(model);
+        let acceleration = with_model(noise.accelerometer_m_s2, MODEL_ACCELERATION_M_S2);
+        let torque = torque_n_m * with_model(noise.torque_mu, MODEL_TORQUE_MU);
+        let std_devs = [
+            with_model(noise.gyro_rad_s, MODEL_TURN_RAD_S),
+            acceleration,
+            acceleration,
+            torque,
+            torque,
+        ];
+        let (sums, measured_s, compared_s) = (self.sums, self.measured_s, self.compared_s);
+        for hypothesis in &mut self.hypotheses {
+            let outputs = hypothesis.take_mean();
+            for (channel, output) in outputs.into_iter().enumerate() {
+                // Means are of the same time only if nothing is missing.
+                if measured_s[channel] < compared_s - 1.0e-6 {
+                    continue;
+                }
+                // Outputs were weighed by COMPARED_S.
+                let output = output * (COMPARED_S / compared_s);
+                hypothesis.compare(
+                    &output,
+                    Measured {
+                        channel,
+                        value: sums[channel] / compared_s,
+                        std_dev: std_devs[channel],
+                    },
+                );
+            }
+        }
+        self.block_s += compared_s;
+        self.clear_sums();
+        if self.block_s < BLOCK_S - 1.0e-6 {
+            return;
+        }
+        self.block_s = 0.0;
+        if std::mem::take(&mut self.is_moving) {
+            self.end_block();
+        } else {
+            for hypothesis in &mut self.hypotheses {
+                hypothesis.drop_block();
+            }
+        }
+    }
+
+    fn end_block(&mut self) {
+        let prior = &self.prior;
+        self.hypotheses
+            .retain_mut(|hypothesis| hypothesis.end_block(prior));
+        if self.hypotheses.is_empty() {
+            let state = self.state();
+            self.begin(&state);
+            return;
+        }
+        self.discard();
+    }
+
+    /// Discards hypotheses that fit worse than the best one, and all but one of those that agree.
+    fn discard(&mut self) {
+        let least = self.least_cost();
+        self.hypotheses.retain(|hypothesis| {
+            hypothesis.age() < BLOCKS_MIN || hypothesis.cost() < least + COST_MARGIN
+        });
+        let mut index = 1;
+        while index < self.hypotheses.len() {
+            let is_same = |first: &Hypothesis, second: &Hypothesis| {
+                first.age() > BLOCKS_MIN
+                    && (first.values()[index::STIFFNESS] - second.values()[index::STIFFNESS]).abs()
+                        < SAME
+            };
+            let (before, rest) = self.hypotheses.split_at(index);
+            let same = before.iter().position(|other| is_same(other, &rest[0]));
+            match same {
+                Some(other) => {
+                    let worse = if before[other].cost() < rest[0].cost() {
+                        index
+                    } else {
+                        other
+                    };
+                    self.hypotheses.remove(worse);
+                }
+                None => index += 1,
+            }
+        }
+    }
+
+    fn least_cost(&self) -> f64 {
+        let costs = self.hypotheses.iter().map(Hypothesis::cost);
+        costs.fold(f64::INFINITY, f64::min)
+    }
+
+    fn best(&self) -> Option<&Hypothesis> {
+        self.hypotheses
+            .iter()
+            .min_by(|first, second| first.cost().total_cmp(&second.cost()))
+    }
+
+    /// θ, as far as the hypotheses agree; none before anything is known, or where the robot does
+    /// not move as the model can.
+    pub(super) fn identified(&self) -> Option<Identified> {
+        let best = self.best()?;
+        if best.age() < BLOCKS_MIN || best.worst_square() > SQUARE_MAX {
+            return None;
+        }
+        let least = self.least_cost();
+        let (mut weights, mut mean, mut square, mut known) = (0.0, 0.0, 0.0, 0.0);
+        for hypothesis in &self.hypotheses {
+            let weight = (-(hypothesis.cost() - least) / COST_SCALE).exp();
+            let value = hypothesis.values()[index::STIFFNESS];
+            let (variance, of_prior) = hypothesis.variances(&self.prior);
+            weights += weight;
+            mean += weight * value;
+            square += weight * (variance + value * value);
+            known += weight * of_prior;
+        }
+        mean /= weights;
+        let variance = square / weights - mean * mean;
+        let of_prior = (known / weights).min(variance);
+        let is_known = mean.is_finite() && variance.is_finite() && variance > 0.0;
+        is_known.then(|| Identified {
+            theta: (-mean).exp(),
+            own_ratio: (variance - of_prior).max(0.0).sqrt(),
+            robot_ratio: of_prior.sqrt(),
+            tyres_ratio: MODEL_STD_DEV,
+            duration_s: f64::from(best.age()) * BLOCK_S,
+        })
+    }
+}
+
+/// Wheel speeds, left and right.
+fn rates(sample: &SensorSample) -> [f64; 2] {
+    let wheels = sample.wheel_speeds;
+    [wheels.left_rad_s, wheels.right_rad_s]
+}

@@ -1,0 +1,263 @@
+//! Equations of motion of a skid-steered robot on deflecting contacts, driven by its measured
+//! wheel speeds.
+//!
+//! State at the centre of mass, body frame: forward and left speed, turn rate; per contact a
+//! deflection s as a slip vector with `ℓ ṡ = v_slip − |u| s` (relaxation length ℓ, rim speed u:
+//! Pacejka, Tire and Vehicle Dynamics, ch. 7). A contact's force is `N K s / D`, with
+//! `D = (1 + n a x + xⁿ)^(1/n)` and `x = K|s|/μ_p`: slope K = 1/θ at zero slip, μ_p far beyond the
+//! peak. a = 0 with a large n is the straight rise of Yi et al. (2007), eq. (7); a = 1/3 with n = 3
+//! is within 4 % of a brush; a = 0 with n = 2.7 of a Magic Formula; a = 2/3 with n = 2 of a `LuGre`
+//! tyre. N follows from where the centre of mass is, the slope, and measured accelerations.
+
+use super::dual::Real;
+use super::parameters::Robot;
+use crate::robot::GRAVITY_M_S2;
+
+/// Longest integration step, seconds.
+const STEP_MAX_S: f64 = 2.6e-3;
+/// Most integration steps of one sample.
+const STEPS_MAX: u32 = 40;
+/// Rim speed below which contacts are damped, and their deflection limited, metres per second.
+const SLOW_M_S: f64 = 0.1;
+/// Damping ratio of a contact at standstill.
+const DAMPING_RATIO: f64 = 0.2;
+/// Deflection of a standing contact, over that of a straight rise to the peak.
+const STANDING_DEFLECTION_MAX: f64 = 5.0;
+/// Rim speed over which resistances change their sign, metres per second.
+const RESISTANCE_TURNS_M_S: f64 = 0.01;
+/// What is added to the square of slip, so that its root has a slope at zero.
+const SLIP_SQUARE_MIN: f64 = 1.0e-10;
+/// Signs of the contacts' places, forward and left; the first two are on the left.
+const CONTACTS: [(f64, f64); 4] = [(0.5, 0.5), (-0.5, 0.5), (0.5, -0.5), (-0.5, -0.5)];
+
+/// The state of motion.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct State<T> {
+    /// Of the centre of mass, metres per second: forward and left.
+    pub(super) speed_m_s: [T; 2],
+    pub(super) turn_rad_s: T,
+    /// Deflection of each contact, forward and left, as slip.
+    pub(super) deflections: [[T; 2]; 4],
+}
+
+impl<T: Real> State<T> {
+    /// At rest, or rolling freely at this speed.
+    pub(super) fn rolling(forward_m_s: f64, turn_rad_s: f64) -> Self {
+        let zero = T::constant(0.0);
+        Self {
+            speed_m_s: [T::constant(forward_m_s), zero],
+            turn_rad_s: T::constant(turn_rad_s),
+            deflections: [[zero; 2]; 4],
+        }
+    }
+}
+
+/// Measured quantities that the model takes as they are, over the time of one sample.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Input {
+    /// Mean wheel speeds, left and right, radians per second.
+    pub(super) wheels_rad_s: [f64; 2],
+    /// Wheel acceleration, left and right, radians per second squared.
+    pub(super) wheels_rad_s2: [f64; 2],
+    /// Heading from where it began, radians.
+    pub(super) heading_rad: f64,
+    /// Smoothed acceleration without gravity, forward and left, for the loads.
+    pub(super) acceleration_m_s2: [f64; 2],
+    /// Time of the sample, seconds, above 0.
+    pub(super) time_s: f64,
+}
+
+/// Means over the time of one sample, as sensors would measure them.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Output<T> {
+    pub(super) turn_rad_s: T,
+    /// Without gravity, forward and left.
+    pub(super) acceleration_m_s2: [T; 2],
+    /// Of the motors, left and right.
+    pub(super) torques_n_m: [T; 2],
+    /// Of the wheels' centre, at the end.
+    pub(super) forward_m_s: T,
+}
+
+impl<T: Real> Output<T> {
+    pub(super) fn zero() -> Self {
+        let zero = T::constant(0.0);
+        Self {
+            turn_rad_s: zero,
+            acceleration_m_s2: [zero; 2],
+            torques_n_m: [zero; 2],
+            forward_m_s: zero,
+        }
+    }
+}
+
+/// A contact, as it is over one sample.
+#[derive(Debug, Clone, Copy)]
+struct Contact<T> {
+    side: usize,
+    /// From the centre of mass, forward and left, metres.
+    place_m: [T; 2],
+    load_n: T,
+}
+
+/// Sums over the contacts.
+struct Forces<T> {
+    force_n: [T; 2],
+    moment_n_m: T,
+    /// Forward, left and right side.
+    sides_n: [T; 2],
+}
+
+impl<T: Real> Robot<T> {
+    /// Acceleration of gravity along the ground, body frame.
+    fn gravity_m_s2(&self, heading_rad: f64) -> [T; 2] {
+        let (sin, cos) = heading_rad.sin_cos();
+        let [x, y] = self.slope;
+        [
+            (x * cos + y * sin) * -GRAVITY_M_S2,
+            (y * cos - x * sin) * -GRAVITY_M_S2,
+        ]
+    }
+
+    /// Contacts with the loads of a rigid body on four equal springs.
+    fn contacts(&self, gravity: [T; 2], acceleration_m_s2: [f64; 2]) -> [Contact<T>; 4] {
+        let [forward_m, left_m, height_m] = self.centre_m;
+        let (base_m, track_m) = (self.wheelbase_m, self.track_m);
+        let tilt = |offset_m: T, axis: usize, size_m: f64| {
+            (offset_m * GRAVITY_M_S2 - height_m * (-gravity[axis] + acceleration_m_s2[axis]))
+                * (size_m * size_m).recip()
+        };
+        let (pitch, roll) = (tilt(forward_m, 0, base_m), tilt(left_m, 1, track_m));
+        CONTACTS.map(|(front, left)| Contact {
+            side: usize::from(left < 0.0),
+            place_m: [-forward_m + front * base_m, -left_m + left * track_m],
+            load_n: (pitch * (front * base_m) + roll * (left * track_m) + 0.25 * GRAVITY_M_S2)
+                * self.mass_kg,
+        })
+    }
+
+    /// Friction coefficient over slip.
+    fn mu_over_slip(&self, slip: T) -> T {
+        let x = self.stiffness / self.peak * slip;
+        let inside = (x.ln() * self.sharpness).exp() + self.sharpness * self.bend * x + 1.0;
+        self.stiffness / (inside.ln() / self.sharpness).exp()
+    }
+
+    /// Moves the contacts' deflections on by a step, and sums their forces.
+    fn deflect(
+        &self,
+        state: &mut State<T>,
+        contacts: &[Contact<T>; 4],
+        rims_m_s: [T; 2],
+        step_s: f64,
+    ) -> Forces<T> {
+        let zero = T::constant(0.0);
+        let mut sums = Forces {
+            force_n: [zero; 2],
+            moment_n_m: zero,
+            sides_n: [zero; 2],
+        };
+        let rate = self.relaxation_m.recip() * step_s;
+        let [forward_m_s, left_m_s] = state.speed_m_s;
+        let turn = state.turn_rad_s;
+        for (contact, deflection) in contacts.iter().zip(&mut state.deflections) {
+            let [x_m, y_m] = contact.place_m;
+            let rim_m_s = rims_m_s[contact.side];
+            let slips_m_s = [
+                rim_m_s - (forward_m_s - turn * y_m),
+                -(left_m_s + turn * x_m),
+            ];
+            // Trapezoidal in the deflection, which is stiff at short relaxation lengths.
+            let rolled = rate * rim_m_s.abs() * 0.5;
+            let (keeps, over) = (-rolled + 1.0, (rolled + 1.0).recip());
+            for (part, slip_m_s) in deflection.iter_mut().zip(slips_m_s) {
+                *part = (*part * keeps + rate * slip_m_s) * over;
+            }
+            let [ahead, aside] = *deflection;
+            let slip = (ahead * ahead + aside * aside + SLIP_SQUARE_MIN).sqrt();
+            let mu_over_slip = self.mu_over_slip(slip);
+            let mut force_n = [ahead, aside].map(|part| mu_over_slip * contact.load_n * part);
+            let slow = 1.0 - rim_m_s.value().abs() / SLOW_M_S;
+            if slow > 0.0 {
+                let (stiffness, length_m) = (self.stiffness.value(), self.relaxation_m.value());
+                let damping =
+                    2.0 * DAMPING_RATIO * slow * (stiffness / GRAVITY_M_S2 / length_m).sqrt();
+                for ((force_n, slip_m_s), part) in
+                    force_n.iter_mut().zip(slips_m_s).zip(*deflection)
+                {
+                    *force_n =
+                        *force_n + contact.load_n * damping * (slip_m_s - rim_m_s.abs() * part);
+                }
+                let most = STANDING_DEFLECTION_MAX * self.peak.value() / stiffness;
+                if slip.value() > most {
+                    *deflection = deflection.map(|part| part * (most / slip.value()));
+                }
+            }
+            let [longitudinal_n, lateral_n] = force_n;
+            sums.force_n = [
+                sums.force_n[0] + longitudinal_n,
+                sums.force_n[1] + lateral_n,
+            ];
+            sums.moment_n_m = sums.moment_n_m + x_m * lateral_n - y_m * longitudinal_n;
+            sums.sides_n[contact.side] = sums.sides_n[contact.side] + longitudinal_n;
+        }
+        sums
+    }
+
+    /// Moves on by the time of one sample. Deflections lead speeds by half a step (leapfrog).
+    pub(super) fn advance(&self, state: &mut State<T>, input: &Input) -> Output<T> {
+        let gravity = self.gravity_m_s2(input.heading_rad);
+        let contacts = self.contacts(gravity, input.acceleration_m_s2);
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "a small number above 0"
+        )]
+        let steps = ((input.time_s / STEP_MAX_S).ceil() as u32).clamp(1, STEPS_MAX);
+        let share = f64::from(steps).recip();
+        let step_s = input.time_s * share;
+        let (per_mass, per_inertia) = (self.mass_kg.recip(), self.inertia_kg_m2.recip());
+        let mut output = Output::zero();
+        for step in 0..steps {
+            let from_middle_s = (f64::from(step) * share - 0.5) * input.time_s;
+            let rims_m_s = [0, 1].map(|side| {
+                self.radius_m[side]
+                    * (input.wheels_rad_s[side] + input.wheels_rad_s2[side] * from_middle_s)
+            });
+            let forces = self.deflect(state, &contacts, rims_m_s, step_s);
+            let [forward_m_s, left_m_s] = state.speed_m_s;
+            let turn = state.turn_rad_s;
+            let acceleration = [0, 1].map(|axis| forces.force_n[axis] * per_mass + gravity[axis]);
+            state.speed_m_s = [
+                forward_m_s + (acceleration[0] + left_m_s * turn) * step_s,
+                left_m_s + (acceleration[1] - forward_m_s * turn) * step_s,
+            ];
+            state.turn_rad_s = turn + forces.moment_n_m * per_inertia * step_s;
+            output.turn_rad_s = output.turn_rad_s + (turn + state.turn_rad_s) * (0.5 * share);
+            for side in 0..2 {
+                output.acceleration_m_s2[side] =
+                    output.acceleration_m_s2[side] + acceleration[side] * share;
+                let load_n = contacts[2 * side].load_n + contacts[2 * side + 1].load_n;
+                let turns = (rims_m_s[side].value() / RESISTANCE_TURNS_M_S).tanh();
+                let side_n = forces.sides_n[side];
+                let taken_n =
+                    side_n + (self.resistance * load_n + self.gear_loss * side_n.abs()) * turns;
+                let nominal_m = self.nominal_radius_m;
+                let rotors_n_m =
+                    self.rotors_kg * (nominal_m * nominal_m * input.wheels_rad_s2[side]);
+                output.torques_n_m[side] = output.torques_n_m[side]
+                    + (taken_n * self.radius_m[side] + rotors_n_m)
+                        * self.torque_scale[side]
+                        * share;
+            }
+        }
+        output.turn_rad_s = output.turn_rad_s + self.gyro_offset_rad_s;
+        for axis in 0..2 {
+            output.acceleration_m_s2[axis] =
+                output.acceleration_m_s2[axis] + self.acceleration_offset_m_s2[axis];
+        }
+        output.forward_m_s =
+            state.speed_m_s[0] + state.turn_rad_s * self.centre_m[1] + self.speed_offset_m_s;
+        output
+    }
+}

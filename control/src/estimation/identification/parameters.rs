@@ -1,0 +1,242 @@
+//! What is unknown of a robot, its tyres and its ground, and what is known of it beforehand.
+
+use nalgebra::{SMatrix, SVector};
+
+use super::dual::Real;
+use crate::estimation::{EstimatorPrior, SensorNoise};
+use crate::robot::RobotModel;
+
+/// Number of parameters.
+pub(super) const PARAMETERS: usize = 23;
+/// Values of all parameters.
+pub(super) type Values = SVector<f64, PARAMETERS>;
+/// Covariance or information of all parameters.
+pub(super) type Square = SMatrix<f64, PARAMETERS, PARAMETERS>;
+
+/// Where each parameter is in [`Values`].
+pub(super) mod index {
+    /// ln K, of the ground.
+    pub(in super::super) const STIFFNESS: usize = 0;
+    /// ln of the mass over that of the model.
+    pub(in super::super) const MASS: usize = 1;
+    /// ln of the yaw inertia over mass, over that of the model.
+    pub(in super::super) const INERTIA: usize = 2;
+    /// Centre of mass forward of the wheels' centre, over the wheelbase.
+    pub(in super::super) const CENTRE_FORWARD: usize = 3;
+    /// Centre of mass to the left of it, over the track.
+    pub(in super::super) const CENTRE_LEFT: usize = 4;
+    /// ln of the relaxation length in metres.
+    pub(in super::super) const RELAXATION: usize = 5;
+    /// Rise of the ground along the axes of the frame in which the robot began.
+    pub(in super::super) const SLOPE_X: usize = 6;
+    pub(in super::super) const SLOPE_Y: usize = 7;
+    /// Error of the torque scale: both sides, and right minus left over two.
+    pub(in super::super) const TORQUE_SCALE: usize = 8;
+    pub(in super::super) const TORQUE_DIFFERENCE: usize = 9;
+    /// Inertia of rotors and wheels at the rim over the model's mass.
+    pub(in super::super) const ROTORS: usize = 10;
+    /// Torque lost in the gears over that which they transmit.
+    pub(in super::super) const GEAR_LOSS: usize = 11;
+    /// Rolling resistance over load, of the ground.
+    pub(in super::super) const RESISTANCE: usize = 12;
+    /// Error of the rolling radius: mean, and right minus left.
+    pub(in super::super) const RADIUS: usize = 13;
+    pub(in super::super) const RADIUS_DIFFERENCE: usize = 14;
+    /// ln of the greatest friction coefficient, of the ground.
+    pub(in super::super) const PEAK: usize = 15;
+    /// Sharpness and early bend of the curve, of the ground: `1/n` and `a` of the model.
+    pub(in super::super) const SHAPE: usize = 16;
+    pub(in super::super) const BEND: usize = 17;
+    /// Offset of the gyro, radians per second.
+    pub(in super::super) const GYRO_OFFSET: usize = 18;
+    /// Offsets of the accelerometer, forward and left, metres per second squared.
+    pub(in super::super) const FORWARD_OFFSET: usize = 19;
+    pub(in super::super) const LEFT_OFFSET: usize = 20;
+    /// Height of the centre of mass over the track.
+    pub(in super::super) const HEIGHT: usize = 21;
+    /// Offset of the body speed, metres per second.
+    pub(in super::super) const SPEED_OFFSET: usize = 22;
+}
+
+/// Parameters of the ground and of what it makes of the tyres. They begin anew on new ground.
+pub(super) const OF_GROUND: [usize; 7] = [
+    index::STIFFNESS,
+    index::RESISTANCE,
+    index::PEAK,
+    index::SHAPE,
+    index::BEND,
+    index::SLOPE_X,
+    index::SLOPE_Y,
+];
+
+/// Mean and standard deviation of ln K: ground from wet ice to asphalt.
+const LN_STIFFNESS: (f64, f64) = (1.1, 1.3);
+/// Of ln of the greatest friction coefficient.
+const LN_PEAK: (f64, f64) = (-0.6, 0.4);
+/// Of the curve's sharpness `1/n` and early bend `a`.
+const SHAPE: (f64, f64) = (0.3, 0.2);
+const BEND: (f64, f64) = (0.25, 0.25);
+/// Smallest `1/n`: the curve is straight up to its peak.
+pub(super) const SHAPE_MIN: f64 = 0.05;
+/// Standard deviation of where the centre of mass is, over the wheelbase.
+const CENTRE_FORWARD_STD_DEV: f64 = 0.03;
+/// Mean and standard deviation of its height over the track.
+const HEIGHT: (f64, f64) = (0.35, 0.1);
+/// Standard deviation of the ground's rise along one axis.
+const SLOPE_STD_DEV: f64 = 0.035;
+/// Standard deviation of the torque scale of both sides over that of each side's own.
+const TORQUE_SCALE_RATIO: f64 = 1.75;
+/// Mean and standard deviation of the torque that gears lose, over what they transmit.
+const GEAR_LOSS: (f64, f64) = (0.015, 0.01);
+/// Of rolling resistance over load.
+const RESISTANCE: (f64, f64) = (0.025, 0.01);
+/// Standard deviation of an offset of the body speed, metres per second.
+const SPEED_OFFSET_STD_DEV: f64 = 0.005;
+/// Least standard deviation, where a prior counts something as exact.
+const STD_DEV_MIN: f64 = 1.0e-4;
+
+/// Mean and standard deviation of each parameter before anything is measured.
+pub(super) fn prior(prior: &EstimatorPrior, noise: &SensorNoise) -> (Values, Values) {
+    let tyres = &prior.tyres;
+    let payload = 1.0 + prior.model.payload_ratio;
+    // A log-normal distribution of that mean and standard deviation.
+    let spread = (1.0 + (tyres.relaxation_std_dev_m / tyres.relaxation_m).powi(2)).ln();
+    let side = noise.torque_gain_ratio * std::f64::consts::FRAC_1_SQRT_2;
+    let table = [
+        (index::STIFFNESS, LN_STIFFNESS),
+        (
+            index::MASS,
+            (payload.ln(), prior.model.mass_ratio / payload),
+        ),
+        (index::INERTIA, (0.0, prior.model.inertia_ratio)),
+        (index::CENTRE_FORWARD, (0.0, CENTRE_FORWARD_STD_DEV)),
+        // Loads of the sides differ by twice the offset over the track.
+        (
+            index::CENTRE_LEFT,
+            (0.0, 0.5 * tyres.load_difference_std_dev),
+        ),
+        (
+            index::RELAXATION,
+            (tyres.relaxation_m.ln() - 0.5 * spread, spread.sqrt()),
+        ),
+        (index::SLOPE_X, (0.0, SLOPE_STD_DEV)),
+        (index::SLOPE_Y, (0.0, SLOPE_STD_DEV)),
+        (
+            index::TORQUE_SCALE,
+            (0.0, TORQUE_SCALE_RATIO * noise.torque_gain_ratio),
+        ),
+        (index::TORQUE_DIFFERENCE, (0.0, side)),
+        (
+            index::ROTORS,
+            (tyres.rotor_ratio, tyres.rotor_std_dev_ratio),
+        ),
+        (index::GEAR_LOSS, GEAR_LOSS),
+        (index::RESISTANCE, RESISTANCE),
+        (
+            index::RADIUS,
+            (0.0, noise.radius_ratio * std::f64::consts::FRAC_1_SQRT_2),
+        ),
+        (
+            index::RADIUS_DIFFERENCE,
+            (0.0, noise.radius_ratio * std::f64::consts::SQRT_2),
+        ),
+        (index::PEAK, LN_PEAK),
+        (index::SHAPE, SHAPE),
+        (index::BEND, BEND),
+        (index::GYRO_OFFSET, (0.0, noise.gyro_offset_rad_s)),
+        (
+            index::FORWARD_OFFSET,
+            (0.0, noise.accelerometer_offset_m_s2),
+        ),
+        (index::LEFT_OFFSET, (0.0, noise.accelerometer_offset_m_s2)),
+        (index::HEIGHT, HEIGHT),
+        (index::SPEED_OFFSET, (0.0, SPEED_OFFSET_STD_DEV)),
+    ];
+    let (mut means, mut std_devs) = (Values::zeros(), Values::zeros());
+    for (place, (mean, std_dev)) in table {
+        means[place] = mean;
+        std_devs[place] = std_dev.max(STD_DEV_MIN);
+    }
+    (means, std_devs)
+}
+
+/// What the parameters say of a robot, in units.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Robot<T> {
+    pub(super) track_m: f64,
+    pub(super) wheelbase_m: f64,
+    /// Rolling radius as it is configured, metres.
+    pub(super) nominal_radius_m: f64,
+    pub(super) stiffness: T,
+    pub(super) mass_kg: T,
+    pub(super) inertia_kg_m2: T,
+    /// Centre of mass from the wheels' centre: forward, left, up, metres.
+    pub(super) centre_m: [T; 3],
+    pub(super) relaxation_m: T,
+    pub(super) slope: [T; 2],
+    /// Measured over true torque, left and right.
+    pub(super) torque_scale: [T; 2],
+    /// Inertia of a side's rotors over the square of the radius, kilograms.
+    pub(super) rotors_kg: T,
+    pub(super) gear_loss: T,
+    pub(super) resistance: T,
+    /// Left and right.
+    pub(super) radius_m: [T; 2],
+    pub(super) peak: T,
+    /// n of the curve.
+    pub(super) sharpness: T,
+    pub(super) bend: T,
+    pub(super) gyro_offset_rad_s: T,
+    pub(super) acceleration_offset_m_s2: [T; 2],
+    pub(super) speed_offset_m_s: T,
+}
+
+impl<T: Real> Robot<T> {
+    pub(super) fn new(values: &[T; PARAMETERS], model: &RobotModel) -> Self {
+        let of = |place: usize| values[place];
+        let mass_kg = of(index::MASS).exp() * model.mass_kg();
+        let (track_m, wheelbase_m) = (model.track_width_m(), model.wheelbase_m());
+        let nominal_radius_m = model.wheel_radius_m();
+        let side = |sign: f64| of(index::TORQUE_SCALE) + of(index::TORQUE_DIFFERENCE) * sign + 1.0;
+        let radius = |half: f64| {
+            (of(index::RADIUS) + of(index::RADIUS_DIFFERENCE) * half + 1.0) * nominal_radius_m
+        };
+        let shape = of(index::SHAPE);
+        let sharpness = if shape.value() > SHAPE_MIN {
+            shape.recip()
+        } else {
+            T::constant(SHAPE_MIN.recip())
+        };
+        let bend = of(index::BEND);
+        Self {
+            track_m,
+            wheelbase_m,
+            nominal_radius_m,
+            stiffness: of(index::STIFFNESS).exp(),
+            mass_kg,
+            inertia_kg_m2: (of(index::MASS) + of(index::INERTIA)).exp() * model.yaw_inertia_kg_m2(),
+            centre_m: [
+                of(index::CENTRE_FORWARD) * wheelbase_m,
+                of(index::CENTRE_LEFT) * track_m,
+                of(index::HEIGHT) * track_m,
+            ],
+            relaxation_m: of(index::RELAXATION).exp(),
+            slope: [of(index::SLOPE_X), of(index::SLOPE_Y)],
+            torque_scale: [side(-1.0), side(1.0)],
+            rotors_kg: of(index::ROTORS) * (0.5 * model.mass_kg()),
+            gear_loss: of(index::GEAR_LOSS),
+            resistance: of(index::RESISTANCE),
+            radius_m: [radius(-0.5), radius(0.5)],
+            peak: of(index::PEAK).exp(),
+            sharpness,
+            bend: if bend.value() < 0.0 {
+                T::constant(0.0)
+            } else {
+                bend
+            },
+            gyro_offset_rad_s: of(index::GYRO_OFFSET),
+            acceleration_offset_m_s2: [of(index::FORWARD_OFFSET), of(index::LEFT_OFFSET)],
+            speed_offset_m_s: of(index::SPEED_OFFSET),
+        }
+    }
+}
