@@ -57,12 +57,12 @@ fn counts(outcomes: &[Outcome]) -> [u32; 3] {
 
 #[test]
 fn intervals_hold_on_robots_that_differ_in_everything() {
-    // Over 300 drives each: 94 % and 90 % of the intervals, 42 % and 37 % of the answers.
-    for (has_torque, least_share) in [(true, 0.3), (false, 0.2)] {
+    // Over 240 drives each: 97 % and 96 % of the intervals, 87 % and 76 % of the answers.
+    for (has_torque, least_share) in [(true, 0.75), (false, 0.6)] {
         let [answers, estimates, covered] = counts(&population(has_torque, 120));
         eprintln!("torque {has_torque}: {covered} of {estimates} of {answers}");
         assert!(f64::from(estimates) > least_share * f64::from(answers));
-        assert!(f64::from(covered) > 0.86 * f64::from(estimates));
+        assert!(f64::from(covered) > 0.92 * f64::from(estimates));
     }
 }
 

@@ -23,6 +23,9 @@
 //! θf shows, so what is known of it goes from segment to segment as a whole (`offsets.rs`). Torques
 //! are over the model's mass; accelerations tell by how much the robot is heavier
 //! ([`apparent_mass`]). Where nothing excites θ, there is no θ: `None`.
+//!
+//! These rows are exact for a robot that is as its model says. θ of any other robot comes from
+//! [`identification`]; its change detection and its segments come from the rows.
 
 mod apparent_mass;
 mod block;

@@ -112,6 +112,7 @@ impl<const N: usize> Sub for Dual<N> {
 impl<const N: usize> Mul for Dual<N> {
     type Output = Self;
 
+    #[expect(clippy::suspicious_arithmetic_impl, reason = "the product rule")]
     fn mul(self, other: Self) -> Self {
         let (a, b) = (self.value, other.value);
         self.zip(other, a * b, |own, other| own * b + a * other)
@@ -121,6 +122,7 @@ impl<const N: usize> Mul for Dual<N> {
 impl<const N: usize> Div for Dual<N> {
     type Output = Self;
 
+    #[expect(clippy::suspicious_arithmetic_impl, reason = "the quotient rule")]
     fn div(self, other: Self) -> Self {
         let (ratio, recip) = (self.value / other.value, other.value.recip());
         self.zip(other, ratio, |own, other| (own - ratio * other) * recip)

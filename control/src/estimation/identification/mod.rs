@@ -12,6 +12,8 @@ mod dual;
 mod hypothesis;
 mod model;
 mod parameters;
+#[cfg(test)]
+mod tests;
 
 use super::{EstimatorPrior, GAP_MAX_S, SensorNoise, SensorSample};
 use crate::robot::RobotModel;

@@ -4,8 +4,8 @@
 //! State at the centre of mass, body frame: forward and left speed, turn rate; per contact a
 //! deflection s as a slip vector with `ℓ ṡ = v_slip − |u| s` (relaxation length ℓ, rim speed u:
 //! Pacejka, Tire and Vehicle Dynamics, ch. 7). A contact's force is `N K s / D`, with
-//! `D = (1 + n a x + xⁿ)^(1/n)` and `x = K|s|/μ_p`: slope K = 1/θ at zero slip, μ_p far beyond the
-//! peak. a = 0 with a large n is the straight rise of Yi et al. (2007), eq. (7); a = 1/3 with n = 3
+//! `D = (1 + n a x + xⁿ)^(1/n)` and `x = K|s|/μ_p`: slope K = 1/θ at zero slip, `μ_p` far beyond
+//! the peak. a = 0 with a large n is the straight rise of Yi et al. (2007), eq. (7); a = 1/3 with n = 3
 //! is within 4 % of a brush; a = 0 with n = 2.7 of a Magic Formula; a = 2/3 with n = 2 of a `LuGre`
 //! tyre. N follows from where the centre of mass is, the slope, and measured accelerations.
 
@@ -148,7 +148,7 @@ impl<T: Real> Robot<T> {
         &self,
         state: &mut State<T>,
         contacts: &[Contact<T>; 4],
-        rims_m_s: [T; 2],
+        speeds_m_s: [T; 2],
         step_s: f64,
     ) -> Forces<T> {
         let zero = T::constant(0.0);
@@ -162,7 +162,7 @@ impl<T: Real> Robot<T> {
         let turn = state.turn_rad_s;
         for (contact, deflection) in contacts.iter().zip(&mut state.deflections) {
             let [x_m, y_m] = contact.place_m;
-            let rim_m_s = rims_m_s[contact.side];
+            let rim_m_s = speeds_m_s[contact.side];
             let slips_m_s = [
                 rim_m_s - (forward_m_s - turn * y_m),
                 -(left_m_s + turn * x_m),
@@ -213,12 +213,12 @@ impl<T: Real> Robot<T> {
             clippy::cast_sign_loss,
             reason = "a small number above 0"
         )]
-        let steps = ((input.time_s / STEP_MAX_S).ceil() as u32).clamp(1, STEPS_MAX);
-        let share = f64::from(steps).recip();
+        let count = ((input.time_s / STEP_MAX_S).ceil() as u32).clamp(1, STEPS_MAX);
+        let share = f64::from(count).recip();
         let step_s = input.time_s * share;
         let (per_mass, per_inertia) = (self.mass_kg.recip(), self.inertia_kg_m2.recip());
         let mut output = Output::zero();
-        for step in 0..steps {
+        for step in 0..count {
             let from_middle_s = (f64::from(step) * share - 0.5) * input.time_s;
             let rims_m_s = [0, 1].map(|side| {
                 self.radius_m[side]

@@ -1,0 +1,191 @@
+use super::parameters::Robot;
+use super::*;
+use crate::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
+
+const SAMPLE_S: f64 = 0.01;
+
+/// A robot that is as some values of the parameters say, without noise.
+struct Simulated {
+    robot: Robot<f64>,
+    state: State<f64>,
+    heading_rad: f64,
+    acceleration_m_s2: [f64; 2],
+    time_s: f64,
+}
+
+impl Simulated {
+    fn new(change: impl Fn(&mut parameters::Values)) -> Self {
+        let (mut values, _) =
+            parameters::prior(&EstimatorPrior::default(), &SensorNoise::default());
+        change(&mut values);
+        let values = std::array::from_fn(|place| values[place]);
+        Self {
+            robot: Robot::new(&values, &RobotModel::yi2007()),
+            state: State::rolling(0.0, 0.0),
+            heading_rad: 0.0,
+            acceleration_m_s2: [0.0; 2],
+            time_s: 0.0,
+        }
+    }
+
+    /// Wheel speeds that accelerate, and turn to both sides.
+    fn wheels_rad_s(time_s: f64) -> [f64; 2] {
+        let mean = 7.0 * (time_s / 2.0).min(1.0) + 1.5 * (0.9 * time_s).sin();
+        let half = 2.0 * (0.5 * time_s).sin() + 0.8 * (2.3 * time_s).sin();
+        [mean - half, mean + half]
+    }
+
+    fn sample(&mut self) -> SensorSample {
+        let [before, now, after] =
+            [-0.5, 0.5, 1.5].map(|offset| Self::wheels_rad_s(self.time_s + offset * SAMPLE_S));
+        let rise = |side: usize| (after[side] - before[side]) / (2.0 * SAMPLE_S);
+        let input = Input {
+            wheels_rad_s: now,
+            wheels_rad_s2: [rise(0), rise(1)],
+            heading_rad: self.heading_rad,
+            acceleration_m_s2: self.acceleration_m_s2,
+            time_s: SAMPLE_S,
+        };
+        let output = self.robot.advance(&mut self.state, &input);
+        self.time_s += SAMPLE_S;
+        self.heading_rad += output.turn_rad_s * SAMPLE_S;
+        self.acceleration_m_s2 = output.acceleration_m_s2;
+        let [forward_m_s2, left_m_s2] = output.acceleration_m_s2;
+        let [left_n_m, right_n_m] = output.torques_n_m;
+        SensorSample {
+            wheel_speeds: WheelSpeeds {
+                left_rad_s: now[0],
+                right_rad_s: now[1],
+            },
+            gyro_rad_s: output.turn_rad_s,
+            acceleration: Some(BodyAcceleration {
+                forward_m_s2,
+                left_m_s2,
+            }),
+            body_speed_m_s: Some(output.forward_m_s),
+            wheel_torques: Some(WheelTorques {
+                left_n_m,
+                right_n_m,
+            }),
+        }
+    }
+}
+
+fn identification() -> Identification {
+    Identification::new(
+        RobotModel::yi2007(),
+        &SensorNoise::default(),
+        &EstimatorPrior::default(),
+    )
+    .expect("the default prior is uncertain")
+}
+
+fn drive(identification: &mut Identification, robot: &mut Simulated, seconds: u32) {
+    for _ in 0..seconds * 100 {
+        identification.update(&robot.sample(), &SensorNoise::default(), SAMPLE_S);
+    }
+}
+
+#[test]
+fn a_robot_with_payload_on_bent_tyres_is_identified_on_any_ground() {
+    for stiffness in [0.5_f64, 2.0, 8.0, 20.0] {
+        let mut robot = Simulated::new(|values| {
+            values[index::STIFFNESS] = stiffness.ln();
+            values[index::MASS] = 1.25_f64.ln();
+            values[index::PEAK] = 0.4_f64.ln();
+            values[index::RELAXATION] = 0.05_f64.ln();
+            values[index::SLOPE_X] = 0.05;
+        });
+        let mut identification = identification();
+        drive(&mut identification, &mut robot, 30);
+        let found = identification.identified().expect("θ is excited");
+        let error = (found.theta * stiffness).ln();
+        let own = found.own_ratio.hypot(found.robot_ratio);
+        // At K 20 and a peak of 0.4 these turns slide nearly all the time.
+        assert!(
+            error.abs() < 0.15 || stiffness > 8.0,
+            "K {stiffness}: {error}"
+        );
+        assert!(
+            error.abs() < 1.96 * own.hypot(found.tyres_ratio),
+            "K {stiffness}: {error}, {own}"
+        );
+    }
+}
+
+#[test]
+fn a_robot_that_stands_or_came_a_moment_ago_says_nothing() {
+    let mut standing = identification();
+    let sample = SensorSample {
+        acceleration: Some(BodyAcceleration::default()),
+        ..SensorSample::default()
+    };
+    for _ in 0..6_000 {
+        standing.update(&sample, &SensorNoise::default(), SAMPLE_S);
+    }
+    assert_eq!(standing.identified(), None);
+    let mut identification = identification();
+    drive(&mut identification, &mut Simulated::new(|_| ()), 4);
+    assert_eq!(identification.identified(), None);
+}
+
+#[test]
+fn new_ground_forgets_its_friction_and_keeps_the_robots_mass() {
+    let ground = |stiffness: f64| {
+        move |values: &mut parameters::Values| {
+            values[index::STIFFNESS] = stiffness.ln();
+            values[index::MASS] = 1.3_f64.ln();
+        }
+    };
+    let mut identification = identification();
+    drive(&mut identification, &mut Simulated::new(ground(6.0)), 40);
+    let mass_before = identification.prior.information[(index::MASS, index::MASS)];
+    identification.begin_ground();
+    assert_eq!(identification.identified(), None);
+    let prior = &identification.prior;
+    assert!(prior.information[(index::MASS, index::MASS)] > mass_before);
+    assert!((prior.mean[index::MASS] - 1.3_f64.ln()).abs() < 0.05);
+    assert!(prior.mean[index::STIFFNESS] < 2.0);
+    drive(&mut identification, &mut Simulated::new(ground(1.0)), 30);
+    let found = identification.identified().expect("θ is excited");
+    assert!((found.theta - 1.0).abs() < 0.15, "{}", found.theta);
+}
+
+#[test]
+fn a_gyro_that_froze_leads_to_no_theta_or_to_a_wide_interval() {
+    let mut identification = identification();
+    let mut robot = Simulated::new(|_| ());
+    for tick in 0..4_000 {
+        let mut sample = robot.sample();
+        if tick > 500 {
+            sample.gyro_rad_s = 0.3;
+        }
+        identification.update(&sample, &SensorNoise::default(), SAMPLE_S);
+    }
+    let truth = (-parameters::prior(&EstimatorPrior::default(), &SensorNoise::default()).0
+        [index::STIFFNESS])
+        .exp();
+    if let Some(found) = identification.identified() {
+        let ratio = found
+            .own_ratio
+            .hypot(found.robot_ratio.hypot(found.tyres_ratio));
+        let error = (found.theta / truth).ln();
+        assert!(error.abs() < 1.96 * ratio, "{error} of {ratio}");
+    }
+}
+
+#[test]
+fn samples_that_stop_and_come_again_do_not_matter() {
+    let mut identification = identification();
+    let mut robot = Simulated::new(|values| values[index::STIFFNESS] = 2.0_f64.ln());
+    for round in 0..6 {
+        drive(&mut identification, &mut robot, 7);
+        // The robot goes on, unseen.
+        for _ in 0..50 * (round % 3) {
+            robot.sample();
+        }
+        identification.interrupt();
+    }
+    let found = identification.identified().expect("θ is excited");
+    assert!((found.theta - 0.5).abs() < 0.1, "{}", found.theta);
+}
