@@ -1,7 +1,7 @@
 //! What is measured: one robot on its way, everything prepared, so that one call is one piece of
 //! work.
 
-use tread_control::estimation::{Estimator, SensorNoise, SensorSample};
+use tread_control::estimation::{Estimator, EstimatorPrior, SensorNoise, SensorSample};
 use tread_control::fence::{Fence, FenceInput};
 use tread_control::follower::{Follower, FollowerConfig, FollowerOutput};
 use tread_control::friction::FrictionCurve;
@@ -95,6 +95,13 @@ impl Robot {
             robot.tick();
         }
         robot
+    }
+
+    /// The same robot with an agent that knows its data sheet only, and identifies the rest.
+    pub(crate) fn identified(mut self) -> Self {
+        let (model, noise) = (RobotModel::yi2007(), SensorNoise::default());
+        self.estimator = Estimator::with_prior(model, noise, EstimatorPrior::default());
+        self
     }
 
     /// The same robot within a fence of a thousand corners, the most that there may be, most of

@@ -82,7 +82,8 @@ pub(super) struct Hypothesis {
     /// Mean square of each channel's standardised residuals.
     squares: [f64; CHANNELS],
     cost: f64,
-    covariance: Square,
+    /// Covariances of ln K with all parameters.
+    of_stiffness: Values,
     /// Blocks that still count, and all of them.
     blocks: f64,
     age: u32,
@@ -103,7 +104,7 @@ impl Hypothesis {
             mean: Output::zero(),
             squares: [1.0; CHANNELS],
             cost: 0.0,
-            covariance: Square::zeros(),
+            of_stiffness: Values::zeros(),
             blocks: 0.0,
             age: 0,
         };
@@ -202,7 +203,9 @@ impl Hypothesis {
         let Some(cholesky) = (self.information + prior.information).cholesky() else {
             return false;
         };
-        self.covariance = cholesky.inverse();
+        let mut stiffness = Values::zeros();
+        stiffness[index::STIFFNESS] = 1.0;
+        self.of_stiffness = cholesky.solve(&stiffness);
         let wanted = cholesky.solve(&(self.preferred + prior.information * prior.mean));
         let mut step = wanted - self.values;
         let largest = step
@@ -243,18 +246,18 @@ impl Hypothesis {
 
     /// Variances of ln K: all of it, and the part that comes from what was known beforehand.
     pub(super) fn variances(&self, prior: &Prior) -> (f64, f64) {
-        let of_stiffness = self.covariance.column(index::STIFFNESS).into_owned();
+        let of_stiffness = self.of_stiffness;
         // Few scores scatter less than they will.
         let few = 1.0 + 2.0 / self.blocks.max(1.0);
         let scattered = few * (self.scores * of_stiffness).dot(&of_stiffness);
         let known = (prior.information * of_stiffness).dot(&of_stiffness);
-        let nominal = self.covariance[(index::STIFFNESS, index::STIFFNESS)];
+        let nominal = of_stiffness[index::STIFFNESS];
         ((scattered + known).max(nominal), known)
     }
 
     /// What this tells beforehand of another ground: the robot's own parameters.
     pub(super) fn prior_on_new_ground(&self, prior: &Prior) -> Option<Prior> {
-        let mut covariance = self.covariance;
+        let mut covariance = (self.information + prior.information).cholesky()?.inverse();
         let mut mean = self.values;
         for place in OF_GROUND {
             covariance.column_mut(place).fill(0.0);

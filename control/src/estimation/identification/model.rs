@@ -13,8 +13,8 @@ use super::dual::Real;
 use super::parameters::Robot;
 use crate::robot::GRAVITY_M_S2;
 
-/// Longest integration step, seconds.
-const STEP_MAX_S: f64 = 2.6e-3;
+/// Longest integration step, seconds: half of it changes no coverage by more than its noise.
+const STEP_MAX_S: f64 = 5.1e-3;
 /// Most integration steps of one sample.
 const STEPS_MAX: u32 = 40;
 /// Rim speed below which contacts are damped, and their deflection limited, metres per second.
