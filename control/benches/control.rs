@@ -28,6 +28,12 @@ fn tick_within_a_fence_of_1000_corners(bencher: Bencher) {
 }
 
 #[divan::bench]
+fn tick_of_a_robot_that_is_identified(bencher: Bencher) {
+    let mut robot = Robot::under_way(5.0).identified();
+    bencher.bench_local(move || robot.tick());
+}
+
+#[divan::bench]
 fn estimator_step(bencher: Bencher) {
     let mut robot = Robot::under_way(5.0);
     bencher.bench_local(move || robot.estimate());
