@@ -160,7 +160,8 @@ fn report_of(
     }
 }
 
-fn segment_of(closed: &ClosedSegment, configuration: ConfigurationId) -> Segment {
+/// The segment as it is uploaded.
+pub(crate) fn segment_of(closed: &ClosedSegment, configuration: ConfigurationId) -> Segment {
     let statistics = &closed.statistics;
     let track = Information {
         information: statistics.effective_track_information,

@@ -306,6 +306,9 @@ impl Estimator {
             self.turning_before = None;
             self.pending = Sums::default();
             self.change = ChangeDetector::default();
+            if let Some(identification) = &mut self.identification {
+                identification.drop_last_block();
+            }
         } else if self.change.is_quiet() {
             self.segment = self.segment.plus(&self.pending);
             self.pending = Sums::default();
@@ -479,11 +482,6 @@ impl Estimator {
         let before = self
             .solve(&self.ground, None)
             .filter(|found| found.theta > 0.0);
-        let whole = self.ground.plus(&segment);
-        // Where all blocks together are no measurement, none of them is one.
-        let ground = self
-            .solve(&whole, None)
-            .filter(|found| self.is_measurement(found, &whole));
         let tyres = before.map_or(self.tyres, |found| found.tyres(&self.tyres));
         let offsets = self.offsets.with_ground(
             &self.ground,
@@ -491,38 +489,13 @@ impl Estimator {
             before.map_or(THETA_FIRST, |found| found.theta),
             &tyres,
         );
-        let solution = ground.and_then(|ground| {
-            let input = SolveInput {
-                offsets: &offsets,
-                tyres: &tyres,
-                theta_given: Some(ground.theta),
-                theta_start: ground.theta,
-            };
-            solve(&segment, input).filter(|found| found.is_informative(ground.theta))
-        });
-        let theta = solution.map(|found| {
-            let shared = before.map_or_else(Shared::default, |before| {
-                before.shared_with(&found, &offsets, &tyres)
-            });
-            // An error that grows with θ is a share of the θ that is known best.
-            let theta = ground.map_or(found.theta, |ground| ground.theta);
-            let scale = self.load_scale(&segment);
-            let square = scale * scale;
-            // What it shares with those before is the robot's own error: reported, and not added up.
-            let own_variance = found.own_variance();
-            let of_offsets = shared.own.clamp(0.0, OFFSETS_SHARE_MAX * own_variance);
-            SegmentTheta {
-                theta: scale * found.theta,
-                information: self
-                    .claims
-                    .add(square * found.variance, square * shared.all),
-                own_information: (square * (own_variance - of_offsets)).recip(),
-                common_ratio: CommonError {
-                    robot: self.gain_ratio(&segment).hypot(of_offsets.sqrt() / theta),
-                    tyres: found.tyre_std_dev() / theta,
-                },
-            }
-        });
+        let whole = self.ground.plus(&segment);
+        let theta = match &mut self.identification {
+            Some(identification) => identification
+                .close_segment()
+                .map(|found| self.claims.identified(&found)),
+            None => self.segment_of_rows(&segment, &whole, before, (&offsets, &tyres)),
+        };
         let statistics = SegmentStatistics::of(
             &segment,
             &offsets,
@@ -534,6 +507,51 @@ impl Estimator {
         self.pending = Sums::default();
         self.refresh();
         statistics
+    }
+
+    /// θ of a segment by its rows, where all blocks of the ground are a measurement of it.
+    fn segment_of_rows(
+        &mut self,
+        segment: &Sums,
+        whole: &Sums,
+        before: Option<Solution>,
+        (offsets, tyres): (&OffsetKnowledge, &TyrePrior),
+    ) -> Option<SegmentTheta> {
+        // Where all blocks together are no measurement, none of them is one.
+        let ground = self
+            .solve(whole, None)
+            .filter(|found| self.is_measurement(found, whole))?;
+        let input = SolveInput {
+            offsets,
+            tyres,
+            theta_given: Some(ground.theta),
+            theta_start: ground.theta,
+        };
+        let found = solve(segment, input).filter(|found| found.is_informative(ground.theta))?;
+        let shared = before.map_or_else(Shared::default, |before| {
+            before.shared_with(&found, offsets, tyres)
+        });
+        let scale = self.load_scale(segment);
+        let square = scale * scale;
+        // What it shares with those before is the robot's own error: reported, and not added up.
+        let own_variance = found.own_variance();
+        let of_offsets = shared.own.clamp(0.0, OFFSETS_SHARE_MAX * own_variance);
+        // An error that grows with θ is a share of the θ that is known best.
+        let common_ratio = CommonError {
+            robot: self
+                .gain_ratio(segment)
+                .hypot(of_offsets.sqrt() / ground.theta),
+            tyres: found.tyre_std_dev() / ground.theta,
+        };
+        Some(SegmentTheta {
+            theta: scale * found.theta,
+            information: self
+                .claims
+                .add(square * found.variance, square * shared.all),
+            own_information: (square * (own_variance - of_offsets)).recip(),
+            common_ratio,
+            duration_s: segment.duration_s,
+        })
     }
 
     /// Starts on new ground: θ is forgotten, what was learned about the robot stays.

@@ -2,9 +2,10 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::CommonError;
+use super::identification::Identified;
 use super::offsets::OffsetKnowledge;
 use super::sums::Sums;
+use super::{BLOCK_S, CommonError};
 
 /// Additive statistics of one segment. `Λ = 1/σ²` of segments add up, and so do `Λθ`.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
@@ -52,6 +53,8 @@ pub(super) struct SegmentTheta {
     pub(super) own_information: f64,
     /// The common errors, over θ.
     pub(super) common_ratio: CommonError,
+    /// Time that was used, seconds.
+    pub(super) duration_s: f64,
 }
 
 /// What the segments of one ground promise together.
@@ -85,6 +88,22 @@ impl Claims {
         self.information = together;
         claimed
     }
+
+    /// A segment that was identified. Its own error is independent of those of the others.
+    pub(super) fn identified(&mut self, found: &Identified) -> SegmentTheta {
+        let [own, tyres] =
+            [found.own_ratio, found.tyres_ratio].map(|ratio| (ratio * found.theta).powi(2));
+        SegmentTheta {
+            theta: found.theta,
+            information: self.add(own + tyres, tyres),
+            own_information: own.recip(),
+            common_ratio: CommonError {
+                robot: found.robot_ratio,
+                tyres: found.tyres_ratio,
+            },
+            duration_s: found.duration_s,
+        }
+    }
 }
 
 impl SegmentStatistics {
@@ -104,6 +123,13 @@ impl SegmentStatistics {
                 .information
                 .max(CLAIM_MIN_RATIO * found.own_information)
         });
+        let duration_s = theta.map_or(0.0, |found| found.duration_s);
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "a number of blocks"
+        )]
+        let blocks = (duration_s / BLOCK_S).round() as u64;
         let track = sums.effective_track(offsets);
         let track_information = track.map_or(0.0, |track| track.std_dev.powi(-2));
         let rolling = sums.rolling_resistance(accelerometer_offset_mu);
@@ -113,8 +139,8 @@ impl SegmentStatistics {
             theta_weighted: theta.map_or(0.0, |found| information * found.theta),
             own_information: theta.map_or(0.0, |found| found.own_information),
             common_ratio: theta.map_or_else(CommonError::default, |found| found.common_ratio),
-            samples: sums.blocks,
-            duration_s: sums.duration_s,
+            samples: sums.blocks.max(blocks),
+            duration_s: sums.duration_s.max(duration_s),
             mu_peak_lower_bound: sums.mu_peak(),
             effective_track_information: track_information,
             effective_track_weighted: track.map_or(0.0, |track| track_information * track.value),

@@ -46,7 +46,8 @@ impl Course {
         }
     }
 
-    fn trajectory(self) -> Trajectory {
+    /// The course as a mission.
+    pub fn trajectory(self) -> Trajectory {
         let options = TrajectoryOptions::default();
         match self {
             Self::Circle => Trajectory::Circle(Circle {

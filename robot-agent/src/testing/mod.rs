@@ -12,8 +12,8 @@ use std::sync::mpsc::SendError;
 use std::time::Duration;
 
 use jiff::Timestamp;
-use tread_api::friction::ThetaEstimate;
-use tread_api::ids::{BootId, MissionId, PlanHash, RobotId, SiteId};
+use tread_api::friction::{Segment, ThetaEstimate};
+use tread_api::ids::{BootId, ConfigurationId, MissionId, PlanHash, RobotId, SiteId};
 use tread_api::safety::Geofence;
 use tread_api::site::Grid;
 use tread_api::terrain::{TerrainRef, TerrainShape};
@@ -43,6 +43,7 @@ use crate::control_loop::tick::LoopCore;
 use crate::drive::simulated::{Individual, SimMode, SimulatedDrive, SimulatedDriveError};
 use crate::drive::{Drive, Feedback, SILENT_AFTER_MAX, SensorSample};
 use crate::geometry::paper_robot;
+use crate::recorder::segment_of;
 use crate::recording::frame::{Notes, notes};
 use crate::recording::{FORMAT, RecordWriter, RecordingConfig, RunHead, VERSION};
 use crate::safety::stop::StopState;
@@ -617,5 +618,13 @@ impl<D: SteppedDrive> Bench<D> {
     /// How many segments were closed so far.
     pub fn segment_count(&self) -> usize {
         self.segments.len()
+    }
+
+    /// The segments that were closed so far, as they are uploaded for a robot of this configuration.
+    pub fn segments(&self, configuration: ConfigurationId) -> Vec<Segment> {
+        let segments = self.segments.iter();
+        segments
+            .map(|closed| segment_of(closed, configuration))
+            .collect()
     }
 }

@@ -6,8 +6,10 @@
 //!
 //! * [`map`]: what a fleet's friction map is worth.
 //! * [`yard`]: the site of that scenario, its robots, and their paths.
+//! * [`cells`]: fused cells of robots unlike the simulator. Their loops run alone; fusion is the server's.
 //! * [`judge`]: what is read from a run, against the truth; [`report`]: what of it must hold.
 
+pub mod cells;
 pub mod judge;
 pub mod map;
 pub mod report;

@@ -56,6 +56,53 @@ impl Prior {
     }
 }
 
+/// Blocks of measurements, linearised about the present values.
+#[derive(Debug, Clone, PartialEq)]
+struct Blocks {
+    /// Their information, and its product with the values that they prefer.
+    information: Square,
+    preferred: Values,
+    /// Sum of the squares of their scores.
+    scores: Square,
+    /// Blocks that still count.
+    count: f64,
+}
+
+impl Blocks {
+    fn none() -> Self {
+        Self {
+            information: Square::zeros(),
+            preferred: Values::zeros(),
+            scores: Square::zeros(),
+            count: 0.0,
+        }
+    }
+
+    fn scale(&mut self, ratio: f64) {
+        self.information *= ratio;
+        self.preferred *= ratio;
+        self.scores *= ratio;
+        self.count *= ratio;
+    }
+
+    fn add(&mut self, other: &Self, ratio: f64) {
+        self.information += other.information * ratio;
+        self.preferred += other.preferred * ratio;
+        self.scores += other.scores * ratio;
+        self.count += other.count * ratio;
+    }
+}
+
+/// ln K of one segment, and variances of it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct OfSegment {
+    pub(super) ln_stiffness: f64,
+    /// By the segment's own blocks.
+    pub(super) own: f64,
+    /// By the robot's other parameters, as all other blocks and the prior know them.
+    pub(super) known: f64,
+}
+
 /// A measurement of one channel.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Measured {
@@ -69,11 +116,11 @@ pub(super) struct Measured {
 pub(super) struct Hypothesis {
     values: Values,
     state: State<Number>,
-    /// Information of all blocks, and its product with the values that they prefer.
-    information: Square,
-    preferred: Values,
-    /// Sum of the squares of the blocks' scores.
-    scores: Square,
+    /// All blocks of this ground.
+    ground: Blocks,
+    /// Those of the open segment but the last one, which may be of the next ground already.
+    segment: Blocks,
+    last: Blocks,
     /// Of the open block.
     block_information: Square,
     block_score: Values,
@@ -84,8 +131,7 @@ pub(super) struct Hypothesis {
     cost: f64,
     /// Covariances of ln K with all parameters.
     of_stiffness: Values,
-    /// Blocks that still count, and all of them.
-    blocks: f64,
+    /// Blocks since it began.
     age: u32,
 }
 
@@ -96,16 +142,15 @@ impl Hypothesis {
         let mut hypothesis = Self {
             values,
             state: State::rolling(0.0, 0.0),
-            information: Square::zeros(),
-            preferred: Values::zeros(),
-            scores: Square::zeros(),
+            ground: Blocks::none(),
+            segment: Blocks::none(),
+            last: Blocks::none(),
             block_information: Square::zeros(),
             block_score: Values::zeros(),
             mean: Output::zero(),
             squares: [1.0; CHANNELS],
             cost: 0.0,
             of_stiffness: Values::zeros(),
-            blocks: 0.0,
             age: 0,
         };
         hypothesis.restart(state);
@@ -190,23 +235,26 @@ impl Hypothesis {
     /// Ends a block: all blocks together give new values. Returns false if they are none.
     pub(super) fn end_block(&mut self, prior: &Prior) -> bool {
         let score = self.block_score;
-        self.information *= 1.0 - BLOCK_FORGETS;
-        self.preferred *= 1.0 - BLOCK_FORGETS;
-        self.scores *= 1.0 - BLOCK_FORGETS;
-        self.information += self.block_information;
-        self.preferred += score + self.block_information * self.values;
-        self.scores.ger(1.0, &score, &score, 1.0);
+        self.segment.add(&self.last, 1.0);
+        self.ground.scale(1.0 - BLOCK_FORGETS);
+        self.segment.scale(1.0 - BLOCK_FORGETS);
+        self.last = Blocks {
+            information: self.block_information,
+            preferred: score + self.block_information * self.values,
+            scores: score * score.transpose(),
+            count: 1.0,
+        };
+        self.ground.add(&self.last, 1.0);
         self.drop_block();
-        self.blocks = self.blocks * (1.0 - BLOCK_FORGETS) + 1.0;
         self.age = self.age.saturating_add(1);
         self.cost *= COST_KEEPS;
-        let Some(cholesky) = (self.information + prior.information).cholesky() else {
+        let Some(cholesky) = (self.ground.information + prior.information).cholesky() else {
             return false;
         };
         let mut stiffness = Values::zeros();
         stiffness[index::STIFFNESS] = 1.0;
         self.of_stiffness = cholesky.solve(&stiffness);
-        let wanted = cholesky.solve(&(self.preferred + prior.information * prior.mean));
+        let wanted = cholesky.solve(&(self.ground.preferred + prior.information * prior.mean));
         let mut step = wanted - self.values;
         let largest = step
             .zip_map(&prior.std_devs, |step, std_dev| step.abs() / std_dev)
@@ -226,10 +274,9 @@ impl Hypothesis {
         let step = self.values - before;
         self.shift_state(&step);
         let keeps = (-3.0 * (step[index::STIFFNESS] / LINEAR_RANGE).powi(2)).exp();
-        self.information *= keeps;
-        self.preferred *= keeps;
-        self.scores *= keeps;
-        self.blocks *= keeps;
+        self.ground.scale(keeps);
+        self.segment.scale(keeps);
+        self.last.scale(keeps);
         self.values.iter().all(|value| value.is_finite())
     }
 
@@ -247,17 +294,67 @@ impl Hypothesis {
     /// Variances of ln K: all of it, and the part that comes from what was known beforehand.
     pub(super) fn variances(&self, prior: &Prior) -> (f64, f64) {
         let of_stiffness = self.of_stiffness;
-        // Few scores scatter less than they will.
-        let few = 1.0 + 2.0 / self.blocks.max(1.0);
-        let scattered = few * (self.scores * of_stiffness).dot(&of_stiffness);
+        let scattered = self.scattered();
         let known = (prior.information * of_stiffness).dot(&of_stiffness);
         let nominal = of_stiffness[index::STIFFNESS];
         ((scattered + known).max(nominal), known)
     }
 
+    /// Variance of ln K by the scatter of the blocks.
+    fn scattered(&self) -> f64 {
+        // Few scores scatter less than they will.
+        let few = 1.0 + 2.0 / self.ground.count.max(1.0);
+        few * (self.ground.scores * self.of_stiffness).dot(&self.of_stiffness)
+    }
+
+    /// Drops the last block and the open one: they may be of either ground.
+    pub(super) fn drop_last_block(&mut self) {
+        self.ground.add(&self.last, -1.0);
+        self.last = Blocks::none();
+        self.drop_block();
+    }
+
+    /// Ends the segment. ln K follows from its own blocks, with the robot's other parameters as the
+    /// ground's other blocks and the prior know them: those blocks tell nothing of K here, so that K
+    /// of segments may differ and their own errors are independent. None if it has no blocks, or
+    /// nothing follows from them.
+    pub(super) fn close_segment(&mut self, prior: &Prior) -> Option<OfSegment> {
+        let mut segment = std::mem::replace(&mut self.segment, Blocks::none());
+        segment.add(&self.last, 1.0);
+        self.last = Blocks::none();
+        if segment.count <= 0.0 {
+            return None;
+        }
+        let mut others = self.ground.information - segment.information + prior.information;
+        let mut wanted = self.ground.preferred - segment.preferred + prior.information * prior.mean;
+        // K of the other blocks is marginalised.
+        let of_stiffness: Values = others.column(index::STIFFNESS).into();
+        let most = of_stiffness[index::STIFFNESS];
+        wanted -= of_stiffness * (wanted[index::STIFFNESS] / most);
+        others.ger(-most.recip(), &of_stiffness, &of_stiffness, 1.0);
+        let cholesky = (others + segment.information).cholesky()?;
+        let values = cholesky.solve(&(wanted + segment.preferred));
+        let mut stiffness = Values::zeros();
+        stiffness[index::STIFFNESS] = 1.0;
+        let of_stiffness = cholesky.solve(&stiffness);
+        // Blocks scatter as those of the whole ground do.
+        let whole = (self.ground.information * self.of_stiffness).dot(&self.of_stiffness);
+        let scatter = (self.scattered() / whole).max(1.0);
+        let own = scatter * (segment.information * of_stiffness).dot(&of_stiffness);
+        let found = OfSegment {
+            ln_stiffness: values[index::STIFFNESS],
+            own,
+            known: (others * of_stiffness).dot(&of_stiffness).max(0.0),
+        };
+        let is_known = found.ln_stiffness.is_finite() && found.known.is_finite() && own > 0.0;
+        (is_known && own.is_finite()).then_some(found)
+    }
+
     /// What this tells beforehand of another ground: the robot's own parameters.
     pub(super) fn prior_on_new_ground(&self, prior: &Prior) -> Option<Prior> {
-        let mut covariance = (self.information + prior.information).cholesky()?.inverse();
+        let mut covariance = (self.ground.information + prior.information)
+            .cholesky()?
+            .inverse();
         let mut mean = self.values;
         for place in OF_GROUND {
             covariance.column_mut(place).fill(0.0);

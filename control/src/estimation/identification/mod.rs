@@ -49,8 +49,16 @@ const SMOOTHED_PER_S: f64 = 35.0;
 const MODEL_TURN_RAD_S: f64 = 7.5e-3;
 const MODEL_ACCELERATION_M_S2: f64 = 0.075;
 const MODEL_TORQUE_MU: f64 = 0.025;
-/// Error of ln θ that all estimates share, since the equations are not those of the true contacts.
-const MODEL_STD_DEV: f64 = 0.06;
+/// Errors that all estimates share, since the equations are not those of the true contacts: of ln θ,
+/// and of θ. The latter is a slip of the wheels over the friction coefficient; it is a greater share
+/// of a small θ.
+const MODEL_LN_THETA_STD_DEV: f64 = 0.03;
+const MODEL_THETA_STD_DEV: f64 = 0.006;
+/// Shortest time that a block may have where a segment ends, seconds.
+const SHORT_BLOCK_S: f64 = 0.5;
+/// Standard deviations of ln K beyond which a segment tells nothing: by its own blocks, and in all.
+const SEGMENT_OWN_STD_DEV_MAX: f64 = 0.5;
+const SEGMENT_STD_DEV_MAX: f64 = 1.0;
 /// Mean square of standardised residuals beyond which the robot does not move as the model can.
 const SQUARE_MAX: f64 = 30.0;
 
@@ -69,6 +77,19 @@ pub(super) struct Identified {
     pub(super) duration_s: f64,
 }
 
+impl Identified {
+    fn new(ln_stiffness: f64, own: f64, of_robot: f64, duration_s: f64) -> Self {
+        let theta = (-ln_stiffness).exp();
+        Self {
+            theta,
+            own_ratio: own.max(0.0).sqrt(),
+            robot_ratio: of_robot.max(0.0).sqrt(),
+            tyres_ratio: MODEL_LN_THETA_STD_DEV.hypot(MODEL_THETA_STD_DEV / theta),
+            duration_s,
+        }
+    }
+}
+
 /// Identifies a robot and its ground.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Identification {
@@ -85,8 +106,10 @@ pub(super) struct Identification {
     samples: f64,
     compared_s: f64,
     block_s: f64,
+    /// Time of the open segment's blocks, and of the last one of them, seconds.
+    segment_s: f64,
+    last_block_s: f64,
     is_moving: bool,
-    has_torque: bool,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -120,8 +143,9 @@ impl Identification {
             samples: 0.0,
             compared_s: 0.0,
             block_s: 0.0,
+            segment_s: 0.0,
+            last_block_s: 0.0,
             is_moving: false,
-            has_torque: false,
         };
         identification.begin(&State::rolling(0.0, 0.0));
         Some(identification)
@@ -144,6 +168,8 @@ impl Identification {
         let state = self.state();
         self.begin(&state);
         self.interrupt();
+        self.segment_s = 0.0;
+        self.last_block_s = 0.0;
     }
 
     /// The state of motion that a robot without slip has at the waiting sample.
@@ -267,7 +293,6 @@ impl Identification {
         if let Some(torques) = sample.wheel_torques.filter(|_| is_rolling) {
             add(3, torques.left_n_m);
             add(4, torques.right_n_m);
-            self.has_torque = true;
         }
     }
 
@@ -307,20 +332,21 @@ impl Identification {
         }
         self.block_s += compared_s;
         self.clear_sums();
-        if self.block_s < BLOCK_S - 1.0e-6 {
-            return;
-        }
-        self.block_s = 0.0;
-        if std::mem::take(&mut self.is_moving) {
+        if self.block_s >= BLOCK_S - 1.0e-6 {
             self.end_block();
-        } else {
-            for hypothesis in &mut self.hypotheses {
-                hypothesis.drop_block();
-            }
         }
     }
 
     fn end_block(&mut self) {
+        let block_s = std::mem::take(&mut self.block_s);
+        if !std::mem::take(&mut self.is_moving) {
+            for hypothesis in &mut self.hypotheses {
+                hypothesis.drop_block();
+            }
+            return;
+        }
+        self.segment_s += block_s;
+        self.last_block_s = block_s;
         let prior = &self.prior;
         self.hypotheses
             .retain_mut(|hypothesis| hypothesis.end_block(prior));
@@ -394,12 +420,60 @@ impl Identification {
         let variance = square / weights - mean * mean;
         let of_prior = (known / weights).min(variance);
         let is_known = mean.is_finite() && variance.is_finite() && variance > 0.0;
-        is_known.then(|| Identified {
-            theta: (-mean).exp(),
-            own_ratio: (variance - of_prior).max(0.0).sqrt(),
-            robot_ratio: of_prior.sqrt(),
-            tyres_ratio: MODEL_STD_DEV,
-            duration_s: f64::from(best.age()) * BLOCK_S,
+        let duration_s = f64::from(best.age()) * BLOCK_S;
+        is_known.then(|| Identified::new(mean, variance - of_prior, of_prior, duration_s))
+    }
+
+    /// Drops the last block: it may be of another ground.
+    pub(super) fn drop_last_block(&mut self) {
+        for hypothesis in &mut self.hypotheses {
+            hypothesis.drop_last_block();
+        }
+        self.segment_s = (self.segment_s - std::mem::take(&mut self.last_block_s)).max(0.0);
+        self.block_s = 0.0;
+        self.is_moving = false;
+    }
+
+    /// Ends a segment of this ground, and gives θ of its own blocks; none where that tells nothing.
+    /// θ is linear in ln K about that of the whole ground, so that the noise of short segments averages
+    /// out in a weighted mean.
+    pub(super) fn close_segment(&mut self) -> Option<Identified> {
+        if self.block_s >= SHORT_BLOCK_S {
+            self.end_block();
+        }
+        let ground = self.identified();
+        let duration_s = std::mem::take(&mut self.segment_s);
+        self.last_block_s = 0.0;
+        let least = self.least_cost();
+        let (mut weights, mut mean, mut square, mut own, mut known) = (0.0, 0.0, 0.0, 0.0, 0.0);
+        let mut is_known = true;
+        for hypothesis in &mut self.hypotheses {
+            let weight = (-(hypothesis.cost() - least) / COST_SCALE).exp();
+            let Some(segment) = hypothesis.close_segment(&self.prior) else {
+                is_known = false;
+                continue;
+            };
+            weights += weight;
+            mean += weight * segment.ln_stiffness;
+            square += weight * segment.ln_stiffness.powi(2);
+            own += weight * segment.own;
+            known += weight * segment.known;
+        }
+        let ground = ground.filter(|_| is_known)?;
+        mean /= weights;
+        own /= weights;
+        // What the hypotheses differ by is not known of the robot.
+        let of_robot = known / weights + (square / weights - mean * mean).max(0.0);
+        if own.sqrt() > SEGMENT_OWN_STD_DEV_MAX || (own + of_robot).sqrt() > SEGMENT_STD_DEV_MAX {
+            return None;
+        }
+        let theta = ground.theta * (1.0 - mean - ground.theta.ln());
+        (theta > 0.0).then(|| Identified {
+            theta,
+            duration_s,
+            own_ratio: own.sqrt(),
+            robot_ratio: of_robot.sqrt(),
+            ..ground
         })
     }
 }

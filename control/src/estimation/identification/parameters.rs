@@ -70,7 +70,7 @@ pub(super) const OF_GROUND: [usize; 7] = [
 ];
 
 /// Mean and standard deviation of ln K: ground from wet ice to asphalt.
-const LN_STIFFNESS: (f64, f64) = (1.1, 1.3);
+const LN_STIFFNESS: (f64, f64) = (1.1, 2.0);
 /// Of ln of the greatest friction coefficient.
 const LN_PEAK: (f64, f64) = (-0.6, 0.4);
 /// Of the curve's sharpness `1/n` and early bend `a`.

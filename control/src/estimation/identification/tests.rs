@@ -189,3 +189,57 @@ fn samples_that_stop_and_come_again_do_not_matter() {
     let found = identification.identified().expect("θ is excited");
     assert!((found.theta - 0.5).abs() < 0.1, "{}", found.theta);
 }
+
+fn with_stiffness(stiffness: f64) -> Simulated {
+    Simulated::new(|values| {
+        values[index::STIFFNESS] = stiffness.ln();
+        values[index::MASS] = 1.2_f64.ln();
+    })
+}
+
+#[test]
+fn segments_hold_theta_and_their_mean_is_that_of_the_whole_ground() {
+    let mut identification = identification();
+    let mut robot = with_stiffness(3.0);
+    drive(&mut identification, &mut robot, 10);
+    identification.close_segment();
+    let (mut information, mut weighted) = (0.0, 0.0);
+    for seconds in [3, 7, 5, 12, 4, 9] {
+        drive(&mut identification, &mut robot, seconds);
+        let segment = identification.close_segment().expect("turns tell θ");
+        assert!((segment.duration_s - f64::from(seconds)).abs() < 1.1);
+        let error = (segment.theta * 3.0).ln();
+        let ratio = segment.own_ratio.hypot(segment.robot_ratio);
+        assert!(error.abs() < 2.0 * ratio, "{error} of {segment:?}");
+        let weight = (segment.own_ratio * segment.theta).powi(-2);
+        information += weight;
+        weighted += weight * segment.theta;
+    }
+    let whole = identification.identified().expect("θ is excited");
+    let difference = (weighted / information / whole.theta).ln();
+    assert!(difference.abs() < 0.02, "{difference}");
+    assert_eq!(identification.close_segment(), None, "it has no blocks");
+}
+
+#[test]
+fn the_last_block_before_a_change_of_the_ground_counts_for_no_segment() {
+    let theta = |seconds: u32, is_dropped: bool| {
+        let mut identification = identification();
+        let mut robot = with_stiffness(4.0);
+        drive(&mut identification, &mut robot, 10);
+        identification.close_segment();
+        drive(&mut identification, &mut robot, 4);
+        robot.robot.stiffness = 0.5;
+        drive(&mut identification, &mut robot, seconds);
+        if is_dropped {
+            identification.drop_last_block();
+        }
+        let segment = identification.close_segment().expect("turns tell θ");
+        assert!((segment.duration_s - f64::from(4 + seconds - u32::from(is_dropped))).abs() < 0.1);
+        segment.theta
+    };
+    let (before, with, without) = (theta(0, false), theta(1, false), theta(1, true));
+    let (of_block, left) = ((with / before).ln(), (without / before).ln());
+    assert!(of_block > 0.05, "{of_block}: the block must matter");
+    assert!(left.abs() < 0.5 * of_block, "{left} of {of_block}");
+}

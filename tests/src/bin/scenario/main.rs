@@ -7,12 +7,13 @@ use std::process::ExitCode;
 use clap::{Parser, Subcommand};
 use serde::Serialize;
 use tread_tests::report;
+use tread_tests::scenario::cells;
 use tread_tests::scenario::map;
-use tread_tests::scenario::report::{Report, Size};
+use tread_tests::scenario::report::Size;
 
 mod print;
 
-use self::print::Tables;
+use self::print::{CellTable, Tables};
 
 /// Runs a fleet in a simulated time and holds what comes of it against what it should be.
 #[derive(Debug, Parser)]
@@ -46,35 +47,70 @@ enum Scenario {
         #[arg(long, default_value = "error")]
         log: String,
     },
+    /// How far fused cells of robots unlike the simulator can be trusted
+    ///
+    /// Robots of the rough world drive figure-8s. Those of one ground differ in payload, inertia, centre of
+    /// mass, torque constants, gears and rolling radii.
+    Cells {
+        /// Seed of the first ground
+        #[arg(long, default_value_t = 1_000_001)]
+        seed: u64,
+        /// Grounds, each once with wheel torque and once without
+        #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+        grounds: u32,
+        /// Robots on each ground
+        #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=20))]
+        robots: u32,
+        /// Print one JSON object instead of a table
+        #[arg(long)]
+        json: bool,
+    },
 }
 
 fn main() -> anyhow::Result<ExitCode> {
-    let Scenario::Map {
-        seed,
-        robots,
-        visits,
-        arrivals,
-        json,
-        log,
-    } = Arguments::parse().scenario;
-    tracing_subscriber::fmt()
-        .with_env_filter(log)
-        .with_writer(std::io::stderr)
-        .init();
-    let runtime = tokio::runtime::Builder::new_multi_thread()
-        .enable_all()
-        .build()?;
-    let report = runtime.block_on(map::run(Size {
-        seed,
-        robots_per_model: robots,
-        visits,
-        arrivals_per_model: arrivals,
-    }))?;
-    let details = Details { report: &report };
-    report::tell_with(json, &details, Tables(&report), &report.checks())
+    match Arguments::parse().scenario {
+        Scenario::Map {
+            seed,
+            robots,
+            visits,
+            arrivals,
+            json,
+            log,
+        } => {
+            tracing_subscriber::fmt()
+                .with_env_filter(log)
+                .with_writer(std::io::stderr)
+                .init();
+            let runtime = tokio::runtime::Builder::new_multi_thread()
+                .enable_all()
+                .build()?;
+            let report = runtime.block_on(map::run(Size {
+                seed,
+                robots_per_model: robots,
+                visits,
+                arrivals_per_model: arrivals,
+            }))?;
+            let details = Details { report: &report };
+            report::tell_with(json, &details, Tables(&report), &report.checks())
+        }
+        Scenario::Cells {
+            seed,
+            grounds,
+            robots,
+            json,
+        } => {
+            let report = cells::run(cells::Size {
+                seed,
+                grounds,
+                robots,
+            })?;
+            let details = Details { report: &report };
+            report::tell_with(json, &details, CellTable(&report), &report.checks())
+        }
+    }
 }
 
 #[derive(Debug, Serialize)]
-struct Details<'a> {
-    report: &'a Report,
+struct Details<'a, R> {
+    report: &'a R,
 }

@@ -2,7 +2,34 @@
 
 use std::fmt::{self, Display, Formatter, Write};
 
+use tread_tests::scenario::cells;
 use tread_tests::scenario::report::{Arrival, Learned, Report};
+
+/// The lines of fused cells.
+pub(super) struct CellTable<'a>(pub(super) &'a cells::Report);
+
+impl Display for CellTable<'_> {
+    fn fmt(&self, out: &mut Formatter<'_>) -> fmt::Result {
+        writeln!(
+            out,
+            "{:<24} {:>7} {:>10} {:>9} {:>8} {:>12}",
+            "", "cells", "estimates", "coverage", "error", "half-width"
+        )?;
+        for line in self.0.lines() {
+            writeln!(
+                out,
+                "{:<24} {:>7} {:>10} {:>8.1}% {:>+7.1}% {:>11.1}%",
+                line.name,
+                line.cells,
+                line.estimates,
+                100.0 * line.coverage,
+                100.0 * line.error_ratio,
+                100.0 * line.half_width,
+            )?;
+        }
+        Ok(())
+    }
+}
 
 /// All tables of a run.
 pub(super) struct Tables<'a>(pub(super) &'a Report);
