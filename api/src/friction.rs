@@ -200,6 +200,49 @@ pub struct LiveFriction {
     /// speed, and from an older agent.
     #[serde(default)]
     pub slip: Option<SideSlip>,
+    /// Parameters of the robot, estimated together with θ; `null` for a robot whose model is configured as
+    /// exact, before it has driven for some seconds, and from an older agent.
+    #[serde(default)]
+    pub robot_parameters: Option<RobotParameters>,
+}
+
+/// Parameters of a robot, estimated together with θ while it drives.
+///
+/// On flat ground torques and accelerations determine only the apparent mass; the mass itself also depends on
+/// the priors of torque constants and rotors. Without wheel torques no mass is observable.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct RobotParameters {
+    /// Apparent mass over the configured mass: torque scale times the sum of mass, payload and the
+    /// inertia of rotors and wheels at the rim.
+    pub apparent_mass_ratio: ParameterEstimate,
+    /// Mass with payload, kg.
+    pub mass_kg: ParameterEstimate,
+    /// Yaw inertia per mass over its configured value.
+    pub yaw_inertia_ratio: ParameterEstimate,
+    /// Centre of mass forward of the centre of the wheels, m.
+    pub center_of_mass_forward_m: ParameterEstimate,
+    /// Centre of mass to the left of the centre of the wheels, m.
+    pub center_of_mass_left_m: ParameterEstimate,
+}
+
+/// Estimate of one parameter.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct ParameterEstimate {
+    /// Estimated value.
+    pub value: f64,
+    /// Standard deviation of the estimate.
+    pub std_dev: f64,
+    /// Whether the prior dominates: the variance is more than half of the prior variance, so that the
+    /// drive added little.
+    pub prior_dominated: bool,
+}
+
+impl ParameterEstimate {
+    /// Returns the 95 % interval `(low, high)`.
+    pub fn interval_95(&self) -> (f64, f64) {
+        let half = NORMAL_95 * self.std_dev;
+        (self.value - half, self.value + half)
+    }
 }
 
 /// Mean longitudinal slip of the wheels of each side, equation (3) of the paper: (rim speed −

@@ -30,6 +30,16 @@ impl Check {
         }
     }
 
+    /// A figure that must not be below a bound; NaN does not hold.
+    pub fn at_least(name: impl Into<String>, value: f64, bound: f64) -> Self {
+        Self {
+            name: name.into(),
+            goal: format!("≥ {bound}"),
+            value: Some(value),
+            holds: value >= bound,
+        }
+    }
+
     /// A figure that must lie between two bounds; NaN does not hold.
     pub fn between(name: impl Into<String>, value: f64, range: RangeInclusive<f64>) -> Self {
         Self {

@@ -6,6 +6,7 @@
 use tread_api::ids::AlertCode;
 use tread_api::robot::{ALERT_TEXT_MAX, AlertReport, OutboxStatus, Severity};
 use tread_control::consistency::{Consequence, Finding, Findings, Kind, Subject};
+use tread_control::estimation::PayloadChange;
 use tread_control::geometry::Point;
 
 use crate::control_loop::channels::Fault;
@@ -37,6 +38,8 @@ pub(crate) struct Causes<'a> {
     pub(crate) base: Option<&'a Counts>,
     /// The comparison that shows that the ground differs from the map.
     pub(crate) surface_change: Option<Comparison>,
+    /// The last change of the payload, while it is reported.
+    pub(crate) payload_change: Option<PayloadChange>,
     /// Position at which the wheels turn without moving the robot.
     pub(crate) dug_in_at: Option<Point>,
     /// Lateness of the loop while the robot is held for it.
@@ -89,6 +92,20 @@ fn surface_change(found: &Comparison) -> Option<AlertReport> {
         expected.std_dev,
     );
     alert("surface-change", Severity::Warning, text)
+}
+
+fn payload_change(PayloadChange { before, after }: &PayloadChange) -> Option<AlertReport> {
+    let how = if after.value > before.value {
+        "was loaded"
+    } else {
+        "was unloaded"
+    };
+    let text = format!(
+        "the robot {how} while it stood: its apparent mass is {:.2} ± {:.2} of the configured mass, \
+         and was {:.2} ± {:.2}; speed and stopping distance depend on it",
+        after.value, after.std_dev, before.value, before.std_dev,
+    );
+    alert("payload-changed", Severity::Warning, text)
 }
 
 /// Returns code, severity and text of a finding.
@@ -259,6 +276,7 @@ impl Alerts {
             stopped.flatten(),
             dug_in,
             causes.surface_change.as_ref().and_then(surface_change),
+            causes.payload_change.as_ref().and_then(payload_change),
             long.flatten(),
             lost.flatten(),
             damaged,
@@ -274,223 +292,4 @@ impl Alerts {
 }
 
 #[cfg(test)]
-mod tests {
-    use std::time::Duration;
-
-    use tread_api::friction::ROBOT_BIAS_RATIO;
-    use tread_api::site::Cell;
-    use tread_control::consistency::Unit;
-    use tread_control::tracking::ThetaKnowledge;
-
-    use super::*;
-    use crate::drive::ros2::refusal::Source;
-
-    fn codes(alerts: &[AlertReport]) -> Vec<&str> {
-        alerts.iter().map(|alert| alert.code.as_str()).collect()
-    }
-
-    #[test]
-    fn a_battery_that_wavers_does_not_make_its_alert_flicker() {
-        let mut alerts = Alerts::default();
-        let mut at = |charge_ratio| {
-            let battery = Some(Battery {
-                charge_ratio,
-                voltage_v: 22.0,
-            });
-            alerts.judge(&Causes {
-                battery,
-                ..Causes::default()
-            })
-        };
-        assert!(at(0.21).is_empty());
-        assert_eq!(codes(&at(0.19)), ["battery-low"]);
-        assert_eq!(codes(&at(0.22)), ["battery-low"]);
-        assert!(at(0.26).is_empty());
-        assert_eq!(codes(&at(0.04)), ["battery-critical"]);
-        assert_eq!(codes(&at(0.07)), ["battery-critical"]);
-        assert_eq!(codes(&at(0.09)), ["battery-low"]);
-    }
-
-    #[test]
-    fn faults_and_losses_are_alerts_each_code_once() {
-        let mut alerts = Alerts::default();
-        let mut causes = Causes {
-            fault: Some(Fault::BaseSilent),
-            outbox: OutboxStatus {
-                pending: 60_000,
-                dropped: 1,
-                refused: 0,
-            },
-            ..Causes::default()
-        };
-        let first = alerts.judge(&causes);
-        assert_eq!(
-            codes(&first),
-            ["base-silent", "outbox-long", "outbox-dropped"]
-        );
-        causes.outbox.pending = 30_000;
-        assert!(codes(&alerts.judge(&causes)).contains(&"outbox-long"));
-        causes.outbox.pending = 20_000;
-        assert!(!codes(&alerts.judge(&causes)).contains(&"outbox-long"));
-    }
-
-    #[test]
-    fn a_loop_that_is_late_is_an_alert_with_its_figures() {
-        let causes = Causes {
-            overrun: Some(Overrun {
-                late: Duration::from_millis(310),
-                late_ticks: 5,
-            }),
-            ..Causes::default()
-        };
-        let said = Alerts::default().judge(&causes);
-        assert_eq!(codes(&said), ["loop-overrun"]);
-        let text =
-            "the control loop is late and the robot is held: a tick by 310 ms, 5 of 64 ticks";
-        assert_eq!(said[0].text, text);
-    }
-
-    #[test]
-    fn records_lost_by_damage_are_an_alert_of_their_own_with_their_number() {
-        let damage = OutboxDamage {
-            lost_records: 34,
-            kept_in: Some("/data/outbox/damaged.bin".into()),
-        };
-        let mut causes = Causes {
-            outbox: OutboxStatus {
-                pending: 34,
-                dropped: 34,
-                refused: 0,
-            },
-            outbox_damage: Some(&damage),
-            ..Causes::default()
-        };
-        let mut alerts = Alerts::default();
-        let said = alerts.judge(&causes);
-        assert_eq!(codes(&said), ["outbox-damaged"]);
-        let text = &said[0].text;
-        assert!(
-            text.contains("34 records") && text.contains("damaged.bin"),
-            "{text}"
-        );
-        causes.outbox.dropped = 35;
-        let both = ["outbox-dropped", "outbox-damaged"];
-        assert_eq!(codes(&alerts.judge(&causes)), both, "a full store too");
-        causes.outbox.dropped = 34;
-        let seen = OutboxDamage {
-            kept_in: None,
-            ..damage.clone()
-        };
-        causes.outbox_damage = Some(&seen);
-        assert!(
-            alerts.judge(&causes).is_empty(),
-            "somebody has looked at it"
-        );
-    }
-
-    #[test]
-    fn a_base_that_started_again_and_a_second_commander_are_alerts() {
-        let counts = Counts::default();
-        let (mut alerts, causes) = (
-            Alerts::default(),
-            Causes {
-                base: Some(&counts),
-                ..Causes::default()
-            },
-        );
-        assert!(alerts.judge(&causes).is_empty());
-        counts.note(Source::Joints, Notice::Restarted);
-        counts.note_foreign_command();
-        let said = alerts.judge(&causes);
-        assert_eq!(codes(&said), ["command-second-writer", "base-restarted"]);
-        assert!(said[0].text.contains("another node"), "{said:?}");
-        assert!(said[1].text.contains("joints"), "{said:?}");
-    }
-
-    #[test]
-    fn other_ground_and_wheels_that_dig_are_alerts_with_their_words() {
-        let known = |theta, std_dev| ThetaKnowledge { theta, std_dev };
-        let causes = Causes {
-            surface_change: Some(Comparison {
-                cell: Cell { ix: -3, iy: 12 },
-                measured: known(1.43, 0.05),
-                expected: known(0.2, 0.02),
-                robot_bias_ratio: ROBOT_BIAS_RATIO,
-            }),
-            dug_in_at: Some(Point {
-                x_m: 3.04,
-                y_m: -1.0,
-            }),
-            ..Causes::default()
-        };
-        let said = Alerts::default().judge(&causes);
-        assert_eq!(codes(&said), ["dug-in", "surface-change"]);
-        assert_eq!(
-            said[0].text,
-            "the wheels turn and the robot stays at (3.0 m, -1.0 m)"
-        );
-        assert_eq!(
-            said[1].text,
-            "the ground in cell (-3, 12) slips more than the map says: θ 1.43 ± 0.05, not 0.20 ± 0.02"
-        );
-    }
-
-    #[test]
-    fn sensors_that_contradict_are_alerts_by_code_with_channel_and_both_values() {
-        let finding = |subject, kind, observed, predicted| Finding {
-            subject,
-            kind,
-            observed,
-            predicted,
-            unit: Unit::RadiansPerSecond,
-        };
-        let mut alerts = sensor_alerts(&[finding(Subject::Gyro, Kind::Frozen, 0.52, -0.31)]);
-        let only = alerts.pop().unwrap();
-        assert_eq!(only.code.as_str(), "sensor-frozen");
-        assert_eq!(only.severity, Severity::Critical);
-        assert_eq!(
-            only.text,
-            "gyro frozen: observed 0.52 rad/s, predicted -0.31 rad/s"
-        );
-        let said = sensor_alerts(&[
-            finding(Subject::Odometry, Kind::Inconsistent, 0.9, 0.6),
-            finding(Subject::Position, Kind::Jumped, 5.0, 0.0),
-            finding(Subject::WheelsAndMotion, Kind::Inconsistent, 0.9, 0.1),
-            finding(Subject::LeftWheels, Kind::Locked, 0.0, 6.0),
-        ]);
-        assert_eq!(
-            codes(&said),
-            [
-                "sensor-inconsistent",
-                "wheels-and-motion-disagree",
-                "wheel-locked"
-            ]
-        );
-        assert_eq!(said[0].severity, Severity::Critical, "the worse of both");
-        assert!(
-            said[0].text.contains("odometry speed") && said[0].text.contains("position jumped")
-        );
-        assert_eq!(said[1].severity, Severity::Warning);
-    }
-
-    #[test]
-    fn a_robot_that_does_not_stand_is_the_first_alert() {
-        let mut causes = Causes {
-            is_stopped: true,
-            standing: StandingReport {
-                is_to_stand: true,
-                does_not_stand: Some(Shown::Speed(0.59)),
-                ..StandingReport::default()
-            },
-            ..Causes::default()
-        };
-        let said = Alerts::default().judge(&causes);
-        assert_eq!(codes(&said), ["does-not-stand", "stopped"]);
-        assert!(said[0].text.contains("0.59 m/s"), "{}", said[0].text);
-        assert_eq!(said[0].severity, Severity::Critical);
-        causes.standing.does_not_stand = None;
-        causes.standing.moves = Some(Shown::Distance(0.6));
-        let said = Alerts::default().judge(&causes);
-        assert_eq!(codes(&said), ["moves-while-stopped", "stopped"]);
-    }
-}
+mod tests;

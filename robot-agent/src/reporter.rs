@@ -109,6 +109,7 @@ impl Reporter {
             outbox_damage: Some(&outbox_damage),
             base: self.base.as_deref(),
             surface_change: snapshot.surface_change,
+            payload_change: snapshot.payload_change,
             dug_in_at: snapshot.dug_in_at,
             overrun: snapshot.overrun,
             findings: snapshot.findings,
@@ -219,6 +220,7 @@ impl Reporter {
                 theta_measured: snapshot.theta_measured,
                 excited: snapshot.excited,
                 slip: snapshot.slip,
+                robot_parameters: snapshot.robot_parameters,
             },
         }
     }

@@ -3,6 +3,7 @@
 use std::process::ExitCode;
 
 use serde::Serialize;
+use tread_api::friction::NORMAL_95;
 use tread_api::ids::{RobotId, SiteId};
 use tread_api::robot::{LinkState, MissionProgress, Robot, RobotLive, RobotMode};
 use tread_api::safety::{Driver, SafetyStatus};
@@ -190,6 +191,7 @@ fn live_lines(live: &RobotLive) -> Vec<String> {
             age(friction.age_ms)
         )
     }));
+    lines.extend(parameters(live));
     let slip = live.friction.and_then(|friction| friction.value.slip);
     lines.extend(slip.map(|slip| {
         format!(
@@ -242,6 +244,35 @@ fn safety_lines(safety: &SafetyStatus) -> Vec<String> {
 pub(super) fn theta(live: &RobotLive) -> Option<String> {
     let measured = live.friction?.value.theta_measured?;
     Some(format!("{:.4} ± {:.4}", measured.theta, measured.std_dev))
+}
+
+/// Returns the parameters of the robot that were estimated while it drove, a line each.
+fn parameters(live: &RobotLive) -> Vec<String> {
+    let friction = live.friction.map(|friction| friction.value);
+    let Some(found) = friction.and_then(|friction| friction.robot_parameters) else {
+        return Vec::new();
+    };
+    let of_configured = " of the configured";
+    [
+        ("apparent mass", found.apparent_mass_ratio, of_configured),
+        ("mass", found.mass_kg, " kg"),
+        ("inertia / mass", found.yaw_inertia_ratio, of_configured),
+        ("centre forward", found.center_of_mass_forward_m, " m"),
+        ("centre left", found.center_of_mass_left_m, " m"),
+    ]
+    .map(|(name, estimate, unit)| {
+        let half_width = NORMAL_95 * estimate.std_dev;
+        let remark = if estimate.prior_dominated {
+            " (mostly prior)"
+        } else {
+            ""
+        };
+        format!(
+            "{name:<15}{:.3} ± {half_width:.3}{unit}{remark}",
+            estimate.value
+        )
+    })
+    .to_vec()
 }
 
 /// Returns the progress of a mission in whole steps, 0 to `steps`; `None` while its length is

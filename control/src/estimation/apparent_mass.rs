@@ -62,14 +62,14 @@ pub(super) struct ApparentMass {
 }
 
 impl ApparentMass {
-    /// Takes a sample, `dt_s` after the one before.
+    /// Takes a sample, `dt_s` after the one before. Returns whether it ended a window.
     pub(super) fn add(
         &mut self,
         sample: &SensorSample,
         model: &RobotModel,
         noise: &SensorNoise,
         dt_s: f64,
-    ) {
+    ) -> bool {
         self.heading_rad += sample.gyro_rad_s * dt_s;
         let block = &mut self.block;
         block.duration_s += dt_s;
@@ -92,15 +92,14 @@ impl ApparentMass {
             _ => block.is_broken = true,
         }
         if block.duration_s < BLOCK_S - 1.0e-6 {
-            return;
+            return false;
         }
         let block = std::mem::take(&mut self.block);
-        if !block.is_broken {
-            self.take(&block, noise);
-        }
+        !block.is_broken && self.take(&block, noise)
     }
 
-    fn take(&mut self, block: &Means, noise: &SensorNoise) {
+    /// Takes a block. Returns whether it ended a window.
+    fn take(&mut self, block: &Means, noise: &SensorNoise) -> bool {
         let force = block.forward_m_s2 / block.samples / GRAVITY_M_S2;
         let (sin, cos) = self.heading_rad.sin_cos();
         let others = Vector3::new(block.sign, cos, sin);
@@ -120,7 +119,9 @@ impl ApparentMass {
             self.information += information;
             self.weighted += weighted;
             self.window = Window::default();
+            return true;
         }
+        false
     }
 
     /// The averages begin anew after a gap.

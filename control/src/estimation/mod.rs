@@ -37,6 +37,7 @@ mod expectation;
 mod identification;
 mod longitudinal;
 mod offsets;
+mod payload;
 mod regression;
 mod rows;
 mod segment;
@@ -55,14 +56,16 @@ pub use expectation::{ExpectedAccuracy, expected_accuracy};
 use identification::{Identification, Identified};
 use longitudinal::{LongitudinalFilter, SlipBound};
 use offsets::OffsetKnowledge;
+use payload::PayloadMonitor;
 use regression::{Shared, Solution, SolveInput, solve};
 use rows::Row;
 pub use segment::SegmentStatistics;
 use segment::{Claims, SegmentTheta};
 use sums::Sums;
 pub use types::{
-    CommonError, Estimate, EstimatorPrior, ModelUncertainty, SensorNoise, SensorSample,
-    ThetaMeasurement, TyrePrior, UpdateOutcome, ValueWithDeviation,
+    CommonError, Estimate, EstimatorPrior, IdentifiedRobot, IdentifiedValue, ModelUncertainty,
+    PayloadChange, SensorNoise, SensorSample, ThetaMeasurement, TyrePrior, UpdateOutcome,
+    ValueWithDeviation,
 };
 
 /// Time over which samples are averaged, seconds.
@@ -122,6 +125,7 @@ pub struct Estimator {
     change: ChangeDetector,
     excitation: Excitation,
     apparent_mass: ApparentMass,
+    payload: PayloadMonitor,
     bound: ThetaBound,
     estimate: Estimate,
     /// What all blocks of this ground give, where that is a measurement.
@@ -163,6 +167,7 @@ impl Estimator {
             change: ChangeDetector::default(),
             excitation: Excitation::default(),
             apparent_mass: ApparentMass::default(),
+            payload: PayloadMonitor::default(),
             bound: ThetaBound {
                 theta: None,
                 slip_max: f64::INFINITY,
@@ -205,6 +210,7 @@ impl Estimator {
             // Nothing is known of the time between: averages begin anew.
             self.block = BlockBuilder::default();
             self.apparent_mass.interrupt();
+            self.payload.interrupt();
             self.turning_before = None;
             self.longitudinal = LongitudinalFilter::new();
             if let Some(identification) = &mut self.identification {
@@ -218,6 +224,9 @@ impl Estimator {
         }
         self.apparent_mass
             .add(sample, &self.model, &self.noise, dt_s);
+        if self.payload.add(sample, &self.model, &self.noise, dt_s) {
+            self.begin_load();
+        }
         self.block.add(sample, &self.model, dt_s);
         if !self.block.is_full() {
             return UpdateOutcome::default();
@@ -393,7 +402,17 @@ impl Estimator {
             radius_difference,
             saturation_share: sums.saturation_share(),
             dropped_samples: self.dropped_samples,
+            robot: self.identification.as_ref().and_then(|found| found.robot()),
+            payload_change: self.payload.change(),
         };
+    }
+
+    /// Starts with another load: what was learned of mass and inertia is forgotten.
+    fn begin_load(&mut self) {
+        self.apparent_mass = ApparentMass::default();
+        if let Some(identification) = &mut self.identification {
+            identification.begin_load();
+        }
     }
 
     /// What θ is multiplied by since the robot weighs more than its model: the same torque is less
@@ -494,7 +513,7 @@ impl Estimator {
             Some(identification) => identification
                 .close_segment()
                 .map(|found| self.claims.identified(&found)),
-            None => self.segment_of_rows(&segment, &whole, before, (&offsets, &tyres)),
+            None => self.segment_of_rows(&segment, &whole, before.as_ref(), (&offsets, &tyres)),
         };
         let statistics = SegmentStatistics::of(
             &segment,
@@ -514,7 +533,7 @@ impl Estimator {
         &mut self,
         segment: &Sums,
         whole: &Sums,
-        before: Option<Solution>,
+        before: Option<&Solution>,
         (offsets, tyres): (&OffsetKnowledge, &TyrePrior),
     ) -> Option<SegmentTheta> {
         // Where all blocks together are no measurement, none of them is one.

@@ -262,6 +262,46 @@ pub struct ThetaMeasurement {
     pub duration_s: f64,
 }
 
+/// A parameter of the robot that was identified.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct IdentifiedValue {
+    /// Its value.
+    pub value: f64,
+    /// Its standard deviation.
+    pub std_dev: f64,
+    /// Whether most of what is known of it was known beforehand: its variance is more than half of
+    /// that of the prior.
+    pub is_mostly_prior: bool,
+}
+
+/// The robot's own parameters, as they were identified together with θ.
+///
+/// On flat ground torques and accelerations tell only the apparent mass, so that the mass itself
+/// rests on what is known of torque constants and rotors. Without torque nothing tells a mass.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct IdentifiedRobot {
+    /// Apparent mass `s (m + j)` over the mass of the model: torque scale s, mass m with payload, and
+    /// inertia j of rotors and wheels at the rim.
+    pub apparent_mass_ratio: IdentifiedValue,
+    /// Mass with payload, kilograms.
+    pub mass_kg: IdentifiedValue,
+    /// Yaw inertia over mass, over that of the model.
+    pub inertia_ratio: IdentifiedValue,
+    /// Centre of mass forward of the centre of the wheels, metres.
+    pub centre_forward_m: IdentifiedValue,
+    /// Centre of mass to the left of it, metres.
+    pub centre_left_m: IdentifiedValue,
+}
+
+/// A change of the load.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PayloadChange {
+    /// Apparent mass over the mass of the model before the robot stood.
+    pub before: ValueWithDeviation,
+    /// The same since then.
+    pub after: ValueWithDeviation,
+}
+
 /// What the estimator can say.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Estimate {
@@ -283,6 +323,11 @@ pub struct Estimate {
     pub saturation_share: f64,
     /// Samples dropped because they were not finite or not possible.
     pub dropped_samples: u64,
+    /// The robot's own parameters; none of a robot that counts as exactly as its model says, and
+    /// before anything is known.
+    pub robot: Option<IdentifiedRobot>,
+    /// The last change of the load, for ten minutes of driving.
+    pub payload_change: Option<PayloadChange>,
 }
 
 /// A figure and its standard deviation.

@@ -57,6 +57,11 @@ impl RoughDrive {
         &self.commands
     }
 
+    /// Changes the payload to this ratio of the model's mass. The robot should be at rest.
+    pub fn load(&mut self, model: &RobotModel, payload_ratio: f64) {
+        self.plant.load(model, payload_ratio);
+    }
+
     /// What it truly is and does.
     pub fn plant(&self) -> &Plant {
         &self.plant

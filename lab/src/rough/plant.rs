@@ -103,6 +103,10 @@ pub struct Plant {
     blend: Option<(Shape, f64)>,
 }
 
+fn inertia_over_mass_m2(model: &RobotModel, spec: &Deviations) -> f64 {
+    model.yaw_inertia_kg_m2() / model.mass_kg() * spec.inertia_ratio
+}
+
 impl Plant {
     /// A robot at rest, with its wheels' centre at a pose; none if four loads are no rectangle.
     pub fn new(model: &RobotModel, spec: Deviations, start: Pose) -> Option<Self> {
@@ -138,9 +142,7 @@ impl Plant {
         let (sin, cos) = start.heading_rad.sin_cos();
         let mut plant = Self {
             mass_kg,
-            inertia_kg_m2: model.yaw_inertia_kg_m2()
-                * spec.inertia_ratio
-                * (1.0 + spec.payload_ratio),
+            inertia_kg_m2: mass_kg * inertia_over_mass_m2(model, &spec),
             side_inertia_kg_m2: spec.rotor_ratio * 0.5 * model.mass_kg() * nominal_m.powi(2),
             center_m,
             radius_m,
@@ -163,6 +165,14 @@ impl Plant {
         };
         plant.bear(1.0);
         Some(plant)
+    }
+
+    /// Changes the payload to this ratio of the model's mass, at the centre of mass.
+    pub fn load(&mut self, model: &RobotModel, payload_ratio: f64) {
+        self.spec.payload_ratio = payload_ratio;
+        self.mass_kg = model.mass_kg() * (1.0 + payload_ratio);
+        self.inertia_kg_m2 = self.mass_kg * inertia_over_mass_m2(model, &self.spec);
+        self.bear(1.0);
     }
 
     /// What it is.

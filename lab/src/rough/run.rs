@@ -3,13 +3,14 @@
 use std::time::Duration;
 
 use tread_agent::testing::Bench;
-use tread_api::friction::ThetaEstimate;
+use tread_api::friction::{ParameterEstimate, RobotParameters, ThetaEstimate};
 use tread_api::geometry::Point;
 use tread_api::trajectory::{
     Circle, Direction, Trajectory, TrajectoryOptions, Waypoint, Waypoints,
 };
 use tread_control::estimation::EstimatorPrior;
 use tread_control::geometry::Pose;
+use tread_control::robot::RobotModel;
 
 use super::bound::{BoundInput, bounds};
 use super::drive::RoughDrive;
@@ -111,6 +112,42 @@ pub struct Outcome {
     pub truth: f64,
     /// Share of the time in which a contact slipped beyond half the slip of the peak.
     pub beyond_half_peak: f64,
+    /// What the agent said of the robot's own parameters in the end.
+    pub parameters: Option<RobotParameters>,
+    /// Their true values, in the order of [`estimates()`].
+    pub true_parameters: [f64; PARAMETERS.len()],
+}
+
+/// Names of a robot's parameters.
+pub const PARAMETERS: [&str; 5] = [
+    "apparent mass over the model's",
+    "mass, kg",
+    "yaw inertia over mass, over the model's",
+    "centre of mass forward, m",
+    "centre of mass to the left, m",
+];
+
+/// A robot's parameters in the order of [`PARAMETERS`].
+pub fn estimates(parameters: &RobotParameters) -> [ParameterEstimate; PARAMETERS.len()] {
+    [
+        parameters.apparent_mass_ratio,
+        parameters.mass_kg,
+        parameters.yaw_inertia_ratio,
+        parameters.center_of_mass_forward_m,
+        parameters.center_of_mass_left_m,
+    ]
+}
+
+fn true_parameters(model: &RobotModel, spec: &Deviations) -> [f64; PARAMETERS.len()] {
+    let scale = 0.5 * (spec.torque_scale[0] + spec.torque_scale[1]);
+    let mass_ratio = 1.0 + spec.payload_ratio;
+    [
+        scale * (mass_ratio + spec.rotor_ratio),
+        mass_ratio * model.mass_kg(),
+        spec.inertia_ratio,
+        spec.center_forward_ratio * model.wheelbase_m(),
+        spec.center_left_ratio * model.track_width_m(),
+    ]
 }
 
 /// Drives; an error if the robot, its pose or its plan cannot be.
@@ -163,5 +200,7 @@ pub fn run(trial: &Trial) -> anyhow::Result<Outcome> {
         bounds,
         truth: trial.deviations.curve.theta(),
         beyond_half_peak: f64::from(beyond) / f64::from(ticks.max(1)),
+        parameters: bench.robot_parameters(),
+        true_parameters: true_parameters(&model, &trial.deviations),
     })
 }

@@ -10,13 +10,13 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use jiff::Timestamp;
-use tread_api::friction::{SideSlip, ThetaEstimate};
+use tread_api::friction::{RobotParameters, SideSlip, ThetaEstimate};
 use tread_api::ids::{MissionId, PlanHash};
 use tread_api::robot::{MissionProgress, RobotMode};
 use tread_api::site::Cell;
 use tread_api::wire::ingest::MissionPhase;
 use tread_control::consistency::Findings;
-use tread_control::estimation::SegmentStatistics;
+use tread_control::estimation::{PayloadChange, SegmentStatistics};
 use tread_control::follower::{FailureReason, Follower};
 use tread_control::gate::GateCause;
 use tread_control::geometry::{Point, Pose, Twist};
@@ -240,6 +240,10 @@ pub(crate) struct Snapshot {
     pub theta_loop: Option<f64>,
     /// Measured θ of the ground under the robot.
     pub theta_measured: Option<ThetaEstimate>,
+    /// Parameters of the robot, estimated together with θ.
+    pub robot_parameters: Option<RobotParameters>,
+    /// The last change of the payload, while it is reported.
+    pub(crate) payload_change: Option<PayloadChange>,
     /// Whether recent motion carried information on θ.
     pub excited: bool,
     /// The comparison that raised the alert that the ground differs from the map.
@@ -282,6 +286,8 @@ impl Default for Snapshot {
             battery: None,
             theta_loop: None,
             theta_measured: None,
+            robot_parameters: None,
+            payload_change: None,
             excited: false,
             surface_change: None,
             dug_in_at: None,

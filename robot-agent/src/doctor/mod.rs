@@ -4,7 +4,7 @@
 //! it ahead for a metre, slowly, and compares what was commanded with what was said ([`moving`]):
 //! sensors that froze ([`frozen`]), sides and signs ([`signs`]), the frame of the odometry's twist
 //! ([`twist_frame`]), the tracks ([`track`]), and how the wheels pull with the robot's mass
-//! ([`pulling`]). Each finding names the key of `robot.toml` to look at, and the lines that mend it
+//! ([`pulling`]), and estimates mass, inertia and centre of mass ([`parameters`]). Each finding names the key of `robot.toml` to look at, and the lines that mend it
 //! where there are such.
 
 mod drove;
@@ -14,6 +14,7 @@ mod heard;
 mod joint_names;
 mod listening;
 mod moving;
+mod parameters;
 mod pulling;
 mod signs;
 mod track;
@@ -34,6 +35,7 @@ use tread_control::twist_limits::TwistLimits;
 use self::drove::Drove;
 use self::finding::Finding;
 use self::heard::{Heard, Message};
+use self::parameters::Parameters;
 use crate::clock::{SharedClock, SystemClock};
 use crate::config::{AgentConfig, DriveConfig, Flags};
 use crate::drive::Drive as _;
@@ -130,6 +132,7 @@ fn examine(args: &DoctorArgs) -> anyhow::Result<Vec<Finding>> {
         clock,
         limits: GateLimits::of(&model),
         said: WheelSpeeds::default(),
+        parameters: Parameters::new(model, config.prior),
     };
     let until = hands.clock.monotonic() + FIRST_WORD_MAX;
     while heard.is_empty() && hands.clock.monotonic() < until {
@@ -160,6 +163,7 @@ struct Hands {
     clock: SharedClock,
     limits: GateLimits,
     said: WheelSpeeds,
+    parameters: Parameters,
 }
 
 impl Hands {
@@ -220,6 +224,11 @@ impl Hands {
         findings.extend(moving::findings(
             settings, model, &turned, &forward, bias_rad_s,
         ));
+        findings.push(if findings.iter().all(|finding| finding.holds) {
+            self.parameters.finding()
+        } else {
+            parameters::spoiled()
+        });
         findings
     }
 
@@ -241,7 +250,8 @@ impl Hands {
     ) -> bool {
         let until = self.clock.monotonic() + span;
         while self.clock.monotonic() < until {
-            let _ = self.drive.read(self.clock.monotonic());
+            let feedback = self.drive.read(self.clock.monotonic());
+            self.parameters.take(&feedback);
             let input = GateInput {
                 command: Some(command),
                 previous: self.said,

@@ -11,6 +11,7 @@ use std::sync::{Arc, OnceLock};
 use std::thread::Thread;
 use std::time::Duration;
 
+use tread_control::estimation;
 use tread_control::geometry::Pose;
 use tread_control::localisation::FixNoise;
 use tread_control::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
@@ -42,6 +43,17 @@ pub struct SensorSample {
     pub position: Option<Pose>,
     /// Standard deviations of the fix, where the base states them.
     pub position_noise: Option<FixNoise>,
+}
+
+/// The motion of a sample for the estimator, if gyro and wheels are finite.
+pub(crate) fn motion_of(sample: &SensorSample) -> Option<estimation::SensorSample> {
+    Some(estimation::SensorSample {
+        wheel_speeds: sample.wheel_speeds.filter(|speeds| speeds.is_finite())?,
+        gyro_rad_s: sample.yaw_rate_rad_s.filter(|rate| rate.is_finite())?,
+        acceleration: sample.acceleration,
+        body_speed_m_s: sample.body_speed_m_s,
+        wheel_torques: sample.wheel_torques,
+    })
 }
 
 /// Standard deviations of the sensors' noise, where the base states them.

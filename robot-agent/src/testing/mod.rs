@@ -12,7 +12,7 @@ use std::sync::mpsc::SendError;
 use std::time::Duration;
 
 use jiff::Timestamp;
-use tread_api::friction::{Segment, ThetaEstimate};
+use tread_api::friction::{RobotParameters, Segment, ThetaEstimate};
 use tread_api::ids::{BootId, ConfigurationId, MissionId, PlanHash, RobotId, SiteId};
 use tread_api::safety::Geofence;
 use tread_api::site::Grid;
@@ -339,6 +339,21 @@ impl<D: SteppedDrive> Bench<D> {
     /// What the robot measured of the present ground, as it reports it.
     pub fn theta(&self) -> Option<ThetaEstimate> {
         self.ends.shared.snapshot().theta_measured
+    }
+
+    /// Parameters of the robot, as it reports them.
+    pub fn robot_parameters(&self) -> Option<RobotParameters> {
+        self.ends.shared.snapshot().robot_parameters
+    }
+
+    /// Whether it reports a change of its payload.
+    pub fn reports_payload_change(&self) -> bool {
+        self.ends.shared.snapshot().payload_change.is_some()
+    }
+
+    /// The base, to change what it is.
+    pub fn drive_mut(&mut self) -> &mut D {
+        &mut self.drive
     }
 
     /// Writes what was noted, if it is to be recorded.

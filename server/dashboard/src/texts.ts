@@ -202,6 +202,12 @@ export const texts = {
     outbox: 'Measurements waiting',
     frictionMeasured: 'θ measured',
     frictionLoop: 'θ in the loop',
+    apparentMass: 'Apparent mass over configured mass, 95 %',
+    mass: 'Mass with payload, 95 %',
+    yawInertia: 'Yaw inertia per mass over configured, 95 %',
+    centerForward: 'Centre of mass, forward, 95 %',
+    centerLeft: 'Centre of mass, left, 95 %',
+    mostlyPrior: '(mostly prior)',
     excitation: 'Motion of late',
     slip: 'Wheel slip, left and right',
     excited: 'suffices for θ',
@@ -458,6 +464,6 @@ export const texts = {
     robotsSeen: (robots: number, segments: number) =>
       `${robots} ${robots === 1 ? 'robot' : 'robots'}, ${segments} ${segments === 1 ? 'measurement' : 'measurements'}`,
   },
-  unit: { m: 'm', mm: 'mm', s: 's', mps: 'm/s', radps: 'rad/s', mps2: 'm/s²', percent: '%', ms: 'ms', deg: '°', h: 'h', d: 'd', min: 'min' },
+  unit: { m: 'm', mm: 'mm', kg: 'kg', s: 's', mps: 'm/s', radps: 'rad/s', mps2: 'm/s²', percent: '%', ms: 'ms', deg: '°', h: 'h', d: 'd', min: 'min' },
   unknown: '–',
 };

@@ -147,7 +147,7 @@ fn map(seed: u64, has_torque: bool, robots: u32) -> anyhow::Result<GroundMap> {
         half_widths: Vec::new(),
     };
     for sums in cells.into_values() {
-        found.judge(sums, now_us);
+        found.judge(&sums, now_us);
     }
     Ok(found)
 }
@@ -179,7 +179,7 @@ fn site() -> SiteDefinition {
 }
 
 impl GroundMap {
-    fn judge(&mut self, sums: Vec<(u32, Sums)>, now_us: i64) {
+    fn judge(&mut self, sums: &[(u32, Sums)], now_us: i64) {
         self.cells += 1;
         let seen = sums.iter();
         let mut seen: Vec<Seen<u32>> = seen

@@ -8,7 +8,7 @@
 
 use super::dual::{Dual, Real};
 use super::model::{Input, Output, State};
-use super::parameters::{OF_GROUND, PARAMETERS, Robot, SHAPE_MIN, Square, Values, index};
+use super::parameters::{PARAMETERS, Robot, SHAPE_MIN, Square, Values, index};
 use crate::robot::RobotModel;
 
 /// Channels: turn rate, acceleration (forward, left), torque (left, right), body speed.
@@ -307,6 +307,23 @@ impl Hypothesis {
         few * (self.ground.scores * self.of_stiffness).dot(&self.of_stiffness)
     }
 
+    /// Variances of linear functions of the parameters. Blocks scatter as they do. None if nothing
+    /// follows from the blocks.
+    pub(super) fn variances_of<const COUNT: usize>(
+        &self,
+        prior: &Prior,
+        slopes: &[Values; COUNT],
+    ) -> Option<[f64; COUNT]> {
+        let cholesky = (self.ground.information + prior.information).cholesky()?;
+        let few = 1.0 + 2.0 / self.ground.count.max(1.0);
+        Some(slopes.map(|slopes| {
+            let covariances = cholesky.solve(&slopes);
+            let scattered = few * (self.ground.scores * covariances).dot(&covariances);
+            let known = (prior.information * covariances).dot(&covariances);
+            (scattered + known).max(covariances.dot(&slopes))
+        }))
+    }
+
     /// Drops the last block and the open one: they may be of either ground.
     pub(super) fn drop_last_block(&mut self) {
         self.ground.add(&self.last, -1.0);
@@ -350,13 +367,13 @@ impl Hypothesis {
         (is_known && own.is_finite()).then_some(found)
     }
 
-    /// What this tells beforehand of another ground: the robot's own parameters.
-    pub(super) fn prior_on_new_ground(&self, prior: &Prior) -> Option<Prior> {
+    /// What this tells beforehand where some of the parameters have changed: all others.
+    pub(super) fn prior_without(&self, prior: &Prior, changed: &[usize]) -> Option<Prior> {
         let mut covariance = (self.ground.information + prior.information)
             .cholesky()?
             .inverse();
         let mut mean = self.values;
-        for place in OF_GROUND {
+        for &place in changed {
             covariance.column_mut(place).fill(0.0);
             covariance.row_mut(place).fill(0.0);
             covariance[(place, place)] = prior.std_devs[place].powi(2);

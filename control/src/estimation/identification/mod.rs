@@ -12,10 +12,12 @@ mod dual;
 mod hypothesis;
 mod model;
 mod parameters;
+mod robot;
+mod segment;
 #[cfg(test)]
 mod tests;
 
-use super::{EstimatorPrior, GAP_MAX_S, SensorNoise, SensorSample};
+use super::{EstimatorPrior, GAP_MAX_S, IdentifiedRobot, SensorNoise, SensorSample};
 use crate::robot::RobotModel;
 
 use hypothesis::{CHANNELS, Hypothesis, Measured, Prior};
@@ -56,9 +58,6 @@ const MODEL_LN_THETA_STD_DEV: f64 = 0.03;
 const MODEL_THETA_STD_DEV: f64 = 0.006;
 /// Shortest time that a block may have where a segment ends, seconds.
 const SHORT_BLOCK_S: f64 = 0.5;
-/// Standard deviations of ln K beyond which a segment tells nothing: by its own blocks, and in all.
-const SEGMENT_OWN_STD_DEV_MAX: f64 = 0.5;
-const SEGMENT_STD_DEV_MAX: f64 = 1.0;
 /// Mean square of standardised residuals beyond which the robot does not move as the model can.
 const SQUARE_MAX: f64 = 30.0;
 
@@ -110,6 +109,8 @@ pub(super) struct Identification {
     segment_s: f64,
     last_block_s: f64,
     is_moving: bool,
+    robot: Option<IdentifiedRobot>,
+    is_robot_due: bool,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -146,6 +147,8 @@ impl Identification {
             segment_s: 0.0,
             last_block_s: 0.0,
             is_moving: false,
+            robot: None,
+            is_robot_due: false,
         };
         identification.begin(&State::rolling(0.0, 0.0));
         Some(identification)
@@ -161,8 +164,18 @@ impl Identification {
 
     /// Starts on new ground, of which nothing is known; what was identified of the robot stays.
     pub(super) fn begin_ground(&mut self) {
+        self.begin_without(&parameters::OF_GROUND);
+    }
+
+    /// Starts with another load; what was identified of torques, radii and sensors stays.
+    pub(super) fn begin_load(&mut self) {
+        self.robot = None;
+        self.begin_without(&parameters::OF_LOAD_AND_GROUND);
+    }
+
+    fn begin_without(&mut self, changed: &[usize]) {
         let best = self.best().filter(|best| best.age() >= BLOCKS_MIN);
-        if let Some(prior) = best.and_then(|best| best.prior_on_new_ground(&self.prior)) {
+        if let Some(prior) = best.and_then(|best| best.prior_without(&self.prior, changed)) {
             self.prior = prior;
         }
         let state = self.state();
@@ -334,6 +347,10 @@ impl Identification {
         self.clear_sums();
         if self.block_s >= BLOCK_S - 1.0e-6 {
             self.end_block();
+            self.is_robot_due = true;
+        } else if self.block_s >= SHORT_BLOCK_S && std::mem::take(&mut self.is_robot_due) {
+            // In another sample than the end of the block, which takes long enough.
+            self.robot = self.identify_robot().or(self.robot);
         }
     }
 
@@ -424,57 +441,9 @@ impl Identification {
         is_known.then(|| Identified::new(mean, variance - of_prior, of_prior, duration_s))
     }
 
-    /// Drops the last block: it may be of another ground.
-    pub(super) fn drop_last_block(&mut self) {
-        for hypothesis in &mut self.hypotheses {
-            hypothesis.drop_last_block();
-        }
-        self.segment_s = (self.segment_s - std::mem::take(&mut self.last_block_s)).max(0.0);
-        self.block_s = 0.0;
-        self.is_moving = false;
-    }
-
-    /// Ends a segment of this ground, and gives θ of its own blocks; none where that tells nothing.
-    /// θ is linear in ln K about that of the whole ground, so that the noise of short segments averages
-    /// out in a weighted mean.
-    pub(super) fn close_segment(&mut self) -> Option<Identified> {
-        if self.block_s >= SHORT_BLOCK_S {
-            self.end_block();
-        }
-        let ground = self.identified();
-        let duration_s = std::mem::take(&mut self.segment_s);
-        self.last_block_s = 0.0;
-        let least = self.least_cost();
-        let (mut weights, mut mean, mut square, mut own, mut known) = (0.0, 0.0, 0.0, 0.0, 0.0);
-        let mut is_known = true;
-        for hypothesis in &mut self.hypotheses {
-            let weight = (-(hypothesis.cost() - least) / COST_SCALE).exp();
-            let Some(segment) = hypothesis.close_segment(&self.prior) else {
-                is_known = false;
-                continue;
-            };
-            weights += weight;
-            mean += weight * segment.ln_stiffness;
-            square += weight * segment.ln_stiffness.powi(2);
-            own += weight * segment.own;
-            known += weight * segment.known;
-        }
-        let ground = ground.filter(|_| is_known)?;
-        mean /= weights;
-        own /= weights;
-        // What the hypotheses differ by is not known of the robot.
-        let of_robot = known / weights + (square / weights - mean * mean).max(0.0);
-        if own.sqrt() > SEGMENT_OWN_STD_DEV_MAX || (own + of_robot).sqrt() > SEGMENT_STD_DEV_MAX {
-            return None;
-        }
-        let theta = ground.theta * (1.0 - mean - ground.theta.ln());
-        (theta > 0.0).then(|| Identified {
-            theta,
-            duration_s,
-            own_ratio: own.sqrt(),
-            robot_ratio: of_robot.sqrt(),
-            ..ground
-        })
+    /// The robot's own parameters, as last identified on this ground or on those before.
+    pub(super) fn robot(&self) -> Option<IdentifiedRobot> {
+        self.robot
     }
 }
 

@@ -69,6 +69,23 @@ pub(super) const OF_GROUND: [usize; 7] = [
     index::SLOPE_Y,
 ];
 
+/// Parameters that change with the load, and those of the ground: where a robot stood long enough to
+/// be loaded, the curve that it leaves on is not that it came on.
+pub(super) const OF_LOAD_AND_GROUND: [usize; 12] = [
+    index::MASS,
+    index::INERTIA,
+    index::CENTRE_FORWARD,
+    index::CENTRE_LEFT,
+    index::HEIGHT,
+    index::STIFFNESS,
+    index::RESISTANCE,
+    index::PEAK,
+    index::SHAPE,
+    index::BEND,
+    index::SLOPE_X,
+    index::SLOPE_Y,
+];
+
 /// Mean and standard deviation of ln K: ground from wet ice to asphalt.
 const LN_STIFFNESS: (f64, f64) = (1.1, 2.0);
 /// Of ln of the greatest friction coefficient.

@@ -12,6 +12,7 @@
 #![expect(clippy::print_stdout, reason = "a program that prints a report")]
 
 mod lines;
+mod parameters;
 mod score;
 
 use std::fs::File;
@@ -27,6 +28,7 @@ use tread_lab::report::{Check, checks_json};
 use tread_lab::rough::run::{ASKED_AT_S, Trial, run};
 
 use lines::{CHANGES, alone, population};
+use parameters::{ParameterLine, parameter_lines};
 use score::{Drive, Line, POPULATION, print, strata};
 
 #[derive(Debug, Parser)]
@@ -108,7 +110,7 @@ fn main() -> anyhow::Result<ExitCode> {
         }
         None => None,
     };
-    let mut lines = Vec::new();
+    let (mut lines, mut parameters) = (Vec::new(), Vec::new());
     for has_torque in [true, false] {
         let one_change = CHANGES
             .into_iter()
@@ -129,6 +131,7 @@ fn main() -> anyhow::Result<ExitCode> {
             ));
             if name == POPULATION {
                 lines.extend(strata(has_torque, &drives));
+                parameters.extend(parameter_lines(has_torque, &drives));
             }
         }
     }
@@ -140,14 +143,24 @@ fn main() -> anyhow::Result<ExitCode> {
     if let Some(mut file) = file {
         file.flush()?;
     }
-    let checks: Vec<Check> = lines.iter().flat_map(Line::checks).collect();
+    let of_parameters = parameters.iter().map(ParameterLine::check);
+    let checks: Vec<Check> = lines
+        .iter()
+        .flat_map(Line::checks)
+        .chain(of_parameters)
+        .collect();
     if arguments.json {
         println!(
             "{}",
-            serde_json::json!({ "lines": lines, "checks": checks_json(&checks) })
+            serde_json::json!({
+                "lines": lines,
+                "parameters": parameters,
+                "checks": checks_json(&checks),
+            })
         );
     } else {
         print(&lines);
+        parameters::print(&parameters);
     }
     Ok(if checks.iter().all(|check| check.holds) {
         ExitCode::SUCCESS

@@ -244,12 +244,12 @@ fn half_width(said: &ThetaEstimate) -> f64 {
     NORMAL_95 * said.std_dev / said.theta
 }
 
-fn median(figures: &mut [f64]) -> f64 {
+pub(crate) fn median(figures: &mut [f64]) -> f64 {
     figures.sort_by(f64::total_cmp);
     figures.get(figures.len() / 2).copied().unwrap_or(0.0)
 }
 
 #[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
-fn share(part: usize, of: usize) -> f64 {
+pub(crate) fn share(part: usize, of: usize) -> f64 {
     part as f64 / of.max(1) as f64
 }

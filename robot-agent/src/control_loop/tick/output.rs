@@ -6,9 +6,10 @@
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
-use tread_api::friction::ThetaEstimate;
+use tread_api::friction::{ParameterEstimate, RobotParameters, ThetaEstimate};
 use tread_api::robot::RobotMode;
 use tread_control::consistency::Subject;
+use tread_control::estimation::{IdentifiedRobot, IdentifiedValue};
 use tread_control::geometry::{Pose, Twist};
 use tread_control::measured::WheelSpeeds;
 use tread_control::robot::RobotModel;
@@ -161,6 +162,8 @@ impl Output {
             theta_loop: mission.theta_loop.filter(|theta| theta.is_finite()),
             theta_measured: measured
                 .filter(|theta| theta.theta.is_finite() && theta.std_dev.is_finite()),
+            robot_parameters: estimated.estimate.robot.map(robot_parameters),
+            payload_change: estimated.estimate.payload_change,
             excited: !estimated.estimate.no_new_information,
             surface_change: mission.surface_change,
             dug_in_at: estimated.dug_in_at,
@@ -229,5 +232,20 @@ fn mode(input: &OutputInput<'_>) -> RobotMode {
         RobotMode::Tracking
     } else {
         RobotMode::Idle
+    }
+}
+
+fn robot_parameters(robot: IdentifiedRobot) -> RobotParameters {
+    let estimate = |found: IdentifiedValue| ParameterEstimate {
+        value: found.value,
+        std_dev: found.std_dev,
+        prior_dominated: found.is_mostly_prior,
+    };
+    RobotParameters {
+        apparent_mass_ratio: estimate(robot.apparent_mass_ratio),
+        mass_kg: estimate(robot.mass_kg),
+        yaw_inertia_ratio: estimate(robot.inertia_ratio),
+        center_of_mass_forward_m: estimate(robot.centre_forward_m),
+        center_of_mass_left_m: estimate(robot.centre_left_m),
     }
 }

@@ -161,22 +161,14 @@ impl Sensing {
     /// Returns the sample's motion, if gyro and wheels are finite. Only such a sample counts as a
     /// message of the base: one that sends only non-finite values becomes silent.
     fn motion_of(&mut self, sample: &drive::SensorSample) -> Option<(SensorSample, f64)> {
-        let gyro_rad_s = sample.yaw_rate_rad_s.filter(|rate| rate.is_finite())?;
-        let wheel_speeds = sample.wheel_speeds.filter(|speeds| speeds.is_finite())?;
+        let motion = drive::motion_of(sample)?;
         let dt_s = self
             .last_sample
             .map_or(0.0, |last| sample.at.saturating_sub(last).as_secs_f64())
             .min(TICK_MAX_S);
         self.last_sample = Some(sample.at);
-        self.wheel_speeds = wheel_speeds;
-        let taken = SensorSample {
-            wheel_speeds,
-            gyro_rad_s,
-            acceleration: sample.acceleration,
-            body_speed_m_s: sample.body_speed_m_s,
-            wheel_torques: sample.wheel_torques,
-        };
-        Some((taken, dt_s))
+        self.wheel_speeds = motion.wheel_speeds;
+        Some((motion, dt_s))
     }
 }
 

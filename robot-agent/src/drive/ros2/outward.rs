@@ -280,6 +280,8 @@ fn estimator(snapshot: &Snapshot) -> Part {
         (Level::Warn, "the wheels turn without progress")
     } else if snapshot.surface_change.is_some() {
         (Level::Warn, "the ground is not as the map says")
+    } else if snapshot.payload_change.is_some() {
+        (Level::Warn, "the payload has changed")
     } else if snapshot.excited {
         (Level::Ok, "learns")
     } else {
@@ -298,6 +300,22 @@ fn estimator(snapshot: &Snapshot) -> Part {
                 number(measured.map(|it| it.std_dev)),
             ),
             ("theta of the law".to_owned(), number(snapshot.theta_loop)),
+            (
+                "apparent mass over configured mass".to_owned(),
+                number(
+                    snapshot
+                        .robot_parameters
+                        .map(|it| it.apparent_mass_ratio.value),
+                ),
+            ),
+            (
+                "yaw inertia over mass over configured".to_owned(),
+                number(
+                    snapshot
+                        .robot_parameters
+                        .map(|it| it.yaw_inertia_ratio.value),
+                ),
+            ),
         ],
     }
 }

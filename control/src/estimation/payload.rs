@@ -1,0 +1,110 @@
+//! Detects that a robot was loaded or unloaded while it stood.
+//!
+//! The apparent mass ([`ApparentMass`]) since the last standstill is compared with that before it. Slopes
+//! and rolling resistance are eliminated for each window of 5 s; what is left of them and of the
+//! tyres counts as [`UNMODELLED_RATIO`].
+
+use super::apparent_mass::ApparentMass;
+use super::{PayloadChange, SensorNoise, SensorSample, ValueWithDeviation};
+use crate::robot::RobotModel;
+
+/// Time that a robot stands while it is loaded, at least, seconds.
+const STANDSTILL_MIN_S: f64 = 5.0;
+/// Rim speed below which a robot stands, metres per second.
+const STANDING_M_S: f64 = 0.02;
+/// Smallest change of the apparent mass that counts, over the model's mass.
+const CHANGE_MIN_RATIO: f64 = 0.05;
+/// Smallest change in standard deviations.
+const CHANGE_MIN_STD_DEVS: f64 = 4.0;
+/// Standard deviation of what the windows do not eliminate, over the model's mass.
+const UNMODELLED_RATIO: f64 = 0.01;
+/// Largest standard deviation of an apparent mass that is compared.
+const COMPARED_STD_DEV_MAX: f64 = 0.05;
+/// Time for which a change is reported, seconds of samples.
+const REPORTED_FOR_S: f64 = 600.0;
+
+/// Compares apparent masses.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct PayloadMonitor {
+    /// Since the last standstill.
+    since: ApparentMass,
+    /// Before it, with the same load.
+    before: Option<ValueWithDeviation>,
+    standing_s: f64,
+    change: Option<PayloadChange>,
+    reported_s: f64,
+}
+
+impl PayloadMonitor {
+    /// Takes a sample, `dt_s` after the one before. Returns whether the load has changed.
+    pub(super) fn add(
+        &mut self,
+        sample: &SensorSample,
+        model: &RobotModel,
+        noise: &SensorNoise,
+        dt_s: f64,
+    ) -> bool {
+        self.reported_s += dt_s;
+        if self.reported_s > REPORTED_FOR_S {
+            self.change = None;
+        }
+        let rim_m_s = sample.wheel_speeds.magnitude_max_rad_s() * model.wheel_radius_m();
+        if rim_m_s < STANDING_M_S {
+            self.standing_s += dt_s;
+            self.since.interrupt();
+            return false;
+        }
+        if std::mem::take(&mut self.standing_s) >= STANDSTILL_MIN_S {
+            self.before = self.known();
+            self.since = ApparentMass::default();
+        }
+        let is_window_done = self.since.add(sample, model, noise, dt_s);
+        is_window_done && self.compare()
+    }
+
+    /// The averages begin anew after a gap.
+    pub(super) fn interrupt(&mut self) {
+        self.since.interrupt();
+    }
+
+    /// The last change, while it is reported.
+    pub(super) fn change(&self) -> Option<PayloadChange> {
+        self.change
+    }
+
+    /// The apparent mass since the last standstill, where it is known well enough.
+    fn present(&self) -> Option<ValueWithDeviation> {
+        let value = self.since.value()?;
+        let std_dev = value.std_dev.hypot(UNMODELLED_RATIO);
+        (std_dev < COMPARED_STD_DEV_MAX).then_some(ValueWithDeviation { std_dev, ..value })
+    }
+
+    /// The apparent mass with the present load, before and since the last standstill together.
+    fn known(&self) -> Option<ValueWithDeviation> {
+        let (Some(before), Some(present)) = (self.before, self.present()) else {
+            return self.present().or(self.before);
+        };
+        let weights = [before.std_dev.powi(-2), present.std_dev.powi(-2)];
+        let sum = weights[0] + weights[1];
+        // What windows do not eliminate does not average out.
+        Some(ValueWithDeviation {
+            value: (weights[0] * before.value + weights[1] * present.value) / sum,
+            std_dev: sum.sqrt().recip().max(UNMODELLED_RATIO),
+        })
+    }
+
+    fn compare(&mut self) -> bool {
+        let Some((before, after)) = self.before.zip(self.present()) else {
+            return false;
+        };
+        let std_dev = before.std_dev.hypot(after.std_dev);
+        let least = CHANGE_MIN_RATIO.max(CHANGE_MIN_STD_DEVS * std_dev);
+        if (after.value - before.value).abs() < least {
+            return false;
+        }
+        self.change = Some(PayloadChange { before, after });
+        self.reported_s = 0.0;
+        self.before = None;
+        true
+    }
+}

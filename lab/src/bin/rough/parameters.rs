@@ -1,0 +1,89 @@
+//! How well the intervals of the robot's own parameters hold.
+
+use serde::Serialize;
+use tread_api::friction::NORMAL_95;
+use tread_lab::report::Check;
+use tread_lab::rough::run::{PARAMETERS, estimates};
+
+use super::score::{Drive, median, share};
+
+/// Coverage that each parameter must have.
+const COVERAGE_MIN: f64 = 0.9;
+
+/// Figures of one parameter over the population, at the end of the drives.
+#[derive(Debug, Serialize)]
+pub(crate) struct ParameterLine {
+    name: &'static str,
+    has_torque: bool,
+    estimates: usize,
+    /// Share of the 95 % intervals that hold the true value.
+    coverage: f64,
+    /// Median half-width of the 95 % interval.
+    half_width: f64,
+    /// Share that the prior dominates.
+    prior_dominated: f64,
+}
+
+/// A line for each parameter.
+pub(crate) fn parameter_lines(has_torque: bool, drives: &[Drive]) -> Vec<ParameterLine> {
+    let line = |place: usize, name: &'static str| {
+        let (mut covered, mut prior, mut widths) = (0, 0, Vec::new());
+        for (_, outcome) in drives {
+            let Some(parameters) = &outcome.parameters else {
+                continue;
+            };
+            let estimate = estimates(parameters)[place];
+            let (low, high) = estimate.interval_95();
+            covered += usize::from((low..=high).contains(&outcome.true_parameters[place]));
+            prior += usize::from(estimate.prior_dominated);
+            widths.push(NORMAL_95 * estimate.std_dev);
+        }
+        ParameterLine {
+            name,
+            has_torque,
+            estimates: widths.len(),
+            coverage: share(covered, widths.len()),
+            half_width: median(&mut widths),
+            prior_dominated: share(prior, widths.len()),
+        }
+    };
+    PARAMETERS
+        .into_iter()
+        .enumerate()
+        .map(|(place, name)| line(place, name))
+        .collect()
+}
+
+impl ParameterLine {
+    /// What must hold.
+    pub(crate) fn check(&self) -> Check {
+        let torque = if self.has_torque { "with" } else { "without" };
+        let name = format!("{}, {torque} torque: coverage", self.name);
+        Check::at_least(name, self.coverage, COVERAGE_MIN)
+    }
+}
+
+/// The table for people.
+pub(crate) fn print(lines: &[ParameterLine]) {
+    println!(
+        "\n{:<42} {:>6} {:>9} {:>9} {:>9} {:>12}",
+        "robot's parameters, population",
+        "torque",
+        "estimates",
+        "coverage",
+        "± half",
+        "mostly prior"
+    );
+    for line in lines {
+        println!(
+            "{:<42} {:>6} {:>9} {:>8.1}% {:>9.4} {:>11.1}%{}",
+            line.name,
+            if line.has_torque { "yes" } else { "no" },
+            line.estimates,
+            100.0 * line.coverage,
+            line.half_width,
+            100.0 * line.prior_dominated,
+            if line.check().holds { "" } else { "  MISSED" },
+        );
+    }
+}
