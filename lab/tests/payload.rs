@@ -15,7 +15,7 @@ use tread_lab::rough::spec::{Deviations, MAKES};
 
 /// Seeds on which nothing was chosen.
 const FIRST_SEED: u64 = 7_500_000;
-const ROBOTS: u64 = 12;
+const ROBOTS: u64 = 8;
 
 /// Whether a robot reports a change after it stood for ten seconds, in which its payload changed.
 fn reports(seed: u64, change_ratio: f64) -> bool {
@@ -65,5 +65,5 @@ fn a_fifth_of_the_mass_put_on_or_taken_off_is_reported_and_no_change_is_not() {
     let said = format!("of {ROBOTS}: {none} unchanged, {loaded} loaded, {unloaded} unloaded");
     eprintln!("{said}");
     assert_eq!(none, 0, "{said}");
-    assert!(loaded >= 10 && unloaded >= 10, "{said}");
+    assert!(loaded >= 7 && unloaded >= 7, "{said}");
 }

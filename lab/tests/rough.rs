@@ -59,7 +59,7 @@ fn counts(outcomes: &[Outcome]) -> [u32; 3] {
 fn intervals_hold_on_robots_that_differ_in_everything() {
     // Over 240 drives each: 97 % and 96 % of the intervals, 87 % and 76 % of the answers.
     for (has_torque, least_share) in [(true, 0.75), (false, 0.6)] {
-        let [answers, estimates, covered] = counts(&population(has_torque, 120));
+        let [answers, estimates, covered] = counts(&population(has_torque, 60));
         eprintln!("torque {has_torque}: {covered} of {estimates} of {answers}");
         assert!(f64::from(estimates) > least_share * f64::from(answers));
         assert!(f64::from(covered) > 0.92 * f64::from(estimates));

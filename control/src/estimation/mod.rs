@@ -25,7 +25,7 @@
 //! ([`apparent_mass`]). Where nothing excites θ, there is no θ: `None`.
 //!
 //! These rows are exact for a robot that is as its model says. θ of any other robot comes from
-//! [`identification`]; its change detection and its segments come from the rows.
+//! [`identification`], and so do its segments and its changes of the ground.
 
 mod apparent_mass;
 mod block;
@@ -219,8 +219,12 @@ impl Estimator {
             return UpdateOutcome::default();
         }
         self.step_longitudinal(sample, dt_s);
-        if let Some(identification) = &mut self.identification {
-            identification.update(sample, &self.noise, dt_s);
+        let ground_changed = match &mut self.identification {
+            Some(identification) => identification.update(sample, &self.noise, dt_s),
+            None => false,
+        };
+        if ground_changed {
+            self.drop_pending();
         }
         self.apparent_mass
             .add(sample, &self.model, &self.noise, dt_s);
@@ -229,7 +233,10 @@ impl Estimator {
         }
         self.block.add(sample, &self.model, dt_s);
         if !self.block.is_full() {
-            return UpdateOutcome::default();
+            return UpdateOutcome {
+                ground_changed,
+                ..UpdateOutcome::default()
+            };
         }
         let next = self.block.next();
         let builder = std::mem::replace(&mut self.block, next);
@@ -244,13 +251,13 @@ impl Estimator {
         if block.is_none() {
             self.turning_before = None;
         }
-        let (ground_changed, slips) = block.map_or((false, false), |block| self.take(block));
+        let (of_rows, slips) = block.map_or((false, false), |block| self.take(block));
         self.excitation.end_block();
         self.refresh();
         UpdateOutcome {
             block_done: true,
             slips,
-            ground_changed,
+            ground_changed: ground_changed || of_rows,
         }
     }
 
@@ -309,20 +316,26 @@ impl Estimator {
         {
             self.excitation.note_block(&row, block.force.is_some());
         }
-        let changed = innovation.is_some_and(|value| self.change.update(value));
+        // The rows of an inexact robot scatter by what they do not know.
+        let changed = self.identification.is_none()
+            && innovation.is_some_and(|value| self.change.update(value));
         if changed {
-            // These blocks may be of either ground: they belong to neither.
-            self.turning_before = None;
-            self.pending = Sums::default();
-            self.change = ChangeDetector::default();
-            if let Some(identification) = &mut self.identification {
-                identification.drop_last_block();
-            }
+            self.drop_pending();
         } else if self.change.is_quiet() {
             self.segment = self.segment.plus(&self.pending);
             self.pending = Sums::default();
         }
         (changed, !block.is_linear)
+    }
+
+    /// Drops the blocks since the ground may have changed: they belong to neither.
+    fn drop_pending(&mut self) {
+        self.turning_before = None;
+        self.pending = Sums::default();
+        self.change = ChangeDetector::default();
+        if let Some(identification) = &mut self.identification {
+            identification.drop_last_block();
+        }
     }
 
     fn solve(&self, sums: &Sums, theta_given: Option<f64>) -> Option<Solution> {

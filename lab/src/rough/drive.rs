@@ -62,6 +62,11 @@ impl RoughDrive {
         self.plant.load(model, payload_ratio);
     }
 
+    /// Changes the stiffness of the ground under all wheels.
+    pub fn change_ground(&mut self, stiffness: f64) {
+        self.plant.change_ground(stiffness);
+    }
+
     /// What it truly is and does.
     pub fn plant(&self) -> &Plant {
         &self.plant

@@ -175,6 +175,11 @@ impl Plant {
         self.bear(1.0);
     }
 
+    /// Changes the stiffness of the ground under all wheels.
+    pub fn change_ground(&mut self, stiffness: f64) {
+        self.spec.curve.stiffness = stiffness;
+    }
+
     /// What it is.
     pub fn spec(&self) -> &Deviations {
         &self.spec

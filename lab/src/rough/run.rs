@@ -47,8 +47,13 @@ impl Course {
         }
     }
 
-    /// The course as a mission.
+    /// The course as a mission of more than a minute.
     pub fn trajectory(self) -> Trajectory {
+        self.laps(LAPS)
+    }
+
+    /// The course as a mission of so many figure-8s, or as many circles and a third.
+    pub fn laps(self, laps: u32) -> Trajectory {
         let options = TrajectoryOptions::default();
         match self {
             Self::Circle => Trajectory::Circle(Circle {
@@ -57,11 +62,11 @@ impl Course {
                 speed_m_s: Some(SPEED_M_S),
                 period_s: None,
                 direction: Direction::CounterClockwise,
-                turns: 4.0,
+                turns: f64::from(laps + laps / 3),
                 options,
             }),
             Self::Figure8 => {
-                let points = 0..=POINTS_PER_LAP * LAPS;
+                let points = 0..=POINTS_PER_LAP * laps;
                 let waypoint = |index: u32| {
                     let angle =
                         std::f64::consts::TAU * f64::from(index) / f64::from(POINTS_PER_LAP);

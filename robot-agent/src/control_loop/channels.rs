@@ -246,6 +246,8 @@ pub(crate) struct Snapshot {
     pub(crate) payload_change: Option<PayloadChange>,
     /// Whether recent motion carried information on θ.
     pub excited: bool,
+    /// Changes of the ground that the estimator detected since the start.
+    pub ground_changes: u64,
     /// The comparison that raised the alert that the ground differs from the map.
     pub(crate) surface_change: Option<Comparison>,
     /// Position at which the wheels turn without moving the robot.
@@ -289,6 +291,7 @@ impl Default for Snapshot {
             robot_parameters: None,
             payload_change: None,
             excited: false,
+            ground_changes: 0,
             surface_change: None,
             dug_in_at: None,
             overrun: None,

@@ -85,6 +85,14 @@ impl SegmentCutter {
     /// Processes one tick, after the estimator has taken its samples.
     pub(crate) fn step(&mut self, input: CutInput<'_>, estimator: &mut Estimator) -> Cut {
         let Some(open) = &mut self.open else {
+            if input.ground_changed && input.place.is_none() {
+                // It belongs to no cell, and is other ground all the same.
+                estimator.begin_ground();
+                return Cut {
+                    segment: None,
+                    is_new_ground: true,
+                };
+            }
             return self.start_at(input, estimator);
         };
         open.distance_m += input.driven_m;

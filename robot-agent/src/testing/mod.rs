@@ -346,6 +346,11 @@ impl<D: SteppedDrive> Bench<D> {
         self.ends.shared.snapshot().robot_parameters
     }
 
+    /// How many changes of the ground it has detected.
+    pub fn ground_changes(&self) -> u64 {
+        self.ends.shared.snapshot().ground_changes
+    }
+
     /// Whether it reports a change of its payload.
     pub fn reports_payload_change(&self) -> bool {
         self.ends.shared.snapshot().payload_change.is_some()

@@ -28,6 +28,8 @@ const SQUARE_GAIN: f64 = 0.005;
 /// Largest square of a residual in that mean, and in the cost.
 const SQUARE_MAX: f64 = 100.0;
 const COST_MAX: f64 = 25.0;
+/// Blocks whose scatter says how innovations scatter.
+const INNOVATION_BLOCKS_MIN: u32 = 15;
 /// Share of the cost that is left after another block.
 const COST_KEEPS: f64 = 0.95;
 
@@ -131,6 +133,10 @@ pub(super) struct Hypothesis {
     cost: f64,
     /// Covariances of ln K with all parameters.
     of_stiffness: Values,
+    /// Score of the open block in that direction, as far as it was taken as an innovation.
+    score_taken: f64,
+    /// Variance of a block's score in that direction.
+    block_variance: f64,
     /// Blocks since it began.
     age: u32,
 }
@@ -151,6 +157,8 @@ impl Hypothesis {
             squares: [1.0; CHANNELS],
             cost: 0.0,
             of_stiffness: Values::zeros(),
+            score_taken: 0.0,
+            block_variance: 0.0,
             age: 0,
         };
         hypothesis.restart(state);
@@ -163,12 +171,22 @@ impl Hypothesis {
         self.state = State::rolling(forward_m_s, state.turn_rad_s);
         self.state.speed_m_s[1] = Number::constant(left_m_s);
         self.mean = Output::zero();
-        self.block_information = Square::zeros();
-        self.block_score = Values::zeros();
+        self.drop_block();
+    }
+
+    /// What the measurements since the last call tell of ln K, over the standard deviation that they
+    /// have by the scatter of the blocks, if each block has this many of them. Positive if K is larger
+    /// than it was taken for. None before blocks have scattered.
+    pub(super) fn innovation(&mut self, per_block: f64) -> Option<f64> {
+        let score = self.of_stiffness.dot(&self.block_score);
+        let new = score - std::mem::replace(&mut self.score_taken, score);
+        (self.age >= INNOVATION_BLOCKS_MIN && self.block_variance > 0.0)
+            .then(|| new / (self.block_variance / per_block).sqrt())
     }
 
     /// Drops what the open block holds.
     pub(super) fn drop_block(&mut self) {
+        self.score_taken = 0.0;
         self.block_information = Square::zeros();
         self.block_score = Values::zeros();
     }
@@ -254,6 +272,10 @@ impl Hypothesis {
         let mut stiffness = Values::zeros();
         stiffness[index::STIFFNESS] = 1.0;
         self.of_stiffness = cholesky.solve(&stiffness);
+        if self.ground.count >= 5.0 {
+            let scatter = (self.ground.scores * self.of_stiffness).dot(&self.of_stiffness);
+            self.block_variance = scatter / self.ground.count;
+        }
         let wanted = cholesky.solve(&(self.ground.preferred + prior.information * prior.mean));
         let mut step = wanted - self.values;
         let largest = step

@@ -8,6 +8,7 @@
 //! ([`parameters`]) follow from the other sensors together ([`hypothesis`]). Since that is not
 //! linear, it begins at three values of K; those that fit worse are discarded.
 
+mod change;
 mod dual;
 mod hypothesis;
 mod model;
@@ -20,6 +21,7 @@ mod tests;
 use super::{EstimatorPrior, GAP_MAX_S, IdentifiedRobot, SensorNoise, SensorSample};
 use crate::robot::RobotModel;
 
+use change::ChangeMonitor;
 use hypothesis::{CHANNELS, Hypothesis, Measured, Prior};
 use model::{Input, State};
 use parameters::index;
@@ -41,6 +43,8 @@ const SAME: f64 = 0.03;
 /// Rim speed below which torques are not compared: friction at rest is undetermined, metres per
 /// second.
 const TORQUE_FROM_M_S: f64 = 0.1;
+/// Rim speed of both sides above which a change of the ground is looked for, metres per second.
+const ROLLING_M_S: f64 = 0.2;
 /// Rim speed below which a robot stands, metres per second.
 const STANDING_M_S: f64 = 0.02;
 /// Share of a new acceleration in the smoothed one, per second.
@@ -111,6 +115,7 @@ pub(super) struct Identification {
     is_moving: bool,
     robot: Option<IdentifiedRobot>,
     is_robot_due: bool,
+    change: ChangeMonitor,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -149,6 +154,7 @@ impl Identification {
             is_moving: false,
             robot: None,
             is_robot_due: false,
+            change: ChangeMonitor::default(),
         };
         identification.begin(&State::rolling(0.0, 0.0));
         Some(identification)
@@ -204,6 +210,7 @@ impl Identification {
             hypothesis.restart(state);
         }
         self.waiting = None;
+        self.change = ChangeMonitor::default();
         self.clear_sums();
         self.block_s = 0.0;
         self.is_moving = false;
@@ -216,8 +223,13 @@ impl Identification {
         self.compared_s = 0.0;
     }
 
-    /// Takes a sample that came `time_s` after the one before.
-    pub(super) fn update(&mut self, sample: &SensorSample, noise: &SensorNoise, time_s: f64) {
+    /// Takes a sample that came `time_s` after the one before. Returns whether the ground has changed.
+    pub(super) fn update(
+        &mut self,
+        sample: &SensorSample,
+        noise: &SensorNoise,
+        time_s: f64,
+    ) -> bool {
         if time_s > GAP_MAX_S {
             self.interrupt();
         }
@@ -229,17 +241,16 @@ impl Identification {
             time_s,
             before_rad_s,
         });
-        if let Some(waiting) = waiting {
-            self.advance(&waiting, (rates(sample), time_s), noise);
-        }
+        waiting.is_some_and(|waiting| self.advance(&waiting, (rates(sample), time_s), noise))
     }
 
+    /// Moves the models on by the sample that waited. Returns whether the ground has changed.
     fn advance(
         &mut self,
         now: &Waiting,
         (after_rad_s, after_s): ([f64; 2], f64),
         noise: &SensorNoise,
-    ) {
+    ) -> bool {
         let (sample, time_s) = (&now.sample, now.time_s);
         let wheels_rad_s = rates(sample);
         // Central difference of means over neighbouring samples.
@@ -278,9 +289,7 @@ impl Identification {
                 hypothesis.compare(&forward, speed);
             }
         }
-        if self.compared_s >= COMPARED_S - 1.0e-6 {
-            self.compare(noise);
-        }
+        self.compared_s >= COMPARED_S - 1.0e-6 && self.compare(noise)
     }
 
     /// Adds a sample's measurements to their means.
@@ -309,8 +318,9 @@ impl Identification {
         }
     }
 
-    /// Compares the means over [`COMPARED_S`], and ends the block where it is full.
-    fn compare(&mut self, noise: &SensorNoise) {
+    /// Compares the means over [`COMPARED_S`], and ends the block where it is full. Returns whether the
+    /// ground has changed.
+    fn compare(&mut self, noise: &SensorNoise) -> bool {
         let torque_n_m = self.model.side_load_n() * self.model.wheel_radius_m();
         let root = self.samples.max(1.0).sqrt();
         let with_model = |sensor: f64, model: f64| (sensor / root).hypot(model);
@@ -345,6 +355,7 @@ impl Identification {
         }
         self.block_s += compared_s;
         self.clear_sums();
+        let changed = self.detect();
         if self.block_s >= BLOCK_S - 1.0e-6 {
             self.end_block();
             self.is_robot_due = true;
@@ -352,6 +363,30 @@ impl Identification {
             // In another sample than the end of the block, which takes long enough.
             self.robot = self.identify_robot().or(self.robot);
         }
+        changed
+    }
+
+    /// Whether the ground has changed, by what the last comparison tells of ln K.
+    fn detect(&mut self) -> bool {
+        let least = self.least_cost();
+        let per_block = BLOCK_S / COMPARED_S;
+        let mut innovation = None;
+        for hypothesis in &mut self.hypotheses {
+            let found = hypothesis.innovation(per_block);
+            if hypothesis.cost() <= least {
+                innovation = found.map(|found| (found, hypothesis.worst_square()));
+            }
+        }
+        self.change.update(innovation, self.is_rolling())
+    }
+
+    /// Whether both sides roll so fast that slip tells friction.
+    fn is_rolling(&self) -> bool {
+        let radius_m = self.model.wheel_radius_m();
+        self.waiting.is_some_and(|waiting| {
+            let [left, right] = rates(&waiting.sample).map(|rate| rate.abs() * radius_m);
+            left.min(right) > ROLLING_M_S
+        })
     }
 
     fn end_block(&mut self) {

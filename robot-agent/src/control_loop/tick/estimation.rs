@@ -65,6 +65,8 @@ pub(super) struct Estimated<'tick> {
     pub(super) ground_at_begin: Ground,
     /// Whether the estimator detected a change of ground.
     pub(super) ground_changed: bool,
+    /// Changes of ground that the estimator detected since the start.
+    pub(super) ground_changes: u64,
     /// Whether a wheel slips beyond the model's range.
     pub(super) slips: bool,
     /// Longitudinal slip of each side.
@@ -125,6 +127,7 @@ pub(super) struct Estimation {
     /// Noise that the base states for its sensors.
     stated_noise: StatedNoise,
     slips: bool,
+    ground_changes: u64,
     slip: SlipMeter,
     progress: ProgressWatch,
 }
@@ -146,6 +149,7 @@ impl Estimation {
             silent_after: SILENT_AFTER_MAX,
             stated_noise: StatedNoise::default(),
             slips: false,
+            ground_changes: 0,
             slip: SlipMeter::default(),
             progress: ProgressWatch::default(),
         }
@@ -195,6 +199,7 @@ impl Estimation {
             ground: self.ground(),
             ground_at_begin,
             ground_changed: taken.ground_changed,
+            ground_changes: self.ground_changes,
             slips: self.slips,
             slip: self.slip.slip(),
             dug_in_at: self.progress.dug_in_at(),
@@ -274,6 +279,7 @@ impl Estimation {
         }
         let outcome = self.estimator.update(&motion, dt_s);
         taken.ground_changed |= outcome.ground_changed;
+        self.ground_changes += u64::from(outcome.ground_changed);
         taken.has_new_block |= outcome.block_done;
         if outcome.block_done {
             self.slips = outcome.slips;

@@ -165,6 +165,7 @@ impl Output {
             robot_parameters: estimated.estimate.robot.map(robot_parameters),
             payload_change: estimated.estimate.payload_change,
             excited: !estimated.estimate.no_new_information,
+            ground_changes: estimated.ground_changes,
             surface_change: mission.surface_change,
             dug_in_at: estimated.dug_in_at,
             overrun: input.demands.overrun,

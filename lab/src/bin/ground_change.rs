@@ -1,0 +1,242 @@
+//! `ground_change`: how soon agents detect that the ground has changed, and how often they do where it
+//! has not, on robots unlike their simulator.
+//!
+//! `cargo run --release -p tread-lab --bin ground_change -- [--hours H] [--runs N] [--seed N] [--json]`
+//!
+//! Robots, sensors and courses are those of the population of `rough`. Drives without a change take ten
+//! minutes each. In the others K changes from 5 to 1 and back under all wheels, after 30 to 54 s.
+
+#![expect(clippy::print_stdout, reason = "a program that prints a report")]
+
+use std::process::ExitCode;
+use std::time::Duration;
+
+use clap::Parser;
+use serde::Serialize;
+use tread_lab::parallel::in_parallel;
+use tread_lab::random::Random;
+use tread_lab::report::{Check, checks_json};
+use tread_lab::rough::ground_change::{ChangeTrial, run};
+use tread_lab::rough::run::Course;
+use tread_lab::rough::sensors::SensorSpec;
+use tread_lab::rough::spec::{Deviations, MAKES};
+
+/// Time of a drive without a change.
+const QUIET: Duration = Duration::from_mins(10);
+/// Drives without a change of one hour.
+const QUIET_PER_HOUR: u32 = 6;
+/// Laps of such a drive, and of one with a change.
+const QUIET_LAPS: u32 = 18;
+const CHANGE_LAPS: u32 = 3;
+/// False alarms per hour that may be.
+const FALSE_PER_HOUR_MAX: f64 = 0.2;
+/// Time in which a change from K 5 to 1 must be detected, seconds, and in what share of the drives.
+const DELAY_MAX_S: f64 = 2.0;
+const DETECTED_MIN: f64 = 0.95;
+
+#[derive(Debug, Parser)]
+#[command(name = "ground_change")]
+struct Arguments {
+    /// Hours without a change, half of them with wheel torque
+    #[arg(long, default_value_t = 50, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    hours: u32,
+    /// Drives of each line with a change
+    #[arg(long, default_value_t = 200, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    runs: u32,
+    /// First seed
+    #[arg(long, default_value_t = 1_000_001)]
+    seed: u64,
+    /// Print one JSON object instead of a table
+    #[arg(long)]
+    json: bool,
+}
+
+/// Drives without a change.
+#[derive(Debug, Serialize)]
+struct Quiet {
+    has_torque: bool,
+    hours: f64,
+    false_alarms: u64,
+    /// Drives that had any.
+    drives: usize,
+}
+
+/// Drives with a change.
+#[derive(Debug, Serialize)]
+struct Changed {
+    from: f64,
+    to: f64,
+    has_torque: bool,
+    drives: usize,
+    /// Share of the drives in which θ was known when the ground changed.
+    known: f64,
+    /// Share of the drives in which the change was detected within two seconds, and at all.
+    in_time: f64,
+    detected: f64,
+    /// Median delay, seconds; none if nothing was detected.
+    delay_s: Option<f64>,
+}
+
+fn trial(seed: u64, has_torque: bool) -> ChangeTrial {
+    let mut random = Random::new(seed ^ 0xc4a6);
+    ChangeTrial {
+        make: random.one_of(&MAKES).unwrap_or(MAKES[0]),
+        deviations: Deviations::drawn(&mut random),
+        sensors: SensorSpec::drawn(&mut random, has_torque),
+        course: random
+            .one_of(&[Course::Figure8, Course::Circle])
+            .unwrap_or(Course::Figure8),
+        laps: QUIET_LAPS,
+        seed,
+        before: QUIET,
+        after: None,
+    }
+}
+
+#[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
+fn share(part: usize, of: usize) -> f64 {
+    part as f64 / of.max(1) as f64
+}
+
+fn quiet(arguments: &Arguments, has_torque: bool) -> anyhow::Result<Quiet> {
+    let drives = arguments.hours * QUIET_PER_HOUR / 2;
+    let seeds = (arguments.seed..).take(drives as usize);
+    let trials: Vec<ChangeTrial> = seeds.map(|seed| trial(seed, has_torque)).collect();
+    let mut line = Quiet {
+        has_torque,
+        hours: f64::from(drives) / f64::from(QUIET_PER_HOUR),
+        false_alarms: 0,
+        drives: 0,
+    };
+    for outcome in in_parallel(&trials, run) {
+        let alarms = outcome?.false_alarms;
+        line.false_alarms += alarms;
+        line.drives += usize::from(alarms > 0);
+    }
+    Ok(line)
+}
+
+fn changed(arguments: &Arguments, from: f64, to: f64, has_torque: bool) -> anyhow::Result<Changed> {
+    let seeds = (arguments.seed..).take(arguments.runs as usize);
+    let trials: Vec<ChangeTrial> = seeds
+        .map(|seed| {
+            let mut trial = trial(seed, has_torque);
+            let curve = &mut trial.deviations.curve;
+            curve.stiffness = from;
+            curve.mu_peak = curve.mu_peak.min(0.9 * from.min(to));
+            ChangeTrial {
+                laps: CHANGE_LAPS,
+                before: Duration::from_secs(30) + Duration::from_millis(377) * (seed % 64) as u32,
+                after: Some(to),
+                ..trial
+            }
+        })
+        .collect();
+    let (mut delays, mut known) = (Vec::new(), 0);
+    for outcome in in_parallel(&trials, run) {
+        let outcome = outcome?;
+        delays.extend(outcome.delay_s);
+        known += usize::from(outcome.was_known);
+    }
+    delays.sort_by(f64::total_cmp);
+    let in_time = delays
+        .iter()
+        .filter(|delay_s| **delay_s <= DELAY_MAX_S)
+        .count();
+    Ok(Changed {
+        from,
+        to,
+        has_torque,
+        drives: trials.len(),
+        known: share(known, trials.len()),
+        in_time: share(in_time, trials.len()),
+        detected: share(delays.len(), trials.len()),
+        delay_s: delays.get(delays.len() / 2).copied(),
+    })
+}
+
+fn with_or_without(has_torque: bool) -> &'static str {
+    if has_torque {
+        "with torque"
+    } else {
+        "without torque"
+    }
+}
+
+fn print(quiet: &[Quiet], changed: &[Changed]) {
+    println!(
+        "{:<34} {:>7} {:>13} {:>9}",
+        "no change", "hours", "false alarms", "per hour"
+    );
+    for line in quiet {
+        println!(
+            "{:<34} {:>7.1} {:>13} {:>9.2}",
+            with_or_without(line.has_torque),
+            line.hours,
+            line.false_alarms,
+            false_per_hour(line),
+        );
+    }
+    println!(
+        "\n{:<34} {:>7} {:>13} {:>9} {:>9} {:>9}",
+        "change of K", "drives", "θ known", "in 2 s", "detected", "median"
+    );
+    for line in changed {
+        let name = format!(
+            "{} to {}, {}",
+            line.from,
+            line.to,
+            with_or_without(line.has_torque)
+        );
+        let delay = line
+            .delay_s
+            .map_or_else(|| "-".to_owned(), |delay_s| format!("{delay_s:.2} s"));
+        println!(
+            "{name:<34} {:>7} {:>12.1}% {:>8.1}% {:>8.1}% {delay:>9}",
+            line.drives,
+            100.0 * line.known,
+            100.0 * line.in_time,
+            100.0 * line.detected,
+        );
+    }
+}
+
+#[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
+fn false_per_hour(line: &Quiet) -> f64 {
+    line.false_alarms as f64 / line.hours
+}
+
+fn main() -> anyhow::Result<ExitCode> {
+    let arguments = Arguments::parse();
+    let quiet = [quiet(&arguments, true)?, quiet(&arguments, false)?];
+    let mut lines = Vec::new();
+    for (from, to) in [(5.0, 1.0), (1.0, 5.0)] {
+        for has_torque in [true, false] {
+            lines.push(changed(&arguments, from, to, has_torque)?);
+        }
+    }
+    let mut checks: Vec<Check> = quiet
+        .iter()
+        .map(|line| {
+            let name = format!("false alarms per hour {}", with_or_without(line.has_torque));
+            Check::at_most(name, false_per_hour(line), FALSE_PER_HOUR_MAX)
+        })
+        .collect();
+    checks.extend(lines.first().map(|line| {
+        let name = "K 5 to 1 with torque: detected within 2 s";
+        Check::at_least(name, line.in_time, DETECTED_MIN)
+    }));
+    if arguments.json {
+        let object = serde_json::json!({
+            "quiet": quiet, "changed": lines, "checks": checks_json(&checks),
+        });
+        println!("{object}");
+    } else {
+        print(&quiet, &lines);
+    }
+    Ok(if checks.iter().all(|check| check.holds) {
+        ExitCode::SUCCESS
+    } else {
+        ExitCode::FAILURE
+    })
+}
