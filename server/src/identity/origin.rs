@@ -100,7 +100,7 @@ pub struct Names {
     pub hosts: Vec<String>,
     /// Origins of foreign pages that may send requests with a token (CORS, `WebSocket`).
     pub allowed_origins: Vec<Origin>,
-    /// Whether this server itself serves `https`.
+    /// Whether browsers reach this server by `https`, directly or through a proxy.
     pub is_tls: bool,
 }
 
