@@ -1,25 +1,26 @@
-//! Friction over slip in the steady state, by four models of the literature.
+//! Steady-state friction coefficient μ(λ) over slip, by four models of the literature.
 
 use serde::Serialize;
 
-/// Which model a contact follows.
+/// Friction model of a contact.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub enum Shape {
-    /// Straight to the peak, constant beyond it: the model of Yi et al. (2007), eq. (7).
+    /// Linear up to the peak, constant beyond it: Yi et al. (2007), eq. (7).
     Linear,
-    /// A brush with parabolic pressure: Pacejka, Tire and Vehicle Dynamics, 3rd ed., eq. (3.8).
+    /// Brush model with parabolic pressure: Pacejka, Tire and Vehicle Dynamics, 3rd ed., eq. (3.8).
     Brush,
-    /// The Magic Formula: ibid., eq. (4.49), with the shape of a truck tyre on a rough road.
+    /// Magic Formula: Pacejka, 3rd ed., eq. (4.49), with the shape of a truck tyre on a rough road.
     MagicFormula,
-    /// `LuGre`, averaged over the patch: Canudas de Wit et al., Vehicle System Dynamics 39 (2003).
+    /// `LuGre` model averaged over the contact patch: Canudas de Wit et al., Vehicle System
+    /// Dynamics 39 (2003).
     LuGre,
 }
 
 impl Shape {
-    /// All of them.
+    /// All shapes.
     pub const ALL: [Self; 4] = [Self::Linear, Self::Brush, Self::MagicFormula, Self::LuGre];
 
-    /// For people.
+    /// Returns the name for reports.
     pub fn text(self) -> &'static str {
         match self {
             Self::Linear => "linear",
@@ -32,33 +33,33 @@ impl Shape {
 
 /// Shape factor C of the Magic Formula's longitudinal force.
 const MAGIC_C: f64 = 1.6;
-/// Its curvature factor E.
+/// Curvature factor E of the Magic Formula's longitudinal force.
 const MAGIC_E: f64 = 0.2;
-/// Sliding over static friction of the `LuGre` model.
+/// Ratio of sliding to static friction of the `LuGre` model.
 const LUGRE_SLIDING_RATIO: f64 = 0.85;
-/// Its Stribeck speed, metres per second.
+/// Stribeck speed of the `LuGre` model, in metres per second.
 const LUGRE_STRIBECK_M_S: f64 = 2.0;
-/// Slip below which curves are taken as their tangent.
+/// Slip below which a curve is replaced by its tangent at zero.
 const SLIP_SMALL: f64 = 1.0e-9;
 
-/// Friction over slip of one ground and tyre.
+/// Friction curve of one ground and tyre.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Curve {
-    /// Its model.
+    /// Friction model.
     pub shape: Shape,
-    /// Slope K at zero slip, friction coefficient per slip, above 0.
+    /// Friction stiffness K: slope at zero slip, friction coefficient per slip, above 0.
     pub stiffness: f64,
-    /// Greatest friction coefficient (of `LuGre`, the static one), above 0.
+    /// Peak friction coefficient (for `LuGre` the static one), above 0.
     pub mu_peak: f64,
 }
 
 impl Curve {
-    /// θ = 1/K.
+    /// Returns the slip compliance θ = 1/K.
     pub fn theta(&self) -> f64 {
         self.stiffness.recip()
     }
 
-    /// Slip of the peak, or of nearly all of it where the curve only approaches it.
+    /// Returns the slip at the peak, or near it for curves that only approach their peak.
     pub fn peak_slip(&self) -> f64 {
         let straight = self.mu_peak / self.stiffness;
         match self.shape {
@@ -69,7 +70,8 @@ impl Curve {
         }
     }
 
-    /// Friction coefficient over slip, for a slip ≥ 0 and a sliding speed ≥ 0, metres per second.
+    /// Returns the ratio μ/λ for a slip ≥ 0 and a sliding speed ≥ 0, in metres per second. The
+    /// sliding speed matters for `LuGre` only.
     pub fn mu_over_slip(&self, slip: f64, sliding_m_s: f64) -> f64 {
         if slip < SLIP_SMALL {
             return self.stiffness;
@@ -91,7 +93,7 @@ impl Curve {
                 let falls = (-(sliding_m_s / LUGRE_STRIBECK_M_S).sqrt()).exp();
                 let sliding = peak * LUGRE_SLIDING_RATIO;
                 let friction = sliding + (peak - sliding) * falls;
-                // Bristles of stiffness 2K over the patch: their mean rises with slope K.
+                // Bristles of stiffness 2K over the patch give a mean force with the slope K.
                 let share = 2.0 * stiffness * slip / friction;
                 friction * (1.0 + (-share).exp_m1() / share)
             }
