@@ -1,10 +1,10 @@
 //! Averages samples over blocks of [`BLOCK_S`], and forms the regression rows of a block.
 
 use super::contacts::{BendInput, Loss, MeanSlip};
-use super::curved::{Curvatures, SideSlips, Turn, bent, bent_slope};
+use super::curved::{Curvatures, ForceAtSlip, SideSlips, Turn};
 use super::rows::{Regressors, Row, index};
 use super::types::Curvature;
-use super::window::{TurnMeans, TurnWindow};
+use super::window::{SampleSpan, TurnMeans, TurnWindow};
 use super::{
     BLOCK_S, RIM_SPEED_MIN_M_S, SLIP_LINEAR_FIRST_MAX, SLIP_LINEAR_MAX, SensorNoise, SensorSample,
     THETA_FIRST, ValueWithDeviation,
@@ -30,11 +30,11 @@ pub(super) struct Force {
     /// Variance of `difference_m_s`; that of `mean_m_s` is a quarter of it.
     difference_noise: f64,
     /// Regressors of θκ and θκ² in the rows of difference and mean, with each side at its own slip.
-    difference_bent: [f64; 2],
-    mean_bent: [f64; 2],
+    difference_curvature: [f64; 2],
+    mean_curvature: [f64; 2],
     /// Ratios of the regressors of θκ and θκ² to the force; they share its noise.
     bend: [f64; 2],
-    /// Covariances of the regressors `difference_bent` with the response.
+    /// Covariances of the regressors `difference_curvature` with the response.
     slip_noise: [f64; 2],
     rate: Rate,
 }
@@ -60,12 +60,13 @@ struct Ends {
 }
 
 impl Ends {
-    /// Returns 0 for a sample at the beginning of a block, 1 at its end, else `None`. `time_s` is
-    /// the middle of the sample.
-    fn of(time_s: f64, dt_s: f64) -> Option<usize> {
-        if time_s + 0.5 * dt_s <= ENDS_SHARE * BLOCK_S + 1.0e-6 {
+    /// Returns 0 for a sample at the beginning of a block, 1 at its end, else `None`. `span` is
+    /// relative to the block's start.
+    fn of(span: SampleSpan) -> Option<usize> {
+        let SampleSpan { middle_s, dt_s } = span;
+        if middle_s + 0.5 * dt_s <= ENDS_SHARE * BLOCK_S + 1.0e-6 {
             Some(0)
-        } else if time_s - 0.5 * dt_s >= (1.0 - ENDS_SHARE) * BLOCK_S - 1.0e-6 {
+        } else if middle_s - 0.5 * dt_s >= (1.0 - ENDS_SHARE) * BLOCK_S - 1.0e-6 {
             Some(1)
         } else {
             None
@@ -198,7 +199,7 @@ impl Block {
         [
             regressors[index::CURVATURE],
             regressors[index::CURVATURE_SQUARE],
-        ] = force.difference_bent;
+        ] = force.difference_curvature;
         regressors[index::RESISTANCE] = -self.rim_difference_m_s;
         regressors[index::RELAXATION] = force.rate.mu[1] - force.rate.mu[0];
         regressors[index::ROTORS] = -(force.rate.rim_m_s[1] - force.rate.rim_m_s[0]);
@@ -239,7 +240,7 @@ impl Block {
         [
             regressors[index::CURVATURE],
             regressors[index::CURVATURE_SQUARE],
-        ] = force.mean_bent;
+        ] = force.mean_curvature;
         regressors[index::RESISTANCE] = -self.rim_mean_m_s;
         regressors[index::RELAXATION] = 0.5 * (force.rate.mu[1] + force.rate.mu[0]);
         regressors[index::ROTORS] = -0.5 * (force.rate.rim_m_s[1] + force.rate.rim_m_s[0]);
@@ -321,8 +322,11 @@ impl BlockBuilder {
         let radius_m = model.wheel_radius_m();
         let left_m_s = sample.wheel_speeds.left_rad_s * radius_m;
         let right_m_s = sample.wheel_speeds.right_rad_s * radius_m;
-        self.window
-            .add(sample, model, self.duration_s + 0.5 * dt_s, dt_s);
+        let span = SampleSpan {
+            middle_s: self.duration_s + 0.5 * dt_s,
+            dt_s,
+        };
+        self.window.add(sample, model, span);
         self.duration_s += dt_s;
         self.samples += 1;
         self.left_m_s += left_m_s;
@@ -339,10 +343,10 @@ impl BlockBuilder {
             let scale = 1.0 / (radius_m * model.side_load_n());
             let (left_mu, right_mu) = (torques.left_n_m * scale, torques.right_n_m * scale);
             self.with_torque += 1;
-            let time_s = self.duration_s - 0.5 * dt_s;
-            if let Some(end) = Ends::of(time_s, dt_s) {
+            let middle_s = self.duration_s - 0.5 * dt_s;
+            if let Some(end) = Ends::of(SampleSpan { middle_s, dt_s }) {
                 self.ends
-                    .add(end, time_s, [left_mu, right_mu], [left_m_s, right_m_s]);
+                    .add(end, middle_s, [left_mu, right_mu], [left_m_s, right_m_s]);
             }
             self.left_mu += left_mu;
             self.right_mu += right_mu;
@@ -469,13 +473,24 @@ impl BlockBuilder {
         };
         // Rim speeds and gyro determine both the slip and the response, so their noises correlate.
         let order = if mean_m_s < 0.0 { [1, 0] } else { [0, 1] };
-        let contact = [left_force_m_s - rolling_m_s, right_force_m_s - rolling_m_s];
+        let left = ForceAtSlip {
+            force_m_s: left_force_m_s - rolling_m_s,
+            slip: left_slip,
+        };
+        let right = ForceAtSlip {
+            force_m_s: right_force_m_s - rolling_m_s,
+            slip: right_slip,
+        };
+        let unit = ForceAtSlip {
+            force_m_s: 1.0,
+            slip: sides.mean,
+        };
         let rim_noise = 2.0 * (noise.wheel_speed_rad_s * model.wheel_radius_m()).powi(2) / count;
         let turn_noise = model.track_width_m() * noise.gyro_rad_s.powi(2) / count;
         let slip_noise = |curvature: f64| {
             let slopes = [
-                -bent_slope(contact[0], left_slip, curvature),
-                bent_slope(contact[1], right_slip, curvature),
+                -left.curvature_regressor_slope(curvature),
+                right.curvature_regressor_slope(curvature),
             ];
             let longitudinal = |by: [f64; 2]| slopes[0] * by[order[0]] + slopes[1] * by[order[1]];
             longitudinal(sides.by_apart) / mean_m_s.abs()
@@ -484,21 +499,18 @@ impl BlockBuilder {
         };
         let curvatures = Curvatures::of(curvature);
         let nodes = curvatures.nodes();
-        let bent_sides = nodes.map(|curvature| {
-            [
-                bent(contact[0], left_slip, curvature),
-                bent(contact[1], right_slip, curvature),
-            ]
-        });
+        let of_curvature =
+            nodes.map(|curvature| [left, right].map(|side| side.curvature_regressor(curvature)));
         Force {
             difference_m_s: right_force_m_s - left_force_m_s,
             mean_m_s: mean_force_m_s,
             difference_noise: noise.torque_mu.powi(2)
                 * (left_m_s * left_m_s + right_m_s * right_m_s)
                 / count,
-            difference_bent: curvatures.split(bent_sides.map(|[left, right]| right - left)),
-            mean_bent: curvatures.split(bent_sides.map(|[left, right]| 0.5 * (left + right))),
-            bend: curvatures.split(nodes.map(|curvature| bent(1.0, sides.mean, curvature))),
+            difference_curvature: curvatures.split(of_curvature.map(|[left, right]| right - left)),
+            mean_curvature: curvatures
+                .split(of_curvature.map(|[left, right]| 0.5 * (left + right))),
+            bend: curvatures.split(nodes.map(|curvature| unit.curvature_regressor(curvature))),
             slip_noise: curvatures.split(nodes.map(slip_noise)),
             rate: self.ends.rate(noise.torque_mu, [left_m_s, right_m_s]),
         }
@@ -600,10 +612,10 @@ mod tests {
             let mut ends = Ends::default();
             let dt_s = BLOCK_S / f64::from(samples);
             for sample in 0..samples {
-                let time_s = (f64::from(sample) + 0.5) * dt_s;
-                if let Some(end) = Ends::of(time_s, dt_s) {
-                    let mu = from + slope * time_s;
-                    ends.add(end, time_s, [mu, -mu], [rim, rim + slope * time_s]);
+                let middle_s = (f64::from(sample) + 0.5) * dt_s;
+                if let Some(end) = Ends::of(SampleSpan { middle_s, dt_s }) {
+                    let mu = from + slope * middle_s;
+                    ends.add(end, middle_s, [mu, -mu], [rim, rim + slope * middle_s]);
                 }
             }
             let rate = ends.rate(0.01, [rim, rim]);

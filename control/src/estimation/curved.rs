@@ -10,17 +10,33 @@ use crate::robot::RobotModel;
 /// Lower bound of slip in denominators.
 pub(super) const SLIP_MIN: f64 = 1.0e-4;
 
-/// Regressor of θκ: the force's slip grows with slip itself on a curved tyre, by
-/// `1/(1 − x + x²/3) − 1` with x = κλ.
-pub(super) fn bent(force_m_s: f64, slip: f64, curvature: f64) -> f64 {
-    let bend = curvature * slip;
-    force_m_s * slip * (1.0 + bend * (2.0 / 3.0 + bend * (1.0 / 3.0 + bend / 9.0)))
+/// Force of contacts at their combined slip.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct ForceAtSlip {
+    /// Friction coefficient times rim speed, metres per second.
+    pub(super) force_m_s: f64,
+    /// Combined slip λ.
+    pub(super) slip: f64,
 }
 
-/// [`bent`] by slip.
-pub(super) fn bent_slope(force_m_s: f64, slip: f64, curvature: f64) -> f64 {
-    let bend = curvature * slip;
-    force_m_s * (1.0 + bend * (4.0 / 3.0 + bend * (1.0 + bend * (4.0 / 9.0))))
+impl ForceAtSlip {
+    /// Returns the regressor of θκ at a curvature κ.
+    ///
+    /// For the same force, curved tyres slip more than linear ones by the factor
+    /// `1/(1 − x + x²/3)`, `x = κλ`. The result is the series of this factor minus 1, to the order
+    /// x⁴, times the force and over κ.
+    pub(super) fn curvature_regressor(self, curvature: f64) -> f64 {
+        let Self { force_m_s, slip } = self;
+        let bend = curvature * slip;
+        force_m_s * slip * (1.0 + bend * (2.0 / 3.0 + bend * (1.0 / 3.0 + bend / 9.0)))
+    }
+
+    /// Returns the derivative of [`Self::curvature_regressor`] with respect to slip.
+    pub(super) fn curvature_regressor_slope(self, curvature: f64) -> f64 {
+        let Self { force_m_s, slip } = self;
+        let bend = curvature * slip;
+        force_m_s * (1.0 + bend * (4.0 / 3.0 + bend * (1.0 + bend * (4.0 / 9.0))))
+    }
 }
 
 /// The two values of κ at which a regressor of θκ, which depends on κ itself, is evaluated.
@@ -56,10 +72,19 @@ impl Curvatures {
     }
 }
 
-/// Share by which the sides' unequal slip makes their stiffness unequal, over κ times that slip and
-/// over their mean stiffness: exact where the mean κ is the tyres' own.
-pub(super) fn uneven(slip: f64, curvature: f64) -> f64 {
-    let bend = curvature * slip;
+/// Curvature of a tyre at its combined slip.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct CurvatureAtSlip {
+    /// κ, per slip.
+    pub(super) curvature: f64,
+    /// Combined slip.
+    pub(super) slip: f64,
+}
+
+/// Returns the relative difference of the sides' stiffness by their unequal slip, over κ times the
+/// difference of their slip. It is exact if κ is that of the tyres.
+pub(super) fn stiffness_difference(at: CurvatureAtSlip) -> f64 {
+    let bend = at.curvature * at.slip;
     (1.0 - 2.0 / 3.0 * bend) / (1.0 - bend + bend * bend / 3.0)
 }
 

@@ -16,7 +16,7 @@
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
 use super::contacts::{BendInput, Loss, MeanSlip};
-use super::curved::{Curvatures, SLIP_MIN, SideSlips, Turn, uneven};
+use super::curved::{CurvatureAtSlip, Curvatures, SLIP_MIN, SideSlips, Turn, stiffness_difference};
 use super::rows::{Regressors, Row, index};
 use super::types::Curvature;
 use super::window::Moment;
@@ -93,6 +93,19 @@ struct Sideways {
     theta: f64,
     /// Increase of the sideslip by curvature, per θκ and θκ², relative to that of linear tyres.
     bend: [f64; 2],
+}
+
+/// Measurement of the forward speed, linear in the parameters.
+#[derive(Debug, Clone, Copy)]
+struct SpeedMeasurement {
+    /// Coefficients of the parameters in the measurement.
+    regressors: Regressors,
+    /// Measured speed, metres per second.
+    speed_m_s: f64,
+    /// Variance of the measured speed.
+    variance: f64,
+    /// Variance of the force regressor.
+    force_noise: f64,
 }
 
 /// Kalman filter of the forward speed, with its sensitivity to the parameters.
@@ -199,7 +212,12 @@ impl LongitudinalFilter {
             );
         }
         if self.standing >= STANDING_STEPS {
-            rows[1] = Some(self.observe(Regressors::zeros(), 0.0, STANDING_NOISE_M_S.powi(2), 0.0));
+            rows[1] = Some(self.observe(SpeedMeasurement {
+                regressors: Regressors::zeros(),
+                speed_m_s: 0.0,
+                variance: STANDING_NOISE_M_S.powi(2),
+                force_noise: 0.0,
+            }));
             let mut regressors = Regressors::zeros();
             regressors[index::GYRO_OFFSET] = 1.0;
             rows[2] = Some(Row::white(
@@ -212,12 +230,12 @@ impl LongitudinalFilter {
             let late_s = step.body_time_s / step.body_samples - 0.5 * step.duration_s;
             let mut regressors = Regressors::zeros();
             regressors[index::LONGITUDINAL_OFFSET] = -late_s;
-            rows[1] = Some(self.observe(
+            rows[1] = Some(self.observe(SpeedMeasurement {
                 regressors,
-                step.body_m_s / step.body_samples - forward_m_s2 * late_s,
-                noise.body_speed_m_s.powi(2) / step.body_samples,
-                0.0,
-            ));
+                speed_m_s: step.body_m_s / step.body_samples - forward_m_s2 * late_s,
+                variance: noise.body_speed_m_s.powi(2) / step.body_samples,
+                force_noise: 0.0,
+            }));
         }
         rows
     }
@@ -315,22 +333,23 @@ impl LongitudinalFilter {
         let felt_noise = (harmonic_m_s * noise.accelerometer_m_s2 / GRAVITY_M_S2).powi(2) / count;
         let rim_noise = 0.5 * (noise.wheel_speed_rad_s * model.wheel_radius_m()).powi(2) / count;
         regressors[index::LONGITUDINAL_OFFSET] = -bound.theta * harmonic_m_s.abs() / GRAVITY_M_S2;
-        let innovation_variance = rim_noise + bound.theta.powi(2) * felt_noise;
-        let mut row = self.observe(
+        let mut row = self.observe(SpeedMeasurement {
             regressors,
-            step.wheels_m_s / count,
-            innovation_variance,
-            felt_noise,
-        );
+            speed_m_s: step.wheels_m_s / count,
+            variance: rim_noise + bound.theta.powi(2) * felt_noise,
+            force_noise: felt_noise,
+        });
         // The force, with its noise, also makes the slips of the sides unequal.
         let sides = SideSlips::of(&turn, bound.theta * longitudinal_mu, model);
         let unequal_by_force = 0.25 * sides.apart * sides.apart / sides.mean.max(SLIP_MIN);
         let curvatures = Curvatures::of(bound.curvature);
-        let more = curvatures.split(
-            curvatures
-                .nodes()
-                .map(|curvature| unequal_by_force * uneven(sides.mean, curvature)),
-        );
+        let more = curvatures.split(curvatures.nodes().map(|curvature| {
+            let at = CurvatureAtSlip {
+                curvature,
+                slip: sides.mean,
+            };
+            unequal_by_force * stiffness_difference(at)
+        }));
         bend[0] += more[0];
         bend[1] += more[1];
         row.bend = bend;
@@ -341,17 +360,17 @@ impl LongitudinalFilter {
 
     /// Updates the filter by one measurement of the speed. Returns its innovation as a row, linear
     /// in the parameters.
-    fn observe(
-        &mut self,
-        regressors: Regressors,
-        response_m_s: f64,
-        noise: f64,
-        force_noise: f64,
-    ) -> Row {
-        let innovation_variance = self.variance + noise;
+    fn observe(&mut self, measurement: SpeedMeasurement) -> Row {
+        let SpeedMeasurement {
+            regressors,
+            speed_m_s,
+            variance,
+            force_noise,
+        } = measurement;
+        let innovation_variance = self.variance + variance;
         let gain = self.variance / innovation_variance;
         let row = regressors + self.sensitivity;
-        let innovation_m_s = response_m_s - self.speed_m_s;
+        let innovation_m_s = speed_m_s - self.speed_m_s;
         self.speed_m_s += gain * innovation_m_s;
         self.sensitivity -= row * gain;
         self.variance *= 1.0 - gain;

@@ -256,14 +256,15 @@ pub(super) fn solve(sums: &Sums, input: SolveInput<'_>) -> Option<Solution> {
             } else {
                 BEND_SHARE
             };
-            let bent = share * parameters[index::THETA] * bend_ratio(&channels, tangent, curvature);
+            let of_curvature =
+                share * parameters[index::THETA] * bend_ratio(&channels, tangent, curvature);
             // Residuals beyond the noise are model errors, which do not average out.
             let unexplained = input.tyres.unexplained_ratio
                 * parameters[index::THETA]
                 * (1.0 - inflated.recip()).sqrt();
             // With an exact model, larger residuals mean that the noise is larger than assumed.
             let noisier = if is_exact { inflation } else { 1.0 };
-            let missed = bent.hypot(unexplained);
+            let missed = of_curvature.hypot(unexplained);
             return Some(Solution {
                 theta,
                 parameters,

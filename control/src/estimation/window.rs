@@ -63,6 +63,25 @@ impl Swing {
     }
 }
 
+/// Time of a sample.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct SampleSpan {
+    /// Middle of the sample, seconds.
+    pub(super) middle_s: f64,
+    /// Duration of the sample, seconds.
+    pub(super) dt_s: f64,
+}
+
+impl SampleSpan {
+    /// Returns the span shifted by a time in seconds.
+    fn later(self, by_s: f64) -> Self {
+        Self {
+            middle_s: self.middle_s + by_s,
+            ..self
+        }
+    }
+}
+
 /// Weighted sums over one window.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct Part {
@@ -132,22 +151,17 @@ impl TurnWindow {
         }
     }
 
-    /// Adds a sample of duration `dt_s`, whose middle is `time_s` after the block's start.
-    pub(super) fn add(
-        &mut self,
-        sample: &SensorSample,
-        model: &RobotModel,
-        time_s: f64,
-        dt_s: f64,
-    ) {
-        let rise = ((time_s - (BLOCK_S - RAMP_S)) / RAMP_S).clamp(0.0, 1.0);
+    /// Adds a sample; `span` is relative to the block's start.
+    pub(super) fn add(&mut self, sample: &SensorSample, model: &RobotModel, span: SampleSpan) {
+        let SampleSpan { middle_s, dt_s } = span;
+        let rise = ((middle_s - (BLOCK_S - RAMP_S)) / RAMP_S).clamp(0.0, 1.0);
         self.ending
-            .add(sample, model, 1.0 - rise, time_s + RAMP_S, dt_s);
+            .add(sample, model, 1.0 - rise, span.later(RAMP_S));
         if rise <= 0.0 {
             return;
         }
         self.beginning
-            .add(sample, model, rise, time_s - (BLOCK_S - RAMP_S), dt_s);
+            .add(sample, model, rise, span.later(-(BLOCK_S - RAMP_S)));
         let share = dt_s / RAMP_S;
         self.ending.ramp[1] += sample.gyro_rad_s * share;
         self.ending.ramp_share[1] += share;
@@ -215,16 +229,9 @@ impl Part {
         }
     }
 
-    /// Adds a sample of duration `dt_s` with the weight `share`, whose middle is `time_s` after the
-    /// window's start.
-    fn add(
-        &mut self,
-        sample: &SensorSample,
-        model: &RobotModel,
-        share: f64,
-        time_s: f64,
-        dt_s: f64,
-    ) {
+    /// Adds a sample with the weight `share`; `span` is relative to the window's start.
+    fn add(&mut self, sample: &SensorSample, model: &RobotModel, share: f64, span: SampleSpan) {
+        let SampleSpan { middle_s, dt_s } = span;
         let (Some(rims), Some(acceleration)) = (signed_rims(sample, model), sample.acceleration)
         else {
             self.is_broken = true;
@@ -238,7 +245,7 @@ impl Part {
         let arm_m = model.effective_track_m() - track_m * tight * tight;
         let forward_m_s2 = rims.sign * acceleration.forward_m_s2;
         let weight_s = share * dt_s;
-        if (time_s - 0.5 * (BLOCK_S + RAMP_S)).abs() <= 0.5 * RAMP_S {
+        if (middle_s - 0.5 * (BLOCK_S + RAMP_S)).abs() <= 0.5 * RAMP_S {
             self.middle[0] += sample.gyro_rad_s;
             self.middle[1] += 1.0;
         }
@@ -259,7 +266,7 @@ impl Part {
             clippy::cast_precision_loss,
             reason = "a share of a few moments, not below zero"
         )]
-        let moment = (time_s.max(0.0) * MOMENTS as f64 / (BLOCK_S + RAMP_S)) as usize;
+        let moment = (middle_s.max(0.0) * MOMENTS as f64 / (BLOCK_S + RAMP_S)) as usize;
         let moment = &mut self.moments[moment.min(MOMENTS - 1)];
         moment.apart += weight_s * apart;
         moment.turn_rad_s += weight_s * sample.gyro_rad_s;

@@ -42,6 +42,15 @@ const LUGRE_STRIBECK_M_S: f64 = 2.0;
 /// Slip below which a curve is replaced by its tangent at zero.
 const SLIP_SMALL: f64 = 1.0e-9;
 
+/// Slip of a contact.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ContactSlip {
+    /// Slip λ, ≥ 0.
+    pub slip: f64,
+    /// Sliding speed, ≥ 0, in metres per second.
+    pub sliding_m_s: f64,
+}
+
 /// Friction curve of one ground and tyre.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Curve {
@@ -70,9 +79,9 @@ impl Curve {
         }
     }
 
-    /// Returns the ratio μ/λ for a slip ≥ 0 and a sliding speed ≥ 0, in metres per second. The
-    /// sliding speed matters for `LuGre` only.
-    pub fn mu_over_slip(&self, slip: f64, sliding_m_s: f64) -> f64 {
+    /// Returns the ratio μ/λ. The sliding speed matters for `LuGre` only.
+    pub fn mu_over_slip(&self, contact: ContactSlip) -> f64 {
+        let ContactSlip { slip, sliding_m_s } = contact;
         if slip < SLIP_SMALL {
             return self.stiffness;
         }
@@ -86,8 +95,8 @@ impl Curve {
             Shape::MagicFormula => {
                 let b = stiffness / (MAGIC_C * peak);
                 let argument = b * slip;
-                let bent = argument - MAGIC_E * (argument - argument.atan());
-                peak * (MAGIC_C * bent.atan()).sin()
+                let bracket = argument - MAGIC_E * (argument - argument.atan());
+                peak * (MAGIC_C * bracket.atan()).sin()
             }
             Shape::LuGre => {
                 let falls = (-(sliding_m_s / LUGRE_STRIBECK_M_S).sqrt()).exp();
@@ -122,16 +131,16 @@ mod tests {
             curve in curve(), slip in 0.0..3.0_f64, sliding_m_s in 0.0..2.0_f64,
         ) {
             let small = 1.0e-5;
-            let slope = curve.mu_over_slip(small, 0.0);
+            let slope = curve.mu_over_slip(ContactSlip { slip: small, sliding_m_s: 0.0 });
             prop_assert!((slope / curve.stiffness - 1.0).abs() < 1.0e-3, "slope {slope}");
-            let mu = slip * curve.mu_over_slip(slip, sliding_m_s);
+            let mu = slip * curve.mu_over_slip(ContactSlip { slip, sliding_m_s });
             prop_assert!((0.0..=curve.mu_peak * (1.0 + 1.0e-9)).contains(&mu), "{mu}");
         }
 
         #[test]
         fn nearly_all_of_the_peak_is_there_at_the_slip_that_is_said(curve in curve()) {
             let slip = curve.peak_slip();
-            let mu = slip * curve.mu_over_slip(slip, 0.0);
+            let mu = slip * curve.mu_over_slip(ContactSlip { slip, sliding_m_s: 0.0 });
             prop_assert!(mu > 0.85 * curve.mu_peak, "{mu} of {}", curve.mu_peak);
         }
     }

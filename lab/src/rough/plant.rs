@@ -13,7 +13,7 @@ use tread_control::geometry::{Pose, wrap_angle_rad};
 use tread_control::measured::WheelSpeeds;
 use tread_control::robot::{GRAVITY_M_S2, RobotModel};
 
-use super::curve::{Curve, Shape};
+use super::curve::{ContactSlip, Curve, Shape};
 use super::means::{Means, Moment, Sums};
 use super::spec::Deviations;
 
@@ -256,12 +256,12 @@ impl Plant {
     }
 
     /// Returns the ratio μ/λ of the blended friction curve.
-    fn mu_over_slip(&self, slip: f64, sliding_m_s: f64) -> f64 {
+    fn mu_over_slip(&self, contact: ContactSlip) -> f64 {
         let curve = self.spec.curve;
-        let own = curve.mu_over_slip(slip, sliding_m_s);
+        let own = curve.mu_over_slip(contact);
         self.blend.map_or(own, |(shape, share)| {
             let other = Curve { shape, ..curve };
-            (1.0 - share) * own + share * other.mu_over_slip(slip, sliding_m_s)
+            (1.0 - share) * own + share * other.mu_over_slip(contact)
         })
     }
 
@@ -294,7 +294,10 @@ impl Plant {
             2.0 * DAMPING_RATIO * (curve.stiffness * self.spec.relaxation_m / GRAVITY_M_S2).sqrt();
         self.contacts.map(|contact| {
             let slip = contact.deflection[0].hypot(contact.deflection[1]);
-            let mu_over_slip = self.mu_over_slip(slip, contact.slip_m_s);
+            let mu_over_slip = self.mu_over_slip(ContactSlip {
+                slip,
+                sliding_m_s: contact.slip_m_s,
+            });
             let rim_m_s = (self.wheels_rad_s[contact.side] * self.radius_m[contact.side]).abs();
             let damped =
                 damping * (1.0 - rim_m_s / DAMPED_BELOW_M_S).max(0.0) / self.spec.relaxation_m;

@@ -89,9 +89,9 @@ impl SensorSpec {
     pub fn drawn(random: &mut Random, has_torque: bool) -> Self {
         let rate_hz = random.one_of(&[5_u32, 10, 20]).unwrap_or(10);
         Self {
-            counts_per_turn: random.log_uniform(4_096.0, 80_000.0),
-            gyro_walk_rad_s: random.log_uniform(3.0e-5, 3.0e-4),
-            position_m: random.log_uniform(0.005, 0.03),
+            counts_per_turn: random.log_uniform(4_096.0..80_000.0),
+            gyro_walk_rad_s: random.log_uniform(3.0e-5..3.0e-4),
+            position_m: random.log_uniform(0.005..0.03),
             position_period: Duration::from_secs(1) / rate_hz,
             position_delay: Duration::from_millis(10) * random.one_of(&[2, 5, 10]).unwrap_or(5),
             outlier_share: random.one_of(&[0.0, 0.002]).unwrap_or(0.0),
@@ -164,7 +164,7 @@ impl Sensors {
             self.wander_m[1] + self.random.normal(spec.position_m),
         ];
         if self.random.chance(spec.outlier_share) {
-            let angle = self.random.uniform(0.0, std::f64::consts::TAU);
+            let angle = self.random.uniform(0.0..std::f64::consts::TAU);
             off_m[0] += OUTLIER_M * angle.cos();
             off_m[1] += OUTLIER_M * angle.sin();
         }

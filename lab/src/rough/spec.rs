@@ -168,27 +168,27 @@ impl Deviations {
         };
         let slope_rad = [slope(), slope()];
         Self {
-            payload_ratio: random.uniform(0.0, 0.3),
-            inertia_ratio: random.uniform(0.8, 1.25),
-            center_forward_ratio: random.uniform(-0.05, 0.05),
-            center_left_ratio: random.uniform(-0.03, 0.03),
-            center_height_ratio: random.uniform(0.2, 0.5),
-            relaxation_m: random.log_uniform(0.01, 0.1),
+            payload_ratio: random.uniform(0.0..0.3),
+            inertia_ratio: random.uniform(0.8..1.25),
+            center_forward_ratio: random.uniform(-0.05..0.05),
+            center_left_ratio: random.uniform(-0.03..0.03),
+            center_height_ratio: random.uniform(0.2..0.5),
+            relaxation_m: random.log_uniform(0.01..0.1),
             slope_rad,
             torque_scale: [
                 scale * (1.0 + random.normal(0.02)),
                 scale * (1.0 + random.normal(0.02)),
             ],
-            rotor_ratio: random.uniform(0.01, 0.1),
-            gear_loss_ratio: random.uniform(0.0, 0.03),
-            rolling_resistance_ratio: random.uniform(0.01, 0.04),
+            rotor_ratio: random.uniform(0.01..0.1),
+            gear_loss_ratio: random.uniform(0.0..0.03),
+            rolling_resistance_ratio: random.uniform(0.01..0.04),
             radius_ratio: [1.0 + random.normal(0.005), 1.0 + random.normal(0.005)],
-            servo_lag_s: random.log_uniform(0.02, 0.1),
-            motor_limit_mu: random.uniform(0.8, 1.5),
+            servo_lag_s: random.log_uniform(0.02..0.1),
+            motor_limit_mu: random.uniform(0.8..1.5),
             curve: Curve {
                 shape,
                 stiffness,
-                mu_peak: random.uniform(0.3, 0.9).min(0.9 * stiffness),
+                mu_peak: random.uniform(0.3..0.9).min(0.9 * stiffness),
             },
         }
     }

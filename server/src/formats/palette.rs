@@ -48,9 +48,18 @@ pub fn doubt(relative_std_dev: f64) -> f64 {
     ((relative_std_dev - SURE) / (UNSURE - SURE)).clamp(0.0, 1.0)
 }
 
-/// Returns the colour at `share` of the scale, 0 to 1, desaturated towards grey of equal luma by
-/// `doubt`, 0 to 1.
-pub fn colour(share: f64, doubt: f64) -> Rgb {
+/// Colour of the map before conversion to RGB.
+#[derive(Debug, Clone, Copy)]
+pub struct Shade {
+    /// Position on the colour scale, 0 to 1.
+    pub share: f64,
+    /// Degree of desaturation, 0 (full colour) to 1 (grey).
+    pub doubt: f64,
+}
+
+/// Returns the colour of a shade, desaturated towards grey of equal luma.
+pub fn colour(shade: Shade) -> Rgb {
+    let Shade { share, doubt } = shade;
     let pure = cividis(share).map(f64::from);
     let grey = 0.299 * pure[0] + 0.587 * pure[1] + 0.114 * pure[2];
     pure.map(|channel| byte(grey + (channel - grey) * (1.0 - doubt.clamp(0.0, 1.0))))
@@ -64,7 +73,10 @@ mod tests {
     fn the_colour_map_goes_from_dark_blue_to_yellow() {
         assert_eq!(cividis(0.0), [0, 32, 81]);
         assert_eq!(cividis(1.0), [253, 234, 69]);
-        let grey = colour(0.5, 1.0);
+        let grey = colour(Shade {
+            share: 0.5,
+            doubt: 1.0,
+        });
         assert!(grey[0] == grey[1] && grey[1] == grey[2], "{grey:?}");
     }
 

@@ -12,7 +12,9 @@ use embedded_graphics::pixelcolor::{Rgb888, RgbColor as _};
 use embedded_graphics::text::{Baseline, Text};
 use embedded_graphics::{Drawable as _, Pixel};
 
-use super::palette::{HATCHED, Rgb, THETA_HIGH, THETA_LOW, UNSURE, cividis, colour, doubt, share};
+use super::palette::{
+    HATCHED, Rgb, Shade, THETA_HIGH, THETA_LOW, UNSURE, cividis, colour, doubt, share,
+};
 use crate::friction::Raster;
 use crate::friction::index::KnownCell;
 
@@ -157,7 +159,10 @@ pub fn encode(raster: &Raster, scale: Option<usize>) -> Result<Vec<u8>, PngError
 
 fn draw(canvas: &mut Canvas, (x, y): (usize, usize), scale: usize, known: &KnownCell) {
     let relative = known.std_dev / known.theta;
-    let ink = colour(share(known.theta), doubt(relative));
+    let ink = colour(Shade {
+        share: share(known.theta),
+        doubt: doubt(relative),
+    });
     canvas.fill((x, y), (scale, scale), ink);
     if scale >= HATCHED_SIDE_PX && relative >= HATCHED {
         for row in y..y + scale {
@@ -203,7 +208,10 @@ fn draw_legend(canvas: &mut Canvas, top: usize, height: usize) {
     canvas.write((MARGIN_PX, y), "σ/θ");
     for column in 0..bar {
         let relative = column as f64 / bar as f64 * UNSURE;
-        let ink = colour(0.75, doubt(relative));
+        let ink = colour(Shade {
+            share: 0.75,
+            doubt: doubt(relative),
+        });
         for row in y..y + BAR_PX {
             let is_hatched = relative >= HATCHED && (left + column + row).is_multiple_of(HATCH_PX);
             canvas.put(left + column, row, if is_hatched { WHITE } else { ink });

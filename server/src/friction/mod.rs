@@ -28,8 +28,8 @@ impl Fused {
     pub fn to_api(self, now_us: i64) -> FusedFriction {
         let theta = self.theta;
         let (theta_low_95, theta_high_95) = theta.interval_95();
-        let lower = theta.quantile(-NORMAL_90, 0.0);
-        let upper = theta.quantile(NORMAL_90, fuse::THETA_MIN);
+        let lower = theta.quantile(-NORMAL_90).max(0.0);
+        let upper = theta.quantile(NORMAL_90).max(fuse::THETA_MIN);
         let layer = |estimate: Estimate| ValueEstimate {
             value: estimate.value,
             std_dev: estimate.std_dev,

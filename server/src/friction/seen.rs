@@ -145,16 +145,17 @@ pub struct Estimate {
 }
 
 impl Estimate {
-    /// Returns the value plus `std_devs` standard deviations, at least `least`.
-    pub fn quantile(&self, std_devs: f64, least: f64) -> f64 {
-        (self.value + std_devs * self.std_dev).max(least)
+    /// Returns the quantile of the normal distribution that is `std_devs` standard deviations above
+    /// the value, or below it if negative.
+    pub fn quantile(&self, std_devs: f64) -> f64 {
+        self.value + std_devs * self.std_dev
     }
 
     /// Returns lower and upper bound of the 95 % interval, both at least 0.
     pub fn interval_95(&self) -> (f64, f64) {
         (
-            self.quantile(-NORMAL_95, 0.0),
-            self.quantile(NORMAL_95, 0.0),
+            self.quantile(-NORMAL_95).max(0.0),
+            self.quantile(NORMAL_95).max(0.0),
         )
     }
 }

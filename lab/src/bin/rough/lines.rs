@@ -29,16 +29,16 @@ pub(crate) const CHANGES: [(&str, Change); 22] = [
         robot.inertia_ratio = 0.8;
     }),
     ("brush, peak 0.3", |robot| {
-        bent(robot, Shape::Brush, 0.3);
+        with_curve(robot, Shape::Brush, 0.3);
     }),
     ("brush, peak 0.8", |robot| {
-        bent(robot, Shape::Brush, 0.8);
+        with_curve(robot, Shape::Brush, 0.8);
     }),
     ("Magic Formula, peak 0.5", |robot| {
-        bent(robot, Shape::MagicFormula, 0.5);
+        with_curve(robot, Shape::MagicFormula, 0.5);
     }),
     ("LuGre, peak 0.6", |robot| {
-        bent(robot, Shape::LuGre, 0.6);
+        with_curve(robot, Shape::LuGre, 0.6);
     }),
     ("relaxation 1 cm", |robot| {
         robot.relaxation_m = 0.01;
@@ -78,7 +78,7 @@ pub(crate) const CHANGES: [(&str, Change); 22] = [
     }),
 ];
 
-fn bent(robot: &mut Deviations, shape: Shape, mu_peak: f64) {
+fn with_curve(robot: &mut Deviations, shape: Shape, mu_peak: f64) {
     robot.curve.shape = shape;
     robot.curve.mu_peak = mu_peak.min(0.9 * robot.curve.stiffness);
 }
