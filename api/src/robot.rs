@@ -311,7 +311,7 @@ pub struct Robot {
     /// Time of its newest connection.
     pub last_hello_at: Timestamp,
     /// Measurements that the server has not put on the friction map.
-    pub measurements: MeasurementsTaken,
+    pub measurements: UnmappedMeasurements,
     /// Link state.
     pub link: LinkState,
     /// Reason why it is not online; `null` while it is online.
@@ -324,7 +324,7 @@ pub struct Robot {
 
 /// Measurements of a robot that are not on the friction map.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
-pub struct MeasurementsTaken {
+pub struct UnmappedMeasurements {
     /// Number of measurements refused for good, because they are implausible.
     pub refused: u64,
     /// Reason of the last refusal, for people; `null` if there was none.

@@ -1,11 +1,11 @@
-//! Time and identifiers that grow with it, injected: nothing else here asks the machine.
+//! The injected clock: wall time, monotonic time and time-ordered identifiers. No other module of
+//! the server reads the machine's clocks.
 //!
-//! The wall time that [`Clock::now`] gives never goes back while the process lives. A machine whose
-//! clock is set back by up to [`STEP_BACK_HELD_MAX`] is waited for: from the last time given on,
-//! this clock advances at half the pace until the machine's has caught up. A larger step is
-//! followed, because a clock that was a day ahead was wrong, and would keep the fleet in the future
-//! for days. The order within one history does not depend on this clock alone: SQL keeps it over
-//! restarts.
+//! The wall time of [`Clock::now`] does not decrease while the process runs, except after a large
+//! step. When the machine's clock steps back by up to [`STEP_BACK_HELD_MAX`], this clock advances
+//! at half the rate from the last time returned until the machine's clock has caught up. It follows
+//! a larger step back at once, because a clock that was more than a day ahead was wrong. Over
+//! restarts, SQL also keeps the order of the times within one history.
 
 mod floor;
 
@@ -20,7 +20,7 @@ use uuid::{ContextV7, Uuid};
 pub use self::floor::{ClockSteps, STEP_BACK_HELD_MAX, STEP_NOTED_MIN};
 use self::floor::{Floor, Step};
 
-/// A clock: the machine's, that of a simulated site, or one that a test moves.
+/// A clock with one of three sources: the machine, a simulated site, or a test that sets the time.
 #[derive(Debug, Clone)]
 pub struct Clock {
     source: Source,
@@ -28,12 +28,12 @@ pub struct Clock {
     identifiers: Arc<Mutex<Identifiers>>,
 }
 
-/// What keeps identifiers in the order of their creation.
+/// State that keeps identifiers in the order of their creation.
 #[derive(Debug)]
 struct Identifiers {
-    /// Keeps the order within this process, whatever time it is given.
+    /// Keeps the order within this process, even for equal or decreasing times.
     context: ContextV7,
-    /// No identifier has an earlier time than this.
+    /// Earliest time of a new identifier.
     not_before: Timestamp,
 }
 
@@ -44,7 +44,7 @@ enum Source {
     Manual(Arc<Mutex<ManualTime>>),
 }
 
-/// Gives the wall time of a simulated site.
+/// Function that returns the wall time of a simulated site.
 type SiteWall = Arc<dyn Fn() -> Timestamp + Send + Sync>;
 
 impl fmt::Debug for Source {
@@ -77,7 +77,8 @@ impl Source {
         }
     }
 
-    /// Whether wall time and monotonic time have the same pace, so that a step forward shows.
+    /// Returns whether wall time and monotonic time advance at the same rate, so that a step
+    /// forward can be detected.
     const fn has_one_pace(&self) -> bool {
         match self {
             Self::System { .. } | Self::Manual(_) => true,
@@ -93,7 +94,7 @@ struct ManualTime {
 }
 
 impl Clock {
-    /// The machine's clock.
+    /// Returns the machine's clock.
     #[expect(
         clippy::disallowed_methods,
         reason = "this is where the time comes from"
@@ -103,8 +104,9 @@ impl Clock {
         Self::of(Source::System { origin })
     }
 
-    /// The wall clock of a simulated site, whose time may go faster than the machine's. Ages and
-    /// bounds, as of the silence of robots, go by the machine's monotonic clock.
+    /// Returns the clock of a simulated site, whose wall time may advance faster than the
+    /// machine's. Ages and timeouts, such as those of silent robots, still use the machine's
+    /// monotonic clock.
     #[expect(
         clippy::disallowed_methods,
         reason = "this is where the time comes from"
@@ -114,7 +116,7 @@ impl Clock {
         Self::of(Source::Site { origin, wall })
     }
 
-    /// A clock that stands still until [`Clock::advance`].
+    /// Returns a clock whose time changes only by [`Clock::advance`] and [`Clock::step`].
     pub fn manual(wall: Timestamp) -> Self {
         let elapsed = Duration::ZERO;
         Self::of(Source::Manual(Arc::new(Mutex::new(ManualTime {
@@ -134,8 +136,8 @@ impl Clock {
         }
     }
 
-    /// Wall time, UTC, in whole microseconds: as fine as the database keeps it. It never goes back
-    /// by a step of the machine's clock up to [`STEP_BACK_HELD_MAX`].
+    /// Returns the wall time, UTC, in whole microseconds, the resolution of the database. Steps
+    /// back of the machine's clock of up to [`STEP_BACK_HELD_MAX`] do not make it decrease.
     pub fn now(&self) -> Timestamp {
         let (issued_us, step) = {
             // Read under the lock, so that threads cannot overtake each other.
@@ -149,23 +151,25 @@ impl Clock {
         Timestamp::from_microsecond(issued_us).unwrap_or(Timestamp::MAX)
     }
 
-    /// The wall clock as it stands, which may go back: for certificates, which other machines judge
-    /// by their own clocks.
+    /// Returns the source's wall time, which may decrease. It serves the validity of certificates,
+    /// which other machines check with their own clocks.
     pub fn machine_time(&self) -> Timestamp {
         let wall = self.source.wall();
         Timestamp::from_microsecond(wall.as_microsecond()).unwrap_or(wall)
     }
 
-    /// Takes up where an earlier run of the server left off: no time before the newest one that the
-    /// database holds, if the machine's clock is behind it by at most [`STEP_BACK_HELD_MAX`], and
-    /// no identifier before the newest one.
+    /// Continues after an earlier run of the server, whose newest time and identifier the database
+    /// holds. New identifiers sort after `newest_id`. Times continue after `newest` if the
+    /// machine's clock is at most [`STEP_BACK_HELD_MAX`] behind it; otherwise `newest` is ignored
+    /// and a warning is logged.
     pub fn continue_after(&self, newest: Option<Timestamp>, newest_id: Option<Uuid>) {
         let id_time = newest_id.and_then(|id| id.get_timestamp());
         let id_time = id_time.and_then(|time| {
             let (seconds, nanos) = time.to_unix();
             Timestamp::new(i64::try_from(seconds).ok()?, i32::try_from(nanos).ok()?).ok()
         });
-        // Identifiers of one millisecond are distinguished by a counter that begins anywhere.
+        // Identifiers of one millisecond differ by a counter with a random start, so skip to the
+        // next.
         let after = id_time.and_then(|time| time.checked_add(Duration::from_millis(1)).ok());
         if let Some(after) = after {
             let mut identifiers = lock(&self.identifiers);
@@ -182,17 +186,17 @@ impl Clock {
         }
     }
 
-    /// Steps of the machine's clock that were seen.
+    /// Returns the steps of the machine's clock that were detected so far.
     pub fn steps(&self) -> ClockSteps {
         lock(&self.floor).steps()
     }
 
-    /// Time since an arbitrary origin; it never jumps. For ages and bounds.
+    /// Returns the monotonic time since an arbitrary origin, for ages and timeouts.
     pub fn elapsed(&self) -> Duration {
         self.source.elapsed()
     }
 
-    /// Moves a manual clock forward; the others move by themselves.
+    /// Advances wall time and monotonic time of a manual clock; has no effect on other clocks.
     pub fn advance(&self, span: Duration) {
         if let Source::Manual(time) = &self.source {
             let mut time = lock(time);
@@ -201,8 +205,8 @@ impl Clock {
         }
     }
 
-    /// Sets the wall time of a manual clock forward or back, as an operator or NTP may do to a
-    /// machine's; its monotonic time stays.
+    /// Steps the wall time of a manual clock forward or back, as an operator or NTP may step a
+    /// machine's clock. The monotonic time does not change. Has no effect on other clocks.
     pub fn step(&self, by: SignedDuration) {
         if let Source::Manual(time) = &self.source {
             let mut time = lock(time);
@@ -210,8 +214,8 @@ impl Clock {
         }
     }
 
-    /// A new identifier, a version 7 UUID; they sort by creation, also within one microsecond, and
-    /// also while the machine's clock is behind.
+    /// Returns a new identifier, a version 7 UUID. Identifiers sort by creation, also within one
+    /// microsecond and after the machine's clock stepped back.
     pub fn new_id<T: From<Uuid>>(&self) -> T {
         let now = self.now();
         let identifiers = lock(&self.identifiers);
@@ -223,7 +227,7 @@ impl Clock {
     }
 }
 
-/// Says once for each step what the machine's clock did.
+/// Logs a step of the machine's clock.
 fn log_step(step: Step) {
     let seconds = |span_us: i64| SignedDuration::from_micros(span_us).as_secs_f64();
     match step {
@@ -297,7 +301,7 @@ mod tests {
         clock.advance(Duration::from_secs(10));
         assert_eq!(clock.now(), before.0 + SignedDuration::from_secs(5));
         assert_eq!(clock.steps().back, 1);
-        // Two days are not waited for, and identifiers sort all the same.
+        // The clock follows a step back of two days at once; identifiers keep their order.
         clock.step(SignedDuration::from_hours(-48));
         assert!(clock.now() < before.0);
         assert!(clock.new_id::<MissionId>() > held.1);

@@ -1,7 +1,7 @@
-//! Configuration: built-in values, then a TOML file, then flags; the later one counts.
+//! Configuration of the server: defaults, overridden by a TOML file, overridden by flags.
 //!
-//! An unknown key, an impossible value or an address beyond this machine stops the start, with a
-//! sentence that names file, line and key.
+//! An unknown key, a value out of range, or an address that other machines can reach without TLS
+//! prevents the start. The error names file, line and key.
 
 pub mod oidc;
 
@@ -20,28 +20,28 @@ pub use crate::friction::weights::FrictionConfig;
 use crate::identity::address::Network;
 use crate::identity::origin::{Names, Origin};
 
-/// Address of the REST API when nothing else is said.
+/// Default address of the REST API.
 pub const HTTP_DEFAULT: &str = "127.0.0.1:8420";
-/// Address of the zenoh router when nothing else is said.
+/// Default address of the zenoh router.
 pub const ZENOH_DEFAULT: &str = "127.0.0.1:7447";
-/// The database file when nothing else is said.
+/// Default database file.
 pub const DATABASE_DEFAULT: &str = "tread.db";
-/// The site that exists from the start when nothing else is said.
+/// Default identifier of the site that is created at the start.
 pub const SITE_DEFAULT: &str = "yard";
 
-/// Flags of the server; each wins over the configuration file.
+/// Flags of the server; each overrides the configuration file.
 #[derive(Debug, Clone, Default, Args)]
 pub struct ServerArgs {
     /// Configuration file, TOML
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
-    /// Address of the REST API; port 0 takes a free one
+    /// Address of the REST API; port 0 selects a free port
     #[arg(long, value_name = "ADDRESS")]
     pub http: Option<SocketAddr>,
-    /// Address of `/metrics` for Prometheus; none when absent
+    /// Address of `/metrics` for Prometheus; no metrics when absent
     #[arg(long, value_name = "ADDRESS")]
     pub metrics: Option<SocketAddr>,
-    /// Address of the zenoh router that robots connect to; port 0 takes a free one
+    /// Address of the zenoh router that robots connect to; port 0 selects a free port
     #[arg(long, value_name = "ADDRESS")]
     pub zenoh: Option<SocketAddr>,
     /// Database file, created when missing
@@ -50,15 +50,15 @@ pub struct ServerArgs {
     /// Site that is created when missing
     #[arg(long)]
     pub site: Option<SiteId>,
-    /// What is logged, such as `info` or `tread_server=debug`; `RUST_LOG` when absent
+    /// Log filter, such as `info` or `tread_server=debug`; `RUST_LOG` when absent
     #[arg(long, value_name = "FILTER")]
     pub log: Option<String>,
-    /// How it is logged
+    /// Format of log lines
     #[arg(long, value_enum, default_value_t)]
     pub log_format: LogFormat,
 }
 
-/// How log lines look.
+/// Format of log lines.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
 pub enum LogFormat {
     /// For people
@@ -68,110 +68,111 @@ pub enum LogFormat {
     Json,
 }
 
-/// Everything that the server needs to know to start.
+/// Complete, checked configuration of the server.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Config {
-    /// Address of the REST API, on this machine.
+    /// Address of the REST API; a loopback address unless `tls` is set.
     pub http: SocketAddr,
-    /// Address of `/metrics`, on this machine, if there is to be one.
+    /// Address of `/metrics`, a loopback address; `None` for no metrics.
     pub metrics: Option<SocketAddr>,
-    /// Address that robots connect to; on this machine, unless they show certificates.
+    /// Address that robots connect to; a loopback address unless `robots` is set.
     pub zenoh: SocketAddr,
-    /// The database file.
+    /// Path of the database file.
     pub database: PathBuf,
-    /// The site that exists from the start.
+    /// Site that is created at the start if missing.
     pub site: SiteId,
-    /// How measurements of several robots and times are weighed.
+    /// Weights of measurements by robot and age.
     pub friction: FrictionConfig,
-    /// How the θ of robot models is brought to that of others, where an answer asks for it.
+    /// Declared ratios of θ between robot models, for answers that normalise θ.
     pub normalisations: Vec<Normalisation>,
-    /// How long raw measurements are kept.
+    /// Retention of raw measurements.
     pub retention: RetentionConfig,
-    /// What is expected of the storage.
+    /// Limits of the storage.
     pub storage: StorageConfig,
-    /// The REST API's certificate; without one it listens on this machine alone.
+    /// Certificate of the REST API; `None` serves plain HTTP on a loopback address.
     pub tls: Option<TlsFiles>,
-    /// What browsers may do.
+    /// Host names, origins and proxies of the REST API.
     pub web: WebConfig,
-    /// What becomes of the audit log besides the database.
+    /// Output of the audit log in addition to the database.
     pub audit: AuditConfig,
-    /// How robots join and show who they are; without it they connect in the clear, on this
-    /// machine alone.
+    /// Enrolment and authentication of robots; `None` lets robots connect without TLS to a loopback
+    /// address.
     pub robots: Option<RobotsConfig>,
-    /// How people sign in at an OpenID provider; without it with tokens alone.
+    /// Sign-in of people at an OpenID provider; `None` allows tokens only.
     pub oidc: Option<OidcConfig>,
 }
 
-/// How robots join and show who they are.
+/// `[robots]`: enrolment and authentication of robots by certificates.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RobotsConfig {
-    /// The folder of the fleet's authority, which `tread-server init` makes.
+    /// Folder of the fleet's certificate authority, created by `tread-server init`.
     pub authority: PathBuf,
-    /// Names and addresses that robots know this server by, besides `localhost`.
+    /// Host names and addresses by which robots reach this server, in addition to `localhost`.
     #[serde(default)]
     pub names: Vec<String>,
-    /// How long a robot's certificate is good for, seconds, within [`CERTIFICATE_S_RANGE`]. A
-    /// robot renews it when two thirds are over.
+    /// Validity period of a robot's certificate in seconds, within [`CERTIFICATE_S_RANGE`]. A robot
+    /// renews its certificate after two thirds of this period.
     #[serde(default = "certificate_s")]
     pub certificate_s: u32,
 }
 
-/// How long a robot's certificate may be good for, seconds: it must outlive an outage or two, and
-/// what was stolen must end some day.
+/// Range of the validity period of robots' certificates, in seconds. The period should outlast
+/// outages of the server; the upper bound limits the use of a stolen certificate.
 pub const CERTIFICATE_S_RANGE: std::ops::RangeInclusive<u32> = 5..=30 * 24 * 3_600;
 
 const fn certificate_s() -> u32 {
     24 * 3_600
 }
 
-/// Certificate and key of the REST API, both PEM.
+/// `[tls]`: certificate and key of the REST API, both PEM.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TlsFiles {
-    /// The certificate, followed by those between it and its authority.
+    /// File with the certificate, followed by its intermediate certificates.
     pub certificate: PathBuf,
-    /// Its private key.
+    /// File with the private key.
     pub key: PathBuf,
 }
 
-/// What browsers may do.
+/// `[web]`: host names, origins and proxies of the REST API.
 #[derive(Debug, Clone, Default, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct WebConfig {
-    /// Names of this server besides `localhost` and its addresses.
+    /// Host names of this server in addition to `localhost` and IP addresses.
     pub hosts: Vec<String>,
-    /// Origins of foreign pages that may ask with a token of their own.
+    /// Origins of foreign pages that may send requests with a token (CORS, `WebSocket`).
     pub allowed_origins: Vec<Origin>,
-    /// A proxy before this server ends TLS: browsers come by `https`.
+    /// Whether a proxy in front of this server terminates TLS, so that browsers use `https`.
     pub behind_https: bool,
-    /// Addresses and networks of the proxies before this server, whose `X-Forwarded-For` says where
-    /// a request comes from. Nobody else's is believed.
+    /// Addresses and networks of the proxies in front of this server. Only their `X-Forwarded-For`
+    /// entries are used to determine the client address of a request.
     pub trusted_proxies: Vec<Network>,
 }
 
-/// What becomes of the audit log besides the database.
+/// `[audit]`: output of the audit log in addition to the database.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct AuditConfig {
-    /// Each entry is a line of the server's log too, of the target `tread_audit`: what the journal or
-    /// a collector of logs has, nobody changes who can write the database.
+    /// Whether each entry is also written to the server's log with the target `tread_audit`, from
+    /// which a log collector can store it where an intruder in the database cannot change it.
     pub log: bool,
 }
 
-/// How long raw measurements are kept; what they say stays on the map for ever.
+/// `[retention]`: retention of raw measurements. Their statistics stay on the map for ever.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RetentionConfig {
-    /// Days after which a raw measurement is removed, within [`SEGMENTS_DAYS_RANGE`].
+    /// Days after which a raw measurement is deleted, within [`SEGMENTS_DAYS_RANGE`].
     pub segments_days: u32,
-    /// Most raw measurements; the oldest go first. Within [`SEGMENTS_MAX_RANGE`].
+    /// Maximum number of raw measurements, within [`SEGMENTS_MAX_RANGE`]; beyond it the oldest are
+    /// deleted.
     pub segments_max: i64,
 }
 
-/// How long raw measurements may be kept, days.
+/// Range of the retention time of raw measurements, in days.
 pub const SEGMENTS_DAYS_RANGE: std::ops::RangeInclusive<u32> = 1..=36_500;
-/// How many raw measurements may be kept.
+/// Range of the maximum number of raw measurements.
 pub const SEGMENTS_MAX_RANGE: std::ops::RangeInclusive<i64> = 1_000..=1_000_000_000_000;
 
 impl Default for RetentionConfig {
@@ -204,16 +205,16 @@ impl RetentionConfig {
     }
 }
 
-/// What is expected of the storage.
+/// `[storage]`: limits of the storage.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct StorageConfig {
-    /// An alert is raised when less than this is free on the disk of the database, MiB; within
-    /// [`DISK_FREE_MIN_MIB_RANGE`].
+    /// Minimum free space on the disk of the database in MiB, within [`DISK_FREE_MIN_MIB_RANGE`];
+    /// below it an alert is raised.
     pub disk_free_min_mib: u64,
 }
 
-/// How much of the disk may be asked to be free, MiB.
+/// Range of the minimum free disk space, in MiB.
 pub const DISK_FREE_MIN_MIB_RANGE: std::ops::RangeInclusive<u64> = 16..=1_000_000_000;
 const BYTES_PER_MIB: u64 = 1_024 * 1_024;
 
@@ -226,7 +227,7 @@ impl Default for StorageConfig {
 }
 
 impl StorageConfig {
-    /// The limit in bytes.
+    /// Returns the minimum free disk space in bytes.
     pub const fn disk_free_min_bytes(self) -> u64 {
         self.disk_free_min_mib.saturating_mul(BYTES_PER_MIB)
     }
@@ -244,7 +245,7 @@ impl StorageConfig {
     }
 }
 
-/// Refuses weights that make no sense.
+/// Checks the ranges of `[friction]`.
 fn check_friction(friction: FrictionConfig) -> Result<(), ConfigError> {
     let FrictionConfig {
         robot_bias_ratio,
@@ -258,7 +259,7 @@ fn check_friction(friction: FrictionConfig) -> Result<(), ConfigError> {
         ("friction.drift_variance_per_s", drift_variance_per_s, ratio),
         ("friction.mu_peak_age_max_s", mu_peak_age_max_s, span),
     ] {
-        // TOML can say `nan`, which no range contains.
+        // TOML allows `nan`, which no range contains.
         if !bounds.contains(&value) {
             return Err(ConfigError::OutOfRange { key, range, value });
         }
@@ -266,7 +267,7 @@ fn check_friction(friction: FrictionConfig) -> Result<(), ConfigError> {
     Ok(())
 }
 
-/// One normalisation of the configuration file.
+/// A normalisation, `[normalisations.NAME]`: ratios of θ relative to a reference configuration.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct NormalisationFields {
@@ -274,7 +275,7 @@ struct NormalisationFields {
     ratios: BTreeMap<ConfigurationId, f64>,
 }
 
-/// θ of one model over that of another on the same ground.
+/// Range of the ratio of θ between two robot models on the same ground.
 const RATIOS: std::ops::RangeInclusive<f64> = 0.01..=100.0;
 
 fn normalisations(
@@ -323,62 +324,63 @@ struct File {
     oidc: Option<OidcConfig>,
 }
 
-/// Why the server cannot start with this configuration.
+/// Error of reading the configuration.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     /// The file cannot be read.
     #[error("cannot read the configuration file `{}`", path.display())]
     Unreadable {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// Why.
+        /// Cause of the failure.
         #[source]
         cause: std::io::Error,
     },
-    /// The file does not say something possible; the text names line and key.
+    /// The file is no valid TOML, or has an unknown key or a value of the wrong type.
     #[error("configuration file `{}`, line {line}: {message}", path.display())]
     Invalid {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// Which line, from 1.
+        /// Number of the line, from 1.
         line: usize,
-        /// Which key, and what is wrong with it.
+        /// Message of the parser, and the text of the line.
         message: String,
     },
     /// A number is out of its range.
     #[error("`{key}` must be {range}, not {value}")]
     OutOfRange {
-        /// Which key.
+        /// Configuration key.
         key: &'static str,
-        /// What is allowed.
+        /// Allowed range.
         range: &'static str,
-        /// What was given.
+        /// Configured value.
         value: f64,
     },
-    /// The sign-in of people at a provider cannot be as it is written.
+    /// `[oidc]` is invalid.
     #[error(transparent)]
     Oidc(#[from] OidcConfigError),
-    /// A name of the robots' port is none.
+    /// An entry of `robots.names` is neither a host name nor an IP address.
     #[error("`robots.names` has `{0}`, which is neither a host name nor an address")]
     PortName(String),
-    /// An address that others can reach.
+    /// Other machines can reach a configured address without TLS.
     #[error("`{key}` is {address}, which other machines can reach without TLS: {cure}")]
     NotLoopback {
-        /// Which key.
+        /// Configuration key.
         key: &'static str,
-        /// What was given.
+        /// Configured address.
         address: SocketAddr,
-        /// What to do.
+        /// Remedy, for the message.
         cure: &'static str,
     },
 }
 
 impl Config {
-    /// Reads the file that the flags name, if any, and lets the flags win.
+    /// Reads the configuration file that the flags name, if any, applies the flags, and checks the
+    /// result.
     ///
     /// # Errors
-    /// [`ConfigError`]: unreadable, an unknown key, an impossible value, or an address beyond
-    /// this machine.
+    /// [`ConfigError`] if the file cannot be read, has an unknown key or an invalid value, or if
+    /// other machines could reach an address without TLS.
     pub fn load(args: &ServerArgs) -> Result<Self, ConfigError> {
         let file = args
             .config
@@ -421,7 +423,7 @@ impl Config {
         Ok(config)
     }
 
-    /// The names that the server goes by.
+    /// Returns the host names of this server and the allowed origins.
     pub fn names(&self) -> Names {
         Names {
             hosts: self.web.hosts.clone(),

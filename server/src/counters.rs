@@ -1,4 +1,4 @@
-//! What the server counts about itself, shown at `GET /v1/server`.
+//! Event counters of the server, reported by `GET /v1/server`.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -7,20 +7,20 @@ use utoipa::ToSchema;
 
 macro_rules! counters {
     ($($(#[$doc:meta])* $name:ident,)*) => {
-        /// Counters since the start of the process; each only grows.
+        /// Event counters since the start of the process.
         #[derive(Debug, Default)]
         pub struct Counters {
             $($(#[$doc])* pub $name: Counter,)*
         }
 
-        /// The counters at one moment.
+        /// Values of the event counters since the start of the server process.
         #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
         pub struct CounterValues {
             $($(#[$doc])* pub $name: u64,)*
         }
 
         impl Counters {
-            /// Reads all counters.
+            /// Returns the present values of all counters.
             pub fn values(&self) -> CounterValues {
                 CounterValues { $($name: self.$name.get(),)* }
             }
@@ -31,199 +31,204 @@ macro_rules! counters {
 counters! {
     /// Segments stored.
     segments_committed,
-    /// Segments and mission reports that were stored before and came again.
+    /// Segments and mission reports received again after they were stored.
     records_duplicate,
-    /// Records that can never be taken: impossible numbers, or not this robot's mission.
+    /// Records refused for good: values out of range, or a mission of another robot.
     records_refused,
-    /// Segments with times in the future, deferred until their run's clock is known.
+    /// Segments with times in the future, deferred until the clock offset of their boot is known.
     segments_deferred,
-    /// Raw segments removed after their time; their statistics stay on the map.
+    /// Raw segments deleted by the retention; their statistics stay on the map.
     segments_removed,
-    /// Mission reports taken.
+    /// Mission reports stored.
     mission_reports_committed,
-    /// Batches answered.
+    /// Uploaded batches that were answered with a receipt.
     batches_answered,
-    /// Transactions of the ingest writer.
+    /// Database transactions of the ingest of uploads.
     ingest_transactions,
-    /// Uploads that found the queue full; the robot sends them again.
+    /// Uploads dropped because the queue was full; robots send them again.
     ingest_dropped_busy,
-    /// States and friction reports taken.
+    /// States and friction reports processed.
     states_received,
-    /// States and friction reports that found the queue full.
+    /// States and friction reports dropped because the queue was full.
     states_dropped,
-    /// Introductions answered.
+    /// Hello messages of robots answered.
     hellos_answered,
-    /// Introductions that found the queue full; the robot sends them again.
+    /// Hello messages dropped because the queue was full; robots send them again.
     hellos_dropped,
-    /// Messages that do not parse, or are too large.
+    /// Messages refused because they cannot be parsed or are too large.
     refused_malformed,
-    /// Messages of another major version.
+    /// Messages refused because of another payload version.
     refused_version,
-    /// Messages that name another robot than their key.
+    /// Messages refused because they name another robot than their key.
     refused_impersonation,
-    /// States and friction reports of robots that have not said hello.
+    /// States and friction reports refused because their robot has not sent a hello message.
     refused_unknown_robot,
-    /// States and friction reports of another run of the agent than the one that said hello last:
-    /// stragglers, or a second agent under the robot's name.
+    /// States and friction reports refused because they are of another boot than the last hello
+    /// message: late messages, or a second agent with the robot's name.
     refused_other_run,
-    /// Messages of robots whose enrolment was revoked.
+    /// Messages refused because the robot's enrolment was revoked.
     refused_revoked_robot,
-    /// Messages of robots that have not joined, where only those that have are accepted.
+    /// Messages refused because the robot is not enrolled, where enrolment is required.
     refused_unenrolled_robot,
-    /// Robots that joined, with those that joined again.
+    /// Enrolments of robots, with repeated ones.
     robots_enrolled,
-    /// Certificates renewed.
+    /// Certificates of robots renewed.
     certificates_renewed,
-    /// Attempts to join with what cannot be a join token.
+    /// Attempts to join with a malformed join token.
     join_token_malformed,
-    /// Attempts to join with a join token that is not kept here.
+    /// Attempts to join with an unknown join token.
     join_token_unknown,
-    /// Attempts to join with a join token whose time is over.
+    /// Attempts to join with an expired join token.
     join_token_expired,
-    /// Attempts to join with a join token that was used before.
+    /// Attempts to join with a join token that was already used.
     join_token_used,
-    /// Attempts to join with a join token that was revoked.
+    /// Attempts to join with a revoked join token.
     join_token_revoked,
     /// Attempts to join as a robot that the join token does not allow.
     join_token_other_robot,
-    /// Renewals refused: no certificate of this fleet, over for too long, or without its key.
+    /// Renewals refused: the certificate is not of this fleet or expired too long ago, or the robot
+    /// did not prove that it has the key.
     renewals_refused,
-    /// Renewals refused because the robot's enrolment was revoked, or it joined again.
+    /// Renewals refused because the enrolment was revoked or superseded by a newer one.
     renewals_revoked,
-    /// Renewals refused because this server did not give the certificate, or gave it long ago.
+    /// Renewals refused because this server did not issue the certificate, or the robot has used a
+    /// newer one since.
     renewals_not_issued,
-    /// Renewals refused because the certificate was of an authority that was retired.
+    /// Renewals refused because the certificate is of a retired authority.
     renewals_retired,
-    /// Connections to the robots' port.
+    /// Connections accepted on the robots' port.
     gate_connections,
-    /// Connections to the robots' port that began with something else than TLS.
+    /// Connections to the robots' port closed because they did not begin with a TLS handshake.
     gate_garbage,
-    /// Connections to the robots' port on which nothing came in time.
+    /// Connections to the robots' port closed because no data arrived in time.
     gate_silent,
-    /// Connections to the robots' port whose TLS handshake failed, for want of a certificate of
-    /// the fleet's or otherwise.
+    /// Connections to the robots' port whose TLS handshake failed, for example without a
+    /// certificate of the fleet.
     gate_tls_failed,
-    /// Connections to the robots' port refused because too many of their address had failed.
+    /// Connections to the robots' port refused because too many of their address failed before.
     gate_rate_limited,
     /// Connections to the robots' port refused because too many were open.
     gate_full,
-    /// Connections to the robots' port ended to make room for new ones before their handshake.
+    /// Connections to the robots' port closed before their handshake to make room for new ones.
     gate_displaced,
-    /// Connections of robots that declared liveliness tokens without end, cut or refused for a while.
+    /// Connections of robots closed or refused because the robot declared too many liveliness
+    /// tokens.
     gate_cut_off,
-    /// Pauses in the reading of robots that send more bytes a second than they may.
+    /// Pauses in reading from robots that exceeded their byte rate.
     gate_throttled,
-    /// Connections of robots whose enrolment was revoked, or that have joined again since.
+    /// Connections of robots closed because the enrolment was revoked or superseded by a newer one.
     gate_revoked,
-    /// Connections of robots ended because their certificate was over.
+    /// Connections of robots closed because their certificate expired.
     gate_expired,
-    /// Connections of robots ended because the authority of their certificate was retired.
+    /// Connections of robots closed because the authority of their certificate was retired.
     gate_retired,
-    /// Connections to the robots' port that the robot ended because it does not trust the port's
-    /// authority: one of another fleet, or from before the authority was changed.
+    /// Connections to the robots' port closed by the robot because it does not trust the port's
+    /// authority: a robot of another fleet, or one that missed a change of the authority.
     gate_distrusted,
-    /// Connections of robots that the router did not take.
+    /// Connections of robots that could not be forwarded to a router.
     gate_router_failed,
-    /// Sessions of robots that did not open: the link ended, it took too long, or the session was
-    /// not one of a client, or not that of the robot whose certificate it showed.
+    /// Sessions of robots that did not open: the link closed, a timeout expired, the session was
+    /// not of a zenoh client, or it was not of the robot that the certificate names.
     gate_session_failed,
-    /// Times that another router was opened beside the present ones, for robots that joined.
+    /// Routers opened in addition to the present ones, for robots that joined.
     routers_opened,
-    /// Messages to a site that is not known.
+    /// Messages refused because of an unknown site.
     refused_unknown_site,
-    /// Messages and liveliness tokens of robots beyond their rate limits.
+    /// Messages and liveliness tokens of robots refused by a rate limit.
     rate_limited,
-    /// Messages on a key that is none of ours.
+    /// Messages refused because their key is not part of the protocol.
     refused_key,
-    /// Changes of presence that found the queue full; the robot shows wrongly until its next one.
+    /// Changes of presence dropped because the queue was full; the robot's presence is wrong until
+    /// its next change.
     presence_dropped,
-    /// Replies that could not be sent because too many were waiting.
+    /// Replies dropped because too many were waiting to be sent.
     replies_dropped,
-    /// Reports on missions that are none of their robot's, or of other content; without effect.
+    /// Mission reports ignored because the mission is of another robot or has other content.
     reports_foreign,
-    /// Robots that were commanded to end a mission which the server does not have as open.
+    /// Commands to end a mission that a robot reported and the server does not have as open.
     missions_disowned,
-    /// Times that the router was opened again because it no longer answered.
+    /// Routers reopened because they no longer answered.
     router_reopened,
-    /// Looks at the router that it did not answer.
+    /// Health checks of a router that it did not answer.
     router_probes_failed,
-    /// Missions offered to robots, with repetitions.
+    /// Offers of missions sent to robots, with repetitions.
     offers_sent,
-    /// Commands that no robot answered.
+    /// Commands that their robot did not answer in time.
     commands_unanswered,
-    /// Stops sent to robots, with repetitions.
+    /// Stop commands sent to robots, with repetitions.
     stops_sent,
-    /// Stops that their robots had not confirmed within 300 ms.
+    /// Stop commands not confirmed by their robot within 300 ms.
     stops_unconfirmed,
-    /// Stops that robots no longer reported although they had not been cleared; sent again.
+    /// Stops sent again because a robot no longer reported them although they were not cleared.
     stops_lost,
     /// Drive commands sent to robots.
     drive_commands_sent,
-    /// Drive commands that a newer one of the same socket replaced before they were sent.
+    /// Drive commands replaced by a newer one of the same socket before they were sent.
     drive_commands_replaced,
     /// Drive sockets closed because a frame was malformed, too large or not allowed.
     drive_frames_refused,
-    /// Drivers whose socket was lost while they had the lease; their robots were commanded to
-    /// stand.
+    /// Drive sockets lost while their driver held the lease; the robots were commanded to stop.
     drivers_lost,
     /// HTTP connections refused because too many were open.
     http_connections_refused,
-    /// HTTP connections ended to make room for new ones: idle, or without a whole request.
+    /// HTTP connections closed to make room for new ones: idle, or without a complete request.
     http_connections_displaced,
-    /// HTTP requests refused because their token, or all others together, had as many connections at
-    /// work as they may.
+    /// HTTP requests refused because the limit of busy connections was reached, for their token,
+    /// for their address or for the server.
     http_requests_without_room,
-    /// HTTP connections on which nothing came in time, or no TLS.
+    /// HTTP connections closed because no request arrived in time, or because TLS was expected.
     http_connections_silent,
-    /// TLS handshakes that failed.
+    /// TLS handshakes of HTTP clients that failed.
     http_tls_failed,
-    /// Requests without a token where one is needed.
+    /// Requests refused because they had no token.
     refused_no_token,
-    /// Requests with a token that cannot be one.
+    /// Requests refused because the token was malformed.
     refused_token_malformed,
-    /// Requests with a token that is not kept here.
+    /// Requests refused because the token was unknown.
     refused_token_unknown,
-    /// Requests with a token whose time is over.
+    /// Requests refused because the token had expired.
     refused_token_expired,
-    /// Requests with a token that was revoked.
+    /// Requests refused because the token was revoked.
     refused_token_revoked,
-    /// Requests with a token that opens nothing, from where there were too many before.
+    /// Requests with an invalid token refused because their address or token prefix was locked
+    /// after too many failures.
     refused_locked,
-    /// Requests that the token's rights do not allow.
+    /// Requests refused because the caller lacks the right.
     refused_role,
-    /// Requests about a site or robot that the token is not for, or to give more than it has.
+    /// Requests refused because the site or robot is outside the caller's scope, or because they
+    /// would grant more than the caller has.
     refused_scope,
-    /// Requests of another site's page.
+    /// Requests refused because a page of another origin sent them.
     refused_origin,
-    /// Requests to a name that is not this server's.
+    /// Requests refused because their `Host` is not a name of this server.
     refused_host,
-    /// Requests whose path or query is too long.
+    /// Requests refused because their path or query is too long.
     refused_too_long,
-    /// Requests that the audit log has as a count in one entry for all repeats.
+    /// Requests that the audit log contains only as a count of repeats.
     audit_repeats,
-    /// Requests that the audit log lost: too many different ones were counted, or the database failed
-    /// until the stop.
+    /// Requests missing in the audit log because too many different repeats were counted, or
+    /// because the database failed until the stop of the server.
     audit_dropped,
-    /// Requests whose handler panicked.
+    /// HTTP requests whose handler panicked.
     http_panics,
 }
 
-/// One counter.
+/// A counter that only increases.
 #[derive(Debug, Default)]
 pub struct Counter(AtomicU64);
 
 impl Counter {
-    /// Counts one.
+    /// Adds one.
     pub fn one(&self) {
         self.add(1);
     }
 
-    /// Counts several.
+    /// Adds `count`.
     pub fn add(&self, count: u64) {
         self.0.fetch_add(count, Ordering::Relaxed);
     }
 
-    /// The count so far.
+    /// Returns the present value.
     pub fn get(&self) -> u64 {
         self.0.load(Ordering::Relaxed)
     }

@@ -1,11 +1,11 @@
-//! What is done beside a server, by whoever can write its database.
+//! Administrative commands that work on the server's database directly, while the server runs or
+//! not.
 //!
-//! `tread-server init`: the first admin's token of a server, and the fleet's authority if robots
-//! are to join. `tread-server forget-certificates`: the next certificate that each robot shows for a
-//! renewal counts.
-//!
-//! Whoever can write the database may make one; the server need not run, and may. The token is
-//! shown once: on standard output, or into a file that only its owner can read.
+//! * `tread-server init` creates the first admin's token, and the fleet's certificate authority if
+//!   `[robots]` is configured. The token is printed once, or written to a file that only its owner
+//!   can read.
+//! * `tread-server forget-certificates` lets each robot renew with the next certificate that it
+//!   presents, as needed after the database was restored from a backup.
 
 use std::io::{self, Write as _};
 use std::os::unix::fs::OpenOptionsExt as _;
@@ -31,17 +31,17 @@ pub(crate) struct InitArgs {
     /// Database file, created when missing
     #[arg(long, value_name = "FILE")]
     database: Option<PathBuf>,
-    /// What people call the token
+    /// Name of the token
     #[arg(long, default_value = "admin")]
     name: String,
-    /// Days until it is refused
+    /// Days until the token expires
     #[arg(long, value_name = "DAYS", default_value_t = 365,
         value_parser = clap::value_parser!(u32).range(1..=i64::from(TOKEN_DAYS_MAX)))]
     valid_days: u32,
-    /// Write the token into this file, which only its owner can read, instead of printing it
+    /// Write the token to this file, readable by its owner only, instead of printing it
     #[arg(long, value_name = "FILE")]
     token_file: Option<PathBuf>,
-    /// Make one though there is an admin; a valid token of the same name is revoked
+    /// Create a token even if an admin exists; a valid token of the same name is revoked
     #[arg(long)]
     force: bool,
 }
@@ -57,11 +57,11 @@ pub(crate) struct ForgetArgs {
     database: Option<PathBuf>,
 }
 
-/// Forgets which certificates robots have: a database out of a backup does not know those that were
-/// given since.
+/// Deletes the list of certificates issued to each robot. A database restored from a backup lacks
+/// the certificates that were issued since, and would refuse their renewal.
 ///
 /// # Errors
-/// The database cannot be written.
+/// The configuration is invalid, or the database cannot be written.
 pub(crate) async fn forget(args: ForgetArgs) -> anyhow::Result<()> {
     let config = Config::load(&ServerArgs {
         config: args.config,
@@ -82,10 +82,10 @@ pub(crate) async fn forget(args: ForgetArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Makes the token and tells it.
+/// Creates the first admin's token and prints it or writes it to the file.
 ///
 /// # Errors
-/// There is an admin and it is not forced; database or file cannot be written.
+/// An admin exists and `--force` is not given, or the database or a file cannot be written.
 pub(crate) async fn run(args: InitArgs) -> anyhow::Result<()> {
     let config = Config::load(&ServerArgs {
         config: args.config,
@@ -122,7 +122,11 @@ pub(crate) async fn run(args: InitArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Makes the fleet's authority unless it is there; robots trust the present one. Whether it did.
+/// Creates the fleet's certificate authority unless one exists, which robots trust. Returns whether
+/// it was created.
+///
+/// # Errors
+/// The folder cannot be written, or the existing authority cannot be used.
 fn make_authority(folder: &Path, clock: &Clock) -> anyhow::Result<bool> {
     match Authority::create(folder, clock.now()) {
         Ok(_made) => {
@@ -131,7 +135,8 @@ fn make_authority(folder: &Path, clock: &Clock) -> anyhow::Result<bool> {
             Ok(true)
         }
         Err(AuthorityError::Exists(_)) => {
-            // During a rotation the files are the server's to judge, which may be at work on them.
+            // During a rotation a running server may be changing the files, so they are not
+            // checked.
             if !folder.join(NEXT_CERTIFICATE_FILE).exists() {
                 Authority::load(folder)?;
             }
@@ -141,7 +146,7 @@ fn make_authority(folder: &Path, clock: &Clock) -> anyhow::Result<bool> {
     }
 }
 
-/// Writes a file that only its owner can read, whole or not at all.
+/// Writes a file atomically, readable by its owner only.
 fn write_secret(file: &Path, secret: &str) -> io::Result<()> {
     let mut name = file.file_name().unwrap_or_default().to_owned();
     name.push(format!(".{}.new", std::process::id()));
@@ -156,7 +161,7 @@ fn write_secret(file: &Path, secret: &str) -> io::Result<()> {
         std::fs::rename(&new, file)
     };
     written().inspect_err(|_| {
-        // What is half written is of no use; the error says why.
+        // Remove the incomplete file; the error of the write is returned.
         let _ = std::fs::remove_file(&new);
     })
 }

@@ -1,11 +1,11 @@
-//! Tread's server: takes missions over REST, hands them to robots over zenoh, keeps what the
-//! robots measure, and gives it back.
+//! Tread's server: accepts missions over REST, sends them to robots over zenoh, stores the friction
+//! measurements of the robots, and serves the friction map.
 //!
-//! * [`http`] knows HTTP and no SQL; [`app`] holds the use cases; [`db`] knows SQL and decides
-//!   nothing; [`fleet`] is the only module that calls zenoh, [`oidc`] the only one that asks the OpenID
-//!   provider; [`friction`] is pure.
-//! * [`Server::start`] runs everything inside a program of one's own; [`run_from_args`] is
-//!   the whole program, until a signal.
+//! * [`http`] is the REST API and uses no SQL; [`app`] contains the use cases; [`db`] contains the
+//!   SQL and no decisions. Only [`fleet`] calls zenoh, and only [`oidc`] the OpenID provider.
+//!   [`friction`] is pure.
+//! * [`Server::start`] runs the server inside another program; [`run_from_args`] is the whole
+//!   program, which runs until a signal.
 
 pub mod app;
 pub mod authority;
@@ -59,14 +59,14 @@ use self::http::tls::Tls;
 use self::identity::address::TrustedProxies;
 use self::supervisor::Supervisor;
 
-/// How long threads that block may take after everything else has stopped.
+/// Maximum wait for blocking threads after all tasks have stopped; then they are abandoned.
 const RUNTIME_STOP_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// Builds servers.
+/// Entry point that starts servers.
 #[derive(Debug, Clone, Copy)]
 pub struct Server;
 
-/// A server at work.
+/// A running server; call [`Self::stop`] to stop it.
 #[derive(Debug)]
 pub struct RunningServer {
     http_address: SocketAddr,
@@ -78,15 +78,15 @@ pub struct RunningServer {
 }
 
 impl Server {
-    /// Starts a server on the machine's clock. Needs a multi-threaded tokio runtime.
+    /// Starts a server with the machine's clock. Needs a multi-threaded tokio runtime.
     ///
     /// # Errors
-    /// The database cannot be opened, or an address is in use.
+    /// A configured file cannot be read, the database cannot be opened, or an address is in use.
     pub async fn start(config: Config) -> anyhow::Result<RunningServer> {
         Self::start_with_clock(config, Clock::system()).await
     }
 
-    /// Starts a server on a clock of one's own.
+    /// Starts a server with the given clock, as tests and simulations need.
     ///
     /// # Errors
     /// As [`Server::start`].
@@ -95,7 +95,7 @@ impl Server {
         let proxies = TrustedProxies::new(config.web.trusted_proxies.clone());
         let tls = config.tls.map(Tls::load).transpose()?.map(Arc::new);
         let lock = DatabaseLock::take(&config.database)?;
-        // Not before: a rotation that was cut short is completed here, by one server alone.
+        // Only with the lock: this completes an interrupted rotation of the authority.
         let security = config.robots.as_ref().map(security).transpose()?;
         let db = Db::open(&config.database).await?;
         let supervisor = Supervisor::new();
@@ -185,7 +185,7 @@ impl Server {
     }
 }
 
-/// Starts what keeps the database in order, and memory true to it.
+/// Starts the tasks that maintain the database and keep the state in memory consistent with it.
 fn look_after_database(app: &App, supervisor: &Supervisor) {
     let stop = || supervisor.stop_token();
     supervisor.spawn_vital("memory", memory::run(app.clone(), stop()));
@@ -194,9 +194,12 @@ fn look_after_database(app: &App, supervisor: &Supervisor) {
     supervisor.spawn_vital("merging", merging::run(app.clone(), stop()));
 }
 
-/// Reads what the server keeps in memory.
+/// Loads the state in memory from the database.
+///
+/// # Errors
+/// The site, robots, map or enrolments cannot be read.
 async fn remember(app: &App, site: &SiteId) -> anyhow::Result<()> {
-    // With a damaged table robots can still be stopped; only a clock that was set back shows.
+    // A failure only loses the protection against a clock set back; Stop must work all the same.
     if let Err(error) = app.continue_time().await {
         app.log_failure("continue the time of the database", &error);
     }
@@ -204,7 +207,7 @@ async fn remember(app: &App, site: &SiteId) -> anyhow::Result<()> {
     app.know_robots().await?;
     app.load_map().await?;
     app.know_enrolments().await?;
-    // Without it each token is looked up when it is shown.
+    // Without this cache each token is looked up at its first use.
     if let Err(error) = app.know_tokens().await {
         app.log_failure("read the valid tokens", &error);
     }
@@ -220,35 +223,36 @@ fn security(robots: &RobotsConfig) -> anyhow::Result<Security> {
 }
 
 impl RunningServer {
-    /// Where the REST API listens.
+    /// Returns the address of the REST API.
     pub fn http_address(&self) -> SocketAddr {
         self.http_address
     }
 
-    /// Where the metrics are, if anywhere.
+    /// Returns the address of `/metrics`; `None` if it is not configured.
     pub fn metrics_address(&self) -> Option<SocketAddr> {
         self.metrics_address
     }
 
-    /// The endpoint that robots connect to, as zenoh writes it.
+    /// Returns the zenoh endpoint that robots connect to, such as `tcp/127.0.0.1:7447`.
     pub fn zenoh_endpoint(&self) -> String {
         self.fleet.endpoint()
     }
 
-    /// The use cases, for tests that look behind the API.
+    /// Returns the use cases, for tests of internal state.
     pub fn app(&self) -> &App {
         &self.app
     }
 
-    /// Waits until a vital task fails.
+    /// Waits until a vital task fails or the server is stopped.
     pub async fn failed(&self) {
         self.supervisor.stopping().await;
     }
 
-    /// Stops: finishes open requests, stores what was uploaded, closes network and database.
+    /// Stops the server: completes open requests, stores received uploads, closes network and
+    /// database.
     ///
     /// # Errors
-    /// A vital task had failed, or tasks did not end in time.
+    /// A vital task failed before, or tasks did not end within [`supervisor::STOP_TIMEOUT`].
     pub async fn stop(self) -> anyhow::Result<()> {
         let stopped = self.supervisor.stop().await;
         audit::finish(&self.app).await;
@@ -271,26 +275,27 @@ struct Command {
 
 #[derive(Debug, clap::Subcommand)]
 enum Action {
-    /// Make the first admin's token of a server, and tell it this once
+    /// Create the first admin's token of a server, and print it once
     Init(init::InitArgs),
-    /// Take the next certificate that each robot shows, as after a backup of the database was restored
+    /// Accept the next certificate that each robot presents, for use after restoring a backup of
+    /// the database
     ForgetCertificates(init::ForgetArgs),
 }
 
-/// The words of the program's command line.
+/// Returns the definition of the command line, for documentation and tests.
 pub fn command_line() -> clap::Command {
     <Command as clap::CommandFactory>::command()
 }
 
-/// The whole program with these arguments, the first of which is its name.
+/// Runs the whole program with these arguments, the first of which is the program's name.
 ///
-/// Says on standard error what went wrong, and gives the code to end with: 0 after a stop that
-/// was asked for, 1 after a failure, 2 for arguments that make no sense.
+/// Prints errors on standard error and returns the exit code: 0 after a requested stop, 1 after a
+/// failure, 2 for invalid arguments.
 pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
     let command = match Command::try_parse_from(arguments) {
         Ok(command) => command,
         Err(error) => {
-            // Help and version come this way too; without a terminal there is nobody to tell.
+            // Help and version are printed here too. A failure to print has no other output.
             let _ = error.print();
             return ExitCode::from(u8::try_from(error.exit_code()).unwrap_or(2));
         }
@@ -309,8 +314,8 @@ pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode 
     }
 }
 
-/// Lets the process have as many connections open as the machine allows: the usual soft limit is
-/// below the bounds of the accept loop.
+/// Raises the soft limit of open files to the hard limit, because the usual soft limit is below the
+/// maximum number of connections.
 fn raise_file_limit() {
     let raised = getrlimit(Resource::RLIMIT_NOFILE)
         .and_then(|(_, most)| setrlimit(Resource::RLIMIT_NOFILE, most, most));
@@ -326,10 +331,10 @@ fn run_beside_server(command: impl Future<Output = anyhow::Result<()>>) -> anyho
     runtime.block_on(command)
 }
 
-/// The whole program: configuration, logging, server, until a signal or a failure.
+/// Runs the server until SIGTERM, SIGINT or the failure of a vital task.
 ///
 /// # Errors
-/// What keeps the server from starting, or what stopped it.
+/// The configuration is invalid, the server cannot start, or a vital task failed.
 pub fn run(args: &ServerArgs) -> anyhow::Result<()> {
     let threads = give_zenoh_threads();
     logging::start(args)?;
@@ -352,7 +357,7 @@ pub fn run(args: &ServerArgs) -> anyhow::Result<()> {
         }
         server.stop().await
     });
-    // A thread that is stuck in the network must not keep the process from ending.
+    // A thread that blocks in a system call must not keep the process from ending.
     runtime.shutdown_timeout(RUNTIME_STOP_TIMEOUT);
     ended
 }

@@ -1,4 +1,4 @@
-//! Structured logs on standard error.
+//! Initialises structured logging to standard error.
 
 use std::io::IsTerminal as _;
 
@@ -8,13 +8,13 @@ use tracing_subscriber::util::SubscriberInitExt as _;
 
 use crate::config::{LogFormat, ServerArgs};
 
-/// What is logged when neither flag nor environment says otherwise.
+/// Default log filter, without `--log` and `RUST_LOG`.
 const FILTER_DEFAULT: &str = "info,zenoh=warn,zenoh_transport=warn";
 
-/// Starts logging for the whole process; a second call changes nothing.
+/// Starts logging for the whole process; a second call has no effect.
 ///
 /// # Errors
-/// A filter that does not parse.
+/// The filter of `--log` or `RUST_LOG` cannot be parsed.
 pub(crate) fn start(args: &ServerArgs) -> anyhow::Result<()> {
     let filter = match &args.log {
         Some(filter) => EnvFilter::try_new(filter)?,
@@ -27,7 +27,7 @@ pub(crate) fn start(args: &ServerArgs) -> anyhow::Result<()> {
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal());
     let registry = tracing_subscriber::registry().with(filter);
-    // The only error is that logging was started before, by a program that embeds this one.
+    // The only possible error is that an embedding program started logging before.
     let _ = match args.log_format {
         LogFormat::Human => registry.with(lines).try_init(),
         LogFormat::Json => registry.with(lines.json()).try_init(),

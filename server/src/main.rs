@@ -1,5 +1,4 @@
-//! The server's program. Flags → logging → configuration → server → until a signal: see
-//! [`tread_server::run`].
+//! The program `tread-server`; see [`tread_server::run_from_args`].
 
 use std::process::ExitCode;
 

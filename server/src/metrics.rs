@@ -1,8 +1,8 @@
-//! What is measured while the server works: durations, refusals, depths of queues. A leaf: whoever
-//! works records here, and [`crate::app::metrics`] adds what is looked up when somebody asks.
+//! Prometheus metrics that are recorded during operation: durations, refusals, queue depths.
+//! [`crate::app::metrics`] adds those that are computed at each scrape.
 //!
-//! Every metric is a handle; clones record into the same. Labels come from closed sets, so the
-//! number of series is bounded.
+//! Every metric is a handle, whose clones record into the same series. Labels have fixed sets of
+//! values, so the number of series is bounded.
 
 use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -18,16 +18,16 @@ use tokio::sync::mpsc;
 use tread_api::mission::MissionState;
 use tread_api::problem::ProblemType;
 
-/// Upper bounds of the buckets, seconds.
+/// Upper bounds of the histogram buckets of requests and transactions, in seconds.
 const BOUNDS_S: [f64; 10] = [0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.5, 1.0, 5.0];
-/// Upper bounds of the buckets of missions, seconds.
+/// Upper bounds of the histogram buckets of missions, in seconds.
 const MISSION_BOUNDS_S: [f64; 10] = [
     5.0, 15.0, 30.0, 60.0, 120.0, 300.0, 600.0, 1_800.0, 3_600.0, 14_400.0,
 ];
-/// Methods of requests that are distinguished.
+/// HTTP methods with a label of their own; others have the label `other`.
 const METHODS: [&str; 7] = ["DELETE", "GET", "HEAD", "OPTIONS", "PATCH", "POST", "PUT"];
 
-/// Makes the histograms of a family.
+/// Constructor of a family's histograms, with upper bounds of their buckets in seconds.
 #[derive(Debug, Clone, Copy)]
 struct Bounds([f64; 10]);
 
@@ -37,10 +37,10 @@ impl MetricConstructor<Histogram> for Bounds {
     }
 }
 
-/// How long something took, by labels.
+/// Histograms of durations in seconds, by labels.
 type Durations<L> = Family<L, Histogram, Bounds>;
 
-/// A request by its route.
+/// Labels of an HTTP request.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
 struct OfRequest {
     method: &'static str,
@@ -48,7 +48,7 @@ struct OfRequest {
     status: u16,
 }
 
-/// A transaction by the use case that began it.
+/// Labels of a database transaction: the use case, and whether it writes.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
 struct OfTransaction {
     kind: &'static str,
@@ -64,16 +64,16 @@ impl EncodeLabelValue for Flag {
     }
 }
 
-/// Who or what was refused, and why.
+/// Labels of a refusal.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
 pub struct Refusal {
-    /// `client`, `request` or `robot`.
+    /// Refused party: `client`, `request` or `robot`.
     pub of: &'static str,
-    /// The reason: a counter's name, or the type of a problem.
+    /// Reason: the name of a counter, or the type of a problem without `/problems/`.
     pub reason: String,
 }
 
-/// What the database measures of itself.
+/// Metrics of the database.
 #[derive(Debug, Clone)]
 pub struct DatabaseMetrics {
     transactions: Durations<OfTransaction>,
@@ -90,7 +90,7 @@ impl Default for DatabaseMetrics {
 }
 
 impl DatabaseMetrics {
-    /// Records a transaction from its begin to its end: the use case, and whether it writes.
+    /// Records a transaction: its use case, whether it writes, and its duration from begin to end.
     pub fn transaction(&self, kind: &'static str, writes: bool, took: Duration) {
         let of = OfTransaction {
             kind,
@@ -100,7 +100,7 @@ impl DatabaseMetrics {
         histogram.observe(took.as_secs_f64());
     }
 
-    /// Records how long a writer waited for its turn.
+    /// Records the time that a write transaction waited for the writer's lock.
     pub fn write_wait(&self, took: Duration) {
         self.write_waits.observe(took.as_secs_f64());
     }
@@ -116,7 +116,7 @@ impl DatabaseMetrics {
     }
 }
 
-/// What the use cases and the HTTP API measure.
+/// Metrics of the use cases and of the REST API.
 #[derive(Debug, Clone)]
 pub struct Metrics {
     requests: Durations<OfRequest>,
@@ -128,7 +128,8 @@ pub struct Metrics {
 impl Default for Metrics {
     fn default() -> Self {
         let missions = Durations::new_with_constructor(Bounds(MISSION_BOUNDS_S));
-        // An end that has not been yet is a zero, not a series that is missing.
+        // Create a series for each final state, so that one that has not occurred is zero, not
+        // absent.
         for end in MissionState::ALL
             .into_iter()
             .filter(|state| state.is_terminal())
@@ -145,10 +146,11 @@ impl Default for Metrics {
 }
 
 impl Metrics {
-    /// Records a request: its method, the pattern of its route, and its answer's status.
+    /// Records a request: its method, the pattern of its route, the status of the response, and its
+    /// duration.
     pub fn request(&self, method: &str, route: &str, status: u16, took: Duration) {
         let of = OfRequest {
-            // Whoever asks chooses the method.
+            // Clients choose the method, so unknown ones share a label.
             method: METHODS
                 .into_iter()
                 .find(|known| *known == method)
@@ -160,23 +162,24 @@ impl Metrics {
         histogram.observe(took.as_secs_f64());
     }
 
-    /// Records an answer that refuses, by the type of its problem.
+    /// Records a refused request by the type of its problem.
     pub fn request_refused(&self, kind: ProblemType) {
         self.refusals.get_or_create(&of_request(kind)).inc();
     }
 
-    /// Records a mission that has ended, from its start on the robot to its end.
+    /// Records a mission that ended: its final state, and the time from its start on the robot to
+    /// its end.
     pub fn mission(&self, ended: MissionState, took: Duration) {
         let histogram = self.missions.get_or_create(&[("state", ended.as_str())]);
         histogram.observe(took.as_secs_f64());
     }
 
-    /// Queues whose depths are shown.
+    /// Returns the queues whose depths are exported.
     pub fn queues(&self) -> &Queues {
         &self.queues
     }
 
-    /// Adds these metrics to a registry, with what was refused according to other counters.
+    /// Adds these metrics to a registry. `others` are further refusals with their counts.
     pub fn register(&self, registry: &mut Registry, others: Vec<(Refusal, u64)>) {
         let mission = self.missions.clone();
         let help = "Missions from start to end, by end";
@@ -199,7 +202,7 @@ impl Metrics {
     }
 }
 
-/// A request that was refused with a problem of this type.
+/// Returns the labels of a request that was refused with a problem of this type.
 fn of_request(kind: ProblemType) -> Refusal {
     let named = serde_json::to_value(kind).unwrap_or_default();
     let reason = named.as_str().unwrap_or_default();
@@ -211,7 +214,7 @@ fn of_request(kind: ProblemType) -> Refusal {
 
 type Depth = Box<dyn Fn() -> usize + Send + Sync>;
 
-/// Depths of the server's queues, looked at when somebody asks; clones show the same.
+/// Depths of the server's queues, read at each scrape; clones share the list of queues.
 #[derive(Clone, Default)]
 pub struct Queues {
     depths: Arc<Mutex<Vec<(&'static str, Depth)>>>,
@@ -224,7 +227,7 @@ impl fmt::Debug for Queues {
 }
 
 impl Queues {
-    /// Shows a queue under a name, for as long as somebody can still send into it.
+    /// Exports the depth of a queue under `name`; it is 0 once all senders are dropped.
     pub fn show<T: Send + 'static>(&self, name: &'static str, queue: &mpsc::Sender<T>) {
         let queue = queue.downgrade();
         let depth = move || {

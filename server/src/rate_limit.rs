@@ -1,39 +1,40 @@
-//! How often something may happen: a burst at once, then one in each interval.
+//! Rate limiter with a burst: up to `burst` events at once, then one per interval.
 //!
-//! The generic cell rate algorithm: a bucket is one time, up to which what has happened is paid
-//! for. In integers, so that no rounding adds up.
+//! Implements the generic cell rate algorithm (GCRA). The state of a bucket is one time, at which
+//! all events so far are earned back. Times are integers, so rounding errors do not accumulate.
 
 use std::time::Duration;
 
-/// A rate with a burst.
+/// Rate limit with a burst.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct RateLimit {
-    /// How many may come at once.
+    /// Maximum number of events at once.
     pub(crate) burst: u32,
-    /// The interval in which one more may come.
+    /// Time in which one further event is allowed.
     pub(crate) interval: Duration,
 }
 
-/// What of a limit is used; the default is nothing.
+/// Used part of a rate limit; the default is unused. All times are durations since one monotonic
+/// origin.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(crate) struct Bucket {
-    /// When all that has been taken is earned again.
+    /// Time at which the bucket is unused again.
     full_at: Duration,
 }
 
 impl Bucket {
-    /// How long until one may be taken.
+    /// Returns the time until the next event is allowed.
     fn delay(self, limit: RateLimit, now: Duration) -> Duration {
         let owed = self.full_at.saturating_sub(now) + limit.interval;
         owed.saturating_sub(limit.interval * limit.burst)
     }
 
-    /// Whether one may be taken now.
+    /// Returns whether an event is allowed now.
     pub(crate) fn has_one(self, limit: RateLimit, now: Duration) -> bool {
         self.delay(limit, now).is_zero()
     }
 
-    /// Takes one, if it may be taken now.
+    /// Counts an event if it is allowed now, and returns whether it is.
     pub(crate) fn take(&mut self, limit: RateLimit, now: Duration) -> bool {
         let has_one = self.has_one(limit, now);
         if has_one {
@@ -42,8 +43,8 @@ impl Bucket {
         has_one
     }
 
-    /// Takes one that may be used after the delay that is given. Who would have to wait for `delay_max`
-    /// takes none and waits for that long.
+    /// Returns the delay after which an event may take place, at most `delay_max`. Counts the event
+    /// if its delay is below `delay_max`.
     pub(crate) fn take_delayed(
         &mut self,
         limit: RateLimit,
@@ -57,19 +58,20 @@ impl Bucket {
         delay
     }
 
-    /// Takes some that have been used already, also more than there are: how long until that is paid for.
+    /// Counts `count` events that have taken place, also beyond the limit. Returns the time until
+    /// the limit is met again.
     pub(crate) fn charge(&mut self, limit: RateLimit, now: Duration, count: u32) -> Duration {
         let owed = self.full_at.saturating_sub(now) + limit.interval * count;
         self.full_at = now + owed;
         owed.saturating_sub(limit.interval * limit.burst)
     }
 
-    /// Whether nothing of the limit is used.
+    /// Returns whether the limit is unused at `now`.
     pub(crate) fn is_full(self, now: Duration) -> bool {
         self.full_at <= now
     }
 
-    /// Since when nothing of the limit is used, or when that will be so.
+    /// Returns the time at which the limit became or becomes unused.
     pub(crate) fn full_at(self) -> Duration {
         self.full_at
     }
@@ -98,7 +100,7 @@ mod tests {
                 let is_taken = bucket.take(limit, now);
                 taken += u128::from(is_taken);
                 prop_assert!(taken <= earned);
-                // It refuses no more than it must: a whole burst was taken not long ago.
+                // A refusal is necessary: a whole burst was taken shortly before.
                 prop_assert!(is_taken || bucket.full_at() + interval > now + interval * burst);
             }
         }
@@ -138,7 +140,7 @@ mod tests {
                 now += delay;
                 let earned = u128::from(burst) + now.as_micros() / 10;
                 prop_assert!(used <= earned);
-                // Nobody waits for what is there.
+                // An event that is allowed now is not delayed.
                 prop_assert!(delay.is_zero() || used == earned);
             }
         }

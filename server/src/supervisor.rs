@@ -1,9 +1,9 @@
-//! The only place that starts tasks, and sees them end.
+//! Starts all tasks of the server and supervises them.
 //!
-//! A *vital* task runs for as long as the process: one that ends early, or panics, stops
-//! everything, and the process ends with a failure code so that its service manager starts it
-//! again. A *passing* task (a connection, a command to a robot) ends by itself; its panic is
-//! logged and harms nobody else.
+//! A *vital* task has to run as long as the process. If it ends early or panics, the server stops,
+//! and the process exits with a failure code so that its service manager restarts it. A *passing*
+//! task (a connection, a command to a robot) ends by itself; its panic is logged and does not
+//! affect other tasks.
 
 use std::future::Future;
 use std::panic::AssertUnwindSafe;
@@ -16,10 +16,10 @@ use tokio_util::task::TaskTracker;
 use tokio_util::task::task_tracker::TaskTrackerToken;
 use tracing::{debug, error};
 
-/// How long tasks may take to end after they were asked to.
+/// Maximum time for tasks to end after a stop was requested; later [`Supervisor::stop`] fails.
 pub const STOP_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// Why the server stopped without being asked to.
+/// Cause of an unrequested or incomplete stop.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum Stopped {
     /// A vital task returned before the stop.
@@ -28,12 +28,12 @@ pub enum Stopped {
     /// A vital task panicked.
     #[error("task `{0}` panicked")]
     Panicked(&'static str),
-    /// Tasks did not end in time after the stop.
+    /// Tasks did not end within [`STOP_TIMEOUT`].
     #[error("tasks did not end within {} s", STOP_TIMEOUT.as_secs())]
     StopTimeout,
 }
 
-/// Starts tasks and watches them; clones are handles to the same supervisor.
+/// Handle of the task supervisor; clones refer to the same supervisor.
 #[derive(Debug, Clone, Default)]
 pub struct Supervisor {
     tracker: TaskTracker,
@@ -42,17 +42,17 @@ pub struct Supervisor {
 }
 
 impl Supervisor {
-    /// A supervisor of nothing yet.
+    /// Creates a supervisor without tasks.
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// The token that is cancelled when everything is to stop.
+    /// Returns the token that is cancelled when all tasks have to stop.
     pub fn stop_token(&self) -> CancellationToken {
         self.stop.clone()
     }
 
-    /// Starts a task that must run until the stop.
+    /// Starts a vital task, whose end before the stop stops the server.
     pub fn spawn_vital(&self, name: &'static str, task: impl Future<Output = ()> + Send + 'static) {
         let (stop, failure) = (self.stop.clone(), Arc::clone(&self.failure));
         self.tracker.spawn(async move {
@@ -63,13 +63,13 @@ impl Supervisor {
                 Err(_panic) => Stopped::Panicked(name),
             };
             error!("{stopped}: the server stops");
-            // Only the first failure counts; what follows is a consequence.
+            // Only the first failure is recorded; later ones are consequences.
             let _ = failure.set(stopped);
             stop.cancel();
         });
     }
 
-    /// Starts a task that ends by itself.
+    /// Starts a passing task, which ends by itself.
     pub fn spawn_passing(
         &self,
         name: &'static str,
@@ -82,15 +82,13 @@ impl Supervisor {
         });
     }
 
-    /// Makes the stop wait for a task that somebody else spawned, such as axum for a `WebSocket`,
-    /// until the result is dropped.
+    /// Returns a token for a task spawned elsewhere, such as a `WebSocket` by axum. [`Self::stop`]
+    /// waits until the token is dropped.
     pub fn attend(&self) -> TaskTrackerToken {
         self.tracker.token()
     }
 
-    /// Runs what blocks its thread on a thread of its own kind.
-    ///
-    /// `None` if it panicked.
+    /// Runs blocking `work` on the thread pool for blocking tasks; `None` if it panicked.
     pub async fn blocking<T: Send + 'static>(
         &self,
         work: impl FnOnce() -> T + Send + 'static,
@@ -98,15 +96,15 @@ impl Supervisor {
         self.tracker.spawn_blocking(work).await.ok()
     }
 
-    /// Waits until a vital task fails or a stop is asked for.
+    /// Waits until a vital task fails or a stop is requested.
     pub async fn stopping(&self) {
         self.stop.cancelled().await;
     }
 
-    /// Asks all tasks to stop, waits for them, and says why they stopped if nobody asked.
+    /// Requests all tasks to stop and waits for them.
     ///
     /// # Errors
-    /// The first failure of a vital task, or [`Stopped::StopTimeout`].
+    /// The first failure of a vital task, or [`Stopped::StopTimeout`] if tasks do not end in time.
     pub async fn stop(&self) -> Result<(), Stopped> {
         self.stop.cancel();
         self.tracker.close();

@@ -1,5 +1,7 @@
 //! Random numbers that a seed repeats: `SplitMix64`, enough for choosing what to break and when.
 
+use std::ops::Range;
+
 /// A sequence of random numbers.
 #[derive(Debug, Clone)]
 pub struct Random {
@@ -27,9 +29,9 @@ impl Random {
         (self.next_u64() >> 11) as f64 / (1_u64 << 53) as f64
     }
 
-    /// A number between two others.
-    pub fn between(&mut self, low: f64, high: f64) -> f64 {
-        low + self.share() * (high - low)
+    /// Returns a uniformly distributed number in `range`.
+    pub fn between(&mut self, range: Range<f64>) -> f64 {
+        range.start + self.share() * (range.end - range.start)
     }
 
     /// True in so many of all cases.

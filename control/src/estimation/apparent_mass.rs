@@ -1,35 +1,37 @@
-//! The robot's apparent mass: measured torque over measured acceleration.
+//! Estimates the robot's apparent mass from measured torque and acceleration.
 //!
-//! Forward, whatever the tyres do, with μ̄ the mean of both sides' measured torques as friction
-//! coefficients of the model's mass,
+//! The longitudinal force balance does not depend on the tyres. With μ̄, the mean of both sides'
+//! measured torques as friction coefficients of the model's mass,
 //!
 //! ```text
 //! μ̄ = q a/g + c₀ + c₁ cos ψ + c₂ sin ψ,    q = s (m + j)/m_model
 //! ```
-//! q is the apparent mass over the model's: torque scale s, true mass m with payload, and the
-//! inertia j of rotors and wheels at the rim. c₀ is rolling resistance, c₁ and c₂ are the slope in
-//! the heading ψ. Rows are means over blocks; the c of each window are eliminated, so that slopes
-//! may change from window to window, and the information on q adds up. A measured torque is over
-//! the model's mass too, so q is what θ from torques must be multiplied by, but for j.
+//! q is the ratio of the apparent mass to the model's: torque scale s, true mass m with payload,
+//! and inertia j of rotors and wheels at the rim. c₀ is the rolling resistance coefficient, c₁ and
+//! c₂ are the slope in the directions of heading ψ = 0 and π/2. Each row is a mean over a block.
+//! c₀, c₁ and c₂ are eliminated in each window, because the slope may change between windows, and
+//! the information on q is summed. Measured torques are relative to the model's mass, so q is also
+//! the factor that corrects θ from torques, except for j.
 
 use nalgebra::{Matrix3, Vector3};
 
 use super::{BLOCK_S, SensorNoise, SensorSample, ValueWithDeviation};
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
-/// Blocks of a window: a slope counts as constant over its path.
+/// Number of blocks of a window, over whose path the slope is assumed constant.
 const WINDOW_BLOCKS: u32 = 25;
-/// Standard deviation of rolling resistance over load, whose mean is as large.
+/// Prior mean and standard deviation of the rolling resistance coefficient.
 const ROLLING_STD_DEV: f64 = 0.02;
-/// Standard deviation of a slope, radians.
+/// Prior standard deviation of the slope, radians.
 const SLOPE_STD_DEV_RAD: f64 = 0.05;
-/// Rim speed below which the sign of rolling resistance is not certain, metres per second.
+/// Rim speed below which the sign of rolling resistance is uncertain, in metres per second; slower
+/// blocks are not used.
 const RIM_SPEED_MIN_M_S: f64 = 0.05;
-/// Standard deviation of what a block's mean force has beside the sensors' noise, friction
-/// coefficient: tyres on uneven ground.
+/// Standard deviation of a block's mean force apart from sensor noise, as a friction coefficient;
+/// models uneven ground.
 const UNEVEN_MU: f64 = 0.002;
 
-/// Means over the block that is filled.
+/// Sums over the samples of the current block.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct Means {
     duration_s: f64,
@@ -40,7 +42,7 @@ struct Means {
     is_broken: bool,
 }
 
-/// Sums over a window. The unknowns besides q are c₀, c₁ and c₂.
+/// Sums of the normal equations over a window. The unknowns other than q are c₀, c₁ and c₂.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct Window {
     blocks: u32,
@@ -51,7 +53,7 @@ struct Window {
     others_response: Vector3<f64>,
 }
 
-/// Measures the apparent mass.
+/// Estimator of the apparent mass.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct ApparentMass {
     block: Means,
@@ -124,13 +126,12 @@ impl ApparentMass {
         false
     }
 
-    /// The averages begin anew after a gap.
+    /// Restarts the current block after a gap between samples.
     pub(super) fn interrupt(&mut self) {
         self.block = Means::default();
     }
 
-    /// q as torques and accelerations give it, with the standard deviation of its noise; none
-    /// before the robot has accelerated.
+    /// Returns q with the standard deviation of its noise; `None` before the robot has accelerated.
     pub(super) fn value(&self) -> Option<ValueWithDeviation> {
         let (information, weighted) = self.window.eliminated();
         let information = self.information + information;
@@ -142,7 +143,7 @@ impl ApparentMass {
 }
 
 impl Window {
-    /// Information on q, and that times q, with the other unknowns eliminated.
+    /// Returns the information on q and its product with q, with the other unknowns eliminated.
     fn eliminated(&self) -> (f64, f64) {
         let known = Vector3::new(
             ROLLING_STD_DEV.powi(-2),
@@ -174,8 +175,8 @@ mod tests {
 
     const DT_S: f64 = 0.01;
 
-    /// A robot of an apparent mass, with rolling resistance, on a slope; it speeds up and down, or
-    /// not at all.
+    /// Simulates a robot with an apparent mass and rolling resistance on a slope, with varying or
+    /// constant speed.
     fn driven(
         apparent: f64,
         rolling: f64,

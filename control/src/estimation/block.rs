@@ -1,22 +1,23 @@
-//! Samples averaged over blocks, and the two differential rows that a block gives.
+//! Averages samples over blocks of [`BLOCK_S`], and forms the regression rows of a block.
 
 use super::contacts::{BendInput, Loss, MeanSlip};
-use super::curved::{Curvatures, SideSlips, Turn, bent, bent_slope};
+use super::curved::{Curvatures, ForceAtSlip, SideSlips, Turn};
 use super::rows::{Regressors, Row, index};
 use super::types::Curvature;
-use super::window::{TurnMeans, TurnWindow};
+use super::window::{SampleSpan, TurnMeans, TurnWindow};
 use super::{
     BLOCK_S, RIM_SPEED_MIN_M_S, SLIP_LINEAR_FIRST_MAX, SLIP_LINEAR_MAX, SensorNoise, SensorSample,
     THETA_FIRST, ValueWithDeviation,
 };
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
-/// Lateral slip beyond which a block is no straight driving, for rolling resistance.
+/// Lateral slip below which a block counts as straight driving, for rolling resistance.
 const STRAIGHT_SLIP_MAX: f64 = 0.01;
-/// Change of speed within a block, as a share, beyond which a body speed taken somewhere in it is
-/// not set against the block's mean force.
+/// Maximum relative change of speed within a block for a row of the sides' mean: a body speed is
+/// measured at one time of the block, but the force is the mean over it.
 const STEADY_SHARE: f64 = 0.05;
-/// Share of a block over which its force's beginning and end are averaged.
+/// Fraction of a block at its beginning and at its end over which forces are averaged for their
+/// rate.
 const ENDS_SHARE: f64 = 0.25;
 
 /// Force regressors of a block.
@@ -26,30 +27,30 @@ pub(super) struct Force {
     difference_m_s: f64,
     /// `(μ_R u_R + μ_L u_L)/2`, metres per second.
     mean_m_s: f64,
-    /// Variance of the former; that of the latter is a quarter of it.
+    /// Variance of `difference_m_s`; that of `mean_m_s` is a quarter of it.
     difference_noise: f64,
-    /// What both add to the regressors of θκ and θκ², each side at its own slip.
-    difference_bent: [f64; 2],
-    mean_bent: [f64; 2],
-    /// Those regressors over the force, whose noise they have.
+    /// Regressors of θκ and θκ² in the rows of difference and mean, with each side at its own slip.
+    difference_curvature: [f64; 2],
+    mean_curvature: [f64; 2],
+    /// Ratios of the regressors of θκ and θκ² to the force; they share its noise.
     bend: [f64; 2],
-    /// Covariance of the difference's with the response.
+    /// Covariances of the regressors `difference_curvature` with the response.
     slip_noise: [f64; 2],
     rate: Rate,
 }
 
-/// How fast the sides' forces and rims change within a block, left and right.
+/// Rates of the sides' forces and rim speeds within a block, `[left, right]`.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct Rate {
-    /// Friction coefficients, per second.
+    /// Rate of the friction coefficients, per second.
     mu: [f64; 2],
-    /// The rims' acceleration over gravity, times their speed, metres per second.
+    /// Rim acceleration over gravity, times the rim speed, metres per second.
     rim_m_s: [f64; 2],
-    /// Variance of the difference of the former.
+    /// Variance of the difference of the sides' `mu`.
     difference_noise: f64,
 }
 
-/// Sums over the first and the last part of a block.
+/// Sums over the samples at the beginning and at the end of a block.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct Ends {
     samples: [f64; 2],
@@ -59,11 +60,13 @@ struct Ends {
 }
 
 impl Ends {
-    /// Which part of a block a sample is of, if any; its middle is at this time.
-    fn of(time_s: f64, dt_s: f64) -> Option<usize> {
-        if time_s + 0.5 * dt_s <= ENDS_SHARE * BLOCK_S + 1.0e-6 {
+    /// Returns 0 for a sample at the beginning of a block, 1 at its end, else `None`. `span` is
+    /// relative to the block's start.
+    fn of(span: SampleSpan) -> Option<usize> {
+        let SampleSpan { middle_s, dt_s } = span;
+        if middle_s + 0.5 * dt_s <= ENDS_SHARE * BLOCK_S + 1.0e-6 {
             Some(0)
-        } else if time_s - 0.5 * dt_s >= (1.0 - ENDS_SHARE) * BLOCK_S - 1.0e-6 {
+        } else if middle_s - 0.5 * dt_s >= (1.0 - ENDS_SHARE) * BLOCK_S - 1.0e-6 {
             Some(1)
         } else {
             None
@@ -97,39 +100,39 @@ impl Ends {
     }
 }
 
-/// What is known about θ when a block is judged.
+/// Knowledge about θ with which the linearity of a block is checked.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct ThetaBound {
-    /// θ, where it is measured.
+    /// Measured θ, if there is one.
     pub(super) theta: Option<f64>,
-    /// θ that weighs rows, measured or not.
+    /// θ for the weights of rows, measured or assumed.
     pub(super) theta_weights: f64,
-    /// Largest θ that the ground may have, for all that is known.
+    /// Upper bound of θ.
     pub(super) theta_most: f64,
-    /// Largest slip at which tyres rise as they are known to.
+    /// Largest slip at which the model of the tyres is valid.
     pub(super) slip_max: f64,
 }
 
 impl ThetaBound {
-    /// θ with which a block computes slip from force. One that is barely known may be many times
-    /// too large, and what a row holds is never taken back.
+    /// Returns the θ with which slip is computed from force: the measured one, else a small
+    /// default. A vague θ may be far too large, and rows are never recomputed.
     pub(super) fn theta_of_slip(&self) -> f64 {
         self.theta.unwrap_or(THETA_FIRST)
     }
 }
 
-/// Means over one block of samples.
+/// Means over the samples of one block.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Block {
     pub(super) duration_s: f64,
-    /// Whether slip was in the linear range.
+    /// Whether the combined slip is in the linear range.
     pub(super) is_linear: bool,
-    /// Slip of the slower side, across and by the sides' difference, as [`Self::judge_slip`] found
-    /// it.
+    /// Combined slip of the slower side from lateral slip and the sides' difference, as computed by
+    /// [`Self::judge_slip`].
     pub(super) slip: f64,
-    /// Geometric slip across of the slower side's wheels.
+    /// Geometric lateral slip of the slower side's wheels.
     slip_lateral: f64,
-    /// Acceleration ahead over gravity, magnitude.
+    /// Magnitude of the forward acceleration over gravity.
     longitudinal_mu: f64,
     /// Rim speed of the slower side, metres per second.
     slower_m_s: f64,
@@ -151,17 +154,19 @@ pub(super) struct Block {
     /// `Wφ̇`, metres per second, and its variance.
     pub(super) turn_m_s: f64,
     pub(super) turn_noise: f64,
-    /// Friction coefficient seen, less two standard deviations.
+    /// Friction coefficient that was used, minus two standard deviations.
     pub(super) mu_seen: f64,
     pub(super) rolling_resistance: Option<ValueWithDeviation>,
 }
 
 impl Block {
-    /// Judges whether slip was in the linear range, combined from along and across. Across, and
-    /// along the sides' difference, it is measured well, known θ or not; what the sides have in
-    /// common is θμ. Before θ is known that is the most it may be, so that turning alone does not
-    /// keep a long robot from ever beginning. With torque it comes from the body speed, which is
-    /// coarse: the bound is tighter, or a robot that slides would begin with what sliding shows.
+    /// Checks whether the combined slip of the block is in the linear range, and sets
+    /// [`Self::slip`].
+    ///
+    /// Lateral slip and the difference of the sides' longitudinal slip are measured without θ. The
+    /// common longitudinal slip is θμ once θ is known. Before, it comes from the body speed if
+    /// torque is measured; this is inaccurate, so the limit is tighter and a sliding robot is
+    /// rejected. Without torque it is bounded by `theta_most`.
     pub(super) fn judge_slip(&mut self, bound: &ThetaBound) {
         let turning = 0.5 * self.difference_m_s.abs() / self.slower_m_s;
         let most = SLIP_LINEAR_MAX.min(bound.slip_max);
@@ -175,12 +180,13 @@ impl Block {
             ),
             (_, None) => (bound.theta_most * self.longitudinal_mu, most),
         };
-        // What is measured well; the rest is an upper bound, or coarse.
+        // The accurate parts; `common` is an upper bound or inaccurate.
         self.slip = turning.hypot(self.slip_lateral);
         self.is_linear &= (turning + common).hypot(self.slip_lateral) < limit;
     }
 
-    /// Row of the sides' difference: on measured torques, or else on measured accelerations.
+    /// Returns the row of the sides' difference, from measured torques, or else from measured
+    /// accelerations.
     pub(super) fn differential_row(&self) -> Option<Row> {
         let Some(force) = self.force else {
             return self.turning;
@@ -193,7 +199,7 @@ impl Block {
         [
             regressors[index::CURVATURE],
             regressors[index::CURVATURE_SQUARE],
-        ] = force.difference_bent;
+        ] = force.difference_curvature;
         regressors[index::RESISTANCE] = -self.rim_difference_m_s;
         regressors[index::RELAXATION] = force.rate.mu[1] - force.rate.mu[0];
         regressors[index::ROTORS] = -(force.rate.rim_m_s[1] - force.rate.rim_m_s[0]);
@@ -222,7 +228,8 @@ impl Block {
         self.turning.filter(|_| self.force.is_none())
     }
 
-    /// Row of the sides' mean, on measured torques and body speed.
+    /// Returns the row of the sides' mean, from measured torques and body speed; `None` without
+    /// these or if the speed changed too much.
     pub(super) fn mean_row(&self) -> Option<Row> {
         let force = self.force?;
         let slip_m_s = self.slip_m_s.filter(|_| self.is_steady)?;
@@ -233,7 +240,7 @@ impl Block {
         [
             regressors[index::CURVATURE],
             regressors[index::CURVATURE_SQUARE],
-        ] = force.mean_bent;
+        ] = force.mean_curvature;
         regressors[index::RESISTANCE] = -self.rim_mean_m_s;
         regressors[index::RELAXATION] = 0.5 * (force.rate.mu[1] + force.rate.mu[0]);
         regressors[index::ROTORS] = -0.5 * (force.rate.rim_m_s[1] + force.rate.rim_m_s[0]);
@@ -250,7 +257,7 @@ impl Block {
         })
     }
 
-    /// Twice the mean force on the sides, metres per second.
+    /// Returns twice the mean force on the sides, times rim speed, in metres per second.
     pub(super) fn mean_force_m_s(&self) -> f64 {
         self.force.map_or(
             2.0 * self.longitudinal_mu * self.rim_mean_m_s.abs(),
@@ -259,7 +266,7 @@ impl Block {
     }
 }
 
-/// Samples of one block.
+/// Sums over the samples of one block.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct BlockBuilder {
     duration_s: f64,
@@ -279,22 +286,22 @@ pub(super) struct BlockBuilder {
     right_force_m_s: f64,
     lateral_m_s2: f64,
     forward_m_s2: f64,
-    /// Mean rim speed minus body speed where the latter was new.
+    /// Sum of mean rim speed minus body speed, over samples with a new body speed.
     slip_m_s: f64,
     window: TurnWindow,
     ends: Ends,
 }
 
-/// What blocks are made with.
+/// Parameters with which a block is evaluated.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct BlockContext<'robot> {
     pub(super) model: &'robot RobotModel,
     pub(super) noise: &'robot SensorNoise,
-    /// What is known of the tyres' curvature at this θ.
+    /// Curvature of the tyres at this θ.
     pub(super) curvature: Curvature,
-    /// `δ_d` as it is known.
+    /// Estimated `δ_d`.
     pub(super) radius_difference: f64,
-    /// θ as it is known.
+    /// Estimated or assumed θ.
     pub(super) theta: f64,
 }
 
@@ -303,7 +310,7 @@ impl BlockBuilder {
         self.duration_s >= BLOCK_S - 1.0e-6
     }
 
-    /// The next block's builder: its window has begun in this one.
+    /// Returns the builder of the next block, whose window began in this one.
     pub(super) fn next(&self) -> Self {
         Self {
             window: self.window.next(),
@@ -315,8 +322,11 @@ impl BlockBuilder {
         let radius_m = model.wheel_radius_m();
         let left_m_s = sample.wheel_speeds.left_rad_s * radius_m;
         let right_m_s = sample.wheel_speeds.right_rad_s * radius_m;
-        self.window
-            .add(sample, model, self.duration_s + 0.5 * dt_s, dt_s);
+        let span = SampleSpan {
+            middle_s: self.duration_s + 0.5 * dt_s,
+            dt_s,
+        };
+        self.window.add(sample, model, span);
         self.duration_s += dt_s;
         self.samples += 1;
         self.left_m_s += left_m_s;
@@ -333,10 +343,10 @@ impl BlockBuilder {
             let scale = 1.0 / (radius_m * model.side_load_n());
             let (left_mu, right_mu) = (torques.left_n_m * scale, torques.right_n_m * scale);
             self.with_torque += 1;
-            let time_s = self.duration_s - 0.5 * dt_s;
-            if let Some(end) = Ends::of(time_s, dt_s) {
+            let middle_s = self.duration_s - 0.5 * dt_s;
+            if let Some(end) = Ends::of(SampleSpan { middle_s, dt_s }) {
                 self.ends
-                    .add(end, time_s, [left_mu, right_mu], [left_m_s, right_m_s]);
+                    .add(end, middle_s, [left_mu, right_mu], [left_m_s, right_m_s]);
             }
             self.left_mu += left_mu;
             self.right_mu += right_mu;
@@ -354,7 +364,7 @@ impl BlockBuilder {
         }
     }
 
-    /// The block's means; none when the robot was too slow or turned on the spot.
+    /// Returns the means of the block; `None` if the robot was too slow or turned on the spot.
     pub(super) fn finish(&self, context: BlockContext<'_>) -> Option<Block> {
         let BlockContext { model, noise, .. } = context;
         if self.samples == 0 || self.usable < self.samples {
@@ -367,8 +377,8 @@ impl BlockBuilder {
         let mean_m_s = 0.5 * (left_m_s + right_m_s);
         let slower_m_s = left_m_s.abs().min(right_m_s.abs());
         let lateral = 0.5 * model.wheelbase_m() * gyro_rad_s.abs() / slower_m_s;
-        // Slip ahead in the linear range is about the geometric one of a steady turn at most, plus
-        // that of acceleration; the measured difference holds both.
+        // In the linear range longitudinal slip is about the geometric slip of a steady turn at
+        // most, plus that of acceleration; the measured difference contains both.
         let difference_m_s = right_m_s - left_m_s - model.track_width_m() * gyro_rad_s;
         let slip = lateral.hypot(0.5 * difference_m_s.abs() / slower_m_s);
         let rim_noise_m_s = noise.wheel_speed_rad_s * model.wheel_radius_m();
@@ -426,7 +436,7 @@ impl BlockBuilder {
         })
     }
 
-    /// Forces from torques; every sample has one.
+    /// Computes the force regressors from torques; every sample must have one.
     fn force(&self, context: &BlockContext<'_>) -> Force {
         let BlockContext {
             model,
@@ -447,7 +457,7 @@ impl BlockBuilder {
             yaw_rate_rad_s: self.gyro_rad_s / count,
             radius_difference: radius_difference * mean_m_s.signum(),
         };
-        // The torque holds rolling resistance, which no contact carries.
+        // Torques include rolling resistance, which is no contact force.
         let contact_m_s = if self.with_acceleration == self.samples {
             self.forward_m_s2 / count / GRAVITY_M_S2 * mean_m_s.abs()
         } else {
@@ -455,21 +465,32 @@ impl BlockBuilder {
         };
         let rolling_m_s = mean_force_m_s - contact_m_s;
         let sides = SideSlips::of(&turn, theta * contact_m_s / mean_m_s, model);
-        // In reverse the robot is looked at mirrored.
+        // In reverse the model is that of the mirrored robot.
         let (left_slip, right_slip) = if mean_m_s < 0.0 {
             (sides.right, sides.left)
         } else {
             (sides.left, sides.right)
         };
-        // The rims and the gyro that give slip stand in the response too.
+        // Rim speeds and gyro determine both the slip and the response, so their noises correlate.
         let order = if mean_m_s < 0.0 { [1, 0] } else { [0, 1] };
-        let contact = [left_force_m_s - rolling_m_s, right_force_m_s - rolling_m_s];
+        let left = ForceAtSlip {
+            force_m_s: left_force_m_s - rolling_m_s,
+            slip: left_slip,
+        };
+        let right = ForceAtSlip {
+            force_m_s: right_force_m_s - rolling_m_s,
+            slip: right_slip,
+        };
+        let unit = ForceAtSlip {
+            force_m_s: 1.0,
+            slip: sides.mean,
+        };
         let rim_noise = 2.0 * (noise.wheel_speed_rad_s * model.wheel_radius_m()).powi(2) / count;
         let turn_noise = model.track_width_m() * noise.gyro_rad_s.powi(2) / count;
         let slip_noise = |curvature: f64| {
             let slopes = [
-                -bent_slope(contact[0], left_slip, curvature),
-                bent_slope(contact[1], right_slip, curvature),
+                -left.curvature_regressor_slope(curvature),
+                right.curvature_regressor_slope(curvature),
             ];
             let longitudinal = |by: [f64; 2]| slopes[0] * by[order[0]] + slopes[1] * by[order[1]];
             longitudinal(sides.by_apart) / mean_m_s.abs()
@@ -478,28 +499,25 @@ impl BlockBuilder {
         };
         let curvatures = Curvatures::of(curvature);
         let nodes = curvatures.nodes();
-        let bent_sides = nodes.map(|curvature| {
-            [
-                bent(contact[0], left_slip, curvature),
-                bent(contact[1], right_slip, curvature),
-            ]
-        });
+        let of_curvature =
+            nodes.map(|curvature| [left, right].map(|side| side.curvature_regressor(curvature)));
         Force {
             difference_m_s: right_force_m_s - left_force_m_s,
             mean_m_s: mean_force_m_s,
             difference_noise: noise.torque_mu.powi(2)
                 * (left_m_s * left_m_s + right_m_s * right_m_s)
                 / count,
-            difference_bent: curvatures.split(bent_sides.map(|[left, right]| right - left)),
-            mean_bent: curvatures.split(bent_sides.map(|[left, right]| 0.5 * (left + right))),
-            bend: curvatures.split(nodes.map(|curvature| bent(1.0, sides.mean, curvature))),
+            difference_curvature: curvatures.split(of_curvature.map(|[left, right]| right - left)),
+            mean_curvature: curvatures
+                .split(of_curvature.map(|[left, right]| 0.5 * (left + right))),
+            bend: curvatures.split(nodes.map(|curvature| unit.curvature_regressor(curvature))),
             slip_noise: curvatures.split(nodes.map(slip_noise)),
             rate: self.ends.rate(noise.torque_mu, [left_m_s, right_m_s]),
         }
     }
 }
 
-/// The moment balance as a row.
+/// Returns the row of the moment balance, see [`super::window`].
 fn turning_row(means: &TurnMeans, context: BlockContext<'_>) -> Row {
     let BlockContext {
         model,
@@ -511,8 +529,7 @@ fn turning_row(means: &TurnMeans, context: BlockContext<'_>) -> Row {
     let track_m = model.track_width_m();
     // 4 I_G/(m g W), seconds squared.
     let inertia = 4.0 * model.yaw_inertia_kg_m2() / (model.mass_kg() * GRAVITY_M_S2 * track_m);
-    // What is known of the radii belongs into the rim speeds' difference here, where it multiplies
-    // θ.
+    // The known difference of radii corrects the rim speeds' difference where it multiplies θ.
     let force_m_s = inertia * means.harmonic_m_s * means.turn_acceleration_rad_s2
         + means.longitudinal_force_m_s
         - radius_difference * means.rim_mean_m_s * means.longitudinal_mu;
@@ -526,7 +543,7 @@ fn turning_row(means: &TurnMeans, context: BlockContext<'_>) -> Row {
     let jerk_noise = (4.0 * inertia / means.duration_s.powi(2)).powi(2)
         * noise.gyro_rad_s.powi(2)
         * (2.0 / means.ramp_samples + 4.0 / means.middle_samples);
-    // The side that slips more carries less; what that adds to the balance is odd in the turn.
+    // A side with more slip has less stiffness; this effect is odd in the turn rate.
     let rim_noise_m_s = noise.wheel_speed_rad_s * model.wheel_radius_m();
     let gyro_noise = noise.gyro_rad_s.powi(2);
     let turn = Turn {
@@ -535,7 +552,7 @@ fn turning_row(means: &TurnMeans, context: BlockContext<'_>) -> Row {
         yaw_rate_rad_s: means.turn_rad_s,
         radius_difference: radius_difference * means.rim_mean_m_s.signum(),
     };
-    // A loop on noisy poses swings the slip within a window; its noise is no slip.
+    // Control on noisy poses varies the slip within a window; remove the sensor noise from it.
     let swing = means.swing.without_noise(
         (2.0 * rim_noise_m_s.powi(2) + track_m * track_m * gyro_noise) / means.harmonic_m_s.powi(2),
     );
@@ -595,10 +612,10 @@ mod tests {
             let mut ends = Ends::default();
             let dt_s = BLOCK_S / f64::from(samples);
             for sample in 0..samples {
-                let time_s = (f64::from(sample) + 0.5) * dt_s;
-                if let Some(end) = Ends::of(time_s, dt_s) {
-                    let mu = from + slope * time_s;
-                    ends.add(end, time_s, [mu, -mu], [rim, rim + slope * time_s]);
+                let middle_s = (f64::from(sample) + 0.5) * dt_s;
+                if let Some(end) = Ends::of(SampleSpan { middle_s, dt_s }) {
+                    let mu = from + slope * middle_s;
+                    ends.add(end, middle_s, [mu, -mu], [rim, rim + slope * middle_s]);
                 }
             }
             let rate = ends.rate(0.01, [rim, rim]);

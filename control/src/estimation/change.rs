@@ -1,13 +1,13 @@
-//! Whether the ground has changed: a two-sided CUSUM on standardised innovations.
+//! Detects a change of the ground by a two-sided CUSUM test on standardised innovations.
 
-/// Threshold h.
+/// Threshold h of the sums, in standard deviations.
 const THRESHOLD: f64 = 12.0;
-/// Drift k.
+/// Drift k that each innovation subtracts from the sums, in standard deviations.
 const DRIFT: f64 = 0.75;
-/// Largest innovation that counts, so that one wild block is no change.
+/// Limit of a single innovation, so that one outlier does not signal a change.
 const INNOVATION_MAX: f64 = 8.0;
 
-/// The two sums.
+/// State of the CUSUM test: the sums for increase and decrease.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct ChangeDetector {
     above: f64,
@@ -15,7 +15,7 @@ pub(super) struct ChangeDetector {
 }
 
 impl ChangeDetector {
-    /// Takes an innovation; true when the ground has changed.
+    /// Adds a standardised innovation. Returns whether the ground has changed.
     pub(super) fn update(&mut self, innovation: f64) -> bool {
         let bounded = innovation.clamp(-INNOVATION_MAX, INNOVATION_MAX);
         self.above = (self.above + bounded - DRIFT).max(0.0);
@@ -23,7 +23,7 @@ impl ChangeDetector {
         self.above > THRESHOLD || self.below > THRESHOLD
     }
 
-    /// Whether neither sum has left zero.
+    /// Returns whether both sums are zero.
     pub(super) fn is_quiet(&self) -> bool {
         self.above <= 0.0 && self.below <= 0.0
     }

@@ -1,13 +1,14 @@
-//! What four contacts on curved tyres carry together.
+//! Forces and moments of four contacts with curved tyres.
 //!
-//! Contact i keeps `w_i = 1 − κℓ_i` of its stiffness, `ℓ = s − κs²/3` at its combined slip s. A
-//! force or moment F to which contacts add their slip times a lever `m_i` then obeys `Σ w_i m_i =
-//! θF`, so that with the means `ℓ̄`, `w̄` over the contacts, exactly,
+//! Contact i has the fraction `w_i = 1 − κℓ_i` of its initial stiffness, with `ℓ = s − κs²/3` at
+//! its combined slip s. A force or moment F, to which each contact contributes its slip times a
+//! lever, `m_i`, then satisfies `Σ w_i m_i = θF`. With the means `ℓ̄` and `w̄` over the contacts
+//! this is exactly
 //!
 //! ```text
 //! Σ m_i = (θF + κ Σ (ℓ_i − ℓ̄) m_i) / w̄
 //! ```
-//! Slip that swings within a row's time is taken as that of several moments.
+//! Slip that varies within the time of a row is represented by several moments ([`Moment`]).
 
 use super::curved::{Curvatures, Turn};
 use super::rows::Bends;
@@ -15,12 +16,12 @@ use super::types::Curvature;
 use super::window::Moment;
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
-/// Rounds in which the slips that the forces cause are found.
+/// Number of iterations for the slip that the forces cause.
 const ROUNDS: usize = 3;
-/// Share of a tyre's stiffness that is assumed at least.
+/// Lower bound of `w̄`.
 const STIFFNESS_LEFT_MIN: f64 = 0.2;
 
-/// What contacts lose, over κ.
+/// Loss of stiffness of the contacts, over κ.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Loss {
     /// `ℓ̄`.
@@ -29,13 +30,13 @@ pub(super) struct Loss {
     pub(super) left: f64,
     /// Mean of `(ℓ_i − ℓ̄)` times the longitudinal slip.
     pub(super) forward: f64,
-    /// The same with the slip across, to the left.
+    /// Mean of `(ℓ_i − ℓ̄)` times the lateral slip, to the left.
     pub(super) lateral: f64,
-    /// The same with the moment of the slip, metres.
+    /// Mean of `(ℓ_i − ℓ̄)` times the moment of the slip, metres.
     pub(super) moment_m: f64,
 }
 
-/// Forces over load times θ: the mean slip that they cause on straight tyres.
+/// Mean slip of linear tyres: θ times force over load.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct MeanSlip {
     pub(super) forward: f64,
@@ -43,7 +44,8 @@ pub(super) struct MeanSlip {
 }
 
 impl Loss {
-    /// At a mean rim speed above zero, all of a robot that drives ahead.
+    /// Computes the loss at a mean rim speed above zero, for a robot that drives forward. `slip` is
+    /// the mean slip of linear tyres at `theta`.
     pub(super) fn of(
         turn: &Turn,
         swing: &[Moment],
@@ -110,15 +112,17 @@ impl Loss {
     }
 }
 
-/// θ over that which is known at which the bend is looked at too: slips by force follow θ.
+/// Ratio of the second θ, at which the effect of curvature is evaluated for its derivative, to the
+/// estimated one.
 const THETA_STEP: f64 = 1.5;
 
-/// What the bend adds to a row whose force is `force_m_s`; `uneven_m_s` is what contacts that carry
-/// unequal shares add, from their [`Loss`] and over `w̄`. `theta` is above zero.
+/// Input for the regressors of curvature in a row with the force `force_m_s`. `uneven_m_s` computes
+/// the effect of unequal contacts from their [`Loss`], before division by `w̄`. `theta` must be
+/// above zero.
 pub(super) struct BendInput<'of, F: Fn(&Loss) -> f64> {
     pub(super) turn: &'of Turn,
     pub(super) swing: &'of [Moment],
-    /// Forces over load.
+    /// Mean forces over load.
     pub(super) mu: MeanSlip,
     pub(super) theta: f64,
     pub(super) force_m_s: f64,
@@ -126,7 +130,8 @@ pub(super) struct BendInput<'of, F: Fn(&Loss) -> f64> {
 }
 
 impl<F: Fn(&Loss) -> f64> BendInput<'_, F> {
-    /// The row's regressors, and the force's shares in those of θκ, θκ² and θ²κ.
+    /// Returns the curvature regressors of the row, and the ratios of the regressors of θκ, θκ² and
+    /// θ²κ to the force.
     pub(super) fn bends(&self, model: &RobotModel, prior: Curvature) -> (Bends, [f64; 3]) {
         if prior.mean <= 0.0 && prior.std_dev <= 0.0 {
             return (Bends::default(), [0.0; 3]);
@@ -145,7 +150,7 @@ impl<F: Fn(&Loss) -> f64> BendInput<'_, F> {
         let [share, square_share] = curvatures.split(known.map(|[share, _]| share));
         let bends = curvatures
             .split(known.map(|[share, uneven_m_s]| self.force_m_s * share + uneven_m_s / theta));
-        // By θ, at the mean κ: both parts along a straight line.
+        // Linear in θ between the two values, at the mean κ.
         let here = at(theta, prior.mean);
         let there = at(THETA_STEP * theta, prior.mean);
         let slope = [0, 1].map(|part| (there[part] - here[part]) / ((THETA_STEP - 1.0) * theta));
@@ -168,7 +173,7 @@ mod tests {
 
     use super::*;
 
-    /// Stiffness left of a brush.
+    /// Returns the remaining fraction of the stiffness of a brush model.
     fn left(slip: f64, curvature: f64) -> f64 {
         let bend = curvature * slip;
         1.0 - bend + bend * bend / 3.0
@@ -189,7 +194,7 @@ mod tests {
                 radius_difference: 0.0,
             };
             let still = [Moment { weight: 1.0, ..Moment::default() }];
-            // The forces that these slips cause.
+            // Forces that these slips cause.
             let (mut longitudinal_force, mut lateral_force, mut moment_m) = (0.0, 0.0, 0.0);
             let mut straight_moment_m = 0.0;
             for sign in [-1.0, 1.0] {

@@ -1,29 +1,45 @@
-//! Tyres that rise along a curve: what their bend adds to rows that are linear in θκ.
+//! Curvature of the tyres' friction curve: its regressors in rows that are linear in θκ.
 //!
-//! Stiffness falls with the combined slip s as `1 − x + x²/3`, `x = κs` (a brush). Rows are exact
-//! in s at two κ, and to second order in κ between them. What the contacts carry unequally is in
-//! [`super::contacts`].
+//! Stiffness decreases with the combined slip s as `1 − x + x²/3`, `x = κs` (brush model).
+//! Regressors are exact in s at two values of κ, and of second order in κ between them. The effect
+//! of unequal contacts is in [`super::contacts`].
 
 use super::types::Curvature;
 use crate::robot::RobotModel;
 
-/// Slip that is divided by at least.
+/// Lower bound of slip in denominators.
 pub(super) const SLIP_MIN: f64 = 1.0e-4;
 
-/// Regressor of θκ: the force's slip grows with slip itself on a curved tyre, by
-/// `1/(1 − x + x²/3) − 1` with x = κλ.
-pub(super) fn bent(force_m_s: f64, slip: f64, curvature: f64) -> f64 {
-    let bend = curvature * slip;
-    force_m_s * slip * (1.0 + bend * (2.0 / 3.0 + bend * (1.0 / 3.0 + bend / 9.0)))
+/// Force of contacts at their combined slip.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct ForceAtSlip {
+    /// Friction coefficient times rim speed, metres per second.
+    pub(super) force_m_s: f64,
+    /// Combined slip λ.
+    pub(super) slip: f64,
 }
 
-/// [`bent`] by slip.
-pub(super) fn bent_slope(force_m_s: f64, slip: f64, curvature: f64) -> f64 {
-    let bend = curvature * slip;
-    force_m_s * (1.0 + bend * (4.0 / 3.0 + bend * (1.0 + bend * (4.0 / 9.0))))
+impl ForceAtSlip {
+    /// Returns the regressor of θκ at a curvature κ.
+    ///
+    /// For the same force, curved tyres slip more than linear ones by the factor
+    /// `1/(1 − x + x²/3)`, `x = κλ`. The result is the series of this factor minus 1, to the order
+    /// x⁴, times the force and over κ.
+    pub(super) fn curvature_regressor(self, curvature: f64) -> f64 {
+        let Self { force_m_s, slip } = self;
+        let bend = curvature * slip;
+        force_m_s * slip * (1.0 + bend * (2.0 / 3.0 + bend * (1.0 / 3.0 + bend / 9.0)))
+    }
+
+    /// Returns the derivative of [`Self::curvature_regressor`] with respect to slip.
+    pub(super) fn curvature_regressor_slope(self, curvature: f64) -> f64 {
+        let Self { force_m_s, slip } = self;
+        let bend = curvature * slip;
+        force_m_s * (1.0 + bend * (4.0 / 3.0 + bend * (1.0 + bend * (4.0 / 9.0))))
+    }
 }
 
-/// The two κ at which a regressor of θκ, which depends on κ itself, is taken.
+/// The two values of κ at which a regressor of θκ, which depends on κ itself, is evaluated.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Curvatures {
     low: f64,
@@ -31,7 +47,7 @@ pub(super) struct Curvatures {
 }
 
 impl Curvatures {
-    /// One standard deviation from the mean.
+    /// Returns the values one standard deviation below and above the mean, at least 0.
     pub(super) fn of(known: Curvature) -> Self {
         Self {
             low: (known.mean - known.std_dev).max(0.0),
@@ -39,12 +55,13 @@ impl Curvatures {
         }
     }
 
-    /// Both κ.
+    /// Returns both values of κ.
     pub(super) fn nodes(self) -> [f64; 2] {
         [self.low, self.high]
     }
 
-    /// The regressors of θκ and θκ² which together are that of θκ at both κ.
+    /// Returns the regressors of θκ and θκ² whose sum equals the given regressor of θκ at both
+    /// values of κ.
     pub(super) fn split(self, [at_low, at_high]: [f64; 2]) -> [f64; 2] {
         let apart = self.high - self.low;
         if apart <= 0.0 {
@@ -55,20 +72,29 @@ impl Curvatures {
     }
 }
 
-/// Share by which the sides' unequal slip makes their stiffness unequal, over κ times that slip and
-/// over their mean stiffness: exact where the mean κ is the tyres' own.
-pub(super) fn uneven(slip: f64, curvature: f64) -> f64 {
-    let bend = curvature * slip;
+/// Curvature of a tyre at its combined slip.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct CurvatureAtSlip {
+    /// κ, per slip.
+    pub(super) curvature: f64,
+    /// Combined slip.
+    pub(super) slip: f64,
+}
+
+/// Returns the relative difference of the sides' stiffness by their unequal slip, over κ times the
+/// difference of their slip. It is exact if κ is that of the tyres.
+pub(super) fn stiffness_difference(at: CurvatureAtSlip) -> f64 {
+    let bend = at.curvature * at.slip;
     (1.0 - 2.0 / 3.0 * bend) / (1.0 - bend + bend * bend / 3.0)
 }
 
-/// Rims and body in a turn.
+/// Rim speeds and turn rate of a robot.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Turn {
     pub(super) rim_m_s: f64,
     pub(super) rim_difference_m_s: f64,
     pub(super) yaw_rate_rad_s: f64,
-    /// `δ_d` as it is known; looked at mirrored in reverse.
+    /// Estimated `δ_d`; with the opposite sign in reverse.
     pub(super) radius_difference: f64,
 }
 
@@ -85,15 +111,15 @@ pub(super) struct SideSlips {
     pub(super) unequal: f64,
     /// Right minus left longitudinal slip.
     pub(super) apart: f64,
-    /// Left and right combined slip by `apart`.
+    /// Derivatives of left and right combined slip with respect to `apart`.
     pub(super) by_apart: [f64; 2],
-    /// Left and right combined slip by the turn rate, seconds.
+    /// Derivatives of left and right combined slip with respect to the turn rate, seconds.
     pub(super) by_turn_s: [f64; 2],
 }
 
 impl SideSlips {
-    /// At a mean rim speed above zero, all of a robot that drives forward; `common` is the
-    /// longitudinal slip that both sides have.
+    /// Computes the slips at a mean rim speed above zero, for a robot that drives forward. `common`
+    /// is the mean longitudinal slip of both sides.
     pub(super) fn of(turn: &Turn, common: f64, model: &RobotModel) -> Self {
         let Turn {
             rim_m_s,

@@ -1,19 +1,20 @@
-//! Whether the last seconds brought information on θ.
+//! Detects whether the motion of the last seconds excites θ.
 //!
-//! The square of the force regressor over its own noise is one on average when nothing excites it.
-//! A running mean of it says whether there was more. Without torque the regressor is an
-//! acceleration, and its sensor's offset is no excitation: there it is taken about its own mean.
+//! Without excitation the square of the force regressor over its noise variance has the mean 1;
+//! excitation is detected by the running mean of this square. Without torque the regressor is an
+//! acceleration: its mean is subtracted first, because the accelerometer's offset is no excitation.
 
 use super::rows::{Row, index};
 
-/// Blocks over which is averaged.
+/// Time constant of the running means, in blocks.
 const MEMORY_BLOCKS: f64 = 10.0;
-/// Mean above which there is excitation. Noise alone exceeds it less than once in 10⁸ blocks.
+/// Running mean above which there is excitation. Noise alone exceeds it less than once in 10⁸
+/// blocks.
 const PRESENT: f64 = 6.0;
-/// Square of one block that counts at most, so that one wild block is no excitation.
+/// Limit of the square of one block, so that one outlier is no excitation.
 const SQUARE_MAX: f64 = 30.0;
 
-/// The running means.
+/// Running means of the squares.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Excitation {
     turning: f64,
@@ -25,7 +26,7 @@ pub(super) struct Excitation {
 }
 
 impl Excitation {
-    /// Notes a block's differential row.
+    /// Adds the differential row of a block.
     pub(super) fn note_block(&mut self, row: &Row, has_torque: bool) {
         let scaled = row.regressors[index::THETA] / row.force_noise.sqrt().max(f64::MIN_POSITIVE);
         self.turning_blocks = (self.turning_blocks + 1.0).min(2.0 * MEMORY_BLOCKS);
@@ -41,7 +42,7 @@ impl Excitation {
         self.turning += ((centred * centred).min(SQUARE_MAX) - self.turning) / MEMORY_BLOCKS;
     }
 
-    /// Notes a row of the forward speed.
+    /// Adds a row of the forward speed.
     pub(super) fn note_longitudinal(&mut self, row: &Row) {
         if row.force_noise > 0.0 {
             self.longitudinal_sum += row.regressors[index::THETA].powi(2) / row.force_noise;
@@ -49,7 +50,7 @@ impl Excitation {
         }
     }
 
-    /// Ends a block, driven or not.
+    /// Ends a block, also one at rest.
     pub(super) fn end_block(&mut self) {
         let square = if self.longitudinal_rows > 0.0 {
             self.longitudinal_sum / self.longitudinal_rows
@@ -61,7 +62,7 @@ impl Excitation {
         self.longitudinal_rows = 0.0;
     }
 
-    /// Whether there is excitation now.
+    /// Returns whether there is excitation now.
     pub(super) fn is_present(&self) -> bool {
         self.turning.max(self.longitudinal) > PRESENT
     }

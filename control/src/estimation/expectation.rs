@@ -1,8 +1,7 @@
-//! Predicts how well θ will be measured on a plan, before the robot moves.
+//! Predicts the accuracy of the θ that a plan will measure, before the robot moves.
 //!
-//! The estimator itself is driven along the plan with the samples that an undisturbed robot would
-//! give on ground of an assumed θ; its own standard deviation is the expectation. Pure in plan,
-//! noise and θ.
+//! The estimator runs on the noise-free samples of an undisturbed robot that follows the plan on
+//! ground of an assumed θ. Its standard deviation is the prediction.
 
 use serde::{Deserialize, Serialize};
 
@@ -11,27 +10,27 @@ use crate::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
 use crate::plan::Plan;
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
-/// Time between two samples, seconds.
+/// Sampling period of the simulated samples, seconds.
 const SAMPLE_S: f64 = 0.005;
-/// Samples from one body speed to the next.
+/// Number of samples per measured body speed.
 const SAMPLES_PER_BODY_SPEED: u32 = 20;
-/// Longest part of a plan that is looked at, seconds: what comes later only makes it better.
+/// Maximum evaluated duration of a plan, seconds; a longer plan is at least as accurate.
 const LOOKED_AT_MAX_S: f64 = 300.0;
 
-/// What accuracy to expect.
+/// Predicted accuracy of θ.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ExpectedAccuracy {
-    /// Standard deviation of θ over θ at the plan's end; none where the plan excites θ too little
-    /// for a measurement.
+    /// Relative standard deviation of θ at the end of the plan; `None` if the plan does not excite
+    /// θ enough for a measurement.
     pub relative_std_dev: Option<f64>,
-    /// Driving time until the first measurement, seconds.
+    /// Driving time until the first measurement, seconds; `None` without a measurement.
     pub first_after_s: Option<f64>,
 }
 
-/// What the robot will have measured on ground of this θ when it has driven the plan.
+/// Predicts the accuracy of θ after driving `plan` on ground of slip compliance `theta`.
 ///
-/// `theta` is 1/K, above zero; `has_torque` says whether the base gives wheel torques. Nothing is
-/// expected of a θ that is not above zero.
+/// `has_torque` states whether the base measures wheel torques. If `theta` is not positive and
+/// finite, both values of the result are `None`.
 pub fn expected_accuracy(
     plan: &Plan,
     model: &RobotModel,
@@ -76,7 +75,7 @@ pub fn expected_accuracy(
     expected
 }
 
-/// How the body moves along a plan.
+/// Motion of the body along a plan.
 struct Motion {
     speed_m_s: f64,
     acceleration_m_s2: f64,
@@ -84,13 +83,13 @@ struct Motion {
     turn_acceleration_rad_s2: f64,
 }
 
-/// The sample of a robot that moves exactly so, in the linear range.
+/// Returns the noise-free sample of a robot with this motion, in the linear range of slip.
 fn undisturbed(motion: &Motion, model: &RobotModel, theta: f64, has_torque: bool) -> SensorSample {
     let track_m = model.track_width_m();
     let wheelbase_m = model.wheelbase_m();
     let turn_rad_s = motion.turn_rad_s;
-    // Force balance and moment balance give the sides' forces over their load: half of the sum,
-    // half of the difference.
+    // Force and moment balance give the sides' forces over their load: half of the sum and half of
+    // the difference.
     let mean_mu = motion.acceleration_m_s2 / GRAVITY_M_S2;
     let inertia_s2 = 4.0 * model.yaw_inertia_kg_m2() / (model.mass_kg() * GRAVITY_M_S2 * track_m);
     let rims = |lateral_mu: f64| {
@@ -102,7 +101,8 @@ fn undisturbed(motion: &Motion, model: &RobotModel, theta: f64, has_torque: bool
             side(mean_mu + lateral_mu, motion.speed_m_s + half_m_s),
         )
     };
-    // The lateral forces' moment depends on the rim speeds, and these on it: two rounds suffice.
+    // The moment of the lateral forces depends on the rim speeds and vice versa: two iterations
+    // suffice.
     let mut half_mu = 0.5 * inertia_s2 * motion.turn_acceleration_rad_s2;
     let (mut left_m_s, mut right_m_s) = rims(half_mu);
     for _ in 0..2 {

@@ -1,8 +1,9 @@
-//! Speed ahead from accelerometer, wheels and body speed, as rows of the regression.
+//! Estimates the forward speed from accelerometer, wheels and body speed; its innovations are rows
+//! of the regression.
 //!
-//! A scalar Kalman filter follows the speed v; what it leaves over is white and linear in the
-//! parameters (Friedland's two-stage form), so every innovation is one row. Averaged over short
-//! steps, with `s = (1/u_L + 1/u_R)/2`, `d = 1/u_L − 1/u_R` (combined slip, linear range):
+//! A scalar Kalman filter estimates the speed v. Its innovations are white and linear in the
+//! parameters (Friedland's two-stage filter), so each innovation is one row. Averaged over short
+//! steps, with `s = (1/u_L + 1/u_R)/2` and `d = 1/u_L − 1/u_R` (combined slip, linear range):
 //!
 //! ```text
 //! (1 + Wφ̇d/4)/s = v + θ (a/g)/s + δ_c/s + δ_d (u_R − u_L)/4        wheels
@@ -10,34 +11,34 @@
 //! 0             = v                                                standing wheels
 //! v̇             = a − b_a − θ v²φ̇²/g                               accelerometer, and sideslip
 //! ```
-//! Below the speed at which slip is defined only the last lines hold: the filter coasts.
+//! Below the speed at which slip is defined the line of the wheels is not used.
 
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
 use super::contacts::{BendInput, Loss, MeanSlip};
-use super::curved::{Curvatures, SLIP_MIN, SideSlips, Turn, uneven};
+use super::curved::{CurvatureAtSlip, Curvatures, SLIP_MIN, SideSlips, Turn, stiffness_difference};
 use super::rows::{Regressors, Row, index};
 use super::types::Curvature;
 use super::window::Moment;
 use super::{SensorNoise, SensorSample, signed_rims};
 
-/// Time over which samples are averaged, seconds.
+/// Duration of a step, over which samples are averaged, seconds.
 pub(super) const STEP_S: f64 = 0.05;
-/// Variance of an unknown speed, metres squared per second squared.
+/// Initial and maximum variance of the speed, metres squared per second squared.
 const UNKNOWN_M2_S2: f64 = 1.0;
-/// Rim speed up to which wheels stand, metres per second.
+/// Rim speed below which a wheel counts as stopped, metres per second.
 const STANDING_M_S: f64 = 3.0e-3;
-/// Standard deviation of a standing robot's speed, metres per second.
+/// Standard deviation of a stopped robot's speed, metres per second.
 const STANDING_NOISE_M_S: f64 = 1.0e-3;
-/// Turn rate below which a robot drives straight, radians per second.
+/// Turn rate below which a robot counts as driving straight, radians per second.
 const TURNING_MIN_RAD_S: f64 = 1.0e-3;
-/// Turn rate above which a robot moves although its wheels stand, radians per second: it slides, or
-/// is carried. A gyro's offset is far smaller.
+/// Turn rate above which a robot with stopped wheels counts as moving, radians per second: it
+/// slides or is carried. Offsets of gyros are far smaller.
 const STANDING_RAD_S: f64 = 0.05;
-/// Steps the wheels must have stood before the body does too.
+/// Number of consecutive steps with stopped wheels after which the body counts as stopped.
 const STANDING_STEPS: u32 = 3;
 
-/// No swing.
+/// Moment of a row without variation of slip.
 const STILL: Moment = Moment {
     apart: 0.0,
     turn_rad_s: 0.0,
@@ -45,63 +46,76 @@ const STILL: Moment = Moment {
     weight: 1.0,
 };
 
-/// Averages over one step.
+/// Sums over the samples of one step.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct Step {
     duration_s: f64,
     samples: f64,
     usable: f64,
     rim_m_s: f64,
-    /// Speeds of the left and the right rim, summed.
+    /// Sums of the rim speeds `[left, right]`.
     sides_m_s: [f64; 2],
     wheels_m_s: f64,
     harmonic_m_s: f64,
     force_m_s: f64,
     rim_difference_m_s: f64,
     forward_m_s2: f64,
-    /// Acceleration times the time since the step's start.
+    /// Sum of acceleration times the time since the start of the step.
     forward_late_m_s: f64,
     gyro_rad_s: f64,
-    /// Speed of the slower side, summed.
+    /// Sum of the rim speed of the slower side.
     slower_m_s: f64,
     body_m_s: f64,
     body_samples: f64,
-    /// Sum of the times of the body speeds, from the step's start.
+    /// Sum of the times of the body speeds since the start of the step.
     body_time_s: f64,
 }
 
-/// How far slip may go for a step to be used.
+/// Limits of slip for a step to be used, and values with which rows are computed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct SlipBound {
-    /// Largest θ that the ground may have, for all that is known.
+    /// Upper bound of θ.
     pub(super) theta_most: f64,
-    /// Largest slip at which tyres rise as they are known to.
+    /// Largest slip at which the model of the tyres is valid.
     pub(super) slip_max: f64,
-    /// θ that weighs the rows.
+    /// θ for the weights of rows.
     pub(super) theta: f64,
-    /// `δ_d` as it is known.
+    /// Estimated `δ_d`.
     pub(super) radius_difference: f64,
-    /// What is known of the tyres at this θ.
+    /// Curvature of the tyres at this θ.
     pub(super) curvature: Curvature,
 }
 
-/// Assumed lateral drift.
+/// Assumed parameters of the sideslip in a turn.
 #[derive(Debug, Clone, Copy)]
 struct Sideways {
-    /// θ as it is known.
+    /// Estimated or assumed θ.
     theta: f64,
-    /// By how much more a curved tyre drifts, as shares of θκ and θκ².
+    /// Increase of the sideslip by curvature, per θκ and θκ², relative to that of linear tyres.
     bend: [f64; 2],
 }
 
-/// The filter.
+/// Measurement of the forward speed, linear in the parameters.
+#[derive(Debug, Clone, Copy)]
+struct SpeedMeasurement {
+    /// Coefficients of the parameters in the measurement.
+    regressors: Regressors,
+    /// Measured speed, metres per second.
+    speed_m_s: f64,
+    /// Variance of the measured speed.
+    variance: f64,
+    /// Variance of the force regressor.
+    force_noise: f64,
+}
+
+/// Kalman filter of the forward speed, with its sensitivity to the parameters.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct LongitudinalFilter {
     step: Step,
     speed_m_s: f64,
     variance: f64,
     sensitivity: Regressors,
-    /// Change of speed that the last step leaves to its successor.
+    /// Part of the last step's change of speed that is added in the next step.
     last_share_m_s: f64,
     last_duration_s: f64,
     last_gyro_rad_s: f64,
@@ -110,7 +124,7 @@ pub(super) struct LongitudinalFilter {
     started: bool,
 }
 
-/// Rows of one step: wheels, body speed or standing, and the gyro of a standing robot.
+/// Rows of one step: wheels; body speed, or zero speed of a stopped robot; gyro of a stopped robot.
 pub(super) type Rows = [Option<Row>; 3];
 
 impl LongitudinalFilter {
@@ -129,7 +143,7 @@ impl LongitudinalFilter {
         }
     }
 
-    /// Takes a sample; rows when a step is over.
+    /// Adds a sample. Returns the rows of a step when it is complete.
     pub(super) fn add(
         &mut self,
         sample: &SensorSample,
@@ -182,7 +196,7 @@ impl LongitudinalFilter {
         self.predict(&step, forward_m_s2, gyro_rad_s, noise, sideways);
         let mut rows: Rows = [None; 3];
         let gained_m_s2 = forward_m_s2 - std::mem::replace(&mut self.last_ahead_m_s2, forward_m_s2);
-        // On the spot the rims turn against each other, and their mean is zero.
+        // When turning on the spot, the mean of the rim speeds is zero, so check both sides.
         let [left_m_s, right_m_s] = step.sides_m_s.map(|sum| (sum / count).abs());
         let is_standing =
             left_m_s.max(right_m_s) < STANDING_M_S && gyro_rad_s.abs() < STANDING_RAD_S;
@@ -198,7 +212,12 @@ impl LongitudinalFilter {
             );
         }
         if self.standing >= STANDING_STEPS {
-            rows[1] = Some(self.observe(Regressors::zeros(), 0.0, STANDING_NOISE_M_S.powi(2), 0.0));
+            rows[1] = Some(self.observe(SpeedMeasurement {
+                regressors: Regressors::zeros(),
+                speed_m_s: 0.0,
+                variance: STANDING_NOISE_M_S.powi(2),
+                force_noise: 0.0,
+            }));
             let mut regressors = Regressors::zeros();
             regressors[index::GYRO_OFFSET] = 1.0;
             rows[2] = Some(Row::white(
@@ -207,22 +226,22 @@ impl LongitudinalFilter {
                 noise.gyro_rad_s.powi(2) / count,
             ));
         } else if step.body_samples > 0.0 {
-            // The samples were taken off the step's middle.
+            // Correct for the time between the middle of the step and the samples.
             let late_s = step.body_time_s / step.body_samples - 0.5 * step.duration_s;
             let mut regressors = Regressors::zeros();
             regressors[index::LONGITUDINAL_OFFSET] = -late_s;
-            rows[1] = Some(self.observe(
+            rows[1] = Some(self.observe(SpeedMeasurement {
                 regressors,
-                step.body_m_s / step.body_samples - forward_m_s2 * late_s,
-                noise.body_speed_m_s.powi(2) / step.body_samples,
-                0.0,
-            ));
+                speed_m_s: step.body_m_s / step.body_samples - forward_m_s2 * late_s,
+                variance: noise.body_speed_m_s.powi(2) / step.body_samples,
+                force_noise: 0.0,
+            }));
         }
         rows
     }
 
-    /// From the mean of the last step to that of this one: the acceleration between, weighed by a
-    /// triangle that rises over the last step and falls over this one.
+    /// Propagates the speed from the mean of the last step to that of this one, by the acceleration
+    /// with a triangular weight that rises over the last step and falls over this one.
     fn predict(
         &mut self,
         step: &Step,
@@ -246,8 +265,8 @@ impl LongitudinalFilter {
         self.speed_m_s += gained_m_s;
         self.sensitivity[index::LONGITUDINAL_OFFSET] -= span_s;
         self.sensitivity[index::LONGITUDINAL_SCALE] += gained_m_s;
-        // Between the middles of two steps. Drift follows the acceleration across, which is less
-        // than vφ̇ while the drift itself grows.
+        // Values between the middles of two steps. Sideslip is proportional to the lateral
+        // acceleration, which is less than vφ̇ while the sideslip grows.
         let turn_rad_s = 0.5 * (gyro_rad_s + last_gyro_rad_s);
         let turn_rad_s2 = (gyro_rad_s - last_gyro_rad_s) / span_s;
         let forward_m_s2 = gained_m_s / span_s;
@@ -310,26 +329,27 @@ impl LongitudinalFilter {
         };
         let (bends, mut bend) = input.bends(model, bound.curvature);
         bends.put(&mut regressors);
-        // The measured acceleration is averaged over the step, and so is its offset.
+        // Noise of the mean acceleration over the step; its offset is a regressor.
         let felt_noise = (harmonic_m_s * noise.accelerometer_m_s2 / GRAVITY_M_S2).powi(2) / count;
         let rim_noise = 0.5 * (noise.wheel_speed_rad_s * model.wheel_radius_m()).powi(2) / count;
         regressors[index::LONGITUDINAL_OFFSET] = -bound.theta * harmonic_m_s.abs() / GRAVITY_M_S2;
-        let innovation_variance = rim_noise + bound.theta.powi(2) * felt_noise;
-        let mut row = self.observe(
+        let mut row = self.observe(SpeedMeasurement {
             regressors,
-            step.wheels_m_s / count,
-            innovation_variance,
-            felt_noise,
-        );
-        // The force makes the sides' slip unequal too, with its noise.
+            speed_m_s: step.wheels_m_s / count,
+            variance: rim_noise + bound.theta.powi(2) * felt_noise,
+            force_noise: felt_noise,
+        });
+        // The force, with its noise, also makes the slips of the sides unequal.
         let sides = SideSlips::of(&turn, bound.theta * longitudinal_mu, model);
         let unequal_by_force = 0.25 * sides.apart * sides.apart / sides.mean.max(SLIP_MIN);
         let curvatures = Curvatures::of(bound.curvature);
-        let more = curvatures.split(
-            curvatures
-                .nodes()
-                .map(|curvature| unequal_by_force * uneven(sides.mean, curvature)),
-        );
+        let more = curvatures.split(curvatures.nodes().map(|curvature| {
+            let at = CurvatureAtSlip {
+                curvature,
+                slip: sides.mean,
+            };
+            unequal_by_force * stiffness_difference(at)
+        }));
         bend[0] += more[0];
         bend[1] += more[1];
         row.bend = bend;
@@ -338,18 +358,19 @@ impl LongitudinalFilter {
         Some(row)
     }
 
-    /// One measurement of the speed, less what the parameters add to it.
-    fn observe(
-        &mut self,
-        regressors: Regressors,
-        response_m_s: f64,
-        noise: f64,
-        force_noise: f64,
-    ) -> Row {
-        let innovation_variance = self.variance + noise;
+    /// Updates the filter by one measurement of the speed. Returns its innovation as a row, linear
+    /// in the parameters.
+    fn observe(&mut self, measurement: SpeedMeasurement) -> Row {
+        let SpeedMeasurement {
+            regressors,
+            speed_m_s,
+            variance,
+            force_noise,
+        } = measurement;
+        let innovation_variance = self.variance + variance;
         let gain = self.variance / innovation_variance;
         let row = regressors + self.sensitivity;
-        let innovation_m_s = response_m_s - self.speed_m_s;
+        let innovation_m_s = speed_m_s - self.speed_m_s;
         self.speed_m_s += gain * innovation_m_s;
         self.sensitivity -= row * gain;
         self.variance *= 1.0 - gain;
@@ -357,7 +378,7 @@ impl LongitudinalFilter {
             regressors: row,
             response: innovation_m_s,
             innovation_variance,
-            // What is wrong in this row stays in the next ones until it has faded.
+            // An error of this row persists in the following innovations and decays.
             force_noise: force_noise * 2.0 / (2.0 - gain),
             bend: [0.0; 3],
             common_noise: Regressors::zeros(),
@@ -367,7 +388,8 @@ impl LongitudinalFilter {
     }
 }
 
-/// By how much more curved tyres drift in a step, as shares of θκ and θκ²; zero on a straight.
+/// Returns the increase of the sideslip by curvature in a step, per θκ and θκ², relative to that of
+/// linear tyres; zero when driving straight.
 fn sideways_bend(
     step: &Step,
     gyro_rad_s: f64,

@@ -1,4 +1,4 @@
-//! What the robot has learned about itself, whatever the ground: radii, track, sensor offsets.
+//! Knowledge about the parameters that all segments share: radii, track, sensor offsets.
 
 use nalgebra::{SMatrix, SVector};
 
@@ -7,27 +7,26 @@ use super::rows::{OFFSETS, ParameterMatrix, Parameters, Tangent, index};
 use super::sums::Sums;
 use super::{SensorNoise, THETA_FIRST, THETA_RANGE, TyrePrior, ValueWithDeviation};
 
-/// Standard deviation of θ that is assumed, about [`THETA_FIRST`], when offsets are learned.
+/// Standard deviation of the prior of θ, with the mean [`THETA_FIRST`], when offsets are learned.
 const THETA_VAGUE: f64 = 2.0;
 
-/// Share of what is known with which equations of few kinds of rows are made regular.
+/// Fraction of the prior information that regularises the equations when few kinds of rows exist.
 const REGULAR_SHARE: f64 = 1.0e-3;
-/// Information on `θf` while nothing is known: far below what anything else tells.
+/// Prior information on `θf` on new ground, negligible compared with any measurement.
 const RESISTANCE_VAGUE: f64 = 1.0;
 
-/// What is known about the robot's own parameters, in information form.
+/// Estimate of the shared parameters in information form.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct OffsetKnowledge {
     pub(super) information: SMatrix<f64, OFFSETS, OFFSETS>,
     pub(super) weighted: SVector<f64, OFFSETS>,
-    /// Whether the present ground has had a word on its rolling resistance. Like `δ_c` it acts on
-    /// both rows with torque, and only their difference can be learned: what one block takes for
-    /// the one, the next must not take for the other.
+    /// Whether measurements of the present ground have updated `θf`. Only the difference of `δ_c`
+    /// and `θf` is observable, so the prior of `θf` must be added only once per ground.
     pub(super) knows_resistance: bool,
 }
 
 impl OffsetKnowledge {
-    /// Only how far they spread; radii of the two sides independently.
+    /// Returns the prior of a robot without measurements; radii of the two sides are independent.
     pub(super) fn unknown(noise: &SensorNoise, tyres: &TyrePrior) -> Self {
         let weight = |std_dev: f64| std_dev.max(1.0e-6).powi(-2);
         let radius = weight(noise.radius_ratio);
@@ -55,7 +54,7 @@ impl OffsetKnowledge {
         }
     }
 
-    /// Without what is the ground's own, for new ground.
+    /// Returns the estimate for new ground: marginalises `θf` and resets it to its prior.
     pub(super) fn on_new_ground(&self) -> Self {
         let mut known = *self;
         let place = index::RESISTANCE - 1;
@@ -73,8 +72,9 @@ impl OffsetKnowledge {
         known
     }
 
-    /// With what these sums tell about the robot, whatever their θ and κ; the given ones only weigh
-    /// them. Without excitation there is no θ, and the rest is learned all the same.
+    /// Returns the estimate updated with the sums of a ground, with θ and κ of the ground
+    /// marginalised. `theta` and the tyres in `found` serve as weights only. Works without
+    /// excitation of θ, too.
     pub(super) fn with_ground(
         &self,
         sums: &Sums,
@@ -116,8 +116,8 @@ impl OffsetKnowledge {
         }
     }
 
-    /// The Schur complement that takes θκ, then θ, out of normal equations; none where what is left
-    /// would not be regular.
+    /// Marginalises the parameters of ground and tyres in normal equations by Schur complements;
+    /// `None` if the remaining equations would be singular.
     fn without_ground(
         &self,
         normal: &Normal,
@@ -128,9 +128,9 @@ impl OffsetKnowledge {
         take_out(index::ROTORS, &mut matrix, &mut right);
         take_out(index::RELAXATION, &mut matrix, &mut right);
         take_out(index::CURVATURE, &mut matrix, &mut right);
-        // A corrected square below its own noise is not known to be smaller than that noise, and it
-        // is no smaller than what the other regressors explain of it: rows whose force hardly
-        // varies would tell the radii by what the correction takes too much.
+        // The corrected square of the force is at least its own noise and at least the part that
+        // the other regressors explain. Without these bounds, rows with nearly constant force would
+        // turn an error of the correction into information on the radii.
         let others = self.information * REGULAR_SHARE + matrix.fixed_view::<OFFSETS, OFFSETS>(1, 1);
         let with_others = matrix
             .fixed_view::<OFFSETS, 1>(1, index::THETA)
@@ -150,7 +150,7 @@ impl OffsetKnowledge {
         ))
     }
 
-    /// `δ_c` and `δ_d` with their standard deviations.
+    /// Returns `δ_c` and `δ_d` with their standard deviations.
     pub(super) fn values(&self) -> (ValueWithDeviation, ValueWithDeviation) {
         let covariance = self
             .information

@@ -1,11 +1,16 @@
-//! The regression of slip on force with errors in variables.
+//! Regression of slip on force with errors in variables.
 //!
-//! Rows are in [`super`] and [`super::longitudinal`]. For known noise `σ_x²` of the force regressor the
-//! corrected normal matrix is `M = Σ_c (X_cᵀX_c − n σ_x² e₁e₁ᵀ)/s_c²` with `s_c² = σ_y² + θ²σ_x²`
-//! (found by iteration), and the variance of θ is
-//! `[M⁻¹]₁₁ + [M⁻¹]₁₁² Σ_c n (σ_x² s_c² + θ²σ_x⁴)/s_c⁴` (Fuller, Measurement Error Models, 1987).
-//! Noise that the response shares with another regressor, `u_R − u_L` beside `δ_c` above all, is
-//! taken out of their product: θ would read low by up to a third of its standard deviation.
+//! The rows are defined in [`super`] and [`super::longitudinal`]. With the known variance `σ_x²` of
+//! the force regressor, the corrected normal matrix is `M = Σ_c (X_cᵀX_c − n σ_x² e₁e₁ᵀ)/s_c²` over
+//! the channels c, with `s_c² = σ_y² + θ²σ_x²` (found by iteration). The variance of θ (Fuller,
+//! Measurement Error Models, 1987) is
+//!
+//! ```text
+//! [M⁻¹]₁₁ + [M⁻¹]₁₁² Σ_c n (σ_x² s_c² + θ²σ_x⁴)/s_c⁴
+//! ```
+//! The covariance of response and regressor noise, mainly of `u_R − u_L` in the regressor of `δ_c`,
+//! is subtracted from their product; otherwise θ would be too small by up to a third of its
+//! standard deviation.
 
 use super::offsets::OffsetKnowledge;
 use super::rows::{Channel, OFFSETS, ParameterMatrix, Parameters, Tangent, index};
@@ -13,33 +18,34 @@ use super::sums::Sums;
 use super::{BLOCKS_MIN, RELATIVE_STD_DEV_MAX, THETA_RANGE, TyrePrior};
 use crate::estimation::block::Block;
 
-/// Rounds of the iteration on the weights.
+/// Maximum number of iterations on the weights.
 const ROUNDS: usize = 5;
-/// Relative step of θ at which that iteration ends.
+/// Relative step of θ below which the iteration on the weights ends.
 const CONVERGED: f64 = 1.0e-4;
-/// Share of a force's effect that the model may miss without the ground having changed.
+/// Relative model error of a force's effect that does not count as a change of the ground.
 const MODEL_SHARE: f64 = 0.05;
-/// Signal over its own noise below which the regressor counts as unexcited.
+/// Signal-to-noise ratio below which the force regressor counts as unexcited.
 const SIGNIFICANCE_MIN: f64 = 6.0;
-/// Rows from which on the residuals tell whether the assumed noise is too small.
+/// Minimum number of rows for testing the assumed noise by the residuals.
 const INFLATION_ROWS: f64 = 15.0;
-/// How large rolling resistance over load may be, one standard deviation.
+/// Prior standard deviation of the rolling resistance coefficient.
 const ROLLING_SPREAD: f64 = 0.02;
-/// Share of the effect of curved tyres that rows on accelerations may miss: they hold what swings
-/// in their time by its measured shape, and κ to second order.
+/// Relative model error of the effect of curvature in rows on accelerations, which use the measured
+/// variation of slip within their time, and κ to second order.
 const BEND_SHARE: f64 = 0.04;
-/// The same of rows on torques, which know their slip by its mean only.
+/// Relative model error of the effect of curvature in rows on torques, which use the mean slip
+/// only.
 const BEND_SHARE_TORQUE: f64 = 0.05;
-/// Most of a variance that neighbouring rows may take from it.
+/// Maximum fraction of a variance that the correlation of neighbouring rows may subtract.
 const NEIGHBOURS_SHARE_MAX: f64 = 0.9;
-/// Relative change of how much larger residuals are at which the search for it ends.
+/// Relative change of the inflation of residuals below which its iteration ends.
 const INFLATION_SETTLED: f64 = 0.1;
-/// Least share of a variance that is the estimate's own.
+/// Minimum fraction of the variance without the tyres' error in the total variance.
 const OWN_SHARE_MIN: f64 = 0.01;
-/// Least standard deviation of θκ, so that the matrix stays regular.
+/// Minimum standard deviation of θκ, which keeps the matrix regular.
 const CURVATURE_STD_DEV_MIN: f64 = 2.0e-4;
 
-/// Normal equations at one choice of weights.
+/// Normal equations for given weights.
 pub(super) struct Normal {
     pub(super) matrix: ParameterMatrix,
     pub(super) right: Parameters,
@@ -47,12 +53,13 @@ pub(super) struct Normal {
     excess: f64,
     /// Standard deviation of the noise in the corrected `M₁₁`.
     pub(super) noise_std_dev: f64,
-    /// Information on θκ that was there before.
+    /// Prior information on θκ.
     curvature_weight: f64,
 }
 
 impl Normal {
-    /// Of these channels, with what is known about the tyres, at this θ and near this κ.
+    /// Sums the channels with weights at `theta`, linearised by `tangent`, and adds the prior of
+    /// the tyres. `inflation` multiplies the variance of residuals.
     pub(super) fn of(
         channels: &[&Channel],
         theta: f64,
@@ -92,7 +99,7 @@ impl Normal {
         normal
     }
 
-    /// Adds how large rolling resistance may be at this θ, where this ground has not shown it yet.
+    /// Adds the prior of rolling resistance, unless it was added for this ground before.
     pub(super) fn with_resistance(mut self, offsets: &OffsetKnowledge, theta: f64) -> Self {
         if !offsets.knows_resistance {
             let resistance = (index::RESISTANCE, index::RESISTANCE);
@@ -101,7 +108,7 @@ impl Normal {
         self
     }
 
-    /// Adds what is known about the robot's own parameters.
+    /// Adds the information on the shared parameters.
     pub(super) fn with_offsets(mut self, offsets: &OffsetKnowledge) -> Self {
         let mut block = self.matrix.fixed_view_mut::<OFFSETS, OFFSETS>(1, 1);
         block += offsets.information;
@@ -111,7 +118,8 @@ impl Normal {
     }
 }
 
-/// What is known of relaxation, rotors and loads: which parameter over θ, its mean and standard deviation.
+/// Returns the priors of relaxation length, rotor inertia and load difference: the index of the
+/// parameter, and mean and standard deviation of the parameter over θ.
 pub(super) fn drive_known(tyres: &TyrePrior) -> [(usize, f64, f64); 3] {
     [
         (
@@ -128,7 +136,8 @@ pub(super) fn drive_known(tyres: &TyrePrior) -> [(usize, f64, f64); 3] {
     ]
 }
 
-/// How much larger the residuals are than the assumed noise; never below one.
+/// Returns the ratio of the residuals' variance to the assumed one if it is significantly above 1,
+/// else 1.
 pub(super) fn inflation(
     channels: &[&Channel],
     parameters: &Parameters,
@@ -149,7 +158,7 @@ pub(super) fn inflation(
     if count < INFLATION_ROWS {
         return 1.0;
     }
-    // Chance alone makes the ratio vary by √(2/n).
+    // The standard deviation of the ratio is √(2/n).
     let freedom = count - 3.0;
     let ratio = squares / freedom;
     if ratio > 1.0 + 2.0 * (2.0 / freedom).sqrt() {
@@ -159,8 +168,9 @@ pub(super) fn inflation(
     }
 }
 
-/// What neighbouring rows add to the variance in the direction `M⁻¹v`; below zero where the force
-/// changes slowly, since what one row has too much of a ramp the next has too little.
+/// Returns the contribution of correlated neighbouring rows to the variance in the direction
+/// `M⁻¹v`. It is negative for slowly varying forces, because the noise of a shared ramp enters both
+/// rows with opposite signs.
 fn neighbours(channels: &[&Channel], direction: &Parameters, theta: f64, tangent: Tangent) -> f64 {
     let of_channel = |channel: &&Channel| {
         if channel.count < 1.0 {
@@ -172,7 +182,7 @@ fn neighbours(channels: &[&Channel], direction: &Parameters, theta: f64, tangent
     channels.iter().map(of_channel).sum()
 }
 
-/// How large the effect of the bend is beside that of θ alone.
+/// Returns the ratio of the effect of curvature to that of θ alone.
 fn bend_ratio(channels: &[&Channel], tangent: Tangent, curvature: f64) -> f64 {
     let mut sums = [0.0; 2];
     for channel in channels {
@@ -187,18 +197,18 @@ fn bend_ratio(channels: &[&Channel], tangent: Tangent, curvature: f64) -> f64 {
     }
 }
 
-/// What a solution starts from.
+/// Input of [`solve`].
 #[derive(Debug, Clone, Copy)]
 pub(super) struct SolveInput<'known> {
     pub(super) offsets: &'known OffsetKnowledge,
     pub(super) tyres: &'known TyrePrior,
-    /// Weights of this θ and no other; `None` finds its own.
+    /// Fixed θ for the weights; `None` iterates it.
     pub(super) theta_given: Option<f64>,
-    /// Where the search for weights starts.
+    /// Initial θ of the iteration on the weights.
     pub(super) theta_start: f64,
 }
 
-/// Estimates all parameters; none without any excitation.
+/// Estimates all parameters; `None` without blocks or if the equations are singular.
 pub(super) fn solve(sums: &Sums, input: SolveInput<'_>) -> Option<Solution> {
     if sums.blocks == 0 {
         return None;
@@ -220,7 +230,7 @@ pub(super) fn solve(sums: &Sums, input: SolveInput<'_>) -> Option<Solution> {
         if input.theta_given.is_none() {
             tyres = learned_tyres(&parameters, &covariance, input.tyres);
         }
-        // Where residuals are larger than the noise explains, rows say less beside what was known.
+        // Residuals larger than the noise reduce the weight of rows relative to the priors.
         let inflation = inflation(&channels, &parameters, theta_weights, tangent);
         let is_weighed = is_exact || (inflation - inflated).abs() <= INFLATION_SETTLED * inflated;
         let is_settled = (next - theta_weights).abs() < CONVERGED * theta_weights
@@ -230,9 +240,9 @@ pub(super) fn solve(sums: &Sums, input: SolveInput<'_>) -> Option<Solution> {
             let (theta, scale) = if sums.has_torque() {
                 (theta, 0.0)
             } else {
-                // Force over load is then an acceleration, and the slip that stands for it is
-                // computed with a radius too large by δ_c: what is estimated is θ(1 − δ_c). Torque
-                // reads too high by just that share.
+                // Without torque the force is an acceleration, and slip is computed with a radius
+                // that is too large by δ_c, so the estimated value is θ(1 − δ_c). With torque the
+                // force is too large by the same ratio.
                 (theta * (1.0 + parameters[index::RADIUS_OFFSET]), theta)
             };
             let cross = covariance[(index::THETA, index::RADIUS_OFFSET)];
@@ -250,14 +260,15 @@ pub(super) fn solve(sums: &Sums, input: SolveInput<'_>) -> Option<Solution> {
             } else {
                 BEND_SHARE
             };
-            let bent = share * parameters[index::THETA] * bend_ratio(&channels, tangent, curvature);
-            // What residuals show beyond the noise is no noise: it does not average out.
+            let of_curvature =
+                share * parameters[index::THETA] * bend_ratio(&channels, tangent, curvature);
+            // Residuals beyond the noise are model errors, which do not average out.
             let unexplained = input.tyres.unexplained_ratio
                 * parameters[index::THETA]
                 * (1.0 - inflated.recip()).sqrt();
-            // Of an exact model, what residuals show is that the noise is larger than assumed.
+            // With an exact model, larger residuals mean that the noise is larger than assumed.
             let noisier = if is_exact { inflation } else { 1.0 };
-            let missed = bent.hypot(unexplained);
+            let missed = of_curvature.hypot(unexplained);
             return Some(Solution {
                 theta,
                 parameters,
@@ -286,7 +297,7 @@ pub(super) fn solve(sums: &Sums, input: SolveInput<'_>) -> Option<Solution> {
     None
 }
 
-/// What a solution tells about the tyres' curvature beyond what was known.
+/// Returns the tyres with the estimated curvature, or `known` if the estimate is not more precise.
 fn learned_tyres(
     parameters: &Parameters,
     covariance: &ParameterMatrix,
@@ -305,43 +316,44 @@ fn learned_tyres(
     }
 }
 
-/// Estimated parameters.
+/// Estimated parameters with their covariance.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Solution {
     pub(super) theta: f64,
-    /// Variance of θ with that of the offsets and of the noisy regressor.
+    /// Variance of θ, including the errors of the offsets and of the noisy regressor.
     pub(super) variance: f64,
-    /// Corrected, centred square of the force over its own noise.
+    /// Ratio of the corrected, centred square of the force to the standard deviation of its noise.
     significance: f64,
     parameters: Parameters,
     covariance: ParameterMatrix,
-    /// Share by which the covariance was enlarged beside what was known.
+    /// Factor by which the covariance was inflated.
     noisier: f64,
-    /// How θ follows from the parameters.
+    /// Derivative of θ with respect to the parameters.
     of_theta: Parameters,
-    /// θκ² as it was computed with.
+    /// Linearisation of products of θ and κ that was used.
     tangent: Tangent,
-    /// What rows to second order may miss of curved tyres, in θ; alike everywhere.
+    /// Model error of θ by curvature and by unexplained residuals, equal in all solutions of a
+    /// ground.
     missed: f64,
-    /// The part of the variance that comes from what was not known of the tyres.
+    /// Part of the variance that is due to the tyres.
     tyre_variance: f64,
 }
 
-/// What two estimates of θ have in common, as the covariance of their errors.
+/// Covariance of the errors of two estimates of θ.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Shared {
-    /// Whatever it comes from.
+    /// Total covariance.
     pub(super) all: f64,
-    /// Without what one error of the tyres explains, as large in each as it says of itself.
+    /// Covariance without the part that a common error of the tyres explains.
     pub(super) own: f64,
 }
 
 impl Solution {
-    /// Covariance of θ's error here with that of θ of other rows, which were solved with what
-    /// these rows tell of the robot and its tyres: what all of them share.
+    /// Returns the covariance of the error of θ with that of `later`, which was solved from other
+    /// rows with the knowledge of robot and tyres from these rows.
     ///
-    /// An estimate that is the best one of all rows before has the same covariance with any
-    /// unbiased one of a part of them, so it does not matter which part those others were.
+    /// The best estimate from all earlier rows has the same covariance with every unbiased estimate
+    /// from a part of them, so the result holds for every part.
     pub(super) fn shared_with(
         &self,
         later: &Self,
@@ -352,7 +364,7 @@ impl Solution {
         let its = later.covariance * later.of_theta / later.noisier;
         let followed = offsets.information * its.fixed_rows::<OFFSETS>(1);
         let of_offsets = followed.dot(&mine.fixed_rows::<OFFSETS>(1));
-        // What moves θκ moves the later θ by as much as its prior weighs.
+        // An error of θκ changes the later θ by the weight of its prior.
         let width = tyres.curvature_std_dev.max(CURVATURE_STD_DEV_MIN);
         let of_curvature = its[index::CURVATURE] / (width * width) * mine[index::CURVATURE];
         let of_drive: f64 = drive_known(tyres)
@@ -370,17 +382,18 @@ impl Solution {
         }
     }
 
-    /// Standard deviation of the error that comes from what was not known of the tyres.
+    /// Returns the standard deviation of the error that is due to the tyres.
     pub(super) fn tyre_std_dev(&self) -> f64 {
         self.tyre_variance.sqrt()
     }
 
-    /// Variance of θ without that of the tyres.
+    /// Returns the variance of θ without the part that is due to the tyres.
     pub(super) fn own_variance(&self) -> f64 {
         (self.variance - self.tyre_variance).max(OWN_SHARE_MIN * self.variance)
     }
 
-    /// Whether the force varied enough, apart from the offsets, to call this a measurement.
+    /// Returns whether θ counts as a measurement: the force was excited, enough blocks exist, and
+    /// the relative standard deviation is small enough.
     pub(super) fn is_measurement(&self, blocks: u64) -> bool {
         blocks >= BLOCKS_MIN
             && THETA_RANGE.contains(&self.theta)
@@ -389,12 +402,13 @@ impl Solution {
             && self.significance > SIGNIFICANCE_MIN
     }
 
-    /// What this tells about the tyres' curvature beyond what was known.
+    /// Returns the tyres with the estimated curvature, or `known` if the estimate is not more
+    /// precise.
     pub(super) fn tyres(&self, known: &TyrePrior) -> TyrePrior {
         learned_tyres(&self.parameters, &self.covariance, known)
     }
 
-    /// Whether a segment's sums carry information at all, judged by the ground's θ.
+    /// Returns whether a segment has information on θ, compared with the ground's `theta_ground`.
     pub(super) fn is_informative(&self, theta_ground: f64) -> bool {
         self.variance.is_finite()
             && self.variance > 0.0
@@ -402,7 +416,8 @@ impl Solution {
             && self.significance > SIGNIFICANCE_MIN
     }
 
-    /// Standardised innovation of a block in the direction of θ.
+    /// Returns the standardised innovation of a block, positive towards larger θ; `None` if the
+    /// block is not in the linear range or has no differential row.
     pub(super) fn innovation(&self, block: &Block) -> Option<f64> {
         if !block.is_linear {
             return None;

@@ -1,4 +1,4 @@
-//! Rows of the regression, and additive sums of them.
+//! Rows of the regression, and their additive sums.
 
 use nalgebra::{SMatrix, SVector};
 
@@ -6,51 +6,50 @@ use super::types::Curvature;
 
 /// Number of parameters.
 pub(super) const PARAMETERS: usize = 12;
-/// Number of the parameters that all segments of a ground share, which follow θ: the robot's own,
-/// and the rolling resistance.
+/// Number of parameters that all segments of a ground share: the robot's own and the rolling
+/// resistance. They have the indices 1 to [`OFFSETS`].
 pub(super) const OFFSETS: usize = 7;
-/// A value for each parameter.
+/// Vector of parameters.
 pub(super) type Parameters = SVector<f64, PARAMETERS>;
-/// A value for each pair of parameters.
+/// Matrix over pairs of parameters.
 pub(super) type ParameterMatrix = SMatrix<f64, PARAMETERS, PARAMETERS>;
-/// Number of regressors: those of the parameters, and of products of θ and κ that follow from them.
+/// Number of regressors: those of the parameters, and of further products of θ and κ.
 const REGRESSORS: usize = PARAMETERS + 3;
-/// A value for each regressor.
+/// Vector of regressors.
 pub(super) type Regressors = SVector<f64, REGRESSORS>;
-/// A value for each pair of regressors.
+/// Matrix over pairs of regressors.
 type RegressorMatrix = SMatrix<f64, REGRESSORS, REGRESSORS>;
 
-/// Which parameter stands where.
+/// Indices of parameters and regressors.
 pub(super) mod index {
     /// θ.
     pub(in crate::estimation) const THETA: usize = 0;
-    /// `δ_c`, mean share by which nominal radii are too large.
+    /// `δ_c`, mean relative error of the nominal rolling radii; positive if they are too large.
     pub(in crate::estimation) const RADIUS_OFFSET: usize = 1;
-    /// `δ_d`, right minus left of the same.
+    /// `δ_d`, right minus left relative error of the nominal rolling radii.
     pub(in crate::estimation) const RADIUS_DIFFERENCE: usize = 2;
-    /// `ε_w`, by which `W_eff/W − 1` differs from `(L/W)²`, as a share of the latter.
+    /// `ε_w`, relative deviation of `W_eff/W − 1` from `(L/W)²`.
     pub(in crate::estimation) const TRACK: usize = 3;
     /// `b_g`, the gyro's offset, radians per second.
     pub(in crate::estimation) const GYRO_OFFSET: usize = 4;
-    /// `b_a`, the accelerometer's offset ahead, metres per second squared.
+    /// `b_a`, the accelerometer's forward offset, metres per second squared.
     pub(in crate::estimation) const LONGITUDINAL_OFFSET: usize = 5;
-    /// Share by which the accelerometer reads too little.
+    /// Relative scale error of the accelerometer; positive if it reads too little.
     pub(in crate::estimation) const LONGITUDINAL_SCALE: usize = 6;
-    /// `θf`, θ times the rolling resistance over load that measured torques hold. It is the
-    /// ground's: new ground forgets it.
+    /// `θf`, θ times the rolling resistance coefficient in measured torques. It belongs to the
+    /// ground and is reset on new ground.
     pub(in crate::estimation) const RESISTANCE: usize = 7;
     /// θκ, θ times the tyre's curvature per slip.
     pub(in crate::estimation) const CURVATURE: usize = 8;
-    /// θℓ, θ times the contacts' relaxation length, metres: a force that rises takes slip of its
-    /// own.
+    /// θℓ, θ times the contacts' relaxation length, metres: a rising force needs additional slip.
     pub(in crate::estimation) const RELAXATION: usize = 9;
-    /// θj, θ times the inertia of the rotors and wheels over the mass: torque that no contact
-    /// carries.
+    /// θj, θ times the inertia of rotors and wheels over the mass; its torque does not reach the
+    /// contacts.
     pub(in crate::estimation) const ROTORS: usize = 10;
-    /// θε, θ times the difference of the sides' loads over their sum, left minus right: a robot
-    /// whose centre of mass is off the middle slips less on the side that carries more.
+    /// θε, θ times the difference of the sides' loads over their sum, left minus right. The side
+    /// with more load slips less.
     pub(in crate::estimation) const LOADS: usize = 11;
-    /// θκ², a regressor's place only, as all that follow.
+    /// θκ²; this and the following indices are of regressors only.
     pub(in crate::estimation) const CURVATURE_SQUARE: usize = 12;
     /// κ.
     pub(in crate::estimation) const CURVATURE_ALONE: usize = 13;
@@ -58,7 +57,7 @@ pub(super) mod index {
     pub(in crate::estimation) const THETA_CURVATURE: usize = 14;
 }
 
-/// The regressors that have the force's noise.
+/// Regressors that contain the noise of the force.
 const FORCED: [usize; 4] = [
     index::THETA,
     index::CURVATURE,
@@ -66,11 +65,11 @@ const FORCED: [usize; 4] = [
     index::THETA_CURVATURE,
 ];
 
-/// Step of κ per slip, or of its square, at which the search for it ends.
+/// Change of κ per slip, or of its square, below which its iteration ends.
 const SETTLED: f64 = 1.0e-2;
 
-/// Products of θ and κ as what they are near one θ and κ: linear in θ and θκ. With `κ = κ₀ ± σ`,
-/// `θκ² = 2κ₀·θκ + (σ² − κ₀²)·θ` on average, since σ adds to the square's mean.
+/// Linearisation of products of θ and κ in the parameters θ and θκ. For κ with mean κ₀ and standard
+/// deviation σ, `θκ² = 2κ₀·θκ + (σ² − κ₀²)·θ` on average.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Tangent {
     square_by_theta: f64,
@@ -79,7 +78,7 @@ pub(super) struct Tangent {
 }
 
 impl Tangent {
-    /// At what is known of θ, above zero, and of κ.
+    /// Linearises at a θ above zero and a κ with its standard deviation.
     pub(super) fn at(theta: f64, known: Curvature) -> Self {
         Self {
             square_by_theta: known.std_dev.powi(2) - known.mean.powi(2),
@@ -88,14 +87,14 @@ impl Tangent {
         }
     }
 
-    /// Whether κ is the same but for what no estimate feels.
+    /// Returns whether κ differs by less than the convergence limit.
     pub(super) fn is_near(self, other: Self) -> bool {
         (self.square_by_curvature - other.square_by_curvature).abs() < SETTLED
             && (self.square_by_theta - other.square_by_theta).abs() < SETTLED
     }
 
-    /// What moves with which parameter besides the parameter itself: the regressor's quantity, the
-    /// parameter, and by how much.
+    /// Returns the linear dependences of regressor-only products: index of the product, index of
+    /// the parameter, coefficient.
     fn followers(self) -> [(usize, usize, f64); 4] {
         [
             (index::CURVATURE_SQUARE, index::THETA, self.square_by_theta),
@@ -109,7 +108,7 @@ impl Tangent {
         ]
     }
 
-    /// Regressors of the parameters alone.
+    /// Reduces regressors to those of the parameters.
     pub(super) fn of_parameters(self, regressors: &Regressors) -> Parameters {
         let mut found = regressors.fixed_rows::<PARAMETERS>(0).into_owned();
         for (from, to, by) in self.followers() {
@@ -118,7 +117,7 @@ impl Tangent {
         found
     }
 
-    /// The same of a matrix with a row and a column for each regressor.
+    /// Reduces a matrix over pairs of regressors to one over pairs of parameters.
     fn of_pairs(self, square: &RegressorMatrix) -> ParameterMatrix {
         let mut columns = square.fixed_columns::<PARAMETERS>(0).into_owned();
         for (from, to, by) in self.followers() {
@@ -136,17 +135,17 @@ impl Tangent {
     }
 }
 
-/// The bend's regressors, as they stand in a row.
+/// Regressors of a row that involve the curvature.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Bends {
-    /// Of θκ and θκ².
+    /// Regressors of θκ and θκ².
     pub(super) curvature: [f64; 2],
-    /// Of κ and θ²κ.
+    /// Regressors of κ and θ²κ.
     pub(super) theta: [f64; 2],
 }
 
 impl Bends {
-    /// Puts them where they belong.
+    /// Writes the regressors to their indices.
     pub(super) fn put(&self, regressors: &mut Regressors) {
         regressors[index::CURVATURE] = self.curvature[0];
         regressors[index::CURVATURE_SQUARE] = self.curvature[1];
@@ -155,29 +154,29 @@ impl Bends {
     }
 }
 
-/// One equation, linear in the parameters.
+/// One linear equation: response = regressors · parameters + noise.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Row {
     pub(super) regressors: Regressors,
     pub(super) response: f64,
-    /// Variance of the response, with that of the force at the θ of the time.
+    /// Variance of the response; in rows of the forward speed it includes that of the force.
     pub(super) innovation_variance: f64,
     /// Variance of the force regressor.
     pub(super) force_noise: f64,
-    /// The force's shares in the regressors of θκ, θκ² and θ²κ, which have the same noise.
+    /// Ratios of the regressors of θκ, θκ² and θ²κ to the force; they share its noise.
     pub(super) bend: [f64; 3],
-    /// Covariance of the other regressors' noise with that of the response: rim speeds and turn
-    /// rate stand on both sides.
+    /// Covariance of the other regressors' noise with that of the response: both contain rim speeds
+    /// and turn rate.
     pub(super) common_noise: Regressors,
-    /// The part of the force's variance that is the gyro's over two ramps, each shared with a
-    /// neighbouring row with the other sign.
+    /// Part of the force's variance by the gyro over the two ramps; each ramp is shared with a
+    /// neighbouring row with the opposite sign.
     pub(super) ramp_noise: f64,
     /// Variance of the force's rate, the regressor of θℓ.
     pub(super) rate_noise: f64,
 }
 
 impl Row {
-    /// A row whose regressors are known.
+    /// Creates a row with noise-free regressors.
     pub(super) fn white(regressors: Regressors, response: f64, innovation_variance: f64) -> Self {
         Self {
             regressors,
@@ -192,19 +191,19 @@ impl Row {
     }
 }
 
-/// Sums of one kind of row.
+/// Sums over the rows of one kind.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Channel {
     pub(super) count: f64,
     square: RegressorMatrix,
     product: Regressors,
     pub(super) response: f64,
-    /// Sum of the variances that the force gives its regressors.
+    /// Sum of the covariances of the regressors [`FORCED`] by the noise of the force.
     force_noise: SMatrix<f64, 4, 4>,
     common_noise: Regressors,
     /// `Σ (x xᵀ′ + x′ xᵀ) cov` over neighbouring rows x, x′ whose force noise has this covariance.
     neighbours: RegressorMatrix,
-    /// Sum of the response's variances.
+    /// Sum of the variances of the response.
     response_noise: f64,
     /// Sum of the variances of the force's rate.
     rate_noise: f64,
@@ -227,7 +226,7 @@ impl Default for Channel {
 }
 
 impl Channel {
-    /// Adds a row; its `innovation_variance` is that of the response alone.
+    /// Adds a row, whose `innovation_variance` must be that of the response alone.
     pub(super) fn add(&mut self, row: &Row) {
         self.count += 1.0;
         self.square += row.regressors * row.regressors.transpose();
@@ -240,14 +239,15 @@ impl Channel {
         self.rate_noise += row.rate_noise;
     }
 
-    /// Notes that a row that was added stands next to another one: they share a ramp.
+    /// Adds the covariance of a row with its predecessor, with which it shares a ramp.
     pub(super) fn note_neighbour(&mut self, row: &Row, before: &Row) {
         let covariance = -0.5 * (row.ramp_noise * before.ramp_noise).sqrt();
         let product = row.regressors * before.regressors.transpose();
         self.neighbours += (product + product.transpose()) * covariance;
     }
 
-    /// Adds a row in units of its own innovation variance, which holds the force's noise at this θ.
+    /// Adds a row scaled to unit innovation variance, which includes the noise of the force at
+    /// `theta`.
     pub(super) fn add_standardised(&mut self, row: &Row, theta: f64) {
         let force_noise = row.force_noise / row.innovation_variance;
         let scale = row.innovation_variance.sqrt().recip();
@@ -277,22 +277,22 @@ impl Channel {
         }
     }
 
-    /// `s²` at a θ.
+    /// Returns `s² = σ_y² + θ²σ_x²`.
     pub(super) fn innovation_variance(&self, theta: f64) -> f64 {
         self.response_noise / self.count + theta * theta * self.force_variance()
     }
 
-    /// Mean variance of the force regressor.
+    /// Returns the mean variance `σ_x²` of the force regressor.
     pub(super) fn force_variance(&self) -> f64 {
         self.force_noise[(0, 0)] / self.count
     }
 
-    /// `Σ xxᵀ`, with the noise of the regressors.
+    /// Returns `Σ xxᵀ`, including the noise of the regressors.
     pub(super) fn square(&self, tangent: Tangent) -> ParameterMatrix {
         tangent.of_pairs(&self.square)
     }
 
-    /// `Σ xxᵀ` without the force's noise.
+    /// Returns `Σ xxᵀ` minus the noise of the force and of its rate.
     pub(super) fn corrected_square(&self, tangent: Tangent) -> ParameterMatrix {
         let mut square = self.square;
         square[(index::RELAXATION, index::RELAXATION)] -= self.rate_noise;
@@ -304,22 +304,23 @@ impl Channel {
         tangent.of_pairs(&square)
     }
 
-    /// `Σ xy`, with the noise that both have.
+    /// Returns `Σ xy`, including the common noise of regressors and response.
     pub(super) fn product(&self, tangent: Tangent) -> Parameters {
         tangent.of_parameters(&self.product)
     }
 
-    /// `Σ xy` without the noise that both have.
+    /// Returns `Σ xy` minus the common noise of regressors and response.
     pub(super) fn corrected_product(&self, tangent: Tangent) -> Parameters {
         tangent.of_parameters(&(self.product - self.common_noise))
     }
 
-    /// What neighbouring rows have in common.
+    /// Returns the sum of the covariances of neighbouring rows.
     pub(super) fn neighbours(&self, tangent: Tangent) -> ParameterMatrix {
         tangent.of_pairs(&self.neighbours)
     }
 
-    /// Squares of what the forces add at this κ by θ itself and by the bend, over the noise.
+    /// Returns the squared effects of the forces by θ alone and by the curvature κ, over the
+    /// variance of the response.
     pub(super) fn force_and_bend(&self, tangent: Tangent, curvature: f64) -> [f64; 2] {
         let noise = (self.response_noise / self.count.max(1.0)).max(f64::MIN_POSITIVE);
         let mut bend = Regressors::zeros();

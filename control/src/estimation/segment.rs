@@ -1,4 +1,4 @@
-//! What a robot learned on one stretch of one ground: additive statistics without any prior on θ.
+//! Additive statistics of one segment, without any prior on θ.
 
 use serde::{Deserialize, Serialize};
 
@@ -10,46 +10,47 @@ use super::{BLOCK_S, CommonError};
 /// Additive statistics of one segment. `Λ = 1/σ²` of segments add up, and so do `Λθ`.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct SegmentStatistics {
-    /// Information on θ, Λ = 1/σ²; 0 when there is none. It holds the offsets' standard deviation
-    /// and the tyres', but not the robot's common error: for who sums up segments and knows nothing
-    /// of common errors. Where the tyres are not known, later segments of one ground say next to
-    /// nothing.
+    /// Information on θ, Λ = 1/σ²; 0 without an estimate. σ includes the errors of offsets and
+    /// tyres, but not the robot's common error, so that segments can be summed without knowledge of
+    /// common errors. With unknown tyres, later segments on the same ground therefore have little
+    /// information.
     pub theta_information: f64,
     /// Λθ.
     pub theta_weighted: f64,
-    /// Information on θ without the common errors, which do not add up.
+    /// Information on θ without the common errors, which do not average out over segments.
     pub own_information: f64,
-    /// The common errors, over θ.
+    /// Standard deviations of the common errors, relative to θ.
     pub common_ratio: CommonError,
-    /// Blocks in the linear range.
+    /// Number of blocks in the linear range.
     pub samples: u64,
-    /// Their time, seconds.
+    /// Duration of these blocks, seconds.
     pub duration_s: f64,
-    /// Friction coefficient that the ground has given at least.
+    /// Lower bound of the peak friction coefficient.
     pub mu_peak_lower_bound: Option<f64>,
-    /// Information on the effective track over W; 0 when there is none.
+    /// Information on the ratio of effective to geometric track width; 0 without an estimate.
     pub effective_track_information: f64,
-    /// That information times the ratio.
+    /// `effective_track_information` times the ratio.
     pub effective_track_weighted: f64,
-    /// Information on the rolling resistance over load; 0 before enough straight driving with
-    /// torque. It holds the offset that the accelerometer may have.
+    /// Information on the rolling resistance coefficient; 0 before enough straight driving with
+    /// torque. It includes the uncertainty of the accelerometer's offset.
     pub rolling_resistance_information: f64,
-    /// That information times the ratio.
+    /// `rolling_resistance_information` times the coefficient.
     pub rolling_resistance_weighted: f64,
-    /// Share of the blocks of this segment beyond the linear range of slip.
+    /// Fraction of the blocks of this segment beyond the linear range of slip.
     pub saturation_ratio: f64,
 }
 
-/// Least share of its own information that a segment claims, so that nobody drops it.
+/// Minimum ratio of a segment's information to its own information, so that it is not dropped as
+/// empty.
 const CLAIM_MIN_RATIO: f64 = 1.0e-6;
 
-/// θ of one segment alone, and the information that it may claim.
+/// θ of one segment alone, with the information that it states.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct SegmentTheta {
     pub(super) theta: f64,
-    /// With the tyres' error inside.
+    /// Information that includes the error of the tyres.
     pub(super) information: f64,
-    /// Without the common errors.
+    /// Information without the common errors.
     pub(super) own_information: f64,
     /// The common errors, over θ.
     pub(super) common_ratio: CommonError,
@@ -57,22 +58,22 @@ pub(super) struct SegmentTheta {
     pub(super) duration_s: f64,
 }
 
-/// What the segments of one ground promise together.
+/// Information that the segments of one ground state together.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Claims {
-    /// Sum of the information claimed, W.
+    /// Sum W of the stated information.
     information: f64,
     /// True variance of θ fused from these segments, V ≤ 1/W.
     variance: f64,
 }
 
 impl Claims {
-    /// The information that the next segment may claim: the most with which the sum still keeps
-    /// its promise. `variance` σ² is of this segment's θ, `shared` c its covariance with those
-    /// before.
+    /// Returns the information w that the next segment states: the largest one for which the
+    /// variance of the fused θ is at most `1/(W + w)`. `variance` σ² is that of this segment's θ,
+    /// `shared` c its covariance with the segments before.
     ///
-    /// With weights W and w the fused variance is `(W²V + w²σ² + 2Wwc)/(W + w)²`; that it is at
-    /// most `1/(W + w)` is a quadratic in w.
+    /// With weights W and w the fused variance is `(W²V + w²σ² + 2Wwc)/(W + w)²`; the condition is
+    /// a quadratic inequality in w.
     pub(super) fn add(&mut self, variance: f64, shared: f64) -> f64 {
         let (sum, own) = (self.information, variance.recip());
         let room = 1.0 - 2.0 * sum * shared;
@@ -107,7 +108,7 @@ impl Claims {
 }
 
 impl SegmentStatistics {
-    /// θ of this segment alone; none when it carries no information.
+    /// Returns θ of this segment alone; `None` without information.
     pub fn theta(&self) -> Option<f64> {
         (self.theta_information > 0.0).then(|| self.theta_weighted / self.theta_information)
     }

@@ -1,35 +1,35 @@
-//! Additive sums over blocks: what a stretch of driving tells, whatever the order.
+//! Additive sums over blocks, independent of their order.
 
 use super::ValueWithDeviation;
 use super::block::Block;
 use super::offsets::OffsetKnowledge;
 use super::rows::{Channel, Row, index};
 
-/// Blocks of straight driving for a rolling resistance.
+/// Minimum number of blocks of straight driving for an estimate of rolling resistance.
 const RESISTANCE_BLOCKS_MIN: f64 = 10.0;
-/// Relative standard deviation above which no effective track is given.
+/// Relative standard deviation above which there is no estimate of the effective track width.
 const TRACK_STD_DEV_MAX: f64 = 0.1;
 
-/// Additive sums.
+/// Additive sums over blocks.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Sums {
-    /// Blocks in the linear range that carry a row.
+    /// Number of blocks in the linear range with a row.
     pub(super) blocks: u64,
     pub(super) duration_s: f64,
-    /// Difference of the sides, on the difference of measured torques.
+    /// Rows of the sides' difference, from measured torques.
     difference: Channel,
-    /// Mean of the sides, on the mean of measured torques.
+    /// Rows of the sides' mean, from measured torques.
     mean: Channel,
-    /// Moment balance, on measured accelerations.
+    /// Rows of the moment balance, from measured accelerations.
     turning: Channel,
-    /// Innovations of the forward speed, in units of their own standard deviation.
+    /// Innovations of the forward speed, scaled to unit variance.
     longitudinal: Channel,
     signal: f64,
     signal_2: f64,
     fast_blocks: f64,
     saturated_blocks: f64,
     mu_seen: f64,
-    /// Squares of the blocks' slip.
+    /// Sum of the squares of the blocks' slip.
     slip_square: f64,
     track_square: f64,
     track_product: f64,
@@ -81,12 +81,12 @@ impl Sums {
         }
     }
 
-    /// Notes that a block that was added follows another one without a gap.
+    /// Adds the covariance of a block's row with that of the block directly before.
     pub(super) fn note_neighbour(&mut self, row: &Row, before: &Row) {
         self.turning.note_neighbour(row, before);
     }
 
-    /// Adds an innovation of the forward speed, weighed at this θ.
+    /// Adds an innovation of the forward speed, with its weight at `theta`.
     pub(super) fn add_longitudinal(&mut self, row: &Row, theta: f64) {
         self.longitudinal.add_standardised(row, theta);
         self.note_signal(row, row.innovation_variance);
@@ -98,7 +98,7 @@ impl Sums {
         self.signal_2 += signal * signal;
     }
 
-    /// Sums of both.
+    /// Returns the sums over the blocks of both.
     pub(super) fn plus(&self, other: &Self) -> Self {
         Self {
             blocks: self.blocks + other.blocks,
@@ -127,7 +127,7 @@ impl Sums {
         }
     }
 
-    /// All kinds of rows.
+    /// Returns the sums of all kinds of rows.
     pub(super) fn channels(&self) -> [&Channel; 4] {
         [
             &self.difference,
@@ -137,18 +137,18 @@ impl Sums {
         ]
     }
 
-    /// Root of the mean square of the blocks' slip.
+    /// Returns the root mean square of the blocks' slip.
     #[expect(clippy::cast_precision_loss, reason = "blocks of a fifth of a second")]
     pub(super) fn slip_rms(&self) -> f64 {
         (self.slip_square / self.blocks.max(1) as f64).sqrt()
     }
 
-    /// Whether measured torques had a part in it.
+    /// Returns whether any row is from measured torques.
     pub(super) fn has_torque(&self) -> bool {
         self.difference.count > 0.0
     }
 
-    /// Rows weighed by their share of the information on θ.
+    /// Returns the effective number of rows, weighted by their information on θ.
     pub(super) fn effective_samples(&self) -> f64 {
         if self.signal_2 > 0.0 {
             self.signal * self.signal / self.signal_2
@@ -157,12 +157,12 @@ impl Sums {
         }
     }
 
-    /// Friction coefficient that the ground has given at least.
+    /// Returns the lower bound of the peak friction coefficient; `None` before any force.
     pub(super) fn mu_peak(&self) -> Option<f64> {
         (self.mu_seen > 0.0).then_some(self.mu_seen)
     }
 
-    /// Share of blocks beyond the linear range.
+    /// Returns the fraction of blocks beyond the linear range.
     pub(super) fn saturation_share(&self) -> f64 {
         if self.fast_blocks > 0.0 {
             self.saturated_blocks / self.fast_blocks
@@ -171,8 +171,9 @@ impl Sums {
         }
     }
 
-    /// Rolling resistance over load. Its standard deviation holds the offset that the accelerometer
-    /// may have, `offset_mu` over gravity, which no number of blocks takes out.
+    /// Returns the rolling resistance coefficient; `None` before enough straight driving. Its
+    /// standard deviation includes that of the accelerometer's offset over gravity, `offset_mu`,
+    /// which does not average out.
     pub(super) fn rolling_resistance(&self, offset_mu: f64) -> Option<ValueWithDeviation> {
         (self.resistance_count >= RESISTANCE_BLOCKS_MIN).then(|| ValueWithDeviation {
             value: self.resistance / self.resistance_count,
@@ -180,7 +181,7 @@ impl Sums {
         })
     }
 
-    /// Effective track over W.
+    /// Returns the ratio of effective to geometric track width; `None` before enough turning.
     pub(super) fn effective_track(&self, offsets: &OffsetKnowledge) -> Option<ValueWithDeviation> {
         if self.track_count < 1.0 || self.track_square <= 0.0 {
             return None;

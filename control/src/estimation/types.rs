@@ -1,32 +1,32 @@
-//! What goes into the estimator, and what comes out of it.
+//! Input and output types of the estimator.
 
 use serde::{Deserialize, Serialize};
 
 use crate::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
 
-/// Noise of the sensors; white, one standard deviation per sample, unless said otherwise.
+/// Errors of the sensors: standard deviations of white noise per sample, unless stated otherwise.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct SensorNoise {
-    /// Gyro, radians per second.
+    /// Noise of the gyro, radians per second.
     pub gyro_rad_s: f64,
-    /// Accelerometer, metres per second squared.
+    /// Noise of the accelerometer, metres per second squared.
     pub accelerometer_m_s2: f64,
-    /// Offset of the accelerometer, unknown, metres per second squared.
+    /// Standard deviation of the accelerometer's constant offset, metres per second squared.
     pub accelerometer_offset_m_s2: f64,
-    /// Error of the accelerometer's scale, unknown, share. Sampling a rough drive has the same
-    /// effect: what lies between two samples is not seen.
+    /// Standard deviation of the accelerometer's relative scale error. Sampling of a rough motion
+    /// has the same effect, because motion between samples is not measured.
     pub accelerometer_scale_ratio: f64,
-    /// Wheel speed, radians per second.
+    /// Noise of a wheel speed, radians per second.
     pub wheel_speed_rad_s: f64,
-    /// Body speed, metres per second.
+    /// Noise of the body speed, metres per second.
     pub body_speed_m_s: f64,
-    /// Wheel torque, as friction coefficient of one side.
+    /// Noise of the wheel torque, as friction coefficient of one side.
     pub torque_mu: f64,
-    /// Error of each side's torque constant, unknown, share.
+    /// Standard deviation of the relative error of each side's torque constant.
     pub torque_gain_ratio: f64,
-    /// Error of each side's rolling radius, unknown, share.
+    /// Standard deviation of the relative error of each side's rolling radius.
     pub radius_ratio: f64,
-    /// Offset of the gyro, unknown, radians per second.
+    /// Standard deviation of the gyro's constant offset, radians per second.
     pub gyro_offset_rad_s: f64,
 }
 
@@ -47,58 +47,60 @@ impl Default for SensorNoise {
     }
 }
 
-/// What is known about the tyres beforehand.
+/// Prior of the tyres.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct TyrePrior {
-    /// How far the tyres' stiffness across may differ from that along, one standard deviation as
-    /// a share. It is learned from turning; it only matters until then.
+    /// Standard deviation of the relative difference of lateral and longitudinal tyre stiffness. It
+    /// is estimated in turns and matters only until then.
     #[serde(alias = "side_grip_spread")]
     pub lateral_stiffness_std_dev: f64,
-    /// Mean θκ of `λ = θμ(1 + κλ + ⅔κ²λ²)`, per friction coefficient: 0 for the paper's straight
-    /// rise, `1/(3μ_p)` for a brush-like tyre of peak `μ_p`.
+    /// Mean of θκ in `λ = θμ(1 + κλ + ⅔κ²λ²)`, per friction coefficient: 0 for the paper's linear
+    /// curve, `1/(3μ_p)` for a brush model with the peak `μ_p`.
     pub curvature: f64,
-    /// Its standard deviation, per friction coefficient. It cannot be learned from turns of one
-    /// radius: where it is above zero, intervals are as wide as it makes them.
+    /// Standard deviation of θκ, per friction coefficient. Turns of one radius do not excite θκ, so
+    /// its uncertainty widens the intervals of θ.
     pub curvature_std_dev: f64,
-    /// Largest friction coefficient at which the rise is as above, somewhat less than the least
-    /// peak that the tyres may have; none if only slip limits it.
+    /// Largest friction coefficient at which this curve is valid, below the smallest possible peak;
+    /// `None` if only slip limits it.
     pub mu_max: Option<f64>,
-    /// Mean of the contacts' relaxation length, metres: the distance over which force follows slip.
+    /// Mean of the contacts' relaxation length, metres: the rolling distance in which force follows
+    /// slip.
     #[serde(default)]
     pub relaxation_m: f64,
-    /// Its standard deviation, metres.
+    /// Standard deviation of the relaxation length, metres.
     #[serde(default)]
     pub relaxation_std_dev_m: f64,
-    /// Mean inertia of what turns with the tyres, at their rim, over the robot's mass.
+    /// Mean ratio of the inertia of wheels and rotors, at the rim, to the robot's mass.
     #[serde(default)]
     pub rotor_ratio: f64,
-    /// Its standard deviation.
+    /// Standard deviation of `rotor_ratio`.
     #[serde(default)]
     pub rotor_std_dev_ratio: f64,
     /// Standard deviation of the difference of the sides' loads over their sum; its mean is 0.
     #[serde(default)]
     pub load_difference_std_dev: f64,
-    /// Error of θ, as a share, where nearly all of the residuals is what rows do not know. Where it
-    /// is 0 the model counts as exact, and residuals beyond the noise as more noise.
+    /// Relative error of θ if nearly all of the residuals are model errors. With 0 the model counts
+    /// as exact, and residuals beyond the noise count as additional noise.
     #[serde(default)]
     pub unexplained_ratio: f64,
 }
 
-/// How far a robot may differ from its model, one standard deviation each as a share. These are
-/// errors of all that a robot measures, and no drive on one ground tells them apart from θ.
+/// Uncertainty of the robot's model: relative standard deviations. These errors are common to all
+/// measurements of a robot and cannot be separated from θ on one ground.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ModelUncertainty {
-    /// Mass, which measured torques are taken over.
+    /// Standard deviation of the mass, relative to the model's; it scales θ from measured torques.
     pub mass_ratio: f64,
-    /// By how much more than its model it weighs on average. Robots are loaded, not lightened.
+    /// Mean payload, relative to the model's mass.
     #[serde(default)]
     pub payload_ratio: f64,
-    /// Yaw inertia over mass, which turns are taken over where torque is not measured.
+    /// Standard deviation of the ratio of yaw inertia to mass, relative to the model's; it scales θ
+    /// from turns without measured torque.
     pub inertia_ratio: f64,
 }
 
 impl Default for ModelUncertainty {
-    /// Of a robot of which only the data sheet is known, with some payload.
+    /// Returns the uncertainty of a robot with some payload, known only by its data sheet.
     fn default() -> Self {
         Self {
             mass_ratio: 0.12,
@@ -109,7 +111,7 @@ impl Default for ModelUncertainty {
 }
 
 impl ModelUncertainty {
-    /// Of a robot that was weighed.
+    /// Returns no uncertainty: a robot with measured mass and inertia.
     pub fn exact() -> Self {
         Self {
             mass_ratio: 0.0,
@@ -119,13 +121,13 @@ impl ModelUncertainty {
     }
 }
 
-/// What is known beforehand of a robot and its tyres. The default fits one of which only the data
-/// sheet is known, on tyres of which nothing is.
+/// Prior of a robot and its tyres. The default is for a robot known only by its data sheet, with
+/// unknown tyres.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct EstimatorPrior {
-    /// Its tyres.
+    /// Prior of the tyres.
     pub tyres: TyrePrior,
-    /// How far it may differ from its model.
+    /// Uncertainty of the robot's model.
     pub model: ModelUncertainty,
 }
 
@@ -139,7 +141,7 @@ impl Default for EstimatorPrior {
 }
 
 impl EstimatorPrior {
-    /// A robot that is as its model says, on tyres that rise straight: the paper's.
+    /// Returns the prior of a robot that equals its model, with linear tyres, as in the paper.
     pub fn exact() -> Self {
         Self {
             tyres: TyrePrior::default(),
@@ -151,17 +153,17 @@ impl EstimatorPrior {
 /// A tyre's curvature κ at one θ, per slip.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Curvature {
-    /// Mean.
+    /// Mean of κ.
     pub(super) mean: f64,
-    /// Standard deviation.
+    /// Standard deviation of κ.
     pub(super) std_dev: f64,
 }
 
 impl TyrePrior {
-    /// Tyres of which nothing is known: straight, or as curved as a `LuGre` tyre of a peak of 0.5,
-    /// with the relaxation lengths of small tyres, the rotors of geared motors, and a load off the
-    /// middle. The largest friction coefficient is below the peak of wet grass or loose gravel
-    /// (0.3), since slip beyond a peak looks like a small stiffness.
+    /// Returns the prior of unknown tyres: from linear to as curved as a `LuGre` tyre with a peak
+    /// of 0.5, with the relaxation lengths of small tyres, the rotors of geared motors and an
+    /// eccentric load. The largest friction coefficient is below the peak on wet grass or loose
+    /// gravel (0.3), because slip beyond a peak looks like a small stiffness.
     pub fn unknown() -> Self {
         Self {
             curvature: 1.0,
@@ -177,12 +179,12 @@ impl TyrePrior {
         }
     }
 
-    /// Largest slip at which the rise is as above, at a θ above zero.
+    /// Returns the largest slip at which the curve is valid, for a `theta` above zero.
     pub(super) fn slip_max(&self, theta: f64) -> f64 {
         self.mu_max.map_or(f64::INFINITY, |mu_max| mu_max * theta)
     }
 
-    /// κ at a θ above zero.
+    /// Returns κ for a `theta` above zero.
     pub(super) fn at(&self, theta: f64) -> Curvature {
         Curvature {
             mean: self.curvature / theta,
@@ -192,7 +194,7 @@ impl TyrePrior {
 }
 
 impl Default for TyrePrior {
-    /// Tyres that rise straight to their peak, as the paper's (7).
+    /// Returns tyres with a linear curve up to the peak, as in the paper's (7).
     fn default() -> Self {
         Self {
             lateral_stiffness_std_dev: 0.3,
@@ -211,54 +213,55 @@ impl Default for TyrePrior {
 
 /// One sample of the robot's own sensors.
 ///
-/// Wheel speeds, turn rate and acceleration are means since the sample before, as encoders that
-/// count and inertial sensors with a filter against aliasing give them. Values of the moment do as
-/// well where nothing changes faster than the samples come.
+/// Wheel speeds, turn rate and acceleration are means since the previous sample, as from
+/// incremental encoders and from inertial sensors with an anti-aliasing filter. Instantaneous
+/// values suffice if nothing changes faster than the sampling rate.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct SensorSample {
     /// Measured wheel speeds.
     pub wheel_speeds: WheelSpeeds,
     /// Turn rate, radians per second.
     pub gyro_rad_s: f64,
-    /// Acceleration without gravity, body frame.
+    /// Acceleration without gravity, body frame, if measured.
     pub acceleration: Option<BodyAcceleration>,
-    /// Speed ahead, metres per second; only in the sample in which it is new.
+    /// Forward speed, metres per second; only in samples with a new measurement.
     pub body_speed_m_s: Option<f64>,
-    /// Drive torques per side, where the base gives them.
+    /// Drive torques per side, if the base measures them.
     pub wheel_torques: Option<WheelTorques>,
 }
 
-/// Standard deviations of the errors of θ that no drive of a robot on one ground averages out.
+/// Standard deviations of the errors of θ that do not average out over drives of one robot on one
+/// ground.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct CommonError {
-    /// Of what is the robot's: mass, yaw inertia, torque constants, and of a segment what is left
-    /// unknown of radii and sensor offsets. One error of all that it measures.
+    /// Error common to all measurements of one robot: mass, yaw inertia, torque constants, and in a
+    /// segment the remaining uncertainty of radii and sensor offsets.
     pub robot: f64,
-    /// Of the tyres' curvature. One error of all robots on these tyres, where they slip alike.
+    /// Error by the tyres' curvature, common to all robots with the same tyres at similar slip.
     pub tyres: f64,
 }
 
 impl CommonError {
-    /// Both together.
+    /// Returns the standard deviation of both errors together.
     pub fn std_dev(&self) -> f64 {
         self.robot.hypot(self.tyres)
     }
 }
 
-/// What is known about the ground under the robot now.
+/// Measurement of θ of the ground under the robot.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ThetaMeasurement {
     /// θ = 1/K.
     pub theta: f64,
-    /// Its standard deviation, with that of the offsets and of all common errors.
+    /// Standard deviation of θ, including offsets and all common errors.
     pub std_dev: f64,
-    /// Standard deviation without the common errors: that of a robot compared with itself.
+    /// Standard deviation of θ without the common errors, for comparing measurements of one robot.
     pub own_std_dev: f64,
-    /// The common errors.
+    /// Common errors of θ.
     pub common: CommonError,
-    /// Blocks that carry the measurement, weighed by their share of its information.
+    /// Effective number of blocks, weighted by their information.
     pub effective_samples: f64,
-    /// Time that was used, seconds.
+    /// Duration of the blocks used, seconds.
     pub duration_s: f64,
 }
 
@@ -302,26 +305,26 @@ pub struct PayloadChange {
     pub after: ValueWithDeviation,
 }
 
-/// What the estimator can say.
+/// Estimates of the present ground and of the robot.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Estimate {
-    /// θ of the present ground; none while it is unexcited.
+    /// θ of the present ground; `None` without excitation.
     pub theta: Option<ThetaMeasurement>,
     /// Whether the last block brought no new information on θ.
     pub no_new_information: bool,
-    /// Friction coefficient that the ground has given at least; none before any force.
+    /// Lower bound of the peak friction coefficient; `None` before any force.
     pub mu_peak_lower_bound: Option<f64>,
-    /// Measured effective track over W; none before enough turning.
+    /// Ratio of effective to geometric track width; `None` before enough turning.
     pub effective_track_ratio: Option<f64>,
-    /// Rolling resistance over load; none before enough straight driving with torque.
+    /// Rolling resistance coefficient; `None` before enough straight driving with torque.
     pub rolling_resistance_ratio: Option<f64>,
-    /// Mean share by which the nominal rolling radii are too large, and its standard deviation.
+    /// Mean relative error of the nominal rolling radii, positive if they are too large.
     pub radius_offset: ValueWithDeviation,
-    /// Right minus left of the same, and its standard deviation.
+    /// Right minus left relative error of the nominal rolling radii.
     pub radius_difference: ValueWithDeviation,
-    /// Share of blocks beyond the linear range of slip, of those driven fast enough.
+    /// Fraction of blocks beyond the linear range of slip, among those with sufficient speed.
     pub saturation_share: f64,
-    /// Samples dropped because they were not finite or not possible.
+    /// Number of samples dropped because they were not finite or not plausible.
     pub dropped_samples: u64,
     /// The robot's own parameters; none of a robot that counts as exactly as its model says, and
     /// before anything is known.
@@ -330,22 +333,23 @@ pub struct Estimate {
     pub payload_change: Option<PayloadChange>,
 }
 
-/// A figure and its standard deviation.
+/// An estimated value with its standard deviation.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct ValueWithDeviation {
-    /// The figure.
+    /// Estimated value.
     pub value: f64,
-    /// Its standard deviation.
+    /// Standard deviation of its error.
     pub std_dev: f64,
 }
 
-/// What a sample led to.
+/// Result of adding a sample.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct UpdateOutcome {
-    /// A block of samples was finished and used.
+    /// Whether a block of samples was completed and used.
     pub block_done: bool,
-    /// In that block a wheel slipped beyond the range in which force grows with slip.
+    /// Whether a wheel slipped beyond the linear range in that block.
     pub slips: bool,
-    /// The ground has changed: close the segment and call [`super::Estimator::begin_ground`].
+    /// Whether the ground has changed; then close the segment and call
+    /// [`super::Estimator::begin_ground`].
     pub ground_changed: bool,
 }

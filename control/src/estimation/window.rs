@@ -1,49 +1,51 @@
-//! The moment balance of a skid-steered base, averaged so that no rate is ever differentiated.
+//! Averages the moment balance of a skid-steered robot over windows, without differentiating any
+//! rate.
 //!
-//! Combined slip in the linear range gives, with rim speeds u, `s = (1/u_L + 1/u_R)/2`,
-//! `d = 1/u_L − 1/u_R`, whatever the body's speed is (it is eliminated with the force balance):
+//! Combined slip in the linear range gives, with rim speeds u, `s = (1/u_L + 1/u_R)/2` and
+//! `d = 1/u_L − 1/u_R`, independent of the body speed (which the force balance eliminates):
 //!
 //! ```text
 //! d/s² − φ̇ (W + L²/W − W (d/2s)²) = θ ( 4I_G φ̈/(m g W s) + (a/g) d/s² )
 //! ```
-//! Windows are trapezoids that add up to one: each begins on the ramp on which the one before
-//! ends. Then `∫ψφ̈` is the difference of the gyro's means over two ramps, and no sample is lost.
-//! How slip swings within a window is kept for curved tyres.
+//! Windows ψ are trapezoids whose sum is one: each rises on the ramp on which the previous one
+//! falls. `∫ψφ̈` is then the difference of the gyro's means over two ramps, and every sample is
+//! used. The variation of slip within a window is recorded for curved tyres.
 
 use super::{BLOCK_S, SensorSample, signed_rims};
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
-/// Most by which the moments of a swing are enlarged for what they average out.
+/// Maximum factor by which the variation of slip is scaled up to compensate for averaging.
 const SWING_SCALE_MAX: f64 = 1.5;
-/// Time of a ramp, seconds.
+/// Duration of a ramp, seconds.
 const RAMP_S: f64 = 0.05;
 
-/// Moments of a window at which a swing is looked at.
+/// Number of intervals of a window in which the variation of slip is recorded.
 pub(super) const MOMENTS: usize = 10;
 
-/// What a swing is at one moment, about the means of its window.
+/// Deviation from the means of the window in one interval.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Moment {
     /// Right minus left longitudinal slip.
     pub(super) apart: f64,
     pub(super) turn_rad_s: f64,
-    /// Acceleration ahead over gravity.
+    /// Forward acceleration over gravity.
     pub(super) longitudinal_mu: f64,
-    /// Share of the window; all add up to one.
+    /// Weight of the interval; the sum over a window is one.
     pub(super) weight: f64,
 }
 
-/// How a robot swings about its mean motion within a window.
+/// Variation of the motion about its mean within a window.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Swing {
-    /// Means over short times.
+    /// Means over short intervals.
     moments: [Moment; MOMENTS],
-    /// Variance of the samples' `apart`, with the sensors' noise.
+    /// Variance of the samples' `apart`, including sensor noise.
     apart_variance: f64,
 }
 
 impl Swing {
-    /// With the variance of the samples less that of their noise: the shape is that of the moments.
+    /// Returns the intervals with `apart` scaled to the variance of the samples minus that of their
+    /// noise, `apart_noise`.
     pub(super) fn without_noise(&self, apart_noise: f64) -> [Moment; MOMENTS] {
         let seen = self
             .moments
@@ -61,7 +63,26 @@ impl Swing {
     }
 }
 
-/// Weighed sums over one window.
+/// Time of a sample.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct SampleSpan {
+    /// Middle of the sample, seconds.
+    pub(super) middle_s: f64,
+    /// Duration of the sample, seconds.
+    pub(super) dt_s: f64,
+}
+
+impl SampleSpan {
+    /// Returns the span shifted by a time in seconds.
+    fn later(self, by_s: f64) -> Self {
+        Self {
+            middle_s: self.middle_s + by_s,
+            ..self
+        }
+    }
+}
+
+/// Weighted sums over one window.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct Part {
     weight_s: f64,
@@ -74,15 +95,16 @@ struct Part {
     turn: f64,
     rim_difference: f64,
     rim_mean: f64,
-    /// Right minus left longitudinal slip, and its square.
+    /// Sums of right minus left longitudinal slip and of its square.
     apart: [f64; 2],
-    /// Sums by the time since the window's start.
+    /// Sums over intervals of the time since the window's start.
     moments: [Moment; MOMENTS],
-    /// Gyro over the ramp, radians per second, and how much of the ramp there was.
+    /// Weighted gyro over the ramps `[first, last]`, radians per second, with the covered fractions
+    /// of the ramps in `ramp_share`.
     ramp: [f64; 2],
     ramp_share: [f64; 2],
     ramp_samples: f64,
-    /// Gyro in the window's middle, radians per second, and of how many samples.
+    /// Sum of the gyro in the window's middle, radians per second, and number of its samples.
     middle: [f64; 2],
 }
 
@@ -95,14 +117,15 @@ pub(super) struct TurnMeans {
     pub(super) harmonic_m_s: f64,
     /// `(a/g) d/s²`, metres per second.
     pub(super) longitudinal_force_m_s: f64,
-    /// `a/g`; in reverse that of the mirrored robot.
+    /// `a/g`; in reverse with the opposite sign.
     pub(super) longitudinal_mu: f64,
     pub(super) turn_rad_s: f64,
     pub(super) turn_acceleration_rad_s2: f64,
-    /// By how much that rises in the window's time, and the samples of its middle.
+    /// Rate of `turn_acceleration_rad_s2` over the window; `middle_samples` is the number of
+    /// samples in its middle.
     pub(super) turn_jerk_rad_s3: f64,
     pub(super) middle_samples: f64,
-    /// `u_R − u_L`, metres per second; driving in reverse it is that of the mirrored robot.
+    /// `u_R − u_L`, metres per second; in reverse that of the mirrored robot.
     pub(super) rim_difference_m_s: f64,
     /// `(u_R + u_L)/2`, metres per second, negative in reverse.
     pub(super) rim_mean_m_s: f64,
@@ -112,7 +135,7 @@ pub(super) struct TurnMeans {
     pub(super) ramp_samples: f64,
 }
 
-/// The window that ends with the block, and the one that begins in it.
+/// The window that ends with the current block, and the one that begins in it.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct TurnWindow {
     ending: Part,
@@ -120,7 +143,7 @@ pub(super) struct TurnWindow {
 }
 
 impl TurnWindow {
-    /// The window of the next block.
+    /// Returns the windows of the next block.
     pub(super) fn next(&self) -> Self {
         Self {
             ending: self.beginning,
@@ -128,22 +151,17 @@ impl TurnWindow {
         }
     }
 
-    /// Takes a sample whose middle is `time_s` after the block's start.
-    pub(super) fn add(
-        &mut self,
-        sample: &SensorSample,
-        model: &RobotModel,
-        time_s: f64,
-        dt_s: f64,
-    ) {
-        let rise = ((time_s - (BLOCK_S - RAMP_S)) / RAMP_S).clamp(0.0, 1.0);
+    /// Adds a sample; `span` is relative to the block's start.
+    pub(super) fn add(&mut self, sample: &SensorSample, model: &RobotModel, span: SampleSpan) {
+        let SampleSpan { middle_s, dt_s } = span;
+        let rise = ((middle_s - (BLOCK_S - RAMP_S)) / RAMP_S).clamp(0.0, 1.0);
         self.ending
-            .add(sample, model, 1.0 - rise, time_s + RAMP_S, dt_s);
+            .add(sample, model, 1.0 - rise, span.later(RAMP_S));
         if rise <= 0.0 {
             return;
         }
         self.beginning
-            .add(sample, model, rise, time_s - (BLOCK_S - RAMP_S), dt_s);
+            .add(sample, model, rise, span.later(-(BLOCK_S - RAMP_S)));
         let share = dt_s / RAMP_S;
         self.ending.ramp[1] += sample.gyro_rad_s * share;
         self.ending.ramp_share[1] += share;
@@ -152,10 +170,10 @@ impl TurnWindow {
         self.beginning.ramp_samples += 1.0;
     }
 
-    /// Means over the window that ends; none where it is not whole.
+    /// Returns the means over the window that ends; `None` if it is incomplete.
     pub(super) fn means(&self, block_s: f64) -> Option<TurnMeans> {
         let part = &self.ending;
-        // The first window of a drive has no ramp to begin on.
+        // The first window of a drive has no rising ramp.
         let is_whole = !part.is_broken
             && part.ramp_share.iter().all(|share| *share > 0.5)
             && part.weight_s > 0.5 * block_s;
@@ -211,15 +229,9 @@ impl Part {
         }
     }
 
-    /// Takes a sample whose middle is `time_s` after the window's start.
-    fn add(
-        &mut self,
-        sample: &SensorSample,
-        model: &RobotModel,
-        share: f64,
-        time_s: f64,
-        dt_s: f64,
-    ) {
+    /// Adds a sample with the weight `share`; `span` is relative to the window's start.
+    fn add(&mut self, sample: &SensorSample, model: &RobotModel, share: f64, span: SampleSpan) {
+        let SampleSpan { middle_s, dt_s } = span;
         let (Some(rims), Some(acceleration)) = (signed_rims(sample, model), sample.acceleration)
         else {
             self.is_broken = true;
@@ -233,7 +245,7 @@ impl Part {
         let arm_m = model.effective_track_m() - track_m * tight * tight;
         let forward_m_s2 = rims.sign * acceleration.forward_m_s2;
         let weight_s = share * dt_s;
-        if (time_s - 0.5 * (BLOCK_S + RAMP_S)).abs() <= 0.5 * RAMP_S {
+        if (middle_s - 0.5 * (BLOCK_S + RAMP_S)).abs() <= 0.5 * RAMP_S {
             self.middle[0] += sample.gyro_rad_s;
             self.middle[1] += 1.0;
         }
@@ -254,7 +266,7 @@ impl Part {
             clippy::cast_precision_loss,
             reason = "a share of a few moments, not below zero"
         )]
-        let moment = (time_s.max(0.0) * MOMENTS as f64 / (BLOCK_S + RAMP_S)) as usize;
+        let moment = (middle_s.max(0.0) * MOMENTS as f64 / (BLOCK_S + RAMP_S)) as usize;
         let moment = &mut self.moments[moment.min(MOMENTS - 1)];
         moment.apart += weight_s * apart;
         moment.turn_rad_s += weight_s * sample.gyro_rad_s;

@@ -134,7 +134,7 @@ impl Path {
                             parameter,
                             parameter_end,
                         });
-                        arc_m += polynomial.length_m(parameter, parameter_end);
+                        arc_m += polynomial.length_m(parameter..parameter_end);
                     }
                 }
             }
@@ -205,7 +205,7 @@ impl Path {
                 let whole_m = (next_m - node.arc_m).max(f64::MIN_POSITIVE);
                 let mut parameter = node.parameter + width * (beyond_m / whole_m).min(1.0);
                 for _ in 0..NEWTON_STEPS {
-                    let excess_m = polynomial.length_m(node.parameter, parameter) - beyond_m;
+                    let excess_m = polynomial.length_m(node.parameter..parameter) - beyond_m;
                     parameter -= excess_m / polynomial.advance(parameter).max(ADVANCE_MIN);
                     parameter = parameter.clamp(node.parameter, node.parameter_end);
                     if excess_m.abs() < 1.0e-12 {

@@ -1,5 +1,7 @@
 //! Planar polynomial curve of degree nine or less.
 
+use std::ops::Range;
+
 use nalgebra::{SMatrix, SVector};
 
 use super::PathSample;
@@ -150,9 +152,10 @@ impl Polynomial {
         })
     }
 
-    /// Returns the arc length between two parameters by five-point Gauss-Legendre quadrature,
+    /// Returns the arc length over a range of parameters by five-point Gauss-Legendre quadrature,
     /// metres.
-    pub(crate) fn length_m(&self, start: f64, end: f64) -> f64 {
+    pub(crate) fn length_m(&self, parameters: Range<f64>) -> f64 {
+        let Range { start, end } = parameters;
         let (middle, half) = (0.5 * (start + end), 0.5 * (end - start));
         GAUSS
             .iter()

@@ -1,13 +1,14 @@
-//! How well θ could be known: the Bayesian Cramér–Rao bound of one drive.
+//! Computes the Bayesian Cramér–Rao bound of ln θ for one drive: the smallest standard deviation
+//! that any estimator can have.
 //!
-//! An observer that knows the equations of [`super::plant`], the noise of the sensors, and the
-//! distributions from which robots are drawn, estimates all parameters of the robot and its ground
-//! at once. The bound is the inverse of `Σ (∂y/∂p)ᵀ R⁻¹ (∂y/∂p) + C⁻¹`: y are the measurements, R
-//! their noise, p the parameters and C the covariance of their distribution (Van Trees, Detection,
-//! Estimation, and Modulation Theory, 1968, part I, 2.4.3). Derivatives are finite differences of
-//! drives whose wheels turn as they did: the servo and its motors are unknown to the observer, and
-//! the encoders' error is neglected. Offsets that walk or wander are piecewise constant. A curve's
-//! shape counts as a mixture of all of them.
+//! The bound assumes an observer that uses the equations of [`super::plant`], the noise of the
+//! sensors, and the distributions from which robots are drawn, and estimates all parameters of
+//! robot and ground together. It is the inverse of `Σ (∂y/∂p)ᵀ R⁻¹ (∂y/∂p) + C⁻¹`, with the
+//! measurements y, the covariance R of their noise, the parameters p and the covariance C of their
+//! distribution (Van Trees, Detection, Estimation, and Modulation Theory, 1968, part I, 2.4.3).
+//! Derivatives are finite differences between drives with the same wheel speeds: the observer does
+//! not know the servo and its motors, and the encoders' error is neglected. Offsets that drift are
+//! piecewise constant. The shape of the friction curve is a mixture of all shapes.
 
 use nalgebra::{DMatrix, DVector};
 use tread_control::geometry::Pose;
@@ -19,26 +20,26 @@ use super::plant::{Plant, STEP_S};
 use super::sensors::{POSITION_WANDERS_S, SAMPLE_PERIOD, SensorSpec};
 use super::spec::Deviations;
 
-/// Step of a finite difference over a parameter's standard deviation.
+/// Step of a finite difference, relative to the standard deviation of the parameter.
 const STEP_RATIO: f64 = 0.02;
-/// Time over which the gyro's offset counts as constant, seconds.
+/// Length of the intervals in which the gyro's offset is constant, in seconds.
 const GYRO_KNOT_S: f64 = 5.0;
-/// Time over which the slow error of positions counts as constant, seconds.
+/// Length of the intervals in which the slow error of positions is constant, in seconds.
 const POSITION_KNOT_S: f64 = 10.0;
-/// Standard deviation of where a robot starts, metres and radians.
+/// Standard deviation of a robot's start pose, in metres and radians.
 const START_STD_DEV: f64 = 1.0;
 
-/// Measurements of one sample: turn rate, acceleration (2), torque (2), speed, pose (3).
+/// Number of measurements of one sample: turn rate, acceleration (2), torque (2), speed, pose (3).
 const CHANNELS: usize = 9;
 type Sample = [f64; CHANNELS];
 
-/// A parameter of the plant: standard deviation, and what a change of it changes.
+/// A parameter of the plant: its standard deviation, and the function that changes it by an amount.
 type Parameter = (f64, fn(&mut Deviations, f64));
 
-/// Standard deviations of [`Deviations::drawn`]; of a uniform distribution that is its range over
-/// √12.
+/// Parameters with the standard deviations of [`Deviations::drawn`]; that of a uniform distribution
+/// is its range over √12.
 const PARAMETERS: [Parameter; 18] = [
-    // ln K, of three grounds; it must be the first.
+    // ln K over three grounds; it must be the first parameter.
     (1.16, |robot, by| robot.curve.stiffness *= by.exp()),
     (0.0866, |robot, by| robot.payload_ratio += by),
     (0.13, |robot, by| robot.inertia_ratio += by),
@@ -62,10 +63,10 @@ const PARAMETERS: [Parameter; 18] = [
     (0.005, |robot, by| robot.radius_ratio[1] += by),
     (0.173, |robot, by| robot.curve.mu_peak += by),
 ];
-/// Shapes beside a robot's own.
+/// Number of shapes other than the robot's own.
 const OTHERS: usize = Shape::ALL.len() - 1;
 
-/// Where each kind of nuisance begins among the parameters.
+/// Indices at which the groups of nuisance parameters begin, and the number of all parameters.
 struct Layout {
     gyro: usize,
     acceleration: usize,
@@ -97,22 +98,23 @@ impl Layout {
     }
 }
 
-/// What is bounded: a robot, its sensors, and how it drove.
+/// Input of [`bounds`]: a robot, its sensors and its drive.
 #[derive(Debug, Clone, Copy)]
 pub struct BoundInput<'drive> {
-    /// The agent's model of it.
+    /// Agent's model of the robot.
     pub model: &'drive RobotModel,
-    /// What it truly is.
+    /// True parameters of robot and ground.
     pub deviations: Deviations,
-    /// What it is measured with.
+    /// Specification of the sensors.
     pub sensors: SensorSpec,
-    /// The commanded wheel speeds of each sample, from rest at the origin.
+    /// Commanded wheel speeds of each sample; the robot starts at rest at the origin.
     pub commands: &'drive [WheelSpeeds],
-    /// After how many samples the bound is asked for, in rising order.
+    /// Numbers of samples after which the bound is computed, ascending.
     pub at_samples: &'drive [usize],
 }
 
-/// Lower bounds of the standard deviation of ln θ at each of the times; none if the plant cannot be.
+/// Returns the lower bound of the standard deviation of ln θ at each time of `at_samples`; `None`
+/// if the plant cannot be constructed or the information matrix is singular.
 pub fn bounds(input: &BoundInput<'_>) -> Option<Vec<f64>> {
     let wheels = wheels(input)?;
     let truth = measure(input, &wheels, input.deviations, None)?;
@@ -132,7 +134,7 @@ pub fn bounds(input: &BoundInput<'_>) -> Option<Vec<f64>> {
     information(input, &truth, &columns)
 }
 
-/// The wheels' speeds after each step of the plant.
+/// Returns the wheel speeds `[left, right]` after each integration step, by sample, in rad/s.
 fn wheels(input: &BoundInput<'_>) -> Option<Vec<Vec<[f64; 2]>>> {
     let mut plant = Plant::new(input.model, input.deviations, Pose::default())?;
     let steps = steps_per_sample();
@@ -155,7 +157,8 @@ fn steps_per_sample() -> usize {
     (SAMPLE_PERIOD.as_secs_f64() / STEP_S).round() as usize
 }
 
-/// Noise-free measurements of a robot whose wheels turn so.
+/// Returns the noise-free measurements of a robot with these wheel speeds. `blend` replaces a
+/// fraction of the friction by that of another shape.
 fn measure(
     input: &BoundInput<'_>,
     wheels: &[Vec<[f64; 2]>],
@@ -170,7 +173,7 @@ fn measure(
     let of_sample = |wheels: &Vec<[f64; 2]>| {
         let means = plant.advance_along(wheels);
         let state = plant.state();
-        // Without leaps at half a turn.
+        // Unwrapped heading, without jumps at ±π.
         heading_rad += means.yaw_rate_rad_s * SAMPLE_PERIOD.as_secs_f64();
         let [left, right] = deviations.torque_scale;
         [
@@ -195,13 +198,13 @@ fn derivative(from: &[Sample], to: &[Sample], step: f64) -> Vec<Sample> {
         .collect()
 }
 
-/// Covariance of all parameters before the drive.
+/// Returns the covariance of all parameters before the drive.
 fn prior(sensors: &SensorSpec, layout: &Layout) -> DMatrix<f64> {
     let mut covariance = DMatrix::zeros(layout.len, layout.len);
     for (index, (std_dev, _)) in PARAMETERS.iter().enumerate() {
         covariance[(index, index)] = std_dev.powi(2);
     }
-    // Indicators of shapes that are equally likely.
+    // Indicator variables of equally likely shapes.
     #[expect(clippy::cast_precision_loss, reason = "four shapes")]
     let likely = 1.0 / Shape::ALL.len() as f64;
     let shapes = PARAMETERS.len()..PARAMETERS.len() + OTHERS;
@@ -241,7 +244,8 @@ fn prior(sensors: &SensorSpec, layout: &Layout) -> DMatrix<f64> {
     covariance
 }
 
-/// Adds what each sample tells, and inverts at the times that are asked for.
+/// Accumulates the information of the samples, and returns the standard deviation of ln θ at the
+/// requested times.
 fn information(
     input: &BoundInput<'_>,
     truth: &[Sample],
@@ -302,7 +306,7 @@ fn is_due(sample: usize, period: std::time::Duration) -> bool {
     (sample as u128).is_multiple_of(every)
 }
 
-/// Derivatives of a channel by offsets and the start.
+/// Sets the derivatives of a channel with respect to sensor offsets and start pose.
 fn nuisances(
     row: &mut DVector<f64>,
     layout: &Layout,

@@ -1,4 +1,4 @@
-//! A robot of the rough world as the agent's base.
+//! Implements the agent's drive interface for a robot of the rough world.
 
 use std::time::Duration;
 
@@ -13,7 +13,7 @@ use super::sensors::{SAMPLE_PERIOD, SensorSpec, Sensors};
 use super::spec::Deviations;
 use crate::random::Random;
 
-/// A robot of the rough world.
+/// A robot of the rough world with its sensors, driven by the agent.
 #[derive(Debug, Clone)]
 pub struct RoughDrive {
     plant: Plant,
@@ -22,12 +22,13 @@ pub struct RoughDrive {
     waiting: Feedback,
     simulated_to: Option<Duration>,
     steps_per_sample: u32,
-    /// The command of each sample so far.
+    /// Command of each sample so far.
     commands: Vec<WheelSpeeds>,
 }
 
 impl RoughDrive {
-    /// A robot at rest at a pose; none if the model's wheels are no rectangle.
+    /// Creates a robot at rest at the pose `start`; `None` if the wheels of `model` do not form a
+    /// rectangle.
     pub fn new(
         model: &RobotModel,
         deviations: Deviations,
@@ -52,7 +53,7 @@ impl RoughDrive {
         })
     }
 
-    /// The command of each sample so far.
+    /// Returns the command of each sample so far.
     pub fn commands(&self) -> &[WheelSpeeds] {
         &self.commands
     }
@@ -67,7 +68,7 @@ impl RoughDrive {
         self.plant.change_ground(stiffness);
     }
 
-    /// What it truly is and does.
+    /// Returns the simulated plant with its true state.
     pub fn plant(&self) -> &Plant {
         &self.plant
     }

@@ -86,7 +86,7 @@ pub fn run(trial: &ChangeTrial) -> anyhow::Result<ChangeOutcome> {
         while delay_s.is_none() && bench.now() < changed_at + DETECTED_WITHIN {
             bench.tick();
             if bench.ground_changes() > false_alarms {
-                delay_s = Some((bench.now() - changed_at).as_secs_f64());
+                delay_s = Some(bench.now().saturating_sub(changed_at).as_secs_f64());
             }
         }
     }

@@ -1,28 +1,28 @@
-//! What sensors see of a robot over some time: means over integration steps.
+//! Means of the plant's motion over integration steps, from which sensor values are made.
 
 use tread_control::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
 
 /// Means over one call of [`super::plant::Plant::advance`].
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Means {
-    /// Turn rate, radians per second.
+    /// Turn rate, in radians per second.
     pub yaw_rate_rad_s: f64,
     /// Acceleration of the centre of mass, without gravity.
     pub acceleration: BodyAcceleration,
     /// Wheel speeds.
     pub wheel_speeds: WheelSpeeds,
-    /// Torques of the motors, per side.
+    /// Motor torques per side.
     pub torques: WheelTorques,
 }
 
-/// What one integration step adds.
+/// Values of one integration step.
 pub(super) struct Moment {
     pub(super) yaw_rate_rad_s: f64,
-    /// Of the centre of mass without gravity, forward and to the left.
+    /// Acceleration of the centre of mass without gravity, `[forward, left]`.
     pub(super) acceleration_m_s2: [f64; 2],
-    /// Left and right.
+    /// Wheel speeds `[left, right]`.
     pub(super) wheels_rad_s: [f64; 2],
-    /// Left and right.
+    /// Motor torques `[left, right]`.
     pub(super) motor_n_m: [f64; 2],
 }
 

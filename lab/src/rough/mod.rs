@@ -1,8 +1,9 @@
-//! A second world, written from the physics and not from the agent's own simulator.
+//! The *rough world*: a second simulator, written independently of the agent's own one.
 //!
-//! What is measured here was not built with it: contacts deflect, curves bend, loads move, motors
-//! have limits and gears, encoders count and positions come late. A robot is driven closed-loop by
-//! the agent's own control loop, configured as an integrator would: with the data sheet.
+//! Its models are more detailed than those of the estimator: deflecting contacts, nonlinear
+//! friction curves, load transfer, limited motors with gears, quantised encoders and delayed
+//! positions. The agent's control loop drives the robot closed-loop, with a configuration from the
+//! data sheet as an integrator would write.
 
 pub mod bound;
 pub mod curve;

@@ -1,84 +1,86 @@
-//! The body, its wheels and its motors, from Newton's laws.
+//! Plant of the rough world: equations of motion of body, wheels, contacts and motors.
 //!
-//! State in the body frame at the centre of mass: speed forward and to the left, turn rate; per
-//! side the wheels' speed (front and rear are coupled by a chain, as on the makes of
-//! [`super::spec`]); per contact the deflection of the tyre as a slip vector s, which follows `ℓ ṡ
-//! = v_slip − |rω| s`. Its force is `N μ(|s|) s/|s|`, with the wheel's own load N: the loads are
-//! those of a rigid body on four equal springs. Gravity acts along the slope. Motors give torque,
-//! limited in size, by a proportional-integral speed servo; rotors, gears and rolling resistance
-//! take their part of it before it reaches the contact.
+//! The state is in the body frame at the centre of mass: forward and left speed, turn rate; per
+//! side the wheel speed (front and rear are coupled by a chain, as on the robots of
+//! [`super::spec`]); per contact the deflection of the tyre as a slip vector s, with `ℓ ṡ = v_slip
+//! − |rω| s`. The contact force is `N μ(|s|) s/|s|`, with the wheel load N of a rigid body on four
+//! equal springs. Gravity acts along the slope. A proportional-integral speed servo commands the
+//! motor torques, which are limited. Rotor inertia, gear losses and rolling resistance reduce the
+//! torque at the contact.
 
 use nalgebra::{Matrix3, Vector3};
 use tread_control::geometry::{Pose, wrap_angle_rad};
 use tread_control::measured::WheelSpeeds;
 use tread_control::robot::{GRAVITY_M_S2, RobotModel};
 
-use super::curve::{Curve, Shape};
+use super::curve::{ContactSlip, Curve, Shape};
 use super::means::{Means, Moment, Sums};
 use super::spec::Deviations;
 
-/// Integration step, seconds: a hundredth of the fastest oscillation of a contact.
+/// Integration step in seconds: a hundredth of the period of the fastest oscillation of a contact.
 pub const STEP_S: f64 = 5.0e-4;
-/// Largest deflection of a contact, as a slip; far beyond every curve's peak.
+/// Maximum deflection of a contact, as a slip, far beyond the peak of every curve; larger values
+/// are clamped.
 const DEFLECTION_MAX: f64 = 3.0;
-/// Rim speed below which tread rubber damps contacts, metres per second.
+/// Rim speed below which contacts have rubber damping, in metres per second.
 const DAMPED_BELOW_M_S: f64 = 0.1;
 /// Damping ratio of a contact at standstill.
 const DAMPING_RATIO: f64 = 0.2;
-/// Rim speed over which rolling resistance turns its sign, metres per second.
+/// Rim speed scale of the smooth sign change of rolling resistance, in metres per second.
 const RESISTANCE_TURNS_M_S: f64 = 0.01;
-/// Time over which loads follow the forces: tyres have some give upright too, seconds.
+/// Time constant with which wheel loads follow the forces, in seconds; models the vertical tyre
+/// springs.
 const LOAD_LAG_S: f64 = 0.02;
 
-/// A wheel's contact.
+/// Contact of one wheel with the ground.
 #[derive(Debug, Clone, Copy, Default)]
 struct Contact {
-    /// From the centre of mass, metres.
+    /// Position relative to the centre of mass, body frame, metres.
     x_m: f64,
     y_m: f64,
     side: usize,
-    /// Deflection as a slip, forward and to the left.
+    /// Deflection as a slip, `[forward, left]`.
     deflection: [f64; 2],
     load_n: f64,
     slip_m_s: f64,
 }
 
-/// The true state, where the agent's model has its own: at the centre of the wheels.
+/// True state at the reference point of the agent's model, the centre of the wheels.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct State {
     /// Pose of the centre of the wheels, site frame.
     pub pose: Pose,
-    /// Its forward speed, metres per second.
+    /// Forward speed, metres per second.
     pub forward_m_s: f64,
-    /// Its speed to the left, metres per second.
+    /// Speed to the left, metres per second.
     pub left_m_s: f64,
     /// Turn rate, radians per second.
     pub yaw_rate_rad_s: f64,
 }
 
-/// What sensors are given of a robot at one time, beside its [`Means`].
+/// True values of one time from which sensor values are made, in addition to [`Means`].
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Truth {
-    /// Where it is and how it moves.
+    /// Pose and velocity of the robot.
     pub state: State,
-    /// How far each side's wheels have turned, radians.
+    /// Accumulated wheel angles `[left, right]`, radians.
     pub turned_rad: [f64; 2],
-    /// Measured over true torque, left and right.
+    /// Ratio of measured to true torque, `[left, right]`.
     pub torque_scale: [f64; 2],
-    /// How far it leans from level, radians.
+    /// Angle between the robot's vertical axis and the vertical, radians.
     pub tilt_rad: f64,
 }
 
-/// What turns the wheels in a step, left and right.
+/// Drive of the wheels in one integration step; values are `[left, right]`.
 #[derive(Debug, Clone, Copy)]
 enum WheelDrive {
-    /// The servo, towards these speeds, radians per second.
+    /// The servo controls the wheels to these speeds, radians per second.
     Servo([f64; 2]),
-    /// Whatever it takes to have these speeds at the step's end.
+    /// The wheels have these speeds at the end of the step, radians per second; the torques follow.
     Given([f64; 2]),
 }
 
-/// A robot of the rough world.
+/// Simulated robot of the rough world.
 #[derive(Debug, Clone)]
 pub struct Plant {
     spec: Deviations,
@@ -89,16 +91,17 @@ pub struct Plant {
     radius_m: [f64; 2],
     contacts: [Contact; 4],
     load_of_moments: Matrix3<f64>,
-    /// Sums of the contacts' forces, for the loads: forward and left, newtons.
+    /// Low-pass filtered sum of the contact forces for the load transfer, `[forward, left]`,
+    /// newtons.
     load_force_n: [f64; 2],
     speed_m_s: [f64; 2],
     yaw_rate_rad_s: f64,
-    /// Of the centre of mass.
+    /// Pose of the centre of mass, site frame.
     pose: Pose,
     wheels_rad_s: [f64; 2],
     integral_n_m: [f64; 2],
     motor_n_m: [f64; 2],
-    /// How far the wheels have turned, radians.
+    /// Accumulated wheel angles `[left, right]`, radians.
     turned_rad: [f64; 2],
     blend: Option<(Shape, f64)>,
 }
@@ -108,7 +111,8 @@ fn inertia_over_mass_m2(model: &RobotModel, spec: &Deviations) -> f64 {
 }
 
 impl Plant {
-    /// A robot at rest, with its wheels' centre at a pose; none if four loads are no rectangle.
+    /// Creates a robot at rest with the centre of its wheels at `start`; `None` if the contacts do
+    /// not form a rectangle.
     pub fn new(model: &RobotModel, spec: Deviations, start: Pose) -> Option<Self> {
         let (track_m, base_m) = (model.track_width_m(), model.wheelbase_m());
         let mass_kg = model.mass_kg() * (1.0 + spec.payload_ratio);
@@ -131,7 +135,7 @@ impl Plant {
             contact(1.0, -1.0),
             contact(-1.0, -1.0),
         ];
-        // Loads c₀ + c₁x + c₂y whose sum and moments are given.
+        // Wheel loads c₀ + c₁x + c₂y with given sum and moments.
         let moments: Matrix3<f64> = contacts
             .iter()
             .map(|contact| {
@@ -180,12 +184,12 @@ impl Plant {
         self.spec.curve.stiffness = stiffness;
     }
 
-    /// What it is.
+    /// Returns the true parameters of robot and ground.
     pub fn spec(&self) -> &Deviations {
         &self.spec
     }
 
-    /// What sensors are given of it now.
+    /// Returns the true values from which sensor values are made.
     pub fn truth(&self) -> Truth {
         Truth {
             state: self.state(),
@@ -195,7 +199,7 @@ impl Plant {
         }
     }
 
-    /// The state of the wheels' centre.
+    /// Returns the true state of the centre of the wheels.
     pub fn state(&self) -> State {
         let (sin, cos) = self.pose.heading_rad.sin_cos();
         let [x_m, y_m, _] = self.center_m;
@@ -211,20 +215,20 @@ impl Plant {
         }
     }
 
-    /// How far it leans from level, radians.
+    /// Returns the angle between the robot's vertical axis and the vertical, radians.
     pub fn tilt_rad(&self) -> f64 {
         let [x_rad, y_rad] = self.spec.slope_rad;
         x_rad.tan().hypot(y_rad.tan()).atan()
     }
 
-    /// Share of the greatest slip of its contacts over the curve's peak slip.
+    /// Returns the ratio of the largest contact slip to the slip at the peak of the friction curve.
     pub fn slip_over_peak(&self) -> f64 {
         let slips = self.contacts.iter();
         let slips = slips.map(|contact| contact.deflection[0].hypot(contact.deflection[1]));
         slips.fold(0.0, f64::max) / self.spec.curve.peak_slip()
     }
 
-    /// Gravity over mass in the body frame: ahead, left, and into the ground.
+    /// Returns the gravitational acceleration in the body frame: forward, left, into the ground.
     fn gravity_m_s2(&self) -> [f64; 3] {
         let [x_rad, y_rad] = self.spec.slope_rad;
         let (rise_x, rise_y) = (x_rad.tan(), y_rad.tan());
@@ -241,7 +245,8 @@ impl Plant {
         ]
     }
 
-    /// Loads that carry the body against the moments of the contacts' forces, a share of the way.
+    /// Moves the wheel loads towards equilibrium with the moments of the contact forces, by the
+    /// fraction `share` of the difference.
     fn bear(&mut self, share: f64) {
         let height_m = self.center_m[2];
         let weight_n = self.mass_kg * self.gravity_m_s2()[2];
@@ -257,25 +262,25 @@ impl Plant {
         }
     }
 
-    /// Follows a curve that is partly another one, for derivatives by the curve's shape: that share
-    /// of the friction is of the other.
+    /// Replaces the fraction `ratio` of the friction by that of another shape, for derivatives with
+    /// respect to the shape.
     #[must_use]
     pub fn with_blend(mut self, shape: Shape, ratio: f64) -> Self {
         self.blend = Some((shape, ratio));
         self
     }
 
-    /// Friction coefficient over slip.
-    fn mu_over_slip(&self, slip: f64, sliding_m_s: f64) -> f64 {
+    /// Returns the ratio μ/λ of the blended friction curve.
+    fn mu_over_slip(&self, contact: ContactSlip) -> f64 {
         let curve = self.spec.curve;
-        let own = curve.mu_over_slip(slip, sliding_m_s);
+        let own = curve.mu_over_slip(contact);
         self.blend.map_or(own, |(shape, share)| {
             let other = Curve { shape, ..curve };
-            (1.0 - share) * own + share * other.mu_over_slip(slip, sliding_m_s)
+            (1.0 - share) * own + share * other.mu_over_slip(contact)
         })
     }
 
-    /// Torques of the motors for commanded wheel speeds.
+    /// Computes the motor torques for commanded wheel speeds `[left, right]`, radians per second.
     fn command(&mut self, command: [f64; 2]) {
         for (side, target_rad_s) in command.into_iter().enumerate() {
             let radius_m = self.radius_m[side];
@@ -283,12 +288,12 @@ impl Plant {
             let gain = inertia / self.spec.servo_lag_s;
             let error = target_rad_s - self.wheels_rad_s[side];
             let most = self.spec.motor_limit_mu * 0.5 * self.mass_kg * GRAVITY_M_S2 * radius_m;
-            // The proportional part as it is at the step's end: light rotors follow a stiff servo in
-            // less than one step.
+            // Implicit proportional part, because light rotors with a stiff servo are faster than
+            // one integration step.
             let stiffness = gain / (1.0 + gain * STEP_S / self.side_inertia_kg_m2);
             let wanted = stiffness * error + self.integral_n_m[side];
             let torque = wanted.clamp(-most, most);
-            // The integral rests while the motor gives all it can.
+            // Anti-windup: the integral does not change while the torque is limited.
             if (wanted - torque).abs() < f64::EPSILON {
                 let rate = gain / (4.0 * self.spec.servo_lag_s);
                 self.integral_n_m[side] += rate * error * STEP_S;
@@ -297,14 +302,17 @@ impl Plant {
         }
     }
 
-    /// Forces of the contacts on the body, forward and left each, newtons.
+    /// Returns the contact forces on the body, `[forward, left]` each, newtons.
     fn forces(&self) -> [[f64; 2]; 4] {
         let curve = self.spec.curve;
         let damping =
             2.0 * DAMPING_RATIO * (curve.stiffness * self.spec.relaxation_m / GRAVITY_M_S2).sqrt();
         self.contacts.map(|contact| {
             let slip = contact.deflection[0].hypot(contact.deflection[1]);
-            let mu_over_slip = self.mu_over_slip(slip, contact.slip_m_s);
+            let mu_over_slip = self.mu_over_slip(ContactSlip {
+                slip,
+                sliding_m_s: contact.slip_m_s,
+            });
             let rim_m_s = (self.wheels_rad_s[contact.side] * self.radius_m[contact.side]).abs();
             let damped =
                 damping * (1.0 - rim_m_s / DAMPED_BELOW_M_S).max(0.0) / self.spec.relaxation_m;
@@ -408,7 +416,7 @@ impl Plant {
                     (*deflection + share * velocity[axis]) / (1.0 + share * rim_m_s.abs());
             }
             let size = contact.deflection[0].hypot(contact.deflection[1]);
-            // A deflection beyond what friction bears slides on.
+            // At low rim speed the contact slides beyond the peak of the curve.
             let most = if rim_m_s.abs() < DAMPED_BELOW_M_S {
                 self.spec.curve.peak_slip().min(DEFLECTION_MAX)
             } else {
@@ -420,7 +428,7 @@ impl Plant {
         }
     }
 
-    /// Moves on by so many steps under commanded wheel speeds; means over that time.
+    /// Integrates `steps` steps with commanded wheel speeds. Returns the means over that time.
     pub fn advance(&mut self, command: WheelSpeeds, steps: u32) -> Means {
         let mut sums = Sums::default();
         let command = [command.left_rad_s, command.right_rad_s];
@@ -430,8 +438,9 @@ impl Plant {
         sums.means()
     }
 
-    /// Moves on by one step for each of these wheel speeds, left and right, which the wheels have at
-    /// its end; means over that time. The motors give whatever torque that takes.
+    /// Integrates one step for each entry of `wheels_rad_s`, which has the wheel speeds `[left,
+    /// right]` at the end of the step, in radians per second; motor torques are unlimited. Returns
+    /// the means over that time.
     pub fn advance_along(&mut self, wheels_rad_s: &[[f64; 2]]) -> Means {
         let mut sums = Sums::default();
         for next in wheels_rad_s {
@@ -440,13 +449,14 @@ impl Plant {
         sums.means()
     }
 
-    /// Wheel speeds, left and right, radians per second.
+    /// Returns the wheel speeds `[left, right]`, radians per second.
     pub fn wheels_rad_s(&self) -> [f64; 2] {
         self.wheels_rad_s
     }
 }
 
-/// Speed of a contact's patch over the ground, turned round: forward and left.
+/// Returns the negative sliding velocity of a contact patch over the ground, `[forward, left]`,
+/// metres per second.
 fn slip_velocity(contact: &Contact, speed: [f64; 2], yaw_rate: f64, rim_m_s: f64) -> [f64; 2] {
     [
         rim_m_s - (speed[0] - yaw_rate * contact.y_m),

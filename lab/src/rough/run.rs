@@ -1,4 +1,4 @@
-//! One drive of one robot, closed-loop, and what its agent said of the ground.
+//! Runs one closed-loop drive of one robot and records the θ that its agent reports.
 
 use std::time::Duration;
 
@@ -18,28 +18,28 @@ use super::sensors::SensorSpec;
 use super::spec::{Deviations, Make};
 use crate::random::Random;
 
-/// Times after the start of the mission at which the agent is asked, seconds.
+/// Times after the start of the mission at which the agent's estimate is read, in seconds.
 pub const ASKED_AT_S: [u64; 4] = [10, 20, 40, 60];
-/// How long the robot may take to know where it is.
+/// Time before the mission in which the robot's localisation converges.
 const SETTLES: Duration = Duration::from_secs(2);
-/// Speed of the courses, metres per second.
+/// Speed on the courses, in metres per second.
 const SPEED_M_S: f64 = 0.6;
-/// Points of a lap of the figure-8.
+/// Number of waypoints per lap of the figure-8.
 const POINTS_PER_LAP: u32 = 24;
-/// Laps of the figure-8: more than a minute of it.
+/// Number of laps of the figure-8; they take more than a minute.
 const LAPS: u32 = 3;
 
-/// What is driven.
+/// Course of a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Course {
     /// A lemniscate, 8 m long and 4 m wide.
     Figure8,
-    /// A circle of 2 m.
+    /// A circle of 2 m radius.
     Circle,
 }
 
 impl Course {
-    /// For people.
+    /// Returns the name for reports.
     pub fn text(self) -> &'static str {
         match self {
             Self::Figure8 => "figure-8",
@@ -87,35 +87,35 @@ impl Course {
     }
 }
 
-/// A drive.
+/// Specification of a drive.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Trial {
-    /// The robot.
+    /// Make of the robot.
     pub make: Make,
-    /// How it and its ground differ from the agent's model.
+    /// Differences of robot and ground from the agent's model.
     pub deviations: Deviations,
-    /// What it is measured with.
+    /// Specification of the sensors.
     pub sensors: SensorSpec,
-    /// What it drives.
+    /// Course to drive.
     pub course: Course,
-    /// What its noise is made from.
+    /// Seed of the sensor noise.
     pub seed: u64,
-    /// How the agent's estimator is configured for the robot and its tyres.
+    /// Prior of the agent's estimator for robot and tyres.
     pub prior: EstimatorPrior,
-    /// Whether to work out how well θ could be known; that takes about ten times as long.
+    /// Whether to compute the Cramér–Rao bound of θ, which takes about ten times as long.
     pub is_bounded: bool,
 }
 
-/// What came of a drive.
+/// Result of a drive.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Outcome {
-    /// What the agent said of θ at [`ASKED_AT_S`].
+    /// Agent's estimates of θ at the times [`ASKED_AT_S`]; `None` where it gave none.
     pub said: [Option<ThetaEstimate>; ASKED_AT_S.len()],
-    /// Lower bounds of the standard deviation of ln θ at those times, where they were asked for.
+    /// Lower bounds of the standard deviation of ln θ at those times, if requested.
     pub bounds: Option<[f64; ASKED_AT_S.len()]>,
-    /// The true θ.
+    /// True θ.
     pub truth: f64,
-    /// Share of the time in which a contact slipped beyond half the slip of the peak.
+    /// Fraction of the time in which a contact slipped by more than half the slip at the peak.
     pub beyond_half_peak: f64,
     /// What the agent said of the robot's own parameters in the end.
     pub parameters: Option<RobotParameters>,
@@ -155,10 +155,10 @@ fn true_parameters(model: &RobotModel, spec: &Deviations) -> [f64; PARAMETERS.le
     ]
 }
 
-/// Drives; an error if the robot, its pose or its plan cannot be.
+/// Runs a drive.
 ///
 /// # Errors
-/// A sentence on what cannot be.
+/// The robot's model or its plan is impossible, or the bound cannot be computed.
 pub fn run(trial: &Trial) -> anyhow::Result<Outcome> {
     let model = trial.make.model()?;
     let random = Random::new(trial.seed);

@@ -1,7 +1,8 @@
-//! Sensors as data sheets describe them: counts, drift, delay, outliers.
+//! Sensor models with the errors of data sheets: quantisation, drift, delay, outliers.
 //!
-//! Joint states and inertial data come at 100 Hz, as the makes' drivers send them. Encoders count;
-//! the gyro's offset walks; positions come late, wander slowly and are wrong now and then.
+//! Joint states and inertial data have a rate of 100 Hz, as from the robots' drivers. Wheel speeds
+//! are quantised by encoder counts. The gyro's offset is a random walk. Positions have a delay, a
+//! slowly varying error and occasional outliers.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -18,50 +19,51 @@ use crate::random::Random;
 
 /// Time between two samples of the fast sensors.
 pub const SAMPLE_PERIOD: Duration = Duration::from_millis(10);
-/// Time over which a position's slow error changes, seconds.
+/// Correlation time of the slow position error, in seconds.
 pub const POSITION_WANDERS_S: f64 = 20.0;
-/// How far an outlier is off, metres.
+/// Error of an outlier, in metres.
 const OUTLIER_M: f64 = 1.0;
 
-/// How good a robot's sensors are; one standard deviation each unless said otherwise.
+/// Errors of a robot's sensors; values are standard deviations unless stated otherwise.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct SensorSpec {
-    /// Encoder counts per turn of a wheel.
+    /// Encoder counts per revolution of a wheel.
     pub counts_per_turn: f64,
-    /// Gyro, radians per second per sample.
+    /// White noise of the gyro, radians per second per sample.
     pub gyro_rad_s: f64,
-    /// Its offset at the start, radians per second.
+    /// Initial offset of the gyro, radians per second.
     pub gyro_offset_rad_s: f64,
-    /// How its offset walks, radians per second per root second.
+    /// Random walk of the gyro's offset, radians per second per √s.
     pub gyro_walk_rad_s: f64,
-    /// Accelerometer, metres per second squared per sample.
+    /// White noise of the accelerometer, metres per second squared per sample.
     pub acceleration_m_s2: f64,
-    /// Its offset, metres per second squared.
+    /// Offset of the accelerometer, metres per second squared.
     pub acceleration_offset_m_s2: f64,
-    /// Torque, as a friction coefficient of one side.
+    /// White noise of the torque of one side, as a friction coefficient.
     pub torque_mu: f64,
     /// Whether torque is measured.
     pub has_torque: bool,
-    /// Speed over ground, metres per second.
+    /// White noise of the speed over ground, metres per second.
     pub body_speed_m_s: f64,
-    /// Time between two speeds over ground.
+    /// Sampling period of the speed over ground.
     pub body_speed_period: Duration,
-    /// Position, per axis, metres.
+    /// White noise of a position, per axis, metres.
     pub position_m: f64,
-    /// Heading of a position, radians.
+    /// White noise of the heading of a position, radians.
     pub heading_rad: f64,
     /// Slow error of a position, per axis, metres.
     pub position_wander_m: f64,
-    /// Time between two positions.
+    /// Sampling period of positions.
     pub position_period: Duration,
-    /// How late they come.
+    /// Delay of positions.
     pub position_delay: Duration,
-    /// Share of positions that are off by a metre.
+    /// Fraction of positions that are outliers.
     pub outlier_share: f64,
 }
 
 impl SensorSpec {
-    /// Poses of 2 cm at 10 Hz that come 50 ms late, and inertial data of a small MEMS unit.
+    /// Returns typical sensors: poses of 2 cm at 10 Hz with a delay of 50 ms, and the inertial data
+    /// of a small MEMS unit.
     pub fn usual(has_torque: bool) -> Self {
         Self {
             counts_per_turn: 16_384.0,
@@ -83,13 +85,13 @@ impl SensorSpec {
         }
     }
 
-    /// The sensors of one robot of the population.
+    /// Draws the sensors of one robot of the population.
     pub fn drawn(random: &mut Random, has_torque: bool) -> Self {
         let rate_hz = random.one_of(&[5_u32, 10, 20]).unwrap_or(10);
         Self {
-            counts_per_turn: random.log_uniform(4_096.0, 80_000.0),
-            gyro_walk_rad_s: random.log_uniform(3.0e-5, 3.0e-4),
-            position_m: random.log_uniform(0.005, 0.03),
+            counts_per_turn: random.log_uniform(4_096.0..80_000.0),
+            gyro_walk_rad_s: random.log_uniform(3.0e-5..3.0e-4),
+            position_m: random.log_uniform(0.005..0.03),
             position_period: Duration::from_secs(1) / rate_hz,
             position_delay: Duration::from_millis(10) * random.one_of(&[2, 5, 10]).unwrap_or(5),
             outlier_share: random.one_of(&[0.0, 0.002]).unwrap_or(0.0),
@@ -98,7 +100,7 @@ impl SensorSpec {
     }
 }
 
-/// The sensors of one robot.
+/// Simulated sensors of one robot.
 #[derive(Debug, Clone)]
 pub struct Sensors {
     spec: SensorSpec,
@@ -114,7 +116,7 @@ pub struct Sensors {
 }
 
 impl Sensors {
-    /// Sensors on a robot of that model.
+    /// Creates the sensors of a robot of this model.
     pub fn new(spec: SensorSpec, model: &RobotModel, mut random: Random) -> Self {
         let load_n = 0.5 * model.mass_kg() * GRAVITY_M_S2;
         Self {
@@ -162,7 +164,7 @@ impl Sensors {
             self.wander_m[1] + self.random.normal(spec.position_m),
         ];
         if self.random.chance(spec.outlier_share) {
-            let angle = self.random.uniform(0.0, std::f64::consts::TAU);
+            let angle = self.random.uniform(0.0..std::f64::consts::TAU);
             off_m[0] += OUTLIER_M * angle.cos();
             off_m[1] += OUTLIER_M * angle.sin();
         }
@@ -173,7 +175,7 @@ impl Sensors {
         }
     }
 
-    /// What the sensors say at `at`, of a robot in a state, after a time over which its means are these.
+    /// Appends the samples of the time `at` to `to`. `means` are the means since the sample before.
     pub fn sample(&mut self, truth: &Truth, means: &Means, at: Duration, to: &mut Feedback) {
         let (spec, state) = (self.spec, truth.state);
         self.gyro_offset_rad_s += self

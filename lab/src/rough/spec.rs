@@ -1,4 +1,4 @@
-//! What a robot of the rough world is, beside the model with which its agent is configured.
+//! Makes of robots, and the differences of a simulated robot and its ground from the agent's model.
 
 use serde::Serialize;
 use tread_control::robot::{Limits, RobotModel, RobotModelError, RobotModelSpec};
@@ -6,22 +6,22 @@ use tread_control::robot::{Limits, RobotModel, RobotModelError, RobotModelSpec};
 use super::curve::{Curve, Shape};
 use crate::random::Random;
 
-/// A make of robot, from its description package and data sheet.
+/// Make of a robot, from its description package and data sheet.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Make {
-    /// Its name.
+    /// Name of the make.
     pub name: &'static str,
     mass_kg: f64,
     track_m: f64,
     wheelbase_m: f64,
     wheel_radius_m: f64,
-    /// Length and width of its body, metres.
+    /// Length and width of the body, metres.
     body_m: (f64, f64),
 }
 
-/// Masses, wheels and body sizes as in `husky_description`, `jackal_description` and
-/// `warthog_description` of Clearpath Robotics and their data sheets; the first is the robot of
-/// Yi et al. (2007), whose body is taken for as large as its track and wheelbase with the wheels.
+/// Makes of robots. Masses, wheels and body sizes are from `husky_description`,
+/// `jackal_description` and `warthog_description` of Clearpath Robotics and their data sheets. The
+/// first is the robot of Yi et al. (2007), whose body is assumed to extend over its wheels.
 pub const MAKES: [Make; 4] = [
     Make {
         name: "paper",
@@ -58,11 +58,11 @@ pub const MAKES: [Make; 4] = [
 ];
 
 impl Make {
-    /// What an integrator writes into the agent's configuration: the data sheet, and the inertia of
-    /// a plate of the body's size.
+    /// Returns the model that an integrator configures: the values of the data sheet, and the yaw
+    /// inertia of a homogeneous plate of the body's size.
     ///
     /// # Errors
-    /// [`RobotModelError`], if a figure of the table is no size.
+    /// [`RobotModelError`] if a value of the table is out of range.
     pub fn model(&self) -> Result<RobotModel, RobotModelError> {
         let (length_m, width_m) = self.body_m;
         RobotModel::try_from(RobotModelSpec {
@@ -84,44 +84,48 @@ impl Make {
     }
 }
 
-/// What makes a robot and its ground differ from the agent's model, and from our simulator.
+/// Differences of a simulated robot and its ground from the agent's model and from the agent's
+/// simulator.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Deviations {
-    /// Payload over the mass of the agent's model; it sits at the centre of mass.
+    /// Ratio of the payload to the mass of the agent's model; the payload is at the centre of mass.
     pub payload_ratio: f64,
-    /// Yaw inertia over that of the agent's model, beside the payload's share.
+    /// Ratio of the yaw inertia to that of the agent's model, apart from the payload's
+    /// contribution.
     pub inertia_ratio: f64,
-    /// Centre of mass ahead of the centre of the wheels, over the wheelbase.
+    /// Distance of the centre of mass forward of the centre of the wheels, relative to the
+    /// wheelbase.
     pub center_forward_ratio: f64,
-    /// Centre of mass to the left of it, over the track.
+    /// Distance of the centre of mass to the left of the centre of the wheels, relative to the
+    /// track width.
     pub center_left_ratio: f64,
-    /// Height of the centre of mass over the track.
+    /// Height of the centre of mass, relative to the track width.
     pub center_height_ratio: f64,
     /// Relaxation length of the contacts, metres.
     pub relaxation_m: f64,
-    /// Rise of the ground along the site's axes, radians.
+    /// Slope of the ground along the site's axes `[x, y]`, radians.
     pub slope_rad: [f64; 2],
-    /// Measured over true torque, left and right.
+    /// Ratio of measured to true torque, `[left, right]`.
     pub torque_scale: [f64; 2],
-    /// Inertia of a side's rotors and wheels at the rim over half the mass.
+    /// Inertia of a side's rotors and wheels at the rim, relative to half the mass.
     pub rotor_ratio: f64,
-    /// Torque lost in the gears over that which they transmit.
+    /// Ratio of the torque lost in the gears to the transmitted torque.
     pub gear_loss_ratio: f64,
-    /// Rolling resistance over load.
+    /// Rolling resistance coefficient.
     pub rolling_resistance_ratio: f64,
-    /// True over nominal rolling radius, left and right.
+    /// Ratio of true to nominal rolling radius, `[left, right]`.
     pub radius_ratio: [f64; 2],
     /// Time constant of the speed servo, seconds.
     pub servo_lag_s: f64,
-    /// Most force of the motors at the rim of a side, over its load.
+    /// Maximum motor force at the rim of a side, relative to its load.
     pub motor_limit_mu: f64,
-    /// Ground and tyre.
+    /// Friction curve of ground and tyre.
     pub curve: Curve,
 }
 
 impl Deviations {
-    /// As near to our simulator as this world can be: nothing differs but the plant and the
-    /// sensors.
+    /// Returns the parameters nearest to the agent's simulator, so that only plant and sensors
+    /// differ.
     pub fn none(stiffness: f64) -> Self {
         Self {
             payload_ratio: 0.0,
@@ -146,12 +150,13 @@ impl Deviations {
         }
     }
 
-    /// One robot of the population.
+    /// Draws one robot of the population.
     ///
-    /// Payload up to what data sheets allow for daily use (0 to 30 %); relaxation lengths of small
-    /// pneumatic and solid tyres (1 to 10 cm: Pacejka, ch. 5); torque constants within 3 % and 2 %
-    /// per side (motor data sheets state ± 5 to 10 % at most); slopes of yards and fields (2° one
-    /// standard deviation per axis, at most 6°).
+    /// Payloads are those that data sheets allow for daily use (0 to 30 %); relaxation lengths are
+    /// those of small pneumatic and solid tyres (1 to 10 cm: Pacejka, ch. 5). Torque constants have
+    /// standard deviations of 3 % for both sides together and 2 % per side (motor data sheets state
+    /// ± 5 to 10 % at most). Slopes are those of yards and fields (standard deviation 2° per axis,
+    /// at most 6°).
     pub fn drawn(random: &mut Random) -> Self {
         let stiffness = random.one_of(&[0.7, 3.0, 12.0]).unwrap_or(3.0);
         let shape = random.one_of(&Shape::ALL).unwrap_or(Shape::Linear);
@@ -163,27 +168,27 @@ impl Deviations {
         };
         let slope_rad = [slope(), slope()];
         Self {
-            payload_ratio: random.uniform(0.0, 0.3),
-            inertia_ratio: random.uniform(0.8, 1.25),
-            center_forward_ratio: random.uniform(-0.05, 0.05),
-            center_left_ratio: random.uniform(-0.03, 0.03),
-            center_height_ratio: random.uniform(0.2, 0.5),
-            relaxation_m: random.log_uniform(0.01, 0.1),
+            payload_ratio: random.uniform(0.0..0.3),
+            inertia_ratio: random.uniform(0.8..1.25),
+            center_forward_ratio: random.uniform(-0.05..0.05),
+            center_left_ratio: random.uniform(-0.03..0.03),
+            center_height_ratio: random.uniform(0.2..0.5),
+            relaxation_m: random.log_uniform(0.01..0.1),
             slope_rad,
             torque_scale: [
                 scale * (1.0 + random.normal(0.02)),
                 scale * (1.0 + random.normal(0.02)),
             ],
-            rotor_ratio: random.uniform(0.01, 0.1),
-            gear_loss_ratio: random.uniform(0.0, 0.03),
-            rolling_resistance_ratio: random.uniform(0.01, 0.04),
+            rotor_ratio: random.uniform(0.01..0.1),
+            gear_loss_ratio: random.uniform(0.0..0.03),
+            rolling_resistance_ratio: random.uniform(0.01..0.04),
             radius_ratio: [1.0 + random.normal(0.005), 1.0 + random.normal(0.005)],
-            servo_lag_s: random.log_uniform(0.02, 0.1),
-            motor_limit_mu: random.uniform(0.8, 1.5),
+            servo_lag_s: random.log_uniform(0.02..0.1),
+            motor_limit_mu: random.uniform(0.8..1.5),
             curve: Curve {
                 shape,
                 stiffness,
-                mu_peak: random.uniform(0.3, 0.9).min(0.9 * stiffness),
+                mu_peak: random.uniform(0.3..0.9).min(0.9 * stiffness),
             },
         }
     }

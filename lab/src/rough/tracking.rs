@@ -1,9 +1,9 @@
-//! Tracking as a robot drives: every law behind the shipped localisation, with the same sensors.
+//! Compares tracking laws with realistic sensors and the shipped localisation.
 //!
-//! Nothing is exact for any law: wheel speeds are counts, the turn rate is the gyro's less the
-//! offset that the localisation found, poses are late and noisy, the servo's lag is drawn. The
-//! robot is one of our own simulator or of the rough world; plans, seeds, localisation, governor,
-//! gate and rate are the same for all laws.
+//! No law has exact inputs: wheel speeds are quantised, the turn rate is the gyro's minus the
+//! estimated offset, poses are delayed and noisy, the servo's lag is random. The robot is of the
+//! agent's simulator or of the rough world. Plans, seeds, localisation, governor, gate and rate are
+//! equal for all laws.
 
 use std::time::Duration;
 
@@ -27,25 +27,25 @@ use super::spec::{Deviations, Make};
 use crate::bench::{Course, Driver, Law, LawInput};
 use crate::random::Random;
 
-/// How long the robot stands before it starts.
+/// Time at rest before the start, in which the localisation converges.
 const SETTLES: Duration = Duration::from_secs(2);
-/// Time on the course from which errors are counted, seconds.
+/// Time after the start from which errors are evaluated, in seconds.
 pub const COUNTED_FROM_S: f64 = 10.0;
-/// Time after which a robot counts as lost, over the plan's.
+/// Maximum duration of a drive relative to the plan's; a robot that takes longer counts as lost.
 const LATE_MAX: f64 = 2.0;
-/// Error at which a drive is given up, metres.
+/// Cross-track error at which a drive is aborted and the robot counts as lost, in metres.
 const GIVEN_UP_M: f64 = 5.0;
-/// Age of the last sample and of the last position that the gate and the law are given.
+/// Age of the last sample and of the last position in the inputs of gate and law, in seconds.
 const FRESH_S: f64 = 0.0;
-/// What is mixed into a seed, so that robots and their noise differ.
+/// Mask of the seed for drawing the robot, so that robot and sensor noise are independent.
 const ROBOT_SEED: u64 = 0x7ac4;
 
-/// Whose simulator.
+/// Simulator of a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum World {
-    /// The agent's own.
+    /// The agent's simulator.
     Own,
-    /// The rough one.
+    /// The rough world.
     Rough,
 }
 
@@ -59,12 +59,12 @@ impl World {
     }
 }
 
-/// How good positions are.
+/// Quality of measured poses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Poses {
-    /// 2 mm at 50 Hz, 20 ms late, as of a motion-capture system.
+    /// 2 mm at 50 Hz with a delay of 20 ms, as of a motion-capture system.
     Fine,
-    /// 2 cm at 10 Hz, 50 ms late, with a slow error of 1 cm, as of a good receiver.
+    /// 2 cm at 10 Hz with a delay of 50 ms and a slow error of 1 cm, as of a good GNSS receiver.
     Coarse,
 }
 
@@ -93,51 +93,51 @@ impl Poses {
     }
 }
 
-/// What the shipped law is given of θ while it drives.
+/// Estimate of θ that the shipped law receives during the drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Knowing {
-    /// Nothing.
+    /// No estimate.
     Nothing,
-    /// What its own estimator measures meanwhile, by wheel torques.
+    /// The estimate of the robot's own estimator, from wheel torques.
     Own,
 }
 
-/// A drive.
+/// Specification of a drive.
 #[derive(Debug, Clone, Copy)]
 pub struct Trial<'a> {
-    /// Whose simulator.
+    /// Simulator of the drive.
     pub world: World,
-    /// How good positions are.
+    /// Quality of measured poses.
     pub poses: Poses,
-    /// The robot.
+    /// Make of the robot.
     pub make: Make,
-    /// Slope K of the ground's friction over slip.
+    /// Friction stiffness K of the ground.
     pub stiffness: f64,
-    /// What is driven, from rest to rest.
+    /// Plan to drive, from rest to rest.
     pub plan: &'a Plan,
-    /// What robot and noise are made from.
+    /// Seed of robot and sensor noise.
     pub seed: u64,
-    /// Who drives.
+    /// Tracking law.
     pub law: Law,
     /// Gains of the shipped law.
     pub config: TrackerConfig,
-    /// What it is given of θ.
+    /// Estimate of θ that the law receives.
     pub knowing: Knowing,
 }
 
-/// Errors of a drive from [`COUNTED_FROM_S`] on, metres; infinite of a robot that was lost.
+/// Errors of a drive from [`COUNTED_FROM_S`] on, metres; infinite if the robot was lost.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Errors {
-    /// Root mean square of the true distance from the course.
+    /// Root mean square of the true cross-track error.
     pub rms_m: f64,
-    /// The largest.
+    /// Maximum of the true cross-track error's magnitude.
     pub most_m: f64,
-    /// Root mean square of the localisation's own error across the course.
+    /// Root mean square of the localisation's error across the course.
     pub localisation_rms_m: f64,
 }
 
 impl Errors {
-    /// Of a robot that was lost, or did not arrive.
+    /// Errors of a robot that was lost or did not arrive in time.
     const LOST: Self = Self {
         rms_m: f64::INFINITY,
         most_m: f64::INFINITY,
@@ -145,7 +145,7 @@ impl Errors {
     };
 }
 
-/// A robot of either world.
+/// Simulated robot of either simulator.
 enum Base {
     Own {
         plant: Box<OwnPlant>,
@@ -239,7 +239,7 @@ impl Base {
     }
 }
 
-/// What the robot knows of itself.
+/// Estimators of the robot, and its last measurements.
 struct Known {
     localisation: Localisation,
     estimator: Estimator,
@@ -302,10 +302,10 @@ impl Known {
     }
 }
 
-/// Drives.
+/// Runs a drive.
 ///
 /// # Errors
-/// A sentence on what cannot be: a robot, a ground, gains.
+/// Robot, ground or gains are impossible.
 pub fn run(trial: &Trial<'_>) -> anyhow::Result<Errors> {
     let model = trial.make.model()?;
     let start = ReferenceSample::from(&trial.plan.sample(0.0)).pose;
@@ -363,7 +363,7 @@ pub fn run(trial: &Trial<'_>) -> anyhow::Result<Errors> {
             Knowing::Own => known.theta(),
         };
         let reference = governor.step(trial.plan, &GovernorInput { lag_m, saturated }, dt_s);
-        // Pure pursuit follows the path at its own pace.
+        // Pure pursuit follows the path without a time reference.
         lag_m = match trial.law {
             Law::Pursuit(_) => 0.0,
             Law::Kanayama(_) | Law::Yi2007 | Law::Shipped(_) => {

@@ -458,7 +458,7 @@ mod tests {
     fn a_speed_is_the_slope_of_all_places() {
         let at = |index: u32| {
             let at_s = 100.0 + 0.05 * f64::from(index);
-            // Every other place is a centimetre off.
+            // Every other position is off by a centimetre.
             let off_m = if index.is_multiple_of(2) { 0.01 } else { -0.01 };
             let pose = tread_control::geometry::Pose {
                 x_m: 0.2 * at_s + off_m,

@@ -171,7 +171,7 @@ mod tests {
     use super::*;
     use crate::drive::ros2::tests::settings;
 
-    /// Both motions of a robot of which some sensors froze, and which moved or stood.
+    /// Returns both motions of a robot with some frozen sensors, which moved or not.
     fn robot(frozen: Frozen, moves: bool, noise: f64) -> [Drove; 2] {
         let mut random = 1_u32;
         let mut measured = |value: f64, is_frozen: bool| {
@@ -290,7 +290,7 @@ mod tests {
     }
 
     proptest! {
-        /// A frozen sensor is named as long as another one saw the robot move, and no other is.
+        /// Exactly the frozen sensors are reported, if another sensor measured motion.
         #[test]
         fn exactly_what_froze_is_named(set in 0_u32..31, noise in 1.0e-6_f64..0.02) {
             let is = |bit: u32| set & (1 << bit) != 0;

@@ -87,7 +87,7 @@ pub(super) fn findings(
     findings
 }
 
-/// What was found of the joints. Others than the robot's may be said on the same topic.
+/// Returns the findings on the joints. The topic may also contain joints of other devices.
 fn of_joints(settings: &Ros2Settings, messages: &[&Message], span: Duration) -> Vec<Finding> {
     let Some(joints) = &settings.joints else {
         return Vec::new();
@@ -122,8 +122,8 @@ fn of_joints(settings: &Ros2Settings, messages: &[&Message], span: Duration) -> 
     std::iter::once(finding).chain(effort).collect()
 }
 
-/// Mean turn rate that the inertial unit says of a robot whose wheels stand; none where they do not,
-/// or where it is not known.
+/// Returns the mean turn rate of the gyro while the wheels are stopped, rad/s; `None` if they are
+/// not stopped or the rate is not measured.
 pub(super) fn gyro_at_rest_rad_s(settings: &Ros2Settings, messages: &[Message]) -> Option<f64> {
     let (mut sum, mut count) = (0.0, 0.0);
     for message in messages {
@@ -161,7 +161,7 @@ fn of_gyro_at_rest(settings: &Ros2Settings, messages: &[Message]) -> Option<Find
     Some(Finding::wrong("gyro", "drive.ros2.imu.topic", text))
 }
 
-/// Who writes on a topic, and whether what comes is new.
+/// Returns a finding if several nodes publish on a topic or if messages are repeated.
 fn of_writers(source: Source, messages: &[&Message]) -> Option<Finding> {
     let (name, topic_key) = names(source);
     let mut writers = Vec::new();
@@ -202,7 +202,7 @@ fn share(part: usize, whole: usize) -> f64 {
     figure(part) / figure(whole).max(1.0)
 }
 
-/// Stamps that never change, while messages come.
+/// Returns a finding if the stamps of the messages never change.
 fn of_stamps(settings: &Ros2Settings, source: Source, messages: &[&Message]) -> Option<Finding> {
     let stamp = |message: &&Message| {
         let read = decoded(settings, source, &message.payload).ok()??;
@@ -273,7 +273,7 @@ fn of_topic(
             StampClock::Host => "\"base\"",
             StampClock::Base => "\"host\"",
         };
-        // A delay that is within reason is one; another clock is farther off.
+        // A moderate difference is a delay, a large one means another clock.
         return if middle_ms.abs() > CLOCK_MIN_MS {
             finding.with_line("drive.ros2", "stamps", other)
         } else {
@@ -347,10 +347,10 @@ fn of_refusal(source: Source, refusal: Refusal, message: &Message, share: f64) -
     Finding::wrong(name, key, text)
 }
 
-/// A table, a key in it, and the frame that is heard.
+/// Table and key of `robot.toml`, and the frame in the message.
 type FrameLine = (&'static str, &'static str, String);
 
-/// The key of a source's frame, and what its message says of frames.
+/// Returns the key of a source's frame, and the frames in its message; `None` if there are none.
 fn frames_of(source: Source, payload: &[u8]) -> Option<(&'static str, Vec<FrameLine>)> {
     match source {
         Source::Odometry => {

@@ -1,11 +1,11 @@
-//! `tread-agent doctor`: what is wrong with the installation on a ROS 2 robot, before it drives.
+//! `tread-agent doctor`: checks the installation on a ROS 2 robot before it drives.
 //!
-//! It listens for a while ([`listening`]); with `--move` it turns the robot on the spot and drives
-//! it ahead for a metre, slowly, and compares what was commanded with what was said ([`moving`]):
-//! sensors that froze ([`frozen`]), sides and signs ([`signs`]), the frame of the odometry's twist
-//! ([`twist_frame`]), the tracks ([`track`]), and how the wheels pull with the robot's mass
-//! ([`pulling`]), and estimates mass, inertia and centre of mass ([`parameters`]). Each finding names the key of `robot.toml` to look at, and the lines that mend it
-//! where there are such.
+//! The doctor listens to the stopped robot ([`listening`]). With `--move` it turns the robot slowly
+//! on the spot, drives it forward for a metre, and compares commands with measurements
+//! ([`moving`]): frozen sensors ([`frozen`]), sides and signs ([`signs`]), the frame of the
+//! odometry's twist ([`twist_frame`]), the tracks ([`track`]), and how the wheels pull with the
+//! robot's mass ([`pulling`]). It estimates mass, inertia and centre of mass ([`parameters`]). Each
+//! finding names the key of `robot.toml` to look at, and the lines that mend it where there are such.
 
 mod drove;
 mod finding;
@@ -44,27 +44,27 @@ use crate::drive::ros2::inlet::Tap;
 use crate::drive::ros2::settings::Ros2Settings;
 use crate::geometry::control_model;
 
-/// How long it listens to the standing robot.
+/// Time for which the doctor listens to the stopped robot.
 const LISTEN_FOR: Duration = Duration::from_secs(3);
-/// Longest wait for the first message.
+/// Maximum wait for the first message.
 const FIRST_WORD_MAX: Duration = Duration::from_secs(5);
 /// Time between two commands.
 const PERIOD: Duration = Duration::from_millis(10);
-/// How long it takes to the whole speed, and back to rest.
+/// Duration of the ramp from zero to full speed, and back.
 const RAMP: Duration = Duration::from_millis(500);
-/// How long a servo takes at the most to follow the ramp to its end.
+/// Time after the ramp in which the servos reach the commanded speed.
 const SETTLE: Duration = Duration::from_millis(500);
-/// How long the whole speed is held after that before it counts.
+/// Time at full speed before the steady part of a motion begins.
 const STEADY_AFTER: Duration = Duration::from_millis(1_500);
-/// How long it counts.
+/// Duration of the steady part of a motion.
 const STEADY_FOR: Duration = Duration::from_secs(2);
-/// How long the robot stands between two motions.
+/// Time at zero speed between two motions.
 const REST: Duration = Duration::from_secs(1);
-/// How often a motion is tried of a base that falls silent in the middle of it.
+/// Maximum number of attempts at a motion if the base falls silent during it.
 const TRIES_MAX: u32 = 5;
-/// Longest wait for the bus to be left.
+/// Maximum wait for closing the session on the robot's bus.
 const CLOSE_MAX: Duration = Duration::from_secs(2);
-/// Speed of the wheels' rims, metres per second.
+/// Rim speed of the motions, metres per second.
 const RIM_M_S: f64 = 0.2;
 
 /// Arguments of `tread-agent doctor`.
@@ -81,10 +81,11 @@ pub(crate) struct DoctorArgs {
     json: bool,
 }
 
-/// Examines the robot and says what was found; whether all is well.
+/// Examines the robot and prints the findings. Returns whether no problem was found.
 ///
 /// # Errors
-/// The configuration is refused, it is of no ROS 2 robot, or nothing can be written.
+/// The configuration is invalid, the robot has no ROS 2 drive, or standard output cannot be
+/// written.
 pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<bool> {
     let findings = examine(args)?;
     let robot_toml = finding::robot_toml(&findings);
@@ -157,7 +158,7 @@ fn examine(args: &DoctorArgs) -> anyhow::Result<Vec<Finding>> {
     Ok(findings)
 }
 
-/// What moves the robot.
+/// Drive of the examined robot, with the command in effect.
 struct Hands {
     drive: Ros2Drive,
     clock: SharedClock,
@@ -167,7 +168,7 @@ struct Hands {
 }
 
 impl Hands {
-    /// Another node that writes on the command topic.
+    /// Returns a finding if another node publishes on the command topic.
     fn other_commander(&self, settings: &Ros2Settings) -> Option<Finding> {
         let times = self.drive.counts().foreign_commands();
         (times > 0).then(|| {

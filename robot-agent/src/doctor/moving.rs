@@ -124,8 +124,10 @@ pub(super) fn findings(
         model,
         &turned_of_track,
         forward,
-        radius_m,
-        gyro_bias_rad_s,
+        track::Calibration {
+            radius_m,
+            gyro_bias_rad_s,
+        },
     ));
     findings.extend(pulling::findings(settings, model, turned, forward));
     findings
@@ -228,7 +230,7 @@ mod tests {
         range
     }
 
-    /// Both motions of the paper's robot as it should be.
+    /// Returns both motions of the paper's robot without any fault.
     fn healthy() -> [Drove; 2] {
         let turn_rad_s = 2.0 * 0.2 / RobotModel::yi2007().effective_track_m();
         let turned = Drove {
@@ -279,7 +281,7 @@ mod tests {
         found.iter().filter_map(|finding| finding.key).collect()
     }
 
-    /// The paper's base, which has its own track and radius.
+    /// The paper's base, with its own track width and radius.
     fn keys_of(change: impl Fn(&mut Drove, &mut Drove)) -> Vec<&'static str> {
         let [mut turned, mut forward] = healthy();
         change(&mut turned, &mut forward);

@@ -172,8 +172,8 @@ mod tests {
     use super::*;
     use crate::drive::ros2::tests::settings;
 
-    /// A turn and a start of the paper's robot on ground of this friction, its torques times these
-    /// factors.
+    /// Returns a turn and a start of the paper's robot on ground with this friction, with its
+    /// torques multiplied by these factors.
     fn found(effort: Effort, friction: f64, factors: [f64; 2]) -> Option<Finding> {
         let model = RobotModel::yi2007();
         let mut settings = settings();
@@ -197,7 +197,7 @@ mod tests {
             torques: torques(-scrub_n_m, scrub_n_m),
             ..Drove::default()
         };
-        // On a slope that takes half a newton metre of each side, to 2 rad/s within a second.
+        // Uphill with half a newton metre per side, from rest to 2 rad/s within a second.
         let setting_off_n_m = model.mass_kg() * 2.0 * model.wheel_radius_m().powi(2);
         let forward = Drove {
             commanded: speeds(2.0, 2.0),
@@ -251,7 +251,7 @@ mod tests {
             assert_eq!(wrong.key, of_constant, "{}", wrong.text);
             assert!(wrong.text.contains(fits), "{}", wrong.text);
         }
-        // Whatever the ground: on ice the pull itself could be that of a good constant.
+        // On any ground; on ice the friction alone would fit a correct constant.
         for friction in [0.1, 0.3, 1.0] {
             for factor in [10.0, 0.1] {
                 let named = key(constant, friction, [factor, factor]);

@@ -26,17 +26,17 @@ pub(super) struct Answers {
 pub(super) enum Flip {
     /// Left and right joints are swapped.
     Sides,
-    /// The left joints say the opposite.
+    /// The left joints report the opposite sign.
     LeftJoints,
-    /// The right joints say the opposite.
+    /// The right joints report the opposite sign.
     RightJoints,
-    /// The base takes a turn to the right for positive.
+    /// For the base a positive turn rate is a turn to the right.
     TurnCommand,
-    /// The base takes backwards for positive.
+    /// For the base a positive speed is backwards.
     ForwardCommand,
-    /// The gyro says the opposite.
+    /// The gyro reports the opposite sign.
     Gyro,
-    /// The position or the odometry says the opposite.
+    /// Position or odometry shows the opposite direction.
     Ground,
 }
 
@@ -110,7 +110,7 @@ impl Flip {
     }
 }
 
-/// What a robot with these flips answers.
+/// Returns the responses of a robot with these flips.
 fn predicted(flips: &[Flip]) -> Answers {
     let sign = |flip: Flip| if flips.contains(&flip) { -1 } else { 1 };
     let (turned, went) = (sign(Flip::TurnCommand), sign(Flip::ForwardCommand));
@@ -133,7 +133,8 @@ fn predicted(flips: &[Flip]) -> Answers {
     }
 }
 
-/// The smallest sets of flips that explain the answers; a set without flips for a healthy robot.
+/// Returns the smallest sets of flips that explain the responses; one empty set for a robot without
+/// fault.
 pub(super) fn explanations(answers: Answers) -> Vec<Vec<Flip>> {
     let agrees = |known: i8, predicted: i8| known == 0 || known == predicted;
     let mut found: Vec<Vec<Flip>> = (0..1_u32 << Flip::ALL.len())
@@ -157,7 +158,7 @@ pub(super) fn explanations(answers: Answers) -> Vec<Vec<Flip>> {
     found
 }
 
-/// What was found of sides and signs.
+/// Returns the finding on sides and signs.
 pub(super) fn finding(answers: Answers, settings: &Ros2Settings) -> Finding {
     let explanations = explanations(answers);
     let Some(flips) = explanations.first() else {
@@ -186,7 +187,7 @@ pub(super) fn finding(answers: Answers, settings: &Ros2Settings) -> Finding {
     };
     let finding = Finding::wrong("sides", key, text);
     if explanations.len() > 1 {
-        // Which of them is right a person must see.
+        // Several sets of flips explain the responses, so a person has to decide.
         return finding;
     }
     let mend = |finding, flip: &Flip| flip.mend(finding, settings);
@@ -200,7 +201,7 @@ mod tests {
     use super::*;
     use crate::drive::ros2::tests::settings;
 
-    /// A robot as it really is, simulated on its own terms: where its wheels go, and what says so.
+    /// Independent simulation of a robot: the motion of its wheels, and what its sensors report.
     fn robot(flips: &[Flip], sees_ground: bool) -> Answers {
         let is = |flip| flips.contains(&flip);
         let drive = |forward: f64, turn: f64| {
@@ -285,8 +286,7 @@ mod tests {
     }
 
     proptest! {
-        /// Whatever is flipped, what is named explains all answers with no more flips than there
-        /// are.
+        /// The reported flips explain all responses, with at most as many flips as there are.
         #[test]
         fn what_is_named_explains_the_answers(set in 0_u32..128, sees_ground: bool) {
             let flips: Vec<Flip> = Flip::ALL

@@ -1,39 +1,57 @@
-//! The turn command, and what a turn on the spot says of the track width. Pure.
+//! Checks the turn command and the track width by a turn on the spot. Pure.
 //!
-//! Two figures are measured. The first is exact: how fast the wheels turn for a commanded turn says
-//! which track the base itself divides by, whatever the ground. The second is the effective track,
-//! `W_eff = r·(ω_R − ω_L)/ψ̇`, and it depends on the ground. By the balance of moments of four
-//! equal contacts in a turn on the spot
+//! Two quantities are measured. The wheel speeds for a commanded turn rate give the track width
+//! that the base itself uses, exactly and on any ground. The effective track width `W_eff = r·(ω_R
+//! − ω_L)/ψ̇` depends on the ground. By the balance of moments of four equal contacts in a turn on
+//! the spot
 //!
 //! ```text
 //! W_eff = W + α·L²/W,    α = lateral over longitudinal slip stiffness
 //! ```
 //!
-//! Ground with the same friction in all directions has α = 1, whatever its θ, and the tyres of real
-//! robots lie within [`STIFFNESS_RATIO`]. So a configured W is impossible where `W_eff` is below
-//! it, and implausible where α would have to lie outside that range. A W within the range that
-//! `W_eff` allows looks like another ground: that range is said, to be compared with a tape
-//! measure.
+//! Isotropic friction gives α = 1 for any θ; for tyres of real robots α is within
+//! [`STIFFNESS_RATIO`]. A configured W is therefore impossible if `W_eff` is below it, and
+//! implausible if α would be outside that range. A wrong W within the range that `W_eff` allows
+//! cannot be distinguished from another ground: the finding states the range, for comparison with a
+//! tape measure.
 
 use super::drove::{Drove, TurnBlock};
 use super::finding::Finding;
 use crate::drive::ros2::settings::{CommandKind, Ros2Settings};
 use tread_control::robot::RobotModel;
 
-/// Lateral over longitudinal slip stiffness of tyres and ground.
+/// Plausible range of α, the ratio of lateral to longitudinal slip stiffness.
 pub(super) const STIFFNESS_RATIO: std::ops::RangeInclusive<f64> = 0.4..=2.5;
-/// Error of a ratio of commanded and measured speeds that is borne, as a share.
+/// Maximum accepted relative difference of measured and commanded speeds.
 pub(super) const COMMAND_SHARE: f64 = 0.06;
-/// Standard errors on either side of the effective track's interval.
+/// Half-width of the interval of the effective track width, in standard errors.
 const INTERVAL_DEVIATIONS: f64 = 2.4;
-/// Share by which the radius may be off that stands in the effective track.
+/// Relative error of the wheel radius, which widens the interval of the effective track width.
 const RADIUS_SHARE: f64 = 0.02;
-/// Slowest turn of which a track is measured, radians per second.
+/// Minimum turn rate for measuring a track width, radians per second.
 const TURNING_MIN_RAD_S: f64 = 0.02;
-/// Tracks are compared to this, metres.
+/// Difference below which track widths count as equal, metres.
 const SAME_M: f64 = 1.0e-6;
 
-/// The effective track, metres.
+/// Values with which wheel speeds and turn rates are converted.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Calibration {
+    /// Wheel radius in metres: measured over ground if possible, else that of the model.
+    pub(super) radius_m: f64,
+    /// Mean of the gyro while the robot was stopped, radians per second.
+    pub(super) gyro_bias_rad_s: f64,
+}
+
+/// Geometry of a robot's wheels.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Geometry {
+    /// Track width, metres.
+    pub(super) track_m: f64,
+    /// Wheelbase, metres.
+    pub(super) wheelbase_m: f64,
+}
+
+/// Effective track width with its interval, metres.
 #[expect(clippy::struct_field_names, reason = "the unit belongs to every name")]
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct EffectiveTrack {
@@ -43,13 +61,13 @@ pub(super) struct EffectiveTrack {
 }
 
 impl EffectiveTrack {
-    /// From the parts of a turn on the spot; none where it turned too slowly or too little was
-    /// said.
-    pub(super) fn measured(
-        blocks: &[TurnBlock],
-        gyro_bias_rad_s: f64,
-        radius_m: f64,
-    ) -> Option<Self> {
+    /// Measures the effective track width in the blocks of a turn on the spot; `None` if the robot
+    /// turned too slowly or fewer than three blocks were measured.
+    pub(super) fn measured(blocks: &[TurnBlock], calibration: Calibration) -> Option<Self> {
+        let Calibration {
+            radius_m,
+            gyro_bias_rad_s,
+        } = calibration;
         let tracks: Vec<f64> = blocks
             .iter()
             .map(|block| (block.difference_rad_s, block.turn_rad_s - gyro_bias_rad_s))
@@ -72,45 +90,47 @@ impl EffectiveTrack {
         })
     }
 
-    /// Whether a robot of that track can turn so.
-    pub(super) fn allows(&self, track_m: f64, wheelbase_m: f64) -> bool {
+    /// Returns whether a robot with this geometry can have this effective track width.
+    pub(super) fn allows(&self, geometry: Geometry) -> bool {
+        let Geometry {
+            track_m,
+            wheelbase_m,
+        } = geometry;
         let ratio = |effective_m: f64| (effective_m - track_m) * track_m / wheelbase_m.powi(2);
         ratio(self.most_m) >= *STIFFNESS_RATIO.start()
             && ratio(self.least_m) <= *STIFFNESS_RATIO.end()
     }
 
-    /// The track of a robot that turns so with this ratio of stiffnesses, the wider of two; none
-    /// where no track does.
+    /// Returns the track width for an effective track width at the stiffness ratio α = `ratio`, the
+    /// larger one of two solutions; `None` if there is none.
     fn track_m(effective_m: f64, ratio: f64, wheelbase_m: f64) -> Option<f64> {
         let root = effective_m.powi(2) - 4.0 * ratio * wheelbase_m.powi(2);
         (root >= 0.0).then(|| 0.5 * (effective_m + root.sqrt()))
     }
 
-    /// Tracks between which the robot's may lie.
+    /// Returns the smallest and the largest possible track width, metres; `None` if there is none.
     fn range_m(&self, wheelbase_m: f64) -> Option<(f64, f64)> {
         let most_m = Self::track_m(self.most_m, *STIFFNESS_RATIO.start(), wheelbase_m)?;
-        // Below this the same turn may be of a track that is shorter than the wheelbase.
+        // Without a solution, use the bound of tracks shorter than the wheelbase.
         let least = Self::track_m(self.least_m, *STIFFNESS_RATIO.end(), wheelbase_m);
         Some((least.unwrap_or(0.5 * self.least_m), most_m))
     }
 }
 
-/// How fast the wheels turned, over how fast they were commanded to.
+/// Ratios of measured to commanded wheel speeds, in the turn and in the drive forward.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Obeyed {
     turn: f64,
     forward: f64,
 }
 
-/// What was found of the command and of the track. The radius is the one by which the robot went
-/// over ground, where that is known.
+/// Returns the findings on the command and on the track width.
 pub(super) fn findings(
     settings: &Ros2Settings,
     model: &RobotModel,
     turned: &Drove,
     forward: &Drove,
-    radius_m: f64,
-    gyro_bias_rad_s: f64,
+    calibration: Calibration,
 ) -> Vec<Finding> {
     let (Some(turning), Some(going)) = (turned.wheels, forward.wheels) else {
         return Vec::new();
@@ -121,13 +141,13 @@ pub(super) fn findings(
         forward: (going.left_rad_s + going.right_rad_s)
             / (forward.commanded.left_rad_s + forward.commanded.right_rad_s),
     };
-    let effective = EffectiveTrack::measured(&turned.turn_blocks, gyro_bias_rad_s, radius_m);
+    let effective = EffectiveTrack::measured(&turned.turn_blocks, calibration);
     let mut findings = vec![of_radius_of_base(settings, obeyed)];
     findings.extend(of_tracks(settings, model, obeyed, effective));
     findings
 }
 
-/// The radius by which the base turns speeds into the wheels' speeds.
+/// Returns the finding on the wheel radius by which the base converts commands to wheel speeds.
 fn of_radius_of_base(settings: &Ros2Settings, obeyed: Obeyed) -> Finding {
     if (obeyed.forward - 1.0).abs() <= COMMAND_SHARE {
         return Finding::well(
@@ -153,7 +173,7 @@ fn of_radius_of_base(settings: &Ros2Settings, obeyed: Obeyed) -> Finding {
     )
 }
 
-/// The track of the base and that of the model.
+/// Returns the findings on the track widths of the base and of the model.
 fn of_tracks(
     settings: &Ros2Settings,
     model: &RobotModel,
@@ -165,8 +185,14 @@ fn of_tracks(
     let ratio = obeyed.turn / obeyed.forward;
     let is_obeyed = (ratio - 1.0).abs() <= COMMAND_SHARE;
     let base_m = command_m * ratio;
-    let allows = |track_m: f64| effective.is_none_or(|it| it.allows(track_m, wheelbase_m));
-    // Where the command's track is the model's, one wrong figure shows in both.
+    let allows = |track_m: f64| {
+        let geometry = Geometry {
+            track_m,
+            wheelbase_m,
+        };
+        effective.is_none_or(|it| it.allows(geometry))
+    };
+    // If the command uses the model's track width, one wrong value causes both findings.
     let is_one_figure = (model_m - command_m).abs() < SAME_M;
     let is_models = !is_obeyed && is_one_figure && !allows(model_m) && allows(base_m);
     let mut findings = Vec::new();
@@ -256,15 +282,15 @@ mod tests {
     use super::*;
     use crate::drive::ros2::tests::settings;
 
-    /// A robot as it is: four contacts whose forces are worked out one by one.
+    /// Independent model of a robot, with the forces of its four contacts computed individually.
     #[derive(Debug, Clone, Copy)]
     struct Truth {
         track_m: f64,
         wheelbase_m: f64,
         radius_m: f64,
-        /// Lateral over longitudinal stiffness of every contact.
+        /// Ratio of lateral to longitudinal stiffness of every contact.
         ratio: f64,
-        /// The track by which the base turns a turn rate into its wheels' speeds.
+        /// Track width by which the base converts a turn rate to wheel speeds.
         base_track_m: f64,
     }
 
@@ -281,7 +307,7 @@ mod tests {
             moment
         }
 
-        /// The turn rate at which the moments balance, by halving.
+        /// Returns the turn rate at which the moments balance, by bisection.
         fn turn_rad_s(&self, rim_m_s: f64) -> f64 {
             let (mut slow, mut fast) = (0.0, 10.0);
             for _ in 0..80 {
@@ -295,7 +321,8 @@ mod tests {
             0.5 * (slow + fast)
         }
 
-        /// What both motions measure with that track in the configuration's command.
+        /// Returns the measurements of both motions with the track width `command_m` in the
+        /// configured command.
         fn drive(&self, command_m: f64, noise: f64, bias_rad_s: f64) -> [Drove; 2] {
             let commanded = 0.2 / self.radius_m;
             let wheels_rad_s = commanded * self.base_track_m / command_m;
@@ -348,8 +375,10 @@ mod tests {
                 &model,
                 &turned,
                 &forward,
-                self.radius_m,
-                bias_rad_s,
+                Calibration {
+                    radius_m: self.radius_m,
+                    gyro_bias_rad_s: bias_rad_s,
+                },
             )
         }
     }
@@ -375,7 +404,7 @@ mod tests {
 
     #[test]
     fn a_track_of_six_tenths_on_a_robot_of_0_43_m_is_the_models_and_nothing_else() {
-        // The command takes the model's track where it is not configured itself.
+        // The command uses the model's track width unless it has its own.
         for command_m in [0.6, 0.43] {
             let found = PAPER.examined(0.6, command_m, 0.01, 0.0);
             assert_eq!(keys(&found), ["model.track_width_m"], "{found:#?}");
@@ -431,7 +460,7 @@ mod tests {
     }
 
     proptest! {
-        /// No robot whose configuration is right is blamed, on any ground within the range.
+        /// A correct configuration gives no finding, on any ground within the range.
         #[test]
         fn a_right_track_is_never_blamed(
             track_m in 0.2_f64..1.2,
@@ -451,7 +480,7 @@ mod tests {
             prop_assert_eq!(keys(&found), Vec::<&str>::new());
         }
 
-        /// The interval holds what was put in.
+        /// The interval contains the true value.
         #[test]
         fn the_effective_track_lies_in_its_interval(
             track_m in 0.2_f64..1.2,
@@ -462,13 +491,14 @@ mod tests {
             let wheelbase_m = wheelbase_share * track_m;
             let truth = Truth { track_m, wheelbase_m, radius_m: 0.1, ratio, base_track_m: track_m };
             let [turned, _] = truth.drive(track_m, noise, 0.0);
-            let found = EffectiveTrack::measured(&turned.turn_blocks, 0.0, 0.1).unwrap();
+            let calibration = Calibration { radius_m: 0.1, gyro_bias_rad_s: 0.0 };
+            let found = EffectiveTrack::measured(&turned.turn_blocks, calibration).unwrap();
             let expected_m = track_m + ratio * wheelbase_m.powi(2) / track_m;
             prop_assert!(found.least_m < expected_m && expected_m < found.most_m, "{found:?} {expected_m}");
             prop_assert!(found.most_m - found.least_m < 0.25 * expected_m);
         }
 
-        /// A track so wide that the robot turns within it is always named.
+        /// A configured track width above the effective one is always reported.
         #[test]
         fn a_track_wider_than_the_effective_one_is_always_named(
             track_m in 0.2_f64..1.2,

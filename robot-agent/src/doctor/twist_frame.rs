@@ -1,8 +1,8 @@
-//! In which frame the odometry's motion is. Pure.
+//! Checks the frame of the odometry's twist. Pure.
 //!
-//! The motion in `nav_msgs/Odometry` is of the frame `child_frame_id`: forward and to the left of the
-//! robot. Where its writer put it into the frame of the pose, it points where the robot heads, and
-//! is right only while that is along the x axis.
+//! The twist in `nav_msgs/Odometry` is defined in the frame `child_frame_id`: forward and to the
+//! left of the robot. If the publisher writes it in the frame of the pose instead, its direction is
+//! the robot's heading, which is correct only while the robot heads along the x axis.
 
 use std::f64::consts::PI;
 
@@ -11,25 +11,27 @@ use tread_control::geometry::wrap_angle_rad;
 use super::drove::PlanarTwist;
 use super::finding::Finding;
 
-/// Angle up to which a motion counts as straight ahead, radians.
+/// Angle up to which a motion counts as straight forward, radians.
 pub(super) const FORWARD_MAX_RAD: f64 = 0.35;
-/// Share of the wheels' speed below which the odometry says nothing of direction.
+/// Ratio to the rim speed below which the direction of the odometry is not used.
 const SPEED_MIN_SHARE: f64 = 0.3;
 
-/// Whether the robot heads along the x axis of its odometry's frame, where both frames look alike.
+/// Returns whether the robot heads along the x axis of the odometry's frame, where the twist is
+/// equal in both frames.
 pub(super) fn is_along_x(heading_rad: f64) -> bool {
     wrap_angle_rad(heading_rad).abs() < 1.5 * FORWARD_MAX_RAD
 }
 
-/// Whether the motion is in the wrong frame; nothing of a robot whose odometry does not move.
+/// Returns a finding if the twist is in the wrong frame; `None` if not, or if the odometry shows no
+/// motion.
 ///
-/// The wheels' rims are commanded to that speed, and the joints of the left and the right say that
-/// they turn ahead (1) or back (-1). Where these disagree, one of them is inverted and nobody knows
-/// which way the robot went.
+/// `rim_m_s` is the commanded rim speed, and `joints` are the measured directions `[left, right]`,
+/// 1 for forward and -1 for backward. If they differ, one of them is inverted and the direction of
+/// the robot is unknown.
 pub(super) fn finding(twist: &PlanarTwist, rim_m_s: f64, joints: [i8; 2]) -> Option<Finding> {
     let speed_m_s = twist.x_m_s.hypot(twist.y_m_s);
     (speed_m_s > SPEED_MIN_SHARE * rim_m_s.abs()).then_some(())?;
-    // A robot that goes backwards is judged by its back.
+    // For a robot that drives backward, the direction is relative to its back.
     let back_rad = if joints == [-1, -1] { PI } else { 0.0 };
     let direction_rad = wrap_angle_rad(twist.y_m_s.atan2(twist.x_m_s) - back_rad);
     let is_along = direction_rad.abs() >= PI - FORWARD_MAX_RAD;
@@ -46,7 +48,7 @@ pub(super) fn finding(twist: &PlanarTwist, rim_m_s: f64, joints: [i8; 2]) -> Opt
         );
         return Some(Finding::wrong("twist", key, text));
     }
-    // Straight backwards is a matter of signs.
+    // A twist straight backward is a matter of signs.
     if is_along {
         return None;
     }
@@ -111,7 +113,7 @@ mod tests {
     #[test]
     fn joints_of_which_one_is_inverted_do_not_make_a_twist_wrong() {
         for joints in [[-1, 1], [1, -1]] {
-            // The robot turned half around before, and went back or ahead.
+            // The robot had turned by half a turn, and drove backward or forward.
             for direction_rad in [0.02, PI - 0.02] {
                 let twist = twist(direction_rad, PI - 0.01);
                 assert_eq!(finding(&twist, RIM_M_S, joints), None);

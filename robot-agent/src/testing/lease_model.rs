@@ -1,7 +1,8 @@
-//! Random drivers on a random network, against a model that knows what was sent.
+//! Model-based test of the teleoperation lease: random drivers on a random network.
 //!
-//! Messages are lost, delayed, doubled and reordered; drivers come, take, go silent and come back;
-//! old runs and old leases speak. The model knows from the messages alone which commands count.
+//! Messages are lost, delayed, duplicated and reordered. Drivers acquire leases, take them over,
+//! fall silent and return; messages of old boots and old leases arrive. A reference model derives
+//! from the messages alone which commands have to be accepted.
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -14,9 +15,9 @@ use uuid::Uuid;
 
 use crate::safety::operator::{LeaseRefusal, Operator, Verdict};
 
-/// Drivers that compete.
+/// Number of competing drivers.
 const DRIVERS: usize = 4;
-/// Messages that are under way at a time.
+/// Maximum number of messages in flight.
 const UNDER_WAY_MAX: usize = 64;
 
 fn boot(number: u128) -> BootId {
@@ -30,35 +31,35 @@ fn driver(number: usize) -> Driver {
     }
 }
 
-/// What a run of the model found.
+/// Result of a run of the model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct LeaseModelReport {
-    /// Steps of the model.
+    /// Number of steps.
     pub steps: u64,
-    /// Leases that were given.
+    /// Number of leases granted.
     pub leases: u64,
-    /// Commands that were taken and should not have been.
+    /// Number of commands accepted that the reference refuses.
     pub wrongly_accepted: u64,
-    /// Commands that were not taken and should have been.
+    /// Number of commands refused that the reference accepts.
     pub wrongly_refused: u64,
-    /// Commands that lasted beyond their end.
+    /// Number of commands in effect beyond their end time.
     pub outlived: u64,
-    /// Leases that were given away while somebody had them, or epochs that fell.
+    /// Number of leases granted while another driver held one, or with a decreasing epoch.
     pub stolen: u64,
-    /// What became of the commands.
+    /// Counts of the robot's verdicts on commands.
     pub counts: DriveCounts,
 }
 
-/// What the model runs.
+/// Parameters of a run of the model.
 #[derive(Debug, Clone, Copy)]
 pub struct LeaseModelRun {
-    /// Steps of its world.
+    /// Number of steps.
     pub steps: u64,
-    /// Seed of its random numbers.
+    /// Seed of the random numbers.
     pub seed: u64,
 }
 
-/// Runs the model.
+/// Runs the model and compares the robot with the reference.
 pub fn run(LeaseModelRun { steps, seed }: LeaseModelRun) -> LeaseModelReport {
     let mut world = World::new(seed);
     for _ in 0..steps {
@@ -78,23 +79,23 @@ enum Message {
     Drive(DriveCommand, usize),
 }
 
-/// A driver's side: which lease it believes to have.
+/// State of a driver: the lease that it assumes to hold.
 #[derive(Debug, Clone, Copy, Default)]
 struct Side {
     epoch: Option<u64>,
     seq: u64,
 }
 
-/// What must hold, by the messages alone.
+/// Reference state, derived from the messages alone.
 #[derive(Debug, Default)]
 struct Truth {
-    /// Who was given which epoch.
+    /// Granted epochs, each with the number of its driver.
     granted: Vec<(u64, usize)>,
-    /// The greatest number taken in the newest lease.
+    /// Largest accepted sequence number of the newest lease.
     last_seq: Option<u64>,
-    /// Until when what was last taken lasts.
+    /// End time of the last accepted command, microseconds.
     until_us: u64,
-    /// When the driver was last heard, if the lease was not given back.
+    /// Time of the driver's last message, microseconds; `None` after the release of the lease.
     heard_us: Option<u64>,
 }
 
@@ -113,7 +114,7 @@ struct World {
     truth: Truth,
     now_us: u64,
     requests: u128,
-    /// Requests by which a lease was given back.
+    /// Requests that released a lease.
     released: Vec<Uuid>,
     report: LeaseModelReport,
 }
@@ -201,7 +202,7 @@ impl World {
         self.post(&Message::Drive(command, number));
     }
 
-    /// Who was named if the lease was refused for somebody.
+    /// Requests the lease. Returns the holder named in a refusal.
     fn acquire(
         &mut self,
         command: &AcquireLease,
@@ -226,7 +227,7 @@ impl World {
         let present = self.operator.lease_at(self.now_us);
         let is_its_own = present.is_some_and(|lease| lease.driver == driver(number));
         self.report.stolen += u64::from(!is_its_own);
-        // The driver hears of it, as often as not.
+        // The answer reaches the driver with a probability of 0.9.
         if self.chance(0.9) {
             self.sides[number] = Side {
                 epoch: Some(epoch),
@@ -236,7 +237,7 @@ impl World {
         None
     }
 
-    /// Who was named if somebody else has the lease.
+    /// Releases the lease. Returns the holder named in a refusal.
     fn release(&mut self, command: &ReleaseLease) -> Option<Driver> {
         let is_known = self.released.contains(&command.request);
         match self.operator.release(command, self.now_us) {
@@ -296,7 +297,7 @@ impl World {
     fn step(&mut self) {
         self.now_us += self.random.random_range(0..20_000);
         if self.chance(0.0005) {
-            // Everybody is silent for a while.
+            // All drivers are silent for a while.
             self.now_us += 6_000_000;
         }
         self.act();

@@ -1,7 +1,8 @@
-//! The loop on a bench: the agent's own tick with a simulated base, stepped tick by tick.
+//! Test bench of the control loop: runs the agent's own tick with a simulated base, step by step.
 //!
-//! No thread, no clock, no network, so runs repeat to the bit and go as fast as the machine does.
-//! For tests, figures and benchmarks: compiled for tests and with the feature `testing`.
+//! The bench uses no thread, machine clock or network, so runs are reproducible to the bit and
+//! faster than real time. It is compiled for tests, reports and benchmarks, with the feature
+//! `testing`.
 
 pub mod lease_model;
 
@@ -50,27 +51,27 @@ use crate::safety::stop::StopState;
 use crate::safety::{Safety, answers, microseconds};
 use crate::sim::scenario::Scenario;
 
-/// Time between two ticks on the bench.
+/// Period of the bench's ticks.
 pub const PERIOD: Duration = Duration::from_millis(10);
 
-/// When the bench begins, by its clock.
+/// Monotonic time at which the bench starts.
 const START_AT: Duration = Duration::from_secs(1);
 
-/// The run of the agent that the bench stands for.
+/// Returns the boot identifier of the bench's agent.
 pub fn boot() -> BootId {
     BootId::from_uuid(Uuid::from_u128(1))
 }
 
-/// Why the bench could not do what it was asked.
+/// Error of a request to the bench.
 #[derive(Debug, thiserror::Error)]
 pub enum BenchError {
-    /// The robot has not had a position fix yet.
+    /// The robot has no position fix yet.
     #[error("the robot does not know yet where it is")]
     NoPose,
     /// The trajectory cannot be driven.
     #[error("the trajectory cannot be driven: {0}")]
     Impossible(String),
-    /// The loop is gone.
+    /// The loop no longer accepts commands.
     #[error("the loop takes no commands any more")]
     Gone,
 }
@@ -81,9 +82,9 @@ impl<T> From<SendError<T>> for BenchError {
     }
 }
 
-/// A base whose time passes by explicit steps.
+/// Drive of a simulated base that advances in explicit steps.
 pub trait SteppedDrive: Drive {
-    /// Moves the base on to `now`.
+    /// Simulates the base up to `now`.
     fn advance(&mut self, now: Duration);
 }
 
@@ -106,26 +107,26 @@ pub struct Bench<D = SimulatedDrive> {
     pub(crate) segments: Vec<ClosedSegment>,
     pub(crate) starts: Vec<MissionId>,
     pub(crate) ended: Vec<(MissionId, EndReason)>,
-    /// Pauses, resumptions and new revisions, as they were reported.
+    /// Reported pauses, resumptions and new revisions of missions.
     pub(crate) news: Vec<MissionPhase>,
-    /// How long before it stood the last pause for safety had begun.
+    /// Time from the start of the last safety pause until the robot stopped.
     pub(crate) paused_for: Option<jiff::SignedDuration>,
-    /// Longest silence of the server that missions bear from now on.
+    /// Maximum silence of the server for missions planned from now on.
     pub(crate) silence_max: Option<Duration>,
-    /// What a map knows along the path of missions from now on.
+    /// Prior along the path for missions planned from now on.
     prior: Option<PathPrior>,
-    /// The record of the last mission that ended.
+    /// Driven path of the last mission that ended.
     pub(crate) last_driven: Option<Driven>,
-    /// Distance from the path when the last mission ended.
+    /// Cross-track error at the end of the last mission, metres.
     pub(crate) cross_track_m: f64,
-    /// Who records, if anybody does, and what waits for him.
+    /// Writer of the recording, if enabled, and the queue of its input.
     record: Option<(RecordWriter, Notes)>,
 }
 
-/// The site of a scenario as a server would define it.
+/// Returns the definition of a scenario's site, as a server would send it.
 ///
 /// # Errors
-/// A sentence on a polygon that is none; a parsed scenario has no such.
+/// A message on an invalid polygon, which a parsed scenario does not contain.
 pub fn site_of(scenario: &Scenario) -> Result<SiteDefinition, String> {
     let mut terrains = Vec::with_capacity(scenario.terrains.len());
     for terrain in &scenario.terrains {
@@ -154,7 +155,7 @@ fn mission_of(number: u128) -> MissionId {
     MissionId::from_uuid(Uuid::from_u128(number))
 }
 
-/// A base whose sensors say what is no number.
+/// Drive whose sensors report NaN.
 struct Nonsense;
 
 impl Drive for Nonsense {
@@ -175,7 +176,7 @@ impl Drive for Nonsense {
     fn write(&mut self, _: WheelSpeeds) {}
 }
 
-/// A base that does not know where it is.
+/// Drive without position fixes.
 struct Blind<'base, D>(&'base mut D);
 
 impl<D: Drive> Drive for Blind<'_, D> {
@@ -195,7 +196,7 @@ impl<D: Drive> Drive for Blind<'_, D> {
     }
 }
 
-/// A base that is not heard, though it hears.
+/// Drive that receives commands but whose messages are lost.
 struct Unheard<'base, D>(&'base mut D);
 
 impl<D: Drive> Drive for Unheard<'_, D> {
@@ -209,7 +210,7 @@ impl<D: Drive> Drive for Unheard<'_, D> {
     }
 }
 
-/// A base whose sensors say the same for ever, with fresh stamps, though it moves.
+/// Drive of a moving base whose sensors report constant values with current stamps.
 #[cfg(test)]
 struct Frozen<'base, D> {
     base: &'base mut D,
@@ -233,7 +234,7 @@ impl<D: Drive> Drive for Frozen<'_, D> {
     }
 }
 
-/// A base that says nothing.
+/// Drive without any messages.
 struct Silence;
 
 impl Drive for Silence {
@@ -245,26 +246,26 @@ impl Drive for Silence {
 }
 
 impl LoopCore {
-    /// One tick that takes no time; see [`Self::tick_by`].
+    /// Runs one tick that takes no time; see [`Self::tick_by`].
     fn tick(&mut self, now: Moment, stop: bool, drive: &mut dyn Drive) {
         self.tick_by(now, &|| now.monotonic, stop, drive);
     }
 }
 
 impl Bench {
-    /// The paper's robot at rest on a scenario's ground.
+    /// Creates a bench with the paper's robot, stopped at `start` on a scenario's ground.
     ///
     /// # Errors
-    /// [`SimulatedDriveError`] when the start is no pose.
+    /// [`SimulatedDriveError`] if `start` is not finite.
     pub fn new(scenario: &Scenario, start: Pose, seed: u64) -> Result<Self, SimulatedDriveError> {
         let model = RobotModel::yi2007();
         let individual = Individual::of_seed(seed);
         let drive = SimulatedDrive::new(scenario, model, start, individual, SimMode::Explicit)?;
-        // A simulated robot is as its model says.
+        // A simulated robot equals its model.
         Ok(Self::with_drive(drive, model).with_prior(EstimatorPrior::exact()))
     }
 
-    /// Records from now on, before the first tick.
+    /// Starts a recording; call it before the first tick.
     pub fn record(&mut self, config: RecordingConfig, site: SiteId, robot: RobotId) {
         let head = RunHead {
             format: FORMAT,
@@ -288,13 +289,13 @@ impl Bench {
 }
 
 impl<D: SteppedDrive> Bench<D> {
-    /// A base, driven by an agent that is configured with this model.
+    /// Creates a bench with a base and an agent that is configured with this model.
     pub fn with_drive(drive: D, model: RobotModel) -> Self {
         let (loop_ends, ends) = loop_channels();
         let clock = Arc::new(ManualClock::new(Timestamp::UNIX_EPOCH));
         clock.advance(START_AT);
         let safety = Safety::open(
-            // Nothing is there, and nothing is written while nobody waits for a confirmation.
+            // The folder does not exist; nothing is written without a pending confirmation.
             Path::new("no-such-folder"),
             StopState::default(),
             boot(),
@@ -324,19 +325,19 @@ impl<D: SteppedDrive> Bench<D> {
         }
     }
 
-    /// The same, with what is known beforehand of the robot.
+    /// Sets the estimator's prior.
     #[must_use]
     pub fn with_prior(mut self, prior: EstimatorPrior) -> Self {
         self.core = self.core.with_prior(prior);
         self
     }
 
-    /// The base.
+    /// Returns the drive.
     pub fn drive(&self) -> &D {
         &self.drive
     }
 
-    /// What the robot measured of the present ground, as it reports it.
+    /// Returns the reported θ of the present ground; `None` without an estimate.
     pub fn theta(&self) -> Option<ThetaEstimate> {
         self.ends.shared.snapshot().theta_measured
     }
@@ -361,14 +362,15 @@ impl<D: SteppedDrive> Bench<D> {
         &mut self.drive
     }
 
-    /// Writes what was noted, if it is to be recorded.
+    /// Writes the pending input of the recording, if there is one.
     fn write_record(&mut self) {
         if let Some((writer, notes)) = &mut self.record {
             writer.drain(notes);
         }
     }
 
-    /// Ends the record; notes that found no room.
+    /// Ends the recording. Returns the number of notes that were dropped because the queue was
+    /// full.
     pub fn end_record(&mut self) -> u64 {
         self.write_record();
         self.core.record_to(None);
@@ -379,16 +381,16 @@ impl<D: SteppedDrive> Bench<D> {
         notes.lost.load(Ordering::Relaxed)
     }
 
-    /// Tells the loop of its site.
+    /// Sends the definition of the site to the loop.
     ///
     /// # Errors
-    /// [`BenchError::Gone`].
+    /// [`BenchError::Gone`] if the loop accepts no commands.
     pub fn know_site(&mut self, definition: SiteDefinition) -> Result<(), BenchError> {
         let view = Arc::new(SiteView::new(definition));
         Ok(self.ends.commands.send(LoopCommand::Site(view))?)
     }
 
-    /// Tells the robot what a map knows, from its next mission on.
+    /// Sets the prior along the path, from the next mission on.
     pub fn tell(&mut self, prior: &PathPrior) {
         self.prior = Some(prior.clone());
     }
@@ -417,10 +419,11 @@ impl<D: SteppedDrive> Bench<D> {
         origin.job(plan, model).map_err(BenchError::Impossible)
     }
 
-    /// Plans a trajectory from where the robot stands and hands it to the loop.
+    /// Plans a trajectory from the robot's pose and starts it as mission `number`.
     ///
     /// # Errors
-    /// [`BenchError`] when the robot does not know where it is or the trajectory is impossible.
+    /// [`BenchError::NoPose`] without a position fix, [`BenchError::Impossible`] if the trajectory
+    /// cannot be driven, [`BenchError::Gone`] if the loop accepts no commands.
     pub fn begin(
         &mut self,
         number: u128,
@@ -434,8 +437,8 @@ impl<D: SteppedDrive> Bench<D> {
         Ok(mission)
     }
 
-    /// Holds the active mission for its next revision, plans that from where the robot comes to
-    /// stand, and hands it to the loop.
+    /// Holds the active mission, plans its next revision from the pose at which the robot stops,
+    /// and sends it to the loop.
     ///
     /// # Errors
     /// As [`Bench::begin`].
@@ -456,10 +459,10 @@ impl<D: SteppedDrive> Bench<D> {
         Ok(self.ends.commands.send(LoopCommand::Replace(job))?)
     }
 
-    /// Pauses the active mission, or lets it go on.
+    /// Pauses the active mission if `is_wanted`, else resumes it.
     ///
     /// # Errors
-    /// [`BenchError::Gone`].
+    /// [`BenchError::Gone`] if the loop accepts no commands.
     pub fn pause(&mut self, mission: MissionId, is_wanted: bool) -> Result<(), BenchError> {
         let command = if is_wanted {
             LoopCommand::Hold(mission, Hold::Pause)
@@ -469,37 +472,38 @@ impl<D: SteppedDrive> Bench<D> {
         Ok(self.ends.commands.send(command)?)
     }
 
-    /// Moves the base on by one period.
+    /// Simulates the base for one period.
     pub fn simulate(&mut self) {
         self.pass_time(PERIOD);
         self.drive.advance(self.now);
     }
 
-    /// Lets time pass.
+    /// Advances the bench's clock without a tick.
     pub fn pass_time(&mut self, time: Duration) {
         self.now += time;
         self.clock.advance(time);
     }
 
-    /// The time of the bench.
+    /// Returns the monotonic time of the bench.
     pub fn now(&self) -> Duration {
         self.now
     }
 
-    /// The robot's clock, on which end times are, microseconds.
+    /// Returns the robot's monotonic clock, to which end times refer, in microseconds.
     pub fn now_us(&self) -> u64 {
         microseconds(self.now)
     }
 
-    /// Acquires or takes the lease of teleoperation, and says its epoch.
+    /// Acquires or takes over the teleoperation lease, and returns its epoch.
     ///
     /// # Errors
-    /// The robot's refusal.
+    /// [`CommandRefusal`] if the robot refuses the lease.
     pub fn lease(&self, command: &AcquireLease) -> Result<u64, CommandRefusal> {
         answers::acquire_lease(&self.safety, command)
     }
 
-    /// Hands over a drive command as it comes from the network; true if it counts.
+    /// Passes a drive command, as received from the network, to the robot. Returns whether it was
+    /// accepted.
     pub fn teleoperate(&self, payload: &[u8]) -> bool {
         let accepted = || {
             let status = self.safety.drive_status();
@@ -510,12 +514,12 @@ impl<D: SteppedDrive> Bench<D> {
         accepted() > before
     }
 
-    /// Whether the wheels' target is zero.
+    /// Returns whether the target of the wheel speeds is zero.
     pub fn target_rests(&self) -> bool {
         self.ends.shared.snapshot().gate.target_rests
     }
 
-    /// Whether the robot stands.
+    /// Returns whether the robot is stopped.
     pub fn stands(&self) -> bool {
         self.core.stands()
     }
@@ -527,13 +531,14 @@ impl<D: SteppedDrive> Bench<D> {
         }
     }
 
-    /// One tick of the loop alone; with `stop`, the robot brakes and its mission ends.
+    /// Runs one tick of the loop alone, without simulating the base. With `stop`, the robot brakes
+    /// and its mission ends.
     pub fn tick_loop(&mut self, stop: bool) {
         let now = self.moment();
         self.core.tick(now, stop, &mut self.drive);
     }
 
-    /// One period in which the base says nothing and does nothing.
+    /// Runs one period in which the base sends nothing and does not move.
     pub fn tick_without_base(&mut self) {
         self.pass_time(PERIOD);
         let now = self.moment();
@@ -541,7 +546,7 @@ impl<D: SteppedDrive> Bench<D> {
         self.collect();
     }
 
-    /// One period in which the base says nothing but nonsense.
+    /// Runs one period in which the sensors report NaN.
     pub fn tick_with_nonsense(&mut self) {
         self.pass_time(PERIOD);
         let now = self.moment();
@@ -549,7 +554,7 @@ impl<D: SteppedDrive> Bench<D> {
         self.collect();
     }
 
-    /// One period in which nothing says where the robot is.
+    /// Runs one period without position fixes.
     pub fn tick_without_position(&mut self) {
         self.simulate();
         let now = self.moment();
@@ -557,7 +562,7 @@ impl<D: SteppedDrive> Bench<D> {
         self.collect();
     }
 
-    /// A tick in which the base follows its command, but sends no message.
+    /// Runs one period in which the base follows its command but its messages are lost.
     pub fn tick_unheard(&mut self) {
         self.simulate();
         let now = self.moment();
@@ -565,7 +570,8 @@ impl<D: SteppedDrive> Bench<D> {
         self.collect();
     }
 
-    /// A tick whose thread gets no time for a while before it judges what is wanted.
+    /// Runs one period whose thread is suspended for `time` between reading the clock and
+    /// evaluating commands.
     #[cfg(test)]
     pub(crate) fn tick_interrupted(&mut self, time: Duration) {
         self.simulate();
@@ -576,7 +582,8 @@ impl<D: SteppedDrive> Bench<D> {
         self.collect();
     }
 
-    /// A tick of a base that follows its command, and whose sensors say this and nothing else.
+    /// Runs one period in which the base follows its command but its sensors report the constant
+    /// `said`.
     #[cfg(test)]
     pub(crate) fn tick_frozen(&mut self, said: SensorSample) {
         self.simulate();
@@ -586,7 +593,7 @@ impl<D: SteppedDrive> Bench<D> {
         self.collect();
     }
 
-    /// Takes what the loop has reported.
+    /// Processes the events that the loop has reported.
     pub fn collect(&mut self) {
         self.write_record();
         for event in self.ends.events.try_iter() {
@@ -614,14 +621,14 @@ impl<D: SteppedDrive> Bench<D> {
         }
     }
 
-    /// One whole period: base, loop, reports.
+    /// Runs one complete period: base, loop, events.
     pub fn tick(&mut self) {
         self.simulate();
         self.tick_loop(false);
         self.collect();
     }
 
-    /// So many whole periods as fit.
+    /// Runs complete periods until `time` has passed.
     pub fn run_for(&mut self, time: Duration) {
         let until = self.now + time;
         while self.now < until {
@@ -629,13 +636,13 @@ impl<D: SteppedDrive> Bench<D> {
         }
     }
 
-    /// How a mission ended, if it has.
+    /// Returns the final phase of a mission; `None` if it has not ended.
     pub fn end_of(&self, mission: MissionId) -> Option<MissionPhase> {
         let ended = self.ended.iter().find(|(ended, _)| *ended == mission);
         ended.map(|(_, reason)| reason.phase())
     }
 
-    /// How many segments were closed so far.
+    /// Returns the number of segments closed so far.
     pub fn segment_count(&self) -> usize {
         self.segments.len()
     }

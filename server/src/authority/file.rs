@@ -1,20 +1,22 @@
-//! The authority on the disk: certificate and key, in a folder of their own.
+//! Stores the certificate authorities on the disk, with certificates and keys in a folder of their
+//! own.
 //!
-//! A rotation adds the next authority, and each of its steps replaces or renames one file, so that a
-//! crash between any two of them leaves what [`Folder::recover`] completes or takes back:
+//! Each step of a rotation writes, renames or removes one file atomically. After a crash between
+//! two steps [`Folder::recover`] completes or undoes the change:
 //!
 //! ```text
 //!  start   next.key, next.json ── next.pem ◄─ from here on the next authority signs
 //!  finish  ca.pem → retired-….pem ◄─ from here on the former is retired
-//!          next.key → ca.key (its key is gone), next.pem → ca.pem, next.json removed
+//!          next.key → ca.key (deletes the former key), next.pem → ca.pem, next.json removed
 //!  replace replacing.key ── replacing.pem ◄─ from here on all others are retired
 //!          ca.pem and next.pem → retired-….pem, next.key and next.json removed,
 //!          replacing.key → ca.key, replacing.pem → ca.pem
 //! ```
 //!
-//! A step is done when the folder shows it, and kept when the disk has confirmed it. What retires an
-//! authority counts from when it is done: to trust it again would be worse. What makes one begins only
-//! when it is kept: a power cut must not take an authority away that has signed.
+//! A step is *done* when the file system shows it, and *durable* when `fsync` of the folder has
+//! succeeded. The retirement of an authority takes effect when its step is done, because trusting
+//! the authority again would be worse. A new authority takes effect only when its step is durable,
+//! because a power failure must not delete an authority that has signed certificates.
 
 use std::fs::{self, DirBuilder, File, OpenOptions};
 use std::io::{self, Write as _};
@@ -30,30 +32,30 @@ use tracing::{error, warn};
 
 use super::{Authority, fingerprint};
 
-/// The authority's certificate, in its folder.
+/// File with the authority's certificate.
 pub const CERTIFICATE_FILE: &str = "ca.pem";
-/// The authority's key, in its folder.
+/// File with the authority's private key.
 pub const KEY_FILE: &str = "ca.key";
-/// During a rotation the certificate of the authority that signs by now, beside the former one's.
+/// File with the certificate of the new authority during a rotation.
 pub const NEXT_CERTIFICATE_FILE: &str = "next.pem";
-/// Its key.
+/// File with the private key of the new authority during a rotation.
 const NEXT_KEY_FILE: &str = "next.key";
-/// Who started the rotation, and when.
+/// File with [`Started`]: the time of the rotation's start and who started it.
 const ROTATION_FILE: &str = "next.json";
-/// The certificate and the key of the authority that replaces all others.
+/// Files with certificate and private key of an authority that replaces all others.
 const REPLACING_CERTIFICATE_FILE: &str = "replacing.pem";
 const REPLACING_KEY_FILE: &str = "replacing.key";
-/// Others may read a certificate, and its owner alone a key.
+/// File modes: all users may read a certificate, and only the owner a key.
 const CERTIFICATE_MODE: u32 = 0o644;
 const KEY_MODE: u32 = 0o600;
-/// What the certificate of a retired authority is called, around the begin of its fingerprint.
+/// Prefix and suffix of the file name of a retired authority's certificate, around its fingerprint.
 const RETIRED_PREFIX: &str = "retired-";
 const RETIRED_SUFFIX: &str = ".pem";
-/// Digits of the fingerprint in that name.
+/// Number of leading digits of the fingerprint in the file name of a retired authority.
 const RETIRED_DIGITS: usize = 16;
-/// Most retired authorities that are read, the newest by the time of their retirement.
+/// Maximum number of retired authorities that are read, those retired last; older ones are ignored.
 const RETIRED_MAX: usize = 8;
-/// The files of a rotation that was never complete.
+/// Files of a rotation that was interrupted before it took effect.
 const INCOMPLETE_ROTATION: [&str; 5] = [
     NEXT_KEY_FILE,
     ROTATION_FILE,
@@ -61,62 +63,62 @@ const INCOMPLETE_ROTATION: [&str; 5] = [
     "next.json.new",
     "next.pem.new",
 ];
-/// The files of a replacement that was never complete.
+/// Files of a replacement that was interrupted before it took effect.
 const INCOMPLETE_REPLACEMENT: [&str; 3] =
     [REPLACING_KEY_FILE, "replacing.key.new", "replacing.pem.new"];
 
-/// Why the authority cannot be used.
+/// Error of the authority's files.
 #[derive(Debug, thiserror::Error)]
 pub enum AuthorityError {
-    /// There is one already.
+    /// The folder already contains an authority.
     #[error("there is a fleet's authority in `{}` already; robots trust it, so it stays", .0.display())]
     Exists(PathBuf),
     /// A file cannot be read.
     #[error("cannot read `{}`; `tread-server init` makes the fleet's authority", path.display())]
     Unreadable {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// Why.
+        /// Cause of the failure.
         #[source]
         cause: io::Error,
     },
     /// A file cannot be written.
     #[error("cannot write `{}`", path.display())]
     Unwritable {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// Why.
+        /// Cause of the failure.
         #[source]
         cause: io::Error,
     },
-    /// A file was written, the disk has not confirmed it, and it could not be removed for certain.
+    /// A file was written, `fsync` failed, and its removal is not confirmed either.
     #[error(
         "cannot write `{}`, nor take it back for certain",
         path.display()
     )]
     NotTakenBack {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// Why.
+        /// Cause of the failure.
         #[source]
         cause: io::Error,
     },
-    /// Others than the owner can read the key.
+    /// Other users than the owner can read the private key.
     #[error("others can read `{}`: make it `chmod 600`, and a new authority if they may have", .0.display())]
     Open(PathBuf),
-    /// Certificate and key are none, or not of each other.
+    /// Certificate or key is invalid, or they do not belong together.
     #[error("certificate and key in `{}` cannot be used", folder.display())]
     Unusable {
-        /// Where they are.
+        /// Folder of the files.
         folder: PathBuf,
-        /// Why.
+        /// Cause of the failure.
         #[source]
         cause: rcgen::Error,
     },
 }
 
 impl AuthorityError {
-    /// What became of a change that was asked for.
+    /// Returns a clause for messages that states whether the failed change had an effect.
     pub fn what_became(&self) -> &'static str {
         match self {
             Self::NotTakenBack { .. } => {
@@ -133,10 +135,11 @@ impl AuthorityError {
 }
 
 impl Authority {
-    /// Makes a new authority in a folder, which is made if it is missing.
+    /// Generates a new authority in a folder, which is created if missing.
     ///
     /// # Errors
-    /// There is one, or the folder cannot be written.
+    /// [`AuthorityError::Exists`] if the folder has an authority, [`AuthorityError::Unwritable`] if
+    /// it cannot be written.
     pub fn create(folder: &Path, now: Timestamp) -> Result<Self, AuthorityError> {
         let (certificate, key) = (folder.join(CERTIFICATE_FILE), folder.join(KEY_FILE));
         let next = folder.join(NEXT_CERTIFICATE_FILE);
@@ -161,7 +164,8 @@ impl Authority {
     /// Reads the authority in a folder.
     ///
     /// # Errors
-    /// There is none, others can read its key, or it cannot be used.
+    /// [`AuthorityError::Unreadable`] if there is none, [`AuthorityError::Open`] if other users can
+    /// read its key, [`AuthorityError::Unusable`] if certificate and key do not fit.
     pub fn load(folder: &Path) -> Result<Self, AuthorityError> {
         load(folder, CERTIFICATE_FILE, KEY_FILE)
     }
@@ -181,34 +185,34 @@ fn load(folder: &Path, certificate: &str, key: &str) -> Result<Authority, Author
     })
 }
 
-/// Who started a rotation, and when.
+/// Start of a rotation: its time, and the name of the caller.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Started {
     pub(super) at: Timestamp,
     pub(super) by: String,
 }
 
-/// What the folder of the authority holds.
+/// Contents of the authority's folder.
 pub(super) struct Kept {
     pub(super) present: Authority,
-    /// The next authority during a rotation.
+    /// New authority, during a rotation.
     pub(super) next: Option<(Authority, Started)>,
     pub(super) retired: Vec<CertificateDer<'static>>,
 }
 
-/// Whether the disk has confirmed what the folder shows.
+/// Whether the last step is durable on the disk.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Settled {
-    /// It has.
+    /// The step is durable.
     Yes,
-    /// It has not: a power cut may undo the last step. [`Folder::settle`] asks again.
+    /// A power failure may undo the step; [`Folder::settle`] retries.
     NotYet,
 }
 
-/// Makes sure that what was changed in a folder is on the disk.
+/// Function that makes the changes of a folder durable (`fsync`).
 type Sync = Arc<dyn Fn(&Path) -> io::Result<()> + Send + std::marker::Sync>;
 
-/// The folder of the authority. Only the server that owns it may change it.
+/// The folder of the authorities. Only the server that holds the lock of the database changes it.
 #[derive(Clone)]
 pub(super) struct Folder {
     path: PathBuf,
@@ -221,7 +225,7 @@ impl std::fmt::Debug for Folder {
     }
 }
 
-/// One change of the folder; each is there whole or not at all.
+/// One atomic change of the folder.
 #[derive(Debug)]
 enum Step {
     Write(&'static str, u32, String),
@@ -236,7 +240,7 @@ impl Step {
         }
     }
 
-    /// Does it, so that the folder shows it; once more does no harm.
+    /// Applies the step without `fsync` of the folder; idempotent.
     fn take(&self, folder: &Path) -> io::Result<()> {
         match self {
             Self::Write(name, mode, text) => replace(folder, name, *mode, text),
@@ -246,7 +250,7 @@ impl Step {
     }
 }
 
-/// What starts a rotation. With the last of the steps it has begun.
+/// Returns the steps that start a rotation; the last one makes it effective.
 fn starting(next: &Authority, started: &Started) -> io::Result<Vec<Step>> {
     let started = serde_json::to_string_pretty(started)?;
     let (key, certificate) = (next.issuer.key().serialize_pem(), &next.certificate_pem);
@@ -257,8 +261,8 @@ fn starting(next: &Authority, started: &Started) -> io::Result<Vec<Step>> {
     ])
 }
 
-/// What finishes a rotation. With the first of the steps it is decided, and [`Folder::recover`] does
-/// the others if the server does not come to it.
+/// Returns the steps that finish a rotation. The first one makes it effective; [`Folder::recover`]
+/// applies the others after an interruption.
 fn finishing(former: &Authority) -> Vec<Step> {
     vec![
         Step::Rename(CERTIFICATE_FILE, retired_name(&former.fingerprint)),
@@ -268,7 +272,7 @@ fn finishing(former: &Authority) -> Vec<Step> {
     ]
 }
 
-/// What decides a replacement: with the last of the steps.
+/// Returns the first steps of a replacement; the last of them makes it effective.
 fn replacing(next: &Authority) -> Vec<Step> {
     let (key, certificate) = (next.issuer.key().serialize_pem(), &next.certificate_pem);
     vec![
@@ -281,7 +285,8 @@ fn replacing(next: &Authority) -> Vec<Step> {
     ]
 }
 
-/// What completes a replacement, out of the fingerprints of those that it retires.
+/// Returns the steps that complete a replacement, given the fingerprints of the authorities that it
+/// retires: the present one, and the new one of a rotation.
 fn completing_replacement(present: Option<&str>, next: Option<&str>) -> Vec<Step> {
     let retire =
         |file: &'static str, fingerprint: &str| Step::Rename(file, retired_name(fingerprint));
@@ -317,20 +322,20 @@ impl Folder {
         self.path.join(name).exists()
     }
 
-    /// The fingerprint of the certificate in a file; `None` without one.
+    /// Returns the fingerprint of the certificate in a file; `None` if it has none.
     fn fingerprint_in(&self, name: &str) -> Option<String> {
         let certificate = CertificateDer::from_pem_file(self.path.join(name)).ok()?;
         Some(fingerprint(&certificate))
     }
 
-    /// Does a step and waits until the disk has it.
+    /// Applies a step and makes it durable.
     fn apply(&self, step: &Step) -> Result<(), AuthorityError> {
         let done = step.take(&self.path).and_then(|()| (self.sync)(&self.path));
         done.map_err(self.unwritable(step.name()))
     }
 
-    /// Does what begins something. If the last step is not known to be kept it is taken back: nothing
-    /// must be done by what a power cut may undo.
+    /// Applies steps of which the last makes a change effective. Undoes that step if it does not
+    /// become durable, because a power failure could undo it later.
     fn begin(&self, steps: &[Step]) -> Result<(), AuthorityError> {
         let Some((deciding, preparing)) = steps.split_last() else {
             return Ok(());
@@ -351,12 +356,13 @@ impl Folder {
     }
 
     fn take_back(&self, name: &str) -> io::Result<()> {
-        // Either the rename has failed, and there is nothing, or the disk has not confirmed it.
+        // Either the rename failed, so there is nothing to remove, or the `fsync` did.
         remove(&self.path.join(name))?;
         (self.sync)(&self.path)
     }
 
-    /// Does what is left of something that is decided; the next start of the server does it otherwise.
+    /// Applies the remaining steps of an effective change. A failure is logged; the next start of
+    /// the server completes them.
     fn complete(&self, steps: &[Step]) {
         for step in steps {
             if let Err(failed) = self.apply(step) {
@@ -370,8 +376,8 @@ impl Folder {
         }
     }
 
-    /// Completes what the disk refused to complete, and removes what was taken back in vain: whatever
-    /// signs here and is none of those that are trusted.
+    /// Completes earlier changes whose last steps failed, and removes new authorities that are not
+    /// in the trusted set because their start failed.
     fn tidy(&self, is_trusted: impl Fn(&str) -> bool) -> Result<(), AuthorityError> {
         for name in [REPLACING_CERTIFICATE_FILE, NEXT_CERTIFICATE_FILE] {
             let known = self.fingerprint_in(name).is_some_and(|it| is_trusted(&it));
@@ -382,10 +388,11 @@ impl Folder {
         self.recover()
     }
 
-    /// Starts a rotation.
+    /// Starts a rotation to `next`.
     ///
     /// # Errors
-    /// It cannot be written; as far as that is possible, it is as before.
+    /// The folder cannot be written; the change is undone, or the error is
+    /// [`AuthorityError::NotTakenBack`].
     pub(super) fn start(
         &self,
         next: &Authority,
@@ -397,10 +404,11 @@ impl Folder {
         self.begin(&steps)
     }
 
-    /// Finishes a rotation. It is decided as soon as the folder shows it, kept by the disk or not.
+    /// Finishes a rotation by retiring `former`. The finish is effective as soon as its first step
+    /// is done; the result tells whether it is durable.
     ///
     /// # Errors
-    /// The folder is as it was.
+    /// The first step failed; the folder is unchanged.
     pub(super) fn finish(&self, former: &Authority) -> Result<Settled, AuthorityError> {
         let steps = finishing(former);
         let Some((deciding, rest)) = steps.split_first() else {
@@ -409,8 +417,8 @@ impl Folder {
         let decided = deciding.take(&self.path);
         decided.map_err(self.unwritable(deciding.name()))?;
         if let Err(cause) = (self.sync)(&self.path) {
-            // The others must not come to the disk before it: key and certificate would not be of
-            // each other.
+            // The other steps must not become durable before this one: after a power failure key
+            // and certificate would not belong together.
             error!("the disk has not confirmed that the former authority is retired: {cause}");
             return Ok(Settled::NotYet);
         }
@@ -418,10 +426,11 @@ impl Folder {
         Ok(Settled::Yes)
     }
 
-    /// Puts an authority in the place of all others.
+    /// Replaces all authorities by `next`.
     ///
     /// # Errors
-    /// It cannot be written; as far as that is possible, it is as before.
+    /// The folder cannot be written; the change is undone, or the error is
+    /// [`AuthorityError::NotTakenBack`].
     pub(super) fn replace(
         &self,
         next: &Authority,
@@ -439,16 +448,16 @@ impl Folder {
         completing_replacement(present.as_deref(), next.as_deref())
     }
 
-    /// Asks the disk again for what it has not confirmed, and completes what waits for it.
+    /// Retries to make the last step durable, and applies the steps that follow it.
     ///
     /// # Errors
-    /// It still does not confirm it.
+    /// The step does not become durable, or another one fails.
     pub(super) fn settle(&self) -> Result<(), AuthorityError> {
         (self.sync)(&self.path).map_err(unwritable(&self.path))?;
         self.recover()
     }
 
-    /// Completes what an earlier run of the server had decided, and takes back what it had not.
+    /// Completes interrupted changes that were effective, and undoes those that were not.
     ///
     /// # Errors
     /// The folder cannot be written.
@@ -477,10 +486,10 @@ impl Folder {
         there.try_for_each(|name| self.apply(&Step::Remove(name)))
     }
 
-    /// Reads it, after [`Self::recover`].
+    /// Reads the authorities; call [`Self::recover`] first.
     ///
     /// # Errors
-    /// There is no authority, others can read a key, or it cannot be used.
+    /// As [`Authority::load`].
     pub(super) fn read(&self) -> Result<Kept, AuthorityError> {
         read(&self.path)
     }
@@ -519,7 +528,8 @@ fn read_retired(folder: &Path) -> io::Result<Vec<CertificateDer<'static>>> {
         if !is_retired {
             continue;
         }
-        // It only tells why a robot is refused; without it the robot is refused all the same.
+        // A retired certificate only explains why a robot is refused, so an unreadable one is
+        // skipped.
         match CertificateDer::from_pem_file(entry.path()) {
             Ok(certificate) => found.push((entry.metadata()?.modified()?, certificate)),
             Err(cause) => warn!("`{}` does not read: {cause}", entry.path().display()),
@@ -543,7 +553,7 @@ fn unwritable(path: &Path) -> impl FnOnce(io::Error) -> AuthorityError + use<> {
     move |cause| AuthorityError::Unwritable { path, cause }
 }
 
-/// Writes a file that was not there, and waits until the disk has it.
+/// Creates a file, which must not exist, and syncs it to the disk.
 fn write(path: &Path, mode: u32, text: &str) -> io::Result<()> {
     let mut options = OpenOptions::new();
     let mut file = options.write(true).create_new(true).mode(mode).open(path)?;
@@ -551,7 +561,7 @@ fn write(path: &Path, mode: u32, text: &str) -> io::Result<()> {
     file.sync_all()
 }
 
-/// Replaces a file.
+/// Replaces a file atomically, by way of a temporary file.
 fn replace(folder: &Path, name: &str, mode: u32, text: &str) -> io::Result<()> {
     let new = folder.join(format!("{name}.new"));
     remove(&new)?;
@@ -566,7 +576,7 @@ fn remove(path: &Path) -> io::Result<()> {
     }
 }
 
-/// Renames a file, unless that was done before.
+/// Renames a file; succeeds if it was renamed before.
 fn rename(from: &Path, to: &Path) -> io::Result<()> {
     match fs::rename(from, to) {
         Err(cause) if cause.kind() == io::ErrorKind::NotFound && to.exists() => Ok(()),

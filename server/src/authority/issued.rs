@@ -1,31 +1,32 @@
-//! Which certificates of a robot count for a renewal: those that this server has signed, and that the
-//! robot may have. Whoever has the authority's key can make others, and gets nothing for them.
+//! Tracks the certificates with which a robot may request a renewal: those signed by this server
+//! that the robot may still hold. A certificate forged with a stolen authority key is not among
+//! them and is refused.
 
 use serde::{Deserialize, Serialize};
 
-/// Most certificates that count at a time.
+/// Maximum number of accepted certificates of a robot; beyond it the second oldest is dropped.
 const ISSUED_MAX: usize = 16;
 
-/// The fingerprints of the certificates that count, oldest first: the one that the robot showed last for
-/// a renewal, and those that were signed since, whose answers may have been lost or come late.
+/// Fingerprints of a robot's certificates that are accepted for a renewal, oldest first: the one
+/// presented at the last renewal, and those signed since, whose answers may be lost or late.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct Issued(Vec<String>);
 
 impl Issued {
-    /// One certificate alone.
+    /// Returns the list of one certificate.
     pub fn one(fingerprint: String) -> Self {
         Self(vec![fingerprint])
     }
 
-    /// What becomes of them when one of them is shown and the next is signed; `None` if the one that is
-    /// shown does not count. Whoever shows one has those of before no more.
+    /// Returns the list after a renewal, in which the robot presented `shown` and `next` was
+    /// signed; `None` if `shown` is not accepted. Certificates older than `shown` are dropped.
     #[must_use]
     pub fn renewed(&self, shown: &str, next: String) -> Option<Self> {
         let at = self.0.iter().position(|one| one == shown)?;
         let mut left = self.0[at..].to_vec();
         if left.len() >= ISSUED_MAX {
-            // Of those that were signed for the same one, the answer to the oldest comes no more.
+            // The answer with the oldest certificate signed for `shown` will not arrive any more.
             left.remove(1);
         }
         left.push(next);
@@ -44,7 +45,7 @@ mod tests {
         let issued = Issued::one("a".to_owned());
         assert_eq!(issued.renewed("forged", "b".to_owned()), None);
         let issued = issued.renewed("a", "b".to_owned()).unwrap();
-        // The answer was lost, and the robot asks again.
+        // The answer was lost, and the robot repeats its request.
         let issued = issued.renewed("a", "c".to_owned()).unwrap();
         let issued = issued.renewed("b", "d".to_owned()).unwrap();
         assert_eq!(issued.renewed("a", "e".to_owned()), None);
@@ -52,8 +53,8 @@ mod tests {
     }
 
     proptest! {
-        /// A robot asks, asks again when it has waited for long, and takes the answer to what it asked
-        /// last; requests come late and in any order, and answers are lost.
+        /// A robot sends a request, repeats it after a timeout, and accepts the answer to its
+        /// latest request only; requests arrive late and in any order, and answers are lost.
         #[test]
         fn whatever_is_lost_or_late_the_certificate_that_a_robot_has_counts(
             steps in prop::collection::vec((0_u8..3, any::<prop::sample::Index>()), 1..200),
@@ -65,7 +66,7 @@ mod tests {
             let mut answers: Vec<(u32, String)> = Vec::new();
             for (what, which) in steps {
                 match what {
-                    // More than a few are never under way: robots wait longer and longer.
+                    // Few requests are in flight at a time, because robots back off.
                     0 if on_the_way.len() + answers.len() < ISSUED_MAX - 2 => {
                         asked += 1;
                         on_the_way.push((asked, held.clone()));

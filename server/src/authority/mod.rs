@@ -1,10 +1,13 @@
-//! The fleet's own authority: signs robots' certificates and the robots' port's own.
+//! The fleet's certificate authority (CA), which signs the certificates of robots and of the
+//! robots' port.
 //!
-//! Its key is in one file that only its owner can read; whoever has it can pose as any robot. The
-//! port's certificate is made anew by each run of the server, so there is no second key to guard.
+//! Its private key is in one file that only its owner can read; anyone with the key can impersonate
+//! any robot. The server generates key and certificate of the port at each start and does not store
+//! them.
 //!
-//! A robot's certificate names `e{enrolment}.{robot}.{site}`: identifiers have no dots, so the
-//! name reads back one way only, and what a robot had before it joined again counts no more.
+//! The common name of a robot's certificate is `e{enrolment}.{robot}.{site}`. Identifiers contain
+//! no dots, so the name is unambiguous. A robot that joins again gets the next enrolment number,
+//! which invalidates its earlier certificates.
 
 mod file;
 mod issued;
@@ -34,27 +37,28 @@ pub use self::file::{AuthorityError, CERTIFICATE_FILE, KEY_FILE, NEXT_CERTIFICAT
 pub use self::issued::Issued;
 pub use self::rotation::{Authorities, Retiring, RotationError, RotationRefused, Trusted};
 
-/// How long the authority lasts.
+/// Validity period of the authority's certificate.
 const AUTHORITY_LASTS: SignedDuration = SignedDuration::from_hours(20 * 365 * 24);
-/// How long the robots' port's certificate lasts; it is made anew with each start, and before a
-/// third of this is over.
+/// Validity period of the certificate of the robots' port. It is replaced at each start, and before
+/// a third of this period is over.
 pub const PORT_LASTS: SignedDuration = SignedDuration::from_hours(90 * 24);
-/// How far robots' clocks may be behind when they look at the port's certificate.
+/// Time by which a robot's clock may be behind the server's when it checks the port's certificate.
 const BEHIND_MAX: SignedDuration = SignedDuration::from_hours(24);
-/// How long after its end a certificate still counts for a renewal: a robot that stood in a shed
-/// for a month comes back by itself. Whether it may is in the database, not in the certificate.
+/// Time after its expiry during which a certificate is still accepted for a renewal, so that a
+/// robot that was switched off for a month can renew it. The database decides whether the robot may
+/// renew.
 pub const RENEWAL_GRACE: SignedDuration = SignedDuration::from_hours(30 * 24);
-/// Names of the port that need no configuration.
+/// Names in the certificate of the robots' port that need no configuration.
 const NAMES_HERE: [&str; 3] = ["localhost", "127.0.0.1", "::1"];
 
-/// Whom a robot's certificate names.
+/// Robot and enrolment in the common name of a robot's certificate.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct RobotName {
-    /// The site.
+    /// Site of the robot.
     pub site: SiteId,
-    /// The robot.
+    /// Identifier of the robot.
     pub robot: RobotId,
-    /// How often it has joined, from 1.
+    /// Number of the robot's enrolment, from 1.
     pub enrolment: u32,
 }
 
@@ -71,57 +75,57 @@ impl RobotName {
             robot: robot.parse().ok()?,
             enrolment: enrolment.parse().ok()?,
         };
-        // `e+1` and `e01` parse too, and are no names of ours.
+        // `e+1` and `e01` parse too, but [`Self::text`] never writes them.
         (name.text() == text).then_some(name)
     }
 }
 
-/// Why a certificate or a request for one does not count.
+/// Error of a certificate or of a certificate signing request.
 #[derive(Debug, thiserror::Error)]
 pub enum CertificateError {
-    /// The request does not read, or is not signed with its own key.
+    /// The request cannot be parsed, or is not signed with its own key.
     #[error("the request for a certificate does not read, or its own signature is wrong")]
     Request(#[source] rcgen::Error),
-    /// The key is of another kind.
+    /// The key in the request is not ECDSA P-256.
     #[error("a robot's key must be ECDSA P-256")]
     Algorithm,
-    /// The certificate does not read.
+    /// The certificate cannot be parsed.
     #[error("the certificate does not read")]
     Unreadable,
-    /// The authority has not signed it, or it is for another purpose.
+    /// No authority of the fleet signed the certificate, or it is not one of a robot.
     #[error("the certificate is not one of this fleet's robots")]
     Foreign,
-    /// It was over too long ago, or is not valid yet.
+    /// The certificate expired longer than [`RENEWAL_GRACE`] ago.
     #[error("the certificate's time is over")]
     Over,
-    /// The proof was not made with the key of the certificate.
+    /// The proof of possession was not signed with the key of the certificate.
     #[error("the proof was not made with the present key")]
     Proof,
-    /// Signing failed.
+    /// The certificate could not be signed.
     #[error("the certificate could not be signed")]
     Signing(#[source] rcgen::Error),
 }
 
-/// A robot's certificate as it was signed.
+/// A robot's certificate that was just signed.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Signed {
-    /// PEM.
+    /// Certificate, PEM.
     pub certificate: String,
-    /// Its SHA-256, in hexadecimal digits.
+    /// SHA-256 of the certificate, in hexadecimal digits.
     pub fingerprint: String,
-    /// From when on it is refused.
+    /// End of its validity.
     pub expires_at: Timestamp,
 }
 
-/// Certificate and key of a port.
+/// TLS certificate and key of the robots' port.
 pub struct PortIdentity {
-    /// The certificate, followed by its authority's.
+    /// Certificate of the port, followed by the authority's.
     pub chain: Vec<CertificateDer<'static>>,
-    /// Its key.
+    /// Private key of the port.
     pub key: PrivateKeyDer<'static>,
 }
 
-/// The fleet's authority.
+/// A certificate authority of the fleet, with its private key.
 pub struct Authority {
     certificate_pem: String,
     fingerprint: String,
@@ -141,7 +145,7 @@ fn named(name: &str) -> DistinguishedName {
     names
 }
 
-/// A certificate's time, which knows no fractions of seconds.
+/// Sets the validity period; certificates have whole seconds.
 fn set_times(params: &mut CertificateParams, from: Timestamp, until: Timestamp) {
     params.not_before = SystemTime::from(from).into();
     params.not_after = SystemTime::from(until).into();
@@ -156,10 +160,10 @@ fn earlier(now: Timestamp, span: SignedDuration) -> Timestamp {
 }
 
 impl Authority {
-    /// Makes a new authority in memory.
+    /// Generates a new authority in memory, valid from a day before `now`.
     ///
     /// # Errors
-    /// The operating system gives no random numbers.
+    /// The operating system provides no random numbers.
     pub fn generate(name: &str, now: Timestamp) -> Result<Self, rcgen::Error> {
         let key = KeyPair::generate()?;
         let mut params = CertificateParams::default();
@@ -202,34 +206,33 @@ impl Authority {
         })
     }
 
-    /// The authority's own certificate, PEM.
+    /// Returns the authority's own certificate, PEM.
     pub fn certificate_pem(&self) -> &str {
         &self.certificate_pem
     }
 
-    /// The authority's own certificate.
+    /// Returns the authority's own certificate, DER.
     pub fn certificate(&self) -> &CertificateDer<'static> {
         &self.certificate
     }
 
-    /// The SHA-256 of the authority's own certificate, in hexadecimal digits.
+    /// Returns the SHA-256 of the authority's own certificate, in hexadecimal digits.
     pub fn fingerprint(&self) -> &str {
         &self.fingerprint
     }
 
-    /// Derives a secret key for one purpose from the authority's own (HMAC-SHA-256).
+    /// Derives a secret key for `purpose` from the authority's private key by HMAC-SHA-256.
     pub fn derive_key(&self, purpose: &str) -> hmac::Key {
         let own = hmac::Key::new(hmac::HMAC_SHA256, self.issuer.key().serialized_der());
         let derived = hmac::sign(&own, purpose.as_bytes());
         hmac::Key::new(hmac::HMAC_SHA256, derived.as_ref())
     }
 
-    /// Signs a certificate for the key in a robot's request. What else the request says is not
-    /// looked at.
+    /// Signs a certificate for `name` and the public key in `request`, valid from a minute before
+    /// `now` until `now` + `lifetime`. All other fields of the request are ignored.
     ///
     /// # Errors
-    /// [`CertificateError::Request`] or [`CertificateError::Algorithm`]; signing fails for want
-    /// of random numbers only.
+    /// [`CertificateError::Signing`] if the operating system provides no random numbers.
     pub fn sign(
         &self,
         request: &RobotRequest,
@@ -237,7 +240,7 @@ impl Authority {
         now: Timestamp,
         lifetime: SignedDuration,
     ) -> Result<Signed, CertificateError> {
-        // Whole seconds, as the certificate has them.
+        // Certificates have whole seconds.
         let until = later(now, lifetime).as_second();
         let expires_at = Timestamp::from_second(until).unwrap_or(Timestamp::MAX);
         let mut params =
@@ -261,10 +264,10 @@ impl Authority {
         })
     }
 
-    /// Makes certificate and key of a port that goes by these names.
+    /// Generates key and certificate of the robots' port for `names` in addition to `localhost`.
     ///
     /// # Errors
-    /// A name is none, or there are no random numbers.
+    /// A name is invalid, or the operating system provides no random numbers.
     pub fn port_identity(
         &self,
         names: &[String],
@@ -292,7 +295,7 @@ impl Authority {
     }
 }
 
-/// A robot's certificate that an authority of the fleet has signed.
+/// A robot's certificate whose signature by an authority of the fleet was verified.
 #[derive(Debug)]
 pub struct PresentCertificate {
     certificate: CertificateDer<'static>,
@@ -302,30 +305,31 @@ pub struct PresentCertificate {
 }
 
 impl PresentCertificate {
-    /// Whom it names.
+    /// Returns the robot and enrolment that the certificate names.
     pub fn name(&self) -> &RobotName {
         &self.name
     }
 
-    /// Its SHA-256, in hexadecimal digits.
+    /// Returns the SHA-256 of the certificate, in hexadecimal digits.
     pub fn fingerprint(&self) -> String {
         fingerprint(&self.certificate)
     }
 
-    /// The fingerprint of the authority that signed it.
+    /// Returns the fingerprint of the authority that signed the certificate.
     pub fn issuer(&self) -> &str {
         &self.issuer
     }
 
-    /// Whether that authority was retired: the certificate tells whose it was and counts for nothing.
+    /// Returns whether the signing authority is retired. The certificate then identifies the robot
+    /// in messages but is not accepted.
     pub fn is_retired(&self) -> bool {
         self.is_retired
     }
 
-    /// Checks that whoever asks for a renewal has the key of this certificate.
+    /// Verifies that `proof` is a signature of the renewal request by the key of this certificate.
     ///
     /// # Errors
-    /// [`CertificateError::Proof`].
+    /// [`CertificateError::Proof`] if it is not.
     pub fn check_proof(&self, request_pem: &str, proof: &[u8]) -> Result<(), CertificateError> {
         let leaf =
             EndEntityCert::try_from(&self.certificate).map_err(|_| CertificateError::Unreadable)?;
@@ -334,15 +338,16 @@ impl PresentCertificate {
     }
 }
 
-/// A request for a certificate that is signed with its own key.
+/// A certificate signing request (PKCS#10) with a valid signature by its own ECDSA P-256 key.
 #[derive(Debug)]
 pub struct RobotRequest(CertificateSigningRequestParams);
 
 impl RobotRequest {
-    /// Reads a request.
+    /// Parses a request and checks its signature.
     ///
     /// # Errors
-    /// It does not read, its signature is wrong, or its key is of another kind than ECDSA P-256.
+    /// [`CertificateError::Request`] if it cannot be parsed or its signature is wrong,
+    /// [`CertificateError::Algorithm`] if its key is not ECDSA P-256.
     pub fn read(pem: &str) -> Result<Self, CertificateError> {
         let request =
             CertificateSigningRequestParams::from_pem(pem).map_err(CertificateError::Request)?;
@@ -353,10 +358,12 @@ impl RobotRequest {
     }
 }
 
-/// Whom a certificate names, and when it ends. Says nothing about who signed it.
+/// Returns the robot that a certificate names and the end of its validity. Does not check the
+/// signature.
 ///
 /// # Errors
-/// It does not read, or names no robot.
+/// [`CertificateError::Unreadable`] if it cannot be parsed, [`CertificateError::Foreign`] if it
+/// names no robot.
 pub fn named_in(
     certificate: &CertificateDer<'_>,
 ) -> Result<(RobotName, Timestamp), CertificateError> {
@@ -375,17 +382,18 @@ pub fn named_in(
     Ok((name, expires_at))
 }
 
-/// The SHA-256 of a certificate in hexadecimal digits.
+/// Returns the SHA-256 of a certificate, in hexadecimal digits.
 fn fingerprint(certificate: &CertificateDer<'_>) -> String {
     let mut text = String::with_capacity(64);
     for byte in Sha256::digest(certificate) {
-        // Writing to a text cannot fail.
+        // Writing to a string cannot fail.
         let _ = write!(text, "{byte:02x}");
     }
     text
 }
 
-/// Whether an authority has signed a certificate for a client, as of that time.
+/// Returns whether `authority` signed `leaf` for client authentication and both are valid at
+/// `looked_at`.
 fn is_signed_by(
     leaf: &EndEntityCert<'_>,
     authority: &CertificateDer<'_>,
@@ -408,7 +416,7 @@ fn is_signed_by(
     verified.is_ok()
 }
 
-/// Whether a text may stand as a name in the port's certificate: an address or a host name.
+/// Returns whether `name` is an IP address or a host name, as allowed in the port's certificate.
 pub fn is_port_name(name: &str) -> bool {
     let is_label = |label: &str| {
         let allowed = |byte: u8| byte.is_ascii_alphanumeric() || byte == b'-';

@@ -1,20 +1,20 @@
-//! Which authorities are trusted, and how another takes the place of one.
+//! Set of trusted certificate authorities, and the rotation to a new one.
 //!
 //! ```text
 //!  A signs, A is trusted ──start──► B signs, A and B are trusted ──finish──► B signs, B is trusted
 //! ```
 //!
-//! While both are trusted the robots' port shows a certificate of A, which robots that know A alone
-//! accept, and those that know both. Each renewal brings a robot both authorities and a certificate
-//! of B. From the finish on the port shows one of B. A key that is new for the fleet is in use as soon
-//! as it is there: B signs, and what is derived from the authority's key derives from B's.
+//! While both are trusted, the robots' port presents a certificate of A, which robots accept that
+//! trust A alone or both. Each renewal gives a robot a certificate of B and both authorities to
+//! trust. After the finish the port presents a certificate of B. From the start on, B signs the
+//! certificates of robots, and secrets derived from the authority's key are derived from B's.
 //!
 //! ```text
 //!  A is trusted, or A and B are ──replace──► C signs, C alone is trusted
 //! ```
 //!
-//! A replacement is for a key that was stolen: no certificate of before opens anything, and every robot
-//! joins again.
+//! A replacement is for a stolen key: it invalidates all earlier certificates at once, and every
+//! robot has to join again.
 
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -33,65 +33,65 @@ use super::{
     is_signed_by, later, named_in,
 };
 
-/// Why a rotation is neither started nor finished.
+/// Reason for refusing to start or finish a rotation, or to replace the authority.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum RotationRefused {
-    /// One is under way.
+    /// A rotation is in progress.
     #[error("a rotation of the authority is under way; finish it first")]
     UnderWay,
-    /// None is under way.
+    /// No rotation is in progress.
     #[error("no rotation of the authority is under way")]
     None,
-    /// Another one is under way.
+    /// Another rotation than the requested one is in progress.
     #[error(
         "rotation `{named}` is not the one that is under way, which is `{under_way}`: look at that one \
          first"
     )]
     Other {
-        /// The one that was named.
+        /// Rotation in the request.
         named: TrustId,
-        /// The one that is under way.
+        /// Rotation in progress.
         under_way: TrustId,
     },
-    /// Another authority signs.
+    /// Another authority than the requested one signs certificates.
     #[error(
         "authority `{named}` is not the one that signs, which is `{signing}`: somebody else has \
          rotated or replaced it"
     )]
     OtherAuthority {
-        /// The one that was named.
+        /// Fingerprint in the request.
         named: String,
-        /// The one that signs.
+        /// Fingerprint of the signing authority.
         signing: String,
     },
 }
 
-/// Why a rotation was not started or finished.
+/// Error of starting or finishing a rotation, or of replacing the authority.
 #[derive(Debug, thiserror::Error)]
 pub enum RotationError {
-    /// It is not the time for it.
+    /// The present state does not allow the change.
     #[error(transparent)]
     Refused(#[from] RotationRefused),
-    /// The folder cannot be written.
+    /// The authority's folder cannot be written.
     #[error(transparent)]
     Files(#[from] AuthorityError),
-    /// There are no random numbers.
+    /// The operating system provides no random numbers.
     #[error("no key could be made")]
     Key(#[from] rcgen::Error),
 }
 
-/// The authority that a rotation retires.
+/// The authority that a rotation in progress is going to retire.
 #[derive(Debug, Clone)]
 pub struct Retiring {
-    /// The authority.
+    /// The authority itself.
     pub authority: Arc<Authority>,
-    /// When the rotation was started.
+    /// Start of the rotation.
     pub started_at: Timestamp,
-    /// Who started it.
+    /// Name of the caller who started it.
     pub started_by: String,
 }
 
-/// Who is trusted at a time.
+/// Authorities trusted at one moment, and the retired ones.
 #[derive(Debug, Clone)]
 pub struct Trusted {
     signing: Arc<Authority>,
@@ -100,7 +100,7 @@ pub struct Trusted {
 }
 
 impl Trusted {
-    /// One authority alone.
+    /// Returns a set with one trusted authority.
     pub fn one(authority: Arc<Authority>) -> Self {
         Self {
             signing: authority,
@@ -109,52 +109,53 @@ impl Trusted {
         }
     }
 
-    /// The authority that signs robots' certificates.
+    /// Returns the authority that signs robots' certificates.
     pub fn signing(&self) -> &Arc<Authority> {
         &self.signing
     }
 
-    /// The authority that is to be retired, if a rotation is under way.
+    /// Returns the authority that the rotation in progress retires; `None` without a rotation.
     pub fn retiring(&self) -> Option<&Retiring> {
         self.retiring.as_ref()
     }
 
-    /// The authority that signs the certificate of the robots' port: one that every robot trusts.
+    /// Returns the authority that signs the certificate of the robots' port; every robot trusts it.
     pub fn of_port(&self) -> &Arc<Authority> {
         let retiring = self.retiring.as_ref().map(|retiring| &retiring.authority);
         retiring.unwrap_or(&self.signing)
     }
 
-    /// All that are trusted, the one that signs first.
+    /// Returns all trusted authorities, the signing one first.
     pub fn all(&self) -> impl Iterator<Item = &Arc<Authority>> {
         let retiring = self.retiring.iter().map(|retiring| &retiring.authority);
         std::iter::once(&self.signing).chain(retiring)
     }
 
-    /// Whether the authority with a fingerprint is trusted.
+    /// Returns whether the authority with this fingerprint is trusted.
     pub fn is_trusted(&self, fingerprint: &str) -> bool {
         self.all().any(|one| one.fingerprint() == fingerprint)
     }
 
-    /// What robots are to trust, PEM.
+    /// Returns the certificates that robots have to trust, PEM.
     pub fn bundle_pem(&self) -> String {
         self.all().map(|one| one.certificate_pem()).collect()
     }
 
-    /// Whether an authority was ever retired.
+    /// Returns whether any authority is retired.
     pub fn has_retired(&self) -> bool {
         !self.retired.is_empty()
     }
 
-    /// The name of what robots are to trust, and so of the rotation that is under way.
+    /// Returns the identifier of the set of trusted authorities, which also identifies the rotation
+    /// in progress.
     pub fn id(&self) -> TrustId {
         TrustId::of(self.all().map(|one| one.certificate().as_ref()))
     }
 
-    /// What a rotation to another authority makes of this.
+    /// Returns the set after the start of a rotation to `next`.
     ///
     /// # Errors
-    /// One is under way.
+    /// [`RotationRefused::UnderWay`] if a rotation is in progress.
     fn started(&self, next: Arc<Authority>, started: Started) -> Result<Self, RotationRefused> {
         if self.retiring.is_some() {
             return Err(RotationRefused::UnderWay);
@@ -170,10 +171,10 @@ impl Trusted {
         })
     }
 
-    /// Refuses unless this rotation is under way.
+    /// Checks that the rotation `named` is in progress.
     ///
     /// # Errors
-    /// None is, or another one.
+    /// [`RotationRefused::None`] if no rotation is, [`RotationRefused::Other`] if another one is.
     pub fn check_rotation(&self, named: TrustId) -> Result<(), RotationRefused> {
         let under_way = self.id();
         if self.retiring.is_none() {
@@ -196,10 +197,10 @@ impl Trusted {
         })
     }
 
-    /// What the end of the rotation makes of this.
+    /// Returns the set after the finish of `rotation`.
     ///
     /// # Errors
-    /// None is under way, or another one.
+    /// As [`Self::check_rotation`].
     fn finished(&self, rotation: TrustId) -> Result<Self, RotationRefused> {
         self.check_rotation(rotation)?;
         let retiring = self.retiring.as_ref().ok_or(RotationRefused::None)?;
@@ -212,7 +213,7 @@ impl Trusted {
         })
     }
 
-    /// What a replacement by another authority makes of this.
+    /// Returns the set after `next` has replaced all trusted authorities.
     fn replaced(&self, next: Arc<Authority>) -> Self {
         let mut retired = self.retired.clone();
         retired.extend(self.all().map(|one| one.certificate().clone()));
@@ -223,7 +224,8 @@ impl Trusted {
         }
     }
 
-    /// The fingerprint of the authority that signed a robot's certificate; `None` unless it is trusted.
+    /// Returns the fingerprint of the trusted authority that signed a robot's certificate; `None`
+    /// if none did or if the certificate is not valid at `now`.
     pub fn issuer_of(&self, certificate: &CertificateDer<'_>, now: Timestamp) -> Option<&str> {
         let leaf = EndEntityCert::try_from(certificate).ok()?;
         let issuer = self
@@ -232,12 +234,14 @@ impl Trusted {
         issuer.map(|authority| authority.fingerprint())
     }
 
-    /// Whom a robot's certificate names, and who signed it: an authority that is trusted or, and then
-    /// it counts for nothing, one that was retired. One that is over counts for another
+    /// Reads a robot's certificate and verifies that a trusted or a retired authority signed it;
+    /// see [`PresentCertificate::is_retired`]. An expired one is accepted for another
     /// [`RENEWAL_GRACE`].
     ///
     /// # Errors
-    /// [`CertificateError`].
+    /// [`CertificateError::Unreadable`] if it cannot be parsed, [`CertificateError::Over`] if it
+    /// expired too long ago, [`CertificateError::Foreign`] if no known authority signed it for a
+    /// robot.
     pub fn read_robot(
         &self,
         certificate_pem: &str,
@@ -268,20 +272,20 @@ impl Trusted {
     }
 }
 
-/// The fleet's authorities, and the folder that keeps them.
+/// The fleet's authorities, with the folder that stores them.
 #[derive(Debug)]
 pub struct Authorities {
-    /// Where they are kept; `None` for those in memory only.
+    /// Folder of the files; `None` for authorities in memory only.
     folder: Option<Folder>,
     present: watch::Sender<Arc<Trusted>>,
-    /// One change at a time.
+    /// Held during a change, so that changes do not overlap.
     turn: Mutex<()>,
-    /// Whether the disk has not confirmed yet that an authority is retired.
+    /// Whether the retirement of an authority is not yet confirmed to be on the disk.
     is_unsettled: AtomicBool,
 }
 
 impl Authorities {
-    /// An authority that is in memory only.
+    /// Returns authorities in memory only, of which `authority` is trusted.
     pub fn in_memory(authority: Arc<Authority>) -> Self {
         Self::new(None, Trusted::one(authority))
     }
@@ -295,10 +299,11 @@ impl Authorities {
         }
     }
 
-    /// Reads the folder, and completes what an earlier run of the server had begun there.
+    /// Reads the authorities from a folder, after completing or undoing an interrupted change.
     ///
     /// # Errors
-    /// There is none, others can read a key, or it cannot be used.
+    /// [`AuthorityError::Unreadable`] if there is no authority, [`AuthorityError::Open`] if other
+    /// users can read a key, [`AuthorityError::Unusable`] if certificate and key do not fit.
     pub fn load(folder: &Path) -> Result<Self, AuthorityError> {
         Self::load_from(Folder::new(folder))
     }
@@ -323,12 +328,13 @@ impl Authorities {
         Ok(Self::new(Some(folder), trusted))
     }
 
-    /// Who is trusted now.
+    /// Returns the present set of trusted authorities.
     pub fn present(&self) -> Arc<Trusted> {
         Arc::clone(&self.present.borrow())
     }
 
-    /// Changes with each start and each end of a rotation.
+    /// Returns a receiver that is notified of each start and finish of a rotation and of each
+    /// replacement.
     pub fn changes(&self) -> watch::Receiver<Arc<Trusted>> {
         self.present.subscribe()
     }
@@ -337,10 +343,11 @@ impl Authorities {
         self.turn.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Starts a rotation: makes the next authority, which signs from now on. Blocks.
+    /// Starts a rotation on behalf of `by`: generates the next authority, which signs from now on.
+    /// Blocks on the disk.
     ///
     /// # Errors
-    /// One is under way, or the folder cannot be written; nothing has changed then.
+    /// A rotation is in progress, or the folder cannot be written; the set is unchanged then.
     pub fn start(&self, by: &str, now: Timestamp) -> Result<Arc<Trusted>, RotationError> {
         let _turn = self.take_turn();
         let next = next_authority(now)?;
@@ -358,12 +365,12 @@ impl Authorities {
         Ok(self.show(trusted))
     }
 
-    /// Finishes a rotation: the former authority is no longer trusted, and its key is removed. It is
-    /// decided as soon as the folder shows it; [`Self::is_settled`] says whether the disk has it. Blocks.
+    /// Finishes a rotation: the former authority is no longer trusted, and its key is deleted. This
+    /// takes effect even if the disk has not confirmed it yet ([`Self::is_settled`]). Blocks on the
+    /// disk.
     ///
     /// # Errors
-    /// None is under way, another one than was named is, or the folder cannot be written; nothing has
-    /// changed then.
+    /// `rotation` is not in progress, or the folder cannot be written; the set is unchanged then.
     pub fn finish(&self, rotation: TrustId) -> Result<Arc<Trusted>, RotationError> {
         let _turn = self.take_turn();
         let present = self.present();
@@ -374,11 +381,12 @@ impl Authorities {
         Ok(self.show(trusted))
     }
 
-    /// Puts another authority in the place of all that are trusted, whether a rotation is under way or
-    /// not: from now on no certificate of before opens anything. Blocks.
+    /// Replaces all trusted authorities by a new one, also during a rotation. All earlier
+    /// certificates are refused from now on. `signing` is the fingerprint of the authority that
+    /// signs at present. Blocks on the disk.
     ///
     /// # Errors
-    /// Another authority than was named signs, or the folder cannot be written; nothing has changed then.
+    /// Another authority signs, or the folder cannot be written; the set is unchanged then.
     pub fn replace(&self, signing: &str, now: Timestamp) -> Result<Arc<Trusted>, RotationError> {
         let _turn = self.take_turn();
         let present = self.present();
@@ -392,7 +400,7 @@ impl Authorities {
         Ok(self.show(trusted))
     }
 
-    /// Whether the disk has all that was decided.
+    /// Returns whether the disk has confirmed all changes.
     pub fn is_settled(&self) -> bool {
         !self.is_unsettled.load(Ordering::Relaxed)
     }
@@ -402,10 +410,10 @@ impl Authorities {
         self.is_unsettled.store(is_unsettled, Ordering::Relaxed);
     }
 
-    /// Asks the disk again for what it has not confirmed. Blocks.
+    /// Retries to write unconfirmed changes to the disk. Blocks on the disk.
     ///
     /// # Errors
-    /// It still does not confirm it.
+    /// The disk still does not confirm them.
     pub fn settle(&self) -> Result<(), AuthorityError> {
         let _turn = self.take_turn();
         if let Some(folder) = self.folder.as_ref().filter(|_| !self.is_settled()) {

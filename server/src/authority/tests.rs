@@ -107,7 +107,7 @@ fn requests_that_are_none_are_refused() {
         assert!(RobotRequest::read(text).is_err(), "`{text}`");
     }
     let mut bytes = request(&KeyPair::generate().unwrap()).into_bytes();
-    // Within the base64 of the signature, which stands last.
+    // Within the base64 of the signature, which is last.
     let at = bytes.len() - 60;
     bytes[at] = if bytes[at] == b'A' { b'B' } else { b'A' };
     let broken = String::from_utf8(bytes).unwrap();
@@ -168,7 +168,7 @@ fn during_a_rotation_certificates_of_both_count_and_afterwards_those_of_the_form
         let der = CertificateDer::from_pem_slice(certificate.as_bytes()).unwrap();
         assert_eq!(during.issuer_of(&der, now()), Some(issuer.fingerprint()));
     }
-    // Robots that know the former alone accept the port, and so do those that know both.
+    // Robots accept the port's certificate, whether they trust the former authority alone or both.
     assert_eq!(during.of_port().fingerprint(), former.fingerprint());
     let bundle = during.bundle_pem();
     assert_eq!(CertificateDer::pem_slice_iter(bundle.as_bytes()).count(), 2);
@@ -229,7 +229,7 @@ fn a_replacement_trusts_nobody_of_before_in_a_rotation_or_not_and_names_whom_it_
             assert_eq!(after.issuer_of(&der, now()), None);
             assert!(!after.is_trusted(one.fingerprint()));
         }
-        // A second one who has looked at the same does not replace the next.
+        // A second caller with the outdated fingerprint does not replace the new authority.
         assert!(authorities.replace(&signing, now()).is_err());
         assert_eq!(authorities.present().id(), after.id());
     }

@@ -1,56 +1,59 @@
-//! A wall clock that does not go back, made of one that may, and of a monotonic one. Pure.
+//! Derives a non-decreasing wall time from a wall clock that may step back and a monotonic clock.
+//! Pure.
 
 use std::time::Duration;
 
-/// The largest step back of the machine's clock that is waited for; a larger one is followed.
+/// Maximum step back of the machine's clock that is bridged by slowing down; a larger one is
+/// followed at once.
 pub const STEP_BACK_HELD_MAX: Duration = Duration::from_hours(24);
-/// The smallest step that is logged and counted.
+/// Minimum size of a step that is logged and counted.
 pub const STEP_NOTED_MIN: Duration = Duration::from_millis(500);
-/// While the machine's clock is behind, this many microseconds give one.
+/// Factor by which the returned time advances more slowly while the machine's clock is behind it.
 const HELD_PACE: u128 = 2;
 
-/// What the machine's clock did.
+/// Step of the machine's clock; `by_us` is its size in microseconds, positive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Step {
-    /// It went back, and is waited for.
+    /// Step back; the returned time slows down until the machine's clock has caught up.
     BackHeld { by_us: i64 },
-    /// It went back further than is waited for.
+    /// Step back by more than [`STEP_BACK_HELD_MAX`]; the returned time follows it.
     BackFollowed { by_us: i64 },
-    /// It went forward by more than the time that passed.
+    /// Step forward: wall time advanced by more than monotonic time.
     Forward { by_us: i64 },
-    /// It is no longer behind.
+    /// The machine's clock has reached the returned time again.
     CaughtUp,
-    /// The database is further ahead of it than is waited for.
+    /// The newest time in the database is ahead by more than [`STEP_BACK_HELD_MAX`].
     DatabaseAhead { by_us: i64 },
 }
 
-/// Steps of the machine's clock since the start.
+/// Steps of the machine's clock since the start of the server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct ClockSteps {
-    /// Steps back.
+    /// Number of steps back.
     pub back: u64,
-    /// Steps forward.
+    /// Number of steps forward.
     pub forward: u64,
-    /// How far the server's time is ahead of the machine's clock, as of the last look.
+    /// Lead of the server's time over the machine's clock at the last reading.
     pub ahead: Duration,
 }
 
-/// A point in both times.
+/// Simultaneous readings of wall clock (microseconds since 1970) and monotonic clock.
 #[derive(Debug, Clone, Copy)]
 struct Mark {
     wall_us: i64,
     elapsed: Duration,
 }
 
-/// The last times, and since when the machine's clock is behind them.
+/// State of the non-decreasing wall time.
 #[derive(Debug, Default)]
 pub(super) struct Floor {
     last_issued_us: Option<i64>,
-    /// The machine's clock at the last look.
+    /// Last reading of the machine's clocks.
     machine: Option<Mark>,
-    /// From where the issued time advances while the machine's clock is behind.
+    /// Start of the slowed-down phase, in returned time; `None` if the machine's clock is not
+    /// behind.
     held_from: Option<Mark>,
-    /// Whether the hold was logged.
+    /// Whether the step back of the current slowed-down phase was logged.
     is_noted: bool,
     steps: ClockSteps,
 }
@@ -60,8 +63,9 @@ fn micros(span: Duration) -> i64 {
 }
 
 impl Floor {
-    /// The time to give, microseconds since 1970, for what the machine's clocks say; and the step, if
-    /// one shows. Steps forward show only where both clocks have one pace.
+    /// Returns the time to use, in microseconds since 1970, for a reading of the machine's clocks,
+    /// and the step to log, if any. Steps forward are detected only if `has_one_pace`, that is, if
+    /// both clocks advance at the same rate.
     pub(super) fn issue(
         &mut self,
         wall_us: i64,
@@ -119,7 +123,8 @@ impl Floor {
         (issued_us, step)
     }
 
-    /// Takes up after a time of an earlier run, if the machine's clock is not too far behind it.
+    /// Continues after the newest time of an earlier run, unless the machine's clock is more than
+    /// [`STEP_BACK_HELD_MAX`] behind it. Returns the step to log, if any.
     pub(super) fn continue_after(
         &mut self,
         newest_us: i64,
@@ -135,7 +140,7 @@ impl Floor {
         (ahead_us > 0).then(|| self.issue(wall_us, elapsed, false).1)?
     }
 
-    /// Steps that were seen.
+    /// Returns the steps that were detected so far.
     pub(super) fn steps(&self) -> ClockSteps {
         self.steps
     }
@@ -158,7 +163,7 @@ mod tests {
         let mut floor = Floor::default();
         let begin_us = 1_000 * SECOND_US;
         assert_eq!(floor.issue(begin_us, after(0), true), (begin_us, None));
-        // Back by 60 s: caught up 120 s later.
+        // A step back of 60 s is caught up after 120 s at half the rate.
         let held = |passed: u64| begin_us + i64::try_from(passed).unwrap() * SECOND_US / 2;
         let machine = |passed: u64| begin_us + (i64::try_from(passed).unwrap() - 60) * SECOND_US;
         let by_us = 60 * SECOND_US;

@@ -1,4 +1,4 @@
-//! `[oidc]`: the sign-in of people at an OpenID provider, and what their groups give them.
+//! `[oidc]`: sign-in of people at an OpenID provider, and the rights of their groups.
 
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
@@ -11,64 +11,65 @@ use tread_api::rights::{Grant, InvalidScope, Right, Rights, Scope};
 use super::ConfigError;
 use crate::identity::origin::{Names, Origin};
 
-/// Most groups that may be given rights.
+/// Maximum number of configured groups; more prevent the start.
 pub const GROUPS_MAX: usize = 200;
-/// Most scopes that may be asked for.
+/// Maximum number of requested scopes; more prevent the start.
 const SCOPES_MAX: usize = 30;
-/// Longest name of a group, scope or claim, in characters.
+/// Maximum length of the name of a group, scope or claim, in characters.
 const TEXT_MAX: usize = 255;
-/// Longest label, in characters.
+/// Maximum length of the label, in characters.
 const LABEL_MAX: usize = 60;
-/// How long a session may last, hours.
+/// Range of the maximum duration of a session, in hours.
 pub const SESSION_HOURS_RANGE: RangeInclusive<u32> = 1..=12;
-/// The route that the provider sends browsers back to.
+/// Route to which the provider redirects browsers after the sign-in.
 pub const CALLBACK: &str = "/v1/sign-in/oidc/callback";
-/// The scope without which it is no OpenID Connect.
+/// Scope that OpenID Connect requires.
 const OPENID: &str = "openid";
 
-/// The sign-in of people at an OpenID provider.
+/// `[oidc]`: sign-in of people at an OpenID provider.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct OidcConfig {
-    /// The provider, as it names itself: `https`, or `http` on this machine.
+    /// Issuer identifier of the provider, a URL: `https`, or `http` with a loopback host.
     pub issuer: String,
-    /// This server's name at the provider.
+    /// Client identifier of this server at the provider.
     pub client_id: String,
-    /// The file with its secret there, which only the server's user can read; without it it is a public
-    /// client, with PKCE alone.
+    /// File with the client secret, readable by the server's user only; `None` for a public client,
+    /// which uses PKCE alone.
     pub client_secret_file: Option<PathBuf>,
-    /// Where browsers find this server: the provider sends them back to
+    /// Origin under which browsers reach this server. The provider redirects them to
     /// `<public_url>/v1/sign-in/oidc/callback`.
     pub public_url: Origin,
-    /// What is asked of the provider.
+    /// Requested scopes, which must include `openid`.
     #[serde(default = "scopes")]
     pub scopes: Vec<String>,
-    /// The claim with a person's groups, by its name or a path such as `realm_access.roles`.
+    /// Claim with a person's groups: its name, or a dotted path such as `realm_access.roles`.
     #[serde(default = "groups_claim")]
     pub groups_claim: String,
-    /// The claim with a person's name; when absent `preferred_username`, then `email`, then `sub`.
+    /// Claim with a person's display name; when absent, `preferred_username`, then `email`, then
+    /// `sub`.
     pub name_claim: Option<String>,
-    /// What people call the provider: `Sign in with <label>`.
+    /// Name of the provider on the sign-in page: `Sign in with <label>`.
     #[serde(default = "label")]
     pub label: String,
-    /// Certificates of the authorities to trust for the provider, PEM, instead of the machine's.
+    /// File with the CA certificates to trust for the provider, PEM; the machine's when absent.
     pub ca: Option<PathBuf>,
-    /// How long a session lasts at the most, hours, within [`SESSION_HOURS_RANGE`].
+    /// Maximum duration of a session in hours, within [`SESSION_HOURS_RANGE`].
     #[serde(default = "session_hours")]
     pub session_hours: u32,
-    /// What each group gives. A person in none of them is refused.
+    /// Rights by group. A person in none of these groups is refused.
     pub groups: BTreeMap<String, GroupConfig>,
 }
 
-/// What a group gives.
+/// `[oidc.groups.NAME]`: rights of a group; needs either `role` or `rights`.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GroupConfig {
-    /// A role.
+    /// Role of the group's members.
     pub role: Option<Role>,
-    /// Rights in place of a role.
+    /// Rights of the group's members, instead of a role.
     pub rights: Option<Vec<Right>>,
-    /// Where, each `SITE` or `SITE/ROBOT`; everywhere when absent.
+    /// Scope of the rights, a list of `SITE` or `SITE/ROBOT`; everywhere when absent.
     pub sites: Option<Vec<String>>,
 }
 
@@ -90,71 +91,74 @@ const fn session_hours() -> u32 {
     *SESSION_HOURS_RANGE.end()
 }
 
-/// Why `[oidc]` cannot be.
+/// Error of the section `[oidc]`.
 #[derive(Debug, thiserror::Error)]
 pub enum OidcConfigError {
-    /// A text is empty, too long, or has letters that cannot be.
+    /// A value is empty, too long, or has characters that are not allowed.
     #[error("`oidc.{key}` cannot be {value:?}: {cause}")]
     Text {
-        /// Which key.
+        /// Key within `[oidc]`.
         key: &'static str,
-        /// What was given.
+        /// Configured value.
         value: String,
-        /// What is wrong.
+        /// Requirement that is not met.
         cause: String,
     },
-    /// The secret of the provider's answers and of sign-ins would go over the network in the clear.
+    /// A URL would send secrets over the network without TLS.
     #[error(
         "`oidc.{key}` is `{value}`: it must be `https`, or `http` with a name of this machine's own"
     )]
     ClearText {
-        /// Which key.
+        /// Key within `[oidc]`.
         key: &'static str,
-        /// What was given.
+        /// Configured value.
         value: String,
     },
-    /// Browsers would come by https to a server that gives them cookies for http.
+    /// `public_url` is `https`, but this server is reached by `http`, for which it sets its
+    /// cookies.
     #[error(
         "`oidc.public_url` is `{0}`, and this server has neither `[tls]` nor `web.behind_https`"
     )]
     NoTls(Origin),
-    /// Browsers would come by http to a server that gives them cookies for https.
+    /// `public_url` is `http`, but this server is reached by `https`, for which it sets its
+    /// cookies.
     #[error("`oidc.public_url` is `{0}`, and this server is reached by `https`")]
     NotTls(Origin),
-    /// The server does not answer to that name.
+    /// The host of `public_url` is not among the names of this server.
     #[error("`oidc.public_url` is `{0}`, and its name is not one of `web.hosts`")]
     UnknownHost(Origin),
-    /// It is no OpenID Connect without it.
+    /// The scope `openid` is missing.
     #[error("`oidc.scopes` must have `openid`")]
     NoOpenid,
-    /// Nobody could sign in, or there are too many.
+    /// No group is configured, or more than [`GROUPS_MAX`].
     #[error(
         "`oidc.groups` must give rights to 1 to {GROUPS_MAX} groups, as in `[oidc.groups.NAME]`"
     )]
     Groups,
-    /// A group gives nothing, or twice.
+    /// A group, the value, has neither role nor rights, or both.
     #[error("`oidc.groups.{0}` needs either a `role` or `rights`, at least one")]
     Rights(String),
-    /// Where a group's rights hold cannot be read.
+    /// The `sites` of a group are invalid.
     #[error("`oidc.groups.{group}.sites` cannot be taken: {cause}")]
     Sites {
-        /// Which group.
+        /// Name of the group.
         group: String,
-        /// Why.
+        /// Cause of the failure.
         cause: InvalidScope,
     },
 }
 
 impl OidcConfig {
-    /// Where the provider sends browsers back to.
+    /// Returns the redirect URI, to which the provider redirects browsers.
     pub fn redirect_uri(&self) -> String {
         format!("{}{}", self.public_url, CALLBACK)
     }
 
-    /// What each group gives.
+    /// Returns the grant of each group.
     ///
     /// # Errors
-    /// A group gives nothing, or places that cannot be read.
+    /// [`OidcConfigError::Rights`] if a group has no rights, [`OidcConfigError::Sites`] if its
+    /// scope is invalid.
     pub fn grants(&self) -> Result<BTreeMap<String, Grant>, OidcConfigError> {
         let grants = self.groups.iter().map(|(name, group)| {
             let rights: Rights = match (group.role, &group.rights) {

@@ -1,4 +1,5 @@
-//! Which connections are open, and who goes when there are too many.
+//! Limits the open connections of a listener, and chooses which one to close when a limit is
+//! reached.
 //!
 //! ```text
 //!  unproven ──valid credential──► busy ──answer given──► idle ──next request──► unproven …
@@ -6,17 +7,20 @@
 //!     └──────────answer given────────────────┘
 //! ```
 //!
-//! A connection whose request has shown no valid credential yet is *unproven*, whatever else it has
-//! sent: there is room for few of those, and a new one displaces the oldest of the address that has
-//! most. So whoever opens thousands and sends nothing, or sends the body of a sign-in byte by byte, only displaces their
-//! own, while an honest client is unproven for a moment. The rest of the room is for those who
-//! have shown a credential, for each of them and for each address a share. When all of it is taken, the
-//! one that has been idle longest goes; connections at work are kept.
+//! A connection is *unproven* until its current request has presented a valid credential. The
+//! number of unproven connections is small, and a new one displaces the oldest of the address that
+//! has most of them. A client that opens thousands of connections and sends nothing, or sends a
+//! body byte by byte, therefore displaces only its own; a regular client is unproven for a moment.
+//! The remaining connections are for clients with a valid credential, with a limit for each
+//! identity and each address. When a limit is reached, the connection that has been idle longest is
+//! closed; busy ones are kept.
 //!
-//! A Stop has room beyond all of that, of which each credential has a share. Nobody keeps it from getting
-//! so far as to show its credential: what is at work has no part in the room of the unproven.
+//! Stop requests have reserved connections beyond these limits, with a limit for each identity.
+//! Busy connections do not use the places of unproven ones, so a Stop can always present its
+//! credential.
 //!
-//! The robots' port uses the same table: there a TLS handshake with a certificate is the proof.
+//! The robots' port uses the same table; there a TLS handshake with a client certificate is the
+//! credential.
 
 mod table;
 
@@ -32,60 +36,60 @@ use crate::identity::address::network_of;
 use crate::identity::subject::SubjectId;
 use crate::rate_limit::Bucket;
 
-/// How many connections there may be.
+/// Maximum numbers of connections of a listener.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Bounds {
-    /// Of all kinds.
+    /// All connections, whatever their phase.
     pub all: usize,
-    /// At work or idle, from one address of another machine, or one /64 of IPv6.
+    /// Busy and idle connections of one remote address (of one /64 for IPv6).
     pub per_address: usize,
-    /// Without a valid credential so far.
+    /// Unproven connections, those without a valid credential.
     pub unproven: usize,
-    /// The same, from one address of another machine, or one /64 of IPv6.
+    /// Unproven connections of one remote address (of one /64 for IPv6).
     pub unproven_per_address: usize,
 }
 
-/// The bounds of the REST API.
+/// Limits of the REST API's listener.
 pub const BOUNDS: Bounds = Bounds {
     all: 4_096,
     per_address: 512,
     unproven: 512,
     unproven_per_address: 64,
 };
-/// Rest after the machine refused a connection, such as for want of file handles.
+/// Pause of the accept loop after a failed `accept`, for example for lack of file descriptors.
 pub const ACCEPT_REST: Duration = Duration::from_millis(100);
-/// Most connections of one token, with its sessions, that are at work or idle: a dashboard may serve
-/// a thousand people by one token, and others find room beside it.
+/// Maximum number of busy and idle connections of one identity with all its sessions. It allows a
+/// dashboard to serve a thousand people with one token, and leaves room for others.
 pub const PER_IDENTITY_MAX: usize = 2_048;
-/// Connections on which a Stop is answered though all others are at work.
+/// Number of connections reserved for Stop requests while all others are busy.
 pub const STOPS_MAX: usize = 256;
-/// Most of them of one token: others find room beside whoever fills his own.
+/// Maximum number of reserved Stop connections of one identity.
 pub const STOPS_PER_IDENTITY_MAX: usize = 32;
 
-/// There is no room for another connection at work.
+/// Error: a limit of busy connections is reached, and no idle connection can be closed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum Full {
-    /// This token has its share.
+    /// The identity has [`PER_IDENTITY_MAX`] busy connections.
     #[error("this token has {PER_IDENTITY_MAX} connections at work; end some of them")]
     Identity,
-    /// This address has its share.
+    /// The address has reached [`Bounds::per_address`], the value.
     #[error("{0} connections of this address are at work; end some of them")]
     Address(usize),
-    /// All of the server's room is taken.
+    /// All places of connections with a credential are busy.
     #[error("all connections of the server are at work; try again later")]
     Server,
 }
 
-/// What a request is for, as far as room is concerned.
+/// Class of a request in the limits of connections.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Purpose {
-    /// It stops robots, and has room of its own.
+    /// Stops robots; uses the reserved connections if the others are busy.
     Stop,
-    /// Anything else.
+    /// Any other request.
     Other,
 }
 
-/// All open connections.
+/// Open connections of a listener, with their limits.
 #[derive(Debug)]
 pub struct Connections {
     bounds: Bounds,
@@ -93,17 +97,17 @@ pub struct Connections {
     begun: Instant,
 }
 
-/// What became of a new connection.
+/// A new connection that was accepted.
 #[derive(Debug)]
 pub struct Admitted {
-    /// Its place, kept as long as this or a clone of it is.
+    /// Entry of the connection in the table; dropping the last clone removes the entry.
     pub slot: Arc<Slot>,
-    /// How many others it displaced.
+    /// Number of connections that were closed to make room.
     pub displaced: usize,
 }
 
 impl Connections {
-    /// No connections yet.
+    /// Creates an empty table with these limits.
     pub fn new(bounds: Bounds) -> Arc<Self> {
         let table = Mutex::default();
         let begun = Instant::now();
@@ -118,13 +122,14 @@ impl Connections {
         self.table.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Takes in a new connection; `None` if all are at work. `cut` is cancelled when it has to
-    /// go.
+    /// Accepts a new connection; `None` if all others are busy. `cut` is cancelled when the
+    /// connection has to be closed.
     pub fn admit(self: &Arc<Self>, peer: IpAddr, cut: CancellationToken) -> Option<Admitted> {
         self.admit_from(peer, peer.to_canonical().is_loopback(), cut)
     }
 
-    /// The same, from an address that many clients may come from.
+    /// Accepts a new connection as [`Self::admit`] does. The limits per address do not apply if
+    /// `is_shared`: many clients use this address, as with a trusted proxy.
     pub fn admit_from(
         self: &Arc<Self>,
         peer: IpAddr,
@@ -182,14 +187,15 @@ impl Connections {
         })
     }
 
-    /// How many are open.
+    /// Returns the number of open connections.
     pub fn count(&self) -> usize {
         self.lock().entries.len()
     }
 }
 
-/// The place of one connection; whoever takes the connection over, as a `WebSocket` does, keeps a
-/// clone, so that it goes on being counted.
+/// Entry of one connection in the table, removed when the last clone is dropped. A task that takes
+/// the connection over, such as a `WebSocket`, keeps a clone so that the connection is still
+/// counted.
 #[derive(Debug)]
 pub struct Slot {
     connections: Arc<Connections>,
@@ -197,8 +203,8 @@ pub struct Slot {
 }
 
 impl Slot {
-    /// The connection has shown who it is; it is at work until the result is dropped. It is cut if
-    /// its address has its share.
+    /// Marks the connection as authenticated and busy until the result is dropped. Closes it if its
+    /// address has reached [`Bounds::per_address`].
     pub fn work(self: &Arc<Self>) -> AtWork {
         let at_work = self.hold();
         let mut table = self.connections.lock();
@@ -210,8 +216,7 @@ impl Slot {
         at_work
     }
 
-    /// The connection stays what it is until the result is dropped, as one does that becomes a
-    /// `WebSocket`.
+    /// Keeps the connection in its phase until the result is dropped, for example as a `WebSocket`.
     pub fn hold(self: &Arc<Self>) -> AtWork {
         let mut table = self.connections.lock();
         if let Some(entry) = table.entries.get_mut(&self.id) {
@@ -220,16 +225,18 @@ impl Slot {
         AtWork(Arc::clone(self))
     }
 
-    /// By how long the next request is delayed, whose head has come: whoever was known on this
-    /// connection before has a rate for all of its connections, everybody else one for this
-    /// connection. A Stop is delayed by no other request.
+    /// Returns the delay of a request whose head has arrived at `now`. An identity that the last
+    /// request on this connection showed has one rate limit over all its connections; other
+    /// requests have one per connection. Other requests do not delay a Stop of an authenticated
+    /// connection.
     pub fn delay(&self, purpose: Purpose, now: Instant) -> Duration {
         let now = now.saturating_duration_since(self.connections.begun);
         self.connections.lock().delay(self.id, purpose, now)
     }
 
-    /// The head of a request has come, of a client that a trusted proxy names if it came by one.
-    /// The connection is unproven until [`Self::prove`]. Gives how many others it displaced.
+    /// Starts a request whose head has arrived; the connection is unproven until [`Self::prove`].
+    /// `client` is the client's address if a trusted proxy reports one. Returns the number of
+    /// connections that were closed to make room.
     pub fn begin(self: &Arc<Self>, client: Option<IpAddr>) -> (AtWork, usize) {
         let at_work = self.hold();
         let mut table = self.connections.lock();
@@ -249,19 +256,20 @@ impl Slot {
         (at_work, displaced)
     }
 
-    /// The request on this connection has shown a valid credential: it is at work until it is
-    /// answered.
+    /// Records that the request has presented a valid credential of `identity`: the connection is
+    /// busy until the request is answered.
     ///
     /// # Errors
-    /// [`Full`], which a Stop meets only when [`STOPS_MAX`] others are being answered beyond it, or
-    /// [`STOPS_PER_IDENTITY_MAX`] of the same token.
+    /// [`Full`] if a limit is reached and no idle connection can be closed; for a Stop only if
+    /// [`STOPS_MAX`] reserved connections, or [`STOPS_PER_IDENTITY_MAX`] of this identity, are in
+    /// use.
     pub fn prove(&self, identity: SubjectId, purpose: Purpose) -> Result<(), Full> {
         let mut table = self.connections.lock();
         if !table.entries.contains_key(&self.id) {
-            // It was cut; what is answered nobody reads.
+            // The connection was closed, so nobody reads the answer.
             return Ok(());
         }
-        // What it was before counts no more, whatever it shows now.
+        // The phase and identity of an earlier request no longer apply.
         table.set(self.id, Phase::Unproven, None);
         let phase = match table.room_for(self.id, identity, &self.connections.bounds) {
             Ok(()) => Phase::Busy,
@@ -289,7 +297,8 @@ impl Drop for Slot {
     }
 }
 
-/// A connection at work on a request.
+/// Guard of a connection that processes a request; dropping the last one makes a busy connection
+/// idle.
 #[derive(Debug)]
 pub struct AtWork(Arc<Slot>);
 

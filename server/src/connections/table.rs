@@ -1,4 +1,4 @@
-//! The table of connections: who is in which phase, counted by address and by identity.
+//! Table of open connections with their phases, counted by address and by identity.
 
 use std::collections::{BTreeMap, HashMap};
 use std::hash::Hash;
@@ -11,20 +11,20 @@ use super::{Bounds, Full, PER_IDENTITY_MAX, Purpose, STOPS_MAX, STOPS_PER_IDENTI
 use crate::identity::subject::SubjectId;
 use crate::rate_limit::{Bucket, RateLimit};
 
-/// Requests of one token, with its sessions, on all of its connections: a dashboard serves a thousand
-/// people.
+/// Rate limit of one identity with all its sessions, over all its connections. It suffices for a
+/// dashboard that serves a thousand people with one token.
 const REQUESTS_OF_IDENTITY: RateLimit = RateLimit {
     burst: 2_000,
     interval: Duration::from_millis(1),
 };
-/// Requests on one connection that has shown nothing valid, and Stops on any one.
+/// Rate limit of one connection for requests without a known identity, and for Stops.
 const REQUESTS_OF_CONNECTION: RateLimit = RateLimit {
     burst: 50,
     interval: Duration::from_millis(20),
 };
-/// Longest delay of one request: the connection's next one is not read meanwhile.
+/// Maximum delay of one request; the next request of the connection is not read during it.
 const REQUEST_DELAY_MAX: Duration = Duration::from_secs(1);
-/// Tokens whose rates are remembered before those that are at rest are forgotten.
+/// Number of identities with a stored rate from which those with an unused limit are dropped.
 const RATES_MAX: usize = 4_096;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -32,40 +32,40 @@ pub(super) enum Phase {
     Unproven,
     Busy,
     Idle,
-    /// A Stop beyond the room of the others.
+    /// Processes a Stop on a reserved connection.
     Stopping,
 }
 
 #[derive(Debug)]
 pub(super) struct Entry {
     pub(super) address: IpAddr,
-    /// Whether many clients come from there: this machine, or a trusted proxy.
+    /// Whether many clients share this address: this machine's, or a trusted proxy's.
     pub(super) is_shared: bool,
-    /// Whose share it is of, while it is not unproven.
+    /// Identity whose limits count this connection; `None` while unproven.
     pub(super) identity: Option<SubjectId>,
     pub(super) phase: Phase,
-    /// Who showed a credential on it last.
+    /// Identity that the latest request presented, for the rate limit.
     pub(super) known: Option<SubjectId>,
-    /// The rate of requests on it that are of nobody known, or stop robots.
+    /// Rate of the requests without a known identity and of the Stops on this connection.
     pub(super) rate: Bucket,
-    /// Requests that are being answered.
+    /// Number of requests in progress.
     pub(super) requests: usize,
-    /// Since when it is in its phase, in the order of changes.
+    /// Sequence number of the last change of phase, unique in the table.
     pub(super) since: u64,
     pub(super) cut: CancellationToken,
 }
 
-/// How many there are of each.
+/// Number of connections for each key; absent if zero.
 type Counts<K> = HashMap<K, usize>;
 
 #[derive(Debug, Default)]
 pub(super) struct Table {
     next: u64,
     pub(super) entries: HashMap<u64, Entry>,
-    /// By when they became so, oldest first.
+    /// Unproven connections, as `since` → connection, so the oldest is first; `idle` likewise.
     pub(super) unproven: BTreeMap<u64, u64>,
     pub(super) idle: BTreeMap<u64, u64>,
-    /// Those that are busy or idle.
+    /// Number of connections that are busy or idle.
     pub(super) proven: usize,
     pub(super) stopping: usize,
     pub(super) proven_per_address: Counts<IpAddr>,
@@ -81,7 +81,8 @@ impl Table {
         self.next
     }
 
-    /// By how long the next request on a connection is delayed, at a time since the server's start.
+    /// Returns the delay of the next request on connection `id`. `now` is the time since the
+    /// table's creation.
     pub(super) fn delay(&mut self, id: u64, purpose: Purpose, now: Duration) -> Duration {
         let Some(entry) = self.entries.get_mut(&id) else {
             return Duration::ZERO;
@@ -97,13 +98,13 @@ impl Table {
         rate.take_delayed(REQUESTS_OF_IDENTITY, now, REQUEST_DELAY_MAX)
     }
 
-    /// Puts a connection in, whose phase is unproven.
+    /// Inserts a connection, whose phase must be unproven.
     pub(super) fn insert(&mut self, id: u64, entry: Entry) {
         self.entries.insert(id, entry);
         self.count_in(id);
     }
 
-    /// Leaves the counts without a connection, before something of it changes.
+    /// Removes a connection from all counts; called before its entry changes.
     fn count_out(&mut self, id: u64) {
         let Some(entry) = self.entries.get(&id) else {
             return;
@@ -126,7 +127,7 @@ impl Table {
         }
     }
 
-    /// Counts a connection as what it is.
+    /// Adds a connection to the counts of its phase, address and identity.
     fn count_in(&mut self, id: u64) {
         let Some(entry) = self.entries.get(&id) else {
             return;
@@ -167,19 +168,19 @@ impl Table {
         self.set(id, phase, identity.filter(|_| phase != Phase::Unproven));
     }
 
-    /// Gives a connection its phase, as of that identity.
+    /// Sets phase and identity of a connection.
     pub(super) fn set(&mut self, id: u64, phase: Phase, identity: Option<SubjectId>) {
         let since = self.number();
         self.count_out(id);
         if let Some(entry) = self.entries.get_mut(&id) {
             (entry.phase, entry.identity, entry.since) = (phase, identity, since);
-            // Of the last request alone: a proxy's connection carries others' as well.
+            // The latest request alone counts, because a proxy sends requests of several clients.
             entry.known = identity;
         }
         self.count_in(id);
     }
 
-    /// Counts a connection as of another address: the one that a trusted proxy names.
+    /// Sets the address of a connection to the client address that a trusted proxy reports.
     pub(super) fn set_address(&mut self, id: u64, address: IpAddr) {
         self.count_out(id);
         if let Some(entry) = self.entries.get_mut(&id)
@@ -190,7 +191,8 @@ impl Table {
         self.count_in(id);
     }
 
-    /// Ends the oldest unproven connections of an address, and of all, that are too many.
+    /// Closes the oldest unproven connections beyond the limits per address and in total. Returns
+    /// the number of closed connections.
     pub(super) fn shed_unproven(
         &mut self,
         address: IpAddr,
@@ -216,7 +218,7 @@ impl Table {
         displaced
     }
 
-    /// Whether the address of a connection has all others at work or idle that it may have.
+    /// Returns whether the other busy and idle connections of this one's address reach the limit.
     pub(super) fn has_share_of_address(&self, id: u64, bounds: &Bounds) -> bool {
         let Some(entry) = self.entries.get(&id) else {
             return false;
@@ -226,7 +228,10 @@ impl Table {
         !entry.is_shared && !counts && count.is_some_and(|&count| count >= bounds.per_address)
     }
 
-    /// Makes room for a connection of an identity at work.
+    /// Makes room for a busy connection of `identity` by closing idle ones.
+    ///
+    /// # Errors
+    /// [`Full`] if a limit is reached and no idle connection can be closed.
     pub(super) fn room_for(
         &mut self,
         id: u64,
@@ -250,7 +255,7 @@ impl Table {
         Ok(())
     }
 
-    /// Whether a Stop of an identity has a turn beyond the room of all others.
+    /// Returns whether a reserved Stop connection is free for `identity`.
     pub(super) fn has_room_for_stop(&self, identity: SubjectId) -> bool {
         let own = self.stopping_per_identity.get(&identity).copied();
         self.stopping < STOPS_MAX && own.unwrap_or(0) < STOPS_PER_IDENTITY_MAX
@@ -269,7 +274,7 @@ impl Table {
     }
 
     fn oldest_idle(&self, is_wanted: impl Fn(&Entry) -> bool) -> Option<u64> {
-        // One whose next request is delayed is not idle.
+        // A connection whose next request is being delayed is not idle.
         let is_idle = |entry: &Entry| entry.requests == 0 && is_wanted(entry);
         let is_wanted = |id: &u64| self.entries.get(id).is_some_and(is_idle);
         self.idle.values().copied().find(is_wanted)
@@ -280,7 +285,7 @@ impl Table {
         idle.or_else(|| self.unproven_to_displace())
     }
 
-    /// The oldest unproven connection of the address that has most of them.
+    /// Returns the oldest unproven connection of the address that has most of them.
     pub(super) fn unproven_to_displace(&self) -> Option<u64> {
         let counts = &self.unproven_per_address;
         let most = counts.values().copied().max()?;

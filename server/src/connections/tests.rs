@@ -78,7 +78,7 @@ fn a_stop_has_room_when_all_are_at_work_and_others_have_none() {
     let _other_at_work = other.begin(None);
     assert_eq!(other.prove(token(9), Purpose::Other), Err(Full::Server));
     assert_eq!(other.prove(token(9), Purpose::Stop), Ok(()));
-    // What is idle gives way.
+    // An idle connection is closed to make room.
     drop(working.remove(0).0);
     let (next, _) = open(&connections, 91).unwrap();
     let _next_at_work = next.begin(None);
@@ -242,7 +242,7 @@ fn one_identity_does_not_fill_the_room_of_stops() {
         let (at_work, _) = slot.begin(None);
         (slot.prove(token(identity), Purpose::Stop), at_work, slot)
     };
-    // The first one takes the one place of the address.
+    // The first connection takes the only place of the address.
     let viewer: Vec<_> = (0..=STOPS_PER_IDENTITY_MAX).map(|_| stop(1)).collect();
     assert!(viewer.iter().all(|(proven, ..)| proven.is_ok()));
     assert_eq!(stop(1).0, Err(Full::Address(1)));

@@ -5,7 +5,7 @@ use std::collections::{BTreeSet, HashMap};
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
 use tread_api::ids::{BootId, ConfigurationId, RobotId, SiteId};
-use tread_api::robot::{Capabilities, MeasurementsTaken, RobotModel};
+use tread_api::robot::{Capabilities, RobotModel, UnmappedMeasurements};
 
 use super::{DbError, from_json, from_us, parse, robots_text, to_json, to_us, unsigned};
 
@@ -40,7 +40,7 @@ pub struct RobotRow {
     /// Last hello.
     pub last_hello_at: Timestamp,
     /// Counts of its refused and deferred measurements.
-    pub measurements: MeasurementsTaken,
+    pub measurements: UnmappedMeasurements,
 }
 
 struct Raw {
@@ -78,7 +78,7 @@ impl TryFrom<Raw> for RobotRow {
             boot: parse("boot", &raw.boot)?,
             first_seen_at: from_us(raw.first_seen_at_us)?,
             last_hello_at: from_us(raw.last_hello_at_us)?,
-            measurements: MeasurementsTaken {
+            measurements: UnmappedMeasurements {
                 refused: unsigned("count", raw.segments_refused)?,
                 refused_why: raw.segments_refused_why,
                 deferred: unsigned("count", raw.segments_deferred)?,

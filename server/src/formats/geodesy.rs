@@ -1,25 +1,25 @@
-//! From a site's plane to WGS 84: the plane touches the ellipsoid at the site's origin.
+//! Converts site coordinates to WGS 84. The site's plane is tangent to the ellipsoid at the origin.
 //!
-//! A point (x, y) is turned into east and north, put into the earth-centred frame, and read back as
-//! latitude and longitude. Height is left out: at 10 km the plane is 8 m above the ellipsoid, and a
-//! place below it on the ground is 1 cm off.
+//! A point (x, y) is rotated into east and north, transformed to the earth-centred, earth-fixed
+//! frame, and converted to latitude and longitude. Height is ignored: at 10 km from the origin the
+//! plane is 8 m above the ellipsoid, which gives a horizontal error of 1 cm.
 
 use tread_api::geometry::Point;
 use tread_api::site::GeoOrigin;
 
 /// Semi-major axis of the WGS 84 ellipsoid, metres.
 const A_M: f64 = 6_378_137.0;
-/// Its flattening.
+/// Flattening of the WGS 84 ellipsoid.
 const F: f64 = 1.0 / 298.257_223_563;
-/// Its eccentricity squared.
+/// Squared first eccentricity of the WGS 84 ellipsoid.
 const E2: f64 = F * (2.0 - F);
-/// Rounds of the latitude's iteration; each gains two digits at least.
+/// Number of iterations for the latitude; each gains at least two digits.
 const ROUNDS: u32 = 6;
 
-/// Longitude and latitude, degrees, in the order of GeoJSON.
+/// `[longitude, latitude]` in degrees, the order of GeoJSON.
 pub type LonLat = [f64; 2];
 
-/// A place on the earth by its coordinates in the site.
+/// Converts `point` in the site frame to WGS 84, given the site's origin.
 pub fn to_wgs84(origin: GeoOrigin, point: Point) -> LonLat {
     let (sin_turn, cos_turn) = origin.x_axis_deg.to_radians().sin_cos();
     let east = point.x_m * cos_turn - point.y_m * sin_turn;
@@ -76,7 +76,7 @@ mod tests {
         );
         assert!(((lat - 52.0) * 111_267.9 - 100.0).abs() < 0.01, "{lat}");
         assert!((lon - 4.0).abs() < 1e-12, "{lon}");
-        // A site whose x axis looks north.
+        // A site whose x axis points north.
         let turned = to_wgs84(
             origin(52.0, 4.0, 90.0),
             Point {
@@ -95,7 +95,7 @@ mod tests {
         ) {
             let from = origin(latitude, longitude, turn);
             let [lon, lat] = to_wgs84(from, Point { x_m, y_m });
-            // By the radii of curvature at the origin.
+            // Expected values from the radii of curvature at the origin.
             let sin = latitude.to_radians().sin();
             let root = (1.0 - E2 * sin * sin).sqrt();
             let north = (lat - latitude).to_radians() * A_M * (1.0 - E2) / root.powi(3);

@@ -1,9 +1,8 @@
-//! Entries as JSON: a list as the API has it, or features of GeoJSON, written piece by piece.
+//! Writes entries as JSON in chunks: as a list of the REST API, or as GeoJSON features.
 //!
-//! GeoJSON (RFC 7946) knows WGS 84 alone. Where a site is tied to it, each cell is a polygon of
-//! longitudes and latitudes. Where it is not, nobody may take metres for degrees: `geometry` is
-//! `null` and the polygon stands in `place`, with `coordRefSys` beside it, in the manner of OGC
-//! JSON-FG.
+//! GeoJSON (RFC 7946) allows WGS 84 only. For a georeferenced site each cell is a polygon of
+//! longitudes and latitudes. For other sites `geometry` is `null`, so that metres are not mistaken
+//! for degrees, and the polygon is in `place`, with `coordRefSys`, as in OGC JSON-FG.
 
 use jiff::Timestamp;
 use serde::Serialize;
@@ -15,13 +14,13 @@ use tread_api::site::Site;
 use super::geodesy::to_wgs84;
 use super::table::{TableError, Writer};
 
-/// The media type of GeoJSON.
+/// Media type of GeoJSON.
 pub const GEOJSON_MEDIA_TYPE: &str = "application/geo+json";
 
-/// How an entry is written.
+/// Function that converts an entry to JSON.
 type Write<T> = Box<dyn Fn(&T) -> Result<Value, serde_json::Error> + Send>;
 
-/// Entries of a list, with what stands before and behind them.
+/// Writer of a JSON list, with the text before and after its entries.
 struct List<T> {
     before: String,
     after: String,
@@ -51,7 +50,8 @@ impl<T> Writer<T> for List<T> {
     }
 }
 
-/// Everything on one page, as the API's lists of the map are, with as of when it is.
+/// Returns a writer of all entries as one page of the REST API. `as_of` is the time to which ages
+/// refer.
 pub fn page<T: Serialize + 'static>(as_of: Option<Timestamp>) -> Box<dyn Writer<T>> {
     Box::new(List {
         before: "{\"items\":[".to_owned(),
@@ -61,7 +61,8 @@ pub fn page<T: Serialize + 'static>(as_of: Option<Timestamp>) -> Box<dyn Writer<
     })
 }
 
-/// Cells of a site as features, with as of when they are.
+/// Returns a writer of a site's cells as a GeoJSON `FeatureCollection`. `as_of` is the time to
+/// which ages refer.
 pub fn features(site: &Site, as_of: Option<Timestamp>) -> Box<dyn Writer<CellFriction>> {
     let origin = site.origin;
     let mut head = match origin {
@@ -78,7 +79,7 @@ pub fn features(site: &Site, as_of: Option<Timestamp>) -> Box<dyn Writer<CellFri
     };
     head["tread:as_of"] = json!(as_of);
     let mut before = head.to_string();
-    // The list comes last in the object.
+    // Remove the closing brace: the list of features is the last member.
     before.pop();
     before.push_str(",\"features\":[");
     Box::new(List {

@@ -1,4 +1,5 @@
-//! The friction map in the formats of other programs. Pure: what is known goes in, bytes come out.
+//! Encoders of the friction map: JSON, GeoJSON, CSV, Parquet, PNG, Nav2 speed mask, binary tile.
+//! Pure.
 
 pub mod geodesy;
 pub mod json;

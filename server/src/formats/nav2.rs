@@ -1,40 +1,42 @@
-//! The map as a speed mask for Nav2: a YAML file for its map server and the picture that it names.
+//! Writes the map as a speed filter mask for Nav2: a YAML file for the map server and its PGM
+//! image.
 //!
-//! The value of a cell, 1 to 100, is the speed that its filter allows, in hundredths of the highest
-//! one: a filter of type 2 (absolute speed) with base 0 and that hundredth as its multiplier. The
-//! picture is read in the mode `scale`, in which 0 (black) is 100 and 255 (white) is 0.
+//! The value of a cell, 1 to 100, is the speed limit in hundredths of the maximum speed: a costmap
+//! filter of type 2 (absolute speed) with base 0 and a multiplier of a hundredth of the maximum
+//! speed. The image has the mode `scale`, in which 0 (black) means 100 and 255 (white) means 0.
 //!
-//! The speed is the one from which a robot stops within a distance: `v² = 2·a·s`, where `a` comes
-//! from the traction limit as the robots' own planner takes it. Where nothing is known the cautious traction limit
-//! counts, so that unknown ground is slow, not free.
+//! The limit is the speed from which a robot stops within a distance `s`: `v² = 2·a·s`. The
+//! deceleration `a` is computed from the traction limit as in the robots' planner. Cells without
+//! measurements use the cautious traction limit, so unknown ground is slow.
 
 use tread_control::robot::RobotModel;
 
 use crate::friction::Raster;
 use crate::friction::index::KnownCell;
 
-/// The media type of the picture.
+/// Media type of the image.
 pub const PGM_MEDIA_TYPE: &str = "image/x-portable-graymap";
-/// The media type of the description.
+/// Media type of the YAML file.
 pub const YAML_MEDIA_TYPE: &str = "application/yaml";
-/// The picture's name in the description.
+/// File name of the image in the YAML file.
 pub const IMAGE: &str = "speed.pgm";
 
-/// How fast is fast.
+/// Parameters of the speed limits.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SpeedScale {
-    /// The speed of a hundred, metres per second.
+    /// Speed of the value 100, the maximum, in metres per second.
     pub speed_max_m_s: f64,
-    /// Within what distance a robot must be able to stop, metres.
+    /// Distance within which a robot has to be able to stop, in metres.
     pub stopping_m: f64,
 }
 
-/// The speed from which a robot stops within the distance, metres per second.
+/// Returns the speed in metres per second from which a robot stops within `scale.stopping_m`.
 fn speed_m_s(traction_limit_mu: f64, scale: SpeedScale) -> f64 {
     (2.0 * RobotModel::longitudinal_traction_m_s2(traction_limit_mu) * scale.stopping_m).sqrt()
 }
 
-/// The value of a cell: whole hundredths, rounded down, at least one (0 would be no limit at all).
+/// Returns the value of a cell in hundredths of the maximum, rounded down, 1 to 100; 0 would mean
+/// unlimited.
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
@@ -46,7 +48,7 @@ fn value(speed_m_s: f64, scale: SpeedScale) -> u8 {
         .clamp(1.0, 100.0) as u8
 }
 
-/// The picture: binary PGM, the highest row first.
+/// Returns the image as binary PGM (P5), the row with the largest y first.
 pub fn pgm(raster: &Raster, scale: SpeedScale) -> Vec<u8> {
     let mut bytes = format!(
         "P5\n# tread speed mask of {}\n{} {}\n255\n",
@@ -65,7 +67,7 @@ pub fn pgm(raster: &Raster, scale: SpeedScale) -> Vec<u8> {
     bytes
 }
 
-/// The description.
+/// Returns the YAML file.
 pub fn yaml(raster: &Raster, scale: SpeedScale) -> Vec<u8> {
     let corner = raster.corner();
     let multiplier = scale.speed_max_m_s / 100.0;
@@ -73,7 +75,7 @@ pub fn yaml(raster: &Raster, scale: SpeedScale) -> Vec<u8> {
         .configuration
         .map_or_else(|| "none".to_owned(), |id| id.to_string());
     let normalisation = raster.normalisation.as_deref().unwrap_or("none");
-    // Names are people's; a line break in one must not begin a key.
+    // Users choose these names; a line break in one must not start a YAML key.
     let normalisation: String = normalisation
         .chars()
         .filter(|letter| !letter.is_control())
@@ -124,7 +126,7 @@ mod tests {
     fn every_value_comes_back_out_of_its_grey() {
         for value in 1..=100_u8 {
             let grey = 255 - u8::try_from((u32::from(value) * 255 + 50) / 100).unwrap();
-            // As the map server reads it.
+            // The conversion of Nav2's map server.
             let occupied = (255.0 - f64::from(grey)) / 255.0;
             assert!(((occupied * 100.0).round() - f64::from(value)).abs() < 1e-9);
         }

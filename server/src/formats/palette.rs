@@ -1,18 +1,19 @@
-//! Colours of the map: the colour map cividis over a fixed range of θ, so that a colour means the
-//! same from day to day, drawn towards grey where a value is unsure. The page has the same.
+//! Colours of the map: the colour map cividis over a fixed logarithmic range of θ, so that colours
+//! are comparable over time. Uncertain values are desaturated towards grey. The dashboard uses the
+//! same.
 
-/// Lowest θ that has a colour of its own.
+/// Lower end of the colour scale, θ; smaller values have the same colour.
 pub const THETA_LOW: f64 = 0.05;
-/// Highest θ that has a colour of its own.
+/// Upper end of the colour scale, θ; larger values have the same colour.
 pub const THETA_HIGH: f64 = 2.0;
-/// Relative standard deviation up to which a value keeps its colour.
+/// Relative standard deviation up to which a value has its full colour.
 pub const SURE: f64 = 0.05;
 /// Relative standard deviation from which a value is grey.
 pub const UNSURE: f64 = 0.5;
 /// Relative standard deviation from which a value is hatched as well.
 pub const HATCHED: f64 = 0.25;
 
-/// Red, green, blue.
+/// `[red, green, blue]`, 0 to 255.
 pub type Rgb = [u8; 3];
 
 #[expect(
@@ -24,7 +25,7 @@ fn byte(value: f64) -> u8 {
     value.round().clamp(0.0, 255.0) as u8
 }
 
-/// The colour of a share from 0 to 1, by polynomials that were fitted to the published table
+/// Returns the colour at `share` of the scale, 0 to 1, by polynomials fitted to the published table
 /// (d3-scale-chromatic, ISC).
 pub fn cividis(share: f64) -> Rgb {
     let t = share.clamp(0.0, 1.0);
@@ -37,18 +38,28 @@ pub fn cividis(share: f64) -> Rgb {
     ]
 }
 
-/// Where θ stands in its range, 0 to 1.
+/// Returns the position of `theta` on the logarithmic colour scale, clamped to 0 to 1.
 pub fn share(theta: f64) -> f64 {
     ((theta / THETA_LOW).ln() / (THETA_HIGH / THETA_LOW).ln()).clamp(0.0, 1.0)
 }
 
-/// How unsure a value is, 0 to 1.
+/// Returns the degree of desaturation, 0 (full colour) to 1 (grey).
 pub fn doubt(relative_std_dev: f64) -> f64 {
     ((relative_std_dev - SURE) / (UNSURE - SURE)).clamp(0.0, 1.0)
 }
 
-/// The colour of a share from 0 to 1, drawn towards grey by `doubt` from 0 to 1.
-pub fn colour(share: f64, doubt: f64) -> Rgb {
+/// Colour of the map before conversion to RGB.
+#[derive(Debug, Clone, Copy)]
+pub struct Shade {
+    /// Position on the colour scale, 0 to 1.
+    pub share: f64,
+    /// Degree of desaturation, 0 (full colour) to 1 (grey).
+    pub doubt: f64,
+}
+
+/// Returns the colour of a shade, desaturated towards grey of equal luma.
+pub fn colour(shade: Shade) -> Rgb {
+    let Shade { share, doubt } = shade;
     let pure = cividis(share).map(f64::from);
     let grey = 0.299 * pure[0] + 0.587 * pure[1] + 0.114 * pure[2];
     pure.map(|channel| byte(grey + (channel - grey) * (1.0 - doubt.clamp(0.0, 1.0))))
@@ -62,7 +73,10 @@ mod tests {
     fn the_colour_map_goes_from_dark_blue_to_yellow() {
         assert_eq!(cividis(0.0), [0, 32, 81]);
         assert_eq!(cividis(1.0), [253, 234, 69]);
-        let grey = colour(0.5, 1.0);
+        let grey = colour(Shade {
+            share: 0.5,
+            doubt: 1.0,
+        });
         assert!(grey[0] == grey[1] && grey[1] == grey[2], "{grey:?}");
     }
 

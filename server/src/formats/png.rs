@@ -1,5 +1,5 @@
-//! The map as a picture for people: θ in colours, grey and hatched where it is unsure, clear where
-//! nothing is known, with a legend below. North-like is up.
+//! Draws the map as a PNG image with a legend: θ as colour, grey and hatched where uncertain,
+//! transparent where unknown. The site's y axis points up.
 
 use std::collections::BTreeMap;
 use std::convert::Infallible;
@@ -12,52 +12,55 @@ use embedded_graphics::pixelcolor::{Rgb888, RgbColor as _};
 use embedded_graphics::text::{Baseline, Text};
 use embedded_graphics::{Drawable as _, Pixel};
 
-use super::palette::{HATCHED, Rgb, THETA_HIGH, THETA_LOW, UNSURE, cividis, colour, doubt, share};
+use super::palette::{
+    HATCHED, Rgb, Shade, THETA_HIGH, THETA_LOW, UNSURE, cividis, colour, doubt, share,
+};
 use crate::friction::Raster;
 use crate::friction::index::KnownCell;
 
-/// The media type.
+/// Media type of the image.
 pub const MEDIA_TYPE: &str = "image/png";
-/// Pixels that the longer side gets when nothing is said, at least.
+/// Minimum length of the longer side in pixels if the request gives no scale.
 const SIDE_PX: usize = 768;
-/// Most pixels of a square's side.
+/// Maximum side of a map square, in pixels.
 pub const SCALE_MAX: usize = 32;
-/// Most pixels of a picture without its legend.
+/// Maximum number of pixels of the map without its legend; a larger image is refused.
 const PIXELS_MAX: usize = 1 << 24;
-/// Least pixels of a square's side for hatching to be seen.
+/// Minimum side of a map square that is hatched, in pixels; smaller ones are not.
 const HATCHED_SIDE_PX: usize = 4;
-/// Distance of the lines of the hatching, pixels.
+/// Distance between hatching lines, in pixels.
 const HATCH_PX: usize = 4;
-/// Letters of the legend, Greek ones too.
+/// Font of the legend, with Greek letters.
 const FONT: MonoFont<'_> = FONT_7X13;
-/// Pixels of a letter's width and height.
+/// Width and height of a letter, in pixels.
 const LETTER_PX: (usize, usize) = (
     FONT.character_size.width as usize,
     FONT.character_size.height as usize,
 );
-/// Pixels of a margin in the legend.
+/// Margin in the legend, in pixels.
 const MARGIN_PX: usize = 8;
-/// Pixels of the height of a bar of the legend.
+/// Height of a colour bar in the legend, in pixels.
 const BAR_PX: usize = 12;
-/// Least width of the legend, pixels.
+/// Minimum width of the legend, in pixels.
 const LEGEND_WIDTH_PX: usize = 280;
 const WHITE: Rgb = [255; 3];
 const INK: Rgb = [32; 3];
-/// What the legend names of θ.
+/// Values of θ labelled in the legend.
 const TICKS: [&str; 6] = ["0.05", "0.1", "0.2", "0.5", "1", "2"];
 
-/// Why there is no picture.
+/// Error of drawing the map.
 #[derive(Debug, thiserror::Error)]
 pub enum PngError {
-    /// The picture would be too large.
+    /// The image would exceed the maximum size; the value is the requested side of a square in
+    /// pixels.
     #[error("with {0} pixels to a square this would be more than {PIXELS_MAX} pixels")]
     TooLarge(usize),
-    /// It cannot be written.
+    /// The image cannot be encoded.
     #[error("the picture cannot be written")]
     Encode(#[from] ::png::EncodingError),
 }
 
-/// Pixels with a channel for what is clear.
+/// RGBA image, initially transparent.
 struct Canvas {
     width: usize,
     height: usize,
@@ -117,16 +120,16 @@ fn text_width_px(text: &str) -> usize {
     text.chars().count() * LETTER_PX.0
 }
 
-/// Pixels of a square's side when nobody says how many.
+/// Returns the side of a map square in pixels if the request gives none.
 fn scale_of(raster: &Raster) -> usize {
     let side = raster.columns.max(raster.rows).max(1);
     SIDE_PX.div_ceil(side).clamp(1, SCALE_MAX)
 }
 
-/// The picture as a PNG file, with `scale` pixels to a square's side.
+/// Draws the map as a PNG file, with map squares of `scale` pixels, clamped to 1 to [`SCALE_MAX`].
 ///
 /// # Errors
-/// [`PngError`]: it would be too large.
+/// [`PngError::TooLarge`] if the image would be too large.
 pub fn encode(raster: &Raster, scale: Option<usize>) -> Result<Vec<u8>, PngError> {
     let scale = scale
         .unwrap_or_else(|| scale_of(raster))
@@ -156,7 +159,10 @@ pub fn encode(raster: &Raster, scale: Option<usize>) -> Result<Vec<u8>, PngError
 
 fn draw(canvas: &mut Canvas, (x, y): (usize, usize), scale: usize, known: &KnownCell) {
     let relative = known.std_dev / known.theta;
-    let ink = colour(share(known.theta), doubt(relative));
+    let ink = colour(Shade {
+        share: share(known.theta),
+        doubt: doubt(relative),
+    });
     canvas.fill((x, y), (scale, scale), ink);
     if scale >= HATCHED_SIDE_PX && relative >= HATCHED {
         for row in y..y + scale {
@@ -167,7 +173,7 @@ fn draw(canvas: &mut Canvas, (x, y): (usize, usize), scale: usize, known: &Known
     }
 }
 
-/// A bar of colours for θ and one from sure to unsure.
+/// Draws a colour bar for θ and one for the relative standard deviation.
 #[expect(
     clippy::cast_precision_loss,
     clippy::cast_possible_truncation,
@@ -202,7 +208,10 @@ fn draw_legend(canvas: &mut Canvas, top: usize, height: usize) {
     canvas.write((MARGIN_PX, y), "σ/θ");
     for column in 0..bar {
         let relative = column as f64 / bar as f64 * UNSURE;
-        let ink = colour(0.75, doubt(relative));
+        let ink = colour(Shade {
+            share: 0.75,
+            doubt: doubt(relative),
+        });
         for row in y..y + BAR_PX {
             let is_hatched = relative >= HATCHED && (left + column + row).is_multiple_of(HATCH_PX);
             canvas.put(left + column, row, if is_hatched { WHITE } else { ink });
@@ -235,7 +244,7 @@ fn write(canvas: &Canvas, raster: &Raster) -> Result<Vec<u8>, PngError> {
     Ok(bytes)
 }
 
-/// What the file says of itself.
+/// Returns the text chunks of the file: site, model, geometry and configuration of the map.
 fn said(raster: &Raster) -> BTreeMap<&'static str, String> {
     let corner = raster.corner();
     let mut said = BTreeMap::from([

@@ -1,11 +1,11 @@
-//! The map as a compact binary tile, see [`tread_api::tile`].
+//! Encodes the map as a compact binary tile, see [`tread_api::tile`].
 
 use tread_api::tile::{Tile, TileSquare};
 
 use crate::friction::Raster;
 use crate::friction::index::CellSummary;
 
-/// The tile as bytes.
+/// Returns the encoded tile.
 pub fn encode(raster: &Raster) -> Vec<u8> {
     let square = |square: &CellSummary| {
         square.known().map(|known| TileSquare {

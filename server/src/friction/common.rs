@@ -1,4 +1,4 @@
-//! Errors that segments have in common: of one robot, and of all robots on the same tyres.
+//! Tests of common errors of segments: of one robot, and of all robots with the same tyres.
 
 use tread_api::friction::{Information, NORMAL_95, ThetaErrors};
 
@@ -9,14 +9,14 @@ use super::weights::FrictionConfig;
 use super::*;
 
 const THETA: f64 = 0.2;
-/// Independent standard deviation of one segment.
+/// Standard deviation of the independent error of one segment.
 const OWN_STD_DEV: f64 = 0.01;
-/// What robots say of their common errors.
+/// Common errors that the robots state, relative to θ.
 const ROBOT_RATIO: f64 = 0.12;
 const TYRE_RATIO: f64 = 0.1;
 const FLEETS: u32 = 3_000;
 
-/// A measurement that tells its common errors.
+/// Returns the sums of a segment that states its common errors.
 fn sums_of(theta: f64, age_s: i64, [robot, tyre]: [f64; 2]) -> Sums {
     let sums = measured(theta, OWN_STD_DEV, age_s);
     let information = OWN_STD_DEV.powi(-2);
@@ -43,7 +43,7 @@ fn theta_narrows_with_robots_and_not_with_the_segments_of_one() {
     assert!(often < 1.01 * common, "{often} {common}");
     let (two, thirty) = (std_dev(2, 50), std_dev(30, 50));
     assert!(two < 0.85 * often, "{two} {often}");
-    // What all have in common is left however many there are.
+    // The error common to all robots does not average out.
     assert!(
         (TYRE_RATIO..1.15 * TYRE_RATIO).contains(&thirty),
         "{thirty}"
@@ -75,7 +75,7 @@ fn intervals_hold_the_truth_where_robots_share_the_error_of_their_tyres() {
     }
 }
 
-/// Share of intervals that hold the truth, and their mean width, of honest robots and perhaps a
+/// Returns coverage and mean width of the intervals of `honest` honest robots and optionally a
 /// wrong one.
 fn beside(honest: u8, wrong: Option<Sums>) -> (f64, f64) {
     let mut normal = Normal(0x5EED_0004);
@@ -132,7 +132,7 @@ fn sums_keep_the_independent_information_and_mean_shares_of_what_is_common() {
     sums.add(&sums_of(THETA, 1, [0.3, 0.0]));
     let seen = Seen::of(1_u8, 0, &sums).unwrap();
     assert!((seen.robot_ratio - 0.2).abs() < 1e-6 && (seen.tyre_ratio - 0.1).abs() < 1e-6);
-    // Who tells nothing of it counts as before.
+    // A robot that does not state its common errors has none in the sums.
     let silent = Seen::of(1_u8, 0, &measured(THETA, OWN_STD_DEV, 0)).unwrap();
     assert!(silent.robot_ratio <= 0.0 && silent.tyre_ratio <= 0.0);
     assert!(

@@ -1,4 +1,4 @@
-//! How often the 95 % interval holds the truth, for robots with a bias of their own.
+//! Tests the coverage of the 95 % interval for robots with individual biases.
 
 use tread_api::friction::{NORMAL_95, ROBOT_BIAS_RATIO};
 
@@ -6,15 +6,15 @@ use super::tests::{at_us, measured};
 use super::weights::FrictionConfig;
 use super::*;
 
-/// Visits of all runs of a fleet. `examples/map_report` does the same with more of them.
+/// Total number of visits over all runs of a fleet. `examples/map_report` repeats this with more.
 const VISITS: u32 = 500_000;
 /// Standard deviation of one visit's θ.
 const VISIT_STD_DEV: f64 = 0.02;
 const THETA: f64 = 0.2;
-/// Of the random numbers; kept, so that a failure is the same again.
+/// Seed of the random numbers, fixed so that failures are reproducible.
 const SEED: u64 = 0x5EED_0001;
 
-/// Normally distributed random numbers (splitmix64, Box and Muller).
+/// Normally distributed random numbers (splitmix64, Box–Muller transform).
 pub(super) struct Normal(pub(super) u64);
 
 impl Normal {
@@ -33,7 +33,7 @@ impl Normal {
     }
 }
 
-/// Shares of intervals that hold the truth: ours as a cell, as an area, and those of summed
+/// Returns the coverage of three intervals: of a fused cell, of a fused area, and of plain sums of
 /// information.
 fn coverage(robots: u32, visits: u32) -> [f64; 3] {
     let mut normal = Normal(SEED ^ u64::from(robots) << 32 ^ u64::from(visits));

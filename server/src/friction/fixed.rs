@@ -1,20 +1,20 @@
-//! Fixed point sums: the same to the bit in whatever order their parts arrive.
+//! Fixed-point sums, which do not depend on the order of their addends.
 //!
 //! A value is `hi + lo / 2³²` with `0 ≤ lo < 2³²`. Sums of floating-point numbers depend on their
-//! order, sums of integers do not. Each part is rounded once, to 2.3·10⁻¹⁰, when it arrives.
+//! order, sums of integers do not. Each addend is rounded once, to 2.3·10⁻¹⁰.
 
 use std::iter::Sum;
 use std::ops::{Add, AddAssign};
 
-/// Steps per unit.
+/// Steps per unit, 2³².
 const SCALE: f64 = 4_294_967_296.0;
 
-/// A sum in steps of 2⁻³².
+/// A fixed-point number in steps of 2⁻³². Additions saturate.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default, Hash)]
 pub struct Fixed(i128);
 
 impl Fixed {
-    /// Rounds a number; `None` if it is not finite or beyond ±9·10¹⁸.
+    /// Rounds a number to fixed point; `None` if it is not finite or beyond ±9·10¹⁸.
     pub fn from_f64(value: f64) -> Option<Self> {
         let steps = (value * SCALE).round();
         let bound = SCALE * 9.0e18;
@@ -22,21 +22,21 @@ impl Fixed {
         (steps.abs() <= bound).then_some(Self(steps as i128))
     }
 
-    /// Puts the two halves together again.
+    /// Returns the number with these halves; see [`Self::halves`].
     pub fn from_halves(hi: i64, lo: i64) -> Self {
         Self((i128::from(hi) << 32) + i128::from(lo))
     }
 
-    /// Whole units, rounded down, and the rest in steps, 0 to 2³² − 1.
+    /// Splits the number into whole units, rounded down, and the rest in steps, 0 to 2³² − 1.
     ///
-    /// `None` if the sum has left the range of the database.
+    /// Returns `None` if the whole units exceed 64 bits, the range of the database.
     pub fn halves(self) -> Option<(i64, i64)> {
         let hi = i64::try_from(self.0 >> 32).ok()?;
         let lo = i64::try_from(self.0 & 0xFFFF_FFFF).ok()?;
         Some((hi, lo))
     }
 
-    /// The nearest number.
+    /// Returns the nearest floating-point number.
     #[expect(
         clippy::cast_precision_loss,
         reason = "rounding once is what is wanted"

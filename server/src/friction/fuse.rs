@@ -1,25 +1,26 @@
-//! Many robots' measurements of one piece of ground as one estimate.
+//! Fuses the measurements of several robots of one piece of ground to one estimate.
 //!
-//! Epoch `e` of robot `r` weighs `w_e = 1 / (1/Λ_e + q·age_e)`, so `θ_r = Σ w_e θ_e / Λ_r` with
-//! `Λ_r = Σ w_e`. Robot `r` weighs `w_r = 1 / ((s_b·θ)² + 1/Λ_r)`, with θ the **common** estimate
-//! `Σ w_r θ_r / Σ w_r`, found by iterating: each robot's own θ there would make intervals too
-//! small. The variance of θ is `1 / Σ w_r`.
+//! Epoch `e` of robot `r` has the weight `w_e = 1 / (1/Λ_e + q·age_e)`, so `θ_r = Σ w_e θ_e / Λ_r`
+//! with `Λ_r = Σ w_e`. Robot `r` has the weight `w_r = 1 / ((s_b·θ)² + 1/Λ_r)`, where θ is the
+//! **common** estimate `Σ w_r θ_r / Σ w_r`, found by iteration; with each robot's own θ intervals
+//! would be too small. The variance of θ is `1 / Σ w_r`.
 //!
-//! `Λ_e` is the information of independent errors. What a robot says of the error that all its
-//! segments have in common takes the place of `s_b` where it is more; that which all robots on the
-//! same tyres have in common, `t·θ`, is added to the standard deviation once and never averages
-//! out. Among three robots or more no robot's bias counts as less than the median, and `t` is the
-//! median, so that no robot is heavier or makes the interval wider by what it says of its errors.
+//! `Λ_e` is the information of independent errors. The error common to all segments of a robot, as
+//! stated by the robot, replaces `s_b` if it is larger. The error common to all robots with the
+//! same tyres, `t·θ`, is added to the standard deviation once and does not average out. With three
+//! robots or more, no robot's bias is taken as smaller than the median of all, and `t` is the
+//! median, so that no robot gains weight or widens the interval by the errors that it states.
 //!
-//! A friction coefficient counts when a second robot has shown as much; of one robot alone up to
-//! [`MU_ALONE_MAX`]. No robot can raise the limits of others by its word.
+//! A peak friction coefficient is accepted if a second robot has shown as much, from one robot
+//! alone up to [`MU_ALONE_MAX`]. A single robot can therefore not raise the traction limit of
+//! others.
 //!
-//! The ground changes. For a cell, the epochs are gone through from the newest back, and where one
-//! contradicts what is newer by more than [`CHANGE_DEVIATIONS`], it and all older ones are left
-//! out. An epoch whose newest telling pass contradicts its other ones counts with that pass alone.
-//! Bad news (more slip) is believed from the first pass, good news when a second one confirms it,
-//! which must be another robot's if several others say otherwise; until then the estimate is
-//! disputed.
+//! Changes of the ground are detected for cells. The epochs are compared from the newest to the
+//! oldest. An epoch that differs from the newer ones by more than [`CHANGE_DEVIATIONS`] is dropped
+//! with all older ones. If the newest significant pass of an epoch contradicts the other passes of
+//! that epoch, only this pass counts. A change to more slip is accepted from the first pass. A
+//! change to less slip is accepted once a second pass confirms it, which must be of another robot
+//! if several robots contradict it; until then the estimate is disputed.
 
 use tread_api::friction::TYRE_DIFFERENCE_SHARE;
 
@@ -28,38 +29,39 @@ use super::seen::{CHANGE_DEVIATIONS, Estimate, Ground, Seen, age_s, seconds};
 use super::sums::Known;
 use super::weights::FrictionConfig;
 
-/// Smallest θ that the map states: stiffer than K = 10⁶ is not distinguished.
+/// Minimum θ that the map states; a smaller estimate is raised to it (K = 10⁶).
 pub const THETA_MIN: f64 = 1.0e-6;
-/// Largest standard deviation of θ that tells something: the whole range of θ, to K 0.1.
+/// Maximum standard deviation of θ; beyond it there is no estimate. It is the whole range of θ (K ≥
+/// 0.1).
 pub const THETA_STD_DEV_MAX: f64 = 10.0;
-/// Friction coefficient up to which one robot alone is believed.
+/// Maximum peak friction coefficient that is accepted from one robot alone.
 pub const MU_ALONE_MAX: f64 = 0.4;
-/// What is known of one piece of ground.
+/// Fused estimate of one piece of ground.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Fused {
     /// θ, at least [`THETA_MIN`].
     pub theta: Estimate,
-    /// Largest friction coefficient seen of late.
+    /// Recent peak friction coefficient.
     pub mu_peak: Option<f64>,
-    /// Ratio of effective to geometric track.
+    /// Ratio of effective to geometric track width.
     pub track: Option<Estimate>,
     /// Rolling resistance coefficient.
     pub rolling: Option<Estimate>,
-    /// Passes that ever came, also those that a change has made void and those without information.
+    /// Number of all passes, including those dropped after a change and those without information.
     pub passes: u64,
-    /// Robots behind the estimate.
+    /// Number of robots that contribute to the estimate.
     pub robots: u32,
     /// End of the newest pass, microseconds since 1970.
     pub newest_at_us: i64,
-    /// Whether measurements differ by more than they should.
+    /// Whether measurements differ by more than their errors explain, or a change is unconfirmed.
     pub is_disputed: bool,
-    /// Since when the ground is as it is, if it was otherwise; microseconds since 1970.
+    /// Time of the last detected change of the ground, microseconds since 1970.
     pub changed_at_us: Option<i64>,
 }
 
 impl Fused {
-    /// The same with uninformative passes counted too: their information is below what the sums
-    /// resolve, 2.3·10⁻¹⁰, so that they change no estimate.
+    /// Adds uninformative passes to the count. Their information is below the resolution of the
+    /// sums, 2.3·10⁻¹⁰, so they do not change the estimate.
     #[must_use]
     pub fn with_uninformative(self, uninformative_passes: u64) -> Self {
         Self {
@@ -69,10 +71,11 @@ impl Fused {
     }
 }
 
-/// One estimate of what was seen; `None` when nothing was, or nothing that tells one ground from
-/// another ([`THETA_STD_DEV_MAX`]).
+/// Fuses the measurements in `seen`, one entry for each robot and epoch; `now_us` is the time to
+/// which ages refer, microseconds since 1970.
 ///
-/// `seen` has one entry for each robot and epoch; it comes back sorted.
+/// Returns `None` without measurements, or if the standard deviation exceeds [`THETA_STD_DEV_MAX`].
+/// Sorts `seen`, and for a cell removes the entries from before a change.
 pub fn fuse<R: Ord + Copy>(
     seen: &mut Vec<Seen<R>>,
     ground: Ground,
@@ -82,7 +85,7 @@ pub fn fuse<R: Ord + Copy>(
     Fuser::default().fuse(seen, ground, config, now_us)
 }
 
-/// Fuses one piece of ground after another in the same room.
+/// Reusable buffers to fuse many pieces of ground without allocation.
 #[derive(Debug)]
 pub struct Fuser<R> {
     before: Vec<Seen<R>>,
@@ -99,7 +102,7 @@ impl<R> Default for Fuser<R> {
 }
 
 impl<R: Ord + Copy> Fuser<R> {
-    /// The same as [`fuse()`].
+    /// Fuses measurements as [`fuse()`] does.
     pub fn fuse(
         &mut self,
         seen: &mut Vec<Seen<R>>,
@@ -111,7 +114,8 @@ impl<R: Ord + Copy> Fuser<R> {
     }
 }
 
-/// Two revisions of a terrain that are one ground may both have a sum of one robot and epoch.
+/// Compares two entries by θ, as a tie-break: two revisions of a terrain may each have a sum of the
+/// same robot and epoch.
 fn by_content<R>(left: &Seen<R>, right: &Seen<R>) -> std::cmp::Ordering {
     let information = left.theta.information.total_cmp(&right.theta.information);
     information.then_with(|| left.theta.value.total_cmp(&right.theta.value))
@@ -188,8 +192,8 @@ fn fuse_in<R: Ord + Copy>(
     })
 }
 
-/// The friction coefficient that two robots have shown, or one alone up to [`MU_ALONE_MAX`]; what
-/// is seen is sorted by robot.
+/// Returns the peak friction coefficient that two robots have shown, or one alone up to
+/// [`MU_ALONE_MAX`]. `seen` must be sorted by robot.
 fn mu_shown<'seen, R: Ord + Copy + 'seen>(
     seen: impl Iterator<Item = &'seen Seen<R>>,
 ) -> Option<f64> {
@@ -218,7 +222,7 @@ fn mu_shown<'seen, R: Ord + Copy + 'seen>(
     alone.map(|alone| second.map_or(alone, |second| second.max(alone)))
 }
 
-/// Which of what was seen of a cell is of the ground as it is.
+/// Result of detecting a change of the ground in a cell.
 #[derive(Debug, Clone, Copy, Default)]
 struct Present {
     is_unconfirmed: bool,
@@ -226,7 +230,8 @@ struct Present {
 }
 
 impl Present {
-    /// Keeps, of what is sorted from the newest back, what is of the ground as it is.
+    /// Removes from `seen`, which is sorted newest first, the entries from before the last change
+    /// of the ground. `older` is a buffer.
     fn of<R: Ord + Copy>(
         seen: &mut Vec<Seen<R>>,
         older: &mut Vec<Seen<R>>,
@@ -247,7 +252,7 @@ impl Present {
                 changed_at_us: Some(changed_at_us),
             };
         }
-        // One pass or one robot against all before. Without it, what was there stands as it stood.
+        // One pass or one robot contradicts all earlier ones: find the estimate without it.
         let now = seen.first().map(|one| one.theta.value);
         let mut index = 0;
         older.retain_mut(|one| {
@@ -283,9 +288,9 @@ impl Present {
     }
 }
 
-/// The one robot that says the ground is better while several others say it is worse. Its word
-/// alone confirms nothing, however often and in however many ways it says it: nothing of it counts
-/// then.
+/// Returns the only robot that measured less slip while several others measured more; `None` if
+/// there is no such robot. Repeated measurements of it do not confirm the change, so all of its
+/// entries are ignored.
 fn lone_witness<R: Ord + Copy>(
     kept: &[Seen<R>],
     contradicted: &[Seen<R>],
@@ -300,7 +305,7 @@ fn lone_witness<R: Ord + Copy>(
         .filter(|one| now.is_better(&Word::of(one, one.theta, config)));
     let first = worse.next()?;
     let against = Word::of(first, first.theta, config);
-    // A robot of which all is kept contradicts itself, and nobody else.
+    // The contradicted entries have to be of at least two robots.
     let second = worse.find(|one| one.robot != first.robot)?;
     let mut witnesses = kept
         .iter()
@@ -314,8 +319,8 @@ fn lone_witness<R: Ord + Copy>(
     (is_alone && !is_of_others).then_some(lone)
 }
 
-/// θ of one or several measurements, with what it takes to compare them: sums of information, and
-/// of information times θ, the robots' bias and the tyres' error, both as shares of θ.
+/// Weighted mean of θ of several measurements, with their errors: sums of the information Λ, and of
+/// Λ times θ, times the robots' bias and times the tyres' error, the latter two relative to θ.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct Word {
     information: f64,
@@ -345,11 +350,11 @@ impl Word {
         self.weighted / self.information
     }
 
-    /// How far their difference may be off if nothing has changed, as a variance: without the
-    /// robots' biases where both are of one robot.
+    /// Returns the variance of the difference of two means on unchanged ground. Biases of robots do
+    /// not contribute if both are of one robot.
     fn difference_variance(&self, other: &Self, is_one_robot: bool) -> f64 {
-        // If nothing has changed, robots differ by a share of the θ that they have in common, which
-        // is nearest to what is known best, not of the larger one.
+        // On unchanged ground biases are relative to the common θ, which the weighted mean of both
+        // estimates best.
         let common = (self.weighted + other.weighted) / (self.information + other.information);
         let (mine, its) = (self.information, other.information);
         let bias = if is_one_robot {
@@ -361,22 +366,23 @@ impl Word {
         mine.recip() + its.recip() + (bias + tyre * tyre) * common * common
     }
 
-    /// Whether it says significantly less slip than another, robots' biases included.
+    /// Returns whether this θ is significantly below the other one, with biases taken into account.
     fn is_better(&self, other: &Self) -> bool {
         let variance = self.difference_variance(other, false);
         other.value() - self.value() > CHANGE_DEVIATIONS * variance.sqrt()
     }
 }
 
-/// How many of the newest agree, those that changed within their epoch cut down to their newest
-/// pass; and since when, if others were left out.
+/// Returns the number of leading entries of `seen` (newest first) that agree, and the time of the
+/// change if there is one, microseconds since 1970. Entries with a change within their epoch are
+/// reduced to their newest pass.
 fn keep_present<R: Ord + Copy>(
     seen: &mut [Seen<R>],
     config: &FrictionConfig,
 ) -> (usize, Option<i64>) {
     let mut changed_at_us = None;
     let mut oldest_kept_us = None;
-    // What is kept, and whose it is while it is one robot's.
+    // Mean of the entries kept so far, and their robot while it is only one.
     let mut kept = Word::default();
     let mut only: Option<R> = None;
     let mut newest_kept_us = 0;

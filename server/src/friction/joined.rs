@@ -1,27 +1,26 @@
-//! Robots' values joined to one, so that one wrong robot cannot lead the others astray.
+//! Robust mean of the robots' values, which limits the influence of any single robot.
 //!
-//! One robot may be wrong without limit: a wheel of another radius, or a robot that lies. Of three
-//! robots or more, what each group that leaves one of them out has in common is found, and the 95 %
-//! interval is the hull of the groups' intervals. A group that contradicts itself by
-//! [`GROUP_CHI_SQUARE_MAX`] more than the most consistent one does not count. So one wrong robot
-//! moves the interval only as far as the others cannot tell. Of two robots nobody can say which
-//! one is wrong; they count both, and the interval widens with their contradiction.
+//! One robot may be arbitrarily wrong, for example by a wrong wheel radius or by manipulation. With
+//! three robots or more, the mean and its 95 % interval are computed for each group that leaves one
+//! robot out, and the result is the hull of these intervals. A group is dropped if its χ² exceeds
+//! that of the most consistent group by more than [`GROUP_CHI_SQUARE_MAX`]. Of two robots the wrong
+//! one cannot be identified: both count, and the interval widens with their difference.
 
 use tread_api::friction::NORMAL_95;
 
 use super::seen::{Estimate, Ground, Seen, age_s};
 use super::sums::Known;
 
-/// Most rounds of the iteration for the common θ; it settles within about ten.
+/// Maximum number of iterations for the common θ; it converges within about ten.
 const ROUNDS_MAX: u32 = 100;
-/// Relative change at which the common θ counts as settled.
+/// Relative change of the common θ below which the iteration ends.
 const SETTLED_RATIO: f64 = 1.0e-12;
-/// Normal quantile from which differences are called a dispute: one in a thousand by chance.
+/// Normal quantile for disputes, with a false alarm rate of one in a thousand.
 const DISPUTE_QUANTILE: f64 = 3.090_232_306_167_813;
-/// How much larger a group's χ² may be than the smallest, for the group to count: its robots are
-/// e² = 7.4 times less likely to agree.
+/// Maximum excess of a group's χ² over the smallest one; a group beyond it is dropped. At this
+/// bound its likelihood is e² = 7.4 times smaller.
 const GROUP_CHI_SQUARE_MAX: f64 = 4.0;
-/// Room for what is joined.
+/// Reusable buffers of [`joined`].
 #[derive(Debug, Default)]
 pub(super) struct Room {
     robots: Vec<Word>,
@@ -29,18 +28,19 @@ pub(super) struct Room {
     ratios: Vec<f64>,
 }
 
-/// What one robot says in one epoch.
+/// Value of one robot in one epoch, with its errors.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Said {
-    /// The value, with its independent error.
+    /// Value, with the information of its independent error.
     pub(super) known: Known,
-    /// Standard deviation of the robot's bias as a share of the value.
+    /// Standard deviation of the robot's bias, relative to the value.
     pub(super) bias_ratio: f64,
-    /// Standard deviation of the error that all robots on its tyres have, as a share of the value.
+    /// Standard deviation of the error common to all robots with the same tyres, relative to the
+    /// value.
     pub(super) tyre_ratio: f64,
 }
 
-/// What one robot says, with the variance that its own measurements leave.
+/// Value of one robot over all epochs, with the variance of its independent errors.
 #[derive(Debug, Clone, Copy)]
 struct Word {
     variance: f64,
@@ -50,16 +50,17 @@ struct Word {
 }
 
 impl Word {
-    /// Its weight beside other robots, about their common value.
+    /// Returns the weight of the robot in a mean with others whose common value is `common`.
     fn weight(&self, common: f64) -> f64 {
         ((self.bias_ratio * common).powi(2) + self.variance).recip()
     }
 }
 
-/// How far apart measurements lie, as sums of squares with their degrees of freedom.
+/// Heterogeneity of measurements: χ² sums between robots, between epochs of a robot, and between
+/// passes of an epoch, with their degrees of freedom.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Heterogeneity {
-    /// How many robots.
+    /// Number of robots.
     pub(super) robots: u32,
     between: f64,
     within: f64,
@@ -69,7 +70,8 @@ pub(super) struct Heterogeneity {
 }
 
 impl Heterogeneity {
-    /// One robot's measurements of an area may differ from place to place; those of a cell may not.
+    /// Returns whether the measurements differ significantly: between robots, and for a cell also
+    /// between and within epochs. Measurements of an area may differ from place to place.
     pub(super) fn is_dispute(&self, ground: Ground) -> bool {
         let between = u64::from(self.robots.saturating_sub(1));
         self.between > chi_square_bound(between)
@@ -78,10 +80,11 @@ impl Heterogeneity {
                     || self.scatter > chi_square_bound(self.scatter_freedom))
     }
 
-    /// Robots that differ by more than their bias may be trusted less, all of them.
+    /// Returns the factor for the standard deviation, at least 1, if two robots differ by more than
+    /// their biases explain.
     pub(super) fn widening(&self) -> f64 {
         let freedom = u64::from(self.robots.saturating_sub(1));
-        // The hull of groups is wide where they contradict each other.
+        // The hull of groups already widens with their differences.
         let is_robust = self.robots as usize >= ROBUST_ROBOTS_MIN;
         if !is_robust && freedom > 0 && self.between > chi_square_bound(freedom) {
             (self.between / as_f64(freedom)).sqrt().max(1.0)
@@ -91,7 +94,7 @@ impl Heterogeneity {
     }
 }
 
-/// What a sum of squares exceeds once in a thousand cases, by Wilson and Hilferty.
+/// Returns the 99.9 % quantile of χ² with these degrees of freedom (Wilson–Hilferty approximation).
 fn chi_square_bound(freedom: u64) -> f64 {
     if freedom == 0 {
         return f64::INFINITY;
@@ -106,8 +109,9 @@ fn as_f64(count: u64) -> f64 {
     count as f64
 }
 
-/// One value out of the epochs of robots, which are sorted by robot; `drift` is the growth of a
-/// measurement's variance with its age.
+/// Computes one estimate from the epochs in `seen`, which must be sorted by robot; `None` without
+/// any value. `said_of` extracts the value of an epoch; `drift` is the growth of a measurement's
+/// variance with its age, per second.
 pub(super) fn joined<R: Ord + Copy>(
     seen: &[Seen<R>],
     Room {
@@ -122,8 +126,7 @@ pub(super) fn joined<R: Ord + Copy>(
     let mut heterogeneity = Heterogeneity::default();
     for epochs in seen.chunk_by(|left, right| left.robot == right.robot) {
         let (mut information, mut weighted, mut square) = (0.0, 0.0, 0.0);
-        // One robot's biases of two epochs are one, so their standard deviations add up, not their
-        // squares.
+        // The bias of a robot is the same in all epochs, so its standard deviations add linearly.
         let (mut bias, mut tyre) = (0.0, 0.0);
         for one in epochs {
             let Some(said) = said_of(one) else { continue };
@@ -151,7 +154,7 @@ pub(super) fn joined<R: Ord + Copy>(
             });
         }
     }
-    // Who knows next to nothing is no check on the others.
+    // Robots with vague values must not count towards the number of robots for robustness.
     let knows_little = |robot: &Word| robot.variance > VAGUE_STD_DEV * VAGUE_STD_DEV;
     if !robots.iter().all(knows_little) {
         robots.retain(|robot| !knows_little(robot));
@@ -179,13 +182,12 @@ pub(super) fn joined<R: Ord + Copy>(
     Some((Estimate { value, std_dev }, heterogeneity))
 }
 
-/// Standard deviation above which a robot's own word does not count beside others.
+/// Standard deviation above which a robot's value is dropped if others are more precise.
 const VAGUE_STD_DEV: f64 = 1.0;
-/// Fewest robots of which one can be identified as wrong.
+/// Minimum number of robots of which a wrong one can be identified.
 const ROBUST_ROBOTS_MIN: usize = 3;
 
-/// What robots say with one of them left out: sums of weights, of weighted values and of weighted
-/// squares.
+/// Weighted sums of a group of robots, with values relative to the median.
 #[derive(Debug, Clone, Copy, Default)]
 struct Group {
     weight: f64,
@@ -217,8 +219,8 @@ impl Group {
     }
 }
 
-/// The hull of the 95 % intervals of all groups that leave one robot out and agree about as well as
-/// the best.
+/// Returns the hull of the 95 % intervals of all groups that leave one robot out and are nearly as
+/// consistent as the best group.
 fn hull_of_groups(
     robots: &mut [Word],
     (behind, ratios): (&mut Vec<Group>, &mut Vec<f64>),
@@ -228,18 +230,18 @@ fn hull_of_groups(
         let by_value = left.value.total_cmp(&right.value);
         by_value.then_with(|| left.variance.total_cmp(&right.variance))
     });
-    // The common θ that the bias is a share of: no single robot moves a median far.
+    // Biases are relative to the common θ: the median, which no single robot moves far.
     let middle = robots.len() / 2;
     let median = if robots.len() % 2 == 1 {
         robots[middle].value
     } else {
         f64::midpoint(robots[middle - 1].value, robots[middle].value)
     };
-    // Nor does one that claims to have hardly any bias, or tyres of which nobody knows anything.
+    // Medians also limit the effect of a robot that states a tiny bias or a huge tyre error.
     let mut middle_of = |ratio_of: fn(&Word) -> f64| {
         ratios.clear();
         ratios.extend(robots.iter().map(ratio_of));
-        // Most fleets say the same of all their robots.
+        // Usually all robots state the same ratios.
         if ratios
             .iter()
             .all(|ratio| ratio.to_bits() == ratios[0].to_bits())
@@ -254,7 +256,7 @@ fn hull_of_groups(
     for robot in robots.iter_mut() {
         robot.bias_ratio = robot.bias_ratio.max(bias_ratio);
     }
-    // What comes behind each robot; with what comes before it that is all but that robot.
+    // Suffix sums; with the prefix sums they give each group without one robot.
     behind.clear();
     behind.resize(robots.len() + 1, Group::default());
     for (index, robot) in robots.iter().enumerate().rev() {
@@ -278,7 +280,7 @@ fn hull_of_groups(
             continue;
         }
         let mean = median + group.weighted / group.weight;
-        // Where even the best groups contradict themselves, more than one robot is wrong.
+        // If even the best groups are inconsistent, more than one robot is wrong.
         let widening = if chi_square > bound {
             (chi_square / as_f64(freedom)).sqrt().max(1.0)
         } else {
@@ -295,7 +297,8 @@ fn hull_of_groups(
     (estimate, heterogeneity)
 }
 
-/// The mean of robots whose biases are shares of this value, and its information.
+/// Returns the weighted mean of the robots and its information, with biases relative to `common`;
+/// `None` without robots.
 fn weighed(robots: &[Word], common: f64) -> Option<(f64, f64)> {
     let (mut sum, mut weighted) = (0.0, 0.0);
     for robot in robots {

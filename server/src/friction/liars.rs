@@ -1,4 +1,4 @@
-//! One robot that is wrong without limit, among others that are not.
+//! Tests one arbitrarily wrong robot among honest ones.
 
 use proptest::prelude::*;
 use tread_api::friction::{NORMAL_95, ROBOT_BIAS_RATIO};
@@ -11,14 +11,14 @@ use super::weights::FrictionConfig;
 use super::*;
 
 const THETA: f64 = 0.2;
-/// Standard deviation of what one robot measures by itself.
+/// Standard deviation of the independent error of one robot's measurement.
 const OWN_STD_DEV: f64 = 0.01;
-/// Fleets of each kind.
+/// Number of random fleets of each kind.
 const FLEETS: u32 = 4_000;
 const SEED: u64 = 0x5EED_0002;
 
-/// Of the fleets with this many honest robots and perhaps a wrong one: the share of intervals that
-/// hold the truth, and their mean width.
+/// Returns coverage and mean width of the intervals of fleets with `honest` honest robots and
+/// optionally a wrong one.
 fn coverage(honest: u8, wrong: Option<Sums>, ground: Ground) -> (f64, f64) {
     let mut normal = Normal(SEED);
     let (mut held, mut width) = (0_u32, 0.0);
@@ -34,7 +34,7 @@ fn coverage(honest: u8, wrong: Option<Sums>, ground: Ground) -> (f64, f64) {
                 Seen::of(robot, 0, &measured(theta, OWN_STD_DEV, i64::from(robot)))
             })
             .collect();
-        // Older than the others: what is newer and worse is believed until it is contradicted.
+        // Older than the others, because newer measurements of more slip count until contradicted.
         seen.extend(wrong.as_ref().and_then(|sums| Seen::of(0, 0, sums)));
         let fused = fuse(&mut seen, ground, &config, at_us(0)).unwrap();
         let (low, high) = fused.theta.interval_95();
@@ -47,13 +47,13 @@ fn coverage(honest: u8, wrong: Option<Sums>, ground: Ground) -> (f64, f64) {
     )
 }
 
-/// The mean width of the interval if all robots were known to be honest.
+/// Returns the mean width of the interval if all robots were known to be honest.
 fn width_of(robots: u8) -> f64 {
     let variance = (ROBOT_BIAS_RATIO * THETA).powi(2) + OWN_STD_DEV.powi(2);
     2.0 * NORMAL_95 * (variance / f64::from(robots)).sqrt()
 }
 
-/// One robot of `honest + 1` is wrong in every way.
+/// Checks fleets of `honest + 1` robots, one of which is wrong in various ways.
 fn check_one_wrong_beside(honest: u8) {
     let std_dev = (THETA * ROBOT_BIAS_RATIO).hypot(OWN_STD_DEV);
     let (mut held_least, mut ratio_most) = (1.0_f64, 0.0_f64);
@@ -168,7 +168,8 @@ fn one_robot_cannot_make_ground_better_that_several_others_found_worse() {
         (estimate.theta - 1.4).abs() < 0.2 && estimate.disputed,
         "{estimate:?}"
     );
-    // Nor by two words of which one makes the other look like bad news, in one hour or in two.
+    // Two false values, of which the older makes the newer look like more slip, have no effect
+    // either, within one hour or over two.
     for (earlier, later) in [(0.001, 0.01), (0.01, 0.001)] {
         for age_s in [20, HOUR_S + 20] {
             let lies = [
@@ -180,12 +181,12 @@ fn one_robot_cannot_make_ground_better_that_several_others_found_worse() {
             assert!((estimate.theta - 1.4).abs() < 0.3, "{estimate:?}");
         }
     }
-    // A vague word that contradicts nobody does not confirm it.
+    // A vague measurement that contradicts nothing does not confirm the change.
     let lie = (9, measured(0.01, 0.001, 10));
     let vague = (8, measured(1.2, 0.7, 20));
     let estimate = fused(honest().chain([lie, vague]), &config).unwrap();
     assert!((estimate.theta - 1.4).abs() < 0.3, "{estimate:?}");
-    // Another one that says so as well is believed.
+    // A second robot with the same measurement confirms the change.
     let others = (0..5).map(|time| {
         (
             u8::try_from(8 + time % 2).unwrap(),

@@ -1,9 +1,9 @@
-//! The map: what many robots measured at many times, as one estimate. Pure.
+//! Fuses friction measurements of many robots and times to one estimate per piece of ground. Pure.
 //!
-//! What is stored are additive statistics ([`sums`]) in fixed point ([`fixed`]); what is said is
-//! made from them when somebody asks ([`fuse()`]), with the age that they have then. So nothing
-//! stored is ever rewritten because time passes, and the answer depends on what was measured, not
-//! on when or how often it arrived. [`index`] holds the sums in memory.
+//! The server stores additive statistics ([`sums`]) in fixed point ([`fixed`]). Estimates are
+//! computed from them for each request ([`fuse()`]), with the age of the measurements at that time.
+//! Ageing therefore changes no stored value, and estimates do not depend on the order or number of
+//! uploads. [`index`] holds the statistics in memory.
 
 pub mod fixed;
 pub mod fuse;
@@ -24,12 +24,12 @@ pub use self::seen::{Estimate, Ground, Seen};
 pub use self::sums::{Sums, bucket_h, epoch_h};
 
 impl Fused {
-    /// In the words of the API, as of a time.
+    /// Converts the estimate to its API type, with its age at `now_us`, microseconds since 1970.
     pub fn to_api(self, now_us: i64) -> FusedFriction {
         let theta = self.theta;
         let (theta_low_95, theta_high_95) = theta.interval_95();
-        let lower = theta.quantile(-NORMAL_90, 0.0);
-        let upper = theta.quantile(NORMAL_90, fuse::THETA_MIN);
+        let lower = theta.quantile(-NORMAL_90).max(0.0);
+        let upper = theta.quantile(NORMAL_90).max(fuse::THETA_MIN);
         let layer = |estimate: Estimate| ValueEstimate {
             value: estimate.value,
             std_dev: estimate.std_dev,

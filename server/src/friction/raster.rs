@@ -1,4 +1,4 @@
-//! The map of one robot model as squares, row by row: what pictures and tiles are made from.
+//! Raster of the map for one robot model, from which images, tiles and speed masks are encoded.
 
 use tread_api::friction::NORMAL_90;
 use tread_api::geometry::Point;
@@ -8,38 +8,38 @@ use tread_api::site::{Cell, Site};
 use super::index::{CellSummary, KnownCell};
 use super::traction_limit::traction_limit_mu;
 
-/// The map as squares.
+/// Raster of the map in squares of one or more cells.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Raster {
-    /// The site.
+    /// Site of the map.
     pub site: Site,
-    /// The robot model whose θ this is; `None` while nobody has measured anything.
+    /// Configuration for which θ is stated; `None` without any measurement.
     pub configuration: Option<ConfigurationId>,
-    /// The model's name.
+    /// Name of the robot model.
     pub model: String,
-    /// The normalisation that joined other models' measurements, if any.
+    /// Name of the normalisation that includes measurements of other models, if any.
     pub normalisation: Option<String>,
-    /// The time at which ages are counted, microseconds since 1970.
+    /// Time to which ages refer, microseconds since 1970.
     pub as_of_us: i64,
-    /// Number of the lowest column and row, in squares from the origin.
+    /// Index of the lowest column and row, in squares from the origin.
     pub first: Cell,
-    /// How many columns.
+    /// Number of columns.
     pub columns: usize,
-    /// How many rows.
+    /// Number of rows.
     pub rows: usize,
-    /// Side of a square, metres.
+    /// Side of a square, in metres.
     pub size_m: f64,
-    /// Row by row from the lowest y, each from the lowest x.
+    /// Squares row by row from the lowest y, each row from the lowest x.
     pub squares: Vec<CellSummary>,
 }
 
 impl Raster {
-    /// What is known of each row from the lowest y up.
+    /// Returns an iterator of the rows, from the lowest y up.
     pub fn rows(&self) -> impl DoubleEndedIterator<Item = &[CellSummary]> {
         self.squares.chunks_exact(self.columns.max(1))
     }
 
-    /// Where the lower left corner lies.
+    /// Returns the corner with the lowest x and y, in the site frame.
     pub fn corner(&self) -> Point {
         Point {
             x_m: f64::from(self.first.ix) * self.size_m,
@@ -47,7 +47,7 @@ impl Raster {
         }
     }
 
-    /// Leaves out rows and columns at the rim of which nothing is known.
+    /// Removes outer rows and columns without any estimate.
     #[must_use]
     pub fn trimmed(mut self) -> Self {
         let is_known = |square: &CellSummary| square.known().is_some();
@@ -81,7 +81,8 @@ impl Raster {
 }
 
 impl KnownCell {
-    /// Friction coefficient to plan with; the cautious one where nothing is known.
+    /// Returns the friction coefficient up to which a plan may use traction; the cautious default
+    /// for `None`.
     pub fn traction_limit_mu(known: Option<&Self>) -> f64 {
         let upper = |known: &Self| known.theta + NORMAL_90 * known.std_dev;
         traction_limit_mu(known.and_then(|known| known.mu_peak), known.map(upper))

@@ -1,50 +1,51 @@
-//! What robots measured of one piece of ground, as it is fused.
+//! Measurements of one piece of ground, the input of the fusion.
 
 use tread_api::friction::{Information, NORMAL_95, TYRE_DIFFERENCE_SHARE};
 
 use super::sums::{Known, Sums};
 use super::weights::FrictionConfig;
 
-/// Standard deviations from which measurements contradict each other. With as many comparisons as
-/// a cell ever sees, one in ten thousand of them cuts off what was true.
+/// Number of standard deviations beyond which measurements contradict each other. With the usual
+/// number of comparisons in a cell, one in ten thousand detects a false change.
 pub(super) const CHANGE_DEVIATIONS: f64 = 4.5;
-/// Microseconds of a second.
+/// Microseconds per second.
 const SECOND_US: f64 = 1.0e6;
 
-/// What one robot measured in one epoch.
+/// Measurements of one robot in one epoch.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Seen<R> {
-    /// The robot; its order is the order of adding, so it must not depend on arrival.
+    /// Robot. Its order determines the order of summation, so it must not depend on the order of
+    /// arrival.
     pub robot: R,
     /// First hour of the epoch.
     pub epoch_h: i64,
-    /// θ, with its independent error.
+    /// θ, with the information of its independent error.
     pub theta: Known,
-    /// Standard deviation of the error that the robot has everywhere, as a share of θ; 0 if it does
-    /// not tell.
+    /// Standard deviation of the error common to all segments of the robot, relative to θ; 0 if the
+    /// robot does not state it.
     pub robot_ratio: f64,
-    /// The same of the error that all robots on its tyres have.
+    /// Standard deviation of the error common to all robots with the same tyres, relative to θ.
     pub tyre_ratio: f64,
-    /// Σ Λ·(θ − mean)² of the passes, which is χ² with one degree less than passes.
+    /// Σ Λ·(θ − mean)² of the passes: χ² with `passes` − 1 degrees of freedom.
     pub scatter: f64,
-    /// How many passes.
+    /// Number of passes.
     pub passes: u64,
     /// End of the newest pass, microseconds since 1970.
     pub newest_at_us: i64,
-    /// θ of the newest pass that tells something, if it is known by itself.
+    /// θ of the newest significant pass, if it is stored separately.
     pub newest: Option<Known>,
-    /// Friction seen by that pass.
+    /// Peak friction coefficient of the newest significant pass.
     pub newest_mu: Option<f64>,
-    /// Largest friction coefficient seen.
+    /// Peak friction coefficient of all passes.
     pub mu_peak: Option<f64>,
-    /// Ratio of effective to geometric track.
+    /// Ratio of effective to geometric track width.
     pub track: Option<Known>,
     /// Rolling resistance coefficient.
     pub rolling: Option<Known>,
 }
 
 impl<R> Seen<R> {
-    /// Of sums; `None` when they know no θ.
+    /// Returns the measurements of `sums`; `None` if they have no information on θ.
     pub fn of(robot: R, epoch_h: i64, sums: &Sums) -> Option<Self> {
         let theta = sums.theta.known()?;
         let scatter = sums.theta_square.to_f64() - theta.information * theta.value * theta.value;
@@ -65,7 +66,7 @@ impl<R> Seen<R> {
         })
     }
 
-    /// The same in the θ of another model, of which this model's is a multiple.
+    /// Converts θ to that of another robot model: divides it by `ratio`.
     #[must_use]
     pub fn scaled(mut self, ratio: f64) -> Self {
         let scale = |known: Known| Known {
@@ -76,7 +77,7 @@ impl<R> Seen<R> {
         self
     }
 
-    /// The passes before the newest one, if the newest contradicts them.
+    /// Returns θ of the newest pass and of the others if they contradict each other, else `None`.
     pub(super) fn contradicted(&self) -> Option<(Known, Known)> {
         let newest = self.newest.filter(|_| self.passes > 1)?;
         let information = self.theta.information - newest.information;
@@ -96,13 +97,14 @@ impl<R> Seen<R> {
             .then_some((newest, before))
     }
 
-    /// Standard deviation of this robot's bias as a share of θ: what it says of itself, and no less
-    /// than what is assumed.
+    /// Returns the standard deviation of this robot's bias relative to θ: the stated one, at least
+    /// the configured one.
     pub(super) fn bias_ratio(&self, config: &FrictionConfig) -> f64 {
         self.robot_ratio.max(config.robot_bias_ratio)
     }
 
-    /// By how much the tyres' errors of two measurements like this one differ, as a share of θ.
+    /// Returns the standard deviation of the difference of the tyres' errors in two measurements
+    /// like this one, relative to θ.
     pub(super) fn tyre_difference_ratio(&self) -> f64 {
         TYRE_DIFFERENCE_SHARE * self.tyre_ratio
     }
@@ -112,7 +114,7 @@ impl<R> Seen<R> {
         self.scatter = 0.0;
         self.passes = 1;
         self.mu_peak = self.newest_mu;
-        // Which of the passes showed these is not kept.
+        // These are not stored separately for the newest pass.
         (self.track, self.rolling) = (None, None);
         self
     }
@@ -133,36 +135,37 @@ fn known(information: &Information) -> Option<Known> {
     })
 }
 
-/// A value with its standard deviation.
+/// An estimated value with its standard deviation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Estimate {
-    /// The value.
+    /// Estimated value.
     pub value: f64,
-    /// Its standard deviation.
+    /// Standard deviation of its error.
     pub std_dev: f64,
 }
 
 impl Estimate {
-    /// The value that is undercut with this normal quantile, not below `least`.
-    pub fn quantile(&self, std_devs: f64, least: f64) -> f64 {
-        (self.value + std_devs * self.std_dev).max(least)
+    /// Returns the quantile of the normal distribution that is `std_devs` standard deviations above
+    /// the value, or below it if negative.
+    pub fn quantile(&self, std_devs: f64) -> f64 {
+        self.value + std_devs * self.std_dev
     }
 
-    /// The 95 % interval; θ is never negative.
+    /// Returns lower and upper bound of the 95 % interval, both at least 0.
     pub fn interval_95(&self) -> (f64, f64) {
         (
-            self.quantile(-NORMAL_95, 0.0),
-            self.quantile(NORMAL_95, 0.0),
+            self.quantile(-NORMAL_95).max(0.0),
+            self.quantile(NORMAL_95).max(0.0),
         )
     }
 }
 
-/// What a piece of ground is, which says how a difference between measurements is understood.
+/// Kind of a piece of ground, which determines the meaning of differences between measurements.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Ground {
-    /// One place: a difference in time is a change.
+    /// One place: differences over time are changes of the ground.
     Cell,
-    /// Many places: a difference is one of place as well.
+    /// Several places: differences may also be spatial, so no changes are detected.
     Area,
 }
 
@@ -171,7 +174,7 @@ pub(super) fn seconds(span_us: i64) -> f64 {
     span_us as f64 / SECOND_US
 }
 
-/// A robot's clock may run ahead; what it measured is at most new.
+/// Returns the age of the newest pass in seconds; 0 if a robot's clock is ahead.
 pub(super) fn age_s<R>(one: &Seen<R>, now_us: i64) -> f64 {
     seconds(now_us - one.newest_at_us).max(0.0)
 }

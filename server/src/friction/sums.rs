@@ -1,8 +1,7 @@
-//! Additive statistics of measurements: what is stored per cell, ground, robot, configuration
-//! and epoch.
+//! Additive statistics of segments, stored per cell, terrain, robot, configuration and epoch.
 //!
-//! Everything is a sum of integers, a largest or a newest, so the result is the same to the bit
-//! for every order and batching of what arrives.
+//! Each statistic is an integer sum, a maximum or the newest element, so the result is identical to
+//! the bit for every order and batching of uploads.
 
 use std::cmp::Ordering;
 
@@ -11,14 +10,14 @@ use tread_api::friction::{Information, Segment};
 
 use super::fixed::Fixed;
 
-/// Seconds of an hour.
+/// Seconds per hour.
 pub const HOUR_S: i64 = 3_600;
-/// Microseconds of an hour.
+/// Microseconds per hour.
 const HOUR_US: i64 = 3_600_000_000;
-/// Hours of a day, into which old epochs are merged.
+/// Hours per day, the length of the buckets into which old epochs are merged.
 pub const DAY_H: i64 = 24;
 
-/// An estimate as sums: Σ Λ and Σ Λ·value.
+/// Estimate in additive form: Σ Λ and Σ Λ·value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Pair {
     /// Σ Λ, in the inverse square of the value's unit.
@@ -40,7 +39,7 @@ impl Pair {
         self.weighted += other.weighted;
     }
 
-    /// Λ and the value; `None` when nothing is known.
+    /// Returns Λ and the value; `None` if Λ is not positive.
     pub fn known(&self) -> Option<Known> {
         let information = self.information.to_f64();
         (information > 0.0).then(|| Known {
@@ -50,34 +49,36 @@ impl Pair {
     }
 }
 
-/// A value with the information behind it.
+/// A value with its information.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Known {
-    /// Λ = 1/σ².
+    /// Λ = 1/σ², in the inverse square of the value's unit.
     pub information: f64,
-    /// The value.
+    /// The estimated value.
     pub value: f64,
 }
 
-/// How many of its own standard deviations θ of a pass must be for the pass to tell of a change.
+/// Minimum ratio of θ to its standard deviation for a pass to be *significant*, that is, to be
+/// compared with other measurements for a change of the ground.
 ///
-/// One that says less contradicts nothing, and would hide one before it that does.
+/// A less significant pass can contradict nothing, and must not replace an earlier significant one.
 pub const TELLING_DEVIATIONS: f64 = 4.5;
 
-/// The newest measurement that tells something, by itself, so that a change of the ground shows
-/// within an epoch; the newest of all if none does.
+/// The newest significant pass ([`TELLING_DEVIATIONS`]) by itself, to detect a change of the ground
+/// within an epoch; the newest of all passes if none is significant.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pass {
-    /// When it ended, microseconds since 1970.
+    /// End of the pass, microseconds since 1970.
     pub ended_at_us: i64,
-    /// Its θ; `None` for sums from before this was kept.
+    /// θ of the pass; `None` for sums stored by versions that did not record it.
     pub theta: Option<Information>,
-    /// Friction that it has seen.
+    /// Peak friction coefficient of the pass.
     pub mu_peak: Option<f64>,
 }
 
 impl Pass {
-    /// Whether θ is known by it at all: `θ/σ = Λθ/√Λ`. The database computes the same.
+    /// Returns whether the pass is significant: `θ/σ = Λθ/√Λ` reaches [`TELLING_DEVIATIONS`]. The
+    /// SQL of the database computes the same.
     fn is_telling(&self) -> bool {
         self.theta.is_some_and(|theta| {
             let least = TELLING_DEVIATIONS * TELLING_DEVIATIONS * theta.information;
@@ -85,7 +86,8 @@ impl Pass {
         })
     }
 
-    /// A total order, so that the newest is the same whoever comes first.
+    /// Compares two passes by a total order, so that the result does not depend on the order of
+    /// arrival.
     fn newer(&self, other: &Self) -> Ordering {
         let bits = |pass: &Self| {
             let theta = pass
@@ -102,7 +104,8 @@ impl Pass {
     }
 }
 
-/// θ with the information of its independent error; all of it where the robot tells nothing apart.
+/// Returns θ with the information of its independent error, or with its total information if the
+/// segment does not state its errors separately.
 fn independent(segment: &Segment) -> Information {
     let theta = segment.theta;
     let Some((errors, value)) = segment.theta_errors.zip(theta.value()) else {
@@ -114,44 +117,44 @@ fn independent(segment: &Segment) -> Information {
     }
 }
 
-/// Bits that compare as the numbers do.
+/// Maps a number to an integer with the same order.
 fn ordered(value: f64) -> i64 {
     let bits = value.to_bits().cast_signed();
     bits ^ ((bits >> 63).cast_unsigned() >> 1).cast_signed()
 }
 
-/// Additive statistics of some measurements.
+/// Additive statistics of a set of segments.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Sums {
-    /// θ.
+    /// θ, with the information of its independent errors.
     pub theta: Pair,
-    /// Σ Λ·θ², which tells how far the measurements differ among themselves.
+    /// Σ Λ·θ², from which the scatter of the segments is computed.
     pub theta_square: Fixed,
-    /// Σ Λ times the common error of the robot, as a share of θ.
+    /// Σ Λ·s, s the standard deviation of the robot's common error relative to θ.
     pub robot_error: Fixed,
-    /// Σ Λ times the common error of the tyres, as a share of θ.
+    /// Σ Λ·t, t the standard deviation of the tyres' common error relative to θ.
     pub tyre_error: Fixed,
-    /// Ratio of effective to geometric track.
+    /// Ratio of effective to geometric track width.
     pub track: Pair,
     /// Rolling resistance coefficient.
     pub rolling: Pair,
-    /// How many segments.
+    /// Number of segments.
     pub segments: u64,
-    /// How many samples behind them.
+    /// Number of samples in the segments.
     pub samples: u64,
-    /// Largest friction coefficient seen.
+    /// Maximum of the peak friction coefficients.
     pub mu_peak: Option<f64>,
-    /// End of the newest of them, microseconds since 1970.
+    /// End of the newest segment, microseconds since 1970.
     pub newest_at_us: i64,
-    /// The newest of them that tells something.
+    /// Newest significant pass.
     pub newest: Pass,
 }
 
 impl Sums {
-    /// The statistics of one segment; `None` if its numbers leave the range of fixed point.
+    /// Returns the statistics of one segment; `None` if a value exceeds the range of [`Fixed`].
     pub fn of(segment: &Segment) -> Option<Self> {
-        // What a robot has in common with itself or with its like does not add up: it is kept beside
-        // what does, and counted only once for all.
+        // Errors common to a robot or to its tyres do not average out over segments: they are
+        // summed separately and applied once to the estimate.
         let errors = segment.theta_errors;
         let theta = independent(segment);
         let square = if theta.information > 0.0 {
@@ -186,7 +189,7 @@ impl Sums {
         })
     }
 
-    /// Adds other measurements.
+    /// Adds the statistics of other segments.
     pub fn add(&mut self, other: &Self) {
         self.theta.add(&other.theta);
         self.theta_square += other.theta_square;
@@ -206,22 +209,22 @@ impl Sums {
         }
     }
 
-    /// End of the newest.
+    /// Returns the end of the newest segment.
     pub fn newest_at(&self) -> Timestamp {
         Timestamp::from_microsecond(self.newest_at_us).unwrap_or(Timestamp::MAX)
     }
 }
 
-/// The bucket of measuring time: whole hours since 1970.
+/// Returns the epoch of a time: whole hours since 1970.
 pub fn epoch_h(time: Timestamp) -> i64 {
     time.as_microsecond().div_euclid(HOUR_US)
 }
 
-/// The first hour of the bucket that an hour lies in, where days before `merged_before_h` are
-/// merged.
+/// Returns the first hour of the bucket that contains `hour`. Buckets are days before
+/// `merged_before_h` and hours from then on.
 ///
-/// What is in the database may not be merged yet: reading through this gives the same answer
-/// before, during and after.
+/// The database may not be merged yet; reading through this function gives the same result before,
+/// during and after the merge.
 pub fn bucket_h(hour: i64, merged_before_h: i64) -> i64 {
     if hour < merged_before_h {
         hour.div_euclid(DAY_H) * DAY_H

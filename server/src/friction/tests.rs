@@ -1,4 +1,4 @@
-//! What fusion must hold, whatever it is given.
+//! Tests of invariants of the fusion.
 
 use std::collections::BTreeMap;
 
@@ -15,7 +15,7 @@ fn now() -> Timestamp {
     "2026-11-01T12:00:00Z".parse().unwrap()
 }
 
-/// So many seconds before now.
+/// Returns the time `age_s` seconds before now.
 pub(super) fn at_us(age_s: i64) -> i64 {
     now().as_microsecond() - age_s * 1_000_000
 }
@@ -60,7 +60,7 @@ pub(super) fn with_peak_friction(mu_peak: f64, sums: Sums) -> Sums {
     }
 }
 
-/// Sums per robot and epoch, as the database keeps them, then fused.
+/// Sums measurements per robot and epoch, as the database does, and fuses them.
 pub(super) fn fused_as(
     parts: impl IntoIterator<Item = (u8, Sums)>,
     ground: Ground,
@@ -155,7 +155,7 @@ fn one_robot_never_gets_surer_than_its_own_bias() {
     assert!(alone.std_dev >= ROBOT_BIAS_RATIO * 0.2, "{alone:?}");
     let robots = (0..5).map(|robot| (robot, measured(0.2, 1e-4, 0)));
     let many = fused(robots, &config).unwrap();
-    // Any one of the five may be wrong: they are as sure as four.
+    // Any one of the five may be wrong, so the interval is that of four.
     assert!(
         (many.std_dev / alone.std_dev - 0.5).abs() < 1e-3,
         "{many:?}"
@@ -221,7 +221,8 @@ fn passes_of_one_robot_that_contradict_each_other_dispute_a_cell_but_not_an_area
     assert!(!area.is_disputed, "places differ: {area:?}");
 }
 
-/// Passes of three robots in the hours before `ice_s` ago on θ 0.2, then the given ones on ice.
+/// Returns passes of three robots on θ 0.2 until `ice_s` seconds ago, and then the given passes on
+/// ice.
 fn iced(on_ice: &[(u8, i64)]) -> Vec<(u8, Sums)> {
     let before = (0..30).map(|visit| {
         let robot = u8::try_from(visit % 3).unwrap();
@@ -260,7 +261,7 @@ fn a_pass_that_says_next_to_nothing_does_not_hide_the_ice_before_it() {
     let config = FrictionConfig::default();
     let mut parts = iced(&[(0, 60)]);
     let seen = fused(parts.clone(), &config).unwrap();
-    // Of the same robot in the same hour, and known to a quarter.
+    // Of the same robot in the same hour, with a relative standard deviation of a quarter.
     parts.push((0, measured(0.8, 0.2, 30)));
     let vague = fused(parts, &config).unwrap();
     assert!(close(vague.theta, seen.theta), "{seen:?}, then {vague:?}");
@@ -343,7 +344,7 @@ proptest! {
             let whole = fused_as(parts.clone(), ground, &config);
             prop_assert_eq!(whole, fused_as(shuffled.clone(), ground, &config));
         }
-        // Batches are summed by themselves first.
+        // Each batch is summed first.
         let mut batches: BTreeMap<(bool, u8, i64), Sums> = BTreeMap::new();
         for (index, (robot, part)) in shuffled.iter().enumerate() {
             let key = (index < cut, *robot, epoch_h(part.newest_at()));
@@ -368,7 +369,7 @@ proptest! {
 
     #[test]
     fn without_a_robot_the_map_is_as_if_it_had_never_come(parts in prop::collection::vec(part(), 1..40)) {
-        // Each robot's sums are its own, so leaving them out leaves no trace in the others'.
+        // Sums are kept per robot, so removing one robot does not change those of others.
         let config = FrictionConfig::default();
         let others: Vec<_> = parts.iter().copied().filter(|(robot, _)| *robot != 2).collect();
         let mut sums: BTreeMap<(u8, i64), Sums> = BTreeMap::new();

@@ -1,8 +1,10 @@
-//! Where a request comes from: the connection's address, or the one that a trusted proxy names.
+//! Determines the client address of a request: the peer address of the connection, or the address
+//! that a trusted proxy reports.
 //!
-//! A proxy appends the address of its client to `X-Forwarded-For`. Whatever stands left of what a
-//! trusted proxy appended was sent by the client itself and counts for nothing, so the list is read
-//! from its end: the first address that is no trusted proxy's is the client.
+//! A proxy appends the address of its client to `X-Forwarded-For`. Entries to the left of those
+//! that trusted proxies appended come from the client itself and are ignored.
+//! [`TrustedProxies::client`] therefore reads the list from its end; the first address that is no
+//! trusted proxy is the client.
 
 use std::fmt;
 use std::net::{IpAddr, Ipv6Addr};
@@ -10,13 +12,13 @@ use std::str::FromStr;
 
 use serde::Deserialize;
 
-/// Most entries of `X-Forwarded-For` that are read, from its end.
+/// Maximum number of entries of `X-Forwarded-For` that are read, from its end; others are ignored.
 pub const HOPS_MAX: usize = 16;
-/// Bits of an IPv6 address that one machine gets as its network.
+/// Prefix length of the IPv6 network that counts as one client, in bits.
 const NETWORK_BITS: u32 = 64;
 
-/// What limits count as one address: the address itself, or for IPv6 its whole /64, which is what
-/// one machine gets.
+/// Returns the key by which limits count clients: the address itself for IPv4, the first address of
+/// its /64 for IPv6, because one machine usually controls a whole /64.
 pub fn network_of(address: IpAddr) -> IpAddr {
     match address.to_canonical() {
         IpAddr::V6(address) if !address.is_loopback() => {
@@ -27,12 +29,12 @@ pub fn network_of(address: IpAddr) -> IpAddr {
     }
 }
 
-/// Why a text is no network.
+/// Error of parsing a [`Network`]. Contains the first 80 characters of the text.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("`{0}` is no address or network: write it like `192.0.2.7`, `10.0.0.0/8` or `fd00::/8`")]
 pub struct InvalidNetwork(String);
 
-/// An address, or all that begin with the same bits.
+/// An IP network in CIDR notation, or a single address (prefix length 32 or 128).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(try_from = "String")]
 pub struct Network {
@@ -41,7 +43,8 @@ pub struct Network {
 }
 
 impl Network {
-    /// Whether an address is in it.
+    /// Returns whether `address` belongs to this network. An IPv4-mapped IPv6 address counts as
+    /// IPv4.
     pub fn contains(&self, address: IpAddr) -> bool {
         let host_bits = |all: u32| all - self.bits;
         match (self.address, address.to_canonical()) {
@@ -95,24 +98,25 @@ impl TryFrom<String> for Network {
     }
 }
 
-/// The proxies whose word on their clients counts.
+/// Networks of the proxies whose `X-Forwarded-For` entries are trusted.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct TrustedProxies(Vec<Network>);
 
 impl TrustedProxies {
-    /// These networks.
+    /// Creates the set of trusted proxies from their networks.
     pub fn new(networks: Vec<Network>) -> Self {
         Self(networks)
     }
 
-    /// Whether an address is a trusted proxy's.
+    /// Returns whether `address` belongs to a trusted proxy.
     pub fn contains(&self, address: IpAddr) -> bool {
         self.0.iter().any(|network| network.contains(address))
     }
 
-    /// The client that a request of a peer comes from, with the values of its `X-Forwarded-For`
-    /// headers in their order. An entry that is no address ends the reading: what a proxy could not
-    /// write was not written by one.
+    /// Returns the address of the client that sent a request. `peer` is the address of the
+    /// connection, `forwarded` the values of the `X-Forwarded-For` headers in their order.
+    ///
+    /// Reading stops at an entry that is no address, because proxies append only addresses.
     pub fn client<'text>(
         &self,
         peer: IpAddr,
@@ -133,7 +137,7 @@ impl TrustedProxies {
     }
 }
 
-/// The address of an entry, which may have a port.
+/// Parses an entry of `X-Forwarded-For`, with or without a port; `None` if it is no address.
 fn entry_address(entry: &str) -> Option<IpAddr> {
     let address = entry.parse().ok();
     let with_port = || {
@@ -192,7 +196,7 @@ mod tests {
         };
         assert_eq!(client("127.0.0.1", &[]), "127.0.0.1");
         assert_eq!(client("127.0.0.1", &["203.0.113.9"]), "203.0.113.9");
-        // The client wrote the first one itself.
+        // The client sent the first entry itself.
         assert_eq!(
             client("127.0.0.1", &["192.0.2.1, 203.0.113.9"]),
             "203.0.113.9"
@@ -208,7 +212,7 @@ mod tests {
         assert_eq!(client("127.0.0.1", &["x, 10.0.0.2"]), "10.0.0.2");
         assert_eq!(client("127.0.0.1", &["[2001:db8::1]:443"]), "2001:db8::1");
         assert_eq!(client("127.0.0.1", &["203.0.113.9:5000"]), "203.0.113.9");
-        // Nobody else is believed.
+        // The header of a peer that is no trusted proxy is ignored.
         assert_eq!(client("203.0.113.9", &["192.0.2.1"]), "203.0.113.9");
         let many = vec!["10.0.0.2"; 100].join(",");
         assert_eq!(client("127.0.0.1", &[&many]), "10.0.0.2");

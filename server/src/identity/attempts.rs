@@ -1,4 +1,5 @@
-//! How many wrong tokens are borne: by address and by the first digits of what was shown.
+//! Counts failed authentication attempts by client address and by token prefix, and locks sources
+//! with too many failures.
 //!
 //! ```text
 //!  free ──10 failures within a minute──► locked 30 s ──again──► 60 s ──► … ──► 15 min
@@ -6,10 +7,10 @@
 //!   └──────────────── an hour without a failure ◄──────────────────────────────────┘
 //! ```
 //!
-//! The lock changes the answer to what is wrong, and nothing else: a good token is let in from
-//! wherever it comes. So a stranger cannot take the Stop button away from people by failing beside
-//! them or behind the same proxy, after a restart either. What guessing costs the server is bounded
-//! by how many secrets are looked up at once ([`crate::app::identity`]).
+//! A lock changes only the answer to invalid tokens; a valid token is accepted from every address.
+//! An attacker behind the same proxy can therefore not lock operators out of Stop, nor can one do
+//! so after a restart. [`crate::app::identity`] bounds the cost of guessing by the number of
+//! concurrent look-ups of secrets.
 
 use std::collections::HashMap;
 use std::net::IpAddr;
@@ -17,30 +18,31 @@ use std::time::Duration;
 
 use super::address::network_of;
 
-/// Failures within [`WINDOW`] that lock.
+/// Number of failures within [`WINDOW`] that locks a source.
 pub const FAILURES_MAX: u32 = 10;
-/// The time within which failures are counted.
+/// Length of the window in which failures are counted.
 pub const WINDOW: Duration = Duration::from_mins(1);
-/// How long the first lock holds; each further one twice as long.
+/// Duration of the first lock of a source; each further lock lasts twice as long as the one before.
 pub const LOCK_FIRST: Duration = Duration::from_secs(30);
-/// How long a lock holds at the most.
+/// Maximum duration of a lock.
 pub const LOCK_MAX: Duration = Duration::from_mins(15);
-/// After so long without a failure all is forgotten.
+/// Time without a failure after which the record of a source is reset.
 pub const FORGOTTEN_AFTER: Duration = Duration::from_hours(1);
-/// Most addresses and prefixes that are remembered.
+/// Maximum number of sources in memory; beyond it the one whose last failure is oldest is dropped,
+/// locked ones last.
 pub const REMEMBERED_MAX: usize = 20_000;
 
-/// What failures are counted by.
+/// Key by which failures are counted.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub enum Source {
-    /// An address; a whole /64 for IPv6, which is what one machine gets.
+    /// Client address; for IPv6 the /64 network, see [`network_of`].
     Address(IpAddr),
-    /// The first digits of a token, from wherever it is tried.
+    /// First digits of the token that was presented, regardless of the client address.
     Prefix(String),
 }
 
 impl Source {
-    /// The source of an address.
+    /// Returns the source to count for a client address.
     pub fn of_address(address: IpAddr) -> Self {
         Self::Address(network_of(address))
     }
@@ -55,14 +57,15 @@ struct Record {
     locked_until: Duration,
 }
 
-/// Failures, remembered within bounds. Times are those of one monotonic clock.
+/// Failure counts and locks of at most [`REMEMBERED_MAX`] sources. All times `now` are durations
+/// since the origin of one monotonic clock.
 #[derive(Debug, Default)]
 pub struct Attempts {
     records: HashMap<Source, Record>,
 }
 
 impl Attempts {
-    /// How long this source is still locked; `None` if it is not.
+    /// Returns the remaining duration of the lock of `source`; `None` if it is not locked.
     pub fn locked_for(&self, source: &Source, now: Duration) -> Option<Duration> {
         let record = self.records.get(source)?;
         record
@@ -71,7 +74,8 @@ impl Attempts {
             .filter(|left| !left.is_zero())
     }
 
-    /// Notes a failure.
+    /// Counts a failure of `source`, and locks it after [`FAILURES_MAX`] failures within
+    /// [`WINDOW`].
     pub fn failed(&mut self, source: Source, now: Duration) {
         if self.records.len() >= REMEMBERED_MAX && !self.records.contains_key(&source) {
             self.forget(now);
@@ -102,7 +106,8 @@ impl Attempts {
         }
     }
 
-    /// Makes room: forgets what is old, and if nothing is, the one that failed longest ago.
+    /// Makes room for a record: drops those without a failure for [`FORGOTTEN_AFTER`]; if there are
+    /// none, drops the one whose last failure is oldest.
     fn forget(&mut self, now: Duration) {
         self.records
             .retain(|_, record| now.saturating_sub(record.failed_last) < FORGOTTEN_AFTER);
@@ -110,7 +115,7 @@ impl Attempts {
             return;
         }
         let oldest = self.records.iter().min_by_key(|(_, record)| {
-            // One that is locked is forgotten last.
+            // Locked sources are dropped last.
             (record.locked_until > now, record.failed_last)
         });
         if let Some(oldest) = oldest.map(|(source, _)| source.clone()) {

@@ -1,20 +1,23 @@
-//! What a provider says of a person: claims, found by name or by path.
+//! Reads the claims of a person from an OpenID provider: groups and display name, by claim name or
+//! dotted path.
 
 use serde_json::{Map, Value};
 use tread_api::text::{cleaned, line};
 
-/// Longest name of a person that is kept, in characters.
+/// Maximum length of a person's display name, in characters. Longer claims are skipped; a longer
+/// subject is cut.
 pub const NAME_MAX: usize = 80;
-/// Longest subject, in characters: what OpenID Connect Core 1.0 allows.
+/// Maximum length of a subject (`sub`), in characters, as in OpenID Connect Core 1.0.
 pub const SUBJECT_MAX: usize = 255;
-/// The claims that name a person where the configuration names none, the best first.
+/// Claims used as the display name if the configured claim is absent, in order of preference.
 const NAMES: [&str; 2] = ["preferred_username", "email"];
 
-/// The claims of one person.
+/// Claims about one person, from an ID token or the user info endpoint.
 pub type Claims = Map<String, Value>;
 
-/// The claim of a name, or at a path such as `realm_access.roles`. A name that has dots itself, such as
-/// `https://example.org/roles`, is found first.
+/// Returns the claim with the name `path`, or else the nested claim at the dotted path, such as
+/// `realm_access.roles`. A name that itself contains dots, such as `https://example.org/roles`, has
+/// precedence. `None` if there is no such claim.
 pub fn claim<'claims>(claims: &'claims Claims, path: &str) -> Option<&'claims Value> {
     if let Some(value) = claims.get(path) {
         return Some(value);
@@ -26,7 +29,8 @@ pub fn claim<'claims>(claims: &'claims Claims, path: &str) -> Option<&'claims Va
     })
 }
 
-/// The groups that a claim names: a list of texts, or one text.
+/// Returns the groups in the claim at `path`, which is a string or a list of strings. Other values
+/// give no groups.
 pub fn groups<'claims>(claims: &'claims Claims, path: &str) -> Vec<&'claims str> {
     match claim(claims, path) {
         Some(Value::String(one)) => vec![one],
@@ -37,8 +41,9 @@ pub fn groups<'claims>(claims: &'claims Claims, path: &str) -> Vec<&'claims str>
     }
 }
 
-/// The name that people know a person by: the configured claim, else the first that there is of
-/// `preferred_username` and `email`, else the subject.
+/// Returns the display name of a person: the configured claim, else `preferred_username`, else
+/// `email`, else the subject. A claim that is longer than [`NAME_MAX`] or no single line is
+/// skipped.
 pub fn shown_name(claims: &Claims, configured: Option<&str>, subject: &str) -> String {
     let names = configured.into_iter().chain(NAMES);
     let mut texts = names.filter_map(|name| claim(claims, name)?.as_str());

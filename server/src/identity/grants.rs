@@ -1,15 +1,15 @@
-//! What somebody may do, and where: one grant, or several of which each counts for itself.
+//! Effective rights of a token or a person: a list of grants, each with rights and a scope.
 //!
-//! A person may be in several groups, each of which gives rights for places. Nobody may do something
-//! somewhere that no single group gives him there, so grants are never mixed: rights are united where
-//! the places are the same, and a request is let through by a grant that has both its right and its
-//! place. What is asked of all grants together errs on the side of less: [`Grants::for_right`].
+//! A person may be in several groups, each of which gives rights for some sites and robots. A right
+//! of one group never applies in the scope of another: only rights with equal scopes are united,
+//! and a request needs one grant that has both its right and its site. Where several grants have to
+//! be summarised as one, the summary has the rights that all of them share: [`Grants::for_right`].
 
 use tread_api::identity::Role;
 use tread_api::ids::{RobotId, SiteId};
 use tread_api::rights::{Grant, Right, Rights, Scope};
 
-/// All that somebody may do; at least one grant.
+/// Effective grants of a token or a person; at least one.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Grants {
     role: Option<Role>,
@@ -17,15 +17,15 @@ pub struct Grants {
 }
 
 impl Grants {
-    /// Those of a token.
+    /// Returns the single grant of a token.
     pub fn of_token(role: Option<Role>, rights: Rights, sites: Scope) -> Self {
         let grants = vec![Grant { rights, sites }];
         Self { role, grants }
     }
 
-    /// Those of somebody in several groups; `None` if no group gives anything.
+    /// Combines the grants of a person's groups; `None` if there are none.
     ///
-    /// Rights for the same places are united; what another grant covers is left out.
+    /// Rights with equal scopes are united; a grant that another one includes is left out.
     pub fn of_groups<'group>(given: impl IntoIterator<Item = &'group Grant>) -> Option<Self> {
         let mut united: Vec<Grant> = Vec::new();
         for grant in given {
@@ -34,7 +34,7 @@ impl Grants {
                 None => united.push(grant.clone()),
             }
         }
-        // No two are for the same places, so no two cover each other.
+        // All scopes differ, so no two grants include each other.
         let covers = |other: &Grant, grant: &Grant| {
             other != grant
                 && other.rights.includes_all(grant.rights)
@@ -46,7 +46,7 @@ impl Grants {
             .filter(|grant| !is_covered(grant))
             .cloned()
             .collect();
-        // The order of groups says nothing.
+        // The result must not depend on the order of the groups.
         grants.sort_by_cached_key(|grant| grant.sites.to_string());
         let role = match grants.as_slice() {
             [] => return None,
@@ -58,55 +58,56 @@ impl Grants {
         Some(Self { role, grants })
     }
 
-    /// The role whose rights these are, if they are those of one.
+    /// Returns the role with exactly these rights; `None` without one or with several grants.
     pub fn role(&self) -> Option<Role> {
         self.role
     }
 
-    /// Each of them.
+    /// Returns the grants, those of groups sorted by scope.
     pub fn as_slice(&self) -> &[Grant] {
         &self.grants
     }
 
-    /// Everywhere that any of them holds.
+    /// Returns the union of the scopes of all grants.
     pub fn scope(&self) -> Scope {
         common(self.grants.iter()).map_or_else(Scope::default, |grant| grant.sites)
     }
 
-    /// Whether any of them has a right.
+    /// Returns whether any grant has `right`, for whatever site.
     pub fn includes(&self, right: Right) -> bool {
         self.grants.iter().any(|grant| grant.rights.includes(right))
     }
 
-    /// Whether one of them has a right for a robot.
+    /// Returns whether one grant has `right` and includes `robot` of `site` in its scope.
     pub fn includes_at(&self, right: Right, site: &SiteId, robot: &RobotId) -> bool {
         let mut grants = self.grants.iter();
         grants.any(|grant| grant.rights.includes(right) && grant.sites.includes_robot(site, robot))
     }
 
-    /// What a request that needs a right is held against: the places of all grants that have the right,
-    /// and the rights that hold at all of these places. `None` if no grant has it.
+    /// Summarises the grants that have `right`: the union of their scopes, and the rights that all
+    /// of them share. `None` if no grant has `right`.
     pub fn for_right(&self, right: Right) -> Option<Grant> {
         let having = self.grants.iter();
         common(having.filter(|grant| grant.rights.includes(right)))
     }
 
-    /// What holds wherever any of them holds.
+    /// Summarises all grants: the union of their scopes, and the rights that all of them share.
     pub fn in_common(&self) -> Grant {
-        // There is one at least.
+        // A constructed value has at least one grant.
         common(self.grants.iter()).unwrap_or_else(|| Grant {
             rights: Rights::default(),
             sites: Scope::EVERYWHERE,
         })
     }
 
-    /// Whether there are several.
+    /// Returns whether there is more than one grant.
     pub fn are_several(&self) -> bool {
         self.grants.len() > 1
     }
 }
 
-/// The places of some grants, and the rights that all of them have.
+/// Returns the union of the scopes of `grants` and the intersection of their rights; `None` if
+/// `grants` is empty.
 fn common<'grant>(mut grants: impl Iterator<Item = &'grant Grant>) -> Option<Grant> {
     let first = grants.next()?.clone();
     Some(grants.fold(first, |all, grant| Grant {
@@ -200,8 +201,7 @@ mod tests {
     }
 
     proptest! {
-        /// Whatever is let through somewhere, one group alone gives there, and all that a group gives
-        /// is let through.
+        /// A request is allowed exactly if one group alone gives its right in its place.
         #[test]
         fn nobody_may_do_somewhere_what_no_single_group_gives_there(
             groups in proptest::collection::vec(some_grant(), 1..6),
@@ -219,7 +219,8 @@ mod tests {
                         let view = grants.for_right(right);
                         let place = |view: &Grant| view.sites.includes_robot(&site, &robot);
                         prop_assert_eq!(view.as_ref().is_some_and(place), given(right));
-                        // What a handler asks beyond the right of its route.
+                        // A further right that a handler checks in addition to the right of its
+                        // route.
                         for view in view.iter().filter(|view| place(view)) {
                             for other in view.rights.iter() {
                                 prop_assert!(given(other), "{other} at {site}/{robot}");
@@ -242,7 +243,7 @@ mod tests {
             }
         }
 
-        /// The order in which the provider names groups changes nothing.
+        /// The result does not depend on the order of the groups.
         #[test]
         fn the_order_of_groups_says_nothing(
             groups in proptest::collection::vec(some_grant(), 1..6),

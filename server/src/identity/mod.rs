@@ -1,5 +1,6 @@
-//! The rules of identity, pure: what a secret looks like, how many failures are borne, which
-//! pages of which origins may ask, what groups at a provider give. No I/O, no clock, no randomness.
+//! Pure rules of authentication and authorisation: the format of secrets, the lock-out of clients
+//! with failed attempts, the checks of `Host` and `Origin`, and the rights that groups of an OpenID
+//! provider give. No I/O, no clock, no randomness.
 
 pub mod address;
 pub mod attempts;

@@ -1,11 +1,12 @@
-//! Which names this server goes by, and which pages may ask it for something.
+//! Checks the `Host`, `Origin` and `Sec-Fetch-Site` headers against this server's own names.
 //!
-//! * A request must name a **host** that is this server's. A page of a stranger whose name was
-//!   made to point here (DNS rebinding) names itself, and is refused.
-//! * A browser sends its **cookie** by itself, so what it asks to be changed counts only if the
-//!   page is this server's own: `Sec-Fetch-Site` says so, or `Origin` where that is missing.
-//! * A **`WebSocket`** has no such protection in browsers at all: its `Origin` must be this server's
-//!   own or one that the configuration allows.
+//! * The **`Host`** of a request must be a name of this server. This prevents DNS rebinding: a
+//!   foreign page whose domain resolves to this server sends its own name and is refused.
+//! * Browsers attach the session **cookie** automatically, so a change that is authenticated by
+//!   cookie is accepted only from this server's own page (protection against CSRF): by
+//!   `Sec-Fetch-Site`, or by `Origin` if that is missing.
+//! * Browsers do not apply the same-origin policy to **`WebSocket`s**: their `Origin` must be this
+//!   server's own or one of the configured origins.
 
 use std::fmt;
 use std::net::IpAddr;
@@ -13,18 +14,18 @@ use std::str::FromStr;
 
 use serde::Deserialize;
 
-/// Why a text is no origin.
+/// Error of parsing an [`Origin`]. Contains the first 80 characters of the text.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("`{0}` is no origin: write it like `https://dashboard.example.org` or with `:8443`")]
 pub struct InvalidOrigin(String);
 
-/// The origin of a page: scheme, host and port, as browsers write it.
+/// Origin of a web page (RFC 6454): scheme, host and port, in lower case, without a default port.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Deserialize)]
 #[serde(try_from = "String")]
 pub struct Origin(String);
 
 impl Origin {
-    /// The origin as browsers write it.
+    /// Returns the origin in the form that browsers send in the `Origin` header.
     pub fn as_str(&self) -> &str {
         &self.0
     }
@@ -63,7 +64,8 @@ impl TryFrom<String> for Origin {
     }
 }
 
-/// Name and port of a `Host` header; `None` if it is none.
+/// Splits a `Host` header into host and optional port; `None` if it is malformed. An IPv6 address
+/// keeps its brackets.
 fn split_host(authority: &str) -> Option<(&str, Option<&str>)> {
     let port_at = match authority.rfind(']') {
         Some(end) => authority[end..].find(':').map(|at| end + at),
@@ -83,7 +85,7 @@ fn split_host(authority: &str) -> Option<(&str, Option<&str>)> {
     (named && port.is_none_or(is_port)).then_some((name, port))
 }
 
-/// The address that a host is, if it is no name; IPv6 stands in brackets.
+/// Parses a host as an IP address, IPv6 in brackets; `None` if it is a domain name.
 fn address_of(name: &str) -> Option<IpAddr> {
     match name.strip_prefix('[') {
         Some(rest) => rest.strip_suffix(']')?.parse().ok().map(IpAddr::V6),
@@ -91,18 +93,18 @@ fn address_of(name: &str) -> Option<IpAddr> {
     }
 }
 
-/// The names that a server goes by, and the pages that may ask it.
+/// Host names of this server, and the foreign origins that it accepts.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Names {
-    /// Names besides `localhost` and every address.
+    /// Accepted host names in addition to `localhost` and all IP addresses.
     pub hosts: Vec<String>,
-    /// Origins of foreign pages that may ask with a token of their own.
+    /// Origins of foreign pages that may send requests with a token (CORS, `WebSocket`).
     pub allowed_origins: Vec<Origin>,
-    /// Whether browsers reach it by `https`.
+    /// Whether browsers reach this server by `https`, directly or through a proxy.
     pub is_tls: bool,
 }
 
-/// What a request says about where it comes from.
+/// Headers of a request from which its origin is determined; `None` for a missing header.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Provenance<'request> {
     /// The `Host` header.
@@ -114,13 +116,15 @@ pub struct Provenance<'request> {
 }
 
 impl Provenance<'_> {
-    /// Whether no foreign page makes the browser ask: this server's own does, or the person typed the
-    /// address. What says nothing is no browser of today.
+    /// Returns whether no foreign page caused this request: `Sec-Fetch-Site` is `same-origin` or
+    /// `none` (address typed by the user), or missing, as in requests of programs that are no
+    /// browsers.
     pub fn is_no_foreign_page(&self) -> bool {
         matches!(self.fetch_site, None | Some("same-origin" | "none"))
     }
 
-    /// Whether the request names the host of an origin. Its scheme is not known here: a proxy may end TLS.
+    /// Returns whether the `Host` header names the host and port of `origin`. The scheme is not
+    /// compared, because a proxy may terminate TLS.
     pub fn is_at(&self, origin: &Origin) -> bool {
         let scheme = origin.0.split_once("://").map_or("", |(scheme, _)| scheme);
         let named = self.host.map(|host| format!("{scheme}://{host}").parse());
@@ -129,8 +133,8 @@ impl Provenance<'_> {
 }
 
 impl Names {
-    /// Whether a `Host` header names this server: an address, `localhost`, or a configured name.
-    /// (Only names can be made to point elsewhere; an address is what it is.)
+    /// Returns whether a `Host` header names this server: an IP address, `localhost` or a
+    /// configured name. Any IP address is accepted, because DNS rebinding needs a domain name.
     pub fn knows(&self, host: &str) -> bool {
         let Some((name, _port)) = split_host(host) else {
             return false;
@@ -145,9 +149,10 @@ impl Names {
             || self.hosts.iter().any(is_configured)
     }
 
-    /// Whether the page is this server's own, as far as the browser says.
+    /// Returns whether the headers show that this server's own page sent the request.
     ///
-    /// A request that says nothing is not: no browser of today sends a change without `Origin`.
+    /// A request without `Origin` and `Sec-Fetch-Site` gives `false`: browsers send `Origin` with
+    /// every request that changes something.
     pub fn is_own_page(&self, request: &Provenance<'_>) -> bool {
         match request.fetch_site {
             Some("same-origin") => request.origin.is_none_or(|_| self.is_own_origin(request)),
@@ -164,11 +169,12 @@ impl Names {
         let own = format!("{scheme}://{host}").parse::<Origin>();
         let own_by_proxy = format!("https://{host}").parse::<Origin>();
         let origin = origin.parse::<Origin>();
-        // Behind a proxy that ends TLS the page is `https` while this server speaks `http`.
+        // Behind a proxy that terminates TLS the page is `https` while this server serves `http`.
         origin.is_ok() && (origin == own || origin == own_by_proxy)
     }
 
-    /// Whether a page of this origin may open a `WebSocket`; programs send no origin.
+    /// Returns whether a request may open a `WebSocket`: it has this server's own origin, a
+    /// configured one, or no `Origin` header, as in requests of programs that are no browsers.
     pub fn may_open_socket(&self, request: &Provenance<'_>) -> bool {
         let Some(origin) = request.origin else {
             return true;

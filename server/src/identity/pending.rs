@@ -1,51 +1,52 @@
-//! A sign-in that is under way at the provider, kept by the browser alone.
+//! State of a sign-in that is in progress at the OpenID provider. Only the browser's cookie holds
+//! it.
 //!
-//! The server makes one random number for each sign-in and puts it into a cookie, with the time. All else
-//! derives from it by HMAC with a key that is new at each start of the server:
+//! The server puts a random number and the time into a cookie for each sign-in. The other values
+//! are derived from the cookie by HMAC with a key that the server generates at each start:
 //!
 //! ```text
 //!  cookie   = time . random number
-//!  state    = HMAC(key, "state"    ‖ cookie)   in the address of the provider, comes back
-//!  nonce    = HMAC(key, "nonce"    ‖ cookie)   comes back inside the ID token
-//!  verifier = HMAC(key, "verifier" ‖ cookie)   its SHA-256 goes to the provider (PKCE), itself with the code
+//!  state    = HMAC(key, "state"    ‖ cookie)   in the request, returned with the code
+//!  nonce    = HMAC(key, "nonce"    ‖ cookie)   returned inside the ID token
+//!  verifier = HMAC(key, "verifier" ‖ cookie)   PKCE: sent with the code
 //! ```
 //!
-//! So the server keeps nothing of a sign-in, strangers cannot fill anything by beginning many, and the
-//! answer of the provider counts in the browser alone in which the sign-in began, for
-//! [`SIGN_IN_LASTS`]. Nobody without the key makes a cookie that has a state.
+//! The server therefore stores nothing for a sign-in, and starting many sign-ins exhausts no
+//! memory. The provider's answer is accepted only from the browser that began the sign-in, for
+//! [`SIGN_IN_LASTS`]. Without the key nobody can compute the state of a cookie.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::URL_SAFE_NO_PAD;
 use jiff::{SignedDuration, Timestamp};
 use ring::hmac;
 
-/// How long somebody may take at the provider.
+/// Maximum time from the start of a sign-in to the provider's answer; a later answer is refused.
 pub const SIGN_IN_LASTS: SignedDuration = SignedDuration::from_mins(10);
-/// Random bytes of a sign-in, and of the key.
+/// Number of random bytes in the cookie of a sign-in, and in a [`PendingKey`].
 pub const SIGN_IN_RANDOM_BYTES: usize = 32;
-/// Longest cookie that is read.
+/// Maximum length of a sign-in cookie, in bytes; a longer one is refused.
 const COOKIE_MAX: usize = 80;
 
-/// What all sign-ins of one run of the server derive from.
+/// HMAC key from which the values of all sign-ins of one server run are derived.
 #[derive(Debug)]
 pub struct PendingKey(hmac::Key);
 
 impl PendingKey {
-    /// The key of these bytes, which must come from the operating system's generator.
+    /// Creates the key from `random`, which must come from the operating system's random generator.
     pub fn from_random(random: &[u8; SIGN_IN_RANDOM_BYTES]) -> Self {
         Self(hmac::Key::new(hmac::HMAC_SHA256, random))
     }
 }
 
-/// A sign-in that is under way.
+/// A sign-in that is in progress at the provider.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Pending {
     cookie: String,
-    /// What goes to the provider and comes back with the code.
+    /// OAuth 2.0 `state`: sent to the provider, which returns it with the authorisation code.
     pub state: String,
-    /// What comes back inside the ID token.
+    /// OpenID Connect `nonce`, which the ID token must contain.
     pub nonce: String,
-    /// What proves to the provider that the code is ours.
+    /// PKCE code verifier (RFC 7636), sent with the authorisation code.
     pub verifier: String,
 }
 
@@ -56,7 +57,8 @@ impl std::fmt::Debug for Pending {
 }
 
 impl Pending {
-    /// Begins a sign-in.
+    /// Begins a sign-in at the time `now`. `random` must come from the operating system's
+    /// generator.
     pub fn begin(key: &PendingKey, random: &[u8; SIGN_IN_RANDOM_BYTES], now: Timestamp) -> Self {
         let cookie = format!("{}.{}", now.as_second(), URL_SAFE_NO_PAD.encode(random));
         Self::of(key, cookie)
@@ -78,13 +80,15 @@ impl Pending {
         }
     }
 
-    /// What the browser keeps.
+    /// Returns the value of the cookie to set in the browser.
     pub fn cookie(&self) -> &str {
         &self.cookie
     }
 
-    /// The sign-in of a cookie and of the state that came back; `None` unless they belong together and
-    /// it began here, not too long ago.
+    /// Restores the sign-in from the browser's cookie and the `state` that the provider returned.
+    ///
+    /// Returns `None` if `state` was not derived from `cookie` with `key`, or if the sign-in began
+    /// [`SIGN_IN_LASTS`] ago or earlier.
     pub fn resume(key: &PendingKey, cookie: &str, state: &str, now: Timestamp) -> Option<Self> {
         use subtle::ConstantTimeEq as _;
         if cookie.len() > COOKIE_MAX {
@@ -94,7 +98,7 @@ impl Pending {
         if !bool::from(pending.state.as_bytes().ct_eq(state.as_bytes())) {
             return None;
         }
-        // Only now is the time known to be the one that was written here.
+        // The matching state authenticates the cookie, so its time can be trusted from here on.
         let (began_s, _random) = cookie.split_once('.')?;
         let began = Timestamp::from_second(began_s.parse().ok()?).ok()?;
         let age = now.duration_since(began);
@@ -128,7 +132,7 @@ mod tests {
         assert_eq!(resume(&key(1), other.cookie(), state, 0), None);
         assert_eq!(resume(&key(1), cookie, &other.state, 0), None);
         assert_eq!(resume(&key(1), cookie, "", 0), None);
-        // A later time needs another state.
+        // Changing the time of the cookie changes the state that it needs.
         let later = cookie.replacen("1800000000", "1800000600", 1);
         assert_ne!(later, cookie);
         assert_eq!(resume(&key(1), &later, state, 600), None);
@@ -142,7 +146,7 @@ mod tests {
     fn what_goes_to_the_provider_tells_nothing_of_the_rest() {
         let pending = Pending::begin(&key(1), &[2; SIGN_IN_RANDOM_BYTES], time(0));
         let texts = [&pending.state, &pending.nonce, &pending.verifier];
-        // PKCE wants 43 to 128 characters out of the unreserved ones.
+        // PKCE requires 43 to 128 unreserved characters.
         assert!(texts.iter().all(|text| text.len() == 43));
         assert!(texts[0] != texts[1] && texts[1] != texts[2] && texts[0] != texts[2]);
         assert!(!format!("{pending:?}").contains(&pending.verifier));

@@ -1,22 +1,24 @@
-//! What of a request's body is kept in the audit log: little, and no secrets.
+//! Reduces the JSON body of a request to what the audit log stores: short fields, without secrets.
 
 use std::collections::BTreeMap;
 
 use serde_json::value::RawValue;
 use serde_json::{Map, Value};
 
-/// Most bytes of JSON that are kept.
+/// Maximum size of the JSON that is stored, in bytes.
 pub const KEPT_MAX: usize = 1_024;
-/// Longest text that is kept of one field when the whole is too long, in characters.
+/// Maximum length of a string field in characters, if the body exceeds [`KEPT_MAX`]; fields with
+/// longer strings are left out.
 const TEXT_MAX: usize = 100;
-/// Names of fields, or parts of them, whose values are never kept.
+/// Substrings of the names of fields that are never stored, in lower case.
 const SECRET_NAMES: [&str; 5] = ["token", "secret", "password", "passphrase", "key"];
 
-/// A body of which no more than its outermost fields is ever taken apart, in bytes: a path of many
-/// points would cost a multiple of itself for nothing.
+/// Maximum size of a body that is parsed completely, in bytes. Of a larger one, such as a path with
+/// many points, only the outermost fields are parsed, which saves memory.
 const WHOLE_MAX: usize = 4 * KEPT_MAX;
 
-/// The same for a body as it came.
+/// Parses the JSON body of a request and reduces it by [`redacted`]; a body larger than `WHOLE_MAX`
+/// keeps at most its short outermost fields. Invalid JSON gives `null`.
 pub fn redacted_text(body: &[u8]) -> Value {
     if body.len() <= WHOLE_MAX {
         return redacted(&serde_json::from_slice(body).unwrap_or_default());
@@ -32,7 +34,8 @@ pub fn redacted_text(body: &[u8]) -> Value {
     redacted(&Value::Object(short.collect()))
 }
 
-/// A body without secrets; one that is long is kept only in its outermost short fields.
+/// Returns `body` without secret fields. If the result exceeds [`KEPT_MAX`], only its short
+/// outermost fields remain; `null` if even these exceed it.
 pub fn redacted(body: &Value) -> Value {
     let clean = without_secrets(body);
     if is_short(&clean) {

@@ -1,9 +1,11 @@
-//! Secrets of tokens, sessions and joining robots: 256 random bits, of which only the SHA-256 is kept.
+//! Secrets of tokens, sessions and join tokens: 256 random bits, of which only the SHA-256 is
+//! stored.
 //!
-//! A secret reads `tread_<kind>_<64 hex digits><8 hex digits>`. The kind is `v`, `o` or `a` for a
-//! token of that role, `t` for one with rights of its own, `s` for a session and `j` for a join token; the last eight digits are a checksum. So a scanner
-//! for leaked secrets knows one when it sees it, and a slip of the pen is refused without asking
-//! the database. The kind tells people what they hold; what it may do is in the database.
+//! A secret has the form `tread_<kind>_<64 hex digits><8 hex digits>`. The kind is `v`, `o` or `a`
+//! for a token of the role viewer, operator or admin, `t` for a token with individual rights, `s`
+//! for a session and `j` for a join token. The last eight digits are a checksum: scanners for
+//! leaked secrets can recognise a secret, and a mistyped one is refused without a database query.
+//! The kind is only informative; the rights are in the database.
 
 use std::fmt;
 
@@ -11,27 +13,27 @@ use sha2::{Digest as _, Sha256};
 use subtle::ConstantTimeEq as _;
 use tread_api::identity::Role;
 
-/// Random bytes in a secret.
+/// Number of random bytes in a secret.
 pub const SECRET_RANDOM_BYTES: usize = 32;
-/// Bytes of the checksum.
+/// Length of the checksum, in bytes.
 const CHECKSUM_BYTES: usize = 4;
-/// What every secret begins with.
+/// Prefix of every secret.
 const BRAND: &str = "tread_";
-/// Hex digits of a secret.
+/// Number of hex digits of a secret, checksum included.
 const DIGITS: usize = 2 * (SECRET_RANDOM_BYTES + CHECKSUM_BYTES);
-/// Bytes of a secret as text.
+/// Length of a secret as text, in bytes.
 const TEXT_LENGTH: usize = BRAND.len() + 2 + DIGITS;
-/// Leading random digits that failures are counted by.
+/// Number of leading random digits by which failed attempts are counted.
 const PREFIX_DIGITS: usize = 8;
 
-/// What a secret is for.
+/// Kind of a secret.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
-    /// A token of that role, or with rights of its own.
+    /// A token of the given role; `None` for a token with individual rights.
     Token(Option<Role>),
-    /// A browser's session.
+    /// A browser session.
     Session,
-    /// The joining of a robot.
+    /// A join token, with which a robot enrols.
     Join,
 }
 
@@ -57,7 +59,7 @@ impl Kind {
     }
 }
 
-/// A secret in memory; it is never shown by `Debug`.
+/// A secret in clear text; `Debug` does not print it.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Secret {
     kind: Kind,
@@ -74,7 +76,8 @@ impl fmt::Debug for Secret {
 }
 
 impl Secret {
-    /// The secret of these bytes, which must come from the operating system's generator.
+    /// Creates a secret from `random`, which must come from the operating system's random
+    /// generator.
     pub fn from_random(kind: Kind, random: &[u8; SECRET_RANDOM_BYTES]) -> Self {
         let mut text = format!("{BRAND}{}_", kind.initial());
         let sum = checksum(kind, random);
@@ -85,7 +88,7 @@ impl Secret {
         Self { kind, text }
     }
 
-    /// Reads a secret; `None` for what cannot be one, such as one with a digit changed.
+    /// Parses a secret; `None` if its form or its checksum is wrong.
     pub fn read(text: &str) -> Option<Self> {
         if text.len() != TEXT_LENGTH {
             return None;
@@ -109,51 +112,52 @@ impl Secret {
         })
     }
 
-    /// What it is for.
+    /// Returns the kind of the secret.
     pub fn kind(&self) -> Kind {
         self.kind
     }
 
-    /// The text, for its owner.
+    /// Returns the secret in clear text, to hand it to its owner.
     pub fn reveal(&self) -> &str {
         &self.text
     }
 
-    /// What is kept of it.
+    /// Returns the SHA-256 of the text, which is what the database stores.
     pub fn fingerprint(&self) -> Fingerprint {
         Fingerprint(Sha256::digest(&self.text).into())
     }
 
-    /// The leading digits, by which failures are counted.
+    /// Returns the leading random digits, by which failed attempts are counted.
     pub fn prefix(&self) -> &str {
         let begin = BRAND.len() + 2;
         &self.text[begin..begin + PREFIX_DIGITS]
     }
 }
 
-/// The SHA-256 of a secret. Of 256 random bits nobody finds the secret again, so no slow hash is
-/// needed.
+/// SHA-256 of a secret's text. A secret has 256 random bits, which cannot be found by search, so no
+/// slow password hash is needed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Fingerprint([u8; 32]);
 
 impl Fingerprint {
-    /// What the database keeps; `None` if it is none.
+    /// Reads a hash from the database; `None` unless it has 32 bytes.
     pub fn from_kept(hash: &[u8]) -> Option<Self> {
         hash.try_into().ok().map(Self)
     }
 
-    /// All of it, for the database.
+    /// Returns the whole hash, to store it in the database.
     pub fn as_bytes(&self) -> &[u8] {
         &self.0
     }
 
-    /// What it is looked up by. How long a look-up takes may tell how many of these bits agree
-    /// with a kept one; the rest is compared in constant time.
+    /// Returns the first 8 bytes, the key of the database look-up. The time of a look-up may reveal
+    /// how many of these bits match a stored hash; [`Self::matches`] compares the rest in constant
+    /// time.
     pub fn lookup(&self) -> &[u8] {
         &self.0[..8]
     }
 
-    /// Whether this is the kept one, in a time that does not depend on where they differ.
+    /// Returns whether this equals the stored hash `kept`, compared in constant time.
     pub fn matches(&self, kept: &[u8]) -> bool {
         self.0.ct_eq(kept).into()
     }
@@ -172,7 +176,8 @@ fn digit(value: u8) -> char {
     char::from_digit(u32::from(value), 16).unwrap_or('0')
 }
 
-/// The value of a digit; capital letters are none, so that each secret has one spelling.
+/// Returns the value of a lower-case hex digit, else `None`. Upper case is refused, so that each
+/// secret has one spelling.
 fn value(digit: u8) -> Option<u8> {
     match digit {
         b'0'..=b'9' => Some(digit - b'0'),

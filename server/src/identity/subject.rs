@@ -1,28 +1,28 @@
-//! Who is behind requests, as far as shares of connections, sockets, streams and the audit log are
-//! concerned: a token with all its sessions, or a person with all theirs. And how they are called where
-//! there is a name alone, so that none passes for another.
+//! Identifies the subject to which limits on connections, sockets, streams and audit log entries
+//! apply: a token or a person, each with all its sessions. Also defines how people and tokens are
+//! named where only a name is recorded, so that a token cannot be confused with a person.
 
 use std::fmt;
 
 use tread_api::ids::{PersonId, TokenId};
 
-/// What stands before the names of people, with a colon. People choose theirs at the provider, at any time,
-/// and no token is called so.
+/// Prefix of people's names, followed by a colon. It keeps the names that people choose at the
+/// provider apart from the names of tokens, which must not have it.
 const PEOPLE: &str = "oidc";
 
-/// What a person is called here who has a name at the provider.
+/// Returns the name under which a person is recorded: `oidc:` and the display name at the provider.
 pub fn name_of_person(name: &str) -> String {
     format!("{PEOPLE}:{name}")
 }
 
-/// Whether a token may have a name: not one that reads like a person's, and not the identifier of one, by
-/// which people own limits.
+/// Returns whether `name` is allowed for a token: it neither begins with the prefix of people's
+/// names nor parses as a [`PersonId`], which names the owner of a person's limits.
 pub fn may_name_token(name: &str) -> bool {
     let kind = name.split(':').next().unwrap_or_default().trim();
     !kind.eq_ignore_ascii_case(PEOPLE) && name.parse::<PersonId>().is_err()
 }
 
-/// Whoever has a share of his own.
+/// Subject with limits of its own.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum SubjectId {
     /// A token, with the sessions that were opened with it.
@@ -41,7 +41,7 @@ impl fmt::Display for SubjectId {
 }
 
 impl SubjectId {
-    /// The token, if it is one.
+    /// Returns the token; `None` for a person.
     pub const fn token(self) -> Option<TokenId> {
         match self {
             Self::Token(token) => Some(token),
@@ -73,7 +73,7 @@ mod tests {
             subject: "anna",
         })
         .to_string();
-        // With a name that somebody gives behind it the third would read like a person too.
+        // A token named `oidc` could be confused with a person once `:` and a name follow it.
         for name in ["oidc:", "OIDC:anna", "oidc", " Oidc : anna", &person] {
             assert!(!may_name_token(name), "{name}");
         }

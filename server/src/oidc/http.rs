@@ -1,4 +1,4 @@
-//! How the provider is asked: by TLS with ring, within bounds, and never sent elsewhere.
+//! HTTP client for the OpenID provider: TLS with ring, bounded times and sizes, no redirects.
 
 use std::os::unix::fs::PermissionsExt as _;
 use std::path::Path;
@@ -11,51 +11,51 @@ use reqwest::{Certificate, Url, redirect};
 use super::ProviderError;
 use crate::identity::claims::Claims;
 
-/// How long the provider may take for one answer. A sign-in asks up to three times, within
+/// Timeout of one request to the provider. A sign-in sends up to three, within
 /// [`crate::http::REQUEST_TIMEOUT`].
 pub(super) const ANSWER_MAX: Duration = Duration::from_secs(4);
-/// How long a connection to it may take.
+/// Timeout of a connection to the provider.
 const CONNECT_MAX: Duration = Duration::from_secs(3);
-/// Largest answer that is read, bytes.
+/// Maximum size of an answer, in bytes; a larger one is an error.
 pub(super) const BODY_MAX: usize = 1024 * 1024;
-/// Connections that are kept for the next question.
+/// Maximum number of idle connections kept open to a host.
 const IDLE_MAX: usize = 4;
 
-/// Why the provider gave no answer.
+/// Error of a request to the provider.
 #[derive(Debug, thiserror::Error)]
 pub enum HttpError {
-    /// It cannot be reached, or took too long.
+    /// The provider cannot be reached, or the request timed out.
     #[error("the request failed")]
     Failed(#[from] reqwest::Error),
-    /// It answered too much.
+    /// The answer is larger than [`BODY_MAX`].
     #[error("the answer has more than {BODY_MAX} bytes")]
     TooLarge,
-    /// It answered with another status than success.
+    /// The status of the answer, the value, is not a success.
     #[error("it answered with status {0}")]
     Status(u16),
-    /// It answered something else than an object of JSON.
+    /// The body of the answer is no JSON object.
     #[error("the answer is no object of JSON")]
     NoObject,
-    /// It cannot be written as an answer.
+    /// The answer cannot be converted.
     #[error("the answer is none")]
     NoAnswer,
 }
 
-/// A client for the provider alone.
+/// HTTP client for requests to the provider.
 #[derive(Debug, Clone)]
 pub(super) struct HttpClient(reqwest::Client);
 
 impl HttpClient {
-    /// A client that trusts the authorities in a file, or those of the machine. A provider in the clear
-    /// is on this machine, and is not asked through a proxy.
+    /// Creates a client that trusts the CA certificates in the file `authorities`, or the machine's
+    /// if `None`. Without TLS the provider runs on this machine, so no proxy is used.
     pub(super) fn new(authorities: Option<&Path>, is_tls: bool) -> Result<Self, ProviderError> {
-        // The first call counts; all install the same.
+        // Fails if a provider is installed already, which is then the same one.
         let _first = rustls::crypto::ring::default_provider().install_default();
         let mut builder = reqwest::Client::builder()
             .connect_timeout(CONNECT_MAX)
             .timeout(ANSWER_MAX)
             .pool_max_idle_per_host(IDLE_MAX)
-            // Whoever redirects a request with a secret or a code would get it.
+            // A redirect would send the client secret or the code to another host.
             .redirect(redirect::Policy::none())
             .user_agent(concat!("tread-server/", env!("CARGO_PKG_VERSION")));
         if !is_tls {
@@ -91,7 +91,7 @@ impl HttpClient {
         Ok(answer)
     }
 
-    /// What the provider says of a person at its user info endpoint.
+    /// Fetches the claims of a person from the provider's user info endpoint.
     pub(super) async fn claims(&self, url: &Url, access_token: &str) -> Result<Claims, HttpError> {
         let asked = self.0.get(url.clone()).bearer_auth(access_token);
         let asked = asked.header("accept", "application/json").build()?;
@@ -115,7 +115,7 @@ impl<'client> AsyncHttpClient<'client> for HttpClient {
     }
 }
 
-/// The client secret in a file that nobody else can read.
+/// Reads the client secret from the first line of a file, which only its owner may access.
 pub(super) fn read_secret(file: &Path) -> Result<String, ProviderError> {
     let unreadable = |cause| ProviderError::Unreadable {
         path: file.to_owned(),

@@ -1,12 +1,13 @@
-//! The OpenID provider: found, asked and believed. The only module that speaks with it.
+//! Client of the OpenID provider: discovery, authorisation code flow, keys. No other module sends
+//! requests to the provider.
 //!
 //! ```text
-//!  start ─► unknown ──discovery──► known ──every hour, or a key that is not known──► known anew
-//!              └──── fails: again after 1 s, 2 s, … at most 30 s ────┘ (what was known stays)
+//!  start ─► unknown ──discovery──► known ──every hour, or unknown signing key──► refreshed
+//!              └── failure: retried after 1 s, 2 s, … at most 30 s ──┘ (earlier metadata stay)
 //! ```
 //!
-//! The authorization code flow with PKCE (RFC 7636). The protocol's messages and the signatures are those
-//! of the crate `openidconnect`; what an ID token must say is in [`verify`].
+//! Implements the authorisation code flow with PKCE (RFC 7636). The crate `openidconnect` builds
+//! the protocol's messages and checks signatures; [`verify`] validates ID tokens.
 
 mod http;
 #[cfg(test)]
@@ -35,97 +36,97 @@ use crate::config::oidc::OidcConfig;
 use crate::identity::claims::{Claims, claim};
 use crate::identity::pending::Pending;
 
-/// The provider's keys are asked for again this often at the most, however many ID tokens are signed by a
-/// key that is not known.
+/// Minimum interval between requests for the provider's keys, however many ID tokens are signed by
+/// an unknown key.
 pub const KEYS_REFRESH_INTERVAL: Duration = Duration::from_secs(10);
-/// The same after a question that was not answered.
+/// Minimum interval before the next request for the provider's keys, after one that failed.
 const KEYS_RETRY_INTERVAL: Duration = Duration::from_secs(1);
-/// Sets of keys that one ID token is held against: those that were known, those that somebody else brought
-/// meanwhile, and those that were asked for because of it.
+/// Maximum number of key sets by which the signature of one ID token is checked: the known set, one
+/// that another sign-in fetched meanwhile, and one fetched for this token.
 const KEYS_TRIED_MAX: usize = 3;
-/// Longest ID token that is kept for the sign-out, bytes.
+/// Maximum size of an ID token that is kept for the sign-out, in bytes; a larger one is not kept.
 const ID_TOKEN_MAX: usize = 16 * 1_024;
 
-/// Why the provider cannot be made ready at the start.
+/// Error of [`Provider::new`].
 #[derive(Debug, thiserror::Error)]
 pub enum ProviderError {
     /// A file cannot be read.
     #[error("cannot read `{}` of `[oidc]`", path.display())]
     Unreadable {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// Why.
+        /// Cause of the failure.
         #[source]
         cause: std::io::Error,
     },
-    /// Others can read the secret.
+    /// Other users can read the file with the client secret.
     #[error("others can read `{}`: give the client secret the mode 0600", .0.display())]
     Open(PathBuf),
-    /// There is no secret in the file.
+    /// The first line of the file with the client secret is empty.
     #[error("`{}` has no client secret in its first line", .0.display())]
     NoSecret(PathBuf),
-    /// The certificates to trust are none.
+    /// The file with trusted CA certificates contains no usable ones.
     #[error("`{}` has no certificates that can be used", path.display())]
     Authority {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// Why.
+        /// Cause of the failure.
         #[source]
         cause: reqwest::Error,
     },
-    /// An address of the configuration is none.
+    /// A URL of the configuration, the value, is invalid.
     #[error("`{0}` of `[oidc]` is no address")]
     Address(String),
-    /// There can be no client at all.
+    /// The HTTP client cannot be created.
     #[error("cannot prepare for asking the OpenID provider")]
     Client(#[source] reqwest::Error),
 }
 
-/// Why the provider is not known.
+/// Error of [`Provider::discover`].
 #[derive(Debug, thiserror::Error)]
 pub enum DiscoverError {
-    /// It did not say who it is.
+    /// The discovery document cannot be fetched or is invalid.
     #[error("the provider does not say how to sign in")]
     Discovery(#[source] Box<DiscoveryError<HttpError>>),
-    /// What it says would be asked in the clear.
+    /// The discovery document names an endpoint, the value, without TLS.
     #[error("the provider names the endpoint `{0}`, which is not `https`")]
     ClearText(String),
-    /// It has no endpoint for codes.
+    /// The discovery document names no token endpoint.
     #[error("the provider names no token endpoint")]
     NoTokenEndpoint,
 }
 
-/// Why a code of the provider signs nobody in.
+/// Error of [`Provider::exchange`].
 #[derive(Debug, thiserror::Error)]
 pub enum ExchangeError {
-    /// The provider is not known yet.
+    /// No discovery has succeeded yet.
     #[error("the OpenID provider is not known yet")]
     Unknown,
-    /// It did not answer.
+    /// The provider did not give a valid answer.
     #[error("the OpenID provider does not answer")]
     Unanswered(#[source] Box<dyn std::error::Error + Send + Sync>),
-    /// It did not say by which keys it signs, a moment ago or now.
+    /// The provider's keys could not be fetched, now or within the retry interval.
     #[error("the OpenID provider does not say which keys it has")]
     KeysUnknown,
-    /// It takes the code from nobody, or not from us.
+    /// The provider refused the authorisation code; the value is its error code.
     #[error("the OpenID provider refuses the code: {0}")]
     Refused(String),
-    /// What it answered cannot be believed.
+    /// The ID token is invalid.
     #[error("the OpenID provider's answer cannot be believed")]
     Invalid(#[source] InvalidIdToken),
-    /// Its word on the person is about another one, or none at all.
+    /// The user info has another subject than the ID token, or none.
     #[error("the OpenID provider's word on the person cannot be used: {0}")]
     UserInfo(String),
 }
 
-/// Whom the provider has signed in.
+/// A person whom the provider has authenticated.
 #[derive(Clone, PartialEq)]
 pub struct SignedInThere {
-    /// The person there.
+    /// Subject (`sub`): the person's identifier at the provider.
     pub subject: String,
-    /// What it says of them.
+    /// Claims of the ID token, with those of the user info if it was fetched.
     pub claims: Claims,
-    /// The ID token as it came, for the sign-out; `None` if it is very long.
+    /// Encoded ID token, for the sign-out at the provider; `None` if larger than `ID_TOKEN_MAX`.
     pub id_token: Option<String>,
 }
 
@@ -138,7 +139,7 @@ type Client = CoreClient<
     EndpointMaybeSet,
 >;
 
-/// The OpenID provider of the configuration.
+/// Client of the configured OpenID provider.
 pub struct Provider {
     issuer: IssuerUrl,
     client_id: ClientId,
@@ -150,17 +151,19 @@ pub struct Provider {
     http: HttpClient,
     clock: Clock,
     known: RwLock<Option<Arc<ProviderMetadataWithLogout>>>,
-    /// Whoever asks the provider for its keys holds this until they are known: the keys that were asked for
-    /// last are those that count, and nobody is refused while better ones are on their way.
+    /// Held during a request for the provider's keys. It orders these requests, so the latest keys
+    /// win, and other sign-ins wait for the new keys instead of failing.
     keys_turn: tokio::sync::Mutex<KeysAsked>,
 }
 
-/// What became of the last question for the provider's keys, and when it was asked; nothing at first.
+/// Monotonic time of the last request for the provider's keys, and whether it succeeded; `None`
+/// before the first.
 #[derive(Debug, Default)]
 struct KeysAsked(Option<(Duration, bool)>);
 
 impl KeysAsked {
-    /// Whether the last question was answered, if it is too early for another.
+    /// Returns whether the last request succeeded if it is too early for another; `None` if a new
+    /// one is allowed.
     fn recently(&self, now: Duration) -> Option<bool> {
         let (at, is_answered) = self.0?;
         let interval = if is_answered {
@@ -183,10 +186,10 @@ impl std::fmt::Debug for Provider {
 }
 
 impl Provider {
-    /// The provider of a configuration; asks it nothing yet.
+    /// Creates a client from the configuration, without sending a request.
     ///
     /// # Errors
-    /// A file that the configuration names cannot be used.
+    /// A file or URL in the configuration is unusable, or the HTTP client cannot be created.
     pub fn new(config: &OidcConfig, clock: Clock) -> Result<Self, ProviderError> {
         let address = |text: String| move |_error| ProviderError::Address(text);
         let issuer = config.issuer.clone();
@@ -210,15 +213,15 @@ impl Provider {
         })
     }
 
-    /// Who it is, as it names itself.
+    /// Returns the issuer identifier of the provider, a URL.
     pub fn issuer(&self) -> &str {
         self.issuer.as_str()
     }
 
-    /// Asks the provider who it is and for its keys.
+    /// Fetches the provider's discovery document and keys.
     ///
     /// # Errors
-    /// [`DiscoverError`]; what was known before stays.
+    /// [`DiscoverError`]; metadata of an earlier discovery stay in use.
     pub async fn discover(&self) -> Result<(), DiscoverError> {
         let _turn = self.keys_turn.lock().await;
         let found = ProviderMetadataWithLogout::discover_async(self.issuer.clone(), &self.http);
@@ -237,7 +240,8 @@ impl Provider {
         ];
         let is_tls = self.issuer.url().scheme() == "https";
         let host = self.issuer.url().host_str();
-        // A provider in the clear is on this machine, and so is what it names.
+        // A provider without TLS runs on this machine, and its endpoints must be on this machine
+        // too.
         let is_safe =
             |url: &reqwest::Url| url.scheme() == "https" || !is_tls && url.host_str() == host;
         let in_the_clear = |url: &&reqwest::Url| !is_safe(url);
@@ -258,7 +262,7 @@ impl Provider {
         known.clone()
     }
 
-    /// Whether people can be sent to it.
+    /// Returns whether a discovery has succeeded, so that people can sign in.
     pub fn is_known(&self) -> bool {
         self.metadata().is_some()
     }
@@ -285,7 +289,8 @@ impl Provider {
             .set_redirect_uri(self.redirect.clone())
     }
 
-    /// Where a browser is sent to sign in; `None` while the provider is not known.
+    /// Returns the URL to which a browser is redirected to sign in; `None` before a successful
+    /// discovery.
     pub fn sign_in_url(&self, pending: &Pending) -> Option<String> {
         let client = self.client(&*self.metadata()?);
         let (state, nonce) = (pending.state.clone(), pending.nonce.clone());
@@ -301,7 +306,8 @@ impl Provider {
         Some(request.url().0.into())
     }
 
-    /// Where a browser is sent to sign out there too; `None` if the provider has no such place.
+    /// Returns the URL to which a browser is redirected to sign out at the provider; `None` if the
+    /// provider has no such endpoint, or before a successful discovery.
     pub fn sign_out_url(&self, id_token: Option<&str>) -> Option<String> {
         let metadata = self.metadata()?;
         let endpoint = metadata.additional_metadata().end_session_endpoint.clone();
@@ -316,10 +322,14 @@ impl Provider {
         Some(request.http_get_url().into())
     }
 
-    /// Gives the provider a code and learns whom it has signed in.
+    /// Exchanges an authorisation code for an ID token, validates it, and returns the person.
+    ///
+    /// Fetches the provider's keys if an unknown one signed the token, and the user info if the
+    /// token lacks the claim of groups.
     ///
     /// # Errors
-    /// [`ExchangeError`].
+    /// [`ExchangeError`] if the provider does not answer or refuses the code, or if its answer is
+    /// invalid.
     pub async fn exchange(
         &self,
         code: &str,
@@ -378,11 +388,12 @@ impl Provider {
         })
     }
 
-    /// The provider with newer keys than these: those that somebody else has brought meanwhile, or else
-    /// those that it is asked for now. `None` if they were asked for a moment ago.
+    /// Returns metadata with newer keys than `known`: those that another sign-in fetched meanwhile,
+    /// or else those fetched now. `None` if keys were fetched less than [`KEYS_REFRESH_INTERVAL`]
+    /// ago.
     ///
     /// # Errors
-    /// The provider does not say which keys it has.
+    /// [`ExchangeError::KeysUnknown`] if the keys cannot be fetched.
     async fn newer_than(
         &self,
         known: &Arc<ProviderMetadataWithLogout>,
@@ -410,7 +421,11 @@ impl Provider {
     }
 }
 
-/// The claims of an ID token with those that only the user info has; it must be about the same person.
+/// Merges the claims of the user info into those of the ID token, which have precedence except for
+/// the claim of groups.
+///
+/// # Errors
+/// [`ExchangeError::UserInfo`] if the user info is not about `subject`.
 fn with_user_info(
     (mut claims, said): (Claims, Claims),
     subject: &str,
@@ -420,7 +435,7 @@ fn with_user_info(
         let detail = "its user info is about somebody else".to_owned();
         return Err(ExchangeError::UserInfo(detail));
     }
-    // The ID token may have an object of this name that lacks the groups.
+    // The ID token may have an object of this name without the groups, which has to be replaced.
     let leads_to_groups = |name: &str| {
         let rest = groups_claim.strip_prefix(name);
         rest.is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
@@ -437,7 +452,7 @@ fn with_user_info(
 
 type TokenError = RequestTokenError<HttpError, StandardErrorResponse<CoreErrorResponseType>>;
 
-/// Whether the provider refuses the code, or cannot say.
+/// Distinguishes a refused code from a failed request.
 fn refused(error: TokenError) -> ExchangeError {
     match error {
         RequestTokenError::ServerResponse(said) => {

@@ -1,5 +1,5 @@
-//! A provider that signs with a key of which the server does not know yet, in the moment in which several
-//! people sign in.
+//! Tests key rollover: the provider signs with a key unknown to the server while several people
+//! sign in.
 
 use std::collections::BTreeMap;
 use std::sync::Mutex;
@@ -21,10 +21,10 @@ use super::*;
 use crate::config::oidc::OidcConfig;
 use crate::identity::pending::{PendingKey, SIGN_IN_RANDOM_BYTES};
 
-/// How long somebody is watched who must wait: a refusal would come at once.
+/// Time for which a sign-in that has to wait is observed; a refusal would come at once.
 const WATCHED: Duration = Duration::from_millis(300);
 
-/// A key of a provider, and what it signs.
+/// Signing key of the test provider.
 pub(super) struct Signer {
     pair: Ed25519KeyPair,
     pub(super) public: CoreJsonWebKey,
@@ -48,16 +48,16 @@ impl Signer {
     }
 }
 
-/// A provider on the loopback, whose answers the test decides.
+/// OpenID provider on the loopback whose answers the test sets.
 struct Fake {
     listener: TcpListener,
-    /// The key that signs, by its number.
+    /// Number of the key that signs ID tokens.
     signs_by: AtomicUsize,
-    /// The keys that it tells, by their numbers; `None` if it fails to.
+    /// Numbers of the published keys; `None` if requests for keys fail.
     tells: Mutex<Option<Vec<usize>>>,
-    /// Lets questions for the keys be answered.
+    /// Permits for answering requests for the keys.
     answers: Semaphore,
-    /// How often it was asked for its keys.
+    /// Number of requests for the keys.
     asked: AtomicUsize,
     clock: Clock,
 }
@@ -82,7 +82,7 @@ impl Fake {
         Signer::new(u8::try_from(number).unwrap(), &number.to_string())
     }
 
-    /// The server's side of it.
+    /// Returns the server's client of this provider.
     fn provider(&self) -> Provider {
         let config = OidcConfig {
             issuer: self.issuer(),
@@ -144,7 +144,7 @@ impl Fake {
                 )
             }
             "/token" => {
-                // The code is the nonce: it says which sign-in it is.
+                // The test uses the nonce as the code, to identify the sign-in.
                 let body = String::from_utf8(body).unwrap();
                 let code = body.split('&').find_map(|pair| pair.strip_prefix("code="));
                 let number = self.signs_by.load(Ordering::SeqCst);
@@ -224,7 +224,7 @@ async fn whoever_signs_in_while_the_new_keys_are_asked_for_waits_for_them() {
         );
     })
     .await;
-    // Once at the discovery, once for both.
+    // One request at the discovery, one for both sign-ins.
     assert_eq!(fake.asked.load(Ordering::SeqCst), 2);
 }
 
@@ -240,14 +240,14 @@ async fn the_provider_is_asked_for_its_keys_once_in_ten_seconds_and_not_blamed_o
                 Err(ExchangeError::Invalid(InvalidIdToken::Signature(_)))
             )
         };
-        // It signs with a key that it tells nobody.
+        // The provider signs with a key that it does not publish.
         fake.signs_by.store(2, Ordering::SeqCst);
         for number in 1..5 {
             assert!(is_refused(fake.signs_in(&provider, number).await));
         }
         assert_eq!(fake.asked.load(Ordering::SeqCst), 2);
         fake.clock.advance(KEYS_REFRESH_INTERVAL);
-        // It does not say which it has: that is no refusal, and is asked again soon.
+        // A failed request for keys refuses nobody and is repeated soon.
         *fake.tells.lock().unwrap() = None;
         for number in 5..9 {
             let unanswered = fake.signs_in(&provider, number).await;
@@ -278,7 +278,7 @@ async fn a_discovery_that_takes_long_does_not_bring_the_former_keys_back() {
             tokio::pin!(sign_in);
             let early = tokio::time::timeout(WATCHED, &mut sign_in).await;
             assert!(early.is_err(), "{early:?}");
-            // The discovery gets the former key, and only then the other one is published.
+            // The discovery gets the old key; the new one is published only then.
             fake.answers.add_permits(1);
             let rollover = async {
                 fake.is_asked(3).await;

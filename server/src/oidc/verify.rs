@@ -1,13 +1,13 @@
-//! What an ID token must say to be believed (OpenID Connect Core 1.0, 3.1.3.7).
+//! Validates ID tokens (OpenID Connect Core 1.0, section 3.1.3.7).
 //!
-//! | | |
+//! | part | requirement |
 //! |---|---|
-//! | signature | by one of the provider's keys, with RSA, ECDSA or EdDSA; never by a shared secret, never none |
+//! | signature | by a key of the provider, with RSA, ECDSA or EdDSA; HMAC and `none` are refused |
 //! | `iss` | the provider |
-//! | `aud` | this client alone; `azp`, if there, too |
-//! | `exp`, `iat` | not over, not of the future, with [`LEEWAY`] for clocks that differ |
+//! | `aud` | this client alone; `azp`, if present, too |
+//! | `exp`, `iat` | not expired, not issued in the future, with a tolerance of [`LEEWAY`] |
 //! | `nonce` | the one of this sign-in |
-//! | `at_hash` | if there, that of the access token that came along |
+//! | `at_hash` | if present, the hash of the access token in the same answer |
 
 use base64::Engine as _;
 use base64::engine::general_purpose::URL_SAFE_NO_PAD;
@@ -23,10 +23,10 @@ use openidconnect::{
 
 use crate::identity::claims::{Claims, SUBJECT_MAX};
 
-/// How far the provider's clock and ours may differ.
+/// Maximum tolerated difference between the provider's clock and this server's.
 pub const LEEWAY: SignedDuration = SignedDuration::from_secs(60);
 
-/// An ID token as it came.
+/// An ID token that is not validated yet.
 pub type IdToken = openidconnect::IdToken<
     EmptyAdditionalClaims,
     CoreGenderClaim,
@@ -34,45 +34,45 @@ pub type IdToken = openidconnect::IdToken<
     CoreJwsSigningAlgorithm,
 >;
 
-/// What an ID token is held against.
+/// Values against which an ID token is validated.
 #[derive(Debug, Clone, Copy)]
 pub struct Expected<'expected> {
-    /// The provider.
+    /// Issuer identifier of the provider.
     pub issuer: &'expected IssuerUrl,
-    /// This client.
+    /// Client identifier of this server.
     pub client_id: &'expected ClientId,
-    /// The nonce of the sign-in.
+    /// Nonce of the sign-in.
     pub nonce: &'expected str,
-    /// The access token that came along.
+    /// Access token in the same answer.
     pub access_token: &'expected AccessToken,
-    /// The time.
+    /// Current time.
     pub now: Timestamp,
-    /// The provider's keys.
+    /// Provider's public keys.
     pub keys: &'expected JsonWebKeySet<CoreJsonWebKey>,
 }
 
-/// Why an ID token is not believed.
+/// Error of validating an ID token.
 #[derive(Debug, thiserror::Error)]
 pub enum InvalidIdToken {
-    /// There is none.
+    /// The provider's answer has no ID token.
     #[error("there is no ID token in the answer")]
     Missing,
-    /// It is signed by a key that is not known, or not rightly.
+    /// The signature is wrong, or by an unknown key.
     #[error("the ID token's signature does not hold")]
     Signature(#[source] ClaimsVerificationError),
-    /// It says something else than it must.
+    /// A claim, such as issuer, audience, expiry or nonce, is missing or wrong.
     #[error("the ID token does not say what it must")]
     Claims(#[source] ClaimsVerificationError),
-    /// It was made for another access token.
+    /// The `at_hash` is not that of the access token.
     #[error("the ID token's `at_hash` is not that of the access token")]
     AccessToken,
-    /// It is for another client.
+    /// The authorised party (`azp`) is another client.
     #[error("the ID token's `azp` is another client")]
     Party,
-    /// Its subject is no name of anybody.
+    /// The subject is empty or longer than [`SUBJECT_MAX`].
     #[error("the ID token's `sub` is empty or too long")]
     Subject,
-    /// It does not read.
+    /// The payload cannot be parsed.
     #[error("the ID token's claims do not read")]
     Unreadable,
 }
@@ -89,10 +89,10 @@ const ALGORITHMS: [CoreJwsSigningAlgorithm; 9] = [
     CoreJwsSigningAlgorithm::EdDsa,
 ];
 
-/// Whom an ID token is about, and what it says of them.
+/// Validates an ID token. Returns its subject and all its claims.
 ///
 /// # Errors
-/// [`InvalidIdToken`].
+/// [`InvalidIdToken`] with the requirement that is not met.
 pub fn claims(
     id_token: &IdToken,
     expected: &Expected<'_>,
@@ -149,7 +149,7 @@ pub fn claims(
     Ok((subject.to_owned(), claims))
 }
 
-/// All claims of an ID token, out of the very bytes that are signed.
+/// Parses all claims of an ID token from the signed bytes.
 fn payload(id_token: &IdToken) -> Option<Claims> {
     let text = id_token.to_string();
     let payload = URL_SAFE_NO_PAD.decode(text.split('.').nth(1)?).ok()?;

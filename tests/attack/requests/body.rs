@@ -95,7 +95,7 @@ fn value(document: &Value, schema: &Value, random: &mut Random, depth: usize) ->
         }
         Some("string") => text(schema, random),
         Some("integer") => json!(random.index(50)),
-        Some("number") => json!(random.between(-5.0, 5.0)),
+        Some("number") => json!(random.between(-5.0..5.0)),
         Some("boolean") => json!(random.chance(0.5)),
         _ => Value::Null,
     }

@@ -58,9 +58,9 @@ pub(super) struct RunPlan {
 
 /// A short path from about where the robot is, to either side.
 pub(super) fn path(random: &mut Random) -> Value {
-    let x_m = random.between(0.0, 1.0);
-    let bend_m = random.between(-0.5, 0.5);
-    let length_m = random.between(1.5, 3.0);
+    let x_m = random.between(0.0..1.0);
+    let bend_m = random.between(-0.5..0.5);
+    let length_m = random.between(1.5..3.0);
     json!({"waypoints": {"speed_m_s": 0.8, "points": [
         {"x_m": x_m, "y_m": 0.0},
         {"x_m": x_m + 0.5 * length_m, "y_m": 0.2 * bend_m},
@@ -82,7 +82,7 @@ fn asked(random: &mut Random, robot: &str, now: jiff::Timestamp) -> Asked {
         body["lost_after_s"] = json!(LOST_AFTER_S);
     }
     if expires {
-        let latest = now + Duration::from_secs_f64(random.between(2.5, 12.0));
+        let latest = now + Duration::from_secs_f64(random.between(2.5..12.0));
         body["latest_start"] = json!(latest);
     }
     Asked {
@@ -103,8 +103,8 @@ impl RunPlan {
         let mut actions = Vec::new();
         let mut away = |random: &mut Random, share: f64, begin: Action, end: Action| {
             if random.chance(share) {
-                let from_s = random.between(0.0, BREAKING.as_secs_f64());
-                let for_s = random.between(0.05, AWAY_MAX_S);
+                let from_s = random.between(0.0..BREAKING.as_secs_f64());
+                let for_s = random.between(0.05..AWAY_MAX_S);
                 let at = Duration::from_secs_f64;
                 actions.push((at(from_s), begin));
                 actions.push((at(from_s + for_s), end));
@@ -120,7 +120,7 @@ impl RunPlan {
             actions.push((Duration::from_secs_f64(at_s), Action::Reset));
         }
         for mission in 0..MISSIONS {
-            let at = Duration::from_secs_f64(random.between(0.0, BREAKING.as_secs_f64()));
+            let at = Duration::from_secs_f64(random.between(0.0..BREAKING.as_secs_f64()));
             if random.chance(0.25) {
                 actions.push((at, Action::Cancel(mission)));
             }

@@ -45,6 +45,8 @@ const SAME: f64 = 0.03;
 const TORQUE_FROM_M_S: f64 = 0.1;
 /// Rim speed of both sides above which a change of the ground is looked for, metres per second.
 const ROLLING_M_S: f64 = 0.2;
+/// Standard deviation of ln K above which no change of the ground is looked for.
+const CHANGES_STD_DEV_MAX: f64 = 0.2;
 /// Rim speed below which a robot stands, metres per second.
 const STANDING_M_S: f64 = 0.02;
 /// Share of a new acceleration in the smoothed one, per second.
@@ -116,6 +118,8 @@ pub(super) struct Identification {
     robot: Option<IdentifiedRobot>,
     is_robot_due: bool,
     change: ChangeMonitor,
+    /// Whether ln K is known well enough that a change of it shows.
+    is_sharp: bool,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -155,6 +159,7 @@ impl Identification {
             robot: None,
             is_robot_due: false,
             change: ChangeMonitor::default(),
+            is_sharp: false,
         };
         identification.begin(&State::rolling(0.0, 0.0));
         Some(identification)
@@ -377,7 +382,8 @@ impl Identification {
                 innovation = found.map(|found| (found, hypothesis.worst_square()));
             }
         }
-        self.change.update(innovation, self.is_rolling())
+        let known = innovation.filter(|_| self.is_sharp);
+        self.change.update(known, self.is_rolling())
     }
 
     /// Whether both sides roll so fast that slip tells friction.
@@ -408,6 +414,8 @@ impl Identification {
             return;
         }
         self.discard();
+        let variance = self.best().map(|best| best.variances(&self.prior).0);
+        self.is_sharp = variance.is_some_and(|variance| variance.sqrt() < CHANGES_STD_DEV_MAX);
     }
 
     /// Discards hypotheses that fit worse than the best one, and all but one of those that agree.

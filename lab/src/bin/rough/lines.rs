@@ -1,4 +1,4 @@
-//! What is driven: robots that differ in one way, and robots that differ in all.
+//! Drives of the report: robots with one deviation, and the population with all deviations.
 
 use tread_lab::random::Random;
 use tread_lab::rough::curve::Shape;
@@ -8,12 +8,12 @@ use tread_lab::rough::spec::{Deviations, MAKES};
 
 use crate::Arguments;
 
-/// Stiffnesses K of the grounds.
+/// Friction stiffnesses K of the grounds.
 pub(crate) const GROUNDS: [f64; 3] = [0.7, 3.0, 12.0];
 
 pub(crate) type Change = fn(&mut Deviations);
 
-/// Deviations, one at a time.
+/// Single deviations, each with its name in the report.
 pub(crate) const CHANGES: [(&str, Change); 22] = [
     ("nothing", |_| {}),
     ("payload 20 %", |robot| {
@@ -29,16 +29,16 @@ pub(crate) const CHANGES: [(&str, Change); 22] = [
         robot.inertia_ratio = 0.8;
     }),
     ("brush, peak 0.3", |robot| {
-        bent(robot, Shape::Brush, 0.3);
+        with_curve(robot, Shape::Brush, 0.3);
     }),
     ("brush, peak 0.8", |robot| {
-        bent(robot, Shape::Brush, 0.8);
+        with_curve(robot, Shape::Brush, 0.8);
     }),
     ("Magic Formula, peak 0.5", |robot| {
-        bent(robot, Shape::MagicFormula, 0.5);
+        with_curve(robot, Shape::MagicFormula, 0.5);
     }),
     ("LuGre, peak 0.6", |robot| {
-        bent(robot, Shape::LuGre, 0.6);
+        with_curve(robot, Shape::LuGre, 0.6);
     }),
     ("relaxation 1 cm", |robot| {
         robot.relaxation_m = 0.01;
@@ -78,12 +78,12 @@ pub(crate) const CHANGES: [(&str, Change); 22] = [
     }),
 ];
 
-fn bent(robot: &mut Deviations, shape: Shape, mu_peak: f64) {
+fn with_curve(robot: &mut Deviations, shape: Shape, mu_peak: f64) {
     robot.curve.shape = shape;
     robot.curve.mu_peak = mu_peak.min(0.9 * robot.curve.stiffness);
 }
 
-/// The drives of one way of being different: the paper's robot on three grounds and two courses.
+/// Returns the drives with one deviation: the paper's robot on three grounds and two courses.
 pub(crate) fn alone(change: Change, has_torque: bool, arguments: &Arguments) -> Vec<Trial> {
     let trial = |index: u32| {
         let stiffness = GROUNDS[index as usize % GROUNDS.len()];
@@ -107,7 +107,7 @@ pub(crate) fn alone(change: Change, has_torque: bool, arguments: &Arguments) -> 
     (0..arguments.runs).map(trial).collect()
 }
 
-/// Robots of all makes in which everything differs.
+/// Returns the drives of the population: robots of all makes with all deviations.
 pub(crate) fn population(has_torque: bool, arguments: &Arguments) -> Vec<Trial> {
     let trial = |index: u32| {
         let seed = arguments.seed + u64::from(index);

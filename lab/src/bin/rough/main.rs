@@ -1,13 +1,14 @@
-//! `rough`: whether what agents report of the ground holds on robots unlike their own simulator.
+//! `rough`: tests the agents' estimates of θ on robots that differ from their model and simulator.
 //!
 //! `cargo run --release -p tread-lab --bin rough -- [--runs N] [--seed N] [--only TEXT]
 //! [--tyres-straight] [--bounds N] [--drives FILE] [--json]`
 //!
-//! Every robot is configured with its data sheet and drives in the rough world. A line is one way
-//! of being different, or the population, in which everything differs at once, and its strata.
-//! Printed are the coverage of the 95 % intervals, the median error, the median half-width and the
-//! share of answers without an interval, or with one wider than 60 % of its value, which says as
-//! little. With `--bounds` some drives of each line are set against how well θ could be known.
+//! Every agent is configured with the robot's data sheet; the robot drives in the rough world. A
+//! line of the report is one deviation, or the population, in which all deviations are drawn at
+//! once, or a stratum of it. The report has the coverage of the 95 % intervals, the median error,
+//! the median half-width, and the fraction of estimates that are missing or have a half-width above
+//! 60 % of the value. With `--bounds` it compares some drives of each line with the Cramér–Rao
+//! bound of θ.
 
 #![expect(clippy::print_stdout, reason = "a program that prints a report")]
 
@@ -34,22 +35,23 @@ use score::{Drive, Line, POPULATION, print, strata};
 #[derive(Debug, Parser)]
 #[command(name = "rough")]
 struct Arguments {
-    /// Drives of each line; the population has ten times as many
+    /// Number of drives of each line; the population has ten times as many
     #[arg(long, default_value_t = 40, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     runs: u32,
     /// First seed
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Only lines whose name contains this
+    /// Run only lines whose name contains this text
     #[arg(long, default_value = "")]
     only: String,
-    /// Configure agents for tyres that rise straight at once, instead of the default
+    /// Configure agents for tyres with a linear friction curve and no relaxation, instead of the
+    /// default
     #[arg(long)]
     tyres_straight: bool,
-    /// Drives of each line of which to work out how well θ could be known
+    /// Number of drives of each line for which to compute the Cramér–Rao bound of θ
     #[arg(long, default_value_t = 0)]
     bounds: u32,
-    /// Write each drive there, one JSON object a line
+    /// Write each drive to this file, one JSON object per line
     #[arg(long, value_name = "FILE")]
     drives: Option<PathBuf>,
     /// Print one JSON object instead of a table
@@ -67,7 +69,7 @@ impl Arguments {
     }
 }
 
-/// Drives them all, on all processors.
+/// Runs all drives in parallel.
 fn drive(trials: Vec<Trial>) -> anyhow::Result<Vec<Drive>> {
     let outcomes = in_parallel(&trials, run);
     let drives = trials.into_iter().zip(outcomes);
@@ -76,7 +78,7 @@ fn drive(trials: Vec<Trial>) -> anyhow::Result<Vec<Drive>> {
         .collect()
 }
 
-/// Writes each drive of a line.
+/// Writes the drives of a line as JSON objects.
 fn write(file: &mut impl Write, name: &str, drives: &[Drive]) -> anyhow::Result<()> {
     for (trial, outcome) in drives {
         let said = outcome

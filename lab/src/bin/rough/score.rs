@@ -1,4 +1,4 @@
-//! How well the agents' intervals hold: figures of a line, and of the strata of the population.
+//! Computes the statistics of a line and of the strata of the population, with their goals.
 
 use std::ops::RangeInclusive;
 
@@ -7,24 +7,25 @@ use tread_api::friction::{NORMAL_95, ThetaEstimate};
 use tread_lab::report::Check;
 use tread_lab::rough::run::{ASKED_AT_S, Outcome, Trial};
 
-/// Half-width over value above which an interval counts as none.
+/// Relative half-width above which an estimate counts as missing.
 const WIDE_RATIO: f64 = 0.6;
-/// Coverage that a line with a single difference, or a stratum of the population, must have.
+/// Goal for the coverage of a line with a single deviation and of a stratum.
 const LINE_GOAL: RangeInclusive<f64> = 0.9..=1.0;
-/// Coverage that the population must have.
+/// Goal for the coverage of the population.
 const POPULATION_GOAL: RangeInclusive<f64> = 0.93..=0.975;
-/// Half-width over value up to which a bound is useful.
+/// Relative half-width of the bound up to which a drive should give an estimate.
 const USEFUL_RATIO: f64 = 0.4;
-/// Median half-width over that of the bound that a line may have.
+/// Goal for the median ratio of the half-width to that of the bound.
 const OVER_BOUND_GOAL: f64 = 1.5;
-/// The last answer of a drive.
+/// Index of the last estimate of a drive.
 const LAST: usize = ASKED_AT_S.len() - 1;
-/// Name of the line in which everything differs.
+/// Name of the line with all deviations.
 pub(crate) const POPULATION: &str = "population";
-/// Share of the time beyond half the peak's slip above which a drive is of the stratum that slips.
+/// Fraction of the time beyond half the slip at the peak above which a drive belongs to the stratum
+/// of large slip.
 const SLIPS_MOSTLY: f64 = 0.5;
 
-/// A drive and what came of it.
+/// A drive and its result.
 pub(crate) type Drive = (Trial, Outcome);
 
 #[derive(Debug, Serialize)]
@@ -32,28 +33,29 @@ pub(crate) struct Line {
     pub(crate) name: String,
     has_torque: bool,
     estimates: usize,
-    /// Share of the estimates whose 95 % interval holds the true θ.
+    /// Fraction of the estimates whose 95 % interval contains the true θ.
     coverage: f64,
     /// Median of θ̂/θ − 1.
     error: f64,
-    /// Median half-width of the 95 % interval over its value.
+    /// Median half-width of the 95 % interval, relative to θ̂.
     half_width: f64,
-    /// Share of answers that say nothing.
+    /// Fraction of missing estimates.
     abstained: f64,
-    /// The same of the last answers.
+    /// Fraction of drives whose last estimate is missing.
     abstained_at_end: f64,
-    /// Share of the time in which a contact slipped beyond half the slip of the peak.
+    /// Median fraction of the time in which a contact slipped by more than half the slip at the
+    /// peak.
     beyond_half_peak: f64,
-    /// Median half-width over its value at best, where it was worked out.
+    /// Median relative half-width of the Cramér–Rao bound, if computed.
     bound: Option<f64>,
-    /// Median of the half-width over the best one, of answers that have both.
+    /// Median ratio of the half-width to that of the bound, over estimates that have both.
     over_bound: Option<f64>,
-    /// Share of drives that end without an estimate although the best one is useful.
+    /// Fraction of drives without a last estimate, among those with a useful bound.
     abstained_needlessly: Option<f64>,
 }
 
 impl Line {
-    /// Figures of drives with or without torque.
+    /// Computes the statistics of drives with or without measured torque.
     pub(crate) fn of(name: impl Into<String>, has_torque: bool, drives: &[&Drive]) -> Self {
         let (mut errors, mut widths, mut beyond) = (Vec::new(), Vec::new(), Vec::new());
         let (mut covered, mut asked, mut last) = (0, 0, 0);
@@ -101,7 +103,8 @@ impl Line {
         }
     }
 
-    /// What must hold: the coverage, and where bounds were worked out width and availability.
+    /// Returns the checks of the line: its coverage and, if bounds were computed, width and
+    /// availability of the estimates.
     pub(crate) fn checks(&self) -> Vec<Check> {
         let named = |what: &str| {
             let torque = if self.has_torque { "with" } else { "without" };
@@ -136,7 +139,8 @@ impl Line {
     }
 }
 
-/// The population by thirds of each deviation, by curve, ground and course, and by how much it slips.
+/// Divides the population by thirds of some deviations, by friction curve, ground, course and make,
+/// and by the amount of slip.
 pub(crate) fn strata(has_torque: bool, drives: &[Drive]) -> Vec<Line> {
     type Figure = fn(&Drive) -> f64;
     let by_figure: [(&str, Figure); 4] = [
@@ -194,7 +198,7 @@ pub(crate) fn strata(has_torque: bool, drives: &[Drive]) -> Vec<Line> {
     lines
 }
 
-/// The table for people.
+/// Prints the lines as a table.
 pub(crate) fn print(lines: &[Line]) {
     println!(
         "{:<42} {:>6} {:>9} {:>9} {:>9} {:>9} {:>9} {:>12} {:>9} {:>8} {:>8} {:>9}",
@@ -239,7 +243,7 @@ pub(crate) fn print(lines: &[Line]) {
     }
 }
 
-/// Half-width of the 95 % interval over its value.
+/// Returns the half-width of the 95 % interval, relative to θ̂.
 fn half_width(said: &ThetaEstimate) -> f64 {
     NORMAL_95 * said.std_dev / said.theta
 }

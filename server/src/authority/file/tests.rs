@@ -48,9 +48,9 @@ fn a_crash_between_any_two_steps_leaves_the_rotation_started_or_not_and_finished
         steps.extend(finishing(&former));
         assert_eq!(steps.len(), 7);
         apply_all(&folder, &steps[..steps_done]);
-        // A half-written file of the step that did not come to its end.
+        // A half-written file of the interrupted step.
         fs::write(folder.join("next.key.new"), "half").unwrap();
-        // Twice: the recovery itself may be cut short and is done again.
+        // Twice, because the recovery itself may be interrupted and repeated.
         for _ in 0..2 {
             let trusted = Authorities::load(&folder).unwrap().present();
             let all: Vec<&str> = trusted.all().map(|one| one.fingerprint()).collect();
@@ -67,7 +67,7 @@ fn a_crash_between_any_two_steps_leaves_the_rotation_started_or_not_and_finished
             assert_eq!(mode(&folder, NEXT_KEY_FILE), 0o600);
             continue;
         }
-        // Nothing is left beside what is in force, above all no other key.
+        // Only the files in use are left, above all no other key.
         let mut expected = vec![KEY_FILE.to_owned(), CERTIFICATE_FILE.to_owned()];
         if steps_done > 3 {
             expected.push(retired_name(&former.fingerprint));
@@ -122,7 +122,8 @@ fn a_crash_between_any_two_steps_leaves_the_authority_replaced_or_not_in_a_rotat
     }
 }
 
-/// A disk that confirms so many changes, fails for some, and confirms all after them.
+/// Returns a folder whose `fsync` succeeds `confirmed` times, then fails `failures` times, then
+/// succeeds.
 fn failing(path: &Path, confirmed: usize, failures: usize) -> Folder {
     let asked = AtomicUsize::new(0);
     let sync = move |path: &Path| {
@@ -143,14 +144,14 @@ fn a_finish_that_the_disk_does_not_confirm_counts_says_so_and_is_completed_later
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("authority");
     let former = Authority::create(&path, now()).unwrap();
-    // Three of the start; then the one that decides the finish fails, and the next asking too.
+    // Three syncs of the start succeed; that of the finish's first step and the next retry fail.
     let authorities = Authorities::load_from(failing(&path, 3, 2)).unwrap();
     let during = authorities.start("admin", now()).unwrap();
     let next = during.signing().fingerprint();
     let after = authorities.finish(during.id()).unwrap();
     assert!(!after.is_trusted(former.fingerprint()) && after.is_trusted(next));
     assert!(!authorities.is_settled());
-    // A power cut that undoes the rename must find key and certificate of each other.
+    // After a power failure that undoes the rename, key and certificate must belong together.
     let undone = tempfile::tempdir().unwrap();
     for name in names(&path) {
         fs::copy(path.join(&name), undone.path().join(name)).unwrap();
@@ -194,12 +195,12 @@ fn what_begins_and_is_not_confirmed_is_taken_back_and_can_be_asked_for_again() {
             assert!(authorities.is_settled());
             let trusted = authorities.present();
             assert_eq!(trusted.signing().fingerprint(), former.fingerprint());
-            // The folder shows the same.
+            // The folder contains the same authorities.
             let shown = Authorities::load(&path).unwrap().present();
             assert_eq!(shown.id(), trusted.id());
         }
         let authorities = Authorities::load(&path).unwrap();
-        // What could not be taken back is not mistaken for what is begun now.
+        // A start that could not be undone is not mistaken for the new one.
         let stale = Authority::generate("stale", now()).unwrap();
         apply_all(&path, &starting(&stale, &started()).unwrap());
         apply_all(&path, &replacing(&stale));
@@ -216,7 +217,7 @@ fn a_folder_that_cannot_be_written_leaves_all_as_it_was() {
     let path = folder.path().join("authority");
     Authority::create(&path, now()).unwrap();
     let authorities = Authorities::load(&path).unwrap();
-    // A folder of that name stands where the file is to be.
+    // A folder occupies the name of the file.
     fs::create_dir(path.join(NEXT_CERTIFICATE_FILE)).unwrap();
     fs::write(path.join(NEXT_CERTIFICATE_FILE).join("file"), "").unwrap();
     let before = authorities.present();
@@ -236,7 +237,7 @@ fn a_folder_that_cannot_be_written_leaves_all_as_it_was() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
 
-    /// Starts, finishes and restarts in any order.
+    /// Starts, finishes, replacements and restarts in any order.
     #[test]
     fn whatever_is_asked_for_one_authority_signs_at_most_two_are_trusted_and_the_disk_says_so(
         asked in prop::collection::vec(0_u8..4, 1..12),
@@ -261,8 +262,8 @@ proptest! {
             let present = authorities.present();
             prop_assert_eq!(present.all().count(), 1 + usize::from(present.retiring().is_some()));
             prop_assert!(present.is_trusted(present.of_port().fingerprint()));
-            // But for a replacement no step leaves a robot that was brought over before without a
-            // common authority.
+            // Except for a replacement, each change leaves a robot with the previous trust set and
+            // the server with a common authority.
             if asked != 2 {
                 prop_assert!(present.is_trusted(before.signing().fingerprint()));
                 prop_assert!(before.is_trusted(present.of_port().fingerprint()));

@@ -1,10 +1,10 @@
-//! Cells of the map as a table.
+//! Table of the map's cells.
 
 use tread_api::friction::CellFriction;
 
 use super::{Column, Kind, Row, Value, each, some};
 
-/// The columns, in the order of [`row`].
+/// Columns of the table, in the order of [`row`].
 pub const COLUMNS: &[Column] = &[
     each("ix", Kind::Integer),
     each("iy", Kind::Integer),
@@ -35,7 +35,7 @@ pub const COLUMNS: &[Column] = &[
     some("changed_at", Kind::Time),
 ];
 
-/// One cell, ground and robot model as a row.
+/// Returns the row of one entry: the friction of a cell on one ground for one robot model.
 pub fn row(entry: &CellFriction) -> Row {
     let CellFriction {
         cell,

@@ -1,4 +1,4 @@
-//! Rows as CSV.
+//! Encodes rows as CSV.
 
 use jiff::Timestamp;
 

@@ -1,4 +1,5 @@
-//! Tables in rows, written piece by piece: nothing of them is held but the rows of one piece.
+//! Writes row-oriented tables (CSV, Parquet) in chunks; only the rows of the current chunk are in
+//! memory.
 
 pub mod cells;
 mod comma;
@@ -10,33 +11,33 @@ use std::marker::PhantomData;
 use self::comma::Comma;
 use self::parquet::Parquet;
 
-/// What a column holds.
+/// Type of a column.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
-    /// A whole number.
+    /// 64-bit integer.
     Integer,
-    /// A number.
+    /// 64-bit floating-point number.
     Number,
-    /// Yes or no.
+    /// Boolean.
     Flag,
-    /// Text.
+    /// String.
     Text,
-    /// A time, microseconds since 1970 UTC.
+    /// Time, in microseconds since 1970 UTC.
     Time,
 }
 
-/// A column: its name, what it holds, and whether every row has it.
+/// Definition of a column.
 #[derive(Debug, Clone, Copy)]
 pub struct Column {
-    /// Its name, with its unit last.
+    /// Name of the column, with its unit last.
     pub name: &'static str,
-    /// What it holds.
+    /// Type of its values.
     pub kind: Kind,
-    /// Whether a row may be without it.
+    /// Whether the value may be missing in a row.
     pub is_optional: bool,
 }
 
-/// A column that every row has.
+/// Returns a column whose value is required.
 const fn each(name: &'static str, kind: Kind) -> Column {
     Column {
         name,
@@ -45,7 +46,7 @@ const fn each(name: &'static str, kind: Kind) -> Column {
     }
 }
 
-/// A column that a row may be without.
+/// Returns a column whose value is optional.
 const fn some(name: &'static str, kind: Kind) -> Column {
     Column {
         name,
@@ -54,20 +55,20 @@ const fn some(name: &'static str, kind: Kind) -> Column {
     }
 }
 
-/// What stands in a row.
+/// Value of one column in a row.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Value {
-    /// Nothing.
+    /// Missing value.
     Nothing,
-    /// A whole number.
+    /// 64-bit integer.
     Integer(i64),
-    /// A number.
+    /// 64-bit floating-point number.
     Number(f64),
-    /// Yes or no.
+    /// Boolean.
     Flag(bool),
-    /// Text.
+    /// String.
     Text(String),
-    /// A time, microseconds since 1970 UTC.
+    /// Time, in microseconds since 1970 UTC.
     Time(i64),
 }
 
@@ -81,52 +82,53 @@ impl Value {
     }
 }
 
-/// One row, in the order of the columns.
+/// Values of one row, in the order of the columns.
 pub type Row = Vec<Value>;
 
-/// Why a table cannot be written.
+/// Error of encoding a table.
 #[derive(Debug, thiserror::Error)]
 pub enum TableError {
-    /// As CSV.
+    /// CSV encoding failed.
     #[error("the rows cannot be written as CSV")]
     Comma(#[from] csv::Error),
-    /// As Parquet.
+    /// Parquet encoding failed.
     #[error("the rows cannot be written as Parquet")]
     Parquet(#[from] ::parquet::errors::ParquetError),
-    /// As JSON.
+    /// JSON encoding failed.
     #[error("the rows cannot be written as JSON")]
     Json(#[from] serde_json::Error),
 }
 
-/// Writes entries piece by piece.
+/// Encoder of entries in chunks: call [`Self::begin`], [`Self::piece`] for each chunk, and
+/// [`Self::end`], and concatenate the results.
 pub trait Writer<T>: Send {
-    /// What stands before the first piece.
+    /// Returns the bytes before the first chunk.
     ///
     /// # Errors
-    /// It cannot be written.
+    /// The encoding fails.
     fn begin(&mut self) -> Result<Vec<u8>, TableError>;
 
-    /// One piece.
+    /// Returns the bytes of one chunk of entries.
     ///
     /// # Errors
-    /// It cannot be written.
+    /// The encoding fails.
     fn piece(&mut self, entries: &[T]) -> Result<Vec<u8>, TableError>;
 
-    /// What stands behind the last piece.
+    /// Returns the bytes after the last chunk.
     ///
     /// # Errors
-    /// It cannot be written.
+    /// The encoding fails.
     fn end(&mut self) -> Result<Vec<u8>, TableError>;
 }
 
-/// Rows of values in some format.
+/// Encoder of rows in one format.
 trait Rows: Send {
     fn begin(&mut self) -> Result<Vec<u8>, TableError>;
     fn rows(&mut self, rows: &[Row]) -> Result<Vec<u8>, TableError>;
     fn end(&mut self) -> Result<Vec<u8>, TableError>;
 }
 
-/// Entries as rows.
+/// Adapter that converts entries to rows and encodes these.
 struct Table<T, F> {
     rows: F,
     row: fn(&T) -> Row,
@@ -148,7 +150,7 @@ impl<T, F: Rows> Writer<T> for Table<T, F> {
     }
 }
 
-/// A table as CSV (RFC 4180, with a row of names).
+/// Returns an encoder of CSV (RFC 4180, with a header row).
 pub fn comma<T: 'static>(columns: &'static [Column], row: fn(&T) -> Row) -> Box<dyn Writer<T>> {
     Box::new(Table {
         rows: Comma::new(columns),
@@ -157,10 +159,11 @@ pub fn comma<T: 'static>(columns: &'static [Column], row: fn(&T) -> Row) -> Box<
     })
 }
 
-/// A table as Parquet, with a group of rows for each piece.
+/// Returns an encoder of Parquet, with one row group for each chunk. `said` are the key–value
+/// metadata of the file.
 ///
 /// # Errors
-/// The columns make no table.
+/// The columns give no valid schema.
 pub fn parquet<T: 'static>(
     columns: &'static [Column],
     row: fn(&T) -> Row,

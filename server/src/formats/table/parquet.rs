@@ -1,4 +1,4 @@
-//! Rows as Parquet.
+//! Encodes rows as Parquet.
 
 use std::fmt::Write as _;
 use std::sync::Arc;
@@ -14,7 +14,7 @@ use super::{Column, Kind, Row, Rows, TableError, Value};
 
 pub(super) struct Parquet {
     columns: &'static [Column],
-    /// Into what is handed out after each piece; `None` after the end.
+    /// Writer into a buffer that is emptied after each chunk; `None` after the end.
     file: Option<SerializedFileWriter<Vec<u8>>>,
 }
 
@@ -41,7 +41,7 @@ impl Parquet {
     }
 }
 
-/// The columns in the language of the format.
+/// Returns the schema in Parquet's message format.
 fn message(columns: &[Column]) -> String {
     let mut message = "message table {\n".to_owned();
     for Column {
@@ -65,7 +65,7 @@ fn message(columns: &[Column]) -> String {
     message
 }
 
-/// Writes one column of the rows.
+/// Writes one column of a row group: the rows, the index of the column, and whether it is optional.
 fn put<D: DataType>(
     mut column: SerializedColumnWriter<'_>,
     (rows, place, is_optional): (&[Row], usize, bool),
@@ -105,7 +105,7 @@ fn put_column(
     }
 }
 
-/// Takes out what was written so far.
+/// Flushes the writer and takes the bytes written so far out of its buffer.
 fn taken(file: &mut SerializedFileWriter<Vec<u8>>) -> Result<Vec<u8>, TableError> {
     file.flush()
         .map_err(::parquet::errors::ParquetError::from)?;

@@ -1,10 +1,10 @@
-//! Raw measurements as a table.
+//! Table of raw measurements, the segments.
 
 use tread_api::friction::{Information, StoredSegment};
 
 use super::{Column, Kind, Row, Value, each, some};
 
-/// The columns, in the order of [`row`].
+/// Columns of the table, in the order of [`row`].
 pub const COLUMNS: &[Column] = &[
     each("id", Kind::Integer),
     each("robot", Kind::Text),
@@ -32,7 +32,7 @@ pub const COLUMNS: &[Column] = &[
     each("saturation_ratio", Kind::Number),
 ];
 
-/// One measurement as a row.
+/// Returns the row of one segment.
 pub fn row(entry: &StoredSegment) -> Row {
     let segment = &entry.segment;
     let terrain = segment.terrain.as_ref();

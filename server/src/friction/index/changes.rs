@@ -1,25 +1,27 @@
-//! Which cells have changed since when, so that what was made of them is made again only there.
+//! Tracks changes of cells, so that values derived from the map are recomputed only for changed
+//! cells.
 
 use std::collections::{BTreeMap, VecDeque};
 
 use tread_api::site::Cell;
 
-/// Side of the squares of cells whose changes are kept together, cells.
+/// Side of a [`Block`], in cells.
 pub const BLOCK_CELLS: i32 = 64;
-/// Changes of one block that are kept one by one; of older ones only that there were some.
+/// Maximum number of changes recorded per block; beyond it the oldest is dropped, and
+/// [`Changes::since`] returns `None` for times before it.
 const KEPT_MAX: usize = 1_024;
 
-/// A square of cells, by row and column of such squares.
+/// Square of [`BLOCK_CELLS`] × [`BLOCK_CELLS`] cells, by its row and column in units of blocks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Block {
-    /// Row.
+    /// Row, along y.
     pub row: i32,
-    /// Column.
+    /// Column, along x.
     pub column: i32,
 }
 
 impl Block {
-    /// The block that a cell lies in.
+    /// Returns the block that contains `cell`.
     pub fn of(cell: Cell) -> Self {
         Self {
             row: cell.iy.div_euclid(BLOCK_CELLS),
@@ -27,7 +29,7 @@ impl Block {
         }
     }
 
-    /// Its cell with the lowest coordinates.
+    /// Returns the cell with the lowest indices.
     pub fn first(self) -> Cell {
         Cell {
             ix: self.column.saturating_mul(BLOCK_CELLS),
@@ -35,7 +37,7 @@ impl Block {
         }
     }
 
-    /// Its cell with the highest coordinates.
+    /// Returns the cell with the highest indices.
     pub fn last(self) -> Cell {
         let first = self.first();
         Cell {
@@ -44,13 +46,13 @@ impl Block {
         }
     }
 
-    /// Where a cell of this block stands in it, row by row.
+    /// Returns the index of `cell` within its block, row by row.
     pub fn place(cell: Cell) -> u16 {
         let place = cell.iy.rem_euclid(BLOCK_CELLS) * BLOCK_CELLS + cell.ix.rem_euclid(BLOCK_CELLS);
         u16::try_from(place).unwrap_or_default()
     }
 
-    /// The cell that stands there.
+    /// Returns the cell with index `place` in this block.
     pub fn cell(self, place: u16) -> Cell {
         let (first, place) = (self.first(), i32::from(place));
         Cell {
@@ -60,17 +62,17 @@ impl Block {
     }
 }
 
-/// Changes of one block.
+/// Recorded changes of one block.
 #[derive(Debug, Default)]
 struct OfBlock {
     newest: u64,
-    /// All changes after this one are kept.
+    /// Number of the newest change that is no longer recorded; all later ones are.
     kept_after: u64,
-    /// Number of the change, and where it was.
+    /// Number of each change, and index of its cell in the block; oldest first.
     kept: VecDeque<(u64, u16)>,
 }
 
-/// All changes of a map, counted.
+/// Changes of a map, numbered consecutively from 1.
 #[derive(Debug, Default)]
 pub struct Changes {
     newest: u64,
@@ -90,7 +92,7 @@ impl Changes {
         block.kept.push_back((self.newest, Block::place(cell)));
     }
 
-    /// Everything that is there has changed.
+    /// Records a change of all cells.
     pub(super) fn note_all(&mut self) {
         self.newest += 1;
         for block in self.blocks.values_mut() {
@@ -102,7 +104,7 @@ impl Changes {
         }
     }
 
-    /// Counts on from older changes, after which everything may have changed.
+    /// Continues the numbering of the map `before`, and records a change of all cells of both.
     pub(super) fn follow(&mut self, before: &Self) {
         self.newest = self.newest.max(before.newest);
         for &block in before.blocks.keys() {
@@ -111,17 +113,18 @@ impl Changes {
         self.note_all();
     }
 
-    /// The number of the newest change.
+    /// Returns the number of the newest change; 0 without changes.
     pub fn newest(&self) -> u64 {
         self.newest
     }
 
-    /// The number of a block's newest change; 0 if nothing was ever there.
+    /// Returns the number of the newest change of a block; 0 without changes.
     pub fn newest_of(&self, block: Block) -> u64 {
         self.blocks.get(&block).map_or(0, |found| found.newest)
     }
 
-    /// The number of the newest change of the blocks of a box.
+    /// Returns the number of the newest change in the rectangle of blocks from `low` to `high`,
+    /// both included; 0 without changes.
     pub fn newest_in(&self, low: Block, high: Block) -> u64 {
         let rows = self.blocks.range(low..=high);
         let columns = low.column..=high.column;
@@ -129,8 +132,8 @@ impl Changes {
         within.fold(0, |newest, (_, found)| newest.max(found.newest))
     }
 
-    /// The cells of a block that have changed since; `None` if that is not kept, so that all may
-    /// have.
+    /// Returns the indices of the cells of a block that changed after change `since`, sorted;
+    /// `None` if these are no longer recorded, so that any cell may have changed.
     pub fn since(&self, block: Block, since: u64) -> Option<Vec<u16>> {
         let Some(found) = self.blocks.get(&block) else {
             return Some(Vec::new());
@@ -145,7 +148,7 @@ impl Changes {
         Some(places)
     }
 
-    /// Blocks that hold anything, row by row, with the number of their newest change.
+    /// Returns the blocks with any change, row by row, with the number of their newest change.
     pub fn blocks(&self) -> impl Iterator<Item = (Block, u64)> + '_ {
         self.blocks
             .iter()

@@ -1,8 +1,8 @@
-//! The map in memory: every sum of the database, where a question finds it at once.
+//! The friction map in memory: all sums of the database, indexed by cell and by terrain.
 //!
-//! It equals what the database says, and is changed after each commit by what was committed. Cells
-//! lie row by row, so that a box is some runs of neighbours and a path some lookups. What is kept
-//! of a (cell, terrain, robot, configuration, epoch) takes 168 bytes besides its place.
+//! The index equals the database and is updated after each commit. Cells are sorted row by row, so
+//! a rectangle is a few ranges of neighbours. Each sum of a (cell, terrain, robot, configuration,
+//! epoch) takes 168 bytes in addition to its key.
 
 mod changes;
 mod names;
@@ -24,32 +24,32 @@ pub use self::summaries::{At, CELLS_PER_BLOCK, CellSummary, GROUND_NONE, KnownCe
 use super::sums::{DAY_H, HOUR_S, bucket_h};
 use super::{Seen, Sums};
 
-/// A sum with the names of what it is about.
+/// Labels of a sum.
 #[derive(Debug, Clone, Copy)]
 pub struct Labelled<'names> {
-    /// The cell.
+    /// Cell of the measurements.
     pub cell: Cell,
-    /// The grid that cut the cell; sums of another one than the map's are not on the map.
+    /// Revision of the grid of `cell`; sums of another revision than the map's are ignored.
     pub grid_revision: u32,
-    /// The ground, if any is drawn.
+    /// Terrain revision, if the cell is on a terrain.
     pub terrain: &'names Option<TerrainRef>,
-    /// The configuration that measured.
+    /// Configuration of the robot.
     pub configuration: ConfigurationId,
-    /// The robot that measured.
+    /// Robot that measured.
     pub robot: &'names RobotId,
-    /// Hour of measuring.
+    /// Epoch of the measurements, hours since 1970.
     pub epoch_h: i64,
 }
 
-/// The map of one site.
+/// Friction map of one site.
 #[derive(Debug, Default)]
 pub struct SiteMap {
     names: Names,
     grid_revision: u32,
     merged_before_h: i64,
-    /// By row and column, both shifted so that they sort as numbers without sign.
+    /// Sums by cell; the key has row and column, shifted to unsigned numbers, see [`place`].
     cells: BTreeMap<u64, Box<[Part]>>,
-    /// The same summed over cells, for terrains.
+    /// Sums over all cells, for terrains.
     totals: BTreeMap<PartKey, Sums>,
     changes: Changes,
 }
@@ -67,23 +67,23 @@ fn cell_at(place: u64) -> Cell {
     }
 }
 
-/// Which measurements count, and how.
+/// Filter of measurements, and the normalisation to apply.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Choice<'choice> {
-    /// Only epochs that were over by then: a sum does not tell what of it came before.
+    /// Only epochs that had ended by this time, because a sum cannot be divided in time.
     pub as_of: Option<Timestamp>,
     /// Only this configuration.
     pub configuration: Option<ConfigurationId>,
     /// Only this robot.
     pub robot: Option<&'choice RobotId>,
-    /// Configurations whose θ is brought to that of another one.
+    /// Ratios by which θ of other configurations is converted.
     pub normalisation: Option<&'choice Normalisation>,
 }
 
 impl Choice<'_> {
-    /// In whose θ a configuration's measurements count, and what they are divided by for that;
-    /// `None` if they do not count. Those that a normalisation joins count in the θ of the one that
-    /// is asked for, of its reference if none is.
+    /// Returns the configuration to whose θ the measurements of `found` are converted, and the
+    /// divisor for that; `None` if they are filtered out. Configurations of the normalisation are
+    /// converted to the chosen configuration, or to the reference if none is chosen.
     fn brought_to(&self, found: ConfigurationId) -> Option<(ConfigurationId, f64)> {
         let ratio = |of: ConfigurationId| self.normalisation.and_then(|joined| joined.ratio(of));
         let reference = self.normalisation.map(|joined| joined.reference);
@@ -98,19 +98,19 @@ impl Choice<'_> {
     }
 }
 
-/// Factors that bring the θ of several configurations to that of one.
+/// Ratios that convert θ between configurations.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Normalisation {
-    /// Its name.
+    /// Name of the normalisation.
     pub name: String,
-    /// The configuration in whose θ the answer is.
+    /// Reference configuration, whose ratio is 1.
     pub reference: ConfigurationId,
-    /// θ of a configuration as a multiple of the reference's, on the same ground.
+    /// Ratio of θ of a configuration to that of the reference on the same ground.
     pub ratios: BTreeMap<ConfigurationId, f64>,
 }
 
 impl Normalisation {
-    /// The factor of a configuration; `None` if it is not one of those that are joined.
+    /// Returns the ratio of a configuration; `None` if it is not part of the normalisation.
     fn ratio(&self, configuration: ConfigurationId) -> Option<f64> {
         if configuration == self.reference {
             Some(1.0)
@@ -120,28 +120,30 @@ impl Normalisation {
     }
 }
 
-/// What was seen of one piece of ground by robots of one configuration.
+/// Measurements of one piece of ground by robots of one configuration.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Group<'map> {
-    /// The ground, if any is drawn; `None` for all revisions of a terrain, too.
+    /// Terrain revision; `None` outside of terrains, and for several revisions of a terrain
+    /// together.
     pub terrain: Option<&'map TerrainRef>,
-    /// The configuration.
+    /// Configuration for which θ is stated.
     pub configuration: ConfigurationId,
-    /// What each robot saw in each epoch.
+    /// Measurements of each robot in each epoch; a robot is given by the rank of its name.
     pub seen: Vec<Seen<u32>>,
-    /// Passes that are uninformative: their information vanishes in the sums.
+    /// Number of passes whose information is below the resolution of the sums.
     pub uninformative_passes: u64,
 }
 
 impl Group<'_> {
-    /// Whether any of its passes has information.
+    /// Returns whether any pass has information.
     fn tells(&self) -> bool {
         !self.seen.is_empty()
     }
 }
 
 impl SiteMap {
-    /// An empty map of this grid, in which hours before this one are read as days.
+    /// Creates an empty map for a grid revision. Epochs before the hour `merged_before_h` are
+    /// merged into days.
     pub fn new(grid_revision: u32, merged_before_h: i64) -> Self {
         Self {
             grid_revision,
@@ -150,7 +152,7 @@ impl SiteMap {
         }
     }
 
-    /// Adds sums to those that are there.
+    /// Adds sums to the map; ignores those of another grid revision.
     pub fn add(&mut self, labelled: Labelled<'_>, sums: &Sums) {
         if labelled.grid_revision != self.grid_revision {
             return;
@@ -183,7 +185,7 @@ impl SiteMap {
         self.changes.note(labelled.cell);
     }
 
-    /// Forgets what a robot measured from one hour to another, both included.
+    /// Removes the measurements of a robot from hour `from_h` to hour `to_h`, both included.
     pub fn withdraw(&mut self, robot: &RobotId, (from_h, to_h): (i64, i64)) {
         let Some(&robot) = self.names.robots.numbers.get(robot) else {
             return;
@@ -205,7 +207,7 @@ impl SiteMap {
         }
     }
 
-    /// Reads hours before this one as days from now on.
+    /// Merges the epochs before the hour `before_h` into days.
     pub fn merge_before(&mut self, before_h: i64) {
         if before_h <= self.merged_before_h {
             return;
@@ -238,51 +240,53 @@ impl SiteMap {
         self.changes.note_all();
     }
 
-    /// Takes the place of an older map of the same site: its changes are counted on from there, and
-    /// everything may have changed.
+    /// Continues the numbering of changes of `before`, an older map of the site that this one
+    /// replaces, and records a change of all cells.
     pub fn follow(&mut self, before: &Self) {
         self.changes.follow(&before.changes);
     }
 
-    /// Hours before this one are read as days.
+    /// Returns the hour before which epochs are merged into days.
     pub fn merged_before_h(&self) -> i64 {
         self.merged_before_h
     }
 
-    /// What has changed, and when.
+    /// Returns the recorded changes of cells.
     pub fn changes(&self) -> &Changes {
         &self.changes
     }
 
-    /// Cells that hold anything.
+    /// Returns the number of cells with measurements.
     pub fn cell_count(&self) -> usize {
         self.cells.len()
     }
 
-    /// Sums of (cell, terrain, robot, configuration, epoch).
+    /// Returns the number of sums of (cell, terrain, robot, configuration, epoch).
     pub fn part_count(&self) -> usize {
         self.cells.values().map(|parts| parts.len()).sum()
     }
 
-    /// What was seen of one cell, per terrain and configuration.
+    /// Returns the measurements of one cell, per terrain and configuration.
     pub fn cell(&self, cell: Cell, choice: Choice<'_>) -> Vec<Group<'_>> {
         let parts = self.cells.get(&place(cell));
         parts.map_or_else(Vec::new, |parts| self.groups(parts, choice))
     }
 
-    /// End of the newest pass through a cell, microseconds since 1970.
+    /// Returns the end of the newest pass through a cell, microseconds since 1970; `None` without
+    /// one.
     pub fn newest_at_us(&self, cell: Cell, choice: Choice<'_>) -> Option<i64> {
         let parts = self.cells.get(&place(cell))?;
         let counted = parts.iter().filter(|part| self.counts(&part.key, &choice));
         counted.map(|part| part.newest_at_us).max()
     }
 
-    /// The robot whose name has that place among all of them.
+    /// Returns the robot with this rank in the order of names.
     pub fn robot_of_rank(&self, rank: u32) -> Option<&RobotId> {
         self.names.robots.numbers.keys().nth(rank as usize)
     }
 
-    /// What was seen of several cells together, each robot's summed, per terrain and configuration.
+    /// Returns the measurements of several cells together, summed per robot and epoch, per terrain
+    /// and configuration.
     pub fn area(&self, cells: &[Cell], choice: Choice<'_>) -> Vec<Group<'_>> {
         let parts = cells
             .iter()
@@ -302,7 +306,8 @@ impl SiteMap {
         self.groups(&parts, choice)
     }
 
-    /// The cells of a box that hold anything, row by row, after one of them.
+    /// Returns the cells with measurements in the rectangle from `min` to `max`, both included, row
+    /// by row; those after the cell `after` if it is given.
     pub fn cells_in(
         &self,
         min: Cell,
@@ -328,7 +333,7 @@ impl SiteMap {
                 if cell.ix < min.ix {
                     next = Bound::Included(place(Cell { ix: min.ix, ..cell }));
                 } else if cell.ix > max.ix {
-                    // On to the next row, if there is one.
+                    // Continue with the next row, if there is one.
                     let iy = cell.iy.checked_add(1)?;
                     next = Bound::Included(place(Cell { ix: min.ix, iy }));
                 } else {
@@ -339,8 +344,8 @@ impl SiteMap {
         })
     }
 
-    /// What was seen of terrains that `is_wanted`, each robot's cells summed, per configuration; the
-    /// revisions that are wanted count as one ground.
+    /// Returns the measurements of all terrain revisions that satisfy `is_wanted`, as one ground,
+    /// summed over cells per robot and epoch, per configuration.
     pub fn terrain(
         &self,
         is_wanted: impl Fn(&TerrainRef) -> bool,
@@ -404,7 +409,7 @@ impl SiteMap {
                 .is_some()
     }
 
-    /// The hour in which an epoch is over.
+    /// Returns the hour at which an epoch ends.
     fn end_h(&self, epoch_h: i32) -> i64 {
         let epoch_h = i64::from(epoch_h);
         epoch_h
@@ -415,15 +420,15 @@ impl SiteMap {
             }
     }
 
-    /// The newest time, not after this one, as of which the map can answer: the end of an hour, of a
-    /// day among those that are merged.
+    /// Returns the newest time, not after `as_of`, for which the map can be computed: the end of an
+    /// hour, or of a day where epochs are merged.
     pub fn effective_as_of(&self, as_of: Timestamp) -> Timestamp {
         let hour = as_of.as_second().div_euclid(HOUR_S);
         let end_s = bucket_h(hour, self.merged_before_h).saturating_mul(HOUR_S);
         Timestamp::from_second(end_s).unwrap_or(as_of)
     }
 
-    /// Parts of one cell, which are sorted by key, as groups in the order of their names.
+    /// Groups the parts of one cell, which are sorted by key, by terrain and configuration.
     fn groups(&self, parts: &[Part], choice: Choice<'_>) -> Vec<Group<'_>> {
         let mut groups: Vec<Group<'_>> = Vec::new();
         for part in parts.iter().filter(|part| self.counts(&part.key, &choice)) {
@@ -462,7 +467,7 @@ impl SiteMap {
         groups
     }
 
-    /// How much each robot has put in: cells, segments, epochs from and to.
+    /// Returns the contribution of each robot to the map, sorted by robot.
     pub fn contributions(&self) -> Vec<Contribution> {
         let mut found: BTreeMap<Number, Contribution> = BTreeMap::new();
         let mut note = |key: &PartKey, cells: u64, sums: Option<&Sums>| {
@@ -497,14 +502,14 @@ impl SiteMap {
     }
 }
 
-/// What one robot has put into a map.
+/// Contribution of one robot to a map.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Contribution {
-    /// The robot.
+    /// Identifier of the robot.
     pub robot: RobotId,
-    /// Cells that it has measured.
+    /// Number of cells that it has measured.
     pub cells: u64,
-    /// Its segments.
+    /// Number of its segments.
     pub segments: u64,
     /// First hour of its first epoch.
     pub first_epoch_h: i64,

@@ -1,14 +1,14 @@
-//! Names of what sums are about, each once, by numbers that are short.
+//! Interns the names of robots, configurations and terrains as short numbers.
 
 use std::collections::BTreeMap;
 
 use tread_api::ids::{ConfigurationId, RobotId};
 use tread_api::terrain::TerrainRef;
 
-/// A robot, configuration or terrain by its place in [`Names`].
+/// Number of a robot, configuration or terrain: its index in [`Names`].
 pub(super) type Number = u32;
 
-/// Names of what sums are about, each once.
+/// Interned names of robots, configurations and terrains.
 #[derive(Debug, Default)]
 pub(super) struct Names {
     pub(super) robots: Interned<RobotId>,
@@ -20,7 +20,7 @@ pub(super) struct Names {
 pub(super) struct Interned<T> {
     pub(super) numbers: BTreeMap<T, Number>,
     pub(super) names: Vec<T>,
-    /// Place of each number in the order of the names, which does not depend on who came first.
+    /// Rank of each number in the order of names, which does not depend on the order of insertion.
     ranks: Vec<u32>,
 }
 

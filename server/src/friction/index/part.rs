@@ -1,4 +1,4 @@
-//! Sums of one (terrain, configuration, robot, epoch) of a cell, in as little room as they need.
+//! Compact sums of one (terrain, configuration, robot, epoch) of a cell.
 
 use tread_api::friction::Information;
 
@@ -7,12 +7,12 @@ use crate::friction::fixed::Fixed;
 use crate::friction::sums::{Known, Pair, Pass};
 use crate::friction::{Seen, Sums};
 
-/// Steps per unit in which a friction coefficient is kept.
+/// Steps per unit of a stored friction coefficient.
 const MU_STEPS: f64 = 1.0e6;
-/// Steps per unit of the lower half of a fixed point number.
+/// Steps per unit of the lower half of a fixed-point number, 2³².
 const STEPS: f64 = 4_294_967_296.0;
 
-/// What a sum is about, within a cell.
+/// Key of a sum within a cell.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct PartKey {
     pub(super) terrain: Number,
@@ -21,20 +21,20 @@ pub(super) struct PartKey {
     pub(super) epoch_h: i32,
 }
 
-/// Sums as they are kept in memory: the same numbers in less room.
+/// [`Sums`] in a compact layout, without the number of samples.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Part {
     hi: [i64; 9],
     lo: [u32; 9],
     pub(super) key: PartKey,
     segments: u32,
-    /// A friction coefficient in steps, plus one; 0 for none.
+    /// Peak friction coefficient in steps, plus one; 0 for none. `newest_mu` likewise.
     mu_peak: u32,
     newest_mu: u32,
     pub(super) newest_at_us: i64,
-    /// End of the pass that is kept by itself.
+    /// End of the newest significant pass, which is stored separately.
     pass_at_us: i64,
-    /// Its information; 0, which no pass has, when it is not known.
+    /// Information of that pass; 0 if it is not stored.
     newest_information: f64,
     newest_weighted: f64,
 }
@@ -78,7 +78,7 @@ impl Part {
             sums.tyre_error,
         ];
         for (index, fixed) in fixed.into_iter().enumerate() {
-            // Beyond this the database has refused the sum.
+            // The database refuses larger sums before.
             let (hi, lo) = fixed.halves().unwrap_or((i64::MAX, 0));
             part.hi[index] = hi;
             part.lo[index] = u32::try_from(lo).unwrap_or_default();
@@ -114,16 +114,16 @@ impl Part {
         }
     }
 
-    /// How many passes it has, with information or without.
+    /// Returns the number of passes, with or without information.
     pub(super) fn passes(&self) -> u64 {
         u64::from(self.segments)
     }
 
-    /// The same as [`Seen::of`] of [`Self::sums`], to the bit, without the detour.
+    /// Returns [`Seen::of`] of [`Self::sums`], identical to the bit but faster.
     pub(super) fn seen<R>(&self, robot: R) -> Option<Seen<R>> {
         let number = |index: usize| {
             let (hi, lo) = (self.hi[index], self.lo[index]);
-            // Both halves are exact, so that adding them rounds once, as the whole would.
+            // Both halves are exact, so their sum is rounded once, like the whole.
             #[expect(clippy::cast_precision_loss, reason = "below 2^52")]
             if hi.unsigned_abs() < 1 << 52 {
                 hi as f64 + f64::from(lo) / STEPS
@@ -161,7 +161,7 @@ impl Part {
         })
     }
 
-    /// The same under another key.
+    /// Returns the sums with another key.
     pub(super) fn moved(&self, key: PartKey) -> Self {
         Self { key, ..*self }
     }

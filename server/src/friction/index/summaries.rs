@@ -1,5 +1,5 @@
-//! Cells as pictures have them: one value for each, of one configuration, for the ground under its
-//! middle. Nothing is allocated for a cell.
+//! Summaries of cells for raster images: one estimate per cell, for one configuration and the
+//! ground at the cell's centre. Allocates nothing per cell.
 
 use jiff::Timestamp;
 use tread_api::site::Cell;
@@ -12,42 +12,42 @@ use crate::friction::sums::HOUR_S;
 use crate::friction::weights::FrictionConfig;
 use crate::friction::{Fused, Fuser, Ground, Seen};
 
-/// The number of ground on which no terrain is drawn.
+/// Number of the ground outside of all terrains.
 pub const GROUND_NONE: u16 = 0;
-/// The number of ground that is drawn no more.
+/// Number of terrain revisions that no longer exist; never the ground of a cell.
 const GROUND_LOST: u16 = u16::MAX;
-/// Marks a square whose measurements contradict each other.
+/// Flag in `segments` of a disputed estimate.
 const DISPUTED: u32 = 1 << 31;
 
-/// What is known of a cell or of several, in 16 bytes.
+/// Estimate of a square of one or several cells, in 16 bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct CellSummary {
-    /// 0, which no θ is, where nothing is known.
+    /// θ; 0 without an estimate.
     theta: f32,
     std_dev: f32,
-    /// Below zero where no friction coefficient was shown.
+    /// Peak friction coefficient; negative if none was measured.
     mu_peak: f32,
-    /// Segments, and [`DISPUTED`].
+    /// Number of segments, with the flag [`DISPUTED`].
     segments: u32,
 }
 
-/// What a square knows.
+/// Unpacked estimate of a square.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct KnownCell {
-    /// θ.
+    /// Estimated θ.
     pub theta: f64,
-    /// Its standard deviation.
+    /// Standard deviation of θ.
     pub std_dev: f64,
-    /// Largest friction coefficient shown of late.
+    /// Recent peak friction coefficient.
     pub mu_peak: Option<f64>,
-    /// Segments that were ever measured here, at most 2³¹ − 1.
+    /// Number of segments ever measured here, at most 2³¹ − 1.
     pub segments: u32,
-    /// Whether measurements contradict each other.
+    /// Whether the estimate is disputed, see [`Fused::is_disputed`].
     pub is_disputed: bool,
 }
 
 impl CellSummary {
-    /// The same of a fused estimate.
+    /// Packs a fused estimate.
     #[expect(
         clippy::cast_possible_truncation,
         reason = "as exact as a picture needs"
@@ -63,7 +63,7 @@ impl CellSummary {
         }
     }
 
-    /// What it knows, if anything.
+    /// Unpacks the estimate; `None` without one.
     pub fn known(&self) -> Option<KnownCell> {
         (self.theta > 0.0).then(|| KnownCell {
             theta: f64::from(self.theta),
@@ -75,14 +75,14 @@ impl CellSummary {
     }
 }
 
-/// Which measurements count for which ground, by the numbers of the map.
+/// Compiled filter of measurements for rasters, with the internal numbers of the map.
 #[derive(Debug, Clone)]
 pub struct Lens {
-    /// The ground of each terrain revision.
+    /// Number of the ground of each terrain revision.
     grounds: Vec<u16>,
-    /// What each configuration's θ is divided by; `None` for those that do not count.
+    /// Divisor of θ of each configuration; `None` for configurations that are filtered out.
     ratios: Vec<Option<f64>>,
-    /// Epochs that end later do not count; seconds since 1970.
+    /// Epochs that end after this time are filtered out; seconds since 1970.
     as_of_s: Option<i64>,
 }
 
@@ -99,27 +99,28 @@ impl Lens {
     }
 }
 
-/// At what time and with which settings squares are fused.
+/// Time and settings of a fusion.
 #[derive(Debug, Clone, Copy)]
 pub struct At<'config> {
-    /// How measurements are weighed.
+    /// Weights of measurements.
     pub config: &'config FrictionConfig,
-    /// The time at which ages are counted, microseconds since 1970.
+    /// Time to which ages refer, microseconds since 1970.
     pub now_us: i64,
 }
 
-/// Room that is used again from square to square.
+/// Buffers that are reused from square to square.
 #[derive(Debug, Default)]
 pub struct Room {
     fuser: Fuser<u32>,
     seen: Vec<Seen<u32>>,
-    /// Passes without information.
+    /// Number of passes without information.
     uninformative_passes: u64,
 }
 
 impl SiteMap {
-    /// Which measurements count: those of the chosen configuration and, by a normalisation, of all
-    /// that it joins with it, on the grounds that `ground_of` numbers. None without a configuration.
+    /// Returns the filter for the configuration in `choice` and those that its normalisation
+    /// converts to it. `ground_of` gives the number of each terrain revision's ground, `None` if it
+    /// no longer exists. Without a configuration in `choice` everything is filtered out.
     pub fn lens(
         &self,
         choice: Choice<'_>,
@@ -141,8 +142,9 @@ impl SiteMap {
         }
     }
 
-    /// Makes squares of a block afresh: those at `places`, or all of them. `grounds` has the ground
-    /// under the middle of each cell; both lie row by row, [`BLOCK_CELLS`] to a row.
+    /// Recomputes the squares of a block, those with the indices `places` or all of them. `grounds`
+    /// has the number of the ground at the centre of each cell. `grounds` and `squares` are row by
+    /// row, with [`BLOCK_CELLS`] per row.
     pub fn fuse_block(
         &self,
         (block, places): (Block, Option<&[u16]>),
@@ -177,7 +179,8 @@ impl SiteMap {
         }
     }
 
-    /// The squares of several cells each: a square of `factor` cells along its side.
+    /// Returns the estimate of one square with the cells from `min` to `max`, both included, on the
+    /// given ground.
     pub fn fuse_square(
         &self,
         (min, max): (Cell, Cell),
@@ -207,7 +210,8 @@ impl SiteMap {
         fused.map_or_else(CellSummary::default, |fused| CellSummary::of(&fused))
     }
 
-    /// What a cell says of the ground with that number.
+    /// Fuses the measurements of a cell on the ground with the number in `which`; `None` without
+    /// any.
     pub fn fuse_cell(
         &self,
         cell: Cell,
@@ -257,7 +261,8 @@ impl SiteMap {
         }
     }
 
-    /// The smallest box of whole blocks that holds everything; `None` while there is nothing.
+    /// Returns the first and last cell of the smallest rectangle of whole blocks with all
+    /// measurements; `None` without any.
     pub fn extent(&self) -> Option<(Cell, Cell)> {
         let mut blocks = self.changes.blocks().map(|(block, _newest)| block);
         let first = blocks.next()?;
@@ -270,7 +275,7 @@ impl SiteMap {
         Some((min.first(), max.last()))
     }
 
-    /// The configurations that have measured here, the one with most segments first.
+    /// Returns the configurations with measurements in this map, the one with most segments first.
     pub fn configurations(&self) -> Vec<tread_api::ids::ConfigurationId> {
         let mut segments = vec![0_u64; self.names.configurations.names.len()];
         for (key, sums) in &self.totals {
@@ -286,7 +291,7 @@ impl SiteMap {
     }
 }
 
-/// Cells of a block.
+/// Number of cells of a block.
 pub const CELLS_PER_BLOCK: usize = (BLOCK_CELLS * BLOCK_CELLS).cast_unsigned() as usize;
 
 #[cfg(test)]

@@ -1,5 +1,5 @@
-//! Cuts that lose packets: TCP sends them again, ever more rarely, which a cut that only holds bytes
-//! back does not show.
+//! Cuts that lose packets: TCP sends them again, ever more rarely, which a cut that only holds
+//! bytes back does not show.
 //!
 //! The program runs itself in a network namespace of its own, where a filter drops what arrives
 //! from or at the router's port. Nothing outside is touched, and all goes with the namespace. That
@@ -101,7 +101,7 @@ pub(crate) async fn measure_here(
         let (mut gone_s, mut back_s) = (Vec::new(), Vec::new());
         for _ in 0..trials {
             settle(&mut random).await;
-            let length = cut_s * random.between(1.0 - SPREAD, 1.0 + SPREAD);
+            let length = cut_s * random.between(1.0 - SPREAD..1.0 + SPREAD);
             let cut_at = Instant::now();
             filter.cut()?;
             let until = cut_at + Duration::from_secs_f64(length);

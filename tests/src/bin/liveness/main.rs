@@ -97,7 +97,7 @@ async fn shown_since(
 
 /// Any moment between two heartbeats.
 async fn settle(random: &mut Random) {
-    tokio::time::sleep(Duration::from_secs_f64(random.between(1.0, 1.5))).await;
+    tokio::time::sleep(Duration::from_secs_f64(random.between(1.0..1.5))).await;
 }
 
 async fn cuts(
@@ -112,7 +112,7 @@ async fn cuts(
         settle(&mut random).await;
         relay.cut();
         gone_s.push(shown(fleet, robot, LinkState::Offline).await?);
-        tokio::time::sleep(Duration::from_secs_f64(random.between(0.0, CUT_MAX_S))).await;
+        tokio::time::sleep(Duration::from_secs_f64(random.between(0.0..CUT_MAX_S))).await;
         if trial % 2 == 1 {
             relay.reset();
         }

@@ -1,8 +1,8 @@
 //! `soak`: whether a server survives what robots may send, for as long as one likes.
 //!
 //! Starts a server that takes robots' certificates as a process of its own. Robots connect, send
-//! damaged payloads on all of their keys and tokens of new boots as fast as the link takes them, and
-//! cut the link or close it in the middle; other threads keep the processor busy meanwhile. One
+//! damaged payloads on all of their keys and tokens of new boots as fast as the link takes them,
+//! and cut the link or close it in the middle; other threads keep the processor busy meanwhile. One
 //! more robot behaves well, and notes how long the server takes to answer it.
 
 use std::convert::Infallible;
@@ -150,7 +150,7 @@ fn send_all(
         clippy::cast_sign_loss,
         reason = "a count between two small constants"
     )]
-    let messages = random.between(MESSAGES.0, MESSAGES.1) as usize;
+    let messages = random.between(MESSAGES.0..MESSAGES.1) as usize;
     let mut tokens = Vec::new();
     for _ in 0..messages {
         if Instant::now() >= until {

@@ -110,7 +110,7 @@ fn before_theta_is_known(courses: &Courses, found: &mut Found) {
     }
     let ratios = in_parallel(&items, |&(name, course, stiffness)| {
         let case = case(course, Terrain::Uniform(stiffness));
-        let whole = |law| simulate(&case, law, Knowing::Nothing).rms_m(0.0, f64::INFINITY);
+        let whole = |law| simulate(&case, law, Knowing::Nothing).rms_m(0.0..f64::INFINITY);
         let best = super::PEER_HEADING_GAINS
             .map(|gain| whole(super::tuned(gain)))
             .into_iter()
@@ -152,7 +152,7 @@ fn with_a_prior(found: &mut Found) {
         let mapped = simulate(&case, Law::Shipped(Some(prior)), Knowing::Map);
         (
             stiffness,
-            mapped.rms_m(0.0, lap_s) / converged.rms_m(2.0 * lap_s, 3.0 * lap_s),
+            mapped.rms_m(0.0..lap_s) / converged.rms_m(2.0 * lap_s..3.0 * lap_s),
         )
     });
     for (stiffness, ratio) in ratios {
@@ -254,7 +254,7 @@ fn with_a_wrong_theta(found: &mut Found) {
             stiffness,
             factor,
             trace.most_m(0.0),
-            trace.rms_m(from_s, to_s) / converged.rms_m(from_s, to_s),
+            trace.rms_m(from_s..to_s) / converged.rms_m(from_s..to_s),
         )
     });
     for (stiffness, factor, most_m, ratio) in rows {

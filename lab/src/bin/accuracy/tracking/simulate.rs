@@ -1,5 +1,7 @@
 //! One seeded run of a law on a course, with the sensors that the estimator gets.
 
+use std::ops::Range;
+
 use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 use tread_control::estimation::{Estimator, SensorNoise, SensorSample};
@@ -91,11 +93,12 @@ pub(crate) struct Tick {
 }
 
 impl Trace {
-    /// Root mean square of the cross-track error between two times, metres; infinite if lost.
-    pub(crate) fn rms_m(&self, from_s: f64, to_s: f64) -> f64 {
+    /// Returns the root mean square of the cross-track error in a range of times in seconds, in
+    /// metres; infinite if the robot was lost.
+    pub(crate) fn rms_m(&self, times_s: Range<f64>) -> f64 {
         let (mut sum, mut count) = (0.0, 0.0_f64);
         for tick in &self.ticks {
-            if tick.time_s >= from_s && tick.time_s < to_s {
+            if times_s.contains(&tick.time_s) {
                 sum += tick.cross_track_m * tick.cross_track_m;
                 count += 1.0;
             }
@@ -107,9 +110,10 @@ impl Trace {
         }
     }
 
-    /// The same over the second half of the time.
+    /// Returns the root mean square of the cross-track error over the second half of the time, in
+    /// metres; infinite if the robot was lost.
     pub(crate) fn second_half_rms_m(&self) -> f64 {
-        self.rms_m(0.5 * self.duration_s, f64::INFINITY)
+        self.rms_m(0.5 * self.duration_s..f64::INFINITY)
     }
 
     /// Largest cross-track error of the second half, metres; infinite if lost.
