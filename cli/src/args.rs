@@ -87,7 +87,7 @@ fn refuse_for_programs(error: &clap::Error) -> ! {
         .take_while(|line| !line.is_empty());
     let said = first.collect::<Vec<_>>().join(" ");
     let said = said.strip_prefix("error: ").unwrap_or(&said);
-    let next_step = "the same command with --help says what it takes";
+    let next_step = "see the same command with --help for its arguments";
     note(&failure(said, Exit::Usage, Some(next_step), None).to_string());
     std::process::exit(error.exit_code())
 }

@@ -31,7 +31,7 @@ pub(crate) enum ClientError {
         cause: reqwest::Error,
     },
     /// The server did not answer in time.
-    #[error("{address} took too long to answer")]
+    #[error("{address} did not answer in time")]
     Silent {
         address: String,
         #[source]
@@ -41,10 +41,12 @@ pub(crate) enum ClientError {
     #[error("{}", refusal(.problem))]
     Refused { problem: Box<ProblemBody> },
     /// The peer does not open a WebSocket.
-    #[error("what answers at {address} opens no connection to drive a robot: is there a proxy?")]
+    #[error(
+        "the server at {address} does not open a WebSocket for driving: check proxies on the way"
+    )]
     NoWebSocket { address: String },
     /// The answer does not have the form of this API.
-    #[error("what answers at {address} is no Tread server of this version ({status})")]
+    #[error("{address} is no Tread server of this version ({status})")]
     NotUnderstood {
         address: String,
         status: StatusCode,
@@ -68,11 +70,11 @@ fn refusal(problem: &ProblemBody) -> String {
 const NEXT_STEPS: &[(ProblemType, &str)] = &[
     (
         ProblemType::InvalidBody,
-        "the same command with --help says what it takes",
+        "see the same command with --help for its arguments",
     ),
     (
         ProblemType::InvalidQuery,
-        "the same command with --help says what it takes",
+        "see the same command with --help for its arguments",
     ),
     (
         ProblemType::Unauthenticated,
@@ -84,11 +86,11 @@ const NEXT_STEPS: &[(ProblemType, &str)] = &[
     ),
     (
         ProblemType::TooManyAttempts,
-        "wait as long as it says, then sign in again with `tread login`",
+        "wait for the stated time, then sign in again with `tread login`",
     ),
     (
         ProblemType::UnknownHost,
-        "use a name that the server goes by, or add this one to its configuration",
+        "use a configured host name of the server, or add this one to `web.hosts` in its configuration",
     ),
     (
         ProblemType::UnknownSite,
@@ -117,19 +119,19 @@ const NEXT_STEPS: &[(ProblemType, &str)] = &[
     ),
     (
         ProblemType::StopNotCleared,
-        "wait until the robot stands, and give its newest stop: `tread clear ROBOT` shows it",
+        "wait until the robot is at rest, and give its newest stop: `tread clear ROBOT` shows it",
     ),
     (
         ProblemType::RobotUnreachable,
-        "`tread robots ROBOT` shows when it was heard last",
+        "`tread robots ROBOT` shows the time of its last message",
     ),
     (
         ProblemType::RobotBusy,
-        "`tread missions --robot ROBOT` lists what it has; cancel that, or use --start append",
+        "`tread missions --robot ROBOT` lists its missions; cancel the active one, or use --start append",
     ),
     (
         ProblemType::RobotRetired,
-        "`tread robots restore ROBOT` takes it back",
+        "`tread robots restore ROBOT` restores it",
     ),
     (
         ProblemType::RobotCannot,
@@ -137,39 +139,39 @@ const NEXT_STEPS: &[(ProblemType, &str)] = &[
     ),
     (
         ProblemType::BeyondLimits,
-        "change the trajectory; the same command with --check shows what it would ask",
+        "change the trajectory; the same command with --check shows its plan",
     ),
     (
         ProblemType::CrossesGeofence,
-        "`tread geofence` shows where robots may be",
+        "`tread geofence` shows the areas that robots may use",
     ),
     (
         ProblemType::RobotOutsideGeofence,
-        "move the robot first, or draw the geofence around it",
+        "move the robot first, or include its position in the geofence",
     ),
     (
         ProblemType::MissionEnded,
-        "`tread missions show MISSION` tells how; send another with `tread send`",
+        "`tread missions show MISSION` shows its end; send another with `tread send`",
     ),
     (
         ProblemType::MissionState,
-        "`tread missions show MISSION` tells where it stands",
+        "`tread missions show MISSION` shows its state",
     ),
     (
         ProblemType::AlreadyExists,
-        "choose another identifier, or change the one that is there",
+        "choose another identifier, or change the existing object",
     ),
     (
         ProblemType::ChangedMeanwhile,
-        "look at it again, and give the new revision with --revision",
+        "read the object again, and give its new revision with --revision",
     ),
     (
         ProblemType::RobotsLeft,
-        "`tread authority` lists them; bring them onto the network, or add --force",
+        "`tread authority` lists them; connect them to the network, or add --force",
     ),
     (
         ProblemType::Internal,
-        "the server's log names the cause; `tread status` shows whether it works",
+        "the server's log has the cause; `tread status` shows whether the server works",
     ),
 ];
 
@@ -194,7 +196,7 @@ impl ClientError {
                  TREAD_SERVER",
             ),
             Self::Silent { .. } => {
-                Some("try again; what was asked for may have been done: look before you repeat it")
+                Some("the request may have been carried out: check before you repeat it")
             }
             Self::NotUnderstood { .. } => Some("compare `tread --version` with `tread status`"),
             Self::Refused { problem } => NEXT_STEPS

@@ -17,7 +17,7 @@ pub(super) async fn run(
         let alert = client.acknowledge(alert).await?;
         output.show(&alert, |alert| {
             format!(
-                "`{}` of {} is noted as seen; it stands until its cause is gone",
+                "alert `{}` of {} is acknowledged; it stays until its cause ends",
                 alert.code,
                 alert.about()
             )
@@ -33,7 +33,7 @@ pub(super) async fn run(
 
 fn list(alerts: &[Alert]) -> String {
     if alerts.is_empty() {
-        return "no alert stands".to_owned();
+        return "there are no alerts".to_owned();
     }
     let mut table = table([
         "ALERT", "ABOUT", "SEVERITY", "CODE", "RAISED", "SEEN", "CLEARED", "TEXT",

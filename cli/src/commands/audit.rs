@@ -53,7 +53,9 @@ pub(super) async fn run(
                     0 => format!("there are no entries after {}", verified.before_id),
                     _ => format!("{count} entries hold, {first} to {last_id}"),
                 };
-                format!("{held}\nnote this and give it next time: --noted {last_id}:{last_hash}")
+                format!(
+                    "{held}\nrecord this for the next verification: --noted {last_id}:{last_hash}"
+                )
             })?;
         }
     }
@@ -186,7 +188,7 @@ fn take(
         let (id, hash) = verifier.last();
         ensure!(
             is_noted(noted, id, hash),
-            "entry {id} is another one than was noted: the log was written anew since"
+            "entry {id} differs from the recorded one: the log was written anew"
         );
         *is_found = Some(true);
     }
@@ -200,7 +202,7 @@ fn is_noted(noted: &Noted, id: u64, hash: &str) -> bool {
 fn found(noted: Option<&Noted>, is_found: Option<bool>) -> anyhow::Result<()> {
     if let (Some(noted), Some(false)) = (noted, is_found) {
         bail!(
-            "entry {} is not in the log, so what was noted cannot be compared",
+            "entry {} is not in the log, so it cannot be compared with the recorded one",
             noted.id
         );
     }

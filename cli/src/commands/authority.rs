@@ -76,7 +76,7 @@ async fn confirm(present: &FleetAuthority, robots: &[Enrolment]) -> anyhow::Resu
     ));
     ensure!(
         io::stdin().is_terminal(),
-        "there is nobody to ask here: give --yes"
+        "confirmation needs a terminal: give --yes"
     );
     note(&format!("Type `{CONFIRMED}` to go on:"));
     let typed = tokio::task::spawn_blocking(|| {
@@ -117,8 +117,14 @@ fn of_rotation(rotation: &AuthorityRotation) -> Vec<String> {
             "rotation {} since {:.0}, started by {}; {} is trusted until it is finished",
             rotation.id, rotation.started_at, rotation.started_by, rotation.retiring
         ),
-        format!("robots brought over: {}", rotation.robots_moved),
-        format!("robots left: {}", rotation.robots_left),
+        format!(
+            "robots with certificates of the new authority: {}",
+            rotation.robots_moved
+        ),
+        format!(
+            "robots with certificates of the former authority: {}",
+            rotation.robots_left
+        ),
     ];
     lines.push(if rotation.left.is_empty() {
         format!(

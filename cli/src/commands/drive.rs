@@ -40,7 +40,7 @@ const KEY_HOLDS: Duration = Duration::from_millis(550);
 /// Maximum time for connecting to the server, and for closing the socket.
 const CONNECT_MAX: Duration = Duration::from_secs(5);
 /// Help line with the keys.
-const HELP: &str = "arrows or WASD drive · space stands · x stops and latches · q quits";
+const HELP: &str = "arrows or WASD drive · space halts · x stops and latches · q quits";
 
 /// Terminal in raw mode, in which keys are read one by one. Dropping it restores the terminal, also
 /// on a panic.
@@ -145,7 +145,7 @@ impl Keys {
 
 pub(super) async fn run(arguments: &DriveArguments, client: &Client) -> anyhow::Result<ExitCode> {
     if !io::stdin().is_terminal() || !io::stdout().is_terminal() {
-        bail!("driving needs a terminal; programs use the WebSocket");
+        bail!("teleoperation needs a terminal; programs use the WebSocket of the API");
     }
     let mut socket = connect(arguments, client).await?;
     let driver = DriverName {
@@ -220,7 +220,7 @@ impl Driving<'_> {
                 _ = hang_up.recv() => return Ok(ExitCode::SUCCESS),
                 key = pressed.recv() => {
                     let Some(key) = key else {
-                        bail!("the terminal gives no more keys");
+                        bail!("the terminal's input ended");
                     };
                     if !self.press(socket, key).await? {
                         return Ok(ExitCode::SUCCESS);
@@ -287,18 +287,18 @@ impl Driving<'_> {
         let update: DriveUpdate = self
             .client
             .read(text.as_bytes())
-            .context("the server said something not known here")?;
+            .context("the server sent an unknown message")?;
         match update {
             DriveUpdate::Welcome { .. } => Ok(()),
             DriveUpdate::Leased(lease) => {
                 self.has_lease = true;
                 self.terminal
-                    .say(&format!("lease {} is yours", lease.epoch))
+                    .say(&format!("you hold lease {}", lease.epoch))
             }
             DriveUpdate::Released { detail, .. } => {
                 self.has_lease = false;
                 self.is_refused = true;
-                self.terminal.say(&format!("the lease is over: {detail}"))
+                self.terminal.say(&format!("the lease has ended: {detail}"))
             }
             DriveUpdate::Refused { detail, .. } => {
                 // Without a lease the command cannot continue.
@@ -309,7 +309,7 @@ impl Driving<'_> {
                 let how = if stop.confirmed_at.is_some() {
                     "confirmed"
                 } else {
-                    "NOT CONFIRMED, it is sent again"
+                    "NOT CONFIRMED, the stop is sent again"
                 };
                 let text = format!(
                     "stopped, {how}; clear it with: tread clear {} {}",
@@ -357,16 +357,16 @@ fn status(view: &DriveView) -> String {
 /// need not see.
 fn slowed_by(cause: GateCause) -> Option<&'static str> {
     match cause {
-        GateCause::CommandAge => Some("slow: the link is late"),
+        GateCause::CommandAge => Some("slow: commands arrive late"),
         GateCause::ExternalLimit => Some("slow: another program limits it"),
         GateCause::Fence => Some("slow: the geofence is near"),
         GateCause::LinkPolicy => Some("held: the server was silent"),
         GateCause::ExternalHold => Some("held by another program"),
-        GateCause::LoopOverrun => Some("held: its control loop is late"),
+        GateCause::LoopOverrun => Some("held: its control loop is overloaded"),
         GateCause::SensorFault => Some("slow or held: its sensors contradict each other"),
-        GateCause::StalePosition => Some("slow or held: it does not know where it is"),
-        GateCause::Tilt => Some("held: it leans too far"),
-        GateCause::StaleFeedback => Some("held: its base is silent"),
+        GateCause::StalePosition => Some("slow or held: its position is stale"),
+        GateCause::Tilt => Some("held: its tilt is too large"),
+        GateCause::StaleFeedback => Some("held: its base sends no measurements"),
         GateCause::Acceleration
         | GateCause::Speed
         | GateCause::NotFinite

@@ -28,22 +28,24 @@ pub(super) async fn run(
             };
             let robot = client.change_robot(site, &arguments.robot, &change).await?;
             output.show(&robot, |it| {
-                format!("`{}` is called {} now", it.id, it.name)
+                format!("the name of `{}` is now {}", it.id, it.name)
             })?;
         }
         RobotsAction::Retire(arguments) => {
             let retired = set_retired(client, arguments, true).await?;
             output.show(&retired, |it| {
-                format!("`{}` is retired; what it measured stays", it.id)
+                format!("`{}` is retired; its measurements stay", it.id)
             })?;
         }
         RobotsAction::Restore(arguments) => {
             let back = set_retired(client, arguments, false).await?;
-            output.show(&back, |it| format!("`{}` is back", it.id))?;
+            output.show(&back, |it| format!("`{}` is restored", it.id))?;
         }
         RobotsAction::Revoke(arguments) => {
             let revoked = client.revoke_robot(site, &arguments.robot).await?;
-            output.show(&revoked, |it| format!("`{}` is out of the fleet", it.robot))?;
+            output.show(&revoked, |it| {
+                format!("the enrolment of `{}` is revoked", it.robot)
+            })?;
         }
     }
     Ok(ExitCode::SUCCESS)
@@ -83,7 +85,7 @@ async fn join_token(
                     |robot| format!("robot `{robot}`"),
                 );
                 note(&format!(
-                    "for {whom} of site `{}`, until {}; it is shown this once:",
+                    "join token for {whom} of site `{}`, valid until {}; it is shown only once:",
                     token.site, token.expires_at
                 ));
             }
@@ -133,7 +135,7 @@ async fn join_tokens_of_all(
     let more = authority.robots_to_join.saturating_sub(listed);
     if more > 0 && !output.is_json() {
         note(&format!(
-            "{more} more robots must join again: ask once more when these have joined"
+            "{more} more robots must join again: repeat this when these have joined"
         ));
     }
     Ok(())

@@ -38,7 +38,10 @@ pub(super) async fn run(
 
 fn describe(geofence: &Geofence) -> String {
     if geofence.is_empty() {
-        return format!("revision {}: robots may be anywhere", geofence.revision);
+        return format!(
+            "revision {}: no geofence, robots may drive anywhere",
+            geofence.revision
+        );
     }
     let mut table = table(["ROBOTS", "CORNERS", "AREA M2", "FIRST CORNER"]);
     let mut add = |may: &str, polygon: &Polygon| {

@@ -17,7 +17,8 @@ use crate::output::{Output, line, note, or_dash, render, table};
 const TOKEN_MAX: u64 = 1_024;
 
 fn store() -> anyhow::Result<Store> {
-    Store::of_user().context("there is no home to keep tokens in: set HOME or TREAD_CREDENTIALS")
+    Store::of_user()
+        .context("there is no home folder for stored tokens: set HOME or TREAD_CREDENTIALS")
 }
 
 /// Reads a token, verifies it at the server, and stores it for that server.
@@ -35,7 +36,7 @@ pub(super) async fn login(connection: &Connection, output: Output) -> anyhow::Re
     let session = client.session().await?;
     let store = store()?;
     store.keep(client.address(), &token)?;
-    note(&format!("kept in {}", store.path().display()));
+    note(&format!("stored in {}", store.path().display()));
     output.show(&session, who)?;
     Ok(ExitCode::SUCCESS)
 }
@@ -60,7 +61,7 @@ pub(super) fn logout(client: &Client, output: Output) -> anyhow::Result<ExitCode
     store()?.forget(client.address(), None)?;
     output.show(&json!({"server": client.address()}), |_| {
         format!(
-            "forgotten for {}; the token itself stays valid until it is revoked",
+            "deleted the stored token of {}; it stays valid until it is revoked",
             client.address()
         )
     })?;
@@ -133,7 +134,7 @@ pub(super) async fn tokens(
                 } = &created.token;
                 let what = what(*role, *rights);
                 note(&format!(
-                    "`{name}`: {what}, {sites}, until {expires_at}; it is shown this once:"
+                    "token `{name}`: {what}, {sites}, valid until {expires_at}; it is shown only once:"
                 ));
             }
             output.show(&created, |created| created.secret.clone())?;
@@ -187,7 +188,7 @@ pub(super) async fn sessions(
                 client.end_session(session).await?;
             }
             output.show(&json!({"ended": sessions}), |_| {
-                "ended; whom the provider still lets in can sign in again".to_owned()
+                "ended; people whom the provider still admits can sign in again".to_owned()
             })?;
         }
     }

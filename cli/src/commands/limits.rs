@@ -34,7 +34,7 @@ pub(super) async fn run(
                 .change_limit(site, robot, &owner, Some(&limit))
                 .await?;
             output.show(&limit, |_| {
-                format!("{robot} has taken the limit of {owner}")
+                format!("{robot} has applied the limit of {owner}")
             })?;
         }
         Some(LimitsAction::End { owner }) => {
@@ -49,7 +49,7 @@ pub(super) async fn run(
 
 fn list(limits: &[LimitStatus]) -> String {
     if limits.is_empty() {
-        return "no program limits it".to_owned();
+        return "no program limits the robot".to_owned();
     }
     let mut table = table(["OWNER", "HOLDS", "SPEED M/S", "ENDS IN", "REQUIRED"]);
     let yes_or_no = |is: bool| if is { "yes" } else { "no" }.to_owned();

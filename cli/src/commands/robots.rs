@@ -56,7 +56,7 @@ pub(super) async fn leases(
     let leases: Vec<Leased<'_>> = robots.iter().filter_map(Leased::of).collect();
     output.show(&leases, |leases| {
         if leases.is_empty() {
-            return "nobody teleoperates a robot".to_owned();
+            return "no robot is being teleoperated".to_owned();
         }
         let mut table = table(["ROBOT", "DRIVER", "LEASE", "CONNECTION"]);
         for lease in leases {
@@ -75,7 +75,7 @@ pub(super) async fn leases(
 /// Returns a table of robots.
 pub(super) fn list(robots: &[Robot]) -> String {
     if robots.is_empty() {
-        return "no robot has said hello on this site yet".to_owned();
+        return "no robot has connected to this site yet".to_owned();
     }
     let mut table = table([
         "ROBOT",
@@ -126,7 +126,7 @@ pub(super) fn details(robot: &Robot) -> String {
     ];
     match &robot.live {
         Some(live) => lines.extend(live_lines(live)),
-        None => lines.push("it has said nothing since the server started".to_owned()),
+        None => lines.push("it has sent no state since the server started".to_owned()),
     }
     lines.extend(
         robot

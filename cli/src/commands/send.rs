@@ -91,10 +91,12 @@ fn planned_from(checked: &TrajectoryCheck) -> String {
         (StartSource::Mission, Some(mission)) => {
             format!("planned from the end of mission {mission}, at {place}")
         }
-        (StartSource::Request, _) => format!("planned from {place}, as asked"),
-        (StartSource::Robot, _) => format!("planned from where the robot is, {place}"),
+        (StartSource::Request, _) => format!("planned from {place}, as requested"),
+        (StartSource::Robot, _) => format!("planned from the robot's position, {place}"),
         (StartSource::Mission | StartSource::Trajectory, _) => {
-            format!("planned from the start of the path, {place}: the robot's place is not known")
+            format!(
+                "planned from the start of the path, {place}: the robot's position is not known"
+            )
         }
     }
 }
@@ -107,7 +109,7 @@ fn demands(checked: &TrajectoryCheck) -> String {
             checked.length_m, checked.approach_length_m, checked.duration_s
         ),
         format!(
-            "at most {:.2} m/s, {:.2} m/s² along, {:.2} m/s² across, {:.2} rad/s",
+            "at most {:.2} m/s, {:.2} m/s² longitudinal, {:.2} m/s² lateral, {:.2} rad/s",
             checked.speed_peak_m_s,
             checked.linear_acceleration_peak_m_s2,
             checked.lateral_acceleration_peak_m_s2,
@@ -116,7 +118,7 @@ fn demands(checked: &TrajectoryCheck) -> String {
     ];
     lines.extend(checked.bindings.iter().map(|binding| {
         format!(
-            "slower than asked, down to {:.2} m/s, from {:.2} to {:.2} m: {}",
+            "slower than requested, down to {:.2} m/s, from {:.2} to {:.2} m: {}",
             binding.speed_min_m_s,
             binding.from.arc_m.unwrap_or_default(),
             binding.to.arc_m.unwrap_or_default(),
@@ -197,7 +199,7 @@ fn latest_start(within: Duration) -> anyhow::Result<Timestamp> {
 /// Returns the name of the limit that slows the robot.
 fn limit_name(limit: BindingLimit) -> &'static str {
     match limit {
-        BindingLimit::LateralAcceleration => "acceleration across the path",
+        BindingLimit::LateralAcceleration => "lateral acceleration",
         BindingLimit::AngularSpeed => "turning speed",
         BindingLimit::WheelSpeed => "wheel speed",
         BindingLimit::WheelAcceleration => "wheel acceleration in a bend",

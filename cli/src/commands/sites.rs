@@ -104,7 +104,7 @@ fn on_earth(origin: GeoOrigin) -> String {
 
 fn list(sites: &[Site]) -> String {
     if sites.is_empty() {
-        return "there is no site yet: an admin makes one with `tread sites create`".to_owned();
+        return "there is no site yet: an admin creates one with `tread sites create`".to_owned();
     }
     let mut table = table([
         "SITE", "NAME", "CELL M", "TERRAINS", "GEOFENCE", "ORIGIN", "CREATED",

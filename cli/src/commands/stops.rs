@@ -67,7 +67,7 @@ fn list(stops: &[Stop]) -> String {
         let confirmed = if stop.confirmed_at.is_some() {
             "yes"
         } else {
-            "NOT YET, it is sent again"
+            "NOT YET, the stop is sent again"
         };
         table.add_row([
             stop.robot.to_string(),
@@ -152,7 +152,7 @@ pub(super) async fn clear(
             .await?;
         output.show(&cleared, |stop| {
             format!(
-                "the stop of {} is cleared; nothing starts by it",
+                "the stop of {} is cleared; the robot does not start to move by itself",
                 stop.robot
             )
         })?;

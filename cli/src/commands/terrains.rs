@@ -63,7 +63,7 @@ pub(super) async fn run(
         Some(TerrainsAction::Delete { terrain }) => {
             client.delete_terrain(site, &terrain).await?;
             output.show(&json!({ "deleted": terrain }), |_| {
-                format!("{terrain} is removed; what was measured on it stays")
+                format!("{terrain} is deleted; its measurements stay")
             })?;
         }
     }
@@ -71,13 +71,12 @@ pub(super) async fn run(
 }
 
 fn polygon(corners: Vec<Point>) -> anyhow::Result<Polygon> {
-    Polygon::new(corners).context("these corners make no terrain")
+    Polygon::new(corners).context("these corners form no valid polygon")
 }
 
 fn list(terrains: &[Terrain]) -> String {
     if terrains.is_empty() {
-        return "no terrain is drawn on this site yet: draw one with `tread terrains create`"
-            .to_owned();
+        return "this site has no terrains yet: create one with `tread terrains create`".to_owned();
     }
     let mut table = table([
         "TERRAIN", "NAME", "CLASS", "LAYER", "AREA M2", "CORNERS", "REVISION",

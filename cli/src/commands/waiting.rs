@@ -123,7 +123,7 @@ pub(super) async fn wait(
                 waited.bar.abandon();
             }
             let text = format!(
-                "{left} of {} missions have not ended within {allowed:?}; they go on: look with `tread missions`",
+                "{left} of {} missions have not ended within {allowed:?}; they continue, see `tread missions`",
                 waited.len()
             );
             return Err(TookTooLong(text).into());

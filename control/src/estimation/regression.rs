@@ -1,16 +1,12 @@
 //! Regression of slip on force with errors in variables.
 //!
 //! The rows are defined in [`super`] and [`super::longitudinal`]. With the known variance `σ_x²` of
-//! the force regressor, the corrected normal matrix is `M = Σ_c (X_cᵀX_c − n σ_x² e₁e₁ᵀ)/s_c²` over
-//! the channels c, with `s_c² = σ_y² + θ²σ_x²` (found by iteration). The variance of θ (Fuller,
-//! Measurement Error Models, 1987) is
-//!
-//! ```text
-//! [M⁻¹]₁₁ + [M⁻¹]₁₁² Σ_c n (σ_x² s_c² + θ²σ_x⁴)/s_c⁴
-//! ```
-//! The covariance of response and regressor noise, mainly of `u_R − u_L` in the regressor of `δ_c`,
-//! is subtracted from their product; otherwise θ would be too small by up to a third of its
-//! standard deviation.
+//! the force regressor, the corrected normal matrix, summed over the channels c, is
+//! `M = Σ_c (X_cᵀX_c − n σ_x² e₁e₁ᵀ)/s_c²` with `s_c² = σ_y² + θ²σ_x²` (found by iteration). The
+//! variance of θ is `[M⁻¹]₁₁ + [M⁻¹]₁₁² Σ_c n (σ_x² s_c² + θ²σ_x⁴)/s_c⁴` (Fuller, Measurement Error
+//! Models, 1987). The covariance of response and regressor noise, mainly of `u_R − u_L` in the
+//! regressor of `δ_c`, is subtracted from their product; otherwise θ would be too small by up to a
+//! third of its standard deviation.
 
 use super::offsets::OffsetKnowledge;
 use super::rows::{Channel, OFFSETS, ParameterMatrix, Parameters, Tangent, index};

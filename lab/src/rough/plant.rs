@@ -1,12 +1,12 @@
 //! Plant of the rough world: equations of motion of body, wheels, contacts and motors.
 //!
-//! The state is in the body frame at the centre of mass: forward and left speed, turn rate; per
-//! side the wheel speed (front and rear are coupled by a chain, as on the robots of
-//! [`super::spec`]); per contact the deflection of the tyre as a slip vector s, with `ℓ ṡ = v_slip
-//! − |rω| s`. The contact force is `N μ(|s|) s/|s|`, with the wheel load N of a rigid body on four
-//! equal springs. Gravity acts along the slope. A proportional-integral speed servo commands the
-//! motor torques, which are limited. Rotor inertia, gear losses and rolling resistance reduce the
-//! torque at the contact.
+//! The state is in the body frame at the centre of mass: forward and left speed, turn rate; per side
+//! the wheel speed (front and rear are coupled by a chain, as on the robots of [`super::spec`]); per
+//! contact the deflection of the tyre as a slip vector s, with
+//! `ℓ ṡ = v_slip − |rω| s`. The contact force is `N μ(|s|) s/|s|`, with the wheel load N of a rigid
+//! body on four equal springs. Gravity acts along the slope. A proportional-integral speed servo
+//! commands the motor torques, which are limited. Rotor inertia, gear losses and rolling resistance
+//! reduce the torque at the contact.
 
 use nalgebra::{Matrix3, Vector3};
 use tread_control::geometry::{Pose, wrap_angle_rad};
@@ -438,9 +438,9 @@ impl Plant {
         sums.means()
     }
 
-    /// Integrates one step for each entry of `wheels_rad_s`, which has the wheel speeds `[left,
-    /// right]` at the end of the step, in radians per second; motor torques are unlimited. Returns
-    /// the means over that time.
+    /// Integrates one step for each entry of `wheels_rad_s`, which has the wheel speeds at the end of
+    /// the step, `[left, right]` in radians per second; motor torques are unlimited. Returns the
+    /// means over that time.
     pub fn advance_along(&mut self, wheels_rad_s: &[[f64; 2]]) -> Means {
         let mut sums = Sums::default();
         for next in wheels_rad_s {

@@ -1,9 +1,9 @@
 //! Checks the turn command and the track width by a turn on the spot. Pure.
 //!
-//! Two quantities are measured. The wheel speeds for a commanded turn rate give the track width
-//! that the base itself uses, exactly and on any ground. The effective track width `W_eff = r·(ω_R
-//! − ω_L)/ψ̇` depends on the ground. By the balance of moments of four equal contacts in a turn on
-//! the spot
+//! Two quantities are measured. The wheel speeds for a commanded turn rate give the track width that
+//! the base itself uses, exactly and on any ground. The effective track width
+//! `W_eff = r·(ω_R − ω_L)/ψ̇` depends on the ground. By the balance of moments of four equal contacts
+//! in a turn on the spot
 //!
 //! ```text
 //! W_eff = W + α·L²/W,    α = lateral over longitudinal slip stiffness

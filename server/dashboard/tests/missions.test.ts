@@ -222,7 +222,7 @@ test('what is no number, and a path too tight, are said in a sentence each, and 
   // This one only the server can tell.
   await type('Radius, m', '0.05');
   await problem.waitFor();
-  expect(await problem.innerText()).toMatch(/^The robot cannot do this: .*\.$/);
+  expect(await problem.innerText()).toMatch(/^The request is impossible for this robot: .*\.$/);
   expect(await page.getByLabel('Radius, m').inputValue()).toBe('0.05');
   // What was drawn of one kind is still there after a look at the other.
   await page.getByRole('radio', { name: 'Waypoints' }).check();
@@ -251,7 +251,7 @@ test('a path outside of where robots may be is refused in one sentence, and kept
     await page.getByLabel('Centre y, m').press('Tab');
     const problem = page.locator('form .problem');
     await problem.waitFor();
-    expect(await problem.innerText()).toMatch(/^The path leaves where robots may be: [^.]*(\d\.\d+[^.]*)*\.$/);
+    expect(await problem.innerText()).toMatch(/^The path leaves the geofence: [^.]*(\d\.\d+[^.]*)*\.$/);
     expect(await page.getByLabel('Centre x, m').inputValue()).toBe('60');
     expect(await page.getByRole('button', { name: 'Send', exact: true }).isEnabled()).toBe(false);
     await shot(page, 'outside');

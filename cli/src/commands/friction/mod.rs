@@ -26,7 +26,7 @@ fn save(picture: &[u8], file: &Path, output: Output) -> anyhow::Result<()> {
     std::fs::write(file, picture).with_context(|| format!("cannot write {name}"))?;
     let bytes = picture.len();
     output.show(&json!({ "file": file, "bytes": bytes }), |_| {
-        format!("the map is in {name}, {bytes} bytes")
+        format!("wrote the map to {name}, {bytes} bytes")
     })
 }
 

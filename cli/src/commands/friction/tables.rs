@@ -103,8 +103,7 @@ fn place(cell: Cell) -> [String; 2] {
 
 pub(super) fn terrains(terrains: &[TerrainFriction]) -> String {
     if terrains.is_empty() {
-        return "no terrain is drawn on this site yet: draw one with `tread terrains create`"
-            .to_owned();
+        return "this site has no terrains yet: create one with `tread terrains create`".to_owned();
     }
     let mut table = friction_table(&["TERRAIN", "CLASS", "MODEL"]);
     for terrain in terrains {
@@ -220,7 +219,7 @@ fn is_sure(friction: &FusedFriction) -> bool {
 
 pub(super) fn differences(Known { items, of }: &Known<CellDifference>) -> String {
     if items.is_empty() {
-        return of_time(*of, "nothing was measured there between these times");
+        return of_time(*of, "no measurements there between these times");
     }
     let mut table = table([
         "IX",
@@ -265,7 +264,10 @@ pub(super) fn differences(Known { items, of }: &Known<CellDifference>) -> String
 pub(super) fn visits(as_of: Option<Timestamp>, visits: &[VisitSuggestion]) -> String {
     let of = MapTimes::as_of(as_of);
     if visits.is_empty() {
-        return of_time(of, "no cell of this box would teach anything");
+        return of_time(
+            of,
+            "no cell of this box would reduce the uncertainty of the map",
+        );
     }
     let mut table = table([
         "X M",
@@ -310,7 +312,7 @@ pub(super) fn contributions(robots: &[RobotContribution]) -> String {
 
 pub(super) fn withdrawals(withdrawals: &[Withdrawal]) -> String {
     if withdrawals.is_empty() {
-        return "nothing was taken off the map".to_owned();
+        return "no measurements were withdrawn".to_owned();
     }
     let mut table = table(["ROBOT", "FROM", "BEFORE", "BY", "AT", "REASON"]);
     for withdrawal in withdrawals {

@@ -89,7 +89,8 @@ impl<'client> Feed<'client> {
         let mut text = Vec::new();
         loop {
             let chunk = timeout(SILENCE_MAX, stream.chunk()).await;
-            let chunk = chunk.with_context(|| format!("{} is silent", self.client.address()))?;
+            let chunk =
+                chunk.with_context(|| format!("{} sent nothing in time", self.client.address()))?;
             match chunk {
                 Ok(Some(chunk)) => text.extend_from_slice(&chunk),
                 Ok(None) => anyhow::bail!("{} has closed the stream", self.client.address()),

@@ -81,7 +81,7 @@ fn now() -> String {
 fn robot_text(robot: &Robot) -> String {
     let mut text = link_name(robot.link).to_owned();
     let Some(live) = &robot.live else {
-        return format!("{text}, not heard since the server started");
+        return format!("{text}, no message since the server started");
     };
     text = format!("{text}, {}", mode_name(live.mode));
     if let Some(stop) = &live.safety.stop {

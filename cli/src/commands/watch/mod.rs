@@ -75,7 +75,7 @@ async fn print(mut news: mpsc::Receiver<News>, output: Output) -> anyhow::Result
 /// Returns the reason why the server ended the stream, for people.
 fn ended(end: StreamEnd) -> &'static str {
     match end {
-        StreamEnd::TooSlow => "the server ended the stream: read too slowly",
+        StreamEnd::TooSlow => "the server closed the stream, because it was read too slowly",
         StreamEnd::Stopping => "the server stops",
     }
 }

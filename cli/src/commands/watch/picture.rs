@@ -122,7 +122,7 @@ fn head(picture: &Picture<'_>) -> Vec<Line<'static>> {
     ];
     first.push(match (&picture.shown.lost, picture.known.is_whole()) {
         (Some(why), _) => Span::styled(
-            format!("NOT LIVE, what is shown is old: {why}"),
+            format!("NOT LIVE, old values are shown: {why}"),
             bold(Color::Red),
         ),
         (None, true) => Span::styled("live", bold(Color::Green)),
@@ -230,7 +230,7 @@ fn draw_robots(frame: &mut Frame<'_>, area: Rect, picture: &Picture<'_>) {
     };
     let title = format!(" robots, {order} ");
     if robots.is_empty() && picture.known.is_whole() {
-        let text = "no robot has said hello on this site yet";
+        let text = "no robot has connected to this site yet";
         let block = framed(title, true);
         frame.render_widget(Paragraph::new(text).block(block), area);
         return;

@@ -216,7 +216,7 @@ impl<'client> Screen<'client> {
                 },
                 key = pressed.recv() => {
                     let Some(key) = key else {
-                        break Err(anyhow::anyhow!("the terminal gives no more keys"));
+                        break Err(anyhow::anyhow!("the terminal's input ended"));
                     };
                     match self.press(key) {
                         Some(Wish::Quit) => break Ok(()),

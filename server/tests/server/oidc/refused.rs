@@ -144,7 +144,7 @@ async fn whoever_is_in_no_group_is_refused_with_that_reason_as_a_person_and_as_a
     assert!(policy.starts_with("default-src 'none'"), "{policy}");
     let page = answer.text().await.unwrap();
     assert!(
-        page.contains("You may do nothing here") && page.contains("eve"),
+        page.contains("You have no rights on this server") && page.contains("eve"),
         "{page}"
     );
 
