@@ -16,7 +16,7 @@ impl Yard {
         // The server may not have heard of the robot yet.
         for _ in 0..50 {
             let mut terminal = self.tread(port, &["drive", ROBOT, "--name", "Ann"]);
-            if terminal.shows_or_ends("is yours").await {
+            if terminal.shows_or_ends("you hold lease").await {
                 return terminal;
             }
             tokio::time::sleep(Duration::from_millis(200)).await;
