@@ -28,7 +28,7 @@ pub(super) mod index {
     pub(in crate::estimation) const RADIUS_OFFSET: usize = 1;
     /// `δ_d`, right minus left relative error of the nominal rolling radii.
     pub(in crate::estimation) const RADIUS_DIFFERENCE: usize = 2;
-    /// `ε_w`, relative deviation of `W_eff/W − 1` from `(L/W)²`.
+    /// `ε_w`, relative difference of `W_eff/W − 1` from `(L/W)²`.
     pub(in crate::estimation) const TRACK: usize = 3;
     /// `b_g`, the gyro's offset, radians per second.
     pub(in crate::estimation) const GYRO_OFFSET: usize = 4;

@@ -1,4 +1,4 @@
-//! Drives of the report: robots with one deviation, and the population with all deviations.
+//! Drives of the report: robots with one difference, and the population with all deviations.
 
 use tread_lab::random::Random;
 use tread_lab::rough::curve::Shape;
@@ -83,7 +83,7 @@ fn with_curve(robot: &mut Deviations, shape: Shape, mu_peak: f64) {
     robot.curve.mu_peak = mu_peak.min(0.9 * robot.curve.stiffness);
 }
 
-/// Returns the drives with one deviation: the paper's robot on three grounds and two courses.
+/// Returns the drives with one difference: the paper's robot on three grounds and two courses.
 pub(crate) fn alone(change: Change, has_torque: bool, arguments: &Arguments) -> Vec<Trial> {
     let trial = |index: u32| {
         let stiffness = GROUNDS[index as usize % GROUNDS.len()];

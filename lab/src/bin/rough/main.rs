@@ -4,7 +4,7 @@
 //! [--tyres-straight] [--bounds N] [--drives FILE] [--json]`
 //!
 //! Every agent is configured with the robot's data sheet; the robot drives in the rough world. A
-//! line of the report is one deviation, or the population, in which all deviations are drawn at
+//! line of the report is one difference, or the population, in which all deviations are drawn at
 //! once, or a stratum of it. The report has the coverage of the 95 % intervals, the median error,
 //! the median half-width, and the fraction of estimates that are missing or have a half-width above
 //! 60 % of the value. With `--bounds` it compares some drives of each line with the Cramér–Rao
