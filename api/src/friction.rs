@@ -49,8 +49,9 @@ pub struct ThetaErrors {
     pub tyre_ratio: f64,
 }
 
-/// Maximum friction coefficient of a segment; one with a larger value is refused. Rubber on dry
-/// concrete reaches about 1; no wheel on drivable ground exceeds this value.
+/// Maximum `mu_peak_lower_bound` of a segment; a segment with a larger value is refused. Rubber on
+/// dry concrete reaches a friction coefficient of about 1; no wheel on drivable ground exceeds this
+/// value.
 pub const MU_PEAK_MAX: f64 = 1.5;
 
 /// Measurement of one robot in one cell on one pass, as additive statistics without any prior.

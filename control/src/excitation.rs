@@ -138,7 +138,8 @@ impl Excitation {
         }
     }
 
-    /// Returns the time t at which τ(t) = `plan_s`, seconds.
+    /// Returns the time t since the start, seconds, at which the plan time τ(t) is `plan_s`, by
+    /// bisection.
     pub(crate) fn time_s(&self, plan_s: f64) -> f64 {
         let (mut early_s, mut late_s) = (0.0, plan_s / (1.0 - self.depth));
         for _ in 0..BISECTIONS {

@@ -44,10 +44,11 @@ pub(crate) struct EnrollArgs {
     endpoint: Option<String>,
 }
 
-/// Joins the fleet and prints the robot's identity.
+/// Joins the fleet with a join token, stores certificate and key in the robot's folder, and prints
+/// the robot and site to standard error.
 ///
 /// # Errors
-/// There is no token, the server refuses it, or the folder cannot be written.
+/// There is no token, the server cannot be reached or refuses it, or the folder cannot be written.
 pub(crate) async fn run(args: EnrollArgs) -> anyhow::Result<()> {
     let place = place(&Flags {
         config: args.config,

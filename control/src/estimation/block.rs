@@ -100,16 +100,16 @@ impl Ends {
     }
 }
 
-/// Knowledge about θ with which the linearity of a block is checked.
+/// θ and its bounds, with which the linearity of a block is checked.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct ThetaBound {
     /// Measured θ, if there is one.
     pub(super) theta: Option<f64>,
-    /// θ for the weights of rows, measured or assumed.
+    /// θ in the weights of rows: estimated, or [`THETA_FIRST`].
     pub(super) theta_weights: f64,
     /// Upper bound of θ.
     pub(super) theta_most: f64,
-    /// Largest slip at which the model of the tyres is valid.
+    /// Maximum slip at which the prior of the tyres' friction curve is valid.
     pub(super) slip_max: f64,
 }
 

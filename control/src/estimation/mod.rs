@@ -1,14 +1,16 @@
-//! Friction of the ground: θ measured, with an honest standard deviation.
+//! Measures the slip compliance θ of the ground with its standard deviation.
 //!
-//! This is the figure that reaches the map; it never mixes with θ̂ of the loop. Per side, in the
-//! linear range, `λ = θ μ` holds exactly under combined slip: slip is regressed on force, from
-//! *measured* wheel speed, gyro, accelerometer, body speed and wheel torque. Every row is linear in
-//! twelve parameters: θ; what is the robot's own, namely `δ_c` and `δ_d` (the shares by which
-//! nominal radii are too large, mean and right minus left), the effective track, the gyro's and the
-//! accelerometer's offset and the latter's scale; θf, rolling resistance f in measured torques; θκ,
-//! the bend of a curved tyre; θℓ, the contacts' relaxation length, times the force's rate; θj,
-//! the inertia of rotors and wheels over the mass, whose torque no contact carries; and θε, the
-//! difference of the sides' loads. Without the last four, in metres per second, u rim speeds:
+//! Only this value reaches the map; it is never mixed with the tracking law's θ̂. Per side, in the
+//! linear range, `λ = θ μ` holds exactly under combined slip (the paper's (7) with θ = 1/K, per
+//! contact): slip is regressed on force, from *measured* wheel speed, gyro, accelerometer, body
+//! speed and wheel torque. Every row is linear in twelve parameters: θ; the robot's own, namely
+//! `δ_c` and `δ_d` (relative errors of the nominal radii, positive if they are too large: mean, and
+//! right minus left), the effective track width, the offsets of gyro and accelerometer and the
+//! latter's scale; θf, with the rolling resistance coefficient f in measured torques; θκ, with the
+//! curvature κ of the tyres' friction curve; θℓ, with the contacts' relaxation length, whose
+//! regressor is the force's rate; θj, with the inertia j of rotors and wheels over the mass, whose
+//! torque does not reach the contacts; and θε, with the difference of the sides' loads. Without the
+//! last four, in metres per second, u rim speeds:
 //!
 //! ```text
 //! with wheel torque
@@ -17,15 +19,16 @@
 //! without
 //!   the moment balance ([`window`]) and the innovations of the forward speed ([`longitudinal`])
 //! ```
-//! The robot's own parameters survive changes of the ground; θ, f and κ are the ground's. Samples
-//! are averaged over blocks; the noise of the regressor is taken out of its square (errors in
-//! variables), and its effect is part of the standard deviation. Only the difference of `δ_c` and
-//! θf shows, so what is known of it goes from segment to segment as a whole (`offsets.rs`). Torques
-//! are over the model's mass; accelerations tell by how much the robot is heavier
-//! ([`apparent_mass`]). Where nothing excites θ, there is no θ: `None`.
+//! The robot's own parameters are kept when the ground changes; θ, f and κ belong to the ground.
+//! Samples are averaged over blocks. The noise variance of the regressor is subtracted from its
+//! square (errors in variables), and its effect is part of the standard deviation. Only the
+//! difference of `δ_c` and θf is observable, so their joint information is passed from segment to
+//! segment (`offsets.rs`). Torques are divided by the model's mass; with accelerations they give
+//! the factor by which the robot is heavier ([`apparent_mass`]). Without excitation of θ the
+//! estimator abstains: `None`.
 //!
-//! These rows are exact for a robot that is as its model says. θ of any other robot comes from
-//! [`identification`], and so do its segments and its changes of the ground.
+//! These rows are exact for a robot that equals its model. For any other robot θ, its segments and
+//! the changes of the ground come from [`identification`].
 
 mod apparent_mass;
 mod block;
@@ -68,43 +71,47 @@ pub use types::{
     ValueWithDeviation,
 };
 
-/// Time over which samples are averaged, seconds.
+/// Duration of a block, over which samples are averaged, seconds.
 pub const BLOCK_S: f64 = 0.2;
-/// Rim speed below which a sample says nothing, metres per second.
+/// Rim speed of either side below which a sample is not used, because slip is undefined at
+/// standstill, metres per second.
 const RIM_SPEED_MIN_M_S: f64 = 0.15;
-/// Largest combined slip that is taken for the linear range.
+/// Maximum combined slip that counts as the linear range.
 const SLIP_LINEAR_MAX: f64 = 0.15;
-/// The same before θ is known, where longitudinal slip comes from the body speed.
+/// Maximum combined slip before θ is measured; lower, because longitudinal slip then comes from the
+/// body speed.
 const SLIP_LINEAR_FIRST_MAX: f64 = 0.10;
-/// Relative standard deviation above which there is said to be no measurement.
+/// Relative standard deviation above which an estimate of θ does not count as a measurement.
 const RELATIVE_STD_DEV_MAX: f64 = 0.5;
-/// Fewest blocks of a measurement.
+/// Minimum number of blocks of a measurement.
 const BLOCKS_MIN: u64 = 5;
-/// Largest measured friction coefficient of one side that is believed.
+/// Maximum plausible friction coefficient of one side; a sample with more torque is dropped.
 const MU_MAX: f64 = 10.0;
-/// θ used to weigh samples before there is any estimate.
+/// θ in the weights of rows before the first estimate.
 const THETA_FIRST: f64 = 0.2;
-/// Range in which an estimate of θ is believed.
+/// Range of plausible θ; an estimate outside it is not a measurement.
 const THETA_RANGE: std::ops::RangeInclusive<f64> = 5.0e-3..=10.0;
-/// Largest θ that is assumed before there is any estimate.
+/// Upper bound of θ before the first measurement.
 const THETA_MOST_FIRST: f64 = 2.0;
-/// Share of θ that rows on accelerations leave out: products of θ with what is learned meanwhile.
-/// One error of all of a robot's segments; with torque that of the torque constants is.
+/// Relative error of θ from rows on accelerations because they neglect products of θ with
+/// parameters that are still being estimated. It is common to all of a robot's segments; with
+/// torque the error of the torque constants takes its place.
 pub const MODEL_RATIO: f64 = 1.5e-3;
-/// Most of a segment's own variance that it may share with the segments before.
+/// Maximum fraction of a segment's own variance that counts as shared with earlier segments.
 const OFFSETS_SHARE_MAX: f64 = 0.9;
-/// Standard deviations to either side of a 95 % interval.
+/// Half-width of a 95 % interval, in standard deviations.
 const NORMAL_95: f64 = 1.959_963_984_540_054;
-/// Least standard deviation that the torque scale is taken to have beforehand.
+/// Minimum prior standard deviation of the torque scale.
 const SCALE_STD_DEV_MIN: f64 = 1.0e-3;
-/// Longest time between two samples over which anything is averaged, seconds.
+/// Maximum time between two samples; after a longer gap all averages restart, seconds.
 const GAP_MAX_S: f64 = 0.1;
-/// Samples in a row that are refused because the wheels' speed leapt.
+/// Maximum number of consecutive samples dropped because the wheel speeds jumped; then the new
+/// speeds are accepted.
 const LEAPS_MAX: u32 = 5;
-/// Wheel acceleration that is believed, as a multiple of the robot's limit.
+/// Maximum plausible wheel acceleration, as a multiple of the robot's limit.
 const LEAP_SHARE: f64 = 10.0;
 
-/// Measures θ.
+/// Estimator of θ and of the robot's parameters from samples of the robot's own sensors.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Estimator {
     model: RobotModel,
@@ -114,13 +121,14 @@ pub struct Estimator {
     block: BlockBuilder,
     longitudinal: LongitudinalFilter,
     offsets: OffsetKnowledge,
-    /// Blocks of this ground in segments that are closed.
+    /// Sums over the blocks of this ground's closed segments.
     ground: Sums,
-    /// What their sum promises on θ, with the tyres' error inside.
+    /// Information on θ that these segments state together, including the tyres' error.
     claims: Claims,
-    /// Blocks of the open segment that are certain to be of this ground.
+    /// Sums over the open segment's blocks that are certainly of this ground.
     segment: Sums,
-    /// Blocks since the change detector last stood at zero.
+    /// Sums over the blocks since the change detector's sums were last zero; they may be of the
+    /// next ground.
     pending: Sums,
     change: ChangeDetector,
     excitation: Excitation,
@@ -128,25 +136,26 @@ pub struct Estimator {
     payload: PayloadMonitor,
     bound: ThetaBound,
     estimate: Estimate,
-    /// What all blocks of this ground give, where that is a measurement.
+    /// Solution from all blocks of this ground, if it is a measurement.
     measured: Option<Solution>,
-    /// The moment balance of the last block, where it was used.
+    /// Moment balance of the last block, if the block was used.
     turning_before: Option<Row>,
     last_wheels: Option<WheelSpeeds>,
     skipped_s: f64,
     leaps_in_a_row: u32,
     dropped_samples: u64,
-    /// θ of a robot whose model is not exact.
+    /// Source of θ if the robot's model is not exact; None if it is.
     identification: Option<Box<Identification>>,
 }
 
 impl Estimator {
-    /// An estimator of a robot that is exactly as its model says, on tyres that rise straight.
+    /// Creates the estimator of a robot that equals its model, with tyres linear up to the peak, as
+    /// in the paper's (7).
     pub fn new(model: RobotModel, noise: SensorNoise) -> Self {
         Self::with_prior(model, noise, EstimatorPrior::exact())
     }
 
-    /// An estimator of a robot of which this is known.
+    /// Creates an estimator with a prior of the robot and its tyres.
     pub fn with_prior(model: RobotModel, noise: SensorNoise, prior: EstimatorPrior) -> Self {
         let EstimatorPrior {
             tyres,
@@ -187,13 +196,13 @@ impl Estimator {
         estimator
     }
 
-    /// The noise of the sensors is this from now on.
+    /// Replaces the standard deviations of sensor noise for all later samples.
     pub fn set_noise(&mut self, noise: SensorNoise) {
         self.noise = noise;
     }
 
-    /// Takes one sample, `dt_s` after the one before. One that is not finite, out of order or
-    /// impossible is dropped and counted.
+    /// Adds one sample, taken `dt_s` seconds after the one before. A sample is dropped and counted
+    /// if it is not finite or not plausible, if the wheel speeds jump, or if `dt_s` is not above 0.
     pub fn update(&mut self, sample: &SensorSample, dt_s: f64) -> UpdateOutcome {
         let is_in_order = dt_s.is_finite() && dt_s > 0.0;
         if !(is_in_order && is_possible(sample, &self.model)) || self.leaps(sample, dt_s) {
@@ -207,7 +216,7 @@ impl Estimator {
         let dt_s = dt_s + std::mem::take(&mut self.skipped_s);
         self.last_wheels = Some(sample.wheel_speeds);
         if dt_s > GAP_MAX_S {
-            // Nothing is known of the time between: averages begin anew.
+            // The motion during the gap is unknown: all averages restart.
             self.block = BlockBuilder::default();
             self.apparent_mass.interrupt();
             self.payload.interrupt();
@@ -261,7 +270,8 @@ impl Estimator {
         }
     }
 
-    /// Whether the wheels' speed differs from the last one by more than any wheel can do.
+    /// Returns whether the wheel speeds differ from the last ones by more than a wheel can
+    /// accelerate.
     fn leaps(&mut self, sample: &SensorSample, dt_s: f64) -> bool {
         let Some(last) = self.last_wheels else {
             return false;
@@ -278,7 +288,7 @@ impl Estimator {
         is_leap
     }
 
-    /// The forward speed: its innovations are rows where the base gives no torque.
+    /// Updates the filter of the forward speed; without measured torque its innovations are rows.
     fn step_longitudinal(&mut self, sample: &SensorSample, dt_s: f64) {
         let bound = SlipBound {
             theta_most: self.bound.theta_most,
@@ -299,7 +309,8 @@ impl Estimator {
         }
     }
 
-    /// Whether the ground has changed, and whether a wheel slips beyond the linear range.
+    /// Adds a block. Returns whether the ground has changed, and whether a wheel slips beyond the
+    /// linear range.
     fn take(&mut self, mut block: Block) -> (bool, bool) {
         block.judge_slip(&self.bound);
         self.pending.add(&block);
@@ -316,7 +327,7 @@ impl Estimator {
         {
             self.excitation.note_block(&row, block.force.is_some());
         }
-        // The rows of an inexact robot scatter by what they do not know.
+        // Without an exact model the innovations of rows contain model errors.
         let changed = self.identification.is_none()
             && innovation.is_some_and(|value| self.change.update(value));
         if changed {
@@ -328,7 +339,7 @@ impl Estimator {
         (changed, !block.is_linear)
     }
 
-    /// Drops the blocks since the ground may have changed: they belong to neither.
+    /// Drops the pending blocks, which may contain samples of both grounds.
     fn drop_pending(&mut self) {
         self.turning_before = None;
         self.pending = Sums::default();
@@ -348,12 +359,12 @@ impl Estimator {
         solve(sums, input)
     }
 
-    /// What is known now.
+    /// Returns the present estimates.
     pub fn estimate(&self) -> Estimate {
         self.estimate
     }
 
-    /// Works out what is known.
+    /// Computes the present estimates from all sums.
     fn refresh(&mut self) {
         let sums = self.ground.plus(&self.segment).plus(&self.pending);
         let solution = self.solve(&sums, None);
@@ -390,7 +401,7 @@ impl Estimator {
                 .map_or(THETA_FIRST, |found| {
                     found.theta.clamp(*THETA_RANGE.start(), *THETA_RANGE.end())
                 }),
-            // A measured θ may be beyond what is assumed at first.
+            // A measured θ may exceed the bound assumed before.
             theta_most: if of_rows.is_some() {
                 most
             } else {
@@ -420,7 +431,7 @@ impl Estimator {
         };
     }
 
-    /// Starts with another load: what was learned of mass and inertia is forgotten.
+    /// Restarts the estimation of mass and inertia after a change of the payload.
     fn begin_load(&mut self) {
         self.apparent_mass = ApparentMass::default();
         if let Some(identification) = &mut self.identification {
@@ -428,8 +439,9 @@ impl Estimator {
         }
     }
 
-    /// What θ is multiplied by since the robot weighs more than its model: the same torque is less
-    /// friction then. Accelerations are forces over the true mass.
+    /// Returns the factor that corrects θ for the robot's true mass: θ from torques assumes the
+    /// model's mass, and a heavier robot needs more torque for the same friction coefficient. θ
+    /// from accelerations needs no correction.
     fn load_scale(&self, sums: &Sums) -> f64 {
         if sums.has_torque() {
             self.torque_scale().value
@@ -438,13 +450,13 @@ impl Estimator {
         }
     }
 
-    /// Torque scale times true mass, over the model's mass: what was known of it beforehand, and
-    /// what torques and accelerations tell.
+    /// Returns the torque scale times the true mass over the model's mass: the prior combined with
+    /// the apparent mass from torques and accelerations.
     fn torque_scale(&self) -> ValueWithDeviation {
         let uncertainty = &self.uncertainty;
         // Errors of the torque constants scale the forces; each side has its own, and the force
-        // difference holds half of each. Errors of the radii cancel: the torque reads too high by
-        // what the rim speed beside it reads too low.
+        // difference contains half of each. Errors of the radii cancel: the torque is too high by
+        // the same ratio by which the rim speed beside it is too low.
         let constants = self.noise.torque_gain_ratio * std::f64::consts::FRAC_1_SQRT_2;
         let known = ValueWithDeviation {
             value: 1.0 + uncertainty.payload_ratio,
@@ -452,7 +464,7 @@ impl Estimator {
                 .hypot(uncertainty.mass_ratio)
                 .max(SCALE_STD_DEV_MIN),
         };
-        // A robot whose mass is exact is as its model says.
+        // An exactly known mass needs no correction.
         let apparent = self.apparent_mass.value();
         let Some(apparent) = apparent.filter(|_| uncertainty.mass_ratio > 0.0) else {
             return known;
@@ -471,8 +483,9 @@ impl Estimator {
         }
     }
 
-    /// Largest slip at which tyres rise as they are known to, on ground of this θ. Without torque
-    /// nothing but θ tells what friction that slip takes, so it counts as small as it may be.
+    /// Returns the largest slip at which the prior of the tyres is valid on ground of this θ.
+    /// Without torque the friction coefficient at a slip follows from θ alone, so the lower end of
+    /// its 95 % interval is used.
     fn slip_max(&self, solution: &Solution, sums: &Sums) -> f64 {
         let doubt = if sums.has_torque() {
             0.0
@@ -483,7 +496,7 @@ impl Estimator {
         self.tyres.slip_max((solution.theta - doubt).max(0.0))
     }
 
-    /// Standard deviation of the error that scales all of a robot's θ, as a share.
+    /// Returns the relative standard deviation of the error that scales every θ of this robot.
     fn gain_ratio(&self, sums: &Sums) -> f64 {
         if sums.has_torque() {
             let scale = self.torque_scale();
@@ -493,8 +506,9 @@ impl Estimator {
         }
     }
 
-    /// Whether the force varied enough, and the slip behind it was that of the rise which is known.
-    /// Before θ was known, blocks of more slip than that may have come in.
+    /// Returns whether a solution counts as a measurement: θ was excited, and the blocks' slip was
+    /// in the range in which the tyres' prior is valid. Blocks from before the first measurement
+    /// may exceed that range.
     fn is_measurement(&self, solution: &Solution, sums: &Sums) -> bool {
         solution.is_measurement(sums.blocks) && sums.slip_rms() <= self.slip_max(solution, sums)
     }
@@ -503,12 +517,13 @@ impl Estimator {
         self.noise.accelerometer_offset_m_s2 / GRAVITY_M_S2
     }
 
-    /// Ends the segment and gives its additive statistics, which hold no prior on θ. The robot's
-    /// own parameters are those known from everything else, and their standard deviation is inside.
+    /// Ends the segment and returns its additive statistics, without any prior on θ. The robot's
+    /// own parameters come from all other segments, and their uncertainty is included.
     ///
-    /// What is not known of the robot itself is the same error in all segments, so that their sum
-    /// would promise too much: each claims as much as the sum of this ground's segments can keep.
-    /// The errors that no drive averages out are distinguished from it as [`CommonError`].
+    /// The error of the robot's parameters is common to all segments, so summing independent
+    /// information would overstate the precision: each segment states only as much information as
+    /// keeps the variance of the sum of this ground's segments truthful. Errors that do not average
+    /// out over drives are reported separately, as [`CommonError`].
     pub fn close_segment(&mut self) -> SegmentStatistics {
         let segment = self.segment.plus(&self.pending);
         let before = self
@@ -541,7 +556,8 @@ impl Estimator {
         statistics
     }
 
-    /// θ of a segment by its rows, where all blocks of the ground are a measurement of it.
+    /// Returns θ of a segment from its rows; None unless all blocks of the ground are a
+    /// measurement.
     fn segment_of_rows(
         &mut self,
         segment: &Sums,
@@ -549,7 +565,7 @@ impl Estimator {
         before: Option<&Solution>,
         (offsets, tyres): (&OffsetKnowledge, &TyrePrior),
     ) -> Option<SegmentTheta> {
-        // Where all blocks together are no measurement, none of them is one.
+        // A segment is no measurement if all blocks of the ground together are none.
         let ground = self
             .solve(whole, None)
             .filter(|found| self.is_measurement(found, whole))?;
@@ -565,10 +581,11 @@ impl Estimator {
         });
         let scale = self.load_scale(segment);
         let square = scale * scale;
-        // What it shares with those before is the robot's own error: reported, and not added up.
+        // The error shared with earlier segments belongs to the robot: it is reported and does not
+        // average out.
         let own_variance = found.own_variance();
         let of_offsets = shared.own.clamp(0.0, OFFSETS_SHARE_MAX * own_variance);
-        // An error that grows with θ is a share of the θ that is known best.
+        // A proportional error is stated relative to the most precise θ.
         let common_ratio = CommonError {
             robot: self
                 .gain_ratio(segment)
@@ -586,8 +603,8 @@ impl Estimator {
         })
     }
 
-    /// Starts on new ground: θ is forgotten, what was learned about the robot stays.
-    /// An open segment is dropped; close it first.
+    /// Starts on new ground: discards θ and keeps the estimates of the robot's parameters. An open
+    /// segment is dropped; close it first.
     pub fn begin_ground(&mut self) {
         let found = self.solve(&self.ground, None);
         let theta = found.map_or(THETA_FIRST, |found| found.theta);
@@ -612,7 +629,7 @@ impl Estimator {
     }
 }
 
-/// What was identified as a measurement, if it is one.
+/// Converts an identified θ to a measurement; None if it is out of range or too uncertain.
 fn measurement(found: Identified) -> Option<ThetaMeasurement> {
     let own_std_dev = found.theta * found.own_ratio;
     let common = CommonError {
@@ -632,16 +649,17 @@ fn measurement(found: Identified) -> Option<ThetaMeasurement> {
     })
 }
 
-/// Rim speeds of the two sides as a robot driving ahead has them.
+/// Rim speeds of the two sides, mirrored in reverse so that the robot drives forward.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Rims {
     left_m_s: f64,
     right_m_s: f64,
-    /// 1 ahead; −1 in reverse, where the robot is looked at mirrored: its left is its right.
+    /// 1 forward; −1 in reverse, where the robot's left side becomes the right one.
     sign: f64,
 }
 
-/// None where a side is too slow for slip to be defined, or the sides turn against each other.
+/// Returns the rim speeds; None if a side is slower than [`RIM_SPEED_MIN_M_S`] or the sides turn in
+/// opposite directions.
 fn signed_rims(sample: &SensorSample, model: &RobotModel) -> Option<Rims> {
     let left_m_s = sample.wheel_speeds.left_rad_s * model.wheel_radius_m();
     let right_m_s = sample.wheel_speeds.right_rad_s * model.wheel_radius_m();

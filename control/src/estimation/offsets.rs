@@ -15,10 +15,12 @@ const REGULAR_SHARE: f64 = 1.0e-3;
 /// Prior information on `θf` on new ground, negligible compared with any measurement.
 const RESISTANCE_VAGUE: f64 = 1.0;
 
-/// Estimate of the shared parameters in information form.
+/// Estimate of the shared parameters in information form: those of the indices 1 to [`OFFSETS`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct OffsetKnowledge {
+    /// Information matrix Λ, the inverse of the covariance.
     pub(super) information: SMatrix<f64, OFFSETS, OFFSETS>,
+    /// Λ times the estimated parameters.
     pub(super) weighted: SVector<f64, OFFSETS>,
     /// Whether measurements of the present ground have updated `θf`. Only the difference of `δ_c`
     /// and `θf` is observable, so the prior of `θf` must be added only once per ground.

@@ -1,34 +1,34 @@
 //! Detects that a robot was loaded or unloaded while it stood.
 //!
-//! The apparent mass ([`ApparentMass`]) since the last standstill is compared with that before it. Slopes
-//! and rolling resistance are eliminated for each window of 5 s; what is left of them and of the
-//! tyres counts as [`UNMODELLED_RATIO`].
+//! The apparent mass ([`ApparentMass`]) since the last standstill is compared with that before it.
+//! Slopes and rolling resistance are eliminated for each window of 5 s; their remaining error and
+//! that of the tyres has the standard deviation [`UNMODELLED_RATIO`].
 
 use super::apparent_mass::ApparentMass;
 use super::{PayloadChange, SensorNoise, SensorSample, ValueWithDeviation};
 use crate::robot::RobotModel;
 
-/// Time that a robot stands while it is loaded, at least, seconds.
+/// Minimum duration of a standstill in which a robot may be loaded, seconds.
 const STANDSTILL_MIN_S: f64 = 5.0;
-/// Rim speed below which a robot stands, metres per second.
+/// Rim speed of the faster side below which the robot counts as standing, metres per second.
 const STANDING_M_S: f64 = 0.02;
-/// Smallest change of the apparent mass that counts, over the model's mass.
+/// Minimum change of the apparent mass that is reported, relative to the model's mass.
 const CHANGE_MIN_RATIO: f64 = 0.05;
-/// Smallest change in standard deviations.
+/// Minimum change that is reported, in standard deviations of the difference.
 const CHANGE_MIN_STD_DEVS: f64 = 4.0;
-/// Standard deviation of what the windows do not eliminate, over the model's mass.
+/// Standard deviation of the errors that windows do not eliminate, relative to the model's mass.
 const UNMODELLED_RATIO: f64 = 0.01;
-/// Largest standard deviation of an apparent mass that is compared.
+/// Maximum standard deviation of an apparent mass that is compared, relative to the model's mass.
 const COMPARED_STD_DEV_MAX: f64 = 0.05;
 /// Time for which a change is reported, seconds of samples.
 const REPORTED_FOR_S: f64 = 600.0;
 
-/// Compares apparent masses.
+/// Compares the apparent masses before and after each long standstill.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct PayloadMonitor {
-    /// Since the last standstill.
+    /// Apparent mass since the last long standstill.
     since: ApparentMass,
-    /// Before it, with the same load.
+    /// Apparent mass before it, over all drives with the same load.
     before: Option<ValueWithDeviation>,
     standing_s: f64,
     change: Option<PayloadChange>,
@@ -36,7 +36,8 @@ pub(super) struct PayloadMonitor {
 }
 
 impl PayloadMonitor {
-    /// Takes a sample, `dt_s` after the one before. Returns whether the load has changed.
+    /// Adds a sample, taken `dt_s` seconds after the one before. Returns whether the payload has
+    /// changed.
     pub(super) fn add(
         &mut self,
         sample: &SensorSample,
@@ -62,31 +63,33 @@ impl PayloadMonitor {
         is_window_done && self.compare()
     }
 
-    /// The averages begin anew after a gap.
+    /// Restarts the averages after a gap between samples.
     pub(super) fn interrupt(&mut self) {
         self.since.interrupt();
     }
 
-    /// The last change, while it is reported.
+    /// Returns the last change for [`REPORTED_FOR_S`] of samples, then None.
     pub(super) fn change(&self) -> Option<PayloadChange> {
         self.change
     }
 
-    /// The apparent mass since the last standstill, where it is known well enough.
+    /// Returns the apparent mass since the last long standstill; None if its standard deviation is
+    /// too large.
     fn present(&self) -> Option<ValueWithDeviation> {
         let value = self.since.value()?;
         let std_dev = value.std_dev.hypot(UNMODELLED_RATIO);
         (std_dev < COMPARED_STD_DEV_MAX).then_some(ValueWithDeviation { std_dev, ..value })
     }
 
-    /// The apparent mass with the present load, before and since the last standstill together.
+    /// Returns the apparent mass with the present load, from the drives before and since the last
+    /// long standstill; they are independent but for the errors that windows do not eliminate.
     fn known(&self) -> Option<ValueWithDeviation> {
         let (Some(before), Some(present)) = (self.before, self.present()) else {
             return self.present().or(self.before);
         };
         let weights = [before.std_dev.powi(-2), present.std_dev.powi(-2)];
         let sum = weights[0] + weights[1];
-        // What windows do not eliminate does not average out.
+        // The errors that windows do not eliminate do not average out.
         Some(ValueWithDeviation {
             value: (weights[0] * before.value + weights[1] * present.value) / sum,
             std_dev: sum.sqrt().recip().max(UNMODELLED_RATIO),

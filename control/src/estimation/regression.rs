@@ -41,9 +41,11 @@ const OWN_SHARE_MIN: f64 = 0.01;
 /// Minimum standard deviation of θκ, which keeps the matrix regular.
 const CURVATURE_STD_DEV_MIN: f64 = 2.0e-4;
 
-/// Normal equations for given weights.
+/// Normal equations `M p = b` of the parameters p for given weights.
 pub(super) struct Normal {
+    /// M, corrected for the noise of the regressors.
     pub(super) matrix: ParameterMatrix,
+    /// b, the right side.
     pub(super) right: Parameters,
     /// `Σ n (σ_x² s² + θ²σ_x⁴)/s⁴`.
     excess: f64,
@@ -196,7 +198,9 @@ fn bend_ratio(channels: &[&Channel], tangent: Tangent, curvature: f64) -> f64 {
 /// Input of [`solve`].
 #[derive(Debug, Clone, Copy)]
 pub(super) struct SolveInput<'known> {
+    /// Information on the parameters that segments share.
     pub(super) offsets: &'known OffsetKnowledge,
+    /// Prior of the tyres.
     pub(super) tyres: &'known TyrePrior,
     /// Fixed θ for the weights; `None` iterates it.
     pub(super) theta_given: Option<f64>,
@@ -315,6 +319,7 @@ fn learned_tyres(
 /// Estimated parameters with their covariance.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Solution {
+    /// Estimated θ.
     pub(super) theta: f64,
     /// Variance of θ, including the errors of the offsets and of the noisy regressor.
     pub(super) variance: f64,

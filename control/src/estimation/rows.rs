@@ -263,6 +263,7 @@ impl Channel {
         });
     }
 
+    /// Returns the sums over the rows of both.
     pub(super) fn plus(&self, other: &Self) -> Self {
         Self {
             count: self.count + other.count,

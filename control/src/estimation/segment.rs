@@ -47,14 +47,16 @@ const CLAIM_MIN_RATIO: f64 = 1.0e-6;
 /// θ of one segment alone, with the information that it states.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct SegmentTheta {
+    /// θ of the segment.
     pub(super) theta: f64,
-    /// Information that includes the error of the tyres.
+    /// Information Λ that the segment adds to the sum of its ground; its variance includes the
+    /// error of the tyres.
     pub(super) information: f64,
     /// Information without the common errors.
     pub(super) own_information: f64,
-    /// The common errors, over θ.
+    /// Standard deviations of the common errors, relative to θ.
     pub(super) common_ratio: CommonError,
-    /// Time that was used, seconds.
+    /// Duration of the blocks used, seconds.
     pub(super) duration_s: f64,
 }
 
@@ -90,7 +92,8 @@ impl Claims {
         claimed
     }
 
-    /// A segment that was identified. Its own error is independent of those of the others.
+    /// Returns θ of an identified segment with the information that it states. Its own error is
+    /// independent of those of other segments.
     pub(super) fn identified(&mut self, found: &Identified) -> SegmentTheta {
         let [own, tyres] =
             [found.own_ratio, found.tyres_ratio].map(|ratio| (ratio * found.theta).powi(2));

@@ -265,43 +265,44 @@ pub struct ThetaMeasurement {
     pub duration_s: f64,
 }
 
-/// A parameter of the robot that was identified.
+/// Estimate of one parameter of the robot.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct IdentifiedValue {
-    /// Its value.
+    /// Estimated value.
     pub value: f64,
-    /// Its standard deviation.
+    /// Standard deviation of its error.
     pub std_dev: f64,
-    /// Whether most of what is known of it was known beforehand: its variance is more than half of
-    /// that of the prior.
+    /// Whether the estimate is prior-dominated: its variance is more than half of the prior
+    /// variance.
     pub is_mostly_prior: bool,
 }
 
-/// The robot's own parameters, as they were identified together with θ.
+/// The robot's own parameters, estimated together with θ.
 ///
-/// On flat ground torques and accelerations tell only the apparent mass, so that the mass itself
-/// rests on what is known of torque constants and rotors. Without torque nothing tells a mass.
+/// On flat ground torques and accelerations determine only the apparent mass; the mass itself also
+/// depends on the priors of torque constants and rotors. Without wheel torques no mass is
+/// observable.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct IdentifiedRobot {
-    /// Apparent mass `s (m + j)` over the mass of the model: torque scale s, mass m with payload, and
-    /// inertia j of rotors and wheels at the rim.
+    /// Apparent mass `s (m + j)` relative to the model's mass: torque scale s, mass m with payload,
+    /// and inertia j of rotors and wheels over the square of the wheel radius.
     pub apparent_mass_ratio: IdentifiedValue,
     /// Mass with payload, kilograms.
     pub mass_kg: IdentifiedValue,
-    /// Yaw inertia over mass, over that of the model.
+    /// Ratio of yaw inertia to mass, relative to the model's.
     pub inertia_ratio: IdentifiedValue,
     /// Centre of mass forward of the centre of the wheels, metres.
     pub centre_forward_m: IdentifiedValue,
-    /// Centre of mass to the left of it, metres.
+    /// Centre of mass to the left of the centre of the wheels, metres.
     pub centre_left_m: IdentifiedValue,
 }
 
-/// A change of the load.
+/// A change of the payload during a standstill.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PayloadChange {
-    /// Apparent mass over the mass of the model before the robot stood.
+    /// Apparent mass relative to the model's mass, before the standstill.
     pub before: ValueWithDeviation,
-    /// The same since then.
+    /// Apparent mass relative to the model's mass, since the standstill.
     pub after: ValueWithDeviation,
 }
 
@@ -326,10 +327,9 @@ pub struct Estimate {
     pub saturation_share: f64,
     /// Number of samples dropped because they were not finite or not plausible.
     pub dropped_samples: u64,
-    /// The robot's own parameters; none of a robot that counts as exactly as its model says, and
-    /// before anything is known.
+    /// The robot's own parameters; `None` if the model counts as exact, and before enough blocks.
     pub robot: Option<IdentifiedRobot>,
-    /// The last change of the load, for ten minutes of driving.
+    /// The last change of the payload, for ten minutes of samples.
     pub payload_change: Option<PayloadChange>,
 }
 

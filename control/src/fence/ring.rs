@@ -149,13 +149,14 @@ impl Ring {
         }
     }
 
-    /// Returns a lower bound of the distance of a point outside, metres; 0 within the bounding box.
+    /// Returns a lower bound of the distance from a point outside the polygon to it, metres: how
+    /// far the point is off the bounding box on one axis; 0 within the box.
     pub(super) fn outside_at_least_m(&self, point: Point) -> f64 {
         let (x_m, y_m) = self.bounds.off(point);
         x_m.max(y_m)
     }
 
-    /// Returns the distance to the border, metres, positive inside.
+    /// Returns the signed distance to the border, metres: positive inside, negative outside.
     pub(super) fn depth_m(&self, point: Point) -> f64 {
         let mut is_inside = false;
         for group in &self.groups {
@@ -167,7 +168,7 @@ impl Ring {
         if is_inside { distance_m } else { -distance_m }
     }
 
-    /// Returns the nearest point of the border.
+    /// Returns the point of the border that is nearest to `point`.
     pub(super) fn border_near(&self, point: Point) -> Point {
         self.nearest(point).point
     }

@@ -105,7 +105,8 @@ pub struct Reasons {
     pub fence_max_m_s: Option<f64>,
     /// Maximum speed set by an external program, metres per second.
     pub outside_max_m_s: Option<f64>,
-    /// Maximum speed for the age of teleoperation commands, metres per second.
+    /// Maximum speed because teleoperation commands arrive late, metres per second; `None` without
+    /// a limit.
     pub command_age_max_m_s: Option<f64>,
     /// Maximum speed of a robot without a position, metres per second.
     pub blind_max_m_s: Option<f64>,

@@ -34,7 +34,8 @@ pub struct AgeMeter {
 }
 
 impl AgeMeter {
-    /// Updates the worst age with the age of a command, seconds.
+    /// Adds the age of one command, seconds: a larger age replaces the worst one, a smaller one
+    /// lowers it by [`FORGOTTEN_SHARE`] of the difference. A negative age counts as 0.
     pub fn note(&mut self, age_s: f64) {
         // A non-finite age counts as [`AGE_LEAST_S`].
         let age_s = if age_s.is_finite() {
@@ -96,8 +97,8 @@ pub fn within_limits(twist: Twist, model: &RobotModel) -> (Twist, bool) {
     (within, over_ratio > 1.0)
 }
 
-/// Moves `previous` towards `target` for one tick within the robot's acceleration limits; slowing
-/// down uses twice these limits.
+/// Returns the twist after one tick of `dt_s` seconds from `previous` towards `target` within the
+/// robot's acceleration limits; decelerations may be twice as large.
 pub fn approach(previous: Twist, target: Twist, model: &RobotModel, dt_s: f64) -> Twist {
     let dt_s = if dt_s.is_finite() { dt_s.max(0.0) } else { 0.0 };
     let slowing = Slowing {

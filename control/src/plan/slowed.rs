@@ -28,7 +28,7 @@ pub struct Slowed {
     pub from_m: f64,
     /// Arc length of its end, metres.
     pub to_m: f64,
-    /// Minimum speed on the stretch, metres per second.
+    /// Lowest planned speed on the stretch, metres per second.
     pub speed_min_m_s: f64,
 }
 
@@ -50,8 +50,8 @@ pub(super) struct CellBounds {
     pub left_m_s: f64,
     /// Limit that keeps the allowed speed below the requested one; None if there is none.
     pub by: Option<SlowedBy>,
-    /// Cause to report where the robot is slower than this cell allows, because it accelerates or
-    /// brakes.
+    /// Cause to report where the plan is slower than this cell allows, because the robot
+    /// accelerates or brakes.
     pub longitudinal: SlowedBy,
 }
 

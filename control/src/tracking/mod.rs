@@ -1,10 +1,10 @@
 //! Adaptive tracking law: wheel speeds from tracking errors. `docs/control.md` has the proof.
 //!
-//! The law adapts θ̂ as the paper does, for a base that slips sideways. Errors are taken in the
+//! The law adapts θ̂ as the paper does, for a base that slips laterally. Errors are taken in the
 //! frame of the robot's *course*, which differs from its heading by the sideslip `β = −vωθ/g` (θ =
-//! 1/K, steady turn of the four-wheel sum); then `ė_y = v sin e_θ + (v²ω/g) θ̃`. So
-//! `V = ½k_y(e_x² + e_y²) + (1 − cos e_θ) + k_y θ̃²/(2ρ)` decreases under `θ̂̇ = ρ e_y v²ω/g`, the
-//! adaptation (26) of the paper. The law never inverts a measured velocity, so it is regular at
+//! 1/K, steady turn of the four-wheel sum); then `ė_y = v sin e_θ + (v²ω/g) θ̃`. So `V = ½k_y(e_x²
+//! + e_y²) + (1 − cos e_θ) + k_y θ̃²/(2ρ)` decreases under `θ̂̇ = ρ e_y v²ω/g`, a gradient law of
+//! the form of the paper's (26). The law never inverts a measured velocity, so it is regular at
 //! standstill.
 //!
 //! In tight bends wheels slip beyond the peak of their friction curve, whatever the speed, and the
@@ -16,8 +16,9 @@
 //! The command is the reference's motion, corrected by the errors (Kanayama's form, with integral
 //! action over the distance driven), plus feed-forward with θ̂: the sideslip, the rim speeds that
 //! the turn needs, lead for the wheel servo and half a sample, and lead for slip relaxation, `vθ/g`
-//! along and `(vθ/g)·4 I_G/(m(W² + L²))` in yaw. An inner loop on the measured turn rate, of gain
-//! below one, keeps the stability margin where slip is slow. Gains depend on the noise of the pose.
+//! along the path and `(vθ/g)·4 I_G/(m(W² + L²))` in yaw. An inner loop on the measured turn rate,
+//! of gain below one, keeps the stability margin where slip is slow. Gains depend on the noise of
+//! the pose.
 //!
 //! θ̂ starts at zero, which means no sideslip. A known θ pulls it, weighted by its confidence. χ̂
 //! starts at one, and returns to one when a known θ contradicts the previous one. Both are bounded

@@ -95,14 +95,16 @@ impl Driver {
         }
     }
 
-    /// Holds the shipped law's adaptation while the gate reduces its command.
+    /// Sets whether the shipped law holds its adapted values, as it does while the gate reduces its
+    /// command. Other laws ignore this.
     pub fn hold_adaptation(&mut self, held: bool) {
         if let Kind::Shipped(law) = &mut self.0 {
             law.hold_adaptation(held);
         }
     }
 
-    /// Returns the distance of the controlled point ahead of the robot's centre, metres.
+    /// Returns the distance of the law's control point ahead of the robot's centre, metres; 0 if
+    /// the law controls the centre.
     pub fn point_forward_m(&self) -> f64 {
         match &self.0 {
             Kind::Paper(law) => law.point_forward_m(),

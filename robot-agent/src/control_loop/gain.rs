@@ -38,7 +38,8 @@ pub(super) struct Gain {
 }
 
 impl Gain {
-    /// Adds a tick of `dt_s` seconds and `driven_m` metres, `since_start_s` after the begin.
+    /// Adds a tick of `dt_s` seconds and `driven_m` metres, `since_start_s` seconds after the
+    /// mission's start.
     pub(super) fn add(
         &mut self,
         ground: &GroundRecord,
@@ -58,7 +59,8 @@ impl Gain {
         }
     }
 
-    /// Adds a cell in which both the map and the robot have an estimate.
+    /// Adds the difference between the map's and the robot's θ in one cell. A difference whose
+    /// z-score is not finite is ignored.
     pub(super) fn compare(&mut self, comparison: &Comparison) {
         let apart = comparison.z_score();
         if !apart.is_finite() {

@@ -418,10 +418,10 @@ impl FleetLink {
         }
     }
 
-    /// Introduces the robot to the server, and returns its answer.
+    /// Sends the robot's hello to the server and returns its welcome.
     ///
     /// # Errors
-    /// [`AskError`] if there is no readable answer.
+    /// [`AskError`] if the hello cannot be encoded, or no readable answer arrives.
     pub async fn hello(self: &Arc<Self>, hello: &Hello) -> Result<Welcome, AskError> {
         let payload = wire::encode(hello).map_err(AskError::Unwritable)?;
         let answer = self.ask(Question::Hello, payload).await?;

@@ -30,7 +30,7 @@ pub(crate) struct TickInputs {
     /// Time by which inputs with an expiry, such as drive commands, were judged; monotonic clock.
     pub(crate) judged: Duration,
     pub(crate) stop_requested: bool,
-    /// Number of commands that the tick took; they are noted before it.
+    /// Number of commands that the tick took from the queue; each is recorded before the tick.
     pub(crate) commands: u32,
     pub(crate) feedback: Feedback,
     pub(crate) is_base_silent: bool,

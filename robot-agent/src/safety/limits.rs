@@ -110,7 +110,8 @@ pub(crate) struct ExternalLimits {
 }
 
 impl ExternalLimits {
-    /// Creates the required owners, at most [`LIMITS_MAX`], without a limit.
+    /// Creates the list with the required owners, at most [`LIMITS_MAX`]. None has sent a limit
+    /// yet, so each holds the robot.
     pub(crate) fn new(boot: BootId, required: &[OwnerId]) -> Self {
         let mut owners = Vec::with_capacity(LIMITS_MAX);
         let required = required.iter().take(LIMITS_MAX).map(|id| Owner {

@@ -25,7 +25,8 @@ pub struct SensorSpec {
     pub gyro_rad_s: f64,
     /// Accelerometer, m/s².
     pub acceleration_m_s2: f64,
-    /// Largest constant offset of the accelerometer, m/s².
+    /// Bound of the accelerometer's constant offset per axis, which is drawn uniformly from ± this
+    /// value, m/s².
     pub acceleration_bias_m_s2: f64,
     /// Wheel speed, rad/s.
     pub wheel_speed_rad_s: f64,
@@ -35,11 +36,12 @@ pub struct SensorSpec {
     pub position_m: f64,
     /// Heading of a position fix, radians.
     pub heading_rad: f64,
-    /// Largest constant relative error of the torque's scale.
+    /// Bound of the constant relative error of the torque scale, drawn uniformly from ± this value.
     pub torque_scale_ratio: f64,
-    /// Torque, as a friction coefficient of one side.
+    /// Torque of one side, as a friction coefficient: over the side's load and the wheel radius.
     pub torque_mu: f64,
-    /// Largest relative difference of a side's rolling radius from the model's.
+    /// Bound of the relative difference of each side's rolling radius from the model's, drawn
+    /// uniformly from ± this value.
     pub radius_ratio: f64,
 }
 

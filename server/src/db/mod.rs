@@ -453,7 +453,8 @@ impl Db {
         Ok(self.timed(inner, kind, false))
     }
 
-    /// Checkpoints the write-ahead log, as far as no reader needs it; writers do not wait for it.
+    /// Copies the write-ahead log into the database file (a passive checkpoint), up to the oldest
+    /// snapshot that a reader still uses. Writers do not wait for it.
     ///
     /// # Errors
     /// SQLite failed, for instance on a full disk; the log remains valid.

@@ -170,10 +170,11 @@ pub async fn find(db: &mut SqliteConnection, id: StopId) -> Result<Option<Stop>,
     raw.map(Stop::try_from).transpose()
 }
 
-/// Stores stops, at most one of each robot, and keeps `kept` of each robot. Stops of unknown
-/// robots, and those stored before, are left out.
+/// Stores new stops, at most one for each robot in a call. Stops of unknown robots, and those
+/// stored before, are ignored.
 ///
-/// The newest stop of a robot is the open one, in whatever order they are stored.
+/// A robot's newest stop is the open one and replaces the others, in whatever order they are
+/// stored. Afterwards only the newest `kept` stops of each robot remain; older ones are deleted.
 pub async fn insert(db: &mut SqliteConnection, stops: &[Stop], kept: u32) -> Result<(), DbError> {
     let entry = |stop: &Stop| {
         (

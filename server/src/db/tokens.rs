@@ -209,7 +209,7 @@ pub async fn revoke(db: &mut SqliteConnection, id: TokenId, at: Timestamp) -> Re
     Ok(())
 }
 
-/// Stores the last use of a token.
+/// Sets the time of a token's last use; a time before the stored one changes nothing.
 pub async fn touch(db: &mut SqliteConnection, id: TokenId, at: Timestamp) -> Result<(), DbError> {
     let (id, at_us) = (id.to_string(), to_us(at));
     sqlx::query!(

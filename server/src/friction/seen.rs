@@ -26,7 +26,8 @@ pub struct Seen<R> {
     pub robot_ratio: f64,
     /// Standard deviation of the error common to all robots with the same tyres, relative to θ.
     pub tyre_ratio: f64,
-    /// Σ Λ·(θ − mean)² of the passes: χ² with `passes` − 1 degrees of freedom.
+    /// Σ Λ·(θ − mean)² over the passes, Λ their information: χ² distributed with `passes` − 1
+    /// degrees of freedom if they agree.
     pub scatter: f64,
     /// Number of passes.
     pub passes: u64,
@@ -38,9 +39,9 @@ pub struct Seen<R> {
     pub newest_mu: Option<f64>,
     /// Peak friction coefficient of all passes.
     pub mu_peak: Option<f64>,
-    /// Ratio of effective to geometric track width.
+    /// Ratio of effective to geometric track width, with its information.
     pub track: Option<Known>,
-    /// Rolling resistance coefficient.
+    /// Rolling resistance coefficient, with its information.
     pub rolling: Option<Known>,
 }
 

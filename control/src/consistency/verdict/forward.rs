@@ -29,7 +29,11 @@ const ODOMETRY_LAG_S: f64 = 0.1;
 /// speed, and metres per radian of turn.
 const LEFT: (f64, f64, f64) = (0.12, 0.4, 0.5);
 
-/// Compares the speeds; returns whether nothing contradicts.
+/// Compares the forward speeds of wheels, odometry and fixes, and the lateral speed, over the time
+/// of the fixes, and records the faulty sensor or slip in `verdicts`.
+///
+/// Returns false if two speeds disagree, even where no sensor can be blamed yet. Returns true if
+/// all agree or nothing can be compared.
 pub(super) fn look(
     view: &View<'_>,
     recent: &Recent,

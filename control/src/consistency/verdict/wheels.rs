@@ -75,8 +75,9 @@ pub(super) fn frozen_base(view: &View<'_>, recent: &Recent, verdicts: &mut Verdi
     }
 }
 
-/// Returns the tolerated difference of wheels and body, and the fraction of the body's noise to add
-/// to it.
+/// Returns the tolerated magnitude of the difference of wheel and body rate on an axis, in m/s
+/// forward or rad/s in turns, and the factor of the body rate's noise to add to it. Both are
+/// smaller where the command also indicates a fault of the wheels.
 pub(super) fn slack(
     view: &View<'_>,
     axis: Axis,

@@ -1,23 +1,25 @@
-//! Whether the ground has changed under a robot that is identified.
+//! Detects a change of the ground under a robot that is being identified.
 //!
-//! Both must hold: a two-sided CUSUM on what comparisons tell of ln K, over its standard deviation by
-//! the scatter of the blocks; and within two seconds the mean square of the standardised residuals has
-//! grown. The first alone is upset by what the model leaves out of turns that begin and end, the
-//! second by all that is wrong at once.
+//! An alarm needs two conditions: a two-sided CUSUM (Page 1954) of the standardised innovations i
+//! of ln K exceeds its threshold, `S ← max(0, S ± i − k) > h`; and the mean square of the
+//! standardised residuals has grown over the last two seconds. The CUSUM alone raises false alarms
+//! where turns begin and end, which the model describes less well; the residuals alone grow with
+//! any error of the model or a sensor.
 
-/// Threshold of the CUSUM, and its drift.
+/// Threshold h of the CUSUM and its drift k, in standard deviations of an innovation.
 const THRESHOLD: f64 = 20.0;
 const DRIFT: f64 = 1.0;
-/// Largest innovation that counts.
+/// Maximum magnitude of an innovation in the CUSUM; larger ones are clamped.
 const INNOVATION_MAX: f64 = 8.0;
-/// Growth of the mean square of the residuals, over its former value or 1.
+/// Minimum growth of the mean square of the residuals, relative to its former value or, if that is
+/// below 1, to 1.
 const GROWTH_MIN: f64 = 0.7;
-/// Comparisons over which it grows: two seconds.
+/// Number of comparisons between the two mean squares: two seconds.
 const GROWS_OVER: usize = 40;
-/// Comparisons after the start of motion before innovations count: one second.
+/// Number of comparisons after the start of motion whose innovations are ignored: one second.
 const ROLLS_FOR: u32 = 20;
 
-/// Detects the change.
+/// State of the detector.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct ChangeMonitor {
     above: f64,
@@ -25,7 +27,7 @@ pub(super) struct ChangeMonitor {
     /// Mean squares of the last comparisons, the oldest at `next`.
     squares: [f64; GROWS_OVER],
     next: usize,
-    /// Comparisons since the robot rolls.
+    /// Number of comparisons since the robot began to roll.
     rolling: u32,
 }
 
@@ -42,8 +44,11 @@ impl Default for ChangeMonitor {
 }
 
 impl ChangeMonitor {
-    /// Takes a comparison: the innovation of ln K and the mean square of the residuals, if they are known.
-    /// Returns whether the ground has changed; then it begins anew.
+    /// Adds one comparison: the standardised innovation of ln K and the mean square of the
+    /// standardised residuals. Without them the detector is reset; while the robot does not roll
+    /// the CUSUM stays 0.
+    ///
+    /// Returns whether the ground has changed; after an alarm the detector is reset.
     pub(super) fn update(&mut self, comparison: Option<(f64, f64)>, is_rolling: bool) -> bool {
         let Some((innovation, square)) = comparison.filter(|found| found.0.is_finite()) else {
             *self = Self::default();

@@ -1,10 +1,11 @@
-//! Forward-mode automatic differentiation: values with their derivatives by all parameters.
+//! Forward-mode automatic differentiation by dual numbers: values with their derivatives with
+//! respect to all parameters.
 //!
 //! Arrays of fixed size, so that the control loop allocates nothing and the compiler can vectorise.
 
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
-/// Numbers with which the robot is modelled: plain ones, or [`Dual`] ones.
+/// Arithmetic that the model needs, on plain numbers or on [`Dual`] ones.
 pub(super) trait Real:
     Copy
     + Add<Output = Self>
@@ -16,20 +17,20 @@ pub(super) trait Real:
     + Sub<f64, Output = Self>
     + Mul<f64, Output = Self>
 {
-    /// A constant.
+    /// Creates a constant, whose derivatives are zero.
     fn constant(value: f64) -> Self;
-    /// The value without its derivatives.
+    /// Returns the value without its derivatives.
     fn value(&self) -> f64;
-    /// e to this power.
+    /// Returns e to the power of this value.
     fn exp(self) -> Self;
-    /// Natural logarithm, of a value above 0.
+    /// Returns the natural logarithm; the value must be above 0.
     fn ln(self) -> Self;
-    /// Square root, of a value above 0.
+    /// Returns the square root; the value must be above 0, where the slope is finite.
     fn sqrt(self) -> Self;
-    /// Reciprocal, of a value other than 0.
+    /// Returns the reciprocal; the value must not be 0.
     fn recip(self) -> Self;
 
-    /// Magnitude.
+    /// Returns the magnitude; at 0 the slope is that of positive values.
     fn abs(self) -> Self {
         if self.value() < 0.0 { -self } else { self }
     }
@@ -61,22 +62,24 @@ impl Real for f64 {
     }
 }
 
-/// A value and its derivatives by `N` parameters.
+/// A value and its derivatives with respect to `N` parameters.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Dual<const N: usize> {
+    /// The value.
     pub(super) value: f64,
+    /// Partial derivatives, in the order of the parameters.
     pub(super) derivatives: [f64; N],
 }
 
 impl<const N: usize> Dual<N> {
-    /// The parameter of this index.
+    /// Creates the parameter of this index, below `N`: its derivative with respect to itself is 1.
     pub(super) fn parameter(value: f64, index: usize) -> Self {
         let mut derivatives = [0.0; N];
         derivatives[index] = 1.0;
         Self { value, derivatives }
     }
 
-    /// A function of this value: its value and its slope.
+    /// Applies a function by the chain rule, given the function's value and slope at this value.
     fn function(mut self, value: f64, slope: f64) -> Self {
         for derivative in &mut self.derivatives {
             *derivative *= slope;

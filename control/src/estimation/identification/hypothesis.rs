@@ -1,10 +1,12 @@
 //! Recursive Gauss–Newton estimation of all parameters from one starting value of K.
 //!
 //! A prediction-error method (Ljung, System Identification, 2nd ed., ch. 11): the model is driven
-//! by the measured wheel speeds, and its outputs are compared with the other sensors. Residuals are
-//! linear in the parameters about those of their block: `r(p) = r_b − J_b (p − p_b)`. What was
-//! linearised elsewhere is forgotten. The covariance is the sandwich `C Σ g gᵀ C`, in which the
-//! scores g of blocks scatter as they do, whether or not residuals are white and the model true.
+//! by the measured wheel speeds, and its outputs are compared with the other sensors. The residuals
+//! r of a block b are linearised about the parameters `p_b` that were in use during the block:
+//! `r(p) = r_b − J_b (p − p_b)`. Earlier blocks lose weight when ln K moves away from the value at
+//! which they were linearised. With `C = (Σ Jᵀ W J + prior information)⁻¹` the covariance is the
+//! robust one, `C (Σ g gᵀ + prior information) C`: the empirical scatter of the blocks' scores `g =
+//! Jᵀ W r` replaces the assumption of white residuals and a true model.
 
 use super::dual::{Dual, Real};
 use super::model::{Input, Output, State};
@@ -15,39 +17,44 @@ use crate::robot::RobotModel;
 pub(super) const CHANNELS: usize = 6;
 /// Change of ln K that makes older linearisations count e⁻³ times as much.
 const LINEAR_RANGE: f64 = 0.1;
-/// Share of its information that a block loses with each later block: offsets drift.
+/// Fraction of its information that a block loses with each later block, because sensor offsets
+/// drift.
 const BLOCK_FORGETS: f64 = 0.002;
-/// Largest change of ln K in one block.
+/// Maximum magnitude of the change of ln K at the end of one block.
 const STEP_MAX: f64 = 0.4;
 /// Range in which parameters stay, in standard deviations of their prior.
 const PRIOR_RANGE: f64 = 5.0;
-/// Residual over its standard deviation from which on it counts less (Huber).
+/// Standardised residual above which Huber's weight falls below 1.
 const HUBER: f64 = 3.0;
-/// Share by which each residual updates the mean square of its channel.
+/// Weight of each new squared residual in the exponentially weighted mean square of its channel.
 const SQUARE_GAIN: f64 = 0.005;
-/// Largest square of a residual in that mean, and in the cost.
+/// Maximum squared standardised residual in that mean, and in the cost.
 const SQUARE_MAX: f64 = 100.0;
 const COST_MAX: f64 = 25.0;
-/// Blocks whose scatter says how innovations scatter.
+/// Minimum number of blocks from whose scatter the variance of innovations is estimated.
 const INNOVATION_BLOCKS_MIN: u32 = 15;
-/// Share of the cost that is left after another block.
+/// Factor by which each later block multiplies the cost so far.
 const COST_KEEPS: f64 = 0.95;
 
-/// A dual number of the parameters.
+/// Value with its derivatives with respect to all parameters.
 pub(super) type Number = Dual<PARAMETERS>;
 
-/// What is known before a ground is driven on.
+/// Normal prior of the parameters at the start of a ground, in the units of [`index`].
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Prior {
+    /// Mean.
     pub(super) mean: Values,
+    /// Information matrix, the inverse of the covariance.
     pub(super) information: Square,
-    /// Standard deviations before anything was measured, for the steps' size.
+    /// Standard deviations of the initial prior, before any measurement. They scale the maximum
+    /// step and the range of each parameter.
     pub(super) std_devs: Values,
-    /// The means that belong to them.
+    /// Mean of the initial prior, the middle of each parameter's range.
     pub(super) first_mean: Values,
 }
 
 impl Prior {
+    /// Creates the initial prior of independent parameters.
     pub(super) fn new(mean: Values, std_devs: Values) -> Self {
         Self {
             mean,
@@ -58,15 +65,16 @@ impl Prior {
     }
 }
 
-/// Blocks of measurements, linearised about the present values.
+/// Weighted sums over linearised blocks of measurements.
 #[derive(Debug, Clone, PartialEq)]
 struct Blocks {
-    /// Their information, and its product with the values that they prefer.
+    /// `A = Σ Jᵀ W J`, the information matrix, and `b = Σ (Jᵀ W J p_b + g)`, the right side of the
+    /// normal equations `A p = b`.
     information: Square,
     preferred: Values,
-    /// Sum of the squares of their scores.
+    /// `Σ g gᵀ` of the scores `g = Jᵀ W r`.
     scores: Square,
-    /// Blocks that still count.
+    /// Sum of the blocks' weights, each at most 1.
     count: f64,
 }
 
@@ -95,35 +103,43 @@ impl Blocks {
     }
 }
 
-/// ln K of one segment, and variances of it.
+/// Estimate of ln K from one segment, and the two parts of its variance.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct OfSegment {
+    /// Estimate of ln K.
     pub(super) ln_stiffness: f64,
-    /// By the segment's own blocks.
+    /// Variance of ln K from the measurement noise of the segment's own blocks; independent between
+    /// segments.
     pub(super) own: f64,
-    /// By the robot's other parameters, as all other blocks and the prior know them.
+    /// Variance of ln K from the uncertainty of all other parameters, which come from the ground's
+    /// other blocks and the prior; common to the segments of a robot.
     pub(super) known: f64,
 }
 
 /// A measurement of one channel.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Measured {
+    /// Index of the channel, below [`CHANNELS`].
     pub(super) channel: usize,
+    /// Measured value in the channel's unit: rad/s, m/s², N m or m/s.
     pub(super) value: f64,
+    /// Standard deviation of sensor noise and model error together, in the same unit.
     pub(super) std_dev: f64,
 }
 
-/// One sequence of estimates.
+/// Estimator that started at one value of K: the model's state, the estimated parameters and their
+/// normal equations.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Hypothesis {
     values: Values,
     state: State<Number>,
-    /// All blocks of this ground.
+    /// All complete blocks of this ground.
     ground: Blocks,
-    /// Those of the open segment but the last one, which may be of the next ground already.
+    /// Complete blocks of the open segment except the last one, which may already be of the next
+    /// ground.
     segment: Blocks,
     last: Blocks,
-    /// Of the open block.
+    /// `Jᵀ W J` and `g` of the open block.
     block_information: Square,
     block_score: Values,
     /// Mean outputs since the last comparison.
@@ -131,17 +147,18 @@ pub(super) struct Hypothesis {
     /// Mean square of each channel's standardised residuals.
     squares: [f64; CHANNELS],
     cost: f64,
-    /// Covariances of ln K with all parameters.
+    /// Column of C for ln K: covariances of ln K with all parameters.
     of_stiffness: Values,
-    /// Score of the open block in that direction, as far as it was taken as an innovation.
+    /// `of_stiffnessᵀ g` of the open block at the last call of [`Hypothesis::innovation`].
     score_taken: f64,
-    /// Variance of a block's score in that direction.
+    /// Variance of `of_stiffnessᵀ g` of one block, from the scatter of the blocks.
     block_variance: f64,
-    /// Blocks since it began.
+    /// Number of complete blocks.
     age: u32,
 }
 
 impl Hypothesis {
+    /// Creates an estimator at the prior's mean with another ln K; the robot moves as in `state`.
     pub(super) fn new(prior: &Prior, ln_stiffness: f64, state: State<f64>) -> Self {
         let mut values = prior.mean;
         values[index::STIFFNESS] = ln_stiffness;
@@ -165,7 +182,7 @@ impl Hypothesis {
         hypothesis
     }
 
-    /// Goes on from another state of motion, after a time of which nothing is known.
+    /// Continues from a given state of motion after a gap in the samples; drops the open block.
     pub(super) fn restart(&mut self, state: State<f64>) {
         let [forward_m_s, left_m_s] = state.speed_m_s;
         self.state = State::rolling(forward_m_s, state.turn_rad_s);
@@ -174,9 +191,10 @@ impl Hypothesis {
         self.drop_block();
     }
 
-    /// What the measurements since the last call tell of ln K, over the standard deviation that they
-    /// have by the scatter of the blocks, if each block has this many of them. Positive if K is larger
-    /// than it was taken for. None before blocks have scattered.
+    /// Returns the standardised innovation of ln K since the last call: the Gauss–Newton step of ln
+    /// K from the measurements since then, over its standard deviation. That follows from the
+    /// scatter of whole blocks and `per_block`, the number of calls per block. Positive if K is
+    /// larger than estimated; None before [`INNOVATION_BLOCKS_MIN`] blocks.
     pub(super) fn innovation(&mut self, per_block: f64) -> Option<f64> {
         let score = self.of_stiffness.dot(&self.block_score);
         let new = score - std::mem::replace(&mut self.score_taken, score);
@@ -184,31 +202,37 @@ impl Hypothesis {
             .then(|| new / (self.block_variance / per_block).sqrt())
     }
 
-    /// Drops what the open block holds.
+    /// Drops the measurements of the open block.
     pub(super) fn drop_block(&mut self) {
         self.score_taken = 0.0;
         self.block_information = Square::zeros();
         self.block_score = Values::zeros();
     }
 
+    /// Returns the estimated parameters, in the units of [`index`].
     pub(super) fn values(&self) -> &Values {
         &self.values
     }
 
+    /// Returns the sum of squared standardised residuals, each at most [`COST_MAX`]; older blocks
+    /// count less. A lower cost is a better fit.
     pub(super) fn cost(&self) -> f64 {
         self.cost
     }
 
+    /// Returns the number of complete blocks.
     pub(super) fn age(&self) -> u32 {
         self.age
     }
 
-    /// Mean square of the standardised residuals of the channel that fits least.
+    /// Returns the largest of the channels' mean squares of standardised residuals; about 1 if
+    /// noise and model are as assumed.
     pub(super) fn worst_square(&self) -> f64 {
         self.squares.into_iter().fold(0.0, f64::max)
     }
 
-    /// Moves the model on by a sample, of which the mean takes this share.
+    /// Advances the model by one sample and adds its outputs to the mean with the weight `share`.
+    /// Returns the forward speed at the sample's end, metres per second.
     pub(super) fn advance(&mut self, model: &RobotModel, input: &Input, share: f64) -> Number {
         let values = std::array::from_fn(|place| Number::parameter(self.values[place], place));
         let output = Robot::new(&values, model).advance(&mut self.state, input);
@@ -224,7 +248,8 @@ impl Hypothesis {
         output.forward_m_s
     }
 
-    /// The mean outputs since the last call, in the order of the channels.
+    /// Returns the weighted mean outputs since the last call, in the order of the channels without
+    /// the body speed, and begins a new mean.
     pub(super) fn take_mean(&mut self) -> [Number; CHANNELS - 1] {
         let mean = std::mem::replace(&mut self.mean, Output::zero());
         let [forward, left] = mean.acceleration_m_s2;
@@ -232,7 +257,8 @@ impl Hypothesis {
         [mean.turn_rad_s, forward, left, torque_left, torque_right]
     }
 
-    /// Compares an output with its measurement.
+    /// Adds the residual of an output to the open block, with Huber's weight. A residual that is
+    /// not finite is ignored.
     pub(super) fn compare(&mut self, output: &Number, measured: Measured) {
         let residual = measured.value - output.value;
         let square = (residual / measured.std_dev).powi(2);
@@ -250,7 +276,9 @@ impl Hypothesis {
         self.cost += square.min(COST_MAX);
     }
 
-    /// Ends a block: all blocks together give new values. Returns false if they are none.
+    /// Ends the open block and takes a bounded Gauss–Newton step from all blocks of the ground and
+    /// the prior. Returns false if the normal equations cannot be solved or a parameter is not
+    /// finite.
     pub(super) fn end_block(&mut self, prior: &Prior) -> bool {
         let score = self.block_score;
         self.segment.add(&self.last, 1.0);
@@ -302,7 +330,7 @@ impl Hypothesis {
         self.values.iter().all(|value| value.is_finite())
     }
 
-    /// The state of motion that the model would have with values that differ by a step.
+    /// Moves the model's state, to first order, to that of the parameters after `step`.
     fn shift_state(&mut self, step: &Values) {
         let shift = |number: &mut Number| {
             let slopes = number.derivatives.iter().zip(step.iter());
@@ -313,7 +341,8 @@ impl Hypothesis {
         self.state.deflections.iter_mut().flatten().for_each(shift);
     }
 
-    /// Variances of ln K: all of it, and the part that comes from what was known beforehand.
+    /// Returns the variance of ln K, and the part of it that the prior contributes. The first is at
+    /// least the nominal variance, the diagonal element of C.
     pub(super) fn variances(&self, prior: &Prior) -> (f64, f64) {
         let of_stiffness = self.of_stiffness;
         let scattered = self.scattered();
@@ -322,15 +351,15 @@ impl Hypothesis {
         ((scattered + known).max(nominal), known)
     }
 
-    /// Variance of ln K by the scatter of the blocks.
+    /// Returns the part of ln K's variance that the scatter of the blocks' scores contributes.
     fn scattered(&self) -> f64 {
-        // Few scores scatter less than they will.
+        // The scatter of few scores underestimates their variance.
         let few = 1.0 + 2.0 / self.ground.count.max(1.0);
         few * (self.ground.scores * self.of_stiffness).dot(&self.of_stiffness)
     }
 
-    /// Variances of linear functions of the parameters. Blocks scatter as they do. None if nothing
-    /// follows from the blocks.
+    /// Returns the robust variances of linear functions of the parameters, given their gradients.
+    /// None if the normal equations cannot be solved.
     pub(super) fn variances_of<const COUNT: usize>(
         &self,
         prior: &Prior,
@@ -346,17 +375,18 @@ impl Hypothesis {
         }))
     }
 
-    /// Drops the last block and the open one: they may be of either ground.
+    /// Drops the last block and the open one, which may contain samples of two grounds.
     pub(super) fn drop_last_block(&mut self) {
         self.ground.add(&self.last, -1.0);
         self.last = Blocks::none();
         self.drop_block();
     }
 
-    /// Ends the segment. ln K follows from its own blocks, with the robot's other parameters as the
-    /// ground's other blocks and the prior know them: those blocks tell nothing of K here, so that K
-    /// of segments may differ and their own errors are independent. None if it has no blocks, or
-    /// nothing follows from them.
+    /// Ends the segment and returns ln K from its own blocks.
+    ///
+    /// The ground's other blocks and the prior contribute the other parameters only: ln K is
+    /// marginalised from them. So K may differ between segments, and the segments' own errors are
+    /// independent. None if the segment has no blocks, or its normal equations cannot be solved.
     pub(super) fn close_segment(&mut self, prior: &Prior) -> Option<OfSegment> {
         let mut segment = std::mem::replace(&mut self.segment, Blocks::none());
         segment.add(&self.last, 1.0);
@@ -376,7 +406,8 @@ impl Hypothesis {
         let mut stiffness = Values::zeros();
         stiffness[index::STIFFNESS] = 1.0;
         let of_stiffness = cholesky.solve(&stiffness);
-        // Blocks scatter as those of the whole ground do.
+        // The segment has too few blocks for a scatter of its own: that of the whole ground is
+        // used.
         let whole = (self.ground.information * self.of_stiffness).dot(&self.of_stiffness);
         let scatter = (self.scattered() / whole).max(1.0);
         let own = scatter * (segment.information * of_stiffness).dot(&of_stiffness);
@@ -389,7 +420,9 @@ impl Hypothesis {
         (is_known && own.is_finite()).then_some(found)
     }
 
-    /// What this tells beforehand where some of the parameters have changed: all others.
+    /// Returns the posterior as the prior of the next ground or load: the parameters `changed` are
+    /// reset to the initial prior, all others keep mean and covariance. None if it cannot be
+    /// computed.
     pub(super) fn prior_without(&self, prior: &Prior, changed: &[usize]) -> Option<Prior> {
         let mut covariance = (self.ground.information + prior.information)
             .cholesky()?

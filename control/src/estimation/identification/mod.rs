@@ -1,12 +1,13 @@
-//! Grey-box identification of a robot whose model is not exact: θ with everything that is
-//! unknown beside it.
+//! Grey-box identification of a robot whose model is not exact: θ together with everything else
+//! that is unknown.
 //!
-//! The rows of the other modules are linear in θ for small slip and average over blocks. That is
-//! exact for a robot that is as its model says. Of other robots it uses a small part of what sensors
-//! tell, and it must be silent where tyres slip more. Here the equations of motion run beside the
-//! robot ([`model`]), with the wheels' measured speeds, and all 23 unknown parameters
-//! ([`parameters`]) follow from the other sensors together ([`hypothesis`]). Since that is not
-//! linear, it begins at three values of K; those that fit worse are discarded.
+//! The rows of the other modules are linear in θ for small slip and average over blocks, which is
+//! exact for a robot that equals its model. For other robots they use a small part of the
+//! measurements, and give no estimate beyond small slip. This module simulates the equations of
+//! motion ([`model`]) with the measured wheel speeds as input, and estimates all 23 unknown
+//! parameters ([`parameters`]) at once from the other sensors ([`hypothesis`]). The problem is
+//! nonlinear, so three estimators start at different values of K; those that fit worse are
+//! discarded.
 
 mod change;
 mod dual;
@@ -26,59 +27,61 @@ use hypothesis::{CHANNELS, Hypothesis, Measured, Prior};
 use model::{Input, State};
 use parameters::index;
 
-/// Values of ln K at which it begins: K 1, 3.3 and 11.
+/// Starting values of ln K: K 1, 3.3 and 11.
 const STARTS: [f64; 3] = [0.0, 1.2, 2.4];
 /// Time over which outputs and measurements are averaged before they are compared, seconds.
 const COMPARED_S: f64 = 0.05;
-/// Time of a block, seconds.
+/// Duration of a block, seconds.
 const BLOCK_S: f64 = 1.0;
-/// Blocks before which nothing is discarded and nothing is known.
+/// Minimum number of blocks before a hypothesis is discarded or an estimate is returned.
 const BLOCKS_MIN: u32 = 5;
-/// Cost by which a hypothesis may exceed the best one and stay.
+/// Excess of a hypothesis's cost over the lowest one from which it is discarded.
 const COST_MARGIN: f64 = 60.0;
-/// Cost by which it may do so and count e⁻¹ times as much.
+/// Excess of cost over the lowest one that reduces a hypothesis's weight to e⁻¹.
 const COST_SCALE: f64 = 10.0;
-/// Difference of ln K below which two hypotheses are one.
+/// Difference of ln K below which two hypotheses are merged.
 const SAME: f64 = 0.03;
-/// Rim speed below which torques are not compared: friction at rest is undetermined, metres per
-/// second.
+/// Rim speed of the slower side below which torques are not compared, because friction at rest is
+/// undetermined, metres per second.
 const TORQUE_FROM_M_S: f64 = 0.1;
-/// Rim speed of both sides above which a change of the ground is looked for, metres per second.
+/// Rim speed that both sides must exceed for a change of the ground to be detected, metres per
+/// second.
 const ROLLING_M_S: f64 = 0.2;
-/// Standard deviation of ln K above which no change of the ground is looked for.
+/// Standard deviation of ln K above which no change of the ground is detected.
 const CHANGES_STD_DEV_MAX: f64 = 0.2;
-/// Rim speed below which a robot stands, metres per second.
+/// Rim speed of the faster side below which the robot counts as standing, metres per second.
 const STANDING_M_S: f64 = 0.02;
-/// Share of a new acceleration in the smoothed one, per second.
+/// Bandwidth of the low-pass filter of accelerations, per second.
 const SMOOTHED_PER_S: f64 = 35.0;
-/// What the equations leave out, one standard deviation of a mean over [`COMPARED_S`]: turn rate
-/// in radians per second, acceleration in metres per second squared, torque as a friction
-/// coefficient.
+/// Standard deviations of the model's error in a mean over [`COMPARED_S`]: turn rate in radians per
+/// second, acceleration in metres per second squared, torque as a friction coefficient.
 const MODEL_TURN_RAD_S: f64 = 7.5e-3;
 const MODEL_ACCELERATION_M_S2: f64 = 0.075;
 const MODEL_TORQUE_MU: f64 = 0.025;
-/// Errors that all estimates share, since the equations are not those of the true contacts: of ln θ,
-/// and of θ. The latter is a slip of the wheels over the friction coefficient; it is a greater share
-/// of a small θ.
+/// Standard deviations of the error that all estimates share because real contacts do not follow
+/// the model's equations: a relative one, of ln θ, and an absolute one, of θ, which is a slip per
+/// friction coefficient and dominates where θ is small.
 const MODEL_LN_THETA_STD_DEV: f64 = 0.03;
 const MODEL_THETA_STD_DEV: f64 = 0.006;
-/// Shortest time that a block may have where a segment ends, seconds.
+/// Minimum duration of the block with which a segment ends, seconds; a shorter one is not used.
 const SHORT_BLOCK_S: f64 = 0.5;
-/// Mean square of standardised residuals beyond which the robot does not move as the model can.
+/// Mean square of standardised residuals above which the model does not describe the robot and no
+/// estimate is returned.
 const SQUARE_MAX: f64 = 30.0;
 
-/// What was identified.
+/// Estimate of θ, and the three independent parts of its standard deviation relative to θ.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Identified {
-    /// θ = 1/K.
+    /// Slip compliance θ = 1/K, above 0.
     pub(super) theta: f64,
-    /// Its relative standard deviation by the drive: noise, and what scattered.
+    /// Part from the measurements of this drive: sensor noise and the scatter of the blocks.
     pub(super) own_ratio: f64,
-    /// By what was known of the robot beforehand.
+    /// Part from the prior of the robot's other parameters; common to all estimates of the robot.
     pub(super) robot_ratio: f64,
-    /// By what the equations miss of tyres and ground.
+    /// Part from tyres and ground that do not follow the model's equations; common to all robots
+    /// with these tyres.
     pub(super) tyres_ratio: f64,
-    /// Time that counts, seconds.
+    /// Duration of the measurements in the estimate, seconds.
     pub(super) duration_s: f64,
 }
 
@@ -95,7 +98,7 @@ impl Identified {
     }
 }
 
-/// Identifies a robot and its ground.
+/// Identification of a robot and its ground from samples of its sensors.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Identification {
     model: RobotModel,
@@ -118,7 +121,7 @@ pub(super) struct Identification {
     robot: Option<IdentifiedRobot>,
     is_robot_due: bool,
     change: ChangeMonitor,
-    /// Whether ln K is known well enough that a change of it shows.
+    /// Whether the standard deviation of ln K is below [`CHANGES_STD_DEV_MAX`].
     is_sharp: bool,
 }
 
@@ -130,7 +133,9 @@ struct Waiting {
 }
 
 impl Identification {
-    /// None for a robot that is exactly as its model says: rows on means serve it better.
+    /// Creates the identification with its prior. None if the prior declares the model exact (no
+    /// unexplained error of the tyres, or no relaxation length): then linear rows on means are more
+    /// accurate.
     pub(super) fn new(
         model: RobotModel,
         noise: &SensorNoise,
@@ -173,12 +178,14 @@ impl Identification {
         }
     }
 
-    /// Starts on new ground, of which nothing is known; what was identified of the robot stays.
+    /// Starts on new ground: resets the parameters of the ground to the initial prior, and keeps
+    /// the estimates of the robot's parameters.
     pub(super) fn begin_ground(&mut self) {
         self.begin_without(&parameters::OF_GROUND);
     }
 
-    /// Starts with another load; what was identified of torques, radii and sensors stays.
+    /// Starts with another payload: resets the parameters of load and ground to the initial prior,
+    /// and keeps those of torques, radii and sensors.
     pub(super) fn begin_load(&mut self) {
         self.robot = None;
         self.begin_without(&parameters::OF_LOAD_AND_GROUND);
@@ -196,7 +203,8 @@ impl Identification {
         self.last_block_s = 0.0;
     }
 
-    /// The state of motion that a robot without slip has at the waiting sample.
+    /// Returns the state of motion of a robot without slip at the waiting sample; at rest if there
+    /// is none.
     fn state(&self) -> State<f64> {
         self.waiting.map_or(State::rolling(0.0, 0.0), |waiting| {
             let wheels = waiting.sample.wheel_speeds;
@@ -208,7 +216,8 @@ impl Identification {
         })
     }
 
-    /// Nothing is known of the time before the next sample.
+    /// Records a gap before the next sample: drops the open block and its sums, and keeps the
+    /// estimates.
     pub(super) fn interrupt(&mut self) {
         let state = self.state();
         for hypothesis in &mut self.hypotheses {
@@ -228,7 +237,8 @@ impl Identification {
         self.compared_s = 0.0;
     }
 
-    /// Takes a sample that came `time_s` after the one before. Returns whether the ground has changed.
+    /// Adds a sample that came `time_s` seconds after the one before; a time above [`GAP_MAX_S`]
+    /// counts as a gap. Returns whether the ground has changed.
     pub(super) fn update(
         &mut self,
         sample: &SensorSample,
@@ -249,7 +259,8 @@ impl Identification {
         waiting.is_some_and(|waiting| self.advance(&waiting, (rates(sample), time_s), noise))
     }
 
-    /// Moves the models on by the sample that waited. Returns whether the ground has changed.
+    /// Advances the models by the sample that waited for its successor. Returns whether the ground
+    /// has changed.
     fn advance(
         &mut self,
         now: &Waiting,
@@ -371,7 +382,8 @@ impl Identification {
         changed
     }
 
-    /// Whether the ground has changed, by what the last comparison tells of ln K.
+    /// Returns whether the change detector raises an alarm on the last comparison's innovation of
+    /// ln K, by the hypothesis with the lowest cost.
     fn detect(&mut self) -> bool {
         let least = self.least_cost();
         let per_block = BLOCK_S / COMPARED_S;
@@ -386,7 +398,7 @@ impl Identification {
         self.change.update(known, self.is_rolling())
     }
 
-    /// Whether both sides roll so fast that slip tells friction.
+    /// Returns whether the rims of both sides are faster than [`ROLLING_M_S`].
     fn is_rolling(&self) -> bool {
         let radius_m = self.model.wheel_radius_m();
         self.waiting.is_some_and(|waiting| {
@@ -458,8 +470,9 @@ impl Identification {
             .min_by(|first, second| first.cost().total_cmp(&second.cost()))
     }
 
-    /// θ, as far as the hypotheses agree; none before anything is known, or where the robot does
-    /// not move as the model can.
+    /// Returns θ of the present ground: the mean of the hypotheses' ln K weighted by their fit,
+    /// with a variance that contains their disagreement. None before [`BLOCKS_MIN`] blocks, or if
+    /// residuals are too large for the model.
     pub(super) fn identified(&self) -> Option<Identified> {
         let best = self.best()?;
         if best.age() < BLOCKS_MIN || best.worst_square() > SQUARE_MAX {
@@ -484,13 +497,13 @@ impl Identification {
         is_known.then(|| Identified::new(mean, variance - of_prior, of_prior, duration_s))
     }
 
-    /// The robot's own parameters, as last identified on this ground or on those before.
+    /// Returns the newest estimate of the robot's own parameters, of this ground or an earlier one.
     pub(super) fn robot(&self) -> Option<IdentifiedRobot> {
         self.robot
     }
 }
 
-/// Wheel speeds, left and right.
+/// Returns the wheel speeds, left and right, radians per second.
 fn rates(sample: &SensorSample) -> [f64; 2] {
     let wheels = sample.wheel_speeds;
     [wheels.left_rad_s, wheels.right_rad_s]

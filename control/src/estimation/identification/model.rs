@@ -1,13 +1,14 @@
-//! Equations of motion of a skid-steered robot on deflecting contacts, driven by its measured
-//! wheel speeds.
+//! Equations of motion of a skid-steered robot on deflecting contacts, driven by its measured wheel
+//! speeds.
 //!
 //! State at the centre of mass, body frame: forward and left speed, turn rate; per contact a
 //! deflection s as a slip vector with `ℓ ṡ = v_slip − |u| s` (relaxation length ℓ, rim speed u:
-//! Pacejka, Tire and Vehicle Dynamics, ch. 7). A contact's force is `N K s / D`, with
-//! `D = (1 + n a x + xⁿ)^(1/n)` and `x = K|s|/μ_p`: slope K = 1/θ at zero slip, `μ_p` far beyond
-//! the peak. a = 0 with a large n is the straight rise of Yi et al. (2007), eq. (7); a = 1/3 with n = 3
-//! is within 4 % of a brush; a = 0 with n = 2.7 of a Magic Formula; a = 2/3 with n = 2 of a `LuGre`
-//! tyre. N follows from where the centre of mass is, the slope, and measured accelerations.
+//! Pacejka, Tire and Vehicle Dynamics, ch. 7). A contact with the load N has the force `N K s / D`,
+//! with `D = (1 + n a x + xⁿ)^(1/n)` and `x = K|s|/μ_p`: its slope is K = 1/θ at zero slip, and its
+//! friction coefficient approaches `μ_p` at large slip. a = 0 with a large n is the straight rise
+//! of Yi et al. (2007), eq. (7), up to the peak; a = 1/3 with n = 3 is within 4 % of a brush model;
+//! a = 0 with n = 2.7 of a Magic Formula; a = 2/3 with n = 2 of a `LuGre` tyre. N follows from the
+//! position of the centre of mass, the slope, and measured accelerations.
 
 use super::dual::Real;
 use super::parameters::Robot;
@@ -21,19 +22,21 @@ const STEPS_MAX: u32 = 40;
 const SLOW_M_S: f64 = 0.1;
 /// Damping ratio of a contact at standstill.
 const DAMPING_RATIO: f64 = 0.2;
-/// Deflection of a standing contact, over that of a straight rise to the peak.
+/// Maximum deflection of a slow contact, relative to `μ_p/K`.
 const STANDING_DEFLECTION_MAX: f64 = 5.0;
-/// Rim speed over which resistances change their sign, metres per second.
+/// Width of the smoothed change of sign of rolling resistance and gear loss, as a rim speed, metres
+/// per second.
 const RESISTANCE_TURNS_M_S: f64 = 0.01;
-/// What is added to the square of slip, so that its root has a slope at zero.
+/// Added to the square of slip, so that the root has a finite slope at zero.
 const SLIP_SQUARE_MIN: f64 = 1.0e-10;
-/// Signs of the contacts' places, forward and left; the first two are on the left.
+/// Positions of the contacts relative to the wheels' centre, forward and left, as fractions of
+/// wheelbase and track width; the first two are on the left.
 const CONTACTS: [(f64, f64); 4] = [(0.5, 0.5), (-0.5, 0.5), (0.5, -0.5), (-0.5, -0.5)];
 
 /// The state of motion.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct State<T> {
-    /// Of the centre of mass, metres per second: forward and left.
+    /// Velocity of the centre of mass in the body frame, forward and left, metres per second.
     pub(super) speed_m_s: [T; 2],
     pub(super) turn_rad_s: T,
     /// Deflection of each contact, forward and left, as slip.
@@ -41,7 +44,7 @@ pub(super) struct State<T> {
 }
 
 impl<T: Real> State<T> {
-    /// At rest, or rolling freely at this speed.
+    /// Creates the state of a robot that rolls without slip at these speeds; 0 and 0 is at rest.
     pub(super) fn rolling(forward_m_s: f64, turn_rad_s: f64) -> Self {
         let zero = T::constant(0.0);
         Self {
@@ -59,9 +62,10 @@ pub(super) struct Input {
     pub(super) wheels_rad_s: [f64; 2],
     /// Wheel acceleration, left and right, radians per second squared.
     pub(super) wheels_rad_s2: [f64; 2],
-    /// Heading from where it began, radians.
+    /// Heading relative to the start of identification, radians.
     pub(super) heading_rad: f64,
-    /// Smoothed acceleration without gravity, forward and left, for the loads.
+    /// Low-pass filtered acceleration without gravity, forward and left, metres per second squared;
+    /// only for the contacts' loads.
     pub(super) acceleration_m_s2: [f64; 2],
     /// Time of the sample, seconds, above 0.
     pub(super) time_s: f64,
@@ -71,11 +75,12 @@ pub(super) struct Input {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Output<T> {
     pub(super) turn_rad_s: T,
-    /// Without gravity, forward and left.
+    /// Acceleration as the accelerometer measures it, without gravity on level ground, forward and
+    /// left, metres per second squared.
     pub(super) acceleration_m_s2: [T; 2],
-    /// Of the motors, left and right.
+    /// Torques of the motors at the wheels, left and right, newton metres.
     pub(super) torques_n_m: [T; 2],
-    /// Of the wheels' centre, at the end.
+    /// Forward speed of the wheels' centre at the sample's end, metres per second.
     pub(super) forward_m_s: T,
 }
 
@@ -95,7 +100,7 @@ impl<T: Real> Output<T> {
 #[derive(Debug, Clone, Copy)]
 struct Contact<T> {
     side: usize,
-    /// From the centre of mass, forward and left, metres.
+    /// Position relative to the centre of mass, forward and left, metres.
     place_m: [T; 2],
     load_n: T,
 }
@@ -104,12 +109,13 @@ struct Contact<T> {
 struct Forces<T> {
     force_n: [T; 2],
     moment_n_m: T,
-    /// Forward, left and right side.
+    /// Longitudinal forces of the left and the right side, newtons.
     sides_n: [T; 2],
 }
 
 impl<T: Real> Robot<T> {
-    /// Acceleration of gravity along the ground, body frame.
+    /// Returns gravity's component along the sloped ground, body frame, forward and left, metres
+    /// per second squared.
     fn gravity_m_s2(&self, heading_rad: f64) -> [T; 2] {
         let (sin, cos) = heading_rad.sin_cos();
         let [x, y] = self.slope;
@@ -119,7 +125,7 @@ impl<T: Real> Robot<T> {
         ]
     }
 
-    /// Contacts with the loads of a rigid body on four equal springs.
+    /// Returns the contacts with their loads, those of a rigid body on four equal springs.
     fn contacts(&self, gravity: [T; 2], acceleration_m_s2: [f64; 2]) -> [Contact<T>; 4] {
         let [forward_m, left_m, height_m] = self.centre_m;
         let (base_m, track_m) = (self.wheelbase_m, self.track_m);
@@ -136,14 +142,14 @@ impl<T: Real> Robot<T> {
         })
     }
 
-    /// Friction coefficient over slip.
+    /// Returns the friction coefficient over slip, `K / D`, at a slip above 0.
     fn mu_over_slip(&self, slip: T) -> T {
         let x = self.stiffness / self.peak * slip;
         let inside = (x.ln() * self.sharpness).exp() + self.sharpness * self.bend * x + 1.0;
         self.stiffness / (inside.ln() / self.sharpness).exp()
     }
 
-    /// Moves the contacts' deflections on by a step, and sums their forces.
+    /// Advances the contacts' deflections by one step, and returns the sums of their forces.
     fn deflect(
         &self,
         state: &mut State<T>,
@@ -204,7 +210,8 @@ impl<T: Real> Robot<T> {
         sums
     }
 
-    /// Moves on by the time of one sample. Deflections lead speeds by half a step (leapfrog).
+    /// Advances the state by the time of one sample and returns what the sensors would measure.
+    /// Deflections lead speeds by half a step (leapfrog integration).
     pub(super) fn advance(&self, state: &mut State<T>, input: &Input) -> Output<T> {
         let gravity = self.gravity_m_s2(input.heading_rad);
         let contacts = self.contacts(gravity, input.acceleration_m_s2);

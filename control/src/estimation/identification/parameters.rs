@@ -1,4 +1,4 @@
-//! What is unknown of a robot, its tyres and its ground, and what is known of it beforehand.
+//! Unknown parameters of a robot, its tyres and its ground, and their prior.
 
 use nalgebra::{SMatrix, SVector};
 
@@ -27,24 +27,27 @@ pub(super) mod index {
     pub(in super::super) const CENTRE_LEFT: usize = 4;
     /// ln of the relaxation length in metres.
     pub(in super::super) const RELAXATION: usize = 5;
-    /// Rise of the ground along the axes of the frame in which the robot began.
+    /// Slopes of the ground (rise per distance) along the axes of the frame in which identification
+    /// began.
     pub(in super::super) const SLOPE_X: usize = 6;
     pub(in super::super) const SLOPE_Y: usize = 7;
-    /// Error of the torque scale: both sides, and right minus left over two.
+    /// Relative error of the torque scale: mean of the sides, and half the difference right minus
+    /// left.
     pub(in super::super) const TORQUE_SCALE: usize = 8;
     pub(in super::super) const TORQUE_DIFFERENCE: usize = 9;
-    /// Inertia of rotors and wheels at the rim over the model's mass.
+    /// Inertia of rotors and wheels over the square of the wheel radius, relative to the model's
+    /// mass.
     pub(in super::super) const ROTORS: usize = 10;
-    /// Torque lost in the gears over that which they transmit.
+    /// Torque lost in the gears, relative to the transmitted torque.
     pub(in super::super) const GEAR_LOSS: usize = 11;
-    /// Rolling resistance over load, of the ground.
+    /// Rolling resistance coefficient of the ground.
     pub(in super::super) const RESISTANCE: usize = 12;
-    /// Error of the rolling radius: mean, and right minus left.
+    /// Relative error of the rolling radius: mean, and difference right minus left.
     pub(in super::super) const RADIUS: usize = 13;
     pub(in super::super) const RADIUS_DIFFERENCE: usize = 14;
-    /// ln of the greatest friction coefficient, of the ground.
+    /// ln of the friction coefficient `μ_p` that the curve approaches, of the ground.
     pub(in super::super) const PEAK: usize = 15;
-    /// Sharpness and early bend of the curve, of the ground: `1/n` and `a` of the model.
+    /// Shape of the friction curve of the ground: `1/n` and `a` of the module `model`.
     pub(in super::super) const SHAPE: usize = 16;
     pub(in super::super) const BEND: usize = 17;
     /// Offset of the gyro, radians per second.
@@ -54,11 +57,12 @@ pub(super) mod index {
     pub(in super::super) const LEFT_OFFSET: usize = 20;
     /// Height of the centre of mass over the track.
     pub(in super::super) const HEIGHT: usize = 21;
-    /// Offset of the body speed, metres per second.
+    /// Offset of the measured body speed, metres per second.
     pub(in super::super) const SPEED_OFFSET: usize = 22;
 }
 
-/// Parameters of the ground and of what it makes of the tyres. They begin anew on new ground.
+/// Parameters of the ground and of the tyres' friction curve on it. They start from the initial
+/// prior on new ground.
 pub(super) const OF_GROUND: [usize; 7] = [
     index::STIFFNESS,
     index::RESISTANCE,
@@ -69,8 +73,8 @@ pub(super) const OF_GROUND: [usize; 7] = [
     index::SLOPE_Y,
 ];
 
-/// Parameters that change with the load, and those of the ground: where a robot stood long enough to
-/// be loaded, the curve that it leaves on is not that it came on.
+/// Parameters of the load and the ground. Both are reset with a new load, because the friction
+/// curve of the tyres after a stop that is long enough for loading may differ.
 pub(super) const OF_LOAD_AND_GROUND: [usize; 12] = [
     index::MASS,
     index::INERTIA,
@@ -88,35 +92,36 @@ pub(super) const OF_LOAD_AND_GROUND: [usize; 12] = [
 
 /// Mean and standard deviation of ln K: ground from wet ice to asphalt.
 const LN_STIFFNESS: (f64, f64) = (1.1, 2.0);
-/// Of ln of the greatest friction coefficient.
+/// Mean and standard deviation of ln `μ_p`.
 const LN_PEAK: (f64, f64) = (-0.6, 0.4);
-/// Of the curve's sharpness `1/n` and early bend `a`.
+/// Means and standard deviations of the curve's shape, `1/n` and `a`.
 const SHAPE: (f64, f64) = (0.3, 0.2);
 const BEND: (f64, f64) = (0.25, 0.25);
-/// Smallest `1/n`: the curve is straight up to its peak.
+/// Minimum of `1/n`, at which the curve is practically straight up to its peak.
 pub(super) const SHAPE_MIN: f64 = 0.05;
-/// Standard deviation of where the centre of mass is, over the wheelbase.
+/// Standard deviation of the centre of mass's forward position, relative to the wheelbase.
 const CENTRE_FORWARD_STD_DEV: f64 = 0.03;
-/// Mean and standard deviation of its height over the track.
+/// Mean and standard deviation of the centre of mass's height, relative to the track width.
 const HEIGHT: (f64, f64) = (0.35, 0.1);
-/// Standard deviation of the ground's rise along one axis.
+/// Standard deviation of the ground's slope along one axis.
 const SLOPE_STD_DEV: f64 = 0.035;
-/// Standard deviation of the torque scale of both sides over that of each side's own.
+/// Standard deviation of the torque scale's mean over both sides, relative to the configured
+/// standard deviation of one side.
 const TORQUE_SCALE_RATIO: f64 = 1.75;
-/// Mean and standard deviation of the torque that gears lose, over what they transmit.
+/// Mean and standard deviation of the gear loss, relative to the transmitted torque.
 const GEAR_LOSS: (f64, f64) = (0.015, 0.01);
-/// Of rolling resistance over load.
+/// Mean and standard deviation of the rolling resistance coefficient.
 const RESISTANCE: (f64, f64) = (0.025, 0.01);
 /// Standard deviation of an offset of the body speed, metres per second.
 const SPEED_OFFSET_STD_DEV: f64 = 0.005;
-/// Least standard deviation, where a prior counts something as exact.
+/// Minimum standard deviation, used where the configuration gives 0.
 const STD_DEV_MIN: f64 = 1.0e-4;
 
-/// Mean and standard deviation of each parameter before anything is measured.
+/// Returns mean and standard deviation of each parameter before any measurement.
 pub(super) fn prior(prior: &EstimatorPrior, noise: &SensorNoise) -> (Values, Values) {
     let tyres = &prior.tyres;
     let payload = 1.0 + prior.model.payload_ratio;
-    // A log-normal distribution of that mean and standard deviation.
+    // Variance of the logarithm of a log-normal distribution with that mean and standard deviation.
     let spread = (1.0 + (tyres.relaxation_std_dev_m / tyres.relaxation_m).powi(2)).ln();
     let side = noise.torque_gain_ratio * std::f64::consts::FRAC_1_SQRT_2;
     let table = [
@@ -177,7 +182,7 @@ pub(super) fn prior(prior: &EstimatorPrior, noise: &SensorNoise) -> (Values, Val
     (means, std_devs)
 }
 
-/// What the parameters say of a robot, in units.
+/// The parameters of a robot in SI units.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Robot<T> {
     pub(super) track_m: f64,
@@ -191,13 +196,13 @@ pub(super) struct Robot<T> {
     pub(super) centre_m: [T; 3],
     pub(super) relaxation_m: T,
     pub(super) slope: [T; 2],
-    /// Measured over true torque, left and right.
+    /// Ratio of measured to true torque, left and right.
     pub(super) torque_scale: [T; 2],
-    /// Inertia of a side's rotors over the square of the radius, kilograms.
+    /// Inertia of one side's rotors and wheels over the square of the wheel radius, kilograms.
     pub(super) rotors_kg: T,
     pub(super) gear_loss: T,
     pub(super) resistance: T,
-    /// Left and right.
+    /// Rolling radius, left and right, metres.
     pub(super) radius_m: [T; 2],
     pub(super) peak: T,
     /// n of the curve.
@@ -209,6 +214,7 @@ pub(super) struct Robot<T> {
 }
 
 impl<T: Real> Robot<T> {
+    /// Converts parameters in the units of [`index`] for a robot of this configured model.
     pub(super) fn new(values: &[T; PARAMETERS], model: &RobotModel) -> Self {
         let of = |place: usize| values[place];
         let mass_kg = of(index::MASS).exp() * model.mass_kg();

@@ -1,20 +1,22 @@
-//! The robot's own parameters, as people know them, with standard deviations.
+//! The robot's own parameters in physical units, with standard deviations.
 
 use super::parameters::{Values, index};
 use super::{BLOCKS_MIN, Identification, SQUARE_MAX};
 use crate::estimation::{IdentifiedRobot, IdentifiedValue};
 
-/// Errors since the equations are not those of the true contacts: of masses over the model's, of yaw
-/// inertia over mass, and of the centre of mass over the wheelbase and the track.
+/// Standard deviations of the errors that remain because real contacts do not follow the model's
+/// equations: of masses relative to the configured mass, of yaw inertia per mass relative to the
+/// configured one, and of the centre of mass relative to wheelbase and track width.
 const MODEL_MASS_RATIO: f64 = 0.03;
 const MODEL_INERTIA_RATIO: f64 = 0.02;
 const MODEL_CENTRE_RATIO: f64 = 0.006;
-/// Share of the first variance above which a parameter is mostly known beforehand.
+/// Fraction of the initial prior variance above which an estimate counts as prior-dominated.
 const PRIOR_SHARE_MAX: f64 = 0.5;
 
 impl Identification {
-    /// The robot's own parameters; none before anything is known, or where the robot does not move as
-    /// the model can.
+    /// Returns the robot's own parameters by the hypothesis with the lowest cost; variances are
+    /// propagated to first order. None before [`BLOCKS_MIN`] blocks, or if residuals are too large
+    /// for the model.
     pub(super) fn identify_robot(&self) -> Option<IdentifiedRobot> {
         let best = self.best()?;
         if best.age() < BLOCKS_MIN || best.worst_square() > SQUARE_MAX {
@@ -46,7 +48,7 @@ impl Identification {
             slopes(&[(index::CENTRE_FORWARD, base_m)]),
             slopes(&[(index::CENTRE_LEFT, track_m)]),
         ];
-        // What the equations miss.
+        // Errors of the model's equations.
         let mass_kg = self.model.mass_kg();
         let model = [
             MODEL_MASS_RATIO,

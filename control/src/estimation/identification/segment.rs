@@ -1,13 +1,14 @@
-//! θ of the segments of the map.
+//! θ of single segments, for the friction map.
 
 use super::{COST_SCALE, Identification, Identified, SHORT_BLOCK_S};
 
-/// Standard deviations of ln K beyond which a segment tells nothing: by its own blocks, and in all.
+/// Standard deviations of ln K above which a segment gives no θ: from its own blocks, and in total.
 const SEGMENT_OWN_STD_DEV_MAX: f64 = 0.5;
 const SEGMENT_STD_DEV_MAX: f64 = 1.0;
 
 impl Identification {
-    /// Drops the last block: it may be of another ground.
+    /// Drops the last block of every hypothesis and the open one, which may contain samples of
+    /// another ground.
     pub(in super::super) fn drop_last_block(&mut self) {
         for hypothesis in &mut self.hypotheses {
             hypothesis.drop_last_block();
@@ -17,9 +18,11 @@ impl Identification {
         self.is_moving = false;
     }
 
-    /// Ends a segment of this ground, and gives θ of its own blocks; none where that tells nothing.
-    /// θ is linear in ln K about that of the whole ground, so that the noise of short segments averages
-    /// out in a weighted mean.
+    /// Ends a segment and returns θ from its own blocks; None if its standard deviation is too
+    /// large.
+    ///
+    /// θ is linearised in ln K about the ground's estimate, `θ = θ_g (1 − ln K + ln K_g)`: so the
+    /// noise of short segments has mean zero and averages out in a weighted mean.
     pub(in super::super) fn close_segment(&mut self) -> Option<Identified> {
         if self.block_s >= SHORT_BLOCK_S {
             self.end_block();
@@ -45,7 +48,7 @@ impl Identification {
         let ground = ground.filter(|_| is_known)?;
         mean /= weights;
         own /= weights;
-        // What the hypotheses differ by is not known of the robot.
+        // The disagreement of the hypotheses counts as uncertainty of the robot's parameters.
         let of_robot = known / weights + (square / weights - mean * mean).max(0.0);
         if own.sqrt() > SEGMENT_OWN_STD_DEV_MAX || (own + of_robot).sqrt() > SEGMENT_STD_DEV_MAX {
             return None;

@@ -9,19 +9,22 @@ use tread_lab::report::{checks_json, checks_markdown};
 /// Most seeded runs per scenario.
 const RUNS_MAX: u32 = 100_000;
 
-/// What was asked for on the command line.
+/// Arguments of the command line.
 pub(crate) struct Options {
-    /// Seeded runs per scenario with noise.
+    /// Number of seeded runs for each scenario with noise.
     pub(crate) runs: u32,
-    /// Threads that share the runs.
+    /// Number of threads that share the runs.
     pub(crate) threads: usize,
-    /// One JSON object instead of tables.
+    /// Whether to print one JSON object instead of tables.
     pub(crate) json: bool,
     only: Vec<String>,
 }
 
 impl Options {
-    /// Reads the arguments; an error is a sentence for people.
+    /// Reads the arguments of the command line.
+    ///
+    /// # Errors
+    /// The usage line, if an argument is unknown or a number is out of range.
     pub(crate) fn from_arguments(
         arguments: impl Iterator<Item = String>,
     ) -> Result<Self, &'static str> {
@@ -37,7 +40,7 @@ impl Options {
             let mut value = || arguments.next().ok_or(USAGE);
             match argument.as_str() {
                 "--json" => options.json = true,
-                // What is printed anyway, asked for as of the other report programs.
+                // The default; accepted because the other report programs have it.
                 "--markdown" => options.json = false,
                 "--runs" => options.runs = value()?.parse().map_err(|_| USAGE)?,
                 "--threads" => options.threads = value()?.parse().map_err(|_| USAGE)?,
@@ -58,30 +61,30 @@ impl Options {
         Ok(options)
     }
 
-    /// Whether a part is to run.
+    /// Returns whether a part is to run: all parts do if none is named.
     pub(crate) fn wants(&self, part: &str) -> bool {
         self.only.is_empty() || self.only.iter().any(|name| name == part)
     }
 }
 
-/// What one part of the program found.
+/// Result of one part of the program.
 pub(crate) struct Section {
-    /// The tables for people, Markdown.
+    /// Tables for people, in Markdown.
     pub(crate) text: String,
     /// The same figures for programs.
     pub(crate) figures: Value,
-    /// What must hold.
+    /// Checks of the part, some of which may have failed.
     pub(crate) checks: Vec<Check>,
 }
 
 impl Section {
-    /// Whether every check holds.
+    /// Returns whether every check holds.
     pub(crate) fn holds(&self) -> bool {
         self.checks.iter().all(|check| check.holds)
     }
 }
 
-/// The whole report.
+/// Returns the whole report, in JSON or Markdown.
 pub(crate) fn render(sections: &[(&str, Section)], as_json: bool) -> String {
     let checks = sections.iter().flat_map(|(_, section)| &section.checks);
     if as_json {

@@ -226,7 +226,8 @@ impl SeededRobot {
     }
 }
 
-/// Runs of the seeds from 0 on, on all threads; results stand in their order.
+/// Calls `one` with each seed from 0 to `runs` − 1 in parallel, and returns the results in the
+/// order of the seeds.
 pub(crate) fn run_seeded<T: Send>(runs: u32, one: impl Fn(u64) -> T + Sync + Send) -> Vec<T> {
     let seeds: Vec<u64> = (0..u64::from(runs)).collect();
     in_parallel(&seeds, |&seed| one(seed))

@@ -131,18 +131,19 @@ pub(super) fn check_endpoint(endpoint: &str) -> Result<(), LinkError> {
 }
 
 impl Tunnel {
-    /// Connects, retrying until it succeeds. If the future is dropped, nothing is left behind.
+    /// Opens a tunnel to the server: retries until the server accepts the connection, however long
+    /// that takes. If the future is dropped, the attempt ends and leaves nothing behind.
     ///
     /// # Errors
-    /// [`LinkError`]: the endpoint is invalid, the certificate cannot be used, or no local port can
-    /// be opened.
+    /// [`LinkError`] at once, without a retry: the endpoint is invalid, the certificate cannot be
+    /// used, or no local port can be opened.
     pub async fn open(endpoint: &str, membership: &Membership) -> Result<Self, LinkError> {
         let nobody: Note = Arc::new(|_noted| {});
         Self::open_noting(endpoint, membership, &nobody).await
     }
 
-    /// Connects as [`Tunnel::open`] does, and notes a server whose certificate the robot does not
-    /// trust.
+    /// Opens a tunnel as [`Tunnel::open`] does, and reports [`Noted::Distrusted`] once if the
+    /// server's certificate is by an authority that the robot does not trust.
     ///
     /// # Errors
     /// As [`Tunnel::open`].

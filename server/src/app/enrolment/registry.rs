@@ -87,7 +87,7 @@ impl EnrolmentRegistry {
         }
     }
 
-    /// Returns whether this enrolment of the robot is in force.
+    /// Returns whether the robot's newest enrolment has this number and is not revoked.
     pub fn is_in_force(&self, key: &RobotKey, enrolment: u32) -> bool {
         self.standing(key) == Some(Standing::Enrolled(enrolment))
     }

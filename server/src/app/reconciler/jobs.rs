@@ -373,7 +373,8 @@ pub(super) async fn disown(
     Ok(Finished::Again)
 }
 
-/// Commands a second agent under a robot's name to end the mission that it drives.
+/// Sends a cancel of its mission to a second agent that runs under a robot's name. Settled if that
+/// agent drives no mission; otherwise the job runs again until it has ended.
 pub(super) async fn end_duplicate_agent(app: App, duplicate: DuplicateAgent) -> Finished {
     let DuplicateAgent { key, boot, mission } = duplicate;
     let Some(mission) = mission else {
