@@ -19,34 +19,13 @@ pub struct Check {
 }
 
 impl Check {
-    /// A figure that must not be above a bound; none, and NaN, do not hold.
-    pub fn at_most(name: impl Into<String>, value: impl Into<Option<f64>>, bound: f64) -> Self {
-        let value = value.into();
-        Self {
+    /// Begins the check of a figure, `None` if nothing was measured. The comparison follows:
+    /// `Check::of(name, value).at_most(bound)`. So value and bound cannot be swapped.
+    #[must_use]
+    pub fn of(name: impl Into<String>, value: impl Into<Option<f64>>) -> Figure {
+        Figure {
             name: name.into(),
-            goal: format!("≤ {bound}"),
-            value,
-            holds: value.is_some_and(|value| value <= bound),
-        }
-    }
-
-    /// A figure that must not be below a bound; NaN does not hold.
-    pub fn at_least(name: impl Into<String>, value: f64, bound: f64) -> Self {
-        Self {
-            name: name.into(),
-            goal: format!("≥ {bound}"),
-            value: Some(value),
-            holds: value >= bound,
-        }
-    }
-
-    /// A figure that must lie between two bounds; NaN does not hold.
-    pub fn between(name: impl Into<String>, value: f64, range: RangeInclusive<f64>) -> Self {
-        Self {
-            name: name.into(),
-            goal: format!("{} … {}", range.start(), range.end()),
-            value: Some(value),
-            holds: range.contains(&value),
+            value: value.into(),
         }
     }
 
@@ -59,6 +38,44 @@ impl Check {
     /// Whether it holds, for people.
     pub fn verdict(&self) -> &'static str {
         if self.holds { "holds" } else { "FAILS" }
+    }
+}
+
+/// A figure before it is held against its bound; none, and NaN, are within no bound.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Figure {
+    name: String,
+    value: Option<f64>,
+}
+
+impl Figure {
+    /// The figure must not be above a bound.
+    #[must_use]
+    pub fn at_most(self, bound: f64) -> Check {
+        self.check(format!("≤ {bound}"), |value| value <= bound)
+    }
+
+    /// The figure must not be below a bound.
+    #[must_use]
+    pub fn at_least(self, bound: f64) -> Check {
+        self.check(format!("≥ {bound}"), |value| value >= bound)
+    }
+
+    /// The figure must lie between two bounds or on one of them.
+    #[must_use]
+    pub fn between(self, range: RangeInclusive<f64>) -> Check {
+        let goal = format!("{} … {}", range.start(), range.end());
+        self.check(goal, |value| range.contains(&value))
+    }
+
+    fn check(self, goal: String, is_within: impl FnOnce(f64) -> bool) -> Check {
+        let Self { name, value } = self;
+        Check {
+            holds: value.is_some_and(is_within),
+            name,
+            goal,
+            value,
+        }
     }
 }
 
@@ -91,12 +108,12 @@ mod tests {
 
     #[test]
     fn a_bar_in_a_name_ends_no_cell_and_no_number_holds_no_goal() {
-        let check = Check::at_most("|ε|, m", f64::NAN, 0.1);
+        let check = Check::of("|ε|, m", f64::NAN).at_most(0.1);
         let table = checks_markdown([&check]);
         let last = table.lines().last().unwrap();
         assert_eq!(last, "| \\|ε\\|, m | ≤ 0.1 | NaN | FAILS |");
-        assert!(!Check::between("x", f64::NAN, 0.0..=1.0).holds);
-        let nothing = Check::at_most("x", None, 1.0);
+        assert!(!Check::of("x", f64::NAN).between(0.0..=1.0).holds);
+        let nothing = Check::of("x", None).at_most(1.0);
         assert!(!nothing.holds && nothing.figure(4) == "none");
     }
 }

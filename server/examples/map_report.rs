@@ -371,24 +371,17 @@ fn main() -> anyhow::Result<ExitCode> {
         segments_per_s,
         ack_p99_ms,
     } = asked.uploaded;
-    let at_most = |name, goal, most: f64, value: f64| (name, goal, value, value <= most);
     let checks = [
-        at_most("memory_bytes_per_sum", "<= 200", 200.0, with_squares),
-        at_most("path_1_km_p99_ms", "<= 5", 5.0, asked.path_p99_ms),
-        at_most(
+        Figure::of("memory_bytes_per_sum", with_squares).at_most(200.0),
+        Figure::of("path_1_km_p99_ms", asked.path_p99_ms).at_most(5.0),
+        Figure::of(
             "path_1_km_under_uploads_p99_ms",
-            "<= 5",
-            5.0,
             asked.path_under_uploads_p99_ms,
-        ),
-        at_most("tile_256_p99_ms", "<= 20", 20.0, asked.tile_p99_ms),
-        (
-            "segments_per_s",
-            ">= 19000",
-            segments_per_s,
-            segments_per_s >= 19_000.0,
-        ),
-        at_most("upload_ack_p99_ms", "<= 100", 100.0, ack_p99_ms),
+        )
+        .at_most(5.0),
+        Figure::of("tile_256_p99_ms", asked.tile_p99_ms).at_most(20.0),
+        Figure::of("segments_per_s", segments_per_s).at_least(19_000.0),
+        Figure::of("upload_ack_p99_ms", ack_p99_ms).at_most(100.0),
     ];
     let figures = [
         ("memory_bytes_per_sum_without_kept_squares", bytes),
@@ -396,24 +389,72 @@ fn main() -> anyhow::Result<ExitCode> {
     ];
     let is_json = std::env::args().any(|argument| argument == "--json");
     if is_json {
-        let checks = checks.map(|(name, goal, value, holds)| {
-            json!({"name": name, "goal": goal, "value": value, "holds": holds})
+        let checks = checks.each_ref().map(|check| {
+            json!({
+                "name": check.name, "goal": check.goal,
+                "value": check.value, "holds": check.holds,
+            })
         });
         let figures = figures.map(|(name, value)| json!({"name": name, "value": value}));
         writeln_out(&json!({"checks": checks, "figures": figures}).to_string())?;
     } else {
-        for (name, goal, value, holds) in checks {
+        for Check {
+            name,
+            goal,
+            value,
+            holds,
+        } in &checks
+        {
             writeln_out(&format!("{name}: {value:.2} (goal {goal}), holds: {holds}"))?;
         }
         for (name, value) in figures {
             writeln_out(&format!("{name}: {value:.2}"))?;
         }
     }
-    Ok(if checks.iter().all(|check| check.3) {
+    Ok(if checks.iter().all(|check| check.holds) {
         ExitCode::SUCCESS
     } else {
         ExitCode::FAILURE
     })
+}
+
+/// A figure with its goal, and whether it reaches it.
+struct Check {
+    name: &'static str,
+    goal: String,
+    value: f64,
+    holds: bool,
+}
+
+/// A figure before it is held against its limit, so that the two cannot be swapped.
+#[derive(Clone, Copy)]
+struct Figure {
+    name: &'static str,
+    value: f64,
+}
+
+impl Figure {
+    fn of(name: &'static str, value: f64) -> Self {
+        Self { name, value }
+    }
+
+    fn at_most(self, most: f64) -> Check {
+        self.check(format!("<= {most}"), self.value <= most)
+    }
+
+    fn at_least(self, least: f64) -> Check {
+        self.check(format!(">= {least}"), self.value >= least)
+    }
+
+    fn check(self, goal: String, holds: bool) -> Check {
+        let Self { name, value } = self;
+        Check {
+            name,
+            goal,
+            value,
+            holds,
+        }
+    }
 }
 
 fn writeln_out(line: &str) -> std::io::Result<()> {

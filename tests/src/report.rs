@@ -23,24 +23,19 @@ pub struct Check {
 }
 
 impl Check {
-    /// A figure that must be at least `least`.
-    pub fn at_least(name: impl Into<String>, least: f64, value: f64) -> Self {
-        Self::new(name, format!(">= {least}"), value, value >= least)
+    /// Begins the check of a figure; the comparison follows: `Check::of(name, value).at_most(limit)`.
+    /// So value and limit cannot be swapped.
+    #[must_use]
+    pub fn of(name: impl Into<String>, value: f64) -> Figure {
+        let name = name.into();
+        Figure { name, value }
     }
 
-    /// A figure that must be at most `most`.
-    pub fn at_most(name: impl Into<String>, most: f64, value: f64) -> Self {
-        Self::new(name, format!("<= {most}"), value, value <= most)
-    }
-
-    /// A figure that must be below `limit`.
-    pub fn below(name: impl Into<String>, limit: f64, value: f64) -> Self {
-        Self::new(name, format!("< {limit}"), value, value < limit)
-    }
-
-    /// A count that must be `goal`.
-    pub fn exactly(name: impl Into<String>, goal: u64, value: u64) -> Self {
-        Self::new(name, format!("= {goal}"), figure(value), value == goal)
+    /// Begins the check of a count: `Check::of_count(name, count).exactly(goal)`.
+    #[must_use]
+    pub fn of_count(name: impl Into<String>, value: u64) -> Count {
+        let name = name.into();
+        Count { name, value }
     }
 
     /// Something that must be so.
@@ -60,6 +55,58 @@ impl Check {
             value,
             holds,
         }
+    }
+}
+
+/// A figure before it is held against its limit; NaN is within none.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Figure {
+    name: String,
+    value: f64,
+}
+
+impl Figure {
+    /// The figure must be at least `least`.
+    #[must_use]
+    pub fn at_least(self, least: f64) -> Check {
+        let holds = self.value >= least;
+        Check::new(self.name, format!(">= {least}"), self.value, holds)
+    }
+
+    /// The figure must be at most `most`.
+    #[must_use]
+    pub fn at_most(self, most: f64) -> Check {
+        let holds = self.value <= most;
+        Check::new(self.name, format!("<= {most}"), self.value, holds)
+    }
+
+    /// The figure must be below `limit`.
+    #[must_use]
+    pub fn below(self, limit: f64) -> Check {
+        let holds = self.value < limit;
+        Check::new(self.name, format!("< {limit}"), self.value, holds)
+    }
+
+    /// The figure is shown beside others and need only exist.
+    #[must_use]
+    pub fn shown(self) -> Check {
+        Check::shown(self.name, self.value)
+    }
+}
+
+/// A count before it is held against its goal.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Count {
+    name: String,
+    value: u64,
+}
+
+impl Count {
+    /// The count must be `goal`.
+    #[must_use]
+    pub fn exactly(self, goal: u64) -> Check {
+        let holds = self.value == goal;
+        Check::new(self.name, format!("= {goal}"), figure(self.value), holds)
     }
 }
 
@@ -145,9 +192,9 @@ mod tests {
     #[test]
     fn what_is_not_a_number_never_holds() {
         let checks = [
-            Check::at_least("", 0.0, f64::NAN),
-            Check::at_most("", 0.0, f64::NAN),
-            Check::below("", 0.0, f64::NAN),
+            Check::of("", f64::NAN).at_least(0.0),
+            Check::of("", f64::NAN).at_most(0.0),
+            Check::of("", f64::NAN).below(0.0),
             Check::shown("", f64::NAN),
         ];
         assert!(checks.iter().all(|check| !check.holds), "{checks:?}");
@@ -155,11 +202,11 @@ mod tests {
 
     #[test]
     fn bounds_belong_to_what_holds_but_not_to_below() {
-        assert!(Check::at_least("", 2.0, 2.0).holds);
-        assert!(Check::at_most("", 2.0, 2.0).holds);
-        assert!(!Check::below("", 2.0, 2.0).holds);
-        assert!(Check::exactly("", 2, 2).holds);
-        assert!(!Check::exactly("", 2, 3).holds);
+        assert!(Check::of("", 2.0).at_least(2.0).holds);
+        assert!(Check::of("", 2.0).at_most(2.0).holds);
+        assert!(!Check::of("", 2.0).below(2.0).holds);
+        assert!(Check::of_count("", 2).exactly(2).holds);
+        assert!(!Check::of_count("", 3).exactly(2).holds);
         assert!(!Check::so("", false).holds);
     }
 

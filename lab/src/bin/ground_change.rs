@@ -219,12 +219,12 @@ fn main() -> anyhow::Result<ExitCode> {
         .iter()
         .map(|line| {
             let name = format!("false alarms per hour {}", with_or_without(line.has_torque));
-            Check::at_most(name, false_per_hour(line), FALSE_PER_HOUR_MAX)
+            Check::of(name, false_per_hour(line)).at_most(FALSE_PER_HOUR_MAX)
         })
         .collect();
     checks.extend(lines.first().map(|line| {
         let name = "K 5 to 1 with torque: detected within 2 s";
-        Check::at_least(name, line.in_time, DETECTED_MIN)
+        Check::of(name, line.in_time).at_least(DETECTED_MIN)
     }));
     if arguments.json {
         let object = serde_json::json!({

@@ -393,7 +393,7 @@ fn main() -> anyhow::Result<ExitCode> {
             ("ours over the best peer", line.over_peer),
             ("with its own θ over without", line.over_unknown),
         ] {
-            checks.push(Check::at_most(format!("{name}: {what}"), value, LINE_GOAL));
+            checks.push(Check::of(format!("{name}: {what}"), value).at_most(LINE_GOAL));
         }
     }
     let sum = |which: usize| -> f64 {
@@ -403,11 +403,13 @@ fn main() -> anyhow::Result<ExitCode> {
             .sum()
     };
     let mean = sum(0) / sum(1);
-    checks.push(Check::at_most(
-        "ours over the best peer, both means over the lines above the localisation's own error",
-        mean,
-        MEAN_GOAL,
-    ));
+    checks.push(
+        Check::of(
+            "ours over the best peer, both means over the lines above the localisation's own error",
+            mean,
+        )
+        .at_most(MEAN_GOAL),
+    );
     let failed = checks.iter().filter(|check| !check.holds).count();
     if arguments.json {
         println!(

@@ -103,58 +103,48 @@ impl Facts {
         .collect();
         let mut checks = vec![
             Check::so("the server survived", !server.has_ended),
-            Check::exactly(
+            Check::of_count(
                 "floods that were sent",
-                count(Flood::ALL.len() + HTTP_FLOODS),
                 count(floods.iter().filter(|done| done.count > 0).count()),
-            ),
+            )
+            .exactly(count(Flood::ALL.len() + HTTP_FLOODS)),
         ];
         if !server.has_ended {
             let (is_verified, missing) = audited(fleet, worked, &mut failures).await?;
             checks.push(Check::so("tread audit verify", is_verified));
-            checks.push(Check::exactly(
-                "changes by the admin that the audit log lost",
-                0,
-                missing,
-            ));
+            checks.push(
+                Check::of_count("changes by the admin that the audit log lost", missing).exactly(0),
+            );
             let path = format!("/v1/sites/{SITE}/friction/terrains");
             let mu_max = largest_mu(&fleet.rest.get(&path).await);
-            checks.push(Check::at_most("largest mu in the map", MU_PEAK_MAX, mu_max));
+            checks.push(Check::of("largest mu in the map", mu_max).at_most(MU_PEAK_MAX));
         }
         checks.extend([
-            Check::at_least(
+            Check::of(
                 "stops by the operator",
-                1.0,
                 figure(count(worked.stops_ms.len())),
-            ),
-            Check::exactly("stops that failed", 0, count(worked.failed_stops.len())),
-            Check::exactly("looks that failed", 0, count(worked.failed_looks.len())),
-            Check::exactly(
+            )
+            .at_least(1.0),
+            Check::of_count("stops that failed", count(worked.failed_stops.len())).exactly(0),
+            Check::of_count("looks that failed", count(worked.failed_looks.len())).exactly(0),
+            Check::of_count(
                 "introductions that failed",
-                0,
                 count(worked.failed_hellos.len()),
-            ),
-            Check::exactly(
+            )
+            .exactly(0),
+            Check::of_count(
                 "work of the operator that failed",
-                0,
                 count(worked.failed_work.len()),
-            ),
-            Check::exactly(
+            )
+            .exactly(0),
+            Check::of_count(
                 "changes by the admin that failed",
-                0,
                 count(worked.failed_changes.len()),
-            ),
-            Check::at_least(
-                "changes by the admin",
-                1.0,
-                figure(count(worked.changes.len())),
-            ),
-            Check::at_most(
-                "memory of the server, MiB",
-                MEMORY_MAX_MIB,
-                server.memory_peak_mib,
-            ),
-            Check::at_most("log of the server, MiB", LOG_MAX_MIB, server.log_mib),
+            )
+            .exactly(0),
+            Check::of("changes by the admin", figure(count(worked.changes.len()))).at_least(1.0),
+            Check::of("memory of the server, MiB", server.memory_peak_mib).at_most(MEMORY_MAX_MIB),
+            Check::of("log of the server, MiB", server.log_mib).at_most(LOG_MAX_MIB),
         ]);
         let timed = timed(worked);
         Ok(Self {
@@ -211,25 +201,25 @@ fn timed(worked: &Worked) -> Vec<Check> {
             "stop over a new connection p50, ms",
             sorted(&worked.stops_ms, 0.5),
         ),
-        Check::at_most(
+        Check::of(
             "stop over a new connection p99, ms",
-            STOP_P99_MAX_MS,
             sorted(&worked.stops_ms, 0.99),
-        ),
+        )
+        .at_most(STOP_P99_MAX_MS),
         Check::shown(
             "stop over a new connection, longest, ms",
             sorted(&worked.stops_ms, 1.0),
         ),
-        Check::at_most(
+        Check::of(
             "age of another robot's state, oldest, ms",
-            STATE_AGE_MAX_MS,
             sorted(&worked.ages_ms, 1.0),
-        ),
-        Check::at_most(
+        )
+        .at_most(STATE_AGE_MAX_MS),
+        Check::of(
             "introduction of another robot, longest, ms",
-            HELLO_MAX_MS,
             sorted(&worked.hellos_ms, 1.0),
-        ),
+        )
+        .at_most(HELLO_MAX_MS),
         Check::shown(
             "other work of the operator p99, ms",
             sorted(&worked.work_ms, 0.99),

@@ -19,7 +19,7 @@ use tread_tests::fleet::Fleet;
 use tread_tests::light_robot::LightRobot;
 use tread_tests::process::node;
 use tread_tests::random::Random;
-use tread_tests::report::{self, Check, figure, quantile};
+use tread_tests::report::{self, Check, Figure, figure, quantile};
 
 use crate::floods::HONEST_ROBOT;
 
@@ -121,35 +121,33 @@ pub(crate) async fn run(arguments: &Arguments, json: bool) -> anyhow::Result<Exi
     let stopped = fleet.rest.call(reqwest::Method::POST, &stop, None).await;
     let is_stopped = stopped.is_some_and(|(_, stop)| stop["confirmed_at"].is_string());
     let (oldest, longest) = (quantile(&mut ages_ms, 1.0), quantile(&mut hellos_ms, 1.0));
-    let bounded = |name: &str, most: f64, value: f64| {
+    let bounded = |figure: Figure, most: f64| {
         if arguments.untimed {
-            Check::shown(name, value)
+            figure.shown()
         } else {
-            Check::at_most(name, most, value)
+            figure.at_most(most)
         }
     };
     let count = |of: &AtomicU64| figure(of.load(Ordering::Relaxed));
     let checks = [
         Check::so("the server survived", survived && !fleet.has_server_ended()),
         Check::so("the other robot is stopped and confirms", is_stopped),
-        Check::exactly("looks and introductions that failed", 0, failed),
+        Check::of_count("looks and introductions that failed", failed).exactly(0),
         bounded(
-            "age of the other robot's state, oldest, ms",
+            Check::of("age of the other robot's state, oldest, ms", oldest),
             STATE_AGE_MAX_MS,
-            oldest,
         ),
         bounded(
-            "introduction of the other robot, longest, ms",
+            Check::of("introduction of the other robot, longest, ms", longest),
             HELLO_MAX_MS,
-            longest,
         ),
-        Check::at_least("damaged payloads", 100.0, count(&sent.payloads)),
-        Check::at_least("damaged openings", 10.0, count(&sent.openings)),
-        Check::at_least(
+        Check::of("damaged payloads", count(&sent.payloads)).at_least(100.0),
+        Check::of("damaged openings", count(&sent.openings)).at_least(10.0),
+        Check::of(
             "share of damaged openings that ended in time",
-            1.0,
             count(&sent.ended_openings) / count(&sent.openings).max(1.0),
-        ),
+        )
+        .at_least(1.0),
     ];
     let words = format!(
         "{} damaged payloads in {} sessions, {} damaged openings\n",

@@ -465,23 +465,23 @@ async fn tell(
             .map(|operation| format!("not in the table: {operation}")),
     );
     let checks = [
-        Check::at_least(
+        Check::of(
             "operations",
-            60.0,
             figure(u64::try_from(target.operations.len())?),
-        ),
-        Check::exactly(
+        )
+        .at_least(60.0),
+        Check::of_count(
             "operations of which nobody wrote who may",
-            0,
             u64::try_from(unknown.len())?,
-        ),
-        Check::at_least("requests that were answered", 300.0, figure(seen.answered)),
-        Check::exactly("server errors", 0, seen.server_errors),
-        Check::exactly("answers past the guard", 0, seen.past_the_guard),
-        Check::exactly("refusals of who may", 0, seen.wrongly_refused),
-        Check::exactly("answers with a secret", 0, seen.secrets),
-        Check::exactly("secrets in the log", 0, u64::try_from(logged)?),
-        Check::exactly("requests without an answer", 0, seen.hangs),
+        )
+        .exactly(0),
+        Check::of("requests that were answered", figure(seen.answered)).at_least(300.0),
+        Check::of_count("server errors", seen.server_errors).exactly(0),
+        Check::of_count("answers past the guard", seen.past_the_guard).exactly(0),
+        Check::of_count("refusals of who may", seen.wrongly_refused).exactly(0),
+        Check::of_count("answers with a secret", seen.secrets).exactly(0),
+        Check::of_count("secrets in the log", u64::try_from(logged)?).exactly(0),
+        Check::of_count("requests without an answer", seen.hangs).exactly(0),
         Check::shown("503 with Retry-After", figure(seen.unavailable)),
         Check::shown("longest answer, ms", seen.longest_ms),
         Check::so("the server survived", !fleet.has_server_ended()),

@@ -258,7 +258,7 @@ impl Report {
         let mut checks: Vec<Check> = all
             .map(|line| {
                 let name = format!("{}: coverage of fused cells", line.name);
-                Check::at_least(name, COVERAGE_MIN, line.coverage)
+                Check::of(name, line.coverage).at_least(COVERAGE_MIN)
             })
             .collect();
         let estimates = lines.iter().map(|line| u64::from(line.estimates)).sum();

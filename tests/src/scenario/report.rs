@@ -113,16 +113,16 @@ impl Report {
             farthest.fold(0.0, f64::max)
         };
         let mut checks = vec![
-            Check::at_most(
+            Check::of(
                 "on ice with the map: departures > 0.3 m from the path",
-                0.0,
                 f64::from(sum(0)),
-            ),
-            Check::at_most(
+            )
+            .at_most(0.0),
+            Check::of(
                 "on ice with the map: farthest from the path, m",
-                BAND_M,
                 farthest(0),
-            ),
+            )
+            .at_most(BAND_M),
             Check::shown(
                 "on ice without the map: departures > 0.3 m",
                 f64::from(sum(1)),
@@ -171,8 +171,8 @@ impl Learned {
             )
         };
         let mut checks = vec![
-            Check::at_least(cells, HELD_RATIO_MIN, self.before.held_ratio()),
-            Check::exactly(alarms, 0, self.false_alarms.len() as u64),
+            Check::of(cells, self.before.held_ratio()).at_least(HELD_RATIO_MIN),
+            Check::of_count(alarms, self.false_alarms.len() as u64).exactly(0),
         ];
         if self.frozen.cells > 0 {
             // What was known of the ford before it froze is of another ground.
@@ -182,11 +182,13 @@ impl Learned {
                 (self.frozen.cells, self.frozen.held),
                 |(cells, held), line| (cells + line.cells, held + line.held),
             );
-            checks.push(Check::at_least(
-                "with torque: the same with the ford's cells driven since it froze",
-                HELD_RATIO_MIN,
-                f64::from(held) / f64::from(cells),
-            ));
+            checks.push(
+                Check::of(
+                    "with torque: the same with the ford's cells driven since it froze",
+                    f64::from(held) / f64::from(cells),
+                )
+                .at_least(HELD_RATIO_MIN),
+            );
             checks.push(Check::shown(
                 "with torque: the same of the frozen ford's cells alone",
                 self.frozen.held_ratio(),
@@ -199,11 +201,13 @@ impl Learned {
                 share(first),
             );
             checks.push(shown);
-            checks.push(Check::at_least(
-                "share of the cells that show the ice after two passes",
-                SHOWN_RATIO_MIN,
-                share(second),
-            ));
+            checks.push(
+                Check::of(
+                    "share of the cells that show the ice after two passes",
+                    share(second),
+                )
+                .at_least(SHOWN_RATIO_MIN),
+            );
         }
         checks
     }

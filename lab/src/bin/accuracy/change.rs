@@ -186,16 +186,8 @@ fn changes(
         "false_alarms": alarms,
     }));
     if let Some(bound_s) = border.delay_max_s {
-        checks.push(Check::at_most(
-            format!("θ {name}: mean delay, s"),
-            mean_s,
-            bound_s,
-        ));
-        checks.push(Check::at_most(
-            format!("θ {name}: changes missed, share"),
-            missed,
-            0.0,
-        ));
+        checks.push(Check::of(format!("θ {name}: mean delay, s"), mean_s).at_most(bound_s));
+        checks.push(Check::of(format!("θ {name}: changes missed, share"), missed).at_most(0.0));
     }
 }
 
@@ -224,12 +216,14 @@ fn quiet(
         "theta": theta, "has_torque": has_torque, "hours": hours,
         "false_alarms_per_hour": rate,
     }));
-    checks.push(Check::at_most(
-        format!(
-            "θ {theta} unchanged, {}: false alarms per hour",
-            channel(has_torque)
-        ),
-        rate,
-        0.2,
-    ));
+    checks.push(
+        Check::of(
+            format!(
+                "θ {theta} unchanged, {}: false alarms per hour",
+                channel(has_torque)
+            ),
+            rate,
+        )
+        .at_most(0.2),
+    );
 }

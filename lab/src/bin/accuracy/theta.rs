@@ -171,11 +171,9 @@ pub(crate) fn run(options: &Options) -> Section {
         .collect();
     #[expect(clippy::cast_precision_loss, reason = "a count of scenarios")]
     let average = coverages.iter().sum::<f64>() / coverages.len() as f64;
-    section.checks.push(Check::between(
-        "95 % intervals hold, all scenarios on average",
-        average,
-        0.94..=0.96,
-    ));
+    section.checks.push(
+        Check::of("95 % intervals hold, all scenarios on average", average).between(0.94..=0.96),
+    );
     section
 }
 
@@ -226,35 +224,36 @@ fn check(scenario: &Scenario, found: &Figures, checks: &mut Vec<Check>) {
     match scenario.goal {
         Goal::Reports => {}
         Goal::Abstains => {
-            checks.push(Check::at_most(
-                format!("{name}: measured at some moment, share of runs"),
-                found.ever_measured,
-                0.0,
-            ));
-            checks.push(Check::at_most(
-                format!("{name}: new information at some moment, share of runs"),
-                found.ever_informed,
-                0.0,
-            ));
-            checks.push(Check::at_most(
-                format!("{name}: information in some segment, share of runs"),
-                found.ever_claimed,
-                0.0,
-            ));
+            checks.push(
+                Check::of(
+                    format!("{name}: measured at some moment, share of runs"),
+                    found.ever_measured,
+                )
+                .at_most(0.0),
+            );
+            checks.push(
+                Check::of(
+                    format!("{name}: new information at some moment, share of runs"),
+                    found.ever_informed,
+                )
+                .at_most(0.0),
+            );
+            checks.push(
+                Check::of(
+                    format!("{name}: information in some segment, share of runs"),
+                    found.ever_claimed,
+                )
+                .at_most(0.0),
+            );
         }
         Goal::Measures { rms_max } => {
             if let Some(bound) = rms_max {
-                checks.push(Check::at_most(
-                    format!("{name}: RMS error of θ"),
-                    found.rms,
-                    bound,
-                ));
+                checks.push(Check::of(format!("{name}: RMS error of θ"), found.rms).at_most(bound));
             }
-            checks.push(Check::between(
-                format!("{name}{INTERVALS_HOLD}"),
-                found.coverage[2],
-                0.925..=0.975,
-            ));
+            checks.push(
+                Check::of(format!("{name}{INTERVALS_HOLD}"), found.coverage[2])
+                    .between(0.925..=0.975),
+            );
         }
     }
 }

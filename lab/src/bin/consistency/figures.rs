@@ -455,37 +455,37 @@ fn case_checks(case: &Case, options: &Options) -> Vec<Check> {
     let wrong = count(|trial| trial.wrong.is_some()) / f64::from(trials);
     let (name, goals) = (case.name, case.goals);
     vec![
-        Check::at_most(
+        Check::of(
             format!("{name}: exciting motion until noticed, p50, s"),
             percentile(&noticed, 0.5),
-            goals.noticed_p50_s,
-        ),
-        Check::at_most(
+        )
+        .at_most(goals.noticed_p50_s),
+        Check::of(
             format!("{name}: exciting motion until named, p50, s"),
             percentile(&named, 0.5),
-            NAMED_WITHIN_S,
-        ),
-        Check::at_most(
+        )
+        .at_most(NAMED_WITHIN_S),
+        Check::of(
             format!("{name}: exciting motion until named, p95, s"),
             percentile(&named, 0.95),
-            NAMED_WITHIN_S,
-        ),
-        Check::at_most(
+        )
+        .at_most(NAMED_WITHIN_S),
+        Check::of(
             format!("{name}: exciting motion until named, max, s"),
             percentile(&named, 1.0),
-            EXCITED_MAX_S,
-        ),
+        )
+        .at_most(EXCITED_MAX_S),
         Check {
             name: format!("{name}: share of trials in which it is named"),
             goal: format!("≥ {}", goals.named_share_min),
             value: Some(identified),
             holds: identified >= goals.named_share_min,
         },
-        Check::at_most(
+        Check::of(
             format!("{name}: share of trials in which another channel is blamed"),
             wrong,
-            BLAMED_SHARE_MAX,
-        ),
+        )
+        .at_most(BLAMED_SHARE_MAX),
     ]
 }
 
@@ -518,16 +518,20 @@ pub(crate) fn checks(options: &Options) -> Vec<Check> {
         }
     }
     let hours = options.hours;
-    checks.push(Check::at_most(
-        format!("channels blamed in {hours} h without a fault, ice included"),
-        f64::from(all.blamed),
-        0.0,
-    ));
-    checks.push(Check::at_most(
-        format!("wheels and motion said to disagree off the ice in {hours} h"),
-        f64::from(all.slip_off_ice),
-        0.0,
-    ));
+    checks.push(
+        Check::of(
+            format!("channels blamed in {hours} h without a fault, ice included"),
+            f64::from(all.blamed),
+        )
+        .at_most(0.0),
+    );
+    checks.push(
+        Check::of(
+            format!("wheels and motion said to disagree off the ice in {hours} h"),
+            f64::from(all.slip_off_ice),
+        )
+        .at_most(0.0),
+    );
     checks.push(Check {
         name: format!("slip on ice said to be a disagreement in {hours} h"),
         goal: "≥ 1".to_owned(),

@@ -59,7 +59,7 @@ impl ParameterLine {
     pub(crate) fn check(&self) -> Check {
         let torque = if self.has_torque { "with" } else { "without" };
         let name = format!("{}, {torque} torque: coverage", self.name);
-        Check::at_least(name, self.coverage, COVERAGE_MIN)
+        Check::of(name, self.coverage).at_least(COVERAGE_MIN)
     }
 }
 

@@ -112,19 +112,11 @@ impl Line {
         };
         let mut checks = vec![self.coverage_check(named("coverage of the 95 % intervals"))];
         checks.extend(self.over_bound.map(|over| {
-            Check::at_most(
-                named("median half-width over the bound's"),
-                over,
-                OVER_BOUND_GOAL,
-            )
+            Check::of(named("median half-width over the bound's"), over).at_most(OVER_BOUND_GOAL)
         }));
         let most = if self.has_torque { 0.1 } else { 0.3 };
         checks.extend(self.abstained_needlessly.map(|share| {
-            Check::at_most(
-                named("none after 60 s though the bound is useful"),
-                share,
-                most,
-            )
+            Check::of(named("none after 60 s though the bound is useful"), share).at_most(most)
         }));
         checks
     }
@@ -135,7 +127,7 @@ impl Line {
         } else {
             LINE_GOAL
         };
-        Check::between(name, self.coverage, goal)
+        Check::of(name, self.coverage).between(goal)
     }
 }
 

@@ -90,15 +90,12 @@ fn tell(arguments: &Arguments, reports: Vec<RunReport>, broken: u64) -> anyhow::
     let without = |what: &str, kind: &str| {
         let of_kind = |report: &&RunReport| report.violations.iter().any(|it| it.kind == kind);
         let count = reports.iter().filter(of_kind).count() as u64;
-        Check::exactly(what, 0, count)
+        Check::of_count(what, count).exactly(0)
     };
     let checks = [
-        Check::exactly(
-            "runs that came to their end",
-            arguments.runs,
-            reports.len() as u64,
-        ),
-        Check::exactly("runs that broke", 0, broken),
+        Check::of_count("runs that came to their end", reports.len() as u64)
+            .exactly(arguments.runs),
+        Check::of_count("runs that broke", broken).exactly(0),
         without("runs with a mission that did not end", "stuck"),
         without("runs with a revived mission", "revived"),
         without("runs with two missions at once", "two_at_once"),

@@ -259,7 +259,7 @@ fn tell(
     new: &[Answers; 2],
 ) -> anyhow::Result<ExitCode> {
     let slower = |name, [normal, disturbed]: &[Answers; 2]| {
-        Check::below(name, SLOWER_MAX, disturbed.p99_ms() / normal.p99_ms())
+        Check::of(name, disturbed.p99_ms() / normal.p99_ms()).below(SLOWER_MAX)
     };
     let all = || kept.iter().chain(new);
     let failed = all().map(|answers| answers.failed).sum();
@@ -273,7 +273,7 @@ fn tell(
     let checks = [
         slower("p99 on kept connections, times normal", kept),
         slower("p99 on new connections, times normal", new),
-        Check::exactly("requests without an answer", 0, failed),
+        Check::of_count("requests without an answer", failed).exactly(0),
     ];
     let [normal, disturbed] = details.kept_p99_ms;
     let [new_normal, new_disturbed] = details.new_p99_ms;

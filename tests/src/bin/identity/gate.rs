@@ -88,32 +88,14 @@ pub(crate) async fn measure(arguments: &Arguments, fleet: &Fleet) -> anyhow::Res
         times[times.len() / 2]
     };
     Ok(vec![
-        Check::at_least(
-            "garbage connections per second",
-            0.95 * f64::from(arguments.garbage_hz),
-            rate_hz,
-        ),
-        Check::at_least("garbage refused and counted", figure(sent), figure(refused)),
-        Check::at_most(
-            "median connect without garbage, ms",
-            CONNECT_MAX_MS,
-            median(&mut alone_ms),
-        ),
-        Check::at_most(
-            "median connect under garbage, ms",
-            CONNECT_MAX_MS,
-            median(&mut ms),
-        ),
-        Check::at_most(
-            "slowest connect without garbage, ms",
-            CONNECT_MAX_MS,
-            most(&alone_ms),
-        ),
-        Check::at_most(
-            "slowest connect under garbage, ms",
-            CONNECT_MAX_MS,
-            most(&ms),
-        ),
+        Check::of("garbage connections per second", rate_hz)
+            .at_least(0.95 * f64::from(arguments.garbage_hz)),
+        Check::of("garbage refused and counted", figure(refused)).at_least(figure(sent)),
+        Check::of("median connect without garbage, ms", median(&mut alone_ms))
+            .at_most(CONNECT_MAX_MS),
+        Check::of("median connect under garbage, ms", median(&mut ms)).at_most(CONNECT_MAX_MS),
+        Check::of("slowest connect without garbage, ms", most(&alone_ms)).at_most(CONNECT_MAX_MS),
+        Check::of("slowest connect under garbage, ms", most(&ms)).at_most(CONNECT_MAX_MS),
     ])
 }
 

@@ -97,21 +97,9 @@ pub(crate) async fn measure(
     }
     let again = u64::try_from(connections(fleet) - before)?;
     Ok(vec![
-        Check::at_most(
-            "from its token to the server hearing it, s",
-            JOIN_MAX_S,
-            joined_s,
-        ),
-        Check::at_most("missions of others disturbed", 0.0, figure(disturbed)),
-        Check::at_most(
-            "looks at which another was not online",
-            0.0,
-            figure(looks_away),
-        ),
-        Check::at_most(
-            "times that another had to connect again",
-            0.0,
-            figure(again),
-        ),
+        Check::of("from its token to the server hearing it, s", joined_s).at_most(JOIN_MAX_S),
+        Check::of("missions of others disturbed", figure(disturbed)).at_most(0.0),
+        Check::of("looks at which another was not online", figure(looks_away)).at_most(0.0),
+        Check::of("times that another had to connect again", figure(again)).at_most(0.0),
     ])
 }

@@ -37,22 +37,19 @@ impl Details {
             ingest, dispatch, ..
         } = self;
         [
-            Check::at_least(
-                "segments committed per second",
-                SEGMENTS_PER_SECOND_MIN,
-                ingest.segments_per_second,
-            ),
-            Check::at_most(
+            Check::of("segments committed per second", ingest.segments_per_second)
+                .at_least(SEGMENTS_PER_SECOND_MIN),
+            Check::of(
                 "server CPU per segment, us",
-                SERVER_CPU_US_PER_SEGMENT_MAX,
                 ingest.server_cpu_us_per_segment,
-            ),
-            Check::at_most("ack p99, ms", ACK_P99_MAX_MS, ingest.ack_p99_ms),
-            Check::exactly("uploads without a receipt", 0, ingest.uploads_failed),
-            Check::exactly("acknowledged but lost", 0, ingest.acknowledged_but_lost),
-            Check::exactly("counted twice", 0, ingest.counted_twice),
-            Check::at_most("dispatch p50, ms", DISPATCH_P50_MAX_MS, dispatch.p50_ms),
-            Check::at_most("dispatch p99, ms", DISPATCH_P99_MAX_MS, dispatch.p99_ms),
+            )
+            .at_most(SERVER_CPU_US_PER_SEGMENT_MAX),
+            Check::of("ack p99, ms", ingest.ack_p99_ms).at_most(ACK_P99_MAX_MS),
+            Check::of_count("uploads without a receipt", ingest.uploads_failed).exactly(0),
+            Check::of_count("acknowledged but lost", ingest.acknowledged_but_lost).exactly(0),
+            Check::of_count("counted twice", ingest.counted_twice).exactly(0),
+            Check::of("dispatch p50, ms", dispatch.p50_ms).at_most(DISPATCH_P50_MAX_MS),
+            Check::of("dispatch p99, ms", dispatch.p99_ms).at_most(DISPATCH_P99_MAX_MS),
         ]
     }
 

@@ -198,11 +198,11 @@ impl Trial<'_> {
         let last_ms = zero.and_then(|(_, last)| last).map_or(0.0, ms);
         let first = format!("{name}: first zero command, ms");
         let last = format!("{name}: last command that was none, ms");
-        let mut checks = vec![self.judgement.at_most(first, most_ms, zero_ms)];
+        let mut checks = vec![self.judgement.at_most(Check::of(first, zero_ms), most_ms)];
         // A base that obeys now and then is tried again and again, and what a rival writes is no rest.
         let is_shared = name == "hijack" || name == "rival";
         if !is_shared {
-            checks.push(self.judgement.at_most(last, most_ms, last_ms));
+            checks.push(self.judgement.at_most(Check::of(last, last_ms), most_ms));
         }
         // A base that starts again may be heard again by now.
         if !starts_again(name) && !is_shared {

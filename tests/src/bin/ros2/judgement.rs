@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use tread_tests::report::Check;
+use tread_tests::report::{Check, Figure};
 
 /// What a run is held against.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -15,10 +15,10 @@ pub(crate) enum Judgement {
 
 impl Judgement {
     /// A figure that is at most that where the machine is fit for it; elsewhere it need only exist.
-    pub(crate) fn at_most(self, name: impl Into<String>, most: f64, value: f64) -> Check {
+    pub(crate) fn at_most(self, figure: Figure, most: f64) -> Check {
         match self {
-            Self::Figures => Check::at_most(name, most, value),
-            Self::Behaviour => Check::shown(name, value),
+            Self::Figures => figure.at_most(most),
+            Self::Behaviour => figure.shown(),
         }
     }
 

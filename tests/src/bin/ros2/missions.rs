@@ -119,18 +119,20 @@ pub(crate) async fn measure(
         }
     }
     let error = (theta - GROUND_THETA).abs() / GROUND_THETA;
-    checks.push(Check::at_most(
-        format!("missions: θ {theta:.3} of the fleet, true {GROUND_THETA}, error"),
-        THETA_ERROR_MAX,
-        error,
-    ));
+    checks.push(
+        Check::of(
+            format!("missions: θ {theta:.3} of the fleet, true {GROUND_THETA}, error"),
+            error,
+        )
+        .at_most(THETA_ERROR_MAX),
+    );
     let p50_ms = quantile(&mut delays_ms, 0.5);
     let times = delays_ms.len();
-    checks.push(judgement.at_most(
+    let p99 = Check::of(
         format!("bus: sensor to command, {times} times, p50 {p50_ms:.2} ms, p99, ms"),
-        DELAY_P99_MS,
         quantile(&mut delays_ms, 0.99),
-    ));
+    );
+    checks.push(judgement.at_most(p99, DELAY_P99_MS));
     checks
 }
 
@@ -148,7 +150,7 @@ async fn compared(fleet: &mut Fleet, ours: &[MissionQuality; 2]) -> anyhow::Resu
         );
         let name =
             format!("missions: {name}, RMS {own_mm:.1} mm, simulated {other_mm:.1} mm, ratio");
-        Check::at_most(name, CROSS_TRACK_RATIO_MAX, own_mm / other_mm)
+        Check::of(name, own_mm / other_mm).at_most(CROSS_TRACK_RATIO_MAX)
     };
     Ok([ratio("circle", 0), ratio("waypoints", 1)])
 }

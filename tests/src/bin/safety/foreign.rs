@@ -161,22 +161,19 @@ pub(crate) async fn measure(arguments: &Arguments, fleet: &Fleet) -> anyhow::Res
         .map_or(0.0, |twist| twist.value.linear_m_s.abs());
     agent.stop().await;
     Ok(vec![
-        Check::at_least(
-            "foreign: refused over zenoh",
-            figure(arguments.foreign),
-            figure(refused(counts)),
-        ),
-        Check::at_most(
+        Check::of("foreign: refused over zenoh", figure(refused(counts)))
+            .at_least(figure(arguments.foreign)),
+        Check::of(
             "foreign: accepted beyond those that were right",
-            0.0,
             figure(counts.accepted.saturating_sub(good)),
-        ),
-        Check::at_least(
+        )
+        .at_most(0.0),
+        Check::of(
             "foreign: right ones accepted, share",
-            0.9,
             figure(counts.accepted) / figure(good),
-        ),
-        Check::at_most("foreign: speed of the robot, m/s", 0.05, moved),
+        )
+        .at_least(0.9),
+        Check::of("foreign: speed of the robot, m/s", moved).at_most(0.05),
     ])
 }
 

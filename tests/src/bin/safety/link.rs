@@ -88,11 +88,13 @@ pub(crate) async fn measure(arguments: &Arguments, fleet: &Fleet) -> anyhow::Res
     #[expect(clippy::cast_precision_loss, reason = "a message's length")]
     let carried =
         figure(driven.limits_refused) * BULK_MESSAGE_BYTES as f64 / figure(arguments.seconds);
-    let mut checks = vec![Check::at_least(
-        "link: bulk carried, share of the link",
-        0.7,
-        carried / LINK_BYTES_PER_S,
-    )];
+    let mut checks = vec![
+        Check::of(
+            "link: bulk carried, share of the link",
+            carried / LINK_BYTES_PER_S,
+        )
+        .at_least(0.7),
+    ];
     checks.extend(driven.checks("link"));
     Ok(checks)
 }
@@ -118,21 +120,9 @@ pub(crate) async fn measure_tls(
     agent.stop().await;
     let uploaded = figure(before) - figure(after);
     let mut checks = vec![
-        Check::at_least(
-            "slow link by TLS: records in the outbox",
-            1.0,
-            figure(filled),
-        ),
-        Check::at_least(
-            "slow link by TLS: records uploaded meanwhile",
-            1.0,
-            uploaded,
-        ),
-        Check::at_least(
-            "slow link by TLS: records left at the end",
-            1.0,
-            figure(after),
-        ),
+        Check::of("slow link by TLS: records in the outbox", figure(filled)).at_least(1.0),
+        Check::of("slow link by TLS: records uploaded meanwhile", uploaded).at_least(1.0),
+        Check::of("slow link by TLS: records left at the end", figure(after)).at_least(1.0),
     ];
     checks.extend(driven.checks("slow link by TLS"));
     Ok(checks)
@@ -166,21 +156,21 @@ struct Driven {
 impl Driven {
     fn checks(mut self, link: &str) -> [Check; 3] {
         [
-            Check::at_most(
+            Check::of(
                 format!("{link}: command age at the robot, p50, ms"),
-                AGE_MAX_MS,
                 quantile(&mut self.ages_ms, 0.5),
-            ),
-            Check::at_most(
+            )
+            .at_most(AGE_MAX_MS),
+            Check::of(
                 format!("{link}: command age at the robot, p99, ms"),
-                AGE_MAX_MS,
                 quantile(&mut self.ages_ms, 0.99),
-            ),
-            Check::at_least(
+            )
+            .at_most(AGE_MAX_MS),
+            Check::of(
                 format!("{link}: drive commands that arrived, share"),
-                ARRIVED_MIN,
                 figure(self.accepted) / figure(self.sent),
-            ),
+            )
+            .at_least(ARRIVED_MIN),
         ]
     }
 }

@@ -93,33 +93,25 @@ fn on_the_bench(run: TrialRun, model: LeaseModelRun) -> anyhow::Result<Vec<Check
     let counts = model.counts;
     let refused = counts.malformed + counts.foreign + counts.out_of_order + counts.expired;
     Ok(vec![
-        Check::at_least("silence: trials", figure(trials), figure(hand.trials)),
-        Check::at_most("silence: misses of 250 ms", 0.0, figure(hand.misses)),
-        Check::at_most("silence: worst, ms", 250.0, hand.worst_zero_ms),
-        Check::at_most(
+        Check::of("silence: trials", figure(hand.trials)).at_least(figure(trials)),
+        Check::of("silence: misses of 250 ms", figure(hand.misses)).at_most(0.0),
+        Check::of("silence: worst, ms", hand.worst_zero_ms).at_most(250.0),
+        Check::of(
             "silence: overruns of v²/2a + v·0.25 s",
-            0.0,
             figure(hand.overruns),
-        ),
-        Check::at_most(
+        )
+        .at_most(0.0),
+        Check::of(
             "silence: worst share of that distance",
-            1.0,
             hand.worst_distance_share,
-        ),
-        Check::at_least(
-            "lease: steps of the model",
-            figure(steps),
-            figure(model.steps),
-        ),
-        Check::at_most(
-            "lease: wrongly accepted",
-            0.0,
-            figure(model.wrongly_accepted),
-        ),
-        Check::at_most("lease: wrongly refused", 0.0, figure(model.wrongly_refused)),
-        Check::at_most("lease: outlived their end", 0.0, figure(model.outlived)),
-        Check::at_most("lease: stolen", 0.0, figure(model.stolen)),
-        Check::at_least("lease: commands accepted", 1.0, figure(counts.accepted)),
-        Check::at_least("lease: commands refused", 1.0, figure(refused)),
+        )
+        .at_most(1.0),
+        Check::of("lease: steps of the model", figure(model.steps)).at_least(figure(steps)),
+        Check::of("lease: wrongly accepted", figure(model.wrongly_accepted)).at_most(0.0),
+        Check::of("lease: wrongly refused", figure(model.wrongly_refused)).at_most(0.0),
+        Check::of("lease: outlived their end", figure(model.outlived)).at_most(0.0),
+        Check::of("lease: stolen", figure(model.stolen)).at_most(0.0),
+        Check::of("lease: commands accepted", figure(counts.accepted)).at_least(1.0),
+        Check::of("lease: commands refused", figure(refused)).at_least(1.0),
     ])
 }

@@ -77,17 +77,17 @@ pub(crate) async fn measure(arguments: &Arguments, fleet: &Fleet) -> anyhow::Res
     let p50_ms = quantile(&mut single_ms, 0.5);
     let p99_ms = quantile(&mut single_ms, 0.99);
     Ok(vec![
-        Check::at_least("stop: robots", 1.0, f64::from(arguments.robots)),
-        Check::at_least("stop: robots that moved", 1.0, figure(moving)),
-        Check::at_most("stop: call to confirmed, p50, ms", STOP_MAX_MS, p50_ms),
-        Check::at_most("stop: call to confirmed, p99, ms", STOP_MAX_MS, p99_ms),
-        Check::at_most(
+        Check::of("stop: robots", f64::from(arguments.robots)).at_least(1.0),
+        Check::of("stop: robots that moved", figure(moving)).at_least(1.0),
+        Check::of("stop: call to confirmed, p50, ms", p50_ms).at_most(STOP_MAX_MS),
+        Check::of("stop: call to confirmed, p99, ms", p99_ms).at_most(STOP_MAX_MS),
+        Check::of(
             "stop: whole fleet confirmed, worst, ms",
-            FLEET_MAX_MS,
             quantile(&mut fleet_ms, 1.0),
-        ),
-        Check::at_most("stop: not confirmed in 300 ms", 0.0, figure(unconfirmed)),
-        Check::at_most("stop: confirmed and not stopped", 0.0, figure(not_zero)),
+        )
+        .at_most(FLEET_MAX_MS),
+        Check::of("stop: not confirmed in 300 ms", figure(unconfirmed)).at_most(0.0),
+        Check::of("stop: confirmed and not stopped", figure(not_zero)).at_most(0.0),
     ])
 }
 

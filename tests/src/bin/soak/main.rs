@@ -320,14 +320,14 @@ fn tell(
     let asked = figure(u64::try_from(took_ms.len())?);
     let checks = [
         Check::so("the server survived", survived),
-        Check::at_least("connections", 1.0, figure(details.connections)),
-        Check::at_least("messages", 1.0, figure(details.messages)),
-        Check::at_least("answered uploads", 1.0, figure(details.answers)),
-        Check::at_most(
+        Check::of("connections", figure(details.connections)).at_least(1.0),
+        Check::of("messages", figure(details.messages)).at_least(1.0),
+        Check::of("answered uploads", figure(details.answers)).at_least(1.0),
+        Check::of(
             "uploads of a well-behaved robot without an answer, share",
-            FAILED_SHARE_MAX,
             figure(u64::try_from(failed)?) / asked.max(1.0),
-        ),
+        )
+        .at_most(FAILED_SHARE_MAX),
         Check::shown("receipt p50, ms", quantile(&mut answered, 0.5)),
         Check::shown("receipt p99, ms", quantile(&mut answered, 0.99)),
     ];

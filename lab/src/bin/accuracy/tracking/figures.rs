@@ -64,13 +64,13 @@ fn from_the_table(lines: &[Line], checks: &mut Vec<Check>) {
                 .find(|line| line.course == course && line.terrain == Terrain::Uniform(stiffness));
             let ratio = line.map(|line| line.rms_m[OWN] / line.rms_m[PEER]);
             let name = format!("{course}, K {stiffness}, own θ over the peer");
-            checks.push(Check::at_most(name, ratio, share));
+            checks.push(Check::of(name, ratio).at_most(share));
         }
     }
     for line in lines.iter().filter(quiet) {
         if line.course == "circle" && matches!(line.terrain, Terrain::Uniform(_)) {
             let name = format!("circle, K {}, RMS, mm", line.ground());
-            checks.push(Check::at_most(name, 1.0e3 * line.rms_m[OWN], 0.5));
+            checks.push(Check::of(name, 1.0e3 * line.rms_m[OWN]).at_most(0.5));
         }
     }
     let worst = |of: &dyn Fn(&&Line) -> bool, column: usize| {
@@ -96,7 +96,7 @@ fn from_the_table(lines: &[Line], checks: &mut Vec<Check>) {
             worst(&switching, OWN),
         ),
     ] {
-        checks.push(Check::at_most(name, value, 1.0));
+        checks.push(Check::of(name, value).at_most(1.0));
     }
 }
 
@@ -118,11 +118,13 @@ fn before_theta_is_known(courses: &Courses, found: &mut Found) {
         (name, stiffness, whole(Law::Shipped(None)) / best)
     });
     for (name, stiffness, ratio) in ratios {
-        found.checks.push(Check::at_most(
-            format!("{name}, K {stiffness}, θ unknown over the peer, whole run"),
-            ratio,
-            1.0,
-        ));
+        found.checks.push(
+            Check::of(
+                format!("{name}, K {stiffness}, θ unknown over the peer, whole run"),
+                ratio,
+            )
+            .at_most(1.0),
+        );
     }
 }
 
@@ -157,7 +159,7 @@ fn with_a_prior(found: &mut Found) {
     });
     for (stiffness, ratio) in ratios {
         let name = format!("figure-8, K {stiffness}, first lap with the prior over converged");
-        found.checks.push(Check::at_most(name, ratio, 1.2));
+        found.checks.push(Check::of(name, ratio).at_most(1.2));
     }
 }
 
@@ -219,11 +221,13 @@ fn at_a_border(courses: &Courses, found: &mut Found) {
             1.0e3 * rms_m[2]
         );
         found.figures[format!("border_{name}_rms_mm")] = json!(rms_m.map(|value| 1.0e3 * value));
-        found.checks.push(Check::at_most(
-            format!("border K 5 → 0.7, first 5 m, {name}, with the prior over without"),
-            rms_m[0] / rms_m[1],
-            0.7,
-        ));
+        found.checks.push(
+            Check::of(
+                format!("border K 5 → 0.7, first 5 m, {name}, with the prior over without"),
+                rms_m[0] / rms_m[1],
+            )
+            .at_most(0.7),
+        );
     }
 }
 
@@ -259,16 +263,12 @@ fn with_a_wrong_theta(found: &mut Found) {
     });
     for (stiffness, factor, most_m, ratio) in rows {
         let name = format!("K {stiffness}, θ wrong × {factor}");
-        found.checks.push(Check::at_most(
-            format!("{name}, largest error, m"),
-            most_m,
-            0.1,
-        ));
-        found.checks.push(Check::at_most(
-            format!("{name}, 10 s after over converged"),
-            ratio,
-            1.2,
-        ));
+        found
+            .checks
+            .push(Check::of(format!("{name}, largest error, m"), most_m).at_most(0.1));
+        found
+            .checks
+            .push(Check::of(format!("{name}, 10 s after over converged"), ratio).at_most(1.2));
     }
 }
 
@@ -313,16 +313,14 @@ fn from_standstill(found: &mut Found) {
         );
         let name = format!("K {stiffness}, 3 m {name}");
         let checks = &mut found.checks;
-        checks.push(Check::at_most(
-            format!("{name}, inside 5 cm, s"),
-            arrival.time_s,
-            6.0,
-        ));
-        checks.push(Check::at_most(
-            format!("{name}, hardest wheel demand over its limit"),
-            arrival.wheel_share,
-            1.0,
-        ));
+        checks.push(Check::of(format!("{name}, inside 5 cm, s"), arrival.time_s).at_most(6.0));
+        checks.push(
+            Check::of(
+                format!("{name}, hardest wheel demand over its limit"),
+                arrival.wheel_share,
+            )
+            .at_most(1.0),
+        );
     }
 }
 

@@ -90,11 +90,13 @@ pub(crate) fn run(options: &Options) -> Section {
     let mut checks = Vec::new();
     for (noise, ratios) in ["without noise", "with noise"].into_iter().zip(worst) {
         for (law, ratio) in ["θ unknown", "own θ"].into_iter().zip(ratios) {
-            checks.push(Check::at_most(
-                format!("held out, {noise}, {law} over the peer, worst line"),
-                ratio,
-                1.0,
-            ));
+            checks.push(
+                Check::of(
+                    format!("held out, {noise}, {law} over the peer, worst line"),
+                    ratio,
+                )
+                .at_most(1.0),
+            );
         }
     }
     Section {
