@@ -1,6 +1,6 @@
 //! What the documentation says is held against what there is: where its links lead, whether its
-//! JSON is what the API takes and gives, whether its settings are read, and whether its book is
-//! whole. `cli/tests/cli/documentation.rs` runs its commands.
+//! JSON is what the API takes and gives, whether its settings are read, whether its Python parses, and
+//! whether its book is whole. `cli/tests/cli/documentation.rs` runs its commands.
 
 #![expect(
     clippy::unwrap_used,
@@ -10,6 +10,7 @@
 mod book;
 mod data;
 mod links;
+mod python;
 mod routes;
 mod schema;
 mod settings;
