@@ -28,23 +28,23 @@ const SEND_EVERY_US: u64 = 50_000;
 /// Longest trial after the driver has fallen silent.
 const SETTLE_MAX: Duration = Duration::from_secs(6);
 
-/// What the trials found.
+/// Result of the trials.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct HandReport {
     /// Trials that were run.
     pub trials: u64,
     /// Ends of commands after which the target had to become zero.
     pub silences: u64,
-    /// Of these: the target was not zero in [`ZERO_WITHIN`].
+    /// Number of these after which the target was not zero within [`ZERO_WITHIN`].
     pub misses: u64,
-    /// The longest time from an end to a target of zero, milliseconds.
+    /// Maximum time from the end of a command to a target of zero, milliseconds.
     pub worst_zero_ms: f64,
-    /// The fastest that the robot was when a trial's last command ended, metres per second.
+    /// Maximum speed of the robot at the end of a trial's last command, metres per second.
     pub fastest_m_s: f64,
     /// Trials in which the robot needed a longer distance to stop than `v²/2a + v·0.25 s`, or did not rest;
     /// `a` is the braking ramp, or what the ground gives where that is less.
     pub overruns: u64,
-    /// The largest share of that distance that was used.
+    /// Maximum ratio of a trial's stopping distance to that distance.
     pub worst_distance_share: f64,
 }
 
@@ -215,7 +215,7 @@ impl Trial<'_> {
     }
 }
 
-/// What is run.
+/// Number and seed of the trials.
 #[derive(Debug, Clone, Copy)]
 pub struct TrialRun {
     /// Number of trials.

@@ -31,10 +31,11 @@ pub const ALPN: &[u8] = b"tread/2";
 pub const LENGTH_BYTES: usize = 2;
 /// Maximum size of credentials as JSON, bytes; longer ones are not sent.
 pub const CREDENTIALS_BYTES_MAX: usize = 1_024;
-/// What the kernel takes of what it cannot send yet, bytes: it has lost its priority too.
+/// Maximum number of bytes that the kernel holds unsent on a connection. It is small, because the
+/// priority of messages has no effect on bytes that the kernel holds.
 pub const NOT_SENT_BYTES_MAX: u32 = 4 * 1024;
-/// After this long without an answer to what was sent, the kernel gives a connection up: the session has given it
-/// up long before.
+/// Time without an acknowledgement of sent data after which the kernel closes a connection. The
+/// zenoh session gives it up long before.
 pub const UNANSWERED_MAX: Duration = Duration::from_secs(10);
 
 /// Credentials of a robot's zenoh session at the router.

@@ -148,7 +148,8 @@ pub struct Finding {
     pub unit: Unit,
 }
 
-/// What a channel says beside what the others let expect.
+/// Value of a channel and its prediction from the other channels, in metres, radians, or one of
+/// these per second.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Comparison {
     pub(super) observed: f64,
@@ -156,7 +157,7 @@ pub(super) struct Comparison {
 }
 
 impl Comparison {
-    /// The same, with the others in doubt.
+    /// Returns the comparison with the other channel as the doubtful one.
     pub(super) fn reversed(self) -> Self {
         Self {
             observed: self.predicted,

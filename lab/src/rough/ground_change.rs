@@ -27,37 +27,37 @@ const DETECTED_WITHIN: Duration = Duration::from_secs(15);
 pub struct ChangeTrial {
     /// The robot.
     pub make: Make,
-    /// How it and its first ground differ from the agent's model.
+    /// Differences of robot and first ground from the agent's model.
     pub deviations: Deviations,
-    /// What it is measured with.
+    /// Specification of the sensors.
     pub sensors: SensorSpec,
-    /// What it drives.
+    /// Course to drive.
     pub course: Course,
-    /// Laps of it.
+    /// Number of laps of the course.
     pub laps: u32,
-    /// What its noise is made from.
+    /// Seed of the sensor noise.
     pub seed: u64,
     /// Time on the first ground.
     pub before: Duration,
-    /// Stiffness of the ground after that; none if the drive ends then.
+    /// Stiffness K of the second ground; `None` if the drive ends without a change.
     pub after: Option<f64>,
 }
 
-/// What was detected.
+/// Result of one drive.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ChangeOutcome {
-    /// Changes that were detected where there was none.
+    /// Number of alarms before the change.
     pub false_alarms: u64,
-    /// Time from the change to its detection, seconds.
+    /// Time from the change to its detection, seconds; `None` if it was not detected.
     pub delay_s: Option<f64>,
     /// Whether θ was known when the ground changed.
     pub was_known: bool,
 }
 
-/// Drives; an error if the robot, its pose or its plan cannot be.
+/// Runs one drive.
 ///
 /// # Errors
-/// A sentence on what cannot be.
+/// The robot, its start pose or its plan is impossible.
 pub fn run(trial: &ChangeTrial) -> anyhow::Result<ChangeOutcome> {
     let model = trial.make.model()?;
     let random = Random::new(trial.seed);

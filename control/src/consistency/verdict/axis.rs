@@ -44,14 +44,14 @@ pub(super) struct Tolerance {
     pub(super) forward_share: f64,
 }
 
-/// What the wheels and another channel of the body say of one motion.
+/// Speed or turn rate by the wheels and by another channel of the body, m/s or rad/s.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Rates {
     pub(super) wheels: f64,
     pub(super) body: f64,
 }
 
-/// One of the two compared motions.
+/// The compared motion: turn rate, or forward speed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Axis {
     Turn,
@@ -63,7 +63,7 @@ impl Rates {
         (self.body - self.wheels).abs()
     }
 
-    /// The wheels are in doubt.
+    /// Returns the comparison with the wheels as the doubtful channel.
     pub(super) fn of_wheels(self) -> Comparison {
         Comparison {
             observed: self.wheels,
@@ -71,7 +71,7 @@ impl Rates {
         }
     }
 
-    /// The other channel is in doubt.
+    /// Returns the comparison with the other channel as the doubtful one.
     pub(super) fn of_body(self) -> Comparison {
         self.of_wheels().reversed()
     }
@@ -92,7 +92,8 @@ impl Axis {
         }
     }
 
-    /// How far two values of this motion may be apart, in either order.
+    /// Returns the tolerated difference of two values, m/s or rad/s: a constant plus a fraction of
+    /// the larger magnitude. The order of the values does not matter.
     pub(super) fn slack(self, tolerance: Tolerance, one: f64, other: f64) -> f64 {
         let (own, share) = match self {
             Self::Turn => (tolerance.own_rad_s, tolerance.share_turn),

@@ -1,4 +1,4 @@
-//! How soon other ground is noticed, and how often where there is none.
+//! Delay of the change detection, and its false alarms on unchanged ground.
 
 use std::fmt::Write as _;
 
@@ -14,19 +14,19 @@ use crate::robot::{LOOP_S, RobotSpec, SeededRobot, run_seeded};
 
 /// Time before the change, in which the first ground is measured, seconds.
 const BEFORE_S: f64 = 45.0;
-/// Time after it in which it must be noticed, seconds.
+/// Time after the change in which it must be detected, seconds.
 const AFTER_S: f64 = 15.0;
 /// Time of one run without change, seconds.
 const QUIET_S: f64 = 300.0;
-/// Runs with change for each without: the latter are longer.
+/// Number of runs with a change for each run without; the latter are longer.
 const CHANGES_PER_QUIET: u32 = 4;
 
-/// From one ground to another.
+/// A change from one ground to another, with the goal of its detection.
 struct Border {
     theta_before: f64,
     theta_after: f64,
     has_torque: bool,
-    /// Delay that must not be exceeded by the mean, seconds.
+    /// Maximum mean delay, seconds; `None` without a goal.
     delay_max_s: Option<f64>,
 }
 
@@ -48,11 +48,11 @@ fn twist(time_s: f64) -> Twist {
     }
 }
 
-/// What one run gave.
+/// Result of one run.
 #[derive(Debug, Clone, Copy, Default)]
 struct Noticed {
     false_alarms: u32,
-    /// From the change to the alarm, seconds.
+    /// Time from the change to the alarm, seconds; `None` if the change was missed.
     delay_s: Option<f64>,
 }
 
@@ -89,7 +89,7 @@ fn drive(spec: &RobotSpec, change: Option<FrictionCurve>, duration_s: f64, seed:
     found
 }
 
-/// Runs the part.
+/// Runs the part `change` and returns its tables and checks.
 pub(crate) fn run(options: &Options) -> Section {
     let borders = [
         (0.2, 0.4, true, Some(1.0)),

@@ -1,4 +1,4 @@
-//! What the robots of the θ part drive.
+//! Drives of the part `theta`.
 
 use tread_control::geometry::{Pose, Twist, wrap_angle_rad};
 use tread_control::measured::WheelSpeeds;
@@ -7,7 +7,7 @@ use tread_control::tracking::{Tracker, TrackerConfig};
 
 use crate::robot::{LOOP_S, SeededRobot};
 
-/// A way to drive.
+/// A motion of the robot over one run.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Drive {
     /// 10 s straight, then 25 s on a circle to the left and 25 s to the right.
@@ -32,23 +32,23 @@ pub(crate) enum Drive {
 pub(crate) const SPEED_M_S: f64 = 0.6;
 /// Acceleration from and to standstill, metres per second squared.
 const RAMP_M_S2: f64 = 0.5;
-/// Time in which the curvature changes, seconds.
+/// Duration of a change of curvature, seconds.
 const CURVE_S: f64 = 1.0;
-/// Time after which a steady drive is steady, seconds.
+/// Time from the start after which a steady drive is measured, seconds.
 const SETTLE_S: f64 = 6.0;
-/// Time in which the figure-8 gathers speed, seconds.
+/// Duration of the figure-8's acceleration from standstill, seconds.
 const GATHER_S: f64 = 3.0;
 
-/// What happened on a drive.
+/// Result of a drive.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Driven {
-    /// The estimator saw the ground change where it did not.
+    /// Number of false alarms: the ground never changes here.
     pub(crate) ground_changes: u32,
-    /// θ was said to be measured at some moment.
+    /// Whether the estimator reported a measured θ at any time.
     pub(crate) ever_measured: bool,
-    /// At some moment there was said to be new information.
+    /// Whether the estimator reported new information at any time.
     pub(crate) ever_informed: bool,
-    /// θ and its standard deviation when it was first said to be measured.
+    /// First reported θ and its standard deviation.
     pub(crate) first: Option<(f64, f64)>,
     /// Sums of the segments' information on θ, and of that times θ.
     pub(crate) segments: (f64, f64),
@@ -58,7 +58,7 @@ pub(crate) struct Driven {
 const SEGMENT_S: f64 = 1.7;
 
 impl Drive {
-    /// Drives it.
+    /// Drives the motion and returns the estimator's results.
     pub(crate) fn run(self, robot: &mut SeededRobot) -> Driven {
         let (duration_s, settle_s) = match self {
             Self::StraightThenCircles { .. } | Self::StopAndGo => (60.0, None),
@@ -103,7 +103,7 @@ impl Drive {
         driven
     }
 
-    /// Where the drive begins.
+    /// Returns the start pose of the drive, site frame.
     pub(crate) fn start(self) -> Pose {
         match self {
             Self::Figure8 => Pose {

@@ -1,5 +1,5 @@
-//! What no gain and no figure of the estimator was chosen on: another robot, other courses, grounds,
-//! speeds and seeds.
+//! The held-out set: a robot, courses, grounds, speeds and seeds on which no gain and no constant
+//! of the estimator was chosen.
 
 use serde_json::json;
 use tread_control::robot::RobotModel;
@@ -11,7 +11,7 @@ use crate::robot::RobotSpec;
 use crate::theta::{Goal, Scenario, measure};
 use crate::tracking::held_out;
 
-/// Seeds of this part start here.
+/// First seed of this part.
 pub(crate) const FIRST_SEED: u64 = 1_000_000;
 /// Stiffnesses K of this part.
 pub(crate) const STIFFNESSES: [f64; 3] = [0.7, 3.0, 12.0];
@@ -21,7 +21,7 @@ pub(crate) fn robots() -> [(&'static str, RobotModel); 2] {
     [("5 kg", RobotModel::yi2007()), ("50 kg", husky_like())]
 }
 
-/// Runs the part.
+/// Runs the part `held-out` and returns its tables and checks.
 pub(crate) fn run(options: &Options) -> Section {
     let theta = measure(scenarios(), FIRST_SEED, options);
     let tracking = held_out::run(options);

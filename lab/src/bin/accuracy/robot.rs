@@ -1,4 +1,4 @@
-//! A seeded robot with noisy sensors around the plant, and what is known of it afterwards.
+//! A simulated robot with seeded sensor errors, its localisation and its estimator.
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -13,23 +13,24 @@ use tread_control::plant::{Ground, Plant, PlantMeans, PlantSpec, TyreRise, Tyres
 use tread_control::robot::RobotModel;
 use tread_lab::parallel::in_parallel;
 
-/// Sensor samples, seconds.
+/// Sampling period of the sensors, seconds.
 pub(crate) const SAMPLE_S: f64 = 0.005;
-/// Control loop, seconds.
+/// Period of the control loop, seconds.
 pub(crate) const LOOP_S: f64 = 0.01;
 const SAMPLES_PER_BODY_SPEED: u32 = 20;
 const SAMPLES_PER_FIX: u32 = 10;
 /// Standard deviations of a position fix: metres, and radians of heading.
 const FIX_NOISE: (f64, f64) = (0.01, 0.005);
 
-/// What a robot of a scenario is like, and what is configured about it.
+/// Robot and ground of a scenario, and the estimator's configuration.
 #[derive(Clone, Copy)]
 pub(crate) struct RobotSpec {
     pub(crate) model: RobotModel,
     pub(crate) curve: FrictionCurve,
-    /// Noise of the sensors, and what is configured of it in the estimator.
+    /// Noise of the sensors, with which the estimator is configured too.
     pub(crate) noise: SensorNoise,
-    /// Largest error of a side's rolling radius; drawn evenly up to it.
+    /// Bound of the relative error of each side's rolling radius, drawn uniformly from ± this
+    /// value.
     pub(crate) radius_error_max: f64,
     pub(crate) has_torque: bool,
     /// Wheel speed, gyro and accelerometer give the value of the moment, not the mean since the
@@ -37,13 +38,13 @@ pub(crate) struct RobotSpec {
     pub(crate) aliases: bool,
     pub(crate) servo_lag_s: f64,
     pub(crate) tyres: Tyres,
-    /// Brush tyres whose curvature is drawn evenly between these, per slip.
+    /// Range of the curvature κ of brush tyres, per slip, drawn uniformly; `None` for linear tyres.
     pub(crate) curvatures: Option<[f64; 2]>,
     pub(crate) configured_tyres: TyrePrior,
 }
 
 impl RobotSpec {
-    /// Default sensors on isotropic ground of this stiffness.
+    /// Creates a robot with default sensors on isotropic ground of this stiffness K.
     pub(crate) fn on(stiffness: f64) -> Self {
         Self {
             model: RobotModel::yi2007(),
@@ -60,7 +61,7 @@ impl RobotSpec {
     }
 }
 
-/// The robot.
+/// Simulated robot with the state of its sensors, localisation and estimator.
 pub(crate) struct SeededRobot {
     pub(crate) model: RobotModel,
     pub(crate) plant: Plant,
@@ -124,7 +125,7 @@ impl SeededRobot {
         robot
     }
 
-    /// Normal deviate of this standard deviation.
+    /// Returns a normally distributed number of mean zero and this standard deviation.
     pub(crate) fn gauss(&mut self, std_dev: f64) -> f64 {
         if let Some(spare) = self.spare.take() {
             return std_dev * spare;
@@ -150,7 +151,7 @@ impl SeededRobot {
         });
     }
 
-    /// What the robot's law may look at.
+    /// Returns the measured pose and motion, the input of the tracking law.
     pub(crate) fn measured(&self) -> Measured {
         Measured {
             pose: self.localisation.pose().unwrap_or_default(),
@@ -161,7 +162,8 @@ impl SeededRobot {
         }
     }
 
-    /// One tick of the loop under this command.
+    /// Advances the robot by one tick of the loop under a command, and returns the estimator's
+    /// outcome.
     pub(crate) fn act(&mut self, command: WheelSpeeds) -> UpdateOutcome {
         let mut outcome = UpdateOutcome::default();
         let mut left_s = LOOP_S;

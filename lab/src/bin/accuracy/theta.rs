@@ -1,4 +1,4 @@
-//! How well θ is measured: bias, RMS error, coverage of the intervals, abstention.
+//! Accuracy of θ: bias, RMS error, coverage of the intervals, abstention.
 
 use serde_json::{Value, json};
 use tread_control::estimation::{MODEL_RATIO, TyrePrior};
@@ -10,14 +10,14 @@ use crate::robot::{RobotSpec, SeededRobot, run_seeded};
 /// Half-widths of the 50, 80 and 95 % intervals, standard deviations.
 const WIDTHS: [f64; 3] = [0.6745, 1.2816, 1.9600];
 
-/// What is expected of a scenario.
+/// Goal of a scenario.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Goal {
-    /// Intervals that hold, and an RMS error of at most this share, where one is asked for.
+    /// The coverage goal, and an RMS error of at most `rms_max`, relative to θ, if given.
     Measures { rms_max: Option<f64> },
-    /// Reported without a goal: the robot is not as it is configured.
+    /// No goal: the robot differs from its configuration.
     Reports,
-    /// No measurement at any moment.
+    /// The estimator must abstain in every run.
     Abstains,
 }
 
@@ -31,19 +31,19 @@ pub(crate) struct Scenario {
 
 /// One run's outcome.
 struct Run {
-    /// None where the robot abstained.
+    /// Error of θ; `None` if the estimator abstained.
     error: Option<RunError>,
     driven: Driven,
 }
 
-/// How far off a run's θ is.
+/// Error of one run's last θ.
 #[derive(Debug, Clone, Copy)]
 struct RunError {
-    /// Error over the truth.
+    /// Error relative to the true θ.
     relative: f64,
-    /// Error over its own standard deviation.
+    /// Error over the reported standard deviation.
     normalised: f64,
-    /// That standard deviation, over the truth.
+    /// Reported standard deviation relative to the true θ.
     std_dev: f64,
 }
 
@@ -56,12 +56,13 @@ struct Figures {
     coverage: [f64; 3],
     ever_measured: f64,
     ever_informed: f64,
-    /// Some segment claimed information.
+    /// Fraction of runs in which a segment stated information.
     ever_claimed: f64,
     false_alarms: u32,
-    /// Of the first measurement of each run.
+    /// Coverage of the 95 % interval of each run's first measurement.
     first_coverage: f64,
-    /// Of θ fused from segments of a metre, as a map does.
+    /// Coverage of the 95 % interval of θ fused from segments of about a metre, as the map fuses
+    /// them.
     segment_coverage: f64,
     segment_rms: f64,
 }
@@ -159,7 +160,7 @@ fn figures(scenario: &Scenario, runs: &[Run]) -> Figures {
     }
 }
 
-/// Runs the part.
+/// Runs the part `theta` and returns its tables and checks.
 pub(crate) fn run(options: &Options) -> Section {
     let mut section = measure(scenarios(), 0, options);
     // The average of all that is asked for.
@@ -177,10 +178,10 @@ pub(crate) fn run(options: &Options) -> Section {
     section
 }
 
-/// How a check on intervals ends.
+/// End of the names of checks of coverage.
 const INTERVALS_HOLD: &str = ": 95 % intervals hold";
 
-/// Runs scenarios with seeds from one on.
+/// Runs scenarios, each with the same seeds from `first_seed` on, and returns tables and checks.
 pub(crate) fn measure(scenarios: Vec<Scenario>, first_seed: u64, options: &Options) -> Section {
     let mut text = String::from(
         "| scenario | bias % | RMS % | reported σ % | coverage of 50 % | of 80 % | of 95 % | abstains % | \
@@ -349,7 +350,7 @@ fn without_torque(all: &mut Vec<Scenario>) {
     }
 }
 
-/// What a robot with or without wheel torque drives in the sweeps, and its name.
+/// Returns the drive of the sweeps for a robot with or without wheel torque, and its name.
 fn usual_drive(has_torque: bool) -> (Drive, &'static str) {
     if has_torque {
         let circles = Drive::StraightThenCircles {
@@ -405,7 +406,7 @@ fn sweeps(all: &mut Vec<Scenario>) {
     }
 }
 
-/// Tyres of a smooth curve; the truth is their initial slope.
+/// Adds scenarios with brush tyres; the true θ is the initial slope of their curve.
 fn tyres(all: &mut Vec<Scenario>) {
     // κ = 1/(3λ_m) of 0.46 to 2.88, mean 1.67, standard deviation 0.7, at θ = 0.2.
     let brush = TyrePrior {

@@ -32,7 +32,7 @@ const LAWS: [&str; 7] = [
     "ours, θ unknown",
     "ours, own θ",
 ];
-/// Column of the peer that counts.
+/// Column of the peer, with which goals compare.
 const PEER: usize = 2;
 /// Column of ours without θ.
 const UNKNOWN: usize = 5;
@@ -45,12 +45,12 @@ struct Line {
     terrain: Terrain,
     lag_s: f64,
     noisy: bool,
-    /// Per law, metres, over the second half.
+    /// RMS cross-track error of each law over the second half of the run, metres.
     rms_m: [f64; LAWS.len()],
     most_m: [f64; LAWS.len()],
 }
 
-/// Runs the part.
+/// Runs the part `tracking` and returns its tables and checks.
 pub(crate) fn run(options: &Options) -> Section {
     let courses = courses::all();
     let mut wanted = Vec::new();
@@ -89,7 +89,7 @@ pub(crate) fn run(options: &Options) -> Section {
     }
 }
 
-/// The tuned peer with a heading gain.
+/// Returns the peer with this heading gain.
 fn tuned(heading_1_m: f64) -> Law {
     Law::Kanayama(KanayamaGains {
         heading_1_m,
@@ -97,7 +97,8 @@ fn tuned(heading_1_m: f64) -> Law {
     })
 }
 
-/// Root mean square over seeds from the case's on, and the largest, of one law.
+/// Returns the root mean square over `seeds` seeds, from the case's own on, and the maximum of the
+/// cross-track error of one law, metres.
 fn score(case: &Case, seeds: u64, law: Law, knowing: Knowing) -> (f64, f64) {
     let (mut sum, mut most_m) = (0.0, 0.0_f64);
     for seed in case.seed..case.seed + seeds {
@@ -117,7 +118,7 @@ fn score(case: &Case, seeds: u64, law: Law, knowing: Knowing) -> (f64, f64) {
     ((sum / count).sqrt(), most_m)
 }
 
-/// The peer that counts: for each line the best of its heading gains.
+/// Returns the scores of the peer with the best of its heading gains for this line.
 fn peer(case: &Case, seeds: u64) -> (f64, f64) {
     PEER_HEADING_GAINS
         .map(|gain| score(case, seeds, tuned(gain), Knowing::Nothing))

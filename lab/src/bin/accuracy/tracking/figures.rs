@@ -1,4 +1,4 @@
-//! The figures to reach: what is compared with what, and the bound.
+//! Goals of tracking: the figures that are compared, and their bounds.
 
 use std::f64::consts::{FRAC_PI_2, PI};
 use std::fmt::Write as _;
@@ -21,23 +21,23 @@ use super::{Courses, Line, OWN, PEER, STIFFNESSES, UNKNOWN, courses};
 use crate::report::Check;
 use crate::robot::LOOP_S;
 
-/// Lag of the figures, seconds.
+/// Servo lag of these figures, seconds.
 const LAG_S: f64 = 0.05;
-/// Borders are scored from here on: before, the robot learns the first ground.
+/// Time from which borders are scored, seconds: before, the robot learns the first ground.
 const BORDER_FROM_S: f64 = 30.0;
-/// How far behind a border is scored, metres.
+/// Distance after a border over which errors are scored, metres.
 const BORDER_LENGTH_M: f64 = 5.0;
-/// Goals over the peer: K and share.
+/// Goals: K, and the maximum ratio of our RMS error to the peer's.
 const SHARES: [(f64, f64); 4] = [(0.5, 0.6), (2.0, 0.7), (5.0, 0.8), (20.0, 1.0)];
 
-/// What was found.
+/// Text, figures and checks of this part.
 pub(super) struct Found {
     pub(super) text: String,
     pub(super) figures: Value,
     pub(super) checks: Vec<Check>,
 }
 
-/// Everything that is not in the table.
+/// Measures all goals, from the table's lines and from runs of their own.
 pub(super) fn find(courses: &Courses, lines: &[Line]) -> Found {
     let mut found = Found {
         text: String::new(),
@@ -53,7 +53,7 @@ pub(super) fn find(courses: &Courses, lines: &[Line]) -> Found {
     found
 }
 
-/// Ratios to the peer, and the steady circle.
+/// Checks the ratios to the peer, and the steady circle.
 fn from_the_table(lines: &[Line], checks: &mut Vec<Check>) {
     let quiet = |line: &&Line| !line.noisy && (line.lag_s - LAG_S).abs() < 1.0e-9;
     for course in ["figure-8", "waypoints"] {
@@ -100,7 +100,7 @@ fn from_the_table(lines: &[Line], checks: &mut Vec<Check>) {
     }
 }
 
-/// From the first second on, never given θ: never worse than the peer, whole run.
+/// Checks that without any θ the law is never worse than the peer over the whole run.
 fn before_theta_is_known(courses: &Courses, found: &mut Found) {
     let mut items = Vec::new();
     for (name, course) in courses {
@@ -140,7 +140,7 @@ fn case(course: &Course, terrain: Terrain) -> Case<'_> {
     }
 }
 
-/// The first lap with the map's prior against a lap of the converged robot.
+/// Compares the first lap with the map's prior with a lap of the converged robot.
 fn with_a_prior(found: &mut Found) {
     let shape = Figure8::usual();
     let (course, lap_s) = (Course::Figure8(shape), shape.lap_s());
@@ -163,8 +163,8 @@ fn with_a_prior(found: &mut Found) {
     }
 }
 
-/// Sum of squares and count over the first metres after every entry into the second ground, once
-/// the first seconds are over.
+/// Returns sum of squares and count of the errors over the first metres after each entry into the
+/// second ground, from [`BORDER_FROM_S`] on.
 fn after_entries(trace: &Trace, border_m: f64) -> [f64; 2] {
     let (mut sum, mut count, mut left_m) = (0.0, 0.0, 0.0);
     for pair in trace.ticks.windows(2) {
@@ -182,7 +182,8 @@ fn after_entries(trace: &Trace, border_m: f64) -> [f64; 2] {
     [sum, count]
 }
 
-/// From K 5 to 0.7: on the circle, and on the figure-8 with the border at several places of it.
+/// Measures the border from K 5 to 0.7 on the circle, and on the figure-8 with the border at
+/// several places.
 fn at_a_border(courses: &Courses, found: &mut Found) {
     let figure_8 = Course::Figure8(Figure8 {
         laps: 5.0,
@@ -231,7 +232,8 @@ fn at_a_border(courses: &Courses, found: &mut Found) {
     }
 }
 
-/// A claim that is ten times wrong, believed for a lap; then the robot's own measurement.
+/// Measures the effect of a given θ that is wrong by a factor of ten for a lap, and the recovery
+/// with the robot's own measurement.
 fn with_a_wrong_theta(found: &mut Found) {
     let shape = Figure8::usual();
     let (course, lap_s) = (Course::Figure8(shape), shape.lap_s());
@@ -272,7 +274,8 @@ fn with_a_wrong_theta(found: &mut Found) {
     }
 }
 
-/// From rest 3 m off the circle with the robot's own follower: time until within 5 cm for good.
+/// Measures the approach from rest, 3 m off the circle, with the robot's own follower: the time
+/// until it stays within 5 cm.
 fn from_standstill(found: &mut Found) {
     let mut items = Vec::new();
     for (name, radius_m, heading_rad) in [
@@ -324,11 +327,11 @@ fn from_standstill(found: &mut Found) {
     }
 }
 
-/// How a robot came to its circle.
+/// Result of an approach.
 struct Arrival {
-    /// From here on within 5 cm, seconds.
+    /// Time from which the robot stays within 5 cm, seconds.
     time_s: f64,
-    /// Largest wheel speed or acceleration let through to the wheels, over its limit.
+    /// Maximum ratio of commanded wheel speed or acceleration to its limit.
     wheel_share: f64,
 }
 

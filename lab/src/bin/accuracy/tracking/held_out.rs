@@ -31,7 +31,7 @@ const POINTS: [(f64, f64); 9] = [
     (4.5, -2.0),
 ];
 
-/// Runs the part.
+/// Runs the tracking part of the held-out set and returns its tables and checks.
 pub(crate) fn run(options: &Options) -> Section {
     let seeds = u64::from((options.runs / 100).clamp(1, 20));
     let mut wanted = Vec::new();

@@ -19,7 +19,7 @@ const NOISE_RAD: f64 = 0.01;
 /// Relative standard deviation of a map's prior.
 pub(crate) const PRIOR_DEVIATION: f64 = 0.1;
 
-/// What lies under the robot.
+/// Friction stiffness K of the ground.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Terrain {
     /// The same stiffness everywhere.
@@ -52,16 +52,17 @@ impl Terrain {
     }
 }
 
-/// Where the shipped law's θ comes from.
+/// Source of the θ given to the shipped law.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Knowing {
-    /// From nowhere.
+    /// No θ.
     Nothing,
-    /// From its own torque channel, unknown at the start.
+    /// θ measured from wheel torques; none at the start.
     Own,
-    /// From the map until it is measured, with the map's word taken at once at a border.
+    /// θ of the map's prior until the robot has measured its own; the prior changes at once at a
+    /// border.
     Map,
-    /// A claim that is wrong by a factor until a time, then its own torque channel.
+    /// θ wrong by a factor until a time, then the robot's own from wheel torques.
     Wrong { factor: f64, until_s: f64 },
 }
 
@@ -137,7 +138,7 @@ fn curve(stiffness: f64) -> FrictionCurve {
     FrictionCurve::with_stiffness(stiffness).expect("the scenarios' stiffnesses are positive")
 }
 
-/// A standard normal number.
+/// Returns a standard normal random number.
 fn normal(rng: &mut ChaCha8Rng) -> f64 {
     let first: f64 = rng.random_range(f64::MIN_POSITIVE..1.0);
     let second: f64 = rng.random();
@@ -182,7 +183,7 @@ impl Sensors {
     }
 }
 
-/// Drives one law to the end of the course, or until it is lost.
+/// Simulates one law until the end of the course, or until the robot is lost.
 pub(crate) fn simulate(case: &Case, law: Law, knowing: Knowing) -> Trace {
     let model = case.model;
     let start_pose = case.course.sample(0.0).pose;
