@@ -23,14 +23,15 @@ use tread_lab::rough::spec::{Deviations, MAKES};
 
 /// Time of a drive without a change.
 const QUIET: Duration = Duration::from_mins(10);
-/// Drives without a change of one hour.
+/// Number of drives without a change in one hour.
 const QUIET_PER_HOUR: u32 = 6;
-/// Laps of such a drive, and of one with a change.
+/// Laps of a drive without a change, and of one with a change.
 const QUIET_LAPS: u32 = 18;
 const CHANGE_LAPS: u32 = 3;
-/// False alarms per hour that may be.
+/// Maximum number of false alarms per hour.
 const FALSE_PER_HOUR_MAX: f64 = 0.2;
-/// Time in which a change from K 5 to 1 must be detected, seconds, and in what share of the drives.
+/// Time within which a change from K 5 to 1 must be detected, seconds, and the minimum fraction of
+/// drives in which it is.
 const DELAY_MAX_S: f64 = 2.0;
 const DETECTED_MIN: f64 = 0.95;
 

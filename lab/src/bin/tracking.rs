@@ -24,10 +24,11 @@ use tread_lab::rough::tracking::{Errors, Knowing, Poses, Trial, World, run};
 
 /// Stiffnesses K of the grounds.
 const GROUNDS: [f64; 3] = [0.7, 3.0, 12.0];
-/// Largest share of the best peer's error that ours may have on a line, and with its own θ of ours
+/// Maximum ratio of our error to the best peer's on a line, and of ours with its own θ to ours
 /// without.
 const LINE_GOAL: f64 = 1.02;
-/// Largest mean share of it above the localisation's own error.
+/// Maximum mean of our error over the mean of the best peer's, both above the localisation's own
+/// error.
 const MEAN_GOAL: f64 = 0.9;
 /// Speed of the courses, metres per second.
 const SPEED_M_S: f64 = 0.6;
@@ -39,7 +40,7 @@ const KANAYAMA: KanayamaGains = KanayamaGains {
     heading_1_m: 8.4,
     integral_1_m2_s: 15.4,
 };
-/// What counts as the error of a robot that was lost, metres.
+/// Error that a lost robot counts with, metres.
 const LOST_M: f64 = 1.0;
 /// Step of the search for a peer's gains, as a factor.
 const TUNE_STEP: f64 = 1.4;

@@ -5,18 +5,18 @@ use tread_lab::report::Check;
 
 use crate::generator::{Fault, Kit, Make, Robot, STEP_S};
 
-/// How much motion that shows a fault there may be until it is named, seconds, of 95 % of robots.
+/// Goal: motion that shows a fault until it is named, in 95 % of the trials, seconds.
 const NAMED_WITHIN_S: f64 = 1.0;
 
 const USAGE: &str =
     "consistency [--json | --markdown] [--hours N] [--trials N] [--seed N] [--other]";
-/// Most hours and trials.
+/// Maximum numbers of hours and trials.
 const HOURS_MAX: u32 = 1_000;
 const TRIALS_MAX: u32 = 10_000;
 const SEED_MAX: u32 = 1_000_000;
-/// Longest excited time that a trial waits for, seconds.
+/// Maximum motion that shows the fault in a trial, seconds.
 const EXCITED_MAX_S: f64 = 15.0;
-/// Longest trial, seconds.
+/// Maximum duration of a trial after the fault, seconds.
 const TRIAL_MAX_S: f64 = 120.0;
 /// Goals of most faults: exciting motion until something is reported, in half of the trials, seconds;
 /// and the share of trials in which the fault is named.
@@ -24,19 +24,19 @@ const USUAL: Goals = Goals {
     noticed_p50_s: 1.0,
     named_share_min: 0.99,
 };
-/// The same of wheels on a robot without odometry: slip is one explanation for a while.
+/// Goals of faults of the wheels on a robot without odometry: slip is a possible explanation for a
+/// while.
 const WHEELS_ALONE: Goals = Goals {
     noticed_p50_s: 1.5,
     named_share_min: 0.98,
 };
-/// The same where noise of 2 cm at 10 Hz hides a third of the speed for a while, and slip is allowed
-/// as much.
+/// Goals of faults that noise of 2 cm at 10 Hz hides for a while, and that slip could explain.
 const HIDDEN: Goals = Goals {
     noticed_p50_s: 4.0,
     named_share_min: 0.9,
 };
 
-/// How the figures are printed.
+/// Format of the output.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Output {
     /// Lines for a terminal.
@@ -47,7 +47,7 @@ pub(crate) enum Output {
     Markdown,
 }
 
-/// What was asked for.
+/// Arguments of the command line.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Options {
     pub(crate) output: Output,
@@ -55,12 +55,15 @@ pub(crate) struct Options {
     pub(crate) trials: u32,
     /// The first seed of the trials and of the hours.
     pub(crate) seed: u32,
-    /// Robots whose bases, sensors and courses nobody looked at when bounds were chosen.
+    /// Usual robots, or those on which no bound was chosen.
     pub(crate) make: Make,
 }
 
 impl Options {
-    /// Reads the arguments; an error is a sentence for people.
+    /// Reads the arguments of the command line.
+    ///
+    /// # Errors
+    /// The usage line, if an argument is unknown or a number is out of range.
     pub(crate) fn from_arguments(
         mut arguments: impl Iterator<Item = String>,
     ) -> Result<Self, &'static str> {
@@ -92,22 +95,23 @@ impl Options {
     }
 }
 
-/// Largest share of trials in which another channel is blamed.
+/// Maximum fraction of trials in which another channel is blamed.
 const BLAMED_SHARE_MAX: f64 = 0.01;
 
-/// What must be reached.
+/// Goals of one fault: median of the motion that shows the fault until anything is reported,
+/// seconds, and minimum fraction of trials in which the fault is named.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Goals {
     pub(crate) noticed_p50_s: f64,
     pub(crate) named_share_min: f64,
 }
 
-/// A fault, what it must be called, and whether its robot has odometry over ground.
+/// A fault, the findings that name it correctly, and its goals.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Case {
     pub(crate) name: &'static str,
     pub(crate) fault: Fault,
-    /// Any of these is right.
+    /// Subjects any of which names the fault.
     pub(crate) subjects: &'static [Subject],
     pub(crate) kind: Option<Kind>,
     pub(crate) has_odometry: bool,
@@ -326,18 +330,18 @@ pub(crate) const CASES: &[Case] = &[
     ),
 ];
 
-/// How one trial went.
+/// Result of one trial.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Trial {
-    /// Exciting motion until anything was said, seconds.
+    /// Motion that shows the fault until the first finding, seconds; `None` without one.
     pub(crate) noticed_s: Option<f64>,
-    /// Exciting motion until the right name, seconds; none if it was not named.
+    /// Motion that shows the fault until the right finding, seconds; `None` if it was not named.
     pub(crate) named_s: Option<f64>,
-    /// The first channel that was wrongly blamed.
+    /// First channel that was wrongly blamed.
     pub(crate) wrong: Option<Subject>,
 }
 
-/// Breaks a robot while it drives and waits for the name of it.
+/// Runs one trial: the fault begins while the robot drives, and the findings are compared with it.
 pub(crate) fn trial(case: &Case, make: Make, seed: u64) -> Trial {
     let mut robot = Robot::new(
         seed,
@@ -383,14 +387,14 @@ pub(crate) fn trial(case: &Case, make: Make, seed: u64) -> Trial {
     }
 }
 
-/// What was found in hours without a fault.
+/// Findings on a robot without a fault.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Quiet {
-    /// Channels that were blamed.
+    /// Number of findings that blame a channel.
     pub(crate) blamed: u32,
-    /// Wheels and motion that were said to disagree off the ice.
+    /// Number of findings that wheels and motion disagree, off the ice.
     pub(crate) slip_off_ice: u32,
-    /// The same on the ice.
+    /// Number of findings that wheels and motion disagree, on the ice.
     pub(crate) slip_on_ice: u32,
 }
 

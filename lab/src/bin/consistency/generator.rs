@@ -15,10 +15,10 @@ use tread_control::geometry::{Pose, Twist};
 use tread_control::measured::{BodyAcceleration, WheelSpeeds};
 use tread_control::robot::{GRAVITY_M_S2, RobotModel};
 
-/// Time of a step: every fast sensor speaks in each.
+/// Duration of a step, in which every fast sensor gives one sample, seconds.
 pub(crate) const STEP_S: f64 = 0.01;
 
-/// What is wrong.
+/// Simulated fault.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Fault {
     GyroFrozen,
@@ -49,7 +49,7 @@ pub(crate) enum Fault {
     EncodersOfTheBaseScaled(f64),
 }
 
-/// What differs between two robots.
+/// Equipment and environment of a robot.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Kit {
     pub(crate) has_odometry: bool,
@@ -60,23 +60,23 @@ pub(crate) struct Kit {
     pub(crate) make: Make,
 }
 
-/// By whom a robot is made.
+/// Origin of a robot's parameters.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Make {
-    /// The one on which the monitor's bounds were chosen.
+    /// The parameters on which the monitor's bounds were chosen.
     Usual,
-    /// Another one for each seed: none was looked at for that.
+    /// Parameters drawn from the seed; no bound was chosen on them.
     Other,
 }
 
-/// How a robot is made: figures of its base, its sensors and its courses.
+/// Parameters of a robot's base, its sensors and its courses.
 #[derive(Debug, Clone, Copy)]
 struct Build {
-    /// Counts of an encoder in a turn of its wheel.
+    /// Encoder counts per revolution of a wheel.
     encoder_counts: f64,
-    /// Memory of the base's filter of the wheel speeds, seconds.
+    /// Time constant of the base's low-pass filter of the wheel speeds, seconds.
     wheels_filter_s: f64,
-    /// How wheels follow their command: delay, lag, and most acceleration.
+    /// Delay, lag and maximum acceleration with which wheels follow their command.
     command_delay_steps: usize,
     wheels_lag_s: f64,
     wheels_most_rad_s2: f64,
@@ -88,16 +88,16 @@ struct Build {
     odometry_noise_m_s: f64,
     steps_per_odometry: u64,
     steps_per_pose: u64,
-    /// How late poses come, in steps.
+    /// Range of the delay of poses, steps.
     pose_late: (f64, f64),
     pose_noise: (f64, f64),
-    /// A part of that which lasts for seconds, metres.
+    /// Slow part of the position error, metres.
     pose_wander_m: f64,
-    /// Most change of speed that is commanded, and the fastest.
+    /// Maximum commanded acceleration and angular acceleration, and maximum commanded speed.
     most_m_s2: f64,
     most_rad_s2: f64,
     fastest: f64,
-    /// The fastest that wheels reach when the battery is low, radians per second.
+    /// Maximum wheel speed with a low battery, radians per second.
     low_rad_s: f64,
 }
 
@@ -198,7 +198,7 @@ pub(crate) struct Robot {
     // How it is driven.
     target: Twist,
     commanded: Twist,
-    /// What the base has heard and not followed yet.
+    /// Commands that the base has received and does not follow yet.
     on_the_way: VecDeque<Twist>,
     until: u64,
     // How its sensors are.
@@ -311,7 +311,7 @@ impl Robot {
         self.fault = None;
     }
 
-    /// It stands from now on, or drives on.
+    /// Sets whether the robot stands or drives.
     #[cfg_attr(
         not(test),
         expect(dead_code, reason = "the report program lets it drive")

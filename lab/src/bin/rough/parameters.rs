@@ -1,4 +1,4 @@
-//! How well the intervals of the robot's own parameters hold.
+//! Coverage of the intervals of the robot's own parameters.
 
 use serde::Serialize;
 use tread_api::friction::NORMAL_95;
@@ -16,7 +16,7 @@ pub(crate) struct ParameterLine {
     name: &'static str,
     has_torque: bool,
     estimates: usize,
-    /// Share of the 95 % intervals that hold the true value.
+    /// Fraction of the 95 % intervals that contain the true value.
     coverage: f64,
     /// Median half-width of the 95 % interval.
     half_width: f64,
@@ -55,7 +55,7 @@ pub(crate) fn parameter_lines(has_torque: bool, drives: &[Drive]) -> Vec<Paramet
 }
 
 impl ParameterLine {
-    /// What must hold.
+    /// Returns the check of the coverage.
     pub(crate) fn check(&self) -> Check {
         let torque = if self.has_torque { "with" } else { "without" };
         let name = format!("{}, {torque} torque: coverage", self.name);
