@@ -479,12 +479,11 @@ fn case_checks(case: &Case, options: &Options) -> Vec<Check> {
             percentile(&named, 1.0),
         )
         .at_most(EXCITED_MAX_S),
-        Check {
-            name: format!("{name}: share of trials in which it is named"),
-            goal: format!("≥ {}", goals.named_share_min),
-            value: Some(identified),
-            holds: identified >= goals.named_share_min,
-        },
+        Check::of(
+            format!("{name}: share of trials in which it is named"),
+            identified,
+        )
+        .at_least(goals.named_share_min),
         Check::of(
             format!("{name}: share of trials in which another channel is blamed"),
             wrong,
@@ -536,11 +535,12 @@ pub(crate) fn checks(options: &Options) -> Vec<Check> {
         )
         .at_most(0.0),
     );
-    checks.push(Check {
-        name: format!("slip on ice said to be a disagreement in {hours} h"),
-        goal: "≥ 1".to_owned(),
-        value: Some(f64::from(ice)),
-        holds: ice >= 1,
-    });
+    checks.push(
+        Check::of(
+            format!("slip on ice said to be a disagreement in {hours} h"),
+            f64::from(ice),
+        )
+        .at_least(1.0),
+    );
     checks
 }
