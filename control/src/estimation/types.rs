@@ -274,7 +274,7 @@ pub struct IdentifiedValue {
     pub std_dev: f64,
     /// Whether the estimate is prior-dominated: its variance is more than half of the prior
     /// variance.
-    pub is_mostly_prior: bool,
+    pub is_prior_dominated: bool,
 }
 
 /// The robot's own parameters, estimated together with θ.

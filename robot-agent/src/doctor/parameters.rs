@@ -16,7 +16,7 @@ const NORMAL_95: f64 = tread_api::friction::NORMAL_95;
 /// Name of the finding.
 const NAME: &str = "parameters";
 
-/// Feeds the estimator with the samples of the base.
+/// Estimator of the examined robot, fed with the samples of the base.
 #[derive(Debug)]
 pub(super) struct Parameters {
     estimator: Estimator,
@@ -24,7 +24,7 @@ pub(super) struct Parameters {
 }
 
 impl Parameters {
-    /// Of a robot of which this is known beforehand.
+    /// Creates the estimator with the configured model and prior.
     pub(super) fn new(model: RobotModel, prior: EstimatorPrior) -> Self {
         Self {
             estimator: Estimator::with_prior(model, SensorNoise::default(), prior),
@@ -32,7 +32,7 @@ impl Parameters {
         }
     }
 
-    /// Takes the samples that the base has sent.
+    /// Adds the samples that the base has sent since the last call.
     pub(super) fn take(&mut self, feedback: &Feedback) {
         for sample in feedback.samples() {
             let Some(motion) = motion_of(sample) else {
@@ -45,7 +45,7 @@ impl Parameters {
         }
     }
 
-    /// The finding: the parameters with 95 % intervals, or why there are none.
+    /// Returns the finding: the parameters with 95 % intervals, or why there are none.
     pub(super) fn finding(&self) -> Finding {
         match self.estimator.estimate().robot {
             Some(robot) => Finding::well(NAME, text(&robot)),
@@ -58,7 +58,7 @@ impl Parameters {
     }
 }
 
-/// The finding where others make it meaningless.
+/// Returns the finding for a robot whose other findings make the parameters meaningless.
 pub(super) fn spoiled() -> Finding {
     let text = "mass, inertia and centre of mass: they need the findings above mended";
     Finding::skipped(NAME, text)
@@ -66,7 +66,7 @@ pub(super) fn spoiled() -> Finding {
 
 fn text(robot: &IdentifiedRobot) -> String {
     let value = |found: IdentifiedValue, decimals: usize, unit: &str| {
-        let prior = if found.is_mostly_prior {
+        let prior = if found.is_prior_dominated {
             ", mostly prior"
         } else {
             ""

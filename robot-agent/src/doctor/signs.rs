@@ -21,7 +21,7 @@ pub(super) struct Answers {
     pub(super) went: i8,
 }
 
-/// Something that is the wrong way round.
+/// A sign or side that is inverted or swapped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Flip {
     /// Left and right joints are swapped.

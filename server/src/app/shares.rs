@@ -12,7 +12,7 @@ use crate::identity::subject::SubjectId;
 /// Limits on places.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Bounds {
-    /// In all.
+    /// Maximum in all.
     pub all: usize,
     /// Maximum for viewers, who may only watch and stop, all together: the rest is for operators
     /// and admins.

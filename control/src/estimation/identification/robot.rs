@@ -70,7 +70,7 @@ impl Identification {
             IdentifiedValue {
                 value: means[place],
                 std_dev: variances[place].sqrt().hypot(model[place]),
-                is_mostly_prior: variances[place] > PRIOR_SHARE_MAX * first.norm_squared(),
+                is_prior_dominated: variances[place] > PRIOR_SHARE_MAX * first.norm_squared(),
             }
         };
         let is_known = variances

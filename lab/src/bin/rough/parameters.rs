@@ -20,7 +20,7 @@ pub(crate) struct ParameterLine {
     coverage: f64,
     /// Median half-width of the 95 % interval.
     half_width: f64,
-    /// Share that the prior dominates.
+    /// Fraction of the estimates that are prior-dominated.
     prior_dominated: f64,
 }
 

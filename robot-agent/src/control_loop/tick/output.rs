@@ -240,7 +240,7 @@ fn robot_parameters(robot: IdentifiedRobot) -> RobotParameters {
     let estimate = |found: IdentifiedValue| ParameterEstimate {
         value: found.value,
         std_dev: found.std_dev,
-        prior_dominated: found.is_mostly_prior,
+        prior_dominated: found.is_prior_dominated,
     };
     RobotParameters {
         apparent_mass_ratio: estimate(robot.apparent_mass_ratio),
