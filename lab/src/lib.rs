@@ -1,15 +1,15 @@
-//! What the product is measured with, and no package contains.
+//! Models, tracking laws and report programs that measure the product; no package contains them.
 //!
-//! * [`mod@paper`] is the paper this began with, exactly; its law is a bench, not what ships.
-//! * [`mod@bench`] holds laws written only for comparison, and the run that compares.
+//! * [`mod@paper`]: the paper's equations with their errata corrected; its law drives no robot.
+//! * [`mod@bench`]: tracking laws for comparison, and the runs that compare them.
 //! * [`parallel`]: drives on all processors.
 //! * [`report`]: the table of goals that report programs print.
 //! * `rough`: a second world, written from the physics alone: robots, contacts and sensors that
 //!   differ from the agent's own simulator and from each other.
 //! * `teleoperation_trials`: random drivers on a bad network who fall silent.
 //!
-//! The last two drive the agent's own loop, which the feature `agent` brings (on by default). What
-//! needs the controller alone compiles much sooner with `--no-default-features`.
+//! The last two run the agent's own control loop and need the feature `agent`, on by default. The
+//! others compile much sooner without it (`--no-default-features`).
 
 pub mod bench;
 pub mod paper;
