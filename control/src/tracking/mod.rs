@@ -2,10 +2,10 @@
 //!
 //! The law adapts θ̂ as the paper does, for a base that slips laterally. Errors are taken in the
 //! frame of the robot's *course*, which differs from its heading by the sideslip `β = −vωθ/g` (θ =
-//! 1/K, steady turn of the four-wheel sum); then `ė_y = v sin e_θ + (v²ω/g) θ̃`. So `V = ½k_y(e_x²
-//! + e_y²) + (1 − cos e_θ) + k_y θ̃²/(2ρ)` decreases under `θ̂̇ = ρ e_y v²ω/g`, a gradient law of
-//! the form of the paper's (26). The law never inverts a measured velocity, so it is regular at
-//! standstill.
+//! 1/K, steady turn of the four-wheel sum); then `ė_y = v sin e_θ + (v²ω/g) θ̃`. So
+//! `V = ½k_y(e_x² + e_y²) + (1 − cos e_θ) + k_y θ̃²/(2ρ)` decreases under `θ̂̇ = ρ e_y v²ω/g`, a
+//! gradient law of the form of the paper's (26). The law never inverts a measured velocity, so it
+//! is regular at standstill.
 //!
 //! In tight bends wheels slip beyond the peak of their friction curve, whatever the speed, and the
 //! sideslip is several times as large. The turn is therefore computed by the four-wheel sum itself,

@@ -5,8 +5,8 @@
 //! r of a block b are linearised about the parameters `p_b` that were in use during the block:
 //! `r(p) = r_b − J_b (p − p_b)`. Earlier blocks lose weight when ln K moves away from the value at
 //! which they were linearised. With `C = (Σ Jᵀ W J + prior information)⁻¹` the covariance is the
-//! robust one, `C (Σ g gᵀ + prior information) C`: the empirical scatter of the blocks' scores `g =
-//! Jᵀ W r` replaces the assumption of white residuals and a true model.
+//! robust one, `C (Σ g gᵀ + prior information) C`: the empirical scatter of the blocks' scores
+//! `g = Jᵀ W r` replaces the assumption of white residuals and a true model.
 
 use super::dual::{Dual, Real};
 use super::model::{Input, Output, State};

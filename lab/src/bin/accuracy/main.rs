@@ -1,8 +1,8 @@
 //! Measures tracking errors, accuracy and coverage of θ, and the delay of change detection on our
 //! own simulator.
 //!
-//! `cargo run --release -p tread-lab --no-default-features --bin accuracy -- [--runs N] [--threads
-//! N] [--json | --markdown] [--only tracking,theta,change,held-out]`
+//! `cargo run --release -p tread-lab --no-default-features --bin accuracy --
+//! [--runs N] [--threads N] [--json | --markdown] [--only tracking,theta,change,held-out]`
 //!
 //! Every run is seeded. Prints tables in Markdown, or with `--json` one object with the tables'
 //! figures and `checks`; the process fails if one does not hold.
