@@ -24,6 +24,7 @@ use tread_samples::rover;
 use tread_server::app::identity::tokens::FirstAdmin;
 use tread_server::authority::Authority;
 use tread_server::clock::Clock;
+use tread_server::config::webhooks::WebhooksConfig;
 use tread_server::config::{FrictionConfig, RobotsConfig, StorageConfig, TlsFiles, WebConfig};
 use tread_server::counters::CounterValues;
 use tread_server::{Config, RunningServer, Server};
@@ -291,6 +292,7 @@ pub(crate) fn config(folder: &Path, zenoh: &str) -> Config {
         tls: None,
         robots: None,
         oidc: None,
+        webhooks: WebhooksConfig::default(),
         audit: tread_server::config::AuditConfig::default(),
         web: WebConfig {
             hosts: vec!["tread.test".to_owned()],

@@ -7,7 +7,8 @@ use tread_api::ids::{MissionId, StopId};
 use tread_api::rights::Scope;
 use tread_api::robot::{LinkCause, LinkState};
 
-use super::{Presence, Presences, RobotKey, stop_of};
+use super::{OFFSETS_MAX, Presence, Presences, RobotKey, stop_of};
+use crate::app::reconciler::conditions::Shown;
 
 /// Revisions of a site's data that a robot reports.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -51,6 +52,26 @@ impl Presences {
         };
         known
             .map(|(key, presence)| (key.clone(), attending(presence)))
+            .collect()
+    }
+
+    /// Returns mission and clock of every robot that is heard at `now`. The clock of a robot without
+    /// enough states counts as right.
+    pub(in crate::app) fn conditions(&self, now: Duration) -> Vec<(RobotKey, Shown)> {
+        let robots = self.lock();
+        let heard = robots
+            .iter()
+            .filter(|(_, presence)| presence.link(now) != LinkState::Offline);
+        let shown = |presence: &Presence| {
+            let has_enough = presence.clock_offsets_ms.len() >= OFFSETS_MAX;
+            let offset_ms = has_enough.then(|| presence.clock_offset_ms());
+            Some(Shown {
+                mission: presence.state()?.mission,
+                clock_offset_ms: offset_ms.unwrap_or(0),
+            })
+        };
+        heard
+            .filter_map(|(key, presence)| Some((key.clone(), shown(presence)?)))
             .collect()
     }
 
