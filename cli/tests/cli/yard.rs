@@ -48,6 +48,7 @@ impl Yard {
             }),
             robots: None,
             oidc: None,
+            webhooks: tread_server::config::webhooks::WebhooksConfig::default(),
             audit: tread_server::config::AuditConfig::default(),
             web: WebConfig::default(),
         });
