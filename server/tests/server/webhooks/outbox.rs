@@ -13,7 +13,7 @@ use tread_server::db::webhooks::NewDelivery;
 
 use super::receiver::{Mood, Receiver};
 use super::{BEGIN, advance, create, deliveries, newest, report, start, start_at};
-use crate::harness::{eventually, time};
+use crate::harness::{Yard, eventually, time};
 use crate::robot::Robot;
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -84,8 +84,8 @@ async fn a_delivery_under_way_when_the_server_stops_is_sent_again_by_the_next() 
     yard.server.stop().await.unwrap();
 }
 
-/// Queues deliveries that nobody sends, as of a webhook that is not enabled.
-async fn queue(yard: &crate::harness::Yard, webhook: &str, count: u32) {
+/// Queues deliveries that were not sent yet, as if at a time.
+async fn queue(yard: &Yard, webhook: &str, count: u32, at: &str) {
     let webhook: WebhookId = webhook.parse().unwrap();
     let app = yard.server.app();
     let mut tx = app.db().write("test").await.unwrap();
@@ -97,7 +97,7 @@ async fn queue(yard: &crate::harness::Yard, webhook: &str, count: u32) {
             event: NoticeEvent::Opened,
             kind: "tyre".parse().unwrap(),
             body: "{}".to_owned(),
-            at: app.clock().now(),
+            at: time(at),
         };
         db::webhooks::queue(&mut tx, &new).await.unwrap();
     }
@@ -110,7 +110,7 @@ async fn of_too_many_that_wait_the_oldest_are_dropped_and_counted() {
     let receiver = Receiver::start(Mood::Says(503, "")).await;
     let settings = json!({"name": "x", "url": receiver.url(), "enabled": false});
     let (id, _) = create(&yard, &settings).await;
-    queue(&yard, &id, PENDING_MAX).await;
+    queue(&yard, &id, PENDING_MAX, BEGIN).await;
     for _ in 0..3 {
         let path = format!("/v1/webhooks/{id}/test");
         assert_eq!(yard.post(&path, &json!({})).await.0, StatusCode::ACCEPTED);
@@ -143,8 +143,8 @@ async fn what_waits_too_long_is_given_up_and_what_is_deleted_is_gone() {
     let receiver = Receiver::start(Mood::Good).await;
     let settings = json!({"name": "x", "url": receiver.url(), "enabled": false});
     let (id, _) = create(&yard, &settings).await;
-    queue(&yard, &id, 2).await;
-    advance(&yard, Duration::from_hours(25)).await;
+    queue(&yard, &id, 2, "2026-11-20T06:00:00Z").await;
+    advance(&yard, Duration::from_hours(23)).await;
     let given_up = newest(&yard, &id, |delivery| delivery["state"] == "failed").await;
     let detail = given_up["detail"].as_str().unwrap();
     assert!(detail.contains("waited too long"), "{detail}");
@@ -172,7 +172,7 @@ async fn a_secret_that_is_replaced_signs_what_waits_and_a_webhook_that_is_enable
     let receiver = Receiver::start(Mood::Good).await;
     let settings = json!({"name": "x", "url": receiver.url(), "enabled": false});
     let (id, former) = create(&yard, &settings).await;
-    queue(&yard, &id, 1).await;
+    queue(&yard, &id, 1, BEGIN).await;
     let path = format!("/v1/webhooks/{id}");
     let (status, made) = yard.post(&format!("{path}/secret"), &json!({})).await;
     assert_eq!(status, StatusCode::OK, "{made}");
