@@ -13,6 +13,7 @@ use tread_api::wire::ingest::MissionReport;
 
 use super::enrolment::{RETIRED_ALERT, REVOKED_ALERT, UNISSUED_ALERT};
 use super::missions::reports::Taken;
+use super::own_alert::OwnAlert;
 use super::reconciler::attendance::ROBOT_LOST_ALERT;
 use super::reconciler::conditions::{CLOCK_WRONG_ALERT, ROBOT_WAITING_ALERT};
 use super::stops::UNCONFIRMED_ALERT;
@@ -51,19 +52,6 @@ const OWN_ALERTS: [&str; 10] = [
     MISSION_EXPIRED_ALERT,
     MISSION_REJECTED_ALERT,
 ];
-
-/// One of the server's own alerts about a robot, to be raised.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct OwnAlert {
-    /// Its code.
-    pub(super) code: &'static str,
-    /// Severity.
-    pub(super) severity: Severity,
-    /// Description, for people.
-    pub(super) text: String,
-    /// Mission that it is about; if `None`, the one that the robot drives.
-    pub(super) mission: Option<MissionId>,
-}
 
 impl App {
     /// Returns a page of alerts, newest first.

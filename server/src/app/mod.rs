@@ -17,6 +17,7 @@ pub mod memory;
 pub mod merging;
 pub mod metrics;
 pub mod missions;
+mod own_alert;
 mod planned_path;
 pub mod presence;
 pub mod reconciler;

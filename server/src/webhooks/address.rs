@@ -6,6 +6,7 @@ use reqwest::Url;
 use tread_api::webhook::WEBHOOK_URL_MAX;
 
 use crate::config::webhooks::WebhooksConfig;
+use crate::identity::origin::Origin;
 
 /// Networks of IPv4 that are not public, with the length of their prefix: this network, private,
 /// shared (CGNAT), loopback, link-local (with the metadata services of clouds), special purposes,
@@ -109,7 +110,7 @@ impl Rules {
     /// configured.
     pub fn link(&self, path: &str) -> String {
         let origin = self.0.public_url.as_ref();
-        format!("{}{path}", origin.map_or("", |origin| origin.as_str()))
+        format!("{}{path}", origin.map_or("", Origin::as_str))
     }
 
     /// Returns whether an address may be called.

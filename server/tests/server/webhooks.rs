@@ -78,7 +78,7 @@ fn report(robot: &Robot, code: Option<&str>) {
     });
 }
 
-async fn advance(yard: &Yard, span: Duration) {
+fn advance(yard: &Yard, span: Duration) {
     yard.server.app().clock().advance(span);
 }
 
@@ -212,7 +212,7 @@ async fn the_note_of_a_restart_ends_by_itself() {
     let path = "/v1/alerts?kind=server-restarted";
     let (_, raised) = yard.get_value(path).await;
     assert_eq!(raised["items"][0]["cleared_at"], Value::Null, "{raised}");
-    advance(&yard, Duration::from_mins(10)).await;
+    advance(&yard, Duration::from_mins(10));
     eventually("it is over", async || {
         let (_, found) = yard.get_value(path).await;
         let is_over = found["items"][0]["cleared_at"].is_string();

@@ -8,7 +8,7 @@ use tread_api::enrolment::Enrolment;
 use tread_api::robot::{Alert, Severity};
 
 use super::registry::Standing;
-use crate::app::alerts::OwnAlert;
+use crate::app::own_alert::OwnAlert;
 use crate::app::presence::RobotKey;
 use crate::app::{App, AppError};
 use crate::authority::RobotName;

@@ -5,10 +5,9 @@ use std::time::Duration;
 
 use tread_api::ids::{MissionId, StopId};
 use tread_api::rights::Scope;
-use tread_api::robot::{LinkCause, LinkState};
+use tread_api::robot::{LinkCause, LinkState, MissionProgress};
 
 use super::{OFFSETS_MAX, Presence, Presences, RobotKey, stop_of};
-use crate::app::reconciler::conditions::Shown;
 
 /// Revisions of a site's data that a robot reports.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -30,6 +29,15 @@ pub struct Attending {
     pub silent_for: Option<Duration>,
     /// Cause of a link that is not online; `None` while it is.
     pub cause: Option<LinkCause>,
+}
+
+/// What a robot shows of itself while it is heard.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Showing {
+    /// Progress of its mission.
+    pub mission: Option<MissionProgress>,
+    /// Offset of its clock, milliseconds, positive if it is ahead of the server's.
+    pub clock_offset_ms: i64,
 }
 
 impl Presences {
@@ -57,7 +65,7 @@ impl Presences {
 
     /// Returns mission and clock of every robot that is heard at `now`. The clock of a robot without
     /// enough states counts as right.
-    pub(in crate::app) fn conditions(&self, now: Duration) -> Vec<(RobotKey, Shown)> {
+    pub fn conditions(&self, now: Duration) -> Vec<(RobotKey, Showing)> {
         let robots = self.lock();
         let heard = robots
             .iter()
@@ -65,7 +73,7 @@ impl Presences {
         let shown = |presence: &Presence| {
             let has_enough = presence.clock_offsets_ms.len() >= OFFSETS_MAX;
             let offset_ms = has_enough.then(|| presence.clock_offset_ms());
-            Some(Shown {
+            Some(Showing {
                 mission: presence.state()?.mission,
                 clock_offset_ms: offset_ms.unwrap_or(0),
             })

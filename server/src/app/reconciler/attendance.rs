@@ -17,7 +17,7 @@ use std::time::Duration;
 
 use tread_api::robot::{LinkCause, Severity};
 
-use crate::app::alerts::OwnAlert;
+use crate::app::own_alert::OwnAlert;
 use crate::app::presence::RobotKey;
 use crate::app::{App, AppError};
 use crate::db;

@@ -9,10 +9,10 @@ use std::collections::{HashMap, HashSet};
 use std::time::Duration;
 
 use tread_api::ids::MissionId;
-use tread_api::robot::{Alert, MissionProgress, Severity};
+use tread_api::robot::{Alert, Severity};
 
-use crate::app::alerts::OwnAlert;
-use crate::app::presence::RobotKey;
+use crate::app::own_alert::OwnAlert;
+use crate::app::presence::{RobotKey, Showing};
 use crate::app::{App, AppError};
 use crate::db;
 
@@ -36,15 +36,6 @@ const CLOCK_WRONG_FOR: Duration = Duration::from_secs(30);
 /// Minimum interval between two checks.
 const LOOK_EVERY: Duration = Duration::from_secs(1);
 
-/// What a robot shows of itself while it is heard.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(in crate::app) struct Shown {
-    /// Progress of its mission.
-    pub(in crate::app) mission: Option<MissionProgress>,
-    /// Offset of its clock, milliseconds, positive if it is ahead of the server's.
-    pub(in crate::app) clock_offset_ms: i64,
-}
-
 /// What is remembered of a robot.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct Memory {
@@ -58,7 +49,7 @@ struct Memory {
 
 impl Memory {
     /// Takes in what the robot shows; `is_waiting` and `is_clock_wrong` are right afterwards.
-    fn judge(&mut self, shown: Shown, now: Duration) {
+    fn judge(&mut self, shown: Showing, now: Duration) {
         match (shown.mission, self.standing) {
             (None, _) => {
                 self.standing = None;
@@ -148,7 +139,7 @@ async fn write_down(
     app: &App,
     (site, robot): &RobotKey,
     (before, after): (Memory, Memory),
-    shown: Shown,
+    shown: Showing,
 ) -> Result<(), AppError> {
     let mut tx = app.db().write("reconciler").await?;
     let Some(robot_pk) = db::robots::pk_of(&mut tx, site, robot).await? else {
@@ -186,7 +177,7 @@ async fn write_down(
     Ok(app.commit_alerts(tx, alerts).await?)
 }
 
-fn waiting_text(shown: Shown) -> String {
+fn waiting_text(shown: Showing) -> String {
     let minutes = WAITED_AFTER.as_secs() / 60;
     let how = match shown.mission {
         Some(progress) if progress.paused => "it is paused",
@@ -213,20 +204,20 @@ mod tests {
 
     use super::*;
 
-    fn shown(mission: u8, driven_m: f64) -> Shown {
+    fn shown(mission: u8, driven_m: f64) -> Showing {
         let progress = json!({
             "id": format!("0192f0c1-2b3c-7d4e-8f50-6172839400{mission:02x}"), "revision": 1,
             "plan_hash": "0192f0c1-2b3c-5d4e-8f50-617283940a1b", "driven_m": driven_m,
             "length_m": 100.0, "cross_track_m": 0.0,
         });
-        Shown {
+        Showing {
             mission: Some(serde_json::from_value(progress).unwrap()),
             clock_offset_ms: 0,
         }
     }
 
-    fn off_by(clock_offset_ms: i64) -> Shown {
-        Shown {
+    fn off_by(clock_offset_ms: i64) -> Showing {
+        Showing {
             mission: None,
             clock_offset_ms,
         }

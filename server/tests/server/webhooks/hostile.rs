@@ -219,7 +219,7 @@ async fn a_webhook_rests_after_a_failure_and_sends_one_delivery_after_the_other(
     eventually("the first attempt is counted", is_stored).await;
     assert_eq!(receiver.requests().len(), 1, "it rests");
     receiver.set(Mood::Good);
-    advance(&yard, Duration::from_secs(11)).await;
+    advance(&yard, Duration::from_secs(11));
     let requests = receiver.has(4).await;
     let mut ids: Vec<&str> = requests[1..].iter().map(|one| one.delivery()).collect();
     assert!(ids.is_sorted(), "the oldest first: {ids:?}");

@@ -5,6 +5,8 @@ use std::time::Duration;
 
 use reqwest::StatusCode;
 use serde_json::{Value, json};
+use sqlx::sqlite::SqliteConnectOptions;
+use sqlx::{Connection as _, SqliteConnection};
 use tread_api::ids::{DeliveryId, WebhookId};
 use tread_api::webhook::NoticeEvent;
 use tread_server::app::webhooks::PENDING_MAX;
@@ -13,7 +15,7 @@ use tread_server::db::webhooks::NewDelivery;
 
 use super::receiver::{Mood, Receiver};
 use super::{BEGIN, advance, create, deliveries, newest, report, start, start_at};
-use crate::harness::{Yard, eventually, time};
+use crate::harness::{Yard, database, eventually, time};
 use crate::robot::Robot;
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -32,7 +34,7 @@ async fn a_delivery_is_repeated_with_its_identifier_until_it_arrives_also_over_a
     let detail = tried["detail"].as_str().unwrap();
     assert!(detail.contains("no [2J room"), "{detail}");
     assert_eq!(receiver.requests().len(), 1, "it waits for its back-off");
-    advance(&yard, Duration::from_secs(10)).await;
+    advance(&yard, Duration::from_secs(10));
     let tried = newest(&yard, &id, |delivery| delivery["attempts"] == 2).await;
     let requests = receiver.has(2).await;
     assert_eq!(requests[0].delivery(), requests[1].delivery());
@@ -78,6 +80,34 @@ async fn a_delivery_under_way_when_the_server_stops_is_sent_again_by_the_next() 
     yard.server.stop().await.unwrap();
     receiver.set(Mood::Good);
     let yard = start_at(folder, time(BEGIN)).await;
+    let again = receiver.has(2).await.remove(1);
+    assert_eq!(again.delivery(), first.delivery());
+    newest(&yard, &id, |delivery| delivery["state"] == "delivered").await;
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn that_nothing_can_be_stored_is_sent_all_the_same_and_once_more_when_it_can() {
+    let folder = Arc::new(tempfile::tempdir().unwrap());
+    let yard = start_at(Arc::clone(&folder), time(BEGIN)).await;
+    let receiver = Receiver::start(Mood::Good).await;
+    let settings = json!({"name": "x", "url": receiver.url(), "kinds": ["storage-unwritable"]});
+    let (id, secret) = create(&yard, &settings).await;
+    let options = SqliteConnectOptions::new().filename(database(folder.path()));
+    let mut other = SqliteConnection::connect_with(&options).await.unwrap();
+    sqlx::query("BEGIN IMMEDIATE")
+        .execute(&mut other)
+        .await
+        .unwrap();
+    // Readiness is asked for anew.
+    advance(&yard, Duration::from_secs(2));
+    let (status, body) = yard.get_value("/readyz").await;
+    assert_eq!(status, StatusCode::SERVICE_UNAVAILABLE, "{body}");
+    let first = receiver.has(1).await.remove(0);
+    assert!(first.is_signed_with(&secret), "{first:?}");
+    assert_eq!(first.json()["kind"], "storage-unwritable");
+    assert_eq!(deliveries(&yard, &id).await, Vec::<Value>::new());
+    sqlx::query("ROLLBACK").execute(&mut other).await.unwrap();
     let again = receiver.has(2).await.remove(1);
     assert_eq!(again.delivery(), first.delivery());
     newest(&yard, &id, |delivery| delivery["state"] == "delivered").await;
@@ -144,7 +174,7 @@ async fn what_waits_too_long_is_given_up_and_what_is_deleted_is_gone() {
     let settings = json!({"name": "x", "url": receiver.url(), "enabled": false});
     let (id, _) = create(&yard, &settings).await;
     queue(&yard, &id, 2, "2026-11-20T06:00:00Z").await;
-    advance(&yard, Duration::from_hours(23)).await;
+    advance(&yard, Duration::from_hours(23));
     let given_up = newest(&yard, &id, |delivery| delivery["state"] == "failed").await;
     let detail = given_up["detail"].as_str().unwrap();
     assert!(detail.contains("waited too long"), "{detail}");
