@@ -165,6 +165,14 @@ uuid_id! {
     JoinTokenId
 }
 uuid_id! {
+    /// Identifier of a webhook: a version 7 UUID.
+    WebhookId
+}
+uuid_id! {
+    /// Identifier of a delivery to a webhook: a version 7 UUID, so that identifiers sort by time.
+    DeliveryId
+}
+uuid_id! {
     /// Identifier of a browser's session: a version 7 UUID; not secret.
     SessionId
 }

@@ -5,7 +5,7 @@
 //! protocol.
 //!
 //! * REST bodies: [`site`], [`terrain`], [`robot`], [`trajectory`], [`mission`], [`friction`],
-//!   [`safety`], [`stop`], [`drive`], [`event`], [`identity`], [`page`], [`problem`].
+//!   [`safety`], [`stop`], [`drive`], [`event`], [`identity`], [`webhook`], [`page`], [`problem`].
 //! * Compact binary form of the friction map: [`tile`].
 //! * zenoh payloads: [`wire`], with the key expressions in [`keys`]; the TLS tunnel below them:
 //!   [`tunnel`].
@@ -39,4 +39,5 @@ pub mod text;
 pub mod tile;
 pub mod trajectory;
 pub mod tunnel;
+pub mod webhook;
 pub mod wire;

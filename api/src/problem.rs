@@ -95,6 +95,8 @@ pub enum ProblemType {
     UnknownToken,
     #[serde(rename = "/problems/unknown-session")]
     UnknownSession,
+    #[serde(rename = "/problems/unknown-webhook")]
+    UnknownWebhook,
     #[serde(rename = "/problems/sign-in-failed")]
     SignInFailed,
     #[serde(rename = "/problems/sign-in-refused")]
@@ -119,7 +121,7 @@ pub enum ProblemType {
 
 impl ProblemType {
     /// Every problem type.
-    pub const ALL: [Self; 51] = [
+    pub const ALL: [Self; 52] = [
         Self::MalformedBody,
         Self::InvalidBody,
         Self::UnknownField,
@@ -161,6 +163,7 @@ impl ProblemType {
         Self::UnknownHost,
         Self::UnknownToken,
         Self::UnknownSession,
+        Self::UnknownWebhook,
         Self::SignInFailed,
         Self::SignInRefused,
         Self::RequestTooLong,
@@ -217,6 +220,7 @@ impl ProblemType {
             Self::UnknownHost => "The host name is not one of this server",
             Self::UnknownToken => "The token is not known",
             Self::UnknownSession => "The session is not known",
+            Self::UnknownWebhook => "The webhook is not known",
             Self::SignInFailed => "The sign-in has failed",
             Self::SignInRefused => "You have no rights on this server",
             Self::RequestTooLong => "The path or query is too long",

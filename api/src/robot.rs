@@ -6,7 +6,7 @@ use utoipa::ToSchema;
 use uuid::Uuid;
 
 use crate::friction::LiveFriction;
-use crate::geometry::{Pose, Twist};
+use crate::geometry::{Point, Pose, Twist};
 use crate::ids::{
     AlertCode, AlertId, BootId, ConfigurationId, DERIVED_NAMESPACE, MissionId, PlanHash, RobotId,
     SiteId,
@@ -235,6 +235,12 @@ pub struct Alert {
     pub severity: Severity,
     /// Description, for people.
     pub text: String,
+    /// Mission that it is about, or that the robot drove when it was raised; `null` without one.
+    #[serde(default)]
+    pub mission: Option<MissionId>,
+    /// Position of the robot in the site frame when it was raised; `null` if unknown.
+    #[serde(default)]
+    pub place: Option<Point>,
     /// Time when the server raised it.
     pub raised_at: Timestamp,
     /// Time when a person acknowledged it; `null` before that.

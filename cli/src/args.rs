@@ -8,6 +8,7 @@ mod map;
 mod missions;
 mod safety;
 mod values;
+mod webhooks;
 
 use std::ffi::OsString;
 use std::path::PathBuf;
@@ -38,6 +39,7 @@ pub(crate) use self::safety::{
 };
 use self::values::duration;
 pub(crate) use self::values::{shield_negative_points, waypoint};
+pub(crate) use self::webhooks::{NamedWebhook, WebhooksAction, WebhooksArguments};
 use crate::exit::Exit;
 use crate::output::{failure, note};
 
@@ -157,6 +159,8 @@ pub(crate) enum RemoteCommand {
     Clear(ClearArguments),
     /// List alerts, or acknowledge one
     Alerts(AlertsArguments),
+    /// List the webhooks to which alerts are sent, or add, test or remove one
+    Webhooks(WebhooksArguments),
     /// Teleoperate a robot from this terminal
     Drive(DriveArguments),
     /// List the leases of teleoperation: who drives which robot
@@ -209,6 +213,7 @@ impl RemoteCommand {
             Self::Stops(arguments) => &arguments.connection,
             Self::Clear(arguments) => &arguments.connection,
             Self::Alerts(arguments) => &arguments.connection,
+            Self::Webhooks(arguments) => &arguments.connection,
             Self::Drive(arguments) => &arguments.connection,
             Self::Limits(arguments) => &arguments.connection,
             Self::Geofence(arguments) => &arguments.connection,

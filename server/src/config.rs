@@ -4,6 +4,7 @@
 //! prevents the start. The error names file, line and key.
 
 pub mod oidc;
+pub mod webhooks;
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
@@ -14,6 +15,7 @@ use serde::Deserialize;
 use tread_api::ids::{ConfigurationId, SiteId};
 
 use self::oidc::{OidcConfig, OidcConfigError};
+use self::webhooks::WebhooksConfig;
 use crate::authority::is_port_name;
 use crate::friction::index::Normalisation;
 pub use crate::friction::weights::FrictionConfig;
@@ -100,6 +102,8 @@ pub struct Config {
     pub robots: Option<RobotsConfig>,
     /// Sign-in of people at an OpenID provider; `None` allows tokens only.
     pub oidc: Option<OidcConfig>,
+    /// Where webhooks may go.
+    pub webhooks: WebhooksConfig,
 }
 
 /// `[robots]`: enrolment and authentication of robots by certificates.
@@ -322,6 +326,8 @@ struct File {
     audit: AuditConfig,
     robots: Option<RobotsConfig>,
     oidc: Option<OidcConfig>,
+    #[serde(default)]
+    webhooks: WebhooksConfig,
 }
 
 /// Error of reading the configuration.
@@ -359,6 +365,16 @@ pub enum ConfigError {
     /// `[oidc]` is invalid.
     #[error(transparent)]
     Oidc(#[from] OidcConfigError),
+    /// A list has too many entries.
+    #[error("`{key}` has {count} entries; at most {most} are possible")]
+    TooMany {
+        /// Configuration key.
+        key: &'static str,
+        /// Number of entries.
+        count: usize,
+        /// Maximum number of entries.
+        most: usize,
+    },
     /// An entry of `robots.names` is neither a host name nor an IP address.
     #[error("`robots.names` has `{0}`, which is neither a host name nor an address")]
     PortName(String),
@@ -418,6 +434,7 @@ impl Config {
             audit: file.audit,
             robots: file.robots,
             oidc: file.oidc,
+            webhooks: file.webhooks,
         };
         config.check()?;
         Ok(config)
@@ -457,6 +474,7 @@ impl Config {
         }
         self.retention.check()?;
         self.storage.check()?;
+        self.webhooks.check()?;
         check_friction(self.friction)
     }
 }

@@ -209,6 +209,14 @@ counters! {
     /// Requests missing in the audit log because too many different repeats were counted, or
     /// because the database failed until the stop of the server.
     audit_dropped,
+    /// Deliveries that the receiver of a webhook took.
+    webhook_delivered,
+    /// Attempts to send a delivery to a webhook that failed.
+    webhook_attempts_failed,
+    /// Deliveries to webhooks given up after the last attempt, or because they waited too long.
+    webhook_given_up,
+    /// Deliveries to webhooks dropped because too many others were waiting.
+    webhook_dropped,
     /// HTTP requests whose handler panicked.
     http_panics,
 }

@@ -2,8 +2,8 @@
 //! measurements of the robots, and serves the friction map.
 //!
 //! * [`http`] is the REST API and uses no SQL; [`app`] contains the use cases; [`db`] contains the
-//!   SQL and no decisions. Only [`fleet`] calls zenoh, and only [`oidc`] the OpenID provider.
-//!   [`friction`] is pure.
+//!   SQL and no decisions. Only [`fleet`] calls zenoh, only [`oidc`] the OpenID provider, and
+//!   only [`webhooks`] the receivers of alerts. [`friction`] is pure.
 //! * [`Server::start`] runs the server inside another program; [`run_from_args`] is the whole
 //!   program, which runs until a signal.
 
@@ -25,6 +25,7 @@ pub mod metrics;
 pub mod oidc;
 mod rate_limit;
 pub mod supervisor;
+pub mod webhooks;
 
 use std::ffi::OsString;
 use std::net::SocketAddr;
@@ -58,6 +59,7 @@ use self::http::serve::Serving;
 use self::http::tls::Tls;
 use self::identity::address::TrustedProxies;
 use self::supervisor::Supervisor;
+use self::webhooks::{Resolver, Sender, SystemResolver};
 
 /// Maximum wait for blocking threads after all tasks have stopped; then they are abandoned.
 const RUNTIME_STOP_TIMEOUT: Duration = Duration::from_secs(2);
@@ -91,6 +93,18 @@ impl Server {
     /// # Errors
     /// As [`Server::start`].
     pub async fn start_with_clock(config: Config, clock: Clock) -> anyhow::Result<RunningServer> {
+        Self::start_with(config, clock, Arc::new(SystemResolver)).await
+    }
+
+    /// Starts a server with the given clock and resolver of webhooks' host names.
+    ///
+    /// # Errors
+    /// As [`Server::start`].
+    pub async fn start_with(
+        config: Config,
+        clock: Clock,
+        resolver: Arc<dyn Resolver>,
+    ) -> anyhow::Result<RunningServer> {
         let names = config.names();
         let proxies = TrustedProxies::new(config.web.trusted_proxies.clone());
         let tls = config.tls.map(Tls::load).transpose()?.map(Arc::new);
@@ -117,12 +131,14 @@ impl Server {
             enrolment: security
                 .zip(config.robots.as_ref())
                 .map(|(security, robots)| enrolment_service(security, robots)),
+            webhooks: config.webhooks,
         });
         app.log_audit(config.audit.log);
         if let Some(oidc) = &config.oidc {
             app.admit_people(oidc)?;
         }
         remember(&app, &config.site).await?;
+        let sender = Sender::new(app.webhook_rules().clone(), resolver)?;
         let listener = http::serve::listen(config.http)
             .with_context(|| format!("cannot listen for HTTP on {}", config.http))?;
         let http_address = listener.local_addr()?;
@@ -141,6 +157,8 @@ impl Server {
         supervisor.spawn_vital("tokens", app::identity::run(app.clone(), stop()));
         let finding = app::identity::people::run(app.clone(), stop());
         supervisor.spawn_vital("provider", finding);
+        let sending = app::webhooks::delivery::run(app.clone(), sender, stop());
+        supervisor.spawn_vital("webhooks", sending);
         let router = http::router(app.clone(), names);
         if let Some(tls) = &tls {
             supervisor.spawn_vital("certificate", http::tls::watch(Arc::clone(tls), stop()));
@@ -205,6 +223,9 @@ async fn remember(app: &App, site: &SiteId) -> anyhow::Result<()> {
     }
     app.ensure_site(site).await?;
     app.know_robots().await?;
+    if !app.presences().known().is_empty() {
+        app.note_restart();
+    }
     app.load_map().await?;
     app.know_enrolments().await?;
     // Without this cache each token is looked up at its first use.

@@ -154,11 +154,29 @@ const EXAMPLES: &[(&str, &str)] = &[
     ),
     (
         "alerts",
-        "  tread alerts\n  tread alerts --all --robot rover-1",
+        "  tread alerts\n  tread alerts --all --robot rover-1 --kind robot-lost",
     ),
     (
         "alerts acknowledge",
         "  tread alerts acknowledge 0192f0c1-2b3c-7d4e-8f50-617283940a1b",
+    ),
+    ("webhooks", "  tread webhooks"),
+    ("webhooks list", "  tread webhooks list --json"),
+    (
+        "webhooks add",
+        "  tread webhooks add \"on call\" https://alerts.example.org/tread > secret\n  tread webhooks add lost https://alerts.example.org/lost --kinds robot-lost,mission-failed --for yard",
+    ),
+    ("webhooks remove", "  tread webhooks remove \"on call\""),
+    ("webhooks test", "  tread webhooks test \"on call\""),
+    (
+        "webhooks deliveries",
+        "  tread webhooks deliveries \"on call\" --limit 50",
+    ),
+    ("webhooks enable", "  tread webhooks enable \"on call\""),
+    ("webhooks disable", "  tread webhooks disable \"on call\""),
+    (
+        "webhooks rotate",
+        "  tread webhooks rotate \"on call\" > secret",
     ),
     ("drive", "  tread drive rover-1 --speed 0.3"),
     ("leases", "  tread leases"),

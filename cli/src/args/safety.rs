@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::{Args, Subcommand};
-use tread_api::ids::{AlertId, OwnerId, RobotId, StopId};
+use tread_api::ids::{AlertCode, AlertId, OwnerId, RobotId, StopId};
 
 use super::Connection;
 use super::values::{duration, finite, look_interval, positive};
@@ -77,6 +77,9 @@ pub(crate) struct AlertsArguments {
     /// Show only alerts of this robot
     #[arg(long)]
     pub(crate) robot: Option<RobotId>,
+    /// Show only alerts of this kind, such as `robot-lost`
+    #[arg(long)]
+    pub(crate) kind: Option<AlertCode>,
     /// Show cleared alerts too
     #[arg(long)]
     pub(crate) all: bool,

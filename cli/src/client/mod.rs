@@ -7,6 +7,7 @@ mod identity;
 mod map;
 mod missions;
 mod safety;
+mod webhooks;
 
 use std::borrow::Cow;
 use std::io;

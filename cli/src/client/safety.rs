@@ -1,7 +1,7 @@
 //! Requests about stops, alerts, external limits and geofences.
 
 use reqwest::Method;
-use tread_api::ids::{AlertId, OwnerId, RobotId, SiteId};
+use tread_api::ids::{AlertCode, AlertId, OwnerId, RobotId, SiteId};
 use tread_api::page::Page;
 use tread_api::robot::Alert;
 use tread_api::safety::{Geofence, LimitStatus, ReplaceGeofence, SetLimit};
@@ -55,7 +55,7 @@ impl Client {
     pub(crate) async fn alerts(
         &self,
         site: &SiteId,
-        robot: Option<&RobotId>,
+        (robot, kind): (Option<&RobotId>, Option<&AlertCode>),
         raised: bool,
         limit: u32,
     ) -> Result<Page<Alert>, ClientError> {
@@ -65,6 +65,7 @@ impl Client {
             ("limit", limit.to_string()),
         ];
         query.extend(robot.map(|robot| ("robot", robot.to_string())));
+        query.extend(kind.map(|kind| ("kind", kind.to_string())));
         self.get_with("/v1/alerts", &query).await
     }
 

@@ -25,8 +25,10 @@ pub(super) async fn run(
         return Ok(ExitCode::SUCCESS);
     }
     let site = &arguments.connection.site;
-    let (robot, raised) = (arguments.robot.as_ref(), !arguments.all);
-    let page = client.alerts(site, robot, raised, arguments.limit).await?;
+    let of = (arguments.robot.as_ref(), arguments.kind.as_ref());
+    let page = client
+        .alerts(site, of, !arguments.all, arguments.limit)
+        .await?;
     output.show(&page.items, |alerts| list(alerts))?;
     Ok(ExitCode::SUCCESS)
 }

@@ -19,6 +19,7 @@ mod stops;
 mod terrains;
 mod waiting;
 mod watch;
+mod webhooks;
 
 use std::process::ExitCode;
 
@@ -67,6 +68,7 @@ pub(crate) async fn run(command: RemoteCommand, output: Output) -> anyhow::Resul
         RemoteCommand::Stops(arguments) => stops::history(&arguments, &client, output).await,
         RemoteCommand::Clear(arguments) => stops::clear(arguments, &client, output).await,
         RemoteCommand::Alerts(arguments) => alerts::run(arguments, &client, output).await,
+        RemoteCommand::Webhooks(arguments) => webhooks::run(arguments, &client, output).await,
         RemoteCommand::Drive(arguments) => drive::run(&arguments, &client).await,
         RemoteCommand::Leases(_) => robots::leases(site, &client, output).await,
         RemoteCommand::Limits(arguments) => limits::run(arguments, &client, output).await,

@@ -47,6 +47,7 @@ impl ServerWithRobots {
             audit: tread_server::config::AuditConfig::default(),
             web: WebConfig::default(),
             oidc: None,
+            webhooks: tread_server::config::webhooks::WebhooksConfig::default(),
         });
         let server = server.await.unwrap();
         let admin = server.app().create_first_admin(FirstAdmin {

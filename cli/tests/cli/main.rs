@@ -12,4 +12,5 @@ mod manual;
 mod operator;
 mod terminal;
 mod watch;
+mod webhooks;
 mod yard;

@@ -8,6 +8,7 @@ use tempfile::TempDir;
 use tread_agent::sim::scenario::Scenario;
 use tread_agent::{Agent, AgentConfig, RunningAgent};
 use tread_server::app::identity::tokens::FirstAdmin;
+use tread_server::config::webhooks::WebhooksConfig;
 use tread_server::config::{FrictionConfig, RetentionConfig, StorageConfig, TlsFiles, WebConfig};
 use tread_server::{Config, RunningServer, Server};
 
@@ -48,6 +49,11 @@ impl Yard {
             }),
             robots: None,
             oidc: None,
+            webhooks: WebhooksConfig {
+                allow_http: true,
+                allowed_networks: vec!["127.0.0.1".parse().unwrap()],
+                ..WebhooksConfig::default()
+            },
             audit: tread_server::config::AuditConfig::default(),
             web: WebConfig::default(),
         });

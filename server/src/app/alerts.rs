@@ -4,34 +4,53 @@
 //! raised here raises and clears alerts; a robot that is offline clears none. Alerts about the
 //! server itself are in [`super::storage`].
 
-use jiff::Timestamp;
 use tread_api::ids::{AlertCode, AlertId, MissionId};
 use tread_api::mission::MissionState;
 use tread_api::page::Page;
 use tread_api::robot::{ALERT_TEXT_MAX, ALERTS_MAX, Alert, AlertReport, Severity};
+use tread_api::webhook::NoticeEvent;
 use tread_api::wire::ingest::MissionReport;
 
 use super::enrolment::{RETIRED_ALERT, REVOKED_ALERT, UNISSUED_ALERT};
 use super::missions::reports::Taken;
+use super::own_alert::OwnAlert;
 use super::reconciler::attendance::ROBOT_LOST_ALERT;
+use super::reconciler::conditions::{CLOCK_WRONG_ALERT, ROBOT_WAITING_ALERT};
 use super::stops::UNCONFIRMED_ALERT;
+use super::storage::SERVER_RESTARTED_ALERT;
 use super::{App, AppError, check_named, page};
 use crate::app::presence::RobotKey;
 pub use crate::db::alerts::AlertFilter;
+use crate::db::alerts::Whereabouts;
 use crate::db::{self, DbError, Outcome};
 
 /// Code of the alert about a mission that failed.
 pub(super) const MISSION_FAILED_ALERT: &str = "mission-failed";
+/// Code of the alert about a mission whose latest start passed before it began.
+pub(super) const MISSION_EXPIRED_ALERT: &str = "mission-expired";
+/// Code of the alert about a mission that its robot rejected for ever.
+pub(super) const MISSION_REJECTED_ALERT: &str = "mission-rejected";
+/// Codes of the alerts about missions that did not succeed. Each is raised until a person
+/// acknowledges it, or until a mission of the robot succeeds.
+pub(super) const MISSION_ALERTS: [&str; 3] = [
+    MISSION_FAILED_ALERT,
+    MISSION_EXPIRED_ALERT,
+    MISSION_REJECTED_ALERT,
+];
 /// Maximum number of alerts stored per robot. Beyond it the oldest cleared ones are deleted first.
 const KEPT_MAX: u32 = 500;
 /// Codes of alerts that the server itself raises and clears, independently of the robot's reports.
-const OWN_ALERTS: [&str; 6] = [
+const OWN_ALERTS: [&str; 10] = [
     UNCONFIRMED_ALERT,
     REVOKED_ALERT,
     RETIRED_ALERT,
     UNISSUED_ALERT,
     ROBOT_LOST_ALERT,
+    ROBOT_WAITING_ALERT,
+    CLOCK_WRONG_ALERT,
     MISSION_FAILED_ALERT,
+    MISSION_EXPIRED_ALERT,
+    MISSION_REJECTED_ALERT,
 ];
 
 impl App {
@@ -59,17 +78,35 @@ impl App {
         Ok(found.and_then(|alert| alert.robot_key()))
     }
 
-    /// Marks an alert as acknowledged by a person. This also clears the alert of a failed mission.
+    /// Returns an alert.
+    ///
+    /// # Errors
+    /// [`AppError::UnknownAlert`].
+    pub async fn alert(&self, id: AlertId) -> Result<Alert, AppError> {
+        if let Some(alert) = self.storage().alert(id) {
+            return Ok(alert);
+        }
+        let mut tx = self.db().read("alerts").await?;
+        let found = db::alerts::find(&mut tx, id).await?;
+        found.ok_or(AppError::UnknownAlert(id))
+    }
+
+    /// Marks an alert as acknowledged by a person. This also clears an alert about a mission that
+    /// did not succeed, and the note about a restart of the server.
     pub async fn acknowledge_alert(&self, id: AlertId) -> Result<Alert, AppError> {
         if let Some(alert) = self.storage().acknowledge(id, self.clock().now()) {
             self.hub().alert(&alert);
+            if alert.cleared_at.is_none() && alert.code.as_str() == SERVER_RESTARTED_ALERT {
+                self.set_server_alert(SERVER_RESTARTED_ALERT, Severity::Warning, None);
+                return Ok(self.storage().alert(id).unwrap_or(alert));
+            }
             return Ok(alert);
         }
         let mut tx = self.db().write("alerts").await?;
         db::alerts::acknowledge(&mut tx, id, self.clock().now()).await?;
         let found = db::alerts::find(&mut tx, id).await?;
         let mut alert = found.ok_or(AppError::UnknownAlert(id))?;
-        if alert.code.as_str() == MISSION_FAILED_ALERT && alert.cleared_at.is_none() {
+        if MISSION_ALERTS.contains(&alert.code.as_str()) && alert.cleared_at.is_none() {
             let now = self.clock().now();
             let robot_pk = match alert.robot_key() {
                 Some((site, robot)) => db::robots::pk_of(&mut tx, &site, &robot).await?,
@@ -79,6 +116,8 @@ impl App {
                 db::alerts::clear(&mut tx, robot_pk, &alert.code, now).await?;
             }
             alert = db::alerts::find(&mut tx, id).await?.unwrap_or(alert);
+            self.queue_alert(&mut tx, NoticeEvent::Ended, &alert)
+                .await?;
         }
         self.commit_alerts(tx, vec![alert.clone()]).await?;
         Ok(alert)
@@ -113,7 +152,6 @@ impl App {
         };
         let raised = db::alerts::raised_of(&mut tx, robot.pk).await?;
         drop(tx);
-        let now = self.clock().now();
         let has = |alert: &Alert| said.iter().any(|report| report.code == alert.code);
         let is_new = |report: &&AlertReport| !raised.iter().any(|alert| alert.code == report.code);
         // A robot cannot clear an alert that the server itself raised.
@@ -133,46 +171,59 @@ impl App {
         if gone.is_empty() && new.is_empty() {
             return Ok(has_all);
         }
-        let mut changed = Vec::new();
+        let mut alerts = Vec::new();
         let mut tx = self.db().write("alerts").await?;
         for alert in gone {
-            db::alerts::clear(&mut tx, robot.pk, &alert.code, now).await?;
-            changed.push(alert.id);
+            let ended = self.end(&mut tx, robot.pk, alert).await?;
+            alerts.extend(ended);
         }
         for report in new {
-            let id = self.raise(&mut tx, robot.pk, report, now).await?;
-            changed.push(id);
-        }
-        let mut alerts = Vec::new();
-        for id in changed {
-            alerts.extend(db::alerts::find(&mut tx, id).await?);
+            let raised = self.raise(&mut tx, robot.pk, report, None).await?;
+            alerts.extend(raised);
         }
         self.commit_alerts(tx, alerts).await?;
         Ok(has_all)
     }
 
-    /// Raises the alert of a mission that failed and clears that of an earlier one. A mission that
-    /// succeeds clears it too.
+    /// Raises the alert of a mission that did not succeed and clears that of an earlier one of the
+    /// same kind. A mission that succeeds clears them all.
     pub(super) async fn alert_mission_end(
         &self,
         tx: &mut db::Tx,
         robot_pk: i64,
         (mission, state, reason): (MissionId, MissionState, &str),
     ) -> Result<Vec<Alert>, DbError> {
-        if !matches!(state, MissionState::Failed | MissionState::Succeeded) {
-            return Ok(Vec::new());
+        let (raised, verb) = match state {
+            MissionState::Failed => (Some(MISSION_FAILED_ALERT), "failed"),
+            MissionState::Expired => (Some(MISSION_EXPIRED_ALERT), "expired"),
+            MissionState::Rejected => (Some(MISSION_REJECTED_ALERT), "was rejected"),
+            MissionState::Succeeded => (None, ""),
+            MissionState::Queued
+            | MissionState::Offered
+            | MissionState::Active
+            | MissionState::Paused
+            | MissionState::Cancelling
+            | MissionState::Cancelled => return Ok(Vec::new()),
+        };
+        let mut changed = Vec::new();
+        for code in MISSION_ALERTS {
+            if raised.is_none_or(|raised| raised == code) {
+                changed.extend(self.end_alert(tx, robot_pk, code).await?);
+            }
         }
-        let ended = self.end_alert(tx, robot_pk, MISSION_FAILED_ALERT).await?;
-        let mut changed: Vec<Alert> = ended.into_iter().collect();
-        if state == MissionState::Failed {
-            let text = format!("mission `{mission}` failed: {reason}");
-            let alert = (MISSION_FAILED_ALERT, Severity::Warning, text);
+        if let Some(code) = raised {
+            let alert = OwnAlert {
+                code,
+                severity: Severity::Warning,
+                text: format!("mission `{mission}` {verb}: {reason}"),
+                mission: Some(mission),
+            };
             changed.extend(self.begin_alert(tx, robot_pk, alert).await?);
         }
         Ok(changed)
     }
 
-    /// Raises or clears the alert of a failed mission after a robot's mission report was accepted.
+    /// Raises or clears the alerts of a mission after a robot's mission report was accepted.
     pub(super) async fn alert_report(
         &self,
         tx: &mut db::Tx,
@@ -192,9 +243,9 @@ impl App {
         &self,
         tx: &mut db::Tx,
         robot_pk: i64,
-        (code, severity, text): (&'static str, Severity, String),
+        alert: OwnAlert,
     ) -> Result<Option<Alert>, DbError> {
-        let Ok(code) = code.parse::<AlertCode>() else {
+        let Ok(code) = alert.code.parse::<AlertCode>() else {
             return Ok(None);
         };
         let raised = db::alerts::raised_of(tx, robot_pk).await?;
@@ -203,13 +254,10 @@ impl App {
         }
         let report = AlertReport {
             code,
-            severity,
-            text,
+            severity: alert.severity,
+            text: alert.text,
         };
-        let id = self
-            .raise(tx, robot_pk, &report, self.clock().now())
-            .await?;
-        db::alerts::find(tx, id).await
+        self.raise(tx, robot_pk, &report, alert.mission).await
     }
 
     /// Clears one of the server's own alerts about a robot.
@@ -223,8 +271,22 @@ impl App {
         let Some(alert) = raised.into_iter().find(|alert| alert.code.as_str() == code) else {
             return Ok(None);
         };
+        self.end(tx, robot_pk, &alert).await
+    }
+
+    /// Clears an alert, and queues what webhooks are to be sent of it.
+    async fn end(
+        &self,
+        tx: &mut db::Tx,
+        robot_pk: i64,
+        alert: &Alert,
+    ) -> Result<Option<Alert>, DbError> {
         db::alerts::clear(tx, robot_pk, &alert.code, self.clock().now()).await?;
-        db::alerts::find(tx, alert.id).await
+        let ended = db::alerts::find(tx, alert.id).await?;
+        if let Some(ended) = &ended {
+            self.queue_alert(tx, NoticeEvent::Ended, ended).await?;
+        }
+        Ok(ended)
     }
 
     /// Commits, and then publishes the alerts that were written, even if the caller is cancelled.
@@ -246,19 +308,22 @@ impl App {
     pub(super) fn show_alerts(&self, alerts: &[Alert]) {
         if !alerts.is_empty() {
             self.robots_changed();
+            self.wake_webhooks();
         }
         for alert in alerts {
             self.hub().alert(alert);
         }
     }
 
+    /// Stores an alert with its mission and place, and queues what webhooks are to be sent of it.
     async fn raise(
         &self,
         tx: &mut db::Tx,
         robot_pk: i64,
         report: &AlertReport,
-        now: Timestamp,
-    ) -> Result<AlertId, DbError> {
+        mission: Option<MissionId>,
+    ) -> Result<Option<Alert>, DbError> {
+        let now = self.clock().now();
         let id = self.clock().new_id::<AlertId>();
         let report = AlertReport {
             text: report.text.chars().take(ALERT_TEXT_MAX).collect(),
@@ -266,6 +331,32 @@ impl App {
         };
         db::alerts::raise(tx, robot_pk, id, &report, now).await?;
         db::alerts::forget(tx, robot_pk, KEPT_MAX).await?;
-        Ok(id)
+        let Some(mut alert) = db::alerts::find(tx, id).await? else {
+            return Ok(None);
+        };
+        let shown = alert.robot_key().and_then(|key| self.whereabouts(&key));
+        let shown = shown.unwrap_or_default();
+        alert.mission = mission.or(shown.mission);
+        alert.place = shown.place;
+        if alert.mission.is_some() || alert.place.is_some() {
+            let whereabouts = Whereabouts {
+                mission: alert.mission,
+                place: alert.place,
+            };
+            db::alerts::locate(tx, id, whereabouts).await?;
+        }
+        self.queue_alert(tx, NoticeEvent::Opened, &alert).await?;
+        Ok(Some(alert))
+    }
+
+    /// Returns the mission and the position that a robot showed last.
+    fn whereabouts(&self, key: &RobotKey) -> Option<Whereabouts> {
+        let presence = self.presences().get(key);
+        let state = presence.state()?;
+        let place = state.pose.map(|pose| pose.value.position());
+        Some(Whereabouts {
+            mission: state.mission.map(|mission| mission.id),
+            place: place.filter(|place| place.x_m.is_finite() && place.y_m.is_finite()),
+        })
     }
 }

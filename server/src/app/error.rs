@@ -3,6 +3,7 @@
 use tread_api::geometry::Point;
 use tread_api::ids::{
     AlertId, JoinTokenId, MissionId, RobotId, SessionId, SiteId, StopId, TerrainId, TokenId,
+    WebhookId,
 };
 use tread_api::mission::MissionState;
 use tread_api::trajectory::Place;
@@ -99,6 +100,9 @@ pub enum AppError {
     /// No session of that identifier.
     #[error("session `{0}` is not known")]
     UnknownSession(SessionId),
+    /// No webhook of that identifier.
+    #[error("webhook `{0}` is not known")]
+    UnknownWebhook(WebhookId),
     /// No join token of that identifier.
     #[error("join token `{0}` is not known")]
     UnknownJoinToken(JoinTokenId),
@@ -280,6 +284,7 @@ impl AppError {
             | Self::UnknownAlert(_)
             | Self::UnknownToken(_)
             | Self::UnknownSession(_)
+            | Self::UnknownWebhook(_)
             | Self::UnknownJoinToken(_)
             | Self::NoAuthority
             | Self::Rotation(_)

@@ -171,6 +171,7 @@ impl App {
         registry.register("tread_robots_reduced", help, reduced);
         let mut tx = self.db().read("metrics").await?;
         let counts = db::missions::counts(&mut tx).await?;
+        let pending = db::webhooks::pending_count(&mut tx).await?;
         drop(tx);
         let missions = Gauges::default();
         for state in MissionState::ALL {
@@ -181,6 +182,8 @@ impl App {
                 .set(number);
         }
         registry.register("tread_missions", "Missions by state", missions);
+        let help = "Deliveries that wait to be sent to webhooks";
+        registry.register("tread_webhook_pending", help, ConstGauge::new(pending));
         let stops = self.stops_in_force().await?;
         let open = stops.iter().filter(|stop| stop.unconfirmed).count();
         let in_force = ConstGauge::new(count(stops.len()));

@@ -17,6 +17,7 @@ pub mod memory;
 pub mod merging;
 pub mod metrics;
 pub mod missions;
+mod own_alert;
 mod planned_path;
 pub mod presence;
 pub mod reconciler;
@@ -30,6 +31,7 @@ pub mod stops;
 pub mod storage;
 pub mod teleop;
 pub mod terrains;
+pub mod webhooks;
 pub mod withdrawals;
 
 use std::sync::Arc;
@@ -56,7 +58,9 @@ use self::shares::Shares;
 use self::stops::Unrecorded;
 use self::storage::Storage;
 use self::teleop::Holds;
+use self::webhooks::Webhooks;
 use crate::clock::Clock;
+use crate::config::webhooks::WebhooksConfig;
 use crate::config::{FrictionConfig, StorageConfig};
 use crate::counters::Counters;
 pub use crate::db::DbError;
@@ -109,6 +113,7 @@ struct Inner {
     holds: Holds,
     drive_shares: Shares,
     event_shares: Shares,
+    webhooks: Webhooks,
 }
 
 /// Dependencies of use cases.
@@ -128,6 +133,8 @@ pub struct Dependencies {
     pub robots: RobotLink,
     /// Service by which robots join; without it any client on the network may act as a robot.
     pub enrolment: Option<EnrolmentService>,
+    /// Where webhooks may go.
+    pub webhooks: WebhooksConfig,
 }
 
 impl App {
@@ -141,6 +148,7 @@ impl App {
             normalisations,
             robots,
             enrolment,
+            webhooks,
         } = dependencies;
         let started_at = clock.elapsed();
         let presences = Arc::default();
@@ -184,6 +192,7 @@ impl App {
             holds: Holds::default(),
             drive_shares: Shares::new(teleop::SHARES),
             event_shares: Shares::new(events::SHARES),
+            webhooks: Webhooks::new(webhooks),
         };
         Self {
             inner: Arc::new(inner),
@@ -206,6 +215,7 @@ impl App {
             normalisations: Vec::new(),
             robots: RobotLink::unconnected(Supervisor::new()),
             enrolment: None,
+            webhooks: WebhooksConfig::default(),
         })
     }
 
@@ -334,6 +344,10 @@ impl App {
 
     fn unrecorded(&self) -> &Unrecorded {
         &self.inner.unrecorded
+    }
+
+    fn webhooks(&self) -> &Webhooks {
+        &self.inner.webhooks
     }
 
     fn holds(&self) -> &Holds {

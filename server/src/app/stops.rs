@@ -41,6 +41,7 @@ use self::delivery::{Outgoing, Settling};
 pub(super) use self::delivery::{StopDelivery, send_stop};
 pub(super) use self::unrecorded::Unrecorded;
 use super::missions::control::hold_all;
+use super::own_alert::OwnAlert;
 use super::{App, AppError, page, site_row};
 use crate::app::presence::RobotKey;
 pub use crate::db::stops::StopFilter;
@@ -445,7 +446,12 @@ impl App {
             "it has not confirmed the stop by {} ({}); the stop is sent again until it does",
             stop.by, stop.reason
         );
-        let alert = (UNCONFIRMED_ALERT, Severity::Critical, text);
+        let alert = OwnAlert {
+            code: UNCONFIRMED_ALERT,
+            severity: Severity::Critical,
+            text,
+            mission: None,
+        };
         Ok(self.begin_alert(tx, robot_pk, alert).await?)
     }
 }

@@ -15,9 +15,10 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 use tokio_util::sync::CancellationToken;
-use tracing::{error, info};
+use tracing::{error, info, warn};
 use tread_api::ids::{AlertId, RobotId};
 use tread_api::robot::{Alert, Severity};
+use tread_api::webhook::NoticeEvent;
 
 use super::App;
 use crate::config::StorageConfig;
@@ -57,6 +58,11 @@ pub const UNWRITABLE_ALERT: &str = "storage-unwritable";
 pub const DAMAGED_ALERT: &str = "database-damaged";
 /// Code of the alert about a disk that is nearly full.
 pub const DISK_LOW_ALERT: &str = "disk-low";
+
+/// Code of the note that the server was restarted.
+pub const SERVER_RESTARTED_ALERT: &str = "server-restarted";
+/// Time after which the note of a restart clears by itself.
+pub const RESTART_NOTED_FOR: Duration = Duration::from_mins(10);
 
 /// Result of the last check.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
@@ -122,11 +128,20 @@ impl Storage {
         }
         let inner = self.lock();
         let cleared = inner.cleared.iter().filter(|_| !filter.raised);
-        let all = inner.raised.iter().chain(cleared);
+        let is_of_kind =
+            |alert: &&Alert| filter.kind.as_ref().is_none_or(|kind| alert.code == *kind);
+        let all = inner.raised.iter().chain(cleared).filter(is_of_kind);
         let before = |alert: &&Alert| filter.before.is_none_or(|before| alert.id < before);
         let mut alerts: Vec<Alert> = all.filter(before).cloned().collect();
         alerts.sort_by_key(|alert| std::cmp::Reverse(alert.id));
         alerts
+    }
+
+    /// Returns an alert about the server; `None` if there is none with this identifier.
+    pub(super) fn alert(&self, id: AlertId) -> Option<Alert> {
+        let inner = self.lock();
+        let mut all = inner.raised.iter().chain(&inner.cleared);
+        all.find(|alert| alert.id == id).cloned()
     }
 
     /// Acknowledges an alert about the server; `None` if there is none with this identifier.
@@ -267,17 +282,41 @@ impl App {
         }
     }
 
-    fn set_server_alert(&self, code: &'static str, severity: Severity, text: Option<String>) {
+    /// Raises the note for people that the server was restarted.
+    pub(crate) fn note_restart(&self) {
+        let text = "the server was restarted; robots connect again by themselves, and streams and \
+                    teleoperation must be opened again";
+        let severity = Severity::Warning;
+        self.set_server_alert(SERVER_RESTARTED_ALERT, severity, Some(text.to_owned()));
+    }
+
+    /// Ends the note of a restart after its time.
+    fn end_restart_note(&self) {
+        if self.uptime() >= RESTART_NOTED_FOR {
+            self.set_server_alert(SERVER_RESTARTED_ALERT, Severity::Warning, None);
+        }
+    }
+
+    /// Raises, changes or clears an alert about the server.
+    pub(super) fn set_server_alert(
+        &self,
+        code: &'static str,
+        severity: Severity,
+        text: Option<String>,
+    ) {
         let now = self.clock().now();
         let mut inner = self.storage().lock();
         let found = inner
             .raised
             .iter()
             .position(|alert| alert.code.as_str() == code);
-        let alert = match (found, text) {
+        let (alert, event) = match (found, text) {
             (None, Some(text)) => {
                 let Ok(code) = code.parse() else { return };
-                error!("{text}");
+                match severity {
+                    Severity::Critical => error!("{text}"),
+                    Severity::Warning => warn!("{text}"),
+                }
                 let alert = Alert {
                     id: self.clock().new_id::<AlertId>(),
                     site: None,
@@ -285,12 +324,14 @@ impl App {
                     code,
                     severity,
                     text,
+                    mission: None,
+                    place: None,
                     raised_at: now,
                     acknowledged_at: None,
                     cleared_at: None,
                 };
                 inner.raised.push(alert.clone());
-                alert
+                (alert, Some(NoticeEvent::Opened))
             }
             (Some(index), None) => {
                 info!("the alert `{code}` is over");
@@ -300,17 +341,20 @@ impl App {
                 if inner.cleared.len() > CLEARED_KEPT_MAX {
                     inner.cleared.pop_front();
                 }
-                alert
+                (alert, Some(NoticeEvent::Ended))
             }
             (Some(index), Some(text)) if inner.raised[index].text != text => {
                 let alert = &mut inner.raised[index];
                 alert.text = text;
-                alert.clone()
+                (alert.clone(), None)
             }
             (Some(_), Some(_)) | (None, None) => return,
         };
         drop(inner);
         self.hub().alert(&alert);
+        if let Some(event) = event {
+            self.queue_server_alert(event, &alert);
+        }
     }
 }
 
@@ -374,6 +418,7 @@ fn is_low(free_bytes: Option<u64>, limit_bytes: u64, was_low: bool) -> bool {
 pub async fn run(app: App, stop: CancellationToken) {
     while !stop.is_cancelled() {
         app.check_storage(CHECK_SHARED_FOR).await;
+        app.end_restart_note();
         tokio::select! {
             () = stop.cancelled() => return,
             () = app.examine_database() => {}

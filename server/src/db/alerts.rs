@@ -2,7 +2,8 @@
 
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
-use tread_api::ids::{AlertCode, AlertId, RobotId, SiteId};
+use tread_api::geometry::Point;
+use tread_api::ids::{AlertCode, AlertId, MissionId, RobotId, SiteId};
 use tread_api::rights::Scope;
 use tread_api::robot::{Alert, AlertReport, Severity};
 
@@ -15,6 +16,9 @@ struct Raw {
     code: String,
     severity: String,
     text: String,
+    mission_id: Option<String>,
+    x_m: Option<f64>,
+    y_m: Option<f64>,
     raised_at_us: i64,
     acknowledged_at_us: Option<i64>,
     cleared_at_us: Option<i64>,
@@ -25,6 +29,8 @@ impl TryFrom<Raw> for Alert {
 
     fn try_from(raw: Raw) -> Result<Self, DbError> {
         let severity = Severity::from_name(&raw.severity);
+        let mission = raw.mission_id.map(|mission| parse("mission", &mission));
+        let place = raw.x_m.zip(raw.y_m);
         Ok(Self {
             id: parse("alert", &raw.id)?,
             site: Some(parse("site", &raw.site)?),
@@ -32,6 +38,8 @@ impl TryFrom<Raw> for Alert {
             code: parse("alert code", &raw.code)?,
             severity: severity.ok_or_else(|| corrupt("severity", &raw.severity))?,
             text: raw.text,
+            mission: mission.transpose()?,
+            place: place.map(|(x_m, y_m)| Point { x_m, y_m }),
             raised_at: from_us(raw.raised_at_us)?,
             acknowledged_at: raw.acknowledged_at_us.map(from_us).transpose()?,
             cleared_at: raw.cleared_at_us.map(from_us).transpose()?,
@@ -44,8 +52,8 @@ macro_rules! alerts {
         sqlx::query_as!(
             Raw,
             r#"SELECT alerts.id, sites.id AS site, robots.id AS robot, alerts.code,
-                   alerts.severity, alerts.text, alerts.raised_at_us, alerts.acknowledged_at_us,
-                   alerts.cleared_at_us
+                   alerts.severity, alerts.text, alerts.mission_id, alerts.x_m, alerts.y_m,
+                   alerts.raised_at_us, alerts.acknowledged_at_us, alerts.cleared_at_us
                FROM alerts
                JOIN robots ON robots.pk = alerts.robot_pk
                JOIN sites ON sites.pk = robots.site_pk "# + $condition
@@ -65,6 +73,8 @@ pub struct AlertFilter {
     pub site: Option<SiteId>,
     /// Only those of robots of this name.
     pub robot: Option<RobotId>,
+    /// Only those of this kind.
+    pub kind: Option<AlertCode>,
     /// Only those that have not cleared.
     pub raised: bool,
     /// Only those older than this one (cursor).
@@ -81,6 +91,7 @@ pub async fn list(
 ) -> Result<Vec<Alert>, DbError> {
     let site = filter.site.as_ref().map(SiteId::as_str);
     let robot = filter.robot.as_ref().map(RobotId::as_str);
+    let kind = filter.kind.as_ref().map(AlertCode::as_str);
     let before = filter.before.map(|id| id.to_string());
     let within = scope_text(&filter.within)?;
     let raw = alerts!(
@@ -88,6 +99,7 @@ pub async fn list(
            AND (?3 = FALSE OR alerts.cleared_at_us IS NULL) AND (?4 IS NULL OR alerts.id < ?4)
            AND (?6 IS NULL OR sites.id IN (SELECT value FROM json_each(?6))
                OR sites.id || '/' || robots.id IN (SELECT value FROM json_each(?6)))
+           AND (?7 IS NULL OR alerts.code = ?7)
          ORDER BY alerts.id DESC LIMIT ?5",
         site,
         robot,
@@ -95,6 +107,7 @@ pub async fn list(
         before,
         limit,
         within,
+        kind,
     )
     .fetch_all(db)
     .await?;
@@ -175,6 +188,37 @@ pub async fn raise(
         severity,
         report.text,
         at_us,
+    )
+    .execute(db)
+    .await?;
+    Ok(())
+}
+
+/// Mission and place of an alert, as far as they are known.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Whereabouts {
+    /// The mission.
+    pub mission: Option<MissionId>,
+    /// The robot's position in the site frame.
+    pub place: Option<Point>,
+}
+
+/// Stores mission and place of an alert.
+pub async fn locate(
+    db: &mut SqliteConnection,
+    id: AlertId,
+    whereabouts: Whereabouts,
+) -> Result<(), DbError> {
+    let id = id.to_string();
+    let mission = whereabouts.mission.map(|mission| mission.to_string());
+    let place = whereabouts.place;
+    let (x_m, y_m) = (place.map(|place| place.x_m), place.map(|place| place.y_m));
+    sqlx::query!(
+        "UPDATE alerts SET mission_id = ?, x_m = ?, y_m = ? WHERE id = ?",
+        mission,
+        x_m,
+        y_m,
+        id,
     )
     .execute(db)
     .await?;

@@ -30,6 +30,7 @@ pub mod sums;
 pub mod terrains;
 pub mod times;
 pub mod tokens;
+pub mod webhooks;
 pub mod withdrawals;
 
 use std::collections::BTreeSet;

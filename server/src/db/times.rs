@@ -37,7 +37,8 @@ pub async fn newest(db: &mut SqliteConnection) -> Result<Option<Timestamp>, DbEr
 pub async fn newest_id(db: &mut SqliteConnection) -> Result<Option<Uuid>, DbError> {
     let newest = sqlx::query_scalar!(
         r#"SELECT MAX(id) AS "newest: String" FROM (
-               SELECT MAX(id) AS id FROM missions UNION ALL SELECT MAX(id) FROM alerts)"#
+               SELECT MAX(id) AS id FROM missions UNION ALL SELECT MAX(id) FROM alerts
+               UNION ALL SELECT MAX(id) FROM webhook_deliveries)"#
     );
     let newest = newest.fetch_one(db).await?;
     newest.map(|id| parse("identifier", &id)).transpose()

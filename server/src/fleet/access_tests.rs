@@ -134,6 +134,7 @@ impl Rig {
                 lifetime: HOUR,
                 port: fleet.address().port(),
             }),
+            webhooks: crate::config::webhooks::WebhooksConfig::default(),
         });
         app.ensure_site(&site()).await.unwrap();
         for (name, number, is_revoked) in [

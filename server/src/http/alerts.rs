@@ -2,7 +2,7 @@
 
 use axum::extract::State;
 use serde::Deserialize;
-use tread_api::ids::{AlertId, RobotId, SiteId};
+use tread_api::ids::{AlertCode, AlertId, RobotId, SiteId};
 use tread_api::page::Page;
 use tread_api::problem::ProblemBody;
 use tread_api::robot::Alert;
@@ -25,6 +25,9 @@ pub(super) struct AlertQuery {
     /// Only those of this robot.
     #[param(value_type = Option<String>)]
     robot: Option<RobotId>,
+    /// Only those of this kind, such as `robot-lost`.
+    #[param(value_type = Option<String>)]
+    kind: Option<AlertCode>,
     /// Only those that have not cleared.
     #[serde(default)]
     #[param(required = false)]
@@ -50,10 +53,22 @@ pub(super) async fn list(
         before: cursor(query.cursor.as_deref())?,
         site: query.site,
         robot: query.robot,
+        kind: query.kind,
         raised: query.raised,
         within: subject.scope.clone(),
     };
     Ok(Json(app.alerts(&filter, limit).await?))
+}
+
+/// Get an alert.
+#[utoipa::path(get, path = "/v1/alerts/{alert}", tag = "alerts", operation_id = "get_alert",
+    security(("token" = ["read"])), params(("alert" = AlertId, Path)),
+    responses((status = 200, body = Alert), (status = 404, body = ProblemBody)))]
+pub(super) async fn get(
+    State(app): State<App>,
+    Path(alert): Path<AlertId>,
+) -> Result<Json<Alert>, Problem> {
+    Ok(Json(app.alert(alert).await?))
 }
 
 /// Acknowledge an alert.

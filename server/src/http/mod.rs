@@ -26,6 +26,7 @@ mod stops;
 mod subject;
 mod terrains;
 pub mod tls;
+mod webhooks;
 mod withdrawals;
 
 use std::any::Any;
@@ -77,7 +78,11 @@ const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
         title = "Tread",
         description = "Missions for skid-steered robots, and the friction that they measure.",
     ),
-    components(schemas(tread_api::drive::DriveRequest, tread_api::identity::AuditOrder,))
+    components(schemas(
+        tread_api::drive::DriveRequest,
+        tread_api::identity::AuditOrder,
+        tread_api::webhook::AlertNotice,
+    ))
 )]
 struct Description;
 
@@ -113,6 +118,11 @@ fn routes() -> OpenApiRouter<App> {
         .routes(routes!(authority::start))
         .routes(routes!(authority::finish))
         .routes(routes!(authority::replace))
+        .routes(routes!(webhooks::list, webhooks::create))
+        .routes(routes!(webhooks::get, webhooks::replace, webhooks::delete))
+        .routes(routes!(webhooks::rotate))
+        .routes(routes!(webhooks::test))
+        .routes(routes!(webhooks::deliveries))
         .routes(routes!(audit::list))
         .routes(routes!(audit::chain))
         .routes(routes!(sites::list, sites::create))
@@ -123,6 +133,7 @@ fn routes() -> OpenApiRouter<App> {
         .routes(routes!(robots::list))
         .routes(routes!(robots::get, robots::change))
         .routes(routes!(alerts::list))
+        .routes(routes!(alerts::get))
         .routes(routes!(alerts::acknowledge))
         .routes(routes!(events::stream))
         .routes(routes!(missions::get))

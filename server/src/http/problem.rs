@@ -90,6 +90,7 @@ const fn status(kind: ProblemType) -> StatusCode {
         | ProblemType::UnknownAlert
         | ProblemType::UnknownToken
         | ProblemType::UnknownSession
+        | ProblemType::UnknownWebhook
         | ProblemType::UnknownStop => StatusCode::NOT_FOUND,
         ProblemType::MethodNotAllowed => StatusCode::METHOD_NOT_ALLOWED,
         ProblemType::AlreadyExists
@@ -141,6 +142,7 @@ impl From<AppError> for Problem {
             AppError::UnknownAlert(_) => ProblemType::UnknownAlert,
             AppError::UnknownToken(_) | AppError::UnknownJoinToken(_) => ProblemType::UnknownToken,
             AppError::UnknownSession(_) => ProblemType::UnknownSession,
+            AppError::UnknownWebhook(_) => ProblemType::UnknownWebhook,
             AppError::OutsideScope(_) | AppError::BeyondRights(_) => ProblemType::Forbidden,
             AppError::NoAuthority => ProblemType::RobotsDoNotJoin,
             AppError::Rotation(_) => ProblemType::AuthorityRotation,

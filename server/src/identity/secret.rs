@@ -1,11 +1,11 @@
 //! Secrets of tokens, sessions and join tokens: 256 random bits, of which only the SHA-256 is
-//! stored.
+//! stored. Secrets of webhooks have the same form; they sign, so they are stored as they are.
 //!
 //! A secret has the form `tread_<kind>_<64 hex digits><8 hex digits>`. The kind is `v`, `o` or `a`
 //! for a token of the role viewer, operator or admin, `t` for a token with individual rights, `s`
-//! for a session and `j` for a join token. The last eight digits are a checksum: scanners for
-//! leaked secrets can recognise a secret, and a mistyped one is refused without a database query.
-//! The kind is only informative; the rights are in the database.
+//! for a session, `j` for a join token and `w` for a webhook. The last eight digits are a checksum:
+//! scanners for leaked secrets can recognise a secret, and a mistyped one is refused without a
+//! database query. The kind is only informative; the rights are in the database.
 
 use std::fmt;
 
@@ -35,16 +35,19 @@ pub enum Kind {
     Session,
     /// A join token, with which a robot enrols.
     Join,
+    /// The key of a webhook's signatures, which is stored as it is.
+    Webhook,
 }
 
 impl Kind {
-    const ALL: [Self; 6] = [
+    const ALL: [Self; 7] = [
         Self::Token(Some(Role::Viewer)),
         Self::Token(Some(Role::Operator)),
         Self::Token(Some(Role::Admin)),
         Self::Token(None),
         Self::Session,
         Self::Join,
+        Self::Webhook,
     ];
 
     const fn initial(self) -> char {
@@ -55,6 +58,7 @@ impl Kind {
             Self::Token(None) => 't',
             Self::Session => 's',
             Self::Join => 'j',
+            Self::Webhook => 'w',
         }
     }
 }

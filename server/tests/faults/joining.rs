@@ -44,6 +44,7 @@ pub(crate) fn replaced(interposer: &Interposer) -> Pin<Box<dyn Future<Output = (
                 lifetime: SignedDuration::from_hours(24),
                 port: 7447,
             }),
+            webhooks: tread_server::config::webhooks::WebhooksConfig::default(),
         });
         let site = "yard".parse().unwrap();
         app.ensure_site(&site).await.unwrap();

@@ -199,6 +199,7 @@ fn config(folder: &std::path::Path) -> Config {
         tls: None,
         robots: None,
         oidc: None,
+        webhooks: tread_server::config::webhooks::WebhooksConfig::default(),
         audit: tread_server::config::AuditConfig::default(),
         web: WebConfig::default(),
     }

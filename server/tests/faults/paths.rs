@@ -8,19 +8,23 @@ use jiff::{SignedDuration, Timestamp};
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 use tread_api::ids::{
-    AlertId, BootId, ConfigurationId, MissionId, OidcSubject, PersonId, SessionId, TokenId,
+    AlertId, BootId, ConfigurationId, DeliveryId, MissionId, OidcSubject, PersonId, SessionId,
+    TokenId,
 };
 use tread_api::mission::{Cause, MissionState, Replacement};
+use tread_api::webhook::{DeliveryState, NoticeEvent, Webhook};
 use tread_server::app::AppError;
 use tread_server::authority::Issued;
 use tread_server::config::RetentionConfig;
 use tread_server::db;
+use tread_server::db::alerts::Whereabouts;
 use tread_server::db::deferred_segments::Origin;
 use tread_server::db::enrolments::Renewal;
 use tread_server::db::idempotency::Given;
 use tread_server::db::missions::Facts;
 use tread_server::db::robots::Introduction;
 use tread_server::db::sessions::{NewSession, OfPeople, Owner, SignedIn};
+use tread_server::db::webhooks::{NewDelivery, Outcome};
 use tread_server::db::withdrawals::WithdrawalRow;
 use tread_server::identity::secret::{Fingerprint, Kind, Secret};
 use tread_server::identity::subject::SubjectId;
@@ -282,9 +286,58 @@ pub(crate) const PATHS: &[WritePath] = &[
                 let report: tread_api::robot::AlertReport =
                     of(json!({"code": "test-alert", "severity": "warning", "text": "a test"}));
                 db::alerts::raise(tx, ground.robot_pk, id, &report, now()).await?;
+                let shown = of(json!({"x_m": 1.0, "y_m": 2.0}));
+                let whereabouts = Whereabouts {
+                    mission: Some(ground.mission),
+                    place: Some(shown),
+                };
+                db::alerts::locate(tx, id, whereabouts).await?;
                 db::alerts::acknowledge(tx, id, now()).await?;
                 db::alerts::clear(tx, ground.robot_pk, &report.code, now()).await?;
                 db::alerts::forget(tx, ground.robot_pk, 3).await
+            }))
+        },
+    },
+    WritePath {
+        name: "webhook",
+        prepare: nothing,
+        act: |ground, number| {
+            Box::pin(ground.write(async move |tx| {
+                let webhook: Webhook = of(json!({
+                    "id": uuid(number), "name": format!("webhook {number}"),
+                    "url": "https://alerts.example.org/", "kinds": ["robot-lost"],
+                    "sites": [ground.site], "enabled": true, "created_at": now(),
+                    "created_by": "a test", "pending": 0,
+                }));
+                db::webhooks::insert(tx, &webhook, "a secret").await?;
+                db::webhooks::replace(tx, webhook.id, &webhook.settings()).await?;
+                db::webhooks::set_secret(tx, webhook.id, "another secret").await?;
+                for one in 0..3 {
+                    let delivery = NewDelivery {
+                        id: DeliveryId::from_uuid(uuid(10 * number + one)),
+                        webhook: webhook.id,
+                        alert: None,
+                        event: NoticeEvent::Test,
+                        kind: of(json!("test")),
+                        body: "{}".to_owned(),
+                        at: now(),
+                    };
+                    db::webhooks::queue(tx, &delivery).await?;
+                }
+                db::webhooks::drop_oldest(tx, webhook.id, 2, now()).await?;
+                let outcome = Outcome {
+                    webhook: webhook.id,
+                    id: DeliveryId::from_uuid(uuid(10 * number + 1)),
+                    state: DeliveryState::Delivered,
+                    at: now(),
+                    due_at: now(),
+                    status: Some(200),
+                    detail: None,
+                };
+                db::webhooks::note_attempt(tx, &outcome).await?;
+                db::webhooks::give_up_older(tx, later(), now()).await?;
+                db::webhooks::forget(tx, webhook.id, 1).await?;
+                db::webhooks::delete(tx, webhook.id).await.map(|_| ())
             }))
         },
     },

@@ -1,17 +1,20 @@
-//! Alerts that the server raises itself: robots that are lost, and missions that failed.
+//! Alerts that the server raises itself: robots that are lost, wait or have a wrong clock, and
+//! missions that did not succeed.
 
 use std::time::Duration;
 
 use jiff::Timestamp;
 use reqwest::StatusCode;
 use serde_json::{Value, json};
+use tread_api::geometry::Pose;
 use tread_api::ids::MissionId;
 use tread_api::mission::{MissionDetail, MissionState};
-use tread_api::robot::{ChangeRobot, LinkState};
+use tread_api::robot::{Aged, ChangeRobot, LinkState};
 use tread_api::wire::ingest::{MissionPhase, Record, RecordContent};
+use tread_api::wire::reply::CommandRefusalCode;
 
-use crate::harness::{Yard, eventually, report, time};
-use crate::robot::Robot;
+use crate::harness::{Yard, circle, eventually, report, time};
+use crate::robot::{Mood, Robot};
 
 const BEGIN: &str = "2026-11-10T08:00:00Z";
 
@@ -264,5 +267,90 @@ async fn a_mission_that_ended_without_its_robots_word_keeps_how_far_it_was_shown
     robot.upload_as(first_run, late).await.unwrap();
     let detail = yard.mission(mission.id).await;
     assert!((driven_m(&detail) - 3.5).abs() < 1e-9, "{detail:?}");
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn missions_that_expire_or_are_rejected_raise_alerts_until_one_succeeds() {
+    let yard = Yard::start_at(time(BEGIN)).await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    robot.set_mood(Mood::Refusing(CommandRefusalCode::Impossible));
+    let rejected = yard.create_mission(&robot.id).await;
+    yard.mission_becomes(rejected.id, MissionState::Rejected)
+        .await;
+    let raised = there_are(&yard, "mission-rejected", 1, true).await;
+    assert_eq!(raised[0]["mission"], json!(rejected.id));
+    assert_eq!(raised[0]["robot"], "rover-1");
+
+    let mut late = circle(&robot.id);
+    drop(robot);
+    link_is(&yard, "rover-1", LinkState::Offline).await;
+    late["latest_start"] = json!("2026-11-10T08:01:00Z");
+    let (status, expired) = yard.post("/v1/missions", &late).await;
+    assert_eq!(status, StatusCode::CREATED, "{expired}");
+    yard.server.app().clock().advance(Duration::from_mins(2));
+    let raised = there_are(&yard, "mission-expired", 1, true).await;
+    assert_eq!(raised[0]["mission"], expired["id"]);
+    there_are(&yard, "mission-rejected", 1, true).await;
+
+    let robot = Robot::join(&yard, "rover-1").await;
+    let mission = yard.create_mission(&robot.id).await;
+    yard.mission_becomes(mission.id, MissionState::Active).await;
+    robot.report(0, &mission, MissionPhase::Succeeded).await;
+    there_are(&yard, "mission-expired", 1, false).await;
+    there_are(&yard, "mission-rejected", 1, false).await;
+    let (_, of_kind) = yard.get_value("/v1/alerts?kind=mission-expired").await;
+    assert_eq!(of_kind["items"].as_array().unwrap().len(), 1, "{of_kind}");
+    let (_, open) = yard
+        .get_value("/v1/alerts?kind=mission-expired&raised=true")
+        .await;
+    assert_eq!(open["items"], json!([]));
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_robot_that_does_not_come_on_raises_an_alert_where_it_stands_until_it_drives() {
+    let yard = Yard::start_at(time(BEGIN)).await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let mission = yard.create_mission(&robot.id).await;
+    yard.mission_becomes(mission.id, MissionState::Active).await;
+    robot.drive(&mission, 3.0);
+    robot.say(|state| {
+        let value = Pose {
+            x_m: 1.0,
+            y_m: 5.0,
+            heading_rad: 0.0,
+        };
+        state.pose = Some(Aged { value, age_ms: 0 });
+    });
+    // Its heartbeats come while the time goes on.
+    pass(&yard, 3).await;
+    for _ in 0..5 {
+        yard.server.app().clock().advance(Duration::from_secs(59));
+        pass(&yard, 1).await;
+    }
+    let raised = there_are(&yard, "robot-waiting", 1, true).await;
+    assert_eq!(raised[0]["mission"], json!(mission.id));
+    assert_eq!(raised[0]["place"], json!({"x_m": 1.0, "y_m": 5.0}));
+    let text = raised[0]["text"].as_str().unwrap();
+    assert!(text.contains("for 5 min"), "{text}");
+    robot.drive(&mission, 4.0);
+    pass(&yard, 2).await;
+    there_are(&yard, "robot-waiting", 1, false).await;
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_robot_whose_clock_stays_wrong_raises_an_alert_that_says_by_how_much() {
+    // The played robots' clocks are nine days behind this.
+    let yard = Yard::start_at(time(BEGIN)).await;
+    let _robot = Robot::join(&yard, "rover-1").await;
+    link_is(&yard, "rover-1", LinkState::Online).await;
+    pass(&yard, 2).await;
+    assert_eq!(alerts(&yard, "clock-wrong").await, Vec::<Value>::new());
+    pass(&yard, 35).await;
+    let raised = there_are(&yard, "clock-wrong", 1, true).await;
+    let text = raised[0]["text"].as_str().unwrap();
+    assert!(text.contains("s behind the server's"), "{text}");
     yard.server.stop().await.unwrap();
 }

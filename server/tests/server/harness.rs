@@ -24,8 +24,10 @@ use tread_samples::rover;
 use tread_server::app::identity::tokens::FirstAdmin;
 use tread_server::authority::Authority;
 use tread_server::clock::Clock;
+use tread_server::config::webhooks::WebhooksConfig;
 use tread_server::config::{FrictionConfig, RobotsConfig, StorageConfig, TlsFiles, WebConfig};
 use tread_server::counters::CounterValues;
+use tread_server::webhooks::Resolver;
 use tread_server::{Config, RunningServer, Server};
 use zenoh::Wait as _;
 
@@ -135,6 +137,20 @@ impl Yard {
             certificate_s: 3_600,
         });
         let server = Server::start_with_clock(config, Clock::manual(wall));
+        Self::of(folder, server.await.unwrap()).await
+    }
+
+    /// A server in a folder and on a clock, with a resolver of webhooks' host names and a
+    /// configuration of one's own.
+    pub(crate) async fn start_resolving(
+        folder: Arc<TempDir>,
+        clock: Clock,
+        resolver: Arc<dyn Resolver>,
+        webhooks: WebhooksConfig,
+    ) -> Self {
+        let mut config = config(folder.path(), "127.0.0.1:0");
+        config.webhooks = webhooks;
+        let server = Server::start_with(config, clock, resolver);
         Self::of(folder, server.await.unwrap()).await
     }
 
@@ -291,6 +307,7 @@ pub(crate) fn config(folder: &Path, zenoh: &str) -> Config {
         tls: None,
         robots: None,
         oidc: None,
+        webhooks: WebhooksConfig::default(),
         audit: tread_server::config::AuditConfig::default(),
         web: WebConfig {
             hosts: vec!["tread.test".to_owned()],

@@ -67,3 +67,5 @@ mod slow_client;
 mod stops;
 #[cfg(test)]
 mod storage;
+#[cfg(test)]
+mod webhooks;

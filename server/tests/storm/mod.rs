@@ -73,6 +73,7 @@ async fn app_on(path: &Path, clock: &Clock, site: &SiteId, robots: RobotLink) ->
         normalisations: Vec::new(),
         robots,
         enrolment: None,
+        webhooks: tread_server::config::webhooks::WebhooksConfig::default(),
     });
     app.ensure_site(site).await.expect("the site is made");
     app

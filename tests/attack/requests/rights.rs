@@ -12,7 +12,7 @@ pub(super) enum Needs {
 use Needs::{Admin, Nothing, Operator, Viewer};
 
 /// Every operation but those that only read; those are a viewer's unless they stand here.
-const TABLE: [(&str, &str, Needs); 48] = [
+const TABLE: [(&str, &str, Needs); 56] = [
     ("GET", "/healthz", Nothing),
     ("GET", "/readyz", Nothing),
     ("POST", "/v1/session", Nothing),
@@ -74,6 +74,14 @@ const TABLE: [(&str, &str, Needs); 48] = [
     ("DELETE", "/v1/join-tokens/{token}", Admin),
     ("POST", "/v1/sites", Admin),
     ("DELETE", "/v1/sites/{site}/enrolments/{robot}", Admin),
+    ("GET", "/v1/webhooks", Admin),
+    ("POST", "/v1/webhooks", Admin),
+    ("GET", "/v1/webhooks/{webhook}", Admin),
+    ("PUT", "/v1/webhooks/{webhook}", Admin),
+    ("DELETE", "/v1/webhooks/{webhook}", Admin),
+    ("POST", "/v1/webhooks/{webhook}/secret", Admin),
+    ("POST", "/v1/webhooks/{webhook}/test", Admin),
+    ("GET", "/v1/webhooks/{webhook}/deliveries", Admin),
     // What a viewer reads though the paths look like those of an admin.
     ("GET", "/v1/sites/{site}/enrolments", Viewer),
     ("GET", "/v1/session", Viewer),

@@ -8,6 +8,7 @@ use tread_api::enrolment::Enrolment;
 use tread_api::robot::{Alert, Severity};
 
 use super::registry::Standing;
+use crate::app::own_alert::OwnAlert;
 use crate::app::presence::RobotKey;
 use crate::app::{App, AppError};
 use crate::authority::RobotName;
@@ -140,7 +141,12 @@ impl App {
         let Some(robot_pk) = robot_pk(&mut tx, key).await? else {
             return Ok(());
         };
-        let alert = (code, Severity::Warning, text);
+        let alert = OwnAlert {
+            code,
+            severity: Severity::Warning,
+            text,
+            mission: None,
+        };
         let raised = self.begin_alert(&mut tx, robot_pk, alert).await?;
         Ok(self.commit_alerts(tx, raised.into_iter().collect()).await?)
     }

@@ -132,7 +132,7 @@ impl App {
         let secret = Secret::read(text).filter(|secret| match secret.kind() {
             Kind::Token(_) => shown == Shown::Token,
             Kind::Session => shown == Shown::Session,
-            Kind::Join => false,
+            Kind::Join | Kind::Webhook => false,
         });
         if let Some(secret) = &secret
             && let Some(credential) = self.known(secret).await
@@ -280,8 +280,8 @@ impl App {
                     }
                 }
             }
-            // A join token gives no access.
-            Kind::Join => return Err(SignInError::Unknown),
+            // A join token gives no access, and a webhook's secret only signs.
+            Kind::Join | Kind::Webhook => return Err(SignInError::Unknown),
         };
         if token.revoked_at.is_some() {
             Err(SignInError::Revoked)

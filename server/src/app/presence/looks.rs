@@ -5,9 +5,9 @@ use std::time::Duration;
 
 use tread_api::ids::{MissionId, StopId};
 use tread_api::rights::Scope;
-use tread_api::robot::{LinkCause, LinkState};
+use tread_api::robot::{LinkCause, LinkState, MissionProgress};
 
-use super::{Presence, Presences, RobotKey, stop_of};
+use super::{OFFSETS_MAX, Presence, Presences, RobotKey, stop_of};
 
 /// Revisions of a site's data that a robot reports.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -31,6 +31,15 @@ pub struct Attending {
     pub cause: Option<LinkCause>,
 }
 
+/// What a robot shows of itself while it is heard.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Showing {
+    /// Progress of its mission.
+    pub mission: Option<MissionProgress>,
+    /// Offset of its clock, milliseconds, positive if it is ahead of the server's.
+    pub clock_offset_ms: i64,
+}
+
 impl Presences {
     /// Returns every robot that has ever sent a hello.
     pub fn known(&self) -> Vec<RobotKey> {
@@ -51,6 +60,26 @@ impl Presences {
         };
         known
             .map(|(key, presence)| (key.clone(), attending(presence)))
+            .collect()
+    }
+
+    /// Returns mission and clock of every robot that is heard at `now`. The clock of a robot without
+    /// enough states counts as right.
+    pub fn conditions(&self, now: Duration) -> Vec<(RobotKey, Showing)> {
+        let robots = self.lock();
+        let heard = robots
+            .iter()
+            .filter(|(_, presence)| presence.link(now) != LinkState::Offline);
+        let shown = |presence: &Presence| {
+            let has_enough = presence.clock_offsets_ms.len() >= OFFSETS_MAX;
+            let offset_ms = has_enough.then(|| presence.clock_offset_ms());
+            Some(Showing {
+                mission: presence.state()?.mission,
+                clock_offset_ms: offset_ms.unwrap_or(0),
+            })
+        };
+        heard
+            .filter_map(|(key, presence)| Some((key.clone(), shown(presence)?)))
             .collect()
     }
 

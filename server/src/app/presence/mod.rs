@@ -18,7 +18,7 @@ use tread_api::wire::state::{FrictionReport, RobotState};
 
 pub use self::duplicate_agent::DuplicateAgent;
 use self::duplicate_agent::OtherRun;
-pub use self::looks::{Attending, Held};
+pub use self::looks::{Attending, Held, Showing};
 use self::news::Shown;
 
 /// Maximum age of the last heartbeat of an online robot: three periods at 5 Hz.

@@ -17,6 +17,7 @@ use std::time::Duration;
 
 use tread_api::robot::{LinkCause, Severity};
 
+use crate::app::own_alert::OwnAlert;
 use crate::app::presence::RobotKey;
 use crate::app::{App, AppError};
 use crate::db;
@@ -173,7 +174,12 @@ async fn write_down(
     let is_missed = row.retired_at.is_none() && app.enrolment_registry().may_speak(key);
     let alert = match turn {
         Turn::Lost if is_missed => {
-            let alert = (ROBOT_LOST_ALERT, Severity::Critical, lost_text(cause));
+            let alert = OwnAlert {
+                code: ROBOT_LOST_ALERT,
+                severity: Severity::Critical,
+                text: lost_text(cause),
+                mission: None,
+            };
             app.begin_alert(&mut tx, row.pk, alert).await?
         }
         Turn::Back => app.end_alert(&mut tx, row.pk, ROBOT_LOST_ALERT).await?,

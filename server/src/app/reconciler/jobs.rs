@@ -183,7 +183,15 @@ async fn take_offer_answer(
         if moved.is_none() && change == Change::Accept && !row.mission.state.is_terminal() {
             db::missions::add_facts(&mut tx, id, facts).await?;
         }
-        tx.commit().await?;
+        let mut alerts = Vec::new();
+        let named = (&row.mission.site, &row.mission.robot);
+        if let Some(state) = moved.filter(|state| state.is_terminal())
+            && let Some(robot_pk) = db::robots::pk_of(&mut tx, named.0, named.1).await?
+        {
+            let ended = (id, state, reason.unwrap_or(change.reason()));
+            alerts = app.alert_mission_end(&mut tx, robot_pk, ended).await?;
+        }
+        app.commit_alerts(tx, alerts).await?;
     }
     app.wake();
     Ok(how)

@@ -7,6 +7,7 @@
 //! kind per robot.
 
 pub(super) mod attendance;
+pub(super) mod conditions;
 mod jobs;
 pub mod needs;
 
@@ -23,6 +24,7 @@ use tread_api::rights::Scope;
 use tread_api::stop::Stop;
 
 use self::attendance::Attendance;
+use self::conditions::Conditions;
 use self::jobs::{
     Finished, adopt_shown, cancel, disown, end_duplicate_agent, hold, offer, push_site, replace,
     settle, stop_again,
@@ -106,6 +108,7 @@ pub struct Reconciler {
     /// Missions that robots show and that are not among their open ones, with the time since which.
     foreign: HashMap<RobotKey, (MissionId, Duration)>,
     attendance: Attendance,
+    conditions: Conditions,
 }
 
 impl Reconciler {
@@ -122,6 +125,7 @@ impl Reconciler {
             stops: Vec::new(),
             foreign: HashMap::new(),
             attendance: Attendance::default(),
+            conditions: Conditions::default(),
         }
     }
 
@@ -208,6 +212,7 @@ impl Reconciler {
         self.end_duplicate_agents();
         self.app.sync_alerts().await?;
         self.attendance.look(&self.app).await?;
+        self.conditions.look(&self.app).await?;
         let mut tx = self.app.db().read("reconciler").await?;
         let mut open = db::missions::in_progress(&mut tx).await?;
         open.extend(db::missions::next_in_queues(&mut tx).await?);

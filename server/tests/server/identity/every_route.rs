@@ -31,7 +31,7 @@ const OPEN: [(&str, &str); 14] = [
     ("GET", "/docs/{*rest}"),
 ];
 /// What an operator may not ask for.
-const ADMINS_ONLY: [(&str, &str); 15] = [
+const ADMINS_ONLY: [(&str, &str); 23] = [
     ("GET", "/v1/tokens"),
     ("POST", "/v1/tokens"),
     ("DELETE", "/v1/tokens/{token}"),
@@ -47,6 +47,14 @@ const ADMINS_ONLY: [(&str, &str); 15] = [
     ("GET", "/v1/audit"),
     ("GET", "/v1/audit/chain"),
     ("POST", "/v1/sites"),
+    ("GET", "/v1/webhooks"),
+    ("POST", "/v1/webhooks"),
+    ("GET", "/v1/webhooks/{webhook}"),
+    ("PUT", "/v1/webhooks/{webhook}"),
+    ("DELETE", "/v1/webhooks/{webhook}"),
+    ("POST", "/v1/webhooks/{webhook}/secret"),
+    ("POST", "/v1/webhooks/{webhook}/test"),
+    ("GET", "/v1/webhooks/{webhook}/deliveries"),
 ];
 
 /// One operation of the description.
@@ -94,7 +102,7 @@ fn filled(path: &str) -> String {
         filled.push('/');
         filled.push_str(match part {
             "{site}" => "yard",
-            "{mission}" | "{alert}" | "{token}" | "{session}" => {
+            "{mission}" | "{alert}" | "{token}" | "{session}" | "{webhook}" => {
                 "0192f0c1-2b3c-7d4e-8f50-617283940a1b"
             }
             "{*rest}" => "index.html",

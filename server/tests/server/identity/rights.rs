@@ -20,7 +20,7 @@ use crate::harness::{Yard, circle, client, eventually, measured, segment, time};
 use crate::robot::Robot;
 
 /// What takes a token for everything.
-const SERVER_WIDE: [(&str, &str); 7] = [
+const SERVER_WIDE: [(&str, &str); 15] = [
     ("GET", "/v1/audit"),
     ("GET", "/v1/audit/chain"),
     ("GET", "/v1/authority"),
@@ -28,6 +28,14 @@ const SERVER_WIDE: [(&str, &str); 7] = [
     ("POST", "/v1/authority/rotation/finish"),
     ("POST", "/v1/authority/replace"),
     ("POST", "/v1/sites"),
+    ("GET", "/v1/webhooks"),
+    ("POST", "/v1/webhooks"),
+    ("GET", "/v1/webhooks/{webhook}"),
+    ("PUT", "/v1/webhooks/{webhook}"),
+    ("DELETE", "/v1/webhooks/{webhook}"),
+    ("POST", "/v1/webhooks/{webhook}/secret"),
+    ("POST", "/v1/webhooks/{webhook}/test"),
+    ("GET", "/v1/webhooks/{webhook}/deliveries"),
 ];
 /// What is about whoever asks, or about the server, and nothing of a site.
 const OWN: [(&str, &str); 3] = [
@@ -139,6 +147,7 @@ impl Ground {
             ("{session}", &self.session),
             ("{terrain}", "gravel"),
             ("{owner}", "gate"),
+            ("{webhook}", "0192f0c1-2b3c-7d4e-8f50-617283940a1b"),
         ];
         let mut filled = path.to_owned();
         for (name, value) in pairs {

@@ -42,6 +42,7 @@ async fn app(folder: &Path, authorities: &Arc<Authorities>, switch: &Arc<OnceLoc
             lifetime: SignedDuration::from_hours(24),
             port: 7447,
         }),
+        webhooks: crate::config::webhooks::WebhooksConfig::default(),
     })
 }
 
