@@ -8,6 +8,7 @@ import { roundUp, type Camera, type PointM } from './camera';
 import type { Draft } from './draft';
 import { HATCHED_CELL_PX, drawFriction } from './draw_friction';
 import type { Raster } from './raster';
+import type { Shown } from './motion';
 import type { Moment } from './replay';
 import { PALETTES, groundFill, groundLine, type Palette } from './palette';
 
@@ -54,7 +55,14 @@ const MOMENT_PX = 11;
 /** Most labels of robots: with more they would only cover each other. */
 const LABELS_MAX = 60;
 
-export function draw(context: CanvasRenderingContext2D, camera: Camera, scene: Scene): void {
+/** Draws everything; true while a robot moves, so that the next frame differs. */
+export function draw(context: CanvasRenderingContext2D, camera: Camera, scene: Scene): boolean {
+  drawGround(context, camera, scene);
+  return drawAbove(context, camera, scene);
+}
+
+/** Draws what robots drive on: all that does not move by itself. */
+export function drawGround(context: CanvasRenderingContext2D, camera: Camera, scene: Scene): void {
   const palette = PALETTES[scene.theme];
   context.fillStyle = palette.ground;
   context.fillRect(0, 0, camera.width, camera.height);
@@ -63,7 +71,12 @@ export function draw(context: CanvasRenderingContext2D, camera: Camera, scene: S
   drawGrid(context, camera, palette);
   if (scene.showFence && scene.fence) drawFence(context, camera, scene.fence, palette);
   drawPaths(context, camera, scene, palette);
-  drawRobots(context, camera, scene, palette);
+}
+
+/** Draws robots, and what is drawn above them; true while one of them moves. */
+export function drawAbove(context: CanvasRenderingContext2D, camera: Camera, scene: Scene): boolean {
+  const palette = PALETTES[scene.theme];
+  const isMoving = drawRobots(context, camera, scene, palette);
   if (scene.draft) {
     drawDraft(context, camera, scene.draft, palette);
     context.setLineDash([6, 5]);
@@ -75,6 +88,7 @@ export function draw(context: CanvasRenderingContext2D, camera: Camera, scene: S
   }
   if (scene.showCross) drawCross(context, camera, palette);
   drawScale(context, camera, palette);
+  return isMoving;
 }
 
 function trace(context: CanvasRenderingContext2D, camera: Camera, points: readonly PointM[]): void {
@@ -273,8 +287,8 @@ function drawMoment(context: CanvasRenderingContext2D, camera: Camera, moment: M
   context.restore();
 }
 
-function drawRobots(context: CanvasRenderingContext2D, camera: Camera, scene: Scene, palette: Palette): void {
-  const all = [...scene.tracked];
+function drawRobots(context: CanvasRenderingContext2D, camera: Camera, scene: Scene, palette: Palette): boolean {
+  const all = [...scene.tracked].map((tracked) => ({ tracked, shown: tracked.shownAt(scene.now) }));
   if (scene.showTrails) {
     // Lines of one pixel are drawn several times as fast as wider ones.
     context.lineWidth = 1;
@@ -283,7 +297,8 @@ function drawRobots(context: CanvasRenderingContext2D, camera: Camera, scene: Sc
     const { scale } = camera;
     const left = camera.width / 2 - camera.center.x_m * scale;
     const top = camera.height / 2 + camera.center.y_m * scale;
-    for (const { trail } of all) {
+    for (const { tracked, shown } of all) {
+      const { trail } = tracked;
       context.beginPath();
       let [xLast, yLast] = [Infinity, Infinity];
       for (let index = 0; index < trail.length; index += 2) {
@@ -294,32 +309,35 @@ function drawRobots(context: CanvasRenderingContext2D, camera: Camera, scene: Sc
         context.lineTo(x, y);
         [xLast, yLast] = [x, y];
       }
+      if (shown && trail.length > 0) context.lineTo(left + shown.pose.x_m * scale, top - shown.pose.y_m * scale);
       context.stroke();
     }
   }
   context.font = '600 12px system-ui, sans-serif';
   context.textAlign = 'left';
-  for (const tracked of all) drawRobot(context, camera, tracked, scene, palette, all.length <= LABELS_MAX);
+  for (const { tracked, shown } of all) {
+    if (shown) drawRobot(context, camera, tracked, shown, scene, palette, all.length <= LABELS_MAX);
+  }
+  return all.some(({ shown }) => shown?.isMoving);
 }
 
 function drawRobot(
   context: CanvasRenderingContext2D,
   camera: Camera,
   tracked: Tracked,
+  { pose, isFrozen }: Shown,
   scene: Scene,
   palette: Palette,
   withLabel: boolean,
 ): void {
   const { robot } = tracked;
-  const pose = robot.live?.pose?.value;
-  if (!pose) return;
   const { x, y } = camera.toPx(pose);
   const isSelected = robot.id === scene.selected;
   const isLost = robot.link === 'offline';
   const isStopped = robot.live?.safety.stop != null || scene.unconfirmed.has(robot.id);
   const colour = isStopped
     ? palette.stopped
-    : isLost
+    : isLost || isFrozen
       ? palette.robotLost
       : robot.link === 'stale' || scene.isOld
         ? palette.robotLate
