@@ -1,8 +1,10 @@
 // Motion of one robot between the states that it reports, so that the map draws it smoothly. Pure.
 //
-// A robot is drawn about one state period late, between two states that are known: by linear
-// interpolation. When the next state is late, the last twist carries it on for a bounded time; then
-// it stands, and `isFrozen` says that it is no longer known where it is.
+// A robot is drawn late, by about one period of its states, so that it lies between two known ones:
+// a cubic Hermite curve through both, with their twists as tangents. When the next state is late,
+// the last twist carries it on along an arc for a bounded time; then it stands, and `isFrozen` says
+// that it is no longer known where it is. Where states come seldom, that time is used in each
+// period, so that what is drawn is less late; what the twist got wrong is made good smoothly.
 import type { AgedTwist, Pose } from '../api/schema';
 
 type Twist = AgedTwist['value'];
@@ -26,16 +28,21 @@ export interface Shown {
 export const EXTRAPOLATION_MAX_MS = 500;
 /** Delay of what is drawn, in state periods: a little more than one, so that a late state does no harm. */
 const DELAY_PERIODS = 1.15;
-/** Period that is assumed until states have shown theirs, milliseconds. */
-const PERIOD_MS = 200;
+/** How much of a long period the twist bridges, milliseconds: less than it may, for states that are late. */
+const BRIDGED_MS = 400;
+/** Period that is assumed until states have shown theirs, milliseconds: that of the stream of events. */
+const PERIOD_MS = 1_000;
 const PERIOD_MIN_MS = 50;
-const PERIOD_MAX_MS = 500;
-/** Share of a new period in their running mean. */
-const PERIOD_GAIN = 0.2;
+const PERIOD_MAX_MS = 1_200;
+/** Shares of a new period in their running mean: a longer one counts soon, or robots would halt. */
+const LONGER_GAIN = 0.5;
+const SHORTER_GAIN = 0.2;
+/** How long the error of a prediction takes to be made good, milliseconds. */
+const BLEND_MS = 250;
 /** States nearer to each other in time are one that was heard twice, milliseconds. */
 const SAME_MS = 15;
 /** Between states farther apart in time nothing is known of the path, milliseconds. */
-const GAP_MAX_MS = 1_000;
+const GAP_MAX_MS = 2_000;
 /** A step that is longer than what the speed explains by this is a jump, metres. */
 export const JUMP_M = 0.5;
 /** Below these a robot stands. */
@@ -47,15 +54,25 @@ const REST_RAD = 0.02;
 /** States that are kept. */
 const STATES_MAX = 16;
 
+/** By how much what was drawn differs from what is known since. */
+interface Misplaced {
+  at_ms: number;
+  x_m: number;
+  y_m: number;
+  heading_rad: number;
+}
+
 export class Motion {
   readonly #states: State[] = [];
   #period_ms = PERIOD_MS;
   /** What is drawn never goes back in time. */
   #drawn_ms = -Infinity;
+  #error: Misplaced | null = null;
 
   /** How late robots are drawn, milliseconds. */
   get delay_ms(): number {
-    return DELAY_PERIODS * this.#period_ms;
+    const delay_ms = DELAY_PERIODS * this.#period_ms;
+    return Math.max(Math.min(delay_ms, BRIDGED_MS), delay_ms - BRIDGED_MS);
   }
 
   push(state: State): void {
@@ -68,28 +85,66 @@ export class Motion {
     if (passed_ms < SAME_MS) return;
     // A robot that stands says so more seldom, which tells nothing of its period on the move.
     if (passed_ms <= GAP_MAX_MS && moves(state.twist) && moves(last.twist)) {
-      const period_ms = this.#period_ms + PERIOD_GAIN * (passed_ms - this.#period_ms);
+      const gain = passed_ms > this.#period_ms ? LONGER_GAIN : SHORTER_GAIN;
+      const period_ms = this.#period_ms + gain * (passed_ms - this.#period_ms);
       this.#period_ms = Math.min(PERIOD_MAX_MS, Math.max(PERIOD_MIN_MS, period_ms));
     }
+    const before = this.#known(this.#drawn_ms);
     const rests = !moves(state.twist) && !moves(last.twist) && isNear(state.pose, last.pose);
     this.#states.push(rests ? { ...state, pose: last.pose } : state);
     if (this.#states.length > STATES_MAX) this.#states.shift();
+    if (before) this.#note(this.#corrected(before).pose);
   }
 
   /** Where the robot is drawn at a time of the page's clock; null before its first state. */
   at(now_ms: number): Shown | null {
     this.#drawn_ms = Math.max(this.#drawn_ms, now_ms - this.delay_ms);
-    const at_ms = this.#drawn_ms;
     const states = this.#states;
-    while (states.length > 1 && (states[1]?.at_ms ?? Infinity) <= at_ms) states.shift();
-    const [from, to] = states;
+    while (states.length > 1 && (states[1]?.at_ms ?? Infinity) <= this.#drawn_ms) states.shift();
+    const known = this.#known(this.#drawn_ms);
+    return known && this.#corrected(known);
+  }
+
+  /** Where its states say that it was; null before the first. */
+  #known(at_ms: number): Shown | null {
+    const states = this.#states;
+    const index = Math.max(0, states.findLastIndex((state) => state.at_ms <= at_ms));
+    const [from, to] = [states[index], states[index + 1]];
     if (!from) return null;
     const isMoving = states.some((state) => state.pose !== from.pose) || moves(states.at(-1)?.twist);
     if (at_ms <= from.at_ms) return { pose: from.pose, isMoving, isFrozen: false };
     if (!to) return carried(from, at_ms);
     if (isJump(from, to)) return { ...carried(from, at_ms), isMoving };
-    const share = (at_ms - from.at_ms) / (to.at_ms - from.at_ms);
-    return { pose: between(from.pose, to.pose, share), isMoving, isFrozen: false };
+    return { pose: from.pose === to.pose ? from.pose : between(from, to, at_ms), isMoving, isFrozen: false };
+  }
+
+  /** Notes that a robot was drawn somewhere, while its states say now that it was somewhere else. */
+  #note(drawn: Pose): void {
+    this.#error = null;
+    const known = this.#known(this.#drawn_ms)?.pose;
+    if (!known || known === drawn || distance(known, drawn) > JUMP_M) return;
+    this.#error = {
+      at_ms: this.#drawn_ms,
+      x_m: drawn.x_m - known.x_m,
+      y_m: drawn.y_m - known.y_m,
+      heading_rad: turnOf(known.heading_rad, drawn.heading_rad),
+    };
+  }
+
+  #corrected(known: Shown): Shown {
+    const error = this.#error;
+    const left = error ? 1 - (this.#drawn_ms - error.at_ms) / BLEND_MS : 0;
+    if (!error || left <= 0) return known;
+    const { x_m, y_m, heading_rad } = known.pose;
+    return {
+      ...known,
+      pose: {
+        x_m: x_m + left * error.x_m,
+        y_m: y_m + left * error.y_m,
+        heading_rad: heading_rad + left * error.heading_rad,
+      },
+      isMoving: true,
+    };
   }
 }
 
@@ -121,12 +176,29 @@ function isJump(from: State, to: State): boolean {
   return distance(from.pose, to.pose) > JUMP_M + speed_m_s * passed_s;
 }
 
-function between(from: Pose, to: Pose, share: number): Pose {
+/** Between two states; straight where their twists are unknown. */
+function between(from: State, to: State, at_ms: number): Pose {
+  const passed_s = (to.at_ms - from.at_ms) / 1000;
+  const share = (at_ms - from.at_ms) / (to.at_ms - from.at_ms);
+  const rest = 1 - share;
+  const heading_rad = from.pose.heading_rad + share * turnOf(from.pose.heading_rad, to.pose.heading_rad);
+  const [begin, end] = [tangent(from), tangent(to)];
+  // Hermite's basis: of both places, and of both tangents.
+  const [p, q] = [rest * rest * (1 + 2 * share), share * share * (1 + 2 * rest)];
+  const [u, v] = [share * rest * rest, -share * share * rest];
+  const mix = (a: number, b: number, da: number | undefined, db: number | undefined) =>
+    da === undefined || db === undefined ? rest * a + share * b : p * a + q * b + passed_s * (u * da + v * db);
   return {
-    x_m: from.x_m + share * (to.x_m - from.x_m),
-    y_m: from.y_m + share * (to.y_m - from.y_m),
-    heading_rad: from.heading_rad + share * turnOf(from.heading_rad, to.heading_rad),
+    x_m: mix(from.pose.x_m, to.pose.x_m, begin?.x_m, end?.x_m),
+    y_m: mix(from.pose.y_m, to.pose.y_m, begin?.y_m, end?.y_m),
+    heading_rad,
   };
+}
+
+/** Velocity in the site's frame, metres per second; null where it is unknown. */
+function tangent({ pose, twist }: State): { x_m: number; y_m: number } | null {
+  if (!twist) return null;
+  return { x_m: twist.linear_m_s * Math.cos(pose.heading_rad), y_m: twist.linear_m_s * Math.sin(pose.heading_rad) };
 }
 
 /** A state carried on by its twist along an arc, for a bounded time. */

@@ -24,8 +24,8 @@ function driven(until_ms: number): Tracked {
 }
 
 test('a trail ends where its robot is drawn, and not before it', () => {
-  const tracked = driven(3_000);
-  const shown = tracked.shownAt(3_000);
+  const tracked = driven(9_000);
+  const shown = tracked.shownAt(9_000);
   const end_m = tracked.trail.at(-2) ?? NaN;
   expect(end_m).toBeLessThanOrEqual(shown?.pose.x_m ?? NaN);
   expect(end_m).toBeGreaterThan((shown?.pose.x_m ?? NaN) - 0.21);
@@ -37,20 +37,20 @@ test('a trail grows while nobody looks at the page, too', () => {
 });
 
 test('a robot that is lost is drawn where it was last', () => {
-  const tracked = driven(3_000);
-  tracked.update(robot(3, 1, 'offline'), 3_400);
-  expect(tracked.shownAt(9_000)).toMatchObject({ pose: { x_m: 3 }, isMoving: false, isFrozen: false });
+  const tracked = driven(9_000);
+  tracked.update(robot(9, 1, 'offline'), 9_400);
+  expect(tracked.shownAt(15_000)).toMatchObject({ pose: { x_m: 9 }, isMoving: false, isFrozen: false });
 });
 
 test('the drive socket moves its robot between the states of the stream', () => {
-  const tracked = driven(3_000);
-  const { live } = robot(3.1, 1);
-  for (let at_ms = 3_100; at_ms <= 6_000; at_ms += 100) {
+  const tracked = driven(9_000);
+  const { live } = robot(9.1, 1);
+  for (let at_ms = 9_100; at_ms <= 12_000; at_ms += 100) {
     const pose = { value: { x_m: at_ms / 1000, y_m: 0, heading_rad: 0 }, age_ms: 0 };
     expect(tracked.seen({ ...live, pose } as unknown as DriveView, at_ms)).toBe(true);
   }
   // Twice as many states make it half as late.
-  expect(6 - (tracked.shownAt(6_000)?.pose.x_m ?? NaN)).toBeLessThan(0.13);
+  expect(12 - (tracked.shownAt(12_000)?.pose.x_m ?? NaN)).toBeLessThan(0.13);
 });
 
 test('a robot that stands and says the same needs no frame, one that is stopped does', () => {
