@@ -87,13 +87,15 @@ test('the friction layer says what the API says, at three places', async () => {
       await page.mouse.move(x + 1, y);
       await page.mouse.move(x, y);
       const said = await page.locator('[data-test="value"]').innerText();
-      const found = /θ = 1\/K ([\d.]+) ± ([\d.]+), (\d+) robots?, (\d+) measurements?/.exec(said);
+      const found = /θ = 1\/K ([\d.]+), 95 % ([\d.]+) to ([\d.]+) · (\d+) robots?, (\d+) passe?s? · [\d.]+ .*ago$/.exec(said);
       if (!most || !found) return false;
       const near = (text: string | undefined, value: number) => Math.abs(Number(text) - value) <= 0.006 * value;
       return (
         near(found[1], most.friction.theta) &&
-        near(found[2], most.friction.std_dev) &&
-        Number(found[4]) === most.friction.segments
+        near(found[2], most.friction.theta_low_95) &&
+        near(found[3], most.friction.theta_high_95) &&
+        Number(found[4]) === most.friction.robots &&
+        Number(found[5]) === most.friction.segments
       );
     });
     compared += 1;

@@ -26,10 +26,10 @@ test('what is within chance is grey, whatever its percent', () => {
 
 test('what only one of the times knows is grey and hatched', () => {
   for (const known of [cell(null, 0.4, null), cell(0.4, null, null)]) {
-    expect(lookOf(known)).toEqual({ colour: changeColour(0), isHatched: true });
+    expect(lookOf(known)).toEqual({ colour: changeColour(0), hatch: 2 });
     expect(changePercent(known)).toBeNull();
   }
-  expect(lookOf(cell(0.2, 0.4, 8)).isHatched).toBe(false);
+  expect(lookOf(cell(0.2, 0.4, 8)).hatch).toBe(0);
 });
 
 test('the legend names the ends of the colours', () => {

@@ -36,7 +36,7 @@ export function lookOf(cell: CellDifference): Look {
   const percent = changePercent(cell);
   const isChance = Math.abs(cell.z_score ?? 0) < CHANCE;
   const share = percent === null || isChance ? 0 : shareOfChange(1 + percent / 100);
-  return { colour: changeColour(share), isHatched: percent === null };
+  return { colour: changeColour(share), hatch: percent === null ? 2 : 0 };
 }
 
 /** Where two terrains or models share a cell, the one that changed most. */

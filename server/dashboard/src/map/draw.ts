@@ -33,7 +33,9 @@ export interface Scene {
   showTerrains: boolean;
   showFence: boolean;
   showTrails: boolean;
-  /** Marks the middle, for those who draw by keys. */
+  /** The place of the friction map that is looked at. */
+  inspected: PointM | null;
+  /** Marks the middle, for those who draw or read by keys. */
   showCross: boolean;
   /** The server is lost: what is shown was so when it was heard last. */
   isOld: boolean;
@@ -69,6 +71,7 @@ export function drawGround(context: CanvasRenderingContext2D, camera: Camera, sc
   if (scene.showTerrains) drawTerrains(context, camera, scene, palette);
   if (scene.friction) drawFriction(context, camera, scene.friction);
   drawGrid(context, camera, palette);
+  if (scene.inspected && scene.friction) drawInspected(context, camera, scene.inspected, scene.friction.cellM, palette);
   if (scene.showFence && scene.fence) drawFence(context, camera, scene.fence, palette);
   drawPaths(context, camera, scene, palette);
 }
@@ -181,6 +184,27 @@ function drawGrid(context: CanvasRenderingContext2D, camera: Camera, palette: Pa
     context.strokeStyle = isStrong ? palette.gridStrong : palette.grid;
     context.stroke();
     context.globalAlpha = 1;
+  }
+}
+
+/** A frame around the cell that is looked at. */
+function drawInspected(
+  context: CanvasRenderingContext2D,
+  camera: Camera,
+  at: PointM,
+  cellM: number,
+  palette: Palette,
+): void {
+  const corner = { x_m: Math.floor(at.x_m / cellM) * cellM, y_m: (Math.floor(at.y_m / cellM) + 1) * cellM };
+  const { x, y } = camera.toPx(corner);
+  const side = Math.max(4, cellM * camera.scale);
+  for (const [width, colour] of [
+    [4, palette.halo],
+    [2, palette.selected],
+  ] as const) {
+    context.lineWidth = width;
+    context.strokeStyle = colour;
+    context.strokeRect(x, y, side, side);
   }
 }
 

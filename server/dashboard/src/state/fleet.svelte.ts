@@ -55,6 +55,8 @@ export class Fleet implements Listener {
   readonly tracked = new Map<string, Tracked>();
   /** Asks the map for a frame: a robot moves, or something else looks different. */
   wake: () => void = () => undefined;
+  /** Says that the friction map has changed somewhere. */
+  mapChanged: () => void = () => undefined;
   #isDirty = true;
   /** Steps of missions, for whoever shows a history. */
   lastStep = $state.raw<MissionStep | null>(null);
@@ -236,6 +238,10 @@ export class Fleet implements Listener {
     if (alert.cleared_at) this.alerts.delete(alert.id);
     else this.alerts.set(alert.id, alert);
     if (alert.code.startsWith('stop')) void this.stops.read();
+  }
+
+  map(): void {
+    this.mapChanged();
   }
 
   link(isLive: boolean): void {
