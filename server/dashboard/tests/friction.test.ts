@@ -48,16 +48,16 @@ test('friction is shown from the start, with a scale whose ends say what they me
   const demand = demandOf(robot.model);
   const row = legend.locator('tr', { has: page.getByRole('cell', { name: '0.1', exact: true }) });
   await legend.getByText('What it means').click();
-  const said = Number(/([\d.]+) %$/.exec(await row.innerText())?.[1]);
+  const said = Number(/([\d.]+)$/.exec(await row.innerText())?.[1]);
   expect(said).toBeCloseTo((slipOf(0.1, demand) ?? NaN) * 100, 1);
-  await legend.getByText(`turn of ${plain(demand.radius_m)} m radius`).waitFor();
+  await legend.locator('.wide').getByText(`turn of ${plain(demand.radius_m)} m radius`).waitFor();
   await legend.getByText('θ is no friction coefficient').waitFor();
   await shot(page, 'friction-legend');
   await legend.getByText('What it means').click();
   await page.getByRole('combobox', { name: 'Friction' }).selectOption('friction');
   await legend.getByText('What it means').click();
   await legend.getByText('It says nothing of θ.').waitFor();
-  await legend.getByText('stops within this distance').waitFor();
+  await legend.locator('.wide').getByText('stops within this distance').waitFor();
   await shot(page, 'friction-peak');
 });
 

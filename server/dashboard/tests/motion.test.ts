@@ -1,7 +1,8 @@
 // Robots on the map move smoothly while they move, and a map on which nothing moves draws nothing.
 import type { Page } from 'playwright-core';
 import { expect, test } from 'vitest';
-import type { Mission, Page as ApiPage, Robot, Stop } from './types';
+import { planned, withApproach } from '../src/map/approach';
+import type { Mission, Page as ApiPage, Robot, Stop, Trajectory, TrajectoryCheck } from './types';
 import { api, browser, eventually, select, shot } from './harness';
 
 const { open } = browser();
@@ -112,4 +113,47 @@ test('a map on which nothing moves draws no frames', async () => {
       });
     }
   }
+});
+
+test('the approach of a path is dashed, what was asked for is not', async () => {
+  const trajectories = {
+    circle: { circle: { center: { x_m: 16, y_m: 18 }, radius_m: 2, speed_m_s: 0.5, turns: 2 } },
+    waypoints: { waypoints: { points: [{ x_m: 12, y_m: 5 }, { x_m: 15, y_m: 7 }, { x_m: 18, y_m: 4 }], speed_m_s: 0.5 } },
+  };
+  // What the page finds of a mission is what a dry run states.
+  for (const trajectory of Object.values(trajectories) as unknown as Trajectory[]) {
+    const check = await api<TrajectoryCheck>('/v1/trajectories/check', 'POST', { site: 'yard', robot: 'rover-2', trajectory });
+    expect(check.approach_length_m).toBeGreaterThan(1);
+    const stated = withApproach(check.path, check.approach_length_m).approach;
+    const found = planned(check.path, trajectory, check.length_m).approach;
+    expect(Math.abs(found - stated)).toBeLessThanOrEqual(1);
+  }
+  const sent = await api<Mission>('/v1/missions', 'POST', {
+    site: 'yard',
+    robot: 'rover-2',
+    start_policy: 'replace',
+    trajectory: trajectories.circle,
+  });
+  // Dashes and colour of each line that the map strokes.
+  const page = await open({
+    async prepare(page) {
+      await page.addInitScript(() => {
+        const strokes = new Set<string>();
+        const stroke = CanvasRenderingContext2D.prototype.stroke;
+        CanvasRenderingContext2D.prototype.stroke = function (this: CanvasRenderingContext2D, ...words: unknown[]) {
+          strokes.add(`${String(this.strokeStyle)} ${this.getLineDash().join()}`);
+          return Reflect.apply(stroke, this, words);
+        } as typeof stroke;
+        Object.assign(globalThis, { strokes });
+      });
+    },
+  });
+  await select(page, 'rover-2');
+  const strokes = () => page.evaluate(() => [...(globalThis as unknown as { strokes: Set<string> }).strokes]);
+  await eventually('an approach and a path', async () => {
+    const all = await strokes();
+    return all.includes('#7a2e9d 3,5') && all.includes('#7a2e9d ');
+  });
+  await shot(page, 'approach');
+  await api(`/v1/missions/${sent.id}/cancel`, 'POST');
 });

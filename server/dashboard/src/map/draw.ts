@@ -5,6 +5,7 @@ import type { Theme } from '../state/session.svelte';
 import { span } from '../format';
 import { texts } from '../texts';
 import { roundUp, type Camera, type PointM } from './camera';
+import type { Planned } from './approach';
 import type { Draft } from './draft';
 import { HATCHED_CELL_PX, drawFriction } from './draw_friction';
 import type { Raster } from './raster';
@@ -24,11 +25,11 @@ export interface Scene {
   friction: Raster<{ cell: Cell }> | null;
   draft: Draft | null;
   /** The mission that is looked at: its path as it was planned, as far as that is known, and driven. */
-  driven: { asked: Trajectory; planned: PointM[]; points: PointM[]; moment: Moment | null } | null;
-  /** The smooth path of what is drawn, by its dry run. */
-  dryRun: PointM[];
+  driven: { asked: Trajectory; planned: Planned | null; points: PointM[]; moment: Moment | null } | null;
+  /** The smooth path of what is drawn, by its dry run; null without one. */
+  dryRun: Planned | null;
   /** The smooth path of a mission, once it is known. */
-  pathOf(mission: Mission): PointM[] | null;
+  pathOf(mission: Mission): Planned | null;
   selected: string | null;
   showTerrains: boolean;
   showFence: boolean;
@@ -52,6 +53,10 @@ const SCALE_BAR_PX = 90;
 const ROBOT_PX = 15;
 /** Points of a trail that are nearer to each other than this are one, pixels. */
 const TRAIL_STEP_PX = 2;
+/** Dashes of the approach to a path, pixels. */
+const APPROACH_DASH = [3, 5];
+/** Dashes of a path that was planned, below the one that was driven, pixels. */
+const PLANNED_DASH = [8, 5];
 /** Length of the arrow of a moment, pixels from its middle. */
 const MOMENT_PX = 11;
 /** Most labels of robots: with more they would only cover each other. */
@@ -82,12 +87,9 @@ export function drawAbove(context: CanvasRenderingContext2D, camera: Camera, sce
   const isMoving = drawRobots(context, camera, scene, palette);
   if (scene.draft) {
     drawDraft(context, camera, scene.draft, palette);
-    context.setLineDash([6, 5]);
     context.lineWidth = 2;
     context.strokeStyle = palette.planned;
-    trace(context, camera, scene.dryRun);
-    context.stroke();
-    context.setLineDash([]);
+    if (scene.dryRun) strokePlanned(context, camera, scene.dryRun, []);
   }
   if (scene.showCross) drawCross(context, camera, palette);
   drawScale(context, camera, palette);
@@ -243,8 +245,25 @@ export function traceTrajectory(context: CanvasRenderingContext2D, camera: Camer
   }
 }
 
+/** Strokes a planned path: its approach in short dashes, what was asked for in others or none. */
+function strokePlanned(
+  context: CanvasRenderingContext2D,
+  camera: Camera,
+  { points, approach }: Planned,
+  dash: number[],
+): void {
+  if (approach > 0) {
+    context.setLineDash(APPROACH_DASH);
+    trace(context, camera, points.slice(0, approach + 1));
+    context.stroke();
+  }
+  context.setLineDash(dash);
+  trace(context, camera, points.slice(approach));
+  context.stroke();
+  context.setLineDash([]);
+}
+
 function drawPaths(context: CanvasRenderingContext2D, camera: Camera, scene: Scene, palette: Palette): void {
-  context.setLineDash([6, 5]);
   for (const mission of scene.missions) {
     const isWaiting = mission.state === 'queued';
     if (isWaiting && mission.robot !== scene.selected) continue;
@@ -252,9 +271,11 @@ function drawPaths(context: CanvasRenderingContext2D, camera: Camera, scene: Sce
     context.lineWidth = mission.robot === scene.selected ? 2 : 1.25;
     context.strokeStyle = palette.planned;
     const path = scene.pathOf(mission);
-    if (path) trace(context, camera, path);
-    else traceTrajectory(context, camera, mission.trajectory);
-    context.stroke();
+    if (path) strokePlanned(context, camera, path, []);
+    else {
+      traceTrajectory(context, camera, mission.trajectory);
+      context.stroke();
+    }
     if ('waypoints' in mission.trajectory && !isWaiting && mission.trajectory.waypoints.points.length <= 200) {
       context.fillStyle = palette.planned;
       for (const point of mission.trajectory.waypoints.points) {
@@ -268,9 +289,13 @@ function drawPaths(context: CanvasRenderingContext2D, camera: Camera, scene: Sce
     context.lineWidth = 2;
     context.strokeStyle = palette.planned;
     const { asked, planned, points, moment } = scene.driven;
-    if (planned.length > 0) trace(context, camera, planned);
-    else traceTrajectory(context, camera, asked);
-    context.stroke();
+    // Dashed, since what was driven lies on it.
+    if (planned) strokePlanned(context, camera, planned, PLANNED_DASH);
+    else {
+      context.setLineDash(PLANNED_DASH);
+      traceTrajectory(context, camera, asked);
+      context.stroke();
+    }
     context.setLineDash([]);
     context.lineWidth = 2.5;
     context.strokeStyle = palette.driven;

@@ -43,7 +43,19 @@ test('a robot that drives evenly is drawn evenly, about one state period late', 
   }
 });
 
-test('of states that come once a second half of the time is bridged by the twist', () => {
+test('states that come unevenly, about once a second, never let a robot that moves freeze', () => {
+  const motion = new Motion();
+  // As a server says them: each second the newest of a robot's five.
+  for (let now_ms = 0, next_ms = 0; now_ms < 60_000; now_ms += 20) {
+    if (now_ms >= next_ms) {
+      motion.push(straight(Math.floor((now_ms - 10) / PERIOD_MS) * PERIOD_MS, 0.7));
+      next_ms = now_ms + 1_030 + (now_ms % 7) * 10;
+    }
+    if (now_ms > 3_000) expect(motion.at(now_ms)?.isFrozen).toBe(false);
+  }
+});
+
+test('of states that come once a second a part of the time is bridged by the twist', () => {
   const motion = new Motion();
   const speed_m_s = 0.8;
   let last_m: number | null = null;
@@ -53,7 +65,7 @@ test('of states that come once a second half of the time is bridged by the twist
     if (now_ms < 4_000) continue;
     expect(shown).toMatchObject({ isMoving: true, isFrozen: false });
     const late_ms = now_ms - ((shown?.pose.x_m ?? NaN) / speed_m_s) * 1000;
-    expect(late_ms).toBeLessThan(800);
+    expect(late_ms).toBeLessThan(950);
     if (last_m !== null) expect((shown?.pose.x_m ?? NaN) - last_m).toBeCloseTo(speed_m_s * 0.02, 5);
     last_m = shown?.pose.x_m ?? NaN;
   }
@@ -86,9 +98,9 @@ test('what the twist predicted wrong is made good without a step', () => {
   for (let at_ms = 0; at_ms <= 4_000; at_ms += 1_000) motion.push(straight(at_ms, 1));
   const now_ms = 5_000 + 100;
   const before = motion.at(now_ms)?.pose.x_m ?? NaN;
-  expect(before).toBeGreaterThan(4.2);
+  expect(before).toBeGreaterThan(4.15);
   // It had braked to a stand meanwhile.
-  motion.push({ at_ms: 5_000, pose: { x_m: 4.2, y_m: 0, heading_rad: 0 }, twist: { linear_m_s: 0, angular_rad_s: 0 } });
+  motion.push({ at_ms: 5_000, pose: { x_m: 4.1, y_m: 0, heading_rad: 0 }, twist: { linear_m_s: 0, angular_rad_s: 0 } });
   expect(motion.at(now_ms)?.pose.x_m).toBeCloseTo(before, 9);
   let last_m = before;
   for (let later_ms = 20; later_ms <= 1_500; later_ms += 20) {
@@ -96,7 +108,7 @@ test('what the twist predicted wrong is made good without a step', () => {
     expect(Math.abs(x_m - last_m)).toBeLessThan(0.025);
     last_m = x_m;
   }
-  expect(last_m).toBeCloseTo(4.2, 9);
+  expect(last_m).toBeCloseTo(4.1, 9);
   expect(motion.at(now_ms + 1_520)?.isMoving).toBe(false);
 });
 

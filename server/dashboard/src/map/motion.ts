@@ -28,8 +28,8 @@ export interface Shown {
 export const EXTRAPOLATION_MAX_MS = 500;
 /** Delay of what is drawn, in state periods: a little more than one, so that a late state does no harm. */
 const DELAY_PERIODS = 1.15;
-/** How much of a long period the twist bridges, milliseconds: less than it may, for states that are late. */
-const BRIDGED_MS = 400;
+/** How much of a long period the twist bridges, milliseconds: less than it may, since states come unevenly. */
+const BRIDGED_MS = 250;
 /** Period that is assumed until states have shown theirs, milliseconds: that of the stream of events. */
 const PERIOD_MS = 1_000;
 const PERIOD_MIN_MS = 50;

@@ -82,7 +82,7 @@ async function measure(): Promise<Frames> {
       friction,
       draft: null,
       driven: null,
-      dryRun: [],
+      dryRun: null,
       pathOf: () => null,
       selected: 'rover-1',
       showTerrains: true,
