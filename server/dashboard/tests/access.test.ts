@@ -29,6 +29,7 @@ async function violations(page: Page): Promise<string[]> {
 for (const theme of ['light', 'dark'] as const) {
   for (const [name, size] of [
     ['wide', { width: 1360, height: 850 }],
+    ['tablet', { width: 900, height: 1100 }],
     ['phone', { width: 390, height: 800 }],
   ] as const) {
     test(`no part of the page violates a rule of accessibility: ${theme}, ${name}`, async () => {

@@ -134,7 +134,7 @@ test('two times of the friction map are compared', async () => {
   const page = await open();
   await page.getByRole('combobox', { name: 'Friction' }).selectOption('change of θ between two times');
   await page.getByLabel('Before').waitFor();
-  await page.locator('.layers figure').getByText('grey: within two standard deviations').waitFor();
+  await page.locator('.layers figure').getByText('white: within two standard deviations').waitFor();
   const place = await windowOf(page);
   const box = await map(page);
   const seen = measured.find(({ cell }) => place(cell.ix + 0.5, 0).x < box.x + box.width - 280);
@@ -154,7 +154,7 @@ test('two times of the friction map are compared', async () => {
   await page.getByLabel('Before').waitFor({ state: 'detached' });
 });
 
-test('ground that has changed is red where θ rose, blue where it fell, and grey within chance', async () => {
+test('ground that has changed is red where θ rose, blue where it fell, and white within chance', async () => {
   const from = new Date(Date.now() - 3_600_000).toISOString();
   await eventually('measured cells', async () => {
     const { items } = await api<ApiPage<CellDifference>>(`/v1/sites/yard/friction/difference?from=${from}&limit=1000`);

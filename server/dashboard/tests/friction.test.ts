@@ -1,6 +1,8 @@
 // The friction layer says by itself what it shows, what that means for a robot, and how it went over time.
 import type { Page } from 'playwright-core';
 import { expect, test } from 'vitest';
+import { colour } from '../src/map/cividis';
+import { RANGES, shade } from '../src/map/friction';
 import { demandOf, plain, slipOf } from '../src/map/meaning';
 import { texts } from '../src/texts';
 import type { CellFriction, FusedFriction, Page as ApiPage, PointFriction, Robot, TerrainHistory } from './types';
@@ -34,6 +36,20 @@ async function overACell(page: Page): Promise<{ x: number; y: number; cell: Cell
   });
 }
 
+/** The share of a part of a canvas that has just this colour. */
+function colouredShare(
+  canvas: Element,
+  { part, expected }: { part: { x: number; y: number; width: number; height: number }; expected: number[] },
+): number {
+  const context = (canvas as HTMLCanvasElement).getContext('2d');
+  const { data } = context!.getImageData(part.x, part.y, part.width, part.height);
+  let count = 0;
+  for (let at = 0; at < data.length; at += 4) {
+    if (expected.every((channel, index) => data[at + index] === channel)) count += 1;
+  }
+  return (4 * count) / data.length;
+}
+
 const place = (page: Page) => page.locator('[data-test="inspect"]');
 
 test('friction is shown from the start, with a scale whose ends say what they mean', async () => {
@@ -59,6 +75,49 @@ test('friction is shown from the start, with a scale whose ends say what they me
   await legend.getByText('It says nothing of θ.').waitFor();
   await legend.locator('.wide').getByText('stops within this distance').waitFor();
   await shot(page, 'friction-peak');
+});
+
+test('how unsure a value is shows in its hatching alone, and not in its colour', async () => {
+  const theta = 0.5;
+  /** Standard deviations over θ: not hatched, and ever denser. */
+  const ratios = [0.02, 0.15, 0.3, 0.8];
+  const shown: CellFriction[] = [];
+  const page = await open({
+    async prepare(page) {
+      await page.route(/\/friction\/cells\?/, async (route) => {
+        const response = await route.fetch();
+        const answer = (await response.json()) as ApiPage<CellFriction>;
+        const [sample] = await measured();
+        if (!sample) throw new Error('nothing is measured');
+        shown.length = 0;
+        for (const [index, ratio] of ratios.entries()) {
+          const friction = { ...sample.friction, theta, stiffness: 1 / theta, std_dev: ratio * theta };
+          shown.push({ ...sample, size_m: 1, cell: { ix: 3 + 2 * index, iy: 19 }, friction });
+        }
+        await route.fulfill({ response, json: { ...answer, items: shown } });
+      });
+    },
+  });
+  await page.getByText('Layers', { exact: true }).click();
+  for (const name of ['Trails', 'Terrains']) await page.getByRole('checkbox', { name }).uncheck();
+  const place = await windowOf(page);
+  const box = await map(page);
+  await eventually('four cells', async () => shown.length === ratios.length);
+  const expected = colour(shade(RANGES.theta, theta));
+  const shares = await eventually('hatching', async () => {
+    const all: number[] = [];
+    for (const { cell } of shown) {
+      const [from, to] = [place(cell.ix + 0.1, cell.iy + 0.9), place(cell.ix + 0.9, cell.iy + 0.1)];
+      const part = { x: from.x - box.x, y: from.y - box.y, width: to.x - from.x, height: to.y - from.y };
+      all.push(await page.getByRole('application', { name: /^Map/ }).evaluate(colouredShare, { part, expected }));
+    }
+    return (all[0] ?? 0) > 0.9 && all;
+  });
+  console.log(`share of a cell in its own colour, by hatching: ${shares.map((share) => share.toFixed(2)).join(', ')}`);
+  // The same colour shows between the lines, of which there are more and more.
+  for (const [index, share] of shares.slice(1).entries()) expect(share).toBeLessThan((shares[index] ?? 0) - 0.1);
+  expect(shares.at(-2)).toBeGreaterThan(0.2);
+  await shot(page, 'friction-unsure');
 });
 
 test('a click reads a place of the map in full, and Escape ends it', async () => {

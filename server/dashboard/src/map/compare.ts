@@ -1,4 +1,4 @@
-// How cells differ between two times, as a layer: blue where θ fell, red where it rose, grey where
+// How cells differ between two times, as a layer: blue where θ fell, red where it rose, white where
 // the difference is within chance, hatched where only one of the times knows anything.
 import type { CellDifference } from '../api/schema';
 import { Raster, type Look } from './raster';
@@ -11,7 +11,7 @@ const MOST = Math.LN2;
 export const CHANGE_TICKS = [-50, 0, 100];
 /** Blue to white to red, which all eyes can distinguish: ends and middle. */
 const FALLEN = [33, 102, 172] as const;
-const SAME = [190, 190, 190] as const;
+const SAME = [244, 244, 244] as const;
 const RISEN = [178, 24, 43] as const;
 
 /** Where a change stands in its range, −1 to 1. */

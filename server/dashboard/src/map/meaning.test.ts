@@ -38,8 +38,10 @@ test('beyond the linear range θ does not tell the slip', () => {
   expect(slipOf(4, demandOf(model))).toBeNull();
 });
 
-test('a stop takes v²/(2 μ g), and is unknown where no friction was shown', () => {
-  expect(stoppingM(0.5, 2)).toBeCloseTo(4 / 9.80665, 12);
-  expect(stoppingM(null, 2)).toBeNull();
-  expect(stoppingM(0, 2)).toBeNull();
+test('a stop takes v²/(2 μ g), longer where the model brakes more softly, and is unknown where no friction was shown', () => {
+  const demand = demandOf(model);
+  expect(stoppingM(0.04, demand)).toBeCloseTo(1 / (2 * 0.04 * 9.80665), 12);
+  expect(stoppingM(0.9, demand)).toBeCloseTo(1 / (2 * 0.8), 12);
+  expect(stoppingM(null, demand)).toBeNull();
+  expect(stoppingM(0, demand)).toBeNull();
 });

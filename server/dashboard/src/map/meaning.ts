@@ -6,7 +6,8 @@
 // (docs/control.md, "The model"), and its rims run ahead of the ground by λ = θ a/g.
 //
 // θ says nothing of how much friction there is at most. That is the traction limit, which is shown
-// by what robots have used: a stop from v with all of it takes v²/(2 μ g). Neither is derived from the other.
+// by what robots have used: a stop from v with all of it takes v²/(2 μ g), or more where the model's own
+// limit of braking is less. Neither is derived from the other.
 import type { RobotModel } from '../api/schema';
 
 /** Standard gravity, m/s². */
@@ -59,9 +60,12 @@ export function slipOf(theta: number, demand: Demand): number | null {
   return slip <= SLIP_LINEAR ? slip : null;
 }
 
-/** Distance in which a robot stops that brakes with a friction coefficient, metres; null where none was shown. */
-export function stoppingM(mu: number | null | undefined, speed_m_s: number): number | null {
-  return mu ? speed_m_s ** 2 / (2 * mu * G_M_S2) : null;
+/**
+ * Distance in which a robot stops from its top speed once it brakes, with a friction coefficient and
+ * no harder than its model may, metres; null where no friction was shown.
+ */
+export function stoppingM(mu: number | null | undefined, { speed_m_s, acceleration_m_s2 }: Demand): number | null {
+  return mu ? speed_m_s ** 2 / (2 * Math.min(mu * G_M_S2, acceleration_m_s2)) : null;
 }
 
 /** Three significant digits, without zeros behind them. */
