@@ -7,7 +7,7 @@ import { texts } from '../texts';
 import { roundUp, type Camera, type PointM } from './camera';
 import type { Planned } from './approach';
 import type { Draft } from './draft';
-import { HATCHED_CELL_PX, drawFriction } from './draw_friction';
+import { HATCHED_CELL_PX, drawFriction, drawInspected } from './draw_friction';
 import type { Raster } from './raster';
 import type { Shown } from './motion';
 import type { Moment } from './replay';
@@ -186,27 +186,6 @@ function drawGrid(context: CanvasRenderingContext2D, camera: Camera, palette: Pa
     context.strokeStyle = isStrong ? palette.gridStrong : palette.grid;
     context.stroke();
     context.globalAlpha = 1;
-  }
-}
-
-/** A frame around the cell that is looked at. */
-function drawInspected(
-  context: CanvasRenderingContext2D,
-  camera: Camera,
-  at: PointM,
-  cellM: number,
-  palette: Palette,
-): void {
-  const corner = { x_m: Math.floor(at.x_m / cellM) * cellM, y_m: (Math.floor(at.y_m / cellM) + 1) * cellM };
-  const { x, y } = camera.toPx(corner);
-  const side = Math.max(4, cellM * camera.scale);
-  for (const [width, colour] of [
-    [4, palette.halo],
-    [2, palette.selected],
-  ] as const) {
-    context.lineWidth = width;
-    context.strokeStyle = colour;
-    context.strokeRect(x, y, side, side);
   }
 }
 

@@ -1,6 +1,7 @@
 // Draws a layer of cells: its image, and hatching over those that are unsure.
-import type { Camera } from './camera';
+import type { Camera, PointM } from './camera';
 import type { Cell } from '../api/schema';
+import type { Palette } from './palette';
 import type { Raster } from './raster';
 
 /** Least pixels of a cell's side for hatching to be read. */
@@ -69,5 +70,26 @@ export function drawFriction(context: CanvasRenderingContext2D, camera: Camera, 
     }
     context.fillStyle = pattern;
     context.fill();
+  }
+}
+
+/** A frame around the cell that is looked at. */
+export function drawInspected(
+  context: CanvasRenderingContext2D,
+  camera: Camera,
+  at: PointM,
+  cellM: number,
+  palette: Palette,
+): void {
+  const corner = { x_m: Math.floor(at.x_m / cellM) * cellM, y_m: (Math.floor(at.y_m / cellM) + 1) * cellM };
+  const { x, y } = camera.toPx(corner);
+  const side = Math.max(4, cellM * camera.scale);
+  for (const [width, colour] of [
+    [4, palette.halo],
+    [2, palette.selected],
+  ] as const) {
+    context.lineWidth = width;
+    context.strokeStyle = colour;
+    context.strokeRect(x, y, side, side);
   }
 }

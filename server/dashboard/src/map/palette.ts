@@ -66,7 +66,7 @@ export const PALETTES: Record<Theme, Palette> = {
 /** Most saturation of ground, percent: colours belong to the scale of the friction layer. */
 export const GROUND_SATURATION_MAX = 8;
 
-/** Hue, saturation and lightness of each kind of ground: greys that are told from each other by their lightness. */
+/** Hue, saturation and lightness of each kind of ground: greys that differ by their lightness. */
 const GROUNDS: Record<TerrainClass, [number, number, number]> = {
   asphalt: [220, 3, 52],
   concrete: [210, 4, 72],
