@@ -29,6 +29,7 @@ async function violations(page: Page): Promise<string[]> {
 for (const theme of ['light', 'dark'] as const) {
   for (const [name, size] of [
     ['wide', { width: 1360, height: 850 }],
+    ['tablet', { width: 900, height: 1100 }],
     ['phone', { width: 390, height: 800 }],
   ] as const) {
     test(`no part of the page violates a rule of accessibility: ${theme}, ${name}`, async () => {
@@ -38,9 +39,18 @@ for (const theme of ['light', 'dark'] as const) {
       await stranger.close();
       const page = await open({ theme, size });
       expect(await violations(page)).toEqual([]);
-      await page.locator('.layers details').evaluate((details: HTMLDetailsElement) => (details.open = true));
+      await page.locator('.layers details').evaluateAll((all) => {
+        for (const details of all) if (details instanceof HTMLDetailsElement) details.open = true;
+      });
       await page.getByRole('combobox', { name: 'Friction' }).selectOption('theta');
       await page.locator('.layers figure').waitFor();
+      // The place in the middle of the map, with its history.
+      await page.getByRole('application', { name: /^Map/ }).press('Enter');
+      const place = page.locator('[data-test="inspect"]');
+      await place.getByRole('button', { name: 'History' }).click();
+      await place.locator('[data-test="history"]').waitFor();
+      expect(await violations(page), 'place').toEqual([]);
+      await place.getByRole('button', { name: 'Close' }).click();
       for (const tab of ['Missions', 'Alerts', 'Terrains']) {
         await page.getByRole('tab', { name: tab }).click();
         expect(await violations(page), tab).toEqual([]);

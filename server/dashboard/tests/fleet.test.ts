@@ -87,13 +87,15 @@ test('the friction layer says what the API says, at three places', async () => {
       await page.mouse.move(x + 1, y);
       await page.mouse.move(x, y);
       const said = await page.locator('[data-test="value"]').innerText();
-      const found = /θ = 1\/K ([\d.]+) ± ([\d.]+), (\d+) robots?, (\d+) measurements?/.exec(said);
+      const found = /θ = 1\/K ([\d.]+), 95 % ([\d.]+) to ([\d.]+) · (\d+) robots?, (\d+) passe?s? · [\d.]+ .*ago$/.exec(said);
       if (!most || !found) return false;
       const near = (text: string | undefined, value: number) => Math.abs(Number(text) - value) <= 0.006 * value;
       return (
         near(found[1], most.friction.theta) &&
-        near(found[2], most.friction.std_dev) &&
-        Number(found[4]) === most.friction.segments
+        near(found[2], most.friction.theta_low_95) &&
+        near(found[3], most.friction.theta_high_95) &&
+        Number(found[4]) === most.friction.robots &&
+        Number(found[5]) === most.friction.segments
       );
     });
     compared += 1;
@@ -132,7 +134,7 @@ test('two times of the friction map are compared', async () => {
   const page = await open();
   await page.getByRole('combobox', { name: 'Friction' }).selectOption('change of θ between two times');
   await page.getByLabel('Before').waitFor();
-  await page.locator('.layers figure').getByText('grey: within two standard deviations').waitFor();
+  await page.locator('.layers figure').getByText('white: within two standard deviations').waitFor();
   const place = await windowOf(page);
   const box = await map(page);
   const seen = measured.find(({ cell }) => place(cell.ix + 0.5, 0).x < box.x + box.width - 280);
@@ -152,7 +154,7 @@ test('two times of the friction map are compared', async () => {
   await page.getByLabel('Before').waitFor({ state: 'detached' });
 });
 
-test('ground that has changed is red where θ rose, blue where it fell, and grey within chance', async () => {
+test('ground that has changed is red where θ rose, blue where it fell, and white within chance', async () => {
   const from = new Date(Date.now() - 3_600_000).toISOString();
   await eventually('measured cells', async () => {
     const { items } = await api<ApiPage<CellDifference>>(`/v1/sites/yard/friction/difference?from=${from}&limit=1000`);

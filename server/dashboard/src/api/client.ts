@@ -82,17 +82,27 @@ export function whenSignedOut(listener: () => void): void {
   ended.add(listener);
 }
 
+export interface Listed<T> {
+  items: T[];
+  isWhole: boolean;
+  /** The times that a list of the friction map states; null where it states none. */
+  asOf: string | null;
+  from: string | null;
+}
+
 /** Reads a list to its end, or to `most` entries. */
-export async function list<T>(path: string, most: number): Promise<{ items: T[]; isWhole: boolean }> {
+export async function list<T>(path: string, most: number): Promise<Listed<T>> {
   const items: T[] = [];
+  let stated: { as_of?: string | null; from?: string | null } = {};
   let cursor: string | null = null;
   do {
     const query = new URLSearchParams({ limit: String(Math.min(PAGE_ENTRIES, most)) });
     if (cursor) query.set('cursor', cursor);
     const mark = path.includes('?') ? '&' : '?';
-    const page: { items: T[]; next_cursor?: string | null } = await ask(`${path}${mark}${query}`);
+    const page: { items: T[]; next_cursor?: string | null; as_of?: string | null; from?: string | null } = await ask(`${path}${mark}${query}`);
     items.push(...page.items);
+    stated = page;
     cursor = page.next_cursor ?? null;
   } while (cursor && items.length < most);
-  return { items, isWhole: cursor === null };
+  return { items, isWhole: cursor === null, asOf: stated.as_of ?? null, from: stated.from ?? null };
 }

@@ -1,5 +1,5 @@
 // The stream of events: opened, resumed by the browser, watched, opened again when it is lost.
-import type { Alert, Event as Sent, Mission, MissionStep, Robot } from './schema';
+import type { Alert, Event as Sent, MapChange, Mission, MissionStep, Robot } from './schema';
 import { Problem, ask } from './client';
 
 /** Silence after which the server is asked whether it is there, milliseconds. */
@@ -18,6 +18,8 @@ export interface Listener {
   mission(mission: Mission): void;
   step(step: MissionStep): void;
   alert(alert: Alert): void;
+  /** The friction map has changed somewhere. */
+  map(change: MapChange): void;
   /** The stream is there, or it is lost. */
   link(isLive: boolean): void;
   /** The server no longer knows who asks. */
@@ -63,7 +65,7 @@ export class Stream {
       // The browser resumes by itself what only broke; an answer that refuses ends it.
       if (source.readyState === EventSource.CLOSED) void this.#reopen();
     };
-    for (const name of ['snapshot_begin', 'snapshot_end', 'robot', 'mission', 'step', 'alert', 'end']) {
+    for (const name of ['snapshot_begin', 'snapshot_end', 'robot', 'mission', 'step', 'alert', 'map', 'end']) {
       source.addEventListener(name, (event: MessageEvent<string>) => {
         this.#heard();
         this.#take(JSON.parse(event.data) as Sent);
@@ -86,6 +88,7 @@ export class Stream {
     else if ('mission' in sent) listener.mission(sent.mission);
     else if ('step' in sent) listener.step(sent.step);
     else if ('alert' in sent) listener.alert(sent.alert);
+    else if ('map' in sent) listener.map(sent.map);
     else if ('end' in sent) void this.#reopen();
   }
 

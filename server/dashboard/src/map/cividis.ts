@@ -17,15 +17,8 @@ export const CIVIDIS = Uint8ClampedArray.from(
   Array.from({ length: STEPS }, (_, step) => channels(step / (STEPS - 1))).flat(),
 );
 
-/** The colour of a share from 0 to 1, drawn towards grey by `doubt` from 0 to 1. */
-export function colour(share: number, doubt: number): [number, number, number] {
+/** The colour of a share from 0 to 1. */
+export function colour(share: number): [number, number, number] {
   const step = Math.round(Math.min(1, Math.max(0, share)) * (STEPS - 1)) * 3;
-  const [red, green, blue] = [CIVIDIS[step] ?? 0, CIVIDIS[step + 1] ?? 0, CIVIDIS[step + 2] ?? 0];
-  const grey = 0.299 * red + 0.587 * green + 0.114 * blue;
-  const keep = 1 - Math.min(1, Math.max(0, doubt));
-  return [
-    Math.round(grey + (red - grey) * keep),
-    Math.round(grey + (green - grey) * keep),
-    Math.round(grey + (blue - grey) * keep),
-  ];
+  return [CIVIDIS[step] ?? 0, CIVIDIS[step + 1] ?? 0, CIVIDIS[step + 2] ?? 0];
 }

@@ -19,17 +19,17 @@ test('where θ rose a cell is red, where it fell blue, and the more the further'
   expect(changePercent(cell(0.2, 0.26, 4))).toBeCloseTo(30);
 });
 
-test('what is within chance is grey, whatever its percent', () => {
+test('what is within chance is white, whatever its percent', () => {
   for (const deviations of [1.9, -1.9, 0]) expect(lookOf(cell(0.2, 0.4, deviations)).colour).toEqual(changeColour(0));
   expect(lookOf(cell(0.2, 0.4, 2.1)).colour).not.toEqual(changeColour(0));
 });
 
-test('what only one of the times knows is grey and hatched', () => {
+test('what only one of the times knows is white and hatched', () => {
   for (const known of [cell(null, 0.4, null), cell(0.4, null, null)]) {
-    expect(lookOf(known)).toEqual({ colour: changeColour(0), isHatched: true });
+    expect(lookOf(known)).toEqual({ colour: changeColour(0), hatch: 2 });
     expect(changePercent(known)).toBeNull();
   }
-  expect(lookOf(cell(0.2, 0.4, 8)).isHatched).toBe(false);
+  expect(lookOf(cell(0.2, 0.4, 8)).hatch).toBe(0);
 });
 
 test('the legend names the ends of the colours', () => {

@@ -1,4 +1,4 @@
-// How cells differ between two times, as a layer: blue where θ fell, red where it rose, grey where
+// How cells differ between two times, as a layer: blue where θ fell, red where it rose, white where
 // the difference is within chance, hatched where only one of the times knows anything.
 import type { CellDifference } from '../api/schema';
 import { Raster, type Look } from './raster';
@@ -11,7 +11,7 @@ const MOST = Math.LN2;
 export const CHANGE_TICKS = [-50, 0, 100];
 /** Blue to white to red, which all eyes can distinguish: ends and middle. */
 const FALLEN = [33, 102, 172] as const;
-const SAME = [190, 190, 190] as const;
+const SAME = [244, 244, 244] as const;
 const RISEN = [178, 24, 43] as const;
 
 /** Where a change stands in its range, −1 to 1. */
@@ -36,7 +36,7 @@ export function lookOf(cell: CellDifference): Look {
   const percent = changePercent(cell);
   const isChance = Math.abs(cell.z_score ?? 0) < CHANCE;
   const share = percent === null || isChance ? 0 : shareOfChange(1 + percent / 100);
-  return { colour: changeColour(share), isHatched: percent === null };
+  return { colour: changeColour(share), hatch: percent === null ? 2 : 0 };
 }
 
 /** Where two terrains or models share a cell, the one that changed most. */

@@ -5,9 +5,11 @@ import type { Theme } from '../state/session.svelte';
 import { span } from '../format';
 import { texts } from '../texts';
 import { roundUp, type Camera, type PointM } from './camera';
+import type { Planned } from './approach';
 import type { Draft } from './draft';
-import { HATCHED_CELL_PX, drawFriction } from './draw_friction';
+import { HATCHED_CELL_PX, drawFriction, drawInspected } from './draw_friction';
 import type { Raster } from './raster';
+import type { Shown } from './motion';
 import type { Moment } from './replay';
 import { PALETTES, groundFill, groundLine, type Palette } from './palette';
 
@@ -23,16 +25,18 @@ export interface Scene {
   friction: Raster<{ cell: Cell }> | null;
   draft: Draft | null;
   /** The mission that is looked at: its path as it was planned, as far as that is known, and driven. */
-  driven: { asked: Trajectory; planned: PointM[]; points: PointM[]; moment: Moment | null } | null;
-  /** The smooth path of what is drawn, by its dry run. */
-  dryRun: PointM[];
+  driven: { asked: Trajectory; planned: Planned | null; points: PointM[]; moment: Moment | null } | null;
+  /** The smooth path of what is drawn, by its dry run; null without one. */
+  dryRun: Planned | null;
   /** The smooth path of a mission, once it is known. */
-  pathOf(mission: Mission): PointM[] | null;
+  pathOf(mission: Mission): Planned | null;
   selected: string | null;
   showTerrains: boolean;
   showFence: boolean;
   showTrails: boolean;
-  /** Marks the middle, for those who draw by keys. */
+  /** The place of the friction map that is looked at. */
+  inspected: PointM | null;
+  /** Marks the middle, for those who draw or read by keys. */
   showCross: boolean;
   /** The server is lost: what is shown was so when it was heard last. */
   isOld: boolean;
@@ -49,32 +53,47 @@ const SCALE_BAR_PX = 90;
 const ROBOT_PX = 15;
 /** Points of a trail that are nearer to each other than this are one, pixels. */
 const TRAIL_STEP_PX = 2;
+/** Dashes of the approach to a path, pixels. */
+const APPROACH_DASH = [3, 5];
+/** Dashes of a path that was planned, below the one that was driven, pixels. */
+const PLANNED_DASH = [8, 5];
 /** Length of the arrow of a moment, pixels from its middle. */
 const MOMENT_PX = 11;
 /** Most labels of robots: with more they would only cover each other. */
 const LABELS_MAX = 60;
 
-export function draw(context: CanvasRenderingContext2D, camera: Camera, scene: Scene): void {
+/** Draws everything; true while a robot moves, so that the next frame differs. */
+export function draw(context: CanvasRenderingContext2D, camera: Camera, scene: Scene): boolean {
+  drawGround(context, camera, scene);
+  return drawAbove(context, camera, scene);
+}
+
+/** Draws what robots drive on: all that does not move by itself. */
+export function drawGround(context: CanvasRenderingContext2D, camera: Camera, scene: Scene): void {
   const palette = PALETTES[scene.theme];
   context.fillStyle = palette.ground;
   context.fillRect(0, 0, camera.width, camera.height);
   if (scene.showTerrains) drawTerrains(context, camera, scene, palette);
   if (scene.friction) drawFriction(context, camera, scene.friction);
   drawGrid(context, camera, palette);
+  if (scene.inspected && scene.friction) drawInspected(context, camera, scene.inspected, scene.friction.cellM, palette);
   if (scene.showFence && scene.fence) drawFence(context, camera, scene.fence, palette);
   drawPaths(context, camera, scene, palette);
-  drawRobots(context, camera, scene, palette);
+}
+
+/** Draws robots, and what is drawn above them; true while one of them moves. */
+export function drawAbove(context: CanvasRenderingContext2D, camera: Camera, scene: Scene): boolean {
+  const palette = PALETTES[scene.theme];
+  const isMoving = drawRobots(context, camera, scene, palette);
   if (scene.draft) {
     drawDraft(context, camera, scene.draft, palette);
-    context.setLineDash([6, 5]);
     context.lineWidth = 2;
     context.strokeStyle = palette.planned;
-    trace(context, camera, scene.dryRun);
-    context.stroke();
-    context.setLineDash([]);
+    if (scene.dryRun) strokePlanned(context, camera, scene.dryRun, []);
   }
   if (scene.showCross) drawCross(context, camera, palette);
   drawScale(context, camera, palette);
+  return isMoving;
 }
 
 function trace(context: CanvasRenderingContext2D, camera: Camera, points: readonly PointM[]): void {
@@ -205,8 +224,25 @@ export function traceTrajectory(context: CanvasRenderingContext2D, camera: Camer
   }
 }
 
+/** Strokes a planned path: its approach in short dashes, what was asked for in others or none. */
+function strokePlanned(
+  context: CanvasRenderingContext2D,
+  camera: Camera,
+  { points, approach }: Planned,
+  dash: number[],
+): void {
+  if (approach > 0) {
+    context.setLineDash(APPROACH_DASH);
+    trace(context, camera, points.slice(0, approach + 1));
+    context.stroke();
+  }
+  context.setLineDash(dash);
+  trace(context, camera, points.slice(approach));
+  context.stroke();
+  context.setLineDash([]);
+}
+
 function drawPaths(context: CanvasRenderingContext2D, camera: Camera, scene: Scene, palette: Palette): void {
-  context.setLineDash([6, 5]);
   for (const mission of scene.missions) {
     const isWaiting = mission.state === 'queued';
     if (isWaiting && mission.robot !== scene.selected) continue;
@@ -214,9 +250,11 @@ function drawPaths(context: CanvasRenderingContext2D, camera: Camera, scene: Sce
     context.lineWidth = mission.robot === scene.selected ? 2 : 1.25;
     context.strokeStyle = palette.planned;
     const path = scene.pathOf(mission);
-    if (path) trace(context, camera, path);
-    else traceTrajectory(context, camera, mission.trajectory);
-    context.stroke();
+    if (path) strokePlanned(context, camera, path, []);
+    else {
+      traceTrajectory(context, camera, mission.trajectory);
+      context.stroke();
+    }
     if ('waypoints' in mission.trajectory && !isWaiting && mission.trajectory.waypoints.points.length <= 200) {
       context.fillStyle = palette.planned;
       for (const point of mission.trajectory.waypoints.points) {
@@ -230,9 +268,13 @@ function drawPaths(context: CanvasRenderingContext2D, camera: Camera, scene: Sce
     context.lineWidth = 2;
     context.strokeStyle = palette.planned;
     const { asked, planned, points, moment } = scene.driven;
-    if (planned.length > 0) trace(context, camera, planned);
-    else traceTrajectory(context, camera, asked);
-    context.stroke();
+    // Dashed, since what was driven lies on it.
+    if (planned) strokePlanned(context, camera, planned, PLANNED_DASH);
+    else {
+      context.setLineDash(PLANNED_DASH);
+      traceTrajectory(context, camera, asked);
+      context.stroke();
+    }
     context.setLineDash([]);
     context.lineWidth = 2.5;
     context.strokeStyle = palette.driven;
@@ -273,8 +315,8 @@ function drawMoment(context: CanvasRenderingContext2D, camera: Camera, moment: M
   context.restore();
 }
 
-function drawRobots(context: CanvasRenderingContext2D, camera: Camera, scene: Scene, palette: Palette): void {
-  const all = [...scene.tracked];
+function drawRobots(context: CanvasRenderingContext2D, camera: Camera, scene: Scene, palette: Palette): boolean {
+  const all = [...scene.tracked].map((tracked) => ({ tracked, shown: tracked.shownAt(scene.now) }));
   if (scene.showTrails) {
     // Lines of one pixel are drawn several times as fast as wider ones.
     context.lineWidth = 1;
@@ -283,7 +325,8 @@ function drawRobots(context: CanvasRenderingContext2D, camera: Camera, scene: Sc
     const { scale } = camera;
     const left = camera.width / 2 - camera.center.x_m * scale;
     const top = camera.height / 2 + camera.center.y_m * scale;
-    for (const { trail } of all) {
+    for (const { tracked, shown } of all) {
+      const { trail } = tracked;
       context.beginPath();
       let [xLast, yLast] = [Infinity, Infinity];
       for (let index = 0; index < trail.length; index += 2) {
@@ -294,32 +337,35 @@ function drawRobots(context: CanvasRenderingContext2D, camera: Camera, scene: Sc
         context.lineTo(x, y);
         [xLast, yLast] = [x, y];
       }
+      if (shown && trail.length > 0) context.lineTo(left + shown.pose.x_m * scale, top - shown.pose.y_m * scale);
       context.stroke();
     }
   }
   context.font = '600 12px system-ui, sans-serif';
   context.textAlign = 'left';
-  for (const tracked of all) drawRobot(context, camera, tracked, scene, palette, all.length <= LABELS_MAX);
+  for (const { tracked, shown } of all) {
+    if (shown) drawRobot(context, camera, tracked, shown, scene, palette, all.length <= LABELS_MAX);
+  }
+  return all.some(({ shown }) => shown?.isMoving);
 }
 
 function drawRobot(
   context: CanvasRenderingContext2D,
   camera: Camera,
   tracked: Tracked,
+  { pose, isFrozen }: Shown,
   scene: Scene,
   palette: Palette,
   withLabel: boolean,
 ): void {
   const { robot } = tracked;
-  const pose = robot.live?.pose?.value;
-  if (!pose) return;
   const { x, y } = camera.toPx(pose);
   const isSelected = robot.id === scene.selected;
   const isLost = robot.link === 'offline';
   const isStopped = robot.live?.safety.stop != null || scene.unconfirmed.has(robot.id);
   const colour = isStopped
     ? palette.stopped
-    : isLost
+    : isLost || isFrozen
       ? palette.robotLost
       : robot.link === 'stale' || scene.isOld
         ? palette.robotLate

@@ -1,6 +1,7 @@
 import { expect, test } from 'vitest';
-import { CIVIDIS, STEPS, colour } from './cividis';
-import { RANGES, doubt, share } from './friction';
+import { CIVIDIS, STEPS } from './cividis';
+import { HATCHED, RANGES, hatchOf, shade, share } from './friction';
+import { GROUND_SATURATION_MAX, groundFill } from './palette';
 
 const known = { theta: 0.2, stiffness: 5, std_dev: 0.01, newest_at: '2026-01-01T00:00:00Z', segments: 4 };
 
@@ -25,12 +26,25 @@ test('a value outside of the range has the colour of its end', () => {
   }
 });
 
-test('what is unsure is grey, what is sure has its colour', () => {
-  const as = (std_dev: number) => doubt({ ...known, std_dev } as Parameters<typeof doubt>[0]);
-  expect(as(0.005)).toBe(0);
-  expect(as(0.2)).toBe(1);
-  const [red, green, blue] = colour(1, 1);
-  expect(red).toBe(green);
-  expect(green).toBe(blue);
-  expect(colour(1, 0)).not.toEqual(colour(1, 1));
+test('the less sure a value is, the denser it is hatched, and nothing else', () => {
+  const as = (std_dev: number) => hatchOf({ ...known, std_dev } as Parameters<typeof hatchOf>[0]);
+  const [some, more, most] = HATCHED.map((relative) => relative * known.theta * 1.001);
+  expect([0, 0.019, some, more, most, 9].map((std_dev) => as(std_dev ?? NaN))).toEqual([0, 0, 1, 2, 3, 3]);
+});
+
+test('slippery ground has the same colour whatever of it is shown', () => {
+  for (const theta of [0.06, 0.2, 0.9]) {
+    expect(shade(RANGES.stiffness, 1 / theta)).toBeCloseTo(shade(RANGES.theta, theta), 9);
+  }
+  expect(shade(RANGES.theta, 2)).toBe(1);
+  expect(shade(RANGES.friction, 1)).toBe(0);
+});
+
+test('ground is grey, so that colours are those of the scale', () => {
+  for (const theme of ['light', 'dark'] as const) {
+    for (const kind of ['grass', 'sand', 'ice', 'mud'] as const) {
+      const saturation = Number(/ (\d+)% /.exec(groundFill(kind, theme))?.[1]);
+      expect(saturation).toBeLessThanOrEqual(GROUND_SATURATION_MAX);
+    }
+  }
 });

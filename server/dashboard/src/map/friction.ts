@@ -2,7 +2,7 @@
 import type { CellFriction, FusedFriction } from '../api/schema';
 import { texts } from '../texts';
 import { colour } from './cividis';
-import { Raster } from './raster';
+import { Raster, type Hatch } from './raster';
 
 export type Quantity = 'theta' | 'stiffness' | 'friction' | 'age' | 'visits';
 
@@ -14,7 +14,13 @@ export interface Range {
   label: string;
   /** What the legend names between its ends. */
   ticks: number[];
-  value(friction: FusedFriction, nowMs: number): number | null;
+  /** What its ends mean, the lower one first. */
+  ends: readonly [string, string];
+  /** Colours go from the higher end to the lower one, so that ground that is slippery looks the same. */
+  isReversed: boolean;
+  /** Whether hatching says how sure the value is. */
+  isHatched: boolean;
+  value(friction: FusedFriction): number | null;
 }
 
 /** The ranges are fixed, so that colours mean the same from day to day. */
@@ -26,6 +32,9 @@ export const RANGES: Record<Quantity, Range> = {
     unit: '',
     label: texts.map.theta,
     ticks: [0.05, 0.1, 0.2, 0.5, 1, 2],
+    ends: [texts.map.ends.firm, texts.map.ends.slippery],
+    isReversed: false,
+    isHatched: true,
     value: (friction) => friction.theta,
   },
   stiffness: {
@@ -35,6 +44,9 @@ export const RANGES: Record<Quantity, Range> = {
     unit: '',
     label: texts.map.stiffness,
     ticks: [0.5, 1, 2, 5, 10, 20],
+    ends: [texts.map.ends.slippery, texts.map.ends.firm],
+    isReversed: true,
+    isHatched: true,
     value: (friction) => friction.stiffness,
   },
   friction: {
@@ -44,6 +56,10 @@ export const RANGES: Record<Quantity, Range> = {
     unit: '',
     label: texts.map.peakFriction,
     ticks: [0, 0.25, 0.5, 0.75, 1],
+    // A low one says nothing bad: nobody has asked for more there.
+    ends: [texts.map.ends.littleShown, texts.map.ends.firm],
+    isReversed: true,
+    isHatched: false,
     value: (friction) => friction.mu_peak_lower_bound ?? null,
   },
   age: {
@@ -53,7 +69,10 @@ export const RANGES: Record<Quantity, Range> = {
     unit: texts.unit.h,
     label: texts.map.age,
     ticks: [1 / 60, 1, 24, 720],
-    value: (friction, nowMs) => Math.max(0, nowMs - Date.parse(friction.newest_at)) / 3_600_000,
+    ends: [texts.map.ends.fresh, texts.map.ends.old],
+    isReversed: false,
+    isHatched: false,
+    value: (friction) => friction.age_s / 3_600,
   },
   visits: {
     low: 1,
@@ -62,15 +81,16 @@ export const RANGES: Record<Quantity, Range> = {
     unit: '',
     label: texts.map.visits,
     ticks: [1, 10, 100, 1_000],
+    ends: [texts.map.ends.few, texts.map.ends.many],
+    isReversed: false,
+    isHatched: false,
     value: (friction) => friction.segments,
   },
 };
 
-/** Relative standard deviation up to which a value keeps its colour, and from which it is grey. */
-const SURE = 0.05;
-const UNSURE = 0.5;
-/** Relative standard deviation from which a cell is hatched. */
-export const HATCHED = 0.25;
+/** Relative standard deviations of θ from which a cell is hatched, and more densely. */
+export const HATCHED = [0.1, 0.25, 0.5] as const;
+
 /** Where a value stands in its range, 0 to 1. */
 export function share(range: Range, value: number): number {
   const of = (number: number) => (range.isLog ? Math.log(Math.max(number, 1e-12)) : number);
@@ -78,10 +98,15 @@ export function share(range: Range, value: number): number {
   return Math.min(1, Math.max(0, at));
 }
 
-/** How unsure a value is, 0 to 1. */
-export function doubt(friction: FusedFriction): number {
+/** Where a value stands on the scale of colours, 0 to 1. */
+export function shade(range: Range, value: number): number {
+  return range.isReversed ? 1 - share(range, value) : share(range, value);
+}
+
+/** How densely a value of θ is hatched: pattern alone says how unsure it is, never a colour. */
+export function hatchOf(friction: FusedFriction): Hatch {
   const relative = friction.std_dev / friction.theta;
-  return Math.min(1, Math.max(0, (relative - SURE) / (UNSURE - SURE)));
+  return HATCHED.filter((least) => relative >= least).length as Hatch;
 }
 
 /** Cells of one robot model; where two terrains share one, the one that was measured more often. */
@@ -91,18 +116,14 @@ export class Layer extends Raster<CellFriction> {
     readonly configuration: string | null,
     cellM: number,
     readonly quantity: Quantity,
-    nowMs: number,
   ) {
     const mine = cells.filter((cell) => !configuration || cell.configuration === configuration);
     super(mine, cellM, (known, other) => known.friction.segments < other.friction.segments);
     const range = RANGES[quantity];
     this.paint((cell) => {
-      const value = range.value(cell.friction, nowMs);
+      const value = range.value(cell.friction);
       if (value === null) return null;
-      return {
-        colour: colour(share(range, value), doubt(cell.friction)),
-        isHatched: cell.friction.std_dev > HATCHED * cell.friction.theta,
-      };
+      return { colour: colour(shade(range, value)), hatch: range.isHatched ? hatchOf(cell.friction) : 0 };
     });
   }
 }

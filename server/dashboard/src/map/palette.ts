@@ -63,29 +63,34 @@ export const PALETTES: Record<Theme, Palette> = {
   },
 };
 
-/** Hue and saturation of each kind of ground. */
-const GROUNDS: Record<TerrainClass, [number, number]> = {
-  asphalt: [220, 6],
-  concrete: [200, 10],
-  paving: [15, 18],
-  gravel: [35, 14],
-  soil: [25, 42],
-  grass: [105, 38],
-  sand: [48, 58],
-  mud: [20, 30],
-  snow: [200, 45],
-  ice: [188, 60],
-  wood: [30, 50],
-  metal: [215, 22],
-  other: [290, 12],
+/** Most saturation of ground, percent: colours belong to the scale of the friction layer. */
+export const GROUND_SATURATION_MAX = 8;
+
+/** Hue, saturation and lightness of each kind of ground: greys that differ by their lightness. */
+const GROUNDS: Record<TerrainClass, [number, number, number]> = {
+  asphalt: [220, 3, 52],
+  concrete: [210, 4, 72],
+  paving: [20, 4, 68],
+  gravel: [30, 4, 62],
+  soil: [25, 8, 50],
+  grass: [105, 8, 66],
+  sand: [45, 8, 80],
+  mud: [20, 6, 44],
+  snow: [210, 8, 95],
+  ice: [200, 8, 88],
+  wood: [30, 8, 58],
+  metal: [215, 6, 76],
+  other: [0, 0, 70],
 };
 
 export function groundFill(kind: TerrainClass, theme: Theme): string {
-  const [hue, saturation] = GROUNDS[kind];
-  return theme === 'dark' ? `hsl(${hue} ${saturation}% 30% / 0.5)` : `hsl(${hue} ${saturation}% 62% / 0.45)`;
+  const [hue, saturation, lightness] = GROUNDS[kind];
+  return theme === 'dark'
+    ? `hsl(${hue} ${saturation}% ${lightness * 0.42}% / 0.6)`
+    : `hsl(${hue} ${saturation}% ${lightness}% / 0.6)`;
 }
 
 export function groundLine(kind: TerrainClass, theme: Theme): string {
   const [hue, saturation] = GROUNDS[kind];
-  return theme === 'dark' ? `hsl(${hue} ${saturation}% 55%)` : `hsl(${hue} ${saturation}% 38%)`;
+  return theme === 'dark' ? `hsl(${hue} ${saturation}% 50%)` : `hsl(${hue} ${saturation}% 45%)`;
 }

@@ -10,15 +10,19 @@ const SIDE_MAX = 2_048;
 /** What a cell looks like. */
 export interface Look {
   colour: [number, number, number];
-  isHatched: boolean;
+  hatch: Hatch;
 }
+
+/** How densely a cell is hatched: 0 is not at all. */
+export type Hatch = 0 | 1 | 2 | 3;
 
 export class Raster<T extends { cell: Cell }> {
   readonly cells = new Map<number, T>();
   image: HTMLCanvasElement | null = null;
   /** What the image covers, metres. */
   bounds: Bounds | null = null;
-  readonly hatched: T[] = [];
+  /** Cells of each density of hatching, from 1 on. */
+  readonly hatched: [T[], T[], T[]] = [[], [], []];
 
   constructor(
     cells: readonly T[],
@@ -63,7 +67,7 @@ export class Raster<T extends { cell: Cell }> {
       const shown = look(cell);
       if (!shown) continue;
       pixels.data.set([...shown.colour, 255], (row * width + column) * 4);
-      if (shown.isHatched) this.hatched.push(cell);
+      if (shown.hatch > 0) this.hatched[shown.hatch - 1]?.push(cell);
     }
     context.putImageData(pixels, 0, 0);
     this.image = canvas;

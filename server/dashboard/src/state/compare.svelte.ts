@@ -18,6 +18,8 @@ export class Compare {
   problem = $state<string | null>(null);
   isReading = $state(false);
   isWhole = $state(true);
+  /** The times that the server has rounded to, as it states them; the second is null for the present. */
+  stated = $state.raw<{ from: string | null; to: string | null } | null>(null);
 
   #asked = 0;
 
@@ -26,6 +28,13 @@ export class Compare {
   begin(): void {
     this.isOn = true;
     this.from ||= local(Date.now() - BACK_MS);
+    void this.read();
+  }
+
+  /** Compares the present with a time that long ago. */
+  since(ago_ms: number): void {
+    this.from = local(Date.now() - ago_ms);
+    this.to = '';
     void this.read();
   }
 
@@ -50,6 +59,7 @@ export class Compare {
       if (mine !== this.#asked) return;
       this.layer = new Comparison(read.items, this.fleet.cellM);
       this.isWhole = read.isWhole;
+      this.stated = { from: read.from, to: read.asOf };
       this.problem = null;
     } catch (error) {
       if (mine !== this.#asked) return;

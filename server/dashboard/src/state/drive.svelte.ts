@@ -32,7 +32,11 @@ export class Drive {
   #limits = { linear_m_s: 0, angular_rad_s: 0 };
   #wasZero = true;
 
-  constructor(readonly driver: () => string) {
+  constructor(
+    readonly driver: () => string,
+    /** Hears where the robot is, more often than the stream of events says it. */
+    readonly heard: (robot: string, view: DriveView) => void,
+  ) {
     addEventListener('blur', () => this.#rest(texts.drive.zero.blur));
     document.addEventListener('visibilitychange', () => {
       if (document.hidden) this.#rest(texts.drive.zero.hidden);
@@ -150,6 +154,7 @@ export class Drive {
       this.isTakenByOther = update.refused.cause === 'leased';
     } else if ('view' in update) {
       this.view = update.view;
+      if (this.robot) this.heard(this.robot, update.view);
     } else if ('ended' in update) {
       this.said = texts.drive.released(update.ended.detail);
     }

@@ -1,6 +1,6 @@
 // Everything that the page knows of one site, kept by the stream of events.
 import { SvelteMap } from 'svelte/reactivity';
-import type { Alert, Geofence, Mission, MissionStep, Robot, Site, Terrain, TerrainFriction } from '../api/schema';
+import type { Alert, DriveView, Geofence, Mission, MissionStep, Robot, Site, Terrain, TerrainFriction } from '../api/schema';
 import { ask, list, sentence } from '../api/client';
 import { Stream, type Listener } from '../api/stream';
 import { signedIn } from './session.svelte';
@@ -53,8 +53,11 @@ export class Fleet implements Listener {
 
   /** For the map, which draws it afresh each time: not reactive. */
   readonly tracked = new Map<string, Tracked>();
-  /** Set when something on the map may look different. */
-  isDirty = true;
+  /** Asks the map for a frame: a robot moves, or something else looks different. */
+  wake: () => void = () => undefined;
+  /** Says that the friction map has changed somewhere. */
+  mapChanged: () => void = () => undefined;
+  #isDirty = true;
   /** Steps of missions, for whoever shows a history. */
   lastStep = $state.raw<MissionStep | null>(null);
 
@@ -78,6 +81,16 @@ export class Fleet implements Listener {
   /** What stands about the server itself and stops its work. */
   get serverProblems(): Alert[] {
     return this.standingAlerts.filter((alert) => alert.robot === null && alert.severity === 'critical');
+  }
+
+  /** Set when something on the map may look different beside its robots. */
+  get isDirty(): boolean {
+    return this.#isDirty;
+  }
+
+  set isDirty(isDirty: boolean) {
+    this.#isDirty = isDirty;
+    if (isDirty) this.wake();
   }
 
   get selectedRobot(): Robot | null {
@@ -182,6 +195,7 @@ export class Fleet implements Listener {
     for (const id of this.missions.keys()) if (!seen.has(`m${id}`)) this.missions.delete(id);
     for (const id of this.alerts.keys()) if (!seen.has(`a${id}`)) this.alerts.delete(id);
     this.#seen = null;
+    this.isDirty = true;
     this.#listsSoon();
     void this.stops.read();
     void this.readGround();
@@ -191,12 +205,19 @@ export class Fleet implements Listener {
     this.#seen?.add(`r${robot.id}`);
     const now = performance.now();
     const known = this.tracked.get(robot.id);
+    // Of a robot that stands and says nothing new no frame is drawn.
+    let looksNew = true;
     if (robot.retired_at) this.tracked.delete(robot.id);
-    else if (known) known.update(robot, now);
+    else if (known) looksNew = known.update(robot, now);
     else this.tracked.set(robot.id, new Tracked(robot, now));
     this.stops.heard(robot);
-    this.isDirty = true;
+    if (looksNew) this.wake();
     this.#listsSoon();
+  }
+
+  /** The drive socket says where its robot is. */
+  driven(robot: string, view: DriveView): void {
+    if (this.tracked.get(robot)?.seen(view, performance.now())) this.wake();
   }
 
   mission(mission: Mission): void {
@@ -217,6 +238,10 @@ export class Fleet implements Listener {
     if (alert.cleared_at) this.alerts.delete(alert.id);
     else this.alerts.set(alert.id, alert);
     if (alert.code.startsWith('stop')) void this.stops.read();
+  }
+
+  map(): void {
+    this.mapChanged();
   }
 
   link(isLive: boolean): void {

@@ -1,10 +1,13 @@
 // What is kept of one robot: its last words, where it was, and its curves.
-import type { Robot } from '../api/schema';
+import type { DriveView, Robot, RobotLive } from '../api/schema';
+import { Motion, type Shown } from '../map/motion';
 
 /** Most points of a trail. */
 export const TRAIL_POINTS = 200;
 /** Distance between two points of a trail, metres. */
 const TRAIL_STEP_M = 0.08;
+/** Most places that wait until the robot is drawn at them. */
+const AHEAD_MAX = 16;
 /** How far back curves go, seconds. */
 export const CURVE_SPAN_S = 300;
 /** Most samples of curves: five minutes at 5 Hz. */
@@ -25,10 +28,22 @@ export interface Sample {
   isExcited: boolean;
 }
 
+/** A place of the trail that the robot is not drawn at yet. */
+interface Ahead {
+  at_ms: number;
+  x_m: number;
+  y_m: number;
+}
+
 export class Tracked {
-  /** x and y in turn, metres, oldest first. */
+  /** x and y in turn, metres, oldest first; up to where the robot is drawn. */
   trail: number[] = [];
   samples: Sample[] = [];
+
+  readonly #motion = new Motion();
+  #ahead: Ahead[] = [];
+  /** How it looks beside its place. */
+  #look = '';
 
   constructor(
     public robot: Robot,
@@ -38,10 +53,30 @@ export class Tracked {
     this.#note();
   }
 
-  update(robot: Robot, receivedAt: number): void {
+  /** Takes its newest words; true if it has to be drawn afresh. */
+  update(robot: Robot, receivedAt: number): boolean {
     this.robot = robot;
     this.receivedAt = receivedAt;
+    const before = this.#look;
     this.#note();
+    return this.#look !== before || this.shownAt(receivedAt)?.isMoving === true;
+  }
+
+  /** Takes its place from its drive socket, which says it more often; true if it is to be drawn. */
+  seen(view: DriveView, receivedAt: number): boolean {
+    this.#move(view, receivedAt);
+    return this.shownAt(receivedAt)?.isMoving === true;
+  }
+
+  /** Where it is drawn at a time of the page's clock; null as long as its place is unknown. */
+  shownAt(now: number): Shown | null {
+    const shown = this.#motion.at(now);
+    const due_ms = now - this.#motion.delay_ms;
+    while (this.#ahead[0] && this.#ahead[0].at_ms <= due_ms) this.#settle();
+    const pose = this.robot.live?.pose?.value;
+    // Out of contact it is drawn where it was last, not where that would have taken it.
+    if (shown && pose && this.robot.link === 'offline') return { pose, isMoving: false, isFrozen: false };
+    return shown;
   }
 
   /** Age of what is shown, seconds; null if it was never heard. */
@@ -52,18 +87,11 @@ export class Tracked {
   }
 
   #note(): void {
-    const live = this.robot.live;
-    if (!live || this.robot.link !== 'online') return;
-    const pose = live.pose?.value;
-    if (pose) {
-      const { trail } = this;
-      const dx = pose.x_m - (trail.at(-2) ?? Infinity);
-      const dy = pose.y_m - (trail.at(-1) ?? Infinity);
-      if (!(Math.hypot(dx, dy) < TRAIL_STEP_M)) {
-        trail.push(pose.x_m, pose.y_m);
-        if (trail.length > TRAIL_POINTS * 2) trail.splice(0, trail.length - TRAIL_POINTS * 2);
-      }
-    }
+    const { robot } = this;
+    const { live } = robot;
+    this.#look = JSON.stringify([robot.link, robot.name, robot.configuration, live?.safety.stop != null]);
+    if (live) this.#move(live, this.receivedAt);
+    if (!live || robot.link !== 'online') return;
     const at_s = Date.now() / 1000;
     const friction = live.friction?.value;
     this.samples.push({
@@ -80,5 +108,28 @@ export class Tracked {
     const old = this.samples.findIndex((sample) => sample.at_s > at_s - CURVE_SPAN_S);
     const over = Math.max(old, this.samples.length - CURVE_SAMPLES);
     if (over > 0) this.samples.splice(0, over);
+  }
+
+  #move({ pose, twist }: Pick<RobotLive | DriveView, 'pose' | 'twist'>, receivedAt: number): void {
+    if (!pose) return;
+    const at_ms = receivedAt - pose.age_ms;
+    this.#motion.push({ at_ms, pose: pose.value, twist: twist?.value ?? null });
+    if (this.robot.link !== 'online') return;
+    const { x_m, y_m } = pose.value;
+    this.#ahead.push({ at_ms, x_m, y_m });
+    // A page that is not looked at draws nothing, and keeps no more for it.
+    if (this.#ahead.length > AHEAD_MAX) this.#settle();
+  }
+
+  /** The oldest place that was ahead joins the trail. */
+  #settle(): void {
+    const place = this.#ahead.shift();
+    if (!place) return;
+    const { trail } = this;
+    const dx = place.x_m - (trail.at(-2) ?? Infinity);
+    const dy = place.y_m - (trail.at(-1) ?? Infinity);
+    if (Math.hypot(dx, dy) < TRAIL_STEP_M) return;
+    trail.push(place.x_m, place.y_m);
+    if (trail.length > TRAIL_POINTS * 2) trail.splice(0, trail.length - TRAIL_POINTS * 2);
   }
 }

@@ -1,18 +1,21 @@
 // What is shown: tabs, layers of the map, the mission that is looked at.
-import type { CellFriction, MissionDetail, PlannedPath } from '../api/schema';
-import { ask, list, sentence } from '../api/client';
+import type { CellFriction, MissionDetail, PlannedPath, RobotModel } from '../api/schema';
+import { ask, list, sentence, type Listed } from '../api/client';
 import { Layer, type Quantity } from '../map/friction';
 import type { Bounds, PointM } from '../map/camera';
 import { serves, windowOn, type Window } from '../map/window';
 import { hasEnded, type Fleet } from './fleet.svelte';
 import { Compare } from './compare.svelte';
+import { MapTime } from './map_time.svelte';
 import { Plans } from './plans';
 import { Replay } from './replay.svelte';
 
 export type Tab = 'robots' | 'missions' | 'alerts' | 'terrains';
 
-/** Time between two looks at the friction map while it is shown, milliseconds. */
-const FRICTION_MS = 10_000;
+/** Least time between two looks at the friction map while it changes, milliseconds. */
+const CHANGED_MS = 3_000;
+/** Time between two looks while it does not: ages grow, milliseconds. */
+const FRICTION_MS = 60_000;
 /** Entries of the friction map that the page reads; the API gives them in pages of 1000. */
 const CELLS_MAX = 20_000;
 /** Squares of the part that is read; one that several terrains or models share has several entries. */
@@ -25,7 +28,7 @@ export class View {
   showTerrains = $state(true);
   showFence = $state(true);
   showTrails = $state(true);
-  quantity = $state<Quantity | null>(null);
+  quantity = $state<Quantity | null>('theta');
   configuration = $state<string | null>(null);
   /** Robot models that the friction map knows. */
   configurations = $state.raw<string[]>([]);
@@ -39,6 +42,8 @@ export class View {
   plan = $state.raw<PlannedPath | null>(null);
   /** Its time line, once it has ended. */
   replay = $state.raw<Replay | null>(null);
+  /** The place of the friction map that somebody looks at; null for none. */
+  inspected = $state.raw<PointM | null>(null);
   /** A wish to the map: to show this, counted so that the same can be wished again. */
   wanted = $state.raw<{ points: PointM[] } | null>(null);
 
@@ -47,20 +52,36 @@ export class View {
   #seen: Bounds | null = null;
   #window: Window | null = null;
   #due: ReturnType<typeof setTimeout> | undefined;
-  #timer: ReturnType<typeof setInterval> | undefined;
+  #changed: ReturnType<typeof setTimeout> | undefined;
+  /** Another part or time of the map was wanted while one was read. */
+  #readAgain = false;
+  readonly #timer: ReturnType<typeof setInterval>;
 
   readonly plans: Plans;
   /** The change between two times, shown instead of a quantity. */
   readonly compare: Compare;
+  /** The time of the map that a quantity is shown of. */
+  readonly time = new MapTime(() => this.readFriction());
 
   constructor(readonly fleet: Fleet) {
     this.plans = new Plans(() => (fleet.isDirty = true));
     this.compare = new Compare(fleet);
+    this.#timer = setInterval(() => this.#again(), FRICTION_MS);
+    fleet.mapChanged = () => {
+      this.#changed ??= setTimeout(() => {
+        this.#changed = undefined;
+        this.#again();
+      }, CHANGED_MS);
+    };
+  }
+
+  /** The past does not change. */
+  #again(): void {
+    if (this.quantity !== null && this.time.at_ms === null) void this.readFriction();
   }
 
   choose(quantity: Quantity | null): void {
     this.quantity = quantity;
-    clearInterval(this.#timer);
     if (quantity === null) {
       this.layer = null;
       this.fleet.isDirty = true;
@@ -68,7 +89,6 @@ export class View {
     }
     this.paint();
     void this.readFriction();
-    this.#timer = setInterval(() => void this.readFriction(), FRICTION_MS);
   }
 
   /** Another site has other ground and other missions. */
@@ -78,6 +98,7 @@ export class View {
     this.configurations = [];
     this.configuration = null;
     this.layer = null;
+    this.inspected = null;
     this.close();
     if (this.compare.isOn) void this.compare.read();
     if (this.quantity !== null) void this.readFriction();
@@ -94,39 +115,55 @@ export class View {
 
   async readFriction(): Promise<void> {
     const { site } = this.fleet;
-    if (!site || this.isReading || document.hidden || this.quantity === null) return;
+    if (!site || document.hidden || this.quantity === null) return;
+    if (this.isReading) {
+      this.#readAgain = true;
+      return;
+    }
     this.isReading = true;
+    const { at_ms } = this.time;
     try {
       const part = this.#seen && windowOn(this.#seen, this.fleet.cellM, SQUARES_MAX);
-      const path = `/v1/sites/${site}/friction/cells${part ? `?${queryOf(part)}` : ''}`;
-      const read = await list<CellFriction>(path, CELLS_MAX);
-      // The site was changed meanwhile; the next look is for that one.
-      if (site !== this.fleet.site) {
-        this.isReading = false;
-        return void this.readFriction();
-      }
-      this.#cells = read.items;
-      this.#window = part;
-      this.isWhole = read.isWhole;
-      // What lies beside may have been measured by other models.
-      const found = read.items.map((cell) => cell.configuration);
-      this.configurations = [...new Set([...this.configurations, ...found])].sort();
-      if (!this.configuration || !this.configurations.includes(this.configuration)) {
-        this.configuration = this.configurations[0] ?? null;
-      }
-      this.frictionProblem = null;
-      this.paint();
+      const query = part ? queryOf(part) : new URLSearchParams();
+      if (at_ms !== null) query.set('as_of', new Date(at_ms).toISOString());
+      const read = await list<CellFriction>(`/v1/sites/${site}/friction/cells?${query}`, CELLS_MAX);
+      // The site may have been changed meanwhile; the next look is for that one.
+      if (site === this.fleet.site) this.#take(read, part);
+      else this.#readAgain = true;
     } catch (error) {
       this.frictionProblem = sentence(error);
     }
     this.isReading = false;
+    if (!this.#readAgain) return;
+    this.#readAgain = false;
+    await this.readFriction();
+  }
+
+  #take(read: Listed<CellFriction>, part: Window | null): void {
+    this.#cells = read.items;
+    this.#window = part;
+    this.isWhole = read.isWhole;
+    this.time.stated = read.asOf;
+    // What lies beside may have been measured by other models.
+    const found = read.items.map((cell) => cell.configuration);
+    this.configurations = [...new Set([...this.configurations, ...found])].sort();
+    if (!this.configuration || !this.configurations.includes(this.configuration)) {
+      this.configuration = this.configurations[0] ?? null;
+    }
+    this.frictionProblem = null;
+    this.paint();
   }
 
   paint(): void {
     if (this.quantity === null) return;
     const squareM = this.#window?.squareM ?? this.fleet.cellM;
-    this.layer = new Layer(this.#cells, this.configuration, squareM, this.quantity, Date.now());
+    this.layer = new Layer(this.#cells, this.configuration, squareM, this.quantity);
     this.fleet.isDirty = true;
+  }
+
+  /** A robot model as its agents declare it; null as long as no robot of the site has it. */
+  modelOf(configuration: string | null): RobotModel | null {
+    return this.fleet.robots.find((view) => view.robot.configuration === configuration)?.robot.model ?? null;
   }
 
   /** The name of a robot model, from whichever robot has it. */
@@ -169,7 +206,9 @@ export class View {
 
   end(): void {
     clearTimeout(this.#due);
+    clearTimeout(this.#changed);
     clearInterval(this.#timer);
+    this.time.pause();
   }
 }
 

@@ -58,7 +58,7 @@ async function measure(): Promise<Frames> {
   const context = canvas?.getContext('2d', { alpha: false });
   if (!canvas || !context) throw new Error('there is no canvas');
   const began = performance.now();
-  const friction = new Layer(cells(), null, 1, 'theta', Date.now());
+  const friction = new Layer(cells(), null, 1, 'theta');
   const layer_ms = performance.now() - began;
   const tracked = Array.from({ length: ROBOTS }, (_, index) => robotAt(index));
   const camera = new Camera();
@@ -82,12 +82,13 @@ async function measure(): Promise<Frames> {
       friction,
       draft: null,
       driven: null,
-      dryRun: [],
+      dryRun: null,
       pathOf: () => null,
       selected: 'rover-1',
       showTerrains: true,
       showFence: true,
       showTrails: true,
+      inspected: null,
       showCross: false,
       isOld: false,
       theme: 'light',

@@ -1,0 +1,26 @@
+import { expect, test } from 'vitest';
+import { SPANS, momentsOf, stepS, thinned } from './moments';
+
+const NOW_MS = Date.parse('2026-11-23T14:37:12Z');
+
+test('the map is had at ends of hours, and of days for a month', () => {
+  const day = momentsOf('day', NOW_MS);
+  expect(new Date(day.at(-1) ?? 0).toISOString()).toBe('2026-11-23T14:00:00.000Z');
+  expect(new Date(day[0] ?? 0).toISOString()).toBe('2026-11-22T14:00:00.000Z');
+  expect(new Date(momentsOf('month', NOW_MS).at(-1) ?? 0).toISOString()).toBe('2026-11-23T00:00:00.000Z');
+  for (const span of SPANS) {
+    const moments = momentsOf(span, NOW_MS);
+    for (const [index, at] of moments.slice(1).entries()) expect(at - (moments[index] ?? 0)).toBe(stepS(span) * 1000);
+    // No more than the history of a terrain may have.
+    expect(moments.length).toBeLessThanOrEqual(1000);
+  }
+});
+
+test('a history of a cell has few times, with the oldest and the newest', () => {
+  const week = momentsOf('week', NOW_MS);
+  const few = thinned(week);
+  expect(few).toHaveLength(25);
+  expect([few[0], few.at(-1)]).toEqual([week[0], week.at(-1)]);
+  expect(new Set(few).size).toBe(25);
+  expect(thinned(momentsOf('day', NOW_MS))).toHaveLength(25);
+});
