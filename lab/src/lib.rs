@@ -12,6 +12,8 @@
 //! needs the controller alone compiles much sooner with `--no-default-features`.
 
 pub mod bench;
+#[cfg(feature = "logs")]
+pub mod logs;
 pub mod paper;
 pub mod parallel;
 pub mod random;
