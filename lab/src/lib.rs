@@ -6,10 +6,12 @@
 //! * [`report`]: the table of goals that report programs print.
 //! * `rough`: a second world, written from the physics alone: robots, contacts and sensors that
 //!   differ from the agent's own simulator and from each other.
+//! * `logs`: recordings of other robots, and what the agent's estimator makes of them.
 //! * `teleoperation_trials`: random drivers on a bad network who fall silent.
 //!
-//! The last two drive the agent's own loop, which the feature `agent` brings (on by default). What
-//! needs the controller alone compiles much sooner with `--no-default-features`.
+//! The last three use the agent's own loop, which the feature `agent` brings, and `logs` that of its
+//! name (both on by default). What needs the controller alone compiles much sooner with
+//! `--no-default-features`.
 
 pub mod bench;
 #[cfg(feature = "logs")]

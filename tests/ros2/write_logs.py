@@ -2,9 +2,10 @@
 
     python write_logs.py FOLDER
 
-The robot is simulated by the few lines below: a rigid body on four contacts whose tangential force
-saturates, `μ = μ_p tanh(K λ / μ_p)`, so that K is the slope at zero slip. Nothing of it is shared
-with Tread. It drives figure-8s at changing speed, in two drives with a pause between them.
+The robot is simulated by the few lines below: a rigid body on four contacts, each with a deflection
+that follows slip within a relaxation length, and a force that saturates, `μ = μ_p tanh(K λ / μ_p)`,
+so that K is the slope at zero slip. Accelerations shift the load. Nothing of it is shared with Tread.
+It drives figure-8s at changing speed, in two drives with a pause between them.
 
     good.mcap   wheels 50 Hz, inertial unit 100 Hz, pose 10 Hz, written by `mcap` with mcap-ros2-support
     good/       the same messages as rosbag2 with SQLite, written by `rosbags`
@@ -31,12 +32,15 @@ STIFFNESS = 4.0
 MU_PEAK = 0.8
 GRAVITY_M_S2 = 9.80665
 ROLLING_RESISTANCE = 0.015
+HEIGHT_M = 0.2
+RELAXATION_M = 0.03
 WHEEL_LAG_S = 0.08
 STEP_S = 0.001
 DRIVE_S = 80.0
 PAUSE_S = 4.0
 BEGIN_NS = 1_750_000_000_000_000_000
-WHEEL_NOISE_RAD_S, GYRO_NOISE_RAD_S, GYRO_OFFSET_RAD_S, ACCELERATION_NOISE_M_S2 = 0.02, 0.003, 0.001, 0.05
+COUNTS_PER_TURN = 16384
+GYRO_NOISE_RAD_S, GYRO_OFFSET_RAD_S, ACCELERATION_NOISE_M_S2 = 0.003, 0.001, 0.05
 POSE_NOISE_M, POSE_NOISE_RAD = 0.02, 0.01
 JOINTS = ["front_left_wheel", "front_right_wheel", "rear_left_wheel", "rear_right_wheel"]
 
@@ -49,7 +53,7 @@ def wanted(at_s):
     if not 1.0 < within_s < DRIVE_S:
         return 0.0, 0.0
     speed = 0.65 + 0.3 * math.sin(2.0 * math.pi * within_s / 4.0)
-    return speed, 0.75 * math.sin(2.0 * math.pi * within_s / 11.0) * speed / 0.65
+    return speed, 0.5 * math.sin(2.0 * math.pi * within_s / 11.0) * speed / 0.65
 
 
 def simulate(random):
@@ -58,8 +62,8 @@ def simulate(random):
     radius, inertia = ROBOT["wheel_radius_m"], ROBOT["yaw_inertia_kg_m2"]
     load = mass * GRAVITY_M_S2 / 4.0
     contacts = [(base / 2, track / 2, 0), (base / 2, -track / 2, 1), (-base / 2, track / 2, 0), (-base / 2, -track / 2, 1)]
-    forward = left = turn = heading = x = y = 0.0
-    wheels = [0.0, 0.0]
+    forward = left = turn = heading = x = y = push_x = push_y = 0.0
+    wheels, bent = [0.0, 0.0], np.zeros((4, 2)).tolist()
     every = round(0.01 / STEP_S)
     sums, samples = np.zeros(5), []
     for step in range(round(2 * (DRIVE_S + PAUSE_S) / STEP_S)):
@@ -69,15 +73,23 @@ def simulate(random):
         for side, rim in ((0, speed - half), (1, speed + half)):
             wheels[side] += (rim / radius - wheels[side]) * STEP_S / WHEEL_LAG_S
         force_x = force_y = moment = 0.0
-        for at_x, at_y, side in contacts:
-            rim = wheels[side] * radius
-            along, across = rim - (forward - turn * at_y), -(left + turn * at_x)
-            reference = max(abs(rim), abs(forward - turn * at_y), 0.02)
-            slip = math.hypot(along, across) / reference
-            if slip > 0.0:
-                force = load * MU_PEAK * math.tanh(STIFFNESS * slip / MU_PEAK) / (slip * reference)
-                along, across = along * force, across * force
-            along -= load * ROLLING_RESISTANCE * math.tanh(rim / 0.01)
+        for number, (at_x, at_y, side) in enumerate(contacts):
+            rim, own = wheels[side] * radius, bent[number]
+            sliding = rim - (forward - turn * at_y), -(left + turn * at_x)
+            for axis in (0, 1):
+                own[axis] += (sliding[axis] - abs(rim) * own[axis]) * STEP_S / RELAXATION_M
+                # A standing wheel deflects no further than its contact holds.
+                own[axis] = max(-1.0, min(1.0, own[axis]))
+            slip = math.hypot(*own)
+            shift = HEIGHT_M * (push_x * math.copysign(1, at_x) / base + push_y * math.copysign(1, at_y) / track) / 2.0
+            weight = load - mass * shift
+            stiffness = MU_PEAK * math.tanh(STIFFNESS * slip / MU_PEAK) / slip if slip > 1e-9 else STIFFNESS
+            along = weight * (stiffness * own[0] - ROLLING_RESISTANCE * math.tanh(rim / 0.01))
+            across = weight * stiffness * own[1]
+            # A contact at rest is damped by its rubber.
+            if abs(rim) < 0.1:
+                along += weight * sliding[0] * (1.0 - abs(rim) / 0.1)
+                across += weight * sliding[1] * (1.0 - abs(rim) / 0.1)
             force_x += along
             force_y += across
             moment += at_x * across - at_y * along
@@ -116,12 +128,11 @@ def vector(x, y, z):
 
 
 def messages(samples, wheel_hz, random):
-    """(topic, message, time), by time."""
+    """(topic, message, time), by time. Wheel speeds are counts of an encoder over the time since the last ones."""
     unmeasured = np.array([-1.0] + [0.0] * 8)
-    per_wheels, turned = round(100 / wheel_hz), []
-    angles = np.zeros(2)
+    per_wheels = round(100 / wheel_hz)
+    angles, counted = np.zeros(2), np.zeros(2)
     for number, (at_ns, (left, right, turn, push_x, push_y), (x, y, heading)) in enumerate(samples, start=1):
-        turned.append((left, right))
         angles += (left * 0.01, right * 0.01)
         imu = make(
             "sensor_msgs/msg/Imu", header(at_ns, "imu_link"), yawed(0.0), unmeasured, vector(0.0, 0.0, turn),
@@ -129,12 +140,9 @@ def messages(samples, wheel_hz, random):
         )
         yield "/imu/data", imu, at_ns
         if number % per_wheels == 0:
-            speeds = np.mean(turned, axis=0) + random.normal(0.0, WHEEL_NOISE_RAD_S, 2)
-            turned = []
-            four = [speeds[0], speeds[1], speeds[0], speeds[1]]
-            joints = make(
-                "sensor_msgs/msg/JointState", header(at_ns, ""), JOINTS, np.tile(angles, 2), np.array(four), np.zeros(0),
-            )
+            before, counted = counted, np.floor(angles / (2 * math.pi) * COUNTS_PER_TURN) * (2 * math.pi) / COUNTS_PER_TURN
+            speeds = np.tile((counted - before) * wheel_hz, 2)
+            joints = make("sensor_msgs/msg/JointState", header(at_ns, ""), JOINTS, np.tile(counted, 2), speeds, np.zeros(0))
             yield "/joint_states", joints, at_ns
         if number % 10 == 0:
             spot = make("geometry_msgs/msg/Point", x + random.normal(0.0, POSE_NOISE_M), y + random.normal(0.0, POSE_NOISE_M), 0.0)

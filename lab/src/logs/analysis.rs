@@ -33,7 +33,9 @@ pub enum AnalysisError {
     #[error(transparent)]
     Recording(#[from] RecordingError),
     /// More than [`MESSAGES_MAX`] messages.
-    #[error("the topics have more than {MESSAGES_MAX} messages: choose a time by `--from-s` and `--to-s`")]
+    #[error(
+        "the topics have more than {MESSAGES_MAX} messages: choose a time by `--from-s` and `--to-s`"
+    )]
     TooLong,
     /// More than [`PASSES_MAX`] passes.
     #[error("there are more than {PASSES_MAX} passes: choose longer ones by `--pass-s`")]
@@ -202,7 +204,10 @@ fn read(
     let mut decoder = Decoder::new(mapping, options.is_by_positions);
     let (mut timed, mut is_full) = (Vec::new(), false);
     let torn = recording.read(&mapping.topics(), &mut |message| {
-        #[expect(clippy::cast_precision_loss, reason = "times of a recording, in nanoseconds")]
+        #[expect(
+            clippy::cast_precision_loss,
+            reason = "times of a recording, in nanoseconds"
+        )]
         let after_s = message.logged_ns.saturating_sub(begin_ns) as f64 * 1.0e-9;
         if !(options.from_s..=options.to_s).contains(&after_s) {
             return ControlFlow::Continue(());
@@ -245,7 +250,12 @@ pub fn analyse(
     begin_ns: i64,
 ) -> Result<Analysis, AnalysisError> {
     let (timed, mut refusals, torn) = read(recording, mapping, options, begin_ns)?;
-    let timeline = assemble(timed, &mapping.settings, &mut refusals, options.interpolates);
+    let timeline = assemble(
+        timed,
+        &mapping.settings,
+        &mut refusals,
+        options.interpolates,
+    );
     let fed = &timeline.fed;
     let feeding = Feeding {
         model: robot.model,
@@ -271,7 +281,9 @@ pub fn analyse(
     }
     let count = stretches.len();
     stretches.push(0..fed.len());
-    let outcomes = in_parallel(&stretches, |stretch| estimate(&fed[stretch.clone()], &feeding));
+    let outcomes = in_parallel(&stretches, |stretch| {
+        estimate(&fed[stretch.clone()], &feeding)
+    });
     let mut verdicts: Vec<Verdict> = stretches
         .iter()
         .zip(&outcomes)
@@ -291,7 +303,10 @@ pub fn analyse(
     } = &timeline;
     let checks = checks(&verdicts, &overall, &pairs, options.chi_square_max);
     Ok(Analysis {
-        clocks: clocks.iter().map(|(source, clock)| (*source, clock.text())).collect(),
+        clocks: clocks
+            .iter()
+            .map(|(source, clock)| (*source, clock.text()))
+            .collect(),
         refusals,
         torn,
         interpolated: *interpolated,
@@ -306,7 +321,12 @@ pub fn analyse(
 }
 
 #[expect(clippy::cast_precision_loss, reason = "a number of passes")]
-fn checks(passes: &[Verdict], overall: &Verdict, pairs: &[Pair], chi_square_max: f64) -> Vec<Check> {
+fn checks(
+    passes: &[Verdict],
+    overall: &Verdict,
+    pairs: &[Pair],
+    chi_square_max: f64,
+) -> Vec<Check> {
     let all = passes.iter().chain([overall]);
     let undecided = all.filter(|verdict| !verdict.is_decided()).count();
     let mut checks = vec![Check::at_most(

@@ -35,7 +35,10 @@ pub struct Refusals(Vec<(Source, Refusal, u64)>);
 impl Refusals {
     /// Counts one.
     pub fn count(&mut self, source: Source, refusal: Refusal) {
-        let known = self.0.iter_mut().find(|(of, by, _)| (*of, *by) == (source, refusal));
+        let known = self
+            .0
+            .iter_mut()
+            .find(|(of, by, _)| (*of, *by) == (source, refusal));
         match known {
             Some((_, _, count)) => *count += 1,
             None => self.0.push((source, refusal, 1)),
@@ -53,7 +56,7 @@ impl Refusals {
 struct Positions {
     stamp_ns: i64,
     names: Vec<String>,
-    positions_rad: Vec<f64>,
+    angles_rad: Vec<f64>,
 }
 
 /// Reads the messages of a robot.
@@ -81,7 +84,9 @@ impl Decoder {
             (mapping.odometry.as_ref(), Source::Odometry),
             (pose.map(|(topic, _)| topic), Source::Pose),
         ];
-        let topics = topics.into_iter().filter_map(|(topic, source)| Some((topic?.clone(), source)));
+        let topics = topics
+            .into_iter()
+            .filter_map(|(topic, source)| Some((topic?.clone(), source)));
         Self {
             settings: mapping.settings.clone(),
             topics: topics.collect(),
@@ -123,7 +128,11 @@ impl Decoder {
         };
         let reading = match read {
             Ok(Some(is_rewritten)) => {
-                let bytes = if is_rewritten { buffer.as_slice() } else { bytes };
+                let bytes = if is_rewritten {
+                    buffer.as_slice()
+                } else {
+                    bytes
+                };
                 self.learn_frames(source, bytes)
                     .and_then(|()| decoded(&self.settings, source, bytes))
             }
@@ -179,15 +188,15 @@ impl Decoder {
 
     /// Writes joint states with differentiated positions for speeds, where speeds are missing.
     /// Returns whether it wrote them; `None` for a first message, whose speeds nobody knows.
-    fn with_speeds(
-        &mut self,
-        bytes: &[u8],
-        buffer: &mut Vec<u8>,
-    ) -> Result<Option<bool>, Refusal> {
+    fn with_speeds(&mut self, bytes: &[u8], buffer: &mut Vec<u8>) -> Result<Option<bool>, Refusal> {
         let message: JointState<'_> = decode(bytes)?;
         let count = message.name.len();
         let has_speeds = message.velocity.len() == count && !self.is_by_positions;
-        let is_ours = self.settings.joints.as_ref().is_some_and(|joints| has_joints(&message, joints));
+        let is_ours = self
+            .settings
+            .joints
+            .as_ref()
+            .is_some_and(|joints| has_joints(&message, joints));
         if has_speeds || !is_ours {
             return Ok(Some(false));
         }
@@ -198,13 +207,16 @@ impl Decoder {
         let now = Positions {
             stamp_ns,
             names: message.name.iter().map(str::to_owned).collect(),
-            positions_rad: message.position.iter().collect(),
+            angles_rad: message.position.iter().collect(),
         };
         let before = self.last.replace(now.clone());
         let Some(before) = before.filter(|before| before.names == now.names) else {
             return Ok(None);
         };
-        #[expect(clippy::cast_precision_loss, reason = "nanoseconds between two messages")]
+        #[expect(
+            clippy::cast_precision_loss,
+            reason = "nanoseconds between two messages"
+        )]
         let span_s = stamp_ns.saturating_sub(before.stamp_ns) as f64 * 1.0e-9;
         if span_s <= 0.0 {
             return Err(Refusal::OutOfOrder);
@@ -212,7 +224,7 @@ impl Decoder {
         if span_s > DIFFERENTIATED_MAX_S {
             return Ok(None);
         }
-        let pairs = now.positions_rad.iter().zip(&before.positions_rad);
+        let pairs = now.angles_rad.iter().zip(&before.angles_rad);
         let speeds: Vec<f64> = pairs.map(|(now, before)| (now - before) / span_s).collect();
         let rewritten = JointState {
             velocity: Sequence::from(speeds.as_slice()),
@@ -225,7 +237,11 @@ impl Decoder {
 
 fn has_joints(message: &JointState<'_>, joints: &JointSettings) -> bool {
     let known = [&joints.left, &joints.right];
-    let is_known = |name: &str| known.iter().any(|side| side.names.iter().any(|one| one == name));
+    let is_known = |name: &str| {
+        known
+            .iter()
+            .any(|side| side.names.iter().any(|one| one == name))
+    };
     message.name.iter().any(is_known)
 }
 

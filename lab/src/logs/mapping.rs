@@ -47,7 +47,10 @@ impl std::str::FromStr for JointNames {
     /// Parses `left,left/right,right`.
     fn from_str(text: &str) -> Result<Self, String> {
         let names = |side: &str| -> Vec<String> {
-            let names = side.split(',').map(str::trim).filter(|name| !name.is_empty());
+            let names = side
+                .split(',')
+                .map(str::trim)
+                .filter(|name| !name.is_empty());
             names.map(str::to_owned).collect()
         };
         let (left, right) = text.split_once('/').ok_or(
@@ -104,7 +107,9 @@ pub enum MappingError {
         found: String,
     },
     /// A topic that was asked for is of another type.
-    #[error("`{topic}` is of the type {found_type}, and {expected} is needed; the recording has\n{found}")]
+    #[error(
+        "`{topic}` is of the type {found_type}, and {expected} is needed; the recording has\n{found}"
+    )]
     WrongType {
         /// The topic.
         topic: String,
@@ -126,7 +131,9 @@ pub enum MappingError {
         found: String,
     },
     /// The joints of the sides cannot be told from their names.
-    #[error("which joints of `{topic}` are left and which are right does not show in their names: say `--joints LEFT,…/RIGHT,…` with some of {names}")]
+    #[error(
+        "which joints of `{topic}` are left and which are right does not show in their names: say `--joints LEFT,…/RIGHT,…` with some of {names}"
+    )]
     Joints {
         /// The topic.
         topic: String,
@@ -144,10 +151,14 @@ pub enum MappingError {
         names: String,
     },
     /// Odometry of the wheels alone.
-    #[error("wheel speeds would come from the odometry `{0}`, which a base computes with a track width of its own: give it as `--odometry-track-m`")]
+    #[error(
+        "wheel speeds would come from the odometry `{0}`, which a base computes with a track width of its own: give it as `--odometry-track-m`"
+    )]
     OdometryTrack(String),
     /// A yaw rate that is computed from the wheels.
-    #[error("the odometry `{0}` would give wheel speeds and yaw rate, and nothing is measured beside the wheels: θ needs a gyro (`--imu`)")]
+    #[error(
+        "the odometry `{0}` would give wheel speeds and yaw rate, and nothing is measured beside the wheels: θ needs a gyro (`--imu`)"
+    )]
     NoGyro(String),
     /// The recording.
     #[error(transparent)]
@@ -175,7 +186,12 @@ impl Mapping {
     /// Returns the topics that are read.
     pub fn topics(&self) -> Vec<&str> {
         let pose = self.pose.as_ref().map(|(topic, _)| topic);
-        let topics = [self.joints.as_ref(), self.imu.as_ref(), self.odometry.as_ref(), pose];
+        let topics = [
+            self.joints.as_ref(),
+            self.imu.as_ref(),
+            self.odometry.as_ref(),
+            pose,
+        ];
         topics.into_iter().flatten().map(String::as_str).collect()
     }
 }
@@ -194,11 +210,11 @@ impl<'a> Choice<'a> {
     fn of_types(&self, types: &[&'static str]) -> Vec<(&'a Topic, &'static str)> {
         let topics = self.contents.topics.iter();
         let topics = topics.filter(|topic| topic.encoding == CDR);
-        let typed = topics.filter_map(|topic| {
+        let found = topics.filter_map(|topic| {
             let kind = types.iter().find(|kind| **kind == topic.message_type)?;
             Some((topic, *kind))
         });
-        typed.collect()
+        found.collect()
     }
 
     /// Returns the topic that was asked for, held against its type.
@@ -319,12 +335,23 @@ pub fn choose(
     )?;
     let imu_of = configured.and_then(|settings| settings.imu.as_ref());
     let asked = topic_of(&wishes.imu, imu_of.map(|imu| &imu.topic));
-    let imu = choice.unambiguous(asked.as_deref(), IMU, "say which is the robot's by `--imu TOPIC`")?;
+    let imu = choice.unambiguous(
+        asked.as_deref(),
+        IMU,
+        "say which is the robot's by `--imu TOPIC`",
+    )?;
     let odometry_of = configured.and_then(|settings| settings.odometry.as_ref());
-    let asked = topic_of(&wishes.odometry, odometry_of.map(|odometry| &odometry.topic));
+    let asked = topic_of(
+        &wishes.odometry,
+        odometry_of.map(|odometry| &odometry.topic),
+    );
     let is_odometry_of_use = joints.is_none() || wishes.is_over_ground || asked.is_some();
     let odometry = if is_odometry_of_use {
-        choice.unambiguous(asked.as_deref(), ODOMETRY, "say which by `--odometry TOPIC`")?
+        choice.unambiguous(
+            asked.as_deref(),
+            ODOMETRY,
+            "say which by `--odometry TOPIC`",
+        )?
     } else {
         None
     };
@@ -333,7 +360,13 @@ pub fn choose(
     let pose = choice.optional(asked.as_deref(), &[COVARIANT_POSE, POSE], "--pose")?;
     let is_over_ground = wishes.is_over_ground
         || odometry_of.is_some_and(|odometry| odometry.motion_of == MotionOf::Ground);
-    check_whole(&choice, &joints, &imu, odometry.as_deref(), is_over_ground)?;
+    check_whole(
+        &choice,
+        joints.as_deref(),
+        imu.as_deref(),
+        odometry.as_deref(),
+        is_over_ground,
+    )?;
     if let Some(topic) = odometry.as_deref().filter(|_| joints.is_none())
         && wishes.odometry_track_m.is_none()
         && configured.is_none()
@@ -352,7 +385,11 @@ pub fn choose(
         topic: Name::default(),
         frame: String::new(),
         child_frame: String::new(),
-        motion_of: if is_over_ground { MotionOf::Ground } else { MotionOf::Wheels },
+        motion_of: if is_over_ground {
+            MotionOf::Ground
+        } else {
+            MotionOf::Wheels
+        },
         site_from_odom: None,
     });
     settings.pose = pose.is_some().then(|| PoseSettings {
@@ -375,8 +412,8 @@ pub fn choose(
 /// Whether wheel speeds and a yaw rate that is not computed from them are there.
 fn check_whole(
     choice: &Choice<'_>,
-    joints: &Option<String>,
-    imu: &Option<String>,
+    joints: Option<&str>,
+    imu: Option<&str>,
     odometry: Option<&str>,
     is_over_ground: bool,
 ) -> Result<(), MappingError> {
@@ -392,7 +429,9 @@ fn check_whole(
         )),
         (None, None, Some(topic)) => Err(MappingError::NoGyro(topic.to_owned())),
         (Some(_), None, _) if !is_over_ground => Err(missing(
-            format!("no topic has a yaw rate that is measured beside the wheels: none is of the type {IMU}"),
+            format!(
+                "no topic has a yaw rate that is measured beside the wheels: none is of the type {IMU}"
+            ),
             "record the inertial unit, or name odometry that is measured over ground by `--odometry TOPIC --over-ground`",
         )),
         _ => Ok(()),
@@ -476,7 +515,9 @@ fn has_word(name: &str, words: [&str; 2]) -> bool {
 /// Chooses the joints of the sides by the words in their names; `None` where that is ambiguous.
 pub fn sides_of(names: &[String]) -> Option<JointNames> {
     let of = |words: [&'static str; 2], others: [&'static str; 2]| -> Vec<String> {
-        let mine = names.iter().filter(|name| has_word(name, words) && !has_word(name, others));
+        let mine = names
+            .iter()
+            .filter(|name| has_word(name, words) && !has_word(name, others));
         mine.cloned().collect()
     };
     let (left_words, right_words) = (["left", "l"], ["right", "r"]);
@@ -514,30 +555,158 @@ fn joint_settings(
             names: listed(),
         });
     }
-    let side = |names: Vec<String>, is_reversed: bool, configured: Option<&SideJoints>| SideJoints {
-        names,
-        sign: if is_reversed {
-            -1.0
-        } else {
-            configured.map_or(1.0, |side| side.sign)
-        },
-        effort_sign: configured.map_or(1.0, |side| side.effort_sign),
-    };
+    let side =
+        |names: Vec<String>, is_reversed: bool, configured: Option<&SideJoints>| SideJoints {
+            names,
+            sign: if is_reversed {
+                -1.0
+            } else {
+                configured.map_or(1.0, |side| side.sign)
+            },
+            effort_sign: configured.map_or(1.0, |side| side.effort_sign),
+        };
     let [is_left_reversed, is_right_reversed] = wishes.reversed;
-    let ratio = wishes.gear_ratio.or(configured.map(|joints| joints.gear_ratio));
+    let ratio = wishes
+        .gear_ratio
+        .or(configured.map(|joints| joints.gear_ratio));
     let effort = wishes.effort.or(configured.map(|joints| joints.effort));
     Ok(JointSettings {
         topic: Name::default(),
-        left: side(chosen.left, is_left_reversed, configured.map(|joints| &joints.left)),
-        right: side(chosen.right, is_right_reversed, configured.map(|joints| &joints.right)),
+        left: side(
+            chosen.left,
+            is_left_reversed,
+            configured.map(|joints| &joints.left),
+        ),
+        right: side(
+            chosen.right,
+            is_right_reversed,
+            configured.map(|joints| &joints.right),
+        ),
         gear_ratio: ratio.unwrap_or(1.0),
         effort: effort.unwrap_or(Effort::None),
     })
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
+
+    /// Settings without any topic.
+    pub(crate) fn settings() -> Ros2Settings {
+        settings_of(&RobotModel::yi2007(), None)
+    }
+
+    fn topic(name: &str, kind: &str) -> Topic {
+        Topic {
+            name: name.to_owned(),
+            message_type: kind.to_owned(),
+            encoding: CDR.to_owned(),
+            count: 2,
+            first_ns: 0,
+            last_ns: 1,
+        }
+    }
+
+    /// Chooses among topics that have no joints to be read.
+    fn chosen(topics: Vec<Topic>, wishes: &Wishes) -> Result<Mapping, MappingError> {
+        let contents = Contents {
+            topics,
+            torn: Vec::new(),
+        };
+        let robot = Robot {
+            model: RobotModel::yi2007(),
+            prior: tread_control::estimation::EstimatorPrior::default(),
+            settings: None,
+            rate_hz: 100.0,
+        };
+        let recording = Recording::open(&[]).unwrap();
+        choose(&recording, &contents, &robot, wishes)
+    }
+
+    #[test]
+    fn what_is_missing_or_ambiguous_is_said_with_the_topics_that_there_are() {
+        let wheels = || topic("/joint_states", JOINT_STATE);
+        let imus = || vec![topic("/a/imu", IMU), topic("/b/imu", IMU), wheels()];
+        let none = Wishes::default();
+        let refused = |topics, wishes: &Wishes| chosen(topics, wishes).unwrap_err().to_string();
+        let two = refused(imus(), &none);
+        assert!(
+            two.contains("--imu") && two.contains("/b/imu  sensor_msgs/msg/Imu"),
+            "{two}"
+        );
+        let wishes = Wishes {
+            imu: Some("b/imu".to_owned()),
+            ..Wishes::default()
+        };
+        // The topics are found, and the next question is which joints are whose.
+        let next = refused(imus(), &wishes);
+        assert!(next.contains("--joints"), "{next}");
+        let wishes = Wishes {
+            imu: Some("/joint_states".to_owned()),
+            ..Wishes::default()
+        };
+        let wrong = refused(imus(), &wishes);
+        assert!(
+            wrong.contains(JOINT_STATE) && wrong.contains("is needed"),
+            "{wrong}"
+        );
+        let wishes = Wishes {
+            wheels: Some("/wheels".to_owned()),
+            ..Wishes::default()
+        };
+        assert!(refused(imus(), &wishes).contains("there is no topic `/wheels`"));
+        assert!(refused(vec![wheels()], &none).contains("yaw rate"));
+        assert!(refused(vec![topic("/imu", IMU)], &none).contains("wheel speeds"));
+        let odometry = || topic("/odom", ODOMETRY);
+        assert!(refused(vec![odometry()], &none).contains("θ needs a gyro"));
+        let both = || vec![odometry(), topic("/imu", IMU)];
+        assert!(refused(both(), &none).contains("--odometry-track-m"));
+        let wishes = Wishes {
+            odometry_track_m: Some(0.8),
+            ..Wishes::default()
+        };
+        let mapping = chosen(both(), &wishes).unwrap();
+        assert_eq!(mapping.topics(), ["/imu", "/odom"]);
+        assert!((mapping.settings.command.base_track_m - 0.8).abs() < 1.0e-12);
+    }
+
+    #[test]
+    fn several_poses_are_left_out_and_that_is_said() {
+        let topics = vec![
+            topic("/imu", IMU),
+            topic("/odom", ODOMETRY),
+            topic("/amcl", COVARIANT_POSE),
+            topic("/mocap", POSE),
+        ];
+        let mut wishes = Wishes {
+            odometry_track_m: Some(0.8),
+            ..Wishes::default()
+        };
+        let mapping = chosen(topics.clone(), &wishes).unwrap();
+        assert_eq!(mapping.pose, None);
+        assert!(
+            mapping.notices[0].contains("/amcl, /mocap"),
+            "{:?}",
+            mapping.notices
+        );
+        wishes.pose = Some("/mocap".to_owned());
+        let mapping = chosen(topics, &wishes).unwrap();
+        assert_eq!(mapping.pose, Some(("/mocap".to_owned(), POSE)));
+    }
+
+    #[test]
+    fn a_list_says_what_is_missing() {
+        let of = |topics| {
+            missing(&Contents {
+                topics,
+                torn: Vec::new(),
+            })
+        };
+        assert_eq!(of(Vec::new()).len(), 2);
+        assert!(of(vec![topic("/odom", ODOMETRY)])[0].contains("--odometry-track-m"));
+        let enough = vec![topic("/imu", IMU), topic("/joints", JOINT_STATE)];
+        assert_eq!(of(enough), Vec::<String>::new());
+    }
 
     fn owned(names: &[&str]) -> Vec<String> {
         names.iter().map(|name| (*name).to_owned()).collect()
@@ -553,9 +722,15 @@ mod tests {
         ]);
         let sides = sides_of(&husky).unwrap();
         assert_eq!(sides.left, owned(&["front_left_wheel", "rear_left_wheel"]));
-        assert_eq!(sides.right, owned(&["front_right_wheel", "rear_right_wheel"]));
+        assert_eq!(
+            sides.right,
+            owned(&["front_right_wheel", "rear_right_wheel"])
+        );
         let short = sides_of(&owned(&["wheel_l", "wheel_r", "lidar_spin"])).unwrap();
-        assert_eq!((short.left, short.right), (owned(&["wheel_l"]), owned(&["wheel_r"])));
+        assert_eq!(
+            (short.left, short.right),
+            (owned(&["wheel_l"]), owned(&["wheel_r"]))
+        );
         assert_eq!(sides_of(&owned(&["wheel_1", "wheel_2"])), None);
         assert_eq!(sides_of(&owned(&["left_a", "left_b", "right_a"])), None);
     }
@@ -563,7 +738,10 @@ mod tests {
     #[test]
     fn joints_are_parsed_with_a_slash_between_the_sides() {
         let names: JointNames = "fl, rl/fr,rr".parse().unwrap();
-        assert_eq!((names.left, names.right), (owned(&["fl", "rl"]), owned(&["fr", "rr"])));
+        assert_eq!(
+            (names.left, names.right),
+            (owned(&["fl", "rl"]), owned(&["fr", "rr"]))
+        );
         for bad in ["fl,fr", "/fr", "a/", "a,b,c,d,e,f,g,h,i/j"] {
             assert!(bad.parse::<JointNames>().is_err(), "{bad}");
         }

@@ -18,8 +18,9 @@ const DRIVING_MIN_S: f64 = 8.0;
 const EXCITED_SHARE: f64 = 0.08;
 /// Share of a turning robot's turns to the rarer side, below which they count as one-sided.
 const ONE_SIDED_SHARE: f64 = 0.2;
-/// Share of blocks beyond the linear range of slip, above which too few are left.
-const SATURATED_SHARE: f64 = 0.5;
+/// Share of blocks beyond the linear range of slip, above which hardly any is within it. The slope at
+/// zero slip is found from much slip too, but not from much slip alone.
+const SATURATED_SHARE: f64 = 0.9;
 
 /// A reason, with what would help.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -43,14 +44,21 @@ pub fn reasons(motion: &Motion, outcome: &Outcome) -> Vec<Reason> {
         reasons = of_motion(motion, outcome);
     }
     if reasons.is_empty() {
-        let beside = if motion.has_torque {
-            "the motion and its noise leave a standard deviation of θ above half of θ"
+        let without = if motion.has_torque {
+            ""
         } else {
-            "without measured torque the motion leaves a standard deviation of θ above half of θ"
+            "without measured torque "
         };
+        let on_the_way = outcome
+            .std_dev_ratios
+            .map_or_else(String::new, |(least, _)| {
+                format!("; on the way it was {} at best", percent(least))
+            });
         reasons.push(Reason {
             code: "uncertain",
-            reason: beside.to_owned(),
+            reason: format!(
+                "{without}the motion leaves a standard deviation of θ above half of θ{on_the_way}"
+            ),
             help: "drive figure-8s of 2 to 4 m for a minute, at changing speed; record the joints' torque, or odometry over ground",
         });
     }
@@ -96,7 +104,8 @@ fn of_recording(motion: &Motion, outcome: &Outcome) -> Vec<Reason> {
         });
     }
     #[expect(clippy::cast_precision_loss, reason = "counts of samples")]
-    let dropped = outcome.estimate.dropped_samples as f64 / (motion.samples_hz * duration_s).max(1.0);
+    let dropped =
+        outcome.estimate.dropped_samples as f64 / (motion.samples_hz * duration_s).max(1.0);
     if dropped > SHARE {
         reasons.push(Reason {
             code: "implausible",
@@ -144,7 +153,9 @@ fn of_motion(motion: &Motion, outcome: &Outcome) -> Vec<Reason> {
     } else if left_s.min(right_s) < ONE_SIDED_SHARE * (left_s + right_s) {
         reasons.push(Reason {
             code: "one_sided",
-            reason: "nearly all turns were to one side, so that different wheel radii look like slip".to_owned(),
+            reason:
+                "nearly all turns were to one side, so that different wheel radii look like slip"
+                    .to_owned(),
             help: "turn to both sides, as in a figure-8",
         });
     }
@@ -227,7 +238,10 @@ mod tests {
             ..outcome()
         };
         let found = reasons(&excited(), &contradicted);
-        assert!(found[0].reason.contains("50 %") && found[0].reason.contains("gyro"), "{found:?}");
+        assert!(
+            found[0].reason.contains("50 %") && found[0].reason.contains("gyro"),
+            "{found:?}"
+        );
     }
 
     #[test]
@@ -247,7 +261,7 @@ mod tests {
         assert_eq!(codes(&circle, &outcome()), ["one_sided", "no_acceleration"]);
         let slipping = Outcome {
             estimate: Estimate {
-                saturation_share: 0.8,
+                saturation_share: 0.95,
                 ..Estimate::default()
             },
             ..outcome()

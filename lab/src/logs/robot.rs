@@ -160,11 +160,14 @@ mod tests {
 
     #[test]
     fn the_agents_example_is_read_without_its_certificate_and_its_folder() {
-        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
-        let robot = Robot::of_file(&root.join("robot-agent/robot.example.toml")).unwrap();
+        let agent = Path::new(env!("CARGO_MANIFEST_DIR")).join("../robot-agent");
+        let robot = Robot::of_file(&agent.join("robot.example.toml")).unwrap();
         assert!((robot.model.track_width_m() - 0.43).abs() < 1.0e-12);
         assert_eq!(robot.prior, EstimatorPrior::default());
         let missing = Robot::of_file(Path::new("no-such-robot.toml")).unwrap_err();
-        assert!(missing.to_string().contains("no-such-robot.toml"), "{missing}");
+        assert!(
+            missing.to_string().contains("no-such-robot.toml"),
+            "{missing}"
+        );
     }
 }

@@ -85,14 +85,14 @@ pub struct EffectiveTrack {
     pub right_bins: usize,
 }
 
-/// Means of a steady turn.
+/// A steady turn.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Steady {
-    turn_rad_s: f64,
+    /// What multiplies `W_eff/W`, the gyro's offset and the difference of the radii: the turn rate,
+    /// 1, and the mean rim speed over the track.
+    regressors: Vector3<f64>,
     /// Difference of the rim speeds over the track, radians per second.
     difference_rad_s: f64,
-    /// Mean of the rim speeds over the track, radians per second.
-    forward_rad_s: f64,
 }
 
 /// Sums of a bin's halves.
@@ -100,12 +100,12 @@ struct Steady {
 struct Sums {
     time_s: [f64; 2],
     turn_rad: [f64; 2],
-    difference_rad: f64,
-    forward_rad: f64,
+    difference_m: f64,
+    forward_m: f64,
 }
 
 impl Sums {
-    fn steady(&self) -> Option<Steady> {
+    fn steady(&self, track_m: f64) -> Option<Steady> {
         let [early_s, late_s] = self.time_s;
         let time_s = early_s + late_s;
         let least_s = 0.5 * COVERED_SHARE * BIN_S;
@@ -114,12 +114,11 @@ impl Sums {
         }
         let turn_rad_s = (self.turn_rad[0] + self.turn_rad[1]) / time_s;
         let change_rad_s = (self.turn_rad[1] / late_s - self.turn_rad[0] / early_s).abs();
-        let is_steady = turn_rad_s.abs() >= TURN_MIN_RAD_S
-            && change_rad_s <= STEADY_SHARE * turn_rad_s.abs();
+        let is_steady =
+            turn_rad_s.abs() >= TURN_MIN_RAD_S && change_rad_s <= STEADY_SHARE * turn_rad_s.abs();
         is_steady.then(|| Steady {
-            turn_rad_s,
-            difference_rad_s: self.difference_rad / time_s,
-            forward_rad_s: self.forward_rad / time_s,
+            regressors: Vector3::new(turn_rad_s, 1.0, self.forward_m / time_s / track_m),
+            difference_rad_s: self.difference_m / time_s / track_m,
         })
     }
 }
@@ -127,7 +126,7 @@ impl Sums {
 /// Returns the means of all steady turns. A sample's values count for the time since the sample
 /// before.
 fn steady_turns(fed: &[Fed], model: &RobotModel) -> Vec<Steady> {
-    let scale = model.wheel_radius_m() / model.track_width_m();
+    let (radius_m, track_m) = (model.wheel_radius_m(), model.track_width_m());
     let mut found = Vec::new();
     let (mut sums, mut bin) = (Sums::default(), None);
     let mut last_s: Option<f64> = None;
@@ -140,7 +139,7 @@ fn steady_turns(fed: &[Fed], model: &RobotModel) -> Vec<Steady> {
         let dt_s = at_s - last_s.replace(at_s).unwrap_or(at_s);
         let number = (at_s / BIN_S).floor();
         if bin.replace(number.to_bits()) != Some(number.to_bits()) {
-            found.extend(std::mem::take(&mut sums).steady());
+            found.extend(std::mem::take(&mut sums).steady(track_m));
         }
         if dt_s <= 0.0 || dt_s > INTERVAL_MAX_S {
             continue;
@@ -148,10 +147,10 @@ fn steady_turns(fed: &[Fed], model: &RobotModel) -> Vec<Steady> {
         let half = usize::from(at_s - number * BIN_S >= 0.5 * BIN_S);
         sums.time_s[half] += dt_s;
         sums.turn_rad[half] += turn_rad_s * dt_s;
-        sums.difference_rad += scale * (wheels.right_rad_s - wheels.left_rad_s) * dt_s;
-        sums.forward_rad += 0.5 * scale * (wheels.right_rad_s + wheels.left_rad_s) * dt_s;
+        sums.difference_m += radius_m * (wheels.right_rad_s - wheels.left_rad_s) * dt_s;
+        sums.forward_m += 0.5 * radius_m * (wheels.right_rad_s + wheels.left_rad_s) * dt_s;
     }
-    found.extend(sums.steady());
+    found.extend(sums.steady(track_m));
     found
 }
 
@@ -166,7 +165,6 @@ pub fn effective_track(fed: &[Fed], model: &RobotModel) -> Option<EffectiveTrack
     }
     let noise = SensorNoise::default();
     let nominal = model.effective_track_ratio();
-    let row = |turn: &Steady| Vector3::new(turn.turn_rad_s, 1.0, turn.forward_rad_s);
     let mut scatter = SCATTER_MIN_RAD_S;
     let mut solved = None;
     // The scatter weighs data against what is known beforehand, and follows from the residuals.
@@ -179,24 +177,26 @@ pub fn effective_track(fed: &[Fed], model: &RobotModel) -> Option<EffectiveTrack
         let mut weighted = Vector3::zeros();
         let weight = scatter.powi(-2);
         for turn in &turns {
-            let row = row(turn);
+            let row = turn.regressors;
             information += weight * row * row.transpose();
             weighted += weight * row * turn.difference_rad_s;
         }
         let covariance = information.try_inverse()?;
         let solution = covariance * weighted;
         let squares = turns.iter().map(|turn| {
-            let residual = turn.difference_rad_s - row(turn).dot(&solution);
+            let residual = turn.difference_rad_s - turn.regressors.dot(&solution);
             residual * residual
         });
         let freedom = (turns.len() - 1) as f64;
-        scatter = (squares.sum::<f64>() / freedom).sqrt().max(SCATTER_MIN_RAD_S);
+        scatter = (squares.sum::<f64>() / freedom)
+            .sqrt()
+            .max(SCATTER_MIN_RAD_S);
         solved = Some((solution[0], covariance[(0, 0)]));
     }
     let (ratio, variance) = solved?;
     // The mean radius scales what wheels say of all turns alike.
     let std_dev = variance.sqrt().hypot(noise.radius_ratio * ratio);
-    let left_bins = turns.iter().filter(|turn| turn.turn_rad_s > 0.0).count();
+    let left_bins = turns.iter().filter(|turn| turn.regressors[0] > 0.0).count();
     Some(EffectiveTrack {
         ratio,
         std_dev,

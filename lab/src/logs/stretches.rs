@@ -70,7 +70,8 @@ pub struct Motion {
 
 /// Whole samples, by which gaps and motion are judged.
 fn whole(fed: &[Fed]) -> impl Iterator<Item = (usize, &Fed)> {
-    let whole = |fed: &Fed| fed.sample.wheel_speeds.is_some() && fed.sample.yaw_rate_rad_s.is_some();
+    let whole =
+        |fed: &Fed| fed.sample.wheel_speeds.is_some() && fed.sample.yaw_rate_rad_s.is_some();
     fed.iter().enumerate().filter(move |(_, fed)| whole(fed))
 }
 
@@ -200,7 +201,9 @@ pub fn motion(fed: &[Fed], model: &RobotModel) -> Motion {
             *time_s += counted_s;
         }
         if let Some(mean_m_s) = bin.add(0.5 * (rims_m_s[0] + rims_m_s[1]), counted_s) {
-            let change_m_s = before_m_s.replace(mean_m_s).map_or(0.0, |before| mean_m_s - before);
+            let change_m_s = before_m_s
+                .replace(mean_m_s)
+                .map_or(0.0, |before| mean_m_s - before);
             if change_m_s.abs() > ACCELERATING_M_S2 * ACCELERATED_BIN_S {
                 motion.accelerating_s += ACCELERATED_BIN_S;
             }
@@ -212,7 +215,10 @@ pub fn motion(fed: &[Fed], model: &RobotModel) -> Motion {
     if motion.duration_s > 0.0 {
         motion.samples_hz = wholes as f64 / motion.duration_s;
     }
-    let long = intervals_s.iter().filter(|interval_s| **interval_s > ESTIMATOR_GAP_S).count();
+    let long = intervals_s
+        .iter()
+        .filter(|interval_s| **interval_s > ESTIMATOR_GAP_S)
+        .count();
     motion.long_interval_ratio = long as f64 / intervals_s.len().max(1) as f64;
     motion.wheel_interval_s = median(&mut intervals_s);
     if wheels > 0 {

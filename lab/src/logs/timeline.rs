@@ -80,7 +80,10 @@ pub fn since_begin_s(at: Duration) -> f64 {
     at.as_secs_f64() - LEAD.as_secs_f64()
 }
 
-#[expect(clippy::cast_precision_loss, reason = "spans of a recording, in nanoseconds")]
+#[expect(
+    clippy::cast_precision_loss,
+    reason = "spans of a recording, in nanoseconds"
+)]
 fn clock_of(timed: &[Timed], source: Source) -> Clock {
     let own = || timed.iter().filter(|timed| timed.source == source);
     let range = |of: fn(&Timed) -> i64| {
@@ -91,7 +94,9 @@ fn clock_of(timed: &[Timed], source: Source) -> Clock {
         most.saturating_sub(least)
     };
     let (stamped_ns, logged_ns) = (range(|one| one.stamp_ns), range(|one| one.logged_ns));
-    let delay_ns = own().map(|one| one.logged_ns.saturating_sub(one.stamp_ns)).min();
+    let delay_ns = own()
+        .map(|one| one.logged_ns.saturating_sub(one.stamp_ns))
+        .min();
     let late_ns = i64::try_from(LATE_AFTER.as_nanos()).unwrap_or(i64::MAX);
     if logged_ns > 0 && (stamped_ns as f64) < STANDING_SHARE * logged_ns as f64 {
         Clock::Recorder
@@ -164,7 +169,12 @@ fn samples(arrived: &[Arrived], settings: &Ros2Settings) -> Vec<Fed> {
         let mut feedback = Feedback::default();
         assembler.take(one, &mut feedback);
         let noise = assembler.noise();
-        fed.extend(feedback.samples().iter().map(|&sample| Fed { sample, noise }));
+        fed.extend(
+            feedback
+                .samples()
+                .iter()
+                .map(|&sample| Fed { sample, noise }),
+        );
     }
     fed
 }

@@ -167,8 +167,14 @@ impl Arguments {
         );
         let positive = |value: f64| value.is_finite() && value > 0.0;
         ensure!(self.from_s < self.to_s, "--from-s must be before --to-s");
-        ensure!(self.gear_ratio.is_none_or(positive), "--gear-ratio must be above zero");
-        ensure!(positive(self.chi_square_max), "--chi-square-max must be above zero");
+        ensure!(
+            self.gear_ratio.is_none_or(positive),
+            "--gear-ratio must be above zero"
+        );
+        ensure!(
+            positive(self.chi_square_max),
+            "--chi-square-max must be above zero"
+        );
         ensure!(
             self.odometry_track_m.is_none_or(positive),
             "--odometry-track-m must be above zero"

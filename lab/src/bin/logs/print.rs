@@ -19,11 +19,18 @@ fn name(source: Source) -> &'static str {
 
 /// The result for programs.
 pub(crate) fn json(recording: &Recording, mapping: &Mapping, analysis: &Analysis) -> Value {
-    let files: Vec<String> = recording.files().map(|file| file.display().to_string()).collect();
+    let files: Vec<String> = recording
+        .files()
+        .map(|file| file.display().to_string())
+        .collect();
     let joints = mapping.settings.joints.as_ref();
-    let clocks = analysis.clocks.iter().map(|(source, clock)| (name(*source), *clock));
-    let clocks: serde_json::Map<String, Value> =
-        clocks.map(|(source, clock)| (source.to_owned(), json!(clock))).collect();
+    let clocks = analysis
+        .clocks
+        .iter()
+        .map(|(source, clock)| (name(*source), *clock));
+    let clocks: serde_json::Map<String, Value> = clocks
+        .map(|(source, clock)| (source.to_owned(), json!(clock)))
+        .collect();
     let refused: Vec<Value> = analysis
         .refusals
         .iter()
@@ -122,16 +129,26 @@ pub(crate) fn text(mapping: &Mapping, analysis: &Analysis) {
         println!("interpolated: {} wheel speeds", analysis.interpolated);
     }
     let (parts, short) = (analysis.parts, analysis.short_drives);
-    println!("{parts} parts, {} passes, {short} drives too short for one", analysis.passes.len());
+    println!(
+        "{parts} parts, {} passes, {short} drives too short for one",
+        analysis.passes.len()
+    );
     for (index, pass) in analysis.passes.iter().enumerate() {
         print_verdict(&format!("pass {}", index + 1), pass);
     }
     print_verdict("all", &analysis.overall);
     if let Some((least, most)) = analysis.std_dev_ratios() {
-        println!("σ of the passes: {:.1} to {:.1} % of θ", 100.0 * least, 100.0 * most);
+        println!(
+            "σ of the passes: {:.1} to {:.1} % of θ",
+            100.0 * least,
+            100.0 * most
+        );
     }
     match analysis.mean_chi_square() {
-        Some(mean) => println!("χ² of {} pairs: {mean:.2} each, 1 is expected", analysis.pairs.len()),
+        Some(mean) => println!(
+            "χ² of {} pairs: {mean:.2} each, 1 is expected",
+            analysis.pairs.len()
+        ),
         None => println!("χ²: fewer than two passes have an estimate"),
     }
     match analysis.effective_track {

@@ -64,7 +64,9 @@ pub enum RecordingError {
         problem: String,
     },
     /// One topic with two types.
-    #[error("`{topic}` is of the type {one} in one file and {other} in another: read them in several runs")]
+    #[error(
+        "`{topic}` is of the type {one} in one file and {other} in another: read them in several runs"
+    )]
     TwoTypes {
         /// The topic.
         topic: String,
@@ -228,14 +230,19 @@ impl Recording {
             }
             contents.torn.extend(torn);
             for topic in topics {
-                let known = contents.topics.iter_mut().find(|known| known.name == topic.name);
+                let known = contents
+                    .topics
+                    .iter_mut()
+                    .find(|known| known.name == topic.name);
                 match known {
                     Some(known) => known.join(&topic)?,
                     None => contents.topics.push(topic),
                 }
             }
         }
-        contents.topics.sort_by(|one, other| one.name.cmp(&other.name));
+        contents
+            .topics
+            .sort_by(|one, other| one.name.cmp(&other.name));
         Ok(contents)
     }
 
@@ -243,7 +250,11 @@ impl Recording {
     ///
     /// # Errors
     /// [`RecordingError`] for a file that gives no message at all.
-    pub fn read(&self, topics: &[&str], take: &mut Take<'_>) -> Result<Vec<String>, RecordingError> {
+    pub fn read(
+        &self,
+        topics: &[&str],
+        take: &mut Take<'_>,
+    ) -> Result<Vec<String>, RecordingError> {
         let mut torn = Vec::new();
         for (file, kind) in &self.files {
             let ended = match kind {
@@ -291,7 +302,10 @@ fn kind_of(file: &Path) -> Result<Kind, RecordingError> {
     let opened = File::open(file).map_err(unreadable(file))?;
     let mut first = Vec::with_capacity(MAGIC_BYTES);
     let bytes = MAGIC_BYTES as u64;
-    opened.take(bytes).read_to_end(&mut first).map_err(unreadable(file))?;
+    opened
+        .take(bytes)
+        .read_to_end(&mut first)
+        .map_err(unreadable(file))?;
     if first.starts_with(mcap::MAGIC) {
         Ok(Kind::Mcap)
     } else if first.starts_with(b"SQLite format 3\0") {

@@ -38,18 +38,20 @@ fn with_database<T>(
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build();
-    runtime.map_err(|problem| refused(&problem))?.block_on(async {
-        let options = SqliteConnectOptions::new()
-            .filename(file)
-            .read_only(true)
-            .disable_statement_logging();
-        let connected = SqliteConnection::connect_with(&options).await;
-        let mut connection = connected.map_err(|problem| refused(&problem))?;
-        let done = work(&mut connection).await;
-        // Nothing was written, so that nothing can be lost by closing.
-        let _ = connection.close().await;
-        done
-    })
+    runtime
+        .map_err(|problem| refused(&problem))?
+        .block_on(async {
+            let options = SqliteConnectOptions::new()
+                .filename(file)
+                .read_only(true)
+                .disable_statement_logging();
+            let connected = SqliteConnection::connect_with(&options).await;
+            let mut connection = connected.map_err(|problem| refused(&problem))?;
+            let done = work(&mut connection).await;
+            // Nothing was written, so that nothing can be lost by closing.
+            let _ = connection.close().await;
+            done
+        })
 }
 
 /// Returns the topics with messages.
@@ -60,16 +62,18 @@ pub(super) fn topics(file: &Path) -> Result<Vec<Topic>, RecordingError> {
             .fetch_all(connection)
             .await
             .map_err(|problem| refused(&problem))?;
-        let topics = rows.into_iter().map(
-            |(name, message_type, encoding, count, first_ns, last_ns)| Topic {
-                name,
-                message_type,
-                encoding,
-                count: count.unsigned_abs(),
-                first_ns,
-                last_ns,
-            },
-        );
+        let topics =
+            rows.into_iter()
+                .map(
+                    |(name, message_type, encoding, count, first_ns, last_ns)| Topic {
+                        name,
+                        message_type,
+                        encoding,
+                        count: count.unsigned_abs(),
+                        first_ns,
+                        last_ns,
+                    },
+                );
         Ok(topics.collect())
     })
 }
