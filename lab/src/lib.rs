@@ -6,12 +6,16 @@
 //! * [`report`]: the table of goals that report programs print.
 //! * `rough`: a second world, written from the physics alone: robots, contacts and sensors that
 //!   differ from the agent's own simulator and from each other.
+//! * `logs`: recordings of other robots, and what the agent's estimator makes of them.
 //! * `teleoperation_trials`: random drivers on a bad network who fall silent.
 //!
-//! The last two run the agent's own control loop and need the feature `agent`, on by default. The
-//! others compile much sooner without it (`--no-default-features`).
+//! The last three run the agent's own control loop and need the feature `agent`; `logs` needs that of
+//! its name too. Both are on by default. The others compile much sooner without them
+//! (`--no-default-features`).
 
 pub mod bench;
+#[cfg(feature = "logs")]
+pub mod logs;
 pub mod paper;
 pub mod parallel;
 pub mod random;

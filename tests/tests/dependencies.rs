@@ -29,7 +29,10 @@ const CRATE_RULES: [(&str, &[&str]); 7] = [
     ("robot-agent", &["tread-api", "tread-control", "tread-ros2"]),
     ("server", &["tread-api", "tread-control"]),
     ("cli", &["tread-agent", "tread-api", "tread-server"]),
-    ("lab", &["tread-agent", "tread-api", "tread-control"]),
+    (
+        "lab",
+        &["tread-agent", "tread-api", "tread-control", "tread-ros2"],
+    ),
 ];
 
 /// Crates that are shipped. None of them may contain the agent's test support.

@@ -41,6 +41,7 @@ use crate::control_loop::origin::JobOrigin;
 use crate::control_loop::segments::Moment;
 use crate::control_loop::site_view::SiteView;
 use crate::control_loop::tick::LoopCore;
+pub use crate::control_loop::tick::listener::{Heard, Listener};
 use crate::drive::simulated::{Individual, SimMode, SimulatedDrive, SimulatedDriveError};
 use crate::drive::{Drive, Feedback, SILENT_AFTER_MAX, SensorSample};
 use crate::geometry::paper_robot;

@@ -17,6 +17,8 @@
 
 mod demands;
 mod estimation;
+#[cfg(any(test, feature = "testing"))]
+pub(crate) mod listener;
 mod mission;
 mod output;
 mod safety;

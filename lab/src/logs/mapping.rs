@@ -1,0 +1,749 @@
+//! Chooses the topics and joints of the robot: the ones that are asked for, those of its
+//! configuration, or else the only ones of their type.
+
+use std::collections::BTreeSet;
+use std::ops::ControlFlow;
+
+use tread_agent::drive::ros2::settings::{
+    BusMode, BusSettings, CommandKind, CommandSettings, Effort, ImuSettings, JOINTS_MAX,
+    JointSettings, MotionOf, OdometrySettings, PoseSettings, Ros2Settings, Scheme, SideJoints,
+    StampClock, Timing,
+};
+use tread_control::geometry::Pose;
+use tread_control::robot::RobotModel;
+use tread_ros2::cdr::decode;
+use tread_ros2::messages::JointState;
+use tread_ros2::names::Name;
+
+use super::recording::{CDR, Contents, Recording, RecordingError, Topic};
+use super::robot::Robot;
+
+/// Wheel speeds.
+pub const JOINT_STATE: &str = "sensor_msgs/msg/JointState";
+/// Yaw rate and acceleration.
+pub const IMU: &str = "sensor_msgs/msg/Imu";
+/// Speed, and a pose.
+pub const ODOMETRY: &str = "nav_msgs/msg/Odometry";
+/// A pose.
+pub const POSE: &str = "geometry_msgs/msg/PoseStamped";
+/// A pose with its covariance.
+pub const COVARIANT_POSE: &str = "geometry_msgs/msg/PoseWithCovarianceStamped";
+
+/// Messages of a topic in which the names of joints are looked for.
+const LOOKED_AT_MAX: u32 = 100;
+
+/// Names of the joints of both sides.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct JointNames {
+    /// Left ones.
+    pub left: Vec<String>,
+    /// Right ones.
+    pub right: Vec<String>,
+}
+
+impl std::str::FromStr for JointNames {
+    type Err = String;
+
+    /// Parses `left,left/right,right`.
+    fn from_str(text: &str) -> Result<Self, String> {
+        let names = |side: &str| -> Vec<String> {
+            let names = side
+                .split(',')
+                .map(str::trim)
+                .filter(|name| !name.is_empty());
+            names.map(str::to_owned).collect()
+        };
+        let (left, right) = text.split_once('/').ok_or(
+            "a slash must stand between the left and the right joints: `left_wheel/right_wheel`",
+        )?;
+        let (left, right) = (names(left), names(right));
+        let is_right = |count: usize| (1..=JOINTS_MAX).contains(&count);
+        if is_right(left.len()) && is_right(right.len()) {
+            Ok(Self { left, right })
+        } else {
+            Err(format!("each side has 1 to {JOINTS_MAX} joints"))
+        }
+    }
+}
+
+/// What is asked for; the rest is chosen.
+#[derive(Debug, Clone, Default)]
+pub struct Wishes {
+    /// Topic of the wheels' joints.
+    pub wheels: Option<String>,
+    /// Joints.
+    pub joints: Option<JointNames>,
+    /// Whether the left and the right joints turn backwards when the robot drives forward.
+    pub reversed: [bool; 2],
+    /// Joint revolutions per wheel revolution.
+    pub gear_ratio: Option<f64>,
+    /// What the joints' effort is.
+    pub effort: Option<Effort>,
+    /// Topic of the inertial unit.
+    pub imu: Option<String>,
+    /// Angle of the inertial unit's x axis against the robot's, radians.
+    pub imu_yaw_rad: Option<f64>,
+    /// Whether the inertial unit is mounted upside down.
+    pub is_imu_upside_down: bool,
+    /// Topic of the odometry.
+    pub odometry: Option<String>,
+    /// Whether the odometry measures the motion of the body over ground.
+    pub is_over_ground: bool,
+    /// Track width with which the base computes its odometry from its wheels, metres.
+    pub odometry_track_m: Option<f64>,
+    /// Topic of the pose.
+    pub pose: Option<String>,
+}
+
+/// Why no topics could be chosen. The texts end with the topics that there are.
+#[derive(Debug, thiserror::Error)]
+pub enum MappingError {
+    /// A topic that was asked for is not there.
+    #[error("there is no topic `{topic}`; the recording has\n{found}")]
+    NoTopic {
+        /// The topic.
+        topic: String,
+        /// The topics that there are.
+        found: String,
+    },
+    /// A topic that was asked for is of another type.
+    #[error(
+        "`{topic}` is of the type {found_type}, and {expected} is needed; the recording has\n{found}"
+    )]
+    WrongType {
+        /// The topic.
+        topic: String,
+        /// Its type.
+        found_type: String,
+        /// Types that can be read.
+        expected: String,
+        /// The topics that there are.
+        found: String,
+    },
+    /// No topic, or several, of a type that is needed.
+    #[error("{problem}: {advice}; the recording has\n{found}")]
+    Missing {
+        /// What is missing or ambiguous.
+        problem: String,
+        /// What to do.
+        advice: &'static str,
+        /// The topics that there are.
+        found: String,
+    },
+    /// The joints of the sides cannot be told from their names.
+    #[error(
+        "which joints of `{topic}` are left and which are right does not show in their names: say `--joints LEFT,…/RIGHT,…` with some of {names}"
+    )]
+    Joints {
+        /// The topic.
+        topic: String,
+        /// Names of its joints.
+        names: String,
+    },
+    /// A joint that was asked for is not there.
+    #[error("`{topic}` has no joint `{joint}`: its joints are {names}")]
+    NoJoint {
+        /// The topic.
+        topic: String,
+        /// The joint.
+        joint: String,
+        /// Names of its joints.
+        names: String,
+    },
+    /// Odometry of the wheels alone.
+    #[error(
+        "wheel speeds would come from the odometry `{0}`, which a base computes with a track width of its own: give it as `--odometry-track-m`"
+    )]
+    OdometryTrack(String),
+    /// A yaw rate that is computed from the wheels.
+    #[error(
+        "the odometry `{0}` would give wheel speeds and yaw rate, and nothing is measured beside the wheels: θ needs a gyro (`--imu`)"
+    )]
+    NoGyro(String),
+    /// The recording.
+    #[error(transparent)]
+    Recording(#[from] RecordingError),
+}
+
+/// The topics of a robot, by their use.
+#[derive(Debug, Clone)]
+pub struct Mapping {
+    /// Wheel speeds, by joints.
+    pub joints: Option<String>,
+    /// Yaw rate and acceleration.
+    pub imu: Option<String>,
+    /// Odometry.
+    pub odometry: Option<String>,
+    /// Pose, and its type.
+    pub pose: Option<(String, &'static str)>,
+    /// What the agent's readers need to know of them. Frames are those of the first messages.
+    pub settings: Ros2Settings,
+    /// Choices that a person should know of.
+    pub notices: Vec<String>,
+}
+
+impl Mapping {
+    /// Returns the topics that are read.
+    pub fn topics(&self) -> Vec<&str> {
+        let pose = self.pose.as_ref().map(|(topic, _)| topic);
+        let topics = [
+            self.joints.as_ref(),
+            self.imu.as_ref(),
+            self.odometry.as_ref(),
+            pose,
+        ];
+        topics.into_iter().flatten().map(String::as_str).collect()
+    }
+}
+
+/// Topics of a recording, to choose from.
+struct Choice<'a> {
+    contents: &'a Contents,
+    notices: Vec<String>,
+}
+
+impl<'a> Choice<'a> {
+    fn found(&self) -> String {
+        self.contents.lines()
+    }
+
+    fn of_types(&self, types: &[&'static str]) -> Vec<(&'a Topic, &'static str)> {
+        let topics = self.contents.topics.iter();
+        let topics = topics.filter(|topic| topic.encoding == CDR);
+        let found = topics.filter_map(|topic| {
+            let kind = types.iter().find(|kind| **kind == topic.message_type)?;
+            Some((topic, *kind))
+        });
+        found.collect()
+    }
+
+    /// Returns the topic that was asked for, held against its type.
+    fn asked(
+        &self,
+        asked: &str,
+        types: &[&'static str],
+    ) -> Result<(String, &'static str), MappingError> {
+        let topics = &self.contents.topics;
+        let named = |name: &str| name.trim_start_matches('/') == asked.trim_start_matches('/');
+        let topic = topics.iter().find(|topic| named(&topic.name));
+        let topic = topic.ok_or_else(|| MappingError::NoTopic {
+            topic: asked.to_owned(),
+            found: self.found(),
+        })?;
+        let kind = types.iter().find(|kind| **kind == topic.message_type);
+        match kind.filter(|_| topic.encoding == CDR) {
+            Some(kind) => Ok((topic.name.clone(), kind)),
+            None => Err(MappingError::WrongType {
+                topic: topic.name.clone(),
+                found_type: format!("{} ({})", topic.message_type, topic.encoding),
+                expected: types.join(" or "),
+                found: self.found(),
+            }),
+        }
+    }
+
+    /// Returns the topic that was asked for, or the only one of its types; none where there are
+    /// none or several.
+    fn optional(
+        &mut self,
+        asked: Option<&str>,
+        types: &[&'static str],
+        flag: &str,
+    ) -> Result<Option<(String, &'static str)>, MappingError> {
+        if let Some(asked) = asked {
+            return self.asked(asked, types).map(Some);
+        }
+        let all = self.of_types(types);
+        if all.len() > 1 {
+            let names: Vec<&str> = all.iter().map(|(topic, _)| topic.name.as_str()).collect();
+            let names = names.join(", ");
+            self.notices.push(format!(
+                "of {names} none is read; choose one by `{flag}` if it shall be"
+            ));
+        }
+        let only = all.first().filter(|_| all.len() == 1);
+        Ok(only.map(|(topic, kind)| (topic.name.clone(), *kind)))
+    }
+
+    /// As [`Self::optional`], and an error where there are several.
+    fn unambiguous(
+        &mut self,
+        asked: Option<&str>,
+        kind: &'static str,
+        advice: &'static str,
+    ) -> Result<Option<String>, MappingError> {
+        let count = self.of_types(&[kind]).len();
+        if asked.is_none() && count > 1 {
+            return Err(MappingError::Missing {
+                problem: format!("{count} topics are of the type {kind}"),
+                advice,
+                found: self.found(),
+            });
+        }
+        let found = self.optional(asked, &[kind], "")?;
+        Ok(found.map(|(topic, _)| topic))
+    }
+}
+
+/// Returns what is missing for an estimate, in words; nothing if nothing is.
+pub fn missing(contents: &Contents) -> Vec<String> {
+    let has = |kind: &str| {
+        let mut topics = contents.topics.iter();
+        topics.any(|topic| topic.message_type == kind && topic.encoding == CDR)
+    };
+    let mut missing = Vec::new();
+    if !has(JOINT_STATE) {
+        missing.push(if has(ODOMETRY) {
+            format!(
+                "wheel speeds: no {JOINT_STATE}; those behind the odometry can be computed if its track width is known (`--odometry-track-m`)"
+            )
+        } else {
+            format!("wheel speeds: no {JOINT_STATE}, and no {ODOMETRY}")
+        });
+    }
+    if !has(IMU) {
+        missing.push(format!("yaw rate: no {IMU} with a gyro"));
+    }
+    missing
+}
+
+/// Chooses topics and joints.
+///
+/// # Errors
+/// [`MappingError`] with the topics that there are.
+pub fn choose(
+    recording: &Recording,
+    contents: &Contents,
+    robot: &Robot,
+    wishes: &Wishes,
+) -> Result<Mapping, MappingError> {
+    let mut choice = Choice {
+        contents,
+        notices: Vec::new(),
+    };
+    let configured = robot.settings.as_ref();
+    let topic_of = |asked: &Option<String>, name: Option<&Name>| {
+        let named = name.map(|name| format!("/{}", name.as_str()));
+        asked.clone().or(named)
+    };
+    let joints_of = configured.and_then(|settings| settings.joints.as_ref());
+    let asked = topic_of(&wishes.wheels, joints_of.map(|joints| &joints.topic));
+    let joints = choice.unambiguous(
+        asked.as_deref(),
+        JOINT_STATE,
+        "say which has the wheels by `--wheels TOPIC`",
+    )?;
+    let imu_of = configured.and_then(|settings| settings.imu.as_ref());
+    let asked = topic_of(&wishes.imu, imu_of.map(|imu| &imu.topic));
+    let imu = choice.unambiguous(
+        asked.as_deref(),
+        IMU,
+        "say which is the robot's by `--imu TOPIC`",
+    )?;
+    let odometry_of = configured.and_then(|settings| settings.odometry.as_ref());
+    let asked = topic_of(
+        &wishes.odometry,
+        odometry_of.map(|odometry| &odometry.topic),
+    );
+    let is_odometry_of_use = joints.is_none() || wishes.is_over_ground || asked.is_some();
+    let odometry = if is_odometry_of_use {
+        choice.unambiguous(
+            asked.as_deref(),
+            ODOMETRY,
+            "say which by `--odometry TOPIC`",
+        )?
+    } else {
+        None
+    };
+    let pose_of = configured.and_then(|settings| settings.pose.as_ref());
+    let asked = topic_of(&wishes.pose, pose_of.map(|pose| &pose.topic));
+    let pose = choice.optional(asked.as_deref(), &[COVARIANT_POSE, POSE], "--pose")?;
+    let is_over_ground = wishes.is_over_ground
+        || odometry_of.is_some_and(|odometry| odometry.motion_of == MotionOf::Ground);
+    check_whole(
+        &choice,
+        joints.as_deref(),
+        imu.as_deref(),
+        odometry.as_deref(),
+        is_over_ground,
+    )?;
+    if let Some(topic) = odometry.as_deref().filter(|_| joints.is_none())
+        && wishes.odometry_track_m.is_none()
+        && configured.is_none()
+    {
+        return Err(MappingError::OdometryTrack(topic.to_owned()));
+    }
+    let joint_settings = match &joints {
+        Some(topic) => Some(joint_settings(recording, topic, joints_of, wishes)?),
+        None => None,
+    };
+    let mut settings = configured
+        .cloned()
+        .unwrap_or_else(|| settings_of(&robot.model, wishes.odometry_track_m));
+    settings.imu = imu.is_some().then(|| imu_settings(imu_of, wishes));
+    settings.odometry = odometry.is_some().then(|| OdometrySettings {
+        topic: Name::default(),
+        frame: String::new(),
+        child_frame: String::new(),
+        motion_of: if is_over_ground {
+            MotionOf::Ground
+        } else {
+            MotionOf::Wheels
+        },
+        site_from_odom: None,
+    });
+    settings.pose = pose.is_some().then(|| PoseSettings {
+        topic: Name::default(),
+        frame: String::new(),
+        site_from_map: Pose::default(),
+    });
+    settings.joints = joint_settings;
+    settings.battery = None;
+    Ok(Mapping {
+        joints,
+        imu,
+        odometry,
+        pose,
+        settings,
+        notices: choice.notices,
+    })
+}
+
+/// Whether wheel speeds and a yaw rate that is not computed from them are there.
+fn check_whole(
+    choice: &Choice<'_>,
+    joints: Option<&str>,
+    imu: Option<&str>,
+    odometry: Option<&str>,
+    is_over_ground: bool,
+) -> Result<(), MappingError> {
+    let missing = |problem: String, advice| MappingError::Missing {
+        problem,
+        advice,
+        found: choice.found(),
+    };
+    match (joints, imu, odometry) {
+        (None, _, None) => Err(missing(
+            format!("no topic has wheel speeds: none is of the type {JOINT_STATE} or {ODOMETRY}"),
+            "record the wheels' joint states",
+        )),
+        (None, None, Some(topic)) => Err(MappingError::NoGyro(topic.to_owned())),
+        (Some(_), None, _) if !is_over_ground => Err(missing(
+            format!(
+                "no topic has a yaw rate that is measured beside the wheels: none is of the type {IMU}"
+            ),
+            "record the inertial unit, or name odometry that is measured over ground by `--odometry TOPIC --over-ground`",
+        )),
+        _ => Ok(()),
+    }
+}
+
+fn imu_settings(configured: Option<&ImuSettings>, wishes: &Wishes) -> ImuSettings {
+    let yaw_rad = wishes.imu_yaw_rad.or(configured.map(|imu| imu.yaw_rad));
+    ImuSettings {
+        topic: Name::default(),
+        frame: String::new(),
+        yaw_rad: yaw_rad.unwrap_or(0.0),
+        is_upside_down: wishes.is_imu_upside_down
+            || configured.is_some_and(|imu| imu.is_upside_down),
+    }
+}
+
+/// Returns the settings of a robot without a configuration. Nothing is connected or commanded, so
+/// what only that needs is empty.
+fn settings_of(model: &RobotModel, odometry_track_m: Option<f64>) -> Ros2Settings {
+    Ros2Settings {
+        bus: BusSettings {
+            scheme: Scheme::Ros2Dds,
+            mode: BusMode::Client,
+            endpoint: String::new(),
+            domain: 0,
+            namespace: Name::default(),
+            node: Name::default(),
+        },
+        timing: Timing {
+            stamps: StampClock::Host,
+            silent_after: tread_agent::drive::SILENT_AFTER_MAX,
+            late_after: super::timeline::LATE_AFTER,
+            pose_late_after: super::timeline::LATE_AFTER,
+        },
+        odometry: None,
+        imu: None,
+        joints: None,
+        pose: None,
+        battery: None,
+        command: CommandSettings {
+            topic: Name::default(),
+            kind: CommandKind::Twist,
+            frame: String::new(),
+            base_radius_m: model.wheel_radius_m(),
+            base_track_m: odometry_track_m.unwrap_or_else(|| model.track_width_m()),
+            turn_sign: 1.0,
+            forward_sign: 1.0,
+            joints: [1, 1],
+            joint_ratios: [1.0, 1.0],
+        },
+        outward: None,
+    }
+}
+
+/// Returns the names of the joints in the first messages of a topic.
+fn names_of(recording: &Recording, topic: &str) -> Result<Vec<String>, RecordingError> {
+    let (mut names, mut looked_at) = (BTreeSet::new(), 0);
+    recording.read(&[topic], &mut |message| {
+        if let Ok(joints) = decode::<JointState<'_>>(message.bytes) {
+            names.extend(joints.name.iter().map(str::to_owned));
+        }
+        looked_at += 1;
+        if looked_at < LOOKED_AT_MAX {
+            ControlFlow::Continue(())
+        } else {
+            ControlFlow::Break(())
+        }
+    })?;
+    Ok(names.into_iter().collect())
+}
+
+/// Whether a name has a word, however words are joined: `front_left_wheel`, `frontLeftWheel`.
+fn has_word(name: &str, words: [&str; 2]) -> bool {
+    let [long, short] = words;
+    let lower = name.to_lowercase();
+    let mut parts = lower.split(|letter: char| !letter.is_ascii_alphanumeric());
+    lower.contains(long) || parts.any(|part| part == short)
+}
+
+/// Chooses the joints of the sides by the words in their names; `None` where that is ambiguous.
+pub fn sides_of(names: &[String]) -> Option<JointNames> {
+    let of = |words: [&'static str; 2], others: [&'static str; 2]| -> Vec<String> {
+        let mine = names
+            .iter()
+            .filter(|name| has_word(name, words) && !has_word(name, others));
+        mine.cloned().collect()
+    };
+    let (left_words, right_words) = (["left", "l"], ["right", "r"]);
+    let (left, right) = (of(left_words, right_words), of(right_words, left_words));
+    let is_even = left.len() == right.len() && (1..=JOINTS_MAX).contains(&left.len());
+    is_even.then_some(JointNames { left, right })
+}
+
+fn joint_settings(
+    recording: &Recording,
+    topic: &str,
+    configured: Option<&JointSettings>,
+    wishes: &Wishes,
+) -> Result<JointSettings, MappingError> {
+    let names = names_of(recording, topic)?;
+    let listed = || {
+        let quoted: Vec<String> = names.iter().map(|name| format!("`{name}`")).collect();
+        quoted.join(", ")
+    };
+    let of_configuration = configured.map(|joints| JointNames {
+        left: joints.left.names.clone(),
+        right: joints.right.names.clone(),
+    });
+    let chosen = wishes.joints.clone().or(of_configuration);
+    let chosen = chosen.or_else(|| sides_of(&names));
+    let chosen = chosen.ok_or_else(|| MappingError::Joints {
+        topic: topic.to_owned(),
+        names: listed(),
+    })?;
+    let mut all = chosen.left.iter().chain(&chosen.right);
+    if let Some(joint) = all.find(|joint| !names.contains(joint)) {
+        return Err(MappingError::NoJoint {
+            topic: topic.to_owned(),
+            joint: joint.clone(),
+            names: listed(),
+        });
+    }
+    let side =
+        |names: Vec<String>, is_reversed: bool, configured: Option<&SideJoints>| SideJoints {
+            names,
+            sign: if is_reversed {
+                -1.0
+            } else {
+                configured.map_or(1.0, |side| side.sign)
+            },
+            effort_sign: configured.map_or(1.0, |side| side.effort_sign),
+        };
+    let [is_left_reversed, is_right_reversed] = wishes.reversed;
+    let ratio = wishes
+        .gear_ratio
+        .or(configured.map(|joints| joints.gear_ratio));
+    let effort = wishes.effort.or(configured.map(|joints| joints.effort));
+    Ok(JointSettings {
+        topic: Name::default(),
+        left: side(
+            chosen.left,
+            is_left_reversed,
+            configured.map(|joints| &joints.left),
+        ),
+        right: side(
+            chosen.right,
+            is_right_reversed,
+            configured.map(|joints| &joints.right),
+        ),
+        gear_ratio: ratio.unwrap_or(1.0),
+        effort: effort.unwrap_or(Effort::None),
+    })
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+
+    /// Settings without any topic.
+    pub(crate) fn settings() -> Ros2Settings {
+        settings_of(&RobotModel::yi2007(), None)
+    }
+
+    fn topic(name: &str, kind: &str) -> Topic {
+        Topic {
+            name: name.to_owned(),
+            message_type: kind.to_owned(),
+            encoding: CDR.to_owned(),
+            count: 2,
+            first_ns: 0,
+            last_ns: 1,
+        }
+    }
+
+    /// Chooses among topics that have no joints to be read.
+    fn chosen(topics: Vec<Topic>, wishes: &Wishes) -> Result<Mapping, MappingError> {
+        let contents = Contents {
+            topics,
+            torn: Vec::new(),
+        };
+        let robot = Robot {
+            model: RobotModel::yi2007(),
+            prior: tread_control::estimation::EstimatorPrior::default(),
+            settings: None,
+            rate_hz: 100.0,
+        };
+        let recording = Recording::open(&[]).unwrap();
+        choose(&recording, &contents, &robot, wishes)
+    }
+
+    #[test]
+    fn what_is_missing_or_ambiguous_is_said_with_the_topics_that_there_are() {
+        let wheels = || topic("/joint_states", JOINT_STATE);
+        let imus = || vec![topic("/a/imu", IMU), topic("/b/imu", IMU), wheels()];
+        let none = Wishes::default();
+        let refused = |topics, wishes: &Wishes| chosen(topics, wishes).unwrap_err().to_string();
+        let two = refused(imus(), &none);
+        assert!(
+            two.contains("--imu") && two.contains("/b/imu  sensor_msgs/msg/Imu"),
+            "{two}"
+        );
+        let wishes = Wishes {
+            imu: Some("b/imu".to_owned()),
+            ..Wishes::default()
+        };
+        // The topics are found, and the next question is which joints are whose.
+        let next = refused(imus(), &wishes);
+        assert!(next.contains("--joints"), "{next}");
+        let wishes = Wishes {
+            imu: Some("/joint_states".to_owned()),
+            ..Wishes::default()
+        };
+        let wrong = refused(imus(), &wishes);
+        assert!(
+            wrong.contains(JOINT_STATE) && wrong.contains("is needed"),
+            "{wrong}"
+        );
+        let wishes = Wishes {
+            wheels: Some("/wheels".to_owned()),
+            ..Wishes::default()
+        };
+        assert!(refused(imus(), &wishes).contains("there is no topic `/wheels`"));
+        assert!(refused(vec![wheels()], &none).contains("yaw rate"));
+        assert!(refused(vec![topic("/imu", IMU)], &none).contains("wheel speeds"));
+        let odometry = || topic("/odom", ODOMETRY);
+        assert!(refused(vec![odometry()], &none).contains("θ needs a gyro"));
+        let both = || vec![odometry(), topic("/imu", IMU)];
+        assert!(refused(both(), &none).contains("--odometry-track-m"));
+        let wishes = Wishes {
+            odometry_track_m: Some(0.8),
+            ..Wishes::default()
+        };
+        let mapping = chosen(both(), &wishes).unwrap();
+        assert_eq!(mapping.topics(), ["/imu", "/odom"]);
+        assert!((mapping.settings.command.base_track_m - 0.8).abs() < 1.0e-12);
+    }
+
+    #[test]
+    fn several_poses_are_left_out_and_that_is_said() {
+        let topics = vec![
+            topic("/imu", IMU),
+            topic("/odom", ODOMETRY),
+            topic("/amcl", COVARIANT_POSE),
+            topic("/mocap", POSE),
+        ];
+        let mut wishes = Wishes {
+            odometry_track_m: Some(0.8),
+            ..Wishes::default()
+        };
+        let mapping = chosen(topics.clone(), &wishes).unwrap();
+        assert_eq!(mapping.pose, None);
+        assert!(
+            mapping.notices[0].contains("/amcl, /mocap"),
+            "{:?}",
+            mapping.notices
+        );
+        wishes.pose = Some("/mocap".to_owned());
+        let mapping = chosen(topics, &wishes).unwrap();
+        assert_eq!(mapping.pose, Some(("/mocap".to_owned(), POSE)));
+    }
+
+    #[test]
+    fn a_list_says_what_is_missing() {
+        let of = |topics| {
+            missing(&Contents {
+                topics,
+                torn: Vec::new(),
+            })
+        };
+        assert_eq!(of(Vec::new()).len(), 2);
+        assert!(of(vec![topic("/odom", ODOMETRY)])[0].contains("--odometry-track-m"));
+        let enough = vec![topic("/imu", IMU), topic("/joints", JOINT_STATE)];
+        assert_eq!(of(enough), Vec::<String>::new());
+    }
+
+    fn owned(names: &[&str]) -> Vec<String> {
+        names.iter().map(|name| (*name).to_owned()).collect()
+    }
+
+    #[test]
+    fn sides_are_told_by_the_words_in_names_and_not_guessed() {
+        let husky = owned(&[
+            "front_left_wheel",
+            "front_right_wheel",
+            "rear_left_wheel",
+            "rear_right_wheel",
+        ]);
+        let sides = sides_of(&husky).unwrap();
+        assert_eq!(sides.left, owned(&["front_left_wheel", "rear_left_wheel"]));
+        assert_eq!(
+            sides.right,
+            owned(&["front_right_wheel", "rear_right_wheel"])
+        );
+        let short = sides_of(&owned(&["wheel_l", "wheel_r", "lidar_spin"])).unwrap();
+        assert_eq!(
+            (short.left, short.right),
+            (owned(&["wheel_l"]), owned(&["wheel_r"]))
+        );
+        assert_eq!(sides_of(&owned(&["wheel_1", "wheel_2"])), None);
+        assert_eq!(sides_of(&owned(&["left_a", "left_b", "right_a"])), None);
+    }
+
+    #[test]
+    fn joints_are_parsed_with_a_slash_between_the_sides() {
+        let names: JointNames = "fl, rl/fr,rr".parse().unwrap();
+        assert_eq!(
+            (names.left, names.right),
+            (owned(&["fl", "rl"]), owned(&["fr", "rr"]))
+        );
+        for bad in ["fl,fr", "/fr", "a/", "a,b,c,d,e,f,g,h,i/j"] {
+            assert!(bad.parse::<JointNames>().is_err(), "{bad}");
+        }
+    }
+}

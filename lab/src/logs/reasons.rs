@@ -1,0 +1,271 @@
+//! Why there is no estimate, and which manoeuvre would help.
+//!
+//! The estimator abstains where the standard deviation of θ would be above half of θ, or where
+//! nothing reached it. It does not say which of many causes that had; they are told here from what
+//! it does say (samples dropped, slip beyond the linear range, no new information), from the
+//! findings of the consistency monitor, and from how the robot moved.
+
+use serde::Serialize;
+
+use super::estimate::Outcome;
+use super::stretches::{ESTIMATOR_GAP_S, Motion};
+
+/// Share of a time, or of samples, from which a cause counts.
+const SHARE: f64 = 0.2;
+/// Shortest driving in which θ can be found, seconds.
+const DRIVING_MIN_S: f64 = 8.0;
+/// Share of the driving that has to be turns, or acceleration, to count as excitation.
+const EXCITED_SHARE: f64 = 0.08;
+/// Share of a turning robot's turns to the rarer side, below which they count as one-sided.
+const ONE_SIDED_SHARE: f64 = 0.2;
+/// Share of blocks beyond the linear range of slip, above which hardly any is within it. The slope at
+/// zero slip is found from much slip too, but not from much slip alone.
+const SATURATED_SHARE: f64 = 0.9;
+
+/// A reason, with what would help.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Reason {
+    /// Name for programs.
+    pub code: &'static str,
+    /// The reason.
+    pub reason: String,
+    /// What to do.
+    pub help: &'static str,
+}
+
+fn percent(share: f64) -> String {
+    format!("{:.0} %", 100.0 * share)
+}
+
+/// Returns what keeps the estimator from knowing θ, the strongest first; never nothing.
+pub fn reasons(motion: &Motion, outcome: &Outcome) -> Vec<Reason> {
+    let mut reasons = of_recording(motion, outcome);
+    if reasons.is_empty() {
+        reasons = of_motion(motion, outcome);
+    }
+    if reasons.is_empty() {
+        let without = if motion.has_torque {
+            ""
+        } else {
+            "without measured torque "
+        };
+        let on_the_way = outcome
+            .std_dev_ratios
+            .map_or_else(String::new, |(least, _)| {
+                format!("; on the way it was {} at best", percent(least))
+            });
+        reasons.push(Reason {
+            code: "uncertain",
+            reason: format!(
+                "{without}the motion leaves a standard deviation of θ above half of θ{on_the_way}"
+            ),
+            help: "drive figure-8s of 2 to 4 m for a minute, at changing speed; record the joints' torque, or odometry over ground",
+        });
+    }
+    reasons
+}
+
+/// What of the recording keeps samples from the estimator, whatever the robot does.
+fn of_recording(motion: &Motion, outcome: &Outcome) -> Vec<Reason> {
+    let mut reasons = Vec::new();
+    if motion.long_interval_ratio > SHARE {
+        reasons.push(Reason {
+            code: "wheel_rate",
+            reason: format!(
+                "{} of the wheel speeds come more than {:.0} ms after the one before (every {:.0} ms in the median), and nothing is known of the motion in between",
+                percent(motion.long_interval_ratio),
+                1.0e3 * ESTIMATOR_GAP_S,
+                1.0e3 * motion.wheel_interval_s
+            ),
+            help: "record wheel speeds at 20 Hz or more; `--interpolate` takes them as changing evenly in between",
+        });
+    }
+    if motion.without_gyro_ratio > SHARE {
+        reasons.push(Reason {
+            code: "gyro",
+            reason: format!(
+                "{} of the wheel speeds have no yaw rate within 60 ms",
+                percent(motion.without_gyro_ratio)
+            ),
+            help: "record the inertial unit at 50 Hz or more, by the same clock as the wheels",
+        });
+    }
+    let duration_s = motion.duration_s.max(f64::MIN_POSITIVE);
+    if outcome.contradicted_s > SHARE * duration_s {
+        let subjects: Vec<&str> = outcome.contradicting.iter().copied().collect();
+        reasons.push(Reason {
+            code: "contradiction",
+            reason: format!(
+                "sensors contradict each other in {} of the time: {}",
+                percent(outcome.contradicted_s / duration_s),
+                subjects.join(", ")
+            ),
+            help: "check wheel radius, track width, the joints' signs and the inertial unit's mounting",
+        });
+    }
+    #[expect(clippy::cast_precision_loss, reason = "counts of samples")]
+    let dropped =
+        outcome.estimate.dropped_samples as f64 / (motion.samples_hz * duration_s).max(1.0);
+    if dropped > SHARE {
+        reasons.push(Reason {
+            code: "implausible",
+            reason: format!("{} of the samples are impossible for this robot", percent(dropped)),
+            help: "check the joints' unit and gear ratio, the wheel radius, and the limits of the model",
+        });
+    }
+    reasons
+}
+
+/// What of the motion leaves θ unknown.
+fn of_motion(motion: &Motion, outcome: &Outcome) -> Vec<Reason> {
+    let mut reasons = Vec::new();
+    if motion.moving_s < DRIVING_MIN_S {
+        reasons.push(Reason {
+            code: "short",
+            reason: format!("the robot drove for {:.1} s only", motion.moving_s),
+            help: "drive for 20 s or more without a break",
+        });
+    }
+    if outcome.estimate.saturation_share > SATURATED_SHARE {
+        reasons.push(Reason {
+            code: "slip",
+            reason: format!(
+                "the wheels slip beyond the range in which slip tells friction in {} of the time",
+                percent(outcome.estimate.saturation_share)
+            ),
+            help: "turn in wider arcs, more slowly, and not on the spot",
+        });
+    }
+    let moving_s = motion.moving_s.max(f64::MIN_POSITIVE);
+    let (left_s, right_s) = (motion.left_s, motion.right_s);
+    let turns = (left_s + right_s) / moving_s;
+    if turns < EXCITED_SHARE {
+        let spot = if motion.on_the_spot_s > EXCITED_SHARE * moving_s {
+            ", but for turns on the spot"
+        } else {
+            ""
+        };
+        reasons.push(Reason {
+            code: "no_turns",
+            reason: format!("the robot rolled straight on nearly all the time{spot}"),
+            help: "drive arcs to both sides, as in a figure-8",
+        });
+    } else if left_s.min(right_s) < ONE_SIDED_SHARE * (left_s + right_s) {
+        reasons.push(Reason {
+            code: "one_sided",
+            reason:
+                "nearly all turns were to one side, so that different wheel radii look like slip"
+                    .to_owned(),
+            help: "turn to both sides, as in a figure-8",
+        });
+    }
+    if motion.accelerating_s < EXCITED_SHARE * moving_s {
+        reasons.push(Reason {
+            code: "no_acceleration",
+            reason: "the speed hardly changed".to_owned(),
+            help: "accelerate and brake, by half of the speed within three seconds",
+        });
+    }
+    if outcome.estimate.no_new_information {
+        reasons.push(Reason {
+            code: "no_excitation",
+            reason: "the last seconds brought no new information on θ".to_owned(),
+            help: "drive figure-8s at changing speed",
+        });
+    }
+    reasons
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use tread_control::estimation::Estimate;
+
+    use super::*;
+
+    fn outcome() -> Outcome {
+        Outcome {
+            estimate: Estimate::default(),
+            contradicted_s: 0.0,
+            contradicting: BTreeSet::new(),
+            ground_changes: 0,
+            first_after_s: None,
+            std_dev_ratios: None,
+        }
+    }
+
+    /// A minute of figure-8s.
+    fn excited() -> Motion {
+        Motion {
+            duration_s: 60.0,
+            moving_s: 60.0,
+            samples_hz: 50.0,
+            wheel_interval_s: 0.02,
+            left_s: 20.0,
+            right_s: 20.0,
+            accelerating_s: 15.0,
+            ..Motion::default()
+        }
+    }
+
+    fn codes(motion: &Motion, outcome: &Outcome) -> Vec<&'static str> {
+        let reasons = reasons(motion, outcome);
+        reasons.iter().map(|reason| reason.code).collect()
+    }
+
+    #[test]
+    fn there_is_always_a_reason_and_a_help() {
+        let found = reasons(&excited(), &outcome());
+        assert_eq!(found.len(), 1);
+        assert_eq!(found[0].code, "uncertain");
+        assert!(!found[0].help.is_empty());
+    }
+
+    #[test]
+    fn a_recording_that_says_too_little_is_named_before_the_motion() {
+        let seldom = Motion {
+            wheel_interval_s: 0.2,
+            long_interval_ratio: 1.0,
+            left_s: 0.0,
+            right_s: 0.0,
+            ..excited()
+        };
+        assert_eq!(codes(&seldom, &outcome()), ["wheel_rate"]);
+        let contradicted = Outcome {
+            contradicted_s: 30.0,
+            contradicting: BTreeSet::from(["gyro"]),
+            ..outcome()
+        };
+        let found = reasons(&excited(), &contradicted);
+        assert!(
+            found[0].reason.contains("50 %") && found[0].reason.contains("gyro"),
+            "{found:?}"
+        );
+    }
+
+    #[test]
+    fn each_missing_manoeuvre_is_asked_for() {
+        let straight = Motion {
+            left_s: 1.0,
+            right_s: 1.0,
+            ..excited()
+        };
+        assert_eq!(codes(&straight, &outcome()), ["no_turns"]);
+        let circle = Motion {
+            left_s: 55.0,
+            right_s: 0.0,
+            accelerating_s: 1.0,
+            ..excited()
+        };
+        assert_eq!(codes(&circle, &outcome()), ["one_sided", "no_acceleration"]);
+        let slipping = Outcome {
+            estimate: Estimate {
+                saturation_share: 0.95,
+                ..Estimate::default()
+            },
+            ..outcome()
+        };
+        assert_eq!(codes(&excited(), &slipping), ["slip"]);
+    }
+}
