@@ -13,8 +13,16 @@
 // of the last step. Tyres have a relaxation length l: v_slip = theta*|r w|*F/N + l*theta*d(F/N)/dt.
 // With the step h and the last step's F'/N' this is slip1 = theta*(|r w| + l/h)/N and a surface motion
 // of l*theta/h*F'/N', both by ODE's own contact (dContactSlip, dContactMotion). In steady motion the
-// second part is zero. ODE limits each of the two friction forces to mu*N (dContactApprox1), so the
-// limit is a pyramid. `wheels` prints force and slip as they are, from contact feedback and from the
+// second part is zero.
+//
+// ODE limits each of the two friction forces to mu*N (dContactApprox1): a pyramid. With is_cone=1 its
+// first direction is that of the force which slip and deflection would give without a limit, so that a
+// sliding contact's force is mu*N against its sliding, as Coulomb's law and every tyre model say. With
+// is_cone=0 the first direction is that of the wheel. Then a tyre that slides sideways with mu*N still
+// gives longitudinal force with the full stiffness K, which no tyre does, but which is what many users
+// of ODE have. Below the limit both are the same.
+//
+// `wheels` prints force and slip as they are, from contact feedback and from the
 // motion of the bodies; with `pull` they are measured against a known force. lab/tests/held_out.rs
 // compares them with theta.
 //
@@ -66,6 +74,8 @@ constexpr double RESET_OVER_LAG = 4.0;
 // Time in which gravity is tilted before the robot is ready, and time after it.
 constexpr double TILTS_S = 1.0;
 constexpr double RESTS_S = 0.5;
+// Slip speed below which a contact's friction has the directions of its wheel.
+constexpr double SLIP_MIN_M_S = 1.0e-6;
 // Least load in the slip compliance, over a quarter of the weight.
 constexpr double LOAD_MIN_RATIO = 0.01;
 // Most steps of one drive command: an hour of the smallest step.
@@ -74,10 +84,10 @@ constexpr int WHEELS = 4;
 
 using Parameters = std::map<std::string, double>;
 
-const std::array<const char *, 24> KEYS = {
+const std::array<const char *, 25> KEYS = {
     "step_s", "mass_kg", "yaw_inertia_kg_m2", "center_forward_m", "center_left_m", "center_height_m",
     "track_m", "wheelbase_m", "radius_left_m", "radius_right_m", "wheel_inertia_kg_m2",
-    "stiffness", "mu_peak", "relaxation_m", "slope_x_rad", "slope_y_rad", "gear_loss_ratio",
+    "stiffness", "mu_peak", "is_cone", "relaxation_m", "slope_x_rad", "slope_y_rad", "gear_loss_ratio",
     "rolling_resistance_ratio", "servo_lag_s", "torque_limit_n_m", "x_m", "y_m", "heading_rad",
     "gravity_m_s2"};
 
@@ -117,7 +127,8 @@ struct Wheel {
     double motor_n_m = 0.0;
     double integral_n_m = 0.0;
     double turned_rad = 0.0;
-    double contact_m[3] = {0.0, 0.0, 0.0};
+    // Directions of the last step's friction: forward and left.
+    dVector3 direction[2] = {};
     WheelMeans means = {};
 };
 
@@ -170,7 +181,7 @@ public:
             }
         }
         for (const Wheel &wheel : wheels_of) {
-            peak = std::max(peak, std::max(std::fabs(wheel.mu[0]), std::fabs(wheel.mu[1])) / is.at("mu_peak"));
+            peak = std::max(peak, std::hypot(wheel.mu[0], wheel.mu[1]) / is.at("mu_peak"));
         }
         dVector3 place, speed;
         dBodyGetRelPointPos(chassis, middle[0], middle[1], middle[2], place);
@@ -377,8 +388,10 @@ private:
         dBodyAddTorque(wheel.body, -rolling * axle[0], -rolling * axle[1], -rolling * axle[2]);
     }
 
-    // Forward direction of a wheel on the ground, and left of it.
-    void directions(const Wheel &wheel, dReal *forward, dReal *left) const {
+    // Forward direction of a wheel on the ground, and left of it. A tyre's deflection turns with its
+    // wheel, so a step's force is resolved in the directions of that step.
+    void directions(Wheel &wheel) const {
+        dReal *forward = wheel.direction[0], *left = wheel.direction[1];
         dVector3 axle;
         dJointGetHingeAxis(wheel.hinge, axle);
         const double size = std::hypot(axle[0], axle[1]);
@@ -391,45 +404,57 @@ private:
 
     void touch(Wheel &wheel) {
         dContact contact = {};
+        directions(wheel);
         wheel.touches = dCollide(wheel.geom, plane, 1, &contact.geom, sizeof contact.geom) == 1;
         if (!wheel.touches) return;
-        dVector3 left;
-        directions(wheel, contact.fdir1, left);
         const double theta = 1.0 / is.at("stiffness");
         const double weight_n = 0.25 * mass_kg * is.at("gravity_m_s2");
         const double load_n = std::max(wheel.load_n, LOAD_MIN_RATIO * weight_n);
         const double rim_m_s = std::max(std::fabs(wheel.rate_rad_s) * wheel.radius_m, RIM_MIN_M_S);
         const double bends_m_s = is.at("relaxation_m") / step_s;
+        const double motion[2] = {theta * bends_m_s * wheel.mu[0], theta * bends_m_s * wheel.mu[1]};
+        // First direction of friction, in those of the wheel.
+        double first[2] = {1.0, 0.0};
+        if (is.at("is_cone") != 0.0) {
+            const double goal[2] = {motion[0] + wheel.slip_m_s[0], motion[1] + wheel.slip_m_s[1]};
+            const double size = std::hypot(goal[0], goal[1]);
+            if (size > SLIP_MIN_M_S) {
+                first[0] = goal[0] / size;
+                first[1] = goal[1] / size;
+            }
+        }
+        for (int axis = 0; axis < 3; ++axis) {
+            contact.fdir1[axis] = first[0] * wheel.direction[0][axis] + first[1] * wheel.direction[1][axis];
+        }
         dSurfaceParameters &surface = contact.surface;
         surface.mode = dContactFDir1 | dContactSoftERP | dContactSoftCFM | dContactApprox1_1 |
                        dContactApprox1_2 | dContactSlip1 | dContactSlip2 | dContactMotion1 | dContactMotion2;
         surface.mu = is.at("mu_peak");
         surface.slip1 = surface.slip2 = theta * (rim_m_s + bends_m_s) / load_n;
-        surface.motion1 = theta * bends_m_s * wheel.mu[0];
-        surface.motion2 = theta * bends_m_s * wheel.mu[1];
+        surface.motion1 = first[0] * motion[0] + first[1] * motion[1];
+        surface.motion2 = first[0] * motion[1] - first[1] * motion[0];
         // A spring and a damper (ODE manual, section 3.8.2).
         const double spring = 0.25 * mass_kg * SPRINGS_RAD_S * SPRINGS_RAD_S;
         const double damper = 2.0 * SPRINGS_DAMPING * 0.25 * mass_kg * SPRINGS_RAD_S;
         surface.soft_erp = step_s * spring / (step_s * spring + damper);
         surface.soft_cfm = 1.0 / (step_s * spring + damper);
-        for (int axis = 0; axis < 3; ++axis) wheel.contact_m[axis] = contact.geom.pos[axis];
         const dJointID joint = dJointCreateContact(world, group, &contact);
         dJointAttach(joint, wheel.body, nullptr);
         dJointSetFeedback(joint, &wheel.contact_feedback);
     }
 
     void measure(Wheel &wheel, double target_rad_s) {
-        dVector3 axle, direction[2];
+        dVector3 axle;
         dJointGetHingeAxis(wheel.hinge, axle);
-        directions(wheel, direction[0], direction[1]);
         if (!wheel.touches) wheel.contact_feedback = {};
         wheel.load_n = wheel.contact_feedback.f1[2];
         dVector3 speed;
-        dBodyGetPointVel(wheel.body, wheel.contact_m[0], wheel.contact_m[1], wheel.contact_m[2], speed);
+        const dReal *center = dBodyGetPosition(wheel.body);
+        dBodyGetPointVel(wheel.body, center[0], center[1], center[2] - wheel.radius_m, speed);
         for (int axis = 0; axis < 2; ++axis) {
-            wheel.force_n[axis] = dot(wheel.contact_feedback.f1, direction[axis]);
+            wheel.force_n[axis] = dot(wheel.contact_feedback.f1, wheel.direction[axis]);
             wheel.mu[axis] = wheel.load_n > 0.0 ? wheel.force_n[axis] / wheel.load_n : 0.0;
-            wheel.slip_m_s[axis] = -dot(speed, direction[axis]);
+            wheel.slip_m_s[axis] = -dot(speed, wheel.direction[axis]);
         }
         wheel.rate_rad_s = dJointGetHingeAngleRate(wheel.hinge);
         wheel.turned_rad += step_s * wheel.rate_rad_s;

@@ -20,7 +20,7 @@ use crate::rough::sensors::{SensorSpec, Sensors};
 use crate::rough::spec::{Deviations, MAKES};
 use crate::rough::width::Width;
 
-use process::{OdePlant, OdeProgram, OdeRobot};
+use process::{FrictionLimit, OdePlant, OdeProgram, OdeRobot};
 
 /// Factor by which distributions are wider than those of the rough world.
 pub const WIDTH: f64 = 1.3;
@@ -48,16 +48,22 @@ pub fn drawn(seed: u64, has_torque: bool) -> Trial {
     }
 }
 
-/// Runs a drive, with so many integration steps in a sample.
+/// Runs a drive with a limit of friction, and so many integration steps in a sample.
 ///
 /// # Errors
 /// The robot's model or its plan is impossible, or the simulation failed.
-pub fn run(program: &OdeProgram, trial: &Trial, steps_per_sample: u32) -> anyhow::Result<Outcome> {
+pub fn run(
+    program: &OdeProgram,
+    trial: &Trial,
+    limit: FrictionLimit,
+    steps_per_sample: u32,
+) -> anyhow::Result<Outcome> {
     let model = trial.make.model()?;
     let robot = OdeRobot {
         model: &model,
         deviations: trial.deviations,
         start: Pose::default(),
+        limit,
         steps_per_sample,
     };
     let plant = OdePlant::start(program, &robot)?;

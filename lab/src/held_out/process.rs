@@ -97,6 +97,17 @@ impl OdeProgram {
     }
 }
 
+/// Limit of a contact's force.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
+pub enum FrictionLimit {
+    /// A sliding contact's force is against its sliding, as that of tyres is.
+    #[default]
+    Cone,
+    /// Longitudinal and lateral force have limits of their own: ODE's pyramid along the wheel. A tyre
+    /// that slides sideways keeps its longitudinal stiffness, which no tyre does.
+    Pyramid,
+}
+
 /// Robot to simulate.
 #[derive(Debug, Clone, Copy)]
 pub struct OdeRobot<'a> {
@@ -106,6 +117,8 @@ pub struct OdeRobot<'a> {
     pub deviations: Deviations,
     /// Pose of the centre of the wheels at the start.
     pub start: Pose,
+    /// Limit of the contacts' forces.
+    pub limit: FrictionLimit,
     /// Integration steps in a sample; at least 10, since steps are at most 1 ms.
     pub steps_per_sample: u32,
 }
@@ -153,6 +166,10 @@ impl OdeRobot<'_> {
             ),
             ("stiffness", spec.curve.stiffness),
             ("mu_peak", spec.curve.mu_peak),
+            (
+                "is_cone",
+                f64::from(u8::from(self.limit == FrictionLimit::Cone)),
+            ),
             ("relaxation_m", spec.relaxation_m),
             ("slope_x_rad", spec.slope_rad[0]),
             ("slope_y_rad", spec.slope_rad[1]),

@@ -7,7 +7,9 @@ use tread_control::robot::GRAVITY_M_S2;
 
 use serde::Serialize;
 
-use super::process::{OdePlant, OdeProgram, OdeRobot, STEPS_PER_SAMPLE, WHEELS, WheelContact};
+use super::process::{
+    FrictionLimit, OdePlant, OdeProgram, OdeRobot, STEPS_PER_SAMPLE, WHEELS, WheelContact,
+};
 use crate::rough::means::Means;
 use crate::rough::spec::{Deviations, MAKES, Make};
 
@@ -21,6 +23,8 @@ const MEAN_SAMPLES: u32 = 50;
 const PULL_MU_PEAK: f64 = 0.4;
 /// Pulls over the limit of friction.
 const PULLS: [f64; 4] = [-0.6, 0.3, 0.6, 0.85];
+/// Limit of friction that no wheel reaches.
+const UNLIMITED_MU: f64 = 10.0;
 /// Friction coefficient below which the ratio of force to slip is not taken.
 const MU_MIN: f64 = 0.01;
 /// Samples of a drive by which steps are compared.
@@ -105,6 +109,7 @@ impl RobotOf {
             model: &self.model,
             deviations: self.deviations,
             start: Pose::default(),
+            limit: FrictionLimit::default(),
             steps_per_sample,
         }
     }
@@ -205,6 +210,8 @@ pub fn unequal_loads(program: &OdeProgram, stiffness: f64) -> anyhow::Result<f64
     deviations.center_forward_ratio = 0.15;
     deviations.center_left_ratio = -0.1;
     deviations.center_height_ratio = 0.5;
+    // No wheel comes to the limit, where the ratio of force to slip is not K.
+    deviations.curve.mu_peak = UNLIMITED_MU;
     deviations.relaxation_m = 0.04;
     let of = robot_of(MAKES[1], deviations)?;
     let mut plant = OdePlant::start(program, &of.robot(STEPS_PER_SAMPLE))?;

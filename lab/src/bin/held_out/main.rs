@@ -24,17 +24,26 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use anyhow::Context;
 use clap::Parser;
-use tread_lab::held_out::process::{OdeProgram, STEPS_PER_SAMPLE};
+use tread_lab::held_out::process::{FrictionLimit, OdeProgram, STEPS_PER_SAMPLE};
 use tread_lab::held_out::{drawn, run};
 use tread_lab::parallel::in_parallel;
 use tread_lab::report::{Check, checks_json, checks_markdown};
-use tread_lab::rough::run::{ASKED_AT_S, Trial};
+use tread_lab::rough::run::{self as rough, ASKED_AT_S, Trial};
 
 use score::{Drive, Line};
 use simulator::Simulator;
 
 /// Number of drives after which progress is printed.
 const PROGRESS_EVERY: usize = 20;
+
+/// World in which robots drive.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum World {
+    /// The simulator that is not ours.
+    Ode,
+    /// The same robots in the rough world.
+    Rough,
+}
 
 #[derive(Debug, Parser)]
 #[command(name = "held_out")]
@@ -45,9 +54,15 @@ struct Arguments {
     /// First seed
     #[arg(long, default_value_t = 9_000_001)]
     seed: u64,
+    /// Limit of the contacts' forces
+    #[arg(long, value_enum, default_value_t = FrictionLimit::Cone)]
+    limit: FrictionLimit,
     /// Integration steps in a sample of 10 ms
     #[arg(long, default_value_t = STEPS_PER_SAMPLE, value_parser = clap::value_parser!(u32).range(10..=1_000))]
     steps: u32,
+    /// World in which the robots drive; `rough` shows what the wider distributions alone do
+    #[arg(long, value_enum, default_value_t = World::Ode)]
+    world: World,
     /// Write each drive to this file, one JSON object per line
     #[arg(long, value_name = "FILE")]
     drives: Option<PathBuf>,
@@ -70,8 +85,11 @@ fn drive(
         .collect();
     let (done, count) = (AtomicUsize::new(0), trials.len());
     let outcomes = in_parallel(&trials, |trial| {
-        let outcome = run(program, trial, arguments.steps)
-            .with_context(|| format!("the drive of seed {} failed", trial.seed));
+        let outcome = match arguments.world {
+            World::Ode => run(program, trial, arguments.limit, arguments.steps),
+            World::Rough => rough::run(trial),
+        };
+        let outcome = outcome.with_context(|| format!("the drive of seed {} failed", trial.seed));
         let done = done.fetch_add(1, Ordering::Relaxed) + 1;
         if done.is_multiple_of(PROGRESS_EVERY) || done == count {
             let torque = if has_torque { "with" } else { "without" };
