@@ -13,7 +13,7 @@ use tread_lab::held_out::process::{
     FrictionLimit, OdeError, OdePlant, OdeProgram, OdeRobot, STEPS_PER_SAMPLE,
 };
 use tread_lab::held_out::truth::{PullDirection, pull, step_differences, unequal_loads};
-use tread_lab::held_out::{drawn, run};
+use tread_lab::held_out::{Tyres, drawn, run};
 use tread_lab::parallel::in_parallel;
 use tread_lab::rough::spec::{Deviations, MAKES};
 
@@ -65,7 +65,7 @@ fn slip_goes_by_the_load_of_each_wheel() {
 #[test]
 fn smaller_steps_change_less_than_the_sensors_see() {
     let Some(program) = program() else { return };
-    let trial = drawn(1, true);
+    let trial = drawn(1, true, Tyres::Elastic);
     let found = step_differences(&program, trial.make, trial.deviations).unwrap();
     let [whole, half] = found
         .try_into()
@@ -131,7 +131,9 @@ fn an_impossible_robot_is_refused_with_its_reason() {
 #[test]
 fn agents_give_estimates_on_odes_contacts_and_most_intervals_hold() {
     let Some(program) = program() else { return };
-    let trials: Vec<_> = (0..4).map(|index| drawn(8_000_001 + index, true)).collect();
+    let trials: Vec<_> = (0..4)
+        .map(|index| drawn(8_000_001 + index, true, Tyres::Rigid))
+        .collect();
     let (mut estimates, mut covered) = (0, 0);
     for outcome in in_parallel(&trials, |trial| {
         run(&program, trial, FrictionLimit::Cone, STEPS_PER_SAMPLE)

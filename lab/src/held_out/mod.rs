@@ -27,14 +27,28 @@ pub const WIDTH: f64 = 1.3;
 /// Mask of the seed for drawing the robot, so that robot and sensor noise are independent.
 const ROBOT_SEED: u64 = 0x0de;
 
+/// Tyres of the robots.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
+pub enum Tyres {
+    /// ODE's contacts alone: force follows slip at once.
+    #[default]
+    Rigid,
+    /// Tyres that deflect, with the drawn relaxation lengths. The deflection is that of a spring under
+    /// the contact's force, so that a sliding contact deflects no further.
+    Elastic,
+}
+
 /// Draws the drive of a seed: the same robot, with torque or without.
-pub fn drawn(seed: u64, has_torque: bool) -> Trial {
+pub fn drawn(seed: u64, has_torque: bool, tyres: Tyres) -> Trial {
     let mut random = Random::new(seed ^ ROBOT_SEED);
     let width = Width::new(WIDTH).unwrap_or_default();
     let make = random.one_of(&MAKES).unwrap_or(MAKES[0]);
     let mut deviations = Deviations::drawn_wider(&mut random, width);
     // ODE's own contacts: force-dependent slip up to a limit.
     deviations.curve.shape = Shape::Linear;
+    if tyres == Tyres::Rigid {
+        deviations.relaxation_m = 0.0;
+    }
     Trial {
         make,
         deviations,

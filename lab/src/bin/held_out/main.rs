@@ -25,7 +25,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use anyhow::Context;
 use clap::Parser;
 use tread_lab::held_out::process::{FrictionLimit, OdeProgram, STEPS_PER_SAMPLE};
-use tread_lab::held_out::{drawn, run};
+use tread_lab::held_out::{Tyres, drawn, run};
 use tread_lab::parallel::in_parallel;
 use tread_lab::report::{Check, checks_json, checks_markdown};
 use tread_lab::rough::run::{self as rough, ASKED_AT_S, Trial};
@@ -60,6 +60,9 @@ struct Arguments {
     /// Integration steps in a sample of 10 ms
     #[arg(long, default_value_t = STEPS_PER_SAMPLE, value_parser = clap::value_parser!(u32).range(10..=1_000))]
     steps: u32,
+    /// Tyres of the robots
+    #[arg(long, value_enum, default_value_t = Tyres::Rigid)]
+    tyres: Tyres,
     /// World in which the robots drive; `rough` shows what the wider distributions alone do
     #[arg(long, value_enum, default_value_t = World::Ode)]
     world: World,
@@ -81,7 +84,7 @@ fn drive(
     arguments: &Arguments,
 ) -> anyhow::Result<Vec<Drive>> {
     let trials: Vec<Trial> = (0..u64::from(arguments.runs))
-        .map(|index| drawn(arguments.seed + index, has_torque))
+        .map(|index| drawn(arguments.seed + index, has_torque, arguments.tyres))
         .collect();
     let (done, count) = (AtomicUsize::new(0), trials.len());
     let outcomes = in_parallel(&trials, |trial| {
