@@ -10,10 +10,10 @@ use tread_control::geometry::Pose;
 use tread_control::measured::WheelSpeeds;
 use tread_control::robot::GRAVITY_M_S2;
 use tread_lab::held_out::process::{
-    FrictionLimit, OdeError, OdePlant, OdeProgram, OdeRobot, STEPS_PER_SAMPLE,
+    Contacts, OdeError, OdePlant, OdeProgram, OdeRobot, STEPS_PER_SAMPLE,
 };
 use tread_lab::held_out::truth::{PullDirection, pull, step_differences, unequal_loads};
-use tread_lab::held_out::{Tyres, drawn, run};
+use tread_lab::held_out::{drawn, run};
 use tread_lab::parallel::in_parallel;
 use tread_lab::rough::spec::{Deviations, MAKES};
 
@@ -65,7 +65,7 @@ fn slip_goes_by_the_load_of_each_wheel() {
 #[test]
 fn smaller_steps_change_less_than_the_sensors_see() {
     let Some(program) = program() else { return };
-    let trial = drawn(1, true, Tyres::Elastic);
+    let trial = drawn(1, true);
     let found = step_differences(&program, trial.make, trial.deviations).unwrap();
     let [whole, half] = found
         .try_into()
@@ -89,7 +89,7 @@ fn a_robot_at_rest_on_a_slope_carries_its_weight_and_creeps_no_further() {
             y_m: -2.0,
             heading_rad: 0.7,
         },
-        limit: FrictionLimit::Cone,
+        contacts: Contacts::Elastic,
         steps_per_sample: STEPS_PER_SAMPLE,
     };
     let mut plant = OdePlant::start(&program, &robot).unwrap();
@@ -121,7 +121,7 @@ fn an_impossible_robot_is_refused_with_its_reason() {
         model: &model,
         deviations,
         start: Pose::default(),
-        limit: FrictionLimit::Cone,
+        contacts: Contacts::Elastic,
         steps_per_sample: STEPS_PER_SAMPLE,
     };
     let refused = OdePlant::start(&program, &robot).expect_err("a servo has a lag");
@@ -131,12 +131,10 @@ fn an_impossible_robot_is_refused_with_its_reason() {
 #[test]
 fn agents_give_estimates_on_odes_contacts_and_most_intervals_hold() {
     let Some(program) = program() else { return };
-    let trials: Vec<_> = (0..4)
-        .map(|index| drawn(8_000_001 + index, true, Tyres::Rigid))
-        .collect();
+    let trials: Vec<_> = (0..4).map(|index| drawn(8_000_001 + index, true)).collect();
     let (mut estimates, mut covered) = (0, 0);
     for outcome in in_parallel(&trials, |trial| {
-        run(&program, trial, FrictionLimit::Cone, STEPS_PER_SAMPLE)
+        run(&program, trial, Contacts::Rigid, STEPS_PER_SAMPLE)
     }) {
         let outcome = outcome.unwrap();
         for said in outcome.said.into_iter().flatten() {

@@ -20,35 +20,21 @@ use crate::rough::sensors::{SensorSpec, Sensors};
 use crate::rough::spec::{Deviations, MAKES};
 use crate::rough::width::Width;
 
-use process::{FrictionLimit, OdePlant, OdeProgram, OdeRobot};
+use process::{Contacts, OdePlant, OdeProgram, OdeRobot};
 
 /// Factor by which distributions are wider than those of the rough world.
 pub const WIDTH: f64 = 1.3;
 /// Mask of the seed for drawing the robot, so that robot and sensor noise are independent.
 const ROBOT_SEED: u64 = 0x0de;
 
-/// Tyres of the robots.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
-pub enum Tyres {
-    /// ODE's contacts alone: force follows slip at once.
-    #[default]
-    Rigid,
-    /// Tyres that deflect, with the drawn relaxation lengths. The deflection is that of a spring under
-    /// the contact's force, so that a sliding contact deflects no further.
-    Elastic,
-}
-
 /// Draws the drive of a seed: the same robot, with torque or without.
-pub fn drawn(seed: u64, has_torque: bool, tyres: Tyres) -> Trial {
+pub fn drawn(seed: u64, has_torque: bool) -> Trial {
     let mut random = Random::new(seed ^ ROBOT_SEED);
     let width = Width::new(WIDTH).unwrap_or_default();
     let make = random.one_of(&MAKES).unwrap_or(MAKES[0]);
     let mut deviations = Deviations::drawn_wider(&mut random, width);
     // ODE's own contacts: force-dependent slip up to a limit.
     deviations.curve.shape = Shape::Linear;
-    if tyres == Tyres::Rigid {
-        deviations.relaxation_m = 0.0;
-    }
     Trial {
         make,
         deviations,
@@ -62,14 +48,14 @@ pub fn drawn(seed: u64, has_torque: bool, tyres: Tyres) -> Trial {
     }
 }
 
-/// Runs a drive with a limit of friction, and so many integration steps in a sample.
+/// Runs a drive on these contacts, with so many integration steps in a sample.
 ///
 /// # Errors
 /// The robot's model or its plan is impossible, or the simulation failed.
 pub fn run(
     program: &OdeProgram,
     trial: &Trial,
-    limit: FrictionLimit,
+    contacts: Contacts,
     steps_per_sample: u32,
 ) -> anyhow::Result<Outcome> {
     let model = trial.make.model()?;
@@ -77,7 +63,7 @@ pub fn run(
         model: &model,
         deviations: trial.deviations,
         start: Pose::default(),
-        limit,
+        contacts,
         steps_per_sample,
     };
     let plant = OdePlant::start(program, &robot)?;

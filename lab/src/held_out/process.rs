@@ -4,6 +4,7 @@ use std::io::{self, BufRead, BufReader, Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 
+use serde::Serialize;
 use tread_control::geometry::Pose;
 use tread_control::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
 use tread_control::robot::{GRAVITY_M_S2, RobotModel};
@@ -97,15 +98,45 @@ impl OdeProgram {
     }
 }
 
-/// Limit of a contact's force.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
-pub enum FrictionLimit {
-    /// A sliding contact's force is against its sliding, as that of tyres is.
+/// Contacts of a robot with the ground.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, clap::ValueEnum)]
+#[serde(rename_all = "snake_case")]
+pub enum Contacts {
+    /// ODE's own: force follows slip at once, and a sliding contact's force is against its sliding.
     #[default]
-    Cone,
-    /// Longitudinal and lateral force have limits of their own: ODE's pyramid along the wheel. A tyre
-    /// that slides sideways keeps its longitudinal stiffness, which no tyre does.
+    Rigid,
+    /// Tyres that deflect, with the drawn relaxation lengths. The deflection is that of a spring under
+    /// the contact's force, so a sliding contact deflects no further.
+    Elastic,
+    /// As rigid ones, but longitudinal and lateral force have limits of their own: ODE's pyramid
+    /// along the wheel. A tyre that slides sideways keeps its longitudinal stiffness, which no tyre
+    /// does.
     Pyramid,
+}
+
+impl Contacts {
+    /// All contacts.
+    pub const ALL: [Self; 3] = [Self::Rigid, Self::Elastic, Self::Pyramid];
+
+    /// Returns the name for reports.
+    pub fn text(self) -> &'static str {
+        match self {
+            Self::Rigid => "rigid",
+            Self::Elastic => "elastic",
+            Self::Pyramid => "pyramid",
+        }
+    }
+
+    fn is_cone(self) -> bool {
+        self != Self::Pyramid
+    }
+
+    fn relaxation_m(self, drawn_m: f64) -> f64 {
+        match self {
+            Self::Elastic => drawn_m,
+            Self::Rigid | Self::Pyramid => 0.0,
+        }
+    }
 }
 
 /// Robot to simulate.
@@ -117,8 +148,8 @@ pub struct OdeRobot<'a> {
     pub deviations: Deviations,
     /// Pose of the centre of the wheels at the start.
     pub start: Pose,
-    /// Limit of the contacts' forces.
-    pub limit: FrictionLimit,
+    /// Contacts with the ground.
+    pub contacts: Contacts,
     /// Integration steps in a sample; at least 10, since steps are at most 1 ms.
     pub steps_per_sample: u32,
 }
@@ -166,11 +197,11 @@ impl OdeRobot<'_> {
             ),
             ("stiffness", spec.curve.stiffness),
             ("mu_peak", spec.curve.mu_peak),
+            ("is_cone", f64::from(u8::from(self.contacts.is_cone()))),
             (
-                "is_cone",
-                f64::from(u8::from(self.limit == FrictionLimit::Cone)),
+                "relaxation_m",
+                self.contacts.relaxation_m(spec.relaxation_m),
             ),
-            ("relaxation_m", spec.relaxation_m),
             ("slope_x_rad", spec.slope_rad[0]),
             ("slope_y_rad", spec.slope_rad[1]),
             ("gear_loss_ratio", spec.gear_loss_ratio),

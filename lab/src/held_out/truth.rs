@@ -8,7 +8,7 @@ use tread_control::robot::GRAVITY_M_S2;
 use serde::Serialize;
 
 use super::process::{
-    FrictionLimit, OdePlant, OdeProgram, OdeRobot, STEPS_PER_SAMPLE, WHEELS, WheelContact,
+    Contacts, OdePlant, OdeProgram, OdeRobot, STEPS_PER_SAMPLE, WHEELS, WheelContact,
 };
 use crate::rough::means::Means;
 use crate::rough::spec::{Deviations, MAKES, Make};
@@ -109,7 +109,7 @@ impl RobotOf {
             model: &self.model,
             deviations: self.deviations,
             start: Pose::default(),
-            limit: FrictionLimit::default(),
+            contacts: Contacts::Elastic,
             steps_per_sample,
         }
     }

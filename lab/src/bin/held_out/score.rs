@@ -2,6 +2,7 @@
 
 use serde::Serialize;
 use tread_api::friction::NORMAL_95;
+use tread_lab::held_out::process::Contacts;
 use tread_lab::report::Check;
 use tread_lab::rough::run::{Outcome, Trial};
 
@@ -16,11 +17,25 @@ const SLIPS_MOSTLY: f64 = 0.5;
 /// A drive and its result.
 pub(crate) type Drive = (Trial, Outcome);
 
+/// Drives that are evaluated together.
+#[derive(Debug, Clone, Copy, Serialize)]
+pub(crate) struct Group {
+    pub(crate) contacts: Contacts,
+    pub(crate) has_torque: bool,
+}
+
+impl Group {
+    /// For people.
+    pub(crate) fn torque(self) -> &'static str {
+        if self.has_torque { "with" } else { "without" }
+    }
+}
+
 /// Figures of all drives, or of a stratum.
 #[derive(Debug, Serialize)]
 pub(crate) struct Line {
     name: String,
-    has_torque: bool,
+    group: Group,
     /// Whether the coverage has a goal.
     has_goal: bool,
     drives: usize,
@@ -42,7 +57,7 @@ pub(crate) struct Line {
 }
 
 impl Line {
-    fn of(name: String, has_torque: bool, has_goal: bool, drives: &[&Drive]) -> Self {
+    fn of(name: String, group: Group, has_goal: bool, drives: &[&Drive]) -> Self {
         let (mut errors, mut widths) = (Vec::new(), Vec::new());
         let (mut answers, mut covered, mut below, mut above) = (0, 0, 0, 0);
         for (_, outcome) in drives {
@@ -63,7 +78,7 @@ impl Line {
         let estimates = errors.len();
         Self {
             name,
-            has_torque,
+            group,
             has_goal,
             drives: drives.len(),
             answers,
@@ -77,17 +92,10 @@ impl Line {
         }
     }
 
-    fn torque(&self) -> &'static str {
-        if self.has_torque { "with" } else { "without" }
-    }
-
     /// What must hold of the coverage, if it has a goal.
     pub(crate) fn check(&self) -> Option<Check> {
-        let name = format!(
-            "{}, {} torque: coverage of 95 % intervals",
-            self.name,
-            self.torque()
-        );
+        let (contacts, torque) = (self.group.contacts.text(), self.group.torque());
+        let name = format!("{contacts}, {}, {torque} torque: coverage", self.name);
         self.has_goal
             .then(|| Check::at_least(name, self.coverage, COVERAGE_MIN))
     }
@@ -122,9 +130,9 @@ const COLUMNS: [&str; 9] = [
 ];
 
 /// All drives, and their strata; those of the ground have a goal.
-pub(crate) fn lines(has_torque: bool, drives: &[Drive]) -> Vec<Line> {
+pub(crate) fn lines(group: Group, drives: &[Drive]) -> Vec<Line> {
     let everything: Vec<&Drive> = drives.iter().collect();
-    let mut lines = vec![Line::of("all".to_owned(), has_torque, true, &everything)];
+    let mut lines = vec![Line::of("all".to_owned(), group, true, &everything)];
     let classes: [(bool, fn(&Drive) -> String); 4] = [
         (true, |(trial, _)| {
             format!("K {:.2}", trial.deviations.curve.stiffness)
@@ -146,7 +154,7 @@ pub(crate) fn lines(has_torque: bool, drives: &[Drive]) -> Vec<Line> {
         for name in names {
             let of_class: Vec<&Drive> =
                 drives.iter().filter(|drive| class(drive) == name).collect();
-            lines.push(Line::of(name, has_torque, has_goal, &of_class));
+            lines.push(Line::of(name, group, has_goal, &of_class));
         }
     }
     lines
@@ -154,24 +162,30 @@ pub(crate) fn lines(has_torque: bool, drives: &[Drive]) -> Vec<Line> {
 
 /// Prints the lines as a table for people.
 pub(crate) fn text(lines: &[Line]) -> String {
-    let row = |name: &str, torque: &str, cells: &[String]| {
+    let row = |contacts: &str, name: &str, torque: &str, cells: &[String]| {
         let cells: Vec<String> = cells.iter().map(|cell| format!("{cell:>10}")).collect();
-        format!("{name:<28} {torque:>8} {}\n", cells.join(" "))
+        format!("{contacts:<8} {name:<28} {torque:>8} {}\n", cells.join(" "))
     };
-    let mut text = row("", "torque", &COLUMNS.map(str::to_owned));
+    let mut text = row("contacts", "", "torque", &COLUMNS.map(str::to_owned));
     for line in lines {
-        text += &row(&line.name, line.torque(), &line.cells());
+        text += &row(
+            line.group.contacts.text(),
+            &line.name,
+            line.group.torque(),
+            &line.cells(),
+        );
     }
     text
 }
 
 /// Prints the lines as a table in Markdown.
 pub(crate) fn markdown(lines: &[Line]) -> String {
-    let mut text = format!("| | torque | {} |\n", COLUMNS.join(" | "));
-    text += &format!("|---|---{}|\n", "|---".repeat(COLUMNS.len()));
+    let mut text = format!("| contacts | | torque | {} |\n", COLUMNS.join(" | "));
+    text += &format!("|---|---|---{}|\n", "|---".repeat(COLUMNS.len()));
     for line in lines {
         let cells = line.cells().join(" | ");
-        text += &format!("| {} | {} | {cells} |\n", line.name, line.torque());
+        let (contacts, torque) = (line.group.contacts.text(), line.group.torque());
+        text += &format!("| {contacts} | {} | {torque} | {cells} |\n", line.name);
     }
     text
 }

@@ -3,9 +3,9 @@
 use std::fmt::Write as _;
 
 use serde::Serialize;
+use tread_lab::held_out::drawn;
 use tread_lab::held_out::process::OdeProgram;
 use tread_lab::held_out::truth::{Pull, StepDifference, pulls, step_differences, unequal_loads};
-use tread_lab::held_out::{Tyres, drawn};
 use tread_lab::report::Check;
 
 /// Stiffnesses of the grounds that are measured, rounded.
@@ -44,7 +44,7 @@ impl Simulator {
                 .push(unequal_loads(program, stiffness)?);
         }
         for seed in COMPARED_SEEDS {
-            let trial = drawn(seed, true, Tyres::Elastic);
+            let trial = drawn(seed, true);
             let found = step_differences(program, trial.make, trial.deviations)?;
             tested.steps.extend(found);
         }
