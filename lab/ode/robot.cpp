@@ -78,18 +78,54 @@ constexpr double RESTS_S = 0.5;
 constexpr double SLIP_MIN_M_S = 1.0e-6;
 // Least load in the slip compliance, over a quarter of the weight.
 constexpr double LOAD_MIN_RATIO = 0.01;
-// Most steps of one drive command: an hour of the smallest step.
-constexpr long STEPS_MAX = 40'000'000;
+// Most steps of one drive command, which bounds the time of an answer.
+constexpr long STEPS_MAX = 1'000'000;
 constexpr int WHEELS = 4;
+// Longest integration step.
+constexpr double STEP_MAX_S = 1.0e-3;
 
-using Parameters = std::map<std::string, double>;
+// What a robot is, as the line `robot` gives it.
+struct Parameters {
+    double step_s, mass_kg, yaw_inertia_kg_m2, center_forward_m, center_left_m, center_height_m, track_m,
+        wheelbase_m, radius_left_m, radius_right_m, wheel_inertia_kg_m2, stiffness, mu_peak, is_cone,
+        relaxation_m, slope_x_rad, slope_y_rad, gear_loss_ratio, rolling_resistance_ratio, servo_lag_s,
+        torque_limit_n_m, x_m, y_m, heading_rad, gravity_m_s2;
+};
 
-const std::array<const char *, 25> KEYS = {
-    "step_s", "mass_kg", "yaw_inertia_kg_m2", "center_forward_m", "center_left_m", "center_height_m",
-    "track_m", "wheelbase_m", "radius_left_m", "radius_right_m", "wheel_inertia_kg_m2",
-    "stiffness", "mu_peak", "is_cone", "relaxation_m", "slope_x_rad", "slope_y_rad", "gear_loss_ratio",
-    "rolling_resistance_ratio", "servo_lag_s", "torque_limit_n_m", "x_m", "y_m", "heading_rad",
-    "gravity_m_s2"};
+struct Key {
+    const char *name;
+    double Parameters::*value;
+    // Values that are possible.
+    enum { ANY, POSITIVE, NOT_NEGATIVE } range;
+};
+
+const Key KEYS[] = {
+    {"step_s", &Parameters::step_s, Key::POSITIVE},
+    {"mass_kg", &Parameters::mass_kg, Key::POSITIVE},
+    {"yaw_inertia_kg_m2", &Parameters::yaw_inertia_kg_m2, Key::POSITIVE},
+    {"center_forward_m", &Parameters::center_forward_m, Key::ANY},
+    {"center_left_m", &Parameters::center_left_m, Key::ANY},
+    {"center_height_m", &Parameters::center_height_m, Key::POSITIVE},
+    {"track_m", &Parameters::track_m, Key::POSITIVE},
+    {"wheelbase_m", &Parameters::wheelbase_m, Key::POSITIVE},
+    {"radius_left_m", &Parameters::radius_left_m, Key::POSITIVE},
+    {"radius_right_m", &Parameters::radius_right_m, Key::POSITIVE},
+    {"wheel_inertia_kg_m2", &Parameters::wheel_inertia_kg_m2, Key::POSITIVE},
+    {"stiffness", &Parameters::stiffness, Key::POSITIVE},
+    {"mu_peak", &Parameters::mu_peak, Key::POSITIVE},
+    {"is_cone", &Parameters::is_cone, Key::ANY},
+    {"relaxation_m", &Parameters::relaxation_m, Key::NOT_NEGATIVE},
+    {"slope_x_rad", &Parameters::slope_x_rad, Key::ANY},
+    {"slope_y_rad", &Parameters::slope_y_rad, Key::ANY},
+    {"gear_loss_ratio", &Parameters::gear_loss_ratio, Key::NOT_NEGATIVE},
+    {"rolling_resistance_ratio", &Parameters::rolling_resistance_ratio, Key::NOT_NEGATIVE},
+    {"servo_lag_s", &Parameters::servo_lag_s, Key::POSITIVE},
+    {"torque_limit_n_m", &Parameters::torque_limit_n_m, Key::POSITIVE},
+    {"x_m", &Parameters::x_m, Key::ANY},
+    {"y_m", &Parameters::y_m, Key::ANY},
+    {"heading_rad", &Parameters::heading_rad, Key::ANY},
+    {"gravity_m_s2", &Parameters::gravity_m_s2, Key::POSITIVE},
+};
 
 [[noreturn]] void fail(const std::string &text) {
     std::cout << "error " << text << std::endl;
@@ -134,13 +170,13 @@ struct Wheel {
 
 class Robot {
 public:
-    explicit Robot(Parameters parameters) : is(std::move(parameters)), step_s(is.at("step_s")) {
+    explicit Robot(const Parameters &parameters) : is(parameters), step_s(is.step_s) {
         world = dWorldCreate();
         group = dJointGroupCreate(0);
         plane = dCreatePlane(nullptr, 0, 0, 1, 0);
-        mass_kg = is.at("mass_kg");
+        mass_kg = is.mass_kg;
         build();
-        const double deflected_m = is.at("gravity_m_s2") / (SPRINGS_RAD_S * SPRINGS_RAD_S);
+        const double deflected_m = is.gravity_m_s2 / (SPRINGS_RAD_S * SPRINGS_RAD_S);
         shift(0.0, 0.0, -deflected_m);
         settle();
     }
@@ -181,7 +217,7 @@ public:
             }
         }
         for (const Wheel &wheel : wheels_of) {
-            peak = std::max(peak, std::hypot(wheel.mu[0], wheel.mu[1]) / is.at("mu_peak"));
+            peak = std::max(peak, std::hypot(wheel.mu[0], wheel.mu[1]) / is.mu_peak);
         }
         dVector3 place, speed;
         dBodyGetRelPointPos(chassis, middle[0], middle[1], middle[2], place);
@@ -240,16 +276,16 @@ private:
     double pull_n[2] = {0, 0};
 
     void build() {
-        const double half_base = 0.5 * is.at("wheelbase_m"), half_track = 0.5 * is.at("track_m");
-        const double radius[2] = {is.at("radius_left_m"), is.at("radius_right_m")};
+        const double half_base = 0.5 * is.wheelbase_m, half_track = 0.5 * is.track_m;
+        const double radius[2] = {is.radius_left_m, is.radius_right_m};
         const double wheel_kg = WHEEL_MASS_SHARE * mass_kg;
         const double chassis_kg = mass_kg - WHEELS * wheel_kg;
-        const double center[3] = {is.at("center_forward_m"), is.at("center_left_m"), is.at("center_height_m")};
-        const double axle_kg_m2 = is.at("wheel_inertia_kg_m2");
+        const double center[3] = {is.center_forward_m, is.center_left_m, is.center_height_m};
+        const double axle_kg_m2 = is.wheel_inertia_kg_m2;
         const double diameter_kg_m2 = DIAMETER_OVER_AXLE * axle_kg_m2;
         // The chassis is what is left of mass, centre of mass and yaw inertia without the wheels.
         double sum[3] = {mass_kg * center[0], mass_kg * center[1], mass_kg * center[2]};
-        double yaw_kg_m2 = is.at("yaw_inertia_kg_m2");
+        double yaw_kg_m2 = is.yaw_inertia_kg_m2;
         double at[WHEELS][3];
         for (int number = 0; number < WHEELS; ++number) {
             at[number][0] = number % 2 == 0 ? half_base : -half_base;
@@ -269,12 +305,12 @@ private:
         dMassSetParameters(&mass, chassis_kg, 0, 0, 0, ROLL_OVER_YAW * yaw_kg_m2,
                            ROLL_OVER_YAW * yaw_kg_m2, yaw_kg_m2, 0, 0, 0);
         dBodySetMass(chassis, &mass);
-        const double cosine = std::cos(is.at("heading_rad")), sine = std::sin(is.at("heading_rad"));
+        const double cosine = std::cos(is.heading_rad), sine = std::sin(is.heading_rad);
         const auto place = [&](dBodyID body, const double *point) {
-            dBodySetPosition(body, is.at("x_m") + cosine * point[0] - sine * point[1],
-                             is.at("y_m") + sine * point[0] + cosine * point[1], point[2]);
+            dBodySetPosition(body, is.x_m + cosine * point[0] - sine * point[1],
+                             is.y_m + sine * point[0] + cosine * point[1], point[2]);
             dMatrix3 rotation;
-            dRFromAxisAndAngle(rotation, 0, 0, 1, is.at("heading_rad"));
+            dRFromAxisAndAngle(rotation, 0, 0, 1, is.heading_rad);
             dBodySetRotation(body, rotation);
         };
         place(chassis, own);
@@ -303,15 +339,15 @@ private:
             dJointSetHingeAxis(wheel.hinge, -sine, cosine, 0);
             dJointSetFeedback(wheel.hinge, &wheel.hinge_feedback);
             // The motor is ODE's: a torque of gain * (target - speed), within its limit.
-            dJointSetHingeParam(wheel.hinge, dParamFMax, is.at("torque_limit_n_m"));
+            dJointSetHingeParam(wheel.hinge, dParamFMax, is.torque_limit_n_m);
             dJointSetHingeParam(wheel.hinge, dParamCFM, 1.0 / gain(wheel));
-            wheel.load_n = 0.25 * mass_kg * is.at("gravity_m_s2");
+            wheel.load_n = 0.25 * mass_kg * is.gravity_m_s2;
         }
     }
 
     double gain(const Wheel &wheel) const {
         const double carried = 0.25 * mass_kg * wheel.radius_m * wheel.radius_m;
-        return (carried + is.at("wheel_inertia_kg_m2")) / is.at("servo_lag_s");
+        return (carried + is.wheel_inertia_kg_m2) / is.servo_lag_s;
     }
 
     // Tilts gravity slowly, so that tyres and springs do not oscillate; then puts the robot back.
@@ -323,7 +359,7 @@ private:
         }
         dVector3 place;
         dBodyGetRelPointPos(chassis, middle[0], middle[1], middle[2], place);
-        shift(is.at("x_m") - place[0], is.at("y_m") - place[1], 0.0);
+        shift(is.x_m - place[0], is.y_m - place[1], 0.0);
         for (Wheel &wheel : wheels_of) wheel.turned_rad = 0.0;
     }
 
@@ -337,8 +373,8 @@ private:
     }
 
     void tilt(double share) {
-        const double x = std::tan(share * is.at("slope_x_rad")), y = std::tan(share * is.at("slope_y_rad"));
-        const double down = is.at("gravity_m_s2") / std::sqrt(1.0 + x * x + y * y);
+        const double x = std::tan(share * is.slope_x_rad), y = std::tan(share * is.slope_y_rad);
+        const double down = is.gravity_m_s2 / std::sqrt(1.0 + x * x + y * y);
         dWorldSetGravity(world, -x * down, -y * down, -down);
     }
 
@@ -379,10 +415,10 @@ private:
     void motor(Wheel &wheel, double target_rad_s) {
         dJointSetHingeParam(wheel.hinge, dParamVel, target_rad_s + wheel.integral_n_m / gain(wheel));
         const double turns = std::tanh(wheel.rate_rad_s * wheel.radius_m / RESISTANCE_TURNS_M_S);
-        const double lost = is.at("gear_loss_ratio") * std::fabs(wheel.force_n[0]) * wheel.radius_m * turns;
+        const double lost = is.gear_loss_ratio * std::fabs(wheel.force_n[0]) * wheel.radius_m * turns;
         dJointAddHingeTorque(wheel.hinge, -lost);
         const double rolling =
-            wheel.touches ? is.at("rolling_resistance_ratio") * wheel.load_n * wheel.radius_m * turns : 0.0;
+            wheel.touches ? is.rolling_resistance_ratio * wheel.load_n * wheel.radius_m * turns : 0.0;
         dVector3 axle;
         dJointGetHingeAxis(wheel.hinge, axle);
         dBodyAddTorque(wheel.body, -rolling * axle[0], -rolling * axle[1], -rolling * axle[2]);
@@ -407,15 +443,15 @@ private:
         directions(wheel);
         wheel.touches = dCollide(wheel.geom, plane, 1, &contact.geom, sizeof contact.geom) == 1;
         if (!wheel.touches) return;
-        const double theta = 1.0 / is.at("stiffness");
-        const double weight_n = 0.25 * mass_kg * is.at("gravity_m_s2");
+        const double theta = 1.0 / is.stiffness;
+        const double weight_n = 0.25 * mass_kg * is.gravity_m_s2;
         const double load_n = std::max(wheel.load_n, LOAD_MIN_RATIO * weight_n);
         const double rim_m_s = std::max(std::fabs(wheel.rate_rad_s) * wheel.radius_m, RIM_MIN_M_S);
-        const double bends_m_s = is.at("relaxation_m") / step_s;
+        const double bends_m_s = is.relaxation_m / step_s;
         const double motion[2] = {theta * bends_m_s * wheel.mu[0], theta * bends_m_s * wheel.mu[1]};
         // First direction of friction, in those of the wheel.
         double first[2] = {1.0, 0.0};
-        if (is.at("is_cone") != 0.0) {
+        if (is.is_cone != 0.0) {
             const double goal[2] = {motion[0] + wheel.slip_m_s[0], motion[1] + wheel.slip_m_s[1]};
             const double size = std::hypot(goal[0], goal[1]);
             if (size > SLIP_MIN_M_S) {
@@ -429,7 +465,7 @@ private:
         dSurfaceParameters &surface = contact.surface;
         surface.mode = dContactFDir1 | dContactSoftERP | dContactSoftCFM | dContactApprox1_1 |
                        dContactApprox1_2 | dContactSlip1 | dContactSlip2 | dContactMotion1 | dContactMotion2;
-        surface.mu = is.at("mu_peak");
+        surface.mu = is.mu_peak;
         surface.slip1 = surface.slip2 = theta * (rim_m_s + bends_m_s) / load_n;
         surface.motion1 = first[0] * motion[0] + first[1] * motion[1];
         surface.motion2 = first[0] * motion[1] - first[1] * motion[0];
@@ -460,8 +496,8 @@ private:
         wheel.turned_rad += step_s * wheel.rate_rad_s;
         wheel.motor_n_m = dot(wheel.hinge_feedback.t1, axle);
         // Anti-windup: the integral does not change while the torque is limited.
-        if (std::fabs(wheel.motor_n_m) < (1.0 - 1.0e-6) * is.at("torque_limit_n_m")) {
-            const double rate = gain(wheel) / (RESET_OVER_LAG * is.at("servo_lag_s"));
+        if (std::fabs(wheel.motor_n_m) < (1.0 - 1.0e-6) * is.torque_limit_n_m) {
+            const double rate = gain(wheel) / (RESET_OVER_LAG * is.servo_lag_s);
             wheel.integral_n_m += rate * (target_rad_s - wheel.rate_rad_s) * step_s;
         }
     }
@@ -469,7 +505,7 @@ private:
 
 // Reads KEY=VALUE pairs: each key once, and no other.
 Parameters parameters_of(std::istringstream &words) {
-    Parameters found;
+    std::map<std::string, double> found;
     for (std::string word; words >> word;) {
         const size_t equals = word.find('=');
         if (equals == std::string::npos) fail("`" + word + "` is not KEY=VALUE");
@@ -479,26 +515,21 @@ Parameters parameters_of(std::istringstream &words) {
         if (text.empty() || *end != '\0' || !std::isfinite(value)) fail("`" + word + "` has no number");
         if (!found.emplace(key, value).second) fail("`" + key + "` is there twice");
     }
-    for (const char *key : KEYS) {
-        if (found.count(key) == 0) fail(std::string("`") + key + "` is missing");
-    }
-    if (found.size() != KEYS.size()) {
-        for (const auto &[key, value] : found) {
-            bool is_known = false;
-            for (const char *known : KEYS) is_known = is_known || key == known;
-            if (!is_known) fail("nothing is named `" + key + "`");
+    Parameters parameters = {};
+    for (const Key &key : KEYS) {
+        const auto given = found.find(key.name);
+        if (given == found.end()) fail(std::string("`") + key.name + "` is missing");
+        const double value = given->second;
+        if (key.range == Key::POSITIVE && value <= 0.0) fail(std::string("`") + key.name + "` must be above zero");
+        if (key.range == Key::NOT_NEGATIVE && value < 0.0) {
+            fail(std::string("`") + key.name + "` must not be below zero");
         }
+        parameters.*key.value = value;
+        found.erase(given);
     }
-    for (const char *key : {"step_s", "mass_kg", "yaw_inertia_kg_m2", "center_height_m", "track_m", "wheelbase_m",
-                            "radius_left_m", "radius_right_m", "wheel_inertia_kg_m2", "stiffness", "mu_peak",
-                            "servo_lag_s", "torque_limit_n_m", "gravity_m_s2"}) {
-        if (found.at(key) <= 0.0) fail(std::string("`") + key + "` must be above zero");
-    }
-    for (const char *key : {"relaxation_m", "gear_loss_ratio", "rolling_resistance_ratio"}) {
-        if (found.at(key) < 0.0) fail(std::string("`") + key + "` must not be below zero");
-    }
-    if (found.at("step_s") > 1.0e-3) fail("`step_s` must be at most 0.001");
-    return found;
+    if (!found.empty()) fail("nothing is named `" + found.begin()->first + "`");
+    if (parameters.step_s > STEP_MAX_S) fail("`step_s` must be at most 0.001");
+    return parameters;
 }
 
 } // namespace
