@@ -15,3 +15,4 @@ pub mod run;
 pub mod sensors;
 pub mod spec;
 pub mod tracking;
+pub mod width;

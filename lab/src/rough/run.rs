@@ -13,7 +13,7 @@ use tread_control::geometry::Pose;
 use tread_control::robot::RobotModel;
 
 use super::bound::{BoundInput, bounds};
-use super::drive::RoughDrive;
+use super::drive::{RoughDrive, SimulatedPlant};
 use super::sensors::SensorSpec;
 use super::spec::{Deviations, Make};
 use crate::random::Random;
@@ -170,6 +170,16 @@ pub fn run(trial: &Trial) -> anyhow::Result<Outcome> {
         random,
     )
     .ok_or_else(|| anyhow::anyhow!("the wheels of {} are no rectangle", trial.make.name))?;
+    run_with(trial, drive)
+}
+
+/// Runs a drive of a robot that is already made, whose plant need not be that of the rough world.
+///
+/// # Errors
+/// The robot's model or its plan is impossible, the simulation failed, or the bound cannot be
+/// computed.
+pub fn run_with<P: SimulatedPlant>(trial: &Trial, drive: RoughDrive<P>) -> anyhow::Result<Outcome> {
+    let model = trial.make.model()?;
     let mut bench = Bench::with_drive(drive, model).with_prior(trial.prior);
     bench.run_for(SETTLES);
     bench.begin(1, &trial.course.trajectory(), None)?;
@@ -184,6 +194,7 @@ pub fn run(trial: &Trial) -> anyhow::Result<Outcome> {
             beyond += u32::from(bench.drive().plant().slip_over_peak() > 0.5);
         }
         driven_ticks = asked_at_s * 100;
+        bench.drive().plant().check()?;
         said[index] = bench.theta();
         at_samples[index] = bench.drive().commands().len();
     }

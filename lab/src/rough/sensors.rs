@@ -15,12 +15,17 @@ use tread_control::robot::{GRAVITY_M_S2, RobotModel};
 
 use super::means::Means;
 use super::plant::Truth;
+use super::width::Width;
 use crate::random::Random;
 
 /// Time between two samples of the fast sensors.
 pub const SAMPLE_PERIOD: Duration = Duration::from_millis(10);
 /// Correlation time of the slow position error, in seconds.
 pub const POSITION_WANDERS_S: f64 = 20.0;
+/// Middle of the drawn sampling periods of positions, in seconds.
+const PERIOD_MIDDLE_S: f64 = 0.1;
+/// Geometric middle of the shortest and the longest delay of positions, in seconds.
+const DELAY_MIDDLE_S: f64 = 0.0447;
 /// Error of an outlier, in metres.
 const OUTLIER_M: f64 = 1.0;
 
@@ -87,15 +92,36 @@ impl SensorSpec {
 
     /// Draws the sensors of one robot of the population.
     pub fn drawn(random: &mut Random, has_torque: bool) -> Self {
-        let rate_hz = random.one_of(&[5_u32, 10, 20]).unwrap_or(10);
+        Self::drawn_wider(random, has_torque, Width::default())
+    }
+
+    /// Draws the sensors of one robot from distributions that are wider than those of the
+    /// population: standard deviations of errors are larger, too.
+    pub fn drawn_wider(random: &mut Random, has_torque: bool, width: Width) -> Self {
+        let period_s = random.one_of(&[0.2, 0.1, 0.05]).unwrap_or(0.1);
+        let period_s = width.log_value(period_s, PERIOD_MIDDLE_S);
+        let usual = Self::usual(has_torque);
         Self {
-            counts_per_turn: random.log_uniform(4_096.0..80_000.0),
-            gyro_walk_rad_s: random.log_uniform(3.0e-5..3.0e-4),
-            position_m: random.log_uniform(0.005..0.03),
-            position_period: Duration::from_secs(1) / rate_hz,
-            position_delay: Duration::from_millis(10) * random.one_of(&[2, 5, 10]).unwrap_or(5),
-            outlier_share: random.one_of(&[0.0, 0.002]).unwrap_or(0.0),
-            ..Self::usual(has_torque)
+            counts_per_turn: random.log_uniform(width.log_range(4_096.0..80_000.0)),
+            gyro_rad_s: width.std_dev(usual.gyro_rad_s),
+            gyro_offset_rad_s: width.std_dev(usual.gyro_offset_rad_s),
+            gyro_walk_rad_s: random.log_uniform(width.log_range(3.0e-5..3.0e-4)),
+            acceleration_m_s2: width.std_dev(usual.acceleration_m_s2),
+            acceleration_offset_m_s2: width.std_dev(usual.acceleration_offset_m_s2),
+            torque_mu: width.std_dev(usual.torque_mu),
+            body_speed_m_s: width.std_dev(usual.body_speed_m_s),
+            heading_rad: width.std_dev(usual.heading_rad),
+            position_wander_m: width.std_dev(usual.position_wander_m),
+            position_m: random.log_uniform(width.log_range(0.005..0.03)),
+            position_period: Duration::from_secs_f64(period_s),
+            position_delay: Duration::from_secs_f64(width.log_value(
+                random.one_of(&[0.02, 0.05, 0.1]).unwrap_or(0.05),
+                DELAY_MIDDLE_S,
+            )),
+            outlier_share: width
+                .value(random.one_of(&[0.0, 0.002]).unwrap_or(0.0), 0.001)
+                .max(0.0),
+            ..usual
         }
     }
 }

@@ -1,9 +1,12 @@
 //! Makes of robots, and the differences of a simulated robot and its ground from the agent's model.
 
+use std::ops::Range;
+
 use serde::Serialize;
 use tread_control::robot::{Limits, RobotModel, RobotModelError, RobotModelSpec};
 
 use super::curve::{Curve, Shape};
+use super::width::Width;
 use crate::random::Random;
 
 /// Make of a robot, from its description package and data sheet.
@@ -158,38 +161,57 @@ impl Deviations {
     /// ± 5 to 10 % at most). Slopes are those of yards and fields (standard deviation 2° per axis,
     /// at most 6°).
     pub fn drawn(random: &mut Random) -> Self {
+        Self::drawn_wider(random, Width::default())
+    }
+
+    /// Draws one robot from distributions that are wider than those of the population.
+    pub fn drawn_wider(random: &mut Random, width: Width) -> Self {
         let stiffness = random.one_of(&[0.7, 3.0, 12.0]).unwrap_or(3.0);
+        let stiffness = width.log_value(stiffness, STIFFNESS_MIDDLE);
         let shape = random.one_of(&Shape::ALL).unwrap_or(Shape::Linear);
-        let scale = 1.0 + random.normal(0.03);
-        let slope_max = 6.0_f64.to_radians();
+        let scale = 1.0 + random.normal(width.std_dev(0.03));
+        let slope_max = width.std_dev(6.0_f64.to_radians());
         let mut slope = || {
-            let rad = random.normal(2.0_f64.to_radians());
+            let rad = random.normal(width.std_dev(2.0_f64.to_radians()));
             rad.clamp(-slope_max, slope_max)
         };
         let slope_rad = [slope(), slope()];
+        let side_scale = width.std_dev(0.02);
+        let radius = width.std_dev(0.005);
         Self {
-            payload_ratio: random.uniform(0.0..0.3),
-            inertia_ratio: random.uniform(0.8..1.25),
-            center_forward_ratio: random.uniform(-0.05..0.05),
-            center_left_ratio: random.uniform(-0.03..0.03),
-            center_height_ratio: random.uniform(0.2..0.5),
-            relaxation_m: random.log_uniform(0.01..0.1),
+            payload_ratio: random.uniform(width.range(0.0..0.3)),
+            inertia_ratio: random.uniform(width.range(0.8..1.25)),
+            center_forward_ratio: random.uniform(width.range(-0.05..0.05)),
+            center_left_ratio: random.uniform(width.range(-0.03..0.03)),
+            center_height_ratio: random.uniform(width.range(0.2..0.5)),
+            relaxation_m: random.log_uniform(width.log_range(0.01..0.1)),
             slope_rad,
             torque_scale: [
-                scale * (1.0 + random.normal(0.02)),
-                scale * (1.0 + random.normal(0.02)),
+                scale * (1.0 + random.normal(side_scale)),
+                scale * (1.0 + random.normal(side_scale)),
             ],
-            rotor_ratio: random.uniform(0.01..0.1),
-            gear_loss_ratio: random.uniform(0.0..0.03),
-            rolling_resistance_ratio: random.uniform(0.01..0.04),
-            radius_ratio: [1.0 + random.normal(0.005), 1.0 + random.normal(0.005)],
-            servo_lag_s: random.log_uniform(0.02..0.1),
-            motor_limit_mu: random.uniform(0.8..1.5),
+            rotor_ratio: random.uniform(above(ROTOR_RATIO_MIN, width.range(0.01..0.1))),
+            gear_loss_ratio: random.uniform(above(0.0, width.range(0.0..0.03))),
+            rolling_resistance_ratio: random.uniform(above(0.0, width.range(0.01..0.04))),
+            radius_ratio: [1.0 + random.normal(radius), 1.0 + random.normal(radius)],
+            servo_lag_s: random.log_uniform(width.log_range(0.02..0.1)),
+            motor_limit_mu: random.uniform(width.range(0.8..1.5)),
             curve: Curve {
                 shape,
                 stiffness,
-                mu_peak: random.uniform(0.3..0.9).min(0.9 * stiffness),
+                mu_peak: random.uniform(width.range(0.3..0.9)).min(0.9 * stiffness),
             },
         }
     }
+}
+
+/// Geometric middle of the grounds' stiffnesses 0.7 and 12.
+const STIFFNESS_MIDDLE: f64 = 2.898;
+/// Least inertia of a side's rotors and wheels at the rim, relative to half the mass: that of the
+/// wheels alone.
+const ROTOR_RATIO_MIN: f64 = 0.002;
+
+/// Returns the part of a range above `least`.
+fn above(least: f64, range: Range<f64>) -> Range<f64> {
+    range.start.max(least)..range.end
 }
