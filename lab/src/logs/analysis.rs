@@ -329,12 +329,15 @@ fn checks(
 ) -> Vec<Check> {
     let all = passes.iter().chain([overall]);
     let undecided = all.filter(|verdict| !verdict.is_decided()).count();
-    let mut checks = vec![Check::at_most(
-        "passes that neither have an estimate nor a reason",
-        undecided as f64,
-        0.0,
-    )];
+    let mut checks = vec![
+        Check::of(
+            "passes that neither have an estimate nor a reason",
+            undecided as f64,
+        )
+        .at_most(0.0),
+    ];
     let mean = mean_chi_square(pairs);
-    checks.extend(mean.map(|mean| Check::at_most("χ² per pair of passes", mean, chi_square_max)));
+    checks
+        .extend(mean.map(|mean| Check::of("χ² per pair of passes", mean).at_most(chi_square_max)));
     checks
 }

@@ -97,7 +97,7 @@ impl Line {
         let (contacts, torque) = (self.group.contacts.text(), self.group.torque());
         let name = format!("{contacts}, {}, {torque} torque: coverage", self.name);
         self.has_goal
-            .then(|| Check::at_least(name, self.coverage, COVERAGE_MIN))
+            .then(|| Check::of(name, self.coverage).at_least(COVERAGE_MIN))
     }
 
     fn cells(&self) -> [String; 9] {

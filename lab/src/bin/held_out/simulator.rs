@@ -75,28 +75,32 @@ impl Simulator {
         let errors = errors.map(|pull| (pull.theta_measured() / pull.theta - 1.0).abs());
         let loads = self.unequal_loads.iter().copied().fold(0.0, f64::max);
         let mut checks = vec![
-            Check::at_most(
+            Check::of(
                 "simulator: θ by known pulls, largest relative error",
                 errors.fold(0.0, f64::max),
-                THETA_ERROR_MAX,
-            ),
-            Check::at_most(
+            )
+            .at_most(THETA_ERROR_MAX),
+            Check::of(
                 "simulator: θ of a wheel with unequal loads, largest relative error",
                 loads,
-                THETA_ERROR_MAX,
-            ),
+            )
+            .at_most(THETA_ERROR_MAX),
         ];
         if let Some(finest) = self.worst_steps().last() {
-            checks.push(Check::at_most(
-                "simulator: acceleration with half the step, RMS difference, m/s²",
-                finest.acceleration_m_s2,
-                ACCELERATION_MAX_M_S2,
-            ));
-            checks.push(Check::at_most(
-                "simulator: turn rate with half the step, RMS difference, rad/s",
-                finest.yaw_rate_rad_s,
-                YAW_RATE_MAX_RAD_S,
-            ));
+            checks.push(
+                Check::of(
+                    "simulator: acceleration with half the step, RMS difference, m/s²",
+                    finest.acceleration_m_s2,
+                )
+                .at_most(ACCELERATION_MAX_M_S2),
+            );
+            checks.push(
+                Check::of(
+                    "simulator: turn rate with half the step, RMS difference, rad/s",
+                    finest.yaw_rate_rad_s,
+                )
+                .at_most(YAW_RATE_MAX_RAD_S),
+            );
         }
         checks
     }
