@@ -117,6 +117,13 @@ const standing: Record<StandingState, string> = {
   other: 'stopped',
 };
 
+/** How points are drawn: with a mouse and keys, or with a finger. */
+function howToDraw(what: string, isTouch: boolean): string {
+  return isTouch
+    ? `Tap on the map to add a ${what}, drag a ${what} to move it, long-press it to delete it.`
+    : `Click on the map to add a ${what}, drag a ${what} to move it, right-click to delete it; by keys: move the map, Enter adds its centre.`;
+}
+
 export const texts = {
   name: 'Tread',
   problem: {
@@ -130,6 +137,7 @@ export const texts = {
     submit: 'Sign in',
     provider: (label: string) => `Sign in with ${label}`,
     unavailable: 'It does not answer at the moment.',
+    wrong: 'The server does not know this token: it is mistyped, expired or revoked.',
     again: 'Your sign-in has ended. Sign in again; what you drew is kept.',
     out: 'Sign out',
     as: (name: string, what: string) => `${name}, ${what}`,
@@ -248,6 +256,8 @@ export const texts = {
     onlyRobot: (robot: string) => `Only ${robot}`,
     detail: 'Mission',
     events: 'What happened',
+    times: (what: string, count: number) => `${what} ${count} times`,
+    lastTime: 'last',
     causes: cause,
     quality: 'How it was driven',
     rms: 'Cross-track error, RMS',
@@ -271,10 +281,17 @@ export const texts = {
     waypoints: 'Waypoints',
     robot: 'Robot',
     hintCircle: 'Drag on the map from the centre outwards, or enter numbers.',
-    hintWaypoints:
-      'Click on the map to add a point, drag a point to move it, right-click to delete it; by keys: move the map, Enter adds its centre.',
-    hintTerrain:
-      'Click on the map to add a corner, drag a corner to move it, right-click to delete it; by keys: move the map, Enter adds its centre.',
+    hintWaypoints: (isTouch: boolean) => howToDraw('point', isTouch),
+    hintTerrain: (isTouch: boolean) => howToDraw('corner', isTouch),
+    /** Why what is drawn cannot be sent yet. */
+    why: {
+      circle: 'Not yet: drag a circle on the map, or enter its centre.',
+      waypoints: (count: number) => `Not yet: a path needs two points, ${count} so far.`,
+      robot: 'Not yet: choose a robot.',
+      flaw: 'Not yet: what is said above has to be changed first.',
+      checking: 'Not yet: the dry run is under way.',
+      sending: 'It is being sent.',
+    },
     centerX: 'Centre x, m',
     centerY: 'Centre y, m',
     radius: 'Radius, m',
@@ -356,7 +373,6 @@ export const texts = {
     drawOut: 'Where robots may not be',
     size: (area: string, corners: number) => `${area} m², ${corners} corners`,
     changed: 'Somebody changed the geofence meanwhile: it is shown as it is now. What you drew is kept; save it again.',
-    hint: 'Click on the map to add a corner, drag a corner to move it, right-click to delete it; by keys: move the map, Enter adds its centre.',
   },
   alerts: {
     none: 'No alert stands.',
@@ -381,6 +397,12 @@ export const texts = {
     class: 'Ground',
     layer: 'Layer (higher lies above)',
     corners: 'Corners',
+    why: {
+      corners: (count: number) => `Not yet: an area needs three corners, ${count} so far.`,
+      id: 'Not yet: enter an identifier.',
+      flaw: 'Not yet: what is said above has to be changed first.',
+      sending: 'It is being saved.',
+    },
     save: 'Save',
     cancel: 'Discard',
     classes: terrainClass,

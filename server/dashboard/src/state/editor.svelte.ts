@@ -124,6 +124,29 @@ export class Editor {
     return Number.isInteger(this.priority) ? null : texts.draw.flaw.priority;
   }
 
+  /** Why the area that is drawn cannot be saved, in one sentence; null when it can. */
+  get whyNotSaved(): string | null {
+    void this.version;
+    const { why } = texts.terrains;
+    if (this.isSending) return why.sending;
+    if (this.flaw) return why.flaw;
+    return this.draft?.isWhole ? null : why.corners(this.draft?.points.length ?? 0);
+  }
+
+  /** Why the mission that is drawn cannot be sent, in one sentence; null when it can. */
+  get whyNotSent(): string | null {
+    void this.version;
+    const { why } = texts.draw;
+    const { draft } = this;
+    if (this.isSending) return why.sending;
+    if (!draft || draft.isEmpty) return draft?.kind === 'waypoints' ? why.waypoints(0) : why.circle;
+    if (this.flaw) return why.flaw;
+    if (!draft.isWhole) return draft.kind === 'waypoints' ? why.waypoints(draft.points.length) : why.circle;
+    if (!this.robot) return why.robot;
+    if (this.isChecking) return why.checking;
+    return this.check === null ? why.flaw : null;
+  }
+
   /** Says that draft or form are no longer what they were. */
   changed(): void {
     this.version += 1;
