@@ -18,8 +18,8 @@ export interface Hands {
   changed(): void;
   /** The camera moved. */
   moved(): void;
-  /** A click where nothing is drawn. */
-  clicked(at: PointPx): void;
+  /** A click where nothing is drawn; with Ctrl or Shift it means more than one. */
+  clicked(at: PointPx, isMore: boolean): void;
   /** The pointer is here; null when it left. */
   over(at: PointPx | null): void;
 }
@@ -135,7 +135,7 @@ export function attach(canvas: HTMLCanvasElement, camera: Camera, hands: Hands):
       draft.add(camera.toM(held.from));
       hands.changed();
     } else {
-      hands.clicked(held.from);
+      hands.clicked(held.from, event.ctrlKey || event.metaKey || event.shiftKey);
     }
   };
 

@@ -25,6 +25,8 @@ export class Editor {
   version = $state(0);
 
   robot = $state('');
+  /** Robots that get the mission, if it is for several; the dry run is for `robot`. */
+  robots = $state.raw<string[]>([]);
   speed_m_s = $state(0.5);
   turns = $state(1);
   clockwise = $state(false);
@@ -55,13 +57,23 @@ export class Editor {
 
   constructor(readonly fleet: Fleet) {}
 
+  /** Begins a mission that each of several robots gets. */
+  beginMissions(robots: string[]): void {
+    const [first] = robots;
+    if (first === undefined) return;
+    this.beginMission(first);
+    if (robots.length > 1) this.robots = robots;
+  }
+
   beginMission(robot: string): void {
     this.robot = robot;
+    this.robots = [];
     this.#begin({ what: 'mission' }, new Draft('circle'));
   }
 
   beginReplace(mission: Mission): void {
     this.robot = mission.robot;
+    this.robots = [];
     this.#begin({ what: 'replace', mission }, this.#asIn(mission.trajectory));
   }
 
@@ -117,7 +129,7 @@ export class Editor {
     if (wrong !== null) return texts.draw.flaw.point(wrong);
     if (this.draft?.kind === 'terrain') return null;
     if (!(this.speed_m_s > 0)) return texts.draw.flaw.speed;
-    const model = this.fleet.robots.find((view) => view.id === this.robot)?.robot.model;
+    const model = this.fleet.byId.get(this.robot)?.robot.model;
     const top = model?.limits.linear_max_m_s ?? Infinity;
     if (this.speed_m_s > top) return texts.draw.flaw.fast(this.robot, String(Number(top.toFixed(2))));
     if (this.draft?.kind === 'circle' && !(this.turns > 0)) return texts.draw.flaw.turns;
@@ -227,17 +239,26 @@ export class Editor {
     if (purpose.what === 'replace') {
       return this.#send(`/v1/missions/${purpose.mission.id}/replace`, 'POST', { trajectory });
     }
+    const body = this.missionFor(this.robot);
+    if (!body) return false;
+    this.#key ||= crypto.randomUUID();
+    return this.#send('/v1/missions', 'POST', body, { 'idempotency-key': this.#key });
+  }
+
+  /** What is drawn as a mission of a robot; null while it is none. */
+  missionFor(robot: string): CreateMission | null {
+    const { trajectory } = this;
+    const site = this.fleet.site;
+    if (!trajectory || !site) return null;
     const link = this.linkPolicy === 'continue' ? 'continue' : { stop_after: { silence_s: 5 } };
-    const body = {
+    return {
       site,
-      robot: this.robot,
+      robot,
       trajectory,
       priority: this.priority,
       start_policy: this.startPolicy,
       link_policy: link,
     } as CreateMission;
-    this.#key ||= crypto.randomUUID();
-    return this.#send('/v1/missions', 'POST', body, { 'idempotency-key': this.#key });
   }
 
   async saveTerrain(): Promise<boolean> {

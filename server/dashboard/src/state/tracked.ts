@@ -35,13 +35,14 @@ export class Tracked {
     /** When the server said this, by this page's monotonic clock, milliseconds. */
     public receivedAt: number,
   ) {
-    this.#note();
+    this.#note(0);
   }
 
-  update(robot: Robot, receivedAt: number): void {
+  /** Takes a newer state; samples for the curves are kept at least so far apart, milliseconds. */
+  update(robot: Robot, receivedAt: number, apartMs = 0): void {
     this.robot = robot;
     this.receivedAt = receivedAt;
-    this.#note();
+    this.#note(apartMs);
   }
 
   /** Age of what is shown, seconds; null if it was never heard. */
@@ -51,7 +52,7 @@ export class Tracked {
     return (live.heard_age_ms + now - this.receivedAt) / 1000;
   }
 
-  #note(): void {
+  #note(apartMs: number): void {
     const live = this.robot.live;
     if (!live || this.robot.link !== 'online') return;
     const pose = live.pose?.value;
@@ -65,6 +66,7 @@ export class Tracked {
       }
     }
     const at_s = Date.now() / 1000;
+    if ((at_s - (this.samples.at(-1)?.at_s ?? 0)) * 1000 < apartMs) return;
     const friction = live.friction?.value;
     this.samples.push({
       at_s,
