@@ -48,6 +48,8 @@ export class Fleet implements Listener {
   /** A monotonic clock for ages, milliseconds, twice a second. */
   now = $state(performance.now());
   selected = $state<string | null>(null);
+  /** The site that is to be shown first, if it is one. */
+  wantedSite: string | null = null;
 
   robots = $state.raw<RobotView[]>([]);
   readonly byId = $derived(new Map(this.robots.map((entry) => [entry.id, entry])));
@@ -118,7 +120,8 @@ export class Fleet implements Listener {
       return;
     }
     const kept = localStorage.getItem(SITE_KEY);
-    const first = this.sites.find((site) => site.id === kept) ?? this.sites[0];
+    const first = this.sites.find((site) => site.id === (this.wantedSite ?? kept)) ?? this.sites[0];
+    this.wantedSite = null;
     if (first && !this.site) this.choose(first.id);
   }
 
