@@ -3,7 +3,7 @@
 //! Each command that connects to a server declares these options, so that the others refuse them.
 //! Options in front are moved behind the command, where it reads them.
 
-use std::ffi::OsString;
+use std::ffi::{OsStr, OsString};
 
 use clap::Command;
 
@@ -20,7 +20,7 @@ const LEADING: [(&str, bool); 5] = [
 /// is, for clap to judge.
 pub(super) fn behind_the_command(words: Vec<OsString>, command: &Command) -> Vec<OsString> {
     let mut at = 1;
-    while let Some(has_value) = words.get(at).and_then(leading) {
+    while let Some(has_value) = words.get(at).and_then(|word| leading(word)) {
         at += if has_value { 2 } else { 1 };
     }
     let begin = at.min(words.len());
@@ -47,7 +47,7 @@ pub(super) fn behind_the_command(words: Vec<OsString>, command: &Command) -> Vec
 
 /// Returns whether the next word is the value of this option; `None` if the option is not one that
 /// may stand before the command.
-fn leading(word: &OsString) -> Option<bool> {
+fn leading(word: &OsStr) -> Option<bool> {
     let word = word.to_str()?;
     let (name, has_own_value) = match word.split_once('=') {
         Some((name, _)) => (name, true),

@@ -194,6 +194,8 @@ test('real robots are sent a mission, paused, resumed, cancelled, stopped and cl
   await page.getByLabel('Select rover-1', { exact: true }).check();
   await bar.getByRole('button', { name: 'Stop', exact: true }).click();
   await eventually('three stops', async () => (await stops()).filter((stop) => stop.confirmed_at).length === 3);
+  await summary(page).getByText('3 of 3 done').waitFor();
+  expect((await lines(page).allInnerTexts()).every((text) => text.includes('stopped, confirmed'))).toBe(true);
   await shot(page, 'bulk-stopped');
   await eventually('cleared', async () => {
     await bar.getByRole('button', { name: 'Clear stops' }).click();

@@ -10,8 +10,8 @@ const AT_ONCE = 5;
 const SHOW_MS = 150;
 
 export type Deed = 'stop' | 'clear' | 'pause' | 'resume' | 'cancel' | 'send';
-/** Done, with nothing to do, or failed. */
-export type Outcome = 'waiting' | 'done' | 'nothing' | 'failed';
+/** Its turn comes, the robot has not confirmed it yet, done, with nothing to do, or failed. */
+export type Outcome = 'waiting' | 'unconfirmed' | 'done' | 'nothing' | 'failed';
 
 export interface Line {
   robot: string;
@@ -21,7 +21,7 @@ export interface Line {
 
 /** What became of one robot. */
 interface Became {
-  outcome: 'done' | 'nothing';
+  outcome: 'done' | 'nothing' | 'unconfirmed';
   text: string;
 }
 
@@ -30,7 +30,8 @@ const nothing = (text: string): Became => ({ outcome: 'nothing', text });
 
 export class Bulk {
   deed = $state<Deed | null>(null);
-  lines = $state.raw<Line[]>([]);
+  /** What became of each robot when it was its turn. */
+  #noted = $state.raw<Line[]>([]);
   isRunning = $state(false);
 
   /** Counts what was begun or ended early. */
@@ -40,8 +41,19 @@ export class Bulk {
 
   constructor(readonly fleet: Fleet) {}
 
+  /** What became of each robot, as it is now: stops are confirmed later than they are sent. */
+  readonly lines = $derived.by(() => {
+    const { inForce } = this.fleet.stops;
+    return this.#noted.map((line) => {
+      if (line.outcome !== 'unconfirmed') return line;
+      const stop = inForce.get(line.robot);
+      // One that is no longer in force was confirmed and cleared.
+      return !stop || stop.confirmed_at ? { ...line, outcome: 'done' as const, text: texts.bulk.stopped } : line;
+    });
+  });
+
   readonly counts = $derived.by(() => {
-    const counts: Record<Outcome, number> = { waiting: 0, done: 0, nothing: 0, failed: 0 };
+    const counts: Record<Outcome, number> = { waiting: 0, unconfirmed: 0, done: 0, nothing: 0, failed: 0 };
     for (const line of this.lines) counts[line.outcome] += 1;
     return counts;
   });
@@ -59,7 +71,7 @@ export class Bulk {
   dismiss(): void {
     if (this.isRunning) return;
     this.deed = null;
-    this.lines = [];
+    this.#noted = [];
   }
 
   async stop(ids: string[]): Promise<void> {
@@ -75,7 +87,7 @@ export class Bulk {
       if (problem !== null) throw new Error(problem);
       const stop = fleet.stops.inForce.get(id);
       if (!stop) throw new Error(texts.bulk.notAmong);
-      return done(stop.confirmed_at ? texts.bulk.stopped : texts.bulk.unconfirmed);
+      return { outcome: 'unconfirmed', text: texts.bulk.unconfirmed };
     });
   }
 
@@ -134,7 +146,7 @@ export class Bulk {
     this.#shown = mine;
     const lines = new Map<string, Line>(ids.map((robot) => [robot, { robot, outcome: 'waiting', text: '' }]));
     const show = () => {
-      this.lines = [...lines.values()];
+      this.#noted = [...lines.values()];
     };
     this.deed = deed;
     this.isRunning = true;
@@ -168,7 +180,7 @@ export class Bulk {
 
 /** What failed first, then what had nothing to do, then what is done. */
 export function failuresFirst(lines: readonly Line[]): Line[] {
-  const rank: Record<Outcome, number> = { failed: 0, waiting: 1, nothing: 2, done: 3 };
+  const rank: Record<Outcome, number> = { failed: 0, unconfirmed: 1, waiting: 2, nothing: 3, done: 4 };
   return [...lines].sort((a, b) => rank[a.outcome] - rank[b.outcome]);
 }
 
