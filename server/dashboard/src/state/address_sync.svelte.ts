@@ -12,7 +12,7 @@ const WRITE_MS = 200;
 const TAB_KEY = 'tread-place';
 const CHANGE = 'change';
 
-export class Keeper {
+export class AddressSync {
   /** What the address wants and is not brought back yet, since what it is about has not been read. */
   #wanted: Place | null;
   draft = $state.raw<DraftState | null>(null);
