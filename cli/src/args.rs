@@ -4,7 +4,9 @@
 mod documented;
 mod examples;
 mod identity;
+mod leading;
 mod map;
+mod mission_name;
 mod missions;
 mod safety;
 mod values;
@@ -29,6 +31,7 @@ pub(crate) use self::map::{
     FrictionAction, FrictionArguments, SitesAction, SitesArguments, TerrainsAction,
     TerrainsArguments,
 };
+pub(crate) use self::mission_name::MissionName;
 pub(crate) use self::missions::{
     MissionsAction, MissionsArguments, Order, SendArguments, SendCircle, SendTrajectory,
     SendWaypoints,
@@ -49,6 +52,8 @@ pub(crate) const SERVER_DEFAULT: &str = "http://127.0.0.1:8420";
 const DEMO_ROBOTS_MAX: i64 = 50;
 
 /// Runs fleets of skid-steered robots and maps the friction of the ground while they drive.
+///
+/// `--server`, `--site`, `--token-file`, `--ca` and `--json` may stand before or behind the command.
 #[derive(Debug, Parser)]
 #[command(name = "tread", version)]
 pub(crate) struct Arguments {
@@ -64,9 +69,10 @@ impl Arguments {
 
     /// Parses the arguments. On an error, prints it and exits the process.
     pub(crate) fn read(words: impl Iterator<Item = OsString>) -> Self {
-        let words: Vec<OsString> = words.collect();
+        let whole = Self::whole();
+        let words = leading::behind_the_command(words.collect(), &whole);
         let is_for_programs = words.iter().any(|word| word == "--json");
-        let read = Self::whole()
+        let read = whole
             .try_get_matches_from(words)
             .and_then(|matches: ArgMatches| Self::from_arg_matches(&matches));
         read.unwrap_or_else(|error| {
@@ -269,7 +275,7 @@ pub(crate) struct DemoArguments {
     #[arg(long, value_name = "FILE")]
     pub(crate) scenario: Option<PathBuf>,
     /// End when all missions have ended, at the latest after this time; without it, run until
-    /// Ctrl-C
+    /// Ctrl-C, which prints the results so far
     #[arg(long, value_name = "TIME", value_parser = duration)]
     pub(crate) exit_after: Option<Duration>,
     /// Print one JSON object at the end instead of progress and tables

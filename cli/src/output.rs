@@ -141,6 +141,17 @@ pub(crate) fn fixed(value: f64, digits: usize) -> String {
     }
 }
 
+/// Formats a change with its sign and `digits` decimals; a change that rounds to zero has no sign.
+pub(crate) fn signed(value: f64, digits: usize) -> String {
+    let text = fixed(value, digits);
+    let is_zero = !text.contains(|digit: char| ('1'..='9').contains(&digit));
+    if text.starts_with('-') || is_zero || !value.is_finite() {
+        text
+    } else {
+        format!("+{text}")
+    }
+}
+
 /// Formats an age for people.
 pub(crate) fn age(age_ms: u64) -> String {
     match age_ms {
@@ -161,5 +172,10 @@ mod tests {
         assert_eq!(fixed(-0.0, 0), "0");
         assert_eq!(fixed(-0.006, 2), "-0.01");
         assert_eq!(fixed(-10.0, 1), "-10.0");
+        assert_eq!(signed(-0.0004, 1), "0.0");
+        assert_eq!(signed(0.0004, 1), "0.0");
+        assert_eq!(signed(0.05, 1), "+0.1");
+        assert_eq!(signed(-5.0, 1), "-5.0");
+        assert_eq!(signed(f64::NAN, 1), "NaN");
     }
 }

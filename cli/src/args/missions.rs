@@ -5,12 +5,12 @@ use std::time::Duration;
 
 use clap::{Args, Subcommand, ValueEnum};
 use tread_api::geometry::Point;
-use tread_api::ids::{MissionId, RobotId};
+use tread_api::ids::RobotId;
 use tread_api::mission::{LinkPolicy, MissionState, StartPolicy};
 use tread_api::trajectory::Waypoint;
 
-use super::Connection;
-use super::values::{duration, finite, mission, mission_state, point, waypoint};
+use super::values::{duration, finite, mission_state, point, waypoint};
+use super::{Connection, MissionName};
 
 #[derive(Debug, Args)]
 pub(crate) struct SendArguments {
@@ -63,9 +63,10 @@ pub(crate) struct Order {
     /// sensing
     #[arg(long)]
     pub(crate) excite: bool,
-    /// Replace the trajectory of this mission instead of creating a mission
-    #[arg(long, value_name = "MISSION", value_parser = mission)]
-    pub(crate) replaces: Option<MissionId>,
+    /// Replace the trajectory of this mission instead of creating a mission; an identifier, or its
+    /// end or beginning
+    #[arg(long, value_name = "MISSION")]
+    pub(crate) replaces: Option<MissionName>,
     /// Only check the trajectory and show its plan; nothing moves
     #[arg(long, conflicts_with_all = ["replaces", "wait"])]
     pub(crate) check: bool,
@@ -170,36 +171,32 @@ pub(crate) struct MissionsArguments {
 pub(crate) enum MissionsAction {
     /// Show a mission with its history
     Show {
-        /// Mission identifier
-        #[arg(value_parser = mission)]
-        mission: MissionId,
+        /// Mission identifier, or its end or beginning: at least 4 digits that name no other mission
+        mission: MissionName,
     },
     /// Wait until missions have ended, showing their progress; exits with 1 if one did not succeed
     #[command(visible_alias = "follow")]
     Wait {
-        /// Mission identifiers
-        #[arg(required = true, value_parser = mission)]
-        missions: Vec<MissionId>,
+        /// Mission identifiers, or their ends or beginnings
+        #[arg(required = true, value_name = "MISSION")]
+        missions: Vec<MissionName>,
         /// Wait at most for this time; the missions continue
         #[arg(long, value_name = "TIME", value_parser = duration)]
         timeout: Option<Duration>,
     },
     /// Pause a mission: its robot brakes along the path and stays at rest
     Pause {
-        /// Mission identifier
-        #[arg(value_parser = mission)]
-        mission: MissionId,
+        /// Mission identifier, or its end or beginning: at least 4 digits that name no other mission
+        mission: MissionName,
     },
     /// Resume a paused mission
     Resume {
-        /// Mission identifier
-        #[arg(value_parser = mission)]
-        mission: MissionId,
+        /// Mission identifier, or its end or beginning: at least 4 digits that name no other mission
+        mission: MissionName,
     },
     /// Cancel a mission: its robot brakes along the path
     Cancel {
-        /// Mission identifier
-        #[arg(value_parser = mission)]
-        mission: MissionId,
+        /// Mission identifier, or its end or beginning: at least 4 digits that name no other mission
+        mission: MissionName,
     },
 }

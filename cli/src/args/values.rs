@@ -6,7 +6,6 @@ use std::time::Duration;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use jiff::{SignedDuration, Timestamp};
 use tread_api::geometry::Point;
-use tread_api::ids::MissionId;
 use tread_api::mission::MissionState;
 use tread_api::site::GeoOrigin;
 use tread_api::terrain::TerrainClass;
@@ -148,15 +147,6 @@ pub(super) fn earth(text: &str) -> Result<GeoOrigin, String> {
     serde_json::from_value(place).map_err(|error| error.to_string())
 }
 
-/// Parses the identifier of a mission.
-pub(super) fn mission(text: &str) -> Result<MissionId, String> {
-    text.parse().map_err(|_| {
-        "give the whole identifier, as `tread missions` prints it: \
-         0192f0c1-2b3c-7d4e-8f50-617283940a1b"
-            .to_owned()
-    })
-}
-
 pub(super) fn point(text: &str) -> Result<Point, String> {
     coordinates(text).map(|(x_m, y_m)| Point { x_m, y_m })
 }
@@ -213,12 +203,6 @@ mod tests {
             let error = earth(wrong).unwrap_err();
             assert!(error.contains(said), "`{wrong}`: {error}");
         }
-    }
-
-    #[test]
-    fn a_mission_that_is_none_is_refused_with_where_to_find_one() {
-        assert!(mission("123").unwrap_err().contains("tread missions"));
-        assert!(mission("0192f0c1-2b3c-7d4e-8f50-617283940a1b").is_ok());
     }
 
     #[test]

@@ -40,6 +40,22 @@ pub(crate) enum ClientError {
     /// The server refused the request.
     #[error("{}", refusal(.problem))]
     Refused { problem: Box<ProblemBody> },
+    /// No mission has an identifier that begins or ends like this.
+    #[error(
+        "no mission of site `{site}` has an identifier that begins or ends with `{part}`, of the \
+         newest {read}"
+    )]
+    NoSuchMission {
+        part: String,
+        site: String,
+        read: usize,
+    },
+    /// Several missions have an identifier that begins or ends like this.
+    #[error("`{part}` stands for {} missions:{}", .candidates.len(), listed(.candidates))]
+    AmbiguousMission {
+        part: String,
+        candidates: Vec<String>,
+    },
     /// The peer does not open a WebSocket.
     #[error(
         "the server at {address} does not open a WebSocket for driving: check proxies on the way"
@@ -55,7 +71,27 @@ pub(crate) enum ClientError {
     },
 }
 
+/// Maximum number of missions that an error lists.
+const CANDIDATES_SHOWN: usize = 10;
+
+fn listed(candidates: &[String]) -> String {
+    let mut text = String::new();
+    for candidate in candidates.iter().take(CANDIDATES_SHOWN) {
+        text.push_str("\n  ");
+        text.push_str(candidate);
+    }
+    match candidates.len().checked_sub(CANDIDATES_SHOWN) {
+        None | Some(0) => text,
+        Some(more) => format!("{text}\n  and {more} more"),
+    }
+}
+
 fn refusal(problem: &ProblemBody) -> String {
+    // What the server says of it is for programs that send HTTP headers.
+    if problem.kind == ProblemType::Unauthenticated {
+        return "the server knows no valid token of you: it is missing, mistyped, expired or revoked"
+            .to_owned();
+    }
     let mut text = problem.title.clone();
     if let Some(field) = &problem.field {
         text = format!("{text}, at `{field}`");
@@ -179,7 +215,8 @@ impl ClientError {
     /// Returns the exit code for the error.
     pub(crate) fn exit(&self) -> Exit {
         match self {
-            Self::Address { .. } => Exit::Usage,
+            Self::Address { .. } | Self::AmbiguousMission { .. } => Exit::Usage,
+            Self::NoSuchMission { .. } => Exit::NotFound,
             Self::Unreachable { .. } | Self::NoWebSocket { .. } => Exit::Unreachable,
             Self::Silent { .. } => Exit::TimedOut,
             Self::Refused { problem } => exit_of(problem),
@@ -197,6 +234,12 @@ impl ClientError {
             ),
             Self::Silent { .. } => {
                 Some("the request may have been carried out: check before you repeat it")
+            }
+            Self::NoSuchMission { .. } => {
+                Some("`tread missions` lists the newest missions of the site")
+            }
+            Self::AmbiguousMission { .. } => {
+                Some("give more of the identifier; its end is what differs")
             }
             Self::NotUnderstood { .. } => Some("compare `tread --version` with `tread status`"),
             Self::Refused { problem } => NEXT_STEPS
@@ -219,6 +262,8 @@ impl ClientError {
             | Self::Authority { .. }
             | Self::Unreachable { .. }
             | Self::Silent { .. }
+            | Self::NoSuchMission { .. }
+            | Self::AmbiguousMission { .. }
             | Self::NoWebSocket { .. }
             | Self::NotUnderstood { .. } => None,
         }
@@ -252,6 +297,31 @@ mod tests {
                 place: None,
             }),
         }
+    }
+
+    #[test]
+    fn a_refused_token_is_said_without_a_word_of_http() {
+        let mut error = refused(ProblemType::Unauthenticated, 401);
+        if let ClientError::Refused { problem } = &mut error {
+            problem.detail = Some("send `authorization: Bearer …`".to_owned());
+        }
+        let said = error.to_string();
+        assert!(said.contains("token"), "{said}");
+        for word in ["authorization", "Bearer", "header", "/v1"] {
+            assert!(!said.contains(word), "{said}");
+        }
+    }
+
+    #[test]
+    fn missions_that_a_part_stands_for_are_listed_up_to_a_bound() {
+        let candidates: Vec<String> = (0..12).map(|at| format!("mission {at}")).collect();
+        let part = "0a1b".to_owned();
+        let said = ClientError::AmbiguousMission { part, candidates }.to_string();
+        assert!(
+            said.starts_with("`0a1b` stands for 12 missions:\n  mission 0\n"),
+            "{said}"
+        );
+        assert!(said.ends_with("\n  mission 9\n  and 2 more"), "{said}");
     }
 
     #[test]

@@ -30,6 +30,12 @@ impl Client {
         self.get_with("/v1/missions", &query).await
     }
 
+    /// Lists all missions of a site that the client reads, the newest first.
+    pub(crate) async fn all_missions(&self, site: &SiteId) -> Result<Vec<Mission>, ClientError> {
+        let query = vec![("site", site.to_string())];
+        self.all_with("/v1/missions", &query).await
+    }
+
     pub(crate) async fn mission(&self, mission: MissionId) -> Result<MissionDetail, ClientError> {
         self.get(&format!("/v1/missions/{mission}")).await
     }

@@ -27,7 +27,7 @@ use super::keys::Keyboard;
 use super::robots::{link_name, mode_name};
 use crate::args::DriveArguments;
 use crate::client::Client;
-use crate::output::{age, line};
+use crate::output::{age, line, signed};
 use crate::socket::{self, Socket};
 
 /// Period of drive commands.
@@ -40,7 +40,7 @@ const KEY_HOLDS: Duration = Duration::from_millis(550);
 /// Maximum time for connecting to the server, and for closing the socket.
 const CONNECT_MAX: Duration = Duration::from_secs(5);
 /// Help line with the keys.
-const HELP: &str = "arrows or WASD drive · space halts · x stops and latches · q quits";
+const HELP: &str = "arrows or WASD drive, let go to halt · space or x stops and latches · q quits";
 
 /// Terminal in raw mode, in which keys are read one by one. Dropping it restores the terminal, also
 /// on a panic.
@@ -86,7 +86,6 @@ impl Drop for RawTerminal {
 enum Meaning {
     /// Fractions of the full speed and of the full yaw rate, -1 to 1.
     Move(f64, f64),
-    Stand,
     Stop,
     Quit,
     Nothing,
@@ -111,8 +110,7 @@ fn meaning(key: KeyEvent) -> Meaning {
         KeyCode::Down | KeyCode::Char('s' | 'S') => Meaning::Move(-1.0, 0.0),
         KeyCode::Left | KeyCode::Char('a' | 'A') => Meaning::Move(0.0, 1.0),
         KeyCode::Right | KeyCode::Char('d' | 'D') => Meaning::Move(0.0, -1.0),
-        KeyCode::Char(' ') => Meaning::Stand,
-        KeyCode::Char('x' | 'X') => Meaning::Stop,
+        KeyCode::Char(' ' | 'x' | 'X') => Meaning::Stop,
         KeyCode::Char('q' | 'Q') | KeyCode::Esc => Meaning::Quit,
         _ => Meaning::Nothing,
     }
@@ -252,10 +250,6 @@ impl Driving<'_> {
     async fn press(&mut self, socket: &mut Socket, key: KeyEvent) -> anyhow::Result<bool> {
         match meaning(key) {
             Meaning::Move(linear, around) => self.keys.press((linear, around), Instant::now()),
-            Meaning::Stand => {
-                self.keys = Keys::default();
-                self.drive(socket).await?;
-            }
             Meaning::Stop => {
                 self.keys = Keys::default();
                 let words = StopWords {
@@ -330,8 +324,9 @@ fn status(view: &DriveView) -> String {
         |twist| {
             let twist = twist.value;
             format!(
-                "{:+.2} m/s {:+.2} rad/s",
-                twist.linear_m_s, twist.angular_rad_s
+                "{} m/s {} rad/s",
+                signed(twist.linear_m_s, 2),
+                signed(twist.angular_rad_s, 2)
             )
         },
     );
@@ -422,7 +417,8 @@ mod tests {
     fn every_key_means_what_the_help_says() {
         assert_eq!(meaning(key(KeyCode::Up)), Meaning::Move(1.0, 0.0));
         assert_eq!(meaning(key(KeyCode::Char('a'))), Meaning::Move(0.0, 1.0));
-        assert_eq!(meaning(key(KeyCode::Char(' '))), Meaning::Stand);
+        assert_eq!(meaning(key(KeyCode::Char(' '))), Meaning::Stop);
+        assert!(HELP.contains("space or x stops and latches"));
         assert_eq!(meaning(key(KeyCode::Char('x'))), Meaning::Stop);
         assert_eq!(meaning(key(KeyCode::Esc)), Meaning::Quit);
         assert_eq!(meaning(key(KeyCode::Char('d'))), Meaning::Move(0.0, -1.0));

@@ -8,7 +8,7 @@ use tread_api::safety::{Geofence, ReplaceGeofence};
 
 use crate::args::GeofenceArguments;
 use crate::client::Client;
-use crate::output::{Output, render, table};
+use crate::output::{Output, fixed, render, table};
 
 pub(super) async fn run(
     arguments: &GeofenceArguments,
@@ -46,7 +46,8 @@ fn describe(geofence: &Geofence) -> String {
     let mut table = table(["ROBOTS", "CORNERS", "AREA M2", "FIRST CORNER"]);
     let mut add = |may: &str, polygon: &Polygon| {
         let first = polygon.corners().first();
-        let first = first.map(|corner| format!("{:.2}, {:.2}", corner.x_m, corner.y_m));
+        let first =
+            first.map(|corner| format!("{}, {}", fixed(corner.x_m, 2), fixed(corner.y_m, 2)));
         table.add_row([
             may.to_owned(),
             polygon.corners().len().to_string(),

@@ -5,6 +5,8 @@ use std::process::ExitCode;
 use tread_api::mission::{Mission, MissionDetail, MissionState};
 use tread_api::trajectory::{Direction, Trajectory};
 
+use super::history::history_table;
+use super::naming::mission_id;
 use super::robots::percent;
 use super::waiting::{have_succeeded, wait};
 use crate::args::{MissionsAction, MissionsArguments};
@@ -16,9 +18,9 @@ pub(super) async fn run(
     client: &Client,
     output: Output,
 ) -> anyhow::Result<ExitCode> {
+    let site = &arguments.connection.site;
     match &arguments.action {
         None => {
-            let site = &arguments.connection.site;
             let page = client
                 .missions(
                     site,
@@ -30,24 +32,32 @@ pub(super) async fn run(
             output.show(&page.items, |missions| list(missions))?;
         }
         Some(MissionsAction::Show { mission }) => {
-            let detail = client.mission(*mission).await?;
+            let mission_id = mission_id(client, site, mission).await?;
+            let detail = client.mission(mission_id).await?;
             output.show(&detail, history)?;
         }
         Some(MissionsAction::Wait { missions, timeout }) => {
-            let ended = wait(client, missions, *timeout, output).await?;
+            let mut mission_ids = Vec::with_capacity(missions.len());
+            for mission in missions {
+                mission_ids.push(mission_id(client, site, mission).await?);
+            }
+            let ended = wait(client, &mission_ids, *timeout, output).await?;
             output.show(&ended, |ended| list(ended))?;
             if !have_succeeded(&ended) {
                 return Ok(ExitCode::FAILURE);
             }
         }
         Some(MissionsAction::Pause { mission }) => {
-            output.show(&client.act(*mission, "pause").await?, summary)?;
+            let mission_id = mission_id(client, site, mission).await?;
+            output.show(&client.act(mission_id, "pause").await?, summary)?;
         }
         Some(MissionsAction::Resume { mission }) => {
-            output.show(&client.act(*mission, "resume").await?, summary)?;
+            let mission_id = mission_id(client, site, mission).await?;
+            output.show(&client.act(mission_id, "resume").await?, summary)?;
         }
         Some(MissionsAction::Cancel { mission }) => {
-            output.show(&client.act(*mission, "cancel").await?, summary)?;
+            let mission_id = mission_id(client, site, mission).await?;
+            output.show(&client.act(mission_id, "cancel").await?, summary)?;
         }
     }
     Ok(ExitCode::SUCCESS)
@@ -120,16 +130,6 @@ pub(super) fn state(mission: &Mission) -> String {
 }
 
 fn history(detail: &MissionDetail) -> String {
-    let mut table = table(["AT", "WHO", "FROM", "TO", "WHY"]);
-    for event in &detail.events {
-        table.add_row([
-            format!("{:.3}", event.at),
-            event.actor.as_str().to_owned(),
-            or_dash(event.from.map(MissionState::as_str)),
-            event.to.as_str().to_owned(),
-            event.reason.clone().unwrap_or_default(),
-        ]);
-    }
     let plan = detail.mission.plan.map(|plan| {
         format!(
             "planned {:.1} m in {:.0} s\n",
@@ -151,7 +151,7 @@ fn history(detail: &MissionDetail) -> String {
         summary(&detail.mission),
         plan.unwrap_or_default(),
         quality.unwrap_or_default(),
-        render(&table)
+        history_table(&detail.events)
     )
 }
 

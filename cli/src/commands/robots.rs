@@ -160,8 +160,10 @@ fn live_lines(live: &RobotLive) -> Vec<String> {
     lines.extend(live.pose.map(|pose| {
         let (value, age) = (pose.value, age(pose.age_ms));
         format!(
-            "pose           x {:.3} m, y {:.3} m, heading {:.3} rad, {age} old",
-            value.x_m, value.y_m, value.heading_rad
+            "pose           x {} m, y {} m, heading {} rad, {age} old",
+            fixed(value.x_m, 3),
+            fixed(value.y_m, 3),
+            fixed(value.heading_rad, 3)
         )
     }));
     lines.extend(live.twist.map(|twist| {
@@ -174,8 +176,11 @@ fn live_lines(live: &RobotLive) -> Vec<String> {
     }));
     lines.extend(live.mission.map(|mission| {
         format!(
-            "mission        {}, {:.1} of {:.1} m, {:.3} m off the path",
-            mission.id, mission.driven_m, mission.length_m, mission.cross_track_m
+            "mission        {}, {} of {:.1} m, {} m off the path",
+            mission.id,
+            fixed(mission.driven_m, 1),
+            mission.length_m,
+            fixed(mission.cross_track_m, 3)
         )
     }));
     lines.extend(live.friction.map(|friction| {
@@ -195,9 +200,9 @@ fn live_lines(live: &RobotLive) -> Vec<String> {
     let slip = live.friction.and_then(|friction| friction.value.slip);
     lines.extend(slip.map(|slip| {
         format!(
-            "wheel slip     {:.1} % left, {:.1} % right",
-            1e2 * slip.left_ratio,
-            1e2 * slip.right_ratio
+            "wheel slip     {} % left, {} % right",
+            fixed(1e2 * slip.left_ratio, 1),
+            fixed(1e2 * slip.right_ratio, 1)
         )
     }));
     lines.push(format!(
@@ -268,8 +273,8 @@ fn parameters(live: &RobotLive) -> Vec<String> {
             ""
         };
         format!(
-            "{name:<15}{:.3} ± {half_width:.3}{unit}{remark}",
-            estimate.value
+            "{name:<15}{} ± {half_width:.3}{unit}{remark}",
+            fixed(estimate.value, 3)
         )
     })
     .to_vec()
@@ -290,7 +295,7 @@ pub(super) fn steps_come(progress: MissionProgress, steps: usize) -> Option<usiz
 
 pub(super) fn percent(part: f64, whole: f64) -> String {
     if whole > 0.0 {
-        format!("{:.0} %", 100.0 * (part / whole).min(1.0))
+        format!("{} %", fixed(100.0 * (part / whole).min(1.0), 0))
     } else {
         "-".to_owned()
     }

@@ -12,11 +12,12 @@ use tread_api::trajectory::{
 };
 
 use super::missions::summary;
+use super::naming::mission_id;
 use super::points::read_waypoints;
 use super::waiting::{have_succeeded, wait};
 use crate::args::{Order, SendArguments, SendCircle, SendTrajectory, SendWaypoints};
 use crate::client::Client;
-use crate::output::Output;
+use crate::output::{Output, fixed};
 
 pub(super) async fn run(
     arguments: SendArguments,
@@ -30,9 +31,10 @@ pub(super) async fn run(
     if order.check {
         return check(trajectory, &order, client, output).await;
     }
-    if let Some(mission) = order.replaces {
+    if let Some(mission) = &order.replaces {
+        let mission_id = mission_id(client, &order.connection.site, mission).await?;
         let replacement = ReplaceMission { trajectory };
-        let mission = client.replace_mission(mission, &replacement).await?;
+        let mission = client.replace_mission(mission_id, &replacement).await?;
         output.show(&mission, summary)?;
         return Ok(ExitCode::SUCCESS);
     }
@@ -86,7 +88,11 @@ async fn check(
 
 /// Returns the origin of the plan, in words.
 fn planned_from(checked: &TrajectoryCheck) -> String {
-    let place = format!("x {:.2} m, y {:.2} m", checked.start.x_m, checked.start.y_m);
+    let place = format!(
+        "x {} m, y {} m",
+        fixed(checked.start.x_m, 2),
+        fixed(checked.start.y_m, 2)
+    );
     match (checked.start_source, checked.after_mission) {
         (StartSource::Mission, Some(mission)) => {
             format!("planned from the end of mission {mission}, at {place}")

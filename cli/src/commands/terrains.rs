@@ -10,7 +10,7 @@ use tread_api::terrain::{CreateTerrain, ReplaceTerrain, Terrain, TerrainClass};
 use super::points::read_corners;
 use crate::args::{TerrainsAction, TerrainsArguments};
 use crate::client::Client;
-use crate::output::{Output, render, table};
+use crate::output::{Output, fixed, render, table};
 
 pub(super) async fn run(
     arguments: TerrainsArguments,
@@ -98,7 +98,7 @@ fn list(terrains: &[Terrain]) -> String {
 fn details(terrain: &Terrain) -> String {
     let mut corners = table(["X M", "Y M"]);
     for corner in terrain.polygon.corners() {
-        corners.add_row([format!("{:.2}", corner.x_m), format!("{:.2}", corner.y_m)]);
+        corners.add_row([fixed(corner.x_m, 2), fixed(corner.y_m, 2)]);
     }
     format!(
         "{}\n\n{}",

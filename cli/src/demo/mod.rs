@@ -36,6 +36,8 @@ const START_WAIT_MAX: Duration = Duration::from_secs(30);
 const UPLOAD_WAIT_MAX: Duration = Duration::from_secs(10);
 /// Polling period of the fleet.
 const LOOK_EVERY: Duration = Duration::from_millis(200);
+/// What is wrong if Ctrl-C cannot be awaited.
+const NO_CTRL_C: &str = "cannot wait for Ctrl-C";
 /// Number of newest missions that are polled.
 const MISSIONS_MAX: u32 = 1_000;
 
@@ -58,38 +60,34 @@ pub(crate) async fn run(arguments: DemoArguments) -> anyhow::Result<ExitCode> {
     let token = credentials::read_token(&processes.token_file())?;
     let client = Client::new(&processes.api_address(), Some(&token), None)?;
     let _signed_in = SignedIn::keep(client.address(), &token);
-    let outcome = async {
-        let demo = Demo {
-            scenario: &scenario,
-            robots: &robots,
-            client: &client,
-        };
-        demo.wait_for_server(&mut processes).await?;
-        let terrains = demo.draw_terrains().await?;
-        for robot in &robots {
-            let file = arguments.scenario.as_deref();
-            processes.start_agent(folder.path(), &scenario.site, robot, file)?;
+    let demo = Demo {
+        scenario: &scenario,
+        robots: &robots,
+        client: &client,
+    };
+    let began = tokio::select! {
+        began = demo.begin(&mut processes, folder.path(), arguments.scenario.as_deref()) => Some(began),
+        interrupted = tokio::signal::ctrl_c() => {
+            interrupted.context(NO_CTRL_C)?;
+            None
         }
-        demo.wait_for_robots(&mut processes).await?;
-        let missions = demo.send_missions().await?;
-        tell(&welcome(&client, &processes, folder.path(), missions.len()));
-        let mut watch = Watch::new(&demo, &terrains, missions, &arguments);
-        watch.until_done(&mut processes).await?;
-        watch.report().await
     };
-    let interrupted = async {
-        tokio::signal::ctrl_c()
-            .await
-            .context("cannot wait for Ctrl-C")?;
-        anyhow::Ok(())
-    };
-    let report = tokio::select! {
-        report = outcome => Some(report),
-        interrupted = interrupted => { interrupted?; None }
+    let outcome = match began {
+        None => None,
+        Some(Err(error)) => Some(Err(error)),
+        Some(Ok((terrains, missions))) => {
+            tell(&welcome(&client, &processes, folder.path(), missions.len()));
+            let watch = Watch::new(&demo, &terrains, missions, &arguments);
+            Some(watch.to_the_end(&mut processes).await)
+        }
     };
     tell("stopping …");
     processes.stop().await;
-    let Some(report) = report.transpose()? else {
+    let Some(Ended {
+        report,
+        is_cut_short,
+    }) = outcome.transpose()?
+    else {
         return Ok(ExitCode::SUCCESS);
     };
     if arguments.json {
@@ -97,7 +95,8 @@ pub(crate) async fn run(arguments: DemoArguments) -> anyhow::Result<ExitCode> {
     } else {
         line(&report.for_people())?;
     }
-    Ok(if report.holds() {
+    // Whoever interrupts it does not wait for its missions.
+    Ok(if is_cut_short || report.holds() {
         ExitCode::SUCCESS
     } else {
         ExitCode::FAILURE
@@ -198,6 +197,22 @@ struct Demo<'demo> {
 }
 
 impl Demo<'_> {
+    /// Starts the agents and sends the missions, as soon as the server is ready.
+    async fn begin(
+        &self,
+        processes: &mut Processes,
+        folder: &Path,
+        scenario_file: Option<&Path>,
+    ) -> anyhow::Result<(Vec<Terrain>, Vec<MissionId>)> {
+        self.wait_for_server(processes).await?;
+        let terrains = self.draw_terrains().await?;
+        for robot in self.robots {
+            processes.start_agent(folder, &self.scenario.site, robot, scenario_file)?;
+        }
+        self.wait_for_robots(processes).await?;
+        Ok((terrains, self.send_missions().await?))
+    }
+
     async fn wait_for_server(&self, processes: &mut Processes) -> anyhow::Result<()> {
         let deadline = Instant::now() + START_WAIT_MAX;
         while !self.client.is_ready().await {
@@ -282,6 +297,13 @@ impl Demo<'_> {
     }
 }
 
+/// Results of a demo.
+struct Ended {
+    report: Report,
+    /// Ctrl-C was pressed before the demo was done.
+    is_cut_short: bool,
+}
+
 /// Polls the fleet until the demo is done.
 struct Watch<'demo> {
     demo: Demo<'demo>,
@@ -321,6 +343,30 @@ impl<'demo> Watch<'demo> {
         }
     }
 
+    /// Shows the fleet until the demo is done or Ctrl-C is pressed, and returns its results.
+    async fn to_the_end(mut self, processes: &mut Processes) -> anyhow::Result<Ended> {
+        let is_cut_short = tokio::select! {
+            done = self.until_done(processes) => {
+                done?;
+                false
+            }
+            interrupted = tokio::signal::ctrl_c() => {
+                interrupted.context(NO_CTRL_C)?;
+                true
+            }
+        };
+        self.progress.finish();
+        if is_cut_short {
+            // The last look may be of before, or none.
+            self.look().await?;
+        }
+        let report = self.report().await?;
+        Ok(Ended {
+            report,
+            is_cut_short,
+        })
+    }
+
     /// Returns when all missions have ended and all measurements are uploaded, or when the time is
     /// over. Without a time limit it shows the fleet until it is cancelled.
     async fn until_done(&mut self, processes: &mut Processes) -> anyhow::Result<()> {
@@ -350,7 +396,6 @@ impl<'demo> Watch<'demo> {
                 }
             }
         }
-        self.progress.finish();
         Ok(())
     }
 

@@ -2,6 +2,7 @@
 
 use std::fs::File;
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
+use std::os::unix::process::CommandExt as _;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
@@ -119,6 +120,8 @@ impl Processes {
             .stdin(Stdio::null())
             .stdout(log_file.try_clone()?)
             .stderr(log_file)
+            // Ctrl-C is for the demo, which asks the server for the results before it stops it.
+            .process_group(0)
             .spawn()
             .with_context(|| format!("cannot start the {name}"))?;
         self.parts.push(Part {

@@ -66,8 +66,8 @@ async fn keys_drive_the_robot_over_tls_stop_it_and_every_way_out_restores_the_te
     eventually("it stands", || yard.speed_m_s().abs() < 0.02).await;
     yard.hold(&mut terminal, "\x1b[B", |speed_m_s| speed_m_s < -0.2)
         .await;
-    terminal.press(" ");
     eventually("it stands", || yard.speed_m_s().abs() < 0.02).await;
+    assert!(yard.stop().is_none(), "letting go latches nothing");
     terminal.press("q");
     assert_eq!(terminal.ended().await, Some(0), "{}", terminal.screen());
     assert!(!terminal.is_raw(), "q left the terminal raw");
@@ -81,20 +81,23 @@ async fn keys_drive_the_robot_over_tls_stop_it_and_every_way_out_restores_the_te
     assert!(!terminal.is_raw(), "Ctrl-C left the terminal raw");
     yard.stands_free().await;
 
-    // A stop latches, whoever drives, and says how to clear it.
-    let mut terminal = yard.drive(yard.port()).await;
-    terminal.press("x");
-    terminal.shows("stopped, confirmed").await;
-    let latch = yard.stop().expect("it is stopped");
-    terminal
-        .shows(&format!("tread clear {ROBOT} {}", latch.id))
-        .await;
-    terminal.press("q");
-    terminal.ended().await;
-    let id = latch.id.to_string();
-    let mut clearing = yard.tread(yard.port(), &["clear", ROBOT, &id]);
-    assert_eq!(clearing.ended().await, Some(0), "{}", clearing.screen());
-    assert!(yard.stop().is_none());
+    // A stop latches, whoever drives, and says how to clear it. Space means the same as on the page.
+    for key in [" ", "x"] {
+        let mut terminal = yard.drive(yard.port()).await;
+        terminal.shows("space or x stops and latches").await;
+        terminal.press(key);
+        terminal.shows("stopped, confirmed").await;
+        let latch = yard.stop().expect("it is stopped");
+        terminal
+            .shows(&format!("tread clear {ROBOT} {}", latch.id))
+            .await;
+        terminal.press("q");
+        terminal.ended().await;
+        let id = latch.id.to_string();
+        let mut clearing = yard.tread(yard.port(), &["clear", ROBOT, &id]);
+        assert_eq!(clearing.ended().await, Some(0), "{}", clearing.screen());
+        assert!(yard.stop().is_none());
+    }
     yard.end().await;
 }
 

@@ -6,6 +6,7 @@
 )]
 
 mod authority;
+mod demo;
 mod documentation;
 mod drive;
 mod manual;

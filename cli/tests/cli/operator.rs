@@ -134,11 +134,25 @@ async fn a_mission_is_checked_sent_held_followed_and_ended_by_commands() {
         .run(&[&LONG_CIRCLE[..], &["--start", "refuse"]].concat())
         .await;
     assert_eq!(refused.code, Some(6), "{}", refused.errors);
+    // The end of its identifier names it, and what names two missions says which.
+    let end = &id[id.len() - 6..];
+    let shown = yard.json(&["missions", "show", end]).await;
+    assert_eq!(id_of(&shown), id);
+    let second = id_of(&yard.json(&LONG_CIRCLE).await);
+    let common = yard.run(&["missions", "show", &id[..4]]).await;
+    assert_eq!(common.code, Some(2), "{}", common.errors);
+    for candidate in [&id, &second] {
+        assert!(common.errors.contains(candidate), "{}", common.errors);
+    }
+    yard.table(&["missions", "cancel", &second[second.len() - 8..]])
+        .await;
+    let nothing = yard.run(&["missions", "show", "ffffffff"]).await;
+    assert_eq!(nothing.code, Some(5), "{}", nothing.errors);
     let wait = ["missions", "wait", &id, "--timeout", "300ms"];
     let waited = yard.run(&wait).await;
     assert_eq!(waited.code, Some(7), "{}", waited.errors);
     let listed = yard.json(&["missions", "--robot", ROBOT]).await;
-    assert_eq!(id_of(&listed[0]), id);
+    assert_eq!(id_of(&listed[1]), id, "the newest is first");
     let is_active = async || {
         let seen = yard.json(&["missions", "show", &id]).await;
         seen["state"] == "active"
@@ -168,7 +182,7 @@ async fn a_mission_is_checked_sent_held_followed_and_ended_by_commands() {
     let ended = yard.run(&["missions", "pause", &id]).await;
     assert_eq!(ended.code, Some(6), "{}", ended.errors);
     let states = yard.json(&["missions", "--state", "cancelled"]).await;
-    assert_eq!(states.as_array().map(Vec::len), Some(1));
+    assert_eq!(states.as_array().map(Vec::len), Some(2));
     yard.end().await;
 }
 
@@ -262,10 +276,17 @@ async fn what_went_wrong_has_its_own_exit_code_and_says_what_to_do_next() {
         "{}",
         stranger.errors
     );
-    let nobody = ["robots", "--server", "http://127.0.0.1:9"];
-    let nobody = Ran::of(nobody.map(str::to_owned).to_vec()).await;
-    assert_eq!(nobody.code, Some(3), "{}", nobody.errors);
-    assert!(nobody.errors.contains("tread demo"), "{}", nobody.errors);
+    for word in ["Bearer", "authorization", "header", "/v1/"] {
+        assert!(!stranger.errors.contains(word), "{}", stranger.errors);
+    }
+    for nobody in [
+        ["robots", "--server", "http://127.0.0.1:9"],
+        ["--server", "http://127.0.0.1:9", "robots"],
+    ] {
+        let nobody = Ran::of(nobody.map(str::to_owned).to_vec()).await;
+        assert_eq!(nobody.code, Some(3), "{}", nobody.errors);
+        assert!(nobody.errors.contains("tread demo"), "{}", nobody.errors);
+    }
     yard.end().await;
 }
 

@@ -1,5 +1,5 @@
 import { expect, test } from 'vitest';
-import { number, short, span } from './format';
+import { exact, moment, number, short, span, unit } from './format';
 
 test('what is not known is a dash', () => {
   expect([number(null, 1), short(undefined), span(NaN), number(Infinity, 2)]).toEqual(['–', '–', '–', '–']);
@@ -7,10 +7,26 @@ test('what is not known is a dash', () => {
 
 test('numbers have no negative zero and no grouping', () => {
   expect(number(-0.001, 2)).toBe('0.00');
+  for (const digits of [0, 1, 2, 3]) {
+    for (let exponent = 0; exponent < 8; exponent += 1) {
+      for (const lead of [0.4999, 0.5, 0.51, 0.9999]) {
+        const text = unit(-lead * 10 ** -exponent, digits, '%');
+        expect(text, `${-lead * 10 ** -exponent} to ${digits}`).not.toMatch(/^-0(\.0*)? /);
+      }
+    }
+  }
+  expect([number(-0, 0), number(-0.5, 0), number(-0.05, 1), short(-1e-9)]).toEqual(['0', '-1', '-0.1', '0.000000']);
   expect(number(12_345.678, 1)).toBe('12345.7');
   expect([short(0.123456), short(12.3456), short(1234.5), short(0)]).toEqual(['0.123', '12.3', '1235', '0']);
 });
 
 test('spans are as short as they can be read', () => {
   expect([0.04, 9.96, 59, 61, 3_660, 90_000].map(span)).toEqual(['0.0 s', '10.0 s', '59 s', '1 min 1 s', '1 h 1 min', '1.0 d']);
+});
+
+test('moments have one format, with the offset for who asks', () => {
+  const at = '2026-01-02T03:04:05Z';
+  expect(moment(at)).toMatch(/^2026-01-0[123] \d\d:\d\d:05$/);
+  expect(exact(at)).toMatch(/^2026-01-0[123]T\d\d:\d\d:05[+-]\d\d:\d\d \(.+\)$/);
+  expect(Date.parse(exact(at).replace(/ \(.*/, ''))).toBe(Date.parse(at));
 });

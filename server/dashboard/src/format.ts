@@ -12,11 +12,12 @@ export function number(value: number | null | undefined, digits: number): string
       minimumFractionDigits: digits,
       maximumFractionDigits: digits,
       useGrouping: false,
+      // What rounds to zero has no sign.
+      signDisplay: 'negative',
     });
     cache.set(digits, format);
   }
-  // A small negative number is not "-0.00".
-  return format.format(Object.is(Math.round(value * 10 ** digits), -0) ? 0 : value);
+  return format.format(value);
 }
 
 /** A number with three significant digits. */
@@ -50,7 +51,24 @@ export function clock(at: string | number | Date): string {
   return new Date(at).toLocaleTimeString('en-GB');
 }
 
-/** Day and time of a wall time. */
-export function moment(at: string): string {
-  return new Date(at).toLocaleString('en-GB', { dateStyle: 'short', timeStyle: 'medium' });
+const two = (value: number) => String(value).padStart(2, '0');
+
+/** Day and time of a wall time, where whoever looks is: `2026-01-31 14:05:09`. */
+export function moment(at: string | number | Date): string {
+  const { day, time } = parts(new Date(at));
+  return `${day} ${time}`;
+}
+
+/** The same with its offset from UTC, and the name of the time zone. */
+export function exact(at: string | number | Date): string {
+  const date = new Date(at);
+  const { day, time } = parts(date);
+  const east_min = -date.getTimezoneOffset();
+  const offset = `${east_min < 0 ? '-' : '+'}${two(Math.floor(Math.abs(east_min) / 60))}:${two(Math.abs(east_min) % 60)}`;
+  return `${day}T${time}${offset} (${Intl.DateTimeFormat().resolvedOptions().timeZone})`;
+}
+
+function parts(date: Date): { day: string; time: string } {
+  const day = `${date.getFullYear()}-${two(date.getMonth() + 1)}-${two(date.getDate())}`;
+  return { day, time: `${two(date.getHours())}:${two(date.getMinutes())}:${two(date.getSeconds())}` };
 }

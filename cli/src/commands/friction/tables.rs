@@ -11,7 +11,7 @@ use tread_api::terrain::TerrainRef;
 
 use crate::client::{Known, MapTimes};
 use crate::commands::terrains::class_name;
-use crate::output::{age, or_dash, render, table};
+use crate::output::{age, fixed, or_dash, render, signed, table};
 
 /// Columns of the friction of an area.
 const FRICTION_COLUMNS: [&str; 7] = [
@@ -241,7 +241,7 @@ pub(super) fn differences(Known { items, of }: &Known<CellDifference>) -> String
                 "unsure".to_owned()
             }
             (Some(before), Some(after)) => {
-                format!("{:+.1} %", 1e2 * (after.theta / before.theta - 1.0))
+                format!("{} %", signed(1e2 * (after.theta / before.theta - 1.0), 1))
             }
             (None, Some(_)) => "new".to_owned(),
             (Some(_), None) => "gone".to_owned(),
@@ -255,7 +255,7 @@ pub(super) fn differences(Known { items, of }: &Known<CellDifference>) -> String
             theta(&cell.before),
             theta(&cell.after),
             change,
-            or_dash(cell.z_score.map(|many| format!("{many:+.1}"))),
+            or_dash(cell.z_score.map(|many| signed(many, 1))),
         ]);
     }
     of_time(*of, &render(&table))
@@ -280,8 +280,8 @@ pub(super) fn visits(as_of: Option<Timestamp>, visits: &[VisitSuggestion]) -> St
     for visit in visits {
         let known = visit.relative_std_dev;
         table.add_row([
-            format!("{:.2}", visit.center.x_m),
-            format!("{:.2}", visit.center.y_m),
+            fixed(visit.center.x_m, 2),
+            fixed(visit.center.y_m, 2),
             terrain_name(visit.terrain.as_ref()),
             or_dash(known.map(|share| format!("{:.1} %", 1e2 * share))),
             format!("{:.2} times", visit.gain.exp()),
@@ -304,7 +304,7 @@ pub(super) fn contributions(robots: &[RobotContribution]) -> String {
             robot.segments.to_string(),
             format!("{:.0}", robot.first_at),
             format!("{:.0}", robot.newest_at),
-            or_dash(bias.map(|ratio| format!("{:+.1} %", 1e2 * (ratio - 1.0)))),
+            or_dash(bias.map(|ratio| format!("{} %", signed(1e2 * (ratio - 1.0), 1)))),
         ]);
     }
     render(&table)

@@ -152,7 +152,7 @@ fn bar(progress: Option<MissionProgress>) -> String {
     };
     let share = (progress.driven_m / progress.length_m).clamp(0.0, 1.0);
     let (full, rest) = ("█".repeat(full), "░".repeat(BAR - full));
-    format!("{full}{rest} {:3.0} %", 1e2 * share)
+    format!("{full}{rest} {:>3} %", fixed(1e2 * share, 0))
 }
 
 fn robot_style(robot: &Robot) -> Style {

@@ -2,14 +2,13 @@
 import type { Cell, Geofence, Mission, Terrain, Trajectory } from '../api/schema';
 import type { Tracked } from '../state/tracked';
 import type { Theme } from '../state/session.svelte';
-import { span } from '../format';
 import { texts } from '../texts';
 import { roundUp, type Camera, type PointM } from './camera';
 import type { Planned } from './approach';
 import type { Draft } from './draft';
 import { HATCHED_CELL_PX, drawFriction, drawInspected } from './draw_friction';
+import { drawRobots, type RobotLabels } from './draw_robots';
 import type { Raster } from './raster';
-import type { Shown } from './motion';
 import type { Moment } from './replay';
 import { PALETTES, groundFill, groundLine, type Palette } from './palette';
 
@@ -31,6 +30,10 @@ export interface Scene {
   /** The smooth path of a mission, once it is known. */
   pathOf(mission: Mission): Planned | null;
   selected: string | null;
+  /** Where labels of robots stood in the frame before. */
+  labels: RobotLabels;
+  /** Robots that are selected with others. */
+  marked: ReadonlySet<string>;
   showTerrains: boolean;
   showFence: boolean;
   showTrails: boolean;
@@ -49,18 +52,12 @@ export interface Scene {
 const GRID_PX = 48;
 /** Width that the scale bar aims at, pixels. */
 const SCALE_BAR_PX = 90;
-/** Smallest a robot is drawn, pixels of its length. */
-const ROBOT_PX = 15;
-/** Points of a trail that are nearer to each other than this are one, pixels. */
-const TRAIL_STEP_PX = 2;
 /** Dashes of the approach to a path, pixels. */
 const APPROACH_DASH = [3, 5];
 /** Dashes of a path that was planned, below the one that was driven, pixels. */
 const PLANNED_DASH = [8, 5];
 /** Length of the arrow of a moment, pixels from its middle. */
 const MOMENT_PX = 11;
-/** Most labels of robots: with more they would only cover each other. */
-const LABELS_MAX = 60;
 
 /** Draws everything; true while a robot moves, so that the next frame differs. */
 export function draw(context: CanvasRenderingContext2D, camera: Camera, scene: Scene): boolean {
@@ -313,104 +310,6 @@ function drawMoment(context: CanvasRenderingContext2D, camera: Camera, moment: M
   context.strokeStyle = palette.driven;
   context.stroke();
   context.restore();
-}
-
-function drawRobots(context: CanvasRenderingContext2D, camera: Camera, scene: Scene, palette: Palette): boolean {
-  const all = [...scene.tracked].map((tracked) => ({ tracked, shown: tracked.shownAt(scene.now) }));
-  if (scene.showTrails) {
-    // Lines of one pixel are drawn several times as fast as wider ones.
-    context.lineWidth = 1;
-    context.lineJoin = 'bevel';
-    context.strokeStyle = palette.trail;
-    const { scale } = camera;
-    const left = camera.width / 2 - camera.center.x_m * scale;
-    const top = camera.height / 2 + camera.center.y_m * scale;
-    for (const { tracked, shown } of all) {
-      const { trail } = tracked;
-      context.beginPath();
-      let [xLast, yLast] = [Infinity, Infinity];
-      for (let index = 0; index < trail.length; index += 2) {
-        const x = left + (trail[index] ?? 0) * scale;
-        const y = top - (trail[index + 1] ?? 0) * scale;
-        const isLast = index + 2 >= trail.length;
-        if (!isLast && Math.abs(x - xLast) + Math.abs(y - yLast) < TRAIL_STEP_PX) continue;
-        context.lineTo(x, y);
-        [xLast, yLast] = [x, y];
-      }
-      if (shown && trail.length > 0) context.lineTo(left + shown.pose.x_m * scale, top - shown.pose.y_m * scale);
-      context.stroke();
-    }
-  }
-  context.font = '600 12px system-ui, sans-serif';
-  context.textAlign = 'left';
-  for (const { tracked, shown } of all) {
-    if (shown) drawRobot(context, camera, tracked, shown, scene, palette, all.length <= LABELS_MAX);
-  }
-  return all.some(({ shown }) => shown?.isMoving);
-}
-
-function drawRobot(
-  context: CanvasRenderingContext2D,
-  camera: Camera,
-  tracked: Tracked,
-  { pose, isFrozen }: Shown,
-  scene: Scene,
-  palette: Palette,
-  withLabel: boolean,
-): void {
-  const { robot } = tracked;
-  const { x, y } = camera.toPx(pose);
-  const isSelected = robot.id === scene.selected;
-  const isLost = robot.link === 'offline';
-  const isStopped = robot.live?.safety.stop != null || scene.unconfirmed.has(robot.id);
-  const colour = isStopped
-    ? palette.stopped
-    : isLost || isFrozen
-      ? palette.robotLost
-      : robot.link === 'stale' || scene.isOld
-        ? palette.robotLate
-        : palette.robot;
-  const length = Math.max(ROBOT_PX, (robot.model.wheelbase_m + 2 * robot.model.wheel_radius_m) * camera.scale);
-  const width = Math.max(ROBOT_PX * 0.8, robot.model.track_width_m * camera.scale);
-  const isOut = x < -length || y < -length || x > camera.width + length || y > camera.height + length;
-  if (isOut) return;
-  context.save();
-  context.translate(x, y);
-  if (isSelected || scene.unconfirmed.has(robot.id)) {
-    context.beginPath();
-    context.arc(0, 0, Math.hypot(length, width) / 2 + 5, 0, 2 * Math.PI);
-    context.lineWidth = scene.unconfirmed.has(robot.id) ? 4 : 2;
-    context.strokeStyle = scene.unconfirmed.has(robot.id) ? palette.stopped : palette.selected;
-    context.stroke();
-  }
-  context.rotate(-pose.heading_rad);
-  context.beginPath();
-  context.roundRect(-length / 2, -width / 2, length, width, 3);
-  context.lineWidth = 2;
-  context.strokeStyle = colour;
-  if (isLost) {
-    // Its last known place: an empty, dashed outline.
-    context.setLineDash([3, 3]);
-    context.fillStyle = palette.halo;
-  } else {
-    context.fillStyle = colour;
-  }
-  context.fill();
-  context.stroke();
-  if (isLost) context.setLineDash([]);
-  context.beginPath();
-  context.moveTo(length * 0.36, 0);
-  context.lineTo(-length * 0.12, width * 0.3);
-  context.lineTo(-length * 0.12, -width * 0.3);
-  context.closePath();
-  context.fillStyle = isLost ? colour : palette.halo;
-  context.fill();
-  context.restore();
-  if (!withLabel && !isSelected) return;
-  const age = tracked.ageS(scene.now);
-  const note = (isLost || scene.isOld) && age !== null ? ` · ${texts.robots.lastKnown}, ${texts.robots.age(span(age))}` : '';
-  const late = robot.link === 'stale' && !scene.isOld ? ` · ${texts.link.stale}` : '';
-  label(context, `${robot.name}${late}${note}`, x + length / 2 + 7, y - 6, colour, palette);
 }
 
 function drawDraft(context: CanvasRenderingContext2D, camera: Camera, draft: Draft, palette: Palette): void {

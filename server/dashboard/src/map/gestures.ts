@@ -6,6 +6,10 @@ import type { Draft } from './draft';
 const CLICK_PX = 5;
 /** How near a point must be to be taken, pixels; fingers are wider than this says. */
 const REACH_PX = 14;
+/** How long a finger rests on a point to delete it, milliseconds. */
+const LONG_PRESS_MS = 550;
+/** A finger that moves less than this rests, pixels. */
+const REST_PX = 10;
 /** Factor of one step of the wheel, per pixel. */
 const WHEEL_FACTOR = 0.0015;
 
@@ -14,8 +18,8 @@ export interface Hands {
   changed(): void;
   /** The camera moved. */
   moved(): void;
-  /** A click where nothing is drawn. */
-  clicked(at: PointPx): void;
+  /** A click where nothing is drawn; with Ctrl or Shift it means more than one. */
+  clicked(at: PointPx, isMore: boolean): void;
   /** The pointer is here; null when it left. */
   over(at: PointPx | null): void;
 }
@@ -23,7 +27,7 @@ export interface Hands {
 type Drag =
   | { what: 'press'; from: PointPx; at: PointPx }
   | { what: 'pan'; at: PointPx }
-  | { what: 'point'; index: number }
+  | { what: 'point'; index: number; from: PointPx }
   | { what: 'circle'; from: PointPx };
 
 /** Lets hands work on a canvas; gives what ends it. */
@@ -42,6 +46,7 @@ export function attach(canvas: HTMLCanvasElement, camera: Camera, hands: Hands):
     canvas.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, at);
     if (pointers.size > 1) {
+      clearTimeout(resting);
       drag = null;
       return;
     }
@@ -49,12 +54,30 @@ export function attach(canvas: HTMLCanvasElement, camera: Camera, hands: Hands):
     const near = draft && draft.kind !== 'circle' ? draft.nearest(camera.toM(at), REACH_PX / camera.scale) : null;
     if (draft && near !== null) {
       draft.mark();
-      drag = { what: 'point', index: near };
+      drag = { what: 'point', index: near, from: at };
+      if (event.pointerType === 'touch') rest(draft, near);
     } else if (draft?.kind === 'circle') {
       drag = { what: 'circle', from: at };
     } else {
       drag = { what: 'press', from: at, at };
     }
+  };
+
+  let resting: ReturnType<typeof setTimeout> | undefined;
+  /** Browsers also say of some long presses that a menu is wanted. */
+  let wasLongPress = false;
+  const rest = (draft: Draft, index: number) => {
+    wasLongPress = false;
+    clearTimeout(resting);
+    resting = setTimeout(() => {
+      if (drag?.what !== 'point' || hands.draft() !== draft) return;
+      drag = null;
+      wasLongPress = true;
+      // Where it was before the finger trembled.
+      draft.undo();
+      draft.remove(index);
+      hands.changed();
+    }, LONG_PRESS_MS);
   };
 
   const move = (event: PointerEvent) => {
@@ -74,6 +97,7 @@ export function attach(canvas: HTMLCanvasElement, camera: Camera, hands: Hands):
       drag.at = at;
       hands.moved();
     } else if (drag?.what === 'point' && draft) {
+      if (distance(drag.from, at) > REST_PX) clearTimeout(resting);
       draft.move(drag.index, camera.toM(at));
       hands.changed();
     } else if (drag?.what === 'circle' && draft && distance(drag.from, at) > CLICK_PX) {
@@ -101,6 +125,7 @@ export function attach(canvas: HTMLCanvasElement, camera: Camera, hands: Hands):
 
   const up = (event: PointerEvent) => {
     const held = drag;
+    clearTimeout(resting);
     pointers.delete(event.pointerId);
     isDrawing = false;
     drag = null;
@@ -110,11 +135,12 @@ export function attach(canvas: HTMLCanvasElement, camera: Camera, hands: Hands):
       draft.add(camera.toM(held.from));
       hands.changed();
     } else {
-      hands.clicked(held.from);
+      hands.clicked(held.from, event.ctrlKey || event.metaKey || event.shiftKey);
     }
   };
 
   const cancel = (event: PointerEvent) => {
+    clearTimeout(resting);
     pointers.delete(event.pointerId);
     isDrawing = false;
     drag = null;
@@ -131,6 +157,10 @@ export function attach(canvas: HTMLCanvasElement, camera: Camera, hands: Hands):
     const draft = hands.draft();
     if (!draft) return;
     event.preventDefault();
+    if (wasLongPress) {
+      wasLongPress = false;
+      return;
+    }
     const near = draft.nearest(camera.toM(place(event)), REACH_PX / camera.scale);
     if (near === null || draft.kind === 'circle') return;
     draft.remove(near);
@@ -147,6 +177,7 @@ export function attach(canvas: HTMLCanvasElement, camera: Camera, hands: Hands):
   canvas.addEventListener('wheel', wheel, { passive: false });
   canvas.addEventListener('contextmenu', menu);
   return () => {
+    clearTimeout(resting);
     canvas.removeEventListener('pointerdown', down);
     canvas.removeEventListener('pointermove', move);
     canvas.removeEventListener('pointerup', up);

@@ -1,6 +1,7 @@
 // What is drawn at the moment and for which purpose; kept whatever happens to server or sign-in.
 import type { CreateMission, Geofence, Mission, ReplaceGeofence, Terrain, TerrainClass, Trajectory, TrajectoryCheck } from '../api/schema';
 import { Problem, ask, sentence } from '../api/client';
+import type { DraftState } from '../address';
 import { Draft, RADIUS_MIN_M, type DraftKind } from '../map/draft';
 import type { PointM } from '../map/camera';
 import { texts } from '../texts';
@@ -18,6 +19,9 @@ export type Purpose =
 
 export type FenceSide = 'keep_in' | 'keep_out';
 
+/** A speed where none is given, metres per second. */
+const SPEED_DEFAULT_M_S = 0.5;
+
 export class Editor {
   purpose = $state.raw<Purpose | null>(null);
   draft = $state.raw<Draft | null>(null);
@@ -25,7 +29,9 @@ export class Editor {
   version = $state(0);
 
   robot = $state('');
-  speed_m_s = $state(0.5);
+  /** Robots that get the mission, if it is for several; the dry run is for `robot`. */
+  robots = $state.raw<string[]>([]);
+  speed_m_s = $state(SPEED_DEFAULT_M_S);
   turns = $state(1);
   clockwise = $state(false);
   excite = $state(false);
@@ -43,6 +49,8 @@ export class Editor {
   isChecking = $state(false);
   sendProblem = $state<string | null>(null);
   isSending = $state(false);
+  /** What was discarded last, in case that was not meant. */
+  discarded = $state.raw<DraftState | null>(null);
   /** Said after a success. */
   said = $state<string | null>(null);
 
@@ -55,13 +63,23 @@ export class Editor {
 
   constructor(readonly fleet: Fleet) {}
 
+  /** Begins a mission that each of several robots gets. */
+  beginMissions(robots: string[]): void {
+    const [first] = robots;
+    if (first === undefined) return;
+    this.beginMission(first);
+    if (robots.length > 1) this.robots = robots;
+  }
+
   beginMission(robot: string): void {
     this.robot = robot;
+    this.robots = [];
     this.#begin({ what: 'mission' }, new Draft('circle'));
   }
 
   beginReplace(mission: Mission): void {
     this.robot = mission.robot;
+    this.robots = [];
     this.#begin({ what: 'replace', mission }, this.#asIn(mission.trajectory));
   }
 
@@ -97,6 +115,7 @@ export class Editor {
     this.draft = draft;
     this.#other = null;
     this.said = null;
+    this.discarded = null;
     this.sendProblem = null;
     this.changed();
   }
@@ -117,11 +136,34 @@ export class Editor {
     if (wrong !== null) return texts.draw.flaw.point(wrong);
     if (this.draft?.kind === 'terrain') return null;
     if (!(this.speed_m_s > 0)) return texts.draw.flaw.speed;
-    const model = this.fleet.robots.find((view) => view.id === this.robot)?.robot.model;
+    const model = this.fleet.byId.get(this.robot)?.robot.model;
     const top = model?.limits.linear_max_m_s ?? Infinity;
     if (this.speed_m_s > top) return texts.draw.flaw.fast(this.robot, String(Number(top.toFixed(2))));
     if (this.draft?.kind === 'circle' && !(this.turns > 0)) return texts.draw.flaw.turns;
     return Number.isInteger(this.priority) ? null : texts.draw.flaw.priority;
+  }
+
+  /** Why the area that is drawn cannot be saved, in one sentence; null when it can. */
+  get whyNotSaved(): string | null {
+    void this.version;
+    const { why } = texts.terrains;
+    if (this.isSending) return why.sending;
+    if (this.flaw) return why.flaw;
+    return this.draft?.isWhole ? null : why.corners(this.draft?.points.length ?? 0);
+  }
+
+  /** Why the mission that is drawn cannot be sent, in one sentence; null when it can. */
+  get whyNotSent(): string | null {
+    void this.version;
+    const { why } = texts.draw;
+    const { draft } = this;
+    if (this.isSending) return why.sending;
+    if (!draft || draft.isEmpty) return draft?.kind === 'waypoints' ? why.waypoints(0) : why.circle;
+    if (this.flaw) return why.flaw;
+    if (!draft.isWhole) return draft.kind === 'waypoints' ? why.waypoints(draft.points.length) : why.circle;
+    if (!this.robot) return why.robot;
+    if (this.isChecking) return why.checking;
+    return this.check === null ? why.flaw : null;
   }
 
   /** Says that draft or form are no longer what they were. */
@@ -141,7 +183,81 @@ export class Editor {
     }
   }
 
+  /** Everything that makes up the draft, to be gone on with elsewhere or later; null without one. */
+  get state(): DraftState | null {
+    void this.version;
+    const { purpose, draft } = this;
+    if (!purpose || !draft) return null;
+    const of = purpose.what === 'replace' ? purpose.mission.id : purpose.what === 'terrain' ? purpose.terrain?.id : '';
+    return {
+      what: purpose.what === 'fence' ? purpose.side : purpose.what,
+      of: of ?? '',
+      kind: draft.kind,
+      center: draft.center && { ...draft.center },
+      radius_m: draft.radius_m,
+      points: draft.points.map((point) => ({ ...point })),
+      old: purpose.what === 'fence' ? purpose.old : null,
+      robot: this.robot,
+      robots: this.robots,
+      speed_m_s: this.speed_m_s,
+      turns: this.turns,
+      clockwise: this.clockwise,
+      excite: this.excite,
+      priority: this.priority,
+      start: this.startPolicy,
+      link: this.linkPolicy,
+      id: this.terrainId,
+      name: this.terrainName,
+      class: this.terrainClass,
+      layer: this.terrainLayer,
+    };
+  }
+
+  /** Goes on with a draft; false while the mission or terrain that it changes is not known. */
+  goOnWith(state: DraftState): boolean {
+    const purpose = this.#purposeOf(state);
+    if (!purpose) return false;
+    const isMission = purpose.what === 'mission' || purpose.what === 'replace';
+    if (isMission !== (state.kind !== 'terrain')) return true;
+    const draft = new Draft(state.kind, state.points);
+    if (state.center) draft.typeCircle(state.center, state.radius_m);
+    this.robot = state.robot;
+    this.robots = state.robots;
+    this.speed_m_s = state.speed_m_s;
+    this.turns = state.turns;
+    this.clockwise = state.clockwise;
+    this.excite = state.excite;
+    this.priority = state.priority;
+    this.startPolicy = state.start;
+    this.linkPolicy = state.link;
+    this.terrainId = state.id;
+    this.terrainName = state.name;
+    this.terrainClass = state.class;
+    this.terrainLayer = state.layer;
+    this.#begin(purpose, draft);
+    return true;
+  }
+
+  #purposeOf({ what, of, old }: DraftState): Purpose | null {
+    if (what === 'mission') return { what };
+    if (what === 'keep_in' || what === 'keep_out') return { what: 'fence', side: what, old };
+    if (what === 'replace') {
+      const mission = this.fleet.missions.get(of);
+      return mission ? { what, mission } : null;
+    }
+    if (of === '') return { what, terrain: null };
+    const terrain = this.fleet.terrains.find((known) => known.id === of);
+    return terrain ? { what, terrain } : null;
+  }
+
+  /** Ends a draft that was sent or saved. */
+  finish(): void {
+    this.discard();
+    this.discarded = null;
+  }
+
   discard(): void {
+    this.discarded = this.draft && !this.draft.isEmpty ? this.state : null;
     clearTimeout(this.#due);
     this.purpose = null;
     this.draft = null;
@@ -204,17 +320,26 @@ export class Editor {
     if (purpose.what === 'replace') {
       return this.#send(`/v1/missions/${purpose.mission.id}/replace`, 'POST', { trajectory });
     }
+    const body = this.missionFor(this.robot);
+    if (!body) return false;
+    this.#key ||= crypto.randomUUID();
+    return this.#send('/v1/missions', 'POST', body, { 'idempotency-key': this.#key });
+  }
+
+  /** What is drawn as a mission of a robot; null while it is none. */
+  missionFor(robot: string): CreateMission | null {
+    const { trajectory } = this;
+    const site = this.fleet.site;
+    if (!trajectory || !site) return null;
     const link = this.linkPolicy === 'continue' ? 'continue' : { stop_after: { silence_s: 5 } };
-    const body = {
+    return {
       site,
-      robot: this.robot,
+      robot,
       trajectory,
       priority: this.priority,
       start_policy: this.startPolicy,
       link_policy: link,
     } as CreateMission;
-    this.#key ||= crypto.randomUUID();
-    return this.#send('/v1/missions', 'POST', body, { 'idempotency-key': this.#key });
   }
 
   async saveTerrain(): Promise<boolean> {

@@ -17,7 +17,13 @@ const LIST_MAX = 5_000;
 const ENDED_MAX = 1_000;
 /** Time between two looks at terrains and fences, which no event tells of, milliseconds. */
 const GROUND_MS = 10_000;
+/** Robots of which every sample is kept for their curves; of more than these one in a while is. */
+const CURVES_MAX = 50;
+/** Time between two samples that are kept of large fleets, milliseconds. */
+const SPARSE_MS = 1_000;
 const SITE_KEY = 'tread-site';
+
+const byId = new Intl.Collator('en', { numeric: true });
 
 /** A robot as lists show it. */
 export interface RobotView {
@@ -42,8 +48,11 @@ export class Fleet implements Listener {
   /** A monotonic clock for ages, milliseconds, twice a second. */
   now = $state(performance.now());
   selected = $state<string | null>(null);
+  /** The site that is to be shown first, if it is one. */
+  wantedSite: string | null = null;
 
   robots = $state.raw<RobotView[]>([]);
+  readonly byId = $derived(new Map(this.robots.map((entry) => [entry.id, entry])));
   terrains = $state.raw<Terrain[]>([]);
   terrainFriction = $state.raw<TerrainFriction[]>([]);
   fence = $state.raw<Geofence | null>(null);
@@ -94,7 +103,7 @@ export class Fleet implements Listener {
   }
 
   get selectedRobot(): Robot | null {
-    return this.robots.find((view) => view.id === this.selected)?.robot ?? null;
+    return this.selected === null ? null : (this.byId.get(this.selected)?.robot ?? null);
   }
 
   /** How a robot is heard, as far as it is known: a lost server says nothing more of it. */
@@ -124,7 +133,8 @@ export class Fleet implements Listener {
       return;
     }
     const kept = localStorage.getItem(SITE_KEY);
-    const first = this.sites.find((site) => site.id === kept) ?? this.sites[0];
+    const first = this.sites.find((site) => site.id === (this.wantedSite ?? kept)) ?? this.sites[0];
+    this.wantedSite = null;
     if (first && !this.site) this.choose(first.id);
   }
 
@@ -208,7 +218,7 @@ export class Fleet implements Listener {
     // Of a robot that stands and says nothing new no frame is drawn.
     let looksNew = true;
     if (robot.retired_at) this.tracked.delete(robot.id);
-    else if (known) looksNew = known.update(robot, now);
+    else if (known) looksNew = known.update(robot, now, this.tracked.size > CURVES_MAX ? SPARSE_MS : 0);
     else this.tracked.set(robot.id, new Tracked(robot, now));
     this.stops.heard(robot);
     if (looksNew) this.wake();
@@ -261,7 +271,7 @@ export class Fleet implements Listener {
       this.#listsDue = undefined;
       this.robots = [...this.tracked.values()]
         .map((tracked) => ({ id: tracked.robot.id, robot: tracked.robot, receivedAt: tracked.receivedAt }))
-        .sort((a, b) => a.id.localeCompare(b.id, 'en', { numeric: true }));
+        .sort((a, b) => byId.compare(a.id, b.id));
     }, LISTS_MS);
   }
 }

@@ -2,6 +2,7 @@
 import type { OidcSignIn, Right, Session, SignInMethods, SignedOut } from '../api/schema';
 import { Problem, ask, sentence, whenSignedOut } from '../api/client';
 import { may } from '../rights';
+import { texts } from '../texts';
 
 const THEME_KEY = 'tread-theme';
 /** Kept while this browser should have a session, so that others are not asked in vain. */
@@ -69,7 +70,8 @@ class SignedIn {
       this.hasEnded = false;
       localStorage.setItem(SESSION_KEY, 'yes');
     } catch (error) {
-      this.problem = sentence(error);
+      // What the server says of it is for programs.
+      this.problem = error instanceof Problem && error.status === 401 ? texts.signIn.wrong : sentence(error);
     }
   }
 
@@ -96,12 +98,16 @@ class SignedIn {
 }
 
 class Look {
+  #fingers = matchMedia('(pointer: coarse)');
+  /** Whether whoever looks points with fingers. */
+  isTouch = $state(this.#fingers.matches);
   #system = matchMedia('(prefers-color-scheme: dark)');
   #wanted = $state<Theme | null>(localStorage.getItem(THEME_KEY) as Theme | null);
   #isDark = $state(this.#system.matches);
 
   constructor() {
     this.#system.addEventListener('change', (event) => (this.#isDark = event.matches));
+    this.#fingers.addEventListener('change', (event) => (this.isTouch = event.matches));
     this.#apply();
   }
 

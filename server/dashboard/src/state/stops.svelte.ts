@@ -31,7 +31,8 @@ export class Stops {
 
   constructor(readonly site: () => string | null) {}
 
-  async stop(robot: string): Promise<void> {
+  /** Stops a robot; why it may not have got it, if so. */
+  async stop(robot: string): Promise<string | null> {
     this.sent.set(robot, { state: 'sending' });
     try {
       const stop = await ask<Stop>(`/v1/sites/${this.site()}/robots/${robot}/stop`, {
@@ -41,12 +42,16 @@ export class Stops {
       });
       this.#take([stop]);
       this.sent.delete(robot);
+      return null;
     } catch (error) {
-      this.sent.set(robot, { state: 'failed', text: failureText(robot, error) });
+      const text = failureText(robot, error);
+      this.sent.set(robot, { state: 'failed', text });
+      return text;
     }
   }
 
-  async stopAll(): Promise<void> {
+  /** Stops all robots of the site; why not, if so. */
+  async stopAll(): Promise<string | null> {
     this.sent.set(FLEET, { state: 'sending' });
     try {
       const stopped = await ask<FleetStop>('/v1/stop', {
@@ -56,12 +61,16 @@ export class Stops {
       });
       this.#take(stopped.stops);
       this.sent.delete(FLEET);
+      return null;
     } catch (error) {
-      this.sent.set(FLEET, { state: 'failed', text: failureText(texts.stop.everyRobot, error) });
+      const text = failureText(texts.stop.everyRobot, error);
+      this.sent.set(FLEET, { state: 'failed', text });
+      return text;
     }
   }
 
-  async clear(stop: Stop): Promise<void> {
+  /** Clears a stop; why not, if so. */
+  async clear(stop: Stop): Promise<string | null> {
     this.clearProblems.delete(stop.robot);
     try {
       await ask<Stop>(`/v1/sites/${stop.site}/robots/${stop.robot}/stop/clear`, {
@@ -69,10 +78,14 @@ export class Stops {
         body: { stop: stop.id },
       });
       this.inForce.delete(stop.robot);
+      return null;
     } catch (error) {
-      this.clearProblems.set(stop.robot, sentence(error));
+      const text = sentence(error);
+      this.clearProblems.set(stop.robot, text);
+      return text;
+    } finally {
+      void this.read();
     }
-    void this.read();
   }
 
   /** What a robot says of its latch; a change is reason enough to ask the server. */

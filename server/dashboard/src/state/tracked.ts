@@ -50,15 +50,18 @@ export class Tracked {
     /** When the server said this, by this page's monotonic clock, milliseconds. */
     public receivedAt: number,
   ) {
-    this.#note();
+    this.#note(0);
   }
 
-  /** Takes its newest words; true if it has to be drawn afresh. */
-  update(robot: Robot, receivedAt: number): boolean {
+  /**
+   * Takes its newest words; true if it has to be drawn afresh. Samples for the curves are kept at least so
+   * far apart, milliseconds.
+   */
+  update(robot: Robot, receivedAt: number, apartMs = 0): boolean {
     this.robot = robot;
     this.receivedAt = receivedAt;
     const before = this.#look;
-    this.#note();
+    this.#note(apartMs);
     return this.#look !== before || this.shownAt(receivedAt)?.isMoving === true;
   }
 
@@ -86,13 +89,14 @@ export class Tracked {
     return (live.heard_age_ms + now - this.receivedAt) / 1000;
   }
 
-  #note(): void {
+  #note(apartMs: number): void {
     const { robot } = this;
     const { live } = robot;
     this.#look = JSON.stringify([robot.link, robot.name, robot.configuration, live?.safety.stop != null]);
     if (live) this.#move(live, this.receivedAt);
     if (!live || robot.link !== 'online') return;
     const at_s = Date.now() / 1000;
+    if ((at_s - (this.samples.at(-1)?.at_s ?? 0)) * 1000 < apartMs) return;
     const friction = live.friction?.value;
     this.samples.push({
       at_s,

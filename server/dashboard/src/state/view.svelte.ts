@@ -44,6 +44,10 @@ export class View {
   replay = $state.raw<Replay | null>(null);
   /** The place of the friction map that somebody looks at; null for none. */
   inspected = $state.raw<PointM | null>(null);
+  /** What the map shows, once it is known: its middle, and pixels per metre. */
+  place = $state.raw<{ center: PointM; scale: number } | null>(null);
+  /** A wish to the map: to show just this part. */
+  wantedPlace = $state.raw<{ center: PointM; scale: number } | null>(null);
   /** A wish to the map: to show this, counted so that the same can be wished again. */
   wanted = $state.raw<{ points: PointM[] } | null>(null);
 

@@ -2,10 +2,10 @@
 import type { CellFriction, Robot } from '../../src/api/schema';
 import { Camera } from '../../src/map/camera';
 import { draw } from '../../src/map/draw';
+import { RobotLabels } from '../../src/map/draw_robots';
 import { Layer } from '../../src/map/friction';
 import { TRAIL_POINTS, Tracked } from '../../src/state/tracked';
 
-const ROBOTS = 200;
 const SIDE = 1_024;
 const MEASURED_MS = 4_000;
 
@@ -48,29 +48,46 @@ function cells(): CellFriction[] {
 
 export interface Frames {
   frames_s: number;
+  draw_p10_ms: number;
   draw_p50_ms: number;
   draw_p99_ms: number;
   layer_ms: number;
+  labels: number;
 }
 
-async function measure(): Promise<Frames> {
+/** What is drawn: so many robots, with the friction layer or without. */
+export interface Load {
+  robots: number;
+  withFriction: boolean;
+}
+
+async function measure({ robots, withFriction }: Load): Promise<Frames> {
   const canvas = document.querySelector('canvas');
   const context = canvas?.getContext('2d', { alpha: false });
   if (!canvas || !context) throw new Error('there is no canvas');
   const began = performance.now();
-  const friction = new Layer(cells(), null, 1, 'theta');
+  const friction = withFriction ? new Layer(cells(), null, 1, 'theta') : null;
   const layer_ms = performance.now() - began;
-  const tracked = Array.from({ length: ROBOTS }, (_, index) => robotAt(index));
+  const tracked = Array.from({ length: robots }, (_, index) => robotAt(index));
   const camera = new Camera();
   camera.width = canvas.width;
   camera.height = canvas.height;
   camera.fit({ xMin: 0, yMin: 0, xMax: SIDE, yMax: SIDE });
   const spent: number[] = [];
+  const labels = new RobotLabels();
+  /** Labels of robots in the last frame. */
+  let labelled = 0;
+  const fillText = context.fillText.bind(context);
+  context.fillText = (text, x, y) => {
+    if (/\d/.test(text) && context.textAlign === 'left') labelled += 1;
+    fillText(text, x, y);
+  };
   const start = performance.now();
   let now = start;
   while (now - start < MEASURED_MS) {
     now = await new Promise<number>((resolve) => requestAnimationFrame(resolve));
     const before = performance.now();
+    labelled = 0;
     // Nothing may be kept from the frame before.
     camera.pan(Math.sin(now / 300), Math.cos(now / 300));
     draw(context, camera, {
@@ -85,6 +102,8 @@ async function measure(): Promise<Frames> {
       dryRun: null,
       pathOf: () => null,
       selected: 'rover-1',
+      marked: new Set<string>(),
+      labels,
       showTerrains: true,
       showFence: true,
       showTrails: true,
@@ -102,9 +121,11 @@ async function measure(): Promise<Frames> {
   spent.sort((a, b) => a - b);
   return {
     frames_s: spent.length / seconds,
+    draw_p10_ms: spent[Math.floor(spent.length * 0.1)] ?? NaN,
     draw_p50_ms: spent[Math.floor(spent.length * 0.5)] ?? NaN,
     draw_p99_ms: spent[Math.floor(spent.length * 0.99)] ?? NaN,
     layer_ms,
+    labels: labelled,
   };
 }
 

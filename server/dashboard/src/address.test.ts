@@ -1,0 +1,74 @@
+import { expect, test } from 'vitest';
+import { ADDRESS_MAX, addressOf, placeOf, type DraftState, type Place } from './address';
+
+const draft: DraftState = {
+  what: 'mission',
+  of: '',
+  kind: 'waypoints',
+  center: { x_m: 1.25, y_m: -3 },
+  radius_m: 2,
+  points: [
+    { x_m: 1, y_m: 2.5 },
+    { x_m: -4.25, y_m: NaN },
+  ],
+  old: null,
+  robot: 'rover-1',
+  robots: ['rover-1', 'rover-2'],
+  speed_m_s: 0.5,
+  turns: NaN,
+  clockwise: true,
+  excite: false,
+  priority: 3,
+  start: 'replace',
+  link: 'stop_after',
+  id: '',
+  name: 'Æ & # %',
+  class: 'sand',
+  layer: 0,
+};
+const place: Place = {
+  site: 'yard',
+  tab: 'missions',
+  robot: 'rover-2',
+  marked: ['rover-1', 'rover-3'],
+  view: { center: { x_m: 12.5, y_m: -0.25 }, scale: 33.3 },
+  layer: 'theta',
+  hidden: ['trails'],
+  draft,
+};
+
+test('what is shown, selected and drawn comes back from the address as it was', () => {
+  const address = addressOf(place);
+  expect(placeOf(`#${address}`)).toEqual(place);
+  expect(address).toContain('view=12.5,-0.25,33.3');
+  const bare = { ...place, draft: null, robot: null, marked: [], view: null, layer: '', hidden: [], tab: 'robots' } as const;
+  expect(addressOf({ ...bare, marked: [], hidden: [] })).toBe('site=yard');
+  expect(placeOf('#site=yard')).toEqual({ ...bare, marked: [], hidden: [] });
+});
+
+test('what is not understood is left out, and breaks nothing', () => {
+  const empty = placeOf('');
+  for (const wrong of [
+    '#signed-in',
+    '#view=1,2',
+    '#view=1,2,-3',
+    '#view=a,b,c',
+    '#tab=kitchen&hidden=walls',
+    '#draft={',
+    '#draft=7',
+    '#draft={"what":"party","kind":"circle"}',
+    '#draft={"what":"mission","kind":"spiral"}',
+  ]) {
+    expect(placeOf(wrong), wrong).toEqual(empty);
+  }
+  const odd = placeOf('#draft={"what":"mission","kind":"circle","robots":[1,"a"],"points":7,"class":"lava"}').draft;
+  expect([odd?.robots, odd?.points, odd?.class, odd?.center]).toEqual([['a'], [], 'grass', null]);
+});
+
+test('a draft that makes the address too long is left out of it, and nothing else is', () => {
+  const points = Array.from({ length: 2_000 }, (_, index) => ({ x_m: index, y_m: 1 - index }));
+  const address = addressOf({ ...place, draft: { ...draft, points } });
+  expect(address.length).toBeLessThan(ADDRESS_MAX);
+  expect(placeOf(address)).toEqual({ ...place, draft: null });
+  expect(placeOf(addressOf({ ...place, draft: { ...draft, points } }, Infinity)).draft?.points).toEqual(points);
+});

@@ -1,0 +1,169 @@
+// What the address of the page keeps: what is shown, selected and drawn, so that a reload or a link brings
+// it back. Pure. Whatever in an address is not understood is left out.
+import type { TerrainClass } from './api/schema';
+import type { PointM } from './map/camera';
+import type { DraftKind } from './map/draft';
+import { texts } from './texts';
+
+export const TABS = ['robots', 'missions', 'alerts', 'terrains'] as const;
+export const HIDEABLE = ['terrains', 'fence', 'trails'] as const;
+export type Hideable = (typeof HIDEABLE)[number];
+const WHATS = ['mission', 'replace', 'terrain', 'keep_in', 'keep_out'] as const;
+const KINDS = ['circle', 'waypoints', 'terrain'] as const satisfies readonly DraftKind[];
+const STARTS = ['append', 'replace', 'refuse'] as const;
+const LINKS = ['continue', 'stop_after'] as const;
+const CLASSES = Object.keys(texts.terrains.classes) as TerrainClass[];
+
+/** Longest address that browsers and chats take well; a longer draft is kept by the tab alone. */
+export const ADDRESS_MAX = 6_000;
+
+/** What is being drawn, and for what. */
+export interface DraftState {
+  what: (typeof WHATS)[number];
+  /** The mission or terrain that it changes; empty for a new one. */
+  of: string;
+  kind: DraftKind;
+  center: PointM | null;
+  radius_m: number;
+  points: PointM[];
+  /** The area of the geofence that it changes. */
+  old: PointM[] | null;
+  robot: string;
+  robots: string[];
+  speed_m_s: number;
+  turns: number;
+  clockwise: boolean;
+  excite: boolean;
+  priority: number;
+  start: (typeof STARTS)[number];
+  link: (typeof LINKS)[number];
+  id: string;
+  name: string;
+  class: TerrainClass;
+  layer: number;
+}
+
+export interface Place {
+  site: string | null;
+  tab: (typeof TABS)[number];
+  robot: string | null;
+  marked: string[];
+  view: { center: PointM; scale: number } | null;
+  /** What the friction layer shows; empty for none. */
+  layer: string;
+  hidden: Hideable[];
+  draft: DraftState | null;
+}
+
+const number = (value: number) => (Number.isFinite(value) ? String(Number(value.toFixed(3))) : '');
+const writePoints = (points: readonly PointM[]) => points.map(({ x_m, y_m }) => `${number(x_m)},${number(y_m)}`).join(';');
+
+/** What was typed and is no number is kept as none. */
+const readNumber = (text: string | undefined) => (text === undefined || text.trim() === '' ? NaN : Number(text));
+
+function readPoints(text: string): PointM[] {
+  if (text === '') return [];
+  return text.split(';').map((pair) => {
+    const [x, y] = pair.split(',');
+    return { x_m: readNumber(x), y_m: readNumber(y) };
+  });
+}
+
+/** An address after its `#`, without the draft if that makes it too long. */
+export function addressOf(place: Place, most = ADDRESS_MAX): string {
+  const query = new URLSearchParams();
+  if (place.site) query.set('site', place.site);
+  if (place.tab !== 'robots') query.set('tab', place.tab);
+  if (place.robot) query.set('robot', place.robot);
+  if (place.marked.length > 0) query.set('selected', place.marked.join(','));
+  if (place.view) {
+    const { center, scale } = place.view;
+    query.set('view', [center.x_m, center.y_m, scale].map(number).join(','));
+  }
+  if (place.layer) query.set('layer', place.layer);
+  if (place.hidden.length > 0) query.set('hidden', place.hidden.join(','));
+  const plain = readable(query);
+  if (!place.draft) return plain;
+  const { center, points, old, radius_m, speed_m_s, turns, priority, layer } = place.draft;
+  query.set(
+    'draft',
+    JSON.stringify({
+      ...place.draft,
+      center: center && writePoints([center]),
+      points: writePoints(points),
+      old: old && writePoints(old),
+      radius_m: number(radius_m),
+      speed_m_s: number(speed_m_s),
+      turns: number(turns),
+      priority: number(priority),
+      layer: number(layer),
+    }),
+  );
+  const whole = readable(query);
+  return whole.length <= most ? whole : plain;
+}
+
+/** Characters that need no escape behind a `#` stay as they are. */
+function readable(query: URLSearchParams): string {
+  return query.toString().replaceAll('%2C', ',').replaceAll('%3B', ';').replaceAll('%3A', ':');
+}
+
+export function placeOf(address: string): Place {
+  const query = new URLSearchParams(address.replace(/^#/, ''));
+  const list = (name: string) => (query.get(name) ?? '').split(',').filter(Boolean);
+  const [x_m = NaN, y_m = NaN, scale = NaN] = (query.get('view') ?? '').split(',').map(readNumber);
+  const isView = [x_m, y_m, scale].every(Number.isFinite) && scale > 0;
+  return {
+    site: query.get('site'),
+    tab: oneOf(TABS, query.get('tab')) ?? 'robots',
+    robot: query.get('robot'),
+    marked: list('selected'),
+    view: isView ? { center: { x_m, y_m }, scale } : null,
+    layer: query.get('layer') ?? '',
+    hidden: list('hidden').flatMap((name) => oneOf(HIDEABLE, name) ?? []),
+    draft: draftOf(query.get('draft')),
+  };
+}
+
+function oneOf<T extends string>(names: readonly T[], name: unknown): T | null {
+  return names.find((known) => known === name) ?? null;
+}
+
+function draftOf(text: string | null): DraftState | null {
+  if (text === null) return null;
+  let read: unknown;
+  try {
+    read = JSON.parse(text);
+  } catch {
+    return null;
+  }
+  if (typeof read !== 'object' || read === null) return null;
+  const of = (name: string): unknown => (read as Record<string, unknown>)[name];
+  const word = (name: string) => (typeof of(name) === 'string' ? (of(name) as string) : '');
+  const what = oneOf(WHATS, of('what'));
+  const kind = oneOf(KINDS, of('kind'));
+  if (!what || !kind) return null;
+  const robots = of('robots');
+  return {
+    what,
+    of: word('of'),
+    kind,
+    center: readPoints(word('center'))[0] ?? null,
+    radius_m: readNumber(word('radius_m')),
+    points: readPoints(word('points')),
+    old: typeof of('old') === 'string' ? readPoints(word('old')) : null,
+    robot: word('robot'),
+    robots: Array.isArray(robots) ? robots.filter((id): id is string => typeof id === 'string') : [],
+    speed_m_s: readNumber(word('speed_m_s')),
+    turns: readNumber(word('turns')),
+    clockwise: of('clockwise') === true,
+    excite: of('excite') === true,
+    priority: readNumber(word('priority')),
+    start: oneOf(STARTS, of('start')) ?? 'append',
+    link: oneOf(LINKS, of('link')) ?? 'continue',
+    id: word('id'),
+    name: word('name'),
+    class: oneOf(CLASSES, of('class')) ?? 'grass',
+    layer: readNumber(word('layer')),
+  };
+}

@@ -1,0 +1,74 @@
+// Which robots of a fleet are listed, in which order, and which a choice means. Pure.
+import type { Robot } from './api/schema';
+import { doing } from './standing';
+
+/** What a robot is up to, as far as it concerns whoever supervises it: trouble first. */
+export const GROUPS = ['fault', 'lost', 'stopped', 'moving', 'idle'] as const;
+export type Group = (typeof GROUPS)[number];
+export type Order = 'trouble' | 'name';
+
+/** What robots are looked for; no groups and no model mean all. */
+export interface Wanted {
+  search: string;
+  groups: ReadonlySet<Group>;
+  model: string | null;
+  order: Order;
+}
+
+export function groupOf(robot: Robot): Group {
+  const { live } = robot;
+  // Whatever a robot said last, nobody knows whether it still is so.
+  if (robot.link === 'offline' || !live) return 'lost';
+  if (live.mode === 'fault' || live.fault || doing(live).isBad) return 'fault';
+  if (live.mode === 'stopped' || live.safety.stop) return 'stopped';
+  return live.mode === 'idle' ? 'idle' : 'moving';
+}
+
+/** The name of a robot's model with its tyres, by which fleets are sorted out. */
+export function modelOf({ model }: Robot): string {
+  return `${model.name}, ${model.tyres}`;
+}
+
+const byName = new Intl.Collator('en', { numeric: true });
+
+/** Robots by name, as people count: 2 before 10. */
+export function compareNames(a: Robot, b: Robot): number {
+  return byName.compare(a.name, b.name) || byName.compare(a.id, b.id);
+}
+
+/** Whether each word of a search is in a robot's name or identifier. */
+function isFound(robot: Robot, words: readonly string[]): boolean {
+  const text = `${robot.name} ${robot.id}`.toLowerCase();
+  return words.every((word) => text.includes(word));
+}
+
+/** The robots that are wanted, in the order that is wanted. */
+export function listed<Entry extends { robot: Robot }>(entries: readonly Entry[], wanted: Wanted): Entry[] {
+  const words = wanted.search.toLowerCase().split(/\s+/).filter(Boolean);
+  const found = entries
+    .map((entry) => ({ entry, rank: GROUPS.indexOf(groupOf(entry.robot)) }))
+    .filter(
+      ({ entry: { robot }, rank }) =>
+        isFound(robot, words) &&
+        (wanted.groups.size === 0 || wanted.groups.has(GROUPS[rank] ?? 'idle')) &&
+        (wanted.model === null || modelOf(robot) === wanted.model),
+    );
+  const isByTrouble = wanted.order === 'trouble';
+  found.sort((a, b) => (isByTrouble ? a.rank - b.rank : 0) || compareNames(a.entry.robot, b.entry.robot));
+  return found.map(({ entry }) => entry);
+}
+
+/** How many robots each group has. */
+export function countsOf(robots: Iterable<Robot>): Record<Group, number> {
+  const counts: Record<Group, number> = { fault: 0, lost: 0, stopped: 0, moving: 0, idle: 0 };
+  for (const robot of robots) counts[groupOf(robot)] += 1;
+  return counts;
+}
+
+/** What lies between two of a list, both included; the second alone if the first is not there. */
+export function between(ids: readonly string[], from: string | null, to: string): string[] {
+  const end = ids.indexOf(to);
+  const begin = from === null ? -1 : ids.indexOf(from);
+  if (end < 0) return [];
+  return begin < 0 ? [to] : ids.slice(Math.min(begin, end), Math.max(begin, end) + 1);
+}

@@ -1,0 +1,116 @@
+// Keeps what is shown, selected and drawn in the address of the page, and brings it back from there.
+import { HIDEABLE, addressOf, placeOf, type DraftState, type Hideable, type Place } from '../address';
+import { RANGES, type Quantity } from '../map/friction';
+import type { Editor } from './editor.svelte';
+import type { Fleet } from './fleet.svelte';
+import type { Roster } from './roster.svelte';
+import type { View } from './view.svelte';
+
+/** Wait after a change before the address says so, milliseconds. */
+const WRITE_MS = 200;
+/** The whole of it, as long as it may be, for the tab alone: for long drafts, and over a sign-in elsewhere. */
+const TAB_KEY = 'tread-place';
+const CHANGE = 'change';
+
+export class AddressSync {
+  /** What the address wants and is not brought back yet, since what it is about has not been read. */
+  #wanted: Place | null;
+  draft = $state.raw<DraftState | null>(null);
+  #due: ReturnType<typeof setTimeout> | undefined;
+
+  constructor(
+    readonly fleet: Fleet,
+    readonly roster: Roster,
+    readonly view: View,
+    readonly editor: Editor,
+  ) {
+    const isAddress = location.hash.includes('=');
+    const kept = placeOf(sessionStorage.getItem(TAB_KEY) ?? '');
+    this.#wanted = isAddress ? placeOf(location.hash) : kept;
+    // The same place with a draft that was too long for the address.
+    const bare = (place: Place) => addressOf({ ...place, draft: null });
+    if (isAddress && !this.#wanted.draft && bare(kept) === bare(this.#wanted)) this.#wanted.draft = kept.draft;
+    fleet.wantedSite = this.#wanted.site;
+  }
+
+  /** Everything as it is now. */
+  get place(): Place {
+    const { fleet, roster, view, editor } = this;
+    const shown: Record<Hideable, boolean> = { terrains: view.showTerrains, fence: view.showFence, trails: view.showTrails };
+    return {
+      site: fleet.site,
+      tab: view.tab,
+      robot: fleet.selected,
+      marked: [...roster.marked],
+      view: view.place,
+      layer: view.compare.isOn ? CHANGE : (view.quantity ?? ''),
+      hidden: HIDEABLE.filter((name) => !shown[name]),
+      draft: this.draft ?? editor.state,
+    };
+  }
+
+  /** Brings back what the address wants, once its site is there. */
+  begin(): void {
+    const wanted = this.#wanted;
+    this.#wanted = null;
+    if (!wanted || wanted.site !== this.fleet.site) return;
+    this.#bringBack(wanted);
+  }
+
+  /** Whoever signs in again finds everything as it was. */
+  pause(): void {
+    if (this.fleet.site) this.#wanted = this.place;
+  }
+
+  /** Somebody has put another address in. */
+  changed(): void {
+    const place = placeOf(location.hash);
+    if (place.site === this.fleet.site) this.#bringBack(place);
+  }
+
+  #bringBack(place: Place): void {
+    const { fleet, roster, view, editor } = this;
+    view.tab = place.tab;
+    fleet.selected = place.robot;
+    for (const id of place.marked) roster.marked.add(id);
+    view.showTerrains = !place.hidden.includes('terrains');
+    view.showFence = !place.hidden.includes('fence');
+    view.showTrails = !place.hidden.includes('trails');
+    if (place.view) view.wantedPlace = place.view;
+    const now = view.compare.isOn ? CHANGE : (view.quantity ?? '');
+    if (place.layer !== now) {
+      view.compare.end();
+      view.choose(place.layer in RANGES ? (place.layer as Quantity) : null);
+      if (place.layer === CHANGE) view.compare.begin();
+    }
+    if (!editor.purpose) this.draft = place.draft;
+    fleet.isDirty = true;
+  }
+
+  /** Goes on with the draft as soon as what it changes is known. */
+  goOn(): void {
+    const { draft, editor } = this;
+    if (draft && editor.goOnWith(draft)) this.draft = null;
+  }
+
+  /** Says soon in the address how everything is. */
+  write(): void {
+    // Read now, so that whoever calls this in an effect is called again.
+    const place = this.place;
+    clearTimeout(this.#due);
+    if (!place.site || this.#wanted) return;
+    this.#due = setTimeout(() => this.#put(place), WRITE_MS);
+  }
+
+  /** Before the page goes. */
+  flush(): void {
+    clearTimeout(this.#due);
+    if (this.fleet.site && !this.#wanted) this.#put(this.place);
+  }
+
+  #put(place: Place): void {
+    const address = `#${addressOf(place)}`;
+    if (address !== location.hash) history.replaceState(null, '', address);
+    sessionStorage.setItem(TAB_KEY, addressOf(place, Infinity));
+  }
+}

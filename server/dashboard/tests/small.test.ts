@@ -1,0 +1,190 @@
+// Small things that are in the way every day: where the focus is, what a view returns to, and words.
+import type { Page } from 'playwright-core';
+import { expect, test } from 'vitest';
+import type { Mission, MissionDetail, Page as ApiPage } from './types';
+import { api, browser, eventually, map, metresAt, select, shot } from './harness';
+
+const { open } = browser();
+
+/** What has the focus, in a word. */
+const focused = (page: Page) =>
+  page.evaluate(() => {
+    const at = document.activeElement;
+    return at === document.body || !at ? 'body' : `${at.tagName.toLowerCase()} ${at.textContent?.trim().slice(0, 20) ?? ''}`;
+  });
+
+/** Names of what reaches beyond the panel, or beyond the card that it is in. */
+const overflowing = (page: Page) =>
+  page.evaluate(() => {
+    const beyond = (inner: Element, outer: Element) =>
+      inner.getBoundingClientRect().right > outer.getBoundingClientRect().right + 0.5;
+    const panel = document.querySelector('#panel');
+    if (!panel) throw new Error('there is no panel');
+    const found = [...panel.querySelectorAll('input, select, button, label, p, dd')].filter((element) => {
+      const card = element.parentElement?.closest('.card') ?? panel;
+      return element.getBoundingClientRect().width > 0 && (beyond(element, card) || beyond(element, panel));
+    });
+    return found.map((element) => `${element.tagName} ${element.textContent?.trim().slice(0, 30)}`);
+  });
+
+for (const [name, size] of [
+  ['wide', { width: 1360, height: 850 }],
+  ['tablet', { width: 820, height: 1180 }],
+  ['phone', { width: 360, height: 740 }],
+] as const) {
+  test(`options stay within their panel: ${name}`, async () => {
+    const page = await open({ size });
+    await select(page, 'rover-3');
+    await page.getByRole('button', { name: 'New mission' }).click();
+    await page.getByRole('radio', { name: 'Waypoints' }).check();
+    await page.getByRole('button', { name: 'Add point' }).click();
+    await page.getByText('Options').click();
+    await page.getByLabel('If the robot has other missions').scrollIntoViewIfNeeded();
+    expect(await overflowing(page)).toEqual([]);
+    await shot(page, `options-${name}`);
+  });
+}
+
+test('the focus goes on where the robot is that was chosen, and back to where it was', async () => {
+  const page = await open();
+  await page.locator('button[data-robot="rover-2"]').focus();
+  await page.keyboard.press('Enter');
+  await page.getByRole('button', { name: 'All robots' }).waitFor();
+  await eventually('the focus on the robot', async () => (await focused(page)) === 'h2 rover-2');
+  await page.getByRole('button', { name: 'All robots' }).focus();
+  await page.keyboard.press('Enter');
+  await page.locator('button[data-robot="rover-2"]').waitFor();
+  await eventually('the focus in the list', async () => (await focused(page)).startsWith('button rover-2'));
+  // The same of what is drawn and discarded.
+  await page.keyboard.press('Enter');
+  await page.getByRole('button', { name: 'New mission' }).click();
+  await page.getByRole('button', { name: 'Discard' }).click();
+  await eventually('the focus in the panel', async () => (await focused(page)) === 'h2 rover-2');
+});
+
+test('a mission that is closed leaves the map as it was, unless it was moved meanwhile', async () => {
+  const ended = await eventually('a mission that has ended', async () => {
+    const { items } = await api<ApiPage<Mission>>('/v1/missions?site=yard&limit=100');
+    return items.find((mission) => mission.state === 'succeeded');
+  }, 60_000);
+  const page = await open();
+  const box = await map(page);
+  const corner = () => metresAt(page, box.x + 20, box.y + 120);
+  for (let step = 0; step < 3; step += 1) await page.getByRole('button', { name: 'Zoom out' }).click();
+  const before = await corner();
+  await page.getByRole('tab', { name: 'Missions' }).click();
+  const row = page.locator('.ended button', { hasText: ended.robot }).first();
+  await row.click();
+  await page.locator('[data-test="detail"]').waitFor();
+  await eventually('another part of the map', async () => Math.abs((await corner()).x_m - before.x_m) > 0.5);
+  await page.getByRole('button', { name: 'Close', exact: true }).click();
+  await eventually('the map as it was', async () => {
+    const now = await corner();
+    return now.x_m === before.x_m && now.y_m === before.y_m;
+  });
+  await row.click();
+  await page.locator('[data-test="detail"]').waitFor();
+  await page.getByRole('button', { name: 'Zoom in' }).click();
+  const moved = await corner();
+  await page.getByRole('button', { name: 'Close', exact: true }).click();
+  await page.locator('[data-test="detail"]').waitFor({ state: 'detached' });
+  expect(await corner()).toEqual(moved);
+});
+
+test('repeated steps of a history are one line, and times have one format', async () => {
+  const { items } = await api<ApiPage<Mission>>('/v1/missions?site=yard&limit=100');
+  const mission = items.find((known) => known.ended_at);
+  if (!mission) throw new Error('no mission has ended');
+  const page = await open({
+    async prepare(page) {
+      await page.route(new RegExp(`/v1/missions/${mission.id}$`), async (route) => {
+        const response = await route.fetch();
+        const detail = (await response.json()) as MissionDetail;
+        const [first, ...rest] = detail.events;
+        if (!first) throw new Error('there is no history');
+        // A robot that gave it back a dozen times before it took it.
+        const offers = Array.from({ length: 12 }, () => [
+          { ...first, from: 'queued', to: 'offered', cause: 'offered', reason: null },
+          { ...first, from: 'offered', to: 'queued', cause: 'returned', reason: 'the robot is stopped' },
+        ]).flat();
+        await route.fulfill({ response, json: { ...detail, events: [first, ...offers, ...rest] } });
+      });
+    },
+  });
+  await page.getByRole('tab', { name: 'Missions' }).click();
+  await page.locator('.ended button').first().waitFor();
+  const rows = page.locator('.ended button');
+  const index = await page.evaluate(() => document.querySelectorAll('.ended button').length);
+  expect(index).toBeGreaterThan(0);
+  for (let at = 0; at < index; at += 1) {
+    await rows.nth(at).click();
+    await page.locator('[data-test="detail"] .events li').first().waitFor();
+    if (await page.getByText('offered 12 times').isVisible()) break;
+  }
+  const line = page.locator('.events li', { hasText: 'offered 12 times' });
+  await line.getByText('the robot is stopped').waitFor();
+  expect(await page.locator('.events li').count()).toBeLessThan(12);
+  const format = /^\d{4}-\d\d-\d\d \d\d:\d\d:\d\d$/;
+  for (const time of await page.locator('time').all()) {
+    expect(await time.innerText()).toMatch(format);
+    expect(await time.getAttribute('title')).toMatch(/[+-]\d\d:\d\d \(.+\)$/);
+  }
+  await line.scrollIntoViewIfNeeded();
+  await shot(page, 'collapsed-history');
+});
+
+test('what cannot be saved or sent yet says why, beside the button', async () => {
+  const page = await open();
+  const why = page.locator('#why-not');
+  await page.getByRole('tab', { name: 'Terrains' }).click();
+  await page.getByRole('button', { name: 'New terrain' }).click();
+  expect(await why.innerText()).toBe('Not yet: an area needs three corners, 0 so far.');
+  expect(await page.getByRole('button', { name: 'Save' }).isDisabled()).toBe(true);
+  for (let corner = 0; corner < 3; corner += 1) await page.getByRole('button', { name: 'Add point' }).click();
+  expect(await why.innerText()).toBe('Not yet: enter an identifier.');
+  await page.getByLabel('Identifier').fill('a-place');
+  await why.waitFor({ state: 'detached' });
+  expect(await page.getByRole('button', { name: 'Save' }).isEnabled()).toBe(true);
+  await page.getByRole('button', { name: 'Discard' }).click();
+  await select(page, 'rover-1');
+  await page.getByRole('button', { name: 'New mission' }).click();
+  expect(await why.innerText()).toBe('Not yet: drag a circle on the map, or enter its centre.');
+  await page.getByRole('radio', { name: 'Waypoints' }).check();
+  await page.getByRole('button', { name: 'Add point' }).click();
+  expect(await why.innerText()).toBe('Not yet: a path needs two points, 1 so far.');
+  await shot(page, 'why-not');
+});
+
+test('a wrong token is said without a word of HTTP', async () => {
+  const page = await open({ as: null, expected: /401/ });
+  await page.getByLabel('Token').fill('tread_a_wrong');
+  await page.getByRole('button', { name: 'Sign in' }).click();
+  const said = await page.getByRole('alert').innerText();
+  expect(said).toMatch(/token.*mistyped, expired or revoked/);
+  expect(said).not.toMatch(/bearer|header|authori[sz]ation|\/v1/i);
+  await shot(page, 'wrong-token');
+});
+
+test('fingers are shown what fingers do: a long press deletes a point', async () => {
+  const page = await open({ size: { width: 390, height: 800 }, hasTouch: true });
+  await select(page, 'rover-1');
+  await page.getByRole('button', { name: 'New mission' }).click();
+  await page.getByRole('radio', { name: 'Waypoints' }).check();
+  const form = page.locator('form');
+  await form.getByText('long-press it to delete it').waitFor();
+  expect(await form.innerText()).not.toMatch(/right-click|click/i);
+  await page.evaluate(() => scrollTo(0, 0));
+  const box = await map(page);
+  const at = { x: box.x + 120, y: box.y + box.height - 90 };
+  const touch = await page.context().newCDPSession(page);
+  const inputs = page.getByLabel(/^Point \d+, x/);
+  await page.touchscreen.tap(at.x, at.y);
+  await page.touchscreen.tap(at.x + 90, at.y);
+  expect(await inputs.count()).toBe(2);
+  await touch.send('Input.dispatchTouchEvent', { type: 'touchStart', touchPoints: [at] });
+  await eventually('the point is gone', async () => (await inputs.count()) === 1);
+  await touch.send('Input.dispatchTouchEvent', { type: 'touchEnd', touchPoints: [] });
+  expect(await inputs.count()).toBe(1);
+  await page.getByRole('button', { name: 'Undo' }).click();
+  expect(await inputs.count()).toBe(2);
+});
