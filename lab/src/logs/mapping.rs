@@ -1,22 +1,20 @@
 //! Chooses the topics and joints of the robot: the ones that are asked for, those of its
 //! configuration, or else the only ones of their type.
 
-use std::collections::BTreeSet;
-use std::ops::ControlFlow;
+mod joints;
 
 use tread_agent::drive::ros2::settings::{
-    BusMode, BusSettings, CommandKind, CommandSettings, Effort, ImuSettings, JOINTS_MAX,
-    JointSettings, MotionOf, OdometrySettings, PoseSettings, Ros2Settings, Scheme, SideJoints,
-    StampClock, Timing,
+    BusMode, BusSettings, CommandKind, CommandSettings, Effort, ImuSettings, MotionOf,
+    OdometrySettings, PoseSettings, Ros2Settings, Scheme, StampClock, Timing,
 };
 use tread_control::geometry::Pose;
 use tread_control::robot::RobotModel;
-use tread_ros2::cdr::decode;
-use tread_ros2::messages::JointState;
 use tread_ros2::names::Name;
 
 use super::recording::{CDR, Contents, Recording, RecordingError, Topic};
 use super::robot::Robot;
+use joints::joint_settings;
+pub use joints::{JointNames, sides_of};
 
 /// Wheel speeds.
 pub const JOINT_STATE: &str = "sensor_msgs/msg/JointState";
@@ -28,43 +26,6 @@ pub const ODOMETRY: &str = "nav_msgs/msg/Odometry";
 pub const POSE: &str = "geometry_msgs/msg/PoseStamped";
 /// A pose with its covariance.
 pub const COVARIANT_POSE: &str = "geometry_msgs/msg/PoseWithCovarianceStamped";
-
-/// Messages of a topic in which the names of joints are looked for.
-const LOOKED_AT_MAX: u32 = 100;
-
-/// Names of the joints of both sides.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct JointNames {
-    /// Left ones.
-    pub left: Vec<String>,
-    /// Right ones.
-    pub right: Vec<String>,
-}
-
-impl std::str::FromStr for JointNames {
-    type Err = String;
-
-    /// Parses `left,left/right,right`.
-    fn from_str(text: &str) -> Result<Self, String> {
-        let names = |side: &str| -> Vec<String> {
-            let names = side
-                .split(',')
-                .map(str::trim)
-                .filter(|name| !name.is_empty());
-            names.map(str::to_owned).collect()
-        };
-        let (left, right) = text.split_once('/').ok_or(
-            "a slash must stand between the left and the right joints: `left_wheel/right_wheel`",
-        )?;
-        let (left, right) = (names(left), names(right));
-        let is_right = |count: usize| (1..=JOINTS_MAX).contains(&count);
-        if is_right(left.len()) && is_right(right.len()) {
-            Ok(Self { left, right })
-        } else {
-            Err(format!("each side has 1 to {JOINTS_MAX} joints"))
-        }
-    }
-}
 
 /// What is asked for; the rest is chosen.
 #[derive(Debug, Clone, Default)]
@@ -487,263 +448,5 @@ fn settings_of(model: &RobotModel, odometry_track_m: Option<f64>) -> Ros2Setting
     }
 }
 
-/// Returns the names of the joints in the first messages of a topic.
-fn names_of(recording: &Recording, topic: &str) -> Result<Vec<String>, RecordingError> {
-    let (mut names, mut looked_at) = (BTreeSet::new(), 0);
-    recording.read(&[topic], &mut |message| {
-        if let Ok(joints) = decode::<JointState<'_>>(message.bytes) {
-            names.extend(joints.name.iter().map(str::to_owned));
-        }
-        looked_at += 1;
-        if looked_at < LOOKED_AT_MAX {
-            ControlFlow::Continue(())
-        } else {
-            ControlFlow::Break(())
-        }
-    })?;
-    Ok(names.into_iter().collect())
-}
-
-/// Whether a name has a word, however words are joined: `front_left_wheel`, `frontLeftWheel`.
-fn has_word(name: &str, words: [&str; 2]) -> bool {
-    let [long, short] = words;
-    let lower = name.to_lowercase();
-    let mut parts = lower.split(|letter: char| !letter.is_ascii_alphanumeric());
-    lower.contains(long) || parts.any(|part| part == short)
-}
-
-/// Chooses the joints of the sides by the words in their names; `None` where that is ambiguous.
-pub fn sides_of(names: &[String]) -> Option<JointNames> {
-    let of = |words: [&'static str; 2], others: [&'static str; 2]| -> Vec<String> {
-        let mine = names
-            .iter()
-            .filter(|name| has_word(name, words) && !has_word(name, others));
-        mine.cloned().collect()
-    };
-    let (left_words, right_words) = (["left", "l"], ["right", "r"]);
-    let (left, right) = (of(left_words, right_words), of(right_words, left_words));
-    let is_even = left.len() == right.len() && (1..=JOINTS_MAX).contains(&left.len());
-    is_even.then_some(JointNames { left, right })
-}
-
-fn joint_settings(
-    recording: &Recording,
-    topic: &str,
-    configured: Option<&JointSettings>,
-    wishes: &Wishes,
-) -> Result<JointSettings, MappingError> {
-    let names = names_of(recording, topic)?;
-    let listed = || {
-        let quoted: Vec<String> = names.iter().map(|name| format!("`{name}`")).collect();
-        quoted.join(", ")
-    };
-    let of_configuration = configured.map(|joints| JointNames {
-        left: joints.left.names.clone(),
-        right: joints.right.names.clone(),
-    });
-    let chosen = wishes.joints.clone().or(of_configuration);
-    let chosen = chosen.or_else(|| sides_of(&names));
-    let chosen = chosen.ok_or_else(|| MappingError::Joints {
-        topic: topic.to_owned(),
-        names: listed(),
-    })?;
-    let mut all = chosen.left.iter().chain(&chosen.right);
-    if let Some(joint) = all.find(|joint| !names.contains(joint)) {
-        return Err(MappingError::NoJoint {
-            topic: topic.to_owned(),
-            joint: joint.clone(),
-            names: listed(),
-        });
-    }
-    let side =
-        |names: Vec<String>, is_reversed: bool, configured: Option<&SideJoints>| SideJoints {
-            names,
-            sign: if is_reversed {
-                -1.0
-            } else {
-                configured.map_or(1.0, |side| side.sign)
-            },
-            effort_sign: configured.map_or(1.0, |side| side.effort_sign),
-        };
-    let [is_left_reversed, is_right_reversed] = wishes.reversed;
-    let ratio = wishes
-        .gear_ratio
-        .or(configured.map(|joints| joints.gear_ratio));
-    let effort = wishes.effort.or(configured.map(|joints| joints.effort));
-    Ok(JointSettings {
-        topic: Name::default(),
-        left: side(
-            chosen.left,
-            is_left_reversed,
-            configured.map(|joints| &joints.left),
-        ),
-        right: side(
-            chosen.right,
-            is_right_reversed,
-            configured.map(|joints| &joints.right),
-        ),
-        gear_ratio: ratio.unwrap_or(1.0),
-        effort: effort.unwrap_or(Effort::None),
-    })
-}
-
 #[cfg(test)]
-pub(crate) mod tests {
-    use super::*;
-
-    /// Settings without any topic.
-    pub(crate) fn settings() -> Ros2Settings {
-        settings_of(&RobotModel::yi2007(), None)
-    }
-
-    fn topic(name: &str, kind: &str) -> Topic {
-        Topic {
-            name: name.to_owned(),
-            message_type: kind.to_owned(),
-            encoding: CDR.to_owned(),
-            count: 2,
-            first_ns: 0,
-            last_ns: 1,
-        }
-    }
-
-    /// Chooses among topics that have no joints to be read.
-    fn chosen(topics: Vec<Topic>, wishes: &Wishes) -> Result<Mapping, MappingError> {
-        let contents = Contents {
-            topics,
-            torn: Vec::new(),
-        };
-        let robot = Robot {
-            model: RobotModel::yi2007(),
-            prior: tread_control::estimation::EstimatorPrior::default(),
-            settings: None,
-            rate_hz: 100.0,
-        };
-        let recording = Recording::open(&[]).unwrap();
-        choose(&recording, &contents, &robot, wishes)
-    }
-
-    #[test]
-    fn what_is_missing_or_ambiguous_is_said_with_the_topics_that_there_are() {
-        let wheels = || topic("/joint_states", JOINT_STATE);
-        let imus = || vec![topic("/a/imu", IMU), topic("/b/imu", IMU), wheels()];
-        let none = Wishes::default();
-        let refused = |topics, wishes: &Wishes| chosen(topics, wishes).unwrap_err().to_string();
-        let two = refused(imus(), &none);
-        assert!(
-            two.contains("--imu") && two.contains("/b/imu  sensor_msgs/msg/Imu"),
-            "{two}"
-        );
-        let wishes = Wishes {
-            imu: Some("b/imu".to_owned()),
-            ..Wishes::default()
-        };
-        // The topics are found, and the next question is which joints are whose.
-        let next = refused(imus(), &wishes);
-        assert!(next.contains("--joints"), "{next}");
-        let wishes = Wishes {
-            imu: Some("/joint_states".to_owned()),
-            ..Wishes::default()
-        };
-        let wrong = refused(imus(), &wishes);
-        assert!(
-            wrong.contains(JOINT_STATE) && wrong.contains("is needed"),
-            "{wrong}"
-        );
-        let wishes = Wishes {
-            wheels: Some("/wheels".to_owned()),
-            ..Wishes::default()
-        };
-        assert!(refused(imus(), &wishes).contains("there is no topic `/wheels`"));
-        assert!(refused(vec![wheels()], &none).contains("yaw rate"));
-        assert!(refused(vec![topic("/imu", IMU)], &none).contains("wheel speeds"));
-        let odometry = || topic("/odom", ODOMETRY);
-        assert!(refused(vec![odometry()], &none).contains("θ needs a gyro"));
-        let both = || vec![odometry(), topic("/imu", IMU)];
-        assert!(refused(both(), &none).contains("--odometry-track-m"));
-        let wishes = Wishes {
-            odometry_track_m: Some(0.8),
-            ..Wishes::default()
-        };
-        let mapping = chosen(both(), &wishes).unwrap();
-        assert_eq!(mapping.topics(), ["/imu", "/odom"]);
-        assert!((mapping.settings.command.base_track_m - 0.8).abs() < 1.0e-12);
-    }
-
-    #[test]
-    fn several_poses_are_left_out_and_that_is_said() {
-        let topics = vec![
-            topic("/imu", IMU),
-            topic("/odom", ODOMETRY),
-            topic("/amcl", COVARIANT_POSE),
-            topic("/mocap", POSE),
-        ];
-        let mut wishes = Wishes {
-            odometry_track_m: Some(0.8),
-            ..Wishes::default()
-        };
-        let mapping = chosen(topics.clone(), &wishes).unwrap();
-        assert_eq!(mapping.pose, None);
-        assert!(
-            mapping.notices[0].contains("/amcl, /mocap"),
-            "{:?}",
-            mapping.notices
-        );
-        wishes.pose = Some("/mocap".to_owned());
-        let mapping = chosen(topics, &wishes).unwrap();
-        assert_eq!(mapping.pose, Some(("/mocap".to_owned(), POSE)));
-    }
-
-    #[test]
-    fn a_list_says_what_is_missing() {
-        let of = |topics| {
-            missing(&Contents {
-                topics,
-                torn: Vec::new(),
-            })
-        };
-        assert_eq!(of(Vec::new()).len(), 2);
-        assert!(of(vec![topic("/odom", ODOMETRY)])[0].contains("--odometry-track-m"));
-        let enough = vec![topic("/imu", IMU), topic("/joints", JOINT_STATE)];
-        assert_eq!(of(enough), Vec::<String>::new());
-    }
-
-    fn owned(names: &[&str]) -> Vec<String> {
-        names.iter().map(|name| (*name).to_owned()).collect()
-    }
-
-    #[test]
-    fn sides_are_told_by_the_words_in_names_and_not_guessed() {
-        let husky = owned(&[
-            "front_left_wheel",
-            "front_right_wheel",
-            "rear_left_wheel",
-            "rear_right_wheel",
-        ]);
-        let sides = sides_of(&husky).unwrap();
-        assert_eq!(sides.left, owned(&["front_left_wheel", "rear_left_wheel"]));
-        assert_eq!(
-            sides.right,
-            owned(&["front_right_wheel", "rear_right_wheel"])
-        );
-        let short = sides_of(&owned(&["wheel_l", "wheel_r", "lidar_spin"])).unwrap();
-        assert_eq!(
-            (short.left, short.right),
-            (owned(&["wheel_l"]), owned(&["wheel_r"]))
-        );
-        assert_eq!(sides_of(&owned(&["wheel_1", "wheel_2"])), None);
-        assert_eq!(sides_of(&owned(&["left_a", "left_b", "right_a"])), None);
-    }
-
-    #[test]
-    fn joints_are_parsed_with_a_slash_between_the_sides() {
-        let names: JointNames = "fl, rl/fr,rr".parse().unwrap();
-        assert_eq!(
-            (names.left, names.right),
-            (owned(&["fl", "rl"]), owned(&["fr", "rr"]))
-        );
-        for bad in ["fl,fr", "/fr", "a/", "a,b,c,d,e,f,g,h,i/j"] {
-            assert!(bad.parse::<JointNames>().is_err(), "{bad}");
-        }
-    }
-}
+pub(crate) mod tests;

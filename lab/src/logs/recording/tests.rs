@@ -90,7 +90,10 @@ fn bag(file: &Path, messages: &[Written]) {
     });
 }
 
-fn all(recording: &Recording, topics: &[&str]) -> (Vec<(String, i64, Vec<u8>)>, Vec<String>) {
+/// A message that was read: topic, time of recording, and bytes.
+type Found = (String, i64, Vec<u8>);
+
+fn all(recording: &Recording, topics: &[&str]) -> (Vec<Found>, Vec<String>) {
     let mut read = Vec::new();
     let torn = recording.read(topics, &mut |message| {
         read.push((

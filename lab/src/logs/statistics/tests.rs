@@ -111,7 +111,7 @@ fn straight_driving_gives_no_effective_track() {
 fn turns_to_both_sides_tell_the_gyros_offset_from_the_track() {
     let mut random = Random::new(2);
     let sides = |index: u32| {
-        if index / 500 % 2 == 0 {
+        if (index / 500).is_multiple_of(2) {
             (0.4, 0.5)
         } else {
             (-0.4, 0.5)
@@ -142,7 +142,7 @@ proptest! {
         ratio in 1.1..2.2_f64, rate in 0.15..0.9_f64, offset in -0.004..0.004_f64, seed in 0_u64..1_000,
     ) {
         let mut random = Random::new(seed);
-        let sides = |index: u32| if index / 500 % 2 == 0 { (rate, 0.4) } else { (-rate, 0.4) };
+        let sides = |index: u32| if (index / 500).is_multiple_of(2) { (rate, 0.4) } else { (-rate, 0.4) };
         let fed = turning(ratio, sides, offset, &mut random);
         let found = effective_track(&fed, &RobotModel::yi2007()).unwrap();
         prop_assert!(found.low_95 < ratio && ratio < found.high_95, "{found:?}");
