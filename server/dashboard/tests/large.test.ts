@@ -195,7 +195,10 @@ test('real robots are sent a mission, paused, resumed, cancelled, stopped and cl
   await bar.getByRole('button', { name: 'Stop', exact: true }).click();
   await eventually('three stops', async () => (await stops()).filter((stop) => stop.confirmed_at).length === 3);
   await summary(page).getByText('3 of 3 done').waitFor();
-  expect((await lines(page).allInnerTexts()).every((text) => text.includes('stopped, confirmed'))).toBe(true);
+  // A newer stop of the same robot is confirmed anew.
+  await eventually('each line confirmed', async () =>
+    (await lines(page).allInnerTexts()).every((text) => text.includes('stopped, confirmed')),
+  );
   await shot(page, 'bulk-stopped');
   await eventually('cleared', async () => {
     await bar.getByRole('button', { name: 'Clear stops' }).click();
