@@ -43,6 +43,14 @@ pub(crate) struct Line {
     answers: usize,
     /// Answers with an interval that is narrow enough.
     estimates: usize,
+    /// Fraction of the answers that abstain.
+    abstained: f64,
+    /// Figures of the estimates, if there are any.
+    of_estimates: Option<Figures>,
+}
+
+#[derive(Debug, Serialize)]
+struct Figures {
     /// Fraction of the estimates whose 95 % interval contains the true θ.
     coverage: f64,
     /// Fractions of the estimates whose interval is below and above the true θ.
@@ -52,8 +60,6 @@ pub(crate) struct Line {
     error: f64,
     /// Median half-width of the 95 % interval, relative to θ̂.
     half_width: f64,
-    /// Fraction of the answers that abstain.
-    abstained: f64,
 }
 
 impl Line {
@@ -83,34 +89,41 @@ impl Line {
             drives: drives.len(),
             answers,
             estimates,
-            coverage: share(covered, estimates),
-            below: share(below, estimates),
-            above: share(above, estimates),
-            error: median(&mut errors),
-            half_width: median(&mut widths),
             abstained: 1.0 - share(estimates, answers),
+            of_estimates: (estimates > 0).then(|| Figures {
+                coverage: share(covered, estimates),
+                below: share(below, estimates),
+                above: share(above, estimates),
+                error: median(&mut errors),
+                half_width: median(&mut widths),
+            }),
         }
     }
 
-    /// What must hold of the coverage, if it has a goal.
+    /// What must hold of the coverage, if it has a goal and there are estimates.
     pub(crate) fn check(&self) -> Option<Check> {
         let (contacts, torque) = (self.group.contacts.text(), self.group.torque());
         let name = format!("{contacts}, {}, {torque} torque: coverage", self.name);
-        self.has_goal
-            .then(|| Check::at_least(name, self.coverage, COVERAGE_MIN))
+        let figures = self.of_estimates.as_ref().filter(|_| self.has_goal)?;
+        Some(Check::at_least(name, figures.coverage, COVERAGE_MIN))
     }
 
     fn cells(&self) -> [String; 9] {
         let percent = |value: f64| format!("{:.1}", 100.0 * value);
+        let of = |text: &dyn Fn(&Figures) -> String| {
+            self.of_estimates
+                .as_ref()
+                .map_or_else(|| "-".to_owned(), text)
+        };
         [
             self.drives.to_string(),
             self.answers.to_string(),
             self.estimates.to_string(),
-            percent(self.coverage),
-            percent(self.below),
-            percent(self.above),
-            format!("{:+.1}", 100.0 * self.error),
-            format!("±{}", percent(self.half_width)),
+            of(&|figures| percent(figures.coverage)),
+            of(&|figures| percent(figures.below)),
+            of(&|figures| percent(figures.above)),
+            of(&|figures| format!("{:+.1}", 100.0 * figures.error)),
+            of(&|figures| format!("±{}", percent(figures.half_width))),
             percent(self.abstained),
         ]
     }
