@@ -1,5 +1,7 @@
 //! Computes the coverage of the drives and of their strata.
 
+use std::fmt::Write as _;
+
 use serde::Serialize;
 use tread_api::friction::NORMAL_95;
 use tread_lab::held_out::process::Contacts;
@@ -194,11 +196,11 @@ pub(crate) fn text(lines: &[Line]) -> String {
 /// Prints the lines as a table in Markdown.
 pub(crate) fn markdown(lines: &[Line]) -> String {
     let mut text = format!("| contacts | | torque | {} |\n", COLUMNS.join(" | "));
-    text += &format!("|---|---|---{}|\n", "|---".repeat(COLUMNS.len()));
+    let _ = writeln!(text, "|---|---|---{}|", "|---".repeat(COLUMNS.len()));
     for line in lines {
         let cells = line.cells().join(" | ");
         let (contacts, torque) = (line.group.contacts.text(), line.group.torque());
-        text += &format!("| {contacts} | {} | {torque} | {cells} |\n", line.name);
+        let _ = writeln!(text, "| {contacts} | {} | {torque} | {cells} |", line.name);
     }
     text
 }
