@@ -19,6 +19,8 @@ use crate::rough::spec::Deviations;
 pub const STEPS_PER_SAMPLE: u32 = 20;
 /// Number of wheels: front left, rear left, front right, rear right.
 pub const WHEELS: usize = 4;
+/// Share of a wheel in what a robot has of all wheels.
+const WHEEL_SHARE: f64 = 0.25;
 /// Exit code of `lab/ode/build` if a tool is missing.
 const MISSING: i32 = 3;
 /// Longest answer that is read, in bytes.
@@ -163,7 +165,6 @@ impl OdeRobot<'_> {
     fn line(&self) -> String {
         let (model, spec, mass_kg) = (self.model, self.deviations, self.mass_kg());
         let radius_m = model.wheel_radius_m();
-        let wheels = f64::from(u8::try_from(WHEELS).unwrap_or(4));
         let values = [
             (
                 "step_s",
@@ -193,7 +194,7 @@ impl OdeRobot<'_> {
             ("radius_right_m", spec.radius_ratio[1] * radius_m),
             (
                 "wheel_inertia_kg_m2",
-                spec.rotor_ratio * model.mass_kg() * radius_m.powi(2) / wheels,
+                WHEEL_SHARE * spec.rotor_ratio * model.mass_kg() * radius_m.powi(2),
             ),
             ("stiffness", spec.curve.stiffness),
             ("mu_peak", spec.curve.mu_peak),
@@ -209,7 +210,7 @@ impl OdeRobot<'_> {
             ("servo_lag_s", spec.servo_lag_s),
             (
                 "torque_limit_n_m",
-                spec.motor_limit_mu * mass_kg * GRAVITY_M_S2 * radius_m / wheels,
+                WHEEL_SHARE * spec.motor_limit_mu * mass_kg * GRAVITY_M_S2 * radius_m,
             ),
             ("x_m", self.start.x_m),
             ("y_m", self.start.y_m),

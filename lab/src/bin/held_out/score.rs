@@ -1,5 +1,7 @@
 //! Computes the coverage of the drives and of their strata.
 
+use std::fmt::Write as _;
+
 use serde::Serialize;
 use tread_api::friction::NORMAL_95;
 use tread_lab::held_out::process::Contacts;
@@ -43,6 +45,14 @@ pub(crate) struct Line {
     answers: usize,
     /// Answers with an interval that is narrow enough.
     estimates: usize,
+    /// Fraction of the answers that abstain.
+    abstained: f64,
+    /// Figures of the estimates, if there are any.
+    of_estimates: Option<Figures>,
+}
+
+#[derive(Debug, Serialize)]
+struct Figures {
     /// Fraction of the estimates whose 95 % interval contains the true θ.
     coverage: f64,
     /// Fractions of the estimates whose interval is below and above the true θ.
@@ -52,8 +62,6 @@ pub(crate) struct Line {
     error: f64,
     /// Median half-width of the 95 % interval, relative to θ̂.
     half_width: f64,
-    /// Fraction of the answers that abstain.
-    abstained: f64,
 }
 
 impl Line {
@@ -83,34 +91,41 @@ impl Line {
             drives: drives.len(),
             answers,
             estimates,
-            coverage: share(covered, estimates),
-            below: share(below, estimates),
-            above: share(above, estimates),
-            error: median(&mut errors),
-            half_width: median(&mut widths),
             abstained: 1.0 - share(estimates, answers),
+            of_estimates: (estimates > 0).then(|| Figures {
+                coverage: share(covered, estimates),
+                below: share(below, estimates),
+                above: share(above, estimates),
+                error: median(&mut errors),
+                half_width: median(&mut widths),
+            }),
         }
     }
 
-    /// What must hold of the coverage, if it has a goal.
+    /// What must hold of the coverage, if it has a goal and there are estimates.
     pub(crate) fn check(&self) -> Option<Check> {
         let (contacts, torque) = (self.group.contacts.text(), self.group.torque());
         let name = format!("{contacts}, {}, {torque} torque: coverage", self.name);
-        self.has_goal
-            .then(|| Check::of(name, self.coverage).at_least(COVERAGE_MIN))
+        let figures = self.of_estimates.as_ref().filter(|_| self.has_goal)?;
+        Some(Check::of(name, figures.coverage).at_least(COVERAGE_MIN))
     }
 
     fn cells(&self) -> [String; 9] {
         let percent = |value: f64| format!("{:.1}", 100.0 * value);
+        let of = |text: &dyn Fn(&Figures) -> String| {
+            self.of_estimates
+                .as_ref()
+                .map_or_else(|| "-".to_owned(), text)
+        };
         [
             self.drives.to_string(),
             self.answers.to_string(),
             self.estimates.to_string(),
-            percent(self.coverage),
-            percent(self.below),
-            percent(self.above),
-            format!("{:+.1}", 100.0 * self.error),
-            format!("±{}", percent(self.half_width)),
+            of(&|figures| percent(figures.coverage)),
+            of(&|figures| percent(figures.below)),
+            of(&|figures| percent(figures.above)),
+            of(&|figures| format!("{:+.1}", 100.0 * figures.error)),
+            of(&|figures| format!("±{}", percent(figures.half_width))),
             percent(self.abstained),
         ]
     }
@@ -181,11 +196,11 @@ pub(crate) fn text(lines: &[Line]) -> String {
 /// Prints the lines as a table in Markdown.
 pub(crate) fn markdown(lines: &[Line]) -> String {
     let mut text = format!("| contacts | | torque | {} |\n", COLUMNS.join(" | "));
-    text += &format!("|---|---|---{}|\n", "|---".repeat(COLUMNS.len()));
+    let _ = writeln!(text, "|---|---|---{}|", "|---".repeat(COLUMNS.len()));
     for line in lines {
         let cells = line.cells().join(" | ");
         let (contacts, torque) = (line.group.contacts.text(), line.group.torque());
-        text += &format!("| {contacts} | {} | {torque} | {cells} |\n", line.name);
+        let _ = writeln!(text, "| {contacts} | {} | {torque} | {cells} |", line.name);
     }
     text
 }

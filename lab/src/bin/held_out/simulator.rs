@@ -157,7 +157,8 @@ impl Simulator {
         for pull in &self.pulls {
             text += &row(&Self::pull_cells(pull));
         }
-        text += &format!("\n{}", row(&STEP_COLUMNS.map(str::to_owned)));
+        text.push('\n');
+        text += &row(&STEP_COLUMNS.map(str::to_owned));
         for found in self.worst_steps() {
             text += &row(&Self::step_cells(&found));
         }
