@@ -78,7 +78,7 @@ pub(crate) async fn run(arguments: DemoArguments) -> anyhow::Result<ExitCode> {
         Some(Ok((terrains, missions))) => {
             tell(&welcome(&client, &processes, folder.path(), missions.len()));
             let watch = Watch::new(&demo, &terrains, missions, &arguments);
-            Some(watch.to_the_end(&mut processes).await)
+            Some(watch.watch_until_end(&mut processes).await)
         }
     };
     tell("stopping …");
@@ -344,7 +344,7 @@ impl<'demo> Watch<'demo> {
     }
 
     /// Shows the fleet until the demo is done or Ctrl-C is pressed, and returns its results.
-    async fn to_the_end(mut self, processes: &mut Processes) -> anyhow::Result<Ended> {
+    async fn watch_until_end(mut self, processes: &mut Processes) -> anyhow::Result<Ended> {
         let is_cut_short = tokio::select! {
             done = self.until_done(processes) => {
                 done?;

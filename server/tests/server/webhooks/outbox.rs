@@ -152,8 +152,8 @@ async fn of_too_many_that_wait_the_oldest_are_dropped_and_counted() {
     let mut states = Vec::new();
     loop {
         let path = format!("/v1/webhooks/{id}/deliveries?limit=400{cursor}");
-        let (status, page) = yard.get_value(&path).await;
-        assert_eq!(status, StatusCode::OK, "{page}");
+        let (answered, page) = yard.get_value(&path).await;
+        assert_eq!(answered, StatusCode::OK, "{page}");
         let items = page["items"].as_array().unwrap().iter();
         states.extend(items.map(|one| one["state"].as_str().unwrap().to_owned()));
         match page["next_cursor"].as_str() {
