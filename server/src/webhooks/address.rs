@@ -12,7 +12,7 @@ use crate::identity::origin::Origin;
 /// shared (CGNAT), loopback, link-local (with the metadata services of clouds), special purposes,
 /// documentation, 6to4 relays, benchmarks, multicast and reserved.
 const NOT_PUBLIC_V4: [(Ipv4Addr, u32); 15] = [
-    (Ipv4Addr::new(0, 0, 0, 0), 8),
+    (Ipv4Addr::UNSPECIFIED, 8),
     (Ipv4Addr::new(10, 0, 0, 0), 8),
     (Ipv4Addr::new(100, 64, 0, 0), 10),
     (Ipv4Addr::new(127, 0, 0, 0), 8),

@@ -190,10 +190,10 @@ fn waiting_text(shown: Showing) -> String {
 
 #[expect(clippy::cast_precision_loss, reason = "for a message")]
 fn clock_text(offset_ms: i64) -> String {
-    let offset_s = offset_ms.unsigned_abs() as f64 / 1_000.0;
+    let seconds = offset_ms.unsigned_abs() as f64 / 1_000.0;
     let direction = if offset_ms > 0 { "ahead of" } else { "behind" };
     format!(
-        "the robot's clock is {offset_s:.1} s {direction} the server's: look which of the two is \
+        "the robot's clock is {seconds:.1} s {direction} the server's: look which of the two is \
          wrong, and synchronise it"
     )
 }
