@@ -36,6 +36,8 @@ use crate::webhooks::{Attempt, Letter, Sender};
 
 /// Interval between looks at the outbox when nothing wakes the task.
 pub const LOOK_EVERY: Duration = Duration::from_secs(1);
+/// Time after a failure of the database in which it is left to others.
+const REST_AFTER_ERROR: Duration = Duration::from_secs(3);
 /// Maximum number of attempts under way at once, at most one per webhook.
 const ATTEMPTS_AT_ONCE_MAX: usize = 16;
 /// Maximum number of attempts of a delivery.
@@ -77,13 +79,18 @@ pub async fn run(app: App, sender: Sender, stop: CancellationToken) {
     while !stop.is_cancelled() {
         if let Err(error) = db::limited(dispatcher.pass()).await {
             app.log_failure("send alerts to webhooks", &error);
-        }
-        tokio::select! {
-            biased;
-            () = stop.cancelled() => break,
-            Some(done) = dispatcher.finishing.recv() => dispatcher.note(done),
-            () = app.webhooks().woken.notified() => {}
-            () = tokio::time::sleep(LOOK_EVERY) => {}
+            tokio::select! {
+                () = stop.cancelled() => break,
+                () = tokio::time::sleep(REST_AFTER_ERROR) => {}
+            }
+        } else {
+            tokio::select! {
+                biased;
+                () = stop.cancelled() => break,
+                Some(done) = dispatcher.finishing.recv() => dispatcher.note(done),
+                () = app.webhooks().woken.notified() => {}
+                () = tokio::time::sleep(LOOK_EVERY) => {}
+            }
         }
         while let Ok(done) = dispatcher.finishing.try_recv() {
             dispatcher.note(done);
