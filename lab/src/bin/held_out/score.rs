@@ -146,9 +146,10 @@ const COLUMNS: [&str; 9] = [
 
 /// All drives, and their strata; those of the ground have a goal.
 pub(crate) fn lines(group: Group, drives: &[Drive]) -> Vec<Line> {
+    type Class = fn(&Drive) -> String;
     let everything: Vec<&Drive> = drives.iter().collect();
     let mut lines = vec![Line::of("all".to_owned(), group, true, &everything)];
-    let classes: [(bool, fn(&Drive) -> String); 4] = [
+    let classes: [(bool, Class); 4] = [
         (true, |(trial, _)| {
             format!("K {:.2}", trial.deviations.curve.stiffness)
         }),
