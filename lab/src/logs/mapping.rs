@@ -3,6 +3,8 @@
 
 mod joints;
 
+use std::time::Duration;
+
 use tread_agent::drive::ros2::settings::{
     BusMode, BusSettings, CommandKind, CommandSettings, Effort, ImuSettings, MotionOf,
     OdometrySettings, PoseSettings, Ros2Settings, Scheme, StampClock, Timing,
@@ -26,6 +28,9 @@ pub const ODOMETRY: &str = "nav_msgs/msg/Odometry";
 pub const POSE: &str = "geometry_msgs/msg/PoseStamped";
 /// A pose with its covariance.
 pub const COVARIANT_POSE: &str = "geometry_msgs/msg/PoseWithCovarianceStamped";
+
+/// Largest age of a message when it was recorded.
+pub const LATE_AFTER: Duration = Duration::from_secs(1);
 
 /// What is asked for; the rest is chosen.
 #[derive(Debug, Clone, Default)]
@@ -91,7 +96,7 @@ pub enum MappingError {
         /// The topics that there are.
         found: String,
     },
-    /// The joints of the sides cannot be told from their names.
+    /// The names of the joints do not show their sides.
     #[error(
         "which joints of `{topic}` are left and which are right does not show in their names: say `--joints LEFT,…/RIGHT,…` with some of {names}"
     )]
@@ -425,8 +430,8 @@ fn settings_of(model: &RobotModel, odometry_track_m: Option<f64>) -> Ros2Setting
         timing: Timing {
             stamps: StampClock::Host,
             silent_after: tread_agent::drive::SILENT_AFTER_MAX,
-            late_after: super::timeline::LATE_AFTER,
-            pose_late_after: super::timeline::LATE_AFTER,
+            late_after: LATE_AFTER,
+            pose_late_after: LATE_AFTER,
         },
         odometry: None,
         imu: None,

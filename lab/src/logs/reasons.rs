@@ -1,7 +1,7 @@
 //! Why there is no estimate, and which manoeuvre would help.
 //!
 //! The estimator abstains where the standard deviation of θ would be above half of θ, or where
-//! nothing reached it. It does not say which of many causes that had; they are told here from what
+//! nothing reached it. It does not say which of many causes that had; they are derived here from what
 //! it does say (samples dropped, slip beyond the linear range, no new information), from the
 //! findings of the consistency monitor, and from how the robot moved.
 

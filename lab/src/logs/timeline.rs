@@ -17,9 +17,8 @@ use tread_agent::drive::{Feedback, SensorSample, StatedNoise};
 use tread_control::measured::{WheelSpeeds, WheelTorques};
 
 use super::decode::{Refusals, Timed};
+use super::mapping::LATE_AFTER;
 
-/// Largest age of a message when it was recorded.
-pub const LATE_AFTER: Duration = Duration::from_secs(1);
 /// Time before the first message, so that one that is older than its record has a time.
 const LEAD: Duration = Duration::from_secs(10);
 /// Largest time by which a stamp is ahead of the recorder's clock if both are one clock,

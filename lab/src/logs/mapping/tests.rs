@@ -122,7 +122,7 @@ fn owned(names: &[&str]) -> Vec<String> {
 }
 
 #[test]
-fn sides_are_told_by_the_words_in_names_and_not_guessed() {
+fn sides_follow_from_the_words_in_names_and_are_not_guessed() {
     let husky = owned(&[
         "front_left_wheel",
         "front_right_wheel",

@@ -98,7 +98,7 @@ fn stamps_count_and_not_when_a_busy_recorder_wrote() {
 }
 
 #[test]
-fn another_clock_and_one_that_stands_still_are_told_apart() {
+fn another_clock_and_one_that_stands_still_are_distinguished() {
     let mut refusals = Refusals::default();
     let of = |stamp: fn(i64) -> i64| -> Vec<Timed> {
         let timed = (0..200_i64).map(|index| wheels(index * 20 * MS, stamp(index), 1.0));
@@ -186,7 +186,7 @@ proptest! {
         for fed in &plain.fed {
             prop_assert!(filled.fed.iter().any(|other| other.sample == fed.sample));
         }
-        let is_filled = INTERPOLATED_RANGE_S.contains(&(f64::from(interval_ms) * 1.0e-3));
+        let is_filled = INTERPOLATED_RANGE_S.contains(&(f64::from(interval_ms) / 1.0e3));
         prop_assert_eq!(is_filled, filled.interpolated > 0);
         prop_assert_eq!(filled.fed.len() as u64, plain.fed.len() as u64 + filled.interpolated);
         let (least, most) = speeds_rad_s.iter().fold((f64::MAX, f64::MIN), |(least, most), speed| {
