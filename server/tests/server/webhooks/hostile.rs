@@ -11,7 +11,7 @@ use tokio_rustls::TlsAcceptor;
 use tread_server::clock::Clock;
 use tread_server::config::webhooks::WebhooksConfig;
 
-use super::receiver::{Mood, Names, Receiver};
+use super::receiver::{Mood, Names, Receiver, Request};
 use super::{BEGIN, advance, allowing, create, newest, report, start};
 use crate::harness::{Yard, eventually, time};
 use crate::robot::Robot;
@@ -221,7 +221,7 @@ async fn a_webhook_rests_after_a_failure_and_sends_one_delivery_after_the_other(
     receiver.set(Mood::Good);
     advance(&yard, Duration::from_secs(11));
     let requests = receiver.has(4).await;
-    let mut ids: Vec<&str> = requests[1..].iter().map(|one| one.delivery()).collect();
+    let mut ids: Vec<&str> = requests[1..].iter().map(Request::delivery).collect();
     assert!(ids.is_sorted(), "the oldest first: {ids:?}");
     ids.dedup();
     assert_eq!(ids.len(), 3);
