@@ -149,21 +149,21 @@ async fn of_too_many_that_wait_the_oldest_are_dropped_and_counted() {
     assert_eq!(webhook["pending"], PENDING_MAX, "{webhook}");
     assert_eq!(yard.counters().await.webhook_dropped, 3);
     let mut cursor = String::new();
-    let mut states = Vec::new();
+    let mut found = Vec::new();
     loop {
         let path = format!("/v1/webhooks/{id}/deliveries?limit=400{cursor}");
         let (answered, page) = yard.get_value(&path).await;
         assert_eq!(answered, StatusCode::OK, "{page}");
         let items = page["items"].as_array().unwrap().iter();
-        states.extend(items.map(|one| one["state"].as_str().unwrap().to_owned()));
+        found.extend(items.map(|one| one["state"].as_str().unwrap().to_owned()));
         match page["next_cursor"].as_str() {
             Some(next) => cursor = format!("&cursor={next}"),
             None => break,
         }
     }
-    assert_eq!(states.len(), 3 + PENDING_MAX as usize);
-    let oldest = &states[PENDING_MAX as usize..];
-    assert!(oldest.iter().all(|state| state == "dropped"), "{oldest:?}");
+    assert_eq!(found.len(), 3 + PENDING_MAX as usize);
+    let oldest = &found[PENDING_MAX as usize..];
+    assert!(oldest.iter().all(|one| one == "dropped"), "{oldest:?}");
     yard.server.stop().await.unwrap();
 }
 
