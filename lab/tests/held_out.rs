@@ -131,11 +131,10 @@ fn an_impossible_robot_is_refused_with_its_reason() {
 #[test]
 fn agents_give_estimates_on_odes_contacts_and_most_intervals_hold() {
     let Some(program) = program() else { return };
-    let trials: Vec<_> = (0..4).map(|index| drawn(8_000_001 + index, true)).collect();
+    // Two robots on K 3, with the longest steps that ODE's robot takes.
+    let trials = [8_000_001, 8_000_003].map(|seed| drawn(seed, true));
     let (mut estimates, mut covered) = (0, 0);
-    for outcome in in_parallel(&trials, |trial| {
-        run(&program, trial, Contacts::Rigid, STEPS_PER_SAMPLE)
-    }) {
+    for outcome in in_parallel(&trials, |trial| run(&program, trial, Contacts::Rigid, 10)) {
         let outcome = outcome.unwrap();
         for said in outcome.said.into_iter().flatten() {
             let (low, high) = said.interval_95();
@@ -143,6 +142,6 @@ fn agents_give_estimates_on_odes_contacts_and_most_intervals_hold() {
             covered += u32::from((low..=high).contains(&outcome.truth));
         }
     }
-    assert!(estimates >= 8, "{estimates} of 16");
+    assert!(estimates >= 6, "{estimates} of 8");
     assert!(4 * covered >= 3 * estimates, "{covered} of {estimates}");
 }
