@@ -47,6 +47,8 @@ fn examples() -> Vec<(&'static str, Value)> {
     let terrain = json!({"name": "Lawn", "class": "grass", "polygon": polygon, "layer": 1});
     let mut new_terrain = terrain.clone();
     new_terrain["id"] = json!("lawn");
+    let webhook = json!({"name": "on call", "url": "https://alerts.example.org/tread",
+        "kinds": ["robot-lost"], "sites": ["yard"], "enabled": true});
     vec![
         (
             "enrol_robot",
@@ -101,6 +103,8 @@ fn examples() -> Vec<(&'static str, Value)> {
             json!({"rotation": "0011223344556677", "force": false}),
         ),
         ("replace_authority", json!({"signing": "00"})),
+        ("create_webhook", webhook.clone()),
+        ("replace_webhook", webhook),
         ("create_terrain", new_terrain),
         ("replace_terrain", terrain),
         (
@@ -142,7 +146,7 @@ fn operations(description: &Value) -> Vec<Operation> {
 fn filled(path: &str) -> String {
     let part = |part: &str| match part {
         "{site}" => "yard".to_owned(),
-        "{mission}" | "{alert}" | "{token}" => ID.to_owned(),
+        "{mission}" | "{alert}" | "{token}" | "{webhook}" => ID.to_owned(),
         other if other.starts_with('{') => "rover-1".to_owned(),
         other => other.to_owned(),
     };
