@@ -111,7 +111,7 @@ async function watchDrawing(page: Page): Promise<void> {
 }
 
 for (const [which, bound_ms] of [
-  ['the selected robot', 500],
+  ['the selected robot', 700],
   ['another robot', 1_300],
 ] as const) {
   test(`${which} is drawn where it says that it is within ${bound_ms} ms`, async () => {

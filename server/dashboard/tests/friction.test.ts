@@ -4,6 +4,7 @@ import { expect, test } from 'vitest';
 import { colour } from '../src/map/cividis';
 import { RANGES, shade } from '../src/map/friction';
 import { demandOf, plain, slipOf } from '../src/map/meaning';
+import { moment } from '../src/format';
 import { texts } from '../src/texts';
 import type { CellFriction, FusedFriction, Page as ApiPage, PointFriction, Robot, TerrainHistory } from './types';
 import { api, browser, eventually, map, shot, windowOf } from './harness';
@@ -250,8 +251,7 @@ test('the map is shown as of past hours, one after the other', async () => {
   const stated = ((await answered.json()) as ApiPage<CellFriction> & { as_of: string }).as_of;
   expect(new URL(answered.url()).searchParams.get('as_of')).toMatch(/:00:00\.000Z$/);
   // The page says what the server has rounded to.
-  const local = new Date(stated).toLocaleString('en-GB', { dateStyle: 'short', timeStyle: 'medium' });
-  await time.getByText(`as of ${local}`).waitFor();
+  await time.getByText(`as of ${moment(stated)}`).waitFor();
   // Nothing was measured before this hour, so the map is empty then.
   const { x, y } = await overACell(page);
   await eventually('an empty map', async () => {
