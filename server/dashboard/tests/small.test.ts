@@ -97,7 +97,7 @@ test('repeated steps of a history are one line, and times have one format', asyn
   if (!mission) throw new Error('no mission has ended');
   const page = await open({
     async prepare(page) {
-      await page.route(new RegExp(`/v1/missions/${mission.id}$`), async (route) => {
+      await page.route(/\/v1\/missions\/[0-9a-f-]{36}$/, async (route) => {
         const response = await route.fetch();
         const detail = (await response.json()) as MissionDetail;
         const [first, ...rest] = detail.events;
@@ -114,13 +114,7 @@ test('repeated steps of a history are one line, and times have one format', asyn
   await page.getByRole('tab', { name: 'Missions' }).click();
   await page.locator('.ended button').first().waitFor();
   const rows = page.locator('.ended button');
-  const index = await page.evaluate(() => document.querySelectorAll('.ended button').length);
-  expect(index).toBeGreaterThan(0);
-  for (let at = 0; at < index; at += 1) {
-    await rows.nth(at).click();
-    await page.locator('[data-test="detail"] .events li').first().waitFor();
-    if (await page.getByText('offered 12 times').isVisible()) break;
-  }
+  await rows.first().click();
   const line = page.locator('.events li', { hasText: 'offered 12 times' });
   await line.getByText('the robot is stopped').waitFor();
   // The two dozen steps of the robot that gave it back are one line.
