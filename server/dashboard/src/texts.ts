@@ -449,6 +449,10 @@ export const texts = {
     warning: 'warning',
     critical: 'critical',
     new: (count: number) => `${count} not acknowledged`,
+    sound: 'Sound for new alerts',
+    notices: 'Notification while the page is not in front',
+    refused: 'The browser does not allow notifications of this page: it takes https, and a permission in its settings.',
+    several: (count: number) => `${count} new alerts`,
   },
   webhooks: {
     title: 'Where alerts are sent',

@@ -3,7 +3,7 @@ import { existsSync, mkdirSync, readFileSync } from 'node:fs';
 import { type Socket, connect, createServer } from 'node:net';
 import type { AddressInfo } from 'node:net';
 import { type Browser, type BrowserContext, type Page, chromium } from 'playwright-core';
-import { afterAll, beforeAll, expect, inject } from 'vitest';
+import { afterAll, afterEach, beforeAll, expect, inject } from 'vitest';
 
 /** How long anything may take to come about, milliseconds. */
 const PATIENCE_MS = 25_000;
@@ -50,7 +50,7 @@ export async function eventually<T>(
 /** A browser for a file of tests; everything that its consoles say amiss fails the file. */
 export function browser(): { open(options?: Open): Promise<Page> } {
   let running: Browser;
-  const contexts: BrowserContext[] = [];
+  const contexts = new Set<BrowserContext>();
   const amiss: string[] = [];
   beforeAll(async () => {
     mkdirSync(SHOTS, { recursive: true });
@@ -61,6 +61,11 @@ export function browser(): { open(options?: Open): Promise<Page> } {
         process.env['TREAD_DIST'] ? ['--disable-features=LocalNetworkAccessChecks'] : [],
       ),
     });
+  });
+  // A page that is no longer needed would go on drawing its robots.
+  afterEach(async () => {
+    for (const context of contexts) await context.close();
+    contexts.clear();
   });
   afterAll(async () => {
     await running.close();
@@ -73,7 +78,7 @@ export function browser(): { open(options?: Open): Promise<Page> } {
         colorScheme: options.theme ?? 'light',
         hasTouch: options.hasTouch ?? false,
       });
-      contexts.push(context);
+      contexts.add(context);
       const page = await context.newPage();
       page.setDefaultTimeout(PATIENCE_MS);
       await page.addInitScript(() => {

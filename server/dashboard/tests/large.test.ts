@@ -10,8 +10,9 @@ const { open } = browser();
 const ROBOTS = 500;
 /** Rows of the list that may be there at a time. */
 const ROWS_MAX = 60;
-/** How long frames of the whole page are counted, milliseconds. */
+/** How long frames of the whole page are counted, and before that not, milliseconds. */
 const COUNTED_MS = 4_000;
+const WARMED_UP_MS = 1_500;
 
 const ALL = ['rover-1', 'rover-2', 'rover-3'];
 const stops = async () => (await api<ApiPage<Stop>>('/v1/stops?site=yard&in_force=true')).items;
@@ -30,11 +31,11 @@ const chip = (page: Page, group: string) => page.locator(`button[data-group="${g
 const lines = (page: Page) => page.locator('[data-test="bulk"] li');
 const summary = (page: Page) => page.locator('[data-test="bulk"] [role="status"]');
 
-/** Frames of the whole page a second below which it is of no use. */
-const FRAMES_MIN = 5;
+/** Frames of the whole page a second, at least. */
+const FRAMES_MIN = 30;
 
 /** Frames of the whole page a second, while the list is scrolled. */
-function frames(page: Page): Promise<number> {
+function frames(page: Page, counted_ms: number): Promise<number> {
   return page.evaluate(async (lasts) => {
     const panel = document.querySelector('#panel');
     const begin = performance.now();
@@ -45,7 +46,7 @@ function frames(page: Page): Promise<number> {
       count += 1;
     }
     return (1000 * count) / (now - begin);
-  }, COUNTED_MS);
+  }, counted_ms);
 }
 
 test('of five hundred robots those in trouble come first, and the list has only the rows that are seen', async () => {
@@ -138,18 +139,17 @@ test('what fails of what was done to several is said robot by robot', async () =
 });
 
 test('the whole page with five hundred robots that move keeps its frames', async () => {
-  const page = await open500();
+  const kinds = { ...CROWD, moving: ROBOTS };
+  const page = await open({ prepare: (page) => crowd(page, ROBOTS, kinds) });
   await page.waitForFunction(() => document.querySelectorAll('button[data-robot]').length > 5);
-  let most = 0;
-  // The goal is 30, which two cores do not reach beside the server; docs/page.md has what they do.
-  // Whatever else the machine does takes frames too, for a while.
-  for (let again = 0; again < 3 && most < FRAMES_MIN; again += 1) {
-    const counted = await frames(page);
-    console.log(`whole page with ${ROBOTS} robots at 2 states/s each, list scrolled: ${counted.toFixed(1)} frames/s`);
-    most = Math.max(most, counted);
-  }
+  await frames(page, WARMED_UP_MS);
+  // The better one of two: whatever else the machine does takes frames too.
+  const counted = [await frames(page, COUNTED_MS), await frames(page, COUNTED_MS)];
+  console.log(
+    `whole page with ${ROBOTS} robots at 2 states/s each, list scrolled: ${counted.map((each) => each.toFixed(1)).join(', ')} frames/s`,
+  );
   await shot(page, 'large-map');
-  expect(most).toBeGreaterThanOrEqual(FRAMES_MIN);
+  expect(Math.max(...counted)).toBeGreaterThanOrEqual(FRAMES_MIN);
 });
 
 test('real robots are sent a mission, paused, resumed, cancelled, stopped and cleared together', async () => {

@@ -100,14 +100,14 @@ test('repeated steps of a history are one line, and times have one format', asyn
       await page.route(/\/v1\/missions\/[0-9a-f-]{36}$/, async (route) => {
         const response = await route.fetch();
         const detail = (await response.json()) as MissionDetail;
-        const [first, ...rest] = detail.events;
-        if (!first) throw new Error('there is no history');
+        const [first, last] = [detail.events[0], detail.events.at(-1)];
+        if (!first || !last) throw new Error('there is no history');
         // A robot that gave it back a dozen times before it took it.
         const offers = Array.from({ length: 12 }, () => [
           { ...first, from: 'queued', to: 'offered', cause: 'offered', reason: null },
           { ...first, from: 'offered', to: 'queued', cause: 'returned', reason: 'the robot is stopped' },
         ]).flat();
-        await route.fulfill({ response, json: { ...detail, events: [first, ...offers, ...rest] } });
+        await route.fulfill({ response, json: { ...detail, events: [first, ...offers, last] } });
       });
     },
   });
@@ -117,8 +117,8 @@ test('repeated steps of a history are one line, and times have one format', asyn
   await rows.first().click();
   const line = page.locator('.events li', { hasText: 'offered 12 times' });
   await line.getByText('the robot is stopped').waitFor();
-  // The two dozen steps of the robot that gave it back are one line.
-  expect(await page.locator('.events li').count()).toBeLessThan(24);
+  // The two dozen steps of the robot that gave it back are one line, between the first step and the last.
+  expect(await page.locator('.events li').count()).toBe(3);
   const format = /^\d{4}-\d\d-\d\d \d\d:\d\d:\d\d$/;
   for (const time of await page.locator('time').all()) {
     expect(await time.innerText()).toMatch(format);

@@ -1,17 +1,13 @@
 //! Colours of the map: the colour map cividis over a fixed logarithmic range of θ, so that colours
-//! are comparable over time. Uncertain values are desaturated towards grey. The dashboard uses the
-//! same.
+//! are comparable over time. Colours do not show how uncertain a value is; hatching does, the denser
+//! the more uncertain. The dashboard uses the same.
 
 /// Lower end of the colour scale, θ; smaller values have the same colour.
 pub const THETA_LOW: f64 = 0.05;
 /// Upper end of the colour scale, θ; larger values have the same colour.
 pub const THETA_HIGH: f64 = 2.0;
-/// Relative standard deviation up to which a value has its full colour.
-pub const SURE: f64 = 0.05;
-/// Relative standard deviation from which a value is grey.
-pub const UNSURE: f64 = 0.5;
-/// Relative standard deviation from which a value is hatched as well.
-pub const HATCHED: f64 = 0.25;
+/// Relative standard deviations from which a value is hatched, and more densely.
+pub const HATCHED: [f64; 3] = [0.1, 0.25, 0.5];
 
 /// `[red, green, blue]`, 0 to 255.
 pub type Rgb = [u8; 3];
@@ -43,26 +39,12 @@ pub fn share(theta: f64) -> f64 {
     ((theta / THETA_LOW).ln() / (THETA_HIGH / THETA_LOW).ln()).clamp(0.0, 1.0)
 }
 
-/// Returns the degree of desaturation, 0 (full colour) to 1 (grey).
-pub fn doubt(relative_std_dev: f64) -> f64 {
-    ((relative_std_dev - SURE) / (UNSURE - SURE)).clamp(0.0, 1.0)
-}
-
-/// Colour of the map before conversion to RGB.
-#[derive(Debug, Clone, Copy)]
-pub struct Shade {
-    /// Position on the colour scale, 0 to 1.
-    pub share: f64,
-    /// Degree of desaturation, 0 (full colour) to 1 (grey).
-    pub doubt: f64,
-}
-
-/// Returns the colour of a shade, desaturated towards grey of equal luma.
-pub fn colour(shade: Shade) -> Rgb {
-    let Shade { share, doubt } = shade;
-    let pure = cividis(share).map(f64::from);
-    let grey = 0.299 * pure[0] + 0.587 * pure[1] + 0.114 * pure[2];
-    pure.map(|channel| byte(grey + (channel - grey) * (1.0 - doubt.clamp(0.0, 1.0))))
+/// Returns the density of the hatching, 0 (none) to 3.
+pub fn density(relative_std_dev: f64) -> usize {
+    HATCHED
+        .iter()
+        .filter(|least| relative_std_dev >= **least)
+        .count()
 }
 
 #[cfg(test)]
@@ -73,17 +55,17 @@ mod tests {
     fn the_colour_map_goes_from_dark_blue_to_yellow() {
         assert_eq!(cividis(0.0), [0, 32, 81]);
         assert_eq!(cividis(1.0), [253, 234, 69]);
-        let grey = colour(Shade {
-            share: 0.5,
-            doubt: 1.0,
-        });
-        assert!(grey[0] == grey[1] && grey[1] == grey[2], "{grey:?}");
     }
 
     #[test]
     fn the_range_is_fixed() {
         assert!(share(THETA_LOW).abs() < 1e-12 && (share(THETA_HIGH) - 1.0).abs() < 1e-12);
         assert!((share(1e-9)).abs() < 1e-12 && (share(1e9) - 1.0).abs() < 1e-12);
-        assert!(doubt(0.05).abs() < 1e-12 && (doubt(0.5) - 1.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn the_more_uncertain_a_value_the_denser_its_hatching() {
+        let densities = [0.0, 0.09, 0.1, 0.25, 0.49, 0.5, 9.0].map(density);
+        assert_eq!(densities, [0, 0, 1, 2, 2, 3, 3]);
     }
 }

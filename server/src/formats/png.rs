@@ -1,5 +1,5 @@
-//! Draws the map as a PNG image with a legend: θ as colour, grey and hatched where uncertain,
-//! transparent where unknown. The site's y axis points up.
+//! Draws the map as a PNG image with a legend: θ as colour, hatched where uncertain, transparent
+//! where unknown. The site's y axis points up.
 
 use std::collections::BTreeMap;
 use std::convert::Infallible;
@@ -12,9 +12,7 @@ use embedded_graphics::pixelcolor::{Rgb888, RgbColor as _};
 use embedded_graphics::text::{Baseline, Text};
 use embedded_graphics::{Drawable as _, Pixel};
 
-use super::palette::{
-    HATCHED, Rgb, Shade, THETA_HIGH, THETA_LOW, UNSURE, cividis, colour, doubt, share,
-};
+use super::palette::{HATCHED, Rgb, THETA_HIGH, THETA_LOW, cividis, density, share};
 use crate::friction::Raster;
 use crate::friction::index::KnownCell;
 
@@ -28,8 +26,10 @@ pub const SCALE_MAX: usize = 32;
 const PIXELS_MAX: usize = 1 << 24;
 /// Minimum side of a map square that is hatched, in pixels; smaller ones are not.
 const HATCHED_SIDE_PX: usize = 4;
-/// Distance between hatching lines, in pixels.
-const HATCH_PX: usize = 4;
+/// Distance between hatching lines of each density, in pixels.
+const LINES_PX: [usize; 3] = [11, 7, 4];
+/// Relative standard deviation at the right end of the legend.
+const LEGEND_END: f64 = 0.75;
 /// Font of the legend, with Greek letters.
 const FONT: MonoFont<'_> = FONT_7X13;
 /// Width and height of a letter, in pixels.
@@ -158,22 +158,33 @@ pub fn encode(raster: &Raster, scale: Option<usize>) -> Result<Vec<u8>, PngError
 }
 
 fn draw(canvas: &mut Canvas, (x, y): (usize, usize), scale: usize, known: &KnownCell) {
-    let relative = known.std_dev / known.theta;
-    let ink = colour(Shade {
-        share: share(known.theta),
-        doubt: doubt(relative),
-    });
-    canvas.fill((x, y), (scale, scale), ink);
-    if scale >= HATCHED_SIDE_PX && relative >= HATCHED {
-        for row in y..y + scale {
-            for column in (x..x + scale).filter(|column| (column + row).is_multiple_of(HATCH_PX)) {
-                canvas.put(column, row, WHITE);
-            }
+    let density = if scale < HATCHED_SIDE_PX {
+        0
+    } else {
+        density(known.std_dev / known.theta)
+    };
+    let ink = cividis(share(known.theta));
+    for row in y..y + scale {
+        for column in x..x + scale {
+            canvas.put(column, row, hatched((column, row), density, ink));
         }
     }
 }
 
-/// Draws a colour bar for θ and one for the relative standard deviation.
+/// Returns the colour of a pixel: diagonal lines, light with a dark edge, are visible on every colour
+/// of the scale.
+fn hatched((column, row): (usize, usize), density: usize, ink: Rgb) -> Rgb {
+    let Some(distance) = density.checked_sub(1).map(|index| LINES_PX[index]) else {
+        return ink;
+    };
+    match (column + row) % distance {
+        0 => WHITE,
+        1 => ink.map(|channel| channel / 2),
+        _ => ink,
+    }
+}
+
+/// Draws a colour bar for θ and a hatched one for the relative standard deviation.
 #[expect(
     clippy::cast_precision_loss,
     clippy::cast_possible_truncation,
@@ -207,19 +218,16 @@ fn draw_legend(canvas: &mut Canvas, top: usize, height: usize) {
     y += letters + 2 + 2 * MARGIN_PX;
     canvas.write((MARGIN_PX, y), "σ/θ");
     for column in 0..bar {
-        let relative = column as f64 / bar as f64 * UNSURE;
-        let ink = colour(Shade {
-            share: 0.75,
-            doubt: doubt(relative),
-        });
+        let density = density(column as f64 / bar as f64 * LEGEND_END);
         for row in y..y + BAR_PX {
-            let is_hatched = relative >= HATCHED && (left + column + row).is_multiple_of(HATCH_PX);
-            canvas.put(left + column, row, if is_hatched { WHITE } else { ink });
+            let at = (left + column, row);
+            canvas.put(at.0, at.1, hatched(at, density, cividis(0.5)));
         }
     }
     y += BAR_PX;
-    for (tick, share) in [("0%", 0.0), ("25%", 0.5), ("50%", 1.0)] {
-        let x = at(share);
+    for least in HATCHED {
+        let tick = &format!("{:.0}%", 100.0 * least);
+        let x = at(least / LEGEND_END);
         canvas.fill((x, y), (1, 3), INK);
         let text_left = x
             .saturating_sub(text_width_px(tick) / 2)

@@ -5,6 +5,7 @@ import { span } from '../format';
 import { texts } from '../texts';
 import type { Camera } from './camera';
 import type { Scene } from './draw';
+import { Kept } from './kept';
 import { Labels, shortened, type Wanted } from './labels';
 import type { Shown } from './motion';
 import type { Palette } from './palette';
@@ -22,14 +23,18 @@ const BASELINE_PX = 11;
 const HALO_PX = 3;
 /** Widths of labels that are kept. */
 const WIDTHS_MAX = 5_000;
+/** Of more robots than these, trails and labels are drawn anew only so often. */
+const ANEW_MAX = 50;
 
 /** Labels of robots from frame to frame. */
 export class RobotLabels {
   readonly places = new Labels();
+  /** Labels, and trails, as they were drawn last. */
+  readonly written = new Kept();
+  readonly trails = new Kept();
   #short = new Map<string, string>();
   #names = '';
   #widths = new Map<string, number>();
-
   /** The shorter form of each name. */
   shortOf(names: readonly string[]): ReadonlyMap<string, string> {
     const key = names.join('\n');
@@ -73,11 +78,21 @@ interface Placed {
 /** Draws all robots; true while one of them moves, so that the next frame differs. */
 export function drawRobots(context: CanvasRenderingContext2D, camera: Camera, scene: Scene, palette: Palette): boolean {
   const all = [...scene.tracked].map((tracked): Placed => ({ tracked, shown: tracked.shownAt(scene.now) }));
-  if (scene.showTrails) drawTrails(context, camera, all, palette);
+  const { labels, now } = scene;
+  const show = (kept: Kept, count: number, draw: (to: CanvasRenderingContext2D) => void): boolean => {
+    if (count > ANEW_MAX) return kept.show(context, camera, now, draw);
+    draw(context);
+    return false;
+  };
+  // What a trail lacks meanwhile lies under its robot.
+  const isTrailOld = scene.showTrails && show(labels.trails, all.length, (to) => drawTrails(to, camera, all, palette));
   const seen = all.flatMap((placed) => seenOf(camera, placed, scene, palette) ?? []);
-  for (const robot of seen) drawRobot(context, robot, scene, palette);
-  drawLabels(context, camera, seen, all, scene, palette);
-  return all.some(({ shown }) => shown?.isMoving);
+  const base = context.getTransform();
+  for (const robot of seen) drawRobot(context, base, robot, scene, palette);
+  context.setTransform(base);
+  const isLabelOld = show(labels.written, seen.length, (to) => drawLabels(to, camera, seen, all, scene, palette));
+  // What was not drawn anew in this frame may have changed.
+  return isTrailOld || isLabelOld || all.some(({ shown }) => shown?.isMoving);
 }
 
 function drawTrails(context: CanvasRenderingContext2D, camera: Camera, all: Placed[], palette: Palette): void {
@@ -127,15 +142,17 @@ function seenOf(camera: Camera, { tracked, shown }: Placed, scene: Scene, palett
   return { tracked, shown, x, y, length, width, colour, rank };
 }
 
-function drawRobot(context: CanvasRenderingContext2D, seen: Seen, scene: Scene, palette: Palette): void {
+function drawRobot(context: CanvasRenderingContext2D, base: DOMMatrix, seen: Seen, scene: Scene, palette: Palette): void {
   const { x, y, length, width, colour } = seen;
   const { robot } = seen.tracked;
   const { heading_rad } = seen.shown.pose;
   const isLost = robot.link === 'offline';
   const isUnconfirmed = scene.unconfirmed.has(robot.id);
   const isMarked = scene.marked.has(robot.id);
-  context.save();
-  context.translate(x, y);
+  // Set at once: to keep and restore everything takes as long as to draw.
+  const { a: ratio, e: left, f: top } = base;
+  const [cos, sin] = [ratio * Math.cos(heading_rad), ratio * Math.sin(heading_rad)];
+  context.setTransform(cos, -sin, sin, cos, left + ratio * x, top + ratio * y);
   if (robot.id === scene.selected || isMarked || isUnconfirmed) {
     context.beginPath();
     context.arc(0, 0, Math.hypot(length, width) / 2 + 5, 0, 2 * Math.PI);
@@ -143,7 +160,6 @@ function drawRobot(context: CanvasRenderingContext2D, seen: Seen, scene: Scene, 
     context.strokeStyle = isUnconfirmed ? palette.stopped : palette.selected;
     context.stroke();
   }
-  context.rotate(-heading_rad);
   context.beginPath();
   if (isLost) {
     // Its last known place: an empty, dashed outline.
@@ -168,7 +184,6 @@ function drawRobot(context: CanvasRenderingContext2D, seen: Seen, scene: Scene, 
   context.closePath();
   context.fillStyle = isLost ? colour : palette.halo;
   context.fill();
-  context.restore();
 }
 
 /** What may be written beside a robot, the longest first. */

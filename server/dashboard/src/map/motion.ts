@@ -1,10 +1,10 @@
 // Motion of one robot between the states that it reports, so that the map draws it smoothly. Pure.
 //
-// A robot is drawn late, by about one period of its states, so that it lies between two known ones:
-// a cubic Hermite curve through both, with their twists as tangents. When the next state is late,
-// the last twist carries it on along an arc for a bounded time; then it stands, and `isFrozen` says
-// that it is no longer known where it is. Where states come seldom, that time is used in each
-// period, so that what is drawn is less late; what the twist got wrong is made good smoothly.
+// A robot is drawn a little late. Where states come often, that is about one period of them, so that it
+// lies between two known ones: a cubic Hermite curve through both, with their twists as tangents. Where
+// they come seldom, the twist of the last one carries the robot on along an arc, for a bounded time;
+// then it stands, and `isFrozen` says that it is no longer known where it is. What the twist predicted
+// wrong is made good smoothly.
 import type { AgedTwist, Pose } from '../api/schema';
 
 type Twist = AgedTwist['value'];
@@ -24,12 +24,15 @@ export interface Shown {
   isFrozen: boolean;
 }
 
-/** How far the last twist may carry a robot, milliseconds. */
-export const EXTRAPOLATION_MAX_MS = 500;
+/**
+ * How far the last twist may carry a robot, milliseconds: a period of the stream of events, with the age of
+ * the state in it, less the delay.
+ */
+export const EXTRAPOLATION_MAX_MS = 1_200;
 /** Delay of what is drawn, in state periods: a little more than one, so that a late state does no harm. */
 const DELAY_PERIODS = 1.15;
-/** How much of a long period the twist bridges, milliseconds: less than it may, since states come unevenly. */
-const BRIDGED_MS = 250;
+/** Longest delay of what is drawn, however seldom states come, milliseconds. */
+export const DELAY_MAX_MS = 250;
 /** Period that is assumed until states have shown theirs, milliseconds: that of the stream of events. */
 const PERIOD_MS = 1_000;
 const PERIOD_MIN_MS = 50;
@@ -38,7 +41,9 @@ const PERIOD_MAX_MS = 1_200;
 const LONGER_GAIN = 0.5;
 const SHORTER_GAIN = 0.2;
 /** How long the error of a prediction takes to be made good, milliseconds. */
-const BLEND_MS = 250;
+const BLEND_MS = 500;
+/** A robot that slows down by at least this is carried on as if it went on doing so, m/s². */
+const BRAKES_M_S2 = 0.25;
 /** States nearer to each other in time are one that was heard twice, milliseconds. */
 const SAME_MS = 15;
 /** Between states farther apart in time nothing is known of the path, milliseconds. */
@@ -68,11 +73,14 @@ export class Motion {
   /** What is drawn never goes back in time. */
   #drawn_ms = -Infinity;
   #error: Misplaced | null = null;
+  /** From when on its last state carries the robot no farther, if that state is not newer. */
+  #held_ms = -Infinity;
+  /** How soon the robot will stand, by its last two states, seconds. */
+  #stands_s = Infinity;
 
   /** How late robots are drawn, milliseconds. */
   get delay_ms(): number {
-    const delay_ms = DELAY_PERIODS * this.#period_ms;
-    return Math.max(Math.min(delay_ms, BRIDGED_MS), delay_ms - BRIDGED_MS);
+    return Math.min(DELAY_PERIODS * this.#period_ms, DELAY_MAX_MS);
   }
 
   push(state: State): void {
@@ -93,7 +101,14 @@ export class Motion {
     const rests = !moves(state.twist) && !moves(last.twist) && isNear(state.pose, last.pose);
     this.#states.push(rests ? { ...state, pose: last.pose } : state);
     if (this.#states.length > STATES_MAX) this.#states.shift();
+    this.#stands_s = standsInS(last, state);
     if (before) this.#note(this.#corrected(before).pose);
+  }
+
+  /** Nobody knows whether it drives on: until its next state it stands where it is drawn. */
+  hold(): void {
+    const last_ms = this.#states.at(-1)?.at_ms ?? Infinity;
+    if (this.#held_ms < last_ms) this.#held_ms = Math.max(this.#drawn_ms, last_ms);
   }
 
   /** Where the robot is drawn at a time of the page's clock; null before its first state. */
@@ -113,16 +128,33 @@ export class Motion {
     if (!from) return null;
     const isMoving = states.some((state) => state.pose !== from.pose) || moves(states.at(-1)?.twist);
     if (at_ms <= from.at_ms) return { pose: from.pose, isMoving, isFrozen: false };
-    if (!to) return carried(from, at_ms);
-    if (isJump(from, to)) return { ...carried(from, at_ms), isMoving };
+    if (!to) return this.#carried(from, at_ms, this.#stands_s);
+    if (isJump(from, to)) return { ...this.#carried(from, at_ms, Infinity), isMoving };
     return { pose: from.pose === to.pose ? from.pose : between(from, to, at_ms), isMoving, isFrozen: false };
+  }
+
+  /** Where a state takes the robot by itself, for a bounded time; slower and slower if it is about to stand. */
+  #carried({ at_ms: from_ms, pose, twist }: State, at_ms: number, stands_s: number): Shown {
+    if (!twist || !moves(twist)) return { pose, isMoving: false, isFrozen: false };
+    const held_ms = this.#held_ms < from_ms ? Infinity : this.#held_ms;
+    const end_ms = Math.min(from_ms + EXTRAPOLATION_MAX_MS, held_ms);
+    const isFrozen = at_ms >= end_ms;
+    const time_s = Math.min((Math.min(at_ms, end_ms) - from_ms) / 1000, stands_s);
+    return {
+      pose: arc(pose, twist, time_s - (time_s * time_s) / (2 * stands_s)),
+      isMoving: !isFrozen,
+      isFrozen,
+    };
   }
 
   /** Notes that a robot was drawn somewhere, while its states say now that it was somewhere else. */
   #note(drawn: Pose): void {
     this.#error = null;
     const known = this.#known(this.#drawn_ms)?.pose;
-    if (!known || known === drawn || distance(known, drawn) > JUMP_M) return;
+    if (!known || known === drawn) return;
+    // As far as the twist may have carried it wrongly; beyond that it is a jump.
+    const speed_m_s = Math.max(...this.#states.map(({ twist }) => Math.abs(twist?.linear_m_s ?? 0)));
+    if (distance(known, drawn) > JUMP_M + (speed_m_s * EXTRAPOLATION_MAX_MS) / 1000) return;
     this.#error = {
       at_ms: this.#drawn_ms,
       x_m: drawn.x_m - known.x_m,
@@ -133,8 +165,10 @@ export class Motion {
 
   #corrected(known: Shown): Shown {
     const error = this.#error;
-    const left = error ? 1 - (this.#drawn_ms - error.at_ms) / BLEND_MS : 0;
-    if (!error || left <= 0) return known;
+    const passed = error ? (this.#drawn_ms - error.at_ms) / BLEND_MS : 1;
+    if (!error || passed >= 1) return known;
+    // Without a step in the speed either.
+    const left = (1 - passed) * (1 - passed) * (1 + 2 * passed);
     const { x_m, y_m, heading_rad } = known.pose;
     return {
       ...known,
@@ -201,23 +235,23 @@ function tangent({ pose, twist }: State): { x_m: number; y_m: number } | null {
   return { x_m: twist.linear_m_s * Math.cos(pose.heading_rad), y_m: twist.linear_m_s * Math.sin(pose.heading_rad) };
 }
 
-/** A state carried on by its twist along an arc, for a bounded time. */
-function carried({ at_ms, pose, twist }: State, now_ms: number): Shown {
-  if (!twist || !moves(twist)) return { pose, isMoving: false, isFrozen: false };
-  const passed_ms = now_ms - at_ms;
-  const isFrozen = passed_ms >= EXTRAPOLATION_MAX_MS;
-  const time_s = Math.min(passed_ms, EXTRAPOLATION_MAX_MS) / 1000;
+/** A state carried on along an arc: by its twist, for so long. */
+function arc(pose: Pose, twist: Twist, time_s: number): Pose {
   const turn_rad = twist.angular_rad_s * time_s;
   // The chord of the arc: its length over the driven one, and its direction half-way round.
   const half_rad = turn_rad / 2;
   const chord_m = twist.linear_m_s * time_s * (Math.abs(half_rad) > 1e-6 ? Math.sin(half_rad) / half_rad : 1);
   return {
-    pose: {
-      x_m: pose.x_m + chord_m * Math.cos(pose.heading_rad + half_rad),
-      y_m: pose.y_m + chord_m * Math.sin(pose.heading_rad + half_rad),
-      heading_rad: pose.heading_rad + turn_rad,
-    },
-    isMoving: !isFrozen,
-    isFrozen,
+    x_m: pose.x_m + chord_m * Math.cos(pose.heading_rad + half_rad),
+    y_m: pose.y_m + chord_m * Math.sin(pose.heading_rad + half_rad),
+    heading_rad: pose.heading_rad + turn_rad,
   };
+}
+
+/** How soon a robot that slows down will stand, seconds; infinite for one that does not. */
+function standsInS(before: State, { at_ms, twist }: State): number {
+  if (!before.twist || !twist) return Infinity;
+  const [was_m_s, is_m_s] = [Math.abs(before.twist.linear_m_s), Math.abs(twist.linear_m_s)];
+  const slows_m_s2 = ((was_m_s - is_m_s) * 1000) / (at_ms - before.at_ms);
+  return slows_m_s2 < BRAKES_M_S2 ? Infinity : is_m_s / slows_m_s2;
 }

@@ -66,6 +66,8 @@ export class Fleet implements Listener {
   wake: () => void = () => undefined;
   /** Says that the friction map has changed somewhere. */
   mapChanged: () => void = () => undefined;
+  /** Says that an alert was raised since the site was opened. */
+  raised: (alert: Alert) => void = () => undefined;
   #isDirty = true;
   /** Steps of missions, for whoever shows a history. */
   lastStep = $state.raw<MissionStep | null>(null);
@@ -74,6 +76,8 @@ export class Fleet implements Listener {
   #timers: ReturnType<typeof setInterval>[] = [];
   #listsDue: ReturnType<typeof setTimeout> | undefined;
   #seen: Set<string> | null = null;
+  /** Everything of this site was read once: what comes now is new. */
+  #isRead = false;
 
   readonly openMissions = $derived(
     [...this.missions.values()]
@@ -151,6 +155,7 @@ export class Fleet implements Listener {
     this.terrainFriction = [];
     this.fence = null;
     this.stops.forget();
+    this.#isRead = false;
     this.isDirty = true;
     this.#stream = new Stream(site, this);
     void this.readGround();
@@ -205,6 +210,7 @@ export class Fleet implements Listener {
     for (const id of this.missions.keys()) if (!seen.has(`m${id}`)) this.missions.delete(id);
     for (const id of this.alerts.keys()) if (!seen.has(`a${id}`)) this.alerts.delete(id);
     this.#seen = null;
+    this.#isRead = true;
     this.isDirty = true;
     this.#listsSoon();
     void this.stops.read();
@@ -245,6 +251,7 @@ export class Fleet implements Listener {
 
   alert(alert: Alert): void {
     this.#seen?.add(`a${alert.id}`);
+    if (this.#isRead && !this.alerts.has(alert.id) && !alert.cleared_at && !alert.acknowledged_at) this.raised(alert);
     if (alert.cleared_at) this.alerts.delete(alert.id);
     else this.alerts.set(alert.id, alert);
     if (alert.code.startsWith('stop')) void this.stops.read();

@@ -42,6 +42,14 @@ test('a robot that is lost is drawn where it was last', () => {
   expect(tracked.shownAt(15_000)).toMatchObject({ pose: { x_m: 9 }, isMoving: false, isFrozen: false });
 });
 
+test('a robot whose link is stale stands where it is drawn', () => {
+  const tracked = driven(9_000);
+  const moving = tracked.shownAt(9_700);
+  expect(moving?.isMoving).toBe(true);
+  tracked.update(robot(9, 1, 'stale'), 9_000);
+  expect(tracked.shownAt(9_900)).toEqual({ pose: moving?.pose, isMoving: false, isFrozen: true });
+});
+
 test('the drive socket moves its robot between the states of the stream', () => {
   const tracked = driven(9_000);
   const { live } = robot(9.1, 1);

@@ -67,7 +67,7 @@ export class Tracked {
 
   /** Takes its place from its drive socket, which says it more often; true if it is to be drawn. */
   seen(view: DriveView, receivedAt: number): boolean {
-    this.#move(view, receivedAt);
+    this.#move(view, receivedAt, view.link);
     return this.shownAt(receivedAt)?.isMoving === true;
   }
 
@@ -93,7 +93,7 @@ export class Tracked {
     const { robot } = this;
     const { live } = robot;
     this.#look = JSON.stringify([robot.link, robot.name, robot.configuration, live?.safety.stop != null]);
-    if (live) this.#move(live, this.receivedAt);
+    if (live) this.#move(live, this.receivedAt, robot.link);
     if (!live || robot.link !== 'online') return;
     const at_s = Date.now() / 1000;
     if ((at_s - (this.samples.at(-1)?.at_s ?? 0)) * 1000 < apartMs) return;
@@ -114,10 +114,12 @@ export class Tracked {
     if (over > 0) this.samples.splice(0, over);
   }
 
-  #move({ pose, twist }: Pick<RobotLive | DriveView, 'pose' | 'twist'>, receivedAt: number): void {
+  #move({ pose, twist }: Pick<RobotLive | DriveView, 'pose' | 'twist'>, receivedAt: number, link: Robot['link']): void {
     if (!pose) return;
     const at_ms = receivedAt - pose.age_ms;
     this.#motion.push({ at_ms, pose: pose.value, twist: twist?.value ?? null });
+    // Of one that is not heard nobody knows whether it drives on.
+    if (link !== 'online') this.#motion.hold();
     if (this.robot.link !== 'online') return;
     const { x_m, y_m } = pose.value;
     this.#ahead.push({ at_ms, x_m, y_m });

@@ -75,20 +75,21 @@ async function measure({ robots, withFriction }: Load): Promise<Frames> {
   camera.fit({ xMin: 0, yMin: 0, xMax: SIDE, yMax: SIDE });
   const spent: number[] = [];
   const labels = new RobotLabels();
-  /** Labels of robots in the last frame. */
-  let labelled = 0;
-  const fillText = context.fillText.bind(context);
-  context.fillText = (text, x, y) => {
-    if (/\d/.test(text) && context.textAlign === 'left') labelled += 1;
-    fillText(text, x, y);
+  /** Labels of robots when they were written last, and so far in this frame. */
+  let [labelled, written] = [0, 0];
+  const { fillText } = CanvasRenderingContext2D.prototype;
+  CanvasRenderingContext2D.prototype.fillText = function (text, x, y) {
+    if (/\d/.test(text) && this.textAlign === 'left') written += 1;
+    fillText.call(this, text, x, y);
   };
   const start = performance.now();
   let now = start;
   while (now - start < MEASURED_MS) {
     now = await new Promise<number>((resolve) => requestAnimationFrame(resolve));
     const before = performance.now();
-    labelled = 0;
-    // Nothing may be kept from the frame before.
+    if (written > 1) labelled = written;
+    written = 0;
+    // The ground is drawn anew in each frame.
     camera.pan(Math.sin(now / 300), Math.cos(now / 300));
     draw(context, camera, {
       terrains: [],
