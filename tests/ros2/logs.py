@@ -78,6 +78,13 @@ with tempfile.TemporaryDirectory() as name:
     expect(without_files(bag) == without_files(good), "rosbag2 and MCAP hold the same messages, and give other results")
     positions = read(folder / "good.mcap", *model, "--from-positions")
     expect(holds(theta, positions["overall"]), f"by positions the interval is {positions['overall']['theta']}")
+    noisy = read(folder / "noisy.mcap", *model)
+    for verdict in [*noisy["passes"], noisy["overall"]]:
+        expect(
+            verdict["theta"] is None or holds(theta, verdict),
+            f"with noise on the wheel speeds θ is {theta}, and the interval is {verdict['theta']}",
+        )
+    expect(any(verdict["theta"] for verdict in noisy["passes"]), "with a little noise no pass gives an estimate")
     named = read(
         folder / "two.mcap", *model, "--imu", "/imu/data",
         "--joints", "front_left_wheel,rear_left_wheel/front_right_wheel,rear_right_wheel",
@@ -112,4 +119,5 @@ with tempfile.TemporaryDirectory() as name:
     print(json.dumps({
         "theta": theta, "interval": interval(good["overall"]), "passes": [interval(one) for one in good["passes"]],
         "effective_track": round(track["ratio"], 4), "at_5_hz": said,
+        "with_noise": [verdict["theta"] and interval(verdict) for verdict in [*noisy["passes"], noisy["overall"]]],
     }))

@@ -10,6 +10,7 @@ It drives figure-8s at changing speed, in two drives with a pause between them.
     good.mcap   wheels 50 Hz, inertial unit 100 Hz, pose 10 Hz, written by `mcap` with mcap-ros2-support
     good/       the same messages as rosbag2 with SQLite, written by `rosbags`
     slow.mcap   wheels 5 Hz, the rest as in good.mcap
+    noisy.mcap  as good.mcap, with white noise on the wheel speeds, as a filter or an analogue sensor has it
     torn.mcap   good.mcap, cut off in the middle
     two.mcap    good.mcap with a second inertial unit
 
@@ -41,6 +42,7 @@ PAUSE_S = 4.0
 BEGIN_NS = 1_750_000_000_000_000_000
 COUNTS_PER_TURN = 16384
 GYRO_NOISE_RAD_S, GYRO_OFFSET_RAD_S, ACCELERATION_NOISE_M_S2 = 0.003, 0.001, 0.05
+WHEEL_NOISE_RAD_S = 0.02
 POSE_NOISE_M, POSE_NOISE_RAD = 0.02, 0.01
 JOINTS = ["front_left_wheel", "front_right_wheel", "rear_left_wheel", "rear_right_wheel"]
 
@@ -127,7 +129,7 @@ def vector(x, y, z):
     return make("geometry_msgs/msg/Vector3", x, y, z)
 
 
-def messages(samples, wheel_hz, random):
+def messages(samples, wheel_hz, random, wheel_noise_rad_s=0.0):
     """(topic, message, time), by time. Wheel speeds are counts of an encoder over the time since the last ones."""
     unmeasured = np.array([-1.0] + [0.0] * 8)
     per_wheels = round(100 / wheel_hz)
@@ -141,7 +143,8 @@ def messages(samples, wheel_hz, random):
         yield "/imu/data", imu, at_ns
         if number % per_wheels == 0:
             before, counted = counted, np.floor(angles / (2 * math.pi) * COUNTS_PER_TURN) * (2 * math.pi) / COUNTS_PER_TURN
-            speeds = np.tile((counted - before) * wheel_hz, 2)
+            noise = random.normal(0.0, wheel_noise_rad_s, 2) if wheel_noise_rad_s else 0.0
+            speeds = np.tile((counted - before) * wheel_hz + noise, 2)
             joints = make("sensor_msgs/msg/JointState", header(at_ns, ""), JOINTS, np.tile(counted, 2), speeds, np.zeros(0))
             yield "/joint_states", joints, at_ns
         if number % 10 == 0:
@@ -192,6 +195,7 @@ good = list(messages(samples, 50, np.random.default_rng(8)))
 write_mcap(folder / "good.mcap", good)
 write_bag(folder / "good", good)
 write_mcap(folder / "slow.mcap", messages(samples, 5, np.random.default_rng(9)))
+write_mcap(folder / "noisy.mcap", messages(samples, 50, np.random.default_rng(10), WHEEL_NOISE_RAD_S))
 whole = (folder / "good.mcap").read_bytes()
 (folder / "torn.mcap").write_bytes(whole[: len(whole) // 2])
 second = [("/imu/other", message, at_ns) for topic, message, at_ns in good if topic == "/imu/data"]

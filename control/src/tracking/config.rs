@@ -13,7 +13,7 @@ pub struct CrossGains {
     /// Heading gain `k_θ`, per metre, above 0.
     pub heading_1_m: f64,
     /// Integral gain `k_I` on the cross-track error over the distance driven, per metre cubed, 0 to
-    /// below `k_θ k_y`.
+    /// below `k_θ k_y`: that of the integral and of the adaptation together.
     pub integral_1_m3: f64,
     /// Inner-loop gain `k_r` from turn rate error (wanted minus measured) to the turn rate command,
     /// 0 to below 1, so that no lag or delay of the base can make the loop unstable.
@@ -62,17 +62,21 @@ pub struct TrackerConfig {
     pub beyond_gain: f64,
     /// Maximum magnitude of θ̂̇ by the gradient, per second.
     pub adaptation_rate_max_1_s: f64,
-    /// Rate p of the pull of θ̂ towards a known θ at full confidence, per second. It is weak enough
-    /// for tracking errors to lead θ̂ away from it.
+    /// Rate p of the pull of θ̂ towards a newly known θ at full confidence, per second.
     pub adaptation_pull_1_s: f64,
-    /// Additional rate of the pull beyond the band of [`TrackerConfig::adaptation_band_ratio`], per
-    /// second.
-    pub adaptation_return_1_s: f64,
-    /// Half-width of the band around a known θ without the additional pull, as a fraction of θ; the
-    /// standard deviation of θ is added to it.
-    pub adaptation_band_ratio: f64,
     /// Maximum θ̂, above 0.
     pub theta_max: f64,
+    /// Adaptation gain `γ_d` of d̂, the sideslip by a slope, per metre squared, at least 0.
+    pub slope_gain_1_m2: f64,
+    /// Maximum magnitude of d̂, radians, at least 0; θ times the slope as fall over run.
+    pub slope_drift_max_rad: f64,
+    /// Adaptation gain `γ_c` of the rotation centre `x̂_c`, without a unit, at least 0.
+    pub center_gain: f64,
+    /// Maximum distance of the rotation centre from the middle of the wheels, metres, at least 0.
+    pub center_max_m: f64,
+    /// Maximum part of the integral action `k_I` that the adaptation of all values together has, 0
+    /// to 1. The adaptation gains are scaled down to it, and the integral has the rest.
+    pub adaptation_share_max: f64,
     /// Pose age above which adaptation and integral are held, seconds.
     pub pose_age_max_s: f64,
 }
@@ -84,7 +88,7 @@ impl Default for TrackerConfig {
             quiet: CrossGains {
                 cross_1_m2: 20.0,
                 heading_1_m: 8.0,
-                integral_1_m3: 26.0,
+                integral_1_m3: 28.0,
                 yaw_rate: 0.7,
             },
             noisy: CrossGains {
@@ -97,14 +101,17 @@ impl Default for TrackerConfig {
             position_middle_m: 4.0e-3,
             integral_max_1_m: 0.5,
             servo_lag_s: 0.05,
-            adaptation_gain: 2800.0,
+            adaptation_gain: 1400.0,
             friction_curve: FrictionCurve::yi2007(),
-            beyond_gain: 8_000.0,
+            beyond_gain: 20_000.0,
             adaptation_rate_max_1_s: 0.3,
-            adaptation_pull_1_s: 1.0,
-            adaptation_return_1_s: 10.0,
-            adaptation_band_ratio: 0.3,
+            adaptation_pull_1_s: 10.0,
             theta_max: 4.0,
+            slope_gain_1_m2: 0.7,
+            slope_drift_max_rad: 0.15,
+            center_gain: 1.0,
+            center_max_m: 0.1,
+            adaptation_share_max: 1.0,
             pose_age_max_s: 0.3,
         }
     }
@@ -151,8 +158,11 @@ impl TrackerConfig {
             ("beyond_gain", self.beyond_gain),
             ("adaptation_rate_max_1_s", self.adaptation_rate_max_1_s),
             ("adaptation_pull_1_s", self.adaptation_pull_1_s),
-            ("adaptation_return_1_s", self.adaptation_return_1_s),
-            ("adaptation_band_ratio", self.adaptation_band_ratio),
+            ("slope_gain_1_m2", self.slope_gain_1_m2),
+            ("slope_drift_max_rad", self.slope_drift_max_rad),
+            ("center_gain", self.center_gain),
+            ("center_max_m", self.center_max_m),
+            ("adaptation_share_max", self.adaptation_share_max),
         ];
         for (field, value) in positive {
             if !(value.is_finite() && value > 0.0) {
@@ -163,6 +173,12 @@ impl TrackerConfig {
             if !(value.is_finite() && value >= 0.0) {
                 return Err(TrackerError::OutOfRange { field, value });
             }
+        }
+        if self.adaptation_share_max > 1.0 {
+            return Err(TrackerError::OutOfRange {
+                field: "adaptation_share_max",
+                value: self.adaptation_share_max,
+            });
         }
         for (integral, yaw_rate, gains) in [
             ("quiet.integral_1_m3", "quiet.yaw_rate", self.quiet),

@@ -2,6 +2,9 @@
 
 /// Number of standard deviations of the difference above which two values contradict each other.
 const CONTRADICTION: f64 = 3.0;
+/// Ratio of two values up to which they do not contradict each other, whatever their standard
+/// deviations: ground differs by more, and estimates are biased by less.
+const SAME_GROUND_RATIO: f64 = 1.5;
 
 /// Slip compliance θ with its standard deviation, from the map or measured by this robot.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -16,7 +19,12 @@ impl ThetaKnowledge {
     /// Returns whether both values are unlikely to hold for the same ground.
     pub(super) fn contradicts(self, other: Self) -> bool {
         let apart = (self.theta - other.theta).abs();
-        apart > CONTRADICTION * self.std_dev.hypot(other.std_dev)
+        apart > CONTRADICTION * self.std_dev.hypot(other.std_dev) && self.is_apart(other)
+    }
+
+    /// Returns whether the values differ by more than estimates of the same ground do.
+    pub(super) fn is_apart(self, other: Self) -> bool {
+        self.theta.max(other.theta) > SAME_GROUND_RATIO * self.theta.min(other.theta)
     }
 
     /// Returns the confidence c = 1/(1 + (3σ/θ)²), 0 to 1; 0 for values out of range.

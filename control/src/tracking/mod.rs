@@ -20,12 +20,19 @@
 //! of gain below one, keeps the stability margin where slip is slow. Gains depend on the noise of
 //! the pose.
 //!
-//! θ̂ starts at zero, which means no sideslip. A known θ pulls it, weighted by its confidence. χ̂
-//! starts at one, and returns to one when a known θ contradicts the previous one. Both are bounded
+//! A slope and a rotation centre off the middle of the wheels cause sideslip too. Both are adapted
+//! by the same function (`drift`). All that is adapted integrates the cross-track error, as the
+//! integral does; their gains are shares of one integral gain (`action`).
+//!
+//! θ̂ starts at zero, which means no sideslip. A θ that is known from the start pulls it, weighted by
+//! its confidence, and so does one that contradicts the previous one; after that errors lead θ̂. χ̂
+//! starts at one, and returns to one when a known θ contradicts the previous one. All are bounded
 //! in range and rate, and held while the wheels saturate, a later stage reduces the command, or the
 //! pose is stale. They serve this loop only; the map uses [`crate::estimation`].
 
+mod action;
 mod config;
+mod drift;
 mod knowledge;
 mod noise;
 mod sideslip;
@@ -37,7 +44,9 @@ use crate::reference::ReferenceSample;
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 use crate::twist_limits::TwistLimits;
 
+use action::IntegralAction;
 pub use config::{CrossGains, TrackerConfig, TrackerError};
+use drift::Drift;
 pub use knowledge::ThetaKnowledge;
 use noise::NoiseLevel;
 use sideslip::{Belief, Sideslip};
@@ -56,7 +65,7 @@ const ALONG_TRACK_MAX_M: f64 = 0.3;
 const INTEGRAL_SPEED_MIN_M_S: f64 = 0.05;
 /// Minimum speed in the heading feedback, metres per second, so that it acts at standstill too.
 const HEADING_SPEED_MIN_M_S: f64 = 0.15;
-/// Cross-track error below which neither θ̂ nor χ̂ changes, metres.
+/// Cross-track error below which nothing is adapted, metres.
 const ADAPTATION_DEAD_ZONE_M: f64 = 5.0e-4;
 /// Maximum part of the command cut by the acceleration limits that is added to the next tick's.
 /// Without it noise would be cut on the side of speeding up only, and the mean speed and turn rate
@@ -67,7 +76,11 @@ const CARRIED_MAX: Twist = Twist {
 };
 
 /// Ratio of standard deviations below which a new θ replaces the one under which χ̂ was adapted.
-const BETTER_WORD: f64 = 0.5;
+const BETTER_WORD: f64 = 0.6;
+/// Time for which a newly known θ pulls θ̂, seconds.
+const PULL_TIME_S: f64 = 2.0;
+/// Distance driven while adapting up to which a first known θ pulls θ̂, metres.
+const KNOWN_FROM_START_M: f64 = 1.0;
 /// Maximum magnitude of χ̂'s rate of change, per second.
 const BEYOND_RATE_MAX_1_S: f64 = 1.0;
 
@@ -112,6 +125,11 @@ pub struct TrackerOutput {
     pub theta_loop: f64,
     /// Adapted χ̂: fraction, 0 to 1, of the modelled friction loss beyond the peak.
     pub beyond_loop: f64,
+    /// Adapted d̂: sideslip of a robot across the slope, as a vector along the site's axes `[x, y]`
+    /// that points downhill, radians.
+    pub slope_loop_rad: [f64; 2],
+    /// Adapted rotation centre `x̂_c` ahead of the middle of the wheels, metres.
+    pub center_loop_m: f64,
     /// Confidence in the known θ, 0 to 1; 0 without one.
     pub confidence: f64,
     /// Whether the wheel speed limit cut the command.
@@ -127,6 +145,17 @@ struct Cut {
     in_yaw: bool,
 }
 
+/// Pull of θ̂ to a known θ.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+struct Pull {
+    /// Remaining time, seconds.
+    left_s: f64,
+    /// Whether there was a pull before.
+    has_acted: bool,
+    /// Whether slope and rotation centre return to zero during the pull.
+    forgets_drift: bool,
+}
+
 /// Tracking law with its state.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Tracker {
@@ -136,10 +165,14 @@ pub struct Tracker {
     theta: f64,
     /// χ̂, the fraction of the loss beyond the peak of the friction curve.
     beyond: f64,
+    drift: Drift,
     /// Known θ under which χ̂ was adapted.
     known: Option<ThetaKnowledge>,
     /// Whether χ̂ is returning to one.
     forgets: bool,
+    pull: Pull,
+    /// Distance driven while adapting, metres.
+    adapted_m: f64,
     noise: NoiseLevel,
     was_cut: bool,
     held_from_outside: bool,
@@ -150,7 +183,7 @@ pub struct Tracker {
 }
 
 impl Tracker {
-    /// Creates a law in its initial state: θ̂ = 0, χ̂ = 1, integral 0.
+    /// Creates a law in its initial state: χ̂ = 1, all others 0.
     ///
     /// # Errors
     /// [`TrackerError`] names a gain or bound that is out of its range.
@@ -162,8 +195,11 @@ impl Tracker {
             integral_1_m: 0.0,
             theta: 0.0,
             beyond: 1.0,
+            drift: Drift::default(),
             known: None,
             forgets: false,
+            pull: Pull::default(),
+            adapted_m: 0.0,
             noise: NoiseLevel::default(),
             was_cut: false,
             held_from_outside: false,
@@ -172,7 +208,7 @@ impl Tracker {
         })
     }
 
-    /// Holds θ̂, χ̂ and the integral while another stage, such as the gate, reduces the command.
+    /// Holds all that is adapted, and the integral, while another stage, such as the gate, reduces the command.
     pub fn hold_adaptation(&mut self, held: bool) {
         self.held_from_outside = held;
     }
@@ -221,8 +257,9 @@ impl Tracker {
             beyond: self.beyond,
         };
         let sideslip = Sideslip::of(reference, belief, &config.friction_curve, &self.model);
+        let drift = self.drift.sideslip(reference);
         let mut course = measured.pose;
-        course.heading_rad += sideslip.angle_rad;
+        course.heading_rad += sideslip.angle_rad + drift.angle_rad;
         let forward = course.body_from_site(reference.pose.point());
         let heading_rad = wrap_angle_rad(reference.pose.heading_rad - course.heading_rad);
         let catch_up_m_s = (CATCH_UP_SPEED_SHARE * self.model.limits().linear_max_m_s - speed_m_s)
@@ -239,9 +276,22 @@ impl Tracker {
             || self.held_from_outside
             || measured.pose_age_s > config.pose_age_max_s
             || speed_m_s < INTEGRAL_SPEED_MIN_M_S;
+        let confidence = knowledge.map_or(0.0, |known| known.confidence());
         if !held {
-            self.integrate(gains.integral_1_m3 * cross_track_m * speed_m_s * dt_s);
-            self.adapt(&sideslip, cross_track_m, knowledge, dt_s);
+            self.adapted_m += speed_m_s * dt_s;
+            let action = IntegralAction::divide(&gains, &config, reference, (&sideslip, &drift));
+            self.integrate(action.integral_1_m3 * cross_track_m * speed_m_s * dt_s);
+            let error_m = if cross_track_m.abs() < ADAPTATION_DEAD_ZONE_M {
+                0.0
+            } else {
+                cross_track_m
+            };
+            let share = action.adaptation_share;
+            self.adapt(&sideslip, share * error_m, knowledge, dt_s);
+            // Slope and rotation centre are not adapted while they return to zero.
+            if self.pull.left_s <= 0.0 || !self.pull.forgets_drift {
+                self.drift.adapt(&drift, &config, share * error_m, dt_s);
+            }
         }
 
         let slip_lead_s = speed_m_s * theta / GRAVITY_M_S2;
@@ -253,7 +303,7 @@ impl Tracker {
             + config.along_track_gain_1_s * along_track_m
             + (lead_s + slip_lead_s) * reference.acceleration_m_s2
             + sideslip.rims.linear_m_s;
-        let wanted_rad_s = reference.turn_rad_s - sideslip.rate_rad_s
+        let wanted_rad_s = reference.turn_rad_s - sideslip.rate_rad_s - drift.rate_rad_s
             + speed_m_s * (gains.cross_1_m2 * cross_track_m + self.integral_1_m)
             + speed_m_s.max(HEADING_SPEED_MIN_M_S) * gains.heading_1_m * heading_rad.sin();
         let angular_rad_s = wanted_rad_s
@@ -276,22 +326,43 @@ impl Tracker {
             errors: TrackingErrors::between(reference, measured),
             theta_loop: self.theta,
             beyond_loop: self.beyond,
-            confidence: knowledge.map_or(0.0, |known| known.confidence()),
+            slope_loop_rad: self.drift.slope_rad,
+            center_loop_m: self.drift.center_forward_m,
+            confidence,
             saturated: cut.by_wheels,
         }
     }
 
-    /// Moves χ̂ back to one after a known θ contradicts the one under which χ̂ was adapted.
+    /// Lets a known θ act if it is new: θ̂ is pulled to it if it is known from the start,
+    /// contradicts the previous one, or refines one that pulled. What was adapted under another θ
+    /// is forgotten: χ̂ moves back to one, slope and rotation centre to zero.
     fn apply_knowledge(&mut self, knowledge: Option<ThetaKnowledge>, dt_s: f64) {
         if let Some(now) = knowledge {
+            let is_first = self.known.is_none();
             let anchor = *self.known.get_or_insert(now);
-            self.forgets |= anchor.contradicts(now);
+            let is_contradicted = anchor.contradicts(now);
             // A much better value for the same ground replaces the stored one; replacing it by many
             // slightly better ones would let it follow a θ that changes.
-            if anchor.contradicts(now) || now.std_dev < BETTER_WORD * anchor.std_dev {
+            let is_better = now.std_dev < BETTER_WORD * anchor.std_dev;
+            let is_refined = self.pull.has_acted && is_better;
+            let is_other = is_contradicted || is_refined && anchor.is_apart(now);
+            self.forgets |= is_other;
+            // Errors that were driven through know better what the loop needs.
+            let is_from_start = is_first && self.adapted_m < KNOWN_FROM_START_M;
+            if is_contradicted || is_refined || is_from_start {
+                self.pull.left_s = PULL_TIME_S;
+                self.pull.has_acted = true;
+                self.pull.forgets_drift = is_other;
+            }
+            if is_contradicted || is_better {
                 self.known = Some(now);
             }
+            if self.pull.left_s > 0.0 && self.pull.forgets_drift {
+                let share = now.confidence() * self.config.adaptation_pull_1_s * dt_s;
+                self.drift.forget(share.min(1.0));
+            }
         }
+        self.pull.left_s = (self.pull.left_s - dt_s).max(0.0);
         if self.forgets {
             self.beyond = (self.beyond + BEYOND_RATE_MAX_1_S * dt_s).min(1.0);
             self.forgets = self.beyond < 1.0;
@@ -305,20 +376,16 @@ impl Tracker {
     }
 
     /// Adapts `θ̂̇ = ρ e_y φ + pull·c (cθ − θ̂)` and `χ̂̇ = ρ_χ e_y φ_χ`, c the confidence, φ and
-    /// `φ_χ` the drifts per θ and per χ; bounded in rate and range.
+    /// `φ_χ` the drifts per θ and per χ; bounded in rate and range. `error_m` is `e_y` times the
+    /// share of the gains.
     fn adapt(
         &mut self,
         sideslip: &Sideslip,
-        cross_track_m: f64,
+        error_m: f64,
         knowledge: Option<ThetaKnowledge>,
         dt_s: f64,
     ) {
         let config = &self.config;
-        let error_m = if cross_track_m.abs() < ADAPTATION_DEAD_ZONE_M {
-            0.0
-        } else {
-            cross_track_m
-        };
         // At the bound of the modelled sideslip a larger θ̂ or χ̂ has no effect and would wind up.
         let most = if sideslip.is_at_end {
             0.0
@@ -326,13 +393,12 @@ impl Tracker {
             f64::INFINITY
         };
         let gradient = (config.adaptation_gain * error_m * sideslip.drift_per_theta_m_s).min(most);
-        let pull = knowledge.map_or(0.0, |known| {
-            let weight = known.confidence();
-            let apart = weight * known.theta - self.theta;
-            let band = config.adaptation_band_ratio * known.theta + known.std_dev;
-            let outside = apart - apart.clamp(-band, band);
-            weight * (config.adaptation_pull_1_s * apart + config.adaptation_return_1_s * outside)
-        });
+        let pull = knowledge
+            .filter(|_| self.pull.left_s > 0.0)
+            .map_or(0.0, |known| {
+                let weight = known.confidence();
+                weight * config.adaptation_pull_1_s * (weight * known.theta - self.theta)
+            });
         let bound = config.adaptation_rate_max_1_s;
         // The pull is not limited to the rate bound of the gradient.
         let rate = gradient.clamp(-bound, bound) + pull;

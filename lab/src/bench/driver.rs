@@ -33,15 +33,15 @@ pub struct LawInput<'a> {
 }
 
 /// A tracking law with its state.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Driver(Kind);
 
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 enum Kind {
     Kanayama(Kanayama),
     Pursuit(Pursuit),
     Paper(PaperLaw),
-    Shipped(Tracker),
+    Shipped(Box<Tracker>),
 }
 
 impl Driver {
@@ -60,12 +60,13 @@ impl Driver {
         Ok(Self(match law {
             Law::Kanayama(gains) => Kind::Kanayama(Kanayama::new(model, gains)),
             Law::Pursuit(config) => Kind::Pursuit(Pursuit::new(model, config)),
-            Law::Yi2007 => PaperLaw::new(model, curve).map_or(Kind::Shipped(tracker), Kind::Paper),
+            Law::Yi2007 => PaperLaw::new(model, curve)
+                .map_or_else(|| Kind::Shipped(Box::new(tracker)), Kind::Paper),
             Law::Shipped(given) => {
                 if let Some(known) = given {
                     tracker.warm_start(known);
                 }
-                Kind::Shipped(tracker)
+                Kind::Shipped(Box::new(tracker))
             }
         }))
     }

@@ -1,6 +1,7 @@
 //! `tracking`: every law behind the shipped localisation, on both worlds' robots.
 //!
-//! `cargo run --release -p tread-lab --bin tracking -- [--seeds N] [--seed N] [--tune] [--json]`
+//! `cargo run --release -p tread-lab --bin tracking -- [--seeds N] [--seed N] [--tune]
+//! [--json | --markdown]`
 //!
 //! A line is a world, a course, a ground and a quality of positions; all laws drive it with the same
 //! seeds. Printed are root mean squares of the true distance from the course, over seeds, and that
@@ -58,8 +59,11 @@ struct Arguments {
     #[arg(long)]
     tune: bool,
     /// Print one JSON object instead of a table
-    #[arg(long)]
+    #[arg(long, conflicts_with = "markdown")]
     json: bool,
+    /// Print the table of the report
+    #[arg(long)]
+    markdown: bool,
 }
 
 /// A line: what is driven where.
@@ -76,6 +80,15 @@ struct Figures {
     /// Millimetres; none of a law that lost the robot.
     rms_mm: Option<f64>,
     localisation_mm: Option<f64>,
+}
+
+impl Figures {
+    fn text(&self) -> String {
+        let text = |value: Option<f64>| {
+            value.map_or_else(|| "lost".to_owned(), |value| format!("{value:.2}"))
+        };
+        format!("{} ({})", text(self.rms_mm), text(self.localisation_mm))
+    }
 }
 
 #[derive(Debug, Serialize)]
@@ -335,19 +348,38 @@ fn print(lines: &[Line]) {
             line.world, line.poses, line.course, line.stiffness
         );
         for (_, figures) in &line.laws {
-            let text = |value: Option<f64>| {
-                value.map_or_else(|| "lost".to_owned(), |value| format!("{value:.2}"))
-            };
-            print!(
-                " {:>18}",
-                format!(
-                    "{} ({})",
-                    text(figures.rms_mm),
-                    text(figures.localisation_mm)
-                )
-            );
+            print!(" {:>18}", figures.text());
         }
         println!(" {:>8.3} {:>8.3}", line.over_peer, line.over_unknown);
+    }
+}
+
+/// Prints the table of the report: a law's error, and the localisation's in brackets.
+fn print_markdown(lines: &[Line]) {
+    for (index, line) in lines.iter().enumerate() {
+        if index == 0 {
+            let names: Vec<_> = line.laws.iter().map(|(name, _)| *name).collect();
+            println!(
+                "| world | positions | course | K | {} | / peer | / no θ |",
+                names.join(" | ")
+            );
+            println!("|{}", "---|".repeat(names.len() + 6));
+        }
+        let figures: Vec<_> = line
+            .laws
+            .iter()
+            .map(|(_, figures)| figures.text())
+            .collect();
+        println!(
+            "| {} | {} | {} | {} | {} | {:.2} | {:.2} |",
+            line.world,
+            line.poses,
+            line.course,
+            line.stiffness,
+            figures.join(" | "),
+            line.over_peer,
+            line.over_unknown
+        );
     }
 }
 
@@ -418,7 +450,12 @@ fn main() -> anyhow::Result<ExitCode> {
             serde_json::json!({ "lines": lines, "checks": checks_json(&checks) })
         );
     } else {
-        print(&lines);
+        if arguments.markdown {
+            print_markdown(&lines);
+            println!();
+        } else {
+            print(&lines);
+        }
         println!(
             "above the localisation's own error, ours is {mean:.3} of the best peer in the mean"
         );

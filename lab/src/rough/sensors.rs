@@ -34,6 +34,9 @@ const OUTLIER_M: f64 = 1.0;
 pub struct SensorSpec {
     /// Encoder counts per revolution of a wheel.
     pub counts_per_turn: f64,
+    /// White noise of the wheel speeds, radians per second per sample: 0 for encoders; a filter or
+    /// an analogue sensor has it.
+    pub wheel_speed_rad_s: f64,
     /// White noise of the gyro, radians per second per sample.
     pub gyro_rad_s: f64,
     /// Initial offset of the gyro, radians per second.
@@ -72,6 +75,7 @@ impl SensorSpec {
     pub fn usual(has_torque: bool) -> Self {
         Self {
             counts_per_turn: 16_384.0,
+            wheel_speed_rad_s: 0.0,
             gyro_rad_s: 0.003,
             gyro_offset_rad_s: 0.002,
             gyro_walk_rad_s: 1.0e-4,
@@ -169,8 +173,13 @@ impl Sensors {
         let per_rad = self.spec.counts_per_turn / std::f64::consts::TAU;
         let counts = turned_rad.map(|turned| (turned * per_rad).floor());
         let before = std::mem::replace(&mut self.counts, counts);
-        let speed =
-            |side: usize| (counts[side] - before[side]) / per_rad / SAMPLE_PERIOD.as_secs_f64();
+        let noise_rad_s = self.spec.wheel_speed_rad_s;
+        let mut speed = |side: usize| {
+            let counted = (counts[side] - before[side]) / per_rad / SAMPLE_PERIOD.as_secs_f64();
+            // Encoders draw nothing, so that their other errors stay those of the seed.
+            let noise = (noise_rad_s > 0.0).then(|| self.random.normal(noise_rad_s));
+            counted + noise.unwrap_or(0.0)
+        };
         WheelSpeeds {
             left_rad_s: speed(0),
             right_rad_s: speed(1),

@@ -8,36 +8,39 @@
 //! robust one, `C (Σ g gᵀ + prior information) C`: the empirical scatter of the blocks' scores
 //! `g = Jᵀ W r` replaces the assumption of white residuals and a true model.
 
-use super::dual::{Dual, Real};
-use super::model::{Input, Output, State};
-use super::parameters::{PARAMETERS, Robot, SHAPE_MIN, Square, Values, index};
+use super::model::{Input, State};
+use super::parameters::{Number, PARAMETERS, Robot, SHAPE_MIN, Square, Values, index};
+use super::scale::{Compared, Residual, Scale};
+use super::simulation::Simulation;
 use crate::robot::RobotModel;
 
+/// Numbers of comparisons in the means of the time scales: 0.05, 0.2 and 0.5 s.
+const SCALES: [u32; 3] = [1, 4, 10];
 /// Channels: turn rate, acceleration (forward, left), torque (left, right), body speed.
 pub(super) const CHANNELS: usize = 6;
+/// Channels of the accelerations.
+const ACCELERATIONS: std::ops::RangeInclusive<usize> = 1..=2;
+/// Weight of each new square in the mean squares that tell the noise of the wheel speeds, once many
+/// are known.
+const NOISE_GAIN: f64 = 0.005;
+/// Mean square of the accelerations' residuals at high frequencies, standardised, from which the
+/// wheel speeds may have noise that matters, and the minimum number of blocks for it.
+const NOISY_SQUARE: f64 = 0.8;
+const NOISE_BLOCKS_MIN: u32 = 6;
+/// Maximum standardised residual in that mean square.
+const RESIDUAL_MAX: f64 = 5.0;
 /// Change of ln K that makes older linearisations count e⁻³ times as much.
 const LINEAR_RANGE: f64 = 0.1;
-/// Fraction of its information that a block loses with each later block, because sensor offsets
-/// drift.
-const BLOCK_FORGETS: f64 = 0.002;
 /// Maximum magnitude of the change of ln K at the end of one block.
 const STEP_MAX: f64 = 0.4;
 /// Range in which parameters stay, in standard deviations of their prior.
 const PRIOR_RANGE: f64 = 5.0;
-/// Standardised residual above which Huber's weight falls below 1.
-const HUBER: f64 = 3.0;
-/// Weight of each new squared residual in the exponentially weighted mean square of its channel.
-const SQUARE_GAIN: f64 = 0.005;
-/// Maximum squared standardised residual in that mean, and in the cost.
-const SQUARE_MAX: f64 = 100.0;
+/// Maximum squared standardised residual in the cost.
 const COST_MAX: f64 = 25.0;
 /// Minimum number of blocks from whose scatter the variance of innovations is estimated.
 const INNOVATION_BLOCKS_MIN: u32 = 15;
 /// Factor by which each later block multiplies the cost so far.
 const COST_KEEPS: f64 = 0.95;
-
-/// Value with its derivatives with respect to all parameters.
-pub(super) type Number = Dual<PARAMETERS>;
 
 /// Normal prior of the parameters at the start of a ground, in the units of [`index`].
 #[derive(Debug, Clone, PartialEq)]
@@ -65,44 +68,6 @@ impl Prior {
     }
 }
 
-/// Weighted sums over linearised blocks of measurements.
-#[derive(Debug, Clone, PartialEq)]
-struct Blocks {
-    /// `A = Σ Jᵀ W J`, the information matrix, and `b = Σ (Jᵀ W J p_b + g)`, the right side of the
-    /// normal equations `A p = b`.
-    information: Square,
-    preferred: Values,
-    /// `Σ g gᵀ` of the scores `g = Jᵀ W r`.
-    scores: Square,
-    /// Sum of the blocks' weights, each at most 1.
-    count: f64,
-}
-
-impl Blocks {
-    fn none() -> Self {
-        Self {
-            information: Square::zeros(),
-            preferred: Values::zeros(),
-            scores: Square::zeros(),
-            count: 0.0,
-        }
-    }
-
-    fn scale(&mut self, ratio: f64) {
-        self.information *= ratio;
-        self.preferred *= ratio;
-        self.scores *= ratio;
-        self.count *= ratio;
-    }
-
-    fn add(&mut self, other: &Self, ratio: f64) {
-        self.information += other.information * ratio;
-        self.preferred += other.preferred * ratio;
-        self.scores += other.scores * ratio;
-        self.count += other.count * ratio;
-    }
-}
-
 /// Estimate of ln K from one segment, and the two parts of its variance.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct OfSegment {
@@ -116,6 +81,17 @@ pub(super) struct OfSegment {
     pub(super) known: f64,
 }
 
+/// Output of one channel, and that of the model with noise added to the wheel speeds.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Predicted {
+    output: Number,
+    perturbed: Option<Number>,
+}
+
+fn slopes(output: &Number) -> Values {
+    Values::from_row_slice(&output.derivatives)
+}
+
 /// A measurement of one channel.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Measured {
@@ -125,6 +101,8 @@ pub(super) struct Measured {
     pub(super) value: f64,
     /// Standard deviation of sensor noise and model error together, in the same unit.
     pub(super) std_dev: f64,
+    /// Standard deviation of sensor noise alone.
+    pub(super) sensor_std_dev: f64,
 }
 
 /// Estimator that started at one value of K: the model's state, the estimated parameters and their
@@ -132,29 +110,29 @@ pub(super) struct Measured {
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Hypothesis {
     values: Values,
-    state: State<Number>,
-    /// All complete blocks of this ground.
-    ground: Blocks,
-    /// Complete blocks of the open segment except the last one, which may already be of the next
-    /// ground.
-    segment: Blocks,
-    last: Blocks,
-    /// `Jᵀ W J` and `g` of the open block.
-    block_information: Square,
-    block_score: Values,
-    /// Mean outputs since the last comparison.
-    mean: Output<Number>,
-    /// Mean square of each channel's standardised residuals.
-    squares: [f64; CHANNELS],
+    model: Simulation,
+    /// The same with noise added to the wheel speeds; None if they have none.
+    perturbed: Option<Simulation>,
+    /// The normal equations at each time scale, and the one that is used.
+    scales: [Scale; SCALES.len()],
+    used: usize,
+    /// The last residuals of the accelerations and the last changes by the added noise,
+    /// standardised.
+    last: [[f64; 2]; 2],
+    /// Exponentially weighted mean squares, halved, of their differences from one comparison to the
+    /// next, without sensor noise. Noise of the wheel speeds shows there, near the contacts'
+    /// resonance at 5 to 10 Hz; other errors of the model change more slowly.
+    residual_square: f64,
+    compared: u32,
+    noise_square: f64,
     cost: f64,
-    /// Column of C for ln K: covariances of ln K with all parameters.
-    of_stiffness: Values,
     /// `of_stiffnessᵀ g` of the open block at the last call of [`Hypothesis::innovation`].
     score_taken: f64,
-    /// Variance of `of_stiffnessᵀ g` of one block, from the scatter of the blocks.
-    block_variance: f64,
     /// Number of complete blocks.
     age: u32,
+    /// Whether the last normal equations could be solved at any time scale: otherwise noise hides
+    /// what the measurements tell.
+    is_determined: bool,
 }
 
 impl Hypothesis {
@@ -162,32 +140,27 @@ impl Hypothesis {
     pub(super) fn new(prior: &Prior, ln_stiffness: f64, state: State<f64>) -> Self {
         let mut values = prior.mean;
         values[index::STIFFNESS] = ln_stiffness;
-        let mut hypothesis = Self {
+        Self {
             values,
-            state: State::rolling(0.0, 0.0),
-            ground: Blocks::none(),
-            segment: Blocks::none(),
-            last: Blocks::none(),
-            block_information: Square::zeros(),
-            block_score: Values::zeros(),
-            mean: Output::zero(),
-            squares: [1.0; CHANNELS],
+            model: Simulation::new(state),
+            perturbed: None,
+            scales: SCALES.map(Scale::new),
+            used: 0,
+            last: [[0.0; 2]; 2],
+            residual_square: 0.0,
+            compared: 0,
+            noise_square: 0.0,
+            is_determined: true,
             cost: 0.0,
-            of_stiffness: Values::zeros(),
             score_taken: 0.0,
-            block_variance: 0.0,
             age: 0,
-        };
-        hypothesis.restart(state);
-        hypothesis
+        }
     }
 
     /// Continues from a given state of motion after a gap in the samples; drops the open block.
     pub(super) fn restart(&mut self, state: State<f64>) {
-        let [forward_m_s, left_m_s] = state.speed_m_s;
-        self.state = State::rolling(forward_m_s, state.turn_rad_s);
-        self.state.speed_m_s[1] = Number::constant(left_m_s);
-        self.mean = Output::zero();
+        self.model = Simulation::new(state);
+        self.perturbed = None;
         self.drop_block();
     }
 
@@ -196,17 +169,21 @@ impl Hypothesis {
     /// scatter of whole blocks and `per_block`, the number of calls per block. Positive if K is
     /// larger than estimated; None before [`INNOVATION_BLOCKS_MIN`] blocks.
     pub(super) fn innovation(&mut self, per_block: f64) -> Option<f64> {
-        let score = self.of_stiffness.dot(&self.block_score);
+        let scale = &self.scales[0];
+        let score = scale.of_stiffness.dot(&scale.score);
         let new = score - std::mem::replace(&mut self.score_taken, score);
-        (self.age >= INNOVATION_BLOCKS_MIN && self.block_variance > 0.0)
-            .then(|| new / (self.block_variance / per_block).sqrt())
+        (self.age >= INNOVATION_BLOCKS_MIN && scale.block_variance > 0.0)
+            .then(|| new / (scale.block_variance / per_block).sqrt())
     }
 
     /// Drops the measurements of the open block.
     pub(super) fn drop_block(&mut self) {
         self.score_taken = 0.0;
-        self.block_information = Square::zeros();
-        self.block_score = Values::zeros();
+        self.scales.iter_mut().for_each(Scale::drop_block);
+    }
+
+    fn scale(&self) -> &Scale {
+        &self.scales[self.used]
     }
 
     /// Returns the estimated parameters, in the units of [`index`].
@@ -228,83 +205,119 @@ impl Hypothesis {
     /// Returns the largest of the channels' mean squares of standardised residuals; about 1 if
     /// noise and model are as assumed.
     pub(super) fn worst_square(&self) -> f64 {
-        self.squares.into_iter().fold(0.0, f64::max)
+        self.scale().worst_square()
     }
 
-    /// Advances the model by one sample and adds its outputs to the mean with the weight `share`.
-    /// Returns the forward speed at the sample's end, metres per second.
-    pub(super) fn advance(&mut self, model: &RobotModel, input: &Input, share: f64) -> Number {
+    /// Advances the model by one sample and adds its outputs to the mean with the weight `share`;
+    /// likewise the model with noise, if there is a `perturbed` input. Returns the forward speed at
+    /// the sample's end, metres per second.
+    pub(super) fn advance(
+        &mut self,
+        model: &RobotModel,
+        input: &Input,
+        perturbed: Option<&Input>,
+        share: f64,
+    ) -> Predicted {
         let values = std::array::from_fn(|place| Number::parameter(self.values[place], place));
-        let output = Robot::new(&values, model).advance(&mut self.state, input);
-        let add = |mean: &mut Number, value: Number| *mean = *mean + value * share;
-        add(&mut self.mean.turn_rad_s, output.turn_rad_s);
-        for axis in 0..2 {
-            add(
-                &mut self.mean.acceleration_m_s2[axis],
-                output.acceleration_m_s2[axis],
-            );
-            add(&mut self.mean.torques_n_m[axis], output.torques_n_m[axis]);
+        let robot = Robot::new(&values, model);
+        let (current, own) = (&self.model, &mut self.perturbed);
+        let perturbed = perturbed.map(|input| {
+            let own = own.get_or_insert_with(|| current.clone());
+            own.advance(&robot, input, share)
+        });
+        Predicted {
+            output: self.model.advance(&robot, input, share),
+            perturbed,
         }
-        output.forward_m_s
     }
 
-    /// Returns the weighted mean outputs since the last call, in the order of the channels without
-    /// the body speed, and begins a new mean.
-    pub(super) fn take_mean(&mut self) -> [Number; CHANNELS - 1] {
-        let mean = std::mem::replace(&mut self.mean, Output::zero());
-        let [forward, left] = mean.acceleration_m_s2;
-        let [torque_left, torque_right] = mean.torques_n_m;
-        [mean.turn_rad_s, forward, left, torque_left, torque_right]
+    /// Returns the mean outputs since the last call, multiplied by `ratio`, in the order of the
+    /// channels without the body speed, and begins a new mean.
+    pub(super) fn take_mean(&mut self, ratio: f64) -> [Predicted; CHANNELS - 1] {
+        let outputs = self.model.take_mean(ratio);
+        let perturbed = self.perturbed.as_mut().map(|own| own.take_mean(ratio));
+        std::array::from_fn(|channel| Predicted {
+            output: outputs[channel],
+            perturbed: perturbed.map(|perturbed| perturbed[channel]),
+        })
     }
 
-    /// Adds the residual of an output to the open block, with Huber's weight. A residual that is
-    /// not finite is ignored.
-    pub(super) fn compare(&mut self, output: &Number, measured: Measured) {
-        let residual = measured.value - output.value;
-        let square = (residual / measured.std_dev).powi(2);
+    /// Adds the residual of an output to the open block. A residual that is not finite is ignored.
+    pub(super) fn compare(&mut self, predicted: &Predicted, measured: Measured) {
+        let Predicted { output, perturbed } = predicted;
+        let (channel, std_dev) = (measured.channel, measured.std_dev);
+        let residual = Residual {
+            value: measured.value - output.value,
+            slopes: slopes(output),
+        };
+        let square = (residual.value / std_dev).powi(2);
         if !square.is_finite() {
             return;
         }
-        let seen = &mut self.squares[measured.channel];
-        let std_dev = measured.std_dev * seen.max(1.0).sqrt();
-        *seen += SQUARE_GAIN * (square.min(SQUARE_MAX) - *seen);
-        let standardised = residual.abs() / std_dev;
-        let weight = std_dev.powi(-2) * (HUBER / standardised.max(HUBER));
-        let slopes = Values::from_row_slice(&output.derivatives);
-        self.block_information.ger(weight, &slopes, &slopes, 1.0);
-        self.block_score.axpy(weight * residual, &slopes, 1.0);
+        let mut noise = Residual {
+            value: 0.0,
+            slopes: Values::zeros(),
+        };
+        let changed = perturbed.map_or(0.0, |perturbed| perturbed.value - output.value);
+        if let Some(place) = ACCELERATIONS.into_iter().position(|own| own == channel) {
+            let of_sensor = (measured.sensor_std_dev / std_dev).powi(2);
+            let limited = |value: f64| (value / std_dev).clamp(-RESIDUAL_MAX, RESIDUAL_MAX);
+            let now = [limited(residual.value), limited(changed)];
+            let before = std::mem::replace(&mut self.last[place], now);
+            let [own, of_noise] = [0, 1].map(|part| 0.5 * (now[part] - before[part]).powi(2));
+            self.compared = self.compared.saturating_add(1);
+            let gain = f64::from(self.compared).recip().max(NOISE_GAIN);
+            self.residual_square += gain * (own - of_sensor - self.residual_square);
+            self.noise_square += gain * (of_noise - self.noise_square);
+        }
+        if let Some(perturbed) = perturbed {
+            let off = (changed / std_dev).powi(2).min(COST_MAX);
+            let ratio = self.noise_ratio();
+            noise.value = ratio * changed;
+            noise.slopes = (slopes(perturbed) - residual.slopes) * ratio;
+            self.cost -= ratio * ratio * off;
+        }
+        let compared = Compared {
+            residual,
+            noise,
+            std_dev,
+        };
+        for scale in &mut self.scales {
+            scale.add(channel, &compared);
+        }
         self.cost += square.min(COST_MAX);
     }
 
+    /// Returns the ratio of the wheel speeds' noise to the added noise, at most 1: at high frequencies
+    /// residuals are not smaller than what the noise does.
+    fn noise_ratio(&self) -> f64 {
+        if self.noise_square > 0.0 {
+            let ratio = self.residual_square / self.noise_square;
+            ratio.clamp(0.0, 1.0).sqrt()
+        } else {
+            0.0
+        }
+    }
+
+    /// Ends a comparison of the means since the last call.
+    pub(super) fn end_comparison(&mut self) {
+        self.scales.iter_mut().for_each(Scale::end_comparison);
+    }
+
     /// Ends the open block and takes a bounded Gauss–Newton step from all blocks of the ground and
-    /// the prior. Returns false if the normal equations cannot be solved or a parameter is not
-    /// finite.
+    /// the prior. Returns false if a parameter is not finite.
     pub(super) fn end_block(&mut self, prior: &Prior) -> bool {
-        let score = self.block_score;
-        self.segment.add(&self.last, 1.0);
-        self.ground.scale(1.0 - BLOCK_FORGETS);
-        self.segment.scale(1.0 - BLOCK_FORGETS);
-        self.last = Blocks {
-            information: self.block_information,
-            preferred: score + self.block_information * self.values,
-            scores: score * score.transpose(),
-            count: 1.0,
-        };
-        self.ground.add(&self.last, 1.0);
-        self.drop_block();
+        let values = self.values;
+        self.scales
+            .iter_mut()
+            .for_each(|scale| scale.end_block(&values));
+        self.score_taken = 0.0;
         self.age = self.age.saturating_add(1);
         self.cost *= COST_KEEPS;
-        let Some(cholesky) = (self.ground.information + prior.information).cholesky() else {
-            return false;
+        let Some(wanted) = self.solve(prior) else {
+            // It goes on from the same values until the measurements tell more.
+            return true;
         };
-        let mut stiffness = Values::zeros();
-        stiffness[index::STIFFNESS] = 1.0;
-        self.of_stiffness = cholesky.solve(&stiffness);
-        if self.ground.count >= 5.0 {
-            let scatter = (self.ground.scores * self.of_stiffness).dot(&self.of_stiffness);
-            self.block_variance = scatter / self.ground.count;
-        }
-        let wanted = cholesky.solve(&(self.ground.preferred + prior.information * prior.mean));
         let mut step = wanted - self.values;
         let largest = step
             .zip_map(&prior.std_devs, |step, std_dev| step.abs() / std_dev)
@@ -322,40 +335,50 @@ impl Hypothesis {
         self.values[index::SHAPE] = self.values[index::SHAPE].max(SHAPE_MIN);
         self.values[index::BEND] = self.values[index::BEND].max(0.0);
         let step = self.values - before;
-        self.shift_state(&step);
+        for own in std::iter::once(&mut self.model).chain(&mut self.perturbed) {
+            own.shift(&step);
+        }
         let keeps = (-3.0 * (step[index::STIFFNESS] / LINEAR_RANGE).powi(2)).exp();
-        self.ground.scale(keeps);
-        self.segment.scale(keeps);
-        self.last.scale(keeps);
+        for scale in &mut self.scales {
+            scale.weaken(keeps);
+        }
         self.values.iter().all(|value| value.is_finite())
     }
 
-    /// Moves the model's state, to first order, to that of the parameters after `step`.
-    fn shift_state(&mut self, step: &Values) {
-        let shift = |number: &mut Number| {
-            let slopes = number.derivatives.iter().zip(step.iter());
-            number.value += slopes.map(|(slope, step)| slope * step).sum::<f64>();
+    /// Solves the normal equations of all time scales and chooses the shortest one that agrees with
+    /// the next longer one. Returns its solution.
+    fn solve(&mut self, prior: &Prior) -> Option<Values> {
+        let mut solutions = [None; SCALES.len()];
+        for (scale, solution) in self.scales.iter_mut().zip(&mut solutions) {
+            *solution = scale.solve(prior);
+        }
+        let is_trusted = |place: usize| {
+            let next = place + 1;
+            let is_last = next == SCALES.len();
+            let agrees = || self.scales[place].agrees_with(&self.scales[next], prior);
+            solutions[place].is_some() && (is_last || solutions[next].is_none() || agrees())
         };
-        self.state.speed_m_s.iter_mut().for_each(shift);
-        shift(&mut self.state.turn_rad_s);
-        self.state.deflections.iter_mut().flatten().for_each(shift);
+        let trusted = (0..SCALES.len()).find(|&place| is_trusted(place));
+        self.is_determined = trusted.is_some();
+        self.used = trusted.unwrap_or(SCALES.len() - 1);
+        solutions[self.used]
+    }
+
+    /// Returns whether the measurements tell more than noise of the wheel speeds would.
+    pub(super) fn is_determined(&self) -> bool {
+        self.is_determined
+    }
+
+    /// Returns whether the accelerations' residuals at high frequencies are larger than those of a
+    /// robot whose wheel speeds have no noise.
+    pub(super) fn is_noisy(&self) -> bool {
+        self.age >= NOISE_BLOCKS_MIN && self.residual_square > NOISY_SQUARE
     }
 
     /// Returns the variance of ln K, and the part of it that the prior contributes. The first is at
     /// least the nominal variance, the diagonal element of C.
     pub(super) fn variances(&self, prior: &Prior) -> (f64, f64) {
-        let of_stiffness = self.of_stiffness;
-        let scattered = self.scattered();
-        let known = (prior.information * of_stiffness).dot(&of_stiffness);
-        let nominal = of_stiffness[index::STIFFNESS];
-        ((scattered + known).max(nominal), known)
-    }
-
-    /// Returns the part of ln K's variance that the scatter of the blocks' scores contributes.
-    fn scattered(&self) -> f64 {
-        // The scatter of few scores underestimates their variance.
-        let few = 1.0 + 2.0 / self.ground.count.max(1.0);
-        few * (self.ground.scores * self.of_stiffness).dot(&self.of_stiffness)
+        self.scale().variances(prior)
     }
 
     /// Returns the robust variances of linear functions of the parameters, given their gradients.
@@ -365,11 +388,12 @@ impl Hypothesis {
         prior: &Prior,
         slopes: &[Values; COUNT],
     ) -> Option<[f64; COUNT]> {
-        let cholesky = (self.ground.information + prior.information).cholesky()?;
-        let few = 1.0 + 2.0 / self.ground.count.max(1.0);
+        let ground = &self.scale().ground;
+        let cholesky = (ground.information + prior.information).cholesky()?;
+        let few = 1.0 + 2.0 / ground.count.max(1.0);
         Some(slopes.map(|slopes| {
             let covariances = cholesky.solve(&slopes);
-            let scattered = few * (self.ground.scores * covariances).dot(&covariances);
+            let scattered = few * (ground.scores * covariances).dot(&covariances);
             let known = (prior.information * covariances).dot(&covariances);
             (scattered + known).max(covariances.dot(&slopes))
         }))
@@ -377,8 +401,7 @@ impl Hypothesis {
 
     /// Drops the last block and the open one, which may contain samples of two grounds.
     pub(super) fn drop_last_block(&mut self) {
-        self.ground.add(&self.last, -1.0);
-        self.last = Blocks::none();
+        self.scales.iter_mut().for_each(Scale::drop_last_block);
         self.drop_block();
     }
 
@@ -388,14 +411,14 @@ impl Hypothesis {
     /// marginalised from them. So K may differ between segments, and the segments' own errors are
     /// independent. None if the segment has no blocks, or its normal equations cannot be solved.
     pub(super) fn close_segment(&mut self, prior: &Prior) -> Option<OfSegment> {
-        let mut segment = std::mem::replace(&mut self.segment, Blocks::none());
-        segment.add(&self.last, 1.0);
-        self.last = Blocks::none();
+        let segments = self.scales.each_mut().map(Scale::take_segment);
+        let (segment, scale) = (&segments[self.used], self.scale());
+        let ground = &scale.ground;
         if segment.count <= 0.0 {
             return None;
         }
-        let mut others = self.ground.information - segment.information + prior.information;
-        let mut wanted = self.ground.preferred - segment.preferred + prior.information * prior.mean;
+        let mut others = ground.information - segment.information + prior.information;
+        let mut wanted = ground.preferred - segment.preferred + prior.information * prior.mean;
         // K of the other blocks is marginalised.
         let of_stiffness: Values = others.column(index::STIFFNESS).into();
         let most = of_stiffness[index::STIFFNESS];
@@ -408,8 +431,8 @@ impl Hypothesis {
         let of_stiffness = cholesky.solve(&stiffness);
         // The segment has too few blocks for a scatter of its own: that of the whole ground is
         // used.
-        let whole = (self.ground.information * self.of_stiffness).dot(&self.of_stiffness);
-        let scatter = (self.scattered() / whole).max(1.0);
+        let whole = (ground.information * scale.of_stiffness).dot(&scale.of_stiffness);
+        let scatter = (scale.scattered() / whole).max(1.0);
         let own = scatter * (segment.information * of_stiffness).dot(&of_stiffness);
         let found = OfSegment {
             ln_stiffness: values[index::STIFFNESS],
@@ -424,7 +447,7 @@ impl Hypothesis {
     /// reset to the initial prior, all others keep mean and covariance. None if it cannot be
     /// computed.
     pub(super) fn prior_without(&self, prior: &Prior, changed: &[usize]) -> Option<Prior> {
-        let mut covariance = (self.ground.information + prior.information)
+        let mut covariance = (self.scale().ground.information + prior.information)
             .cholesky()?
             .inverse();
         let mut mean = self.values;

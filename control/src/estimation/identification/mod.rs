@@ -15,9 +15,12 @@ mod hypothesis;
 mod model;
 mod parameters;
 mod robot;
+mod scale;
 mod segment;
+mod simulation;
 #[cfg(test)]
 mod tests;
+mod wheel_noise;
 
 use super::{EstimatorPrior, GAP_MAX_S, IdentifiedRobot, SensorNoise, SensorSample};
 use crate::robot::RobotModel;
@@ -26,6 +29,7 @@ use change::ChangeMonitor;
 use hypothesis::{CHANNELS, Hypothesis, Measured, Prior};
 use model::{Input, State};
 use parameters::index;
+use wheel_noise::WheelNoise;
 
 /// Starting values of ln K: K 1, 3.3 and 11.
 const STARTS: [f64; 3] = [0.0, 1.2, 2.4];
@@ -121,6 +125,7 @@ pub(super) struct Identification {
     robot: Option<IdentifiedRobot>,
     is_robot_due: bool,
     change: ChangeMonitor,
+    wheel_noise: WheelNoise,
     /// Whether the standard deviation of ln K is below [`CHANGES_STD_DEV_MAX`].
     is_sharp: bool,
 }
@@ -164,6 +169,7 @@ impl Identification {
             robot: None,
             is_robot_due: false,
             change: ChangeMonitor::default(),
+            wheel_noise: WheelNoise::new(),
             is_sharp: false,
         };
         identification.begin(&State::rolling(0.0, 0.0));
@@ -224,6 +230,7 @@ impl Identification {
             hypothesis.restart(state);
         }
         self.waiting = None;
+        self.wheel_noise.interrupt();
         self.change = ChangeMonitor::default();
         self.clear_sums();
         self.block_s = 0.0;
@@ -247,6 +254,8 @@ impl Identification {
     ) -> bool {
         if time_s > GAP_MAX_S {
             self.interrupt();
+        } else {
+            self.wheel_noise.add(rates(sample), time_s);
         }
         let before_rad_s = self
             .waiting
@@ -290,6 +299,12 @@ impl Identification {
             acceleration_m_s2: self.acceleration_m_s2,
             time_s,
         };
+        let noise_of_wheels = self.wheel_noise.excess(apart_s);
+        let perturbed = noise_of_wheels.map(|(speeds, rises)| Input {
+            wheels_rad_s: [0, 1].map(|side| wheels_rad_s[side] + speeds[side]),
+            wheels_rad_s2: [0, 1].map(|side| wheels_rad_s2[side] + rises[side]),
+            ..input
+        });
         let rims_m_s = wheels_rad_s.map(|speed| speed.abs() * self.model.wheel_radius_m());
         self.is_moving |= rims_m_s[0].max(rims_m_s[1]) > STANDING_M_S;
         self.add(sample, measured, rims_m_s, time_s);
@@ -298,9 +313,10 @@ impl Identification {
             channel: CHANNELS - 1,
             value,
             std_dev: noise.body_speed_m_s,
+            sensor_std_dev: noise.body_speed_m_s,
         });
         for hypothesis in &mut self.hypotheses {
-            let forward = hypothesis.advance(&self.model, &input, share);
+            let forward = hypothesis.advance(&self.model, &input, perturbed.as_ref(), share);
             if let Some(speed) = speed {
                 hypothesis.compare(&forward, speed);
             }
@@ -349,25 +365,34 @@ impl Identification {
             torque,
             torque,
         ];
+        let of_torque_n_m = torque_n_m * noise.torque_mu;
+        let sensors = [
+            noise.gyro_rad_s,
+            noise.accelerometer_m_s2,
+            noise.accelerometer_m_s2,
+            of_torque_n_m,
+            of_torque_n_m,
+        ];
         let (sums, measured_s, compared_s) = (self.sums, self.measured_s, self.compared_s);
         for hypothesis in &mut self.hypotheses {
-            let outputs = hypothesis.take_mean();
+            // Outputs were weighed by COMPARED_S.
+            let outputs = hypothesis.take_mean(COMPARED_S / compared_s);
             for (channel, output) in outputs.into_iter().enumerate() {
                 // Means are of the same time only if nothing is missing.
                 if measured_s[channel] < compared_s - 1.0e-6 {
                     continue;
                 }
-                // Outputs were weighed by COMPARED_S.
-                let output = output * (COMPARED_S / compared_s);
                 hypothesis.compare(
                     &output,
                     Measured {
                         channel,
                         value: sums[channel] / compared_s,
                         std_dev: std_devs[channel],
+                        sensor_std_dev: sensors[channel] / root,
                     },
                 );
             }
+            hypothesis.end_comparison();
         }
         self.block_s += compared_s;
         self.clear_sums();
@@ -409,7 +434,9 @@ impl Identification {
 
     fn end_block(&mut self) {
         let block_s = std::mem::take(&mut self.block_s);
-        if !std::mem::take(&mut self.is_moving) {
+        let is_moving = std::mem::take(&mut self.is_moving);
+        self.wheel_noise.end_block(is_moving);
+        if !is_moving {
             for hypothesis in &mut self.hypotheses {
                 hypothesis.drop_block();
             }
@@ -426,8 +453,22 @@ impl Identification {
             return;
         }
         self.discard();
+        self.look_for_noise();
         let variance = self.best().map(|best| best.variances(&self.prior).0);
         self.is_sharp = variance.is_some_and(|variance| variance.sqrt() < CHANGES_STD_DEV_MAX);
+    }
+
+    /// Begins anew with noise of the wheel speeds taken into account if residuals may come from it.
+    fn look_for_noise(&mut self) {
+        let is_noisy = self.best().is_some_and(Hypothesis::is_noisy);
+        if !is_noisy || self.wheel_noise.is_excess_given {
+            return;
+        }
+        self.wheel_noise.is_excess_given = true;
+        // What was identified so far took the noise for slip.
+        self.prior = Prior::new(self.prior.first_mean, self.prior.std_devs);
+        let state = self.state();
+        self.begin(&state);
     }
 
     /// Discards hypotheses that fit worse than the best one, and all but one of those that agree.
@@ -475,7 +516,7 @@ impl Identification {
     /// residuals are too large for the model.
     pub(super) fn identified(&self) -> Option<Identified> {
         let best = self.best()?;
-        if best.age() < BLOCKS_MIN || best.worst_square() > SQUARE_MAX {
+        if best.age() < BLOCKS_MIN || best.worst_square() > SQUARE_MAX || !best.is_determined() {
             return None;
         }
         let least = self.least_cost();

@@ -2,7 +2,7 @@
 
 use nalgebra::{SMatrix, SVector};
 
-use super::dual::Real;
+use super::dual::{Dual, Real};
 use crate::estimation::{EstimatorPrior, SensorNoise};
 use crate::robot::RobotModel;
 
@@ -12,6 +12,8 @@ pub(super) const PARAMETERS: usize = 23;
 pub(super) type Values = SVector<f64, PARAMETERS>;
 /// Covariance or information of all parameters.
 pub(super) type Square = SMatrix<f64, PARAMETERS, PARAMETERS>;
+/// Value with its derivatives with respect to all parameters.
+pub(super) type Number = Dual<PARAMETERS>;
 
 /// Where each parameter is in [`Values`].
 pub(super) mod index {

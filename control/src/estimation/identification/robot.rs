@@ -19,7 +19,7 @@ impl Identification {
     /// for the model.
     pub(super) fn identify_robot(&self) -> Option<IdentifiedRobot> {
         let best = self.best()?;
-        if best.age() < BLOCKS_MIN || best.worst_square() > SQUARE_MAX {
+        if best.age() < BLOCKS_MIN || best.worst_square() > SQUARE_MAX || !best.is_determined() {
             return None;
         }
         let values = best.values();

@@ -1,3 +1,6 @@
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
 use super::parameters::Robot;
 use super::*;
 use crate::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
@@ -242,4 +245,57 @@ fn the_last_block_before_a_change_of_the_ground_counts_for_no_segment() {
     let (of_block, left) = ((with / before).ln(), (without / before).ln());
     assert!(of_block > 0.05, "{of_block}: the block must matter");
     assert!(left.abs() < 0.5 * of_block, "{left} of {of_block}");
+}
+
+/// Returns the mean of two samples, whose wheel speeds have the errors of a filter or an analogue
+/// sensor: each sample has its own.
+fn noisy(samples: [SensorSample; 2], std_dev_rad_s: f64, random: &mut impl RngExt) -> SensorSample {
+    let [first, second] = samples;
+    let mean = |of: fn(&SensorSample) -> f64| 0.5 * (of(&first) + of(&second));
+    // The sum of twelve uniform values has a variance of 1.
+    let mut noise = || (0..12).map(|_| random.random::<f64>() - 0.5).sum::<f64>() * std_dev_rad_s;
+    SensorSample {
+        wheel_speeds: WheelSpeeds {
+            left_rad_s: mean(|of| of.wheel_speeds.left_rad_s) + noise(),
+            right_rad_s: mean(|of| of.wheel_speeds.right_rad_s) + noise(),
+        },
+        gyro_rad_s: mean(|of| of.gyro_rad_s),
+        acceleration: Some(BodyAcceleration {
+            forward_m_s2: mean(|of| of.acceleration.map_or(0.0, |of| of.forward_m_s2)),
+            left_m_s2: mean(|of| of.acceleration.map_or(0.0, |of| of.left_m_s2)),
+        }),
+        wheel_torques: Some(WheelTorques {
+            left_n_m: mean(|of| of.wheel_torques.map_or(0.0, |of| of.left_n_m)),
+            right_n_m: mean(|of| of.wheel_torques.map_or(0.0, |of| of.right_n_m)),
+        }),
+        ..second
+    }
+}
+
+#[test]
+fn white_noise_of_the_wheel_speeds_is_not_taken_for_slip() {
+    for (stiffness, error_max) in [(1.0_f64, 0.05), (4.0, 0.08), (12.0, 0.25)] {
+        for (samples, std_dev_rad_s) in [(1, 0.02), (1, 0.05), (2, 0.02)] {
+            let mut random = ChaCha8Rng::seed_from_u64(1);
+            let mut robot = with_stiffness(stiffness);
+            let mut identification = identification();
+            for _ in 0..4_000 / samples {
+                let first = robot.sample();
+                let second = if samples == 2 { robot.sample() } else { first };
+                let sample = noisy([first, second], std_dev_rad_s, &mut random);
+                let time_s = f64::from(samples) * SAMPLE_S;
+                identification.update(&sample, &SensorNoise::default(), time_s);
+            }
+            let case = format!("K {stiffness}, {std_dev_rad_s} rad/s, {samples}");
+            let Some(found) = identification.identified() else {
+                assert!(stiffness > 10.0, "{case}: nothing");
+                continue;
+            };
+            let error = (found.theta * stiffness).ln();
+            let own = found.own_ratio.hypot(found.robot_ratio);
+            let ratio = own.hypot(found.tyres_ratio);
+            assert!(error.abs() < error_max, "{case}: {error}");
+            assert!(error.abs() < 1.96 * ratio, "{case}: {error} of {ratio}");
+        }
+    }
 }

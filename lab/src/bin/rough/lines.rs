@@ -11,70 +11,80 @@ use crate::Arguments;
 /// Friction stiffnesses K of the grounds.
 pub(crate) const GROUNDS: [f64; 3] = [0.7, 3.0, 12.0];
 
-pub(crate) type Change = fn(&mut Deviations);
+pub(crate) type Change = fn(&mut Deviations, &mut SensorSpec);
 
-/// Single deviations, each with its name in the report.
-pub(crate) const CHANGES: [(&str, Change); 22] = [
-    ("nothing", |_| {}),
-    ("payload 20 %", |robot| {
+/// Single differences, each with its name in the report.
+pub(crate) const CHANGES: [(&str, Change); 24] = [
+    ("nothing", |_, _| {}),
+    ("payload 20 %", |robot, _| {
         robot.payload_ratio = 0.2;
     }),
-    ("payload -10 %", |robot| {
+    ("payload -10 %", |robot, _| {
         robot.payload_ratio = -0.1;
     }),
-    ("yaw inertia +25 %", |robot| {
+    ("yaw inertia +25 %", |robot, _| {
         robot.inertia_ratio = 1.25;
     }),
-    ("yaw inertia -20 %", |robot| {
+    ("yaw inertia -20 %", |robot, _| {
         robot.inertia_ratio = 0.8;
     }),
-    ("brush, peak 0.3", |robot| {
+    ("brush, peak 0.3", |robot, _| {
         with_curve(robot, Shape::Brush, 0.3);
     }),
-    ("brush, peak 0.8", |robot| {
+    ("brush, peak 0.8", |robot, _| {
         with_curve(robot, Shape::Brush, 0.8);
     }),
-    ("Magic Formula, peak 0.5", |robot| {
+    ("Magic Formula, peak 0.5", |robot, _| {
         with_curve(robot, Shape::MagicFormula, 0.5);
     }),
-    ("LuGre, peak 0.6", |robot| {
+    ("LuGre, peak 0.6", |robot, _| {
         with_curve(robot, Shape::LuGre, 0.6);
     }),
-    ("relaxation 1 cm", |robot| {
+    ("relaxation 1 cm", |robot, _| {
         robot.relaxation_m = 0.01;
     }),
-    ("relaxation 5 cm", |robot| {
+    ("relaxation 5 cm", |robot, _| {
         robot.relaxation_m = 0.05;
     }),
-    ("torque scale +3 %", |robot| robot.torque_scale = [1.03; 2]),
-    ("torque scale -3 %", |robot| robot.torque_scale = [0.97; 2]),
-    ("rotors 10 %, gears 3 %", |robot| {
+    ("torque scale +3 %", |robot, _| {
+        robot.torque_scale = [1.03; 2]
+    }),
+    ("torque scale -3 %", |robot, _| {
+        robot.torque_scale = [0.97; 2]
+    }),
+    ("rotors 10 %, gears 3 %", |robot, _| {
         robot.rotor_ratio = 0.1;
         robot.gear_loss_ratio = 0.03;
     }),
-    ("center of mass 5 % forward", |robot| {
+    ("center of mass 5 % forward", |robot, _| {
         robot.center_forward_ratio = 0.05;
     }),
-    ("center of mass 5 % rearward", |robot| {
+    ("center of mass 5 % rearward", |robot, _| {
         robot.center_forward_ratio = -0.05;
     }),
-    ("center of mass 3 % left", |robot| {
+    ("center of mass 3 % left", |robot, _| {
         robot.center_left_ratio = 0.03;
     }),
-    ("center of mass 3 % right", |robot| {
+    ("center of mass 3 % right", |robot, _| {
         robot.center_left_ratio = -0.03;
     }),
-    ("slope 5°", |robot| {
+    ("slope 5°", |robot, _| {
         robot.slope_rad = [0.0, 5.0_f64.to_radians()];
     }),
-    ("slope -5°", |robot| {
+    ("slope -5°", |robot, _| {
         robot.slope_rad = [0.0, -5.0_f64.to_radians()];
     }),
-    ("rolling resistance 4 %", |robot| {
+    ("rolling resistance 4 %", |robot, _| {
         robot.rolling_resistance_ratio = 0.04;
     }),
-    ("servo lag 0.1 s", |robot| {
+    ("servo lag 0.1 s", |robot, _| {
         robot.servo_lag_s = 0.1;
+    }),
+    ("wheel speed noise 0.02 rad/s", |_, sensors| {
+        sensors.wheel_speed_rad_s = 0.02;
+    }),
+    ("wheel speed noise 0.05 rad/s", |_, sensors| {
+        sensors.wheel_speed_rad_s = 0.05;
     }),
 ];
 
@@ -88,12 +98,13 @@ pub(crate) fn alone(change: Change, has_torque: bool, arguments: &Arguments) -> 
     let trial = |index: u32| {
         let stiffness = GROUNDS[index as usize % GROUNDS.len()];
         let mut deviations = Deviations::none(stiffness);
-        change(&mut deviations);
+        let mut sensors = SensorSpec::usual(has_torque);
+        change(&mut deviations, &mut sensors);
         let is_circle = (index / 3).is_multiple_of(2);
         Trial {
             make: MAKES[0],
             deviations,
-            sensors: SensorSpec::usual(has_torque),
+            sensors,
             course: if is_circle {
                 Course::Circle
             } else {

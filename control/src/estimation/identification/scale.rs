@@ -1,0 +1,327 @@
+//! Normal equations of one time scale.
+//!
+//! The residuals of all channels are compared as means over a number of comparisons. Short means
+//! hold the most information. Noise of the wheel speeds, by which the model is driven, and vibration
+//! disturb them the most: the noise of an output is correlated with that of its slopes, which
+//! biases the estimates (errors in the variables: Söderström, Errors-in-Variables Methods in System
+//! Identification, 2018). In longer means both average out. So the same equations are kept at more
+//! than one scale, and the shorter scale is used only as long as its estimate agrees with that of
+//! the longer one (the specification test of Hausman, Econometrica 46, 1978).
+
+use super::hypothesis::{CHANNELS, Prior};
+use super::parameters::{Square, Values, index};
+
+/// Fraction of its information that a block loses with each later block, because sensor offsets
+/// drift.
+const BLOCK_FORGETS: f64 = 0.002;
+/// Standardised residual above which Huber's weight falls below 1.
+const HUBER: f64 = 3.0;
+/// Weight of each new squared residual in the exponentially weighted mean square of its channel.
+const SQUARE_GAIN: f64 = 0.005;
+/// Maximum squared standardised residual in that mean.
+const SQUARE_MAX: f64 = 100.0;
+/// Number of blocks below which the variance of one block's score is not known.
+const SCATTER_BLOCKS_MIN: f64 = 5.0;
+/// Standard deviations of their difference by which the estimates of two scales may differ.
+const DIFFERENT: f64 = 2.0;
+/// Minimum variance of that difference, relative to the variance at the longer scale.
+const DIFFERENCE_MIN: f64 = 0.2;
+
+/// Weighted sums over linearised blocks of measurements.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Blocks {
+    /// `A = Σ Jᵀ W J`, the information matrix, and `b = Σ (Jᵀ W J p_b + g)`, the right side of the
+    /// normal equations `A p = b`.
+    pub(super) information: Square,
+    pub(super) preferred: Values,
+    /// `Σ g gᵀ` of the scores `g = Jᵀ W r`.
+    pub(super) scores: Square,
+    /// Sum of the blocks' weights, each at most 1.
+    pub(super) count: f64,
+}
+
+impl Blocks {
+    fn none() -> Self {
+        Self {
+            information: Square::zeros(),
+            preferred: Values::zeros(),
+            scores: Square::zeros(),
+            count: 0.0,
+        }
+    }
+
+    fn scale(&mut self, ratio: f64) {
+        self.information *= ratio;
+        self.preferred *= ratio;
+        self.scores *= ratio;
+        self.count *= ratio;
+    }
+
+    fn add(&mut self, other: &Self, ratio: f64) {
+        self.information += other.information * ratio;
+        self.preferred += other.preferred * ratio;
+        self.scores += other.scores * ratio;
+        self.count += other.count * ratio;
+    }
+}
+
+/// A residual or a mean of residuals, with the slopes of the output.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Residual {
+    pub(super) value: f64,
+    pub(super) slopes: Values,
+}
+
+impl Residual {
+    fn none() -> Self {
+        Self {
+            value: 0.0,
+            slopes: Values::zeros(),
+        }
+    }
+
+    fn add(&mut self, other: &Self) {
+        self.value += other.value;
+        self.slopes += other.slopes;
+    }
+
+    fn times(&self, ratio: f64) -> Self {
+        Self {
+            value: self.value * ratio,
+            slopes: self.slopes * ratio,
+        }
+    }
+}
+
+/// A comparison of one channel.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Compared {
+    /// Measurement minus output.
+    pub(super) residual: Residual,
+    /// What added noise of the wheel speeds changed, multiplied by the square root of the noise's
+    /// variance over that of the added noise; 0 without noise.
+    pub(super) noise: Residual,
+    /// Standard deviation of the residual without that noise.
+    pub(super) std_dev: f64,
+}
+
+/// Sums of one channel over the open mean.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Mean {
+    residual: Residual,
+    noise: Residual,
+    std_dev: f64,
+    count: u32,
+}
+
+impl Mean {
+    fn none() -> Self {
+        Self {
+            residual: Residual::none(),
+            noise: Residual::none(),
+            std_dev: 1.0,
+            count: 0,
+        }
+    }
+}
+
+/// The normal equations of all blocks at one time scale.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Scale {
+    /// Number of comparisons in one mean.
+    length: u32,
+    means: [Mean; CHANNELS],
+    compared: u32,
+    /// `Jᵀ W J` and `g` of the open block.
+    information: Square,
+    pub(super) score: Values,
+    /// All complete blocks of this ground.
+    pub(super) ground: Blocks,
+    /// Complete blocks of the open segment except the last one, which may already be of the next
+    /// ground.
+    segment: Blocks,
+    last: Blocks,
+    /// Mean square of each channel's standardised residuals.
+    squares: [f64; CHANNELS],
+    /// Column of C for ln K: covariances of ln K with all parameters.
+    pub(super) of_stiffness: Values,
+    /// Variance of `of_stiffnessᵀ g` of one block, from the scatter of the blocks.
+    pub(super) block_variance: f64,
+    /// Solution of the normal equations for ln K.
+    ln_stiffness: f64,
+}
+
+impl Scale {
+    /// Creates the equations without measurements, for means over `length` comparisons.
+    pub(super) fn new(length: u32) -> Self {
+        Self {
+            length,
+            means: [Mean::none(); CHANNELS],
+            compared: 0,
+            information: Square::zeros(),
+            score: Values::zeros(),
+            ground: Blocks::none(),
+            segment: Blocks::none(),
+            last: Blocks::none(),
+            squares: [0.0; CHANNELS],
+            of_stiffness: Values::zeros(),
+            block_variance: 0.0,
+            ln_stiffness: 0.0,
+        }
+    }
+
+    /// Returns the largest of the channels' mean squares of standardised residuals; about 1 if
+    /// noise and model are as assumed.
+    pub(super) fn worst_square(&self) -> f64 {
+        self.squares.into_iter().fold(0.0, f64::max)
+    }
+
+    /// Adds a comparison to the open mean of its channel.
+    pub(super) fn add(&mut self, channel: usize, compared: &Compared) {
+        if self.length == 1 || channel == CHANNELS - 1 {
+            // The body speed is no mean.
+            self.compare(channel, compared);
+            return;
+        }
+        let mean = &mut self.means[channel];
+        mean.residual.add(&compared.residual);
+        mean.noise.add(&compared.noise);
+        mean.std_dev = compared.std_dev;
+        mean.count += 1;
+    }
+
+    /// Ends a comparison, of which all channels were added.
+    pub(super) fn end_comparison(&mut self) {
+        self.compared += 1;
+        if self.compared >= self.length {
+            self.end_mean();
+        }
+    }
+
+    /// Adds the means of the channels to the open block. One that was not measured all the time is
+    /// none.
+    fn end_mean(&mut self) {
+        let compared = std::mem::take(&mut self.compared);
+        for channel in 0..CHANNELS - 1 {
+            let mean = std::mem::replace(&mut self.means[channel], Mean::none());
+            if mean.count > 0 && mean.count == compared {
+                let share = f64::from(compared).recip();
+                let compared = Compared {
+                    residual: mean.residual.times(share),
+                    noise: mean.noise.times(share),
+                    std_dev: mean.std_dev,
+                };
+                self.compare(channel, &compared);
+            }
+        }
+    }
+
+    /// Adds a comparison to the open block, with Huber's weight.
+    ///
+    /// The noise e of an output and its slopes ∂e/∂p are correlated, which adds the mean of
+    /// −e ∂e/∂p to the score. That of the added noise, which is independent, cancels it.
+    fn compare(&mut self, channel: usize, compared: &Compared) {
+        let Residual { value, slopes } = &compared.residual;
+        let square = (value / compared.std_dev).powi(2);
+        let seen = &mut self.squares[channel];
+        let std_dev = compared.std_dev * seen.max(1.0).sqrt();
+        *seen += SQUARE_GAIN * f64::from(self.length) * (square.min(SQUARE_MAX) - *seen);
+        let standardised = value.abs() / std_dev;
+        let weight = std_dev.powi(-2) * (HUBER / standardised.max(HUBER));
+        self.information.ger(weight, slopes, slopes, 1.0);
+        self.score.axpy(weight * value, slopes, 1.0);
+        let Residual { value, slopes } = &compared.noise;
+        if *value != 0.0 {
+            self.information.ger(-weight, slopes, slopes, 1.0);
+            self.score.axpy(weight * value, slopes, 1.0);
+        }
+    }
+
+    /// Drops the measurements of the open block.
+    pub(super) fn drop_block(&mut self) {
+        self.information = Square::zeros();
+        self.score = Values::zeros();
+        self.compared = 0;
+        self.means = [Mean::none(); CHANNELS];
+    }
+
+    /// Ends the open block, which was linearised about `values`.
+    pub(super) fn end_block(&mut self, values: &Values) {
+        if self.compared > 0 {
+            self.end_mean();
+        }
+        let score = self.score;
+        self.segment.add(&self.last, 1.0);
+        self.ground.scale(1.0 - BLOCK_FORGETS);
+        self.segment.scale(1.0 - BLOCK_FORGETS);
+        self.last = Blocks {
+            information: self.information,
+            preferred: score + self.information * values,
+            scores: score * score.transpose(),
+            count: 1.0,
+        };
+        self.ground.add(&self.last, 1.0);
+        self.drop_block();
+    }
+
+    /// Solves the normal equations of the ground's blocks and the prior. Returns the parameters;
+    /// None if they cannot be solved.
+    pub(super) fn solve(&mut self, prior: &Prior) -> Option<Values> {
+        let cholesky = (self.ground.information + prior.information).cholesky()?;
+        let mut stiffness = Values::zeros();
+        stiffness[index::STIFFNESS] = 1.0;
+        self.of_stiffness = cholesky.solve(&stiffness);
+        if self.ground.count >= SCATTER_BLOCKS_MIN {
+            let scatter = (self.ground.scores * self.of_stiffness).dot(&self.of_stiffness);
+            self.block_variance = scatter / self.ground.count;
+        }
+        let wanted = cholesky.solve(&(self.ground.preferred + prior.information * prior.mean));
+        self.ln_stiffness = wanted[index::STIFFNESS];
+        Some(wanted)
+    }
+
+    /// Returns whether the last solution agrees with that of the longer scale `other`.
+    pub(super) fn agrees_with(&self, other: &Self, prior: &Prior) -> bool {
+        let (own, of_other) = (self.variances(prior).0, other.variances(prior).0);
+        // That of the difference to an efficient estimate is the difference of the variances.
+        let variance = (of_other - own).max(DIFFERENCE_MIN * of_other);
+        (self.ln_stiffness - other.ln_stiffness).powi(2) <= DIFFERENT.powi(2) * variance
+    }
+
+    /// Multiplies the weights of all complete blocks.
+    pub(super) fn weaken(&mut self, ratio: f64) {
+        self.ground.scale(ratio);
+        self.segment.scale(ratio);
+        self.last.scale(ratio);
+    }
+
+    /// Returns the variance of ln K, and the part of it that the prior contributes. The first is at
+    /// least the nominal variance, the diagonal element of C.
+    pub(super) fn variances(&self, prior: &Prior) -> (f64, f64) {
+        let of_stiffness = self.of_stiffness;
+        let known = (prior.information * of_stiffness).dot(&of_stiffness);
+        let nominal = of_stiffness[index::STIFFNESS];
+        ((self.scattered() + known).max(nominal), known)
+    }
+
+    /// Returns the part of ln K's variance that the scatter of the blocks' scores contributes.
+    pub(super) fn scattered(&self) -> f64 {
+        // The scatter of few scores underestimates their variance.
+        let few = 1.0 + 2.0 / self.ground.count.max(1.0);
+        few * (self.ground.scores * self.of_stiffness).dot(&self.of_stiffness)
+    }
+
+    /// Drops the last block, which may contain samples of two grounds.
+    pub(super) fn drop_last_block(&mut self) {
+        self.ground.add(&self.last, -1.0);
+        self.last = Blocks::none();
+    }
+
+    /// Takes the blocks of the open segment; the ground keeps them.
+    pub(super) fn take_segment(&mut self) -> Blocks {
+        let mut segment = std::mem::replace(&mut self.segment, Blocks::none());
+        segment.add(&self.last, 1.0);
+        self.last = Blocks::none();
+        segment
+    }
+}
