@@ -47,10 +47,10 @@ pub(crate) const CHANGES: [(&str, Change); 24] = [
         robot.relaxation_m = 0.05;
     }),
     ("torque scale +3 %", |robot, _| {
-        robot.torque_scale = [1.03; 2]
+        robot.torque_scale = [1.03; 2];
     }),
     ("torque scale -3 %", |robot, _| {
-        robot.torque_scale = [0.97; 2]
+        robot.torque_scale = [0.97; 2];
     }),
     ("rotors 10 %, gears 3 %", |robot, _| {
         robot.rotor_ratio = 0.1;
