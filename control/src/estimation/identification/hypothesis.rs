@@ -8,16 +8,14 @@
 //! robust one, `C (Σ g gᵀ + prior information) C`: the empirical scatter of the blocks' scores
 //! `g = Jᵀ W r` replaces the assumption of white residuals and a true model.
 
-use super::model::{Input, State};
-use super::parameters::{Number, PARAMETERS, Robot, SHAPE_MIN, Square, Values, index};
+use super::model::{CHANNELS, Input, State};
+use super::parameters::{Number, PARAMETERS, Prior, Robot, SHAPE_MIN, Square, Values, index};
 use super::scale::{Compared, Residual, Scale};
 use super::simulation::Simulation;
 use crate::robot::RobotModel;
 
 /// Numbers of comparisons in the means of the time scales: 0.05, 0.2 and 0.5 s.
 const SCALES: [u32; 3] = [1, 4, 10];
-/// Channels: turn rate, acceleration (forward, left), torque (left, right), body speed.
-pub(super) const CHANNELS: usize = 6;
 /// Channels of the accelerations.
 const ACCELERATIONS: std::ops::RangeInclusive<usize> = 1..=2;
 /// Weight of each new square in the mean squares that tell the noise of the wheel speeds, once many
@@ -41,32 +39,6 @@ const COST_MAX: f64 = 25.0;
 const INNOVATION_BLOCKS_MIN: u32 = 15;
 /// Factor by which each later block multiplies the cost so far.
 const COST_KEEPS: f64 = 0.95;
-
-/// Normal prior of the parameters at the start of a ground, in the units of [`index`].
-#[derive(Debug, Clone, PartialEq)]
-pub(super) struct Prior {
-    /// Mean.
-    pub(super) mean: Values,
-    /// Information matrix, the inverse of the covariance.
-    pub(super) information: Square,
-    /// Standard deviations of the initial prior, before any measurement. They scale the maximum
-    /// step and the range of each parameter.
-    pub(super) std_devs: Values,
-    /// Mean of the initial prior, the middle of each parameter's range.
-    pub(super) first_mean: Values,
-}
-
-impl Prior {
-    /// Creates the initial prior of independent parameters.
-    pub(super) fn new(mean: Values, std_devs: Values) -> Self {
-        Self {
-            mean,
-            information: Square::from_diagonal(&std_devs.map(|std_dev| std_dev.powi(-2))),
-            std_devs,
-            first_mean: mean,
-        }
-    }
-}
 
 /// Estimate of ln K from one segment, and the two parts of its variance.
 #[derive(Debug, Clone, Copy)]

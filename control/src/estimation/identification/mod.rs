@@ -26,9 +26,9 @@ use super::{EstimatorPrior, GAP_MAX_S, IdentifiedRobot, SensorNoise, SensorSampl
 use crate::robot::RobotModel;
 
 use change::ChangeMonitor;
-use hypothesis::{CHANNELS, Hypothesis, Measured, Prior};
-use model::{Input, State};
-use parameters::index;
+use hypothesis::{Hypothesis, Measured};
+use model::{CHANNELS, Input, State};
+use parameters::{Prior, index};
 use wheel_noise::WheelNoise;
 
 /// Starting values of ln K: K 1, 3.3 and 11.

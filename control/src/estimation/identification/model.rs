@@ -14,6 +14,8 @@ use super::dual::Real;
 use super::parameters::Robot;
 use crate::robot::GRAVITY_M_S2;
 
+/// Number of channels: turn rate, acceleration (forward, left), torque (left, right), body speed.
+pub(super) const CHANNELS: usize = 6;
 /// Longest integration step, seconds: half of it changes no coverage by more than its noise.
 const STEP_MAX_S: f64 = 5.1e-3;
 /// Most integration steps of one sample.

@@ -63,6 +63,32 @@ pub(super) mod index {
     pub(in super::super) const SPEED_OFFSET: usize = 22;
 }
 
+/// Normal prior of the parameters at the start of a ground, in the units of [`index`].
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Prior {
+    /// Mean.
+    pub(super) mean: Values,
+    /// Information matrix, the inverse of the covariance.
+    pub(super) information: Square,
+    /// Standard deviations of the initial prior, before any measurement. They scale the maximum
+    /// step and the range of each parameter.
+    pub(super) std_devs: Values,
+    /// Mean of the initial prior, the middle of each parameter's range.
+    pub(super) first_mean: Values,
+}
+
+impl Prior {
+    /// Creates the initial prior of independent parameters.
+    pub(super) fn new(mean: Values, std_devs: Values) -> Self {
+        Self {
+            mean,
+            information: Square::from_diagonal(&std_devs.map(|std_dev| std_dev.powi(-2))),
+            std_devs,
+            first_mean: mean,
+        }
+    }
+}
+
 /// Parameters of the ground and of the tyres' friction curve on it. They start from the initial
 /// prior on new ground.
 pub(super) const OF_GROUND: [usize; 7] = [

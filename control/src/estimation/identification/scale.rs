@@ -8,8 +8,8 @@
 //! than one scale, and the shorter scale is used only as long as its estimate agrees with that of
 //! the longer one (the specification test of Hausman, Econometrica 46, 1978).
 
-use super::hypothesis::{CHANNELS, Prior};
-use super::parameters::{Square, Values, index};
+use super::model::CHANNELS;
+use super::parameters::{Prior, Square, Values, index};
 
 /// Fraction of its information that a block loses with each later block, because sensor offsets
 /// drift.

@@ -1,8 +1,7 @@
 //! The model's state of motion, its outputs since the last comparison, and their derivatives.
 
 use super::dual::Real;
-use super::hypothesis::CHANNELS;
-use super::model::{Input, Output, State};
+use super::model::{CHANNELS, Input, Output, State};
 use super::parameters::{Number, Robot, Values};
 
 /// A simulated robot that follows the measured wheel speeds.
