@@ -9,7 +9,7 @@
 //! `g = Jᵀ W r` replaces the assumption of white residuals and a true model.
 
 use super::model::{CHANNELS, Input, State};
-use super::parameters::{Number, PARAMETERS, Prior, Robot, SHAPE_MIN, Square, Values, index};
+use super::parameters::{Number, PARAMETERS, Prior, Robot, SHAPE_MIN, Values, index};
 use super::scale::{Compared, Residual, Scale};
 use super::simulation::Simulation;
 use crate::robot::RobotModel;

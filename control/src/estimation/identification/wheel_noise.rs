@@ -11,7 +11,7 @@
 //! third differences of sums of two values, around 10 Hz, and fourth differences, at higher
 //! frequencies. A smooth motion passes neither. Speeds that are differences of encoder counts have
 //! noise that cancels in sums: its spectrum rises as `x = 4 sin²(ω/2)`, of which the filters see the
-//! means 1.75 and 3.6, while white noise has the same power in both. So the two are told apart by
+//! means 1.75 and 3.6, while white noise has the same power in both. So the two are distinguished by
 //! extrapolation to x = 0. Wheels that truly move at 10 Hz, as behind noisy positions, count as noise
 //! here; but the accelerometer feels them too, so that residuals do not grow, and `hypothesis`
 //! reduces the correction.
