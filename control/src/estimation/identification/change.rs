@@ -1,113 +1,247 @@
 //! Detects a change of the ground under a robot that is being identified.
 //!
-//! An alarm needs two conditions: a two-sided CUSUM (Page 1954) of the standardised innovations i
-//! of ln K exceeds its threshold, `S ← max(0, S ± i − k) > h`; and the mean square of the
-//! standardised residuals has grown over the last two seconds. The CUSUM alone raises false alarms
-//! where turns begin and end, which the model describes less well; the residuals alone grow with
-//! any error of the model or a sensor.
+//! Beside the best hypothesis the same robot is simulated on softer and on stiffer ground. The
+//! evidence for each of them is a CUSUM (Page 1954) of how much better it explains the
+//! measurements: `S ← max(0, S + Σ ρ(r/σ) − Σ ρ(r'/σ) − k) > h`, with the residuals r of the
+//! hypothesis and r' of the other ground, over all channels of a comparison, and ρ the square up to
+//! a limit. That is a likelihood ratio over a grid of K (Basseville and Nikiforov, Detection of
+//! Abrupt Changes, 1993, ch. 2). An error of the model or a sensor makes both residuals large, and
+//! their difference small.
 
-/// Threshold h of the CUSUM and its drift k, in standard deviations of an innovation.
-const THRESHOLD: f64 = 20.0;
-const DRIFT: f64 = 1.0;
-/// Maximum magnitude of an innovation in the CUSUM; larger ones are clamped.
-const INNOVATION_MAX: f64 = 8.0;
-/// Minimum growth of the mean square of the residuals, relative to its former value or, if that is
-/// below 1, to 1.
-const GROWTH_MIN: f64 = 0.7;
-/// Number of comparisons between the two mean squares: two seconds.
-const GROWS_OVER: usize = 40;
-/// Number of comparisons after the start of motion whose innovations are ignored: one second.
+use super::model::{CHANNELS, Input, State};
+use super::parameters::{PARAMETERS, Robot, Values, index};
+use super::simulation::Simulation;
+use crate::robot::RobotModel;
+
+/// Differences of ln K of the other grounds.
+const OFFSETS: [f64; 2] = [-1.0, 1.0];
+/// Threshold h of the CUSUM and its drift k: squares of standard deviations.
+const THRESHOLD: f64 = 100.0;
+const DRIFT: f64 = 2.0;
+/// Limit of one channel's squared standardised residual.
+const SQUARE_MAX: f64 = 25.0;
+/// Number of comparisons after the start of motion that are ignored: one second.
 const ROLLS_FOR: u32 = 20;
+/// Number of compared channels: all but the body speed.
+pub(super) const COMPARED: usize = CHANNELS - 1;
 
-/// State of the detector.
+/// A measurement of one channel, with the output of the best hypothesis and the standard deviation
+/// of their difference, in the channel's unit.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Explained {
+    pub(super) measured: f64,
+    pub(super) output: f64,
+    pub(super) std_dev: f64,
+}
+
+impl Explained {
+    /// Returns the limited squared residual of an output.
+    fn square(&self, output: f64) -> f64 {
+        let residual = (self.measured - output) / self.std_dev;
+        (residual * residual).min(SQUARE_MAX)
+    }
+}
+
+/// The robot on another ground.
 #[derive(Debug, Clone, PartialEq)]
+struct OtherGround {
+    robot: Robot<f64>,
+    model: Simulation<f64>,
+    evidence: f64,
+}
+
+/// State of the detector. It detects nothing before [`ChangeMonitor::follow`].
+#[derive(Debug, Clone, PartialEq, Default)]
 pub(super) struct ChangeMonitor {
-    above: f64,
-    below: f64,
-    /// Mean squares of the last comparisons, the oldest at `next`.
-    squares: [f64; GROWS_OVER],
-    next: usize,
+    others: Option<[OtherGround; OFFSETS.len()]>,
     /// Number of comparisons since the robot began to roll.
     rolling: u32,
 }
 
-impl Default for ChangeMonitor {
-    fn default() -> Self {
-        Self {
-            above: 0.0,
-            below: 0.0,
-            squares: [f64::INFINITY; GROWS_OVER],
-            next: 0,
-            rolling: 0,
+impl ChangeMonitor {
+    /// Takes the parameters of the best hypothesis, in the units of [`index`]. The first call begins
+    /// with the robots in the motion `state`.
+    pub(super) fn follow(&mut self, values: &Values, model: &RobotModel, state: State<f64>) {
+        let robot = |offset: f64| {
+            let mut values: [f64; PARAMETERS] = (*values).into();
+            values[index::STIFFNESS] += offset;
+            Robot::new(&values, model)
+        };
+        if let Some(others) = &mut self.others {
+            for (other, offset) in others.iter_mut().zip(OFFSETS) {
+                other.robot = robot(offset);
+            }
+        } else {
+            self.others = Some(OFFSETS.map(|offset| OtherGround {
+                robot: robot(offset),
+                model: Simulation::new(state),
+                evidence: 0.0,
+            }));
         }
     }
-}
 
-impl ChangeMonitor {
-    /// Adds one comparison: the standardised innovation of ln K and the mean square of the
-    /// standardised residuals. Without them the detector is reset; while the robot does not roll
-    /// the CUSUM stays 0.
+    /// Advances the robots on other grounds by one sample, whose outputs have the weight `share`.
+    pub(super) fn advance(&mut self, input: &Input, share: f64) {
+        for other in self.others.iter_mut().flatten() {
+            other.model.advance(&other.robot, input, share);
+        }
+    }
+
+    /// Adds one comparison of the means since the last call; `ratio` multiplies the outputs of the
+    /// other grounds. While the robot does not roll there is no evidence.
     ///
     /// Returns whether the ground has changed; after an alarm the detector is reset.
-    pub(super) fn update(&mut self, comparison: Option<(f64, f64)>, is_rolling: bool) -> bool {
-        let Some((innovation, square)) = comparison.filter(|found| found.0.is_finite()) else {
-            *self = Self::default();
-            return false;
+    pub(super) fn compare(
+        &mut self,
+        explained: &[Option<Explained>; COMPARED],
+        ratio: f64,
+        is_rolling: bool,
+    ) -> bool {
+        self.rolling = if is_rolling {
+            self.rolling.saturating_add(1)
+        } else {
+            0
         };
-        let before = std::mem::replace(&mut self.squares[self.next], square);
-        self.next = (self.next + 1) % GROWS_OVER;
-        if !is_rolling {
-            (self.above, self.below, self.rolling) = (0.0, 0.0, 0);
-            return false;
+        let mut has_changed = false;
+        for other in self.others.iter_mut().flatten() {
+            let outputs = other.model.take_mean(ratio);
+            if self.rolling <= ROLLS_FOR {
+                other.evidence = 0.0;
+                continue;
+            }
+            let gains = explained.iter().zip(outputs).map(|(explained, output)| {
+                explained.map_or(0.0, |explained| {
+                    explained.square(explained.output) - explained.square(output)
+                })
+            });
+            let gain: f64 = gains.sum();
+            if gain.is_finite() {
+                other.evidence = (other.evidence + gain - DRIFT).max(0.0);
+            }
+            has_changed |= other.evidence > THRESHOLD;
         }
-        self.rolling = self.rolling.saturating_add(1);
-        if self.rolling <= ROLLS_FOR {
-            return false;
-        }
-        let bounded = innovation.clamp(-INNOVATION_MAX, INNOVATION_MAX);
-        self.above = (self.above + bounded - DRIFT).max(0.0);
-        self.below = (self.below - bounded - DRIFT).max(0.0);
-        let has_grown = square - before > GROWTH_MIN * before.max(1.0);
-        let changed = has_grown && self.above.max(self.below) > THRESHOLD;
-        if changed {
+        if has_changed {
             *self = Self::default();
         }
-        changed
+        has_changed
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::*;
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
 
-    /// Comparisons until an alarm, of at most 400 after 100 quiet ones.
-    fn alarm(innovation: f64, square_step: f64) -> Option<u32> {
-        let mut monitor = ChangeMonitor::default();
-        for count in 0..100_u32 {
-            let noise = if count % 2 == 0 { 1.0 } else { -1.0 };
-            assert!(!monitor.update(Some((noise, 1.0)), true));
+    use super::super::parameters;
+    use super::*;
+    use crate::estimation::{EstimatorPrior, SensorNoise};
+
+    const SAMPLE_S: f64 = 0.01;
+    const SAMPLES: u32 = 5;
+    /// Standard deviations of the channels.
+    const STD_DEVS: [f64; COMPARED] = [0.008, 0.08, 0.08, 0.15, 0.15];
+
+    /// A robot in turns, one that is believed to be it, and the monitor of that belief.
+    struct Drive {
+        model: RobotModel,
+        values: Values,
+        robot: Simulation<f64>,
+        believed: Simulation<f64>,
+        monitor: ChangeMonitor,
+        random: ChaCha8Rng,
+        time_s: f64,
+    }
+
+    impl Drive {
+        fn new(seed: u64) -> Self {
+            let model = RobotModel::yi2007();
+            let (mut values, _) =
+                parameters::prior(&EstimatorPrior::default(), &SensorNoise::default());
+            values[index::STIFFNESS] = 3.0_f64.ln();
+            let state = State::rolling(0.0, 0.0);
+            let mut monitor = ChangeMonitor::default();
+            monitor.follow(&values, &model, state);
+            Self {
+                model,
+                values,
+                robot: Simulation::new(state),
+                believed: Simulation::new(state),
+                monitor,
+                random: ChaCha8Rng::seed_from_u64(seed),
+                time_s: 0.0,
+            }
         }
-        (0..400).find(|&count| {
-            let square = 1.0 + square_step * f64::from(count + 1);
-            monitor.update(Some((innovation, square)), true)
-        })
+
+        /// Drives one comparison on ground of a stiffness, with `scaled` torques. Returns whether the
+        /// monitor raises an alarm.
+        fn compare(&mut self, stiffness: f64, scaled: f64, is_rolling: bool) -> bool {
+            let mut values: [f64; PARAMETERS] = self.values.into();
+            let believed = Robot::new(&values, &self.model);
+            values[index::STIFFNESS] = stiffness.ln();
+            let robot = Robot::new(&values, &self.model);
+            let share = f64::from(SAMPLES).recip();
+            for _ in 0..SAMPLES {
+                self.time_s += SAMPLE_S;
+                let speed = |phase: f64| 6.0 + 2.5 * (0.9 * self.time_s + phase).sin();
+                let rise = |phase: f64| 2.5 * 0.9 * (0.9 * self.time_s + phase).cos();
+                let input = Input {
+                    wheels_rad_s: [speed(0.0), speed(2.0)],
+                    wheels_rad_s2: [rise(0.0), rise(2.0)],
+                    heading_rad: 0.0,
+                    acceleration_m_s2: [0.0; 2],
+                    time_s: SAMPLE_S,
+                };
+                self.robot.advance(&robot, &input, share);
+                self.believed.advance(&believed, &input, share);
+                self.monitor.advance(&input, share);
+            }
+            let truth = self.robot.take_mean(1.0);
+            let outputs = self.believed.take_mean(1.0);
+            let explained = std::array::from_fn(|channel| {
+                let of_12 = (0..12).map(|_| self.random.random::<f64>() - 0.5);
+                let factor = if channel > 2 { scaled } else { 1.0 };
+                Some(Explained {
+                    measured: factor * truth[channel] + STD_DEVS[channel] * of_12.sum::<f64>(),
+                    output: outputs[channel],
+                    std_dev: STD_DEVS[channel],
+                })
+            });
+            self.monitor.compare(&explained, 1.0, is_rolling)
+        }
     }
 
     #[test]
-    fn innovations_to_one_side_with_growing_residuals_are_a_change_and_neither_alone_is() {
-        assert!(alarm(4.0, 0.05).is_some_and(|count| count < 20));
-        assert!(alarm(-4.0, 0.05).is_some_and(|count| count < 20));
-        assert_eq!(alarm(4.0, 0.0), None);
-        assert_eq!(alarm(0.9, 0.05), None);
+    fn softer_and_stiffer_ground_is_detected_the_sooner_the_more_it_differs() {
+        let grounds = [
+            (0.7, 30),
+            (1.0, 30),
+            (1.5, 120),
+            (6.0, 120),
+            (9.0, 30),
+            (12.0, 30),
+        ];
+        for (seed, (stiffness, most)) in (0..).zip(grounds) {
+            let mut drive = Drive::new(seed);
+            assert!(!(0..200).any(|_| drive.compare(3.0, 1.0, true)));
+            let delay = (0..200).position(|_| drive.compare(stiffness, 1.0, true));
+            let is_in_time = delay.is_some_and(|delay| delay < most);
+            assert!(is_in_time, "{stiffness}: {delay:?}");
+        }
+    }
+
+    #[test]
+    fn noise_and_wrong_torques_on_the_same_ground_raise_no_alarm() {
+        for (seed, scaled) in (0..).zip([1.0, 0.85, 1.15]) {
+            let mut drive = Drive::new(seed);
+            let alarm = (0..12_000).position(|_| drive.compare(3.0, scaled, true));
+            assert_eq!(alarm, None, "torques × {scaled}");
+        }
     }
 
     #[test]
     fn a_robot_that_sets_off_or_stands_raises_no_alarm() {
-        let mut monitor = ChangeMonitor::default();
-        for count in 0..1_000_u32 {
-            let square = 1.0 + f64::from(count);
-            let is_rolling = count % 25 >= 6;
-            assert!(!monitor.update(Some((8.0, square)), is_rolling));
-        }
+        let mut drive = Drive::new(1);
+        let alarm = (0..1_000).position(|count| drive.compare(1.0, 1.0, count % 25 >= 6));
+        assert_eq!(alarm, None);
     }
 }

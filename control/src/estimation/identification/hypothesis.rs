@@ -35,8 +35,6 @@ const STEP_MAX: f64 = 0.4;
 const PRIOR_RANGE: f64 = 5.0;
 /// Maximum squared standardised residual in the cost.
 const COST_MAX: f64 = 25.0;
-/// Minimum number of blocks from whose scatter the variance of innovations is estimated.
-const INNOVATION_BLOCKS_MIN: u32 = 15;
 /// Factor by which each later block multiplies the cost so far.
 const COST_KEEPS: f64 = 0.95;
 
@@ -58,6 +56,13 @@ pub(super) struct OfSegment {
 pub(super) struct Predicted {
     output: Number,
     perturbed: Option<Number>,
+}
+
+impl Predicted {
+    /// Returns the output without derivatives.
+    pub(super) fn value(&self) -> f64 {
+        self.output.value
+    }
 }
 
 fn slopes(output: &Number) -> Values {
@@ -82,9 +87,9 @@ pub(super) struct Measured {
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Hypothesis {
     values: Values,
-    model: Simulation,
+    model: Simulation<Number>,
     /// The same with noise added to the wheel speeds; None if they have none.
-    perturbed: Option<Simulation>,
+    perturbed: Option<Simulation<Number>>,
     /// The normal equations at each time scale, and the one that is used.
     scales: [Scale; SCALES.len()],
     used: usize,
@@ -98,8 +103,6 @@ pub(super) struct Hypothesis {
     compared: u32,
     noise_square: f64,
     cost: f64,
-    /// `of_stiffnessᵀ g` of the open block at the last call of [`Hypothesis::innovation`].
-    score_taken: f64,
     /// Number of complete blocks.
     age: u32,
     /// Whether the last normal equations could be solved at any time scale: otherwise noise hides
@@ -114,7 +117,7 @@ impl Hypothesis {
         values[index::STIFFNESS] = ln_stiffness;
         Self {
             values,
-            model: Simulation::new(state),
+            model: Simulation::new(state.constants()),
             perturbed: None,
             scales: SCALES.map(Scale::new),
             used: 0,
@@ -124,33 +127,30 @@ impl Hypothesis {
             noise_square: 0.0,
             is_determined: true,
             cost: 0.0,
-            score_taken: 0.0,
             age: 0,
         }
     }
 
     /// Continues from a given state of motion after a gap in the samples; drops the open block.
     pub(super) fn restart(&mut self, state: State<f64>) {
-        self.model = Simulation::new(state);
+        self.model = Simulation::new(state.constants());
         self.perturbed = None;
         self.drop_block();
     }
 
-    /// Returns the standardised innovation of ln K since the last call: the Gauss–Newton step of ln
-    /// K from the measurements since then, over its standard deviation. That follows from the
-    /// scatter of whole blocks and `per_block`, the number of calls per block. Positive if K is
-    /// larger than estimated; None before [`INNOVATION_BLOCKS_MIN`] blocks.
-    pub(super) fn innovation(&mut self, per_block: f64) -> Option<f64> {
-        let scale = &self.scales[0];
-        let score = scale.of_stiffness.dot(&scale.score);
-        let new = score - std::mem::replace(&mut self.score_taken, score);
-        (self.age >= INNOVATION_BLOCKS_MIN && scale.block_variance > 0.0)
-            .then(|| new / (scale.block_variance / per_block).sqrt())
+    /// Returns the state of motion, without derivatives.
+    pub(super) fn motion(&self) -> State<f64> {
+        self.model.motion()
+    }
+
+    /// Returns the factor, at least 1, by which a channel's residuals exceed their standard
+    /// deviation.
+    pub(super) fn residual_ratio(&self, channel: usize) -> f64 {
+        self.scales[0].residual_ratio(channel)
     }
 
     /// Drops the measurements of the open block.
     pub(super) fn drop_block(&mut self) {
-        self.score_taken = 0.0;
         self.scales.iter_mut().for_each(Scale::drop_block);
     }
 
@@ -283,7 +283,6 @@ impl Hypothesis {
         self.scales
             .iter_mut()
             .for_each(|scale| scale.end_block(&values));
-        self.score_taken = 0.0;
         self.age = self.age.saturating_add(1);
         self.cost *= COST_KEEPS;
         let Some(wanted) = self.solve(prior) else {

@@ -25,7 +25,7 @@ mod wheel_noise;
 use super::{EstimatorPrior, GAP_MAX_S, IdentifiedRobot, SensorNoise, SensorSample};
 use crate::robot::RobotModel;
 
-use change::ChangeMonitor;
+use change::{COMPARED, ChangeMonitor, Explained};
 use hypothesis::{Hypothesis, Measured};
 use model::{CHANNELS, Input, State};
 use parameters::{Prior, index};
@@ -51,8 +51,11 @@ const TORQUE_FROM_M_S: f64 = 0.1;
 /// Rim speed that both sides must exceed for a change of the ground to be detected, metres per
 /// second.
 const ROLLING_M_S: f64 = 0.2;
-/// Standard deviation of ln K above which no change of the ground is detected.
-const CHANGES_STD_DEV_MAX: f64 = 0.2;
+/// Standard deviations of ln K above which no change of the ground is detected, without and with
+/// measured torque. Without torque an estimate that is still converging looks like a change.
+const CHANGES_STD_DEVS_MAX: [f64; 2] = [0.2, 0.5];
+/// Minimum number of blocks before a change of the ground is detected.
+const CHANGES_BLOCKS_MIN: u32 = 10;
 /// Rim speed of the faster side below which the robot counts as standing, metres per second.
 const STANDING_M_S: f64 = 0.02;
 /// Bandwidth of the low-pass filter of accelerations, per second.
@@ -126,8 +129,8 @@ pub(super) struct Identification {
     is_robot_due: bool,
     change: ChangeMonitor,
     wheel_noise: WheelNoise,
-    /// Whether the standard deviation of ln K is below [`CHANGES_STD_DEV_MAX`].
-    is_sharp: bool,
+    /// Whether the last sample had wheel torques.
+    has_torque: bool,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -170,7 +173,7 @@ impl Identification {
             is_robot_due: false,
             change: ChangeMonitor::default(),
             wheel_noise: WheelNoise::new(),
-            is_sharp: false,
+            has_torque: false,
         };
         identification.begin(&State::rolling(0.0, 0.0));
         Some(identification)
@@ -178,6 +181,7 @@ impl Identification {
 
     fn begin(&mut self, state: &State<f64>) {
         self.hypotheses.clear();
+        self.change = ChangeMonitor::default();
         for start in STARTS {
             self.hypotheses
                 .push(Hypothesis::new(&self.prior, start, *state));
@@ -321,6 +325,7 @@ impl Identification {
                 hypothesis.compare(&forward, speed);
             }
         }
+        self.change.advance(&input, share);
         self.compared_s >= COMPARED_S - 1.0e-6 && self.compare(noise)
     }
 
@@ -343,6 +348,7 @@ impl Identification {
             add(1, forward);
             add(2, left);
         }
+        self.has_torque = sample.wheel_torques.is_some();
         let is_rolling = rims_m_s[0].min(rims_m_s[1]) > TORQUE_FROM_M_S;
         if let Some(torques) = sample.wheel_torques.filter(|_| is_rolling) {
             add(3, torques.left_n_m);
@@ -374,13 +380,23 @@ impl Identification {
             of_torque_n_m,
         ];
         let (sums, measured_s, compared_s) = (self.sums, self.measured_s, self.compared_s);
+        let least = self.least_cost();
+        let mut explained = [None; COMPARED];
         for hypothesis in &mut self.hypotheses {
+            let is_best = hypothesis.cost() <= least;
             // Outputs were weighed by COMPARED_S.
             let outputs = hypothesis.take_mean(COMPARED_S / compared_s);
             for (channel, output) in outputs.into_iter().enumerate() {
                 // Means are of the same time only if nothing is missing.
                 if measured_s[channel] < compared_s - 1.0e-6 {
                     continue;
+                }
+                if is_best {
+                    explained[channel] = Some(Explained {
+                        measured: sums[channel] / compared_s,
+                        output: output.value(),
+                        std_dev: std_devs[channel] * hypothesis.residual_ratio(channel),
+                    });
                 }
                 hypothesis.compare(
                     &output,
@@ -396,7 +412,10 @@ impl Identification {
         }
         self.block_s += compared_s;
         self.clear_sums();
-        let changed = self.detect();
+        let is_rolling = self.is_rolling();
+        let changed = self
+            .change
+            .compare(&explained, COMPARED_S / compared_s, is_rolling);
         if self.block_s >= BLOCK_S - 1.0e-6 {
             self.end_block();
             self.is_robot_due = true;
@@ -405,22 +424,6 @@ impl Identification {
             self.robot = self.identify_robot().or(self.robot);
         }
         changed
-    }
-
-    /// Returns whether the change detector raises an alarm on the last comparison's innovation of
-    /// ln K, by the hypothesis with the lowest cost.
-    fn detect(&mut self) -> bool {
-        let least = self.least_cost();
-        let per_block = BLOCK_S / COMPARED_S;
-        let mut innovation = None;
-        for hypothesis in &mut self.hypotheses {
-            let found = hypothesis.innovation(per_block);
-            if hypothesis.cost() <= least {
-                innovation = found.map(|found| (found, hypothesis.worst_square()));
-            }
-        }
-        let known = innovation.filter(|_| self.is_sharp);
-        self.change.update(known, self.is_rolling())
     }
 
     /// Returns whether the rims of both sides are faster than [`ROLLING_M_S`].
@@ -454,8 +457,21 @@ impl Identification {
         }
         self.discard();
         self.look_for_noise();
-        let variance = self.best().map(|best| best.variances(&self.prior).0);
-        self.is_sharp = variance.is_some_and(|variance| variance.sqrt() < CHANGES_STD_DEV_MAX);
+        self.watch_ground();
+    }
+
+    /// Gives the change monitor the best hypothesis, if its ln K is known well enough.
+    fn watch_ground(&mut self) {
+        let most = CHANGES_STD_DEVS_MAX[usize::from(self.has_torque)];
+        let is_known = |best: &&Hypothesis| {
+            let std_dev = best.variances(&self.prior).0.sqrt();
+            best.age() >= CHANGES_BLOCKS_MIN && std_dev < most
+        };
+        let known = self.best().filter(is_known);
+        match known.map(|best| (*best.values(), best.motion())) {
+            Some((values, state)) => self.change.follow(&values, &self.model, state),
+            None => self.change = ChangeMonitor::default(),
+        }
     }
 
     /// Begins anew with noise of the wheel speeds taken into account if residuals may come from it.

@@ -57,6 +57,16 @@ impl<T: Real> State<T> {
     }
 }
 
+impl State<f64> {
+    /// Returns the same motion without deflections, as constants of another type.
+    pub(super) fn constants<T: Real>(&self) -> State<T> {
+        let [forward_m_s, left_m_s] = self.speed_m_s;
+        let mut own = State::rolling(forward_m_s, self.turn_rad_s);
+        own.speed_m_s[1] = T::constant(left_m_s);
+        own
+    }
+}
+
 /// Measured quantities that the model takes as they are, over the time of one sample.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Input {

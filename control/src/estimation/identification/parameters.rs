@@ -211,7 +211,7 @@ pub(super) fn prior(prior: &EstimatorPrior, noise: &SensorNoise) -> (Values, Val
 }
 
 /// The parameters of a robot in SI units.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Robot<T> {
     pub(super) track_m: f64,
     pub(super) wheelbase_m: f64,

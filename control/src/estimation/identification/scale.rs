@@ -20,8 +20,6 @@ const HUBER: f64 = 3.0;
 const SQUARE_GAIN: f64 = 0.005;
 /// Maximum squared standardised residual in that mean.
 const SQUARE_MAX: f64 = 100.0;
-/// Number of blocks below which the variance of one block's score is not known.
-const SCATTER_BLOCKS_MIN: f64 = 5.0;
 /// Standard deviations of their difference by which the estimates of two scales may differ.
 const DIFFERENT: f64 = 2.0;
 /// Minimum variance of that difference, relative to the variance at the longer scale.
@@ -145,8 +143,6 @@ pub(super) struct Scale {
     squares: [f64; CHANNELS],
     /// Column of C for ln K: covariances of ln K with all parameters.
     pub(super) of_stiffness: Values,
-    /// Variance of `of_stiffnessᵀ g` of one block, from the scatter of the blocks.
-    pub(super) block_variance: f64,
     /// Solution of the normal equations for ln K.
     ln_stiffness: f64,
 }
@@ -165,7 +161,6 @@ impl Scale {
             last: Blocks::none(),
             squares: [0.0; CHANNELS],
             of_stiffness: Values::zeros(),
-            block_variance: 0.0,
             ln_stiffness: 0.0,
         }
     }
@@ -174,6 +169,12 @@ impl Scale {
     /// noise and model are as assumed.
     pub(super) fn worst_square(&self) -> f64 {
         self.squares.into_iter().fold(0.0, f64::max)
+    }
+
+    /// Returns the factor, at least 1, by which a channel's residuals exceed their standard
+    /// deviation.
+    pub(super) fn residual_ratio(&self, channel: usize) -> f64 {
+        self.squares[channel].max(1.0).sqrt()
     }
 
     /// Adds a comparison to the open mean of its channel.
@@ -271,10 +272,6 @@ impl Scale {
         let mut stiffness = Values::zeros();
         stiffness[index::STIFFNESS] = 1.0;
         self.of_stiffness = cholesky.solve(&stiffness);
-        if self.ground.count >= SCATTER_BLOCKS_MIN {
-            let scatter = (self.ground.scores * self.of_stiffness).dot(&self.of_stiffness);
-            self.block_variance = scatter / self.ground.count;
-        }
         let wanted = cholesky.solve(&(self.ground.preferred + prior.information * prior.mean));
         self.ln_stiffness = wanted[index::STIFFNESS];
         Some(wanted)
