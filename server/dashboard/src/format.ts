@@ -1,23 +1,31 @@
 // Numbers and times for people. What is not known is a dash.
+import { preferences } from './preferences.svelte';
 import { texts } from './texts';
 
-const cache = new Map<number, Intl.NumberFormat>();
+const cache = new Map<string, Intl.NumberFormat>();
+
+/** Numbers as whoever looks writes them. */
+function formatOf(name: string, options: Intl.NumberFormatOptions): Intl.NumberFormat {
+  const { locale } = preferences;
+  const key = `${locale} ${name}`;
+  let format = cache.get(key);
+  if (!format) {
+    // What rounds to zero has no sign.
+    format = new Intl.NumberFormat(locale, { useGrouping: false, signDisplay: 'negative', ...options });
+    cache.set(key, format);
+  }
+  return format;
+}
 
 /** A number with a fixed count of digits after the point. */
 export function number(value: number | null | undefined, digits: number): string {
   if (value === null || value === undefined || !Number.isFinite(value)) return texts.unknown;
-  let format = cache.get(digits);
-  if (!format) {
-    format = new Intl.NumberFormat('en', {
-      minimumFractionDigits: digits,
-      maximumFractionDigits: digits,
-      useGrouping: false,
-      // What rounds to zero has no sign.
-      signDisplay: 'negative',
-    });
-    cache.set(digits, format);
-  }
-  return format.format(value);
+  return formatOf(`${digits}`, { minimumFractionDigits: digits, maximumFractionDigits: digits }).format(value);
+}
+
+/** Three significant digits at most, without zeros behind them. */
+export function plain(value: number): string {
+  return formatOf('plain', { maximumSignificantDigits: 3 }).format(value);
 }
 
 /** A number with three significant digits. */
