@@ -1,4 +1,5 @@
 // Numbers and times for people. What is not known is a dash.
+import { roughly } from './eta';
 import { preferences } from './preferences.svelte';
 import { texts } from './texts';
 
@@ -54,9 +55,28 @@ export function span(seconds: number | null | undefined): string {
   return `${number(passed / 86_400, 1)} ${d}`;
 }
 
+/** A span that is an estimate: without its zeros, and no finer than minutes from an hour on. */
+export function estimate(seconds: number): string {
+  const rough = roughly(seconds);
+  const { s, min, h } = texts.unit;
+  const [hours, minutes, rest] = [Math.floor(rough / 3600), Math.floor((rough % 3600) / 60), rough % 60];
+  const named = [[hours, h], [minutes, min], [rest, s]] as const;
+  return named
+    .filter(([count]) => count > 0)
+    .map(([count, name]) => `${count} ${name}`)
+    .join(' ');
+}
+
 /** Time of day of a wall time. */
 export function clock(at: string | number | Date): string {
   return new Date(at).toLocaleTimeString('en-GB');
+}
+
+/** Time of day of a wall time to the minute, with its day unless that is today. */
+export function about(at: number, now: number): string {
+  const [then, today] = [parts(new Date(at)), parts(new Date(now))];
+  const time = then.time.slice(0, -3);
+  return then.day === today.day ? time : `${then.day} ${time}`;
 }
 
 const two = (value: number) => String(value).padStart(2, '0');

@@ -6,6 +6,8 @@ import { Stream, type Listener } from '../api/stream';
 import { signedIn } from './session.svelte';
 import { doing } from '../standing';
 import { texts } from '../texts';
+import { Pace, remainingS, startsInS } from '../eta';
+import { LatePlans } from './late_plans';
 import { Stops } from './stops.svelte';
 import { Tracked } from './tracked';
 
@@ -59,6 +61,11 @@ export class Fleet implements Listener {
   readonly missions = new SvelteMap<string, Mission>();
   readonly alerts = new SvelteMap<string, Alert>();
   readonly stops = new Stops(() => this.site);
+  readonly #pace = new Pace();
+  readonly #latePlans = new LatePlans(
+    (id) => this.missions.get(id),
+    (mission) => this.mission(mission),
+  );
 
   /** For the map, which draws it afresh each time: not reactive. */
   readonly tracked = new Map<string, Tracked>();
@@ -117,6 +124,20 @@ export class Fleet implements Listener {
     return { text: texts.link[robot.link], look: robot.link === 'online' ? 'good' : 'warn' };
   }
 
+  /** Time until a mission ends, seconds; null where that cannot be known. */
+  remainingS(mission: Mission): number | null {
+    const entry = this.byId.get(mission.robot);
+    if (!entry || this.lostAt !== null || this.stops.inForce.has(mission.robot)) return null;
+    const heard_age_ms = entry.robot.live?.heard_age_ms ?? 0;
+    const age_s = (heard_age_ms + Math.max(0, this.now - entry.receivedAt)) / 1000;
+    return remainingS(mission, entry.robot, age_s, this.#pace);
+  }
+
+  /** Time until a mission that waits begins, seconds; null where that cannot be known. */
+  startsInS(mission: Mission): number | null {
+    return startsInS(mission, this.openMissions, (other) => this.remainingS(other));
+  }
+
   /** Robots of the site that are to stand and move. */
   get runaways(): Robot[] {
     return this.robots.map((entry) => entry.robot).filter((robot) => doing(robot.live).isBad);
@@ -155,6 +176,7 @@ export class Fleet implements Listener {
     this.terrainFriction = [];
     this.fence = null;
     this.stops.forget();
+    this.#pace.forget();
     this.#isRead = false;
     this.isDirty = true;
     this.#stream = new Stream(site, this);
@@ -226,6 +248,7 @@ export class Fleet implements Listener {
     if (robot.retired_at) this.tracked.delete(robot.id);
     else if (known) looksNew = known.update(robot, now, this.tracked.size > CURVES_MAX ? SPARSE_MS : 0);
     else this.tracked.set(robot.id, new Tracked(robot, now));
+    this.#pace.note(robot.id, robot.live?.mission, now - (robot.live?.heard_age_ms ?? 0));
     this.stops.heard(robot);
     if (looksNew) this.wake();
     this.#listsSoon();
@@ -239,6 +262,7 @@ export class Fleet implements Listener {
   mission(mission: Mission): void {
     this.#seen?.add(`m${mission.id}`);
     this.missions.set(mission.id, mission);
+    this.#latePlans.look(mission);
     this.isDirty = true;
     if (this.missions.size > ENDED_MAX * 2) {
       for (const old of this.endedMissions.slice(ENDED_MAX)) this.missions.delete(old.id);

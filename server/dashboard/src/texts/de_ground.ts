@@ -15,6 +15,8 @@ export const ground: Pick<Texts, Areas> = {
     circle: (radius) => `Kreis, Radius ${radius}`,
     waypoints: (count) => (count === 1 ? '1 Wegpunkt' : `${count} Wegpunkte`),
     progress: (driven, length) => `${driven} von ${length}`,
+    ends: (left, at) => `noch etwa ${left}, Ende gegen ${at}`,
+    starts: (wait, at) => `Beginn in etwa ${wait}, gegen ${at}`,
     priority: (priority) => `Priorität ${priority}`,
     pause: 'Pausieren',
     resume: 'Fortsetzen',

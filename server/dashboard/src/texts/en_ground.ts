@@ -12,6 +12,9 @@ export const ground = {
     circle: (radius: string) => `circle, radius ${radius}`,
     waypoints: (count: number) => `${count} waypoints`,
     progress: (driven: string, length: string) => `${driven} of ${length}`,
+    /** When it ends, and when it begins: spans and times of day. */
+    ends: (left: string, at: string) => `about ${left} left, ends at about ${at}`,
+    starts: (wait: string, at: string) => `starts in about ${wait}, at about ${at}`,
     priority: (priority: number) => `priority ${priority}`,
     pause: 'Pause',
     resume: 'Resume',
