@@ -12,7 +12,7 @@ const LOOK_AGAIN_MS = 50;
 const SHOTS = new URL('../shots/', import.meta.url).pathname;
 
 /** What tests find in the browser's storage, unless they want something else. */
-const KEPT = { 'tread-units': 'metric' } as const;
+const KEPT = { 'tread-units': 'metric', 'tread-guide': 'closed' } as const;
 
 export const server = (): string => inject('server');
 export const token = (): string => inject('token');

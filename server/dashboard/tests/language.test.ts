@@ -9,6 +9,8 @@ import { api, browser, eventually, select, shot } from './harness';
 
 const { open } = browser();
 const LOCALES: Record<Language, string> = { en: 'en-US', de: 'de-DE' };
+/** How long a tour of all screens may take on a busy machine, milliseconds. */
+const TOUR_MAX_MS = 300_000;
 /** A word of at least so many letters tells its language. */
 const LETTERS_MIN = 4;
 
@@ -100,7 +102,7 @@ async function tour(page: Page, texts: Texts, look: (screen: string) => Promise<
   await page.locator('.ended button', { hasText: texts.missions.state.succeeded }).first().click();
   await page.locator('[data-test="replay"]').waitFor();
   await look('mission');
-  await button(texts.missions.close).click();
+  await page.locator('[data-test="detail"]').getByRole('button', { name: texts.missions.close }).click();
   await button(texts.missions.create).click();
   await look('circle');
   await page.getByRole('radio', { name: texts.draw.waypoints }).check();
@@ -162,9 +164,9 @@ for (const language of LANGUAGES) {
       await stranger.locator('input[name="token"]').waitFor();
       await look(stranger, 'sign-in');
       await stranger.close();
-      const page = await open({ size, theme, locale: LOCALES[language] });
+      const page = await open({ size, theme, locale: LOCALES[language], kept: { 'tread-guide': 'open' } });
       await tour(page, texts, (screen) => look(page, screen));
-    }, 180_000);
+    }, TOUR_MAX_MS);
   }
 }
 

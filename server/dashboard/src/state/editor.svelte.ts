@@ -336,7 +336,7 @@ export class Editor {
     const body = this.missionFor(this.robot);
     if (!body) return false;
     this.#key ||= crypto.randomUUID();
-    return this.#send('/v1/missions', 'POST', body, { 'idempotency-key': this.#key });
+    return this.#send('/v1/missions', 'POST', body, { 'idempotency-key': this.#key }, this.fleet.sent);
   }
 
   /** What is drawn as a mission of a robot; null while it is none. */
@@ -414,11 +414,12 @@ export class Editor {
     method: 'POST' | 'PUT',
     body: unknown,
     headers: Record<string, string> = {},
+    then: (answer: Mission) => void = () => undefined,
   ): Promise<boolean> {
     this.isSending = true;
     this.sendProblem = null;
     try {
-      await ask(path, { method, body, headers });
+      then(await ask<Mission>(path, { method, body, headers }));
       return true;
     } catch (error) {
       this.sendProblem = sentence(error);

@@ -75,6 +75,8 @@ export class Fleet implements Listener {
   mapChanged: () => void = () => undefined;
   /** Says that an alert was raised since the site was opened. */
   raised: (alert: Alert) => void = () => undefined;
+  /** Says that a mission was sent from this page. */
+  sent: (mission: Mission) => void = () => undefined;
   #isDirty = true;
   /** Steps of missions, for whoever shows a history. */
   lastStep = $state.raw<MissionStep | null>(null);
@@ -84,7 +86,7 @@ export class Fleet implements Listener {
   #listsDue: ReturnType<typeof setTimeout> | undefined;
   #seen: Set<string> | null = null;
   /** Everything of this site was read once: what comes now is new. */
-  #isRead = false;
+  isRead = $state(false);
 
   readonly openMissions = $derived(
     [...this.missions.values()]
@@ -177,7 +179,7 @@ export class Fleet implements Listener {
     this.fence = null;
     this.stops.forget();
     this.#pace.forget();
-    this.#isRead = false;
+    this.isRead = false;
     this.isDirty = true;
     this.#stream = new Stream(site, this);
     void this.readGround();
@@ -232,7 +234,7 @@ export class Fleet implements Listener {
     for (const id of this.missions.keys()) if (!seen.has(`m${id}`)) this.missions.delete(id);
     for (const id of this.alerts.keys()) if (!seen.has(`a${id}`)) this.alerts.delete(id);
     this.#seen = null;
-    this.#isRead = true;
+    this.isRead = true;
     this.isDirty = true;
     this.#listsSoon();
     void this.stops.read();
@@ -275,7 +277,7 @@ export class Fleet implements Listener {
 
   alert(alert: Alert): void {
     this.#seen?.add(`a${alert.id}`);
-    if (this.#isRead && !this.alerts.has(alert.id) && !alert.cleared_at && !alert.acknowledged_at) this.raised(alert);
+    if (this.isRead && !this.alerts.has(alert.id) && !alert.cleared_at && !alert.acknowledged_at) this.raised(alert);
     if (alert.cleared_at) this.alerts.delete(alert.id);
     else this.alerts.set(alert.id, alert);
     if (alert.code.startsWith('stop')) void this.stops.read();

@@ -2,7 +2,7 @@
 import type { Texts } from './en';
 import { alertTitles, driveRefusal, gate, link, mode, release } from './de_words';
 
-type Areas = 'signIn' | 'settings' | 'header' | 'stop' | 'tabs' | 'link' | 'mode' | 'gate' | 'robots' | 'bulk' | 'curves' | 'alerts' | 'webhooks' | 'drive';
+type Areas = 'signIn' | 'settings' | 'guide' | 'header' | 'stop' | 'tabs' | 'link' | 'mode' | 'gate' | 'robots' | 'bulk' | 'curves' | 'alerts' | 'webhooks' | 'drive';
 
 export const fleet: Pick<Texts, Areas> = {
   signIn: {
@@ -23,6 +23,31 @@ export const fleet: Pick<Texts, Areas> = {
     languages: { en: 'English', de: 'Deutsch' },
     units: 'Einheiten',
     systems: { metric: 'metrisch: m, kg', imperial: 'imperial: ft, lb' },
+  },
+  guide: {
+    title: 'Erste Schritte',
+    open: 'Erste Schritte zeigen',
+    done: 'erledigt',
+    steps: {
+      robot: 'Ein Roboter ist online',
+      mission: 'Er fährt eine Mission von Ihnen',
+      friction: 'Die gemessene Reibung ist auf der Karte',
+    },
+    enrol:
+      'Nehmen Sie einen Roboter auf: Erzeugen Sie dort, wo die Kommandozeile ist, ein Beitrittstoken, und verwenden Sie es innerhalb einer Stunde auf dem Roboter.',
+    commands: 'Befehle, mit denen ein Roboter beitritt',
+    askAdmin: 'Kein Roboter ist online. Wer diesen Server verwaltet, nimmt Roboter auf.',
+    copy: 'Kopieren',
+    copied: 'Kopiert.',
+    notCopied: 'Der Browser erlaubt es nicht: Markieren Sie den Text.',
+    mission: 'Zeichnen Sie einen Kreis und senden Sie ihn: Beim Drehen zeigt sich die Reibung.',
+    draw: 'Mission zeichnen',
+    drawing: 'Ziehen Sie auf der Karte einen Kreis vom Mittelpunkt nach außen, und drücken Sie dann Senden.',
+    waits: (robot) => `Sie ist gesendet. ${robot} hat noch nicht begonnen.`,
+    failed: 'Diese Mission endete, bevor sie begann. Zeichnen Sie eine andere.',
+    friction: 'Der Roboter misst während der Fahrt. Die ersten Werte kommen nach Sekunden.',
+    show: 'Auf der Karte zeigen',
+    all: 'Alles erledigt: So verbessert jede Mission die Karte.',
   },
   header: {
     site: 'Standort',
