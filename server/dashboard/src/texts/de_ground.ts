@@ -1,6 +1,6 @@
 // German texts about missions, the ground and the map.
 import type { Texts } from './en';
-import { cause, howToDraw, missionState, pausedBy, terrainClass } from './de_words';
+import { cause, howToDraw, missionState, notes, pausedBy, terrainClass } from './de_words';
 
 type Areas = 'missions' | 'draw' | 'replay' | 'fence' | 'terrains' | 'map';
 
@@ -34,6 +34,7 @@ export const ground: Pick<Texts, Areas> = {
     times: (what, count) => `${what}, ${count}-mal`,
     lastTime: 'zuletzt',
     causes: cause,
+    note: (said) => notes[said] ?? '',
     quality: 'Wie gefahren wurde',
     rms: 'Querabweichung, RMS',
     worst: 'Querabweichung, größte',

@@ -184,6 +184,11 @@ export const alertTitles: Readonly<Record<string, string>> = {
   'loop-overrun': 'Der Regelkreis ist zu langsam',
 };
 
+/** What the server notes in a mission's history, as far as it is always the same. */
+export const notes: Readonly<Record<string, string>> = {
+  'the robot began to drive': 'der Roboter ist losgefahren',
+};
+
 export const problemTitles: Record<ProblemType, string> = {
   '/problems/malformed-body': 'Die Anfrage ist kein JSON',
   '/problems/invalid-body': 'Die Anfrage hat einen ungültigen Wert',

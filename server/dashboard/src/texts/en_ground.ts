@@ -32,6 +32,8 @@ export const ground = {
     times: (what: string, count: number) => `${what} ${count} times`,
     lastTime: 'last',
     causes: cause,
+    /** What a note of the server says, where its own text is in another language and known; else empty. */
+    note: (_said: string) => '',
     quality: 'How it was driven',
     rms: 'Cross-track error, RMS',
     worst: 'Cross-track error, most',

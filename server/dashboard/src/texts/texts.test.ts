@@ -55,7 +55,7 @@ const SAME = [
   'unknown',
 ];
 /** What is a text of the server's own in English. */
-const OF_SERVER = ['problem.title', 'alerts.title', 'drive.released', 'drive.refused'];
+const OF_SERVER = ['problem.title', 'missions.note', 'alerts.title', 'drive.released', 'drive.refused'];
 
 const SESSION = { name: 'desk', role: 'operator', grants: [], rights: [], sites: null } as unknown as Session;
 /** Arguments that functions of a dictionary are called with: numbers, one of something, names, switches. */
