@@ -55,7 +55,12 @@ export interface Place {
   draft: DraftState | null;
 }
 
-const number = (value: number) => (Number.isFinite(value) ? String(Number(value.toFixed(3))) : '');
+/** Digits of numbers in metres: of what is seen, and of what is drawn, which another unit may need. */
+const SEEN_DIGITS = 3;
+const DRAWN_DIGITS = 9;
+
+const number = (value: number, digits = DRAWN_DIGITS) =>
+  Number.isFinite(value) ? String(Number(value.toFixed(digits))) : '';
 const writePoints = (points: readonly PointM[]) => points.map(({ x_m, y_m }) => `${number(x_m)},${number(y_m)}`).join(';');
 
 /** What was typed and is no number is kept as none. */
@@ -78,7 +83,7 @@ export function addressOf(place: Place, most = ADDRESS_MAX): string {
   if (place.marked.length > 0) query.set('selected', place.marked.join(','));
   if (place.view) {
     const { center, scale } = place.view;
-    query.set('view', [center.x_m, center.y_m, scale].map(number).join(','));
+    query.set('view', [center.x_m, center.y_m, scale].map((value) => number(value, SEEN_DIGITS)).join(','));
   }
   if (place.layer) query.set('layer', place.layer);
   if (place.hidden.length > 0) query.set('hidden', place.hidden.join(','));

@@ -1,5 +1,5 @@
 import { expect, test } from 'vitest';
-import { exact, moment, number, short, span, unit } from './format';
+import { about, estimate, exact, moment, number, short, span, unit } from './format';
 
 test('what is not known is a dash', () => {
   expect([number(null, 1), short(undefined), span(NaN), number(Infinity, 2)]).toEqual(['–', '–', '–', '–']);
@@ -29,4 +29,10 @@ test('moments have one format, with the offset for who asks', () => {
   expect(moment(at)).toMatch(/^2026-01-0[123] \d\d:\d\d:05$/);
   expect(exact(at)).toMatch(/^2026-01-0[123]T\d\d:\d\d:05[+-]\d\d:\d\d \(.+\)$/);
   expect(Date.parse(exact(at).replace(/ \(.*/, ''))).toBe(Date.parse(at));
+});
+
+test('estimates are short, and a time of day has its day where that is another one', () => {
+  expect([3, 42, 61, 600, 3_700, 7_500].map(estimate)).toEqual(['5 s', '40 s', '1 min', '10 min', '1 h', '2 h 5 min']);
+  const noon = new Date(2026, 0, 31, 12, 0, 0).getTime();
+  expect([about(noon + 125_000, noon), about(noon + 86_400_000, noon)]).toEqual(['12:02', '2026-02-01 12:00']);
 });

@@ -1,23 +1,32 @@
 // Numbers and times for people. What is not known is a dash.
+import { roughly } from './eta';
+import { preferences } from './preferences.svelte';
 import { texts } from './texts';
 
-const cache = new Map<number, Intl.NumberFormat>();
+const cache = new Map<string, Intl.NumberFormat>();
+
+/** Numbers as whoever looks writes them. */
+function formatOf(name: string, options: Intl.NumberFormatOptions): Intl.NumberFormat {
+  const { locale } = preferences;
+  const key = `${locale} ${name}`;
+  let format = cache.get(key);
+  if (!format) {
+    // What rounds to zero has no sign.
+    format = new Intl.NumberFormat(locale, { useGrouping: false, signDisplay: 'negative', ...options });
+    cache.set(key, format);
+  }
+  return format;
+}
 
 /** A number with a fixed count of digits after the point. */
 export function number(value: number | null | undefined, digits: number): string {
   if (value === null || value === undefined || !Number.isFinite(value)) return texts.unknown;
-  let format = cache.get(digits);
-  if (!format) {
-    format = new Intl.NumberFormat('en', {
-      minimumFractionDigits: digits,
-      maximumFractionDigits: digits,
-      useGrouping: false,
-      // What rounds to zero has no sign.
-      signDisplay: 'negative',
-    });
-    cache.set(digits, format);
-  }
-  return format.format(value);
+  return formatOf(`${digits}`, { minimumFractionDigits: digits, maximumFractionDigits: digits }).format(value);
+}
+
+/** Three significant digits at most, without zeros behind them. */
+export function plain(value: number): string {
+  return formatOf('plain', { maximumSignificantDigits: 3 }).format(value);
 }
 
 /** A number with three significant digits. */
@@ -46,9 +55,28 @@ export function span(seconds: number | null | undefined): string {
   return `${number(passed / 86_400, 1)} ${d}`;
 }
 
+/** A span that is an estimate: without its zeros, and no finer than minutes from an hour on. */
+export function estimate(seconds: number): string {
+  const rough = roughly(seconds);
+  const { s, min, h } = texts.unit;
+  const [hours, minutes, rest] = [Math.floor(rough / 3600), Math.floor((rough % 3600) / 60), rough % 60];
+  const named = [[hours, h], [minutes, min], [rest, s]] as const;
+  return named
+    .filter(([count]) => count > 0)
+    .map(([count, name]) => `${count} ${name}`)
+    .join(' ');
+}
+
 /** Time of day of a wall time. */
 export function clock(at: string | number | Date): string {
   return new Date(at).toLocaleTimeString('en-GB');
+}
+
+/** Time of day of a wall time to the minute, with its day unless that is today. */
+export function about(at: number, now: number): string {
+  const [then, today] = [parts(new Date(at)), parts(new Date(now))];
+  const time = then.time.slice(0, -3);
+  return then.day === today.day ? time : `${then.day} ${time}`;
 }
 
 const two = (value: number) => String(value).padStart(2, '0');

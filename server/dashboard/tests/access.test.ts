@@ -1,31 +1,11 @@
 // For everybody: axe-core on every part of the page, and a whole run by keys alone.
-import { readFileSync } from 'node:fs';
-import { createRequire } from 'node:module';
 import type { Page } from 'playwright-core';
 import { expect, test } from 'vitest';
 import type { Mission, Page as ApiPage } from './types';
+import { violations } from './checks';
 import { api, browser, eventually, select, shot, token } from './harness';
 
 const { open } = browser();
-const AXE = readFileSync(createRequire(import.meta.url).resolve('axe-core/axe.min.js'), 'utf8');
-
-interface Result {
-  violations: { id: string; nodes: { html: string; failureSummary: string }[] }[];
-}
-
-/** Says what breaks WCAG 2.2 A or AA or good practice. */
-async function violations(page: Page): Promise<string[]> {
-  // The page's policy lets no inline script run; the protocol's evaluation is not the page's.
-  await page.evaluate(AXE);
-  const result = await page.evaluate(
-    () =>
-      (globalThis as unknown as { axe: { run(): Promise<unknown> } }).axe.run() as Promise<unknown>,
-  );
-  return (result as Result).violations.flatMap((found) =>
-    found.nodes.map((node) => `${found.id}: ${node.html} ${node.failureSummary}`),
-  );
-}
-
 for (const theme of ['light', 'dark'] as const) {
   for (const [name, size] of [
     ['wide', { width: 1360, height: 850 }],

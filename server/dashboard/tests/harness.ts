@@ -11,6 +11,9 @@ const LOOK_AGAIN_MS = 50;
 /** Screenshots are kept here, to be looked at. */
 const SHOTS = new URL('../shots/', import.meta.url).pathname;
 
+/** What tests find in the browser's storage, unless they want something else. */
+const KEPT = { 'tread-units': 'metric', 'tread-guide': 'closed' } as const;
+
 export const server = (): string => inject('server');
 export const token = (): string => inject('token');
 
@@ -77,6 +80,8 @@ export function browser(): { open(options?: Open): Promise<Page> } {
         viewport: options.size ?? { width: 1360, height: 850 },
         colorScheme: options.theme ?? 'light',
         hasTouch: options.hasTouch ?? false,
+        // Tests find things by their English names, whatever the machine speaks.
+        locale: options.locale ?? 'en-US',
       });
       contexts.add(context);
       const page = await context.newPage();
@@ -86,6 +91,13 @@ export function browser(): { open(options?: Open): Promise<Page> } {
           console.error(`CSP: ${event.violatedDirective} ${event.blockedURI}`),
         );
       });
+      // What this browser keeps from before, unless something else was chosen since.
+      const kept = { ...KEPT, ...options.kept };
+      await page.addInitScript((kept) => {
+        for (const [key, value] of Object.entries(kept)) {
+          if (value !== null && localStorage.getItem(key) === null) localStorage.setItem(key, value);
+        }
+      }, kept);
       page.on('pageerror', (error) => amiss.push(error.message));
       page.on('console', (message) => {
         const text = message.text();
@@ -119,14 +131,18 @@ export interface Open {
   size?: { width: number; height: number };
   theme?: 'light' | 'dark';
   hasTouch?: boolean;
+  /** What the browser asks for. */
+  locale?: string;
+  /** What the browser's storage has from before; null for nothing. */
+  kept?: Partial<Record<keyof typeof KEPT, string | null>>;
   /** What the console may say, since the test makes it happen. */
   expected?: RegExp;
   prepare?(page: Page): Promise<void>;
 }
 
 export async function signIn(page: Page, secret: string): Promise<void> {
-  await page.getByLabel('Token').fill(secret);
-  await page.getByRole('button', { name: 'Sign in' }).click();
+  await page.locator('input[name="token"]').fill(secret);
+  await page.locator('form button.main').click();
   await page.locator('button[data-robot]').first().waitFor();
 }
 

@@ -2,6 +2,7 @@
 import type { Page } from 'playwright-core';
 import { expect, test } from 'vitest';
 import type { Mission, MissionDetail, Page as ApiPage } from './types';
+import { overflowing } from './checks';
 import { api, browser, eventually, map, metresAt, select, shot } from './harness';
 
 const { open } = browser();
@@ -11,20 +12,6 @@ const focused = (page: Page) =>
   page.evaluate(() => {
     const at = document.activeElement;
     return at === document.body || !at ? 'body' : `${at.tagName.toLowerCase()} ${at.textContent?.trim().slice(0, 20) ?? ''}`;
-  });
-
-/** Names of what reaches beyond the panel, or beyond the card that it is in. */
-const overflowing = (page: Page) =>
-  page.evaluate(() => {
-    const beyond = (inner: Element, outer: Element) =>
-      inner.getBoundingClientRect().right > outer.getBoundingClientRect().right + 0.5;
-    const panel = document.querySelector('#panel');
-    if (!panel) throw new Error('there is no panel');
-    const found = [...panel.querySelectorAll('input, select, button, label, p, dd')].filter((element) => {
-      const card = element.parentElement?.closest('.card') ?? panel;
-      return element.getBoundingClientRect().width > 0 && (beyond(element, card) || beyond(element, panel));
-    });
-    return found.map((element) => `${element.tagName} ${element.textContent?.trim().slice(0, 30)}`);
   });
 
 for (const [name, size] of [

@@ -30,7 +30,8 @@ export function sentence(error: unknown): string {
 
 /** A sentence from a problem's parts. */
 export function tell(body: ProblemBody): string {
-  const detail = body.detail ? `${body.title}: ${body.detail}` : body.title;
+  const title = texts.problem.title(body.type, body.title);
+  const detail = body.detail ? `${title}: ${body.detail}` : title;
   return `${detail.charAt(0).toUpperCase()}${detail.slice(1)}.`;
 }
 

@@ -67,6 +67,11 @@ export class Draft implements Shape {
     if (index in this.points) this.points[index] = rounded(point);
   }
 
+  /** A point out of numbers, as exactly as they were typed. */
+  typePoint(index: number, point: PointM): void {
+    if (index in this.points) this.points[index] = { ...point };
+  }
+
   remove(index: number): void {
     if (!(index in this.points)) return;
     this.mark();
@@ -75,7 +80,7 @@ export class Draft implements Shape {
 
   /** A circle out of numbers, also of such as are none: what was typed is kept, and said to be wrong. */
   typeCircle(center: PointM, radius_m: number): void {
-    this.center = rounded(center);
+    this.center = { ...center };
     this.radius_m = radius_m;
   }
 

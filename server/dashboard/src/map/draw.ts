@@ -3,7 +3,8 @@ import type { Cell, Geofence, Mission, Terrain, Trajectory } from '../api/schema
 import type { Tracked } from '../state/tracked';
 import type { Theme } from '../state/session.svelte';
 import { texts } from '../texts';
-import { roundUp, type Camera, type PointM } from './camera';
+import { scaleBar, stepM } from '../units';
+import type { Camera, PointM } from './camera';
 import type { Planned } from './approach';
 import type { Draft } from './draft';
 import { HATCHED_CELL_PX, drawFriction, drawInspected } from './draw_friction';
@@ -162,7 +163,7 @@ function labelPlace(polygon: readonly PointM[]): PointM {
 }
 
 function drawGrid(context: CanvasRenderingContext2D, camera: Camera, palette: Palette): void {
-  const step = roundUp(GRID_PX / camera.scale);
+  const step = stepM(GRID_PX / camera.scale);
   const { xMin, yMin, xMax, yMax } = camera.bounds;
   for (const isStrong of [false, true]) {
     context.beginPath();
@@ -363,8 +364,8 @@ function drawCross(context: CanvasRenderingContext2D, camera: Camera, palette: P
 }
 
 function drawScale(context: CanvasRenderingContext2D, camera: Camera, palette: Palette): void {
-  const length = roundUp(SCALE_BAR_PX / camera.scale);
-  const width = length * camera.scale;
+  const { length_m, text } = scaleBar(SCALE_BAR_PX / camera.scale);
+  const width = length_m * camera.scale;
   const [x, y] = [14, camera.height - 14];
   context.beginPath();
   context.moveTo(x, y - 6);
@@ -376,6 +377,5 @@ function drawScale(context: CanvasRenderingContext2D, camera: Camera, palette: P
   context.stroke();
   context.font = '12px system-ui, sans-serif';
   context.textAlign = 'center';
-  const text = length >= 1 ? `${length} m` : length >= 0.01 ? `${Math.round(length * 100)} cm` : `${length * 1000} mm`;
   label(context, text, x + width / 2, y - 8, palette.text, palette);
 }

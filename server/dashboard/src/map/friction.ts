@@ -10,12 +10,12 @@ export interface Range {
   low: number;
   high: number;
   isLog: boolean;
-  unit: string;
-  label: string;
+  readonly unit: string;
+  readonly label: string;
   /** What the legend names between its ends. */
   ticks: number[];
   /** What its ends mean, the lower one first. */
-  ends: readonly [string, string];
+  readonly ends: readonly [string, string];
   /** Colours go from the higher end to the lower one, so that ground that is slippery looks the same. */
   isReversed: boolean;
   /** Whether hatching says how sure the value is. */
@@ -30,9 +30,13 @@ export const RANGES: Record<Quantity, Range> = {
     high: 2,
     isLog: true,
     unit: '',
-    label: texts.map.theta,
+    get label() {
+      return texts.map.theta;
+    },
     ticks: [0.05, 0.1, 0.2, 0.5, 1, 2],
-    ends: [texts.map.ends.firm, texts.map.ends.slippery],
+    get ends() {
+      return [texts.map.ends.firm, texts.map.ends.slippery] as const;
+    },
     isReversed: false,
     isHatched: true,
     value: (friction) => friction.theta,
@@ -42,9 +46,13 @@ export const RANGES: Record<Quantity, Range> = {
     high: 20,
     isLog: true,
     unit: '',
-    label: texts.map.stiffness,
+    get label() {
+      return texts.map.stiffness;
+    },
     ticks: [0.5, 1, 2, 5, 10, 20],
-    ends: [texts.map.ends.slippery, texts.map.ends.firm],
+    get ends() {
+      return [texts.map.ends.slippery, texts.map.ends.firm] as const;
+    },
     isReversed: true,
     isHatched: true,
     value: (friction) => friction.stiffness,
@@ -54,10 +62,14 @@ export const RANGES: Record<Quantity, Range> = {
     high: 1,
     isLog: false,
     unit: '',
-    label: texts.map.peakFriction,
+    get label() {
+      return texts.map.peakFriction;
+    },
     ticks: [0, 0.25, 0.5, 0.75, 1],
     // A low one says nothing bad: nobody has asked for more there.
-    ends: [texts.map.ends.littleShown, texts.map.ends.firm],
+    get ends() {
+      return [texts.map.ends.littleShown, texts.map.ends.firm] as const;
+    },
     isReversed: true,
     isHatched: false,
     value: (friction) => friction.mu_peak_lower_bound ?? null,
@@ -66,10 +78,16 @@ export const RANGES: Record<Quantity, Range> = {
     low: 1 / 60,
     high: 720,
     isLog: true,
-    unit: texts.unit.h,
-    label: texts.map.age,
+    get unit() {
+      return texts.unit.h;
+    },
+    get label() {
+      return texts.map.age;
+    },
     ticks: [1 / 60, 1, 24, 720],
-    ends: [texts.map.ends.fresh, texts.map.ends.old],
+    get ends() {
+      return [texts.map.ends.fresh, texts.map.ends.old] as const;
+    },
     isReversed: false,
     isHatched: false,
     value: (friction) => friction.age_s / 3_600,
@@ -79,9 +97,13 @@ export const RANGES: Record<Quantity, Range> = {
     high: 1_000,
     isLog: true,
     unit: '',
-    label: texts.map.visits,
+    get label() {
+      return texts.map.visits;
+    },
     ticks: [1, 10, 100, 1_000],
-    ends: [texts.map.ends.few, texts.map.ends.many],
+    get ends() {
+      return [texts.map.ends.few, texts.map.ends.many] as const;
+    },
     isReversed: false,
     isHatched: false,
     value: (friction) => friction.segments,

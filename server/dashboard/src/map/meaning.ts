@@ -67,8 +67,3 @@ export function slipOf(theta: number, demand: Demand): number | null {
 export function stoppingM(mu: number | null | undefined, { speed_m_s, acceleration_m_s2 }: Demand): number | null {
   return mu ? speed_m_s ** 2 / (2 * Math.min(mu * G_M_S2, acceleration_m_s2)) : null;
 }
-
-/** Three significant digits, without zeros behind them. */
-export function plain(value: number): string {
-  return String(Number(value.toPrecision(3)));
-}

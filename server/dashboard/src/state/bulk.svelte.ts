@@ -122,7 +122,7 @@ export class Bulk {
   async send(ids: string[], body: (robot: string) => unknown): Promise<void> {
     await this.#each('send', ids, async (id) => {
       const headers = { 'idempotency-key': crypto.randomUUID() };
-      await ask<Mission>('/v1/missions', { method: 'POST', body: body(id), headers });
+      this.fleet.sent(await ask<Mission>('/v1/missions', { method: 'POST', body: body(id), headers }));
       return done(texts.bulk.sent);
     });
   }

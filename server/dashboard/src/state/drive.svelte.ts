@@ -147,16 +147,16 @@ export class Drive {
       this.#pressed.clear();
       this.#stick = null;
       this.wish = { forward: 0, left: 0 };
-      this.said = texts.drive.released(update.released.detail);
+      this.said = texts.drive.released(update.released.cause, update.released.detail);
       this.isTakenByOther = update.released.cause === 'taken';
     } else if ('refused' in update) {
-      this.said = texts.drive.refused(update.refused.detail);
+      this.said = texts.drive.refused(update.refused.cause, update.refused.detail);
       this.isTakenByOther = update.refused.cause === 'leased';
     } else if ('view' in update) {
       this.view = update.view;
       if (this.robot) this.heard(this.robot, update.view);
     } else if ('ended' in update) {
-      this.said = texts.drive.released(update.ended.detail);
+      this.said = texts.drive.released('ended', update.ended.detail);
     }
   }
 

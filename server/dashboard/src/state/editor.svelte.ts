@@ -4,7 +4,10 @@ import { Problem, ask, sentence } from '../api/client';
 import type { DraftState } from '../address';
 import { Draft, RADIUS_MIN_M, type DraftKind } from '../map/draft';
 import type { PointM } from '../map/camera';
+import { plain } from '../format';
+import { preferences } from '../preferences.svelte';
 import { texts } from '../texts';
+import { about, inUnit } from '../units';
 import type { Fleet } from './fleet.svelte';
 
 /** Wait after a change before the dry run is asked for, milliseconds. */
@@ -45,7 +48,8 @@ export class Editor {
   terrainLayer = $state(0);
 
   check = $state.raw<TrajectoryCheck | null>(null);
-  checkProblem = $state<string | null>(null);
+  /** What the server says against the path. */
+  #refusal = $state<string | null>(null);
   isChecking = $state(false);
   sendProblem = $state<string | null>(null);
   isSending = $state(false);
@@ -91,7 +95,7 @@ export class Editor {
     }
     const { center, radius_m, speed_m_s, turns, direction } = trajectory.circle;
     const draft = new Draft('circle');
-    draft.setCircle(center, radius_m);
+    draft.typeCircle(center, radius_m);
     this.speed_m_s = speed_m_s ?? this.speed_m_s;
     this.turns = turns ?? 1;
     this.clockwise = direction === 'clockwise';
@@ -132,15 +136,24 @@ export class Editor {
   get flaw(): string | null {
     const wrong = this.draft?.flaw ?? null;
     if (wrong === 'center') return texts.draw.flaw.center;
-    if (wrong === 'radius') return texts.draw.flaw.radius(RADIUS_MIN_M);
+    const { system } = preferences;
+    if (wrong === 'radius') {
+      return texts.draw.flaw.radius(texts.draw.lengths[system], plain(inUnit('length', RADIUS_MIN_M)));
+    }
     if (wrong !== null) return texts.draw.flaw.point(wrong);
     if (this.draft?.kind === 'terrain') return null;
-    if (!(this.speed_m_s > 0)) return texts.draw.flaw.speed;
+    if (!(this.speed_m_s > 0)) return texts.draw.flaw.speed(texts.draw.speeds[system]);
     const model = this.fleet.byId.get(this.robot)?.robot.model;
     const top = model?.limits.linear_max_m_s ?? Infinity;
-    if (this.speed_m_s > top) return texts.draw.flaw.fast(this.robot, String(Number(top.toFixed(2))));
+    if (this.speed_m_s > top) return texts.draw.flaw.fast(this.robot, about('speed', top));
     if (this.draft?.kind === 'circle' && !(this.turns > 0)) return texts.draw.flaw.turns;
     return Number.isInteger(this.priority) ? null : texts.draw.flaw.priority;
+  }
+
+  /** What is wrong with what is drawn: what was typed, or what the server says of it. */
+  get checkProblem(): string | null {
+    void this.version;
+    return this.draft && !this.draft.isEmpty ? (this.flaw ?? this.#refusal) : this.#refusal;
   }
 
   /** Why the area that is drawn cannot be saved, in one sentence; null when it can. */
@@ -172,7 +185,7 @@ export class Editor {
     this.fleet.isDirty = true;
     this.#key = '';
     this.check = null;
-    this.checkProblem = this.draft?.isEmpty ? null : this.flaw;
+    this.#refusal = null;
     this.#asked += 1;
     this.isChecking = false;
     clearTimeout(this.#due);
@@ -262,7 +275,7 @@ export class Editor {
     this.purpose = null;
     this.draft = null;
     this.check = null;
-    this.checkProblem = null;
+    this.#refusal = null;
     this.sendProblem = null;
     this.fleet.isDirty = true;
   }
@@ -306,7 +319,7 @@ export class Editor {
       });
       if (mine === this.#asked) this.check = check;
     } catch (error) {
-      if (mine === this.#asked) this.checkProblem = sentence(error);
+      if (mine === this.#asked) this.#refusal = sentence(error);
     }
     if (mine === this.#asked) this.isChecking = false;
   }
@@ -323,7 +336,7 @@ export class Editor {
     const body = this.missionFor(this.robot);
     if (!body) return false;
     this.#key ||= crypto.randomUUID();
-    return this.#send('/v1/missions', 'POST', body, { 'idempotency-key': this.#key });
+    return this.#send('/v1/missions', 'POST', body, { 'idempotency-key': this.#key }, this.fleet.sent);
   }
 
   /** What is drawn as a mission of a robot; null while it is none. */
@@ -401,11 +414,12 @@ export class Editor {
     method: 'POST' | 'PUT',
     body: unknown,
     headers: Record<string, string> = {},
+    then: (answer: Mission) => void = () => undefined,
   ): Promise<boolean> {
     this.isSending = true;
     this.sendProblem = null;
     try {
-      await ask(path, { method, body, headers });
+      then(await ask<Mission>(path, { method, body, headers }));
       return true;
     } catch (error) {
       this.sendProblem = sentence(error);

@@ -6,6 +6,8 @@ import { Stream, type Listener } from '../api/stream';
 import { signedIn } from './session.svelte';
 import { doing } from '../standing';
 import { texts } from '../texts';
+import { Pace, remainingS, startsInS } from '../eta';
+import { LatePlans } from './late_plans';
 import { Stops } from './stops.svelte';
 import { Tracked } from './tracked';
 
@@ -59,6 +61,11 @@ export class Fleet implements Listener {
   readonly missions = new SvelteMap<string, Mission>();
   readonly alerts = new SvelteMap<string, Alert>();
   readonly stops = new Stops(() => this.site);
+  readonly #pace = new Pace();
+  readonly #latePlans = new LatePlans(
+    (id) => this.missions.get(id),
+    (mission) => this.mission(mission),
+  );
 
   /** For the map, which draws it afresh each time: not reactive. */
   readonly tracked = new Map<string, Tracked>();
@@ -68,6 +75,8 @@ export class Fleet implements Listener {
   mapChanged: () => void = () => undefined;
   /** Says that an alert was raised since the site was opened. */
   raised: (alert: Alert) => void = () => undefined;
+  /** Says that a mission was sent from this page. */
+  sent: (mission: Mission) => void = () => undefined;
   #isDirty = true;
   /** Steps of missions, for whoever shows a history. */
   lastStep = $state.raw<MissionStep | null>(null);
@@ -77,7 +86,7 @@ export class Fleet implements Listener {
   #listsDue: ReturnType<typeof setTimeout> | undefined;
   #seen: Set<string> | null = null;
   /** Everything of this site was read once: what comes now is new. */
-  #isRead = false;
+  isRead = $state(false);
 
   readonly openMissions = $derived(
     [...this.missions.values()]
@@ -115,6 +124,20 @@ export class Fleet implements Listener {
     if (robot.link === 'offline') return { text: texts.link.offline, look: 'bad' };
     if (this.lostAt !== null) return { text: texts.robots.lastKnown, look: 'warn' };
     return { text: texts.link[robot.link], look: robot.link === 'online' ? 'good' : 'warn' };
+  }
+
+  /** Time until a mission ends, seconds; null where that cannot be known. */
+  remainingS(mission: Mission): number | null {
+    const entry = this.byId.get(mission.robot);
+    if (!entry || this.lostAt !== null || this.stops.inForce.has(mission.robot)) return null;
+    const heard_age_ms = entry.robot.live?.heard_age_ms ?? 0;
+    const age_s = (heard_age_ms + Math.max(0, this.now - entry.receivedAt)) / 1000;
+    return remainingS(mission, entry.robot, age_s, this.#pace);
+  }
+
+  /** Time until a mission that waits begins, seconds; null where that cannot be known. */
+  startsInS(mission: Mission): number | null {
+    return startsInS(mission, this.openMissions, (other) => this.remainingS(other));
   }
 
   /** Robots of the site that are to stand and move. */
@@ -155,7 +178,8 @@ export class Fleet implements Listener {
     this.terrainFriction = [];
     this.fence = null;
     this.stops.forget();
-    this.#isRead = false;
+    this.#pace.forget();
+    this.isRead = false;
     this.isDirty = true;
     this.#stream = new Stream(site, this);
     void this.readGround();
@@ -210,7 +234,7 @@ export class Fleet implements Listener {
     for (const id of this.missions.keys()) if (!seen.has(`m${id}`)) this.missions.delete(id);
     for (const id of this.alerts.keys()) if (!seen.has(`a${id}`)) this.alerts.delete(id);
     this.#seen = null;
-    this.#isRead = true;
+    this.isRead = true;
     this.isDirty = true;
     this.#listsSoon();
     void this.stops.read();
@@ -226,6 +250,7 @@ export class Fleet implements Listener {
     if (robot.retired_at) this.tracked.delete(robot.id);
     else if (known) looksNew = known.update(robot, now, this.tracked.size > CURVES_MAX ? SPARSE_MS : 0);
     else this.tracked.set(robot.id, new Tracked(robot, now));
+    this.#pace.note(robot.id, robot.live?.mission, now - (robot.live?.heard_age_ms ?? 0));
     this.stops.heard(robot);
     if (looksNew) this.wake();
     this.#listsSoon();
@@ -239,6 +264,7 @@ export class Fleet implements Listener {
   mission(mission: Mission): void {
     this.#seen?.add(`m${mission.id}`);
     this.missions.set(mission.id, mission);
+    this.#latePlans.look(mission);
     this.isDirty = true;
     if (this.missions.size > ENDED_MAX * 2) {
       for (const old of this.endedMissions.slice(ENDED_MAX)) this.missions.delete(old.id);
@@ -251,7 +277,7 @@ export class Fleet implements Listener {
 
   alert(alert: Alert): void {
     this.#seen?.add(`a${alert.id}`);
-    if (this.#isRead && !this.alerts.has(alert.id) && !alert.cleared_at && !alert.acknowledged_at) this.raised(alert);
+    if (this.isRead && !this.alerts.has(alert.id) && !alert.cleared_at && !alert.acknowledged_at) this.raised(alert);
     if (alert.cleared_at) this.alerts.delete(alert.id);
     else this.alerts.set(alert.id, alert);
     if (alert.code.startsWith('stop')) void this.stops.read();

@@ -1,0 +1,28 @@
+// The German dictionary.
+import { rightsOf } from '../rights';
+import type { Texts } from './en';
+import { fleet } from './de_fleet';
+import { ground } from './de_ground';
+import { limit, problemTitles, right, role, standing } from './de_words';
+
+export const de: Texts = {
+  name: 'Tread',
+  problem: {
+    lost: 'Der Server antwortet nicht; Ihre Eingaben bleiben erhalten.',
+    unreadable: (status) => `Der Server hat mit Status ${status} und nichts Lesbarem geantwortet.`,
+    title: (type, said) => problemTitles[type] ?? said,
+  },
+  rights: (session) =>
+    session.role
+      ? role[session.role]
+      : rightsOf(session)
+          .map((one) => right[one])
+          .join(', '),
+  standing,
+  limitNames: limit,
+  ...fleet,
+  ...ground,
+  unit: { s: 's', percent: '%', ms: 'ms', deg: '°', h: 'h', d: 'd', min: 'min', radps: 'rad/s', volt: 'V' },
+  pair: (first, second) => `${first}; ${second}`,
+  unknown: '–',
+};

@@ -1,0 +1,137 @@
+// English words for what the API enumerates.
+import type {
+  BindingLimit,
+  Cause,
+  GateCause,
+  LinkState,
+  MissionState,
+  PauseCause,
+  RobotMode,
+  Right,
+  Role,
+  StandingState,
+  TerrainClass,
+} from '../api/schema';
+
+export const link: Record<LinkState, string> = { online: 'online', stale: 'late', offline: 'lost' };
+export const mode: Record<RobotMode, string> = {
+  idle: 'idle',
+  tracking: 'on a mission',
+  teleoperated: 'teleoperated',
+  stopped: 'stopped',
+  fault: 'fault',
+};
+export const missionState: Record<MissionState, string> = {
+  queued: 'waiting',
+  offered: 'offered',
+  active: 'driving',
+  paused: 'paused',
+  cancelling: 'ending',
+  succeeded: 'succeeded',
+  failed: 'failed',
+  cancelled: 'cancelled',
+  rejected: 'rejected',
+  expired: 'expired',
+};
+export const cause: Record<Cause, string> = {
+  requested: 'asked for',
+  offered: 'offered to the robot',
+  returned: 'given back by the robot',
+  accepted: 'the robot has taken it',
+  rejected: 'the robot refuses it',
+  pause_requested: 'a pause is asked for',
+  paused: 'the robot stands',
+  resume_requested: 'going on is asked for',
+  resumed: 'the robot goes on',
+  replace_requested: 'another path is asked for',
+  replaced: 'the robot has the other path',
+  replace_refused: 'the robot refuses the other path',
+  cancel_requested: 'its end is asked for',
+  superseded: 'another mission took its place',
+  cancelled: 'ended before its path did',
+  succeeded: 'driven to its end',
+  failed: 'the robot could not go on',
+  expired: 'waited too long',
+  robot_lost: 'the robot is not heard',
+  agent_restarted: 'the robot started afresh',
+  robot_forgot: 'the robot no longer knows it',
+  robot_retired: 'the robot is retired',
+  noted: 'noted',
+};
+export const limit: Record<BindingLimit, string> = {
+  lateral_acceleration: 'sideways acceleration',
+  angular_speed: 'turning speed',
+  wheel_speed: 'wheel speed',
+  wheel_acceleration: 'wheel acceleration',
+  linear_acceleration: 'acceleration',
+  traction: 'traction limit of the ground',
+};
+export const gate: Record<GateCause, string> = {
+  acceleration: 'acceleration limit',
+  speed: 'speed limit',
+  command_age: 'commands come late',
+  external_limit: 'limited from outside',
+  fence: 'near the fence',
+  not_finite: 'command is no number',
+  no_command: 'no command',
+  lease: 'last command has ended',
+  link_policy: 'server not heard',
+  external_hold: 'held from outside',
+  loop_overrun: 'control loop is late',
+  sensor_fault: 'sensors contradict each other',
+  stale_position: 'position is old',
+  tilt: 'leans too much',
+  stale_feedback: 'base is silent',
+  stop: 'stop',
+  other: 'another reason',
+};
+export const pausedBy: Record<PauseCause, string> = {
+  request: 'on request',
+  teleoperation: 'teleoperated',
+  stop: 'stopped',
+  other: 'another reason',
+};
+export const terrainClass: Record<TerrainClass, string> = {
+  asphalt: 'asphalt',
+  concrete: 'concrete',
+  paving: 'paving',
+  gravel: 'gravel',
+  soil: 'soil',
+  grass: 'grass',
+  sand: 'sand',
+  mud: 'mud',
+  snow: 'snow',
+  ice: 'ice',
+  wood: 'wood',
+  metal: 'metal',
+  other: 'other',
+};
+export const role: Record<Role, string> = { viewer: 'viewer', operator: 'operator', admin: 'admin' };
+
+export const right: Record<Right, string> = {
+  stop: 'stop',
+  read: 'read',
+  drive: 'drive',
+  clear_stop: 'clear stops',
+  hold: 'hold',
+  release_hold: 'release holds',
+  dispatch: 'dispatch',
+  acknowledge: 'acknowledge',
+  configure: 'configure',
+  administer: 'administer',
+};
+
+export const standing: Record<StandingState, string> = {
+  stopping: 'stopping',
+  standing: 'stopped, stands',
+  does_not_stand: 'DOES NOT STAND',
+  moves: 'MOVES WHILE STOPPED',
+  other: 'stopped',
+};
+
+/** How points are drawn: with a mouse and keys, or with a finger. */
+export function howToDraw(what: string, isTouch: boolean): string {
+  return isTouch
+    ? `Tap on the map to add a ${what}, drag a ${what} to move it, long-press it to delete it.`
+    : `Click on the map to add a ${what}, drag a ${what} to move it, right-click to delete it; by keys: move the map, Enter adds its centre.`;
+}
