@@ -39,11 +39,13 @@ pub enum Verb {
     Lease,
     /// Holds or slows the robot by an external limit.
     Limit,
+    /// Requests states at a higher rate for a limited time.
+    StateRate,
 }
 
 impl Verb {
     /// Every verb.
-    pub const ALL: [Self; 9] = [
+    pub const ALL: [Self; 10] = [
         Self::Offer,
         Self::Cancel,
         Self::Pause,
@@ -53,6 +55,7 @@ impl Verb {
         Self::Clear,
         Self::Lease,
         Self::Limit,
+        Self::StateRate,
     ];
 
     /// Returns the verb as a chunk of a key.
@@ -67,6 +70,7 @@ impl Verb {
             Self::Clear => "clear",
             Self::Lease => "lease",
             Self::Limit => "limit",
+            Self::StateRate => "state_rate",
         }
     }
 

@@ -41,6 +41,7 @@ use crate::recording::{RecordWriter, RunHead};
 use crate::reporter::{Reporter, log_losses};
 use crate::safety::Safety;
 use crate::safety::latch_file::LatchFile;
+use crate::state_rate::PublishRate;
 use crate::supervisor::{PartEnded, Supervisor};
 
 /// Longest time that a stopping agent waits for the server to accept its last records.
@@ -166,10 +167,8 @@ impl Agent {
         threads.extend(writing);
         let stop = || supervisor.stop_token();
         supervisor.spawn("outbox", outbox.clone().keep_synced(stop()));
-        supervisor.spawn(
-            "losses",
-            log_losses(Arc::clone(&shared), counts.clone(), stop()),
-        );
+        let losses = log_losses(Arc::clone(&shared), counts.clone(), stop());
+        supervisor.spawn("losses", losses);
 
         let reporter = Arc::new(Reporter {
             identity: identity.clone(),
@@ -179,6 +178,7 @@ impl Agent {
             safety: Arc::clone(&safety),
             outbox: outbox.clone(),
             rate_hz: config.rate_hz,
+            publish_rate: Arc::new(PublishRate::new(config.state_rate_hz)),
             states: AtomicU64::new(0),
             frictions: AtomicU64::new(0),
             alerts: Mutex::default(),
@@ -192,6 +192,7 @@ impl Agent {
             site,
             shared: Arc::clone(&shared),
             safety,
+            publish_rate: Arc::clone(&reporter.publish_rate),
             to_loop: commands,
         });
         let (connected, is_connected) = watch::channel(false);

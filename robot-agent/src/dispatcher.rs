@@ -1,4 +1,5 @@
-//! Answers the server's commands: offers, pauses, cancellations, new definitions of the site.
+//! Answers the server's commands: offers, pauses, cancellations, new definitions of the site, requests
+//! for states more often.
 //!
 //! Offers are processed one after the other, so that a repeated offer finds the first one decided;
 //! all other commands run concurrently, so that planning does not delay a cancellation. Planning
@@ -41,6 +42,7 @@ use crate::fleet::{Commands, IncomingCommand};
 use crate::knowledge::{Missions, SiteCell};
 use crate::missions::{ActiveMission, CancelDecision, OfferDecision};
 use crate::safety::{Safety, answers};
+use crate::state_rate::PublishRate;
 
 /// Capacity of the queue of offers; the server repeats an offer that finds it full.
 const OFFERS_MAX: usize = 8;
@@ -66,6 +68,7 @@ pub(crate) struct Dispatcher {
     pub(crate) site: Arc<SiteCell>,
     pub(crate) shared: Arc<Shared>,
     pub(crate) safety: Arc<Safety>,
+    pub(crate) publish_rate: Arc<PublishRate>,
     pub(crate) to_loop: SyncSender<LoopCommand>,
 }
 
@@ -105,7 +108,7 @@ impl Dispatcher {
                 let lane = match command.verb {
                     Verb::Offer => &to_planner,
                     Verb::Stop | Verb::Clear | Verb::Lease | Verb::Limit => &to_guard,
-                    Verb::Cancel | Verb::Pause | Verb::Resume | Verb::Site => {
+                    Verb::Cancel | Verb::Pause | Verb::Resume | Verb::Site | Verb::StateRate => {
                         self.respond(command).await;
                         continue;
                     }
@@ -173,6 +176,10 @@ impl Dispatcher {
             Verb::Limit => {
                 let limit = async |limit| answers::limit(&self.safety, &limit);
                 self.answer(command, limit).await;
+            }
+            Verb::StateRate => {
+                let rate = async |asked| self.publish_rate.request(asked);
+                self.answer(command, rate).await;
             }
         }
     }

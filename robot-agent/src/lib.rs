@@ -7,8 +7,8 @@
 //! * [`agent`] starts and stops all parts; [`program`] is the process; [`config`] is `robot.toml`.
 //! * The loop: `control_loop`, the base behind [`drive`], the simulated one in [`sim`].
 //! * Around it: [`missions`] (state of missions), `dispatcher` (answers commands), `alerts`,
-//!   `recorder` and [`outbox`] (durable records), `reporter` (published state), [`fleet`] (the only
-//!   user of zenoh).
+//!   `recorder` and [`outbox`] (durable records), `reporter` (published state), `state_rate`
+//!   (how often), [`fleet`] (the only user of zenoh).
 //! * [`membership`]: enrolment and renewal of the robot's certificate.
 //! * `safety`: stops, limits and teleoperation.
 //! * `recording`: records of the loop's inputs and outputs, and their replay.
@@ -45,6 +45,7 @@ mod recorder;
 mod recording;
 mod reporter;
 mod safety;
+mod state_rate;
 mod supervisor;
 
 pub use agent::{Agent, RunningAgent};

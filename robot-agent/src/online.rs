@@ -61,9 +61,11 @@ impl Online {
         let (shared, clock) = (&self.dispatcher.shared, &self.dispatcher.clock);
         let (shared, clock) = (Arc::clone(shared), Arc::clone(clock));
         let heard = self.heard.clone();
+        let publish_rate = Arc::clone(&self.reporter.publish_rate);
         let note: Note = Arc::new(move |noted| match noted {
             Noted::ServerHeard => shared.note_server_heard(clock.monotonic()),
             Noted::CommandLost => Shared::count(&shared.lost_commands),
+            Noted::ServerLost => publish_rate.end_request(),
             Noted::Trust(trust) => hear(&heard, ServerTrust::Is(trust)),
             Noted::Distrusted => hear(&heard, ServerTrust::Distrusted),
         });
@@ -94,6 +96,8 @@ impl Online {
         membership: &mut Option<watch::Receiver<Arc<Membership>>>,
         listeners: &Listeners,
     ) -> ControlFlow<()> {
+        // The server that requested it was that of the link before.
+        self.reporter.publish_rate.end_request();
         let shown = membership
             .as_mut()
             .map(|it| Arc::clone(&it.borrow_and_update()));
@@ -140,7 +144,7 @@ impl Online {
             tokio::join!(
                 self.introduce(Arc::clone(&link), welcomed),
                 uploading,
-                publish_states(self.config.state_rate_hz, Arc::clone(&link), reporter),
+                publish_states(Arc::clone(&link), reporter),
                 every(self.config.friction_rate_hz, Arc::clone(&link), |link| {
                     link.publish_friction(&reporter.friction());
                 }),

@@ -24,6 +24,7 @@ use crate::geometry::{wire_pose, wire_twist};
 use crate::knowledge::SiteCell;
 use crate::outbox::Outbox;
 use crate::safety::{Safety, microseconds};
+use crate::state_rate::{PublishRate, PublishTimes};
 
 /// Longest wait for the loop before a change is published: two ticks of the slowest loop.
 const TICK_WAIT_MAX: Duration = Duration::from_millis(100);
@@ -40,6 +41,7 @@ pub(crate) struct Reporter {
     pub(crate) safety: Arc<Safety>,
     pub(crate) outbox: Outbox,
     pub(crate) rate_hz: f64,
+    pub(crate) publish_rate: Arc<PublishRate>,
     pub(crate) states: AtomicU64,
     pub(crate) frictions: AtomicU64,
     pub(crate) alerts: Mutex<Alerts>,
@@ -284,14 +286,13 @@ pub(crate) async fn log_losses(
     }
 }
 
-/// Publishes the state at a fixed rate, and at once when a stop or a lease has begun or ended,
+/// Publishes the state at the present rate, and at once when a stop or a lease has begun or ended,
 /// until the future is dropped.
-pub(crate) async fn publish_states(rate_hz: f64, link: Arc<FleetLink>, reporter: &Reporter) {
-    let mut ticks = tokio::time::interval(Duration::from_secs_f64(rate_hz.recip()));
-    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+pub(crate) async fn publish_states(link: Arc<FleetLink>, reporter: &Reporter) {
+    let mut times = PublishTimes::new(&reporter.publish_rate);
     loop {
         tokio::select! {
-            _ = ticks.tick() => {}
+            () = times.next() => {}
             () = reporter.safety.changed() => reporter.loop_has_seen().await,
         }
         link.publish_state(&reporter.state());

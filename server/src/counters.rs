@@ -155,6 +155,8 @@ counters! {
     offers_sent,
     /// Commands that their robot did not answer in time.
     commands_unanswered,
+    /// Requests for states at a higher rate sent to watched robots, with repetitions.
+    state_rates_asked,
     /// Stop commands sent to robots, with repetitions.
     stops_sent,
     /// Stop commands not confirmed by their robot within 300 ms.

@@ -148,6 +148,8 @@ impl Server {
         fleet.listen(&app, uploads).await?;
         supervisor.spawn_vital("reconciler", reconciler::run(app.clone(), stop()));
         supervisor.spawn_vital("events", events::run(app.clone(), stop()));
+        let asking = app::watched::run(app.clone(), stop());
+        supervisor.spawn_vital("watched robots", asking);
         look_after_database(&app, &supervisor);
         let telling = app::friction::live::run(app.clone(), stop());
         supervisor.spawn_vital("map", telling);

@@ -1,5 +1,5 @@
-//! State that a robot publishes periodically, and the server's pulse. Only the newest message
-//! counts, so a lost one does no harm.
+//! State that a robot publishes periodically, the request for a higher rate of it, and the server's
+//! pulse. Only the newest message counts, so a lost one does no harm.
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -8,12 +8,14 @@ use crate::enrolment::TrustId;
 use crate::friction::LiveFriction;
 use crate::geometry::{Pose, Twist};
 use crate::ids::{BootId, RobotId};
+use crate::keys::Verb;
 use crate::robot::{
     Aged, AlertReport, Battery, LoopStatus, MissionProgress, OutboxStatus, RobotMode,
 };
 use crate::safety::SafetyStatus;
 use crate::site::Cell;
 use crate::terrain::TerrainRef;
+use crate::wire::reply::{Acknowledgement, Command};
 
 /// State of a robot, published on its `state` key.
 ///
@@ -71,6 +73,46 @@ pub struct RobotState {
     pub safety: SafetyStatus,
 }
 
+/// State rate that the server requests while somebody watches or drives a robot, Hz.
+pub const WATCHED_STATE_RATE_HZ: f64 = 10.0;
+/// Maximum state rate that an agent takes from a request, Hz.
+pub const STATE_RATE_MAX_HZ: f64 = 20.0;
+/// Maximum duration of a request for a state rate, milliseconds; an agent shortens a longer one.
+pub const STATE_RATE_FOR_MAX_MS: u64 = 10_000;
+
+/// `cmd/state_rate`: requests states at a rate for a limited time.
+///
+/// The newest request counts. An agent reduces a rate above [`STATE_RATE_MAX_HZ`] to it, and never
+/// publishes at less than its own configured rate. When the time has passed or the connection is
+/// lost, the agent returns to its own rate. A rate that [`StateRate::validate`] refuses is answered
+/// as `impossible`. An agent of an older release does not answer.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct StateRate {
+    /// Rate of states, Hz, above 0.
+    pub rate_hz: f64,
+    /// Duration of the request from its arrival, milliseconds; 0 ends the one before.
+    pub for_ms: u64,
+}
+
+impl StateRate {
+    /// Checks the rate.
+    ///
+    /// # Errors
+    /// A message for people, if the rate is not finite or not above 0.
+    pub fn validate(&self) -> Result<(), String> {
+        let rate_hz = self.rate_hz;
+        if rate_hz.is_finite() && rate_hz > 0.0 {
+            return Ok(());
+        }
+        Err(format!("rate_hz must be finite and above 0, not {rate_hz}"))
+    }
+}
+
+impl Command for StateRate {
+    const VERB: Verb = Verb::StateRate;
+    type Reply = Acknowledgement;
+}
+
 /// Pulse of the server, published every [`PULSE_PERIOD_MS`] milliseconds on the site's `pulse` key.
 ///
 /// From it a robot measures for how long the server has been silent.
@@ -104,4 +146,30 @@ pub struct FrictionReport {
     pub terrain: Option<TerrainRef>,
     /// Estimates of the tracking law and of the estimator.
     pub friction: LiveFriction,
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::wire;
+
+    proptest! {
+        #[test]
+        fn a_state_rate_survives_the_wire_and_only_a_positive_finite_rate_is_valid(
+            rate_hz in any::<f64>(),
+            for_ms in 0..1_u64 << 53,
+        ) {
+            let asked = StateRate { rate_hz, for_ms };
+            prop_assert_eq!(asked.validate().is_ok(), rate_hz.is_finite() && rate_hz > 0.0);
+            let read = wire::encode(&asked).ok().map(|text| wire::decode::<StateRate>(&text));
+            if rate_hz.is_finite() {
+                prop_assert_eq!(read.unwrap().unwrap(), asked);
+            } else {
+                // No such number exists on the wire.
+                prop_assert!(!matches!(read, Some(Ok(_))));
+            }
+        }
+    }
 }

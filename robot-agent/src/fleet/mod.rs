@@ -71,6 +71,8 @@ pub enum Noted {
     ServerHeard,
     /// A command was dropped because the queue was full; the server repeats it.
     CommandLost,
+    /// The server is not reachable any more.
+    ServerLost,
     /// The server stated which authorities robots shall trust.
     Trust(TrustId),
     /// The server's robot port shows a certificate of an authority that this robot does not trust.
@@ -313,11 +315,14 @@ impl FleetLink {
         let hello = querier(keys::hello(site, robot), HELLO_TIMEOUT, Priority::DataHigh)
             .map_err(zenoh_failed("declare `hello`"))?;
         let (seen_sender, server_seen) = watch::channel(0_u64);
+        let lost = Arc::clone(&listeners.note);
         hello
             .matching_listener()
             .callback(move |status| {
                 if status.matching() {
                     seen_sender.send_modify(|count| *count += 1);
+                } else {
+                    lost(Noted::ServerLost);
                 }
             })
             .background()

@@ -10,6 +10,7 @@ mod control;
 mod recording;
 mod rig;
 mod safety;
+mod state_rate;
 mod support;
 
 use std::path::Path;

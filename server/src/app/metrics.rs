@@ -248,6 +248,11 @@ impl App {
                 "Drive sockets that are open",
             ),
             (
+                "tread_robots_watched",
+                self.watched_robots(),
+                "Robots that somebody watches or drives by a drive socket",
+            ),
+            (
                 "tread_event_clients",
                 self.hub().client_count(),
                 "Event clients",

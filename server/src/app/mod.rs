@@ -31,6 +31,7 @@ pub mod stops;
 pub mod storage;
 pub mod teleop;
 pub mod terrains;
+pub mod watched;
 pub mod webhooks;
 pub mod withdrawals;
 
@@ -58,6 +59,7 @@ use self::shares::Shares;
 use self::stops::Unrecorded;
 use self::storage::Storage;
 use self::teleop::Holds;
+use self::watched::Watched;
 use self::webhooks::Webhooks;
 use crate::clock::Clock;
 use crate::config::webhooks::WebhooksConfig;
@@ -112,6 +114,7 @@ struct Inner {
     allowances: Allowances,
     holds: Holds,
     drive_shares: Shares,
+    watched: Watched,
     event_shares: Shares,
     webhooks: Webhooks,
 }
@@ -191,6 +194,7 @@ impl App {
             allowances: Allowances::default(),
             holds: Holds::default(),
             drive_shares: Shares::new(teleop::SHARES),
+            watched: Watched::default(),
             event_shares: Shares::new(events::SHARES),
             webhooks: Webhooks::new(webhooks),
         };
@@ -352,6 +356,10 @@ impl App {
 
     fn holds(&self) -> &Holds {
         &self.inner.holds
+    }
+
+    fn watched(&self) -> &Watched {
+        &self.inner.watched
     }
 
     fn allowances(&self) -> &Allowances {

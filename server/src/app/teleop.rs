@@ -30,6 +30,7 @@ use super::missions::control::hold_all;
 use super::robot_link::DrivePublisher;
 use super::shares::{Bounds, Place};
 use super::stops::StopWords;
+use super::watched::Watch;
 use super::{App, AppError};
 use crate::app::presence::RobotKey;
 use crate::db;
@@ -139,6 +140,7 @@ pub struct Session {
     key: RobotKey,
     client: Uuid,
     active: Option<ActiveLease>,
+    _watch: Watch,
     /// The server's stop waits until the session has commanded the robot to stop; dropped last.
     _attended: TaskTrackerToken,
 }
@@ -153,6 +155,7 @@ impl App {
         Ok(Session {
             app: self.clone(),
             _attended: self.supervisor().attend(),
+            _watch: self.watched().begin((site.clone(), robot.clone())),
             key: (site.clone(), robot.clone()),
             client: Uuid::new_v4(),
             active: None,

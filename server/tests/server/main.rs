@@ -68,4 +68,6 @@ mod stops;
 #[cfg(test)]
 mod storage;
 #[cfg(test)]
+mod watched;
+#[cfg(test)]
 mod webhooks;

@@ -7,6 +7,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use serde::de::DeserializeOwned;
+use tokio::time::Instant;
 use tread_api::ids::{BootId, RobotId};
 use tread_api::keys::{self, Verb};
 use tread_api::mission::Mission;
@@ -17,7 +18,7 @@ use tread_api::wire::hello::{Hello, SiteDefinition, Welcome};
 use tread_api::wire::ingest::{Batch, MissionPhase, Receipt, Record};
 use tread_api::wire::reply::CommandRefusalCode;
 use tread_api::wire::safety::{ClearStop, DriveCommand, ExternalLimit, LeaseCommand, Stop};
-use tread_api::wire::state::RobotState;
+use tread_api::wire::state::{RobotState, StateRate};
 use tread_api::wire::{self, Refusal};
 use tread_server::supervisor::Supervisor;
 use uuid::Uuid;
@@ -48,7 +49,9 @@ struct Heard {
     leases: Vec<LeaseCommand>,
     limits: Vec<ExternalLimit>,
     drives: Vec<DriveCommand>,
+    state_rates: Vec<(Instant, StateRate)>,
     deaf_to_stops: bool,
+    deaf_to_state_rates: bool,
     stops_are_over: bool,
     epoch: u64,
 }
@@ -143,7 +146,9 @@ impl Robot {
             leases: Vec::new(),
             limits: Vec::new(),
             drives: Vec::new(),
+            state_rates: Vec::new(),
             deaf_to_stops: false,
+            deaf_to_state_rates: false,
             stops_are_over: false,
             epoch: 0,
         }));
@@ -180,7 +185,7 @@ impl Robot {
         let beats = Arc::clone(&beating);
         let supervisor = Supervisor::new();
         let stop = supervisor.stop_token();
-        let clock = tokio::time::Instant::now();
+        let clock = Instant::now();
         supervisor.spawn_vital("speaking", async move {
             while !stop.is_cancelled() {
                 let payload = {
@@ -297,6 +302,16 @@ impl Robot {
 
     pub(crate) fn drives(&self) -> Vec<DriveCommand> {
         self.heard.lock().unwrap().drives.clone()
+    }
+
+    /// The requested state rates, with the time of each.
+    pub(crate) fn state_rates(&self) -> Vec<(Instant, StateRate)> {
+        self.heard.lock().unwrap().state_rates.clone()
+    }
+
+    /// Lets it know no state rates, as an agent of an older release.
+    pub(crate) fn be_deaf_to_state_rates(&self) {
+        self.heard.lock().unwrap().deaf_to_state_rates = true;
     }
 
     pub(crate) fn state(&self) -> RobotState {

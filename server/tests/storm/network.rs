@@ -50,7 +50,8 @@ impl World {
             | Verb::Stop
             | Verb::Clear
             | Verb::Lease
-            | Verb::Limit => return,
+            | Verb::Limit
+            | Verb::StateRate => return,
         };
         let mission = mission.expect("the server writes what can be read");
         if self.held.contains(&mission) {

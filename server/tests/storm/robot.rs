@@ -245,7 +245,7 @@ impl Robot {
                 let held = self.hold(&pause, verb == Verb::Pause);
                 self.acknowledges(held)
             }
-            Verb::Site => self.acknowledges(Ok(())),
+            Verb::Site | Verb::StateRate => self.acknowledges(Ok(())),
             Verb::Stop => {
                 let latched = self.latch(wire::decode(payload).expect("a stop"));
                 self.acknowledges(latched)

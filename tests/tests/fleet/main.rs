@@ -18,6 +18,8 @@ mod pages;
 mod safety;
 #[cfg(test)]
 mod scenario;
+#[cfg(test)]
+mod state_rate;
 
 use std::path::Path;
 

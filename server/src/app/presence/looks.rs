@@ -3,11 +3,11 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use tread_api::ids::{MissionId, StopId};
+use tread_api::ids::{BootId, MissionId, StopId};
 use tread_api::rights::Scope;
 use tread_api::robot::{LinkCause, LinkState, MissionProgress};
 
-use super::{OFFSETS_MAX, Presence, Presences, RobotKey, stop_of};
+use super::{Presence, Presences, RobotKey, stop_of};
 
 /// Revisions of a site's data that a robot reports.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -71,8 +71,8 @@ impl Presences {
             .iter()
             .filter(|(_, presence)| presence.link(now) != LinkState::Offline);
         let shown = |presence: &Presence| {
-            let has_enough = presence.clock_offsets_ms.len() >= OFFSETS_MAX;
-            let offset_ms = has_enough.then(|| presence.clock_offset_ms());
+            let offset_ms = presence.clock_offsets_ms.has_enough();
+            let offset_ms = offset_ms.then(|| presence.clock_offset_ms());
             Some(Showing {
                 mission: presence.state()?.mission,
                 clock_offset_ms: offset_ms.unwrap_or(0),
@@ -109,6 +109,14 @@ impl Presences {
         online
             .map(|(key, presence)| (key.clone(), held(presence)))
             .collect()
+    }
+
+    /// Returns the present run of a robot that is online at `now`; `None` if it is not.
+    pub fn online_run(&self, key: &RobotKey, now: Duration) -> Option<BootId> {
+        let robots = self.lock();
+        let presence = robots.get(key)?;
+        let (boot, _since) = presence.boot()?;
+        (presence.link(now) == LinkState::Online).then_some(boot)
     }
 
     /// Returns, for each robot heard at `now` that reports a mission, the robot and that mission.

@@ -4,8 +4,9 @@
 mod duplicate_agent;
 mod looks;
 mod news;
+mod offsets;
 
-use std::collections::{BTreeSet, HashMap, VecDeque};
+use std::collections::{BTreeSet, HashMap};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -20,8 +21,10 @@ pub use self::duplicate_agent::DuplicateAgent;
 use self::duplicate_agent::OtherRun;
 pub use self::looks::{Attending, Held, Showing};
 use self::news::Shown;
+use self::offsets::Offsets;
 
-/// Maximum age of the last heartbeat of an online robot: three periods at 5 Hz.
+/// Maximum age of the last heartbeat of an online robot: three periods at 5 Hz, the rate at which a
+/// robot publishes that nobody watches.
 pub const ONLINE_TIMEOUT: Duration = Duration::from_millis(700);
 /// Age of the last heartbeat beyond which a robot is offline, whether or not its liveliness token
 /// is there.
@@ -65,10 +68,10 @@ pub struct Presence {
     went_suddenly: bool,
     /// Offsets of the robot's wall clock, robot minus server, milliseconds, of the last states. The
     /// largest is of the state with the shortest delay.
-    clock_offsets_ms: VecDeque<i64>,
+    clock_offsets_ms: Offsets,
     /// Offsets of the robot's monotonic clock, robot minus server, microseconds, of the last
     /// states.
-    monotonic_offsets_us: VecDeque<i64>,
+    monotonic_offsets_us: Offsets,
     alerts_changed: bool,
     other: Option<OtherRun>,
     shown: Option<Shown>,
@@ -132,7 +135,7 @@ impl Presence {
     /// Returns the offset of the robot's wall clock, robot minus server, milliseconds; 0 if it is
     /// not known.
     pub fn clock_offset_ms(&self) -> i64 {
-        self.clock_offsets_ms.iter().copied().max().unwrap_or(0)
+        self.clock_offsets_ms.largest().unwrap_or(0)
     }
 
     /// Returns the robot's monotonic clock at `now`, microseconds, with the run that it belongs to.
@@ -140,7 +143,7 @@ impl Presence {
     /// never too late. `None` for a robot that does not send its clock.
     pub fn robot_clock_us(&self, now: Duration) -> Option<(BootId, u64)> {
         let (boot, _since) = self.boot?;
-        let ahead_us = self.monotonic_offsets_us.iter().copied().max()?;
+        let ahead_us = self.monotonic_offsets_us.largest()?;
         let now_us = i64::try_from(now.as_micros()).ok()?;
         let clock_us = u64::try_from(now_us.saturating_add(ahead_us)).ok()?;
         Some((boot, clock_us))
@@ -236,9 +239,6 @@ impl Presence {
         }
     }
 }
-
-/// Number of states of which the clocks' offsets are kept.
-const OFFSETS_MAX: usize = 16;
 
 /// Presence of all robots.
 #[derive(Debug, Default)]
@@ -358,16 +358,10 @@ impl Presences {
             return if news { Heard::News } else { Heard::Nothing };
         }
         let ahead_ms = state.robot_time.duration_since(wall).as_millis();
-        if presence.clock_offsets_ms.len() >= OFFSETS_MAX {
-            presence.clock_offsets_ms.pop_front();
-        }
         let ahead_ms = i64::try_from(ahead_ms).unwrap_or(i64::MAX);
-        presence.clock_offsets_ms.push_back(ahead_ms);
+        presence.clock_offsets_ms.push(now, ahead_ms);
         if let Some(ahead_us) = monotonic_offset_us(&state, now) {
-            if presence.monotonic_offsets_us.len() >= OFFSETS_MAX {
-                presence.monotonic_offsets_us.pop_front();
-            }
-            presence.monotonic_offsets_us.push_back(ahead_us);
+            presence.monotonic_offsets_us.push(now, ahead_us);
         }
         let said = presence.state().map(|before| &before.alerts);
         presence.alerts_changed |= said != Some(&state.alerts);

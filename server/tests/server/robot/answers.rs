@@ -2,6 +2,7 @@
 
 use std::sync::Mutex;
 
+use tokio::time::Instant;
 use tread_api::ids::BootId;
 use tread_api::keys::{Key, Verb};
 use tread_api::robot::{MissionProgress, RobotMode};
@@ -15,7 +16,7 @@ use tread_api::wire::reply::{
 use tread_api::wire::safety::{
     AcquireLease, ClearStop, ExternalLimit, LeaseCommand, ReleaseLease, Stop,
 };
-use tread_api::wire::state::RobotState;
+use tread_api::wire::state::{RobotState, StateRate};
 use zenoh::Wait as _;
 
 use super::{Heard, Mood};
@@ -90,6 +91,12 @@ pub(super) fn answer(
         Verb::Limit => {
             heard.limits.push(wire::decode(&payload).unwrap());
             Some(says::<ExternalLimit>(boot, Acknowledgement::Done))
+        }
+        Verb::StateRate => {
+            let asked: StateRate = wire::decode(&payload).unwrap();
+            heard.state_rates.push((Instant::now(), asked));
+            let is_deaf = heard.deaf_to_state_rates;
+            (!is_deaf).then(|| says::<StateRate>(boot, Acknowledgement::Done))
         }
     };
     let Some(payload) = reply else {
