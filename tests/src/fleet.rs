@@ -43,6 +43,7 @@ pub struct Fleet {
     server: Option<Process>,
     agents: HashMap<RobotId, Process>,
     agent_flags: Vec<String>,
+    server_environment: Vec<(String, String)>,
     config: Option<PathBuf>,
 }
 
@@ -81,6 +82,23 @@ impl Fleet {
         fleet
     }
 
+    /// The same, with this configuration of the server, and these variables in its environment.
+    ///
+    /// # Panics
+    /// If the server does not get ready.
+    pub async fn start_in_environment(
+        node: &Path,
+        config: &str,
+        environment: &[(&str, &str)],
+    ) -> Self {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let mut fleet = Self::new(node, folder, Some(config), &[]);
+        let owned = |(name, value): &(&str, &str)| ((*name).to_owned(), (*value).to_owned());
+        fleet.server_environment = environment.iter().map(owned).collect();
+        fleet.start_server().await;
+        fleet
+    }
+
     async fn start_configured(node: &Path, config: Option<&str>) -> Self {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let mut fleet = Self::new(node, folder, config, &[]);
@@ -110,6 +128,7 @@ impl Fleet {
             server: None,
             agents: HashMap::new(),
             agent_flags: Vec::new(),
+            server_environment: Vec::new(),
             config,
         }
     }
@@ -291,7 +310,8 @@ impl Fleet {
         if let Some(config) = &self.config {
             arguments.push(format!("--config={}", config.display()));
         }
-        self.server = Some(self.start_process("server", &arguments));
+        let environment = &self.server_environment;
+        self.server = Some(self.start_process("server", &arguments, environment));
         let log = self.folder.path().join("server.log");
         let look = || async {
             let ready = self.rest.call(reqwest::Method::GET, "/readyz", None).await;
@@ -424,7 +444,7 @@ impl Fleet {
             format!("--scenario={}", scenario.display()),
         ];
         arguments.extend(self.agent_flags.iter().cloned());
-        let process = self.start_process(name.as_str(), &arguments);
+        let process = self.start_process(name.as_str(), &arguments, &[]);
         self.agents.insert(name.clone(), process);
     }
 
@@ -445,9 +465,16 @@ impl Fleet {
             .await
     }
 
-    fn start_process(&self, name: &str, arguments: &[String]) -> Process {
+    fn start_process(
+        &self,
+        name: &str,
+        arguments: &[String],
+        environment: &[(String, String)],
+    ) -> Process {
         let log = self.folder.path().join(format!("{name}.log"));
-        Process::start(name, &self.node, arguments, &log).expect("the node can be started")
+        let how = (log.as_path(), environment);
+        Process::start_with_environment(name, &self.node, arguments, how)
+            .expect("the node can be started")
     }
 }
 

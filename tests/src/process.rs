@@ -63,10 +63,24 @@ impl Process {
         arguments: &[String],
         log: &Path,
     ) -> anyhow::Result<Self> {
+        Self::start_with_environment(name, program, arguments, (log, &[]))
+    }
+
+    /// The same, with these variables of the environment beside those of this process.
+    ///
+    /// # Errors
+    /// The program cannot be started or its log not be written.
+    pub fn start_with_environment(
+        name: &str,
+        program: &Path,
+        arguments: &[String],
+        (log, environment): (&Path, &[(String, String)]),
+    ) -> anyhow::Result<Self> {
         let log_file = File::options().create(true).append(true).open(log);
         let log_file = log_file.with_context(|| format!("cannot write {}", log.display()))?;
         let child = Command::new(program)
             .args(arguments)
+            .envs(environment.iter().map(|(name, value)| (name, value)))
             .stdin(Stdio::null())
             .stdout(log_file.try_clone()?)
             .stderr(log_file)

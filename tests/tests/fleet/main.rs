@@ -20,6 +20,8 @@ mod safety;
 mod scenario;
 #[cfg(test)]
 mod state_rate;
+#[cfg(test)]
+mod webhooks;
 
 use std::path::Path;
 
