@@ -80,6 +80,11 @@ impl Socket {
         tokio::time::timeout(PATIENCE, reading).await.unwrap()
     }
 
+    /// Reads all that comes until the socket ends.
+    pub(crate) async fn stay(mut self) {
+        while let Some(Ok(_)) = self.0.next().await {}
+    }
+
     /// Waits for the server's close, and gives its code.
     async fn closed(&mut self) -> u16 {
         let reading = async {
