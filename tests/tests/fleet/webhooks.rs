@@ -93,8 +93,8 @@ async fn proxies_of_the_environment_do_not_divert_deliveries_to_webhooks() {
         .await;
         let first = heard.last().unwrap();
         if scheme == "http" {
-            let text = String::from_utf8_lossy(first);
-            assert!(text.starts_with("POST /alerts HTTP/1.1"), "{text}");
+            let line = String::from_utf8_lossy(first);
+            assert!(line.starts_with("POST /alerts HTTP/1.1"), "{line}");
         } else {
             assert_eq!(first.first(), Some(&TLS_HANDSHAKE), "{first:?}");
         }
