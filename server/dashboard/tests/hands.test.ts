@@ -1,6 +1,7 @@
 // Stop and teleoperation, with real robots at the other end.
 import { execFileSync } from 'node:child_process';
 import { readFileSync } from 'node:fs';
+import { setTimeout as delay } from 'node:timers/promises';
 import { expect, inject, test } from 'vitest';
 import type { Page } from 'playwright-core';
 import type { Page as ApiPage, Robot, Stop } from './types';
@@ -27,6 +28,18 @@ async function beginDriving(page: Page, id: string): Promise<void> {
   await select(page, id);
   await page.getByRole('button', { name: 'Teleoperate' }).click();
   await page.getByText('You have the lease.').waitFor();
+}
+
+/** How late what the server sends on the drive socket reaches the page: several commands. */
+const LATE_MS = 300;
+
+async function answersLate(page: Page): Promise<void> {
+  await page.routeWebSocket(/\/drive$/, (socket) => {
+    const server = socket.connectToServer();
+    server.onMessage((message) => {
+      setTimeout(() => socket.send(message), LATE_MS);
+    });
+  });
 }
 
 async function standsStill(id: string): Promise<void> {
@@ -153,6 +166,20 @@ test('a lease is refused while another has it, taken by force, and the loss is s
   await first.getByRole('button', { name: 'Take the lease' }).click();
   await first.getByText('You have the lease.').waitFor();
   await first.getByRole('button', { name: 'Give back' }).click();
+});
+
+test('why a lease was lost stays written when commands were under way', async () => {
+  const first = await open({ prepare: answersLate });
+  const second = await open();
+  await beginDriving(first, 'rover-2');
+  await select(second, 'rover-2');
+  await second.getByRole('button', { name: 'Teleoperate' }).click();
+  await second.getByRole('button', { name: /^Take over from/ }).click();
+  await second.getByText('You have the lease.').waitFor();
+  await first.getByText(/^The lease is gone/).waitFor();
+  await delay(2 * LATE_MS);
+  expect(await first.getByText(/^The lease is gone/).count()).toBe(1);
+  await second.getByRole('button', { name: 'Give back' }).click();
 });
 
 test('the touch stick of a phone drives too', async () => {

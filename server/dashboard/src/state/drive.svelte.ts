@@ -150,6 +150,8 @@ export class Drive {
       this.said = texts.drive.released(update.released.cause, update.released.detail);
       this.isTakenByOther = update.released.cause === 'taken';
     } else if ('refused' in update) {
+      // A command that was under way when the lease was lost: why it was lost stays written.
+      if (update.refused.cause === 'no_lease' && !this.hasLease) return;
       this.said = texts.drive.refused(update.refused.cause, update.refused.detail);
       this.isTakenByOther = update.refused.cause === 'leased';
     } else if ('view' in update) {
