@@ -68,7 +68,7 @@ const BRIDGED: Configuration = Configuration {
 
 /// The robot's model but for its track, which is 0.43 m.
 const WIDE_MODEL: &str = "[model]\nname = \"yi2007\"\ntyres = \"standard\"\nmass_kg = 5.0\n\
-    track_width_m = 0.6\nwheelbase_m = 0.28\nwheel_radius_m = 0.08\nyaw_inertia_kg_m2 = 0.45\n\
+    track_width_m = 0.63\nwheelbase_m = 0.28\nwheel_radius_m = 0.08\nyaw_inertia_kg_m2 = 0.45\n\
     [model.limits]\nlinear_max_m_s = 1.0\nangular_max_rad_s = 2.0\n\
     linear_acceleration_max_m_s2 = 0.8\nlateral_acceleration_max_m_s2 = 1.0\n\
     linear_jerk_max_m_s3 = 4.0\nwheel_speed_max_rad_s = 20.0\n\
