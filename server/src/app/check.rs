@@ -2,6 +2,7 @@
 
 mod drawn;
 mod start;
+mod traction;
 
 use std::ops::RangeInclusive;
 
@@ -9,6 +10,7 @@ use tread_api::geometry::{Point, Polygon, Pose};
 use tread_api::ids::{RobotId, SiteId};
 use tread_api::robot::RobotModel;
 use tread_api::safety::Geofence;
+use tread_api::site::Grid;
 use tread_api::trajectory::{
     BINDINGS_MAX, Binding, BindingLimit, CheckTrajectory, Direction, ExpectedMeasurement, Place,
     StartSource, THETA_ASSUMED, Trajectory, TrajectoryCheck, Waypoint,
@@ -23,7 +25,8 @@ use tread_control::trajectory as planned;
 
 pub(super) use self::drawn::drawn;
 pub(super) use self::start::Place as StartPlace;
-use self::start::{Start, after, earlier};
+use self::start::{Earlier, Start, after, earlier};
+use self::traction::Traction;
 use super::{App, AppError, site_row};
 use crate::db;
 
@@ -38,8 +41,9 @@ const FENCE_STEP_M: f64 = 0.02;
 const FENCE_STEPS_MAX: f64 = 500_000.0;
 
 impl App {
-    /// Plans a trajectory for a robot without moving it. Planning begins at the pose expected after
-    /// the robot's active and queued missions, unless the request gives a pose.
+    /// Plans a trajectory for a robot without moving it, with the traction limits that an offer
+    /// would carry. Planning begins at the pose expected after the robot's active and queued
+    /// missions, unless the request gives a pose.
     ///
     /// # Errors
     /// [`AppError::Impossible`] names place and reason; site and robot must be known.
@@ -65,11 +69,11 @@ impl App {
             });
         }
         let mut tx = self.db().read("check").await?;
-        let site_pk = site_row(&mut tx, &site).await?.pk;
-        let row = db::robots::find(&mut tx, site_pk, &robot).await?;
+        let site_row = site_row(&mut tx, &site).await?;
+        let row = db::robots::find(&mut tx, site_row.pk, &robot).await?;
         let unknown = || AppError::UnknownRobot(site.clone(), robot.clone());
         let row = row.ok_or_else(unknown)?;
-        let fence = control_fence(&db::geofences::present(&mut tx, site_pk).await?);
+        let fence = control_fence(&db::geofences::present(&mut tx, site_row.pk).await?);
         let place = start::Place {
             priority,
             policy: start_policy,
@@ -80,6 +84,10 @@ impl App {
             None => earlier(&mut tx, row.pk, place).await?,
         };
         drop(tx);
+        let named = (&site, &robot);
+        let grid = &site_row.site.grid;
+        let before = self.with_tractions(named, grid, before).await?;
+        let traction = self.traction_along(named, grid, &trajectory).await?;
         let first = match start {
             Some(pose) => Start {
                 pose,
@@ -101,7 +109,11 @@ impl App {
         let model = row.model;
         let checking = move || {
             let start = after(first, &before, &model);
-            check(&model, &trajectory, start, ground, &fence)
+            let asked = Planning {
+                trajectory: &trajectory,
+                traction: &traction,
+            };
+            check(&model, asked, start, ground, &fence)
         };
         match tokio::task::spawn_blocking(checking).await {
             Ok(checked) => checked.map_err(|refused| refused.of(robot)),
@@ -138,12 +150,19 @@ impl App {
         };
         let before = earlier(&mut tx, row.pk, place).await?;
         drop(tx);
+        let grid = &site_row.site.grid;
+        let before = self.with_tractions((site, robot), grid, before).await?;
+        let traction = self.traction_along((site, robot), grid, trajectory).await?;
         let first = self.expected_start((site, robot), trajectory);
         let _turn = self.check_turn().await;
         let trajectory = trajectory.clone();
         let checking = move || {
             let start = after(first, &before, &row.model);
-            match planned(&row.model, &trajectory, start.pose) {
+            let asked = Planning {
+                trajectory: &trajectory,
+                traction: &traction,
+            };
+            match planned(&row.model, asked, start.pose) {
                 Ok(planned) => fenced(&planned, &trajectory, &fence),
                 // A trajectory that cannot be planned is refused by the robot.
                 Err(_impossible) => Ok(()),
@@ -153,6 +172,34 @@ impl App {
             Ok(checked) => checked.map_err(|refused| refused.of(robot.clone())),
             Err(_panic) => Ok(()),
         }
+    }
+
+    /// Returns the traction limits with which the robot would plan a trajectory now.
+    pub(super) async fn traction_along(
+        &self,
+        named: (&SiteId, &RobotId),
+        grid: &Grid,
+        trajectory: &Trajectory,
+    ) -> Result<Traction, AppError> {
+        let prior = self.prior_along(named, trajectory).await?;
+        Ok(Traction::of_prior(prior.as_ref(), grid))
+    }
+
+    /// Returns missions with the traction limits along them.
+    async fn with_tractions(
+        &self,
+        named: (&SiteId, &RobotId),
+        grid: &Grid,
+        missions: Vec<Earlier>,
+    ) -> Result<Vec<(Earlier, Traction)>, AppError> {
+        let mut with = Vec::with_capacity(missions.len());
+        for mission in missions {
+            let traction = self
+                .traction_along(named, grid, mission.trajectory())
+                .await?;
+            with.push((mission, traction));
+        }
+        Ok(with)
     }
 
     /// Returns the robot's present pose, or, if it shows none, the begin of the trajectory.
@@ -245,9 +292,19 @@ pub(super) struct Planned {
     pub(super) plan: Plan,
 }
 
+/// What is planned: a trajectory, and the traction limits of the ground along it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Planning<'a> {
+    pub(super) trajectory: &'a Trajectory,
+    pub(super) traction: &'a Traction,
+}
+
 pub(super) fn planned(
     model: &RobotModel,
-    trajectory: &Trajectory,
+    Planning {
+        trajectory,
+        traction,
+    }: Planning<'_>,
     start: Pose,
 ) -> Result<Planned, Refused> {
     let model = control_model(model).map_err(|error| Refused {
@@ -260,7 +317,7 @@ pub(super) fn planned(
         y_m: start.y_m,
         heading_rad: start.heading_rad,
     };
-    let options = plan_options(trajectory);
+    let options = traction.limiting(&plan_options(trajectory));
     let plan = Plan::with_options(&control_trajectory(trajectory), from, &model, &options)
         .map_err(|error| Refused {
             detail: error.to_string(),
@@ -272,12 +329,13 @@ pub(super) fn planned(
 
 fn check(
     model: &RobotModel,
-    trajectory: &Trajectory,
+    asked: Planning<'_>,
     start: Start,
     ground: AssumedGround,
     fence: &Fence,
 ) -> Result<TrajectoryCheck, Refused> {
-    let planned = planned(model, trajectory, start.pose)?;
+    let planned = planned(model, asked, start.pose)?;
+    let trajectory = asked.trajectory;
     fenced(&planned, trajectory, fence)?;
     let plan = &planned.plan;
     let AssumedGround { theta, has_torque } = ground;

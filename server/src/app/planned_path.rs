@@ -3,12 +3,13 @@
 use tread_api::ids::MissionId;
 use tread_api::trajectory::PlannedPath;
 
-use super::check::{Refused, begin_of, drawn, planned};
+use super::check::{Planning, Refused, begin_of, drawn, planned};
 use super::{App, AppError};
 use crate::db;
 
 impl App {
-    /// Returns the smooth path of a mission's present revision. It begins where its robot planned
+    /// Returns the smooth path of a mission's present revision, with the traction limits that are
+    /// known now. It begins where its robot planned
     /// it, once the robot has accepted it, and at the begin of the trajectory before that.
     ///
     /// # Errors
@@ -20,17 +21,25 @@ impl App {
             .await?
             .ok_or(AppError::UnknownMission(id))?;
         let mission = row.mission;
-        let site_pk = super::site_row(&mut tx, &mission.site).await?.pk;
-        let robot = db::robots::find(&mut tx, site_pk, &mission.robot).await?;
+        let site_row = super::site_row(&mut tx, &mission.site).await?;
+        let robot = db::robots::find(&mut tx, site_row.pk, &mission.robot).await?;
         let unknown = || AppError::UnknownRobot(mission.site.clone(), mission.robot.clone());
         let model = robot.ok_or_else(unknown)?.model;
         drop(tx);
+        let named = (&mission.site, &mission.robot);
+        let traction = self
+            .traction_along(named, &site_row.site.grid, &mission.trajectory)
+            .await?;
         let _turn = self.check_turn().await;
         let trajectory = mission.trajectory;
         let begin = mission.plan.and_then(|plan| plan.begin);
         let planning = move || {
             let begin = begin.unwrap_or_else(|| begin_of(&trajectory));
-            let planned = planned(&model, &trajectory, begin)?;
+            let asked = Planning {
+                trajectory: &trajectory,
+                traction: &traction,
+            };
+            let planned = planned(&model, asked, begin)?;
             Ok(drawn(&planned.plan, &trajectory))
         };
         match tokio::task::spawn_blocking(planning).await {

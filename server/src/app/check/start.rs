@@ -7,7 +7,8 @@ use tread_api::mission::{Mission, MissionState, StartPolicy};
 use tread_api::robot::RobotModel;
 use tread_api::trajectory::{StartSource, Trajectory};
 
-use super::planned;
+use super::traction::Traction;
+use super::{Planning, planned};
 use crate::app::AppError;
 use crate::db::missions::Standing;
 use crate::db::{self, Tx};
@@ -97,6 +98,10 @@ pub(super) async fn earlier(
 }
 
 impl Earlier {
+    pub(super) fn trajectory(&self) -> &Trajectory {
+        &self.trajectory
+    }
+
     fn of(mission: Mission) -> Self {
         let begin = mission.plan.and_then(|plan| plan.begin);
         match mission.replacement {
@@ -117,10 +122,14 @@ impl Earlier {
 
 /// Returns the pose after those missions. Missions that cannot be planned are skipped: the robot
 /// will refuse them and stay where it is.
-pub(super) fn after(first: Start, earlier: &[Earlier], model: &RobotModel) -> Start {
-    earlier.iter().fold(first, |start, mission| {
+pub(super) fn after(first: Start, earlier: &[(Earlier, Traction)], model: &RobotModel) -> Start {
+    earlier.iter().fold(first, |start, (mission, traction)| {
         let from = mission.begin.unwrap_or(start.pose);
-        let Ok(planned) = planned(model, &mission.trajectory, from) else {
+        let asked = Planning {
+            trajectory: &mission.trajectory,
+            traction,
+        };
+        let Ok(planned) = planned(model, asked, from) else {
             return start;
         };
         let plan = &planned.plan;
