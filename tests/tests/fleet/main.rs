@@ -5,6 +5,7 @@ mod chaos;
 mod control;
 #[cfg(test)]
 mod drivers;
+#[cfg(test)]
 mod dry_runs;
 #[cfg(test)]
 mod earlier_state;
