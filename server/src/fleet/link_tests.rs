@@ -16,7 +16,7 @@ use super::access_tests::{Rig, Who, enrolment, put, robot, site};
 use super::gate::LINKS_PER_ROBOT_MAX;
 use super::inbox::STATE_BYTES_MAX;
 use super::routers::Router;
-use super::test_client::{Shown, TestSession};
+use super::test_client::{POLL_INTERVAL, Shown, TestSession, until};
 use crate::rate_limit::RateLimit;
 
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -24,19 +24,8 @@ const PATIENCE: Duration = Duration::from_secs(20);
 const CUT_MAX: Duration = Duration::from_secs(1);
 /// How long a session may try to open, milliseconds: less than the lease of one that stands.
 const OPEN_MS: u32 = 2_000;
-const LOOK_EVERY: Duration = Duration::from_millis(5);
 /// Liveliness tokens of a robot that floods.
 const TOKENS: usize = 2_000;
-
-async fn until(what: &str, mut holds: impl AsyncFnMut() -> bool) {
-    let waiting = async {
-        while !holds().await {
-            tokio::time::sleep(LOOK_EVERY).await;
-        }
-    };
-    let waited = tokio::time::timeout(PATIENCE, waiting).await;
-    assert!(waited.is_ok(), "not within {PATIENCE:?}: {what}");
-}
 
 async fn sessions_on(router: &Arc<Router>) -> usize {
     let router = Arc::clone(router);
@@ -83,7 +72,10 @@ async fn a_robot_that_is_put_out_is_cut_off_within_a_second_and_cannot_come_back
         .note(&enrolment("rover-1", 2, true));
     let took = cut(&mut session, &router).await;
     assert!(took < CUT_MAX, "it took {took:?}");
-    assert_eq!(rig.app.counters().gate_revoked.get(), 1);
+    until("the cut is counted", async || {
+        rig.app.counters().gate_revoked.get() == 1
+    })
+    .await;
     assert!(rig.connect(Who::Own, 300).await.is_none());
     let other = rig.connect(Who::Foreign, 10_000).await;
     other.expect("others are not concerned").close().await;
@@ -255,7 +247,7 @@ async fn a_robot_that_declares_liveliness_tokens_without_end_is_cut_off_for_a_wh
     })
     .await;
     assert!(rig.connect(Who::Own, 300).await.is_none());
-    let undisturbed = tokio::time::timeout(LOOK_EVERY, other.link_ended()).await;
+    let undisturbed = tokio::time::timeout(POLL_INTERVAL, other.link_ended()).await;
     assert!(undisturbed.is_err(), "others are not concerned");
     until("it is let in again", async || {
         rig.connect(Who::Own, OPEN_MS).await.is_some()
@@ -327,7 +319,7 @@ async fn a_robot_that_sends_too_many_bytes_is_read_later_and_keeps_its_link() {
     })
     .await;
     assert!(counters.gate_throttled.get() > 0);
-    let cut = tokio::time::timeout(LOOK_EVERY, session.link_ended()).await;
+    let cut = tokio::time::timeout(POLL_INTERVAL, session.link_ended()).await;
     assert!(cut.is_err(), "its link stays");
     session.close().await;
     end(rig).await;

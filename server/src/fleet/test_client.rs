@@ -19,6 +19,23 @@ use zenoh::{Config, Session, Wait as _};
 /// Maximum time for a link to end.
 const END_TIMEOUT: Duration = Duration::from_secs(15);
 
+/// Maximum time for a state to be reached.
+const STATE_TIMEOUT: Duration = Duration::from_secs(20);
+pub(super) const POLL_INTERVAL: Duration = Duration::from_millis(5);
+
+/// Waits until a state is reached.
+///
+/// A client sees the end of its link before the server has counted it, so tests wait for counters.
+pub(super) async fn until(what: &str, mut holds: impl AsyncFnMut() -> bool) {
+    let waiting = async {
+        while !holds().await {
+            tokio::time::sleep(POLL_INTERVAL).await;
+        }
+    };
+    let waited = tokio::time::timeout(STATE_TIMEOUT, waiting).await;
+    assert!(waited.is_ok(), "not within {STATE_TIMEOUT:?}: {what}");
+}
+
 /// Values that a session shows instead of its own.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Shown {
