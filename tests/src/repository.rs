@@ -4,9 +4,14 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// The repository's root.
+/// The repository's root: of the clone in which cargo runs the test. With a target folder that
+/// clones share, it may have been compiled in another one.
+///
+/// # Panics
+/// Outside of cargo.
 pub fn root() -> PathBuf {
-    let tests = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let tests = std::env::var_os("CARGO_MANIFEST_DIR").expect("cargo runs this and says where");
+    let tests = Path::new(&tests);
     tests.parent().unwrap_or(tests).to_owned()
 }
 

@@ -9,6 +9,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use syn::visit::Visit;
+use tread_tests::repository::{files, root};
 
 /// Crates whose modules are read.
 const CRATES: [&str; 7] = [
@@ -202,10 +203,6 @@ fn read(file: &Path, folder: &Path, module: &[String], modules: &mut Modules) {
     }
 }
 
-fn root() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
-}
-
 fn modules_of(name: &str) -> Modules {
     let folder = root().join(name).join("src");
     let mut modules = Modules::new();
@@ -326,6 +323,20 @@ fn the_layers_of_the_server_name_only_those_below_them() {
         }
     }
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
+/// Cargo does not compile a crate again in another clone that shares its target folder, so a path
+/// that is compiled in leads out of the clone.
+#[test]
+fn no_code_reads_the_folder_in_which_it_was_compiled() {
+    let compiled_in = concat!("env!(\"CARGO_", "MANIFEST_DIR\")");
+    let names = files().into_iter().filter(|name| name.ends_with(".rs"));
+    let is_wrong = |name: &String| {
+        let text = fs::read_to_string(root().join(name)).expect("it can be read");
+        text.contains(compiled_in)
+    };
+    let found: Vec<String> = names.filter(is_wrong).collect();
+    assert!(found.is_empty(), "take the variable at run time: {found:?}");
 }
 
 #[test]

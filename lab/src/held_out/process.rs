@@ -36,6 +36,9 @@ pub enum OdeError {
     /// Compiler or library are not installed.
     #[error("ODE or its compiler is missing: apt-get install libode-dev g++")]
     Missing,
+    /// Its source is not here.
+    #[error("there is no lab/ode/robot.cpp here: run this inside the repository")]
+    Elsewhere,
     /// The program does not compile.
     #[error("`lab/ode/robot.cpp` does not compile: {0}")]
     Build(String),
@@ -65,6 +68,17 @@ fn io_error(action: &'static str) -> impl FnOnce(io::Error) -> OdeError {
     move |source| OdeError::Io { action, source }
 }
 
+/// Returns the folder of the simulator's source: in the crate that cargo runs, or below the present
+/// folder.
+fn source() -> Result<PathBuf, OdeError> {
+    let of_cargo = std::env::var_os("CARGO_MANIFEST_DIR").map(PathBuf::from);
+    let folders = of_cargo.into_iter().chain(["lab".into(), ".".into()]);
+    let mut folders = folders.map(|folder| folder.join("ode"));
+    folders
+        .find(|folder| folder.join("robot.cpp").exists())
+        .ok_or(OdeError::Elsewhere)
+}
+
 /// The compiled simulator.
 #[derive(Debug, Clone)]
 pub struct OdeProgram(PathBuf);
@@ -75,7 +89,7 @@ impl OdeProgram {
     /// # Errors
     /// [`OdeError::Missing`] if ODE is not installed, others if it cannot be compiled.
     pub fn build(folder: &Path) -> Result<Self, OdeError> {
-        let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("ode");
+        let source = source()?;
         let program = folder.join("held-out-robot");
         let time_of = |path: &Path| path.metadata().and_then(|found| found.modified());
         let changed = time_of(&source.join("robot.cpp")).map_err(io_error("read robot.cpp"))?;

@@ -160,8 +160,9 @@ mod tests {
 
     #[test]
     fn the_agents_example_is_read_without_its_certificate_and_its_folder() {
-        let agent = Path::new(env!("CARGO_MANIFEST_DIR")).join("../robot-agent");
-        let robot = Robot::of_file(&agent.join("robot.example.toml")).unwrap();
+        // Tests run in the folder of their crate.
+        let example = Path::new("../robot-agent/robot.example.toml");
+        let robot = Robot::of_file(example).unwrap();
         assert!((robot.model.track_width_m() - 0.43).abs() < 1.0e-12);
         assert_eq!(robot.prior, EstimatorPrior::default());
         let missing = Robot::of_file(Path::new("no-such-robot.toml")).unwrap_err();

@@ -16,6 +16,7 @@ use tread_agent::missions::memory::Memory;
 use tread_api::ids::{MissionId, RobotId};
 use tread_api::mission::MissionState;
 use tread_tests::fleet::{Fleet, SITE};
+use tread_tests::repository::root;
 use tread_tests::rest::Rest;
 use tread_tests::wait::{SHORT, eventually};
 
@@ -39,7 +40,7 @@ const KEPT_DAYS: i64 = 390;
 const REMOVED_BY_AGE: [&str; 3] = ["audit", "join_tokens", "tokens"];
 
 fn fixtures() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/state-before-renaming")
+    root().join("tests/fixtures/state-before-renaming")
 }
 
 fn unpacked(file: &Path) -> Vec<u8> {
