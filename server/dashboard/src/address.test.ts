@@ -1,5 +1,5 @@
 import { expect, test } from 'vitest';
-import { ADDRESS_MAX, addressOf, placeOf, type DraftState, type Place } from './address';
+import { ADDRESS_MAX, addressOf, placeAtStart, placeOf, type DraftState, type Place } from './address';
 
 const draft: DraftState = {
   what: 'mission',
@@ -44,6 +44,22 @@ test('what is shown, selected and drawn comes back from the address as it was', 
   const bare = { ...place, draft: null, robot: null, marked: [], view: null, layer: '', hidden: [], tab: 'robots' } as const;
   expect(addressOf({ ...bare, marked: [], hidden: [] })).toBe('site=yard');
   expect(placeOf('#site=yard')).toEqual({ ...bare, marked: [], hidden: [] });
+});
+
+test('a reload brings back what the tab kept, an address from elsewhere what it says', () => {
+  const bare = { ...place, draft: null, robot: null };
+  const [own, other] = [`#${addressOf(bare)}`, '#site=yard&robot=rover-7'];
+  const tab = { place: addressOf(place, Infinity), address: own };
+  // The address was read before the last change was in it.
+  expect(placeAtStart(own, tab)).toEqual(place);
+  expect(placeAtStart('', tab)).toEqual(place);
+  expect(placeAtStart(other, tab)).toEqual(placeOf(other));
+  expect(placeAtStart(own, { place: '', address: null })).toEqual(bare);
+  expect(placeAtStart(own, { place: '', address: own })).toEqual(bare);
+  // A draft that is too long for the address.
+  const long = { ...place, draft };
+  const short = `#${addressOf(long, 1)}`;
+  expect(placeAtStart(short, { place: addressOf(long, Infinity), address: other })).toEqual(long);
 });
 
 test('what is not understood is left out, and breaks nothing', () => {

@@ -130,6 +130,26 @@ export function placeOf(address: string): Place {
   };
 }
 
+/** What the tab kept when its page went: everything as it was, and the address that it had until then. */
+export interface KeptByTab {
+  place: string;
+  address: string | null;
+}
+
+/**
+ * What a page that starts brings back. An address from elsewhere counts. The tab's own gives way to what the tab kept,
+ * which is newer and has drafts that are too long for an address: browsers reload the address that a page had before
+ * it began to go.
+ */
+export function placeAtStart(hash: string, tab: KeptByTab): Place {
+  const kept = placeOf(tab.place);
+  if (!hash.includes('=') || (hash === tab.address && kept.site)) return kept;
+  const place = placeOf(hash);
+  const bare = (place: Place) => addressOf({ ...place, draft: null });
+  if (!place.draft && bare(kept) === bare(place)) place.draft = kept.draft;
+  return place;
+}
+
 function oneOf<T extends string>(names: readonly T[], name: unknown): T | null {
   return names.find((known) => known === name) ?? null;
 }

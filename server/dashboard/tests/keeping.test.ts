@@ -75,6 +75,26 @@ test('draft, view, selection and layer survive a reload, and go with the address
   await same(other);
 });
 
+test('what was selected just before a reload is selected after it', async () => {
+  const page = await open();
+  for (const robot of ['rover-2', 'rover-1', 'rover-3']) {
+    await select(page, robot);
+    await page.getByRole('heading', { name: robot }).waitFor();
+    await says(page, `robot=${robot}`);
+    await page.getByRole('button', { name: 'All robots' }).click();
+    await says(page, 'site=yard');
+    await eventually('no robot in the address', async () => !(await hash(page)).includes('robot='));
+    // At once, before the address says so.
+    const isBack = page.waitForEvent('domcontentloaded');
+    await page.evaluate((robot) => {
+      document.querySelector<HTMLElement>(`button[data-robot="${robot}"]`)?.click();
+      location.reload();
+    }, robot);
+    await isBack;
+    await page.getByRole('heading', { name: robot }).waitFor();
+  }
+});
+
 test('a robot that is open, a tab, and what a mission is replaced by survive a reload', async () => {
   const trajectory = { circle: { center: { x_m: 8, y_m: 6 }, radius_m: 2, speed_m_s: 0.3, turns: 20 } };
   const body = { site: 'yard', robot: 'rover-1', trajectory, start_policy: 'replace' };

@@ -1,5 +1,5 @@
 // Keeps what is shown, selected and drawn in the address of the page, and brings it back from there.
-import { HIDEABLE, addressOf, placeOf, type DraftState, type Hideable, type Place } from '../address';
+import { HIDEABLE, addressOf, placeAtStart, placeOf, type DraftState, type Hideable, type Place } from '../address';
 import { RANGES, type Quantity } from '../map/friction';
 import type { Editor } from './editor.svelte';
 import type { Fleet } from './fleet.svelte';
@@ -10,6 +10,8 @@ import type { View } from './view.svelte';
 const WRITE_MS = 200;
 /** The whole of it, as long as it may be, for the tab alone: for long drafts, and over a sign-in elsewhere. */
 const TAB_KEY = 'tread-place';
+/** The address that the tab had when its page went: what is reloaded is this one, whatever was put in at the end. */
+const LAST_ADDRESS_KEY = 'tread-address';
 const CHANGE = 'change';
 
 export class AddressSync {
@@ -17,6 +19,8 @@ export class AddressSync {
   #wanted: Place | null;
   draft = $state.raw<DraftState | null>(null);
   #due: ReturnType<typeof setTimeout> | undefined;
+  /** The address as this page found it, or has put it in since. */
+  #address: string;
 
   constructor(
     readonly fleet: Fleet,
@@ -24,12 +28,11 @@ export class AddressSync {
     readonly view: View,
     readonly editor: Editor,
   ) {
-    const isAddress = location.hash.includes('=');
-    const kept = placeOf(sessionStorage.getItem(TAB_KEY) ?? '');
-    this.#wanted = isAddress ? placeOf(location.hash) : kept;
-    // The same place with a draft that was too long for the address.
-    const bare = (place: Place) => addressOf({ ...place, draft: null });
-    if (isAddress && !this.#wanted.draft && bare(kept) === bare(this.#wanted)) this.#wanted.draft = kept.draft;
+    this.#wanted = placeAtStart(location.hash, {
+      place: sessionStorage.getItem(TAB_KEY) ?? '',
+      address: sessionStorage.getItem(LAST_ADDRESS_KEY),
+    });
+    this.#address = location.hash;
     fleet.wantedSite = this.#wanted.site;
   }
 
@@ -105,12 +108,14 @@ export class AddressSync {
   /** Before the page goes. */
   flush(): void {
     clearTimeout(this.#due);
+    sessionStorage.setItem(LAST_ADDRESS_KEY, this.#address);
     if (this.fleet.site && !this.#wanted) this.#put(this.place);
   }
 
   #put(place: Place): void {
     const address = `#${addressOf(place)}`;
     if (address !== location.hash) history.replaceState(null, '', address);
+    this.#address = location.hash;
     sessionStorage.setItem(TAB_KEY, addressOf(place, Infinity));
   }
 }
