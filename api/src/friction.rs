@@ -355,8 +355,9 @@ pub struct TerrainFriction {
     pub name: String,
     /// Class of the ground.
     pub class: TerrainClass,
-    /// Time up to which measurements are included: the end of the last epoch before the requested
-    /// time. `null` if no time was requested; all measurements are included then.
+    /// Time up to which measurements are included: the requested time rounded down to a minute, or
+    /// to the end of an epoch where raw measurements of the epoch are missing. `null` if no time was
+    /// requested; all measurements are included then.
     #[serde(default)]
     pub as_of: Option<Timestamp>,
     /// Friction for each robot model.
@@ -402,16 +403,29 @@ pub struct TerrainHistory {
     /// Terrain at its present revision.
     pub terrain: TerrainRef,
     /// Friction at each time, the oldest first.
-    pub items: Vec<TerrainAt>,
+    pub items: Vec<FrictionAt>,
 }
 
-/// Friction of a terrain at one time.
+/// Friction at a point at several times.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
-pub struct TerrainAt {
+pub struct PointHistory {
+    /// Cell that contains the point.
+    pub cell: Cell,
+    /// Terrain under the point, `null` where none is drawn. Only measurements on this terrain are
+    /// included.
+    pub terrain: Option<TerrainRef>,
+    /// Friction at each time, the oldest first.
+    pub items: Vec<FrictionAt>,
+}
+
+/// Friction at one time.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct FrictionAt {
     /// Requested time.
     pub at: Timestamp,
-    /// Time up to which measurements are included: the end of the last epoch before `at`, or `at`
-    /// itself where that is the present.
+    /// Time up to which measurements are included: `at` rounded down to a minute, or to the end of
+    /// an epoch where raw measurements of the epoch are missing; `at` itself where that is the
+    /// present.
     pub as_of: Timestamp,
     /// Friction for each robot model.
     pub models: Vec<ModelFriction>,
@@ -420,8 +434,9 @@ pub struct TerrainAt {
 /// Friction of the ground at a point.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct PointFriction {
-    /// Time up to which measurements are included: the end of the last epoch before the requested
-    /// time. `null` if no time was requested; all measurements are included then.
+    /// Time up to which measurements are included: the requested time rounded down to a minute, or
+    /// to the end of an epoch where raw measurements of the epoch are missing. `null` if no time was
+    /// requested; all measurements are included then.
     #[serde(default)]
     pub as_of: Option<Timestamp>,
     /// Cell that contains the point.
@@ -453,8 +468,9 @@ pub struct AskPath {
 /// Friction along a path, with the speed that follows from it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct PathFriction {
-    /// Time up to which measurements are included: the end of the last epoch before the requested
-    /// time. `null` if no time was requested; all measurements are included then.
+    /// Time up to which measurements are included: the requested time rounded down to a minute, or
+    /// to the end of an epoch where raw measurements of the epoch are missing. `null` if no time was
+    /// requested; all measurements are included then.
     #[serde(default)]
     pub as_of: Option<Timestamp>,
     /// Length of the path, metres.

@@ -25,8 +25,8 @@ pub struct MapPage<T> {
     pub items: Vec<T>,
     /// Value of `cursor` for the request of the next page; `null` on the last page.
     pub next_cursor: Option<String>,
-    /// Time up to which measurements are included: the end of the last epoch before the requested
-    /// time. `null` if no time was requested; all measurements are included then.
+    /// Time up to which measurements are included: the requested time rounded down to a minute,
+    /// or to the end of an epoch where raw measurements of the epoch are missing. `null` if no time was requested; all measurements are included then.
     #[serde(default)]
     pub as_of: Option<Timestamp>,
 }
@@ -38,12 +38,12 @@ pub struct DifferencePage<T> {
     pub items: Vec<T>,
     /// Value of `cursor` for the request of the next page; `null` on the last page.
     pub next_cursor: Option<String>,
-    /// Time up to which measurements are included before: the end of the last epoch before the
-    /// requested first time.
+    /// Time up to which measurements are included before: the requested first time, rounded down
+    /// like that of a [`MapPage`].
     #[serde(default)]
     pub from: Option<Timestamp>,
-    /// Time up to which measurements are included after: the end of the last epoch before the
-    /// requested second time; `null` if none was requested, and all measurements are included then.
+    /// Time up to which measurements are included after: the requested second time, rounded down
+    /// likewise; `null` if none was requested, and all measurements are included then.
     #[serde(default)]
     pub as_of: Option<Timestamp>,
 }

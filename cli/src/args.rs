@@ -28,8 +28,8 @@ pub(crate) use self::identity::{
     SessionsArguments, TokensAction, TokensArguments,
 };
 pub(crate) use self::map::{
-    FrictionAction, FrictionArguments, SitesAction, SitesArguments, TerrainsAction,
-    TerrainsArguments,
+    FrictionAction, FrictionArguments, HistoryArguments, SitesAction, SitesArguments,
+    TerrainsAction, TerrainsArguments,
 };
 pub(crate) use self::mission_name::MissionName;
 pub(crate) use self::missions::{
@@ -41,7 +41,7 @@ pub(crate) use self::safety::{
     LimitsArguments, StopArguments, StopsArguments, WatchArguments,
 };
 use self::values::duration;
-pub(crate) use self::values::{shield_negative_points, waypoint};
+pub(crate) use self::values::{HistoryPlace, shield_negative_points, waypoint};
 pub(crate) use self::webhooks::{NamedWebhook, WebhooksAction, WebhooksArguments};
 use crate::exit::Exit;
 use crate::output::{failure, note};

@@ -114,7 +114,7 @@ const EXAMPLES: &[(&str, &str)] = &[
     ),
     (
         "friction history",
-        "  tread friction history sand-pit --from 12h --step 30m",
+        "  tread friction history sand-pit --from 12h --step 30m\n  tread friction history -1.5,2 --from 1h --step 1m",
     ),
     (
         "friction cells",

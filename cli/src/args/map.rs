@@ -11,8 +11,11 @@ use tread_api::site::GeoOrigin;
 use tread_api::terrain::TerrainClass;
 
 use super::Connection;
-use super::values::{area, duration, earth, finite, moment, point, positive, terrain_class};
-use crate::client::{Area, Reading};
+use super::values::{
+    HistoryPlace, area, duration, earth, finite, history_place, moment, point, positive,
+    terrain_class,
+};
+use crate::client::{Area, HistoryTimes, Reading};
 
 #[derive(Debug, Args)]
 pub(crate) struct SitesArguments {
@@ -177,6 +180,35 @@ pub(crate) struct BoxArgument {
     pub(crate) area: Option<Area>,
 }
 
+/// Place and times of a history.
+#[derive(Debug, Args)]
+pub(crate) struct HistoryArguments {
+    /// Terrain identifier, or point in metres in the site frame
+    #[arg(value_name = "TERRAIN|X,Y", value_parser = history_place)]
+    pub(crate) place: HistoryPlace,
+    /// First time: RFC 3339, or how long ago
+    #[arg(long, value_name = "WHEN", default_value = "24h", value_parser = moment)]
+    from: Timestamp,
+    /// Last time: RFC 3339, or how long ago; now if absent
+    #[arg(long, value_name = "WHEN", value_parser = moment)]
+    to: Option<Timestamp>,
+    /// Time between two rows, at least one minute
+    #[arg(long, value_name = "TIME", default_value = "1h", value_parser = duration)]
+    step: Duration,
+    #[command(flatten)]
+    pub(crate) models: ModelArguments,
+}
+
+impl HistoryArguments {
+    pub(crate) fn times(&self) -> HistoryTimes {
+        HistoryTimes {
+            from: self.from,
+            to: self.to,
+            step_s: self.step.as_secs(),
+        }
+    }
+}
+
 #[derive(Debug, Subcommand)]
 pub(crate) enum FrictionAction {
     /// Show the friction of each terrain, or of one
@@ -186,22 +218,8 @@ pub(crate) enum FrictionAction {
         #[command(flatten)]
         reading: ReadingArguments,
     },
-    /// Show the friction of a terrain at equally spaced times
-    History {
-        /// Terrain identifier
-        terrain: TerrainId,
-        /// First time: RFC 3339, or how long ago
-        #[arg(long, value_name = "WHEN", default_value = "24h", value_parser = moment)]
-        from: Timestamp,
-        /// Last time: RFC 3339, or how long ago; now if absent
-        #[arg(long, value_name = "WHEN", value_parser = moment)]
-        to: Option<Timestamp>,
-        /// Time between two rows, at least one minute
-        #[arg(long, value_name = "TIME", default_value = "1h", value_parser = duration)]
-        step: Duration,
-        #[command(flatten)]
-        models: ModelArguments,
-    },
+    /// Show the friction of a terrain or at a point at equally spaced times
+    History(HistoryArguments),
     /// Show the friction of the cells in a box or of the whole map
     Cells {
         #[command(flatten)]

@@ -6,6 +6,7 @@ use std::time::Duration;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use jiff::{SignedDuration, Timestamp};
 use tread_api::geometry::Point;
+use tread_api::ids::TerrainId;
 use tread_api::mission::MissionState;
 use tread_api::site::GeoOrigin;
 use tread_api::terrain::TerrainClass;
@@ -149,6 +150,24 @@ pub(super) fn earth(text: &str) -> Result<GeoOrigin, String> {
 
 pub(super) fn point(text: &str) -> Result<Point, String> {
     coordinates(text).map(|(x_m, y_m)| Point { x_m, y_m })
+}
+
+/// Where a history of friction is asked for.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum HistoryPlace {
+    /// On a terrain.
+    Terrain(TerrainId),
+    /// At a point in the site frame.
+    Point(Point),
+}
+
+/// Parses a terrain, or a point `x,y` in metres; no identifier has a comma.
+pub(super) fn history_place(text: &str) -> Result<HistoryPlace, String> {
+    if text.contains(',') {
+        return point(text).map(HistoryPlace::Point);
+    }
+    let terrain = text.parse().map(HistoryPlace::Terrain);
+    terrain.map_err(|invalid| format!("{invalid}; a point is X,Y"))
 }
 
 /// Parses one waypoint, `x,y` in metres.

@@ -5,7 +5,7 @@ use reqwest::Method;
 use serde::Serialize;
 use tread_api::friction::{
     AskPath, CellDifference, CellFriction, CreateWithdrawal, PathFriction, PointFriction,
-    RobotContribution, TerrainFriction, TerrainHistory, VisitSuggestion, Withdrawal,
+    PointHistory, RobotContribution, TerrainFriction, TerrainHistory, VisitSuggestion, Withdrawal,
 };
 use tread_api::geometry::Point;
 use tread_api::ids::{ConfigurationId, RobotId, SiteId, TerrainId};
@@ -77,6 +77,33 @@ impl Area {
     }
 }
 
+/// Equally spaced times of a history.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct HistoryTimes {
+    pub(crate) from: Timestamp,
+    /// The present if absent.
+    pub(crate) to: Option<Timestamp>,
+    pub(crate) step_s: u64,
+}
+
+impl HistoryTimes {
+    fn query(self) -> Vec<(&'static str, String)> {
+        let mut query = vec![
+            ("from", self.from.to_string()),
+            ("step_s", self.step_s.to_string()),
+        ];
+        query.extend(self.to.map(|to| ("to", to.to_string())));
+        query
+    }
+}
+
+fn at_point(point: Point) -> [(&'static str, String); 2] {
+    [
+        ("x_m", point.x_m.to_string()),
+        ("y_m", point.y_m.to_string()),
+    ]
+}
+
 impl Client {
     pub(crate) async fn terrains(&self, site: &SiteId) -> Result<Vec<Terrain>, ClientError> {
         self.all(&format!("/v1/sites/{site}/terrains")).await
@@ -140,19 +167,30 @@ impl Client {
         }
     }
 
-    /// Requests the friction of a terrain between two times, in steps of `step_s` seconds.
+    /// Requests the friction of a terrain at equally spaced times.
     pub(crate) async fn terrain_history(
         &self,
         (site, terrain): (&SiteId, &TerrainId),
-        (from, to): (Timestamp, Option<Timestamp>),
-        step_s: u64,
+        times: HistoryTimes,
         reading: Reading,
     ) -> Result<TerrainHistory, ClientError> {
         let mut query = reading.query();
-        query.push(("from", from.to_string()));
-        query.extend(to.map(|to| ("to", to.to_string())));
-        query.push(("step_s", step_s.to_string()));
+        query.extend(times.query());
         let path = format!("/v1/sites/{site}/friction/terrains/{terrain}/history");
+        self.get_with(&path, &query).await
+    }
+
+    /// Requests the friction at a point at equally spaced times.
+    pub(crate) async fn point_history(
+        &self,
+        (site, point): (&SiteId, Point),
+        times: HistoryTimes,
+        reading: Reading,
+    ) -> Result<PointHistory, ClientError> {
+        let mut query = reading.query();
+        query.extend(times.query());
+        query.extend(at_point(point));
+        let path = format!("/v1/sites/{site}/friction/point/history");
         self.get_with(&path, &query).await
     }
 
@@ -179,8 +217,7 @@ impl Client {
         reading: Reading,
     ) -> Result<PointFriction, ClientError> {
         let mut query = reading.query();
-        query.push(("x_m", point.x_m.to_string()));
-        query.push(("y_m", point.y_m.to_string()));
+        query.extend(at_point(point));
         self.get_with(&format!("/v1/sites/{site}/friction/point"), &query)
             .await
     }

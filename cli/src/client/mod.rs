@@ -23,7 +23,7 @@ use tread_api::page::{DifferencePage, PAGE_LIMIT_MAX};
 use tread_api::text;
 
 pub(crate) use self::error::ClientError;
-pub(crate) use self::map::{Area, Known, MapTimes, Reading};
+pub(crate) use self::map::{Area, HistoryTimes, Known, MapTimes, Reading};
 
 /// Maximum time for an answer; planning the longest path takes several seconds.
 const ANSWER_WAIT_MAX: Duration = Duration::from_secs(30);

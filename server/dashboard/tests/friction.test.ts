@@ -6,7 +6,7 @@ import { RANGES, shade } from '../src/map/friction';
 import { demandOf, slipOf } from '../src/map/meaning';
 import { moment, plain } from '../src/format';
 import { texts } from '../src/texts';
-import type { CellFriction, FusedFriction, Page as ApiPage, PointFriction, Robot, TerrainHistory } from './types';
+import type { CellFriction, FusedFriction, Page as ApiPage, PointHistory, Robot, TerrainHistory } from './types';
 import { api, browser, eventually, map, shot, windowOf } from './harness';
 
 const { open } = browser();
@@ -182,19 +182,10 @@ async function riseOverTime(page: Page): Promise<{ asked: string[] }> {
   const sample = cells[0]?.friction;
   const configuration = cells[0]?.configuration;
   if (!sample || !configuration) throw new Error('nothing is measured');
-  await page.route(/\/friction\/point\?/, async (route) => {
-    const as_of = new URL(route.request().url()).searchParams.get('as_of');
-    asked.push(as_of ?? 'now');
-    const response = await route.fetch();
-    const answer = (await response.json()) as PointFriction;
-    const friction = of(as_of ? Date.parse(as_of) : Date.now(), null, sample);
-    answer.models = [{ configuration, friction, model: 'rover', normalisation: null, prior: null }];
-    await route.fulfill({ response, json: answer });
-  });
-  await page.route(/\/friction\/terrains\/[^/]+\/history\?/, async (route) => {
+  await page.route(/\/friction\/(terrains\/[^/]+|point)\/history\?/, async (route) => {
     asked.push(new URL(route.request().url()).searchParams.get('step_s') ?? '');
     const response = await route.fetch();
-    const answer = (await response.json()) as TerrainHistory;
+    const answer = (await response.json()) as TerrainHistory | PointHistory;
     for (const item of answer.items) {
       const friction = of(Date.parse(item.as_of), null, sample);
       item.models = [{ configuration, friction, model: 'rover', normalisation: null, prior: null }];
@@ -216,15 +207,16 @@ test('the history of a cell and of a terrain is a curve with its interval', asyn
   await place(page).getByRole('button', { name: 'History' }).click();
   const said = place(page).getByText(/^θ 0\.1[678].* at first, 0\.[34]\d* at last\./);
   await said.waitFor();
-  // Hours that are over, and the present.
-  expect(asked.filter((as_of) => as_of.endsWith(':00:00.000Z'))).toHaveLength(asked.length - 1);
-  expect(asked).toHaveLength(26);
+  expect(asked).toEqual(['3600']);
   const line = place(page).locator('polyline');
   const points = ((await line.getAttribute('points')) ?? '').split(' ').map((point) => point.split(',').map(Number));
-  expect(points).toHaveLength(13);
+  expect(points).toHaveLength(12);
   // θ rises, so the line goes up, which is down in the picture's numbers.
   for (const [index, point] of points.slice(1).entries()) expect(point[1]).toBeLessThan(points[index]?.[1] ?? NaN);
   await shot(page, 'friction-history');
+  await place(page).getByRole('combobox').selectOption('60 minutes');
+  await eventually('a history of minutes', async () => asked.includes('60'));
+  await eventually('a point a minute', async () => ((await line.getAttribute('points')) ?? '').split(' ').length >= 61);
   await page.getByRole('tab', { name: 'Terrains' }).click();
   asked.length = 0;
   const terrain = page.getByRole('listitem').filter({ hasText: 'Lawn' });
@@ -272,4 +264,15 @@ test('the map is shown as of past hours, one after the other', async () => {
   await time.getByRole('button', { name: 'Hold' }).click();
   expect([...days].sort()).toEqual(days);
   expect(days.every((day) => day.endsWith('T00:00:00.000Z'))).toBe(true);
+  // Of the last hour each minute is known, and the server rounds nothing.
+  await time.getByRole('combobox', { name: 'Span' }).selectOption('60 minutes');
+  await time.getByText('now', { exact: true }).waitFor();
+  const ofMinute = page.waitForResponse((response) => response.url().includes('as_of='));
+  await slider.focus();
+  await slider.press('ArrowLeft');
+  const minute = await ofMinute;
+  const asked = new URL(minute.url()).searchParams.get('as_of') ?? '';
+  const { as_of } = (await minute.json()) as { as_of: string };
+  expect(asked).toMatch(/:00\.000Z$/);
+  expect(Date.parse(as_of)).toBe(Date.parse(asked));
 });

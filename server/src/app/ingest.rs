@@ -28,6 +28,7 @@ use tread_api::wire::ingest::{
 use tread_api::wire::{Refusal, RefusalCode};
 
 use self::keys::{CONFIGURATIONS_MAX, Configured, Keys, RobotKeys};
+pub(super) use self::prepared::SKEW_MIN;
 use self::prepared::{Prepared, Ready, Skew, prepared};
 use super::App;
 use super::map::{Folded, MapChange};
@@ -470,7 +471,8 @@ impl Writer {
                 configuration_pk: candidate.configuration_pk,
                 epoch_h: epoch_h(segment.ended_at),
             };
-            if withdrawals.iter().any(|row| is_withdrawn(row, &key)) {
+            let is_withdrawn = |row: &WithdrawalRow| row.includes(key.robot_pk, key.epoch_h);
+            if withdrawals.iter().any(is_withdrawn) {
                 continue;
             }
             match folded.entry(key) {
@@ -536,10 +538,6 @@ fn possible(
         format!("the robot has measured with {CONFIGURATIONS_MAX} other configurations")
     })?;
     Ok((*configuration, prepared))
-}
-
-fn is_withdrawn(row: &WithdrawalRow, key: &SumKey) -> bool {
-    row.robot_pk == key.robot_pk && (row.from_h..=row.to_h).contains(&key.epoch_h)
 }
 
 fn refusal(code: RefusalCode, detail: &str) -> Refusal {

@@ -48,7 +48,7 @@ use self::allowance::Allowances;
 use self::enrolment::{EnrolmentService, Membership};
 pub use self::error::AppError;
 use self::events::Hub;
-use self::friction::{MapNews, Pictures, Views};
+use self::friction::{MapNews, Pictures, Timelines, Views};
 use self::identity::Identity;
 use self::map::Maps;
 use self::missions::idempotency::InFlight;
@@ -106,6 +106,7 @@ struct Inner {
     normalisations: Vec<Arc<Normalisation>>,
     map_readers: Semaphore,
     pictures: Pictures,
+    timelines: Timelines,
     views: Views,
     news: MapNews,
     removed: Removed,
@@ -186,6 +187,7 @@ impl App {
             normalisations: normalisations.into_iter().map(Arc::new).collect(),
             map_readers: Semaphore::new(friction::MAP_READERS_MAX),
             pictures: Pictures::default(),
+            timelines: Timelines::default(),
             views: Views::default(),
             news: MapNews::default(),
             removed: Removed::default(),
@@ -328,6 +330,10 @@ impl App {
 
     fn pictures(&self) -> &Pictures {
         &self.inner.pictures
+    }
+
+    fn timelines(&self) -> &Timelines {
+        &self.inner.timelines
     }
 
     fn views(&self) -> &Views {

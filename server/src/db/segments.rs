@@ -6,7 +6,7 @@ use std::sync::LazyLock;
 use jiff::Timestamp;
 use serde_json::value::RawValue;
 use sqlx::SqliteConnection;
-use tread_api::friction::StoredSegment;
+use tread_api::friction::{Segment, StoredSegment};
 use tread_api::ids::{RobotId, TerrainId};
 
 use super::rows::{Row, RowsStatement};
@@ -276,4 +276,82 @@ pub async fn list(
         }
     };
     raw.into_iter().map(StoredSegment::try_from).collect()
+}
+
+/// A measurement of a site, with what decides whether it is on the map.
+#[derive(Debug)]
+pub struct SiteSegment {
+    /// Its key.
+    pub pk: i64,
+    /// Key of the robot.
+    pub robot_pk: i64,
+    /// The robot.
+    pub robot: RobotId,
+    /// The measurement.
+    pub segment: Segment,
+}
+
+/// Returns the key of the first measurement that was received at a time or later, and whether it is
+/// the first of all; `None` without one. Times of receipt are in the order of keys, which have no
+/// gaps.
+pub async fn first_since(
+    db: &mut SqliteConnection,
+    at: Timestamp,
+) -> Result<Option<(i64, bool)>, DbError> {
+    let at_us = to_us(at);
+    let ends = sqlx::query!(
+        r#"SELECT (SELECT MIN(pk) FROM segments) AS "first: i64",
+               (SELECT MAX(pk) FROM segments) AS "last: i64""#
+    );
+    let ends = ends.fetch_one(&mut *db).await?;
+    let Some((first, last)) = ends.first.zip(ends.last) else {
+        return Ok(None);
+    };
+    let (mut low, mut high) = (first, last + 1);
+    while low < high {
+        let middle = low + (high - low) / 2;
+        let received = sqlx::query_scalar!(
+            "SELECT received_at_us FROM segments WHERE pk >= ? ORDER BY pk LIMIT 1",
+            middle
+        );
+        if received.fetch_one(&mut *db).await? < at_us {
+            low = middle + 1;
+        } else {
+            high = middle;
+        }
+    }
+    Ok((low <= last).then_some((low, low == first)))
+}
+
+/// Returns measurements of all sites in the order of their commits, after a key; those of other
+/// sites without their content.
+pub async fn of_site(
+    db: &mut SqliteConnection,
+    site_pk: i64,
+    after: i64,
+    limit: u32,
+) -> Result<Vec<(i64, Option<SiteSegment>)>, DbError> {
+    let rows = sqlx::query!(
+        r#"SELECT segments.pk AS "pk!", segments.robot_pk, robots.id AS robot,
+               CASE WHEN segments.site_pk = ?1 THEN segments.measurement END AS "measurement: String"
+           FROM segments JOIN robots ON robots.pk = segments.robot_pk
+           WHERE segments.pk > ?2 ORDER BY segments.pk LIMIT ?3"#,
+        site_pk,
+        after,
+        limit,
+    );
+    let rows = rows.fetch_all(db).await?;
+    let read = rows.into_iter().map(|row| {
+        let Some(measurement) = row.measurement else {
+            return Ok((row.pk, None));
+        };
+        let segment = SiteSegment {
+            pk: row.pk,
+            robot_pk: row.robot_pk,
+            robot: parse("robot", &row.robot)?,
+            segment: from_json("measurement", &measurement)?,
+        };
+        Ok((row.pk, Some(segment)))
+    });
+    read.collect()
 }

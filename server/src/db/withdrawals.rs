@@ -24,6 +24,13 @@ pub struct WithdrawalRow {
     pub at: Timestamp,
 }
 
+impl WithdrawalRow {
+    /// Returns whether what a robot measured in an hour is withdrawn.
+    pub fn includes(&self, robot_pk: i64, hour: i64) -> bool {
+        self.robot_pk == robot_pk && (self.from_h..=self.to_h).contains(&hour)
+    }
+}
+
 /// Returns all withdrawals, oldest first.
 pub async fn all(db: &mut SqliteConnection) -> Result<Vec<WithdrawalRow>, DbError> {
     let rows = sqlx::query!(

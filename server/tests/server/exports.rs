@@ -388,8 +388,8 @@ async fn an_export_says_as_of_when_it_is() {
         (measured_at, 0),
         (measured_at + SignedDuration::from_hours(1), 6),
     ] {
-        let hour = asked.as_second().div_euclid(3_600) * 3_600;
-        let effective = jiff::Timestamp::from_second(hour).unwrap().to_string();
+        let minute = asked.as_second().div_euclid(60) * 60;
+        let effective = jiff::Timestamp::from_second(minute).unwrap().to_string();
         for format in ["json", "geojson", "csv", "parquet", "png", "tile"] {
             let path = format!("{MAP}?format={format}&as_of={asked}");
             let (headers, bytes) = fetched(&yard, &path).await;

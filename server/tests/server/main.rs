@@ -4,6 +4,8 @@
 #[cfg(test)]
 mod alerts;
 #[cfg(test)]
+mod as_of;
+#[cfg(test)]
 mod bad_input;
 #[cfg(test)]
 mod bounds;

@@ -9,9 +9,10 @@ use std::process::ExitCode;
 use anyhow::Context as _;
 use serde_json::json;
 use tread_api::friction::{AskPath, CreateWithdrawal};
+use tread_api::ids::SiteId;
 
 use super::points::read_corners;
-use crate::args::{FrictionAction, FrictionArguments};
+use crate::args::{FrictionAction, FrictionArguments, HistoryArguments, HistoryPlace};
 use crate::client::{Client, Reading};
 use crate::output::Output;
 
@@ -30,6 +31,24 @@ fn save(picture: &[u8], file: &Path, output: Output) -> anyhow::Result<()> {
     })
 }
 
+async fn history(
+    (client, output): (&Client, Output),
+    site: &SiteId,
+    asked: &HistoryArguments,
+) -> anyhow::Result<()> {
+    let (times, reading) = (asked.times(), asked.models.reading());
+    match &asked.place {
+        HistoryPlace::Terrain(terrain) => {
+            let read = client.terrain_history((site, terrain), times, reading);
+            output.show(&read.await?, tables::terrain_history)
+        }
+        HistoryPlace::Point(point) => {
+            let read = client.point_history((site, *point), times, reading);
+            output.show(&read.await?, tables::point_history)
+        }
+    }
+}
+
 pub(super) async fn run(
     arguments: FrictionArguments,
     client: &Client,
@@ -45,16 +64,8 @@ pub(super) async fn run(
             let read = client.terrain_friction(site, terrain.as_ref(), reading.reading());
             output.show(&read.await?, |terrains| tables::terrains(terrains))?;
         }
-        Some(FrictionAction::History {
-            terrain,
-            from,
-            to,
-            step,
-            models,
-        }) => {
-            let (step_s, reading) = (step.as_secs(), models.reading());
-            let read = client.terrain_history((site, &terrain), (from, to), step_s, reading);
-            output.show(&read.await?, tables::history)?;
+        Some(FrictionAction::History(asked)) => {
+            history((client, output), site, &asked).await?;
         }
         Some(FrictionAction::Cells {
             area,

@@ -3,8 +3,9 @@
 use comfy_table::Table;
 use jiff::Timestamp;
 use tread_api::friction::{
-    CellDifference, CellFriction, FusedFriction, ModelFriction, PathFriction, PointFriction,
-    RobotContribution, TerrainFriction, TerrainHistory, VisitSuggestion, Withdrawal,
+    CellDifference, CellFriction, FrictionAt, FusedFriction, ModelFriction, PathFriction,
+    PointFriction, PointHistory, RobotContribution, TerrainFriction, TerrainHistory,
+    VisitSuggestion, Withdrawal,
 };
 use tread_api::site::Cell;
 use tread_api::terrain::TerrainRef;
@@ -121,10 +122,27 @@ pub(super) fn terrains(terrains: &[TerrainFriction]) -> String {
     of_time(MapTimes::as_of(as_of), &render(&table))
 }
 
-pub(super) fn history(history: &TerrainHistory) -> String {
-    let mut table = friction_table(&["AT", "MODEL"]);
-    for item in &history.items {
-        let at = format!("{:.0}", item.at);
+pub(super) fn terrain_history(history: &TerrainHistory) -> String {
+    format!(
+        "terrain {}, revision {}\n{}",
+        history.terrain.id,
+        history.terrain.revision,
+        history_table(&history.items)
+    )
+}
+
+pub(super) fn point_history(history: &PointHistory) -> String {
+    format!(
+        "{}\n{}",
+        ground_at(history.cell, history.terrain.as_ref()),
+        history_table(&history.items)
+    )
+}
+
+fn history_table(items: &[FrictionAt]) -> String {
+    let mut table = friction_table(&["AS OF", "MODEL"]);
+    for item in items {
+        let at = format!("{:.0}", item.as_of);
         if item.models.is_empty() {
             let row = [at.clone(), "-".to_owned()].into_iter();
             table.add_row(row.chain(columns(None)));
@@ -133,12 +151,15 @@ pub(super) fn history(history: &TerrainHistory) -> String {
             table.add_row([at.clone()].into_iter().chain(model_row(model)));
         }
     }
-    format!(
-        "terrain {}, revision {}\n{}",
-        history.terrain.id,
-        history.terrain.revision,
-        render(&table)
-    )
+    render(&table)
+}
+
+fn ground_at(Cell { ix, iy }: Cell, terrain: Option<&TerrainRef>) -> String {
+    let ground = match terrain {
+        Some(terrain) => format!("terrain {}, revision {}", terrain.id, terrain.revision),
+        None => "no terrain is drawn there".to_owned(),
+    };
+    format!("cell {ix}, {iy}; {ground}")
 }
 
 pub(super) fn cells(Known { items, of }: &Known<CellFriction>) -> String {
@@ -155,14 +176,9 @@ pub(super) fn cells(Known { items, of }: &Known<CellFriction>) -> String {
 }
 
 pub(super) fn point(point: &PointFriction) -> String {
-    let Cell { ix, iy } = point.cell;
-    let ground = match &point.terrain {
-        Some(terrain) => format!("terrain {}, revision {}", terrain.id, terrain.revision),
-        None => "no terrain is drawn there".to_owned(),
-    };
     let head = of_time(
         MapTimes::as_of(point.as_of),
-        &format!("cell {ix}, {iy}; {ground}"),
+        &ground_at(point.cell, point.terrain.as_ref()),
     );
     if point.models.is_empty() {
         return format!(

@@ -1,9 +1,13 @@
 import { expect, test } from 'vitest';
-import { SPANS, momentsOf, stepS, thinned } from './moments';
+import { SPANS, momentsOf, stepS } from './moments';
 
 const NOW_MS = Date.parse('2026-11-23T14:37:12Z');
 
-test('the map is had at ends of hours, and of days for a month', () => {
+test('the map is had by the minute for an hour, at ends of hours, and of days for a month', () => {
+  const hour = momentsOf('hour', NOW_MS);
+  expect(new Date(hour.at(-1) ?? 0).toISOString()).toBe('2026-11-23T14:36:00.000Z');
+  expect(hour).toHaveLength(61);
+
   const day = momentsOf('day', NOW_MS);
   expect(new Date(day.at(-1) ?? 0).toISOString()).toBe('2026-11-23T14:00:00.000Z');
   expect(new Date(day[0] ?? 0).toISOString()).toBe('2026-11-22T14:00:00.000Z');
@@ -14,13 +18,4 @@ test('the map is had at ends of hours, and of days for a month', () => {
     // No more than the history of a terrain may have.
     expect(moments.length).toBeLessThanOrEqual(1000);
   }
-});
-
-test('a history of a cell has few times, with the oldest and the newest', () => {
-  const week = momentsOf('week', NOW_MS);
-  const few = thinned(week);
-  expect(few).toHaveLength(25);
-  expect([few[0], few.at(-1)]).toEqual([week[0], week.at(-1)]);
-  expect(new Set(few).size).toBe(25);
-  expect(thinned(momentsOf('day', NOW_MS))).toHaveLength(25);
 });

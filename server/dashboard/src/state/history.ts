@@ -1,11 +1,8 @@
 // How θ of a terrain or of a cell went over time, as the server says it.
-import type { FusedFriction, ModelFriction, PointFriction, TerrainHistory } from '../api/schema';
+import type { FrictionAt, FusedFriction, ModelFriction, PointHistory, TerrainHistory } from '../api/schema';
 import { ask } from '../api/client';
 import type { PointM } from '../map/camera';
-import { momentsOf, stepS, thinned, type Span } from '../map/moments';
-
-/** Requests for the history of a cell at once. */
-const AT_ONCE = 4;
+import { momentsOf, stepS, type Span } from '../map/moments';
 
 /** Friction at one time; null where it was unknown then. */
 export interface Known {
@@ -19,33 +16,33 @@ export async function terrainHistory(
   configuration: string | null,
   span: Span,
 ): Promise<Known[]> {
-  const first_ms = momentsOf(span, Date.now())[0] ?? 0;
-  const query = new URLSearchParams({ from: new Date(first_ms).toISOString(), step_s: String(stepS(span)) });
-  const path = `/v1/sites/${site}/friction/terrains/${terrain}/history?${query}`;
+  const path = `/v1/sites/${site}/friction/terrains/${terrain}/history?${timesOf(span)}`;
   const { items } = await ask<TerrainHistory>(path);
-  return items.map(({ as_of, models }) => ({ at_ms: Date.parse(as_of), friction: ofModel(models, configuration) }));
+  return knownOf(items, configuration);
 }
 
-/** The API has no history of a cell: it is asked for at each time. */
+/** Of the cell at a point, on the terrain there. */
 export async function cellHistory(
   site: string,
   at: PointM,
   configuration: string | null,
   span: Span,
 ): Promise<Known[]> {
-  const moments: (number | null)[] = [...thinned(momentsOf(span, Date.now())), null];
-  const known: Known[] = [];
-  const one = async (at_ms: number | null, index: number) => {
-    const query = new URLSearchParams({ x_m: String(at.x_m), y_m: String(at.y_m) });
-    if (at_ms !== null) query.set('as_of', new Date(at_ms).toISOString());
-    const point = await ask<PointFriction>(`/v1/sites/${site}/friction/point?${query}`);
-    known[index] = { at_ms: at_ms ?? Date.now(), friction: ofModel(point.models, configuration) };
-  };
-  for (let begin = 0; begin < moments.length; begin += AT_ONCE) {
-    const some = moments.slice(begin, begin + AT_ONCE);
-    await Promise.all(some.map((at_ms, index) => one(at_ms, begin + index)));
-  }
-  return known;
+  const query = timesOf(span);
+  query.set('x_m', String(at.x_m));
+  query.set('y_m', String(at.y_m));
+  const { items } = await ask<PointHistory>(`/v1/sites/${site}/friction/point/history?${query}`);
+  return knownOf(items, configuration);
+}
+
+/** The times of a span up to the server's present. */
+function timesOf(span: Span): URLSearchParams {
+  const first_ms = momentsOf(span, Date.now())[0] ?? 0;
+  return new URLSearchParams({ from: new Date(first_ms).toISOString(), step_s: String(stepS(span)) });
+}
+
+function knownOf(items: FrictionAt[], configuration: string | null): Known[] {
+  return items.map(({ as_of, models }) => ({ at_ms: Date.parse(as_of), friction: ofModel(models, configuration) }));
 }
 
 function ofModel(models: ModelFriction[], configuration: string | null): FusedFriction | null {

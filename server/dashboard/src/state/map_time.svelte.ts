@@ -1,4 +1,4 @@
-// The time of the friction map: the present, or the end of an hour or day that is past; and its play.
+// The time of the friction map: the present, or the end of a minute, hour or day that is past; and its play.
 import { momentsOf, type Span } from '../map/moments';
 
 /** How long each time is shown while they play, milliseconds. */

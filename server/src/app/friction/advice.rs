@@ -38,7 +38,7 @@ impl App {
     ) -> Result<MapPage<VisitSuggestion>, AppError> {
         let reading = Reading::new(self, asked)?;
         let view = self.site_view(site).await?;
-        let reading = reading.of_site(self, &view.row);
+        let reading = reading.of_site(self, &view.row).await?;
         let as_of = reading.as_of;
         let grid = view.row.site.grid;
         let count = area.count(grid.cell_m);

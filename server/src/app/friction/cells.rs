@@ -8,7 +8,7 @@ use tread_api::geometry::{COORDINATE_MAX_M, Point};
 use tread_api::ids::{ConfigurationId, SiteId};
 use tread_api::page::{DifferencePage, MapPage};
 use tread_api::site::{CELL_MAX_M, Cell, Grid};
-use tread_api::terrain::TerrainRef;
+use tread_api::terrain::{Terrain, TerrainRef};
 
 use super::drawn::{Drawn, is_here};
 use super::{App, AppError, Asked, Reading, SiteView, page, site_row, terrain_ref};
@@ -115,7 +115,7 @@ impl App {
         let reading = Reading::new(self, asked)?;
         let after = cursor.map(read_cursor).transpose()?;
         let row = site_row(&mut self.db().read("friction").await?, site).await?;
-        let reading = reading.of_site(self, &row);
+        let reading = reading.of_site(self, &row).await?;
         let grid = row.site.grid;
         let factor = factor(&grid, resolution_m)?;
         check_count(&area, resolution_m)?;
@@ -152,12 +152,8 @@ impl App {
     ) -> Result<PointFriction, AppError> {
         let reading = Reading::new(self, asked)?;
         let view = self.site_view(site).await?;
-        let reading = reading.of_site(self, &view.row);
-        let off_the_map = || AppError::InvalidQuery {
-            parameter: "x_m",
-            detail: format!("a point lies on the map, within {COORDINATE_MAX_M} m of the origin"),
-        };
-        let cell = view.row.site.grid.cell_at(point).ok_or_else(off_the_map)?;
+        let reading = reading.of_site(self, &view.row).await?;
+        let cell = view.cell_at(point)?;
         let looking = move |app: &Self| app.known_at_point(&view, &reading, (cell, point));
         Ok(self.off_thread(looking).await)
     }
@@ -170,18 +166,7 @@ impl App {
     ) -> PointFriction {
         let drawn = Drawn::new(&view.terrains);
         let terrain = drawn.at(point);
-        let measured = self.maps().look(&view.row, |map| {
-            let groups = map.cell(cell, reading.choice()).into_iter();
-            let here = groups.filter(|group| is_here(view, group.terrain, terrain));
-            let models = same_ground(here).into_iter().map(|group| ModelFriction {
-                configuration: group.configuration,
-                model: view.model(group.configuration),
-                friction: reading.fused(group, Ground::Cell),
-                prior: None,
-                normalisation: reading.normalisation(),
-            });
-            models.collect::<Vec<_>>()
-        });
+        let measured = self.measured_at_point(view, reading, cell, terrain);
         // The prior of the terrain's class is needed only where nothing was measured.
         let models = match terrain {
             Some(terrain) if measured.is_empty() => {
@@ -202,6 +187,28 @@ impl App {
             terrain: terrain.map(terrain_ref),
             models,
         }
+    }
+
+    /// Returns the friction measured in a cell, on the given terrain alone, per robot model.
+    pub(super) fn measured_at_point(
+        &self,
+        view: &SiteView,
+        reading: &Reading,
+        cell: Cell,
+        terrain: Option<&Terrain>,
+    ) -> Vec<ModelFriction> {
+        self.maps().look(&view.row, |map| {
+            let groups = map.cell(cell, reading.choice()).into_iter();
+            let here = groups.filter(|group| is_here(view, group.terrain, terrain));
+            let models = same_ground(here).into_iter().map(|group| ModelFriction {
+                configuration: group.configuration,
+                model: view.model(group.configuration),
+                friction: reading.fused(group, Ground::Cell),
+                prior: None,
+                normalisation: reading.normalisation(),
+            });
+            models.collect()
+        })
     }
 
     /// Returns the differences of friction between two times, for cells that were measured in
@@ -226,8 +233,8 @@ impl App {
         }
         let after = cells.cursor.map(read_cursor).transpose()?;
         let row = site_row(&mut self.db().read("friction").await?, site).await?;
-        let late = late.of_site(self, &row);
-        let early = late.at(from).of_site(self, &row);
+        let late = late.of_site(self, &row).await?;
+        let early = late.at(from).of_site(self, &row).await?;
         let early_us = early.now_us;
         let (min, max) = cells.area.cells(&row.site.grid)?;
         let wanted = usize::try_from(cells.limit).unwrap_or(usize::MAX);

@@ -65,7 +65,7 @@ impl App {
     ) -> Result<CellExport, AppError> {
         let reading = Reading::new(self, &asked.asked)?;
         let row = site_row(&mut self.db().read("friction").await?, site).await?;
-        let reading = reading.of_site(self, &row);
+        let reading = reading.of_site(self, &row).await?;
         let grid = row.site.grid;
         let factor = factor(&grid, asked.resolution_m)?;
         let area = match asked.area {

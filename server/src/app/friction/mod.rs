@@ -4,24 +4,29 @@ mod advice;
 mod cells;
 mod drawn;
 mod export;
+mod history;
 pub mod live;
 mod path;
 mod pictures;
 mod prior;
 mod raster;
 mod reading;
+mod timelines;
 mod views;
 
 use std::collections::HashMap;
 
-use jiff::{SignedDuration, Timestamp};
-use tread_api::friction::{ModelFriction, TerrainAt, TerrainFriction, TerrainHistory};
+use jiff::Timestamp;
+use tread_api::friction::{ModelFriction, TerrainFriction};
+use tread_api::geometry::{COORDINATE_MAX_M, Point};
 use tread_api::ids::{ConfigurationId, SiteId, TerrainId};
 use tread_api::page::Page;
+use tread_api::site::Cell;
 use tread_api::terrain::{Terrain, TerrainRef};
 
 pub use self::cells::{Area, CELLS_MAX, CellsAsked};
 pub use self::export::{CellExport, SegmentExport};
+pub use self::history::Times;
 pub(super) use self::live::MapNews;
 pub use self::pictures::Picture;
 pub(super) use self::pictures::Pictures;
@@ -29,6 +34,7 @@ use self::prior::Classes;
 pub use self::raster::{PictureAsked, SQUARES_MAX};
 pub use self::reading::Asked;
 pub(super) use self::reading::Reading;
+pub(super) use self::timelines::Timelines;
 pub(super) use self::views::Views;
 use super::{App, AppError, page, site_row};
 use crate::db::sites::SiteRow;
@@ -37,8 +43,6 @@ use crate::friction::Ground;
 
 /// Model name shown for a configuration that no robot has declared.
 const UNKNOWN_MODEL: &str = "not declared";
-/// Maximum number of times in one history.
-const TIMES_MAX: i64 = 1_000;
 /// Maximum number of map requests that are worked on at once; further ones wait.
 pub(in crate::app) const MAP_READERS_MAX: usize = 4;
 
@@ -80,6 +84,15 @@ impl SiteView {
             .ok_or_else(unknown)
     }
 
+    /// Returns the cell that contains a point.
+    fn cell_at(&self, point: Point) -> Result<Cell, AppError> {
+        let off_the_map = || AppError::InvalidQuery {
+            parameter: "x_m",
+            detail: format!("a point lies on the map, within {COORDINATE_MAX_M} m of the origin"),
+        };
+        self.row.site.grid.cell_at(point).ok_or_else(off_the_map)
+    }
+
     pub(super) fn model(&self, configuration: ConfigurationId) -> String {
         let name = self.models.get(&configuration);
         name.cloned().unwrap_or_else(|| UNKNOWN_MODEL.to_owned())
@@ -115,7 +128,7 @@ impl App {
     ) -> Result<Page<TerrainFriction>, AppError> {
         let reading = Reading::new(self, asked)?;
         let view = self.site_view(site).await?;
-        let reading = reading.of_site(self, &view.row);
+        let reading = reading.of_site(self, &view.row).await?;
         let cursor = cursor.map(str::to_owned);
         let listing = move |app: &Self| {
             let classes = app.classes(&view, &reading);
@@ -147,71 +160,13 @@ impl App {
     ) -> Result<TerrainFriction, AppError> {
         let reading = Reading::new(self, asked)?;
         let view = self.site_view(site).await?;
-        let reading = reading.of_site(self, &view.row);
+        let reading = reading.of_site(self, &view.row).await?;
         let terrain = view.find(site, id)?.clone();
         let looking = move |app: &Self| {
             let models = app
                 .classes(&view, &reading)
                 .models(&view, &reading, &terrain);
             terrain_friction(&terrain, models, reading.as_of)
-        };
-        Ok(self.off_thread(looking).await)
-    }
-
-    /// Returns the friction of one terrain as known at equally spaced times, the last of which is
-    /// `to`.
-    pub async fn history_of_terrain(
-        &self,
-        (site, id): (&SiteId, &TerrainId),
-        asked: &Asked,
-        (from, to): (Timestamp, Option<Timestamp>),
-        step: SignedDuration,
-    ) -> Result<TerrainHistory, AppError> {
-        let is_to_now = to.is_none();
-        let to = to.unwrap_or_else(|| self.clock().now());
-        let invalid = |parameter, detail| AppError::InvalidQuery { parameter, detail };
-        if to < from {
-            return Err(invalid("to", "to lies before from".to_owned()));
-        }
-        let steps = to.duration_since(from).as_secs() / step.as_secs().max(1);
-        if steps >= TIMES_MAX {
-            let detail = format!(
-                "this would give {} times; at most {TIMES_MAX}",
-                steps.saturating_add(1)
-            );
-            return Err(invalid("step_s", detail));
-        }
-        let reading = Reading::new(self, asked)?;
-        Reading::new(
-            self,
-            &Asked {
-                as_of: Some(to),
-                ..asked.clone()
-            },
-        )?;
-        let view = self.site_view(site).await?;
-        let terrain = view.find(site, id)?.clone();
-        let looking = move |app: &Self| {
-            let back =
-                |index| step.saturating_mul(i32::try_from(steps - index).unwrap_or(i32::MAX));
-            let times = (0..=steps).map(|index| to.checked_sub(back(index)).unwrap_or(from));
-            let known = |at| {
-                // The present is read without a time, so that all received measurements count.
-                let reading = if is_to_now && at == to {
-                    reading.clone()
-                } else {
-                    reading.at(at).of_site(app, &view.row)
-                };
-                TerrainAt {
-                    at,
-                    as_of: reading.as_of.unwrap_or(to),
-                    models: app.measured_models(&view, &reading, &terrain),
-                }
-            };
-            TerrainHistory {
-                terrain: terrain_ref(&terrain),
-                items: times.map(known).collect(),
-            }
         };
         Ok(self.off_thread(looking).await)
     }

@@ -62,7 +62,7 @@ impl App {
             normalisation,
         };
         let reading = Reading::new(self, &asked).map_err(in_body)?;
-        let reading = reading.of_site(self, &view.row);
+        let reading = reading.of_site(self, &view.row).await?;
         let length_m = checked_length(&points)?;
         let cut = cut(&points, &view.row.site.grid)?;
         let looking = move |app: &Self| {
@@ -405,7 +405,7 @@ fn drawn_near<'view, 'cut>(
 struct CellReader<'map> {
     map: &'map SiteMap,
     near: &'map Near<'map>,
-    lens: Lens,
+    lens: Lens<'map>,
     reading: &'map Reading,
     room: Room,
 }

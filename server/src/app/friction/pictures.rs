@@ -108,7 +108,7 @@ impl App {
     ) -> Result<Picture, AppError> {
         let reading = Reading::new(self, &asked.asked)?;
         let view = self.site_view(site).await?;
-        let reading = reading.of_site(self, &view.row);
+        let reading = reading.of_site(self, &view.row).await?;
         let drawing = move |app: &Self| {
             let key = format!("{}/{format}/{asked:?}", view.row.pk);
             // Read before the squares are made, so that a change meanwhile makes the picture stale.

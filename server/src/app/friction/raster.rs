@@ -92,7 +92,7 @@ pub(super) struct Frame<'view> {
 }
 
 impl Frame<'_> {
-    fn lens(&self, map: &SiteMap) -> Lens {
+    fn lens(&self, map: &SiteMap) -> Lens<'_> {
         let choice = crate::friction::index::Choice {
             configuration: Some(self.configuration),
             ..self.reading.choice()

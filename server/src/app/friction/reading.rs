@@ -9,11 +9,11 @@ use tread_api::ids::ConfigurationId;
 use crate::app::{App, AppError};
 use crate::config::FrictionConfig;
 use crate::db::sites::SiteRow;
-use crate::friction::index::{At, Choice, Group, Normalisation};
+use crate::friction::index::{At, Choice, Epoch, Group, Normalisation, PartialEpoch, Timeline};
 use crate::friction::{Ground, fuse};
 
-/// Microseconds of a minute.
-const MINUTE_US: i64 = 60_000_000;
+/// Seconds of a minute.
+const MINUTE_S: i64 = 60;
 
 /// Parameters of a map request besides the place.
 #[derive(Debug, Clone, Default)]
@@ -31,6 +31,8 @@ pub struct Asked {
 pub(in crate::app) struct Reading {
     /// Only measurements made before this time; `None` for all that were received.
     pub(in crate::app) as_of: Option<Timestamp>,
+    /// What was measured before `as_of` in the epoch that it divides.
+    partial: Option<Arc<PartialEpoch>>,
     configuration: Option<ConfigurationId>,
     normalisation: Option<Arc<Normalisation>>,
     config: FrictionConfig,
@@ -56,36 +58,91 @@ impl Reading {
                 detail: format!("no normalisation `{name}` is declared here"),
             })
         });
-        let minute_us = now.as_microsecond().div_euclid(MINUTE_US) * MINUTE_US;
         Ok(Self {
             as_of: asked.as_of,
+            partial: None,
             configuration: asked.configuration,
             normalisation: normalisation.transpose()?,
             config: *app.friction_config(),
-            now_us: asked.as_of.map_or(minute_us, Timestamp::as_microsecond),
+            now_us: asked.as_of.unwrap_or(minute_of(now)).as_microsecond(),
         })
     }
 
-    /// Returns these parameters with `as_of` moved back to the end of an epoch of this site's map.
-    /// Sums are stored per epoch, so an epoch cannot be split at a time within it.
-    pub(in crate::app) fn of_site(self, app: &App, row: &SiteRow) -> Self {
-        let Some(as_of) = self.as_of else { return self };
-        let effective = app.maps().look(row, |map| map.effective_as_of(as_of));
-        self.at(effective)
+    /// Returns these parameters with `as_of` rounded down to a whole minute, or to the end of an
+    /// epoch of this site's map where the raw measurements of the epoch are not all there: a sum
+    /// cannot be divided in time.
+    ///
+    /// # Errors
+    /// The database failed.
+    pub(in crate::app) async fn of_site(
+        mut self,
+        app: &App,
+        row: &SiteRow,
+    ) -> Result<Self, AppError> {
+        let Some(as_of) = self.as_of else {
+            return Ok(self);
+        };
+        let epoch = app.maps().look(row, |map| map.epoch_at(as_of));
+        let timeline = if Self::divides(as_of, epoch) {
+            app.timeline(row, epoch).await?
+        } else {
+            None
+        };
+        let summed = move |_: &App| {
+            self.move_to(as_of, epoch, timeline.as_ref());
+            self
+        };
+        Ok(app.off_thread(summed).await)
     }
 
-    /// Returns these parameters as of another time.
-    pub(in crate::app) fn at(&self, at: Timestamp) -> Self {
-        Self {
-            as_of: Some(at),
-            now_us: at.as_microsecond(),
-            ..self.clone()
+    /// Returns whether a time, rounded down to a minute, divides the epoch that it lies in.
+    pub(super) fn divides(at: Timestamp, epoch: Epoch) -> bool {
+        minute_of(at) > epoch.begin()
+    }
+
+    /// Moves `as_of` to a time within `epoch`, rounded down: to a minute if the measurements of the
+    /// epoch are given, else to its begin. Fast for rising times.
+    pub(super) fn move_to(
+        &mut self,
+        at: Timestamp,
+        epoch: Epoch,
+        timeline: Option<&Arc<Timeline>>,
+    ) {
+        let minute = minute_of(at);
+        let Some(timeline) = timeline.filter(|_| Self::divides(at, epoch)) else {
+            self.partial = None;
+            self.set_as_of(epoch.begin());
+            return;
+        };
+        let is_later = self.as_of.is_some_and(|as_of| as_of <= minute);
+        let same = self.partial.as_mut().and_then(Arc::get_mut);
+        let same = same.filter(|same| is_later && Arc::ptr_eq(same.timeline(), timeline));
+        if let Some(same) = same {
+            same.advance(minute.as_microsecond());
+        } else {
+            let partial = PartialEpoch::before(Arc::clone(timeline), minute.as_microsecond());
+            self.partial = Some(Arc::new(partial));
         }
+        self.set_as_of(minute);
+    }
+
+    fn set_as_of(&mut self, at: Timestamp) {
+        self.as_of = Some(at);
+        self.now_us = at.as_microsecond();
+    }
+
+    /// Returns these parameters for another time, which [`of_site`](Self::of_site) rounds.
+    pub(in crate::app) fn at(&self, at: Timestamp) -> Self {
+        let mut other = self.clone();
+        other.partial = None;
+        other.set_as_of(at);
+        other
     }
 
     pub(in crate::app) fn choice(&self) -> Choice<'_> {
         Choice {
             as_of: self.as_of,
+            partial: self.partial.as_deref(),
             configuration: self.configuration,
             robot: None,
             normalisation: self.normalisation.as_deref(),
@@ -125,4 +182,10 @@ impl Reading {
                 .to_api(self.now_us)
         })
     }
+}
+
+/// Returns a time rounded down to a whole minute.
+fn minute_of(at: Timestamp) -> Timestamp {
+    let second = at.as_second();
+    Timestamp::from_second(second - second.rem_euclid(MINUTE_S)).unwrap_or(at)
 }

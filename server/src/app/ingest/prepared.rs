@@ -19,7 +19,7 @@ pub(super) struct Skew {
 }
 
 /// Maximum offset that is ignored.
-const SKEW_MIN: SignedDuration = SignedDuration::from_secs(30);
+pub(in crate::app) const SKEW_MIN: SignedDuration = SignedDuration::from_secs(30);
 
 impl Skew {
     pub(super) fn of(robot_time: Option<Timestamp>, now: Timestamp) -> Self {

@@ -7,6 +7,7 @@
 mod changes;
 mod names;
 mod part;
+mod partial;
 mod summaries;
 
 use std::collections::BTreeMap;
@@ -20,8 +21,10 @@ use tread_api::terrain::TerrainRef;
 pub use self::changes::{BLOCK_CELLS, Block, Changes};
 use self::names::{Names, Number};
 use self::part::{Part, PartKey};
+use self::partial::When;
+pub use self::partial::{Epoch, Measurement, PartialEpoch, Timeline};
 pub use self::summaries::{At, CELLS_PER_BLOCK, CellSummary, GROUND_NONE, KnownCell, Lens, Room};
-use super::sums::{DAY_H, HOUR_S, bucket_h};
+use super::sums::bucket_h;
 use super::{Seen, Sums};
 
 /// Labels of a sum.
@@ -52,6 +55,8 @@ pub struct SiteMap {
     /// Sums over all cells, for terrains.
     totals: BTreeMap<PartKey, Sums>,
     changes: Changes,
+    /// Number of withdrawals since the map was read.
+    withdrawals: u64,
 }
 
 fn place(cell: Cell) -> u64 {
@@ -72,6 +77,8 @@ fn cell_at(place: u64) -> Cell {
 pub struct Choice<'choice> {
     /// Only epochs that had ended by this time, because a sum cannot be divided in time.
     pub as_of: Option<Timestamp>,
+    /// What was measured before `as_of` in the epoch that this time lies within.
+    pub partial: Option<&'choice PartialEpoch>,
     /// Only this configuration.
     pub configuration: Option<ConfigurationId>,
     /// Only this robot.
@@ -80,7 +87,14 @@ pub struct Choice<'choice> {
     pub normalisation: Option<&'choice Normalisation>,
 }
 
-impl Choice<'_> {
+impl<'choice> Choice<'choice> {
+    fn when(&self) -> When<'choice> {
+        When {
+            as_of: self.as_of,
+            partial: self.partial,
+        }
+    }
+
     /// Returns the configuration to whose θ the measurements of `found` are converted, and the
     /// divisor for that; `None` if they are filtered out. Configurations of the normalisation are
     /// converted to the chosen configuration, or to the reference if none is chosen.
@@ -187,6 +201,7 @@ impl SiteMap {
 
     /// Removes the measurements of a robot from hour `from_h` to hour `to_h`, both included.
     pub fn withdraw(&mut self, robot: &RobotId, (from_h, to_h): (i64, i64)) {
+        self.withdrawals += 1;
         let Some(&robot) = self.names.robots.numbers.get(robot) else {
             return;
         };
@@ -244,11 +259,17 @@ impl SiteMap {
     /// replaces, and records a change of all cells.
     pub fn follow(&mut self, before: &Self) {
         self.changes.follow(&before.changes);
+        self.withdrawals = before.withdrawals + 1;
     }
 
     /// Returns the hour before which epochs are merged into days.
     pub fn merged_before_h(&self) -> i64 {
         self.merged_before_h
+    }
+
+    /// Returns a number that changes whenever measurements may have left the map.
+    pub fn withdrawals(&self) -> u64 {
+        self.withdrawals
     }
 
     /// Returns the recorded changes of cells.
@@ -268,14 +289,13 @@ impl SiteMap {
 
     /// Returns the measurements of one cell, per terrain and configuration.
     pub fn cell(&self, cell: Cell, choice: Choice<'_>) -> Vec<Group<'_>> {
-        let parts = self.cells.get(&place(cell));
-        parts.map_or_else(Vec::new, |parts| self.groups(parts, choice))
+        self.groups(&self.parts_at(place(cell), choice.when()), choice)
     }
 
     /// Returns the end of the newest pass through a cell, microseconds since 1970; `None` without
     /// one.
     pub fn newest_at_us(&self, cell: Cell, choice: Choice<'_>) -> Option<i64> {
-        let parts = self.cells.get(&place(cell))?;
+        let parts = self.parts_at(place(cell), choice.when());
         let counted = parts.iter().filter(|part| self.counts(&part.key, &choice));
         counted.map(|part| part.newest_at_us).max()
     }
@@ -288,15 +308,14 @@ impl SiteMap {
     /// Returns the measurements of several cells together, summed per robot and epoch, per terrain
     /// and configuration.
     pub fn area(&self, cells: &[Cell], choice: Choice<'_>) -> Vec<Group<'_>> {
-        let parts = cells
-            .iter()
-            .filter_map(|&cell| self.cells.get(&place(cell)));
         let mut sums: BTreeMap<PartKey, Sums> = BTreeMap::new();
-        for part in parts.flat_map(|parts| parts.iter()) {
-            if self.counts(&part.key, &choice) {
-                sums.entry(part.key)
-                    .and_modify(|sums| sums.add(&part.sums()))
-                    .or_insert_with(|| part.sums());
+        for &cell in cells {
+            for part in &*self.parts_at(place(cell), choice.when()) {
+                if self.counts(&part.key, &choice) {
+                    sums.entry(part.key)
+                        .and_modify(|sums| sums.add(&part.sums()))
+                        .or_insert_with(|| part.sums());
+                }
             }
         }
         let parts: Vec<Part> = sums
@@ -358,17 +377,8 @@ impl SiteMap {
             .collect();
         let mut sums: BTreeMap<(ConfigurationId, u32, i32), Sums> = BTreeMap::new();
         for &terrain in &wanted {
-            let first = PartKey {
-                terrain,
-                configuration: 0,
-                robot: 0,
-                epoch_h: i32::MIN,
-            };
-            for (key, total) in self.totals.range(first..) {
-                if key.terrain != terrain {
-                    break;
-                }
-                if self.counts(key, &choice) {
+            for (key, total) in self.totals_at(terrain, choice.when()) {
+                if self.counts(&key, &choice) {
                     let configuration = *self.names.configurations.name(key.configuration);
                     let rank = self.names.robots.rank(key.robot);
                     sums.entry((configuration, rank, key.epoch_h))
@@ -396,36 +406,15 @@ impl SiteMap {
         groups.into_values().filter(Group::tells).collect()
     }
 
+    /// Returns whether measurements of this robot and configuration are chosen.
     fn counts(&self, key: &PartKey, choice: &Choice<'_>) -> bool {
         let names = &self.names;
         choice
-            .as_of
-            .is_none_or(|as_of| self.end_h(key.epoch_h) * HOUR_S <= as_of.as_second())
-            && choice
-                .robot
-                .is_none_or(|robot| names.robots.name(key.robot) == robot)
+            .robot
+            .is_none_or(|robot| names.robots.name(key.robot) == robot)
             && choice
                 .brought_to(*names.configurations.name(key.configuration))
                 .is_some()
-    }
-
-    /// Returns the hour at which an epoch ends.
-    fn end_h(&self, epoch_h: i32) -> i64 {
-        let epoch_h = i64::from(epoch_h);
-        epoch_h
-            + if epoch_h < self.merged_before_h {
-                DAY_H
-            } else {
-                1
-            }
-    }
-
-    /// Returns the newest time, not after `as_of`, for which the map can be computed: the end of an
-    /// hour, or of a day where epochs are merged.
-    pub fn effective_as_of(&self, as_of: Timestamp) -> Timestamp {
-        let hour = as_of.as_second().div_euclid(HOUR_S);
-        let end_s = bucket_h(hour, self.merged_before_h).saturating_mul(HOUR_S);
-        Timestamp::from_second(end_s).unwrap_or(as_of)
     }
 
     /// Groups the parts of one cell, which are sorted by key, by terrain and configuration.

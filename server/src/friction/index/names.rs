@@ -9,14 +9,14 @@ use tread_api::terrain::TerrainRef;
 pub(super) type Number = u32;
 
 /// Interned names of robots, configurations and terrains.
-#[derive(Debug, Default)]
+#[derive(Debug, Clone, Default)]
 pub(super) struct Names {
     pub(super) robots: Interned<RobotId>,
     pub(super) configurations: Interned<ConfigurationId>,
     pub(super) terrains: Interned<Option<TerrainRef>>,
 }
 
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(super) struct Interned<T> {
     pub(super) numbers: BTreeMap<T, Number>,
     pub(super) names: Vec<T>,
@@ -47,6 +47,11 @@ impl<T: Ord + Clone> Interned<T> {
             self.ranks[number as usize] = rank;
         }
         number
+    }
+
+    /// Returns the number of a name; `None` if the name is new.
+    pub(super) fn find(&self, name: &T) -> Option<Number> {
+        self.numbers.get(name).copied()
     }
 
     pub(super) fn name(&self, number: Number) -> &T {

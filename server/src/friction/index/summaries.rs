@@ -1,14 +1,13 @@
 //! Summaries of cells for raster images: one estimate per cell, for one configuration and the
-//! ground at the cell's centre. Allocates nothing per cell.
+//! ground at the cell's centre. Allocates nothing per cell, except as of a past time.
 
-use jiff::Timestamp;
 use tread_api::site::Cell;
 use tread_api::terrain::TerrainRef;
 
 use super::changes::{BLOCK_CELLS, Block};
 use super::part::{Part, PartKey};
+use super::partial::When;
 use super::{Choice, SiteMap, Sums, place};
-use crate::friction::sums::HOUR_S;
 use crate::friction::weights::FrictionConfig;
 use crate::friction::{Fused, Fuser, Ground, Seen};
 
@@ -77,22 +76,18 @@ impl CellSummary {
 
 /// Compiled filter of measurements for rasters, with the internal numbers of the map.
 #[derive(Debug, Clone)]
-pub struct Lens {
+pub struct Lens<'choice> {
     /// Number of the ground of each terrain revision.
     grounds: Vec<u16>,
     /// Divisor of θ of each configuration; `None` for configurations that are filtered out.
     ratios: Vec<Option<f64>>,
-    /// Epochs that end after this time are filtered out; seconds since 1970.
-    as_of_s: Option<i64>,
+    when: When<'choice>,
 }
 
-impl Lens {
-    fn sees(&self, map: &SiteMap, key: &PartKey, ground: u16) -> Option<f64> {
+impl Lens<'_> {
+    fn sees(&self, key: &PartKey, ground: u16) -> Option<f64> {
         let is_here = self.grounds.get(key.terrain as usize) == Some(&ground);
-        let is_over = self
-            .as_of_s
-            .is_none_or(|as_of_s| map.end_h(key.epoch_h) * HOUR_S <= as_of_s);
-        if !is_here || !is_over {
+        if !is_here {
             return None;
         }
         *self.ratios.get(key.configuration as usize)?
@@ -121,11 +116,11 @@ impl SiteMap {
     /// Returns the filter for the configuration in `choice` and those that its normalisation
     /// converts to it. `ground_of` gives the number of each terrain revision's ground, `None` if it
     /// no longer exists. Without a configuration in `choice` everything is filtered out.
-    pub fn lens(
+    pub fn lens<'choice>(
         &self,
-        choice: Choice<'_>,
+        choice: Choice<'choice>,
         ground_of: impl Fn(Option<&TerrainRef>) -> Option<u16>,
-    ) -> Lens {
+    ) -> Lens<'choice> {
         let terrains = self.names.terrains.names.iter();
         let configurations = self.names.configurations.names.iter();
         Lens {
@@ -138,7 +133,7 @@ impl SiteMap {
                     (Some(reference) == choice.configuration).then_some(ratio)
                 })
                 .collect(),
-            as_of_s: choice.as_of.map(Timestamp::as_second),
+            when: choice.when(),
         }
     }
 
@@ -149,7 +144,7 @@ impl SiteMap {
         &self,
         (block, places): (Block, Option<&[u16]>),
         grounds: &[u16],
-        lens: &Lens,
+        lens: &Lens<'_>,
         at: At<'_>,
         squares: &mut [CellSummary],
     ) {
@@ -165,8 +160,7 @@ impl SiteMap {
         };
         if let Some(places) = places {
             for &one in places {
-                let parts = self.cells.get(&place(block.cell(one)));
-                put(one, parts.map_or(&[], |parts| &**parts));
+                put(one, &self.parts_at(place(block.cell(one)), lens.when));
             }
             return;
         }
@@ -174,7 +168,8 @@ impl SiteMap {
         for iy in first.iy..=last.iy {
             let row = place(Cell { iy, ..first })..=place(Cell { iy, ..last });
             for (&at_place, parts) in self.cells.range(row) {
-                put(Block::place(super::cell_at(at_place)), parts);
+                let parts = self.parts_then((at_place, parts), lens.when);
+                put(Block::place(super::cell_at(at_place)), &parts);
             }
         }
     }
@@ -184,14 +179,14 @@ impl SiteMap {
     pub fn fuse_square(
         &self,
         (min, max): (Cell, Cell),
-        (ground, lens): (u16, &Lens),
+        (ground, lens): (u16, &Lens<'_>),
         at: At<'_>,
         room: &mut Room,
     ) -> CellSummary {
         let mut sums: std::collections::BTreeMap<PartKey, Sums> = std::collections::BTreeMap::new();
         for cell in self.cells_in(min, max, None) {
-            for part in self.cells.get(&place(cell)).into_iter().flatten() {
-                if lens.sees(self, &part.key, ground).is_some() {
+            for part in &*self.parts_at(place(cell), lens.when) {
+                if lens.sees(&part.key, ground).is_some() {
                     let added = part.sums();
                     let entry = sums.entry(part.key);
                     entry.and_modify(|sums| sums.add(&added)).or_insert(added);
@@ -215,17 +210,18 @@ impl SiteMap {
     pub fn fuse_cell(
         &self,
         cell: Cell,
-        which: (u16, &Lens),
+        which: (u16, &Lens<'_>),
         at: At<'_>,
         room: &mut Room,
     ) -> Option<Fused> {
-        self.fuse_parts(self.cells.get(&place(cell))?, which, at, room)
+        let parts = self.parts_at(place(cell), which.1.when);
+        self.fuse_parts(&parts, which, at, room)
     }
 
     fn fuse_parts(
         &self,
         parts: &[Part],
-        which: (u16, &Lens),
+        which: (u16, &Lens<'_>),
         at: At<'_>,
         room: &mut Room,
     ) -> Option<Fused> {
@@ -238,7 +234,7 @@ impl SiteMap {
     fn square(
         &self,
         parts: &[Part],
-        which: (u16, &Lens),
+        which: (u16, &Lens<'_>),
         at: At<'_>,
         room: &mut Room,
     ) -> CellSummary {
@@ -246,11 +242,11 @@ impl SiteMap {
         fused.map_or_else(CellSummary::default, |fused| CellSummary::of(&fused))
     }
 
-    fn gather(&self, parts: &[Part], (ground, lens): (u16, &Lens), room: &mut Room) {
+    fn gather(&self, parts: &[Part], (ground, lens): (u16, &Lens<'_>), room: &mut Room) {
         room.seen.clear();
         room.uninformative_passes = 0;
         for part in parts {
-            let Some(ratio) = lens.sees(self, &part.key, ground) else {
+            let Some(ratio) = lens.sees(&part.key, ground) else {
                 continue;
             };
             let rank = self.names.robots.rank(part.key.robot);

@@ -1,8 +1,9 @@
 //! `/v1/sites/{site}/friction` and `/v1/sites/{site}/segments`.
 //!
-//! Every answer about the map has an `ETag` and takes `as_of`: the map as it was known then, in
-//! whole epochs (those that were over), with the ages of then. The answer says as of when it is.
+//! Every answer about the map has an `ETag` and takes `as_of`: the map as it was known then, with the
+//! ages of then. The answer says as of when it is.
 
+pub(super) mod history;
 pub(super) mod map;
 pub(super) mod places;
 mod streamed;
@@ -10,12 +11,12 @@ mod streamed;
 use axum::extract::State;
 use axum::http::HeaderMap;
 use axum::response::Response;
-use jiff::{SignedDuration, Timestamp};
+use jiff::Timestamp;
 use serde::Deserialize;
-use tread_api::friction::{RobotContribution, StoredSegment, TerrainFriction, TerrainHistory};
+use tread_api::friction::{RobotContribution, StoredSegment, TerrainFriction};
 use tread_api::ids::{ConfigurationId, RobotId, SiteId, TerrainId};
 use tread_api::page::Page;
-use tread_api::problem::{ProblemBody, ProblemType};
+use tread_api::problem::ProblemBody;
 use utoipa::IntoParams;
 
 use self::map::say_as_of;
@@ -31,15 +32,13 @@ use crate::app::segments::SegmentFilter;
 use crate::app::{App, AppError};
 use crate::formats::table::{self, segments};
 
-/// Longest step of a history, seconds: a year.
-const STEP_MAX_S: i64 = 366 * 86_400;
-
 /// What is asked for of a terrain.
 #[derive(Debug, Clone, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(super) struct ReadingQuery {
-    /// As of when, rounded down to the end of an epoch; all that has come when absent.
+    /// As of when, rounded down to a minute, or to the end of an epoch without all of its raw
+    /// measurements; all that has come when absent.
     as_of: Option<Timestamp>,
     /// Only measurements of this robot model and tyres.
     #[param(value_type = Option<String>)]
@@ -95,7 +94,8 @@ pub(super) async fn terrains(
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(super) struct OneQuery {
-    /// As of when, rounded down to the end of an epoch; all that has come when absent.
+    /// As of when, rounded down to a minute, or to the end of an epoch without all of its raw
+    /// measurements; all that has come when absent.
     as_of: Option<Timestamp>,
     /// Only measurements of this robot model and tyres.
     #[param(value_type = Option<String>)]
@@ -120,50 +120,6 @@ pub(super) async fn terrain(
     let asked = asked(query.as_of, query.configuration, query.normalisation);
     let found = app.friction_of_terrain(&site, &terrain, &asked).await?;
     Ok(say_as_of(etag::json(&headers, &found), found.as_of))
-}
-
-/// Which times of a terrain's history.
-#[derive(Debug, Clone, Deserialize, IntoParams)]
-#[into_params(parameter_in = Query)]
-#[serde(deny_unknown_fields)]
-pub(super) struct HistoryQuery {
-    /// The oldest time.
-    from: Timestamp,
-    /// The newest time; now when absent.
-    to: Option<Timestamp>,
-    /// Seconds from one time to the next, at least 60; an hour when absent. At most 1000 times.
-    step_s: Option<i64>,
-    /// Only measurements of this robot model and tyres.
-    #[param(value_type = Option<String>)]
-    configuration: Option<ConfigurationId>,
-    /// A declared normalisation that joins robot models.
-    normalisation: Option<String>,
-}
-
-/// Get the history of a terrain's friction at equally spaced times.
-#[utoipa::path(get, path = "/v1/sites/{site}/friction/terrains/{terrain}/history",
-    tag = "friction", security(("token" = ["read"])),
-    operation_id = "get_terrain_history",
-    params(("site" = SiteId, Path), ("terrain" = TerrainId, Path), HistoryQuery),
-    responses((status = 200, body = TerrainHistory), (status = 304),
-        (status = 400, body = ProblemBody), (status = 404, body = ProblemBody)))]
-pub(super) async fn history(
-    State(app): State<App>,
-    Path((site, terrain)): Path<(SiteId, TerrainId)>,
-    Query(query): Query<HistoryQuery>,
-    headers: HeaderMap,
-) -> Result<Response, Problem> {
-    let step_s = query.step_s.unwrap_or(3_600);
-    if !(60..=STEP_MAX_S).contains(&step_s) {
-        let detail = format!("step_s must be 60 to {STEP_MAX_S}, not {step_s}");
-        return Err(Problem::new(ProblemType::InvalidQuery)
-            .detail(detail)
-            .field("step_s"));
-    }
-    let asked = asked(None, query.configuration, query.normalisation);
-    let (times, step) = ((query.from, query.to), SignedDuration::from_secs(step_s));
-    let found = app.history_of_terrain((&site, &terrain), &asked, times, step);
-    Ok(etag::json(&headers, &found.await?))
 }
 
 /// List what each robot contributed to the map.
