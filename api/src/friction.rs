@@ -356,7 +356,7 @@ pub struct TerrainFriction {
     /// Class of the ground.
     pub class: TerrainClass,
     /// Time up to which measurements are included: the requested time rounded down to a minute, or
-    /// to the end of an epoch where raw measurements of the epoch are missing. `null` if no time was
+    /// to the end of an epoch whose raw measurements are missing or too many. `null` if no time was
     /// requested; all measurements are included then.
     #[serde(default)]
     pub as_of: Option<Timestamp>,
@@ -424,7 +424,7 @@ pub struct FrictionAt {
     /// Requested time.
     pub at: Timestamp,
     /// Time up to which measurements are included: `at` rounded down to a minute, or to the end of
-    /// an epoch where raw measurements of the epoch are missing; `at` itself where that is the
+    /// an epoch whose raw measurements are missing or too many; `at` itself where that is the
     /// present.
     pub as_of: Timestamp,
     /// Friction for each robot model.
@@ -435,7 +435,7 @@ pub struct FrictionAt {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct PointFriction {
     /// Time up to which measurements are included: the requested time rounded down to a minute, or
-    /// to the end of an epoch where raw measurements of the epoch are missing. `null` if no time was
+    /// to the end of an epoch whose raw measurements are missing or too many. `null` if no time was
     /// requested; all measurements are included then.
     #[serde(default)]
     pub as_of: Option<Timestamp>,
@@ -469,7 +469,7 @@ pub struct AskPath {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct PathFriction {
     /// Time up to which measurements are included: the requested time rounded down to a minute, or
-    /// to the end of an epoch where raw measurements of the epoch are missing. `null` if no time was
+    /// to the end of an epoch whose raw measurements are missing or too many. `null` if no time was
     /// requested; all measurements are included then.
     #[serde(default)]
     pub as_of: Option<Timestamp>,

@@ -98,6 +98,11 @@ slug! {
 }
 
 slug! {
+    /// Tag of a robot, by which people sort out a fleet.
+    Tag
+}
+
+slug! {
     /// Kind of an alert, for programs; the same kind always has the same code.
     AlertCode
 }

@@ -26,7 +26,7 @@ pub struct MapPage<T> {
     /// Value of `cursor` for the request of the next page; `null` on the last page.
     pub next_cursor: Option<String>,
     /// Time up to which measurements are included: the requested time rounded down to a minute,
-    /// or to the end of an epoch where raw measurements of the epoch are missing. `null` if no time was requested; all measurements are included then.
+    /// or to the end of an epoch whose raw measurements are missing or too many. `null` if no time was requested; all measurements are included then.
     #[serde(default)]
     pub as_of: Option<Timestamp>,
 }

@@ -9,7 +9,7 @@ use crate::friction::LiveFriction;
 use crate::geometry::{Point, Pose, Twist};
 use crate::ids::{
     AlertCode, AlertId, BootId, ConfigurationId, DERIVED_NAMESPACE, MissionId, PlanHash, RobotId,
-    SiteId,
+    SiteId, Tag,
 };
 use crate::safety::SafetyStatus;
 
@@ -261,6 +261,9 @@ impl Alert {
     }
 }
 
+/// Maximum number of tags of a robot.
+pub const TAGS_MAX: usize = 16;
+
 /// Body of `PATCH /v1/sites/{site}/robots/{robot}`; absent fields stay unchanged.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 pub struct ChangeRobot {
@@ -271,6 +274,9 @@ pub struct ChangeRobot {
     /// default; its measurements stay.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub retired: Option<bool>,
+    /// All tags that the robot is to have, at most [`TAGS_MAX`]; repeated ones count once.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tags: Option<Vec<Tag>>,
 }
 
 /// Value with its age at the time of the answer.
@@ -300,6 +306,9 @@ pub struct Robot {
     pub id: RobotId,
     /// Name for people; equal to the identifier until the robot is renamed.
     pub name: String,
+    /// Tags by which people sort out the fleet, in alphabetical order.
+    #[serde(default)]
+    pub tags: Vec<Tag>,
     /// Time when it was retired; `null` if it is not retired.
     pub retired_at: Option<Timestamp>,
     /// Site of the robot.

@@ -127,6 +127,12 @@ pub(crate) fn render(table: &Table) -> String {
     lines.join("\n")
 }
 
+/// Returns values with commas between them.
+pub(crate) fn joined<T: ToString>(values: &[T]) -> String {
+    let texts: Vec<String> = values.iter().map(ToString::to_string).collect();
+    texts.join(", ")
+}
+
 /// Returns a value as text, `-` for `None`.
 pub(crate) fn or_dash<T: ToString>(value: Option<T>) -> String {
     value.map_or_else(|| "-".to_owned(), |value| value.to_string())

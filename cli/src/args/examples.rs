@@ -54,6 +54,10 @@ const EXAMPLES: &[(&str, &str)] = &[
         "robots rename",
         "  tread robots rename rover-1 \"Old Betsy\"",
     ),
+    (
+        "robots tag",
+        "  tread robots tag rover-1 north spare\n  tread robots tag rover-1 --none",
+    ),
     ("robots retire", "  tread robots retire rover-1"),
     ("robots restore", "  tread robots restore rover-1"),
     ("robots revoke", "  tread robots revoke rover-1"),

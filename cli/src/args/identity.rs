@@ -7,7 +7,7 @@ use std::str::FromStr;
 use clap::{Args, Subcommand};
 use tread_api::enrolment::{JOIN_MINUTES_MAX, TrustId};
 use tread_api::identity::{Role, TOKEN_DAYS_DEFAULT, TOKEN_DAYS_MAX};
-use tread_api::ids::{JoinTokenId, RobotId, SessionId, TokenId};
+use tread_api::ids::{JoinTokenId, RobotId, SessionId, Tag, TokenId};
 use tread_api::rights::Right;
 
 use super::{Connection, duration};
@@ -200,6 +200,8 @@ pub(crate) enum RobotsAction {
     Enrolments(PlainArguments),
     /// Change the name of a robot for people
     Rename(RenameArguments),
+    /// Replace the tags of a robot, by which the fleet is sorted out
+    Tag(TagArguments),
     /// Retire a robot: its missions are cancelled, it gets no new ones and is not listed
     Retire(RobotArguments),
     /// Restore a retired robot
@@ -214,6 +216,7 @@ impl RobotsAction {
             Self::JoinToken(arguments) => &arguments.connection,
             Self::Enrolments(arguments) => &arguments.connection,
             Self::Rename(arguments) => &arguments.connection,
+            Self::Tag(arguments) => &arguments.connection,
             Self::Retire(arguments) | Self::Restore(arguments) | Self::Revoke(arguments) => {
                 &arguments.connection
             }
@@ -257,6 +260,20 @@ pub(crate) struct RenameArguments {
     pub(crate) robot: RobotId,
     /// New name
     pub(crate) name: String,
+    #[command(flatten)]
+    pub(crate) connection: Connection,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct TagArguments {
+    /// Robot to tag
+    pub(crate) robot: RobotId,
+    /// All tags that it is to have: a-z, 0-9 and `-`
+    #[arg(value_name = "TAG", required_unless_present = "none")]
+    pub(crate) tags: Vec<Tag>,
+    /// Remove all tags
+    #[arg(long, conflicts_with = "tags")]
+    pub(crate) none: bool,
     #[command(flatten)]
     pub(crate) connection: Connection,
 }

@@ -52,7 +52,7 @@ impl Client {
         self.get(&format!("/v1/sites/{site}/robots/{robot}")).await
     }
 
-    /// Renames, retires or restores a robot.
+    /// Renames, tags, retires or restores a robot.
     pub(crate) async fn change_robot(
         &self,
         site: &SiteId,

@@ -1,4 +1,4 @@
-//! `tread robots join-token`, `enrolments`, `rename`, `retire`, `restore` and `revoke`.
+//! `tread robots join-token`, `enrolments`, `rename`, `tag`, `retire`, `restore` and `revoke`.
 
 use std::process::ExitCode;
 
@@ -7,7 +7,7 @@ use tread_api::robot::{ChangeRobot, Robot};
 
 use crate::args::{JoinTokenAction, JoinTokenArguments, RobotArguments, RobotsAction};
 use crate::client::{Client, ClientError};
-use crate::output::{Output, note, or_dash, render, table};
+use crate::output::{Output, joined, note, or_dash, render, table};
 
 pub(super) async fn run(
     action: &RobotsAction,
@@ -24,11 +24,24 @@ pub(super) async fn run(
         RobotsAction::Rename(arguments) => {
             let change = ChangeRobot {
                 name: Some(arguments.name.clone()),
-                retired: None,
+                ..ChangeRobot::default()
             };
             let robot = client.change_robot(site, &arguments.robot, &change).await?;
             output.show(&robot, |it| {
                 format!("the name of `{}` is now {}", it.id, it.name)
+            })?;
+        }
+        RobotsAction::Tag(arguments) => {
+            let change = ChangeRobot {
+                tags: Some(arguments.tags.clone()),
+                ..ChangeRobot::default()
+            };
+            let robot = client.change_robot(site, &arguments.robot, &change).await?;
+            output.show(&robot, |it| {
+                if it.tags.is_empty() {
+                    return format!("`{}` has no tags", it.id);
+                }
+                format!("`{}` has the tags {}", it.id, joined(&it.tags))
             })?;
         }
         RobotsAction::Retire(arguments) => {
@@ -57,8 +70,8 @@ async fn set_retired(
     is_retired: bool,
 ) -> Result<Robot, ClientError> {
     let change = ChangeRobot {
-        name: None,
         retired: Some(is_retired),
+        ..ChangeRobot::default()
     };
     let site = &arguments.connection.site;
     client.change_robot(site, &arguments.robot, &change).await

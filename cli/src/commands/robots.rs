@@ -10,7 +10,7 @@ use tread_api::safety::{Driver, SafetyStatus};
 
 use crate::args::RobotsArguments;
 use crate::client::Client;
-use crate::output::{Output, age, fixed, or_dash, render, table};
+use crate::output::{Output, age, fixed, joined, or_dash, render, table};
 
 pub(super) async fn run(
     arguments: &RobotsArguments,
@@ -124,6 +124,9 @@ pub(super) fn details(robot: &Robot) -> String {
         format!("first seen     {}", robot.first_seen_at),
         format!("last hello     {}", robot.last_hello_at),
     ];
+    if !robot.tags.is_empty() {
+        lines.push(format!("tags           {}", joined(&robot.tags)));
+    }
     match &robot.live {
         Some(live) => lines.extend(live_lines(live)),
         None => lines.push("it has sent no state since the server started".to_owned()),

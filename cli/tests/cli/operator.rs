@@ -196,6 +196,12 @@ async fn a_mission_is_checked_sent_held_followed_and_ended_by_commands() {
 async fn robots_are_named_stopped_fenced_and_watched_over_by_commands() {
     let yard = Yard::start().await;
     yard.table(&["robots", "rename", ROBOT, "Old Betsy"]).await;
+    let tagged = yard.json(&["robots", "tag", ROBOT, "spare", "north"]).await;
+    assert_eq!(tagged["tags"], serde_json::json!(["north", "spare"]));
+    let shown = yard.table(&["robots", ROBOT]).await;
+    assert!(shown.contains("north, spare"), "{shown}");
+    let none = yard.table(&["robots", "tag", ROBOT, "--none"]).await;
+    assert!(none.contains("has no tags"), "{none}");
     let shown = yard.table(&["robots", ROBOT]).await;
     assert!(shown.contains("Old Betsy"), "{shown}");
     assert!(yard.table(&["status"]).await.contains("robots present  1"));

@@ -1,5 +1,5 @@
 import { expect, test } from 'vitest';
-import { ADDRESS_MAX, addressOf, placeAtStart, placeOf, type DraftState, type Place } from './address';
+import { ADDRESS_MAX, CHANGE, LAYER_FIRST, addressOf, placeAtStart, placeOf, type DraftState, type Place } from './address';
 
 const draft: DraftState = {
   what: 'mission',
@@ -42,8 +42,10 @@ test('what is shown, selected and drawn comes back from the address as it was', 
   expect(placeOf(`#${address}`)).toEqual(place);
   expect(address).toContain('view=12.5,-0.25,33.3');
   const bare = { ...place, draft: null, robot: null, marked: [], view: null, layer: '', hidden: [], tab: 'robots' } as const;
-  expect(addressOf({ ...bare, marked: [], hidden: [] })).toBe('site=yard');
-  expect(placeOf('#site=yard')).toEqual({ ...bare, marked: [], hidden: [] });
+  const none = { ...bare, marked: [], hidden: [] };
+  expect(addressOf(none)).toBe('site=yard&layer=none');
+  expect(placeOf('#site=yard&layer=none')).toEqual(none);
+  for (const layer of ['stiffness', CHANGE]) expect(placeOf(addressOf({ ...place, layer })).layer).toBe(layer);
 });
 
 test('a reload brings back what the tab kept, an address from elsewhere what it says', () => {
@@ -60,6 +62,12 @@ test('a reload brings back what the tab kept, an address from elsewhere what it 
   const long = { ...place, draft };
   const short = `#${addressOf(long, 1)}`;
   expect(placeAtStart(short, { place: addressOf(long, Infinity), address: other })).toEqual(long);
+});
+
+test('an address that says nothing of the friction layer shows it', () => {
+  for (const address of ['#site=yard&robot=rover-1', '#site=yard&layer=', '#site=yard&layer=snow', '']) {
+    expect(placeOf(address).layer, address).toBe(LAYER_FIRST);
+  }
 });
 
 test('what is not understood is left out, and breaks nothing', () => {

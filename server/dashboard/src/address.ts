@@ -3,6 +3,7 @@
 import type { TerrainClass } from './api/schema';
 import type { PointM } from './map/camera';
 import type { DraftKind } from './map/draft';
+import { RANGES, type Quantity } from './map/friction';
 import { texts } from './texts';
 
 export const TABS = ['robots', 'missions', 'alerts', 'terrains'] as const;
@@ -12,6 +13,12 @@ const WHATS = ['mission', 'replace', 'terrain', 'keep_in', 'keep_out'] as const;
 const KINDS = ['circle', 'waypoints', 'terrain'] as const satisfies readonly DraftKind[];
 const STARTS = ['append', 'replace', 'refuse'] as const;
 const LINKS = ['continue', 'stop_after'] as const;
+/** The friction layer shows the change between two times. */
+export const CHANGE = 'change';
+/** What the friction layer shows from the start. */
+export const LAYER_FIRST = 'theta' satisfies Quantity;
+const LAYERS: readonly string[] = [...Object.keys(RANGES), CHANGE];
+const LAYER_NONE = 'none';
 const CLASSES = Object.keys(texts.terrains.classes) as TerrainClass[];
 
 /** Longest address that browsers and chats take well; a longer draft is kept by the tab alone. */
@@ -49,7 +56,7 @@ export interface Place {
   robot: string | null;
   marked: string[];
   view: { center: PointM; scale: number } | null;
-  /** What the friction layer shows; empty for none. */
+  /** What the friction layer shows, or `CHANGE`; empty for none. */
   layer: string;
   hidden: Hideable[];
   draft: DraftState | null;
@@ -85,7 +92,7 @@ export function addressOf(place: Place, most = ADDRESS_MAX): string {
     const { center, scale } = place.view;
     query.set('view', [center.x_m, center.y_m, scale].map((value) => number(value, SEEN_DIGITS)).join(','));
   }
-  if (place.layer) query.set('layer', place.layer);
+  query.set('layer', place.layer || LAYER_NONE);
   if (place.hidden.length > 0) query.set('hidden', place.hidden.join(','));
   const plain = readable(query);
   if (!place.draft) return plain;
@@ -124,7 +131,7 @@ export function placeOf(address: string): Place {
     robot: query.get('robot'),
     marked: list('selected'),
     view: isView ? { center: { x_m, y_m }, scale } : null,
-    layer: query.get('layer') ?? '',
+    layer: layerOf(query.get('layer')),
     hidden: list('hidden').flatMap((name) => oneOf(HIDEABLE, name) ?? []),
     draft: draftOf(query.get('draft')),
   };
@@ -148,6 +155,12 @@ export function placeAtStart(hash: string, tab: KeptByTab): Place {
   const bare = (place: Place) => addressOf({ ...place, draft: null });
   if (!place.draft && bare(kept) === bare(place)) place.draft = kept.draft;
   return place;
+}
+
+/** An address that says nothing of the layer shows the one that is shown from the start. */
+function layerOf(text: string | null): string {
+  if (text === LAYER_NONE) return '';
+  return oneOf(LAYERS, text) ?? LAYER_FIRST;
 }
 
 function oneOf<T extends string>(names: readonly T[], name: unknown): T | null {

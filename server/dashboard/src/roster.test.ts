@@ -9,12 +9,14 @@ interface Made {
   standing?: string;
   model?: string;
   name?: string;
+  tags?: string[];
 }
 
 function robot(id: string, made: Made = {}): Robot {
   return {
     id,
     name: made.name ?? id,
+    tags: made.tags ?? [],
     link: made.link ?? 'online',
     model: { name: made.model ?? 'rover', tyres: 'air' },
     live: {
@@ -25,7 +27,7 @@ function robot(id: string, made: Made = {}): Robot {
   } as unknown as Robot;
 }
 
-const all: Wanted = { search: '', groups: new Set<Group>(), model: null, order: 'trouble' };
+const all: Wanted = { search: '', groups: new Set<Group>(), model: null, tag: null, order: 'trouble' };
 const ids = (robots: Robot[], wanted: Partial<Wanted>) =>
   listed(robots.map((robot) => ({ robot })), { ...all, ...wanted }).map((entry) => entry.robot.id);
 
@@ -76,4 +78,12 @@ test('a range reaches from the first to the last, whichever was chosen first', (
   expect(between(list, null, 'b')).toEqual(['b']);
   expect(between(list, 'gone', 'b')).toEqual(['b']);
   expect(between(list, 'a', 'gone')).toEqual([]);
+});
+
+test('robots are found by their tags, in the search and by choice', () => {
+  const tagged = [robot('a', { tags: ['north', 'spare'] }), robot('b', { tags: ['south'] }), robot('c')];
+  expect(ids(tagged, { tag: 'spare' })).toEqual(['a']);
+  expect(ids(tagged, { search: 'sou' })).toEqual(['b']);
+  expect(ids(tagged, { tag: 'east' })).toEqual([]);
+  expect(ids(tagged, {})).toEqual(['a', 'b', 'c']);
 });

@@ -7,11 +7,12 @@ export const GROUPS = ['fault', 'lost', 'stopped', 'moving', 'idle'] as const;
 export type Group = (typeof GROUPS)[number];
 export type Order = 'trouble' | 'name';
 
-/** What robots are looked for; no groups and no model mean all. */
+/** What robots are looked for; no groups, no model and no tag mean all. */
 export interface Wanted {
   search: string;
   groups: ReadonlySet<Group>;
   model: string | null;
+  tag: string | null;
   order: Order;
 }
 
@@ -36,9 +37,9 @@ export function compareNames(a: Robot, b: Robot): number {
   return byName.compare(a.name, b.name) || byName.compare(a.id, b.id);
 }
 
-/** Whether each word of a search is in a robot's name or identifier. */
+/** Whether each word of a search is in a robot's name, identifier or tags. */
 function isFound(robot: Robot, words: readonly string[]): boolean {
-  const text = `${robot.name} ${robot.id}`.toLowerCase();
+  const text = [robot.name, robot.id, ...(robot.tags ?? [])].join(' ').toLowerCase();
   return words.every((word) => text.includes(word));
 }
 
@@ -51,7 +52,8 @@ export function listed<Entry extends { robot: Robot }>(entries: readonly Entry[]
       ({ entry: { robot }, rank }) =>
         isFound(robot, words) &&
         (wanted.groups.size === 0 || wanted.groups.has(GROUPS[rank] ?? 'idle')) &&
-        (wanted.model === null || modelOf(robot) === wanted.model),
+        (wanted.model === null || modelOf(robot) === wanted.model) &&
+        (wanted.tag === null || (robot.tags ?? []).includes(wanted.tag)),
     );
   const isByTrouble = wanted.order === 'trouble';
   found.sort((a, b) => (isByTrouble ? a.rank - b.rank : 0) || compareNames(a.entry.robot, b.entry.robot));

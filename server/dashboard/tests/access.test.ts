@@ -1,11 +1,25 @@
 // For everybody: axe-core on every part of the page, and a whole run by keys alone.
 import type { Page } from 'playwright-core';
-import { expect, test } from 'vitest';
+import { beforeAll, expect, test } from 'vitest';
 import type { Mission, Page as ApiPage } from './types';
 import { violations } from './checks';
 import { api, browser, eventually, select, shot, token } from './harness';
 
 const { open } = browser();
+/** How long a short mission may take, milliseconds. */
+const MISSION_MS = 55_000;
+
+// A mission that has succeeded is looked at, whichever tests ran before.
+beforeAll(async () => {
+  const succeeded = async () =>
+    (await api<ApiPage<Mission>>('/v1/missions?site=yard&state=succeeded&limit=1')).items.length > 0;
+  if (await succeeded()) return;
+  const circle = { center: { x_m: 8, y_m: 16 }, radius_m: 2, speed_m_s: 0.6, turns: 0.1 };
+  const order = { site: 'yard', robot: 'rover-2', trajectory: { circle }, start_policy: 'replace' };
+  await api<Mission>('/v1/missions', 'POST', order);
+  await eventually('a mission that has succeeded', succeeded, MISSION_MS);
+});
+
 for (const theme of ['light', 'dark'] as const) {
   for (const [name, size] of [
     ['wide', { width: 1360, height: 850 }],
@@ -13,9 +27,13 @@ for (const theme of ['light', 'dark'] as const) {
     ['phone', { width: 390, height: 800 }],
   ] as const) {
     test(`no part of the page violates a rule of accessibility: ${theme}, ${name}`, async () => {
-      const stranger = await open({ as: null, theme, size });
+      const stranger = await open({ as: null, theme, size, expected: /401/ });
       await stranger.getByLabel('Token').waitFor();
       expect(await violations(stranger)).toEqual([]);
+      await stranger.getByLabel('Token').fill('tread_wrong');
+      await stranger.getByRole('button', { name: 'Sign in' }).click();
+      await stranger.getByText('The server does not know this token').waitFor();
+      expect(await violations(stranger), 'refused').toEqual([]);
       await stranger.close();
       const page = await open({ theme, size });
       expect(await violations(page)).toEqual([]);
@@ -24,6 +42,15 @@ for (const theme of ['light', 'dark'] as const) {
       });
       await page.getByRole('combobox', { name: 'Friction' }).selectOption('theta');
       await page.locator('.layers figure').waitFor();
+      // A time that is past, and back to the present.
+      const time = page.getByRole('slider', { name: 'Time of the map' });
+      await time.press('ArrowLeft');
+      await page.locator('[data-test="map-time"]').getByText(/^as of/).waitFor();
+      expect(await violations(page), 'the past').toEqual([]);
+      await time.press('ArrowRight');
+      await page.getByRole('button', { name: 'Settings' }).click();
+      expect(await violations(page), 'settings').toEqual([]);
+      await page.keyboard.press('Escape');
       // The place in the middle of the map, with its history.
       await page.getByRole('application', { name: /^Map/ }).press('Enter');
       const place = page.locator('[data-test="inspect"]');
@@ -62,6 +89,12 @@ for (const theme of ['light', 'dark'] as const) {
       await clear.waitFor();
       expect(await violations(page), 'driving, stopped').toEqual([]);
       await shot(page, `${theme}-${name}`);
+      await page.getByRole('tab', { name: 'Alerts' }).click();
+      await page.locator('[data-alert]').first().waitFor();
+      expect(await violations(page), 'alerts').toEqual([]);
+      await page.getByRole('combobox', { name: 'Which alerts' }).selectOption('now and past');
+      await page.locator('[data-alert]').first().waitFor();
+      expect(await violations(page), 'alerts of the past').toEqual([]);
       await eventually('the clear', async () => {
         if (await clear.isVisible()) await clear.click({ timeout: 2_000 });
         return !(await clear.isVisible());

@@ -3,6 +3,8 @@ import type { Locator } from 'playwright-core';
 import { expect, test } from 'vitest';
 import type { CellDifference, CellFriction, CreatedToken, Mission, Page as ApiPage, Robot } from './types';
 import { changeColour, shareOfChange } from '../src/map/compare';
+import { moment } from '../src/format';
+import { texts } from '../src/texts';
 import { api, browser, eventually, map, select, server, shot, token, windowOf } from './harness';
 
 const { open } = browser();
@@ -125,6 +127,9 @@ test('from far the friction layer is read in larger squares, and whole', async (
   await shot(page, 'far');
 });
 
+/** A wall time as its input has it. */
+const local = (at_ms: number) => new Date(at_ms - new Date(at_ms).getTimezoneOffset() * 60_000).toISOString().slice(0, 16);
+
 test('two times of the friction map are compared', async () => {
   const from = new Date(Date.now() - 3_600_000).toISOString();
   const measured = await eventually('measured cells', async () => {
@@ -146,6 +151,12 @@ test('two times of the friction map are compared', async () => {
     return (await page.locator('[data-test="value"]').innerText()) === 'measured for the first time';
   });
   await shot(page, 'compare');
+  // Two times of one hour, and the page says which.
+  const [before_ms, after_ms] = [2, 1].map((minutes) => (Math.floor(Date.now() / 60_000) - minutes) * 60_000) as [number, number];
+  await page.getByLabel('Before').fill(local(before_ms));
+  await page.getByLabel('After').fill(local(after_ms));
+  const said = texts.map.compared(...([before_ms, after_ms].map((at) => moment(new Date(at).toISOString())) as [string, string]));
+  await page.locator('[data-test="compared"]').getByText(said).waitFor();
   // Between two times of long ago nothing was measured.
   await page.getByLabel('Before').fill('2020-01-01T00:00');
   await page.getByLabel('After').fill('2020-02-01T00:00');

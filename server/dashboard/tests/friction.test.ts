@@ -3,7 +3,7 @@ import type { Page } from 'playwright-core';
 import { expect, test } from 'vitest';
 import { colour } from '../src/map/cividis';
 import { RANGES, shade } from '../src/map/friction';
-import { demandOf, slipOf } from '../src/map/meaning';
+import { demandOf, slipOf, stoppingM } from '../src/map/meaning';
 import { moment, plain } from '../src/format';
 import { texts } from '../src/texts';
 import type { CellFriction, FusedFriction, Page as ApiPage, PointHistory, Robot, TerrainHistory } from './types';
@@ -75,6 +75,10 @@ test('friction is shown from the start, with a scale whose ends say what they me
   await legend.getByText('What it means').click();
   await legend.getByText('It says nothing of θ.').waitFor();
   await legend.locator('.wide').getByText('stops within this distance').waitFor();
+  const mu = RANGES.friction.ticks[1] ?? NaN;
+  const limit = legend.locator('tr', { has: page.getByRole('cell', { name: plain(mu), exact: true }) });
+  const stops_m = Number(/([\d.]+)$/.exec(await limit.innerText())?.[1]);
+  expect(stops_m).toBeCloseTo(stoppingM(mu, demand) ?? NaN, 2);
   await shot(page, 'friction-peak');
 });
 

@@ -60,6 +60,21 @@ test('a stop is shown confirmed and is cleared from the page', async () => {
   expect(await stops('rover-2')).toEqual([]);
 });
 
+test('space on the stick stops the robot that somebody drives', async () => {
+  const page = await open();
+  await beginDriving(page, 'rover-2');
+  await eventually('the stick has the keys', async () =>
+    page.evaluate(() => document.activeElement?.getAttribute('role') === 'application'),
+  );
+  await page.keyboard.press('Space');
+  const shown = page.locator('[data-robot="rover-2"].held');
+  await shown.waitFor();
+  expect((await stops('rover-2')).length).toBe(1);
+  await standsStill('rover-2');
+  await page.getByRole('button', { name: 'Clear rover-2' }).click();
+  await shown.waitFor({ state: 'detached' });
+});
+
 test('a stop that the robot has not confirmed stays red until it has', async () => {
   const page = await open();
   await select(page, 'rover-2');

@@ -2,6 +2,7 @@
 import type { Page } from 'playwright-core';
 import { expect, test } from 'vitest';
 import type { Mission, Page as ApiPage, Stop } from './types';
+import { violations } from './checks';
 import { CROWD, crowd } from './crowd';
 import { api, browser, eventually, map, select, shot } from './harness';
 
@@ -230,4 +231,27 @@ test('robots are selected together on the map', async () => {
   expect(await page.getByLabel('Select rover-1', { exact: true }).isChecked()).toBe(true);
   await canvas.click({ position: middle, modifiers: ['Shift'] });
   await page.getByText('1 selected').waitFor({ state: 'detached' });
+});
+
+test('robots are tagged on the page, and listed by tag', async () => {
+  const page = await open();
+  await select(page, 'rover-2');
+  await page.getByRole('button', { name: 'Change tags' }).click();
+  await page.getByLabel('Tags, with spaces between').fill('spare North');
+  expect(await violations(page), 'tags').toEqual([]);
+  await page.getByRole('button', { name: 'Save tags' }).click();
+  await page.getByText('north, spare').waitFor();
+  await page.getByRole('button', { name: 'All robots' }).click();
+  await page.getByRole('combobox', { name: 'Tag' }).selectOption('spare');
+  await page.getByLabel('Select 1 robot').waitFor();
+  expect(await page.locator('button[data-robot]').count()).toBe(1);
+  await page.locator('button[data-robot="rover-2"]').waitFor();
+  await select(page, 'rover-2');
+  await page.getByRole('button', { name: 'Change tags' }).click();
+  await page.getByLabel('Tags, with spaces between').fill('');
+  await page.getByRole('button', { name: 'Save tags' }).click();
+  await page.getByRole('button', { name: 'Change tags' }).waitFor();
+  await page.getByRole('button', { name: 'All robots' }).click();
+  await page.getByRole('button', { name: 'Show all' }).click();
+  await page.getByRole('combobox', { name: 'Tag' }).waitFor({ state: 'detached' });
 });

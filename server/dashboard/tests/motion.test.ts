@@ -7,6 +7,8 @@ import { api, browser, eventually, select, shot } from './harness';
 
 const { open } = browser();
 const WATCHED_MS = 4_000;
+/** Of ten views a second, as many come on a busy machine. */
+const VIEWS_MIN_HZ = 8;
 /** Frames of robots that a map may draw by chance while nothing moves. */
 const IDLE_FRAMES_MAX = 2;
 
@@ -56,7 +58,12 @@ function steps(places: Place[]): number[] {
   return places.slice(1).map((place, index) => Math.hypot(place.x - (places[index]?.x ?? 0), place.y - (places[index]?.y ?? 0)));
 }
 
-test('a robot that moves is drawn at another place at least 20 times a second, in even steps', async () => {
+for (const isSelected of [true, false]) {
+  const which = isSelected ? 'a robot that is selected' : 'a robot that nobody has selected';
+  test(`${which} is drawn at another place at least 20 times a second, in even steps`, () => movesEvenly(isSelected));
+}
+
+async function movesEvenly(isSelected: boolean): Promise<void> {
   const sent = await api<Mission>('/v1/missions', 'POST', {
     site: 'yard',
     robot: 'rover-1',
@@ -64,7 +71,7 @@ test('a robot that moves is drawn at another place at least 20 times a second, i
     trajectory: { circle: { center: { x_m: 8, y_m: 6 }, radius_m: 2, speed_m_s: 0.6, turns: 20 } },
   });
   const page = await open({ prepare: watchOutlines });
-  await select(page, 'rover-1');
+  if (isSelected) await select(page, 'rover-1');
   await eventually('rover-1 is on its way', async () => {
     const robot = await api<Robot>('/v1/sites/yard/robots/rover-1');
     return (robot.live?.twist?.value.linear_m_s ?? 0) > 0.5;
@@ -87,6 +94,31 @@ test('a robot that moves is drawn at another place at least 20 times a second, i
   expect(fast).toBeLessThan((2 * length_px) / seconds);
   await shot(page, 'motion');
   await api(`/v1/missions/${sent.id}/cancel`, 'POST');
+}
+
+test('the socket of whoever looks at a robot or drives it says ten times a second where it is', async () => {
+  const page = await open();
+  let views = 0;
+  page.on('websocket', (socket) => {
+    socket.on('framereceived', ({ payload }) => {
+      if (String(payload).includes('"view"')) views += 1;
+    });
+  });
+  const rate = async () => {
+    await eventually('a first view', async () => views > 0);
+    const [before, begin_ms] = [views, Date.now()];
+    await page.waitForTimeout(WATCHED_MS);
+    return ((views - before) / (Date.now() - begin_ms)) * 1000;
+  };
+  await select(page, 'rover-2');
+  const watching = await rate();
+  await page.getByRole('button', { name: 'Teleoperate' }).click();
+  await page.getByText('You have the lease.').waitFor();
+  views = 0;
+  const driving = await rate();
+  console.log(`views a second: ${watching.toFixed(1)} while somebody looks, ${driving.toFixed(1)} while somebody drives`);
+  expect(watching).toBeGreaterThanOrEqual(VIEWS_MIN_HZ);
+  expect(driving).toBeGreaterThanOrEqual(VIEWS_MIN_HZ);
 });
 
 test('a map on which nothing moves draws no frames', async () => {

@@ -7,6 +7,7 @@ import type { AddressInfo } from 'node:net';
 import { tmpdir } from 'node:os';
 import { join } from 'node:path';
 import { afterAll, beforeAll, expect, test } from 'vitest';
+import { violations } from './checks';
 import { browser, eventually, shot } from './harness';
 
 const { open } = browser();
@@ -71,7 +72,11 @@ afterAll(async () => {
 
 test('a webhook is made, tested, disabled and removed on the page, and its deliveries are listed', async () => {
   const page = await open({ as: null, address, expected: /422/ });
-  await page.getByLabel('Token').fill(readFileSync(join(folder, 'token'), 'utf8').trim());
+  const admin = readFileSync(join(folder, 'token'), 'utf8').trim();
+  const headers = { authorization: `Bearer ${admin}`, 'content-type': 'application/json' };
+  const made = await fetch(`${address}/v1/sites`, { method: 'POST', headers, body: JSON.stringify({ id: 'yard' }) });
+  expect(made.status).toBe(201);
+  await page.getByLabel('Token').fill(admin);
   await page.getByRole('button', { name: 'Sign in' }).click();
   await page.getByRole('tab', { name: 'Alerts' }).click();
   await page.getByText('Where alerts are sent').click();
@@ -81,6 +86,7 @@ test('a webhook is made, tested, disabled and removed on the page, and its deliv
     await form.getByLabel('Name').fill('on call');
     await form.getByLabel('Address').fill(url);
     await form.getByLabel('Kinds').fill('robot-lost, mission-failed');
+    await form.getByLabel('Sites').fill('yard');
     await form.getByRole('button', { name: 'Add' }).click();
   };
   await add('http://10.0.0.1/hook');
@@ -91,6 +97,8 @@ test('a webhook is made, tested, disabled and removed on the page, and its deliv
   const card = page.locator('details li.card');
   await card.getByText(url).waitFor();
   await card.getByText('mission-failed, robot-lost').waitFor();
+  await card.getByText('yard', { exact: true }).waitFor();
+  expect(await violations(page), 'a webhook and its secret').toEqual([]);
 
   const press = (name: string) => card.getByRole('button', { name, exact: true }).click();
   const lines = card.locator('li');
@@ -104,9 +112,9 @@ test('a webhook is made, tested, disabled and removed on the page, and its deliv
   await press('Send a test');
   await newest(/arrived/);
   expect(received).toHaveLength(1);
-  const { headers, body } = received[0] ?? { headers: {}, body: '' };
-  const signed = createHmac('sha256', secret).update(`${String(headers['tread-timestamp'])}.${body}`).digest('hex');
-  expect(headers['tread-signature']).toBe(`v1=${signed}`);
+  const { headers: sent, body } = received[0] ?? { headers: {}, body: '' };
+  const signed = createHmac('sha256', secret).update(`${String(sent['tread-timestamp'])}.${body}`).digest('hex');
+  expect(sent['tread-signature']).toBe(`v1=${signed}`);
   expect(JSON.parse(body)).toMatchObject({ v: 1, id: null });
   await shot(page, 'webhooks');
 

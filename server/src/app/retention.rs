@@ -35,11 +35,6 @@ impl Removed {
         boots.contains(&boot_pk)
     }
 
-    pub(super) fn is_empty(&self) -> bool {
-        let boots = self.boots.lock().unwrap_or_else(PoisonError::into_inner);
-        boots.is_empty()
-    }
-
     pub(super) fn extend(&self, found: impl IntoIterator<Item = i64>) {
         let mut boots = self.boots.lock().unwrap_or_else(PoisonError::into_inner);
         boots.extend(found);

@@ -1,11 +1,13 @@
 //! Robots: listing, changes, and their hello.
 
+use std::collections::BTreeSet;
+
 use tracing::info;
-use tread_api::ids::{RobotId, SiteId};
+use tread_api::ids::{RobotId, SiteId, Tag};
 use tread_api::mission::Actor;
 use tread_api::page::Page;
 use tread_api::rights::Scope;
-use tread_api::robot::{ALERTS_MAX, Alert, ChangeRobot, Robot, RobotModel};
+use tread_api::robot::{ALERTS_MAX, Alert, ChangeRobot, Robot, RobotModel, TAGS_MAX};
 use tread_api::site::NAME_LENGTH_MAX;
 use tread_api::text::is_printable;
 use tread_api::wire::hello::{Hello, Welcome};
@@ -98,6 +100,9 @@ impl App {
             let name = name_or(change.name, id.as_str())?;
             db::robots::rename(&mut tx, row.pk, &name).await?;
         }
+        if let Some(tags) = change.tags {
+            db::robots::set_tags(&mut tx, row.pk, &distinct_tags(tags)?).await?;
+        }
         match (change.retired, row.retired_at) {
             (Some(true), None) => {
                 let why = (Change::Retire, Actor::Client, Change::Retire.reason());
@@ -134,6 +139,7 @@ impl App {
             id: row.id,
             site: row.site,
             name: row.name,
+            tags: row.tags,
             retired_at: row.retired_at,
             model: row.model,
             configuration: row.configuration,
@@ -310,4 +316,19 @@ fn check_model(hello: &Hello) -> Result<(), String> {
         Some((field, value)) => Err(format!("model.{field} must be positive, not {value}")),
         None => Ok(()),
     }
+}
+
+/// Returns tags without repetition.
+///
+/// # Errors
+/// There are more than [`TAGS_MAX`].
+fn distinct_tags(tags: Vec<Tag>) -> Result<BTreeSet<Tag>, AppError> {
+    let tags: BTreeSet<Tag> = tags.into_iter().collect();
+    if tags.len() > TAGS_MAX {
+        return Err(AppError::Invalid {
+            field: "tags",
+            detail: format!("{} tags; a robot has at most {TAGS_MAX}", tags.len()),
+        });
+    }
+    Ok(tags)
 }

@@ -4,7 +4,7 @@ use std::collections::{BTreeSet, HashMap};
 
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
-use tread_api::ids::{BootId, ConfigurationId, RobotId, SiteId};
+use tread_api::ids::{BootId, ConfigurationId, RobotId, SiteId, Tag};
 use tread_api::robot::{Capabilities, RobotModel, UnmappedMeasurements};
 
 use super::{DbError, from_json, from_us, parse, robots_text, to_json, to_us, unsigned};
@@ -27,6 +27,8 @@ pub struct RobotRow {
     pub configuration: ConfigurationId,
     /// Display name; the identifier until it is renamed.
     pub name: String,
+    /// Tags, sorted.
+    pub tags: Vec<Tag>,
     /// Time at which it was retired; `None` if it is not.
     pub retired_at: Option<Timestamp>,
     /// What the base and its agent can do.
@@ -50,6 +52,7 @@ struct Raw {
     model: String,
     configuration: String,
     name: Option<String>,
+    tags: String,
     retired_at_us: Option<i64>,
     capabilities: String,
     agent_version: String,
@@ -70,6 +73,7 @@ impl TryFrom<Raw> for RobotRow {
             site: parse("site", &raw.site)?,
             id: parse("robot", &raw.id)?,
             name: raw.name.unwrap_or(raw.id),
+            tags: from_json("tags", &raw.tags)?,
             retired_at: raw.retired_at_us.map(from_us).transpose()?,
             capabilities: from_json("capabilities", &raw.capabilities)?,
             model: from_json("robot model", &raw.model)?,
@@ -93,7 +97,7 @@ macro_rules! robots {
             Raw,
             r#"SELECT robots.pk AS "pk!", sites.id AS site, robots.id,
                    configurations.model AS "model!", configurations.id AS configuration,
-                   robots.name, robots.retired_at_us, robots.capabilities,
+                   robots.name, robots.tags, robots.retired_at_us, robots.capabilities,
                    robots.agent_version, robots.boot, robots.first_seen_at_us,
                    robots.last_hello_at_us, robots.segments_refused,
                    robots.segments_refused_why,
@@ -413,6 +417,19 @@ pub async fn names(db: &mut SqliteConnection) -> Result<Vec<(SiteId, RobotId)>, 
 /// Changes a robot's display name.
 pub async fn rename(db: &mut SqliteConnection, robot_pk: i64, name: &str) -> Result<(), DbError> {
     sqlx::query!("UPDATE robots SET name = ? WHERE pk = ?", name, robot_pk)
+        .execute(db)
+        .await?;
+    Ok(())
+}
+
+/// Replaces a robot's tags.
+pub async fn set_tags(
+    db: &mut SqliteConnection,
+    robot_pk: i64,
+    tags: &BTreeSet<Tag>,
+) -> Result<(), DbError> {
+    let tags = to_json("tags", tags)?;
+    sqlx::query!("UPDATE robots SET tags = ? WHERE pk = ?", tags, robot_pk)
         .execute(db)
         .await?;
     Ok(())

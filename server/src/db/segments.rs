@@ -278,26 +278,30 @@ pub async fn list(
     raw.into_iter().map(StoredSegment::try_from).collect()
 }
 
-/// A measurement of a site, with what decides whether it is on the map.
+/// A measurement of a site as it is stored, with what decides whether it is on the map.
 #[derive(Debug)]
 pub struct SiteSegment {
-    /// Its key.
-    pub pk: i64,
     /// Key of the robot.
     pub robot_pk: i64,
     /// The robot.
     pub robot: RobotId,
-    /// The measurement.
-    pub segment: Segment,
+    measurement: String,
 }
 
-/// Returns the key of the first measurement that was received at a time or later, and whether it is
-/// the first of all; `None` without one. Times of receipt are in the order of keys, which have no
-/// gaps.
-pub async fn first_since(
-    db: &mut SqliteConnection,
-    at: Timestamp,
-) -> Result<Option<(i64, bool)>, DbError> {
+impl SiteSegment {
+    /// Decodes the measurement.
+    ///
+    /// # Errors
+    /// The stored measurement is damaged.
+    pub fn segment(&self) -> Result<Segment, DbError> {
+        from_json("measurement", &self.measurement)
+    }
+}
+
+/// Returns the key of the first measurement that was received at a time or later, if none that was
+/// can have been removed; else `None`. Keys are in the order of receipt, begin at 1 and have no
+/// gaps; the first ones are removed first, the last one never is.
+pub async fn first_since(db: &mut SqliteConnection, at: Timestamp) -> Result<Option<i64>, DbError> {
     let at_us = to_us(at);
     let ends = sqlx::query!(
         r#"SELECT (SELECT MIN(pk) FROM segments) AS "first: i64",
@@ -320,7 +324,8 @@ pub async fn first_since(
             high = middle;
         }
     }
-    Ok((low <= last).then_some((low, low == first)))
+    let is_known = low <= last && (low > first || first == 1);
+    Ok(is_known.then_some(low))
 }
 
 /// Returns measurements of all sites in the order of their commits, after a key; those of other
@@ -346,10 +351,9 @@ pub async fn of_site(
             return Ok((row.pk, None));
         };
         let segment = SiteSegment {
-            pk: row.pk,
             robot_pk: row.robot_pk,
             robot: parse("robot", &row.robot)?,
-            segment: from_json("measurement", &measurement)?,
+            measurement,
         };
         Ok((row.pk, Some(segment)))
     });

@@ -56,7 +56,7 @@ pub(super) async fn get(
     Ok(Json(app.robot(&site, &robot).await?))
 }
 
-/// Rename, retire or restore a robot.
+/// Rename, tag, retire or restore a robot.
 ///
 /// Retiring cancels all its missions.
 #[utoipa::path(patch, path = "/v1/sites/{site}/robots/{robot}", tag = "robots",

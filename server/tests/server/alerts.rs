@@ -104,8 +104,8 @@ async fn a_robot_that_goes_away_raises_an_alert_until_it_is_back_also_over_a_res
     there_are(&yard, "robot-lost", 2, true).await;
     // Nobody misses a robot that is retired.
     let retired = ChangeRobot {
-        name: None,
         retired: Some(true),
+        ..ChangeRobot::default()
     };
     let path = yard.url("/v1/sites/yard/robots/rover-1");
     let (status, said) = yard.send(yard.client().patch(path).json(&retired)).await;

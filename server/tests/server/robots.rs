@@ -50,6 +50,43 @@ async fn alerts_are_raised_once_acknowledged_and_cleared() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn tags_of_a_robot_are_replaced_sorted_listed_and_kept_over_a_restart() {
+    let yard = Yard::start().await;
+    let _robot = Robot::join(&yard, "rover-1").await;
+    let path = "/v1/sites/yard/robots/rover-1";
+    let change = async |body: Value| {
+        let request = yard.client().patch(yard.url(path));
+        yard.send(request.json(&body)).await
+    };
+    let (_, new) = yard.get_value(path).await;
+    assert_eq!(new["tags"], json!([]));
+    let (status, body) = change(json!({"tags": ["spare", "north", "spare"]})).await;
+    assert_eq!(
+        (status, &body["tags"]),
+        (StatusCode::OK, &json!(["north", "spare"]))
+    );
+    let many: Vec<String> = (0..17).map(|number| format!("tag-{number}")).collect();
+    for (tags, says) in [
+        (json!(many), "at most 16"),
+        (json!(["North Yard"]), "North Yard"),
+    ] {
+        let (status, body) = change(json!({"tags": tags})).await;
+        assert_eq!(status, StatusCode::UNPROCESSABLE_ENTITY, "{body}");
+        assert!(body["detail"].as_str().unwrap().contains(says), "{body}");
+    }
+    // Another change leaves them.
+    let (_, body) = change(json!({"name": "Old one"})).await;
+    assert_eq!(body["tags"], json!(["north", "spare"]));
+    let yard = yard.restart().await;
+    let (_, page) = yard.get_value("/v1/sites/yard/robots").await;
+    assert_eq!(page["items"][0]["tags"], json!(["north", "spare"]));
+    let request = yard.client().patch(yard.url(path));
+    let (_, body) = yard.send(request.json(&json!({"tags": []}))).await;
+    assert_eq!(body["tags"], json!([]));
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_retired_robot_is_renamed_loses_its_missions_and_gets_no_more() {
     let yard = Yard::start().await;
     let robot = Robot::join(&yard, "rover-1").await;

@@ -90,9 +90,12 @@ async fn an_alert_is_sent_signed_when_it_is_raised_and_when_it_ends() {
                           "sites": ["yard"]});
     let (id, secret) = create(&yard, &settings).await;
     let other = Receiver::start(Mood::Good).await;
+    let (status, said) = yard.post("/v1/sites", &json!({"id": "quarry"})).await;
+    assert_eq!(status, StatusCode::CREATED, "{said}");
     for (name, more) in [
         ("other kinds", json!({"kinds": ["robot-lost"]})),
         ("disabled", json!({"enabled": false})),
+        ("another site", json!({"sites": ["quarry"]})),
     ] {
         let mut settings = json!({"name": name, "url": other.url()});
         let more = more.as_object().unwrap().clone();

@@ -140,15 +140,15 @@ pub(super) fn point_history(history: &PointHistory) -> String {
 }
 
 fn history_table(items: &[FrictionAt]) -> String {
-    let mut table = friction_table(&["AS OF", "MODEL"]);
+    let mut table = friction_table(&["AT", "AS OF", "MODEL"]);
     for item in items {
-        let at = format!("{:.0}", item.as_of);
+        let times = [item.at, item.as_of].map(|at| format!("{at:.0}"));
         if item.models.is_empty() {
-            let row = [at.clone(), "-".to_owned()].into_iter();
+            let row = times.clone().into_iter().chain(["-".to_owned()]);
             table.add_row(row.chain(columns(None)));
         }
         for model in &item.models {
-            table.add_row([at.clone()].into_iter().chain(model_row(model)));
+            table.add_row(times.clone().into_iter().chain(model_row(model)));
         }
     }
     render(&table)

@@ -1,5 +1,5 @@
 // Keeps what is shown, selected and drawn in the address of the page, and brings it back from there.
-import { HIDEABLE, addressOf, placeAtStart, placeOf, type DraftState, type Hideable, type Place } from '../address';
+import { CHANGE, HIDEABLE, addressOf, placeAtStart, placeOf, type DraftState, type Hideable, type Place } from '../address';
 import { RANGES, type Quantity } from '../map/friction';
 import type { Editor } from './editor.svelte';
 import type { Fleet } from './fleet.svelte';
@@ -12,7 +12,6 @@ const WRITE_MS = 200;
 const TAB_KEY = 'tread-place';
 /** The address that the tab had when its page went: what is reloaded is this one, whatever was put in at the end. */
 const LAST_ADDRESS_KEY = 'tread-address';
-const CHANGE = 'change';
 
 export class AddressSync {
   /** What the address wants and is not brought back yet, since what it is about has not been read. */
@@ -75,6 +74,7 @@ export class AddressSync {
     const { fleet, roster, view, editor } = this;
     view.tab = place.tab;
     fleet.selected = place.robot;
+    roster.unmark();
     for (const id of place.marked) roster.marked.add(id);
     view.showTerrains = !place.hidden.includes('terrains');
     view.showFence = !place.hidden.includes('fence');
@@ -108,8 +108,13 @@ export class AddressSync {
   /** Before the page goes. */
   flush(): void {
     clearTimeout(this.#due);
-    sessionStorage.setItem(LAST_ADDRESS_KEY, this.#address);
-    if (this.fleet.site && !this.#wanted) this.#put(this.place);
+    if (this.fleet.site && !this.#wanted) {
+      sessionStorage.setItem(LAST_ADDRESS_KEY, this.#address);
+      this.#put(this.place);
+    } else {
+      // What the address wants was not brought back yet, so it is not this tab's own.
+      sessionStorage.removeItem(LAST_ADDRESS_KEY);
+    }
   }
 
   #put(place: Place): void {

@@ -35,6 +35,7 @@ export class MapTime {
 
   seek(index: number): void {
     this.pause();
+    this.#follow();
     this.index = index;
     void this.read();
   }
@@ -48,8 +49,16 @@ export class MapTime {
     this.isRunning = false;
   }
 
+  /** From the present on, the times are those up to now. */
+  #follow(): void {
+    if (this.at_ms === null) this.moments = momentsOf(this.span, Date.now());
+  }
+
   async #run(): Promise<void> {
-    if (this.at_ms === null) this.index = 0;
+    if (this.at_ms === null) {
+      this.#follow();
+      this.index = 0;
+    }
     this.isRunning = true;
     for (;;) {
       await this.read();

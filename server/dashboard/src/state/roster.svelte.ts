@@ -10,6 +10,7 @@ export class Roster {
   search = $state('');
   readonly groups = new SvelteSet<Group>();
   model = $state<string | null>(null);
+  tag = $state<string | null>(null);
   order = $state<Order>('trouble');
   /** Robots that are marked. */
   readonly marked = new SvelteSet<string>();
@@ -28,17 +29,18 @@ export class Roster {
 
   readonly counts = $derived.by(() => countsOf(this.fleet.robots.map((entry) => entry.robot)));
   readonly models = $derived.by(() => [...new Set(this.fleet.robots.map((entry) => modelOf(entry.robot)))].sort());
+  readonly tags = $derived.by(() => [...new Set(this.fleet.robots.flatMap((entry) => entry.robot.tags ?? []))].sort());
   readonly shown = $derived.by((): RobotView[] => {
     const { robots, site } = this.fleet;
-    const { search, model, order } = this;
+    const { search, model, tag, order } = this;
     const groups = new Set(this.groups);
-    const key = JSON.stringify([site, search, [...groups], model, order]);
+    const key = JSON.stringify([site, search, [...groups], model, tag, order]);
     const isHeld = this.isPointedAt || this.fleet.now - this.#keyAt < STAYS_MS;
     if (isHeld && key === this.#lastKey) {
       const known = this.fleet.byId;
       return this.#last.flatMap((id) => known.get(id) ?? []);
     }
-    const found = listed(robots, { search, groups, model, order });
+    const found = listed(robots, { search, groups, model, tag, order });
     this.#last = found.map((entry) => entry.id);
     this.#lastKey = key;
     return found;
@@ -48,7 +50,7 @@ export class Roster {
   readonly areAllMarked = $derived.by(() => this.shown.length > 0 && this.shown.every((entry) => this.marked.has(entry.id)));
 
   get isFiltered(): boolean {
-    return this.search.trim() !== '' || this.groups.size > 0 || this.model !== null;
+    return this.search.trim() !== '' || this.groups.size > 0 || this.model !== null || this.tag !== null;
   }
 
   /** Robots that a Stop of a selection is for: those that are marked, or the one that is open. */
@@ -65,6 +67,7 @@ export class Roster {
     this.search = '';
     this.groups.clear();
     this.model = null;
+    this.tag = null;
   }
 
   toggle(id: string): void {

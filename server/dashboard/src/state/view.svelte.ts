@@ -1,5 +1,6 @@
 // What is shown: tabs, layers of the map, the mission that is looked at.
 import type { CellFriction, MissionDetail, PlannedPath, RobotModel } from '../api/schema';
+import { LAYER_FIRST } from '../address';
 import { ask, list, sentence, type Listed } from '../api/client';
 import { Layer, type Quantity } from '../map/friction';
 import type { Bounds, PointM } from '../map/camera';
@@ -28,7 +29,7 @@ export class View {
   showTerrains = $state(true);
   showFence = $state(true);
   showTrails = $state(true);
-  quantity = $state<Quantity | null>('theta');
+  quantity = $state<Quantity | null>(LAYER_FIRST);
   configuration = $state<string | null>(null);
   /** Robot models that the friction map knows. */
   configurations = $state.raw<string[]>([]);

@@ -259,7 +259,7 @@ export const ground = {
     span: 'Span',
     play: 'Play',
     hold: 'Hold',
-    rounded: 'Times are rounded down to a minute, or to an hour or day of which the server no longer has every measurement.',
+    rounded: 'Times are rounded down to a minute, or to an hour or day whose measurements are gone or too many.',
     compared: (from: string, to: string) => `Compared: ${from} with ${to}.`,
     since: { hour: '1 h ago', day: '1 d ago', week: '7 d ago' },
     inspect: 'Place on the map',

@@ -9,20 +9,41 @@ import { TRAIL_POINTS, Tracked } from '../../src/state/tracked';
 const SIDE = 1_024;
 const MEASURED_MS = 4_000;
 
-function robotAt(index: number): Tracked {
-  const heading_rad = index * 0.7;
-  const pose = { x_m: (index * 37) % SIDE, y_m: (index * 91) % SIDE, heading_rad };
-  const robot = {
+/** Time between two states of a robot, as the server passes them on, milliseconds. */
+const STATE_MS = 1_000;
+/** Robots drive on circles. */
+const RADIUS_M = 5;
+const SPEED_M_S = 0.7;
+
+/** What a robot says at a time. */
+function stateAt(index: number, at_ms: number): Robot {
+  const angular_rad_s = SPEED_M_S / RADIUS_M;
+  const heading_rad = index * 0.7 + (angular_rad_s * at_ms) / 1_000;
+  const x_m = ((index * 37) % SIDE) + RADIUS_M * Math.sin(heading_rad);
+  const y_m = ((index * 91) % SIDE) - RADIUS_M * Math.cos(heading_rad);
+  const twist = { linear_m_s: SPEED_M_S, angular_rad_s };
+  return {
     id: `rover-${index}`,
     name: `rover-${index}`,
     link: index % 10 === 0 ? 'offline' : 'online',
     model: { wheelbase_m: 0.28, track_width_m: 0.43, wheel_radius_m: 0.08 },
-    live: { heard_age_ms: 10, pose: { value: pose, age_ms: 10 }, safety: {} },
+    live: {
+      heard_age_ms: 10,
+      pose: { value: { x_m, y_m, heading_rad }, age_ms: 10 },
+      twist: { value: twist, age_ms: 10 },
+      safety: {},
+    },
   } as unknown as Robot;
-  const tracked = new Tracked(robot, performance.now());
+}
+
+function robotAt(index: number, now: number): Tracked {
+  const robot = stateAt(index, now);
+  const { pose } = robot.live as { pose: { value: { x_m: number; y_m: number; heading_rad: number } } };
+  const { heading_rad } = pose.value;
+  const tracked = new Tracked(robot, now);
   tracked.trail = Array.from({ length: TRAIL_POINTS }, (_, point) => [
-    pose.x_m - point * Math.cos(heading_rad + point / 90),
-    pose.y_m - point * Math.sin(heading_rad + point / 60),
+    pose.value.x_m - point * Math.cos(heading_rad + point / 90),
+    pose.value.y_m - point * Math.sin(heading_rad + point / 60),
   ]).flat();
   return tracked;
 }
@@ -53,6 +74,8 @@ export interface Frames {
   draw_p99_ms: number;
   layer_ms: number;
   labels: number;
+  /** Places a second at which a robot that drives is drawn. */
+  moves_s: number;
 }
 
 /** What is drawn: so many robots, with the friction layer or without. */
@@ -68,7 +91,11 @@ async function measure({ robots, withFriction }: Load): Promise<Frames> {
   const began = performance.now();
   const friction = withFriction ? new Layer(cells(), null, 1, 'theta') : null;
   const layer_ms = performance.now() - began;
-  const tracked = Array.from({ length: robots }, (_, index) => robotAt(index));
+  const tracked = Array.from({ length: robots }, (_, index) => robotAt(index, began));
+  /** When each robot says its next state: evenly spread. */
+  const due = tracked.map((_, index) => began + (STATE_MS * index) / robots);
+  /** Where one of those online is drawn in each frame. */
+  const places = new Set<string>();
   const camera = new Camera();
   camera.width = canvas.width;
   camera.height = canvas.height;
@@ -89,6 +116,13 @@ async function measure({ robots, withFriction }: Load): Promise<Frames> {
     const before = performance.now();
     if (written > 1) labelled = written;
     written = 0;
+    for (const [index, one] of tracked.entries()) {
+      if (now < (due[index] ?? 0)) continue;
+      one.update(stateAt(index, now), now);
+      due[index] = now + STATE_MS;
+    }
+    const { pose } = tracked[1]?.shownAt(now) ?? {};
+    if (pose) places.add(`${pose.x_m} ${pose.y_m}`);
     // The ground is drawn anew in each frame.
     camera.pan(Math.sin(now / 300), Math.cos(now / 300));
     draw(context, camera, {
@@ -127,6 +161,7 @@ async function measure({ robots, withFriction }: Load): Promise<Frames> {
     draw_p99_ms: spent[Math.floor(spent.length * 0.99)] ?? NaN,
     layer_ms,
     labels: labelled,
+    moves_s: places.size / seconds,
   };
 }
 

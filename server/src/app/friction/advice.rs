@@ -38,8 +38,7 @@ impl App {
     ) -> Result<MapPage<VisitSuggestion>, AppError> {
         let reading = Reading::new(self, asked)?;
         let view = self.site_view(site).await?;
-        let reading = reading.of_site(self, &view.row).await?;
-        let as_of = reading.as_of;
+        let row = view.row.clone();
         let grid = view.row.site.grid;
         let count = area.count(grid.cell_m);
         if count > LOOKED_AT_MAX {
@@ -49,19 +48,20 @@ impl App {
             });
         }
         let (min, max) = area.cells(&grid)?;
-        let looking = move |app: &Self| {
+        let looking = move |app: &Self, [reading]: &[Reading; 1]| {
             let drawn = Drawn::new(&view.terrains);
-            app.maps().look(&view.row, |map| {
+            let found = app.maps().look(&view.row, |map| {
                 let rows = min.iy..=max.iy;
                 let cells = rows.flat_map(|iy| (min.ix..=max.ix).map(move |ix| Cell { ix, iy }));
                 let suggestion = |cell: Cell| {
                     let center = grid.center_of(cell);
-                    suggested(map, &drawn, &reading, cell, center)
+                    suggested(map, &drawn, reading, cell, center)
                 };
                 cells.filter_map(suggestion).collect::<Vec<_>>()
-            })
+            });
+            (found, reading.as_of)
         };
-        let mut found = self.off_thread(looking).await;
+        let (mut found, as_of) = self.read_map(&row, [reading], looking).await?;
         found.sort_by(|left, right| {
             let by_gain = right.gain.total_cmp(&left.gain);
             by_gain.then_with(|| (left.cell.iy, left.cell.ix).cmp(&(right.cell.iy, right.cell.ix)))

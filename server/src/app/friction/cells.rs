@@ -115,7 +115,6 @@ impl App {
         let reading = Reading::new(self, asked)?;
         let after = cursor.map(read_cursor).transpose()?;
         let row = site_row(&mut self.db().read("friction").await?, site).await?;
-        let reading = reading.of_site(self, &row).await?;
         let grid = row.site.grid;
         let factor = factor(&grid, resolution_m)?;
         check_count(&area, resolution_m)?;
@@ -127,12 +126,13 @@ impl App {
         let wanted = usize::try_from(limit)
             .unwrap_or(usize::MAX)
             .saturating_add(1);
-        let looking = move |app: &Self| {
+        let of_site = row.clone();
+        let looking = move |app: &Self, [reading]: &[Reading; 1]| {
             app.maps().look(&row, |map| {
                 let found = squares(map, factor, bounds, after, wanted);
                 let cells = page(found, limit, |(cell, _)| format!("{},{}", cell.ix, cell.iy));
                 let squares = cells.items.into_iter();
-                let items = squares.flat_map(|square| of_square(map, &reading, square, size_m));
+                let items = squares.flat_map(|square| of_square(map, reading, square, size_m));
                 MapPage {
                     items: items.collect(),
                     next_cursor: cells.next_cursor,
@@ -140,7 +140,7 @@ impl App {
                 }
             })
         };
-        Ok(self.off_thread(looking).await)
+        self.read_map(&of_site, [reading], looking).await
     }
 
     /// Returns the friction at a point, from measurements on the terrain at this point alone.
@@ -152,10 +152,12 @@ impl App {
     ) -> Result<PointFriction, AppError> {
         let reading = Reading::new(self, asked)?;
         let view = self.site_view(site).await?;
-        let reading = reading.of_site(self, &view.row).await?;
         let cell = view.cell_at(point)?;
-        let looking = move |app: &Self| app.known_at_point(&view, &reading, (cell, point));
-        Ok(self.off_thread(looking).await)
+        let row = view.row.clone();
+        let looking = move |app: &Self, [reading]: &[Reading; 1]| {
+            app.known_at_point(&view, reading, (cell, point))
+        };
+        self.read_map(&row, [reading], looking).await
     }
 
     fn known_at_point(
@@ -233,24 +235,23 @@ impl App {
         }
         let after = cells.cursor.map(read_cursor).transpose()?;
         let row = site_row(&mut self.db().read("friction").await?, site).await?;
-        let late = late.of_site(self, &row).await?;
-        let early = late.at(from).of_site(self, &row).await?;
-        let early_us = early.now_us;
+        let early = late.at(from);
         let (min, max) = cells.area.cells(&row.site.grid)?;
         let wanted = usize::try_from(cells.limit).unwrap_or(usize::MAX);
         let limit = cells.limit;
-        let looking = move |app: &Self| {
+        let of_site = row.clone();
+        let looking = move |app: &Self, [early, late]: &[Reading; 2]| {
             app.maps().look(&row, |map| {
                 let measured = map.cells_in(min, max, after).filter(|&cell| {
                     let newest = map.newest_at_us(cell, late.choice());
-                    newest.is_some_and(|newest_us| newest_us >= early_us)
+                    newest.is_some_and(|newest_us| newest_us >= early.now_us)
                 });
                 let found: Vec<Cell> = measured.take(wanted.saturating_add(1)).collect();
                 let cells = page(found, limit, |cell| format!("{},{}", cell.ix, cell.iy));
                 let items = cells
                     .items
                     .into_iter()
-                    .flat_map(|cell| differences(map, cell, &early, &late));
+                    .flat_map(|cell| differences(map, cell, early, late));
                 DifferencePage {
                     items: items.collect(),
                     next_cursor: cells.next_cursor,
@@ -259,7 +260,7 @@ impl App {
                 }
             })
         };
-        Ok(self.off_thread(looking).await)
+        self.read_map(&of_site, [early, late], looking).await
     }
 }
 

@@ -9,12 +9,13 @@ use tread_api::site::{Cell, Grid, Site};
 
 use super::cells::{Area, factor, of_square, squares};
 use super::raster::PictureAsked;
-use super::{App, AppError, Reading};
+use super::{App, AppError, MOVED, Reading};
 use crate::app::site_row;
 use crate::db;
 use crate::db::segments::SegmentFilter;
 use crate::db::sites::SiteRow;
 use crate::formats::table::{TableError, Writer};
+use crate::friction::index::{SiteMap, Stamp};
 
 /// Number of cells per chunk.
 const CELLS_PIECE: usize = 4_096;
@@ -42,6 +43,8 @@ pub struct CellExport {
     reading: Reading,
     factor: i32,
     bounds: (Cell, Cell),
+    /// State of the map for which `reading` was made.
+    stamp: Stamp,
     after: Option<Cell>,
     stage: Stage,
     state: (String, String),
@@ -63,9 +66,8 @@ impl App {
             Option<Timestamp>,
         ) -> Result<Box<dyn Writer<CellFriction>>, TableError>,
     ) -> Result<CellExport, AppError> {
-        let reading = Reading::new(self, &asked.asked)?;
+        let mut reading = Reading::new(self, &asked.asked)?;
         let row = site_row(&mut self.db().read("friction").await?, site).await?;
-        let reading = reading.of_site(self, &row).await?;
         let grid = row.site.grid;
         let factor = factor(&grid, asked.resolution_m)?;
         let area = match asked.area {
@@ -76,6 +78,9 @@ impl App {
             cell_m: grid.cell_m * f64::from(factor),
             ..grid
         };
+        let bounds = area.cells(&coarse)?;
+        let stamp = self.maps().look(&row, SiteMap::stamp);
+        reading.of_site(self, &row).await?;
         // Read before any chunk is made, so that later changes give another state.
         let state = self.state_of(&row, &reading, asked);
         let state = (self.run_id(), format!("{state:?} {:?} {asked:?}", row.site));
@@ -85,7 +90,8 @@ impl App {
             state,
             reading,
             factor,
-            bounds: area.cells(&coarse)?,
+            bounds,
+            stamp,
             after: None,
             stage: Stage::Begin,
             writer: writer_of(&row.site, as_of)?,
@@ -148,14 +154,20 @@ impl CellExport {
             }
             Stage::Entries => {
                 let size_m = self.row.site.grid.cell_m * f64::from(self.factor);
-                let reading = &self.reading;
+                // Summed again for each chunk, so that a slow client keeps no sums in memory.
+                let mut reading = self.reading.clone();
+                reading.sum(app);
                 let (entries, last) = app.maps().look(&self.row, |map| {
                     let found = squares(map, self.factor, self.bounds, self.after, CELLS_PIECE);
                     let last = found.last().map(|(cell, _)| *cell);
                     let found = found.into_iter();
-                    let entries = found.flat_map(|square| of_square(map, reading, square, size_m));
+                    let entries = found.flat_map(|square| of_square(map, &reading, square, size_m));
                     (entries.collect::<Vec<_>>(), last)
                 });
+                let stamp = app.maps().look(&self.row, SiteMap::stamp);
+                if self.reading.as_of.is_some() && stamp != self.stamp {
+                    return Err(AppError::Unwritable(MOVED.to_owned()));
+                }
                 match last {
                     Some(_) => self.after = last,
                     None => self.stage = Stage::End,

@@ -10,8 +10,8 @@ use tread_api::ids::{SiteId, TerrainId};
 
 use super::drawn::Drawn;
 use super::timelines::MEASUREMENTS_MAX;
-use super::{App, AppError, Asked, Reading, SiteView, terrain_ref};
-use crate::friction::index::{Epoch, Timeline};
+use super::{App, AppError, Asked, MOVED, READS_MAX, Reading, SiteView, terrain_ref};
+use crate::friction::index::{Epoch, SiteMap, Timeline};
 
 /// Maximum number of times in one history.
 const TIMES_MAX: i64 = 1_000;
@@ -87,14 +87,15 @@ impl App {
         let reading = Reading::new(self, asked)?;
         let view = self.site_view(site).await?;
         let terrain = view.find(site, id)?.clone();
-        let timelines = self.timelines_of(&view, &times).await?;
-        let looking = move |app: &Self| TerrainHistory {
-            terrain: terrain_ref(&terrain),
-            items: known_at(app, &view, &reading, &times, &timelines, |reading| {
-                app.measured_models(&view, reading, &terrain)
-            }),
+        let of_terrain = terrain_ref(&terrain);
+        let known = move |app: &Self, view: &SiteView, reading: &Reading| {
+            app.measured_models(view, reading, &terrain)
         };
-        Ok(self.off_thread(looking).await)
+        let items = self.known_at(&view, reading, times, known).await?;
+        Ok(TerrainHistory {
+            terrain: of_terrain,
+            items,
+        })
     }
 
     /// Returns the friction at a point as known at several times, from measurements on the terrain
@@ -110,19 +111,43 @@ impl App {
         let reading = Reading::new(self, asked)?;
         let view = self.site_view(site).await?;
         let cell = view.cell_at(point)?;
-        let timelines = self.timelines_of(&view, &times).await?;
-        let looking = move |app: &Self| {
-            let drawn = Drawn::new(&view.terrains);
-            let terrain = drawn.at(point);
-            PointHistory {
-                cell,
-                terrain: terrain.map(terrain_ref),
-                items: known_at(app, &view, &reading, &times, &timelines, |reading| {
-                    app.measured_at_point(&view, reading, cell, terrain)
-                }),
-            }
+        let terrain = Drawn::new(&view.terrains).at(point).cloned();
+        let of_terrain = terrain.as_ref().map(terrain_ref);
+        let known = move |app: &Self, view: &SiteView, reading: &Reading| {
+            app.measured_at_point(view, reading, cell, terrain.as_ref())
         };
-        Ok(self.off_thread(looking).await)
+        let items = self.known_at(&view, reading, times, known).await?;
+        Ok(PointHistory {
+            cell,
+            terrain: of_terrain,
+            items,
+        })
+    }
+
+    /// Returns what is known at each time, the oldest first.
+    async fn known_at(
+        &self,
+        view: &Arc<SiteView>,
+        reading: Reading,
+        times: Checked,
+        models: impl Fn(&Self, &SiteView, &Reading) -> Vec<ModelFriction> + Send + Sync + 'static,
+    ) -> Result<Vec<FrictionAt>, AppError> {
+        let shared = Arc::new((reading, times, models));
+        for _ in 0..READS_MAX {
+            let stamp = self.maps().look(&view.row, SiteMap::stamp);
+            let timelines = self.timelines_of(view, &shared.1).await?;
+            let (view_then, shared) = (Arc::clone(view), Arc::clone(&shared));
+            let looking = move |app: &Self| {
+                let (reading, times, models) = &*shared;
+                let models = |reading: &Reading| models(app, &view_then, reading);
+                known_at(app, &view_then, reading, times, &timelines, models)
+            };
+            let known = self.off_thread(looking).await;
+            if self.maps().look(&view.row, SiteMap::stamp) == stamp {
+                return Ok(known);
+            }
+        }
+        Err(AppError::Unwritable(MOVED.to_owned()))
     }
 
     /// Returns the measurements of the epochs that the times divide, as far as there are any.
@@ -173,7 +198,8 @@ fn known_at(
             };
         }
         let epoch = app.maps().look(&view.row, |map| map.epoch_at(at));
-        then.move_to(at, epoch, timelines.get(&epoch));
+        then.move_to(at, epoch, timelines.get(&epoch).cloned());
+        then.sum_on();
         FrictionAt {
             at,
             as_of: then.as_of.unwrap_or(at),

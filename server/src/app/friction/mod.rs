@@ -15,6 +15,7 @@ mod timelines;
 mod views;
 
 use std::collections::HashMap;
+use std::sync::Arc;
 
 use jiff::Timestamp;
 use tread_api::friction::{ModelFriction, TerrainFriction};
@@ -40,9 +41,14 @@ use super::{App, AppError, page, site_row};
 use crate::db::sites::SiteRow;
 use crate::db::{self, Tx};
 use crate::friction::Ground;
+use crate::friction::index::SiteMap;
 
 /// Model name shown for a configuration that no robot has declared.
 const UNKNOWN_MODEL: &str = "not declared";
+/// Maximum number of times that a map is read for one answer about the past.
+const READS_MAX: usize = 3;
+/// Why an answer about the past is given up.
+const MOVED: &str = "hours of the map were merged or withdrawn while it was read";
 /// Maximum number of map requests that are worked on at once; further ones wait.
 pub(in crate::app) const MAP_READERS_MAX: usize = 4;
 
@@ -118,6 +124,40 @@ impl App {
         }
     }
 
+    /// Reads a site's map for an answer, on a blocking thread. Times of the readings are rounded
+    /// first; if meanwhile measurements of the map have moved to other epochs, all is done again.
+    ///
+    /// # Errors
+    /// The database failed.
+    async fn read_map<T: Send + 'static, const N: usize>(
+        &self,
+        row: &SiteRow,
+        readings: [Reading; N],
+        look: impl Fn(&Self, &[Reading; N]) -> T + Send + Sync + 'static,
+    ) -> Result<T, AppError> {
+        let is_past = readings.iter().any(|reading| reading.as_of.is_some());
+        let look = Arc::new(look);
+        for _ in 0..READS_MAX {
+            let stamp = self.maps().look(row, SiteMap::stamp);
+            let mut readings = readings.clone();
+            for reading in &mut readings {
+                reading.of_site(self, row).await?;
+            }
+            let look = Arc::clone(&look);
+            let looking = move |app: &Self| {
+                for reading in &mut readings {
+                    reading.sum(app);
+                }
+                look(app, &readings)
+            };
+            let answer = self.off_thread(looking).await;
+            if !is_past || self.maps().look(row, SiteMap::stamp) == stamp {
+                return Ok(answer);
+            }
+        }
+        Err(AppError::Unwritable(MOVED.to_owned()))
+    }
+
     /// Returns the friction of each terrain of a site, after a cursor.
     pub async fn friction_of_terrains(
         &self,
@@ -128,10 +168,10 @@ impl App {
     ) -> Result<Page<TerrainFriction>, AppError> {
         let reading = Reading::new(self, asked)?;
         let view = self.site_view(site).await?;
-        let reading = reading.of_site(self, &view.row).await?;
+        let row = view.row.clone();
         let cursor = cursor.map(str::to_owned);
-        let listing = move |app: &Self| {
-            let classes = app.classes(&view, &reading);
+        let listing = move |app: &Self, [reading]: &[Reading; 1]| {
+            let classes = app.classes(&view, reading);
             let wanted = |terrain: &&Terrain| {
                 cursor
                     .as_deref()
@@ -140,7 +180,7 @@ impl App {
             let listed: Vec<&Terrain> = view.terrains.iter().filter(wanted).collect();
             let Page { items, next_cursor } = page(listed, limit, |terrain| terrain.id.to_string());
             let items = items.into_iter().map(|terrain| {
-                let models = classes.models(&view, &reading, terrain);
+                let models = classes.models(&view, reading, terrain);
                 terrain_friction(terrain, models, reading.as_of)
             });
             Page {
@@ -148,7 +188,7 @@ impl App {
                 next_cursor,
             }
         };
-        Ok(self.off_thread(listing).await)
+        self.read_map(&row, [reading], listing).await
     }
 
     /// Returns the friction of one terrain.
@@ -160,15 +200,13 @@ impl App {
     ) -> Result<TerrainFriction, AppError> {
         let reading = Reading::new(self, asked)?;
         let view = self.site_view(site).await?;
-        let reading = reading.of_site(self, &view.row).await?;
         let terrain = view.find(site, id)?.clone();
-        let looking = move |app: &Self| {
-            let models = app
-                .classes(&view, &reading)
-                .models(&view, &reading, &terrain);
+        let row = view.row.clone();
+        let looking = move |app: &Self, [reading]: &[Reading; 1]| {
+            let models = app.classes(&view, reading).models(&view, reading, &terrain);
             terrain_friction(&terrain, models, reading.as_of)
         };
-        Ok(self.off_thread(looking).await)
+        self.read_map(&row, [reading], looking).await
     }
 
     /// Returns the measured friction of a terrain, per robot model.

@@ -62,14 +62,14 @@ impl App {
             normalisation,
         };
         let reading = Reading::new(self, &asked).map_err(in_body)?;
-        let reading = reading.of_site(self, &view.row).await?;
         let length_m = checked_length(&points)?;
         let cut = cut(&points, &view.row.site.grid)?;
-        let looking = move |app: &Self| {
+        let row = view.row.clone();
+        let looking = move |app: &Self, [reading]: &[Reading; 1]| {
             let drawn = Drawn::new(&view.terrains);
             let near = drawn_near(&drawn, &cut);
             let mut pieces: Vec<PathPiece> = app.maps().look(&view.row, |map| {
-                let mut reader = CellReader::new(map, (&view, &drawn, &near), &reading);
+                let mut reader = CellReader::new(map, (&view, &drawn, &near), reading);
                 let piece = |cut: &Cut| described(cut, reader.known_at(cut).as_ref());
                 cut.iter().map(piece).collect()
             });
@@ -89,7 +89,7 @@ impl App {
                 pieces,
             }
         };
-        Ok(self.off_thread(looking).await)
+        self.read_map(&row, [reading], looking).await
     }
 }
 

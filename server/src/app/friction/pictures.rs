@@ -9,7 +9,7 @@ use super::raster::{Blocks, PictureAsked};
 use super::{App, AppError, Reading};
 use crate::db::sites::SiteRow;
 use crate::friction::Raster;
-use crate::friction::index::Block;
+use crate::friction::index::{Block, Stamp};
 
 /// Maximum number of bytes of cached pictures.
 const KEPT_BYTES_MAX: usize = 64 * 1024 * 1024;
@@ -32,6 +32,9 @@ pub(super) struct State {
     change: u64,
     terrain_revision: u64,
     now_us: i64,
+    /// Number of measurements of the epoch that a past time divides, and what tells that none of
+    /// them has gone: they were read before `change`.
+    divided: Option<(usize, Stamp)>,
 }
 
 #[derive(Debug, Clone)]
@@ -104,19 +107,19 @@ impl App {
         site: &SiteId,
         asked: PictureAsked,
         format: String,
-        write: impl FnOnce(&Raster) -> Result<Vec<u8>, AppError> + Send + 'static,
+        write: impl Fn(&Raster) -> Result<Vec<u8>, AppError> + Send + Sync + 'static,
     ) -> Result<Picture, AppError> {
         let reading = Reading::new(self, &asked.asked)?;
         let view = self.site_view(site).await?;
-        let reading = reading.of_site(self, &view.row).await?;
-        let drawing = move |app: &Self| {
+        let row = view.row.clone();
+        let drawing = move |app: &Self, [reading]: &[Reading; 1]| {
             let key = format!("{}/{format}/{asked:?}", view.row.pk);
             // Read before the squares are made, so that a change meanwhile makes the picture stale.
-            let state = app.state_of(&view.row, &reading, &asked);
+            let state = app.state_of(&view.row, reading, &asked);
             if let Some(picture) = app.pictures().find(&key, state) {
                 return Ok(picture);
             }
-            let mut raster = app.raster(&view, &reading, &asked)?;
+            let mut raster = app.raster(&view, reading, &asked)?;
             let bytes: Arc<[u8]> = write(&raster)?.into();
             raster.squares = Vec::new();
             let of = Arc::new(raster);
@@ -124,24 +127,26 @@ impl App {
             app.pictures().keep(key, state, picture.clone());
             Ok(picture)
         };
-        self.off_thread(drawing).await
+        self.read_map(&row, [reading], drawing).await?
     }
 
     pub(super) fn state_of(&self, row: &SiteRow, reading: &Reading, asked: &PictureAsked) -> State {
         let grid = row.site.grid;
         let bounds = asked.area.and_then(|area| area.cells(&grid).ok());
         let bounds = bounds.map(|(min, max)| (Block::of(min), Block::of(max)));
-        let change = self.maps().look(row, |map| match bounds {
-            // The default model, the one driven most, depends on the whole map.
-            Some((low, high)) if reading.reference().is_some() => {
-                map.changes().newest_in(low, high)
-            }
-            Some(_) | None => map.changes().newest(),
-        });
-        State {
-            change,
+        self.maps().look(row, |map| State {
+            change: match bounds {
+                // The default model, the one driven most, depends on the whole map.
+                Some((low, high)) if reading.reference().is_some() => {
+                    map.changes().newest_in(low, high)
+                }
+                Some(_) | None => map.changes().newest(),
+            },
             terrain_revision: row.site.terrain_revision,
             now_us: reading.now_us,
-        }
+            divided: reading
+                .measurements_of_epoch()
+                .map(|count| (count, map.stamp())),
+        })
     }
 }

@@ -31,7 +31,9 @@ pub struct Asked {
 pub(in crate::app) struct Reading {
     /// Only measurements made before this time; `None` for all that were received.
     pub(in crate::app) as_of: Option<Timestamp>,
-    /// What was measured before `as_of` in the epoch that it divides.
+    /// Measurements of the epoch that `as_of` divides.
+    timeline: Option<Arc<Timeline>>,
+    /// Sums of those of them from before `as_of`.
     partial: Option<Arc<PartialEpoch>>,
     configuration: Option<ConfigurationId>,
     normalisation: Option<Arc<Normalisation>>,
@@ -60,6 +62,7 @@ impl Reading {
         });
         Ok(Self {
             as_of: asked.as_of,
+            timeline: None,
             partial: None,
             configuration: asked.configuration,
             normalisation: normalisation.transpose()?,
@@ -68,19 +71,14 @@ impl Reading {
         })
     }
 
-    /// Returns these parameters with `as_of` rounded down to a whole minute, or to the end of an
-    /// epoch of this site's map where the raw measurements of the epoch are not all there: a sum
-    /// cannot be divided in time.
+    /// Rounds `as_of` down to a whole minute, or to the end of an epoch of this site's map where the
+    /// raw measurements of the epoch are not all there: a sum cannot be divided in time.
     ///
     /// # Errors
     /// The database failed.
-    pub(in crate::app) async fn of_site(
-        mut self,
-        app: &App,
-        row: &SiteRow,
-    ) -> Result<Self, AppError> {
+    pub(super) async fn of_site(&mut self, app: &App, row: &SiteRow) -> Result<(), AppError> {
         let Some(as_of) = self.as_of else {
-            return Ok(self);
+            return Ok(());
         };
         let epoch = app.maps().look(row, |map| map.epoch_at(as_of));
         let timeline = if Self::divides(as_of, epoch) {
@@ -88,11 +86,8 @@ impl Reading {
         } else {
             None
         };
-        let summed = move |_: &App| {
-            self.move_to(as_of, epoch, timeline.as_ref());
-            self
-        };
-        Ok(app.off_thread(summed).await)
+        self.move_to(as_of, epoch, timeline);
+        Ok(())
     }
 
     /// Returns whether a time, rounded down to a minute, divides the epoch that it lies in.
@@ -101,29 +96,40 @@ impl Reading {
     }
 
     /// Moves `as_of` to a time within `epoch`, rounded down: to a minute if the measurements of the
-    /// epoch are given, else to its begin. Fast for rising times.
-    pub(super) fn move_to(
-        &mut self,
-        at: Timestamp,
-        epoch: Epoch,
-        timeline: Option<&Arc<Timeline>>,
-    ) {
-        let minute = minute_of(at);
-        let Some(timeline) = timeline.filter(|_| Self::divides(at, epoch)) else {
+    /// epoch are given, else to its begin. Without [`sum`](Self::sum) nothing of the epoch counts.
+    pub(super) fn move_to(&mut self, at: Timestamp, epoch: Epoch, timeline: Option<Arc<Timeline>>) {
+        self.timeline = timeline.filter(|_| Self::divides(at, epoch));
+        self.set_as_of(match self.timeline {
+            Some(_) => minute_of(at),
+            None => epoch.begin(),
+        });
+    }
+
+    /// Sums what was measured before `as_of` in the epoch that it divides.
+    pub(super) fn sum(&mut self, app: &App) {
+        let timeline = self.timeline.as_ref();
+        self.partial = timeline.map(|timeline| app.timelines().before(timeline, self.now_us));
+    }
+
+    /// Sums the same; fast for rising times of one epoch, if nobody else has these sums.
+    pub(super) fn sum_on(&mut self) {
+        let Some(timeline) = &self.timeline else {
             self.partial = None;
-            self.set_as_of(epoch.begin());
             return;
         };
-        let is_later = self.as_of.is_some_and(|as_of| as_of <= minute);
         let same = self.partial.as_mut().and_then(Arc::get_mut);
-        let same = same.filter(|same| is_later && Arc::ptr_eq(same.timeline(), timeline));
+        let same = same.filter(|same| Arc::ptr_eq(same.timeline(), timeline));
         if let Some(same) = same {
-            same.advance(minute.as_microsecond());
+            same.advance(self.now_us);
         } else {
-            let partial = PartialEpoch::before(Arc::clone(timeline), minute.as_microsecond());
+            let partial = PartialEpoch::before(Arc::clone(timeline), self.now_us);
             self.partial = Some(Arc::new(partial));
         }
-        self.set_as_of(minute);
+    }
+
+    /// Returns the number of measurements of the epoch that `as_of` divides.
+    pub(super) fn measurements_of_epoch(&self) -> Option<usize> {
+        self.timeline.as_ref().map(|timeline| timeline.count())
     }
 
     fn set_as_of(&mut self, at: Timestamp) {
@@ -134,7 +140,7 @@ impl Reading {
     /// Returns these parameters for another time, which [`of_site`](Self::of_site) rounds.
     pub(in crate::app) fn at(&self, at: Timestamp) -> Self {
         let mut other = self.clone();
-        other.partial = None;
+        (other.timeline, other.partial) = (None, None);
         other.set_as_of(at);
         other
     }

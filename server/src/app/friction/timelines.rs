@@ -13,23 +13,30 @@ use crate::app::ingest::SKEW_MIN;
 use crate::db::segments::SiteSegment;
 use crate::db::sites::SiteRow;
 use crate::db::withdrawals::WithdrawalRow;
-use crate::db::{self, Tx};
-use crate::friction::index::{Epoch, Measurement, SiteMap, Timeline};
+use crate::db::{self, DbError, Tx};
+use crate::friction::index::{Epoch, Measurement, PartialEpoch, SiteMap, Stamp, Timeline};
 use crate::friction::{Sums, epoch_h};
 
 /// Maximum number of measurements of a timeline, and of all that are cached; 184 bytes each.
 pub(super) const MEASUREMENTS_MAX: usize = 200_000;
-/// Maximum number of measurements that are read from the database for one timeline, of all sites
-/// and epochs since its begin.
-const READ_MAX: usize = 400_000;
-/// Number of measurements that are read at a time.
+/// Maximum number of cached timelines.
+const KEPT_MAX: usize = 64;
+/// Maximum number of cached partial epochs.
+const PARTIALS_MAX: usize = 2;
+/// Number of measurements that are read at a time, of all sites and epochs since a timeline begins.
 const READ_AT_ONCE: u32 = 4_096;
+/// Maximum number of times that one request reads for one timeline; the next request reads on.
+const READ_MAX: usize = 100;
+/// Number of times after which what was read is cached, in case that the request ends.
+const KEPT_EVERY: usize = 16;
 
 /// Cache of timelines.
 #[derive(Debug, Default)]
 pub(in crate::app) struct Timelines {
     /// The least recently used first.
     kept: Mutex<Vec<Kept>>,
+    /// The newest partial epochs, the oldest first: pages and frames of one map share theirs.
+    partials: Mutex<Vec<(i64, Arc<PartialEpoch>)>>,
     /// Held while measurements are read, so that one request at a time does.
     reading: tokio::sync::Mutex<()>,
 }
@@ -48,7 +55,7 @@ struct Identity {
     site_pk: i64,
     epoch: Epoch,
     grid_revision: u32,
-    withdrawals: u64,
+    stamp: Stamp,
 }
 
 impl Timelines {
@@ -66,9 +73,27 @@ impl Timelines {
         kept.retain(|kept| !same(kept));
         kept.push(new);
         let count = |kept: &Vec<Kept>| kept.iter().map(|kept| kept.timeline.count()).sum::<usize>();
-        while kept.len() > 1 && count(&kept) > MEASUREMENTS_MAX {
+        while kept.len() > KEPT_MAX || (kept.len() > 1 && count(&kept) > MEASUREMENTS_MAX) {
             kept.remove(0);
         }
+    }
+
+    /// Returns the sums of the measurements of a timeline that ended before a time.
+    pub(super) fn before(&self, timeline: &Arc<Timeline>, at_us: i64) -> Arc<PartialEpoch> {
+        let partials = || self.partials.lock().unwrap_or_else(PoisonError::into_inner);
+        let is_same = |(found_us, partial): &&(i64, Arc<PartialEpoch>)| {
+            *found_us == at_us && Arc::ptr_eq(partial.timeline(), timeline)
+        };
+        if let Some((_, found)) = partials().iter().find(is_same) {
+            return Arc::clone(found);
+        }
+        let partial = Arc::new(PartialEpoch::before(Arc::clone(timeline), at_us));
+        let mut partials = partials();
+        if partials.len() >= PARTIALS_MAX {
+            partials.remove(0);
+        }
+        partials.push((at_us, Arc::clone(&partial)));
+        partial
     }
 }
 
@@ -83,9 +108,9 @@ impl App {
         row: &SiteRow,
         epoch: Epoch,
     ) -> Result<Option<Arc<Timeline>>, AppError> {
-        let looked = |map: &SiteMap| (map.measurements_of(epoch), map.withdrawals());
+        let looked = |map: &SiteMap| (map.measurements_of(epoch), map.stamp());
         // Read before the database, which is never behind the map.
-        let (wanted, withdrawals) = self.maps().look(row, looked);
+        let (wanted, stamp) = self.maps().look(row, looked);
         let wanted = usize::try_from(wanted).unwrap_or(usize::MAX);
         if wanted == 0 {
             return Ok(Some(Arc::new(Timeline::new(epoch))));
@@ -97,86 +122,96 @@ impl App {
             site_pk: row.pk,
             epoch,
             grid_revision: row.site.grid.revision,
-            withdrawals,
+            stamp,
         };
         let is_whole = |kept: &Kept| kept.timeline.count() >= wanted;
         if let Some(found) = self.timelines().find(of).filter(is_whole) {
             return Ok(Some(found.timeline));
         }
         let _turn = self.timelines().reading.lock().await;
-        let kept = self.timelines().find(of);
-        if let Some(found) = kept.as_ref().filter(|kept| is_whole(kept)) {
-            return Ok(Some(Arc::clone(&found.timeline)));
-        }
         let mut tx = self.db().read("friction").await?;
-        let begun = match kept {
-            Some(kept) => Some(kept),
-            None => self.begun(&mut tx, of).await?,
+        let mut kept = match self.timelines().find(of) {
+            Some(kept) => kept,
+            None => match begun(&mut tx, of).await? {
+                Some(begun) => begun,
+                None => return Ok(None),
+            },
         };
-        let Some(begun) = begun else { return Ok(None) };
-        let read = read(&mut tx, begun, wanted).await?;
-        Ok(is_whole(&read).then(|| {
-            self.timelines().keep(read.clone());
-            read.timeline
-        }))
-    }
-
-    /// Returns an empty timeline from before the first measurement of an epoch; `None` if some were
-    /// removed.
-    async fn begun(&self, tx: &mut Tx, of: Identity) -> Result<Option<Kept>, AppError> {
-        let begin = of.epoch.begin();
-        let since = begin.checked_sub(SKEW_MIN).unwrap_or(Timestamp::MIN);
-        let first = db::segments::first_since(tx, since).await?;
-        Ok(first
-            .filter(|&(_, is_first)| !is_first || self.removed().is_empty())
-            .map(|(first, _)| Kept {
-                of,
-                read_to: first - 1,
-                timeline: Arc::new(Timeline::new(of.epoch)),
-            }))
+        let withdrawals: Arc<[WithdrawalRow]> = db::withdrawals::all(&mut tx).await?.into();
+        for batch in 1..=READ_MAX {
+            if is_whole(&kept) {
+                break;
+            }
+            let rows = db::segments::of_site(&mut tx, of.site_pk, kept.read_to, READ_AT_ONCE);
+            let rows = rows.await?;
+            if rows.is_empty() {
+                break;
+            }
+            let withdrawals = Arc::clone(&withdrawals);
+            let adding = move |_: &Self| kept.with(&rows, &withdrawals);
+            kept = self.off_thread(adding).await?;
+            if batch % KEPT_EVERY == 0 {
+                self.timelines().keep(kept.clone());
+            }
+        }
+        drop(tx);
+        self.timelines().keep(kept.clone());
+        Ok(is_whole(&kept).then_some(kept.timeline))
     }
 }
 
-/// Reads on until a timeline has as many measurements as wanted, or there are no more.
-async fn read(tx: &mut Tx, mut kept: Kept, wanted: usize) -> Result<Kept, AppError> {
-    let of = kept.of;
-    let withdrawals = db::withdrawals::all(tx).await?;
-    let mut found: Vec<Measurement> = Vec::new();
-    let mut count = 0;
-    while kept.timeline.count() + found.len() < wanted && count < READ_MAX {
-        let rows = db::segments::of_site(tx, of.site_pk, kept.read_to, READ_AT_ONCE).await?;
-        let Some(&(last, _)) = rows.last() else { break };
-        kept.read_to = last;
-        count += rows.len();
-        let rows = rows.into_iter().filter_map(|(_, segment)| segment);
-        found.extend(rows.filter_map(|segment| counted(segment, of, &withdrawals)));
-    }
-    Arc::make_mut(&mut kept.timeline).extend(found);
-    Ok(kept)
+/// Returns an empty timeline from before the first measurement of an epoch; `None` if some were
+/// removed.
+async fn begun(tx: &mut Tx, of: Identity) -> Result<Option<Kept>, AppError> {
+    let begin = of.epoch.begin();
+    let since = begin.checked_sub(SKEW_MIN).unwrap_or(Timestamp::MIN);
+    let first = db::segments::first_since(tx, since).await?;
+    Ok(first.map(|first| Kept {
+        of,
+        read_to: first - 1,
+        timeline: Arc::new(Timeline::new(of.epoch)),
+    }))
 }
 
-/// Returns a measurement of the epoch that is on the map.
+impl Kept {
+    /// Adds those of the given measurements that are of this epoch and on the map.
+    fn with(
+        mut self,
+        rows: &[(i64, Option<SiteSegment>)],
+        withdrawals: &[WithdrawalRow],
+    ) -> Result<Self, DbError> {
+        let last = rows.last().map(|&(pk, _)| pk);
+        let of_site = rows.iter().filter_map(|(_, row)| row.as_ref());
+        let found = of_site.map(|row| counted(row, self.of, withdrawals));
+        let found: Vec<Option<Measurement>> = found.collect::<Result<_, _>>()?;
+        if found.iter().any(Option::is_some) {
+            Arc::make_mut(&mut self.timeline).extend(found.into_iter().flatten());
+        }
+        self.read_to = last.unwrap_or(self.read_to);
+        Ok(self)
+    }
+}
+
+/// Returns a measurement if it is of the epoch and on the map.
 fn counted(
-    SiteSegment {
-        robot_pk,
-        robot,
-        segment,
-        ..
-    }: SiteSegment,
+    row: &SiteSegment,
     of: Identity,
     withdrawals: &[WithdrawalRow],
-) -> Option<Measurement> {
+) -> Result<Option<Measurement>, DbError> {
+    let segment = row.segment()?;
     let hour = epoch_h(segment.ended_at);
     let is_on_map = of.epoch.includes_h(hour)
         && segment.grid_revision == of.grid_revision
-        && !withdrawals.iter().any(|row| row.includes(robot_pk, hour));
-    let sums = is_on_map.then(|| Sums::of(&segment)).flatten()?;
-    Some(Measurement {
+        && !withdrawals
+            .iter()
+            .any(|found| found.includes(row.robot_pk, hour));
+    let sums = is_on_map.then(|| Sums::of(&segment)).flatten();
+    Ok(sums.map(|sums| Measurement {
         ended_at_us: segment.ended_at.as_microsecond(),
         cell: segment.cell,
         terrain: segment.terrain,
         configuration: segment.configuration,
-        robot,
+        robot: row.robot.clone(),
         sums,
-    })
+    }))
 }

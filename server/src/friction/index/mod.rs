@@ -55,8 +55,10 @@ pub struct SiteMap {
     /// Sums over all cells, for terrains.
     totals: BTreeMap<PartKey, Sums>,
     changes: Changes,
-    /// Number of withdrawals since the map was read.
-    withdrawals: u64,
+    /// Number of times that measurements may have left the map.
+    removals: u64,
+    /// Number of measurements of each epoch.
+    segments: BTreeMap<i32, u64>,
 }
 
 fn place(cell: Cell) -> u64 {
@@ -70,6 +72,13 @@ fn cell_at(place: u64) -> Cell {
         ix: signed(place & 0xFFFF_FFFF),
         iy: signed(place >> 32),
     }
+}
+
+/// Changes whenever measurements may have left a map or moved to another epoch.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Stamp {
+    merged_before_h: i64,
+    removals: u64,
 }
 
 /// Filter of measurements, and the normalisation to apply.
@@ -196,12 +205,20 @@ impl SiteMap {
                 samples: 0,
                 ..*sums
             });
+        *self.segments.entry(key.epoch_h).or_default() += sums.segments;
         self.changes.note(labelled.cell);
+    }
+
+    fn count_segments(&mut self) {
+        self.segments.clear();
+        for (key, sums) in &self.totals {
+            *self.segments.entry(key.epoch_h).or_default() += sums.segments;
+        }
     }
 
     /// Removes the measurements of a robot from hour `from_h` to hour `to_h`, both included.
     pub fn withdraw(&mut self, robot: &RobotId, (from_h, to_h): (i64, i64)) {
-        self.withdrawals += 1;
+        self.removals += 1;
         let Some(&robot) = self.names.robots.numbers.get(robot) else {
             return;
         };
@@ -217,6 +234,7 @@ impl SiteMap {
         }
         self.cells.retain(|_place, parts| !parts.is_empty());
         self.totals.retain(|key, _sums| !goes(key));
+        self.count_segments();
         for cell in changed {
             self.changes.note(cell);
         }
@@ -252,6 +270,7 @@ impl SiteMap {
             total.and_modify(|total| total.add(sums)).or_insert(*sums);
         }
         self.totals = totals;
+        self.count_segments();
         self.changes.note_all();
     }
 
@@ -259,7 +278,7 @@ impl SiteMap {
     /// replaces, and records a change of all cells.
     pub fn follow(&mut self, before: &Self) {
         self.changes.follow(&before.changes);
-        self.withdrawals = before.withdrawals + 1;
+        self.removals = before.removals + 1;
     }
 
     /// Returns the hour before which epochs are merged into days.
@@ -267,9 +286,12 @@ impl SiteMap {
         self.merged_before_h
     }
 
-    /// Returns a number that changes whenever measurements may have left the map.
-    pub fn withdrawals(&self) -> u64 {
-        self.withdrawals
+    /// Returns what changes whenever measurements may have left the map or moved to another epoch.
+    pub fn stamp(&self) -> Stamp {
+        Stamp {
+            merged_before_h: self.merged_before_h,
+            removals: self.removals,
+        }
     }
 
     /// Returns the recorded changes of cells.

@@ -101,6 +101,7 @@ impl Timeline {
                 part: Part::new(key, &measurement.sums),
             });
         }
+        // Fast for what is mostly in order already.
         self.rows.sort_by_key(|row| row.ended_at_us);
     }
 }
@@ -132,7 +133,8 @@ impl PartialEpoch {
         let rows = rest.iter().take_while(|row| row.ended_at_us < at_us);
         for row in rows {
             let sums = row.part.sums();
-            let parts = self.cells.entry(row.place).or_default();
+            let parts = self.cells.entry(row.place);
+            let parts = parts.or_insert_with(|| Vec::with_capacity(1));
             match parts.iter_mut().find(|part| part.key == row.part.key) {
                 Some(part) => part.add(&sums),
                 None => parts.push(row.part),
@@ -172,9 +174,8 @@ impl SiteMap {
 
     /// Returns the number of measurements of an epoch that are on the map.
     pub fn measurements_of(&self, epoch: Epoch) -> u64 {
-        let of_epoch = |key: &PartKey| i64::from(key.epoch_h) == epoch.first_h;
-        let totals = self.totals.iter().filter(|(key, _)| of_epoch(key));
-        totals.map(|(_, sums)| sums.segments).sum()
+        let first_h = i32::try_from(epoch.first_h).unwrap_or(i32::MAX);
+        self.segments.get(&first_h).copied().unwrap_or(0)
     }
 
     /// Returns the parts of a cell that count at a time.

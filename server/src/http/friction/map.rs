@@ -115,8 +115,8 @@ pub(in crate::http) struct MapQuery {
     /// Side of the squares, metres, a multiple of the grid's; the grid's own when absent. There
     /// may be 1 048 576 squares.
     resolution_m: Option<f64>,
-    /// As of when, rounded down to a minute, or to the end of an epoch without all of its raw
-    /// measurements; all that has come when absent.
+    /// As of when, rounded down to a minute, or to the end of an epoch whose raw measurements are
+    /// missing or too many; all that has come when absent.
     as_of: Option<Timestamp>,
     /// The robot model and tyres whose θ it is; the one with most measurements when absent.
     #[param(value_type = Option<String>)]
@@ -192,7 +192,7 @@ impl MapQuery {
 }
 
 /// Encodes a raster in a format.
-type Write = Box<dyn FnOnce(&Raster) -> Result<Vec<u8>, AppError> + Send>;
+type Write = Box<dyn Fn(&Raster) -> Result<Vec<u8>, AppError> + Send + Sync>;
 
 fn writer(
     format: PictureFormat,

@@ -37,8 +37,8 @@ use crate::formats::table::{self, segments};
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(super) struct ReadingQuery {
-    /// As of when, rounded down to a minute, or to the end of an epoch without all of its raw
-    /// measurements; all that has come when absent.
+    /// As of when, rounded down to a minute, or to the end of an epoch whose raw measurements are
+    /// missing or too many; all that has come when absent.
     as_of: Option<Timestamp>,
     /// Only measurements of this robot model and tyres.
     #[param(value_type = Option<String>)]
@@ -94,8 +94,8 @@ pub(super) async fn terrains(
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(super) struct OneQuery {
-    /// As of when, rounded down to a minute, or to the end of an epoch without all of its raw
-    /// measurements; all that has come when absent.
+    /// As of when, rounded down to a minute, or to the end of an epoch whose raw measurements are
+    /// missing or too many; all that has come when absent.
     as_of: Option<Timestamp>,
     /// Only measurements of this robot model and tyres.
     #[param(value_type = Option<String>)]

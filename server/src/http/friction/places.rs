@@ -39,8 +39,8 @@ pub(in crate::http) struct CellQuery {
     /// Side of the squares that cells are put together to, metres, a multiple of the grid's; the
     /// box may have 4 194 304 of them. Different ground is never put together.
     resolution_m: Option<f64>,
-    /// As of when, rounded down to a minute, or to the end of an epoch without all of its raw
-    /// measurements; all that has come when absent.
+    /// As of when, rounded down to a minute, or to the end of an epoch whose raw measurements are
+    /// missing or too many; all that has come when absent.
     as_of: Option<Timestamp>,
     /// Only measurements of this robot model and tyres.
     #[param(value_type = Option<String>)]
@@ -89,8 +89,8 @@ pub(in crate::http) struct PointQuery {
     x_m: f64,
     /// North-like coordinate, metres.
     y_m: f64,
-    /// As of when, rounded down to a minute, or to the end of an epoch without all of its raw
-    /// measurements; all that has come when absent.
+    /// As of when, rounded down to a minute, or to the end of an epoch whose raw measurements are
+    /// missing or too many; all that has come when absent.
     as_of: Option<Timestamp>,
     /// Only measurements of this robot model and tyres.
     #[param(value_type = Option<String>)]
@@ -208,8 +208,8 @@ pub(in crate::http) struct VisitQuery {
     x_max_m: f64,
     /// Highest y of the area, metres.
     y_max_m: f64,
-    /// As of when, rounded down to a minute, or to the end of an epoch without all of its raw
-    /// measurements; all that has come when absent.
+    /// As of when, rounded down to a minute, or to the end of an epoch whose raw measurements are
+    /// missing or too many; all that has come when absent.
     as_of: Option<Timestamp>,
     /// Only measurements of this robot model and tyres.
     #[param(value_type = Option<String>)]

@@ -1,0 +1,58 @@
+// Alerts of the past, with those that stand: read from the server page by page, the newest first.
+import { SvelteSet } from 'svelte/reactivity';
+import type { Alert } from '../api/schema';
+import { ask, sentence } from '../api/client';
+
+/** Alerts of one page. */
+const PAGE = 50;
+
+export interface AlertFilter {
+  /** Both empty for all. */
+  kind: string;
+  robot: string;
+}
+
+export class PastAlerts {
+  items = $state.raw<Alert[]>([]);
+  /** Kinds of all that was ever read. */
+  readonly kinds = new SvelteSet<string>();
+  problem = $state<string | null>(null);
+  isReading = $state(false);
+  hasMore = $state(false);
+
+  #cursor: string | null = null;
+  #asked = 0;
+
+  /** Reads the newest ones of a site that pass a filter. */
+  async read(site: string, filter: AlertFilter): Promise<void> {
+    this.#cursor = null;
+    await this.#page(site, filter, []);
+  }
+
+  /** Reads the page behind those that were read. */
+  async more(site: string, filter: AlertFilter): Promise<void> {
+    await this.#page(site, filter, this.items);
+  }
+
+  async #page(site: string, { kind, robot }: AlertFilter, before: Alert[]): Promise<void> {
+    const mine = (this.#asked += 1);
+    const query = new URLSearchParams({ site, limit: String(PAGE) });
+    if (kind) query.set('kind', kind);
+    if (robot) query.set('robot', robot);
+    if (this.#cursor) query.set('cursor', this.#cursor);
+    this.isReading = true;
+    try {
+      const page = await ask<{ items: Alert[]; next_cursor?: string | null }>(`/v1/alerts?${query}`);
+      if (mine !== this.#asked) return;
+      this.items = [...before, ...page.items];
+      for (const { code } of page.items) this.kinds.add(code);
+      this.#cursor = page.next_cursor ?? null;
+      this.hasMore = this.#cursor !== null;
+      this.problem = null;
+    } catch (error) {
+      if (mine !== this.#asked) return;
+      this.problem = sentence(error);
+    }
+    this.isReading = false;
+  }
+}
