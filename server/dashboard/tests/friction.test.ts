@@ -78,7 +78,8 @@ test('friction is shown from the start, with a scale whose ends say what they me
   const mu = RANGES.friction.ticks[1] ?? NaN;
   const limit = legend.locator('tr', { has: page.getByRole('cell', { name: plain(mu), exact: true }) });
   const stops_m = Number(/([\d.]+)$/.exec(await limit.innerText())?.[1]);
-  expect(stops_m).toBeCloseTo(stoppingM(mu, demand) ?? NaN, 2);
+  // Two decimals are shown, and a half may go either way.
+  expect(Math.abs(stops_m - (stoppingM(mu, demand) ?? NaN))).toBeLessThan(0.0051);
   await shot(page, 'friction-peak');
 });
 
