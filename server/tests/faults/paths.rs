@@ -1,6 +1,7 @@
 //! Every write path of the server, each as something that is prepared while all works, and an act
 //! in which a call fails.
 
+use std::collections::BTreeSet;
 use std::pin::Pin;
 use std::time::Duration;
 
@@ -126,6 +127,8 @@ pub(crate) const PATHS: &[WritePath] = &[
                 };
                 db::robots::introduce(tx, ground.site_pk, introduction, RUNS_KEPT).await?;
                 db::robots::rename(tx, ground.robot_pk, &format!("rover {number}")).await?;
+                let tags = BTreeSet::from([format!("tag-{number}").parse().unwrap()]);
+                db::robots::set_tags(tx, ground.robot_pk, &tags).await?;
                 db::robots::set_retired(tx, ground.robot_pk, Some(now())).await?;
                 db::robots::set_retired(tx, ground.robot_pk, None).await?;
                 db::robots::count_refused(tx, ground.robot_pk, 1, "a test").await?;
