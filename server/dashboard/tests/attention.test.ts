@@ -20,6 +20,8 @@ async function watchCalls(page: Page, permission: NotificationPermission): Promi
       constructor(...words: ConstructorParameters<typeof EventSource>) {
         super(...words);
         calls.source = this;
+        // Alerts of the demo's robots come and go when they like: here there are those of the test alone.
+        this.addEventListener('alert', (event) => event.isTrusted && event.stopImmediatePropagation());
       }
     }
     class Notice {
