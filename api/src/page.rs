@@ -25,8 +25,9 @@ pub struct MapPage<T> {
     pub items: Vec<T>,
     /// Value of `cursor` for the request of the next page; `null` on the last page.
     pub next_cursor: Option<String>,
-    /// Time up to which measurements are included: the requested time rounded down to a minute,
-    /// or to the end of an epoch whose raw measurements are missing or too many. `null` if no time was requested; all measurements are included then.
+    /// Time up to which measurements are included: the requested time rounded down to a minute, or
+    /// to the end of an epoch whose raw measurements are missing or too many. `null` if no time was
+    /// requested; all measurements are included then.
     #[serde(default)]
     pub as_of: Option<Timestamp>,
 }
@@ -38,8 +39,8 @@ pub struct DifferencePage<T> {
     pub items: Vec<T>,
     /// Value of `cursor` for the request of the next page; `null` on the last page.
     pub next_cursor: Option<String>,
-    /// Time up to which measurements are included before: the requested first time, rounded down
-    /// like that of a [`MapPage`].
+    /// Time up to which measurements are included before: the requested first time rounded down to
+    /// a minute, or to the end of an epoch whose raw measurements are missing or too many.
     #[serde(default)]
     pub from: Option<Timestamp>,
     /// Time up to which measurements are included after: the requested second time, rounded down

@@ -274,7 +274,7 @@ pub struct ChangeRobot {
     /// default; its measurements stay.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub retired: Option<bool>,
-    /// All tags that the robot is to have, at most [`TAGS_MAX`]; repeated ones count once.
+    /// New tags, which replace all present ones, at most 16; repeated ones count once.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tags: Option<Vec<Tag>>,
 }

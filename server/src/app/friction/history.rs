@@ -199,7 +199,7 @@ fn known_at(
         }
         let epoch = app.maps().look(&view.row, |map| map.epoch_at(at));
         then.move_to(at, epoch, timelines.get(&epoch).cloned());
-        then.sum_on();
+        then.advance_sum();
         FrictionAt {
             at,
             as_of: then.as_of.unwrap_or(at),

@@ -112,7 +112,7 @@ impl Reading {
     }
 
     /// Sums the same; fast for rising times of one epoch, if nobody else has these sums.
-    pub(super) fn sum_on(&mut self) {
+    pub(super) fn advance_sum(&mut self) {
         let Some(timeline) = &self.timeline else {
             self.partial = None;
             return;
