@@ -102,6 +102,15 @@ async fn the_map_is_known_by_the_minute_and_nothing_later_counts() {
 async fn days_of_merged_hours_are_divided_too() {
     let (yard, _robot) = driven(SignedDuration::from_hours(24 * 10)).await;
     yard.server.app().move_horizons().await.unwrap();
+    // They are merged: one hour alone can no longer be withdrawn.
+    let body = json!({"from": after_min(60), "to": after_min(90), "reason": "a wheel was loose"});
+    let path = "/v1/sites/yard/robots/rover-1/withdrawals";
+    let (status, said) = yard.post(path, &body).await;
+    assert_eq!(status, StatusCode::UNPROCESSABLE_ENTITY, "{said}");
+    assert!(
+        said["detail"].as_str().unwrap().contains("merged"),
+        "{said}"
+    );
     known_by_the_minute(&yard, &[60, 180, 1_800, 3_600]).await;
     yard.server.stop().await.unwrap();
 }
