@@ -212,7 +212,20 @@ impl Robot {
             supervisor,
         };
         robot.hello().await;
+        robot.is_seen(yard).await;
         robot
+    }
+
+    /// Waits until the server has a state of this run: its clock alone dates limits and leases.
+    async fn is_seen(&self, yard: &Yard) {
+        let path = format!("/v1/sites/{}/robots/{}", site(), self.id);
+        eventually("the server has the robot's state", async || {
+            let (_, found) = yard.get_value(&path).await;
+            let boot = found["live"]["boot"].as_str();
+            let is_seen = boot == Some(self.boot.to_string().as_str());
+            if is_seen { Ok(()) } else { Err(found) }
+        })
+        .await;
     }
 
     /// Ends this run of the agent and begins another, which remembers nothing.
