@@ -46,14 +46,14 @@ pub(crate) use self::webhooks::{NamedWebhook, WebhooksAction, WebhooksArguments}
 use crate::exit::Exit;
 use crate::output::{failure, note};
 
-/// Where a server answers, unless configured otherwise.
+/// Default address of the server.
 pub(crate) const SERVER_DEFAULT: &str = "http://127.0.0.1:8420";
-/// Most robots of a demo; each is a process of its own.
+/// Maximum number of robots of a demo; each is a separate process.
 const DEMO_ROBOTS_MAX: i64 = 50;
 
 /// Runs fleets of skid-steered robots and maps the friction of the ground while they drive.
 ///
-/// `--server`, `--site`, `--token-file`, `--ca` and `--json` may stand before or behind the command.
+/// Give `--server`, `--site`, `--token-file`, `--ca` and `--json` before or after the command.
 #[derive(Debug, Parser)]
 #[command(name = "tread", version)]
 pub(crate) struct Arguments {

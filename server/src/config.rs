@@ -102,7 +102,7 @@ pub struct Config {
     pub robots: Option<RobotsConfig>,
     /// Sign-in of people at an OpenID provider; `None` allows tokens only.
     pub oidc: Option<OidcConfig>,
-    /// Where webhooks may go.
+    /// Networks to which webhooks may send.
     pub webhooks: WebhooksConfig,
 }
 
@@ -342,7 +342,7 @@ pub enum ConfigError {
         #[source]
         cause: std::io::Error,
     },
-    /// The file is no valid TOML, or has an unknown key or a value of the wrong type.
+    /// The file is not valid TOML, or has an unknown key or a value of the wrong type.
     #[error("configuration file `{}`, line {line}: {message}", path.display())]
     Invalid {
         /// Path of the file.

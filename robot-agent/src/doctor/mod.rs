@@ -73,7 +73,7 @@ pub(crate) struct DoctorArgs {
     /// The configuration file of the robot
     #[arg(long, env = "TREAD_AGENT_CONFIG")]
     config: PathBuf,
-    /// Move the robot: it turns on the spot and drives a metre ahead, at 0.2 m/s
+    /// Move the robot: it turns on the spot and drives a metre forward, at 0.2 m/s
     #[arg(long = "move")]
     moves: bool,
     /// Print one JSON object
