@@ -45,6 +45,7 @@ use tread_api::startup::give_zenoh_threads;
 
 use self::app::enrolment::EnrolmentService;
 use self::app::identity::audit;
+use self::app::identity::people::People;
 use self::app::{
     App, Dependencies, checkpoints, events, ingest, memory, merging, reconciler, retention, storage,
 };
@@ -121,6 +122,11 @@ impl Server {
             lifetime: SignedDuration::from_secs(robots.certificate_s.into()),
             port: fleet.address().port(),
         };
+        let people = config
+            .oidc
+            .as_ref()
+            .map(|oidc| People::new(oidc, clock.clone()))
+            .transpose()?;
         let app = App::new(Dependencies {
             db,
             clock,
@@ -132,11 +138,9 @@ impl Server {
                 .zip(config.robots.as_ref())
                 .map(|(security, robots)| enrolment_service(security, robots)),
             webhooks: config.webhooks,
+            people,
+            audit: config.audit,
         });
-        app.log_audit(config.audit.log);
-        if let Some(oidc) = &config.oidc {
-            app.admit_people(oidc)?;
-        }
         remember(&app, &config.site).await?;
         let sender = Sender::new(app.webhook_rules().clone(), resolver)?;
         let listener = http::serve::listen(config.http)

@@ -50,6 +50,7 @@ pub use self::error::AppError;
 use self::events::Hub;
 use self::friction::{MapNews, Pictures, Timelines, Views};
 use self::identity::Identity;
+use self::identity::people::People;
 use self::map::Maps;
 use self::missions::idempotency::InFlight;
 use self::presence::Presences;
@@ -63,7 +64,7 @@ use self::watched::Watched;
 use self::webhooks::Webhooks;
 use crate::clock::Clock;
 use crate::config::webhooks::WebhooksConfig;
-use crate::config::{FrictionConfig, StorageConfig};
+use crate::config::{AuditConfig, FrictionConfig, StorageConfig};
 use crate::counters::Counters;
 pub use crate::db::DbError;
 use crate::db::sites::SiteRow;
@@ -139,6 +140,29 @@ pub struct Dependencies {
     pub enrolment: Option<EnrolmentService>,
     /// Where webhooks may go.
     pub webhooks: WebhooksConfig,
+    /// Sign-in of people at an OpenID provider; without it people sign in with tokens alone.
+    pub people: Option<People>,
+    /// Where the audit log is written beside the database.
+    pub audit: AuditConfig,
+}
+
+impl Dependencies {
+    /// Returns dependencies on a database alone, with default settings and without a connection to
+    /// robots.
+    pub fn on_database(db: Db, clock: Clock) -> Self {
+        Self {
+            db,
+            clock,
+            friction: FrictionConfig::default(),
+            storage: StorageConfig::default(),
+            normalisations: Vec::new(),
+            robots: RobotLink::unconnected(Supervisor::new()),
+            enrolment: None,
+            webhooks: WebhooksConfig::default(),
+            people: None,
+            audit: AuditConfig::default(),
+        }
+    }
 }
 
 impl App {
@@ -153,6 +177,8 @@ impl App {
             robots,
             enrolment,
             webhooks,
+            people,
+            audit,
         } = dependencies;
         let started_at = clock.elapsed();
         let presences = Arc::default();
@@ -177,7 +203,7 @@ impl App {
             hub,
             keys_in_flight: InFlight::default(),
             checks: Semaphore::new(check::CHECKS_MAX),
-            identity: Identity::default(),
+            identity: Identity::new(people, audit),
             maps: Maps::default(),
             membership: Membership::new(enrolment),
             metrics: Metrics::default(),
@@ -214,14 +240,9 @@ impl App {
         storage: StorageConfig,
     ) -> Self {
         Self::new(Dependencies {
-            db,
-            clock,
             friction,
             storage,
-            normalisations: Vec::new(),
-            robots: RobotLink::unconnected(Supervisor::new()),
-            enrolment: None,
-            webhooks: WebhooksConfig::default(),
+            ..Dependencies::on_database(db, clock)
         })
     }
 
