@@ -35,7 +35,7 @@ use tread_control::plan::Plan;
 use tread_control::robot::RobotModel;
 
 use crate::clock::SharedClock;
-use crate::control_loop::active::Hold;
+use crate::control_loop::channels::Hold;
 use crate::control_loop::channels::{GivenPlan, LoopCommand, Shared};
 use crate::control_loop::site_view::SiteView;
 use crate::fleet::{Commands, IncomingCommand};
