@@ -100,7 +100,7 @@ pub const MODEL_RATIO: f64 = 1.5e-3;
 /// Maximum fraction of a segment's own variance that counts as shared with earlier segments.
 const OFFSETS_SHARE_MAX: f64 = 0.9;
 /// Half-width of a 95 % interval, in standard deviations.
-const NORMAL_95: f64 = 1.959_963_984_540_054;
+pub const NORMAL_95: f64 = 1.959_963_984_540_054;
 /// Minimum prior standard deviation of the torque scale.
 const SCALE_STD_DEV_MIN: f64 = 1.0e-3;
 /// Maximum time between two samples; after a longer gap all averages restart, seconds.

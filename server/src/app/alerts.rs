@@ -21,7 +21,7 @@ use super::storage::SERVER_RESTARTED_ALERT;
 use super::{App, AppError, check_named, page};
 use crate::app::presence::RobotKey;
 pub use crate::db::alerts::AlertFilter;
-use crate::db::alerts::Whereabouts;
+use crate::db::alerts::AlertLocation;
 use crate::db::{self, DbError, Outcome};
 
 /// Code of the alert about a mission that failed.
@@ -334,27 +334,27 @@ impl App {
         let Some(mut alert) = db::alerts::find(tx, id).await? else {
             return Ok(None);
         };
-        let shown = alert.robot_key().and_then(|key| self.whereabouts(&key));
+        let shown = alert.robot_key().and_then(|key| self.location(&key));
         let shown = shown.unwrap_or_default();
         alert.mission = mission.or(shown.mission);
         alert.place = shown.place;
         if alert.mission.is_some() || alert.place.is_some() {
-            let whereabouts = Whereabouts {
+            let location = AlertLocation {
                 mission: alert.mission,
                 place: alert.place,
             };
-            db::alerts::locate(tx, id, whereabouts).await?;
+            db::alerts::locate(tx, id, location).await?;
         }
         self.queue_alert(tx, NoticeEvent::Opened, &alert).await?;
         Ok(Some(alert))
     }
 
     /// Returns the mission and the position that a robot showed last.
-    fn whereabouts(&self, key: &RobotKey) -> Option<Whereabouts> {
+    fn location(&self, key: &RobotKey) -> Option<AlertLocation> {
         let presence = self.presences().get(key);
         let state = presence.state()?;
         let place = state.pose.map(|pose| pose.value.position());
-        Some(Whereabouts {
+        Some(AlertLocation {
             mission: state.mission.map(|mission| mission.id),
             place: place.filter(|place| place.x_m.is_finite() && place.y_m.is_finite()),
         })
