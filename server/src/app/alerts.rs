@@ -16,6 +16,7 @@ use super::missions::reports::Taken;
 use super::own_alert::OwnAlert;
 use super::reconciler::attendance::ROBOT_LOST_ALERT;
 use super::reconciler::conditions::{CLOCK_WRONG_ALERT, ROBOT_WAITING_ALERT};
+use super::reconciler::delays::MISSION_WAITING_ALERT;
 use super::stops::UNCONFIRMED_ALERT;
 use super::storage::SERVER_RESTARTED_ALERT;
 use super::{App, AppError, check_named, page};
@@ -32,7 +33,18 @@ pub(super) const MISSION_EXPIRED_ALERT: &str = "mission-expired";
 pub(super) const MISSION_REJECTED_ALERT: &str = "mission-rejected";
 /// Codes of the alerts about missions that did not succeed. Each is raised until a person
 /// acknowledges it, or until a mission of the robot succeeds.
-pub(super) const MISSION_ALERTS: [&str; 3] = [
+const MISSION_ALERTS: [&str; 3] = [
+    MISSION_FAILED_ALERT,
+    MISSION_EXPIRED_ALERT,
+    MISSION_REJECTED_ALERT,
+];
+/// Codes of the alerts about a robot's presence and work. They end when the robot is retired or
+/// revoked: nobody expects it to report or to drive.
+const WORK_ALERTS: [&str; 7] = [
+    ROBOT_LOST_ALERT,
+    ROBOT_WAITING_ALERT,
+    MISSION_WAITING_ALERT,
+    CLOCK_WRONG_ALERT,
     MISSION_FAILED_ALERT,
     MISSION_EXPIRED_ALERT,
     MISSION_REJECTED_ALERT,
@@ -40,13 +52,14 @@ pub(super) const MISSION_ALERTS: [&str; 3] = [
 /// Maximum number of alerts stored per robot. Beyond it the oldest cleared ones are deleted first.
 const KEPT_MAX: u32 = 500;
 /// Codes of alerts that the server itself raises and clears, independently of the robot's reports.
-const OWN_ALERTS: [&str; 10] = [
+const OWN_ALERTS: [&str; 11] = [
     UNCONFIRMED_ALERT,
     REVOKED_ALERT,
     RETIRED_ALERT,
     UNISSUED_ALERT,
     ROBOT_LOST_ALERT,
     ROBOT_WAITING_ALERT,
+    MISSION_WAITING_ALERT,
     CLOCK_WRONG_ALERT,
     MISSION_FAILED_ALERT,
     MISSION_EXPIRED_ALERT,
@@ -272,6 +285,19 @@ impl App {
             return Ok(None);
         };
         self.end(tx, robot_pk, &alert).await
+    }
+
+    /// Clears the alerts about the presence and the work of a robot that is retired or revoked.
+    pub(super) async fn end_work_alerts(
+        &self,
+        tx: &mut db::Tx,
+        robot_pk: i64,
+    ) -> Result<Vec<Alert>, DbError> {
+        let mut ended = Vec::new();
+        for code in WORK_ALERTS {
+            ended.extend(self.end_alert(tx, robot_pk, code).await?);
+        }
+        Ok(ended)
     }
 
     /// Clears an alert, and queues what webhooks are to be sent of it.

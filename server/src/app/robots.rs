@@ -13,12 +13,9 @@ use tread_api::text::is_printable;
 use tread_api::wire::hello::{Hello, Welcome};
 use tread_api::wire::{Refusal, RefusalCode};
 
-use super::alerts::MISSION_ALERTS;
 use super::allowance::Kind;
 use super::missions::end_all;
 use super::missions::transitions::Change;
-use super::reconciler::attendance::ROBOT_LOST_ALERT;
-use super::reconciler::conditions::{CLOCK_WRONG_ALERT, ROBOT_WAITING_ALERT};
 use super::terrains::site_definition;
 use super::{App, AppError, name_or, page, site_row};
 use crate::app::presence::RobotKey;
@@ -108,10 +105,7 @@ impl App {
                 let why = (Change::Retire, Actor::Client, Change::Retire.reason());
                 end_all(&mut tx, row.pk, why, now).await?;
                 db::robots::set_retired(&mut tx, row.pk, Some(now)).await?;
-                let of_work = [ROBOT_LOST_ALERT, ROBOT_WAITING_ALERT, CLOCK_WRONG_ALERT];
-                for code in of_work.into_iter().chain(MISSION_ALERTS) {
-                    ended.extend(self.end_alert(&mut tx, row.pk, code).await?);
-                }
+                ended = self.end_work_alerts(&mut tx, row.pk).await?;
             }
             (Some(false), Some(_)) => db::robots::set_retired(&mut tx, row.pk, None).await?,
             (Some(true), Some(_)) | (Some(false), None) | (None, _) => {}

@@ -8,6 +8,7 @@
 
 pub(super) mod attendance;
 pub(super) mod conditions;
+pub(super) mod delays;
 mod jobs;
 pub mod needs;
 
@@ -25,6 +26,7 @@ use tread_api::stop::Stop;
 
 use self::attendance::Attendance;
 use self::conditions::Conditions;
+use self::delays::Delays;
 use self::jobs::{
     Finished, adopt_shown, cancel, disown, end_duplicate_agent, hold, offer, push_site, replace,
     settle, stop_again,
@@ -109,6 +111,7 @@ pub struct Reconciler {
     foreign: HashMap<RobotKey, (MissionId, Duration)>,
     attendance: Attendance,
     conditions: Conditions,
+    delays: Delays,
 }
 
 impl Reconciler {
@@ -126,6 +129,7 @@ impl Reconciler {
             foreign: HashMap::new(),
             attendance: Attendance::default(),
             conditions: Conditions::default(),
+            delays: Delays::default(),
         }
     }
 
@@ -218,6 +222,8 @@ impl Reconciler {
         open.extend(db::missions::next_in_queues(&mut tx).await?);
         let sites = db::sites::list(&mut tx, &Scope::EVERYWHERE, "", SITES_MAX).await?;
         drop(tx);
+        self.conditions.end_of_absent(&self.app, &open).await?;
+        self.delays.look(&self.app, &open).await?;
         self.forget_all_but(&open);
         self.disown_foreign(&open);
         for mission in open {
