@@ -151,6 +151,8 @@ export const fleet: Pick<Texts, Areas> = {
     excited: 'reicht für θ',
     unexcited: 'zu gering für θ',
     newMission: 'Neue Mission',
+    awaitsRelease: (robot: string) =>
+      `Der Server wurde aus einer Sicherung wiederhergestellt und weiß nicht, was seitdem geschah: Dieser Roboter bekommt keine Mission, bis er freigegeben ist. Sehen Sie nach seinen Missionen, dann: tread robots release ${robot}`,
     center: 'Auf der Karte zeigen',
   },
   bulk: {

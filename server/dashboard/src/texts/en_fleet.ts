@@ -147,6 +147,8 @@ export const fleet = {
     excited: 'suffices for θ',
     unexcited: 'too little for θ',
     newMission: 'New mission',
+    awaitsRelease: (robot: string) =>
+      `The server was restored from a backup and does not know what happened since: no mission is sent to this robot until it is released. Look at its missions, then: tread robots release ${robot}`,
     center: 'Show on map',
   },
   bulk: {
