@@ -28,6 +28,7 @@ pub mod keys;
 pub mod mission;
 pub mod page;
 pub mod problem;
+pub mod release;
 pub mod rights;
 pub mod robot;
 pub mod safety;

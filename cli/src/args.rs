@@ -24,8 +24,8 @@ use tread_server::config::SITE_DEFAULT;
 use self::identity::Showing;
 pub(crate) use self::identity::{
     AuditAction, AuditArguments, AuthorityAction, AuthorityArguments, JoinTokenAction,
-    JoinTokenArguments, Noted, PlainArguments, RobotArguments, RobotsAction, SessionsAction,
-    SessionsArguments, TokensAction, TokensArguments,
+    JoinTokenArguments, Noted, PlainArguments, ReleaseArguments, RobotArguments, RobotsAction,
+    SessionsAction, SessionsArguments, TokensAction, TokensArguments,
 };
 pub(crate) use self::map::{
     FrictionAction, FrictionArguments, HistoryArguments, SitesAction, SitesArguments,
@@ -55,7 +55,7 @@ const DEMO_ROBOTS_MAX: i64 = 50;
 ///
 /// Give `--server`, `--site`, `--token-file`, `--ca` and `--json` before or after the command.
 #[derive(Debug, Parser)]
-#[command(name = "tread", version)]
+#[command(name = "tread", version = tread_api::release::long_version())]
 pub(crate) struct Arguments {
     #[command(subcommand)]
     pub(crate) command: Command,

@@ -19,7 +19,7 @@ use crate::recording::salvage::{self, RecoverArgs};
 
 /// Drives one robot and measures the friction of the ground.
 #[derive(Debug, Parser)]
-#[command(name = "tread-agent", version, args_conflicts_with_subcommands = true)]
+#[command(name = "tread-agent", version = tread_api::release::long_version(), args_conflicts_with_subcommands = true)]
 struct Words {
     #[command(subcommand)]
     action: Option<Action>,

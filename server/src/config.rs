@@ -3,6 +3,7 @@
 //! An unknown key, a value out of range, or an address that other machines can reach without TLS
 //! prevents the start. The error names file, line and key.
 
+pub mod backup;
 pub mod oidc;
 pub mod webhooks;
 
@@ -14,6 +15,7 @@ use clap::{Args, ValueEnum};
 use serde::Deserialize;
 use tread_api::ids::{ConfigurationId, SiteId};
 
+use self::backup::BackupConfig;
 use self::oidc::{OidcConfig, OidcConfigError};
 use self::webhooks::WebhooksConfig;
 use crate::authority::is_port_name;
@@ -104,6 +106,8 @@ pub struct Config {
     pub oidc: Option<OidcConfig>,
     /// Networks to which webhooks may send.
     pub webhooks: WebhooksConfig,
+    /// Backups that the server makes by itself; `None` for none.
+    pub backup: Option<BackupConfig>,
 }
 
 /// `[robots]`: enrolment and authentication of robots by certificates.
@@ -328,6 +332,7 @@ struct File {
     oidc: Option<OidcConfig>,
     #[serde(default)]
     webhooks: WebhooksConfig,
+    backup: Option<BackupConfig>,
 }
 
 /// Error of reading the configuration.
@@ -435,6 +440,7 @@ impl Config {
             robots: file.robots,
             oidc: file.oidc,
             webhooks: file.webhooks,
+            backup: file.backup,
         };
         config.check()?;
         Ok(config)
@@ -475,6 +481,9 @@ impl Config {
         self.retention.check()?;
         self.storage.check()?;
         self.webhooks.check()?;
+        if let Some(backup) = &self.backup {
+            backup.check()?;
+        }
         check_friction(self.friction)
     }
 }

@@ -9,6 +9,8 @@
 
 pub mod app;
 pub mod authority;
+pub mod backup;
+pub mod build;
 pub mod clock;
 pub mod config;
 pub mod connections;
@@ -21,6 +23,7 @@ pub mod http;
 pub mod identity;
 mod init;
 mod logging;
+mod maintenance;
 pub mod metrics;
 pub mod oidc;
 mod rate_limit;
@@ -47,7 +50,8 @@ use self::app::enrolment::EnrolmentService;
 use self::app::identity::audit;
 use self::app::identity::people::People;
 use self::app::{
-    App, Dependencies, checkpoints, events, ingest, memory, merging, reconciler, retention, storage,
+    App, Dependencies, backups, checkpoints, events, ingest, memory, merging, reconciler,
+    retention, storage,
 };
 use self::authority::Authorities;
 use self::clock::Clock;
@@ -142,6 +146,15 @@ impl Server {
             audit: config.audit,
         });
         remember(&app, &config.site).await?;
+        let schedule = config.backup.map(|settings| backups::Schedule {
+            config: settings,
+            database: config.database.clone(),
+            authority: config
+                .robots
+                .as_ref()
+                .map(|robots| robots.authority.clone()),
+            reserve_bytes: config.storage.disk_free_min_bytes(),
+        });
         let sender = Sender::new(app.webhook_rules().clone(), resolver)?;
         let listener = http::serve::listen(config.http)
             .with_context(|| format!("cannot listen for HTTP on {}", config.http))?;
@@ -163,6 +176,8 @@ impl Server {
         supervisor.spawn_vital("tokens", app::identity::run(app.clone(), stop()));
         let finding = app::identity::people::run(app.clone(), stop());
         supervisor.spawn_vital("provider", finding);
+        let backing_up = backups::run(app.clone(), schedule, stop());
+        supervisor.spawn_vital("backups", backing_up);
         let sending = app::webhooks::delivery::run(app.clone(), sender, stop());
         supervisor.spawn_vital("webhooks", sending);
         let router = http::router(app.clone(), names);
@@ -228,6 +243,8 @@ async fn remember(app: &App, site: &SiteId) -> anyhow::Result<()> {
         app.log_failure("continue the time of the database", &error);
     }
     app.ensure_site(site).await?;
+    app.note_version().await?;
+    app.know_restoration().await?;
     app.know_robots().await?;
     if !app.presences().known().is_empty() {
         app.note_restart();
@@ -292,7 +309,7 @@ impl RunningServer {
 
 /// Tread's server: missions to robots, friction from robots, one REST API.
 #[derive(Debug, clap::Parser)]
-#[command(name = "tread-server", version, args_conflicts_with_subcommands = true)]
+#[command(name = "tread-server", version = build::long_version(), args_conflicts_with_subcommands = true)]
 struct Command {
     #[command(subcommand)]
     action: Option<Action>,
@@ -307,6 +324,12 @@ enum Action {
     /// Accept the next certificate that each robot presents, for use after restoring a backup of
     /// the database
     ForgetCertificates(init::ForgetArgs),
+    /// Back the database and the fleet's authority up into one file, beside a running server
+    Backup(maintenance::backup::BackupArgs),
+    /// Restore a backup; no server may run on the database
+    Restore(maintenance::restore::RestoreArgs),
+    /// Show or apply the changes of the database's schema that this version needs
+    Migrate(maintenance::migrate::MigrateArgs),
 }
 
 /// Returns the definition of the command line, for documentation and tests.
@@ -330,6 +353,13 @@ pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode 
     let ended = match command.action {
         Some(Action::Init(args)) => run_beside_server(init::run(args)),
         Some(Action::ForgetCertificates(args)) => run_beside_server(init::forget(args)),
+        Some(Action::Backup(args)) => run_beside_server(maintenance::backup::run(args)),
+        Some(Action::Restore(args)) => run_beside_server(maintenance::restore::run(args)),
+        Some(Action::Migrate(args)) => {
+            return maintenance::migrate::exit_code(run_beside_server(maintenance::migrate::run(
+                args,
+            )));
+        }
         None => run(&command.server),
     };
     match ended {
@@ -351,7 +381,7 @@ fn raise_file_limit() {
     }
 }
 
-fn run_beside_server(command: impl Future<Output = anyhow::Result<()>>) -> anyhow::Result<()> {
+fn run_beside_server<T>(command: impl Future<Output = anyhow::Result<T>>) -> anyhow::Result<T> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()?;

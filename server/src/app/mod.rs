@@ -2,6 +2,7 @@
 
 pub mod alerts;
 mod allowance;
+pub mod backups;
 pub mod check;
 pub mod checkpoints;
 pub mod enrolment;
@@ -21,6 +22,7 @@ mod own_alert;
 mod planned_path;
 pub mod presence;
 pub mod reconciler;
+pub mod restoration;
 pub mod retention;
 pub mod robot_link;
 pub mod robots;
@@ -45,6 +47,7 @@ use tread_api::rights::Scope;
 use uuid::Uuid;
 
 use self::allowance::Allowances;
+use self::backups::Backups;
 use self::enrolment::{EnrolmentService, Membership};
 pub use self::error::AppError;
 use self::events::Hub;
@@ -54,6 +57,7 @@ use self::identity::people::People;
 use self::map::Maps;
 use self::missions::idempotency::InFlight;
 use self::presence::Presences;
+use self::restoration::Restored;
 use self::retention::Removed;
 use self::robot_link::{Commands, RobotLink};
 use self::shares::Shares;
@@ -119,6 +123,8 @@ struct Inner {
     watched: Watched,
     event_shares: Shares,
     webhooks: Webhooks,
+    backups: Backups,
+    restored: Restored,
 }
 
 /// Dependencies of use cases.
@@ -225,6 +231,8 @@ impl App {
             watched: Watched::default(),
             event_shares: Shares::new(events::SHARES),
             webhooks: Webhooks::new(webhooks),
+            backups: Backups::default(),
+            restored: Restored::default(),
         };
         Self {
             inner: Arc::new(inner),
@@ -377,6 +385,14 @@ impl App {
         &self.inner.unrecorded
     }
 
+    fn restored(&self) -> &Restored {
+        &self.inner.restored
+    }
+
+    fn backups(&self) -> &Backups {
+        &self.inner.backups
+    }
+
     fn webhooks(&self) -> &Webhooks {
         &self.inner.webhooks
     }
@@ -412,6 +428,17 @@ impl App {
 
     fn friction_config(&self) -> &FrictionConfig {
         &self.inner.friction
+    }
+
+    /// Stores the version of this server, unless the last one to open the database was the same.
+    ///
+    /// # Errors
+    /// The database failed.
+    pub async fn note_version(&self) -> Result<(), AppError> {
+        let mut tx = self.db().write("mod").await?;
+        let now = self.clock().now();
+        db::schema::note_version(&mut tx, crate::build::VERSION, now).await?;
+        Ok(tx.commit().await?)
     }
 
     /// Continues the clock after the newest time in the database, so that time does not go back

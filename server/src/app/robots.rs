@@ -2,10 +2,11 @@
 
 use std::collections::BTreeSet;
 
-use tracing::info;
+use tracing::{info, warn};
 use tread_api::ids::{RobotId, SiteId, Tag};
 use tread_api::mission::Actor;
 use tread_api::page::Page;
+use tread_api::release::Peer;
 use tread_api::rights::Scope;
 use tread_api::robot::{ALERTS_MAX, Alert, ChangeRobot, Robot, RobotModel, TAGS_MAX};
 use tread_api::site::NAME_LENGTH_MAX;
@@ -135,6 +136,7 @@ impl App {
             name: row.name,
             tags: row.tags,
             retired_at: row.retired_at,
+            awaits_release_since: row.awaits_release_since,
             model: row.model,
             configuration: row.configuration,
             capabilities: row.capabilities,
@@ -192,6 +194,10 @@ impl App {
             refusal(RefusalCode::Busy, detail)
         })?;
         info!(robot.id = %hello.robot, "robot `{}` of site `{site}` said hello", hello.robot);
+        let (peer, version) = (Peer::of(&hello.agent_version), &hello.agent_version);
+        if matches!(peer, Peer::TooOld | Peer::TooNew) {
+            warn!(robot.id = %hello.robot, "agent {version} of robot `{}` {peer}", hello.robot);
+        }
         self.presences()
             .hello(key, hello.boot, self.clock().elapsed());
         self.robots_changed();

@@ -23,6 +23,7 @@ use tread_server::db::deferred_segments::Origin;
 use tread_server::db::enrolments::Renewal;
 use tread_server::db::idempotency::StoredAnswer;
 use tread_server::db::missions::Facts;
+use tread_server::db::restorations::Restoration;
 use tread_server::db::robots::Introduction;
 use tread_server::db::sessions::{NewSession, OfPeople, Owner, SignedIn};
 use tread_server::db::webhooks::{NewDelivery, Outcome};
@@ -137,6 +138,26 @@ pub(crate) const PATHS: &[WritePath] = &[
                 db::robots::boot_key(tx, ground.robot_pk, other, RUNS_KEPT).await?;
                 let configuration: ConfigurationId = of(json!(format!("{number:032x}")));
                 db::robots::note_measured(tx, ground.robot_pk, configuration)
+                    .await
+                    .map(|_| ())
+            }))
+        },
+    },
+    WritePath {
+        name: "restoration of a backup",
+        prepare: nothing,
+        act: |ground, number| {
+            Box::pin(ground.write(async move |tx| {
+                let version = format!("0.0.{number}");
+                db::schema::note_version(tx, &version, now()).await?;
+                let restoration = Restoration {
+                    restored_at: now(),
+                    taken_at: LONG_AGO,
+                    version,
+                };
+                db::restorations::begin(tx, &restoration).await?;
+                db::restorations::note_outcomes(tx, ground.robot_pk).await?;
+                db::restorations::release(tx, ground.robot_pk)
                     .await
                     .map(|_| ())
             }))

@@ -6,6 +6,8 @@ mod alerts;
 #[cfg(test)]
 mod as_of;
 #[cfg(test)]
+mod backups;
+#[cfg(test)]
 mod bad_input;
 #[cfg(test)]
 mod bounds;
@@ -54,9 +56,13 @@ mod pictures;
 #[cfg(test)]
 mod program;
 #[cfg(test)]
+mod releases;
+#[cfg(test)]
 mod request_bodies;
 #[cfg(test)]
 mod resources;
+#[cfg(test)]
+mod restoration;
 #[cfg(test)]
 mod retention;
 #[cfg(test)]

@@ -153,6 +153,8 @@ export const fleet: Pick<Texts, Areas> = {
     excited: 'reicht, um θ zu messen',
     unexcited: 'zu gering, um θ zu messen',
     newMission: 'Neue Mission',
+    awaitsRelease: (robot: string) =>
+      `Der Server wurde aus einer Sicherung wiederhergestellt und weiß nicht, was seitdem geschah: Dieser Roboter bekommt keine Mission, bis er freigegeben ist. Sehen Sie nach seinen Missionen, dann: tread robots release ${robot}`,
     center: 'Auf der Karte zeigen',
   },
   bulk: {

@@ -148,6 +148,8 @@ export const fleet = {
     excited: 'enough to measure θ',
     unexcited: 'too little to measure θ',
     newMission: 'New mission',
+    awaitsRelease: (robot: string) =>
+      `The server was restored from a backup and does not know what happened since: no mission is sent to this robot until it is released. Look at its missions, then: tread robots release ${robot}`,
     center: 'Show on map',
   },
   bulk: {
