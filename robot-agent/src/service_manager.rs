@@ -12,6 +12,10 @@
 //! its network, its disk or another thread is slow. Runs on its own thread, independent of a starved
 //! async runtime. Without `NOTIFY_SOCKET` nothing is sent.
 
+use std::fmt::Write as _;
+use std::io;
+use std::os::unix::net::UnixDatagram;
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
@@ -78,9 +82,25 @@ pub(crate) fn is_there() -> bool {
 
 /// Sends messages; one that cannot be sent is logged.
 fn notify(messages: &[NotifyState<'_>]) {
-    if let Err(cause) = sd_notify::notify(messages) {
+    if let Err(cause) = send(messages) {
         warn!("cannot notify the service manager: {cause}");
     }
+}
+
+/// Sends messages without waiting: a service manager that does not read must not block a thread.
+fn send(messages: &[NotifyState<'_>]) -> io::Result<()> {
+    let Some(path) = std::env::var_os("NOTIFY_SOCKET") else {
+        return Ok(());
+    };
+    let mut text = String::new();
+    for message in messages {
+        // Writing to a string cannot fail.
+        let _ = writeln!(text, "{message}");
+    }
+    let socket = UnixDatagram::unbound()?;
+    socket.set_nonblocking(true)?;
+    socket.send_to(text.as_bytes(), Path::new(&path))?;
+    Ok(())
 }
 
 impl Teller {

@@ -11,6 +11,10 @@
 //! The watchdog ignores storage and readiness: a restart mends no full disk, and would take Stop
 //! and teleoperation away, which work without the disk. Without `NOTIFY_SOCKET` nothing is sent.
 
+use std::fmt::Write as _;
+use std::io;
+use std::os::unix::net::UnixDatagram;
+use std::path::Path;
 use std::time::Duration;
 
 use sd_notify::NotifyState;
@@ -28,9 +32,25 @@ const STATUS_EVERY: Duration = Duration::from_secs(10);
 
 /// Sends messages; one that cannot be sent is logged.
 pub(crate) fn notify(states: &[NotifyState<'_>]) {
-    if let Err(error) = sd_notify::notify(states) {
+    if let Err(error) = send(states) {
         warn!("cannot notify the service manager: {error}");
     }
+}
+
+/// Sends messages without waiting: a service manager that does not read must not block a thread.
+fn send(messages: &[NotifyState<'_>]) -> io::Result<()> {
+    let Some(path) = std::env::var_os("NOTIFY_SOCKET") else {
+        return Ok(());
+    };
+    let mut text = String::new();
+    for message in messages {
+        // Writing to a string cannot fail.
+        let _ = writeln!(text, "{message}");
+    }
+    let socket = UnixDatagram::unbound()?;
+    socket.set_nonblocking(true)?;
+    socket.send_to(text.as_bytes(), Path::new(&path))?;
+    Ok(())
 }
 
 /// Returns whether a service manager waits for messages.
