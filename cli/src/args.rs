@@ -16,7 +16,9 @@ use std::ffi::OsString;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use clap::{ArgMatches, Args, CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
+use clap::{
+    ArgMatches, Args, CommandFactory as _, FromArgMatches as _, Parser, Subcommand, ValueEnum,
+};
 use clap_complete::Shell;
 use tread_api::ids::{RobotId, SiteId};
 use tread_server::config::SITE_DEFAULT;
@@ -111,12 +113,18 @@ pub(crate) enum Command {
     Completions {
         /// Shell to print the script for
         shell: Shell,
+        /// Program to print the script for
+        #[arg(long, value_enum, default_value_t)]
+        program: Program,
     },
     /// Write the manual as man pages, one for each command
     Man {
         /// Folder to write them to; created if it does not exist
         #[arg(long, value_name = "DIR")]
         dir: PathBuf,
+        /// Program to write the manual of
+        #[arg(long, value_enum, default_value_t)]
+        program: Program,
     },
     /// Run the server; used by `tread demo`
     #[command(hide = true, disable_help_flag = true)]
@@ -124,6 +132,18 @@ pub(crate) enum Command {
     /// Run an agent; used by `tread demo`
     #[command(hide = true, disable_help_flag = true)]
     Agent(PassedOn),
+}
+
+/// A program whose command line is documented.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
+pub(crate) enum Program {
+    /// This one
+    #[default]
+    Tread,
+    /// The server
+    TreadServer,
+    /// The agent on a robot
+    TreadAgent,
 }
 
 /// Arguments that are passed on to another program.

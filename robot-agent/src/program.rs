@@ -118,7 +118,8 @@ fn run(flags: &Flags) -> anyhow::Result<()> {
         .build()
         .context("no runtime")?;
     let ended = runtime.block_on(async {
-        let agent = Agent::start(config)?;
+        let mut agent = Agent::start(config)?;
+        agent.tell_service_manager()?;
         let ended = wait(&agent).await;
         agent.stop().await;
         ended

@@ -4,6 +4,7 @@
 //! prevents the start. The error names file, line and key.
 
 pub mod backup;
+pub(crate) mod credentials;
 pub mod oidc;
 pub mod webhooks;
 
@@ -380,6 +381,14 @@ pub enum ConfigError {
         /// Maximum number of entries.
         most: usize,
     },
+    /// The name of a credential is none.
+    #[error("`credential:{0}` names no credential: give the name of `LoadCredential=`, not a path")]
+    CredentialName(String),
+    /// The service manager has not passed a credential.
+    #[error(
+        "`credential:{0}` was not passed by the service manager: put it into /etc/credstore/{0}, with          `LoadCredential={0}` in the unit, or give the path of a file"
+    )]
+    NoCredential(String),
     /// An entry of `robots.names` is neither a host name nor an IP address.
     #[error("`robots.names` has `{0}`, which is neither a host name nor an address")]
     PortName(String),
@@ -410,7 +419,7 @@ impl Config {
             .transpose()?
             .unwrap_or_default();
         let builtin = "the built-in value parses";
-        let config = Self {
+        let mut config = Self {
             http: args
                 .http
                 .or(file.http)
@@ -442,6 +451,7 @@ impl Config {
             webhooks: file.webhooks,
             backup: file.backup,
         };
+        config.resolve_credentials(credentials::folder().as_deref())?;
         config.check()?;
         Ok(config)
     }

@@ -19,14 +19,17 @@ pub mod db;
 pub mod fleet;
 pub mod formats;
 pub mod friction;
+mod health;
 pub mod http;
 pub mod identity;
 mod init;
+pub mod liveness;
 mod logging;
 mod maintenance;
 pub mod metrics;
 pub mod oidc;
 mod rate_limit;
+mod service_manager;
 pub mod supervisor;
 pub mod webhooks;
 
@@ -77,6 +80,7 @@ pub struct Server;
 #[derive(Debug)]
 pub struct RunningServer {
     http_address: SocketAddr,
+    scheme: &'static str,
     metrics_address: Option<SocketAddr>,
     app: App,
     fleet: Fleet,
@@ -106,10 +110,11 @@ impl Server {
     /// # Errors
     /// As [`Server::start`].
     pub async fn start_with(
-        config: Config,
+        mut config: Config,
         clock: Clock,
         resolver: Arc<dyn Resolver>,
     ) -> anyhow::Result<RunningServer> {
+        config.check_credentials()?;
         let names = config.names();
         let proxies = TrustedProxies::new(config.web.trusted_proxies.clone());
         let tls = config.tls.map(Tls::load).transpose()?.map(Arc::new);
@@ -182,7 +187,8 @@ impl Server {
         supervisor.spawn_vital("webhooks", sending);
         let router = http::router(app.clone(), names);
         if let Some(tls) = &tls {
-            supervisor.spawn_vital("certificate", http::tls::watch(Arc::clone(tls), stop()));
+            supervisor
+                .spawn_vital_unwatched("certificate", http::tls::watch(Arc::clone(tls), stop()));
         }
         let scheme = if tls.is_some() { "https" } else { "http" };
         let serving = Serving {
@@ -215,6 +221,7 @@ impl Server {
         }
         Ok(RunningServer {
             http_address,
+            scheme,
             metrics_address,
             app,
             fleet,
@@ -287,6 +294,18 @@ impl RunningServer {
         &self.app
     }
 
+    /// Tells the service manager that started this process, if any, that the server is ready, and
+    /// from then on that it lives, until the stop.
+    fn tell_service_manager(&self) {
+        if service_manager::is_there() {
+            let address = format!("{}://{}", self.scheme, self.http_address);
+            let (supervisor, app) = (&self.supervisor, self.app.clone());
+            let (liveness, stop) = (supervisor.liveness(), supervisor.stop_token());
+            let telling = service_manager::run(app, address, liveness, stop);
+            supervisor.spawn_vital("service manager", telling);
+        }
+    }
+
     /// Waits until a vital task fails or the server is stopped.
     pub async fn failed(&self) {
         self.supervisor.stopping().await;
@@ -319,6 +338,8 @@ struct Command {
 
 #[derive(Debug, clap::Subcommand)]
 enum Action {
+    /// Exit with 0 if the server on this machine answers, for health checks of containers
+    Health(health::HealthArgs),
     /// Create the first admin's token of a server, and print it once
     Init(init::InitArgs),
     /// Accept the next certificate that each robot presents, for use after restoring a backup of
@@ -351,6 +372,7 @@ pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode 
         }
     };
     let ended = match command.action {
+        Some(Action::Health(args)) => run_beside_server(health::run(args)),
         Some(Action::Init(args)) => run_beside_server(init::run(args)),
         Some(Action::ForgetCertificates(args)) => run_beside_server(init::forget(args)),
         Some(Action::Backup(args)) => run_beside_server(maintenance::backup::run(args)),
@@ -407,6 +429,7 @@ pub fn run(args: &ServerArgs) -> anyhow::Result<()> {
         let mut terminate = signal(SignalKind::terminate())?;
         let mut interrupt = signal(SignalKind::interrupt())?;
         let server = Server::start(config).await?;
+        server.tell_service_manager();
         tokio::select! {
             _ = terminate.recv() => info!("asked to stop"),
             _ = interrupt.recv() => info!("asked to stop"),

@@ -5,6 +5,7 @@
 mod estimation;
 mod file;
 mod place;
+mod realtime;
 mod recording;
 mod ros2;
 
@@ -27,6 +28,7 @@ use crate::drive::simulated::{Individual, Stall};
 use crate::geometry::{control_model, paper_robot};
 use crate::membership::{Membership, MembershipFileError};
 use crate::outbox;
+use crate::realtime::RealtimeConfig;
 use crate::recording::RecordingConfig;
 use crate::sim::faults::Fault;
 use crate::sim::scenario::{BUILT_IN_NAME, Scenario, ScenarioError};
@@ -263,6 +265,8 @@ pub struct AgentConfig {
     pub outbox: outbox::Limits,
     /// Destination of records of the loop; `None` for no records.
     pub recording: Option<RecordingConfig>,
+    /// What is asked of the operating system's scheduler.
+    pub realtime: RealtimeConfig,
     /// Estimator's prior of the robot's and the tyres' parameters.
     pub prior: EstimatorPrior,
 }
@@ -432,8 +436,10 @@ fn assemble(
         }
     };
     let recording = recording::checked(file.recording.unwrap_or_default(), &data_dir)?;
+    let realtime = realtime::checked(file.realtime.unwrap_or_default())?;
     Ok(AgentConfig {
         recording,
+        realtime,
         prior: estimation::checked(
             file.estimation.unwrap_or_default(),
             estimation::default_of(&drive),

@@ -75,9 +75,13 @@ pub fn write_files(folder: &Path, files: &[(String, Vec<u8>)]) -> Result<(), Aut
     }
     for (name, content) in files {
         let path = folder.join(name);
-        let mode = if name.ends_with(".pem") { 0o644 } else { 0o600 };
+        let permissions = if name.ends_with(".pem") { 0o644 } else { 0o600 };
         let mut options = OpenOptions::new();
-        let opened = options.write(true).create_new(true).mode(mode).open(&path);
+        let opened = options
+            .write(true)
+            .create_new(true)
+            .mode(permissions)
+            .open(&path);
         let written = opened.and_then(|mut file| {
             file.write_all(content)?;
             file.sync_all()

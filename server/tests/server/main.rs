@@ -70,6 +70,8 @@ mod robot;
 #[cfg(test)]
 mod robots;
 #[cfg(test)]
+mod service_manager;
+#[cfg(test)]
 mod slow_client;
 #[cfg(test)]
 mod stops;
