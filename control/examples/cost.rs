@@ -136,10 +136,10 @@ fn undisturbed_p99(name: &str, robot: impl Fn() -> Robot, goal_us: f64) -> Check
         let mut robot = robot();
         for fastest_s in &mut times_s {
             robot.sense();
-            let time_s = timed_s(|| {
+            let took_s = timed_s(|| {
                 black_box(robot.tick());
             });
-            *fastest_s = fastest_s.min(time_s);
+            *fastest_s = fastest_s.min(took_s);
         }
     }
     let times_s = &mut times_s[REPEATED_FROM..];

@@ -336,8 +336,8 @@ impl Tracker {
     }
 
     /// Lets a known θ act if it is new: θ̂ is pulled to it if it is known from the start, refines or
-    /// corrects one that pulled, or jumps to another value, as on other ground. What was adapted under another θ
-    /// is forgotten: χ̂ moves back to one, slope and rotation centre to zero.
+    /// corrects one that pulled, or jumps to another value, as on other ground. What was adapted
+    /// under another θ is forgotten: χ̂ moves back to one, slope and rotation centre to zero.
     fn apply_knowledge(&mut self, knowledge: Option<ThetaKnowledge>, dt_s: f64) {
         if let Some(now) = knowledge {
             let is_first = self.known.is_none();

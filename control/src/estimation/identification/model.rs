@@ -252,11 +252,11 @@ impl<T: Real> Robot<T> {
         let mut output = Output::zero();
         for step in 0..count {
             let from_middle_s = (f64::from(step) * share - 0.5) * input.time_s;
-            let rim_m_s = |side: usize| {
+            let rim_of = |side: usize| {
                 self.radius_m[side]
                     * (input.wheels_rad_s[side] + input.wheels_rad_s2[side] * from_middle_s)
             };
-            let rims_m_s = [rim_m_s(0), rim_m_s(1)];
+            let rims_m_s = [rim_of(0), rim_of(1)];
             let forces = self.deflect(state, &contacts, rims_m_s, step_s);
             let [forward_m_s, left_m_s] = state.speed_m_s;
             let turn = state.turn_rad_s;
