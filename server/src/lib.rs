@@ -151,15 +151,7 @@ impl Server {
             audit: config.audit,
         });
         remember(&app, &config.site).await?;
-        let schedule = config.backup.map(|settings| backups::Schedule {
-            config: settings,
-            database: config.database.clone(),
-            authority: config
-                .robots
-                .as_ref()
-                .map(|robots| robots.authority.clone()),
-            reserve_bytes: config.storage.disk_free_min_bytes(),
-        });
+        let schedule = backup_schedule(&config);
         let sender = Sender::new(app.webhook_rules().clone(), resolver)?;
         let listener = http::serve::listen(config.http)
             .with_context(|| format!("cannot listen for HTTP on {}", config.http))?;
@@ -199,22 +191,10 @@ impl Server {
         };
         let serving = http::serve::run(serving, app.clone(), supervisor.clone(), stop());
         supervisor.spawn_vital("http", serving);
-        let mut metrics_address = None;
-        if let Some(address) = config.metrics {
-            let listener = http::serve::listen(address)
-                .with_context(|| format!("cannot listen for metrics on {address}"))?;
-            let address = listener.local_addr()?;
-            metrics_address = Some(address);
-            let serving = Serving {
-                listener,
-                router: http::metrics_router(app.clone()),
-                tls: None,
-                proxies: Arc::default(),
-            };
-            let serving = http::serve::run(serving, app.clone(), supervisor.clone(), stop());
-            supervisor.spawn_vital("metrics", serving);
-            info!("metrics on http://{address}/metrics");
-        }
+        let metrics_address = config
+            .metrics
+            .map(|address| serve_metrics(address, &app, &supervisor))
+            .transpose()?;
         info!("REST API on {scheme}://{http_address}, described at {scheme}://{http_address}/docs");
         if app.admin_count().await? == 0 {
             warn!("nobody can sign in yet: make the first admin's token with `tread-server init`");
@@ -229,6 +209,44 @@ impl Server {
             lock,
         })
     }
+}
+
+/// Serves the metrics; returns the address, with the port that was taken.
+///
+/// # Errors
+/// The address cannot be taken.
+fn serve_metrics(
+    address: SocketAddr,
+    app: &App,
+    supervisor: &Supervisor,
+) -> anyhow::Result<SocketAddr> {
+    let listener = http::serve::listen(address)
+        .with_context(|| format!("cannot listen for metrics on {address}"))?;
+    let address = listener.local_addr()?;
+    let serving = Serving {
+        listener,
+        router: http::metrics_router(app.clone()),
+        tls: None,
+        proxies: Arc::default(),
+    };
+    let stop = supervisor.stop_token();
+    let serving = http::serve::run(serving, app.clone(), supervisor.clone(), stop);
+    supervisor.spawn_vital("metrics", serving);
+    info!("metrics on http://{address}/metrics");
+    Ok(address)
+}
+
+/// Returns the schedule of the server's own backups; `None` if it makes none.
+fn backup_schedule(config: &Config) -> Option<backups::Schedule> {
+    Some(backups::Schedule {
+        config: config.backup.clone()?,
+        database: config.database.clone(),
+        authority: config
+            .robots
+            .as_ref()
+            .map(|robots| robots.authority.clone()),
+        reserve_bytes: config.storage.disk_free_min_bytes(),
+    })
 }
 
 /// Starts the tasks that maintain the database and keep the state in memory consistent with it.

@@ -32,8 +32,11 @@ pub fn read_files(folder: &Path) -> Result<Vec<(String, Vec<u8>)>, AuthorityErro
     Err(unreadable(cause))
 }
 
+/// Files of an authority: names and contents.
+type Files = Vec<(String, Vec<u8>)>;
+
 /// Returns the files in the order of their names; `None` if one was renamed meanwhile.
-fn read_once(folder: &Path) -> io::Result<Option<Vec<(String, Vec<u8>)>>> {
+fn read_once(folder: &Path) -> io::Result<Option<Files>> {
     let mut files = Vec::new();
     for entry in fs::read_dir(folder)? {
         let entry = entry?;
@@ -75,7 +78,8 @@ pub fn write_files(folder: &Path, files: &[(String, Vec<u8>)]) -> Result<(), Aut
     }
     for (name, content) in files {
         let path = folder.join(name);
-        let permissions = if name.ends_with(".pem") { 0o644 } else { 0o600 };
+        let is_certificate = path.extension().is_some_and(|extension| extension == "pem");
+        let permissions = if is_certificate { 0o644 } else { 0o600 };
         let mut options = OpenOptions::new();
         let opened = options
             .write(true)

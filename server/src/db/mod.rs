@@ -363,7 +363,7 @@ impl Db {
             .await
             .map_err(failed)?;
         if let Ok(found) = found {
-            refuse_newer(path, found)?;
+            refuse_newer(path, &found)?;
         }
         writer
             .with_first(async |connection| schema::migrator().run(connection).await)
@@ -574,7 +574,7 @@ impl Db {
 ///
 /// # Errors
 /// [`OpenError::Newer`].
-pub fn refuse_newer(path: &Path, found: schema::FileSchema) -> Result<(), OpenError> {
+pub fn refuse_newer(path: &Path, found: &schema::FileSchema) -> Result<(), OpenError> {
     let known = schema::known();
     let Some(newer) = found.schema.filter(|schema| *schema > known) else {
         return Ok(());

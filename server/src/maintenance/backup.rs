@@ -76,12 +76,11 @@ pub(crate) async fn run(args: BackupArgs) -> anyhow::Result<()> {
             made.bytes,
             rows.join(", ")
         );
-        if made
-            .manifest
-            .authority
-            .iter()
-            .any(|file| file.name.ends_with(".key"))
-        {
+        if made.manifest.authority.iter().any(|file| {
+            Path::new(&file.name)
+                .extension()
+                .is_some_and(|extension| extension == "key")
+        }) {
             eprintln!(
                 "it has the key of the fleet's authority: keep it where nobody else can read it"
             );

@@ -82,7 +82,7 @@ pub(crate) async fn run(args: MigrateArgs) -> anyhow::Result<Compared> {
         build::VERSION
     )?;
     let missing = schema::missing_after(found.schema);
-    if let Err(newer) = db::refuse_newer(&path, found) {
+    if let Err(newer) = db::refuse_newer(&path, &found) {
         eprintln!("error: {newer}");
         return Ok(Compared::Newer);
     }

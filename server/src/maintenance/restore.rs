@@ -417,7 +417,11 @@ fn tell(
     {
         let rights = token.role.map(|role| role.to_string());
         let rights = rights.unwrap_or_else(|| {
-            let rights: Vec<&str> = token.rights.iter().map(|right| right.as_str()).collect();
+            let rights: Vec<&str> = token
+                .rights
+                .iter()
+                .map(tread_api::rights::Right::as_str)
+                .collect();
             rights.join(",")
         });
         let Token {

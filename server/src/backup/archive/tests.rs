@@ -70,8 +70,8 @@ fn an_archive_gives_back_what_was_put_in_and_its_owner_alone_can_read_it() {
         ("ca.key".to_owned(), b"secret".to_vec())
     );
     assert_eq!(manifest(&made.archive, None).unwrap(), found.manifest);
-    let mode = fs::metadata(&made.archive).unwrap().permissions().mode();
-    assert_eq!(mode & 0o777, 0o600);
+    let permissions = fs::metadata(&made.archive).unwrap().permissions();
+    assert_eq!(permissions.mode() & 0o777, 0o600);
     assert!(!partial_name(&made.archive).exists());
 }
 
