@@ -117,6 +117,7 @@ impl Server {
         config.check_credentials()?;
         let names = config.names();
         let proxies = TrustedProxies::new(config.web.trusted_proxies.clone());
+        let schedule = backup_schedule(&config);
         let tls = config.tls.map(Tls::load).transpose()?.map(Arc::new);
         let lock = DatabaseLock::take(&config.database)?;
         // Only with the lock: this completes an interrupted rotation of the authority.
@@ -151,7 +152,6 @@ impl Server {
             audit: config.audit,
         });
         remember(&app, &config.site).await?;
-        let schedule = backup_schedule(&config);
         let sender = Sender::new(app.webhook_rules().clone(), resolver)?;
         let listener = http::serve::listen(config.http)
             .with_context(|| format!("cannot listen for HTTP on {}", config.http))?;

@@ -1,7 +1,7 @@
 //! `tread-server backup`: makes one backup, beside a running server or without one.
 
 use std::io::{self, IsTerminal as _, Write as _};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
 use anyhow::{Context as _, ensure};

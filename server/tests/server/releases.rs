@@ -296,7 +296,7 @@ async fn takes(messages: &Value) {
     let welcome: Welcome = ask(&session, keys::hello(&site, &robot), bytes(hello))
         .await
         .unwrap();
-    assert_eq!(welcome.site.grid.cell_m, 1.0);
+    assert!((welcome.site.grid.cell_m - 1.0).abs() < f64::EPSILON);
     let batches = messages["batches"].as_array().unwrap();
     let (mut segments, mut committed) = (0, 0);
     for batch in batches {
@@ -332,7 +332,7 @@ async fn takes(messages: &Value) {
     })
     .await;
     let counters = yard.counters().await;
-    let malformed = serde_json::to_value(&counters).unwrap()["refused_malformed"].clone();
+    let malformed = serde_json::to_value(counters).unwrap()["refused_malformed"].clone();
     assert_eq!(malformed, json!(0));
     drop(token);
     yard.server.stop().await.unwrap();
