@@ -5,7 +5,9 @@ use crate::ids::AlertCode;
 
 /// Codes that servers and agents of this version raise, in alphabetical order. Those about the
 /// messages of a robot's base are named by [`BASE_PREFIX`] alone, but for the ones listed here.
-pub const ALERT_KINDS: [&str; 37] = [
+pub const ALERT_KINDS: [&str; 40] = [
+    "backup-failed",
+    "backup-old",
     "base-clock",
     "base-restarted",
     "base-silent",
@@ -32,6 +34,7 @@ pub const ALERT_KINDS: [&str; 37] = [
     "revoked-robot",
     "robot-lost",
     "robot-waiting",
+    "robots-await-release",
     "sensor-frozen",
     "sensor-inconsistent",
     "server-restarted",
