@@ -45,6 +45,7 @@ impl ServerWithRobots {
                 certificate_s: 3_600,
             }),
             audit: tread_server::config::AuditConfig::default(),
+            tracing: tread_server::config::TracingConfig::default(),
             web: WebConfig::default(),
             oidc: None,
             webhooks: tread_server::config::webhooks::WebhooksConfig::default(),

@@ -31,6 +31,7 @@ use crate::recording::RecordingConfig;
 use crate::sim::faults::Fault;
 use crate::sim::scenario::{BUILT_IN_NAME, Scenario, ScenarioError};
 use crate::sim::trace::Trace;
+use tread_telemetry::{TelemetryError, TracingConfig};
 
 /// Default endpoint of the server.
 pub const SERVER_DEFAULT: &str = "tcp/127.0.0.1:7447";
@@ -43,7 +44,10 @@ pub const PUBLISH_HZ_RANGE: std::ops::RangeInclusive<f64> = 0.1..=50.0;
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     /// The file could not be read.
-    #[error("the configuration `{file}` cannot be read")]
+    #[error(
+        "the configuration `{file}` cannot be read: it must exist, and the user that the agent runs \
+         as must be able to read it"
+    )]
     Unreadable {
         /// The file.
         file: String,
@@ -59,6 +63,9 @@ pub enum ConfigError {
         /// Line, column, key and what is wrong with it.
         problem: String,
     },
+    /// `[tracing]` is invalid.
+    #[error(transparent)]
+    Tracing(#[from] TelemetryError),
     /// A value without a default is missing.
     #[error("`{key}` is missing: give it in the configuration or as `--{flag}`")]
     Missing {
@@ -265,6 +272,8 @@ pub struct AgentConfig {
     pub recording: Option<RecordingConfig>,
     /// Estimator's prior of the robot's and the tyres' parameters.
     pub prior: EstimatorPrior,
+    /// Where traces of missions are sent.
+    pub tracing: TracingConfig,
 }
 
 impl AgentConfig {
@@ -432,8 +441,11 @@ fn assemble(
         }
     };
     let recording = recording::checked(file.recording.unwrap_or_default(), &data_dir)?;
+    let tracing = file.tracing.unwrap_or_default();
+    tracing.check()?;
     Ok(AgentConfig {
         recording,
+        tracing,
         prior: estimation::checked(
             file.estimation.unwrap_or_default(),
             estimation::default_of(&drive),

@@ -2,6 +2,7 @@
 
 pub mod alerts;
 mod allowance;
+pub mod certificate;
 pub mod check;
 pub mod checkpoints;
 pub mod enrolment;
@@ -31,12 +32,13 @@ pub mod stops;
 pub mod storage;
 pub mod teleop;
 pub mod terrains;
+mod traces;
 pub mod watched;
 pub mod webhooks;
 pub mod withdrawals;
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use tokio::sync::{Notify, Semaphore, SemaphorePermit};
@@ -118,6 +120,7 @@ struct Inner {
     watched: Watched,
     event_shares: Shares,
     webhooks: Webhooks,
+    telemetry: OnceLock<tread_telemetry::Telemetry>,
 }
 
 /// Dependencies of use cases.
@@ -199,6 +202,7 @@ impl App {
             watched: Watched::default(),
             event_shares: Shares::new(events::SHARES),
             webhooks: Webhooks::new(webhooks),
+            telemetry: OnceLock::new(),
         };
         Self {
             inner: Arc::new(inner),

@@ -2,6 +2,8 @@
 
 mod bad_input;
 mod chaos;
+#[cfg(test)]
+mod conditions;
 mod control;
 #[cfg(test)]
 mod drivers;
@@ -22,6 +24,8 @@ mod safety;
 mod scenario;
 #[cfg(test)]
 mod state_rate;
+#[cfg(test)]
+mod traces;
 #[cfg(test)]
 mod webhooks;
 
