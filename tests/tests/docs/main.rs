@@ -12,5 +12,6 @@ mod data;
 mod links;
 mod python;
 mod routes;
+mod runbook;
 mod schema;
 mod settings;
