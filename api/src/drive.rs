@@ -39,7 +39,7 @@ pub enum DriveRequest {
     /// Commands a velocity for a limited time. A newer command replaces an older one.
     Drive(Drive),
     /// Stops the robot and latches the stop. Needs no lease.
-    Stop(StopWords),
+    Stop(StopReason),
 }
 
 /// Object without fields.
@@ -74,7 +74,7 @@ pub struct Drive {
 /// Author and reason of a stop, for people.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
-pub struct StopWords {
+pub struct StopReason {
     /// Name of the person who stops, put behind the token's name; the token's name alone when
     /// absent.
     #[serde(

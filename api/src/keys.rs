@@ -41,11 +41,13 @@ pub enum Verb {
     Limit,
     /// Requests states at a higher rate for a limited time.
     StateRate,
+    /// Asks how missions ended.
+    Outcomes,
 }
 
 impl Verb {
     /// Every verb.
-    pub const ALL: [Self; 10] = [
+    pub const ALL: [Self; 11] = [
         Self::Offer,
         Self::Cancel,
         Self::Pause,
@@ -56,6 +58,7 @@ impl Verb {
         Self::Lease,
         Self::Limit,
         Self::StateRate,
+        Self::Outcomes,
     ];
 
     /// Returns the verb as a chunk of a key.
@@ -71,6 +74,7 @@ impl Verb {
             Self::Lease => "lease",
             Self::Limit => "limit",
             Self::StateRate => "state_rate",
+            Self::Outcomes => "outcomes",
         }
     }
 

@@ -5,7 +5,7 @@
 //! protocol.
 //!
 //! * REST bodies: [`site`], [`terrain`], [`robot`], [`trajectory`], [`mission`], [`friction`],
-//!   [`safety`], [`stop`], [`drive`], [`event`], [`identity`], [`webhook`], [`page`], [`problem`].
+//!   [`safety`], [`stop`], [`drive`], [`event`], [`identity`], [`webhook`], [`alert_kind`], [`page`], [`problem`].
 //! * Compact binary form of the friction map: [`tile`].
 //! * zenoh payloads: [`wire`], with the key expressions in [`keys`]; the TLS tunnel below them:
 //!   [`tunnel`].
@@ -15,6 +15,7 @@
 //! value is `null`, never a default. Integers stay below 2⁵³.
 
 pub mod access;
+pub mod alert_kind;
 pub mod audit;
 pub mod drive;
 pub mod enrolment;
@@ -27,6 +28,7 @@ pub mod keys;
 pub mod mission;
 pub mod page;
 pub mod problem;
+pub mod release;
 pub mod rights;
 pub mod robot;
 pub mod safety;

@@ -319,7 +319,8 @@ pub struct ThetaSample {
     /// Measured θ; `null` where it was unknown.
     pub theta_measured: Option<f64>,
     /// Standard deviation of measured θ; `null` where it was unknown.
-    pub theta_sd: Option<f64>,
+    #[serde(alias = "theta_sd")]
+    pub theta_std_dev: Option<f64>,
 }
 
 /// Path that a robot drove during a mission, as it measured it.

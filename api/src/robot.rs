@@ -311,6 +311,10 @@ pub struct Robot {
     pub tags: Vec<Tag>,
     /// Time when it was retired; `null` if it is not retired.
     pub retired_at: Option<Timestamp>,
+    /// Time since which no mission is sent to it, because the server was restored from a backup and
+    /// does not know what happened since; an operator releases it. `null` if that is not so.
+    #[serde(default)]
+    pub awaits_release_since: Option<Timestamp>,
     /// Site of the robot.
     pub site: SiteId,
     /// Model and tyres as its agent declared them last.

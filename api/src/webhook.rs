@@ -38,7 +38,7 @@ pub struct WebhookSettings {
     pub name: String,
     /// URL to which alerts are sent, `https` unless the server's configuration allows `http`.
     pub url: String,
-    /// Kinds of alerts that are sent, at most 100; all when absent.
+    /// Kinds of alerts that are sent, at most 100; all when absent. A kind of no alert is refused.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub kinds: Option<Vec<AlertCode>>,
     /// Sites whose alerts are sent, at most 100; all when absent. Alerts about the server itself
@@ -232,8 +232,8 @@ pub struct AlertNotice {
     pub opened_at: Option<Timestamp>,
     /// Time when its cause ended; `null` before that.
     pub ended_at: Option<Timestamp>,
-    /// Address of the alert: absolute if the server's configuration has `webhooks.public_url`, else
-    /// a path; `null` for a test.
+    /// Address at which the page shows the alert: absolute if the server's configuration has
+    /// `webhooks.public_url`, else a path; `null` for a test.
     pub link: Option<String>,
 }
 

@@ -16,7 +16,9 @@ use std::ffi::OsString;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use clap::{ArgMatches, Args, CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
+use clap::{
+    ArgMatches, Args, CommandFactory as _, FromArgMatches as _, Parser, Subcommand, ValueEnum,
+};
 use clap_complete::Shell;
 use tread_api::ids::{RobotId, SiteId};
 use tread_server::config::SITE_DEFAULT;
@@ -24,8 +26,8 @@ use tread_server::config::SITE_DEFAULT;
 use self::identity::Showing;
 pub(crate) use self::identity::{
     AuditAction, AuditArguments, AuthorityAction, AuthorityArguments, JoinTokenAction,
-    JoinTokenArguments, Noted, PlainArguments, RobotArguments, RobotsAction, SessionsAction,
-    SessionsArguments, TokensAction, TokensArguments,
+    JoinTokenArguments, Noted, PlainArguments, ReleaseArguments, RobotArguments, RobotsAction,
+    SessionsAction, SessionsArguments, TokensAction, TokensArguments,
 };
 pub(crate) use self::map::{
     FrictionAction, FrictionArguments, HistoryArguments, SitesAction, SitesArguments,
@@ -46,16 +48,16 @@ pub(crate) use self::webhooks::{NamedWebhook, WebhooksAction, WebhooksArguments}
 use crate::exit::Exit;
 use crate::output::{failure, note};
 
-/// Where a server answers, unless configured otherwise.
+/// Default address of the server.
 pub(crate) const SERVER_DEFAULT: &str = "http://127.0.0.1:8420";
-/// Most robots of a demo; each is a process of its own.
+/// Maximum number of robots of a demo; each is a separate process.
 const DEMO_ROBOTS_MAX: i64 = 50;
 
 /// Runs fleets of skid-steered robots and maps the friction of the ground while they drive.
 ///
-/// `--server`, `--site`, `--token-file`, `--ca` and `--json` may stand before or behind the command.
+/// Give `--server`, `--site`, `--token-file`, `--ca` and `--json` before or after the command.
 #[derive(Debug, Parser)]
-#[command(name = "tread", version)]
+#[command(name = "tread", version = tread_api::release::long_version())]
 pub(crate) struct Arguments {
     #[command(subcommand)]
     pub(crate) command: Command,
@@ -111,12 +113,18 @@ pub(crate) enum Command {
     Completions {
         /// Shell to print the script for
         shell: Shell,
+        /// Program to print the script for
+        #[arg(long, value_enum, default_value_t)]
+        program: Program,
     },
     /// Write the manual as man pages, one for each command
     Man {
         /// Folder to write them to; created if it does not exist
         #[arg(long, value_name = "DIR")]
         dir: PathBuf,
+        /// Program to write the manual of
+        #[arg(long, value_enum, default_value_t)]
+        program: Program,
     },
     /// Run the server; used by `tread demo`
     #[command(hide = true, disable_help_flag = true)]
@@ -124,6 +132,18 @@ pub(crate) enum Command {
     /// Run an agent; used by `tread demo`
     #[command(hide = true, disable_help_flag = true)]
     Agent(PassedOn),
+}
+
+/// A program whose command line is documented.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
+pub(crate) enum Program {
+    /// This one
+    #[default]
+    Tread,
+    /// The server
+    TreadServer,
+    /// The agent on a robot
+    TreadAgent,
 }
 
 /// Arguments that are passed on to another program.

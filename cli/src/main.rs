@@ -40,8 +40,12 @@ fn main() -> ExitCode {
             let output = Output::new(command.connection().json);
             finish(output, commands::run(command, output))
         }
-        Command::Completions { shell } => ended(Output::new(false), manual::completions(shell)),
-        Command::Man { dir } => ended(Output::new(false), manual::man_pages(&dir)),
+        Command::Completions { shell, program } => {
+            ended(Output::new(false), manual::completions(shell, program))
+        }
+        Command::Man { dir, program } => {
+            ended(Output::new(false), manual::man_pages(&dir, program))
+        }
     }
 }
 

@@ -323,11 +323,6 @@ impl Governor {
         self.reference(&plan.sample(self.clock_s))
     }
 
-    /// Returns the reference `ahead_s` seconds from now if σ stays constant.
-    pub fn sample_ahead(&self, plan: &Plan, ahead_s: f64) -> ReferenceSample {
-        self.reference(&plan.sample(self.clock_s + self.rate * ahead_s))
-    }
-
     fn reference(&self, planned: &PlanSample) -> ReferenceSample {
         let speed_m_s = self.rate * planned.speed_m_s;
         let acceleration_m_s2 = self.rate * self.rate * planned.acceleration_m_s2

@@ -69,18 +69,16 @@ impl TwistLimits {
     pub fn step(&self, previous: Twist, target: Twist, slowing: Slowing, dt_s: f64) -> Twist {
         let limits = self.model.limits();
         let free = Twist {
-            linear_m_s: stepped(
-                previous.linear_m_s,
-                target.linear_m_s,
-                limits.linear_acceleration_max_m_s2 * dt_s,
-                slowing.linear_m_s2 * dt_s,
-            ),
-            angular_rad_s: stepped(
-                previous.angular_rad_s,
-                target.angular_rad_s,
-                self.model.angular_acceleration_max_rad_s2() * dt_s,
-                slowing.angular_rad_s2 * dt_s,
-            ),
+            linear_m_s: Step {
+                up_max: limits.linear_acceleration_max_m_s2 * dt_s,
+                down_max: slowing.linear_m_s2 * dt_s,
+            }
+            .towards(target.linear_m_s, previous.linear_m_s),
+            angular_rad_s: Step {
+                up_max: self.model.angular_acceleration_max_rad_s2() * dt_s,
+                down_max: slowing.angular_rad_s2 * dt_s,
+            }
+            .towards(target.angular_rad_s, previous.angular_rad_s),
         };
         let from = self.model.wheel_speeds_from_twist(previous);
         let to = self.model.wheel_speeds_from_twist(free);
@@ -124,27 +122,39 @@ impl TwistLimits {
     }
 }
 
-/// Moves `previous` towards `target`: its magnitude grows by at most `up` and falls by at most
-/// `down`. A change of sign first uses `down` to reach zero, then the rest of the step with `up`.
-fn stepped(previous: f64, target: f64, up: f64, down: f64) -> f64 {
-    if previous * target >= 0.0 {
-        let sign = if previous.abs() > 0.0 {
-            previous
-        } else {
-            target
-        };
-        let gap = target.abs() - previous.abs();
-        return if (-down..=up).contains(&gap) {
-            target
-        } else {
-            (previous.abs() + gap.clamp(-down, up)).copysign(sign)
-        };
+/// Largest change of a signed speed in one step, in the speed's unit.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Step {
+    /// Largest increase of the magnitude.
+    up_max: f64,
+    /// Largest decrease of the magnitude.
+    down_max: f64,
+}
+
+impl Step {
+    /// Returns `previous` moved towards `target`. A change of sign first uses `down_max` to reach
+    /// zero, then the rest of the step with `up_max`.
+    fn towards(self, target: f64, previous: f64) -> f64 {
+        let Self { up_max, down_max } = self;
+        if previous * target >= 0.0 {
+            let sign = if previous.abs() > 0.0 {
+                previous
+            } else {
+                target
+            };
+            let gap = target.abs() - previous.abs();
+            return if (-down_max..=up_max).contains(&gap) {
+                target
+            } else {
+                (previous.abs() + gap.clamp(-down_max, up_max)).copysign(sign)
+            };
+        }
+        if previous.abs() >= down_max {
+            return (previous.abs() - down_max).copysign(previous);
+        }
+        let left = 1.0 - previous.abs() / down_max;
+        target.abs().min(up_max * left).copysign(target)
     }
-    if previous.abs() >= down {
-        return (previous.abs() - down).copysign(previous);
-    }
-    let left = 1.0 - previous.abs() / down;
-    target.abs().min(up * left).copysign(target)
 }
 
 #[cfg(test)]

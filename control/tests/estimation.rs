@@ -73,6 +73,32 @@ fn intervals_hold_and_errors_are_a_few_percent() {
     }
 }
 
+#[test]
+fn an_identified_robot_computes_theta_and_radii_in_different_ticks() {
+    // Both in one tick would make it the longest one.
+    let mut robot = SimRobot::new(Pose::default(), 3.0, 1, true);
+    let (noise, prior) = (SensorNoise::default(), EstimatorPrior::default());
+    robot.estimator = Estimator::with_prior(robot.model, noise, prior);
+    let (mut of_theta, mut of_radii, mut of_both) = (0, 0, 0);
+    for tick in 0..3_000_u32 {
+        let twist = Twist {
+            linear_m_s: 0.6,
+            angular_rad_s: 0.2 * (0.005 * f64::from(tick)).sin(),
+        };
+        let before = robot.estimator.estimate();
+        robot.act(robot.model.wheel_speeds_from_twist(twist));
+        let now = robot.estimator.estimate();
+        let has_theta = now.theta != before.theta;
+        let has_radii = now.radius_difference != before.radius_difference;
+        of_theta += u32::from(has_theta);
+        of_radii += u32::from(has_radii);
+        of_both += u32::from(has_theta && has_radii);
+    }
+    assert!(of_theta > 20, "{of_theta}");
+    assert!(of_radii > 100, "{of_radii}");
+    assert_eq!(of_both, 0);
+}
+
 /// Bends that swing from side to side, with a period of 8 s.
 fn weave(robot: &mut SimRobot, duration_s: f64) {
     let mut time_s = 0.0_f64;

@@ -35,12 +35,14 @@ use crate::membership::{Membership, Renewal, ServerTrust};
 use crate::missions::memory::{Memory, MemoryError};
 use crate::online::Online;
 use crate::outbox::{Outbox, OutboxError};
+use crate::realtime::{RealtimeError, lock_memory};
 use crate::recorder::Recorder;
 use crate::recording::frame::notes;
 use crate::recording::{RecordWriter, RunHead};
 use crate::reporter::{Reporter, log_losses};
 use crate::safety::Safety;
 use crate::safety::latch_file::LatchFile;
+use crate::service_manager::{self, Teller};
 use crate::state_rate::PublishRate;
 use crate::supervisor::{PartEnded, Supervisor};
 
@@ -67,6 +69,9 @@ pub enum StartError {
     /// The mission memory could not be read.
     #[error(transparent)]
     Memory(#[from] MemoryError),
+    /// The operating system does not give the configured priority, or does not lock the memory.
+    #[error(transparent)]
+    Realtime(#[from] RealtimeError),
     /// A thread could not be started.
     #[error("no thread for the {part}")]
     Thread {
@@ -115,6 +120,7 @@ impl Agent {
         config: AgentConfig,
         clock: SharedClock,
     ) -> Result<RunningAgent, StartError> {
+        config.realtime.lock_memory.then(lock_memory).transpose()?;
         let model = control_model(&config.model)?;
         fleet::check_endpoint(&config.server)?;
         let base = Base::new(&config.drive, model, &clock)?;
@@ -160,9 +166,7 @@ impl Agent {
         let saving = supervisor
             .spawn_thread("recorder", move || recorder.run(&events))
             .map_err(no_thread("recorder"))?;
-        let mut threads = base
-            .spawn(core, &config, &supervisor, &shared, &clock)
-            .map_err(no_thread("control loop"))?;
+        let mut threads = base.spawn(core, &config, &supervisor, &shared, &clock)?;
         threads.push(saving);
         threads.extend(writing);
         let stop = || supervisor.stop_token();
@@ -346,6 +350,28 @@ impl RunningAgent {
     #[cfg(any(test, feature = "testing"))]
     pub fn has_connected(&self) -> bool {
         *self.is_connected.borrow()
+    }
+
+    /// Tells the service manager that started this process, if any, that the agent is ready once its
+    /// loop ticks, and from then on that the loop ticks, until the stop.
+    ///
+    /// # Errors
+    /// The thread for it cannot be started.
+    pub fn tell_service_manager(&mut self) -> Result<(), StartError> {
+        if !service_manager::is_there() {
+            return Ok(());
+        }
+        let teller = Teller {
+            identity: self.identity.clone(),
+            shared: Arc::clone(&self.shared),
+            clock: Arc::clone(&self.reporter.clock),
+            has_connected: self.is_connected.clone(),
+        };
+        let part = "service manager";
+        let telling = self.supervisor.spawn_thread(part, move || teller.run());
+        let no_thread = move |source| StartError::Thread { part, source };
+        self.threads.push(telling.map_err(no_thread)?);
+        Ok(())
     }
 
     /// Waits for the first part of the agent that ends unexpectedly, after which the agent must

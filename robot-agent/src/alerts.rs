@@ -14,7 +14,8 @@ use crate::control_loop::overrun::{Overrun, WINDOW_TICKS};
 use crate::control_loop::standing::{Shown, StandingReport};
 use crate::control_loop::surface::Comparison;
 use crate::drive::Battery;
-use crate::drive::ros2::notices::{ForeignCommands, Notice, Noticing};
+use crate::drive::ros2::notices::{ForeignCommands, Noticing};
+use crate::drive::ros2::refusal::Notice;
 use crate::drive::ros2::refusal::{Counts, Dropping};
 use crate::outbox::OutboxDamage;
 

@@ -1,6 +1,7 @@
 //! The robot's base behind the drive interface, and the threads around it.
 
 use std::sync::Arc;
+use std::sync::mpsc::sync_channel;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -17,6 +18,7 @@ use crate::drive::ros2::Ros2Drive;
 use crate::drive::ros2::bus::Bus;
 use crate::drive::ros2::refusal::Counts;
 use crate::drive::simulated::{SimMode, SimulatedDrive, SimulatedDriveError};
+use crate::realtime::raise_priority;
 use crate::safety::watchdog;
 use crate::supervisor::Supervisor;
 
@@ -69,7 +71,7 @@ impl Base {
     /// Starts the threads of the loop, its watchdog and the robot's bus.
     ///
     /// # Errors
-    /// The operating system's error if a thread cannot be started.
+    /// A thread cannot be started, or the loop may not have the configured priority.
     pub(crate) fn spawn(
         self,
         core: LoopCore,
@@ -77,23 +79,35 @@ impl Base {
         supervisor: &Supervisor,
         shared: &Arc<Shared>,
         clock: &SharedClock,
-    ) -> std::io::Result<Vec<JoinHandle<()>>> {
+    ) -> Result<Vec<JoinHandle<()>>, StartError> {
+        let no_thread = |part| move |source| StartError::Thread { part, source };
         let mut threads = Vec::new();
         if let Some(mut bus) = self.bus {
             bus.tell_of(shared, self.counts.unwrap_or_default(), &config.robot);
             // It ends when the loop drops its drive.
-            threads.push(supervisor.spawn_thread("robot's bus", move || bus.run())?);
+            let running = supervisor.spawn_thread("robot's bus", move || bus.run());
+            threads.push(running.map_err(no_thread("robot's bus"))?);
         }
         let (drive, period, loop_clock) = (self.drive, config.period(), Arc::clone(clock));
-        threads.push(supervisor.spawn_thread("control loop", move || {
-            control_loop::run(core, drive, &loop_clock, period);
-        })?);
+        let priority = config.realtime.priority;
+        let (raised, has_priority) = sync_channel(1);
+        let looping = supervisor.spawn_thread("control loop", move || {
+            let result = priority.map_or(Ok(()), raise_priority);
+            let may_run = result.is_ok();
+            // The starter waits for it.
+            let _ = raised.send(result);
+            if may_run {
+                control_loop::run(core, drive, &loop_clock, period);
+            }
+        });
+        threads.push(looping.map_err(no_thread("control loop"))?);
+        // Without an answer the thread has panicked, which the supervisor reports.
+        has_priority.recv().unwrap_or(Ok(()))?;
         let (shared, clock) = (Arc::clone(shared), Arc::clone(clock));
-        threads.push(
-            supervisor.spawn_thread("watchdog of the control loop", move || {
-                watchdog::run(&shared, &clock);
-            })?,
-        );
+        let watching = supervisor.spawn_thread("watchdog of the control loop", move || {
+            watchdog::run(&shared, &clock);
+        });
+        threads.push(watching.map_err(no_thread("watchdog of the control loop"))?);
         Ok(threads)
     }
 }

@@ -25,9 +25,11 @@ use tread_api::ids::{BootId, MissionId};
 use tread_api::keys::Verb;
 use tread_api::mission::PlanSummary;
 use tread_api::robot::RobotMode;
-use tread_api::wire::command::{Cancel, Offer, Pause, Resume};
+use tread_api::wire::command::{Cancel, OUTCOMES_MAX, Offer, Outcomes, Pause, Resume};
 use tread_api::wire::hello::SiteDefinition;
-use tread_api::wire::reply::{Answer, Command, CommandRefusal, CommandRefusalCode};
+use tread_api::wire::reply::{
+    Answer, Command, CommandRefusal, CommandRefusalCode, MissionOutcomes,
+};
 use tread_api::wire::safety::{AcquireLease, LeaseCommand, ReleaseLease};
 use tread_api::wire::{self, Refusal, WireError};
 use tread_control::geometry::Pose;
@@ -35,7 +37,7 @@ use tread_control::plan::Plan;
 use tread_control::robot::RobotModel;
 
 use crate::clock::SharedClock;
-use crate::control_loop::active::Hold;
+use crate::control_loop::channels::Hold;
 use crate::control_loop::channels::{GivenPlan, LoopCommand, Shared};
 use crate::control_loop::site_view::SiteView;
 use crate::fleet::{Commands, IncomingCommand};
@@ -108,7 +110,12 @@ impl Dispatcher {
                 let lane = match command.verb {
                     Verb::Offer => &to_planner,
                     Verb::Stop | Verb::Clear | Verb::Lease | Verb::Limit => &to_guard,
-                    Verb::Cancel | Verb::Pause | Verb::Resume | Verb::Site | Verb::StateRate => {
+                    Verb::Cancel
+                    | Verb::Pause
+                    | Verb::Resume
+                    | Verb::Site
+                    | Verb::StateRate
+                    | Verb::Outcomes => {
                         self.respond(command).await;
                         continue;
                     }
@@ -181,7 +188,20 @@ impl Dispatcher {
                 let rate = async |asked| self.publish_rate.request(asked);
                 self.answer(command, rate).await;
             }
+            Verb::Outcomes => {
+                let outcomes = async |asked| self.outcomes(&asked);
+                self.answer(command, outcomes).await;
+            }
         }
+    }
+
+    fn outcomes(&self, asked: &Outcomes) -> Result<MissionOutcomes, CommandRefusal> {
+        let count = asked.missions.len();
+        if count > OUTCOMES_MAX {
+            let detail = format!("{count} missions; at most {OUTCOMES_MAX} are possible");
+            return refused(CommandRefusalCode::TooMany, detail);
+        }
+        Ok(self.missions.slot().outcomes(&asked.missions))
     }
 
     /// Decodes a command, decides on it and answers.

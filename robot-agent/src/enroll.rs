@@ -20,14 +20,14 @@ pub(crate) struct EnrollArgs {
     /// Address of the server's REST API, such as <https://tread.example:8420>
     #[arg(long, value_name = "URL")]
     server: String,
-    /// File with the join token, `-` for standard input; else `TREAD_JOIN_TOKEN`. No flag takes
-    /// the token itself: everybody on a machine can read the command lines
+    /// File with the join token, `-` for standard input; if absent, `TREAD_JOIN_TOKEN`. No flag
+    /// takes the token itself, because every user of the machine can read command lines
     #[arg(long, value_name = "FILE")]
     token_file: Option<PathBuf>,
-    /// Certificate of the authority of the REST API, PEM, instead of the machine's
+    /// PEM file with the certificate of the REST API's authority, instead of those of the system
     #[arg(long, value_name = "FILE", conflicts_with = "ca_fingerprint")]
     ca: Option<PathBuf>,
-    /// SHA-256 of the REST API's own certificate, or of its authority's if it shows that too
+    /// SHA-256 of the REST API's own certificate, or of its authority's if the API sends that too
     #[arg(long, value_name = "SHA256")]
     ca_fingerprint: Option<Fingerprint>,
     /// Configuration file, for the robot's name and its folder
@@ -36,10 +36,10 @@ pub(crate) struct EnrollArgs {
     /// The robot; not needed if the token names it
     #[arg(long)]
     robot: Option<RobotId>,
-    /// The robot's folder, where certificate and key will be
+    /// The robot's folder, to which certificate and key are written
     #[arg(long)]
     data_dir: Option<PathBuf>,
-    /// The robots' port, such as `tls/tread.example:7447`, if it is not where the server says
+    /// The robots' port, such as `tls/tread.example:7447`, if it differs from the server's answer
     #[arg(long, value_name = "ENDPOINT")]
     endpoint: Option<String>,
 }

@@ -149,13 +149,14 @@ pub fn plan_options(asked: &trajectory::Trajectory) -> PlanOptions<'static> {
 
 #[cfg(test)]
 mod tests {
-    use tread_control::{path, plan};
+    use tread_api::friction;
+    use tread_control::{estimation, path, plan};
 
     use super::*;
 
     #[test]
     #[expect(clippy::float_cmp, reason = "the bounds are the same figures")]
-    fn the_planner_has_the_bounds_that_the_api_has() {
+    fn planner_and_estimator_have_the_figures_that_the_api_has() {
         assert_eq!(trajectory::WAYPOINTS_MAX, plan::WAYPOINTS_MAX);
         assert_eq!(
             trajectory::WAYPOINT_SPACING_MIN_M,
@@ -163,5 +164,6 @@ mod tests {
         );
         assert_eq!(trajectory::RADIUS_MIN_M, path::RADIUS_MIN_M);
         assert_eq!(wire::COORDINATE_MAX_M, plan::COORDINATE_MAX_M);
+        assert_eq!(friction::NORMAL_95, estimation::NORMAL_95);
     }
 }

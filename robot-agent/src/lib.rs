@@ -12,6 +12,7 @@
 //! * [`membership`]: enrolment and renewal of the robot's certificate.
 //! * `safety`: stops, limits and teleoperation.
 //! * `recording`: records of the loop's inputs and outputs, and their replay.
+//! * `realtime`: priority of the loop's thread; `service_manager`: messages to systemd.
 //! * `testing` runs the loop tick by tick, for tests and reports; no shipped program contains it.
 //! * Used by all: [`clock`], `supervisor`, [`geometry`] (conversions between wire and controller).
 //!
@@ -41,10 +42,12 @@ mod durable;
 mod enroll;
 mod knowledge;
 mod online;
+mod realtime;
 mod recorder;
 mod recording;
 mod reporter;
 mod safety;
+mod service_manager;
 mod state_rate;
 mod supervisor;
 
@@ -52,5 +55,6 @@ pub use agent::{Agent, RunningAgent};
 pub use config::AgentConfig;
 pub use control_loop::channels::Fault;
 pub use program::{command_line, run_from_args};
+pub use realtime::{PRIORITY_RANGE, RealtimeConfig, RealtimeError};
 pub use recording::{FILE_MIB_RANGE, FILES_RANGE, RecordingConfig};
 pub use supervisor::PartEnded;

@@ -17,9 +17,9 @@ use crate::enroll::{self, EnrollArgs};
 use crate::recording::report::{self, ReplayArgs};
 use crate::recording::salvage::{self, RecoverArgs};
 
-/// Drives one robot and measures its ground.
+/// Drives one robot and measures the friction of the ground.
 #[derive(Debug, Parser)]
-#[command(name = "tread-agent", version, args_conflicts_with_subcommands = true)]
+#[command(name = "tread-agent", version = tread_api::release::long_version(), args_conflicts_with_subcommands = true)]
 struct Words {
     #[command(subcommand)]
     action: Option<Action>,
@@ -29,13 +29,13 @@ struct Words {
 
 #[derive(Debug, Subcommand)]
 enum Action {
-    /// Join the fleet by a join token: get a certificate, and keep it in the robot's folder
+    /// Join the fleet with a join token: get a certificate and store it in the robot's folder
     Enroll(EnrollArgs),
-    /// Say what is wrong with the installation on a ROS 2 robot
+    /// Check the installation on a ROS 2 robot and print what is wrong
     Doctor(DoctorArgs),
-    /// Run controller and estimator on a record again, and say where they differ from it
+    /// Run controller and estimator on a record again and print the differences
     Replay(ReplayArgs),
-    /// Copy what is readable of a damaged or torn record into a whole one
+    /// Copy the readable part of a damaged or truncated record into a valid one
     Recover(RecoverArgs),
 }
 
@@ -47,7 +47,7 @@ pub fn command_line() -> clap::Command {
 /// Runs an agent until SIGTERM or ctrl-c stops it; the first argument is the
 /// program's name. Sets up logging, so it is for whole processes.
 ///
-/// The code is 0 after an orderly stop, 1 when the agent could not start or a part of it died,
+/// The code is 0 after an orderly stop, 1 when the agent could not start or a part of it failed,
 /// and 2 for wrong flags.
 pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
     // The first call counts; all install the same provider.
@@ -118,7 +118,8 @@ fn run(flags: &Flags) -> anyhow::Result<()> {
         .build()
         .context("no runtime")?;
     let ended = runtime.block_on(async {
-        let agent = Agent::start(config)?;
+        let mut agent = Agent::start(config)?;
+        agent.tell_service_manager()?;
         let ended = wait(&agent).await;
         agent.stop().await;
         ended

@@ -1,4 +1,7 @@
-//! What tests, benchmarks and reports send to a server. No program depends on it.
+//! What tests, benchmarks and reports send to a server, and the service manager that tests play. No
+//! program depends on it.
+
+pub mod service_manager;
 
 use tread_api::robot::{RobotLimits, RobotModel};
 

@@ -3,6 +3,8 @@
 //! An unknown key, a value out of range, or an address that other machines can reach without TLS
 //! prevents the start. The error names file, line and key.
 
+pub mod backup;
+pub(crate) mod credentials;
 pub mod oidc;
 pub mod webhooks;
 
@@ -14,6 +16,7 @@ use clap::{Args, ValueEnum};
 use serde::Deserialize;
 use tread_api::ids::{ConfigurationId, SiteId};
 
+use self::backup::BackupConfig;
 use self::oidc::{OidcConfig, OidcConfigError};
 use self::webhooks::WebhooksConfig;
 use crate::authority::is_port_name;
@@ -102,8 +105,10 @@ pub struct Config {
     pub robots: Option<RobotsConfig>,
     /// Sign-in of people at an OpenID provider; `None` allows tokens only.
     pub oidc: Option<OidcConfig>,
-    /// Where webhooks may go.
+    /// Networks to which webhooks may send.
     pub webhooks: WebhooksConfig,
+    /// Backups that the server makes by itself; `None` for none.
+    pub backup: Option<BackupConfig>,
 }
 
 /// `[robots]`: enrolment and authentication of robots by certificates.
@@ -328,6 +333,7 @@ struct File {
     oidc: Option<OidcConfig>,
     #[serde(default)]
     webhooks: WebhooksConfig,
+    backup: Option<BackupConfig>,
 }
 
 /// Error of reading the configuration.
@@ -342,7 +348,7 @@ pub enum ConfigError {
         #[source]
         cause: std::io::Error,
     },
-    /// The file is no valid TOML, or has an unknown key or a value of the wrong type.
+    /// The file is not valid TOML, or has an unknown key or a value of the wrong type.
     #[error("configuration file `{}`, line {line}: {message}", path.display())]
     Invalid {
         /// Path of the file.
@@ -375,6 +381,14 @@ pub enum ConfigError {
         /// Maximum number of entries.
         most: usize,
     },
+    /// The name of a credential is none.
+    #[error("`credential:{0}` names no credential: give the name of `LoadCredential=`, not a path")]
+    CredentialName(String),
+    /// The service manager has not passed a credential.
+    #[error(
+        "`credential:{0}` was not passed by the service manager: put it into /etc/credstore/{0}, with          `LoadCredential={0}` in the unit, or give the path of a file"
+    )]
+    NoCredential(String),
     /// An entry of `robots.names` is neither a host name nor an IP address.
     #[error("`robots.names` has `{0}`, which is neither a host name nor an address")]
     PortName(String),
@@ -405,7 +419,7 @@ impl Config {
             .transpose()?
             .unwrap_or_default();
         let builtin = "the built-in value parses";
-        let config = Self {
+        let mut config = Self {
             http: args
                 .http
                 .or(file.http)
@@ -435,7 +449,9 @@ impl Config {
             robots: file.robots,
             oidc: file.oidc,
             webhooks: file.webhooks,
+            backup: file.backup,
         };
+        config.resolve_credentials(credentials::folder().as_deref())?;
         config.check()?;
         Ok(config)
     }
@@ -475,6 +491,9 @@ impl Config {
         self.retention.check()?;
         self.storage.check()?;
         self.webhooks.check()?;
+        if let Some(backup) = &self.backup {
+            backup.check()?;
+        }
         check_friction(self.friction)
     }
 }

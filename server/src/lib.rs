@@ -9,6 +9,8 @@
 
 pub mod app;
 pub mod authority;
+pub mod backup;
+pub mod build;
 pub mod clock;
 pub mod config;
 pub mod connections;
@@ -17,13 +19,17 @@ pub mod db;
 pub mod fleet;
 pub mod formats;
 pub mod friction;
+mod health;
 pub mod http;
 pub mod identity;
 mod init;
+pub mod liveness;
 mod logging;
+mod maintenance;
 pub mod metrics;
 pub mod oidc;
 mod rate_limit;
+mod service_manager;
 pub mod supervisor;
 pub mod webhooks;
 
@@ -45,8 +51,10 @@ use tread_api::startup::give_zenoh_threads;
 
 use self::app::enrolment::EnrolmentService;
 use self::app::identity::audit;
+use self::app::identity::people::People;
 use self::app::{
-    App, Dependencies, checkpoints, events, ingest, memory, merging, reconciler, retention, storage,
+    App, Dependencies, backups, checkpoints, events, ingest, memory, merging, reconciler,
+    retention, storage,
 };
 use self::authority::Authorities;
 use self::clock::Clock;
@@ -72,6 +80,7 @@ pub struct Server;
 #[derive(Debug)]
 pub struct RunningServer {
     http_address: SocketAddr,
+    scheme: &'static str,
     metrics_address: Option<SocketAddr>,
     app: App,
     fleet: Fleet,
@@ -101,12 +110,14 @@ impl Server {
     /// # Errors
     /// As [`Server::start`].
     pub async fn start_with(
-        config: Config,
+        mut config: Config,
         clock: Clock,
         resolver: Arc<dyn Resolver>,
     ) -> anyhow::Result<RunningServer> {
+        config.check_credentials()?;
         let names = config.names();
         let proxies = TrustedProxies::new(config.web.trusted_proxies.clone());
+        let schedule = backup_schedule(&config);
         let tls = config.tls.map(Tls::load).transpose()?.map(Arc::new);
         let lock = DatabaseLock::take(&config.database)?;
         // Only with the lock: this completes an interrupted rotation of the authority.
@@ -121,6 +132,11 @@ impl Server {
             lifetime: SignedDuration::from_secs(robots.certificate_s.into()),
             port: fleet.address().port(),
         };
+        let people = config
+            .oidc
+            .as_ref()
+            .map(|oidc| People::new(oidc, clock.clone()))
+            .transpose()?;
         let app = App::new(Dependencies {
             db,
             clock,
@@ -132,11 +148,9 @@ impl Server {
                 .zip(config.robots.as_ref())
                 .map(|(security, robots)| enrolment_service(security, robots)),
             webhooks: config.webhooks,
+            people,
+            audit: config.audit,
         });
-        app.log_audit(config.audit.log);
-        if let Some(oidc) = &config.oidc {
-            app.admit_people(oidc)?;
-        }
         remember(&app, &config.site).await?;
         let sender = Sender::new(app.webhook_rules().clone(), resolver)?;
         let listener = http::serve::listen(config.http)
@@ -159,11 +173,14 @@ impl Server {
         supervisor.spawn_vital("tokens", app::identity::run(app.clone(), stop()));
         let finding = app::identity::people::run(app.clone(), stop());
         supervisor.spawn_vital("provider", finding);
+        let backing_up = backups::run(app.clone(), schedule, stop());
+        supervisor.spawn_vital("backups", backing_up);
         let sending = app::webhooks::delivery::run(app.clone(), sender, stop());
         supervisor.spawn_vital("webhooks", sending);
         let router = http::router(app.clone(), names);
         if let Some(tls) = &tls {
-            supervisor.spawn_vital("certificate", http::tls::watch(Arc::clone(tls), stop()));
+            supervisor
+                .spawn_vital_unwatched("certificate", http::tls::watch(Arc::clone(tls), stop()));
         }
         let scheme = if tls.is_some() { "https" } else { "http" };
         let serving = Serving {
@@ -174,28 +191,17 @@ impl Server {
         };
         let serving = http::serve::run(serving, app.clone(), supervisor.clone(), stop());
         supervisor.spawn_vital("http", serving);
-        let mut metrics_address = None;
-        if let Some(address) = config.metrics {
-            let listener = http::serve::listen(address)
-                .with_context(|| format!("cannot listen for metrics on {address}"))?;
-            let address = listener.local_addr()?;
-            metrics_address = Some(address);
-            let serving = Serving {
-                listener,
-                router: http::metrics_router(app.clone()),
-                tls: None,
-                proxies: Arc::default(),
-            };
-            let serving = http::serve::run(serving, app.clone(), supervisor.clone(), stop());
-            supervisor.spawn_vital("metrics", serving);
-            info!("metrics on http://{address}/metrics");
-        }
+        let metrics_address = config
+            .metrics
+            .map(|address| serve_metrics(address, &app, &supervisor))
+            .transpose()?;
         info!("REST API on {scheme}://{http_address}, described at {scheme}://{http_address}/docs");
         if app.admin_count().await? == 0 {
             warn!("nobody can sign in yet: make the first admin's token with `tread-server init`");
         }
         Ok(RunningServer {
             http_address,
+            scheme,
             metrics_address,
             app,
             fleet,
@@ -203,6 +209,44 @@ impl Server {
             lock,
         })
     }
+}
+
+/// Serves the metrics; returns the address, with the port that was taken.
+///
+/// # Errors
+/// The address cannot be taken.
+fn serve_metrics(
+    address: SocketAddr,
+    app: &App,
+    supervisor: &Supervisor,
+) -> anyhow::Result<SocketAddr> {
+    let listener = http::serve::listen(address)
+        .with_context(|| format!("cannot listen for metrics on {address}"))?;
+    let address = listener.local_addr()?;
+    let serving = Serving {
+        listener,
+        router: http::metrics_router(app.clone()),
+        tls: None,
+        proxies: Arc::default(),
+    };
+    let stop = supervisor.stop_token();
+    let serving = http::serve::run(serving, app.clone(), supervisor.clone(), stop);
+    supervisor.spawn_vital("metrics", serving);
+    info!("metrics on http://{address}/metrics");
+    Ok(address)
+}
+
+/// Returns the schedule of the server's own backups; `None` if it makes none.
+fn backup_schedule(config: &Config) -> Option<backups::Schedule> {
+    Some(backups::Schedule {
+        config: config.backup.clone()?,
+        database: config.database.clone(),
+        authority: config
+            .robots
+            .as_ref()
+            .map(|robots| robots.authority.clone()),
+        reserve_bytes: config.storage.disk_free_min_bytes(),
+    })
 }
 
 /// Starts the tasks that maintain the database and keep the state in memory consistent with it.
@@ -224,6 +268,8 @@ async fn remember(app: &App, site: &SiteId) -> anyhow::Result<()> {
         app.log_failure("continue the time of the database", &error);
     }
     app.ensure_site(site).await?;
+    app.note_version().await?;
+    app.know_restoration().await?;
     app.know_robots().await?;
     if !app.presences().known().is_empty() {
         app.note_restart();
@@ -266,6 +312,18 @@ impl RunningServer {
         &self.app
     }
 
+    /// Tells the service manager that started this process, if any, that the server is ready, and
+    /// from then on that it lives, until the stop.
+    fn tell_service_manager(&self) {
+        if service_manager::is_there() {
+            let address = format!("{}://{}", self.scheme, self.http_address);
+            let (supervisor, app) = (&self.supervisor, self.app.clone());
+            let (liveness, stop) = (supervisor.liveness(), supervisor.stop_token());
+            let telling = service_manager::run(app, address, liveness, stop);
+            supervisor.spawn_vital("service manager", telling);
+        }
+    }
+
     /// Waits until a vital task fails or the server is stopped.
     pub async fn failed(&self) {
         self.supervisor.stopping().await;
@@ -288,7 +346,7 @@ impl RunningServer {
 
 /// Tread's server: missions to robots, friction from robots, one REST API.
 #[derive(Debug, clap::Parser)]
-#[command(name = "tread-server", version, args_conflicts_with_subcommands = true)]
+#[command(name = "tread-server", version = build::long_version(), args_conflicts_with_subcommands = true)]
 struct Command {
     #[command(subcommand)]
     action: Option<Action>,
@@ -298,11 +356,19 @@ struct Command {
 
 #[derive(Debug, clap::Subcommand)]
 enum Action {
+    /// Exit with 0 if the server on this machine answers, for health checks of containers
+    Health(health::HealthArgs),
     /// Create the first admin's token of a server, and print it once
     Init(init::InitArgs),
     /// Accept the next certificate that each robot presents, for use after restoring a backup of
     /// the database
     ForgetCertificates(init::ForgetArgs),
+    /// Back the database and the fleet's authority up into one file, beside a running server
+    Backup(maintenance::backup::BackupArgs),
+    /// Restore a backup; no server may run on the database
+    Restore(maintenance::restore::RestoreArgs),
+    /// Show or apply the changes of the database's schema that this version needs
+    Migrate(maintenance::migrate::MigrateArgs),
 }
 
 /// Returns the definition of the command line, for documentation and tests.
@@ -324,8 +390,16 @@ pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode 
         }
     };
     let ended = match command.action {
+        Some(Action::Health(args)) => run_beside_server(health::run(args)),
         Some(Action::Init(args)) => run_beside_server(init::run(args)),
         Some(Action::ForgetCertificates(args)) => run_beside_server(init::forget(args)),
+        Some(Action::Backup(args)) => run_beside_server(maintenance::backup::run(args)),
+        Some(Action::Restore(args)) => run_beside_server(maintenance::restore::run(args)),
+        Some(Action::Migrate(args)) => {
+            return maintenance::migrate::exit_code(run_beside_server(maintenance::migrate::run(
+                args,
+            )));
+        }
         None => run(&command.server),
     };
     match ended {
@@ -347,7 +421,7 @@ fn raise_file_limit() {
     }
 }
 
-fn run_beside_server(command: impl Future<Output = anyhow::Result<()>>) -> anyhow::Result<()> {
+fn run_beside_server<T>(command: impl Future<Output = anyhow::Result<T>>) -> anyhow::Result<T> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()?;
@@ -373,6 +447,7 @@ pub fn run(args: &ServerArgs) -> anyhow::Result<()> {
         let mut terminate = signal(SignalKind::terminate())?;
         let mut interrupt = signal(SignalKind::interrupt())?;
         let server = Server::start(config).await?;
+        server.tell_service_manager();
         tokio::select! {
             _ = terminate.recv() => info!("asked to stop"),
             _ = interrupt.recv() => info!("asked to stop"),

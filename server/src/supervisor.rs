@@ -16,6 +16,8 @@ use tokio_util::task::TaskTracker;
 use tokio_util::task::task_tracker::TaskTrackerToken;
 use tracing::{debug, error};
 
+use crate::liveness::Liveness;
+
 /// Maximum time for tasks to end after a stop was requested; later [`Supervisor::stop`] fails.
 pub const STOP_TIMEOUT: Duration = Duration::from_secs(10);
 
@@ -39,6 +41,7 @@ pub struct Supervisor {
     tracker: TaskTracker,
     stop: CancellationToken,
     failure: Arc<OnceLock<Stopped>>,
+    liveness: Liveness,
 }
 
 impl Supervisor {
@@ -52,8 +55,25 @@ impl Supervisor {
         self.stop.clone()
     }
 
-    /// Starts a vital task, whose end before the stop stops the server.
+    /// Returns the liveness of the vital tasks.
+    pub fn liveness(&self) -> Liveness {
+        self.liveness.clone()
+    }
+
+    /// Starts a vital task, whose end before the stop stops the server. It must not block its thread:
+    /// the watchdog of the service manager watches its polls.
     pub fn spawn_vital(&self, name: &'static str, task: impl Future<Output = ()> + Send + 'static) {
+        let task = self.liveness.watch(name, task);
+        self.spawn_vital_unwatched(name, task);
+    }
+
+    /// Starts a vital task that reads files in its polls, so that they may last as long as a disk
+    /// hangs. The watchdog does not watch it.
+    pub fn spawn_vital_unwatched(
+        &self,
+        name: &'static str,
+        task: impl Future<Output = ()> + Send + 'static,
+    ) {
         let (stop, failure) = (self.stop.clone(), Arc::clone(&self.failure));
         self.tracker.spawn(async move {
             let ended = AssertUnwindSafe(task).catch_unwind().await;

@@ -16,7 +16,7 @@ mod signature;
 
 pub use self::address::{InvalidUrl, Rules, is_public};
 pub use self::sender::{
-    ANSWER_MAX, Attempt, BODY_MAX, CONNECT_MAX, Letter, RESOLVE_MAX, Resolved, Resolver, Sender,
-    SenderError, SystemResolver,
+    ANSWER_MAX, Attempt, BODY_MAX, CONNECT_MAX, OutgoingDelivery, RESOLVE_MAX, Resolved, Resolver,
+    Sender, SenderError, SystemResolver,
 };
 pub use self::signature::signature;

@@ -37,6 +37,10 @@ pub struct Fleet {
     pub rest: Rest,
     token: String,
     node: PathBuf,
+    /// Executable of the server, if it is another one.
+    server_node: Option<PathBuf>,
+    /// A `tread-agent` that every agent runs, if it is another one.
+    agent_program: Option<PathBuf>,
     folder: TempDir,
     http: SocketAddr,
     zenoh: SocketAddr,
@@ -122,6 +126,8 @@ impl Fleet {
             rest: Rest::new(format!("http://{http}"), &token),
             token,
             node: node.to_owned(),
+            server_node: None,
+            agent_program: None,
             folder,
             http,
             zenoh,
@@ -295,6 +301,17 @@ impl Fleet {
         self.folder.path().join(name)
     }
 
+    /// The server's executable from its next start on.
+    pub fn upgrade_server_to(&mut self, node: &Path) {
+        self.server_node = Some(node.to_owned());
+    }
+
+    /// The program `tread-agent` of every agent that is started from now on, as one of another
+    /// release.
+    pub fn agents_run(&mut self, program: &Path) {
+        self.agent_program = Some(program.to_owned());
+    }
+
     /// Starts the server on the same ports and database as before, and waits until it is ready.
     ///
     /// # Panics
@@ -311,7 +328,9 @@ impl Fleet {
             arguments.push(format!("--config={}", config.display()));
         }
         let environment = &self.server_environment;
-        self.server = Some(self.start_process("server", &arguments, environment));
+        let node = self.server_node.as_ref().unwrap_or(&self.node);
+        let started = self.start_process("server", (node, &arguments), environment);
+        self.server = Some(started);
         let log = self.folder.path().join("server.log");
         let look = || async {
             let ready = self.rest.call(reqwest::Method::GET, "/readyz", None).await;
@@ -435,16 +454,20 @@ impl Fleet {
              [[robots]]\nid = \"{robot}\"\nx_m = {x_m:?}\ny_m = 0.0\nheading_rad = 0.0\nseed = 7\n"
         );
         std::fs::write(&scenario, text).expect("the temporary folder can be written");
-        let mut arguments = vec![
-            "agent".to_owned(),
+        let (node, first) = match &self.agent_program {
+            Some(program) => (program, None),
+            None => (&self.node, Some("agent".to_owned())),
+        };
+        let mut arguments: Vec<String> = first.into_iter().collect();
+        arguments.extend([
             format!("--site={SITE}"),
             format!("--robot={robot}"),
             format!("--server={endpoint}"),
             format!("--data-dir={}", self.robot_folder(name).display()),
             format!("--scenario={}", scenario.display()),
-        ];
+        ]);
         arguments.extend(self.agent_flags.iter().cloned());
-        let process = self.start_process(name.as_str(), &arguments, &[]);
+        let process = self.start_process(name.as_str(), (node, &arguments), &[]);
         self.agents.insert(name.clone(), process);
     }
 
@@ -468,12 +491,12 @@ impl Fleet {
     fn start_process(
         &self,
         name: &str,
-        arguments: &[String],
+        (node, arguments): (&Path, &[String]),
         environment: &[(String, String)],
     ) -> Process {
         let log = self.folder.path().join(format!("{name}.log"));
         let how = (log.as_path(), environment);
-        Process::start_with_environment(name, &self.node, arguments, how)
+        Process::start_with_environment(name, node, arguments, how)
             .expect("the node can be started")
     }
 }

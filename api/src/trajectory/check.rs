@@ -54,7 +54,7 @@ pub struct ExpectedMeasurement {
     pub wheel_torque: bool,
     /// Expected standard deviation of θ at the end, as a ratio of θ; `null` if the excitation does
     /// not suffice for a measurement.
-    pub relative_sd: Option<f64>,
+    pub relative_std_dev: Option<f64>,
     /// Driving time until the first measurement, seconds; `null` if there is none.
     pub first_after_s: Option<f64>,
 }

@@ -27,8 +27,6 @@ pub use splice::splice;
 
 /// Protocol identifier that both sides offer in the TLS handshake (ALPN).
 pub const ALPN: &[u8] = b"tread/2";
-/// Size of the length field in front of the credentials, bytes.
-pub const LENGTH_BYTES: usize = 2;
 /// Maximum size of credentials as JSON, bytes; longer ones are not sent.
 pub const CREDENTIALS_BYTES_MAX: usize = 1_024;
 /// Maximum number of bytes that the kernel holds unsent on a connection. It is small, because the
@@ -152,7 +150,7 @@ mod tests {
         fn credentials_are_read_back_as_they_were_sent(user in "[a-z0-9.-]{1,127}", password in "[0-9a-f]{64}", bits: u64) {
             let sent = RouterCredentials { user, password, session_prefix: SessionPrefix::new(bits) };
             let bytes = sent.to_bytes().unwrap();
-            let (length, json) = bytes.split_at(LENGTH_BYTES);
+            let (length, json) = bytes.split_at(size_of::<u16>());
             prop_assert_eq!(usize::from(length[0]) * 256 + usize::from(length[1]), json.len());
             let read: RouterCredentials = serde_json::from_slice(json).unwrap();
             prop_assert_eq!(read, sent);

@@ -7,7 +7,7 @@
 use serde::{Deserialize, Serialize};
 use uuid::Uuid;
 
-use super::reply::{Acknowledgement, Command, OfferReply};
+use super::reply::{Acknowledgement, Command, OfferReply, OutcomesReply};
 use crate::friction::{ROBOT_BIAS_RATIO, THETA_MAX};
 use crate::ids::{DERIVED_NAMESPACE, MissionId, PlanHash};
 use crate::keys::Verb;
@@ -149,6 +149,22 @@ pub struct Resume {
     pub mission: MissionId,
     /// Revision of the mission.
     pub revision: u32,
+}
+
+/// Maximum number of missions of one [`Outcomes`].
+pub const OUTCOMES_MAX: usize = 2_000;
+
+/// `cmd/outcomes`: asks how missions ended on the robot. A server asks that was restored from a
+/// backup, and does not know what happened since.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Outcomes {
+    /// Missions, at most [`OUTCOMES_MAX`].
+    pub missions: Vec<MissionId>,
+}
+
+impl Command for Outcomes {
+    const VERB: Verb = Verb::Outcomes;
+    type Reply = OutcomesReply;
 }
 
 impl Command for Offer {

@@ -2,12 +2,13 @@
 //!
 //! [`Command`] binds a payload to its verb and to the type of its reply, so that only possible
 //! replies are handled. On the wire an answer is `{"boot": …, "outcome": …}`; its outcome is
-//! `"done"`, `{"accepted": {…}}`, `{"leased": {…}}` or `{"refused": {…}}`.
+//! `"done"`, `{"accepted": {…}}`, `{"leased": {…}}`, `{"outcomes": {…}}` or `{"refused": {…}}`.
 
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
-use crate::ids::BootId;
+use super::ingest::MissionPhase;
+use crate::ids::{BootId, MissionId, PlanHash};
 use crate::keys::Verb;
 use crate::mission::PlanSummary;
 
@@ -53,6 +54,59 @@ pub enum LeaseReply {
     },
     /// The robot refused the lease.
     Refused(CommandRefusal),
+}
+
+/// A mission that has ended on the robot.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct EndedMission {
+    /// The mission.
+    pub mission: MissionId,
+    /// The phase in which it ended.
+    pub phase: MissionPhase,
+}
+
+/// A mission that the robot has accepted and that has not ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct AcceptedMission {
+    /// The mission.
+    pub mission: MissionId,
+    /// Its revision.
+    pub revision: u32,
+    /// Hash of its plan.
+    pub plan_hash: PlanHash,
+}
+
+/// What a robot remembers of missions.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct MissionOutcomes {
+    /// Those of the missions asked for that have ended.
+    pub ended: Vec<EndedMission>,
+    /// The mission that it has accepted, also if it was not asked for.
+    #[serde(default)]
+    pub active: Option<AcceptedMission>,
+    /// Newest mission that it has forgotten: of that one, and of older ones that are not in `ended`,
+    /// it does not know whether they ended here. Absent while it has forgotten none.
+    #[serde(default)]
+    pub forgotten: Option<MissionId>,
+}
+
+/// Reply to [`Outcomes`](super::command::Outcomes).
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum OutcomesReply {
+    /// What the robot remembers.
+    Outcomes(MissionOutcomes),
+    /// The robot refused to say.
+    Refused(CommandRefusal),
+}
+
+impl From<Result<MissionOutcomes, CommandRefusal>> for OutcomesReply {
+    fn from(decided: Result<MissionOutcomes, CommandRefusal>) -> Self {
+        match decided {
+            Ok(outcomes) => Self::Outcomes(outcomes),
+            Err(refusal) => Self::Refused(refusal),
+        }
+    }
 }
 
 /// Reply to every other command.
@@ -241,6 +295,20 @@ mod tests {
         says(OfferReply::from(Err(refusal.clone())), refused);
         says(LeaseReply::from(Ok(7)), r#"{"leased":{"epoch":7}}"#);
         says(LeaseReply::from(Err(refusal.clone())), refused);
+        says(
+            OutcomesReply::from(Ok(MissionOutcomes {
+                ended: vec![EndedMission {
+                    mission: MissionId::from_uuid(Uuid::from_u128(1)),
+                    phase: MissionPhase::Succeeded,
+                }],
+                active: None,
+                forgotten: None,
+            })),
+            &format!(
+                r#"{{"outcomes":{{"ended":[{{"mission":"{BOOT}","phase":"succeeded"}}],"active":null,"forgotten":null}}}}"#
+            ),
+        );
+        says(OutcomesReply::from(Err(refusal.clone())), refused);
         says(Acknowledgement::from(Ok(())), r#""done""#);
         says(Acknowledgement::from(Err(refusal)), refused);
     }

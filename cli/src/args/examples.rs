@@ -59,6 +59,10 @@ const EXAMPLES: &[(&str, &str)] = &[
         "  tread robots tag rover-1 north spare\n  tread robots tag rover-1 --none",
     ),
     ("robots retire", "  tread robots retire rover-1"),
+    (
+        "robots release",
+        "  tread robots release rover-1\n  tread robots release --all",
+    ),
     ("robots restore", "  tread robots restore rover-1"),
     ("robots revoke", "  tread robots revoke rover-1"),
     (

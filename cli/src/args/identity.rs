@@ -204,6 +204,8 @@ pub(crate) enum RobotsAction {
     Tag(TagArguments),
     /// Retire a robot: its missions are cancelled, it gets no new ones and is not listed
     Retire(RobotArguments),
+    /// Release robots after the server was restored from a backup: missions are sent to them again
+    Release(ReleaseArguments),
     /// Restore a retired robot
     Restore(RobotArguments),
     /// Revoke a robot's enrolment; it can join again only with a join token that names it
@@ -217,6 +219,7 @@ impl RobotsAction {
             Self::Enrolments(arguments) => &arguments.connection,
             Self::Rename(arguments) => &arguments.connection,
             Self::Tag(arguments) => &arguments.connection,
+            Self::Release(arguments) => &arguments.connection,
             Self::Retire(arguments) | Self::Restore(arguments) | Self::Revoke(arguments) => {
                 &arguments.connection
             }
@@ -274,6 +277,18 @@ pub(crate) struct TagArguments {
     /// Remove all tags
     #[arg(long, conflicts_with = "tags")]
     pub(crate) none: bool,
+    #[command(flatten)]
+    pub(crate) connection: Connection,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct ReleaseArguments {
+    /// Robots to release
+    #[arg(required_unless_present = "all", conflicts_with = "all")]
+    pub(crate) robots: Vec<RobotId>,
+    /// Release all robots of the site
+    #[arg(long)]
+    pub(crate) all: bool,
     #[command(flatten)]
     pub(crate) connection: Connection,
 }

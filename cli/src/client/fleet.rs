@@ -64,6 +64,16 @@ impl Client {
             .await
     }
 
+    /// Releases a robot after a restoration of the server.
+    pub(crate) async fn release_robot(
+        &self,
+        site: &SiteId,
+        robot: &RobotId,
+    ) -> Result<Robot, ClientError> {
+        let path = format!("/v1/sites/{site}/robots/{robot}/release");
+        self.send(self.request(Method::POST, &path)).await
+    }
+
     /// Opens the event stream of a site, behind the event with the identifier `last` if given.
     pub(crate) async fn events(
         &self,

@@ -18,7 +18,7 @@ use tokio::sync::mpsc;
 use tokio::time::{Instant, MissedTickBehavior};
 use tokio_tungstenite::tungstenite::{Error, Message};
 use tread_api::drive::{
-    Drive, DriveRequest, DriveUpdate, DriveView, DriverName, Nothing, StopWords,
+    Drive, DriveRequest, DriveUpdate, DriveView, DriverName, Nothing, StopReason,
 };
 use tread_api::safety::GateCause;
 use tread_api::text::escaped;
@@ -252,7 +252,7 @@ impl Driving<'_> {
             Meaning::Move(linear, around) => self.keys.press((linear, around), Instant::now()),
             Meaning::Stop => {
                 self.keys = Keys::default();
-                let words = StopWords {
+                let words = StopReason {
                     by: Some(self.arguments.name.clone()),
                     reason: Some("from the terminal".to_owned()),
                 };

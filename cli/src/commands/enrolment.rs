@@ -1,11 +1,14 @@
-//! `tread robots join-token`, `enrolments`, `rename`, `tag`, `retire`, `restore` and `revoke`.
+//! `tread robots join-token`, `enrolments`, `rename`, `tag`, `retire`,
+//! `release`, `restore` and `revoke`.
 
 use std::process::ExitCode;
 
 use tread_api::enrolment::{CreateJoinToken, CreatedJoinToken, Enrolment, JoinToken};
 use tread_api::robot::{ChangeRobot, Robot};
 
-use crate::args::{JoinTokenAction, JoinTokenArguments, RobotArguments, RobotsAction};
+use crate::args::{
+    JoinTokenAction, JoinTokenArguments, ReleaseArguments, RobotArguments, RobotsAction,
+};
 use crate::client::{Client, ClientError};
 use crate::output::{Output, joined, note, or_dash, render, table};
 
@@ -50,6 +53,16 @@ pub(super) async fn run(
                 format!("`{}` is retired; its measurements stay", it.id)
             })?;
         }
+        RobotsAction::Release(arguments) => {
+            let released = release(client, arguments).await?;
+            output.show(&released, |released| {
+                if released.is_empty() {
+                    return "no robot awaits its release".to_owned();
+                }
+                let names: Vec<_> = released.iter().map(|robot| &robot.id).collect();
+                format!("missions are sent again to {}", joined(&names))
+            })?;
+        }
         RobotsAction::Restore(arguments) => {
             let back = set_retired(client, arguments, false).await?;
             output.show(&back, |it| format!("`{}` is restored", it.id))?;
@@ -62,6 +75,25 @@ pub(super) async fn run(
         }
     }
     Ok(ExitCode::SUCCESS)
+}
+
+/// Releases robots: those that are named, or all of the site that await it.
+async fn release(client: &Client, arguments: &ReleaseArguments) -> Result<Vec<Robot>, ClientError> {
+    let site = &arguments.connection.site;
+    let names = if arguments.all {
+        let robots = client.robots(site, false).await?;
+        let awaiting = robots
+            .into_iter()
+            .filter(|robot| robot.awaits_release_since.is_some());
+        awaiting.map(|robot| robot.id).collect()
+    } else {
+        arguments.robots.clone()
+    };
+    let mut released = Vec::with_capacity(names.len());
+    for robot in &names {
+        released.push(client.release_robot(site, robot).await?);
+    }
+    Ok(released)
 }
 
 async fn set_retired(

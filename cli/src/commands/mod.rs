@@ -11,6 +11,7 @@ mod history;
 mod identity;
 mod keys;
 mod limits;
+mod mission_text;
 mod missions;
 mod naming;
 mod points;

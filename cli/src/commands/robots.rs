@@ -136,6 +136,12 @@ pub(super) fn details(robot: &Robot) -> String {
             .retired_at
             .map(|at| format!("retired        since {at:.0}")),
     );
+    lines.extend(robot.awaits_release_since.map(|at| {
+        format!(
+            "waits          since {at:.0} for its release after a restoration: `tread robots release {}`",
+            robot.id
+        )
+    }));
     lines.extend(robot.alerts.iter().map(|alert| {
         let severity = alert.severity.as_str();
         format!("alert          {severity}: {}", alert.text)

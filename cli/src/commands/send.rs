@@ -11,7 +11,7 @@ use tread_api::trajectory::{
     TrajectoryCheck, TrajectoryOptions, Waypoints,
 };
 
-use super::missions::summary;
+use super::mission_text::summary;
 use super::naming::mission_id;
 use super::points::read_waypoints;
 use super::waiting::{have_succeeded, wait};
@@ -141,10 +141,10 @@ fn demands(checked: &TrajectoryCheck) -> String {
         "without wheel torque"
     };
     let assumed = format!("theta {:.2}, {sensing}", measurement.theta_assumed);
-    lines.push(match (measurement.relative_sd, measurement.first_after_s) {
-        (Some(relative_sd), Some(first_after_s)) => format!(
+    lines.push(match (measurement.relative_std_dev, measurement.first_after_s) {
+        (Some(relative_std_dev), Some(first_after_s)) => format!(
             "friction measured to about {:.1} % in the end, first after {first_after_s:.0} s ({assumed})",
-            1e2 * relative_sd
+            1e2 * relative_std_dev
         ),
         _ => format!("friction not measured: too little excitation ({assumed})"),
     });

@@ -25,10 +25,26 @@ fn describe(status: &Value, address: &str) -> String {
     };
     let text = |name: &str| status[name].as_str().map(str::to_owned);
     add("version", text("version"));
+    add("commit", text("commit"));
+    let schema = status["schema"].as_i64();
+    add("schema", schema.map(|schema| schema.to_string()));
     add("up for", status["uptime_ms"].as_u64().map(age));
     add("sqlite", text("sqlite_version"));
     let present = status["robots_present"].as_u64();
     add("robots present", present.map(|count| count.to_string()));
+    let backup = &status["backup"];
+    add("last backup", backup["last_at"].as_str().map(str::to_owned));
+    add("no backup", backup["failure"].as_str().map(str::to_owned));
+    let restoration = &status["restoration"];
+    let awaiting = restoration["robots_awaiting_release"].as_u64();
+    add(
+        "restored",
+        restoration["restored_at"].as_str().map(|at| {
+            let of = restoration["backup_taken_at"].as_str().unwrap_or_default();
+            let awaiting = awaiting.unwrap_or_default();
+            format!("{at} from a backup of {of}; {awaiting} robots await their release")
+        }),
+    );
     let counters = status["counters"].as_object();
     let counted: Vec<(&String, u64)> = counters
         .into_iter()

@@ -10,7 +10,7 @@ use tokio::time::Instant;
 use tread_api::ids::MissionId;
 use tread_api::mission::{Mission, MissionState};
 
-use super::missions::{state, summary};
+use super::mission_text::{state, summary};
 use super::robots::steps_come;
 use crate::client::Client;
 use crate::output::{Output, TookTooLong, note};

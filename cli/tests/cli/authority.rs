@@ -44,6 +44,7 @@ impl ServerWithRobots {
                 names: Vec::new(),
                 certificate_s: 3_600,
             }),
+            backup: None,
             audit: tread_server::config::AuditConfig::default(),
             web: WebConfig::default(),
             oidc: None,

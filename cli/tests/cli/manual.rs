@@ -50,3 +50,27 @@ async fn every_command_has_a_man_page_with_its_example() {
         "it is no command for people"
     );
 }
+
+#[tokio::test]
+async fn server_and_agent_have_man_pages_and_completions_too() {
+    let folder = tempfile::tempdir().unwrap();
+    for (program, page, word) in [
+        ("tread-server", "tread-server-health.1", "--ready"),
+        ("tread-agent", "tread-agent-enroll.1", "--token-file"),
+    ] {
+        let at = folder.path().join(program);
+        let of_program = ["--program", program];
+        let ran = tread(&[&["man", "--dir", at.to_str().unwrap()][..], &of_program].concat()).await;
+        assert_eq!(ran.code, Some(0), "{}", ran.errors);
+        let read = |name: &str| std::fs::read_to_string(at.join(name)).unwrap();
+        assert!(read(page).replace('\\', "").contains(word), "{page}");
+        let main = read(&format!("{program}.1"));
+        assert!(main.contains(".SH SYNOPSIS"), "{main}");
+        for shell in ["bash", "zsh", "fish"] {
+            let ran = tread(&[&["completions", shell][..], &of_program].concat()).await;
+            assert_eq!(ran.code, Some(0), "{shell}: {}", ran.errors);
+            let word = word.trim_start_matches('-');
+            assert!(ran.text.contains(word), "{program} in {shell}");
+        }
+    }
+}

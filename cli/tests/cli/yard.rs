@@ -54,6 +54,7 @@ impl Yard {
                 allowed_networks: vec!["127.0.0.1".parse().unwrap()],
                 ..WebhooksConfig::default()
             },
+            backup: None,
             audit: tread_server::config::AuditConfig::default(),
             web: WebConfig::default(),
         });

@@ -310,6 +310,11 @@ impl BlockBuilder {
         self.duration_s >= BLOCK_S - 1.0e-6
     }
 
+    /// Returns whether half of the block's time is over.
+    pub(super) fn is_half_full(&self) -> bool {
+        self.duration_s >= 0.5 * BLOCK_S
+    }
+
     /// Returns the builder of the next block, whose window began in this one.
     pub(super) fn next(&self) -> Self {
         Self {

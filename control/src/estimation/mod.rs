@@ -100,7 +100,7 @@ pub const MODEL_RATIO: f64 = 1.5e-3;
 /// Maximum fraction of a segment's own variance that counts as shared with earlier segments.
 const OFFSETS_SHARE_MAX: f64 = 0.9;
 /// Half-width of a 95 % interval, in standard deviations.
-const NORMAL_95: f64 = 1.959_963_984_540_054;
+pub const NORMAL_95: f64 = 1.959_963_984_540_054;
 /// Minimum prior standard deviation of the torque scale.
 const SCALE_STD_DEV_MIN: f64 = 1.0e-3;
 /// Maximum time between two samples; after a longer gap all averages restart, seconds.
@@ -138,6 +138,10 @@ pub struct Estimator {
     estimate: Estimate,
     /// Solution from all blocks of this ground, if it is a measurement.
     measured: Option<Solution>,
+    /// Newest solution, as long as radii and track are not computed with it, and whether they are
+    /// due.
+    solution: Option<Solution>,
+    are_offsets_due: bool,
     /// Moment balance of the last block, if the block was used.
     turning_before: Option<Row>,
     last_wheels: Option<WheelSpeeds>,
@@ -185,6 +189,8 @@ impl Estimator {
             },
             estimate: Estimate::default(),
             measured: None,
+            solution: None,
+            are_offsets_due: false,
             turning_before: None,
             last_wheels: None,
             skipped_s: 0.0,
@@ -242,6 +248,11 @@ impl Estimator {
         }
         self.block.add(sample, &self.model, dt_s);
         if !self.block.is_full() {
+            if self.are_offsets_due && self.block.is_half_full() {
+                // In another tick than θ, because a tick with both takes long.
+                let solution = self.solution.take();
+                self.refresh_offsets(solution.as_ref());
+            }
             return UpdateOutcome {
                 ground_changed,
                 ..UpdateOutcome::default()
@@ -262,7 +273,12 @@ impl Estimator {
         }
         let (of_rows, slips) = block.map_or((false, false), |block| self.take(block));
         self.excitation.end_block();
-        self.refresh();
+        let solution = self.refresh_theta();
+        if self.identification.is_some() {
+            self.solution = solution;
+        } else {
+            self.refresh_offsets(solution.as_ref());
+        }
         UpdateOutcome {
             block_done: true,
             slips,
@@ -366,7 +382,13 @@ impl Estimator {
 
     /// Computes the present estimates from all sums.
     fn refresh(&mut self) {
-        let sums = self.ground.plus(&self.segment).plus(&self.pending);
+        let solution = self.refresh_theta();
+        self.refresh_offsets(solution.as_ref());
+    }
+
+    /// Computes θ and all that follows from it from all sums. Returns the solution.
+    fn refresh_theta(&mut self) -> Option<Solution> {
+        let sums = self.sums();
         let solution = self.solve(&sums, None);
         self.measured = solution.filter(|solution| self.is_measurement(solution, &sums));
         let of_rows = self.measured.map(|solution| {
@@ -408,6 +430,24 @@ impl Estimator {
                 most.min(THETA_MOST_FIRST)
             },
         };
+        self.estimate = Estimate {
+            theta,
+            no_new_information: !self.excitation.is_present(),
+            mu_peak_lower_bound: sums.mu_peak(),
+            saturation_share: sums.saturation_share(),
+            dropped_samples: self.dropped_samples,
+            robot: self.identification.as_ref().and_then(|found| found.robot()),
+            payload_change: self.payload.change(),
+            ..self.estimate
+        };
+        self.are_offsets_due = true;
+        solution
+    }
+
+    /// Computes the estimates of radii and track from all sums and their `solution`.
+    fn refresh_offsets(&mut self, solution: Option<&Solution>) {
+        self.are_offsets_due = false;
+        let sums = self.sums();
         let theta_ground = solution.map_or(THETA_FIRST, |found| found.theta);
         let tyres = solution.map_or(self.tyres, |found| found.tyres(&self.tyres));
         let offsets = self
@@ -415,20 +455,19 @@ impl Estimator {
             .with_ground(&sums, &self.tyres, theta_ground, &tyres);
         let (radius_offset, radius_difference) = offsets.values();
         self.estimate = Estimate {
-            theta,
-            no_new_information: !self.excitation.is_present(),
-            mu_peak_lower_bound: sums.mu_peak(),
             effective_track_ratio: sums.effective_track(&offsets).map(|track| track.value),
             rolling_resistance_ratio: sums
                 .rolling_resistance(self.accelerometer_offset_mu())
                 .map(|rolling| rolling.value),
             radius_offset,
             radius_difference,
-            saturation_share: sums.saturation_share(),
-            dropped_samples: self.dropped_samples,
-            robot: self.identification.as_ref().and_then(|found| found.robot()),
-            payload_change: self.payload.change(),
+            ..self.estimate
         };
+    }
+
+    /// Returns the sums over all blocks of this ground.
+    fn sums(&self) -> Sums {
+        self.ground.plus(&self.segment).plus(&self.pending)
     }
 
     /// Restarts the estimation of mass and inertia after a change of the payload.

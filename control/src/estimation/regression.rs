@@ -9,7 +9,9 @@
 //! third of its standard deviation.
 
 use super::offsets::OffsetKnowledge;
-use super::rows::{Channel, OFFSETS, ParameterMatrix, Parameters, Tangent, index};
+use super::rows::{
+    Channel, OFFSETS, ParameterMatrix, Parameters, RegressorMatrix, Regressors, Tangent, index,
+};
 use super::sums::Sums;
 use super::{BLOCKS_MIN, RELATIVE_STD_DEV_MAX, THETA_RANGE, TyrePrior};
 use crate::estimation::block::Block;
@@ -72,19 +74,22 @@ impl Normal {
             curvature_weight: tyres.curvature_std_dev.max(CURVATURE_STD_DEV_MIN).powi(-2),
         };
         let mut noise_variance = 0.0;
+        let (mut square, mut product) = (RegressorMatrix::zeros(), Regressors::zeros());
         for channel in channels {
             if channel.count < 1.0 {
                 continue;
             }
             let innovation_variance = channel.innovation_variance(theta) * inflation;
             let force_noise = channel.force_variance();
-            normal.matrix += channel.corrected_square(tangent) / innovation_variance;
-            normal.right += channel.corrected_product(tangent) / innovation_variance;
+            channel.add_corrected(innovation_variance.recip(), &mut square, &mut product);
             normal.excess += channel.count
                 * (force_noise * innovation_variance + (theta * force_noise).powi(2))
                 / (innovation_variance * innovation_variance);
             noise_variance += 2.0 * channel.count * (force_noise / innovation_variance).powi(2);
         }
+        // Both are linear, so that one reduction of the sums is enough.
+        normal.matrix = tangent.of_pairs(&square);
+        normal.right = tangent.of_parameters(&product);
         normal.noise_std_dev = noise_variance.sqrt();
         let known = normal.curvature_weight;
         normal.matrix[(index::CURVATURE, index::CURVATURE)] += known;
@@ -144,13 +149,12 @@ pub(super) fn inflation(
 ) -> f64 {
     let mut squares = 0.0;
     let mut count = 0.0;
+    let coefficients = tangent.of_regressors(parameters);
     for channel in channels {
         if channel.count < 1.0 {
             continue;
         }
-        let fitted = (channel.square(tangent) * parameters).dot(parameters);
-        let sum = channel.response - 2.0 * channel.product(tangent).dot(parameters) + fitted;
-        squares += sum / channel.innovation_variance(theta);
+        squares += channel.squared_residuals(&coefficients) / channel.innovation_variance(theta);
         count += channel.count;
     }
     if count < INFLATION_ROWS {
@@ -170,12 +174,13 @@ pub(super) fn inflation(
 /// `M⁻¹v`. It is negative for slowly varying forces, because the noise of a shared ramp enters both
 /// rows with opposite signs.
 fn neighbours(channels: &[&Channel], direction: &Parameters, theta: f64, tangent: Tangent) -> f64 {
+    let coefficients = tangent.of_regressors(direction);
     let of_channel = |channel: &&Channel| {
         if channel.count < 1.0 {
             return 0.0;
         }
         let scale = theta / channel.innovation_variance(theta);
-        (channel.neighbours(tangent) * direction).dot(direction) * scale * scale
+        channel.neighbours(&coefficients) * scale * scale
     };
     channels.iter().map(of_channel).sum()
 }
@@ -223,12 +228,15 @@ pub(super) fn solve(sums: &Sums, input: SolveInput<'_>) -> Option<Solution> {
         let normal = Normal::of(&channels, theta_weights, tangent, (input.tyres, inflated))
             .with_resistance(input.offsets, theta_weights)
             .with_offsets(input.offsets);
-        let covariance = normal.matrix.cholesky()?.inverse();
-        let parameters = covariance * normal.right;
+        let factors = normal.matrix.cholesky()?;
+        let parameters = factors.solve(&normal.right);
         let theta = parameters[index::THETA];
         let next = theta.clamp(*THETA_RANGE.start(), *THETA_RANGE.end());
         if input.theta_given.is_none() {
-            tyres = learned_tyres(&parameters, &covariance, input.tyres);
+            let mut curvature = Parameters::zeros();
+            curvature[index::CURVATURE] = 1.0;
+            let variance = factors.solve(&curvature)[index::CURVATURE];
+            tyres = learned_tyres(&parameters, variance, input.tyres);
         }
         // Residuals larger than the noise reduce the weight of rows relative to the priors.
         let inflation = inflation(&channels, &parameters, theta_weights, tangent);
@@ -236,6 +244,7 @@ pub(super) fn solve(sums: &Sums, input: SolveInput<'_>) -> Option<Solution> {
         let is_settled = (next - theta_weights).abs() < CONVERGED * theta_weights
             && Tangent::at(next, tyres.at(next)).is_near(tangent);
         if round == ROUNDS || is_weighed && (input.theta_given.is_some() || is_settled) {
+            let covariance = factors.inverse();
             let base = covariance[(index::THETA, index::THETA)];
             let (theta, scale) = if sums.has_torque() {
                 (theta, 0.0)
@@ -297,13 +306,9 @@ pub(super) fn solve(sums: &Sums, input: SolveInput<'_>) -> Option<Solution> {
     None
 }
 
-/// Returns the tyres with the estimated curvature, or `known` if the estimate is not more precise.
-fn learned_tyres(
-    parameters: &Parameters,
-    covariance: &ParameterMatrix,
-    known: &TyrePrior,
-) -> TyrePrior {
-    let variance = covariance[(index::CURVATURE, index::CURVATURE)];
+/// Returns the tyres with the estimated curvature, given the variance of θκ, or `known` if the
+/// estimate is not more precise.
+fn learned_tyres(parameters: &Parameters, variance: f64, known: &TyrePrior) -> TyrePrior {
     let (curvature, std_dev) = (parameters[index::CURVATURE], variance.max(0.0).sqrt());
     if curvature.is_finite() && std_dev < known.curvature_std_dev {
         TyrePrior {
@@ -406,7 +411,8 @@ impl Solution {
     /// Returns the tyres with the estimated curvature, or `known` if the estimate is not more
     /// precise.
     pub(super) fn tyres(&self, known: &TyrePrior) -> TyrePrior {
-        learned_tyres(&self.parameters, &self.covariance, known)
+        let curvature = (index::CURVATURE, index::CURVATURE);
+        learned_tyres(&self.parameters, self.covariance[curvature], known)
     }
 
     /// Returns whether a segment has information on θ, compared with the ground's `theta_ground`.

@@ -18,7 +18,7 @@ const REGRESSORS: usize = PARAMETERS + 3;
 /// Vector of regressors.
 pub(super) type Regressors = SVector<f64, REGRESSORS>;
 /// Matrix over pairs of regressors.
-type RegressorMatrix = SMatrix<f64, REGRESSORS, REGRESSORS>;
+pub(super) type RegressorMatrix = SMatrix<f64, REGRESSORS, REGRESSORS>;
 
 /// Indices of parameters and regressors.
 pub(super) mod index {
@@ -117,19 +117,32 @@ impl Tangent {
         found
     }
 
-    /// Reduces a matrix over pairs of regressors to one over pairs of parameters.
-    fn of_pairs(self, square: &RegressorMatrix) -> ParameterMatrix {
-        let mut columns = square.fixed_columns::<PARAMETERS>(0).into_owned();
+    /// Extends parameters to coefficients of all regressors: the transpose of
+    /// [`Tangent::of_parameters`].
+    pub(super) fn of_regressors(self, parameters: &Parameters) -> Regressors {
+        let mut found = Regressors::zeros();
+        found.fixed_rows_mut::<PARAMETERS>(0).copy_from(parameters);
         for (from, to, by) in self.followers() {
-            let more = square.column(from) * by;
-            let mut column = columns.column_mut(to);
-            column += more;
+            found[from] += by * parameters[to];
         }
-        let mut found = columns.fixed_rows::<PARAMETERS>(0).into_owned();
+        found
+    }
+
+    /// Reduces a matrix over pairs of regressors to one over pairs of parameters.
+    pub(super) fn of_pairs(self, square: &RegressorMatrix) -> ParameterMatrix {
+        let mut columns = *square;
         for (from, to, by) in self.followers() {
-            let more = columns.row(from) * by;
-            let mut row = found.row_mut(to);
-            row += more;
+            for row in 0..REGRESSORS {
+                columns[(row, to)] += by * square[(row, from)];
+            }
+        }
+        let mut found = columns
+            .fixed_view::<PARAMETERS, PARAMETERS>(0, 0)
+            .into_owned();
+        for column in 0..PARAMETERS {
+            for (from, to, by) in self.followers() {
+                found[(to, column)] += by * columns[(from, column)];
+            }
         }
         found
     }
@@ -265,6 +278,9 @@ impl Channel {
 
     /// Returns the sums over the rows of both.
     pub(super) fn plus(&self, other: &Self) -> Self {
+        if other.count == 0.0 {
+            return *self;
+        }
         Self {
             count: self.count + other.count,
             square: self.square + other.square,
@@ -288,36 +304,37 @@ impl Channel {
         self.force_noise[(0, 0)] / self.count
     }
 
-    /// Returns `Σ xxᵀ`, including the noise of the regressors.
-    pub(super) fn square(&self, tangent: Tangent) -> ParameterMatrix {
-        tangent.of_pairs(&self.square)
+    /// Returns the sum of squared residuals of these coefficients of all regressors, including the
+    /// noise of the regressors.
+    pub(super) fn squared_residuals(&self, coefficients: &Regressors) -> f64 {
+        let fitted = (self.square * coefficients).dot(coefficients);
+        self.response - 2.0 * self.product.dot(coefficients) + fitted
     }
 
-    /// Returns `Σ xxᵀ` minus the noise of the force and of its rate.
-    pub(super) fn corrected_square(&self, tangent: Tangent) -> ParameterMatrix {
-        let mut square = self.square;
-        square[(index::RELAXATION, index::RELAXATION)] -= self.rate_noise;
+    /// Adds `Σ xxᵀ` and `Σ xy`, both multiplied by `weight`: the first minus the noise of the force
+    /// and of its rate, the second minus the common noise of regressors and response.
+    pub(super) fn add_corrected(
+        &self,
+        weight: f64,
+        square: &mut RegressorMatrix,
+        product: &mut Regressors,
+    ) {
+        for (sum, own) in square.as_mut_slice().iter_mut().zip(self.square.as_slice()) {
+            *sum += own * weight;
+        }
+        square[(index::RELAXATION, index::RELAXATION)] -= self.rate_noise * weight;
         for (row, row_of) in FORCED.into_iter().enumerate() {
             for (column, column_of) in FORCED.into_iter().enumerate() {
-                square[(row_of, column_of)] -= self.force_noise[(row, column)];
+                square[(row_of, column_of)] -= self.force_noise[(row, column)] * weight;
             }
         }
-        tangent.of_pairs(&square)
+        *product += (self.product - self.common_noise) * weight;
     }
 
-    /// Returns `Σ xy`, including the common noise of regressors and response.
-    pub(super) fn product(&self, tangent: Tangent) -> Parameters {
-        tangent.of_parameters(&self.product)
-    }
-
-    /// Returns `Σ xy` minus the common noise of regressors and response.
-    pub(super) fn corrected_product(&self, tangent: Tangent) -> Parameters {
-        tangent.of_parameters(&(self.product - self.common_noise))
-    }
-
-    /// Returns the sum of the covariances of neighbouring rows.
-    pub(super) fn neighbours(&self, tangent: Tangent) -> ParameterMatrix {
-        tangent.of_pairs(&self.neighbours)
+    /// Returns the variance of a linear function of the regressors, given its coefficients, that the
+    /// covariances of neighbouring rows contribute.
+    pub(super) fn neighbours(&self, coefficients: &Regressors) -> f64 {
+        (self.neighbours * coefficients).dot(coefficients)
     }
 
     /// Returns the squared effects of the forces by θ alone and by the curvature κ, over the
@@ -364,6 +381,8 @@ mod tests {
             let said = row.dot(&all);
             let lean = tangent.of_parameters(&row).dot(&parameters);
             prop_assert!((lean - said).abs() < 1.0e-9 * (1.0 + said.abs()));
+            prop_assert!((row.dot(&tangent.of_regressors(&parameters)) - said).abs()
+                < 1.0e-9 * (1.0 + said.abs()));
             let square = tangent.of_pairs(&(row * row.transpose()));
             let twice = (square * parameters).dot(&parameters);
             prop_assert!((twice - said * said).abs() < 1.0e-8 * (1.0 + said * said));

@@ -166,8 +166,9 @@ pub struct Tracker {
     /// χ̂, the fraction of the loss beyond the peak of the friction curve.
     beyond: f64,
     drift: Drift,
-    /// Known θ under which χ̂ was adapted.
+    /// Known θ under which χ̂ was adapted, and the newest one.
     known: Option<ThetaKnowledge>,
+    last: Option<ThetaKnowledge>,
     /// Whether χ̂ is returning to one.
     forgets: bool,
     pull: Pull,
@@ -197,6 +198,7 @@ impl Tracker {
             beyond: 1.0,
             drift: Drift::default(),
             known: None,
+            last: None,
             forgets: false,
             pull: Pull::default(),
             adapted_m: 0.0,
@@ -333,23 +335,27 @@ impl Tracker {
         }
     }
 
-    /// Lets a known θ act if it is new: θ̂ is pulled to it if it is known from the start,
-    /// contradicts the previous one, or refines one that pulled. What was adapted under another θ
-    /// is forgotten: χ̂ moves back to one, slope and rotation centre to zero.
+    /// Lets a known θ act if it is new: θ̂ is pulled to it if it is known from the start, refines or
+    /// corrects one that pulled, or jumps to another value, as on other ground. What was adapted
+    /// under another θ is forgotten: χ̂ moves back to one, slope and rotation centre to zero.
     fn apply_knowledge(&mut self, knowledge: Option<ThetaKnowledge>, dt_s: f64) {
         if let Some(now) = knowledge {
             let is_first = self.known.is_none();
             let anchor = *self.known.get_or_insert(now);
             let is_contradicted = anchor.contradicts(now);
+            // An estimate that drifts away was wrong before, which matters only if it pulled. On other
+            // ground it jumps.
+            let has_jumped = self.last.is_some_and(|last| last.contradicts(now));
+            let is_corrected = is_contradicted && (has_jumped || self.pull.has_acted);
             // A much better value for the same ground replaces the stored one; replacing it by many
             // slightly better ones would let it follow a θ that changes.
             let is_better = now.std_dev < BETTER_WORD * anchor.std_dev;
             let is_refined = self.pull.has_acted && is_better;
-            let is_other = is_contradicted || is_refined && anchor.is_apart(now);
+            let is_other = is_corrected || is_refined && anchor.is_apart(now);
             self.forgets |= is_other;
             // Errors that were driven through know better what the loop needs.
             let is_from_start = is_first && self.adapted_m < KNOWN_FROM_START_M;
-            if is_contradicted || is_refined || is_from_start {
+            if is_corrected || is_refined || is_from_start {
                 self.pull.left_s = PULL_TIME_S;
                 self.pull.has_acted = true;
                 self.pull.forgets_drift = is_other;
@@ -357,6 +363,7 @@ impl Tracker {
             if is_contradicted || is_better {
                 self.known = Some(now);
             }
+            self.last = Some(now);
             if self.pull.left_s > 0.0 && self.pull.forgets_drift {
                 let share = now.confidence() * self.config.adaptation_pull_1_s * dt_s;
                 self.drift.forget(share.min(1.0));

@@ -268,7 +268,11 @@ impl Known {
                     body_speed_m_s: sample.body_speed_m_s,
                     wheel_torques: sample.wheel_torques,
                 };
-                self.estimator.update(&taken, dt_s);
+                if self.estimator.update(&taken, dt_s).ground_changed {
+                    // As the agent does.
+                    self.estimator.close_segment();
+                    self.estimator.begin_ground();
+                }
             }
             if let Some(pose) = sample.position {
                 let age_s = self

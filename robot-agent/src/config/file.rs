@@ -25,6 +25,7 @@ pub(super) struct FileConfig {
     pub(super) drive: Option<DriveFile>,
     pub(super) recording: Option<RecordingFile>,
     pub(super) estimation: Option<EstimationFile>,
+    pub(super) realtime: Option<RealtimeFile>,
 }
 
 /// `[estimation]` in `robot.toml`.
@@ -42,6 +43,14 @@ pub(super) struct EstimationFile {
     pub(super) rotor_std_dev_ratio: Option<f64>,
     pub(super) load_difference_std_dev: Option<f64>,
     pub(super) payload_ratio: Option<f64>,
+}
+
+/// `[realtime]` in `robot.toml`.
+#[derive(Debug, Clone, Copy, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct RealtimeFile {
+    pub(super) priority: Option<u8>,
+    pub(super) lock_memory: Option<bool>,
 }
 
 /// `[recording]` in `robot.toml`.

@@ -5,6 +5,7 @@
 mod estimation;
 mod file;
 mod place;
+mod realtime;
 mod recording;
 mod ros2;
 
@@ -27,6 +28,7 @@ use crate::drive::simulated::{Individual, Stall};
 use crate::geometry::{control_model, paper_robot};
 use crate::membership::{Membership, MembershipFileError};
 use crate::outbox;
+use crate::realtime::RealtimeConfig;
 use crate::recording::RecordingConfig;
 use crate::sim::faults::Fault;
 use crate::sim::scenario::{BUILT_IN_NAME, Scenario, ScenarioError};
@@ -97,7 +99,7 @@ pub enum ConfigError {
 #[command(
     name = "tread-agent",
     version,
-    about = "Drives one robot and measures its ground"
+    about = "Drives one robot and measures the friction of the ground"
 )]
 pub struct Flags {
     /// The configuration file
@@ -109,10 +111,10 @@ pub struct Flags {
     /// The robot's identifier within its site
     #[arg(long)]
     pub robot: Option<RobotId>,
-    /// The server's zenoh endpoint [default: what `enroll` was given, or tcp/127.0.0.1:7447]
+    /// The server's zenoh endpoint [default: that of `enroll`, or tcp/127.0.0.1:7447]
     #[arg(long)]
     pub server: Option<String>,
-    /// Where measurements wait for the server
+    /// Folder of the outbox: measurements that wait for upload
     #[arg(long)]
     pub data_dir: Option<PathBuf>,
     /// Rate of the control loop, 20 to 200 Hz [default: 100]
@@ -121,7 +123,7 @@ pub struct Flags {
     /// The scenario of the simulated base: a file, or `yard` for the built-in one
     #[arg(long)]
     pub scenario: Option<PathBuf>,
-    /// Start of the simulated base: x, y in metres and heading in radians, with commas
+    /// Start of the simulated base: x, y in metres and heading in radians, separated by commas
     #[arg(long, value_parser = parse_start, allow_hyphen_values = true)]
     pub start: Option<Pose>,
     /// Seed of the simulated base
@@ -130,22 +132,22 @@ pub struct Flags {
     /// Charge of the simulated battery at the start, 0 to 1 [default: 1]
     #[arg(long)]
     pub battery_charge: Option<f64>,
-    /// How far the simulated robot's wall clock is ahead, seconds, negative for behind [default: 0]
+    /// Error of the simulated robot's wall clock, seconds, positive if it is ahead [default: 0]
     #[arg(long, allow_hyphen_values = true)]
     pub clock_ahead_s: Option<i64>,
-    /// A fault of the simulated base: after so many seconds its reading blocks, for so many more,
-    /// with a comma between them
+    /// Simulated fault of the base, two numbers separated by a comma: seconds until its reading
+    /// blocks, and for how many seconds it blocks
     #[arg(long, value_parser = parse_stall)]
     pub stall_s: Option<Stall>,
-    /// What to log, as in `info,tread_agent=debug`
+    /// Log filter, such as `info,tread_agent=debug`
     #[arg(long, env = "RUST_LOG", default_value = "info,zenoh=warn")]
     pub log: String,
-    /// How to log
+    /// Format of log lines
     #[arg(long, value_enum, default_value_t)]
     pub log_format: LogFormat,
 }
 
-/// How to log.
+/// Format of log lines.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
 pub enum LogFormat {
     /// Lines for people.
@@ -263,6 +265,8 @@ pub struct AgentConfig {
     pub outbox: outbox::Limits,
     /// Destination of records of the loop; `None` for no records.
     pub recording: Option<RecordingConfig>,
+    /// What is asked of the operating system's scheduler.
+    pub realtime: RealtimeConfig,
     /// Estimator's prior of the robot's and the tyres' parameters.
     pub prior: EstimatorPrior,
 }
@@ -432,8 +436,10 @@ fn assemble(
         }
     };
     let recording = recording::checked(file.recording.unwrap_or_default(), &data_dir)?;
+    let realtime = realtime::checked(file.realtime.unwrap_or_default())?;
     Ok(AgentConfig {
         recording,
+        realtime,
         prior: estimation::checked(
             file.estimation.unwrap_or_default(),
             estimation::default_of(&drive),

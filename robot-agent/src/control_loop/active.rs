@@ -12,7 +12,6 @@
 
 use std::time::Duration;
 
-use serde::{Deserialize, Serialize};
 use tread_api::robot::{MissionProgress, PauseCause};
 use tread_control::follower::FollowerStatus;
 use tread_control::gate::GateCause;
@@ -21,8 +20,9 @@ use tread_control::robot::RobotModel;
 use tread_control::tracking::ThetaKnowledge;
 
 use super::STANDING_TICKS;
-use super::channels::{EndReason, Job};
+use super::channels::{EndReason, Hold};
 use super::driven::TickRecord;
+use super::job::Job;
 use super::prior::Prior;
 use super::surface::Comparison;
 
@@ -47,24 +47,6 @@ pub(super) struct Step {
 pub(super) enum News {
     Paused,
     Resumed,
-}
-
-/// Why a mission is held.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub(crate) enum Hold {
-    /// An operator paused the mission.
-    Pause,
-    /// The next revision is being planned from where the robot stops.
-    Replacement,
-    /// An external limit holds the robot; the mission goes on when the limit ends.
-    Outside,
-    /// The base is silent, or was heard again too recently; the mission goes on by itself.
-    Base,
-    /// The control loop does not keep its rate; the mission goes on when it does.
-    Overrun,
-    /// A sensor that the mission needs is contradicted; the mission goes on when the finding ends.
-    Sensors,
 }
 
 /// The holds that are active.

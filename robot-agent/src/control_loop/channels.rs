@@ -10,24 +10,22 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
 use tread_api::friction::{RobotParameters, SideSlip, ThetaEstimate};
-use tread_api::ids::{MissionId, PlanHash};
+use tread_api::ids::MissionId;
 use tread_api::robot::{MissionProgress, RobotMode};
 use tread_api::site::Cell;
 use tread_api::wire::ingest::MissionPhase;
 use tread_control::consistency::Findings;
 use tread_control::estimation::{PayloadChange, SegmentStatistics};
-use tread_control::follower::{FailureReason, Follower};
+use tread_control::follower::FailureReason;
 use tread_control::gate::GateCause;
 use tread_control::geometry::{Point, Pose, Twist};
 use tread_control::plan::Plan;
 use tread_control::reference::Governor;
 
-use super::active::Hold;
-use super::driven::Driven;
-use super::origin::JobOrigin;
+use super::job::Job;
 use super::overrun::Overrun;
-use super::prior::Prior;
 use super::site_view::SiteView;
 use super::standing::StandingReport;
 use super::surface::Comparison;
@@ -39,23 +37,22 @@ pub(crate) const COMMANDS_MAX: usize = 16;
 /// Capacity of the event channel; segments that find it full are dropped and counted.
 pub(crate) const EVENTS_MAX: usize = 1_024;
 
-/// A planned mission, ready to drive.
-#[derive(Debug)]
-pub(crate) struct Job {
-    pub(crate) mission: MissionId,
-    pub(crate) revision: u32,
-    pub(crate) plan_hash: PlanHash,
-    pub(crate) follower: Follower,
-    /// Friction of the map along the path.
-    pub(crate) prior: Prior,
-    /// Latest start, by the monotonic clock; a later start ends the mission as expired.
-    pub(crate) start_by: Option<Duration>,
-    /// Longest silence of the server before the mission is stopped; `None` for no limit.
-    pub(crate) silence_max: Option<Duration>,
-    /// Record of the driven path and of the mission's quality.
-    pub(crate) driven: Driven,
-    /// Inputs from which this job was planned.
-    pub(crate) origin: Arc<JobOrigin>,
+/// Why a mission is held.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum Hold {
+    /// An operator paused the mission.
+    Pause,
+    /// The next revision is being planned from where the robot stops.
+    Replacement,
+    /// An external limit holds the robot; the mission goes on when the limit ends.
+    Outside,
+    /// The base is silent, or was heard again too recently; the mission goes on by itself.
+    Base,
+    /// The control loop does not keep its rate; the mission goes on when it does.
+    Overrun,
+    /// A sensor that the mission needs is contradicted; the mission goes on when the finding ends.
+    Sensors,
 }
 
 /// A command to the loop.
@@ -82,7 +79,7 @@ pub(crate) enum EndReason {
     Cancelled,
     Failed(FailureReason),
     TooLate,
-    AnotherInHand,
+    AnotherActive,
     AgentStopped,
     ServerSilent,
     SensorFault,
@@ -95,7 +92,7 @@ impl EndReason {
             Self::Cancelled => MissionPhase::Cancelled,
             Self::TooLate => MissionPhase::Expired,
             Self::Failed(_)
-            | Self::AnotherInHand
+            | Self::AnotherActive
             | Self::AgentStopped
             | Self::ServerSilent
             | Self::SensorFault => MissionPhase::Failed,
@@ -109,7 +106,7 @@ impl EndReason {
             Self::Cancelled => Some("cancelled on request"),
             Self::Failed(reason) => Some(reason.text()),
             Self::TooLate => Some("its latest start passed before it began"),
-            Self::AnotherInHand => Some("another mission was being driven"),
+            Self::AnotherActive => Some("another mission was being driven"),
             Self::AgentStopped => Some("the agent was stopped"),
             Self::SensorFault => Some("sensors contradicted each other for too long"),
             Self::ServerSilent => Some("the server was silent for longer than the mission allows"),

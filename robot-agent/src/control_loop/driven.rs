@@ -230,7 +230,7 @@ impl Driven {
             driven_m: self.distance_m,
             theta_loop,
             theta_measured: measured.map(|(theta, _)| theta),
-            theta_sd: measured.map(|(_, std_dev)| std_dev),
+            theta_std_dev: measured.map(|(_, std_dev)| std_dev),
         });
         self.theta_at_m = self.distance_m + self.theta_spacing_m;
     }

@@ -181,7 +181,7 @@ fn a_revision_that_comes_at_the_very_end_is_driven_and_one_that_does_not_come_ho
 
     let (mut bench, other, _) = driving();
     assert_eq!(other, mission);
-    let hold = LoopCommand::Hold(mission, super::active::Hold::Replacement);
+    let hold = LoopCommand::Hold(mission, super::channels::Hold::Replacement);
     bench.ends.commands.send(hold).unwrap();
     bench.run_for(5 * SECOND);
     assert!(bench.drive.truth().twist().linear_m_s.abs() < 0.01);

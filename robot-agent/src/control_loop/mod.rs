@@ -8,7 +8,7 @@ pub(crate) mod active;
 pub(crate) mod channels;
 pub(crate) mod driven;
 mod gain;
-pub(crate) mod origin;
+pub(crate) mod job;
 mod outgoing;
 pub(crate) mod overrun;
 mod pace;

@@ -53,7 +53,7 @@ impl Bounds {
 
 /// Ground under the wheels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Footing {
+pub(crate) enum GroundUnderWheels {
     /// All wheels on one terrain, as its index in the definition; `None` where no terrain is drawn.
     Whole(Option<usize>),
     /// Wheels on different terrains.
@@ -149,7 +149,7 @@ impl SiteView {
     }
 
     /// Returns the terrain under the four wheels.
-    pub(crate) fn footing(&self, pose: Pose, model: &RobotModel) -> Footing {
+    pub(crate) fn ground_under_wheels(&self, pose: Pose, model: &RobotModel) -> GroundUnderWheels {
         let (sin, cos) = pose.heading_rad.sin_cos();
         let (forward_m, left_m) = (0.5 * model.wheelbase_m(), 0.5 * model.track_width_m());
         let under = |forward_m: f64, left_m: f64| {
@@ -168,9 +168,9 @@ impl SiteView {
             .into_iter()
             .all(|(forward_m, left_m)| under(forward_m, left_m) == first)
         {
-            Footing::Whole(first)
+            GroundUnderWheels::Whole(first)
         } else {
-            Footing::Mixed
+            GroundUnderWheels::Mixed
         }
     }
 
@@ -251,7 +251,7 @@ mod tests {
         let view = SiteView::new(site(vec![square("a", 0.0, 2.0, 0)]));
         let model = RobotModel::yi2007();
         let at = |x_m: f64| {
-            view.footing(
+            view.ground_under_wheels(
                 Pose {
                     x_m,
                     y_m: 0.0,
@@ -260,9 +260,9 @@ mod tests {
                 &model,
             )
         };
-        assert_eq!(at(0.0), Footing::Whole(Some(0)));
-        assert_eq!(at(2.0), Footing::Mixed);
-        assert_eq!(at(3.0), Footing::Whole(None));
+        assert_eq!(at(0.0), GroundUnderWheels::Whole(Some(0)));
+        assert_eq!(at(2.0), GroundUnderWheels::Mixed);
+        assert_eq!(at(3.0), GroundUnderWheels::Whole(None));
     }
 
     #[test]

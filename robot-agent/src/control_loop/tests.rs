@@ -237,7 +237,7 @@ fn a_second_mission_does_not_disturb_the_first() {
     bench.run_for(Duration::from_secs(2));
     let second = bench.start(2, LINE, None);
     bench.run_for(Duration::from_secs(2));
-    assert_eq!(bench.ended, [(second, EndReason::AnotherInHand)]);
+    assert_eq!(bench.ended, [(second, EndReason::AnotherActive)]);
     assert_eq!(
         bench
             .ends

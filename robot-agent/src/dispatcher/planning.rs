@@ -10,8 +10,8 @@ use tread_control::geometry::Pose;
 use tread_control::plan::Plan;
 
 use super::{Dispatcher, refused};
-use crate::control_loop::channels::Job;
-use crate::control_loop::origin::JobOrigin;
+use crate::control_loop::job::Job;
+use crate::control_loop::job::JobOrigin;
 use crate::geometry::wire_pose;
 
 /// A plan, its summary, and the job that tracks it.

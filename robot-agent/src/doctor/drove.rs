@@ -26,7 +26,7 @@ const FROZEN_MIN: u32 = 10;
 
 /// Summary of the steady second half of a motion.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub(super) struct Drove {
+pub(super) struct DriveSummary {
     /// Commanded wheel speeds.
     pub(super) commanded: WheelSpeeds,
     /// Measured wheel speeds, if any.
@@ -46,7 +46,7 @@ pub(super) struct Drove {
     /// Mean wheel torques, if measured.
     pub(super) torques: Option<WheelTorques>,
     /// Torque of both sides while the robot accelerated.
-    pub(super) set_off: Option<SetOff>,
+    pub(super) acceleration: Option<AccelerationPhase>,
     /// Whether the base was heard during the whole motion.
     pub(super) is_heard: bool,
 }
@@ -175,7 +175,7 @@ impl Ranges {
 
 /// Torque of the wheels during the acceleration from zero.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct SetOff {
+pub(super) struct AccelerationPhase {
     /// Mean torque of both sides together, N m.
     pub(super) torque_n_m: f64,
     /// Duration of the acceleration by the messages' stamps, seconds.
@@ -184,7 +184,7 @@ pub(super) struct SetOff {
     pub(super) gained_rad_s: f64,
 }
 
-impl Drove {
+impl DriveSummary {
     /// Returns the speed over ground, m/s: by position fixes if available, else by odometry.
     pub(super) fn ground_m_s(&self) -> Option<f64> {
         self.places_m_s.or(self.odometry_m_s)
@@ -215,7 +215,7 @@ pub(super) fn drove(
     settings: &Ros2Settings,
     starting: &[Message],
     messages: &[Message],
-) -> Drove {
+) -> DriveSummary {
     let (mut left, mut right) = (Mean::default(), Mean::default());
     let (mut left_torque, mut right_torque) = (Mean::default(), Mean::default());
     let (mut gyro, mut odometry_turn, mut speed) =
@@ -263,7 +263,7 @@ pub(super) fn drove(
             ranges.add(settings, &content);
         }
     }
-    Drove {
+    DriveSummary {
         commanded,
         twist: planar_twist(messages),
         turn_blocks: turn_blocks(settings, messages),
@@ -285,7 +285,7 @@ pub(super) fn drove(
                 left_n_m,
                 right_n_m,
             }),
-        set_off: set_off(settings, starting),
+        acceleration: acceleration(settings, starting),
         is_heard: true,
     }
 }
@@ -372,7 +372,7 @@ pub(super) fn newest_heading_rad(settings: &Ros2Settings, messages: &[Message]) 
 }
 
 /// Returns the torque during the acceleration.
-fn set_off(settings: &Ros2Settings, messages: &[Message]) -> Option<SetOff> {
+fn acceleration(settings: &Ros2Settings, messages: &[Message]) -> Option<AccelerationPhase> {
     let mut torque = Mean::default();
     let mut said = Vec::with_capacity(messages.len());
     for message in messages {
@@ -396,7 +396,7 @@ fn set_off(settings: &Ros2Settings, messages: &[Message]) -> Option<SetOff> {
         gained.add(*speed_rad_s);
     }
     let gained_rad_s = gained.value()?;
-    (intervals > 0.0).then(|| SetOff {
+    (intervals > 0.0).then(|| AccelerationPhase {
         torque_n_m: torque.sum / torque.count,
         // Each message accounts for the time since the previous one.
         span_s: (last_s - first_s) * torque.count / intervals,

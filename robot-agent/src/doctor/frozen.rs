@@ -4,7 +4,7 @@
 //! The robot turned and drove, so every value that depends on motion must have changed. A frozen
 //! sensor differs from a robot that did not move in that another sensor measured the motion.
 
-use super::drove::{Drove, Ranges};
+use super::drove::{DriveSummary, Ranges};
 use super::finding::Finding;
 use crate::drive::ros2::settings::Ros2Settings;
 
@@ -34,7 +34,7 @@ pub(super) struct Frozen {
 impl Frozen {
     /// Detects the sensors that were frozen during both motions; `gyro_bias_rad_s` is the gyro's
     /// offset.
-    pub(super) fn of(turned: &Drove, forward: &Drove, gyro_bias_rad_s: f64) -> Self {
+    pub(super) fn of(turned: &DriveSummary, forward: &DriveSummary, gyro_bias_rad_s: f64) -> Self {
         let ranges = turned.ranges.with(&forward.ranges);
         let turn_rad_s = turned.turn_rad_s.unwrap_or(gyro_bias_rad_s) - gyro_bias_rad_s;
         let seen = Seen::of(&ranges, turn_rad_s, forward);
@@ -67,8 +67,8 @@ impl Frozen {
     pub(super) fn findings(
         self,
         settings: &Ros2Settings,
-        turned: &Drove,
-        forward: &Drove,
+        turned: &DriveSummary,
+        forward: &DriveSummary,
     ) -> Vec<Finding> {
         let mut findings = Vec::new();
         if self.joints() {
@@ -117,7 +117,7 @@ impl Frozen {
 }
 
 /// Describes the motion measured by all sensors but the wheels, for people.
-fn moved(turned: &Drove, forward: &Drove) -> String {
+fn moved(turned: &DriveSummary, forward: &DriveSummary) -> String {
     let mut parts = Vec::new();
     if let Some(turn_rad_s) = turned.turn_rad_s {
         parts.push(format!("turned at {turn_rad_s:.2} rad/s"));
@@ -143,7 +143,7 @@ struct Seen {
 }
 
 impl Seen {
-    fn of(ranges: &Ranges, turn_rad_s: f64, forward: &Drove) -> Self {
+    fn of(ranges: &Ranges, turn_rad_s: f64, forward: &DriveSummary) -> Self {
         let has_turned = |span: f64, commanded: f64| span > TURNED_SHARE * commanded.abs();
         Self {
             left: has_turned(ranges.left.span(), forward.commanded.left_rad_s),
@@ -172,7 +172,7 @@ mod tests {
     use crate::drive::ros2::tests::settings;
 
     /// Returns both motions of a robot with some frozen sensors, which moved or not.
-    fn robot(frozen: Frozen, moves: bool, noise: f64) -> [Drove; 2] {
+    fn robot(frozen: Frozen, moves: bool, noise: f64) -> [DriveSummary; 2] {
         let mut random = 1_u32;
         let mut measured = |value: f64, is_frozen: bool| {
             if is_frozen {
@@ -184,13 +184,13 @@ mod tests {
         [(-1.0, 1.0), (1.0, 1.0)].map(|(left, right): (f64, f64)| {
             let scale = if moves { 1.0 } else { 0.0 };
             let (turn, forward) = (scale * (right - left), scale * (left + right));
-            let mut drove = Drove {
+            let mut drove = DriveSummary {
                 commanded: WheelSpeeds {
                     left_rad_s: 2.5 * left,
                     right_rad_s: 2.5 * right,
                 },
                 turn_rad_s: Some(if frozen.gyro { 0.125 } else { 0.3 * turn }),
-                ..Drove::default()
+                ..DriveSummary::default()
             };
             let ranges = &mut drove.ranges;
             for step in 0..100 {

@@ -32,7 +32,7 @@ use tread_control::measured::WheelSpeeds;
 use tread_control::robot::RobotModel;
 use tread_control::twist_limits::TwistLimits;
 
-use self::drove::Drove;
+use self::drove::DriveSummary;
 use self::finding::Finding;
 use self::heard::{Heard, Message};
 use self::parameters::Parameters;
@@ -73,7 +73,7 @@ pub(crate) struct DoctorArgs {
     /// The configuration file of the robot
     #[arg(long, env = "TREAD_AGENT_CONFIG")]
     config: PathBuf,
-    /// Move the robot: it turns on the spot and drives a metre ahead, at 0.2 m/s
+    /// Move the robot: it turns on the spot and drives a metre forward, at 0.2 m/s
     #[arg(long = "move")]
     moves: bool,
     /// Print one JSON object
@@ -128,29 +128,29 @@ fn examine(args: &DoctorArgs) -> anyhow::Result<Vec<Finding>> {
         .name("robot's bus".to_owned())
         .spawn(move || bus.run())
         .context("no thread")?;
-    let mut hands = Hands {
+    let mut examined = ExaminedDrive {
         drive,
         clock,
         limits: GateLimits::of(&model),
         said: WheelSpeeds::default(),
         parameters: Parameters::new(model, config.prior),
     };
-    let until = hands.clock.monotonic() + FIRST_WORD_MAX;
-    while heard.is_empty() && hands.clock.monotonic() < until {
-        hands.hold(WheelSpeeds::default(), PERIOD);
+    let until = examined.clock.monotonic() + FIRST_WORD_MAX;
+    while heard.is_empty() && examined.clock.monotonic() < until {
+        examined.hold(WheelSpeeds::default(), PERIOD);
     }
     heard.forget();
-    hands.hold(WheelSpeeds::default(), LISTEN_FOR);
+    examined.hold(WheelSpeeds::default(), LISTEN_FOR);
     let at_rest = heard.taken();
     let mut findings = listening::findings(settings, &at_rest, LISTEN_FOR);
-    findings.extend(hands.other_commander(settings));
+    findings.extend(examined.other_commander(settings));
     if args.moves {
         let bias_rad_s = listening::gyro_at_rest_rad_s(settings, &at_rest).unwrap_or(0.0);
-        findings = hands.move_about(settings, &model, &heard, bias_rad_s, findings);
+        findings = examined.move_about(settings, &model, &heard, bias_rad_s, findings);
     }
-    let until = hands.clock.monotonic() + CLOSE_MAX;
-    let clock = Arc::clone(&hands.clock);
-    drop(hands);
+    let until = examined.clock.monotonic() + CLOSE_MAX;
+    let clock = Arc::clone(&examined.clock);
+    drop(examined);
     // A session that does not close is left to the end of the process.
     while !speaking.is_finished() && clock.monotonic() < until {
         std::thread::sleep(PERIOD);
@@ -159,7 +159,7 @@ fn examine(args: &DoctorArgs) -> anyhow::Result<Vec<Finding>> {
 }
 
 /// Drive of the examined robot, with the command in effect.
-struct Hands {
+struct ExaminedDrive {
     drive: Ros2Drive,
     clock: SharedClock,
     limits: GateLimits,
@@ -167,7 +167,7 @@ struct Hands {
     parameters: Parameters,
 }
 
-impl Hands {
+impl ExaminedDrive {
     /// Returns a finding if another node publishes on the command topic.
     fn other_commander(&self, settings: &Ros2Settings) -> Option<Finding> {
         let times = self.drive.counts().foreign_commands();
@@ -288,7 +288,12 @@ impl Hands {
 
     /// Drives with these wheel speeds and summarises the messages. If the base falls silent, it is
     /// commanded to zero and the motion is repeated, at most [`TRIES_MAX`] times.
-    fn drive_for(&mut self, command: WheelSpeeds, settings: &Ros2Settings, heard: &Heard) -> Drove {
+    fn drive_for(
+        &mut self,
+        command: WheelSpeeds,
+        settings: &Ros2Settings,
+        heard: &Heard,
+    ) -> DriveSummary {
         for _ in 0..TRIES_MAX {
             let messages = self.try_to_drive(command, heard);
             self.ramp(WheelSpeeds::default());
@@ -297,7 +302,7 @@ impl Hands {
                 return drove::drove(command, settings, &starting, &steady);
             }
         }
-        Drove::default()
+        DriveSummary::default()
     }
 
     /// Returns the messages of the acceleration and of the steady motion; `None` if the base fell

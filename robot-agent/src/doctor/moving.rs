@@ -7,7 +7,7 @@
 use tread_control::measured::WheelSpeeds;
 use tread_control::robot::RobotModel;
 
-use super::drove::Drove;
+use super::drove::DriveSummary;
 use super::finding::Finding;
 use super::frozen::Frozen;
 use super::signs::{self, Answers};
@@ -34,7 +34,7 @@ fn direction(said: f64, commanded: f64) -> i8 {
     }
 }
 
-fn directions(said: WheelSpeeds, drove: &Drove) -> [i8; 2] {
+fn directions(said: WheelSpeeds, drove: &DriveSummary) -> [i8; 2] {
     [
         direction(said.left_rad_s, drove.commanded.left_rad_s),
         direction(said.right_rad_s, drove.commanded.right_rad_s),
@@ -45,8 +45,8 @@ fn directions(said: WheelSpeeds, drove: &Drove) -> [i8; 2] {
 pub(super) fn findings(
     settings: &Ros2Settings,
     model: &RobotModel,
-    turned: &Drove,
-    forward: &Drove,
+    turned: &DriveSummary,
+    forward: &DriveSummary,
     gyro_bias_rad_s: f64,
 ) -> Vec<Finding> {
     if !(turned.is_heard && forward.is_heard) {
@@ -111,7 +111,7 @@ pub(super) fn findings(
         .map(|ground_m_s| 2.0 * ground_m_s / (going.left_rad_s + going.right_rad_s));
     findings.extend(radius_m.map(|radius_m| of_radius(model, radius_m)));
     let radius_m = radius_m.unwrap_or(model.wheel_radius_m());
-    let turned_of_track = Drove {
+    let turned_of_track = DriveSummary {
         turn_blocks: if frozen.gyro {
             Vec::new()
         } else {
@@ -155,7 +155,9 @@ fn of_standing(of_turn: [i8; 2], of_forward: [i8; 2]) -> Option<Finding> {
         (true, false) => "the left wheels stand though they are commanded to turn",
         (false, true) => "the right wheels stand though they are commanded to turn",
         (false, false) if of_turn.contains(&0) => "the wheels stand when a turn is commanded",
-        (false, false) if of_forward.contains(&0) => "the wheels stand when ahead is commanded",
+        (false, false) if of_forward.contains(&0) => {
+            "the wheels stand when a forward speed is commanded"
+        }
         (false, false) => return None,
     };
     Some(Finding::wrong("wheels", "drive.ros2.command.topic", text))
@@ -186,7 +188,7 @@ fn of_still_body(
             "drive.ros2.odometry.topic"
         };
         let text =
-            "the robot stays where it is though its wheels turn ahead, by its position or odometry";
+            "the robot stays where it is though its wheels turn forward, by its position or odometry";
         Finding::wrong("ground", key, text)
     })
 }
@@ -231,9 +233,9 @@ mod tests {
     }
 
     /// Returns both motions of the paper's robot without any fault.
-    fn healthy() -> [Drove; 2] {
+    fn healthy() -> [DriveSummary; 2] {
         let turn_rad_s = 2.0 * 0.2 / RobotModel::yi2007().effective_track_m();
-        let turned = Drove {
+        let turned = DriveSummary {
             commanded: speeds(-2.5, 2.5),
             wheels: Some(speeds(-2.5, 2.5)),
             turn_rad_s: Some(turn_rad_s),
@@ -251,9 +253,9 @@ mod tests {
                 ..Ranges::default()
             },
             is_heard: true,
-            ..Drove::default()
+            ..DriveSummary::default()
         };
-        let forward = Drove {
+        let forward = DriveSummary {
             commanded: speeds(2.5, 2.5),
             wheels: Some(speeds(2.5, 2.5)),
             turn_rad_s: Some(0.0),
@@ -271,18 +273,18 @@ mod tests {
                 ..Ranges::default()
             },
             is_heard: true,
-            ..Drove::default()
+            ..DriveSummary::default()
         };
         [turned, forward]
     }
 
-    fn keys(turned: &Drove, forward: &Drove) -> Vec<&'static str> {
+    fn keys(turned: &DriveSummary, forward: &DriveSummary) -> Vec<&'static str> {
         let found = findings(&settings(), &RobotModel::yi2007(), turned, forward, 0.0);
         found.iter().filter_map(|finding| finding.key).collect()
     }
 
     /// The paper's base, with its own track width and radius.
-    fn keys_of(change: impl Fn(&mut Drove, &mut Drove)) -> Vec<&'static str> {
+    fn keys_of(change: impl Fn(&mut DriveSummary, &mut DriveSummary)) -> Vec<&'static str> {
         let [mut turned, mut forward] = healthy();
         change(&mut turned, &mut forward);
         keys(&turned, &forward)
@@ -295,7 +297,7 @@ mod tests {
 
     #[test]
     fn frozen_joints_of_a_robot_that_moved_are_not_a_command_that_nobody_takes() {
-        let still = |turned: &mut Drove, forward: &mut Drove| {
+        let still = |turned: &mut DriveSummary, forward: &mut DriveSummary| {
             for drove in [turned, forward] {
                 drove.wheels = Some(speeds(0.0, 0.0));
                 drove.ranges.left = moving([0.0, 0.0]);
@@ -359,7 +361,7 @@ mod tests {
     #[test]
     fn a_radius_is_reported_from_the_distance_over_ground_with_the_line_that_mends_it() {
         let [turned, mut forward] = healthy();
-        let turned = Drove {
+        let turned = DriveSummary {
             turn_rad_s: turned.turn_rad_s.map(|rate| 1.25 * rate),
             turn_blocks: turned
                 .turn_blocks

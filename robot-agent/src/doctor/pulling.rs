@@ -11,7 +11,7 @@
 
 use tread_control::robot::RobotModel;
 
-use super::drove::{Drove, SetOff};
+use super::drove::{AccelerationPhase, DriveSummary};
 use super::finding::Finding;
 use crate::drive::ros2::settings::{Effort, JointSettings, Ros2Settings};
 
@@ -39,23 +39,28 @@ struct Pull {
 pub(super) fn findings(
     settings: &Ros2Settings,
     model: &RobotModel,
-    turned: &Drove,
-    forward: &Drove,
+    turned: &DriveSummary,
+    forward: &DriveSummary,
 ) -> Option<Finding> {
     let joints = settings.joints.as_ref()?;
     let effort = joints.effort;
     (effort != Effort::None).then_some(())?;
     let pull = Pull {
         friction: friction(model, turned)?,
-        momentum_ratio: forward.set_off.and_then(|set_off| {
+        momentum_ratio: forward.acceleration.and_then(|acceleration| {
             let steady = forward.torques?;
-            momentum_ratio(model, forward, &set_off, steady.left_n_m + steady.right_n_m)
+            momentum_ratio(
+                model,
+                forward,
+                &acceleration,
+                steady.left_n_m + steady.right_n_m,
+            )
         }),
     };
     Some(of_signs(&pull, joints).unwrap_or_else(|| of_size(&pull, effort, model)))
 }
 
-fn friction(model: &RobotModel, turned: &Drove) -> Option<[f64; 2]> {
+fn friction(model: &RobotModel, turned: &DriveSummary) -> Option<[f64; 2]> {
     let (torques, wheels) = (turned.torques?, turned.wheels?);
     let longitudinal = model.wheelbase_m() / model.wheelbase_m().hypot(model.track_width_m());
     let traction_n_m = model.wheel_radius_m() * model.side_load_n() * longitudinal;
@@ -67,14 +72,15 @@ fn friction(model: &RobotModel, turned: &Drove) -> Option<[f64; 2]> {
 
 fn momentum_ratio(
     model: &RobotModel,
-    forward: &Drove,
-    set_off: &SetOff,
+    forward: &DriveSummary,
+    acceleration: &AccelerationPhase,
     steady_n_m: f64,
 ) -> Option<f64> {
     let commanded_rad_s = 0.5 * (forward.commanded.left_rad_s + forward.commanded.right_rad_s);
-    (set_off.gained_rad_s > GAINED_MIN * commanded_rad_s).then_some(())?;
-    let gained_m_s = model.wheel_radius_m() * set_off.gained_rad_s;
-    let given_n_s = (set_off.torque_n_m - steady_n_m) * set_off.span_s / model.wheel_radius_m();
+    (acceleration.gained_rad_s > GAINED_MIN * commanded_rad_s).then_some(())?;
+    let gained_m_s = model.wheel_radius_m() * acceleration.gained_rad_s;
+    let given_n_s =
+        (acceleration.torque_n_m - steady_n_m) * acceleration.span_s / model.wheel_radius_m();
     Some(given_n_s / (model.mass_kg() * gained_m_s))
 }
 
@@ -191,24 +197,24 @@ mod tests {
         };
         let longitudinal = model.wheelbase_m() / model.wheelbase_m().hypot(model.track_width_m());
         let scrub_n_m = friction * longitudinal * model.side_load_n() * model.wheel_radius_m();
-        let turned = Drove {
+        let turned = DriveSummary {
             commanded: speeds(-2.0, 2.0),
             wheels: Some(speeds(-2.0, 2.0)),
             torques: torques(-scrub_n_m, scrub_n_m),
-            ..Drove::default()
+            ..DriveSummary::default()
         };
         // Uphill with half a newton metre per side, from rest to 2 rad/s within a second.
         let setting_off_n_m = model.mass_kg() * 2.0 * model.wheel_radius_m().powi(2);
-        let forward = Drove {
+        let forward = DriveSummary {
             commanded: speeds(2.0, 2.0),
             wheels: Some(speeds(2.0, 2.0)),
             torques: torques(0.5, 0.5),
-            set_off: Some(SetOff {
+            acceleration: Some(AccelerationPhase {
                 torque_n_m: factors.iter().sum::<f64>() * 0.5 * (1.0 + setting_off_n_m),
                 span_s: 1.0,
                 gained_rad_s: 2.0,
             }),
-            ..Drove::default()
+            ..DriveSummary::default()
         };
         findings(&settings, &model, &turned, &forward)
     }

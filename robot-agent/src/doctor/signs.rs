@@ -71,7 +71,7 @@ impl Flip {
             Self::TurnCommand => "the base takes a turn to the right for positive",
             Self::ForwardCommand => "the base takes backwards for positive",
             Self::Gyro => "the gyro turns the other way: it hangs upside down",
-            Self::Ground => "position or odometry says backwards where the robot went ahead",
+            Self::Ground => "position or odometry says backwards where the robot drove forward",
         }
     }
 
@@ -168,7 +168,7 @@ pub(super) fn finding(answers: Answers, settings: &Ros2Settings) -> Finding {
     let Some(first) = flips.first() else {
         return Finding::well(
             "sides",
-            "wheels, gyro, ground and command agree on left and ahead",
+            "wheels, gyro, ground and command agree on left and forward",
         );
     };
     let sentence = |flips: &[Flip]| {

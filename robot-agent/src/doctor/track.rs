@@ -15,7 +15,7 @@
 //! cannot be distinguished from another ground: the finding states the range, for comparison with a
 //! tape measure.
 
-use super::drove::{Drove, TurnBlock};
+use super::drove::{DriveSummary, TurnBlock};
 use super::finding::Finding;
 use crate::drive::ros2::settings::{CommandKind, Ros2Settings};
 use tread_control::robot::RobotModel;
@@ -101,19 +101,36 @@ impl EffectiveTrack {
             && ratio(self.least_m) <= *STIFFNESS_RATIO.end()
     }
 
-    /// Returns the track width for an effective track width at the stiffness ratio α = `ratio`, the
-    /// larger one of two solutions; `None` if there is none.
-    fn track_m(effective_m: f64, ratio: f64, wheelbase_m: f64) -> Option<f64> {
-        let root = effective_m.powi(2) - 4.0 * ratio * wheelbase_m.powi(2);
-        (root >= 0.0).then(|| 0.5 * (effective_m + root.sqrt()))
-    }
-
     /// Returns the smallest and the largest possible track width, metres; `None` if there is none.
     fn range_m(&self, wheelbase_m: f64) -> Option<(f64, f64)> {
-        let most_m = Self::track_m(self.most_m, *STIFFNESS_RATIO.start(), wheelbase_m)?;
+        let most_m = Wheels {
+            wheelbase_m,
+            stiffness_ratio: *STIFFNESS_RATIO.start(),
+        }
+        .track_m(self.most_m)?;
         // Without a solution, use the bound of tracks shorter than the wheelbase.
-        let least = Self::track_m(self.least_m, *STIFFNESS_RATIO.end(), wheelbase_m);
+        let least = Wheels {
+            wheelbase_m,
+            stiffness_ratio: *STIFFNESS_RATIO.end(),
+        }
+        .track_m(self.least_m);
         Some((least.unwrap_or(0.5 * self.least_m), most_m))
+    }
+}
+
+/// Wheelbase and stiffness ratio α of the wheels, which relate track and effective track.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Wheels {
+    wheelbase_m: f64,
+    stiffness_ratio: f64,
+}
+
+impl Wheels {
+    /// Returns the track width for an effective track width, the larger one of two solutions, metres;
+    /// `None` if there is none.
+    fn track_m(self, effective_m: f64) -> Option<f64> {
+        let root = effective_m.powi(2) - 4.0 * self.stiffness_ratio * self.wheelbase_m.powi(2);
+        (root >= 0.0).then(|| 0.5 * (effective_m + root.sqrt()))
     }
 }
 
@@ -128,8 +145,8 @@ struct Obeyed {
 pub(super) fn findings(
     settings: &Ros2Settings,
     model: &RobotModel,
-    turned: &Drove,
-    forward: &Drove,
+    turned: &DriveSummary,
+    forward: &DriveSummary,
     calibration: Calibration,
 ) -> Vec<Finding> {
     let (Some(turning), Some(going)) = (turned.wheels, forward.wheels) else {
@@ -152,17 +169,17 @@ fn of_radius_of_base(settings: &Ros2Settings, obeyed: Obeyed) -> Finding {
     if (obeyed.forward - 1.0).abs() <= COMMAND_SHARE {
         return Finding::well(
             "command",
-            "driving ahead the wheels turn as fast as they are commanded",
+            "driving forward, the wheels turn as fast as they are commanded",
         );
     }
     let percent = 100.0 * obeyed.forward;
     if settings.command.kind == CommandKind::JointSpeeds {
-        let text = format!("driving ahead the wheels turn at {percent:.0} % of their command");
+        let text = format!("driving forward, the wheels turn at {percent:.0} % of their command");
         return Finding::wrong("command", "drive.ros2.joints.gear_ratio", text);
     }
     let base_radius_m = settings.command.base_radius_m / obeyed.forward;
     let text = format!(
-        "driving ahead the wheels turn at {percent:.0} % of their command: the base itself divides by a \
+        "driving forward, the wheels turn at {percent:.0} % of their command: the base itself divides by a \
          radius of about {base_radius_m:.3} m (or the gear is another)"
     );
     let value = format!("{base_radius_m:.3}");
@@ -197,11 +214,11 @@ fn of_tracks(
     let is_models = !is_obeyed && is_one_figure && !allows(model_m) && allows(base_m);
     let mut findings = Vec::new();
     if is_obeyed {
-        let text = "turning the wheels turn as fast as they are commanded";
+        let text = "in a turn the wheels turn as fast as they are commanded";
         findings.push(Finding::well("turn command", text));
     } else if settings.command.kind == CommandKind::JointSpeeds {
         let text = format!(
-            "turning the wheels turn at {:.0} % of their command",
+            "in a turn the wheels turn at {:.0} % of their command",
             100.0 * obeyed.turn
         );
         findings.push(Finding::wrong(
@@ -211,7 +228,7 @@ fn of_tracks(
         ));
     } else if !is_models {
         let text = format!(
-            "turning the wheels turn at {:.0} % of their command, ahead at {:.0} %: the base itself \
+            "in a turn the wheels turn at {:.0} % of their command, driving forward at {:.0} %: the base itself \
              divides by a track of {base_m:.3} m (its wheel separation times its multiplier), the \
              configuration says {command_m:.3} m",
             100.0 * obeyed.turn,
@@ -255,7 +272,11 @@ fn of_tracks(
     let fits_m = if allows(base_m) && (base_m - model_m).abs() > SAME_M {
         Some(base_m)
     } else {
-        EffectiveTrack::track_m(effective.mean_m, 1.0, wheelbase_m)
+        Wheels {
+            wheelbase_m,
+            stiffness_ratio: 1.0,
+        }
+        .track_m(effective.mean_m)
     };
     let why = if effective.most_m < model_m {
         "less than the track itself, which no wheels can"

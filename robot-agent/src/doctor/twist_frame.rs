@@ -41,7 +41,7 @@ pub(super) fn finding(twist: &PlanarTwist, rim_m_s: f64, joints: [i8; 2]) -> Opt
     let key = "drive.ros2.odometry.child_frame";
     if wrap_angle_rad(direction_rad - twist.heading_rad).abs() <= FORWARD_MAX_RAD {
         let text = format!(
-            "driving ahead, the odometry's twist points {:.0}° to the left, which is where its pose heads: it \
+            "driving forward, the odometry's twist points {:.0}° to the left, which is where its pose heads: it \
              is in the frame of the pose, and nav_msgs/Odometry wants it in `child_frame_id`. Mend what \
              writes it; no key of robot.toml can",
             direction_rad.to_degrees()
@@ -53,7 +53,7 @@ pub(super) fn finding(twist: &PlanarTwist, rim_m_s: f64, joints: [i8; 2]) -> Opt
         return None;
     }
     let text = format!(
-        "driving ahead, the odometry's twist points {:.0}° to the left: its child frame is turned against the \
+        "driving forward, the odometry's twist points {:.0}° to the left: its child frame is turned against the \
          robot",
         direction_rad.to_degrees()
     );

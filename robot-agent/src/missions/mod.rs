@@ -14,14 +14,16 @@
 
 pub mod memory;
 
-use std::collections::VecDeque;
+use std::collections::{HashSet, VecDeque};
 
 use serde::{Deserialize, Serialize};
 use tread_api::ids::{MissionId, PlanHash};
 use tread_api::mission::PlanSummary;
 use tread_api::wire::command::Offer;
 use tread_api::wire::ingest::MissionPhase;
-use tread_api::wire::reply::{CommandRefusal, CommandRefusalCode};
+use tread_api::wire::reply::{
+    AcceptedMission, CommandRefusal, CommandRefusalCode, EndedMission, MissionOutcomes,
+};
 
 /// Number of ended missions that are remembered; the oldest is dropped first.
 pub const ENDED_MAX: usize = 1_000;
@@ -57,6 +59,9 @@ pub struct MissionSlot {
     #[serde(alias = "held")]
     active: Option<ActiveMission>,
     ended: VecDeque<Ended>,
+    /// Newest of the missions that were dropped from `ended`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    forgotten: Option<MissionId>,
     /// Phase of the active mission's end, while that is being recorded.
     #[serde(skip)]
     ending: Option<MissionPhase>,
@@ -105,6 +110,23 @@ impl MissionSlot {
             .iter()
             .find(|ended| ended.mission == mission)
             .map(|ended| ended.phase)
+    }
+
+    /// Returns how missions ended here, for a server that does not know.
+    pub fn outcomes(&self, asked: &[MissionId]) -> MissionOutcomes {
+        let asked: HashSet<MissionId> = asked.iter().copied().collect();
+        let ended = self.ended.iter().filter(|it| asked.contains(&it.mission));
+        let ended = ended.map(|&Ended { mission, phase }| EndedMission { mission, phase });
+        let accepted = |active: &ActiveMission| AcceptedMission {
+            mission: active.mission,
+            revision: active.revision,
+            plan_hash: active.plan_hash,
+        };
+        MissionOutcomes {
+            ended: ended.collect(),
+            active: self.active.as_ref().map(accepted),
+            forgotten: self.forgotten,
+        }
     }
 
     /// Decides on an offer; changes nothing.
@@ -270,7 +292,8 @@ impl MissionSlot {
 
     fn remember(&mut self, ended: Ended) {
         if self.ended.len() >= ENDED_MAX {
-            self.ended.pop_front();
+            let dropped = self.ended.pop_front().map(|dropped| dropped.mission);
+            self.forgotten = self.forgotten.max(dropped);
         }
         self.ended.push_back(ended);
     }
@@ -436,6 +459,12 @@ mod tests {
                     }
                 }
                 prop_assert!(slot.active().is_none_or(|active| !over.contains(&active.mission)));
+                let asked: Vec<MissionId> = (0..4).map(id).collect();
+                let outcomes = slot.outcomes(&asked);
+                let said: Vec<MissionId> = outcomes.ended.iter().map(|it| it.mission).collect();
+                prop_assert_eq!(&said, &over);
+                let active = outcomes.active.map(|active| active.mission);
+                prop_assert_eq!(active, slot.active().map(|active| active.mission));
             }
         }
 
@@ -446,6 +475,9 @@ mod tests {
                 slot.cancel(id(mission));
             }
             prop_assert_eq!(slot.ended().count() as u128, count.min(ENDED_MAX as u128));
+            let forgotten = slot.outcomes(&[]).forgotten;
+            let last = count.checked_sub(ENDED_MAX as u128 + 1);
+            prop_assert_eq!(forgotten, last.map(id));
             let newest = slot.ended().last().map(|ended| ended.mission);
             prop_assert_eq!(newest, count.checked_sub(1).map(id));
         }

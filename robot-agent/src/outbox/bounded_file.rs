@@ -4,7 +4,8 @@ use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 
-use super::store::{StoreError, failure, size};
+use super::error::{StoreError, failure};
+use super::files::size;
 
 /// Size above which a file becomes the old one, bytes; there are at most two files.
 pub(super) const FILE_BYTES_MAX: u64 = 1024 * 1024;

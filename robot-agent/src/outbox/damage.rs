@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 
 use super::bounded_file::BoundedFile;
-use super::store::{StoreError, failure};
+use super::error::{StoreError, failure};
 
 /// Largest number of bytes kept of one damaged range; the rest is dropped.
 const PIECE_BYTES_MAX: usize = 256 * 1024;

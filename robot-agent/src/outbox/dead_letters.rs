@@ -7,7 +7,7 @@ use serde::Serialize;
 use tread_api::ids::BootId;
 
 use super::bounded_file::BoundedFile;
-use super::store::{StoreError, failure};
+use super::error::{StoreError, failure};
 
 /// The dead-letter file of one outbox.
 #[derive(Debug)]

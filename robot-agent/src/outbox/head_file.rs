@@ -9,8 +9,8 @@ use std::io;
 use std::os::unix::fs::FileExt as _;
 use std::path::{Path, PathBuf};
 
+use super::error::{StoreError, failure};
 use super::frame::{self, Frame, HEAD_FRAME_BYTES, Head};
-use super::store::{StoreError, failure};
 
 const FILE_NAME: &str = "head";
 /// Offsets of the two slots, bytes.

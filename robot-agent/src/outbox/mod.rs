@@ -13,6 +13,8 @@
 mod bounded_file;
 mod damage;
 mod dead_letters;
+mod error;
+mod files;
 mod frame;
 mod head_file;
 mod recovery;
@@ -31,8 +33,9 @@ use tread_api::robot::OutboxStatus;
 use tread_api::wire::ingest::{BATCH_RECORDS_MAX, Batch, Receipt, Record, RecordContent};
 
 use dead_letters::DeadLetters;
+pub use error::StoreError;
 pub use frame::CONTENT_BYTES_MAX;
-pub use store::{Limits, StoreError};
+pub use store::Limits;
 use store::{Settled, Store};
 
 /// Longest delay between appending a record and syncing it to disk.

@@ -14,8 +14,9 @@ use std::os::unix::fs::FileExt as _;
 use std::path::{Path, PathBuf};
 
 use super::damage::DamagedBytes;
+use super::error::{StoreError, failure};
+use super::files::{file_path, size};
 use super::frame::{self, Frame, Head, RecordName};
-use super::store::{StoreError, failure, file_path, size};
 use crate::durable;
 
 /// Bytes per read, so that an unreadable sector costs no more than these.

@@ -9,7 +9,7 @@
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fs::{self, File, OpenOptions};
-use std::io::{self, Write};
+use std::io::Write;
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
@@ -17,12 +17,11 @@ use tracing::error;
 use tread_api::ids::BootId;
 
 use super::damage::DamagedBytes;
+use super::error::{StoreError, failure};
+use super::files::{file_names, file_path, size};
 use super::frame::{self, CONTENT_BYTES_MAX, Frame, Head, RecordName};
 use super::head_file::{HeadFile, HeadWrite};
 use super::recovery::{self, Recovery, Scan};
-
-/// Extension of the store's files.
-const FILE_ENDING: &str = "log";
 
 /// Capacity of a store.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -42,36 +41,6 @@ impl Default for Limits {
             pending_records_max: 200_000,
             file_bytes: 1024 * 1024,
         }
-    }
-}
-
-/// Errors of the store.
-#[derive(Debug, thiserror::Error)]
-pub enum StoreError {
-    /// A file could not be read, written or removed.
-    #[error("the outbox could not {action} `{}`", path.display())]
-    File {
-        /// The operation that failed.
-        action: &'static str,
-        /// The file.
-        path: PathBuf,
-        /// Error of the operating system.
-        #[source]
-        source: io::Error,
-    },
-    /// A record is too large for the store.
-    #[error("a record of {0} bytes does not fit in the outbox")]
-    TooLarge(usize),
-}
-
-pub(super) fn failure<'path>(
-    action: &'static str,
-    path: &'path Path,
-) -> impl FnOnce(io::Error) -> StoreError + 'path {
-    move |source| StoreError::File {
-        action,
-        path: path.to_owned(),
-        source,
     }
 }
 
@@ -495,31 +464,6 @@ impl Store {
     pub(super) fn damage(&self) -> Option<PathBuf> {
         self.has_damage.then(|| self.damaged.path())
     }
-}
-
-pub(super) fn size(length: usize) -> u64 {
-    u64::try_from(length).expect("no machine has longer pointers than 64 bits")
-}
-
-pub(super) fn file_path(folder: &Path, first_ordinal: u64) -> PathBuf {
-    folder.join(format!("{first_ordinal:020}.{FILE_ENDING}"))
-}
-
-fn file_names(folder: &Path) -> Result<Vec<u64>, StoreError> {
-    let mut names = Vec::new();
-    for entry in fs::read_dir(folder).map_err(failure("list", folder))? {
-        let path = entry.map_err(failure("list", folder))?.path();
-        let is_ours = path.extension().is_some_and(|ending| ending == FILE_ENDING);
-        let stem = path.file_stem().and_then(|stem| stem.to_str());
-        if let Some(first_ordinal) = stem
-            .filter(|_| is_ours)
-            .and_then(|stem| stem.parse::<u64>().ok())
-        {
-            names.push(first_ordinal);
-        }
-    }
-    names.sort_unstable();
-    Ok(names)
 }
 
 fn open_for_append(path: &Path) -> Result<File, StoreError> {

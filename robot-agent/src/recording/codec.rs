@@ -12,7 +12,6 @@ use tread_ros2::messages::Text;
 use tread_ros2::messages::tread::{LoopSample, LoopTick, sample_bits, tick_bits};
 
 use super::frame::TickFrame;
-use super::replay::Difference;
 use crate::control_loop::channels::Fault;
 use crate::drive::{Battery, Feedback, SAMPLES_MAX, SensorSample, StatedNoise};
 
@@ -20,6 +19,14 @@ use crate::drive::{Battery, Feedback, SAMPLES_MAX, SensorSample, StatedNoise};
 const TEXT_BYTES_MAX: usize = 64 * 1024 * 1024;
 /// Recorded in fields of absent values, whose bit in `present` is zero.
 const NONE: f64 = f64::NAN;
+
+/// An output that differs from the recorded one.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Difference {
+    pub(crate) name: &'static str,
+    pub(crate) recorded: f64,
+    pub(crate) replayed: f64,
+}
 
 /// Returns whole nanoseconds; saturates at 584 years.
 pub(super) fn nanoseconds(time: Duration) -> u64 {

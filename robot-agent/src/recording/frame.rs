@@ -12,9 +12,9 @@ use tread_control::gate::GateCause;
 use tread_control::geometry::{Pose, Twist};
 use tread_control::measured::WheelSpeeds;
 
-use crate::control_loop::active::Hold;
+use crate::control_loop::channels::Hold;
 use crate::control_loop::channels::{Fault, LoopCommand};
-use crate::control_loop::origin::JobOrigin;
+use crate::control_loop::job::JobOrigin;
 use crate::control_loop::segments::Moment;
 use crate::control_loop::site_view::SiteView;
 use crate::drive::{Battery, Feedback, StatedNoise};

@@ -26,8 +26,8 @@ use tread_api::wire::hello::SiteDefinition;
 use tread_control::estimation::EstimatorPrior;
 
 use crate::config::AgentConfig;
-use crate::control_loop::active::Hold;
-use crate::control_loop::origin::JobOrigin;
+use crate::control_loop::channels::Hold;
+use crate::control_loop::job::JobOrigin;
 use crate::safety::LoopView;
 use frame::NotedCommand;
 pub(crate) use writer::RecordWriter;

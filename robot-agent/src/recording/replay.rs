@@ -15,11 +15,12 @@ use tread_control::robot::{RobotModel, RobotModelError};
 use tread_ros2::cdr::{decode, encode};
 use tread_ros2::messages::tread::{LoopSample, LoopTick, tick_bits};
 
+use super::codec::Difference;
 use super::frame::{Note, Notes, TickFrame, notes};
 use super::read::{Entry, ReadError, Run};
 use super::{CommandMessage, CommandRecord, FORMAT, RunHead, VERSION, codec};
-use crate::control_loop::channels::{AgentEnds, COMMANDS_MAX, Job, LoopCommand, loop_channels};
-use crate::control_loop::origin::JobOrigin;
+use crate::control_loop::channels::{AgentEnds, COMMANDS_MAX, LoopCommand, loop_channels};
+use crate::control_loop::job::{Job, JobOrigin};
 use crate::control_loop::segments::Moment;
 use crate::control_loop::site_view::SiteView;
 use crate::control_loop::tick::LoopCore;
@@ -39,14 +40,6 @@ pub(crate) enum ReplayError {
     Model(#[from] RobotModelError),
     #[error("tick {tick} of the record is none: {problem}")]
     Malformed { tick: u64, problem: String },
-}
-
-/// An output that differs from the recorded one.
-#[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Difference {
-    pub(crate) name: &'static str,
-    pub(crate) recorded: f64,
-    pub(crate) replayed: f64,
 }
 
 /// A tick with outputs that differ.

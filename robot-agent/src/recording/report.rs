@@ -12,7 +12,7 @@ use super::replay::{DifferingTick, Replayed, replay};
 /// Arguments of `tread-agent replay`.
 #[derive(Debug, Clone, Args)]
 pub(crate) struct ReplayArgs {
-    /// The files of one run, all from its first part on
+    /// All files of one run, from its first part on
     #[arg(required = true)]
     files: Vec<PathBuf>,
     /// Print one JSON object

@@ -34,9 +34,9 @@ const CHUNK_BYTES_MAX: u64 = 256 * 1024 * 1024;
 /// Arguments of `tread-agent recover`.
 #[derive(Debug, Clone, Args)]
 pub(crate) struct RecoverArgs {
-    /// The damaged or torn record
+    /// The damaged or truncated record
     file: PathBuf,
-    /// The record to write; it must not be there
+    /// The record to write; the file must not exist
     #[arg(long)]
     into: PathBuf,
     /// Print one JSON object

@@ -34,7 +34,7 @@ use super::{
     CommandMessage, CommandRecord, RecordingConfig, RunHead, SafetyMessage, codec, topics, views,
 };
 use crate::clock::SharedClock;
-use crate::control_loop::origin::JobOrigin;
+use crate::control_loop::job::JobOrigin;
 use crate::safety::LoopView;
 
 /// Interval at which written data are handed to the operating system.

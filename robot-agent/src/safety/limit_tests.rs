@@ -206,7 +206,7 @@ fn a_base_that_falls_silent_is_not_speeded_up() {
 }
 
 #[test]
-fn teleoperation_keeps_every_limit_when_the_hand_turns_about() {
+fn teleoperation_keeps_every_limit_when_the_commands_reverse() {
     let mut bench = bench(5);
     let mut teleoperator = Teleoperator::acquire(&bench);
     let mut watch = Watch::of(&bench);

@@ -273,7 +273,7 @@ fn the_operator_watchdog_stops_a_robot_whose_driver_is_silent() {
 }
 
 #[test]
-fn a_hand_within_limits_and_its_ramps() {
+fn a_teleoperator_stays_within_limits_and_ramps() {
     let mut bench = bench_in(Geofence::default());
     let mut teleoperator = Teleoperator::acquire(&bench);
     let mut fastest_m_s2: f64 = 0.0;
@@ -370,7 +370,7 @@ fn yard() -> Geofence {
 }
 
 #[test]
-fn a_hand_cannot_drive_through_a_fence() {
+fn a_teleoperator_cannot_drive_through_a_fence() {
     for (linear_m_s, angular_rad_s) in [(1.0, 0.0), (-1.0, 0.0), (0.8, 0.3), (1.0, -0.15)] {
         let mut bench = bench_in(yard());
         assert_eq!(bench.ends.shared.snapshot().fence_revision, Some(4));
@@ -508,7 +508,7 @@ fn a_base_without_commands_stops_its_wheels() {
 #[test]
 fn a_refusal_of_a_lease_names_who_has_it() {
     let bench = bench_in(Geofence::default());
-    let _hand = Teleoperator::acquire(&bench);
+    let _teleoperator = Teleoperator::acquire(&bench);
     let refusal = acquire(&bench, 2, 2).unwrap_err();
     assert_eq!(refusal.code, CommandRefusalCode::Leased);
     assert!(refusal.detail.contains("driver 1"), "{refusal:?}");
@@ -517,7 +517,7 @@ fn a_refusal_of_a_lease_names_who_has_it() {
 #[test]
 fn commands_that_do_not_parse_are_counted_and_change_nothing() {
     let mut bench = bench_in(Geofence::default());
-    let _hand = Teleoperator::acquire(&bench);
+    let _teleoperator = Teleoperator::acquire(&bench);
     let long = vec![b' '; 5_000];
     for bad in [&b""[..], b"{}", b"\xff", &long] {
         assert!(!bench.teleoperate(bad));

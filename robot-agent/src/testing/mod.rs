@@ -32,12 +32,11 @@ use tread_control::robot::RobotModel;
 use uuid::Uuid;
 
 use crate::clock::{ManualClock, SharedClock};
-use crate::control_loop::active::Hold;
 use crate::control_loop::channels::{
-    AgentEnds, ClosedSegment, EndReason, Job, LoopCommand, LoopEvent, loop_channels,
+    AgentEnds, ClosedSegment, EndReason, Hold, LoopCommand, LoopEvent, loop_channels,
 };
 use crate::control_loop::driven::Driven;
-use crate::control_loop::origin::JobOrigin;
+use crate::control_loop::job::{Job, JobOrigin};
 use crate::control_loop::segments::Moment;
 use crate::control_loop::site_view::SiteView;
 use crate::control_loop::tick::LoopCore;

@@ -33,7 +33,10 @@ const place: Place = {
   marked: ['rover-1', 'rover-3'],
   view: { center: { x_m: 12.5, y_m: -0.25 }, scale: 33.3 },
   layer: 'theta',
+  time: { at_ms: Date.UTC(2026, 0, 31, 14, 5), span: 'week' },
+  compared: null,
   hidden: ['trails'],
+  alert: null,
   draft,
 };
 
@@ -41,11 +44,27 @@ test('what is shown, selected and drawn comes back from the address as it was', 
   const address = addressOf(place);
   expect(placeOf(`#${address}`)).toEqual(place);
   expect(address).toContain('view=12.5,-0.25,33.3');
-  const bare = { ...place, draft: null, robot: null, marked: [], view: null, layer: '', hidden: [], tab: 'robots' } as const;
+  const bare = { ...place, draft: null, robot: null, marked: [], view: null, layer: '', time: null, hidden: [], tab: 'robots' } as const;
   const none = { ...bare, marked: [], hidden: [] };
   expect(addressOf(none)).toBe('site=yard&layer=none');
   expect(placeOf('#site=yard&layer=none')).toEqual(none);
   for (const layer of ['stiffness', CHANGE]) expect(placeOf(addressOf({ ...place, layer })).layer).toBe(layer);
+});
+
+test('an alert, the time of the friction layer and the times that it compares are in the address', () => {
+  const alert = '0192f0c1-2b3c-7d4e-8f50-617283940a1c';
+  expect(placeOf(`#site=yard&tab=alerts&alert=${alert}`)).toMatchObject({ site: 'yard', tab: 'alerts', alert });
+  expect(addressOf(place)).toContain('time=2026-01-31T14:05Z&span=week');
+  const compared = { from_ms: Date.UTC(2026, 0, 1, 8), to_ms: Date.UTC(2026, 0, 2, 9, 30) };
+  const whole: Place = { ...place, tab: 'alerts', alert, layer: CHANGE, time: null, compared };
+  expect(addressOf(whole)).toContain('from=2026-01-01T08:00Z&to=2026-01-02T09:30Z');
+  expect(placeOf(addressOf(whole))).toEqual(whole);
+  const open: Place = { ...whole, compared: { ...compared, to_ms: null } };
+  expect(placeOf(addressOf(open))).toEqual(open);
+  for (const wrong of ['now', '2026-13-01T00:00Z', '2026-01-01', '1e9']) {
+    expect(placeOf(`site=yard&time=${wrong}&from=${wrong}`)).toMatchObject({ time: null, compared: null });
+  }
+  expect(placeOf('site=yard&time=2026-01-31T14:05Z&span=year').time?.span).toBe('day');
 });
 
 test('a reload brings back what the tab kept, an address from elsewhere what it says', () => {

@@ -4,6 +4,7 @@ import type { TerrainClass } from './api/schema';
 import type { PointM } from './map/camera';
 import type { DraftKind } from './map/draft';
 import { RANGES, type Quantity } from './map/friction';
+import { SPANS, type Span } from './map/moments';
 import { texts } from './texts';
 
 export const TABS = ['robots', 'missions', 'alerts', 'terrains'] as const;
@@ -58,7 +59,13 @@ export interface Place {
   view: { center: PointM; scale: number } | null;
   /** What the friction layer shows, or `CHANGE`; empty for none. */
   layer: string;
+  /** The time that the friction layer is shown of, with the span of its slider; null for the present. */
+  time: { at_ms: number; span: Span } | null;
+  /** The times that the friction layer compares; the second is null for the present. */
+  compared: { from_ms: number; to_ms: number | null } | null;
   hidden: Hideable[];
+  /** The alert that is shown; null for none. */
+  alert: string | null;
   draft: DraftState | null;
 }
 
@@ -69,6 +76,15 @@ const DRAWN_DIGITS = 9;
 const number = (value: number, digits = DRAWN_DIGITS) =>
   Number.isFinite(value) ? String(Number(value.toFixed(digits))) : '';
 const writePoints = (points: readonly PointM[]) => points.map(({ x_m, y_m }) => `${number(x_m)},${number(y_m)}`).join(';');
+
+/** A moment, to the minute: `2026-01-31T14:05Z`. */
+const writeMoment = (at_ms: number) => `${new Date(at_ms).toISOString().slice(0, 16)}Z`;
+
+function readMoment(text: string | null): number | null {
+  if (text === null || !/^\d{4}-\d{2}-\d{2}T\d{2}:\d{2}Z$/.test(text)) return null;
+  const at_ms = Date.parse(text);
+  return Number.isNaN(at_ms) ? null : at_ms;
+}
 
 /** What was typed and is no number is kept as none. */
 const readNumber = (text: string | undefined) => (text === undefined || text.trim() === '' ? NaN : Number(text));
@@ -93,7 +109,16 @@ export function addressOf(place: Place, most = ADDRESS_MAX): string {
     query.set('view', [center.x_m, center.y_m, scale].map((value) => number(value, SEEN_DIGITS)).join(','));
   }
   query.set('layer', place.layer || LAYER_NONE);
+  if (place.time) {
+    query.set('time', writeMoment(place.time.at_ms));
+    query.set('span', place.time.span);
+  }
+  if (place.compared) {
+    query.set('from', writeMoment(place.compared.from_ms));
+    if (place.compared.to_ms !== null) query.set('to', writeMoment(place.compared.to_ms));
+  }
   if (place.hidden.length > 0) query.set('hidden', place.hidden.join(','));
+  if (place.alert) query.set('alert', place.alert);
   const plain = readable(query);
   if (!place.draft) return plain;
   const { center, points, old, radius_m, speed_m_s, turns, priority, layer } = place.draft;
@@ -125,6 +150,7 @@ export function placeOf(address: string): Place {
   const list = (name: string) => (query.get(name) ?? '').split(',').filter(Boolean);
   const [x_m = NaN, y_m = NaN, scale = NaN] = (query.get('view') ?? '').split(',').map(readNumber);
   const isView = [x_m, y_m, scale].every(Number.isFinite) && scale > 0;
+  const [at_ms, from_ms] = [readMoment(query.get('time')), readMoment(query.get('from'))];
   return {
     site: query.get('site'),
     tab: oneOf(TABS, query.get('tab')) ?? 'robots',
@@ -132,7 +158,10 @@ export function placeOf(address: string): Place {
     marked: list('selected'),
     view: isView ? { center: { x_m, y_m }, scale } : null,
     layer: layerOf(query.get('layer')),
+    time: at_ms === null ? null : { at_ms, span: oneOf(SPANS, query.get('span')) ?? 'day' },
+    compared: from_ms === null ? null : { from_ms, to_ms: readMoment(query.get('to')) },
     hidden: list('hidden').flatMap((name) => oneOf(HIDEABLE, name) ?? []),
+    alert: query.get('alert'),
     draft: draftOf(query.get('draft')),
   };
 }

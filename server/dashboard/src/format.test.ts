@@ -1,5 +1,5 @@
 import { expect, test } from 'vitest';
-import { about, estimate, exact, moment, number, short, span, unit } from './format';
+import { about, estimate, exact, moment, number, short, span, unit, minute, momentOf } from './format';
 
 test('what is not known is a dash', () => {
   expect([number(null, 1), short(undefined), span(NaN), number(Infinity, 2)]).toEqual(['–', '–', '–', '–']);
@@ -29,6 +29,15 @@ test('moments have one format, with the offset for who asks', () => {
   expect(moment(at)).toMatch(/^2026-01-0[123] \d\d:\d\d:05$/);
   expect(exact(at)).toMatch(/^2026-01-0[123]T\d\d:\d\d:05[+-]\d\d:\d\d \(.+\)$/);
   expect(Date.parse(exact(at).replace(/ \(.*/, ''))).toBe(Date.parse(at));
+});
+
+test('what is typed as a moment is read as it is shown, and nothing else is', () => {
+  const at = new Date(2026, 0, 31, 14, 5).getTime();
+  expect(minute(at)).toBe('2026-01-31 14:05');
+  for (const text of [minute(at), ' 2026-1-31 14:05 ', '2026-01-31T14:05', '2026-01-31 14:05:00']) expect(momentOf(text), text).toBe(at);
+  for (const text of ['', 'yesterday', '31.01.2026 14:05', '2026-02-31 14:05', '2026-01-31 24:05', '2026-01-31', '14:05']) {
+    expect(momentOf(text), text).toBeNaN();
+  }
 });
 
 test('estimates are short, and a time of day has its day where that is another one', () => {

@@ -87,7 +87,23 @@ export function moment(at: string | number | Date): string {
   return `${day} ${time}`;
 }
 
-/** The same with its offset from UTC, and the name of the time zone. */
+/** The same to the minute, as it is typed: `2026-01-31 14:05`. */
+export function minute(at: string | number | Date): string {
+  return moment(at).slice(0, -':00'.length);
+}
+
+/** What was typed as a moment, where whoever looks is, milliseconds; `NaN` if it is none. Seconds may be left out. */
+export function momentOf(text: string): number {
+  const found = /^\s*(\d{4})-(\d{1,2})-(\d{1,2})[ T]+(\d{1,2}):(\d{2})(?::(\d{2}))?\s*$/.exec(text);
+  if (!found) return NaN;
+  const [year = NaN, month = NaN, day = NaN, hour = NaN, min = NaN, s = 0] = found.slice(1).map((part) => (part ? Number(part) : undefined));
+  const date = new Date(year, month - 1, day, hour, min, s);
+  // A date like the 31st of April would be one of May.
+  const isMeant = date.getMonth() === month - 1 && date.getDate() === day && hour < 24 && min < 60 && s < 60;
+  return isMeant ? date.getTime() : NaN;
+}
+
+/** A moment with its offset from UTC, and the name of the time zone. */
 export function exact(at: string | number | Date): string {
   const date = new Date(at);
   const { day, time } = parts(date);

@@ -1,6 +1,6 @@
 import { expect, test } from 'vitest';
 import type { Robot } from './api/schema';
-import { between, countsOf, groupOf, listed, type Group, type Wanted } from './roster';
+import { between, countsOf, groupOf, listed, nameRanks, type Group, type Wanted } from './roster';
 
 interface Made {
   mode?: string;
@@ -29,7 +29,7 @@ function robot(id: string, made: Made = {}): Robot {
 
 const all: Wanted = { search: '', groups: new Set<Group>(), model: null, tag: null, order: 'trouble' };
 const ids = (robots: Robot[], wanted: Partial<Wanted>) =>
-  listed(robots.map((robot) => ({ robot })), { ...all, ...wanted }).map((entry) => entry.robot.id);
+  listed(robots.map((robot) => ({ robot })), { ...all, ...wanted }, nameRanks(robots)).map((entry) => entry.robot.id);
 
 const fleet = [
   robot('rover-10'),

@@ -39,12 +39,20 @@ export function compareNames(a: Robot, b: Robot): number {
 
 /** Whether each word of a search is in a robot's name, identifier or tags. */
 function isFound(robot: Robot, words: readonly string[]): boolean {
+  if (words.length === 0) return true;
   const text = [robot.name, robot.id, ...(robot.tags ?? [])].join(' ').toLowerCase();
   return words.every((word) => text.includes(word));
 }
 
-/** The robots that are wanted, in the order that is wanted. */
-export function listed<Entry extends { robot: Robot }>(entries: readonly Entry[], wanted: Wanted): Entry[] {
+/** The place of each robot in the order of names. */
+export type NameRanks = ReadonlyMap<string, number>;
+
+export function nameRanks(robots: Iterable<Robot>): NameRanks {
+  return new Map([...robots].sort(compareNames).map((robot, rank) => [robot.id, rank]));
+}
+
+/** The robots that are wanted, in the order that is wanted. Names are ranked beforehand: they change seldom. */
+export function listed<Entry extends { robot: Robot }>(entries: readonly Entry[], wanted: Wanted, ranks: NameRanks): Entry[] {
   const words = wanted.search.toLowerCase().split(/\s+/).filter(Boolean);
   const found = entries
     .map((entry) => ({ entry, rank: GROUPS.indexOf(groupOf(entry.robot)) }))
@@ -56,7 +64,8 @@ export function listed<Entry extends { robot: Robot }>(entries: readonly Entry[]
         (wanted.tag === null || (robot.tags ?? []).includes(wanted.tag)),
     );
   const isByTrouble = wanted.order === 'trouble';
-  found.sort((a, b) => (isByTrouble ? a.rank - b.rank : 0) || compareNames(a.entry.robot, b.entry.robot));
+  const rankOf = ({ robot }: Entry) => ranks.get(robot.id) ?? ranks.size;
+  found.sort((a, b) => (isByTrouble ? a.rank - b.rank : 0) || rankOf(a.entry) - rankOf(b.entry));
   return found.map(({ entry }) => entry);
 }
 

@@ -20,12 +20,12 @@ test('a robot that is to stand and moves is said so, whatever its mode', () => {
 });
 
 test('a stop is red until it is confirmed, and again where its robot does not stand', () => {
-  expect(stopped(stop(null), live('stopped', 'standing')).look).toBe('red');
-  expect(stopped(stop(AT), live('stopped', 'stopping'))).toEqual({
+  expect(stopped(stop(null), 'rover-1', live('stopped', 'standing')).look).toBe('red');
+  expect(stopped(stop(AT), 'rover-1', live('stopped', 'stopping'))).toEqual({
     text: 'rover-1 is stopping: its wheels are commanded to rest',
     look: 'held',
   });
-  expect(stopped(stop(AT), live('stopped', 'standing')).text).toContain('stands');
-  expect(stopped(stop(AT), live('stopped', 'does_not_stand')).look).toBe('red');
-  expect(stopped(stop(AT), live('stopped', 'moves')).look).toBe('red');
+  expect(stopped(stop(AT), 'rover-1', live('stopped', 'standing')).text).toContain('stands');
+  expect(stopped(stop(AT), 'rover-1', live('stopped', 'does_not_stand')).look).toBe('red');
+  expect(stopped(stop(AT), 'rover-1', live('stopped', 'moves')).look).toBe('red');
 });

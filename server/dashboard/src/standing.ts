@@ -13,11 +13,11 @@ export function doing(live: RobotLive | null | undefined): { text: string; isBad
 }
 
 /** A stop that is in force: unconfirmed, stopping, standing, or not obeyed. */
-export function stopped(stop: Stop, live: RobotLive | null | undefined): { text: string; look: 'held' | 'red' } {
+export function stopped(stop: Stop, name: string, live: RobotLive | null | undefined): { text: string; look: 'held' | 'red' } {
   const standing = live?.safety.standing?.state;
-  if (!stop.confirmed_at) return { text: texts.stop.unconfirmed(stop.robot), look: 'red' };
-  if (standing === 'does_not_stand') return { text: texts.stop.runs(stop.robot), look: 'red' };
-  if (standing === 'moves') return { text: texts.stop.moves(stop.robot), look: 'red' };
+  if (!stop.confirmed_at) return { text: texts.stop.unconfirmed(name), look: 'red' };
+  if (standing === 'does_not_stand') return { text: texts.stop.runs(name), look: 'red' };
+  if (standing === 'moves') return { text: texts.stop.moves(name), look: 'red' };
   const stands = standing === 'standing' || (standing === undefined && stop.standing_at);
-  return { text: stands ? texts.stop.confirmed(stop.robot) : texts.stop.stopping(stop.robot), look: 'held' };
+  return { text: stands ? texts.stop.confirmed(name) : texts.stop.stopping(name), look: 'held' };
 }

@@ -1,9 +1,9 @@
 // For everybody: axe-core on every part of the page, and a whole run by keys alone.
 import type { Page } from 'playwright-core';
 import { beforeAll, expect, test } from 'vitest';
-import type { Mission, Page as ApiPage } from './types';
+import type { Mission, Page as ApiPage, Stop } from './types';
 import { violations } from './checks';
-import { api, browser, eventually, select, shot, token } from './harness';
+import { agentOf, api, browser, eventually, line, select, shot, token } from './harness';
 
 const { open } = browser();
 /** How long a short mission may take, milliseconds. */
@@ -20,12 +20,14 @@ beforeAll(async () => {
   await eventually('a mission that has succeeded', succeeded, MISSION_MS);
 });
 
+const SIZES = [
+  ['wide', { width: 1360, height: 850 }],
+  ['tablet', { width: 900, height: 1100 }],
+  ['phone', { width: 390, height: 800 }],
+] as const;
+
 for (const theme of ['light', 'dark'] as const) {
-  for (const [name, size] of [
-    ['wide', { width: 1360, height: 850 }],
-    ['tablet', { width: 900, height: 1100 }],
-    ['phone', { width: 390, height: 800 }],
-  ] as const) {
+  for (const [name, size] of SIZES) {
     test(`no part of the page violates a rule of accessibility: ${theme}, ${name}`, async () => {
       const stranger = await open({ as: null, theme, size, expected: /401/ });
       await stranger.getByLabel('Token').waitFor();
@@ -83,9 +85,9 @@ for (const theme of ['light', 'dark'] as const) {
       expect(await violations(page), 'drawing').toEqual([]);
       await page.getByRole('button', { name: 'Discard' }).click();
       await page.getByRole('button', { name: 'Teleoperate' }).click();
-      await page.getByText('You have the lease.').waitFor();
+      await page.getByText('You control this robot.').waitFor();
       await page.getByRole('button', { name: 'Stop rover-3' }).click();
-      const clear = page.getByRole('button', { name: 'Clear rover-3' });
+      const clear = page.getByRole('button', { name: 'Clear the stop of rover-3' });
       await clear.waitFor();
       expect(await violations(page), 'driving, stopped').toEqual([]);
       await shot(page, `${theme}-${name}`);
@@ -102,6 +104,108 @@ for (const theme of ['light', 'dark'] as const) {
       // With the page goes its lease.
       await page.close();
     });
+  }
+}
+
+/** What browsers say of a line that was cut, and of answers that tests let the server give. */
+const EXPECTED = /ERR_|Failed to load|WebSocket|CSP: none|40[149]|412|422|503/;
+
+for (const theme of ['light', 'dark'] as const) {
+  for (const [name, size] of SIZES) {
+    test(`nothing that goes wrong violates a rule of accessibility: ${theme}, ${name}`, async () => {
+      const wire = await line();
+      const page = await open({ theme, size, address: wire.address, expected: EXPECTED, kept: { 'tread-guide': 'open' } });
+      await page.locator('[data-test="guide"]').waitFor();
+      expect(await violations(page), 'first steps').toEqual([]);
+      await page.locator('[data-test="guide"]').getByRole('button', { name: 'Close' }).click();
+
+      // A draft that the server refuses, and one that sends others away.
+      await select(page, 'rover-2');
+      await page.getByRole('button', { name: 'Change tags' }).click();
+      expect(await violations(page), 'tags').toEqual([]);
+      await page.getByRole('button', { name: 'Cancel', exact: true }).click();
+      await page.getByRole('button', { name: 'New mission' }).click();
+      await page.getByLabel('Centre x, m').fill('8');
+      await page.getByLabel('Centre y, m').fill('16');
+      // Longer than any path may be.
+      await page.getByLabel('Turns').fill('99999');
+      await page.getByLabel('Turns').press('Tab');
+      await page.locator('form .problem').first().waitFor();
+      await page.getByText(/^Not yet\. /).waitFor();
+      expect(await violations(page), 'a refused draft').toEqual([]);
+      await shot(page, `refused-${theme}-${name}`);
+      await page.getByRole('button', { name: 'Discard' }).click();
+      expect(await violations(page), 'a discarded draft').toEqual([]);
+      await page.getByRole('button', { name: 'Dismiss' }).click();
+
+      // A geofence that somebody changed meanwhile.
+      await page.getByRole('tab', { name: 'Terrains' }).click();
+      await page.route('**/geofence', (route) =>
+        route.request().method() === 'PUT'
+          ? route.fulfill({ status: 412, contentType: 'application/problem+json', body: JSON.stringify({ type: '/problems/changed-meanwhile', title: 'It was changed', status: 412 }) })
+          : route.fallback(),
+      );
+      await page.getByRole('button', { name: 'Area to stay out of' }).click();
+      for (let corner = 0; corner < 3; corner += 1) await page.getByRole('button', { name: 'Add point' }).click();
+      await page.getByRole('button', { name: 'Save' }).click();
+      await page.getByText('Somebody changed the geofence meanwhile').waitFor();
+      expect(await violations(page), 'a conflict of the geofence').toEqual([]);
+      await page.getByRole('button', { name: 'Discard' }).click();
+
+      // Webhooks, their form, and what asks once more.
+      await page.getByRole('tab', { name: 'Alerts' }).click();
+      await page.getByText('Webhooks', { exact: true }).click();
+      await page.getByRole('button', { name: 'New webhook' }).click();
+      await page.getByRole('checkbox', { name: 'all kinds' }).uncheck();
+      expect(await violations(page), 'the form of a webhook').toEqual([]);
+
+      // Stops of several robots of which one cannot answer.
+      await page.getByRole('tab', { name: 'Robots' }).click();
+      await page.getByRole('button', { name: 'All robots' }).click();
+      await page.getByLabel('Select all 3').check();
+      const bar = page.getByRole('region', { name: 'What to do with the selected robots' });
+      await bar.getByRole('button', { name: 'Cancel missions' }).click();
+      expect(await violations(page), 'what asks once more').toEqual([]);
+      const agent = agentOf('rover-2');
+      process.kill(agent, 'SIGSTOP');
+      try {
+        await bar.getByRole('button', { name: 'Stop', exact: true }).click();
+        await page.getByText('rover-2 has NOT confirmed its stop').first().waitFor();
+        await page.locator('[data-test="bulk"]').getByText(/NOT confirmed/).first().waitFor();
+        expect(await violations(page), 'a stop that is not confirmed').toEqual([]);
+        await shot(page, `unconfirmed-${theme}-${name}`);
+      } finally {
+        process.kill(agent, 'SIGCONT');
+      }
+      await bar.getByRole('button', { name: 'Clear stops' }).click();
+      await bar.getByRole('button', { name: 'Clear the stops of 3 now' }).click();
+      await page.locator('[data-test="bulk"]').getByText(/cleared|done|failed/).first().waitFor();
+      expect(await violations(page), 'what became of each robot').toEqual([]);
+      await eventually('no stop is in force', async () => {
+        const { items } = await api<ApiPage<Stop>>('/v1/stops?site=yard&in_force=true');
+        for (const { robot, id } of items) await api(`/v1/sites/yard/robots/${robot}/stop/clear`, 'POST', { stop: id }).catch(() => undefined);
+        return items.length === 0;
+      });
+
+      // A server that is lost, and a stop that did not get there.
+      wire.cut();
+      await page.getByText(/^The server has not answered since/).waitFor();
+      await page.keyboard.press('Alt+Shift+KeyX');
+      await page.getByText(/may not have got the stop/).waitFor();
+      expect(await violations(page), 'a lost server and a failed stop').toEqual([]);
+      await shot(page, `lost-${theme}-${name}`);
+      wire.end();
+      await page.close();
+
+      // Whoever may only look.
+      const made = await api<{ secret: string }>('/v1/tokens', 'POST', { name: `viewer ${theme} ${name} ${Date.now()}`, role: 'viewer' });
+      const viewer = await open({ theme, size, as: made.secret });
+      for (const tab of ['Robots', 'Missions', 'Alerts', 'Terrains']) {
+        await viewer.getByRole('tab', { name: tab }).click();
+        expect(await violations(viewer), `${tab} of a viewer`).toEqual([]);
+      }
+      await viewer.close();
+    }, 180_000);
   }
 }
 
@@ -167,7 +271,7 @@ test('a whole run by keys alone: sign in, select, draw, send, stop, clear', asyn
     const robot = await api<{ live: { twist: { value: { linear_m_s: number } } } }>('/v1/sites/yard/robots/rover-3');
     return Math.abs(robot.live.twist.value.linear_m_s) < 0.02;
   });
-  await tabTo(page, /^Clear rover-3/);
+  await tabTo(page, /^Clear the stop of rover-3/);
   await page.keyboard.press('Enter');
   await page.locator('[data-robot="rover-3"].held').waitFor({ state: 'detached' });
   await api(`/v1/missions/${sent.id}/cancel`, 'POST');

@@ -58,6 +58,8 @@ function wordsOf(model: Robot, index: number, count: number, kinds: Record<keyof
 
 /** Puts a crowd in the place of the robots of the stream, before the page is opened. */
 export async function crowd(page: Page, count: number, kinds: Record<keyof typeof CROWD, number> = CROWD): Promise<void> {
+  // The server knows none of them: nothing is behind the sockets that watch them.
+  await page.routeWebSocket(/\/drive$/, () => undefined);
   const { items } = await api<{ items: Robot[] }>('/v1/sites/yard/robots');
   const model = items.find((robot) => robot.live?.pose && robot.live.twist);
   if (!model) throw new Error('no robot says where it is');

@@ -65,6 +65,7 @@ test('the first robot is listed within 600 ms after the sign-in, half of the tim
 for (const [name, load] of [
   ['200 robots with trails and 1024² cells', { robots: 200, withFriction: true }],
   ['500 robots with trails and labels', { robots: 500, withFriction: false }],
+  ['500 robots with trails, labels and 1024² cells', { robots: 500, withFriction: true }],
 ] as const) {
   test(`${name} are drawn 30 times a second without a graphics card`, async () => {
     const bench = await createServer({ root: new URL('..', import.meta.url).pathname, logLevel: 'error', server: { port: 0 } });
@@ -77,7 +78,7 @@ for (const [name, load] of [
         load,
       );
       console.log(`${name}: ${JSON.stringify(frames)}`);
-      await shot(page, `bench-${load.robots}`);
+      await shot(page, `bench-${load.robots}${load.withFriction ? '-friction' : ''}`);
       expect(frames.labels).toBeGreaterThanOrEqual(load.robots);
       expect(frames.frames_s).toBeGreaterThanOrEqual(30);
       // They drive, and each frame shows it.

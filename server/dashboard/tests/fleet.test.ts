@@ -3,7 +3,7 @@ import type { Locator } from 'playwright-core';
 import { expect, test } from 'vitest';
 import type { CellDifference, CellFriction, CreatedToken, Mission, Page as ApiPage, Robot } from './types';
 import { changeColour, shareOfChange } from '../src/map/compare';
-import { moment } from '../src/format';
+import { minute, moment } from '../src/format';
 import { texts } from '../src/texts';
 import { api, browser, eventually, map, select, server, shot, token, windowOf } from './harness';
 
@@ -127,8 +127,6 @@ test('from far the friction layer is read in larger squares, and whole', async (
   await shot(page, 'far');
 });
 
-/** A wall time as its input has it. */
-const local = (at_ms: number) => new Date(at_ms - new Date(at_ms).getTimezoneOffset() * 60_000).toISOString().slice(0, 16);
 
 test('two times of the friction map are compared', async () => {
   const from = new Date(Date.now() - 3_600_000).toISOString();
@@ -153,13 +151,28 @@ test('two times of the friction map are compared', async () => {
   await shot(page, 'compare');
   // Two times of one hour, and the page says which.
   const [before_ms, after_ms] = [2, 1].map((minutes) => (Math.floor(Date.now() / 60_000) - minutes) * 60_000) as [number, number];
-  await page.getByLabel('Before').fill(local(before_ms));
-  await page.getByLabel('After').fill(local(after_ms));
+  const enter = async (label: string, text: string) => {
+    await page.getByLabel(label).fill(text);
+    await page.getByLabel(label).press('Enter');
+  };
+  await enter('Before', minute(before_ms));
+  await enter('After', minute(after_ms));
   const said = texts.map.compared(...([before_ms, after_ms].map((at) => moment(new Date(at).toISOString())) as [string, string]));
   await page.locator('[data-test="compared"]').getByText(said).waitFor();
+  // Both times come back with the address.
+  await eventually('the times in the address', async () => /from=.*Z&to=.*Z/.test(page.url()));
+  await page.reload();
+  await page.locator('[data-test="compared"]').getByText(said).waitFor();
+  expect(await page.getByLabel('Before').inputValue()).toBe(minute(before_ms));
+  expect(await page.getByLabel('After').inputValue()).toBe(minute(after_ms));
+  // What is no time is said to be none.
+  for (const wrong of ['', 'yesterday', '2026-02-31 12:00']) {
+    await enter('Before', wrong);
+    await page.getByText(/^Before: enter a time like \d{4}-\d\d-\d\d \d\d:\d\d\.$/).waitFor();
+  }
   // Between two times of long ago nothing was measured.
-  await page.getByLabel('Before').fill('2020-01-01T00:00');
-  await page.getByLabel('After').fill('2020-02-01T00:00');
+  await enter('Before', '2020-01-01 00:00');
+  await enter('After', '2020-02-01 00:00');
   await page.getByText('Nothing was measured between these times.').waitFor();
   await page.getByRole('combobox', { name: 'Friction' }).selectOption('θ = 1/K');
   await page.getByLabel('Before').waitFor({ state: 'detached' });

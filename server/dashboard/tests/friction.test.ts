@@ -266,7 +266,7 @@ test('the map is shown as of past hours, one after the other', async () => {
   });
   await time.getByRole('button', { name: 'Play' }).click();
   await eventually('three days', async () => new Set(days).size >= 3);
-  await time.getByRole('button', { name: 'Hold' }).click();
+  await time.getByRole('button', { name: 'Pause' }).click();
   expect([...days].sort()).toEqual(days);
   expect(days.every((day) => day.endsWith('T00:00:00.000Z'))).toBe(true);
   // Of the last hour each minute is known, and the server rounds nothing.

@@ -1,11 +1,9 @@
 // Stop and teleoperation, with real robots at the other end.
-import { execFileSync } from 'node:child_process';
-import { readFileSync } from 'node:fs';
 import { setTimeout as delay } from 'node:timers/promises';
-import { expect, inject, test } from 'vitest';
+import { expect, test } from 'vitest';
 import type { Page } from 'playwright-core';
 import type { Page as ApiPage, Robot, Stop } from './types';
-import { api, browser, eventually, select, shot } from './harness';
+import { agentOf, api, browser, eventually, select, shot } from './harness';
 
 const { open } = browser();
 
@@ -14,20 +12,10 @@ const speed = async (id: string) => (await robot(id)).live?.twist?.value.linear_
 const stops = async (id: string) =>
   (await api<ApiPage<Stop>>(`/v1/stops?site=yard&robot=${id}&in_force=true`)).items;
 
-/** The process of a robot's agent: one of the demo's children. */
-function agentOf(id: string): number {
-  const children = execFileSync('pgrep', ['-P', String(inject('demoPid'))], { encoding: 'utf8' });
-  for (const pid of children.trim().split('\n').map(Number)) {
-    const words = readFileSync(`/proc/${pid}/cmdline`, 'utf8').split('\0');
-    if (words.includes('agent') && words.some((word) => word.includes(id))) return pid;
-  }
-  throw new Error(`no agent of ${id} among ${children}`);
-}
-
 async function beginDriving(page: Page, id: string): Promise<void> {
   await select(page, id);
   await page.getByRole('button', { name: 'Teleoperate' }).click();
-  await page.getByText('You have the lease.').waitFor();
+  await page.getByText('You control this robot.').waitFor();
 }
 
 /** How late what the server sends on the drive socket reaches the page: several commands. */
@@ -55,7 +43,7 @@ test('a stop is shown confirmed and is cleared from the page', async () => {
   expect((await stops('rover-2')).length).toBe(1);
   await shot(page, 'stopped');
   await standsStill('rover-2');
-  await page.getByRole('button', { name: 'Clear rover-2' }).click();
+  await page.getByRole('button', { name: 'Clear the stop of rover-2' }).click();
   await shown.waitFor({ state: 'detached' });
   expect(await stops('rover-2')).toEqual([]);
 });
@@ -71,7 +59,7 @@ test('space on the stick stops the robot that somebody drives', async () => {
   await shown.waitFor();
   expect((await stops('rover-2')).length).toBe(1);
   await standsStill('rover-2');
-  await page.getByRole('button', { name: 'Clear rover-2' }).click();
+  await page.getByRole('button', { name: 'Clear the stop of rover-2' }).click();
   await shown.waitFor({ state: 'detached' });
 });
 
@@ -90,7 +78,7 @@ test('a stop that the robot has not confirmed stays red until it has', async () 
   }
   await page.locator('[data-robot="rover-2"].held').waitFor();
   await standsStill('rover-2');
-  await page.getByRole('button', { name: 'Clear rover-2' }).click();
+  await page.getByRole('button', { name: 'Clear the stop of rover-2' }).click();
   await eventually('the clear', async () => (await stops('rover-2')).length === 0);
 });
 
@@ -106,7 +94,7 @@ test('the shortcut stops all robots, also while somebody types', async () => {
   await shot(page, 'all-stopped');
   for (const id of ['rover-1', 'rover-2', 'rover-3']) {
     await standsStill(id);
-    await page.getByRole('button', { name: `Clear ${id}` }).click();
+    await page.getByRole('button', { name: `Clear the stop of ${id}` }).click();
     await eventually(`${id} is cleared`, async () => (await stops(id)).length === 0);
   }
 });
@@ -134,7 +122,7 @@ test('keys drive a robot, and a hidden tab makes it stand', async () => {
   await eventually('rover-2 drives backwards', async () => (await speed('rover-2')) < -0.1);
   await page.keyboard.up('ArrowDown');
   await standsStill('rover-2');
-  await page.getByRole('button', { name: 'Give back' }).click();
+  await page.getByRole('button', { name: 'End teleoperation' }).click();
   await eventually('nobody has the lease', async () => !(await robot('rover-2')).live?.safety.lease);
 });
 
@@ -174,13 +162,13 @@ test('a lease is refused while another has it, taken by force, and the loss is s
   const take = second.getByRole('button', { name: /^Take over from/ });
   await take.waitFor();
   await take.click();
-  await second.getByText('You have the lease.').waitFor();
-  await first.getByText(/^The lease is gone/).waitFor();
-  await second.getByRole('button', { name: 'Give back' }).click();
+  await second.getByText('You control this robot.').waitFor();
+  await first.getByText(/^You no longer control the robot/).waitFor();
+  await second.getByRole('button', { name: 'End teleoperation' }).click();
   await first.getByText('Nobody drives.').waitFor();
-  await first.getByRole('button', { name: 'Take the lease' }).click();
-  await first.getByText('You have the lease.').waitFor();
-  await first.getByRole('button', { name: 'Give back' }).click();
+  await first.getByRole('button', { name: 'Take control' }).click();
+  await first.getByText('You control this robot.').waitFor();
+  await first.getByRole('button', { name: 'End teleoperation' }).click();
 });
 
 test('why a lease was lost stays written when commands were under way', async () => {
@@ -190,11 +178,11 @@ test('why a lease was lost stays written when commands were under way', async ()
   await select(second, 'rover-2');
   await second.getByRole('button', { name: 'Teleoperate' }).click();
   await second.getByRole('button', { name: /^Take over from/ }).click();
-  await second.getByText('You have the lease.').waitFor();
-  await first.getByText(/^The lease is gone/).waitFor();
+  await second.getByText('You control this robot.').waitFor();
+  await first.getByText(/^You no longer control the robot/).waitFor();
   await delay(2 * LATE_MS);
-  expect(await first.getByText(/^The lease is gone/).count()).toBe(1);
-  await second.getByRole('button', { name: 'Give back' }).click();
+  expect(await first.getByText(/^You no longer control the robot/).count()).toBe(1);
+  await second.getByRole('button', { name: 'End teleoperation' }).click();
 });
 
 test('the touch stick of a phone drives too', async () => {

@@ -1,4 +1,5 @@
 // A browser on the page, the API beside it, and waiting for states with a bound.
+import { execFileSync } from 'node:child_process';
 import { existsSync, mkdirSync, readFileSync } from 'node:fs';
 import { type Socket, connect, createServer } from 'node:net';
 import type { AddressInfo } from 'node:net';
@@ -155,6 +156,16 @@ export async function select(page: Page, robot: string): Promise<void> {
   const back = page.getByRole('button', { name: 'All robots' });
   if (await back.isVisible()) await back.click();
   await page.locator(`button[data-robot="${robot}"]`).click();
+}
+
+/** The process of a robot's agent: one of the demo's children. */
+export function agentOf(id: string): number {
+  const children = execFileSync('pgrep', ['-P', String(inject('demoPid'))], { encoding: 'utf8' });
+  for (const pid of children.trim().split('\n').map(Number)) {
+    const words = readFileSync(`/proc/${pid}/cmdline`, 'utf8').split('\0');
+    if (words.includes('agent') && words.some((word) => word.includes(id))) return pid;
+  }
+  throw new Error(`no agent of ${id} among ${children}`);
 }
 
 /** The map's canvas and where it lies. */

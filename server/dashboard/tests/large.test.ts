@@ -33,11 +33,31 @@ const lines = (page: Page) => page.locator('[data-test="bulk"] li');
 const summary = (page: Page) => page.locator('[data-test="bulk"] [role="status"]');
 
 /**
- * Frames of the whole page a second, at least. The goal is 30, which is printed beside what was counted; machines
- * of two cores without a graphics card, which also run the server and the robots' states, count 27 to 43.
+ * Frames of the whole page a second, at least. The goal is 30, which is printed beside what was counted and the
+ * processor time of each frame: what else the machine does takes frames too.
  */
 const FRAMES_MIN = 15;
 const FRAMES_GOAL = 30;
+/** Times that frames are counted; the best one counts. */
+const ROUNDS = 4;
+
+/**
+ * Frames a second while the list is scrolled, and the processor time of the main thread for each, milliseconds. That of
+ * the states, which does not depend on frames, is in it: of few frames each has more of it.
+ */
+async function framesWithCost(page: Page): Promise<{ frames_s: number; frame_ms: number }> {
+  const session = await page.context().newCDPSession(page);
+  await session.send('Performance.enable');
+  const spent_s = async () => {
+    const { metrics } = await session.send('Performance.getMetrics');
+    return metrics.find(({ name }) => name === 'ThreadTime')?.value ?? NaN;
+  };
+  const before_s = await spent_s();
+  const frames_s = await frames(page, COUNTED_MS);
+  const cost_s = (await spent_s()) - before_s;
+  await session.detach();
+  return { frames_s, frame_ms: (1_000 * cost_s) / ((frames_s * COUNTED_MS) / 1_000) };
+}
 
 /** Frames of the whole page a second, while the list is scrolled. */
 function frames(page: Page, counted_ms: number): Promise<number> {
@@ -56,7 +76,9 @@ function frames(page: Page, counted_ms: number): Promise<number> {
 
 test('of five hundred robots those in trouble come first, and the list has only the rows that are seen', async () => {
   const page = await open500();
-  for (const [group, count] of Object.entries(CROWD)) await chip(page, group).getByText(`${group} ${count}`).waitFor();
+  for (const [group, count] of Object.entries(CROWD)) {
+    await chip(page, group).getByText(`${group === 'lost' ? 'offline' : group} ${count}`).waitFor();
+  }
   const first = await rows(page);
   expect(first.length).toBeLessThan(ROWS_MAX);
   const badges = await page.locator('button[data-robot]').allInnerTexts();
@@ -148,13 +170,13 @@ test('the whole page with five hundred robots that move keeps its frames', async
   const page = await open({ prepare: (page) => crowd(page, ROBOTS, kinds) });
   await page.waitForFunction(() => document.querySelectorAll('button[data-robot]').length > 5);
   await frames(page, WARMED_UP_MS);
-  // The better one of two: whatever else the machine does takes frames too.
-  const counted = [await frames(page, COUNTED_MS), await frames(page, COUNTED_MS)];
-  console.log(
-    `whole page with ${ROBOTS} robots at 2 states/s each, list scrolled: ${counted.map((each) => each.toFixed(1)).join(', ')} frames/s, goal ${FRAMES_GOAL}`,
-  );
+  // The best one of some: whatever else the machine does takes frames too.
+  const counted: { frames_s: number; frame_ms: number }[] = [];
+  for (let round = 0; round < ROUNDS; round += 1) counted.push(await framesWithCost(page));
+  const said = counted.map(({ frames_s, frame_ms }) => `${frames_s.toFixed(1)} (${frame_ms.toFixed(1)} ms each)`).join(', ');
+  console.log(`whole page with ${ROBOTS} robots at 2 states/s each, list scrolled: ${said} frames/s, goal ${FRAMES_GOAL}`);
   await shot(page, 'large-map');
-  expect(Math.max(...counted)).toBeGreaterThanOrEqual(FRAMES_MIN);
+  expect(Math.max(...counted.map(({ frames_s }) => frames_s))).toBeGreaterThanOrEqual(FRAMES_MIN);
 });
 
 test('real robots are sent a mission, paused, resumed, cancelled, stopped and cleared together', async () => {
@@ -194,7 +216,8 @@ test('real robots are sent a mission, paused, resumed, cancelled, stopped and cl
     (await Promise.all(sent.map((mission) => api<Mission>(`/v1/missions/${mission.id}`)))).map((mission) => mission.state);
   await eventually('all paused', async () => (await states()).every((state) => state === 'paused'));
   await press('Pause', /3 had nothing to do/);
-  await press('Resume', /3 of 3 done/);
+  await bar.getByRole('button', { name: 'Resume' }).click();
+  await press('Let 3 drive on', /3 of 3 done/);
   await eventually('all driving', async () => (await states()).every((state) => state === 'active'));
   // The shortcut is for what is selected.
   await page.getByLabel('Select rover-1', { exact: true }).uncheck();
@@ -211,6 +234,8 @@ test('real robots are sent a mission, paused, resumed, cancelled, stopped and cl
   await shot(page, 'bulk-stopped');
   await eventually('cleared', async () => {
     await bar.getByRole('button', { name: 'Clear stops' }).click();
+    await bar.getByRole('button', { name: 'Clear the stops of 3 now' }).click();
+    await summary(page).getByText('under way').waitFor({ state: 'detached' });
     return (await stops()).length === 0;
   });
   await bar.getByRole('button', { name: 'Cancel missions' }).click();
@@ -248,6 +273,13 @@ test('robots are tagged on the page, and listed by tag', async () => {
   await page.locator('button[data-robot="rover-2"]').waitFor();
   await select(page, 'rover-2');
   await page.getByRole('button', { name: 'Change tags' }).click();
+  // Escape ends the change alone, and so does Cancel.
+  await page.getByLabel('Tags, with spaces between').press('Escape');
+  await page.getByRole('heading', { name: 'rover-2' }).waitFor();
+  await page.getByRole('button', { name: 'Change tags' }).click();
+  await page.getByRole('button', { name: 'Cancel', exact: true }).click();
+  await page.getByRole('button', { name: 'Change tags' }).click();
+  expect(await page.getByLabel('Tags, with spaces between').inputValue()).toBe('north spare');
   await page.getByLabel('Tags, with spaces between').fill('');
   await page.getByRole('button', { name: 'Save tags' }).click();
   await page.getByRole('button', { name: 'Change tags' }).waitFor();

@@ -63,9 +63,9 @@ test('a driver whose line is cut is notified, and the robot stands', async () =>
   const page = await open({ address: wire.address, expected: CUT });
   await select(page, 'rover-3');
   await page.getByRole('button', { name: 'Teleoperate' }).click();
-  await page.getByText('You have the lease.').waitFor();
+  await page.getByText('You control this robot.').waitFor();
   wire.cut();
-  await page.getByText(/^The socket is lost/).waitFor();
+  await page.getByText(/^The connection is lost/).waitFor();
   await eventually('nobody has the lease', async () => {
     const robot = await api<{ live: { safety: { lease?: unknown } } }>('/v1/sites/yard/robots/rover-3');
     return !robot.live.safety.lease;

@@ -96,7 +96,7 @@ async function replayed(page: Page, mission: MissionDetail): Promise<void> {
     const { time_s } = await said();
     return time_s > 1 && time_s < lasts_s;
   });
-  await replay.getByRole('button', { name: 'Hold' }).click();
+  await replay.getByRole('button', { name: 'Pause' }).click();
   const { off_mm } = await said();
   // The robot's own figure is measured against its reference, this one against the whole path.
   const worst_mm = (mission.quality?.cross_track_max_m ?? NaN) * 1000;
@@ -171,7 +171,9 @@ test('waypoints are clicked, moved, deleted and taken back; paused, resumed, rep
     return 'circle' in mission.trajectory && mission.revision > sent.revision;
   });
   await card.getByText('circle, radius 1.5 m').waitFor();
-  await card.getByRole('button', { name: 'Cancel' }).click();
+  await card.getByRole('button', { name: 'Cancel', exact: true }).click();
+  // It asks once more.
+  await card.getByRole('button', { name: 'Cancel it for good' }).click();
   await eventually('the cancelled mission', async () => {
     const mission = await api<MissionDetail>(`/v1/missions/${sent.id}`);
     return mission.state === 'cancelled';

@@ -3,6 +3,7 @@ import type { Page } from 'playwright-core';
 import { expect, test } from 'vitest';
 import { planned, withApproach } from '../src/map/approach';
 import type { Mission, Page as ApiPage, Robot, Stop, Trajectory, TrajectoryCheck } from './types';
+import { crowd } from './crowd';
 import { api, browser, eventually, select, shot } from './harness';
 
 const { open } = browser();
@@ -113,12 +114,41 @@ test('the socket of whoever looks at a robot or drives it says ten times a secon
   await select(page, 'rover-2');
   const watching = await rate();
   await page.getByRole('button', { name: 'Teleoperate' }).click();
-  await page.getByText('You have the lease.').waitFor();
+  await page.getByText('You control this robot.').waitFor();
   views = 0;
   const driving = await rate();
   console.log(`views a second: ${watching.toFixed(1)} while somebody looks, ${driving.toFixed(1)} while somebody drives`);
   expect(watching).toBeGreaterThanOrEqual(VIEWS_MIN_HZ);
   expect(driving).toBeGreaterThanOrEqual(VIEWS_MIN_HZ);
+});
+
+test('robots that are selected are watched too, and no longer when they are not', async () => {
+  const page = await open();
+  const sockets = new Set<string>();
+  page.on('websocket', (socket) => {
+    const robot = /robots\/([^/]+)\/drive$/.exec(socket.url())?.[1] ?? '';
+    sockets.add(robot);
+    socket.on('close', () => sockets.delete(robot));
+  });
+  const watched = (robots: string) => eventually(`watched: ${robots}`, async () => [...sockets].sort().join() === robots);
+  await page.getByLabel('Select rover-1', { exact: true }).check();
+  await page.getByLabel('Select rover-3', { exact: true }).check();
+  await watched('rover-1,rover-3');
+  await select(page, 'rover-2');
+  await watched('rover-1,rover-2,rover-3');
+  await page.getByRole('button', { name: 'All robots' }).click();
+  await page.getByRole('button', { name: 'Select none' }).click();
+  await watched('');
+});
+
+test('of many that are selected six are watched', async () => {
+  const page = await open({ prepare: (page) => crowd(page, 40) });
+  const sockets: string[] = [];
+  await page.routeWebSocket(/\/drive$/, (socket) => void sockets.push(socket.url()));
+  await page.getByLabel('Select all 40').check();
+  await eventually('six sockets', async () => sockets.length >= 6);
+  await page.waitForTimeout(500);
+  expect(sockets.length).toBe(6);
 });
 
 test('a map on which nothing moves draws no frames', async () => {

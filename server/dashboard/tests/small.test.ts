@@ -170,3 +170,53 @@ test('fingers are shown what fingers do: a long press deletes a point', async ()
   await page.getByRole('button', { name: 'Undo' }).click();
   expect(await inputs.count()).toBe(2);
 });
+
+test('why nothing can be stopped is written beside the button, not only behind it', async () => {
+  const page = await open();
+  const why = page.getByText('Select robots on the map or in the list to stop these alone.');
+  await why.waitFor();
+  const button = page.getByRole('button', { name: 'Stop robot', exact: true });
+  expect(await button.isDisabled()).toBe(true);
+  expect(await button.getAttribute('aria-describedby')).toBe(await why.getAttribute('id'));
+  await select(page, 'rover-2');
+  await why.waitFor({ state: 'detached' });
+});
+
+test('the legend of a mission says what the map draws: lines while it is driven, dashes once it is over', async () => {
+  const circle = { center: { x_m: 8, y_m: 16 }, radius_m: 3, speed_m_s: 0.4, turns: 20 };
+  const sent = await api<Mission>('/v1/missions', 'POST', { site: 'yard', robot: 'rover-2', trajectory: { circle }, start_policy: 'replace' });
+  await eventually('it is driven', async () => (await api<Mission>(`/v1/missions/${sent.id}`)).state === 'active');
+  const page = await open();
+  await page.getByRole('tab', { name: 'Missions' }).click();
+  await page.locator(`[data-mission="${sent.id}"]`).getByRole('button', { name: 'Show' }).click();
+  const legend = page.locator('[data-test="detail"] .legend');
+  await legend.getByText('approach').waitFor();
+  const styleOf = (name: string) =>
+    legend.getByText(name, { exact: true }).evaluate((element) => getComputedStyle(element, '::before').borderTopStyle);
+  expect([await styleOf('approach'), await styleOf('planned')]).toEqual(['dotted', 'solid']);
+  await shot(page, 'legend');
+  // Sending another one in its place asks once more, since that ends it.
+  await page.getByRole('button', { name: 'New mission' }).click();
+  const robots = page.locator('form.card .fields select').first();
+  for (const text of await robots.locator('option').allInnerTexts()) expect(text.trim()).toMatch(/^rover-\d \(.+\)$/);
+  await robots.selectOption('rover-2');
+  for (const [label, value] of [
+    ['Centre x, m', '8'],
+    ['Centre y, m', '16'],
+    ['Radius, m', '2'],
+  ] as const) {
+    await page.getByLabel(label).fill(value);
+    await page.getByLabel(label).press('Tab');
+  }
+  await page.getByText('Options').click();
+  await page.getByLabel('If the robot has other missions').selectOption('cancel them');
+  await page.locator('[data-test="dry-run"]').waitFor();
+  await page.getByRole('button', { name: 'Send and cancel the others' }).click();
+  await page.getByRole('button', { name: 'Cancel the others for good and send' }).click();
+  await page.getByText('Sent to rover-2.').waitFor();
+  await eventually('the other one is cancelled', async () => (await api<Mission>(`/v1/missions/${sent.id}`)).state === 'cancelled');
+  await page.locator('.ended button', { hasText: 'rover-2' }).first().click();
+  await eventually('dashes', async () => (await styleOf('planned')) === 'dashed');
+  const { items } = await api<ApiPage<Mission>>('/v1/missions?site=yard&robot=rover-2&limit=1');
+  if (items[0]) await api(`/v1/missions/${items[0].id}/cancel`, 'POST');
+});

@@ -101,7 +101,7 @@ test('map, legend, drive and planner speak of feet alone', async () => {
   await page.getByRole('button', { name: 'Teleoperate' }).click();
   await page.getByText(/^Top speed: [\d.]+ ft\/s$/).waitFor();
   await shot(page, 'imperial-robot');
-  await page.getByRole('button', { name: 'Give back' }).click();
+  await page.getByRole('button', { name: 'End teleoperation' }).click();
   const panel = await page.locator('#panel').innerText();
   expect(panel).not.toMatch(/\d (m|m\/s|kg|mm)\b/);
 });

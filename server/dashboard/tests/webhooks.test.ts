@@ -1,14 +1,11 @@
-// Where alerts are sent: a webhook is made, tested and looked after on the page, and a receiver gets what it sends.
-import { type ChildProcess, execFileSync, spawn } from 'node:child_process';
+// Webhooks: one is made, tested and looked after on the page, and a receiver gets what it sends.
 import { createHmac } from 'node:crypto';
-import { mkdtempSync, readFileSync, rmSync, writeFileSync } from 'node:fs';
 import { type IncomingHttpHeaders, type Server, createServer } from 'node:http';
 import type { AddressInfo } from 'node:net';
-import { tmpdir } from 'node:os';
-import { join } from 'node:path';
 import { afterAll, beforeAll, expect, test } from 'vitest';
 import { violations } from './checks';
 import { browser, eventually, shot } from './harness';
+import { type OwnServer, ownServer } from './own_server';
 
 const { open } = browser();
 
@@ -20,26 +17,11 @@ interface Received {
 const received: Received[] = [];
 /** What the receiver answers. */
 let status = 204;
-let folder: string;
 let receiver: Server;
-let server: ChildProcess;
-let address: string;
-
-/** Listens at a free port of this machine. */
-function listening(server: Server): Promise<number> {
-  return new Promise((resolve) => server.listen(0, '127.0.0.1', () => resolve((server.address() as AddressInfo).port)));
-}
-
-async function freePort(): Promise<number> {
-  const holder = createServer();
-  const port = await listening(holder);
-  await new Promise((resolve) => holder.close(resolve));
-  return port;
-}
+let own: OwnServer;
 
 // A server of its own, which may call this machine: the demo's may not.
 beforeAll(async () => {
-  folder = mkdtempSync(join(tmpdir(), 'tread-webhooks-'));
   receiver = createServer((request, response) => {
     let body = '';
     request.on('data', (chunk: Buffer) => (body += chunk.toString()));
@@ -48,82 +30,102 @@ beforeAll(async () => {
       response.writeHead(status).end();
     });
   });
-  await listening(receiver);
-  const program = process.env['TREAD_BIN'] ?? '';
-  const [http, zenoh] = [await freePort(), await freePort()];
-  const config = join(folder, 'server.toml');
-  const database = join(folder, 'tread.db');
-  writeFileSync(config, '[webhooks]\nallow_http = true\nallowed_networks = ["127.0.0.0/8"]\n');
-  execFileSync(program, ['server', 'init', '--force', '--name=admin', `--database=${database}`, `--token-file=${join(folder, 'token')}`]);
-  const flags = [`--config=${config}`, `--database=${database}`, `--http=127.0.0.1:${http}`, `--zenoh=127.0.0.1:${zenoh}`];
-  server = spawn(program, ['server', ...flags], { stdio: 'ignore' });
-  address = `http://127.0.0.1:${http}`;
-  await eventually('the server', async () => (await fetch(`${address}/readyz`)).ok);
+  await new Promise<void>((resolve) => receiver.listen(0, '127.0.0.1', resolve));
+  own = await ownServer('[webhooks]\nallow_http = true\nallowed_networks = ["127.0.0.0/8"]\n');
 });
 
 afterAll(async () => {
-  const ended = new Promise((resolve) => server.once('exit', resolve));
-  server.kill('SIGTERM');
-  await ended;
+  await own.end();
   receiver.closeAllConnections();
   receiver.close();
-  rmSync(folder, { recursive: true, force: true });
 });
 
-test('a webhook is made, tested, disabled and removed on the page, and its deliveries are listed', async () => {
-  const page = await open({ as: null, address, expected: /422/ });
-  const admin = readFileSync(join(folder, 'token'), 'utf8').trim();
-  await page.getByLabel('Token').fill(admin);
+const genuine = (secret: string, { headers, body }: Received) =>
+  headers['tread-signature'] === `v1=${createHmac('sha256', secret).update(`${String(headers['tread-timestamp'])}.${body}`).digest('hex')}`;
+
+test('a webhook is made, tested, changed, disabled and removed on the page, and its deliveries are listed', async () => {
+  const page = await open({ as: null, address: own.address, expected: /422/ });
+  await page.getByLabel('Token').fill(own.token);
   await page.getByRole('button', { name: 'Sign in' }).click();
   await page.getByRole('tab', { name: 'Alerts' }).click();
-  await page.getByText('Where alerts are sent').click();
-  // An address that the server may not call is refused in a sentence.
+  await page.getByText('Webhooks', { exact: true }).click();
+  await page.getByRole('button', { name: 'New webhook' }).click();
+  // An address that the server may not call is refused in a sentence, and what was entered stays.
   const form = page.locator('details form');
-  const add = async (url: string) => {
-    await form.getByLabel('Name').fill('on call');
-    await form.getByLabel('Address').fill(url);
-    await form.getByLabel('Kinds').fill('robot-lost, mission-failed');
-    await form.getByLabel('Sites').fill('yard');
-    await form.getByRole('button', { name: 'Add' }).click();
-  };
-  await add('http://10.0.0.1/hook');
-  await page.locator('details .problem').getByText('not public').waitFor();
+  const box = (name: string) => form.getByRole('checkbox', { name, exact: true });
+  await form.getByLabel('Name', { exact: true }).fill('on call');
+  await form.getByLabel('Address').fill('http://10.0.0.1/hook');
+  // Kinds and sites are chosen among those that there are.
+  await box('all kinds').uncheck();
+  await form.getByText('Not yet: choose at least one.').waitFor();
+  expect(await form.getByRole('button', { name: 'Add' }).isDisabled()).toBe(true);
+  await box('No contact with the robot').check();
+  await box('Mission failed').check();
+  await box('all sites').uncheck();
+  await box('yard').check();
+  expect(await violations(page), 'the form of a webhook').toEqual([]);
+  await shot(page, 'webhook-form');
+  await form.getByRole('button', { name: 'Add' }).click();
+  await form.locator('.problem').getByText('not public').waitFor();
   const url = `http://127.0.0.1:${(receiver.address() as AddressInfo).port}/hook`;
-  await add(url);
-  const secret = (await page.locator('details .note code').innerText()).trim();
+  await form.getByLabel('Address').fill(url);
+  await form.getByRole('button', { name: 'Add' }).click();
+  const note = page.locator('[data-test="secret"]');
+  const secret = (await note.locator('code').innerText()).trim();
+  await page.context().grantPermissions(['clipboard-read', 'clipboard-write']);
+  await note.getByRole('button', { name: 'Copy' }).click();
+  await note.getByText('Copied.').waitFor();
+  expect(await page.evaluate(() => navigator.clipboard.readText())).toBe(secret);
   const card = page.locator('details li.card');
   await card.getByText(url).waitFor();
-  await card.getByText('mission-failed, robot-lost').waitFor();
-  await card.getByText('yard', { exact: true }).waitFor();
+  await card.getByText('Mission failed, No contact with the robot · yard').waitFor();
   expect(await violations(page), 'a webhook and its secret').toEqual([]);
 
   const press = (name: string) => card.getByRole('button', { name, exact: true }).click();
-  const lines = card.locator('li');
-  const newest = async (says: RegExp) =>
-    eventually(`a delivery that ${says}`, async () => {
-      await press('Log');
-      return (await lines.count()) > 0 && says.test(await lines.first().innerText());
-    });
+  const newest = card.locator('.log li').first();
   await press('Log');
   await card.getByText('Nothing was sent.').waitFor();
   await press('Send a test');
-  await newest(/arrived/);
+  await card.getByText('The test has arrived.').waitFor();
+  expect((await newest.innerText()).replace(/\s+/g, ' ')).toMatch(/ test: arrived 1 attempt, HTTP status 204$/);
   expect(received).toHaveLength(1);
-  const { headers, body } = received[0] ?? { headers: {}, body: '' };
-  const signed = createHmac('sha256', secret).update(`${String(headers['tread-timestamp'])}.${body}`).digest('hex');
-  expect(headers['tread-signature']).toBe(`v1=${signed}`);
-  expect(JSON.parse(body)).toMatchObject({ v: 1, id: null });
+  const [first] = received;
+  if (!first) throw new Error('nothing was received');
+  expect(genuine(secret, first)).toBe(true);
+  expect(JSON.parse(first.body)).toMatchObject({ v: 1, id: null });
   await shot(page, 'webhooks');
 
-  // What the receiver refuses is sent again later, and the page says why it did not arrive.
+  // Another secret, once it was asked for twice.
+  await press('New secret');
+  await press('Replace the secret for good');
+  await eventually('another secret', async () => (await note.locator('code').innerText()).trim() !== secret);
+  const next = (await note.locator('code').innerText()).trim();
+  await press('Send a test');
+  await eventually('the test of the new secret', async () => received.length === 2);
+  const [, second] = received;
+  expect(second && genuine(next, second) && !genuine(secret, second)).toBe(true);
+  await note.getByRole('button', { name: 'Dismiss' }).click();
+
+  // What was set is changed, and the rest stays.
+  await press('Edit');
+  expect(await box('Mission failed').isChecked()).toBe(true);
+  await form.getByLabel('Name', { exact: true }).fill('night shift');
+  await box('all sites').check();
+  await form.getByRole('button', { name: 'Save' }).click();
+  await card.getByText('night shift').waitFor();
+  await card.getByText('Mission failed, No contact with the robot · all sites').waitFor();
+
+  // What the receiver refuses is sent again later, and the page says why it did not arrive, and when it is sent next.
+  await eventually('the rest', async () => (await own.api<{ items: { pending: number }[] }>('/v1/webhooks')).items[0]?.pending === 0);
   status = 500;
   await press('Send a test');
-  await newest(/waits.*500/s);
+  await card.getByText(/^The test has not arrived: .*500.*It is sent again\.$/).waitFor();
+  expect((await newest.innerText()).replace(/\s+/g, ' ')).toMatch(/ test: waits 1 attempt, HTTP status 500, next attempt \d{4}-\d\d-\d\d/);
   await press('Disable');
   await card.getByText('disabled', { exact: true }).waitFor();
   await press('Enable');
   await card.getByText('disabled', { exact: true }).waitFor({ state: 'detached' });
-  page.once('dialog', (dialog) => void dialog.accept());
   await press('Remove');
+  await press('Remove it with all that waits');
   await card.waitFor({ state: 'detached' });
 });

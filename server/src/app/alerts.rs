@@ -16,12 +16,13 @@ use super::missions::reports::Taken;
 use super::own_alert::OwnAlert;
 use super::reconciler::attendance::ROBOT_LOST_ALERT;
 use super::reconciler::conditions::{CLOCK_WRONG_ALERT, ROBOT_WAITING_ALERT};
+use super::reconciler::delays::MISSION_WAITING_ALERT;
 use super::stops::UNCONFIRMED_ALERT;
 use super::storage::SERVER_RESTARTED_ALERT;
 use super::{App, AppError, check_named, page};
 use crate::app::presence::RobotKey;
 pub use crate::db::alerts::AlertFilter;
-use crate::db::alerts::Whereabouts;
+use crate::db::alerts::AlertLocation;
 use crate::db::{self, DbError, Outcome};
 
 /// Code of the alert about a mission that failed.
@@ -32,7 +33,18 @@ pub(super) const MISSION_EXPIRED_ALERT: &str = "mission-expired";
 pub(super) const MISSION_REJECTED_ALERT: &str = "mission-rejected";
 /// Codes of the alerts about missions that did not succeed. Each is raised until a person
 /// acknowledges it, or until a mission of the robot succeeds.
-pub(super) const MISSION_ALERTS: [&str; 3] = [
+const MISSION_ALERTS: [&str; 3] = [
+    MISSION_FAILED_ALERT,
+    MISSION_EXPIRED_ALERT,
+    MISSION_REJECTED_ALERT,
+];
+/// Codes of the alerts about a robot's presence and work. They end when the robot is retired or
+/// revoked: nobody expects it to report or to drive.
+const WORK_ALERTS: [&str; 7] = [
+    ROBOT_LOST_ALERT,
+    ROBOT_WAITING_ALERT,
+    MISSION_WAITING_ALERT,
+    CLOCK_WRONG_ALERT,
     MISSION_FAILED_ALERT,
     MISSION_EXPIRED_ALERT,
     MISSION_REJECTED_ALERT,
@@ -40,13 +52,14 @@ pub(super) const MISSION_ALERTS: [&str; 3] = [
 /// Maximum number of alerts stored per robot. Beyond it the oldest cleared ones are deleted first.
 const KEPT_MAX: u32 = 500;
 /// Codes of alerts that the server itself raises and clears, independently of the robot's reports.
-const OWN_ALERTS: [&str; 10] = [
+const OWN_ALERTS: [&str; 11] = [
     UNCONFIRMED_ALERT,
     REVOKED_ALERT,
     RETIRED_ALERT,
     UNISSUED_ALERT,
     ROBOT_LOST_ALERT,
     ROBOT_WAITING_ALERT,
+    MISSION_WAITING_ALERT,
     CLOCK_WRONG_ALERT,
     MISSION_FAILED_ALERT,
     MISSION_EXPIRED_ALERT,
@@ -274,6 +287,19 @@ impl App {
         self.end(tx, robot_pk, &alert).await
     }
 
+    /// Clears the alerts about the presence and the work of a robot that is retired or revoked.
+    pub(super) async fn end_work_alerts(
+        &self,
+        tx: &mut db::Tx,
+        robot_pk: i64,
+    ) -> Result<Vec<Alert>, DbError> {
+        let mut ended = Vec::new();
+        for code in WORK_ALERTS {
+            ended.extend(self.end_alert(tx, robot_pk, code).await?);
+        }
+        Ok(ended)
+    }
+
     /// Clears an alert, and queues what webhooks are to be sent of it.
     async fn end(
         &self,
@@ -334,27 +360,27 @@ impl App {
         let Some(mut alert) = db::alerts::find(tx, id).await? else {
             return Ok(None);
         };
-        let shown = alert.robot_key().and_then(|key| self.whereabouts(&key));
+        let shown = alert.robot_key().and_then(|key| self.location(&key));
         let shown = shown.unwrap_or_default();
         alert.mission = mission.or(shown.mission);
         alert.place = shown.place;
         if alert.mission.is_some() || alert.place.is_some() {
-            let whereabouts = Whereabouts {
+            let location = AlertLocation {
                 mission: alert.mission,
                 place: alert.place,
             };
-            db::alerts::locate(tx, id, whereabouts).await?;
+            db::alerts::locate(tx, id, location).await?;
         }
         self.queue_alert(tx, NoticeEvent::Opened, &alert).await?;
         Ok(Some(alert))
     }
 
     /// Returns the mission and the position that a robot showed last.
-    fn whereabouts(&self, key: &RobotKey) -> Option<Whereabouts> {
+    fn location(&self, key: &RobotKey) -> Option<AlertLocation> {
         let presence = self.presences().get(key);
         let state = presence.state()?;
         let place = state.pose.map(|pose| pose.value.position());
-        Some(Whereabouts {
+        Some(AlertLocation {
             mission: state.mission.map(|mission| mission.id),
             place: place.filter(|place| place.x_m.is_finite() && place.y_m.is_finite()),
         })

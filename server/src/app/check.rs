@@ -360,7 +360,7 @@ fn check(
         measurement: ExpectedMeasurement {
             theta_assumed: theta,
             wheel_torque: has_torque,
-            relative_sd: expected.relative_std_dev,
+            relative_std_dev: expected.relative_std_dev,
             first_after_s: expected.first_after_s,
         },
         path: drawn(plan, trajectory),

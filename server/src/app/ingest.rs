@@ -256,6 +256,7 @@ impl Writer {
             at,
             since: since.unwrap_or(at),
             shown: self.app.presences().get(&key).progress_of(report.mission),
+            restored_at: self.app.restoration().map(|(newest, _)| newest.restored_at),
         }
     }
 

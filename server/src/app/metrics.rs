@@ -9,11 +9,13 @@ use prometheus_client::encoding::text::encode;
 use prometheus_client::metrics::counter::{ConstCounter, Counter};
 use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::gauge::{ConstGauge, Gauge};
+use prometheus_client::metrics::info::Info;
 use prometheus_client::registry::{Registry, Unit};
 use tread_api::mission::{Mission, MissionState};
 
 use super::friction::KnownGround;
 use super::{App, AppError};
+use crate::build;
 use crate::db;
 use crate::db::failure::{self, StorageFailure};
 use crate::metrics::Refusal;
@@ -74,6 +76,8 @@ impl App {
         }
         self.register_clients(&mut registry);
         self.register_clock(&mut registry);
+        self.register_build(&mut registry);
+        self.register_backups(&mut registry);
         let uptime = ConstGauge::new(self.uptime().as_secs_f64());
         let help = "Time since the start";
         registry.register_with_unit("tread_uptime", help, Unit::Seconds, uptime);
@@ -132,6 +136,47 @@ impl App {
         }
         let help = "Failures of the storage, by kind";
         registry.register("tread_storage_failures", help, failures);
+    }
+
+    /// Registers version, commit and schema.
+    fn register_build(&self, registry: &mut Registry) {
+        let info = Info::new([
+            ("version", build::VERSION.to_owned()),
+            ("commit", build::commit().unwrap_or("unknown").to_owned()),
+            ("schema", build::schema().to_string()),
+        ]);
+        registry.register("tread_build", "Version, commit and schema", info);
+        let awaiting = self.restoration().map_or(0, |(_, awaiting)| awaiting);
+        let help = "Robots that await their release after a restoration from a backup";
+        registry.register(
+            "tread_robots_awaiting_release",
+            help,
+            ConstGauge::new(awaiting),
+        );
+    }
+
+    /// Registers the state of scheduled backups; nothing without them.
+    fn register_backups(&self, registry: &mut Registry) {
+        let Some(state) = self.backup_state() else {
+            return;
+        };
+        if let Some((at, bytes)) = state.last {
+            let age = self.clock().now().duration_since(at);
+            let age = ConstGauge::new(age.as_secs_f64());
+            let help = "Age of the last complete backup";
+            registry.register_with_unit("tread_backup_age", help, Unit::Seconds, age);
+            let help = "Size of the last complete backup";
+            let bytes = ConstGauge::new(bytes);
+            registry.register_with_unit("tread_backup_size", help, Unit::Bytes, bytes);
+        }
+        if let Some(took) = state.took {
+            let help = "Duration of the last backup of this process";
+            let took = ConstGauge::new(took.as_secs_f64());
+            registry.register_with_unit("tread_backup_duration", help, Unit::Seconds, took);
+        }
+        let failed = ConstGauge::new(u64::from(state.failure.is_some()));
+        let help = "Whether the last attempt to make a backup failed";
+        registry.register("tread_backup_failed", help, failed);
     }
 
     /// Registers the steps of the machine's clock.

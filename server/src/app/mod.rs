@@ -2,6 +2,7 @@
 
 pub mod alerts;
 mod allowance;
+pub mod backups;
 pub mod check;
 pub mod checkpoints;
 pub mod enrolment;
@@ -21,6 +22,7 @@ mod own_alert;
 mod planned_path;
 pub mod presence;
 pub mod reconciler;
+pub mod restoration;
 pub mod retention;
 pub mod robot_link;
 pub mod robots;
@@ -45,14 +47,17 @@ use tread_api::rights::Scope;
 use uuid::Uuid;
 
 use self::allowance::Allowances;
+use self::backups::Backups;
 use self::enrolment::{EnrolmentService, Membership};
 pub use self::error::AppError;
 use self::events::Hub;
 use self::friction::{MapNews, Pictures, Timelines, Views};
 use self::identity::Identity;
+use self::identity::people::People;
 use self::map::Maps;
 use self::missions::idempotency::InFlight;
 use self::presence::Presences;
+use self::restoration::Restored;
 use self::retention::Removed;
 use self::robot_link::{Commands, RobotLink};
 use self::shares::Shares;
@@ -63,7 +68,7 @@ use self::watched::Watched;
 use self::webhooks::Webhooks;
 use crate::clock::Clock;
 use crate::config::webhooks::WebhooksConfig;
-use crate::config::{FrictionConfig, StorageConfig};
+use crate::config::{AuditConfig, FrictionConfig, StorageConfig};
 use crate::counters::Counters;
 pub use crate::db::DbError;
 use crate::db::sites::SiteRow;
@@ -118,6 +123,8 @@ struct Inner {
     watched: Watched,
     event_shares: Shares,
     webhooks: Webhooks,
+    backups: Backups,
+    restored: Restored,
 }
 
 /// Dependencies of use cases.
@@ -139,6 +146,29 @@ pub struct Dependencies {
     pub enrolment: Option<EnrolmentService>,
     /// Where webhooks may go.
     pub webhooks: WebhooksConfig,
+    /// Sign-in of people at an OpenID provider; without it people sign in with tokens alone.
+    pub people: Option<People>,
+    /// Where the audit log is written beside the database.
+    pub audit: AuditConfig,
+}
+
+impl Dependencies {
+    /// Returns dependencies on a database alone, with default settings and without a connection to
+    /// robots.
+    pub fn on_database(db: Db, clock: Clock) -> Self {
+        Self {
+            db,
+            clock,
+            friction: FrictionConfig::default(),
+            storage: StorageConfig::default(),
+            normalisations: Vec::new(),
+            robots: RobotLink::unconnected(Supervisor::new()),
+            enrolment: None,
+            webhooks: WebhooksConfig::default(),
+            people: None,
+            audit: AuditConfig::default(),
+        }
+    }
 }
 
 impl App {
@@ -153,6 +183,8 @@ impl App {
             robots,
             enrolment,
             webhooks,
+            people,
+            audit,
         } = dependencies;
         let started_at = clock.elapsed();
         let presences = Arc::default();
@@ -177,7 +209,7 @@ impl App {
             hub,
             keys_in_flight: InFlight::default(),
             checks: Semaphore::new(check::CHECKS_MAX),
-            identity: Identity::default(),
+            identity: Identity::new(people, audit),
             maps: Maps::default(),
             membership: Membership::new(enrolment),
             metrics: Metrics::default(),
@@ -199,6 +231,8 @@ impl App {
             watched: Watched::default(),
             event_shares: Shares::new(events::SHARES),
             webhooks: Webhooks::new(webhooks),
+            backups: Backups::default(),
+            restored: Restored::default(),
         };
         Self {
             inner: Arc::new(inner),
@@ -214,14 +248,9 @@ impl App {
         storage: StorageConfig,
     ) -> Self {
         Self::new(Dependencies {
-            db,
-            clock,
             friction,
             storage,
-            normalisations: Vec::new(),
-            robots: RobotLink::unconnected(Supervisor::new()),
-            enrolment: None,
-            webhooks: WebhooksConfig::default(),
+            ..Dependencies::on_database(db, clock)
         })
     }
 
@@ -356,6 +385,14 @@ impl App {
         &self.inner.unrecorded
     }
 
+    fn restored(&self) -> &Restored {
+        &self.inner.restored
+    }
+
+    fn backups(&self) -> &Backups {
+        &self.inner.backups
+    }
+
     fn webhooks(&self) -> &Webhooks {
         &self.inner.webhooks
     }
@@ -391,6 +428,17 @@ impl App {
 
     fn friction_config(&self) -> &FrictionConfig {
         &self.inner.friction
+    }
+
+    /// Stores the version of this server, unless the last one to open the database was the same.
+    ///
+    /// # Errors
+    /// The database failed.
+    pub async fn note_version(&self) -> Result<(), AppError> {
+        let mut tx = self.db().write("mod").await?;
+        let now = self.clock().now();
+        db::schema::note_version(&mut tx, crate::build::VERSION, now).await?;
+        Ok(tx.commit().await?)
     }
 
     /// Continues the clock after the newest time in the database, so that time does not go back

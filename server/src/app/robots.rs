@@ -2,10 +2,11 @@
 
 use std::collections::BTreeSet;
 
-use tracing::info;
+use tracing::{info, warn};
 use tread_api::ids::{RobotId, SiteId, Tag};
 use tread_api::mission::Actor;
 use tread_api::page::Page;
+use tread_api::release::Peer;
 use tread_api::rights::Scope;
 use tread_api::robot::{ALERTS_MAX, Alert, ChangeRobot, Robot, RobotModel, TAGS_MAX};
 use tread_api::site::NAME_LENGTH_MAX;
@@ -13,12 +14,9 @@ use tread_api::text::is_printable;
 use tread_api::wire::hello::{Hello, Welcome};
 use tread_api::wire::{Refusal, RefusalCode};
 
-use super::alerts::MISSION_ALERTS;
 use super::allowance::Kind;
 use super::missions::end_all;
 use super::missions::transitions::Change;
-use super::reconciler::attendance::ROBOT_LOST_ALERT;
-use super::reconciler::conditions::{CLOCK_WRONG_ALERT, ROBOT_WAITING_ALERT};
 use super::terrains::site_definition;
 use super::{App, AppError, name_or, page, site_row};
 use crate::app::presence::RobotKey;
@@ -108,10 +106,7 @@ impl App {
                 let why = (Change::Retire, Actor::Client, Change::Retire.reason());
                 end_all(&mut tx, row.pk, why, now).await?;
                 db::robots::set_retired(&mut tx, row.pk, Some(now)).await?;
-                let of_work = [ROBOT_LOST_ALERT, ROBOT_WAITING_ALERT, CLOCK_WRONG_ALERT];
-                for code in of_work.into_iter().chain(MISSION_ALERTS) {
-                    ended.extend(self.end_alert(&mut tx, row.pk, code).await?);
-                }
+                ended = self.end_work_alerts(&mut tx, row.pk).await?;
             }
             (Some(false), Some(_)) => db::robots::set_retired(&mut tx, row.pk, None).await?,
             (Some(true), Some(_)) | (Some(false), None) | (None, _) => {}
@@ -141,6 +136,7 @@ impl App {
             name: row.name,
             tags: row.tags,
             retired_at: row.retired_at,
+            awaits_release_since: row.awaits_release_since,
             model: row.model,
             configuration: row.configuration,
             capabilities: row.capabilities,
@@ -198,6 +194,10 @@ impl App {
             refusal(RefusalCode::Busy, detail)
         })?;
         info!(robot.id = %hello.robot, "robot `{}` of site `{site}` said hello", hello.robot);
+        let (peer, version) = (Peer::of(&hello.agent_version), &hello.agent_version);
+        if matches!(peer, Peer::TooOld | Peer::TooNew) {
+            warn!(robot.id = %hello.robot, "agent {version} of robot `{}` {peer}", hello.robot);
+        }
         self.presences()
             .hello(key, hello.boot, self.clock().elapsed());
         self.robots_changed();

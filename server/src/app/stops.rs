@@ -60,7 +60,7 @@ const SOMEBODY: &str = "somebody";
 
 /// Author and reason of a stop, for people.
 #[derive(Debug, Clone, Default)]
-pub struct StopWords {
+pub struct StopReason {
     /// The author.
     pub by: Option<String>,
     /// The reason.
@@ -105,7 +105,7 @@ impl App {
         &self,
         site: &SiteId,
         robot: &RobotId,
-        words: StopWords,
+        words: StopReason,
     ) -> Result<Stop, AppError> {
         let key = (site.clone(), robot.clone());
         // Memory decides, so that a slow database does not delay a stop.
@@ -132,7 +132,7 @@ impl App {
         &self,
         within: &Scope,
         site: Option<&SiteId>,
-        words: StopWords,
+        words: StopReason,
     ) -> Result<FleetStop, AppError> {
         let known = self.presences().known();
         let wanted = |key: &RobotKey| {
@@ -158,7 +158,7 @@ impl App {
         })
     }
 
-    async fn stop_all(&self, keys: Vec<RobotKey>, said: StopWords) -> Vec<Stop> {
+    async fn stop_all(&self, keys: Vec<RobotKey>, said: StopReason) -> Vec<Stop> {
         let wanted_at = self.clock().now();
         let by = words(said.by, SOMEBODY);
         let reason = words(said.reason, "no reason was given");

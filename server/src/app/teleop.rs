@@ -29,7 +29,7 @@ use super::identity::Credential;
 use super::missions::control::hold_all;
 use super::robot_link::DrivePublisher;
 use super::shares::{Bounds, Place};
-use super::stops::StopWords;
+use super::stops::StopReason;
 use super::watched::Watch;
 use super::{App, AppError};
 use crate::app::presence::RobotKey;
@@ -380,12 +380,12 @@ impl Session {
     ///
     /// # Errors
     /// As [`App::stop_robot`].
-    pub async fn stop(&mut self, words: StopWords) -> Result<Stop, AppError> {
+    pub async fn stop(&mut self, words: StopReason) -> Result<Stop, AppError> {
         let driver = self
             .active
             .as_ref()
             .map(|active| active.lease.driver.name.clone());
-        let words = StopWords {
+        let words = StopReason {
             by: words.by.or(driver),
             ..words
         };

@@ -9,6 +9,7 @@ use std::collections::{BTreeSet, HashMap, HashSet, VecDeque};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::Notify;
+use tread_api::alert_kind;
 use tread_api::ids::{AlertCode, DeliveryId, WebhookId};
 use tread_api::page::Page;
 use tread_api::robot::Alert;
@@ -262,8 +263,8 @@ impl App {
     }
 
     fn notice(&self, delivery: DeliveryId, event: NoticeEvent, alert: &Alert) -> AlertNotice {
-        let link = format!("/v1/alerts/{}", alert.id);
-        AlertNotice::of_alert(delivery, event, alert, self.webhook_rules().link(&link))
+        let link = self.webhook_rules().link(&page_of(alert));
+        AlertNotice::of_alert(delivery, event, alert, link)
     }
 
     async fn queue_delivery(
@@ -349,14 +350,46 @@ impl App {
         for site in sites.iter().flatten() {
             site_row(tx, site).await?;
         }
+        let kinds = distinct("kinds", settings.kinds, WEBHOOK_KINDS_MAX)?;
+        for kind in kinds.iter().flatten() {
+            check_kind(tx, kind).await?;
+        }
         Ok(WebhookSettings {
             name: people_line("name", &settings.name, WEBHOOK_NAME_MAX)?,
             url: url.to_string(),
-            kinds: distinct("kinds", settings.kinds, WEBHOOK_KINDS_MAX)?,
+            kinds,
             sites,
             enabled: settings.enabled,
         })
     }
+}
+
+/// Refuses a kind of which this version raises no alerts and of which none is stored: a mistyped
+/// kind would never be sent. Agents of a newer version may raise kinds that are not known here.
+async fn check_kind(tx: &mut Tx, kind: &AlertCode) -> Result<(), AppError> {
+    if alert_kind::is_known(kind) {
+        return Ok(());
+    }
+    let filter = db::alerts::AlertFilter {
+        kind: Some(kind.clone()),
+        ..db::alerts::AlertFilter::default()
+    };
+    if !db::alerts::list(tx, &filter, 1).await?.is_empty() {
+        return Ok(());
+    }
+    let known = alert_kind::ALERT_KINDS.join(", ");
+    let detail = format!("`{kind}` is the kind of no alert; kinds are {known}, and `base-…`");
+    Err(AppError::Invalid {
+        field: "kinds",
+        detail,
+    })
+}
+
+/// Returns where the page shows an alert to people.
+fn page_of(alert: &Alert) -> String {
+    let site = alert.site.as_ref();
+    let site = site.map_or_else(String::new, |site| format!("site={site}&"));
+    format!("/#{site}tab=alerts&alert={}", alert.id)
 }
 
 /// Returns the entries of a list, each once and in order.

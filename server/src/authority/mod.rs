@@ -9,6 +9,7 @@
 //! no dots, so the name is unambiguous. A robot that joins again gets the next enrolment number,
 //! which invalidates its earlier certificates.
 
+pub mod copies;
 mod file;
 mod issued;
 mod rotation;

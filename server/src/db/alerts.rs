@@ -196,7 +196,7 @@ pub async fn raise(
 
 /// Mission and place of an alert, as far as they are known.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Whereabouts {
+pub struct AlertLocation {
     /// The mission.
     pub mission: Option<MissionId>,
     /// The robot's position in the site frame.
@@ -207,11 +207,11 @@ pub struct Whereabouts {
 pub async fn locate(
     db: &mut SqliteConnection,
     id: AlertId,
-    whereabouts: Whereabouts,
+    location: AlertLocation,
 ) -> Result<(), DbError> {
     let id = id.to_string();
-    let mission = whereabouts.mission.map(|mission| mission.to_string());
-    let place = whereabouts.place;
+    let mission = location.mission.map(|mission| mission.to_string());
+    let place = location.place;
     let (x_m, y_m) = (place.map(|place| place.x_m), place.map(|place| place.y_m));
     sqlx::query!(
         "UPDATE alerts SET mission_id = ?, x_m = ?, y_m = ? WHERE id = ?",

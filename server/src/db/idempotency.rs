@@ -9,7 +9,7 @@ use crate::identity::subject::SubjectId;
 
 /// An answer that was given under an idempotency key.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Given {
+pub struct StoredAnswer {
     /// Hash of the request that was answered.
     pub request_hash: Uuid,
     /// The answer, JSON.
@@ -25,7 +25,7 @@ pub async fn find(
     db: &mut SqliteConnection,
     (owner, key): OwnKey<'_>,
     request_hash: Uuid,
-) -> Result<Option<Given>, DbError> {
+) -> Result<Option<StoredAnswer>, DbError> {
     let (owner, request_hash) = (owner.to_string(), request_hash.to_string());
     let row = sqlx::query!(
         "SELECT request_hash, answer FROM idempotency_keys
@@ -38,7 +38,7 @@ pub async fn find(
     .fetch_optional(db)
     .await?;
     row.map(|row| {
-        Ok(Given {
+        Ok(StoredAnswer {
             request_hash: parse("request hash", &row.request_hash)?,
             answer: row.answer,
         })
@@ -50,10 +50,10 @@ pub async fn find(
 pub async fn insert(
     db: &mut SqliteConnection,
     (owner, key): OwnKey<'_>,
-    given: &Given,
+    stored: &StoredAnswer,
     at: Timestamp,
 ) -> Result<(), DbError> {
-    let (request_hash, at_us) = (given.request_hash.to_string(), to_us(at));
+    let (request_hash, at_us) = (stored.request_hash.to_string(), to_us(at));
     let owner = owner.to_string();
     sqlx::query!(
         "INSERT INTO idempotency_keys (owner, key, request_hash, answer, created_at_us)
@@ -61,7 +61,7 @@ pub async fn insert(
         owner,
         key,
         request_hash,
-        given.answer,
+        stored.answer,
         at_us,
     )
     .execute(db)

@@ -8,6 +8,7 @@ pub mod alerts;
 pub mod attendance;
 pub mod audit;
 mod connections;
+pub mod copy;
 pub mod deferred_segments;
 pub mod enrolments;
 pub mod failure;
@@ -19,8 +20,10 @@ pub mod lock;
 pub mod missions;
 mod private;
 pub mod removed;
+pub mod restorations;
 pub mod robots;
 mod rows;
+pub mod schema;
 pub mod secrets;
 pub mod segments;
 pub mod sessions;
@@ -51,6 +54,7 @@ use sqlx::{AssertSqlSafe, SqliteConnection};
 use tokio::sync::{Notify, Semaphore};
 use tokio::time::Instant;
 use tread_api::ids::RobotId;
+use tread_api::release::VERSION;
 use tread_api::rights::Scope;
 
 use self::connections::{COMMIT_TIMEOUT, Connections, Lent};
@@ -255,7 +259,27 @@ pub enum OpenError {
         #[source]
         cause: sqlx::Error,
     },
-    /// A migration failed, or the file is of a newer version.
+    /// The file is of a newer version.
+    #[error(
+        "the database `{}` has schema {found}{by}, and tread-server {version} knows schemas up to \
+         {known}: a server never goes back. Install {wanted}, or restore a backup that was made \
+         before the upgrade with `tread-server restore --from FILE --force`", path.display()
+    )]
+    Newer {
+        /// The file.
+        path: PathBuf,
+        /// Its schema.
+        found: i64,
+        /// ` of tread-server V`, or empty if the version is not known.
+        by: String,
+        /// The version to install, for people.
+        wanted: String,
+        /// The newest schema that this program knows.
+        known: i64,
+        /// Version of this program.
+        version: &'static str,
+    },
+    /// A migration failed.
     #[error("cannot bring the database `{}` up to date", path.display())]
     Migrate {
         /// The file.
@@ -334,8 +358,15 @@ impl Db {
         if !is_new_enough(&version) {
             return Err(OpenError::TooOld(version));
         }
+        let found = writer
+            .with_first(async |connection| schema::of_connection(connection).await)
+            .await
+            .map_err(failed)?;
+        if let Ok(found) = found {
+            refuse_newer(path, &found)?;
+        }
         writer
-            .with_first(async |connection| sqlx::migrate!("../migrations").run(connection).await)
+            .with_first(async |connection| schema::migrator().run(connection).await)
             .await
             .map_err(failed)?
             .map_err(|cause| OpenError::Migrate {
@@ -537,6 +568,30 @@ impl Db {
         self.checkpoints.close().await;
         self.writer.close().await;
     }
+}
+
+/// Refuses a file that a newer version has written.
+///
+/// # Errors
+/// [`OpenError::Newer`].
+pub fn refuse_newer(path: &Path, found: &schema::FileSchema) -> Result<(), OpenError> {
+    let known = schema::known();
+    let Some(newer) = found.schema.filter(|schema| *schema > known) else {
+        return Ok(());
+    };
+    let by = found.version.as_ref();
+    let wanted = by.map_or_else(
+        || "the version that wrote it, or a newer one".to_owned(),
+        |version| format!("version {version} or newer"),
+    );
+    Err(OpenError::Newer {
+        path: path.to_owned(),
+        found: newer,
+        by: by.map_or_else(String::new, |version| format!(" of tread-server {version}")),
+        wanted,
+        known,
+        version: VERSION,
+    })
 }
 
 /// Runs work on the database with a maximum time of [`WORK_MAX`].

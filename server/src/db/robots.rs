@@ -31,6 +31,8 @@ pub struct RobotRow {
     pub tags: Vec<Tag>,
     /// Time at which it was retired; `None` if it is not.
     pub retired_at: Option<Timestamp>,
+    /// Since when it awaits its release after a restoration; `None` if it does not.
+    pub awaits_release_since: Option<Timestamp>,
     /// What the base and its agent can do.
     pub capabilities: Capabilities,
     /// Version of the agent.
@@ -54,6 +56,7 @@ struct Raw {
     name: Option<String>,
     tags: String,
     retired_at_us: Option<i64>,
+    awaits_release_since_us: Option<i64>,
     capabilities: String,
     agent_version: String,
     boot: String,
@@ -75,6 +78,7 @@ impl TryFrom<Raw> for RobotRow {
             name: raw.name.unwrap_or(raw.id),
             tags: from_json("tags", &raw.tags)?,
             retired_at: raw.retired_at_us.map(from_us).transpose()?,
+            awaits_release_since: raw.awaits_release_since_us.map(from_us).transpose()?,
             capabilities: from_json("capabilities", &raw.capabilities)?,
             model: from_json("robot model", &raw.model)?,
             configuration: parse("configuration", &raw.configuration)?,
@@ -97,7 +101,8 @@ macro_rules! robots {
             Raw,
             r#"SELECT robots.pk AS "pk!", sites.id AS site, robots.id,
                    configurations.model AS "model!", configurations.id AS configuration,
-                   robots.name, robots.tags, robots.retired_at_us, robots.capabilities,
+                   robots.name, robots.tags, robots.retired_at_us,
+                   robots.awaits_release_since_us, robots.capabilities,
                    robots.agent_version, robots.boot, robots.first_seen_at_us,
                    robots.last_hello_at_us, robots.segments_refused,
                    robots.segments_refused_why,

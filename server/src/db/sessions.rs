@@ -319,7 +319,7 @@ mod tests {
         let path = folder.path().join("tread.db");
         let options = SqliteConnectOptions::new().filename(&path);
         let mut old = options.create_if_missing(true).connect().await.unwrap();
-        let all = sqlx::migrate!("../migrations");
+        let all = super::super::schema::migrator();
         let before = all.iter().filter(|step| step.version < 20_261_122_163_000);
         let before = Migrator {
             migrations: before.cloned().collect::<Vec<_>>().into(),

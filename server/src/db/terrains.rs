@@ -78,7 +78,8 @@ pub async fn count(db: &mut SqliteConnection, site_pk: i64) -> Result<usize, DbE
     unsigned("count", count)
 }
 
-/// Returns the newest revision of an identifier, also of a deleted terrain; 0 for none.
+/// Returns the newest revision of an identifier, also of a deleted terrain; 0 for none. After a
+/// restoration it is at least the newest one that may have been given before it.
 pub async fn last_revision(
     db: &mut SqliteConnection,
     site_pk: i64,
@@ -86,7 +87,8 @@ pub async fn last_revision(
 ) -> Result<u32, DbError> {
     let id = id.as_str();
     let revision = sqlx::query_scalar!(
-        r#"SELECT COALESCE(MAX(revision), 0) AS "revision!: i64"
+        r#"SELECT MAX(COALESCE(MAX(revision), 0),
+               COALESCE((SELECT MAX(revision_floor) FROM restorations), 0)) AS "revision!: i64"
            FROM terrain_revisions WHERE site_pk = ? AND id = ?"#,
         site_pk,
         id,

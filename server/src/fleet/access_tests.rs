@@ -27,7 +27,6 @@ use crate::app::enrolment::EnrolmentService;
 use crate::app::{App, Dependencies};
 use crate::authority::{Authorities, Authority, RobotName, RobotRequest};
 use crate::clock::Clock;
-use crate::config::{FrictionConfig, StorageConfig};
 use crate::db::Db;
 use crate::supervisor::Supervisor;
 
@@ -123,18 +122,13 @@ impl Rig {
         let mut fleet = opening.unwrap();
         change(&mut fleet);
         let app = App::new(Dependencies {
-            db,
-            clock: clock.clone(),
-            friction: FrictionConfig::default(),
-            storage: StorageConfig::default(),
-            normalisations: Vec::new(),
             robots: fleet.robot_link(),
             enrolment: Some(EnrolmentService {
                 authorities: Arc::clone(&authorities),
                 lifetime: HOUR,
                 port: fleet.address().port(),
             }),
-            webhooks: crate::config::webhooks::WebhooksConfig::default(),
+            ..Dependencies::on_database(db, clock.clone())
         });
         app.ensure_site(&site()).await.unwrap();
         for (name, number, is_revoked) in [

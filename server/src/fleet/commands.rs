@@ -63,7 +63,9 @@ const fn priority_of(verb: Verb) -> Priority {
         Verb::Clear | Verb::Lease | Verb::Limit | Verb::Pause | Verb::Cancel => {
             Priority::InteractiveHigh
         }
-        Verb::Offer | Verb::Resume | Verb::Site | Verb::StateRate => Priority::Data,
+        Verb::Offer | Verb::Resume | Verb::Site | Verb::StateRate | Verb::Outcomes => {
+            Priority::Data
+        }
     }
 }
 

@@ -24,7 +24,7 @@
 
 use tread_api::friction::TYRE_DIFFERENCE_SHARE;
 
-use super::joined::{Room, Said, joined};
+use super::joined::{EpochValue, Room, joined};
 use super::seen::{CHANGE_DEVIATIONS, Estimate, Ground, Seen, age_s, seconds};
 use super::sums::Known;
 use super::weights::FrictionConfig;
@@ -151,7 +151,7 @@ fn fuse_in<R: Ord + Copy>(
     let drift = config.drift_variance_per_s;
     let words = &mut room.room;
     let said = |one: &Seen<R>| {
-        Some(Said {
+        Some(EpochValue {
             known: one.theta,
             bias_ratio: one.bias_ratio(config),
             tyre_ratio: one.tyre_ratio,
@@ -165,7 +165,7 @@ fn fuse_in<R: Ord + Copy>(
     let mut layer = |value_of: fn(&Seen<R>) -> Option<Known>| {
         let is_known = seen.iter().any(|one| value_of(one).is_some());
         let said = |one: &Seen<R>| {
-            value_of(one).map(|known| Said {
+            value_of(one).map(|known| EpochValue {
                 known,
                 bias_ratio: config.robot_bias_ratio,
                 tyre_ratio: 0.0,
@@ -296,20 +296,20 @@ fn lone_witness<R: Ord + Copy>(
     contradicted: &[Seen<R>],
     config: &FrictionConfig,
 ) -> Option<R> {
-    let mut now = Word::default();
+    let mut now = WeightedTheta::default();
     for one in kept {
-        now.add(Word::of(one, one.theta, config));
+        now.add(WeightedTheta::of(one, one.theta, config));
     }
     let mut worse = contradicted
         .iter()
-        .filter(|one| now.is_better(&Word::of(one, one.theta, config)));
+        .filter(|one| now.is_better(&WeightedTheta::of(one, one.theta, config)));
     let first = worse.next()?;
-    let against = Word::of(first, first.theta, config);
+    let against = WeightedTheta::of(first, first.theta, config);
     // The contradicted entries have to be of at least two robots.
     let second = worse.find(|one| one.robot != first.robot)?;
     let mut witnesses = kept
         .iter()
-        .filter(|one| Word::of(one, one.theta, config).is_better(&against))
+        .filter(|one| WeightedTheta::of(one, one.theta, config).is_better(&against))
         .map(|one| one.robot);
     let lone = witnesses.next()?;
     let is_alone = witnesses.all(|robot| robot == lone);
@@ -322,14 +322,14 @@ fn lone_witness<R: Ord + Copy>(
 /// Weighted mean of θ of several measurements, with their errors: sums of the information Λ, and of
 /// Λ times θ, times the robots' bias and times the tyres' error, the latter two relative to θ.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-struct Word {
+struct WeightedTheta {
     information: f64,
     weighted: f64,
     bias: f64,
     tyre: f64,
 }
 
-impl Word {
+impl WeightedTheta {
     fn of<R>(one: &Seen<R>, theta: Known, config: &FrictionConfig) -> Self {
         Self {
             information: theta.information,
@@ -383,18 +383,18 @@ fn keep_present<R: Ord + Copy>(
     let mut changed_at_us = None;
     let mut oldest_kept_us = None;
     // Mean of the entries kept so far, and their robot while it is only one.
-    let mut kept = Word::default();
+    let mut kept = WeightedTheta::default();
     let mut only: Option<R> = None;
     let mut newest_kept_us = 0;
     for (index, one) in seen.iter_mut().enumerate() {
         let mixed = one.contradicted();
         let theta = mixed.map_or(one.theta, |(newest, _before)| newest);
-        let word = Word::of(one, theta, config);
+        let weighted = WeightedTheta::of(one, theta, config);
         if kept.information > 0.0 {
             let apart_s = seconds(newest_kept_us - one.newest_at_us);
-            let variance = kept.difference_variance(&word, only == Some(one.robot))
+            let variance = kept.difference_variance(&weighted, only == Some(one.robot))
                 + config.drift_variance_per_s * apart_s;
-            if (word.value() - kept.value()).abs() > CHANGE_DEVIATIONS * variance.sqrt() {
+            if (weighted.value() - kept.value()).abs() > CHANGE_DEVIATIONS * variance.sqrt() {
                 return (index, oldest_kept_us.or(changed_at_us));
             }
             if only != Some(one.robot) {
@@ -409,7 +409,7 @@ fn keep_present<R: Ord + Copy>(
             *one = one.with_newest_alone(newest);
             changed_at_us = Some(one.newest_at_us);
         }
-        kept.add(word);
+        kept.add(weighted);
     }
     (seen.len(), changed_at_us)
 }

@@ -23,14 +23,14 @@ const GROUP_CHI_SQUARE_MAX: f64 = 4.0;
 /// Reusable buffers of [`joined`].
 #[derive(Debug, Default)]
 pub(super) struct Room {
-    robots: Vec<Word>,
+    robots: Vec<RobotValue>,
     groups: Vec<Group>,
     ratios: Vec<f64>,
 }
 
 /// Value of one robot in one epoch, with its errors.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Said {
+pub(super) struct EpochValue {
     /// Value, with the information of its independent error.
     pub(super) known: Known,
     /// Standard deviation of the robot's bias, relative to the value.
@@ -42,14 +42,14 @@ pub(super) struct Said {
 
 /// Value of one robot over all epochs, with the variance of its independent errors.
 #[derive(Debug, Clone, Copy)]
-struct Word {
+struct RobotValue {
     variance: f64,
     value: f64,
     bias_ratio: f64,
     tyre_ratio: f64,
 }
 
-impl Word {
+impl RobotValue {
     /// Returns the weight of the robot in a mean with others whose common value is `common`.
     fn weight(&self, common: f64) -> f64 {
         ((self.bias_ratio * common).powi(2) + self.variance).recip()
@@ -119,7 +119,7 @@ pub(super) fn joined<R: Ord + Copy>(
         groups,
         ratios,
     }: &mut Room,
-    said_of: impl Fn(&Seen<R>) -> Option<Said>,
+    said_of: impl Fn(&Seen<R>) -> Option<EpochValue>,
     (now_us, drift): (i64, f64),
 ) -> Option<(Estimate, Heterogeneity)> {
     robots.clear();
@@ -146,7 +146,7 @@ pub(super) fn joined<R: Ord + Copy>(
             heterogeneity.within += (square - weighted * value).max(0.0);
             heterogeneity.within_freedom -= 1;
             let variance = f64::recip(information);
-            robots.push(Word {
+            robots.push(RobotValue {
                 variance,
                 value,
                 bias_ratio: bias / information,
@@ -155,7 +155,7 @@ pub(super) fn joined<R: Ord + Copy>(
         }
     }
     // Robots with vague values must not count towards the number of robots for robustness.
-    let knows_little = |robot: &Word| robot.variance > VAGUE_STD_DEV * VAGUE_STD_DEV;
+    let knows_little = |robot: &RobotValue| robot.variance > VAGUE_STD_DEV * VAGUE_STD_DEV;
     if !robots.iter().all(knows_little) {
         robots.retain(|robot| !knows_little(robot));
     }
@@ -196,7 +196,7 @@ struct Group {
 }
 
 impl Group {
-    fn plus(self, robot: &Word, origin: f64) -> Self {
+    fn plus(self, robot: &RobotValue, origin: f64) -> Self {
         let weight = robot.weight(origin);
         let value = robot.value - origin;
         Self {
@@ -222,7 +222,7 @@ impl Group {
 /// Returns the hull of the 95 % intervals of all groups that leave one robot out and are nearly as
 /// consistent as the best group.
 fn hull_of_groups(
-    robots: &mut [Word],
+    robots: &mut [RobotValue],
     (behind, ratios): (&mut Vec<Group>, &mut Vec<f64>),
     mut heterogeneity: Heterogeneity,
 ) -> (Estimate, Heterogeneity) {
@@ -238,7 +238,7 @@ fn hull_of_groups(
         f64::midpoint(robots[middle - 1].value, robots[middle].value)
     };
     // Medians also limit the effect of a robot that states a tiny bias or a huge tyre error.
-    let mut middle_of = |ratio_of: fn(&Word) -> f64| {
+    let mut middle_of = |ratio_of: fn(&RobotValue) -> f64| {
         ratios.clear();
         ratios.extend(robots.iter().map(ratio_of));
         // Usually all robots state the same ratios.
@@ -299,7 +299,7 @@ fn hull_of_groups(
 
 /// Returns the weighted mean of the robots and its information, with biases relative to `common`;
 /// `None` without robots.
-fn weighed(robots: &[Word], common: f64) -> Option<(f64, f64)> {
+fn weighed(robots: &[RobotValue], common: f64) -> Option<(f64, f64)> {
     let (mut sum, mut weighted) = (0.0, 0.0);
     for robot in robots {
         let weight = robot.weight(common);

@@ -38,7 +38,7 @@ use super::problem::Problem;
 use super::subject::Subject;
 use crate::app::App;
 use crate::app::identity::Credential;
-use crate::app::stops::StopWords;
+use crate::app::stops::StopReason;
 use crate::app::teleop::{Refused, Session};
 use crate::connections::Slot;
 
@@ -194,7 +194,7 @@ impl Connection {
                 DriveRequest::Take(driver) => self.acquire(&driver.name, true).await?,
                 DriveRequest::Release(_) => self.release().await?,
                 DriveRequest::Stop(words) => {
-                    let words = StopWords {
+                    let words = StopReason {
                         by: Some(self.subject.said_by(words.by.as_deref())),
                         reason: words.reason,
                     };
@@ -297,7 +297,7 @@ impl Connection {
         self.send(&DriveUpdate::Refused { cause, detail }).await
     }
 
-    async fn stop(&mut self, words: StopWords) -> Result<(), End> {
+    async fn stop(&mut self, words: StopReason) -> Result<(), End> {
         let update = match self.session.stop(words).await {
             Ok(stop) => DriveUpdate::Stopped(Box::new(stop)),
             Err(error) => DriveUpdate::Refused {
@@ -385,14 +385,14 @@ impl Connection {
 }
 
 /// Parses what it can of a frame that requests a stop: a stop is not refused for its other content.
-fn stop_of(text: &str) -> Option<drive::StopWords> {
+fn stop_of(text: &str) -> Option<drive::StopReason> {
     let frame: serde_json::Map<String, Value> = serde_json::from_str(text).ok()?;
     let words = frame.get("stop")?;
     let text = |field: &str| {
         let text = words.get(field)?.as_str()?;
         Some(cleaned(text, STOP_TEXT_MAX))
     };
-    Some(drive::StopWords {
+    Some(drive::StopReason {
         by: text("by"),
         reason: text("reason"),
     })

@@ -132,6 +132,7 @@ fn routes() -> OpenApiRouter<App> {
         .routes(routes!(terrains::get, terrains::replace, terrains::delete))
         .routes(routes!(robots::list))
         .routes(routes!(robots::get, robots::change))
+        .routes(routes!(robots::release))
         .routes(routes!(alerts::list))
         .routes(routes!(alerts::get))
         .routes(routes!(alerts::acknowledge))

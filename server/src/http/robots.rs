@@ -56,6 +56,21 @@ pub(super) async fn get(
     Ok(Json(app.robot(&site, &robot).await?))
 }
 
+/// Release a robot after the server was restored from a backup.
+///
+/// What happened after the backup is unknown, so no mission is sent to a robot until it is released.
+/// Does nothing to one that does not await that.
+#[utoipa::path(post, path = "/v1/sites/{site}/robots/{robot}/release", tag = "robots",
+    security(("token" = ["dispatch"])),
+    operation_id = "release_robot", params(("site" = SiteId, Path), ("robot" = RobotId, Path)),
+    responses((status = 200, body = Robot), (status = 404, body = ProblemBody)))]
+pub(super) async fn release(
+    State(app): State<App>,
+    Path((site, robot)): Path<(SiteId, RobotId)>,
+) -> Result<Json<Robot>, Problem> {
+    Ok(Json(app.release_robot(&site, &robot).await?))
+}
+
 /// Rename, tag, retire or restore a robot.
 ///
 /// Retiring cancels all its missions.

@@ -35,7 +35,7 @@ use super::subject::{AuditSlot, Subject};
 use crate::app::App;
 use crate::app::identity::Credential;
 use crate::app::stops::StopFilter;
-use crate::app::stops::StopWords;
+use crate::app::stops::StopReason;
 
 /// Maximum time for the body of a stop to arrive; after it the stop is executed without the body.
 const STOP_BODY_TIMEOUT: Duration = Duration::from_millis(500);
@@ -68,8 +68,8 @@ impl StopBody {
     }
 
     /// Returns author and reason; the token's name precedes any name given in the body.
-    fn words(&self, subject: &Credential) -> StopWords {
-        StopWords {
+    fn words(&self, subject: &Credential) -> StopReason {
+        StopReason {
             by: Some(subject.said_by(self.text("by").as_deref())),
             reason: self.text("reason"),
         }

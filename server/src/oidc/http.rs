@@ -9,6 +9,7 @@ use openidconnect::{AsyncHttpClient, HttpRequest, HttpResponse};
 use reqwest::{Certificate, Url, redirect};
 
 use super::ProviderError;
+use crate::config::credentials;
 use crate::identity::claims::Claims;
 
 /// Timeout of one request to the provider. A sign-in sends up to three, within
@@ -122,7 +123,7 @@ pub(super) fn read_secret(file: &Path) -> Result<String, ProviderError> {
         cause,
     };
     let mode = std::fs::metadata(file).map_err(unreadable)?.permissions();
-    if mode.mode() & 0o077 != 0 {
+    if mode.mode() & 0o077 != 0 && !credentials::is_passed(file) {
         return Err(ProviderError::Open(file.to_owned()));
     }
     let text = std::fs::read_to_string(file).map_err(unreadable)?;

@@ -70,7 +70,7 @@ impl Resolve for Checked {
 
 /// A delivery to be sent.
 #[derive(Clone, PartialEq, Eq)]
-pub struct Letter {
+pub struct OutgoingDelivery {
     /// Identifier of the delivery.
     pub id: DeliveryId,
     /// URL of the webhook.
@@ -147,8 +147,8 @@ impl Sender {
     }
 
     /// Sends a delivery once.
-    pub async fn send(&self, letter: &Letter) -> Attempt {
-        let request = match self.request(letter).await {
+    pub async fn send(&self, outgoing: &OutgoingDelivery) -> Attempt {
+        let request = match self.request(outgoing).await {
             Ok(request) => request,
             Err(failure) => return Attempt::without_answer(&failure),
         };
@@ -158,21 +158,24 @@ impl Sender {
         }
     }
 
-    async fn request(&self, letter: &Letter) -> Result<reqwest::RequestBuilder, String> {
+    async fn request(
+        &self,
+        outgoing: &OutgoingDelivery,
+    ) -> Result<reqwest::RequestBuilder, String> {
         // Read again: the configuration may have changed since the webhook was set up.
-        let url = self.rules.read(&letter.url);
+        let url = self.rules.read(&outgoing.url);
         let url = url.map_err(|wrong| wrong.to_string())?;
         let addresses = self.addresses(&url).await?;
         let client = self.client(&url, addresses).await?;
-        let timestamp_s = letter.at.as_second();
-        let signed = signature(&letter.secret, timestamp_s, &letter.body);
+        let timestamp_s = outgoing.at.as_second();
+        let signed = signature(&outgoing.secret, timestamp_s, &outgoing.body);
         Ok(client
             .post(url)
             .header(header::CONTENT_TYPE, "application/json")
             .header(TIMESTAMP_HEADER, timestamp_s)
-            .header(DELIVERY_HEADER, letter.id.to_string())
+            .header(DELIVERY_HEADER, outgoing.id.to_string())
             .header(SIGNATURE_HEADER, signed)
-            .body(letter.body.clone()))
+            .body(outgoing.body.clone()))
     }
 
     /// Resolves the host of a URL and checks what comes of it.

@@ -52,12 +52,17 @@ impl Interposer {
             .open(path)
             .unwrap();
         let interposer = Self { control };
+        interposer.assert_loaded();
+        Some(interposer)
+    }
+
+    /// Fails the test unless the process has loaded the library.
+    pub(crate) fn assert_loaded(&self) {
         assert_eq!(
-            interposer.number(4),
+            self.number(4),
             3,
             "the library is not loaded, or SQLite's allocator is not among the program's symbols"
         );
-        Some(interposer)
     }
 
     fn number(&self, index: u64) -> u64 {
@@ -118,6 +123,18 @@ pub(crate) fn run_with_faults(test: &str) {
         child.status
     );
     eprintln!("{printed}");
+}
+
+/// A program whose calls can fail, and what lets them; the folder must outlive it.
+pub(crate) fn program_with_faults(mut program: Command, folder: &Path) -> (Command, Interposer) {
+    let control = folder.join("control");
+    std::fs::write(&control, [0; 8 * NUMBERS]).unwrap();
+    program
+        .env("LD_PRELOAD", compiled(folder))
+        .env(CONTROL, &control);
+    let mut options = OpenOptions::new();
+    let control = options.read(true).write(true).open(control).unwrap();
+    (program, Interposer { control })
 }
 
 fn compiled(folder: &Path) -> PathBuf {

@@ -10,13 +10,10 @@ use rcgen::{CertificateParams, KeyPair};
 use tread_api::enrolment::{CreateJoinToken, EnrolRobot, ReplaceAuthority};
 use tread_api::rights::Scope;
 use tread_server::app::enrolment::EnrolmentService;
-use tread_server::app::robot_link::RobotLink;
 use tread_server::app::{App, Dependencies};
 use tread_server::authority::{Authorities, Authority};
 use tread_server::clock::Clock;
-use tread_server::config::{FrictionConfig, StorageConfig};
 use tread_server::db::Db;
-use tread_server::supervisor::Supervisor;
 
 use crate::ground::now;
 use crate::interposer::Interposer;
@@ -33,18 +30,15 @@ pub(crate) fn replaced(interposer: &Interposer) -> Pin<Box<dyn Future<Output = (
         let signing = authority.fingerprint().to_owned();
         let authorities = Arc::new(Authorities::in_memory(authority));
         let app = App::new(Dependencies {
-            db: Db::open(&folder.path().join("tread.db")).await.unwrap(),
-            clock: Clock::manual(now()),
-            friction: FrictionConfig::default(),
-            storage: StorageConfig::default(),
-            normalisations: Vec::new(),
-            robots: RobotLink::unconnected(Supervisor::new()),
             enrolment: Some(EnrolmentService {
                 authorities: Arc::clone(&authorities),
                 lifetime: SignedDuration::from_hours(24),
                 port: 7447,
             }),
-            webhooks: tread_server::config::webhooks::WebhooksConfig::default(),
+            ..Dependencies::on_database(
+                Db::open(&folder.path().join("tread.db")).await.unwrap(),
+                Clock::manual(now()),
+            )
         });
         let site = "yard".parse().unwrap();
         app.ensure_site(&site).await.unwrap();

@@ -200,6 +200,7 @@ fn config(folder: &std::path::Path) -> Config {
         robots: None,
         oidc: None,
         webhooks: tread_server::config::webhooks::WebhooksConfig::default(),
+        backup: None,
         audit: tread_server::config::AuditConfig::default(),
         web: WebConfig::default(),
     }

@@ -20,6 +20,8 @@ mod paths;
 mod statements;
 #[cfg(test)]
 mod uncertain;
+#[cfg(test)]
+mod watchdog;
 
 #[cfg(test)]
 mod tests {
@@ -159,6 +161,11 @@ mod tests {
             Some(interposer) => crate::lasting::full_disk(&interposer),
             None => run_with_faults(name),
         }
+    }
+
+    #[test]
+    fn the_watchdog_of_the_service_manager_is_fed_while_the_storage_fails() {
+        crate::watchdog::fed();
     }
 
     #[test]

@@ -18,11 +18,12 @@ use tread_server::app::AppError;
 use tread_server::authority::Issued;
 use tread_server::config::RetentionConfig;
 use tread_server::db;
-use tread_server::db::alerts::Whereabouts;
+use tread_server::db::alerts::AlertLocation;
 use tread_server::db::deferred_segments::Origin;
 use tread_server::db::enrolments::Renewal;
-use tread_server::db::idempotency::Given;
+use tread_server::db::idempotency::StoredAnswer;
 use tread_server::db::missions::Facts;
+use tread_server::db::restorations::Restoration;
 use tread_server::db::robots::Introduction;
 use tread_server::db::sessions::{NewSession, OfPeople, Owner, SignedIn};
 use tread_server::db::webhooks::{NewDelivery, Outcome};
@@ -137,6 +138,26 @@ pub(crate) const PATHS: &[WritePath] = &[
                 db::robots::boot_key(tx, ground.robot_pk, other, RUNS_KEPT).await?;
                 let configuration: ConfigurationId = of(json!(format!("{number:032x}")));
                 db::robots::note_measured(tx, ground.robot_pk, configuration)
+                    .await
+                    .map(|_| ())
+            }))
+        },
+    },
+    WritePath {
+        name: "restoration of a backup",
+        prepare: nothing,
+        act: |ground, number| {
+            Box::pin(ground.write(async move |tx| {
+                let version = format!("0.0.{number}");
+                db::schema::note_version(tx, &version, now()).await?;
+                let restoration = Restoration {
+                    restored_at: now(),
+                    taken_at: LONG_AGO,
+                    version,
+                };
+                db::restorations::begin(tx, &restoration).await?;
+                db::restorations::note_outcomes(tx, ground.robot_pk).await?;
+                db::restorations::release(tx, ground.robot_pk)
                     .await
                     .map(|_| ())
             }))
@@ -290,11 +311,11 @@ pub(crate) const PATHS: &[WritePath] = &[
                     of(json!({"code": "test-alert", "severity": "warning", "text": "a test"}));
                 db::alerts::raise(tx, ground.robot_pk, id, &report, now()).await?;
                 let shown = of(json!({"x_m": 1.0, "y_m": 2.0}));
-                let whereabouts = Whereabouts {
+                let location = AlertLocation {
                     mission: Some(ground.mission),
                     place: Some(shown),
                 };
-                db::alerts::locate(tx, id, whereabouts).await?;
+                db::alerts::locate(tx, id, location).await?;
                 db::alerts::acknowledge(tx, id, now()).await?;
                 db::alerts::clear(tx, ground.robot_pk, &report.code, now()).await?;
                 db::alerts::forget(tx, ground.robot_pk, 3).await
@@ -520,12 +541,13 @@ pub(crate) const PATHS: &[WritePath] = &[
         prepare: nothing,
         act: |ground, number| {
             Box::pin(ground.write(async move |tx| {
-                let given = Given {
+                let stored = StoredAnswer {
                     request_hash: uuid(number),
                     answer: "{}".to_owned(),
                 };
                 let key = format!("alone-{number}");
-                db::idempotency::insert(tx, (SubjectId::Token(token(7)), &key), &given, now()).await
+                db::idempotency::insert(tx, (SubjectId::Token(token(7)), &key), &stored, now())
+                    .await
             }))
         },
     },

@@ -355,3 +355,67 @@ async fn a_robot_whose_clock_stays_wrong_raises_an_alert_that_says_by_how_much()
     assert!(text.contains("s behind the server's"), "{text}");
     yard.server.stop().await.unwrap();
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_mission_that_does_not_begin_raises_an_alert_until_it_begins_or_ends() {
+    let yard = Yard::start_at(time(BEGIN)).await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    link_is(&yard, "rover-1", LinkState::Online).await;
+    let id = robot.id.clone();
+    drop(robot);
+    link_is(&yard, "rover-1", LinkState::Offline).await;
+    let first = yard.create_mission(&id).await;
+    pass(&yard, 2).await;
+    yard.server.app().clock().advance(Duration::from_secs(290));
+    pass(&yard, 1).await;
+    assert_eq!(alerts(&yard, "mission-waiting").await, Vec::<Value>::new());
+    yard.server.app().clock().advance(Duration::from_secs(10));
+    pass(&yard, 1).await;
+    let raised = there_are(&yard, "mission-waiting", 1, true).await;
+    assert_eq!(raised[0]["mission"], json!(first.id));
+    let text = raised[0]["text"].as_str().unwrap();
+    assert!(text.contains("5 min: the robot is not heard"), "{text}");
+    // It is the same alert after a restart, and ends with its mission.
+    let yard = yard.restart_at(time("2026-11-10T09:00:00Z")).await;
+    pass(&yard, 3).await;
+    there_are(&yard, "mission-waiting", 1, true).await;
+    let path = format!("/v1/missions/{}/cancel", first.id);
+    let (status, said) = yard.post(&path, &json!({})).await;
+    assert_eq!(status, StatusCode::ACCEPTED, "{said}");
+    pass(&yard, 1).await;
+    there_are(&yard, "mission-waiting", 1, false).await;
+    // One that begins in time raises none.
+    let _robot = Robot::join(&yard, "rover-1").await;
+    let mission = yard.create_mission(&id).await;
+    yard.mission_becomes(mission.id, MissionState::Active).await;
+    there_are(&yard, "mission-waiting", 1, false).await;
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_robot_that_is_away_no_longer_waits_on_a_mission_that_has_ended() {
+    let yard = Yard::start_at(time(BEGIN)).await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let mission = yard.create_mission(&robot.id).await;
+    yard.mission_becomes(mission.id, MissionState::Active).await;
+    robot.drive(&mission, 3.0);
+    pass(&yard, 3).await;
+    for _ in 0..32 {
+        yard.server.app().clock().advance(Duration::from_secs(10));
+        link_is(&yard, "rover-1", LinkState::Online).await;
+    }
+    pass(&yard, 2).await;
+    there_are(&yard, "robot-waiting", 1, true).await;
+    drop(robot);
+    link_is(&yard, "rover-1", LinkState::Offline).await;
+    let path = format!("/v1/missions/{}/cancel", mission.id);
+    let (status, said) = yard.post(&path, &json!({})).await;
+    assert_eq!(status, StatusCode::ACCEPTED, "{said}");
+    pass(&yard, 1).await;
+    // The robot may be driving it still, as far as anybody knows.
+    there_are(&yard, "robot-waiting", 1, true).await;
+    yard.server.app().clock().advance(Duration::from_hours(2));
+    pass(&yard, 3).await;
+    there_are(&yard, "robot-waiting", 1, false).await;
+    yard.server.stop().await.unwrap();
+}

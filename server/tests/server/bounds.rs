@@ -20,7 +20,7 @@ use tread_api::wire::RefusalCode;
 use tread_api::wire::hello::Hello;
 use tread_api::wire::ingest::Record;
 use tread_server::app::App;
-use tread_server::app::stops::StopWords;
+use tread_server::app::stops::StopReason;
 use tread_server::db;
 use tread_server::db::stops::StopFilter;
 use uuid::Uuid;
@@ -571,7 +571,7 @@ async fn of_several_open_stops_of_a_robot_the_newest_stays_open() {
 async fn a_stop_is_recorded_and_shown_unconfirmed_while_no_robot_is_reached() {
     let writer = Writer::start().await;
     let (site, robot) = (site(), "rover-1".parse().unwrap());
-    let asked = writer.app.stop_robot(&site, &robot, StopWords::default());
+    let asked = writer.app.stop_robot(&site, &robot, StopReason::default());
     let stop = asked.await.unwrap();
     assert!(stop.unconfirmed, "{stop:?}");
     eventually("the database has the stop", async || {

@@ -113,7 +113,7 @@ async fn a_dry_run_tells_how_well_friction_would_be_measured() {
     let check = async |body: &Value| yard.post("/v1/trajectories/check", body).await;
     let (_, steady) = check(&body).await;
     assert_eq!(steady["measurement"]["theta_assumed"], 0.2, "{steady}");
-    let none = &steady["measurement"]["relative_sd"];
+    let none = &steady["measurement"]["relative_std_dev"];
     assert!(
         none.is_null(),
         "a steady circle tells a base without torque nothing: {steady}"
@@ -124,9 +124,9 @@ async fn a_dry_run_tells_how_well_friction_would_be_measured() {
     body["theta"] = json!(0.5);
     let (_, excited) = check(&body).await;
     assert_eq!(excited["measurement"]["theta_assumed"], 0.5, "{excited}");
-    let relative_sd = excited["measurement"]["relative_sd"].as_f64();
+    let relative_std_dev = excited["measurement"]["relative_std_dev"].as_f64();
     assert!(
-        relative_sd.is_some_and(|relative_sd| (0.001..0.3).contains(&relative_sd)),
+        relative_std_dev.is_some_and(|relative_std_dev| (0.001..0.3).contains(&relative_std_dev)),
         "{excited}"
     );
     let depth = excited["excitation_depth_ratio"].as_f64().unwrap();

@@ -219,6 +219,19 @@ impl Yard {
         Self::start_in(self.folder, zenoh.trim_start_matches("tcp/")).await
     }
 
+    /// Stops the server, does something with its folder, and starts another on the same database
+    /// and network address.
+    pub(crate) async fn restart_after(self, act: impl FnOnce(&Path) + Send + 'static) -> Self {
+        let zenoh = self.server.zenoh_endpoint();
+        self.server.stop().await.unwrap();
+        let folder = Arc::clone(&self.folder);
+        tokio::task::spawn_blocking(move || act(folder.path()))
+            .await
+            .unwrap();
+        let (_, address) = zenoh.split_once('/').unwrap();
+        Self::start_in(self.folder, address).await
+    }
+
     /// The same with a clock that stands at another time.
     pub(crate) async fn restart_at(self, wall: Timestamp) -> Self {
         let zenoh = self.server.zenoh_endpoint();
@@ -308,6 +321,7 @@ pub(crate) fn config(folder: &Path, zenoh: &str) -> Config {
         robots: None,
         oidc: None,
         webhooks: WebhooksConfig::default(),
+        backup: None,
         audit: tread_server::config::AuditConfig::default(),
         web: WebConfig {
             hosts: vec!["tread.test".to_owned()],

@@ -6,6 +6,8 @@ mod alerts;
 #[cfg(test)]
 mod as_of;
 #[cfg(test)]
+mod backups;
+#[cfg(test)]
 mod bad_input;
 #[cfg(test)]
 mod bounds;
@@ -54,15 +56,21 @@ mod pictures;
 #[cfg(test)]
 mod program;
 #[cfg(test)]
+mod releases;
+#[cfg(test)]
 mod request_bodies;
 #[cfg(test)]
 mod resources;
+#[cfg(test)]
+mod restoration;
 #[cfg(test)]
 mod retention;
 #[cfg(test)]
 mod robot;
 #[cfg(test)]
 mod robots;
+#[cfg(test)]
+mod service_manager;
 #[cfg(test)]
 mod slow_client;
 #[cfg(test)]

@@ -5,6 +5,7 @@ use std::collections::BTreeSet;
 use reqwest::StatusCode;
 use tread_api::mission::MissionState;
 use tread_api::wire::ingest::MissionPhase;
+use tread_server::config::backup::BackupConfig;
 
 use crate::harness::{Yard, eventually, folder_of_the_crate};
 use crate::robot::Robot;
@@ -54,7 +55,21 @@ async fn missions_refusals_queues_and_transactions_are_measured() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn alert_rules_and_dashboard_name_only_metrics_that_exist() {
-    let yard = Yard::start().await;
+    let yard = Yard::start_configured(|config, folder| {
+        config.backup = Some(BackupConfig {
+            folder: folder.join("backups"),
+            every_hours: 24,
+            keep: 1,
+            encrypt: None,
+        });
+    })
+    .await;
+    eventually("the server has made a backup", async || {
+        let (_, status) = yard.get_value("/v1/server").await;
+        let is_made = status["backup"]["last_at"].is_string();
+        if is_made { Ok(()) } else { Err(status) }
+    })
+    .await;
     // Of requests there is nothing before the first one.
     assert_eq!(yard.get_value("/v1/sites").await.0, StatusCode::OK);
     let text = page(&yard).await;

@@ -8,15 +8,15 @@ use std::time::Duration;
 
 use serde::de::DeserializeOwned;
 use tokio::time::Instant;
-use tread_api::ids::{BootId, RobotId};
+use tread_api::ids::{BootId, MissionId, RobotId};
 use tread_api::keys::{self, Verb};
 use tread_api::mission::Mission;
 use tread_api::robot::{Capabilities, LoopStatus, MissionProgress, OutboxStatus, RobotMode};
 use tread_api::safety::SafetyStatus;
-use tread_api::wire::command::{Cancel, Offer};
+use tread_api::wire::command::{Cancel, Offer, Outcomes};
 use tread_api::wire::hello::{Hello, SiteDefinition, Welcome};
 use tread_api::wire::ingest::{Batch, MissionPhase, Receipt, Record};
-use tread_api::wire::reply::CommandRefusalCode;
+use tread_api::wire::reply::{CommandRefusalCode, EndedMission, MissionOutcomes};
 use tread_api::wire::safety::{ClearStop, DriveCommand, ExternalLimit, LeaseCommand, Stop};
 use tread_api::wire::state::{RobotState, StateRate};
 use tread_api::wire::{self, Refusal};
@@ -54,6 +54,9 @@ struct Heard {
     deaf_to_state_rates: bool,
     stops_are_over: bool,
     epoch: u64,
+    outcomes_asked: Vec<Outcomes>,
+    /// What it says of missions that ended; `None` is silence.
+    remembered: Option<MissionOutcomes>,
 }
 
 /// A robot on the network that says what the test tells it to.
@@ -151,6 +154,12 @@ impl Robot {
             deaf_to_state_rates: false,
             stops_are_over: false,
             epoch: 0,
+            outcomes_asked: Vec::new(),
+            remembered: Some(MissionOutcomes {
+                ended: Vec::new(),
+                active: None,
+                forgotten: None,
+            }),
         }));
         let state = Arc::new(Mutex::new(first_state(&id, boot, pending)));
         let (listener, holding) = (Arc::clone(&heard), Arc::clone(&state));
@@ -389,6 +398,31 @@ impl Robot {
         }])
         .await
         .unwrap()
+    }
+
+    /// Lets it remember that missions ended, and that it has forgotten those up to one.
+    pub(crate) fn remember(
+        &self,
+        ended: &[(MissionId, MissionPhase)],
+        forgotten: Option<MissionId>,
+    ) {
+        let ended = ended.iter();
+        let ended = ended.map(|&(mission, phase)| EndedMission { mission, phase });
+        self.heard.lock().unwrap().remembered = Some(MissionOutcomes {
+            ended: ended.collect(),
+            active: None,
+            forgotten,
+        });
+    }
+
+    /// Lets it not know the question how missions ended, as an older agent.
+    pub(crate) fn be_deaf_to_outcomes(&self) {
+        self.heard.lock().unwrap().remembered = None;
+    }
+
+    /// How often it was asked how missions ended.
+    pub(crate) fn outcomes_asked(&self) -> usize {
+        self.heard.lock().unwrap().outcomes_asked.len()
     }
 
     /// Shows in its state that it drives a mission.

@@ -86,7 +86,7 @@ fn advance(yard: &Yard, span: Duration) {
 async fn an_alert_is_sent_signed_when_it_is_raised_and_when_it_ends() {
     let yard = start().await;
     let receiver = Receiver::start(Mood::Good).await;
-    let settings = json!({"name": "on call", "url": receiver.url(), "kinds": ["tyre"],
+    let settings = json!({"name": "on call", "url": receiver.url(), "kinds": ["battery-low"],
                           "sites": ["yard"]});
     let (id, secret) = create(&yard, &settings).await;
     let other = Receiver::start(Mood::Good).await;
@@ -111,7 +111,7 @@ async fn an_alert_is_sent_signed_when_it_is_raised_and_when_it_ends() {
         };
         state.pose = Some(Aged { value, age_ms: 0 });
     });
-    report(&robot, Some("tyre"));
+    report(&robot, Some("battery-low"));
     let opened = receiver.has(1).await.remove(0);
     assert!(
         opened.line.starts_with("POST /alerts?of=yard "),
@@ -122,21 +122,21 @@ async fn an_alert_is_sent_signed_when_it_is_raised_and_when_it_ends() {
     assert!(!opened.is_signed_with("tread_w_another"), "{opened:?}");
     assert_eq!(opened.timestamp_s(), time(BEGIN).as_second());
     let said = opened.json();
-    let (_, alerts) = yard.get_value("/v1/alerts?kind=tyre&raised=true").await;
+    let (_, alerts) = yard
+        .get_value("/v1/alerts?kind=battery-low&raised=true")
+        .await;
     let alert = &alerts["items"][0];
     assert_eq!(
         said,
         json!({
             "v": 1, "delivery": opened.delivery(), "event": "opened", "id": alert["id"],
-            "kind": "tyre", "severity": "warning", "text": "flat", "site": "yard",
+            "kind": "battery-low", "severity": "warning", "text": "flat", "site": "yard",
             "robot": "rover-1", "mission": null, "place": {"x_m": 3.5, "y_m": -2.0},
             "at": alert["raised_at"], "opened_at": alert["raised_at"], "ended_at": null,
-            "link": format!("/v1/alerts/{}", alert["id"].as_str().unwrap()),
+            "link": format!("/#site=yard&tab=alerts&alert={}", alert["id"].as_str().unwrap()),
         })
     );
     assert_eq!(alert["place"], json!({"x_m": 3.5, "y_m": -2.0}));
-    let (status, linked) = yard.get_value(said["link"].as_str().unwrap()).await;
-    assert_eq!((status, &linked), (StatusCode::OK, alert));
 
     report(&robot, None);
     let ended = receiver.has(2).await.remove(1);
@@ -194,10 +194,12 @@ async fn an_alert_about_the_server_reaches_webhooks_of_every_site() {
         (&said["site"], &said["robot"]),
         (&Value::Null, &Value::Null)
     );
-    let link = said["link"].as_str().unwrap();
-    assert_eq!(yard.get_value(link).await.0, StatusCode::OK);
+    let id = said["id"].as_str().unwrap();
+    assert_eq!(said["link"], format!("/#tab=alerts&alert={id}"));
+    let path = format!("/v1/alerts/{id}");
+    assert_eq!(yard.get_value(&path).await.0, StatusCode::OK);
     // Whoever has seen it ends it.
-    let (status, seen) = yard.post(&format!("{link}/acknowledge"), &json!({})).await;
+    let (status, seen) = yard.post(&format!("{path}/acknowledge"), &json!({})).await;
     assert_eq!(status, StatusCode::OK, "{seen}");
     assert!(seen["cleared_at"].is_string(), "{seen}");
     let ended = receiver.has(2).await.remove(1);

@@ -33,7 +33,6 @@ use tread_server::app::reconciler::Reconciler;
 use tread_server::app::robot_link::RobotLink;
 use tread_server::app::{App, AppError, Dependencies};
 use tread_server::clock::Clock;
-use tread_server::config::{FrictionConfig, StorageConfig};
 use tread_server::db::Db;
 use tread_server::supervisor::Supervisor;
 
@@ -66,14 +65,11 @@ struct Storm {
 
 async fn app_on(path: &Path, clock: &Clock, site: &SiteId, robots: RobotLink) -> App {
     let app = App::new(Dependencies {
-        db: Db::open(path).await.expect("the database opens"),
-        clock: clock.clone(),
-        friction: FrictionConfig::default(),
-        storage: StorageConfig::default(),
-        normalisations: Vec::new(),
         robots,
-        enrolment: None,
-        webhooks: tread_server::config::webhooks::WebhooksConfig::default(),
+        ..Dependencies::on_database(
+            Db::open(path).await.expect("the database opens"),
+            clock.clone(),
+        )
     });
     app.ensure_site(site).await.expect("the site is made");
     app

@@ -51,7 +51,8 @@ impl World {
             | Verb::Clear
             | Verb::Lease
             | Verb::Limit
-            | Verb::StateRate => return,
+            | Verb::StateRate
+            | Verb::Outcomes => return,
         };
         let mission = mission.expect("the server writes what can be read");
         if self.held.contains(&mission) {

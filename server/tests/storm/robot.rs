@@ -245,7 +245,8 @@ impl Robot {
                 let held = self.hold(&pause, verb == Verb::Pause);
                 self.acknowledges(held)
             }
-            Verb::Site | Verb::StateRate => self.acknowledges(Ok(())),
+            // No server of the storm was restored, so none asks for outcomes.
+            Verb::Site | Verb::StateRate | Verb::Outcomes => self.acknowledges(Ok(())),
             Verb::Stop => {
                 let latched = self.latch(wire::decode(payload).expect("a stop"));
                 self.acknowledges(latched)

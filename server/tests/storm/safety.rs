@@ -10,7 +10,7 @@ use tread_api::stop::Stop;
 use tread_api::wire;
 use tread_api::wire::safety::AcquireLease;
 use tread_server::app::robot_link::{CommandTransport as _, RobotLink};
-use tread_server::app::stops::StopWords;
+use tread_server::app::stops::StopReason;
 use tread_server::db;
 use tread_server::db::stops::StopFilter;
 use tread_server::supervisor::Supervisor;
@@ -45,7 +45,7 @@ impl Storm {
         let robot = with(&self.world, |world| world.robots[index].id.clone());
         let stopped = self
             .app
-            .stop_robot(&self.site, &robot, StopWords::default());
+            .stop_robot(&self.site, &robot, StopReason::default());
         let stopped = stopped.await;
         if let Ok(stop) = &stopped {
             self.is_settled(stop).await?;

@@ -12,7 +12,7 @@ pub(super) enum Needs {
 use Needs::{Admin, Nothing, Operator, Viewer};
 
 /// Every operation but those that only read; those are a viewer's unless they stand here.
-const TABLE: [(&str, &str, Needs); 56] = [
+const TABLE: [(&str, &str, Needs); 57] = [
     ("GET", "/healthz", Nothing),
     ("GET", "/readyz", Nothing),
     ("POST", "/v1/session", Nothing),
@@ -46,6 +46,7 @@ const TABLE: [(&str, &str, Needs); 56] = [
         "/v1/sites/{site}/robots/{robot}/limits/{owner}",
         Operator,
     ),
+    ("POST", "/v1/sites/{site}/robots/{robot}/release", Operator),
     (
         "POST",
         "/v1/sites/{site}/robots/{robot}/stop/clear",

@@ -159,9 +159,9 @@ fn two_at_once(steps: &[Step]) -> Option<String> {
     let mut in_progress: Vec<&str> = Vec::new();
     for (mission, state) in steps {
         let state = MissionState::from_name(state)?;
-        let is_in_hand = !state.is_terminal() && state != MissionState::Queued;
+        let is_active = !state.is_terminal() && state != MissionState::Queued;
         in_progress.retain(|active| active != mission);
-        if is_in_hand {
+        if is_active {
             in_progress.push(mission);
         }
         if in_progress.len() > 1 {
@@ -281,7 +281,7 @@ mod tests {
     }
 
     #[test]
-    fn the_robots_own_log_shows_a_second_mission_in_hand() {
+    fn the_robots_own_log_shows_a_second_active_mission() {
         let after = "agent of `r` runs\ntook mission m1 x\nmission m1 ended: Failed\n\
                      took mission m2\nagent of `r` runs\ntook mission m3\n";
         assert_eq!(two_on_the_robot(after), None);

@@ -7,6 +7,7 @@
     reason = "what the helpers of a test cannot do fails the test"
 )]
 
+mod alerts;
 mod book;
 mod data;
 mod links;

@@ -17,6 +17,10 @@ mod missions;
 mod outages;
 #[cfg(test)]
 mod pages;
+#[cfg(test)]
+mod releases;
+#[cfg(test)]
+mod restoration;
 mod safety;
 #[cfg(test)]
 mod scenario;

@@ -6,7 +6,7 @@ use jiff::Timestamp;
 use tread_api::event::Event;
 use tread_api::robot::Robot;
 
-use crate::commands::missions::{state, trajectory};
+use crate::commands::mission_text::{state, trajectory};
 use crate::commands::robots::{link_name, mode_name};
 
 /// Maximum number of objects whose last line is kept; beyond it, all are dropped and printed once

@@ -9,6 +9,7 @@ mod known;
 mod lines;
 mod picture;
 mod screen;
+mod view;
 
 use std::io::{self, IsTerminal as _};
 use std::process::ExitCode;

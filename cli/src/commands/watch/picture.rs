@@ -11,8 +11,8 @@ use tread_api::robot::{LinkState, MissionProgress, Robot, RobotLive, RobotMode, 
 use tread_api::safety::StandingState;
 
 use super::known::Known;
-use super::screen::{Order, Section, Shown};
-use crate::commands::missions::{state, trajectory};
+use super::view::{Order, Section, View};
+use crate::commands::mission_text::{state, trajectory};
 use crate::commands::robots::{details, link_name, mode_name, steps_come, theta};
 use crate::output::{age, fixed, or_dash};
 
@@ -39,7 +39,7 @@ pub(super) struct Picture<'screen> {
     pub(super) site: &'screen SiteId,
     pub(super) address: &'screen str,
     pub(super) known: &'screen Known,
-    pub(super) shown: &'screen Shown,
+    pub(super) shown: &'screen View,
 }
 
 /// Returns the number of rows for a list of `count` entries, with heading and border.
@@ -413,7 +413,7 @@ mod tests {
             site: &site,
             address: "http://here",
             known,
-            shown: &Shown::default(),
+            shown: &View::default(),
         };
         terminal
             .draw(|frame| draw(frame, &picture))

@@ -12,13 +12,13 @@ use tokio::sync::mpsc;
 use tokio::time::MissedTickBehavior;
 use tread_api::event::Event;
 use tread_api::ids::{AlertId, RobotId, SiteId};
-use tread_api::robot::{Alert, LinkState, Robot};
 use tread_api::stop::StopRobot;
 
 use super::ended;
 use super::feed::News;
 use super::known::Known;
 use super::picture::{Picture, draw};
+use super::view::{Order, Section, View};
 use crate::args::WatchArguments;
 use crate::client::Client;
 use crate::commands::keys::Keyboard;
@@ -26,138 +26,9 @@ use crate::commands::keys::Keyboard;
 /// Number of rows by which the page keys move.
 const PAGE_ROWS: usize = 10;
 
-/// Table to which the keys apply.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(super) enum Section {
-    #[default]
-    Robots,
-    Missions,
-    Alerts,
-}
-
-impl Section {
-    const ALL: [Self; 3] = [Self::Robots, Self::Missions, Self::Alerts];
-
-    fn next(self) -> Self {
-        let at = Self::ALL.iter().position(|section| *section == self);
-        Self::ALL[(at.unwrap_or_default() + 1) % Self::ALL.len()]
-    }
-}
-
-/// Order of the robots.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(super) enum Order {
-    #[default]
-    Name,
-    /// Robots that need attention first: stopped, offline, stale.
-    Trouble,
-}
-
-/// State of the screen besides the data of the site.
-#[derive(Debug, Default)]
-pub(super) struct Shown {
-    pub(super) section: Section,
-    pub(super) order: Order,
-    /// Selected object of each section, by its identifier, so that an action applies to the
-    /// selected object even if its row has moved.
-    selected: [Option<String>; 3],
-    /// Whether the details of the selected robot replace its table.
-    pub(super) details: bool,
-    /// Result of the last action.
-    pub(super) said: Option<String>,
-    /// Reason why no events arrive; `None` while they do.
-    pub(super) lost: Option<String>,
-}
-
-impl Shown {
-    /// Returns the identifiers in a section, in their order.
-    fn listed(&self, known: &Known, section: Section) -> Vec<String> {
-        match section {
-            Section::Robots => {
-                let robots = self.robots(known).into_iter();
-                robots.map(|robot| robot.id.to_string()).collect()
-            }
-            Section::Missions => {
-                let missions = known.missions().into_iter();
-                missions.map(|mission| mission.id.to_string()).collect()
-            }
-            Section::Alerts => {
-                let alerts = known.alerts().into_iter();
-                alerts.map(|alert| alert.id.to_string()).collect()
-            }
-        }
-    }
-
-    /// Returns the selected row of a section; the first one if nothing is selected.
-    pub(super) fn row(&self, known: &Known, section: Section) -> usize {
-        let selected = self.selected[section as usize].as_ref();
-        let listed = self.listed(known, section);
-        let at = listed.iter().position(|id| Some(id) == selected);
-        at.unwrap_or_default()
-    }
-
-    fn move_by(&mut self, known: &Known, rows: isize) {
-        let listed = self.listed(known, self.section);
-        let row = self.row(known, self.section).saturating_add_signed(rows);
-        let row = row.min(listed.len().saturating_sub(1));
-        self.selected[self.section as usize] = listed.get(row).cloned();
-    }
-
-    /// Fixes the selection to the objects that are drawn as selected, so that it follows them when
-    /// rows move.
-    fn mark(&mut self, known: &Known) {
-        if !known.is_whole() {
-            // Rows are still missing.
-            return;
-        }
-        for section in Section::ALL {
-            let row = self.row(known, section);
-            let listed = self.listed(known, section);
-            self.selected[section as usize] = listed.get(row).cloned();
-        }
-    }
-
-    /// Returns the robots in the chosen order.
-    pub(super) fn robots<'known>(&self, known: &'known Known) -> Vec<&'known Robot> {
-        let mut robots: Vec<&Robot> = known.robots().collect();
-        if self.order == Order::Trouble {
-            robots.sort_by_key(|robot| std::cmp::Reverse(trouble(robot)));
-        }
-        robots
-    }
-
-    /// Returns the selected robot.
-    pub(super) fn robot<'known>(&self, known: &'known Known) -> Option<&'known Robot> {
-        let selected = self.selected[Section::Robots as usize].as_deref();
-        known
-            .robots()
-            .find(|robot| Some(robot.id.as_str()) == selected)
-    }
-
-    /// Returns the selected alert.
-    fn alert<'known>(&self, known: &'known Known) -> Option<&'known Alert> {
-        let selected = self.selected[Section::Alerts as usize].as_deref();
-        let mut alerts = known.alerts().into_iter();
-        alerts.find(|alert| Some(alert.id.to_string().as_str()) == selected)
-    }
-}
-
-/// Returns a score of how much a robot needs attention; higher comes first.
-fn trouble(robot: &Robot) -> u8 {
-    let live = robot.live.as_ref();
-    let is_stopped = live.is_some_and(|live| live.safety.stop.is_some() || live.fault.is_some());
-    let link = match robot.link {
-        LinkState::Online => 0,
-        LinkState::Stale => 1,
-        LinkState::Offline => 2,
-    };
-    let alerts = u8::from(!robot.alerts.is_empty());
-    8 * u8::from(is_stopped) + 2 * link + alerts
-}
-
 /// Action of a key beyond the screen itself.
 #[derive(Debug, Clone, PartialEq, Eq)]
-enum Wish {
+enum KeyAction {
     Quit,
     Stop(RobotId),
     Acknowledge(AlertId),
@@ -169,7 +40,7 @@ pub(super) struct Screen<'client> {
     site: &'client SiteId,
     every: Duration,
     known: Known,
-    shown: Shown,
+    shown: View,
     /// Requests without an answer yet.
     asked: FuturesUnordered<BoxFuture<'client, String>>,
 }
@@ -190,7 +61,7 @@ impl<'client> Screen<'client> {
             site: &arguments.connection.site,
             every: arguments.every,
             known: Known::default(),
-            shown: Shown::default(),
+            shown: View::default(),
             asked: FuturesUnordered::new(),
         }
     }
@@ -219,8 +90,8 @@ impl<'client> Screen<'client> {
                         break Err(anyhow::anyhow!("the terminal's input ended"));
                     };
                     match self.press(key) {
-                        Some(Wish::Quit) => break Ok(()),
-                        Some(wish) => self.ask(wish),
+                        Some(KeyAction::Quit) => break Ok(()),
+                        Some(action) => self.ask(action),
                         None => {}
                     }
                     ticks.reset_immediately();
@@ -259,13 +130,13 @@ impl<'client> Screen<'client> {
         }
     }
 
-    fn press(&mut self, key: KeyEvent) -> Option<Wish> {
+    fn press(&mut self, key: KeyEvent) -> Option<KeyAction> {
         if key.kind == KeyEventKind::Release {
             return None;
         }
         if key.modifiers.contains(KeyModifiers::CONTROL) {
             let is_end = matches!(key.code, KeyCode::Char('c' | 'd'));
-            return is_end.then_some(Wish::Quit);
+            return is_end.then_some(KeyAction::Quit);
         }
         self.shown.said = None;
         let page = isize::try_from(PAGE_ROWS).unwrap_or(isize::MAX);
@@ -275,7 +146,7 @@ impl<'client> Screen<'client> {
         )]
         match key.code {
             KeyCode::Esc if self.shown.details => self.shown.details = false,
-            KeyCode::Char('q') | KeyCode::Esc => return Some(Wish::Quit),
+            KeyCode::Char('q') | KeyCode::Esc => return Some(KeyAction::Quit),
             KeyCode::Up | KeyCode::Char('k') => self.shown.move_by(&self.known, -1),
             KeyCode::Down | KeyCode::Char('j') => self.shown.move_by(&self.known, 1),
             KeyCode::PageUp => self.shown.move_by(&self.known, -page),
@@ -292,11 +163,11 @@ impl<'client> Screen<'client> {
             }
             KeyCode::Char('X') => {
                 let robot = self.shown.robot(&self.known)?;
-                return Some(Wish::Stop(robot.id.clone()));
+                return Some(KeyAction::Stop(robot.id.clone()));
             }
             KeyCode::Char('a') => {
                 let alert = self.shown.alert(&self.known)?;
-                return Some(Wish::Acknowledge(alert.id));
+                return Some(KeyAction::Acknowledge(alert.id));
             }
             _ => {}
         }
@@ -317,18 +188,18 @@ impl<'client> Screen<'client> {
                 alert.and_then(|alert| Some(alert.robot.as_ref()?.to_string()))
             }
         };
-        if robot.is_some() {
-            self.shown.selected[Section::Robots as usize] = robot;
+        if let Some(robot) = robot {
+            self.shown.select_robot(robot);
         }
         self.shown.details = !self.shown.details;
         self.shown.section = Section::Robots;
     }
 
-    fn ask(&mut self, wish: Wish) {
+    fn ask(&mut self, action: KeyAction) {
         let (client, site) = (self.client, self.site);
-        match wish {
-            Wish::Quit => {}
-            Wish::Stop(robot) => {
+        match action {
+            KeyAction::Quit => {}
+            KeyAction::Stop(robot) => {
                 self.shown.said = Some(format!("stopping {robot} …"));
                 self.asked.push(Box::pin(async move {
                     let words = StopRobot {
@@ -349,7 +220,7 @@ impl<'client> Screen<'client> {
                     }
                 }));
             }
-            Wish::Acknowledge(alert) => {
+            KeyAction::Acknowledge(alert) => {
                 self.asked.push(Box::pin(async move {
                     match client.acknowledge(alert).await {
                         Ok(alert) => format!("noted as seen: {}", alert.text),

@@ -15,15 +15,24 @@ use crate::robot::RobotModel;
 
 /// Differences of ln K of the other grounds.
 const OFFSETS: [f64; 2] = [-1.0, 1.0];
-/// Threshold h of the CUSUM and its drift k: squares of standard deviations.
-const THRESHOLD: f64 = 100.0;
+/// Threshold h of the CUSUM, without and with measured torque, and its drift k: squares of standard
+/// deviations.
+const THRESHOLDS: [f64; 2] = [100.0, 115.0];
 const DRIFT: f64 = 2.0;
 /// Limit of one channel's squared standardised residual.
 const SQUARE_MAX: f64 = 25.0;
-/// Number of comparisons after the start of motion that are ignored: one second.
-const ROLLS_FOR: u32 = 20;
+/// Limit of what one comparison adds: a jerk in all channels is no change of the ground.
+const GAIN_MAX: f64 = 25.0;
+/// Number of comparisons that are ignored after the robot stood: one second.
+const STARTS_FOR: u32 = 20;
+/// Number of comparisons that are ignored after one side was slow.
+const RESUMES_FOR: u32 = 12;
+/// Maximum number of comparisons with a slow side after which evidence is kept: two seconds.
+const SLOW_MAX: u32 = 40;
 /// Number of compared channels: all but the body speed.
 pub(super) const COMPARED: usize = CHANNELS - 1;
+/// Index of the first channel of the torques, which are the last ones.
+const TORQUES_FROM: usize = 3;
 
 /// A measurement of one channel, with the output of the best hypothesis and the standard deviation
 /// of their difference, in the channel's unit.
@@ -50,12 +59,38 @@ struct OtherGround {
     evidence: f64,
 }
 
+/// Motion of a robot in one comparison.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Motion {
+    /// Both sides roll.
+    Rolling,
+    /// One side is too slow for a comparison, as the inner one in a tight bend.
+    Slow,
+    /// The robot stands.
+    Standing,
+}
+
 /// State of the detector. It detects nothing before [`ChangeMonitor::follow`].
-#[derive(Debug, Clone, PartialEq, Default)]
+#[derive(Debug, Clone, PartialEq)]
 pub(super) struct ChangeMonitor {
     others: Option<[OtherGround; OFFSETS.len()]>,
-    /// Number of comparisons since the robot began to roll.
-    rolling: u32,
+    /// Number of comparisons that are still ignored.
+    ignored: u32,
+    /// Number of comparisons in a row in which the robot did not roll.
+    slow: u32,
+    /// Whether torques were compared.
+    has_torque: bool,
+}
+
+impl Default for ChangeMonitor {
+    fn default() -> Self {
+        Self {
+            others: None,
+            ignored: STARTS_FOR,
+            slow: 0,
+            has_torque: false,
+        }
+    }
 }
 
 impl ChangeMonitor {
@@ -87,6 +122,27 @@ impl ChangeMonitor {
         }
     }
 
+    /// Takes the motion during a comparison. Returns whether the comparison counts. Evidence is kept
+    /// while one side is slow for a short time, and is dropped at standstill.
+    fn note(&mut self, motion: Motion) -> bool {
+        if motion == Motion::Rolling {
+            if std::mem::take(&mut self.slow) > 0 {
+                self.ignored = self.ignored.max(RESUMES_FOR);
+            }
+            let is_ignored = self.ignored > 0;
+            self.ignored = self.ignored.saturating_sub(1);
+            return !is_ignored;
+        }
+        self.slow = self.slow.saturating_add(1);
+        if motion == Motion::Standing || self.slow > SLOW_MAX {
+            self.ignored = STARTS_FOR;
+            for other in self.others.iter_mut().flatten() {
+                other.evidence = 0.0;
+            }
+        }
+        false
+    }
+
     /// Adds one comparison of the means since the last call; `ratio` multiplies the outputs of the
     /// other grounds. While the robot does not roll there is no evidence.
     ///
@@ -95,18 +151,15 @@ impl ChangeMonitor {
         &mut self,
         explained: &[Option<Explained>; COMPARED],
         ratio: f64,
-        is_rolling: bool,
+        motion: Motion,
     ) -> bool {
-        self.rolling = if is_rolling {
-            self.rolling.saturating_add(1)
-        } else {
-            0
-        };
+        let counts = self.note(motion);
+        self.has_torque |= explained[TORQUES_FROM..].iter().any(Option::is_some);
+        let threshold = THRESHOLDS[usize::from(self.has_torque)];
         let mut has_changed = false;
         for other in self.others.iter_mut().flatten() {
             let outputs = other.model.take_mean(ratio);
-            if self.rolling <= ROLLS_FOR {
-                other.evidence = 0.0;
+            if !counts {
                 continue;
             }
             let gains = explained.iter().zip(outputs).map(|(explained, output)| {
@@ -116,9 +169,9 @@ impl ChangeMonitor {
             });
             let gain: f64 = gains.sum();
             if gain.is_finite() {
-                other.evidence = (other.evidence + gain - DRIFT).max(0.0);
+                other.evidence = (other.evidence + gain.min(GAIN_MAX) - DRIFT).max(0.0);
             }
-            has_changed |= other.evidence > THRESHOLD;
+            has_changed |= other.evidence > threshold;
         }
         if has_changed {
             *self = Self::default();
@@ -174,7 +227,7 @@ mod tests {
 
         /// Drives one comparison on ground of a stiffness, with `scaled` torques. Returns whether the
         /// monitor raises an alarm.
-        fn compare(&mut self, stiffness: f64, scaled: f64, is_rolling: bool) -> bool {
+        fn compare(&mut self, stiffness: f64, scaled: f64, motion: Motion) -> bool {
             let mut values: [f64; PARAMETERS] = self.values.into();
             let believed = Robot::new(&values, &self.model);
             values[index::STIFFNESS] = stiffness.ln();
@@ -206,7 +259,7 @@ mod tests {
                     std_dev: STD_DEVS[channel],
                 })
             });
-            self.monitor.compare(&explained, 1.0, is_rolling)
+            self.monitor.compare(&explained, 1.0, motion)
         }
     }
 
@@ -222,8 +275,8 @@ mod tests {
         ];
         for (seed, (stiffness, most)) in (0..).zip(grounds) {
             let mut drive = Drive::new(seed);
-            assert!(!(0..200).any(|_| drive.compare(3.0, 1.0, true)));
-            let delay = (0..400).position(|_| drive.compare(stiffness, 1.0, true));
+            assert!(!(0..200).any(|_| drive.compare(3.0, 1.0, Motion::Rolling)));
+            let delay = (0..400).position(|_| drive.compare(stiffness, 1.0, Motion::Rolling));
             let is_in_time = delay.is_some_and(|delay| delay < most);
             assert!(is_in_time, "{stiffness}: {delay:?}");
         }
@@ -233,7 +286,7 @@ mod tests {
     fn noise_and_wrong_torques_on_the_same_ground_raise_no_alarm() {
         for (seed, scaled) in (0..).zip([1.0, 0.85, 1.15]) {
             let mut drive = Drive::new(seed);
-            let alarm = (0..12_000).position(|_| drive.compare(3.0, scaled, true));
+            let alarm = (0..12_000).position(|_| drive.compare(3.0, scaled, Motion::Rolling));
             assert_eq!(alarm, None, "torques × {scaled}");
         }
     }
@@ -241,7 +294,37 @@ mod tests {
     #[test]
     fn a_robot_that_sets_off_or_stands_raises_no_alarm() {
         let mut drive = Drive::new(1);
-        let alarm = (0..1_000).position(|count| drive.compare(1.0, 1.0, count % 25 >= 6));
+        let motion = |count: u32| match count % 25 {
+            0..6 => Motion::Standing,
+            _ => Motion::Rolling,
+        };
+        let alarm = (0..1_000).position(|count| drive.compare(1.0, 1.0, motion(count)));
         assert_eq!(alarm, None);
+    }
+
+    #[test]
+    fn an_inner_side_that_is_slow_in_every_bend_delays_an_alarm_only() {
+        // Evidence of the parts in which both sides roll adds up.
+        let mut drive = Drive::new(2);
+        let motion = |count: u32| match count % 40 {
+            0..15 => Motion::Slow,
+            _ => Motion::Rolling,
+        };
+        let has_alarm = (0..200).any(|count| drive.compare(3.0, 1.0, motion(count)));
+        assert!(!has_alarm, "the ground is the same");
+        let alarm = (0..400).position(|count| drive.compare(1.2, 1.0, motion(count)));
+        assert!(alarm.is_some(), "softer ground was not detected");
+    }
+
+    #[test]
+    fn a_jerk_in_all_channels_raises_no_alarm() {
+        let mut drive = Drive::new(3);
+        let mut has_alarm = false;
+        for count in 0..600 {
+            // As if the ground were softer for three comparisons in every five seconds.
+            let stiffness = if count % 100 < 3 { 0.4 } else { 3.0 };
+            has_alarm |= drive.compare(stiffness, 1.0, Motion::Rolling);
+        }
+        assert!(!has_alarm);
     }
 }

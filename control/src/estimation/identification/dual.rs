@@ -3,6 +3,11 @@
 //!
 //! Arrays of fixed size, so that the control loop allocates nothing and the compiler can vectorise.
 
+#![expect(
+    clippy::inline_always,
+    reason = "an operator that is not inlined copies its arguments, which takes longer than the sum"
+)]
+
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
 /// Arithmetic that the model needs, on plain numbers or on [`Dual`] ones.
@@ -73,6 +78,7 @@ pub(super) struct Dual<const N: usize> {
 
 impl<const N: usize> Dual<N> {
     /// Creates the parameter of this index, below `N`: its derivative with respect to itself is 1.
+    #[inline(always)]
     pub(super) fn parameter(value: f64, index: usize) -> Self {
         let mut derivatives = [0.0; N];
         derivatives[index] = 1.0;
@@ -80,6 +86,7 @@ impl<const N: usize> Dual<N> {
     }
 
     /// Applies a function by the chain rule, given the function's value and slope at this value.
+    #[inline(always)]
     fn function(mut self, value: f64, slope: f64) -> Self {
         for derivative in &mut self.derivatives {
             *derivative *= slope;
@@ -87,6 +94,7 @@ impl<const N: usize> Dual<N> {
         Self { value, ..self }
     }
 
+    #[inline(always)]
     fn zip(self, other: Self, value: f64, combine: impl Fn(f64, f64) -> f64) -> Self {
         let mut derivatives = self.derivatives;
         for (own, other) in derivatives.iter_mut().zip(other.derivatives) {
@@ -99,6 +107,7 @@ impl<const N: usize> Dual<N> {
 impl<const N: usize> Add for Dual<N> {
     type Output = Self;
 
+    #[inline(always)]
     fn add(self, other: Self) -> Self {
         self.zip(other, self.value + other.value, |own, other| own + other)
     }
@@ -107,6 +116,7 @@ impl<const N: usize> Add for Dual<N> {
 impl<const N: usize> Sub for Dual<N> {
     type Output = Self;
 
+    #[inline(always)]
     fn sub(self, other: Self) -> Self {
         self.zip(other, self.value - other.value, |own, other| own - other)
     }
@@ -116,6 +126,7 @@ impl<const N: usize> Mul for Dual<N> {
     type Output = Self;
 
     #[expect(clippy::suspicious_arithmetic_impl, reason = "the product rule")]
+    #[inline(always)]
     fn mul(self, other: Self) -> Self {
         let (a, b) = (self.value, other.value);
         self.zip(other, a * b, |own, other| own * b + a * other)
@@ -126,6 +137,7 @@ impl<const N: usize> Div for Dual<N> {
     type Output = Self;
 
     #[expect(clippy::suspicious_arithmetic_impl, reason = "the quotient rule")]
+    #[inline(always)]
     fn div(self, other: Self) -> Self {
         let (ratio, recip) = (self.value / other.value, other.value.recip());
         self.zip(other, ratio, |own, other| (own - ratio * other) * recip)
@@ -135,6 +147,7 @@ impl<const N: usize> Div for Dual<N> {
 impl<const N: usize> Neg for Dual<N> {
     type Output = Self;
 
+    #[inline(always)]
     fn neg(self) -> Self {
         self.function(-self.value, -1.0)
     }
@@ -143,6 +156,7 @@ impl<const N: usize> Neg for Dual<N> {
 impl<const N: usize> Add<f64> for Dual<N> {
     type Output = Self;
 
+    #[inline(always)]
     fn add(mut self, other: f64) -> Self {
         self.value += other;
         self
@@ -152,6 +166,7 @@ impl<const N: usize> Add<f64> for Dual<N> {
 impl<const N: usize> Sub<f64> for Dual<N> {
     type Output = Self;
 
+    #[inline(always)]
     fn sub(mut self, other: f64) -> Self {
         self.value -= other;
         self
@@ -161,12 +176,14 @@ impl<const N: usize> Sub<f64> for Dual<N> {
 impl<const N: usize> Mul<f64> for Dual<N> {
     type Output = Self;
 
+    #[inline(always)]
     fn mul(self, other: f64) -> Self {
         self.function(self.value * other, other)
     }
 }
 
 impl<const N: usize> Real for Dual<N> {
+    #[inline(always)]
     fn constant(value: f64) -> Self {
         Self {
             value,
@@ -174,24 +191,29 @@ impl<const N: usize> Real for Dual<N> {
         }
     }
 
+    #[inline(always)]
     fn value(&self) -> f64 {
         self.value
     }
 
+    #[inline(always)]
     fn exp(self) -> Self {
         let exp = self.value.exp();
         self.function(exp, exp)
     }
 
+    #[inline(always)]
     fn ln(self) -> Self {
         self.function(self.value.ln(), self.value.recip())
     }
 
+    #[inline(always)]
     fn sqrt(self) -> Self {
         let sqrt = self.value.sqrt();
         self.function(sqrt, 0.5 / sqrt)
     }
 
+    #[inline(always)]
     fn recip(self) -> Self {
         let recip = self.value.recip();
         self.function(recip, -recip * recip)

@@ -25,7 +25,7 @@ mod wheel_noise;
 use super::{EstimatorPrior, GAP_MAX_S, IdentifiedRobot, SensorNoise, SensorSample};
 use crate::robot::RobotModel;
 
-use change::{COMPARED, ChangeMonitor, Explained};
+use change::{COMPARED, ChangeMonitor, Explained, Motion};
 use hypothesis::{Hypothesis, Measured};
 use model::{CHANNELS, Input, State};
 use parameters::{Prior, index};
@@ -412,10 +412,10 @@ impl Identification {
         }
         self.block_s += compared_s;
         self.clear_sums();
-        let is_rolling = self.is_rolling();
+        let motion = self.motion();
         let changed = self
             .change
-            .compare(&explained, COMPARED_S / compared_s, is_rolling);
+            .compare(&explained, COMPARED_S / compared_s, motion);
         if self.block_s >= BLOCK_S - 1.0e-6 {
             self.end_block();
             self.is_robot_due = true;
@@ -426,13 +426,19 @@ impl Identification {
         changed
     }
 
-    /// Returns whether the rims of both sides are faster than [`ROLLING_M_S`].
-    fn is_rolling(&self) -> bool {
+    /// Returns the motion at the waiting sample.
+    fn motion(&self) -> Motion {
         let radius_m = self.model.wheel_radius_m();
-        self.waiting.is_some_and(|waiting| {
-            let [left, right] = rates(&waiting.sample).map(|rate| rate.abs() * radius_m);
-            left.min(right) > ROLLING_M_S
-        })
+        let [left_m_s, right_m_s] = self.waiting.map_or([0.0; 2], |waiting| {
+            rates(&waiting.sample).map(|rate| rate.abs() * radius_m)
+        });
+        if left_m_s.min(right_m_s) > ROLLING_M_S {
+            Motion::Rolling
+        } else if left_m_s.max(right_m_s) > STANDING_M_S {
+            Motion::Slow
+        } else {
+            Motion::Standing
+        }
     }
 
     fn end_block(&mut self) {

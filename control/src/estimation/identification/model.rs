@@ -31,6 +31,9 @@ const STANDING_DEFLECTION_MAX: f64 = 5.0;
 const RESISTANCE_TURNS_M_S: f64 = 0.01;
 /// Added to the square of slip, so that the root has a finite slope at zero.
 const SLIP_SQUARE_MIN: f64 = 1.0e-10;
+// Arrays of numbers are written out below: `map` copies them, and a copy of numbers with their
+// derivatives takes as long as arithmetic with them.
+
 /// Positions of the contacts relative to the wheels' centre, forward and left, as fractions of
 /// wheelbase and track width; the first two are on the left.
 const CONTACTS: [(f64, f64); 4] = [(0.5, 0.5), (-0.5, 0.5), (0.5, -0.5), (-0.5, -0.5)];
@@ -146,12 +149,19 @@ impl<T: Real> Robot<T> {
                 * (size_m * size_m).recip()
         };
         let (pitch, roll) = (tilt(forward_m, 0, base_m), tilt(left_m, 1, track_m));
-        CONTACTS.map(|(front, left)| Contact {
+        let contact = |(front, left): (f64, f64)| Contact {
             side: usize::from(left < 0.0),
             place_m: [-forward_m + front * base_m, -left_m + left * track_m],
             load_n: (pitch * (front * base_m) + roll * (left * track_m) + 0.25 * GRAVITY_M_S2)
                 * self.mass_kg,
-        })
+        };
+        let [first, second, third, fourth] = CONTACTS;
+        [
+            contact(first),
+            contact(second),
+            contact(third),
+            contact(fourth),
+        ]
     }
 
     /// Returns the friction coefficient over slip, `K / D`, at a slip above 0.
@@ -194,7 +204,8 @@ impl<T: Real> Robot<T> {
             let [ahead, aside] = *deflection;
             let slip = (ahead * ahead + aside * aside + SLIP_SQUARE_MIN).sqrt();
             let mu_over_slip = self.mu_over_slip(slip);
-            let mut force_n = [ahead, aside].map(|part| mu_over_slip * contact.load_n * part);
+            let per_slip_n = mu_over_slip * contact.load_n;
+            let mut force_n = [per_slip_n * ahead, per_slip_n * aside];
             let slow = 1.0 - rim_m_s.value().abs() / SLOW_M_S;
             if slow > 0.0 {
                 let (stiffness, length_m) = (self.stiffness.value(), self.relaxation_m.value());
@@ -208,7 +219,9 @@ impl<T: Real> Robot<T> {
                 }
                 let most = STANDING_DEFLECTION_MAX * self.peak.value() / stiffness;
                 if slip.value() > most {
-                    *deflection = deflection.map(|part| part * (most / slip.value()));
+                    let [ahead, aside] = deflection;
+                    *ahead = *ahead * (most / slip.value());
+                    *aside = *aside * (most / slip.value());
                 }
             }
             let [longitudinal_n, lateral_n] = force_n;
@@ -239,14 +252,16 @@ impl<T: Real> Robot<T> {
         let mut output = Output::zero();
         for step in 0..count {
             let from_middle_s = (f64::from(step) * share - 0.5) * input.time_s;
-            let rims_m_s = [0, 1].map(|side| {
+            let rim_of = |side: usize| {
                 self.radius_m[side]
                     * (input.wheels_rad_s[side] + input.wheels_rad_s2[side] * from_middle_s)
-            });
+            };
+            let rims_m_s = [rim_of(0), rim_of(1)];
             let forces = self.deflect(state, &contacts, rims_m_s, step_s);
             let [forward_m_s, left_m_s] = state.speed_m_s;
             let turn = state.turn_rad_s;
-            let acceleration = [0, 1].map(|axis| forces.force_n[axis] * per_mass + gravity[axis]);
+            let along = |axis: usize| forces.force_n[axis] * per_mass + gravity[axis];
+            let acceleration = [along(0), along(1)];
             state.speed_m_s = [
                 forward_m_s + (acceleration[0] + left_m_s * turn) * step_s,
                 left_m_s + (acceleration[1] - forward_m_s * turn) * step_s,

@@ -49,17 +49,36 @@ impl Blocks {
     }
 
     fn scale(&mut self, ratio: f64) {
-        self.information *= ratio;
-        self.preferred *= ratio;
-        self.scores *= ratio;
+        let scale = |values: &mut [f64]| values.iter_mut().for_each(|value| *value *= ratio);
+        scale(self.information.as_mut_slice());
+        scale(self.preferred.as_mut_slice());
+        scale(self.scores.as_mut_slice());
         self.count *= ratio;
     }
 
-    fn add(&mut self, other: &Self, ratio: f64) {
-        self.information += other.information * ratio;
-        self.preferred += other.preferred * ratio;
-        self.scores += other.scores * ratio;
-        self.count += other.count * ratio;
+    /// Replaces each sum by what `combine` makes of it and of that of `other`. In place, because
+    /// copies of the matrices would take most of the time.
+    fn combine(&mut self, other: &Self, combine: impl Fn(f64, f64) -> f64) {
+        let all = |own: &mut [f64], other: &[f64]| {
+            for (own, other) in own.iter_mut().zip(other) {
+                *own = combine(*own, *other);
+            }
+        };
+        all(
+            self.information.as_mut_slice(),
+            other.information.as_slice(),
+        );
+        all(self.preferred.as_mut_slice(), other.preferred.as_slice());
+        all(self.scores.as_mut_slice(), other.scores.as_slice());
+        self.count = combine(self.count, other.count);
+    }
+
+    fn add(&mut self, other: &Self) {
+        self.combine(other, |own, other| own + other);
+    }
+
+    fn subtract(&mut self, other: &Self) {
+        self.combine(other, |own, other| own - other);
     }
 }
 
@@ -240,10 +259,12 @@ impl Scale {
 
     /// Drops the measurements of the open block.
     pub(super) fn drop_block(&mut self) {
-        self.information = Square::zeros();
-        self.score = Values::zeros();
+        self.information.fill(0.0);
+        self.score.fill(0.0);
         self.compared = 0;
-        self.means = [Mean::none(); CHANNELS];
+        if self.length > 1 {
+            self.means = [Mean::none(); CHANNELS];
+        }
     }
 
     /// Ends the open block, which was linearised about `values`.
@@ -251,17 +272,17 @@ impl Scale {
         if self.compared > 0 {
             self.end_mean();
         }
-        let score = self.score;
-        self.segment.add(&self.last, 1.0);
-        self.ground.scale(1.0 - BLOCK_FORGETS);
-        self.segment.scale(1.0 - BLOCK_FORGETS);
-        self.last = Blocks {
-            information: self.information,
-            preferred: score + self.information * values,
-            scores: score * score.transpose(),
-            count: 1.0,
-        };
-        self.ground.add(&self.last, 1.0);
+        let keeps = 1.0 - BLOCK_FORGETS;
+        self.segment
+            .combine(&self.last, |own, last| (own + last) * keeps);
+        let last = &mut self.last;
+        std::mem::swap(&mut last.information, &mut self.information);
+        last.preferred = self.score;
+        last.preferred.gemv(1.0, &last.information, values, 1.0);
+        last.scores.ger(1.0, &self.score, &self.score, 0.0);
+        last.count = 1.0;
+        self.ground
+            .combine(&self.last, |own, last| own * keeps + last);
         self.drop_block();
     }
 
@@ -310,14 +331,14 @@ impl Scale {
 
     /// Drops the last block, which may contain samples of two grounds.
     pub(super) fn drop_last_block(&mut self) {
-        self.ground.add(&self.last, -1.0);
+        self.ground.subtract(&self.last);
         self.last = Blocks::none();
     }
 
     /// Takes the blocks of the open segment; the ground keeps them.
     pub(super) fn take_segment(&mut self) -> Blocks {
         let mut segment = std::mem::replace(&mut self.segment, Blocks::none());
-        segment.add(&self.last, 1.0);
+        segment.add(&self.last);
         self.last = Blocks::none();
         segment
     }

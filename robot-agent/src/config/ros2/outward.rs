@@ -5,7 +5,7 @@ use tread_control::geometry::Pose;
 use super::file::OutwardFile;
 use super::{Topics, refused};
 use crate::config::ConfigError;
-use crate::drive::ros2::outward::Word;
+use crate::drive::ros2::outward::OutwardTopic;
 use crate::drive::ros2::settings::{OutwardSettings, Ros2Settings};
 
 /// Returns the frame of the topic that gives the position, and its pose in the site.
@@ -29,36 +29,36 @@ impl OutwardFile {
         }
         // Without a source of positions both paths stay empty.
         let (frame, site_from_frame) = frame(others).unwrap_or_default();
-        let name = |word, given: &Option<String>, default| {
-            topics.name(key(word), given.as_deref(), default)
+        let name = |topic, given: &Option<String>, default| {
+            topics.name(key(topic), given.as_deref(), default)
         };
         let settings = OutwardSettings {
-            plan: name(Word::Plan, &self.plan, "tread/plan")?,
-            driven: name(Word::Driven, &self.driven, "tread/driven")?,
-            theta: name(Word::Theta, &self.theta, "tread/theta")?,
-            diagnostics: name(Word::Diagnostics, &self.diagnostics, "/diagnostics")?,
+            plan: name(OutwardTopic::Plan, &self.plan, "tread/plan")?,
+            driven: name(OutwardTopic::Driven, &self.driven, "tread/driven")?,
+            theta: name(OutwardTopic::Theta, &self.theta, "tread/theta")?,
+            diagnostics: name(OutwardTopic::Diagnostics, &self.diagnostics, "/diagnostics")?,
             frame,
             site_from_frame,
         };
         // A base commanded by lists of numbers would execute θ as a command.
         let mut taken = others.topics();
-        for word in Word::ALL {
-            let topic = word.topic(&settings);
-            if taken.contains(&topic) {
-                return Err(refused(key(word), format!("`{topic}` is used already")));
+        for topic in OutwardTopic::ALL {
+            let name = topic.topic(&settings);
+            if taken.contains(&name) {
+                return Err(refused(key(topic), format!("`{name}` is used already")));
             }
-            taken.push(topic);
+            taken.push(name);
         }
         Ok(Some(settings))
     }
 }
 
-fn key(word: Word) -> &'static str {
-    match word {
-        Word::Plan => "drive.ros2.outward.plan",
-        Word::Driven => "drive.ros2.outward.driven",
-        Word::Theta => "drive.ros2.outward.theta",
-        Word::Diagnostics => "drive.ros2.outward.diagnostics",
+fn key(topic: OutwardTopic) -> &'static str {
+    match topic {
+        OutwardTopic::Plan => "drive.ros2.outward.plan",
+        OutwardTopic::Driven => "drive.ros2.outward.driven",
+        OutwardTopic::Theta => "drive.ros2.outward.theta",
+        OutwardTopic::Diagnostics => "drive.ros2.outward.diagnostics",
     }
 }
 
@@ -80,7 +80,7 @@ mod tests {
     fn it_speaks_unless_it_is_switched_off() {
         let text = "namespace = \"/robot7\"\n[odometry]\ngives_position = true\nsite_x_m = 2.0\n";
         let settings = checked(text).unwrap().unwrap();
-        let names = Word::ALL.map(|word| word.topic(&settings).to_string());
+        let names = OutwardTopic::ALL.map(|topic| topic.topic(&settings).to_string());
         let expected = [
             "/robot7/tread/plan",
             "/robot7/tread/driven",

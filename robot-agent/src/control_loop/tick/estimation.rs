@@ -21,7 +21,7 @@ use crate::control_loop::gain::GroundRecord;
 use crate::control_loop::prior::{Prior, fused};
 use crate::control_loop::progress::ProgressWatch;
 use crate::control_loop::segments::{CutInput, Place, SegmentCutter};
-use crate::control_loop::site_view::{Footing, SiteView};
+use crate::control_loop::site_view::{GroundUnderWheels, SiteView};
 use crate::control_loop::slip::SlipMeter;
 use crate::drive::{SILENT_AFTER_MAX, StatedNoise};
 use crate::geometry::wire_point;
@@ -118,7 +118,7 @@ pub(super) struct Estimation {
     estimate: Estimate,
     cutter: SegmentCutter,
     site: Option<Arc<SiteView>>,
-    footing: Option<Footing>,
+    ground_under_wheels: Option<GroundUnderWheels>,
     last_fix: Option<Duration>,
     /// Time up to which the localisation has integrated the robot's motion.
     integrated_to: Option<Duration>,
@@ -143,7 +143,7 @@ impl Estimation {
             estimator,
             cutter: SegmentCutter::default(),
             site: None,
-            footing: None,
+            ground_under_wheels: None,
             last_fix: None,
             integrated_to: None,
             silent_after: SILENT_AFTER_MAX,
@@ -204,9 +204,9 @@ impl Estimation {
             slip: self.slip.slip(),
             dug_in_at: self.progress.dug_in_at(),
             cell: self.cutter.cell(),
-            terrain: match self.footing {
-                Some(Footing::Whole(terrain)) => terrain,
-                Some(Footing::Mixed) | None => None,
+            terrain: match self.ground_under_wheels {
+                Some(GroundUnderWheels::Whole(terrain)) => terrain,
+                Some(GroundUnderWheels::Mixed) | None => None,
             },
             closed,
             unplaced_blocks: taken.unplaced_blocks,
@@ -274,7 +274,7 @@ impl Estimation {
         self.progress.note_wheels(forward_m_s * dt_s);
         self.localisation.predict(gyro_rad_s, wheel_speeds, dt_s);
         // With wheels on two kinds of ground there is no single θ to estimate.
-        if self.footing == Some(Footing::Mixed) || !sample.may_learn {
+        if self.ground_under_wheels == Some(GroundUnderWheels::Mixed) || !sample.may_learn {
             return;
         }
         let outcome = self.estimator.update(&motion, dt_s);
@@ -344,13 +344,13 @@ impl Estimation {
         ground_changed: bool,
     ) -> Option<ClosedSegment> {
         let mut place = None;
-        self.footing = None;
+        self.ground_under_wheels = None;
         if let (Some(site), Some(pose)) = (&self.site, self.localisation.pose()) {
-            let footing = site.footing(pose, &self.model);
-            self.footing = Some(footing);
+            let ground_under_wheels = site.ground_under_wheels(pose, &self.model);
+            self.ground_under_wheels = Some(ground_under_wheels);
             let former = self.cutter.cell();
-            if let (Footing::Whole(terrain), Some(cell)) =
-                (footing, site.cell(wire_point(pose), former))
+            if let (GroundUnderWheels::Whole(terrain), Some(cell)) =
+                (ground_under_wheels, site.cell(wire_point(pose), former))
             {
                 place = Some(Place { cell, terrain });
             }

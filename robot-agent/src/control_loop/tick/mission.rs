@@ -20,10 +20,11 @@ use super::demands::Demands;
 use super::estimation::{Estimated, Released};
 use super::sensing::Sensed;
 use crate::control_loop::BRAKING_MAX;
-use crate::control_loop::active::{Active, Hold, News, progress_of};
-use crate::control_loop::channels::{ClosedSegment, EndReason, Job, LoopCommand, LoopEvent};
+use crate::control_loop::active::{Active, News, progress_of};
+use crate::control_loop::channels::{ClosedSegment, EndReason, Hold, LoopCommand, LoopEvent};
 use crate::control_loop::driven::TickRecord;
 use crate::control_loop::gain::GroundRecord;
+use crate::control_loop::job::Job;
 use crate::control_loop::outgoing::Outgoing;
 use crate::control_loop::segments::Moment;
 use crate::control_loop::site_view::SiteView;
@@ -186,7 +187,7 @@ impl MissionStage {
         let refusal = if tick.stop {
             Some(EndReason::AgentStopped)
         } else if self.active.is_some() {
-            Some(EndReason::AnotherInHand)
+            Some(EndReason::AnotherActive)
         } else if job.start_by.is_some_and(is_too_late) {
             Some(EndReason::TooLate)
         } else {

@@ -46,7 +46,7 @@ impl Truth {
 
     /// Returns the measurements of both motions with the track width `command_m` in the
     /// configured command.
-    fn drive(&self, command_m: f64, noise: f64, bias_rad_s: f64) -> [Drove; 2] {
+    fn drive(&self, command_m: f64, noise: f64, bias_rad_s: f64) -> [DriveSummary; 2] {
         let commanded = 0.2 / self.radius_m;
         let wheels_rad_s = commanded * self.base_track_m / command_m;
         let turn_rad_s = self.turn_rad_s(wheels_rad_s * self.radius_m);
@@ -62,16 +62,16 @@ impl Truth {
             }
         });
         [
-            Drove {
+            DriveSummary {
                 commanded: speeds(-commanded, commanded),
                 wheels: Some(speeds(-wheels_rad_s, wheels_rad_s)),
                 turn_blocks: blocks.collect(),
-                ..Drove::default()
+                ..DriveSummary::default()
             },
-            Drove {
+            DriveSummary {
                 commanded: speeds(commanded, commanded),
                 wheels: Some(speeds(commanded, commanded)),
-                ..Drove::default()
+                ..DriveSummary::default()
             },
         ]
     }

@@ -25,7 +25,7 @@ use super::command;
 use super::command_watch::CommandWatch;
 use super::inlet::{Inlet, Numbering};
 use super::outlet::{COMMAND_SILENCE_MAX, Outlet};
-use super::outward::{LOOK_EVERY, Outward, Word};
+use super::outward::{LOOK_EVERY, Outward, OutwardTopic};
 use super::refusal::Counts;
 use super::settings::{BusMode, BusSettings, Ros2Settings, Scheme};
 use crate::clock::SharedClock;
@@ -106,7 +106,7 @@ pub struct Bus {
 #[derive(Debug)]
 struct Declared {
     commands: Writer,
-    words: Vec<(Word, Writer)>,
+    outward_topics: Vec<(OutwardTopic, Writer)>,
     _tokens: Vec<LivelinessToken>,
 }
 
@@ -270,15 +270,15 @@ impl Bus {
         let commands = self.writer(session, &node, &topic, Priority::RealTime, &mut tokens)?;
         self.command_watch.write_as(commands.gid);
         self.watch_commands(session)?;
-        let mut words = Vec::new();
+        let mut outward_topics = Vec::new();
         if let Some(outward) = self.settings.outward.as_ref().filter(|_| tells) {
-            for word in Word::ALL {
+            for outward_topic in OutwardTopic::ALL {
                 number += 1;
-                let message_type = word.message_type();
+                let message_type = outward_topic.message_type();
                 let topic = Topic {
                     role: Role::Publisher,
                     number,
-                    name: word.topic(outward),
+                    name: outward_topic.topic(outward),
                     message_type: &message_type,
                     quality: Quality {
                         is_reliable: true,
@@ -288,12 +288,12 @@ impl Bus {
                 // A path of hundreds of points must not delay a command or a sensor's message.
                 let writer =
                     self.writer(session, &node, &topic, Priority::Background, &mut tokens)?;
-                words.push((word, writer));
+                outward_topics.push((outward_topic, writer));
             }
         }
         Ok(Declared {
             commands,
-            words,
+            outward_topics,
             _tokens: tokens,
         })
     }
@@ -389,7 +389,7 @@ impl Bus {
     fn speak(&self, declared: &Declared, outward: Option<&mut Outward>) {
         std::thread::scope(|scope| {
             let telling = outward.and_then(|outward| {
-                let body = || self.tell(&declared.words, outward);
+                let body = || self.tell(&declared.outward_topics, outward);
                 let named = std::thread::Builder::new().name("to the robot".to_owned());
                 let spawned = named.spawn_scoped(scope, body);
                 spawned
@@ -404,13 +404,13 @@ impl Bus {
     }
 
     /// Publishes the agent's state when due, until the loop's end of the outlet is closed.
-    fn tell(&self, words: &[(Word, Writer)], outward: &mut Outward) {
+    fn tell(&self, outward_topics: &[(OutwardTopic, Writer)], outward: &mut Outward) {
         while !self.outlet.is_closed() {
             let (now, wall_ns) = (self.clock.monotonic(), self.clock.host_wall_ns());
-            outward.step(now, wall_ns, |word, bytes| {
-                let writer = words.iter().find(|(known, _)| *known == word);
+            outward.step(now, wall_ns, |topic, bytes| {
+                let writer = outward_topics.iter().find(|(known, _)| *known == topic);
                 if let Some(Err(cause)) = writer.map(|(_, writer)| writer.put(bytes, wall_ns)) {
-                    debug!("{word:?} was not said: {cause}");
+                    debug!("cannot publish {topic:?}: {cause}");
                 }
             });
             std::thread::park_timeout(LOOK_EVERY);

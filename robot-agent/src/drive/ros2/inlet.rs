@@ -12,9 +12,8 @@ use tread_ros2::names::Name;
 use tread_ros2::rmw::{Attachment, check_key};
 
 use super::assemble::Arrived;
-use super::notices::Notice;
 use super::reading::{self, Content, Reading};
-use super::refusal::{Counts, Refusal, Source};
+use super::refusal::{Counts, Notice, Refusal, Source};
 use super::settings::{Ros2Settings, Scheme};
 use super::stamps::{Arrival, Stamps};
 use super::writer_watch::{Order, WriterWatch};

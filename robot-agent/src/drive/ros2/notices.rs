@@ -1,36 +1,7 @@
 //! Reports events on the bus that need no action: restarted writers, clock jumps, and commands
 //! written by other nodes.
 
-use super::refusal::{Counts, QUIET_LOOKS, Source};
-
-/// An event on a topic that is read.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Notice {
-    /// The topic's writer restarted, or another writer replaced a silent one.
-    Restarted,
-    /// The message stamps jumped, and the new ones are accepted.
-    ClockLeapt,
-}
-
-impl Notice {
-    /// All events.
-    pub const ALL: [Self; 2] = [Self::Restarted, Self::ClockLeapt];
-
-    fn text(self) -> &'static str {
-        match self {
-            Self::Restarted => "started again and is heard again",
-            Self::ClockLeapt => "set its clock anew and is heard again",
-        }
-    }
-
-    /// Returns the alert code, for programs.
-    pub fn code(self) -> &'static str {
-        match self {
-            Self::Restarted => "base-restarted",
-            Self::ClockLeapt => "base-clock",
-        }
-    }
-}
+use super::refusal::{Counts, Notice, QUIET_LOOKS, Source};
 
 /// Detects recent events by comparing the counts at intervals.
 #[derive(Debug, Clone, Copy, Default)]

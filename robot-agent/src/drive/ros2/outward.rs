@@ -34,7 +34,7 @@ const THETA_LABEL: &str = "theta,theta_std_dev,theta_loop";
 
 /// A published topic.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) enum Word {
+pub(crate) enum OutwardTopic {
     /// Plan of the active mission; empty without one.
     Plan,
     /// Driven path since the last mission began, the newest [`PATH_POINTS_MAX`] points.
@@ -45,7 +45,7 @@ pub(crate) enum Word {
     Diagnostics,
 }
 
-impl Word {
+impl OutwardTopic {
     /// All topics.
     pub(crate) const ALL: [Self; 4] = [Self::Plan, Self::Driven, Self::Theta, Self::Diagnostics];
 
@@ -120,7 +120,12 @@ impl Outward {
     }
 
     /// Publishes what is due.
-    pub(crate) fn step(&mut self, now: Duration, wall_ns: i64, mut say: impl FnMut(Word, &[u8])) {
+    pub(crate) fn step(
+        &mut self,
+        now: Duration,
+        wall_ns: i64,
+        mut say: impl FnMut(OutwardTopic, &[u8]),
+    ) {
         let snapshot = self.shared.snapshot();
         let is_new = self.update_mission(&snapshot);
         self.update_place(&snapshot);
@@ -131,14 +136,14 @@ impl Outward {
         self.said = Some(now);
         let (frame, mut bytes) = (self.settings.frame.as_str(), Vec::new());
         path(&self.plan, frame, wall_ns, &mut bytes);
-        say(Word::Plan, &bytes);
+        say(OutwardTopic::Plan, &bytes);
         path(&self.driven, frame, wall_ns, &mut bytes);
-        say(Word::Driven, &bytes);
+        say(OutwardTopic::Driven, &bytes);
         theta(&snapshot, &mut bytes);
-        say(Word::Theta, &bytes);
+        say(OutwardTopic::Theta, &bytes);
         let parts = self.parts(now, &snapshot);
         diagnostics(&parts, &self.robot, wall_ns, &mut bytes);
-        say(Word::Diagnostics, &bytes);
+        say(OutwardTopic::Diagnostics, &bytes);
     }
 
     /// Updates the plan; returns whether it has changed.

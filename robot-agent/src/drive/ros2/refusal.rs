@@ -1,11 +1,39 @@
-//! Reasons for which messages of the base are dropped, with their counts and recent changes.
+//! Reasons for which messages of the base are dropped, and events on their topics, with their counts
+//! and recent changes.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use tread_ros2::cdr::CdrError;
 use tread_ros2::rmw::KeyMismatch;
 
-use super::notices::Notice;
+/// An event on a topic that is read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Notice {
+    /// The topic's writer restarted, or another writer replaced a silent one.
+    Restarted,
+    /// The message stamps jumped, and the new ones are accepted.
+    ClockLeapt,
+}
+
+impl Notice {
+    /// All events.
+    pub const ALL: [Self; 2] = [Self::Restarted, Self::ClockLeapt];
+
+    pub(super) fn text(self) -> &'static str {
+        match self {
+            Self::Restarted => "started again and is heard again",
+            Self::ClockLeapt => "set its clock anew and is heard again",
+        }
+    }
+
+    /// Returns the alert code, for programs.
+    pub fn code(self) -> &'static str {
+        match self {
+            Self::Restarted => "base-restarted",
+            Self::ClockLeapt => "base-clock",
+        }
+    }
+}
 
 /// Why a message was dropped. A dropped message does not count as a sign of life: a base that sends
 /// no other counts as silent.

@@ -7,7 +7,7 @@ use tread_ros2::messages::{Header, Imu, JointState, Quaternion, Time, Vector3};
 use tread_ros2::names::Name;
 use tread_ros2::rmw::{Attachment, Generation, topic_key};
 
-use super::notices::Notice;
+use super::refusal::Notice;
 use super::settings::*;
 use super::*;
 use crate::clock::{Clock as _, ManualClock};

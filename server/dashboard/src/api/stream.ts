@@ -26,7 +26,7 @@ export interface Listener {
   signedOut(): void;
 }
 
-/** Follows one site until `close`. */
+/** Follows what a query asks for, until `close`. */
 export class Stream {
   #source: EventSource | null = null;
   #heardAt = performance.now();
@@ -37,8 +37,9 @@ export class Stream {
   readonly #look: ReturnType<typeof setInterval>;
 
   constructor(
-    readonly site: string,
-    readonly listener: Listener,
+    /** Which events are wanted: `site=yard`. */
+    readonly query: string,
+    readonly listener: Partial<Listener>,
   ) {
     this.#open();
     this.#look = setInterval(() => void this.#watch(), LOOK_MS);
@@ -53,15 +54,15 @@ export class Stream {
 
   #open(): void {
     this.#source?.close();
-    const source = new EventSource(`/v1/events?site=${encodeURIComponent(this.site)}`);
+    const source = new EventSource(`/v1/events?${this.query}`);
     this.#source = source;
     this.#heardAt = performance.now();
     source.onopen = () => {
       this.#heard();
-      this.listener.link(true);
+      this.listener.link?.(true);
     };
     source.onerror = () => {
-      this.listener.link(false);
+      this.listener.link?.(false);
       // The browser resumes by itself what only broke; an answer that refuses ends it.
       if (source.readyState === EventSource.CLOSED) void this.#reopen();
     };
@@ -79,16 +80,16 @@ export class Stream {
 
   #take(sent: Sent): void {
     const { listener } = this;
-    if (sent === 'snapshot_begin') listener.begin();
+    if (sent === 'snapshot_begin') listener.begin?.();
     else if (sent === 'snapshot_end') {
-      listener.whole();
-      listener.link(true);
+      listener.whole?.();
+      listener.link?.(true);
     } else if (typeof sent === 'string') return;
-    else if ('robot' in sent) listener.robot(sent.robot);
-    else if ('mission' in sent) listener.mission(sent.mission);
-    else if ('step' in sent) listener.step(sent.step);
-    else if ('alert' in sent) listener.alert(sent.alert);
-    else if ('map' in sent) listener.map(sent.map);
+    else if ('robot' in sent) listener.robot?.(sent.robot);
+    else if ('mission' in sent) listener.mission?.(sent.mission);
+    else if ('step' in sent) listener.step?.(sent.step);
+    else if ('alert' in sent) listener.alert?.(sent.alert);
+    else if ('map' in sent) listener.map?.(sent.map);
     else if ('end' in sent) void this.#reopen();
   }
 
@@ -103,7 +104,7 @@ export class Stream {
       this.#suspect = false;
     } catch {
       this.#suspect = true;
-      this.listener.link(false);
+      this.listener.link?.(false);
     } finally {
       this.#asking = false;
     }
@@ -117,7 +118,7 @@ export class Stream {
       await ask('/v1/session', { timeoutMs: READY_MAX_MS });
     } catch (error) {
       if (error instanceof Problem && error.status === 401) {
-        this.listener.signedOut();
+        this.listener.signedOut?.();
         return;
       }
     }

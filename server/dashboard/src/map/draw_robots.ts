@@ -25,13 +25,16 @@ const HALO_PX = 3;
 const WIDTHS_MAX = 5_000;
 /** Of more robots than these, trails and labels are drawn anew only so often. */
 const ANEW_MAX = 50;
+/** Time between two times that they are, milliseconds: robots lie over what their trails lack meanwhile. */
+const LABELS_ANEW_MS = 100;
+const TRAILS_ANEW_MS = 200;
 
 /** Labels of robots from frame to frame. */
 export class RobotLabels {
   readonly places = new Labels();
   /** Labels, and trails, as they were drawn last. */
-  readonly written = new Kept();
-  readonly trails = new Kept();
+  readonly written = new Kept(LABELS_ANEW_MS);
+  readonly trails = new Kept(TRAILS_ANEW_MS);
   #short = new Map<string, string>();
   #names = '';
   #widths = new Map<string, number>();

@@ -1,13 +1,15 @@
 // A part of the map that takes most of a frame to draw: it is drawn anew only so often, and copied meanwhile.
 import type { Camera, PointM } from './camera';
 
-/** Time between two times that it is drawn anew, milliseconds. */
-const ANEW_MS = 100;
-
 export class Kept {
   readonly #layer = document.createElement('canvas').getContext('2d');
   /** When it was drawn, and for which part of the map. */
   #drawn: { now: number; center: PointM; scale: number } | null = null;
+
+  constructor(
+    /** Time between two times that it is drawn anew, milliseconds. */
+    readonly anewMs: number,
+  ) {}
 
   /** Shows it on the map, by `draw` if that is due; true if what is shown was drawn before, and may have changed. */
   show(context: CanvasRenderingContext2D, camera: Camera, now: number, draw: (to: CanvasRenderingContext2D) => void): boolean {
@@ -19,7 +21,7 @@ export class Kept {
     const { width, height } = context.canvas;
     const isSized = layer.canvas.width === width && layer.canvas.height === height;
     const drawn = this.#drawn;
-    if (drawn && isSized && drawn.scale === camera.scale && now - drawn.now < ANEW_MS) {
+    if (drawn && isSized && drawn.scale === camera.scale && now - drawn.now < this.anewMs) {
       // In whole pixels, so that letters stay sharp.
       const x = Math.round((drawn.center.x_m - camera.center.x_m) * camera.scale);
       const y = Math.round((camera.center.y_m - drawn.center.y_m) * camera.scale);

@@ -1,5 +1,5 @@
 import { expect, test } from 'vitest';
-import { SPANS, momentsOf, stepS } from './moments';
+import { SPANS, momentsOf, momentsWith, stepS } from './moments';
 
 const NOW_MS = Date.parse('2026-11-23T14:37:12Z');
 
@@ -17,5 +17,21 @@ test('the map is had by the minute for an hour, at ends of hours, and of days fo
     for (const [index, at] of moments.slice(1).entries()) expect(at - (moments[index] ?? 0)).toBe(stepS(span) * 1000);
     // No more than the history of a terrain may have.
     expect(moments.length).toBeLessThanOrEqual(1000);
+  }
+});
+
+test('a time that is wanted is among those of the shortest span that reaches back to it', () => {
+  const ago = (minutes: number) => NOW_MS - minutes * 60_000;
+  for (const [at, wanted, span] of [
+    [ago(30), 'hour', 'hour'],
+    [ago(300), 'hour', 'day'],
+    [ago(300), 'week', 'week'],
+    [ago(60 * 24 * 20), 'day', 'month'],
+    [ago(60 * 24 * 400), 'hour', 'month'],
+  ] as const) {
+    const found = momentsWith(at, wanted, NOW_MS);
+    expect(found.span).toBe(span);
+    expect(found.moments[found.index]).toBe(at);
+    expect([...found.moments].sort((a, b) => a - b)).toEqual(found.moments);
   }
 });

@@ -23,6 +23,14 @@ export function momentsOf(span: Span, now_ms: number): number[] {
   return Array.from({ length: count + 1 }, (_, index) => last_ms - (count - index) * step_ms);
 }
 
+/** The times of the shortest span, from the one that is wanted on, that reaches back to a time; that time is one of them. */
+export function momentsWith(at_ms: number, wanted: Span, now_ms: number): { span: Span; moments: number[]; index: number } {
+  const reaches = (span: Span) => (momentsOf(span, now_ms)[0] ?? Infinity) <= at_ms;
+  const span = SPANS.slice(SPANS.indexOf(wanted)).find(reaches) ?? 'month';
+  const moments = [...new Set([...momentsOf(span, now_ms), at_ms])].sort((a, b) => a - b);
+  return { span, moments, index: moments.indexOf(at_ms) };
+}
+
 /** The steps of a span, seconds. */
 export function stepS(span: Span): number {
   return STEPS[span].step_ms / 1000;

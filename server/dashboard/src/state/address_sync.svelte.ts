@@ -46,7 +46,10 @@ export class AddressSync {
       marked: [...roster.marked],
       view: view.place,
       layer: view.compare.isOn ? CHANGE : (view.quantity ?? ''),
+      time: view.quantity === null || view.time.at_ms === null ? null : { at_ms: view.time.at_ms, span: view.time.span },
+      compared: view.compare.isOn ? view.compare.times : null,
       hidden: HIDEABLE.filter((name) => !shown[name]),
+      alert: view.tab === 'alerts' ? view.alert : null,
       draft: this.draft ?? editor.state,
     };
   }
@@ -55,8 +58,10 @@ export class AddressSync {
   begin(): void {
     const wanted = this.#wanted;
     this.#wanted = null;
-    if (!wanted || wanted.site !== this.fleet.site) return;
-    this.#bringBack(wanted);
+    if (!wanted) return;
+    if (wanted.site === this.fleet.site) this.#bringBack(wanted);
+    // An alert about the server is of no site.
+    else if (wanted.site === null && wanted.alert) this.#openAlert(wanted);
   }
 
   /** Whoever signs in again finds everything as it was. */
@@ -68,6 +73,15 @@ export class AddressSync {
   changed(): void {
     const place = placeOf(location.hash);
     if (place.site === this.fleet.site) this.#bringBack(place);
+    else if (place.alert && (place.site === null || this.fleet.sites.some(({ id }) => id === place.site))) {
+      if (place.site !== null) this.fleet.choose(place.site);
+      this.#openAlert(place);
+    }
+  }
+
+  #openAlert({ tab, alert }: Place): void {
+    this.view.tab = tab;
+    this.view.alert = alert;
   }
 
   #bringBack(place: Place): void {
@@ -79,15 +93,24 @@ export class AddressSync {
     view.showTerrains = !place.hidden.includes('terrains');
     view.showFence = !place.hidden.includes('fence');
     view.showTrails = !place.hidden.includes('trails');
+    view.alert = place.alert;
     if (place.view) view.wantedPlace = place.view;
-    const now = view.compare.isOn ? CHANGE : (view.quantity ?? '');
-    if (place.layer !== now) {
-      view.compare.end();
-      view.choose(place.layer in RANGES ? (place.layer as Quantity) : null);
-      if (place.layer === CHANGE) view.compare.begin();
-    }
+    this.#bringBackLayer(place);
     if (!editor.purpose) this.draft = place.draft;
     fleet.isDirty = true;
+  }
+
+  #bringBackLayer(place: Place): void {
+    const { view } = this;
+    const now = this.place;
+    const isSame = (['layer', 'time', 'compared'] as const).every((name) => JSON.stringify(now[name]) === JSON.stringify(place[name]));
+    if (isSame) return;
+    view.time.bringBack(place.time);
+    view.compare.end();
+    view.choose(place.layer in RANGES ? (place.layer as Quantity) : null);
+    if (place.layer !== CHANGE) return;
+    if (place.compared) view.compare.bringBack(place.compared);
+    view.compare.begin();
   }
 
   /** Goes on with the draft as soon as what it changes is known. */

@@ -20,8 +20,12 @@ export class Attention {
   #due: ReturnType<typeof setTimeout> | undefined;
   #audio: AudioContext | null = null;
 
-  /** `open` shows the alerts. */
-  constructor(readonly open: () => void) {}
+  constructor(
+    /** Shows the alerts, and one of them if one is given. */
+    readonly open: (alert: Alert | null) => void,
+    /** Whom or what an alert is about, with its site if there are several. */
+    readonly about: (alert: Alert) => string,
+  ) {}
 
   /** Turns the sound on or off; on, it is heard once. */
   setSound(isOn: boolean): void {
@@ -52,11 +56,13 @@ export class Attention {
     if (!first) return;
     if (this.sound) this.#play(TONES[first.severity]);
     if (!this.notices || !isAllowed() || document.hasFocus()) return;
-    const title = alerts.length === 1 ? (first.robot ?? texts.alerts.server) : texts.alerts.several(alerts.length);
-    const notice = new Notification(`${texts.name}: ${title}`, { body: first.text, tag: first.id });
+    const isAlone = alerts.length === 1;
+    const worst = `${this.about(first)}: ${texts.alerts.title(first.code)}`;
+    const [title, body] = isAlone ? [worst, first.text] : [texts.alerts.several(alerts.length), `${worst}. ${first.text}`];
+    const notice = new Notification(`${texts.name}: ${title}`, { body, tag: first.id });
     notice.onclick = () => {
       window.focus();
-      this.open();
+      this.open(isAlone ? first : null);
       notice.close();
     };
   }

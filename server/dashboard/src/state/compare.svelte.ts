@@ -1,7 +1,9 @@
 // How the friction map differs between two times: which times, what the server says, and its layer.
 import type { CellDifference } from '../api/schema';
 import { list, sentence } from '../api/client';
+import { minute, momentOf } from '../format';
 import { Comparison } from '../map/compare';
+import { texts } from '../texts';
 import type { Fleet } from './fleet.svelte';
 
 /** Entries that are read; the API gives them in pages of 1000. */
@@ -11,7 +13,7 @@ const BACK_MS = 3_600_000;
 
 export class Compare {
   isOn = $state(false);
-  /** Both as `<input type="datetime-local">` has them, in the time zone of whoever looks. */
+  /** Both as they are typed, in the time zone of whoever looks; the second is empty for the present. */
   from = $state('');
   to = $state('');
   layer = $state.raw<Comparison | null>(null);
@@ -25,15 +27,28 @@ export class Compare {
 
   constructor(readonly fleet: Fleet) {}
 
+  /** The times that are typed; null while one of them cannot be read. */
+  get times(): { from_ms: number; to_ms: number | null } | null {
+    const [from_ms, to_ms] = [momentOf(this.from), this.to.trim() === '' ? null : momentOf(this.to)];
+    if (Number.isNaN(from_ms) || (to_ms !== null && Number.isNaN(to_ms))) return null;
+    return { from_ms, to_ms };
+  }
+
   begin(): void {
     this.isOn = true;
-    this.from ||= local(Date.now() - BACK_MS);
+    this.from ||= minute(Date.now() - BACK_MS);
     void this.read();
+  }
+
+  /** Takes these times, for instance those of an address; without reading. */
+  bringBack({ from_ms, to_ms }: { from_ms: number; to_ms: number | null }): void {
+    this.from = minute(from_ms);
+    this.to = to_ms === null ? '' : minute(to_ms);
   }
 
   /** Compares the present with a time that long ago. */
   since(ago_ms: number): void {
-    this.from = local(Date.now() - ago_ms);
+    this.from = minute(Date.now() - ago_ms);
     this.to = '';
     void this.read();
   }
@@ -47,13 +62,18 @@ export class Compare {
 
   async read(): Promise<void> {
     const { site } = this.fleet;
-    const from = Date.parse(this.from);
-    const to = this.to ? Date.parse(this.to) : null;
-    if (!site || Number.isNaN(from) || Number.isNaN(to)) return;
+    const { times } = this;
+    if (!site) return;
     const mine = (this.#asked += 1);
+    if (!times) {
+      const field = Number.isNaN(momentOf(this.from)) ? texts.map.from : texts.map.to;
+      this.problem = texts.map.momentWrong(field, minute(Date.now() - BACK_MS));
+      this.isReading = false;
+      return;
+    }
     this.isReading = true;
-    const query = new URLSearchParams({ from: new Date(from).toISOString() });
-    if (to !== null) query.set('to', new Date(to).toISOString());
+    const query = new URLSearchParams({ from: new Date(times.from_ms).toISOString() });
+    if (times.to_ms !== null) query.set('to', new Date(times.to_ms).toISOString());
     try {
       const read = await list<CellDifference>(`/v1/sites/${site}/friction/difference?${query}`, CELLS_MAX);
       if (mine !== this.#asked) return;
@@ -68,10 +88,4 @@ export class Compare {
     this.isReading = false;
     this.fleet.isDirty = true;
   }
-}
-
-/** A wall time as the input has it. */
-export function local(atMs: number): string {
-  const here = new Date(atMs - new Date(atMs).getTimezoneOffset() * 60_000);
-  return here.toISOString().slice(0, 16);
 }

@@ -145,7 +145,7 @@ export class Editor {
     if (!(this.speed_m_s > 0)) return texts.draw.flaw.speed(texts.draw.speeds[system]);
     const model = this.fleet.byId.get(this.robot)?.robot.model;
     const top = model?.limits.linear_max_m_s ?? Infinity;
-    if (this.speed_m_s > top) return texts.draw.flaw.fast(this.robot, about('speed', top));
+    if (this.speed_m_s > top) return texts.draw.flaw.fast(this.fleet.nameOf(this.robot), about('speed', top));
     if (this.draft?.kind === 'circle' && !(this.turns > 0)) return texts.draw.flaw.turns;
     return Number.isInteger(this.priority) ? null : texts.draw.flaw.priority;
   }
@@ -161,7 +161,7 @@ export class Editor {
     void this.version;
     const { why } = texts.terrains;
     if (this.isSending) return why.sending;
-    if (this.flaw) return why.flaw;
+    if (this.flaw) return why.because(this.flaw);
     return this.draft?.isWhole ? null : why.corners(this.draft?.points.length ?? 0);
   }
 
@@ -172,11 +172,19 @@ export class Editor {
     const { draft } = this;
     if (this.isSending) return why.sending;
     if (!draft || draft.isEmpty) return draft?.kind === 'waypoints' ? why.waypoints(0) : why.circle;
-    if (this.flaw) return why.flaw;
+    if (this.flaw) return why.because(this.flaw);
     if (!draft.isWhole) return draft.kind === 'waypoints' ? why.waypoints(draft.points.length) : why.circle;
     if (!this.robot) return why.robot;
     if (this.isChecking) return why.checking;
-    return this.check === null ? why.flaw : null;
+    if (this.check !== null) return null;
+    return this.#refusal === null ? why.checking : why.because(this.#refusal);
+  }
+
+  /** Whether sending it ends other missions of its robots. */
+  get cancelsOthers(): boolean {
+    if (this.purpose?.what !== 'mission' || this.startPolicy !== 'replace') return false;
+    const robots = new Set([this.robot, ...this.robots]);
+    return this.fleet.openMissions.some((mission) => robots.has(mission.robot));
   }
 
   /** Says that draft or form are no longer what they were. */

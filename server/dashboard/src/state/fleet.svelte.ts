@@ -4,10 +4,12 @@ import type { Alert, DriveView, Geofence, Mission, MissionStep, Robot, Site, Ter
 import { ask, list, sentence } from '../api/client';
 import { Stream, type Listener } from '../api/stream';
 import { signedIn } from './session.svelte';
+import { nameRanks, type NameRanks } from '../roster';
 import { doing } from '../standing';
 import { texts } from '../texts';
 import { Pace, remainingS, startsInS } from '../eta';
 import { LatePlans } from './late_plans';
+import { SiteAlerts } from './site_alerts.svelte';
 import { Stops } from './stops.svelte';
 import { Tracked } from './tracked';
 
@@ -23,6 +25,8 @@ const GROUND_MS = 10_000;
 const CURVES_MAX = 50;
 /** Time between two samples that are kept of large fleets, milliseconds. */
 const SPARSE_MS = 1_000;
+/** Time between two looks at which sites there are, milliseconds. */
+const SITES_MS = 60_000;
 const SITE_KEY = 'tread-site';
 
 const byId = new Intl.Collator('en', { numeric: true });
@@ -59,8 +63,19 @@ export class Fleet implements Listener {
   terrainFriction = $state.raw<TerrainFriction[]>([]);
   fence = $state.raw<Geofence | null>(null);
   readonly missions = new SvelteMap<string, Mission>();
+  /** Alerts of this site and about the server that stand. */
   readonly alerts = new SvelteMap<string, Alert>();
-  readonly stops = new Stops(() => this.site);
+  readonly siteAlerts = new SiteAlerts(
+    (alert) => {
+      // Those of the site that is shown come by its own stream too.
+      if (alert.site !== this.site) this.raised(alert);
+    },
+    () => this.signedOut(),
+  );
+  readonly stops = new Stops(
+    () => this.site,
+    (robot) => this.nameOf(robot),
+  );
   readonly #pace = new Pace();
   readonly #latePlans = new LatePlans(
     (id) => this.missions.get(id),
@@ -85,6 +100,13 @@ export class Fleet implements Listener {
   #timers: ReturnType<typeof setInterval>[] = [];
   #listsDue: ReturnType<typeof setTimeout> | undefined;
   #seen: Set<string> | null = null;
+  /** Robots in the order of lists; null once another one is there, or one is gone. */
+  #order: string[] | null = null;
+  #namesAreOld = true;
+  /** The order of robots by their names. */
+  nameRanks = $state.raw<NameRanks>(new Map());
+  /** Names that several robots of the site have. */
+  #sameNames = $state.raw<ReadonlySet<string>>(new Set());
   /** Everything of this site was read once: what comes now is new. */
   isRead = $state(false);
 
@@ -96,8 +118,10 @@ export class Fleet implements Listener {
   readonly endedMissions = $derived(
     [...this.missions.values()].filter(hasEnded).sort((a, b) => ((a.ended_at ?? '') < (b.ended_at ?? '') ? 1 : -1)),
   );
-  readonly standingAlerts = $derived(
-    [...this.alerts.values()].filter((alert) => !alert.cleared_at).sort((a, b) => (a.raised_at < b.raised_at ? 1 : -1)),
+  readonly standingAlerts = $derived(newestFirst(this.alerts.values()));
+  /** Those of the other sites too. */
+  readonly allStandingAlerts = $derived(
+    newestFirst([...this.alerts.values(), ...[...this.siteAlerts.standing.values()].filter(({ id }) => !this.alerts.has(id))]),
   );
 
   /** What stands about the server itself and stops its work. */
@@ -119,11 +143,40 @@ export class Fleet implements Listener {
     return this.selected === null ? null : (this.byId.get(this.selected)?.robot ?? null);
   }
 
+  /** The name of a robot of this site, with its identifier if another one has the same name. */
+  nameOf(id: string): string {
+    const name = this.byId.get(id)?.robot.name;
+    if (name === undefined || name === id) return id;
+    return this.#sameNames.has(name) ? `${name} (${id})` : name;
+  }
+
+  /** Whom or what an alert is about; robots of other sites are known by their identifiers. */
+  subjectOf(alert: Alert): string {
+    if (alert.robot == null) return texts.alerts.server;
+    return alert.site === this.site ? this.nameOf(alert.robot) : alert.robot;
+  }
+
+  /** The name of a site. */
+  siteName(id: string): string {
+    return this.sites.find((site) => site.id === id)?.name ?? id;
+  }
+
   /** How a robot is heard, as far as it is known: a lost server says nothing more of it. */
   linkOf(robot: Robot): { text: string; look: 'good' | 'warn' | 'bad' } {
     if (robot.link === 'offline') return { text: texts.link.offline, look: 'bad' };
     if (this.lostAt !== null) return { text: texts.robots.lastKnown, look: 'warn' };
     return { text: texts.link[robot.link], look: robot.link === 'online' ? 'good' : 'warn' };
+  }
+
+  /** The robot that can begin a mission soonest, as far as that shows; null without robots. */
+  get readiest(): string | null {
+    const rank = ({ robot }: RobotView) => {
+      if (robot.link !== 'online' || !robot.live || robot.live.safety.stop) return 2;
+      return robot.live.mode === 'idle' ? 0 : 1;
+    };
+    let best: RobotView | null = null;
+    for (const entry of this.robots) if (!best || rank(entry) < rank(best)) best = entry;
+    return best?.id ?? null;
   }
 
   /** Time until a mission ends, seconds; null where that cannot be known. */
@@ -141,20 +194,22 @@ export class Fleet implements Listener {
   }
 
   /** Robots of the site that are to stand and move. */
-  get runaways(): Robot[] {
-    return this.robots.map((entry) => entry.robot).filter((robot) => doing(robot.live).isBad);
-  }
+  readonly runaways = $derived(this.robots.map((entry) => entry.robot).filter((robot) => doing(robot.live).isBad));
 
   async start(): Promise<void> {
     this.#timers.push(setInterval(() => (this.now = performance.now()), 500));
     this.#timers.push(setInterval(() => void this.readGround(), GROUND_MS));
+    this.#timers.push(setInterval(() => void this.readSites(), SITES_MS));
     await this.readSites();
   }
 
   async readSites(): Promise<void> {
     try {
-      this.sites = (await list<Site>('/v1/sites', LIST_MAX)).items;
+      const sites = (await list<Site>('/v1/sites', LIST_MAX)).items;
+      if (!signedIn.session) return;
+      if (JSON.stringify(sites) !== JSON.stringify(this.sites)) this.sites = sites;
       this.problem = null;
+      this.siteAlerts.follow(sites.length > 1);
     } catch (error) {
       this.problem = sentence(error);
       return;
@@ -171,6 +226,7 @@ export class Fleet implements Listener {
     this.site = site;
     this.selected = null;
     this.tracked.clear();
+    this.#order = null;
     this.missions.clear();
     this.alerts.clear();
     this.robots = [];
@@ -181,7 +237,7 @@ export class Fleet implements Listener {
     this.#pace.forget();
     this.isRead = false;
     this.isDirty = true;
-    this.#stream = new Stream(site, this);
+    this.#stream = new Stream(`site=${encodeURIComponent(site)}`, this);
     void this.readGround();
     void this.stops.read();
   }
@@ -189,6 +245,7 @@ export class Fleet implements Listener {
   end(): void {
     this.#stream?.close();
     this.#stream = null;
+    this.siteAlerts.follow(false);
     for (const timer of this.#timers) clearInterval(timer);
     clearTimeout(this.#listsDue);
     this.#timers = [];
@@ -230,7 +287,7 @@ export class Fleet implements Listener {
   whole(): void {
     const seen = this.#seen;
     if (!seen) return;
-    for (const id of this.tracked.keys()) if (!seen.has(`r${id}`)) this.tracked.delete(id);
+    for (const id of this.tracked.keys()) if (!seen.has(`r${id}`)) this.#forget(id);
     for (const id of this.missions.keys()) if (!seen.has(`m${id}`)) this.missions.delete(id);
     for (const id of this.alerts.keys()) if (!seen.has(`a${id}`)) this.alerts.delete(id);
     this.#seen = null;
@@ -247,9 +304,13 @@ export class Fleet implements Listener {
     const known = this.tracked.get(robot.id);
     // Of a robot that stands and says nothing new no frame is drawn.
     let looksNew = true;
-    if (robot.retired_at) this.tracked.delete(robot.id);
+    this.#namesAreOld ||= known?.robot.name !== robot.name;
+    if (robot.retired_at) this.#forget(robot.id);
     else if (known) looksNew = known.update(robot, now, this.tracked.size > CURVES_MAX ? SPARSE_MS : 0);
-    else this.tracked.set(robot.id, new Tracked(robot, now));
+    else {
+      this.tracked.set(robot.id, new Tracked(robot, now));
+      this.#order = null;
+    }
     this.#pace.note(robot.id, robot.live?.mission, now - (robot.live?.heard_age_ms ?? 0));
     this.stops.heard(robot);
     if (looksNew) this.wake();
@@ -277,6 +338,9 @@ export class Fleet implements Listener {
 
   alert(alert: Alert): void {
     this.#seen?.add(`a${alert.id}`);
+    this.siteAlerts.changed(alert);
+    // This page may have changed one of another site.
+    if (alert.site != null && alert.site !== this.site) return;
     if (this.isRead && !this.alerts.has(alert.id) && !alert.cleared_at && !alert.acknowledged_at) this.raised(alert);
     if (alert.cleared_at) this.alerts.delete(alert.id);
     else this.alerts.set(alert.id, alert);
@@ -302,11 +366,37 @@ export class Fleet implements Listener {
   #listsSoon(): void {
     this.#listsDue ??= setTimeout(() => {
       this.#listsDue = undefined;
-      this.robots = [...this.tracked.values()]
-        .map((tracked) => ({ id: tracked.robot.id, robot: tracked.robot, receivedAt: tracked.receivedAt }))
-        .sort((a, b) => byId.compare(a.id, b.id));
+      this.#order ??= [...this.tracked.keys()].sort(byId.compare);
+      this.robots = this.#order.flatMap((id) => {
+        const tracked = this.tracked.get(id);
+        return tracked ? { id, robot: tracked.robot, receivedAt: tracked.receivedAt } : [];
+      });
+      if (this.#namesAreOld) this.#readNames();
     }, LISTS_MS);
   }
+
+  #readNames(): void {
+    const robots = this.robots.map((entry) => entry.robot);
+    this.nameRanks = nameRanks(robots);
+    this.#sameNames = repeated(robots.map((robot) => robot.name));
+    this.#namesAreOld = false;
+  }
+
+  #forget(id: string): void {
+    if (!this.tracked.delete(id)) return;
+    this.#order = null;
+    this.#namesAreOld = true;
+  }
+}
+
+/** What is there more than once. */
+function repeated(names: readonly string[]): ReadonlySet<string> {
+  const seen = new Set<string>();
+  return new Set(names.filter((name) => seen.size === seen.add(name).size));
+}
+
+function newestFirst(alerts: Iterable<Alert>): Alert[] {
+  return [...alerts].filter((alert) => !alert.cleared_at).sort((a, b) => (a.raised_at < b.raised_at ? 1 : -1));
 }
 
 /** Active missions before those that wait. */

@@ -1,5 +1,5 @@
 // The time of the friction map: the present, or the end of a minute, hour or day that is past; and its play.
-import { momentsOf, type Span } from '../map/moments';
+import { momentsOf, momentsWith, type Span } from '../map/moments';
 
 /** How long each time is shown while they play, milliseconds. */
 const SHOWN_MS = 600;
@@ -38,6 +38,19 @@ export class MapTime {
     this.#follow();
     this.index = index;
     void this.read();
+  }
+
+  /** Shows the map of a time, or of the present; without reading it. */
+  bringBack(wanted: { at_ms: number; span: Span } | null): void {
+    this.pause();
+    if (!wanted) {
+      this.index = this.moments.length;
+      return;
+    }
+    const { span, moments, index } = momentsWith(wanted.at_ms, wanted.span, Date.now());
+    this.span = span;
+    this.moments = moments;
+    this.index = index;
   }
 
   toggle(): void {

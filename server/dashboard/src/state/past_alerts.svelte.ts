@@ -7,8 +7,9 @@ import { ask, sentence } from '../api/client';
 const PAGE = 50;
 
 export interface AlertFilter {
-  /** Both empty for all. */
+  /** Each is empty for all. */
   kind: string;
+  site: string;
   robot: string;
 }
 
@@ -23,20 +24,21 @@ export class PastAlerts {
   #cursor: string | null = null;
   #asked = 0;
 
-  /** Reads the newest ones of a site that pass a filter. */
-  async read(site: string, filter: AlertFilter): Promise<void> {
+  /** Reads the newest ones that pass a filter. */
+  async read(filter: AlertFilter): Promise<void> {
     this.#cursor = null;
-    await this.#page(site, filter, []);
+    await this.#page(filter, []);
   }
 
   /** Reads the page behind those that were read. */
-  async more(site: string, filter: AlertFilter): Promise<void> {
-    await this.#page(site, filter, this.items);
+  async more(filter: AlertFilter): Promise<void> {
+    await this.#page(filter, this.items);
   }
 
-  async #page(site: string, { kind, robot }: AlertFilter, before: Alert[]): Promise<void> {
+  async #page({ kind, site, robot }: AlertFilter, before: Alert[]): Promise<void> {
     const mine = (this.#asked += 1);
-    const query = new URLSearchParams({ site, limit: String(PAGE) });
+    const query = new URLSearchParams({ limit: String(PAGE) });
+    if (site) query.set('site', site);
     if (kind) query.set('kind', kind);
     if (robot) query.set('robot', robot);
     if (this.#cursor) query.set('cursor', this.#cursor);

@@ -40,7 +40,7 @@ export class Roster {
       const known = this.fleet.byId;
       return this.#last.flatMap((id) => known.get(id) ?? []);
     }
-    const found = listed(robots, { search, groups, model, tag, order });
+    const found = listed(robots, { search, groups, model, tag, order }, this.fleet.nameRanks);
     this.#last = found.map((entry) => entry.id);
     this.#lastKey = key;
     return found;

@@ -29,7 +29,11 @@ export class Stops {
   #reading = false;
   #readAgain = false;
 
-  constructor(readonly site: () => string | null) {}
+  constructor(
+    readonly site: () => string | null,
+    /** What people call a robot. */
+    readonly nameOf: (robot: string) => string,
+  ) {}
 
   /** Stops a robot; why it may not have got it, if so. */
   async stop(robot: string): Promise<string | null> {
@@ -44,7 +48,7 @@ export class Stops {
       this.sent.delete(robot);
       return null;
     } catch (error) {
-      const text = failureText(robot, error);
+      const text = failureText(this.nameOf(robot), error);
       this.sent.set(robot, { state: 'failed', text });
       return text;
     }
@@ -148,7 +152,7 @@ export class Stops {
   }
 }
 
-function failureText(robot: string, error: unknown): string {
+function failureText(name: string, error: unknown): string {
   const isLost = error instanceof Problem && error.isLost;
-  return isLost ? texts.stop.failed(robot) : texts.stop.refused(robot, sentence(error));
+  return isLost ? texts.stop.failed(name) : texts.stop.refused(name, sentence(error));
 }

@@ -21,6 +21,8 @@ const FRICTION_MS = 60_000;
 const CELLS_MAX = 20_000;
 /** Squares of the part that is read; one that several terrains or models share has several entries. */
 const SQUARES_MAX = 16_000;
+/** Scale at which a single place is shown, pixels per metre. */
+export const PLACE_SCALE = 40;
 /** Wait after the map was moved before another part is read, milliseconds. */
 const MOVED_MS = 300;
 
@@ -37,6 +39,8 @@ export class View {
   frictionProblem = $state<string | null>(null);
   isReading = $state(false);
   isWhole = $state(true);
+  /** The alert that is shown and marked among the others; null for none. */
+  alert = $state<string | null>(null);
   detail = $state.raw<MissionDetail | null>(null);
   detailProblem = $state<string | null>(null);
   /** The smooth path of the mission that is looked at, once it is known. */
@@ -203,6 +207,11 @@ export class View {
     this.replay?.pause();
     this.replay = null;
     this.fleet.isDirty = true;
+  }
+
+  /** Shows a place of the site that is being opened. */
+  showOnOpening(center: PointM): void {
+    this.wantedPlace = { center, scale: PLACE_SCALE };
   }
 
   show(points: PointM[]): void {

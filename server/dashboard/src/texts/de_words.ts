@@ -15,8 +15,9 @@ import type {
   StandingState,
   TerrainClass,
 } from '../api/schema';
+import type { AlertKind } from './en_words';
 
-export const link: Record<LinkState, string> = { online: 'online', stale: 'verzögert', offline: 'kein Kontakt' };
+export const link: Record<LinkState, string> = { online: 'online', stale: 'verzögert', offline: 'offline' };
 export const mode: Record<RobotMode, string> = {
   idle: 'bereit',
   tracking: 'auf Mission',
@@ -132,31 +133,35 @@ export const standing: Record<StandingState, string> = {
 };
 
 export const release: Record<ReleaseCause | 'ended', string> = {
-  released: 'Es wurde abgegeben.',
-  taken: 'Jemand anders hat es übernommen.',
+  released: 'Sie haben das Fernsteuern beendet.',
+  taken: 'Jemand anders hat die Steuerung übernommen.',
   lost: 'Die Verbindung ist abgerissen.',
   ended: 'Die Verbindung wurde beendet.',
 };
 export const driveRefusal: Record<DriveRefusal, string> = {
-  leased: 'jemand anders hat das Steuerrecht',
-  no_lease: 'Sie haben das Steuerrecht nicht',
+  leased: 'jemand anders steuert den Roboter',
+  no_lease: 'Sie steuern den Roboter nicht',
   stopped: 'der Roboter ist gestoppt',
   forbidden: 'Ihre Rechte erlauben das nicht',
   unreachable: 'der Roboter antwortet nicht',
   refused: 'der Roboter lehnt es ab',
 };
 
-/** What codes of alerts mean; an unknown one has no title. */
-export const alertTitles: Readonly<Record<string, string>> = {
+/** What codes of alerts mean. */
+export const alertTitles: Readonly<Record<AlertKind, string>> = {
   'two-agents': 'Zwei Agenten unter einem Namen',
   'storage-unwritable': 'Der Server kann nichts speichern',
   'database-damaged': 'Die Datenbank ist beschädigt',
   'disk-low': 'Der Speicherplatz wird knapp',
   'server-restarted': 'Der Server wurde neu gestartet',
+  'backup-failed': 'Die Sicherung ist fehlgeschlagen',
+  'backup-old': 'Die letzte Sicherung ist alt',
+  'robots-await-release': 'Roboter warten auf ihre Freigabe',
   'mission-failed': 'Mission fehlgeschlagen',
   'mission-expired': 'Mission verfallen',
   'mission-rejected': 'Mission abgelehnt',
-  'robot-waiting': 'Der Roboter wartet',
+  'mission-waiting': 'Mission beginnt nicht',
+  'robot-waiting': 'Der Roboter setzt seine Mission nicht fort',
   'clock-wrong': 'Die Uhr des Roboters geht falsch',
   'robot-lost': 'Kein Kontakt zum Roboter',
   'stop-unconfirmed': 'Stopp nicht bestätigt',
@@ -175,6 +180,8 @@ export const alertTitles: Readonly<Record<string, string>> = {
   'battery-critical': 'Der Akku ist fast leer',
   'battery-low': 'Der Akku wird leer',
   'base-silent': 'Das Fahrgestell antwortet nicht',
+  'base-restarted': 'Das Fahrgestell wurde neu gestartet',
+  'base-clock': 'Das Fahrgestell hat seine Uhr neu gestellt',
   'position-lost': 'Die Position ist verloren',
   'command-second-writer': 'Jemand anders befiehlt dem Fahrgestell',
   'outbox-long': 'Viele Messungen warten',

@@ -13,7 +13,7 @@ import type {
   TerrainClass,
 } from '../api/schema';
 
-export const link: Record<LinkState, string> = { online: 'online', stale: 'late', offline: 'lost' };
+export const link: Record<LinkState, string> = { online: 'online', stale: 'delayed', offline: 'offline' };
 export const mode: Record<RobotMode, string> = {
   idle: 'idle',
   tracking: 'on a mission',
@@ -59,8 +59,8 @@ export const cause: Record<Cause, string> = {
   noted: 'noted',
 };
 export const limit: Record<BindingLimit, string> = {
-  lateral_acceleration: 'sideways acceleration',
-  angular_speed: 'turning speed',
+  lateral_acceleration: 'lateral acceleration',
+  angular_speed: 'turn rate',
   wheel_speed: 'wheel speed',
   wheel_acceleration: 'wheel acceleration',
   linear_acceleration: 'acceleration',
@@ -128,6 +128,57 @@ export const standing: Record<StandingState, string> = {
   moves: 'MOVES WHILE STOPPED',
   other: 'stopped',
 };
+
+/** What codes of alerts mean: the table of `docs/rest.md`. */
+export const alertTitles = {
+  'two-agents': 'Two agents under one name',
+  'storage-unwritable': 'The server cannot store anything',
+  'database-damaged': 'The database is damaged',
+  'disk-low': 'The server’s disk is nearly full',
+  'server-restarted': 'The server was restarted',
+  'backup-failed': 'The backup failed',
+  'backup-old': 'The newest backup is old',
+  'robots-await-release': 'Robots await their release',
+  'mission-failed': 'Mission failed',
+  'mission-expired': 'Mission expired',
+  'mission-rejected': 'Mission rejected',
+  'mission-waiting': 'Mission does not begin',
+  'robot-waiting': 'Robot does not continue its mission',
+  'clock-wrong': 'Robot’s clock is wrong',
+  'robot-lost': 'No contact with the robot',
+  'stop-unconfirmed': 'Stop not confirmed',
+  'revoked-robot': 'Revoked robot reports',
+  'retired-authority': 'Certificate of a retired authority',
+  'unknown-certificate': 'Unknown certificate',
+  'does-not-stand': 'Robot does not stand',
+  'moves-while-stopped': 'Robot moves while it is stopped',
+  stopped: 'Robot is stopped',
+  'dug-in': 'Robot is dug in',
+  'payload-changed': 'Payload has changed',
+  'wheels-and-motion-disagree': 'Wheels and motion disagree',
+  'wheel-locked': 'A wheel is locked',
+  'sensor-frozen': 'A sensor always reports the same',
+  'sensor-inconsistent': 'A sensor contradicts the others',
+  'battery-critical': 'Battery is nearly empty',
+  'battery-low': 'Battery is low',
+  'base-silent': 'Base does not answer',
+  'base-restarted': 'Base was restarted',
+  'base-clock': 'Base has set its clock anew',
+  'position-lost': 'Position is lost',
+  'command-second-writer': 'Another node commands the base',
+  'outbox-long': 'Many measurements wait',
+  'outbox-damaged': 'Stored measurements are damaged',
+  'outbox-dropped': 'Measurements were lost',
+  'surface-change': 'Ground has changed',
+  'loop-overrun': 'Control loop is late',
+} as const;
+export type AlertKind = keyof typeof alertTitles;
+
+/** The title of an alert; a code that is not known here is its own title. */
+export function alertTitle(code: string, titles: Readonly<Record<AlertKind, string>>, ofBase: string): string {
+  if (Object.hasOwn(titles, code)) return titles[code as AlertKind];
+  return code.startsWith('base-') ? ofBase : code;
+}
 
 /** How points are drawn: with a mouse and keys, or with a finger. */
 export function howToDraw(what: string, isTouch: boolean): string {

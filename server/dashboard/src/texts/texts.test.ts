@@ -5,6 +5,7 @@ import { expect, test } from 'vitest';
 import type { Session } from '../api/schema';
 import { de } from './de';
 import { en } from './en';
+import { alertTitles } from './en_words';
 
 /** What is the same word in both languages, by where it stands. */
 const SAME = [
@@ -17,15 +18,19 @@ const SAME = [
   'header.live',
   'stop.keys.one',
   'link.online',
+  'link.offline',
+  'robots.groups.lost',
   'robots.position',
   'curves.theta',
   'alerts.server',
+  'webhooks.title',
   'webhooks.name',
   'drive.gamepad',
   'missions.detail',
   'draw.point',
   'draw.radius',
   'draw.head',
+  'draw.robotIs',
   'draw.slowsBy',
   'replay.times',
   'fence.title',
@@ -127,6 +132,26 @@ test('what a function is given is in what it says, in both languages', () => {
     for (const name of SAMPLES[NAMES] ?? []) {
       if (String(name).length > 1) expect(other.includes(String(name)), `${path}: ${other}`).toBe(mine.includes(String(name)));
     }
+  }
+});
+
+test('every alert of the documentation has a title of its own in each language', () => {
+  const rest = readFileSync(new URL('../../../../docs/rest.md', import.meta.url), 'utf8');
+  const section = rest.split('\n## Alerts\n')[1]?.split('\n## ')[0] ?? '';
+  const rows = section.split('\n').filter((line) => line.startsWith('| `'));
+  // Of the codes about dropped messages the table has two examples.
+  const codes = rows
+    .flatMap((row) => [...(row.split('|')[1] ?? '').matchAll(/`([^`]+)`/g)].map((found) => found[1] ?? ''))
+    .filter((code) => code !== 'base-late' && code !== 'base-value');
+  expect(codes.length).toBeGreaterThan(30);
+  expect(Object.keys(alertTitles).sort()).toEqual([...codes].sort());
+  for (const { alerts } of [en, de]) {
+    const titles = codes.map((code) => alerts.title(code));
+    expect(new Set(titles).size).toBe(codes.length);
+    for (const title of titles) expect(codes).not.toContain(title);
+    expect(alerts.title('base-late')).toBe(alerts.title('base-value'));
+    // What a newer agent says is shown as it is.
+    expect(alerts.title('tyre-flat')).toBe('tyre-flat');
   }
 });
 

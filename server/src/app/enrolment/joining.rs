@@ -125,7 +125,9 @@ impl App {
                 count: FLEET_ROBOTS_MAX as usize,
             }));
         }
-        let number = former.map_or(1, |former| former.number.saturating_add(1));
+        let floor = db::restorations::enrolment_floor(&mut tx).await?;
+        let number = former.map_or(0, |former| former.number).max(floor);
+        let number = number.saturating_add(1);
         let name = RobotName {
             site: token.site.clone(),
             robot: robot.clone(),

@@ -36,7 +36,6 @@ use self::rotation::Shown;
 use super::identity::new_secret;
 use super::identity::quota::{Count, Quota};
 use super::identity::tokens::{DEAD_KEPT, FORGET_MAX};
-use super::reconciler::attendance::ROBOT_LOST_ALERT;
 use super::{App, AppError, page, site_row};
 use crate::authority::{Authorities, CertificateError, Issued, RobotName, RobotRequest};
 use crate::db::enrolments::{Counting, Renewal};
@@ -330,13 +329,11 @@ impl App {
         let found = db::enrolments::newest(&mut tx, site, robot).await?;
         let unknown = || AppError::UnknownRobot(site.clone(), robot.clone());
         let enrolment = found.ok_or_else(unknown)?;
-        let mut ended = None;
-        if let Some(robot_pk) = db::robots::pk_of(&mut tx, site, robot).await? {
-            // A revoked robot is not reported as lost.
-            ended = self.end_alert(&mut tx, robot_pk, ROBOT_LOST_ALERT).await?;
-        }
-        self.commit_enrolment(tx, &enrolment, ended.into_iter().collect())
-            .await?;
+        let ended = match db::robots::pk_of(&mut tx, site, robot).await? {
+            Some(robot_pk) => self.end_work_alerts(&mut tx, robot_pk).await?,
+            None => Vec::new(),
+        };
+        self.commit_enrolment(tx, &enrolment, ended).await?;
         tracing::warn!(robot.id = %robot, "robot `{robot}` of site `{site}` was put out by {revoked_by}");
         Ok(enrolment)
     }

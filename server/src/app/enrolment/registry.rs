@@ -146,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stranger_may_speak_until_the_roll_is_closed() {
+    fn a_stranger_may_speak_until_the_registry_is_closed() {
         let registry = EnrolmentRegistry::default();
         let key: RobotKey = ("yard".parse().unwrap(), "rover-1".parse().unwrap());
         assert!(registry.may_speak(&key) && !registry.is_in_force(&key, 1));

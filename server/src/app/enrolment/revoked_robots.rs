@@ -128,7 +128,7 @@ impl App {
             }
         };
         // The task that reads all robots' messages must not wait for the database.
-        self.supervisor().spawn_passing("outsider", raising);
+        self.supervisor().spawn_passing("revoked robot", raising);
     }
 
     async fn raise_outsider(

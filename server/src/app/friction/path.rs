@@ -18,7 +18,7 @@ use tread_control::robot::RobotModel as PlannedModel;
 
 use super::drawn::{Drawn, Near};
 use super::{App, AppError, Asked, Reading, SiteView};
-use crate::friction::index::{Lens, Room, SiteMap};
+use crate::friction::index::{CompiledFilter, Room, SiteMap};
 use crate::friction::traction_limit;
 
 /// Maximum length of a path, metres.
@@ -405,7 +405,7 @@ fn drawn_near<'view, 'cut>(
 struct CellReader<'map> {
     map: &'map SiteMap,
     near: &'map Near<'map>,
-    lens: Lens<'map>,
+    filter: CompiledFilter<'map>,
     reading: &'map Reading,
     room: Room,
 }
@@ -416,11 +416,11 @@ impl<'map> CellReader<'map> {
         (view, drawn, near): (&'map SiteView, &Drawn<'_>, &'map Near<'map>),
         reading: &'map Reading,
     ) -> Self {
-        let lens = map.lens(reading.choice(), |found| drawn.ground_of(view, found));
+        let filter = map.filter(reading.choice(), |found| drawn.ground_of(view, found));
         Self {
             map,
             near,
-            lens,
+            filter,
             reading,
             room: Room::default(),
         }
@@ -429,7 +429,7 @@ impl<'map> CellReader<'map> {
     /// Returns the friction of the ground that is drawn at the centre of a cell.
     fn known_at(&mut self, place: &Cut) -> Option<FusedFriction> {
         let ground = self.near.ground_at(place.middle);
-        let (which, at) = ((ground, &self.lens), self.reading.fused_at());
+        let (which, at) = ((ground, &self.filter), self.reading.fused_at());
         let fused = self.map.fuse_cell(place.cell, which, at, &mut self.room);
         fused.map(|fused| fused.to_api(self.reading.now_us))
     }

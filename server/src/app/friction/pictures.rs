@@ -45,7 +45,7 @@ struct Kept {
 }
 
 #[derive(Debug, Default)]
-struct Shelf {
+struct PictureCache {
     clock: u64,
     bytes: usize,
     kept: HashMap<String, Kept>,
@@ -55,12 +55,12 @@ struct Shelf {
 #[derive(Debug, Default)]
 pub(in crate::app) struct Pictures {
     pub(super) blocks: Blocks,
-    shelf: Mutex<Shelf>,
+    cache: Mutex<PictureCache>,
 }
 
 impl Pictures {
     fn find(&self, key: &str, state: State) -> Option<Picture> {
-        let mut held = self.shelf.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut held = self.cache.lock().unwrap_or_else(PoisonError::into_inner);
         held.clock += 1;
         let now = held.clock;
         let found = held.kept.get_mut(key)?;
@@ -73,7 +73,7 @@ impl Pictures {
         if size > KEPT_BYTES_MAX / 4 {
             return;
         }
-        let mut held = self.shelf.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut held = self.cache.lock().unwrap_or_else(PoisonError::into_inner);
         let used = held.clock;
         let kept = Kept {
             state,

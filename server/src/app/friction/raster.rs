@@ -15,7 +15,7 @@ use super::cells::{Area, factor};
 use super::drawn::Drawn;
 use super::{App, AppError, Asked, Reading, SiteView};
 use crate::friction::Raster;
-use crate::friction::index::{Block, CELLS_PER_BLOCK, CellSummary, Lens, Room, SiteMap};
+use crate::friction::index::{Block, CELLS_PER_BLOCK, CellSummary, CompiledFilter, Room, SiteMap};
 
 /// Maximum number of squares in one picture.
 pub const SQUARES_MAX: u64 = 1 << 20;
@@ -92,12 +92,12 @@ pub(super) struct Frame<'view> {
 }
 
 impl Frame<'_> {
-    fn lens(&self, map: &SiteMap) -> Lens<'_> {
+    fn filter(&self, map: &SiteMap) -> CompiledFilter<'_> {
         let choice = crate::friction::index::Choice {
             configuration: Some(self.configuration),
             ..self.reading.choice()
         };
-        map.lens(choice, |found| self.drawn.ground_of(self.view, found))
+        map.filter(choice, |found| self.drawn.ground_of(self.view, found))
     }
 
     fn grounds(&self, block: Block) -> Arc<[u16]> {
@@ -141,10 +141,10 @@ impl Frame<'_> {
                 ),
             };
             if newest > 0 {
-                let lens = self.lens(map);
+                let filter = self.filter(map);
                 let kept = Arc::make_mut(&mut squares);
                 let which = (block, places.as_deref());
-                map.fuse_block(which, &grounds, &lens, reading.fused_at(), kept);
+                map.fuse_block(which, &grounds, &filter, reading.fused_at(), kept);
             }
             (newest, squares)
         });
@@ -202,7 +202,7 @@ impl Frame<'_> {
         for iy in min.iy..=max.iy {
             // The lock is released after each row.
             app.maps().look(&self.view.row, |map| {
-                let lens = self.lens(map);
+                let filter = self.filter(map);
                 for ix in min.ix..=max.ix {
                     let ground = near.ground_at(coarse.center_of(Cell { ix, iy }));
                     let low = Cell {
@@ -213,7 +213,7 @@ impl Frame<'_> {
                         ix: low.ix.saturating_add(factor - 1),
                         iy: low.iy.saturating_add(factor - 1),
                     };
-                    let which = (ground, &lens);
+                    let which = (ground, &filter);
                     let at = self.reading.fused_at();
                     squares.push(map.fuse_square((low, high), which, at, &mut room));
                 }

@@ -15,7 +15,6 @@
 use std::collections::{HashMap, VecDeque};
 use std::fmt::Write as _;
 use std::hash::{DefaultHasher, Hash as _, Hasher as _};
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -29,6 +28,7 @@ use tread_api::ids::{PersonId, SessionId, TokenId};
 use tread_api::page::Page;
 
 use crate::app::{App, AppError, page};
+use crate::config::AuditConfig;
 use crate::db;
 pub use crate::db::audit::AuditFilter;
 use crate::rate_limit::{Bucket, RateLimit};
@@ -317,10 +317,18 @@ impl Waiting {
 pub(super) struct AuditLog {
     waiting: Mutex<Waiting>,
     added: Notify,
-    is_logged: AtomicBool,
+    /// Whether each written entry is also a line of the server's log.
+    is_logged: bool,
 }
 
 impl AuditLog {
+    pub(super) fn new(config: AuditConfig) -> Self {
+        Self {
+            is_logged: config.log,
+            ..Self::default()
+        }
+    }
+
     fn lock(&self) -> MutexGuard<'_, Waiting> {
         self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -342,12 +350,6 @@ impl App {
         let log = &self.identity().audit;
         log.lock().uses.insert(used, at);
         log.added.notify_one();
-    }
-
-    /// Sets whether each entry written from now on is also logged as a line of the server's log.
-    pub fn log_audit(&self, is_logged: bool) {
-        let log = &self.identity().audit;
-        log.is_logged.store(is_logged, Ordering::Relaxed);
     }
 
     /// Returns a page of the audit log.
@@ -387,7 +389,7 @@ impl App {
             db::audit::forget(&mut tx, before, ENTRIES_MAX, FORGET_MAX).await?;
         }
         tx.commit().await?;
-        if self.identity().audit.is_logged.load(Ordering::Relaxed) {
+        if self.identity().audit.is_logged {
             written.iter().for_each(log_entry);
         }
         Ok(())

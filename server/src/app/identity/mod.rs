@@ -23,7 +23,7 @@ pub mod sessions;
 pub mod tokens;
 
 use std::net::IpAddr;
-use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
@@ -37,6 +37,7 @@ pub use self::known::Credential;
 use self::known::{Known, Valid};
 use self::people::People;
 use super::{App, AppError};
+use crate::config::AuditConfig;
 use crate::connections::Purpose;
 use crate::db::sessions::Owner;
 use crate::db::{self, DbError, Tx};
@@ -69,18 +70,18 @@ pub(super) struct Identity {
     audit: AuditLog,
     turns: Semaphore,
     stop_turns: Semaphore,
-    people: OnceLock<People>,
+    people: Option<People>,
 }
 
-impl Default for Identity {
-    fn default() -> Self {
+impl Identity {
+    pub(super) fn new(people: Option<People>, audit: AuditConfig) -> Self {
         Self {
             known: Known::default(),
             attempts: Mutex::default(),
-            audit: AuditLog::default(),
+            audit: AuditLog::new(audit),
             turns: Semaphore::new(LOOK_UP_TURNS),
             stop_turns: Semaphore::new(STOP_LOOK_UP_TURNS),
-            people: OnceLock::new(),
+            people,
         }
     }
 }

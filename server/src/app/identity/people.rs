@@ -27,6 +27,7 @@ use tread_api::text::cleaned;
 use super::Credential;
 use super::id_tokens::IdTokens;
 use crate::app::{App, AppError};
+use crate::clock::Clock;
 use crate::config::oidc::OidcConfig;
 use crate::db;
 use crate::db::sessions::{Owner, SessionRow, SignedIn};
@@ -161,11 +162,15 @@ struct Used {
 }
 
 impl People {
-    fn new(config: &OidcConfig, app: &App) -> anyhow::Result<Self> {
+    /// Creates the sign-in at the configured provider, which need not be reachable yet.
+    ///
+    /// # Errors
+    /// A file that the configuration names cannot be used.
+    pub fn new(config: &OidcConfig, clock: Clock) -> anyhow::Result<Self> {
         let mut random = [0; SIGN_IN_RANDOM_BYTES];
         getrandom::fill(&mut random).map_err(|error| AppError::NoRandomness(error.to_string()))?;
         Ok(Self {
-            provider: Provider::new(config, app.clock().clone())?,
+            provider: Provider::new(config, clock)?,
             home: config.public_url.clone(),
             grants: config.grants()?,
             groups_claim: config.groups_claim.clone(),
@@ -287,18 +292,8 @@ impl People {
 }
 
 impl App {
-    /// Enables sign-in at a provider; only the first call has an effect.
-    ///
-    /// # Errors
-    /// A file that the configuration names cannot be used.
-    pub fn admit_people(&self, config: &OidcConfig) -> anyhow::Result<()> {
-        let people = People::new(config, self)?;
-        let _ = self.identity().people.set(people);
-        Ok(())
-    }
-
     pub(super) fn people(&self) -> Option<&People> {
-        self.identity().people.get()
+        self.identity().people.as_ref()
     }
 
     /// Returns how people sign in at a provider; `None` if no provider is configured.

@@ -13,7 +13,7 @@ use uuid::Uuid;
 
 use crate::app::{App, AppError};
 use crate::db;
-use crate::db::idempotency::{Given, OwnKey};
+use crate::db::idempotency::{OwnKey, StoredAnswer};
 use crate::identity::subject::SubjectId;
 
 /// Maximum length of a key, characters.
@@ -83,25 +83,25 @@ impl App {
             self.check_new(&request).await?;
         }
         let mut tx = self.db().write("missions").await?;
-        if let Some(given) = db::idempotency::find(&mut tx, key, request_hash).await? {
-            if given.request_hash != request_hash {
+        if let Some(stored) = db::idempotency::find(&mut tx, key, request_hash).await? {
+            if stored.request_hash != request_hash {
                 return Err(AppError::KeyReused);
             }
             let corrupt = |_error| db::DbError::Corrupt {
                 what: "answer",
-                value: given.answer.clone(),
+                value: stored.answer.clone(),
             };
-            return Ok(serde_json::from_str(&given.answer).map_err(corrupt)?);
+            return Ok(serde_json::from_str(&stored.answer).map_err(corrupt)?);
         }
         let mission = self.enqueue(&mut tx, request).await?;
         let answer =
             serde_json::to_string(&mission).map_err(|_error| db::DbError::DoesNotFit("mission"))?;
-        let given = Given {
+        let stored = StoredAnswer {
             request_hash,
             answer,
         };
         let now = self.clock().now();
-        db::idempotency::insert(&mut tx, key, &given, now).await?;
+        db::idempotency::insert(&mut tx, key, &stored, now).await?;
         let kept = SignedDuration::try_from(KEPT).unwrap_or(SignedDuration::MAX);
         if let Ok(before) = now.checked_sub(kept) {
             db::idempotency::forget_before(&mut tx, before, FORGET_MAX).await?;

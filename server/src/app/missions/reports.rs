@@ -28,6 +28,8 @@ pub(crate) struct Reporting {
     pub(crate) since: Timestamp,
     /// Progress of this mission that the robot showed last.
     pub(crate) shown: Option<MissionProgress>,
+    /// Time of the last restoration of the database from a backup, if there was one.
+    pub(crate) restored_at: Option<Timestamp>,
 }
 
 /// Effect of an accepted report: the state in which it ended the mission and the reason, if it did.
@@ -48,7 +50,8 @@ pub(crate) struct Foreign(pub(crate) String);
 ///
 /// A report on a revision that was being sent shows that the robot has it: that revision becomes
 /// the present one. An end under an earlier revision ends the mission all the same: the robot had
-/// finished before the new one arrived.
+/// finished before the new one arrived. So does an end under a later revision that a restoration
+/// from a backup has taken from the server.
 pub(crate) async fn take_report(
     tx: &mut Tx,
     reporting: Reporting,
@@ -63,7 +66,7 @@ pub(crate) async fn take_report(
     if let Some(reason) = impossible(report) {
         return Ok(Err(Foreign(reason)));
     }
-    let row = match content_of(report, &row.mission) {
+    let row = match content_of(report, &row.mission, reporting.restored_at) {
         Content::Present => row,
         Content::Replacement => {
             adopt(tx, &row, Actor::Robot, reporting.now).await?;
@@ -72,7 +75,15 @@ pub(crate) async fn take_report(
                 None => row,
             }
         }
-        Content::Earlier if is_end(report.phase) => row,
+        Content::Earlier | Content::Lost if is_end(report.phase) => row,
+        Content::Lost => {
+            let text = format!(
+                "the robot reported of revision {}, which was lost with a restoration",
+                report.revision
+            );
+            note(tx, &row, Actor::Robot, reporting.now, &text).await?;
+            return Ok(Ok(NOTED));
+        }
         Content::Earlier => {
             let text = format!("the robot reported late of revision {}", report.revision);
             note(tx, &row, Actor::Robot, reporting.now, &text).await?;
@@ -103,10 +114,16 @@ enum Content {
     Present,
     Replacement,
     Earlier,
+    /// A later revision that the server had before it was restored from a backup.
+    Lost,
     Other,
 }
 
-fn content_of(report: &MissionReport, mission: &Mission) -> Content {
+fn content_of(
+    report: &MissionReport,
+    mission: &Mission,
+    restored_at: Option<Timestamp>,
+) -> Content {
     let said = (report.revision, report.plan_hash);
     let replacement = mission.replacement.as_ref();
     if said == (mission.revision, mission.plan_hash) {
@@ -115,6 +132,10 @@ fn content_of(report: &MissionReport, mission: &Mission) -> Content {
         Content::Replacement
     } else if report.revision < mission.revision {
         Content::Earlier
+    } else if report.revision > mission.revision
+        && restored_at.is_some_and(|at| mission.created_at < at)
+    {
+        Content::Lost
     } else {
         Content::Other
     }

@@ -9,12 +9,14 @@ use std::collections::{HashMap, HashSet};
 use std::time::Duration;
 
 use tread_api::ids::MissionId;
-use tread_api::robot::{Alert, Severity};
+use tread_api::mission::MissionState;
+use tread_api::robot::{Alert, LinkState, Severity};
 
 use crate::app::own_alert::OwnAlert;
 use crate::app::presence::{RobotKey, Showing};
 use crate::app::{App, AppError};
 use crate::db;
+use crate::db::missions::Standing;
 
 /// Code of the alert about a robot that has waited too long on its mission.
 pub(in crate::app) const ROBOT_WAITING_ALERT: &str = "robot-waiting";
@@ -116,6 +118,48 @@ impl Conditions {
         self.looked_at = Some(now);
         Ok(())
     }
+
+    /// Clears the alert about a robot that is not heard and waited on a mission that has ended
+    /// meanwhile: the robot cannot show that it no longer drives it.
+    ///
+    /// # Errors
+    /// The database failed; the next check repeats this one.
+    pub(super) async fn end_of_absent(
+        &mut self,
+        app: &App,
+        open: &[Standing],
+    ) -> Result<(), AppError> {
+        let now = app.clock().elapsed();
+        let robots = self.robots.iter_mut().flatten();
+        for (key, memory) in robots.filter(|(_, memory)| memory.is_waiting) {
+            let is_of_robot =
+                |mission: &&Standing| (&mission.site, &mission.robot) == (&key.0, &key.1);
+            let has_mission = open.iter().filter(is_of_robot).any(is_in_progress);
+            if has_mission || app.presences().get(key).link(now) != LinkState::Offline {
+                continue;
+            }
+            let judged = Memory {
+                is_waiting: false,
+                standing: None,
+                ..*memory
+            };
+            let shown = Showing {
+                mission: None,
+                clock_offset_ms: 0,
+            };
+            write_down(app, key, (*memory, judged), shown).await?;
+            *memory = judged;
+        }
+        Ok(())
+    }
+}
+
+/// Returns whether a robot has accepted a mission that has not ended.
+fn is_in_progress(mission: &Standing) -> bool {
+    matches!(
+        mission.state,
+        MissionState::Active | MissionState::Paused | MissionState::Cancelling
+    )
 }
 
 async fn raised(app: &App) -> Result<HashMap<RobotKey, Memory>, AppError> {

@@ -8,8 +8,10 @@
 
 pub(super) mod attendance;
 pub(super) mod conditions;
+pub(super) mod delays;
 mod jobs;
 pub mod needs;
+mod outcomes;
 
 use std::collections::{HashMap, HashSet};
 use std::time::Duration;
@@ -25,6 +27,7 @@ use tread_api::stop::Stop;
 
 use self::attendance::Attendance;
 use self::conditions::Conditions;
+use self::delays::Delays;
 use self::jobs::{
     Finished, adopt_shown, cancel, disown, end_duplicate_agent, hold, offer, push_site, replace,
     settle, stop_again,
@@ -36,6 +39,7 @@ use super::{App, AppError};
 use crate::app::presence::{DuplicateAgent, RobotKey};
 use crate::db;
 use crate::db::missions::Standing;
+use crate::db::restorations::Restrained;
 
 /// Interval between passes when nothing wakes it.
 pub const PERIOD: Duration = Duration::from_millis(500);
@@ -55,6 +59,13 @@ const EXPIRE_MAX: u32 = 1_000;
 /// cancel: its report of the end may be under way.
 const FOREIGN_GRACE: Duration = Duration::from_millis(1_500);
 
+/// Number of attempts to ask a robot how its missions ended, at most [`RETRY_MAX`] apart: an agent
+/// that does not know the question never answers.
+const OUTCOMES_TRIES_MAX: u32 = 6;
+/// Time for which a robot is given to upload its reports before it is asked how its missions ended:
+/// they say more.
+const OUTBOX_PATIENCE: Duration = Duration::from_secs(10);
+
 /// A command that is under way or waits to be repeated.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 enum Job {
@@ -67,6 +78,7 @@ enum Job {
     Disown(RobotKey),
     EndDuplicateAgent(RobotKey),
     Site(RobotKey),
+    Outcomes(RobotKey),
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -109,6 +121,12 @@ pub struct Reconciler {
     foreign: HashMap<RobotKey, (MissionId, Duration)>,
     attendance: Attendance,
     conditions: Conditions,
+    delays: Delays,
+    /// Robots that are restrained since a restoration, as read last.
+    restrained: HashMap<RobotKey, Restrained>,
+    /// Since when each of those that are to say how their missions ended is heard, and how often it
+    /// was asked.
+    asked: HashMap<RobotKey, (Duration, u32)>,
 }
 
 impl Reconciler {
@@ -126,6 +144,9 @@ impl Reconciler {
             foreign: HashMap::new(),
             attendance: Attendance::default(),
             conditions: Conditions::default(),
+            delays: Delays::default(),
+            restrained: HashMap::new(),
+            asked: HashMap::new(),
         }
     }
 
@@ -184,7 +205,8 @@ impl Reconciler {
                 | Job::Cancel(_)
                 | Job::Disown(_)
                 | Job::EndDuplicateAgent(_)
-                | Job::Site(_) => RETRY_MAX,
+                | Job::Site(_)
+                | Job::Outcomes(_) => RETRY_MAX,
             };
             let wait = match (how, before) {
                 (Finished::Delivered, _) => most,
@@ -208,6 +230,7 @@ impl Reconciler {
     /// The database failed; the next pass repeats this one.
     pub async fn pass(&mut self) -> Result<(), AppError> {
         self.stop_again().await;
+        self.look_after_restrained().await?;
         self.expire().await?;
         self.end_duplicate_agents();
         self.app.sync_alerts().await?;
@@ -218,6 +241,8 @@ impl Reconciler {
         open.extend(db::missions::next_in_queues(&mut tx).await?);
         let sites = db::sites::list(&mut tx, &Scope::EVERYWHERE, "", SITES_MAX).await?;
         drop(tx);
+        self.conditions.end_of_absent(&self.app, &open).await?;
+        self.delays.look(&self.app, &open).await?;
         self.forget_all_but(&open);
         self.disown_foreign(&open);
         for mission in open {
@@ -272,12 +297,74 @@ impl Reconciler {
         }
     }
 
+    /// Reads which robots are restrained since a restoration, and asks them how their missions
+    /// ended.
+    async fn look_after_restrained(&mut self) -> Result<(), AppError> {
+        let mut tx = self.app.db().read("reconciler").await?;
+        let restrained = db::restorations::restrained(&mut tx).await?;
+        drop(tx);
+        self.app.show_awaiting(&restrained);
+        let key_of = |it: &Restrained| (it.site.clone(), it.robot.clone());
+        let by_key = restrained.into_iter().map(|it| (key_of(&it), it));
+        self.restrained = by_key.collect();
+        let wanted = |key: &RobotKey| {
+            let found = self.restrained.get(key);
+            found.is_some_and(|found| found.outcomes_wanted)
+        };
+        self.asked.retain(|key, _| wanted(key));
+        self.retries
+            .retain(|job, _| !matches!(job, Job::Outcomes(key) if !wanted(key)));
+        let now = self.app.clock().elapsed();
+        let silent: Vec<Restrained> = self.restrained.values().cloned().collect();
+        for robot in silent.into_iter().filter(|it| it.outcomes_wanted) {
+            let key = key_of(&robot);
+            let presence = self.app.presences().get(&key);
+            if !is_heard(&presence, now) {
+                continue;
+            }
+            let pending = presence.state().map_or(0, |state| state.outbox.pending);
+            let (since, tries) = *self.asked.entry(key.clone()).or_insert((now, 0));
+            let is_patient = pending > 0 && now.saturating_sub(since) < OUTBOX_PATIENCE;
+            let job = Job::Outcomes(key.clone());
+            if !is_patient && self.is_due(&job) {
+                self.asked.insert(key, (since, tries + 1));
+                let is_last = tries + 1 >= OUTCOMES_TRIES_MAX;
+                let app = self.app.clone();
+                self.start(job, outcomes::ask(app, robot, is_last));
+            }
+        }
+        Ok(())
+    }
+
+    /// Returns what may be decided about a mission of a robot that is restrained.
+    fn restrain(&self, key: &RobotKey, heard: bool, need: Need) -> Need {
+        let Some(restrained) = self.restrained.get(key) else {
+            return need;
+        };
+        // A robot that was released, and does not come back, is lost as any other.
+        let is_unknown = restrained.outcomes_wanted && (restrained.awaits_release || heard);
+        let is_dispatch = matches!(need, Need::Offer | Need::Replace | Need::Resume);
+        let is_seen = |change| matches!(change, Change::Accept | Change::Pause | Change::Resume);
+        let is_guess = matches!(need, Need::Settle(change) if !is_seen(change));
+        if is_dispatch && (is_unknown || restrained.awaits_release) || is_guess && is_unknown {
+            Need::Wait
+        } else {
+            need
+        }
+    }
+
     async fn expire(&self) -> Result<(), AppError> {
         let now = self.app.clock().now();
         let mut tx = self.app.db().read("reconciler").await?;
         let overdue = db::missions::overdue(&mut tx, now, EXPIRE_MAX).await?;
         drop(tx);
         for mission in overdue {
+            let key = (mission.site.clone(), mission.robot.clone());
+            let heard = is_heard(&self.app.presences().get(&key), self.app.clock().elapsed());
+            let expires = Need::Settle(Change::Expire);
+            if self.restrain(&key, heard, expires) != expires {
+                continue;
+            }
             settle(&self.app, &mission, Change::Expire).await?;
         }
         Ok(())
@@ -291,7 +378,11 @@ impl Reconciler {
             Job::Offer(id) | Job::Replace(id) | Job::Hold(id, _) | Job::Cancel(id) => {
                 open.contains(id)
             }
-            Job::Disown(_) | Job::EndDuplicateAgent(_) | Job::Site(_) | Job::Stop(_) => true,
+            Job::Disown(_)
+            | Job::EndDuplicateAgent(_)
+            | Job::Site(_)
+            | Job::Outcomes(_)
+            | Job::Stop(_) => true,
         });
     }
 
@@ -314,6 +405,7 @@ impl Reconciler {
             | Job::Cancel(_)
             | Job::Disown(_)
             | Job::Site(_)
+            | Job::Outcomes(_)
             | Job::Stop(_) => true,
         });
         for duplicate in duplicates {
@@ -369,6 +461,7 @@ impl Reconciler {
             | Job::Cancel(_)
             | Job::EndDuplicateAgent(_)
             | Job::Site(_)
+            | Job::Outcomes(_)
             | Job::Stop(_) => true,
         });
     }
@@ -408,6 +501,7 @@ impl Reconciler {
         let memory = *memory;
         let app = self.app.clone();
         let need = decide(&mission, &presence, memory, now);
+        let need = self.restrain(&key, heard, need);
         // A command that is wanted again later does not inherit the back-off of the earlier one.
         for (held, wanted) in [(true, Need::Pause), (false, Need::Resume)] {
             if need != wanted {

@@ -32,7 +32,7 @@ use super::{LOG_MAX, body};
 use crate::app::{App, AppError};
 use crate::db;
 use crate::db::webhooks::{Due, DueTimes, Outcome};
-use crate::webhooks::{Attempt, Letter, Sender};
+use crate::webhooks::{Attempt, OutgoingDelivery, Sender};
 
 /// Interval between looks at the outbox when nothing wakes the task.
 pub const LOOK_EVERY: Duration = Duration::from_secs(1);
@@ -165,7 +165,7 @@ impl Dispatcher {
                 attempts,
                 created_at,
             } = due;
-            let letter = Letter {
+            let outgoing = OutgoingDelivery {
                 id,
                 url,
                 secret,
@@ -176,7 +176,7 @@ impl Dispatcher {
                 attempts,
                 created_at,
             };
-            self.start(webhook, letter, what);
+            self.start(webhook, outgoing, what);
         }
         Ok(())
     }
@@ -187,7 +187,7 @@ impl Dispatcher {
             && !self.resting.contains_key(&webhook)
     }
 
-    fn start(&mut self, webhook: WebhookId, letter: Letter, what: What) {
+    fn start(&mut self, webhook: WebhookId, outgoing: OutgoingDelivery, what: What) {
         self.under_way.insert(webhook);
         let (sender, finished) = (Arc::clone(&self.sender), self.finished.clone());
         let stop = self.stop.clone();
@@ -195,13 +195,13 @@ impl Dispatcher {
             let attempt = tokio::select! {
                 // It is sent again after the restart.
                 () = stop.cancelled() => return,
-                attempt = sender.send(&letter) => attempt,
+                attempt = sender.send(&outgoing) => attempt,
             };
             let done = Done {
                 webhook,
-                id: letter.id,
+                id: outgoing.id,
                 what,
-                at: letter.at,
+                at: outgoing.at,
                 attempt,
             };
             // There is room for every attempt that is under way, unless the server stops.
@@ -300,14 +300,14 @@ impl Dispatcher {
                 let id = known.unwrap_or_else(|| self.app.clock().new_id());
                 self.keep_id(&change, webhook, id);
                 let notice = self.app.notice(id, change.event, &change.alert);
-                let letter = Letter {
+                let outgoing = OutgoingDelivery {
                     id,
                     url: receiver.url,
                     secret: receiver.secret,
                     body: body(&notice)?,
                     at: self.app.clock().now(),
                 };
-                self.start(webhook, letter, What::Unwritten);
+                self.start(webhook, outgoing, What::Unwritten);
             }
         }
         Ok(())

@@ -74,11 +74,11 @@ const BACKLOG: u32 = 1_024;
 pub(super) struct Gate {
     listener: TcpListener,
     address: SocketAddr,
-    door: Door,
+    trust: PortTrust,
 }
 
 /// Certificate of the port and trusted authorities.
-struct Door {
+struct PortTrust {
     security: Security,
     clock: Clock,
     present: Mutex<Present>,
@@ -90,13 +90,13 @@ struct Present {
     trusted: Arc<Trusted>,
 }
 
-impl std::fmt::Debug for Door {
+impl std::fmt::Debug for PortTrust {
     fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        formatter.debug_struct("Door").finish_non_exhaustive()
+        formatter.debug_struct("PortTrust").finish_non_exhaustive()
     }
 }
 
-impl Door {
+impl PortTrust {
     fn new(security: Security, clock: Clock) -> anyhow::Result<Self> {
         let made_at = clock.machine_time();
         let trusted = security.authorities.present();
@@ -182,7 +182,7 @@ impl Gate {
         security: Security,
         clock: Clock,
     ) -> Result<Self, FleetError> {
-        let door = Door::new(security, clock).map_err(FleetError::Certificates)?;
+        let trust = PortTrust::new(security, clock).map_err(FleetError::Certificates)?;
         let listener = listen(address).map_err(|cause| FleetError::InUse { address, cause })?;
         let address = listener
             .local_addr()
@@ -190,7 +190,7 @@ impl Gate {
         Ok(Self {
             listener,
             address,
-            door,
+            trust,
         })
     }
 
@@ -241,8 +241,8 @@ impl Gate {
                 app: app.clone(),
                 peer,
                 slot: admitted.slot,
-                acceptor: self.door.acceptor(),
-                authorities: Arc::clone(&self.door.security.authorities),
+                acceptor: self.trust.acceptor(),
+                authorities: Arc::clone(&self.trust.security.authorities),
                 routers: Arc::clone(&routers),
                 failures: Arc::clone(&failures),
                 links: links.clone(),

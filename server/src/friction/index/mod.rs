@@ -23,7 +23,9 @@ use self::names::{Names, Number};
 use self::part::{Part, PartKey};
 use self::partial::When;
 pub use self::partial::{Epoch, Measurement, PartialEpoch, Timeline};
-pub use self::summaries::{At, CELLS_PER_BLOCK, CellSummary, GROUND_NONE, KnownCell, Lens, Room};
+pub use self::summaries::{
+    At, CELLS_PER_BLOCK, CellSummary, CompiledFilter, GROUND_NONE, KnownCell, Room,
+};
 use super::sums::bucket_h;
 use super::{Seen, Sums};
 
@@ -297,11 +299,6 @@ impl SiteMap {
     /// Returns the recorded changes of cells.
     pub fn changes(&self) -> &Changes {
         &self.changes
-    }
-
-    /// Returns the number of cells with measurements.
-    pub fn cell_count(&self) -> usize {
-        self.cells.len()
     }
 
     /// Returns the number of sums of (cell, terrain, robot, configuration, epoch).

@@ -402,8 +402,8 @@ mod tests {
                 );
                 prop_assert_eq!(map.newest_at_us(cell, choice), expected.newest_at_us(cell, present));
                 let seen = |map: &SiteMap, choice| {
-                    let lens = map.lens(choice, ground_of);
-                    map.fuse_cell(cell, (1, &lens), at, &mut Room::default())
+                    let filter = map.filter(choice, ground_of);
+                    map.fuse_cell(cell, (1, &filter), at, &mut Room::default())
                 };
                 prop_assert_eq!(seen(&map, choice), seen(&expected, present));
             }

@@ -76,7 +76,7 @@ impl CellSummary {
 
 /// Compiled filter of measurements for rasters, with the internal numbers of the map.
 #[derive(Debug, Clone)]
-pub struct Lens<'choice> {
+pub struct CompiledFilter<'choice> {
     /// Number of the ground of each terrain revision.
     grounds: Vec<u16>,
     /// Divisor of θ of each configuration; `None` for configurations that are filtered out.
@@ -84,7 +84,7 @@ pub struct Lens<'choice> {
     when: When<'choice>,
 }
 
-impl Lens<'_> {
+impl CompiledFilter<'_> {
     fn sees(&self, key: &PartKey, ground: u16) -> Option<f64> {
         let is_here = self.grounds.get(key.terrain as usize) == Some(&ground);
         if !is_here {
@@ -116,14 +116,14 @@ impl SiteMap {
     /// Returns the filter for the configuration in `choice` and those that its normalisation
     /// converts to it. `ground_of` gives the number of each terrain revision's ground, `None` if it
     /// no longer exists. Without a configuration in `choice` everything is filtered out.
-    pub fn lens<'choice>(
+    pub fn filter<'choice>(
         &self,
         choice: Choice<'choice>,
         ground_of: impl Fn(Option<&TerrainRef>) -> Option<u16>,
-    ) -> Lens<'choice> {
+    ) -> CompiledFilter<'choice> {
         let terrains = self.names.terrains.names.iter();
         let configurations = self.names.configurations.names.iter();
-        Lens {
+        CompiledFilter {
             grounds: terrains
                 .map(|terrain| ground_of(terrain.as_ref()).unwrap_or(GROUND_LOST))
                 .collect(),
@@ -144,7 +144,7 @@ impl SiteMap {
         &self,
         (block, places): (Block, Option<&[u16]>),
         grounds: &[u16],
-        lens: &Lens<'_>,
+        filter: &CompiledFilter<'_>,
         at: At<'_>,
         squares: &mut [CellSummary],
     ) {
@@ -155,12 +155,12 @@ impl SiteMap {
         let mut put = |place: u16, parts: &[Part]| {
             let index = usize::from(place);
             if let (Some(&ground), Some(square)) = (grounds.get(index), squares.get_mut(index)) {
-                *square = self.square(parts, (ground, lens), at, &mut room);
+                *square = self.square(parts, (ground, filter), at, &mut room);
             }
         };
         if let Some(places) = places {
             for &one in places {
-                put(one, &self.parts_at(place(block.cell(one)), lens.when));
+                put(one, &self.parts_at(place(block.cell(one)), filter.when));
             }
             return;
         }
@@ -168,7 +168,7 @@ impl SiteMap {
         for iy in first.iy..=last.iy {
             let row = place(Cell { iy, ..first })..=place(Cell { iy, ..last });
             for (&at_place, parts) in self.cells.range(row) {
-                let parts = self.parts_then((at_place, parts), lens.when);
+                let parts = self.parts_then((at_place, parts), filter.when);
                 put(Block::place(super::cell_at(at_place)), &parts);
             }
         }
@@ -179,14 +179,14 @@ impl SiteMap {
     pub fn fuse_square(
         &self,
         (min, max): (Cell, Cell),
-        (ground, lens): (u16, &Lens<'_>),
+        (ground, filter): (u16, &CompiledFilter<'_>),
         at: At<'_>,
         room: &mut Room,
     ) -> CellSummary {
         let mut sums: std::collections::BTreeMap<PartKey, Sums> = std::collections::BTreeMap::new();
         for cell in self.cells_in(min, max, None) {
-            for part in &*self.parts_at(place(cell), lens.when) {
-                if lens.sees(&part.key, ground).is_some() {
+            for part in &*self.parts_at(place(cell), filter.when) {
+                if filter.sees(&part.key, ground).is_some() {
                     let added = part.sums();
                     let entry = sums.entry(part.key);
                     entry.and_modify(|sums| sums.add(&added)).or_insert(added);
@@ -197,7 +197,7 @@ impl SiteMap {
             .iter()
             .map(|(&key, sums)| Part::new(key, sums))
             .collect();
-        self.gather(&parts, (ground, lens), room);
+        self.gather(&parts, (ground, filter), room);
         let fused = room
             .fuser
             .fuse(&mut room.seen, Ground::Area, at.config, at.now_us)
@@ -210,7 +210,7 @@ impl SiteMap {
     pub fn fuse_cell(
         &self,
         cell: Cell,
-        which: (u16, &Lens<'_>),
+        which: (u16, &CompiledFilter<'_>),
         at: At<'_>,
         room: &mut Room,
     ) -> Option<Fused> {
@@ -221,7 +221,7 @@ impl SiteMap {
     fn fuse_parts(
         &self,
         parts: &[Part],
-        which: (u16, &Lens<'_>),
+        which: (u16, &CompiledFilter<'_>),
         at: At<'_>,
         room: &mut Room,
     ) -> Option<Fused> {
@@ -234,7 +234,7 @@ impl SiteMap {
     fn square(
         &self,
         parts: &[Part],
-        which: (u16, &Lens<'_>),
+        which: (u16, &CompiledFilter<'_>),
         at: At<'_>,
         room: &mut Room,
     ) -> CellSummary {
@@ -242,11 +242,16 @@ impl SiteMap {
         fused.map_or_else(CellSummary::default, |fused| CellSummary::of(&fused))
     }
 
-    fn gather(&self, parts: &[Part], (ground, lens): (u16, &Lens<'_>), room: &mut Room) {
+    fn gather(
+        &self,
+        parts: &[Part],
+        (ground, filter): (u16, &CompiledFilter<'_>),
+        room: &mut Room,
+    ) {
         room.seen.clear();
         room.uninformative_passes = 0;
         for part in parts {
-            let Some(ratio) = lens.sees(&part.key, ground) else {
+            let Some(ratio) = filter.sees(&part.key, ground) else {
                 continue;
             };
             let rank = self.names.robots.rank(part.key.robot);

@@ -19,7 +19,7 @@ use tread_server::db::robots::Introduction;
 use tread_server::identity::attempts::FAILURES_MAX;
 use uuid::Uuid;
 
-use crate::harness::{Yard, client, eventually, site, time};
+use crate::harness::{Yard, circle, client, eventually, site, time};
 
 fn request(key: &KeyPair) -> String {
     let params = CertificateParams::default();
@@ -258,6 +258,58 @@ async fn introduce(yard: &Yard, robot: &str) {
     let introduced = db::robots::introduce(&mut tx, site.pk, introduction, 3).await;
     introduced.unwrap();
     tx.commit().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_robot_that_is_put_out_leaves_no_alert_about_its_presence_or_its_work() {
+    let yard = yard().await;
+    let key = KeyPair::generate().unwrap();
+    introduce(&yard, "rover-1").await;
+    joined(&yard, "rover-1", &key).await;
+    let mut late = circle(&"rover-1".parse().unwrap());
+    late["latest_start"] = json!("2026-11-02T10:01:00Z");
+    let (status, sent) = yard.post("/v1/missions", &late).await;
+    assert_eq!(status, StatusCode::CREATED, "{sent}");
+    let (status, sent) = yard
+        .post("/v1/missions", &circle(&"rover-1".parse().unwrap()))
+        .await;
+    assert_eq!(status, StatusCode::CREATED, "{sent}");
+    let raised = async || {
+        let (_, found) = yard
+            .get_value("/v1/alerts?robot=rover-1&raised=true&site=yard")
+            .await;
+        let codes = found["items"].as_array().unwrap().iter();
+        let mut codes: Vec<String> = codes
+            .map(|alert| alert["code"].as_str().unwrap().to_owned())
+            .collect();
+        codes.sort();
+        codes
+    };
+    eventually(
+        "a mission has expired and another does not begin",
+        async || {
+            yard.server.app().clock().advance(Duration::from_mins(3));
+            yard.server.app().wake();
+            let codes = raised().await;
+            if codes == ["mission-expired", "mission-waiting"] {
+                Ok(())
+            } else {
+                Err(codes)
+            }
+        },
+    )
+    .await;
+    let path = yard.url("/v1/sites/yard/enrolments/rover-1");
+    let (status, out) = yard.send(yard.client().delete(path)).await;
+    assert_eq!(status, StatusCode::OK, "{out}");
+    assert_eq!(raised().await, Vec::<String>::new());
+    // Nobody waits for it, however long its mission stays in the queue.
+    for _ in 0..5 {
+        yard.server.app().clock().advance(Duration::from_mins(2));
+        yard.server.app().wake();
+        let _ = yard.counters().await;
+    }
+    assert_eq!(raised().await, Vec::<String>::new());
 }
 
 /// A certificate that a thief of the authority's key makes.

@@ -8,10 +8,11 @@ use tread_api::keys::{Key, Verb};
 use tread_api::robot::{MissionProgress, RobotMode};
 use tread_api::safety::{Lease, StopLatch};
 use tread_api::wire;
-use tread_api::wire::command::{Cancel, Offer, Pause};
+use tread_api::wire::command::{Cancel, Offer, Outcomes, Pause};
 use tread_api::wire::hello::SiteDefinition;
 use tread_api::wire::reply::{
-    Acknowledgement, Answer, Command, CommandRefusal, CommandRefusalCode, LeaseReply, OfferReply,
+    AcceptedMission, Acknowledgement, Answer, Command, CommandRefusal, CommandRefusalCode,
+    LeaseReply, OfferReply, OutcomesReply,
 };
 use tread_api::wire::safety::{
     AcquireLease, ClearStop, ExternalLimit, LeaseCommand, ReleaseLease, Stop,
@@ -97,6 +98,19 @@ pub(super) fn answer(
             heard.state_rates.push((Instant::now(), asked));
             let is_deaf = heard.deaf_to_state_rates;
             (!is_deaf).then(|| says::<StateRate>(boot, Acknowledgement::Done))
+        }
+        Verb::Outcomes => {
+            let asked: Outcomes = wire::decode(&payload).unwrap();
+            heard.outcomes_asked.push(asked);
+            let accepted = state.mission.map(|held| AcceptedMission {
+                mission: held.id,
+                revision: held.revision,
+                plan_hash: held.plan_hash,
+            });
+            heard.remembered.clone().map(|mut outcomes| {
+                outcomes.active = accepted;
+                says::<Outcomes>(boot, OutcomesReply::Outcomes(outcomes))
+            })
         }
     };
     let Some(payload) = reply else {

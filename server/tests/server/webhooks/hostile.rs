@@ -48,10 +48,12 @@ async fn whatever_a_receiver_does_alerts_go_on_and_others_get_theirs() {
     .await;
     let (good_id, _) = create(&yard, &json!({"name": "good", "url": good.url()})).await;
     let robot = Robot::join(&yard, "rover-1").await;
-    report(&robot, Some("tyre"));
+    report(&robot, Some("battery-low"));
     good.has(1).await;
     // While the one that hangs is still waited for, alerts and Stop go their way.
-    let (status, alerts) = yard.get_value("/v1/alerts?kind=tyre&raised=true").await;
+    let (status, alerts) = yard
+        .get_value("/v1/alerts?kind=battery-low&raised=true")
+        .await;
     assert_eq!(status, StatusCode::OK);
     assert_eq!(alerts["items"].as_array().unwrap().len(), 1, "{alerts}");
     let (status, _) = yard

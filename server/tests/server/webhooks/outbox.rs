@@ -25,7 +25,7 @@ async fn a_delivery_is_repeated_with_its_identifier_until_it_arrives_also_over_a
     let receiver = Receiver::start(Mood::Says(500, "no\u{1b}[2J room")).await;
     let (id, secret) = create(&yard, &json!({"name": "x", "url": receiver.url()})).await;
     let robot = Robot::join(&yard, "rover-1").await;
-    report(&robot, Some("tyre"));
+    report(&robot, Some("battery-low"));
     let tried = newest(&yard, &id, |delivery| delivery["attempts"] == 1).await;
     assert_eq!(
         (&tried["state"], &tried["status"]),
@@ -125,7 +125,7 @@ async fn queue(yard: &Yard, webhook: &str, count: u32, at: &str) {
             webhook,
             alert: None,
             event: NoticeEvent::Opened,
-            kind: "tyre".parse().unwrap(),
+            kind: "battery-low".parse().unwrap(),
             body: "{}".to_owned(),
             at: time(at),
         };

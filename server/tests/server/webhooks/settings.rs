@@ -9,8 +9,9 @@ use tread_server::clock::Clock;
 use tread_server::config::webhooks::WebhooksConfig;
 
 use super::receiver::Names;
-use super::{BEGIN, create};
+use super::{BEGIN, create, report};
 use crate::harness::{Yard, eventually, time};
+use crate::robot::Robot;
 
 /// A server that may call public addresses over `https` alone.
 async fn start() -> Yard {
@@ -57,6 +58,11 @@ async fn settings_that_cannot_be_are_refused_with_the_field_and_a_reason() {
             json!({"name": "a", "url": URL, "kinds": []}),
             "kinds",
             "1 to 100",
+        ),
+        (
+            json!({"name": "a", "url": URL, "kinds": ["robot-lost", "robot-lots"]}),
+            "kinds",
+            "`robot-lots` is the kind of no alert",
         ),
         (
             json!({"name": "a", "url": URL, "sites": []}),
@@ -108,7 +114,8 @@ async fn settings_that_cannot_be_are_refused_with_the_field_and_a_reason() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_secret_is_shown_once_and_changes_are_in_the_audit_log_without_it() {
     let yard = start().await;
-    let settings = json!({"name": " on call ", "url": URL, "kinds": ["b", "a", "b"]});
+    let settings =
+        json!({"name": " on call ", "url": URL, "kinds": ["stopped", "base-late", "stopped"]});
     let (id, secret) = create(&yard, &settings).await;
     assert!(secret.starts_with("tread_w_"), "{secret}");
     let path = format!("/v1/webhooks/{id}");
@@ -119,7 +126,7 @@ async fn the_secret_is_shown_once_and_changes_are_in_the_audit_log_without_it() 
     assert_eq!(status, StatusCode::OK);
     assert_eq!(
         found,
-        json!({"id": id, "name": "on call", "url": URL, "kinds": ["a", "b"], "sites": null,
+        json!({"id": id, "name": "on call", "url": URL, "kinds": ["base-late", "stopped"], "sites": null,
                "enabled": true, "created_at": BEGIN, "created_by": "tests", "pending": 0})
     );
     let (_, list) = yard.get_value("/v1/webhooks").await;
@@ -155,5 +162,29 @@ async fn the_secret_is_shown_once_and_changes_are_in_the_audit_log_without_it() 
     let client = crate::harness::client(Some(&next));
     let asked = client.get(yard.url("/v1/sites"));
     assert_eq!(yard.send(asked).await.0, StatusCode::UNAUTHORIZED);
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_kind_of_a_newer_agent_may_be_named_once_an_alert_has_it() {
+    let yard = start().await;
+    let settings = json!({"name": "tyres", "url": URL, "kinds": ["tyre-flat"]});
+    let (status, said) = yard.post("/v1/webhooks", &settings).await;
+    assert_eq!(status, StatusCode::UNPROCESSABLE_ENTITY, "{said}");
+    let robot = Robot::join(&yard, "rover-1").await;
+    report(&robot, Some("tyre-flat"));
+    eventually("the alert is stored", async || {
+        let (_, found) = yard.get_value("/v1/alerts?kind=tyre-flat").await;
+        if found["items"]
+            .as_array()
+            .is_some_and(|items| !items.is_empty())
+        {
+            Ok(())
+        } else {
+            Err(found)
+        }
+    })
+    .await;
+    create(&yard, &settings).await;
     yard.server.stop().await.unwrap();
 }

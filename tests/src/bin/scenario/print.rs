@@ -61,14 +61,14 @@ fn tables(out: &mut impl Write, report: &Report) -> fmt::Result {
         if let Some([with, without]) = course {
             writeln!(
                 out,
-                "{robot:<20} {:>9.3} {:>7.3} {:>6.2} | {:>8.3} {:>7.3} {:>6.2}  μ {:.3}, {ends:?}",
+                "{robot:<20} {:>9.3} {:>7.3} {:>6.2} | {:>8.3} {:>7.3} {:>6.2}  μ {}, {ends:?}",
                 with.farthest_m,
                 with.rms_m,
                 with.fastest_m_s,
                 without.farthest_m,
                 without.rms_m,
                 without.fastest_m_s,
-                traction_limit_mu.unwrap_or(f64::NAN)
+                traction_limit_mu.map_or_else(|| "unknown".to_owned(), |mu| format!("{mu:.3}"))
             )?;
         }
         if let Some([with, without]) = stop {

@@ -6,7 +6,7 @@ use tread_api::robot::PauseCause;
 use tread_control::consistency::{Kind, Subject};
 
 use super::{MissionInput, MissionStage};
-use crate::control_loop::active::Hold;
+use crate::control_loop::channels::Hold;
 use crate::control_loop::channels::{EndReason, Fault};
 use crate::control_loop::outgoing::Outgoing;
 use crate::control_loop::segments::Moment;

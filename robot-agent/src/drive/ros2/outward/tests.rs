@@ -46,20 +46,20 @@ fn outward(shared: &Arc<Shared>) -> Outward {
     Outward::new(settings(), Arc::clone(shared), Arc::default(), robot)
 }
 
-type Words = BTreeMap<Word, Vec<u8>>;
+type Messages = BTreeMap<OutwardTopic, Vec<u8>>;
 
 /// What is said at that moment.
-fn said(outward: &mut Outward, now: Duration) -> Words {
-    let mut words = Words::new();
-    outward.step(now, 1_500_000_000, |word, bytes| {
-        let again = words.insert(word, bytes.to_vec());
-        assert_eq!(again, None, "{word:?} was said twice");
+fn said(outward: &mut Outward, now: Duration) -> Messages {
+    let mut messages = Messages::new();
+    outward.step(now, 1_500_000_000, |topic, bytes| {
+        let again = messages.insert(topic, bytes.to_vec());
+        assert_eq!(again, None, "{topic:?} was said twice");
     });
-    words
+    messages
 }
 
-fn points(words: &Words, word: Word) -> Vec<Point> {
-    let path: Path<'_> = decode(&words[&word]).unwrap();
+fn points(messages: &Messages, topic: OutwardTopic) -> Vec<Point> {
+    let path: Path<'_> = decode(&messages[&topic]).unwrap();
     assert_eq!(path.header.frame_id, "map");
     assert_eq!(path.header.stamp.nanoseconds(), Some(1_500_000_000));
     let poses = path.poses.iter();
@@ -71,16 +71,16 @@ fn points(words: &Words, word: Word) -> Vec<Point> {
         .collect()
 }
 
-fn numbers(words: &Words) -> Vec<f64> {
-    let theta: Float64MultiArray<'_> = decode(&words[&Word::Theta]).unwrap();
+fn numbers(messages: &Messages) -> Vec<f64> {
+    let theta: Float64MultiArray<'_> = decode(&messages[&OutwardTopic::Theta]).unwrap();
     let dimension = theta.layout.dim.get(0).unwrap();
     assert_eq!((dimension.label, dimension.size), (THETA_LABEL, 3));
     theta.data.iter().collect()
 }
 
 /// Level, sentence and figures of a part.
-fn part(words: &Words, name: &str) -> (u8, String, BTreeMap<String, String>) {
-    let array: DiagnosticArray<'_> = decode(&words[&Word::Diagnostics]).unwrap();
+fn part(messages: &Messages, name: &str) -> (u8, String, BTreeMap<String, String>) {
+    let array: DiagnosticArray<'_> = decode(&messages[&OutwardTopic::Diagnostics]).unwrap();
     let mut parts = array.status.iter();
     let part = parts.find(|part| part.name == name).unwrap();
     assert_eq!(part.hardware_id, "rover-1");
@@ -98,8 +98,12 @@ fn a_mission_is_shown_from_its_plan_to_the_way_driven_in_the_robots_frame() {
     let (mut bench, mission, plan) = driving();
     let shared = Arc::clone(&bench.ends.shared);
     let mut outward = outward(&shared);
-    let words = said(&mut outward, bench.now);
-    assert_eq!(points(&words, Word::Plan), [], "it was not given yet");
+    let messages = said(&mut outward, bench.now);
+    assert_eq!(
+        points(&messages, OutwardTopic::Plan),
+        [],
+        "it was not given yet"
+    );
     let progress = shared.snapshot().mission.unwrap();
     let end = plan.path().sample(plan.length_m()).pose;
     let start = plan.path().sample(0.0).pose;
@@ -108,8 +112,8 @@ fn a_mission_is_shown_from_its_plan_to_the_way_driven_in_the_robots_frame() {
         revision: progress.revision,
         plan: Arc::new(plan),
     });
-    let words = said(&mut outward, bench.now);
-    let shown = points(&words, Word::Plan);
+    let messages = said(&mut outward, bench.now);
+    let shown = points(&messages, OutwardTopic::Plan);
     let in_map = |pose: Pose| SITE_FROM_MAP.body_from_site(pose.point());
     assert!(near(shown[0], in_map(start)), "{shown:?}");
     assert!(near(*shown.last().unwrap(), in_map(end)), "{shown:?}");
@@ -121,8 +125,8 @@ fn a_mission_is_shown_from_its_plan_to_the_way_driven_in_the_robots_frame() {
     }
     assert!((2..=3).contains(&times), "{times} times in three seconds");
 
-    let words = said(&mut outward, bench.now + SAY_EVERY);
-    let driven = points(&words, Word::Driven);
+    let messages = said(&mut outward, bench.now + SAY_EVERY);
+    let driven = points(&messages, OutwardTopic::Driven);
     let snapshot = shared.snapshot();
     let (pose, _) = snapshot.pose.unwrap();
     let behind_m = driven.last().unwrap().distance_m(in_map(pose));
@@ -137,13 +141,13 @@ fn a_mission_is_shown_from_its_plan_to_the_way_driven_in_the_robots_frame() {
         snapshot.theta_loop.unwrap(),
     ];
     assert_eq!(
-        numbers(&words)
+        numbers(&messages)
             .iter()
             .map(|it| it.to_bits())
             .collect::<Vec<_>>(),
         expected.map(f64::to_bits)
     );
-    let (level, text, values) = part(&words, "tread_agent: control");
+    let (level, text, values) = part(&messages, "tread_agent: control");
     assert_eq!((level, text.as_str()), (Level::Ok as u8, "on a mission"));
     assert_eq!(values["mission"], mission.to_string());
 }
@@ -164,8 +168,8 @@ fn a_path_keeps_its_newest_points_and_no_more_than_it_may() {
         outward.update_place(&snapshot);
         outward.update_place(&snapshot);
     }
-    let words = said(&mut outward, Duration::ZERO);
-    let driven = points(&words, Word::Driven);
+    let messages = said(&mut outward, Duration::ZERO);
+    let driven = points(&messages, OutwardTopic::Driven);
     assert_eq!(driven.len(), PATH_POINTS_MAX as usize);
     let last = at(f64::from(3 * PATH_POINTS_MAX - 1));
     let newest = SITE_FROM_MAP.body_from_site(last.point());
@@ -178,10 +182,10 @@ fn what_is_wrong_is_said_and_is_over_when_it_is() {
     let mut outward = outward(&shared);
     let now = SILENT_SERVER / 2;
     shared.note_server_heard(now);
-    let words = said(&mut outward, now);
-    assert!(numbers(&words).iter().all(|number| number.is_nan()));
+    let messages = said(&mut outward, now);
+    assert!(numbers(&messages).iter().all(|number| number.is_nan()));
     for name in ["control", "link", "estimator", "base"] {
-        let (level, text, _) = part(&words, &format!("tread_agent: {name}"));
+        let (level, text, _) = part(&messages, &format!("tread_agent: {name}"));
         assert_eq!(level, Level::Ok as u8, "{name}: {text}");
     }
     outward.counts.refuse(Source::Imu, Refusal::Late);
@@ -190,29 +194,29 @@ fn what_is_wrong_is_said_and_is_over_when_it_is() {
         dug_in_at: Some(Point { x_m: 1.0, y_m: 2.0 }),
         ..Snapshot::default()
     });
-    assert_eq!(said(&mut outward, now), Words::new(), "nothing is due");
-    let words = said(&mut outward, now + SILENT_SERVER);
+    assert_eq!(said(&mut outward, now), Messages::new(), "nothing is due");
+    let messages = said(&mut outward, now + SILENT_SERVER);
     for (name, expected) in [
         ("control", Level::Error),
         ("link", Level::Warn),
         ("estimator", Level::Warn),
         ("base", Level::Warn),
     ] {
-        let (level, text, _) = part(&words, &format!("tread_agent: {name}"));
+        let (level, text, _) = part(&messages, &format!("tread_agent: {name}"));
         assert_eq!(level, expected as u8, "{name}: {text}");
     }
-    let (_, text, values) = part(&words, "tread_agent: base");
+    let (_, text, values) = part(&messages, "tread_agent: base");
     assert_eq!(text, "messages dropped of late: 1");
     assert_eq!(values["imu: late"], "1");
-    let words = said(&mut outward, now + SILENT_SERVER + SAY_EVERY);
-    let (level, _, values) = part(&words, "tread_agent: base");
+    let messages = said(&mut outward, now + SILENT_SERVER + SAY_EVERY);
+    let (level, _, values) = part(&messages, "tread_agent: base");
     assert_eq!(
         (level, values["imu: late"].as_str()),
         (Level::Ok as u8, "1")
     );
     outward.counts.note_foreign_command();
-    let words = said(&mut outward, now + SILENT_SERVER + 2 * SAY_EVERY);
-    let (level, text, values) = part(&words, "tread_agent: base");
+    let messages = said(&mut outward, now + SILENT_SERVER + 2 * SAY_EVERY);
+    let (level, text, values) = part(&messages, "tread_agent: base");
     assert_eq!(level, Level::Error as u8, "{text}");
     assert_eq!(values["commands of others"], "1");
 }
@@ -307,27 +311,27 @@ fn heard_by_another(tells: bool, look: impl FnOnce(&OutwardSettings, &Observer))
 fn another_node_on_the_bus_hears_every_topic_by_its_key_and_sees_who_publishes_it() {
     heard_by_another(true, |settings, observer| {
         // Rest is commanded as well.
-        let found = observer.first_of(Word::ALL.len() + 1);
+        let found = observer.first_of(OutwardTopic::ALL.len() + 1);
         let tokens = observer.publishers();
-        assert_eq!(tokens.len(), Word::ALL.len() + 1, "{tokens:?}");
-        let mut words = Words::new();
-        for word in Word::ALL {
-            let message_type = word.message_type();
-            let key = topic_key(0, word.topic(settings), &message_type, Generation::Hashed);
+        assert_eq!(tokens.len(), OutwardTopic::ALL.len() + 1, "{tokens:?}");
+        let mut messages = Messages::new();
+        for topic in OutwardTopic::ALL {
+            let message_type = topic.message_type();
+            let key = topic_key(0, topic.topic(settings), &message_type, Generation::Hashed);
             assert!(key.ends_with(message_type.hash), "{key}");
             let (attachment, bytes) = &found[&key];
             let attachment = Attachment::from_bytes(attachment).unwrap();
             let token = tokens.iter().find(|token| gid(token) == attachment.gid);
             let token = token.unwrap_or_else(|| panic!("nobody publishes {key}"));
             assert!(token.contains(message_type.hash), "{token}");
-            words.insert(word, bytes.clone());
+            messages.insert(topic, bytes.clone());
         }
-        for word in [Word::Plan, Word::Driven] {
-            let path: Path<'_> = decode(&words[&word]).unwrap();
+        for topic in [OutwardTopic::Plan, OutwardTopic::Driven] {
+            let path: Path<'_> = decode(&messages[&topic]).unwrap();
             assert_eq!((path.header.frame_id, path.poses.len()), ("map", 0));
         }
-        assert_eq!(numbers(&words).len(), 3);
-        let (level, text, _) = part(&words, "tread_agent: control");
+        assert_eq!(numbers(&messages).len(), 3);
+        let (level, text, _) = part(&messages, "tread_agent: control");
         assert_eq!((level, text.as_str()), (Level::Ok as u8, "idle"));
     });
 }

@@ -9,12 +9,9 @@ use tread_api::rights::Scope;
 
 use super::*;
 use crate::app::Dependencies;
-use crate::app::robot_link::RobotLink;
 use crate::authority::{Authorities, Authority};
 use crate::clock::Clock;
-use crate::config::{FrictionConfig, StorageConfig};
 use crate::db::Db;
-use crate::supervisor::Supervisor;
 
 fn start() -> Timestamp {
     "2026-06-01T12:00:00Z".parse().unwrap()
@@ -31,18 +28,12 @@ async fn app(folder: &Path, authorities: &Arc<Authorities>, switch: &Arc<OnceLoc
         start()
     });
     App::new(Dependencies {
-        db: Db::open(&folder.join("tread.db")).await.unwrap(),
-        clock,
-        friction: FrictionConfig::default(),
-        storage: StorageConfig::default(),
-        normalisations: Vec::new(),
-        robots: RobotLink::unconnected(Supervisor::new()),
         enrolment: Some(EnrolmentService {
             authorities: Arc::clone(authorities),
             lifetime: SignedDuration::from_hours(24),
             port: 7447,
         }),
-        webhooks: crate::config::webhooks::WebhooksConfig::default(),
+        ..Dependencies::on_database(Db::open(&folder.join("tread.db")).await.unwrap(), clock)
     })
 }
 

@@ -1,10 +1,10 @@
 use std::io;
 
 use super::*;
+use crate::app::Dependencies;
 use crate::app::identity::SESSION_LASTS;
 use crate::clock::Clock;
 use crate::config::oidc::SESSION_HOURS_RANGE;
-use crate::config::{FrictionConfig, StorageConfig};
 use crate::db::Db;
 
 /// What is logged.
@@ -38,12 +38,6 @@ async fn a_sign_in_that_is_sent_to_another_name_is_logged_once_with_both_names()
     let folder = tempfile::tempdir().unwrap();
     let db = Db::open(&folder.path().join("tread.db")).await.unwrap();
     let clock = Clock::manual(Timestamp::UNIX_EPOCH);
-    let app = App::without_robots(
-        db,
-        clock,
-        FrictionConfig::default(),
-        StorageConfig::default(),
-    );
     let config = r#"
         issuer = "https://login.example.org"
         client_id = "tread"
@@ -51,7 +45,11 @@ async fn a_sign_in_that_is_sent_to_another_name_is_logged_once_with_both_names()
         [groups.admins]
         role = "admin"
     "#;
-    app.admit_people(&toml::from_str(config).unwrap()).unwrap();
+    let people = People::new(&toml::from_str(config).unwrap(), clock.clone()).unwrap();
+    let app = App::new(Dependencies {
+        people: Some(people),
+        ..Dependencies::on_database(db, clock)
+    });
 
     let log = Log::default();
     let writer = log.clone();

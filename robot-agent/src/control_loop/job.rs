@@ -1,4 +1,5 @@
-//! The inputs of a job's planning, from which the same plan is computed again to the bit.
+//! A planned mission, and the inputs of its planning, from which the same plan is computed again to
+//! the bit.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -13,10 +14,28 @@ use tread_control::geometry::Pose;
 use tread_control::plan::{Plan, PlanOptions};
 use tread_control::robot::RobotModel;
 
-use super::channels::Job;
 use super::driven::Driven;
 use super::prior::Prior;
 use crate::geometry::{control_trajectory, plan_options};
+
+/// A planned mission, ready to drive.
+#[derive(Debug)]
+pub(crate) struct Job {
+    pub(crate) mission: MissionId,
+    pub(crate) revision: u32,
+    pub(crate) plan_hash: PlanHash,
+    pub(crate) follower: Follower,
+    /// Friction of the map along the path.
+    pub(crate) prior: Prior,
+    /// Latest start, by the monotonic clock; a later start ends the mission as expired.
+    pub(crate) start_by: Option<Duration>,
+    /// Longest silence of the server before the mission is stopped; `None` for no limit.
+    pub(crate) silence_max: Option<Duration>,
+    /// Record of the driven path and of the mission's quality.
+    pub(crate) driven: Driven,
+    /// Inputs from which this job was planned.
+    pub(crate) origin: Arc<JobOrigin>,
+}
 
 /// Request, start pose and map data from which a mission was planned.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -1,0 +1,103 @@
+//! Encryption of archives by a program of the operator's choice, such as `age` or `gpg`: an archive is
+//! written through its standard input, and read through its standard output.
+
+use std::io::{self, BufReader, Read};
+use std::process::{Child, ChildStdout, Command, ExitStatus, Stdio};
+
+/// Reason why an archive cannot be encrypted or decrypted.
+#[derive(Debug, thiserror::Error)]
+pub enum EncryptionError {
+    /// The shell cannot be started.
+    #[error("cannot run `{command}`")]
+    Start {
+        /// The command.
+        command: String,
+        /// The cause.
+        #[source]
+        cause: io::Error,
+    },
+    /// The command failed.
+    #[error("`{command}` failed: {status}; what it says is above, or in the server's log")]
+    Failed {
+        /// The command.
+        command: String,
+        /// How it ended.
+        status: ExitStatus,
+    },
+}
+
+/// A shell command that encrypts, or decrypts, its standard input to its standard output.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Filter(pub String);
+
+impl Filter {
+    /// Starts the command, with its output piped.
+    ///
+    /// # Errors
+    /// [`EncryptionError::Start`].
+    pub fn start(&self, input: Stdio) -> Result<Child, EncryptionError> {
+        let mut shell = Command::new("sh");
+        shell.arg("-c").arg(&self.0).stdin(input);
+        let started = shell.stdout(Stdio::piped()).spawn();
+        started.map_err(|cause| EncryptionError::Start {
+            command: self.0.clone(),
+            cause,
+        })
+    }
+
+    /// Checks how the command ended.
+    ///
+    /// # Errors
+    /// [`EncryptionError::Failed`].
+    pub fn check(&self, status: ExitStatus) -> Result<(), EncryptionError> {
+        if status.success() {
+            return Ok(());
+        }
+        Err(EncryptionError::Failed {
+            command: self.0.clone(),
+            status,
+        })
+    }
+}
+
+/// Reader of an archive, through a command that decrypts it or not.
+pub enum Opening<R: Read> {
+    /// Without a command.
+    Plain(R),
+    /// The output of a command, which ends when this is dropped.
+    Filtered(Filtered),
+}
+
+/// The output of a command.
+pub struct Filtered {
+    child: Child,
+    output: BufReader<ChildStdout>,
+}
+
+impl Filtered {
+    /// Takes the output of a command that was started.
+    pub fn new(mut child: Child) -> Option<Self> {
+        let output = child.stdout.take()?;
+        Some(Self {
+            child,
+            output: BufReader::new(output),
+        })
+    }
+}
+
+impl Drop for Filtered {
+    fn drop(&mut self) {
+        // Both fail only if it has ended already.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+impl<R: Read> Read for Opening<R> {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        match self {
+            Self::Plain(input) => input.read(buffer),
+            Self::Filtered(filtered) => filtered.output.read(buffer),
+        }
+    }
+}

@@ -1,0 +1,167 @@
+//! Consistent copies of a database, made beside whoever writes it, and what a copy contains.
+
+use std::collections::BTreeMap;
+use std::fs::{self, OpenOptions};
+use std::io;
+use std::os::unix::fs::OpenOptionsExt as _;
+use std::path::Path;
+
+use sqlx::sqlite::SqliteConnectOptions;
+use sqlx::{AssertSqlSafe, ConnectOptions as _, Connection as _, SqliteConnection};
+
+use super::{BUSY_TIMEOUT, DbError, corrupt, unsigned};
+
+/// Tables whose rows are counted in a copy.
+const COUNTED: [&str; 8] = [
+    "audit",
+    "cell_sums",
+    "enrolments",
+    "missions",
+    "robots",
+    "segments",
+    "stops",
+    "tokens",
+];
+
+/// What a copy contains.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct CopyContents {
+    /// Its newest migration.
+    pub schema: i64,
+    /// Rows of the main tables.
+    pub rows: BTreeMap<String, u64>,
+}
+
+/// Maximum size of a copy: that of the database with its log.
+///
+/// # Errors
+/// The database cannot be read.
+pub async fn size_bytes(database: &Path) -> Result<u64, DbError> {
+    let mut connection = connect(database, false).await?;
+    let size: Result<(i64,), _> = sqlx::query_as(
+        "SELECT page_count * page_size FROM pragma_page_count(), pragma_page_size()",
+    )
+    .fetch_one(&mut connection)
+    .await;
+    connection.close().await?;
+    unsigned("size", size?.0)
+}
+
+/// Copies the database as of one moment into a new file, readable by its owner alone.
+///
+/// Writers go on. Until it is done the log of the database cannot be shortened, because the moment
+/// of the copy is kept in it.
+///
+/// # Errors
+/// The database cannot be read, or the file not be written; then the file is removed.
+pub async fn copy_into(database: &Path, target: &Path) -> Result<(), DbError> {
+    let Some(name) = target.to_str() else {
+        return Err(corrupt("file name", target.display()));
+    };
+    // SQLite writes into an empty file that exists, and would give others access to a new one.
+    let created = OpenOptions::new()
+        .write(true)
+        .create_new(true)
+        .mode(0o600)
+        .open(target);
+    created.map_err(sqlx::Error::Io)?;
+    let copying = async {
+        let mut connection = connect(database, false).await?;
+        let copied = sqlx::query("VACUUM INTO ?").bind(name);
+        let copied = copied.execute(&mut connection).await;
+        connection.close().await?;
+        copied.map(|_done| ())
+    };
+    let copied = copying.await;
+    if copied.is_err() {
+        remove(target).map_err(sqlx::Error::Io)?;
+    }
+    // A full disk at the target is no failure of the server's own storage, so it is not noted.
+    copied.map_err(DbError::Sqlite)
+}
+
+/// Removes a file if it is there.
+fn remove(file: &Path) -> io::Result<()> {
+    match fs::remove_file(file) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
+        Ok(()) | Err(_) => Ok(()),
+    }
+}
+
+/// Reads a whole copy, checks its structure, and counts what it contains.
+///
+/// # Errors
+/// It cannot be read, or SQLite finds damage.
+pub async fn examine(copy: &Path) -> Result<CopyContents, DbError> {
+    let mut connection = connect(copy, true).await?;
+    let found = examine_with(&mut connection).await;
+    connection.close().await.map_err(DbError::Sqlite)?;
+    found
+}
+
+async fn examine_with(connection: &mut SqliteConnection) -> Result<CopyContents, DbError> {
+    let failed = DbError::Sqlite;
+    let (finding,): (String,) = sqlx::query_as("PRAGMA quick_check(1)")
+        .fetch_one(&mut *connection)
+        .await
+        .map_err(failed)?;
+    if finding != "ok" {
+        return Err(corrupt("page", finding));
+    }
+    let schema = schema_with(&mut *connection).await?;
+    let schema = schema.ok_or_else(|| corrupt("schema", "no migration"))?;
+    let mut rows = BTreeMap::new();
+    for table in COUNTED {
+        let is_there: Option<(i64,)> =
+            sqlx::query_as("SELECT 1 FROM sqlite_schema WHERE type = 'table' AND name = ?")
+                .bind(table)
+                .fetch_optional(&mut *connection)
+                .await
+                .map_err(failed)?;
+        if is_there.is_none() {
+            continue;
+        }
+        let count = AssertSqlSafe(format!("SELECT COUNT(*) FROM {table}"));
+        let (count,): (i64,) = sqlx::query_as(count)
+            .fetch_one(&mut *connection)
+            .await
+            .map_err(failed)?;
+        rows.insert(table.to_owned(), unsigned("count", count)?);
+    }
+    Ok(CopyContents { schema, rows })
+}
+
+/// Returns the newest migration of a connected database; `None` if it is empty.
+pub(super) async fn schema_with(connection: &mut SqliteConnection) -> Result<Option<i64>, DbError> {
+    let is_there: Option<(i64,)> =
+        sqlx::query_as("SELECT 1 FROM sqlite_schema WHERE name = '_sqlx_migrations'")
+            .fetch_optional(&mut *connection)
+            .await
+            .map_err(DbError::Sqlite)?;
+    if is_there.is_none() {
+        return Ok(None);
+    }
+    let (schema,): (Option<i64>,) =
+        sqlx::query_as("SELECT MAX(version) FROM _sqlx_migrations WHERE success")
+            .fetch_one(connection)
+            .await
+            .map_err(DbError::Sqlite)?;
+    Ok(schema)
+}
+
+/// Opens a file that must exist. A copy that nobody writes is opened without locks.
+///
+/// # Errors
+/// It is missing, or cannot be opened.
+pub async fn connect(file: &Path, is_copy: bool) -> Result<SqliteConnection, sqlx::Error> {
+    let options = SqliteConnectOptions::new()
+        .filename(file)
+        .create_if_missing(false)
+        .busy_timeout(BUSY_TIMEOUT);
+    let options = if is_copy {
+        options.read_only(true).immutable(true)
+    } else {
+        options
+    };
+    options.connect().await
+}

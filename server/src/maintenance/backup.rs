@@ -1,0 +1,119 @@
+//! `tread-server backup`: makes one backup, beside a running server or without one.
+
+use std::io::{self, IsTerminal as _, Write as _};
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+
+use anyhow::{Context as _, ensure};
+use clap::Args;
+
+use super::ServerFiles;
+use crate::app::backups::{self, Order, Progress};
+use crate::backup::Filter;
+use crate::clock::Clock;
+
+/// Steps of the progress that are printed to a file, per cent.
+const STEP_PERCENT: u64 = 10;
+
+/// Arguments of `tread-server backup`.
+#[derive(Debug, Clone, Args)]
+pub(crate) struct BackupArgs {
+    #[command(flatten)]
+    files: ServerFiles,
+    /// File to write, or an existing folder for a file named by the time
+    #[arg(long, value_name = "PATH")]
+    to: PathBuf,
+    /// Encrypt by this shell command, from its standard input to its standard output, such as
+    /// `age -r age1…`; that of `[backup]` when absent
+    #[arg(long, value_name = "COMMAND")]
+    encrypt: Option<String>,
+    /// Do not encrypt, although `[backup]` has a command for it
+    #[arg(long, conflicts_with = "encrypt")]
+    plain: bool,
+    /// Print no progress
+    #[arg(long)]
+    quiet: bool,
+}
+
+/// Makes the backup, and prints its path.
+///
+/// # Errors
+/// The configuration is invalid, or the backup could not be made.
+pub(crate) async fn run(args: BackupArgs) -> anyhow::Result<()> {
+    let config = args.files.load()?;
+    ensure!(
+        config.database.exists(),
+        "there is no database `{}`: name it by `--database` or in the configuration",
+        config.database.display()
+    );
+    let configured = config.backup.and_then(|backup| backup.encrypt);
+    let command = args.encrypt.or(configured).filter(|_| !args.plain);
+    let order = Order {
+        database: config.database,
+        authority: config.robots.map(|robots| robots.authority),
+        target: args.to,
+        encryption: command.map(Filter),
+        reserve_bytes: config.storage.disk_free_min_bytes(),
+        now: Clock::system().now(),
+    };
+    let is_quiet = args.quiet;
+    let shown = Mutex::new(Shown::default());
+    let made = backups::make(order, move |progress| {
+        if !is_quiet && let Ok(mut shown) = shown.lock() {
+            shown.show(progress);
+        }
+    });
+    let made = made.await.context("no backup was made")?;
+    let path = made.path.display();
+    if !is_quiet {
+        let rows = made.manifest.rows.iter();
+        let rows: Vec<String> = rows
+            .map(|(table, count)| format!("{count} {table}"))
+            .collect();
+        let files = made.manifest.authority.len();
+        eprintln!(
+            "{} bytes, read back: {}; {files} files of the authority",
+            made.bytes,
+            rows.join(", ")
+        );
+        if made.manifest.authority.iter().any(|file| {
+            Path::new(&file.name)
+                .extension()
+                .is_some_and(|extension| extension == "key")
+        }) {
+            eprintln!(
+                "it has the key of the fleet's authority: keep it where nobody else can read it"
+            );
+        }
+    }
+    writeln!(io::stdout().lock(), "{path}").context("cannot print")?;
+    Ok(())
+}
+
+/// What was printed last.
+#[derive(Default)]
+struct Shown(Option<(&'static str, u64)>);
+
+impl Shown {
+    fn show(&mut self, progress: Progress) {
+        let (what, bytes, of) = match progress {
+            Progress::Copying { bytes, of } => ("copying", bytes, of),
+            Progress::Checking => ("checking the copy", 0, 1),
+            Progress::Writing { bytes, of } => ("writing", bytes, of),
+        };
+        let percent = (bytes.saturating_mul(100) / of.max(1)).min(100);
+        let step = percent / STEP_PERCENT * STEP_PERCENT;
+        if self.0 == Some((what, step)) {
+            return;
+        }
+        self.0 = Some((what, step));
+        if io::stderr().is_terminal() {
+            eprint!("\r\x1b[K{what} {percent} %");
+            if progress == Progress::Checking || percent == 100 {
+                eprintln!();
+            }
+        } else {
+            eprintln!("{what} {percent} %");
+        }
+    }
+}

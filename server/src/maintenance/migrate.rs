@@ -1,0 +1,117 @@
+//! `tread-server migrate`: shows or applies what the database's schema lacks for this version. A
+//! server does the same at its start.
+
+use std::io::{self, Write as _};
+use std::process::ExitCode;
+
+use anyhow::{Context as _, ensure};
+use clap::Args;
+
+use super::ServerFiles;
+use crate::build;
+use crate::clock::Clock;
+use crate::db::lock::DatabaseLock;
+use crate::db::{self, Db, schema};
+
+/// Exit code of `--check` when migrations are due.
+const DUE: u8 = 3;
+/// Exit code when the database is of a newer version.
+const NEWER: u8 = 4;
+
+/// Arguments of `tread-server migrate`.
+#[derive(Debug, Clone, Args)]
+pub(crate) struct MigrateArgs {
+    #[command(flatten)]
+    files: ServerFiles,
+    /// Only show what would be done: exit code 0 if nothing, 3 if migrations are due, 4 if the
+    /// database is of a newer version
+    #[arg(long)]
+    check: bool,
+}
+
+/// How the schemas of file and program compare.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Compared {
+    /// They are the same, or are now.
+    Same,
+    /// Migrations are due, and were only shown.
+    Due,
+    /// The file is newer.
+    Newer,
+}
+
+/// Returns the exit code for a result.
+pub(crate) fn exit_code(ended: anyhow::Result<Compared>) -> ExitCode {
+    match ended {
+        Ok(Compared::Same) => ExitCode::SUCCESS,
+        Ok(Compared::Due) => ExitCode::from(DUE),
+        Ok(Compared::Newer) => ExitCode::from(NEWER),
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// Compares the schemas, and applies the migrations that are due unless only a check was asked for.
+///
+/// # Errors
+/// The configuration is invalid, the file cannot be read, a server runs on it, or a migration
+/// failed.
+pub(crate) async fn run(args: MigrateArgs) -> anyhow::Result<Compared> {
+    let path = args.files.load()?.database;
+    ensure!(
+        path.exists(),
+        "there is no database `{}`: name it by `--database` or in the configuration",
+        path.display()
+    );
+    let found = schema::of_file(&path).await;
+    let found = found.with_context(|| format!("cannot read `{}`", path.display()))?;
+    let mut out = io::stdout().lock();
+    let of_file = found
+        .schema
+        .map_or("none".to_owned(), |schema| schema.to_string());
+    let by = found.version.as_ref();
+    let by = by.map(|version| format!(", last opened by tread-server {version}"));
+    let by = by.unwrap_or_default();
+    writeln!(out, "schema of `{}`: {of_file}{by}", path.display())?;
+    writeln!(
+        out,
+        "schema of this program: {}, tread-server {}",
+        schema::known(),
+        build::VERSION
+    )?;
+    let missing = schema::missing_after(found.schema);
+    if let Err(newer) = db::refuse_newer(&path, &found) {
+        eprintln!("error: {newer}");
+        return Ok(Compared::Newer);
+    }
+    if missing.is_empty() {
+        writeln!(out, "nothing is to be done")?;
+        return Ok(Compared::Same);
+    }
+    for (version, description) in &missing {
+        writeln!(out, "due: {version} {description}")?;
+    }
+    if args.check {
+        writeln!(
+            out,
+            "`tread-server migrate`, or a start of the server, applies them; make a backup first: \
+             there is no way back but a backup"
+        )?;
+        return Ok(Compared::Due);
+    }
+    let _lock = DatabaseLock::take(&path)?;
+    let database = Db::open(&path).await?;
+    let noting = async {
+        let mut tx = database.write("migrate").await?;
+        schema::note_version(&mut tx, build::VERSION, Clock::system().now()).await?;
+        tx.commit().await?;
+        Ok::<_, db::DbError>(())
+    };
+    let noted = noting.await;
+    database.close().await;
+    noted.context("cannot write the database")?;
+    writeln!(out, "applied {} migrations", missing.len())?;
+    Ok(Compared::Same)
+}

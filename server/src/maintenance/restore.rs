@@ -1,0 +1,492 @@
+//! `tread-server restore`: replaces the database, and the fleet's authority if it is missing, by
+//! those of a backup.
+//!
+//! ```text
+//! lock ─► manifest ─► space ─► extract, compare checksums ─► examine ─► migrate, prepare for
+//! robots and people that went on ─► move the old database aside ─► rename the new one ─► report
+//! ```
+//!
+//! Nothing of the old database is changed before the new one is complete, and nothing of it is
+//! removed.
+
+use std::ffi::OsString;
+use std::fs;
+use std::io::{self, IsTerminal as _, Write};
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context as _, bail, ensure};
+use clap::Args;
+use jiff::Timestamp;
+use serde_json::json;
+use sqlx::Connection as _;
+use tread_api::enrolment::Enrolment;
+use tread_api::identity::{AuditEntry, Token};
+use tread_api::rights::Scope;
+
+use super::ServerFiles;
+use crate::app::backups::check_space;
+use crate::authority::{AuthorityError, CERTIFICATE_FILE, copies};
+use crate::backup::archive::{self, sync_folder};
+use crate::backup::{Filter, Manifest};
+use crate::build;
+use crate::clock::Clock;
+use crate::db::lock::DatabaseLock;
+use crate::db::restorations::{Changed, Restoration};
+use crate::db::{self, Db, DbError, copy, schema};
+
+/// Suffix of the database while it is restored.
+const RESTORING_ENDING: &str = ".restoring";
+/// Infix of the names of what was moved aside.
+const ASIDE: &str = ".before-restore-";
+/// Free space that must remain beyond the database, bytes: for its log, and for migrations.
+const RESERVE_BYTES: u64 = 128 * 1024 * 1024;
+/// Maximum number of tokens that are listed; they are read in pages of that many.
+const TOKENS_MAX: u32 = 10_000;
+/// Steps of the progress that are printed to a file, per cent.
+const STEP_PERCENT: u64 = 10;
+
+/// Arguments of `tread-server restore`.
+#[derive(Debug, Clone, Args)]
+pub(crate) struct RestoreArgs {
+    #[command(flatten)]
+    files: ServerFiles,
+    /// The backup
+    #[arg(long, value_name = "FILE")]
+    from: PathBuf,
+    /// Decrypt by this shell command, from its standard input to its standard output, such as
+    /// `age -d -i key.txt`
+    #[arg(long, value_name = "COMMAND")]
+    decrypt: Option<String>,
+    /// Replace a database that exists; it is moved aside and kept
+    #[arg(long)]
+    force: bool,
+    /// Replace the fleet's authority too, although there is one; it is moved aside and kept
+    #[arg(long)]
+    replace_authority: bool,
+}
+
+/// What became of the authority.
+#[derive(Debug, PartialEq, Eq)]
+enum AuthorityFate {
+    /// The backup or the configuration has none.
+    None,
+    /// The one that is there stays.
+    Kept(PathBuf),
+    /// It was restored, and what was there is in another folder.
+    Restored(PathBuf, Option<PathBuf>),
+}
+
+/// What a restored database holds for people to review.
+struct Review {
+    changed: Changed,
+    tokens: Vec<Token>,
+    enrolments: Vec<Enrolment>,
+}
+
+/// Restores a backup.
+///
+/// # Errors
+/// The backup cannot be used, a server runs, a database exists and `--force` is not given, or a
+/// file cannot be written.
+pub(crate) async fn run(args: RestoreArgs) -> anyhow::Result<()> {
+    let config = args.files.clone().load()?;
+    let database = config.database;
+    let key = args.decrypt.clone().map(Filter);
+    let _lock = DatabaseLock::take(&database)
+        .context("a backup is restored while no server uses the database: stop it first")?;
+    ensure!(
+        args.force || !database.exists(),
+        "there is a database `{}`: with `--force` it is moved aside, and kept",
+        database.display()
+    );
+    let manifest = archive::manifest(&args.from, key.as_ref())?;
+    refuse_newer(&manifest)?;
+    let folder = database.parent().filter(|it| !it.as_os_str().is_empty());
+    let folder = folder.unwrap_or(Path::new("."));
+    ensure!(
+        folder.is_dir(),
+        "the folder `{}` of the database does not exist; create it first",
+        folder.display()
+    );
+    check_space(
+        folder,
+        manifest.database.bytes.saturating_add(RESERVE_BYTES),
+    )?;
+    let now = Clock::system().now();
+    let restoring = Restoring::begin(&database)?;
+    let extracted = extract(&args.from, key.as_ref(), &restoring.path).await?;
+    let contents = copy::examine(&restoring.path).await;
+    let contents = contents.context("the database in the backup is damaged")?;
+    ensure!(
+        (contents.schema, &contents.rows) == (manifest.schema, &manifest.rows),
+        "the database in the backup is not the one that its manifest describes"
+    );
+    eprintln!("checked; preparing the database");
+    let restoration = Restoration {
+        restored_at: now,
+        taken_at: manifest.taken_at,
+        version: manifest.version.clone(),
+    };
+    let review = prepare(&restoring.path, &restoration, &args.from).await?;
+    let authority = match &config.robots {
+        Some(robots) => restore_authority(
+            &robots.authority,
+            &extracted.authority,
+            (args.replace_authority, now),
+        )?,
+        None => AuthorityFate::None,
+    };
+    let aside = restoring.finish(&database, now).await?;
+    let mut out = io::stdout().lock();
+    tell(&mut out, (&database, aside), &restoration, &review).context("cannot print")?;
+    tell_authority(&mut out, &authority, &manifest).context("cannot print")?;
+    Ok(())
+}
+
+/// Refuses a backup whose schema this program does not know.
+fn refuse_newer(manifest: &Manifest) -> anyhow::Result<()> {
+    let (known, version) = (schema::known(), &manifest.version);
+    if manifest.schema > known {
+        bail!(
+            "the backup has schema {} of tread-server {version}, and this is tread-server {} with \
+             schema {known}: install version {version} or newer",
+            manifest.schema,
+            build::VERSION
+        );
+    }
+    Ok(())
+}
+
+/// The database while it is restored; removed unless it is finished.
+struct Restoring {
+    path: PathBuf,
+    is_finished: bool,
+}
+
+fn with_ending(path: &Path, ending: &str) -> PathBuf {
+    let mut name = OsString::from(path);
+    name.push(ending);
+    name.into()
+}
+
+fn remove_if_there(path: &Path) -> io::Result<()> {
+    match fs::remove_file(path) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
+        Ok(()) | Err(_) => Ok(()),
+    }
+}
+
+/// Suffixes of SQLite's files beside a database.
+const BESIDE: [&str; 3] = ["-wal", "-shm", "-journal"];
+
+impl Restoring {
+    /// Removes what an interrupted restoration left behind.
+    fn begin(database: &Path) -> anyhow::Result<Self> {
+        let path = with_ending(database, RESTORING_ENDING);
+        let restoring = Self {
+            path,
+            is_finished: false,
+        };
+        let removed = restoring.remove();
+        removed.with_context(|| format!("cannot remove `{}`", restoring.path.display()))?;
+        Ok(restoring)
+    }
+
+    fn remove(&self) -> io::Result<()> {
+        for ending in BESIDE {
+            remove_if_there(&with_ending(&self.path, ending))?;
+        }
+        remove_if_there(&self.path)
+    }
+
+    /// Moves the old database aside, and the new one to its place. Returns where the old one is.
+    async fn finish(mut self, database: &Path, now: Timestamp) -> anyhow::Result<Option<PathBuf>> {
+        let moved = |path: &Path| format!("cannot move `{}` aside", path.display());
+        // SQLite removed its log when the last connection was closed; a log that is left belongs to
+        // a database that is not complete without it.
+        for ending in BESIDE {
+            let beside = with_ending(&self.path, ending);
+            ensure!(!beside.exists(), "`{}` is still in use", beside.display());
+        }
+        let mut aside = None;
+        if database.exists() {
+            let to = aside_name(database, now);
+            settle_log(database).await;
+            // A log beside the new database would be taken for its own. A crash here leaves the old
+            // database without what its log still had, and everything in the files aside.
+            for ending in BESIDE {
+                let beside = with_ending(database, ending);
+                if beside.exists() {
+                    let renamed = fs::rename(&beside, with_ending(&to, ending));
+                    renamed.with_context(|| moved(&beside))?;
+                }
+            }
+            // There is a database under the name at every moment: a server that starts meanwhile
+            // must not make an empty one.
+            fs::hard_link(database, &to).with_context(|| moved(database))?;
+            aside = Some(to);
+        }
+        let renamed = fs::rename(&self.path, database);
+        renamed.with_context(|| format!("cannot write `{}`", database.display()))?;
+        self.is_finished = true;
+        sync_folder(database)?;
+        Ok(aside)
+    }
+}
+
+impl Drop for Restoring {
+    fn drop(&mut self) {
+        if !self.is_finished {
+            // The next restoration removes what stays.
+            let _ = self.remove();
+        }
+    }
+}
+
+fn aside_name(path: &Path, now: Timestamp) -> PathBuf {
+    let time = now.strftime("%Y%m%dT%H%M%SZ");
+    with_ending(path, &format!("{ASIDE}{time}"))
+}
+
+/// Brings the log of a database into its file, so that one file is the whole of it. A damaged
+/// database keeps its log.
+async fn settle_log(database: &Path) {
+    let settling = async {
+        let mut connection = copy::connect(database, false).await?;
+        sqlx::query("PRAGMA wal_checkpoint(TRUNCATE)")
+            .execute(&mut connection)
+            .await?;
+        connection.close().await
+    };
+    if let Err(error) = settling.await {
+        eprintln!("the log of the old database stays beside it: {error}");
+    }
+}
+
+async fn extract(
+    from: &Path,
+    key: Option<&Filter>,
+    target: &Path,
+) -> anyhow::Result<archive::Extracted> {
+    let (from, key, target) = (from.to_owned(), key.cloned(), target.to_owned());
+    let extracting = tokio::task::spawn_blocking(move || {
+        let of = archive::manifest(&from, key.as_ref())?.database.bytes;
+        let mut shown = None;
+        archive::extract(&from, key.as_ref(), &target, &mut |bytes| {
+            let percent = (bytes.saturating_mul(100) / of.max(1)).min(100);
+            let step = percent / STEP_PERCENT * STEP_PERCENT;
+            if shown != Some(step) {
+                shown = Some(step);
+                show_step(percent);
+            }
+        })
+    });
+    Ok(extracting.await??)
+}
+
+fn show_step(percent: u64) {
+    if io::stderr().is_terminal() {
+        eprint!("\r\x1b[Kextracting {percent} %");
+        if percent == 100 {
+            eprintln!();
+        }
+    } else {
+        eprintln!("extracting {percent} %");
+    }
+}
+
+/// Brings the database up to date, and changes what robots and people must not find as it was.
+async fn prepare(path: &Path, restoration: &Restoration, from: &Path) -> anyhow::Result<Review> {
+    let database = Db::open(path).await?;
+    let prepared = prepare_in(&database, restoration, from).await;
+    database.close().await;
+    prepared.context("cannot prepare the database")
+}
+
+async fn prepare_in(
+    database: &Db,
+    restoration: &Restoration,
+    from: &Path,
+) -> Result<Review, DbError> {
+    let mut tx = database.write("restore").await?;
+    let changed = db::restorations::begin(&mut tx, restoration).await?;
+    let entry = audit_entry(restoration, from, changed);
+    db::audit::append(&mut tx, &[entry]).await?;
+    let tokens = db::tokens::list(&mut tx, &Scope::EVERYWHERE, None, TOKENS_MAX).await?;
+    let enrolments = db::enrolments::all_newest(&mut tx).await?;
+    tx.commit().await?;
+    Ok(Review {
+        changed,
+        tokens,
+        enrolments,
+    })
+}
+
+/// The chain of the audit log goes on from the backup; this entry says what is missing.
+fn audit_entry(restoration: &Restoration, from: &Path, changed: Changed) -> AuditEntry {
+    let name = from.file_name().unwrap_or_default().to_string_lossy();
+    AuditEntry {
+        id: 0,
+        at: restoration.restored_at,
+        since: None,
+        count: 1,
+        who: Some("tread-server restore".to_owned()),
+        token: None,
+        person: None,
+        role: None,
+        address: "127.0.0.1".to_owned(),
+        method: "RESTORE".to_owned(),
+        route: "tread-server restore".to_owned(),
+        path: name.into_owned(),
+        status: 200,
+        request_id: String::new(),
+        what: Some(json!({
+            "backup_taken_at": restoration.taken_at,
+            "backup_version": restoration.version,
+            "robots_awaiting_release": changed.robots,
+        })),
+        previous_hash: None,
+        hash: None,
+    }
+}
+
+/// Restores the authority if there is none, or if it is to be replaced. The one that is there is
+/// newer than the backup, and robots trust it.
+fn restore_authority(
+    folder: &Path,
+    files: &[(String, Vec<u8>)],
+    (replace, now): (bool, Timestamp),
+) -> Result<AuthorityFate, AuthorityError> {
+    if files.is_empty() {
+        return Ok(AuthorityFate::None);
+    }
+    let is_there = folder.join(CERTIFICATE_FILE).exists();
+    if is_there && !replace {
+        return Ok(AuthorityFate::Kept(folder.to_owned()));
+    }
+    let mut aside = None;
+    if folder.exists() {
+        let to = aside_name(folder, now);
+        fs::rename(folder, &to).map_err(|cause| AuthorityError::Unwritable {
+            path: folder.to_owned(),
+            cause,
+        })?;
+        aside = Some(to);
+    }
+    copies::write_files(folder, files)?;
+    Ok(AuthorityFate::Restored(folder.to_owned(), aside))
+}
+
+fn tell(
+    out: &mut impl Write,
+    (database, aside): (&Path, Option<PathBuf>),
+    restoration: &Restoration,
+    review: &Review,
+) -> io::Result<()> {
+    let Restoration {
+        taken_at, version, ..
+    } = restoration;
+    writeln!(
+        out,
+        "`{}` is restored from a backup of {taken_at:.0} by tread-server {version}",
+        database.display()
+    )?;
+    if let Some(aside) = aside {
+        writeln!(out, "the old database is `{}`", aside.display())?;
+    }
+    let Changed {
+        robots,
+        sessions,
+        join_tokens,
+        deliveries,
+        certificates,
+    } = review.changed;
+    writeln!(
+        out,
+        "ended: {sessions} sessions, {join_tokens} join tokens, {deliveries} deliveries to webhooks; \
+         the next certificate of {certificates} robots counts"
+    )?;
+    writeln!(
+        out,
+        "\nreview: what was created or revoked after the backup is unknown to this database"
+    )?;
+    for token in review
+        .tokens
+        .iter()
+        .filter(|token| token.revoked_at.is_none())
+    {
+        let rights = token.role.map(|role| role.to_string());
+        let rights = rights.unwrap_or_else(|| {
+            let rights: Vec<&str> = token
+                .rights
+                .iter()
+                .map(tread_api::rights::Right::as_str)
+                .collect();
+            rights.join(",")
+        });
+        let Token {
+            id,
+            name,
+            created_at,
+            expires_at,
+            ..
+        } = token;
+        writeln!(
+            out,
+            "  token `{name}` ({rights}) of {created_at:.0}, until {expires_at:.0}: tread tokens revoke {id}"
+        )?;
+    }
+    let in_force = review
+        .enrolments
+        .iter()
+        .filter(|it| it.revoked_at.is_none());
+    for enrolment in in_force {
+        let Enrolment {
+            site,
+            robot,
+            enrolled_at,
+            ..
+        } = enrolment;
+        writeln!(
+            out,
+            "  robot `{robot}` of site `{site}`, joined {enrolled_at:.0}: tread robots revoke {robot} --site {site}"
+        )?;
+    }
+    writeln!(
+        out,
+        "\nno mission is sent to {robots} robots until they are released. Start the server; when the \
+         robots are back:\n  tread status\n  tread missions\n  tread robots release --all"
+    )
+}
+
+fn tell_authority(
+    out: &mut impl Write,
+    fate: &AuthorityFate,
+    manifest: &Manifest,
+) -> io::Result<()> {
+    match fate {
+        AuthorityFate::None if manifest.authority.is_empty() => Ok(()),
+        AuthorityFate::None => writeln!(
+            out,
+            "the backup has a fleet's authority, and the configuration names no folder for it \
+             (`[robots] authority`): it was left out"
+        ),
+        AuthorityFate::Kept(folder) => writeln!(
+            out,
+            "the fleet's authority in `{}` stays, as it is newer; `--replace-authority` takes the one \
+             of the backup",
+            folder.display()
+        ),
+        AuthorityFate::Restored(folder, aside) => {
+            writeln!(
+                out,
+                "the fleet's authority is restored to `{}`",
+                folder.display()
+            )?;
+            match aside {
+                Some(aside) => writeln!(out, "the old one is in `{}`", aside.display()),
+                None => Ok(()),
+            }
+        }
+    }
+}
