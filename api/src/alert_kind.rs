@@ -5,7 +5,7 @@ use crate::ids::AlertCode;
 
 /// Codes that servers and agents of this version raise, in alphabetical order. Those about the
 /// messages of a robot's base are named by [`BASE_PREFIX`] alone, but for the ones listed here.
-pub const ALERT_KINDS: [&str; 40] = [
+pub const ALERT_KINDS: [&str; 41] = [
     "backup-failed",
     "backup-old",
     "base-clock",
@@ -13,6 +13,7 @@ pub const ALERT_KINDS: [&str; 40] = [
     "base-silent",
     "battery-critical",
     "battery-low",
+    "certificate-expiring",
     "clock-wrong",
     "command-second-writer",
     "database-damaged",

@@ -25,6 +25,7 @@ pub mod geometry;
 pub mod identity;
 pub mod ids;
 pub mod keys;
+pub mod link;
 pub mod mission;
 pub mod page;
 pub mod problem;

@@ -11,6 +11,7 @@ use crate::ids::{
     AlertCode, AlertId, BootId, ConfigurationId, DERIVED_NAMESPACE, MissionId, PlanHash, RobotId,
     SiteId, Tag,
 };
+use crate::link::LinkQuality;
 use crate::safety::SafetyStatus;
 
 /// Model and tyres of a robot, as its agent declares them.
@@ -335,6 +336,10 @@ pub struct Robot {
     pub link: LinkState,
     /// Reason why it is not online; `null` while it is online.
     pub link_cause: Option<LinkCause>,
+    /// Quality of its link in the last hour; `null` before it has connected to this run of the
+    /// server.
+    #[serde(default)]
+    pub link_quality: Option<LinkQuality>,
     /// Alerts that have not cleared.
     pub alerts: Vec<Alert>,
     /// Last state that the robot sent; `null` if it has sent none since the server started.

@@ -165,6 +165,9 @@ impl PassedOn {
 pub(crate) enum RemoteCommand {
     /// Show version, uptime and counters of the server
     Status(PlainArguments),
+    /// Say what is wrong with the server, the token, clocks, robots and their links; exits with 1 if
+    /// anything is
+    Doctor(PlainArguments),
     /// List sites, create one, or set its position in WGS 84
     Sites(SitesArguments),
     /// List the robots of a site, or show, rename, retire, enrol or revoke one
@@ -226,6 +229,7 @@ impl RemoteCommand {
             Self::Friction(arguments) => &arguments.connection,
             Self::Watch(arguments) => &arguments.connection,
             Self::Status(arguments)
+            | Self::Doctor(arguments)
             | Self::Leases(arguments)
             | Self::Login(arguments)
             | Self::Logout(arguments)

@@ -1,4 +1,5 @@
-//! Tokens with which the user has signed in, by server, in a file that only the user can read.
+//! Tokens with which the user has signed in, by server, in a file that only the user can read. Beside
+//! it is a file with the fingerprints by which servers are trusted.
 //!
 //! A token is taken from the first of: `--token-file`, the environment variable `TREAD_TOKEN`, this
 //! file.
@@ -10,11 +11,14 @@ use std::os::unix::fs::{DirBuilderExt as _, MetadataExt as _, OpenOptionsExt as 
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, ensure};
+use tread_agent::membership::Fingerprint;
 
 /// Environment variable with a token.
 const TOKEN_VARIABLE: &str = "TREAD_TOKEN";
 /// Environment variable with the path of the credentials file, instead of the default path.
 const FILE_VARIABLE: &str = "TREAD_CREDENTIALS";
+/// File beside the credentials with the fingerprints by which servers are trusted.
+const FINGERPRINTS_FILE: &str = "fingerprints.json";
 /// Permission bits of a file that give access to others.
 const OTHERS: u32 = 0o077;
 
@@ -31,6 +35,16 @@ pub(crate) fn find(address: &str, token_file: Option<&Path>) -> anyhow::Result<O
         Some(store) => store.find(address),
         None => Ok(None),
     }
+}
+
+/// Returns the fingerprint by which a server is trusted; `None` if `tread login` was given none.
+pub(crate) fn fingerprint(address: &str) -> anyhow::Result<Option<Fingerprint>> {
+    let Some(store) = Store::of_user().map(|store| store.fingerprints()) else {
+        return Ok(None);
+    };
+    let kept = store.find(address)?.map(|kept| kept.parse());
+    let named = || format!("a fingerprint in {} does not read", store.path().display());
+    kept.transpose().with_context(named)
 }
 
 /// Reads a token from a file without other content.
@@ -59,6 +73,12 @@ impl Store {
         let named = of(FILE_VARIABLE).map(PathBuf::from);
         let file = named.or_else(|| Some(folder()?.join("tread").join("credentials.json")))?;
         Some(Self { file })
+    }
+
+    /// Returns the file beside it with the fingerprints of servers.
+    pub(crate) fn fingerprints(&self) -> Self {
+        let file = self.file.with_file_name(FINGERPRINTS_FILE);
+        Self { file }
     }
 
     /// Returns the path of the file.
@@ -97,7 +117,7 @@ impl Store {
         let mode = std::fs::metadata(&self.file).with_context(named)?.mode();
         ensure!(
             mode & OTHERS == 0,
-            "others can read the tokens in {}: `chmod 600` it, and revoke them if somebody has",
+            "others can read {}: `chmod 600` it, and revoke the tokens in it if somebody has",
             self.file.display()
         );
         serde_json::from_str(&text).with_context(named)

@@ -18,6 +18,7 @@ use tread_api::ids::BootId;
 use tread_api::wire::ingest::{MissionPhase, MissionReport, RecordContent};
 use tread_api::wire::state::{FrictionReport, RobotState};
 use tread_control::robot::{RobotModel, RobotModelError};
+use tread_telemetry::{Telemetry, TelemetryError};
 use uuid::Uuid;
 
 use crate::base::Base;
@@ -69,6 +70,9 @@ pub enum StartError {
     /// The mission memory could not be read.
     #[error(transparent)]
     Memory(#[from] MemoryError),
+    /// Traces cannot be sent.
+    #[error(transparent)]
+    Tracing(#[from] TelemetryError),
     /// The operating system does not give the configured priority, or does not lock the memory.
     #[error(transparent)]
     Realtime(#[from] RealtimeError),
@@ -97,6 +101,7 @@ pub struct RunningAgent {
     reporter: Arc<Reporter>,
     is_connected: watch::Receiver<bool>,
     threads: Vec<JoinHandle<()>>,
+    telemetry: Telemetry,
 }
 
 impl Agent {
@@ -131,12 +136,7 @@ impl Agent {
         let outbox_folder = config.data_dir.join("outbox");
         let outbox = Outbox::open(&outbox_folder, config.outbox, config.robot.clone(), boot)?;
         let missions = recall_missions(&config, &outbox, &clock)?;
-        let identity = Identity {
-            site: config.site.clone(),
-            robot: config.robot.clone(),
-            boot,
-        };
-
+        let identity = identity_of(&config, boot);
         let (loop_ends, ends) = loop_channels();
         let AgentEnds {
             commands,
@@ -145,10 +145,12 @@ impl Agent {
         } = ends;
         let site = Arc::new(SiteCell::default());
         let supervisor = Arc::new(Supervisor::new());
+        let telemetry = Telemetry::start(&config.tracing, "tread-agent")?;
         let recorder = Recorder {
             configuration: config.model.configuration(),
             missions: Arc::clone(&missions),
             outbox: outbox.clone(),
+            telemetry: telemetry.clone(),
         };
         let safety = Safety::open(
             &config.data_dir,
@@ -198,6 +200,7 @@ impl Agent {
             safety,
             publish_rate: Arc::clone(&reporter.publish_rate),
             to_loop: commands,
+            telemetry: telemetry.clone(),
         });
         let (connected, is_connected) = watch::channel(false);
         let (heard, membership) = renew_membership(&supervisor, &config, &dispatcher.clock);
@@ -222,7 +225,16 @@ impl Agent {
             reporter,
             is_connected,
             threads,
+            telemetry,
         })
+    }
+}
+
+fn identity_of(config: &AgentConfig, boot: BootId) -> Identity {
+    Identity {
+        site: config.site.clone(),
+        robot: config.robot.clone(),
+        boot,
     }
 }
 
@@ -413,6 +425,9 @@ impl RunningAgent {
             }
         }
         self.supervisor.end_tasks().await;
+        let telemetry = self.telemetry.clone();
+        // A collector that does not answer must not hold the runtime.
+        let _ended = tokio::task::spawn_blocking(move || telemetry.stop()).await;
         let outbox = self.outbox.clone();
         match tokio::task::spawn_blocking(move || outbox.sync()).await {
             Ok(Ok(())) => info!("stopped"),

@@ -12,6 +12,7 @@
 //! ```
 
 mod planning;
+mod traces;
 
 use std::sync::Arc;
 use std::sync::mpsc::SyncSender;
@@ -35,6 +36,7 @@ use tread_api::wire::{self, Refusal, WireError};
 use tread_control::geometry::Pose;
 use tread_control::plan::Plan;
 use tread_control::robot::RobotModel;
+use tread_telemetry::Telemetry;
 
 use crate::clock::SharedClock;
 use crate::control_loop::channels::Hold;
@@ -72,6 +74,7 @@ pub(crate) struct Dispatcher {
     pub(crate) safety: Arc<Safety>,
     pub(crate) publish_rate: Arc<PublishRate>,
     pub(crate) to_loop: SyncSender<LoopCommand>,
+    pub(crate) telemetry: Telemetry,
 }
 
 fn refused<T>(code: CommandRefusalCode, detail: impl Into<String>) -> Result<T, CommandRefusal> {
@@ -144,7 +147,11 @@ impl Dispatcher {
 
     async fn respond(&self, command: IncomingCommand) {
         match command.verb {
-            Verb::Offer => self.answer(command, |offer| self.offer(offer)).await,
+            Verb::Offer => {
+                let parent = wire::traceparent(&command.payload);
+                let offer = |offer| self.traced_offer(offer, parent);
+                self.answer(command, offer).await;
+            }
             Verb::Cancel => self.answer(command, |cancel| self.cancel(cancel)).await,
             Verb::Pause => {
                 let pause = async |pause: Pause| self.hold(pause.mission, pause.revision, true);

@@ -5,6 +5,7 @@ use std::ops::ControlFlow;
 use std::sync::Arc;
 use std::time::Duration;
 
+use jiff::{SignedDuration, Timestamp};
 use tokio::sync::{mpsc, watch};
 use tokio_util::sync::CancellationToken;
 use tracing::{error, info, warn};
@@ -23,6 +24,9 @@ use crate::reporter::{Reporter, every, publish_states};
 /// Time for the last state to be sent before the session closes.
 const LAST_WORD_WAIT: Duration = Duration::from_millis(100);
 
+/// Difference between the robot's clock and the server's from which it is logged: that from which
+/// the server raises an alert.
+const CLOCK_WRONG_AFTER: SignedDuration = SignedDuration::from_secs(10);
 /// Pause after the link failed for a reason of this machine, such as no free port.
 const LINK_FAILED_REST: Duration = Duration::from_secs(1);
 
@@ -209,6 +213,10 @@ impl Online {
         match link.hello(&hello).await {
             Ok(welcome) => {
                 info!("the server welcomes `{}`", self.identity.robot);
+                let own = self.dispatcher.clock.wall();
+                if let Some(text) = clock_warning(own, welcome.server_time) {
+                    warn!("{text}");
+                }
                 self.dispatcher.take_welcome(welcome.site)
             }
             Err(fleet::AskError::NoAnswer) => false,
@@ -220,5 +228,46 @@ impl Online {
                 false
             }
         }
+    }
+}
+
+/// Returns what is wrong with the clocks; `None` if they agree.
+fn clock_warning(own: Timestamp, server: Timestamp) -> Option<String> {
+    let ahead = own.duration_since(server);
+    (ahead.abs() >= CLOCK_WRONG_AFTER).then(|| {
+        let direction = if ahead.is_negative() {
+            "behind"
+        } else {
+            "ahead of"
+        };
+        format!(
+            "this robot's clock is {} s {direction} the server's: it says {own:.0}, and the server \
+             {server:.0}; set the wrong one, and have both synchronised (chrony); this agent takes \
+             the robot's clock at its start, so start it again then",
+            ahead.abs().as_secs()
+        )
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_clock_an_hour_off_is_said_with_its_direction_and_what_to_do() {
+        let server: Timestamp = "2026-11-02T10:00:00Z".parse().unwrap();
+        let hour = SignedDuration::from_hours(1);
+        assert_eq!(clock_warning(server, server), None);
+        assert_eq!(
+            clock_warning(server + SignedDuration::from_secs(9), server),
+            None
+        );
+        let behind = clock_warning(server - hour, server).unwrap();
+        assert!(behind.contains("3600 s behind the server's"), "{behind}");
+        let ahead = clock_warning(server + hour, server).unwrap();
+        assert!(
+            ahead.contains("3600 s ahead of") && ahead.contains("chrony"),
+            "{ahead}"
+        );
     }
 }

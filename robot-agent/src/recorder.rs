@@ -7,6 +7,7 @@ use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::Duration;
 
+use jiff::Timestamp;
 use tracing::{error, info, warn};
 use tread_api::friction::{
     COMMON_RATIO_MAX, INFORMATION_MAX, Information, MU_PEAK_MAX, SAMPLES_MAX, Segment, ThetaErrors,
@@ -14,6 +15,7 @@ use tread_api::friction::{
 use tread_api::ids::ConfigurationId;
 use tread_api::robot::MissionProgress;
 use tread_api::wire::ingest::{MissionPhase, MissionReport, RecordContent};
+use tread_telemetry::{Place, Span, Telemetry};
 
 use crate::control_loop::channels::{ClosedSegment, LoopEvent};
 use crate::knowledge::Missions;
@@ -30,6 +32,7 @@ pub(crate) struct Recorder {
     pub(crate) configuration: ConfigurationId,
     pub(crate) missions: Arc<Missions>,
     pub(crate) outbox: Outbox,
+    pub(crate) telemetry: Telemetry,
 }
 
 impl Recorder {
@@ -60,6 +63,7 @@ impl Recorder {
     fn take(&self, event: LoopEvent, unsaved: &mut VecDeque<RecordContent>) {
         match event {
             LoopEvent::Started { at, progress } => {
+                self.telemetry.began(progress.id, at);
                 let report = report_of(&progress, at, MissionPhase::Started);
                 unsaved.push_back(RecordContent::Mission(report));
             }
@@ -100,6 +104,7 @@ impl Recorder {
                     "mission {mission} ended: {phase:?} {}",
                     reason.text().unwrap_or_default(),
                 );
+                self.trace_end(&progress, at, phase, reason.text());
                 let mut report = report_of(&progress, at, phase);
                 report.reason = reason.text().map(str::to_owned);
                 report.quality = Some(job.driven.quality());
@@ -120,6 +125,34 @@ impl Recorder {
             }
             LoopEvent::Retired(site) => drop(site),
         }
+    }
+
+    /// Sends the span of a mission from its start to its end.
+    fn trace_end(
+        &self,
+        progress: &MissionProgress,
+        at: Timestamp,
+        phase: MissionPhase,
+        reason: Option<&str>,
+    ) {
+        if !self.telemetry.is_on() {
+            return;
+        }
+        let open = self.telemetry.open(progress.id);
+        let failure = (phase != MissionPhase::Succeeded)
+            .then(|| reason.map_or_else(|| format!("{phase:?}"), str::to_owned));
+        self.telemetry.send(Span {
+            name: "drive",
+            place: Place::below(open.parent),
+            began_at: open.began_at.unwrap_or(at),
+            ended_at: at,
+            attributes: vec![
+                ("mission.id", progress.id.to_string()),
+                ("mission.revision", progress.revision.to_string()),
+                ("driven_m", format!("{:.3}", progress.driven_m)),
+            ],
+            failure,
+        });
     }
 
     /// Appends records in order; those that the disk refuses stay for later, the oldest are

@@ -233,7 +233,8 @@ fn log_step(step: Step) {
     match step {
         Step::BackHeld { by_us } => warn!(
             "the machine's clock has gone back: it is {:.3} s behind the server's times, which \
-             advance at half the pace until it has caught up",
+             advance at half the pace until it has caught up; have the clock synchronised (chrony, \
+             systemd-timesyncd)",
             seconds(by_us)
         ),
         Step::BackFollowed { by_us } => warn!(
@@ -248,7 +249,7 @@ fn log_step(step: Step) {
         Step::CaughtUp => info!("the machine's clock has caught up with the server's times"),
         Step::DatabaseAhead { by_us } => warn!(
             "the database holds times that are {:.3} s ahead of the machine's clock, more than is \
-             waited for; look whether the clock is right",
+             waited for: set the clock, and have it synchronised (chrony, systemd-timesyncd)",
             seconds(by_us)
         ),
     }

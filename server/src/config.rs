@@ -15,6 +15,8 @@ use std::path::{Path, PathBuf};
 use clap::{Args, ValueEnum};
 use serde::Deserialize;
 use tread_api::ids::{ConfigurationId, SiteId};
+use tread_telemetry::TelemetryError;
+pub use tread_telemetry::TracingConfig;
 
 use self::backup::BackupConfig;
 use self::oidc::{OidcConfig, OidcConfigError};
@@ -95,7 +97,7 @@ pub struct Config {
     /// Limits of the storage.
     pub storage: StorageConfig,
     /// Certificate of the REST API; `None` serves plain HTTP on a loopback address.
-    pub tls: Option<TlsFiles>,
+    pub tls: Option<TlsSource>,
     /// Host names, origins and proxies of the REST API.
     pub web: WebConfig,
     /// Output of the audit log in addition to the database.
@@ -107,6 +109,8 @@ pub struct Config {
     pub oidc: Option<OidcConfig>,
     /// Networks to which webhooks may send.
     pub webhooks: WebhooksConfig,
+    /// Where traces of missions are sent.
+    pub tracing: TracingConfig,
     /// Backups that the server makes by itself; `None` for none.
     pub backup: Option<BackupConfig>,
 }
@@ -134,14 +138,54 @@ const fn certificate_s() -> u32 {
     24 * 3_600
 }
 
-/// `[tls]`: certificate and key of the REST API, both PEM.
+/// `[tls]`: origin of the REST API's certificate.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(try_from = "TlsFields")]
+pub enum TlsSource {
+    /// From files.
+    Files(TlsFiles),
+    /// Issued by the fleet's own authority at each start, and renewed while the server runs.
+    Authority,
+}
+
+/// Certificate and key of the REST API, both PEM.
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub struct TlsFiles {
     /// File with the certificate, followed by its intermediate certificates.
     pub certificate: PathBuf,
     /// File with the private key.
     pub key: PathBuf,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct TlsFields {
+    certificate: Option<PathBuf>,
+    key: Option<PathBuf>,
+    #[serde(default)]
+    authority: bool,
+}
+
+impl TryFrom<TlsFields> for TlsSource {
+    type Error = &'static str;
+
+    fn try_from(fields: TlsFields) -> Result<Self, Self::Error> {
+        match fields {
+            TlsFields {
+                certificate: Some(certificate),
+                key: Some(key),
+                authority: false,
+            } => Ok(Self::Files(TlsFiles { certificate, key })),
+            TlsFields {
+                certificate: None,
+                key: None,
+                authority: true,
+            } => Ok(Self::Authority),
+            TlsFields { .. } => {
+                Err("`[tls]` needs `certificate` and `key`, or `authority = true` alone")
+            }
+        }
+    }
 }
 
 /// `[web]`: host names, origins and proxies of the REST API.
@@ -324,7 +368,7 @@ struct File {
     retention: RetentionConfig,
     #[serde(default)]
     storage: StorageConfig,
-    tls: Option<TlsFiles>,
+    tls: Option<TlsSource>,
     #[serde(default)]
     web: WebConfig,
     #[serde(default)]
@@ -333,6 +377,8 @@ struct File {
     oidc: Option<OidcConfig>,
     #[serde(default)]
     webhooks: WebhooksConfig,
+    #[serde(default)]
+    tracing: TracingConfig,
     backup: Option<BackupConfig>,
 }
 
@@ -340,7 +386,10 @@ struct File {
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     /// The file cannot be read.
-    #[error("cannot read the configuration file `{}`", path.display())]
+    #[error(
+        "cannot read the configuration file `{}`: it must exist (`tread-server init` writes one), \
+         and the user that the server runs as must be able to read it", path.display()
+    )]
     Unreadable {
         /// Path of the file.
         path: PathBuf,
@@ -368,6 +417,9 @@ pub enum ConfigError {
         /// Configured value.
         value: f64,
     },
+    /// `[tracing]` is invalid.
+    #[error(transparent)]
+    Tracing(#[from] TelemetryError),
     /// `[oidc]` is invalid.
     #[error(transparent)]
     Oidc(#[from] OidcConfigError),
@@ -392,6 +444,12 @@ pub enum ConfigError {
     /// An entry of `robots.names` is neither a host name nor an IP address.
     #[error("`robots.names` has `{0}`, which is neither a host name nor an address")]
     PortName(String),
+    /// `tls.authority` is set, and there is no authority.
+    #[error(
+        "`tls.authority` needs the fleet's authority: give `authority` under `[robots]` \
+         (`tread-server init` makes it)"
+    )]
+    NoAuthority,
     /// Other machines can reach a configured address without TLS.
     #[error("`{key}` is {address}, which other machines can reach without TLS: {cure}")]
     NotLoopback {
@@ -449,11 +507,26 @@ impl Config {
             robots: file.robots,
             oidc: file.oidc,
             webhooks: file.webhooks,
+            tracing: file.tracing,
             backup: file.backup,
         };
         config.resolve_credentials(credentials::folder().as_deref())?;
         config.check()?;
         Ok(config)
+    }
+
+    /// Returns the names for a certificate of the REST API that the fleet's authority issues: those
+    /// of `[web]` and of `[robots]`, each once.
+    pub fn certificate_names(&self) -> Vec<String> {
+        let of_robots = self.robots.iter().flat_map(|robots| &robots.names);
+        let all = self.web.hosts.iter().chain(of_robots);
+        let mut names: Vec<String> = Vec::new();
+        for name in all.filter(|name| is_port_name(name)) {
+            if !names.contains(name) {
+                names.push(name.clone());
+            }
+        }
+        names
     }
 
     /// Returns the host names of this server and the allowed origins.
@@ -467,8 +540,8 @@ impl Config {
 
     fn check(&self) -> Result<(), ConfigError> {
         const HERE: &str = "use an address of this machine such as 127.0.0.1";
-        const TLS: &str = "give `certificate` and `key` under `[tls]`, or use an address of this \
-                           machine such as 127.0.0.1";
+        const TLS: &str = "give `certificate` and `key`, or `authority = true`, under `[tls]`, or \
+                           use an address of this machine such as 127.0.0.1";
         const ROBOTS: &str = "give `authority` under `[robots]` (`tread-server init` makes it), or \
                               use an address of this machine such as 127.0.0.1";
         let metrics = self.metrics.map(|address| ("metrics", address, HERE));
@@ -485,12 +558,16 @@ impl Config {
         if let Some(robots) = &self.robots {
             robots.check()?;
         }
+        if self.tls == Some(TlsSource::Authority) && self.robots.is_none() {
+            return Err(ConfigError::NoAuthority);
+        }
         if let Some(oidc) = &self.oidc {
             oidc.check(&self.names())?;
         }
         self.retention.check()?;
         self.storage.check()?;
         self.webhooks.check()?;
+        self.tracing.check()?;
         if let Some(backup) = &self.backup {
             backup.check()?;
         }

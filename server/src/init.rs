@@ -3,7 +3,7 @@
 //!
 //! * `tread-server init` creates the first admin's token, and the fleet's certificate authority if
 //!   `[robots]` is configured. The token is printed once, or written to a file that only its owner
-//!   can read.
+//!   can read. Where there is no configuration yet, it writes one first ([`crate::setup`]).
 //! * `tread-server forget-certificates` lets each robot renew with the next certificate that it
 //!   presents, as needed after the database was restored from a backup.
 
@@ -21,11 +21,13 @@ use crate::authority::{Authority, AuthorityError, NEXT_CERTIFICATE_FILE};
 use crate::clock::Clock;
 use crate::config::{Config, ServerArgs};
 use crate::db::{self, Db, DbError};
+use crate::setup::{self, Given, SetupArgs};
 
 /// Arguments of `tread-server init`.
 #[derive(Debug, Clone, Args)]
 pub(crate) struct InitArgs {
-    /// Configuration file of the server, TOML
+    /// Configuration file of the server, TOML. One that does not exist is written: with --yes or
+    /// other flags below, or by questions in a terminal
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
     /// Database file, created when missing
@@ -41,9 +43,12 @@ pub(crate) struct InitArgs {
     /// Write the token to this file, readable by its owner only, instead of printing it
     #[arg(long, value_name = "FILE")]
     token_file: Option<PathBuf>,
-    /// Create a token even if an admin exists; a valid token of the same name is revoked
+    /// Create a token even if an admin exists, and revoke a valid token of the same name; replace
+    /// files that exist
     #[arg(long)]
     force: bool,
+    #[command(flatten)]
+    setup: SetupArgs,
 }
 
 /// Arguments of `tread-server forget-certificates`.
@@ -82,16 +87,52 @@ pub(crate) async fn forget(args: ForgetArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Creates the first admin's token and prints it or writes it to the file.
+/// Writes a configuration if there is none yet, creates the first admin's token, and prints it or
+/// writes it to the file.
 ///
 /// # Errors
 /// An admin exists and `--force` is not given, or the database or a file cannot be written.
 pub(crate) async fn run(args: InitArgs) -> anyhow::Result<()> {
-    let config = Config::load(&ServerArgs {
-        config: args.config,
-        database: args.database,
-        ..ServerArgs::default()
-    })?;
+    let given = Given {
+        config: args.config.as_deref(),
+        database: args.database.as_deref(),
+        token_file: args.token_file.as_deref(),
+        force: args.force,
+    };
+    let first = FirstAdmin {
+        name: args.name.clone(),
+        valid_days: args.valid_days,
+        force: args.force,
+    };
+    let Some(prepared) = setup::prepare(&args.setup, &given)? else {
+        if let Some(file) = &args.token_file {
+            setup::refuse_to_replace("token file", file, args.force)?;
+        }
+        let config = Config::load(&ServerArgs {
+            config: args.config,
+            database: args.database,
+            ..ServerArgs::default()
+        })?;
+        return make(&config, first, args.token_file.as_deref()).await;
+    };
+    let token_file = Some(prepared.choices.token_file.as_path());
+    let made = make(&prepared.config, first, token_file).await;
+    let made = made.and_then(|()| prepared.finish());
+    if let Err(error) = made {
+        prepared.discard();
+        return Err(error);
+    }
+    let authority = match &prepared.config.robots {
+        Some(robots) => Some(Authority::load(&robots.authority)?),
+        None => None,
+    };
+    let fingerprint = authority.as_ref().map(Authority::fingerprint);
+    let text = setup::next_steps(&prepared.choices, fingerprint);
+    write!(io::stdout().lock(), "{text}").context("cannot print")
+}
+
+/// Creates the fleet's authority, if one is configured, and the first admin's token.
+async fn make(config: &Config, first: FirstAdmin, token_file: Option<&Path>) -> anyhow::Result<()> {
     let clock = Clock::system();
     let made_authority = match &config.robots {
         Some(robots) => make_authority(&robots.authority, &clock)?,
@@ -99,11 +140,6 @@ pub(crate) async fn run(args: InitArgs) -> anyhow::Result<()> {
     };
     let db = Db::open(&config.database).await?;
     let app = App::without_robots(db, clock, config.friction, config.storage);
-    let first = FirstAdmin {
-        name: args.name,
-        valid_days: args.valid_days,
-        force: args.force,
-    };
     let created = app.create_first_admin(first).await;
     app.db().close().await;
     if let (true, Err(AppError::AlreadyExists { .. })) = (made_authority, &created) {
@@ -112,7 +148,7 @@ pub(crate) async fn run(args: InitArgs) -> anyhow::Result<()> {
     }
     let created = created
         .context("cannot make the first admin's token (with --force another one is made)")?;
-    match &args.token_file {
+    match token_file {
         Some(file) => write_secret(file, &created.secret)
             .with_context(|| format!("cannot write {}", file.display()))?,
         None => writeln!(io::stdout().lock(), "{}", created.secret).context("cannot print")?,

@@ -11,11 +11,13 @@ pub mod app;
 pub mod authority;
 pub mod backup;
 pub mod build;
+pub mod certificate;
 pub mod clock;
 pub mod config;
 pub mod connections;
 pub mod counters;
 pub mod db;
+mod doctor;
 pub mod fleet;
 pub mod formats;
 pub mod friction;
@@ -30,6 +32,7 @@ pub mod metrics;
 pub mod oidc;
 mod rate_limit;
 mod service_manager;
+mod setup;
 pub mod supervisor;
 pub mod webhooks;
 
@@ -43,11 +46,13 @@ use anyhow::Context as _;
 use clap::Parser as _;
 use jiff::SignedDuration;
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
+use tokio::net::TcpListener;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 use tracing::{info, warn};
 use tread_api::ids::SiteId;
 use tread_api::startup::give_zenoh_threads;
+use tread_telemetry::Telemetry;
 
 use self::app::enrolment::EnrolmentService;
 use self::app::identity::audit;
@@ -58,13 +63,14 @@ use self::app::{
 };
 use self::authority::Authorities;
 use self::clock::Clock;
-use self::config::RobotsConfig;
 pub use self::config::{Config, ServerArgs};
+use self::config::{RobotsConfig, TlsSource};
 use self::db::Db;
+use self::db::failure::StorageFailure;
 use self::db::lock::DatabaseLock;
 use self::fleet::{Fleet, Security};
 use self::http::serve::Serving;
-use self::http::tls::Tls;
+use self::http::tls::{Issuer, Tls};
 use self::identity::address::TrustedProxies;
 use self::supervisor::Supervisor;
 use self::webhooks::{Resolver, Sender, SystemResolver};
@@ -118,10 +124,10 @@ impl Server {
         let names = config.names();
         let proxies = TrustedProxies::new(config.web.trusted_proxies.clone());
         let schedule = backup_schedule(&config);
-        let tls = config.tls.map(Tls::load).transpose()?.map(Arc::new);
         let lock = DatabaseLock::take(&config.database)?;
         // Only with the lock: this completes an interrupted rotation of the authority.
         let security = config.robots.as_ref().map(security).transpose()?;
+        let tls = open_tls(&config, security.as_ref(), &clock)?;
         let db = Db::open(&config.database).await?;
         let supervisor = Supervisor::new();
         let stop = || supervisor.stop_token();
@@ -150,11 +156,12 @@ impl Server {
             webhooks: config.webhooks,
             people,
             audit: config.audit,
+            telemetry: Telemetry::start(&config.tracing, "tread-server")?,
         });
-        remember(&app, &config.site).await?;
+        let remembered = remember(&app, &config.site).await;
+        remembered.map_err(|error| not_readable(error, &config.database))?;
         let sender = Sender::new(app.webhook_rules().clone(), resolver)?;
-        let listener = http::serve::listen(config.http)
-            .with_context(|| format!("cannot listen for HTTP on {}", config.http))?;
+        let listener = listen_for_http(config.http)?;
         let http_address = listener.local_addr()?;
 
         let (uploads, uploads_in) = mpsc::channel(ingest::UPLOADS_WAITING_MAX);
@@ -179,8 +186,8 @@ impl Server {
         supervisor.spawn_vital("webhooks", sending);
         let router = http::router(app.clone(), names);
         if let Some(tls) = &tls {
-            supervisor
-                .spawn_vital_unwatched("certificate", http::tls::watch(Arc::clone(tls), stop()));
+            let watching = http::tls::watch(Arc::clone(tls), app.clone(), stop());
+            supervisor.spawn_vital_unwatched("certificate", watching);
         }
         let scheme = if tls.is_some() { "https" } else { "http" };
         let serving = Serving {
@@ -283,6 +290,50 @@ async fn remember(app: &App, site: &SiteId) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// Reads the certificate of the REST API, or has the fleet's authority issue it.
+fn open_tls(
+    config: &Config,
+    security: Option<&Security>,
+    clock: &Clock,
+) -> anyhow::Result<Option<Arc<Tls>>> {
+    let tls = match (&config.tls, security) {
+        (Some(TlsSource::Files(files)), _) => Some(Tls::load(files.clone())?),
+        (Some(TlsSource::Authority), Some(security)) => Some(Tls::issued(Issuer {
+            authorities: Arc::clone(&security.authorities),
+            names: config.certificate_names(),
+            clock: clock.clone(),
+        })?),
+        // The configuration was checked: an authority is there where it issues certificates.
+        (Some(TlsSource::Authority) | None, _) => None,
+    };
+    Ok(tls.map(Arc::new))
+}
+
+fn listen_for_http(address: SocketAddr) -> anyhow::Result<TcpListener> {
+    http::serve::listen(address).with_context(|| {
+        format!(
+            "cannot listen for HTTP on {address}: another program has it, or it is no address of \
+             this machine; `tread-server doctor` examines the ports"
+        )
+    })
+}
+
+/// Adds to an error of reading the database which file it is, and what to do.
+fn not_readable(error: anyhow::Error, database: &std::path::Path) -> anyhow::Error {
+    let failure = error
+        .chain()
+        .find_map(|cause| cause.downcast_ref::<sqlx::Error>())
+        .and_then(StorageFailure::of);
+    let advice = failure.map_or(
+        "`tread-server doctor --deep` examines it",
+        StorageFailure::advice,
+    );
+    error.context(format!(
+        "cannot read the database `{}`: {advice}",
+        database.display()
+    ))
+}
+
 fn security(robots: &RobotsConfig) -> anyhow::Result<Security> {
     let authorities = Authorities::load(&robots.authority)?;
     Ok(Security {
@@ -337,6 +388,9 @@ impl RunningServer {
     pub async fn stop(self) -> anyhow::Result<()> {
         let stopped = self.supervisor.stop().await;
         audit::finish(&self.app).await;
+        let app = self.app.clone();
+        // A collector that does not answer must not hold the runtime.
+        let _ended = tokio::task::spawn_blocking(move || app.finish_traces()).await;
         self.fleet.close().await;
         self.app.db().close().await;
         drop(self.lock);
@@ -358,8 +412,10 @@ struct Command {
 enum Action {
     /// Exit with 0 if the server on this machine answers, for health checks of containers
     Health(health::HealthArgs),
-    /// Create the first admin's token of a server, and print it once
-    Init(init::InitArgs),
+    /// Write a configuration where there is none, and create the first admin's token
+    Init(Box<init::InitArgs>),
+    /// Say what is wrong with configuration, files, database, certificates, ports, clock and limits
+    Doctor(doctor::DoctorArgs),
     /// Accept the next certificate that each robot presents, for use after restoring a backup of
     /// the database
     ForgetCertificates(init::ForgetArgs),
@@ -391,7 +447,13 @@ pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode 
     };
     let ended = match command.action {
         Some(Action::Health(args)) => run_beside_server(health::run(args)),
-        Some(Action::Init(args)) => run_beside_server(init::run(args)),
+        Some(Action::Init(args)) => run_beside_server(init::run(*args)),
+        Some(Action::Doctor(args)) => match run_beside_server(doctor::run(args)) {
+            Ok(true) => Ok(()),
+            // The findings have been printed.
+            Ok(false) => return ExitCode::FAILURE,
+            Err(error) => Err(error),
+        },
         Some(Action::ForgetCertificates(args)) => run_beside_server(init::forget(args)),
         Some(Action::Backup(args)) => run_beside_server(maintenance::backup::run(args)),
         Some(Action::Restore(args)) => run_beside_server(maintenance::restore::run(args)),

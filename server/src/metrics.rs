@@ -5,13 +5,13 @@
 //! values, so the number of series is bounded.
 
 use std::fmt;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use prometheus_client::encoding::{EncodeLabelSet, EncodeLabelValue, LabelValueEncoder};
-use prometheus_client::metrics::counter::Counter;
+use prometheus_client::metrics::counter::{ConstCounter, Counter};
 use prometheus_client::metrics::family::{Family, MetricConstructor};
-use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::histogram::Histogram;
 use prometheus_client::registry::{Registry, Unit};
 use tokio::sync::mpsc;
@@ -20,6 +20,8 @@ use tread_api::problem::ProblemType;
 
 /// Upper bounds of the histogram buckets of requests and transactions, in seconds.
 const BOUNDS_S: [f64; 10] = [0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.5, 1.0, 5.0];
+/// Duration from which a transaction of the database counts as slow.
+pub const SLOW_AFTER: Duration = Duration::from_millis(500);
 /// Upper bounds of the histogram buckets of missions, in seconds.
 const MISSION_BOUNDS_S: [f64; 10] = [
     5.0, 15.0, 30.0, 60.0, 120.0, 300.0, 600.0, 1_800.0, 3_600.0, 14_400.0,
@@ -73,11 +75,28 @@ pub struct Refusal {
     pub reason: String,
 }
 
+/// Slow transactions of one use case.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SlowUseCase {
+    /// Name of the use case.
+    pub kind: &'static str,
+    /// Whether its transactions write.
+    pub writes: bool,
+    /// Number of slow ones.
+    pub count: u64,
+    /// Duration of the longest.
+    pub longest: Duration,
+}
+
+/// Slow transactions by use case: one entry for each name in the code, so their number is bounded.
+type Slow = Arc<Mutex<Vec<SlowUseCase>>>;
+
 /// Metrics of the database.
 #[derive(Debug, Clone)]
 pub struct DatabaseMetrics {
     transactions: Durations<OfTransaction>,
     write_waits: Histogram,
+    slow: Slow,
 }
 
 impl Default for DatabaseMetrics {
@@ -85,6 +104,7 @@ impl Default for DatabaseMetrics {
         Self {
             transactions: Family::new_with_constructor(Bounds(BOUNDS_S)),
             write_waits: Histogram::new(BOUNDS_S),
+            slow: Slow::default(),
         }
     }
 }
@@ -98,6 +118,34 @@ impl DatabaseMetrics {
         };
         let histogram = self.transactions.get_or_create(&of);
         histogram.observe(took.as_secs_f64());
+        if took >= SLOW_AFTER {
+            self.note_slow(kind, writes, took);
+        }
+    }
+
+    fn note_slow(&self, kind: &'static str, writes: bool, took: Duration) {
+        let mut slow = self.slow.lock().unwrap_or_else(PoisonError::into_inner);
+        let is_same = |of: &&mut SlowUseCase| (of.kind, of.writes) == (kind, writes);
+        match slow.iter_mut().find(is_same) {
+            Some(of) => {
+                of.count += 1;
+                of.longest = of.longest.max(took);
+            }
+            None => slow.push(SlowUseCase {
+                kind,
+                writes,
+                count: 1,
+                longest: took,
+            }),
+        }
+    }
+
+    /// Returns the use cases with slow transactions, the slowest first.
+    pub fn slow(&self) -> Vec<SlowUseCase> {
+        let slow = self.slow.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut slow = slow.clone();
+        slow.sort_by_key(|of| std::cmp::Reverse(of.longest));
+        slow
     }
 
     /// Records the time that a write transaction waited for the writer's lock.
@@ -113,6 +161,9 @@ impl DatabaseMetrics {
         let help = "Wait for the turn to write";
         let metric = self.write_waits.clone();
         registry.register_with_unit("tread_db_write_wait", help, Unit::Seconds, metric);
+        let slow = self.slow().iter().map(|of| of.count).sum::<u64>();
+        let help = "Transactions that took half a second or longer";
+        registry.register("tread_db_slow_transactions", help, ConstCounter::new(slow));
     }
 }
 
@@ -187,7 +238,6 @@ impl Metrics {
         let requests = self.requests.clone();
         let help = "Requests by route";
         registry.register_with_unit("tread_http_request", help, Unit::Seconds, requests);
-        self.queues.register(registry);
         let refusals = Family::<Refusal, Counter>::default();
         let of_requests = ProblemType::ALL.map(of_request).into_iter();
         let of_requests = of_requests.filter_map(|of| {
@@ -238,14 +288,22 @@ impl Queues {
         depths.push((name, Box::new(depth)));
     }
 
-    fn register(&self, registry: &mut Registry) {
-        let family = Family::<[(&'static str, &'static str); 1], Gauge>::default();
+    /// Exports a depth under `name` that its owner stores in the returned number.
+    pub fn show_count(&self, name: &'static str) -> Arc<AtomicUsize> {
+        let count = Arc::new(AtomicUsize::new(0));
+        let shown = Arc::clone(&count);
+        let mut depths = self.depths.lock().unwrap_or_else(PoisonError::into_inner);
+        depths.push((name, Box::new(move || shown.load(Ordering::Relaxed))));
+        count
+    }
+
+    /// Returns the depth of each queue, by its name.
+    pub fn depths(&self) -> Vec<(&'static str, usize)> {
         let depths = self.depths.lock().unwrap_or_else(PoisonError::into_inner);
-        for (queue, depth) in depths.iter() {
-            let gauge = family.get_or_create(&[("queue", queue)]);
-            gauge.set(i64::try_from(depth()).unwrap_or(i64::MAX));
-        }
-        registry.register("tread_queue_depth", "What waits in each queue", family);
+        depths
+            .iter()
+            .map(|(name, depth)| (*name, depth()))
+            .collect()
     }
 }
 
@@ -254,6 +312,20 @@ mod tests {
     use prometheus_client::encoding::text::encode;
 
     use super::*;
+
+    #[test]
+    fn slow_transactions_are_listed_by_use_case_the_slowest_first() {
+        let metrics = DatabaseMetrics::default();
+        for (kind, took_ms) in [("a", 499), ("b", 500), ("c", 900), ("b", 700)] {
+            metrics.transaction(kind, true, Duration::from_millis(took_ms));
+        }
+        let listed: Vec<_> = metrics
+            .slow()
+            .into_iter()
+            .map(|of| (of.kind, of.count, of.longest.as_millis()))
+            .collect();
+        assert_eq!(listed, [("c", 1, 900), ("b", 2, 700)]);
+    }
 
     #[test]
     fn whoever_asks_does_not_choose_how_many_series_there_are() {

@@ -48,6 +48,8 @@ pub struct Fleet {
     agents: HashMap<RobotId, Process>,
     agent_flags: Vec<String>,
     server_environment: Vec<(String, String)>,
+    /// Variables that agents get in their environment from now on.
+    pub agent_environment: Vec<(String, String)>,
     config: Option<PathBuf>,
 }
 
@@ -135,6 +137,7 @@ impl Fleet {
             agents: HashMap::new(),
             agent_flags: Vec::new(),
             server_environment: Vec::new(),
+            agent_environment: Vec::new(),
             config,
         }
     }
@@ -426,8 +429,7 @@ impl Fleet {
 
     /// All that the runs of a process have logged.
     pub fn log(&self, name: &str) -> String {
-        let log = self.folder.path().join(format!("{name}.log"));
-        std::fs::read_to_string(log).unwrap_or_default()
+        std::fs::read_to_string(self.file(&format!("{name}.log"))).unwrap_or_default()
     }
 
     /// The last lines that a process logged.
@@ -467,7 +469,8 @@ impl Fleet {
             format!("--scenario={}", scenario.display()),
         ]);
         arguments.extend(self.agent_flags.iter().cloned());
-        let process = self.start_process(name.as_str(), (node, &arguments), &[]);
+        let process =
+            self.start_process(name.as_str(), (node, &arguments), &self.agent_environment);
         self.agents.insert(name.clone(), process);
     }
 

@@ -12,7 +12,7 @@ use syn::visit::Visit;
 use tread_tests::repository::{files, root};
 
 /// Crates whose modules are read.
-const CRATES: [&str; 7] = [
+const CRATES: [&str; 8] = [
     "api",
     "cli",
     "control",
@@ -20,15 +20,25 @@ const CRATES: [&str; 7] = [
     "robot-agent",
     "ros2",
     "server",
+    "telemetry",
 ];
 
 /// Crates of this workspace that a crate may depend on, tests aside.
-const CRATE_RULES: [(&str, &[&str]); 7] = [
+const CRATE_RULES: [(&str, &[&str]); 8] = [
     ("api", &[]),
     ("control", &[]),
     ("ros2", &[]),
-    ("robot-agent", &["tread-api", "tread-control", "tread-ros2"]),
-    ("server", &["tread-api", "tread-control"]),
+    ("telemetry", &["tread-api"]),
+    (
+        "robot-agent",
+        &[
+            "tread-api",
+            "tread-control",
+            "tread-ros2",
+            "tread-telemetry",
+        ],
+    ),
+    ("server", &["tread-api", "tread-control", "tread-telemetry"]),
     ("cli", &["tread-agent", "tread-api", "tread-server"]),
     (
         "lab",
@@ -37,7 +47,15 @@ const CRATE_RULES: [(&str, &[&str]); 7] = [
 ];
 
 /// Crates that are shipped. None of them may contain the agent's test support.
-const SHIPPED: [&str; 6] = ["api", "cli", "control", "robot-agent", "ros2", "server"];
+const SHIPPED: [&str; 7] = [
+    "api",
+    "cli",
+    "control",
+    "robot-agent",
+    "ros2",
+    "server",
+    "telemetry",
+];
 
 /// Modules of the server that a module must not name.
 const SERVER_RULES: [(&str, &[&str]); 18] = [

@@ -9,7 +9,9 @@ pub mod ingest;
 pub mod reply;
 pub mod safety;
 pub mod state;
+pub mod trace;
 
+use self::trace::TraceParent;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use serde_json::value::RawValue;
@@ -44,6 +46,8 @@ pub enum WireError {
 #[derive(Serialize)]
 struct Outgoing<'body, T> {
     v: u32,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    traceparent: Option<TraceParent>,
     body: &'body T,
 }
 
@@ -60,7 +64,36 @@ struct Incoming<'payload> {
 /// The value cannot be represented in JSON, such as a map whose keys are not strings. A non-finite
 /// number is not an error: it becomes `null`, which the reader refuses.
 pub fn encode<T: Serialize>(body: &T) -> Result<Vec<u8>, serde_json::Error> {
-    serde_json::to_vec(&Outgoing { v: VERSION, body })
+    encode_traced(body, None)
+}
+
+/// Encodes a payload with a trace context beside its body, which older peers ignore.
+///
+/// # Errors
+/// As [`encode`].
+pub fn encode_traced<T: Serialize>(
+    body: &T,
+    traceparent: Option<TraceParent>,
+) -> Result<Vec<u8>, serde_json::Error> {
+    serde_json::to_vec(&Outgoing {
+        v: VERSION,
+        traceparent,
+        body,
+    })
+}
+
+/// Returns the trace context of a payload; `None` if it has none, or one that cannot be read. The
+/// payload itself is refused by [`decode`] if it is not valid.
+pub fn traceparent(payload: &[u8]) -> Option<TraceParent> {
+    #[derive(Deserialize)]
+    struct Traced {
+        traceparent: TraceParent,
+    }
+    if payload.len() > PAYLOAD_BYTES_MAX {
+        return None;
+    }
+    let traced: Traced = serde_json::from_slice(payload).ok()?;
+    Some(traced.traceparent)
 }
 
 /// Decodes a payload.
@@ -136,6 +169,23 @@ mod tests {
         let payload = encode(&Body { x: 0.1 }).unwrap();
         assert_eq!(payload, br#"{"v":2,"body":{"x":0.1}}"#);
         assert_eq!(decode::<Body>(&payload).unwrap(), Body { x: 0.1 });
+    }
+
+    #[test]
+    fn a_trace_context_stands_beside_the_body_and_a_wrong_one_counts_as_none() {
+        let mission = "0192f0c1-2b3c-7d4e-8f50-617283940a1b".parse().unwrap();
+        let parent = TraceParent::of_mission(mission);
+        let payload = encode_traced(&Body { x: 0.1 }, Some(parent)).unwrap();
+        assert_eq!(traceparent(&payload), Some(parent));
+        assert_eq!(decode::<Body>(&payload).unwrap(), Body { x: 0.1 });
+        for text in [
+            r#"{"v":2,"body":{"x":0.1}}"#,
+            r#"{"v":2,"traceparent":"nonsense","body":{"x":0.1}}"#,
+            r#"{"v":2,"traceparent":7,"body":{"x":0.1}}"#,
+        ] {
+            assert_eq!(traceparent(text.as_bytes()), None, "{text}");
+            assert!(decode::<Body>(text.as_bytes()).is_ok(), "{text}");
+        }
     }
 
     #[test]

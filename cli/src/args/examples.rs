@@ -18,6 +18,10 @@ const EXAMPLES: &[(&str, &str)] = &[
     ),
     ("man", "  tread man --dir ~/.local/share/man/man1"),
     ("status", "  tread status"),
+    (
+        "doctor",
+        "  tread doctor\n  tread doctor --site park --json",
+    ),
     ("sites", "  tread sites"),
     (
         "sites create",

@@ -5,12 +5,14 @@ use std::path::PathBuf;
 use std::str::FromStr;
 
 use clap::{Args, Subcommand};
+use tread_agent::membership::Fingerprint;
 use tread_api::enrolment::{JOIN_MINUTES_MAX, TrustId};
 use tread_api::identity::{Role, TOKEN_DAYS_DEFAULT, TOKEN_DAYS_MAX};
 use tread_api::ids::{JoinTokenId, RobotId, SessionId, Tag, TokenId};
 use tread_api::rights::Right;
 
 use super::{Connection, duration};
+use crate::client::Trusted;
 
 /// Options for authentication and for the trust in the server.
 #[derive(Debug, Clone, Default, Args)]
@@ -22,6 +24,27 @@ pub(crate) struct Showing {
     /// PEM file with the certificate of the authority to trust, instead of those of the system
     #[arg(long, global = true, env = "TREAD_CA", value_name = "FILE")]
     pub(crate) ca: Option<PathBuf>,
+    /// SHA-256 of the server's certificate, or of its authority's if the server shows that too, to
+    /// trust instead of those of the system; `tread login` keeps it for the server. `--ca` counts
+    /// before it
+    #[arg(
+        long,
+        global = true,
+        env = "TREAD_CA_FINGERPRINT",
+        value_name = "SHA256"
+    )]
+    pub(crate) ca_fingerprint: Option<Fingerprint>,
+}
+
+impl Showing {
+    /// Returns which certificates of a server to trust.
+    pub(crate) fn trusted(&self, kept: Option<Fingerprint>) -> Trusted<'_> {
+        match (&self.ca, self.ca_fingerprint.or(kept)) {
+            (Some(file), _) => Trusted::Authority(file),
+            (None, Some(fingerprint)) => Trusted::Fingerprint(fingerprint),
+            (None, None) => Trusted::System,
+        }
+    }
 }
 
 #[derive(Debug, Args)]

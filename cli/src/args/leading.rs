@@ -8,11 +8,12 @@ use std::ffi::{OsStr, OsString};
 use clap::Command;
 
 /// Options that may stand before the command, and whether a value follows each.
-const LEADING: [(&str, bool); 5] = [
+const LEADING: [(&str, bool); 6] = [
     ("--server", true),
     ("--site", true),
     ("--token-file", true),
     ("--ca", true),
+    ("--ca-fingerprint", true),
     ("--json", false),
 ];
 

@@ -23,6 +23,15 @@ pub(crate) enum ClientError {
         #[source]
         cause: std::io::Error,
     },
+    /// TLS cannot be set up.
+    #[error("TLS cannot be set up")]
+    Tls(#[source] rustls::Error),
+    /// The server's certificate is not accepted.
+    #[error("the certificate of {address} is not accepted: {}", why_not(.cause))]
+    Untrusted {
+        address: String,
+        cause: rustls::Error,
+    },
     /// The connection failed.
     #[error("no server answers at {address}")]
     Unreachable {
@@ -69,6 +78,78 @@ pub(crate) enum ClientError {
         #[source]
         cause: serde_json::Error,
     },
+}
+
+/// Returns why a certificate is not accepted, for people.
+#[expect(
+    clippy::wildcard_enum_match_arm,
+    reason = "the library's own words serve for all other causes"
+)]
+fn why_not(cause: &rustls::Error) -> String {
+    use rustls::CertificateError as Cause;
+    match cause {
+        rustls::Error::InvalidCertificate(Cause::Expired | Cause::ExpiredContext { .. }) => {
+            "it has expired, or the clock of this machine is wrong".to_owned()
+        }
+        rustls::Error::InvalidCertificate(
+            Cause::NotValidYet | Cause::NotValidYetContext { .. },
+        ) => "it is not valid yet: the clock of this machine or of the server is wrong".to_owned(),
+        rustls::Error::InvalidCertificate(
+            Cause::NotValidForName | Cause::NotValidForNameContext { .. },
+        ) => "it is for another name".to_owned(),
+        rustls::Error::InvalidCertificate(Cause::UnknownIssuer) => {
+            "its authority is not trusted here".to_owned()
+        }
+        other => other.to_string(),
+    }
+}
+
+/// Returns what to do about a certificate that is not accepted.
+#[expect(
+    clippy::wildcard_enum_match_arm,
+    reason = "one hint serves for all other causes"
+)]
+fn trust_step(cause: &rustls::Error) -> &'static str {
+    use rustls::CertificateError as Cause;
+    match cause {
+        rustls::Error::InvalidCertificate(
+            Cause::Expired
+            | Cause::ExpiredContext { .. }
+            | Cause::NotValidYet
+            | Cause::NotValidYetContext { .. },
+        ) => "compare the clocks, and run `tread-server doctor` on the server",
+        rustls::Error::InvalidCertificate(
+            Cause::NotValidForName | Cause::NotValidForNameContext { .. },
+        ) => {
+            "use a name of the certificate in --server, or add this one to the server's certificate"
+        }
+        _ => {
+            "give the authority's certificate with --ca, or its fingerprint with --ca-fingerprint: \
+             `tread-server init` and `tread-server doctor` print it"
+        }
+    }
+}
+
+/// Returns the TLS error behind a transport error; `None` if there is none.
+pub(crate) fn tls_error(cause: &reqwest::Error) -> Option<rustls::Error> {
+    let mut next: Option<&(dyn std::error::Error + 'static)> = Some(cause);
+    while let Some(error) = next {
+        // The source of an input error is that of what it holds, not what it holds.
+        let within = error
+            .downcast_ref::<std::io::Error>()
+            .and_then(std::io::Error::get_ref);
+        let found = within
+            .and_then(|within| within.downcast_ref::<rustls::Error>())
+            .or_else(|| error.downcast_ref::<rustls::Error>());
+        if let Some(found) = found {
+            return Some(found.clone());
+        }
+        next = match within {
+            Some(within) => Some(within),
+            None => error.source(),
+        };
+    }
+    None
 }
 
 /// Maximum number of missions that an error lists.
@@ -217,11 +298,13 @@ impl ClientError {
         match self {
             Self::Address { .. } | Self::AmbiguousMission { .. } => Exit::Usage,
             Self::NoSuchMission { .. } => Exit::NotFound,
-            Self::Unreachable { .. } | Self::NoWebSocket { .. } => Exit::Unreachable,
+            Self::Unreachable { .. } | Self::Untrusted { .. } | Self::NoWebSocket { .. } => {
+                Exit::Unreachable
+            }
             Self::Silent { .. } => Exit::TimedOut,
             Self::Refused { problem } => exit_of(problem),
             Self::ClearText { .. } => Exit::Refused,
-            Self::Authority { .. } | Self::NotUnderstood { .. } => Exit::WentWrong,
+            Self::Authority { .. } | Self::Tls(_) | Self::NotUnderstood { .. } => Exit::WentWrong,
         }
     }
 
@@ -232,6 +315,7 @@ impl ClientError {
                 "start one with `tread demo` or `tread-server`, or name another with --server or \
                  TREAD_SERVER",
             ),
+            Self::Untrusted { cause, .. } => Some(trust_step(cause)),
             Self::Silent { .. } => {
                 Some("the request may have been carried out: check before you repeat it")
             }
@@ -249,6 +333,7 @@ impl ClientError {
             Self::Address { .. }
             | Self::ClearText { .. }
             | Self::Authority { .. }
+            | Self::Tls(_)
             | Self::NoWebSocket { .. } => None,
         }
     }
@@ -260,6 +345,8 @@ impl ClientError {
             Self::Address { .. }
             | Self::ClearText { .. }
             | Self::Authority { .. }
+            | Self::Tls(_)
+            | Self::Untrusted { .. }
             | Self::Unreachable { .. }
             | Self::Silent { .. }
             | Self::NoSuchMission { .. }

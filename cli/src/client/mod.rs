@@ -19,6 +19,7 @@ use reqwest::{Certificate, Method, RequestBuilder, Response, Url};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
+use tread_agent::membership::{Fingerprint, Trust};
 use tread_api::page::{DifferencePage, PAGE_LIMIT_MAX};
 use tread_api::text;
 
@@ -56,6 +57,17 @@ fn is_here(url: &Url) -> bool {
     }
 }
 
+/// Which certificates of a server are trusted.
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum Trusted<'a> {
+    /// Those of the system's authorities.
+    System,
+    /// Those of the authorities in a PEM file.
+    Authority(&'a Path),
+    /// The one with this fingerprint, or those that the authority with it has signed.
+    Fingerprint(Fingerprint),
+}
+
 /// Client of one server.
 #[derive(Debug, Clone)]
 pub(crate) struct Client {
@@ -77,12 +89,11 @@ fn certificates(file: &Path) -> Result<Vec<Certificate>, ClientError> {
 }
 
 impl Client {
-    /// Creates a client that sends this token, and trusts the authorities in this file instead of
-    /// those of the system.
+    /// Creates a client that sends this token, and trusts these certificates.
     pub(crate) fn new(
         address: &str,
         token: Option<&str>,
-        authority: Option<&Path>,
+        trusted: Trusted<'_>,
     ) -> Result<Self, ClientError> {
         let invalid = || ClientError::Address {
             address: address.to_owned(),
@@ -100,12 +111,19 @@ impl Client {
             .timeout(ANSWER_WAIT_MAX)
             .connect_timeout(CONNECT_WAIT_MAX)
             .user_agent(concat!("tread/", env!("CARGO_PKG_VERSION")));
-        builder = match authority {
-            Some(file) => builder.tls_certs_only(certificates(file)?),
-            None if is_tls => builder,
+        builder = match trusted {
+            Trusted::Authority(file) => builder.tls_certs_only(certificates(file)?),
             // Without TLS no authority is trusted, so that the system's certificates are not
             // loaded.
-            None => builder.tls_certs_only([]),
+            Trusted::System | Trusted::Fingerprint(_) if !is_tls => builder.tls_certs_only([]),
+            Trusted::System => builder,
+            Trusted::Fingerprint(fingerprint) => {
+                let config = Trust::Fingerprint(fingerprint).client_config(None);
+                match config.map_err(ClientError::Tls)? {
+                    Some(config) => builder.tls_backend_preconfigured(config),
+                    None => builder,
+                }
+            }
         };
         let http = builder.build().map_err(|cause| ClientError::Unreachable {
             address: address.clone(),
@@ -168,6 +186,9 @@ impl Client {
     /// Converts a transport error of a request or an answer.
     pub(crate) fn lost(&self, cause: reqwest::Error) -> ClientError {
         let address = self.address.clone();
+        if let Some(cause) = error::tls_error(&cause) {
+            return ClientError::Untrusted { address, cause };
+        }
         if cause.is_timeout() && !cause.is_connect() {
             ClientError::Silent { address, cause }
         } else {
@@ -314,7 +335,7 @@ mod tests {
     #[test]
     fn a_token_goes_over_the_network_only_by_tls() {
         let _first = rustls::crypto::ring::default_provider().install_default();
-        let to = |address| Client::new(address, Some("t"), None).map(|_| ());
+        let to = |address| Client::new(address, Some("t"), Trusted::System).map(|_| ());
         for here in [
             "http://127.0.0.1:8420/",
             "http://[::1]:8420",
@@ -331,9 +352,9 @@ mod tests {
                 matches!(to(away), Err(ClientError::ClearText { .. })),
                 "{away}"
             );
-            assert!(Client::new(away, None, None).is_ok());
+            assert!(Client::new(away, None, Trusted::System).is_ok());
         }
-        let client = Client::new("http://127.0.0.1:1", None, None).unwrap();
+        let client = Client::new("http://127.0.0.1:1", None, Trusted::System).unwrap();
         let sent = r#"{"a\u001b": ["x\ny", "\u202ee\u009b", "ü"], "n": 1.5}"#.as_bytes();
         let shown: Value = client.clone().for_people(true).read(sent).unwrap();
         let said = serde_json::json!({"a\\u{1b}": ["x\\ny", "\\u{202e}e\\u{9b}", "ü"], "n": 1.5});

@@ -9,7 +9,7 @@ use tread_api::identity::{CreateToken, PersonSession, Role, Session, Token};
 use tread_api::rights::{Grant, Rights, Scope};
 
 use crate::args::{Connection, SessionsAction, TokensAction, TokensArguments};
-use crate::client::Client;
+use crate::client::{Client, address_of};
 use crate::credentials::{self, Store};
 use crate::output::{Output, line, note, or_dash, render, table};
 
@@ -27,15 +27,18 @@ pub(super) async fn login(connection: &Connection, output: Output) -> anyhow::Re
         Some(file) => credentials::read_token(file)?,
         None => tokio::task::spawn_blocking(read_from_input).await??,
     };
-    let client = Client::new(
-        &connection.server,
-        Some(&token),
-        connection.showing.ca.as_deref(),
-    )?;
+    let showing = &connection.showing;
+    let kept = credentials::fingerprint(address_of(&connection.server))?;
+    let client = Client::new(&connection.server, Some(&token), showing.trusted(kept))?;
     let client = client.for_people(!output.is_json());
     let session = client.session().await?;
     let store = store()?;
     store.keep(client.address(), &token)?;
+    if let Some(fingerprint) = showing.ca_fingerprint {
+        store
+            .fingerprints()
+            .keep(client.address(), &fingerprint.to_string())?;
+    }
     note(&format!("stored in {}", store.path().display()));
     output.show(&session, who)?;
     Ok(ExitCode::SUCCESS)
@@ -58,7 +61,9 @@ fn read_from_input() -> anyhow::Result<String> {
 
 /// Deletes the stored token of a server; the token stays valid.
 pub(super) fn logout(client: &Client, output: Output) -> anyhow::Result<ExitCode> {
-    store()?.forget(client.address(), None)?;
+    let store = store()?;
+    store.forget(client.address(), None)?;
+    store.fingerprints().forget(client.address(), None)?;
     output.show(&json!({"server": client.address()}), |_| {
         format!(
             "deleted the stored token of {}; it stays valid until it is revoked",

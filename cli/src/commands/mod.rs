@@ -3,6 +3,7 @@
 mod alerts;
 mod audit;
 mod authority;
+mod doctor;
 mod drive;
 mod enrolment;
 mod friction;
@@ -40,7 +41,8 @@ pub(crate) async fn run(command: RemoteCommand, output: Output) -> anyhow::Resul
     let showing = &connection.showing;
     let address = address_of(&connection.server);
     let token = credentials::find(address, showing.token_file.as_deref())?;
-    let client = Client::new(address, token.as_deref(), showing.ca.as_deref())?;
+    let trusted = showing.trusted(credentials::fingerprint(address)?);
+    let client = Client::new(address, token.as_deref(), trusted)?;
     let client = client.for_people(!output.is_json());
     let site = &connection.site;
     match command {
@@ -58,6 +60,7 @@ pub(crate) async fn run(command: RemoteCommand, output: Output) -> anyhow::Resul
         }
         RemoteCommand::Audit(arguments) => audit::run(&arguments, &client, output).await,
         RemoteCommand::Status(_) => sites::status(&client, output).await,
+        RemoteCommand::Doctor(_) => doctor::run(site, &client, output).await,
         RemoteCommand::Sites(arguments) => sites::run(arguments, &client, output).await,
         RemoteCommand::Robots(arguments) => match &arguments.action {
             None => robots::run(&arguments, &client, output).await,

@@ -26,7 +26,7 @@ use self::processes::Processes;
 use self::progress::Progress;
 use self::report::Report;
 use crate::args::DemoArguments;
-use crate::client::{Client, ClientError, Reading};
+use crate::client::{Client, ClientError, Reading, Trusted};
 use crate::credentials::{self, Store};
 use crate::output::{json_line, line, note};
 
@@ -58,7 +58,7 @@ pub(crate) async fn run(arguments: DemoArguments) -> anyhow::Result<ExitCode> {
     tell("starting server, database and router …");
     let mut processes = Processes::start_server(folder.path(), arguments.port, &scenario.site)?;
     let token = credentials::read_token(&processes.token_file())?;
-    let client = Client::new(&processes.api_address(), Some(&token), None)?;
+    let client = Client::new(&processes.api_address(), Some(&token), Trusted::System)?;
     let _signed_in = SignedIn::keep(client.address(), &token);
     let demo = Demo {
         scenario: &scenario,

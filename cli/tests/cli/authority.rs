@@ -46,6 +46,7 @@ impl ServerWithRobots {
             }),
             backup: None,
             audit: tread_server::config::AuditConfig::default(),
+            tracing: tread_server::config::TracingConfig::default(),
             web: WebConfig::default(),
             oidc: None,
             webhooks: tread_server::config::webhooks::WebhooksConfig::default(),

@@ -54,7 +54,7 @@ tread() {
 # Both end with this shell.
 tread-server() {
     case "$1" in
-        init | forget-certificates | backup) "$PROGRAM" server "$@" ;;
+        init | forget-certificates | backup | doctor) "$PROGRAM" server "$@" ;;
         *)
             "$PROGRAM" server "$@" >"$FOLDER/server.log" 2>&1 &
             for _ in $(seq 150); do

@@ -9,6 +9,7 @@ mod authority;
 mod demo;
 mod documentation;
 mod drive;
+mod first_steps;
 mod manual;
 mod operator;
 mod terminal;

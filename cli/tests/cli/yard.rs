@@ -9,7 +9,9 @@ use tread_agent::sim::scenario::Scenario;
 use tread_agent::{Agent, AgentConfig, RunningAgent};
 use tread_server::app::identity::tokens::FirstAdmin;
 use tread_server::config::webhooks::WebhooksConfig;
-use tread_server::config::{FrictionConfig, RetentionConfig, StorageConfig, TlsFiles, WebConfig};
+use tread_server::config::{
+    FrictionConfig, RetentionConfig, StorageConfig, TlsFiles, TlsSource, WebConfig,
+};
 use tread_server::{Config, RunningServer, Server};
 
 use crate::terminal::{PATIENCE, Terminal, eventually};
@@ -43,10 +45,10 @@ impl Yard {
             retention: RetentionConfig::default(),
             storage: StorageConfig::default(),
             normalisations: Vec::new(),
-            tls: Some(TlsFiles {
+            tls: Some(TlsSource::Files(TlsFiles {
                 certificate: at("cert.pem"),
                 key: at("key.pem"),
-            }),
+            })),
             robots: None,
             oidc: None,
             webhooks: WebhooksConfig {
@@ -56,6 +58,7 @@ impl Yard {
             },
             backup: None,
             audit: tread_server::config::AuditConfig::default(),
+            tracing: tread_server::config::TracingConfig::default(),
             web: WebConfig::default(),
         });
         let server = server.await.unwrap();

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use serde::Deserialize;
 use tread_api::ids::{OwnerId, RobotId, SiteId};
 use tread_api::robot::RobotModel;
+use tread_telemetry::TracingConfig;
 
 use super::ros2::Ros2File;
 
@@ -24,6 +25,7 @@ pub(super) struct FileConfig {
     pub(super) model: Option<ModelFile>,
     pub(super) drive: Option<DriveFile>,
     pub(super) recording: Option<RecordingFile>,
+    pub(super) tracing: Option<TracingConfig>,
     pub(super) estimation: Option<EstimationFile>,
     pub(super) realtime: Option<RealtimeFile>,
 }

@@ -33,6 +33,7 @@ use crate::recording::RecordingConfig;
 use crate::sim::faults::Fault;
 use crate::sim::scenario::{BUILT_IN_NAME, Scenario, ScenarioError};
 use crate::sim::trace::Trace;
+use tread_telemetry::{TelemetryError, TracingConfig};
 
 /// Default endpoint of the server.
 pub const SERVER_DEFAULT: &str = "tcp/127.0.0.1:7447";
@@ -45,7 +46,10 @@ pub const PUBLISH_HZ_RANGE: std::ops::RangeInclusive<f64> = 0.1..=50.0;
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     /// The file could not be read.
-    #[error("the configuration `{file}` cannot be read")]
+    #[error(
+        "the configuration `{file}` cannot be read: it must exist, and the user that the agent runs \
+         as must be able to read it"
+    )]
     Unreadable {
         /// The file.
         file: String,
@@ -61,6 +65,9 @@ pub enum ConfigError {
         /// Line, column, key and what is wrong with it.
         problem: String,
     },
+    /// `[tracing]` is invalid.
+    #[error(transparent)]
+    Tracing(#[from] TelemetryError),
     /// A value without a default is missing.
     #[error("`{key}` is missing: give it in the configuration or as `--{flag}`")]
     Missing {
@@ -269,6 +276,8 @@ pub struct AgentConfig {
     pub realtime: RealtimeConfig,
     /// Estimator's prior of the robot's and the tyres' parameters.
     pub prior: EstimatorPrior,
+    /// Where traces of missions are sent.
+    pub tracing: TracingConfig,
 }
 
 impl AgentConfig {
@@ -436,9 +445,12 @@ fn assemble(
         }
     };
     let recording = recording::checked(file.recording.unwrap_or_default(), &data_dir)?;
+    let tracing = file.tracing.unwrap_or_default();
+    tracing.check()?;
     let realtime = realtime::checked(file.realtime.unwrap_or_default())?;
     Ok(AgentConfig {
         recording,
+        tracing,
         realtime,
         prior: estimation::checked(
             file.estimation.unwrap_or_default(),

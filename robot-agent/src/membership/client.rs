@@ -98,7 +98,7 @@ pub async fn enrol(enrolment: &Enrolment, now: Timestamp) -> Result<Membership, 
         robot: enrolment.robot.clone(),
         certificate_request: request,
     };
-    let got = post(&url, &enrolment.trust, "v1/enrolments", &body).await?;
+    let got = post(&url, (&enrolment.trust, None), "v1/enrolments", &body).await?;
     let host = url.host_str().unwrap_or_default();
     let own = || format!("tls/{host}:{}", got.port);
     Ok(Membership {
@@ -133,7 +133,8 @@ impl Membership {
             certificate_request: request,
             proof: BASE64_STANDARD.encode(proof),
         };
-        let got = post(&url, &self.trust, "v1/enrolments/renew", &body).await?;
+        let trust = (&self.trust, Some(self.authority.as_str()));
+        let got = post(&url, trust, "v1/enrolments/renew", &body).await?;
         Ok(Self {
             certificate: got.certificate,
             key: next.serialize_pem(),
@@ -181,7 +182,7 @@ fn parse(server: &str) -> Result<Url, MembershipError> {
 
 async fn post<B: Serialize + Sync>(
     url: &Url,
-    trust: &Trust,
+    (trust, fleet): (&Trust, Option<&str>),
     path: &str,
     body: &B,
 ) -> Result<RobotCertificate, MembershipError> {
@@ -194,7 +195,7 @@ async fn post<B: Serialize + Sync>(
         .timeout(ANSWER_WAIT_MAX)
         .connect_timeout(CONNECT_WAIT_MAX)
         .user_agent(concat!("tread-agent/", env!("CARGO_PKG_VERSION")));
-    builder = match trust.client_config().map_err(MembershipError::Trust)? {
+    builder = match trust.client_config(fleet).map_err(MembershipError::Trust)? {
         Some(config) => builder.tls_backend_preconfigured(config),
         None if url.scheme() == "https" => builder,
         // No roots are trusted, so that the machine's certificates are not read.

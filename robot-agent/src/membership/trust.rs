@@ -106,17 +106,27 @@ pub(super) fn certificates(pem: &str) -> Result<Vec<CertificateDer<'static>>, ru
 }
 
 impl Trust {
-    /// Returns the TLS configuration; `None` for the machine's authorities.
+    /// Returns the TLS configuration; `None` for the machine's authorities. A certificate that an
+    /// authority in `fleet`, PEM, has signed is accepted too: a member of the fleet trusts these
+    /// anyway, and a server whose REST API has its certificate of them shows another one after a
+    /// rotation.
     ///
     /// # Errors
     /// The authority's certificate cannot be parsed.
-    pub(super) fn client_config(&self) -> Result<Option<ClientConfig>, rustls::Error> {
+    pub fn client_config(
+        &self,
+        fleet: Option<&str>,
+    ) -> Result<Option<ClientConfig>, rustls::Error> {
+        let mut of_fleet = RootCertStore::empty();
+        for certificate in fleet.map(certificates).transpose()?.into_iter().flatten() {
+            of_fleet.add(certificate)?;
+        }
         let builder = ClientConfig::builder_with_provider(provider());
         let builder = builder.with_safe_default_protocol_versions()?;
         let config = match self {
             Self::Machine => return Ok(None),
             Self::Authority(pem) => {
-                let mut roots = RootCertStore::empty();
+                let mut roots = of_fleet;
                 for certificate in certificates(pem)? {
                     roots.add(certificate)?;
                 }
@@ -125,6 +135,7 @@ impl Trust {
             Self::Fingerprint(fingerprint) => {
                 let verifier = Pinned {
                     fingerprint: *fingerprint,
+                    fleet: of_fleet,
                     algorithms: provider().signature_verification_algorithms,
                 };
                 builder
@@ -136,10 +147,11 @@ impl Trust {
     }
 }
 
-/// Accepts one certificate, or those that one authority has signed.
+/// Accepts one certificate, or those that one authority or an authority of the fleet has signed.
 #[derive(Debug)]
 struct Pinned {
     fingerprint: Fingerprint,
+    fleet: RootCertStore,
     algorithms: WebPkiSupportedAlgorithms,
 }
 
@@ -157,10 +169,14 @@ impl ServerCertVerifier for Pinned {
         }
         let is_named =
             |certificate: &&CertificateDer<'_>| Fingerprint::of(certificate) == self.fingerprint;
-        let authority = chain.iter().find(is_named);
         let unknown = || rustls::Error::InvalidCertificate(CertificateError::UnknownIssuer);
-        let mut roots = RootCertStore::empty();
-        roots.add(authority.ok_or_else(unknown)?.clone().into_owned())?;
+        let mut roots = self.fleet.clone();
+        if let Some(authority) = chain.iter().find(is_named) {
+            roots.add(authority.clone().into_owned())?;
+        }
+        if roots.is_empty() {
+            return Err(unknown());
+        }
         let verifier = WebPkiServerVerifier::builder_with_provider(Arc::new(roots), provider())
             .build()
             .map_err(|_| unknown())?;
@@ -195,6 +211,14 @@ mod tests {
     use rcgen::{BasicConstraints, CertificateParams, IsCa, Issuer, KeyPair};
 
     use super::*;
+
+    fn roots_of(pem: &str) -> RootCertStore {
+        let mut roots = RootCertStore::empty();
+        for certificate in certificates(pem).unwrap() {
+            roots.add(certificate).unwrap();
+        }
+        roots
+    }
 
     #[test]
     fn a_fingerprint_reads_with_and_without_colons() {
@@ -240,6 +264,7 @@ mod tests {
             |pinned: Fingerprint, leaf: &rcgen::Certificate, chain: &[CertificateDer<'_>]| {
                 let verifier = Pinned {
                     fingerprint: pinned,
+                    fleet: RootCertStore::empty(),
                     algorithms: provider().signature_verification_algorithms,
                 };
                 let looked_at = verifier.verify_server_cert(leaf.der(), chain, &name, &[], now);
@@ -255,5 +280,18 @@ mod tests {
             "it has another name"
         );
         assert!(!takes(of(&mine), &other, &chain));
+        let after_a_rotation = |fleet: &str| {
+            let verifier = Pinned {
+                fingerprint: Fingerprint::of(&CertificateDer::from(b"former".to_vec())),
+                fleet: roots_of(fleet),
+                algorithms: provider().signature_verification_algorithms,
+            };
+            let looked_at = verifier.verify_server_cert(mine.der(), &chain, &name, &[], now);
+            looked_at.is_ok()
+        };
+        assert!(after_a_rotation(&authority.pem()));
+        let stranger = KeyPair::generate().unwrap();
+        let stranger = CertificateParams::default().self_signed(&stranger).unwrap();
+        assert!(!after_a_rotation(&stranger.pem()));
     }
 }

@@ -1,6 +1,7 @@
 //! All metrics of the server in the OpenMetrics format: those recorded continuously
 //! ([`crate::metrics`]), and those read at the time of the request.
 
+use std::collections::BTreeMap;
 use std::sync::atomic::AtomicU64;
 use std::time::Duration;
 
@@ -11,6 +12,7 @@ use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::gauge::{ConstGauge, Gauge};
 use prometheus_client::metrics::info::Info;
 use prometheus_client::registry::{Registry, Unit};
+use tread_api::link::LinkQuality;
 use tread_api::mission::{Mission, MissionState};
 
 use super::friction::KnownGround;
@@ -24,6 +26,9 @@ use crate::metrics::Refusal;
 pub const MEDIA_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 /// Maximum number of pairs of terrain and robot model with their own time series.
 pub const TERRAIN_SERIES_MAX: usize = 500;
+
+/// Maximum number of robots whose links have time series of their own.
+pub const ROBOT_SERIES_MAX: usize = 500;
 
 /// Reasons for which HTTP requests are refused before a handler runs.
 const OF_CLIENTS: [&str; 11] = [
@@ -53,8 +58,22 @@ struct OfTerrain {
     configuration: String,
 }
 
+/// Labels of a robot.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct OfRobot {
+    site: String,
+    robot: String,
+}
+
+/// Selects one value of a link's quality.
+type LinkNumber = fn(&LinkQuality) -> Option<f64>;
 /// Selects one value of a terrain's friction.
 type NumberOf = fn(&KnownGround) -> f64;
+
+#[expect(clippy::cast_precision_loss, reason = "counts of an hour")]
+fn as_f64(count: u64) -> f64 {
+    count as f64
+}
 
 fn count(of: usize) -> u64 {
     u64::try_from(of).unwrap_or(u64::MAX)
@@ -75,6 +94,7 @@ impl App {
             }
         }
         self.register_clients(&mut registry);
+        self.register_links(&mut registry);
         self.register_clock(&mut registry);
         self.register_build(&mut registry);
         self.register_backups(&mut registry);
@@ -91,8 +111,9 @@ impl App {
         text
     }
 
-    /// Records the duration of a mission that has ended; none if it never began.
+    /// Records the duration of a mission that has ended, none if it never began, and sends its trace.
     pub(super) fn record_duration(&self, mission: &Mission) {
+        self.trace_mission(mission);
         if let (Some(began), Some(ended)) = (mission.started_at, mission.ended_at) {
             let took = Duration::try_from(ended.duration_since(began)).unwrap_or_default();
             self.metrics().mission(mission.state, took);
@@ -123,11 +144,27 @@ impl App {
                 condition.disk_free_bytes,
                 "Free bytes on the disk of the database",
             ),
+            (
+                "tread_db_size_bytes",
+                condition.database_bytes,
+                "Size of the database file",
+            ),
+            (
+                "tread_db_log_bytes",
+                condition.log_bytes,
+                "Size of the write-ahead log of the database",
+            ),
         ];
         for (name, value, help) in gauges {
             if let Some(value) = value {
                 registry.register(name, help, ConstGauge::new(value));
             }
+        }
+        if let Some(ends) = self.storage().certificate_ends() {
+            let left = ends.duration_since(self.clock().machine_time());
+            let help = "Time until the certificate of the REST API expires";
+            let left = ConstGauge::new(left.as_secs_f64());
+            registry.register("tread_certificate_left_seconds", help, left);
         }
         let failures = Counts::default();
         for failure in StorageFailure::ALL {
@@ -218,6 +255,7 @@ impl App {
         let counts = db::missions::counts(&mut tx).await?;
         let pending = db::webhooks::pending_count(&mut tx).await?;
         drop(tx);
+        self.register_queues(registry, pending);
         let missions = Gauges::default();
         for state in MissionState::ALL {
             let found = counts.iter().find(|(of, _)| *of == state);
@@ -244,6 +282,90 @@ impl App {
             ConstGauge::new(count(open)),
         );
         Ok(())
+    }
+
+    /// Registers the depths of queues.
+    fn register_queues(&self, registry: &mut Registry, webhooks: u64) {
+        let family = Gauges::default();
+        for (queue, depth) in self.depths(webhooks) {
+            family.get_or_create(&[("queue", queue)]).set(depth);
+        }
+        let help = "What waits in each queue";
+        registry.register("tread_queue_depth", help, family);
+    }
+
+    fn depths(&self, webhooks: u64) -> BTreeMap<&'static str, u64> {
+        let queues = self.metrics().queues().depths();
+        let mut depths: BTreeMap<&'static str, u64> = queues
+            .into_iter()
+            .map(|(name, depth)| (name, count(depth)))
+            .collect();
+        depths.insert("webhooks", webhooks);
+        depths.insert("events", count(self.hub().longest_buffer()));
+        depths
+    }
+
+    /// Returns what waits in each queue: messages of robots, uploads to be stored, commands of the
+    /// reconciler, deliveries to webhooks, and events for the slowest client. Without the deliveries
+    /// while the database cannot be read.
+    pub async fn queue_depths(&self) -> BTreeMap<&'static str, u64> {
+        let pending = async {
+            let mut tx = self.db().read("metrics").await?;
+            Ok::<_, AppError>(db::webhooks::pending_count(&mut tx).await?)
+        };
+        match pending.await {
+            Ok(pending) => self.depths(pending),
+            Err(error) => {
+                self.log_failure("count the deliveries to webhooks", &error);
+                let mut depths = self.depths(0);
+                depths.remove("webhooks");
+                depths
+            }
+        }
+    }
+
+    /// Registers the quality of robots' links.
+    fn register_links(&self, registry: &mut Registry) {
+        let now = self.clock().elapsed();
+        let (links, left_out) = self.presences().link_qualities(now, ROBOT_SERIES_MAX);
+        let gauges: [(&str, LinkNumber, &str); 4] = [
+            (
+                "tread_robot_round_trip_seconds",
+                |link| link.round_trip_ms.map(|round_trip_ms| round_trip_ms / 1e3),
+                "Time from the last command to the robot's answer",
+            ),
+            (
+                "tread_robot_states_received_hour",
+                |link| Some(as_f64(link.states_received)),
+                "States of the robot that arrived in the last hour",
+            ),
+            (
+                "tread_robot_states_missed_hour",
+                |link| Some(as_f64(link.states_missed)),
+                "States of the robot that did not arrive in the last hour",
+            ),
+            (
+                "tread_robot_reconnects_hour",
+                |link| Some(as_f64(link.reconnects)),
+                "Times that the robot connected again in the last hour",
+            ),
+        ];
+        for (name, value_of, help) in gauges {
+            let family = Family::<OfRobot, Gauge<f64, AtomicU64>>::default();
+            for ((site, robot), link) in &links {
+                if let Some(value) = value_of(link) {
+                    let of = OfRobot {
+                        site: site.to_string(),
+                        robot: robot.to_string(),
+                    };
+                    family.get_or_create(&of).set(value);
+                }
+            }
+            registry.register(name, help, family);
+        }
+        let help = "Robots beyond those whose links have series of their own";
+        let left_out = ConstGauge::new(count(left_out));
+        registry.register("tread_robot_series_left_out", help, left_out);
     }
 
     /// Registers the friction of terrains.

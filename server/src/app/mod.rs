@@ -3,6 +3,7 @@
 pub mod alerts;
 mod allowance;
 pub mod backups;
+pub mod certificate;
 pub mod check;
 pub mod checkpoints;
 pub mod enrolment;
@@ -33,6 +34,7 @@ pub mod stops;
 pub mod storage;
 pub mod teleop;
 pub mod terrains;
+mod traces;
 pub mod watched;
 pub mod webhooks;
 pub mod withdrawals;
@@ -44,6 +46,7 @@ use std::time::Duration;
 use tokio::sync::{Notify, Semaphore, SemaphorePermit};
 use tread_api::ids::{RobotId, SiteId};
 use tread_api::rights::Scope;
+use tread_telemetry::Telemetry;
 use uuid::Uuid;
 
 use self::allowance::Allowances;
@@ -123,6 +126,7 @@ struct Inner {
     watched: Watched,
     event_shares: Shares,
     webhooks: Webhooks,
+    telemetry: Telemetry,
     backups: Backups,
     restored: Restored,
 }
@@ -150,6 +154,8 @@ pub struct Dependencies {
     pub people: Option<People>,
     /// Where the audit log is written beside the database.
     pub audit: AuditConfig,
+    /// Sender of traces of missions; its default sends none.
+    pub telemetry: Telemetry,
 }
 
 impl Dependencies {
@@ -167,6 +173,7 @@ impl Dependencies {
             webhooks: WebhooksConfig::default(),
             people: None,
             audit: AuditConfig::default(),
+            telemetry: Telemetry::default(),
         }
     }
 }
@@ -185,6 +192,7 @@ impl App {
             webhooks,
             people,
             audit,
+            telemetry,
         } = dependencies;
         let started_at = clock.elapsed();
         let presences = Arc::default();
@@ -231,6 +239,7 @@ impl App {
             watched: Watched::default(),
             event_shares: Shares::new(events::SHARES),
             webhooks: Webhooks::new(webhooks),
+            telemetry,
             backups: Backups::default(),
             restored: Restored::default(),
         };

@@ -146,6 +146,7 @@ impl App {
             measurements: row.measurements,
             link: presence.link(now),
             link_cause: presence.link_cause(now),
+            link_quality: presence.link_quality(now),
             alerts,
             live: presence.live(now),
         }

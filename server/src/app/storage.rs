@@ -9,6 +9,8 @@
 //! These alerts are about the server and no robot. They are kept in memory and in the log, because
 //! they report that nothing can be stored.
 
+mod growth;
+
 use std::collections::{HashMap, VecDeque};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -20,6 +22,7 @@ use tread_api::ids::{AlertId, RobotId};
 use tread_api::robot::{Alert, Severity};
 use tread_api::webhook::NoticeEvent;
 
+use self::growth::Growth;
 use super::App;
 use crate::config::StorageConfig;
 use crate::db::DbError;
@@ -73,6 +76,13 @@ pub struct StorageCondition {
     pub damaged: Option<String>,
     /// Free bytes on the database's disk; `None` if the operating system does not report them.
     pub disk_free_bytes: Option<u64>,
+    /// Size of the database file, bytes.
+    pub database_bytes: Option<u64>,
+    /// Size of its write-ahead log, bytes.
+    pub log_bytes: Option<u64>,
+    /// Growth of the database file, bytes per hour; `None` until it was
+    /// measured for ten minutes.
+    pub growth_bytes_per_hour: Option<i64>,
     /// Whether the free space is below the configured limit.
     pub is_disk_low: bool,
 }
@@ -102,6 +112,9 @@ struct Inner {
     examined: Option<(Duration, u64)>,
     /// Time of the last log entry of each failure, and the number of those suppressed since.
     logged: HashMap<&'static str, (Duration, u64)>,
+    growth: Growth,
+    /// End of the validity of the REST API's certificate.
+    certificate_ends: Option<Timestamp>,
     raised: Vec<Alert>,
     /// Cleared alerts, newest last.
     cleared: VecDeque<Alert>,
@@ -118,6 +131,16 @@ impl Storage {
 
     fn lock(&self) -> MutexGuard<'_, Inner> {
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Stores the end of the validity of the REST API's certificate.
+    pub(super) fn note_certificate_end(&self, ends: Option<Timestamp>) {
+        self.lock().certificate_ends = ends;
+    }
+
+    /// Returns the end of the validity of the REST API's certificate; `None` without one.
+    pub(super) fn certificate_ends(&self) -> Option<Timestamp> {
+        self.lock().certificate_ends
     }
 
     /// Returns the alerts about the server that a filter lets through, newest first.
@@ -196,10 +219,14 @@ impl App {
         }
         let written = limited(self.db().probe_write()).await;
         let read = limited(self.db().probe_tables()).await;
-        let disk_free_bytes = self.db().disk_free_bytes().await;
+        let disk = self.db().disk().await.unwrap_or_default();
+        let disk_free_bytes = disk.free_bytes;
         let condition = {
             let mut inner = self.storage().lock();
             inner.checked_at = Some(self.clock().elapsed());
+            let growth = disk
+                .database_bytes
+                .map(|bytes| inner.growth.note(now, bytes));
             let is_damaged = inner.has_new_damage();
             let condition = &mut inner.condition;
             condition.unwritable = unwritable(written.and(read).err());
@@ -208,6 +235,9 @@ impl App {
                 condition.damaged = Some(text.to_owned());
             }
             condition.disk_free_bytes = disk_free_bytes;
+            condition.database_bytes = disk.database_bytes;
+            condition.log_bytes = disk.log_bytes;
+            condition.growth_bytes_per_hour = growth.flatten();
             let limit = self.storage().config.disk_free_min_bytes();
             condition.is_disk_low = is_low(disk_free_bytes, limit, condition.is_disk_low);
             condition.clone()
@@ -260,18 +290,23 @@ impl App {
 
     /// Raises and clears the alerts about the storage.
     fn show_condition(&self, condition: &StorageCondition) {
+        let path = self.db().path().display();
         let unwritable = condition.unwritable.as_ref().map(|why| {
             format!(
-                "nothing can be stored: {why}; missions and measurements wait, Stop and \
+                "nothing can be stored in `{path}`: {why}; missions and measurements wait, Stop and \
                  teleoperation work"
             )
         });
         let damaged = condition.damaged.as_ref().map(|finding| {
-            format!("the database is damaged, restore a backup of it; SQLite says: {finding}")
+            format!(
+                "the database `{path}` is damaged, restore a backup of it; SQLite says: {finding}"
+            )
         });
         let disk = condition.is_disk_low.then(|| {
             let limit = self.storage().config.disk_free_min_mib;
-            format!("less than {limit} MiB are free on the disk of the database")
+            format!(
+                "less than {limit} MiB are free on the disk of the database `{path}`: make room"
+            )
         });
         for (code, severity, text) in [
             (UNWRITABLE_ALERT, Severity::Critical, unwritable),
@@ -378,28 +413,33 @@ fn chain(error: &dyn std::error::Error) -> String {
     text
 }
 
+/// Returns what failed, and what to do about it.
+fn why_and_cure(failure: StorageFailure) -> String {
+    format!("{}: {}", failure.explanation(), failure.advice())
+}
+
 /// Runs a check with a time limit; on failure returns the reason, for people.
-async fn limited(probe: impl Future<Output = Result<(), DbError>>) -> Result<(), &'static str> {
+async fn limited(probe: impl Future<Output = Result<(), DbError>>) -> Result<(), String> {
     match tokio::time::timeout(CHECK_TIMEOUT, probe).await {
         Ok(Ok(())) => Ok(()),
         Ok(Err(cause)) => {
             tracing::debug!("a check of the storage failed: {cause:?}");
-            let unknown = "the database answers with an error, see the log";
-            Err(cause.failure().map_or(unknown, StorageFailure::explanation))
+            let unknown = || "the database answers with an error, see the log".to_owned();
+            Err(cause.failure().map_or_else(unknown, why_and_cure))
         }
-        Err(_elapsed) => Err(StorageFailure::Busy.explanation()),
+        Err(_elapsed) => Err(why_and_cure(StorageFailure::Busy)),
     }
 }
 
 /// Returns why nothing can be stored, from the checks and from recent failures.
-fn unwritable(found: Option<&'static str>) -> Option<String> {
+fn unwritable(found: Option<String>) -> Option<String> {
     let recent = || {
         let (failure, since) = failure::last()?;
         // Damage has an alert of its own: writes elsewhere succeed.
         let counts = failure != StorageFailure::Damaged && since < RECOVERED_AFTER;
-        counts.then(|| failure.explanation())
+        counts.then(|| why_and_cure(failure))
     };
-    found.or_else(recent).map(str::to_owned)
+    found.or_else(recent)
 }
 
 #[expect(

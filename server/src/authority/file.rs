@@ -74,7 +74,10 @@ pub enum AuthorityError {
     #[error("there is a fleet's authority in `{}` already; robots trust it, so it stays", .0.display())]
     Exists(PathBuf),
     /// A file cannot be read.
-    #[error("cannot read `{}`; `tread-server init` makes the fleet's authority", path.display())]
+    #[error(
+        "cannot read `{}`: `tread-server init` makes the fleet's authority, and the user that the \
+         server runs as must be able to read it", path.display()
+    )]
     Unreadable {
         /// Path of the file.
         path: PathBuf,

@@ -3,15 +3,18 @@
 //!
 //! Only the server itself has that folder. Commands beside it (`init`, `health`) read the same
 //! configuration without it, so a name is resolved where possible and refused at the server's start.
+//! `doctor` looks where the unit of the Debian package takes them from.
 
 use std::path::{Path, PathBuf};
 
-use super::{Config, ConfigError};
+use super::{Config, ConfigError, TlsSource};
 
 /// Beginning of the name of a credential.
 const PREFIX: &str = "credential:";
 /// Environment variable with the folder of the credentials.
 const FOLDER: &str = "CREDENTIALS_DIRECTORY";
+/// Folder from which the unit takes the credentials, readable by root alone.
+const STORE: &str = "/etc/credstore";
 
 /// Returns the folder of the credentials; `None` if the service manager passes none.
 pub(super) fn folder() -> Option<PathBuf> {
@@ -20,7 +23,7 @@ pub(super) fn folder() -> Option<PathBuf> {
 
 /// Returns whether a file is a credential, which is protected by its folder, whatever its mode.
 pub(crate) fn is_passed(file: &Path) -> bool {
-    folder().is_some_and(|folder| file.starts_with(folder))
+    file.starts_with(STORE) || folder().is_some_and(|folder| file.starts_with(folder))
 }
 
 fn name_of(file: &Path) -> Option<&str> {
@@ -30,10 +33,13 @@ fn name_of(file: &Path) -> Option<&str> {
 impl Config {
     /// Returns the files that may be credentials.
     fn secret_files(&mut self) -> impl Iterator<Item = &mut PathBuf> {
-        let tls = self.tls.iter_mut();
-        let tls = tls.flat_map(|files| [&mut files.certificate, &mut files.key]);
+        let tls = match &mut self.tls {
+            Some(TlsSource::Files(files)) => vec![&mut files.certificate, &mut files.key],
+            Some(TlsSource::Authority) | None => Vec::new(),
+        };
         let oidc = self.oidc.iter_mut();
-        tls.chain(oidc.filter_map(|oidc| oidc.client_secret_file.as_mut()))
+        tls.into_iter()
+            .chain(oidc.filter_map(|oidc| oidc.client_secret_file.as_mut()))
     }
 
     /// Replaces the names of credentials by their files in `folder`.
@@ -53,6 +59,11 @@ impl Config {
             }
         }
         Ok(())
+    }
+
+    /// Replaces the names of credentials by the files that the service manager passes to the server.
+    pub(crate) fn find_credentials(&mut self) -> Result<(), ConfigError> {
+        self.resolve_credentials(Some(Path::new(STORE)))
     }
 
     /// Checks that the service manager has passed all credentials that are named.
@@ -86,7 +97,9 @@ mod tests {
         config
             .resolve_credentials(Some(Path::new("/run/credentials/tread-server.service")))
             .unwrap();
-        let tls = config.tls.unwrap();
+        let Some(TlsSource::Files(tls)) = config.tls else {
+            panic!("the certificate comes from files");
+        };
         let expected = "/run/credentials/tread-server.service/tread.tls-certificate";
         assert_eq!(tls.certificate, Path::new(expected));
         assert_eq!(tls.key, Path::new("/etc/tread/key.pem"));

@@ -5,6 +5,7 @@
 //! connection. A damaged page may also stay in a connection's cache. Therefore every connection
 //! that is older than the last failure is replaced before it is used again: [`is_older_than_last`].
 
+use std::io;
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::time::Duration;
@@ -63,6 +64,24 @@ impl StorageFailure {
         }
     }
 
+    /// Returns what to do about it, for operators.
+    pub const fn advice(self) -> &'static str {
+        match self {
+            Self::Full => "make room on its disk (`df -h`, `df -i`)",
+            Self::Io => {
+                "see whether the user that the server runs as may write the file and its folder, \
+                 whether the disk is mounted read-only, and what `dmesg` says of the disk"
+            }
+            Self::Memory => "give the machine or its control group more memory",
+            Self::Damaged => {
+                "stop the server, keep the file, and restore a backup; without one, \
+                 `sqlite3 FILE .recover | sqlite3 NEW`"
+            }
+            Self::Busy => "end the other process that uses the file (`fuser FILE`)",
+            Self::Connection => "see the log; start the server again if it lasts",
+        }
+    }
+
     /// Returns the failure behind an error; `None` for an error of the statement or its values.
     #[expect(
         clippy::wildcard_enum_match_arm,
@@ -102,6 +121,35 @@ impl StorageFailure {
             (_, 5 | 6 | 15) => Some(Self::Busy),
             _ => None,
         }
+    }
+}
+
+/// Returns what to do about an error of the operating system about a file, for operators.
+#[expect(
+    clippy::wildcard_enum_match_arm,
+    reason = "of all other errors the kernel log says more"
+)]
+pub fn advice_on(error: &io::Error) -> &'static str {
+    match error.kind() {
+        io::ErrorKind::PermissionDenied => {
+            "give the file and its folder to the user that the server runs as (`ls -l`, `chown`)"
+        }
+        io::ErrorKind::ReadOnlyFilesystem => {
+            "its disk is mounted read-only: see `dmesg`, repair the file system, and mount it for \
+             writing"
+        }
+        io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => StorageFailure::Full.advice(),
+        io::ErrorKind::NotFound => "create its folder first",
+        _ => "see `dmesg` for what the disk answers",
+    }
+}
+
+/// Returns what to do about an error of the database, for operators.
+pub fn advice_on_database(error: &sqlx::Error) -> &'static str {
+    match (error, StorageFailure::of(error)) {
+        (sqlx::Error::Io(error), _) => advice_on(error),
+        (_, Some(failure)) => failure.advice(),
+        (_, None) => "see docs/runbook.md",
     }
 }
 

@@ -11,6 +11,10 @@ use std::io::{self, Read as _, Seek as _, Write as _};
 use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _};
 use std::path::{Path, PathBuf};
 
+use super::failure::advice_on;
+
+/// List of all locks on files of this machine.
+const LOCKS_FILE: &str = "/proc/locks";
 /// Suffix of the lock file's name, after that of the database.
 const LOCK_ENDING: &str = ".lock";
 /// Maximum number of symbolic links followed: as many as Linux follows.
@@ -45,7 +49,7 @@ pub enum LockError {
         names: u64,
     },
     /// The lock file cannot be created.
-    #[error("cannot lock the database with `{}`", path.display())]
+    #[error("cannot lock the database with `{}`: {}", path.display(), advice_on(source))]
     File {
         /// The lock file.
         path: PathBuf,
@@ -108,6 +112,23 @@ impl DatabaseLock {
     }
 }
 
+/// Returns the process of the server that holds a database's lock; `None` if none does, or the
+/// operating system does not tell. Takes no lock, so that it disturbs no server that starts.
+pub fn holder_of(database: &Path) -> Option<u32> {
+    let found = fs::metadata(lock_path(database)).ok()?;
+    let locks = fs::read_to_string(LOCKS_FILE).ok()?;
+    let inode = found.ino().to_string();
+    locks.lines().find_map(|line| {
+        // `1: FLOCK  ADVISORY  WRITE 4711 08:02:1234567 0 EOF`
+        let words: Vec<&str> = line.split_whitespace().collect();
+        let [_, "FLOCK", _, "WRITE", process, file, ..] = words[..] else {
+            return None;
+        };
+        let is_this = file.rsplit(':').next() == Some(inode.as_str());
+        is_this.then(|| process.parse().ok()).flatten()
+    })
+}
+
 /// Returns the path beside the file itself, after following links, also if it does not exist yet.
 fn lock_path(database: &Path) -> PathBuf {
     let file = behind_links(database);
@@ -152,7 +173,9 @@ mod tests {
     fn a_second_server_is_refused_by_every_name_of_the_file_until_the_first_is_gone() {
         let folder = tempfile::tempdir().unwrap();
         let database = folder.path().join("tread.db");
+        assert_eq!(holder_of(&database), None);
         let first = DatabaseLock::take(&database).unwrap();
+        assert_eq!(holder_of(&database), Some(std::process::id()));
         let refused = DatabaseLock::take(&database).unwrap_err().to_string();
         let own = format!("(process {})", std::process::id());
         assert!(

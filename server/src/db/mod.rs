@@ -15,6 +15,7 @@ pub mod failure;
 pub mod geofences;
 pub mod history;
 pub mod idempotency;
+pub mod inspection;
 pub mod join_tokens;
 pub mod lock;
 pub mod missions;
@@ -49,6 +50,7 @@ use jiff::Timestamp;
 use nix::sys::statvfs::statvfs;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
+use sqlx::migrate::MigrateError;
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqliteSynchronous};
 use sqlx::{AssertSqlSafe, SqliteConnection};
 use tokio::sync::{Notify, Semaphore};
@@ -244,14 +246,30 @@ impl DbError {
     }
 }
 
+/// Size of the database's files, and the free space on their disk.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Disk {
+    /// Free bytes.
+    pub free_bytes: Option<u64>,
+    /// Size of the database file, bytes.
+    pub database_bytes: Option<u64>,
+    /// Size of its write-ahead log, bytes.
+    pub log_bytes: Option<u64>,
+}
+
 /// Reason why the database cannot be opened.
 #[derive(Debug, thiserror::Error)]
 pub enum OpenError {
     /// The folder of the file is missing.
-    #[error("the folder `{}` of the database does not exist; create it first", .0.display())]
+    #[error(
+        "the folder `{}` of the database does not exist; create it first, for the user that the \
+         server runs as", .0.display()
+    )]
     NoFolder(PathBuf),
     /// The file cannot be opened.
-    #[error("cannot open the database `{}`", path.display())]
+    #[error(
+        "cannot open the database `{}`: {}", path.display(), failure::advice_on_database(cause)
+    )]
     Open {
         /// The file.
         path: PathBuf,
@@ -369,9 +387,19 @@ impl Db {
             .with_first(async |connection| schema::migrator().run(connection).await)
             .await
             .map_err(failed)?
-            .map_err(|cause| OpenError::Migrate {
-                path: path.to_owned(),
-                cause,
+            .map_err(|cause| {
+                let migrate = |cause| OpenError::Migrate {
+                    path: path.to_owned(),
+                    cause,
+                };
+                let MigrateError::Execute(cause) = cause else {
+                    return migrate(cause);
+                };
+                // Such a file cannot be read, whatever its version is.
+                if StorageFailure::of(&cause).is_some() {
+                    return failed(cause);
+                }
+                migrate(MigrateError::Execute(cause))
             })?;
         // This connection has no transactions that could stay open, and is never replaced: while
         // one connection is open the log's index exists, for which a full disk has no room.
@@ -421,6 +449,11 @@ impl Db {
         drop(self.write("refresh").await?);
         self.commits.generation.fetch_add(1, Ordering::AcqRel);
         Ok(())
+    }
+
+    /// Returns the path of the database file.
+    pub fn path(&self) -> &Path {
+        &self.path
     }
 
     /// Returns the version of the SQLite library.
@@ -542,24 +575,30 @@ impl Db {
         Ok((finding != "ok").then_some(finding))
     }
 
-    /// Returns the free bytes on the database's disk; `None` if the operating system does not
-    /// report them.
-    pub async fn disk_free_bytes(&self) -> Option<u64> {
+    /// Returns the size of the database's files and the free space on their disk; `None` if the
+    /// operating system does not answer in time.
+    pub async fn disk(&self) -> Option<Disk> {
         // A hanging disk may block this; meanwhile no further request is made.
         let asking = Arc::clone(&self.asking_disk).try_acquire_owned().ok()?;
         let path = self.path.clone();
         let asked = tokio::task::spawn_blocking(move || {
-            let found = statvfs(&path);
+            let free = statvfs(&path).ok().map(|found| {
+                found
+                    .blocks_available()
+                    .saturating_mul(found.fragment_size())
+            });
+            let size = |file: &Path| std::fs::metadata(file).ok().map(|found| found.len());
+            let mut log = path.clone().into_os_string();
+            log.push("-wal");
+            let found = Disk {
+                free_bytes: free,
+                database_bytes: size(&path),
+                log_bytes: size(Path::new(&log)),
+            };
             drop(asking);
             found
         });
-        let found = tokio::time::timeout(DISK_TIMEOUT, asked).await.ok()?;
-        let found = found.ok()?.ok()?;
-        Some(
-            found
-                .blocks_available()
-                .saturating_mul(found.fragment_size()),
-        )
+        tokio::time::timeout(DISK_TIMEOUT, asked).await.ok()?.ok()
     }
 
     /// Closes all connections after their present work; the file is complete then.

@@ -83,7 +83,10 @@ pub enum FleetError {
     #[error("cannot use the certificates of the robots' port")]
     Certificates(#[source] anyhow::Error),
     /// Another program listens on the address.
-    #[error("cannot listen for robots on {address}")]
+    #[error(
+        "cannot listen for robots on {address}: another program has it, or it is no address of this \
+         machine; `tread-server doctor` examines the ports"
+    )]
     InUse {
         /// The address.
         address: SocketAddr,

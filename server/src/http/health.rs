@@ -1,5 +1,7 @@
 //! Whether the server lives, is ready, and what it counts.
 
+use std::time::Duration;
+
 use axum::extract::State;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -14,6 +16,7 @@ use crate::app::backups::BackupState;
 use crate::app::storage::StorageCondition;
 use crate::build;
 use crate::counters::CounterValues;
+use crate::metrics::SLOW_AFTER;
 
 /// The server is there.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
@@ -35,6 +38,69 @@ pub struct StorageStatus {
     pub disk_free_bytes: Option<u64>,
     /// Whether that is below `storage.disk_free_min_mib`.
     pub disk_low: bool,
+    /// Size of the database file, bytes; `null` if the operating system does not report it.
+    pub database_bytes: Option<u64>,
+    /// Size of its write-ahead log, bytes; `null` if the operating system does not report it.
+    pub log_bytes: Option<u64>,
+    /// Growth of the database file over the last hour, bytes per hour; `null` in the first ten
+    /// minutes of a run of the server.
+    pub growth_bytes_per_hour: Option<i64>,
+}
+
+/// What waits in a queue.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct QueueDepth {
+    /// Name of the queue.
+    pub name: String,
+    /// Number of entries.
+    pub depth: u64,
+}
+
+/// Slow transactions of the database since the start of the server.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct SlowTransactions {
+    /// Duration from which a transaction counts as slow, milliseconds.
+    pub threshold_ms: u64,
+    /// Number of slow transactions.
+    pub count: u64,
+    /// Use cases with the slowest ones, the slowest first, at most 10.
+    pub slowest: Vec<SlowUseCase>,
+}
+
+/// Slow transactions of one use case.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct SlowUseCase {
+    /// Name of the use case, as the label `kind` in the metrics.
+    pub kind: String,
+    /// Whether its transactions write.
+    pub writes: bool,
+    /// Number of slow ones.
+    pub count: u64,
+    /// Duration of the longest, milliseconds.
+    pub longest_ms: u64,
+}
+
+/// Maximum number of use cases with slow transactions that are listed.
+const SLOWEST_MAX: usize = 10;
+
+fn whole_ms(span: Duration) -> u64 {
+    u64::try_from(span.as_millis()).unwrap_or(u64::MAX)
+}
+
+fn slow_transactions(app: &App) -> SlowTransactions {
+    let slow = app.db().metrics().slow();
+    let count = slow.iter().map(|of| of.count).sum();
+    let slowest = slow.into_iter().take(SLOWEST_MAX).map(|of| SlowUseCase {
+        kind: of.kind.to_owned(),
+        writes: of.writes,
+        count: of.count,
+        longest_ms: whole_ms(of.longest),
+    });
+    SlowTransactions {
+        threshold_ms: whole_ms(SLOW_AFTER),
+        count,
+        slowest: slowest.collect(),
+    }
 }
 
 impl From<StorageCondition> for StorageStatus {
@@ -45,6 +111,9 @@ impl From<StorageCondition> for StorageStatus {
             damaged: condition.damaged,
             disk_free_bytes: condition.disk_free_bytes,
             disk_low: condition.is_disk_low,
+            database_bytes: condition.database_bytes,
+            log_bytes: condition.log_bytes,
+            growth_bytes_per_hour: condition.growth_bytes_per_hour,
         }
     }
 }
@@ -98,6 +167,12 @@ pub struct ServerStatus {
     pub sqlite_version: String,
     /// The storage as it was checked last.
     pub storage: StorageStatus,
+    /// What waits in each queue: messages of robots (`hellos`, `presence`, `states`,
+    /// `uploads`), uploads to be stored (`ingest`), commands of the reconciler (`reconciler`),
+    /// deliveries to webhooks (`webhooks`), events for the slowest client (`events`).
+    pub queues: Vec<QueueDepth>,
+    /// Slow transactions of the database.
+    pub slow_transactions: SlowTransactions,
     /// Its backups; `null` if it makes none by itself.
     pub backup: Option<BackupStatus>,
     /// The last restoration from a backup; `null` if there was none.
@@ -141,13 +216,22 @@ pub(super) async fn status(
     State(app): State<App>,
     Subject(subject): Subject,
 ) -> Json<ServerStatus> {
+    let queues = app.queue_depths().await;
     Json(ServerStatus {
         version: build::VERSION.to_owned(),
         commit: build::commit().map(str::to_owned),
         schema: build::schema(),
-        uptime_ms: u64::try_from(app.uptime().as_millis()).unwrap_or(u64::MAX),
+        uptime_ms: whole_ms(app.uptime()),
         sqlite_version: app.db().sqlite_version().to_owned(),
         storage: app.storage_condition().into(),
+        queues: queues
+            .into_iter()
+            .map(|(name, depth)| QueueDepth {
+                name: name.to_owned(),
+                depth,
+            })
+            .collect(),
+        slow_transactions: slow_transactions(&app),
         backup: app.backup_state().map(BackupStatus::from),
         restoration: app
             .restoration()

@@ -47,7 +47,7 @@ pub(crate) fn disk(interposer: &Interposer) -> Pin<Box<dyn Future<Output = ()> +
             app.clock().advance(APART);
             ask().await.unwrap();
         }
-        let asked = join_all((0..QUESTIONS).map(|_| app.db().disk_free_bytes())).await;
+        let asked = join_all((0..QUESTIONS).map(|_| app.db().disk())).await;
         assert!(asked.iter().all(Option::is_none), "{asked:?}");
         let more = threads() - before;
         assert!(interposer.disarm() > 0, "nothing hung");
@@ -60,7 +60,7 @@ pub(crate) fn disk(interposer: &Interposer) -> Pin<Box<dyn Future<Output = ()> +
         })
         .await;
         until("the disk is known again", async || {
-            app.db().disk_free_bytes().await.is_some()
+            app.db().disk().await.is_some()
         })
         .await;
         app.clock().advance(APART * 10);

@@ -25,7 +25,9 @@ use tread_server::app::identity::tokens::FirstAdmin;
 use tread_server::authority::Authority;
 use tread_server::clock::Clock;
 use tread_server::config::webhooks::WebhooksConfig;
-use tread_server::config::{FrictionConfig, RobotsConfig, StorageConfig, TlsFiles, WebConfig};
+use tread_server::config::{
+    FrictionConfig, RobotsConfig, StorageConfig, TlsFiles, TlsSource, WebConfig,
+};
 use tread_server::counters::CounterValues;
 use tread_server::webhooks::Resolver;
 use tread_server::{Config, RunningServer, Server};
@@ -157,7 +159,7 @@ impl Yard {
     pub(crate) async fn start_with_tls(tls: TlsFiles) -> Self {
         let folder = Arc::new(tempfile::tempdir().unwrap());
         let mut config = config(folder.path(), "127.0.0.1:0");
-        config.tls = Some(tls);
+        config.tls = Some(TlsSource::Files(tls));
         Self::of(folder, Server::start(config).await.unwrap()).await
     }
 
@@ -323,6 +325,7 @@ pub(crate) fn config(folder: &Path, zenoh: &str) -> Config {
         webhooks: WebhooksConfig::default(),
         backup: None,
         audit: tread_server::config::AuditConfig::default(),
+        tracing: tread_server::config::TracingConfig::default(),
         web: WebConfig {
             hosts: vec!["tread.test".to_owned()],
             allowed_origins: vec!["https://dash.test".parse().unwrap()],

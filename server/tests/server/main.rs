@@ -14,6 +14,8 @@ mod bounds;
 #[cfg(test)]
 mod clock;
 #[cfg(test)]
+mod conditions;
+#[cfg(test)]
 mod control;
 #[cfg(test)]
 mod drive;
@@ -23,6 +25,8 @@ mod dry_run;
 mod events;
 #[cfg(test)]
 mod exports;
+#[cfg(test)]
+mod first_steps;
 #[cfg(test)]
 mod flood;
 #[cfg(test)]

@@ -5,9 +5,10 @@ use std::collections::BTreeSet;
 use reqwest::StatusCode;
 use tread_api::mission::MissionState;
 use tread_api::wire::ingest::MissionPhase;
+use tread_server::certificate::Certificate;
 use tread_server::config::backup::BackupConfig;
 
-use crate::harness::{Yard, eventually, folder_of_the_crate};
+use crate::harness::{Yard, eventually, folder_of_the_crate, time};
 use crate::robot::Robot;
 
 async fn page(yard: &Yard) -> String {
@@ -72,6 +73,23 @@ async fn alert_rules_and_dashboard_name_only_metrics_that_exist() {
     .await;
     // Of requests there is nothing before the first one.
     assert_eq!(yard.get_value("/v1/sites").await.0, StatusCode::OK);
+    // A certificate and a robot that has answered are measured.
+    let robot = Robot::join(&yard, "rover-1").await;
+    let stop = "/v1/sites/yard/robots/rover-1/stop";
+    assert_eq!(
+        yard.post(stop, &serde_json::json!({})).await.0,
+        StatusCode::OK
+    );
+    let certificate = Certificate {
+        subject: "a server".to_owned(),
+        issuer: "an authority".to_owned(),
+        names: Vec::new(),
+        not_before: time("2026-01-01T00:00:00Z"),
+        not_after: time("2100-01-01T00:00:00Z"),
+    };
+    yard.server
+        .app()
+        .note_certificate(Some(&certificate), "a test");
     let text = page(&yard).await;
     let mut exist = BTreeSet::new();
     for line in text.lines() {
@@ -94,6 +112,7 @@ async fn alert_rules_and_dashboard_name_only_metrics_that_exist() {
         let missing: Vec<&String> = looked_for.difference(&exist).collect();
         assert!(missing.is_empty(), "{file} looks for {missing:?}");
     }
+    drop(robot);
     yard.server.stop().await.unwrap();
 }
 

@@ -13,5 +13,6 @@ mod data;
 mod links;
 mod python;
 mod routes;
+mod runbook;
 mod schema;
 mod settings;

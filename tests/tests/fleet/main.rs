@@ -2,6 +2,8 @@
 
 mod bad_input;
 mod chaos;
+#[cfg(test)]
+mod conditions;
 mod control;
 #[cfg(test)]
 mod drivers;
@@ -26,6 +28,8 @@ mod safety;
 mod scenario;
 #[cfg(test)]
 mod state_rate;
+#[cfg(test)]
+mod traces;
 #[cfg(test)]
 mod webhooks;
 

@@ -122,11 +122,12 @@ fn read(client: &Client, block: &str) -> (Option<String>, Option<Box<Event>>) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::client::Trusted;
 
     #[test]
     fn an_event_is_read_with_its_id_and_what_is_not_known_is_passed_over() {
         let _first = rustls::crypto::ring::default_provider().install_default();
-        let client = Client::new("http://127.0.0.1:1", None, None).unwrap();
+        let client = Client::new("http://127.0.0.1:1", None, Trusted::System).unwrap();
         let end = "event: snapshot_end\ndata: \"snapshot_end\"\nid: 5-7\n\n";
         let (id, event) = read(&client, end);
         assert_eq!(id.as_deref(), Some("5-7"));

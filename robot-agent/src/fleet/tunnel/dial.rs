@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use rustls::pki_types::pem::PemObject as _;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer, ServerName};
-use rustls::{CertificateError, ClientConfig, ClientConnection, RootCertStore};
+use rustls::{AlertDescription, CertificateError, ClientConfig, ClientConnection, RootCertStore};
 use socket2::SockRef;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpSocket, TcpStream, lookup_host};
@@ -45,12 +45,31 @@ pub enum DialError {
     /// The server's certificate is of an authority that this robot does not trust.
     #[error("the server's robot port is of another authority than this robot trusts")]
     Distrusted(#[source] io::Error),
+    /// The server refuses the robot's certificate because of its validity.
+    #[error(
+        "the server refuses this robot's certificate as expired: it is renewed while the server's \
+         REST API can be reached; otherwise join again with `tread-agent enroll`"
+    )]
+    Expired(#[source] io::Error),
+    /// The server's certificate is not valid by this robot's clock.
+    #[error(
+        "the server's certificate is not valid by this robot's clock: compare the clocks of robot \
+         and server, and have both synchronised"
+    )]
+    ClockWrong(#[source] io::Error),
     /// The connection was not made in time.
     #[error("the server's robot port did not answer in time")]
     TooSlow,
     /// The server's protocol or credentials are not those of this version.
     #[error("the server's robot port does not speak this version of the protocol")]
     NotUnderstood,
+}
+
+impl DialError {
+    /// Returns whether a certificate is refused because of its validity.
+    pub(super) fn is_about_validity(&self) -> bool {
+        matches!(self, Self::Expired(_) | Self::ClockWrong(_))
+    }
 }
 
 impl From<io::Error> for DialError {
@@ -61,6 +80,15 @@ impl From<io::Error> for DialError {
             Some(rustls::Error::InvalidCertificate(
                 CertificateError::UnknownIssuer | CertificateError::BadSignature,
             )) => Self::Distrusted(cause),
+            Some(rustls::Error::InvalidCertificate(
+                CertificateError::Expired
+                | CertificateError::ExpiredContext { .. }
+                | CertificateError::NotValidYet
+                | CertificateError::NotValidYetContext { .. },
+            )) => Self::ClockWrong(cause),
+            Some(rustls::Error::AlertReceived(AlertDescription::CertificateExpired)) => {
+                Self::Expired(cause)
+            }
             _ => Self::Unreachable(cause),
         }
     }

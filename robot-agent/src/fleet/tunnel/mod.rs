@@ -154,7 +154,7 @@ impl Tunnel {
     ) -> Result<Self, LinkError> {
         let dialer = Dialer::new(endpoint, membership)?;
         let mut pause = RETRY_FIRST;
-        let mut is_distrusted = false;
+        let (mut is_distrusted, mut is_invalid) = (false, false);
         let (connection, credentials) = loop {
             match dialer.dial(&[]).await {
                 Ok(dialled) => break dialled,
@@ -170,6 +170,13 @@ impl Tunnel {
                              this robot trusts; it is tried again"
                         );
                         note(Noted::Distrusted);
+                    }
+                    if cause.is_about_validity() && !is_invalid {
+                        is_invalid = true;
+                        warn!(
+                            error = &cause as &dyn std::error::Error,
+                            "no link to {endpoint}: {cause}; it is tried again"
+                        );
                     }
                     tokio::time::sleep(pause).await;
                     pause = next_pause(pause, &cause);
@@ -225,7 +232,11 @@ impl Tunnel {
 fn next_pause(pause: Duration, cause: &DialError) -> Duration {
     let longest = match cause {
         DialError::Distrusted(_) => DISTRUSTED_RETRY_MAX,
-        DialError::Unreachable(_) | DialError::TooSlow | DialError::NotUnderstood => RETRY_MAX,
+        DialError::Unreachable(_)
+        | DialError::Expired(_)
+        | DialError::ClockWrong(_)
+        | DialError::TooSlow
+        | DialError::NotUnderstood => RETRY_MAX,
     };
     (2 * pause).min(longest)
 }
@@ -323,7 +334,9 @@ async fn join(local: TcpStream, shared: &Shared, first: Vec<u8>) {
 /// unchanged.
 async fn reconnect(shared: &Shared, first: &[u8]) -> Result<Connection, DialError> {
     let dialled = shared.dialer.dial(first).await;
-    if matches!(dialled, Err(DialError::Distrusted(_))) {
+    let is_lasting =
+        |cause: &DialError| matches!(cause, DialError::Distrusted(_)) || cause.is_about_validity();
+    if dialled.as_ref().err().is_some_and(is_lasting) {
         // The session cannot reconnect with the authorities that this tunnel trusts. Opening
         // another tunnel notes it, so that the robot requests a certificate of the present
         // authority.

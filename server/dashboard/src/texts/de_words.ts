@@ -154,6 +154,7 @@ export const alertTitles: Readonly<Record<AlertKind, string>> = {
   'database-damaged': 'Die Datenbank ist beschädigt',
   'disk-low': 'Der Speicherplatz wird knapp',
   'server-restarted': 'Der Server wurde neu gestartet',
+  'certificate-expiring': 'Das Zertifikat des Servers läuft ab',
   'backup-failed': 'Die Sicherung ist fehlgeschlagen',
   'backup-old': 'Die letzte Sicherung ist alt',
   'robots-await-release': 'Roboter warten auf ihre Freigabe',

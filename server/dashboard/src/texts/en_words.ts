@@ -136,6 +136,7 @@ export const alertTitles = {
   'database-damaged': 'The database is damaged',
   'disk-low': 'The server’s disk is nearly full',
   'server-restarted': 'The server was restarted',
+  'certificate-expiring': 'The server’s certificate expires',
   'backup-failed': 'The backup failed',
   'backup-old': 'The newest backup is old',
   'robots-await-release': 'Robots await their release',

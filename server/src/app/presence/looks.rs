@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use tread_api::ids::{BootId, MissionId, StopId};
+use tread_api::link::LinkQuality;
 use tread_api::rights::Scope;
 use tread_api::robot::{LinkCause, LinkState, MissionProgress};
 
@@ -149,6 +150,25 @@ impl Presences {
             }
         }
         causes
+    }
+
+    /// Returns the quality of the links of at most `robots_max` robots, in the order of their
+    /// names, and the number of robots beyond those.
+    pub fn link_qualities(
+        &self,
+        now: Duration,
+        robots_max: usize,
+    ) -> (Vec<(RobotKey, LinkQuality)>, usize) {
+        let robots = self.lock();
+        let welcomed = robots.iter().filter(|(_, presence)| presence.welcomed);
+        let mut found: Vec<(RobotKey, LinkQuality)> = welcomed
+            .filter_map(|(key, presence)| Some((key.clone(), presence.link_quality(now)?)))
+            .collect();
+        drop(robots);
+        found.sort_by(|(one, _), (other, _)| one.cmp(other));
+        let left_out = found.len().saturating_sub(robots_max);
+        found.truncate(robots_max);
+        (found, left_out)
     }
 
     /// Returns the number of robots in each link state.

@@ -2,6 +2,7 @@
 //! server's monotonic clock.
 
 mod duplicate_agent;
+mod link_quality;
 mod looks;
 mod news;
 mod offsets;
@@ -13,12 +14,14 @@ use std::time::Duration;
 use jiff::Timestamp;
 use tread_api::friction::LiveFriction;
 use tread_api::ids::{BootId, MissionId, RobotId, SiteId, StopId};
+use tread_api::link::LinkQuality;
 use tread_api::robot::{Aged, LinkCause, LinkState, MissionProgress, RobotLive};
 use tread_api::safety::StandingState;
 use tread_api::wire::state::{FrictionReport, RobotState};
 
 pub use self::duplicate_agent::DuplicateAgent;
 use self::duplicate_agent::OtherRun;
+use self::link_quality::LinkCounts;
 pub use self::looks::{Attending, Held, Showing};
 use self::news::Shown;
 use self::offsets::Offsets;
@@ -79,6 +82,7 @@ pub struct Presence {
     /// Progress of the mission that it showed last, of any run of the agent.
     progress: Option<MissionProgress>,
     friction: Option<(LiveFriction, Duration)>,
+    link_counts: LinkCounts,
 }
 
 impl Presence {
@@ -211,6 +215,15 @@ impl Presence {
         })
     }
 
+    /// Returns the quality of the robot's link; `None` if it has sent nothing.
+    pub fn link_quality(&self, now: Duration) -> Option<LinkQuality> {
+        self.spoken_at?;
+        let offsets = &self.clock_offsets_ms;
+        let variation_ms = offsets.largest().zip(offsets.newest());
+        let variation_ms = variation_ms.map(|(fastest, newest)| fastest.abs_diff(newest));
+        Some(self.link_counts.quality(now, variation_ms))
+    }
+
     /// Makes a run the present one, and drops the data of the run before.
     fn enter_boot(&mut self, boot: BootId, now: Duration) {
         if self.boot.is_none_or(|(present, _since)| present != boot) {
@@ -307,10 +320,21 @@ impl Presences {
         self.lock().entry(key).or_default().welcomed = true;
     }
 
+    /// Records the time from a command to a robot's answer.
+    pub fn round_trip(&self, key: &RobotKey, took: Duration) {
+        if let Some(presence) = self.lock().get_mut(key) {
+            presence.link_counts.round_trip(took);
+        }
+    }
+
     /// Records a robot's hello.
     pub fn hello(&self, key: RobotKey, boot: BootId, now: Duration) {
         let mut robots = self.lock();
         let presence = robots.entry(key).or_default();
+        // A hello is the first message of each connection.
+        if presence.spoken_at.is_some() {
+            presence.link_counts.reconnect(now);
+        }
         presence.welcomed = true;
         presence.enter_boot(boot, now);
         presence.spoken_at = Some(now);
@@ -355,8 +379,16 @@ impl Presences {
             .state()
             .is_some_and(|before| before.seq >= state.seq)
         {
+            if presence
+                .state()
+                .is_some_and(|before| before.seq > state.seq)
+            {
+                presence.link_counts.late_state(now);
+            }
             return if news { Heard::News } else { Heard::Nothing };
         }
+        let before = presence.state().map(|before| before.seq);
+        presence.link_counts.state(now, before, state.seq);
         let ahead_ms = state.robot_time.duration_since(wall).as_millis();
         let ahead_ms = i64::try_from(ahead_ms).unwrap_or(i64::MAX);
         presence.clock_offsets_ms.push(now, ahead_ms);

@@ -39,6 +39,11 @@ impl Offsets {
         self.last.iter().map(|&(_, offset)| offset).max()
     }
 
+    /// Returns the offset of the last state; `None` without a state.
+    pub(super) fn newest(&self) -> Option<i64> {
+        self.last.back().map(|&(_, offset)| offset)
+    }
+
     /// Returns whether there are enough of them for the largest to count as right.
     pub(super) fn has_enough(&self) -> bool {
         self.last.len() >= OFFSETS_MIN

@@ -7,6 +7,7 @@ use tread_api::robot::MissionProgress;
 use tread_api::stop::Stop;
 use tread_api::wire::command::{Cancel, Offer, Pause, Resume};
 use tread_api::wire::reply::{Acknowledgement, Answer, CommandRefusalCode, OfferReply};
+use tread_telemetry::Place;
 
 use crate::app::missions::reports::adopt;
 use crate::app::missions::transitions::Change;
@@ -124,19 +125,27 @@ pub(super) async fn offer(app: App, standing: Standing) -> Result<Finished, AppE
     let start_within_ms = start_within_ms(&app, &row);
     let mission = row.mission;
     let prior = app.prior_along((&mission.site, &mission.robot), &mission.trajectory);
+    let place = app.trace_offer(&mission);
     let command = Offer {
         prior: prior.await?,
         mission: mission.id,
         revision: mission.revision,
         plan_hash: mission.plan_hash,
-        trajectory: mission.trajectory,
+        trajectory: mission.trajectory.clone(),
         start_within_ms,
         link_policy: mission.link_policy,
         on_hold: mission.pause_wanted,
     };
     app.counters().offers_sent.one();
-    let key = (mission.site, mission.robot);
-    let Ok(answer) = app.commands().send(&key, &command).await else {
+    let key = (mission.site.clone(), mission.robot.clone());
+    let traceparent = place.map(Place::context);
+    let began_at = app.clock().now();
+    let answer = app
+        .commands()
+        .send_traced(&key, &command, traceparent)
+        .await;
+    app.trace_offered(place, &mission, began_at, &answer);
+    let Ok(answer) = answer else {
         return Ok(Finished::Again);
     };
     take_offer_answer(&app, mission.id, &answer).await

@@ -14,6 +14,7 @@ pub mod needs;
 mod outcomes;
 
 use std::collections::{HashMap, HashSet};
+use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use jiff::SignedDuration;
@@ -89,11 +90,13 @@ struct Retry {
 
 /// Runs until the stop.
 pub async fn run(app: App, stop: CancellationToken) {
+    let depth = app.metrics().queues().show_count("reconciler");
     let mut reconciler = Reconciler::new(app.clone());
     loop {
         if let Err(error) = db::limited(reconciler.pass()).await {
             app.log_failure("reconcile missions", &error);
         }
+        depth.store(reconciler.depth(), Ordering::Relaxed);
         let pause = reconciler.pause();
         tokio::select! {
             biased;
@@ -164,6 +167,13 @@ impl Reconciler {
         while let Ok((job, how)) = self.finishing.try_recv() {
             self.note(job, how);
         }
+    }
+
+    /// Returns the number of commands that are under way or to be repeated.
+    fn depth(&self) -> usize {
+        let repeated = self.retries.keys();
+        let waiting = repeated.filter(|job| !self.under_way.contains(*job));
+        self.under_way.len() + waiting.count()
     }
 
     /// Returns the time until something is due.

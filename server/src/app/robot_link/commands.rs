@@ -3,11 +3,13 @@
 use std::pin::Pin;
 use std::sync::Arc;
 
+use tokio::time::Instant;
 use tracing::warn;
 use tread_api::ids::BootId;
 use tread_api::keys::Verb;
 use tread_api::wire;
 use tread_api::wire::reply::{Answer, Command};
+use tread_api::wire::trace::TraceParent;
 
 use super::Unconnected;
 use crate::app::presence::{Presences, RobotKey};
@@ -97,7 +99,26 @@ impl Commands {
         run: Option<BootId>,
         command: &C,
     ) -> Result<Answer<C::Reply>, Undelivered> {
-        let answer = self.exchange(robot, run, command).await;
+        let answer = self.exchange(robot, run, (command, None)).await;
+        if answer.is_err() {
+            self.counters.commands_unanswered.one();
+        }
+        answer
+    }
+
+    /// Sends one command to a robot's present run, with a trace context, and waits for its answer.
+    ///
+    /// # Errors
+    /// [`Undelivered`]: the robot may have received the command nevertheless.
+    pub async fn send_traced<C: Command>(
+        &self,
+        robot: &RobotKey,
+        command: &C,
+        traceparent: Option<TraceParent>,
+    ) -> Result<Answer<C::Reply>, Undelivered> {
+        let present = self.presences.get(robot).boot();
+        let run = present.map(|(boot, _since)| boot);
+        let answer = self.exchange(robot, run, (command, traceparent)).await;
         if answer.is_err() {
             self.counters.commands_unanswered.one();
         }
@@ -108,14 +129,19 @@ impl Commands {
         &self,
         robot: &RobotKey,
         run: Option<BootId>,
-        command: &C,
+        (command, traceparent): (&C, Option<TraceParent>),
     ) -> Result<Answer<C::Reply>, Undelivered> {
         let verb = C::VERB.as_str();
-        let payload = wire::encode(command).map_err(|error| {
+        let payload = wire::encode_traced(command, traceparent).map_err(|error| {
             warn!("cannot write a `{verb}` command for `{}`: {error}", robot.1);
             Undelivered::Unreachable
         })?;
+        let sent_at = Instant::now();
         let answer = self.transport.send(robot, run, C::VERB, payload).await?;
+        // A robot plans before it answers an offer.
+        if C::VERB != Verb::Offer {
+            self.presences.round_trip(robot, sent_at.elapsed());
+        }
         wire::decode(&answer).map_err(|error| {
             warn!(
                 error = &error as &dyn std::error::Error,

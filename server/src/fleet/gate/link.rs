@@ -4,7 +4,7 @@ use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use rustls::{AlertDescription, ServerConnection};
+use rustls::{AlertDescription, CertificateError, ServerConnection};
 use sha2::{Digest as _, Sha256};
 use socket2::SockRef;
 use tokio::io::AsyncWriteExt as _;
@@ -42,6 +42,9 @@ const SESSION_GONE_EVERY: Duration = Duration::from_millis(5);
 const BUFFER_BYTES: usize = 4 * 1024;
 /// Number of bytes of a connection that are inspected first.
 const LOOKED_AT_BYTES: usize = 6;
+/// What the log says of a robot whose certificate has expired.
+const EXPIRED: &str = "admit a robot whose certificate has expired (it renews it while it reaches the REST API; otherwise \
+     compare its clock with this one, or let it join again by `tread-agent enroll`)";
 
 /// A connection with what it needs.
 pub(super) struct Link {
@@ -163,6 +166,10 @@ impl Link {
                 counters.gate_tls_failed.one();
                 if is_distrust(&error) {
                     counters.gate_distrusted.one();
+                }
+                if is_expired(&error) {
+                    counters.gate_expired.one();
+                    self.app.log_failure(EXPIRED, &error);
                 }
                 self.failed();
                 debug!("a handshake with {} failed: {error}", self.peer);
@@ -330,6 +337,20 @@ fn is_distrust(error: &std::io::Error) -> bool {
     matches!(
         cause,
         Some(rustls::Error::AlertReceived(AlertDescription::UnknownCA))
+    )
+}
+
+/// Whether a robot's certificate was refused because of its validity.
+fn is_expired(error: &std::io::Error) -> bool {
+    let cause = error.get_ref().and_then(|cause| cause.downcast_ref());
+    matches!(
+        cause,
+        Some(rustls::Error::InvalidCertificate(
+            CertificateError::Expired
+                | CertificateError::ExpiredContext { .. }
+                | CertificateError::NotValidYet
+                | CertificateError::NotValidYetContext { .. }
+        ))
     )
 }
 

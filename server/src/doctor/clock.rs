@@ -1,0 +1,95 @@
+//! The machine's clock: whether it is synchronised, and whether the database holds later times.
+
+use std::path::Path;
+use std::process::{Command, Stdio};
+
+use jiff::{SignedDuration, Timestamp};
+
+use super::Examined;
+use super::finding::Finding;
+
+/// File that systemd-timesyncd makes after its first synchronisation.
+const TIMESYNC_FILE: &str = "/run/systemd/timesync/synchronized";
+/// Time by which the database's newest time may be ahead of the clock: that of a step which the
+/// server bridges within seconds.
+const AHEAD_MAX: SignedDuration = SignedDuration::from_secs(5);
+const SYNCHRONISE: &str = "set the clock, and have it synchronised: `apt-get install chrony`, or \
+                           `timedatectl set-ntp true`";
+
+pub(super) fn findings(examined: &Examined, newest: Option<Timestamp>) -> Vec<Finding> {
+    let now = examined.clock.machine_time();
+    let mut findings = vec![match is_synchronised() {
+        Some(true) => Finding::well("clock", format!("it is synchronised, and says {now:.0}")),
+        Some(false) => Finding::warning(
+            "clock",
+            format!("it is not synchronised, and says {now:.0}"),
+            SYNCHRONISE,
+        ),
+        None => Finding::skipped(
+            "clock",
+            format!("it says {now:.0}; whether it is synchronised is not known here"),
+        ),
+    }];
+    findings.extend(newest.and_then(|newest| behind(now, newest)));
+    findings
+}
+
+/// Returns a finding if the database holds times that are still to come.
+fn behind(now: Timestamp, newest: Timestamp) -> Option<Finding> {
+    let ahead = newest.duration_since(now);
+    (ahead > AHEAD_MAX).then(|| {
+        Finding::problem(
+            "clock",
+            format!(
+                "it says {now:.0}, {} s before the newest time in the database, {newest:.0}: it was \
+                 set back, or was ahead before",
+                ahead.as_secs()
+            ),
+            SYNCHRONISE,
+        )
+    })
+}
+
+/// Returns whether the clock is synchronised; `None` if nothing on this machine tells.
+fn is_synchronised() -> Option<bool> {
+    if Path::new(TIMESYNC_FILE).exists() {
+        return Some(true);
+    }
+    let words = ["show", "--property=NTPSynchronized", "--value"];
+    let said = output_of("timedatectl", &words);
+    match said.as_deref().map(str::trim) {
+        Some("yes") => return Some(true),
+        Some("no") => return Some(false),
+        Some(_) | None => {}
+    }
+    // The last field of the table is the leap status.
+    let said = output_of("chronyc", &["-c", "tracking"])?;
+    let leap = said.trim().rsplit(',').next()?.to_owned();
+    Some(leap != "Not synchronised")
+}
+
+fn output_of(program: &str, words: &[&str]) -> Option<String> {
+    let output = Command::new(program)
+        .args(words)
+        .stdin(Stdio::null())
+        .stderr(Stdio::null())
+        .output()
+        .ok()?;
+    let is_done = output.status.success();
+    is_done.then(|| String::from_utf8_lossy(&output.stdout).into_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_clock_behind_the_database_is_found_and_a_short_step_is_not() {
+        let now: Timestamp = "2026-11-02T10:00:00Z".parse().unwrap();
+        assert_eq!(behind(now, now + SignedDuration::from_secs(5)), None);
+        assert_eq!(behind(now, now - SignedDuration::from_hours(1)), None);
+        let found = behind(now, now + SignedDuration::from_hours(1)).unwrap();
+        assert!(found.text.contains("3600 s before"), "{found:?}");
+        assert!(!found.holds());
+    }
+}

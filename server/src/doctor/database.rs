@@ -1,0 +1,93 @@
+//! The database: its schema, and whether it can be read.
+
+use jiff::Timestamp;
+
+use super::Examined;
+use super::finding::{Finding, chain};
+use crate::db::failure::StorageFailure;
+use crate::db::inspection::{InspectError, Inspection, Schema, inspect};
+
+const RESTORE: &str = "stop the server, keep the file, and restore a backup; or bring what can be \
+                       read into a new file: `sqlite3 FILE .recover | sqlite3 NEW`";
+
+/// Returns the findings, and the newest time that the database holds.
+pub(super) async fn findings(examined: &Examined) -> (Vec<Finding>, Option<Timestamp>) {
+    let path = &examined.config.database;
+    let shown = path.display();
+    let inspected = inspect(path, examined.server_process.is_some(), examined.is_deep).await;
+    let inspection = match inspected {
+        Ok(Some(inspection)) => inspection,
+        Ok(None) => {
+            let text = format!("`{shown}` does not exist yet; the server makes it");
+            return (vec![Finding::skipped("database", text)], None);
+        }
+        Err(error) => return (vec![unreadable(&shown.to_string(), &error)], None),
+    };
+    let newest = inspection.newest;
+    let mut findings = vec![schema(&shown.to_string(), &inspection)];
+    match (&inspection.damage, examined.is_deep) {
+        (Some(damage), _) => findings.push(Finding::problem(
+            "database content",
+            format!("`{shown}` is damaged: {damage}"),
+            RESTORE,
+        )),
+        (None, true) => {
+            findings.push(Finding::well(
+                "database content",
+                "the whole file can be read",
+            ));
+        }
+        (None, false) => findings.push(Finding::well(
+            "database content",
+            "every table can be read; --deep reads the whole file",
+        )),
+    }
+    (findings, newest)
+}
+
+fn schema(shown: &str, inspection: &Inspection) -> Finding {
+    match inspection.schema {
+        Schema::Current(version) => Finding::well(
+            "database",
+            format!("`{shown}` has the present schema, {version}"),
+        ),
+        Schema::Empty => Finding::well(
+            "database",
+            format!("`{shown}` is empty; the server makes its tables"),
+        ),
+        Schema::Older { pending } => Finding::warning(
+            "database",
+            format!("`{shown}` is of an older version: {pending} migrations are pending"),
+            "back it up; the next start of this version brings it up to date, and an older one does \
+             not take it any more",
+        ),
+        Schema::Newer(version) => Finding::problem(
+            "database",
+            format!("`{shown}` was opened by a newer version: its schema is {version}"),
+            "install that version again, or restore the backup of before the upgrade",
+        ),
+        Schema::Differs(version) => Finding::problem(
+            "database",
+            format!("`{shown}` has another migration {version} than this version"),
+            "it was made by a build that was never released: take that one, or a backup",
+        ),
+    }
+}
+
+fn unreadable(shown: &str, error: &InspectError) -> Finding {
+    let text = format!("`{shown}` cannot be read: {}", chain(error));
+    let step = match error.failure() {
+        Some(StorageFailure::Damaged) => RESTORE,
+        Some(StorageFailure::Busy) => "another process holds it: end that one, and try again",
+        Some(
+            StorageFailure::Full
+            | StorageFailure::Io
+            | StorageFailure::Memory
+            | StorageFailure::Connection,
+        )
+        | None => {
+            "run this as the user that the server runs as; see `dmesg` for what the disk answers"
+        }
+    };
+    Finding::problem("database", text, step)
+}

@@ -1,0 +1,22 @@
+//! Limits of the operating system.
+
+use nix::sys::resource::{Resource, getrlimit};
+
+use super::finding::Finding;
+
+/// Open files that a server at its bounds needs: its connections, the robots' and their files.
+const FILES_NEEDED: u64 = 8_192;
+
+pub(super) fn findings() -> Vec<Finding> {
+    let finding = match getrlimit(Resource::RLIMIT_NOFILE) {
+        Ok((_, most)) if most < FILES_NEEDED => Finding::warning(
+            "file limit",
+            format!("at most {most} files can be open, and a full fleet needs {FILES_NEEDED}"),
+            "raise the hard limit: `LimitNOFILE=` in the unit, or /etc/security/limits.conf; this \
+             is the limit of this shell, the server's may be another",
+        ),
+        Ok((_, most)) => Finding::well("file limit", format!("{most} files can be open")),
+        Err(error) => Finding::skipped("file limit", format!("it is not known: {error}")),
+    };
+    vec![finding]
+}

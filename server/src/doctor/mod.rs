@@ -1,0 +1,130 @@
+//! `tread-server doctor`: examines configuration, files, database, certificates, ports, clock and
+//! limits of a server, before its first start, beside a running one, or after it has failed.
+//!
+//! It changes nothing: what it writes to find out whether it can is removed again, and the database
+//! is opened for reading. Each finding says what is wrong and what to do.
+
+mod certificates;
+mod clock;
+mod database;
+mod files;
+mod finding;
+mod limits;
+mod ports;
+mod probe;
+
+use std::io::Write as _;
+use std::path::PathBuf;
+
+use clap::Args;
+
+use self::finding::{Finding, chain};
+use crate::clock::Clock;
+use crate::config::{Config, ServerArgs};
+use crate::db::lock;
+
+/// Arguments of `tread-server doctor`.
+#[derive(Debug, Clone, Args)]
+pub(crate) struct DoctorArgs {
+    /// Configuration file of the server, TOML
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Database file
+    #[arg(long, value_name = "FILE")]
+    database: Option<PathBuf>,
+    /// Read the whole database (`PRAGMA quick_check`), which takes seconds for each gigabyte
+    #[arg(long)]
+    deep: bool,
+    /// Print one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+/// What every check is given.
+struct Examined {
+    config: Config,
+    config_file: Option<PathBuf>,
+    clock: Clock,
+    /// Process that holds the database, if a server runs.
+    server_process: Option<u32>,
+    is_deep: bool,
+}
+
+/// Examines a server and prints the findings. Returns whether no problem was found.
+///
+/// # Errors
+/// Standard output cannot be written.
+pub(crate) async fn run(args: DoctorArgs) -> anyhow::Result<bool> {
+    let is_json = args.json;
+    let findings = examine(args).await;
+    let mut out = std::io::stdout().lock();
+    let is_well = findings.iter().all(Finding::holds);
+    if is_json {
+        let report = serde_json::json!({ "ok": is_well, "checks": findings });
+        serde_json::to_writer(&mut out, &report)?;
+        writeln!(out)?;
+    } else {
+        for finding in &findings {
+            writeln!(out, "{} {}: {}", finding.mark(), finding.name, finding.text)?;
+            if let Some(next_step) = &finding.next_step {
+                writeln!(out, "      do: {next_step}")?;
+            }
+        }
+    }
+    Ok(is_well)
+}
+
+async fn examine(args: DoctorArgs) -> Vec<Finding> {
+    let loaded = Config::load(&ServerArgs {
+        config: args.config.clone(),
+        database: args.database,
+        ..ServerArgs::default()
+    });
+    let resolved = loaded.and_then(|mut config| config.find_credentials().map(|()| config));
+    let config = match resolved {
+        Ok(config) => config,
+        Err(error) => {
+            return vec![Finding::problem(
+                "configuration",
+                chain(&error),
+                configuration_step(args.config.as_deref()),
+            )];
+        }
+    };
+    let said = match &args.config {
+        Some(file) => format!("`{}` can be used", file.display()),
+        None => "the built-in values are used, since no --config is given".to_owned(),
+    };
+    let examined = Examined {
+        server_process: lock::holder_of(&config.database),
+        config,
+        config_file: args.config,
+        clock: Clock::system(),
+        is_deep: args.deep,
+    };
+    let mut findings = vec![Finding::well("configuration", said)];
+    findings.push(match examined.server_process {
+        Some(process) => Finding::well("server", format!("it runs, as process {process}")),
+        None => Finding::skipped("server", "it does not run on this database"),
+    });
+    findings.extend(files::findings(&examined));
+    let (of_database, newest) = database::findings(&examined).await;
+    findings.extend(of_database);
+    findings.extend(clock::findings(&examined, newest));
+    findings.extend(certificates::findings(&examined));
+    findings.extend(ports::findings(&examined).await);
+    findings.extend(limits::findings());
+    findings
+}
+
+fn configuration_step(file: Option<&std::path::Path>) -> String {
+    match file {
+        Some(file) if !file.exists() => format!(
+            "write one: `tread-server init --config {} --yes`, or without --yes in a terminal",
+            file.display()
+        ),
+        Some(_) | None => {
+            "correct it; docs/deployment.md has every setting with its default".to_owned()
+        }
+    }
+}

@@ -1,0 +1,238 @@
+//! The ports: free for the server, or held by it.
+
+use std::io;
+use std::net::{SocketAddr, TcpListener};
+
+use jiff::SignedDuration;
+use jiff::fmt::rfc2822;
+
+use super::Examined;
+use super::finding::Finding;
+use super::probe::{self, Answer};
+use crate::authority::Authority;
+use crate::certificate::{Certificate, Condition};
+use crate::config::TlsSource;
+use crate::http::tls::read_files;
+
+/// Difference between this clock and the server's that is none.
+const CLOCK_DIFFERENCE_MAX: SignedDuration = SignedDuration::from_secs(5);
+
+/// What was found at a port.
+enum Port {
+    /// The server can take it.
+    Free,
+    /// Something has it.
+    Taken,
+    /// It cannot be taken, and nobody has it.
+    Impossible(io::Error),
+}
+
+fn look(address: SocketAddr) -> Port {
+    match TcpListener::bind(address) {
+        Ok(_) => Port::Free,
+        Err(error) if error.kind() == io::ErrorKind::AddrInUse => Port::Taken,
+        Err(error) => Port::Impossible(error),
+    }
+}
+
+pub(super) async fn findings(examined: &Examined) -> Vec<Finding> {
+    let config = &examined.config;
+    let mut findings = rest(examined).await;
+    findings.push(robots(examined).await);
+    if let Some(address) = config.metrics {
+        findings.push(match look(address) {
+            Port::Taken => match probe::get(address, false, "/metrics").await {
+                Some(answer) if answer.text.contains("tread_uptime") => Finding::well(
+                    "port of metrics",
+                    format!("our server answers on {address}"),
+                ),
+                Some(_) | None => taken("port of metrics", "metrics", address),
+            },
+            other @ (Port::Free | Port::Impossible(_)) => {
+                not_taken(examined, "port of metrics", "metrics", address, other)
+            }
+        });
+    }
+    findings
+}
+
+/// Examines the port of the REST API.
+async fn rest(examined: &Examined) -> Vec<Finding> {
+    const NAME: &str = "port of REST";
+    let address = examined.config.http;
+    match look(address) {
+        Port::Taken => {}
+        other @ (Port::Free | Port::Impossible(_)) => {
+            return vec![not_taken(examined, NAME, "http", address, other)];
+        }
+    }
+    let is_tls = examined.config.tls.is_some();
+    let Some(answer) = probe::get(address, is_tls, "/healthz").await else {
+        return vec![taken(NAME, "http", address)];
+    };
+    if !answer.is_health() {
+        return vec![taken(NAME, "http", address)];
+    }
+    let mut findings = vec![Finding::well(
+        NAME,
+        format!("a Tread server answers on {address}"),
+    )];
+    if examined.server_process.is_none() {
+        findings = vec![Finding::problem(
+            NAME,
+            format!("a Tread server answers on {address}, and it does not use this database"),
+            "stop that server, or give this one another address by `http`",
+        )];
+    }
+    findings.extend(readiness(address, is_tls).await);
+    findings.extend(clock_of(examined, &answer));
+    findings.extend(served(examined, &answer));
+    findings
+}
+
+async fn readiness(address: SocketAddr, is_tls: bool) -> Option<Finding> {
+    let answer = probe::get(address, is_tls, "/readyz").await?;
+    if answer.is_health() {
+        return Some(Finding::well("readiness", "the server can work"));
+    }
+    let body = answer.text.split("\r\n\r\n").nth(1).unwrap_or_default();
+    let problem: serde_json::Value = serde_json::from_str(body).unwrap_or_default();
+    let why = problem["detail"].as_str().unwrap_or("it does not say why");
+    Some(Finding::problem(
+        "readiness",
+        format!("the server cannot work: {why}"),
+        "see the findings on folder, disk and database, and docs/runbook.md",
+    ))
+}
+
+/// Compares the clock with the server's.
+fn clock_of(examined: &Examined, answer: &Answer) -> Option<Finding> {
+    let said = rfc2822::parse(answer.header("date")?).ok()?.timestamp();
+    let difference = examined.clock.machine_time().duration_since(said);
+    (difference.abs() > CLOCK_DIFFERENCE_MAX).then(|| {
+        Finding::warning(
+            "clock of the server",
+            format!("the server says {said}, {} s off", difference.as_secs()),
+            "ask again; if it lasts, the clock is being set",
+        )
+    })
+}
+
+/// Compares the certificate that is served with the file.
+fn served(examined: &Examined, answer: &Answer) -> Option<Finding> {
+    let leaf = answer.leaf.as_ref()?;
+    let read = Certificate::read(leaf)?;
+    if let Some(TlsSource::Files(files)) = &examined.config.tls
+        && let Ok((certificates, _key)) = read_files(files)
+        && certificates.first() != Some(leaf)
+    {
+        return Some(Finding::warning(
+            "certificate served",
+            format!(
+                "the server shows another certificate than `{}`, valid until {}",
+                files.certificate.display(),
+                read.not_after
+            ),
+            "wait a minute: it reads the file again then, and its log says if it cannot use it",
+        ));
+    }
+    let now = examined.clock.machine_time();
+    let is_well = matches!(read.condition(now), Condition::Valid | Condition::Expiring);
+    let text = format!("valid until {}", read.not_after);
+    Some(if is_well {
+        Finding::well("certificate served", text)
+    } else {
+        Finding::problem(
+            "certificate served",
+            format!("the server shows one that is not valid now: {text}"),
+            "see the finding on the certificate, and set the clock if it is wrong",
+        )
+    })
+}
+
+/// Examines the robots' port.
+async fn robots(examined: &Examined) -> Finding {
+    const NAME: &str = "port of robots";
+    let address = examined.config.zenoh;
+    match look(address) {
+        Port::Taken => {}
+        other @ (Port::Free | Port::Impossible(_)) => {
+            return not_taken(examined, NAME, "zenoh", address, other);
+        }
+    }
+    let Some(robots) = &examined.config.robots else {
+        let is_ours = examined.server_process.is_some() && probe::is_open(address).await;
+        return if is_ours {
+            Finding::well(NAME, format!("it accepts connections on {address}"))
+        } else {
+            taken(NAME, "zenoh", address)
+        };
+    };
+    let Some(leaf) = probe::certificate(address).await else {
+        return taken(NAME, "zenoh", address);
+    };
+    let issuer = Certificate::read(&leaf).map(|read| read.issuer);
+    let authority = Authority::load(&robots.authority).ok();
+    let subject = authority
+        .as_ref()
+        .and_then(|authority| Certificate::read(authority.certificate()))
+        .map(|read| read.subject);
+    if issuer.is_some() && issuer == subject {
+        Finding::well(
+            NAME,
+            format!("it answers on {address} with a certificate of the fleet's authority"),
+        )
+    } else {
+        Finding::problem(
+            NAME,
+            format!("what answers on {address} shows no certificate of the fleet's authority"),
+            "stop the other program, or give the robots another address by `zenoh`",
+        )
+    }
+}
+
+fn taken(name: &'static str, key: &str, address: SocketAddr) -> Finding {
+    let port = address.port();
+    Finding::problem(
+        name,
+        format!("another program has {address}"),
+        format!(
+            "`ss -ltnp sport = :{port}` shows which; stop it, or take another address by `{key}`"
+        ),
+    )
+}
+
+#[expect(
+    clippy::wildcard_enum_match_arm,
+    reason = "of all other errors the message says enough"
+)]
+fn not_taken(
+    examined: &Examined,
+    name: &'static str,
+    key: &str,
+    address: SocketAddr,
+    port: Port,
+) -> Finding {
+    match (port, examined.server_process) {
+        (Port::Taken, _) => taken(name, key, address),
+        (Port::Free, Some(process)) if address.port() != 0 => Finding::problem(
+            name,
+            format!("the server, process {process}, does not have {address}"),
+            "it was started with another configuration, is still starting, or hangs: see its log",
+        ),
+        (Port::Free, _) => Finding::well(name, format!("{address} is free")),
+        (Port::Impossible(error), _) => {
+            let step = match error.kind() {
+                io::ErrorKind::PermissionDenied => format!(
+                    "ports below 1024 are for root: take another by `{key}`, or give the server \
+                     CAP_NET_BIND_SERVICE"
+                ),
+                io::ErrorKind::AddrNotAvailable => format!(
+                    "`{key}` must be an address of this machine (`ip address`), or 0.0.0.0 for all"
+                ),
+                _ => format!("take another address by `{key}`"),
+            };
+            Finding::problem(name, format!("cannot listen on {address}: {error}"), step)
+        }
+    }
+}

@@ -1,0 +1,333 @@
+//! `tread-server init` as the first command on a machine: writes a working configuration, from
+//! answers in a terminal or from flags.
+//!
+//! [`choices`] turns flags, answers and defaults into [`Choices`]; [`text`] writes them as TOML.
+//! The file is moved into its place last, after everything else has succeeded, so that a failed
+//! run can be repeated.
+
+mod choices;
+mod questions;
+mod steps;
+mod text;
+
+use std::fs::{self, DirBuilder, OpenOptions};
+use std::io::{self, IsTerminal as _, Write as _};
+use std::net::SocketAddr;
+use std::os::unix::fs::{DirBuilderExt as _, MetadataExt as _, OpenOptionsExt as _, lchown};
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context as _, bail, ensure};
+use clap::{Args, ValueEnum};
+use nix::unistd::Uid;
+use tread_api::ids::SiteId;
+
+pub(crate) use self::choices::Choices;
+use self::questions::Questions;
+pub(crate) use self::steps::next_steps;
+use crate::config::{Config, ServerArgs};
+
+/// Mode of the configuration file: it holds no secret, but the group of the data folder may read
+/// it and others need not.
+const CONFIG_MODE: u32 = 0o640;
+/// Mode of a data folder that is created.
+const DATA_MODE: u32 = 0o700;
+/// Suffix of the name of a configuration file that was replaced.
+const REPLACED_ENDING: &str = "old";
+
+/// How the REST API is reached.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum TlsChoice {
+    /// By TLS with a certificate that the fleet's own authority issues and renews
+    Authority,
+    /// By TLS with certificate and key from files
+    Files,
+    /// By a proxy on this machine that ends TLS
+    Proxy,
+    /// From this machine alone, without TLS
+    Loopback,
+}
+
+/// Arguments for writing a configuration.
+#[derive(Debug, Clone, Default, Args)]
+#[command(next_help_heading = "Writing a configuration")]
+pub(crate) struct SetupArgs {
+    /// Write a configuration without questions: what no flag gives has its default
+    #[arg(long)]
+    pub(crate) yes: bool,
+    /// Folder of the database and the fleet's authority, created when missing
+    #[arg(long, value_name = "DIR")]
+    pub(crate) data_dir: Option<PathBuf>,
+    /// Site that the server creates at its first start
+    #[arg(long)]
+    pub(crate) site: Option<SiteId>,
+    /// Host names and addresses by which others find this server, separated by commas
+    #[arg(long, value_name = "NAMES", value_delimiter = ',')]
+    pub(crate) names: Vec<String>,
+    /// How the REST API is reached
+    #[arg(long, value_enum)]
+    pub(crate) tls: Option<TlsChoice>,
+    /// Certificate of the REST API, PEM, followed by its intermediate certificates
+    #[arg(long, value_name = "FILE", requires = "tls_key")]
+    pub(crate) tls_certificate: Option<PathBuf>,
+    /// Private key of that certificate, PEM
+    #[arg(long, value_name = "FILE", requires = "tls_certificate")]
+    pub(crate) tls_key: Option<PathBuf>,
+    /// Address of the REST API
+    #[arg(long, value_name = "ADDRESS")]
+    pub(crate) http: Option<SocketAddr>,
+    /// Address that robots connect to
+    #[arg(long, value_name = "ADDRESS")]
+    pub(crate) zenoh: Option<SocketAddr>,
+}
+
+impl SetupArgs {
+    /// Returns whether any flag asks for a configuration.
+    fn is_given(&self) -> bool {
+        let Self {
+            yes,
+            data_dir,
+            site,
+            names,
+            tls,
+            tls_certificate,
+            tls_key,
+            http,
+            zenoh,
+        } = self;
+        *yes || !names.is_empty()
+            || tls.is_some()
+            || data_dir.is_some()
+            || site.is_some()
+            || http.is_some()
+            || zenoh.is_some()
+            || tls_certificate.is_some()
+            || tls_key.is_some()
+    }
+}
+
+/// What `init` was given besides [`SetupArgs`].
+#[derive(Debug)]
+pub(crate) struct Given<'a> {
+    /// The configuration file.
+    pub(crate) config: Option<&'a Path>,
+    /// The database file.
+    pub(crate) database: Option<&'a Path>,
+    /// The file for the admin's token.
+    pub(crate) token_file: Option<&'a Path>,
+    /// Whether to replace what exists.
+    pub(crate) force: bool,
+}
+
+/// A configuration that is ready to be moved into its place.
+#[derive(Debug)]
+pub(crate) struct Prepared {
+    /// What was chosen.
+    pub(crate) choices: Choices,
+    /// The configuration as the server reads it.
+    pub(crate) config: Config,
+    /// The complete file, under a temporary name.
+    new: PathBuf,
+}
+
+/// Returns the configuration file that is used without `--config`.
+pub(crate) fn config_default(is_root: bool) -> PathBuf {
+    PathBuf::from(if is_root {
+        "/etc/tread/tread.toml"
+    } else {
+        "tread.toml"
+    })
+}
+
+/// Prepares a configuration if one is to be written; `None` if the existing one, or the built-in
+/// values, are to be used.
+///
+/// # Errors
+/// A choice is impossible, the file exists and may not be replaced, nobody answers, or a folder
+/// cannot be written.
+pub(crate) fn prepare(args: &SetupArgs, given: &Given<'_>) -> anyhow::Result<Option<Prepared>> {
+    let is_root = Uid::effective().is_root();
+    let has_terminal = io::stdin().is_terminal() && io::stderr().is_terminal();
+    let file = given
+        .config
+        .map_or_else(|| config_default(is_root), Path::to_owned);
+    let exists = file.exists();
+    let is_first = given.database.is_none() && !exists && has_terminal;
+    if !args.is_given() && !is_first {
+        if given.config.is_some() && !exists {
+            bail!(
+                "there is no configuration file `{}`: give --yes, and it is written with defaults, \
+                 or flags such as --names and --tls, or run this in a terminal to be asked",
+                file.display()
+            );
+        }
+        if given.config.is_none() && given.database.is_none() && exists {
+            bail!(
+                "there is a configuration file `{}` already: name it with --config to make an \
+                 admin's token for it",
+                file.display()
+            );
+        }
+        return Ok(None);
+    }
+    ensure!(
+        given.database.is_none(),
+        "--database names a file; a configuration that is written here takes --data-dir, the \
+         folder of the database"
+    );
+    refuse_to_replace("configuration file", &file, given.force)?;
+    let defaults = choices::Defaults {
+        config: file,
+        token_file: given.token_file.map(Path::to_owned),
+        is_root,
+        host_name: host_name(),
+    };
+    let choices = if args.yes || !has_terminal {
+        Choices::of(args, &defaults)?
+    } else {
+        let (mut input, mut output) = (io::stdin().lock(), io::stderr().lock());
+        let mut questions = Questions::new(&mut input, &mut output);
+        questions::ask(args, &defaults, &mut questions)?
+    };
+    refuse_to_replace("configuration file", &choices.config, given.force)?;
+    refuse_to_replace("token file", &choices.token_file, given.force)?;
+    write_beside(choices).map(Some)
+}
+
+/// Refuses to replace a file without `--force`.
+///
+/// # Errors
+/// The file exists, and `force` is false.
+pub(crate) fn refuse_to_replace(what: &str, file: &Path, force: bool) -> anyhow::Result<()> {
+    // A link without a target counts too: writing would create what it leads to.
+    let exists = fs::symlink_metadata(file).is_ok();
+    ensure!(
+        !exists || force,
+        "the {what} `{}` exists and is not replaced: name another one, or give --force",
+        file.display()
+    );
+    Ok(())
+}
+
+fn host_name() -> Option<String> {
+    let name = fs::read_to_string("/proc/sys/kernel/hostname").ok()?;
+    let name = name.trim();
+    (!name.is_empty() && name != "localhost").then(|| name.to_owned())
+}
+
+/// Writes the configuration under a temporary name in its folder, and reads it as the server does.
+fn write_beside(choices: Choices) -> anyhow::Result<Prepared> {
+    make_folder(folder_of(&choices.config), 0o755)?;
+    make_folder(&choices.data_dir, DATA_MODE)?;
+    let new = beside(&choices.config, &format!("{}.new", std::process::id()));
+    let written = || -> anyhow::Result<Config> {
+        let mut options = OpenOptions::new();
+        options.write(true).create_new(true).mode(CONFIG_MODE);
+        let mut handle = options
+            .open(&new)
+            .with_context(|| format!("cannot write in `{}`", folder_of(&new).display()))?;
+        handle
+            .write_all(text::toml(&choices).as_bytes())
+            .and_then(|()| handle.sync_all())
+            .with_context(|| format!("cannot write `{}`", new.display()))?;
+        Ok(Config::load(&ServerArgs {
+            config: Some(new.clone()),
+            ..ServerArgs::default()
+        })?)
+    };
+    match written() {
+        Ok(config) => Ok(Prepared {
+            choices,
+            config,
+            new,
+        }),
+        Err(error) => {
+            // The error of the write is returned; a file that was never made cannot be removed.
+            let _ = fs::remove_file(&new);
+            Err(error)
+        }
+    }
+}
+
+impl Prepared {
+    /// Moves the configuration into its place, and gives the files of the data folder to its owner.
+    ///
+    /// # Errors
+    /// A file cannot be written.
+    pub(crate) fn finish(&self) -> anyhow::Result<()> {
+        let file = &self.choices.config;
+        if file.exists() {
+            let old = beside(file, REPLACED_ENDING);
+            fs::rename(file, &old).with_context(|| {
+                format!("cannot keep `{}` as `{}`", file.display(), old.display())
+            })?;
+            eprintln!("the former configuration is kept as `{}`", old.display());
+        }
+        self.give_to_owner()?;
+        fs::rename(&self.new, file).with_context(|| format!("cannot write `{}`", file.display()))
+    }
+
+    /// Gives what root has made in a folder of another user, such as that of the service, to that
+    /// user.
+    fn give_to_owner(&self) -> anyhow::Result<()> {
+        if !Uid::effective().is_root() {
+            return Ok(());
+        }
+        let data_dir = &self.choices.data_dir;
+        let folder = fs::metadata(data_dir)
+            .with_context(|| format!("cannot look at `{}`", data_dir.display()))?;
+        let (user, group) = (folder.uid(), folder.gid());
+        if user == 0 {
+            return Ok(());
+        }
+        lchown(&self.new, None, Some(group))
+            .with_context(|| format!("cannot give `{}` to its group", self.new.display()))?;
+        give(data_dir, user, group)
+    }
+
+    /// Removes the temporary file after a failure.
+    pub(crate) fn discard(&self) {
+        // The failure is reported; a file that is left has a name of its own.
+        let _ = fs::remove_file(&self.new);
+    }
+}
+
+/// Gives all files of root in a folder to a user, and those in its folders.
+fn give(folder: &Path, user: u32, group: u32) -> anyhow::Result<()> {
+    let named = || format!("cannot give `{}` to its owner", folder.display());
+    for entry in fs::read_dir(folder).with_context(named)? {
+        let path = entry.with_context(named)?.path();
+        let found = fs::symlink_metadata(&path).with_context(named)?;
+        if found.uid() == 0 {
+            lchown(&path, Some(user), Some(group)).with_context(named)?;
+        }
+        if found.is_dir() {
+            give(&path, user, group)?;
+        }
+    }
+    Ok(())
+}
+
+fn folder_of(file: &Path) -> &Path {
+    let folder = file.parent().filter(|it| !it.as_os_str().is_empty());
+    folder.unwrap_or(Path::new("."))
+}
+
+fn beside(file: &Path, ending: &str) -> PathBuf {
+    let mut name = file.file_name().unwrap_or_default().to_owned();
+    name.push(format!(".{ending}"));
+    file.with_file_name(name)
+}
+
+fn make_folder(folder: &Path, mode: u32) -> anyhow::Result<()> {
+    let mut builder = DirBuilder::new();
+    let created = builder.recursive(true).mode(mode).create(folder);
+    created.with_context(|| {
+        format!(
+            "cannot make the folder `{}`: run this as root, or name another one",
+            folder.display()
+        )
+    })
+}
+
+#[cfg(test)]
+mod tests;

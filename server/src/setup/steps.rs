@@ -1,0 +1,99 @@
+//! What to type after `tread-server init`.
+
+use std::fmt::Write as _;
+
+use super::choices::{Choices, Web};
+use super::config_default;
+
+/// Unit of the service manager that starts the server, if it is installed.
+const UNIT: &str = "tread-server.service";
+/// Folders in which service managers look for units.
+const UNIT_FOLDERS: [&str; 3] = [
+    "/etc/systemd/system",
+    "/usr/lib/systemd/system",
+    "/lib/systemd/system",
+];
+
+/// Returns a word as a shell reads it.
+fn word(text: &str) -> String {
+    let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b"-_./:,@%+=".contains(&byte);
+    if !text.is_empty() && text.bytes().all(is_plain) {
+        return text.to_owned();
+    }
+    format!("'{}'", text.replace('\'', r"'\''"))
+}
+
+fn has_unit() -> bool {
+    UNIT_FOLDERS
+        .iter()
+        .any(|folder| std::path::Path::new(folder).join(UNIT).exists())
+}
+
+/// Returns the address of the REST API for people.
+fn server(choices: &Choices) -> String {
+    let (port, first) = (choices.http.port(), choices.names.first());
+    let host = first.map_or("127.0.0.1", String::as_str);
+    let host = if host.contains(':') {
+        format!("[{host}]")
+    } else {
+        host.to_owned()
+    };
+    match choices.web {
+        Web::Authority | Web::Files(_) => format!("https://{host}:{port}"),
+        Web::Proxy => format!("https://{host}"),
+        Web::Loopback => format!("http://{}", choices.http),
+    }
+}
+
+/// Returns what was made, and the next commands. `fingerprint` is that of the fleet's authority.
+pub(crate) fn next_steps(choices: &Choices, fingerprint: Option<&str>) -> String {
+    let config = word(&choices.config.display().to_string());
+    let token = word(&choices.token_file.display().to_string());
+    let server = server(choices);
+    let trust = match (&choices.web, fingerprint) {
+        (Web::Authority, Some(fingerprint)) => format!(" --ca-fingerprint {fingerprint}"),
+        (_, _) => String::new(),
+    };
+    let is_unit = has_unit() && choices.config == config_default(true);
+    let start = if is_unit {
+        "systemctl enable --now tread-server".to_owned()
+    } else {
+        format!("tread-server --config {config}")
+    };
+    let mut text = String::new();
+    // Writing to a string cannot fail.
+    let _ = write!(
+        text,
+        "configuration  {config}\n\
+         data           {}\n\
+         admin's token  {token} (mode 0600)\n",
+        word(&choices.data_dir.display().to_string()),
+    );
+    if let Some(fingerprint) = fingerprint {
+        let _ = writeln!(text, "authority      SHA-256 {fingerprint}");
+    }
+    let _ = write!(
+        text,
+        "\nnext:\n  tread-server doctor --config {config}\n  {start}\n  \
+         tread login --server {server}{trust} --token-file {token}\n"
+    );
+    if choices.has_authority() {
+        // From the same machine a server behind a proxy is reached without it.
+        let _ = write!(
+            text,
+            "a robot:\n  \
+             tread robots join-token --server {server} --name rover-1 --expires 1h > token\n  \
+             tread-agent enroll --server {server}{trust} --token-file token --config robot.toml   \
+             # on the robot\n  \
+             tread-agent --config robot.toml\n"
+        );
+    } else {
+        let _ = write!(
+            text,
+            "a robot on this machine:\n  tread-agent --config robot.toml   # with server = \
+             \"tcp/{}\" in it\n",
+            choices.zenoh
+        );
+    }
+    text
+}
