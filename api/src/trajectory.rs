@@ -12,7 +12,7 @@ pub use self::check::{
 };
 pub use self::rules::InvalidTrajectory;
 use self::rules::{CircleFields, WaypointsFields, is_speed};
-use crate::geometry::Point;
+use crate::geometry::{Point, Pose};
 
 /// Minimum number of waypoints of a path.
 pub const WAYPOINTS_MIN: usize = 2;
@@ -38,6 +38,10 @@ pub const EXCITATION_DEPTH_MAX: f64 = 0.8;
 pub const EXCITATION_PERIOD_MIN_S: f64 = 1.0;
 /// Maximum period of an excitation, seconds.
 pub const EXCITATION_PERIOD_MAX_S: f64 = 20.0;
+/// Maximum distance of a robot from the expected start of its trajectory from which it plans, metres.
+pub const START_TOLERANCE_M: f64 = 0.05;
+/// Maximum difference of its heading from that of the expected start, radians.
+pub const START_TOLERANCE_RAD: f64 = 0.1;
 
 /// Trajectory to drive, as a user requests it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
@@ -128,6 +132,12 @@ pub struct TrajectoryOptions {
     /// torque sensing. No excitation when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub excitation: Option<Excitation>,
+    /// Pose from which a dry run planned this trajectory, the `start` of its answer. A robot that
+    /// stands within 5 cm and 0.1 rad of it plans from it, so that the plan is that of the dry run:
+    /// of two approaches of similar length, millimetres decide otherwise. No effect when absent, or
+    /// if the robot stands elsewhere.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub expected_start: Option<Pose>,
 }
 
 /// Periodic variation of the speed: the speed falls by the depth and recovers. It never exceeds the
@@ -164,7 +174,20 @@ fn default_period() -> f64 {
 impl TrajectoryOptions {
     /// Whether no option is set.
     pub fn is_none(&self) -> bool {
-        self.approach_speed_m_s.is_none() && self.excitation.is_none()
+        self.approach_speed_m_s.is_none()
+            && self.excitation.is_none()
+            && self.expected_start.is_none()
+    }
+
+    /// Returns the pose from which a robot at `actual` plans: the expected start if it is near, else
+    /// `actual`.
+    pub fn planning_start(&self, actual: Pose) -> Pose {
+        let is_near = |expected: &Pose| {
+            let turn_rad = expected.heading_rad - actual.heading_rad;
+            expected.position().distance_m(actual.position()) <= START_TOLERANCE_M
+                && turn_rad.sin().atan2(turn_rad.cos()).abs() <= START_TOLERANCE_RAD
+        };
+        self.expected_start.filter(is_near).unwrap_or(actual)
     }
 
     /// Checks that every option is within its range.
@@ -177,6 +200,12 @@ impl TrajectoryOptions {
             .filter(|&speed_m_s| !is_speed(speed_m_s))
         {
             return Err(InvalidTrajectory::ApproachSpeed(speed_m_s));
+        }
+        let is_pose = |pose: &Pose| {
+            pose.position().is_on_the_map() && pose.heading_rad.abs() <= std::f64::consts::TAU
+        };
+        if !self.expected_start.as_ref().is_none_or(is_pose) {
+            return Err(InvalidTrajectory::ExpectedStart);
         }
         let Some(excitation) = self.excitation else {
             return Ok(());
@@ -270,9 +299,35 @@ mod tests {
             (json!({"excitation": {"depth_ratio": 0.0}}), "depth_ratio"),
             (json!({"excitation": {"period_s": 0.5}}), "period_s"),
             (json!({"approach_speed_m_s": -1.0}), "approach_speed_m_s"),
+            (
+                json!({"expected_start": {"x_m": 2e6, "y_m": 0.0, "heading_rad": 0.0}}),
+                "expected_start",
+            ),
         ] {
             assert!(refusal(&circle(options)).contains(field), "{field}");
         }
+    }
+
+    #[test]
+    fn a_robot_near_the_expected_start_plans_from_it() {
+        let pose = |x_m: f64, heading_rad: f64| Pose {
+            x_m,
+            y_m: 1.0,
+            heading_rad,
+        };
+        let options = TrajectoryOptions {
+            expected_start: Some(pose(2.0, 3.12)),
+            ..TrajectoryOptions::default()
+        };
+        // Headings on both sides of π are near.
+        for near in [pose(2.049, 3.12), pose(1.96, 3.03), pose(2.0, -3.11)] {
+            assert_eq!(options.planning_start(near), pose(2.0, 3.12), "{near:?}");
+        }
+        for far in [pose(2.051, 3.12), pose(2.0, 3.0), pose(2.0, -3.0)] {
+            assert_eq!(options.planning_start(far), far);
+        }
+        let none = TrajectoryOptions::default();
+        assert_eq!(none.planning_start(pose(2.0, 3.0)), pose(2.0, 3.0));
     }
 
     #[test]

@@ -20,6 +20,15 @@ pub(crate) fn wire_pose(pose: control::Pose) -> wire::Pose {
     }
 }
 
+/// Converts a pose of the wire to the controller's.
+pub(crate) fn control_pose(pose: wire::Pose) -> control::Pose {
+    control::Pose {
+        x_m: pose.x_m,
+        y_m: pose.y_m,
+        heading_rad: pose.heading_rad,
+    }
+}
+
 /// Converts a twist to the wire's.
 pub(crate) fn wire_twist(twist: control::Twist) -> wire::Twist {
     wire::Twist {

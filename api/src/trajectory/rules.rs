@@ -53,6 +53,11 @@ pub enum InvalidTrajectory {
         "excitation.period_s must be {EXCITATION_PERIOD_MIN_S} to {EXCITATION_PERIOD_MAX_S}, not {0}"
     )]
     ExcitationPeriod(f64),
+    /// The expected start is beyond [`COORDINATE_MAX_M`], or its heading is beyond ±2π.
+    #[error(
+        "expected_start must be within {COORDINATE_MAX_M} m of the origin, its heading within 2 pi"
+    )]
+    ExpectedStart,
     /// A point is not finite or beyond [`COORDINATE_MAX_M`].
     #[error("points[{0}] must be within {COORDINATE_MAX_M} m of the origin")]
     PointOffTheMap(usize),

@@ -154,6 +154,7 @@ fn demands(checked: &TrajectoryCheck) -> String {
 /// Returns the options of the trajectory that the flags select.
 fn options(order: &Order) -> TrajectoryOptions {
     TrajectoryOptions {
+        expected_start: None,
         approach_speed_m_s: order.approach_speed,
         excitation: order.excite.then(Excitation::default),
     }

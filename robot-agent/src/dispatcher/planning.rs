@@ -12,7 +12,7 @@ use tread_control::plan::Plan;
 use super::{Dispatcher, refused};
 use crate::control_loop::job::Job;
 use crate::control_loop::job::JobOrigin;
-use crate::geometry::wire_pose;
+use crate::geometry::{control_pose, wire_pose};
 
 /// A plan, its summary, and the job that tracks it.
 pub(super) struct Planned {
@@ -31,7 +31,7 @@ fn silence_max(policy: LinkPolicy) -> Result<Option<Duration>, String> {
 }
 
 impl Dispatcher {
-    /// Plans an offer from a pose.
+    /// Plans an offer from a pose, or from the start that the offer expects, if that is near.
     pub(super) async fn plan(
         &self,
         offer: &Offer,
@@ -41,6 +41,8 @@ impl Dispatcher {
         let model = self.model;
         let view = self.site.view();
         let offer = offer.clone();
+        let options = offer.trajectory.options();
+        let start = control_pose(options.planning_start(wire_pose(start)));
         let planning = tokio::task::spawn_blocking(move || {
             let origin = JobOrigin {
                 mission: offer.mission,

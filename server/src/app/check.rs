@@ -314,6 +314,7 @@ pub(super) fn planned(
         place: None,
         crosses: false,
     })?;
+    let start = trajectory.options().planning_start(start);
     let from = control::Pose {
         x_m: start.x_m,
         y_m: start.y_m,
@@ -338,6 +339,7 @@ fn check(
 ) -> Result<TrajectoryCheck, Refused> {
     let planned = planned(model, asked, start.pose)?;
     let trajectory = asked.trajectory;
+    let begin = trajectory.options().planning_start(start.pose);
     fenced(&planned, trajectory, fence)?;
     let plan = &planned.plan;
     let AssumedGround { theta, has_torque } = ground;
@@ -345,7 +347,7 @@ fn check(
     let expected = expected_accuracy(plan, &planned.model, noise, theta, has_torque);
     let bindings = plan.slowed().iter().take(BINDINGS_MAX);
     Ok(TrajectoryCheck {
-        start: start.pose,
+        start: begin,
         start_source: start.source,
         after_mission: start.after_mission,
         length_m: plan.length_m(),

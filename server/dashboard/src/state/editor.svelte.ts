@@ -1,5 +1,16 @@
 // What is drawn at the moment and for which purpose; kept whatever happens to server or sign-in.
-import type { CreateMission, Geofence, Mission, ReplaceGeofence, Terrain, TerrainClass, Trajectory, TrajectoryCheck } from '../api/schema';
+import type {
+  Circle,
+  CreateMission,
+  Geofence,
+  Mission,
+  ReplaceGeofence,
+  Terrain,
+  TerrainClass,
+  Trajectory,
+  TrajectoryCheck,
+  Waypoints,
+} from '../api/schema';
 import { Problem, ask, sentence } from '../api/client';
 import type { DraftState } from '../address';
 import { Draft, RADIUS_MIN_M, type DraftKind } from '../map/draft';
@@ -339,7 +350,8 @@ export class Editor {
     if (!trajectory || !site || !purpose) return false;
     if (purpose.what !== 'mission' && purpose.what !== 'replace') return false;
     if (purpose.what === 'replace') {
-      return this.#send(`/v1/missions/${purpose.mission.id}/replace`, 'POST', { trajectory });
+      const replacement = this.#planned(trajectory, this.robot);
+      return this.#send(`/v1/missions/${purpose.mission.id}/replace`, 'POST', { trajectory: replacement });
     }
     const body = this.missionFor(this.robot);
     if (!body) return false;
@@ -356,11 +368,25 @@ export class Editor {
     return {
       site,
       robot,
-      trajectory,
+      trajectory: this.#planned(trajectory, robot),
       priority: this.priority,
       start_policy: this.startPolicy,
       link_policy: link,
     } as CreateMission;
+  }
+
+  /** The trajectory with the start of its dry run, so that the robot plans what was shown. */
+  #planned(trajectory: Trajectory, robot: string): Trajectory {
+    const { check } = this;
+    if (!check || this.isChecking || robot !== this.robot || check.start_source === 'trajectory') {
+      return trajectory;
+    }
+    const withStart = <T extends Circle | Waypoints>(of: T): T => ({
+      ...of,
+      options: { ...of.options, expected_start: check.start },
+    });
+    if ('circle' in trajectory) return { circle: withStart(trajectory.circle) };
+    return { waypoints: withStart(trajectory.waypoints) };
   }
 
   async saveTerrain(): Promise<boolean> {
