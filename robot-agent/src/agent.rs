@@ -26,9 +26,9 @@ use crate::clock::{SharedClock, SystemClock};
 use crate::config::AgentConfig;
 use crate::control_loop::BRAKING_MAX;
 use crate::control_loop::channels::{AgentEnds, LoopEnds, Shared, loop_channels};
+use crate::control_loop::frame::notes;
 use crate::control_loop::tick::LoopCore;
 use crate::dispatcher::Dispatcher;
-use crate::drive::simulated::SimulatedDriveError;
 use crate::fleet::{self, Identity, LinkError};
 use crate::geometry::control_model;
 use crate::knowledge::{Missions, SiteCell};
@@ -38,12 +38,13 @@ use crate::online::Online;
 use crate::outbox::{Outbox, OutboxError};
 use crate::realtime::{RealtimeError, lock_memory};
 use crate::recorder::Recorder;
-use crate::recording::frame::notes;
 use crate::recording::{RecordWriter, RunHead};
 use crate::reporter::{Reporter, log_losses};
 use crate::safety::Safety;
 use crate::safety::latch_file::LatchFile;
 use crate::service_manager::{self, Teller};
+use crate::sim::drive::SimulatedDriveError;
+use crate::start_error::StartError;
 use crate::state_rate::PublishRate;
 use crate::supervisor::{PartEnded, Supervisor};
 
@@ -51,41 +52,6 @@ use crate::supervisor::{PartEnded, Supervisor};
 const LAST_UPLOAD_MAX: Duration = Duration::from_secs(1);
 /// Interval of the checks for records that still wait.
 const LAST_UPLOAD_POLL: Duration = Duration::from_millis(10);
-
-/// Why an agent could not start.
-#[derive(Debug, thiserror::Error)]
-pub enum StartError {
-    /// The robot's model is impossible.
-    #[error("the robot's model is impossible")]
-    Model(#[from] RobotModelError),
-    /// The endpoint of the server or of the robot's bus is invalid.
-    #[error(transparent)]
-    Link(#[from] LinkError),
-    /// The simulated base could not be made.
-    #[error(transparent)]
-    Drive(#[from] SimulatedDriveError),
-    /// The outbox could not be opened.
-    #[error(transparent)]
-    Outbox(#[from] OutboxError),
-    /// The mission memory could not be read.
-    #[error(transparent)]
-    Memory(#[from] MemoryError),
-    /// Traces cannot be sent.
-    #[error(transparent)]
-    Tracing(#[from] TelemetryError),
-    /// The operating system does not give the configured priority, or does not lock the memory.
-    #[error(transparent)]
-    Realtime(#[from] RealtimeError),
-    /// A thread could not be started.
-    #[error("no thread for the {part}")]
-    Thread {
-        /// Name of the part.
-        part: &'static str,
-        /// Error of the operating system.
-        #[source]
-        source: std::io::Error,
-    },
-}
 
 /// Starts agents.
 #[derive(Debug)]

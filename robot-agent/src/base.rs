@@ -7,19 +7,20 @@ use std::time::Duration;
 
 use tread_control::robot::RobotModel;
 
-use crate::agent::StartError;
 use crate::clock::SharedClock;
 use crate::config::{AgentConfig, DriveConfig, SimulatedConfig};
 use crate::control_loop;
 use crate::control_loop::channels::Shared;
 use crate::control_loop::tick::LoopCore;
+use crate::control_loop::watchdog;
 use crate::drive::Drive;
 use crate::drive::ros2::Ros2Drive;
 use crate::drive::ros2::bus::Bus;
 use crate::drive::ros2::refusal::Counts;
-use crate::drive::simulated::{SimMode, SimulatedDrive, SimulatedDriveError};
 use crate::realtime::raise_priority;
-use crate::safety::watchdog;
+use crate::ros2_status::Outward;
+use crate::sim::drive::{SimMode, SimulatedDrive, SimulatedDriveError};
+use crate::start_error::StartError;
 use crate::supervisor::Supervisor;
 
 /// A base before its loop is started.
@@ -83,7 +84,11 @@ impl Base {
         let no_thread = |part| move |source| StartError::Thread { part, source };
         let mut threads = Vec::new();
         if let Some(mut bus) = self.bus {
-            bus.tell_of(shared, self.counts.unwrap_or_default(), &config.robot);
+            if let Some(settings) = bus.outward_settings().cloned() {
+                let (shared, counts) = (Arc::clone(shared), self.counts.unwrap_or_default());
+                let robot = config.robot.to_string();
+                bus.publish(Box::new(Outward::new(settings, shared, counts, robot)));
+            }
             // It ends when the loop drops its drive.
             let running = supervisor.spawn_thread("robot's bus", move || bus.run());
             threads.push(running.map_err(no_thread("robot's bus"))?);

@@ -11,6 +11,7 @@
 //!                                                                 └ refused: hold released
 //! ```
 
+pub(crate) mod answers;
 mod planning;
 mod traces;
 
@@ -45,7 +46,7 @@ use crate::control_loop::site_view::SiteView;
 use crate::fleet::{Commands, IncomingCommand};
 use crate::knowledge::{Missions, SiteCell};
 use crate::missions::{ActiveMission, CancelDecision, OfferDecision};
-use crate::safety::{Safety, answers};
+use crate::safety::Safety;
 use crate::state_rate::PublishRate;
 
 /// Capacity of the queue of offers; the server repeats an offer that finds it full.

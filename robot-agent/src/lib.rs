@@ -46,15 +46,17 @@ mod realtime;
 mod recorder;
 mod recording;
 mod reporter;
+mod ros2_status;
 mod safety;
 mod service_manager;
+pub mod start_error;
 mod state_rate;
 mod supervisor;
 
 pub use agent::{Agent, RunningAgent};
 pub use config::AgentConfig;
+pub use config::recording::{FILE_MIB_RANGE, FILES_RANGE, RecordingConfig};
 pub use control_loop::channels::Fault;
 pub use program::{command_line, run_from_args};
 pub use realtime::{PRIORITY_RANGE, RealtimeConfig, RealtimeError};
-pub use recording::{FILE_MIB_RANGE, FILES_RANGE, RecordingConfig};
 pub use supervisor::PartEnded;

@@ -79,26 +79,6 @@ const SERVER_RULES: [(&str, &[&str]); 18] = [
     ("webhooks", &["app", "db", "fleet", "http"]),
 ];
 
-/// Modules that still need each other, by crate and parent. A line goes when its cycle is gone;
-/// none is added.
-const KNOWN_CYCLES: &[(&str, &str, &[&str])] = &[
-    ("control", "estimation", &["offsets", "regression", "sums"]),
-    (
-        "robot-agent",
-        "",
-        &[
-            "agent",
-            "base",
-            "config",
-            "control_loop",
-            "drive",
-            "recording",
-            "safety",
-            "sim",
-        ],
-    ),
-];
-
 /// What one module names.
 #[derive(Debug, Default)]
 struct Module {
@@ -379,28 +359,12 @@ fn no_code_reads_the_folder_in_which_it_was_compiled() {
 
 #[test]
 fn no_modules_need_each_other() {
-    let mut known: BTreeMap<(String, String), BTreeSet<String>> = BTreeMap::new();
-    for (name, parent, within) in KNOWN_CYCLES {
-        let within = within.iter().map(|name| (*name).to_owned()).collect();
-        known.insert(((*name).to_owned(), (*parent).to_owned()), within);
-    }
     let mut wrong = Vec::new();
     for name in CRATES {
-        for (parent, cycle) in cycles(&modules_of(name)) {
-            let listed = known.remove(&(name.to_owned(), parent.clone()));
-            if listed.as_ref() != Some(&cycle.within) {
-                let Cycle { within, path } = cycle;
-                wrong.push(format!(
-                    "{name}, {parent:?}: {within:?} ({path}); listed: {listed:?}"
-                ));
-            }
+        for (parent, Cycle { within, path }) in cycles(&modules_of(name)) {
+            wrong.push(format!("{name}, {parent:?}: {within:?} ({path})"));
         }
     }
-    wrong.extend(
-        known
-            .keys()
-            .map(|(name, parent)| format!("{name}, {parent:?}: no cycle is left, remove its line")),
-    );
     assert!(
         wrong.is_empty(),
         "modules need each other:\n{}",

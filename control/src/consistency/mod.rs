@@ -306,8 +306,8 @@ impl Monitor {
         let turned_rad = wrap_angle_rad(newest.heading_rad - rest_at.heading_rad);
         let (position_m, heading_rad) = self.fixes.std_devs();
         let stays = rest_at.point().distance_m(newest.point())
-            <= REST_SPREAD_M.max(REST_DEVIATIONS * position_m)
-            && turned_rad.abs() <= REST_SPREAD_RAD.max(REST_DEVIATIONS * heading_rad);
+            <= REST_DISTANCE_MAX_M.max(REST_DEVIATIONS * position_m)
+            && turned_rad.abs() <= REST_TURN_MAX_RAD.max(REST_DEVIATIONS * heading_rad);
         if !stays {
             self.rest_at = None;
         }
@@ -322,8 +322,8 @@ const REST_M_S: f64 = 0.02;
 const REST_RAD_S: f64 = 0.05;
 /// Maximum distance of a stopped robot's fixes from the first one, metres and radians, or in
 /// standard deviations of a fix if that is more.
-const REST_SPREAD_M: f64 = 0.3;
-const REST_SPREAD_RAD: f64 = 0.1;
+const REST_DISTANCE_MAX_M: f64 = 0.3;
+const REST_TURN_MAX_RAD: f64 = 0.1;
 const REST_DEVIATIONS: f64 = 7.0;
 
 /// Window in which the turn gain is learned, seconds ago: a fault is found sooner than that.

@@ -15,7 +15,7 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use super::{BLOCK_S, SensorNoise, SensorSample, ValueWithDeviation};
+use super::{BLOCK_S, SensorNoise, SensorSample, ValueWithStdDev};
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
 /// Number of blocks of a window, over whose path the slope is assumed constant.
@@ -132,10 +132,10 @@ impl ApparentMass {
     }
 
     /// Returns q with the standard deviation of its noise; `None` before the robot has accelerated.
-    pub(super) fn value(&self) -> Option<ValueWithDeviation> {
+    pub(super) fn value(&self) -> Option<ValueWithStdDev> {
         let (information, weighted) = self.window.eliminated();
         let information = self.information + information;
-        (information > 0.0).then(|| ValueWithDeviation {
+        (information > 0.0).then(|| ValueWithStdDev {
             value: (self.weighted + weighted) / information,
             std_dev: information.sqrt().recip(),
         })

@@ -7,7 +7,7 @@ use super::types::Curvature;
 use super::window::{SampleSpan, TurnMeans, TurnWindow};
 use super::{
     BLOCK_S, RIM_SPEED_MIN_M_S, SLIP_LINEAR_FIRST_MAX, SLIP_LINEAR_MAX, SensorNoise, SensorSample,
-    THETA_FIRST, ValueWithDeviation,
+    THETA_FIRST, ValueWithStdDev,
 };
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
@@ -156,7 +156,7 @@ pub(super) struct Block {
     pub(super) turn_noise: f64,
     /// Friction coefficient that was used, minus two standard deviations.
     pub(super) mu_seen: f64,
-    pub(super) rolling_resistance: Option<ValueWithDeviation>,
+    pub(super) rolling_resistance: Option<ValueWithStdDev>,
 }
 
 impl Block {
@@ -404,7 +404,7 @@ impl BlockBuilder {
         let mean_mu = 0.5 * (self.left_mu + self.right_mu) / count;
         let resistance =
             (force.is_some() && has_acceleration && lateral < STRAIGHT_SLIP_MAX).then(|| {
-                ValueWithDeviation {
+                ValueWithStdDev {
                     value: (mean_mu - longitudinal_mu) * mean_m_s.signum(),
                     std_dev: (noise.torque_mu * std::f64::consts::FRAC_1_SQRT_2)
                         .hypot(noise.accelerometer_m_s2 / GRAVITY_M_S2)

@@ -37,6 +37,7 @@ mod contacts;
 mod curved;
 mod excitation;
 mod expectation;
+mod ground_offsets;
 mod identification;
 mod longitudinal;
 mod offsets;
@@ -68,7 +69,7 @@ use sums::Sums;
 pub use types::{
     CommonError, Estimate, EstimatorPrior, IdentifiedRobot, IdentifiedValue, ModelUncertainty,
     PayloadChange, SensorNoise, SensorSample, ThetaMeasurement, TyrePrior, UpdateOutcome,
-    ValueWithDeviation,
+    ValueWithStdDev,
 };
 
 /// Duration of a block, over which samples are averaged, seconds.
@@ -491,13 +492,13 @@ impl Estimator {
 
     /// Returns the torque scale times the true mass over the model's mass: the prior combined with
     /// the apparent mass from torques and accelerations.
-    fn torque_scale(&self) -> ValueWithDeviation {
+    fn torque_scale(&self) -> ValueWithStdDev {
         let uncertainty = &self.uncertainty;
         // Errors of the torque constants scale the forces; each side has its own, and the force
         // difference contains half of each. Errors of the radii cancel: the torque is too high by
         // the same ratio by which the rim speed beside it is too low.
         let constants = self.noise.torque_gain_ratio * std::f64::consts::FRAC_1_SQRT_2;
-        let known = ValueWithDeviation {
+        let known = ValueWithStdDev {
             value: 1.0 + uncertainty.payload_ratio,
             std_dev: constants
                 .hypot(uncertainty.mass_ratio)
@@ -516,7 +517,7 @@ impl Estimator {
         let values = [known.value, apparent.value - self.tyres.rotor_ratio];
         let sum = weights[0] + weights[1];
         let value = (weights[0] * values[0] + weights[1] * values[1]) / sum;
-        ValueWithDeviation {
+        ValueWithStdDev {
             value,
             std_dev: sum.sqrt().recip(),
         }

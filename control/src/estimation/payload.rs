@@ -5,7 +5,7 @@
 //! that of the tyres has the standard deviation [`UNMODELLED_RATIO`].
 
 use super::apparent_mass::ApparentMass;
-use super::{PayloadChange, SensorNoise, SensorSample, ValueWithDeviation};
+use super::{PayloadChange, SensorNoise, SensorSample, ValueWithStdDev};
 use crate::robot::RobotModel;
 
 /// Minimum duration of a standstill in which a robot may be loaded, seconds.
@@ -29,7 +29,7 @@ pub(super) struct PayloadMonitor {
     /// Apparent mass since the last long standstill.
     since: ApparentMass,
     /// Apparent mass before it, over all drives with the same load.
-    before: Option<ValueWithDeviation>,
+    before: Option<ValueWithStdDev>,
     standing_s: f64,
     change: Option<PayloadChange>,
     reported_s: f64,
@@ -75,22 +75,22 @@ impl PayloadMonitor {
 
     /// Returns the apparent mass since the last long standstill; None if its standard deviation is
     /// too large.
-    fn present(&self) -> Option<ValueWithDeviation> {
+    fn present(&self) -> Option<ValueWithStdDev> {
         let value = self.since.value()?;
         let std_dev = value.std_dev.hypot(UNMODELLED_RATIO);
-        (std_dev < COMPARED_STD_DEV_MAX).then_some(ValueWithDeviation { std_dev, ..value })
+        (std_dev < COMPARED_STD_DEV_MAX).then_some(ValueWithStdDev { std_dev, ..value })
     }
 
     /// Returns the apparent mass with the present load, from the drives before and since the last
     /// long standstill; they are independent but for the errors that windows do not eliminate.
-    fn known(&self) -> Option<ValueWithDeviation> {
+    fn known(&self) -> Option<ValueWithStdDev> {
         let (Some(before), Some(present)) = (self.before, self.present()) else {
             return self.present().or(self.before);
         };
         let weights = [before.std_dev.powi(-2), present.std_dev.powi(-2)];
         let sum = weights[0] + weights[1];
         // The errors that windows do not eliminate do not average out.
-        Some(ValueWithDeviation {
+        Some(ValueWithStdDev {
             value: (weights[0] * before.value + weights[1] * present.value) / sum,
             std_dev: sum.sqrt().recip().max(UNMODELLED_RATIO),
         })

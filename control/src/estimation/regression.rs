@@ -27,7 +27,7 @@ const SIGNIFICANCE_MIN: f64 = 6.0;
 /// Minimum number of rows for testing the assumed noise by the residuals.
 const INFLATION_ROWS: f64 = 15.0;
 /// Prior standard deviation of the rolling resistance coefficient.
-const ROLLING_SPREAD: f64 = 0.02;
+const ROLLING_STD_DEV: f64 = 0.02;
 /// Relative model error of the effect of curvature in rows on accelerations, which use the measured
 /// variation of slip within their time, and κ to second order.
 const BEND_SHARE: f64 = 0.04;
@@ -106,7 +106,7 @@ impl Normal {
     pub(super) fn with_resistance(mut self, offsets: &OffsetKnowledge, theta: f64) -> Self {
         if !offsets.knows_resistance {
             let resistance = (index::RESISTANCE, index::RESISTANCE);
-            self.matrix[resistance] += (theta * ROLLING_SPREAD).powi(-2);
+            self.matrix[resistance] += (theta * ROLLING_STD_DEV).powi(-2);
         }
         self
     }

@@ -1,6 +1,6 @@
 //! Additive sums over blocks, independent of their order.
 
-use super::ValueWithDeviation;
+use super::ValueWithStdDev;
 use super::block::Block;
 use super::offsets::OffsetKnowledge;
 use super::rows::{Channel, Row, index};
@@ -174,15 +174,15 @@ impl Sums {
     /// Returns the rolling resistance coefficient; `None` before enough straight driving. Its
     /// standard deviation includes that of the accelerometer's offset over gravity, `offset_mu`,
     /// which does not average out.
-    pub(super) fn rolling_resistance(&self, offset_mu: f64) -> Option<ValueWithDeviation> {
-        (self.resistance_count >= RESISTANCE_BLOCKS_MIN).then(|| ValueWithDeviation {
+    pub(super) fn rolling_resistance(&self, offset_mu: f64) -> Option<ValueWithStdDev> {
+        (self.resistance_count >= RESISTANCE_BLOCKS_MIN).then(|| ValueWithStdDev {
             value: self.resistance / self.resistance_count,
             std_dev: (self.resistance_noise.sqrt() / self.resistance_count).hypot(offset_mu),
         })
     }
 
     /// Returns the ratio of effective to geometric track width; `None` before enough turning.
-    pub(super) fn effective_track(&self, offsets: &OffsetKnowledge) -> Option<ValueWithDeviation> {
+    pub(super) fn effective_track(&self, offsets: &OffsetKnowledge) -> Option<ValueWithStdDev> {
         if self.track_count < 1.0 || self.track_square <= 0.0 {
             return None;
         }
@@ -196,6 +196,6 @@ impl Sums {
             + (common.std_dev * self.track_offset[0] / self.track_square).powi(2)
             + (difference.std_dev * self.track_offset[1] / self.track_square).powi(2);
         let std_dev = variance.sqrt();
-        (std_dev < TRACK_STD_DEV_MAX * value).then_some(ValueWithDeviation { value, std_dev })
+        (std_dev < TRACK_STD_DEV_MAX * value).then_some(ValueWithStdDev { value, std_dev })
     }
 }

@@ -301,9 +301,9 @@ pub struct IdentifiedRobot {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PayloadChange {
     /// Apparent mass relative to the model's mass, before the standstill.
-    pub before: ValueWithDeviation,
+    pub before: ValueWithStdDev,
     /// Apparent mass relative to the model's mass, since the standstill.
-    pub after: ValueWithDeviation,
+    pub after: ValueWithStdDev,
 }
 
 /// Estimates of the present ground and of the robot.
@@ -320,9 +320,9 @@ pub struct Estimate {
     /// Rolling resistance coefficient; `None` before enough straight driving with torque.
     pub rolling_resistance_ratio: Option<f64>,
     /// Mean relative error of the nominal rolling radii, positive if they are too large.
-    pub radius_offset: ValueWithDeviation,
+    pub radius_offset: ValueWithStdDev,
     /// Right minus left relative error of the nominal rolling radii.
-    pub radius_difference: ValueWithDeviation,
+    pub radius_difference: ValueWithStdDev,
     /// Fraction of blocks beyond the linear range of slip, among those with sufficient speed.
     pub saturation_share: f64,
     /// Number of samples dropped because they were not finite or not plausible.
@@ -335,7 +335,7 @@ pub struct Estimate {
 
 /// An estimated value with its standard deviation.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct ValueWithDeviation {
+pub struct ValueWithStdDev {
     /// Estimated value.
     pub value: f64,
     /// Standard deviation of its error.

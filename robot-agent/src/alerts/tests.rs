@@ -3,7 +3,7 @@ use std::time::Duration;
 use tread_api::friction::ROBOT_BIAS_RATIO;
 use tread_api::site::Cell;
 use tread_control::consistency::Unit;
-use tread_control::estimation::ValueWithDeviation;
+use tread_control::estimation::ValueWithStdDev;
 use tread_control::tracking::ThetaKnowledge;
 
 use super::*;
@@ -132,7 +132,7 @@ fn a_base_that_started_again_and_a_second_commander_are_alerts() {
 
 #[test]
 fn a_robot_that_was_unloaded_is_an_alert_with_both_masses() {
-    let apparent = |value| ValueWithDeviation {
+    let apparent = |value| ValueWithStdDev {
         value,
         std_dev: 0.012,
     };

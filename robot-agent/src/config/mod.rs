@@ -6,7 +6,7 @@ mod estimation;
 mod file;
 mod place;
 mod realtime;
-mod recording;
+pub(crate) mod recording;
 mod ros2;
 
 use std::path::{Path, PathBuf};
@@ -24,12 +24,11 @@ pub(crate) use place::place;
 use place::place_at;
 
 use crate::drive::ros2::settings::{Effort, Ros2Settings};
-use crate::drive::simulated::{Individual, Stall};
 use crate::geometry::{control_model, paper_robot};
 use crate::membership::{Membership, MembershipFileError};
 use crate::outbox;
 use crate::realtime::RealtimeConfig;
-use crate::recording::RecordingConfig;
+use crate::sim::drive::{Individual, Stall};
 use crate::sim::faults::Fault;
 use crate::sim::scenario::{BUILT_IN_NAME, Scenario, ScenarioError};
 use crate::sim::trace::Trace;

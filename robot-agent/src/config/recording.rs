@@ -1,12 +1,29 @@
 //! Checks `[recording]` of `robot.toml`.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use super::ConfigError;
 use super::file::RecordingFile;
-use crate::recording::{
-    FILE_MIB_DEFAULT, FILE_MIB_RANGE, FILES_DEFAULT, FILES_RANGE, RecordingConfig,
-};
+
+/// Permitted size of a file, MiB.
+pub const FILE_MIB_RANGE: std::ops::RangeInclusive<u64> = 1..=4_096;
+/// Permitted number of files.
+pub const FILES_RANGE: std::ops::RangeInclusive<usize> = 2..=1_000;
+/// Default size of a file, MiB.
+const FILE_MIB_DEFAULT: u64 = 64;
+/// Default number of files.
+const FILES_DEFAULT: usize = 16;
+
+/// Destination and size of records.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct RecordingConfig {
+    /// Folder of the files.
+    pub folder: PathBuf,
+    /// Size at which a file is closed and the next one begun, bytes.
+    pub file_bytes: u64,
+    /// Number of files that are kept, of all runs together.
+    pub files: usize,
+}
 
 /// Returns the destination of records; `None` if recording is off.
 ///

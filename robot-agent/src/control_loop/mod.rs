@@ -7,6 +7,7 @@
 pub(crate) mod active;
 pub(crate) mod channels;
 pub(crate) mod driven;
+pub(crate) mod frame;
 mod gain;
 pub(crate) mod job;
 mod outgoing;
@@ -20,6 +21,7 @@ pub(crate) mod slip;
 pub(crate) mod standing;
 pub(crate) mod surface;
 pub(crate) mod tick;
+pub(crate) mod watchdog;
 
 use std::time::Duration;
 

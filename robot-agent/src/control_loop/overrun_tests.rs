@@ -19,10 +19,11 @@ use super::overrun::{LATE_AFTER, LATE_MAX, Overrun, RELEASE_AFTER};
 use super::tests::{LINE, ORIGIN, bench_at, one_ground, site_of};
 use super::tick::LoopCore;
 use crate::clock::{SharedClock, SystemClock};
-use crate::drive::simulated::{Individual, SimMode, SimulatedDrive};
+use crate::dispatcher::answers;
 use crate::drive::{Drive, Feedback};
 use crate::safety::stop::StopState;
-use crate::safety::{Safety, answers, microseconds};
+use crate::safety::{Safety, microseconds};
+use crate::sim::drive::{Individual, SimMode, SimulatedDrive};
 use crate::testing::{Bench, PERIOD, boot};
 
 const MILLISECOND: Duration = Duration::from_millis(1);

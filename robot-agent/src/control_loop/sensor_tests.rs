@@ -13,7 +13,7 @@ use uuid::Uuid;
 
 use super::channels::EndReason;
 use super::tests::{CIRCLE, LINE, ORIGIN, bench_at, one_ground, site_of};
-use crate::drive::simulated::{Individual, SimMode, SimulatedDrive};
+use crate::sim::drive::{Individual, SimMode, SimulatedDrive};
 use crate::sim::faults::{Channel, Fault, FaultKind};
 use crate::sim::scenario::{Scenario, ScenarioText};
 use crate::testing::{Bench, PERIOD};

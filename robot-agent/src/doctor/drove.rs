@@ -13,7 +13,7 @@ use crate::drive::ros2::settings::{MotionOf, Ros2Settings};
 
 /// Smallest sum of squared deviations of the positions' times for a speed, s²: ten fixes in a
 /// second.
-const PLACES_SPREAD_MIN_S2: f64 = 0.8;
+const TIMES_SQUARES_MIN_S2: f64 = 0.8;
 /// Number of the last wheel messages whose mean is the speed gained.
 const LAST_SPEEDS: usize = 10;
 /// Number of blocks into which the steady part of a motion is divided, to give means a standard
@@ -430,7 +430,7 @@ fn speed_of(places: &[(f64, Position)]) -> Option<f64> {
         squares += (at_s - middle_s).powi(2);
         products += (at_s - middle_s) * (forward_m - middle_m);
     }
-    (squares > PLACES_SPREAD_MIN_S2).then(|| products / squares)
+    (squares > TIMES_SQUARES_MIN_S2).then(|| products / squares)
 }
 
 #[cfg(test)]

@@ -4,7 +4,6 @@
 //! estimator sees all of a 200 Hz sensor in a 100 Hz loop. Neither call may block or allocate.
 
 pub mod ros2;
-pub mod simulated;
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};

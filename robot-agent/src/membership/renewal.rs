@@ -21,7 +21,7 @@ const RETRY_MAX: Duration = Duration::from_mins(5);
 /// Longest uninterrupted wait, since the wall clock may be set meanwhile.
 const LOOK_EVERY: Duration = Duration::from_mins(10);
 /// Time over which the renewals of a fleet are spread when all robots must renew at once.
-const SPREAD_MAX: Duration = Duration::from_secs(5);
+const JITTER_MAX: Duration = Duration::from_secs(5);
 
 /// The server's statement on the authorities that robots shall trust.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -64,7 +64,7 @@ fn spread(present: &Membership) -> Duration {
     let names = [present.site.as_str(), present.robot.as_str()];
     let bits = TrustId::of(names.map(str::as_bytes)).bits();
     let share = f64::from(u32::try_from(bits >> 32).unwrap_or_default()) / f64::from(u32::MAX);
-    SPREAD_MAX.mul_f64(share)
+    JITTER_MAX.mul_f64(share)
 }
 
 /// State of the renewal task.
@@ -240,7 +240,7 @@ mod tests {
         };
         let pauses: Vec<Duration> = (0..1_000).map(|number| spread(&robot(number))).collect();
         for tenth in 0..10 {
-            let within = SPREAD_MAX / 10 * tenth..SPREAD_MAX / 10 * (tenth + 1);
+            let within = JITTER_MAX / 10 * tenth..JITTER_MAX / 10 * (tenth + 1);
             let count = pauses
                 .iter()
                 .filter(|pause| within.contains(*pause))

@@ -11,8 +11,8 @@ use tread_ros2::cdr::{CdrError, ENCAPSULATION_BYTES, Sequence, decode, decode_up
 use tread_ros2::messages::Text;
 use tread_ros2::messages::tread::{LoopSample, LoopTick, sample_bits, tick_bits};
 
-use super::frame::TickFrame;
 use crate::control_loop::channels::Fault;
+use crate::control_loop::frame::TickFrame;
 use crate::drive::{Battery, Feedback, SAMPLES_MAX, SensorSample, StatedNoise};
 
 /// Largest text that is decoded, bytes: a site of many polygons, a prior of many cells.

@@ -8,7 +8,6 @@
 //! Foxglove and ROS tools. A disk that is full or fails costs only the record.
 
 mod codec;
-pub(crate) mod frame;
 mod read;
 pub(crate) mod replay;
 pub(crate) mod report;
@@ -26,10 +25,11 @@ use tread_api::wire::hello::SiteDefinition;
 use tread_control::estimation::EstimatorPrior;
 
 use crate::config::AgentConfig;
+use crate::config::recording::RecordingConfig;
 use crate::control_loop::channels::Hold;
+use crate::control_loop::frame::NotedCommand;
 use crate::control_loop::job::JobOrigin;
 use crate::safety::LoopView;
-use frame::NotedCommand;
 pub(crate) use writer::RecordWriter;
 
 /// Version of the record format. Format 1 had JSON messages, a tick without
@@ -40,14 +40,6 @@ pub(crate) const FORMAT: u32 = 2;
 pub(crate) const FORMATS_READ: std::ops::RangeInclusive<u32> = 1..=FORMAT;
 /// Version of this agent.
 pub(crate) const VERSION: &str = env!("CARGO_PKG_VERSION");
-/// Permitted size of a file, MiB.
-pub const FILE_MIB_RANGE: std::ops::RangeInclusive<u64> = 1..=4_096;
-/// Permitted number of files.
-pub const FILES_RANGE: std::ops::RangeInclusive<usize> = 2..=1_000;
-/// Default size of a file, MiB.
-pub(crate) const FILE_MIB_DEFAULT: u64 = 64;
-/// Default number of files.
-pub(crate) const FILES_DEFAULT: usize = 16;
 
 /// Topics of a record.
 pub(crate) mod topics {
@@ -73,17 +65,6 @@ pub(crate) mod topics {
     pub(crate) const PLAN: &str = "/tread/plan";
     /// State of the loop, once a second.
     pub(crate) const DIAGNOSTICS: &str = "/tread/diagnostics";
-}
-
-/// Destination and size of records.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct RecordingConfig {
-    /// Folder of the files.
-    pub folder: PathBuf,
-    /// Size at which a file is closed and the next one begun, bytes.
-    pub file_bytes: u64,
-    /// Number of files that are kept, of all runs together.
-    pub files: usize,
 }
 
 /// Head of a file: the run, and the configuration of its loop.

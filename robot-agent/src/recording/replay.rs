@@ -16,10 +16,10 @@ use tread_ros2::cdr::{decode, encode};
 use tread_ros2::messages::tread::{LoopSample, LoopTick, tick_bits};
 
 use super::codec::Difference;
-use super::frame::{Note, Notes, TickFrame, notes};
 use super::read::{Entry, ReadError, Run};
 use super::{CommandMessage, CommandRecord, FORMAT, RunHead, VERSION, codec};
 use crate::control_loop::channels::{AgentEnds, COMMANDS_MAX, LoopCommand, loop_channels};
+use crate::control_loop::frame::{Note, Notes, TickFrame, notes};
 use crate::control_loop::job::{Job, JobOrigin};
 use crate::control_loop::segments::Moment;
 use crate::control_loop::site_view::SiteView;

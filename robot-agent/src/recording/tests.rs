@@ -23,7 +23,8 @@ use uuid::Uuid;
 
 use super::read::ReadError;
 use super::replay::{ReplayError, Replayed, replay};
-use super::{RecordingConfig, RunHead, codec, report, topics};
+use super::{RunHead, codec, report, topics};
+use crate::config::recording::RecordingConfig;
 use crate::sim::scenario::Scenario;
 use crate::testing::{Bench, boot, site_of};
 

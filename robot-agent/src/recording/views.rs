@@ -16,8 +16,8 @@ use tread_ros2::messages::{
     Twist, TwistStamped, TwistWithCovariance, Vector3,
 };
 
-use super::frame::TickFrame;
 use crate::control_loop::channels::Fault;
+use crate::control_loop::frame::TickFrame;
 use crate::drive::SensorSample;
 
 /// Frame of positions and poses.

@@ -29,11 +29,10 @@ use tread_ros2::messages::{
     PoseWithCovarianceStamped, Text, TwistStamped,
 };
 
-use super::frame::{Note, NotedCommand, Notes, TickFrame};
-use super::{
-    CommandMessage, CommandRecord, RecordingConfig, RunHead, SafetyMessage, codec, topics, views,
-};
+use super::{CommandMessage, CommandRecord, RunHead, SafetyMessage, codec, topics, views};
 use crate::clock::SharedClock;
+use crate::config::recording::RecordingConfig;
+use crate::control_loop::frame::{Note, NotedCommand, Notes, TickFrame};
 use crate::control_loop::job::JobOrigin;
 use crate::safety::LoopView;
 

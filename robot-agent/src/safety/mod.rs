@@ -10,12 +10,10 @@
 //! enters any queue. It is answered once the loop has set its target to zero under it
 //! ([`Safety::confirm_stop`]) and the latch is on disk.
 
-pub(crate) mod answers;
 pub(crate) mod latch_file;
 pub(crate) mod limits;
 pub(crate) mod operator;
 pub(crate) mod stop;
-pub(crate) mod watchdog;
 
 use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};

@@ -20,7 +20,7 @@ use tread_control::robot::RobotModel;
 use uuid::Uuid;
 
 use crate::control_loop::channels::EndReason;
-use crate::drive::simulated::COMMAND_TIMEOUT;
+use crate::sim::drive::COMMAND_TIMEOUT;
 use crate::sim::scenario::Scenario;
 use crate::testing::{Bench, boot, site_of};
 

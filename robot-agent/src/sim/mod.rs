@@ -5,6 +5,7 @@
 //! common simulated time.
 
 pub mod battery;
+pub mod drive;
 pub mod faults;
 pub mod ground;
 pub mod scenario;

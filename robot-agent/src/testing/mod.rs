@@ -32,23 +32,25 @@ use tread_control::robot::RobotModel;
 use uuid::Uuid;
 
 use crate::clock::{ManualClock, SharedClock};
+use crate::config::recording::RecordingConfig;
 use crate::control_loop::channels::{
     AgentEnds, ClosedSegment, EndReason, Hold, LoopCommand, LoopEvent, loop_channels,
 };
 use crate::control_loop::driven::Driven;
+use crate::control_loop::frame::{Notes, notes};
 use crate::control_loop::job::{Job, JobOrigin};
 use crate::control_loop::segments::Moment;
 use crate::control_loop::site_view::SiteView;
 use crate::control_loop::tick::LoopCore;
 pub use crate::control_loop::tick::listener::{Heard, Listener};
-use crate::drive::simulated::{Individual, SimMode, SimulatedDrive, SimulatedDriveError};
+use crate::dispatcher::answers;
 use crate::drive::{Drive, Feedback, SILENT_AFTER_MAX, SensorSample};
 use crate::geometry::paper_robot;
 use crate::recorder::segment_of;
-use crate::recording::frame::{Notes, notes};
-use crate::recording::{FORMAT, RecordWriter, RecordingConfig, RunHead, VERSION};
+use crate::recording::{FORMAT, RecordWriter, RunHead, VERSION};
 use crate::safety::stop::StopState;
-use crate::safety::{Safety, answers, microseconds};
+use crate::safety::{Safety, microseconds};
+use crate::sim::drive::{Individual, SimMode, SimulatedDrive, SimulatedDriveError};
 use crate::sim::scenario::Scenario;
 
 /// Period of the bench's ticks.

@@ -21,10 +21,10 @@ use super::safety::Gated;
 use super::sensing::Sensed;
 use super::{STANDING, Tick};
 use crate::control_loop::channels::{LoopCommand, Shared, Snapshot};
+use crate::control_loop::frame::{NoteTaker, TickFrame, TickInputs, TickOutputs};
 use crate::control_loop::site_view::SiteView;
 use crate::control_loop::standing::{Motion, StandingWatch};
 use crate::drive::{Battery, Feedback, StatedNoise};
-use crate::recording::frame::{NoteTaker, TickFrame, TickInputs, TickOutputs};
 
 /// Input of the stage.
 #[derive(Debug)]

@@ -9,7 +9,6 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use tracing::{debug, info, warn};
-use tread_api::ids::RobotId;
 use tread_control::measured::WheelSpeeds;
 use tread_ros2::bridge;
 use tread_ros2::messages::MessageType;
@@ -25,11 +24,9 @@ use super::command;
 use super::command_watch::CommandWatch;
 use super::inlet::{Inlet, Numbering};
 use super::outlet::{COMMAND_SILENCE_MAX, Outlet};
-use super::outward::{LOOK_EVERY, Outward, OutwardTopic};
-use super::refusal::Counts;
-use super::settings::{BusMode, BusSettings, Ros2Settings, Scheme};
+use super::outward::{LOOK_EVERY, OutwardSource, OutwardTopic};
+use super::settings::{BusMode, BusSettings, OutwardSettings, Ros2Settings, Scheme};
 use crate::clock::SharedClock;
-use crate::control_loop::channels::Shared;
 use crate::fleet::{LinkError, zenoh_failed};
 
 /// Timeout of a series of attempts to connect, after which the thread checks whether it shall end,
@@ -98,7 +95,7 @@ pub struct Bus {
     pub(super) inlets: Vec<Arc<Inlet>>,
     outlet: Arc<Outlet>,
     clock: SharedClock,
-    outward: Option<Outward>,
+    outward: Option<Box<dyn OutwardSource>>,
     command_watch: Arc<CommandWatch>,
 }
 
@@ -169,11 +166,14 @@ impl Bus {
         })
     }
 
-    /// Enables publishing the agent's state, if the settings name its topics.
-    pub(crate) fn tell_of(&mut self, shared: &Arc<Shared>, counts: Arc<Counts>, robot: &RobotId) {
-        let settings = self.settings.outward.clone();
-        self.outward = settings
-            .map(|settings| Outward::new(settings, Arc::clone(shared), counts, robot.to_string()));
+    /// Returns the settings of the topics on which the agent publishes its state.
+    pub(crate) fn outward_settings(&self) -> Option<&OutwardSettings> {
+        self.settings.outward.as_ref()
+    }
+
+    /// Publishes the messages of this source.
+    pub(crate) fn publish(&mut self, source: Box<dyn OutwardSource>) {
+        self.outward = Some(source);
     }
 
     /// Runs the session until the loop's end of the outlet is closed. For a thread of its own.
@@ -184,7 +184,7 @@ impl Bus {
         while let Some(session) = self.open() {
             info!(endpoint, "on the robot's bus at `{endpoint}`");
             match self.declare(&session, outward.is_some()) {
-                Ok(declared) => self.speak(&declared, outward.as_mut()),
+                Ok(declared) => self.speak(&declared, outward.as_deref_mut()),
                 Err(cause) => {
                     let cause = &cause as &dyn std::error::Error;
                     warn!(error = cause, "the robot's bus cannot be used");
@@ -386,7 +386,7 @@ impl Bus {
 
     /// Writes commands, and publishes the agent's state on a thread of its own, so that no command
     /// waits for a path of hundreds of points.
-    fn speak(&self, declared: &Declared, outward: Option<&mut Outward>) {
+    fn speak(&self, declared: &Declared, outward: Option<&mut (dyn OutwardSource + 'static)>) {
         std::thread::scope(|scope| {
             let telling = outward.and_then(|outward| {
                 let body = || self.tell(&declared.outward_topics, outward);
@@ -404,10 +404,10 @@ impl Bus {
     }
 
     /// Publishes the agent's state when due, until the loop's end of the outlet is closed.
-    fn tell(&self, outward_topics: &[(OutwardTopic, Writer)], outward: &mut Outward) {
+    fn tell(&self, outward_topics: &[(OutwardTopic, Writer)], outward: &mut dyn OutwardSource) {
         while !self.outlet.is_closed() {
             let (now, wall_ns) = (self.clock.monotonic(), self.clock.host_wall_ns());
-            outward.step(now, wall_ns, |topic, bytes| {
+            outward.step(now, wall_ns, &mut |topic, bytes| {
                 let writer = outward_topics.iter().find(|(known, _)| *known == topic);
                 if let Some(Err(cause)) = writer.map(|(_, writer)| writer.put(bytes, wall_ns)) {
                     debug!("cannot publish {topic:?}: {cause}");

@@ -10,10 +10,10 @@ use tread_api::terrain::{Terrain, TerrainClass};
 
 use super::{Reading, SiteView};
 
-/// Assumed spread of θ between terrains of one class, as a fraction of θ, while few are measured.
-const SPREAD_RATIO: f64 = 0.4;
+/// Assumed standard deviation of θ between terrains of one class, as a fraction of θ, while few are measured.
+const BETWEEN_TERRAINS_RATIO: f64 = 0.4;
 /// Number of terrains by which this assumption is weighted.
-const SPREAD_TERRAINS: f64 = 2.0;
+const ASSUMED_TERRAINS: f64 = 2.0;
 
 /// Measured friction of every terrain of a site.
 pub(super) struct Classes {
@@ -84,8 +84,8 @@ impl Classes {
         let count = f64::from(terrains);
         let plain = known.iter().map(|(theta, _)| theta).sum::<f64>() / count;
         let apart: f64 = known.iter().map(|(theta, _)| (theta - plain).powi(2)).sum();
-        let assumed = SPREAD_TERRAINS * (SPREAD_RATIO * plain).powi(2);
-        let between_variance = (assumed + apart) / (SPREAD_TERRAINS + count - 1.0);
+        let assumed = ASSUMED_TERRAINS * (BETWEEN_TERRAINS_RATIO * plain).powi(2);
+        let between_variance = (assumed + apart) / (ASSUMED_TERRAINS + count - 1.0);
         let weight = |std_dev: f64| (between_variance + std_dev * std_dev).recip();
         let sum: f64 = known.iter().map(|&(_, std_dev)| weight(std_dev)).sum();
         let theta = known

@@ -10,7 +10,7 @@ use tread_control::measured::WheelSpeeds;
 use tread_control::plant::{Plant, PlantError, PlantSpec};
 use tread_control::robot::RobotModel;
 
-use super::{Battery, Drive, Feedback, SensorSample};
+use crate::drive::{Battery, Drive, Feedback, SensorSample};
 use crate::sim::battery::SimulatedBattery;
 use crate::sim::faults::{Fault, Faults};
 use crate::sim::ground::GroundMap;

@@ -10,15 +10,15 @@ use tread_ros2::cdr::decode;
 use tread_ros2::rmw::{Attachment, Generation, gid, topic_key};
 use zenoh::Wait as _;
 
-use super::super::Ros2Drive;
-use super::super::bus::session_config;
-use super::super::refusal::{Refusal, Source};
-use super::super::settings::{BusMode, Ros2Settings};
-use super::super::tests as drive_tests;
 use super::*;
 use crate::clock::{SharedClock, SystemClock};
 use crate::control_loop::channels::Fault;
 use crate::control_loop::hold_tests::driving;
+use crate::drive::ros2::Ros2Drive;
+use crate::drive::ros2::bus::session_config;
+use crate::drive::ros2::refusal::{Refusal, Source};
+use crate::drive::ros2::settings::{BusMode, Ros2Settings};
+use crate::drive::ros2::tests as drive_tests;
 
 /// Longest wait for what is to be heard.
 const WAIT_MAX: Duration = Duration::from_secs(10);

@@ -7,12 +7,12 @@ use tread_api::safety::Driver;
 use tread_api::wire::reply::{CommandRefusal, CommandRefusalCode};
 use tread_api::wire::safety::{AcquireLease, ClearStop, ExternalLimit, ReleaseLease, Stop};
 
-use super::limits::LimitRefusal;
-use super::operator::LeaseRefusal;
-use super::stop::ClearRefusal;
-use super::{NotCleared, Safety};
 use crate::clock::SharedClock;
 use crate::control_loop::channels::Shared;
+use crate::safety::limits::LimitRefusal;
+use crate::safety::operator::LeaseRefusal;
+use crate::safety::stop::ClearRefusal;
+use crate::safety::{NotCleared, Safety};
 
 /// Largest age of the loop's snapshot by which the robot may count as stopped.
 const STANDS_AGE_MAX: Duration = Duration::from_millis(500);
