@@ -35,17 +35,17 @@ use tread_api::wire::reply::{
 use tread_api::wire::safety::{AcquireLease, LeaseCommand, ReleaseLease};
 use tread_api::wire::{self, Refusal, WireError};
 use tread_control::geometry::Pose;
-use tread_control::plan::Plan;
 use tread_control::robot::RobotModel;
 use tread_telemetry::Telemetry;
 
+use self::planning::{active_of, given_of};
 use crate::clock::SharedClock;
 use crate::control_loop::channels::Hold;
-use crate::control_loop::channels::{GivenPlan, LoopCommand, Shared};
+use crate::control_loop::channels::{LoopCommand, Shared};
 use crate::control_loop::site_view::SiteView;
 use crate::fleet::{Commands, IncomingCommand};
 use crate::knowledge::{Missions, SiteCell};
-use crate::missions::{ActiveMission, CancelDecision, OfferDecision};
+use crate::missions::{CancelDecision, OfferDecision};
 use crate::safety::Safety;
 use crate::state_rate::PublishRate;
 
@@ -84,24 +84,6 @@ fn refused<T>(code: CommandRefusalCode, detail: impl Into<String>) -> Result<T, 
 
 fn loop_is_busy() -> CommandRefusal {
     CommandRefusal::new(CommandRefusalCode::NotReady, "the control loop is busy")
-}
-
-fn active_of(offer: &Offer, plan: PlanSummary) -> ActiveMission {
-    ActiveMission {
-        mission: offer.mission,
-        revision: offer.revision,
-        plan_hash: offer.plan_hash,
-        plan,
-        is_cancelled: false,
-    }
-}
-
-fn given_of(offer: &Offer, plan: Arc<Plan>) -> GivenPlan {
-    GivenPlan {
-        mission: offer.mission,
-        revision: offer.revision,
-        plan,
-    }
 }
 
 impl Dispatcher {

@@ -11,8 +11,8 @@ use tread_api::ids::MissionId;
 use tread_control::geometry::{Pose, wrap_angle_rad};
 use tread_ros2::cdr::{Sequence, encode};
 use tread_ros2::messages::{
-    DiagnosticArray, DiagnosticStatus, Float64MultiArray, KeyValue, Level, Message as _,
-    MultiArrayDimension, MultiArrayLayout, Path,
+    DiagnosticArray, DiagnosticStatus, Float64MultiArray, KeyValue, Level, MultiArrayDimension,
+    MultiArrayLayout,
 };
 
 use crate::control_loop::channels::{GivenPlan, Shared, Snapshot};

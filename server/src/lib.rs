@@ -30,28 +30,22 @@ mod logging;
 mod maintenance;
 pub mod metrics;
 pub mod oidc;
+mod program;
 mod rate_limit;
 mod service_manager;
 mod setup;
 pub mod supervisor;
 pub mod webhooks;
 
-use std::ffi::OsString;
 use std::net::SocketAddr;
-use std::process::ExitCode;
 use std::sync::Arc;
-use std::time::Duration;
 
 use anyhow::Context as _;
-use clap::Parser as _;
 use jiff::SignedDuration;
-use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use tokio::net::TcpListener;
-use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 use tracing::{info, warn};
 use tread_api::ids::SiteId;
-use tread_api::startup::give_zenoh_threads;
 use tread_telemetry::Telemetry;
 
 use self::app::enrolment::EnrolmentService;
@@ -72,11 +66,9 @@ use self::fleet::{Fleet, Security};
 use self::http::serve::Serving;
 use self::http::tls::{Issuer, Tls};
 use self::identity::address::TrustedProxies;
+pub use self::program::{command_line, run, run_from_args};
 use self::supervisor::Supervisor;
 use self::webhooks::{Resolver, Sender, SystemResolver};
-
-/// Maximum wait for blocking threads after all tasks have stopped; then they are abandoned.
-const RUNTIME_STOP_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Entry point that starts servers.
 #[derive(Debug, Clone, Copy)]
@@ -396,128 +388,4 @@ impl RunningServer {
         drop(self.lock);
         Ok(stopped?)
     }
-}
-
-/// Tread's server: missions to robots, friction from robots, one REST API.
-#[derive(Debug, clap::Parser)]
-#[command(name = "tread-server", version = build::long_version(), args_conflicts_with_subcommands = true)]
-struct Command {
-    #[command(subcommand)]
-    action: Option<Action>,
-    #[command(flatten)]
-    server: ServerArgs,
-}
-
-#[derive(Debug, clap::Subcommand)]
-enum Action {
-    /// Exit with 0 if the server on this machine answers, for health checks of containers
-    Health(health::HealthArgs),
-    /// Write a configuration where there is none, and create the first admin's token
-    Init(Box<init::InitArgs>),
-    /// Say what is wrong with configuration, files, database, certificates, ports, clock and limits
-    Doctor(doctor::DoctorArgs),
-    /// Accept the next certificate that each robot presents, for use after restoring a backup of
-    /// the database
-    ForgetCertificates(init::ForgetArgs),
-    /// Back the database and the fleet's authority up into one file, beside a running server
-    Backup(maintenance::backup::BackupArgs),
-    /// Restore a backup; no server may run on the database
-    Restore(maintenance::restore::RestoreArgs),
-    /// Show or apply the changes of the database's schema that this version needs
-    Migrate(maintenance::migrate::MigrateArgs),
-}
-
-/// Returns the definition of the command line, for documentation and tests.
-pub fn command_line() -> clap::Command {
-    <Command as clap::CommandFactory>::command()
-}
-
-/// Runs the whole program with these arguments, the first of which is the program's name.
-///
-/// Prints errors on standard error and returns the exit code: 0 after a requested stop, 1 after a
-/// failure, 2 for invalid arguments.
-pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
-    let command = match Command::try_parse_from(arguments) {
-        Ok(command) => command,
-        Err(error) => {
-            // Help and version are printed here too. A failure to print has no other output.
-            let _ = error.print();
-            return ExitCode::from(u8::try_from(error.exit_code()).unwrap_or(2));
-        }
-    };
-    let ended = match command.action {
-        Some(Action::Health(args)) => run_beside_server(health::run(args)),
-        Some(Action::Init(args)) => run_beside_server(init::run(*args)),
-        Some(Action::Doctor(args)) => match run_beside_server(doctor::run(args)) {
-            Ok(true) => Ok(()),
-            // The findings have been printed.
-            Ok(false) => return ExitCode::FAILURE,
-            Err(error) => Err(error),
-        },
-        Some(Action::ForgetCertificates(args)) => run_beside_server(init::forget(args)),
-        Some(Action::Backup(args)) => run_beside_server(maintenance::backup::run(args)),
-        Some(Action::Restore(args)) => run_beside_server(maintenance::restore::run(args)),
-        Some(Action::Migrate(args)) => {
-            return maintenance::migrate::exit_code(run_beside_server(maintenance::migrate::run(
-                args,
-            )));
-        }
-        None => run(&command.server),
-    };
-    match ended {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            eprintln!("error: {error:#}");
-            ExitCode::FAILURE
-        }
-    }
-}
-
-/// Raises the soft limit of open files to the hard limit, because the usual soft limit is below the
-/// maximum number of connections.
-fn raise_file_limit() {
-    let raised = getrlimit(Resource::RLIMIT_NOFILE)
-        .and_then(|(_, most)| setrlimit(Resource::RLIMIT_NOFILE, most, most));
-    if let Err(error) = raised {
-        warn!("cannot raise the limit of open files: {error}");
-    }
-}
-
-fn run_beside_server<T>(command: impl Future<Output = anyhow::Result<T>>) -> anyhow::Result<T> {
-    let runtime = tokio::runtime::Builder::new_current_thread()
-        .enable_all()
-        .build()?;
-    runtime.block_on(command)
-}
-
-/// Runs the server until SIGTERM, SIGINT or the failure of a vital task.
-///
-/// # Errors
-/// The configuration is invalid, the server cannot start, or a vital task failed.
-pub fn run(args: &ServerArgs) -> anyhow::Result<()> {
-    let threads = give_zenoh_threads();
-    logging::start(args)?;
-    if let Err(cause) = threads {
-        warn!("zenoh has few threads, robots may be mute for seconds after a cut: {cause}");
-    }
-    let config = Config::load(args)?;
-    raise_file_limit();
-    let runtime = tokio::runtime::Builder::new_multi_thread()
-        .enable_all()
-        .build()?;
-    let ended = runtime.block_on(async {
-        let mut terminate = signal(SignalKind::terminate())?;
-        let mut interrupt = signal(SignalKind::interrupt())?;
-        let server = Server::start(config).await?;
-        server.tell_service_manager();
-        tokio::select! {
-            _ = terminate.recv() => info!("asked to stop"),
-            _ = interrupt.recv() => info!("asked to stop"),
-            () = server.failed() => {}
-        }
-        server.stop().await
-    });
-    // A thread that blocks in a system call must not keep the process from ending.
-    runtime.shutdown_timeout(RUNTIME_STOP_TIMEOUT);
-    ended
 }

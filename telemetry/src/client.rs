@@ -1,5 +1,5 @@
-//! HTTP client of the exporter: ours, with rustls and ring, on the program's runtime. The exporter
-//! calls it on a thread of its own, which has none.
+//! HTTP client of the exporter, with rustls and ring. It runs on the program's runtime, because the
+//! exporter calls it on a separate thread without a runtime.
 
 use std::time::Duration;
 
@@ -7,7 +7,7 @@ use async_trait::async_trait;
 use opentelemetry_http::{Bytes, HttpClient, HttpError, Request, Response};
 use tokio::runtime::Handle;
 
-/// Maximum length of a collector's answer; it says at most which spans it did not take.
+/// Maximum length of a collector's answer; it only lists the spans that the collector rejected.
 const ANSWER_BYTES_MAX: usize = 64 * 1_024;
 
 #[derive(Debug, Clone)]
@@ -19,7 +19,7 @@ pub(super) struct Client {
 impl Client {
     /// Creates a client that sends on the present runtime.
     pub(super) fn new(timeout: Duration) -> Result<Self, reqwest::Error> {
-        // The first call counts; all install the same provider.
+        // Only the first call has an effect; all install the same provider.
         let _first = rustls::crypto::ring::default_provider().install_default();
         let http = reqwest::Client::builder()
             .timeout(timeout)

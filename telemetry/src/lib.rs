@@ -1,7 +1,7 @@
-//! Traces of missions in the OpenTelemetry format, sent by OTLP over HTTP to a collector.
+//! Sends traces of missions in the OpenTelemetry format to a collector, by OTLP over HTTP.
 //!
-//! Off unless `[tracing]` names an endpoint. A span is handed to a bounded queue and sent by a thread
-//! of its own; a collector that is away costs the spans and nothing else.
+//! It sends nothing unless `[tracing]` names an endpoint. A separate thread sends the spans from a
+//! bounded queue. If the collector is away, spans are lost; missions are not affected.
 //!
 //! ```text
 //! mission ────────────────────────────────────────── server, when it has ended
@@ -34,7 +34,7 @@ use uuid::Uuid;
 
 use self::client::Client;
 
-/// Maximum number of spans that wait to be sent; beyond it spans are dropped.
+/// Maximum number of spans in the queue; further spans are dropped.
 const SPANS_WAITING_MAX: usize = 2_048;
 /// Maximum number of spans of one request.
 const BATCH_SPANS_MAX: usize = 256;
@@ -42,17 +42,17 @@ const BATCH_SPANS_MAX: usize = 256;
 const SEND_EVERY: Duration = Duration::from_secs(1);
 /// Maximum time for a request.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(5);
-/// Maximum time for the last spans at the stop.
+/// Maximum time to send the last spans when the program stops.
 const STOP_TIMEOUT: Duration = Duration::from_secs(2);
-/// Maximum number of missions that are remembered.
+/// Maximum number of missions whose place in the trace is kept.
 const OPEN_MAX: usize = 16;
 
-/// `[tracing]`: where traces are sent.
+/// `[tracing]`: the collector that receives the traces.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TracingConfig {
     /// URL of the collector's OTLP/HTTP endpoint for traces, such as
-    /// `http://127.0.0.1:4318/v1/traces`; without it nothing is traced.
+    /// `http://127.0.0.1:4318/v1/traces`; without it no traces are sent.
     pub endpoint: Option<String>,
 }
 
@@ -65,10 +65,10 @@ pub enum TelemetryError {
          as http://127.0.0.1:4318/v1/traces"
     )]
     Endpoint(String),
-    /// The HTTP client could not be made.
+    /// The HTTP client could not be created.
     #[error("the client for `tracing.endpoint` cannot be made")]
     Client(#[source] reqwest::Error),
-    /// The exporter could not be made.
+    /// The exporter could not be created.
     #[error("the exporter for `tracing.endpoint` cannot be made: {0}")]
     Exporter(String),
 }
@@ -104,13 +104,13 @@ struct Inner {
     open: Mutex<VecDeque<Open>>,
 }
 
-/// A mission that goes on, with its place in the trace.
+/// A mission that has not ended, with its place in the trace.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Open {
     mission: MissionId,
-    /// Span below which the rest of it happens.
+    /// Parent of its further spans.
     pub parent: TraceParent,
-    /// Time at which it began to drive; `None` before that.
+    /// Time at which the robot began to drive it; `None` before that.
     pub began_at: Option<Timestamp>,
 }
 
@@ -121,13 +121,13 @@ pub struct Span {
     pub name: &'static str,
     /// Its trace, and its parent; `None` for the root, whose identifier the trace gives.
     pub place: Place,
-    /// Begin.
+    /// Time of its begin.
     pub began_at: Timestamp,
-    /// End; not before the begin.
+    /// Time of its end, not before its begin.
     pub ended_at: Timestamp,
-    /// Attributes, with the names of the log's fields.
+    /// Attributes, which have the same names as fields of the log.
     pub attributes: Vec<(&'static str, String)>,
-    /// Reason if it failed.
+    /// Reason of its failure, if it failed.
     pub failure: Option<String>,
 }
 
@@ -148,12 +148,12 @@ pub enum Place {
 impl Place {
     /// Returns the place of a new span below a parent.
     pub fn below(parent: TraceParent) -> Self {
-        // An identifier of version 4 is never zero.
+        // A UUID of version 4 is never zero.
         let span_id = Uuid::new_v4().as_u64_pair().0;
         Self::Below { parent, span_id }
     }
 
-    /// Returns the trace context for what happens within the span.
+    /// Returns the trace context for children of the span.
     pub fn context(self) -> TraceParent {
         match self {
             Self::Root(root) => root,
@@ -163,8 +163,8 @@ impl Place {
 }
 
 impl Telemetry {
-    /// Starts to send to the collector; does nothing without an endpoint. Must be called
-    /// within a tokio runtime, which then sends.
+    /// Starts to send to the collector; does nothing without an endpoint. Call it within a tokio
+    /// runtime, because the client sends on that runtime.
     ///
     /// # Errors
     /// [`TelemetryError`]: the endpoint is no URL, or no client can be made.
@@ -208,14 +208,14 @@ impl Telemetry {
         self.inner.is_some()
     }
 
-    /// Hands a span to the queue. Does not wait.
+    /// Puts a span into the queue, without waiting.
     pub fn send(&self, span: Span) {
         if let Some(inner) = &self.inner {
             inner.processor.on_end(data(span, inner.scope.clone()));
         }
     }
 
-    /// Remembers the span below which the rest of a mission happens.
+    /// Keeps the parent of a mission's further spans.
     pub fn remember(&self, mission: MissionId, parent: TraceParent) {
         let began_at = self.open(mission).began_at;
         self.keep(Open {
@@ -225,7 +225,7 @@ impl Telemetry {
         });
     }
 
-    /// Remembers when a mission began to drive.
+    /// Keeps the time at which the robot began to drive a mission.
     pub fn began(&self, mission: MissionId, at: Timestamp) {
         self.keep(Open {
             began_at: Some(at),
@@ -243,7 +243,7 @@ impl Telemetry {
         }
     }
 
-    /// Returns what was remembered of a mission; the root of its trace if nothing was.
+    /// Returns the kept place of a mission, or the root of its trace if none is kept.
     pub fn open(&self, mission: MissionId) -> Open {
         let unknown = Open {
             mission,
@@ -258,7 +258,7 @@ impl Telemetry {
         found.copied().unwrap_or(unknown)
     }
 
-    /// Sends what waits, and ends. Blocks for at most two seconds.
+    /// Sends the spans in the queue, and ends. Blocks for at most two seconds.
     pub fn stop(&self) {
         if let Some(inner) = &self.inner
             && let Err(error) = inner.processor.shutdown_with_timeout(STOP_TIMEOUT)

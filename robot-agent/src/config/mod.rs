@@ -23,6 +23,7 @@ use file::{DriveFile, DriveKind, FileConfig};
 pub(crate) use place::place;
 use place::place_at;
 
+use self::recording::RecordingConfig;
 use crate::drive::ros2::settings::{Effort, Ros2Settings};
 use crate::geometry::{control_model, paper_robot};
 use crate::membership::{Membership, MembershipFileError};

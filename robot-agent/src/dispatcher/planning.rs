@@ -10,9 +10,10 @@ use tread_control::geometry::Pose;
 use tread_control::plan::Plan;
 
 use super::{Dispatcher, refused};
-use crate::control_loop::job::Job;
-use crate::control_loop::job::JobOrigin;
+use crate::control_loop::channels::GivenPlan;
+use crate::control_loop::job::{Job, JobOrigin};
 use crate::geometry::{control_pose, wire_pose};
+use crate::missions::ActiveMission;
 
 /// A plan, its summary, and the job that tracks it.
 pub(super) struct Planned {
@@ -28,6 +29,26 @@ fn silence_max(policy: LinkPolicy) -> Result<Option<Duration>, String> {
         LinkPolicy::Continue => None,
         LinkPolicy::StopAfter { silence_s } => Some(Duration::from_secs_f64(silence_s)),
     })
+}
+
+/// Returns the active mission of an accepted offer.
+pub(super) fn active_of(offer: &Offer, plan: PlanSummary) -> ActiveMission {
+    ActiveMission {
+        mission: offer.mission,
+        revision: offer.revision,
+        plan_hash: offer.plan_hash,
+        plan,
+        is_cancelled: false,
+    }
+}
+
+/// Returns the plan of an accepted offer, for other threads.
+pub(super) fn given_of(offer: &Offer, plan: Arc<Plan>) -> GivenPlan {
+    GivenPlan {
+        mission: offer.mission,
+        revision: offer.revision,
+        plan,
+    }
 }
 
 impl Dispatcher {

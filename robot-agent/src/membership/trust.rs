@@ -112,15 +112,15 @@ impl Trust {
     /// rotation.
     ///
     /// # Errors
-    /// The authority's certificate cannot be parsed.
+    /// The certificate of the trusted authority cannot be parsed.
     pub fn client_config(
         &self,
         fleet: Option<&str>,
     ) -> Result<Option<ClientConfig>, rustls::Error> {
         let mut of_fleet = RootCertStore::empty();
-        for certificate in fleet.map(certificates).transpose()?.into_iter().flatten() {
-            of_fleet.add(certificate)?;
-        }
+        // A damaged certificate of the fleet vouches for nobody; the renewal replaces it.
+        let readable = fleet.and_then(|pem| certificates(pem).ok());
+        of_fleet.add_parsable_certificates(readable.into_iter().flatten());
         let builder = ClientConfig::builder_with_provider(provider());
         let builder = builder.with_safe_default_protocol_versions()?;
         let config = match self {

@@ -15,7 +15,6 @@ pub(crate) mod salvage;
 pub(crate) mod views;
 mod writer;
 
-use std::path::PathBuf;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};

@@ -7,6 +7,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 
 use tread_control::geometry::Point;
 use tread_ros2::cdr::decode;
+use tread_ros2::messages::Path;
 use tread_ros2::rmw::{Attachment, Generation, gid, topic_key};
 use zenoh::Wait as _;
 
@@ -51,7 +52,7 @@ type Messages = BTreeMap<OutwardTopic, Vec<u8>>;
 /// What is said at that moment.
 fn said(outward: &mut Outward, now: Duration) -> Messages {
     let mut messages = Messages::new();
-    outward.step(now, 1_500_000_000, |topic, bytes| {
+    outward.step(now, 1_500_000_000, &mut |topic, bytes| {
         let again = messages.insert(topic, bytes.to_vec());
         assert_eq!(again, None, "{topic:?} was said twice");
     });
@@ -297,7 +298,9 @@ fn heard_by_another(tells: bool, look: impl FnOnce(&OutwardSettings, &Observer))
     if tells {
         let shared = Arc::new(Shared::default());
         shared.note_server_heard(clock.monotonic());
-        bus.tell_of(&shared, drive.counts(), &"rover-1".parse().unwrap());
+        let settings = bus.outward_settings().cloned().unwrap();
+        let outward = Outward::new(settings, shared, drive.counts(), "rover-1".to_owned());
+        bus.publish(Box::new(outward));
     }
     let running = std::thread::spawn(move || bus.run());
     let observer = Observer::start(&settings);

@@ -4,7 +4,7 @@
 //! [`stop`], [`operator`] and [`limits`] are pure state machines. [`Safety`] owns them, stores the
 //! stop latch on disk ([`latch_file`]) and publishes what the loop needs in a [`SafetyCell`], which
 //! the loop reads without blocking. Every entry in the cell carries its expiry, so a tick that
-//! cannot read the cell prolongs nothing. [`watchdog`] watches the loop itself.
+//! cannot read the cell prolongs nothing. [`crate::control_loop::watchdog`] watches the loop itself.
 //!
 //! A stop takes effect when its message arrives: [`Safety::stop_now`] is called before the message
 //! enters any queue. It is answered once the loop has set its target to zero under it

@@ -1,4 +1,4 @@
-// Several sites: whoever looks at one is told what happens at the others.
+// Several sites: the page of one site shows the alerts of the others.
 import { afterAll, beforeAll, expect, test } from 'vitest';
 import type { Alert, Page as ApiPage, Stop } from './types';
 import { violations } from './checks';

@@ -6,6 +6,7 @@ pub mod backups;
 pub mod certificate;
 pub mod check;
 pub mod checkpoints;
+mod dependencies;
 pub mod enrolment;
 mod error;
 pub mod events;
@@ -51,12 +52,12 @@ use uuid::Uuid;
 
 use self::allowance::Allowances;
 use self::backups::Backups;
-use self::enrolment::{EnrolmentService, Membership};
+pub use self::dependencies::Dependencies;
+use self::enrolment::Membership;
 pub use self::error::AppError;
 use self::events::Hub;
 use self::friction::{MapNews, Pictures, Timelines, Views};
 use self::identity::Identity;
-use self::identity::people::People;
 use self::map::Maps;
 use self::missions::idempotency::InFlight;
 use self::presence::Presences;
@@ -70,8 +71,7 @@ use self::teleop::Holds;
 use self::watched::Watched;
 use self::webhooks::Webhooks;
 use crate::clock::Clock;
-use crate::config::webhooks::WebhooksConfig;
-use crate::config::{AuditConfig, FrictionConfig, StorageConfig};
+use crate::config::FrictionConfig;
 use crate::counters::Counters;
 pub use crate::db::DbError;
 use crate::db::sites::SiteRow;
@@ -129,53 +129,6 @@ struct Inner {
     telemetry: Telemetry,
     backups: Backups,
     restored: Restored,
-}
-
-/// Dependencies of use cases.
-#[derive(Debug)]
-pub struct Dependencies {
-    /// The database.
-    pub db: Db,
-    /// The clock.
-    pub clock: Clock,
-    /// Settings of the fusion of measurements.
-    pub friction: FrictionConfig,
-    /// Limits beyond which the storage counts as failing.
-    pub storage: StorageConfig,
-    /// Declared normalisations, which join robot models.
-    pub normalisations: Vec<Normalisation>,
-    /// Connections to the robots.
-    pub robots: RobotLink,
-    /// Service by which robots join; without it any client on the network may act as a robot.
-    pub enrolment: Option<EnrolmentService>,
-    /// Where webhooks may go.
-    pub webhooks: WebhooksConfig,
-    /// Sign-in of people at an OpenID provider; without it people sign in with tokens alone.
-    pub people: Option<People>,
-    /// Where the audit log is written beside the database.
-    pub audit: AuditConfig,
-    /// Sender of traces of missions; its default sends none.
-    pub telemetry: Telemetry,
-}
-
-impl Dependencies {
-    /// Returns dependencies on a database alone, with default settings and without a connection to
-    /// robots.
-    pub fn on_database(db: Db, clock: Clock) -> Self {
-        Self {
-            db,
-            clock,
-            friction: FrictionConfig::default(),
-            storage: StorageConfig::default(),
-            normalisations: Vec::new(),
-            robots: RobotLink::unconnected(Supervisor::new()),
-            enrolment: None,
-            webhooks: WebhooksConfig::default(),
-            people: None,
-            audit: AuditConfig::default(),
-            telemetry: Telemetry::default(),
-        }
-    }
 }
 
 impl App {
@@ -246,21 +199,6 @@ impl App {
         Self {
             inner: Arc::new(inner),
         }
-    }
-
-    /// Creates use cases without a connection to robots, for programs that work on the database
-    /// alone.
-    pub fn without_robots(
-        db: Db,
-        clock: Clock,
-        friction: FrictionConfig,
-        storage: StorageConfig,
-    ) -> Self {
-        Self::new(Dependencies {
-            friction,
-            storage,
-            ..Dependencies::on_database(db, clock)
-        })
     }
 
     fn normalisations(&self) -> &[Arc<Normalisation>] {

@@ -1,4 +1,4 @@
-//! Writes and reads archives, in pieces: memory does not grow with the database.
+//! Writes and reads archives in pieces, so that memory does not grow with the database.
 
 mod extraction;
 
@@ -25,7 +25,7 @@ const MANIFEST_SUM_NAME: &str = "manifest.sha256";
 pub const DATABASE_NAME: &str = "tread.db";
 /// Folder of the authority's entries.
 const AUTHORITY_FOLDER: &str = "authority/";
-/// Mode of archives and of what is extracted: they contain secrets.
+/// Mode of archives and of extracted files: they contain secrets.
 const MODE: u32 = 0o600;
 /// Size of the pieces in which files are read and written, bytes.
 const PIECE_BYTES: usize = 1024 * 1024;
@@ -64,7 +64,7 @@ pub enum ArchiveError {
         /// What is wrong.
         detail: String,
     },
-    /// The format is of a newer program.
+    /// A newer program wrote the format.
     #[error(
         "the backup has format {found}, made by version {version}; this program reads format {FORMAT} \
          and older: install version {version} or newer"
@@ -85,13 +85,13 @@ pub enum ArchiveError {
         name: String,
         /// Checksum in the manifest.
         expected: String,
-        /// Checksum of what was read.
+        /// Checksum of the content that was read.
         found: String,
     },
     /// The archive ends before its last entry.
     #[error("the backup ends too early: `{0}` is missing; take another backup")]
     Incomplete(String),
-    /// What was written does not read back.
+    /// The file on the disk differs from the written data.
     #[error("the backup `{}` does not read back as it was written: the disk is unreliable", .0.display())]
     NotReadBack(PathBuf),
 }
@@ -105,7 +105,7 @@ fn file_error(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Ar
     }
 }
 
-/// What is put into an archive.
+/// Content of an archive.
 #[derive(Debug)]
 pub struct Source<'source> {
     /// The manifest, with the checksums of everything else.
@@ -218,7 +218,7 @@ pub fn write(
     progress: &mut dyn FnMut(u64),
 ) -> Result<Archived, ArchiveError> {
     let partial = partial_name(target);
-    // Left behind by a process that was killed; the lock of backups excludes another writer.
+    // A killed process may have left it; the lock of backups excludes another writer.
     let _ = fs::remove_file(&partial);
     let written = write_new(&partial, source, encryption, progress).and_then(|archived| {
         read_back(&partial, &archived)?;
@@ -232,7 +232,7 @@ pub fn write(
     written
 }
 
-/// Returns the name of an archive that is not complete yet.
+/// Returns the name of an incomplete archive.
 pub fn partial_name(target: &Path) -> PathBuf {
     let mut name = target.file_name().unwrap_or_default().to_owned();
     name.push(".partial");
@@ -275,18 +275,18 @@ fn write_new(
     let mut file = Hashing::new(file);
     let (packed, copied) = thread::scope(|scope| {
         let file = &mut file;
-        // It takes the output, so that the command ends when the file cannot be written.
+        // It owns the output, so that the command ends if the file cannot be written.
         let copying = scope.spawn(move || io::copy(&mut output, file));
         let input = BufWriter::with_capacity(PIECE_BYTES, input);
         let packed = pack(input, partial, source, progress);
-        // Its input ends here, or it would wait for more.
+        // This closes the command's input; otherwise the command would wait for more.
         let packed = packed.and_then(|mut input| input.flush().map_err(failed()));
         (packed, copying.join())
     });
     let copied = copied.unwrap_or_else(|_panic| Err(io::Error::other("a thread panicked")));
     let status = child.wait().map_err(failed())?;
     copied.map_err(failed())?;
-    // When the command fails, a broken pipe is only what follows from that.
+    // If the command failed, the broken pipe is only a consequence.
     filter.check(status)?;
     packed?;
     let (file, archived) = file.done();
@@ -327,7 +327,7 @@ fn pack<W: Write>(
     tar.into_inner().map_err(failed())
 }
 
-/// Reader that reports how far it is.
+/// Reader that reports its progress.
 struct Counting<'progress, R> {
     inner: R,
     bytes: u64,
@@ -357,11 +357,11 @@ fn append<W: Write>(
     tar.append_data(&mut header, name, content.take(bytes))
 }
 
-/// Reads a file from the disk and compares it with what was written.
+/// Reads a file from the disk and compares it with the written data.
 fn read_back(partial: &Path, written: &Archived) -> Result<(), ArchiveError> {
     let file = File::open(partial).map_err(file_error("read", partial))?;
-    // Otherwise only the memory of the operating system would be read. Without it the check says
-    // less, and the backup is the same.
+    // Otherwise the check would only read the cache of the operating system. If the call fails, the
+    // check is weaker, but the backup is the same.
     let _ = posix_fadvise(&file, 0, 0, PosixFadviseAdvice::POSIX_FADV_DONTNEED);
     drop(file);
     let found = describe_file(partial, "")?;

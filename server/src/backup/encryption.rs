@@ -1,5 +1,5 @@
-//! Encryption of archives by a program of the operator's choice, such as `age` or `gpg`: an archive is
-//! written through its standard input, and read through its standard output.
+//! Encrypts and decrypts archives with a program of the operator's choice, such as `age` or `gpg`.
+//! The archive is piped through the program's standard input and standard output.
 
 use std::io::{self, BufReader, Read};
 use std::process::{Child, ChildStdout, Command, ExitStatus, Stdio};
@@ -21,7 +21,7 @@ pub enum EncryptionError {
     Failed {
         /// The command.
         command: String,
-        /// How it ended.
+        /// Its exit status.
         status: ExitStatus,
     },
 }
@@ -31,7 +31,7 @@ pub enum EncryptionError {
 pub struct Filter(pub String);
 
 impl Filter {
-    /// Starts the command, with its output piped.
+    /// Starts the command, and pipes its output.
     ///
     /// # Errors
     /// [`EncryptionError::Start`].
@@ -45,7 +45,7 @@ impl Filter {
         })
     }
 
-    /// Checks how the command ended.
+    /// Checks the exit status of the command.
     ///
     /// # Errors
     /// [`EncryptionError::Failed`].
@@ -60,11 +60,11 @@ impl Filter {
     }
 }
 
-/// Reader of an archive, through a command that decrypts it or not.
+/// Reader of an archive, with or without a command that decrypts it.
 pub enum Opening<R: Read> {
     /// Without a command.
     Plain(R),
-    /// The output of a command, which ends when this is dropped.
+    /// The output of a command; dropping this ends the command.
     Filtered(Filtered),
 }
 
@@ -87,7 +87,7 @@ impl Filtered {
 
 impl Drop for Filtered {
     fn drop(&mut self) {
-        // Both fail only if it has ended already.
+        // Both calls fail only if the command has already ended.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }

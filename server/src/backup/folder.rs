@@ -47,7 +47,7 @@ fn time_in(name: &str) -> Option<Timestamp> {
     Some(time.to_zoned(TimeZone::UTC).ok()?.timestamp())
 }
 
-/// Returns the complete backups of a folder, oldest first. Other files are left out.
+/// Returns the complete backups of a folder, oldest first. It ignores other files.
 ///
 /// # Errors
 /// The folder cannot be read.
@@ -72,10 +72,10 @@ pub fn list(folder: &Path) -> io::Result<Vec<Stored>> {
     Ok(found)
 }
 
-/// Removes the oldest backups of a folder beyond `keep`. Returns how many.
+/// Removes the oldest backups of a folder beyond `keep`. Returns their number.
 ///
 /// # Errors
-/// The folder cannot be read, or a file not be removed.
+/// The folder cannot be read, or a file cannot be removed.
 pub fn remove_old(folder: &Path, keep: usize) -> io::Result<usize> {
     let found = list(folder)?;
     let over = found.len().saturating_sub(keep);

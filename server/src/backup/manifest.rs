@@ -1,4 +1,4 @@
-//! The manifest of an archive: what made it, when, and what it contains.
+//! The manifest of an archive states its producer, its time and its content.
 
 use std::collections::BTreeMap;
 

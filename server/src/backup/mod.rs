@@ -1,11 +1,11 @@
-//! Backup archives: one file with a copy of the database, the fleet's certificate authority, and a
-//! manifest with the checksum of each of them.
+//! Backup archives. An archive is one file with a copy of the database, the fleet's certificate
+//! authority, and a manifest with the checksum of each.
 //!
-//! An archive is a tar file whose first entry is `manifest.json`. It may be encrypted by a program of
-//! the operator's choice. It is written under another name, read back, and renamed when it is
-//! complete.
+//! An archive is a tar file whose first entry is `manifest.json`. A program of the operator's
+//! choice may encrypt it. It gets a temporary name first; the server reads it back, and renames it
+//! when it is complete.
 //!
-//! This module knows files and no database. [`crate::app::backups`] makes backups.
+//! This module handles files and knows no database. [`crate::app::backups`] makes backups.
 
 pub mod archive;
 pub mod encryption;

@@ -1,4 +1,4 @@
-//! The fleet's authority, and the certificate of the REST API.
+//! Examines the fleet's authority and the certificate of the REST API.
 
 use std::path::Path;
 
@@ -32,7 +32,7 @@ pub(super) fn findings(examined: &Examined) -> Vec<Finding> {
         }
         None if examined.config.web.behind_https => findings.push(Finding::skipped(
             "certificate",
-            "it is that of the proxy: see there until when it is valid",
+            "the proxy has it: check its expiry there",
         )),
         None => findings.push(Finding::skipped(
             "certificate",
@@ -223,7 +223,7 @@ fn is_signed_by(one: &CertificateDer<'_>, next: &CertificateDer<'_>) -> bool {
     );
     match verified {
         Ok(_) => true,
-        // Another error than that of the signature or the name of the issuer.
+        // The error concerns neither the signature nor the name of the issuer.
         Err(error) => !matches!(
             error,
             webpki::Error::UnknownIssuer | webpki::Error::InvalidSignatureForPublicKey

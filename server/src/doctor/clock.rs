@@ -1,4 +1,5 @@
-//! The machine's clock: whether it is synchronised, and whether the database holds later times.
+//! Examines whether the machine's clock is synchronised, and whether the database holds later
+//! times.
 
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -8,10 +9,10 @@ use jiff::{SignedDuration, Timestamp};
 use super::Examined;
 use super::finding::Finding;
 
-/// File that systemd-timesyncd makes after its first synchronisation.
+/// File that systemd-timesyncd creates after its first synchronisation.
 const TIMESYNC_FILE: &str = "/run/systemd/timesync/synchronized";
-/// Time by which the database's newest time may be ahead of the clock: that of a step which the
-/// server bridges within seconds.
+/// Time by which the database's newest time may be ahead of the clock; the server bridges such a
+/// step within seconds.
 const AHEAD_MAX: SignedDuration = SignedDuration::from_secs(5);
 const SYNCHRONISE: &str = "set the clock, and have it synchronised: `apt-get install chrony`, or \
                            `timedatectl set-ntp true`";
@@ -34,7 +35,7 @@ pub(super) fn findings(examined: &Examined, newest: Option<Timestamp>) -> Vec<Fi
     findings
 }
 
-/// Returns a finding if the database holds times that are still to come.
+/// Returns a finding if the database holds times in the future.
 fn behind(now: Timestamp, newest: Timestamp) -> Option<Finding> {
     let ahead = newest.duration_since(now);
     (ahead > AHEAD_MAX).then(|| {
@@ -50,7 +51,7 @@ fn behind(now: Timestamp, newest: Timestamp) -> Option<Finding> {
     })
 }
 
-/// Returns whether the clock is synchronised; `None` if nothing on this machine tells.
+/// Returns whether the clock is synchronised; `None` if no program on this machine reports it.
 fn is_synchronised() -> Option<bool> {
     if Path::new(TIMESYNC_FILE).exists() {
         return Some(true);

@@ -1,4 +1,4 @@
-//! The database: its schema, and whether it can be read.
+//! Examines the schema of the database, and whether the database is readable.
 
 use jiff::Timestamp;
 
@@ -10,7 +10,7 @@ use crate::db::inspection::{InspectError, Inspection, Schema, inspect};
 const RESTORE: &str = "stop the server, keep the file, and restore a backup; or bring what can be \
                        read into a new file: `sqlite3 FILE .recover | sqlite3 NEW`";
 
-/// Returns the findings, and the newest time that the database holds.
+/// Returns the findings, and the newest time in the database.
 pub(super) async fn findings(examined: &Examined) -> (Vec<Finding>, Option<Timestamp>) {
     let path = &examined.config.database;
     let shown = path.display();
@@ -58,8 +58,8 @@ fn schema(shown: &str, inspection: &Inspection) -> Finding {
         Schema::Older { pending } => Finding::warning(
             "database",
             format!("`{shown}` is of an older version: {pending} migrations are pending"),
-            "back it up; the next start of this version brings it up to date, and an older one does \
-             not take it any more",
+            "back it up; the next start of this version migrates it, and older versions then \
+             refuse it",
         ),
         Schema::Newer(version) => Finding::problem(
             "database",
@@ -68,8 +68,8 @@ fn schema(shown: &str, inspection: &Inspection) -> Finding {
         ),
         Schema::Differs(version) => Finding::problem(
             "database",
-            format!("`{shown}` has another migration {version} than this version"),
-            "it was made by a build that was never released: take that one, or a backup",
+            format!("`{shown}` has another migration {version} than this program"),
+            "a build that was never released made it: use that build, or restore a backup",
         ),
     }
 }

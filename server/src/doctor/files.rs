@@ -1,4 +1,4 @@
-//! Folder of the database, its disk, and who may use the files.
+//! Examines the folder of the database, its disk, and the modes and owners of the files.
 
 use std::fs::{self, OpenOptions};
 use std::io::{self, Write as _};
@@ -13,7 +13,7 @@ use super::finding::Finding;
 use crate::config::TlsSource;
 use crate::config::credentials::is_passed;
 
-/// Bytes written to find out whether the disk takes them.
+/// Number of bytes written to test the disk.
 const TRIED_BYTES: usize = 16 * 1_024;
 const BYTES_PER_MIB: u64 = 1_024 * 1_024;
 /// Permissions of group and others.
@@ -38,7 +38,7 @@ fn folder_of(file: &Path) -> &Path {
     folder.unwrap_or(Path::new("."))
 }
 
-/// Examines whether the folder of the database takes files.
+/// Examines whether files can be created in the folder of the database.
 #[expect(
     clippy::wildcard_enum_match_arm,
     reason = "of all other errors the kernel log says more"
@@ -66,7 +66,7 @@ fn folder_finding(folder: &Path) -> Finding {
         );
     }
     match try_to_write(folder) {
-        Ok(()) => Finding::well("folder", format!("`{shown}` takes files")),
+        Ok(()) => Finding::well("folder", format!("files can be created in `{shown}`")),
         Err(error) => {
             let step = match error.kind() {
                 io::ErrorKind::PermissionDenied => format!(
@@ -76,7 +76,7 @@ fn folder_finding(folder: &Path) -> Finding {
                 io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => {
                     "make room on that disk; `df -h` and `df -i` show what is free".to_owned()
                 }
-                _ => "see `dmesg` for what the disk answers".to_owned(),
+                _ => "see `dmesg` for errors of the disk".to_owned(),
             };
             Finding::problem(
                 "folder",
@@ -98,7 +98,7 @@ fn try_to_write(folder: &Path) -> io::Result<()> {
         handle.sync_all()
     };
     let written = written();
-    // If it was not made there is nothing to remove; the error of the write is returned.
+    // The error of the write matters more; the removal fails if the file was never made.
     let _ = fs::remove_file(&file);
     written
 }
@@ -127,7 +127,7 @@ fn disk(examined: &Examined, folder: &Path) -> Finding {
         return Finding::problem(
             "disk",
             format!("the disk of `{shown}` is full"),
-            "make room; what robots measured waits with them, and the server goes on by itself",
+            "make room on the disk; robots keep their measurements, and the server continues by itself",
         );
     }
     if free_bytes < limit_bytes {
@@ -143,7 +143,7 @@ fn disk(examined: &Examined, folder: &Path) -> Finding {
     Finding::well("disk", format!("{free} MiB are free for `{shown}`"))
 }
 
-/// Examines who may read what is secret.
+/// Examines who may read the secrets.
 fn secrets(examined: &Examined) -> Vec<Finding> {
     let config = &examined.config;
     let mut secret: Vec<PathBuf> = Vec::new();
@@ -175,7 +175,7 @@ fn secrets(examined: &Examined) -> Vec<Finding> {
             findings.push(Finding::warning(
                 "file modes",
                 format!("the group of `{shown}` can use it, with the mode {mode:o}"),
-                format!("`chmod 600 {shown}`, unless that group may do everything"),
+                format!("`chmod 600 {shown}`, unless you trust every member of that group"),
             ));
         }
     }
@@ -188,14 +188,14 @@ fn secrets(examined: &Examined) -> Vec<Finding> {
     findings
 }
 
-/// Examines whether the files are of the user who asks, and can be read.
+/// Examines whether the files belong to the user who runs the doctor, and are readable.
 fn owners(examined: &Examined) -> Finding {
     let config = &examined.config;
     let mut files: Vec<PathBuf> = examined.config_file.iter().cloned().collect();
     files.push(config.database.clone());
     files.push(folder_of(&config.database).to_owned());
     if let Some(TlsSource::Files(tls)) = &config.tls {
-        // Root keeps credentials, and the service manager passes them.
+        // Root owns credentials, and the service manager passes them.
         let files_of_user = [&tls.certificate, &tls.key].into_iter();
         files.extend(files_of_user.filter(|file| !is_passed(file)).cloned());
     }

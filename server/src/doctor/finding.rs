@@ -1,31 +1,31 @@
-//! Findings of the doctor, each on one question.
+//! Findings of the doctor: each answers one question.
 
 use serde::Serialize;
 
-/// How much a finding matters.
+/// Severity of a finding.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub(super) enum Verdict {
     /// Nothing is wrong.
     Ok,
-    /// The server works, and somebody should act.
+    /// The server works, but somebody should act.
     Warning,
-    /// The server does not work, or not for everybody.
+    /// The server does not work, at least for some clients.
     Problem,
-    /// The question could not be examined, or does not arise.
+    /// The question could not be examined, or does not apply.
     Skipped,
 }
 
-/// Finding on one question.
+/// Answer to one question.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub(super) struct Finding {
     /// The question.
     pub(super) name: &'static str,
-    /// How much it matters.
+    /// The severity.
     pub(super) verdict: Verdict,
     /// Description for people.
     pub(super) text: String,
-    /// What to do, if anything.
+    /// The remedy, if one is needed.
     pub(super) next_step: Option<String>,
 }
 
@@ -70,7 +70,7 @@ impl Finding {
         }
     }
 
-    /// Returns whether it is no problem.
+    /// Returns whether the finding is no problem.
     pub(super) fn holds(&self) -> bool {
         self.verdict != Verdict::Problem
     }

@@ -1,10 +1,11 @@
-//! Limits of the operating system.
+//! Examines the limits of the operating system.
 
 use nix::sys::resource::{Resource, getrlimit};
 
 use super::finding::Finding;
 
-/// Open files that a server at its bounds needs: its connections, the robots' and their files.
+/// Number of open files that a fully loaded server needs: for its connections, those of robots, and
+/// their files.
 const FILES_NEEDED: u64 = 8_192;
 
 pub(super) fn findings() -> Vec<Finding> {

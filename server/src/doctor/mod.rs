@@ -1,8 +1,9 @@
-//! `tread-server doctor`: examines configuration, files, database, certificates, ports, clock and
-//! limits of a server, before its first start, beside a running one, or after it has failed.
+//! `tread-server doctor` examines configuration, files, database, certificates, ports, clock and
+//! limits of a server. It works before the first start, beside a running server and after a
+//! failure.
 //!
-//! It changes nothing: what it writes to find out whether it can is removed again, and the database
-//! is opened for reading. Each finding says what is wrong and what to do.
+//! It changes nothing: it removes its test file, and opens the database for reading only. Each
+//! finding states the fault and the remedy.
 
 mod certificates;
 mod clock;
@@ -40,7 +41,7 @@ pub(crate) struct DoctorArgs {
     json: bool,
 }
 
-/// What every check is given.
+/// Input of every check.
 struct Examined {
     config: Config,
     config_file: Option<PathBuf>,

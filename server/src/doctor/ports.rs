@@ -1,4 +1,4 @@
-//! The ports: free for the server, or held by it.
+//! Examines whether each port is free for the server, or held by it.
 
 use std::io;
 use std::net::{SocketAddr, TcpListener};
@@ -14,16 +14,16 @@ use crate::certificate::{Certificate, Condition};
 use crate::config::TlsSource;
 use crate::http::tls::read_files;
 
-/// Difference between this clock and the server's that is none.
+/// Maximum difference between this clock and the server's that counts as equal.
 const CLOCK_DIFFERENCE_MAX: SignedDuration = SignedDuration::from_secs(5);
 
-/// What was found at a port.
+/// State of a port.
 enum Port {
     /// The server can take it.
     Free,
-    /// Something has it.
+    /// A program has it.
     Taken,
-    /// It cannot be taken, and nobody has it.
+    /// No program has it, but the server cannot take it.
     Impossible(io::Error),
 }
 
@@ -118,7 +118,7 @@ fn clock_of(examined: &Examined, answer: &Answer) -> Option<Finding> {
     })
 }
 
-/// Compares the certificate that is served with the file.
+/// Compares the served certificate with the file.
 fn served(examined: &Examined, answer: &Answer) -> Option<Finding> {
     let leaf = answer.leaf.as_ref()?;
     let read = Certificate::read(leaf)?;

@@ -1,5 +1,5 @@
-//! One request to a port of this machine, over TLS without asking whom the certificate is for: the
-//! certificate is what is examined.
+//! Sends one request to a port of this machine. Over TLS it accepts every certificate, because the
+//! doctor examines the certificate itself.
 
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -13,7 +13,7 @@ use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _};
 use tokio::net::TcpStream;
 use tokio_rustls::TlsConnector;
 
-/// Maximum time of a connection, with its answer.
+/// Maximum time for a connection and its answer.
 const WAIT_MAX: Duration = Duration::from_secs(5);
 /// Maximum length of an answer.
 const ANSWER_BYTES_MAX: u64 = 64 * 1_024;
@@ -23,12 +23,12 @@ const ANSWER_BYTES_MAX: u64 = 64 * 1_024;
 pub(super) struct Answer {
     /// Status line, headers and body.
     pub(super) text: String,
-    /// The certificate that was shown first.
+    /// The first certificate of the presented chain.
     pub(super) leaf: Option<CertificateDer<'static>>,
 }
 
 impl Answer {
-    /// Returns whether our own server answers that it lives.
+    /// Returns whether this is the answer of a live Tread server.
     pub(super) fn is_health(&self) -> bool {
         self.text.starts_with("HTTP/1.1 200") && self.text.ends_with(r#"{"status":"ok"}"#)
     }
@@ -53,7 +53,7 @@ pub(super) fn from_here(address: SocketAddr) -> SocketAddr {
     SocketAddr::new(ip, address.port())
 }
 
-/// Asks for a page; `None` if nothing answers in time.
+/// Requests a page; returns `None` if nothing answers in time.
 pub(super) async fn get(address: SocketAddr, is_tls: bool, path: &str) -> Option<Answer> {
     let asking = async {
         let stream = TcpStream::connect(from_here(address)).await.ok()?;
@@ -68,7 +68,7 @@ pub(super) async fn get(address: SocketAddr, is_tls: bool, path: &str) -> Option
     tokio::time::timeout(WAIT_MAX, asking).await.ok().flatten()
 }
 
-/// Begins TLS with a port, and returns the certificate that it shows.
+/// Begins TLS with a port, and returns the certificate that it presents.
 pub(super) async fn certificate(address: SocketAddr) -> Option<CertificateDer<'static>> {
     let asking = async {
         let stream = TcpStream::connect(from_here(address)).await.ok()?;
@@ -78,7 +78,7 @@ pub(super) async fn certificate(address: SocketAddr) -> Option<CertificateDer<'s
     tokio::time::timeout(WAIT_MAX, asking).await.ok().flatten()
 }
 
-/// Returns whether something accepts connections.
+/// Returns whether a program accepts connections.
 pub(super) async fn is_open(address: SocketAddr) -> bool {
     let connecting = TcpStream::connect(from_here(address));
     matches!(tokio::time::timeout(WAIT_MAX, connecting).await, Ok(Ok(_)))
@@ -89,7 +89,7 @@ async fn ask(mut stream: impl AsyncRead + AsyncWrite + Unpin, path: &str) -> Opt
     stream.write_all(request.as_bytes()).await.ok()?;
     let mut bytes = Vec::new();
     let read = stream.take(ANSWER_BYTES_MAX).read_to_end(&mut bytes).await;
-    // A peer that does not say goodbye in TLS has answered all the same.
+    // A peer that does not close TLS properly has still answered.
     if read.is_err() && bytes.is_empty() {
         return None;
     }
@@ -120,7 +120,7 @@ async fn handshake(stream: TcpStream) -> Option<OverTls> {
     Some((stream, leaf.clone()))
 }
 
-/// Keeps the certificate that is shown, and accepts it, since nothing secret is sent.
+/// Keeps the presented certificate, and accepts it, since the request contains no secret.
 #[derive(Debug)]
 struct Shown {
     leaf: Mutex<Option<CertificateDer<'static>>>,

@@ -1,4 +1,4 @@
-//! `tread-server backup`: makes one backup, beside a running server or without one.
+//! `tread-server backup` makes one backup, with or without a running server.
 
 use std::io::{self, IsTerminal as _, Write as _};
 use std::path::{Path, PathBuf};
@@ -12,7 +12,7 @@ use crate::app::backups::{self, Order, Progress};
 use crate::backup::Filter;
 use crate::clock::Clock;
 
-/// Steps of the progress that are printed to a file, per cent.
+/// Step of the progress between printed lines, per cent.
 const STEP_PERCENT: u64 = 10;
 
 /// Arguments of `tread-server backup`.
@@ -20,14 +20,14 @@ const STEP_PERCENT: u64 = 10;
 pub(crate) struct BackupArgs {
     #[command(flatten)]
     files: ServerFiles,
-    /// File to write, or an existing folder for a file named by the time
+    /// File to write, or an existing folder for a file that is named after the time
     #[arg(long, value_name = "PATH")]
     to: PathBuf,
-    /// Encrypt by this shell command, from its standard input to its standard output, such as
-    /// `age -r age1…`; that of `[backup]` when absent
+    /// Encrypt with this shell command, from its standard input to its standard output, such as
+    /// `age -r age1…`; the default is the command in `[backup]`
     #[arg(long, value_name = "COMMAND")]
     encrypt: Option<String>,
-    /// Do not encrypt, although `[backup]` has a command for it
+    /// Do not encrypt, even if `[backup]` has a command for it
     #[arg(long, conflicts_with = "encrypt")]
     plain: bool,
     /// Print no progress
@@ -90,7 +90,7 @@ pub(crate) async fn run(args: BackupArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// What was printed last.
+/// The last printed progress.
 #[derive(Default)]
 struct Shown(Option<(&'static str, u64)>);
 

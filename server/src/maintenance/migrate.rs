@@ -1,5 +1,5 @@
-//! `tread-server migrate`: shows or applies what the database's schema lacks for this version. A
-//! server does the same at its start.
+//! `tread-server migrate` shows or applies the migrations that the database lacks for this version.
+//! A server applies them at its start.
 
 use std::io::{self, Write as _};
 use std::process::ExitCode;
@@ -15,7 +15,7 @@ use crate::db::{self, Db, schema};
 
 /// Exit code of `--check` when migrations are due.
 const DUE: u8 = 3;
-/// Exit code when the database is of a newer version.
+/// Exit code when a newer version has opened the database.
 const NEWER: u8 = 4;
 
 /// Arguments of `tread-server migrate`.
@@ -23,18 +23,18 @@ const NEWER: u8 = 4;
 pub(crate) struct MigrateArgs {
     #[command(flatten)]
     files: ServerFiles,
-    /// Only show what would be done: exit code 0 if nothing, 3 if migrations are due, 4 if the
+    /// Only show the due migrations: exit code 0 if there are none, 3 if there are some, 4 if the
     /// database is of a newer version
     #[arg(long)]
     check: bool,
 }
 
-/// How the schemas of file and program compare.
+/// Comparison of the schemas of file and program.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Compared {
-    /// They are the same, or are now.
+    /// They are the same, possibly after migrations.
     Same,
-    /// Migrations are due, and were only shown.
+    /// Migrations are due, and were not applied.
     Due,
     /// The file is newer.
     Newer,
@@ -53,7 +53,7 @@ pub(crate) fn exit_code(ended: anyhow::Result<Compared>) -> ExitCode {
     }
 }
 
-/// Compares the schemas, and applies the migrations that are due unless only a check was asked for.
+/// Compares the schemas, and applies the due migrations unless `--check` is given.
 ///
 /// # Errors
 /// The configuration is invalid, the file cannot be read, a server runs on it, or a migration
@@ -87,7 +87,7 @@ pub(crate) async fn run(args: MigrateArgs) -> anyhow::Result<Compared> {
         return Ok(Compared::Newer);
     }
     if missing.is_empty() {
-        writeln!(out, "nothing is to be done")?;
+        writeln!(out, "no migrations are pending")?;
         return Ok(Compared::Same);
     }
     for (version, description) in &missing {
@@ -97,7 +97,7 @@ pub(crate) async fn run(args: MigrateArgs) -> anyhow::Result<Compared> {
         writeln!(
             out,
             "`tread-server migrate`, or a start of the server, applies them; make a backup first: \
-             there is no way back but a backup"
+             only a backup leads back to the present schema"
         )?;
         return Ok(Compared::Due);
     }

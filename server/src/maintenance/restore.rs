@@ -1,13 +1,12 @@
-//! `tread-server restore`: replaces the database, and the fleet's authority if it is missing, by
-//! those of a backup.
+//! `tread-server restore` replaces the database by that of a backup. If the fleet's authority is
+//! missing, it restores the authority too.
 //!
 //! ```text
 //! lock ─► manifest ─► space ─► extract, compare checksums ─► examine ─► migrate, prepare for
 //! robots and people that went on ─► move the old database aside ─► rename the new one ─► report
 //! ```
 //!
-//! Nothing of the old database is changed before the new one is complete, and nothing of it is
-//! removed.
+//! It does not change the old database before the new one is complete, and never removes it.
 
 use std::ffi::OsString;
 use std::fs;
@@ -36,13 +35,13 @@ use crate::db::{self, Db, DbError, copy, schema};
 
 /// Suffix of the database while it is restored.
 const RESTORING_ENDING: &str = ".restoring";
-/// Infix of the names of what was moved aside.
+/// Infix of the names of files and folders that were moved aside.
 const ASIDE: &str = ".before-restore-";
-/// Free space that must remain beyond the database, bytes: for its log, and for migrations.
+/// Free space that must remain besides the database, for its log and for migrations, bytes.
 const RESERVE_BYTES: u64 = 128 * 1024 * 1024;
-/// Maximum number of tokens that are listed; they are read in pages of that many.
+/// Maximum number of tokens that are listed; also the size of the page that is read.
 const TOKENS_MAX: u32 = 10_000;
-/// Steps of the progress that are printed to a file, per cent.
+/// Step of the progress between printed lines, per cent.
 const STEP_PERCENT: u64 = 10;
 
 /// Arguments of `tread-server restore`.
@@ -50,33 +49,33 @@ const STEP_PERCENT: u64 = 10;
 pub(crate) struct RestoreArgs {
     #[command(flatten)]
     files: ServerFiles,
-    /// The backup
+    /// Backup to restore
     #[arg(long, value_name = "FILE")]
     from: PathBuf,
-    /// Decrypt by this shell command, from its standard input to its standard output, such as
+    /// Decrypt with this shell command, from its standard input to its standard output, such as
     /// `age -d -i key.txt`
     #[arg(long, value_name = "COMMAND")]
     decrypt: Option<String>,
-    /// Replace a database that exists; it is moved aside and kept
+    /// Replace an existing database, which is moved aside and kept
     #[arg(long)]
     force: bool,
-    /// Replace the fleet's authority too, although there is one; it is moved aside and kept
+    /// Replace an existing authority of the fleet too, which is moved aside and kept
     #[arg(long)]
     replace_authority: bool,
 }
 
-/// What became of the authority.
+/// Outcome for the authority.
 #[derive(Debug, PartialEq, Eq)]
 enum AuthorityFate {
     /// The backup or the configuration has none.
     None,
-    /// The one that is there stays.
+    /// The existing authority stays.
     Kept(PathBuf),
-    /// It was restored, and what was there is in another folder.
+    /// It was restored to the first folder; an earlier one is now in the second folder.
     Restored(PathBuf, Option<PathBuf>),
 }
 
-/// What a restored database holds for people to review.
+/// Entries of a restored database that people must review.
 struct Review {
     changed: Changed,
     tokens: Vec<Token>,
@@ -93,7 +92,7 @@ pub(crate) async fn run(args: RestoreArgs) -> anyhow::Result<()> {
     let database = config.database;
     let key = args.decrypt.clone().map(Filter);
     let _lock = DatabaseLock::take(&database)
-        .context("a backup is restored while no server uses the database: stop it first")?;
+        .context("a server uses the database: stop it before you restore a backup")?;
     ensure!(
         args.force || !database.exists(),
         "there is a database `{}`: with `--force` it is moved aside, and kept",
@@ -157,7 +156,7 @@ fn refuse_newer(manifest: &Manifest) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The database while it is restored; removed unless it is finished.
+/// The database during its restoration; removed on drop unless it is finished.
 struct Restoring {
     path: PathBuf,
     is_finished: bool,
@@ -180,7 +179,7 @@ fn remove_if_there(path: &Path) -> io::Result<()> {
 const BESIDE: [&str; 3] = ["-wal", "-shm", "-journal"];
 
 impl Restoring {
-    /// Removes what an interrupted restoration left behind.
+    /// Removes the files of an interrupted restoration.
     fn begin(database: &Path) -> anyhow::Result<Self> {
         let path = with_ending(database, RESTORING_ENDING);
         let restoring = Self {
@@ -199,11 +198,11 @@ impl Restoring {
         remove_if_there(&self.path)
     }
 
-    /// Moves the old database aside, and the new one to its place. Returns where the old one is.
+    /// Moves the old database aside, and the new one to its place. Returns the path of the old one.
     async fn finish(mut self, database: &Path, now: Timestamp) -> anyhow::Result<Option<PathBuf>> {
         let moved = |path: &Path| format!("cannot move `{}` aside", path.display());
-        // SQLite removed its log when the last connection was closed; a log that is left belongs to
-        // a database that is not complete without it.
+        // SQLite removes its log when the last connection closes. If a log remains, the database is
+        // incomplete without it.
         for ending in BESIDE {
             let beside = with_ending(&self.path, ending);
             ensure!(!beside.exists(), "`{}` is still in use", beside.display());
@@ -212,8 +211,8 @@ impl Restoring {
         if database.exists() {
             let to = aside_name(database, now);
             settle_log(database).await;
-            // A log beside the new database would be taken for its own. A crash here leaves the old
-            // database without what its log still had, and everything in the files aside.
+            // SQLite would use a log beside the new database as that database's log. After a crash
+            // here the old database lacks its log, which is among the files that were moved aside.
             for ending in BESIDE {
                 let beside = with_ending(database, ending);
                 if beside.exists() {
@@ -221,8 +220,8 @@ impl Restoring {
                     renamed.with_context(|| moved(&beside))?;
                 }
             }
-            // There is a database under the name at every moment: a server that starts meanwhile
-            // must not make an empty one.
+            // The link keeps a database under this name at every moment: a server that starts
+            // meanwhile must not create an empty one.
             fs::hard_link(database, &to).with_context(|| moved(database))?;
             aside = Some(to);
         }
@@ -237,7 +236,7 @@ impl Restoring {
 impl Drop for Restoring {
     fn drop(&mut self) {
         if !self.is_finished {
-            // The next restoration removes what stays.
+            // The next restoration removes files that remain.
             let _ = self.remove();
         }
     }
@@ -248,8 +247,8 @@ fn aside_name(path: &Path, now: Timestamp) -> PathBuf {
     with_ending(path, &format!("{ASIDE}{time}"))
 }
 
-/// Brings the log of a database into its file, so that one file is the whole of it. A damaged
-/// database keeps its log.
+/// Moves the log of a database into its file, so that one file contains the complete database. A
+/// damaged database keeps its log.
 async fn settle_log(database: &Path) {
     let settling = async {
         let mut connection = copy::connect(database, false).await?;
@@ -295,7 +294,8 @@ fn show_step(percent: u64) {
     }
 }
 
-/// Brings the database up to date, and changes what robots and people must not find as it was.
+/// Applies migrations, and adapts the database to robots and people that continued after the
+/// backup.
 async fn prepare(path: &Path, restoration: &Restoration, from: &Path) -> anyhow::Result<Review> {
     let database = Db::open(path).await?;
     let prepared = prepare_in(&database, restoration, from).await;
@@ -322,7 +322,8 @@ async fn prepare_in(
     })
 }
 
-/// The chain of the audit log goes on from the backup; this entry says what is missing.
+/// Returns the entry with which the audit log continues from the backup. It names the backup's
+/// time.
 fn audit_entry(restoration: &Restoration, from: &Path, changed: Changed) -> AuditEntry {
     let name = from.file_name().unwrap_or_default().to_string_lossy();
     AuditEntry {
@@ -350,8 +351,8 @@ fn audit_entry(restoration: &Restoration, from: &Path, changed: Changed) -> Audi
     }
 }
 
-/// Restores the authority if there is none, or if it is to be replaced. The one that is there is
-/// newer than the backup, and robots trust it.
+/// Restores the authority if there is none, or if `replace` is set. An existing authority otherwise
+/// stays, since it is newer than the backup and robots trust it.
 fn restore_authority(
     folder: &Path,
     files: &[(String, Vec<u8>)],
@@ -404,7 +405,7 @@ fn tell(
     writeln!(
         out,
         "ended: {sessions} sessions, {join_tokens} join tokens, {deliveries} deliveries to webhooks; \
-         the next certificate of {certificates} robots counts"
+         the server accepts the next certificate of {certificates} robots"
     )?;
     writeln!(
         out,

@@ -1,4 +1,4 @@
-//! What a configuration is written from: flags, answers and defaults.
+//! The choices in a configuration, from flags, answers and defaults.
 
 use std::net::{IpAddr, SocketAddr};
 use std::path::{Path, PathBuf};
@@ -28,9 +28,9 @@ pub(crate) enum Web {
     Authority,
     /// From files.
     Files(TlsFiles),
-    /// Of a proxy.
+    /// A proxy on this machine has one.
     Proxy,
-    /// It has none, and is reached from this machine alone.
+    /// It has none, and only this machine reaches it.
     Loopback,
 }
 
@@ -55,7 +55,7 @@ pub(crate) struct Choices {
     pub(crate) web: Web,
 }
 
-/// Values of what nobody chooses.
+/// Values for choices that neither a flag nor an answer gives.
 #[derive(Debug, Clone)]
 pub(super) struct Defaults {
     pub(super) config: PathBuf,
@@ -86,7 +86,7 @@ impl TlsChoice {
         let outside = |here: SocketAddr| SocketAddr::new(IpAddr::from([0, 0, 0, 0]), here.port());
         match self {
             Self::Authority | Self::Files => [outside(http), outside(zenoh)],
-            // The proxy is on this machine, and robots do not pass it.
+            // The proxy is on this machine, and robots do not connect through it.
             Self::Proxy => [http, outside(zenoh)],
             Self::Loopback => [http, zenoh],
         }
@@ -94,7 +94,7 @@ impl TlsChoice {
 }
 
 impl Choices {
-    /// Returns the choices of flags and defaults.
+    /// Returns the choices that flags and defaults give.
     ///
     /// # Errors
     /// A choice is impossible; the message names the flag.
@@ -130,17 +130,17 @@ impl Choices {
         self.data_dir.join("authority")
     }
 
-    /// Checks what single values do not show.
+    /// Checks that the values are valid and fit together.
     ///
     /// # Errors
-    /// The message says what contradicts what.
+    /// A value is invalid, or two values contradict each other; the message names them.
     pub(super) fn check(&self) -> anyhow::Result<()> {
         for name in &self.names {
             check_name(name).map_err(anyhow::Error::msg)?;
         }
         if self.web != Web::Loopback && self.names.is_empty() {
             bail!(
-                "others need a name or an address to find this server by: give --names, such as \
+                "other machines need a name or an address of this server: give --names, such as \
                  --names tread.example.org,192.0.2.1"
             );
         }
@@ -170,7 +170,7 @@ impl Choices {
     }
 }
 
-/// Returns how the REST API is reached if no flag says it.
+/// Returns the way to reach the REST API if no flag gives it.
 pub(super) fn tls_default(args: &SetupArgs) -> TlsChoice {
     if args.tls_certificate.is_some() {
         TlsChoice::Files
@@ -181,7 +181,7 @@ pub(super) fn tls_default(args: &SetupArgs) -> TlsChoice {
     }
 }
 
-/// Returns the files of the flags, if they are given.
+/// Returns the certificate files, if flags name them.
 pub(super) fn files(args: &SetupArgs) -> Option<TlsFiles> {
     Some(TlsFiles {
         certificate: args.tls_certificate.clone()?,
@@ -192,7 +192,7 @@ pub(super) fn files(args: &SetupArgs) -> Option<TlsFiles> {
 /// Returns the certificate of the REST API.
 ///
 /// # Errors
-/// Files are missing, or are given and not used.
+/// The choice needs files that no flag names, or flags name files that the choice does not use.
 pub(super) fn web(tls: TlsChoice, files: Option<TlsFiles>) -> anyhow::Result<Web> {
     Ok(match (tls, files) {
         (TlsChoice::Files, Some(files)) => Web::Files(files),
@@ -217,7 +217,8 @@ pub(super) fn check_name(name: &str) -> Result<(), String> {
     ))
 }
 
-/// Checks that certificate and key can be used, are for these names, and are valid.
+/// Checks that certificate and key belong together, and that the certificate is for these names
+/// and valid now.
 ///
 /// # Errors
 /// The message names the file.

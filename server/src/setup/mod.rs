@@ -1,9 +1,9 @@
-//! `tread-server init` as the first command on a machine: writes a working configuration, from
+//! `tread-server init` is the first command on a machine. It writes a working configuration, from
 //! answers in a terminal or from flags.
 //!
 //! [`choices`] turns flags, answers and defaults into [`Choices`]; [`text`] writes them as TOML.
-//! The file is moved into its place last, after everything else has succeeded, so that a failed
-//! run can be repeated.
+//! `init` moves the file into its place last, after everything else has succeeded, so that a person
+//! can repeat a failed run.
 
 mod choices;
 mod questions;
@@ -26,15 +26,15 @@ use self::questions::Questions;
 pub(crate) use self::steps::next_steps;
 use crate::config::{Config, ServerArgs};
 
-/// Mode of the configuration file: it holds no secret, but the group of the data folder may read
-/// it and others need not.
+/// Mode of the configuration file. It holds no secret: the group of the data folder may read it,
+/// and others need not.
 const CONFIG_MODE: u32 = 0o640;
 /// Mode of a data folder that is created.
 const DATA_MODE: u32 = 0o700;
-/// Suffix of the name of a configuration file that was replaced.
+/// Suffix of the name of a replaced configuration file.
 const REPLACED_ENDING: &str = "old";
 
-/// How the REST API is reached.
+/// The way to reach the REST API.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum TlsChoice {
     /// By TLS with a certificate that the fleet's own authority issues and renews
@@ -51,7 +51,7 @@ pub(crate) enum TlsChoice {
 #[derive(Debug, Clone, Default, Args)]
 #[command(next_help_heading = "Writing a configuration")]
 pub(crate) struct SetupArgs {
-    /// Write a configuration without questions: what no flag gives has its default
+    /// Write a configuration without questions, with defaults for all flags that are not given
     #[arg(long)]
     pub(crate) yes: bool,
     /// Folder of the database and the fleet's authority, created when missing
@@ -60,10 +60,10 @@ pub(crate) struct SetupArgs {
     /// Site that the server creates at its first start
     #[arg(long)]
     pub(crate) site: Option<SiteId>,
-    /// Host names and addresses by which others find this server, separated by commas
+    /// Host names and addresses by which others reach this server, separated by commas
     #[arg(long, value_name = "NAMES", value_delimiter = ',')]
     pub(crate) names: Vec<String>,
-    /// How the REST API is reached
+    /// Way to reach the REST API
     #[arg(long, value_enum)]
     pub(crate) tls: Option<TlsChoice>,
     /// Certificate of the REST API, PEM, followed by its intermediate certificates
@@ -105,7 +105,7 @@ impl SetupArgs {
     }
 }
 
-/// What `init` was given besides [`SetupArgs`].
+/// Arguments of `init` besides [`SetupArgs`].
 #[derive(Debug)]
 pub(crate) struct Given<'a> {
     /// The configuration file.
@@ -114,14 +114,14 @@ pub(crate) struct Given<'a> {
     pub(crate) database: Option<&'a Path>,
     /// The file for the admin's token.
     pub(crate) token_file: Option<&'a Path>,
-    /// Whether to replace what exists.
+    /// Whether to replace existing files.
     pub(crate) force: bool,
 }
 
 /// A configuration that is ready to be moved into its place.
 #[derive(Debug)]
 pub(crate) struct Prepared {
-    /// What was chosen.
+    /// The choices.
     pub(crate) choices: Choices,
     /// The configuration as the server reads it.
     pub(crate) config: Config,
@@ -129,7 +129,7 @@ pub(crate) struct Prepared {
     new: PathBuf,
 }
 
-/// Returns the configuration file that is used without `--config`.
+/// Returns the default of `--config`.
 pub(crate) fn config_default(is_root: bool) -> PathBuf {
     PathBuf::from(if is_root {
         "/etc/tread/tread.toml"
@@ -138,11 +138,11 @@ pub(crate) fn config_default(is_root: bool) -> PathBuf {
     })
 }
 
-/// Prepares a configuration if one is to be written; `None` if the existing one, or the built-in
-/// values, are to be used.
+/// Prepares a configuration; returns `None` if `init` should use the existing one or the built-in
+/// values.
 ///
 /// # Errors
-/// A choice is impossible, the file exists and may not be replaced, nobody answers, or a folder
+/// A choice is impossible, the file exists and `--force` is not given, nobody answers, or a folder
 /// cannot be written.
 pub(crate) fn prepare(args: &SetupArgs, given: &Given<'_>) -> anyhow::Result<Option<Prepared>> {
     let is_root = Uid::effective().is_root();
@@ -198,7 +198,7 @@ pub(crate) fn prepare(args: &SetupArgs, given: &Given<'_>) -> anyhow::Result<Opt
 /// # Errors
 /// The file exists, and `force` is false.
 pub(crate) fn refuse_to_replace(what: &str, file: &Path, force: bool) -> anyhow::Result<()> {
-    // A link without a target counts too: writing would create what it leads to.
+    // A link without a target counts too: a write would create its target.
     let exists = fs::symlink_metadata(file).is_ok();
     ensure!(
         !exists || force,
@@ -241,7 +241,7 @@ fn write_beside(choices: Choices) -> anyhow::Result<Prepared> {
             new,
         }),
         Err(error) => {
-            // The error of the write is returned; a file that was never made cannot be removed.
+            // The error of the write matters more; the removal fails if the file was never made.
             let _ = fs::remove_file(&new);
             Err(error)
         }
@@ -249,7 +249,8 @@ fn write_beside(choices: Choices) -> anyhow::Result<Prepared> {
 }
 
 impl Prepared {
-    /// Moves the configuration into its place, and gives the files of the data folder to its owner.
+    /// Moves the configuration into its place, and gives root's files in the data folder to the
+    /// folder's owner.
     ///
     /// # Errors
     /// A file cannot be written.
@@ -266,8 +267,7 @@ impl Prepared {
         fs::rename(&self.new, file).with_context(|| format!("cannot write `{}`", file.display()))
     }
 
-    /// Gives what root has made in a folder of another user, such as that of the service, to that
-    /// user.
+    /// Gives root's files in a data folder of another user, such as the service's, to that user.
     fn give_to_owner(&self) -> anyhow::Result<()> {
         if !Uid::effective().is_root() {
             return Ok(());
@@ -286,12 +286,12 @@ impl Prepared {
 
     /// Removes the temporary file after a failure.
     pub(crate) fn discard(&self) {
-        // The failure is reported; a file that is left has a name of its own.
+        // The caller reports the failure; a file that remains has a unique name.
         let _ = fs::remove_file(&self.new);
     }
 }
 
-/// Gives all files of root in a folder to a user, and those in its folders.
+/// Gives all files of root in a folder and its subfolders to a user.
 fn give(folder: &Path, user: u32, group: u32) -> anyhow::Result<()> {
     let named = || format!("cannot give `{}` to its owner", folder.display());
     for entry in fs::read_dir(folder).with_context(named)? {

@@ -1,5 +1,5 @@
-//! Questions in a terminal. Each shows its default, which Enter takes; an answer that cannot be
-//! taken is explained, and the question repeated.
+//! Questions in a terminal. Each shows its default, and Enter accepts it. An invalid answer gets an
+//! explanation, and the question is repeated.
 
 use std::fmt::Display;
 use std::io::{BufRead, Write};
@@ -32,10 +32,10 @@ impl<'a> Questions<'a> {
         writeln!(self.output, "{text}").context("cannot print")
     }
 
-    /// Asks until `read` takes the answer; an empty one is the default.
+    /// Asks until `read` accepts the answer. An empty answer stands for the default.
     ///
     /// # Errors
-    /// Nobody answers, or no answer can be taken.
+    /// Nobody answers, or no answer is valid.
     fn ask<T>(
         &mut self,
         question: &str,
@@ -110,7 +110,7 @@ fn is_yes(text: &str) -> Result<bool, String> {
     }
 }
 
-/// Asks for everything that no flag gives.
+/// Asks for all choices that no flag gives.
 ///
 /// # Errors
 /// Nobody answers, or the answers contradict each other.
@@ -201,7 +201,7 @@ pub(super) fn ask(
     Ok(choices)
 }
 
-/// Asks for certificate and key until they can be used.
+/// Asks for certificate and key until they are usable.
 fn ask_files(names: &[String], questions: &mut Questions<'_>) -> anyhow::Result<TlsFiles> {
     for _ in 0..TRIES_MAX {
         let files = TlsFiles {

@@ -1,20 +1,20 @@
-//! What to type after `tread-server init`.
+//! The commands to run after `tread-server init`.
 
 use std::fmt::Write as _;
 
 use super::choices::{Choices, Web};
 use super::config_default;
 
-/// Unit of the service manager that starts the server, if it is installed.
+/// Unit of systemd that starts the server, if it is installed.
 const UNIT: &str = "tread-server.service";
-/// Folders in which service managers look for units.
+/// Folders in which systemd looks for units.
 const UNIT_FOLDERS: [&str; 3] = [
     "/etc/systemd/system",
     "/usr/lib/systemd/system",
     "/lib/systemd/system",
 ];
 
-/// Returns a word as a shell reads it.
+/// Returns a word, quoted for a shell if necessary.
 fn word(text: &str) -> String {
     let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b"-_./:,@%+=".contains(&byte);
     if !text.is_empty() && text.bytes().all(is_plain) {
@@ -45,7 +45,8 @@ fn server(choices: &Choices) -> String {
     }
 }
 
-/// Returns what was made, and the next commands. `fingerprint` is that of the fleet's authority.
+/// Returns a list of the created files and the next commands. `fingerprint` is that of the fleet's
+/// authority.
 pub(crate) fn next_steps(choices: &Choices, fingerprint: Option<&str>) -> String {
     let config = word(&choices.config.display().to_string());
     let token = word(&choices.token_file.display().to_string());
@@ -78,7 +79,7 @@ pub(crate) fn next_steps(choices: &Choices, fingerprint: Option<&str>) -> String
          tread login --server {server}{trust} --token-file {token}\n"
     );
     if choices.has_authority() {
-        // From the same machine a server behind a proxy is reached without it.
+        // Clients on the same machine reach the server without its proxy.
         let _ = write!(
             text,
             "a robot:\n  \

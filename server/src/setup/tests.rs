@@ -208,8 +208,11 @@ fn whoever_does_not_answer_is_referred_to_the_flags() {
     let folder = tempfile::tempdir().unwrap();
     let (choices, _) = answered(folder.path(), &SetupArgs::default(), "\n");
     assert!(choices.unwrap_err().to_string().contains("--yes"));
-    let (choices, _) = answered(folder.path(), &SetupArgs::default(), &"\n\nA b\n".repeat(5));
-    assert!(choices.is_err());
+    // Every answer to the third question, the site, is refused.
+    let answers = format!("\n\n{}", "A b\n".repeat(6));
+    let (choices, _) = answered(folder.path(), &SetupArgs::default(), &answers);
+    let refused = choices.unwrap_err().to_string();
+    assert!(refused.contains("no answer to `Site`"), "{refused}");
 }
 
 #[test]
@@ -223,7 +226,7 @@ fn nothing_that_exists_is_replaced_without_force() {
     let link = folder.path().join("link");
     std::os::unix::fs::symlink(folder.path().join("nowhere"), &link).unwrap();
     assert!(refuse_to_replace("token file", &link, false).is_err());
-    // With force the former one is kept.
+    // With force, `init` keeps the former file.
     let choices = Choices::of(&SetupArgs::default(), &defaults(folder.path())).unwrap();
     read(choices);
     let old = fs::read_to_string(folder.path().join("tread.toml.old")).unwrap();

@@ -1,11 +1,11 @@
-//! Choices as a configuration file.
+//! Writes choices as a configuration file.
 
 use std::fmt::Write as _;
 use std::path::Path;
 
 use super::choices::{Choices, Web};
 
-/// Returns a text as a basic string of TOML, whose escapes are those of JSON.
+/// Returns a text as a basic string of TOML, which has the same escapes as JSON.
 fn quoted(text: &str) -> String {
     serde_json::Value::from(text).to_string()
 }
@@ -19,7 +19,7 @@ fn list(names: &[String]) -> String {
     format!("[{}]", names.join(", "))
 }
 
-/// Returns the configuration file.
+/// Returns the text of the configuration file.
 pub(super) fn toml(choices: &Choices) -> String {
     let mut text = String::from(
         "# Configuration of a Tread server, written by `tread-server init`. Every setting is in\n\

@@ -96,6 +96,8 @@ async fn a_server_is_set_up_by_one_command_and_examined_before_during_and_after(
         "--yes",
         "--config",
         "tread.toml",
+        "--data-dir",
+        "tread-data",
         "--names",
         "localhost",
         "--http",

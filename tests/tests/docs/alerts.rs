@@ -4,6 +4,7 @@ use std::collections::BTreeSet;
 
 use tread_api::alert_kind::ALERT_KINDS;
 use tread_tests::markdown::documents;
+use tread_tests::repository::root;
 
 /// Kinds that the table names beside those of the list: examples of a prefix.
 const EXAMPLES: [&str; 2] = ["base-late", "base-value"];
@@ -15,8 +16,7 @@ fn the_table_of_alerts_has_every_kind_and_no_other() {
         .iter()
         .find(|document| document.name.ends_with("rest.md"));
     let path = rest.map(|rest| rest.name.clone()).unwrap();
-    let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
-    let text = std::fs::read_to_string(root.join(path)).unwrap();
+    let text = std::fs::read_to_string(root().join(path)).unwrap();
     let after = text.split("\n## Alerts\n").nth(1).unwrap();
     let section = after.split("\n## ").next().unwrap();
     let rows = section.lines().filter(|line| line.starts_with("| `"));

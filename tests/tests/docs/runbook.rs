@@ -51,10 +51,13 @@ fn codes() -> BTreeSet<String> {
     let notices = shipped("robot-agent/src/drive/ros2/notices.rs");
     codes.extend(found(r#"=> "([a-z]+-[a-z-]+)""#, &notices));
     let refusals = shipped("robot-agent/src/drive/ros2/refusal.rs");
-    let begin = refusals.find("pub fn code(").expect("refusals have codes");
+    let begin = refusals
+        .find("/// Part of an alert's code")
+        .expect("refusals have codes");
     let end = begin + refusals[begin..].find("\n    }\n").expect("it ends");
     let of_bases = found(r#"=> "([a-z-]+)""#, &refusals[begin..end]);
     codes.extend(of_bases.iter().map(|code| format!("base-{code}")));
+    codes.extend(found(r#"=> "(base-[a-z-]+)""#, &refusals));
     codes
 }
 

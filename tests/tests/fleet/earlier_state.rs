@@ -34,6 +34,8 @@ const NOT_COMPARED: [&str; 7] = [
 const MEANS: [&str; 2] = [".effective_track_ratio.value", ".friction.theta"];
 /// Largest difference of a mean, as a share.
 const MEAN_DIFFERENCE_MAX: f64 = 0.02;
+/// Keys that were renamed since, by their earlier names.
+const RENAMED: [(&str, &str); 1] = [("theta_sd", "theta_std_dev")];
 /// Days for which the server surely keeps audit entries, and tokens that are over.
 const KEPT_DAYS: i64 = 390;
 /// What it removes then.
@@ -107,6 +109,8 @@ fn losses(place: &str, earlier: &Value, present: &Value, found: &mut Vec<String>
                 if NOT_COMPARED.iter().any(|end| place.ends_with(end)) {
                     continue;
                 }
+                let renamed = RENAMED.iter().find(|(earlier, _)| earlier == name);
+                let name = renamed.map_or(name.as_str(), |(_, now)| now);
                 match present.get(name) {
                     Some(present) => losses(&place, earlier, present, found),
                     None => found.push(format!("{place}: {earlier} is gone")),

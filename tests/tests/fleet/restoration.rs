@@ -16,7 +16,7 @@ use tread_tests::fleet::{Fleet, SITE};
 use tread_tests::light_robot::{LightRobot, ask};
 use tread_tests::wait::{DRIVE, SHORT, eventually};
 
-use crate::{arc, fleet};
+use crate::{arc, fleet, slalom};
 
 /// Columns of the sums that say what was measured; keys of rows are a matter of each database.
 const SUMS: &str = "ix, iy, grid_revision, terrain, terrain_revision, epoch_h, information_hi, \
@@ -111,7 +111,8 @@ async fn robots_and_a_restored_server_agree_again_and_nothing_is_done_twice() {
     let mut fleet = fleet().await;
     let robot: RobotId = "rover-1".parse().unwrap();
     fleet.start_agent(&robot, 0.0).await;
-    let active = fleet.rest.send(&robot, arc(0.0, 1.0)).await;
+    // A circle alone may end without a measurement.
+    let active = fleet.rest.send(&robot, slalom(0.0, 6)).await;
     let queued = fleet.rest.send(&robot, arc(0.0, 1.0)).await;
     fleet
         .rest
@@ -132,7 +133,7 @@ async fn robots_and_a_restored_server_agree_again_and_nothing_is_done_twice() {
     let succeeded = [MissionState::Succeeded];
     fleet.rest.mission_reaches(active, &succeeded, DRIVE).await;
     fleet.rest.mission_reaches(queued, &succeeded, DRIVE).await;
-    let later = fleet.rest.send(&robot, arc(0.0, 3.0)).await;
+    let later = fleet.rest.send(&robot, slalom(0.0, 12)).await;
     fleet
         .rest
         .mission_reaches(later, &[MissionState::Active], SHORT)

@@ -1,8 +1,8 @@
-//! Findings of the doctor, each on one question.
+//! Findings of the doctor: each answers one question.
 
 use serde::Serialize;
 
-/// How much a finding matters.
+/// Severity of a finding.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub(super) enum Verdict {
@@ -12,14 +12,14 @@ pub(super) enum Verdict {
     Skipped,
 }
 
-/// Finding on one question.
+/// Answer to one question.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub(super) struct Finding {
     /// The question, or the robot.
     pub(super) name: String,
     pub(super) verdict: Verdict,
     pub(super) text: String,
-    /// What to do, if anything.
+    /// The remedy, if one is needed.
     pub(super) next_step: Option<String>,
 }
 

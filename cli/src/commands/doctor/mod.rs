@@ -1,5 +1,5 @@
-//! `tread doctor`: examines a server and its robots from here, over the REST API: whether the server
-//! is reached and trusted, what the token may do, whose clock is off, and which robots need somebody.
+//! `tread doctor` examines a server and its robots over the REST API. It checks the connection and
+//! its certificate, the rights of the token, the clocks, and the state of each robot.
 
 mod finding;
 mod robots;
@@ -20,22 +20,22 @@ use self::robots::of_robot;
 use crate::client::{Client, ClientError};
 use crate::output::{Output, joined};
 
-/// Difference between two clocks that matters: certificates and end times suffer beyond it.
+/// Maximum difference between two clocks; a larger one affects certificates and end times.
 const CLOCK_DIFFERENCE_MAX: SignedDuration = SignedDuration::from_secs(10);
-/// Time before its end from which a token is about to expire.
+/// Remaining time below which the doctor warns that a token expires soon.
 const EXPIRING_BEFORE: SignedDuration = SignedDuration::from_hours(7 * 24);
-/// Maximum number of alerts that are read.
+/// Maximum number of alerts that the doctor reads.
 const ALERTS_MAX: u32 = 100;
 
-/// What is printed.
+/// The printed report.
 #[derive(Debug, Serialize)]
 struct Report {
     ok: bool,
     checks: Vec<Finding>,
 }
 
-/// Examines the server and the robots of a site, and prints the findings. Exits with 1 if there is
-/// a problem.
+/// Examines the server and the robots of a site, and prints the findings. The exit code is 1 if
+/// there is a problem.
 pub(super) async fn run(
     site: &SiteId,
     client: &Client,
@@ -149,7 +149,7 @@ fn now() -> Timestamp {
     Timestamp::now()
 }
 
-/// Reaches the server, and compares its clock with that of this machine.
+/// Connects to the server, and compares its clock with that of this machine.
 ///
 /// # Errors
 /// No server answers, or its certificate is not accepted.
@@ -197,7 +197,7 @@ async fn readiness(client: &Client) -> Option<Finding> {
 
 /// Compares the server's clock with that of this machine.
 fn clock(said: Timestamp, now: Timestamp, took: Duration) -> Finding {
-    // The header has whole seconds, and was written during the request.
+    // The header has whole seconds, and the server wrote it during the request.
     let slack = SignedDuration::try_from(took).unwrap_or(SignedDuration::ZERO)
         + SignedDuration::from_secs(1);
     let difference = said.duration_since(now);
@@ -238,7 +238,7 @@ fn token(session: &tread_api::identity::Session, now: Timestamp) -> Finding {
     Finding::well("token", text)
 }
 
-/// Examines what the server says about itself, of whatever version it is.
+/// Examines the server's own status. The server may be of any version.
 fn of_server(status: &Value) -> Vec<Finding> {
     let mut findings = Vec::new();
     let version = status["version"].as_str().unwrap_or("unknown");
@@ -299,10 +299,10 @@ fn alerts(alerts: &[Alert]) -> Finding {
     let step = "`tread alerts` lists them; docs/runbook.md has a section for each";
     match (named.as_slice(), alerts.len()) {
         ([], 0) => Finding::well("alerts", "there are none"),
-        ([], count) => Finding::warning("alerts", format!("{count} warnings stand"), step),
+        ([], count) => Finding::warning("alerts", format!("{count} warnings are active"), step),
         (named, count) => Finding::problem(
             "alerts",
-            format!("{count} stand, critical ones: {}", joined(named)),
+            format!("{count} are active; critical: {}", joined(named)),
             step,
         ),
     }
@@ -341,7 +341,7 @@ mod tests {
         ] {
             assert!(said.contains(part), "`{part}` in {said}");
         }
-        // A server of before says less.
+        // An earlier server reports less.
         let earlier = json!({"version": env!("CARGO_PKG_VERSION")});
         assert_eq!(of_server(&earlier).len(), 1);
     }

@@ -1,4 +1,4 @@
-//! What the doctor finds about one robot.
+//! Findings of the doctor about one robot.
 
 use jiff::SignedDuration;
 use tread_api::robot::{LinkState, Robot};
@@ -7,16 +7,16 @@ use super::CLOCK_DIFFERENCE_MAX;
 use super::finding::Finding;
 use crate::output::{age, joined};
 
-/// Records in a robot's outbox beyond which it does not get rid of them.
+/// Maximum number of records in a robot's outbox that is normal.
 const OUTBOX_LONG: u64 = 1_000;
-/// Share of states that may be missing on a good link.
+/// Maximum share of missing states on a good link.
 const MISSED_SHARE_MAX: f64 = 0.05;
-/// Round trip of a command beyond which teleoperation suffers.
+/// Maximum round trip of a command; a longer one impairs teleoperation.
 const ROUND_TRIP_MAX_MS: f64 = 250.0;
-/// Times that a robot may connect again within an hour.
+/// Maximum number of reconnections within an hour on a good link.
 const RECONNECTS_MAX: u64 = 6;
 
-/// Examines one robot; several findings if several things are wrong.
+/// Examines one robot. Returns one finding for each fault.
 pub(super) fn of_robot(robot: &Robot, server_version: Option<&str>) -> Vec<Finding> {
     let name = format!("robot {}", robot.id);
     let mut findings = Vec::new();

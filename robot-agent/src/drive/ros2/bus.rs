@@ -25,6 +25,7 @@ use super::command_watch::CommandWatch;
 use super::inlet::{Inlet, Numbering};
 use super::outlet::{COMMAND_SILENCE_MAX, Outlet};
 use super::outward::{LOOK_EVERY, OutwardSource, OutwardTopic};
+use super::refusal::Counts;
 use super::settings::{BusMode, BusSettings, OutwardSettings, Ros2Settings, Scheme};
 use crate::clock::SharedClock;
 use crate::fleet::{LinkError, zenoh_failed};
@@ -179,8 +180,7 @@ impl Bus {
     /// Runs the session until the loop's end of the outlet is closed. For a thread of its own.
     pub fn run(mut self) {
         self.outlet.attend();
-        let mut outward = self.outward.take();
-        let endpoint = &self.settings.bus.endpoint;
+        let (mut outward, endpoint) = (self.outward.take(), &self.settings.bus.endpoint);
         while let Some(session) = self.open() {
             info!(endpoint, "on the robot's bus at `{endpoint}`");
             match self.declare(&session, outward.is_some()) {

@@ -49,7 +49,7 @@ impl OutwardTopic {
 }
 
 /// Source of the messages. Runs on a thread of its own.
-pub(crate) trait OutwardSource: std::fmt::Debug + Send {
+pub(crate) trait OutwardSource: std::fmt::Debug + Send + Sync {
     /// Calls `say` with each message that is due, encoded.
     fn step(&mut self, now: Duration, wall_ns: i64, say: &mut dyn FnMut(OutwardTopic, &[u8]));
 }

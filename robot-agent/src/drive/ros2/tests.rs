@@ -19,7 +19,7 @@ const COMMANDED: WheelSpeeds = WheelSpeeds {
     right_rad_s: 5.0,
 };
 
-pub(super) fn topic(text: &str) -> Name {
+pub(crate) fn topic(text: &str) -> Name {
     Name::topic(text, &Name::default()).unwrap()
 }
 

@@ -25,6 +25,13 @@ struct Minute {
     reconnects: u32,
 }
 
+impl Minute {
+    /// Returns whether this minute is no longer within the hour that ends in minute `now`.
+    fn is_over(&self, now: u64) -> bool {
+        now.saturating_sub(self.number) >= SPAN.as_secs() / MINUTE_S
+    }
+}
+
 /// Counts of a robot's link, by minute, and its last round trip.
 #[derive(Debug, Clone, Default)]
 pub(super) struct LinkCounts {
@@ -46,13 +53,12 @@ impl LinkCounts {
         &mut self.minutes[last]
     }
 
-    /// Drops the minutes that are over for an hour.
+    /// Drops the minutes that ended an hour ago.
     fn forget(&mut self, number: u64) {
-        let oldest = number.saturating_sub(SPAN.as_secs() / MINUTE_S);
         while self
             .minutes
             .front()
-            .is_some_and(|first| first.number <= oldest && first.number != number)
+            .is_some_and(|first| first.is_over(number))
         {
             self.minutes.pop_front();
         }
@@ -90,9 +96,8 @@ impl LinkCounts {
 
     /// Returns the quality of the last hour.
     pub(super) fn quality(&self, now: Duration, delay_variation_ms: Option<u64>) -> LinkQuality {
-        let oldest = (now.as_secs() / MINUTE_S).saturating_sub(SPAN.as_secs() / MINUTE_S);
-        let is_new = |minute: &&Minute| minute.number > oldest || now < SPAN;
-        let minutes = || self.minutes.iter().filter(is_new);
+        let number = now.as_secs() / MINUTE_S;
+        let minutes = || self.minutes.iter().filter(|minute| !minute.is_over(number));
         let sum =
             |of: fn(&Minute) -> u32| -> u64 { minutes().map(|minute| u64::from(of(minute))).sum() };
         LinkQuality {

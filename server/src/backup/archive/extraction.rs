@@ -1,4 +1,4 @@
-//! Reads archives: their manifest, and their content with every checksum.
+//! Reads the manifest and the content of archives, and checks every checksum.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufReader, Read as _, Write};
@@ -17,7 +17,7 @@ use super::{
 use crate::backup::encryption::{Filter, Filtered, Opening};
 use crate::backup::manifest::{ArchivedFile, FORMAT, Manifest};
 
-/// What was extracted from an archive.
+/// Extracted content of an archive.
 #[derive(Debug)]
 pub struct Extracted {
     /// The manifest.
@@ -54,7 +54,7 @@ fn open(
     )))
 }
 
-/// Parts of a manifest of any format.
+/// Fields that manifests of all formats have.
 #[derive(serde::Deserialize)]
 struct Head {
     format: u32,
@@ -100,7 +100,7 @@ fn next_manifest(
 }
 
 /// Extracts an archive: the database into a new file, and the authority into memory. Compares every
-/// checksum. `progress` gets the number of bytes of the database that are read.
+/// checksum. `progress` gets the number of database bytes that were read.
 ///
 /// # Errors
 /// [`ArchiveError`]; the file of the database is removed.
@@ -177,7 +177,7 @@ fn extract_into(
         progress(entry.bytes);
     }
     compare(&manifest.database, &entry.done().1)?;
-    // It comes last, so an archive that has it is complete.
+    // It is the last entry, so an archive that has it is complete.
     let sum = ArchivedFile {
         name: MANIFEST_SUM_NAME.to_owned(),
         ..read_manifest.clone()
@@ -199,7 +199,7 @@ fn extract_into(
     })
 }
 
-/// Whether a name stays in its folder.
+/// Returns whether a name cannot lead out of its folder.
 fn is_plain(name: &str) -> bool {
     let is_allowed = |letter: char| letter.is_ascii_alphanumeric() || ".-_".contains(letter);
     !name.is_empty() && !name.starts_with('.') && name.chars().all(is_allowed)

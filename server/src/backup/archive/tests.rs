@@ -81,7 +81,7 @@ fn filter(command: &str) -> Filter {
 
 #[test]
 fn a_command_encrypts_and_another_decrypts() {
-    // No cipher, but a filter of every byte, which any machine has.
+    // It is no cipher, but it changes every byte, and every machine has it.
     let (to, from) = (
         filter("LC_ALL=C tr '\\000-\\377' '\\001-\\377\\000'"),
         filter("LC_ALL=C tr '\\001-\\377\\000' '\\000-\\377'"),
@@ -135,7 +135,7 @@ fn damage_anywhere_is_found() {
         fs::write(&made.archive, damaged).unwrap();
         match extracted(&made, None) {
             Err(_refused) => found += 1,
-            // A tar file has zeros between its entries, which say nothing.
+            // The zeros between the entries of a tar file have no meaning.
             Ok(read) => {
                 assert_eq!(read.manifest, intact.manifest, "byte {at}");
                 assert_eq!(read.authority, intact.authority, "byte {at}");

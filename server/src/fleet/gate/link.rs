@@ -7,7 +7,7 @@ use std::time::Duration;
 use rustls::{AlertDescription, CertificateError, ServerConnection};
 use sha2::{Digest as _, Sha256};
 use socket2::SockRef;
-use tokio::io::AsyncWriteExt as _;
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpSocket, TcpStream};
 use tokio_rustls::{TlsAcceptor, server};
 use tracing::{debug, info, warn};
@@ -40,6 +40,9 @@ const SESSION_GONE_EVERY: Duration = Duration::from_millis(5);
 /// Bytes buffered within the gate, in each direction; buffered bytes are no longer ordered by
 /// priority.
 const BUFFER_BYTES: usize = 4 * 1024;
+/// Maximum time and number of bytes for which a connection is read after a failed handshake.
+const REFUSED_CLOSE_MAX: Duration = Duration::from_millis(500);
+const REFUSED_BYTES_MAX: u64 = 16 * 1024;
 /// Number of bytes of a connection that are inspected first.
 const LOOKED_AT_BYTES: usize = 6;
 /// What the log says of a robot whose certificate has expired.
@@ -159,10 +162,10 @@ impl Link {
         }
         // rustls would otherwise buffer 64 KiB beyond the socket, unordered by priority.
         let bound = |tls: &mut ServerConnection| tls.set_buffer_limit(Some(BUFFER_BYTES));
-        let handshake = self.acceptor.accept_with(stream, bound);
+        let handshake = self.acceptor.accept_with(stream, bound).into_fallible();
         let stream = match tokio::time::timeout(HANDSHAKE_TIMEOUT, handshake).await {
             Ok(Ok(stream)) => stream,
-            Ok(Err(error)) => {
+            Ok(Err((error, stream))) => {
                 counters.gate_tls_failed.one();
                 if is_distrust(&error) {
                     counters.gate_distrusted.one();
@@ -173,6 +176,7 @@ impl Link {
                 }
                 self.failed();
                 debug!("a handshake with {} failed: {error}", self.peer);
+                close_refused(stream).await;
                 return None;
             }
             Err(_elapsed) => {
@@ -338,6 +342,19 @@ fn is_distrust(error: &std::io::Error) -> bool {
         cause,
         Some(rustls::Error::AlertReceived(AlertDescription::UnknownCA))
     )
+}
+
+/// Closes a connection after a failed handshake, so that the client receives the alert with the
+/// reason. A close with unread data resets the connection, and the client loses the alert; a robot
+/// sends its first message along with the end of the handshake.
+async fn close_refused(mut stream: TcpStream) {
+    let closing = async {
+        stream.shutdown().await?;
+        let mut rest = stream.take(REFUSED_BYTES_MAX);
+        tokio::io::copy(&mut rest, &mut tokio::io::sink()).await
+    };
+    // A client that keeps the connection open is not waited for.
+    let _ = tokio::time::timeout(REFUSED_CLOSE_MAX, closing).await;
 }
 
 /// Whether a robot's certificate was refused because of its validity.

@@ -2,7 +2,7 @@
 
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, Command, Output, Stdio};
 
 use reqwest::StatusCode;
 use serde_json::{Value, json};
@@ -75,16 +75,22 @@ impl Running {
             .join(below)
     }
 
-    fn init(&self) -> String {
-        let output = Command::new(PROGRAM)
-            .arg("init")
-            .arg(format!(
-                "--database={}",
-                self.disk().join("tread.db").display()
-            ))
+    /// Runs the program where the disk is mounted, on the server's database. SQLite follows links,
+    /// so a path below `/proc` would lead it to another file.
+    fn run(&self, arguments: &[&str]) -> Output {
+        let database = self.folder.path().join("disk/tread.db");
+        Command::new("nsenter")
+            .arg(format!("--target={}", self.child.id()))
+            .args(["--mount", PROGRAM])
+            .args(arguments)
+            .arg(format!("--database={}", database.display()))
             .stdin(Stdio::null())
             .output()
-            .unwrap();
+            .unwrap()
+    }
+
+    fn init(&self) -> String {
+        let output = self.run(&["init"]);
         assert!(output.status.success(), "{}", said(&output));
         String::from_utf8(output.stdout).unwrap().trim().to_owned()
     }
@@ -183,14 +189,7 @@ async fn on_a_full_disk_the_server_says_so_and_keeps_all_that_it_acknowledged() 
     );
 
     // The doctor, beside the running server.
-    let doctor = Command::new(PROGRAM)
-        .args(["doctor", "--json"])
-        .arg(format!(
-            "--database={}",
-            running.disk().join("tread.db").display()
-        ))
-        .output()
-        .unwrap();
+    let doctor = running.run(&["doctor", "--json"]);
     assert_eq!(doctor.status.code(), Some(1));
     assert_says(&String::from_utf8_lossy(&doctor.stdout), &["make room"]);
 

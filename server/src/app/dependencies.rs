@@ -1,0 +1,78 @@
+//! What the use cases are created from.
+
+use tread_telemetry::Telemetry;
+
+use super::App;
+use super::enrolment::EnrolmentService;
+use super::identity::people::People;
+use super::robot_link::RobotLink;
+use crate::clock::Clock;
+use crate::config::webhooks::WebhooksConfig;
+use crate::config::{AuditConfig, FrictionConfig, StorageConfig};
+use crate::db::Db;
+use crate::friction::index::Normalisation;
+use crate::supervisor::Supervisor;
+
+/// Dependencies of use cases.
+#[derive(Debug)]
+pub struct Dependencies {
+    /// The database.
+    pub db: Db,
+    /// The clock.
+    pub clock: Clock,
+    /// Settings of the fusion of measurements.
+    pub friction: FrictionConfig,
+    /// Limits beyond which the storage counts as failing.
+    pub storage: StorageConfig,
+    /// Declared normalisations, which join robot models.
+    pub normalisations: Vec<Normalisation>,
+    /// Connections to the robots.
+    pub robots: RobotLink,
+    /// Service by which robots join; without it any client on the network may act as a robot.
+    pub enrolment: Option<EnrolmentService>,
+    /// Where webhooks may go.
+    pub webhooks: WebhooksConfig,
+    /// Sign-in of people at an OpenID provider; without it people sign in with tokens alone.
+    pub people: Option<People>,
+    /// Where the audit log is written beside the database.
+    pub audit: AuditConfig,
+    /// Sender of traces of missions; its default sends none.
+    pub telemetry: Telemetry,
+}
+
+impl Dependencies {
+    /// Returns dependencies on a database alone, with default settings and without a connection to
+    /// robots.
+    pub fn on_database(db: Db, clock: Clock) -> Self {
+        Self {
+            db,
+            clock,
+            friction: FrictionConfig::default(),
+            storage: StorageConfig::default(),
+            normalisations: Vec::new(),
+            robots: RobotLink::unconnected(Supervisor::new()),
+            enrolment: None,
+            webhooks: WebhooksConfig::default(),
+            people: None,
+            audit: AuditConfig::default(),
+            telemetry: Telemetry::default(),
+        }
+    }
+}
+
+impl App {
+    /// Creates use cases without a connection to robots, for programs that work on the database
+    /// alone.
+    pub fn without_robots(
+        db: Db,
+        clock: Clock,
+        friction: FrictionConfig,
+        storage: StorageConfig,
+    ) -> Self {
+        Self::new(Dependencies {
+            friction,
+            storage,
+            ..Dependencies::on_database(db, clock)
+        })
+    }
+}
