@@ -190,10 +190,10 @@ test('another language changes everything at once, also what was drawn, and lose
   await page.getByLabel('Centre x, m').fill('8');
   await page.getByLabel('Centre x, m').press('Tab');
   await page.getByLabel('Speed, m/s').fill('40');
-  await page.getByText('That is too fast').waitFor();
+  await page.getByText('That is too fast').first().waitFor();
   await page.getByRole('button', { name: 'Settings' }).click();
   await page.getByLabel('Language').selectOption('de');
-  await page.getByText('Das ist zu schnell').waitFor();
+  await page.getByText('Das ist zu schnell').first().waitFor();
   expect(await page.getByLabel('Mittelpunkt x, m').inputValue()).toBe('8');
   await page.keyboard.press('Escape');
   await page.locator('#settings').waitFor({ state: 'detached' });
