@@ -18,6 +18,7 @@ pub mod connections;
 pub mod counters;
 pub mod db;
 mod doctor;
+mod error_text;
 pub mod fleet;
 pub mod formats;
 pub mod friction;

@@ -28,6 +28,7 @@ use crate::config::StorageConfig;
 use crate::db::DbError;
 use crate::db::alerts::AlertFilter;
 use crate::db::failure::{self, StorageFailure};
+use crate::error_text::chain;
 
 /// Interval between checks of the storage.
 const CHECK_EVERY: Duration = Duration::from_secs(5);
@@ -399,18 +400,6 @@ impl Inner {
         let examined = self.examined.map_or(0, |(_, reports)| reports);
         failure::count(StorageFailure::Damaged) > examined
     }
-}
-
-/// Formats an error with its causes on one line.
-fn chain(error: &dyn std::error::Error) -> String {
-    let mut text = error.to_string();
-    let mut cause = error.source();
-    while let Some(error) = cause {
-        text.push_str(": ");
-        text.push_str(&error.to_string());
-        cause = error.source();
-    }
-    text
 }
 
 /// Returns what failed, and what to do about it.

@@ -6,11 +6,12 @@ use rustls::pki_types::CertificateDer;
 use webpki::EndEntityCert;
 
 use super::Examined;
-use super::finding::{Finding, chain};
+use super::finding::Finding;
 use crate::authority::{Authority, NEXT_CERTIFICATE_FILE};
 use crate::certificate::{Certificate, Condition, is_for};
 use crate::config::credentials::is_passed;
 use crate::config::{TlsFiles, TlsSource};
+use crate::error_text::chain;
 use crate::http::tls::{Tls, read_files};
 
 pub(super) fn findings(examined: &Examined) -> Vec<Finding> {

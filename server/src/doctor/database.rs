@@ -3,9 +3,10 @@
 use jiff::Timestamp;
 
 use super::Examined;
-use super::finding::{Finding, chain};
+use super::finding::Finding;
 use crate::db::failure::StorageFailure;
 use crate::db::inspection::{InspectError, Inspection, Schema, inspect};
+use crate::error_text::chain;
 
 const RESTORE: &str = "stop the server, keep the file, and restore a backup; or bring what can be \
                        read into a new file: `sqlite3 FILE .recover | sqlite3 NEW`";

@@ -19,10 +19,11 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use self::finding::{Finding, chain};
+use self::finding::Finding;
 use crate::clock::Clock;
 use crate::config::{Config, ServerArgs};
 use crate::db::lock;
+use crate::error_text::chain;
 
 /// Arguments of `tread-server doctor`.
 #[derive(Debug, Clone, Args)]
