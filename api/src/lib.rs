@@ -17,6 +17,7 @@
 pub mod access;
 pub mod alert_kind;
 pub mod audit;
+pub mod diagnosis;
 pub mod drive;
 pub mod enrolment;
 pub mod event;

@@ -21,7 +21,7 @@ use crate::authority::{Authority, AuthorityError, NEXT_CERTIFICATE_FILE};
 use crate::clock::Clock;
 use crate::config::{Config, ServerArgs};
 use crate::db::{self, Db, DbError};
-use crate::setup::{self, Given, SetupArgs};
+use crate::setup::{self, Given, Service, SetupArgs};
 
 /// Arguments of `tread-server init`.
 #[derive(Debug, Clone, Args)]
@@ -127,7 +127,11 @@ pub(crate) async fn run(args: InitArgs) -> anyhow::Result<()> {
         None => None,
     };
     let fingerprint = authority.as_ref().map(Authority::fingerprint);
-    let text = setup::next_steps(&prepared.choices, fingerprint);
+    let is_started = args.setup.start;
+    if is_started {
+        Service::of(&prepared.choices)?.start()?;
+    }
+    let text = setup::next_steps(&prepared.choices, fingerprint, is_started);
     write!(io::stdout().lock(), "{text}").context("cannot print")
 }
 

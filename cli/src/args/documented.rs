@@ -9,7 +9,11 @@ use tread_tests::shell::commands;
 use super::{Arguments, shield_negative_points};
 
 /// Placeholders in the documentation, with a valid value for each.
-const PLACEHOLDERS: [(&str, &str); 2] = [
+const PLACEHOLDERS: [(&str, &str); 3] = [
+    (
+        "FINGERPRINT",
+        "9c0e51d2b7463f0c8a5e91d2b746617283940a1b2b3c7d4e8f500192f0c12b3c",
+    ),
     ("TOKEN_ID", "0192f0c1-2b3c-7d4e-8f50-617283940a1b"),
     ("ROTATION", "3f0c8a5e91d2b746"),
 ];

@@ -1,8 +1,8 @@
 //! The commands that README and documentation show are run, in their order: those of a page in one
 //! shell, against a demo, or against server and agent that the page itself starts.
 //!
-//! A comment `not run: why` above a block leaves it out. `args/documented.rs` reads every command all
-//! the same.
+//! A comment `not run: why` above a block leaves it out. `run in a clean root: name` leaves it to
+//! `deploy/check-packages --install`. `args/documented.rs` reads every command all the same.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -15,9 +15,13 @@ use tread_tests::wait::{SHORT, eventually};
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_tread");
 /// Most blocks that are not run.
-const NOT_RUN_MAX: usize = 27;
+const NOT_RUN_MAX: usize = 23;
 /// Begin of the comment above a block that is not run.
 const NOT_RUN: &str = "not run: ";
+/// Begin of the comment above a block that is run from packages alone; a name follows.
+const IN_CLEAN_ROOT: &str = "run in a clean root: ";
+/// Program that runs those blocks.
+const CLEAN_ROOT: &str = "deploy/check-packages";
 /// Pages whose commands are for the fleet of a demo.
 const WITH_A_DEMO: [&str; 3] = ["README.md", "docs/rest.md", "docs/friction.md"];
 /// The page that starts a server and an agent of its own.
@@ -79,7 +83,7 @@ ROTATION() { "$PROGRAM" authority --json | grep -o '"id":"[^"]*"' | head -n 1 | 
 
 fn is_run(block: &Block) -> bool {
     let note = block.note.as_deref().unwrap_or_default();
-    block.language == "sh" && !note.starts_with(NOT_RUN)
+    block.language == "sh" && !note.starts_with(NOT_RUN) && !note.starts_with(IN_CLEAN_ROOT)
 }
 
 /// The shell's script of a page.
@@ -226,12 +230,22 @@ async fn a_server_and_a_robot_are_set_up_as_their_page_says() {
 #[test]
 fn every_block_is_run_or_says_why_not() {
     let mut not_run = Vec::new();
+    let clean_root = std::fs::read_to_string(root().join(CLEAN_ROOT)).unwrap();
+    let named = clean_root.lines().find_map(|line| {
+        let names = line.strip_prefix("for block in ")?.strip_suffix("; do")?;
+        Some(names.split(' ').collect::<Vec<_>>())
+    });
+    let named = named.expect("the names of blocks stand in a loop");
     for page in documents() {
         let name = &page.name;
         let has_a_session = WITH_A_DEMO.contains(&name.as_str()) || name == OF_ITS_OWN;
         for block in page.blocks.iter().filter(|block| block.language == "sh") {
             let place = format!("{name}:{}", block.line);
-            if is_run(block) {
+            let note = block.note.as_deref().unwrap_or_default();
+            if let Some(block) = note.strip_prefix(IN_CLEAN_ROOT) {
+                let is_run = name == OF_ITS_OWN && named.contains(&block.trim());
+                assert!(is_run, "{CLEAN_ROOT} does not run {place}");
+            } else if is_run(block) {
                 assert!(
                     has_a_session,
                     "{place} is run by nothing: say `{NOT_RUN}…` above"

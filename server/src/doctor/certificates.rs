@@ -3,10 +3,10 @@
 use std::path::Path;
 
 use rustls::pki_types::CertificateDer;
+use tread_api::diagnosis::Finding;
 use webpki::EndEntityCert;
 
 use super::Examined;
-use super::finding::Finding;
 use crate::authority::{Authority, NEXT_CERTIFICATE_FILE};
 use crate::certificate::{Certificate, Condition, is_for};
 use crate::config::credentials::is_passed;

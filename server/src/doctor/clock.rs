@@ -5,9 +5,9 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 
 use jiff::{SignedDuration, Timestamp};
+use tread_api::diagnosis::Finding;
 
 use super::Examined;
-use super::finding::Finding;
 
 /// File that systemd-timesyncd creates after its first synchronisation.
 const TIMESYNC_FILE: &str = "/run/systemd/timesync/synchronized";

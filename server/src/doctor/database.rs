@@ -1,9 +1,9 @@
 //! Examines the schema of the database, and whether the database is readable.
 
 use jiff::Timestamp;
+use tread_api::diagnosis::Finding;
 
 use super::Examined;
-use super::finding::Finding;
 use crate::db::failure::StorageFailure;
 use crate::db::inspection::{InspectError, Inspection, Schema, inspect};
 use crate::error_text::chain;

@@ -7,9 +7,9 @@ use std::path::{Path, PathBuf};
 
 use nix::sys::statvfs::{FsFlags, statvfs};
 use nix::unistd::Uid;
+use tread_api::diagnosis::Finding;
 
 use super::Examined;
-use super::finding::Finding;
 use crate::config::TlsSource;
 use crate::config::credentials::is_passed;
 

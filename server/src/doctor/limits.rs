@@ -1,8 +1,7 @@
 //! Examines the limits of the operating system.
 
 use nix::sys::resource::{Resource, getrlimit};
-
-use super::finding::Finding;
+use tread_api::diagnosis::Finding;
 
 /// Number of open files that a fully loaded server needs: for its connections, those of robots, and
 /// their files.

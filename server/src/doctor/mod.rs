@@ -9,7 +9,6 @@ mod certificates;
 mod clock;
 mod database;
 mod files;
-mod finding;
 mod limits;
 mod ports;
 mod probe;
@@ -18,8 +17,8 @@ use std::io::Write as _;
 use std::path::PathBuf;
 
 use clap::Args;
+use tread_api::diagnosis::Finding;
 
-use self::finding::Finding;
 use crate::clock::Clock;
 use crate::config::{Config, ServerArgs};
 use crate::db::lock;

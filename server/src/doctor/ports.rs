@@ -5,9 +5,9 @@ use std::net::{SocketAddr, TcpListener};
 
 use jiff::SignedDuration;
 use jiff::fmt::rfc2822;
+use tread_api::diagnosis::Finding;
 
 use super::Examined;
-use super::finding::Finding;
 use super::probe::{self, Answer};
 use crate::authority::Authority;
 use crate::certificate::{Certificate, Condition};

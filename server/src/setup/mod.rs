@@ -7,6 +7,7 @@
 
 mod choices;
 mod questions;
+mod service;
 mod steps;
 mod text;
 
@@ -23,6 +24,7 @@ use tread_api::ids::SiteId;
 
 pub(crate) use self::choices::Choices;
 use self::questions::Questions;
+pub(crate) use self::service::Service;
 pub(crate) use self::steps::next_steps;
 use crate::config::{Config, ServerArgs};
 
@@ -54,6 +56,9 @@ pub(crate) struct SetupArgs {
     /// Write a configuration without questions, with defaults for all flags that are not given
     #[arg(long)]
     pub(crate) yes: bool,
+    /// Then enable and start the service `tread-server` of the package
+    #[arg(long)]
+    pub(crate) start: bool,
     /// Folder of the database and the fleet's authority, created when missing
     #[arg(long, value_name = "DIR")]
     pub(crate) data_dir: Option<PathBuf>,
@@ -85,6 +90,7 @@ impl SetupArgs {
     fn is_given(&self) -> bool {
         let Self {
             yes,
+            start,
             data_dir,
             site,
             names,
@@ -94,7 +100,8 @@ impl SetupArgs {
             http,
             zenoh,
         } = self;
-        *yes || !names.is_empty()
+        *yes || *start
+            || !names.is_empty()
             || tls.is_some()
             || data_dir.is_some()
             || site.is_some()
@@ -190,6 +197,9 @@ pub(crate) fn prepare(args: &SetupArgs, given: &Given<'_>) -> anyhow::Result<Opt
     };
     refuse_to_replace("configuration file", &choices.config, given.force)?;
     refuse_to_replace("token file", &choices.token_file, given.force)?;
+    if args.start {
+        Service::of(&choices)?;
+    }
     write_beside(choices).map(Some)
 }
 

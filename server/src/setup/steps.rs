@@ -3,16 +3,7 @@
 use std::fmt::Write as _;
 
 use super::choices::{Choices, Web};
-use super::config_default;
-
-/// Unit of systemd that starts the server, if it is installed.
-const UNIT: &str = "tread-server.service";
-/// Folders in which systemd looks for units.
-const UNIT_FOLDERS: [&str; 3] = [
-    "/etc/systemd/system",
-    "/usr/lib/systemd/system",
-    "/lib/systemd/system",
-];
+use super::service::Service;
 
 /// Returns a word, quoted for a shell if necessary.
 fn word(text: &str) -> String {
@@ -21,12 +12,6 @@ fn word(text: &str) -> String {
         return text.to_owned();
     }
     format!("'{}'", text.replace('\'', r"'\''"))
-}
-
-fn has_unit() -> bool {
-    UNIT_FOLDERS
-        .iter()
-        .any(|folder| std::path::Path::new(folder).join(UNIT).exists())
 }
 
 /// Returns the address of the REST API for people.
@@ -46,8 +31,8 @@ fn server(choices: &Choices) -> String {
 }
 
 /// Returns a list of the created files and the next commands. `fingerprint` is that of the fleet's
-/// authority.
-pub(crate) fn next_steps(choices: &Choices, fingerprint: Option<&str>) -> String {
+/// authority, `is_started` whether the server runs.
+pub(crate) fn next_steps(choices: &Choices, fingerprint: Option<&str>, is_started: bool) -> String {
     let config = word(&choices.config.display().to_string());
     let token = word(&choices.token_file.display().to_string());
     let server = server(choices);
@@ -55,11 +40,12 @@ pub(crate) fn next_steps(choices: &Choices, fingerprint: Option<&str>) -> String
         (Web::Authority, Some(fingerprint)) => format!(" --ca-fingerprint {fingerprint}"),
         (_, _) => String::new(),
     };
-    let is_unit = has_unit() && choices.config == config_default(true);
-    let start = if is_unit {
-        "systemctl enable --now tread-server".to_owned()
+    let start = if is_started {
+        String::new()
+    } else if Service::of(choices).is_ok() {
+        "  systemctl enable --now tread-server\n".to_owned()
     } else {
-        format!("tread-server --config {config}")
+        format!("  tread-server --config {config}\n")
     };
     let mut text = String::new();
     // Writing to a string cannot fail.
@@ -75,7 +61,7 @@ pub(crate) fn next_steps(choices: &Choices, fingerprint: Option<&str>) -> String
     }
     let _ = write!(
         text,
-        "\nnext:\n  tread-server doctor --config {config}\n  {start}\n  \
+        "\nnext:\n  tread-server doctor --config {config}\n{start}  \
          tread login --server {server}{trust} --token-file {token}\n"
     );
     if choices.has_authority() {

@@ -53,7 +53,7 @@ fn with_a_name_others_reach_it_by_tls_of_its_own_authority() {
     assert_eq!(config.certificate_names(), args.names);
     let robots = config.robots.unwrap();
     assert_eq!(robots.authority, folder.path().join("tread-data/authority"));
-    let steps = next_steps(&choices, Some("abcd"));
+    let steps = next_steps(&choices, Some("abcd"), false);
     for part in [
         "tread login --server https://tread.example.org:8420 --ca-fingerprint abcd --token-file",
         "tread-agent enroll --server https://tread.example.org:8420 --ca-fingerprint abcd",
@@ -74,7 +74,8 @@ fn behind_a_proxy_only_the_proxy_reaches_the_rest_api() {
     let choices = Choices::of(&args, &defaults(folder.path())).unwrap();
     assert_eq!(addresses(&choices), ["127.0.0.1:8420", "0.0.0.0:7447"]);
     assert!(
-        next_steps(&choices, Some("abcd")).contains("--server https://tread.example.org --token")
+        next_steps(&choices, Some("abcd"), false)
+            .contains("--server https://tread.example.org --token")
     );
     let config = read(choices);
     assert!(config.web.behind_https && config.tls.is_none() && config.robots.is_some());

@@ -264,6 +264,8 @@ fn flags_that_do_not_go_together_are_refused_by_their_names() {
         (vec!["init", "--yes", "--database", "x.db"], "--data-dir"),
         (vec!["init", "--yes", "--site", "A b"], "--site"),
         (vec!["init", "--yes", "--tls-key", "x"], "--tls-certificate"),
+        // Either the service is not installed, or it reads another configuration.
+        (vec!["init", "--start"], "--start needs"),
     ] {
         let mut arguments = arguments;
         if !arguments.contains(&"--database") {

@@ -1,7 +1,6 @@
 //! `tread doctor` examines a server and its robots over the REST API. It checks the connection and
 //! its certificate, the rights of the token, the clocks, and the state of each robot.
 
-mod finding;
 mod robots;
 
 use std::process::ExitCode;
@@ -12,10 +11,10 @@ use jiff::{SignedDuration, Timestamp};
 use reqwest::{Method, header};
 use serde::Serialize;
 use serde_json::Value;
+use tread_api::diagnosis::Finding;
 use tread_api::ids::SiteId;
 use tread_api::robot::{Alert, Severity};
 
-use self::finding::{Finding, Verdict};
 use self::robots::of_robot;
 use crate::client::{Client, ClientError};
 use crate::output::{Output, joined};
@@ -42,9 +41,7 @@ pub(super) async fn run(
     output: Output,
 ) -> anyhow::Result<ExitCode> {
     let checks = examine(site, client).await;
-    let ok = !checks
-        .iter()
-        .any(|finding| finding.verdict == Verdict::Problem);
+    let ok = checks.iter().all(Finding::holds);
     output.show(&Report { ok, checks }, |report| describe(&report.checks))?;
     Ok(if ok {
         ExitCode::SUCCESS
@@ -121,11 +118,9 @@ async fn examine(site: &SiteId, client: &Client) -> Vec<Finding> {
         Err(error) => findings.push(failed("server", &error)),
     }
     match client.robots(site, false).await {
-        Ok(robots) if robots.is_empty() => findings.push(Finding::new(
+        Ok(robots) if robots.is_empty() => findings.push(Finding::skipped(
             "robots",
-            Verdict::Skipped,
             format!("no robot has connected to site `{site}` yet"),
-            None,
         )),
         Ok(robots) => findings.extend(
             robots
@@ -311,6 +306,7 @@ fn alerts(alerts: &[Alert]) -> Finding {
 #[cfg(test)]
 mod tests {
     use serde_json::json;
+    use tread_api::diagnosis::Verdict;
 
     use super::*;
 

@@ -1,10 +1,10 @@
 //! Findings of the doctor about one robot.
 
 use jiff::SignedDuration;
+use tread_api::diagnosis::Finding;
 use tread_api::robot::{LinkState, Robot};
 
 use super::CLOCK_DIFFERENCE_MAX;
-use super::finding::Finding;
 use crate::output::{age, joined};
 
 /// Maximum number of records in a robot's outbox that is normal.

@@ -293,7 +293,8 @@ export class Fleet implements Listener {
     this.#seen = null;
     this.isRead = true;
     this.isDirty = true;
-    this.#listsSoon();
+    // Whoever has just signed in waits for it.
+    this.#listNow();
     void this.stops.read();
     void this.readGround();
   }
@@ -364,15 +365,18 @@ export class Fleet implements Listener {
   }
 
   #listsSoon(): void {
-    this.#listsDue ??= setTimeout(() => {
-      this.#listsDue = undefined;
-      this.#order ??= [...this.tracked.keys()].sort(byId.compare);
-      this.robots = this.#order.flatMap((id) => {
-        const tracked = this.tracked.get(id);
-        return tracked ? { id, robot: tracked.robot, receivedAt: tracked.receivedAt } : [];
-      });
-      if (this.#namesAreOld) this.#readNames();
-    }, LISTS_MS);
+    this.#listsDue ??= setTimeout(() => this.#listNow(), LISTS_MS);
+  }
+
+  #listNow(): void {
+    clearTimeout(this.#listsDue);
+    this.#listsDue = undefined;
+    this.#order ??= [...this.tracked.keys()].sort(byId.compare);
+    this.robots = this.#order.flatMap((id) => {
+      const tracked = this.tracked.get(id);
+      return tracked ? { id, robot: tracked.robot, receivedAt: tracked.receivedAt } : [];
+    });
+    if (this.#namesAreOld) this.#readNames();
   }
 
   #readNames(): void {

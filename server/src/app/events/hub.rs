@@ -24,7 +24,7 @@ pub const CLIENT_BYTES_MAX: usize = 4 * 1024 * 1024;
 /// Maximum number of recent events kept for clients that reconnect.
 pub const KEPT_EVENTS_MAX: usize = 8_192;
 /// Maximum number of bytes of those recent events.
-pub const KEPT_BYTES_MAX: usize = 32 * 1024 * 1024;
+pub const KEPT_BYTES_MAX: usize = 16 * 1024 * 1024;
 /// How long a client that was dropped may take to read its end.
 const LINGER: Duration = Duration::from_secs(5);
 

@@ -1,0 +1,66 @@
+//! The service of the package, which `init --start` enables and starts.
+
+use std::path::Path;
+use std::process::Command;
+
+use anyhow::{Context as _, bail, ensure};
+
+use super::choices::Choices;
+use super::config_default;
+
+/// Name of the service.
+const NAME: &str = "tread-server";
+/// Folders in which systemd looks for units.
+const UNIT_FOLDERS: [&str; 3] = [
+    "/etc/systemd/system",
+    "/usr/lib/systemd/system",
+    "/lib/systemd/system",
+];
+
+/// The installed service, which reads the configuration that `init` writes.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Service(());
+
+impl Service {
+    /// Returns the service that starts a server with these choices.
+    ///
+    /// # Errors
+    /// The service is not installed, or it reads another configuration.
+    pub(crate) fn of(choices: &Choices) -> anyhow::Result<Self> {
+        let file = format!("{NAME}.service");
+        ensure!(
+            UNIT_FOLDERS
+                .iter()
+                .any(|folder| Path::new(folder).join(&file).exists()),
+            "--start needs the service `{NAME}`, which the Debian package installs: leave --start \
+             away, and start the server with `tread-server --config {}`",
+            choices.config.display()
+        );
+        let config = config_default(true);
+        ensure!(
+            choices.config == config,
+            "--start needs the configuration `{}`, which the service reads: leave --config away",
+            config.display()
+        );
+        Ok(Self(()))
+    }
+
+    /// Enables and starts the service. Returns when the server is ready.
+    ///
+    /// # Errors
+    /// `systemctl` is missing, or the service does not start.
+    pub(crate) fn start(self) -> anyhow::Result<()> {
+        let status = Command::new("systemctl")
+            .args(["enable", "--now", NAME])
+            .status()
+            .context("cannot run systemctl, which --start needs: start the server yourself")?;
+        if !status.success() {
+            bail!(
+                "the configuration is written, and the server does not start: `tread-server \
+                 doctor` and `journalctl -u {NAME}` say why; then run `systemctl enable --now \
+                 {NAME}`"
+            );
+        }
+        Ok(())
+    }
+}
