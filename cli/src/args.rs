@@ -45,10 +45,11 @@ pub(crate) use self::safety::{
 use self::values::duration;
 pub(crate) use self::values::{HistoryPlace, shield_negative_points, waypoint};
 pub(crate) use self::webhooks::{NamedWebhook, WebhooksAction, WebhooksArguments};
+use crate::credentials;
 use crate::exit::Exit;
 use crate::output::{failure, note};
 
-/// Default address of the server.
+/// Address of the server if neither a flag nor a login names one.
 pub(crate) const SERVER_DEFAULT: &str = "http://127.0.0.1:8420";
 /// Maximum number of robots of a demo; each is a separate process.
 const DEMO_ROBOTS_MAX: i64 = 50;
@@ -254,9 +255,10 @@ impl RemoteCommand {
 /// Options for the connection to the server, and for the format of the output.
 #[derive(Debug, Clone, Args)]
 pub(crate) struct Connection {
-    /// Address of the server
-    #[arg(long, global = true, env = "TREAD_SERVER", default_value = SERVER_DEFAULT, value_name = "URL")]
-    pub(crate) server: String,
+    /// Address of the server [default: that of the last `tread login`, else
+    /// http://127.0.0.1:8420]
+    #[arg(long, global = true, env = "TREAD_SERVER", value_name = "URL")]
+    pub(crate) server: Option<String>,
     #[command(flatten)]
     pub(crate) showing: Showing,
     /// Site to use
@@ -265,6 +267,21 @@ pub(crate) struct Connection {
     /// Print JSON instead of tables
     #[arg(long, global = true)]
     pub(crate) json: bool,
+}
+
+impl Connection {
+    /// Returns the address of the server: the given one, else that of the last `tread login`, else
+    /// the built-in one.
+    ///
+    /// # Errors
+    /// The file of the last login cannot be read.
+    pub(crate) fn server(&self) -> anyhow::Result<String> {
+        if let Some(given) = &self.server {
+            return Ok(given.clone());
+        }
+        let kept = credentials::last_server()?;
+        Ok(kept.unwrap_or_else(|| SERVER_DEFAULT.to_owned()))
+    }
 }
 
 #[derive(Debug, Args)]

@@ -1,5 +1,6 @@
 //! Tokens with which the user has signed in, by server, in a file that only the user can read. Beside
-//! it is a file with the fingerprints by which servers are trusted.
+//! it are a file with the fingerprints by which servers are trusted, and one with the server of the
+//! last login.
 //!
 //! A token is taken from the first of: `--token-file`, the environment variable `TREAD_TOKEN`, this
 //! file.
@@ -19,6 +20,10 @@ const TOKEN_VARIABLE: &str = "TREAD_TOKEN";
 const FILE_VARIABLE: &str = "TREAD_CREDENTIALS";
 /// File beside the credentials with the fingerprints by which servers are trusted.
 const FINGERPRINTS_FILE: &str = "fingerprints.json";
+/// File beside the credentials with the server of the last login.
+const LAST_LOGIN_FILE: &str = "last-login.json";
+/// Key in that file.
+pub(crate) const LAST_SERVER: &str = "server";
 /// Permission bits of a file that give access to others.
 const OTHERS: u32 = 0o077;
 
@@ -45,6 +50,11 @@ pub(crate) fn fingerprint(address: &str) -> anyhow::Result<Option<Fingerprint>> 
     let kept = store.find(address)?.map(|kept| kept.parse());
     let named = || format!("a fingerprint in {} does not read", store.path().display());
     kept.transpose().with_context(named)
+}
+
+/// Returns the server of the last login; `None` if there was none.
+pub(crate) fn last_server() -> anyhow::Result<Option<String>> {
+    Store::of_user().map_or(Ok(None), |store| store.last_login().find(LAST_SERVER))
 }
 
 /// Reads a token from a file without other content.
@@ -78,6 +88,12 @@ impl Store {
     /// Returns the file beside it with the fingerprints of servers.
     pub(crate) fn fingerprints(&self) -> Self {
         let file = self.file.with_file_name(FINGERPRINTS_FILE);
+        Self { file }
+    }
+
+    /// Returns the file beside it with the server of the last login.
+    pub(crate) fn last_login(&self) -> Self {
+        let file = self.file.with_file_name(LAST_LOGIN_FILE);
         Self { file }
     }
 

@@ -10,7 +10,7 @@ use tread_api::rights::{Grant, Rights, Scope};
 
 use crate::args::{Connection, SessionsAction, TokensAction, TokensArguments};
 use crate::client::{Client, address_of};
-use crate::credentials::{self, Store};
+use crate::credentials::{self, LAST_SERVER, Store};
 use crate::output::{Output, line, note, or_dash, render, table};
 
 /// Maximum length of a token that is read, bytes.
@@ -28,8 +28,9 @@ pub(super) async fn login(connection: &Connection, output: Output) -> anyhow::Re
         None => tokio::task::spawn_blocking(read_from_input).await??,
     };
     let showing = &connection.showing;
-    let kept = credentials::fingerprint(address_of(&connection.server))?;
-    let client = Client::new(&connection.server, Some(&token), showing.trusted(kept))?;
+    let server = connection.server()?;
+    let kept = credentials::fingerprint(address_of(&server))?;
+    let client = Client::new(&server, Some(&token), showing.trusted(kept))?;
     let client = client.for_people(!output.is_json());
     let session = client.session().await?;
     let store = store()?;
@@ -39,7 +40,12 @@ pub(super) async fn login(connection: &Connection, output: Output) -> anyhow::Re
             .fingerprints()
             .keep(client.address(), &fingerprint.to_string())?;
     }
-    note(&format!("stored in {}", store.path().display()));
+    store.last_login().keep(LAST_SERVER, client.address())?;
+    note(&format!(
+        "stored in {}; commands without --server use {} from now on",
+        store.path().display(),
+        client.address()
+    ));
     output.show(&session, who)?;
     Ok(ExitCode::SUCCESS)
 }
@@ -64,6 +70,9 @@ pub(super) fn logout(client: &Client, output: Output) -> anyhow::Result<ExitCode
     let store = store()?;
     store.forget(client.address(), None)?;
     store.fingerprints().forget(client.address(), None)?;
+    store
+        .last_login()
+        .forget(LAST_SERVER, Some(client.address()))?;
     output.show(&json!({"server": client.address()}), |_| {
         format!(
             "deleted the stored token of {}; it stays valid until it is revoked",

@@ -39,7 +39,8 @@ pub(crate) async fn run(command: RemoteCommand, output: Output) -> anyhow::Resul
         return identity::login(&connection, output).await;
     }
     let showing = &connection.showing;
-    let address = address_of(&connection.server);
+    let server = connection.server()?;
+    let address = address_of(&server);
     let token = credentials::find(address, showing.token_file.as_deref())?;
     let trusted = showing.trusted(credentials::fingerprint(address)?);
     let client = Client::new(address, token.as_deref(), trusted)?;

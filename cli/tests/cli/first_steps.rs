@@ -100,6 +100,13 @@ impl OwnServer {
         });
         running.await.unwrap()
     }
+
+    /// Runs the command line as that user, who names no server.
+    async fn run_unnamed(&self, words: &'static [&'static str]) -> Output {
+        let folder = self.folder.path().to_owned();
+        let running = tokio::task::spawn_blocking(move || run(&folder, words));
+        running.await.unwrap()
+    }
 }
 
 fn run(home: &Path, words: &[&str]) -> Output {
@@ -109,6 +116,7 @@ fn run(home: &Path, words: &[&str]) -> Output {
         .env_remove("XDG_CONFIG_HOME")
         .env_remove("TREAD_CREDENTIALS")
         .env_remove("TREAD_TOKEN")
+        .env_remove("TREAD_SERVER")
         .stdin(Stdio::null())
         .output()
         .unwrap()
@@ -155,8 +163,13 @@ async fn a_server_is_trusted_by_the_fingerprint_of_its_authority_and_by_no_other
     ] {
         assert!(said.contains(part), "`{part}` in {said}");
     }
-    let logout = own.run(&["logout"]).await;
+    // A command that names no server goes to that of the last login, until its logout.
+    let whoami = own.run_unnamed(&["whoami"]).await;
+    assert!(whoami.status.success(), "{}", text(&whoami));
+    let logout = own.run_unnamed(&["logout"]).await;
     assert!(logout.status.success(), "{}", text(&logout));
+    let last = own.folder.path().join(".config/tread/last-login.json");
+    assert_eq!(std::fs::read_to_string(last).unwrap().trim(), "{}");
     let doctor = own.run(&["doctor", "--json"]).await;
     assert_eq!(doctor.status.code(), Some(1), "{}", text(&doctor));
     let report: serde_json::Value = serde_json::from_slice(&doctor.stdout).unwrap();
