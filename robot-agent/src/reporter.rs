@@ -280,7 +280,8 @@ pub(crate) async fn log_losses(
         if unplaced > blocks {
             info!(
                 unplaced,
-                "{unplaced} measurements belong to no cell: the site is not known"
+                "{unplaced} measurements belong to no cell: site or pose was not known, the robot \
+                 was outside of the grid, or its wheels were on two kinds of ground"
             );
             blocks = unplaced;
         }

@@ -19,6 +19,7 @@ pub mod counters;
 pub mod db;
 mod doctor;
 mod error_text;
+mod file_owner;
 pub mod fleet;
 pub mod formats;
 pub mod friction;

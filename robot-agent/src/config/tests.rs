@@ -23,17 +23,27 @@ fn defaults_fill_what_a_short_file_leaves_open() {
     assert_eq!(seed, 11, "the scenario's robot of that name");
 }
 
+const EXAMPLE: &str = include_str!("../../robot.example.toml");
+
 #[test]
 fn the_example_says_what_the_defaults_are() {
-    let example = load(include_str!("../../robot.example.toml"), &[]).unwrap();
+    let example = load(EXAMPLE, &[]).unwrap();
     let short = GOOD.replace("/tmp/rover", "/var/lib/tread-agent");
-    // What it says of the robot is of a real one; of a simulated one everything is explained.
+    // Its base is simulated, and equals its model.
+    assert_eq!(example.prior, EstimatorPrior::exact());
+    assert_eq!(example, load(&short, &[]).unwrap());
+}
+
+#[test]
+fn what_the_example_shows_of_the_prior_are_the_defaults_of_a_real_robot() {
+    let begin = EXAMPLE.find("[estimation]").unwrap();
+    let length = EXAMPLE[begin..].find("\n\n").unwrap();
+    let shown = &EXAMPLE[begin..begin + length];
+    let stated = EXAMPLE.replace(shown, &shown.replace("\n# ", "\n"));
+    let prior = load(&stated, &[]).unwrap().prior;
     let mut real = EstimatorPrior::default();
-    real.tyres.unexplained_ratio = example.prior.tyres.unexplained_ratio;
-    assert_eq!(example.prior, real);
-    let default = load(&short, &[]).unwrap();
-    let prior = example.prior;
-    assert_eq!(example, AgentConfig { prior, ..default });
+    real.tyres.unexplained_ratio = prior.tyres.unexplained_ratio;
+    assert_eq!(prior, real);
 }
 
 #[test]

@@ -12,6 +12,7 @@ use crate::build;
 use crate::clock::Clock;
 use crate::db::lock::DatabaseLock;
 use crate::db::{self, Db, schema};
+use crate::file_owner;
 
 /// Exit code of `--check` when migrations are due.
 const DUE: u8 = 3;
@@ -112,6 +113,7 @@ pub(crate) async fn run(args: MigrateArgs) -> anyhow::Result<Compared> {
     let noted = noting.await;
     database.close().await;
     noted.context("cannot write the database")?;
+    file_owner::give_database(&path)?;
     writeln!(out, "applied {} migrations", missing.len())?;
     Ok(Compared::Same)
 }

@@ -32,6 +32,7 @@ use crate::clock::Clock;
 use crate::db::lock::DatabaseLock;
 use crate::db::restorations::{Changed, Restoration};
 use crate::db::{self, Db, DbError, copy, schema};
+use crate::file_owner;
 
 /// Suffix of the database while it is restored.
 const RESTORING_ENDING: &str = ".restoring";
@@ -136,6 +137,12 @@ pub(crate) async fn run(args: RestoreArgs) -> anyhow::Result<()> {
         None => AuthorityFate::None,
     };
     let aside = restoring.finish(&database, now).await?;
+    file_owner::give_database(&database)?;
+    if let AuthorityFate::Restored(folder, aside) = &authority {
+        for folder in aside.iter().chain([folder]) {
+            file_owner::give_to_owner_around(folder)?;
+        }
+    }
     let mut out = io::stdout().lock();
     tell(&mut out, (&database, aside), &restoration, &review).context("cannot print")?;
     tell_authority(&mut out, &authority, &manifest).context("cannot print")?;

@@ -14,7 +14,7 @@ mod text;
 use std::fs::{self, DirBuilder, OpenOptions};
 use std::io::{self, IsTerminal as _, Write as _};
 use std::net::SocketAddr;
-use std::os::unix::fs::{DirBuilderExt as _, MetadataExt as _, OpenOptionsExt as _, lchown};
+use std::os::unix::fs::{DirBuilderExt as _, OpenOptionsExt as _, lchown};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, bail, ensure};
@@ -27,6 +27,7 @@ use self::questions::Questions;
 pub(crate) use self::service::Service;
 pub(crate) use self::steps::next_steps;
 use crate::config::{Config, ServerArgs};
+use crate::file_owner;
 
 /// Mode of the configuration file. It holds no secret: the group of the data folder may read it,
 /// and others need not.
@@ -279,19 +280,13 @@ impl Prepared {
 
     /// Gives root's files in a data folder of another user, such as the service's, to that user.
     fn give_to_owner(&self) -> anyhow::Result<()> {
-        if !Uid::effective().is_root() {
-            return Ok(());
-        }
         let data_dir = &self.choices.data_dir;
-        let folder = fs::metadata(data_dir)
-            .with_context(|| format!("cannot look at `{}`", data_dir.display()))?;
-        let (user, group) = (folder.uid(), folder.gid());
-        if user == 0 {
+        let Some(owner) = file_owner::other_owner(data_dir)? else {
             return Ok(());
-        }
-        lchown(&self.new, None, Some(group))
+        };
+        lchown(&self.new, None, Some(owner.1))
             .with_context(|| format!("cannot give `{}` to its group", self.new.display()))?;
-        give(data_dir, user, group)
+        file_owner::give(data_dir, owner)
     }
 
     /// Removes the temporary file after a failure.
@@ -299,22 +294,6 @@ impl Prepared {
         // The caller reports the failure; a file that remains has a unique name.
         let _ = fs::remove_file(&self.new);
     }
-}
-
-/// Gives all files of root in a folder and its subfolders to a user.
-fn give(folder: &Path, user: u32, group: u32) -> anyhow::Result<()> {
-    let named = || format!("cannot give `{}` to its owner", folder.display());
-    for entry in fs::read_dir(folder).with_context(named)? {
-        let path = entry.with_context(named)?.path();
-        let found = fs::symlink_metadata(&path).with_context(named)?;
-        if found.uid() == 0 {
-            lchown(&path, Some(user), Some(group)).with_context(named)?;
-        }
-        if found.is_dir() {
-            give(&path, user, group)?;
-        }
-    }
-    Ok(())
 }
 
 fn folder_of(file: &Path) -> &Path {
