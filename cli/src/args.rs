@@ -255,8 +255,8 @@ impl RemoteCommand {
 /// Options for the connection to the server, and for the format of the output.
 #[derive(Debug, Clone, Args)]
 pub(crate) struct Connection {
-    /// Address of the server [default: that of the last `tread login`, else
-    /// http://127.0.0.1:8420]
+    /// Address of the server; if absent, that of the last `tread login`, else of this machine, port
+    /// 8420
     #[arg(long, global = true, env = "TREAD_SERVER", value_name = "URL")]
     pub(crate) server: Option<String>,
     #[command(flatten)]

@@ -19,7 +19,9 @@ const UNIT_FOLDERS: [&str; 3] = [
 
 /// The installed service, which reads the configuration that `init` writes.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Service(());
+pub(crate) struct Service {
+    name: &'static str,
+}
 
 impl Service {
     /// Returns the service that starts a server with these choices.
@@ -42,7 +44,7 @@ impl Service {
             "--start needs the configuration `{}`, which the service reads: leave --config away",
             config.display()
         );
-        Ok(Self(()))
+        Ok(Self { name: NAME })
     }
 
     /// Enables and starts the service. Returns when the server is ready.
@@ -50,15 +52,16 @@ impl Service {
     /// # Errors
     /// `systemctl` is missing, or the service does not start.
     pub(crate) fn start(self) -> anyhow::Result<()> {
+        let name = self.name;
         let status = Command::new("systemctl")
-            .args(["enable", "--now", NAME])
+            .args(["enable", "--now", name])
             .status()
             .context("cannot run systemctl, which --start needs: start the server yourself")?;
         if !status.success() {
             bail!(
                 "the configuration is written, and the server does not start: `tread-server \
-                 doctor` and `journalctl -u {NAME}` say why; then run `systemctl enable --now \
-                 {NAME}`"
+                 doctor` and `journalctl -u {name}` say why; then run `systemctl enable --now \
+                 {name}`"
             );
         }
         Ok(())
