@@ -11,13 +11,13 @@ fn rough(form: &[&str]) -> String {
     program
         .args(["--runs", "1", "--only", "nothing"])
         .args(form);
-    let output = program.output().unwrap();
+    let output = program.output().expect("it runs");
     let errors = String::from_utf8_lossy(&output.stderr);
     assert!(
         output.status.code().is_some_and(|code| code < 2),
         "{errors}"
     );
-    String::from_utf8(output.stdout).unwrap()
+    String::from_utf8(output.stdout).expect("text")
 }
 
 #[test]

@@ -12,6 +12,8 @@ use tread_api::startup::apply_environment;
 
 use crate::{Config, Server, ServerArgs, build, doctor, health, init, logging, maintenance};
 
+/// Lowest priority for the processor that a process may give itself.
+const LOWEST_PRIORITY: i32 = 19;
 /// Maximum wait for blocking threads after all tasks have stopped; then they are abandoned.
 const RUNTIME_STOP_TIMEOUT: Duration = Duration::from_secs(2);
 
@@ -72,7 +74,10 @@ pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode 
             Err(error) => Err(error),
         },
         Some(Action::ForgetCertificates(args)) => run_beside_server(init::forget(args)),
-        Some(Action::Backup(args)) => run_beside_server(maintenance::backup::run(args)),
+        Some(Action::Backup(args)) => {
+            lower_priority();
+            run_beside_server(maintenance::backup::run(args))
+        }
         Some(Action::Restore(args)) => run_beside_server(maintenance::restore::run(args)),
         Some(Action::Migrate(args)) => {
             return maintenance::migrate::exit_code(run_beside_server(maintenance::migrate::run(
@@ -97,6 +102,14 @@ fn raise_file_limit() {
         .and_then(|(_, most)| setrlimit(Resource::RLIMIT_NOFILE, most, most));
     if let Err(error) = raised {
         warn!("cannot raise the limit of open files: {error}");
+    }
+}
+
+/// Gives this thread and those that it will start the lowest priority for the processor, so that a
+/// server on the same machine goes first. No thread has been started yet.
+fn lower_priority() {
+    if let Err(error) = rustix::process::nice(LOWEST_PRIORITY) {
+        eprintln!("cannot lower the priority: {error}");
     }
 }
 

@@ -30,6 +30,8 @@ const AUTHORITY_FOLDER: &str = "authority/";
 const MODE: u32 = 0o600;
 /// Size of the pieces in which files are read and written, bytes.
 const PIECE_BYTES: usize = 1024 * 1024;
+/// Bytes of an archive after which they are written to the disk.
+const SYNC_EVERY_BYTES: u64 = 4 * 1024 * 1024;
 /// Maximum size of a manifest, bytes.
 const MANIFEST_BYTES_MAX: u64 = 1024 * 1024;
 /// Maximum size of a file of the authority, bytes.
@@ -124,6 +126,29 @@ pub struct Archived {
     pub bytes: u64,
     /// SHA-256 of the file, hexadecimal.
     pub sha256: String,
+}
+
+/// File that is written to the disk every [`SYNC_EVERY_BYTES`]. Without this the kernel writes it all
+/// at once, and commits of the server beside it wait for that.
+struct Synced {
+    file: File,
+    unsynced: u64,
+}
+
+impl Write for Synced {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let written = self.file.write(bytes)?;
+        self.unsynced += written as u64;
+        if self.unsynced >= SYNC_EVERY_BYTES {
+            self.file.sync_data()?;
+            self.unsynced = 0;
+        }
+        Ok(written)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.file.flush()
+    }
 }
 
 /// Writer that computes size and checksum.
@@ -260,12 +285,13 @@ fn write_new(
     let mut options = OpenOptions::new();
     let file = options.write(true).create_new(true).mode(MODE);
     let file = file.open(partial).map_err(failed())?;
+    let file = Synced { file, unsynced: 0 };
     let Some(filter) = encryption else {
         let output = BufWriter::with_capacity(PIECE_BYTES, Hashing::new(file));
         let output = pack(output, partial, source, progress)?;
         let hashing = output.into_inner().map_err(io::IntoInnerError::into_error);
         let (file, archived) = hashing.map_err(failed())?.done();
-        file.sync_all().map_err(failed())?;
+        file.file.sync_all().map_err(failed())?;
         return Ok(archived);
     };
     let mut child = filter.start(Stdio::piped())?;
@@ -290,7 +316,7 @@ fn write_new(
     filter.check(status)?;
     packed?;
     let (file, archived) = file.done();
-    file.sync_all().map_err(failed())?;
+    file.file.sync_all().map_err(failed())?;
     Ok(archived)
 }
 

@@ -13,8 +13,8 @@ use std::ops::{Deref, DerefMut};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use sqlx::sqlite::SqliteConnectOptions;
-use sqlx::{ConnectOptions as _, Connection as _, SqliteConnection};
+use sqlx::sqlite::{SqliteConnectOptions, SqliteRow};
+use sqlx::{ConnectOptions as _, Connection as _, FromRow, SqliteConnection};
 use tokio::runtime::Handle;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::{Instant, timeout};
@@ -136,11 +136,7 @@ impl Connections {
     /// # Errors
     /// No connection became free in time, or SQLite failed.
     pub(super) async fn begin(&self, statement: &'static str) -> Result<Lent, sqlx::Error> {
-        let waiting = Arc::clone(&self.inner.permits).acquire_owned();
-        let permit = timeout(ACQUIRE_TIMEOUT, waiting)
-            .await
-            .map_err(|_elapsed| sqlx::Error::PoolTimedOut)?
-            .map_err(|_closed| sqlx::Error::PoolClosed)?;
+        let permit = self.reserve().await?;
         let mut opened = match self.inner.take_idle() {
             Some(opened) => opened,
             None => self.inner.connect().await?,
@@ -157,12 +153,15 @@ impl Connections {
         })
     }
 
-    /// Runs a statement outside of any transaction. Its connection stays open also if the statement
-    /// fails, unless it is broken.
+    /// Runs a statement outside of any transaction, and returns its row. Its connection stays open
+    /// also if the statement fails, unless it is broken.
     ///
     /// # Errors
     /// As [`Connections::begin`].
-    pub(super) async fn run(&self, statement: &'static str) -> Result<(), sqlx::Error> {
+    pub(super) async fn run<T>(&self, statement: &'static str) -> Result<T, sqlx::Error>
+    where
+        T: for<'row> FromRow<'row, SqliteRow> + Send + Unpin,
+    {
         let permit = self.inner.permits.acquire().await;
         let _permit = permit.map_err(|_closed| sqlx::Error::PoolClosed)?;
         let idle = self.inner.idle().pop();
@@ -171,18 +170,32 @@ impl Connections {
             Some(opened) => opened,
             None => self.inner.connect().await?,
         };
-        let ran = sqlx::query(statement).execute(opened.connection()?).await;
+        let ran = sqlx::query_as(statement).fetch_one(opened.connection()?);
+        let ran = ran.await;
         // SQLite has answered, so the connection can be used further.
         if matches!(ran, Ok(_) | Err(sqlx::Error::Database(_))) {
             self.inner.give_back(opened);
         } else if !is_new {
             // The connection's thread had ended after the statement before.
             let mut opened = self.inner.connect().await?;
-            sqlx::query(statement).execute(opened.connection()?).await?;
+            let row = sqlx::query_as(statement).fetch_one(opened.connection()?);
+            let row = row.await?;
             self.inner.give_back(opened);
-            return Ok(());
+            return Ok(row);
         }
-        ran.map(|_done| ())
+        ran
+    }
+
+    /// Reserves a connection without using it: with a pool of one, nobody else has any meanwhile.
+    ///
+    /// # Errors
+    /// No connection became free in time, or the pool is closed.
+    pub(super) async fn reserve(&self) -> Result<OwnedSemaphorePermit, sqlx::Error> {
+        let waiting = Arc::clone(&self.inner.permits).acquire_owned();
+        timeout(ACQUIRE_TIMEOUT, waiting)
+            .await
+            .map_err(|_elapsed| sqlx::Error::PoolTimedOut)?
+            .map_err(|_closed| sqlx::Error::PoolClosed)
     }
 
     /// Runs work on one connection before any transaction begins.

@@ -1,10 +1,13 @@
 //! Consistent copies of a database, made beside whoever writes it, and what a copy contains.
 
 use std::collections::BTreeMap;
-use std::fs::{self, OpenOptions};
+use std::convert::Infallible;
+use std::fs::{self, File, OpenOptions};
 use std::io;
 use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
 
 use sqlx::sqlite::SqliteConnectOptions;
 use sqlx::{AssertSqlSafe, ConnectOptions as _, Connection as _, SqliteConnection};
@@ -22,6 +25,10 @@ const COUNTED: [&str; 8] = [
     "stops",
     "tokens",
 ];
+
+/// Interval at which what was copied is written to the disk. Without this the kernel writes it all at
+/// once, and commits of the server beside it wait for that.
+const SYNC_EVERY: Duration = Duration::from_millis(50);
 
 /// What a copy contains.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -64,7 +71,7 @@ pub async fn copy_into(database: &Path, target: &Path) -> Result<(), DbError> {
         .create_new(true)
         .mode(0o600)
         .open(target);
-    created.map_err(sqlx::Error::Io)?;
+    let file = created.map_err(sqlx::Error::Io)?;
     let copying = async {
         let mut connection = connect(database, false).await?;
         let copied = sqlx::query("VACUUM INTO ?").bind(name);
@@ -72,12 +79,25 @@ pub async fn copy_into(database: &Path, target: &Path) -> Result<(), DbError> {
         connection.close().await?;
         copied.map(|_done| ())
     };
-    let copied = copying.await;
+    let copied = tokio::select! {
+        copied = copying => copied,
+        never = sync_periodically(file) => match never {},
+    };
     if copied.is_err() {
         remove(target).map_err(sqlx::Error::Io)?;
     }
     // A full disk at the target is no failure of the server's own storage, so it is not noted.
     copied.map_err(DbError::Sqlite)
+}
+
+/// Writes a file to the disk again and again. A failure is left to whoever writes the file.
+async fn sync_periodically(file: File) -> Infallible {
+    let file = Arc::new(file);
+    loop {
+        tokio::time::sleep(SYNC_EVERY).await;
+        let file = Arc::clone(&file);
+        let _ = tokio::task::spawn_blocking(move || file.sync_data()).await;
+    }
 }
 
 /// Removes a file if it is there.

@@ -67,9 +67,17 @@ use crate::metrics::DatabaseMetrics;
 pub const SQLITE_VERSION_MIN: (u32, u32, u32) = (3, 51, 3);
 /// Number of connections that read at the same time.
 const READERS_MAX: u32 = 4;
-/// Pages of the write-ahead log (64 MiB) at which a commit also checkpoints it, if
-/// [`Db::checkpoint`] has not.
-const WAL_PAGES: u32 = 16_384;
+/// Pages of the write-ahead log (512 MiB) at which a commit also checkpoints it, if
+/// [`Db::checkpoint`] has not. The commit takes as long as what is left to copy, so this is for the
+/// case that nothing else helps.
+const WAL_PAGES: u32 = 131_072;
+/// Pages of the log (16 MiB) from which on it is begun anew when it has been copied.
+const WAL_RESET_PAGES: i64 = 4_096;
+/// Pages (4 MiB) that may be left to copy while commits wait.
+const WAL_REST_PAGES_MAX: i64 = 1_024;
+/// Number of times that the log is copied in one checkpoint until so little is left: each time that
+/// is what was written during the time before.
+const COPIES_MAX: u32 = 8;
 /// Page cache of the writer, KiB: holds the cells that robots drive over now.
 const WRITER_CACHE_KIB: u32 = 32 * 1_024;
 /// Maximum time for background work. It exceeds any real duration; the library never answers a
@@ -311,6 +319,13 @@ pub enum OpenError {
     TooOld(String),
 }
 
+/// Pages in the write-ahead log, and how many of them are in the database file.
+#[derive(Debug, Clone, Copy)]
+struct Checkpointed {
+    pages: i64,
+    copied: i64,
+}
+
 /// The open database; clones share it.
 #[derive(Debug, Clone)]
 pub struct Db {
@@ -519,13 +534,37 @@ impl Db {
     }
 
     /// Copies the write-ahead log into the database file (a passive checkpoint), up to the oldest
-    /// snapshot that a reader still uses. Writers do not wait for it.
+    /// snapshot that a reader still uses. Writers do not wait for it, unless the log is large and
+    /// little is left: that is copied between two commits, and the next commit begins the log anew.
     ///
     /// # Errors
     /// SQLite failed, for instance on a full disk; the log remains valid.
     pub async fn checkpoint(&self) -> Result<(), DbError> {
+        let mut copied_before = -1;
+        for _ in 0..COPIES_MAX {
+            let Checkpointed { pages, copied } = self.copy_log().await?;
+            // A reader keeps the rest from being copied, or nothing is to be done.
+            let is_stuck = copied == copied_before;
+            if pages < WAL_RESET_PAGES || pages == copied || is_stuck {
+                return Ok(());
+            }
+            copied_before = copied;
+            if pages - copied > WAL_REST_PAGES_MAX {
+                continue;
+            }
+            // Without the writer the rest stays until the next time.
+            if let Ok(_writer) = self.writer.reserve().await {
+                self.copy_log().await?;
+            }
+            return Ok(());
+        }
+        Ok(())
+    }
+
+    async fn copy_log(&self) -> Result<Checkpointed, DbError> {
         let checkpoint = self.checkpoints.run("PRAGMA wal_checkpoint(PASSIVE)");
-        Ok(checkpoint.await?)
+        let (_is_busy, pages, copied): (i64, i64, i64) = checkpoint.await?;
+        Ok(Checkpointed { pages, copied })
     }
 
     /// Makes a write without effect, as durable as any other.

@@ -65,3 +65,60 @@ async fn what_is_committed_counts_even_if_nobody_waits_for_it_and_uploads_never_
         .unwrap();
     assert_eq!(db.generation(), before + 1);
 }
+
+/// Fills the log with so many MiB by commits.
+async fn fill_log(db: &Db, mebibytes: usize) {
+    for _ in 0..mebibytes {
+        let mut tx = db.write_uploads("db").await.unwrap();
+        let blob = "INSERT INTO filling VALUES (randomblob(1048576))";
+        sqlx::query(blob).execute(&mut *tx).await.unwrap();
+        tx.commit().await.unwrap();
+    }
+}
+
+async fn db_with_filling(folder: &Path) -> Db {
+    let db = Db::open(&folder.join("tread.db")).await.unwrap();
+    let mut tx = db.write_uploads("db").await.unwrap();
+    let table = sqlx::query("CREATE TABLE filling (bytes BLOB)");
+    table.execute(&mut *tx).await.unwrap();
+    tx.commit().await.unwrap();
+    db
+}
+
+#[tokio::test]
+async fn a_large_log_is_begun_anew_after_a_checkpoint_and_does_not_grow() {
+    let folder = tempfile::tempdir().unwrap();
+    let db = db_with_filling(folder.path()).await;
+    let log = folder.path().join("tread.db-wal");
+    let mut sizes = Vec::new();
+    for _ in 0..4 {
+        fill_log(&db, 20).await;
+        db.checkpoint().await.unwrap();
+        sizes.push(std::fs::metadata(&log).unwrap().len());
+    }
+    assert!(sizes[0] >= 20 << 20, "{sizes:?}");
+    assert!(sizes[3] < sizes[0] + (2 << 20), "{sizes:?}");
+}
+
+#[tokio::test]
+async fn no_commit_copies_the_log_that_a_reader_has_kept_from_being_copied() {
+    let folder = tempfile::tempdir().unwrap();
+    let db = db_with_filling(folder.path()).await;
+    let mut reading = db.read("db").await.unwrap();
+    let count = sqlx::query("SELECT count(*) FROM filling");
+    count.execute(&mut *reading).await.unwrap();
+    fill_log(&db, 80).await;
+    db.checkpoint().await.unwrap();
+    drop(reading);
+    // The file grows by what is copied. This commit is the first after the reader has ended.
+    let size = || {
+        std::fs::metadata(folder.path().join("tread.db"))
+            .unwrap()
+            .len()
+    };
+    let before = size();
+    fill_log(&db, 1).await;
+    assert_eq!(size(), before, "the commit has copied the log");
+    db.checkpoint().await.unwrap();
+    assert!(size() >= before + (80 << 20), "{before} {}", size());
+}

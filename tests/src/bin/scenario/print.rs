@@ -85,8 +85,8 @@ impl Tables {
             let part =
                 |value: Option<f64>| value.map_or_else(|| "-".to_owned(), |it| format!("{it:.3}"));
             table.row([
-                line.terrain.to_string(),
-                line.model.to_string(),
+                line.terrain.clone(),
+                line.model.to_owned(),
                 format!("{:.3}", line.truth),
                 part(line.theta),
                 part(line.low_95),
