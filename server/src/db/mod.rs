@@ -73,8 +73,10 @@ const READERS_MAX: u32 = 4;
 const WAL_PAGES: u32 = 131_072;
 /// Pages of the log (16 MiB) from which on it is begun anew when it has been copied.
 const WAL_RESET_PAGES: i64 = 4_096;
-/// Pages (4 MiB) that may be left to copy while commits wait.
+/// Pages (4 MiB) that may be left to copy while commits wait, and the part of a larger log that may:
+/// where writers are as fast as the disk, less is never left.
 const WAL_REST_PAGES_MAX: i64 = 1_024;
+const WAL_REST_PART: i64 = 8;
 /// Number of times that the log is copied in one checkpoint until so little is left: each time that
 /// is what was written during the time before.
 const COPIES_MAX: u32 = 8;
@@ -549,7 +551,7 @@ impl Db {
                 return Ok(());
             }
             copied_before = copied;
-            if pages - copied > WAL_REST_PAGES_MAX {
+            if pages - copied > WAL_REST_PAGES_MAX.max(pages / WAL_REST_PART) {
                 continue;
             }
             // Without the writer the rest stays until the next time.
