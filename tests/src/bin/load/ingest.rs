@@ -5,13 +5,12 @@ use std::time::Duration;
 use anyhow::{Context, ensure};
 use hdrhistogram::Histogram;
 use serde::Serialize;
-use sqlx::sqlite::SqliteConnectOptions;
-use sqlx::{ConnectOptions, Row};
 use tokio::task::JoinSet;
 use tokio::time::{Instant, MissedTickBehavior};
 use tread_tests::fleet::Fleet;
 use tread_tests::light_robot::LightRobot;
 use tread_tests::process::{Usage, usage_of};
+use tread_tests::stored;
 
 use crate::{Arguments, period_of};
 
@@ -79,9 +78,14 @@ pub(crate) async fn measure(
         all.states += tally.states;
     }
     let seconds = begin.elapsed().as_secs_f64();
-    let server = fleet.server_usage().context("the server is gone")?;
     let generator = usage_of(std::process::id()).context("/proc is not readable")?;
-    let stored = count_stored(fleet).await?;
+    // Sums are stored behind the receipts; their cost belongs to the segments. A difference that
+    // stays is counted below.
+    if let Err(error) = stored::await_sums(&fleet.database()).await {
+        eprintln!("{error}");
+    }
+    let server = fleet.server_usage().context("the server is gone")?;
+    let stored = stored::count(&fleet.database()).await?;
     let committed = i64::try_from(all.committed)?;
     #[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
     let (committed_f64, states_f64) = (all.committed as f64, all.states as f64);
@@ -176,29 +180,4 @@ async fn work(mut robot: LightRobot, plan: UploadPlan, end: Instant) -> anyhow::
             }
         }
     }
-}
-
-/// What the database holds.
-struct Stored {
-    segments: i64,
-    doubles: i64,
-    in_sums: i64,
-}
-
-async fn count_stored(fleet: &Fleet) -> anyhow::Result<Stored> {
-    let options = SqliteConnectOptions::new()
-        .filename(fleet.database())
-        .read_only(true);
-    let mut connection = options.connect().await?;
-    let row = sqlx::query(
-        "SELECT count(*), count(*) - count(DISTINCT boot_pk || ':' || seq), \
-         (SELECT coalesce(sum(segments), 0) FROM cell_sums) FROM segments",
-    )
-    .fetch_one(&mut connection)
-    .await?;
-    Ok(Stored {
-        segments: row.try_get(0)?,
-        doubles: row.try_get(1)?,
-        in_sums: row.try_get(2)?,
-    })
 }
