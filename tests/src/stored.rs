@@ -21,6 +21,8 @@ pub struct Stored {
     pub doubles: i64,
     /// Segments in the stored sums of cells.
     pub in_sums: i64,
+    /// Stored sums of cells.
+    pub sums: i64,
 }
 
 /// Counts what a database holds now.
@@ -32,7 +34,8 @@ pub async fn count(database: &Path) -> anyhow::Result<Stored> {
     let mut connection = options.read_only(true).connect().await?;
     let row = sqlx::query(
         "SELECT count(*), count(*) - count(DISTINCT boot_pk || ':' || seq), \
-         (SELECT coalesce(sum(segments), 0) FROM cell_sums) FROM segments",
+         (SELECT coalesce(sum(segments), 0) FROM cell_sums), \
+         (SELECT count(*) FROM cell_sums) FROM segments",
     )
     .fetch_one(&mut connection)
     .await?;
@@ -41,6 +44,7 @@ pub async fn count(database: &Path) -> anyhow::Result<Stored> {
         segments: row.try_get(0)?,
         doubles: row.try_get(1)?,
         in_sums: row.try_get(2)?,
+        sums: row.try_get(3)?,
     })
 }
 
