@@ -41,7 +41,7 @@ impl Finding {
 
     /// Returns the finding that nothing is wrong.
     #[must_use]
-    pub fn well(name: &str, text: impl Into<String>) -> Self {
+    pub fn ok(name: &str, text: impl Into<String>) -> Self {
         Self::new(name, Verdict::Ok, text)
     }
 
@@ -63,9 +63,7 @@ impl Finding {
         Self::new(name, Verdict::Problem, text).with_next_step(next_step)
     }
 
-    /// Adds what to do.
-    #[must_use]
-    pub fn with_next_step(self, next_step: impl Into<String>) -> Self {
+    fn with_next_step(self, next_step: impl Into<String>) -> Self {
         Self {
             next_step: Some(next_step.into()),
             ..self

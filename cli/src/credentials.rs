@@ -23,7 +23,7 @@ const FINGERPRINTS_FILE: &str = "fingerprints.json";
 /// File beside the credentials with the server of the last login.
 const LAST_LOGIN_FILE: &str = "last-login.json";
 /// Key in that file.
-pub(crate) const LAST_SERVER: &str = "server";
+const LAST_SERVER: &str = "server";
 /// Permission bits of a file that give access to others.
 const OTHERS: u32 = 0o077;
 
@@ -91,10 +91,19 @@ impl Store {
         Self { file }
     }
 
-    /// Returns the file beside it with the server of the last login.
-    pub(crate) fn last_login(&self) -> Self {
+    fn last_login(&self) -> Self {
         let file = self.file.with_file_name(LAST_LOGIN_FILE);
         Self { file }
+    }
+
+    /// Stores the server of the last login.
+    pub(crate) fn keep_last_server(&self, address: &str) -> anyhow::Result<()> {
+        self.last_login().keep(LAST_SERVER, address)
+    }
+
+    /// Deletes the server of the last login if it is this one.
+    pub(crate) fn forget_last_server(&self, address: &str) -> anyhow::Result<()> {
+        self.last_login().forget(LAST_SERVER, Some(address))
     }
 
     /// Returns the path of the file.

@@ -1,6 +1,6 @@
 //! What a tick costs, how fast the plant runs and how exact it is.
 //!
-//! `cargo run --release -p tread-control --example cost [-- --json]`
+//! `cargo run --release -p tread-control --example cost [-- --json | -- --markdown]`
 //!
 //! Instructions per call, counted by valgrind instead of a clock:
 //! `valgrind --tool=callgrind --callgrind-out-file=target/cost.callgrind \
@@ -40,6 +40,12 @@ struct Check {
     goal: String,
     value: f64,
     holds: bool,
+}
+
+impl Check {
+    fn verdict(&self) -> &'static str {
+        if self.holds { "holds" } else { "FAILS" }
+    }
 }
 
 fn main() -> ExitCode {
@@ -85,9 +91,18 @@ fn main() -> ExitCode {
             })
             .collect();
         println!("{}", serde_json::json!({ "checks": checks }));
+    } else if has("--markdown") {
+        println!("| figure | goal | value | verdict |\n|---|---:|---:|---:|");
+        for check in &checks {
+            let verdict = check.verdict();
+            println!(
+                "| {} | {} | {:.6} | {verdict} |",
+                check.name, check.goal, check.value
+            );
+        }
     } else {
         for check in &checks {
-            let verdict = if check.holds { "holds" } else { "FAILS" };
+            let verdict = check.verdict();
             println!(
                 "{:55} {:>12.6}  goal {:8} {verdict}",
                 check.name, check.value, check.goal

@@ -1,6 +1,6 @@
-//! What report programs print of the goals that they check: one table for all of them.
+//! What report programs print: their tables, and the goals that they check.
 
-use std::fmt::Write as _;
+use std::fmt::{self, Display, Formatter, Write as _};
 use std::ops::RangeInclusive;
 
 use serde_json::{Value, json};
@@ -79,6 +79,81 @@ impl Figure {
     }
 }
 
+/// A table of a report: for people in a terminal by [`Display`], for a page by
+/// [`Table::markdown`].
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Table {
+    head: Vec<String>,
+    rows: Vec<Vec<String>>,
+}
+
+impl Table {
+    /// Begins a table with the names of its columns. The first column is aligned to the left, all
+    /// others to the right.
+    #[must_use]
+    pub fn new<'a>(head: impl IntoIterator<Item = &'a str>) -> Self {
+        Self {
+            head: head.into_iter().map(str::to_owned).collect(),
+            rows: Vec::new(),
+        }
+    }
+
+    /// Adds a row; cells that are missing are empty, those beyond the last column are left out.
+    pub fn row(&mut self, cells: impl IntoIterator<Item = String>) {
+        let empty = std::iter::repeat_with(String::new);
+        let row = cells.into_iter().chain(empty).take(self.head.len());
+        self.rows.push(row.collect());
+    }
+
+    /// The table in Markdown.
+    pub fn markdown(&self) -> String {
+        let mut text = String::new();
+        // A bar would end the cell.
+        let line = |cells: &[String]| {
+            let cells: Vec<String> = cells.iter().map(|cell| cell.replace('|', "\\|")).collect();
+            format!("| {} |\n", cells.join(" | "))
+        };
+        text.push_str(&line(&self.head));
+        text.push('|');
+        for place in 0..self.head.len() {
+            text.push_str(if place == 0 { "---|" } else { "---:|" });
+        }
+        text.push('\n');
+        for row in &self.rows {
+            text.push_str(&line(row));
+        }
+        text
+    }
+}
+
+impl Display for Table {
+    fn fmt(&self, out: &mut Formatter<'_>) -> fmt::Result {
+        let lines = || std::iter::once(&self.head).chain(&self.rows);
+        let widths: Vec<usize> = (0..self.head.len())
+            .map(|place| lines().map(|cells| cells[place].chars().count()).max())
+            .map(Option::unwrap_or_default)
+            .collect();
+        for cells in lines() {
+            let mut text = String::new();
+            for (place, (cell, width)) in cells.iter().zip(&widths).enumerate() {
+                if place == 0 {
+                    write!(text, "{cell:<width$}")?;
+                } else {
+                    write!(text, "  {cell:>width$}")?;
+                }
+            }
+            writeln!(out, "{}", text.trim_end())?;
+        }
+        Ok(())
+    }
+}
+
+/// A ratio in per cent, with one decimal; a dash for none.
+pub fn percent(ratio: impl Into<Option<f64>>) -> String {
+    let text = |ratio: f64| format!("{:.1} %", 100.0 * ratio);
+    ratio.into().map_or_else(|| "-".to_owned(), text)
+}
+
 /// The checks for programs.
 pub fn checks_json<'a>(checks: impl IntoIterator<Item = &'a Check>) -> Value {
     let one = |check: &Check| {
@@ -92,14 +167,16 @@ pub fn checks_json<'a>(checks: impl IntoIterator<Item = &'a Check>) -> Value {
 
 /// The checks as a table in Markdown.
 pub fn checks_markdown<'a>(checks: impl IntoIterator<Item = &'a Check>) -> String {
-    let mut text = String::from("| figure | goal | value | |\n|---|---|---|---|\n");
+    let mut table = Table::new(["figure", "goal", "value", "verdict"]);
     for check in checks {
-        // A bar would end the cell.
-        let name = check.name.replace('|', "\\|");
-        let (goal, value, verdict) = (&check.goal, check.figure(4), check.verdict());
-        let _ = writeln!(text, "| {name} | {goal} | {value} | {verdict} |");
+        table.row([
+            check.name.clone(),
+            check.goal.clone(),
+            check.figure(4),
+            check.verdict().to_owned(),
+        ]);
     }
-    text
+    table.markdown()
 }
 
 #[cfg(test)]
@@ -115,5 +192,21 @@ mod tests {
         assert!(!Check::of("x", f64::NAN).between(0.0..=1.0).holds);
         let nothing = Check::of("x", None).at_most(1.0);
         assert!(!nothing.holds && nothing.figure(4) == "none");
+    }
+
+    #[test]
+    fn columns_of_a_table_are_aligned_by_characters_and_short_rows_are_filled() {
+        let mut table = Table::new(["line", "θ", "coverage"]);
+        table.row(["circle".to_owned(), "0.2".to_owned(), percent(0.951)]);
+        table.row(["8".to_owned()]);
+        assert_eq!(
+            table.to_string(),
+            "line      θ  coverage\ncircle  0.2    95.1 %\n8\n"
+        );
+        assert_eq!(
+            table.markdown(),
+            "| line | θ | coverage |\n|---|---:|---:|\n| circle | 0.2 | 95.1 % |\n| 8 |  |  |\n"
+        );
+        assert_eq!(percent(None), "-");
     }
 }

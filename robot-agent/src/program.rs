@@ -8,7 +8,7 @@ use anyhow::Context;
 use clap::{Parser, Subcommand};
 use tracing::{error, info, warn};
 use tracing_subscriber::EnvFilter;
-use tread_api::startup::give_zenoh_threads;
+use tread_api::startup::apply_environment;
 
 use crate::agent::{Agent, RunningAgent};
 use crate::config::{AgentConfig, Flags, LogFormat};
@@ -108,8 +108,11 @@ fn run_enroll(args: EnrollArgs) -> anyhow::Result<()> {
 }
 
 fn run(flags: &Flags) -> anyhow::Result<()> {
-    if let Err(cause) = give_zenoh_threads() {
-        warn!("zenoh has few threads, the robot may be mute for seconds after a cut: {cause}");
+    if let Err(cause) = apply_environment() {
+        warn!(
+            "zenoh has few threads, the robot may be silent for seconds after a loss of the \
+             link: {cause}"
+        );
     }
     let config = AgentConfig::load(flags)?;
     let runtime = tokio::runtime::Builder::new_multi_thread()

@@ -1,5 +1,5 @@
-//! Owners of files that root creates for the service's user: `init`, `restore` and `migrate` run as
-//! root on a machine with packages, and the server does not.
+//! Owners of the files that root creates for the service's user. `init`, `restore` and `migrate` run
+//! as root on a machine with packages. The server runs as another user.
 
 use std::fs;
 use std::os::unix::fs::{MetadataExt as _, lchown};
@@ -8,11 +8,13 @@ use std::path::Path;
 use anyhow::Context as _;
 use nix::unistd::Uid;
 
-/// User and group of a folder, if this process is root and another user owns the folder.
+use crate::paths::folder_of;
+
+/// Returns user and group of a folder that another user owns, if this process runs as root.
 ///
 /// # Errors
 /// The folder cannot be examined.
-pub(crate) fn other_owner(folder: &Path) -> anyhow::Result<Option<(u32, u32)>> {
+pub(crate) fn service_owner(folder: &Path) -> anyhow::Result<Option<(u32, u32)>> {
     if !Uid::effective().is_root() {
         return Ok(None);
     }
@@ -21,48 +23,43 @@ pub(crate) fn other_owner(folder: &Path) -> anyhow::Result<Option<(u32, u32)>> {
     Ok((found.uid() != 0).then(|| (found.uid(), found.gid())))
 }
 
-/// Gives a file of root, or all files of root in a folder and its subfolders, to a user.
+/// Changes the owner of root's files: a file, or a folder with everything in it.
 ///
 /// # Errors
-/// A file cannot be examined or given away.
-pub(crate) fn give(path: &Path, owner: (u32, u32)) -> anyhow::Result<()> {
-    let named = || format!("cannot give `{}` to its owner", path.display());
+/// A file cannot be examined, or its owner cannot be changed.
+pub(crate) fn chown_recursively(path: &Path, owner: (u32, u32)) -> anyhow::Result<()> {
+    let named = || format!("cannot change the owner of `{}`", path.display());
     let found = fs::symlink_metadata(path).with_context(named)?;
     if found.uid() == 0 {
         lchown(path, Some(owner.0), Some(owner.1)).with_context(named)?;
     }
     if found.is_dir() {
         for entry in fs::read_dir(path).with_context(named)? {
-            give(&entry.with_context(named)?.path(), owner)?;
+            chown_recursively(&entry.with_context(named)?.path(), owner)?;
         }
     }
     Ok(())
 }
 
-/// Gives root's files in a folder to the owner of the folder around it.
+/// Makes the owner of the parent folder the owner of root's files in a folder.
 ///
 /// # Errors
-/// A file cannot be examined or given away.
-pub(crate) fn give_to_owner_around(folder: &Path) -> anyhow::Result<()> {
-    match other_owner(parent_of(folder))? {
-        Some(owner) => give(folder, owner),
+/// A file cannot be examined, or its owner cannot be changed.
+pub(crate) fn chown_to_parents_owner(folder: &Path) -> anyhow::Result<()> {
+    match service_owner(folder_of(folder))? {
+        Some(owner) => chown_recursively(folder, owner),
         None => Ok(()),
     }
 }
 
-fn parent_of(path: &Path) -> &Path {
-    let folder = path.parent().filter(|it| !it.as_os_str().is_empty());
-    folder.unwrap_or(Path::new("."))
-}
-
-/// Gives root's files of a database (those whose names begin with its name) to the owner of their
-/// folder.
+/// Makes the owner of the folder the owner of root's files of a database: those whose names begin
+/// with its name.
 ///
 /// # Errors
-/// A file cannot be examined or given away.
-pub(crate) fn give_database(database: &Path) -> anyhow::Result<()> {
-    let folder = parent_of(database);
-    let Some((owner, name)) = other_owner(folder)?.zip(database.file_name()) else {
+/// A file cannot be examined, or its owner cannot be changed.
+pub(crate) fn chown_database(database: &Path) -> anyhow::Result<()> {
+    let folder = folder_of(database);
+    let Some((owner, name)) = service_owner(folder)?.zip(database.file_name()) else {
         return Ok(());
     };
     let named = || format!("cannot look at `{}`", folder.display());
@@ -73,7 +70,7 @@ pub(crate) fn give_database(database: &Path) -> anyhow::Result<()> {
             .as_encoded_bytes()
             .starts_with(name.as_encoded_bytes())
         {
-            give(&entry.path(), owner)?;
+            chown_recursively(&entry.path(), owner)?;
         }
     }
     Ok(())
@@ -100,18 +97,18 @@ mod tests {
         let owner = |name: &str| fs::metadata(at(name)).unwrap().uid();
         if !Uid::effective().is_root() {
             // Nobody else can give files away; nothing is tried.
-            give_database(&at("tread.db")).unwrap();
+            chown_database(&at("tread.db")).unwrap();
             assert_eq!(owner("tread.db"), Uid::effective().as_raw());
             return;
         }
         chown(folder.path(), Some(OTHER), Some(OTHER)).unwrap();
-        give_database(&at("tread.db")).unwrap();
+        chown_database(&at("tread.db")).unwrap();
         for name in ["tread.db", "tread.db-wal", "tread.db.lock"] {
             assert_eq!(owner(name), OTHER, "{name}");
         }
         assert_eq!(owner("notes"), 0, "it is not of the database");
         assert_eq!(owner("authority/ca.key"), 0);
-        give_to_owner_around(&at("authority")).unwrap();
+        chown_to_parents_owner(&at("authority")).unwrap();
         assert_eq!(owner("authority"), OTHER);
         assert_eq!(owner("authority/ca.key"), OTHER);
     }

@@ -21,7 +21,7 @@ use crate::authority::{Authority, AuthorityError, NEXT_CERTIFICATE_FILE};
 use crate::clock::Clock;
 use crate::config::{Config, ServerArgs};
 use crate::db::{self, Db, DbError};
-use crate::setup::{self, Given, Service, SetupArgs};
+use crate::setup::{self, Given, SetupArgs};
 
 /// Arguments of `tread-server init`.
 #[derive(Debug, Clone, Args)]
@@ -129,7 +129,7 @@ pub(crate) async fn run(args: InitArgs) -> anyhow::Result<()> {
     let fingerprint = authority.as_ref().map(Authority::fingerprint);
     let is_started = args.setup.start;
     if is_started {
-        Service::of(&prepared.choices)?.start()?;
+        setup::start_service()?;
     }
     let text = setup::next_steps(&prepared.choices, fingerprint, is_started);
     write!(io::stdout().lock(), "{text}").context("cannot print")

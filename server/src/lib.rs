@@ -32,6 +32,7 @@ mod logging;
 mod maintenance;
 pub mod metrics;
 pub mod oidc;
+mod paths;
 mod program;
 mod rate_limit;
 mod service_manager;

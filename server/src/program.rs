@@ -8,7 +8,7 @@ use clap::Parser as _;
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use tokio::signal::unix::{SignalKind, signal};
 use tracing::{info, warn};
-use tread_api::startup::give_zenoh_threads;
+use tread_api::startup::apply_environment;
 
 use crate::{Config, Server, ServerArgs, build, doctor, health, init, logging, maintenance};
 
@@ -112,10 +112,13 @@ fn run_beside_server<T>(command: impl Future<Output = anyhow::Result<T>>) -> any
 /// # Errors
 /// The configuration is invalid, the server cannot start, or a vital task failed.
 pub fn run(args: &ServerArgs) -> anyhow::Result<()> {
-    let threads = give_zenoh_threads();
+    let environment = apply_environment();
     logging::start(args)?;
-    if let Err(cause) = threads {
-        warn!("zenoh has few threads, robots may be mute for seconds after a cut: {cause}");
+    if let Err(cause) = environment {
+        warn!(
+            "zenoh has few threads and the allocator keeps memory, robots may be silent for \
+             seconds after a loss of the link: {cause}"
+        );
     }
     let config = Config::load(args)?;
     raise_file_limit();

@@ -8,6 +8,7 @@ use std::io::{self, Write};
 use std::process::ExitCode;
 
 use serde::Serialize;
+use tread_lab::report::Table;
 
 /// A figure with what it must be.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -163,19 +164,44 @@ pub fn tell_with(
         write!(out, "{words}")?;
         lines(&mut out, checks)?;
     }
-    let all_hold = checks.iter().all(|check| check.holds);
-    Ok(if all_hold {
+    Ok(exit_code(checks))
+}
+
+/// Prints a report for a page: its tables in Markdown, then the checks.
+///
+/// # Errors
+/// Nothing can be written.
+pub fn tell_markdown(tables: &str, checks: &[Check]) -> anyhow::Result<ExitCode> {
+    let mut table = Table::new(["figure", "goal", "value", "verdict"]);
+    for check in checks {
+        table.row([
+            check.name.clone(),
+            check.goal.clone(),
+            format!("{:.3}", check.value),
+            verdict(check).to_owned(),
+        ]);
+    }
+    write!(io::stdout().lock(), "{tables}\n{}", table.markdown())?;
+    Ok(exit_code(checks))
+}
+
+fn exit_code(checks: &[Check]) -> ExitCode {
+    if checks.iter().all(|check| check.holds) {
         ExitCode::SUCCESS
     } else {
         ExitCode::FAILURE
-    })
+    }
+}
+
+fn verdict(check: &Check) -> &'static str {
+    if check.holds { "ok" } else { "FAILED" }
 }
 
 fn lines(out: &mut impl Write, checks: &[Check]) -> io::Result<()> {
     let widest = checks.iter().map(|check| check.name.chars().count()).max();
     let width = widest.unwrap_or(0);
     for check in checks {
-        let verdict = if check.holds { "ok" } else { "FAILED" };
+        let verdict = verdict(check);
         writeln!(
             out,
             "{verdict:<7}{:<width$}{:>14.3}   goal {}",

@@ -10,7 +10,7 @@ use tread_api::rights::{Grant, Rights, Scope};
 
 use crate::args::{Connection, SessionsAction, TokensAction, TokensArguments};
 use crate::client::{Client, address_of};
-use crate::credentials::{self, LAST_SERVER, Store};
+use crate::credentials::{self, Store};
 use crate::output::{Output, line, note, or_dash, render, table};
 
 /// Maximum length of a token that is read, bytes.
@@ -40,7 +40,7 @@ pub(super) async fn login(connection: &Connection, output: Output) -> anyhow::Re
             .fingerprints()
             .keep(client.address(), &fingerprint.to_string())?;
     }
-    store.last_login().keep(LAST_SERVER, client.address())?;
+    store.keep_last_server(client.address())?;
     note(&format!(
         "stored in {}; commands without --server use {} from now on",
         store.path().display(),
@@ -70,9 +70,7 @@ pub(super) fn logout(client: &Client, output: Output) -> anyhow::Result<ExitCode
     let store = store()?;
     store.forget(client.address(), None)?;
     store.fingerprints().forget(client.address(), None)?;
-    store
-        .last_login()
-        .forget(LAST_SERVER, Some(client.address()))?;
+    store.forget_last_server(client.address())?;
     output.show(&json!({"server": client.address()}), |_| {
         format!(
             "deleted the stored token of {}; it stays valid until it is revoked",

@@ -1,7 +1,8 @@
 //! `ground_change`: how soon agents detect that the ground has changed, and how often they do where it
 //! has not, on robots unlike their simulator.
 //!
-//! `cargo run --release -p tread-lab --bin ground_change -- [--hours H] [--runs N] [--seed N] [--json]`
+//! `cargo run --release -p tread-lab --bin ground_change -- [--hours H] [--runs N] [--seed N]
+//! [--json | --markdown]`
 //!
 //! Robots, sensors and courses are those of the population of `rough`. Drives without a change take ten
 //! minutes each. In the others K changes from 5 to 1 and back under all wheels, after 30 to 54 s.
@@ -15,7 +16,7 @@ use clap::Parser;
 use serde::Serialize;
 use tread_lab::parallel::in_parallel;
 use tread_lab::random::Random;
-use tread_lab::report::{Check, checks_json};
+use tread_lab::report::{Check, Table, checks_json, checks_markdown, percent};
 use tread_lab::rough::ground_change::{ChangeTrial, run};
 use tread_lab::rough::run::Course;
 use tread_lab::rough::sensors::SensorSpec;
@@ -47,9 +48,12 @@ struct Arguments {
     /// First seed
     #[arg(long, default_value_t = 1_000_001)]
     seed: u64,
-    /// Print one JSON object instead of a table
-    #[arg(long)]
+    /// Print one JSON object instead of tables
+    #[arg(long, conflicts_with = "markdown")]
     json: bool,
+    /// Print the tables in Markdown, for the page of the report
+    #[arg(long)]
+    markdown: bool,
 }
 
 /// Drives without a change.
@@ -164,42 +168,41 @@ fn with_or_without(has_torque: bool) -> &'static str {
     }
 }
 
-fn print(quiet: &[Quiet], changed: &[Changed]) {
-    println!(
-        "{:<34} {:>7} {:>13} {:>9}",
-        "no change", "hours", "false alarms", "per hour"
-    );
-    for line in quiet {
-        println!(
-            "{:<34} {:>7.1} {:>13} {:>9.2}",
-            with_or_without(line.has_torque),
-            line.hours,
-            line.false_alarms,
-            false_per_hour(line),
-        );
+fn quiet_table(lines: &[Quiet]) -> Table {
+    let mut table = Table::new(["no change", "hours", "false alarms", "per hour"]);
+    for line in lines {
+        table.row([
+            with_or_without(line.has_torque).to_owned(),
+            format!("{:.1}", line.hours),
+            line.false_alarms.to_string(),
+            format!("{:.2}", false_per_hour(line)),
+        ]);
     }
-    println!(
-        "\n{:<34} {:>7} {:>13} {:>9} {:>9} {:>9}",
-        "change of K", "drives", "θ known", "in 2 s", "detected", "median"
-    );
-    for line in changed {
-        let name = format!(
-            "{} to {}, {}",
-            line.from,
-            line.to,
-            with_or_without(line.has_torque)
-        );
-        let delay = line
-            .delay_s
-            .map_or_else(|| "-".to_owned(), |delay_s| format!("{delay_s:.2} s"));
-        println!(
-            "{name:<34} {:>7} {:>12.1}% {:>8.1}% {:>8.1}% {delay:>9}",
-            line.drives,
-            100.0 * line.known,
-            100.0 * line.in_time,
-            100.0 * line.detected,
-        );
+    table
+}
+
+fn change_table(lines: &[Changed]) -> Table {
+    let mut table = Table::new([
+        "change of K",
+        "drives",
+        "θ known before",
+        "detected within 2 s",
+        "detected",
+        "median delay",
+    ]);
+    for line in lines {
+        let torque = with_or_without(line.has_torque);
+        let delay = |delay_s: f64| format!("{delay_s:.2} s");
+        table.row([
+            format!("{} to {}, {torque}", line.from, line.to),
+            line.drives.to_string(),
+            percent(line.known),
+            percent(line.in_time),
+            percent(line.detected),
+            line.delay_s.map_or_else(|| "-".to_owned(), delay),
+        ]);
     }
+    table
 }
 
 #[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
@@ -233,7 +236,13 @@ fn main() -> anyhow::Result<ExitCode> {
         });
         println!("{object}");
     } else {
-        print(&quiet, &lines);
+        let tables = [quiet_table(&quiet), change_table(&lines)];
+        if arguments.markdown {
+            let tables = tables.map(|table| table.markdown()).join("\n");
+            println!("{tables}\n{}", checks_markdown(&checks));
+        } else {
+            println!("{}\n{}", tables[0], tables[1]);
+        }
     }
     Ok(if checks.iter().all(|check| check.holds) {
         ExitCode::SUCCESS

@@ -33,7 +33,7 @@ pub(crate) struct Finding {
 }
 
 impl Finding {
-    pub(super) fn well(name: &'static str, text: impl Into<String>) -> Self {
+    pub(super) fn ok(name: &'static str, text: impl Into<String>) -> Self {
         Self {
             name,
             holds: true,
@@ -48,7 +48,7 @@ impl Finding {
         Self {
             holds: false,
             key: Some(key),
-            ..Self::well(name, text)
+            ..Self::ok(name, text)
         }
     }
 
@@ -56,7 +56,7 @@ impl Finding {
     pub(super) fn skipped(name: &'static str, text: impl Into<String>) -> Self {
         Self {
             is_skipped: true,
-            ..Self::well(name, text)
+            ..Self::ok(name, text)
         }
     }
 
@@ -122,7 +122,7 @@ mod tests {
             Finding::wrong("command", "drive.ros2.command.track_width_m", "")
                 .with_line("drive.ros2.command", "track_width_m", "0.430")
                 .with_line("drive.ros2.joints", "left", left),
-            Finding::well("imu", "all is well"),
+            Finding::ok("imu", "all is well"),
             Finding::wrong("signs", "drive.ros2.command.turn_sign", "")
                 .with_line("drive.ros2.command", "turn_sign", "-1")
                 .with_line("drive.ros2.command", "track_width_m", "0.5"),

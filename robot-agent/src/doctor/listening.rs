@@ -151,7 +151,7 @@ fn of_gyro_at_rest(settings: &Ros2Settings, messages: &[Message]) -> Option<Find
     let degrees = bias_rad_s.to_degrees();
     if bias_rad_s.abs() <= GYRO_BIAS_MAX_RAD_S {
         let text = format!("the gyro says {bias_rad_s:.4} rad/s ({degrees:.2} °/s) at rest");
-        return Some(Finding::well("gyro", text));
+        return Some(Finding::ok("gyro", text));
     }
     let text = format!(
         "the gyro says {bias_rad_s:.4} rad/s ({degrees:.2} °/s) while the robot stands, at most \
@@ -288,7 +288,7 @@ fn of_topic(
         1.0e3 * gap.as_secs_f64()
     });
     let gap_ms = gaps.fold(0.0, f64::max);
-    Finding::well(
+    Finding::ok(
         name,
         format!(
             "{rate_hz:.1} Hz, {middle_ms:.1} ms old when they come (the 99th of 100 {late_ms:.1} \
@@ -417,5 +417,5 @@ fn effort(settings: &Ros2Settings, messages: &[&Message]) -> Option<Finding> {
         let finding = Finding::wrong("effort", "drive.ros2.joints.effort", text);
         return Some(finding.with_line("drive.ros2.joints", "effort", "\"none\""));
     }
-    Some(Finding::well("effort", "the joints say how they pull"))
+    Some(Finding::ok("effort", "the joints say how they pull"))
 }

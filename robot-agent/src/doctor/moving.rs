@@ -198,7 +198,7 @@ fn of_radius(model: &RobotModel, radius_m: f64) -> Finding {
     let model_m = model.wheel_radius_m();
     if (radius_m / model_m - 1.0).abs() <= RADIUS_SHARE {
         let text = format!("the wheels roll as with a radius of {radius_m:.3} m");
-        return Finding::well("radius", text);
+        return Finding::ok("radius", text);
     }
     let text = format!(
         "the wheels roll as with a radius of {radius_m:.3} m, the model says {model_m:.3} m"

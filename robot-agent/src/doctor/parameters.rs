@@ -48,7 +48,7 @@ impl Parameters {
     /// Returns the finding: the parameters with 95 % intervals, or why there are none.
     pub(super) fn finding(&self) -> Finding {
         match self.estimator.estimate().robot {
-            Some(robot) => Finding::well(NAME, text(&robot)),
+            Some(robot) => Finding::ok(NAME, text(&robot)),
             None => Finding::skipped(
                 NAME,
                 "mass, inertia and centre of mass: the motion excited them too little, or \

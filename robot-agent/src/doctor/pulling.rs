@@ -141,7 +141,7 @@ fn of_size(pull: &Pull, effort: Effort, model: &RobotModel) -> Finding {
     } else if least < *FRICTION.start() || ratio.is_some_and(|it| it < *MOMENTUM_RATIO.start()) {
         "too little"
     } else {
-        return Finding::well("torque", format!("{turn}{setting_off}"));
+        return Finding::ok("torque", format!("{turn}{setting_off}"));
     };
     let (key, hint, fits) = match effort {
         Effort::Current(n_m_a) => {

@@ -166,7 +166,7 @@ pub(super) fn finding(answers: Answers, settings: &Ros2Settings) -> Finding {
         return Finding::wrong("sides", "drive.ros2.joints.left", text);
     };
     let Some(first) = flips.first() else {
-        return Finding::well(
+        return Finding::ok(
             "sides",
             "wheels, gyro, ground and command agree on left and forward",
         );

@@ -167,7 +167,7 @@ pub(super) fn findings(
 /// Returns the finding on the wheel radius by which the base converts commands to wheel speeds.
 fn of_radius_of_base(settings: &Ros2Settings, obeyed: Obeyed) -> Finding {
     if (obeyed.forward - 1.0).abs() <= COMMAND_SHARE {
-        return Finding::well(
+        return Finding::ok(
             "command",
             "driving forward, the wheels turn as fast as they are commanded",
         );
@@ -215,7 +215,7 @@ fn of_tracks(
     let mut findings = Vec::new();
     if is_obeyed {
         let text = "in a turn the wheels turn as fast as they are commanded";
-        findings.push(Finding::well("turn command", text));
+        findings.push(Finding::ok("turn command", text));
     } else if settings.command.kind == CommandKind::JointSpeeds {
         let text = format!(
             "in a turn the wheels turn at {:.0} % of their command",
@@ -266,7 +266,7 @@ fn of_tracks(
         format!("with a wheelbase of {wheelbase_m:.3} m no track turns so: measure both")
     });
     if allows(model_m) {
-        findings.push(Finding::well("track", format!("{shown}; {range}")));
+        findings.push(Finding::ok("track", format!("{shown}; {range}")));
         return findings;
     }
     let fits_m = if allows(base_m) && (base_m - model_m).abs() > SAME_M {

@@ -60,7 +60,19 @@ test('a robot that moves though it is stopped is a fault, and one that nobody he
   expect(groupOf(robot('a', { mode: 'stopped', standing: 'does_not_stand' }))).toBe('fault');
   expect(groupOf(robot('a', { link: 'offline', mode: 'tracking' }))).toBe('lost');
   expect(groupOf({ ...robot('a'), live: null })).toBe('lost');
-  expect(countsOf(fleet)).toEqual({ fault: 2, lost: 1, stopped: 1, moving: 2, idle: 2 });
+  expect(countsOf(fleet)).toEqual({ unconfirmed: 0, fault: 2, lost: 1, stopped: 1, moving: 2, idle: 2 });
+});
+
+test('robots whose stop is not confirmed or has failed come before all others, whatever they say of themselves', () => {
+  // One says that it is idle, the other is not heard at all.
+  const hasStopProblem = (id: string) => id === 'rover-10' || id === 'rover-4';
+  const entries = fleet.map((robot) => ({ robot }));
+  const order = listed(entries, all, nameRanks(fleet), hasStopProblem).map((entry) => entry.robot.id);
+  expect(order.slice(0, 3)).toEqual(['rover-4', 'rover-10', 'rover-3']);
+  expect(groupOf(robot('rover-10'), hasStopProblem)).toBe('unconfirmed');
+  expect(countsOf(fleet, hasStopProblem)).toEqual({ unconfirmed: 2, fault: 2, lost: 0, stopped: 1, moving: 2, idle: 1 });
+  const found = listed(entries, { ...all, groups: new Set<Group>(['unconfirmed']) }, nameRanks(fleet), hasStopProblem);
+  expect(found.map((entry) => entry.robot.id)).toEqual(['rover-4', 'rover-10']);
 });
 
 test('a search, groups and a model leave what fits all of them', () => {

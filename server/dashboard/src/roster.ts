@@ -1,9 +1,12 @@
 // Which robots of a fleet are listed, in which order, and which a choice means. Pure.
 import type { Robot } from './api/schema';
-import { doing } from './standing';
+import { doing, hasFault } from './standing';
 
-/** What a robot is up to, as far as it concerns whoever supervises it: trouble first. */
-export const GROUPS = ['fault', 'lost', 'stopped', 'moving', 'idle'] as const;
+/**
+ * What a robot is up to, as far as it concerns whoever supervises it: trouble first, and first of all robots that are
+ * to stop and have not confirmed it, or whose stop failed.
+ */
+export const GROUPS = ['unconfirmed', 'fault', 'lost', 'stopped', 'moving', 'idle'] as const;
 export type Group = (typeof GROUPS)[number];
 export type Order = 'trouble' | 'name';
 
@@ -16,11 +19,17 @@ export interface Wanted {
   order: Order;
 }
 
-export function groupOf(robot: Robot): Group {
+/** Whether something is wrong with the stop of a robot: it is not confirmed, or it failed. */
+export type HasStopProblem = (robot: string) => boolean;
+const NONE: HasStopProblem = () => false;
+
+export function groupOf(robot: Robot, hasStopProblem: HasStopProblem = NONE): Group {
   const { live } = robot;
+  // It may drive on, whatever else is known of it.
+  if (hasStopProblem(robot.id)) return 'unconfirmed';
   // Whatever a robot said last, nobody knows whether it still is so.
   if (robot.link === 'offline' || !live) return 'lost';
-  if (live.mode === 'fault' || live.fault || doing(live).isBad) return 'fault';
+  if (hasFault(live) || doing(live).isBad) return 'fault';
   if (live.mode === 'stopped' || live.safety.stop) return 'stopped';
   return live.mode === 'idle' ? 'idle' : 'moving';
 }
@@ -52,10 +61,15 @@ export function nameRanks(robots: Iterable<Robot>): NameRanks {
 }
 
 /** The robots that are wanted, in the order that is wanted. Names are ranked beforehand: they change seldom. */
-export function listed<Entry extends { robot: Robot }>(entries: readonly Entry[], wanted: Wanted, ranks: NameRanks): Entry[] {
+export function listed<Entry extends { robot: Robot }>(
+  entries: readonly Entry[],
+  wanted: Wanted,
+  ranks: NameRanks,
+  hasStopProblem: HasStopProblem = NONE,
+): Entry[] {
   const words = wanted.search.toLowerCase().split(/\s+/).filter(Boolean);
   const found = entries
-    .map((entry) => ({ entry, rank: GROUPS.indexOf(groupOf(entry.robot)) }))
+    .map((entry) => ({ entry, rank: GROUPS.indexOf(groupOf(entry.robot, hasStopProblem)) }))
     .filter(
       ({ entry: { robot }, rank }) =>
         isFound(robot, words) &&
@@ -70,9 +84,9 @@ export function listed<Entry extends { robot: Robot }>(entries: readonly Entry[]
 }
 
 /** How many robots each group has. */
-export function countsOf(robots: Iterable<Robot>): Record<Group, number> {
-  const counts: Record<Group, number> = { fault: 0, lost: 0, stopped: 0, moving: 0, idle: 0 };
-  for (const robot of robots) counts[groupOf(robot)] += 1;
+export function countsOf(robots: Iterable<Robot>, hasStopProblem: HasStopProblem = NONE): Record<Group, number> {
+  const counts: Record<Group, number> = { unconfirmed: 0, fault: 0, lost: 0, stopped: 0, moving: 0, idle: 0 };
+  for (const robot of robots) counts[groupOf(robot, hasStopProblem)] += 1;
   return counts;
 }
 

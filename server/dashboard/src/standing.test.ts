@@ -1,6 +1,7 @@
 import { expect, test } from 'vitest';
 import type { RobotLive, RobotMode, StandingState, Stop } from './api/schema';
-import { doing, stopped } from './standing';
+import { STOP_STATES, doing, hasFault, isRed, stopState, stopWord } from './standing';
+import { DICTIONARIES } from './texts';
 
 const live = (mode: RobotMode, state?: StandingState): RobotLive =>
   ({ mode, safety: { standing: state ? { state } : null } }) as RobotLive;
@@ -13,19 +14,46 @@ test('a robot that is to stand and moves is said so, whatever its mode', () => {
     expect(doing(live(mode, 'moves')).isBad).toBe(true);
   }
   expect(doing(live('stopped', 'stopping'))).toEqual({ text: 'stopping', isBad: false });
-  expect(doing(live('stopped', 'standing')).text).toBe('stopped, stands');
+  expect(doing(live('stopped', 'standing')).text).toBe('stopped, stands still');
   expect(doing(live('tracking', 'standing')).text).toBe('on a mission');
   expect(doing(live('tracking')).isBad).toBe(false);
   expect(doing(null).isBad).toBe(false);
 });
 
 test('a stop is red until it is confirmed, and again where its robot does not stand', () => {
-  expect(stopped(stop(null), 'rover-1', live('stopped', 'standing')).look).toBe('red');
-  expect(stopped(stop(AT), 'rover-1', live('stopped', 'stopping'))).toEqual({
-    text: 'rover-1 is stopping: its wheels are commanded to rest',
-    look: 'held',
-  });
-  expect(stopped(stop(AT), 'rover-1', live('stopped', 'standing')).text).toContain('stands');
-  expect(stopped(stop(AT), 'rover-1', live('stopped', 'does_not_stand')).look).toBe('red');
-  expect(stopped(stop(AT), 'rover-1', live('stopped', 'moves')).look).toBe('red');
+  expect(stopState(stop(null), live('stopped', 'standing'))).toBe('unconfirmed');
+  expect(stopState(stop(AT), live('stopped', 'stopping'))).toBe('stopping');
+  expect(stopState(stop(AT), live('stopped', 'standing'))).toBe('standing');
+  expect(stopState(stop(AT), live('stopped', 'does_not_stand'))).toBe('runs');
+  expect(stopState(stop(AT), live('stopped', 'moves'))).toBe('moves');
+  expect(STOP_STATES.filter(isRed)).toEqual(['runs', 'moves', 'unconfirmed']);
+});
+
+test('each state of a stop is one sentence with a robot, who stopped it, and a full stop', () => {
+  const { en } = DICTIONARIES;
+  expect(en.stop.states.standing('rover-1', 'demo')).toBe('rover-1: stopped by demo. The robot stands still.');
+  for (const { stop: said } of Object.values(DICTIONARIES)) {
+    for (const state of STOP_STATES) {
+      const sentence = said.states[state]('rover-1', 'demo');
+      expect(sentence).toMatch(/^rover-1.*\bdemo\b.*\.$/);
+      expect(sentence).not.toMatch(/befohlen|commanded/);
+    }
+    // What begins a sentence is no lower-case word.
+    for (const sentence of [said.sending(said.everyRobot), said.failed(said.everyRobot), said.refused(said.everyRobot, 'x')]) {
+      expect(sentence).toMatch(/^\p{Lu}/u);
+    }
+  }
+});
+
+test('the bar of stops, what was done to several and the card of a robot call a state alike', () => {
+  expect(stopWord('standing')).toBe(doing(live('stopped', 'standing')).text);
+  expect(stopWord('stopping')).toBe(doing(live('stopped', 'stopping')).text);
+  expect(stopWord('runs')).toBe(doing(live('stopped', 'does_not_stand')).text);
+});
+
+test('a robot is in fault by its mode or by what it says', () => {
+  expect(hasFault({ ...live('fault'), fault: null })).toBe(true);
+  expect(hasFault({ ...live('idle'), fault: 'a motor is too hot' })).toBe(true);
+  expect(hasFault({ ...live('idle'), fault: null })).toBe(false);
+  expect(hasFault(null)).toBe(false);
 });

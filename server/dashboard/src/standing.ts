@@ -12,12 +12,37 @@ export function doing(live: RobotLive | null | undefined): { text: string; isBad
   return { text: isStopped ? texts.standing[standing] : texts.mode[live.mode], isBad: false };
 }
 
-/** A stop that is in force: unconfirmed, stopping, standing, or not obeyed. */
-export function stopped(stop: Stop, name: string, live: RobotLive | null | undefined): { text: string; look: 'held' | 'red' } {
+/** Whether a robot says that it is in fault. */
+export function hasFault(live: RobotLive | null | undefined): boolean {
+  return live != null && (live.mode === 'fault' || live.fault != null);
+}
+
+/** How a stop that is in force goes on, the worst first: not obeyed, not confirmed, coming to rest, at rest. */
+export const STOP_STATES = ['runs', 'moves', 'unconfirmed', 'stopping', 'standing'] as const;
+export type StopState = (typeof STOP_STATES)[number];
+
+export function stopState(stop: Stop, live: RobotLive | null | undefined): StopState {
   const standing = live?.safety.standing?.state;
-  if (!stop.confirmed_at) return { text: texts.stop.unconfirmed(name), look: 'red' };
-  if (standing === 'does_not_stand') return { text: texts.stop.runs(name), look: 'red' };
-  if (standing === 'moves') return { text: texts.stop.moves(name), look: 'red' };
+  if (!stop.confirmed_at) return 'unconfirmed';
+  if (standing === 'does_not_stand') return 'runs';
+  if (standing === 'moves') return 'moves';
   const stands = standing === 'standing' || (standing === undefined && stop.standing_at);
-  return { text: stands ? texts.stop.confirmed(name) : texts.stop.stopping(name), look: 'held' };
+  return stands ? 'standing' : 'stopping';
+}
+
+/** Whether a stop is not what it is to be, which is shown in red. */
+export function isRed(state: StopState): boolean {
+  return state !== 'stopping' && state !== 'standing';
+}
+
+/** How the stop of a robot goes on, in a word, as {@link doing} says it of the robot. */
+export function stopWord(state: StopState): string {
+  const words = {
+    runs: texts.standing.does_not_stand,
+    moves: texts.standing.moves,
+    unconfirmed: texts.stop.problems.unconfirmed,
+    stopping: texts.standing.stopping,
+    standing: texts.standing.standing,
+  };
+  return words[state];
 }

@@ -2,10 +2,12 @@
 import { expect, test } from 'vitest';
 import type { Alert, Mission, Page as ApiPage, Stop } from './types';
 import { violations } from './checks';
-import { api, browser, eventually, shot } from './harness';
+import { api, browser, eventually, shot, windowOf } from './harness';
 
 const { open } = browser();
 const ROBOT = 'rover-2';
+/** So near a place is shown at least, pixels per metre. */
+const PLACE_PX_M = 35;
 const alertsOf = async (query: string) => (await api<ApiPage<Alert>>(`/v1/alerts?site=yard&${query}`)).items;
 
 test('an alert leads to its robot, its mission and its place, and is found again when it is over', async () => {
@@ -24,9 +26,12 @@ test('an alert leads to its robot, its mission and its place, and is found again
   const card = page.locator(`[data-alert="${alert.id}"]`);
   await tab.click();
   await card.getByRole('button', { name: 'Show the place' }).click();
-  await eventually('the place in the middle', async () => {
-    const [x, y] = /view=([-\d.]+),([-\d.]+)/.exec(decodeURIComponent(page.url()))?.slice(1).map(Number) ?? [];
-    return Math.hypot((x ?? NaN) - (alert.place?.x_m ?? NaN), (y ?? NaN) - (alert.place?.y_m ?? NaN)) < 0.05;
+  const { x_m, y_m } = alert.place ?? { x_m: NaN, y_m: NaN };
+  await eventually('the place near, and under no panel', async () => {
+    const place = await windowOf(page);
+    const [at, beside] = [place(x_m, y_m), place(x_m + 1, y_m)];
+    const isSeen = await page.evaluate(({ x, y }) => document.elementFromPoint(x, y)?.localName === 'canvas', at);
+    return isSeen && beside.x - at.x >= PLACE_PX_M;
   });
   expect(await violations(page), 'alerts').toEqual([]);
   await shot(page, 'alerts');
@@ -39,6 +44,16 @@ test('an alert leads to its robot, its mission and its place, and is found again
   await page.getByRole('heading', { name: ROBOT }).waitFor();
   // The robot's own panel leads to the same mission and place.
   await page.getByRole('tabpanel').or(page.locator('.note, .problem')).getByRole('button', { name: 'Show the place' }).first().waitFor();
+
+  // In German the alert is a German sentence, and the words of the server are marked as English.
+  const german = await open({ locale: 'de-DE' });
+  await german.getByRole('tab', { name: 'Meldungen' }).click();
+  const same = german.locator(`[data-alert="${alert.id}"]`);
+  await same.getByText(`Für ${ROBOT} gilt ein Stopp.`).waitFor();
+  expect(await same.locator('[lang="en"]').innerText()).toBe(alert.text);
+  expect(await violations(german), 'alerts in German').toEqual([]);
+  await shot(german, 'alerts-de');
+  await german.close();
 
   await tab.click();
   const kind = page.getByRole('combobox', { name: 'Kind' });

@@ -90,7 +90,7 @@ test('new alerts are counted in the title, sound, and are notified', async () =>
   await say(page, 2);
   await titled(2);
   await eventually('a notification', async () => (await calls(page)).notices.length === 1);
-  expect(await calls(page)).toEqual({ tones: 2, notices: [{ title: 'Tread: rover-2: No contact with the robot', body: 'alert 2' }] });
+  expect(await calls(page)).toEqual({ tones: 2, notices: [{ title: 'Tread: rover-2: No contact with the robot', body: 'Nothing has arrived from rover-2 for at least 15 s. alert 2' }] });
   // What was said before calls nobody again.
   await say(page, 2);
   await say(page, 1, { acknowledged_at: '2026-01-31T14:06:00Z' });
@@ -101,7 +101,7 @@ test('new alerts are counted in the title, sound, and are notified', async () =>
   await say(page, 3);
   await say(page, 4, { severity: 'critical' });
   await eventually('another one', async () => (await calls(page)).notices.length === 2);
-  expect(await calls(page)).toMatchObject({ tones: 5, notices: [{}, { title: 'Tread: 2 new alerts', body: 'rover-2: No contact with the robot. alert 4' }] });
+  expect(await calls(page)).toMatchObject({ tones: 5, notices: [{}, { title: 'Tread: 2 new alerts', body: 'Nothing has arrived from rover-2 for at least 15 s. alert 4' }] });
   await page.evaluate(() => (globalThis as unknown as { calls: Calls }).calls.notices[1]?.onclick?.());
   await eventually('the alerts', async () => (await page.getByRole('tab', { name: 'Alerts' }).getAttribute('aria-selected')) === 'true');
 });

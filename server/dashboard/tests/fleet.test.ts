@@ -89,7 +89,7 @@ test('the friction layer says what the API says, at three places', async () => {
       await page.mouse.move(x + 1, y);
       await page.mouse.move(x, y);
       const said = await page.locator('[data-test="value"]').innerText();
-      const found = /θ = 1\/K ([\d.]+), 95 % ([\d.]+) to ([\d.]+) · (\d+) robots?, (\d+) passe?s? · [\d.]+ .*ago$/.exec(said);
+      const found = /Slip \(θ\) ([\d.]+), 95 % ([\d.]+) to ([\d.]+) · (\d+) robots?, (\d+) passe?s? · [\d.]+ .*ago$/.exec(said);
       if (!most || !found) return false;
       const near = (text: string | undefined, value: number) => Math.abs(Number(text) - value) <= 0.006 * value;
       return (
@@ -135,7 +135,7 @@ test('two times of the friction map are compared', async () => {
     return items.length >= 3 && items;
   });
   const page = await open();
-  await page.getByRole('combobox', { name: 'Friction' }).selectOption('change of θ between two times');
+  await page.getByRole('combobox', { name: 'Friction' }).selectOption('Change of slip');
   await page.getByLabel('Before').waitFor();
   await page.locator('.layers figure').getByText('white: within two standard deviations').waitFor();
   const place = await windowOf(page);
@@ -174,7 +174,7 @@ test('two times of the friction map are compared', async () => {
   await enter('Before', '2020-01-01 00:00');
   await enter('After', '2020-02-01 00:00');
   await page.getByText('Nothing was measured between these times.').waitFor();
-  await page.getByRole('combobox', { name: 'Friction' }).selectOption('θ = 1/K');
+  await page.getByRole('combobox', { name: 'Friction' }).selectOption('Slip (θ)');
   await page.getByLabel('Before').waitFor({ state: 'detached' });
 });
 
@@ -206,7 +206,7 @@ test('ground that has changed is red where θ rose, blue where it fell, and whit
   });
   await page.getByText('Layers', { exact: true }).click();
   await page.getByRole('checkbox', { name: 'Trails' }).uncheck();
-  await page.getByRole('combobox', { name: 'Friction' }).selectOption('change of θ between two times');
+  await page.getByRole('combobox', { name: 'Friction' }).selectOption('Change of slip');
   await page.getByText('loading …').waitFor({ state: 'detached' });
   const place = await windowOf(page);
   const box = await map(page);

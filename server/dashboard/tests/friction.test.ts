@@ -60,27 +60,68 @@ test('friction is shown from the start, with a scale whose ends say what they me
   const legend = page.locator('.layers figure');
   await legend.getByText(texts.map.ends.slippery, { exact: true }).waitFor();
   await legend.getByText(texts.map.ends.firm, { exact: true }).waitFor();
-  // What θ means for the model of these robots, by its limits.
+  await legend.getByText('How much the wheels slip when the robot turns or accelerates').waitFor();
+  expect(await legend.getByText('θ = 1/K').isVisible()).toBe(false);
+  // What θ means for the model of these robots, by its limits, and its formula are said to whoever asks.
   const robot = await api<Robot>('/v1/sites/yard/robots/rover-1');
   const demand = demandOf(robot.model);
-  const row = legend.locator('tr', { has: page.getByRole('cell', { name: '0.1', exact: true }) });
-  await legend.getByText('What it means').click();
+  const row = legend.locator('tr', { has: page.getByRole('cell', { name: '0.2', exact: true }) });
+  await legend.getByText('More', { exact: true }).click();
   const said = Number(/([\d.]+)$/.exec(await row.innerText())?.[1]);
-  expect(said).toBeCloseTo((slipOf(0.1, demand) ?? NaN) * 100, 1);
-  await legend.locator('.wide').getByText(`turn of ${plain(demand.radius_m)} m radius`).waitFor();
-  await legend.getByText('θ is no friction coefficient').waitFor();
+  expect(Math.abs(said - (slipOf(0.2, demand) ?? NaN) * 100)).toBeLessThan(0.51);
+  await legend.getByText(`turn of ${plain(demand.radius_m)} m radius`).waitFor();
+  await legend.getByText('θ = 1/K is no friction coefficient').waitFor();
   await shot(page, 'friction-legend');
-  await legend.getByText('What it means').click();
-  await page.getByRole('combobox', { name: 'Friction' }).selectOption('friction');
-  await legend.getByText('What it means').click();
-  await legend.getByText('It says nothing of θ.').waitFor();
-  await legend.locator('.wide').getByText('stops within this distance').waitFor();
-  const mu = RANGES.friction.ticks[1] ?? NaN;
-  const limit = legend.locator('tr', { has: page.getByRole('cell', { name: plain(mu), exact: true }) });
-  const stops_m = Number(/([\d.]+)$/.exec(await limit.innerText())?.[1]);
-  // Two decimals are shown, and a half may go either way.
-  expect(Math.abs(stops_m - (stoppingM(mu, demand) ?? NaN))).toBeLessThan(0.0051);
-  await shot(page, 'friction-peak');
+});
+
+/** Puts another braking limit in the place of that of the robots. */
+const braking = (acceleration_m_s2: number) => async (page: Page) => {
+  // Robots come by the stream of events, whose messages are JSON.
+  await page.addInitScript((limit) => {
+    const parse = JSON.parse;
+    JSON.parse = (text: string, ...more) => {
+      const value = parse(text, ...more);
+      if (value?.robot?.model) value.robot.model.limits.linear_acceleration_max_m_s2 = limit;
+      return value;
+    };
+  }, acceleration_m_s2);
+};
+
+test('peak friction has a scale of its own, and what it means for a robot, once if it is always the same', async () => {
+  await measured();
+  const { model } = await api<Robot>('/v1/sites/yard/robots/rover-1');
+  const [first = NaN] = RANGES.friction.ticks.filter((mu) => mu > 0);
+  for (const limit_m_s2 of [0.5, 20]) {
+    const page = await open({ prepare: braking(limit_m_s2) });
+    const legend = page.locator('.layers figure');
+    const background = () => legend.locator('.bar').evaluate((bar) => getComputedStyle(bar).backgroundImage);
+    const ofSlip = await background();
+    await page.getByRole('combobox', { name: 'Friction' }).selectOption('friction');
+    await legend.getByText(texts.map.ends.littleShown, { exact: true }).waitFor();
+    await legend.getByText('a low value is no warning').waitFor();
+    expect(await background()).not.toBe(ofSlip);
+    // Yellow is slippery ground, and is not on this scale.
+    expect(await background()).not.toContain(`rgb(${RANGES.theta.scale(1).join(', ')})`);
+    await legend.getByText('More', { exact: true }).click();
+    await legend.getByText('It says nothing of θ.').waitFor();
+    const demand = demandOf({ ...model, limits: { ...model.limits, linear_acceleration_max_m_s2: limit_m_s2 } });
+    const stops_m = stoppingM(first, demand) ?? NaN;
+    const constant = legend.locator('[data-test="constant"]');
+    if (limit_m_s2 < first * 9.8) {
+      // It brakes no harder than its model may, whatever the friction.
+      const said = await constant.innerText();
+      expect(Math.abs(Number(/stops within ([\d.]+) m/.exec(said)?.[1]) - stops_m)).toBeLessThan(0.0051);
+      expect(await legend.locator('table').count()).toBe(0);
+    } else {
+      await legend.getByText('stops within this distance').waitFor();
+      const row = legend.locator('tr', { has: page.getByRole('cell', { name: plain(first), exact: true }) });
+      // Two decimals are shown, and a half may go either way.
+      expect(Math.abs(Number(/([\d.]+)$/.exec(await row.innerText())?.[1]) - stops_m)).toBeLessThan(0.0051);
+      expect(await constant.count()).toBe(0);
+    }
+    await shot(page, `friction-peak-${limit_m_s2 < 1 ? 'constant' : 'table'}`);
+    await page.close();
+  }
 });
 
 test('how unsure a value is shows in its hatching alone, and not in its colour', async () => {
@@ -256,7 +297,16 @@ test('the map is shown as of past hours, one after the other', async () => {
     await page.mouse.move(x, y);
     return (await page.locator('[data-test="value"]').innerText()) === texts.map.noValue;
   });
+  await page.getByText('Nothing had been measured here by then.').waitFor();
   await shot(page, 'friction-past');
+  await page.getByRole('button', { name: 'Now' }).click();
+  await time.getByText('now', { exact: true }).waitFor();
+  await page.getByText('Nothing had been measured here by then.').waitFor({ state: 'hidden' });
+  await eventually('the map of now', async () => {
+    await page.mouse.move(x + 1, y);
+    await page.mouse.move(x, y);
+    return (await page.locator('[data-test="value"]').innerText()) !== texts.map.noValue;
+  });
   await time.getByRole('combobox', { name: 'Span' }).selectOption('30 days');
   await time.getByText('now', { exact: true }).waitFor();
   const days: string[] = [];

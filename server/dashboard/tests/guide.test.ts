@@ -17,6 +17,18 @@ const SHOWN_MS = 1_500;
 const guideOf = (page: Page) => page.locator('[data-test="guide"]');
 const stepOf = (page: Page, step: string, isDone: boolean) => guideOf(page).locator(`[data-step="${step}"][data-done="${isDone}"]`);
 
+/** Commands of which a part is out of sight. */
+const clipped = (page: Page) =>
+  guideOf(page)
+    .locator('pre, pre code')
+    .evaluateAll((all) => {
+      const isOut = (one: Element) => {
+        const edge = one.closest('[data-test="guide"]')?.getBoundingClientRect().right ?? 0;
+        return one.scrollWidth > one.clientWidth + 1 || one.getBoundingClientRect().right > edge;
+      };
+      return all.filter(isOut).map((one) => one.textContent);
+    });
+
 async function newest(robot: string): Promise<Mission | undefined> {
   return (await api<ApiPage<Mission>>(`/v1/missions?site=yard&robot=${robot}&limit=1`)).items[0];
 }
@@ -36,6 +48,13 @@ for (const [name, size, theme] of [
     const page = await open({ size, theme, kept: NEW, as: null });
     await page.getByLabel('Token').fill(token());
     await page.getByRole('button', { name: 'Sign in' }).click();
+    // On a phone the steps are behind a line.
+    const unfold = async () => {
+      const line = guideOf(page).locator('summary');
+      await guideOf(page).waitFor();
+      if (await line.isVisible()) await line.click();
+    };
+    await unfold();
     // A robot of the demo is online: the first step has ticked itself.
     await stepOf(page, 'robot', true).waitFor();
     await stepOf(page, 'mission', false).waitFor();
@@ -60,6 +79,7 @@ for (const [name, size, theme] of [
     await shot(page, `guide-${name}-driving`);
     // A reload on the way loses nothing.
     await page.reload();
+    await unfold();
     await stepOf(page, 'mission', true).waitFor();
     await stepOf(page, 'friction', true).waitFor({ timeout: MEASURED_MS });
     await guideOf(page).getByText('All done').first().waitFor();
@@ -83,7 +103,7 @@ for (const [name, size, theme] of [
           const isSeen = at.x > box.x && at.x < box.x + box.width - 280 && at.y > box.y + 60 && at.y < box.y + box.height - 40;
           if (!isSeen || Date.parse(friction.newest_at) < Date.parse(sent?.started_at ?? '')) continue;
           await page.mouse.move(at.x, at.y);
-          return /θ = 1\/K [\d.]+/.test(await page.locator('output.cursor').innerText());
+          return /Slip \(θ\) [\d.]+/.test(await page.locator('output.cursor').innerText());
         }
         return false;
       });
@@ -133,6 +153,7 @@ test('an empty fleet is shown how a robot joins, with commands to copy', async (
   await page.getByRole('button', { name: 'Copy' }).click();
   await page.getByText('Copied.').waitFor();
   expect((await page.evaluate(() => navigator.clipboard.readText())).trim()).toBe(commands.trim());
+  expect(await clipped(page)).toEqual([]);
   await shot(page, 'guide-enrol');
   // Who may not let robots join is not shown how.
   const operator = await api<CreatedToken>('/v1/tokens', 'POST', { name: `operator ${Date.now()}`, role: 'operator' });
@@ -148,6 +169,8 @@ test('the first steps are German where the page is', async () => {
   await page.getByRole('button', { name: 'Anmelden' }).click();
   await guideOf(page).getByText('Nehmen Sie einen Roboter auf').waitFor();
   expect(await violations(page)).toEqual([]);
+  expect(await clipped(page)).toEqual([]);
+  await guideOf(page).getByRole('button', { name: 'Kopieren' }).waitFor();
   await shot(page, 'guide-enrol-de');
 });
 

@@ -58,9 +58,17 @@ test('space on the stick stops the robot that somebody drives', async () => {
   const shown = page.locator('[data-robot="rover-2"].held');
   await shown.waitFor();
   expect((await stops('rover-2')).length).toBe(1);
+  // Whoever has control of a stopped robot is shown what to do to drive.
+  const panel = page.locator('[data-test="drive"]');
+  await panel.getByText('The robot is stopped.', { exact: true }).waitFor();
+  await panel.getByText('A stopped robot follows no command. To drive, press “Clear the stop of rover-2”').waitFor();
+  expect(await page.getByText('You control this robot.').count()).toBe(0);
   await standsStill('rover-2');
+  await shown.getByText(/^rover-2: stopped by .+\. The robot stands still\.$/).waitFor();
+  await shot(page, 'driving-stopped');
   await page.getByRole('button', { name: 'Clear the stop of rover-2' }).click();
   await shown.waitFor({ state: 'detached' });
+  await panel.getByText('You control this robot.').waitFor();
 });
 
 test('a stop that the robot has not confirmed stays red until it has', async () => {
@@ -70,7 +78,7 @@ test('a stop that the robot has not confirmed stays red until it has', async () 
   process.kill(agent, 'SIGSTOP');
   try {
     await page.keyboard.press('Alt+KeyX');
-    await page.getByText('rover-2 has NOT confirmed its stop').waitFor();
+    await page.getByText('rover-2 has NOT confirmed its stop').first().waitFor();
     expect((await stops('rover-2'))[0]?.confirmed_at ?? null).toBeNull();
     await shot(page, 'unconfirmed');
   } finally {
@@ -192,6 +200,10 @@ test('the touch stick of a phone drives too', async () => {
   await stick.evaluate((element) => element.scrollIntoView({ block: 'center' }));
   const box = await stick.boundingBox();
   if (!box) throw new Error('there is no stick');
+  // Fingers are shown no keys.
+  expect(await page.locator('.keys').isVisible()).toBe(false);
+  expect(await page.locator('body').innerText()).not.toMatch(/W A S D|arrows|Alt\+|space stops/i);
+  expect(await stick.getAttribute('aria-label')).toBe('Drive stick: drag');
   const touch = await page.context().newCDPSession(page);
   const at = (y: number) => [{ x: box.x + box.width / 2, y: box.y + y * box.height }];
   await touch.send('Input.dispatchTouchEvent', { type: 'touchStart', touchPoints: at(0.5) });

@@ -80,6 +80,8 @@ async function tour(page: Page, texts: Texts, look: (screen: string) => Promise<
   await page.getByRole('checkbox', { name: texts.robots.mark('rover-3') }).check();
   await look('selected');
   await button(texts.robots.unmark).click();
+  // On a phone the layers are a strip.
+  await page.locator('.layers > details').evaluate((one) => ((one as HTMLDetailsElement).open = true));
   for (const quantity of ['stiffness', 'friction', 'age', 'visits', 'change', 'theta']) {
     await page.getByRole('combobox', { name: texts.map.friction, exact: true }).selectOption(quantity);
     await page.locator('.layers figure').waitFor();
@@ -228,7 +230,9 @@ test('a refusal of the server has a German title', async () => {
     await page.getByLabel('Mittelpunkt x, m').press('Tab');
     const problem = page.locator('form .problem');
     await problem.waitFor();
-    expect(await problem.innerText()).toMatch(/^Die Bahn verlässt den Geofence: /);
+    expect(await problem.innerText()).toMatch(/^Die Bahn verlässt den Geofence\./);
+    // What the server adds is English, and marked so.
+    expect((await problem.locator('[lang="en"]').innerText()).length).toBeGreaterThan(5);
   } finally {
     await api('/v1/sites/yard/geofence', 'PUT', { keep_in: before.keep_in, keep_out: before.keep_out });
   }

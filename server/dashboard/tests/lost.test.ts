@@ -24,7 +24,7 @@ test('a lost server is said, what was drawn is kept, and everything goes on when
   await page.getByRole('button', { name: 'Send', exact: true }).click();
   await page.getByText('The server does not answer; what you entered is kept.').waitFor();
   await page.getByRole('button', { name: 'Stop rover-1' }).click();
-  await page.getByText(/rover-1 may not have got the stop/).waitFor();
+  await page.getByText(/rover-1: the stop may not have arrived/).first().waitFor();
   // Nothing that was so is shown as if it were.
   await page.locator('.head .warn', { hasText: /^last known · / }).waitFor();
   await shot(page, 'lost');

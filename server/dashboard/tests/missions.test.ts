@@ -2,7 +2,8 @@
 import type { Page } from 'playwright-core';
 import { expect, test } from 'vitest';
 import type { Geofence, Mission, MissionDetail, Page as ApiPage, PlannedPath, Terrain } from './types';
-import { api, browser, eventually, metresAt, select, shot, windowOf } from './harness';
+import { violations } from './checks';
+import { api, browser, eventually, map, metresAt, select, shot, windowOf } from './harness';
 
 const { open } = browser();
 
@@ -10,6 +11,15 @@ const { open } = browser();
 async function newest(robot: string): Promise<Mission | null> {
   const { items } = await api<ApiPage<Mission>>(`/v1/missions?site=yard&robot=${robot}&limit=1`);
   return items[0] ?? null;
+}
+
+/** Whether two sides of an outline cross or touch. */
+function crosses(one: (readonly [number, number] | undefined)[], other: (readonly [number, number] | undefined)[]): boolean {
+  const [[a, b] = [], [c, d] = []] = [one, other];
+  if (!a || !b || !c || !d) return false;
+  const turn = (p: readonly [number, number], q: readonly [number, number], r: readonly [number, number]) =>
+    Math.sign((q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0]));
+  return turn(a, b, c) * turn(a, b, d) <= 0 && turn(c, d, a) * turn(c, d, b) <= 0;
 }
 
 async function cancelAll(robot: string): Promise<void> {
@@ -224,7 +234,7 @@ test('what is no number, and a path too tight, are said in a sentence each, and 
   // This one only the server can tell.
   await type('Radius, m', '0.05');
   await problem.waitFor();
-  expect(await problem.innerText()).toMatch(/^The request is impossible for this robot: .*\.$/);
+  expect(await problem.innerText()).toMatch(/^The request is impossible for this robot\.\s+robot `rover-1` cannot drive this: [^\d]+$/);
   expect(await page.getByLabel('Radius, m').inputValue()).toBe('0.05');
   // What was drawn of one kind is still there after a look at the other.
   await page.getByRole('radio', { name: 'Waypoints' }).check();
@@ -233,6 +243,73 @@ test('what is no number, and a path too tight, are said in a sentence each, and 
   await problem.getByText('Point 1 needs two numbers, x and y.').waitFor();
   await page.getByRole('radio', { name: 'Circle' }).check();
   expect(await page.getByLabel('Centre y, m').inputValue()).toBe('6');
+});
+
+test('a point at fault has the number of the table, is marked there, and can be shown on the map', async () => {
+  const page = await open({ expected: /422/ });
+  await select(page, 'rover-1');
+  await page.getByRole('button', { name: 'New mission' }).click();
+  await page.getByRole('radio', { name: 'Waypoints' }).check();
+  const points = [
+    [4, 4],
+    [8, 4],
+    [8, 4],
+  ] as const;
+  for (const [index, [x_m, y_m]] of points.entries()) {
+    await page.getByRole('button', { name: 'Add point' }).click();
+    for (const [axis, value] of [['x', x_m], ['y', y_m]] as const) {
+      await page.getByLabel(`Point ${index + 1}, ${axis} in m`).fill(String(value));
+      await page.getByLabel(`Point ${index + 1}, ${axis} in m`).press('Tab');
+    }
+  }
+  const problem = page.locator('form .problem');
+  await problem.getByText('Point 3 is at the same place as the one before.', { exact: true }).waitFor();
+  const field = page.getByLabel('Point 3, x in m');
+  expect(await field.getAttribute('aria-invalid')).toBe('true');
+  expect(await field.getAttribute('aria-describedby')).toBe(await problem.getAttribute('id'));
+  expect(await page.locator('[aria-invalid="true"]').count()).toBe(2);
+  expect(await page.getByText('Point 3 is at the same place').count()).toBe(1);
+  expect(await violations(page)).toEqual([]);
+  for (let step = 0; step < 2; step += 1) await page.getByRole('button', { name: 'Zoom out' }).click();
+  await problem.getByRole('button', { name: 'Show on map' }).click();
+  await shot(page, 'point-refused');
+  await eventually('the point in sight', async () => {
+    const [box, at] = [await map(page), (await windowOf(page))(8, 4)];
+    return at.x > box.x + 40 && at.x < box.x + box.width - 280 && at.y > box.y + 40 && at.y < box.y + box.height - 40;
+  });
+  // What is no number is marked where it is missing alone.
+  await field.fill('');
+  await field.press('Tab');
+  await problem.getByText('Point 3 needs two numbers, x and y.').waitFor();
+  expect(await page.locator('[aria-invalid="true"]').count()).toBe(1);
+  expect(await field.getAttribute('aria-invalid')).toBe('true');
+  await field.fill('12');
+  await field.press('Tab');
+  await page.locator('[data-test="dry-run"]').waitFor();
+  expect(await page.locator('[aria-invalid="true"]').count()).toBe(0);
+});
+
+test('time and length of the dry run are beside the button, and what slows it has the width of the card', async () => {
+  for (const [name, size] of [['wide', { width: 1360, height: 850 }], ['phone', { width: 390, height: 800 }]] as const) {
+    const page = await open({ size });
+    await select(page, 'rover-1');
+    await page.getByRole('button', { name: 'New mission' }).click();
+    for (const [label, value] of [['Centre x, m', '8'], ['Centre y, m', '6'], ['Radius, m', '1.5'], ['Speed, m/s', '0.9']] as const) {
+      await page.getByLabel(label).fill(value);
+      await page.getByLabel(label).press('Tab');
+    }
+    const takes = page.locator('.foot [data-test="takes"]');
+    await takes.getByText(/^Takes .* for \d+\.\d m\.$/).waitFor();
+    const send = await page.getByRole('button', { name: 'Send', exact: true }).boundingBox();
+    const said = await takes.boundingBox();
+    expect(Math.abs((said?.y ?? 0) - (send?.y ?? 0))).toBeLessThan(80);
+    const card = await page.locator('[data-test="dry-run"]').boundingBox();
+    const slowed = await page.locator('[data-test="dry-run"] .whole').boundingBox();
+    expect(slowed?.width).toBeGreaterThan(0.95 * (card?.width ?? Infinity));
+    await page.locator('[data-test="dry-run"] .whole').scrollIntoViewIfNeeded();
+    await shot(page, `dry-run-${name}`);
+    await page.close();
+  }
 });
 
 test('a path outside of where robots may be is refused in one sentence, and kept', async () => {
@@ -253,7 +330,7 @@ test('a path outside of where robots may be is refused in one sentence, and kept
     await page.getByLabel('Centre y, m').press('Tab');
     const problem = page.locator('form .problem');
     await problem.waitFor();
-    expect(await problem.innerText()).toMatch(/^The path leaves the geofence: [^.]*(\d\.\d+[^.]*)*\.$/);
+    expect(await problem.innerText()).toMatch(/^The path leaves the geofence\.\s+[^.]*(\d\.\d+[^.]*)*$/);
     expect(await page.getByLabel('Centre x, m').inputValue()).toBe('60');
     expect(await page.getByRole('button', { name: 'Send', exact: true }).isEnabled()).toBe(false);
     await shot(page, 'outside');
@@ -318,21 +395,48 @@ test('an area of the geofence is drawn, changed after a conflict, and deleted', 
     [-5, -5],
     [-9, -5],
   ] as const;
+  /** First they cross. */
+  const refused: [number, number][] = [[-9, -9], [-5, -9], [-9, -7], [-4, -8]];
   const set = async (label: string, value: number) => {
     await page.getByLabel(label).fill(String(value));
     await page.getByLabel(label).press('Tab');
   };
-  for (const [index, [x_m, y_m]] of corners.entries()) {
+  for (const index of corners.keys()) {
     await page.getByRole('button', { name: 'Add point' }).click();
-    // First one that crosses itself: it is refused where it is drawn, and kept.
-    await set(`Point ${index + 1}, x in m`, index === 2 ? -9 : x_m);
-    await set(`Point ${index + 1}, y in m`, index === 2 ? -7 : y_m);
+    const [x_m, y_m] = refused[index] ?? [];
+    await set(`Point ${index + 1}, x in m`, x_m ?? NaN);
+    await set(`Point ${index + 1}, y in m`, y_m ?? NaN);
   }
-  await set('Point 4, x in m', -4);
-  await set('Point 4, y in m', -8);
   await page.getByRole('button', { name: 'Save' }).click();
-  await page.locator('form .problem').waitFor();
+  // Said once, with the numbers of the table, and marked there; the server counts from 0.
+  const problem = page.locator('form .problem');
+  await problem.waitFor();
+  const said = await problem.innerText();
+  const [first = NaN, second = NaN] = /^The side from corner (\d) crosses or touches the side from corner (\d)\./.exec(said)?.slice(1).map(Number) ?? [];
+  const sides = [first, second].map((number) => [number, (number % 4) + 1].map((corner) => refused[corner - 1]));
+  expect(crosses(sides[0] ?? [], sides[1] ?? []), said).toBe(true);
+  expect(await page.getByText('crosses or touches').count()).toBe(1);
+  const marked = async () =>
+    (await page.locator('.points [aria-invalid="true"]').evaluateAll((all) => all.map((one) => one.getAttribute('aria-label')))).map((label) =>
+      Number(/^Point (\d)/.exec(label ?? '')?.[1]),
+    );
+  expect([...new Set(await marked())]).toEqual([first, second].sort());
+  expect(await violations(page)).toEqual([]);
+  await problem.getByRole('button', { name: 'Show on map' }).click();
+  await eventually('the corners in sight', async () => {
+    const place = await windowOf(page);
+    const box = await map(page);
+    return [first, second].every((number) => {
+      const [x_m = NaN, y_m = NaN] = refused[number - 1] ?? [];
+      const { x, y } = place(x_m, y_m);
+      return x > box.x && x < box.x + box.width - 260 && y > box.y && y < box.y + box.height;
+    });
+  });
   await shot(page, 'fence-refused');
+  // What is changed is no longer at fault.
+  await set('Point 1, x in m', -8.5);
+  expect(await marked()).toEqual([]);
+  expect(await problem.count()).toBe(0);
   for (const [index, [x_m, y_m]] of corners.entries()) {
     await set(`Point ${index + 1}, x in m`, x_m);
     await set(`Point ${index + 1}, y in m`, y_m);

@@ -40,7 +40,7 @@ test('an alert of another site is counted, listed with its site, and leads there
   await page.getByRole('tab', { name: 'Alerts' }).click();
   const card = page.locator(`[data-alert="${alert.id}"]`);
   await card.getByText('Robot is stopped', { exact: true }).waitFor();
-  await card.getByText('· Quarry').waitFor();
+  await card.getByText('Quarry', { exact: true }).waitFor();
   expect(await violations(page), 'an alert of another site').toEqual([]);
   await shot(page, 'sites-alerts');
   // What is of the other site alone can be shown alone.
@@ -51,7 +51,7 @@ test('an alert of another site is counted, listed with its site, and leads there
   await card.getByRole('button', { name: 'Open digger-1' }).click();
   await page.getByRole('heading', { name: 'Big digger' }).waitFor();
   await eventually('the address of the other site', async () => page.url().includes('site=quarry'));
-  await page.getByText('Big digger is stopped and stands').waitFor();
+  await page.getByText(/^Big digger: stopped by .+\. The robot stands still\.$/).waitFor();
   await titled('(1) Tread');
   // Acknowledged there, it is no longer counted anywhere.
   await page.getByRole('tab', { name: 'Alerts' }).click();

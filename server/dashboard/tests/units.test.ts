@@ -90,7 +90,8 @@ test('what is typed in feet is sent exactly, and comes back as it was typed', as
 test('map, legend, drive and planner speak of feet alone', async () => {
   const page = await open({ kept: { 'tread-units': 'imperial' } });
   await page.getByRole('combobox', { name: 'Friction' }).selectOption('friction');
-  await page.getByText(/^Lower figures, ft\..* ft\/s .* ft\/s² at most\.$/).waitFor();
+  await page.locator('.layers figure').getByText('More', { exact: true }).click();
+  await page.getByText(/^From .* ft\/s .* ft\/s² at most\.$/).waitFor();
   const box = await map(page);
   await page.mouse.move(box.x + 200, box.y + 300);
   await page.locator('output.cursor').getByText(/^x -?[\d.]+ ft, y -?[\d.]+ ft/).waitFor();

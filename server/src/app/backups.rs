@@ -28,6 +28,7 @@ use crate::backup::manifest::{ArchivedFile, FORMAT};
 use crate::backup::{ArchiveError, Filter, Manifest, Source, folder};
 use crate::build;
 use crate::db::{DbError, copy};
+use crate::paths::folder_of;
 
 /// Interval of reports about a copy in progress.
 const PROGRESS_EVERY: Duration = Duration::from_secs(1);
@@ -177,11 +178,6 @@ impl Drop for CopyFile {
         // If it stays, the next backup removes it.
         let _ = fs::remove_file(&self.0);
     }
-}
-
-fn folder_of(file: &Path) -> &Path {
-    let folder = file.parent().filter(|it| !it.as_os_str().is_empty());
-    folder.unwrap_or(Path::new("."))
 }
 
 fn free_bytes(folder: &Path) -> Result<u64, BackupError> {

@@ -16,6 +16,7 @@ use tar::{Builder, EntryType, Header};
 pub use self::extraction::{Extracted, extract, manifest, verify};
 use super::encryption::{EncryptionError, Filter};
 use super::manifest::{ArchivedFile, FORMAT, Manifest};
+use crate::paths::folder_of;
 
 /// Name of the manifest's entry, the first of an archive.
 const MANIFEST_NAME: &str = "manifest.json";
@@ -244,8 +245,7 @@ pub fn partial_name(target: &Path) -> PathBuf {
 /// # Errors
 /// The folder cannot be synced.
 pub fn sync_folder(file: &Path) -> Result<(), ArchiveError> {
-    let folder = file.parent().filter(|it| !it.as_os_str().is_empty());
-    let folder = folder.unwrap_or(Path::new("."));
+    let folder = folder_of(file);
     let synced = File::open(folder).and_then(|folder| folder.sync_all());
     synced.map_err(file_error("sync", folder))
 }

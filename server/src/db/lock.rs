@@ -12,6 +12,7 @@ use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _};
 use std::path::{Path, PathBuf};
 
 use super::failure::advice_on;
+use crate::paths::folder_of;
 
 /// List of all locks on files of this machine.
 const LOCKS_FILE: &str = "/proc/locks";
@@ -132,8 +133,7 @@ pub fn holder_of(database: &Path) -> Option<u32> {
 /// Returns the path beside the file itself, after following links, also if it does not exist yet.
 fn lock_path(database: &Path) -> PathBuf {
     let file = behind_links(database);
-    let folder = file.parent().filter(|it| !it.as_os_str().is_empty());
-    let folder = fs::canonicalize(folder.unwrap_or(Path::new(".")));
+    let folder = fs::canonicalize(folder_of(&file));
     let file = match (folder, file.file_name()) {
         (Ok(folder), Some(name)) => folder.join(name),
         (Ok(_) | Err(_), _) => file,

@@ -23,7 +23,7 @@ pub(super) fn findings(examined: &Examined) -> Vec<Finding> {
         Some(TlsSource::Files(files)) => findings.extend(of_files(examined, files)),
         Some(TlsSource::Authority) => {
             let names = examined.config.certificate_names();
-            findings.push(Finding::well(
+            findings.push(Finding::ok(
                 "certificate",
                 format!(
                     "the fleet's authority issues it, for localhost, {}",
@@ -69,7 +69,7 @@ fn authority(examined: &Examined, folder: &Path) -> Finding {
     let condition = read.as_ref().map(|read| read.condition(now));
     match (condition, read) {
         (Some(Condition::Valid) | None, _) | (_, None) => {
-            Finding::well("authority", format!("`{shown}`, SHA-256 {fingerprint}"))
+            Finding::ok("authority", format!("`{shown}`, SHA-256 {fingerprint}"))
         }
         (Some(Condition::Expiring), Some(read)) => Finding::warning(
             "authority",
@@ -132,7 +132,7 @@ fn validity(examined: &Examined, shown: &str, certificate: &Certificate) -> Find
     let now = examined.clock.machine_time();
     let (from, until) = (certificate.not_before, certificate.not_after);
     match certificate.condition(now) {
-        Condition::Valid => Finding::well("certificate", format!("`{shown}`, valid until {until}")),
+        Condition::Valid => Finding::ok("certificate", format!("`{shown}`, valid until {until}")),
         Condition::Expiring => Finding::warning(
             "certificate",
             format!("the certificate in `{shown}` expires at {until}"),
@@ -170,7 +170,7 @@ fn names(
             format!("`{shown}` is for {names}, and `web.hosts` names none of them"),
             "add the names by which browsers find the server to `web.hosts`",
         ),
-        None => Finding::well("certificate names", format!("`{shown}` is for {names}")),
+        None => Finding::ok("certificate names", format!("`{shown}` is for {names}")),
         Some(host) => Finding::problem(
             "certificate names",
             format!("`{shown}` is for {names}, and not for `{host}` of `web.hosts`"),
@@ -196,7 +196,7 @@ fn issuers(shown: &str, certificates: &[CertificateDer<'static>]) -> Finding {
     }
     let last = certificates.last().and_then(Certificate::read);
     let from = last.map_or_else(String::new, |last| last.issuer);
-    Finding::well("certificate chain", format!("it leads to `{from}`"))
+    Finding::ok("certificate chain", format!("it leads to `{from}`"))
 }
 
 fn is_signed_by(one: &CertificateDer<'_>, next: &CertificateDer<'_>) -> bool {

@@ -20,7 +20,7 @@ const SYNCHRONISE: &str = "set the clock, and have it synchronised: `apt-get ins
 pub(super) fn findings(examined: &Examined, newest: Option<Timestamp>) -> Vec<Finding> {
     let now = examined.clock.machine_time();
     let mut findings = vec![match is_synchronised() {
-        Some(true) => Finding::well("clock", format!("it is synchronised, and says {now:.0}")),
+        Some(true) => Finding::ok("clock", format!("it is synchronised, and says {now:.0}")),
         Some(false) => Finding::warning(
             "clock",
             format!("it is not synchronised, and says {now:.0}"),

@@ -33,12 +33,12 @@ pub(super) async fn findings(examined: &Examined) -> (Vec<Finding>, Option<Times
             RESTORE,
         )),
         (None, true) => {
-            findings.push(Finding::well(
+            findings.push(Finding::ok(
                 "database content",
                 "the whole file can be read",
             ));
         }
-        (None, false) => findings.push(Finding::well(
+        (None, false) => findings.push(Finding::ok(
             "database content",
             "every table can be read; --deep reads the whole file",
         )),
@@ -48,11 +48,11 @@ pub(super) async fn findings(examined: &Examined) -> (Vec<Finding>, Option<Times
 
 fn schema(shown: &str, inspection: &Inspection) -> Finding {
     match inspection.schema {
-        Schema::Current(version) => Finding::well(
+        Schema::Current(version) => Finding::ok(
             "database",
             format!("`{shown}` has the present schema, {version}"),
         ),
-        Schema::Empty => Finding::well(
+        Schema::Empty => Finding::ok(
             "database",
             format!("`{shown}` is empty; the server makes its tables"),
         ),

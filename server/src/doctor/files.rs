@@ -12,6 +12,7 @@ use tread_api::diagnosis::Finding;
 use super::Examined;
 use crate::config::TlsSource;
 use crate::config::credentials::is_passed;
+use crate::paths::folder_of;
 
 /// Number of bytes written to test the disk.
 const TRIED_BYTES: usize = 16 * 1_024;
@@ -31,11 +32,6 @@ pub(super) fn findings(examined: &Examined) -> Vec<Finding> {
     findings.extend(secrets(examined));
     findings.push(owners(examined));
     findings
-}
-
-fn folder_of(file: &Path) -> &Path {
-    let folder = file.parent().filter(|it| !it.as_os_str().is_empty());
-    folder.unwrap_or(Path::new("."))
 }
 
 /// Examines whether files can be created in the folder of the database.
@@ -66,7 +62,7 @@ fn folder_finding(folder: &Path) -> Finding {
         );
     }
     match try_to_write(folder) {
-        Ok(()) => Finding::well("folder", format!("files can be created in `{shown}`")),
+        Ok(()) => Finding::ok("folder", format!("files can be created in `{shown}`")),
         Err(error) => {
             let step = match error.kind() {
                 io::ErrorKind::PermissionDenied => format!(
@@ -140,7 +136,7 @@ fn disk(examined: &Examined, folder: &Path) -> Finding {
              storage.disk_free_min_mib",
         );
     }
-    Finding::well("disk", format!("{free} MiB are free for `{shown}`"))
+    Finding::ok("disk", format!("{free} MiB are free for `{shown}`"))
 }
 
 /// Examines who may read the secrets.
@@ -180,7 +176,7 @@ fn secrets(examined: &Examined) -> Vec<Finding> {
         }
     }
     if findings.is_empty() {
-        findings.push(Finding::well(
+        findings.push(Finding::ok(
             "file modes",
             "only their owner can use the secrets",
         ));
@@ -233,6 +229,6 @@ fn owners(examined: &Examined) -> Finding {
                  `setpriv --reuid={owner} --clear-groups tread-server doctor …`"
             ),
         ),
-        Some(_) | None => Finding::well("file owners", format!("user {user} can read all files")),
+        Some(_) | None => Finding::ok("file owners", format!("user {user} can read all files")),
     }
 }

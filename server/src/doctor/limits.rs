@@ -15,7 +15,7 @@ pub(super) fn findings() -> Vec<Finding> {
             "raise the hard limit: `LimitNOFILE=` in the unit, or /etc/security/limits.conf; this \
              is the limit of this shell, the server's may be another",
         ),
-        Ok((_, most)) => Finding::well("file limit", format!("{most} files can be open")),
+        Ok((_, most)) => Finding::ok("file limit", format!("{most} files can be open")),
         Err(error) => Finding::skipped("file limit", format!("it is not known: {error}")),
     };
     vec![finding]

@@ -103,9 +103,9 @@ async fn examine(args: DoctorArgs) -> Vec<Finding> {
         clock: Clock::system(),
         is_deep: args.deep,
     };
-    let mut findings = vec![Finding::well("configuration", said)];
+    let mut findings = vec![Finding::ok("configuration", said)];
     findings.push(match examined.server_process {
-        Some(process) => Finding::well("server", format!("it runs, as process {process}")),
+        Some(process) => Finding::ok("server", format!("it runs, as process {process}")),
         None => Finding::skipped("server", "it does not run on this database"),
     });
     findings.extend(files::findings(&examined));

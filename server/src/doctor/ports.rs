@@ -42,7 +42,7 @@ pub(super) async fn findings(examined: &Examined) -> Vec<Finding> {
     if let Some(address) = config.metrics {
         findings.push(match look(address) {
             Port::Taken => match probe::get(address, false, "/metrics").await {
-                Some(answer) if answer.text.contains("tread_uptime") => Finding::well(
+                Some(answer) if answer.text.contains("tread_uptime") => Finding::ok(
                     "port of metrics",
                     format!("our server answers on {address}"),
                 ),
@@ -73,7 +73,7 @@ async fn rest(examined: &Examined) -> Vec<Finding> {
     if !answer.is_health() {
         return vec![taken(NAME, "http", address)];
     }
-    let mut findings = vec![Finding::well(
+    let mut findings = vec![Finding::ok(
         NAME,
         format!("a Tread server answers on {address}"),
     )];
@@ -93,7 +93,7 @@ async fn rest(examined: &Examined) -> Vec<Finding> {
 async fn readiness(address: SocketAddr, is_tls: bool) -> Option<Finding> {
     let answer = probe::get(address, is_tls, "/readyz").await?;
     if answer.is_health() {
-        return Some(Finding::well("readiness", "the server can work"));
+        return Some(Finding::ok("readiness", "the server can work"));
     }
     let body = answer.text.split("\r\n\r\n").nth(1).unwrap_or_default();
     let problem: serde_json::Value = serde_json::from_str(body).unwrap_or_default();
@@ -140,7 +140,7 @@ fn served(examined: &Examined, answer: &Answer) -> Option<Finding> {
     let is_well = matches!(read.condition(now), Condition::Valid | Condition::Expiring);
     let text = format!("valid until {}", read.not_after);
     Some(if is_well {
-        Finding::well("certificate served", text)
+        Finding::ok("certificate served", text)
     } else {
         Finding::problem(
             "certificate served",
@@ -163,7 +163,7 @@ async fn robots(examined: &Examined) -> Finding {
     let Some(robots) = &examined.config.robots else {
         let is_ours = examined.server_process.is_some() && probe::is_open(address).await;
         return if is_ours {
-            Finding::well(NAME, format!("it accepts connections on {address}"))
+            Finding::ok(NAME, format!("it accepts connections on {address}"))
         } else {
             taken(NAME, "zenoh", address)
         };
@@ -178,7 +178,7 @@ async fn robots(examined: &Examined) -> Finding {
         .and_then(|authority| Certificate::read(authority.certificate()))
         .map(|read| read.subject);
     if issuer.is_some() && issuer == subject {
-        Finding::well(
+        Finding::ok(
             NAME,
             format!("it answers on {address} with a certificate of the fleet's authority"),
         )
@@ -220,7 +220,7 @@ fn not_taken(
             format!("the server, process {process}, does not have {address}"),
             "it was started with another configuration, is still starting, or hangs: see its log",
         ),
-        (Port::Free, _) => Finding::well(name, format!("{address} is free")),
+        (Port::Free, _) => Finding::ok(name, format!("{address} is free")),
         (Port::Impossible(error), _) => {
             let step = match error.kind() {
                 io::ErrorKind::PermissionDenied => format!(

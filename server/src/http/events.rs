@@ -69,7 +69,7 @@ pub(super) async fn stream(
     let events = stream::unfold(client, async |client: (Subscription, Place)| {
         let (mut subscription, place) = client;
         let sent = subscription.next().await?;
-        let mut event = Event::default().event(sent.name).data(&sent.text);
+        let mut event = Event::default().event(sent.name).data(&*sent.text);
         if let Some(id) = &sent.id {
             event = event.id(id);
         }

@@ -113,7 +113,7 @@ pub(crate) async fn run(args: MigrateArgs) -> anyhow::Result<Compared> {
     let noted = noting.await;
     database.close().await;
     noted.context("cannot write the database")?;
-    file_owner::give_database(&path)?;
+    file_owner::chown_database(&path)?;
     writeln!(out, "applied {} migrations", missing.len())?;
     Ok(Compared::Same)
 }

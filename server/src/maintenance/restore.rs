@@ -33,6 +33,7 @@ use crate::db::lock::DatabaseLock;
 use crate::db::restorations::{Changed, Restoration};
 use crate::db::{self, Db, DbError, copy, schema};
 use crate::file_owner;
+use crate::paths::folder_of;
 
 /// Suffix of the database while it is restored.
 const RESTORING_ENDING: &str = ".restoring";
@@ -101,8 +102,7 @@ pub(crate) async fn run(args: RestoreArgs) -> anyhow::Result<()> {
     );
     let manifest = archive::manifest(&args.from, key.as_ref())?;
     refuse_newer(&manifest)?;
-    let folder = database.parent().filter(|it| !it.as_os_str().is_empty());
-    let folder = folder.unwrap_or(Path::new("."));
+    let folder = folder_of(&database);
     ensure!(
         folder.is_dir(),
         "the folder `{}` of the database does not exist; create it first",
@@ -137,10 +137,10 @@ pub(crate) async fn run(args: RestoreArgs) -> anyhow::Result<()> {
         None => AuthorityFate::None,
     };
     let aside = restoring.finish(&database, now).await?;
-    file_owner::give_database(&database)?;
+    file_owner::chown_database(&database)?;
     if let AuthorityFate::Restored(folder, aside) = &authority {
         for folder in aside.iter().chain([folder]) {
-            file_owner::give_to_owner_around(folder)?;
+            file_owner::chown_to_parents_owner(folder)?;
         }
     }
     let mut out = io::stdout().lock();

@@ -24,10 +24,11 @@ use tread_api::ids::SiteId;
 
 pub(crate) use self::choices::Choices;
 use self::questions::Questions;
-pub(crate) use self::service::Service;
+pub(crate) use self::service::{check_service, start_service};
 pub(crate) use self::steps::next_steps;
 use crate::config::{Config, ServerArgs};
 use crate::file_owner;
+use crate::paths::folder_of;
 
 /// Mode of the configuration file. It holds no secret: the group of the data folder may read it,
 /// and others need not.
@@ -199,7 +200,7 @@ pub(crate) fn prepare(args: &SetupArgs, given: &Given<'_>) -> anyhow::Result<Opt
     refuse_to_replace("configuration file", &choices.config, given.force)?;
     refuse_to_replace("token file", &choices.token_file, given.force)?;
     if args.start {
-        Service::of(&choices)?;
+        check_service(&choices)?;
     }
     write_beside(choices).map(Some)
 }
@@ -274,19 +275,20 @@ impl Prepared {
             })?;
             eprintln!("the former configuration is kept as `{}`", old.display());
         }
-        self.give_to_owner()?;
+        self.chown_to_service()?;
         fs::rename(&self.new, file).with_context(|| format!("cannot write `{}`", file.display()))
     }
 
-    /// Gives root's files in a data folder of another user, such as the service's, to that user.
-    fn give_to_owner(&self) -> anyhow::Result<()> {
+    /// Makes the owner of the data folder, such as the service's user, the owner of root's files in
+    /// it.
+    fn chown_to_service(&self) -> anyhow::Result<()> {
         let data_dir = &self.choices.data_dir;
-        let Some(owner) = file_owner::other_owner(data_dir)? else {
+        let Some(owner) = file_owner::service_owner(data_dir)? else {
             return Ok(());
         };
         lchown(&self.new, None, Some(owner.1))
             .with_context(|| format!("cannot give `{}` to its group", self.new.display()))?;
-        file_owner::give(data_dir, owner)
+        file_owner::chown_recursively(data_dir, owner)
     }
 
     /// Removes the temporary file after a failure.
@@ -294,11 +296,6 @@ impl Prepared {
         // The caller reports the failure; a file that remains has a unique name.
         let _ = fs::remove_file(&self.new);
     }
-}
-
-fn folder_of(file: &Path) -> &Path {
-    let folder = file.parent().filter(|it| !it.as_os_str().is_empty());
-    folder.unwrap_or(Path::new("."))
 }
 
 fn beside(file: &Path, ending: &str) -> PathBuf {

@@ -17,53 +17,43 @@ const UNIT_FOLDERS: [&str; 3] = [
     "/lib/systemd/system",
 ];
 
-/// The installed service, which reads the configuration that `init` writes.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Service {
-    name: &'static str,
+/// Checks that the service is installed and reads the configuration of these choices.
+///
+/// # Errors
+/// The service is not installed, or it reads another configuration.
+pub(crate) fn check_service(choices: &Choices) -> anyhow::Result<()> {
+    let file = format!("{NAME}.service");
+    ensure!(
+        UNIT_FOLDERS
+            .iter()
+            .any(|folder| Path::new(folder).join(&file).exists()),
+        "--start needs the service `{NAME}`, which the Debian package installs: omit --start, and \
+         start the server with `tread-server --config {}`",
+        choices.config.display()
+    );
+    let config = config_default(true);
+    ensure!(
+        choices.config == config,
+        "--start needs the configuration `{}`, which the service reads: omit --config",
+        config.display()
+    );
+    Ok(())
 }
 
-impl Service {
-    /// Returns the service that starts a server with these choices.
-    ///
-    /// # Errors
-    /// The service is not installed, or it reads another configuration.
-    pub(crate) fn of(choices: &Choices) -> anyhow::Result<Self> {
-        let file = format!("{NAME}.service");
-        ensure!(
-            UNIT_FOLDERS
-                .iter()
-                .any(|folder| Path::new(folder).join(&file).exists()),
-            "--start needs the service `{NAME}`, which the Debian package installs: leave --start \
-             away, and start the server with `tread-server --config {}`",
-            choices.config.display()
+/// Enables and starts the service. Returns when the server is ready.
+///
+/// # Errors
+/// `systemctl` is missing, or the service does not start.
+pub(crate) fn start_service() -> anyhow::Result<()> {
+    let status = Command::new("systemctl")
+        .args(["enable", "--now", NAME])
+        .status()
+        .context("cannot run systemctl, which --start needs: start the server yourself")?;
+    if !status.success() {
+        bail!(
+            "the configuration is written, but the server does not start: `tread-server doctor` \
+             and `journalctl -u {NAME}` give the reason; then run `systemctl enable --now {NAME}`"
         );
-        let config = config_default(true);
-        ensure!(
-            choices.config == config,
-            "--start needs the configuration `{}`, which the service reads: leave --config away",
-            config.display()
-        );
-        Ok(Self { name: NAME })
     }
-
-    /// Enables and starts the service. Returns when the server is ready.
-    ///
-    /// # Errors
-    /// `systemctl` is missing, or the service does not start.
-    pub(crate) fn start(self) -> anyhow::Result<()> {
-        let name = self.name;
-        let status = Command::new("systemctl")
-            .args(["enable", "--now", name])
-            .status()
-            .context("cannot run systemctl, which --start needs: start the server yourself")?;
-        if !status.success() {
-            bail!(
-                "the configuration is written, and the server does not start: `tread-server \
-                 doctor` and `journalctl -u {name}` say why; then run `systemctl enable --now \
-                 {name}`"
-            );
-        }
-        Ok(())
-    }
+    Ok(())
 }

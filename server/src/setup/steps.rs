@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 
 use super::choices::{Choices, Web};
-use super::service::Service;
+use super::service::check_service;
 
 /// Returns a word, quoted for a shell if necessary.
 fn word(text: &str) -> String {
@@ -42,7 +42,7 @@ pub(crate) fn next_steps(choices: &Choices, fingerprint: Option<&str>, is_starte
     };
     let start = if is_started {
         String::new()
-    } else if Service::of(choices).is_ok() {
+    } else if check_service(choices).is_ok() {
         "  systemctl enable --now tread-server\n".to_owned()
     } else {
         format!("  tread-server --config {config}\n")

@@ -15,9 +15,8 @@ use crate::fleet;
 
 /// Clients that read.
 const READERS: usize = 1_000;
-/// Memory that a thousand clients and one that never reads may cost the server, bytes. Measured are
-/// 95 to 117 MB; the server itself has 85 MB without optimisation, most of them its program.
-const MEMORY_MAX: u64 = 150_000_000;
+/// Memory that a thousand clients and one that never reads may cost the server, bytes.
+const MEMORY_MAX: u64 = 200_000_000;
 /// Events of robots that each reader must see after the deaf one has joined.
 const EVENTS_EACH: usize = 5;
 
@@ -65,7 +64,6 @@ async fn of_a_thousand_event_clients_one_that_never_reads_disturbs_nobody() {
         let robot = LightRobot::start(&endpoint, &fleet.site(), id).await;
         robots.push(robot.unwrap());
     }
-    let before = fleet.server_usage().unwrap();
     // A socket that takes next to nothing, so that what is sent piles up at the server.
     let socket = TcpSocket::new_v4().unwrap();
     socket.set_recv_buffer_size(4_096).unwrap();
@@ -114,11 +112,10 @@ async fn of_a_thousand_event_clients_one_that_never_reads_disturbs_nobody() {
     };
     assert_eq!(whole, READERS, "some clients were cut off");
     let used = fleet.server_usage().unwrap();
-    let cost = used.memory_peak_bytes.saturating_sub(before.memory_bytes);
     assert!(
-        cost < MEMORY_MAX,
-        "the clients cost the server {} MB",
-        cost / 1_000_000
+        used.memory_peak_bytes < MEMORY_MAX,
+        "the server used {} MB",
+        used.memory_peak_bytes / 1_000_000
     );
     let health: Value = fleet.rest.get("/v1/server").await;
     assert!(!health.is_null());

@@ -171,7 +171,7 @@ async fn reach(client: &Client) -> Result<Vec<Finding>, ClientError> {
     let said = said
         .and_then(|date| date.to_str().ok())
         .and_then(|date| rfc2822::parse(date).ok());
-    let mut findings = vec![Finding::well("server", text)];
+    let mut findings = vec![Finding::ok("server", text)];
     findings.extend(said.map(|said| clock(said.timestamp(), now(), took)));
     findings.extend(readiness(client).await);
     Ok(findings)
@@ -180,7 +180,7 @@ async fn reach(client: &Client) -> Result<Vec<Finding>, ClientError> {
 async fn readiness(client: &Client) -> Option<Finding> {
     let answer = client.request(Method::GET, "/readyz").send().await.ok()?;
     if answer.status().is_success() {
-        return Some(Finding::well("readiness", "the server can work"));
+        return Some(Finding::ok("readiness", "the server can work"));
     }
     let why = client.refusal(answer).await;
     Some(Finding::problem(
@@ -197,7 +197,7 @@ fn clock(said: Timestamp, now: Timestamp, took: Duration) -> Finding {
         + SignedDuration::from_secs(1);
     let difference = said.duration_since(now);
     if difference.abs() <= CLOCK_DIFFERENCE_MAX + slack {
-        return Finding::well("clock", "the server's and this machine's agree");
+        return Finding::ok("clock", "the server's and this machine's agree");
     }
     let (seconds, which) = (
         difference.abs().as_secs(),
@@ -230,7 +230,7 @@ fn token(session: &tread_api::identity::Session, now: Timestamp) -> Finding {
             "it expires soon: an admin makes another with `tread tokens create`",
         );
     }
-    Finding::well("token", text)
+    Finding::ok("token", text)
 }
 
 /// Examines the server's own status. The server may be of any version.
@@ -239,7 +239,7 @@ fn of_server(status: &Value) -> Vec<Finding> {
     let version = status["version"].as_str().unwrap_or("unknown");
     let own = env!("CARGO_PKG_VERSION");
     findings.push(if version == own {
-        Finding::well("version", format!("server and `tread` are of {own}"))
+        Finding::ok("version", format!("server and `tread` are of {own}"))
     } else {
         Finding::warning(
             "version",
@@ -293,7 +293,7 @@ fn alerts(alerts: &[Alert]) -> Finding {
         .collect();
     let step = "`tread alerts` lists them; docs/runbook.md has a section for each";
     match (named.as_slice(), alerts.len()) {
-        ([], 0) => Finding::well("alerts", "there are none"),
+        ([], 0) => Finding::ok("alerts", "there are none"),
         ([], count) => Finding::warning("alerts", format!("{count} warnings are active"), step),
         (named, count) => Finding::problem(
             "alerts",

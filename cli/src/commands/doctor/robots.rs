@@ -94,7 +94,7 @@ pub(super) fn of_robot(robot: &Robot, server_version: Option<&str>) -> Vec<Findi
         let round_trip = round_trip.map_or_else(String::new, |round_trip_ms| {
             format!(", it answers within {round_trip_ms:.0} ms")
         });
-        findings.push(Finding::well(&name, format!("it is online{round_trip}")));
+        findings.push(Finding::ok(&name, format!("it is online{round_trip}")));
     }
     findings
 }

@@ -1,7 +1,7 @@
 //! `rough`: tests the agents' estimates of θ on robots that differ from their model and simulator.
 //!
 //! `cargo run --release -p tread-lab --bin rough -- [--runs N] [--seed N] [--only TEXT]
-//! [--tyres-straight] [--bounds N] [--drives FILE] [--json]`
+//! [--tyres-straight] [--bounds N] [--drives FILE] [--json | --markdown]`
 //!
 //! Every agent is configured with the robot's data sheet; the robot drives in the rough world. A
 //! line of the report is one difference, or the population, in which all deviations are drawn at
@@ -25,12 +25,12 @@ use anyhow::Context;
 use clap::Parser;
 use tread_control::estimation::{EstimatorPrior, TyrePrior};
 use tread_lab::parallel::in_parallel;
-use tread_lab::report::{Check, checks_json};
+use tread_lab::report::{Check, checks_json, checks_markdown};
 use tread_lab::rough::run::{ASKED_AT_S, Trial, run};
 
 use lines::{CHANGES, alone, population};
 use parameters::{ParameterLine, parameter_lines};
-use score::{Drive, Line, POPULATION, print, strata};
+use score::{Drive, Line, POPULATION, strata};
 
 #[derive(Debug, Parser)]
 #[command(name = "rough")]
@@ -54,9 +54,12 @@ struct Arguments {
     /// Write each drive to this file, one JSON object per line
     #[arg(long, value_name = "FILE")]
     drives: Option<PathBuf>,
-    /// Print one JSON object instead of a table
-    #[arg(long)]
+    /// Print one JSON object instead of tables
+    #[arg(long, conflicts_with = "markdown")]
     json: bool,
+    /// Print the tables in Markdown, for the page of the report
+    #[arg(long)]
+    markdown: bool,
 }
 
 impl Arguments {
@@ -161,8 +164,13 @@ fn main() -> anyhow::Result<ExitCode> {
             })
         );
     } else {
-        print(&lines);
-        parameters::print(&parameters);
+        let tables = [score::table(&lines), parameters::table(&parameters)];
+        if arguments.markdown {
+            let tables = tables.map(|table| table.markdown()).join("\n");
+            println!("{tables}\n{}", checks_markdown(&checks));
+        } else {
+            println!("{}\n{}", tables[0], tables[1]);
+        }
     }
     Ok(if checks.iter().all(|check| check.holds) {
         ExitCode::SUCCESS

@@ -2,10 +2,10 @@
 
 use serde::Serialize;
 use tread_api::friction::NORMAL_95;
-use tread_lab::report::Check;
+use tread_lab::report::{Check, Table, percent};
 use tread_lab::rough::run::{PARAMETERS, estimates};
 
-use super::score::{Drive, median, share};
+use super::score::{Drive, median, share, verdict, yes_or_no};
 
 /// Coverage that each parameter must have.
 const COVERAGE_MIN: f64 = 0.9;
@@ -63,27 +63,27 @@ impl ParameterLine {
     }
 }
 
-/// The table for people.
-pub(crate) fn print(lines: &[ParameterLine]) {
-    println!(
-        "\n{:<42} {:>6} {:>9} {:>9} {:>9} {:>12}",
-        "robot's parameters, population",
+/// The lines as a table.
+pub(crate) fn table(lines: &[ParameterLine]) -> Table {
+    let mut table = Table::new([
+        "parameter of the robot, population",
         "torque",
         "estimates",
         "coverage",
-        "± half",
-        "mostly prior"
-    );
+        "half-width",
+        "mostly prior",
+        "goals",
+    ]);
     for line in lines {
-        println!(
-            "{:<42} {:>6} {:>9} {:>8.1}% {:>9.4} {:>11.1}%{}",
-            line.name,
-            if line.has_torque { "yes" } else { "no" },
-            line.estimates,
-            100.0 * line.coverage,
-            line.half_width,
-            100.0 * line.prior_dominated,
-            if line.check().holds { "" } else { "  MISSED" },
-        );
+        table.row([
+            line.name.to_owned(),
+            yes_or_no(line.has_torque),
+            line.estimates.to_string(),
+            percent(line.coverage),
+            format!("{:.4}", line.half_width),
+            percent(line.prior_dominated),
+            verdict(line.check().holds),
+        ]);
     }
+    table
 }

@@ -4,7 +4,7 @@ use std::ops::RangeInclusive;
 
 use serde::Serialize;
 use tread_api::friction::{NORMAL_95, ThetaEstimate};
-use tread_lab::report::Check;
+use tread_lab::report::{Check, Table, percent};
 use tread_lab::rough::run::{ASKED_AT_S, Outcome, Trial};
 
 /// Relative half-width above which an estimate counts as missing.
@@ -190,49 +190,52 @@ pub(crate) fn strata(has_torque: bool, drives: &[Drive]) -> Vec<Line> {
     lines
 }
 
-/// Prints the lines as a table.
-pub(crate) fn print(lines: &[Line]) {
-    println!(
-        "{:<42} {:>6} {:>9} {:>9} {:>9} {:>9} {:>9} {:>12} {:>9} {:>8} {:>8} {:>9}",
-        "",
+/// The lines as a table.
+pub(crate) fn table(lines: &[Line]) -> Table {
+    let mut table = Table::new([
+        "what differs",
         "torque",
         "estimates",
         "coverage",
         "error",
-        "± half",
+        "half-width",
         "none",
         "none at 60 s",
-        "> ½ peak",
-        "± bound",
-        "/ bound",
-        "needless"
-    );
-    let percent = |value: Option<f64>| {
-        value.map_or_else(|| "-".to_owned(), |value| format!("{:.1}%", 100.0 * value))
-    };
+        "beyond half the peak",
+        "bound",
+        "half-width over bound",
+        "needlessly none",
+        "goals",
+    ]);
     for line in lines {
-        println!(
-            "{:<42} {:>6} {:>9} {:>8.1}% {:>+8.1}% {:>8.1}% {:>8.1}% {:>11.1}% {:>8.1}% {:>8} {:>8} {:>9}{}",
-            line.name,
-            if line.has_torque { "yes" } else { "no" },
-            line.estimates,
-            100.0 * line.coverage,
-            100.0 * line.error,
-            100.0 * line.half_width,
-            100.0 * line.abstained,
-            100.0 * line.abstained_at_end,
-            100.0 * line.beyond_half_peak,
+        let holds = line.checks().iter().all(|check| check.holds);
+        table.row([
+            line.name.clone(),
+            yes_or_no(line.has_torque),
+            line.estimates.to_string(),
+            percent(line.coverage),
+            format!("{:+.1} %", 100.0 * line.error),
+            percent(line.half_width),
+            percent(line.abstained),
+            percent(line.abstained_at_end),
+            percent(line.beyond_half_peak),
             percent(line.bound),
             line.over_bound
                 .map_or_else(|| "-".to_owned(), |over| format!("{over:.1}")),
             percent(line.abstained_needlessly),
-            if line.checks().iter().all(|check| check.holds) {
-                ""
-            } else {
-                "  MISSED"
-            },
-        );
+            verdict(holds),
+        ]);
     }
+    table
+}
+
+pub(crate) fn yes_or_no(is_so: bool) -> String {
+    if is_so { "yes" } else { "no" }.to_owned()
+}
+
+/// Whether all goals of a line are reached, for people.
+pub(crate) fn verdict(holds: bool) -> String {
+    if holds { "hold" } else { "MISSED" }.to_owned()
 }
 
 /// Returns the half-width of the 95 % interval, relative to θ̂.

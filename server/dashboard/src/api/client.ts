@@ -1,5 +1,6 @@
 // Asks the server: one function, one kind of error.
 import type { ProblemBody } from './schema';
+import { withDetail } from '../said';
 import { texts } from '../texts';
 
 /** How long an answer may take, milliseconds; the server's own bound is 15 s. */
@@ -7,7 +8,7 @@ const ANSWER_MAX_MS = 16_000;
 /** Entries of one page of a list, the most that the server gives. */
 const PAGE_ENTRIES = 1_000;
 
-/** What went wrong, in one plain sentence. */
+/** What went wrong: one plain sentence, and what the server adds to it. */
 export class Problem extends Error {
   constructor(
     message: string,
@@ -23,16 +24,15 @@ export class Problem extends Error {
   }
 }
 
-/** One sentence for people about whatever was thrown. */
+/** One sentence for people about whatever was thrown, with what the server adds (`said.ts`). */
 export function sentence(error: unknown): string {
   return error instanceof Error ? error.message : String(error);
 }
 
-/** A sentence from a problem's parts. */
+/** A sentence in the language of the page by the problem's type, with the server's own words after it. */
 export function tell(body: ProblemBody): string {
   const title = texts.problem.title(body.type, body.title);
-  const detail = body.detail ? `${title}: ${body.detail}` : title;
-  return `${detail.charAt(0).toUpperCase()}${detail.slice(1)}.`;
+  return withDetail(`${title.charAt(0).toUpperCase()}${title.slice(1)}.`, body.detail);
 }
 
 export interface Asked {

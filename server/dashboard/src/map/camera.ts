@@ -10,6 +10,14 @@ export interface PointPx {
   y: number;
 }
 
+/** A rectangle of the canvas, pixels. */
+export interface RectPx {
+  left: number;
+  top: number;
+  right: number;
+  bottom: number;
+}
+
 export interface Bounds {
   xMin: number;
   yMin: number;
@@ -24,6 +32,8 @@ export const SCALE_MAX = 500;
 const MARGIN_PX = 36;
 /** Least width that a fit shows, metres. */
 const FIT_MIN_M = 4;
+/** Least side of a part of the canvas that is fitted into, pixels: a smaller one shows nothing. */
+const FREE_MIN_PX = 160;
 
 export class Camera {
   /** What stands in the middle of the canvas. */
@@ -62,15 +72,48 @@ export class Camera {
     };
   }
 
-  fit(bounds: Bounds): void {
+  /** Shows everything within bounds, as large as it can be beside what covers the canvas. */
+  fit(bounds: Bounds, covered: readonly RectPx[] = []): void {
     const width = Math.max(bounds.xMax - bounds.xMin, FIT_MIN_M);
     const height = Math.max(bounds.yMax - bounds.yMin, FIT_MIN_M);
-    const scale = Math.min(
-      Math.max(1, this.width - 2 * MARGIN_PX) / width,
-      Math.max(1, this.height - 2 * MARGIN_PX) / height,
-    );
+    const scaleIn = ({ left, top, right, bottom }: RectPx) =>
+      Math.min(Math.max(1, right - left - 2 * MARGIN_PX) / width, Math.max(1, bottom - top - 2 * MARGIN_PX) / height);
+    const free = this.#free(covered, scaleIn);
+    this.scale = Math.min(SCALE_MAX, Math.max(SCALE_MIN, scaleIn(free)));
+    this.#put({ x_m: (bounds.xMin + bounds.xMax) / 2, y_m: (bounds.yMin + bounds.yMax) / 2 }, free);
+  }
+
+  /** Shows a place in the middle of the largest part of the canvas that nothing covers. */
+  showPlace(place: PointM, scale: number, covered: readonly RectPx[] = []): void {
     this.scale = Math.min(SCALE_MAX, Math.max(SCALE_MIN, scale));
-    this.center = { x_m: (bounds.xMin + bounds.xMax) / 2, y_m: (bounds.yMin + bounds.yMax) / 2 };
+    this.#put(place, this.#free(covered, ({ left, top, right, bottom }) => (right - left) * (bottom - top)));
+  }
+
+  /** Moves so that a place stands in the middle of a rectangle. */
+  #put(place: PointM, { left, top, right, bottom }: RectPx): void {
+    this.center = {
+      x_m: place.x_m - ((left + right) / 2 - this.width / 2) / this.scale,
+      y_m: place.y_m + ((top + bottom) / 2 - this.height / 2) / this.scale,
+    };
+  }
+
+  /** The best rectangle that nothing covers; the whole canvas if nothing of some size is left. */
+  #free(covered: readonly RectPx[], worth: (rectangle: RectPx) => number): RectPx {
+    const whole = { left: 0, top: 0, right: this.width, bottom: this.height };
+    let best: RectPx | null = null;
+    for (const left of [0, ...covered.map((rectangle) => rectangle.right)]) {
+      for (const right of [this.width, ...covered.map((rectangle) => rectangle.left)]) {
+        if (right - left < FREE_MIN_PX) continue;
+        for (const top of [0, ...covered.map((rectangle) => rectangle.bottom)]) {
+          for (const bottom of [this.height, ...covered.map((rectangle) => rectangle.top)]) {
+            const one = { left, top, right, bottom };
+            if (bottom - top < FREE_MIN_PX || covered.some((other) => overlap(one, other))) continue;
+            if (!best || worth(one) > worth(best)) best = one;
+          }
+        }
+      }
+    }
+    return best ?? whole;
   }
 
   /** What can be seen. */
@@ -79,6 +122,10 @@ export class Camera {
     const high = this.toM({ x: this.width, y: 0 });
     return { xMin: low.x_m, yMin: low.y_m, xMax: high.x_m, yMax: high.y_m };
   }
+}
+
+function overlap(one: RectPx, other: RectPx): boolean {
+  return one.left < other.right && other.left < one.right && one.top < other.bottom && other.top < one.bottom;
 }
 
 /** The box around points; null without any. */

@@ -7,6 +7,8 @@ export type DraftKind = 'circle' | 'waypoints' | 'terrain';
 const UNDO_MAX = 100;
 /** Smallest circle, metres, as the API has it. */
 export const RADIUS_MIN_M = 0.05;
+/** How far from the origin a coordinate may be, metres, as the API has it. */
+export const COORDINATE_MAX_M = 1e6;
 
 interface Shape {
   center: PointM | null;

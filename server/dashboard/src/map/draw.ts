@@ -20,10 +20,12 @@ export interface Scene {
   fence: Geofence | null;
   tracked: Iterable<Tracked>;
   missions: Mission[];
-  /** Robots that a stop is on its way to without their confirmation. */
+  /** Robots whose stop is not confirmed, or has failed. */
   unconfirmed: ReadonlySet<string>;
   friction: Raster<{ cell: Cell }> | null;
   draft: Draft | null;
+  /** Points of the draft that are at fault, by their numbers in the table, from 1. */
+  faulty: readonly number[];
   /** The mission that is looked at: its path as it was planned, as far as that is known, and driven. */
   driven: { asked: Trajectory; planned: Planned | null; points: PointM[]; moment: Moment | null } | null;
   /** The smooth path of what is drawn, by its dry run; null without one. */
@@ -31,6 +33,8 @@ export interface Scene {
   /** The smooth path of a mission, once it is known. */
   pathOf(mission: Mission): Planned | null;
   selected: string | null;
+  /** The robot that is pointed at, on the map or in the list. */
+  pointed: string | null;
   /** Where labels of robots stood in the frame before. */
   labels: RobotLabels;
   /** Robots that are selected with others. */
@@ -54,9 +58,13 @@ const GRID_PX = 48;
 /** Width that the scale bar aims at, pixels. */
 const SCALE_BAR_PX = 90;
 /** Dashes of the approach to a path, pixels. */
-const APPROACH_DASH = [3, 5];
+export const APPROACH_DASH = [3, 5];
 /** Dashes of a path that was planned, below the one that was driven, pixels. */
-const PLANNED_DASH = [8, 5];
+export const PLANNED_DASH = [8, 5];
+/** Radius of the ring around a point that is at fault, pixels. */
+const FAULTY_PX = 12;
+/** What stays free around the text and the line of the scale bar, pixels. */
+const SCALE_BAR_MARGIN_PX = 6;
 /** Length of the arrow of a moment, pixels from its middle. */
 const MOMENT_PX = 11;
 
@@ -77,6 +85,8 @@ export function drawGround(context: CanvasRenderingContext2D, camera: Camera, sc
   if (scene.inspected && scene.friction) drawInspected(context, camera, scene.inspected, scene.friction.cellM, palette);
   if (scene.showFence && scene.fence) drawFence(context, camera, scene.fence, palette);
   drawPaths(context, camera, scene, palette);
+  // Below robots and drafts, which its ground is not to hide.
+  drawScale(context, camera, palette);
 }
 
 /** Draws robots, and what is drawn above them; true while one of them moves. */
@@ -84,13 +94,12 @@ export function drawAbove(context: CanvasRenderingContext2D, camera: Camera, sce
   const palette = PALETTES[scene.theme];
   const isMoving = drawRobots(context, camera, scene, palette);
   if (scene.draft) {
-    drawDraft(context, camera, scene.draft, palette);
+    drawDraft(context, camera, scene.draft, scene.faulty, palette);
     context.lineWidth = 2;
     context.strokeStyle = palette.planned;
     if (scene.dryRun) strokePlanned(context, camera, scene.dryRun, []);
   }
   if (scene.showCross) drawCross(context, camera, palette);
-  drawScale(context, camera, palette);
   return isMoving;
 }
 
@@ -313,7 +322,13 @@ function drawMoment(context: CanvasRenderingContext2D, camera: Camera, moment: M
   context.restore();
 }
 
-function drawDraft(context: CanvasRenderingContext2D, camera: Camera, draft: Draft, palette: Palette): void {
+function drawDraft(
+  context: CanvasRenderingContext2D,
+  camera: Camera,
+  draft: Draft,
+  faulty: readonly number[],
+  palette: Palette,
+): void {
   context.strokeStyle = palette.draft;
   context.fillStyle = palette.draftFill;
   context.lineWidth = 2;
@@ -344,9 +359,17 @@ function drawDraft(context: CanvasRenderingContext2D, camera: Camera, draft: Dra
     const { x, y } = camera.toPx(point);
     context.beginPath();
     context.arc(x, y, 6, 0, 2 * Math.PI);
-    context.fillStyle = palette.draft;
+    const isFaulty = faulty.includes(index + 1);
+    context.fillStyle = isFaulty ? palette.stopped : palette.draft;
     context.fill();
-    label(context, String(index + 1), x, y - 10, palette.draft, palette);
+    if (isFaulty) {
+      context.beginPath();
+      context.arc(x, y, FAULTY_PX, 0, 2 * Math.PI);
+      context.lineWidth = 2.5;
+      context.strokeStyle = palette.stopped;
+      context.stroke();
+    }
+    label(context, String(index + 1), x, y - (isFaulty ? FAULTY_PX + 4 : 10), isFaulty ? palette.stopped : palette.draft, palette);
   });
 }
 
@@ -367,6 +390,15 @@ function drawScale(context: CanvasRenderingContext2D, camera: Camera, palette: P
   const { length_m, text } = scaleBar(SCALE_BAR_PX / camera.scale);
   const width = length_m * camera.scale;
   const [x, y] = [14, camera.height - 14];
+  context.font = '12px system-ui, sans-serif';
+  context.textAlign = 'center';
+  // A ground of its own, so that it is read over every colour of the layers.
+  const half = Math.max(width, context.measureText(text).width) / 2 + SCALE_BAR_MARGIN_PX;
+  const top = y - 20 - SCALE_BAR_MARGIN_PX;
+  context.fillStyle = palette.ground;
+  context.globalAlpha = 0.9;
+  context.fillRect(x + width / 2 - half, top, 2 * half, y + SCALE_BAR_MARGIN_PX - top);
+  context.globalAlpha = 1;
   context.beginPath();
   context.moveTo(x, y - 6);
   context.lineTo(x, y);
@@ -375,7 +407,6 @@ function drawScale(context: CanvasRenderingContext2D, camera: Camera, palette: P
   context.lineWidth = 2;
   context.strokeStyle = palette.text;
   context.stroke();
-  context.font = '12px system-ui, sans-serif';
-  context.textAlign = 'center';
-  label(context, text, x + width / 2, y - 8, palette.text, palette);
+  context.fillStyle = palette.text;
+  context.fillText(text, x + width / 2, y - 8);
 }

@@ -1,12 +1,14 @@
-// Draws robots with their trails and labels. Every robot in sight has its label: close together they are
-// shorter or on another side, but none is left out.
+// Draws robots with their trails and labels. Every robot in sight has its label: close together they are shorter or
+// on another side. In a crowd, where labels would cover the map and each other, robots that are selected, pointed at or
+// in trouble are named as ever, and the labels of all others are short and pale.
 import type { Tracked } from '../state/tracked';
 import { span } from '../format';
 import { texts } from '../texts';
 import type { Camera } from './camera';
 import type { Scene } from './draw';
 import { Kept } from './kept';
-import { Labels, shortened, type Wanted } from './labels';
+import { doing, hasFault } from '../standing';
+import { Labels, crowdOf, shortened, type Box, type Wanted } from './labels';
 import type { Shown } from './motion';
 import type { Palette } from './palette';
 
@@ -21,6 +23,10 @@ const FONT = '600 12px system-ui, sans-serif';
 const BASELINE_PX = 11;
 /** Width of the halo around a label, pixels. */
 const HALO_PX = 3;
+/** The sign above a robot in trouble, beside its colour: a triangle of this height, pixels. */
+const SIGN_PX = 15;
+/** From a robot to its sign, pixels. */
+const SIGN_GAP_PX = 3;
 /** Widths of labels that are kept. */
 const WIDTHS_MAX = 5_000;
 /** Of more robots than these, trails and labels are drawn anew only so often. */
@@ -35,6 +41,8 @@ export class RobotLabels {
   /** Labels, and trails, as they were drawn last. */
   readonly written = new Kept(LABELS_ANEW_MS);
   readonly trails = new Kept(TRAILS_ANEW_MS);
+  /** Robots that were in a crowd when labels were written last. */
+  crowd: ReadonlySet<string> = new Set();
   #short = new Map<string, string>();
   #names = '';
   #widths = new Map<string, number>();
@@ -68,6 +76,8 @@ interface Seen {
   length: number;
   width: number;
   colour: string;
+  /** It is in fault, does not stand though it is to, or its stop is not confirmed. */
+  isInTrouble: boolean;
   /** Whose label comes first where there is little room. */
   rank: number;
 }
@@ -93,6 +103,7 @@ export function drawRobots(context: CanvasRenderingContext2D, camera: Camera, sc
   const base = context.getTransform();
   for (const robot of seen) drawRobot(context, base, robot, scene, palette);
   context.setTransform(base);
+  for (const robot of seen) if (robot.isInTrouble) drawSign(context, robot, palette);
   const isLabelOld = show(labels.written, seen.length, (to) => drawLabels(to, camera, seen, all, scene, palette));
   // What was not drawn anew in this frame may have changed.
   return isTrailOld || isLabelOld || all.some(({ shown }) => shown?.isMoving);
@@ -134,16 +145,27 @@ function seenOf(camera: Camera, { tracked, shown }: Placed, scene: Scene, palett
   if (isOut) return null;
   const isLost = robot.link === 'offline';
   const isStopped = robot.live?.safety.stop != null || scene.unconfirmed.has(robot.id);
+  // Of one that is not heard nobody knows whether it still is so.
+  const isFaulty = !isLost && hasFault(robot.live);
+  const isInTrouble = scene.unconfirmed.has(robot.id) || isFaulty || (!isLost && doing(robot.live).isBad);
   const colour = isStopped
     ? palette.stopped
-    : isLost || shown.isFrozen
-      ? palette.robotLost
-      : robot.link === 'stale' || scene.isOld
-        ? palette.robotLate
-        : palette.robot;
-  const rank = robot.id === scene.selected ? 0 : scene.marked.has(robot.id) ? 1 : isStopped || isLost ? 2 : 3;
-  return { tracked, shown, x, y, length, width, colour, rank };
+    : isFaulty
+      ? palette.fault
+      : isLost || shown.isFrozen
+        ? palette.robotLost
+        : robot.link === 'stale' || scene.isOld
+          ? palette.robotLate
+          : palette.robot;
+  const isChosen = robot.id === scene.selected || robot.id === scene.pointed;
+  const rank = isChosen ? 0 : scene.marked.has(robot.id) ? 1 : isInTrouble || isLost ? 2 : isStopped ? 3 : 4;
+  return { tracked, shown, x, y, length, width, colour, isInTrouble, rank };
 }
+
+/** Ranks of robots that are named in a crowd too. */
+const NAMED_RANK_MAX = 2;
+/** Opacity of the labels of all others in a crowd. */
+const PALE = 0.5;
 
 function drawRobot(context: CanvasRenderingContext2D, base: DOMMatrix, seen: Seen, scene: Scene, palette: Palette): void {
   const { x, y, length, width, colour } = seen;
@@ -158,7 +180,7 @@ function drawRobot(context: CanvasRenderingContext2D, base: DOMMatrix, seen: See
   context.setTransform(cos, -sin, sin, cos, left + ratio * x, top + ratio * y);
   if (robot.id === scene.selected || isMarked || isUnconfirmed) {
     context.beginPath();
-    context.arc(0, 0, Math.hypot(length, width) / 2 + 5, 0, 2 * Math.PI);
+    context.arc(0, 0, ringPx(seen), 0, 2 * Math.PI);
     context.lineWidth = isUnconfirmed ? 4 : 2;
     context.strokeStyle = isUnconfirmed ? palette.stopped : palette.selected;
     context.stroke();
@@ -189,13 +211,49 @@ function drawRobot(context: CanvasRenderingContext2D, base: DOMMatrix, seen: See
   context.fill();
 }
 
+/** Radius of the ring around a robot that is selected or has not confirmed its stop, pixels. */
+function ringPx({ length, width }: Seen): number {
+  return Math.hypot(length, width) / 2 + 5;
+}
+
+/** Where the sign above a robot lies. */
+function signOf(seen: Seen): Box {
+  const top = seen.y - ringPx(seen) - SIGN_GAP_PX - SIGN_PX;
+  return { left: seen.x - SIGN_PX * 0.6, top, width: SIGN_PX * 1.2, height: SIGN_PX };
+}
+
+/** A triangle with an exclamation mark above a robot, which is recognised without its colour. */
+function drawSign(context: CanvasRenderingContext2D, seen: Seen, palette: Palette): void {
+  const { x } = seen;
+  const { left, top, width, height } = signOf(seen);
+  context.beginPath();
+  context.moveTo(x, top);
+  context.lineTo(left + width, top + height);
+  context.lineTo(left, top + height);
+  context.closePath();
+  context.lineJoin = 'round';
+  context.lineWidth = HALO_PX;
+  context.strokeStyle = palette.halo;
+  context.stroke();
+  context.fillStyle = palette.fault;
+  context.fill();
+  context.fillStyle = palette.halo;
+  context.fillRect(x - 1, top + SIGN_PX * 0.36, 2, SIGN_PX * 0.34);
+  context.fillRect(x - 1, top + SIGN_PX * 0.78, 2, 2);
+}
+
 /** What may be written beside a robot, the longest first. */
-function textsOf({ robot, ...tracked }: { robot: Tracked['robot']; age_s: number | null }, short: string, isOld: boolean): string[] {
+function textsOf(
+  { robot, ...tracked }: { robot: Tracked['robot']; age_s: number | null; trouble: string },
+  short: string,
+  isOld: boolean,
+): string[] {
   const { name } = robot;
+  const trouble = tracked.trouble && ` · ${tracked.trouble}`;
   const isLast = (robot.link === 'offline' || isOld) && tracked.age_s !== null;
   const note = isLast ? ` · ${texts.robots.lastKnown}, ${texts.robots.age(span(tracked.age_s))}` : '';
   const late = robot.link === 'stale' && !isOld ? ` · ${texts.link.stale}` : '';
-  return [...new Set([`${name}${late}${note}`, name, short])];
+  return [...new Set([`${name}${trouble}${late}${note}`, `${name}${trouble}`, name, short])];
 }
 
 function drawLabels(
@@ -213,24 +271,42 @@ function drawLabels(
   context.lineJoin = 'round';
   context.strokeStyle = palette.halo;
   const short = labels.shortOf(all.map(({ tracked }) => tracked.robot.name));
-  const order = [...seen].sort((a, b) => a.rank - b.rank);
-  const wanted = order.map(({ tracked, x, y, length, width }): Wanted => {
-    const { robot } = tracked;
-    const age_s = tracked.ageS(scene.now);
-    const names = textsOf({ robot, age_s }, short.get(robot.name) ?? robot.name, scene.isOld);
-    return { id: robot.id, x, y, reach: Math.max(length, width) / 2, texts: names };
-  });
   const widthOf = (text: string) => labels.widthOf(context, text);
+  const members = seen.map(({ tracked: { robot }, x, y, length, width }) => {
+    return { id: robot.id, x, y, reach: Math.max(length, width) / 2, width: widthOf(robot.name) };
+  });
+  labels.crowd = crowdOf(members, labels.crowd);
+  const isNamed = ({ rank, tracked }: Seen) => rank <= NAMED_RANK_MAX || !labels.crowd.has(tracked.robot.id);
+  const order = [...seen].sort((a, b) => Number(isNamed(b)) - Number(isNamed(a)) || a.rank - b.rank);
+  const wanted = order.map((one): Wanted => {
+    const { tracked, x, y, length, width, isInTrouble } = one;
+    const { robot } = tracked;
+    const reach = Math.max(length, width) / 2;
+    const shortName = short.get(robot.name) ?? robot.name;
+    if (!isNamed(one)) return { id: robot.id, x, y, reach, texts: [shortName] };
+    const age_s = tracked.ageS(scene.now);
+    const trouble = scene.unconfirmed.has(robot.id)
+      ? texts.stop.problems.unconfirmed
+      : isInTrouble
+        ? hasFault(robot.live)
+          ? texts.mode.fault
+          : doing(robot.live).text
+        : '';
+    return { id: robot.id, x, y, reach, texts: textsOf({ robot, age_s, trouble }, shortName, scene.isOld) };
+  });
   const view = { left: 0, top: 0, width: camera.width, height: camera.height };
-  const placed = labels.places.place(wanted, widthOf, view);
+  const signs = seen.filter(({ isInTrouble }) => isInTrouble).map(signOf);
+  const placed = labels.places.place(wanted, widthOf, view, signs);
   // Those that come first lie above.
   for (let index = placed.length - 1; index >= 0; index -= 1) {
     const label = placed[index];
     const robot = order[index];
     if (!label || !robot) continue;
     const [x, y] = [label.left + HALO_PX / 2, label.top + BASELINE_PX];
+    context.globalAlpha = isNamed(robot) ? 1 : PALE;
     context.strokeText(label.text, x, y);
     context.fillStyle = robot.colour;
     context.fillText(label.text, x, y);
   }
+  context.globalAlpha = 1;
 }

@@ -1,8 +1,9 @@
 // The friction layer: cells to an image, with a fixed range for each quantity.
 import type { CellFriction, FusedFriction } from '../api/schema';
 import { texts } from '../texts';
-import { colour } from './cividis';
+import { colour as cividis } from './cividis';
 import { Raster, type Hatch } from './raster';
+import { slate, teal, type Rgb } from './single_hue';
 
 export type Quantity = 'theta' | 'stiffness' | 'friction' | 'age' | 'visits';
 
@@ -16,6 +17,10 @@ export interface Range {
   ticks: number[];
   /** What its ends mean, the lower one first. */
   readonly ends: readonly [string, string];
+  /** Says in one plain sentence what it is. */
+  readonly plain: string;
+  /** Its colour map. Cividis is that of slip alone, so that no colour means opposite things. */
+  scale: (share: number) => Rgb;
   /** Colours go from the higher end to the lower one, so that ground that is slippery looks the same. */
   isReversed: boolean;
   /** Whether hatching says how sure the value is. */
@@ -33,10 +38,14 @@ export const RANGES: Record<Quantity, Range> = {
     get label() {
       return texts.map.theta;
     },
-    ticks: [0.05, 0.1, 0.2, 0.5, 1, 2],
+    ticks: [0.05, 0.2, 0.5, 1, 2],
     get ends() {
       return [texts.map.ends.firm, texts.map.ends.slippery] as const;
     },
+    get plain() {
+      return texts.map.plain.theta;
+    },
+    scale: cividis,
     isReversed: false,
     isHatched: true,
     value: (friction) => friction.theta,
@@ -53,6 +62,10 @@ export const RANGES: Record<Quantity, Range> = {
     get ends() {
       return [texts.map.ends.slippery, texts.map.ends.firm] as const;
     },
+    get plain() {
+      return texts.map.plain.stiffness;
+    },
+    scale: cividis,
     isReversed: true,
     isHatched: true,
     value: (friction) => friction.stiffness,
@@ -68,9 +81,13 @@ export const RANGES: Record<Quantity, Range> = {
     ticks: [0, 0.25, 0.5, 0.75, 1],
     // A low one says nothing bad: nobody has asked for more there.
     get ends() {
-      return [texts.map.ends.littleShown, texts.map.ends.firm] as const;
+      return [texts.map.ends.littleShown, texts.map.ends.muchShown] as const;
     },
-    isReversed: true,
+    get plain() {
+      return texts.map.plain.friction;
+    },
+    scale: teal,
+    isReversed: false,
     isHatched: false,
     value: (friction) => friction.mu_peak_lower_bound ?? null,
   },
@@ -88,7 +105,11 @@ export const RANGES: Record<Quantity, Range> = {
     get ends() {
       return [texts.map.ends.fresh, texts.map.ends.old] as const;
     },
-    isReversed: false,
+    get plain() {
+      return texts.map.plain.age;
+    },
+    scale: slate,
+    isReversed: true,
     isHatched: false,
     value: (friction) => friction.age_s / 3_600,
   },
@@ -104,6 +125,10 @@ export const RANGES: Record<Quantity, Range> = {
     get ends() {
       return [texts.map.ends.few, texts.map.ends.many] as const;
     },
+    get plain() {
+      return texts.map.plain.visits;
+    },
+    scale: slate,
     isReversed: false,
     isHatched: false,
     value: (friction) => friction.segments,
@@ -123,6 +148,11 @@ export function share(range: Range, value: number): number {
 /** Where a value stands on the scale of colours, 0 to 1. */
 export function shade(range: Range, value: number): number {
   return range.isReversed ? 1 - share(range, value) : share(range, value);
+}
+
+/** The colour of a value. */
+export function colourOf(range: Range, value: number): Rgb {
+  return range.scale(shade(range, value));
 }
 
 /** How densely a value of θ is hatched: pattern alone says how unsure it is, never a colour. */
@@ -145,7 +175,7 @@ export class Layer extends Raster<CellFriction> {
     this.paint((cell) => {
       const value = range.value(cell.friction);
       if (value === null) return null;
-      return { colour: colour(shade(range, value)), hatch: range.isHatched ? hatchOf(cell.friction) : 0 };
+      return { colour: colourOf(range, value), hatch: range.isHatched ? hatchOf(cell.friction) : 0 };
     });
   }
 }

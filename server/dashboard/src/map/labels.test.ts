@@ -1,5 +1,5 @@
 import { expect, test } from 'vitest';
-import { LABEL_PX, Labels, overlap, shortened, type Wanted } from './labels';
+import { CROWD_MIN, LABEL_PX, Labels, crowdOf, overlap, shortened, type Member, type Wanted } from './labels';
 
 const widthOf = (text: string) => 7 * text.length;
 
@@ -41,6 +41,49 @@ test('labels are whole where there is room, shorter where there is less, and onl
   const crowd = texts(4);
   expect(crowd.some((label) => label.isOver)).toBe(true);
   for (const label of crowd.filter((one) => one.isOver)) expect(label.text).toMatch(/^\d+$/);
+});
+
+test('a label keeps off the sign above a robot while there is room elsewhere', () => {
+  const wanted: Wanted[] = [{ id: 'rover-1', x: 100, y: 100, reach: 8, texts: ['rover-1'] }];
+  const sign = { left: 110, top: 80, width: 60, height: 40 };
+  const [label] = new Labels().place(wanted, widthOf, undefined, [sign]);
+  expect(label && overlap(label, sign)).toBe(false);
+});
+
+const NOBODY: ReadonlySet<string> = new Set();
+const members = (side: number, apart: number): Member[] => square(side, apart).map((one) => ({ ...one, width: 62 }));
+
+test('five hundred robots on one screen are a crowd to their edges, and none where each name has its room', () => {
+  expect(crowdOf(members(22, 35), NOBODY).size).toBe(484);
+  expect(crowdOf(members(22, 12), NOBODY).size).toBe(484);
+  expect(crowdOf(members(22, 150), NOBODY).size).toBe(0);
+});
+
+test('few robots are no crowd, however close together they are', () => {
+  const few = members(5, 10).slice(0, CROWD_MIN - 1);
+  expect(crowdOf(few, NOBODY).size).toBe(0);
+});
+
+test('a robot apart from a crowd is not in it, and neither is a row of robots', () => {
+  const apart: Member = { id: 'apart', x: 900, y: 500, reach: 8, width: 62 };
+  const crowd = crowdOf([...members(6, 20), apart], NOBODY);
+  expect(crowd.size).toBe(36);
+  expect(crowd.has('apart')).toBe(false);
+  const row = Array.from({ length: 40 }, (_, index): Member => ({ id: `${index}`, x: index * 45, y: 0, reach: 8, width: 62 }));
+  expect(crowdOf(row, NOBODY).size).toBe(0);
+});
+
+test('a robot at the limit of a crowd stays as it was', () => {
+  // Six others are near the one in the middle, then five.
+  const ring = (count: number): Member[] => [
+    { id: 'middle', x: 0, y: 0, reach: 8, width: 40 },
+    ...Array.from({ length: count }, (_, index) => ({ id: `${index}`, x: 45, y: (index - count / 2) * 6, reach: 8, width: 40 })),
+  ];
+  const others = Array.from({ length: CROWD_MIN }, (_, index): Member => ({ id: `far-${index}`, x: 5_000 + index * 500, y: 0, reach: 8, width: 40 }));
+  const isIn = (count: number, before: ReadonlySet<string>) => crowdOf([...ring(count), ...others], before).has('middle');
+  expect(isIn(6, NOBODY)).toBe(true);
+  expect(isIn(5, new Set(['middle']))).toBe(true);
+  expect(isIn(4, new Set(['middle']))).toBe(false);
 });
 
 test('a label stays beside its robot', () => {

@@ -1,4 +1,5 @@
-// Where the labels of robots stand: every one somewhere, beside each other as far as there is room. Pure.
+// Where the labels of robots stand: every one somewhere, beside each other as far as there is room; and which robots
+// stand so close together that their labels would cover the map and each other. Pure.
 
 export interface Box {
   left: number;
@@ -95,17 +96,70 @@ function within(box: Box, view: Box): Box {
   return { ...box, left, top };
 }
 
+/** A robot with the width of its whole name. */
+export interface Member {
+  id: string;
+  x: number;
+  y: number;
+  reach: number;
+  /** Width of its name, pixels. */
+  width: number;
+}
+
+/** Of fewer robots than these each has its label, however close together they are. */
+export const CROWD_MIN = 20;
+/** With so many others around its label a robot is in a crowd, and with so many it stays in one: it does not flicker. */
+const CROWDED_BY = 6;
+const STAYS_CROWDED_BY = 5;
+
+/**
+ * Robots in crowds: those with many others as near as a label reaches, and the robots beside these. `before` has those
+ * that were in a crowd last.
+ */
+export function crowdOf(members: readonly Member[], before: ReadonlySet<string>): Set<string> {
+  const crowd = new Set<string>();
+  if (members.length < CROWD_MIN) return crowd;
+  const sorted = [...members].sort((a, b) => a.x - b.x);
+  const half = sorted.map(({ reach, width }) => ({ x: (reach + width) / 2 + GAP_PX, y: reach + LABEL_PX }));
+  const widest = Math.max(...half.map(({ x }) => x));
+  const near = sorted.map((): number[] => []);
+  for (const [index, one] of sorted.entries()) {
+    const mine = half[index];
+    for (let next = index + 1; mine && next < sorted.length; next += 1) {
+      const [other, theirs] = [sorted[next], half[next]];
+      if (!other || !theirs || other.x - one.x > mine.x + widest) break;
+      if (other.x - one.x >= mine.x + theirs.x || Math.abs(other.y - one.y) >= mine.y + theirs.y) continue;
+      near[index]?.push(next);
+      near[next]?.push(index);
+    }
+  }
+  for (const [index, others] of near.entries()) {
+    const id = sorted[index]?.id ?? '';
+    if (others.length < (before.has(id) ? STAYS_CROWDED_BY : CROWDED_BY)) continue;
+    for (const member of [index, ...others]) crowd.add(sorted[member]?.id ?? '');
+  }
+  return crowd;
+}
+
 /** Places labels frame after frame; one that still has its room stays where it was. */
 export class Labels {
   /** Place and text that a label had last, as one number. */
   #last = new Map<string, number>();
 
-  /** Places all labels within `view`, the first of them first. Every label gets a place. */
-  place(wanted: readonly Wanted[], widthOf: (text: string) => number, view: Box = EVERYWHERE): Placed[] {
+  /**
+   * Places all labels within `view`, the first of them first. Every label gets a place, and keeps off `signs` as it
+   * does off robots.
+   */
+  place(
+    wanted: readonly Wanted[],
+    widthOf: (text: string) => number,
+    view: Box = EVERYWHERE,
+    signs: readonly Box[] = [],
+  ): Placed[] {
     const marks = new Taken();
     const labels = new Taken();
     const own = wanted.map(({ x, y, reach }) => ({ left: x - reach, top: y - reach, width: 2 * reach, height: 2 * reach }));
-    for (const mark of own) marks.add(mark);
+    for (const mark of [...own, ...signs]) marks.add(mark);
     const last = new Map<string, number>();
     const placed = wanted.map((one, index): Placed => {
       const count = one.texts.length * PLACES.length;

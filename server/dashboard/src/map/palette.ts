@@ -12,6 +12,7 @@ export interface Palette {
   robotLate: string;
   robotLost: string;
   stopped: string;
+  fault: string;
   selected: string;
   trail: string;
   planned: string;
@@ -33,6 +34,7 @@ export const PALETTES: Record<Theme, Palette> = {
     robotLate: '#8a5a00',
     robotLost: '#5d666b',
     stopped: '#b3121d',
+    fault: '#b3121d',
     selected: '#111111',
     trail: '#5f93c2',
     planned: '#7a2e9d',
@@ -52,6 +54,7 @@ export const PALETTES: Record<Theme, Palette> = {
     robotLate: '#e0a93b',
     robotLost: '#93a0a8',
     stopped: '#ff6b6b',
+    fault: '#ff6b6b',
     selected: '#ffffff',
     trail: '#4a82b3',
     planned: '#d59bf6',

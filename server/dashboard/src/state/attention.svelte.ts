@@ -58,7 +58,8 @@ export class Attention {
     if (!this.notices || !isAllowed() || document.hasFocus()) return;
     const isAlone = alerts.length === 1;
     const worst = `${this.about(first)}: ${texts.alerts.title(first.code)}`;
-    const [title, body] = isAlone ? [worst, first.text] : [texts.alerts.several(alerts.length), `${worst}. ${first.text}`];
+    const said = texts.alerts.notice(texts.alerts.sentence(first.code, this.about(first)), first.text);
+    const [title, body] = isAlone ? [worst, said] : [texts.alerts.several(alerts.length), said];
     const notice = new Notification(`${texts.name}: ${title}`, { body, tag: first.id });
     notice.onclick = () => {
       window.focus();

@@ -1,6 +1,7 @@
 // What is done to several robots at once, with one line of what became of it for each.
 import type { Mission, Stop } from '../api/schema';
 import { ask, sentence } from '../api/client';
+import { stopState, stopWord } from '../standing';
 import { texts } from '../texts';
 import { hasEnded, type Fleet } from './fleet.svelte';
 
@@ -43,12 +44,14 @@ export class Bulk {
 
   /** What became of each robot, as it is now: stops are confirmed later than they are sent. */
   readonly lines = $derived.by(() => {
-    const { inForce } = this.fleet.stops;
+    const { byId, stops } = this.fleet;
     return this.#noted.map((line) => {
       if (line.outcome !== 'unconfirmed') return line;
-      const stop = inForce.get(line.robot);
+      const stop = stops.inForce.get(line.robot);
       // One that is no longer in force was confirmed and cleared.
-      return !stop || stop.confirmed_at ? { ...line, outcome: 'done' as const, text: texts.bulk.stopped } : line;
+      if (!stop) return { ...line, outcome: 'done' as const, text: texts.bulk.cleared };
+      const state = stopState(stop, byId.get(line.robot)?.robot.live);
+      return state === 'unconfirmed' ? line : { ...line, outcome: 'done' as const, text: stopWord(state) };
     });
   });
 

@@ -152,6 +152,8 @@ export class Drive {
     } else if ('refused' in update) {
       // A command that was under way when the lease was lost: why it was lost stays written.
       if (update.refused.cause === 'no_lease' && !this.hasLease) return;
+      // That the robot is stopped is shown as long as it is so, with what to do.
+      if (update.refused.cause === 'stopped' && this.view?.safety.stop) return;
       this.said = texts.drive.refused(update.refused.cause, update.refused.detail);
       this.isTakenByOther = update.refused.cause === 'leased';
     } else if ('view' in update) {

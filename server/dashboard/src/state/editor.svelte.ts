@@ -17,9 +17,11 @@ import { Draft, RADIUS_MIN_M, type DraftKind } from '../map/draft';
 import type { PointM } from '../map/camera';
 import { plain } from '../format';
 import { preferences } from '../preferences.svelte';
+import { NO_FAULTS, type DraftField, type Faults } from '../refusal';
 import { texts } from '../texts';
 import { about, inUnit } from '../units';
 import type { Fleet } from './fleet.svelte';
+import { refusalIn, refusalText } from './refused';
 
 /** Wait after a change before the dry run is asked for, milliseconds. */
 const CHECK_WAIT_MS = 350;
@@ -59,10 +61,11 @@ export class Editor {
   terrainLayer = $state(0);
 
   check = $state.raw<TrajectoryCheck | null>(null);
-  /** What the server says against the path. */
-  #refusal = $state<string | null>(null);
+  /** What went wrong with the dry run: what the server says against the path, or that it is lost. */
+  #refused = $state.raw<unknown>(null);
   isChecking = $state(false);
-  sendProblem = $state<string | null>(null);
+  /** What went wrong when it was sent or saved. */
+  #unsent = $state.raw<unknown>(null);
   isSending = $state(false);
   /** What was discarded last, in case that was not meant. */
   discarded = $state.raw<DraftState | null>(null);
@@ -131,7 +134,6 @@ export class Editor {
     this.#other = null;
     this.said = null;
     this.discarded = null;
-    this.sendProblem = null;
     this.changed();
   }
 
@@ -143,52 +145,82 @@ export class Editor {
     this.changed();
   }
 
-  /** Why what was typed can be no mission, in one sentence; null when it can. */
-  get flaw(): string | null {
+  /** Why what was typed can be no mission, in one sentence, and where; null when it can. */
+  get #flaw(): { said: string; faults: Faults } | null {
+    const of = (field: DraftField, said: string) => ({ said, faults: { ...NO_FAULTS, field } });
     const wrong = this.draft?.flaw ?? null;
-    if (wrong === 'center') return texts.draw.flaw.center;
+    if (wrong === 'center') return of('center', texts.draw.flaw.center);
     const { system } = preferences;
     if (wrong === 'radius') {
-      return texts.draw.flaw.radius(texts.draw.lengths[system], plain(inUnit('length', RADIUS_MIN_M)));
+      const least = plain(inUnit('length', RADIUS_MIN_M));
+      return of('radius', texts.draw.flaw.radius(texts.draw.lengths[system], least));
     }
-    if (wrong !== null) return texts.draw.flaw.point(wrong);
+    if (wrong !== null) {
+      const point = this.draft?.points[wrong - 1];
+      const [hasX, hasY] = [Number.isFinite(point?.x_m), Number.isFinite(point?.y_m)];
+      const axis = hasX ? 'y_m' : hasY ? 'x_m' : null;
+      return { said: texts.draw.flaw.point(wrong), faults: { points: [wrong], axis, field: null } };
+    }
     if (this.draft?.kind === 'terrain') return null;
-    if (!(this.speed_m_s > 0)) return texts.draw.flaw.speed(texts.draw.speeds[system]);
+    if (!(this.speed_m_s > 0)) return of('speed', texts.draw.flaw.speed(texts.draw.speeds[system]));
     const model = this.fleet.byId.get(this.robot)?.robot.model;
     const top = model?.limits.linear_max_m_s ?? Infinity;
-    if (this.speed_m_s > top) return texts.draw.flaw.fast(this.fleet.nameOf(this.robot), about('speed', top));
-    if (this.draft?.kind === 'circle' && !(this.turns > 0)) return texts.draw.flaw.turns;
-    return Number.isInteger(this.priority) ? null : texts.draw.flaw.priority;
+    if (this.speed_m_s > top) return of('speed', texts.draw.flaw.fast(this.fleet.nameOf(this.robot), about('speed', top)));
+    if (this.draft?.kind === 'circle' && !(this.turns > 0)) return of('turns', texts.draw.flaw.turns);
+    return Number.isInteger(this.priority) ? null : of('priority', texts.draw.flaw.priority);
   }
 
   /** What is wrong with what is drawn: what was typed, or what the server says of it. */
   get checkProblem(): string | null {
     void this.version;
-    return this.draft && !this.draft.isEmpty ? (this.flaw ?? this.#refusal) : this.#refusal;
+    const flaw = this.draft && !this.draft.isEmpty ? this.#flaw : null;
+    return flaw?.said ?? (this.#refused === null ? null : refusalText(this.#refused, this.#hasPoints));
   }
 
-  /** Why the area that is drawn cannot be saved, in one sentence; null when it can. */
+  /** Why it could not be sent or saved; null unless that was tried. */
+  get sendProblem(): string | null {
+    return this.#unsent === null ? null : refusalText(this.#unsent, this.#hasPoints);
+  }
+
+  /** Which points and which field of the draft are at fault, by what was typed or by what the server says. */
+  readonly faults: Faults = $derived.by(() => {
+    void this.version;
+    if (!this.draft || this.draft.isEmpty) return NO_FAULTS;
+    const refusal = (error: unknown) => refusalIn(error, this.#hasPoints);
+    return this.#flaw?.faults ?? refusal(this.#refused) ?? refusal(this.#unsent) ?? NO_FAULTS;
+  });
+
+  /** Where the points at fault lie, as far as they are numbers. */
+  get faultyPlaces(): PointM[] {
+    const places = this.faults.points.flatMap((number) => this.draft?.points[number - 1] ?? []);
+    return places.filter(({ x_m, y_m }) => Number.isFinite(x_m) && Number.isFinite(y_m));
+  }
+
+  get #hasPoints(): boolean {
+    return this.draft?.kind !== 'circle';
+  }
+
+  /** Why the area that is drawn cannot be saved, beside what is wrong with it; null when it can. */
   get whyNotSaved(): string | null {
     void this.version;
     const { why } = texts.terrains;
     if (this.isSending) return why.sending;
-    if (this.flaw) return why.because(this.flaw);
+    if (this.#flaw) return null;
     return this.draft?.isWhole ? null : why.corners(this.draft?.points.length ?? 0);
   }
 
-  /** Why the mission that is drawn cannot be sent, in one sentence; null when it can. */
+  /** Why the mission that is drawn cannot be sent, beside what is wrong with it; null when it can. */
   get whyNotSent(): string | null {
     void this.version;
     const { why } = texts.draw;
     const { draft } = this;
     if (this.isSending) return why.sending;
     if (!draft || draft.isEmpty) return draft?.kind === 'waypoints' ? why.waypoints(0) : why.circle;
-    if (this.flaw) return why.because(this.flaw);
+    if (this.#flaw) return null;
     if (!draft.isWhole) return draft.kind === 'waypoints' ? why.waypoints(draft.points.length) : why.circle;
     if (!this.robot) return why.robot;
     if (this.isChecking) return why.checking;
-    if (this.check !== null) return null;
-    return this.#refusal === null ? why.checking : why.because(this.#refusal);
+    return this.check !== null || this.#refused !== null ? null : why.checking;
   }
 
   /** Whether sending it ends other missions of its robots. */
@@ -204,12 +236,13 @@ export class Editor {
     this.fleet.isDirty = true;
     this.#key = '';
     this.check = null;
-    this.#refusal = null;
+    this.#refused = null;
+    this.#unsent = null;
     this.#asked += 1;
     this.isChecking = false;
     clearTimeout(this.#due);
     const isMission = this.purpose?.what === 'mission' || this.purpose?.what === 'replace';
-    if (isMission && this.draft?.isWhole && this.robot && !this.flaw) {
+    if (isMission && this.draft?.isWhole && this.robot && !this.#flaw) {
       this.isChecking = true;
       this.#due = setTimeout(() => void this.#dryRun(), CHECK_WAIT_MS);
     }
@@ -294,8 +327,8 @@ export class Editor {
     this.purpose = null;
     this.draft = null;
     this.check = null;
-    this.#refusal = null;
-    this.sendProblem = null;
+    this.#refused = null;
+    this.#unsent = null;
     this.fleet.isDirty = true;
   }
 
@@ -338,7 +371,7 @@ export class Editor {
       });
       if (mine === this.#asked) this.check = check;
     } catch (error) {
-      if (mine === this.#asked) this.#refusal = sentence(error);
+      if (mine === this.#asked) this.#refused = error;
     }
     if (mine === this.#asked) this.isChecking = false;
   }
@@ -412,20 +445,21 @@ export class Editor {
     const { purpose, draft } = this;
     if (purpose?.what !== 'fence' || !draft) return false;
     this.isSending = true;
-    this.sendProblem = await this.#putFence(purpose.side, purpose.old, draft.points);
+    this.#unsent = await this.#putFence(purpose.side, purpose.old, draft.points);
     this.isSending = false;
-    return this.sendProblem === null;
+    return this.#unsent === null;
   }
 
   /** Deletes an area; why not, if it was not. */
-  removeFence(side: FenceSide, old: PointM[]): Promise<string | null> {
-    return this.#putFence(side, old, null);
+  async removeFence(side: FenceSide, old: PointM[]): Promise<string | null> {
+    const error = await this.#putFence(side, old, null);
+    return error === null ? null : sentence(error);
   }
 
-  /** Replaces one area of the geofence, unless somebody changed it meanwhile. */
-  async #putFence(side: FenceSide, old: PointM[] | null, area: PointM[] | null): Promise<string | null> {
+  /** Replaces one area of the geofence, unless somebody changed it meanwhile; what went wrong, or null. */
+  async #putFence(side: FenceSide, old: PointM[] | null, area: PointM[] | null): Promise<unknown> {
     const { fence, site } = this.fleet;
-    if (!fence || !site) return texts.problem.lost;
+    if (!fence || !site) return new Problem(texts.problem.lost, 0);
     const gone = JSON.stringify(old);
     const others = fence[side].filter((known) => JSON.stringify(known) !== gone);
     const body: ReplaceGeofence = { keep_in: fence.keep_in, keep_out: fence.keep_out };
@@ -437,9 +471,9 @@ export class Editor {
       this.fleet.isDirty = true;
       return null;
     } catch (error) {
-      if (!(error instanceof Problem) || error.status !== 412) return sentence(error);
+      if (!(error instanceof Problem) || error.status !== 412) return error;
       await this.fleet.readGround();
-      return texts.fence.changed;
+      return new Problem(texts.fence.changed, error.status);
     }
   }
 
@@ -451,12 +485,12 @@ export class Editor {
     then: (answer: Mission) => void = () => undefined,
   ): Promise<boolean> {
     this.isSending = true;
-    this.sendProblem = null;
+    this.#unsent = null;
     try {
       then(await ask<Mission>(path, { method, body, headers }));
       return true;
     } catch (error) {
-      this.sendProblem = sentence(error);
+      this.#unsent = error;
       return false;
     } finally {
       this.isSending = false;

@@ -18,6 +18,8 @@ export class Roster {
   active = $state<string | null>(null);
   /** A pointer is over the list: what it points at stays there. */
   isPointedAt = $state(false);
+  /** The robot whose row is pointed at or has the focus: the map names it, however crowded it is. */
+  named = $state<string | null>(null);
 
   /** Where a range begins. */
   #anchor: string | null = null;
@@ -25,9 +27,11 @@ export class Roster {
   #last: string[] = [];
   #lastKey = '';
 
+  readonly #hasStopProblem = (robot: string) => this.fleet.stops.problemOf(robot) !== null;
+
   constructor(readonly fleet: Fleet) {}
 
-  readonly counts = $derived.by(() => countsOf(this.fleet.robots.map((entry) => entry.robot)));
+  readonly counts = $derived.by(() => countsOf(this.fleet.robots.map((entry) => entry.robot), this.#hasStopProblem));
   readonly models = $derived.by(() => [...new Set(this.fleet.robots.map((entry) => modelOf(entry.robot)))].sort());
   readonly tags = $derived.by(() => [...new Set(this.fleet.robots.flatMap((entry) => entry.robot.tags ?? []))].sort());
   readonly shown = $derived.by((): RobotView[] => {
@@ -40,7 +44,7 @@ export class Roster {
       const known = this.fleet.byId;
       return this.#last.flatMap((id) => known.get(id) ?? []);
     }
-    const found = listed(robots, { search, groups, model, tag, order }, this.fleet.nameRanks);
+    const found = listed(robots, { search, groups, model, tag, order }, this.fleet.nameRanks, this.#hasStopProblem);
     this.#last = found.map((entry) => entry.id);
     this.#lastKey = key;
     return found;

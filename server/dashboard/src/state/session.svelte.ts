@@ -101,6 +101,9 @@ class Look {
   #fingers = matchMedia('(pointer: coarse)');
   /** Whether whoever looks points with fingers. */
   isTouch = $state(this.#fingers.matches);
+  #narrow = matchMedia('(max-width: 760px)');
+  /** Whether the map lies above the panel, as on phones. */
+  isNarrow = $state(this.#narrow.matches);
   #system = matchMedia('(prefers-color-scheme: dark)');
   #wanted = $state<Theme | null>(localStorage.getItem(THEME_KEY) as Theme | null);
   #isDark = $state(this.#system.matches);
@@ -108,6 +111,7 @@ class Look {
   constructor() {
     this.#system.addEventListener('change', (event) => (this.#isDark = event.matches));
     this.#fingers.addEventListener('change', (event) => (this.isTouch = event.matches));
+    this.#narrow.addEventListener('change', (event) => (this.isNarrow = event.matches));
     this.#apply();
   }
 

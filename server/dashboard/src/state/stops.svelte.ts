@@ -15,6 +15,8 @@ export const FLEET = '*';
 
 /** Where a stop that this page sent stands until it is among the stops of the server. */
 export type Sent = { state: 'sending' } | { state: 'failed'; text: string };
+/** What is wrong with the stop of a robot. */
+export type StopProblem = 'unconfirmed' | 'failed';
 
 export class Stops {
   /** Stops in force by robot, the newest of each. */
@@ -23,6 +25,14 @@ export class Stops {
   readonly sent = new SvelteMap<string, Sent>();
   /** Why a clear did not come about, by robot. */
   readonly clearProblems = new SvelteMap<string, string>();
+
+  /** What is wrong with stops, by robot. */
+  readonly #problems = $derived.by(() => {
+    const problems = new Map<string, StopProblem>();
+    for (const [robot, sent] of this.sent) if (sent.state === 'failed') problems.set(robot, 'failed');
+    for (const stop of this.inForce.values()) if (!stop.confirmed_at) problems.set(stop.robot, 'unconfirmed');
+    return problems;
+  });
 
   #latches = new Map<string, string | null>();
   #again: ReturnType<typeof setTimeout> | undefined;
@@ -34,6 +44,12 @@ export class Stops {
     /** What people call a robot. */
     readonly nameOf: (robot: string) => string,
   ) {}
+
+  /** What is wrong with the stop of a robot; null if nothing is, or it has none. */
+  problemOf(robot: string): StopProblem | null {
+    // A stop of all robots that failed has failed for each that has no other one.
+    return this.#problems.get(robot) ?? (this.#problems.has(FLEET) && !this.inForce.has(robot) ? 'failed' : null);
+  }
 
   /** Stops a robot; why it may not have got it, if so. */
   async stop(robot: string): Promise<string | null> {

@@ -1,6 +1,7 @@
 // What is kept of one robot: its last words, where it was, and its curves.
 import type { DriveView, Robot, RobotLive } from '../api/schema';
 import { Motion, type Shown } from '../map/motion';
+import { doing, hasFault } from '../standing';
 
 /** Most points of a trail. */
 export const TRAIL_POINTS = 200;
@@ -92,7 +93,14 @@ export class Tracked {
   #note(apartMs: number): void {
     const { robot } = this;
     const { live } = robot;
-    this.#look = JSON.stringify([robot.link, robot.name, robot.configuration, live?.safety.stop != null]);
+    this.#look = JSON.stringify([
+      robot.link,
+      robot.name,
+      robot.configuration,
+      live?.safety.stop != null,
+      hasFault(live),
+      doing(live).isBad,
+    ]);
     if (live) this.#move(live, this.receivedAt, robot.link);
     if (!live || robot.link !== 'online') return;
     const at_s = Date.now() / 1000;

@@ -4,6 +4,7 @@ import { LAYER_FIRST } from '../address';
 import { ask, list, sentence, type Listed } from '../api/client';
 import { Layer, type Quantity } from '../map/friction';
 import type { Bounds, PointM } from '../map/camera';
+import { modelLabel } from '../map/models';
 import { serves, windowOn, type Window } from '../map/window';
 import { hasEnded, type Fleet } from './fleet.svelte';
 import { Compare } from './compare.svelte';
@@ -179,6 +180,11 @@ export class View {
   modelName(configuration: string): string {
     const robot = this.fleet.robots.find((view) => view.robot.configuration === configuration)?.robot;
     return robot ? `${robot.model.name}, ${robot.model.tyres}` : configuration.slice(0, 8);
+  }
+
+  /** The same in a list of models, where there is little room. */
+  modelLabel(configuration: string): string {
+    return modelLabel(configuration, this.configurations, (one) => this.modelOf(one));
   }
 
   async open(mission: string): Promise<void> {

@@ -1,7 +1,7 @@
 // German texts about robots, alerts and whoever is signed in.
 import type { Texts } from './en';
-import { alertTitles, driveRefusal, gate, link, mode, release } from './de_words';
-import { alertTitle } from './en_words';
+import { alertSentences, alertTitles, driveRefusal, gate, link, mode, release } from './de_words';
+import { alertSentence, alertTitle } from './en_words';
 
 type Areas = 'signIn' | 'settings' | 'guide' | 'header' | 'stop' | 'tabs' | 'link' | 'mode' | 'gate' | 'robots' | 'bulk' | 'curves' | 'alerts' | 'webhooks' | 'drive';
 
@@ -49,6 +49,7 @@ export const fleet: Pick<Texts, Areas> = {
     friction: 'Der Roboter misst während der Fahrt. Die ersten Werte kommen nach Sekunden.',
     show: 'Auf der Karte zeigen',
     all: 'Alles erledigt: So verbessert jede Mission die Karte.',
+    at: (step, of, what) => `Schritt ${step} von ${of}: ${what}`,
   },
   header: {
     site: 'Standort',
@@ -68,21 +69,34 @@ export const fleet: Pick<Texts, Areas> = {
     choose: 'Wählen Sie Roboter auf der Karte oder in der Liste aus, um nur diese zu stoppen.',
     several: (count) => `${count} Ausgewählte stoppen`,
     andMore: (count) => `und ${count} weitere`,
-    moreStopped: (count) => `${count} weitere sind gestoppt: Die Liste der Roboter zeigt sie alle.`,
+    moreStopped: (count) => `${count} weitere: Die Liste der Roboter zeigt sie alle.`,
     all: 'Alle stoppen',
     allOf: (site) => `Alle von ${site} stoppen`,
     region: 'Stopp',
     sending: (robot) => `${robot}: Der Stopp wird gesendet …`,
-    unconfirmed: (robot) => `${robot} hat den Stopp NICHT bestätigt. Er wird gesendet, bis die Bestätigung da ist.`,
     failed: (robot) =>
       `${robot}: Der Stopp kam möglicherweise nicht an, denn der Server antwortet nicht. Benutzen Sie den Schalter am Roboter.`,
     refused: (robot, why) => `${robot}: nicht gestoppt. ${why}`,
-    stopping: (robot) => `${robot} hält an: Den Rädern ist Stillstand befohlen`,
-    confirmed: (robot) => `${robot} ist gestoppt und steht`,
-    runs: (robot) => `${robot} ist gestoppt und STEHT NICHT. Benutzen Sie den Schalter am Roboter.`,
-    moves: (robot) =>
-      `${robot} ist gestoppt und BEWEGT SICH, obwohl er schon stand: Er wird geschoben, rollt oder wird angetrieben.`,
-    by: (name) => `· Stopp durch ${name}`,
+    states: {
+      runs: (robot, by) => `${robot}: gestoppt von ${by}, STEHT aber NICHT. Benutzen Sie den Schalter am Roboter.`,
+      moves: (robot, by) =>
+        `${robot}: gestoppt von ${by}, BEWEGT SICH aber wieder: Der Roboter wird geschoben, rollt oder wird angetrieben.`,
+      unconfirmed: (robot, by) =>
+        `${robot} hat den Stopp NICHT bestätigt. Der Stopp von ${by} wird gesendet, bis die Bestätigung da ist.`,
+      stopping: (robot, by) => `${robot}: gestoppt von ${by}. Der Roboter hält an.`,
+      standing: (robot, by) => `${robot}: gestoppt von ${by}. Der Roboter steht still.`,
+    },
+    counted: {
+      failed: (count) => `${count} Stopps sind FEHLGESCHLAGEN`,
+      runs: (count) => `${count} Roboter sind gestoppt und STEHEN NICHT`,
+      moves: (count) => `${count} Roboter sind gestoppt und BEWEGEN SICH`,
+      unconfirmed: (count) => `${count} Roboter haben den Stopp NICHT bestätigt`,
+      sending: (count) => `${count} Stopps werden gesendet …`,
+      stopping: (count) => `${count} Roboter halten an`,
+      standing: (count) => `${count} Roboter sind gestoppt und stehen still`,
+    },
+    problems: { unconfirmed: 'Stopp NICHT bestätigt', failed: 'Stopp FEHLGESCHLAGEN' },
+    by: (name) => `von ${name}`,
     clear: (robot) => `Stopp von ${robot} aufheben`,
     everyRobot: 'Alle Roboter',
     keys: { one: 'Alt+X', all: 'Alt+Umschalt+X' },
@@ -102,7 +116,14 @@ export const fleet: Pick<Texts, Areas> = {
     none: 'An diesem Standort hat sich noch kein Roboter gemeldet.',
     noneFound: 'Kein Roboter passt.',
     search: 'Namen suchen',
-    groups: { fault: 'gestört', lost: 'offline', stopped: 'gestoppt', moving: 'fahrend', idle: 'bereit' },
+    groups: {
+      unconfirmed: 'Stopp unbestätigt',
+      fault: 'gestört',
+      lost: 'offline',
+      stopped: 'gestoppt',
+      moving: 'fahrend',
+      idle: 'bereit',
+    },
     groupsOf: 'Zustand',
     allModels: 'Alle Modelle',
     tag: 'Schlagwort',
@@ -126,6 +147,9 @@ export const fleet: Pick<Texts, Areas> = {
     notSeen: 'seit dem Start des Servers kein Kontakt',
     age: (age) => `vor ${age}`,
     lastKnown: 'letzter Stand',
+    offlineSince: (time) => `offline seit ${time}`,
+    lastAt: (place) => `zuletzt bei ${place}`,
+    lastPosition: 'Letzte bekannte Position',
     state: 'Zustand',
     link: 'Verbindung',
     mode: 'Betriebsart',
@@ -187,7 +211,6 @@ export const fleet: Pick<Texts, Areas> = {
     waiting: 'ist noch nicht an der Reihe',
     dismiss: 'Ausblenden',
     selectFailed: 'Fehlgeschlagene auswählen',
-    stopped: 'gestoppt, bestätigt',
     unconfirmed: 'hat den Stopp noch NICHT bestätigt; er wird gesendet, bis die Bestätigung da ist',
     notAmong: 'Der Roboter ist nicht unter denen, die der Server gestoppt hat.',
     notStopped: 'ist nicht gestoppt',
@@ -237,6 +260,10 @@ export const fleet: Pick<Texts, Areas> = {
     acknowledged: 'quittiert',
     raised: 'seit',
     title: (code) => alertTitle(code, alertTitles, 'Nachrichten des Fahrgestells werden verworfen'),
+    sentence: (code, subject) =>
+      alertSentence(code, subject, alertSentences, (robot) => `Nachrichten des Fahrgestells von ${robot} werden verworfen.`) ??
+      `${subject} meldet „${code}“.`,
+    notice: (sentence, _said) => sentence,
     warning: 'Warnung',
     critical: 'kritisch',
     new: (count) => `${count} nicht quittiert`,
@@ -291,12 +318,20 @@ export const fleet: Pick<Texts, Areas> = {
     takeFree: 'Steuerung übernehmen',
     release: 'Fernsteuern beenden',
     have: 'Sie steuern diesen Roboter.',
+    isStopped: 'Der Roboter ist gestoppt.',
+    clearFirst: (clear) =>
+      `Ein gestoppter Roboter folgt keinem Befehl. Um zu fahren, drücken Sie „${clear}“ neben den Stopptasten.`,
+    othersClearFirst:
+      'Ein gestoppter Roboter folgt keinem Befehl. Zuerst muss jemand, der Stopps aufheben darf, seinen Stopp aufheben.',
     other: (name) => `${name} steuert.`,
     nobody: 'Niemand steuert.',
     speed: 'Höchstgeschwindigkeit',
     turn: 'Höchste Drehrate',
     keys: 'Ziehen Sie den Steuerknüppel oder benutzen Sie W A S D oder die Pfeiltasten; die Leertaste stoppt. Der Roboter steht, wenn Sie loslassen, das Fenster den Fokus verliert oder der Tab verdeckt ist.',
+    fingers:
+      'Ziehen Sie den Steuerknüppel. Der Roboter steht, wenn Sie loslassen, eine andere App in den Vordergrund kommt oder der Tab verdeckt ist.',
     stick: 'Steuerknüppel: ziehen, oder W A S D oder Pfeiltasten',
+    stickFingers: 'Steuerknüppel: ziehen',
     latency: 'Alter der Befehle',
     socket: 'Verzögerung zum Server',
     zero: {

@@ -126,7 +126,7 @@ export const right: Record<Right, string> = {
 
 export const standing: Record<StandingState, string> = {
   stopping: 'hält an',
-  standing: 'gestoppt, steht',
+  standing: 'gestoppt, steht still',
   does_not_stand: 'STEHT NICHT',
   moves: 'BEWEGT SICH TROTZ STOPP',
   other: 'gestoppt',
@@ -192,6 +192,52 @@ export const alertTitles: Readonly<Record<AlertKind, string>> = {
   'loop-overrun': 'Der Regelkreis ist zu langsam',
 };
 
+/** What has happened when an alert of a code is raised. */
+export const alertSentences: Readonly<Record<AlertKind, (robot: string) => string>> = {
+  'two-agents': (robot) => `Zwei Agenten sind unter dem Namen ${robot} verbunden.`,
+  'storage-unwritable': () => 'Der Server kann nicht in seinen Speicher schreiben: Neues geht verloren.',
+  'database-damaged': () => 'Die Datenbank des Servers ist beschädigt.',
+  'disk-low': () => 'Der Datenträger des Servers ist fast voll.',
+  'server-restarted': () => 'Der Server wurde neu gestartet.',
+  'certificate-expiring': () => 'Das Zertifikat des Servers ist abgelaufen oder läuft bald ab.',
+  'backup-failed': () => 'Die letzte Sicherung ist fehlgeschlagen.',
+  'backup-old': () => 'Die letzte Sicherung ist älter als zwei Abstände zwischen Sicherungen.',
+  'robots-await-release': () =>
+    'Der Server wurde aus einer Sicherung wiederhergestellt. Roboter bekommen keine Missionen, bis sie freigegeben sind.',
+  'mission-failed': (robot) => `Eine Mission von ${robot} ist fehlgeschlagen.`,
+  'mission-expired': (robot) => `Eine Mission von ${robot} hat zu lange gewartet und ist verfallen.`,
+  'mission-rejected': (robot) => `${robot} hat eine Mission abgelehnt.`,
+  'mission-waiting': (robot) => `Die nächste Mission von ${robot} hat seit 5 Minuten nicht begonnen.`,
+  'robot-waiting': (robot) => `${robot} kommt mit seiner Mission seit 5 Minuten nicht voran.`,
+  'clock-wrong': (robot) => `Die Uhr von ${robot} weicht um mehr als 10 s von der des Servers ab.`,
+  'robot-lost': (robot) => `Von ${robot} kam mindestens 15 s lang nichts an.`,
+  'stop-unconfirmed': (robot) => `${robot} hat den Stopp nicht bestätigt.`,
+  'revoked-robot': (robot) => `${robot} ist gesperrt und versucht, sich zu verbinden.`,
+  'retired-authority': (robot) => `${robot} hat ein Zertifikat einer abgelösten Stelle und muss neu beitreten.`,
+  'unknown-certificate': (robot) => `Der Server kennt ein Zertifikat von ${robot} nicht. Der Roboter muss neu beitreten.`,
+  'does-not-stand': (robot) => `${robot} soll stillstehen, steht aber nicht.`,
+  'moves-while-stopped': (robot) => `${robot} soll stillstehen und stand schon, bewegt sich aber wieder.`,
+  stopped: (robot) => `Für ${robot} gilt ein Stopp.`,
+  'dug-in': (robot) => `Die Räder von ${robot} drehen sich, aber der Roboter bewegt sich nicht.`,
+  'payload-changed': (robot) => `${robot} wurde beladen oder entladen: Die wirksame Masse hat sich geändert.`,
+  'wheels-and-motion-disagree': (robot) => `Die Räder von ${robot} und die gemessene Bewegung widersprechen sich.`,
+  'wheel-locked': (robot) => `Ein Rad von ${robot} dreht sich nicht.`,
+  'sensor-frozen': (robot) => `Ein Sensor von ${robot} meldet immer denselben Wert.`,
+  'sensor-inconsistent': (robot) => `Ein Sensor von ${robot} widerspricht den anderen.`,
+  'battery-critical': (robot) => `Der Akku von ${robot} ist unter 5 % gefallen.`,
+  'battery-low': (robot) => `Der Akku von ${robot} ist unter 20 % gefallen.`,
+  'base-silent': (robot) => `Das Fahrgestell von ${robot} sendet nichts. Der Roboter ist gestört.`,
+  'base-restarted': (robot) => `Das Fahrgestell von ${robot} wurde neu gestartet.`,
+  'base-clock': (robot) => `Die Uhr des Fahrgestells von ${robot} wurde gestellt.`,
+  'position-lost': (robot) => `${robot} hat keine Position. Der Roboter ist gestört.`,
+  'command-second-writer': (robot) => `Ein anderer ROS-2-Knoten befiehlt dem Fahrgestell von ${robot}.`,
+  'outbox-long': (robot) => `Viele Messungen von ${robot} warten auf ihre Übertragung.`,
+  'outbox-damaged': (robot) => `Gespeicherte Messungen auf dem Datenträger von ${robot} wurden beschädigt.`,
+  'outbox-dropped': (robot) => `Messungen von ${robot} sind verloren gegangen.`,
+  'surface-change': (robot) => `${robot} hat Boden gemessen, der von der Reibungskarte abweicht.`,
+  'loop-overrun': (robot) => `Der Regelkreis von ${robot} ist zu langsam. Der Roboter wird angehalten.`,
+};
+
 /** What the server notes in a mission's history, as far as it is always the same. */
 export const notes: Readonly<Record<string, string>> = {
   'the robot began to drive': 'der Roboter ist losgefahren',
@@ -207,7 +253,7 @@ export const problemTitles: Record<ProblemType, string> = {
   '/problems/not-acceptable': 'Keines der gewünschten Formate ist verfügbar',
   '/problems/invalid-path': 'Der Pfad hat eine ungültige Kennung',
   '/problems/invalid-query': 'Die Abfrage hat einen ungültigen Wert',
-  '/problems/not-found': 'Das gibt es nicht',
+  '/problems/not-found': 'Was angefragt wurde, gibt es nicht',
   '/problems/method-not-allowed': 'Das ist an dieser Stelle nicht möglich',
   '/problems/unknown-site': 'Der Standort ist nicht bekannt',
   '/problems/unknown-robot': 'Der Roboter ist nicht bekannt',
@@ -233,8 +279,8 @@ export const problemTitles: Record<ProblemType, string> = {
   '/problems/invalid-header': 'Ein Kopffeld hat einen ungültigen Wert',
   '/problems/unauthenticated': 'Ein gültiges Token ist nötig',
   '/problems/forbidden': 'Ihre Rechte erlauben das hier nicht',
-  '/problems/too-many-attempts': 'Zu viele Fehlversuche',
-  '/problems/too-many-requests': 'Zu viele Anfragen',
+  '/problems/too-many-attempts': 'Es gab zu viele Fehlversuche',
+  '/problems/too-many-requests': 'Es kamen zu viele Anfragen',
   '/problems/foreign-origin': 'Eine fremde Seite darf das nicht anfragen',
   '/problems/unknown-host': 'Der Hostname gehört nicht zu diesem Server',
   '/problems/unknown-token': 'Das Token ist nicht bekannt',
@@ -249,7 +295,7 @@ export const problemTitles: Record<ProblemType, string> = {
   '/problems/too-many': 'Die größte Anzahl ist erreicht',
   '/problems/timeout': 'Die Antwort dauerte zu lange',
   '/problems/unavailable': 'Der Server ist vorübergehend nicht verfügbar',
-  '/problems/internal': 'Interner Fehler des Servers',
+  '/problems/internal': 'Im Server ist ein Fehler aufgetreten',
 };
 
 /** How points are drawn: with a mouse and keys, or with a finger. */

@@ -1,6 +1,6 @@
 // English texts about robots, alerts and whoever is signed in.
 import type { DriveRefusal, ReleaseCause } from '../api/schema';
-import { alertTitle, alertTitles, gate, link, mode } from './en_words';
+import { alertSentence, alertSentences, alertTitle, alertTitles, gate, link, mode } from './en_words';
 
 export const fleet = {
   signIn: {
@@ -45,6 +45,8 @@ export const fleet = {
     friction: 'The robot measures while it drives. The first values come within seconds.',
     show: 'Show it on the map',
     all: 'All done: this is how every mission improves the map.',
+    /** All of it in one line, for small screens. */
+    at: (step: number, of: number, what: string) => `Step ${step} of ${of}: ${what}`,
   },
   header: {
     site: 'Site',
@@ -64,22 +66,39 @@ export const fleet = {
     choose: 'Select robots on the map or in the list to stop these alone.',
     several: (count: number) => `Stop ${count} selected`,
     andMore: (count: number) => `and ${count} more`,
-    moreStopped: (count: number) => `${count} more are stopped: the list of robots has them all.`,
+    moreStopped: (count: number) => `${count} more: the list of robots has them all.`,
     all: 'Stop all',
     allOf: (site: string) => `Stop all of ${site}`,
     region: 'Stop',
-    sending: (robot: string) => `${robot}: stop is being sent …`,
-    unconfirmed: (robot: string) => `${robot} has NOT confirmed its stop. The stop is sent again until it does.`,
+    sending: (robot: string) => `${robot}: the stop is being sent …`,
     failed: (robot: string) =>
-      `${robot} may not have got the stop: the server does not answer. Use the switch on the robot.`,
-    refused: (robot: string, why: string) => `${robot} was not stopped. ${why}`,
-    stopping: (robot: string) => `${robot} is stopping: its wheels are commanded to rest`,
-    confirmed: (robot: string) => `${robot} is stopped and stands`,
-    runs: (robot: string) => `${robot} is stopped and DOES NOT STAND. Use the switch on the robot.`,
-    moves: (robot: string) => `${robot} is stopped and MOVES though it stood: it is pushed, rolls, or is driven.`,
+      `${robot}: the stop may not have arrived, because the server does not answer. Use the switch on the robot.`,
+    refused: (robot: string, why: string) => `${robot}: not stopped. ${why}`,
+    /** How a stop in force goes on, and who gave it. */
+    states: {
+      runs: (robot: string, by: string) => `${robot}: stopped by ${by}, but it DOES NOT STAND. Use the switch on the robot.`,
+      moves: (robot: string, by: string) =>
+        `${robot}: stopped by ${by}, but it MOVES again: it is pushed, rolls, or is driven.`,
+      unconfirmed: (robot: string, by: string) =>
+        `${robot} has NOT confirmed its stop. The stop by ${by} is sent again until the robot confirms it.`,
+      stopping: (robot: string, by: string) => `${robot}: stopped by ${by}. The robot is coming to a standstill.`,
+      standing: (robot: string, by: string) => `${robot}: stopped by ${by}. The robot stands still.`,
+    },
+    /** Several stops that go on alike. */
+    counted: {
+      failed: (count: number) => `${count} stops have FAILED`,
+      runs: (count: number) => `${count} robots are stopped and DO NOT STAND`,
+      moves: (count: number) => `${count} robots are stopped and MOVE`,
+      unconfirmed: (count: number) => `${count} robots have NOT confirmed their stop`,
+      sending: (count: number) => `${count} stops are being sent …`,
+      stopping: (count: number) => `${count} robots are stopping`,
+      standing: (count: number) => `${count} robots are stopped and stand still`,
+    },
+    /** What is wrong with the stop of a robot, on its card. */
+    problems: { unconfirmed: 'stop NOT confirmed', failed: 'stop FAILED' } as const,
     by: (name: string) => `by ${name}`,
     clear: (robot: string) => `Clear the stop of ${robot}`,
-    everyRobot: 'the robots',
+    everyRobot: 'All robots',
     keys: { one: 'Alt+X', all: 'Alt+Shift+X' },
     again: 'Stop again',
     dismiss: 'Dismiss',
@@ -97,7 +116,14 @@ export const fleet = {
     none: 'No robot has reported to this site yet.',
     noneFound: 'No robot fits.',
     search: 'Search by name',
-    groups: { fault: 'fault', lost: 'offline', stopped: 'stopped', moving: 'moving', idle: 'idle' } as const,
+    groups: {
+      unconfirmed: 'stop not confirmed',
+      fault: 'fault',
+      lost: 'offline',
+      stopped: 'stopped',
+      moving: 'moving',
+      idle: 'idle',
+    } as const,
     groupsOf: 'State',
     allModels: 'All models',
     tag: 'Tag',
@@ -121,6 +147,9 @@ export const fleet = {
     notSeen: 'not heard since the server started',
     age: (age: string) => `${age} old`,
     lastKnown: 'last known',
+    offlineSince: (time: string) => `offline since ${time}`,
+    lastAt: (place: string) => `last at ${place}`,
+    lastPosition: 'Last known position',
     state: 'State',
     link: 'Link',
     mode: 'Mode',
@@ -182,7 +211,6 @@ export const fleet = {
     waiting: 'waits for its turn',
     dismiss: 'Dismiss',
     selectFailed: 'Select those that failed',
-    stopped: 'stopped, confirmed',
     unconfirmed: 'has NOT confirmed its stop yet; it is sent again until it does',
     notAmong: 'It is not among the robots that the server has stopped.',
     notStopped: 'is not stopped',
@@ -232,6 +260,12 @@ export const fleet = {
     raised: 'since',
     /** What an alert's code means. */
     title: (code: string) => alertTitle(code, alertTitles, 'Messages of the base are dropped'),
+    /** What has happened to whom. */
+    sentence: (code: string, subject: string) =>
+      alertSentence(code, subject, alertSentences, (robot) => `Messages of the base of ${robot} are dropped.`) ??
+      `${subject} reports “${code}”.`,
+    /** The same for a notification, which marks no language: with what the server says, if that is in the same one. */
+    notice: (sentence: string, said: string) => `${sentence} ${said}`,
     warning: 'warning',
     critical: 'critical',
     new: (count: number) => `${count} not acknowledged`,
@@ -285,12 +319,20 @@ export const fleet = {
     takeFree: 'Take control',
     release: 'End teleoperation',
     have: 'You control this robot.',
+    isStopped: 'The robot is stopped.',
+    /** With the name of the button that clears its stop. */
+    clearFirst: (clear: string) =>
+      `A stopped robot follows no command. To drive, press “${clear}” beside the stop buttons.`,
+    othersClearFirst: 'A stopped robot follows no command. Somebody who may clear stops has to clear its stop first.',
     other: (name: string) => `${name} drives.`,
     nobody: 'Nobody drives.',
     speed: 'Top speed',
     turn: 'Top turning',
     keys: 'Drag the stick, or use W A S D or the arrows; space stops. The robot stands when they are let go, the window loses focus or the tab is hidden.',
+    /** The same where there are no keys. */
+    fingers: 'Drag the stick. The robot stands when you let it go, another app comes to the front or the tab is hidden.',
     stick: 'Drive stick: drag, or use W A S D or the arrows',
+    stickFingers: 'Drive stick: drag',
     latency: 'Commands’ age',
     socket: 'Delay to the server',
     zero: {

@@ -123,7 +123,7 @@ export const right: Record<Right, string> = {
 
 export const standing: Record<StandingState, string> = {
   stopping: 'stopping',
-  standing: 'stopped, stands',
+  standing: 'stopped, stands still',
   does_not_stand: 'DOES NOT STAND',
   moves: 'MOVES WHILE STOPPED',
   other: 'stopped',
@@ -174,6 +174,62 @@ export const alertTitles = {
   'loop-overrun': 'Control loop is late',
 } as const;
 export type AlertKind = keyof typeof alertTitles;
+
+/** What has happened when an alert of a code is raised, to the robot that is named. */
+export const alertSentences: Readonly<Record<AlertKind, (robot: string) => string>> = {
+  'two-agents': (robot) => `Two agents are connected under the name ${robot}.`,
+  'storage-unwritable': () => 'The server cannot write to its storage: nothing new is kept.',
+  'database-damaged': () => 'The database of the server is damaged.',
+  'disk-low': () => 'The disk of the server is nearly full.',
+  'server-restarted': () => 'The server was restarted.',
+  'certificate-expiring': () => 'The certificate of the server has expired or expires soon.',
+  'backup-failed': () => 'The last attempt at a backup failed.',
+  'backup-old': () => 'The newest backup is older than two backup intervals.',
+  'robots-await-release': () => 'The server was restored from a backup. Robots get no missions until they are released.',
+  'mission-failed': (robot) => `A mission of ${robot} failed.`,
+  'mission-expired': (robot) => `A mission of ${robot} waited too long and expired.`,
+  'mission-rejected': (robot) => `${robot} rejected a mission.`,
+  'mission-waiting': (robot) => `The next mission of ${robot} has not begun for 5 minutes.`,
+  'robot-waiting': (robot) => `${robot} has made no progress on its mission for 5 minutes.`,
+  'clock-wrong': (robot) => `The clock of ${robot} is more than 10 s from that of the server.`,
+  'robot-lost': (robot) => `Nothing has arrived from ${robot} for at least 15 s.`,
+  'stop-unconfirmed': (robot) => `${robot} has not confirmed its stop.`,
+  'revoked-robot': (robot) => `${robot} is revoked and tries to connect.`,
+  'retired-authority': (robot) => `${robot} has a certificate of a retired authority and has to join again.`,
+  'unknown-certificate': (robot) => `A certificate of ${robot} is not known to the server. The robot has to join again.`,
+  'does-not-stand': (robot) => `${robot} is commanded to rest, but it does not stand.`,
+  'moves-while-stopped': (robot) => `${robot} is commanded to rest and stood, but it moves again.`,
+  stopped: (robot) => `A stop of ${robot} is in force.`,
+  'dug-in': (robot) => `The wheels of ${robot} turn, but the robot does not move.`,
+  'payload-changed': (robot) => `${robot} was loaded or unloaded: its apparent mass has changed.`,
+  'wheels-and-motion-disagree': (robot) => `The wheels of ${robot} and its measured motion contradict each other.`,
+  'wheel-locked': (robot) => `A wheel of ${robot} does not turn.`,
+  'sensor-frozen': (robot) => `A sensor of ${robot} always reports the same value.`,
+  'sensor-inconsistent': (robot) => `A sensor of ${robot} contradicts the others.`,
+  'battery-critical': (robot) => `The battery of ${robot} fell below 5 %.`,
+  'battery-low': (robot) => `The battery of ${robot} fell below 20 %.`,
+  'base-silent': (robot) => `The base of ${robot} sends no messages. The robot is in fault.`,
+  'base-restarted': (robot) => `The base of ${robot} was restarted.`,
+  'base-clock': (robot) => `The clock of the base of ${robot} was set.`,
+  'position-lost': (robot) => `${robot} has no position. The robot is in fault.`,
+  'command-second-writer': (robot) => `Another ROS 2 node commands the base of ${robot}.`,
+  'outbox-long': (robot) => `Many measurements of ${robot} wait for upload.`,
+  'outbox-damaged': (robot) => `Stored measurements on the disk of ${robot} were damaged.`,
+  'outbox-dropped': (robot) => `Measurements of ${robot} were lost.`,
+  'surface-change': (robot) => `${robot} has measured ground that differs from the friction map.`,
+  'loop-overrun': (robot) => `The control loop of ${robot} is late. The robot is held.`,
+};
+
+/** The sentence of an alert; null for a code that is not known here. */
+export function alertSentence(
+  code: string,
+  robot: string,
+  sentences: typeof alertSentences,
+  ofBase: (robot: string) => string,
+): string | null {
+  if (Object.hasOwn(sentences, code)) return sentences[code as AlertKind](robot);
+  return code.startsWith('base-') ? ofBase(robot) : null;
+}
 
 /** The title of an alert; a code that is not known here is its own title. */
 export function alertTitle(code: string, titles: Readonly<Record<AlertKind, string>>, ofBase: string): string {

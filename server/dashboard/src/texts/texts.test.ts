@@ -2,8 +2,9 @@
 import { readFileSync, readdirSync } from 'node:fs';
 import { parse } from 'svelte/compiler';
 import { expect, test } from 'vitest';
-import type { Session } from '../api/schema';
+import type { ProblemType, Session } from '../api/schema';
 import { de } from './de';
+import { problemTitles } from './de_words';
 import { en } from './en';
 import { alertTitles } from './en_words';
 
@@ -42,8 +43,6 @@ const SAME = [
   'map.help.7.0',
   'map.help.10.0',
   'map.fence',
-  'map.theta',
-  'map.stiffness',
   'map.unsureFrom',
   'map.tooMuch',
   'map.atLeast',
@@ -60,7 +59,15 @@ const SAME = [
   'unknown',
 ];
 /** What is a text of the server's own in English. */
-const OF_SERVER = ['problem.title', 'missions.note', 'alerts.title', 'drive.released', 'drive.refused'];
+const OF_SERVER = [
+  'problem.title',
+  'missions.note',
+  'alerts.title',
+  'alerts.sentence',
+  'alerts.notice',
+  'drive.released',
+  'drive.refused',
+];
 
 const SESSION = { name: 'desk', role: 'operator', grants: [], rights: [], sites: null } as unknown as Session;
 /** Arguments that functions of a dictionary are called with: numbers, one of something, names, switches. */
@@ -135,14 +142,18 @@ test('what a function is given is in what it says, in both languages', () => {
   }
 });
 
-test('every alert of the documentation has a title of its own in each language', () => {
+/** Codes of alerts in the documentation; of those about dropped messages it has two examples, which are left out. */
+function alertCodes(): string[] {
   const rest = readFileSync(new URL('../../../../docs/rest.md', import.meta.url), 'utf8');
   const section = rest.split('\n## Alerts\n')[1]?.split('\n## ')[0] ?? '';
   const rows = section.split('\n').filter((line) => line.startsWith('| `'));
-  // Of the codes about dropped messages the table has two examples.
-  const codes = rows
+  return rows
     .flatMap((row) => [...(row.split('|')[1] ?? '').matchAll(/`([^`]+)`/g)].map((found) => found[1] ?? ''))
     .filter((code) => code !== 'base-late' && code !== 'base-value');
+}
+
+test('every alert of the documentation has a title of its own in each language', () => {
+  const codes = alertCodes();
   expect(codes.length).toBeGreaterThan(30);
   expect(Object.keys(alertTitles).sort()).toEqual([...codes].sort());
   for (const { alerts } of [en, de]) {
@@ -153,6 +164,42 @@ test('every alert of the documentation has a title of its own in each language',
     // What a newer agent says is shown as it is.
     expect(alerts.title('tyre-flat')).toBe('tyre-flat');
   }
+});
+
+test('every alert of the documentation is a sentence of its own in each language, about its robot', () => {
+  const codes = alertCodes();
+  for (const { alerts } of [en, de]) {
+    const sentences = codes.map((code) => alerts.sentence(code, 'rover-1'));
+    expect(new Set(sentences).size).toBe(codes.length);
+    for (const [index, sentence] of sentences.entries()) {
+      expect(sentence).toMatch(/^\p{Lu}.+\.$|^rover-1 .+\.$/u);
+      const isOfServer = /server|storage|database|disk|backup|certificate-expiring|robots-await/.test(codes[index] ?? '');
+      expect(sentence.includes('rover-1'), codes[index]).toBe(!isOfServer);
+    }
+    // Whatever the reason for which messages are dropped, and what a newer agent says.
+    expect(alerts.sentence('base-late', 'rover-1')).toBe(alerts.sentence('base-value', 'rover-1'));
+    expect(alerts.sentence('tyre-flat', 'rover-1')).toMatch(/rover-1.*tyre-flat/);
+  }
+  // A notification marks no language: there is no English in a German one.
+  expect(de.alerts.notice('Der Akku ist leer.', 'battery at 2 %')).toBe('Der Akku ist leer.');
+  expect(en.alerts.notice('The battery is empty.', 'battery at 2 %')).toContain('battery at 2 %');
+});
+
+test('every type of problem of the API has a sentence in each language', () => {
+  const api = JSON.parse(readFileSync(new URL('../../../openapi.json', import.meta.url), 'utf8')) as {
+    components: { schemas: { ProblemType: { enum: ProblemType[] } } };
+  };
+  const types = api.components.schemas.ProblemType.enum;
+  expect(types.length).toBeGreaterThan(40);
+  expect(Object.keys(problemTitles).sort()).toEqual([...types].sort());
+  for (const type of types) {
+    const german = de.problem.title(type, 'what the server says');
+    expect(german, type).toMatch(/^\p{Lu}.*\p{L}$/u);
+    expect(german).not.toContain('what the server says');
+    // The server's own title is the English one.
+    expect(en.problem.title(type, 'what the server says')).toBe('what the server says');
+  }
+  expect(new Set(Object.values(problemTitles)).size).toBe(types.length);
 });
 
 const SOURCES = new URL('../', import.meta.url);

@@ -13,8 +13,9 @@ pub struct Sent {
     pub id: Option<String>,
     /// Its name.
     pub name: &'static str,
-    /// Its body, JSON on one line.
-    pub text: String,
+    /// Its body, JSON on one line. A boxed string has no spare capacity, so that its length is the
+    /// memory that it takes: of a large event the encoder's buffer has up to twice as much.
+    pub text: Box<str>,
     pub(super) seq: u64,
     pub(super) topic: Option<Topic>,
     pub(super) about: Option<About>,
@@ -65,7 +66,9 @@ pub(super) fn unnumbered(event: &Event, topic: Option<Topic>, about: Option<Abou
     Sent {
         id: None,
         name: event.name(),
-        text: serde_json::to_string(event).unwrap_or_default(),
+        text: serde_json::to_string(event)
+            .unwrap_or_default()
+            .into_boxed_str(),
         seq: 0,
         topic,
         about,

@@ -6,14 +6,14 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 use serde::Serialize;
-use tread_tests::report;
+use tread_tests::report::{self, Check};
 use tread_tests::scenario::cells;
 use tread_tests::scenario::map;
 use tread_tests::scenario::report::Size;
 
 mod print;
 
-use self::print::{CellTable, Tables};
+use self::print::Tables;
 
 /// Runs a fleet in a simulated time and holds what comes of it against what it should be.
 #[derive(Debug, Parser)]
@@ -41,8 +41,11 @@ enum Scenario {
         #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=3))]
         arrivals: u32,
         /// Print one JSON object instead of tables
-        #[arg(long)]
+        #[arg(long, conflicts_with = "markdown")]
         json: bool,
+        /// Print the tables in Markdown, for the page of the report
+        #[arg(long)]
+        markdown: bool,
         /// What to log on standard error, such as `info`
         #[arg(long, default_value = "error")]
         log: String,
@@ -62,8 +65,11 @@ enum Scenario {
         #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=20))]
         robots: u32,
         /// Print one JSON object instead of a table
-        #[arg(long)]
+        #[arg(long, conflicts_with = "markdown")]
         json: bool,
+        /// Print the table in Markdown, for the page of the report
+        #[arg(long)]
+        markdown: bool,
     },
 }
 
@@ -75,6 +81,7 @@ fn main() -> anyhow::Result<ExitCode> {
             visits,
             arrivals,
             json,
+            markdown,
             log,
         } => {
             tracing_subscriber::fmt()
@@ -90,24 +97,63 @@ fn main() -> anyhow::Result<ExitCode> {
                 visits,
                 arrivals_per_model: arrivals,
             }))?;
-            let details = Details { report: &report };
-            report::tell_with(json, &details, Tables(&report), &report.checks())
+            tell(
+                Form::of(json, markdown),
+                &report,
+                &Tables::of_map(&report),
+                &report.checks(),
+            )
         }
         Scenario::Cells {
             seed,
             grounds,
             robots,
             json,
+            markdown,
         } => {
             let report = cells::run(cells::Size {
                 seed,
                 grounds,
                 robots,
             })?;
-            let details = Details { report: &report };
-            report::tell_with(json, &details, CellTable(&report), &report.checks())
+            tell(
+                Form::of(json, markdown),
+                &report,
+                &Tables::of_cells(&report),
+                &report.checks(),
+            )
         }
     }
+}
+
+/// In what form a report is printed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Form {
+    People,
+    Json,
+    Markdown,
+}
+
+impl Form {
+    fn of(json: bool, markdown: bool) -> Self {
+        match (json, markdown) {
+            (true, _) => Self::Json,
+            (_, true) => Self::Markdown,
+            _ => Self::People,
+        }
+    }
+}
+
+fn tell(
+    form: Form,
+    report: &impl Serialize,
+    tables: &Tables,
+    checks: &[Check],
+) -> anyhow::Result<ExitCode> {
+    if form == Form::Markdown {
+        return report::tell_markdown(&tables.markdown(), checks);
+    }
+    report::tell_with(form == Form::Json, &Details { report }, tables, checks)
 }
 
 #[derive(Debug, Serialize)]
