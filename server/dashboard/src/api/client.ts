@@ -1,6 +1,6 @@
 // Asks the server: one function, one kind of error.
 import type { ProblemBody } from './schema';
-import { withDetail } from '../said';
+import { withDetail } from '../message';
 import { texts } from '../texts';
 
 /** How long an answer may take, milliseconds; the server's own bound is 15 s. */
@@ -24,7 +24,7 @@ export class Problem extends Error {
   }
 }
 
-/** One sentence for people about whatever was thrown, with what the server adds (`said.ts`). */
+/** One sentence for people about whatever was thrown, with what the server adds (`message.ts`). */
 export function sentence(error: unknown): string {
   return error instanceof Error ? error.message : String(error);
 }
