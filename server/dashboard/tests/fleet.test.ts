@@ -1,30 +1,14 @@
 // What whoever comes first sees: signing in, motion, the friction map, and a viewer's page.
-import type { Locator } from 'playwright-core';
 import { expect, test } from 'vitest';
 import type { CellDifference, CellFriction, CreatedToken, Mission, Page as ApiPage, Robot } from './types';
 import { changeColour, shareOfChange } from '../src/map/compare';
 import { minute, moment } from '../src/format';
 import { texts } from '../src/texts';
-import { api, browser, eventually, map, select, server, shot, token, windowOf } from './harness';
+import { api, browser, eventually, inked, map, select, server, shot, token, windowOf } from './harness';
 
 const { open } = browser();
 /** So many pixels of its ink are a curve, and no single point. */
 const CURVE_PIXELS = 40;
-
-/** Pixels of a canvas that have just this colour. */
-function inked(canvas: Locator, [red, green, blue]: readonly number[]): Promise<number> {
-  return canvas.evaluate(
-    (drawn: HTMLCanvasElement, ink) => {
-      const { data } = drawn.getContext('2d')!.getImageData(0, 0, drawn.width, drawn.height);
-      let count = 0;
-      for (let at = 0; at < data.length; at += 4) {
-        if (data[at] === ink[0] && data[at + 1] === ink[1] && data[at + 2] === ink[2]) count += 1;
-      }
-      return count;
-    },
-    [red, green, blue],
-  );
-}
 
 test('a stranger sees the sign-in and nothing else', async () => {
   const page = await open({ as: null });

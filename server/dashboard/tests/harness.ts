@@ -3,7 +3,7 @@ import { execFileSync } from 'node:child_process';
 import { existsSync, mkdirSync, readFileSync } from 'node:fs';
 import { type Socket, connect, createServer } from 'node:net';
 import type { AddressInfo } from 'node:net';
-import { type Browser, type BrowserContext, type Page, chromium } from 'playwright-core';
+import { type Browser, type BrowserContext, type Locator, type Page, chromium } from 'playwright-core';
 import { afterAll, afterEach, beforeAll, expect, inject } from 'vitest';
 
 /** How long anything may take to come about, milliseconds. */
@@ -166,6 +166,21 @@ export function agentOf(id: string): number {
     if (words.includes('agent') && words.some((word) => word.includes(id))) return pid;
   }
   throw new Error(`no agent of ${id} among ${children}`);
+}
+
+/** Pixels of a canvas that have just this colour. */
+export function inked(canvas: Locator, [red, green, blue]: readonly number[]): Promise<number> {
+  return canvas.evaluate(
+    (drawn: HTMLCanvasElement, ink) => {
+      const { data } = drawn.getContext('2d')!.getImageData(0, 0, drawn.width, drawn.height);
+      let count = 0;
+      for (let at = 0; at < data.length; at += 4) {
+        if (data[at] === ink[0] && data[at + 1] === ink[1] && data[at + 2] === ink[2]) count += 1;
+      }
+      return count;
+    },
+    [red, green, blue],
+  );
 }
 
 /** The map's canvas and where it lies. */

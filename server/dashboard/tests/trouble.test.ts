@@ -4,7 +4,7 @@ import { expect, test } from 'vitest';
 import type { Stop } from './types';
 import { overflowing, violations } from './checks';
 import { CROWD, crowd } from './crowd';
-import { browser, eventually, map, shot } from './harness';
+import { browser, eventually, inked, map, shot } from './harness';
 
 const { open } = browser();
 
@@ -184,32 +184,20 @@ for (const [name, size, theme] of [
   });
 }
 
-/** Pixels of a part of the map that have just this colour. */
-const inked = (page: Page, [red, green, blue]: readonly number[]) =>
-  page.getByRole('application', { name: /^Map/ }).evaluate(
-    (canvas, ink) => {
-      const drawn = canvas as HTMLCanvasElement;
-      const { data } = drawn.getContext('2d')!.getImageData(0, 0, drawn.width, drawn.height);
-      let count = 0;
-      for (let at = 0; at < data.length; at += 4) {
-        if (data[at] === ink[0] && data[at + 1] === ink[1] && data[at + 2] === ink[2]) count += 1;
-      }
-      return count;
-    },
-    [red, green, blue],
-  );
+/** The canvas of the map. */
+const canvas = (page: Page) => page.getByRole('application', { name: /^Map/ });
 
 test('a robot in fault is red on the map, under a sign, and its label says so', async () => {
   const red = [0xb3, 0x12, 0x1d];
   const kinds = { fault: 0, lost: 0, stopped: 0, moving: 1 };
   const well = await open({ prepare: async (page) => (await watchNames(page), crowd(page, 3, kinds)) });
   await eventually('names', async () => (await namesOn(well)).length >= 3);
-  expect(await inked(well, red)).toBe(0);
+  expect(await inked(canvas(well), red)).toBe(0);
   await well.close();
   const page = await open({ prepare: async (page) => (await watchNames(page), crowd(page, 3, { ...kinds, fault: 1 })) });
   await eventually('a label with the fault', async () => (await namesOn(page)).some((name) => /^crowd-\d+ · fault$/.test(name)));
   // The robot itself, the triangle above it and the label.
-  expect(await inked(page, red)).toBeGreaterThan(150);
+  expect(await inked(canvas(page), red)).toBeGreaterThan(150);
   await shot(page, 'fault');
 });
 
