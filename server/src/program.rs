@@ -12,8 +12,8 @@ use tread_api::startup::apply_environment;
 
 use crate::{Config, Server, ServerArgs, build, doctor, health, init, logging, maintenance};
 
-/// Lowest priority for the processor that a process may give itself.
-const LOWEST_PRIORITY: i32 = 19;
+/// Nice value of the lowest priority.
+const NICE_LOWEST: i32 = 19;
 /// Maximum wait for blocking threads after all tasks have stopped; then they are abandoned.
 const RUNTIME_STOP_TIMEOUT: Duration = Duration::from_secs(2);
 
@@ -105,10 +105,10 @@ fn raise_file_limit() {
     }
 }
 
-/// Gives this thread and those that it will start the lowest priority for the processor, so that a
-/// server on the same machine goes first. No thread has been started yet.
+/// Lowers the priority of this process, so that a server on the same machine runs first. Call it
+/// before any thread starts: Linux lowers that of the calling thread and of those that it starts.
 fn lower_priority() {
-    if let Err(error) = rustix::process::nice(LOWEST_PRIORITY) {
+    if let Err(error) = rustix::process::nice(NICE_LOWEST) {
         eprintln!("cannot lower the priority: {error}");
     }
 }

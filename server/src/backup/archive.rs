@@ -30,7 +30,7 @@ const AUTHORITY_FOLDER: &str = "authority/";
 const MODE: u32 = 0o600;
 /// Size of the pieces in which files are read and written, bytes.
 const PIECE_BYTES: usize = 1024 * 1024;
-/// Bytes of an archive after which they are written to the disk.
+/// Bytes of an archive that are written before each sync.
 const SYNC_EVERY_BYTES: u64 = 4 * 1024 * 1024;
 /// Maximum size of a manifest, bytes.
 const MANIFEST_BYTES_MAX: u64 = 1024 * 1024;
@@ -128,20 +128,33 @@ pub struct Archived {
     pub sha256: String,
 }
 
-/// File that is written to the disk every [`SYNC_EVERY_BYTES`]. Without this the kernel writes it all
-/// at once, and commits of the server beside it wait for that.
-struct Synced {
+/// File that is synced every [`SYNC_EVERY_BYTES`]. Otherwise the kernel writes everything at the end
+/// at once, which delays the commits of the server.
+struct PeriodicallySynced {
     file: File,
-    unsynced: u64,
+    unsynced_bytes: u64,
 }
 
-impl Write for Synced {
+impl PeriodicallySynced {
+    fn new(file: File) -> Self {
+        Self {
+            file,
+            unsynced_bytes: 0,
+        }
+    }
+
+    fn finish(self) -> io::Result<()> {
+        self.file.sync_all()
+    }
+}
+
+impl Write for PeriodicallySynced {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let written = self.file.write(bytes)?;
-        self.unsynced += written as u64;
-        if self.unsynced >= SYNC_EVERY_BYTES {
+        self.unsynced_bytes += written as u64;
+        if self.unsynced_bytes >= SYNC_EVERY_BYTES {
             self.file.sync_data()?;
-            self.unsynced = 0;
+            self.unsynced_bytes = 0;
         }
         Ok(written)
     }
@@ -285,13 +298,13 @@ fn write_new(
     let mut options = OpenOptions::new();
     let file = options.write(true).create_new(true).mode(MODE);
     let file = file.open(partial).map_err(failed())?;
-    let file = Synced { file, unsynced: 0 };
+    let file = PeriodicallySynced::new(file);
     let Some(filter) = encryption else {
         let output = BufWriter::with_capacity(PIECE_BYTES, Hashing::new(file));
         let output = pack(output, partial, source, progress)?;
         let hashing = output.into_inner().map_err(io::IntoInnerError::into_error);
         let (file, archived) = hashing.map_err(failed())?.done();
-        file.file.sync_all().map_err(failed())?;
+        file.finish().map_err(failed())?;
         return Ok(archived);
     };
     let mut child = filter.start(Stdio::piped())?;
@@ -316,7 +329,7 @@ fn write_new(
     filter.check(status)?;
     packed?;
     let (file, archived) = file.done();
-    file.file.sync_all().map_err(failed())?;
+    file.finish().map_err(failed())?;
     Ok(archived)
 }
 

@@ -170,8 +170,8 @@ impl Connections {
             Some(opened) => opened,
             None => self.inner.connect().await?,
         };
-        let ran = sqlx::query_as(statement).fetch_one(opened.connection()?);
-        let ran = ran.await;
+        let running = sqlx::query_as(statement).fetch_one(opened.connection()?);
+        let ran = running.await;
         // SQLite has answered, so the connection can be used further.
         if matches!(ran, Ok(_) | Err(sqlx::Error::Database(_))) {
             self.inner.give_back(opened);

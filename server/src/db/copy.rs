@@ -26,8 +26,8 @@ const COUNTED: [&str; 8] = [
     "tokens",
 ];
 
-/// Interval at which what was copied is written to the disk. Without this the kernel writes it all at
-/// once, and commits of the server beside it wait for that.
+/// Interval at which a copy is synced while SQLite writes it. Otherwise the kernel writes everything at
+/// the end at once, which delays the commits of the server.
 const SYNC_EVERY: Duration = Duration::from_millis(50);
 
 /// What a copy contains.
@@ -90,7 +90,7 @@ pub async fn copy_into(database: &Path, target: &Path) -> Result<(), DbError> {
     copied.map_err(DbError::Sqlite)
 }
 
-/// Writes a file to the disk again and again. A failure is left to whoever writes the file.
+/// Syncs a file periodically. It ignores failures, because SQLite syncs the copy itself at the end.
 async fn sync_periodically(file: File) -> Infallible {
     let file = Arc::new(file);
     loop {

@@ -71,15 +71,15 @@ const READERS_MAX: u32 = 4;
 /// [`Db::checkpoint`] has not. The commit takes as long as what is left to copy, so this is for the
 /// case that nothing else helps.
 const WAL_PAGES: u32 = 131_072;
-/// Pages of the log (16 MiB) from which on it is begun anew when it has been copied.
+/// Pages of the log (16 MiB) from which on a checkpoint also resets it.
 const WAL_RESET_PAGES: i64 = 4_096;
-/// Pages (4 MiB) that may be left to copy while commits wait, and the part of a larger log that may:
-/// where writers are as fast as the disk, less is never left.
-const WAL_REST_PAGES_MAX: i64 = 1_024;
-const WAL_REST_PART: i64 = 8;
-/// Number of times that the log is copied in one checkpoint until so little is left: each time that
-/// is what was written during the time before.
-const COPIES_MAX: u32 = 8;
+/// Pages (4 MiB) that a reset may copy while commits wait. Of a larger log it may copy this part,
+/// because fewer never remain where writers are as fast as the disk.
+const WAL_REMAINING_PAGES_MAX: i64 = 1_024;
+const WAL_REMAINING_DIVISOR: i64 = 8;
+/// Maximum number of passive checkpoints before a reset. Each copies what was written during the one
+/// before, so that ever fewer pages remain.
+const PASSES_MAX: u32 = 8;
 /// Page cache of the writer, KiB: holds the cells that robots drive over now.
 const WRITER_CACHE_KIB: u32 = 32 * 1_024;
 /// Maximum time for background work. It exceeds any real duration; the library never answers a
@@ -537,33 +537,33 @@ impl Db {
 
     /// Copies the write-ahead log into the database file (a passive checkpoint), up to the oldest
     /// snapshot that a reader still uses. Writers do not wait for it, unless the log is large and
-    /// little is left: that is copied between two commits, and the next commit begins the log anew.
+    /// few pages remain: those are copied between two commits, and the next commit resets the log.
     ///
     /// # Errors
     /// SQLite failed, for instance on a full disk; the log remains valid.
     pub async fn checkpoint(&self) -> Result<(), DbError> {
         let mut copied_before = -1;
-        for _ in 0..COPIES_MAX {
-            let Checkpointed { pages, copied } = self.copy_log().await?;
-            // A reader keeps the rest from being copied, or nothing is to be done.
-            let is_stuck = copied == copied_before;
-            if pages < WAL_RESET_PAGES || pages == copied || is_stuck {
+        for _ in 0..PASSES_MAX {
+            let Checkpointed { pages, copied } = self.passive_checkpoint().await?;
+            // The snapshot of a reader prevents that more is copied.
+            let is_blocked = copied == copied_before;
+            if pages < WAL_RESET_PAGES || pages == copied || is_blocked {
                 return Ok(());
             }
             copied_before = copied;
-            if pages - copied > WAL_REST_PAGES_MAX.max(pages / WAL_REST_PART) {
+            if pages - copied > WAL_REMAINING_PAGES_MAX.max(pages / WAL_REMAINING_DIVISOR) {
                 continue;
             }
-            // Without the writer the rest stays until the next time.
+            // If the writer is not free in time, the next checkpoint tries again.
             if let Ok(_writer) = self.writer.reserve().await {
-                self.copy_log().await?;
+                self.passive_checkpoint().await?;
             }
             return Ok(());
         }
         Ok(())
     }
 
-    async fn copy_log(&self) -> Result<Checkpointed, DbError> {
+    async fn passive_checkpoint(&self) -> Result<Checkpointed, DbError> {
         let checkpoint = self.checkpoints.run("PRAGMA wal_checkpoint(PASSIVE)");
         let (_is_busy, pages, copied): (i64, i64, i64) = checkpoint.await?;
         Ok(Checkpointed { pages, copied })

@@ -86,7 +86,7 @@ async fn db_with_filling(folder: &Path) -> Db {
 }
 
 #[tokio::test]
-async fn a_large_log_is_begun_anew_after_a_checkpoint_and_does_not_grow() {
+async fn a_checkpoint_resets_a_large_log_so_that_it_does_not_grow() {
     let folder = tempfile::tempdir().unwrap();
     let db = db_with_filling(folder.path()).await;
     let log = folder.path().join("tread.db-wal");
@@ -101,7 +101,7 @@ async fn a_large_log_is_begun_anew_after_a_checkpoint_and_does_not_grow() {
 }
 
 #[tokio::test]
-async fn no_commit_copies_the_log_that_a_reader_has_kept_from_being_copied() {
+async fn no_commit_checkpoints_the_log_that_a_long_reader_has_blocked() {
     let folder = tempfile::tempdir().unwrap();
     let db = db_with_filling(folder.path()).await;
     let mut reading = db.read("db").await.unwrap();
@@ -118,7 +118,7 @@ async fn no_commit_copies_the_log_that_a_reader_has_kept_from_being_copied() {
     };
     let before = size();
     fill_log(&db, 1).await;
-    assert_eq!(size(), before, "the commit has copied the log");
+    assert_eq!(size(), before, "the commit has checkpointed the log");
     db.checkpoint().await.unwrap();
     assert!(size() >= before + (80 << 20), "{before} {}", size());
 }
