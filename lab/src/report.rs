@@ -148,6 +148,12 @@ impl Display for Table {
     }
 }
 
+/// A report for a page: its tables in Markdown, and then the checks.
+pub fn page_markdown<'a>(tables: &[Table], checks: impl IntoIterator<Item = &'a Check>) -> String {
+    let tables: Vec<String> = tables.iter().map(Table::markdown).collect();
+    format!("{}\n{}", tables.join("\n"), checks_markdown(checks))
+}
+
 /// A ratio in per cent, with one decimal; a dash for none.
 pub fn percent(ratio: impl Into<Option<f64>>) -> String {
     let text = |ratio: f64| format!("{:.1} %", 100.0 * ratio);

@@ -8,7 +8,7 @@ use std::io::{self, Write};
 use std::process::ExitCode;
 
 use serde::Serialize;
-use tread_lab::report::Table;
+use tread_lab::report::checks_markdown;
 
 /// A figure with what it must be.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -172,16 +172,14 @@ pub fn tell_with(
 /// # Errors
 /// Nothing can be written.
 pub fn tell_markdown(tables: &str, checks: &[Check]) -> anyhow::Result<ExitCode> {
-    let mut table = Table::new(["figure", "goal", "value", "verdict"]);
-    for check in checks {
-        table.row([
-            check.name.clone(),
-            check.goal.clone(),
-            format!("{:.3}", check.value),
-            verdict(check).to_owned(),
-        ]);
-    }
-    write!(io::stdout().lock(), "{tables}\n{}", table.markdown())?;
+    let of_lab = |check: &Check| tread_lab::report::Check {
+        name: check.name.clone(),
+        goal: check.goal.clone(),
+        value: Some(check.value),
+        holds: check.holds,
+    };
+    let table = checks_markdown(&checks.iter().map(of_lab).collect::<Vec<_>>());
+    write!(io::stdout().lock(), "{tables}\n{table}")?;
     Ok(exit_code(checks))
 }
 
@@ -193,15 +191,11 @@ fn exit_code(checks: &[Check]) -> ExitCode {
     }
 }
 
-fn verdict(check: &Check) -> &'static str {
-    if check.holds { "ok" } else { "FAILED" }
-}
-
 fn lines(out: &mut impl Write, checks: &[Check]) -> io::Result<()> {
     let widest = checks.iter().map(|check| check.name.chars().count()).max();
     let width = widest.unwrap_or(0);
     for check in checks {
-        let verdict = verdict(check);
+        let verdict = if check.holds { "ok" } else { "FAILED" };
         writeln!(
             out,
             "{verdict:<7}{:<width$}{:>14.3}   goal {}",

@@ -16,7 +16,7 @@ use clap::Parser;
 use serde::Serialize;
 use tread_lab::parallel::in_parallel;
 use tread_lab::random::Random;
-use tread_lab::report::{Check, Table, checks_json, checks_markdown, percent};
+use tread_lab::report::{Check, Table, checks_json, page_markdown, percent};
 use tread_lab::rough::ground_change::{ChangeTrial, run};
 use tread_lab::rough::run::Course;
 use tread_lab::rough::sensors::SensorSpec;
@@ -238,8 +238,7 @@ fn main() -> anyhow::Result<ExitCode> {
     } else {
         let tables = [quiet_table(&quiet), change_table(&lines)];
         if arguments.markdown {
-            let tables = tables.map(|table| table.markdown()).join("\n");
-            println!("{tables}\n{}", checks_markdown(&checks));
+            println!("{}", page_markdown(&tables, &checks));
         } else {
             println!("{}\n{}", tables[0], tables[1]);
         }

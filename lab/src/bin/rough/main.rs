@@ -25,7 +25,7 @@ use anyhow::Context;
 use clap::Parser;
 use tread_control::estimation::{EstimatorPrior, TyrePrior};
 use tread_lab::parallel::in_parallel;
-use tread_lab::report::{Check, checks_json, checks_markdown};
+use tread_lab::report::{Check, checks_json, page_markdown};
 use tread_lab::rough::run::{ASKED_AT_S, Trial, run};
 
 use lines::{CHANGES, alone, population};
@@ -166,8 +166,7 @@ fn main() -> anyhow::Result<ExitCode> {
     } else {
         let tables = [score::table(&lines), parameters::table(&parameters)];
         if arguments.markdown {
-            let tables = tables.map(|table| table.markdown()).join("\n");
-            println!("{tables}\n{}", checks_markdown(&checks));
+            println!("{}", page_markdown(&tables, &checks));
         } else {
             println!("{}\n{}", tables[0], tables[1]);
         }
