@@ -18,8 +18,8 @@ use tread_api::terrain::TerrainRef;
 use tread_api::wire;
 use tread_api::wire::hello::Hello;
 use tread_api::wire::ingest::{Batch, Record, RecordContent};
-use tread_server::app::App;
 use tread_server::app::ingest::{self, UPLOADS_WAITING_MAX, Upload};
+use tread_server::app::{App, sums};
 use tread_server::clock::Clock;
 use tread_server::config::{FrictionConfig, StorageConfig};
 use tread_server::db::Db;
@@ -141,6 +141,7 @@ impl Bench {
         let writer = ingest::run(app.clone(), uploads_in, supervisor.stop_token());
         let entered = runtime.enter();
         supervisor.spawn_vital("ingest", writer);
+        supervisor.spawn_vital("sums", sums::run(app.clone(), supervisor.stop_token()));
         drop(entered);
         Ok(Self {
             runtime,
@@ -268,6 +269,8 @@ fn main() -> anyhow::Result<()> {
             .map_err(|_panic| anyhow::anyhow!("the generator panicked"))?
     });
     let (generator_us, waits) = generated?;
+    // What is stored behind the receipts belongs to them.
+    bench.runtime.block_on(bench.app.write_sums())?;
     let span_s = started.elapsed().as_secs_f64();
     let server_us = processor_us("/proc/self/stat")? - before_us - generator_us;
     let count = bench.app.counters().segments_committed.get() as f64;

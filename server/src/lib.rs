@@ -56,7 +56,7 @@ use self::app::identity::audit;
 use self::app::identity::people::People;
 use self::app::{
     App, Dependencies, backups, checkpoints, events, ingest, memory, merging, reconciler,
-    retention, storage,
+    retention, storage, sums,
 };
 use self::authority::Authorities;
 use self::clock::Clock;
@@ -258,6 +258,7 @@ fn look_after_database(app: &App, supervisor: &Supervisor) {
     supervisor.spawn_vital("checkpoints", checkpoints::run(app.clone(), stop()));
     supervisor.spawn_vital("storage", storage::run(app.clone(), stop()));
     supervisor.spawn_vital("merging", merging::run(app.clone(), stop()));
+    supervisor.spawn_vital("sums", sums::run(app.clone(), stop()));
 }
 
 /// Loads the state in memory from the database.
@@ -375,14 +376,15 @@ impl RunningServer {
         self.supervisor.stopping().await;
     }
 
-    /// Stops the server: completes open requests, stores received uploads, closes network and
-    /// database.
+    /// Stops the server: completes open requests, stores received uploads and their sums, closes
+    /// network and database.
     ///
     /// # Errors
     /// A vital task failed before, or tasks did not end within [`supervisor::STOP_TIMEOUT`].
     pub async fn stop(self) -> anyhow::Result<()> {
         let stopped = self.supervisor.stop().await;
         audit::finish(&self.app).await;
+        self.app.try_to_write_sums().await;
         let app = self.app.clone();
         // A collector that does not answer must not hold the runtime.
         let _ended = tokio::task::spawn_blocking(move || app.finish_traces()).await;

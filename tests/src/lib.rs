@@ -7,6 +7,7 @@
 //! * [`relay`]: a network between robot and server that can be cut.
 //! * [`wait`]: waits for a state with a bound, and says what was seen last.
 //! * [`chaos`]: runs in which things fail at random, from a seed of [`random`].
+//! * [`stored`]: what a database holds of measurements.
 //! * [`scenario`]: fleets in a simulated time, from which figures are read.
 //! * [`damage`]: damages payloads.
 //! * [`light_robot`]: robots without physics, for load.
@@ -29,4 +30,5 @@ pub mod repository;
 pub mod rest;
 pub mod scenario;
 pub mod shell;
+pub mod stored;
 pub mod wait;

@@ -2,8 +2,9 @@
 //!
 //! Transactions begin at least [`GROUP_INTERVAL`] apart; uploads that arrive meanwhile go into the
 //! next one, up to a limit. One fsync thus serves many robots, and a single upload does not wait
-//! for others. Only newly inserted segments are added to the cell sums, in the same transaction;
-//! the answer is sent after the commit. A segment that is sent twice counts once.
+//! for others. The answer is sent after the commit. Only newly inserted segments are added to the
+//! cell sums, with the commit in memory, and later in the database ([`super::sums`]). A
+//! segment that is sent twice counts once.
 
 mod keys;
 mod prepared;
@@ -34,7 +35,7 @@ use super::App;
 use super::map::{Folded, MapChange};
 use super::missions::reports::{Foreign, Reporting, Taken, take_report};
 use crate::db::deferred_segments::Origin;
-use crate::db::segments::{Inserted, NewSegment};
+use crate::db::segments::{Added, New, NewSegment};
 use crate::db::sums::SumKey;
 use crate::db::withdrawals::WithdrawalRow;
 use crate::db::{self, DbError, Tx};
@@ -265,6 +266,7 @@ impl Writer {
         let mut candidates = Vec::new();
         let mut tally = Tally::default();
         let app = self.app.clone();
+        app.bound_unwritten_sums().await?;
         let turn = app.map_turn_to_change().await?;
         let mut tx = app.db().write_uploads("ingest").await?;
         let now = self.app.clock().now();
@@ -342,11 +344,8 @@ impl Writer {
                     }
                     RecordContent::Mission(report) => {
                         let of = self.reporting(upload, robot_pk, report, (now, skew));
-                        let taken = take_new_report(&mut tx, of, keys, report).await?;
-                        if let Some(Ok(taken)) = &taken {
-                            let alerts = app.alert_report(&mut tx, robot_pk, report, taken);
-                            tally.alerts.extend(alerts.await?);
-                        }
+                        let taken = self.take_report(&mut tx, of, keys, report, &mut tally);
+                        let taken = taken.await?;
                         tally.note_report(taken, seq, &mut receipt);
                     }
                 }
@@ -354,12 +353,31 @@ impl Writer {
             count_refused(&mut tx, robot_pk, &receipt).await?;
             outcomes.push(Ok(receipt));
         }
-        let folded = self
+        let (folded, added) = self
             .insert(&mut tx, &candidates, now, &mut outcomes, &mut tally)
             .await?;
         let alerts = tally.alerts.clone();
-        turn.commit(tx, MapChange::Add(folded), alerts).await?;
+        turn.commit(tx, MapChange::Add(folded, added), alerts)
+            .await?;
         Ok((outcomes, tally))
+    }
+
+    /// Applies a report with its alerts, unless it was applied before; then it returns `None`.
+    async fn take_report(
+        &self,
+        tx: &mut Tx,
+        of: Reporting,
+        keys: (i64, i64),
+        report: &MissionReport,
+        tally: &mut Tally,
+    ) -> Result<Option<Result<Taken, Foreign>>, DbError> {
+        let robot_pk = of.robot_pk;
+        let taken = take_new_report(tx, of, keys, report).await?;
+        if let Some(Ok(taken)) = &taken {
+            let alerts = self.app.alert_report(tx, robot_pk, report, taken);
+            tally.alerts.extend(alerts.await?);
+        }
+        Ok(taken)
     }
 
     /// Returns the database keys of a batch, or the reason why all of it is refused.
@@ -427,7 +445,8 @@ impl Writer {
         Ok(removed)
     }
 
-    /// Stores segments, and adds to the sums those that are new and not withdrawn.
+    /// Stores segments. Returns the sums of those that are new and not withdrawn, and the keys of
+    /// all that are new.
     async fn insert(
         &self,
         tx: &mut Tx,
@@ -435,14 +454,14 @@ impl Writer {
         now: Timestamp,
         outcomes: &mut [Outcome],
         tally: &mut Tally,
-    ) -> Result<Vec<Folded>, DbError> {
+    ) -> Result<(Vec<Folded>, Added), DbError> {
         let removed = self.removed_before(tx, candidates).await?;
         let rows = rows(candidates, &removed);
-        let mut new: Option<HashSet<(i64, i64)>> =
-            match db::segments::insert_new(tx, &rows, now).await? {
-                Inserted::All => None,
-                Inserted::Only(keys) => Some(keys.into_iter().collect()),
-            };
+        let (new, added) = db::segments::insert_new(tx, &rows, now).await?;
+        let mut new: Option<HashSet<(i64, i64)>> = match new {
+            New::All => None,
+            New::Only(names) => Some(names.into_iter().collect()),
+        };
         let withdrawals = db::withdrawals::all(tx).await?;
         let mut folded: HashMap<SumKey, Folded> = HashMap::new();
         for candidate in candidates {
@@ -489,13 +508,7 @@ impl Writer {
                 }
             }
         }
-        // In the order of the table, so that neighbours share database pages.
-        let mut folded: Vec<Folded> = folded.into_values().collect();
-        folded.sort_unstable_by_key(|Folded { key, .. }| {
-            (key.robot_pk, key.epoch_h, key.cell.iy, key.cell.ix)
-        });
-        db::sums::add(tx, folded.iter().map(|part| (&part.key, &part.sums))).await?;
-        Ok(folded)
+        Ok((folded.into_values().collect(), added))
     }
 }
 

@@ -1,23 +1,30 @@
-//! The friction map in memory, a copy of the sums in the database: loaded at the start and changed
-//! with each commit.
+//! The friction map in memory: the stored sums, and those that are stored behind the receipts
+//! ([`unwritten`]). It is loaded at the start and changed with each commit.
 //!
 //! To change sums, a task takes the [`MapTurn`], writes, and commits with [`MapTurn::commit`]:
 //! commit and change in memory are one task, which cancellation of the caller does not interrupt.
 //! After a commit of unknown outcome no turn is given until memory was read again (see
 //! [`super::memory`]).
 
+mod reading;
+mod unwritten;
+pub mod writing;
+
 use std::collections::HashMap;
-use std::sync::{Arc, PoisonError, RwLock};
+use std::sync::{Arc, Mutex as StdMutex, MutexGuard, PoisonError, RwLock};
 
 use tokio::sync::{Mutex, OwnedMutexGuard};
 use tread_api::ids::{ConfigurationId, RobotId};
-use tread_api::rights::Scope;
 use tread_api::robot::Alert;
 
+use self::unwritten::Unwritten;
+pub use self::unwritten::UnwrittenCounts;
 use super::App;
+use crate::db::segments::Added;
 use crate::db::sites::SiteRow;
 use crate::db::sums::SumKey;
-use crate::db::{self, DbError, Outcome, Tx};
+use crate::db::watermarks::WatermarkStep;
+use crate::db::{DbError, Outcome, Tx};
 use crate::friction::Sums;
 use crate::friction::index::{Labelled, SiteMap};
 
@@ -25,6 +32,8 @@ use crate::friction::index::{Labelled, SiteMap};
 #[derive(Debug, Default)]
 pub(super) struct Maps {
     sites: RwLock<HashMap<i64, SiteMap>>,
+    /// Changes only while `order` is held.
+    unwritten: StdMutex<Unwritten>,
     /// Held from before a transaction that changes sums until memory shows the change, so that
     /// database and memory change in the same order. Its value is the number of commits of unknown
     /// outcome at the last reading of memory.
@@ -43,10 +52,12 @@ pub(super) struct MapTurn {
 pub(super) enum MapChange {
     /// No change: the same sums in another form.
     Nothing,
-    /// Sums are added.
-    Add(Vec<Folded>),
-    /// Sums of a robot's measurements between two hours, both included, are removed.
-    Withdraw(Box<SiteRow>, RobotId, (i64, i64)),
+    /// Sums of segments that were stored with these keys are added.
+    Add(Vec<Folded>, Added),
+    /// The unwritten sums of robots are stored up to these watermarks.
+    Store(Vec<WatermarkStep>),
+    /// Sums of a robot's measurements are removed.
+    Withdraw(Box<Withdrawn>),
     /// Hours before this one are merged into days.
     MergeBefore(Box<SiteRow>, i64),
     /// Raw measurements of these runs were removed.
@@ -60,6 +71,16 @@ pub(super) struct Folded {
     pub(super) robot: RobotId,
     pub(super) configuration: ConfigurationId,
     pub(super) sums: Sums,
+}
+
+/// A robot's hours whose sums are removed.
+#[derive(Debug)]
+pub(super) struct Withdrawn {
+    pub(super) site: SiteRow,
+    pub(super) robot: RobotId,
+    pub(super) robot_pk: i64,
+    /// First and last hour.
+    pub(super) hours: (i64, i64),
 }
 
 impl MapTurn {
@@ -108,18 +129,10 @@ impl Maps {
         }
     }
 
-    /// Replaces the maps by those read from the database.
-    fn replace(&self, mut read: HashMap<i64, SiteMap>) {
-        let mut sites = self.sites.write().unwrap_or_else(PoisonError::into_inner);
-        for (pk, before) in sites.drain() {
-            match read.get_mut(&pk) {
-                Some(map) => map.follow(&before),
-                None => {
-                    read.insert(pk, before);
-                }
-            }
-        }
-        *sites = read;
+    fn unwritten(&self) -> MutexGuard<'_, Unwritten> {
+        self.unwritten
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -169,14 +182,25 @@ impl App {
     fn apply(&self, change: MapChange) {
         match change {
             MapChange::Nothing => {}
-            MapChange::Add(folded) => {
+            MapChange::Add(folded, added) => {
                 if !folded.is_empty() {
+                    let sums = folded.iter().map(|part| (&part.key, &part.sums));
+                    let now = self.clock().elapsed();
+                    self.maps().unwritten().add(sums, added, now);
                     let sites = self.maps().sites.write();
                     add(&mut sites.unwrap_or_else(PoisonError::into_inner), &folded);
                 }
             }
-            MapChange::Withdraw(row, robot, hours) => {
-                self.maps().change(&row, |map| map.withdraw(&robot, hours));
+            MapChange::Store(steps) => self.maps().unwritten().written(&steps),
+            MapChange::Withdraw(withdrawn) => {
+                let Withdrawn {
+                    site,
+                    robot,
+                    robot_pk,
+                    hours,
+                } = *withdrawn;
+                self.maps().unwritten().withdraw(robot_pk, hours);
+                self.maps().change(&site, |map| map.withdraw(&robot, hours));
             }
             MapChange::MergeBefore(row, hour) => {
                 self.maps().change(&row, |map| map.merge_before(hour));
@@ -184,61 +208,4 @@ impl App {
             MapChange::Remove(boots) => self.removed().extend(boots),
         }
     }
-
-    /// Reads all sums into memory, and the runs of which raw measurements were removed.
-    ///
-    /// # Errors
-    /// The database failed.
-    pub async fn load_map(&self) -> Result<(), DbError> {
-        self.load_map_again(self.db().unknown_outcomes()).await
-    }
-
-    /// Reads everything again when `ended` commits of unknown outcome have ended. No sums change
-    /// meanwhile.
-    ///
-    /// # Errors
-    /// The database failed; memory is unchanged.
-    pub(super) async fn load_map_again(&self, ended: u64) -> Result<(), DbError> {
-        let mut order = Arc::clone(&self.maps().order).lock_owned().await;
-        let mut tx = self.db().read("map").await?;
-        let read = read_maps(&mut tx).await?;
-        self.removed().extend(db::removed::boots(&mut tx).await?);
-        drop(tx);
-        self.maps().replace(read);
-        *order = ended;
-        Ok(())
-    }
-}
-
-async fn read_maps(tx: &mut Tx) -> Result<HashMap<i64, SiteMap>, DbError> {
-    let mut sites = HashMap::new();
-    let mut after = String::new();
-    loop {
-        let rows = db::sites::list(tx, &Scope::EVERYWHERE, &after, 100).await?;
-        let Some(last) = rows.last() else { break };
-        after = last.site.id.to_string();
-        for row in &rows {
-            ensure(&mut sites, row);
-        }
-    }
-    let robots = db::robots::ids_by_key(tx).await?;
-    let configurations = db::robots::configurations_by_key(tx).await?;
-    db::sums::each(tx, |row| {
-        let key = row.key;
-        // The foreign keys of a sum guarantee both.
-        if let (Some(robot), Some(&configuration)) = (
-            robots.get(&key.robot_pk),
-            configurations.get(&key.configuration_pk),
-        ) {
-            let folded = Folded {
-                robot: robot.clone(),
-                configuration,
-                sums: row.sums,
-                key,
-            };
-            add(&mut sites, std::slice::from_ref(&folded));
-        }
-    })
-    .await?;
-    Ok(sites)
 }

@@ -2,7 +2,8 @@
 //!
 //! First a site's horizon is moved: from then on, hours before it are *read* as days, in memory and
 //! after a restart. Then the rows are merged a few at a time, each time in one transaction that
-//! removes hours and adds them to their day. If this is interrupted, the map stays the same.
+//! removes hours and adds them to their day. If this is interrupted, the map stays the same. Hours
+//! that are unwritten meanwhile are stored as such later, and merged with the next pass.
 
 use std::collections::BTreeMap;
 use std::time::Duration;

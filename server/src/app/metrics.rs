@@ -84,6 +84,7 @@ impl App {
     pub async fn metrics_text(&self) -> String {
         let mut registry = Registry::default();
         self.register_storage(&mut registry);
+        self.register_sums(&mut registry);
         // Metrics from memory are shown also while the database cannot be read.
         for registered in [
             self.register_fleet(&mut registry).await,
@@ -173,6 +174,22 @@ impl App {
         }
         let help = "Failures of the storage, by kind";
         registry.register("tread_storage_failures", help, failures);
+    }
+
+    /// Registers the sums that are not stored yet.
+    fn register_sums(&self, registry: &mut Registry) {
+        let unwritten = self.unwritten_sums();
+        let help = "Sums of the map with measurements that are not in the database's sums yet";
+        let sums = ConstGauge::new(count(unwritten.sums));
+        registry.register("tread_map_sums_unwritten", help, sums);
+        let help = "Measurements in these sums";
+        let segments = ConstGauge::new(unwritten.segments);
+        registry.register("tread_map_segments_unwritten", help, segments);
+        let now = self.clock().elapsed();
+        let age = unwritten.oldest_at.map(|at| now.saturating_sub(at));
+        let age = ConstGauge::new(age.unwrap_or_default().as_secs_f64());
+        let help = "Age of the oldest of these sums";
+        registry.register_with_unit("tread_map_sums_unwritten_age", help, Unit::Seconds, age);
     }
 
     /// Registers version, commit and schema.

@@ -59,6 +59,7 @@ use self::events::Hub;
 use self::friction::{MapNews, Pictures, Timelines, Views};
 use self::identity::Identity;
 use self::map::Maps;
+pub use self::map::{UnwrittenCounts, writing as sums};
 use self::missions::idempotency::InFlight;
 use self::presence::Presences;
 use self::restoration::Restored;

@@ -2,8 +2,8 @@
 //! kept for ever.
 //!
 //! The oldest are removed first, a few at a time. Each transaction removes some and records their
-//! names (`boot`, `seq`), so that one that is sent again after years is still recognised. If this
-//! is interrupted, the map stays the same.
+//! names (`boot`, `seq`), so that one that is sent again after years is still recognised. None is
+//! removed before its sum is stored. If this is interrupted, the map stays the same.
 
 use std::collections::HashSet;
 use std::sync::{Mutex, PoisonError};
@@ -93,11 +93,20 @@ impl App {
         // The last row stays, so that keys, which are cursors of lists, never restart.
         rows.retain(|row| row.pk < last);
         drop(tx);
-        if rows.is_empty() {
-            return Ok(0);
+        let first = self.first_unwritten_key();
+        if rows
+            .iter()
+            .any(|row| first.is_some_and(|first| row.pk >= first))
+        {
+            self.write_sums().await?;
         }
         // Uploads wait meanwhile: none is between checking the names and its commit.
         let turn = self.map_turn_to_change().await?;
+        let first = self.first_unwritten_key();
+        rows.retain(|row| first.is_none_or(|first| row.pk < first));
+        if rows.is_empty() {
+            return Ok(0);
+        }
         let mut tx = self.db().write("retention").await?;
         db::removed::remove(&mut tx, &rows).await?;
         let boots = rows.iter().map(|row| row.boot_pk).collect();

@@ -1,7 +1,7 @@
 //! Withdrawal of a robot's measurements: the map is then as if they had never arrived.
 //!
-//! The sums of the withdrawn hours are removed, and later uploads of these hours are not added. Raw
-//! segments are kept. Hours that are merged into days can only be withdrawn by whole days.
+//! The sums of the withdrawn hours are removed, stored or not, and later uploads of these hours are
+//! not added, nor are their segments when the server starts. Raw segments are kept. Hours that are merged into days can only be withdrawn by whole days.
 
 use jiff::Timestamp;
 use tread_api::friction::{CreateWithdrawal, Withdrawal};
@@ -10,7 +10,7 @@ use tread_api::mission::REASON_LENGTH_MAX;
 use tread_api::page::Page;
 use tread_api::rights::Scope;
 
-use super::map::MapChange;
+use super::map::{MapChange, Withdrawn};
 use super::{App, AppError, page, people_line, site_row};
 use crate::db;
 use crate::db::withdrawals::WithdrawalRow;
@@ -62,7 +62,12 @@ impl App {
         };
         row.pk = db::withdrawals::insert(&mut tx, &row).await?;
         let removed = db::sums::remove_hours(&mut tx, robot_pk, (from_h, to_h)).await?;
-        let change = MapChange::Withdraw(Box::new(site_row), robot.clone(), (from_h, to_h));
+        let change = MapChange::Withdraw(Box::new(Withdrawn {
+            site: site_row,
+            robot: robot.clone(),
+            robot_pk,
+            hours: (from_h, to_h),
+        }));
         turn.commit(tx, change, Vec::new()).await?;
         tracing::info!(robot.id = %robot, "{removed} sums of robot `{robot}` were withdrawn");
         Ok(to_api(row, robot.clone()))

@@ -34,6 +34,7 @@ pub mod sums;
 pub mod terrains;
 pub mod times;
 pub mod tokens;
+pub mod watermarks;
 pub mod webhooks;
 pub mod withdrawals;
 

@@ -43,11 +43,20 @@ static INSERT: LazyLock<RowsStatement> = LazyLock::new(|| {
 
 /// Those of the given measurements that were new.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Inserted {
+pub enum New {
     /// All of them.
     All,
-    /// Those with these keys (run and sequence number), in the given order.
+    /// Those with these names (run and sequence number), in the given order.
     Only(Vec<(i64, i64)>),
+}
+
+/// Keys of measurements that were added together; empty if `last` is before `first`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Added {
+    /// Key of the first one.
+    pub first: i64,
+    /// Key of the last one.
+    pub last: i64,
 }
 
 /// Stores the measurements that are not stored yet.
@@ -55,9 +64,9 @@ pub async fn insert_new(
     db: &mut SqliteConnection,
     segments: &[NewSegment<'_>],
     received_at: Timestamp,
-) -> Result<Inserted, DbError> {
+) -> Result<(New, Added), DbError> {
     if segments.is_empty() {
-        return Ok(Inserted::All);
+        return Ok((New::All, Added { first: 1, last: 0 }));
     }
     let last = sqlx::query!(
         r#"SELECT pk AS "pk!", received_at_us FROM segments ORDER BY pk DESC LIMIT 1"#
@@ -78,22 +87,22 @@ pub async fn insert_new(
         Ok(())
     };
     let inserted = INSERT.execute(&mut *db, segments, bind).await?;
+    // The one writer assigns increasing keys without gaps, so the rows added now follow the earlier
+    // ones.
+    let added = Added {
+        first: last + 1,
+        last: last.saturating_add_unsigned(inserted),
+    };
     if usize::try_from(inserted) == Ok(segments.len()) {
-        return Ok(Inserted::All);
+        return Ok((New::All, added));
     }
-    // The one writer assigns increasing keys, so the rows added now follow the earlier ones.
-    let added = sqlx::query!(
+    let rows = sqlx::query!(
         "SELECT boot_pk, seq FROM segments WHERE pk > ? ORDER BY pk",
         last
-    )
-    .fetch_all(db)
-    .await?;
-    Ok(Inserted::Only(
-        added
-            .into_iter()
-            .map(|row| (row.boot_pk, row.seq))
-            .collect(),
-    ))
+    );
+    let rows = rows.fetch_all(db).await?;
+    let names = rows.into_iter().map(|row| (row.boot_pk, row.seq)).collect();
+    Ok((New::Only(names), added))
 }
 
 /// Filter of a list of measurements.

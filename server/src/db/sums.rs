@@ -1,4 +1,5 @@
-//! Sums of measurements per cell, ground, robot, configuration and hour of measuring.
+//! Sums of measurements per cell, ground, robot, configuration and hour of measuring, up to the
+//! watermark of each robot ([`super::watermarks`]).
 
 use std::sync::LazyLock;
 
@@ -72,10 +73,12 @@ const PASS: [&str; 4] = [
 
 /// Returns the SQL that adds a sum to a stored one, equal to [`Sums::add`].
 fn added() -> String {
+    // SQLite adds integers beyond 64 bits as real numbers, and the cast brings those back to the end
+    // of the range: one robot's sum that overflows must not fail the transaction of all.
     let fixed = FIXED.map(|name| {
         format!(
-            "{name}_hi = {name}_hi + excluded.{name}_hi
-                 + (({name}_lo + excluded.{name}_lo) >> 32),
+            "{name}_hi = CAST({name}_hi + excluded.{name}_hi
+                 + (({name}_lo + excluded.{name}_lo) >> 32) AS INTEGER),
              {name}_lo = ({name}_lo + excluded.{name}_lo) & 4294967295,"
         )
     });

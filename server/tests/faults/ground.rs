@@ -154,13 +154,16 @@ impl Ground {
             broken.len()
         );
         drop(tx);
+        // Before the last sums are stored, and after.
+        self.check_map().await;
         let counted = self.segments_counted().await;
         assert_eq!(counted, self.acknowledged.load(Ordering::Relaxed));
         self.check_map().await;
     }
 
-    /// Segments in the sums of the database.
+    /// Segments in the sums of the database, after all were stored.
     pub(crate) async fn segments_counted(&self) -> u64 {
+        self.app.write_sums().await.unwrap();
         let mut tx = self.app.db().read("test").await.unwrap();
         let mut counted = 0;
         db::sums::each(&mut tx, |row| counted += row.sums.segments)

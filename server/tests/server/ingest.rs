@@ -115,14 +115,21 @@ impl Writer {
         self.send(robot, boot, records).await.await.unwrap()
     }
 
+    /// The stored sums, after those that are unwritten were stored.
     pub(crate) async fn sums(&self) -> Vec<SumRow> {
-        let mut tx = self.app.db().read("test").await.unwrap();
-        let mut rows = Vec::new();
-        let taken = db::sums::each(&mut tx, |row| rows.push(row)).await;
-        taken.unwrap();
-        rows.sort_by(|left: &SumRow, right| left.key.cmp(&right.key));
-        rows
+        self.app.write_sums().await.unwrap();
+        stored_sums(&self.app).await
     }
+}
+
+/// The stored sums.
+pub(crate) async fn stored_sums(app: &App) -> Vec<SumRow> {
+    let mut tx = app.db().read("test").await.unwrap();
+    let mut rows = Vec::new();
+    let taken = db::sums::each(&mut tx, |row| rows.push(row)).await;
+    taken.unwrap();
+    rows.sort_by(|left: &SumRow, right| left.key.cmp(&right.key));
+    rows
 }
 
 impl Drop for Writer {

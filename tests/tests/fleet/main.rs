@@ -13,6 +13,8 @@ mod dry_runs;
 mod earlier_state;
 mod event_clients;
 mod impostors;
+#[cfg(test)]
+mod killed_server;
 mod membership;
 mod messages;
 mod missions;

@@ -14,6 +14,7 @@ use tread_api::mission::MissionState;
 use tread_api::wire::ingest::{Batch, Receipt, Record, RecordContent};
 use tread_tests::fleet::{Fleet, SITE};
 use tread_tests::light_robot::{LightRobot, ask};
+use tread_tests::stored::await_sums;
 use tread_tests::wait::{DRIVE, SHORT, eventually};
 
 use crate::{arc, fleet, slalom};
@@ -35,8 +36,9 @@ async fn server_command(arguments: Vec<String>) {
     assert!(ended.status.success(), "{said}");
 }
 
-/// The sums of a database, each as one text, sorted.
+/// The sums of a database, each as one text, sorted, once all segments are in them.
 async fn sums(fleet: &Fleet) -> Vec<String> {
+    await_sums(&fleet.database()).await.unwrap();
     let options = SqliteConnectOptions::new().filename(fleet.database());
     let mut connection = options.read_only(true).connect().await.unwrap();
     let columns: Vec<&str> = SUMS.split(", ").map(str::trim).collect();

@@ -1,8 +1,8 @@
-//! The friction map in memory: all sums of the database, indexed by cell and by terrain.
+//! The friction map in memory: all sums, indexed by cell and by terrain.
 //!
-//! The index equals the database and is updated after each commit. Cells are sorted row by row, so
-//! a rectangle is a few ranges of neighbours. Each sum of a (cell, terrain, robot, configuration,
-//! epoch) takes 168 bytes in addition to its key.
+//! The index equals the stored sums with those that are stored behind the receipts, and is updated
+//! with each commit. Cells are sorted row by row, so a rectangle is a few ranges of neighbours. Each
+//! sum of a (cell, terrain, robot, configuration, epoch) takes 168 bytes in addition to its key.
 
 mod changes;
 mod names;

@@ -4,16 +4,20 @@ use std::time::Duration;
 
 use anyhow::{Context, ensure};
 use hdrhistogram::Histogram;
+use nix::sys::statfs::{TMPFS_MAGIC, statfs};
 use serde::Serialize;
-use sqlx::sqlite::SqliteConnectOptions;
-use sqlx::{ConnectOptions, Row};
 use tokio::task::JoinSet;
 use tokio::time::{Instant, MissedTickBehavior};
 use tread_tests::fleet::Fleet;
 use tread_tests::light_robot::LightRobot;
 use tread_tests::process::{Usage, usage_of};
+use tread_tests::report::figure;
+use tread_tests::stored;
 
 use crate::{Arguments, period_of};
+
+/// Shortest time between two uploads of a robot that uploads as fast as receipts arrive.
+const SATURATED_EVERY: Duration = Duration::from_millis(1);
 
 /// What the ingest measurement found.
 #[derive(Debug, Serialize)]
@@ -30,6 +34,8 @@ pub(crate) struct Ingest {
     pub(crate) server_cpu_us_per_segment: f64,
     pub(crate) acknowledged_but_lost: u64,
     pub(crate) counted_twice: u64,
+    pub(crate) sums_per_robot: f64,
+    pub(crate) is_on_disk: bool,
     pub(crate) server: Usage,
     pub(crate) generator: Usage,
 }
@@ -79,9 +85,14 @@ pub(crate) async fn measure(
         all.states += tally.states;
     }
     let seconds = begin.elapsed().as_secs_f64();
-    let server = fleet.server_usage().context("the server is gone")?;
     let generator = usage_of(std::process::id()).context("/proc is not readable")?;
-    let stored = count_stored(fleet).await?;
+    // Sums are stored behind the receipts; their cost belongs to the segments. A difference that
+    // stays is counted below.
+    if let Err(error) = stored::await_sums(&fleet.database()).await {
+        eprintln!("{error}");
+    }
+    let server = fleet.server_usage().context("the server is gone")?;
+    let stored = stored::count(&fleet.database()).await?;
     let committed = i64::try_from(all.committed)?;
     #[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
     let (committed_f64, states_f64) = (all.committed as f64, all.states as f64);
@@ -104,6 +115,8 @@ pub(crate) async fn measure(
         acknowledged_but_lost: (committed - stored.segments).max(0).cast_unsigned(),
         counted_twice: (stored.in_sums - stored.segments).unsigned_abs()
             + stored.doubles.cast_unsigned(),
+        sums_per_robot: figure(stored.sums.cast_unsigned()) / f64::from(arguments.robots),
+        is_on_disk: statfs(&fleet.database())?.filesystem_type() != TMPFS_MAGIC,
         server,
         generator,
     })
@@ -115,10 +128,21 @@ struct UploadPlan {
     every: Duration,
     first: Duration,
     state_every: Duration,
+    /// Whether the next upload follows the receipt, until the time is over.
+    saturates: bool,
 }
 
 impl UploadPlan {
     fn new(arguments: &Arguments, index: usize, count: usize) -> anyhow::Result<Self> {
+        if arguments.saturate {
+            return Ok(Self {
+                records: arguments.records.into(),
+                every: SATURATED_EVERY,
+                first: Duration::ZERO,
+                state_every: period_of(arguments.state_rate_hz),
+                saturates: true,
+            });
+        }
         let every = Duration::from_millis(arguments.upload_every_ms);
         let all_per_upload = f64::from(arguments.segments_per_second) * every.as_secs_f64();
         let records = all_per_upload / f64::from(u32::try_from(count)?);
@@ -142,6 +166,7 @@ impl UploadPlan {
             every,
             first,
             state_every: period_of(arguments.state_rate_hz),
+            saturates: false,
         })
     }
 }
@@ -157,7 +182,12 @@ async fn work(mut robot: LightRobot, plan: UploadPlan, end: Instant) -> anyhow::
     loop {
         tokio::select! {
             due = uploads.tick() => {
-                if due >= end {
+                let is_over = if plan.saturates {
+                    Instant::now() >= end
+                } else {
+                    due >= end
+                };
+                if is_over {
                     return Ok(tally);
                 }
                 let batch = robot.next_batch(plan.records);
@@ -176,29 +206,4 @@ async fn work(mut robot: LightRobot, plan: UploadPlan, end: Instant) -> anyhow::
             }
         }
     }
-}
-
-/// What the database holds.
-struct Stored {
-    segments: i64,
-    doubles: i64,
-    in_sums: i64,
-}
-
-async fn count_stored(fleet: &Fleet) -> anyhow::Result<Stored> {
-    let options = SqliteConnectOptions::new()
-        .filename(fleet.database())
-        .read_only(true);
-    let mut connection = options.connect().await?;
-    let row = sqlx::query(
-        "SELECT count(*), count(*) - count(DISTINCT boot_pk || ':' || seq), \
-         (SELECT coalesce(sum(segments), 0) FROM cell_sums) FROM segments",
-    )
-    .fetch_one(&mut connection)
-    .await?;
-    Ok(Stored {
-        segments: row.try_get(0)?,
-        doubles: row.try_get(1)?,
-        in_sums: row.try_get(2)?,
-    })
 }

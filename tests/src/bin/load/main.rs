@@ -8,6 +8,10 @@
 //!    time; afterwards the database must hold each acknowledged segment exactly once.
 //! 2. **dispatch**: circles are sent over REST to real agents, one at a time, while the light
 //!    robots publish their states; counted is the time from the request to the first wheel command.
+//!
+//! With `--saturate` ingest alone, in the hardest case: every robot uploads its next batch as soon as it
+//! has the receipt, and each segment is in another cell than the one before, of 1 600 cells of each
+//! robot, so that every segment has its own sum.
 
 mod dispatch;
 mod ingest;
@@ -42,6 +46,12 @@ pub(crate) struct Arguments {
     /// Time between two uploads of a robot, milliseconds
     #[arg(long, default_value_t = 250, value_parser = clap::value_parser!(u64).range(10..=10_000))]
     upload_every_ms: u64,
+    /// Upload as fast as receipts arrive, and measure nothing else
+    #[arg(long)]
+    saturate: bool,
+    /// Segments of each upload with `--saturate`
+    #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u16).range(1..=1_000))]
+    records: u16,
     /// States published per second by each light robot
     #[arg(long, default_value_t = 2.0)]
     state_rate_hz: f64,
@@ -70,7 +80,11 @@ async fn main() -> anyhow::Result<ExitCode> {
     };
     let robots = start_light_robots(&fleet, arguments.robots, arguments.tls).await?;
     let ingest = ingest::measure(&arguments, &mut fleet, robots).await?;
-    let dispatch = dispatch::measure(&arguments, &mut fleet).await?;
+    let dispatch = if arguments.saturate {
+        None
+    } else {
+        Some(dispatch::measure(&arguments, &mut fleet).await?)
+    };
     let details = Details {
         robots: arguments.robots,
         ingest,

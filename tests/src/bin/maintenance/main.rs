@@ -33,6 +33,7 @@ use tread_api::mission::MissionState;
 use tread_tests::fleet::{Fleet, SITE};
 use tread_tests::process::node;
 use tread_tests::report::{Check, figure, tell_with};
+use tread_tests::stored;
 use tread_tests::wait::{DRIVE, eventually};
 
 use crate::uploads::{Tally, Uploads};
@@ -244,7 +245,11 @@ async fn measure_backup(
     let usage = fleet.server_usage().context("the server is gone")?;
     details.server_memory_peak_mib = mib(usage.memory_peak_bytes);
     let ratio = details.receipt_p99_during_ms / details.receipt_p99_before_ms;
-    let stored = count_stored(fleet).await?;
+    // Sums are stored behind the receipts. A difference that stays is counted below.
+    if let Err(error) = stored::await_sums(&fleet.database()).await {
+        eprintln!("{error}");
+    }
+    let stored = stored::count(&fleet.database()).await?;
     checks.extend([
         Check::of("p99 of receipts during the backup / before", ratio).at_most(RECEIPT_RATIO_MAX),
         Check::of(
@@ -265,7 +270,7 @@ async fn measure_backup(
         Check::of_count("uploads without a receipt", failed).exactly(0),
         Check::of_count(
             "acknowledged segments that are missing",
-            committed.saturating_sub(stored.segments),
+            committed.saturating_sub(stored.segments.cast_unsigned()),
         )
         .exactly(0),
         Check::of_count(
@@ -294,28 +299,6 @@ async fn during(uploads: &Uploads, time: Duration) -> (Tally, f64) {
     let begin = Instant::now();
     tokio::time::sleep(time).await;
     (uploads.take(), begin.elapsed().as_secs_f64())
-}
-
-/// What the database holds.
-struct Stored {
-    segments: u64,
-    in_sums: u64,
-}
-
-async fn count_stored(fleet: &Fleet) -> anyhow::Result<Stored> {
-    let options = SqliteConnectOptions::new().filename(fleet.database());
-    let mut connection = options.read_only(true).connect().await?;
-    let row = sqlx::query(
-        "SELECT COUNT(*), (SELECT COALESCE(SUM(segments), 0) FROM cell_sums) FROM segments",
-    )
-    .fetch_one(&mut connection)
-    .await?;
-    let number =
-        |index: usize| -> anyhow::Result<u64> { Ok(u64::try_from(row.try_get::<i64, _>(index)?)?) };
-    Ok(Stored {
-        segments: number(0)?,
-        in_sums: number(1)?,
-    })
 }
 
 async fn measure_restoration(

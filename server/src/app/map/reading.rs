@@ -1,0 +1,162 @@
+//! Reads the map into memory: the stored sums, and the segments that follow each robot's watermark.
+
+use std::collections::HashMap;
+use std::sync::{Arc, PoisonError};
+use std::time::Duration;
+
+use tread_api::ids::{ConfigurationId, RobotId};
+use tread_api::rights::Scope;
+
+use super::unwritten::Unwritten;
+use super::{Folded, Maps, add, ensure};
+use crate::app::App;
+use crate::db::segments::Added;
+use crate::db::sums::SumKey;
+use crate::db::watermarks::Following;
+use crate::db::withdrawals::WithdrawalRow;
+use crate::db::{self, DbError, Tx};
+use crate::friction::index::SiteMap;
+use crate::friction::{Sums, epoch_h};
+
+/// What was read.
+struct Read {
+    sites: HashMap<i64, SiteMap>,
+    unwritten: Unwritten,
+}
+
+/// Database keys of what a segment names.
+struct Names {
+    robots: HashMap<i64, RobotId>,
+    configurations: HashMap<i64, ConfigurationId>,
+    configuration_keys: HashMap<ConfigurationId, i64>,
+    withdrawals: Vec<WithdrawalRow>,
+}
+
+impl App {
+    /// Reads all sums into memory, and the runs of which raw measurements were removed.
+    ///
+    /// # Errors
+    /// The database failed.
+    pub async fn load_map(&self) -> Result<(), DbError> {
+        self.load_map_again(self.db().unknown_outcomes()).await
+    }
+
+    /// Reads everything again when `ended` commits of unknown outcome have ended. No sums change
+    /// meanwhile.
+    ///
+    /// # Errors
+    /// The database failed; memory is unchanged.
+    pub(in crate::app) async fn load_map_again(&self, ended: u64) -> Result<(), DbError> {
+        let mut order = Arc::clone(&self.maps().order).lock_owned().await;
+        let mut tx = self.db().read("map").await?;
+        let now = self.clock().elapsed();
+        let read = read(&mut tx, now).await?;
+        self.removed().extend(db::removed::boots(&mut tx).await?);
+        drop(tx);
+        self.maps().replace(read);
+        *order = ended;
+        Ok(())
+    }
+}
+
+impl Maps {
+    /// Replaces the maps by those read from the database.
+    fn replace(&self, mut read: Read) {
+        let mut sites = self.sites.write().unwrap_or_else(PoisonError::into_inner);
+        for (pk, before) in sites.drain() {
+            match read.sites.get_mut(&pk) {
+                Some(map) => map.follow(&before),
+                None => {
+                    read.sites.insert(pk, before);
+                }
+            }
+        }
+        *sites = read.sites;
+        *self.unwritten() = read.unwritten;
+    }
+}
+
+async fn read(tx: &mut Tx, now: Duration) -> Result<Read, DbError> {
+    let mut sites = HashMap::new();
+    let mut after = String::new();
+    loop {
+        let rows = db::sites::list(tx, &Scope::EVERYWHERE, &after, 100).await?;
+        let Some(last) = rows.last() else { break };
+        after = last.site.id.to_string();
+        for row in &rows {
+            ensure(&mut sites, row);
+        }
+    }
+    let configurations = db::robots::configurations_by_key(tx).await?;
+    let names = Names {
+        robots: db::robots::ids_by_key(tx).await?,
+        configuration_keys: configurations.iter().map(|(&pk, &id)| (id, pk)).collect(),
+        configurations,
+        withdrawals: db::withdrawals::all(tx).await?,
+    };
+    db::sums::each(tx, |row| {
+        // The foreign keys of a sum guarantee both names.
+        if let Some(folded) = names.named(row.key, row.sums) {
+            add(&mut sites, std::slice::from_ref(&folded));
+        }
+    })
+    .await?;
+    let mut unwritten = Unwritten::following(db::watermarks::all(tx).await?);
+    db::watermarks::following(tx, |following| {
+        let keys = Added {
+            first: following.pk,
+            last: following.pk,
+        };
+        if let Some(folded) = names.folded(following)? {
+            unwritten.add([(&folded.key, &folded.sums)], keys, now);
+            add(&mut sites, std::slice::from_ref(&folded));
+        }
+        Ok(())
+    })
+    .await?;
+    Ok(Read { sites, unwritten })
+}
+
+impl Names {
+    fn named(&self, key: SumKey, sums: Sums) -> Option<Folded> {
+        Some(Folded {
+            robot: self.robots.get(&key.robot_pk)?.clone(),
+            configuration: *self.configurations.get(&key.configuration_pk)?,
+            sums,
+            key,
+        })
+    }
+
+    /// Returns the sum of a stored segment, as it was added before its receipt; `None` if it is
+    /// withdrawn.
+    fn folded(&self, following: Following) -> Result<Option<Folded>, DbError> {
+        let Following {
+            robot_pk,
+            site_pk,
+            segment,
+            ..
+        } = following;
+        let damaged = |what| DbError::Corrupt {
+            what,
+            value: following.pk.to_string(),
+        };
+        // It was checked, and its configuration noted, in the transaction that stored it.
+        let sums = Sums::of(&segment).ok_or_else(|| damaged("measurement out of range"))?;
+        let configuration_pk = self.configuration_keys.get(&segment.configuration);
+        let key = SumKey {
+            robot_pk,
+            epoch_h: epoch_h(segment.ended_at),
+            cell: segment.cell,
+            terrain: segment.terrain,
+            grid_revision: segment.grid_revision,
+            site_pk,
+            configuration_pk: *configuration_pk
+                .ok_or_else(|| damaged("measurement of no configuration"))?,
+        };
+        let is_withdrawn = |row: &WithdrawalRow| row.includes(robot_pk, key.epoch_h);
+        if self.withdrawals.iter().any(is_withdrawn) {
+            return Ok(None);
+        }
+        Ok(self.named(key, sums))
+    }
+}

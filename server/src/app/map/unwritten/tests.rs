@@ -1,0 +1,258 @@
+//! A model of the database: whatever is committed, stored, withdrawn and killed, stored and unwritten
+//! sums together are those of all segments.
+
+use proptest::prelude::*;
+use tread_api::site::Cell;
+
+use super::*;
+use crate::db::withdrawals::WithdrawalRow;
+use crate::friction::fixed::Fixed;
+use crate::friction::sums::{Pair, Pass};
+
+#[derive(Debug, Clone)]
+enum Act {
+    /// Segments are committed together: robot, cell, hour and value of each.
+    Commit(Vec<(i64, i32, i64, f64)>),
+    /// Sums are stored, so many in each transaction, for at most so many transactions.
+    Store {
+        limit: usize,
+        transactions: usize,
+    },
+    Withdraw(i64, (i64, i64)),
+    Kill,
+}
+
+fn act() -> impl Strategy<Value = Act> {
+    let segment = (0_i64..4, 0_i32..3, 0_i64..4, 0.0_f64..1e6);
+    prop_oneof![
+        5 => prop::collection::vec(segment, 0..8).prop_map(Act::Commit),
+        3 => (1_usize..6, 1_usize..4)
+            .prop_map(|(limit, transactions)| Act::Store { limit, transactions }),
+        1 => (0_i64..4, 0_i64..4, 0_i64..4)
+            .prop_map(|(robot, from, hours)| Act::Withdraw(robot, (from, from + hours))),
+        2 => Just(Act::Kill),
+    ]
+}
+
+fn key(robot_pk: i64, ix: i32, epoch_h: i64) -> SumKey {
+    SumKey {
+        robot_pk,
+        epoch_h,
+        cell: Cell { ix, iy: 0 },
+        terrain: None,
+        grid_revision: 1,
+        site_pk: 1,
+        configuration_pk: 1,
+    }
+}
+
+fn one(value: f64) -> Sums {
+    let fixed = Fixed::from_f64(value).unwrap();
+    let pair = Pair {
+        information: fixed,
+        weighted: fixed,
+    };
+    Sums {
+        theta: pair,
+        theta_square: fixed,
+        robot_error: fixed,
+        tyre_error: fixed,
+        track: pair,
+        rolling: pair,
+        segments: 1,
+        samples: 1,
+        mu_peak: Some(value),
+        newest_at_us: 1,
+        newest: Pass {
+            ended_at_us: 1,
+            theta: None,
+            mu_peak: Some(value),
+        },
+    }
+}
+
+type Table = BTreeMap<SumKey, Sums>;
+
+fn add_to(table: &mut Table, key: &SumKey, sums: &Sums) {
+    table
+        .entry(key.clone())
+        .and_modify(|present| present.add(sums))
+        .or_insert(*sums);
+}
+
+/// What a disk keeps, and the memory of a server on it.
+#[derive(Debug, Default)]
+struct Server {
+    /// The key of each is its index plus one.
+    segments: Vec<(SumKey, Sums)>,
+    stored: Table,
+    watermarks: HashMap<i64, i64>,
+    withdrawals: Vec<(i64, (i64, i64))>,
+    unwritten: Unwritten,
+}
+
+impl Server {
+    fn is_withdrawn(&self, key: &SumKey) -> bool {
+        self.withdrawals.iter().any(|&(robot_pk, (from_h, to_h))| {
+            let row = WithdrawalRow {
+                pk: 1,
+                robot_pk,
+                from_h,
+                to_h,
+                reason: String::new(),
+                by: String::new(),
+                at: jiff::Timestamp::UNIX_EPOCH,
+            };
+            row.includes(key.robot_pk, key.epoch_h)
+        })
+    }
+
+    fn run(&mut self, act: Act) {
+        match act {
+            Act::Commit(segments) => {
+                let first = last_key(&self.segments) + 1;
+                let mut folded = Table::new();
+                for (robot_pk, ix, hour, value) in segments {
+                    let (key, sums) = (key(robot_pk, ix, hour), one(value));
+                    if !self.is_withdrawn(&key) {
+                        add_to(&mut folded, &key, &sums);
+                    }
+                    self.segments.push((key, sums));
+                }
+                let last = last_key(&self.segments);
+                let added = Added { first, last };
+                self.unwritten.add(&folded, added, Duration::ZERO);
+            }
+            Act::Store {
+                limit,
+                transactions,
+            } => {
+                let until = self.unwritten.additions();
+                for _ in 0..transactions {
+                    let portion = self.unwritten.portion(until, limit);
+                    for (key, sums) in &portion.sums {
+                        add_to(&mut self.stored, key, sums);
+                    }
+                    for step in &portion.steps {
+                        let before = self.watermarks.insert(step.robot_pk, step.to_pk);
+                        assert_eq!(before.unwrap_or_default(), step.from_pk);
+                    }
+                    self.unwritten.written(&portion.steps);
+                }
+            }
+            Act::Withdraw(robot_pk, (from_h, to_h)) => {
+                self.withdrawals.push((robot_pk, (from_h, to_h)));
+                self.stored.retain(|key, _| {
+                    key.robot_pk != robot_pk || !(from_h..=to_h).contains(&key.epoch_h)
+                });
+                self.unwritten.withdraw(robot_pk, (from_h, to_h));
+            }
+            Act::Kill => {
+                self.unwritten = Unwritten::following(self.watermarks.clone());
+                for (pk, (key, sums)) in (1..).zip(&self.segments) {
+                    let watermark = self.watermarks.get(&key.robot_pk);
+                    if pk > watermark.copied().unwrap_or_default() && !self.is_withdrawn(key) {
+                        let added = Added {
+                            first: pk,
+                            last: pk,
+                        };
+                        self.unwritten.add([(key, sums)], added, Duration::ZERO);
+                    }
+                }
+            }
+        }
+    }
+
+    /// The sums of all segments that are not withdrawn.
+    fn expected(&self) -> Table {
+        let mut table = Table::new();
+        for (key, sums) in &self.segments {
+            if !self.is_withdrawn(key) {
+                add_to(&mut table, key, sums);
+            }
+        }
+        table
+    }
+
+    /// What the map shows.
+    fn shown(&self) -> Table {
+        let mut table = self.stored.clone();
+        for (key, sums) in &self.unwritten.portion(u64::MAX, usize::MAX).sums {
+            add_to(&mut table, key, sums);
+        }
+        table
+    }
+}
+
+fn last_key(segments: &[(SumKey, Sums)]) -> i64 {
+    i64::try_from(segments.len()).unwrap()
+}
+
+proptest! {
+    #[test]
+    fn stored_and_unwritten_sums_are_those_of_all_segments_whenever_the_server_is_killed(
+        acts in prop::collection::vec(act(), 0..40),
+    ) {
+        let mut server = Server::default();
+        for act in acts {
+            server.run(act);
+            prop_assert_eq!(server.shown(), server.expected());
+            let all = server.unwritten.portion(u64::MAX, usize::MAX);
+            let counts = server.unwritten.counts();
+            let segments = all.sums.iter().map(|(_, sums)| sums.segments).sum::<u64>();
+            prop_assert_eq!((counts.sums, counts.segments), (all.sums.len(), segments));
+            prop_assert_eq!(counts.oldest_at.is_some(), counts.sums > 0);
+            // Retention removes nothing that a killed server would miss.
+            let first = server.unwritten.first_key();
+            for (pk, (key, _)) in (1..).zip(&server.segments) {
+                let watermark = server.watermarks.get(&key.robot_pk);
+                if pk > watermark.copied().unwrap_or_default() && !server.is_withdrawn(key) {
+                    prop_assert!(first.is_some_and(|first| first <= pk));
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn a_portion_has_all_sums_of_its_robots_and_no_robot_that_began_later() {
+    let mut unwritten = Unwritten::default();
+    let added = Added { first: 1, last: 9 };
+    let sums: Table = (0..3)
+        .flat_map(|robot| (0..4).map(move |ix| (key(robot, ix, 0), one(1.0))))
+        .collect();
+    unwritten.add(&sums, added, Duration::ZERO);
+    let until = unwritten.additions();
+    let later: Table = [(key(7, 0, 0), one(1.0))].into();
+    unwritten.add(&later, added, Duration::ZERO);
+    let robots = |portion: &Portion| -> Vec<i64> {
+        portion.steps.iter().map(|step| step.robot_pk).collect()
+    };
+    let first = unwritten.portion(until, 1);
+    assert_eq!((robots(&first), first.sums.len()), (vec![0], 4));
+    let two = unwritten.portion(until, 9);
+    assert_eq!((robots(&two), two.sums.len()), (vec![0, 1], 8));
+    unwritten.written(&two.steps);
+    let rest = unwritten.portion(until, 9);
+    assert_eq!(robots(&rest), [2]);
+    unwritten.written(&rest.steps);
+    assert!(unwritten.portion(until, 9).steps.is_empty());
+    assert_eq!(unwritten.counts().sums, 1);
+}
+
+#[test]
+fn sums_are_stored_before_further_receipts_when_too_many_segments_are_unwritten() {
+    let mut unwritten = Unwritten::default();
+    let many = Sums {
+        segments: UNWRITTEN_SEGMENTS_MAX - 1,
+        ..one(1.0)
+    };
+    let added = Added { first: 1, last: 1 };
+    unwritten.add([(&key(1, 0, 0), &many)], added, Duration::ZERO);
+    assert!(!unwritten.is_full());
+    unwritten.add([(&key(1, 0, 0), &one(1.0))], added, Duration::ZERO);
+    assert!(unwritten.is_full());
+    let all = unwritten.portion(u64::MAX, 1);
+    unwritten.written(&all.steps);
+    assert!(!unwritten.is_full());
+}
