@@ -20,6 +20,7 @@ use tread_api::robot::{
     Aged, Capabilities, LoopStatus, OutboxStatus, RobotLimits, RobotMode, RobotModel,
 };
 use tread_api::site::Cell;
+use tread_api::wire::encoding::Encoding;
 use tread_api::wire::hello::{Hello, Welcome};
 use tread_api::wire::ingest::{Batch, Receipt, Record, RecordContent};
 use tread_api::wire::state::RobotState;
@@ -94,9 +95,19 @@ pub async fn ask_raw<A: DeserializeOwned>(
     key: &str,
     payload: Vec<u8>,
 ) -> anyhow::Result<A> {
+    ask_encoded(session, key, payload, Encoding::Json).await
+}
+
+async fn ask_encoded<A: DeserializeOwned>(
+    session: &Session,
+    key: &str,
+    payload: Vec<u8>,
+    encoding: Encoding,
+) -> anyhow::Result<A> {
     let replies = session
         .get(key)
         .payload(payload)
+        .encoding(encoding.media_type())
         .consolidation(ConsolidationMode::None)
         .timeout(ANSWER_WAIT_MAX)
         .await
@@ -148,6 +159,8 @@ pub struct LightRobot {
     pub session: Session,
     /// What the server answered of the site.
     pub welcome: Welcome,
+    /// Encoding of its uploads; at first the one that an agent would take.
+    pub encoding: Encoding,
     model: RobotModel,
     ingest_key: String,
     state_publisher: Publisher<'static>,
@@ -203,6 +216,7 @@ impl LightRobot {
             site: site.clone(),
             boot,
             session,
+            encoding: welcome.upload_encoding(),
             welcome,
             model,
             ingest_key,
@@ -328,7 +342,10 @@ impl LightRobot {
     /// The server did not answer in time, or refused.
     pub async fn upload(&self, batch: &Batch) -> anyhow::Result<(Receipt, Duration)> {
         let begin = Instant::now();
-        let receipt = ask(&self.session, &self.ingest_key, batch).await?;
+        let payload = wire::encode_as(self.encoding, batch);
+        let payload = payload.map_err(|error| anyhow::anyhow!("cannot encode: {error}"))?;
+        let key = &self.ingest_key;
+        let receipt = ask_encoded(&self.session, key, payload, self.encoding).await?;
         Ok((receipt, begin.elapsed()))
     }
 }

@@ -4,6 +4,7 @@
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
+use super::encoding::Encoding;
 use super::reply::{Acknowledgement, Command};
 use crate::ids::{BootId, RobotId};
 use crate::keys::Verb;
@@ -38,6 +39,20 @@ pub struct Welcome {
     pub site: SiteDefinition,
     /// Wall clock of the server.
     pub server_time: Timestamp,
+    /// Encodings of uploads that the server reads besides JSON; an older server names none.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub upload_encodings: Vec<Encoding>,
+}
+
+impl Welcome {
+    /// Returns the encoding in which a robot uploads to this server.
+    pub fn upload_encoding(&self) -> Encoding {
+        if self.upload_encodings.contains(&Encoding::Cbor) {
+            Encoding::Cbor
+        } else {
+            Encoding::Json
+        }
+    }
 }
 
 /// Data of a site that a robot needs to assign measurements to cells and terrains, and to respect

@@ -125,3 +125,69 @@ pub struct RefusedRecord {
     /// Reason, for people.
     pub reason: String,
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::wire::encoding::Encoding;
+    use crate::wire::{decode_as, encode_as};
+
+    const BATCH: &str = r#"{
+        "robot": "rover-1", "boot": "0192f0c1-2b3c-7d4e-8f50-617283940a1b",
+        "robot_time": "2026-11-26T08:00:00.123456Z",
+        "records": [
+            {"seq": 0, "content": {"segment": {
+                "configuration": "0192f0c1-2b3c-5d4e-8f50-617283940a1c",
+                "mission": "0192f0c1-2b3c-7d4e-8f50-617283940a1d",
+                "started_at": "2026-11-26T07:59:50Z", "ended_at": "2026-11-26T08:00:00.000001Z",
+                "grid_revision": 1, "cell": {"ix": -3, "iy": 4},
+                "terrain": {"id": "gravel", "revision": 2},
+                "theta": {"information": 2.5e4, "weighted": 5e3},
+                "theta_errors": {"independent_information": 3e4, "robot_ratio": 0.1,
+                    "tyre_ratio": 0.2},
+                "effective_track_ratio": {"information": 10.0, "weighted": 15.5},
+                "rolling_resistance": {"information": 100.0, "weighted": 2.5},
+                "mu_peak_lower_bound": 0.3, "samples": 160, "distance_m": 1.0,
+                "saturation_ratio": 0.0}}},
+            {"seq": 9007199254740991, "content": {"mission": {
+                "mission": "0192f0c1-2b3c-7d4e-8f50-617283940a1d", "revision": 1,
+                "plan_hash": "0192f0c1-2b3c-5d4e-8f50-617283940a1e",
+                "at": "2026-11-26T08:00:00Z", "phase": "failed", "reason": "no way",
+                "driven": {"tolerance_m": 0.05, "points": [{"x_m": 1.0, "y_m": -2.5}],
+                    "times_s": [0.5]}}}}
+        ]
+    }"#;
+
+    #[test]
+    fn a_batch_is_the_same_in_every_encoding() {
+        let batch: Batch = serde_json::from_str(BATCH).unwrap();
+        let mut sizes = Vec::new();
+        for encoding in [Encoding::Json, Encoding::Cbor] {
+            let payload = encode_as(encoding, &batch).unwrap();
+            assert_eq!(decode_as::<Batch>(encoding, &payload).unwrap(), batch);
+            sizes.push(payload.len());
+        }
+        assert!(sizes[1] < sizes[0], "{sizes:?}");
+    }
+
+    #[test]
+    fn another_major_version_is_refused_in_every_encoding() {
+        #[derive(Serialize)]
+        struct Newer {
+            v: u32,
+            body: Vec<u8>,
+        }
+        let newer = Newer {
+            v: 9,
+            body: Vec::new(),
+        };
+        for encoding in [Encoding::Json, Encoding::Cbor] {
+            let payload = encoding.write(&newer).unwrap();
+            let refused = decode_as::<Batch>(encoding, &payload).unwrap_err();
+            assert!(
+                matches!(refused, crate::wire::WireError::Version(9)),
+                "{refused:?}"
+            );
+        }
+    }
+}

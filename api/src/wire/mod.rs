@@ -1,9 +1,11 @@
-//! zenoh payloads: versioned JSON, readable by any zenoh client.
+//! zenoh payloads: versioned JSON, readable by any zenoh client, or CBOR of the same types where both
+//! sides know it ([`encoding`]).
 //!
 //! Every payload is `{"v": 2, "body": {…}}`. `v` is the major version; a payload of another major
 //! version is refused. Unknown fields are ignored, so that a newer peer may add fields.
 
 pub mod command;
+pub mod encoding;
 pub mod hello;
 pub mod ingest;
 pub mod reply;
@@ -11,10 +13,10 @@ pub mod safety;
 pub mod state;
 pub mod trace;
 
+use self::encoding::{CodecError, Encoding};
 use self::trace::TraceParent;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
-use serde_json::value::RawValue;
 
 /// Major version of all payloads.
 pub const VERSION: u32 = 2;
@@ -40,7 +42,7 @@ pub enum WireError {
     Version(u32),
     /// The payload does not parse.
     #[error("the payload does not parse")]
-    Malformed(#[source] serde_json::Error),
+    Malformed(#[source] CodecError),
 }
 
 #[derive(Serialize)]
@@ -52,10 +54,15 @@ struct Outgoing<'body, T> {
 }
 
 #[derive(Deserialize)]
-struct Incoming<'payload> {
+struct Incoming<T> {
     v: u32,
-    #[serde(borrow)]
-    body: &'payload RawValue,
+    body: T,
+}
+
+/// Of a payload, only its version.
+#[derive(Deserialize)]
+struct Versioned {
+    v: u32,
 }
 
 /// Encodes a payload.
@@ -65,6 +72,18 @@ struct Incoming<'payload> {
 /// number is not an error: it becomes `null`, which the reader refuses.
 pub fn encode<T: Serialize>(body: &T) -> Result<Vec<u8>, serde_json::Error> {
     encode_traced(body, None)
+}
+
+/// Encodes a payload in an encoding that the reader knows.
+///
+/// # Errors
+/// As [`encode`].
+pub fn encode_as<T: Serialize>(encoding: Encoding, body: &T) -> Result<Vec<u8>, CodecError> {
+    encoding.write(&Outgoing {
+        v: VERSION,
+        traceparent: None,
+        body,
+    })
 }
 
 /// Encodes a payload with a trace context beside its body, which older peers ignore.
@@ -96,19 +115,31 @@ pub fn traceparent(payload: &[u8]) -> Option<TraceParent> {
     Some(traced.traceparent)
 }
 
-/// Decodes a payload.
+/// Decodes a JSON payload.
 ///
 /// # Errors
 /// [`WireError`] if it is too large, of another major version, or does not parse as `T`.
 pub fn decode<T: DeserializeOwned>(payload: &[u8]) -> Result<T, WireError> {
+    decode_as(Encoding::Json, payload)
+}
+
+/// Decodes a payload in one pass.
+///
+/// # Errors
+/// As [`decode`].
+pub fn decode_as<T: DeserializeOwned>(encoding: Encoding, payload: &[u8]) -> Result<T, WireError> {
     if payload.len() > PAYLOAD_BYTES_MAX {
         return Err(WireError::TooLarge(payload.len()));
     }
-    let incoming: Incoming<'_> = serde_json::from_slice(payload).map_err(WireError::Malformed)?;
-    if incoming.v != VERSION {
-        return Err(WireError::Version(incoming.v));
+    match encoding.read::<Incoming<T>>(payload) {
+        Ok(incoming) if incoming.v == VERSION => Ok(incoming.body),
+        Ok(incoming) => Err(WireError::Version(incoming.v)),
+        // A body of another version need not parse.
+        Err(cause) => match encoding.read::<Versioned>(payload) {
+            Ok(Versioned { v }) if v != VERSION => Err(WireError::Version(v)),
+            _ => Err(WireError::Malformed(cause)),
+        },
     }
-    serde_json::from_str(incoming.body.get()).map_err(WireError::Malformed)
 }
 
 /// Reason why a peer refused a query; the body of every error reply.

@@ -1,5 +1,6 @@
 //! Errors of the link and of queries to the server.
 
+use tread_api::wire::encoding::CodecError;
 use tread_api::wire::{self, Refusal, RefusalCode, WireError};
 
 /// Why the link could not be opened.
@@ -49,8 +50,8 @@ pub enum AskError {
     #[error("the server's answer cannot be read")]
     Unreadable(#[source] WireError),
     /// The query cannot be encoded.
-    #[error("the message cannot be written as JSON")]
-    Unwritable(#[source] serde_json::Error),
+    #[error("the message cannot be encoded")]
+    Unwritable(#[source] CodecError),
     /// A call of zenoh failed.
     #[error(transparent)]
     Link(#[from] LinkError),

@@ -12,8 +12,10 @@ mod tunnel;
 pub mod uploader;
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use serde::Serialize;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::CancellationToken;
 use tracing::{debug, info, warn};
@@ -21,10 +23,11 @@ use tread_api::enrolment::TrustId;
 use tread_api::ids::{BootId, OwnerId, RobotId, SiteId};
 use tread_api::keys::{self, Key, Verb};
 use tread_api::safety::SMALL_PAYLOAD_MAX;
+use tread_api::wire::encoding::Encoding;
 use tread_api::wire::hello::{Hello, Welcome};
 use tread_api::wire::ingest::{Batch, Receipt};
 use tread_api::wire::state::{FrictionReport, RobotState, ServerPulse};
-use tread_api::wire::{self, PAYLOAD_BYTES_MAX};
+use tread_api::wire::{self, PAYLOAD_BYTES_MAX, RefusalCode};
 use zenoh::Wait;
 use zenoh::handlers::FifoChannel;
 use zenoh::liveliness::LivelinessToken;
@@ -119,6 +122,8 @@ impl std::fmt::Debug for Listeners {
 pub struct FleetLink {
     identity: Identity,
     session: zenoh::Session,
+    /// Whether the server that welcomed the robot last reads uploads in CBOR.
+    uploads_cbor: AtomicBool,
     state: Publisher<'static>,
     friction: Publisher<'static>,
     hello: Querier<'static>,
@@ -336,6 +341,7 @@ impl FleetLink {
         Ok(Self {
             identity,
             session,
+            uploads_cbor: AtomicBool::new(false),
             state,
             friction,
             hello,
@@ -428,26 +434,52 @@ impl FleetLink {
     /// # Errors
     /// [`AskError`] if the hello cannot be encoded, or no readable answer arrives.
     pub async fn hello(self: &Arc<Self>, hello: &Hello) -> Result<Welcome, AskError> {
-        let payload = wire::encode(hello).map_err(AskError::Unwritable)?;
-        let answer = self.ask(Question::Hello, payload).await?;
-        wire::decode(&answer).map_err(AskError::Unreadable)
+        let encoding = Encoding::Json;
+        let answer = self.ask_in(encoding, Question::Hello, hello).await?;
+        let welcome: Welcome = wire::decode(&answer).map_err(AskError::Unreadable)?;
+        self.uploads_cbor.store(
+            welcome.upload_encoding() == Encoding::Cbor,
+            Ordering::Relaxed,
+        );
+        Ok(welcome)
     }
 
-    /// Uploads a batch; the receipt is sent after the server's commit.
+    /// Uploads a batch in the encoding that the server's welcome names; the receipt is sent after the
+    /// server's commit.
     ///
     /// # Errors
     /// [`AskError`] if there is no readable receipt: the batch may or may not have been stored.
     pub async fn upload(self: &Arc<Self>, batch: &Batch) -> Result<Receipt, AskError> {
-        let payload = wire::encode(batch).map_err(AskError::Unwritable)?;
-        let answer = self.ask(Question::Ingest, payload).await?;
+        let encoding = self.upload_encoding();
+        let answer = match self.ask_in(encoding, Question::Ingest, batch).await {
+            // An older server has taken the place of the one that welcomed the robot.
+            Err(AskError::Refused(refusal))
+                if encoding != Encoding::Json && refusal.code == RefusalCode::Malformed =>
+            {
+                self.uploads_cbor.store(false, Ordering::Relaxed);
+                let encoding = Encoding::Json;
+                self.ask_in(encoding, Question::Ingest, batch).await?
+            }
+            answer => answer?,
+        };
         wire::decode(&answer).map_err(AskError::Unreadable)
     }
 
-    async fn ask(
+    fn upload_encoding(&self) -> Encoding {
+        if self.uploads_cbor.load(Ordering::Relaxed) {
+            Encoding::Cbor
+        } else {
+            Encoding::Json
+        }
+    }
+
+    async fn ask_in<T: Serialize>(
         self: &Arc<Self>,
+        encoding: Encoding,
         question: Question,
-        payload: Vec<u8>,
+        body: &T,
     ) -> Result<Vec<u8>, AskError> {
+        let payload = wire::encode_as(encoding, body).map_err(AskError::Unwritable)?;
         let link = Arc::clone(self);
         // Sending blocks while the network is slow.
         let sending = tokio::task::spawn_blocking(move || {
@@ -458,6 +490,7 @@ impl FleetLink {
             querier
                 .get()
                 .payload(payload)
+                .encoding(encoding.media_type())
                 .with(FifoChannel::new(REPLIES_MAX))
                 .wait()
         });

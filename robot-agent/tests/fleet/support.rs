@@ -163,6 +163,7 @@ impl FakeServer {
         let welcome = Welcome {
             site: definition,
             server_time: jiff::Timestamp::UNIX_EPOCH,
+            upload_encodings: Vec::new(),
         };
         let welcome = wire::encode(&welcome).unwrap();
         let (kept, answer) = (Arc::clone(memory), welcome);

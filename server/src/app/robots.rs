@@ -11,6 +11,7 @@ use tread_api::rights::Scope;
 use tread_api::robot::{ALERTS_MAX, Alert, ChangeRobot, Robot, RobotModel, TAGS_MAX};
 use tread_api::site::NAME_LENGTH_MAX;
 use tread_api::text::is_printable;
+use tread_api::wire::encoding::Encoding;
 use tread_api::wire::hello::{Hello, Welcome};
 use tread_api::wire::{Refusal, RefusalCode};
 
@@ -247,6 +248,7 @@ impl App {
             Ok(Welcome {
                 site,
                 server_time: now,
+                upload_encodings: vec![Encoding::Cbor],
             })
         }))
     }

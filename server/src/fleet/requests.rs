@@ -9,6 +9,7 @@ use tokio_util::sync::CancellationToken;
 use tracing::{debug, warn};
 use tread_api::ids::{RobotId, SiteId};
 use tread_api::keys::Key;
+use tread_api::wire::encoding::Encoding;
 use tread_api::wire::hello::Hello;
 use tread_api::wire::ingest::Batch;
 use tread_api::wire::{self, Refusal, RefusalCode};
@@ -84,7 +85,9 @@ impl Replies {
             .payload()
             .map(zenoh::bytes::ZBytes::to_bytes)
             .unwrap_or_default();
-        let body = match wire::decode::<T>(&payload) {
+        let encoding = query.encoding().map(ToString::to_string);
+        let encoding = Encoding::of_media_type(encoding.as_deref().unwrap_or_default());
+        let body = match wire::decode_as::<T>(encoding, &payload) {
             Ok(body) if *robot_of(&body) == robot => Ok(body),
             Ok(body) => {
                 self.app.counters().refused_impersonation.one();

@@ -93,6 +93,7 @@ fn listen(endpoint: &str, heard: &Arc<Mutex<Heard>>) -> zenoh::Session {
                 wire::encode(&Welcome {
                     site: definition(),
                     server_time: "2026-11-25T08:00:00Z".parse::<Timestamp>().unwrap(),
+                    upload_encodings: Vec::new(),
                 })
             } else {
                 let records = message["body"]["records"].as_array().map_or(0, Vec::len);

@@ -21,6 +21,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::Parser;
+use tread_api::wire::encoding::Encoding;
 use tread_tests::fleet::Fleet;
 use tread_tests::light_robot::LightRobot;
 use tread_tests::process::node;
@@ -52,6 +53,9 @@ pub(crate) struct Arguments {
     /// Segments of each upload with `--saturate`
     #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u16).range(1..=1_000))]
     records: u16,
+    /// Encoding of the uploads: `cbor` as agents take, or `json`
+    #[arg(long, default_value = "cbor", value_parser = encoding_of)]
+    encoding: Encoding,
     /// States published per second by each light robot
     #[arg(long, default_value_t = 2.0)]
     state_rate_hz: f64,
@@ -78,7 +82,10 @@ async fn main() -> anyhow::Result<ExitCode> {
     } else {
         Fleet::start_with(&node).await
     };
-    let robots = start_light_robots(&fleet, arguments.robots, arguments.tls).await?;
+    let mut robots = start_light_robots(&fleet, arguments.robots, arguments.tls).await?;
+    for robot in &mut robots {
+        robot.encoding = arguments.encoding;
+    }
     let ingest = ingest::measure(&arguments, &mut fleet, robots).await?;
     let dispatch = if arguments.saturate {
         None
@@ -87,6 +94,7 @@ async fn main() -> anyhow::Result<ExitCode> {
     };
     let details = Details {
         robots: arguments.robots,
+        encoding: arguments.encoding,
         ingest,
         dispatch,
     };
@@ -121,6 +129,14 @@ pub(crate) async fn start_light_robots(
         }
     }
     Ok(robots)
+}
+
+fn encoding_of(text: &str) -> Result<Encoding, String> {
+    match text {
+        "cbor" => Ok(Encoding::Cbor),
+        "json" => Ok(Encoding::Json),
+        _ => Err("it is `cbor` or `json`".to_owned()),
+    }
 }
 
 /// A period as a duration; longer than any measurement when the rate is not above zero.
