@@ -207,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn an_unknown_encoding_is_no_error_and_media_types_are_told_apart() {
+    fn an_unknown_encoding_is_no_error_and_each_media_type_is_another() {
         let known: Vec<Encoding> = serde_json::from_str(r#"["json","cbor","zstd"]"#).unwrap();
         assert_eq!(known, [Encoding::Json, Encoding::Cbor, Encoding::Other]);
         for encoding in [Encoding::Json, Encoding::Cbor] {

@@ -7,9 +7,10 @@
 //! segment that is sent twice counts once.
 
 mod keys;
+mod known;
 mod prepared;
 
-use std::collections::hash_map::Entry;
+use std::borrow::Cow;
 use std::collections::{HashMap, HashSet};
 use std::time::Duration;
 
@@ -29,22 +30,23 @@ use tread_api::wire::ingest::{
 use tread_api::wire::{Refusal, RefusalCode};
 
 use self::keys::{CONFIGURATIONS_MAX, Configured, Keys, RobotKeys};
+use self::known::Known;
 pub(super) use self::prepared::SKEW_MIN;
-use self::prepared::{Prepared, Ready, Skew, prepared};
+use self::prepared::{Prepared, Ready, Skew, prepared, us_of};
 use super::App;
 use super::map::{Folded, MapChange};
 use super::missions::reports::{Foreign, Reporting, Taken, take_report};
 use crate::db::deferred_segments::Origin;
-use crate::db::segments::{Added, New, NewSegment};
+use crate::db::segments::{Added, NewSegment};
 use crate::db::sums::SumKey;
 use crate::db::withdrawals::WithdrawalRow;
 use crate::db::{self, DbError, Tx};
-use crate::friction::epoch_h;
+use crate::friction::epoch_h_at;
 
 /// Maximum number of uploads that wait for the writer.
 pub const UPLOADS_WAITING_MAX: usize = 256;
 /// Number of records in a transaction beyond which it takes no further batch.
-const GROUP_RECORDS_MAX: usize = 2_000;
+const GROUP_RECORDS_MAX: usize = 5_000;
 /// Minimum interval between the beginnings of two transactions while uploads keep arriving: each
 /// transaction has a cost of its own, in processor time and on the disk.
 const GROUP_INTERVAL: Duration = Duration::from_millis(40);
@@ -111,7 +113,31 @@ struct Candidate<'group> {
     robot_pk: i64,
     configuration_pk: i64,
     robot: &'group RobotId,
-    ready: Box<Ready>,
+    ready: Ready<'group>,
+}
+
+impl Candidate<'_> {
+    fn row(&self) -> NewSegment<'_> {
+        let (boot_pk, seq) = self.keys;
+        NewSegment {
+            boot_pk,
+            seq,
+            robot_pk: self.robot_pk,
+            site_pk: self.site_pk,
+            configuration_pk: self.configuration_pk,
+            segment: &self.ready.segment,
+            times_ns: self.ready.times_ns,
+        }
+    }
+
+    /// Returns whether the sums of a segment that ended in an hour belong to these.
+    fn belongs_to(&self, folded: &Folded, epoch_h: i64) -> bool {
+        let (key, segment) = (&folded.key, &*self.ready.segment);
+        (key.robot_pk, key.site_pk, key.configuration_pk)
+            == (self.robot_pk, self.site_pk, self.configuration_pk)
+            && (key.epoch_h, key.grid_revision) == (epoch_h, segment.grid_revision)
+            && key.terrain == segment.terrain
+    }
 }
 
 /// A batch whose robot and run are known.
@@ -263,7 +289,8 @@ impl Writer {
 
     async fn commit_once(&mut self, group: &[Upload]) -> Result<(Vec<Outcome>, Tally), DbError> {
         let mut outcomes: Vec<Outcome> = Vec::with_capacity(group.len());
-        let mut candidates = Vec::new();
+        let records = group.iter().map(|upload| upload.batch.records.len());
+        let mut candidates = Vec::with_capacity(records.sum());
         let mut tally = Tally::default();
         let app = self.app.clone();
         app.bound_unwritten_sums().await?;
@@ -419,55 +446,24 @@ impl Writer {
         }))
     }
 
-    /// Returns those of the candidates that were stored before and removed at the end of their
-    /// retention. Queries only runs with removed measurements, so that all others cost nothing.
-    async fn removed_before(
-        &self,
-        tx: &mut Tx,
-        candidates: &[Candidate<'_>],
-    ) -> Result<HashSet<(i64, i64)>, DbError> {
-        let mut spans: HashMap<i64, (i64, i64)> = HashMap::new();
-        for &(boot_pk, seq) in candidates.iter().map(|candidate| &candidate.keys) {
-            if self.app.removed().has(boot_pk) {
-                let span = spans.entry(boot_pk).or_insert((seq, seq));
-                *span = (span.0.min(seq), span.1.max(seq));
-            }
-        }
-        let mut removed = HashSet::new();
-        for (boot_pk, span) in spans {
-            let ranges = db::removed::within(tx, boot_pk, span).await?;
-            let keys = candidates.iter().map(|candidate| candidate.keys);
-            removed.extend(keys.filter(|&(of, seq)| {
-                let holds = |&(from, to): &(i64, i64)| (from..=to).contains(&seq);
-                of == boot_pk && ranges.iter().any(holds)
-            }));
-        }
-        Ok(removed)
-    }
-
     /// Stores segments. Returns the sums of those that are new and not withdrawn, and the keys of
     /// all that are new.
     async fn insert(
-        &self,
+        &mut self,
         tx: &mut Tx,
         candidates: &[Candidate<'_>],
         now: Timestamp,
         outcomes: &mut [Outcome],
         tally: &mut Tally,
     ) -> Result<(Vec<Folded>, Added), DbError> {
-        let removed = self.removed_before(tx, candidates).await?;
-        let rows = rows(candidates, &removed);
-        let (new, added) = db::segments::insert_new(tx, &rows, now).await?;
-        let mut new: Option<HashSet<(i64, i64)>> = match new {
-            New::All => None,
-            New::Only(names) => Some(names.into_iter().collect()),
-        };
+        let removed = self.app.removed();
+        let mut known = Known::read(tx, candidates, removed, &mut self.keys).await?;
         let withdrawals = db::withdrawals::all(tx).await?;
-        let mut folded: HashMap<SumKey, Folded> = HashMap::new();
+        let mut rows = Vec::with_capacity(candidates.len());
+        let mut folded: Vec<Folded> = Vec::new();
         for candidate in candidates {
             // A segment that occurs twice in this group is new once.
-            let is_new = !removed.contains(&candidate.keys)
-                && new.as_mut().is_none_or(|new| new.remove(&candidate.keys));
+            let is_new = known.insert(candidate.keys);
             let upload = candidate.upload.and_then(|upload| outcomes.get_mut(upload));
             if let Some(Ok(receipt)) = upload {
                 if is_new {
@@ -480,74 +476,64 @@ impl Writer {
                 continue;
             }
             tally.segments += 1;
-            let Ready { segment, sums, .. } = &*candidate.ready;
-            let configuration = segment.configuration;
-            let key = SumKey {
-                site_pk: candidate.site_pk,
-                cell: segment.cell,
-                grid_revision: segment.grid_revision,
-                terrain: segment.terrain.clone(),
-                robot_pk: candidate.robot_pk,
-                configuration_pk: candidate.configuration_pk,
-                epoch_h: epoch_h(segment.ended_at),
-            };
-            let is_withdrawn = |row: &WithdrawalRow| row.includes(key.robot_pk, key.epoch_h);
+            rows.push(candidate.row());
+            let Ready {
+                segment,
+                times_ns,
+                sums,
+            } = &candidate.ready;
+            let epoch_h = epoch_h_at(us_of(times_ns.1));
+            let is_withdrawn = |row: &WithdrawalRow| row.includes(candidate.robot_pk, epoch_h);
             if withdrawals.iter().any(is_withdrawn) {
                 continue;
             }
-            match folded.entry(key) {
-                Entry::Occupied(mut present) => present.get_mut().sums.add(sums),
-                Entry::Vacant(room) => {
-                    let key = room.key().clone();
-                    room.insert(Folded {
-                        key,
-                        robot: candidate.robot.clone(),
-                        configuration,
-                        sums: *sums,
-                    });
-                }
+            let last = folded.last_mut();
+            match last.filter(|last| candidate.belongs_to(last, epoch_h)) {
+                Some(last) => last.cells.push((segment.cell, *sums)),
+                None => folded.push(Folded {
+                    key: SumKey {
+                        site_pk: candidate.site_pk,
+                        cell: segment.cell,
+                        grid_revision: segment.grid_revision,
+                        terrain: segment.terrain.clone(),
+                        robot_pk: candidate.robot_pk,
+                        configuration_pk: candidate.configuration_pk,
+                        epoch_h,
+                    },
+                    robot: candidate.robot.clone(),
+                    configuration: segment.configuration,
+                    cells: vec![(segment.cell, *sums)],
+                }),
             }
         }
-        Ok((folded.into_values().collect(), added))
+        let added = db::segments::insert(tx, &rows, now).await?;
+        Ok((folded, added))
     }
-}
-
-fn rows<'group>(
-    candidates: &'group [Candidate<'_>],
-    removed: &HashSet<(i64, i64)>,
-) -> Vec<NewSegment<'group>> {
-    let row = |candidate: &'group Candidate<'_>| {
-        let terrain = candidate.ready.segment.terrain.as_ref();
-        let terrain = terrain.map_or("", |terrain| terrain.id.as_str());
-        let (boot_pk, seq) = candidate.keys;
-        let (robot_pk, site_pk) = (candidate.robot_pk, candidate.site_pk);
-        let measurement = &*candidate.ready.measurement;
-        NewSegment(boot_pk, seq, robot_pk, site_pk, terrain, measurement)
-    };
-    let kept = candidates
-        .iter()
-        .filter(|candidate| !removed.contains(&candidate.keys));
-    kept.map(row).collect()
 }
 
 /// Returns the configurations that a batch measured with.
 fn measured_with(batch: &Batch) -> HashSet<ConfigurationId> {
-    let records = batch.records.iter();
-    let configurations = records.filter_map(|record| match &record.content {
-        RecordContent::Segment(segment) => Some(segment.configuration),
-        RecordContent::Mission(_) => None,
-    });
-    configurations.collect()
+    let mut found = HashSet::new();
+    let mut last = None;
+    for record in &batch.records {
+        if let RecordContent::Segment(segment) = &record.content
+            && last != Some(segment.configuration)
+        {
+            last = Some(segment.configuration);
+            found.insert(segment.configuration);
+        }
+    }
+    found
 }
 
 /// Checks a segment. Returns it with the key of its configuration, or the reason why it is refused.
-fn possible(
-    segment: &Segment,
+fn possible<'segment>(
+    segment: &'segment Segment,
     grid: &Grid,
     skew: Skew,
     configurations: &HashMap<ConfigurationId, i64>,
-) -> Result<(i64, Prepared), String> {
-    let prepared = prepared(segment, grid, skew)?;
+) -> Result<(i64, Prepared<'segment>), String> {
+    let prepared = prepared(Cow::Borrowed(segment), grid, skew)?;
     let configuration = configurations.get(&segment.configuration).ok_or_else(|| {
         format!("the robot has measured with {CONFIGURATIONS_MAX} other configurations")
     })?;
@@ -586,10 +572,10 @@ async fn released(
     boot_pk: i64,
     grid: &Grid,
     skew: Skew,
-) -> Result<Vec<((i64, i64), Box<Ready>)>, DbError> {
+) -> Result<Vec<((i64, i64), Ready<'static>)>, DbError> {
     let waiting = db::deferred_segments::take(tx, boot_pk, skew.latest_us(), RELEASED_MAX).await?;
     let ready = |waiting: db::deferred_segments::DeferredSegment| match prepared(
-        &waiting.segment,
+        Cow::Owned(waiting.segment),
         grid,
         skew,
     ) {

@@ -10,12 +10,13 @@ mod reading;
 mod unwritten;
 pub mod writing;
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::sync::{Arc, Mutex as StdMutex, MutexGuard, PoisonError, RwLock};
 
 use tokio::sync::{Mutex, OwnedMutexGuard};
 use tread_api::ids::{ConfigurationId, RobotId};
 use tread_api::robot::Alert;
+use tread_api::site::Cell;
 
 use self::unwritten::Unwritten;
 pub use self::unwritten::UnwrittenCounts;
@@ -61,16 +62,17 @@ pub(super) enum MapChange {
     /// Hours before this one are merged into days.
     MergeBefore(Box<SiteRow>, i64),
     /// Raw measurements of these runs were removed.
-    Remove(Vec<i64>),
+    Remove(HashSet<i64>),
 }
 
-/// Sums to be added to the map.
+/// Sums to be added to the map, which agree in all but their cells.
 #[derive(Debug, Clone)]
 pub(super) struct Folded {
+    /// Key of the first cell.
     pub(super) key: SumKey,
     pub(super) robot: RobotId,
     pub(super) configuration: ConfigurationId,
-    pub(super) sums: Sums,
+    pub(super) cells: Vec<(Cell, Sums)>,
 }
 
 /// A robot's hours whose sums are removed.
@@ -148,7 +150,7 @@ fn add(sites: &mut HashMap<i64, SiteMap>, folded: &[Folded]) {
         key,
         robot,
         configuration,
-        sums,
+        cells,
     } in folded
     {
         if let Some(map) = sites.get_mut(&key.site_pk) {
@@ -160,7 +162,7 @@ fn add(sites: &mut HashMap<i64, SiteMap>, folded: &[Folded]) {
                 robot,
                 epoch_h: key.epoch_h,
             };
-            map.add(labelled, sums);
+            map.add_cells(labelled, cells);
         }
     }
 }
@@ -184,7 +186,7 @@ impl App {
             MapChange::Nothing => {}
             MapChange::Add(folded, added) => {
                 if !folded.is_empty() {
-                    let sums = folded.iter().map(|part| (&part.key, &part.sums));
+                    let sums = folded.iter().map(|part| (&part.key, &*part.cells));
                     let now = self.clock().elapsed();
                     self.maps().unwritten().add(sums, added, now);
                     let sites = self.maps().sites.write();

@@ -84,35 +84,32 @@ impl App {
         let kept = SignedDuration::from_hours(i64::from(config.segments_days) * DAY_H);
         let before = now.checked_sub(kept).unwrap_or(jiff::Timestamp::MIN);
         let mut tx = self.db().read("retention").await?;
-        let Some(last) = db::removed::last_key(&mut tx).await? else {
+        let Some((first, last)) = db::segment_ranges::ends(&mut tx).await? else {
             return Ok(0);
         };
-        // Keys have no gaps, since only the first ones are ever removed.
-        let before_pk = last.saturating_sub(config.segments_max) + 1;
-        let mut rows = db::removed::oldest(&mut tx, before, before_pk, limit).await?;
-        // The last row stays, so that keys, which are cursors of lists, never restart.
-        rows.retain(|row| row.pk < last);
+        let until = first.saturating_add(i64::from(limit)) - 1;
+        let old = db::removed::last_before(&mut tx, before, until).await?;
         drop(tx);
-        let first = self.first_unwritten_key();
-        if rows
-            .iter()
-            .any(|row| first.is_some_and(|first| row.pk >= first))
-        {
+        // Keys have no gaps, since only the first ones are ever removed. The last one stays, so that
+        // keys, which are cursors of lists, never restart.
+        let over = last.saturating_sub(config.segments_max);
+        let until = until.min(over.max(old.unwrap_or_default())).min(last - 1);
+        let unwritten = self.first_unwritten_key();
+        if first <= until && unwritten.is_some_and(|unwritten| unwritten <= until) {
             self.write_sums().await?;
         }
         // Uploads wait meanwhile: none is between checking the names and its commit.
         let turn = self.map_turn_to_change().await?;
-        let first = self.first_unwritten_key();
-        rows.retain(|row| first.is_none_or(|first| row.pk < first));
-        if rows.is_empty() {
+        let unwritten = self.first_unwritten_key();
+        let until = unwritten.map_or(until, |unwritten| until.min(unwritten - 1));
+        if until < first {
             return Ok(0);
         }
         let mut tx = self.db().write("retention").await?;
-        db::removed::remove(&mut tx, &rows).await?;
-        let boots = rows.iter().map(|row| row.boot_pk).collect();
+        let (removed, boots) = db::removed::remove(&mut tx, until).await?;
         turn.commit(tx, MapChange::Remove(boots), Vec::new())
             .await?;
-        self.counters().segments_removed.add(rows.len() as u64);
-        Ok(rows.len() as u64)
+        self.counters().segments_removed.add(removed);
+        Ok(removed)
     }
 }

@@ -14,7 +14,7 @@ use sqlx::{AssertSqlSafe, ConnectOptions as _, Connection as _, SqliteConnection
 
 use super::{BUSY_TIMEOUT, DbError, corrupt, unsigned};
 
-/// Tables whose rows are counted in a copy.
+/// Tables and views whose rows are counted in a copy.
 const COUNTED: [&str; 8] = [
     "audit",
     "cell_sums",
@@ -132,12 +132,13 @@ async fn examine_with(connection: &mut SqliteConnection) -> Result<CopyContents,
     let schema = schema.ok_or_else(|| corrupt("schema", "no migration"))?;
     let mut rows = BTreeMap::new();
     for table in COUNTED {
-        let is_there: Option<(i64,)> =
-            sqlx::query_as("SELECT 1 FROM sqlite_schema WHERE type = 'table' AND name = ?")
-                .bind(table)
-                .fetch_optional(&mut *connection)
-                .await
-                .map_err(failed)?;
+        let is_there: Option<(i64,)> = sqlx::query_as(
+            "SELECT 1 FROM sqlite_schema WHERE type IN ('table', 'view') AND name = ?",
+        )
+        .bind(table)
+        .fetch_optional(&mut *connection)
+        .await
+        .map_err(failed)?;
         if is_there.is_none() {
             continue;
         }

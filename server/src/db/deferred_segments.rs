@@ -47,7 +47,8 @@ pub async fn put(
         "INSERT INTO deferred_segments
              (boot_pk, seq, site_pk, robot_pk, ended_at_us, received_at_us, measurement)
          SELECT ?1, ?2, ?3, ?4, ?5, ?6, ?7
-         WHERE NOT EXISTS (SELECT 1 FROM segments WHERE boot_pk = ?1 AND seq = ?2)
+         WHERE COALESCE((SELECT last_seq FROM segment_ranges WHERE boot_pk = ?1 AND first_seq <= ?2
+                 ORDER BY first_seq DESC LIMIT 1) < ?2, TRUE)
              AND NOT EXISTS (SELECT 1 FROM segments_removed
                  WHERE boot_pk = ?1 AND ?2 BETWEEN from_seq AND to_seq)
          ON CONFLICT DO NOTHING",

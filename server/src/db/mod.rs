@@ -26,6 +26,7 @@ pub mod robots;
 mod rows;
 pub mod schema;
 pub mod secrets;
+pub mod segment_ranges;
 pub mod segments;
 pub mod sessions;
 pub mod sites;

@@ -1,7 +1,7 @@
 //! Raw measurements that were removed after their retention; their names (`boot`, `seq`) are kept
 //! as ranges.
 
-use std::collections::{BTreeMap, HashSet};
+use std::collections::HashSet;
 
 use futures_util::TryStreamExt as _;
 use jiff::Timestamp;
@@ -9,70 +9,59 @@ use sqlx::SqliteConnection;
 
 use super::{DbError, to_us};
 
-/// A raw measurement to be removed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Oldest {
-    /// Its key; keys are in the order of commits.
-    pub pk: i64,
-    /// Key of the run of the agent.
-    pub boot_pk: i64,
-    /// Its sequence number within that run.
-    pub seq: i64,
-    /// Time at which it was received, microseconds since 1970.
-    pub received_at_us: i64,
-}
-
-/// Returns at most `limit` of the oldest measurements that were received before a time or lie
-/// before a key.
-///
-/// Keys increase with commits, so later measurements have larger ones.
-pub async fn oldest(
+/// Returns the key of the last measurement that was received before a time and lies in a range that
+/// begins at or before a key; `None` without such ones.
+pub async fn last_before(
     db: &mut SqliteConnection,
     before: Timestamp,
-    before_pk: i64,
-    limit: u32,
-) -> Result<Vec<Oldest>, DbError> {
-    let rows = sqlx::query_as!(
-        Oldest,
-        r#"SELECT pk AS "pk!", boot_pk, seq, received_at_us FROM segments
-           ORDER BY pk LIMIT ?"#,
-        limit,
-    );
-    let mut rows = rows.fetch_all(db).await?;
+    begins_until_pk: i64,
+) -> Result<Option<i64>, DbError> {
     let before_us = to_us(before);
-    let is_over = |row: &Oldest| row.received_at_us < before_us || row.pk < before_pk;
-    let over = rows.iter().take_while(|row| is_over(row)).count();
-    rows.truncate(over);
-    Ok(rows)
-}
-
-/// Returns the last key; `None` without measurements.
-pub async fn last_key(db: &mut SqliteConnection) -> Result<Option<i64>, DbError> {
-    let last = sqlx::query_scalar!(r#"SELECT MAX(pk) AS "last: i64" FROM segments"#);
+    let last = sqlx::query_scalar!(
+        r#"SELECT MAX(last_pk) AS "last: i64" FROM segment_ranges
+           WHERE first_pk <= ? AND received_at_us < ?"#,
+        begins_until_pk,
+        before_us,
+    );
     Ok(last.fetch_one(db).await?)
 }
 
-/// Removes measurements, and records their names.
-pub async fn remove(db: &mut SqliteConnection, rows: &[Oldest]) -> Result<(), DbError> {
-    let Some(last) = rows.last() else {
-        return Ok(());
-    };
-    let mut seqs: BTreeMap<i64, Vec<i64>> = BTreeMap::new();
-    for row in rows {
-        seqs.entry(row.boot_pk).or_default().push(row.seq);
+/// Removes the measurements up to a key, and records their names. Returns how many they were, and the
+/// runs of agents that they are of.
+pub async fn remove(
+    db: &mut SqliteConnection,
+    until_pk: i64,
+) -> Result<(u64, HashSet<i64>), DbError> {
+    let ranges = sqlx::query!(
+        r#"SELECT first_pk AS "first_pk!", last_pk, first_seq, boot_pk FROM segment_ranges
+           WHERE first_pk <= ? ORDER BY first_pk"#,
+        until_pk
+    );
+    let mut boots = HashSet::new();
+    for range in ranges.fetch_all(&mut *db).await? {
+        let last = range.last_pk.min(until_pk);
+        let seqs = (range.first_seq, range.first_seq + (last - range.first_pk));
+        note(db, range.boot_pk, seqs).await?;
+        boots.insert(range.boot_pk);
     }
-    for (boot_pk, mut seqs) in seqs {
-        seqs.sort_unstable();
-        for run in seqs.chunk_by(|left, right| left + 1 == *right) {
-            if let (Some(&from), Some(&to)) = (run.first(), run.last()) {
-                note(db, boot_pk, (from, to)).await?;
-            }
-        }
-    }
-    sqlx::query!("DELETE FROM segments WHERE pk <= ?", last.pk)
+    sqlx::query!(
+        "DELETE FROM segment_ranges WHERE first_pk <= ?1 AND last_pk <= ?1",
+        until_pk
+    )
+    .execute(&mut *db)
+    .await?;
+    // Of a range that remains in part, the first measurements go.
+    sqlx::query!(
+        "UPDATE segment_ranges SET first_seq = first_seq + (?1 + 1 - first_pk), first_pk = ?1 + 1
+         WHERE first_pk <= ?1",
+        until_pk
+    )
+    .execute(&mut *db)
+    .await?;
+    let removed = sqlx::query!("DELETE FROM segment_values WHERE pk <= ?", until_pk)
         .execute(db)
         .await?;
-    Ok(())
+    Ok((removed.rows_affected(), boots))
 }
 
 /// Records a range, joined with the ranges that it touches.
@@ -133,4 +122,13 @@ pub async fn within(
         found.push((row.from_seq, row.to_seq));
     }
     Ok(found)
+}
+
+/// Returns the largest removed sequence number of a run; `None` without removed measurements.
+pub async fn newest_seq(db: &mut SqliteConnection, boot_pk: i64) -> Result<Option<i64>, DbError> {
+    let newest = sqlx::query_scalar!(
+        "SELECT to_seq FROM segments_removed WHERE boot_pk = ? ORDER BY from_seq DESC LIMIT 1",
+        boot_pk
+    );
+    Ok(newest.fetch_optional(db).await?)
 }

@@ -301,7 +301,7 @@ async fn forget_runs(db: &mut SqliteConnection, robot_pk: i64, kept: u32) -> Res
              AND boots.pk <= (SELECT more.pk FROM boots AS more WHERE more.robot_pk = ?1
                  ORDER BY more.pk DESC LIMIT 1 OFFSET ?2)
              AND boots.id <> (SELECT robots.boot FROM robots WHERE robots.pk = ?1)
-             AND NOT EXISTS (SELECT 1 FROM segments WHERE segments.boot_pk = boots.pk)
+             AND NOT EXISTS (SELECT 1 FROM segment_ranges WHERE segment_ranges.boot_pk = boots.pk)
              AND NOT EXISTS (SELECT 1 FROM deferred_segments
                  WHERE deferred_segments.boot_pk = boots.pk)
            ORDER BY boots.pk LIMIT ?3"#,

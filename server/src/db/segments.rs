@@ -1,54 +1,67 @@
 //! Raw measurements, in the order of their commits.
+//!
+//! Their values have a table of typed columns; what the measurements of a range have in common is in
+//! the ledger ([`super::segment_ranges`]).
 
 use std::collections::BTreeSet;
 use std::sync::LazyLock;
 
+use futures_util::{Stream, StreamExt as _};
 use jiff::Timestamp;
-use serde_json::value::RawValue;
 use sqlx::SqliteConnection;
-use tread_api::friction::{Segment, StoredSegment};
+use tread_api::friction::{Information, Segment, StoredSegment, ThetaErrors};
 use tread_api::ids::{RobotId, TerrainId};
+use tread_api::site::Cell;
+use tread_api::terrain::TerrainRef;
 
 use super::rows::{Row, RowsStatement};
-use super::{DbError, from_json, from_us, parse, robots_text, to_us, unsigned};
+use super::segment_ranges::{self, NewRange};
+use super::{DbError, corrupt, from_us, parse, robots_text, to_us, unsigned};
 
 /// A measurement to be stored.
-#[derive(Debug)]
-pub struct NewSegment<'segment>(
+#[derive(Debug, Clone, Copy)]
+pub struct NewSegment<'segment> {
     /// Key of the run of the agent.
-    pub i64,
+    pub boot_pk: i64,
     /// Its sequence number within that run.
-    pub i64,
+    pub seq: i64,
     /// Key of the robot.
-    pub i64,
+    pub robot_pk: i64,
     /// Key of the site.
-    pub i64,
-    /// Identifier of the terrain; `""` for none.
-    pub &'segment str,
-    /// The measurement as JSON.
-    pub &'segment RawValue,
-);
+    pub site_pk: i64,
+    /// Key of the configuration.
+    pub configuration_pk: i64,
+    /// The measurement.
+    pub segment: &'segment Segment,
+    /// Its begin and end, by the server's clock, nanoseconds since 1970.
+    pub times_ns: (i64, i64),
+}
+
+impl NewSegment<'_> {
+    /// Returns whether the ledger may name this and the next measurement in one range.
+    fn is_followed_by(&self, next: &Self) -> bool {
+        let whole = |new: &Self| (new.boot_pk, new.robot_pk, new.site_pk, new.configuration_pk);
+        let shared = |segment: &Segment| (segment.mission, segment.grid_revision);
+        self.seq.checked_add(1) == Some(next.seq)
+            && whole(self) == whole(next)
+            && shared(self.segment) == shared(next.segment)
+            && self.segment.terrain == next.segment.terrain
+    }
+}
 
 /// Number of columns of a measurement.
-const COLUMNS: usize = 7;
+const COLUMNS: usize = 18;
 
 static INSERT: LazyLock<RowsStatement> = LazyLock::new(|| {
     RowsStatement::new(
-        "INSERT INTO segments
-             (boot_pk, seq, robot_pk, site_pk, terrain, received_at_us, measurement)",
+        "INSERT INTO segment_values (pk, started_at_ns, ended_at_ns, ix, iy, theta_information,
+             theta_weighted, independent_information, robot_error_ratio, tyre_error_ratio,
+             track_information, track_weighted, rolling_information, rolling_weighted,
+             mu_peak_lower_bound, samples, distance_m, saturation_ratio)",
         COLUMNS,
-        "ON CONFLICT (boot_pk, seq) DO NOTHING",
+        "",
     )
 });
-
-/// Those of the given measurements that were new.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum New {
-    /// All of them.
-    All,
-    /// Those with these names (run and sequence number), in the given order.
-    Only(Vec<(i64, i64)>),
-}
 
 /// Keys of measurements that were added together; empty if `last` is before `first`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -59,50 +72,69 @@ pub struct Added {
     pub last: i64,
 }
 
-/// Stores the measurements that are not stored yet.
-pub async fn insert_new(
+/// Stores measurements, none of which is stored yet.
+///
+/// # Errors
+/// The database failed, for example because a measurement is stored already.
+pub async fn insert(
     db: &mut SqliteConnection,
     segments: &[NewSegment<'_>],
     received_at: Timestamp,
-) -> Result<(New, Added), DbError> {
-    if segments.is_empty() {
-        return Ok((New::All, Added { first: 1, last: 0 }));
-    }
-    let last = sqlx::query!(
-        r#"SELECT pk AS "pk!", received_at_us FROM segments ORDER BY pk DESC LIMIT 1"#
-    );
-    let last = last.fetch_optional(&mut *db).await?;
-    let (last, last_us) = last.map_or((0, i64::MIN), |row| (row.pk, row.received_at_us));
+) -> Result<Added, DbError> {
+    let (last, last_us) = segment_ranges::last(db).await?.unwrap_or((0, i64::MIN));
     // Times are in the order of commits, whatever the clock did.
     let received_at_us = to_us(received_at).max(last_us);
-    let bind = |row: &mut Row<'_>, segment: &NewSegment<'_>| {
-        let NewSegment(boot_pk, seq, robot_pk, site_pk, terrain, measurement) = *segment;
-        row.add(boot_pk)?
-            .add(seq)?
-            .add(robot_pk)?
-            .add(site_pk)?
-            .add(terrain)?
-            .add(received_at_us)?
-            .add(measurement.get())?;
-        Ok(())
-    };
-    let inserted = INSERT.execute(&mut *db, segments, bind).await?;
-    // The one writer assigns increasing keys without gaps, so the rows added now follow the earlier
-    // ones.
-    let added = Added {
-        first: last + 1,
-        last: last.saturating_add_unsigned(inserted),
-    };
-    if usize::try_from(inserted) == Ok(segments.len()) {
-        return Ok((New::All, added));
+    let mut ranges = Vec::new();
+    let mut next_pk = last + 1;
+    for range in segments.chunk_by(NewSegment::is_followed_by) {
+        let Some(first) = range.first() else { continue };
+        let (first_pk, count) = (next_pk, range.len() as u64);
+        next_pk = next_pk.saturating_add_unsigned(count);
+        ranges.push(NewRange {
+            first_pk,
+            first_seq: first.seq,
+            count,
+            boot_pk: first.boot_pk,
+            robot_pk: first.robot_pk,
+            site_pk: first.site_pk,
+            configuration_pk: first.configuration_pk,
+            mission: first.segment.mission,
+            grid_revision: first.segment.grid_revision,
+            terrain: first.segment.terrain.as_ref(),
+        });
     }
-    let rows = sqlx::query!(
-        "SELECT boot_pk, seq FROM segments WHERE pk > ? ORDER BY pk",
-        last
-    );
-    let rows = rows.fetch_all(db).await?;
-    let names = rows.into_iter().map(|row| (row.boot_pk, row.seq)).collect();
-    Ok((New::Only(names), added))
+    segment_ranges::insert(db, &ranges, received_at_us).await?;
+    let rows: Vec<(i64, &NewSegment<'_>)> = (last + 1..).zip(segments).collect();
+    INSERT.execute(db, &rows, bind).await?;
+    Ok(Added {
+        first: last + 1,
+        last: next_pk - 1,
+    })
+}
+
+fn bind(row: &mut Row<'_>, &(pk, new): &(i64, &NewSegment<'_>)) -> Result<(), DbError> {
+    let (segment, (started_at_ns, ended_at_ns)) = (new.segment, new.times_ns);
+    let errors = segment.theta_errors;
+    let (track, rolling) = (segment.effective_track_ratio, segment.rolling_resistance);
+    row.add(pk)?
+        .add(started_at_ns)?
+        .add(ended_at_ns)?
+        .add(segment.cell.ix)?
+        .add(segment.cell.iy)?
+        .add(segment.theta.information)?
+        .add(segment.theta.weighted)?
+        .add(errors.map(|errors| errors.independent_information))?
+        .add(errors.map(|errors| errors.robot_ratio))?
+        .add(errors.map(|errors| errors.tyre_ratio))?
+        .add(track.map(|pair| pair.information))?
+        .add(track.map(|pair| pair.weighted))?
+        .add(rolling.map(|pair| pair.information))?
+        .add(rolling.map(|pair| pair.weighted))?
+        .add(segment.mu_peak_lower_bound)?
+        .add(i64::from(segment.samples))?
+        .add(segment.distance_m)?
+        .add(segment.saturation_ratio)?;
+    Ok(())
 }
 
 /// Filter of a list of measurements.
@@ -118,13 +150,92 @@ pub struct SegmentFilter {
     pub after: i64,
 }
 
+/// A row of the statement of [`measurements`](macro@measurements).
 struct Raw {
     pk: i64,
+    robot_pk: i64,
+    site_pk: i64,
+    configuration_pk: i64,
     robot: String,
     boot: String,
     seq: i64,
     received_at_us: i64,
-    measurement: String,
+    configuration: String,
+    mission: Option<String>,
+    grid_revision: i64,
+    terrain: String,
+    terrain_revision: i64,
+    started_at_ns: i64,
+    ended_at_ns: i64,
+    ix: i64,
+    iy: i64,
+    theta_information: f64,
+    theta_weighted: f64,
+    independent_information: Option<f64>,
+    robot_error_ratio: Option<f64>,
+    tyre_error_ratio: Option<f64>,
+    track_information: Option<f64>,
+    track_weighted: Option<f64>,
+    rolling_information: Option<f64>,
+    rolling_weighted: Option<f64>,
+    mu_peak_lower_bound: Option<f64>,
+    samples: i64,
+    distance_m: f64,
+    saturation_ratio: f64,
+}
+
+fn pair(information: Option<f64>, weighted: Option<f64>) -> Option<Information> {
+    let (information, weighted) = information.zip(weighted)?;
+    Some(Information {
+        information,
+        weighted,
+    })
+}
+
+fn from_ns(ns: i64) -> Result<Timestamp, DbError> {
+    Timestamp::from_nanosecond(ns.into()).map_err(|_range| corrupt("time", ns))
+}
+
+impl Raw {
+    fn segment(&self) -> Result<Segment, DbError> {
+        let errors = self.independent_information.zip(self.robot_error_ratio);
+        let mission = self.mission.as_deref().map(|id| parse("mission", id));
+        let terrain = (!self.terrain.is_empty()).then(|| {
+            Ok::<_, DbError>(TerrainRef {
+                id: parse("terrain", &self.terrain)?,
+                revision: unsigned("revision", self.terrain_revision)?,
+            })
+        });
+        Ok(Segment {
+            configuration: parse("configuration", &self.configuration)?,
+            mission: mission.transpose()?,
+            started_at: from_ns(self.started_at_ns)?,
+            ended_at: from_ns(self.ended_at_ns)?,
+            grid_revision: unsigned("revision", self.grid_revision)?,
+            cell: Cell {
+                ix: unsigned("cell", self.ix)?,
+                iy: unsigned("cell", self.iy)?,
+            },
+            terrain: terrain.transpose()?,
+            theta: Information {
+                information: self.theta_information,
+                weighted: self.theta_weighted,
+            },
+            theta_errors: errors.zip(self.tyre_error_ratio).map(
+                |((independent_information, robot_ratio), tyre_ratio)| ThetaErrors {
+                    independent_information,
+                    robot_ratio,
+                    tyre_ratio,
+                },
+            ),
+            effective_track_ratio: pair(self.track_information, self.track_weighted),
+            rolling_resistance: pair(self.rolling_information, self.rolling_weighted),
+            mu_peak_lower_bound: self.mu_peak_lower_bound,
+            samples: unsigned("number", self.samples)?,
+            distance_m: self.distance_m,
+            saturation_ratio: self.saturation_ratio,
+        })
+    }
 }
 
 impl TryFrom<Raw> for StoredSegment {
@@ -137,20 +248,48 @@ impl TryFrom<Raw> for StoredSegment {
             boot: parse("boot", &raw.boot)?,
             seq: unsigned("number", raw.seq)?,
             received_at: from_us(raw.received_at_us)?,
-            segment: from_json("measurement", &raw.measurement)?,
+            segment: raw.segment()?,
         })
     }
 }
 
-macro_rules! segments {
-    ($condition:tt, $($argument:expr),* $(,)?) => {
+/// Reads measurements range by range; a cross join keeps its order. The first argument is a key: only
+/// later measurements are read. Of the ranges that begin before it only the last can reach beyond it.
+macro_rules! measurements {
+    ($condition:tt, $after:expr, $($argument:expr),* $(,)?) => {
         sqlx::query_as!(
             Raw,
-            r#"SELECT segments.pk AS "pk!", robots.id AS robot, boots.id AS boot, segments.seq,
-                   segments.received_at_us, segments.measurement
-               FROM segments
-               JOIN robots ON robots.pk = segments.robot_pk
-               JOIN boots ON boots.pk = segments.boot_pk "# + $condition,
+            r#"SELECT segment_values.pk AS "pk!", segment_ranges.robot_pk AS "robot_pk!",
+                   segment_ranges.site_pk AS "site_pk!",
+                   segment_ranges.configuration_pk AS "configuration_pk!", robots.id AS "robot!",
+                   boots.id AS "boot!",
+                   segment_ranges.first_seq + segment_values.pk - segment_ranges.first_pk
+                       AS "seq!: i64",
+                   received_at_us AS "received_at_us!", configurations.id AS "configuration!",
+                   mission AS "mission?", grid_revision AS "grid_revision!",
+                   terrain AS "terrain!", terrain_revision AS "terrain_revision!",
+                   started_at_ns AS "started_at_ns!", ended_at_ns AS "ended_at_ns!", ix AS "ix!",
+                   iy AS "iy!", theta_information AS "theta_information!",
+                   theta_weighted AS "theta_weighted!",
+                   independent_information AS "independent_information?",
+                   robot_error_ratio AS "robot_error_ratio?",
+                   tyre_error_ratio AS "tyre_error_ratio?",
+                   track_information AS "track_information?", track_weighted AS "track_weighted?",
+                   rolling_information AS "rolling_information?",
+                   rolling_weighted AS "rolling_weighted?",
+                   mu_peak_lower_bound AS "mu_peak_lower_bound?", samples AS "samples!",
+                   distance_m AS "distance_m!", saturation_ratio AS "saturation_ratio!"
+               FROM segment_ranges
+               CROSS JOIN robots ON robots.pk = segment_ranges.robot_pk
+               CROSS JOIN boots ON boots.pk = segment_ranges.boot_pk
+               CROSS JOIN configurations ON configurations.pk = segment_ranges.configuration_pk
+               CROSS JOIN segment_values ON segment_values.pk
+                   BETWEEN segment_ranges.first_pk AND segment_ranges.last_pk
+               WHERE segment_ranges.first_pk >= COALESCE(
+                       (SELECT MAX(first_pk) FROM segment_ranges WHERE first_pk <= ?1), 0)
+                   AND segment_values.pk > ?1 "# + $condition
+                + " ORDER BY segment_ranges.first_pk, segment_values.pk LIMIT ?2",
+            $after,
             $($argument),*
         )
     };
@@ -181,8 +320,8 @@ pub async fn extent(
         (Some(robot), _) => {
             let row = sqlx::query!(
                 r#"SELECT
-                       (SELECT MIN(pk) FROM segments WHERE robot_pk = robots.pk) AS "first: i64",
-                       (SELECT MAX(pk) FROM segments WHERE robot_pk = robots.pk) AS "last: i64"
+                       (SELECT MIN(first_pk) FROM segment_ranges WHERE robot_pk = robots.pk) AS "first: i64",
+                       (SELECT MAX(last_pk) FROM segment_ranges WHERE robot_pk = robots.pk) AS "last: i64"
                    FROM robots WHERE site_pk = ? AND id = ?"#,
                 site_pk,
                 robot,
@@ -193,9 +332,9 @@ pub async fn extent(
         (None, Some(terrain)) => {
             let row = sqlx::query!(
                 r#"SELECT
-                       (SELECT MIN(pk) FROM segments WHERE site_pk = ?1 AND terrain = ?2)
+                       (SELECT MIN(first_pk) FROM segment_ranges WHERE site_pk = ?1 AND terrain = ?2)
                            AS "first: i64",
-                       (SELECT MAX(pk) FROM segments WHERE site_pk = ?1 AND terrain = ?2)
+                       (SELECT MAX(last_pk) FROM segment_ranges WHERE site_pk = ?1 AND terrain = ?2)
                            AS "last: i64""#,
                 site_pk,
                 terrain,
@@ -203,21 +342,10 @@ pub async fn extent(
             let row = row.fetch_one(&mut *db).await?;
             (row.first, row.last)
         }
-        (None, None) => {
-            let row = sqlx::query!(
-                r#"SELECT (SELECT MIN(pk) FROM segments) AS "first: i64",
-                       (SELECT MAX(pk) FROM segments) AS "last: i64""#
-            );
-            let row = row.fetch_one(&mut *db).await?;
-            (row.first, row.last)
-        }
+        (None, None) => segment_ranges::ends(db).await?.unzip(),
     };
     let last_at_us = match last {
-        Some(last) => {
-            let at_us =
-                sqlx::query_scalar!("SELECT received_at_us FROM segments WHERE pk = ?", last);
-            at_us.fetch_optional(db).await?
-        }
+        Some(last) => segment_ranges::received_at_us(db, last).await?,
         None => None,
     };
     Ok(Extent {
@@ -241,43 +369,40 @@ pub async fn list(
     // column from the choice of index.
     let raw = match (robot, terrain) {
         (Some(robot), _) => {
-            segments!(
-                "WHERE segments.robot_pk = (SELECT pk FROM robots WHERE site_pk = ?1 AND id = ?2)
-                   AND segments.pk > ?3 AND (?4 IS NULL OR segments.terrain = ?4)
-                   AND (?6 IS NULL OR robots.id IN (SELECT value FROM json_each(?6)))
-                 ORDER BY segments.pk LIMIT ?5",
-                site_pk,
-                robot,
-                filter.after,
-                terrain,
-                limit,
-                named,
-            )
+            measurements!(
+            "AND segment_ranges.robot_pk = (SELECT pk FROM robots WHERE site_pk = ?3 AND id = ?4)
+                 AND (?5 IS NULL OR terrain = ?5)
+                 AND (?6 IS NULL OR robots.id IN (SELECT value FROM json_each(?6)))",
+            filter.after,
+            limit,
+            site_pk,
+            robot,
+            terrain,
+            named,
+        )
             .fetch_all(db)
             .await?
         }
         (None, Some(terrain)) => {
-            segments!(
-                "WHERE segments.site_pk = ?1 AND segments.terrain = ?2 AND segments.pk > ?3
-                   AND (?5 IS NULL OR robots.id IN (SELECT value FROM json_each(?5)))
-                 ORDER BY segments.pk LIMIT ?4",
-                site_pk,
-                terrain,
+            measurements!(
+                "AND segment_ranges.site_pk = ?3 AND terrain = ?4
+                 AND (?5 IS NULL OR robots.id IN (SELECT value FROM json_each(?5)))",
                 filter.after,
                 limit,
+                site_pk,
+                terrain,
                 named,
             )
             .fetch_all(db)
             .await?
         }
         (None, None) => {
-            segments!(
-                "WHERE +segments.site_pk = ?1 AND segments.pk > ?2
-                   AND (?4 IS NULL OR robots.id IN (SELECT value FROM json_each(?4)))
-                 ORDER BY segments.pk LIMIT ?3",
-                site_pk,
+            measurements!(
+                "AND +segment_ranges.site_pk = ?3
+                 AND (?4 IS NULL OR robots.id IN (SELECT value FROM json_each(?4)))",
                 filter.after,
                 limit,
+                site_pk,
                 named,
             )
             .fetch_all(db)
@@ -287,24 +412,51 @@ pub async fn list(
     raw.into_iter().map(StoredSegment::try_from).collect()
 }
 
-/// A measurement of a site as it is stored, with what decides whether it is on the map.
+/// A measurement with the keys of what it names.
 #[derive(Debug)]
-pub struct SiteSegment {
+pub struct KeyedSegment {
+    /// Its key.
+    pub pk: i64,
     /// Key of the robot.
     pub robot_pk: i64,
     /// The robot.
     pub robot: RobotId,
-    measurement: String,
+    /// Key of the site.
+    pub site_pk: i64,
+    /// Key of the configuration.
+    pub configuration_pk: i64,
+    /// The measurement.
+    pub segment: Segment,
 }
 
-impl SiteSegment {
-    /// Decodes the measurement.
-    ///
-    /// # Errors
-    /// The stored measurement is damaged.
-    pub fn segment(&self) -> Result<Segment, DbError> {
-        from_json("measurement", &self.measurement)
+impl TryFrom<Raw> for KeyedSegment {
+    type Error = DbError;
+
+    fn try_from(raw: Raw) -> Result<Self, DbError> {
+        Ok(Self {
+            pk: raw.pk,
+            robot_pk: raw.robot_pk,
+            robot: parse("robot", &raw.robot)?,
+            site_pk: raw.site_pk,
+            configuration_pk: raw.configuration_pk,
+            segment: raw.segment()?,
+        })
     }
+}
+
+/// Returns all measurements of a robot after a key, in the order of their commits.
+pub fn of_robot(
+    db: &mut SqliteConnection,
+    robot_pk: i64,
+    after: i64,
+) -> impl Stream<Item = Result<KeyedSegment, DbError>> {
+    let rows = measurements!(
+        "AND segment_ranges.robot_pk = ?3",
+        after,
+        i64::MAX,
+        robot_pk,
+    );
+    rows.fetch(db).map(|raw| KeyedSegment::try_from(raw?))
 }
 
 /// Returns the key of the first measurement that was received at a time or later, if none that was
@@ -312,22 +464,14 @@ impl SiteSegment {
 /// gaps; the first ones are removed first, the last one never is.
 pub async fn first_since(db: &mut SqliteConnection, at: Timestamp) -> Result<Option<i64>, DbError> {
     let at_us = to_us(at);
-    let ends = sqlx::query!(
-        r#"SELECT (SELECT MIN(pk) FROM segments) AS "first: i64",
-               (SELECT MAX(pk) FROM segments) AS "last: i64""#
-    );
-    let ends = ends.fetch_one(&mut *db).await?;
-    let Some((first, last)) = ends.first.zip(ends.last) else {
+    let Some((first, last)) = segment_ranges::ends(db).await? else {
         return Ok(None);
     };
     let (mut low, mut high) = (first, last + 1);
     while low < high {
         let middle = low + (high - low) / 2;
-        let received = sqlx::query_scalar!(
-            "SELECT received_at_us FROM segments WHERE pk >= ? ORDER BY pk LIMIT 1",
-            middle
-        );
-        if received.fetch_one(&mut *db).await? < at_us {
+        let received = segment_ranges::received_at_us(db, middle).await?;
+        if received.is_some_and(|received| received < at_us) {
             low = middle + 1;
         } else {
             high = middle;
@@ -337,34 +481,14 @@ pub async fn first_since(db: &mut SqliteConnection, at: Timestamp) -> Result<Opt
     Ok(is_known.then_some(low))
 }
 
-/// Returns measurements of all sites in the order of their commits, after a key; those of other
-/// sites without their content.
+/// Returns at most `limit` measurements of a site in the order of their commits, after a key.
 pub async fn of_site(
     db: &mut SqliteConnection,
     site_pk: i64,
     after: i64,
     limit: u32,
-) -> Result<Vec<(i64, Option<SiteSegment>)>, DbError> {
-    let rows = sqlx::query!(
-        r#"SELECT segments.pk AS "pk!", segments.robot_pk, robots.id AS robot,
-               CASE WHEN segments.site_pk = ?1 THEN segments.measurement END AS "measurement: String"
-           FROM segments JOIN robots ON robots.pk = segments.robot_pk
-           WHERE segments.pk > ?2 ORDER BY segments.pk LIMIT ?3"#,
-        site_pk,
-        after,
-        limit,
-    );
+) -> Result<Vec<KeyedSegment>, DbError> {
+    let rows = measurements!("AND +segment_ranges.site_pk = ?3", after, limit, site_pk);
     let rows = rows.fetch_all(db).await?;
-    let read = rows.into_iter().map(|row| {
-        let Some(measurement) = row.measurement else {
-            return Ok((row.pk, None));
-        };
-        let segment = SiteSegment {
-            robot_pk: row.robot_pk,
-            robot: parse("robot", &row.robot)?,
-            measurement,
-        };
-        Ok((row.pk, Some(segment)))
-    });
-    read.collect()
+    rows.into_iter().map(KeyedSegment::try_from).collect()
 }

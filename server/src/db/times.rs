@@ -19,7 +19,7 @@ pub async fn newest(db: &mut SqliteConnection) -> Result<Option<Timestamp>, DbEr
                UNION ALL SELECT MAX(at_us) FROM (
                    SELECT at_us FROM audit ORDER BY id DESC LIMIT ?1)
                UNION ALL SELECT MAX(received_at_us) FROM (
-                   SELECT received_at_us FROM segments ORDER BY pk DESC LIMIT ?1)
+                   SELECT received_at_us FROM segment_ranges ORDER BY first_pk DESC LIMIT ?1)
                UNION ALL SELECT MAX(MAX(raised_at_us, COALESCE(acknowledged_at_us, 0),
                        COALESCE(cleared_at_us, 0))) FROM alerts
                UNION ALL SELECT MAX(MAX(wanted_at_us, COALESCE(confirmed_at_us, 0),

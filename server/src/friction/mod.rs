@@ -21,7 +21,7 @@ use tread_api::friction::{FrictionBounds, FusedFriction, NORMAL_90, ValueEstimat
 pub use self::fuse::{Fused, Fuser, fuse};
 pub use self::raster::Raster;
 pub use self::seen::{Estimate, Ground, Seen};
-pub use self::sums::{Sums, bucket_h, epoch_h};
+pub use self::sums::{Sums, bucket_h, epoch_h, epoch_h_at};
 
 impl Fused {
     /// Converts the estimate to its API type, with its age at `now_us`, microseconds since 1970.

@@ -153,6 +153,11 @@ pub struct Sums {
 impl Sums {
     /// Returns the statistics of one segment; `None` if a value exceeds the range of [`Fixed`].
     pub fn of(segment: &Segment) -> Option<Self> {
+        Self::of_ended_at(segment, segment.ended_at.as_microsecond())
+    }
+
+    /// The same for a segment whose end was corrected to another time, microseconds since 1970.
+    pub fn of_ended_at(segment: &Segment, ended_at_us: i64) -> Option<Self> {
         // Errors common to a robot or to its tyres do not average out over segments: they are
         // summed separately and applied once to the estimate.
         let errors = segment.theta_errors;
@@ -180,9 +185,9 @@ impl Sums {
             segments: 1,
             samples: u64::from(segment.samples),
             mu_peak: segment.mu_peak_lower_bound,
-            newest_at_us: segment.ended_at.as_microsecond(),
+            newest_at_us: ended_at_us,
             newest: Pass {
-                ended_at_us: segment.ended_at.as_microsecond(),
+                ended_at_us,
                 theta: Some(theta),
                 mu_peak: segment.mu_peak_lower_bound,
             },
@@ -217,7 +222,12 @@ impl Sums {
 
 /// Returns the epoch of a time: whole hours since 1970.
 pub fn epoch_h(time: Timestamp) -> i64 {
-    time.as_microsecond().div_euclid(HOUR_US)
+    epoch_h_at(time.as_microsecond())
+}
+
+/// The same for a time in microseconds since 1970.
+pub fn epoch_h_at(time_us: i64) -> i64 {
+    time_us.div_euclid(HOUR_US)
 }
 
 /// Returns the first hour of the bucket that contains `hour`. Buckets are days before

@@ -51,7 +51,7 @@ async fn damage(yard: &Yard, table: &'static str) {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_damaged_table_makes_the_server_unready_and_stop_and_presence_work_on() {
-    for table in ["missions", "segments"] {
+    for table in ["missions", "segment_values"] {
         let yard = Yard::start().await;
         let id = Robot::join(&yard, "rover-1").await.id.clone();
         damage(&yard, table).await;

@@ -10,10 +10,10 @@ use jiff::Timestamp;
 
 use super::{App, AppError};
 use crate::app::ingest::SKEW_MIN;
-use crate::db::segments::SiteSegment;
+use crate::db::segments::KeyedSegment;
 use crate::db::sites::SiteRow;
 use crate::db::withdrawals::WithdrawalRow;
-use crate::db::{self, DbError, Tx};
+use crate::db::{self, Tx};
 use crate::friction::index::{Epoch, Measurement, PartialEpoch, SiteMap, Stamp, Timeline};
 use crate::friction::{Sums, epoch_h};
 
@@ -23,7 +23,7 @@ pub(super) const MEASUREMENTS_MAX: usize = 200_000;
 const KEPT_MAX: usize = 64;
 /// Maximum number of cached partial epochs.
 const PARTIALS_MAX: usize = 2;
-/// Number of measurements that are read at a time, of all sites and epochs since a timeline begins.
+/// Number of measurements that are read at a time, of all epochs since a timeline begins.
 const READ_AT_ONCE: u32 = 4_096;
 /// Maximum number of times that one request reads for one timeline; the next request reads on.
 const READ_MAX: usize = 100;
@@ -149,7 +149,7 @@ impl App {
             }
             let withdrawals = Arc::clone(&withdrawals);
             let adding = move |_: &Self| kept.with(&rows, &withdrawals);
-            kept = self.off_thread(adding).await?;
+            kept = self.off_thread(adding).await;
             if batch % KEPT_EVERY == 0 {
                 self.timelines().keep(kept.clone());
             }
@@ -175,43 +175,35 @@ async fn begun(tx: &mut Tx, of: Identity) -> Result<Option<Kept>, AppError> {
 
 impl Kept {
     /// Adds those of the given measurements that are of this epoch and on the map.
-    fn with(
-        mut self,
-        rows: &[(i64, Option<SiteSegment>)],
-        withdrawals: &[WithdrawalRow],
-    ) -> Result<Self, DbError> {
-        let last = rows.last().map(|&(pk, _)| pk);
-        let of_site = rows.iter().filter_map(|(_, row)| row.as_ref());
-        let found = of_site.map(|row| counted(row, self.of, withdrawals));
-        let found: Vec<Option<Measurement>> = found.collect::<Result<_, _>>()?;
-        if found.iter().any(Option::is_some) {
-            Arc::make_mut(&mut self.timeline).extend(found.into_iter().flatten());
+    fn with(mut self, rows: &[KeyedSegment], withdrawals: &[WithdrawalRow]) -> Self {
+        let found = rows
+            .iter()
+            .filter_map(|row| counted(row, self.of, withdrawals));
+        let found: Vec<Measurement> = found.collect();
+        if !found.is_empty() {
+            Arc::make_mut(&mut self.timeline).extend(found);
         }
-        self.read_to = last.unwrap_or(self.read_to);
-        Ok(self)
+        self.read_to = rows.last().map_or(self.read_to, |row| row.pk);
+        self
     }
 }
 
 /// Returns a measurement if it is of the epoch and on the map.
-fn counted(
-    row: &SiteSegment,
-    of: Identity,
-    withdrawals: &[WithdrawalRow],
-) -> Result<Option<Measurement>, DbError> {
-    let segment = row.segment()?;
+fn counted(row: &KeyedSegment, of: Identity, withdrawals: &[WithdrawalRow]) -> Option<Measurement> {
+    let segment = &row.segment;
     let hour = epoch_h(segment.ended_at);
     let is_on_map = of.epoch.includes_h(hour)
         && segment.grid_revision == of.grid_revision
         && !withdrawals
             .iter()
             .any(|found| found.includes(row.robot_pk, hour));
-    let sums = is_on_map.then(|| Sums::of(&segment)).flatten();
-    Ok(sums.map(|sums| Measurement {
+    let sums = is_on_map.then(|| Sums::of(segment)).flatten();
+    sums.map(|sums| Measurement {
         ended_at_us: segment.ended_at.as_microsecond(),
         cell: segment.cell,
-        terrain: segment.terrain,
+        terrain: segment.terrain.clone(),
         configuration: segment.configuration,
         robot: row.robot.clone(),
         sums,
-    }))
+    })
 }

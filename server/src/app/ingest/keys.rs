@@ -35,6 +35,9 @@ pub(super) struct Keys {
     robots: HashMap<(SiteId, RobotId), RobotKeys>,
     boots: HashMap<(i64, BootId), i64>,
     configurations: HashMap<(i64, ConfigurationId), i64>,
+    /// A sequence number at or after that of every segment of a run that is or was stored; `None`
+    /// without such segments.
+    newest_seqs: HashMap<i64, Option<i64>>,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -50,7 +53,13 @@ impl Keys {
     }
 
     pub(super) fn bound(&mut self) {
-        if self.robots.len() + self.boots.len() + self.configurations.len() > KEYS_MAX {
+        let maps = [
+            self.robots.len(),
+            self.boots.len(),
+            self.configurations.len(),
+            self.newest_seqs.len(),
+        ];
+        if maps.into_iter().sum::<usize>() > KEYS_MAX {
             self.forget();
         }
     }
@@ -101,6 +110,28 @@ impl Keys {
         let key = db::robots::boot_key(tx, robot_pk, batch.boot, RUNS_KEPT_MAX).await?;
         self.boots.insert((robot_pk, batch.boot), key);
         Ok(Some(key))
+    }
+
+    /// Returns a sequence number at or after that of every segment of a run that is or was stored;
+    /// `None` without such segments.
+    pub(super) async fn newest_seq(
+        &mut self,
+        tx: &mut Tx,
+        boot_pk: i64,
+    ) -> Result<Option<i64>, DbError> {
+        if let Some(&found) = self.newest_seqs.get(&boot_pk) {
+            return Ok(found);
+        }
+        let stored = db::segment_ranges::newest_seq(tx, boot_pk).await?;
+        let newest = stored.max(db::removed::newest_seq(tx, boot_pk).await?);
+        self.newest_seqs.insert(boot_pk, newest);
+        Ok(newest)
+    }
+
+    /// Notes that segments of a run up to a sequence number are about to be stored.
+    pub(super) fn note_seq(&mut self, boot_pk: i64, seq: i64) {
+        let newest = self.newest_seqs.entry(boot_pk).or_default();
+        *newest = (*newest).max(Some(seq));
     }
 
     /// Returns the key of a configuration that a robot measures with, or why it is refused.

@@ -1,5 +1,7 @@
 //! Validation of a segment, and correction of its times, before it is stored.
 
+use std::borrow::Cow;
+
 use jiff::{SignedDuration, Timestamp};
 use serde_json::value::{RawValue, to_raw_value};
 use tread_api::friction::Segment;
@@ -57,26 +59,36 @@ impl Skew {
 
 /// Result of checking a segment.
 #[derive(Debug)]
-pub(super) enum Prepared {
+#[expect(
+    clippy::large_enum_variant,
+    reason = "a measurement with a time in the future is rare"
+)]
+pub(super) enum Prepared<'segment> {
     /// A measurement with corrected times.
-    Ready(Box<Ready>),
+    Ready(Ready<'segment>),
     /// A measurement with a time in the future: the clock of its run is not known.
     Ahead(Box<RawValue>),
 }
 
 /// A valid segment, ready to be stored.
 #[derive(Debug)]
-pub(super) struct Ready {
-    pub(super) segment: Segment,
+pub(super) struct Ready<'segment> {
+    /// The measurement, with the times of the robot's clock.
+    pub(super) segment: Cow<'segment, Segment>,
+    /// Its corrected begin and end, nanoseconds since 1970.
+    pub(super) times_ns: (i64, i64),
     pub(super) sums: Sums,
-    pub(super) measurement: Box<RawValue>,
 }
 
 /// Checks a segment and corrects its times.
 ///
 /// # Errors
 /// The reason why it is invalid, for people.
-pub(super) fn prepared(segment: &Segment, grid: &Grid, skew: Skew) -> Result<Prepared, String> {
+pub(super) fn prepared<'segment>(
+    segment: Cow<'segment, Segment>,
+    grid: &Grid,
+    skew: Skew,
+) -> Result<Prepared<'segment>, String> {
     segment.validate().map_err(|invalid| invalid.to_string())?;
     if segment.grid_revision > grid.revision {
         return Err(format!("the site has no grid {}", segment.grid_revision));
@@ -85,19 +97,29 @@ pub(super) fn prepared(segment: &Segment, grid: &Grid, skew: Skew) -> Result<Pre
         return Err("the cell lies outside the site".to_owned());
     }
     if segment.ended_at.as_microsecond() > skew.latest_us() {
-        let measurement = to_raw_value(segment).map_err(|error| error.to_string())?;
+        let measurement = to_raw_value(&*segment).map_err(|error| error.to_string())?;
         return Ok(Prepared::Ahead(measurement));
     }
-    let mut segment = segment.clone();
     let span = segment.ended_at.duration_since(segment.started_at);
-    segment.ended_at = skew.shifted(segment.ended_at);
-    let started_at = segment.ended_at.checked_sub(span);
-    segment.started_at = started_at.unwrap_or(segment.ended_at);
-    let sums = Sums::of(&segment).ok_or_else(|| "theta is out of range".to_owned())?;
-    let measurement = to_raw_value(&segment).map_err(|error| error.to_string())?;
-    Ok(Prepared::Ready(Box::new(Ready {
+    let ended_at = skew.shifted(segment.ended_at);
+    let started_at = ended_at.checked_sub(span).unwrap_or(ended_at);
+    let (started_at_ns, ended_at_ns) = (stored_ns(started_at), stored_ns(ended_at));
+    let sums = Sums::of_ended_at(&segment, us_of(ended_at_ns));
+    Ok(Prepared::Ready(Ready {
+        sums: sums.ok_or_else(|| "theta is out of range".to_owned())?,
         segment,
-        sums,
-        measurement,
-    })))
+        times_ns: (started_at_ns, ended_at_ns),
+    }))
+}
+
+/// Returns a time as it is stored, nanoseconds since 1970. Times before 1677 or after 2262, which wrong
+/// clocks give, become the first or the last that can be stored.
+fn stored_ns(at: Timestamp) -> i64 {
+    let ns = at.as_nanosecond();
+    i64::try_from(ns).unwrap_or(if ns < 0 { i64::MIN } else { i64::MAX })
+}
+
+/// Converts a time to microseconds since 1970, as [`Timestamp::as_microsecond`] does.
+pub(super) fn us_of(at_ns: i64) -> i64 {
+    at_ns / 1_000
 }

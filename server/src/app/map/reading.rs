@@ -1,18 +1,19 @@
 //! Reads the map into memory: the stored sums, and the segments that follow each robot's watermark.
 
 use std::collections::HashMap;
+use std::pin::pin;
 use std::sync::{Arc, PoisonError};
 use std::time::Duration;
 
+use futures_util::TryStreamExt as _;
 use tread_api::ids::{ConfigurationId, RobotId};
 use tread_api::rights::Scope;
 
 use super::unwritten::Unwritten;
 use super::{Folded, Maps, add, ensure};
 use crate::app::App;
-use crate::db::segments::Added;
+use crate::db::segments::{Added, KeyedSegment};
 use crate::db::sums::SumKey;
-use crate::db::watermarks::Following;
 use crate::db::withdrawals::WithdrawalRow;
 use crate::db::{self, DbError, Tx};
 use crate::friction::index::SiteMap;
@@ -28,7 +29,6 @@ struct Read {
 struct Names {
     robots: HashMap<i64, RobotId>,
     configurations: HashMap<i64, ConfigurationId>,
-    configuration_keys: HashMap<ConfigurationId, i64>,
     withdrawals: Vec<WithdrawalRow>,
 }
 
@@ -87,11 +87,9 @@ async fn read(tx: &mut Tx, now: Duration) -> Result<Read, DbError> {
             ensure(&mut sites, row);
         }
     }
-    let configurations = db::robots::configurations_by_key(tx).await?;
     let names = Names {
         robots: db::robots::ids_by_key(tx).await?,
-        configuration_keys: configurations.iter().map(|(&pk, &id)| (id, pk)).collect(),
-        configurations,
+        configurations: db::robots::configurations_by_key(tx).await?,
         withdrawals: db::withdrawals::all(tx).await?,
     };
     db::sums::each(tx, |row| {
@@ -101,19 +99,26 @@ async fn read(tx: &mut Tx, now: Duration) -> Result<Read, DbError> {
         }
     })
     .await?;
-    let mut unwritten = Unwritten::following(db::watermarks::all(tx).await?);
-    db::watermarks::following(tx, |following| {
-        let keys = Added {
-            first: following.pk,
-            last: following.pk,
-        };
-        if let Some(folded) = names.folded(following)? {
-            unwritten.add([(&folded.key, &folded.sums)], keys, now);
-            add(&mut sites, std::slice::from_ref(&folded));
+    let watermarks = db::watermarks::all(tx).await?;
+    let mut unwritten = Unwritten::following(watermarks.clone());
+    for (robot_pk, last_pk) in db::segment_ranges::last_keys(tx).await? {
+        let watermark = watermarks.get(&robot_pk).copied().unwrap_or_default();
+        // A damaged table of measurements does not keep a server from starting that needs none.
+        if last_pk <= watermark {
+            continue;
         }
-        Ok(())
-    })
-    .await?;
+        let mut following = pin!(db::segments::of_robot(tx, robot_pk, watermark));
+        while let Some(row) = following.try_next().await? {
+            let keys = Added {
+                first: row.pk,
+                last: row.pk,
+            };
+            if let Some(folded) = names.folded(row)? {
+                unwritten.add([(&folded.key, &*folded.cells)], keys, now);
+                add(&mut sites, std::slice::from_ref(&folded));
+            }
+        }
+    }
     Ok(Read { sites, unwritten })
 }
 
@@ -122,27 +127,27 @@ impl Names {
         Some(Folded {
             robot: self.robots.get(&key.robot_pk)?.clone(),
             configuration: *self.configurations.get(&key.configuration_pk)?,
-            sums,
+            cells: vec![(key.cell, sums)],
             key,
         })
     }
 
     /// Returns the sum of a stored segment, as it was added before its receipt; `None` if it is
     /// withdrawn.
-    fn folded(&self, following: Following) -> Result<Option<Folded>, DbError> {
-        let Following {
+    fn folded(&self, row: KeyedSegment) -> Result<Option<Folded>, DbError> {
+        let KeyedSegment {
+            pk,
             robot_pk,
             site_pk,
+            configuration_pk,
             segment,
             ..
-        } = following;
-        let damaged = |what| DbError::Corrupt {
-            what,
-            value: following.pk.to_string(),
-        };
-        // It was checked, and its configuration noted, in the transaction that stored it.
-        let sums = Sums::of(&segment).ok_or_else(|| damaged("measurement out of range"))?;
-        let configuration_pk = self.configuration_keys.get(&segment.configuration);
+        } = row;
+        // It was checked in the transaction that stored it.
+        let sums = Sums::of(&segment).ok_or_else(|| DbError::Corrupt {
+            what: "measurement out of range",
+            value: pk.to_string(),
+        })?;
         let key = SumKey {
             robot_pk,
             epoch_h: epoch_h(segment.ended_at),
@@ -150,8 +155,7 @@ impl Names {
             terrain: segment.terrain,
             grid_revision: segment.grid_revision,
             site_pk,
-            configuration_pk: *configuration_pk
-                .ok_or_else(|| damaged("measurement of no configuration"))?,
+            configuration_pk,
         };
         let is_withdrawn = |row: &WithdrawalRow| row.includes(robot_pk, key.epoch_h);
         if self.withdrawals.iter().any(is_withdrawn) {

@@ -8,6 +8,9 @@
 use std::collections::{BTreeMap, HashMap};
 use std::time::Duration;
 
+use foldhash::fast::RandomState;
+use tread_api::site::Cell;
+
 use crate::db::segments::Added;
 use crate::db::sums::SumKey;
 use crate::db::watermarks::WatermarkStep;
@@ -17,7 +20,7 @@ use crate::friction::Sums;
 /// receipts.
 pub(super) const UNWRITTEN_SUMS_MAX: usize = 200_000;
 /// Maximum number of segments in unwritten sums, which a killed server adds again when it starts.
-pub(super) const UNWRITTEN_SEGMENTS_MAX: u64 = 500_000;
+pub(super) const UNWRITTEN_SEGMENTS_MAX: u64 = 1_000_000;
 
 /// The unwritten sums of all robots.
 #[derive(Debug, Default)]
@@ -33,7 +36,7 @@ pub(super) struct Unwritten {
 
 #[derive(Debug)]
 struct OfRobot {
-    sums: HashMap<SumKey, Sums>,
+    sums: HashMap<SumKey, Sums, RandomState>,
     /// Keys between which all its segments in `sums` are.
     keys: Added,
     /// Number of the first addition, and its time.
@@ -68,28 +71,33 @@ impl Unwritten {
         }
     }
 
-    /// Adds sums of segments that were committed together, with the keys of these.
+    /// Adds sums of segments that were committed together, with the keys of these. The keys of sums
+    /// differ from the given ones in their cells.
     pub(super) fn add<'sums>(
         &mut self,
-        sums: impl IntoIterator<Item = (&'sums SumKey, &'sums Sums)>,
+        sums: impl IntoIterator<Item = (&'sums SumKey, &'sums [(Cell, Sums)])>,
         added: Added,
         at: Duration,
     ) {
         self.additions += 1;
-        for (key, sums) in sums {
+        for (key, cells) in sums {
             let robot = self.robots.entry(key.robot_pk).or_insert_with(|| OfRobot {
-                sums: HashMap::new(),
+                sums: HashMap::default(),
                 keys: added,
                 began: (self.additions, at),
             });
             robot.keys.first = robot.keys.first.min(added.first);
             robot.keys.last = robot.keys.last.max(added.last);
-            self.segments += sums.segments;
-            if let Some(present) = robot.sums.get_mut(key) {
-                present.add(sums);
-            } else {
-                robot.sums.insert(key.clone(), *sums);
-                self.sums += 1;
+            let mut key = key.clone();
+            for (cell, sums) in cells {
+                key.cell = *cell;
+                self.segments += sums.segments;
+                if let Some(present) = robot.sums.get_mut(&key) {
+                    present.add(sums);
+                } else {
+                    robot.sums.insert(key.clone(), *sums);
+                    self.sums += 1;
+                }
             }
         }
     }

@@ -12,10 +12,10 @@ use crate::app::App;
 use crate::db::{self, DbError};
 
 /// Interval at which unwritten sums are stored.
-const WRITE_EVERY: Duration = Duration::from_secs(5);
+const WRITE_EVERY: Duration = Duration::from_secs(10);
 /// Number of sums in a transaction beyond which it takes those of no further robot: receipts wait
 /// for it.
-const SUMS_WRITTEN_MAX: usize = 5_000;
+const SUMS_WRITTEN_MAX: usize = 2_000;
 
 /// Stores unwritten sums periodically until the stop.
 pub async fn run(app: App, stop: CancellationToken) {

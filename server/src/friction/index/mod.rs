@@ -179,6 +179,11 @@ impl SiteMap {
 
     /// Adds sums to the map; ignores those of another grid revision.
     pub fn add(&mut self, labelled: Labelled<'_>, sums: &Sums) {
+        self.add_cells(labelled, &[(labelled.cell, *sums)]);
+    }
+
+    /// Adds sums that agree in all labels but their cells; `labelled.cell` is ignored.
+    pub fn add_cells(&mut self, labelled: Labelled<'_>, cells: &[(Cell, Sums)]) {
         if labelled.grid_revision != self.grid_revision {
             return;
         }
@@ -189,7 +194,26 @@ impl SiteMap {
             robot: self.names.robots.number(labelled.robot),
             epoch_h: i32::try_from(epoch_h).unwrap_or(i32::MAX),
         };
-        let parts = self.cells.entry(place(labelled.cell)).or_default();
+        let mut all: Option<Sums> = None;
+        for (cell, sums) in cells {
+            self.add_part(*cell, key, sums);
+            self.changes.note(*cell);
+            match &mut all {
+                Some(all) => all.add(sums),
+                None => all = Some(*sums),
+            }
+        }
+        if let Some(all) = all {
+            let total = self.totals.entry(key);
+            total
+                .and_modify(|total| total.add(&all))
+                .or_insert_with(|| Sums { samples: 0, ..all });
+            *self.segments.entry(key.epoch_h).or_default() += all.segments;
+        }
+    }
+
+    fn add_part(&mut self, cell: Cell, key: PartKey, sums: &Sums) {
+        let parts = self.cells.entry(place(cell)).or_default();
         match parts.binary_search_by_key(&key, |part| part.key) {
             Ok(index) => parts[index].add(sums),
             Err(index) => {
@@ -200,15 +224,6 @@ impl SiteMap {
                 *parts = longer.into_boxed_slice();
             }
         }
-        let total = self.totals.entry(key);
-        total
-            .and_modify(|total| total.add(sums))
-            .or_insert_with(|| Sums {
-                samples: 0,
-                ..*sums
-            });
-        *self.segments.entry(key.epoch_h).or_default() += sums.segments;
-        self.changes.note(labelled.cell);
     }
 
     fn count_segments(&mut self) {

@@ -1,5 +1,6 @@
 //! Segments per second, with receipts, and whether each acknowledged one is stored exactly once.
 
+use std::path::PathBuf;
 use std::time::Duration;
 
 use anyhow::{Context, ensure};
@@ -61,18 +62,47 @@ impl Tally {
     }
 }
 
+/// A server that is measured.
+pub(crate) trait Server {
+    /// What its process has used; `None` when it is gone.
+    fn usage(&self) -> Option<Usage>;
+    /// Its database.
+    fn database(&self) -> PathBuf;
+}
+
+impl Server for Fleet {
+    fn usage(&self) -> Option<Usage> {
+        self.server_usage()
+    }
+
+    fn database(&self) -> PathBuf {
+        Self::database(self)
+    }
+}
+
+/// How often robots upload.
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum Pace {
+    /// So many segments per second, of all robots together.
+    PerSecond(f64),
+    /// The next batch follows the receipt, until the time is over.
+    Saturating,
+}
+
 pub(crate) async fn measure(
     arguments: &Arguments,
-    fleet: &mut Fleet,
+    server: &impl Server,
     robots: Vec<LightRobot>,
+    pace: Pace,
 ) -> anyhow::Result<Ingest> {
-    let server_before = fleet.server_usage().context("the server is gone")?;
+    let (robots_count, database) = (robots.len(), server.database());
+    let generator_before = usage_of(std::process::id()).context("/proc is not readable")?;
+    let server_before = server.usage().context("the server is gone")?;
     let begin = Instant::now();
     let end = begin + Duration::from_secs(arguments.seconds);
     let mut working = JoinSet::new();
-    let count = robots.len();
     for (index, robot) in robots.into_iter().enumerate() {
-        let plan = UploadPlan::new(arguments, index, count)?;
+        let plan = UploadPlan::new(arguments, pace, (index, robots_count))?;
         working.spawn(async move { work(robot, plan, end).await });
     }
     let mut all = Tally::new()?;
@@ -85,14 +115,16 @@ pub(crate) async fn measure(
         all.states += tally.states;
     }
     let seconds = begin.elapsed().as_secs_f64();
-    let generator = usage_of(std::process::id()).context("/proc is not readable")?;
+    let mut generator = usage_of(std::process::id()).context("/proc is not readable")?;
+    generator.cpu_s -= generator_before.cpu_s;
     // Sums are stored behind the receipts; their cost belongs to the segments. A difference that
     // stays is counted below.
-    if let Err(error) = stored::await_sums(&fleet.database()).await {
+    if let Err(error) = stored::await_sums(&database).await {
         eprintln!("{error}");
     }
-    let server = fleet.server_usage().context("the server is gone")?;
-    let stored = stored::count(&fleet.database()).await?;
+    let mut used = server.usage().context("the server is gone")?;
+    used.cpu_s -= server_before.cpu_s;
+    let stored = stored::count(&database).await?;
     let committed = i64::try_from(all.committed)?;
     #[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
     let (committed_f64, states_f64) = (all.committed as f64, all.states as f64);
@@ -108,18 +140,40 @@ pub(crate) async fn measure(
         ack_max_ms: quantile_ms(1.0),
         uploads_failed: all.failed,
         states_published_per_second: states_f64 / seconds,
-        server_cpu_us_per_segment: 1e6 * (server.cpu_s - server_before.cpu_s)
-            / committed_f64.max(1.0),
+        server_cpu_us_per_segment: 1e6 * used.cpu_s / committed_f64.max(1.0),
         // An upload without receipt may or may not be stored, so more may be there than was
         // acknowledged, never less; the sums must hold each stored one once.
         acknowledged_but_lost: (committed - stored.segments).max(0).cast_unsigned(),
         counted_twice: (stored.in_sums - stored.segments).unsigned_abs()
             + stored.doubles.cast_unsigned(),
-        sums_per_robot: figure(stored.sums.cast_unsigned()) / f64::from(arguments.robots),
-        is_on_disk: statfs(&fleet.database())?.filesystem_type() != TMPFS_MAGIC,
-        server,
+        sums_per_robot: figure(stored.sums.cast_unsigned()) / figure(robots_count as u64),
+        is_on_disk: statfs(&database)?.filesystem_type() != TMPFS_MAGIC,
+        server: used,
         generator,
     })
+}
+
+impl Ingest {
+    /// Returns what is not among the checks, in a line.
+    pub(crate) fn words(&self) -> String {
+        let Self {
+            server, generator, ..
+        } = self;
+        let memory_mb = |usage: &Usage| usage.memory_peak_bytes / 1_000_000;
+        format!(
+            "{:.0} segments/s, {:.0} states/s; server {:.1} s CPU, {} MB at most; generator {:.1} s \
+             CPU, {} MB at most; ack p50 {:.1}, p99 {:.1}, max {:.1} ms",
+            self.segments_per_second,
+            self.states_published_per_second,
+            server.cpu_s,
+            memory_mb(server),
+            generator.cpu_s,
+            memory_mb(generator),
+            self.ack_p50_ms,
+            self.ack_p99_ms,
+            self.ack_max_ms,
+        )
+    }
 }
 
 #[derive(Clone, Copy)]
@@ -133,18 +187,25 @@ struct UploadPlan {
 }
 
 impl UploadPlan {
-    fn new(arguments: &Arguments, index: usize, count: usize) -> anyhow::Result<Self> {
-        if arguments.saturate {
-            return Ok(Self {
-                records: arguments.records.into(),
-                every: SATURATED_EVERY,
-                first: Duration::ZERO,
-                state_every: period_of(arguments.state_rate_hz),
-                saturates: true,
-            });
-        }
+    fn new(
+        arguments: &Arguments,
+        pace: Pace,
+        (index, count): (usize, usize),
+    ) -> anyhow::Result<Self> {
+        let per_second = match pace {
+            Pace::PerSecond(per_second) => per_second,
+            Pace::Saturating => {
+                return Ok(Self {
+                    records: arguments.records.into(),
+                    every: SATURATED_EVERY,
+                    first: Duration::ZERO,
+                    state_every: period_of(arguments.state_rate_hz),
+                    saturates: true,
+                });
+            }
+        };
         let every = Duration::from_millis(arguments.upload_every_ms);
-        let all_per_upload = f64::from(arguments.segments_per_second) * every.as_secs_f64();
+        let all_per_upload = per_second * every.as_secs_f64();
         let records = all_per_upload / f64::from(u32::try_from(count)?);
         #[expect(
             clippy::cast_possible_truncation,

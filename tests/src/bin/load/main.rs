@@ -11,22 +11,30 @@
 //!
 //! With `--saturate` ingest alone, in the hardest case: every robot uploads its next batch as soon as it
 //! has the receipt, and each segment is in another cell than the one before, of 1 600 cells of each
-//! robot, so that every segment has its own sum.
+//! robot, so that every segment has its own sum. First in CBOR, then in JSON, then in CBOR at 60 % of
+//! what was reached. With `--peers` also into a service in Python (`tests/peers`).
 
+mod details;
 mod dispatch;
 mod ingest;
-mod report;
+mod peers;
+mod saturation;
 
+use std::ops::Range;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::Parser;
-use tread_api::wire::encoding::Encoding;
+use tokio::task::JoinSet;
+use tread_api::ids::{RobotId, SiteId};
 use tread_tests::fleet::Fleet;
 use tread_tests::light_robot::LightRobot;
 use tread_tests::process::node;
+use tread_tests::report;
 
-use crate::report::Details;
+use crate::details::Details;
+use crate::ingest::Pace;
 
 /// How long certificates are good for: longer than any measurement.
 const CERTIFICATE_S: u32 = 86_400;
@@ -53,9 +61,9 @@ pub(crate) struct Arguments {
     /// Segments of each upload with `--saturate`
     #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u16).range(1..=1_000))]
     records: u16,
-    /// Encoding of the uploads: `cbor` as agents take, or `json`
-    #[arg(long, default_value = "cbor", value_parser = encoding_of)]
-    encoding: Encoding,
+    /// Compare with the service in `tests/peers`: a Python that has its `requirements.txt`
+    #[arg(long, value_name = "PYTHON", requires = "saturate")]
+    peers: Option<PathBuf>,
     /// States published per second by each light robot
     #[arg(long, default_value_t = 2.0)]
     state_rate_hz: f64,
@@ -77,28 +85,31 @@ pub(crate) struct Arguments {
 async fn main() -> anyhow::Result<ExitCode> {
     let arguments = Arguments::parse();
     let node = node()?;
-    let mut fleet = if arguments.tls {
-        Fleet::start_secure_with(&node, CERTIFICATE_S).await
-    } else {
-        Fleet::start_with(&node).await
-    };
-    let mut robots = start_light_robots(&fleet, arguments.robots, arguments.tls).await?;
-    for robot in &mut robots {
-        robot.encoding = arguments.encoding;
+    if arguments.saturate {
+        let saturation = saturation::measure(&arguments, &node).await?;
+        let checks = saturation.checks();
+        return report::tell_with(arguments.json, &saturation, saturation.words(), &checks);
     }
-    let ingest = ingest::measure(&arguments, &mut fleet, robots).await?;
-    let dispatch = if arguments.saturate {
-        None
-    } else {
-        Some(dispatch::measure(&arguments, &mut fleet).await?)
-    };
+    let mut fleet = start_fleet(&node, arguments.tls).await;
+    let robots = start_light_robots(&fleet, arguments.robots, arguments.tls).await?;
+    let pace = Pace::PerSecond(f64::from(arguments.segments_per_second));
+    let ingest = ingest::measure(&arguments, &fleet, robots, pace).await?;
+    let dispatch = dispatch::measure(&arguments, &mut fleet).await?;
     let details = Details {
         robots: arguments.robots,
-        encoding: arguments.encoding,
         ingest,
         dispatch,
     };
     details.tell(arguments.json)
+}
+
+/// Starts a server, whose robots show certificates if they connect by TLS.
+pub(crate) async fn start_fleet(node: &Path, tls: bool) -> Fleet {
+    if tls {
+        Fleet::start_secure_with(node, CERTIFICATE_S).await
+    } else {
+        Fleet::start_with(node).await
+    }
 }
 
 /// Connects the light robots, a few at a time as a fleet does after a power cut with jitter.
@@ -107,22 +118,18 @@ pub(crate) async fn start_light_robots(
     count: u32,
     tls: bool,
 ) -> anyhow::Result<Vec<LightRobot>> {
-    const AT_ONCE: u32 = 20;
+    let site = fleet.site();
+    if !tls {
+        return connect_light_robots(&fleet.zenoh_endpoint(), &site, count).await;
+    }
     let endpoint = fleet.zenoh_endpoint();
     let mut robots = Vec::new();
-    for first in (0..count).step_by(AT_ONCE as usize) {
-        let mut starting = tokio::task::JoinSet::new();
-        for number in first..count.min(first + AT_ONCE) {
+    for numbers in batches(count) {
+        let mut starting = JoinSet::new();
+        for number in numbers {
             let endpoint = endpoint.clone();
-            let site = fleet.site();
-            let id = format!("light-{number}").parse()?;
-            if tls {
-                let membership = fleet.membership(&id).await;
-                starting
-                    .spawn(async move { LightRobot::start_secure(&endpoint, &membership).await });
-            } else {
-                starting.spawn(async move { LightRobot::start(&endpoint, &site, id).await });
-            }
+            let membership = fleet.membership(&light_id(number)?).await;
+            starting.spawn(async move { LightRobot::start_secure(&endpoint, &membership).await });
         }
         while let Some(started) = starting.join_next().await {
             robots.push(started??);
@@ -131,12 +138,35 @@ pub(crate) async fn start_light_robots(
     Ok(robots)
 }
 
-fn encoding_of(text: &str) -> Result<Encoding, String> {
-    match text {
-        "cbor" => Ok(Encoding::Cbor),
-        "json" => Ok(Encoding::Json),
-        _ => Err("it is `cbor` or `json`".to_owned()),
+/// The same without TLS, at any server.
+pub(crate) async fn connect_light_robots(
+    endpoint: &str,
+    site: &SiteId,
+    count: u32,
+) -> anyhow::Result<Vec<LightRobot>> {
+    let mut robots = Vec::new();
+    for numbers in batches(count) {
+        let mut starting = JoinSet::new();
+        for number in numbers {
+            let (endpoint, site, id) = (endpoint.to_owned(), site.clone(), light_id(number)?);
+            starting.spawn(async move { LightRobot::start(&endpoint, &site, id).await });
+        }
+        while let Some(started) = starting.join_next().await {
+            robots.push(started??);
+        }
     }
+    Ok(robots)
+}
+
+fn light_id(number: u32) -> anyhow::Result<RobotId> {
+    Ok(format!("light-{number}").parse()?)
+}
+
+/// Returns the numbers of the robots that are started at the same time.
+fn batches(count: u32) -> impl Iterator<Item = Range<u32>> {
+    const AT_ONCE: u32 = 20;
+    let begins = (0..count).step_by(AT_ONCE as usize);
+    begins.map(move |first| first..count.min(first + AT_ONCE))
 }
 
 /// A period as a duration; longer than any measurement when the rate is not above zero.

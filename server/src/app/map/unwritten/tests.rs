@@ -80,6 +80,19 @@ fn add_to(table: &mut Table, key: &SumKey, sums: &Sums) {
         .or_insert(*sums);
 }
 
+fn add<'sums>(
+    unwritten: &mut Unwritten,
+    sums: impl IntoIterator<Item = (&'sums SumKey, &'sums Sums)>,
+    added: Added,
+) {
+    let sums: Vec<_> = sums
+        .into_iter()
+        .map(|(key, sums)| (key, [(key.cell, *sums)]))
+        .collect();
+    let sums = sums.iter().map(|(key, cells)| (*key, cells.as_slice()));
+    unwritten.add(sums, added, Duration::ZERO);
+}
+
 /// What a disk keeps, and the memory of a server on it.
 #[derive(Debug, Default)]
 struct Server {
@@ -121,7 +134,7 @@ impl Server {
                 }
                 let last = last_key(&self.segments);
                 let added = Added { first, last };
-                self.unwritten.add(&folded, added, Duration::ZERO);
+                add(&mut self.unwritten, &folded, added);
             }
             Act::Store {
                 limit,
@@ -156,7 +169,7 @@ impl Server {
                             first: pk,
                             last: pk,
                         };
-                        self.unwritten.add([(key, sums)], added, Duration::ZERO);
+                        add(&mut self.unwritten, [(key, sums)], added);
                     }
                 }
             }
@@ -221,10 +234,10 @@ fn a_portion_has_all_sums_of_its_robots_and_no_robot_that_began_later() {
     let sums: Table = (0..3)
         .flat_map(|robot| (0..4).map(move |ix| (key(robot, ix, 0), one(1.0))))
         .collect();
-    unwritten.add(&sums, added, Duration::ZERO);
+    add(&mut unwritten, &sums, added);
     let until = unwritten.additions();
     let later: Table = [(key(7, 0, 0), one(1.0))].into();
-    unwritten.add(&later, added, Duration::ZERO);
+    add(&mut unwritten, &later, added);
     let robots = |portion: &Portion| -> Vec<i64> {
         portion.steps.iter().map(|step| step.robot_pk).collect()
     };
@@ -248,9 +261,9 @@ fn sums_are_stored_before_further_receipts_when_too_many_segments_are_unwritten(
         ..one(1.0)
     };
     let added = Added { first: 1, last: 1 };
-    unwritten.add([(&key(1, 0, 0), &many)], added, Duration::ZERO);
+    add(&mut unwritten, [(&key(1, 0, 0), &many)], added);
     assert!(!unwritten.is_full());
-    unwritten.add([(&key(1, 0, 0), &one(1.0))], added, Duration::ZERO);
+    add(&mut unwritten, [(&key(1, 0, 0), &one(1.0))], added);
     assert!(unwritten.is_full());
     let all = unwritten.portion(u64::MAX, 1);
     unwritten.written(&all.steps);

@@ -1,0 +1,105 @@
+//! Which segments are stored already, or were stored and removed at the end of their retention.
+
+use std::collections::{BTreeMap, HashMap};
+
+use super::Candidate;
+use super::keys::Keys;
+use crate::app::retention::Removed;
+use crate::db::{self, DbError, Tx};
+
+/// Sequence numbers of the runs of a group of uploads.
+#[derive(Debug, Default)]
+pub(super) struct Known {
+    boots: HashMap<i64, Seqs>,
+}
+
+impl Known {
+    /// Reads which of the candidates' sequence numbers are known. A run whose numbers follow those of
+    /// its former uploads costs no query.
+    pub(super) async fn read(
+        tx: &mut Tx,
+        candidates: &[Candidate<'_>],
+        removed: &Removed,
+        keys: &mut Keys,
+    ) -> Result<Self, DbError> {
+        let mut spans: HashMap<i64, (i64, i64)> = HashMap::new();
+        for &Candidate {
+            keys: (boot_pk, seq),
+            ..
+        } in candidates
+        {
+            let span = spans.entry(boot_pk).or_insert((seq, seq));
+            *span = (span.0.min(seq), span.1.max(seq));
+        }
+        let mut known = Self::default();
+        for (boot_pk, span) in spans {
+            let newest = keys.newest_seq(tx, boot_pk).await?;
+            keys.note_seq(boot_pk, span.1);
+            if newest.is_none_or(|newest| newest < span.0) {
+                continue;
+            }
+            let mut ranges = db::segment_ranges::within(tx, boot_pk, span).await?;
+            if removed.has(boot_pk) {
+                ranges.extend(db::removed::within(tx, boot_pk, span).await?);
+            }
+            known
+                .boots
+                .insert(boot_pk, Seqs(ranges.into_iter().collect()));
+        }
+        Ok(known)
+    }
+
+    /// Adds a segment by its run and sequence number. Returns whether it was unknown.
+    pub(super) fn insert(&mut self, (boot_pk, seq): (i64, i64)) -> bool {
+        self.boots.entry(boot_pk).or_default().insert(seq)
+    }
+}
+
+/// A set of sequence numbers, as disjoint ranges from the first to the last number of each.
+#[derive(Debug, Default)]
+struct Seqs(BTreeMap<i64, i64>);
+
+impl Seqs {
+    /// Adds a number. Returns whether it was not in the set.
+    fn insert(&mut self, seq: i64) -> bool {
+        let Self(ranges) = self;
+        match ranges.range_mut(..=seq).next_back() {
+            Some((_, last)) if seq <= *last => return false,
+            Some((_, last)) if seq - 1 == *last => *last = seq,
+            _ => {
+                ranges.insert(seq, seq);
+            }
+        }
+        true
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn a_number_is_new_once_whatever_the_ranges_and_the_order(
+            stored in prop::collection::btree_set(0_i64..60, 0..30),
+            inserted in prop::collection::vec(0_i64..70, 0..80),
+        ) {
+            let mut ranges: Vec<(i64, i64)> = Vec::new();
+            for &seq in &stored {
+                match ranges.last_mut() {
+                    Some((_, last)) if *last + 1 == seq => *last = seq,
+                    _ => ranges.push((seq, seq)),
+                }
+            }
+            let mut seqs = Seqs(ranges.into_iter().collect());
+            let mut expected: BTreeSet<i64> = stored;
+            for seq in inserted {
+                prop_assert_eq!(seqs.insert(seq), expected.insert(seq), "{}", seq);
+            }
+        }
+    }
+}
