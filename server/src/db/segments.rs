@@ -150,7 +150,7 @@ pub struct SegmentFilter {
     pub after: i64,
 }
 
-/// A row of the statement of [`measurements`](macro@measurements).
+/// A row of the statement of `measurements!`.
 struct Raw {
     pk: i64,
     robot_pk: i64,
