@@ -61,6 +61,8 @@ struct Details {
 #[derive(Debug, Clone, Copy)]
 struct Run {
     is_realtime: bool,
+    /// Whether the memory of an agent with real-time priority is locked.
+    locks_memory: bool,
     load_threads: usize,
 }
 
@@ -82,7 +84,8 @@ impl Run {
 
 fn configuration(run: Run, folder: &Path) -> String {
     let realtime = if run.is_realtime {
-        format!("[realtime]\npriority = {PRIORITY}\nlock_memory = true\n")
+        let locks_memory = run.locks_memory;
+        format!("[realtime]\npriority = {PRIORITY}\nlock_memory = {locks_memory}\n")
     } else {
         String::new()
     };
@@ -195,14 +198,16 @@ fn checks(run: Run, mut late_ms: Vec<f64>) -> Vec<Check> {
 #[tokio::main]
 async fn main() -> anyhow::Result<ExitCode> {
     let arguments = Arguments::parse();
-    // Fails for an ordinary user, whose agent then says why it does not start.
-    _ = setrlimit(Resource::RLIMIT_MEMLOCK, RLIM_INFINITY, RLIM_INFINITY);
+    // Fails for an ordinary user, and where root may not raise limits.
+    let locks_memory = setrlimit(Resource::RLIMIT_MEMLOCK, RLIM_INFINITY, RLIM_INFINITY).is_ok();
     let cores = std::thread::available_parallelism()?.get();
     let load = arguments.load.map_or(2 * cores, usize::from);
-    let (mut checks_of_all, mut not_measured) = (Vec::new(), None);
+    let mut checks_of_all = Vec::new();
+    let mut not_measured = (!locks_memory).then(|| "memory may not be locked here".to_owned());
     for (is_realtime, load_threads) in [(false, 0), (true, 0), (false, load), (true, load)] {
         let run = Run {
             is_realtime,
+            locks_memory,
             load_threads,
         };
         eprintln!("{}: {} s", run.name(), arguments.seconds);
