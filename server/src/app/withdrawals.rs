@@ -1,7 +1,8 @@
 //! Withdrawal of a robot's measurements: the map is then as if they had never arrived.
 //!
 //! The sums of the withdrawn hours are removed, stored or not, and later uploads of these hours are
-//! not added, nor are their segments when the server starts. Raw segments are kept. Hours that are merged into days can only be withdrawn by whole days.
+//! not added, nor are their segments when the server starts. Raw segments are kept. Hours that are
+//! merged into days can only be withdrawn by whole days.
 
 use jiff::Timestamp;
 use tread_api::friction::{CreateWithdrawal, Withdrawal};
