@@ -111,7 +111,7 @@ class Store:
         with self.engine.begin() as connection:
             done = connection.exec_driver_sql(self.insert, every)
             if done.rowcount != len(every):
-                raise SystemExit("this service is measured with new segments alone")
+                raise RuntimeError("this service is measured with new segments alone")
         if time.monotonic() - self.stored_sums_at > SUMS_EVERY_S:
             self.store_sums()
         return counts
