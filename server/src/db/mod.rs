@@ -13,6 +13,7 @@ pub mod deferred_segments;
 pub mod enrolments;
 pub mod failure;
 pub mod geofences;
+mod ground;
 pub mod history;
 pub mod idempotency;
 pub mod inspection;

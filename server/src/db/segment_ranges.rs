@@ -9,8 +9,8 @@ use sqlx::SqliteConnection;
 use tread_api::ids::MissionId;
 use tread_api::terrain::TerrainRef;
 
-use super::DbError;
 use super::rows::RowsStatement;
+use super::{DbError, ground};
 
 /// A range to be stored.
 #[derive(Debug, Clone, Copy)]
@@ -56,6 +56,7 @@ pub(super) async fn insert(
 ) -> Result<(), DbError> {
     let inserting = INSERT.execute(db, ranges, |row, range| {
         let after = range.count.saturating_sub(1);
+        let (terrain, terrain_revision) = ground::columns(range.terrain);
         row.add(range.first_pk)?
             .add(range.first_pk.saturating_add_unsigned(after))?
             .add(range.first_seq)?
@@ -66,12 +67,8 @@ pub(super) async fn insert(
             .add(range.configuration_pk)?
             .add(range.mission.map(|mission| mission.to_string()))?
             .add(i64::from(range.grid_revision))?
-            .add(range.terrain.map_or("", |terrain| terrain.id.as_str()))?
-            .add(
-                range
-                    .terrain
-                    .map_or(0, |terrain| i64::from(terrain.revision)),
-            )?
+            .add(terrain)?
+            .add(terrain_revision)?
             .add(received_at_us)?;
         Ok(())
     });

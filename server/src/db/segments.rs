@@ -11,12 +11,10 @@ use jiff::Timestamp;
 use sqlx::SqliteConnection;
 use tread_api::friction::{Information, Segment, StoredSegment, ThetaErrors};
 use tread_api::ids::{RobotId, TerrainId};
-use tread_api::site::Cell;
-use tread_api::terrain::TerrainRef;
 
 use super::rows::{Row, RowsStatement};
 use super::segment_ranges::{self, NewRange};
-use super::{DbError, corrupt, from_us, parse, robots_text, to_us, unsigned};
+use super::{DbError, corrupt, from_us, ground, parse, robots_text, to_us, unsigned};
 
 /// A measurement to be stored.
 #[derive(Debug, Clone, Copy)]
@@ -200,23 +198,14 @@ impl Raw {
     fn segment(&self) -> Result<Segment, DbError> {
         let errors = self.independent_information.zip(self.robot_error_ratio);
         let mission = self.mission.as_deref().map(|id| parse("mission", id));
-        let terrain = (!self.terrain.is_empty()).then(|| {
-            Ok::<_, DbError>(TerrainRef {
-                id: parse("terrain", &self.terrain)?,
-                revision: unsigned("revision", self.terrain_revision)?,
-            })
-        });
         Ok(Segment {
             configuration: parse("configuration", &self.configuration)?,
             mission: mission.transpose()?,
             started_at: from_ns(self.started_at_ns)?,
             ended_at: from_ns(self.ended_at_ns)?,
             grid_revision: unsigned("revision", self.grid_revision)?,
-            cell: Cell {
-                ix: unsigned("cell", self.ix)?,
-                iy: unsigned("cell", self.iy)?,
-            },
-            terrain: terrain.transpose()?,
+            cell: ground::cell(self.ix, self.iy)?,
+            terrain: ground::terrain(&self.terrain, self.terrain_revision)?,
             theta: Information {
                 information: self.theta_information,
                 weighted: self.theta_weighted,

@@ -10,7 +10,7 @@ use tread_api::site::Cell;
 use tread_api::terrain::TerrainRef;
 
 use super::rows::{Row, RowsStatement};
-use super::{DbError, corrupt, parse, unsigned};
+use super::{DbError, ground, unsigned};
 use crate::friction::Sums;
 use crate::friction::fixed::Fixed;
 use crate::friction::sums::{Pair, Pass, TELLING_DEVIATIONS};
@@ -113,13 +113,13 @@ fn count(number: u64) -> Result<i64, DbError> {
 }
 
 fn bind(row: &mut Row<'_>, (key, sums): &(&SumKey, &Sums)) -> Result<(), DbError> {
-    let terrain = key.terrain.as_ref();
+    let (terrain, terrain_revision) = ground::columns(key.terrain.as_ref());
     row.add(key.site_pk)?
         .add(key.cell.iy)?
         .add(key.cell.ix)?
         .add(key.grid_revision)?
-        .add(terrain.map_or("", |terrain| terrain.id.as_str()))?
-        .add(terrain.map_or(0, |terrain| terrain.revision))?
+        .add(terrain)?
+        .add(terrain_revision)?
         .add(key.robot_pk)?
         .add(key.configuration_pk)?
         .add(key.epoch_h)?;
@@ -212,23 +212,11 @@ impl TryFrom<Raw> for SumRow {
     type Error = DbError;
 
     fn try_from(raw: Raw) -> Result<Self, DbError> {
-        let index = |value: i64| i32::try_from(value).map_err(|_range| corrupt("cell", value));
-        let terrain = if raw.terrain.is_empty() {
-            None
-        } else {
-            Some(TerrainRef {
-                id: parse("terrain", &raw.terrain)?,
-                revision: unsigned("terrain revision", raw.terrain_revision)?,
-            })
-        };
         let key = SumKey {
             robot_pk: raw.robot_pk,
             epoch_h: raw.epoch_h,
-            cell: Cell {
-                ix: index(raw.ix)?,
-                iy: index(raw.iy)?,
-            },
-            terrain,
+            cell: ground::cell(raw.ix, raw.iy)?,
+            terrain: ground::terrain(&raw.terrain, raw.terrain_revision)?,
             grid_revision: unsigned("grid revision", raw.grid_revision)?,
             site_pk: raw.site_pk,
             configuration_pk: raw.configuration_pk,
@@ -331,9 +319,7 @@ pub async fn unmerged(
 
 /// Removes one sum; `false` if it does not exist.
 pub async fn remove(db: &mut SqliteConnection, key: &SumKey) -> Result<bool, DbError> {
-    let terrain = key.terrain.as_ref();
-    let id = terrain.map_or("", |terrain| terrain.id.as_str());
-    let revision = terrain.map_or(0, |terrain| terrain.revision);
+    let (id, revision) = ground::columns(key.terrain.as_ref());
     let SumKey {
         robot_pk,
         epoch_h,
