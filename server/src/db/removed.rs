@@ -7,7 +7,7 @@ use futures_util::TryStreamExt as _;
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
 
-use super::{DbError, to_us};
+use super::{DbError, segment_ranges, to_us};
 
 /// Returns the key of the last measurement that was received before a time and lies in a range that
 /// begins at or before a key; `None` without such ones.
@@ -105,23 +105,14 @@ pub async fn within(
     boot_pk: i64,
     (from, to): (i64, i64),
 ) -> Result<Vec<(i64, i64)>, DbError> {
-    // In descending order: the ranges do not overlap, so the search ends at the first that ends too
-    // early.
-    let mut rows = sqlx::query!(
+    let rows = sqlx::query!(
         "SELECT from_seq, to_seq FROM segments_removed WHERE boot_pk = ? AND from_seq <= ?
          ORDER BY from_seq DESC",
         boot_pk,
         to,
-    )
-    .fetch(db);
-    let mut found = Vec::new();
-    while let Some(row) = rows.try_next().await? {
-        if row.to_seq < from {
-            break;
-        }
-        found.push((row.from_seq, row.to_seq));
-    }
-    Ok(found)
+    );
+    let rows = rows.fetch(db);
+    segment_ranges::ending_from(rows.map_ok(|row| (row.from_seq, row.to_seq)), from).await
 }
 
 /// Returns the largest removed sequence number of a run; `None` without removed measurements.

@@ -4,7 +4,8 @@
 use std::collections::HashMap;
 use std::sync::LazyLock;
 
-use futures_util::TryStreamExt as _;
+use futures_util::future::ready;
+use futures_util::{Stream, TryStreamExt as _};
 use sqlx::SqliteConnection;
 use tread_api::ids::MissionId;
 use tread_api::terrain::TerrainRef;
@@ -115,23 +116,24 @@ pub async fn within(
     boot_pk: i64,
     (from, to): (i64, i64),
 ) -> Result<Vec<(i64, i64)>, DbError> {
-    // In descending order: the ranges do not overlap, so the search ends at the first that ends too
-    // early.
-    let mut rows = sqlx::query!(
+    let rows = sqlx::query!(
         "SELECT first_seq, last_seq FROM segment_ranges WHERE boot_pk = ? AND first_seq <= ?
          ORDER BY first_seq DESC",
         boot_pk,
         to,
-    )
-    .fetch(db);
-    let mut found = Vec::new();
-    while let Some(row) = rows.try_next().await? {
-        if row.last_seq < from {
-            break;
-        }
-        found.push((row.first_seq, row.last_seq));
-    }
-    Ok(found)
+    );
+    let rows = rows.fetch(db);
+    ending_from(rows.map_ok(|row| (row.first_seq, row.last_seq)), from).await
+}
+
+/// Returns the ranges that end at a number or later, of disjoint ones in descending order: the search
+/// ends at the first that ends before.
+pub(super) async fn ending_from(
+    ranges: impl Stream<Item = Result<(i64, i64), sqlx::Error>>,
+    from: i64,
+) -> Result<Vec<(i64, i64)>, DbError> {
+    let found = ranges.try_take_while(|&(_, to)| ready(Ok(from <= to)));
+    Ok(found.try_collect().await?)
 }
 
 /// Returns the largest stored sequence number of a run; `None` without stored measurements.
