@@ -6,8 +6,8 @@
 //! cell sums, with the commit in memory, and later in the database ([`super::sums`]). A
 //! segment that is sent twice counts once.
 
+mod deduplication;
 mod keys;
-mod known;
 mod prepared;
 
 use std::borrow::Cow;
@@ -29,8 +29,8 @@ use tread_api::wire::ingest::{
 };
 use tread_api::wire::{Refusal, RefusalCode};
 
+use self::deduplication::Deduplication;
 use self::keys::{CONFIGURATIONS_MAX, Configured, Keys, RobotKeys};
-use self::known::Known;
 pub(super) use self::prepared::SKEW_MIN;
 use self::prepared::{Prepared, Ready, Skew, prepared, us_of};
 use super::App;
@@ -371,7 +371,7 @@ impl Writer {
                     }
                     RecordContent::Mission(report) => {
                         let of = self.reporting(upload, robot_pk, report, (now, skew));
-                        let taken = self.take_report(&mut tx, of, keys, report, &mut tally);
+                        let taken = self.apply_report(&mut tx, of, keys, report, &mut tally);
                         let taken = taken.await?;
                         tally.note_report(taken, seq, &mut receipt);
                     }
@@ -390,7 +390,7 @@ impl Writer {
     }
 
     /// Applies a report with its alerts, unless it was applied before; then it returns `None`.
-    async fn take_report(
+    async fn apply_report(
         &self,
         tx: &mut Tx,
         of: Reporting,
@@ -457,13 +457,14 @@ impl Writer {
         tally: &mut Tally,
     ) -> Result<(Vec<Folded>, Added), DbError> {
         let removed = self.app.removed();
-        let mut known = Known::read(tx, candidates, removed, &mut self.keys).await?;
+        let keys = &mut self.keys;
+        let mut stored = Deduplication::read(tx, candidates, removed, keys).await?;
         let withdrawals = db::withdrawals::all(tx).await?;
         let mut rows = Vec::with_capacity(candidates.len());
         let mut folded: Vec<Folded> = Vec::new();
         for candidate in candidates {
             // A segment that occurs twice in this group is new once.
-            let is_new = known.insert(candidate.keys);
+            let is_new = stored.insert(candidate.keys);
             let upload = candidate.upload.and_then(|upload| outcomes.get_mut(upload));
             if let Some(Ok(receipt)) = upload {
                 if is_new {

@@ -7,13 +7,13 @@ use super::keys::Keys;
 use crate::app::retention::Removed;
 use crate::db::{self, DbError, Tx};
 
-/// Sequence numbers of the runs of a group of uploads.
+/// Recognises segments of a group of uploads that are stored already, or twice in the group.
 #[derive(Debug, Default)]
-pub(super) struct Known {
-    boots: HashMap<i64, Seqs>,
+pub(super) struct Deduplication {
+    boots: HashMap<i64, SeqSet>,
 }
 
-impl Known {
+impl Deduplication {
     /// Reads which of the candidates' sequence numbers are known. A run whose numbers follow those of
     /// its former uploads costs no query.
     pub(super) async fn read(
@@ -31,7 +31,7 @@ impl Known {
             let span = spans.entry(boot_pk).or_insert((seq, seq));
             *span = (span.0.min(seq), span.1.max(seq));
         }
-        let mut known = Self::default();
+        let mut found = Self::default();
         for (boot_pk, span) in spans {
             let newest = keys.newest_seq(tx, boot_pk).await?;
             keys.note_seq(boot_pk, span.1);
@@ -42,11 +42,11 @@ impl Known {
             if removed.has(boot_pk) {
                 ranges.extend(db::removed::within(tx, boot_pk, span).await?);
             }
-            known
+            found
                 .boots
-                .insert(boot_pk, Seqs(ranges.into_iter().collect()));
+                .insert(boot_pk, SeqSet(ranges.into_iter().collect()));
         }
-        Ok(known)
+        Ok(found)
     }
 
     /// Adds a segment by its run and sequence number. Returns whether it was unknown.
@@ -57,9 +57,9 @@ impl Known {
 
 /// A set of sequence numbers, as disjoint ranges from the first to the last number of each.
 #[derive(Debug, Default)]
-struct Seqs(BTreeMap<i64, i64>);
+struct SeqSet(BTreeMap<i64, i64>);
 
-impl Seqs {
+impl SeqSet {
     /// Adds a number. Returns whether it was not in the set.
     fn insert(&mut self, seq: i64) -> bool {
         let Self(ranges) = self;
@@ -95,7 +95,7 @@ mod tests {
                     _ => ranges.push((seq, seq)),
                 }
             }
-            let mut seqs = Seqs(ranges.into_iter().collect());
+            let mut seqs = SeqSet(ranges.into_iter().collect());
             let mut expected: BTreeSet<i64> = stored;
             for seq in inserted {
                 prop_assert_eq!(seqs.insert(seq), expected.insert(seq), "{}", seq);
