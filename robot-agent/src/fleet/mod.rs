@@ -434,8 +434,7 @@ impl FleetLink {
     /// # Errors
     /// [`AskError`] if the hello cannot be encoded, or no readable answer arrives.
     pub async fn hello(self: &Arc<Self>, hello: &Hello) -> Result<Welcome, AskError> {
-        let encoding = Encoding::Json;
-        let answer = self.ask_in(encoding, Question::Hello, hello).await?;
+        let answer = self.ask(Encoding::Json, Question::Hello, hello).await?;
         let welcome: Welcome = wire::decode(&answer).map_err(AskError::Unreadable)?;
         self.uploads_cbor.store(
             welcome.upload_encoding() == Encoding::Cbor,
@@ -451,18 +450,17 @@ impl FleetLink {
     /// [`AskError`] if there is no readable receipt: the batch may or may not have been stored.
     pub async fn upload(self: &Arc<Self>, batch: &Batch) -> Result<Receipt, AskError> {
         let encoding = self.upload_encoding();
-        let answer = match self.ask_in(encoding, Question::Ingest, batch).await {
-            // An older server has taken the place of the one that welcomed the robot.
-            Err(AskError::Refused(refusal))
-                if encoding != Encoding::Json && refusal.code == RefusalCode::Malformed =>
-            {
-                self.uploads_cbor.store(false, Ordering::Relaxed);
-                let encoding = Encoding::Json;
-                self.ask_in(encoding, Question::Ingest, batch).await?
-            }
-            answer => answer?,
+        let mut answer = self.ask(encoding, Question::Ingest, batch).await;
+        let is_unread = |answer: &Result<_, AskError>| match answer {
+            Err(AskError::Refused(refusal)) => refusal.code == RefusalCode::Malformed,
+            _ => false,
         };
-        wire::decode(&answer).map_err(AskError::Unreadable)
+        // An older server may have taken the place of the one that welcomed the robot.
+        if encoding == Encoding::Cbor && is_unread(&answer) {
+            self.uploads_cbor.store(false, Ordering::Relaxed);
+            answer = self.ask(Encoding::Json, Question::Ingest, batch).await;
+        }
+        wire::decode(&answer?).map_err(AskError::Unreadable)
     }
 
     fn upload_encoding(&self) -> Encoding {
@@ -473,7 +471,7 @@ impl FleetLink {
         }
     }
 
-    async fn ask_in<T: Serialize>(
+    async fn ask<T: Serialize>(
         self: &Arc<Self>,
         encoding: Encoding,
         question: Question,

@@ -23,6 +23,7 @@ use support::{eventually, offer};
 use tread_api::keys::Verb;
 use tread_api::wire::RefusalCode;
 use tread_api::wire::command::Cancel;
+use tread_api::wire::encoding::Encoding;
 use tread_api::wire::ingest::MissionPhase;
 use tread_api::wire::reply::{Acknowledgement, CommandRefusal, CommandRefusalCode, OfferReply};
 use tread_api::wire::{self};
@@ -268,6 +269,39 @@ async fn a_lost_receipt_makes_duplicates_and_nothing_is_lost() {
             "three receipts were lost, yet nothing came more than {most} times"
         );
     }
+    rig.assert_every_record_came_once_per_name();
+    agent.stop().await;
+    server.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn uploads_are_in_cbor_where_the_server_reads_it_and_in_json_when_an_older_one_takes_over() {
+    let rig = Rig::new();
+    let server = rig.serve();
+    let agent = rig.agent();
+    rig.ready(agent.boot()).await;
+    let short = offer(1, SHORT);
+    server.offer(&rig.robot, &short).await;
+    rig.sees("the first mission ends", |memory| {
+        let phases = memory.phases(short.mission);
+        phases.contains(&MissionPhase::Succeeded).then_some(())
+    })
+    .await;
+    let first = rig.memory.lock().unwrap().encodings.clone();
+    assert!(!first.is_empty());
+    assert!(first.iter().all(|&of| of == Encoding::Cbor), "{first:?}");
+
+    server.reads_json_alone.store(true, Ordering::SeqCst);
+    let next = offer(2, SHORT);
+    server.offer(&rig.robot, &next).await;
+    rig.sees("the second mission ends", |memory| {
+        let phases = memory.phases(next.mission);
+        phases.contains(&MissionPhase::Succeeded).then_some(())
+    })
+    .await;
+    let all = rig.memory.lock().unwrap().encodings.clone();
+    assert_eq!(all.last(), Some(&Encoding::Json), "{all:?}");
+    assert_eq!(agent.outbox_status().refused, 0, "no record was given up");
     rig.assert_every_record_came_once_per_name();
     agent.stop().await;
     server.stop().await;

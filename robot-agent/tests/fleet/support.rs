@@ -15,6 +15,7 @@ use tread_api::site::Grid;
 use tread_api::terrain::{TerrainRef, TerrainShape};
 use tread_api::trajectory::Trajectory;
 use tread_api::wire::command::Offer;
+use tread_api::wire::encoding::Encoding;
 use tread_api::wire::hello::{Hello, SiteDefinition, Welcome};
 use tread_api::wire::ingest::{Batch, MissionPhase, Receipt, Record, RecordContent};
 use tread_api::wire::reply::{Answer, Command, OfferReply};
@@ -53,6 +54,8 @@ pub(crate) struct Memory {
     pub(crate) hellos: Vec<Hello>,
     /// Every record by its name, and how often it came.
     pub(crate) records: BTreeMap<(BootId, u64), (RecordContent, usize)>,
+    /// The encoding of each upload that was read.
+    pub(crate) encodings: Vec<Encoding>,
     pub(crate) states: Vec<RobotState>,
     pub(crate) frictions: Vec<FrictionReport>,
     /// The robot's clock in each batch.
@@ -94,6 +97,8 @@ pub(crate) struct FakeServer {
     pub(crate) receipts_to_lose: Arc<AtomicUsize>,
     /// Batches with the start of a mission in them are refused as a whole.
     pub(crate) refuses_starts: Arc<AtomicBool>,
+    /// Uploads in CBOR are refused, as by an older server, which takes them for broken JSON.
+    pub(crate) reads_json_alone: Arc<AtomicBool>,
 }
 
 pub(crate) fn free_port() -> u16 {
@@ -153,6 +158,7 @@ impl FakeServer {
             site: scenario.site.clone(),
             receipts_to_lose,
             refuses_starts,
+            reads_json_alone: Arc::new(AtomicBool::new(false)),
         };
         server.declare(definition, memory);
         server
@@ -163,7 +169,7 @@ impl FakeServer {
         let welcome = Welcome {
             site: definition,
             server_time: jiff::Timestamp::UNIX_EPOCH,
-            upload_encodings: Vec::new(),
+            upload_encodings: vec![Encoding::Other, Encoding::Cbor],
         };
         let welcome = wire::encode(&welcome).unwrap();
         let (kept, answer) = (Arc::clone(memory), welcome);
@@ -182,11 +188,26 @@ impl FakeServer {
             .unwrap();
         let (kept, to_lose) = (Arc::clone(memory), Arc::clone(&self.receipts_to_lose));
         let refuses_starts = Arc::clone(&self.refuses_starts);
+        let reads_json_alone = Arc::clone(&self.reads_json_alone);
         session
             .declare_queryable(keys::ALL_INGEST)
             .complete(true)
             .callback(move |query| {
-                let batch: Batch = read(&query);
+                let media_type = query.encoding().unwrap().to_string();
+                let encoding = match Encoding::of_media_type(&media_type) {
+                    _ if reads_json_alone.load(Ordering::SeqCst) => Encoding::Json,
+                    named => named,
+                };
+                let payload = query.payload().unwrap().to_bytes();
+                let batch: Batch = match wire::decode_as(encoding, &payload) {
+                    Ok(batch) => batch,
+                    Err(error) => {
+                        let payload = wire::encode(&Refusal::from(&error)).unwrap();
+                        query.reply_err(payload).wait().unwrap();
+                        return;
+                    }
+                };
+                kept.lock().unwrap().encodings.push(encoding);
                 if refuses_starts.load(Ordering::SeqCst) && batch.records.iter().any(is_start) {
                     let refusal = Refusal {
                         code: RefusalCode::Malformed,
