@@ -39,9 +39,11 @@ impl Encoding {
         }
     }
 
-    /// Returns the encoding with a media type. Payloads without a known one are JSON.
+    /// Returns the encoding with a media type, of which parameters after `;` say nothing. Payloads
+    /// without a known one are JSON.
     pub fn of_media_type(text: &str) -> Self {
-        if text == Self::Cbor.media_type() {
+        let essence = text.split(';').next().unwrap_or_default();
+        if essence.trim().eq_ignore_ascii_case(Self::Cbor.media_type()) {
             Self::Cbor
         } else {
             Self::Json
@@ -213,6 +215,10 @@ mod tests {
         for encoding in [Encoding::Json, Encoding::Cbor] {
             assert_eq!(Encoding::of_media_type(encoding.media_type()), encoding);
         }
+        assert_eq!(
+            Encoding::of_media_type("application/cbor;schema=report"),
+            Encoding::Cbor
+        );
         assert_eq!(Encoding::of_media_type("zenoh/bytes"), Encoding::Json);
     }
 }

@@ -86,3 +86,18 @@ pub async fn note_version(
     .await?;
     Ok(())
 }
+
+/// Creates a database of an earlier schema: the last one before a migration.
+#[cfg(test)]
+pub(super) async fn open_before(path: &Path, version: i64) -> SqliteConnection {
+    use sqlx::ConnectOptions as _;
+    let options = sqlx::sqlite::SqliteConnectOptions::new().filename(path);
+    let mut old = options.create_if_missing(true).connect().await.unwrap();
+    let before = MIGRATOR.iter().filter(|step| step.version < version);
+    let before = Migrator {
+        migrations: before.cloned().collect::<Vec<_>>().into(),
+        ..Migrator::DEFAULT
+    };
+    before.run(&mut old).await.unwrap();
+    old
+}

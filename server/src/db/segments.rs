@@ -481,3 +481,6 @@ pub async fn of_site(
     let rows = rows.fetch_all(db).await?;
     rows.into_iter().map(KeyedSegment::try_from).collect()
 }
+
+#[cfg(test)]
+mod tests;

@@ -303,29 +303,18 @@ pub async fn surplus(
 
 #[cfg(test)]
 mod tests {
-    use sqlx::ConnectOptions as _;
     use sqlx::Connection as _;
-    use sqlx::migrate::Migrator;
-    use sqlx::sqlite::SqliteConnectOptions;
     use tread_api::ids::OidcSubject;
 
     use super::*;
-    use crate::db::Db;
+    use crate::db::{Db, schema};
     use crate::identity::secret::{Kind, SECRET_RANDOM_BYTES, Secret};
 
     #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
     async fn sessions_of_before_there_were_people_stay() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("tread.db");
-        let options = SqliteConnectOptions::new().filename(&path);
-        let mut old = options.create_if_missing(true).connect().await.unwrap();
-        let all = super::super::schema::migrator();
-        let before = all.iter().filter(|step| step.version < 20_261_122_163_000);
-        let before = Migrator {
-            migrations: before.cloned().collect::<Vec<_>>().into(),
-            ..Migrator::DEFAULT
-        };
-        before.run(&mut old).await.unwrap();
+        let mut old = schema::open_before(&path, 20_261_122_163_000).await;
         let (id, token) = (
             "0192f0c1-2b3c-7d4e-8f50-617283940a1b",
             "0192f0c1-2b3c-7d4e-8f50-617283940a1c",
