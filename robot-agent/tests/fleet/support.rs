@@ -186,17 +186,57 @@ impl FakeServer {
             .background()
             .wait()
             .unwrap();
+        self.declare_ingest(memory);
+        let kept = Arc::clone(memory);
+        session
+            .declare_subscriber("tread/*/robots/*/*")
+            .callback(move |sample| {
+                let bytes = sample.payload().to_bytes();
+                let mut memory = kept.lock().unwrap();
+                match Key::parse(sample.key_expr().as_str()) {
+                    Some(Key::State(..)) => memory.states.push(wire::decode(&bytes).unwrap()),
+                    Some(Key::Friction(..)) => memory.frictions.push(wire::decode(&bytes).unwrap()),
+                    Some(Key::Teleop(..)) => {}
+                    other => panic!("published on {other:?}"),
+                }
+            })
+            .background()
+            .wait()
+            .unwrap();
+        let kept = Arc::clone(memory);
+        session
+            .liveliness()
+            .declare_subscriber(keys::ALL_ALIVE)
+            .history(true)
+            .callback(move |sample| {
+                let Some(Key::Alive(_, _, boot)) = Key::parse(sample.key_expr().as_str()) else {
+                    panic!("no token: {}", sample.key_expr());
+                };
+                let mut memory = kept.lock().unwrap();
+                match sample.kind() {
+                    SampleKind::Put => memory.alive.push(boot),
+                    SampleKind::Delete => memory.gone.push(boot),
+                }
+            })
+            .background()
+            .wait()
+            .unwrap();
+    }
+
+    /// Answers uploads.
+    fn declare_ingest(&self, memory: &SharedMemory) {
         let (kept, to_lose) = (Arc::clone(memory), Arc::clone(&self.receipts_to_lose));
         let refuses_starts = Arc::clone(&self.refuses_starts);
         let reads_json_alone = Arc::clone(&self.reads_json_alone);
-        session
+        self.session
             .declare_queryable(keys::ALL_INGEST)
             .complete(true)
             .callback(move |query| {
                 let media_type = query.encoding().unwrap().to_string();
-                let encoding = match Encoding::of_media_type(&media_type) {
-                    _ if reads_json_alone.load(Ordering::SeqCst) => Encoding::Json,
-                    named => named,
+                let encoding = if reads_json_alone.load(Ordering::SeqCst) {
+                    Encoding::Json
+                } else {
+                    Encoding::of_media_type(&media_type)
                 };
                 let payload = query.payload().unwrap().to_bytes();
                 let batch: Batch = match wire::decode_as(encoding, &payload) {
@@ -228,40 +268,6 @@ impl FakeServer {
                         .reply(query.key_expr().clone(), payload)
                         .wait()
                         .unwrap();
-                }
-            })
-            .background()
-            .wait()
-            .unwrap();
-        let kept = Arc::clone(memory);
-        session
-            .declare_subscriber("tread/*/robots/*/*")
-            .callback(move |sample| {
-                let bytes = sample.payload().to_bytes();
-                let mut memory = kept.lock().unwrap();
-                match Key::parse(sample.key_expr().as_str()) {
-                    Some(Key::State(..)) => memory.states.push(wire::decode(&bytes).unwrap()),
-                    Some(Key::Friction(..)) => memory.frictions.push(wire::decode(&bytes).unwrap()),
-                    Some(Key::Teleop(..)) => {}
-                    other => panic!("published on {other:?}"),
-                }
-            })
-            .background()
-            .wait()
-            .unwrap();
-        let kept = Arc::clone(memory);
-        session
-            .liveliness()
-            .declare_subscriber(keys::ALL_ALIVE)
-            .history(true)
-            .callback(move |sample| {
-                let Some(Key::Alive(_, _, boot)) = Key::parse(sample.key_expr().as_str()) else {
-                    panic!("no token: {}", sample.key_expr());
-                };
-                let mut memory = kept.lock().unwrap();
-                match sample.kind() {
-                    SampleKind::Put => memory.alive.push(boot),
-                    SampleKind::Delete => memory.gone.push(boot),
                 }
             })
             .background()
