@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use jiff::Timestamp;
 use tokio::sync::mpsc;
 use tokio::sync::mpsc::error::TrySendError;
 use tokio::time::MissedTickBehavior;
@@ -29,6 +30,11 @@ const PRESENCE_WAITING_MAX: usize = 32_768;
 const STATES_WAITING_MAX: usize = 10_000;
 /// Maximum number of waiting hellos.
 const HELLOS_WAITING_MAX: usize = 8_192;
+/// Maximum number of states and friction reports that are processed at once.
+const STATES_AT_ONCE_MAX: usize = 1_000;
+/// Pause after states were processed. Those that arrive meanwhile wake no thread: with a thousand
+/// robots, waking one for each would cost more than decoding it.
+const STATES_PAUSE: Duration = Duration::from_millis(5);
 /// Maximum size of a state or a friction report, bytes.
 pub(super) const STATE_BYTES_MAX: usize = 256 * 1024;
 /// Interval of checks for tokens that came too fast.
@@ -61,11 +67,21 @@ enum TokenChange {
     RouterClosed(u64),
 }
 
+/// A state or a friction report.
 #[derive(Debug)]
 struct Published {
-    key: String,
+    kind: Kind,
     payload: Vec<u8>,
-    _place: Place,
+    place: Place,
+    /// Time of arrival.
+    at: Arrival,
+}
+
+/// Time of arrival of a message, by both clocks of the server.
+#[derive(Debug, Clone, Copy)]
+struct Arrival {
+    monotonic: Duration,
+    wall: Timestamp,
 }
 
 impl Channels {
@@ -240,10 +256,15 @@ pub(super) fn declare(session: &Session, channels: &Channels, router: u64) -> ze
                 if sample.payload().len() > STATE_BYTES_MAX {
                     return to.app.counters().refused_malformed.one();
                 }
+                let clock = to.app.clock();
                 let published = Published {
-                    key: key.to_owned(),
+                    kind,
                     payload: sample.payload().to_bytes().into_owned(),
-                    _place: place,
+                    place,
+                    at: Arrival {
+                        monotonic: clock.elapsed(),
+                        wall: clock.now(),
+                    },
                 };
                 hand_over(&to.states, published, &to.app.counters().states_dropped);
             })
@@ -333,47 +354,61 @@ async fn read_states(
     limits: RateLimits,
     stop: CancellationToken,
 ) {
-    while let Some(message) = next(&mut published, &stop).await {
-        let now = app.clock().elapsed();
-        match Key::parse(&message.key) {
-            Some(Key::State(site, robot)) => {
-                let named = |state: &RobotState| state.robot == robot;
-                let key: RobotKey = (site, robot.clone());
-                if !app.admits(&key) {
-                    continue;
-                }
-                if let Some(state) = read(&app, &limits, &key, &message, named) {
-                    match app.presences().state(&key, state, now, app.clock().now()) {
-                        Heard::News => app.wake(),
-                        Heard::Nothing => {}
-                        Heard::Stranger => refuse_stranger(&app, &key),
-                        Heard::Other => app.counters().refused_other_run.one(),
-                    }
-                }
-            }
-            Some(Key::Friction(site, robot)) => {
-                let named = |report: &FrictionReport| report.robot == robot;
-                let key: RobotKey = (site, robot.clone());
-                if !app.admits(&key) {
-                    continue;
-                }
-                if let Some(report) = read(&app, &limits, &key, &message, named) {
-                    match app.presences().friction(&key, &report, now) {
-                        Heard::News | Heard::Nothing => {}
-                        Heard::Stranger => refuse_stranger(&app, &key),
-                        Heard::Other => app.counters().refused_other_run.one(),
-                    }
-                }
-            }
-            Some(_) | None => refuse_key(&app, &message.key),
+    let mut messages = Vec::with_capacity(STATES_AT_ONCE_MAX);
+    loop {
+        let received = tokio::select! {
+            biased;
+            () = stop.cancelled() => return,
+            received = published.recv_many(&mut messages, STATES_AT_ONCE_MAX) => received,
+        };
+        if received == 0 {
+            return;
         }
+        for message in messages.drain(..) {
+            process(&app, &limits, &message);
+        }
+        // More wait already, otherwise.
+        if received < STATES_AT_ONCE_MAX {
+            tokio::time::sleep(STATES_PAUSE).await;
+        } else {
+            tokio::task::yield_now().await;
+        }
+    }
+}
+
+/// Records a state or a friction report of a robot.
+fn process(app: &App, limits: &RateLimits, message: &Published) {
+    let key = message.place.robot();
+    if !app.admits(key) {
+        return;
+    }
+    let (_, robot) = key;
+    let heard = if message.kind == Kind::Friction {
+        let named = |report: &FrictionReport| report.robot == *robot;
+        let Some(report) = read(app, limits, message, named) else {
+            return;
+        };
+        let presences = app.presences();
+        presences.friction(key, &report, message.at.monotonic)
+    } else {
+        let named = |state: &RobotState| state.robot == *robot;
+        let Some(state) = read(app, limits, message, named) else {
+            return;
+        };
+        let (presences, at) = (app.presences(), message.at);
+        presences.state(key, state, at.monotonic, at.wall)
+    };
+    match heard {
+        Heard::News => app.wake(),
+        Heard::Nothing => {}
+        Heard::Stranger => refuse_stranger(app, key),
+        Heard::Other => app.counters().refused_other_run.one(),
     }
 }
 
 fn read<T: serde::de::DeserializeOwned>(
     app: &App,
     limits: &RateLimits,
-    robot: &RobotKey,
     message: &Published,
     is_named: impl Fn(&T) -> bool,
 ) -> Option<T> {
@@ -392,7 +427,13 @@ fn read<T: serde::de::DeserializeOwned>(
             explained(&error)
         }
     };
-    log_refusal(app, limits, robot, &message.key, &why);
+    let (site, robot) = message.place.robot();
+    let key = if message.kind == Kind::Friction {
+        keys::friction(site, robot)
+    } else {
+        keys::state(site, robot)
+    };
+    log_refusal(app, limits, message.place.robot(), &key, &why);
     None
 }
 

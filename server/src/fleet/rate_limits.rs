@@ -180,6 +180,13 @@ pub(super) struct Place {
     kind: Kind,
 }
 
+impl Place {
+    /// Returns the robot whose message it is.
+    pub(super) fn robot(&self) -> &RobotKey {
+        &self.robot
+    }
+}
+
 impl Drop for Place {
     fn drop(&mut self) {
         if let Some(robot) = self.limits.lock().get_mut(&self.robot) {
