@@ -295,7 +295,7 @@ impl Writer {
         let app = self.app.clone();
         app.bound_unwritten_sums().await?;
         let turn = app.map_turn_to_change().await?;
-        let mut tx = app.db().write_uploads("ingest").await?;
+        let mut tx = app.db().write_uncounted("ingest").await?;
         let now = self.app.clock().now();
         for (index, upload) in group.iter().enumerate() {
             let batch = &upload.batch;

@@ -441,8 +441,8 @@ impl Db {
         })
     }
 
-    /// Returns the generation: a counter of commits other than uploads. Data that uploads do not
-    /// change are unchanged while it is the same.
+    /// Returns the generation: a counter of commits other than of uploads and missions. Data that
+    /// those do not change are unchanged while it is the same.
     pub fn generation(&self) -> u64 {
         self.commits.generation.load(Ordering::Acquire)
     }
@@ -497,12 +497,12 @@ impl Db {
         })
     }
 
-    /// Begins a write transaction for uploads of robots (measurements and mission reports), which
-    /// [`Db::generation`] does not count.
+    /// Begins a write transaction that [`Db::generation`] does not count, since it changes no site,
+    /// terrain or robot: of uploads, or of missions.
     ///
     /// # Errors
     /// The connection did not become free in time, or SQLite failed.
-    pub async fn write_uploads(&self, kind: &'static str) -> Result<Tx, DbError> {
+    pub async fn write_uncounted(&self, kind: &'static str) -> Result<Tx, DbError> {
         Ok(Tx {
             is_counted: false,
             ..self.write(kind).await?
@@ -577,7 +577,7 @@ impl Db {
     /// # Errors
     /// The database cannot be written.
     pub async fn probe_write(&self) -> Result<(), DbError> {
-        let mut tx = self.write_uploads("storage").await?;
+        let mut tx = self.write_uncounted("storage").await?;
         // A number in the file's header that is not used otherwise; its page is written each time.
         sqlx::query("PRAGMA user_version = 1")
             .execute(&mut *tx)

@@ -57,7 +57,7 @@ async fn what_is_committed_counts_even_if_nobody_waits_for_it_and_uploads_never_
         .await
         .unwrap();
     assert_eq!(db.generation(), before + 1);
-    db.write_uploads("db")
+    db.write_uncounted("db")
         .await
         .unwrap()
         .commit()
@@ -69,7 +69,7 @@ async fn what_is_committed_counts_even_if_nobody_waits_for_it_and_uploads_never_
 /// Fills the log with so many MiB by commits.
 async fn fill_log(db: &Db, mebibytes: usize) {
     for _ in 0..mebibytes {
-        let mut tx = db.write_uploads("db").await.unwrap();
+        let mut tx = db.write_uncounted("db").await.unwrap();
         let blob = "INSERT INTO filling VALUES (randomblob(1048576))";
         sqlx::query(blob).execute(&mut *tx).await.unwrap();
         tx.commit().await.unwrap();
@@ -78,7 +78,7 @@ async fn fill_log(db: &Db, mebibytes: usize) {
 
 async fn db_with_filling(folder: &Path) -> Db {
     let db = Db::open(&folder.join("tread.db")).await.unwrap();
-    let mut tx = db.write_uploads("db").await.unwrap();
+    let mut tx = db.write_uncounted("db").await.unwrap();
     let table = sqlx::query("CREATE TABLE filling (bytes BLOB)");
     table.execute(&mut *tx).await.unwrap();
     tx.commit().await.unwrap();

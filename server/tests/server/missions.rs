@@ -4,15 +4,16 @@ use std::time::Duration;
 
 use reqwest::StatusCode;
 use serde_json::json;
-use tread_api::ids::BootId;
+use tread_api::ids::{BootId, RobotId};
 use tread_api::mission::{Actor, Mission, MissionState};
 use tread_api::page::Page;
 use tread_api::wire::ingest::{MissionPhase, Record};
 use tread_api::wire::reply::CommandRefusalCode;
 use uuid::Uuid;
 
-use crate::harness::{Yard, circle, eventually, report};
-use crate::robot::{Mood, Robot};
+use crate::harness::{Yard, circle, eventually, report, site};
+use crate::ingest::{Writer, boot};
+use crate::robot::{Mood, Robot, first_state};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_mission_is_offered_driven_and_succeeds_with_its_whole_history() {
@@ -326,4 +327,44 @@ async fn a_robot_cannot_end_the_mission_of_another_one() {
         MissionState::Active
     );
     yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_mission_is_offered_in_the_commit_that_creates_it_where_nothing_comes_before_it() {
+    // There is no reconciler that would offer it.
+    let writer = Writer::start().await;
+    let (app, robot): (_, RobotId) = (&writer.app, "rover-1".parse().unwrap());
+    let create = async |robot: &RobotId| {
+        let request = serde_json::from_value(circle(robot)).unwrap();
+        let created = app.create_mission(request).await.unwrap();
+        assert_eq!(created.state, MissionState::Queued);
+        app.mission(created.id).await.unwrap()
+    };
+    let appears = |robot: &RobotId| {
+        let (key, now) = ((site(), robot.clone()), app.clock().elapsed());
+        app.presences().token_appeared(key.clone(), boot(1), now);
+        let state = first_state(robot, boot(1), 0);
+        app.presences().state(&key, state, now, app.clock().now());
+    };
+    let unheard = create(&robot).await;
+    assert_eq!(unheard.mission.state, MissionState::Queued, "nobody hears");
+    appears(&robot);
+    let second = create(&robot).await;
+    assert_eq!(second.mission.state, MissionState::Queued, "behind another");
+    let other: RobotId = "rover-2".parse().unwrap();
+    appears(&other);
+    let offered = create(&other).await;
+    assert_eq!(offered.mission.state, MissionState::Offered);
+    let steps: Vec<(Actor, MissionState)> = offered
+        .events
+        .iter()
+        .map(|event| (event.actor, event.to))
+        .collect();
+    assert_eq!(
+        steps,
+        [
+            (Actor::Client, MissionState::Queued),
+            (Actor::Server, MissionState::Offered),
+        ]
+    );
 }

@@ -103,7 +103,7 @@ pub(crate) async fn session(yard: &Yard) -> zenoh::Session {
 }
 
 /// What a robot says first, with that many records in its store.
-fn first_state(id: &RobotId, boot: BootId, pending: u64) -> RobotState {
+pub(crate) fn first_state(id: &RobotId, boot: BootId, pending: u64) -> RobotState {
     RobotState {
         robot: id.clone(),
         boot,

@@ -1,5 +1,5 @@
 //! Cache of the sites and robots that map requests need from the database, valid until something
-//! other than an upload is committed. Requests then need no database connection.
+//! other than an upload or a mission is committed. Requests then need no database connection.
 
 use std::collections::HashMap;
 use std::hash::Hash;

@@ -59,7 +59,7 @@ impl App {
         if portion.steps.is_empty() {
             return Ok(false);
         }
-        let mut tx = self.db().write_uploads("sums").await?;
+        let mut tx = self.db().write_uncounted("sums").await?;
         db::sums::add(&mut tx, portion.sums.iter().map(|(key, sums)| (key, sums))).await?;
         for &step in &portion.steps {
             db::watermarks::advance(&mut tx, step).await?;

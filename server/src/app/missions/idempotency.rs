@@ -82,7 +82,7 @@ impl App {
         if is_new {
             self.check_new(&request).await?;
         }
-        let mut tx = self.db().write("missions").await?;
+        let mut tx = self.db().write_uncounted("missions").await?;
         if let Some(stored) = db::idempotency::find(&mut tx, key, request_hash).await? {
             if stored.request_hash != request_hash {
                 return Err(AppError::KeyReused);
@@ -108,6 +108,7 @@ impl App {
         }
         tx.commit().await?;
         self.wake();
+        self.trace_stored(&mission);
         Ok(mission)
     }
 }

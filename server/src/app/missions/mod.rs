@@ -4,6 +4,7 @@
 
 pub mod control;
 pub mod idempotency;
+mod immediate_offer;
 pub(crate) mod reports;
 pub mod transitions;
 
@@ -36,10 +37,11 @@ impl App {
     /// Creates a mission.
     pub async fn create_mission(&self, request: CreateMission) -> Result<Mission, AppError> {
         self.check_new(&request).await?;
-        let mut tx = self.db().write("missions").await?;
+        let mut tx = self.db().write_uncounted("missions").await?;
         let mission = self.enqueue(&mut tx, request).await?;
         tx.commit().await?;
         self.wake();
+        self.trace_stored(&mission);
         Ok(mission)
     }
 
@@ -55,7 +57,8 @@ impl App {
         self.check_fence(robot, &request.trajectory, place).await
     }
 
-    /// Inserts a mission into its robot's queue, according to its start policy.
+    /// Inserts a mission into its robot's queue, according to its start policy. Returns it as it was
+    /// inserted; it may have been offered since.
     async fn enqueue(&self, tx: &mut Tx, request: CreateMission) -> Result<Mission, AppError> {
         check_figures(&request)?;
         let CreateMission {
@@ -150,6 +153,7 @@ impl App {
             reason: None,
         };
         db::history::add_event(tx, id, &event).await?;
+        self.offer_immediately(tx, &row).await?;
         Ok(row.mission)
     }
 

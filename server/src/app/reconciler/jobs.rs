@@ -44,7 +44,7 @@ pub(super) async fn settle(app: &App, mission: &Standing, change: Change) -> Res
         progress: last_progress(app, mission),
         ..Facts::default()
     };
-    let mut tx = app.db().write("reconciler").await?;
+    let mut tx = app.db().write_uncounted("reconciler").await?;
     let step = server_step(app, change, None, facts);
     let mut alerts = Vec::new();
     if let Some(state) = take_step(&mut tx, mission, step).await?
@@ -102,7 +102,7 @@ fn start_within_ms(app: &App, row: &MissionRow) -> Option<u64> {
 /// Offers a mission to its robot and stores the answer.
 pub(super) async fn offer(app: App, standing: Standing) -> Result<Finished, AppError> {
     if standing.state == MissionState::Queued {
-        let mut tx = app.db().write("reconciler").await?;
+        let mut tx = app.db().write_uncounted("reconciler").await?;
         let step = server_step(&app, Change::Offer, None, Facts::default());
         match take_step(&mut tx, &standing, step).await {
             Ok(Some(_)) => {
@@ -181,7 +181,7 @@ async fn take_offer_answer(
             }
         }
     };
-    let mut tx = app.db().write("reconciler").await?;
+    let mut tx = app.db().write_uncounted("reconciler").await?;
     // Read again: the robot's own report or a cancellation may have come first.
     if let Some(row) = db::missions::find(&mut tx, id).await? {
         let step = Step {
@@ -235,7 +235,7 @@ pub(super) async fn replace(app: App, standing: Standing) -> Result<Finished, Ap
     let Ok(answer) = app.commands().send(&key, &command).await else {
         return Ok(Finished::Again);
     };
-    let mut tx = app.db().write("reconciler").await?;
+    let mut tx = app.db().write_uncounted("reconciler").await?;
     let row = db::missions::find(&mut tx, standing.id).await?;
     let as_sent = |row: &MissionRow| {
         let hash = row.mission.replacement.as_ref().map(|next| next.plan_hash);
@@ -271,7 +271,7 @@ pub(super) async fn replace(app: App, standing: Standing) -> Result<Finished, Ap
 
 /// Makes the revision that the robot shows the present one.
 pub(super) async fn adopt_shown(app: &App, standing: &Standing) -> Result<(), AppError> {
-    let mut tx = app.db().write("reconciler").await?;
+    let mut tx = app.db().write_uncounted("reconciler").await?;
     if let Some(row) = db::missions::find(&mut tx, standing.id).await? {
         adopt(&mut tx, &row, Actor::Robot, app.clock().now()).await?;
         tx.commit().await?;
@@ -335,7 +335,7 @@ pub(super) async fn cancel(app: App, mission: Standing) -> Result<Finished, AppE
             return Ok(Finished::Again);
         }
     };
-    let mut tx = app.db().write("reconciler").await?;
+    let mut tx = app.db().write_uncounted("reconciler").await?;
     if let Some(row) = db::missions::find(&mut tx, mission.id).await? {
         let reason = detail.or(row.mission.reason.as_deref());
         let standing = (&row.mission).into();

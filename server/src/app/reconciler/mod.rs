@@ -12,6 +12,7 @@ pub(super) mod delays;
 mod jobs;
 pub mod needs;
 mod outcomes;
+mod upkeep;
 
 use std::collections::{HashMap, HashSet};
 use std::sync::atomic::Ordering;
@@ -23,27 +24,25 @@ use tokio_util::sync::CancellationToken;
 use tracing::debug;
 use tread_api::ids::{MissionId, SiteId, StopId};
 use tread_api::mission::MissionState;
-use tread_api::rights::Scope;
 use tread_api::stop::Stop;
 
 use self::attendance::Attendance;
 use self::conditions::Conditions;
 use self::delays::Delays;
-use self::jobs::{
-    Finished, adopt_shown, cancel, disown, end_duplicate_agent, hold, offer, push_site, replace,
-    settle, stop_again,
-};
+use self::jobs::{Finished, adopt_shown, cancel, disown, hold, offer, replace, settle, stop_again};
 use self::needs::{Memory, Need, Now, Silence, decide, is_absent, is_heard, is_held_otherwise};
 use super::missions::transitions::Change;
-use super::sites::SITES_MAX;
 use super::{App, AppError};
-use crate::app::presence::{DuplicateAgent, RobotKey};
+use crate::app::presence::RobotKey;
 use crate::db;
 use crate::db::missions::Standing;
 use crate::db::restorations::Restrained;
 
 /// Interval between passes when nothing wakes it.
 pub const PERIOD: Duration = Duration::from_millis(500);
+/// Minimum interval between two looks at what is not a step of a mission: definitions of sites,
+/// alerts, expiry. With them in each pass, a new mission would wait for them.
+const UPKEEP_EVERY: Duration = Duration::from_millis(100);
 /// Maximum number of commands under way at once.
 const COMMANDS_MAX: usize = 64;
 /// Maximum number of stops under way at once, in addition to other commands.
@@ -54,18 +53,9 @@ const STOP_RETRY_MAX: Duration = Duration::from_millis(400);
 const RETRY_MIN: Duration = Duration::from_millis(100);
 /// Maximum wait before a command is repeated.
 const RETRY_MAX: Duration = Duration::from_secs(2);
-/// Maximum number of missions that expire in one pass.
-const EXPIRE_MAX: u32 = 1_000;
 /// Time for which a robot may show a mission that is not among its open ones before it gets a
 /// cancel: its report of the end may be under way.
 const FOREIGN_GRACE: Duration = Duration::from_millis(1_500);
-
-/// Number of attempts to ask a robot how its missions ended, at most [`RETRY_MAX`] apart: an agent
-/// that does not know the question never answers.
-const OUTCOMES_TRIES_MAX: u32 = 6;
-/// Time for which a robot is given to upload its reports before it is asked how its missions ended:
-/// they say more.
-const OUTBOX_PATIENCE: Duration = Duration::from_secs(10);
 
 /// A command that is under way or waits to be repeated.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -109,6 +99,10 @@ pub async fn run(app: App, stop: CancellationToken) {
     }
 }
 
+fn key_of(robot: &Restrained) -> RobotKey {
+    (robot.site.clone(), robot.robot.clone())
+}
+
 /// Compares the wanted state with the robots' state, one pass at a time.
 #[derive(Debug)]
 pub struct Reconciler {
@@ -130,6 +124,9 @@ pub struct Reconciler {
     /// Since when each of those that are to say how their missions ended is heard, and how often it
     /// was asked.
     asked: HashMap<RobotKey, (Duration, u32)>,
+    /// Time from which the upkeep may run again, and whether a pass has left it out.
+    upkeep_due: Duration,
+    is_upkeep_owed: bool,
 }
 
 impl Reconciler {
@@ -150,6 +147,8 @@ impl Reconciler {
             delays: Delays::default(),
             restrained: HashMap::new(),
             asked: HashMap::new(),
+            upkeep_due: Duration::ZERO,
+            is_upkeep_owed: false,
         }
     }
 
@@ -186,7 +185,9 @@ impl Reconciler {
             .map(until)
             .filter(|wait| !wait.is_zero())
             .min();
-        soonest.unwrap_or(PERIOD).min(PERIOD)
+        let upkeep = self.upkeep_due.saturating_sub(now);
+        let most = if self.is_upkeep_owed { upkeep } else { PERIOD };
+        soonest.unwrap_or(PERIOD).min(most)
     }
 
     fn note(&mut self, job: Job, how: Finished) {
@@ -234,53 +235,43 @@ impl Reconciler {
     }
 
     /// Runs one pass: reads the database and the presence of robots, and starts the missing
-    /// commands.
+    /// commands. Missions come first, since people wait for them; what can wait is looked at every
+    /// [`UPKEEP_EVERY`] at most.
     ///
     /// # Errors
     /// The database failed; the next pass repeats this one.
     pub async fn pass(&mut self) -> Result<(), AppError> {
+        let served = self.serve_missions().await;
         self.stop_again().await;
-        self.look_after_restrained().await?;
-        self.expire().await?;
-        self.end_duplicate_agents();
-        self.app.sync_alerts().await?;
-        self.attendance.look(&self.app).await?;
-        self.conditions.look(&self.app).await?;
+        let now = self.app.clock().elapsed();
+        if self.upkeep_due > now {
+            self.is_upkeep_owed = true;
+            return served.map(|_open| ());
+        }
+        self.upkeep_due = now + UPKEEP_EVERY;
+        self.is_upkeep_owed = false;
+        let (open, served) = match served {
+            Ok(open) => (Some(open), Ok(())),
+            Err(error) => (None, Err(error)),
+        };
+        served.and(self.upkeep(open.as_deref()).await)
+    }
+
+    /// Starts what open missions need, and returns them.
+    async fn serve_missions(&mut self) -> Result<Vec<Standing>, AppError> {
         let mut tx = self.app.db().read("reconciler").await?;
+        let restrained = db::restorations::restrained(&mut tx).await?;
         let mut open = db::missions::in_progress(&mut tx).await?;
         open.extend(db::missions::next_in_queues(&mut tx).await?);
-        let sites = db::sites::list(&mut tx, &Scope::EVERYWHERE, "", SITES_MAX).await?;
         drop(tx);
-        self.conditions.end_of_absent(&self.app, &open).await?;
-        self.delays.look(&self.app, &open).await?;
+        let by_key = restrained.into_iter().map(|it| (key_of(&it), it));
+        self.restrained = by_key.collect();
         self.forget_all_but(&open);
         self.disown_foreign(&open);
-        for mission in open {
-            self.serve(mission).await?;
+        for mission in &open {
+            self.serve(mission.clone()).await?;
         }
-        let wanted: HashMap<SiteId, (u64, u64)> = sites
-            .into_iter()
-            .map(|row| {
-                let (terrains, fence) = (row.site.terrain_revision, row.site.geofence_revision);
-                (row.site.id, (terrains, fence))
-            })
-            .collect();
-        for (key, held) in self.app.presences().online(self.app.clock().elapsed()) {
-            // A robot without any definition of its site sends a hello and gets one.
-            let lags = wanted.get(&key.0).is_some_and(|&(terrains, fence)| {
-                held.terrains.is_some_and(|held| held != terrains)
-                    // A robot without support for geofences reports no revision.
-                    || held.fence.is_some_and(|held| held != fence)
-            });
-            let job = Job::Site(key.clone());
-            if lags && self.is_due(&job) {
-                let app = self.app.clone();
-                self.start(job, push_site(app, key));
-            } else if !lags {
-                self.retries.remove(&job);
-            }
-        }
-        Ok(())
+        Ok(open)
     }
 
     /// Sends unconfirmed stops again. Continues even if everything else fails.
@@ -307,45 +298,6 @@ impl Reconciler {
         }
     }
 
-    /// Reads which robots are restrained since a restoration, and asks them how their missions
-    /// ended.
-    async fn look_after_restrained(&mut self) -> Result<(), AppError> {
-        let mut tx = self.app.db().read("reconciler").await?;
-        let restrained = db::restorations::restrained(&mut tx).await?;
-        drop(tx);
-        self.app.show_awaiting(&restrained);
-        let key_of = |it: &Restrained| (it.site.clone(), it.robot.clone());
-        let by_key = restrained.into_iter().map(|it| (key_of(&it), it));
-        self.restrained = by_key.collect();
-        let wanted = |key: &RobotKey| {
-            let found = self.restrained.get(key);
-            found.is_some_and(|found| found.outcomes_wanted)
-        };
-        self.asked.retain(|key, _| wanted(key));
-        self.retries
-            .retain(|job, _| !matches!(job, Job::Outcomes(key) if !wanted(key)));
-        let now = self.app.clock().elapsed();
-        let silent: Vec<Restrained> = self.restrained.values().cloned().collect();
-        for robot in silent.into_iter().filter(|it| it.outcomes_wanted) {
-            let key = key_of(&robot);
-            let presence = self.app.presences().get(&key);
-            if !is_heard(&presence, now) {
-                continue;
-            }
-            let pending = presence.state().map_or(0, |state| state.outbox.pending);
-            let (since, tries) = *self.asked.entry(key.clone()).or_insert((now, 0));
-            let is_patient = pending > 0 && now.saturating_sub(since) < OUTBOX_PATIENCE;
-            let job = Job::Outcomes(key.clone());
-            if !is_patient && self.is_due(&job) {
-                self.asked.insert(key, (since, tries + 1));
-                let is_last = tries + 1 >= OUTCOMES_TRIES_MAX;
-                let app = self.app.clone();
-                self.start(job, outcomes::ask(app, robot, is_last));
-            }
-        }
-        Ok(())
-    }
-
     /// Returns what may be decided about a mission of a robot that is restrained.
     fn restrain(&self, key: &RobotKey, heard: bool, need: Need) -> Need {
         let Some(restrained) = self.restrained.get(key) else {
@@ -363,23 +315,6 @@ impl Reconciler {
         }
     }
 
-    async fn expire(&self) -> Result<(), AppError> {
-        let now = self.app.clock().now();
-        let mut tx = self.app.db().read("reconciler").await?;
-        let overdue = db::missions::overdue(&mut tx, now, EXPIRE_MAX).await?;
-        drop(tx);
-        for mission in overdue {
-            let key = (mission.site.clone(), mission.robot.clone());
-            let heard = is_heard(&self.app.presences().get(&key), self.app.clock().elapsed());
-            let expires = Need::Settle(Change::Expire);
-            if self.restrain(&key, heard, expires) != expires {
-                continue;
-            }
-            settle(&self.app, &mission, Change::Expire).await?;
-        }
-        Ok(())
-    }
-
     /// Forgets everything about missions that are no longer open.
     fn forget_all_but(&mut self, missions: &[Standing]) {
         let open: HashSet<MissionId> = missions.iter().map(|mission| mission.id).collect();
@@ -394,40 +329,6 @@ impl Reconciler {
             | Job::Outcomes(_)
             | Job::Stop(_) => true,
         });
-    }
-
-    /// Finds second agents that drive a mission, and commands them to end it.
-    fn end_duplicate_agents(&mut self) {
-        let duplicates = self
-            .app
-            .presences()
-            .take_duplicate_agents(self.app.clock().elapsed());
-        let driving = |key: &RobotKey| {
-            let of_key =
-                |duplicate: &&DuplicateAgent| duplicate.key == *key && duplicate.mission.is_some();
-            duplicates.iter().find(of_key)
-        };
-        self.retries.retain(|job, _| match job {
-            Job::EndDuplicateAgent(key) => driving(key).is_some(),
-            Job::Offer(_)
-            | Job::Replace(_)
-            | Job::Hold(..)
-            | Job::Cancel(_)
-            | Job::Disown(_)
-            | Job::Site(_)
-            | Job::Outcomes(_)
-            | Job::Stop(_) => true,
-        });
-        for duplicate in duplicates {
-            let job = Job::EndDuplicateAgent(duplicate.key.clone());
-            if duplicate.mission.is_some() && self.is_due(&job) {
-                let app = self.app.clone();
-                self.start(
-                    job,
-                    async move { Ok(end_duplicate_agent(app, duplicate).await) },
-                );
-            }
-        }
     }
 
     /// Finds robots that drive a mission that is not among their open ones, and commands them to

@@ -1,0 +1,159 @@
+//! What no mission waits for: robots that are restrained since a restoration, expiry, second agents,
+//! alerts, and definitions of sites that robots lack.
+
+use std::collections::HashMap;
+use std::time::Duration;
+
+use tread_api::ids::SiteId;
+use tread_api::rights::Scope;
+
+use super::jobs::{end_duplicate_agent, push_site, settle};
+use super::needs::{Need, is_heard};
+use super::{Job, Reconciler, key_of, outcomes};
+use crate::app::AppError;
+use crate::app::missions::transitions::Change;
+use crate::app::presence::{DuplicateAgent, RobotKey};
+use crate::app::sites::SITES_MAX;
+use crate::db;
+use crate::db::missions::Standing;
+use crate::db::restorations::Restrained;
+
+/// Maximum number of missions that expire in one pass.
+const EXPIRE_MAX: u32 = 1_000;
+/// Number of attempts to ask a robot how its missions ended, at most [`super::RETRY_MAX`] apart: an agent
+/// that does not know the question never answers.
+const OUTCOMES_TRIES_MAX: u32 = 6;
+/// Time for which a robot is given to upload its reports before it is asked how its missions ended:
+/// they say more.
+const OUTBOX_PATIENCE: Duration = Duration::from_secs(10);
+
+impl Reconciler {
+    /// Looks at everything that is not a step of a mission; `open` are the open missions, if they
+    /// could be read.
+    pub(super) async fn upkeep(&mut self, open: Option<&[Standing]>) -> Result<(), AppError> {
+        self.look_after_restrained();
+        self.expire().await?;
+        self.end_duplicate_agents();
+        self.app.sync_alerts().await?;
+        self.attendance.look(&self.app).await?;
+        self.conditions.look(&self.app).await?;
+        if let Some(open) = open {
+            self.conditions.end_of_absent(&self.app, open).await?;
+            self.delays.look(&self.app, open).await?;
+        }
+        self.push_sites().await
+    }
+
+    /// Sends the definition of its site to each robot that has an older one.
+    async fn push_sites(&mut self) -> Result<(), AppError> {
+        let mut tx = self.app.db().read("reconciler").await?;
+        let sites = db::sites::list(&mut tx, &Scope::EVERYWHERE, "", SITES_MAX).await?;
+        drop(tx);
+        let wanted: HashMap<SiteId, (u64, u64)> = sites
+            .into_iter()
+            .map(|row| {
+                let (terrains, fence) = (row.site.terrain_revision, row.site.geofence_revision);
+                (row.site.id, (terrains, fence))
+            })
+            .collect();
+        for (key, held) in self.app.presences().online(self.app.clock().elapsed()) {
+            // A robot without any definition of its site sends a hello and gets one.
+            let lags = wanted.get(&key.0).is_some_and(|&(terrains, fence)| {
+                held.terrains.is_some_and(|held| held != terrains)
+                    // A robot without support for geofences reports no revision.
+                    || held.fence.is_some_and(|held| held != fence)
+            });
+            let job = Job::Site(key.clone());
+            if lags && self.is_due(&job) {
+                let app = self.app.clone();
+                self.start(job, push_site(app, key));
+            } else if !lags {
+                self.retries.remove(&job);
+            }
+        }
+        Ok(())
+    }
+
+    /// Shows which robots are restrained since a restoration, and asks them how their missions
+    /// ended.
+    fn look_after_restrained(&mut self) {
+        let restrained: Vec<Restrained> = self.restrained.values().cloned().collect();
+        self.app.show_awaiting(&restrained);
+        let wanted = |key: &RobotKey| {
+            let found = self.restrained.get(key);
+            found.is_some_and(|found| found.outcomes_wanted)
+        };
+        self.asked.retain(|key, _| wanted(key));
+        self.retries
+            .retain(|job, _| !matches!(job, Job::Outcomes(key) if !wanted(key)));
+        let now = self.app.clock().elapsed();
+        for robot in restrained.into_iter().filter(|it| it.outcomes_wanted) {
+            let key = key_of(&robot);
+            let presence = self.app.presences().get(&key);
+            if !is_heard(&presence, now) {
+                continue;
+            }
+            let pending = presence.state().map_or(0, |state| state.outbox.pending);
+            let (since, tries) = *self.asked.entry(key.clone()).or_insert((now, 0));
+            let is_patient = pending > 0 && now.saturating_sub(since) < OUTBOX_PATIENCE;
+            let job = Job::Outcomes(key.clone());
+            if !is_patient && self.is_due(&job) {
+                self.asked.insert(key, (since, tries + 1));
+                let is_last = tries + 1 >= OUTCOMES_TRIES_MAX;
+                let app = self.app.clone();
+                self.start(job, outcomes::ask(app, robot, is_last));
+            }
+        }
+    }
+
+    async fn expire(&self) -> Result<(), AppError> {
+        let now = self.app.clock().now();
+        let mut tx = self.app.db().read("reconciler").await?;
+        let overdue = db::missions::overdue(&mut tx, now, EXPIRE_MAX).await?;
+        drop(tx);
+        for mission in overdue {
+            let key = (mission.site.clone(), mission.robot.clone());
+            let heard = is_heard(&self.app.presences().get(&key), self.app.clock().elapsed());
+            let expires = Need::Settle(Change::Expire);
+            if self.restrain(&key, heard, expires) != expires {
+                continue;
+            }
+            settle(&self.app, &mission, Change::Expire).await?;
+        }
+        Ok(())
+    }
+
+    /// Finds second agents that drive a mission, and commands them to end it.
+    fn end_duplicate_agents(&mut self) {
+        let duplicates = self
+            .app
+            .presences()
+            .take_duplicate_agents(self.app.clock().elapsed());
+        let driving = |key: &RobotKey| {
+            let of_key =
+                |duplicate: &&DuplicateAgent| duplicate.key == *key && duplicate.mission.is_some();
+            duplicates.iter().find(of_key)
+        };
+        self.retries.retain(|job, _| match job {
+            Job::EndDuplicateAgent(key) => driving(key).is_some(),
+            Job::Offer(_)
+            | Job::Replace(_)
+            | Job::Hold(..)
+            | Job::Cancel(_)
+            | Job::Disown(_)
+            | Job::Site(_)
+            | Job::Outcomes(_)
+            | Job::Stop(_) => true,
+        });
+        for duplicate in duplicates {
+            let job = Job::EndDuplicateAgent(duplicate.key.clone());
+            if duplicate.mission.is_some() && self.is_due(&job) {
+                let app = self.app.clone();
+                self.start(
+                    job,
+                    async move { Ok(end_duplicate_agent(app, duplicate).await) },
+                );
+            }
+        }
+    }
+}
