@@ -5,6 +5,7 @@
 //!
 //! ```text
 //! mission ────────────────────────────────────────── server, when it has ended
+//! ├─ store ──────── server, from the request to the commit
 //! ├─ offer ──────── server, each attempt
 //! │  ├─ plan ────── agent
 //! │  └─ drive ───── agent, from start to end

@@ -51,6 +51,8 @@ pub struct Fleet {
     /// Variables that agents get in their environment from now on.
     pub agent_environment: Vec<(String, String)>,
     config: Option<PathBuf>,
+    /// Whether robots need certificates.
+    has_certificates: bool,
 }
 
 impl Fleet {
@@ -105,6 +107,20 @@ impl Fleet {
         fleet
     }
 
+    /// The same, whose server sends its traces to this collector; robots show certificates that are good
+    /// for so many seconds, if given.
+    ///
+    /// # Panics
+    /// If the server does not get ready.
+    pub async fn start_traced(node: &Path, collector: &str, certificate_s: Option<u32>) -> Self {
+        let robots = certificate_s.map(|seconds| {
+            format!("[robots]\nauthority = \"authority\"\ncertificate_s = {seconds}\n")
+        });
+        let robots = robots.unwrap_or_default();
+        let text = format!("{robots}[tracing]\nendpoint = \"{collector}\"\n");
+        Self::start_configured(node, Some(&text)).await
+    }
+
     async fn start_configured(node: &Path, config: Option<&str>) -> Self {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let mut fleet = Self::new(node, folder, config, &[]);
@@ -116,6 +132,7 @@ impl Fleet {
     /// A fleet of which nothing runs yet.
     fn new(node: &Path, folder: TempDir, config: Option<&str>, init: &[&str]) -> Self {
         let (http, zenoh) = (free_address(), free_address());
+        let has_certificates = config.is_some_and(|text| text.contains("[robots]"));
         let config = config.map(|text| {
             let path = folder.path().join("tread.toml");
             let authority = folder.path().join("authority");
@@ -139,6 +156,7 @@ impl Fleet {
             server_environment: Vec::new(),
             agent_environment: Vec::new(),
             config,
+            has_certificates,
         }
     }
 
@@ -164,7 +182,8 @@ impl Fleet {
 
     /// Where the server's router listens.
     pub fn zenoh_endpoint(&self) -> String {
-        let protocol = if self.config.is_some() { "tls" } else { "tcp" };
+        let is_tls = self.has_certificates && self.config.is_some();
+        let protocol = if is_tls { "tls" } else { "tcp" };
         format!("{protocol}/{}", self.zenoh)
     }
 

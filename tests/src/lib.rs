@@ -9,14 +9,18 @@
 //! * [`chaos`]: runs in which things fail at random, from a seed of [`random`].
 //! * [`stored`]: what a database holds of measurements.
 //! * [`scenario`]: fleets in a simulated time, from which figures are read.
+//! * [`collector`]: receives traces as a collector does.
 //! * [`damage`]: damages payloads.
+//! * [`bare_router`]: a zenoh router without a server, to compare with.
 //! * [`light_robot`]: robots without physics, for load.
 //! * [`report`]: figures against their goals, as every report program prints them.
 //! * [`markdown`]: the documentation, to be held against what there is.
 //! * [`repository`]: its files.
 //! * [`shell`]: the commands that it shows.
 
+pub mod bare_router;
 pub mod chaos;
+pub mod collector;
 pub mod damage;
 pub mod fleet;
 pub mod light_robot;

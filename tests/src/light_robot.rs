@@ -198,22 +198,44 @@ impl LightRobot {
     /// The server does not answer or does not welcome it.
     async fn start_on(session: Session, site: &SiteId, id: RobotId) -> anyhow::Result<Self> {
         let boot = BootId::from_uuid(uuid::Uuid::new_v4());
-        let model = paper_robot();
         let welcome = introduce(&session, site, &id, boot).await?;
+        Self::announce(session, welcome, (site.clone(), id), boot).await
+    }
+
+    /// Connects to a router without a server, and announces itself as if it had been welcomed so.
+    ///
+    /// # Errors
+    /// No router answers.
+    pub async fn start_without_server(
+        endpoint: &str,
+        welcome: Welcome,
+        named: (SiteId, RobotId),
+    ) -> anyhow::Result<Self> {
+        let boot = BootId::from_uuid(uuid::Uuid::new_v4());
+        Self::announce(open_session(endpoint).await?, welcome, named, boot).await
+    }
+
+    async fn announce(
+        session: Session,
+        welcome: Welcome,
+        (site, id): (SiteId, RobotId),
+        boot: BootId,
+    ) -> anyhow::Result<Self> {
+        let model = paper_robot();
         let failed = |error: zenoh::Error| anyhow::anyhow!("zenoh: {error}");
         let state_publisher = session
-            .declare_publisher(keys::state(site, &id))
+            .declare_publisher(keys::state(&site, &id))
             .congestion_control(CongestionControl::Drop)
             .await
             .map_err(failed)?;
         let token = session
             .liveliness()
-            .declare_token(keys::alive(site, &id, boot));
+            .declare_token(keys::alive(&site, &id, boot));
         let token = token.await.map_err(failed)?;
-        let ingest_key = keys::ingest(site, &id);
+        let ingest_key = keys::ingest(&site, &id);
         Ok(Self {
             id,
-            site: site.clone(),
+            site,
             boot,
             session,
             encoding: welcome.upload_encoding(),

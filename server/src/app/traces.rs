@@ -15,6 +15,21 @@ impl App {
         &self.inner.telemetry
     }
 
+    /// Sends the span of a new mission from its request to its commit.
+    pub(super) fn trace_stored(&self, mission: &Mission) {
+        if !self.telemetry().is_on() {
+            return;
+        }
+        self.telemetry().send(Span {
+            name: "store",
+            place: Place::below(TraceParent::of_mission(mission.id)),
+            began_at: mission.created_at,
+            ended_at: self.clock().now(),
+            attributes: attributes(mission),
+            failure: None,
+        });
+    }
+
     /// Returns the place of the next offer of a mission in its trace; `None` without tracing.
     pub(super) fn trace_offer(&self, mission: &Mission) -> Option<Place> {
         let is_on = self.telemetry().is_on();

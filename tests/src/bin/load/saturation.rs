@@ -3,7 +3,6 @@
 
 use std::path::Path;
 
-use anyhow::Context as _;
 use serde::Serialize;
 use tread_api::wire::encoding::Encoding;
 use tread_tests::light_robot::LightRobot;
@@ -11,6 +10,7 @@ use tread_tests::report::Check;
 
 use crate::ingest::{self, Ingest, Pace};
 use crate::peers::PythonService;
+use crate::states::welcome_of;
 use crate::{Arguments, connect_light_robots, start_fleet, start_light_robots};
 
 /// Segments committed per second, at the least.
@@ -73,12 +73,7 @@ async fn tread(
 }
 
 async fn peer(arguments: &Arguments, node: &Path, python: &Path) -> anyhow::Result<Ingest> {
-    let (welcome, site) = {
-        let fleet = start_fleet(node, false).await;
-        let robots = start_light_robots(&fleet, 1, false).await?;
-        let first = robots.first().context("no robot was started")?;
-        (first.welcome.clone(), fleet.site())
-    };
+    let (welcome, site) = welcome_of(node).await?;
     let service = PythonService::start(python, &welcome).await?;
     let endpoint = service.zenoh_endpoint();
     let mut robots = connect_light_robots(&endpoint, &site, arguments.robots).await?;
