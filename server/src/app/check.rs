@@ -146,8 +146,11 @@ impl App {
             return Ok(());
         };
         let fence = control_fence(&db::geofences::present(&mut tx, site_row.pk).await?);
+        if fence.is_empty() {
+            return Ok(());
+        }
         let row = db::robots::find(&mut tx, site_row.pk, robot).await?;
-        let Some(row) = row.filter(|_| !fence.is_empty()) else {
+        let Some(row) = row else {
             return Ok(());
         };
         let before = earlier(&mut tx, row.pk, place).await?;

@@ -61,6 +61,7 @@ use self::identity::Identity;
 use self::map::Maps;
 pub use self::map::{UnwrittenCounts, writing as sums};
 use self::missions::idempotency::InFlight;
+use self::missions::immediate_offer::JustOffered;
 use self::presence::Presences;
 use self::restoration::Restored;
 use self::retention::Removed;
@@ -102,6 +103,7 @@ struct Inner {
     announced: Notify,
     hub: Hub,
     keys_in_flight: InFlight,
+    just_offered: JustOffered,
     checks: Semaphore,
     identity: Identity,
     maps: Maps,
@@ -170,6 +172,7 @@ impl App {
             announced: Notify::new(),
             hub,
             keys_in_flight: InFlight::default(),
+            just_offered: JustOffered::default(),
             checks: Semaphore::new(check::CHECKS_MAX),
             identity: Identity::new(people, audit),
             maps: Maps::default(),
@@ -293,6 +296,10 @@ impl App {
 
     fn keys_in_flight(&self) -> &InFlight {
         &self.inner.keys_in_flight
+    }
+
+    fn just_offered(&self) -> &JustOffered {
+        &self.inner.just_offered
     }
 
     /// Waits for a turn to plan. `None` cannot occur, since the semaphore is never closed.

@@ -261,7 +261,7 @@ pub async fn compare_and_set(
 }
 
 /// Facts from a robot's answer or report; `None` leaves the stored value unchanged.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Facts {
     /// Run of the agent that accepted it.
     pub boot: Option<BootId>,
@@ -281,6 +281,9 @@ pub async fn add_facts(
     id: MissionId,
     facts: Facts,
 ) -> Result<(), DbError> {
+    if facts == Facts::default() {
+        return Ok(());
+    }
     let id = id.to_string();
     let boot = facts.boot.map(|boot| boot.to_string());
     let plan = facts.plan.map(|plan| to_json("plan", &plan)).transpose()?;

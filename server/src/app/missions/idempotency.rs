@@ -93,9 +93,9 @@ impl App {
             };
             return Ok(serde_json::from_str(&stored.answer).map_err(corrupt)?);
         }
-        let mission = self.enqueue(&mut tx, request).await?;
-        let answer =
-            serde_json::to_string(&mission).map_err(|_error| db::DbError::DoesNotFit("mission"))?;
+        let enqueued = self.enqueue(&mut tx, request).await?;
+        let answer = serde_json::to_string(&enqueued.row.mission)
+            .map_err(|_error| db::DbError::DoesNotFit("mission"))?;
         let stored = StoredAnswer {
             request_hash,
             answer,
@@ -107,8 +107,6 @@ impl App {
             db::idempotency::forget_before(&mut tx, before, FORGET_MAX).await?;
         }
         tx.commit().await?;
-        self.wake();
-        self.trace_stored(&mission);
-        Ok(mission)
+        Ok(self.enqueued(enqueued))
     }
 }

@@ -1,7 +1,11 @@
 //! The offer of a mission in the transaction that inserts it.
 //!
 //! The reconciler would set the mission to `offered` in a transaction of its own, with a write to the
-//! disk that the robot waits for. It still sends the offer.
+//! disk that the robot waits for. It still sends the offer: at once, from [`JustOffered`], or as of every
+//! mission that it reads as offered.
+
+use std::collections::VecDeque;
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use tread_api::mission::Actor;
 use tread_api::robot::LinkState;
@@ -12,27 +16,56 @@ use crate::app::{App, AppError};
 use crate::db::missions::{Facts, MissionRow};
 use crate::db::{self, Tx};
 
+/// Maximum number of missions in [`JustOffered`]; the reconciler reads the others from the database.
+const JUST_OFFERED_MAX: usize = 64;
+
+/// Missions whose creation and offer are committed, for the reconciler.
+#[derive(Debug, Default)]
+pub(in crate::app) struct JustOffered {
+    rows: Mutex<VecDeque<MissionRow>>,
+}
+
+impl JustOffered {
+    fn lock(&self) -> MutexGuard<'_, VecDeque<MissionRow>> {
+        self.rows.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Adds a mission; does nothing if there are too many.
+    pub(super) fn add(&self, row: MissionRow) {
+        let mut rows = self.lock();
+        if rows.len() < JUST_OFFERED_MAX {
+            rows.push_back(row);
+        }
+    }
+
+    /// Takes all of them, in the order of their commits.
+    pub(in crate::app) fn take(&self) -> VecDeque<MissionRow> {
+        std::mem::take(&mut *self.lock())
+    }
+}
+
 impl App {
     /// Sets a new mission to `offered` if the reconciler would do so at once: its robot is heard, has no
     /// other open mission, is not stopped or teleoperated, and not restrained since a restoration.
+    /// Returns whether it did.
     pub(super) async fn offer_immediately(
         &self,
         tx: &mut Tx,
         row: &MissionRow,
-    ) -> Result<(), AppError> {
+    ) -> Result<bool, AppError> {
         let mission = &row.mission;
         let key = (mission.site.clone(), mission.robot.clone());
         let link = self.presences().get(&key).link(self.clock().elapsed());
         if mission.pause_wanted || link == LinkState::Offline {
-            return Ok(());
+            return Ok(false);
         }
         let open = db::missions::open_of_robot(tx, row.robot_pk).await?;
         if open.iter().any(|other| other.id != mission.id) {
-            return Ok(());
+            return Ok(false);
         }
         let restrained = db::restorations::restrained(tx).await?;
         if restrained.iter().any(|robot| robot.pk == row.robot_pk) {
-            return Ok(());
+            return Ok(false);
         }
         let step = Step {
             change: Change::Offer,
@@ -41,7 +74,6 @@ impl App {
             at: self.clock().now(),
             facts: Facts::default(),
         };
-        take_step(tx, &mission.into(), step).await?;
-        Ok(())
+        Ok(take_step(tx, &mission.into(), step).await?.is_some())
     }
 }

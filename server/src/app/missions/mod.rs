@@ -4,7 +4,7 @@
 
 pub mod control;
 pub mod idempotency;
-mod immediate_offer;
+pub(super) mod immediate_offer;
 pub(crate) mod reports;
 pub mod transitions;
 
@@ -33,16 +33,32 @@ pub const QUEUE_MAX: usize = 1_000;
 /// Maximum number of events in one mission's history; mere notes are dropped beyond half of it.
 const EVENTS_MAX: u32 = 1_000;
 
+/// A mission as it was inserted.
+struct Enqueued {
+    row: MissionRow,
+    /// Whether the same transaction set it to `offered`.
+    is_offered: bool,
+}
+
 impl App {
     /// Creates a mission.
     pub async fn create_mission(&self, request: CreateMission) -> Result<Mission, AppError> {
         self.check_new(&request).await?;
         let mut tx = self.db().write_uncounted("missions").await?;
-        let mission = self.enqueue(&mut tx, request).await?;
+        let enqueued = self.enqueue(&mut tx, request).await?;
         tx.commit().await?;
+        Ok(self.enqueued(enqueued))
+    }
+
+    /// Sends what follows the commit of a new mission on its way.
+    fn enqueued(&self, Enqueued { row, is_offered }: Enqueued) -> Mission {
+        let mission = row.mission.clone();
+        if is_offered {
+            self.just_offered().add(row);
+        }
         self.wake();
         self.trace_stored(&mission);
-        Ok(mission)
+        mission
     }
 
     /// Refuses a new mission that leaves the geofence, from the pose at which its robot is expected
@@ -57,9 +73,8 @@ impl App {
         self.check_fence(robot, &request.trajectory, place).await
     }
 
-    /// Inserts a mission into its robot's queue, according to its start policy. Returns it as it was
-    /// inserted; it may have been offered since.
-    async fn enqueue(&self, tx: &mut Tx, request: CreateMission) -> Result<Mission, AppError> {
+    /// Inserts a mission into its robot's queue, according to its start policy.
+    async fn enqueue(&self, tx: &mut Tx, request: CreateMission) -> Result<Enqueued, AppError> {
         check_figures(&request)?;
         let CreateMission {
             site,
@@ -153,8 +168,8 @@ impl App {
             reason: None,
         };
         db::history::add_event(tx, id, &event).await?;
-        self.offer_immediately(tx, &row).await?;
-        Ok(row.mission)
+        let is_offered = self.offer_immediately(tx, &row).await?;
+        Ok(Enqueued { row, is_offered })
     }
 
     /// Returns whether a mission's robot is stopped or teleoperated.

@@ -122,6 +122,11 @@ pub(super) async fn offer(app: App, standing: Standing) -> Result<Finished, AppE
     let Some(row) = row.filter(|row| row.mission.state == MissionState::Offered) else {
         return Ok(Finished::Settled);
     };
+    send_offer(app, row).await
+}
+
+/// Sends the offer of a mission that is set to `offered`, and stores the answer.
+pub(super) async fn send_offer(app: App, row: MissionRow) -> Result<Finished, AppError> {
     let start_within_ms = start_within_ms(&app, &row);
     let mission = row.mission;
     let prior = app.prior_along((&mission.site, &mission.robot), &mission.trajectory);

@@ -29,7 +29,9 @@ use tread_api::stop::Stop;
 use self::attendance::Attendance;
 use self::conditions::Conditions;
 use self::delays::Delays;
-use self::jobs::{Finished, adopt_shown, cancel, disown, hold, offer, replace, settle, stop_again};
+use self::jobs::{
+    Finished, adopt_shown, cancel, disown, hold, offer, replace, send_offer, settle, stop_again,
+};
 use self::needs::{Memory, Need, Now, Silence, decide, is_absent, is_heard, is_held_otherwise};
 use super::missions::transitions::Change;
 use super::{App, AppError};
@@ -241,6 +243,7 @@ impl Reconciler {
     /// # Errors
     /// The database failed; the next pass repeats this one.
     pub async fn pass(&mut self) -> Result<(), AppError> {
+        self.send_just_offered();
         let served = self.serve_missions().await;
         self.stop_again().await;
         let now = self.app.clock().elapsed();
@@ -255,6 +258,16 @@ impl Reconciler {
             Err(error) => (None, Err(error)),
         };
         served.and(self.upkeep(open.as_deref()).await)
+    }
+
+    /// Sends the offers of missions that were created just now, without reading them again.
+    fn send_just_offered(&mut self) {
+        for row in self.app.just_offered().take() {
+            let job = Job::Offer(row.mission.id);
+            if self.is_due(&job) {
+                self.start(job, send_offer(self.app.clone(), row));
+            }
+        }
     }
 
     /// Starts what open missions need, and returns them.
