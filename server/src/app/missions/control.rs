@@ -23,7 +23,7 @@ impl App {
     /// Requests the end of a mission. A queued mission ends at once, an active one when its robot
     /// confirms.
     pub async fn cancel_mission(&self, id: MissionId) -> Result<MissionDetail, AppError> {
-        let mut tx = self.db().write("missions").await?;
+        let mut tx = self.db().write_uncounted("missions").await?;
         let row = open_row(&mut tx, id).await?;
         if row.mission.state != MissionState::Cancelling {
             let step = Step {
@@ -54,7 +54,7 @@ impl App {
         } else {
             ("resumed", Cause::ResumeRequested)
         };
-        let mut tx = self.db().write("missions").await?;
+        let mut tx = self.db().write_uncounted("missions").await?;
         let row = open_row(&mut tx, id).await?;
         let mission = &row.mission;
         let state = mission.state;
@@ -123,7 +123,7 @@ impl App {
             replaces: Some(id),
         };
         self.check_fence(robot, &request.trajectory, place).await?;
-        let mut tx = self.db().write("missions").await?;
+        let mut tx = self.db().write_uncounted("missions").await?;
         let row = open_row(&mut tx, id).await?;
         let mission = &row.mission;
         let robot = robot_of(&mut tx, &row).await?;

@@ -11,6 +11,7 @@ use jiff::SignedDuration;
 use tread_api::mission::{CreateMission, Mission};
 use uuid::Uuid;
 
+use super::Enqueued;
 use crate::app::{App, AppError};
 use crate::db;
 use crate::db::idempotency::{OwnKey, StoredAnswer};
@@ -57,6 +58,14 @@ impl Drop for Holding<'_> {
     }
 }
 
+/// What became of a request with a key.
+enum Once {
+    /// The key has an answer from before.
+    Before(Mission),
+    /// The mission is stored.
+    Now(Enqueued),
+}
+
 impl App {
     /// Creates a mission, once per idempotency key of a token or person.
     ///
@@ -82,6 +91,30 @@ impl App {
         if is_new {
             self.check_new(&request).await?;
         }
+        let robot = (request.site.clone(), request.robot.clone());
+        let trajectory = request.trajectory.clone();
+        let early_prior = async {
+            if is_new {
+                self.early_prior(&robot, &trajectory).await
+            } else {
+                None
+            }
+        };
+        let storing = self.store_once(key, request_hash, request);
+        let (prior, stored) = tokio::join!(early_prior, storing);
+        Ok(match stored? {
+            Once::Before(answer) => answer,
+            Once::Now(enqueued) => self.enqueued(enqueued, prior),
+        })
+    }
+
+    /// Stores a mission with the answer to its request, unless the key has one.
+    async fn store_once(
+        &self,
+        key: OwnKey<'_>,
+        request_hash: Uuid,
+        request: CreateMission,
+    ) -> Result<Once, AppError> {
         let mut tx = self.db().write_uncounted("missions").await?;
         if let Some(stored) = db::idempotency::find(&mut tx, key, request_hash).await? {
             if stored.request_hash != request_hash {
@@ -91,7 +124,8 @@ impl App {
                 what: "answer",
                 value: stored.answer.clone(),
             };
-            return Ok(serde_json::from_str(&stored.answer).map_err(corrupt)?);
+            let answer = serde_json::from_str(&stored.answer).map_err(corrupt)?;
+            return Ok(Once::Before(answer));
         }
         let enqueued = self.enqueue(&mut tx, request).await?;
         let answer = serde_json::to_string(&enqueued.row.mission)
@@ -107,6 +141,6 @@ impl App {
             db::idempotency::forget_before(&mut tx, before, FORGET_MAX).await?;
         }
         tx.commit().await?;
-        Ok(self.enqueued(enqueued))
+        Ok(Once::Now(enqueued))
     }
 }

@@ -9,9 +9,12 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use tread_api::mission::Actor;
 use tread_api::robot::LinkState;
+use tread_api::trajectory::Trajectory;
+use tread_api::wire::command::PathPrior;
 
 use super::transitions::Change;
 use super::{Step, take_step};
+use crate::app::presence::RobotKey;
 use crate::app::{App, AppError};
 use crate::db::missions::{Facts, MissionRow};
 use crate::db::{self, Tx};
@@ -19,32 +22,59 @@ use crate::db::{self, Tx};
 /// Maximum number of missions in [`JustOffered`]; the reconciler reads the others from the database.
 const JUST_OFFERED_MAX: usize = 64;
 
+/// A mission that is to be offered now.
+#[derive(Debug)]
+pub(in crate::app) struct OfferedNow {
+    pub(in crate::app) row: MissionRow,
+    /// What the map says along its trajectory.
+    pub(in crate::app) prior: Option<PathPrior>,
+}
+
 /// Missions whose creation and offer are committed, for the reconciler.
 #[derive(Debug, Default)]
 pub(in crate::app) struct JustOffered {
-    rows: Mutex<VecDeque<MissionRow>>,
+    missions: Mutex<VecDeque<OfferedNow>>,
 }
 
 impl JustOffered {
-    fn lock(&self) -> MutexGuard<'_, VecDeque<MissionRow>> {
-        self.rows.lock().unwrap_or_else(PoisonError::into_inner)
+    fn lock(&self) -> MutexGuard<'_, VecDeque<OfferedNow>> {
+        self.missions.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Adds a mission; does nothing if there are too many.
-    pub(super) fn add(&self, row: MissionRow) {
-        let mut rows = self.lock();
-        if rows.len() < JUST_OFFERED_MAX {
-            rows.push_back(row);
+    pub(super) fn add(&self, mission: OfferedNow) {
+        let mut missions = self.lock();
+        if missions.len() < JUST_OFFERED_MAX {
+            missions.push_back(mission);
         }
     }
 
     /// Takes all of them, in the order of their commits.
-    pub(in crate::app) fn take(&self) -> VecDeque<MissionRow> {
+    pub(in crate::app) fn take(&self) -> VecDeque<OfferedNow> {
         std::mem::take(&mut *self.lock())
     }
 }
 
+/// What the map says along the trajectory of a mission that is being stored.
+#[derive(Debug)]
+pub(super) struct EarlyPrior(pub(super) Option<PathPrior>);
+
 impl App {
+    /// Reads the map along a new mission, while the mission is stored; `None` if its robot is not
+    /// heard, so that it is not offered now, or if the map could not be read.
+    pub(super) async fn early_prior(
+        &self,
+        key: &RobotKey,
+        trajectory: &Trajectory,
+    ) -> Option<EarlyPrior> {
+        let link = self.presences().get(key).link(self.clock().elapsed());
+        if link == LinkState::Offline {
+            return None;
+        }
+        let prior = self.prior_along((&key.0, &key.1), trajectory).await;
+        prior.ok().map(EarlyPrior)
+    }
+
     /// Sets a new mission to `offered` if the reconciler would do so at once: its robot is heard, has no
     /// other open mission, is not stopped or teleoperated, and not restrained since a restoration.
     /// Returns whether it did.

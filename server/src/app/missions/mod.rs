@@ -19,6 +19,7 @@ use tread_api::robot::RobotLimits;
 use tread_api::trajectory::Trajectory;
 use tread_api::wire::command::Offer;
 
+use self::immediate_offer::{EarlyPrior, OfferedNow};
 use self::transitions::{Change, next};
 use super::check::StartPlace;
 use super::{App, AppError, check_named, site_row};
@@ -44,17 +45,27 @@ impl App {
     /// Creates a mission.
     pub async fn create_mission(&self, request: CreateMission) -> Result<Mission, AppError> {
         self.check_new(&request).await?;
-        let mut tx = self.db().write_uncounted("missions").await?;
-        let enqueued = self.enqueue(&mut tx, request).await?;
-        tx.commit().await?;
-        Ok(self.enqueued(enqueued))
+        let key = (request.site.clone(), request.robot.clone());
+        let trajectory = request.trajectory.clone();
+        let storing = async {
+            let mut tx = self.db().write_uncounted("missions").await?;
+            let enqueued = self.enqueue(&mut tx, request).await?;
+            tx.commit().await?;
+            Ok::<Enqueued, AppError>(enqueued)
+        };
+        let (prior, enqueued) = tokio::join!(self.early_prior(&key, &trajectory), storing);
+        Ok(self.enqueued(enqueued?, prior))
     }
 
     /// Sends what follows the commit of a new mission on its way.
-    fn enqueued(&self, Enqueued { row, is_offered }: Enqueued) -> Mission {
+    fn enqueued(
+        &self,
+        Enqueued { row, is_offered }: Enqueued,
+        prior: Option<EarlyPrior>,
+    ) -> Mission {
         let mission = row.mission.clone();
-        if is_offered {
-            self.just_offered().add(row);
+        if let Some(EarlyPrior(prior)) = prior.filter(|_| is_offered) {
+            self.just_offered().add(OfferedNow { row, prior });
         }
         self.wake();
         self.trace_stored(&mission);

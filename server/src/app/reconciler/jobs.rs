@@ -9,6 +9,7 @@ use tread_api::wire::command::{Cancel, Offer, Pause, Resume};
 use tread_api::wire::reply::{Acknowledgement, Answer, CommandRefusalCode, OfferReply};
 use tread_telemetry::Place;
 
+use crate::app::missions::immediate_offer::OfferedNow;
 use crate::app::missions::reports::adopt;
 use crate::app::missions::transitions::Change;
 use crate::app::missions::{Step, add_note, take_step};
@@ -122,17 +123,21 @@ pub(super) async fn offer(app: App, standing: Standing) -> Result<Finished, AppE
     let Some(row) = row.filter(|row| row.mission.state == MissionState::Offered) else {
         return Ok(Finished::Settled);
     };
-    send_offer(app, row).await
+    let named = (&row.mission.site, &row.mission.robot);
+    let prior = app.prior_along(named, &row.mission.trajectory).await?;
+    send_offer(app, OfferedNow { row, prior }).await
 }
 
 /// Sends the offer of a mission that is set to `offered`, and stores the answer.
-pub(super) async fn send_offer(app: App, row: MissionRow) -> Result<Finished, AppError> {
+pub(super) async fn send_offer(
+    app: App,
+    OfferedNow { row, prior }: OfferedNow,
+) -> Result<Finished, AppError> {
     let start_within_ms = start_within_ms(&app, &row);
     let mission = row.mission;
-    let prior = app.prior_along((&mission.site, &mission.robot), &mission.trajectory);
     let place = app.trace_offer(&mission);
     let command = Offer {
-        prior: prior.await?,
+        prior,
         mission: mission.id,
         revision: mission.revision,
         plan_hash: mission.plan_hash,

@@ -43,7 +43,7 @@ use crate::db::restorations::Restrained;
 /// Interval between passes when nothing wakes it.
 pub const PERIOD: Duration = Duration::from_millis(500);
 /// Minimum interval between two looks at what is not a step of a mission: definitions of sites,
-/// alerts, expiry. With them in each pass, a new mission would wait for them.
+/// attendance, expiry. With them in each pass, a new mission would wait for them.
 const UPKEEP_EVERY: Duration = Duration::from_millis(100);
 /// Maximum number of commands under way at once.
 const COMMANDS_MAX: usize = 64;
@@ -246,10 +246,11 @@ impl Reconciler {
         self.send_just_offered();
         let served = self.serve_missions().await;
         self.stop_again().await;
+        let alerts = self.app.sync_alerts().await;
         let now = self.app.clock().elapsed();
         if self.upkeep_due > now {
             self.is_upkeep_owed = true;
-            return served.map(|_open| ());
+            return served.map(|_open| ()).and(alerts);
         }
         self.upkeep_due = now + UPKEEP_EVERY;
         self.is_upkeep_owed = false;
@@ -257,15 +258,16 @@ impl Reconciler {
             Ok(open) => (Some(open), Ok(())),
             Err(error) => (None, Err(error)),
         };
-        served.and(self.upkeep(open.as_deref()).await)
+        let upkeep = self.upkeep(open.as_deref()).await;
+        served.and(alerts).and(upkeep)
     }
 
     /// Sends the offers of missions that were created just now, without reading them again.
     fn send_just_offered(&mut self) {
-        for row in self.app.just_offered().take() {
-            let job = Job::Offer(row.mission.id);
+        for mission in self.app.just_offered().take() {
+            let job = Job::Offer(mission.row.mission.id);
             if self.is_due(&job) {
-                self.start(job, send_offer(self.app.clone(), row));
+                self.start(job, send_offer(self.app.clone(), mission));
             }
         }
     }

@@ -1,5 +1,5 @@
 //! What no mission waits for: robots that are restrained since a restoration, expiry, second agents,
-//! alerts, and definitions of sites that robots lack.
+//! the alerts of the server, and definitions of sites that robots lack.
 
 use std::collections::HashMap;
 use std::time::Duration;
@@ -34,7 +34,6 @@ impl Reconciler {
         self.look_after_restrained();
         self.expire().await?;
         self.end_duplicate_agents();
-        self.app.sync_alerts().await?;
         self.attendance.look(&self.app).await?;
         self.conditions.look(&self.app).await?;
         if let Some(open) = open {
