@@ -115,7 +115,7 @@ impl App {
             }
             return Ok(alert);
         }
-        let mut tx = self.db().write("alerts").await?;
+        let mut tx = self.db().write_uncounted("alerts").await?;
         db::alerts::acknowledge(&mut tx, id, self.clock().now()).await?;
         let found = db::alerts::find(&mut tx, id).await?;
         let mut alert = found.ok_or(AppError::UnknownAlert(id))?;
@@ -185,7 +185,7 @@ impl App {
             return Ok(has_all);
         }
         let mut alerts = Vec::new();
-        let mut tx = self.db().write("alerts").await?;
+        let mut tx = self.db().write_uncounted("alerts").await?;
         for alert in gone {
             let ended = self.end(&mut tx, robot.pk, alert).await?;
             alerts.extend(ended);

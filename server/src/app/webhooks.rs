@@ -111,7 +111,7 @@ impl App {
         settings: WebhookSettings,
         created_by: &str,
     ) -> Result<CreatedWebhook, AppError> {
-        let mut tx = self.db().write("webhooks").await?;
+        let mut tx = self.db().write_uncounted("webhooks").await?;
         let settings = self.checked(&mut tx, settings).await?;
         let count = db::webhooks::count(&mut tx).await?;
         if usize::try_from(count).is_ok_and(|count| count >= WEBHOOKS_MAX) {
@@ -150,7 +150,7 @@ impl App {
         id: WebhookId,
         settings: WebhookSettings,
     ) -> Result<Webhook, AppError> {
-        let mut tx = self.db().write("webhooks").await?;
+        let mut tx = self.db().write_uncounted("webhooks").await?;
         known(&mut tx, id).await?;
         let settings = self.checked(&mut tx, settings).await?;
         let replaced = db::webhooks::replace(&mut tx, id, &settings).await;
@@ -169,7 +169,7 @@ impl App {
     /// [`AppError::UnknownWebhook`].
     pub async fn rotate_webhook_secret(&self, id: WebhookId) -> Result<CreatedWebhook, AppError> {
         let secret = new_secret(Kind::Webhook)?;
-        let mut tx = self.db().write("webhooks").await?;
+        let mut tx = self.db().write_uncounted("webhooks").await?;
         if !db::webhooks::set_secret(&mut tx, id, secret.reveal()).await? {
             return Err(AppError::UnknownWebhook(id));
         }
@@ -186,7 +186,7 @@ impl App {
     /// # Errors
     /// [`AppError::UnknownWebhook`].
     pub async fn delete_webhook(&self, id: WebhookId) -> Result<Webhook, AppError> {
-        let mut tx = self.db().write("webhooks").await?;
+        let mut tx = self.db().write_uncounted("webhooks").await?;
         let webhook = known(&mut tx, id).await?;
         db::webhooks::delete(&mut tx, id).await?;
         tx.commit().await?;
@@ -198,7 +198,7 @@ impl App {
     /// # Errors
     /// [`AppError::UnknownWebhook`].
     pub async fn test_webhook(&self, id: WebhookId) -> Result<Delivery, AppError> {
-        let mut tx = self.db().write("webhooks").await?;
+        let mut tx = self.db().write_uncounted("webhooks").await?;
         let webhook = known(&mut tx, id).await?;
         let (delivery, at) = (self.clock().new_id::<DeliveryId>(), self.clock().now());
         let kind: AlertCode = TEST_KIND.parse().expect("the kind of a test is a code");
@@ -316,7 +316,7 @@ impl App {
         if changes.is_empty() {
             return Ok(());
         }
-        let mut tx = self.db().write("webhooks").await?;
+        let mut tx = self.db().write_uncounted("webhooks").await?;
         for change in &changes {
             for webhook in db::webhooks::interested(&mut tx, &change.alert.code, None).await? {
                 let known = change.ids.get(&webhook.id).copied();

@@ -441,7 +441,7 @@ impl Db {
         })
     }
 
-    /// Returns the generation: a counter of commits other than of uploads and missions. Data that
+    /// Returns the generation: a counter of all commits but those of [`Db::write_uncounted`]. Data that
     /// those do not change are unchanged while it is the same.
     pub fn generation(&self) -> u64 {
         self.commits.generation.load(Ordering::Acquire)
@@ -498,7 +498,7 @@ impl Db {
     }
 
     /// Begins a write transaction that [`Db::generation`] does not count, since it changes no site,
-    /// terrain or robot: of uploads, or of missions.
+    /// terrain or robot: of uploads, missions, alerts, identities and the audit log.
     ///
     /// # Errors
     /// The connection did not become free in time, or SQLite failed.

@@ -353,8 +353,11 @@ async fn a_mission_is_offered_in_the_commit_that_creates_it_where_nothing_comes_
     assert_eq!(second.mission.state, MissionState::Queued, "behind another");
     let other: RobotId = "rover-2".parse().unwrap();
     appears(&other);
+    let generation = app.db().generation();
     let offered = create(&other).await;
     assert_eq!(offered.mission.state, MissionState::Offered);
+    // What map requests keep of sites and robots stays valid.
+    assert_eq!(app.db().generation(), generation);
     let steps: Vec<(Actor, MissionState)> = offered
         .events
         .iter()

@@ -1,5 +1,6 @@
-//! Cache of the sites and robots that map requests need from the database, valid until something
-//! other than an upload or a mission is committed. Requests then need no database connection.
+//! Cache of the sites and robots that map requests need from the database, valid until a
+//! transaction is committed that may change them ([`db::Db::generation`]). Requests then need no
+//! database connection.
 
 use std::collections::HashMap;
 use std::hash::Hash;

@@ -374,7 +374,7 @@ impl App {
         entries: &[AuditEntry],
         uses: &HashMap<Used, Timestamp>,
     ) -> Result<(), AppError> {
-        let mut tx = self.db().write("identity").await?;
+        let mut tx = self.db().write_uncounted("identity").await?;
         let mut written = Vec::new();
         if !entries.is_empty() {
             written = db::audit::append(&mut tx, entries).await?;

@@ -57,7 +57,7 @@ impl App {
             created_at: now,
             expires_at,
         };
-        let mut tx = self.db().write("identity").await?;
+        let mut tx = self.db().write_uncounted("identity").await?;
         if let Some(token) = token {
             let valid = db::tokens::find(&mut tx, token).await?;
             if valid.is_none_or(|token| token.revoked_at.is_some()) {
@@ -103,7 +103,7 @@ impl App {
     /// Ends a browser's session: its requests are refused from now on, and its open connections
     /// close.
     pub async fn end_session(&self, id: SessionId) -> Result<(), AppError> {
-        let mut tx = self.db().write("identity").await?;
+        let mut tx = self.db().write_uncounted("identity").await?;
         db::sessions::delete(&mut tx, id).await?;
         let app = self.clone();
         tx.commit_then(move |_outcome| app.end_known_sessions(&[id]))

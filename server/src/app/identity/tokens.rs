@@ -87,7 +87,7 @@ impl App {
             );
             return Err(AppError::BeyondRights(detail));
         }
-        let mut tx = self.db().write("identity").await?;
+        let mut tx = self.db().write_uncounted("identity").await?;
         // The creator's token may have been revoked since the request began.
         let now = self.clock().now();
         let holds = still_holds(&mut tx, giver, now).await?;
@@ -113,7 +113,7 @@ impl App {
         request: CreateToken,
         created_by: &str,
     ) -> Result<CreatedToken, AppError> {
-        let mut tx = self.db().write("identity").await?;
+        let mut tx = self.db().write_uncounted("identity").await?;
         let maker = (created_by, &Scope::EVERYWHERE);
         let created = self.new_token(&mut tx, request, maker).await?;
         tx.commit().await?;
@@ -126,7 +126,7 @@ impl App {
     /// A valid admin's token exists and `force` is not set.
     pub async fn create_first_admin(&self, first: FirstAdmin) -> Result<CreatedToken, AppError> {
         let now = self.clock().now();
-        let mut tx = self.db().write("identity").await?;
+        let mut tx = self.db().write_uncounted("identity").await?;
         let (_, admin_count) = db::tokens::valid_counts(&mut tx, now).await?;
         if admin_count > 0 && !first.force {
             return Err(AppError::AlreadyExists {
@@ -263,7 +263,7 @@ impl App {
     /// looked up again.
     pub async fn revoke_token(&self, id: TokenId) -> Result<Token, AppError> {
         let ending = Ending(self.clone(), id);
-        let mut tx = self.db().write("identity").await?;
+        let mut tx = self.db().write_uncounted("identity").await?;
         db::tokens::revoke(&mut tx, id, self.clock().now()).await?;
         let token = db::tokens::find(&mut tx, id).await?;
         let token = token.ok_or(AppError::UnknownToken(id))?;

@@ -146,7 +146,7 @@ impl Dispatcher {
         let due = db::webhooks::due(&mut tx, DueTimes { now, latest }).await?;
         drop(tx);
         if has_older {
-            let mut tx = self.app.db().write("webhooks").await?;
+            let mut tx = self.app.db().write_uncounted("webhooks").await?;
             let count = db::webhooks::give_up_older(&mut tx, oldest, now).await?;
             tx.commit().await?;
             self.app.counters().webhook_given_up.add(count);
@@ -272,7 +272,7 @@ impl Dispatcher {
         if self.outcomes.is_empty() {
             return Ok(());
         }
-        let mut tx = self.app.db().write("webhooks").await?;
+        let mut tx = self.app.db().write_uncounted("webhooks").await?;
         for outcome in &self.outcomes {
             db::webhooks::note_attempt(&mut tx, outcome).await?;
             if outcome.state != DeliveryState::Pending {
