@@ -24,7 +24,7 @@ use crate::dispatch::{self, Dispatch};
 use crate::{Arguments, batches, light_id, period_of, start_fleet, start_light_robots};
 
 /// Robots, and states of each per second.
-const FLEETS: [(u32, f64); 2] = [(5_000, 2.0), (1_000, 10.0)];
+const FLEETS: [(u32, f64); 2] = [(1_000, 10.0), (5_000, 2.0)];
 /// Processor time for each state over that of the bare router, at the most, microseconds.
 const OVER_ROUTER_MAX_US: f64 = 25.0;
 /// Memory over that of the bare router, at the most, MB.
@@ -42,6 +42,15 @@ pub(crate) struct Used {
     memory_peak_mb: f64,
     #[serde(skip_serializing_if = "Option::is_none")]
     dispatch: Option<Dispatch>,
+}
+
+impl Used {
+    fn words(&self) -> String {
+        format!(
+            "{:.0} states/s, {:.1} us CPU each, {:.0} MB",
+            self.states_per_second, self.cpu_us_per_state, self.memory_peak_mb
+        )
+    }
 }
 
 /// What was measured of a fleet.
@@ -66,20 +75,26 @@ pub(crate) async fn measure(arguments: &Arguments, node: &Path) -> anyhow::Resul
     for (robots, state_rate_hz) in FLEETS {
         let period = period_of(state_rate_hz);
         let seconds = arguments.seconds;
-        eprintln!("{robots} robots at {state_rate_hz} Hz: a router alone");
+        let say = |what: &str, used: &Used| {
+            eprintln!(
+                "{robots} robots at {state_rate_hz} Hz: {what}: {}",
+                used.words()
+            );
+        };
         let router = bare_router(node, (robots, period), seconds).await?;
-        eprintln!("{robots} robots at {state_rate_hz} Hz: the server");
+        say("a router alone", &router);
         let mut fleet = start_fleet(node, false).await;
         let light = start_light_robots(&fleet, robots, false).await?;
         let publishing = publish(light, period);
         let mut server = used(|| fleet.server_usage(), &publishing, seconds).await?;
+        say("the server", &server);
         server.dispatch = Some(dispatch::send_missions(arguments, &mut fleet, None).await?);
         drop((publishing, fleet));
-        eprintln!("{robots} robots at {state_rate_hz} Hz: the server, with certificates");
         let fleet = start_fleet(node, true).await;
         let light = start_light_robots(&fleet, robots, true).await?;
         let publishing = publish(light, period);
         let tls = used(|| fleet.server_usage(), &publishing, seconds).await?;
+        say("the server, with certificates", &tls);
         drop((publishing, fleet));
         fleets.push(OfFleet {
             robots,
