@@ -31,6 +31,15 @@ const FSYNCS: usize = 100;
 const FSYNC_BYTES: usize = 8 * 1024;
 /// Part of the missions whose traces must have arrived.
 const TRACED_MIN: f64 = 0.9;
+/// Parts of the time from the request to the first wheel command, in their order.
+const PARTS: [&str; 6] = [
+    "HTTP and checks",
+    "commit",
+    "reconciler",
+    "query to the robot",
+    "planning",
+    "loop tick",
+];
 /// Maximum wait for the last spans, which are sent every second.
 const SPANS_WAIT: Duration = Duration::from_secs(3);
 
@@ -144,15 +153,7 @@ pub(crate) async fn send_missions(
 /// Divides the time of each mission by its spans, which server and agent send to the collector.
 async fn parts(sent: &[Sent], collector: &Collector) -> anyhow::Result<Vec<Part>> {
     tokio::time::sleep(SPANS_WAIT).await;
-    const NAMES: [&str; 6] = [
-        "HTTP and checks",
-        "commit",
-        "reconciler",
-        "query to the robot",
-        "planning",
-        "loop tick",
-    ];
-    let mut times_ms = vec![Vec::new(); NAMES.len()];
+    let mut times_ms = vec![Vec::new(); PARTS.len()];
     for Sent {
         mission, asked_at, ..
     } in sent
@@ -179,7 +180,7 @@ async fn parts(sent: &[Sent], collector: &Collector) -> anyhow::Result<Vec<Part>
         "only {:.0} % of the missions have all of their spans",
         100.0 * traced
     );
-    let parts = NAMES.into_iter().zip(&mut times_ms);
+    let parts = PARTS.into_iter().zip(&mut times_ms);
     let part = |(name, times_ms): (&'static str, &mut Vec<f64>)| Part {
         name,
         p50_ms: quantile(times_ms, 0.5),
@@ -189,7 +190,6 @@ async fn parts(sent: &[Sent], collector: &Collector) -> anyhow::Result<Vec<Part>
 }
 
 /// Returns the times of writes with `fdatasync` to a file beside the database.
-#[expect(clippy::disallowed_methods, reason = "a measurement of real time")]
 fn fsyncs_ms(database: &Path) -> anyhow::Result<Vec<f64>> {
     let mut file = std::fs::File::create(database.with_extension("fsync"))?;
     let bytes = [0x5a_u8; FSYNC_BYTES];

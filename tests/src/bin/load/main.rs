@@ -47,6 +47,10 @@ const CERTIFICATE_S: u32 = 86_400;
 /// Measures what one server carries.
 #[derive(Debug, Parser)]
 #[command(name = "load")]
+#[expect(
+    clippy::struct_excessive_bools,
+    reason = "each is a flag of the command line"
+)]
 pub(crate) struct Arguments {
     /// Light robots
     #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=5_000))]
