@@ -2,7 +2,8 @@
 //! cancellations, and sends terrains.
 //!
 //! Woken by every change and by a timer, it reads the database anew and compares it with the
-//! presence of robots. It has no other input, so it is correct after any restart. The decision for
+//! presence of robots, so it is correct after any restart. Missions that were offered with their
+//! creation are also handed to it in memory, to save the time of reading them. The decision for
 //! one mission is pure (`needs`). Commands to different robots run concurrently, at most one of a
 //! kind per robot.
 
