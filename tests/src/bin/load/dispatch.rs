@@ -40,8 +40,8 @@ const PARTS: [&str; 6] = [
     "planning",
     "loop tick",
 ];
-/// Maximum wait for the last spans, which are sent every second.
-const SPANS_WAIT: Duration = Duration::from_secs(3);
+/// Spans of server and agent between which the parts lie.
+const SPANS: [&str; 4] = ["store", "offer", "plan", "drive"];
 
 /// What the dispatch measurement found.
 #[derive(Debug, Serialize)]
@@ -152,22 +152,30 @@ pub(crate) async fn send_missions(
 
 /// Divides the time of each mission by its spans, which server and agent send to the collector.
 async fn parts(sent: &[Sent], collector: &Collector) -> anyhow::Result<Vec<Part>> {
-    tokio::time::sleep(SPANS_WAIT).await;
+    let of_mission = |sent: &Sent| {
+        let trace = TraceParent::of_mission(sent.mission);
+        collector.of_trace(trace.trace_id)
+    };
+    // Server and agents send their spans in order, so those of the others have arrived too.
+    if let Some(last) = sent.last() {
+        let look = async || of_mission(last);
+        eventually("the last spans have arrived", SHORT, look, |spans| {
+            SPANS.iter().all(|name| spans.contains_key(*name))
+        })
+        .await;
+    }
     let mut times_ms = vec![Vec::new(); PARTS.len()];
-    for Sent {
-        mission, asked_at, ..
-    } in sent
-    {
-        let spans = collector.of_trace(TraceParent::of_mission(*mission).trace_id);
+    for mission in sent {
+        let spans = of_mission(mission);
         let ends_ns = |name: &str| {
             let (_, span) = spans.get(name)?.last()?;
             Some((span.start_time_unix_nano, span.end_time_unix_nano))
         };
-        let found = ["store", "offer", "plan", "drive"].map(ends_ns);
+        let found = SPANS.map(ends_ns);
         let [Some(store), Some(offer), Some(plan), Some(drive)] = found else {
             continue;
         };
-        let asked_ns = u64::try_from(asked_at.as_nanosecond())?;
+        let asked_ns = u64::try_from(mission.asked_at.as_nanosecond())?;
         let marks_ns = [asked_ns, store.0, store.1, offer.0, plan.0, plan.1, drive.0];
         for (times_ms, pair) in times_ms.iter_mut().zip(marks_ns.windows(2)) {
             // The loop may take a plan before the span of planning ends.
