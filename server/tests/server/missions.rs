@@ -5,7 +5,7 @@ use std::time::Duration;
 use reqwest::StatusCode;
 use serde_json::json;
 use tread_api::ids::{BootId, RobotId};
-use tread_api::mission::{Actor, Mission, MissionState};
+use tread_api::mission::{Actor, Mission, MissionDetail, MissionState};
 use tread_api::page::Page;
 use tread_api::wire::ingest::{MissionPhase, Record};
 use tread_api::wire::reply::CommandRefusalCode;
@@ -14,6 +14,12 @@ use uuid::Uuid;
 use crate::harness::{Yard, circle, eventually, report, site};
 use crate::ingest::{Writer, boot};
 use crate::robot::{Mood, Robot, first_state};
+
+/// Who moved a mission into which states, in their order.
+fn steps_of(mission: &MissionDetail) -> Vec<(Actor, MissionState)> {
+    let events = mission.events.iter();
+    events.map(|event| (event.actor, event.to)).collect()
+}
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_mission_is_offered_driven_and_succeeds_with_its_whole_history() {
@@ -45,13 +51,8 @@ async fn a_mission_is_offered_driven_and_succeeds_with_its_whole_history() {
     let ended = yard.mission(mission.id).await;
     assert_eq!(ended.mission.state, MissionState::Succeeded);
     assert!(ended.mission.started_at.is_some() && ended.mission.ended_at.is_some());
-    let steps: Vec<(Actor, MissionState)> = ended
-        .events
-        .iter()
-        .map(|event| (event.actor, event.to))
-        .collect();
     assert_eq!(
-        steps,
+        steps_of(&ended),
         [
             (Actor::Client, MissionState::Queued),
             (Actor::Server, MissionState::Offered),
@@ -358,13 +359,8 @@ async fn a_mission_is_offered_in_the_commit_that_creates_it_where_nothing_comes_
     assert_eq!(offered.mission.state, MissionState::Offered);
     // What map requests keep of sites and robots stays valid.
     assert_eq!(app.db().generation(), generation);
-    let steps: Vec<(Actor, MissionState)> = offered
-        .events
-        .iter()
-        .map(|event| (event.actor, event.to))
-        .collect();
     assert_eq!(
-        steps,
+        steps_of(&offered),
         [
             (Actor::Client, MissionState::Queued),
             (Actor::Server, MissionState::Offered),
