@@ -367,10 +367,10 @@ async fn read_states(
         for message in messages.drain(..) {
             process(&app, &limits, &message);
         }
-        // More wait already, otherwise.
         if received < STATES_AT_ONCE_MAX {
             tokio::time::sleep(STATES_PAUSE).await;
         } else {
+            // More are probably waiting.
             tokio::task::yield_now().await;
         }
     }
