@@ -9,7 +9,7 @@ use tread_tests::light_robot::LightRobot;
 use tread_tests::report::Check;
 
 use crate::ingest::{self, Ingest, Pace};
-use crate::peers::PythonService;
+use crate::peers::{PythonService, SqliteFloor, sqlite_floor};
 use crate::states::welcome_of;
 use crate::{Arguments, connect_light_robots, start_fleet, start_light_robots};
 
@@ -39,14 +39,20 @@ pub(crate) struct Saturation {
     /// The service in Python, with the same records in JSON.
     #[serde(skip_serializing_if = "Option::is_none")]
     python: Option<Ingest>,
+    /// SQLite alone.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    sqlite: Option<SqliteFloor>,
 }
 
 pub(crate) async fn measure(arguments: &Arguments, node: &Path) -> anyhow::Result<Saturation> {
     let cbor = tread(arguments, node, Encoding::Cbor, Pace::Saturating).await?;
     let json = tread(arguments, node, Encoding::Json, Pace::Saturating).await?;
-    let python = match &arguments.peers {
-        Some(python) => Some(peer(arguments, node, python).await?),
-        None => None,
+    let (python, sqlite) = match &arguments.peers {
+        Some(python) => (
+            Some(peer(arguments, node, python).await?),
+            Some(sqlite_floor(python, arguments.seconds)?),
+        ),
+        None => (None, None),
     };
     let pace = Pace::PerSecond(LOADED_RATIO * cbor.segments_per_second);
     let loaded = tread(arguments, node, Encoding::Cbor, pace).await?;
@@ -56,6 +62,7 @@ pub(crate) async fn measure(arguments: &Arguments, node: &Path) -> anyhow::Resul
         json,
         loaded,
         python,
+        sqlite,
     })
 }
 
@@ -131,6 +138,11 @@ impl Saturation {
                 rate.at_least(PYTHON_PER_SECOND_MIN),
                 Check::shown(cpu, python.server_cpu_us_per_segment),
             ]);
+        }
+        if let Some(sqlite) = &self.sqlite {
+            let rate = Check::shown("SQLite alone: rows per second", sqlite.rows_per_second);
+            let cpu = Check::shown("SQLite alone: CPU per row, us", sqlite.cpu_us_per_row);
+            checks.extend([rate, cpu]);
         }
         checks
     }
