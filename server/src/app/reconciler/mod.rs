@@ -280,6 +280,9 @@ impl Reconciler {
         let mut open = db::missions::in_progress(&mut tx).await?;
         open.extend(db::missions::next_in_queues(&mut tx).await?);
         drop(tx);
+        // Before a mission of a robot that was released is offered, so that nobody sees it driven while
+        // its robot counts as one that awaits its release.
+        self.app.show_awaiting(&restrained);
         let by_key = restrained.into_iter().map(|it| (key_of(&it), it));
         self.restrained = by_key.collect();
         self.forget_all_but(&open);

@@ -31,7 +31,7 @@ impl Reconciler {
     /// Looks at everything that is not a step of a mission; `open` are the open missions, if they
     /// could be read.
     pub(super) async fn upkeep(&mut self, open: Option<&[Standing]>) -> Result<(), AppError> {
-        self.look_after_restrained();
+        self.ask_restrained();
         self.expire().await?;
         self.end_duplicate_agents();
         self.attendance.look(&self.app).await?;
@@ -73,11 +73,9 @@ impl Reconciler {
         Ok(())
     }
 
-    /// Shows which robots are restrained since a restoration, and asks them how their missions
-    /// ended.
-    fn look_after_restrained(&mut self) {
+    /// Asks robots that are restrained since a restoration how their missions ended.
+    fn ask_restrained(&mut self) {
         let restrained: Vec<Restrained> = self.restrained.values().cloned().collect();
-        self.app.show_awaiting(&restrained);
         let wanted = |key: &RobotKey| {
             let found = self.restrained.get(key);
             found.is_some_and(|found| found.outcomes_wanted)
