@@ -562,7 +562,7 @@ pub struct RobotContribution {
     pub cells: u64,
     /// Number of its segments.
     pub segments: u64,
-    /// Begin of the epoch (hour or day) of its first measurement.
+    /// Begin of the epoch (hour, day or month) of its first measurement.
     pub first_at: Timestamp,
     /// End of its newest measurement.
     pub newest_at: Timestamp,

@@ -32,7 +32,7 @@ use tread_server::clock::Clock;
 use tread_server::config::{FrictionConfig, StorageConfig};
 use tread_server::db::Db;
 use tread_server::friction::index::{CELLS_PER_BLOCK, CellSummary, Labelled, SiteMap};
-use tread_server::friction::{Sums, epoch_h};
+use tread_server::friction::{Horizons, Sums, epoch_h};
 use tread_server::http;
 use tread_server::identity::origin::Names;
 use tread_server::supervisor::Supervisor;
@@ -96,7 +96,7 @@ fn ratio(part: usize, whole: usize) -> f64 {
 fn bytes_per_sum(robots: &[RobotId]) -> anyhow::Result<(f64, f64)> {
     let at = jiff::Timestamp::from_second(1_793_000_000)?;
     let region = Region::new(ALLOCATOR);
-    let mut map = SiteMap::new(1, 0);
+    let mut map = SiteMap::new(1, Horizons::default());
     for place in 0..SIDE_CELLS * SIDE_CELLS {
         let cell = Cell {
             ix: place % SIDE_CELLS,

@@ -26,8 +26,8 @@ use crate::db::sites::SiteRow;
 use crate::db::sums::SumKey;
 use crate::db::watermarks::WatermarkStep;
 use crate::db::{DbError, Outcome, Tx};
-use crate::friction::Sums;
 use crate::friction::index::{Labelled, SiteMap};
+use crate::friction::{Horizons, Sums};
 
 /// The maps of all sites.
 #[derive(Debug, Default)]
@@ -59,8 +59,8 @@ pub(super) enum MapChange {
     Store(Vec<WatermarkStep>),
     /// Sums of a robot's measurements are removed.
     Withdraw(Box<Withdrawn>),
-    /// Hours before this one are merged into days.
-    MergeBefore(Box<SiteRow>, i64),
+    /// Epochs before these horizons are merged.
+    MergeBefore(Box<SiteRow>, Horizons),
     /// Raw measurements of these runs were removed.
     Remove(HashSet<i64>),
 }
@@ -127,7 +127,7 @@ impl Maps {
         let sites = self.sites.read().unwrap_or_else(PoisonError::into_inner);
         match sites.get(&row.pk) {
             Some(map) => look(map),
-            None => look(&SiteMap::new(row.site.grid.revision, row.merged_before_h)),
+            None => look(&SiteMap::new(row.site.grid.revision, row.horizons)),
         }
     }
 
@@ -141,7 +141,7 @@ impl Maps {
 fn ensure<'maps>(sites: &'maps mut HashMap<i64, SiteMap>, row: &SiteRow) -> &'maps mut SiteMap {
     sites
         .entry(row.pk)
-        .or_insert_with(|| SiteMap::new(row.site.grid.revision, row.merged_before_h))
+        .or_insert_with(|| SiteMap::new(row.site.grid.revision, row.horizons))
 }
 
 /// Adds sums to their maps.
@@ -204,8 +204,8 @@ impl App {
                 self.maps().unwritten().withdraw(robot_pk, hours);
                 self.maps().change(&site, |map| map.withdraw(&robot, hours));
             }
-            MapChange::MergeBefore(row, hour) => {
-                self.maps().change(&row, |map| map.merge_before(hour));
+            MapChange::MergeBefore(row, horizons) => {
+                self.maps().change(&row, |map| map.merge_before(horizons));
             }
             MapChange::Remove(boots) => self.removed().extend(boots),
         }

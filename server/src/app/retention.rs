@@ -16,7 +16,7 @@ use super::map::MapChange;
 use super::{App, AppError};
 use crate::config::RetentionConfig;
 use crate::db;
-use crate::friction::sums::DAY_H;
+use crate::friction::epochs::DAY_H;
 
 /// Interval at which the server checks for measurements to remove.
 const LOOK_EVERY: Duration = Duration::from_mins(10);

@@ -2,7 +2,7 @@
 //!
 //! The sums of the withdrawn hours are removed, stored or not, and later uploads of these hours are
 //! not added, nor are their segments when the server starts. Raw segments are kept. Hours that are
-//! merged into days can only be withdrawn by whole days.
+//! merged into days or months can only be withdrawn by whole ones.
 
 use jiff::Timestamp;
 use tread_api::friction::{CreateWithdrawal, Withdrawal};
@@ -15,8 +15,8 @@ use super::map::{MapChange, Withdrawn};
 use super::{App, AppError, page, people_line, site_row};
 use crate::db;
 use crate::db::withdrawals::WithdrawalRow;
-use crate::friction::sums::{DAY_H, HOUR_S};
-use crate::friction::{bucket_h, epoch_h};
+use crate::friction::epochs::HOUR_S;
+use crate::friction::{Horizons, epoch_h};
 
 /// Maximum number of withdrawals of one server; each new segment is compared with all of them.
 const WITHDRAWALS_MAX: usize = 1_000;
@@ -43,8 +43,7 @@ impl App {
         let robot_pk = found.ok_or_else(unknown)?.pk;
         let from_h = from.map_or(0, epoch_h).max(0);
         let to_h = to.map_or(epoch_h(now), epoch_h);
-        let merged_before_h = site_row.merged_before_h;
-        check_hours((from_h, to_h), merged_before_h)?;
+        check_hours((from_h, to_h), site_row.horizons)?;
         let count = db::withdrawals::count(&mut tx).await?;
         if count >= WITHDRAWALS_MAX {
             return Err(AppError::TooMany {
@@ -94,7 +93,7 @@ impl App {
     }
 }
 
-fn check_hours((from_h, to_h): (i64, i64), merged_before_h: i64) -> Result<(), AppError> {
+fn check_hours((from_h, to_h): (i64, i64), horizons: Horizons) -> Result<(), AppError> {
     let time = |hour: i64| Timestamp::from_second(hour * HOUR_S).unwrap_or(Timestamp::MAX);
     if to_h < from_h {
         return Err(AppError::Invalid {
@@ -102,14 +101,19 @@ fn check_hours((from_h, to_h): (i64, i64), merged_before_h: i64) -> Result<(), A
             detail: "to lies before from".to_owned(),
         });
     }
-    let cuts_begin = bucket_h(from_h, merged_before_h) != from_h;
-    let ends_day = to_h >= merged_before_h || to_h.rem_euclid(DAY_H) == DAY_H - 1;
-    if cuts_begin || !ends_day {
+    let (first, last) = (horizons.epoch_of(from_h), horizons.epoch_of(to_h));
+    let cuts_begin = first.first_h != from_h;
+    if cuts_begin || last.end_h != to_h + 1 {
+        let cut = if cuts_begin { first } else { last };
         return Err(AppError::Invalid {
             field: if cuts_begin { "from" } else { "to" },
             detail: format!(
-                "hours before {} are merged into days: give whole ones",
-                time(merged_before_h)
+                "hours before {} are merged into days, and days before {} into months (UTC): give \
+                 whole ones; this one is from {} to {}",
+                time(horizons.days_before_h),
+                time(horizons.months_before_h),
+                time(cut.first_h),
+                time(cut.end_h),
             ),
         });
     }

@@ -6,6 +6,7 @@ use tread_api::rights::Scope;
 use tread_api::site::{GeoOrigin, Grid, Site};
 
 use super::{DbError, from_json, from_us, parse, scope_text, to_json, to_us, unsigned};
+use crate::friction::Horizons;
 
 /// A site with its key in the database.
 #[derive(Debug, Clone)]
@@ -14,8 +15,8 @@ pub struct SiteRow {
     pub pk: i64,
     /// The site.
     pub site: Site,
-    /// Hour since 1970 before which hours are read as days.
-    pub merged_before_h: i64,
+    /// Horizons before which the epochs of its map are merged.
+    pub horizons: Horizons,
 }
 
 struct Raw {
@@ -28,6 +29,7 @@ struct Raw {
     geofence_revision: i64,
     created_at_us: i64,
     merged_before_h: i64,
+    months_before_h: i64,
     origin: Option<String>,
 }
 
@@ -52,7 +54,10 @@ impl TryFrom<Raw> for SiteRow {
         Ok(Self {
             pk: raw.pk,
             site,
-            merged_before_h: raw.merged_before_h,
+            horizons: Horizons {
+                days_before_h: raw.merged_before_h,
+                months_before_h: raw.months_before_h,
+            },
         })
     }
 }
@@ -100,7 +105,7 @@ pub async fn find(db: &mut SqliteConnection, id: &SiteId) -> Result<Option<SiteR
     let raw = sqlx::query_as!(
         Raw,
         r#"SELECT pk AS "pk!", id, name, grid_revision, cell_m, terrain_revision, created_at_us,
-               merged_before_h, origin,
+               merged_before_h, months_before_h, origin,
                COALESCE((SELECT MAX(revision) FROM geofences WHERE site_pk = sites.pk), 0)
                    AS "geofence_revision!: i64"
            FROM sites WHERE id = ?"#,
@@ -122,7 +127,7 @@ pub async fn list(
     let rows = sqlx::query_as!(
         Raw,
         r#"SELECT pk AS "pk!", id, name, grid_revision, cell_m, terrain_revision, created_at_us,
-               merged_before_h, origin,
+               merged_before_h, months_before_h, origin,
                COALESCE((SELECT MAX(revision) FROM geofences WHERE site_pk = sites.pk), 0)
                    AS "geofence_revision!: i64"
            FROM sites
@@ -149,16 +154,17 @@ pub async fn count_terrain_change(db: &mut SqliteConnection, pk: i64) -> Result<
     Ok(())
 }
 
-/// Sets the hour, a multiple of 24, before which hours are read as days; never moves it back.
-pub async fn merge_before(
+/// Sets the horizons of a site's map; the caller never moves one back.
+pub async fn set_horizons(
     db: &mut SqliteConnection,
     pk: i64,
-    before_h: i64,
+    horizons: Horizons,
 ) -> Result<(), DbError> {
     sqlx::query!(
-        "UPDATE sites SET merged_before_h = ?2 WHERE pk = ?1 AND merged_before_h < ?2",
+        "UPDATE sites SET merged_before_h = ?2, months_before_h = ?3 WHERE pk = ?1",
         pk,
-        before_h,
+        horizons.days_before_h,
+        horizons.months_before_h,
     )
     .execute(db)
     .await?;

@@ -11,9 +11,9 @@ use tread_api::terrain::TerrainRef;
 
 use super::rows::{Row, RowsStatement};
 use super::{DbError, ground, unsigned};
-use crate::friction::Sums;
 use crate::friction::fixed::Fixed;
 use crate::friction::sums::{Pair, Pass, TELLING_DEVIATIONS};
+use crate::friction::{Horizons, Sums};
 
 /// Key of one sum.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -276,25 +276,57 @@ pub async fn each(db: &mut SqliteConnection, mut take: impl FnMut(SumRow)) -> Re
     Ok(())
 }
 
-/// Returns a robot with hours to merge, and the horizon of its site; `None` if there are none.
-pub async fn one_unmerged(db: &mut SqliteConnection) -> Result<Option<(i64, i64)>, DbError> {
+/// An hour of a robot under which sums are stored.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct StoredHour {
+    /// Key of the robot.
+    pub robot_pk: i64,
+    /// Hours since 1970.
+    pub epoch_h: i64,
+    /// Horizons of the robot's site.
+    pub horizons: Horizons,
+}
+
+/// Returns an hour whose sums are to be merged into its day or month; `None` if there is none. It
+/// looks at each stored hour before a horizon once, not at each sum.
+pub async fn one_unmerged(db: &mut SqliteConnection) -> Result<Option<StoredHour>, DbError> {
     let row = sqlx::query!(
-        r#"SELECT robots.pk AS "pk!", sites.merged_before_h FROM robots
-           JOIN sites ON sites.pk = robots.site_pk
-           WHERE EXISTS (SELECT 1 FROM cell_sums s WHERE s.robot_pk = robots.pk
-               AND s.epoch_h < sites.merged_before_h AND s.epoch_h % 24 <> 0)
+        r#"WITH RECURSIVE stored (robot_pk, epoch_h, days_before_h, months_before_h) AS (
+               SELECT robots.pk,
+                   (SELECT MIN(epoch_h) FROM cell_sums WHERE robot_pk = robots.pk),
+                   merged_before_h, months_before_h
+               FROM robots JOIN sites ON sites.pk = robots.site_pk
+               UNION ALL
+               SELECT robot_pk,
+                   (SELECT MIN(next.epoch_h) FROM cell_sums AS next
+                    WHERE next.robot_pk = stored.robot_pk AND next.epoch_h > stored.epoch_h),
+                   days_before_h, months_before_h
+               FROM stored WHERE epoch_h < days_before_h
+           )
+           SELECT robot_pk AS "robot_pk!: i64", epoch_h AS "epoch_h!: i64",
+               days_before_h AS "days_before_h!: i64", months_before_h AS "months_before_h!: i64"
+           FROM stored
+           WHERE epoch_h < days_before_h AND epoch_h % 24 <> 0
+               OR epoch_h < months_before_h
+                   AND strftime('%d %H', epoch_h * 3600, 'unixepoch') <> '01 00'
            LIMIT 1"#
     );
     let row = row.fetch_optional(db).await?;
-    Ok(row.map(|row| (row.pk, row.merged_before_h)))
+    Ok(row.map(|row| StoredHour {
+        robot_pk: row.robot_pk,
+        epoch_h: row.epoch_h,
+        horizons: Horizons {
+            days_before_h: row.days_before_h,
+            months_before_h: row.months_before_h,
+        },
+    }))
 }
 
-/// Returns at most `limit` sums of one robot whose hours are before `before_h` and not the first of
-/// their day, in the order of the table.
-pub async fn unmerged(
+/// Returns at most `limit` sums of one robot and hour, in the order of the table.
+pub async fn of_hour(
     db: &mut SqliteConnection,
     robot_pk: i64,
-    before_h: i64,
+    epoch_h: i64,
     limit: u32,
 ) -> Result<Vec<SumRow>, DbError> {
     let raw = sqlx::query_as!(
@@ -306,10 +338,9 @@ pub async fn unmerged(
                rolling_information_lo, rolling_weighted_hi, rolling_weighted_lo, segments,
                samples, mu_peak, newest_at_us, newest_information, newest_weighted, newest_mu,
                pass_at_us, robot_error_hi, robot_error_lo, tyre_error_hi, tyre_error_lo
-           FROM cell_sums WHERE robot_pk = ?1 AND epoch_h < ?2 AND epoch_h % 24 <> 0
-           LIMIT ?3"#,
+           FROM cell_sums WHERE robot_pk = ?1 AND epoch_h = ?2 LIMIT ?3"#,
         robot_pk,
-        before_h,
+        epoch_h,
         limit,
     )
     .fetch_all(db)

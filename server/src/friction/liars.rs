@@ -4,8 +4,8 @@ use proptest::prelude::*;
 use tread_api::friction::{NORMAL_95, ROBOT_BIAS_RATIO};
 
 use super::coverage::Normal;
+use super::epochs::HOUR_S;
 use super::fuse::MU_ALONE_MAX;
-use super::sums::HOUR_S;
 use super::tests::{at_us, fused, fused_as, measured, with_peak_friction};
 use super::weights::FrictionConfig;
 use super::*;

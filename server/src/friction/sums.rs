@@ -10,13 +10,6 @@ use tread_api::friction::{Information, Segment};
 
 use super::fixed::Fixed;
 
-/// Seconds per hour.
-pub const HOUR_S: i64 = 3_600;
-/// Microseconds per hour.
-const HOUR_US: i64 = 3_600_000_000;
-/// Hours per day, the length of the buckets into which old epochs are merged.
-pub const DAY_H: i64 = 24;
-
 /// Estimate in additive form: Σ Λ and Σ Λ·value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Pair {
@@ -220,29 +213,6 @@ impl Sums {
     }
 }
 
-/// Returns the epoch of a time: whole hours since 1970.
-pub fn epoch_h(time: Timestamp) -> i64 {
-    epoch_h_at(time.as_microsecond())
-}
-
-/// The same for a time in microseconds since 1970.
-pub fn epoch_h_at(time_us: i64) -> i64 {
-    time_us.div_euclid(HOUR_US)
-}
-
-/// Returns the first hour of the bucket that contains `hour`. Buckets are days before
-/// `merged_before_h` and hours from then on.
-///
-/// The database may not be merged yet; reading through this function gives the same result before,
-/// during and after the merge.
-pub fn bucket_h(hour: i64, merged_before_h: i64) -> i64 {
-    if hour < merged_before_h {
-        hour.div_euclid(DAY_H) * DAY_H
-    } else {
-        hour
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
@@ -253,14 +223,6 @@ mod tests {
         #[test]
         fn ordered_bits_compare_as_numbers_do(left in -1.0e9_f64..1.0e9, right in -1.0e9_f64..1.0e9) {
             prop_assert_eq!(ordered(left).cmp(&ordered(right)), left.total_cmp(&right));
-        }
-
-        #[test]
-        fn a_bucket_holds_its_hours_and_begins_with_its_first(hour in -10_000_i64..1_000_000, days in 0_i64..50_000) {
-            let bucket = bucket_h(hour, days * DAY_H);
-            prop_assert!(bucket <= hour && hour - bucket < DAY_H);
-            prop_assert_eq!(bucket_h(bucket, days * DAY_H), bucket);
-            prop_assert_eq!(bucket == hour, hour >= days * DAY_H || hour % DAY_H == 0);
         }
     }
 }

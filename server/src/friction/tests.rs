@@ -5,9 +5,10 @@ use std::collections::BTreeMap;
 use proptest::prelude::*;
 use tread_api::friction::{Information, ROBOT_BIAS_RATIO};
 
+use super::epochs::HOUR_S;
 use super::fixed::Fixed;
 use super::fuse::THETA_STD_DEV_MAX;
-use super::sums::{HOUR_S, Pair, Pass};
+use super::sums::{Pair, Pass};
 use super::weights::FrictionConfig;
 use super::*;
 

@@ -14,6 +14,7 @@ use tread_server::app::App;
 use tread_server::app::friction::{Area, Asked, CellsAsked};
 use tread_server::app::ingest::Upload;
 use tread_server::config::{FrictionConfig, StorageConfig};
+use tread_server::friction::epoch_h;
 
 use crate::harness::{Yard, measured, segment, site, time};
 use crate::ingest::{Writer, boot};
@@ -265,25 +266,11 @@ pub(crate) async fn said(app: &App) -> MapPage<CellFriction> {
     app.friction_of_cells(&site(), &asked, cells).await.unwrap()
 }
 
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn old_hours_are_merged_into_days_and_a_kill_on_the_way_changes_nothing_that_is_said() {
-    let writer = Writer::start().await;
-    let app = &writer.app;
-    // Thirty hours over two days, all before the clock's 1 November.
-    let drive = (0..30).map(|seq| {
-        let place = i32::try_from(seq % 3).unwrap();
-        let hour = i64::try_from(seq).unwrap();
-        measured(
-            seq,
-            segment((place, 0), 0.2 + 0.001 * f64::from(place), hour * 3_600),
-        )
-    });
-    upload_at(&writer, None, drive.collect()).await;
-    assert_eq!(writer.sums().await.len(), 30);
-    app.clock().advance(Duration::from_hours(10 * 24));
+/// Merges all that the horizons have passed, with a kill after each transaction; the map must stay
+/// the same. Returns the number of transactions.
+async fn merged_with_kills(app: &App) -> u32 {
     app.move_horizons().await.unwrap();
     let expected = said(app).await;
-    assert_eq!(expected.items.len(), 3);
     let mut rounds = 0;
     loop {
         // What a server would say that was killed here and started again.
@@ -300,19 +287,55 @@ async fn old_hours_are_merged_into_days_and_a_kill_on_the_way_changes_nothing_th
         }
         rounds += 1;
     }
-    assert!(rounds > 3, "{rounds} rounds");
     assert_eq!(said(app).await, expected);
-    let merged = writer.sums().await;
-    assert!(
-        merged.len() <= 9,
-        "three cells on at most three days: {}",
-        merged.len()
-    );
-    assert!(merged.iter().all(|row| row.key.epoch_h % 24 == 0));
-    let segments: u64 = merged.iter().map(|row| row.sums.segments).sum();
-    assert_eq!(segments, 30, "nothing lost, nothing twice");
+    rounds
+}
 
-    // What comes late falls into its day.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn hours_become_days_and_then_months_and_a_kill_on_the_way_changes_nothing_that_is_said() {
+    let writer = Writer::start().await;
+    let app = &writer.app;
+    // Thirty hours over two days, all before the clock's 1 November.
+    let drive = (0..30).map(|seq| {
+        let place = i32::try_from(seq % 3).unwrap();
+        let hour = i64::try_from(seq).unwrap();
+        measured(
+            seq,
+            segment((place, 0), 0.2 + 0.001 * f64::from(place), hour * 3_600),
+        )
+    });
+    upload_at(&writer, None, drive.collect()).await;
+    assert_eq!(writer.sums().await.len(), 30);
+    // Three cells on three days, two of them in October; then in one month.
+    for (days, rows) in [(10, 6..=9), (130, 3..=3)] {
+        app.clock().advance(Duration::from_hours(days * 24));
+        let rounds = merged_with_kills(app).await;
+        assert!(rounds > 1, "{rounds} rounds");
+        let merged = writer.sums().await;
+        assert!(
+            rows.contains(&merged.len()),
+            "after {days} days: {}",
+            merged.len()
+        );
+        assert!(merged.iter().all(|row| row.key.epoch_h % 24 == 0));
+        let segments: u64 = merged.iter().map(|row| row.sums.segments).sum();
+        assert_eq!(segments, 30, "nothing lost, nothing twice");
+    }
+    assert_eq!(
+        merged_with_kills(app).await,
+        0,
+        "there is nothing left to merge"
+    );
+    let october = "2026-10-01T00:00:00Z".parse().unwrap();
+    assert!(
+        writer
+            .sums()
+            .await
+            .iter()
+            .all(|row| row.key.epoch_h == epoch_h(october))
+    );
+
+    // What comes late falls into its month.
     upload_at(
         &writer,
         None,

@@ -14,8 +14,8 @@ use super::cells::Area;
 use super::drawn::Drawn;
 use super::{App, AppError, Asked, Reading, SiteView, page, terrain_ref};
 use crate::friction::Ground;
+use crate::friction::epochs::HOUR_S;
 use crate::friction::index::{Contribution, SiteMap};
-use crate::friction::sums::HOUR_S;
 
 /// Maximum number of cells that one request for visits may cover.
 const LOOKED_AT_MAX: f64 = 262_144.0;

@@ -11,7 +11,8 @@ use tread_api::ids::{SiteId, TerrainId};
 use super::drawn::Drawn;
 use super::timelines::MEASUREMENTS_MAX;
 use super::{App, AppError, Asked, MOVED, READS_MAX, Reading, SiteView, terrain_ref};
-use crate::friction::index::{Epoch, SiteMap, Timeline};
+use crate::friction::Epoch;
+use crate::friction::index::{SiteMap, Timeline};
 
 /// Maximum number of times in one history.
 const TIMES_MAX: i64 = 1_000;

@@ -9,8 +9,8 @@ use tread_api::ids::ConfigurationId;
 use crate::app::{App, AppError};
 use crate::config::FrictionConfig;
 use crate::db::sites::SiteRow;
-use crate::friction::index::{At, Choice, Epoch, Group, Normalisation, PartialEpoch, Timeline};
-use crate::friction::{Ground, fuse};
+use crate::friction::index::{At, Choice, Group, Normalisation, PartialEpoch, Timeline};
+use crate::friction::{Epoch, Ground, fuse};
 
 /// Seconds of a minute.
 const MINUTE_S: i64 = 60;

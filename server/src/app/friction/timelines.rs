@@ -14,8 +14,8 @@ use crate::db::segments::KeyedSegment;
 use crate::db::sites::SiteRow;
 use crate::db::withdrawals::WithdrawalRow;
 use crate::db::{self, Tx};
-use crate::friction::index::{Epoch, Measurement, PartialEpoch, SiteMap, Stamp, Timeline};
-use crate::friction::{Sums, epoch_h};
+use crate::friction::index::{Measurement, PartialEpoch, SiteMap, Stamp, Timeline};
+use crate::friction::{Epoch, Sums, epoch_h};
 
 /// Maximum number of measurements of a timeline, and of all that are cached; 184 bytes each.
 pub(super) const MEASUREMENTS_MAX: usize = 200_000;

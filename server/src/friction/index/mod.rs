@@ -22,12 +22,11 @@ pub use self::changes::{BLOCK_CELLS, Block, Changes};
 use self::names::{Names, Number};
 use self::part::{Part, PartKey};
 use self::partial::When;
-pub use self::partial::{Epoch, Measurement, PartialEpoch, Timeline};
+pub use self::partial::{Measurement, PartialEpoch, Timeline};
 pub use self::summaries::{
     At, CELLS_PER_BLOCK, CellSummary, CompiledFilter, GROUND_NONE, KnownCell, Room,
 };
-use super::sums::bucket_h;
-use super::{Seen, Sums};
+use super::{Horizons, Seen, Sums};
 
 /// Labels of a sum.
 #[derive(Debug, Clone, Copy)]
@@ -51,7 +50,7 @@ pub struct Labelled<'names> {
 pub struct SiteMap {
     names: Names,
     grid_revision: u32,
-    merged_before_h: i64,
+    horizons: Horizons,
     /// Sums by cell; the key has row and column, shifted to unsigned numbers, see [`place`].
     cells: BTreeMap<u64, Box<[Part]>>,
     /// Sums over all cells, for terrains.
@@ -79,7 +78,7 @@ fn cell_at(place: u64) -> Cell {
 /// Changes whenever measurements may have left a map or moved to another epoch.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Stamp {
-    merged_before_h: i64,
+    horizons: Horizons,
     removals: u64,
 }
 
@@ -167,12 +166,11 @@ impl Group<'_> {
 }
 
 impl SiteMap {
-    /// Creates an empty map for a grid revision. Epochs before the hour `merged_before_h` are
-    /// merged into days.
-    pub fn new(grid_revision: u32, merged_before_h: i64) -> Self {
+    /// Creates an empty map for a grid revision, whose epochs are merged before these horizons.
+    pub fn new(grid_revision: u32, horizons: Horizons) -> Self {
         Self {
             grid_revision,
-            merged_before_h,
+            horizons,
             ..Self::default()
         }
     }
@@ -187,7 +185,7 @@ impl SiteMap {
         if labelled.grid_revision != self.grid_revision {
             return;
         }
-        let epoch_h = bucket_h(labelled.epoch_h, self.merged_before_h);
+        let epoch_h = self.horizons.epoch_of(labelled.epoch_h).first_h;
         let key = PartKey {
             terrain: self.names.terrains.number(labelled.terrain),
             configuration: self.names.configurations.number(&labelled.configuration),
@@ -257,15 +255,19 @@ impl SiteMap {
         }
     }
 
-    /// Merges the epochs before the hour `before_h` into days.
-    pub fn merge_before(&mut self, before_h: i64) {
-        if before_h <= self.merged_before_h {
+    /// Merges the epochs before these horizons; none is ever divided again.
+    pub fn merge_before(&mut self, horizons: Horizons) {
+        let horizons = self.horizons.advanced_to(horizons);
+        if horizons == self.horizons {
             return;
         }
-        self.merged_before_h = before_h;
-        let bucket = |key: PartKey| PartKey {
-            epoch_h: i32::try_from(bucket_h(i64::from(key.epoch_h), before_h)).unwrap_or(i32::MAX),
-            ..key
+        self.horizons = horizons;
+        let bucket = |key: PartKey| {
+            let first_h = horizons.epoch_of(i64::from(key.epoch_h)).first_h;
+            PartKey {
+                epoch_h: i32::try_from(first_h).unwrap_or(i32::MAX),
+                ..key
+            }
         };
         for parts in self.cells.values_mut() {
             if parts.iter().all(|part| bucket(part.key) == part.key) {
@@ -298,15 +300,15 @@ impl SiteMap {
         self.removals = before.removals + 1;
     }
 
-    /// Returns the hour before which epochs are merged into days.
-    pub fn merged_before_h(&self) -> i64 {
-        self.merged_before_h
+    /// Returns the horizons before which epochs are merged.
+    pub fn horizons(&self) -> Horizons {
+        self.horizons
     }
 
     /// Returns what changes whenever measurements may have left the map or moved to another epoch.
     pub fn stamp(&self) -> Stamp {
         Stamp {
-            merged_before_h: self.merged_before_h,
+            horizons: self.horizons,
             removals: self.removals,
         }
     }

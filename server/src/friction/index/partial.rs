@@ -16,28 +16,8 @@ use tread_api::terrain::TerrainRef;
 use super::names::{Names, Number};
 use super::part::{Part, PartKey};
 use super::{SiteMap, Sums, place};
-use crate::friction::sums::{DAY_H, HOUR_S, bucket_h};
-
-/// An epoch of a site's map.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub struct Epoch {
-    /// First hour, since 1970.
-    pub first_h: i64,
-    /// Hour after the last one.
-    pub end_h: i64,
-}
-
-impl Epoch {
-    /// Returns the time at which the epoch begins.
-    pub fn begin(self) -> Timestamp {
-        Timestamp::from_second(self.first_h.saturating_mul(HOUR_S)).unwrap_or(Timestamp::MIN)
-    }
-
-    /// Returns whether an hour belongs to the epoch.
-    pub fn includes_h(self, hour: i64) -> bool {
-        (self.first_h..self.end_h).contains(&hour)
-    }
-}
+use crate::friction::epochs::HOUR_S;
+use crate::friction::{Epoch, epoch_h};
 
 /// A raw measurement with what its sum is stored under.
 #[derive(Debug, Clone)]
@@ -163,13 +143,7 @@ pub(super) struct When<'partial> {
 impl SiteMap {
     /// Returns the epoch that a time lies in.
     pub fn epoch_at(&self, at: Timestamp) -> Epoch {
-        let hour = at.as_second().div_euclid(HOUR_S);
-        let first_h = bucket_h(hour, self.merged_before_h);
-        let is_day = hour < self.merged_before_h;
-        Epoch {
-            first_h,
-            end_h: first_h + if is_day { DAY_H } else { 1 },
-        }
+        self.horizons.epoch_of(epoch_h(at))
     }
 
     /// Returns the number of measurements of an epoch that are on the map.
@@ -228,10 +202,8 @@ impl SiteMap {
     }
 
     fn is_over(&self, key: &PartKey, as_of: Timestamp) -> bool {
-        let epoch_h = i64::from(key.epoch_h);
-        let is_day = epoch_h < self.merged_before_h;
-        let end_h = epoch_h + if is_day { DAY_H } else { 1 };
-        end_h * HOUR_S <= as_of.as_second()
+        let epoch = self.horizons.epoch_of(i64::from(key.epoch_h));
+        epoch.end_h * HOUR_S <= as_of.as_second()
     }
 
     /// Returns a key of a partial epoch with the numbers of this map; `None` if a name is new to
@@ -257,11 +229,12 @@ mod tests {
     use super::super::{At, Choice, Group, Labelled, Room};
     use super::*;
     use crate::friction::Seen;
-    use crate::friction::epoch_h;
+    use crate::friction::epochs::{DAY_H, Horizons};
     use crate::friction::tests::{at_us, measured};
     use crate::friction::weights::FrictionConfig;
 
-    const HOURS: i64 = 72;
+    /// Beyond two months, so that all kinds of epochs occur.
+    const HOURS: i64 = 70 * DAY_H;
 
     fn configuration(number: u8) -> ConfigurationId {
         ConfigurationId::from_uuid(Uuid::from_u128(u128::from(number)))
@@ -302,10 +275,10 @@ mod tests {
     }
 
     fn map_of<'all>(
-        merged_before_h: i64,
+        horizons: Horizons,
         measurements: impl IntoIterator<Item = &'all Measurement>,
     ) -> SiteMap {
-        let mut map = SiteMap::new(1, merged_before_h);
+        let mut map = SiteMap::new(1, horizons);
         for measurement in measurements {
             add(&mut map, measurement);
         }
@@ -348,15 +321,19 @@ mod tests {
         fn as_of_a_time_within_an_epoch_the_map_is_that_of_what_was_measured_before(
             measurements in prop::collection::vec(measurement(), 1..60),
             age_s in 0..HOURS * HOUR_S,
-            merged_h in 0_i64..HOURS,
+            horizon_ages_h in (0_i64..HOURS, 0_i64..HOURS),
             cut in 0_usize..60,
             earlier_s in 0_i64..HOUR_S,
         ) {
             let as_of_us = at_us(age_s);
             let as_of = Timestamp::from_microsecond(as_of_us).unwrap();
             let newest_h = epoch_h(Timestamp::from_microsecond(at_us(0)).unwrap());
-            let merged_before_h = (newest_h - merged_h).div_euclid(DAY_H) * DAY_H;
-            let map = map_of(merged_before_h, &measurements);
+            let month = Horizons { months_before_h: i64::MAX, ..Horizons::default() };
+            let horizons = Horizons {
+                days_before_h: (newest_h - horizon_ages_h.0).div_euclid(DAY_H) * DAY_H,
+                months_before_h: month.epoch_of(newest_h - horizon_ages_h.0.max(horizon_ages_h.1)).first_h,
+            };
+            let map = map_of(horizons, &measurements);
             let epoch = map.epoch_at(as_of);
             let of_epoch = |found: &&Measurement| {
                 let at = Timestamp::from_microsecond(found.ended_at_us).unwrap();
@@ -374,7 +351,7 @@ mod tests {
                 .iter()
                 .filter(|found| found.ended_at_us < as_of_us)
                 .collect();
-            let expected = map_of(merged_before_h, then.iter().copied());
+            let expected = map_of(horizons, then.iter().copied());
             let choice = Choice {
                 as_of: Some(as_of),
                 partial: Some(&partial),
