@@ -87,12 +87,16 @@ async fn a_robot_on_a_router_that_was_since_replaced_is_cut_off_too() {
     let rig = Rig::start().await;
     let mut session = rig.connect(Who::Own, 10_000).await.unwrap();
     let former = rig.fleet.routers.newest().unwrap();
-    rig.app
-        .enrolment_registry()
-        .note(&enrolment("rover-4", 1, false));
+    // Routers are superseded by those for as many robots again.
+    for joined in ["rover-4", "rover-5", "rover-6"] {
+        rig.app
+            .enrolment_registry()
+            .note(&enrolment(joined, 1, false));
+    }
     let number = former.number;
-    until("another router is open", async || {
-        rig.fleet.routers.newest().unwrap().number != number
+    until("another router takes its robots", async || {
+        let present = rig.fleet.routers.of(&(site(), robot("rover-1")));
+        present.unwrap().number != number
     })
     .await;
     assert_eq!(sessions_on(&former).await, 1, "it stays where it is");
@@ -321,6 +325,38 @@ async fn a_robot_that_sends_too_many_bytes_is_read_later_and_keeps_its_link() {
     assert!(counters.gate_throttled.get() > 0);
     let cut = tokio::time::timeout(POLL_INTERVAL, session.link_ended()).await;
     assert!(cut.is_err(), "its link stays");
+    session.close().await;
+    end(rig).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_robot_that_joins_gets_a_router_of_its_own_and_others_connect_to_theirs() {
+    let rig = Rig::start().await;
+    let first = rig.fleet.routers.newest().unwrap();
+    rig.app
+        .enrolment_registry()
+        .note(&enrolment("rover-4", 1, false));
+    until("another router is open", async || {
+        rig.fleet.routers.newest().unwrap().number != first.number
+    })
+    .await;
+    let second = rig.fleet.routers.newest().unwrap();
+    assert_eq!(second.robots, [(site(), robot("rover-4"))].into());
+    let session = rig.connect(Who::Own, 10_000).await.unwrap();
+    assert_eq!(
+        sessions_on(&first).await,
+        1,
+        "it is one of the first router"
+    );
+    // The server hears it there.
+    let counters = rig.app.counters();
+    let refused = counters.refused_malformed.get();
+    let key = keys::state(&site(), &robot("rover-1"));
+    put(&session.zenoh, key, "no state".to_owned());
+    until("it is heard", async || {
+        counters.refused_malformed.get() > refused
+    })
+    .await;
     session.close().await;
     end(rig).await;
 }

@@ -23,6 +23,7 @@ mod rate_limits;
 mod received;
 mod requests;
 mod router;
+mod router_groups;
 mod router_pool;
 mod routers;
 mod teleop;
@@ -202,7 +203,7 @@ impl Fleet {
     }
 
     /// Opens the router and starts the tasks of the network: listening to robots, the heartbeat of
-    /// the server, and the watch of the router. Only the first call has an effect.
+    /// the server, and the watch of the routers. Only the first call has an effect.
     ///
     /// # Errors
     /// [`FleetError::Open`] if zenoh refuses.
@@ -220,7 +221,7 @@ impl Fleet {
             channels: inbox::Channels::new(&self.supervisor, app, uploads, links.clone()),
             turn: Mutex::new(()),
         });
-        pool.open().await?;
+        pool.open(app.enrolment_registry().robots()).await?;
         let stop = || self.supervisor.stop_token();
         let pulse = pulse::run(app.clone(), Arc::clone(&self.routers), stop());
         self.supervisor.spawn_vital("pulse", pulse);

@@ -1,8 +1,9 @@
-//! Watches the router: a client queries it, as a robot would, and if several queries fail the
-//! router is closed and opened again.
+//! Watches the routers that robots connect to: a client queries each, as a robot would, and if several
+//! queries fail the router is closed and opened again.
 //!
 //! A router may stop accepting connections without any error, which only a client can detect.
 
+use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -33,40 +34,46 @@ pub(super) struct Watch {
     pub(super) stop: CancellationToken,
 }
 
-/// Probes the router of new connections until the stop.
+/// Probes the routers that robots connect to, until the stop.
 pub(super) async fn watch(watch: Watch) {
-    let mut failures = 0;
-    let mut seen = None;
+    // Numbers of consecutive failures, by the number of the router; `None` without any router.
+    let mut failures: HashMap<Option<u64>, u32> = HashMap::new();
     loop {
         tokio::select! {
             biased;
             () = watch.stop.cancelled() => return,
             () = tokio::time::sleep(watch.period) => {}
         }
-        let newest = watch.pool.routers.newest();
-        let number = newest.as_ref().map(|router| router.number);
-        if number != seen {
-            (seen, failures) = (number, 0);
+        let current = watch.pool.current();
+        let numbers: Vec<u64> = current.iter().map(|router| router.number).collect();
+        failures.retain(|of, _| of.map_or(numbers.is_empty(), |number| numbers.contains(&number)));
+        let mut silent = Vec::new();
+        if current.is_empty() {
+            silent.push(None);
         }
-        if looked_at(&watch, newest.as_ref()).await {
-            failures = 0;
-            continue;
+        for router in current {
+            if answers(&watch, &router).await {
+                failures.remove(&Some(router.number));
+            } else {
+                silent.push(Some(router));
+            }
         }
-        failures += 1;
-        let counters = watch.pool.app.counters();
-        counters.router_probes_failed.one();
-        warn!("the zenoh router did not answer, {failures} of {FAILURES_MAX} times");
-        if failures >= FAILURES_MAX && !watch.stop.is_cancelled() {
-            failures = 0;
-            reopen(&watch.pool, newest.as_ref()).await;
+        for router in silent {
+            let number = router.as_ref().map(|router| router.number);
+            let failures = failures.entry(number).or_default();
+            *failures += 1;
+            watch.pool.app.counters().router_probes_failed.one();
+            warn!("the zenoh router did not answer, {failures} of {FAILURES_MAX} times");
+            if *failures >= FAILURES_MAX && !watch.stop.is_cancelled() {
+                *failures = 0;
+                reopen(&watch.pool, router.as_ref()).await;
+            }
         }
     }
 }
 
-async fn looked_at(watch: &Watch, router: Option<&Arc<Router>>) -> bool {
-    let Some(router) = router.map(Arc::clone) else {
-        return false;
-    };
+async fn answers(watch: &Watch, router: &Arc<Router>) -> bool {
+    let router = Arc::clone(router);
     let credentials = router.credentials.as_ref();
     let credentials = credentials.map(|derivation| derivation.of_probe());
     let looking = watch
@@ -91,7 +98,9 @@ async fn reopen(pool: &RouterPool, former: Option<&Arc<Router>>) {
             return;
         }
     }
-    match pool.open().await {
+    let robots = former.map(|former| former.robots.iter().cloned().collect());
+    let robots = robots.unwrap_or_else(|| pool.app.enrolment_registry().robots());
+    match pool.open(robots).await {
         Ok(()) => {
             pool.app.counters().router_reopened.one();
             warn!("the zenoh router was opened again");
@@ -165,7 +174,7 @@ mod tests {
                 channels: Channels::new(&supervisor, &app, uploads, None),
                 turn: Mutex::new(()),
             };
-            pool.open().await.unwrap();
+            pool.open(Vec::new()).await.unwrap();
             let router = pool.routers.newest().unwrap();
             let credentials = router.credentials.as_ref().map(|it| it.of_probe());
             let config = client_config(router.address, credentials.as_ref(), 5_000).unwrap();

@@ -1,12 +1,12 @@
-//! Keeps a router open whose rules include every robot of the fleet, and closes unused ones.
+//! Keeps routers open whose rules together include every robot of the fleet, and closes unused ones.
 //!
 //! ```text
-//!  a robot joins, or another authority signs
-//!                ─► a new router beside the others ─► robots come to it as they reconnect
-//!                                                      (each at the latest when it renews)
+//!  robots join, or another authority signs
+//!                ─► a new router beside the others (`router_groups`) ─► robots come to it as they
+//!                                           reconnect (each at the latest when it renews)
 //!  an authority is retired ─► routers whose passwords derive from its key are closed
-//!  an older router without robots ─► closed
-//!  too many routers ─► the older one with the fewest robots is closed; they reconnect at once
+//!  a superseded router without robots ─► closed
+//!  too many superseded ones ─► the one with the fewest robots is closed; they reconnect at once
 //! ```
 
 use std::sync::Arc;
@@ -18,13 +18,14 @@ use tracing::{error, info};
 
 use super::inbox::Channels;
 use super::opening::{self, Opener};
+use super::router_groups::{Group, superseded, to_open};
 use super::routers::{Router, Routers};
 use crate::app::App;
 use crate::app::presence::RobotKey;
 use crate::authority::Trusted;
 
-/// Maximum number of routers.
-const ROUTERS_MAX: usize = 4;
+/// Maximum number of superseded routers that still have robots.
+const SUPERSEDED_MAX: usize = 4;
 /// Interval of checks for unused routers.
 const LOOK_EVERY: Duration = Duration::from_secs(5);
 
@@ -40,12 +41,11 @@ pub(super) struct RouterPool {
 }
 
 impl RouterPool {
-    /// Opens a router for all robots of the fleet, beside those that are open.
+    /// Opens a router for these robots, beside those that are open.
     ///
     /// # Errors
     /// [`super::FleetError`].
-    pub(super) async fn open(&self) -> Result<(), super::FleetError> {
-        let robots = self.app.enrolment_registry().robots();
+    pub(super) async fn open(&self, robots: Vec<RobotKey>) -> Result<(), super::FleetError> {
         let router = self.opener.open(robots).await?;
         if let Err(failed) = self.opener.declare(&router, &self.channels).await {
             opening::close(router.session.clone()).await;
@@ -87,24 +87,37 @@ impl RouterPool {
         }
     }
 
-    async fn let_everybody_in(&self) {
-        let newest = self.routers.newest();
-        let knows = |robot: &RobotKey| {
-            let newest = newest.as_ref();
-            newest.is_some_and(|newest| newest.robots.contains(robot))
-        };
+    /// Returns the open routers as groups of robots, oldest first.
+    fn groups<'all>(&self, all: &'all [Arc<Router>]) -> Vec<Group<'all>> {
         let trusted = self.opener.authorities.as_ref().map(|it| it.present());
-        let is_of_signing = newest.as_ref().is_some_and(|newest| {
-            let signing = trusted.as_ref().map(|it| it.signing().fingerprint());
-            newest.authority() == signing
-        });
-        if is_of_signing && self.app.enrolment_registry().robots().iter().all(knows) {
+        let signing = trusted.as_ref().map(|it| it.signing().fingerprint());
+        let group = |router: &'all Arc<Router>| Group {
+            robots: &router.robots,
+            is_of_signing: router.authority() == signing,
+        };
+        all.iter().map(group).collect()
+    }
+
+    /// Returns the routers that robots connect to: those that are not superseded.
+    pub(super) fn current(&self) -> Vec<Arc<Router>> {
+        let all = self.routers.all();
+        let is_superseded = superseded(&self.groups(&all));
+        let with = all.iter().zip(is_superseded);
+        with.filter_map(|(router, is_superseded)| (!is_superseded).then(|| Arc::clone(router)))
+            .collect()
+    }
+
+    async fn let_everybody_in(&self) {
+        let all = self.routers.all();
+        let fleet = self.app.enrolment_registry().robots();
+        let Some(robots) = to_open(&self.groups(&all), &fleet) else {
             return;
-        }
-        match self.open().await {
+        };
+        let count = robots.len();
+        match self.open(robots.into_iter().collect()).await {
             Ok(()) => {
                 self.app.counters().routers_opened.one();
-                info!("another zenoh router was opened");
+                info!("another zenoh router was opened, for {count} robots");
             }
             // The next check tries again.
             Err(failed) => error!("cannot open another router: {failed}"),
@@ -113,23 +126,23 @@ impl RouterPool {
 
     async fn close_idle(&self) {
         let all = self.routers.all();
-        let Some((_newest, older)) = all.split_last() else {
-            return;
-        };
-        let mut left = all.len();
+        let is_superseded = superseded(&self.groups(&all));
         let mut counted = Vec::new();
-        for router in older {
-            let counts = !self.is_of_retired(router);
-            counted.push((counts, robots_on(router).await, router.number));
+        for (router, is_superseded) in all.iter().zip(is_superseded) {
+            if is_superseded {
+                let counts = !self.is_of_retired(router);
+                counted.push((counts, robots_on(router).await, router.number));
+            }
         }
+        let mut left = counted.len();
         counted.sort_unstable();
         for (counts, robot_count, number) in counted {
-            if counts && robot_count > 0 && left <= ROUTERS_MAX {
+            if counts && robot_count > 0 && left <= SUPERSEDED_MAX {
                 break;
             }
             self.close(number).await;
             left -= 1;
-            info!("an older zenoh router with {robot_count} robots was closed");
+            info!("a superseded zenoh router with {robot_count} robots was closed");
         }
     }
 }

@@ -1,9 +1,9 @@
 //! The open routers.
 //!
 //! The access control of a zenoh router is fixed when it opens, so a router cannot accept a robot
-//! that joins later. Another router is then opened beside it, whose rules include the new robot.
-//! Later connections go to the newest router; existing ones stay undisturbed. The server receives
-//! from and sends to all of them.
+//! that joins later. Another router is then opened beside it, whose rules include the new robot
+//! ([`super::router_groups`]). A robot connects to the newest router that knows it; existing
+//! connections stay undisturbed. The server receives from and sends to all of them.
 
 use std::collections::HashSet;
 use std::net::SocketAddr;
@@ -74,6 +74,13 @@ impl Routers {
     /// Returns all routers, newest last.
     pub(super) fn all(&self) -> Vec<Arc<Router>> {
         self.lock().clone()
+    }
+
+    /// Returns the newest router whose rules include a robot.
+    pub(super) fn of(&self, robot: &RobotKey) -> Option<Arc<Router>> {
+        let open = self.lock();
+        let knows = |router: &&Arc<Router>| router.robots.contains(robot);
+        open.iter().rev().find(knows).cloned()
     }
 
     /// Returns the newest router.

@@ -300,8 +300,7 @@ impl Link {
         let mut changes = self.routers.changes();
         loop {
             changes.mark_unchanged();
-            let newest = self.routers.newest();
-            if let Some(router) = newest.filter(|router| router.robots.contains(robot))
+            if let Some(router) = self.routers.of(robot)
                 && let Some(derivation) = &router.credentials
             {
                 let credentials = derivation.of_robot(robot);
