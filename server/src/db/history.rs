@@ -8,6 +8,54 @@ use tread_api::mission::{Actor, MissionEvent, MissionState};
 use super::missions::{cause, state};
 use super::{DbError, corrupt, from_us, parse, to_us, unsigned};
 
+/// Adds the first event of a new mission, and a second one that happened at once.
+pub async fn begin(
+    db: &mut SqliteConnection,
+    id: MissionId,
+    first: &MissionEvent,
+    second: Option<&MissionEvent>,
+) -> Result<(), DbError> {
+    let id = id.to_string();
+    let texts = |event: &MissionEvent| {
+        let from = event.from.map(MissionState::as_str);
+        (
+            event.actor.as_str(),
+            from,
+            event.to.as_str(),
+            event.cause.as_str(),
+        )
+    };
+    let (at_us, (actor, from, to, cause)) = (to_us(first.at), texts(first));
+    let then_at_us = second.map(|event| to_us(event.at).max(at_us));
+    let (then_actor, then_from, then_to, then_cause) = second
+        .map(texts)
+        .map_or((None, None, None, None), |(actor, from, to, cause)| {
+            (Some(actor), from, Some(to), Some(cause))
+        });
+    let then_reason = second.and_then(|event| event.reason.as_deref());
+    sqlx::query!(
+        "INSERT INTO mission_events (mission, at_us, actor, from_state, to_state, cause, reason)
+         SELECT ?1, ?2, ?3, ?4, ?5, ?6, ?7
+         UNION ALL SELECT ?1, ?8, ?9, ?10, ?11, ?12, ?13 WHERE ?8 IS NOT NULL",
+        id,
+        at_us,
+        actor,
+        from,
+        to,
+        cause,
+        first.reason,
+        then_at_us,
+        then_actor,
+        then_from,
+        then_to,
+        then_cause,
+        then_reason,
+    )
+    .execute(db)
+    .await?;
+    Ok(())
+}
+
 /// Adds an event to a mission's history, with a time not before the preceding event's.
 pub async fn add_event(
     db: &mut SqliteConnection,

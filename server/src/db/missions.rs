@@ -128,24 +128,42 @@ macro_rules! missions {
     };
 }
 
-/// Adds a mission.
-pub async fn insert(db: &mut SqliteConnection, row: &MissionRow) -> Result<(), DbError> {
+/// State in which a mission is inserted.
+#[derive(Debug, Clone, Copy)]
+pub struct Inserted<'reason> {
+    /// The state.
+    pub state: MissionState,
+    /// Why it is in this state.
+    pub cause: Cause,
+    /// The same for people.
+    pub reason: Option<&'reason str>,
+}
+
+/// Adds a mission in a state that counts instead of its own.
+pub async fn insert(
+    db: &mut SqliteConnection,
+    row: &MissionRow,
+    inserted: Inserted<'_>,
+) -> Result<(), DbError> {
     let mission = &row.mission;
-    let (id, state) = (mission.id.to_string(), mission.state.as_str());
+    let (id, state) = (mission.id.to_string(), inserted.state.as_str());
     let (revision, plan_hash) = (i64::from(mission.revision), mission.plan_hash.to_string());
     let trajectory = to_json("trajectory", &mission.trajectory)?;
     let latest_start_us = mission.latest_start.map(to_us);
     let created_at_us = to_us(mission.created_at);
-    let cause = mission.cause.as_str();
+    let cause = inserted.cause.as_str();
     let link_policy = to_json("link policy", &mission.link_policy)?;
     sqlx::query!(
-        "INSERT INTO missions (id, robot_pk, state, cause, revision, plan_hash, trajectory,
-             latest_start_us, priority, link_policy, lost_after_s, created_at_us)
-         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        "INSERT INTO missions (id, robot_pk, state, cause, reason, pause_wanted, revision,
+             plan_hash, trajectory, latest_start_us, priority, link_policy, lost_after_s,
+             created_at_us)
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         id,
         row.robot_pk,
         state,
         cause,
+        inserted.reason,
+        mission.pause_wanted,
         revision,
         plan_hash,
         trajectory,
@@ -222,18 +240,6 @@ pub async fn list(
         rows.push(MissionRow::try_from(raw)?);
     }
     Ok((rows, false))
-}
-
-/// Returns the number of a robot's queued missions.
-pub async fn queued_count(db: &mut SqliteConnection, robot_pk: i64) -> Result<usize, DbError> {
-    let count = sqlx::query_scalar!(
-        r#"SELECT COUNT(*) AS "count!: i64" FROM missions
-           WHERE robot_pk = ? AND state = 'queued'"#,
-        robot_pk,
-    )
-    .fetch_one(db)
-    .await?;
-    unsigned("count", count)
 }
 
 /// Changes a mission's state; `false` if it is no longer in the expected state.

@@ -23,7 +23,7 @@ const COMMAND_TIMEOUT: Duration = Duration::from_millis(800);
 /// Additional time of the query beyond that, after which it counts as not delivered.
 const MARGIN: Duration = Duration::from_millis(200);
 
-/// Sends commands as queries through all routers of this server.
+/// Sends commands as queries through the routers of this server.
 #[derive(Debug)]
 pub(super) struct ZenohCommands {
     pub(super) routers: Arc<Routers>,
@@ -43,7 +43,7 @@ impl CommandTransport for ZenohCommands {
             key = keys::to_run(&key, boot);
         }
         // A robot is connected to one of them; on the others the query gets no reply.
-        let routers = self.routers.all();
+        let routers = self.routers.reaching(&(site.clone(), robot.clone()));
         let sessions = routers.iter().map(|router| router.session.clone());
         let sessions: Vec<Session> = sessions.collect();
         let supervisor = self.supervisor.clone();

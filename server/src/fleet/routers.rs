@@ -83,6 +83,14 @@ impl Routers {
         open.iter().rev().find(knows).cloned()
     }
 
+    /// Returns the routers that a robot may be connected to; without a gate all, newest last.
+    pub(super) fn reaching(&self, robot: &RobotKey) -> Vec<Arc<Router>> {
+        let open = self.lock();
+        let may_have =
+            |router: &&Arc<Router>| router.credentials.is_none() || router.robots.contains(robot);
+        open.iter().filter(may_have).cloned().collect()
+    }
+
     /// Returns the newest router.
     pub(super) fn newest(&self) -> Option<Arc<Router>> {
         self.lock().last().cloned()

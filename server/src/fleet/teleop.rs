@@ -16,7 +16,7 @@ use crate::app::presence::RobotKey;
 use crate::app::robot_link::{DrivePublisher, DriveTransport, Opening};
 use crate::supervisor::Supervisor;
 
-/// Opens publishers of drive commands on all routers of this server.
+/// Opens publishers of drive commands on the routers of this server.
 #[derive(Debug)]
 pub(super) struct ZenohDrive {
     pub(super) routers: Arc<Routers>,
@@ -27,11 +27,11 @@ pub(super) struct ZenohDrive {
 #[derive(Debug)]
 struct RobotPublisher {
     routers: Arc<Routers>,
-    key: String,
+    robot: RobotKey,
     declared: Mutex<Declared>,
 }
 
-/// One publisher on each router of one version of their list.
+/// One publisher on each router that the robot may be connected to, of one version of their list.
 #[derive(Debug)]
 struct Declared {
     version: u64,
@@ -40,18 +40,19 @@ struct Declared {
 
 impl Declared {
     /// Declares the publishers. Blocks its thread, for a moment.
-    fn on(routers: &Routers, key: &str) -> zenoh::Result<Self> {
+    fn on(routers: &Routers, robot: &RobotKey) -> zenoh::Result<Self> {
         let version = routers.version();
+        let key = keys::teleop(&robot.0, &robot.1);
         let declare = |session: &zenoh::Session| {
             session
-                .declare_publisher(key.to_owned())
+                .declare_publisher(key.clone())
                 .congestion_control(CongestionControl::Drop)
                 .priority(Priority::RealTime)
                 .express(true)
                 .wait()
         };
-        let all = routers.all();
-        let publishers = all.iter().map(|router| declare(&router.session));
+        let reaching = routers.reaching(robot);
+        let publishers = reaching.iter().map(|router| declare(&router.session));
         let publishers = publishers.collect::<zenoh::Result<Vec<_>>>()?;
         Ok(Self {
             version,
@@ -61,13 +62,13 @@ impl Declared {
 }
 
 impl DriveTransport for ZenohDrive {
-    fn open(&self, (site, robot): &RobotKey) -> Opening {
-        let (key, robot) = (keys::teleop(site, robot), robot.clone());
+    fn open(&self, robot: &RobotKey) -> Opening {
+        let robot = robot.clone();
         let (routers, supervisor) = (Arc::clone(&self.routers), self.supervisor.clone());
         Box::pin(async move {
             // While a router is being opened again there is no network.
             routers.newest()?;
-            let (on, of) = (Arc::clone(&routers), key.clone());
+            let (on, of) = (Arc::clone(&routers), robot.clone());
             // Declaring blocks its thread.
             let declared = supervisor.blocking(move || Declared::on(&on, &of));
             match declared.await? {
@@ -75,13 +76,13 @@ impl DriveTransport for ZenohDrive {
                     let declared = Mutex::new(declared);
                     let publisher = RobotPublisher {
                         routers,
-                        key,
+                        robot,
                         declared,
                     };
                     Some(Box::new(publisher) as Box<dyn DrivePublisher>)
                 }
                 Err(error) => {
-                    warn!("cannot publish drive commands to `{robot}`: {error}");
+                    warn!("cannot publish drive commands to `{}`: {error}", robot.1);
                     None
                 }
             }
@@ -97,7 +98,7 @@ impl DrivePublisher for RobotPublisher {
         };
         let mut declared = self.declared.lock().unwrap_or_else(PoisonError::into_inner);
         if declared.version != self.routers.version() {
-            match Declared::on(&self.routers, &self.key) {
+            match Declared::on(&self.routers, &self.robot) {
                 Ok(present) => *declared = present,
                 Err(error) => debug!("cannot declare drive commands on a new router: {error}"),
             }

@@ -7,16 +7,13 @@
 use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use tread_api::mission::Actor;
 use tread_api::robot::LinkState;
 use tread_api::trajectory::Trajectory;
 use tread_api::wire::command::PathPrior;
 
-use super::transitions::Change;
-use super::{Step, take_step};
 use crate::app::presence::RobotKey;
 use crate::app::{App, AppError};
-use crate::db::missions::{Facts, MissionRow};
+use crate::db::missions::MissionRow;
 use crate::db::{self, Tx};
 
 /// Maximum number of missions in [`JustOffered`]; the reconciler reads the others from the database.
@@ -75,10 +72,10 @@ impl App {
         prior.ok().map(EarlyPrior)
     }
 
-    /// Sets a new mission to `offered` if the reconciler would do so at once: its robot is heard, has no
-    /// other open mission, is not stopped or teleoperated, and not restrained since a restoration.
-    /// Returns whether it did.
-    pub(super) async fn offer_immediately(
+    /// Returns whether the reconciler would offer a new mission at once, as the only open one of its
+    /// robot: the robot is heard, is not stopped or teleoperated, and not restrained since a
+    /// restoration.
+    pub(super) async fn may_offer_at_once(
         &self,
         tx: &mut Tx,
         row: &MissionRow,
@@ -89,21 +86,11 @@ impl App {
         if mission.pause_wanted || link == LinkState::Offline {
             return Ok(false);
         }
-        let open = db::missions::open_of_robot(tx, row.robot_pk).await?;
-        if open.iter().any(|other| other.id != mission.id) {
-            return Ok(false);
+        // Robots of a database that was never restored are not restrained.
+        if self.restoration().is_none() {
+            return Ok(true);
         }
         let restrained = db::restorations::restrained(tx).await?;
-        if restrained.iter().any(|robot| robot.pk == row.robot_pk) {
-            return Ok(false);
-        }
-        let step = Step {
-            change: Change::Offer,
-            actor: Actor::Server,
-            reason: None,
-            at: self.clock().now(),
-            facts: Facts::default(),
-        };
-        Ok(take_step(tx, &mission.into(), step).await?.is_some())
+        Ok(restrained.iter().all(|robot| robot.pk != row.robot_pk))
     }
 }

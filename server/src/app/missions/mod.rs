@@ -24,7 +24,7 @@ use self::transitions::{Change, next};
 use super::check::StartPlace;
 use super::{App, AppError, check_named, site_row};
 pub use crate::db::missions::MissionFilter;
-use crate::db::missions::{Facts, MissionRow, Standing};
+use crate::db::missions::{Facts, Inserted, MissionRow, Standing};
 use crate::db::{self, DbError, Tx};
 
 /// Number of bytes of trajectories after which a page of missions ends, whatever its limit.
@@ -113,25 +113,25 @@ impl App {
                 detail,
             });
         }
-        match start_policy {
-            StartPolicy::Append => {}
-            StartPolicy::Refuse => {
-                let open = db::missions::open_of_robot(tx, robot_row.pk).await?;
-                if let Some(other) = open.first() {
-                    return Err(AppError::RobotBusy {
-                        robot,
-                        mission: other.id,
-                        state: other.state,
-                    });
-                }
+        let mut open = db::missions::open_of_robot(tx, robot_row.pk).await?;
+        match (start_policy, open.first()) {
+            (StartPolicy::Append, _) | (_, None) => {}
+            (StartPolicy::Refuse, Some(other)) => {
+                return Err(AppError::RobotBusy {
+                    robot,
+                    mission: other.id,
+                    state: other.state,
+                });
             }
-            StartPolicy::Replace => {
+            (StartPolicy::Replace, Some(_)) => {
                 let reason = format!("mission `{id}` was asked for in its place");
                 let why = (Change::Supersede, Actor::Client, reason.as_str());
-                end_all(tx, robot_row.pk, why, created_at).await?;
+                end_each(tx, &open, why, created_at).await?;
+                open = db::missions::open_of_robot(tx, robot_row.pk).await?;
             }
         }
-        if db::missions::queued_count(tx, robot_row.pk).await? >= QUEUE_MAX {
+        let is_queued = |other: &&Standing| other.state == MissionState::Queued;
+        if open.iter().filter(is_queued).count() >= QUEUE_MAX {
             return Err(AppError::TooMany {
                 what: "missions that wait for it",
                 count: QUEUE_MAX,
@@ -164,22 +164,10 @@ impl App {
             robot_pk: robot_row.pk,
             mission,
         };
-        db::missions::insert(tx, &row).await?;
-        if self.is_operator_controlled(tx, &row.mission).await? {
-            // It would start by itself once the robot is free again.
-            db::missions::want_pause(tx, id, true).await?;
-            row.mission.pause_wanted = true;
-        }
-        let event = MissionEvent {
-            at: created_at,
-            actor: Actor::Client,
-            from: None,
-            to: MissionState::Queued,
-            cause: Cause::Requested,
-            reason: None,
-        };
-        db::history::add_event(tx, id, &event).await?;
-        let is_offered = self.offer_immediately(tx, &row).await?;
+        // It would start by itself once the robot is free again.
+        row.mission.pause_wanted = self.is_operator_controlled(tx, &row.mission).await?;
+        let is_offered = open.is_empty() && self.may_offer_at_once(tx, &row).await?;
+        insert(tx, &row, is_offered).await?;
         Ok(Enqueued { row, is_offered })
     }
 
@@ -287,6 +275,50 @@ fn check_figures(request: &CreateMission) -> Result<(), AppError> {
     }
 }
 
+/// Inserts a mission with its history: as it is, or offered at once.
+async fn insert(tx: &mut Tx, row: &MissionRow, is_offered: bool) -> Result<(), DbError> {
+    let mission = &row.mission;
+    let created = MissionEvent {
+        at: mission.created_at,
+        actor: Actor::Client,
+        from: None,
+        to: mission.state,
+        cause: mission.cause,
+        reason: None,
+    };
+    let offered = next(mission.state, Change::Offer).filter(|_| is_offered);
+    let offered = offered.map(|to| MissionEvent {
+        actor: Actor::Server,
+        from: Some(mission.state),
+        to,
+        cause: Change::Offer.cause(),
+        reason: Some(bounded(Change::Offer.reason())),
+        ..created
+    });
+    let newest = offered.as_ref().unwrap_or(&created);
+    let inserted = Inserted {
+        state: newest.to,
+        cause: newest.cause,
+        reason: newest.reason.as_deref(),
+    };
+    db::missions::insert(tx, row, inserted).await?;
+    db::history::begin(tx, mission.id, &created, offered.as_ref()).await?;
+    if let Some(offered) = &offered {
+        log_step(&mission.into(), offered.to);
+    }
+    Ok(())
+}
+
+fn log_step(standing: &Standing, to: MissionState) {
+    let Standing {
+        id, robot, state, ..
+    } = standing;
+    tracing::info!(
+        mission.id = %id, robot.id = %robot,
+        "mission `{id}` of robot `{robot}` went from {} to {}", state.as_str(), to.as_str(),
+    );
+}
+
 /// Requests the end of all open missions of a robot.
 pub(super) async fn end_all(
     tx: &mut Tx,
@@ -294,7 +326,18 @@ pub(super) async fn end_all(
     (change, actor, reason): (Change, Actor, &str),
     at: Timestamp,
 ) -> Result<(), DbError> {
-    for open in db::missions::open_of_robot(tx, robot_pk).await? {
+    let open = db::missions::open_of_robot(tx, robot_pk).await?;
+    end_each(tx, &open, (change, actor, reason), at).await
+}
+
+/// Requests the end of these open missions.
+async fn end_each(
+    tx: &mut Tx,
+    open: &[Standing],
+    (change, actor, reason): (Change, Actor, &str),
+    at: Timestamp,
+) -> Result<(), DbError> {
+    for open in open {
         let step = Step {
             change,
             actor,
@@ -302,7 +345,7 @@ pub(super) async fn end_all(
             at,
             facts: Facts::default(),
         };
-        take_step(tx, &open, step).await?;
+        take_step(tx, open, step).await?;
     }
     Ok(())
 }
@@ -381,11 +424,7 @@ pub(super) async fn take_step(
         reason,
     };
     db::history::add_event(tx, id, &event).await?;
-    tracing::info!(
-        mission.id = %id, robot.id = %standing.robot,
-        "mission `{id}` of robot `{}` went from {} to {}",
-        standing.robot, from.as_str(), to.as_str(),
-    );
+    log_step(standing, to);
     Ok(Some(to))
 }
 
