@@ -5,7 +5,8 @@ use crate::ids::AlertCode;
 
 /// Codes that servers and agents of this version raise, in alphabetical order. Those about the
 /// messages of a robot's base are named by [`BASE_PREFIX`] alone, but for the ones listed here.
-pub const ALERT_KINDS: [&str; 41] = [
+pub const ALERT_KINDS: [&str; 42] = [
+    "archive-failed",
     "backup-failed",
     "backup-old",
     "base-clock",

@@ -213,7 +213,7 @@ pub struct AuditConfig {
 }
 
 /// `[retention]`: retention of raw measurements. Their statistics stay on the map for ever.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RetentionConfig {
     /// Days after which a raw measurement is deleted, within [`SEGMENTS_DAYS_RANGE`].
@@ -221,6 +221,9 @@ pub struct RetentionConfig {
     /// Maximum number of raw measurements, within [`SEGMENTS_MAX_RANGE`]; beyond it the oldest are
     /// deleted.
     pub segments_max: i64,
+    /// Folder of Parquet files to which raw measurements are written before they are deleted; without
+    /// it they are only deleted.
+    pub archive: Option<PathBuf>,
 }
 
 /// Range of the retention time of raw measurements, in days.
@@ -233,13 +236,14 @@ impl Default for RetentionConfig {
         Self {
             segments_days: 90,
             segments_max: 20_000_000,
+            archive: None,
         }
     }
 }
 
 impl RetentionConfig {
     #[expect(clippy::cast_precision_loss, reason = "for a message")]
-    fn check(self) -> Result<(), ConfigError> {
+    fn check(&self) -> Result<(), ConfigError> {
         if !SEGMENTS_DAYS_RANGE.contains(&self.segments_days) {
             return Err(ConfigError::OutOfRange {
                 key: "retention.segments_days",

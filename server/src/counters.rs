@@ -39,6 +39,10 @@ counters! {
     segments_deferred,
     /// Raw segments deleted by the retention; their statistics stay on the map.
     segments_removed,
+    /// Raw segments written to the archive.
+    segments_archived,
+    /// Failures of the archive of raw segments, to write or to read.
+    archive_failures,
     /// Mission reports stored.
     mission_reports_committed,
     /// Uploaded batches that were answered with a receipt.

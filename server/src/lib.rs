@@ -8,6 +8,7 @@
 //!   program, which runs until a signal.
 
 pub mod app;
+pub mod archive;
 pub mod authority;
 pub mod backup;
 pub mod build;
@@ -151,6 +152,7 @@ impl Server {
             webhooks: config.webhooks,
             people,
             audit: config.audit,
+            archive: config.retention.archive.clone(),
             telemetry: Telemetry::start(&config.tracing, "tread-server")?,
         });
         let remembered = remember(&app, &config.site).await;

@@ -58,8 +58,9 @@ const SHIPPED: [&str; 7] = [
 ];
 
 /// Modules of the server that a module must not name.
-const SERVER_RULES: [(&str, &[&str]); 18] = [
+const SERVER_RULES: [(&str, &[&str]); 19] = [
     ("app", &["http", "fleet"]),
+    ("archive", &["app", "db", "fleet", "http"]),
     ("authority", &["app", "db", "fleet", "http"]),
     ("clock", &["app", "db", "fleet", "http"]),
     ("config", &["app", "db", "fleet", "http"]),

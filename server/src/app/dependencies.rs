@@ -1,5 +1,7 @@
 //! What the use cases are created from.
 
+use std::path::PathBuf;
+
 use tread_telemetry::Telemetry;
 
 use super::App;
@@ -36,6 +38,8 @@ pub struct Dependencies {
     pub people: Option<People>,
     /// Where the audit log is written beside the database.
     pub audit: AuditConfig,
+    /// Folder of the archive of raw measurements; without it old ones are only removed.
+    pub archive: Option<PathBuf>,
     /// Sender of traces of missions; its default sends none.
     pub telemetry: Telemetry,
 }
@@ -55,6 +59,7 @@ impl Dependencies {
             webhooks: WebhooksConfig::default(),
             people: None,
             audit: AuditConfig::default(),
+            archive: None,
             telemetry: Telemetry::default(),
         }
     }

@@ -8,6 +8,7 @@ use tread_api::ids::{
 use tread_api::mission::MissionState;
 use tread_api::trajectory::Place;
 
+use crate::archive::SegmentArchiveError;
 use crate::authority::{AuthorityError, RotationRefused};
 use crate::db::DbError;
 
@@ -229,6 +230,9 @@ pub enum AppError {
     /// The answer cannot be encoded in the requested format.
     #[error("the answer cannot be written: {0}")]
     Unwritable(String),
+    /// Archived measurements cannot be read or written.
+    #[error("the archive of measurements failed: {0}")]
+    Archive(#[source] SegmentArchiveError),
     /// The database failed.
     #[error("the database failed")]
     Storage(#[from] DbError),
@@ -304,6 +308,7 @@ impl AppError {
             | Self::KeyReused
             | Self::TooMany { .. }
             | Self::Unwritable(_)
+            | Self::Archive(_)
             | Self::Storage(_) => None,
         }
     }

@@ -99,6 +99,7 @@ impl App {
         self.register_clock(&mut registry);
         self.register_build(&mut registry);
         self.register_backups(&mut registry);
+        self.register_archive(&mut registry);
         let uptime = ConstGauge::new(self.uptime().as_secs_f64());
         let help = "Time since the start";
         registry.register_with_unit("tread_uptime", help, Unit::Seconds, uptime);
@@ -231,6 +232,15 @@ impl App {
         let failed = ConstGauge::new(u64::from(state.failure.is_some()));
         let help = "Whether the last attempt to make a backup failed";
         registry.register("tread_backup_failed", help, failed);
+    }
+
+    /// Registers the state of the archive; nothing without one.
+    fn register_archive(&self, registry: &mut Registry) {
+        if let Some(is_failed) = self.is_archive_failed() {
+            let failed = ConstGauge::new(u64::from(is_failed));
+            let help = "Whether the last attempt to archive old measurements failed";
+            registry.register("tread_archive_failed", help, failed);
+        }
     }
 
     /// Registers the steps of the machine's clock.

@@ -2,6 +2,7 @@
 
 pub mod alerts;
 mod allowance;
+pub mod archive;
 pub mod backups;
 pub mod certificate;
 pub mod check;
@@ -51,6 +52,7 @@ use tread_telemetry::Telemetry;
 use uuid::Uuid;
 
 use self::allowance::Allowances;
+use self::archive::Archive;
 use self::backups::Backups;
 pub use self::dependencies::Dependencies;
 use self::enrolment::Membership;
@@ -131,6 +133,7 @@ struct Inner {
     webhooks: Webhooks,
     telemetry: Telemetry,
     backups: Backups,
+    archive: Option<Archive>,
     restored: Restored,
 }
 
@@ -148,6 +151,7 @@ impl App {
             webhooks,
             people,
             audit,
+            archive,
             telemetry,
         } = dependencies;
         let started_at = clock.elapsed();
@@ -159,6 +163,7 @@ impl App {
             Arc::clone(&counters),
         );
         let hub = Hub::new(clock.now());
+        let archive = archive.map(|folder| Archive::new(folder, db.path()));
         let run_id = clock.new_id::<Uuid>();
         let inner = Inner {
             db,
@@ -198,6 +203,7 @@ impl App {
             webhooks: Webhooks::new(webhooks),
             telemetry,
             backups: Backups::default(),
+            archive,
             restored: Restored::default(),
         };
         Self {
@@ -338,14 +344,6 @@ impl App {
 
     fn unrecorded(&self) -> &Unrecorded {
         &self.inner.unrecorded
-    }
-
-    fn restored(&self) -> &Restored {
-        &self.inner.restored
-    }
-
-    fn backups(&self) -> &Backups {
-        &self.inner.backups
     }
 
     fn webhooks(&self) -> &Webhooks {

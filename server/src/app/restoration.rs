@@ -23,6 +23,10 @@ pub(super) struct Restored {
 }
 
 impl App {
+    fn restored(&self) -> &Restored {
+        &self.inner.restored
+    }
+
     /// Loads the newest restoration from the database.
     ///
     /// # Errors

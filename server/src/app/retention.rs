@@ -3,7 +3,8 @@
 //!
 //! The oldest are removed first, a few at a time. Each transaction removes some and records their
 //! names (`boot`, `seq`), so that one that is sent again after years is still recognised. None is
-//! removed before its sum is stored. If this is interrupted, the map stays the same.
+//! removed before its sum is stored. If this is interrupted, the map stays the same. With an archive
+//! ([`super::archive`]) none is removed before it is in there either.
 
 use std::collections::HashSet;
 use std::sync::{Mutex, PoisonError};
@@ -12,8 +13,10 @@ use std::time::Duration;
 use jiff::SignedDuration;
 use tokio_util::sync::CancellationToken;
 
+use super::archive::FILE_ROWS_MAX;
 use super::map::MapChange;
 use super::{App, AppError};
+use crate::archive::KeyRange;
 use crate::config::RetentionConfig;
 use crate::db;
 use crate::friction::epochs::DAY_H;
@@ -44,7 +47,8 @@ impl Removed {
 /// Removes measurements periodically until the stop.
 pub async fn run(app: App, config: RetentionConfig, stop: CancellationToken) {
     loop {
-        if let Err(cause) = remove_all(&app, &config, &stop).await {
+        let removing = app.archive_and_remove(&config, FILE_ROWS_MAX, &stop);
+        if let Err(cause) = removing.await {
             tracing::error!("cannot remove old measurements: {cause:?}");
         }
         tokio::select! {
@@ -54,48 +58,97 @@ pub async fn run(app: App, config: RetentionConfig, stop: CancellationToken) {
     }
 }
 
-async fn remove_all(
-    app: &App,
-    config: &RetentionConfig,
-    stop: &CancellationToken,
-) -> Result<(), AppError> {
-    let mut removed = 0;
-    while !stop.is_cancelled() {
-        let some = db::limited(app.remove_some(config, REMOVED_MAX)).await?;
-        removed += some;
-        if some == 0 {
-            break;
-        }
-    }
-    if removed > 0 {
-        tracing::info!("{removed} raw measurements were removed after their time");
-    }
-    Ok(())
-}
-
 impl App {
-    /// Removes at most `limit` raw measurements beyond the limits of age or number. Returns how
-    /// many.
+    /// Archives, if an archive is configured, and removes all measurements beyond the limits of age or
+    /// number. A failure of the archive raises an alert. `file_rows_max` is
+    /// [`FILE_ROWS_MAX`](super::archive::FILE_ROWS_MAX), and less in tests.
+    ///
+    /// # Errors
+    /// The database failed.
+    pub async fn archive_and_remove(
+        &self,
+        config: &RetentionConfig,
+        file_rows_max: u32,
+        stop: &CancellationToken,
+    ) -> Result<(), AppError> {
+        let mut removed = 0;
+        let ended = self.remove_all(config, file_rows_max, stop, &mut removed);
+        let ended = ended.await;
+        if removed > 0 {
+            tracing::info!("{removed} raw measurements were removed after their time");
+        }
+        match ended {
+            Err(AppError::Archive(cause)) => self.show_archived(Some(&cause)),
+            Err(cause) => return Err(cause),
+            Ok(()) => self.show_archived(None),
+        }
+        Ok(())
+    }
+
+    async fn remove_all(
+        &self,
+        config: &RetentionConfig,
+        file_rows_max: u32,
+        stop: &CancellationToken,
+        removed: &mut u64,
+    ) -> Result<(), AppError> {
+        self.prepare_archive().await?;
+        while !stop.is_cancelled() {
+            let due = db::limited(self.due(config, file_rows_max)).await?;
+            let Some(due) = due else { break };
+            tokio::select! {
+                () = stop.cancelled() => break,
+                archived = self.archive_due(due, file_rows_max) => archived?,
+            }
+            let some = db::limited(self.remove_some(config, REMOVED_MAX)).await?;
+            *removed += some;
+            if some == 0 {
+                break;
+            }
+        }
+        Ok(())
+    }
+
+    /// Returns the keys of at most `limit` measurements beyond the limits of age or number.
+    async fn due(
+        &self,
+        config: &RetentionConfig,
+        limit: u32,
+    ) -> Result<Option<KeyRange>, AppError> {
+        let mut tx = self.db().read("retention").await?;
+        let now = self.clock().now();
+        let kept = SignedDuration::from_hours(i64::from(config.segments_days) * DAY_H);
+        let before = now.checked_sub(kept).unwrap_or(jiff::Timestamp::MIN);
+        let Some((first, last)) = db::segment_ranges::ends(&mut tx).await? else {
+            return Ok(None);
+        };
+        let until = first.saturating_add(i64::from(limit)) - 1;
+        let old = db::removed::last_before(&mut tx, before, until).await?;
+        // Keys have no gaps, since only the first ones are ever removed. The last one stays, so that
+        // keys, which are cursors of lists, never restart.
+        let over = last.saturating_sub(config.segments_max);
+        let last = until.min(over.max(old.unwrap_or_default())).min(last - 1);
+        Ok((first <= last).then_some(KeyRange { first, last }))
+    }
+
+    /// Removes at most `limit` raw measurements beyond the limits of age or number, with an archive only
+    /// those that are in there. Returns how many.
     ///
     /// # Errors
     /// The database failed; nothing is removed.
     pub async fn remove_some(&self, config: &RetentionConfig, limit: u32) -> Result<u64, AppError> {
-        let now = self.clock().now();
-        let kept = SignedDuration::from_hours(i64::from(config.segments_days) * DAY_H);
-        let before = now.checked_sub(kept).unwrap_or(jiff::Timestamp::MIN);
-        let mut tx = self.db().read("retention").await?;
-        let Some((first, last)) = db::segment_ranges::ends(&mut tx).await? else {
+        let Some(KeyRange { first, last }) = self.due(config, limit).await? else {
             return Ok(0);
         };
-        let until = first.saturating_add(i64::from(limit)) - 1;
-        let old = db::removed::last_before(&mut tx, before, until).await?;
-        drop(tx);
-        // Keys have no gaps, since only the first ones are ever removed. The last one stays, so that
-        // keys, which are cursors of lists, never restart.
-        let over = last.saturating_sub(config.segments_max);
-        let until = until.min(over.max(old.unwrap_or_default())).min(last - 1);
+        let until = match self.archive() {
+            Some(archive) => archive
+                .removable_to(first)
+                .map(|removable| last.min(removable)),
+            None => Some(last),
+        };
+        let Some(until) = until else { return Ok(0) };
         let unwritten = self.first_unwritten_key();
-        if first <= until && unwritten.is_some_and(|unwritten| unwritten <= until) {
+        if unwritten.is_some_and(|unwritten| unwritten <= until) {
             self.write_sums().await?;
         }
         // Uploads wait meanwhile: none is between checking the names and its commit.

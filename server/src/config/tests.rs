@@ -40,6 +40,11 @@ fn how_long_measurements_are_kept_is_bounded() {
     let kept = load("[retention]\nsegments_days = 7").unwrap().retention;
     assert_eq!(kept.segments_days, 7);
     assert_eq!(kept.segments_max, RetentionConfig::default().segments_max);
+    assert_eq!(kept.archive, None);
+    let kept = load("[retention]\narchive = \"/srv/measurements\"")
+        .unwrap()
+        .retention;
+    assert_eq!(kept.archive, Some("/srv/measurements".into()));
     for wrong in [
         "segments_days = 0",
         "segments_max = 10",

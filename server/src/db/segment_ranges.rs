@@ -98,10 +98,7 @@ pub async fn ends(db: &mut SqliteConnection) -> Result<Option<(i64, i64)>, DbErr
 
 /// Returns the time at which the measurement with a key was received, microseconds since 1970; `None`
 /// if there is none at that key or before it.
-pub(super) async fn received_at_us(
-    db: &mut SqliteConnection,
-    pk: i64,
-) -> Result<Option<i64>, DbError> {
+pub async fn received_at_us(db: &mut SqliteConnection, pk: i64) -> Result<Option<i64>, DbError> {
     let at_us = sqlx::query_scalar!(
         "SELECT received_at_us FROM segment_ranges WHERE first_pk <= ?
          ORDER BY first_pk DESC LIMIT 1",

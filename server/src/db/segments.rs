@@ -482,5 +482,18 @@ pub async fn of_site(
     rows.into_iter().map(KeyedSegment::try_from).collect()
 }
 
+/// Returns at most `limit` measurements of all sites in the order of their commits, after a key and up
+/// to another one, each with the key of its site.
+pub async fn of_all_sites(
+    db: &mut SqliteConnection,
+    (after, until): (i64, i64),
+    limit: u32,
+) -> Result<Vec<(i64, StoredSegment)>, DbError> {
+    let rows = measurements!("AND segment_values.pk <= ?3", after, limit, until);
+    let rows = rows.fetch_all(db).await?;
+    let with_site = |raw: Raw| Ok((raw.site_pk, raw.try_into()?));
+    rows.into_iter().map(with_site).collect()
+}
+
 #[cfg(test)]
 mod tests;

@@ -8,6 +8,8 @@ use tread_api::problem::{PROBLEM_MEDIA_TYPE, ProblemBody, ProblemType};
 
 use crate::app::AppError;
 use crate::app::DbError;
+use crate::archive::SegmentArchiveError;
+use crate::error_text::chain;
 
 /// `Retry-After` of responses when the server could not do its work, seconds.
 const RETRY_AFTER_S: u32 = 5;
@@ -48,6 +50,12 @@ impl Problem {
             None => Self::new(ProblemType::Internal)
                 .detail("the cause is in the server's log, under the id of this request"),
         }
+    }
+
+    /// Creates the problem of archived measurements that cannot be read, and logs the cause.
+    fn archive(cause: &SegmentArchiveError) -> Self {
+        error!("a request failed: {}", chain(cause));
+        Self::new(ProblemType::Unavailable).detail(format!("archived measurements: {cause}"))
     }
 
     /// Sets the explanation for people.
@@ -163,6 +171,7 @@ impl From<AppError> for Problem {
                 error!("a request failed: {app_error}");
                 ProblemType::Internal
             }
+            AppError::Archive(cause) => return Self::archive(cause),
             AppError::Storage(cause) => return Self::storage(cause),
         };
         let mut problem = Self::new(kind).detail(app_error.to_string());

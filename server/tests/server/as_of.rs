@@ -123,6 +123,7 @@ async fn epochs_count_when_they_are_over_where_raw_measurements_were_removed() {
     let few = RetentionConfig {
         segments_days: 90,
         segments_max: 20,
+        archive: None,
     };
     assert_eq!(app.remove_some(&few, 1_000).await.unwrap(), 4);
     for hours in [1, 3] {

@@ -1,5 +1,7 @@
 //! Sent twice is counted once, in whatever order it comes; and the map says what was measured.
 
+use std::path::PathBuf;
+
 use jiff::SignedDuration;
 use proptest::prelude::*;
 use proptest::test_runner::{Config as ProptestConfig, TestRunner};
@@ -10,10 +12,9 @@ use tread_api::ids::BootId;
 use tread_api::page::Page;
 use tread_api::wire::hello::Hello;
 use tread_api::wire::ingest::{Batch, Receipt, Record};
-use tread_server::app::App;
 use tread_server::app::ingest::{self, UPLOADS_WAITING_MAX, Upload};
+use tread_server::app::{App, Dependencies};
 use tread_server::clock::Clock;
-use tread_server::config::{FrictionConfig, StorageConfig};
 use tread_server::db::sums::SumRow;
 use tread_server::db::{self, Db};
 use tread_server::supervisor::Supervisor;
@@ -24,7 +25,7 @@ use crate::robot::Robot;
 
 /// The writer on a database of its own, without a network.
 pub(crate) struct Writer {
-    _folder: tempfile::TempDir,
+    _folder: Option<tempfile::TempDir>,
     pub(crate) app: App,
     pub(crate) uploads: mpsc::Sender<Upload>,
     supervisor: Supervisor,
@@ -36,15 +37,27 @@ pub(crate) fn boot(number: u128) -> BootId {
 
 impl Writer {
     pub(crate) async fn start() -> Self {
+        Self::start_with(None).await
+    }
+
+    /// The same, with an archive in a folder.
+    pub(crate) async fn start_with(archive: Option<PathBuf>) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let db = Db::open(&database(folder.path())).await.unwrap();
         let clock = Clock::manual(time("2026-11-01T00:00:00Z"));
-        let app = App::without_robots(
-            db,
-            clock,
-            FrictionConfig::default(),
-            StorageConfig::default(),
-        );
+        let app = App::new(Dependencies {
+            archive,
+            ..Dependencies::on_database(db, clock)
+        });
+        Self::with(app, Some(folder)).await
+    }
+
+    /// The writer on a database that is open already.
+    pub(crate) async fn on(app: App) -> Self {
+        Self::with(app, None).await
+    }
+
+    async fn with(app: App, folder: Option<tempfile::TempDir>) -> Self {
         app.ensure_site(&site()).await.unwrap();
         for robot in ["rover-1", "rover-2"] {
             let hello = Hello {

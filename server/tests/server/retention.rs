@@ -20,6 +20,7 @@ fn kept(segments_days: u32, segments_max: i64) -> RetentionConfig {
     RetentionConfig {
         segments_days,
         segments_max,
+        archive: None,
     }
 }
 

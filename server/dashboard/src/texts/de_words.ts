@@ -155,6 +155,7 @@ export const alertTitles: Readonly<Record<AlertKind, string>> = {
   'disk-low': 'Der Speicherplatz wird knapp',
   'server-restarted': 'Der Server wurde neu gestartet',
   'certificate-expiring': 'Das Zertifikat des Servers läuft ab',
+  'archive-failed': 'Messungen lassen sich nicht archivieren',
   'backup-failed': 'Die Sicherung ist fehlgeschlagen',
   'backup-old': 'Die letzte Sicherung ist alt',
   'robots-await-release': 'Roboter warten auf ihre Freigabe',
@@ -200,6 +201,7 @@ export const alertSentences: Readonly<Record<AlertKind, (robot: string) => strin
   'disk-low': () => 'Der Datenträger des Servers ist fast voll.',
   'server-restarted': () => 'Der Server wurde neu gestartet.',
   'certificate-expiring': () => 'Das Zertifikat des Servers ist abgelaufen oder läuft bald ab.',
+  'archive-failed': () => 'Alte Messungen lassen sich nicht archivieren. Sie bleiben in der Datenbank.',
   'backup-failed': () => 'Die letzte Sicherung ist fehlgeschlagen.',
   'backup-old': () => 'Die letzte Sicherung ist älter als zwei Abstände zwischen Sicherungen.',
   'robots-await-release': () =>

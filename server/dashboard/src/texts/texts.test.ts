@@ -173,7 +173,7 @@ test('every alert of the documentation is a sentence of its own in each language
     expect(new Set(sentences).size).toBe(codes.length);
     for (const [index, sentence] of sentences.entries()) {
       expect(sentence).toMatch(/^\p{Lu}.+\.$|^rover-1 .+\.$/u);
-      const isOfServer = /server|storage|database|disk|backup|certificate-expiring|robots-await/.test(codes[index] ?? '');
+      const isOfServer = /server|storage|database|disk|backup|archive|certificate-expiring|robots-await/.test(codes[index] ?? '');
       expect(sentence.includes('rover-1'), codes[index]).toBe(!isOfServer);
     }
     // Whatever the reason for which messages are dropped, and what a newer agent says.

@@ -54,6 +54,10 @@ impl Backups {
 }
 
 impl App {
+    fn backups(&self) -> &Backups {
+        &self.inner.backups
+    }
+
     /// Returns the state of scheduled backups; `None` if none are configured.
     pub fn backup_state(&self) -> Option<BackupState> {
         self.backups().lock().clone()

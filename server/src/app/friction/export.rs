@@ -10,6 +10,7 @@ use tread_api::site::{Cell, Grid, Site};
 use super::cells::{Area, factor, of_square, squares};
 use super::raster::PictureAsked;
 use super::{App, AppError, MOVED, Reading};
+use crate::app::segments::Batch;
 use crate::app::site_row;
 use crate::db;
 use crate::db::segments::SegmentFilter;
@@ -112,10 +113,16 @@ impl App {
         let mut tx = self.db().read("friction").await?;
         let row = site_row(&mut tx, site).await?;
         let extent = db::segments::extent(&mut tx, row.pk, &filter).await?;
-        let state = format!("{extent:?} {filter:?} {site}");
+        let ends = db::segment_ranges::ends(&mut tx).await?;
+        drop(tx);
+        let archived = match ends {
+            Some((first, _)) if filter.after < first - 1 => self.archive_extent().await?,
+            Some(_) | None => String::new(),
+        };
+        let state = format!("{extent:?} {archived} {filter:?} {site}");
         Ok(SegmentExport {
             app: self.clone(),
-            site_pk: row.pk,
+            site: site.clone(),
             state,
             filter,
             stage: Stage::Begin,
@@ -187,7 +194,7 @@ impl CellExport {
 /// Export of all raw measurements of a site, in one table format.
 pub struct SegmentExport {
     app: App,
-    site_pk: i64,
+    site: SiteId,
     state: String,
     filter: SegmentFilter,
     stage: Stage,
@@ -206,27 +213,31 @@ impl SegmentExport {
     /// # Errors
     /// The database failed, or a chunk cannot be encoded.
     pub async fn next(self) -> Result<Option<(Vec<u8>, Self)>, AppError> {
-        let mut found = Vec::new();
-        if matches!(self.stage, Stage::Entries) {
-            let mut tx = self.app.db().read("friction").await?;
-            found = db::segments::list(&mut tx, self.site_pk, &self.filter, SEGMENTS_PIECE).await?;
-        }
+        let found = match self.stage {
+            Stage::Entries => {
+                let reading = self
+                    .app
+                    .some_segments(&self.site, &self.filter, SEGMENTS_PIECE);
+                reading.await?
+            }
+            Stage::Begin | Stage::End | Stage::Over => Batch::default(),
+        };
         let app = self.app.clone();
         app.off_thread(move |_app| self.step(&found)).await
     }
 
-    fn step(mut self, found: &[StoredSegment]) -> Result<Option<(Vec<u8>, Self)>, AppError> {
+    fn step(mut self, found: &Batch) -> Result<Option<(Vec<u8>, Self)>, AppError> {
         let bytes = match self.stage {
             Stage::Begin => {
                 self.stage = Stage::Entries;
                 self.writer.begin()?
             }
             Stage::Entries => {
-                match found.last() {
-                    Some(last) => self.filter.after = last.id,
+                match found.next {
+                    Some(next) => self.filter.after = next,
                     None => self.stage = Stage::End,
                 }
-                self.writer.piece(found)?
+                self.writer.piece(&found.segments)?
             }
             Stage::End => {
                 self.stage = Stage::Over;

@@ -1,0 +1,152 @@
+//! Checksums of a file: CRC-32 of the bytes of each row group, and of the footer.
+//!
+//! The footer contains its own checksum as text. It is computed as if that text were zeros.
+
+use std::fs::File;
+use std::io::{self, Write};
+use std::os::unix::fs::FileExt as _;
+
+use flate2::Crc;
+
+/// What stands before the checksum in the footer.
+const FOOTER_LABEL: &str = "footer-crc32:";
+/// The text in place of the checksum while it is computed.
+const ZEROS: &str = "00000000";
+/// Bytes after the footer: its length, and the magic number.
+const TAIL_BYTES: usize = 8;
+const MAGIC: &[u8] = b"PAR1";
+/// Maximum length of a footer, bytes.
+const FOOTER_MAX_BYTES: u64 = 16 * 1024 * 1024;
+/// Number of bytes that are read at a time.
+const READ_BYTES: usize = 64 * 1024;
+
+/// A file whose written bytes are summed.
+#[derive(Debug)]
+pub(super) struct Summed {
+    file: File,
+    crc: Crc,
+    written: u64,
+}
+
+impl Summed {
+    pub(super) fn new(file: File) -> Self {
+        Self {
+            file,
+            crc: Crc::new(),
+            written: 0,
+        }
+    }
+
+    /// Returns the number of bytes so far, and the checksum of those since the last call.
+    pub(super) fn take(&mut self) -> (u64, u32) {
+        let sum = self.crc.sum();
+        self.crc.reset();
+        (self.written, sum)
+    }
+
+    pub(super) fn file(&self) -> &File {
+        &self.file
+    }
+}
+
+impl Write for Summed {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let count = self.file.write(bytes)?;
+        self.crc.update(&bytes[..count]);
+        self.written += count as u64;
+        Ok(count)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.file.flush()
+    }
+}
+
+/// Returns the text of the footer's checksum before it is known.
+pub(super) fn placeholder() -> String {
+    format!("{FOOTER_LABEL}{ZEROS}")
+}
+
+fn invalid(what: &'static str) -> io::Error {
+    io::Error::new(io::ErrorKind::InvalidData, what)
+}
+
+/// A footer, the position of its first byte in the file, and that of its checksum in the footer.
+struct Footer {
+    bytes: Vec<u8>,
+    begin: u64,
+    checksum_at: usize,
+}
+
+impl Footer {
+    fn read(file: &File) -> io::Result<Self> {
+        let length = file.metadata()?.len();
+        let tail_at = length.checked_sub(TAIL_BYTES as u64);
+        let tail_at = tail_at.ok_or_else(|| invalid("it is too short"))?;
+        let mut tail = [0; TAIL_BYTES];
+        file.read_exact_at(&mut tail, tail_at)?;
+        let (size, magic) = tail.split_at(4);
+        if magic != MAGIC {
+            return Err(invalid("it does not end like a Parquet file"));
+        }
+        let size = size.try_into().map(u32::from_le_bytes).unwrap_or_default();
+        let begin = tail_at.checked_sub(size.into());
+        let begin = begin.filter(|_| u64::from(size) <= FOOTER_MAX_BYTES);
+        let begin = begin.ok_or_else(|| invalid("its footer has an impossible length"))?;
+        let mut bytes = vec![0; usize::try_from(size).unwrap_or_default()];
+        file.read_exact_at(&mut bytes, begin)?;
+        let label = FOOTER_LABEL.as_bytes();
+        let label_at = bytes.windows(label.len()).rposition(|part| part == label);
+        let checksum_at = label_at.map(|at| at + label.len());
+        let checksum_at = checksum_at.filter(|at| at + ZEROS.len() <= bytes.len());
+        Ok(Self {
+            checksum_at: checksum_at.ok_or_else(|| invalid("its footer has no checksum"))?,
+            bytes,
+            begin,
+        })
+    }
+
+    /// Replaces the checksum by zeros; returns the former text, and the right one.
+    fn sum(&mut self) -> (Vec<u8>, String) {
+        let place = self.checksum_at..self.checksum_at + ZEROS.len();
+        let former = self.bytes[place.clone()].to_vec();
+        self.bytes[place].copy_from_slice(ZEROS.as_bytes());
+        let mut crc = Crc::new();
+        crc.update(&self.bytes);
+        (former, format!("{:08x}", crc.sum()))
+    }
+}
+
+/// Writes the checksum of the footer into it.
+pub(super) fn seal_footer(file: &File) -> io::Result<()> {
+    let mut footer = Footer::read(file)?;
+    let (_, right) = footer.sum();
+    file.write_all_at(right.as_bytes(), footer.begin + footer.checksum_at as u64)
+}
+
+/// Checks the checksum of the footer. Returns where the footer begins.
+pub(super) fn check_footer(file: &File) -> io::Result<u64> {
+    let mut footer = Footer::read(file)?;
+    let (former, right) = footer.sum();
+    if former != right.as_bytes() {
+        return Err(invalid("the checksum of its footer is wrong"));
+    }
+    Ok(footer.begin)
+}
+
+/// Checks the bytes from `begin` to before `end`.
+pub(super) fn check_bytes(file: &File, (begin, end): (u64, u64), sum: u32) -> io::Result<()> {
+    let mut crc = Crc::new();
+    let mut buffer = vec![0; READ_BYTES];
+    let mut at = begin;
+    while at < end {
+        let count = usize::try_from(end - at).map_or(READ_BYTES, |left| left.min(READ_BYTES));
+        file.read_exact_at(&mut buffer[..count], at)?;
+        crc.update(&buffer[..count]);
+        at += count as u64;
+    }
+    if crc.sum() == sum {
+        return Ok(());
+    }
+    Err(invalid("the checksum of its rows is wrong"))
+}

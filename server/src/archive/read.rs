@@ -1,0 +1,222 @@
+//! Reads a file: only the row groups that may contain what is wanted, and only after their checksums.
+
+use std::fs::File;
+use std::path::{Path, PathBuf};
+
+use parquet::data_type::Int64Type;
+use parquet::file::metadata::{KeyValue, RowGroupMetaData};
+use parquet::file::reader::FileReader as _;
+use parquet::file::serialized_reader::SerializedFileReader;
+use tread_api::ids::{RobotId, SiteId, TerrainId};
+
+use super::fault::{Fault, fault, guarded};
+use super::rows::{Columns, Names, Values};
+use super::{ArchivedSegment, Found, KeyRange, SegmentArchiveError, Selection, checksum, schema};
+
+/// A row group: its keys, its bytes in the file, and their checksum.
+#[derive(Debug, Clone)]
+struct Group {
+    keys: KeyRange,
+    bytes: (u64, u64),
+    sum: u32,
+}
+
+/// A file whose footer was checked.
+pub(super) struct OpenFile {
+    path: PathBuf,
+    file: File,
+    reader: SerializedFileReader<File>,
+    groups: Vec<Group>,
+    /// Last key of the file before, 0 if there was none.
+    follows: i64,
+}
+
+impl OpenFile {
+    /// Opens a file that contains these keys.
+    pub(super) fn open(path: &Path, keys: KeyRange) -> Result<Self, SegmentArchiveError> {
+        let opened = File::open(path);
+        let file = opened.map_err(SegmentArchiveError::file("open", path))?;
+        guarded(path, || {
+            let footer_at = checksum::check_footer(&file)?;
+            let reader = SerializedFileReader::new(file.try_clone()?)?;
+            let about = reader.metadata().file_metadata();
+            let said = about.key_value_metadata().map_or(&[][..], Vec::as_slice);
+            if value_of(said, schema::FORMAT_KEY) != Some(schema::FORMAT) {
+                return Err(fault("it is not of this format"));
+            }
+            if about.schema() != &schema::columns()? {
+                return Err(fault("it has other columns"));
+            }
+            let follows = value_of(said, schema::FOLLOWS_KEY);
+            let follows = follows.and_then(|follows| follows.parse().ok());
+            let groups = value_of(said, schema::ROW_GROUPS_KEY).unwrap_or_default();
+            let counts = reader.metadata().row_groups().iter();
+            let counts: Vec<i64> = counts.map(RowGroupMetaData::num_rows).collect();
+            let groups = groups_of(groups, &counts, keys, footer_at);
+            Ok(Self {
+                path: path.to_owned(),
+                groups: groups.ok_or_else(|| fault("its row groups do not have its keys"))?,
+                file,
+                follows: follows.ok_or_else(|| fault("it does not name the file before"))?,
+                reader,
+            })
+        })
+    }
+
+    /// Checks that this file follows the last key before it, if there is one. Returns a key that is
+    /// missing between them.
+    pub(super) fn missing_before(
+        &self,
+        preceding: Option<i64>,
+    ) -> Result<Option<i64>, SegmentArchiveError> {
+        match preceding {
+            Some(last) if last > self.follows => Err(SegmentArchiveError::Damaged {
+                path: self.path.clone(),
+                what: format!("it does not follow the measurement {last}"),
+            }),
+            Some(last) => Ok((last < self.follows).then_some(self.follows)),
+            None => Ok(None),
+        }
+    }
+
+    /// Adds the selected measurements to those found. Returns whether the search goes on after this
+    /// file; it ends at `limit` measurements, and when no rows are left to be searched.
+    pub(super) fn read(
+        &self,
+        selection: &Selection,
+        limit: usize,
+        rows_left: &mut usize,
+        found: &mut Found,
+    ) -> Result<bool, SegmentArchiveError> {
+        for (index, group) in self.groups.iter().enumerate() {
+            let first = group.keys.first.max(selection.after.saturating_add(1));
+            let last = group.keys.last.min(selection.before.saturating_sub(1));
+            if first > last {
+                continue;
+            }
+            let is_needed = guarded(&self.path, || self.may_contain(index, selection))?;
+            if is_needed {
+                if found.segments.len() >= limit || *rows_left == 0 {
+                    return Ok(false);
+                }
+                let keys = KeyRange { first, last };
+                *rows_left = rows_left.saturating_sub(place(keys.count()));
+                let wanted = limit - found.segments.len();
+                let read = || self.read_group(index, keys, selection, wanted);
+                let segments = guarded(&self.path, read)?;
+                let is_full = segments.len() >= wanted;
+                found.segments.extend(segments);
+                if let (true, Some(segment)) = (is_full, found.segments.last()) {
+                    found.searched_to = segment.stored.id;
+                    return Ok(false);
+                }
+            }
+            found.searched_to = last;
+        }
+        Ok(true)
+    }
+
+    /// Returns whether a row group may have selected rows, by the statistics of its columns.
+    fn may_contain(&self, index: usize, selection: &Selection) -> Result<bool, Fault> {
+        let group = self.reader.metadata().row_groups().get(index);
+        let group = group.ok_or_else(|| fault("a row group is missing"))?;
+        let site = selection.site.as_ref().map(SiteId::as_str);
+        let robot = selection.robot.as_ref().map(RobotId::as_str);
+        let terrain = selection.terrain.as_ref().map(TerrainId::as_str);
+        let one_of = |column, name: Option<&str>| {
+            name.is_none_or(|name| is_within(group, column, [name].into_iter()))
+        };
+        let robots = selection.robots.as_ref();
+        Ok(one_of(schema::SITE, site)
+            && one_of(schema::ROBOT, robot)
+            && one_of(schema::TERRAIN, terrain)
+            && robots.is_none_or(|robots| {
+                is_within(group, schema::ROBOT, robots.iter().map(RobotId::as_str))
+            }))
+    }
+
+    /// Reads the selected rows of a row group with keys of a range, at most `limit`.
+    fn read_group(
+        &self,
+        index: usize,
+        keys: KeyRange,
+        selection: &Selection,
+        limit: usize,
+    ) -> Result<Vec<ArchivedSegment>, Fault> {
+        let about = self.groups.get(index);
+        let about = about.ok_or_else(|| fault("a row group is missing"))?;
+        checksum::check_bytes(&self.file, about.bytes, about.sum)?;
+        let group = self.reader.get_row_group(index)?;
+        let skipped = place(keys.first - about.keys.first);
+        let rows = skipped..skipped + place(keys.count());
+        let mut columns = Columns::new(group.as_ref(), rows);
+        let ids = columns.each::<Int64Type>()?;
+        if !ids.iter().copied().eq(keys.first..=keys.last) {
+            return Err(fault("its rows do not have its keys"));
+        }
+        let names = Names::read(&mut columns)?;
+        let chosen: Vec<usize> = names.chosen(selection).into_iter().take(limit).collect();
+        let Some((&first, &last)) = chosen.first().zip(chosen.last()) else {
+            return Ok(Vec::new());
+        };
+        columns.narrow(first..last + 1);
+        let values = Values::read(&mut columns)?;
+        let segment = |row: usize| names.segment(row, ids[row], &values, row - first);
+        chosen.into_iter().map(segment).collect()
+    }
+}
+
+fn value_of<'said>(said: &'said [KeyValue], key: &str) -> Option<&'said str> {
+    let found = said.iter().find(|pair| pair.key == key);
+    found.and_then(|pair| pair.value.as_deref())
+}
+
+/// Returns a number of rows; it is never negative.
+fn place(count: i64) -> usize {
+    usize::try_from(count).unwrap_or_default()
+}
+
+/// Returns the row groups of a file from their ends and checksums, and their numbers of rows; `None` if
+/// they do not have the keys of the file.
+fn groups_of(said: &str, counts: &[i64], keys: KeyRange, footer_at: u64) -> Option<Vec<Group>> {
+    let mut groups = Vec::new();
+    let (mut first, mut begin) = (keys.first, 0);
+    let mut counts = counts.iter();
+    for group in said.split(',') {
+        let (end, sum) = group.split_once(' ')?;
+        let (end, sum) = (end.parse().ok()?, u32::from_str_radix(sum, 16).ok()?);
+        let next = first.checked_add(*counts.next().filter(|count| **count > 0)?)?;
+        if !(begin < end && end <= footer_at) {
+            return None;
+        }
+        groups.push(Group {
+            keys: KeyRange {
+                first,
+                last: next - 1,
+            },
+            bytes: (begin, end),
+            sum,
+        });
+        (first, begin) = (next, end);
+    }
+    (counts.next().is_none() && first.checked_sub(1) == Some(keys.last)).then_some(groups)
+}
+
+/// Returns whether the statistics of a column of names allow one of some names.
+fn is_within<'name>(
+    group: &RowGroupMetaData,
+    column: usize,
+    mut names: impl Iterator<Item = &'name str>,
+) -> bool {
+    let Some(known) = group
+        .columns()
+        .get(column)
+        .and_then(|column| column.statistics())
+    else {
+        return true;
+    };
+    match known.min_bytes_opt().zip(known.max_bytes_opt()) {
+        Some((least, most)) => names.any(|name| (least..=most).contains(&name.as_bytes())),
+        None => known.null_count_opt() != u64::try_from(group.num_rows()).ok(),
+    }
+}
