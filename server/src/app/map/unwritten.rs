@@ -4,8 +4,12 @@
 //! commit of segments ─► added here and to the map ─► stored with the robot's watermark ─► removed
 //! kill ─► nothing here; the segments that follow each watermark are added again
 //! ```
+//!
+//! The sums of a robot are stored up to a watermark, so those of the same segments are stored in one
+//! transaction, for which receipts wait. A robot that has driven through many cells therefore has
+//! several generations of sums, each of the segments after those of the one before.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::time::Duration;
 
 use foldhash::fast::RandomState;
@@ -22,10 +26,16 @@ pub(super) const UNWRITTEN_SUMS_MAX: usize = 200_000;
 /// Maximum number of segments in unwritten sums, which a killed server adds again when it starts.
 pub(super) const UNWRITTEN_SEGMENTS_MAX: u64 = 1_000_000;
 
+/// Number of sums from which a robot's further segments are added to another generation.
+const GENERATION_SUMS: usize = 2_000;
+
 /// The unwritten sums of all robots.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct Unwritten {
-    robots: BTreeMap<i64, OfRobot>,
+    /// The generations of each robot, oldest first; at least one.
+    robots: BTreeMap<i64, VecDeque<Generation>>,
+    /// [`GENERATION_SUMS`], and fewer in tests.
+    generation_sums: usize,
     /// Stored watermarks by robot.
     watermarks: HashMap<i64, i64>,
     sums: usize,
@@ -34,10 +44,11 @@ pub(super) struct Unwritten {
     additions: u64,
 }
 
+/// Sums of some segments of one robot.
 #[derive(Debug)]
-struct OfRobot {
+struct Generation {
     sums: HashMap<SumKey, Sums, RandomState>,
-    /// Keys between which all its segments in `sums` are.
+    /// Keys between which all segments in `sums` are.
     keys: Added,
     /// Number of the first addition, and its time.
     began: (u64, Duration),
@@ -54,12 +65,31 @@ pub struct UnwrittenCounts {
     pub oldest_at: Option<Duration>,
 }
 
-/// Sums that are stored in one transaction: all of some robots.
+/// Sums that are stored in one transaction: the oldest generations of some robots.
 #[derive(Debug, Default)]
 pub(super) struct Portion {
     /// In the order of the table, so that neighbours share database pages.
     pub(super) sums: Vec<(SumKey, Sums)>,
     pub(super) steps: Vec<WatermarkStep>,
+}
+
+impl Default for Unwritten {
+    fn default() -> Self {
+        Self {
+            robots: BTreeMap::new(),
+            generation_sums: GENERATION_SUMS,
+            watermarks: HashMap::new(),
+            sums: 0,
+            segments: 0,
+            additions: 0,
+        }
+    }
+}
+
+impl Generation {
+    fn segments(&self) -> u64 {
+        self.sums.values().map(|sums| sums.segments).sum()
+    }
 }
 
 impl Unwritten {
@@ -81,21 +111,30 @@ impl Unwritten {
     ) {
         self.additions += 1;
         for (key, cells) in sums {
-            let robot = self.robots.entry(key.robot_pk).or_insert_with(|| OfRobot {
-                sums: HashMap::default(),
-                keys: added,
-                began: (self.additions, at),
-            });
-            robot.keys.first = robot.keys.first.min(added.first);
-            robot.keys.last = robot.keys.last.max(added.last);
+            let generations = self.robots.entry(key.robot_pk).or_default();
+            // What was added together is stored together.
+            let has_room = |newest: &Generation| {
+                newest.sums.len() < self.generation_sums || newest.keys.last >= added.first
+            };
+            if !generations.back().is_some_and(has_room) {
+                generations.push_back(Generation {
+                    sums: HashMap::default(),
+                    keys: added,
+                    began: (self.additions, at),
+                });
+            }
+            let Some(newest) = generations.back_mut() else {
+                continue;
+            };
+            newest.keys.last = newest.keys.last.max(added.last);
             let mut key = key.clone();
             for (cell, sums) in cells {
                 key.cell = *cell;
                 self.segments += sums.segments;
-                if let Some(present) = robot.sums.get_mut(&key) {
+                if let Some(present) = newest.sums.get_mut(&key) {
                     present.add(sums);
                 } else {
-                    robot.sums.insert(key.clone(), *sums);
+                    newest.sums.insert(key.clone(), *sums);
                     self.sums += 1;
                 }
             }
@@ -107,26 +146,29 @@ impl Unwritten {
         self.additions
     }
 
-    /// Returns the sums of robots that have had some since before addition `until` ended, with the
-    /// steps of their watermarks: those of as many robots as have `limit` sums, and of at least one.
+    /// Returns the oldest generations that began before addition `until` ended, with the steps of their
+    /// robots' watermarks: as many as have `limit` sums, and at least one.
     pub(super) fn portion(&self, until: u64, limit: usize) -> Portion {
         let mut portion = Portion::default();
-        for (&robot_pk, robot) in &self.robots {
-            if robot.began.0 > until {
-                continue;
+        'robots: for (&robot_pk, generations) in &self.robots {
+            let mut step = None;
+            for generation in generations.iter().take_while(|it| it.began.0 <= until) {
+                let is_first = step.is_none() && portion.steps.is_empty();
+                if !is_first && portion.sums.len() + generation.sums.len() > limit {
+                    portion.steps.extend(step);
+                    break 'robots;
+                }
+                step = Some(WatermarkStep {
+                    robot_pk,
+                    from_pk: self.watermarks.get(&robot_pk).copied().unwrap_or_default(),
+                    to_pk: generation.keys.last,
+                });
+                let sums = generation.sums.iter();
+                portion
+                    .sums
+                    .extend(sums.map(|(key, sums)| (key.clone(), *sums)));
             }
-            if !portion.steps.is_empty() && portion.sums.len() + robot.sums.len() > limit {
-                break;
-            }
-            portion.steps.push(WatermarkStep {
-                robot_pk,
-                from_pk: self.watermarks.get(&robot_pk).copied().unwrap_or_default(),
-                to_pk: robot.keys.last,
-            });
-            let sums = robot.sums.iter();
-            portion
-                .sums
-                .extend(sums.map(|(key, sums)| (key.clone(), *sums)));
+            portion.steps.extend(step);
         }
         portion
             .sums
@@ -138,34 +180,45 @@ impl Unwritten {
     pub(super) fn written(&mut self, steps: &[WatermarkStep]) {
         for step in steps {
             self.watermarks.insert(step.robot_pk, step.to_pk);
-            if let Some(robot) = self.robots.remove(&step.robot_pk) {
-                self.sums -= robot.sums.len();
-                self.segments -= segments_of(&robot);
+            let Some(generations) = self.robots.get_mut(&step.robot_pk) else {
+                continue;
+            };
+            let is_stored = |oldest: &mut Generation| oldest.keys.last <= step.to_pk;
+            while let Some(stored) = generations.pop_front_if(is_stored) {
+                self.sums -= stored.sums.len();
+                self.segments -= stored.segments();
+            }
+            if generations.is_empty() {
+                self.robots.remove(&step.robot_pk);
             }
         }
     }
 
     /// Removes the sums of a robot between two hours, both included.
     pub(super) fn withdraw(&mut self, robot_pk: i64, (from_h, to_h): (i64, i64)) {
-        let Some(mut robot) = self.robots.remove(&robot_pk) else {
+        let Some(mut generations) = self.robots.remove(&robot_pk) else {
             return;
         };
-        self.sums -= robot.sums.len();
-        self.segments -= segments_of(&robot);
-        robot
-            .sums
-            .retain(|key, _| !(from_h..=to_h).contains(&key.epoch_h));
-        if !robot.sums.is_empty() {
-            self.sums += robot.sums.len();
-            self.segments += segments_of(&robot);
-            self.robots.insert(robot_pk, robot);
+        for generation in &mut generations {
+            self.sums -= generation.sums.len();
+            self.segments -= generation.segments();
+            generation
+                .sums
+                .retain(|key, _| !(from_h..=to_h).contains(&key.epoch_h));
+            self.sums += generation.sums.len();
+            self.segments += generation.segments();
+        }
+        generations.retain(|generation| !generation.sums.is_empty());
+        if !generations.is_empty() {
+            self.robots.insert(robot_pk, generations);
         }
     }
 
     /// Returns a key at or before that of the first segment in unwritten sums; `None` without such
     /// sums.
     pub(super) fn first_key(&self) -> Option<i64> {
-        self.robots.values().map(|robot| robot.keys.first).min()
+        let oldest = self.robots.values().filter_map(VecDeque::front);
+        oldest.map(|oldest| oldest.keys.first).min()
     }
 
     /// Returns how much is unwritten.
@@ -173,7 +226,12 @@ impl Unwritten {
         UnwrittenCounts {
             sums: self.sums,
             segments: self.segments,
-            oldest_at: self.robots.values().map(|robot| robot.began.1).min(),
+            oldest_at: self
+                .robots
+                .values()
+                .filter_map(VecDeque::front)
+                .map(|oldest| oldest.began.1)
+                .min(),
         }
     }
 
@@ -181,10 +239,6 @@ impl Unwritten {
     pub(super) fn is_full(&self) -> bool {
         self.sums >= UNWRITTEN_SUMS_MAX || self.segments >= UNWRITTEN_SEGMENTS_MAX
     }
-}
-
-fn segments_of(robot: &OfRobot) -> u64 {
-    robot.sums.values().map(|sums| sums.segments).sum()
 }
 
 #[cfg(test)]

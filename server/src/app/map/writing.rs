@@ -13,8 +13,7 @@ use crate::db::{self, DbError};
 
 /// Interval at which unwritten sums are stored.
 const WRITE_EVERY: Duration = Duration::from_secs(10);
-/// Number of sums in a transaction beyond which it takes those of no further robot: receipts wait
-/// for it.
+/// Number of sums in a transaction beyond which it takes no further ones: receipts wait for it.
 const SUMS_WRITTEN_MAX: usize = 2_000;
 
 /// Stores unwritten sums periodically until the stop.
@@ -37,7 +36,7 @@ impl App {
         }
     }
 
-    /// Stores all sums that are unwritten now, those of some robots in each transaction.
+    /// Stores all sums that are unwritten now, some in each transaction.
     ///
     /// # Errors
     /// The database failed; the sums of some robots may be stored.
@@ -47,8 +46,8 @@ impl App {
         Ok(())
     }
 
-    /// Stores sums of some robots that have had unwritten ones since the addition `until`, which is
-    /// the last one if it is `None`. Returns whether there may be more.
+    /// Stores some of the sums that have been unwritten since the addition `until`, which is the last
+    /// one if it is `None`. Returns whether there may be more.
     async fn write_some_sums(&self, until: &mut Option<u64>) -> Result<bool, DbError> {
         let turn = self.map_turn_to_change().await?;
         let portion = {
@@ -74,15 +73,14 @@ impl App {
         self.maps().unwritten().counts()
     }
 
-    /// Stores sums if so many are unwritten that no receipt may add to them.
+    /// Stores some sums while so many are unwritten that no receipt may add to them.
     ///
     /// # Errors
     /// As [`App::write_sums`].
     pub(in crate::app) async fn bound_unwritten_sums(&self) -> Result<(), DbError> {
-        let is_full = self.maps().unwritten().is_full();
-        if is_full {
-            self.write_sums().await?;
-        }
+        let mut until = None;
+        let is_full = || self.maps().unwritten().is_full();
+        while is_full() && db::limited(self.write_some_sums(&mut until)).await? {}
         Ok(())
     }
 

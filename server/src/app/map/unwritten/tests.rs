@@ -161,7 +161,9 @@ impl Server {
                 self.unwritten.withdraw(robot_pk, (from_h, to_h));
             }
             Act::Kill => {
+                let generation_sums = self.unwritten.generation_sums;
                 self.unwritten = Unwritten::following(self.watermarks.clone());
+                self.unwritten.generation_sums = generation_sums;
                 for (pk, (key, sums)) in (1..).zip(&self.segments) {
                     let watermark = self.watermarks.get(&key.robot_pk);
                     if pk > watermark.copied().unwrap_or_default() && !self.is_withdrawn(key) {
@@ -205,11 +207,16 @@ proptest! {
     #[test]
     fn stored_and_unwritten_sums_are_those_of_all_segments_whenever_the_server_is_killed(
         acts in prop::collection::vec(act(), 0..40),
+        generation_sums in 1_usize..6,
     ) {
         let mut server = Server::default();
+        server.unwritten.generation_sums = generation_sums;
         for act in acts {
             server.run(act);
             prop_assert_eq!(server.shown(), server.expected());
+            // No transaction is larger than the limit by more than what was added together.
+            let one = server.unwritten.portion(u64::MAX, 1).sums.len();
+            prop_assert!(one < generation_sums + 8, "{one} sums");
             let all = server.unwritten.portion(u64::MAX, usize::MAX);
             let counts = server.unwritten.counts();
             let segments = all.sums.iter().map(|(_, sums)| sums.segments).sum::<u64>();
@@ -228,7 +235,7 @@ proptest! {
 }
 
 #[test]
-fn a_portion_has_all_sums_of_its_robots_and_no_robot_that_began_later() {
+fn a_portion_has_whole_generations_and_none_that_began_later() {
     let mut unwritten = Unwritten::default();
     let added = Added { first: 1, last: 9 };
     let sums: Table = (0..3)
@@ -251,6 +258,38 @@ fn a_portion_has_all_sums_of_its_robots_and_no_robot_that_began_later() {
     unwritten.written(&rest.steps);
     assert!(unwritten.portion(until, 9).steps.is_empty());
     assert_eq!(unwritten.counts().sums, 1);
+}
+
+#[test]
+fn a_robot_in_many_cells_is_stored_in_several_transactions_each_with_its_watermark() {
+    let mut unwritten = Unwritten::default();
+    let batch = 100;
+    for first in (0..10_000).step_by(batch) {
+        let begin = i32::try_from(first).unwrap();
+        let count = i32::try_from(batch).unwrap();
+        let cells: Table = (begin..begin + count)
+            .map(|ix| (key(1, ix, 0), one(1.0)))
+            .collect();
+        let keys = Added {
+            first: i64::from(begin) + 1,
+            last: i64::from(begin + count),
+        };
+        add(&mut unwritten, &cells, keys);
+    }
+    let until = unwritten.additions();
+    let mut marks = vec![0];
+    loop {
+        let portion = unwritten.portion(until, GENERATION_SUMS);
+        let [step] = portion.steps.as_slice() else {
+            break;
+        };
+        assert!(portion.sums.len() <= GENERATION_SUMS + batch);
+        assert_eq!(Some(&step.from_pk), marks.last());
+        marks.push(step.to_pk);
+        unwritten.written(&portion.steps);
+    }
+    assert_eq!(marks, [0, 2_000, 4_000, 6_000, 8_000, 10_000]);
+    assert_eq!(unwritten.counts(), UnwrittenCounts::default());
 }
 
 #[test]
