@@ -34,6 +34,9 @@ use zenoh::query::ConsolidationMode;
 /// Longest wait for the server's answer to anything.
 const ANSWER_WAIT_MAX: Duration = Duration::from_secs(5);
 
+/// Maximum number of times that a robot says hello again.
+const HELLO_TRIES_MAX: u32 = 3;
+
 /// A session as agents open it: a client of one router, nothing discovered.
 ///
 /// # Errors
@@ -198,7 +201,15 @@ impl LightRobot {
     /// The server does not answer or does not welcome it.
     async fn start_on(session: Session, site: &SiteId, id: RobotId) -> anyhow::Result<Self> {
         let boot = BootId::from_uuid(uuid::Uuid::new_v4());
-        let welcome = introduce(&session, site, &id, boot).await?;
+        let mut tries = 1..=HELLO_TRIES_MAX;
+        let welcome = loop {
+            // As agents do: its router may close when another one takes its robots.
+            match introduce(&session, site, &id, boot).await {
+                Err(error) if tries.next().is_none() => return Err(error),
+                Err(_again) => {}
+                Ok(welcome) => break welcome,
+            }
+        };
         Self::announce(session, welcome, (site.clone(), id), boot).await
     }
 

@@ -25,7 +25,7 @@ use crate::app::presence::RobotKey;
 use crate::authority::Trusted;
 
 /// Maximum number of superseded routers that still have robots.
-const SUPERSEDED_MAX: usize = 4;
+const SUPERSEDED_MAX: usize = 8;
 /// Interval of checks for unused routers.
 const LOOK_EVERY: Duration = Duration::from_secs(5);
 

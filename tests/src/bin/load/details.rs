@@ -3,9 +3,12 @@
 use std::process::ExitCode;
 
 use serde::Serialize;
+use tread_lab::report::Table;
 use tread_tests::report::{self, Check};
 
+use crate::Arguments;
 use crate::dispatch::Dispatch;
+use crate::floor::QueryFloor;
 use crate::ingest::Ingest;
 
 /// Segments committed per second, at the least.
@@ -25,11 +28,45 @@ pub(crate) struct Details {
     pub(crate) robots: u32,
     pub(crate) ingest: Ingest,
     pub(crate) dispatch: Dispatch,
+    pub(crate) query: QueryFloor,
 }
 
 impl Details {
-    pub(crate) fn tell(&self, json: bool) -> anyhow::Result<ExitCode> {
-        report::tell_with(json, self, self.words(), &self.checks())
+    pub(crate) fn tell(&self, arguments: &Arguments) -> anyhow::Result<ExitCode> {
+        if arguments.markdown {
+            let (ingest, dispatch) = (self.ingest.words(), self.dispatch_table().markdown());
+            let tables = format!("{} light robots; {ingest}\n\n{dispatch}", self.robots);
+            return report::tell_markdown(&tables, &self.checks());
+        }
+        report::tell_with(arguments.json, self, self.words(), &self.checks())
+    }
+
+    /// Returns the parts of the time of a dispatch, and what it cannot be shorter than.
+    fn dispatch_table(&self) -> Table {
+        let mut table = Table::new(["part of a dispatch", "p50, ms", "p99, ms"]);
+        let dispatch = &self.dispatch;
+        let mut row = |name: &str, p50_ms: f64, p99_ms: f64| {
+            table.row([
+                name.to_owned(),
+                format!("{p50_ms:.2}"),
+                format!("{p99_ms:.2}"),
+            ]);
+        };
+        for part in &dispatch.parts {
+            row(part.name, part.p50_ms, part.p99_ms);
+        }
+        row("all", dispatch.p50_ms, dispatch.p99_ms);
+        row(
+            "one write with fdatasync",
+            dispatch.fsync_p50_ms,
+            dispatch.fsync_p99_ms,
+        );
+        row(
+            "one query through a bare router",
+            self.query.p50_ms,
+            self.query.p99_ms,
+        );
+        table
     }
 
     fn checks(&self) -> Vec<Check> {
@@ -56,10 +93,12 @@ impl Details {
 
     fn words(&self) -> String {
         format!(
-            "{} light robots; {}\n{}\n",
+            "{} light robots; {}\n{}; one query through a bare router {:.2} / {:.2}\n",
             self.robots,
             self.ingest.words(),
             self.dispatch.words(),
+            self.query.p50_ms,
+            self.query.p99_ms,
         )
     }
 }

@@ -60,9 +60,9 @@ pub(crate) struct Dispatch {
 /// A part of the time from the request to the first wheel command.
 #[derive(Debug, Serialize)]
 pub(crate) struct Part {
-    name: &'static str,
-    p50_ms: f64,
-    p99_ms: f64,
+    pub(crate) name: &'static str,
+    pub(crate) p50_ms: f64,
+    pub(crate) p99_ms: f64,
 }
 
 impl Dispatch {

@@ -14,11 +14,14 @@
 //! robot, so that every segment has its own sum. First in CBOR, then in JSON, then in CBOR at 60 % of
 //! what was reached. With `--peers` also into a service in Python (`tests/peers`).
 //!
+//! Beside dispatch, the time of a query to a client of a bare zenoh router, and of a write to the disk.
+//!
 //! With `--states` what the states of 5 000 robots at 2 Hz, and of 1 000 at 10 Hz, cost over a bare zenoh
 //! router with the same sessions and messages.
 
 mod details;
 mod dispatch;
+mod floor;
 mod ingest;
 mod peers;
 mod saturation;
@@ -89,8 +92,11 @@ pub(crate) struct Arguments {
     #[arg(long)]
     tls: bool,
     /// Print one JSON object instead of a table
-    #[arg(long)]
+    #[arg(long, conflicts_with = "markdown")]
     json: bool,
+    /// Print tables for a page
+    #[arg(long)]
+    markdown: bool,
 }
 
 #[tokio::main]
@@ -100,11 +106,17 @@ async fn main() -> anyhow::Result<ExitCode> {
     if arguments.saturate {
         let saturation = saturation::measure(&arguments, &node).await?;
         let checks = saturation.checks();
+        if arguments.markdown {
+            return report::tell_markdown(&saturation.table().markdown(), &checks);
+        }
         return report::tell_with(arguments.json, &saturation, saturation.words(), &checks);
     }
     if arguments.states {
         let states = states::measure(&arguments, &node).await?;
         let checks = states.checks();
+        if arguments.markdown {
+            return report::tell_markdown(&states.table().markdown(), &checks);
+        }
         return report::tell_with(arguments.json, &states, states.words(), &checks);
     }
     let collector = Collector::default();
@@ -113,12 +125,14 @@ async fn main() -> anyhow::Result<ExitCode> {
     let pace = Pace::PerSecond(f64::from(arguments.segments_per_second));
     let ingest = ingest::measure(&arguments, &fleet, robots, pace).await?;
     let dispatch = dispatch::measure(&arguments, &mut fleet, &collector).await?;
+    let query = floor::query(&node).await?;
     let details = Details {
         robots: arguments.robots,
         ingest,
         dispatch,
+        query,
     };
-    details.tell(arguments.json)
+    details.tell(&arguments)
 }
 
 /// Starts a server, whose robots show certificates if they connect by TLS.

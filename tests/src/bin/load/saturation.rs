@@ -5,6 +5,7 @@ use std::path::Path;
 
 use serde::Serialize;
 use tread_api::wire::encoding::Encoding;
+use tread_lab::report::Table;
 use tread_tests::light_robot::LightRobot;
 use tread_tests::report::Check;
 
@@ -147,14 +148,62 @@ impl Saturation {
         checks
     }
 
-    pub(crate) fn words(&self) -> String {
-        let runs = [
+    /// Returns the runs under their names.
+    fn runs(&self) -> [(&'static str, Option<&Ingest>); 4] {
+        [
             ("CBOR", Some(&self.cbor)),
             ("JSON", Some(&self.json)),
             ("CBOR at 60 %", Some(&self.loaded)),
             ("Python", self.python.as_ref()),
-        ];
-        let lines = runs
+        ]
+    }
+
+    /// Returns what the servers and SQLite alone reached.
+    pub(crate) fn table(&self) -> Table {
+        let mut table = Table::new([
+            "run",
+            "segments/s",
+            "over Python",
+            "CPU per segment, us",
+            "over SQLite alone",
+            "receipt p50, ms",
+            "receipt p99, ms",
+        ]);
+        let ratio = |value: f64, of: Option<f64>| {
+            of.map_or_else(String::new, |of| format!("{:.2}", value / of))
+        };
+        let python = self
+            .python
+            .as_ref()
+            .map(|python| python.segments_per_second);
+        let floor = self.sqlite.as_ref().map(|sqlite| sqlite.cpu_us_per_row);
+        for (name, ingest) in self.runs() {
+            let Some(ingest) = ingest else { continue };
+            table.row([
+                name.to_owned(),
+                format!("{:.0}", ingest.segments_per_second),
+                ratio(ingest.segments_per_second, python),
+                format!("{:.1}", ingest.server_cpu_us_per_segment),
+                ratio(ingest.server_cpu_us_per_segment, floor),
+                format!("{:.1}", ingest.ack_p50_ms),
+                format!("{:.1}", ingest.ack_p99_ms),
+            ]);
+        }
+        if let Some(sqlite) = &self.sqlite {
+            table.row([
+                "SQLite alone".to_owned(),
+                format!("{:.0}", sqlite.rows_per_second),
+                ratio(sqlite.rows_per_second, python),
+                format!("{:.1}", sqlite.cpu_us_per_row),
+                ratio(sqlite.cpu_us_per_row, floor),
+            ]);
+        }
+        table
+    }
+
+    pub(crate) fn words(&self) -> String {
+        let lines = self
+            .runs()
             .into_iter()
             .filter_map(|(name, ingest)| Some(format!("{name}: {}\n", ingest?.words())));
         format!(

@@ -14,6 +14,7 @@ use tokio::task::JoinSet;
 use tokio::time::{Instant, MissedTickBehavior, sleep};
 use tread_api::ids::SiteId;
 use tread_api::wire::hello::Welcome;
+use tread_lab::report::Table;
 use tread_tests::fleet::Fleet;
 use tread_tests::light_robot::LightRobot;
 use tread_tests::ports::free_address;
@@ -161,14 +162,14 @@ async fn used(
 }
 
 /// A running router without a server; it ends when it is dropped.
-struct BareRouter {
+pub(crate) struct BareRouter {
     process: Process,
-    address: SocketAddr,
+    pub(crate) address: SocketAddr,
     _folder: TempDir,
 }
 
 impl BareRouter {
-    fn start(node: &Path) -> anyhow::Result<Self> {
+    pub(crate) fn start(node: &Path) -> anyhow::Result<Self> {
         let (folder, address) = (tempfile::tempdir()?, free_address());
         let arguments = ["router".to_owned(), format!("--listen=tcp/{address}")];
         let log: PathBuf = folder.path().join("router.log");
@@ -254,6 +255,48 @@ impl States {
             ]
         };
         self.fleets.iter().flat_map(of_fleet).collect()
+    }
+
+    /// Returns what the router and the servers used.
+    pub(crate) fn table(&self) -> Table {
+        let mut table = Table::new([
+            "robots",
+            "process",
+            "states/s",
+            "CPU per state, us",
+            "over the router, us",
+            "memory, MB",
+            "over the router, MB",
+            "dispatch p50 / p99, ms",
+        ]);
+        for fleet in &self.fleets {
+            let router = &fleet.router;
+            let rows = [
+                ("a bare router", router),
+                ("the server", &fleet.server),
+                ("the server, with certificates", &fleet.tls),
+            ];
+            for (process, used) in rows {
+                let over = |value: f64, of: f64| match process {
+                    "a bare router" => String::new(),
+                    _ => format!("{:.1}", value - of),
+                };
+                let dispatch = used.dispatch.as_ref();
+                table.row([
+                    format!("{} at {} Hz", fleet.robots, fleet.state_rate_hz),
+                    process.to_owned(),
+                    format!("{:.0}", used.states_per_second),
+                    format!("{:.1}", used.cpu_us_per_state),
+                    over(used.cpu_us_per_state, router.cpu_us_per_state),
+                    format!("{:.0}", used.memory_peak_mb),
+                    over(used.memory_peak_mb, router.memory_peak_mb),
+                    dispatch.map_or_else(String::new, |dispatch| {
+                        format!("{:.1} / {:.1}", dispatch.p50_ms, dispatch.p99_ms)
+                    }),
+                ]);
+            }
+        }
+        table
     }
 
     pub(crate) fn words(&self) -> String {
