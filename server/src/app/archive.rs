@@ -49,7 +49,7 @@ const MARK_ENDING: &str = ".archived";
 #[derive(Debug)]
 pub(super) struct Archive {
     files: Arc<SegmentArchive>,
-    readers: Semaphore,
+    readers: Arc<Semaphore>,
     state: Mutex<State>,
 }
 
@@ -67,7 +67,7 @@ impl Archive {
         mark.push(MARK_ENDING);
         Self {
             files: Arc::new(SegmentArchive::new(folder, mark.into())),
-            readers: Semaphore::new(READERS_MAX),
+            readers: Arc::new(Semaphore::new(READERS_MAX)),
             state: Mutex::default(),
         }
     }
@@ -80,6 +80,21 @@ impl Archive {
     pub(super) fn removable_to(&self, first: i64) -> Option<i64> {
         let removable = self.lock().removable?;
         removable.contains(first).then_some(removable.last)
+    }
+
+    /// Reads files for a request, as one of at most [`READERS_MAX`]. The turn ends with the work and not
+    /// with its caller, which may be gone: a disk that hangs holds no more threads than these.
+    async fn read_in_turn<T: Send + 'static>(
+        &self,
+        work: impl FnOnce(&SegmentArchive) -> Result<T, SegmentArchiveError> + Send + 'static,
+    ) -> Result<T, AppError> {
+        // Never closed, so that this waits for a turn.
+        let turn = Arc::clone(&self.readers).acquire_owned().await;
+        self.off_thread(move |files| {
+            let _turn = turn;
+            work(files)
+        })
+        .await
     }
 
     /// Runs work on files on a blocking thread.
@@ -275,10 +290,8 @@ impl App {
         selection: Selection,
         limit: usize,
     ) -> Result<Found, AppError> {
-        // Never closed, so that this waits for a turn.
-        let _turn = archive.readers.acquire().await;
         let found = archive
-            .off_thread(move |files| files.read(&selection, limit))
+            .read_in_turn(move |files| files.read(&selection, limit))
             .await;
         found.inspect_err(|_| self.counters().archive_failures.one())
     }
@@ -288,7 +301,7 @@ impl App {
         let Some(archive) = self.archive() else {
             return Ok(String::new());
         };
-        let listing = archive.off_thread(SegmentArchive::list).await?;
+        let listing = archive.read_in_turn(SegmentArchive::list).await?;
         let files = listing.files;
         let (first, last) = (files.first(), files.last());
         Ok(format!("{} {first:?} {last:?}", files.len()))

@@ -16,12 +16,13 @@ use super::map::MapChange;
 use super::sites::SITES_MAX;
 use super::{App, AppError};
 use crate::db;
-use crate::db::sums::SumKey;
+use crate::db::sums::{StoredHour, SumKey};
 use crate::friction::{Horizons, Sums};
 
 /// Interval at which the server checks for hours to merge.
 const MERGE_EVERY: Duration = Duration::from_mins(10);
-/// Maximum number of rows merged in one transaction; other writers proceed in between.
+/// Maximum number of rows merged in one transaction; other writers proceed in between. Also the number of
+/// hours that are looked up at a time.
 const ROWS_MERGED_MAX: u32 = 500;
 
 /// Merges periodically until the stop.
@@ -39,8 +40,13 @@ pub async fn run(app: App, stop: CancellationToken) {
 
 async fn merge_all(app: &App, stop: &CancellationToken) -> Result<(), AppError> {
     db::limited(app.move_horizons()).await?;
-    while !stop.is_cancelled() && db::limited(app.merge_some(ROWS_MERGED_MAX)).await? {}
-    Ok(())
+    loop {
+        tokio::select! {
+            biased;
+            () = stop.cancelled() => return Ok(()),
+            more = app.merge_some(ROWS_MERGED_MAX) => if !more? { return Ok(()) },
+        }
+    }
 }
 
 impl App {
@@ -67,35 +73,54 @@ impl App {
         Ok(())
     }
 
-    /// Merges some rows of an hour before a horizon into their epoch. Returns whether there may be more.
+    /// Merges at most `limit` hours before a horizon into their epochs, in transactions of at most
+    /// `limit` rows. Returns whether there may be more.
     ///
     /// # Errors
     /// The database failed.
     pub async fn merge_some(&self, limit: u32) -> Result<bool, AppError> {
         let mut tx = self.db().read("merging").await?;
-        let found = db::sums::one_unmerged(&mut tx).await?;
+        let hours = db::sums::unmerged(&mut tx, limit).await?;
         drop(tx);
-        let Some(hour) = found else {
-            return Ok(false);
-        };
-        let epoch = hour.horizons.epoch_of(hour.epoch_h);
+        let mut remaining = hours.as_slice();
+        while !remaining.is_empty() {
+            let merged = db::limited(self.merge_rows(remaining, limit)).await?;
+            remaining = remaining.get(merged..).unwrap_or_default();
+        }
+        Ok(!hours.is_empty())
+    }
+
+    /// Merges at most `limit` rows of the first of these hours in one transaction. Returns the number of
+    /// hours of which no row is left.
+    async fn merge_rows(&self, hours: &[StoredHour], limit: u32) -> Result<usize, AppError> {
+        let limit = limit as usize;
         let turn = self.map_turn_to_change().await?;
         let mut tx = self.db().write("merging").await?;
-        let rows = db::sums::of_hour(&mut tx, hour.robot_pk, hour.epoch_h, limit).await?;
         let mut merged: BTreeMap<SumKey, Sums> = BTreeMap::new();
-        for row in rows {
-            db::sums::remove(&mut tx, &row.key).await?;
-            let key = SumKey {
-                epoch_h: epoch.first_h,
-                ..row.key
-            };
-            merged
-                .entry(key)
-                .and_modify(|sums| sums.add(&row.sums))
-                .or_insert(row.sums);
+        let (mut taken, mut done) = (0, 0);
+        for hour in hours {
+            let left = limit - taken;
+            if left == 0 {
+                break;
+            }
+            let epoch = hour.horizons.epoch_of(hour.epoch_h);
+            let rows = db::sums::of_hour(&mut tx, (hour.robot_pk, hour.epoch_h), left).await?;
+            taken += rows.len();
+            done += usize::from(rows.len() < left);
+            for row in rows {
+                db::sums::remove(&mut tx, &row.key).await?;
+                let key = SumKey {
+                    epoch_h: epoch.first_h,
+                    ..row.key
+                };
+                merged
+                    .entry(key)
+                    .and_modify(|sums| sums.add(&row.sums))
+                    .or_insert(row.sums);
+            }
         }
         db::sums::add(&mut tx, merged.iter()).await?;
         turn.commit(tx, MapChange::Nothing, Vec::new()).await?;
-        Ok(true)
+        Ok(done)
     }
 }

@@ -94,11 +94,17 @@ impl App {
     ) -> Result<(), AppError> {
         self.prepare_archive().await?;
         while !stop.is_cancelled() {
-            let due = db::limited(self.due(config, file_rows_max)).await?;
-            let Some(due) = due else { break };
-            tokio::select! {
-                () = stop.cancelled() => break,
-                archived = self.archive_due(due, file_rows_max) => archived?,
+            let Some(next) = db::limited(self.due(config, REMOVED_MAX)).await? else {
+                break;
+            };
+            let archive = self.archive();
+            if archive.is_some_and(|archive| archive.removable_to(next.first).is_none()) {
+                let due = db::limited(self.due(config, file_rows_max)).await?;
+                let Some(due) = due else { break };
+                tokio::select! {
+                    () = stop.cancelled() => break,
+                    archived = self.archive_due(due, file_rows_max) => archived?,
+                }
             }
             let some = db::limited(self.remove_some(config, REMOVED_MAX)).await?;
             *removed += some;

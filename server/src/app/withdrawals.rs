@@ -25,7 +25,7 @@ impl App {
     /// Withdraws what a robot measured in whole hours, on its site's map.
     ///
     /// # Errors
-    /// Site or robot is not known, the hours are invalid, or they cut through a merged day.
+    /// Site or robot is not known, the hours are invalid, or they cut through a merged day or month.
     pub async fn withdraw(
         &self,
         (site, robot): (&SiteId, &RobotId),

@@ -346,7 +346,16 @@ impl SegmentArchive {
         let keys = file.keys;
         let mut superseded = Vec::new();
         // Not `list`, which refuses files with the same keys.
-        for name in self.names()? {
+        let names = self.names()?;
+        let mut found = names.iter().filter_map(|name| KeyRange::of_name(name));
+        // Its first measurements are in no other file, and would no longer be listed.
+        if found.any(|found| found.first < keys.first && found.overlaps(keys)) {
+            return Err(SegmentArchiveError::Overlap {
+                folder: self.folder.clone(),
+                key: keys.first,
+            });
+        }
+        for name in names {
             if KeyRange::of_name(&name).is_some_and(|found| found.overlaps(keys)) {
                 superseded.push(self.supersede(&name)?);
             }

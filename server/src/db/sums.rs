@@ -287,10 +287,10 @@ pub struct StoredHour {
     pub horizons: Horizons,
 }
 
-/// Returns an hour whose sums are to be merged into its day or month; `None` if there is none. It
-/// looks at each stored hour before a horizon once, not at each sum.
-pub async fn one_unmerged(db: &mut SqliteConnection) -> Result<Option<StoredHour>, DbError> {
-    let row = sqlx::query!(
+/// Returns at most `limit` hours whose sums are to be merged into their days or months, those of a robot
+/// one after the other. It looks at each stored hour before a horizon once, not at each sum.
+pub async fn unmerged(db: &mut SqliteConnection, limit: u32) -> Result<Vec<StoredHour>, DbError> {
+    let rows = sqlx::query!(
         r#"WITH RECURSIVE stored (robot_pk, epoch_h, days_before_h, months_before_h) AS (
                SELECT robots.pk,
                    (SELECT MIN(epoch_h) FROM cell_sums WHERE robot_pk = robots.pk),
@@ -302,6 +302,7 @@ pub async fn one_unmerged(db: &mut SqliteConnection) -> Result<Option<StoredHour
                     WHERE next.robot_pk = stored.robot_pk AND next.epoch_h > stored.epoch_h),
                    days_before_h, months_before_h
                FROM stored WHERE epoch_h < days_before_h
+               ORDER BY 1, 2
            )
            SELECT robot_pk AS "robot_pk!: i64", epoch_h AS "epoch_h!: i64",
                days_before_h AS "days_before_h!: i64", months_before_h AS "months_before_h!: i64"
@@ -309,26 +310,28 @@ pub async fn one_unmerged(db: &mut SqliteConnection) -> Result<Option<StoredHour
            WHERE epoch_h < days_before_h AND epoch_h % 24 <> 0
                OR epoch_h < months_before_h
                    AND strftime('%d %H', epoch_h * 3600, 'unixepoch') <> '01 00'
-           LIMIT 1"#
+           LIMIT ?"#,
+        limit,
     );
-    let row = row.fetch_optional(db).await?;
-    Ok(row.map(|row| StoredHour {
+    let rows = rows.fetch_all(db).await?;
+    let hours = rows.into_iter().map(|row| StoredHour {
         robot_pk: row.robot_pk,
         epoch_h: row.epoch_h,
         horizons: Horizons {
             days_before_h: row.days_before_h,
             months_before_h: row.months_before_h,
         },
-    }))
+    });
+    Ok(hours.collect())
 }
 
 /// Returns at most `limit` sums of one robot and hour, in the order of the table.
 pub async fn of_hour(
     db: &mut SqliteConnection,
-    robot_pk: i64,
-    epoch_h: i64,
-    limit: u32,
+    (robot_pk, epoch_h): (i64, i64),
+    limit: usize,
 ) -> Result<Vec<SumRow>, DbError> {
+    let limit = i64::try_from(limit).unwrap_or(i64::MAX);
     let raw = sqlx::query_as!(
         Raw,
         r#"SELECT site_pk, ix, iy, grid_revision, terrain, terrain_revision, robot_pk,

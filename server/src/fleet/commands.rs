@@ -80,9 +80,11 @@ async fn query(
     // Sending blocks its thread when the robot's link is full.
     let sent = supervisor.blocking(move || {
         let answer = Arc::new(Mutex::new(Some(answer)));
-        for session in sessions {
+        let (mut is_sent, mut failure) = (false, None);
+        // One that is closing fails; the robot may be on another.
+        for session in sessions.iter().rev() {
             let answer = Arc::clone(&answer);
-            session
+            let queried = session
                 .get(&query_key)
                 .payload(payload.clone())
                 .priority(priority)
@@ -98,9 +100,13 @@ async fn query(
                         let _ = waiting.send(reply);
                     }
                 })
-                .wait()?;
+                .wait();
+            match queried {
+                Ok(()) => is_sent = true,
+                Err(error) => failure = Some(error),
+            }
         }
-        Ok::<(), zenoh::Error>(())
+        failure.filter(|_| !is_sent).map_or(Ok(()), Err)
     });
     let exchange = async {
         let sent = sent.await.ok_or(Undelivered::Unreachable)?;

@@ -3,7 +3,7 @@
 //!
 //! A router may stop accepting connections without any error, which only a client can detect.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -16,6 +16,7 @@ use super::opening::client_config;
 use super::probe::PROBE_KEY;
 use super::router_pool::{RouterPool, robots_on};
 use super::routers::Router;
+use crate::app::presence::RobotKey;
 use crate::supervisor::Supervisor;
 
 /// Interval between two probes.
@@ -63,7 +64,11 @@ pub(super) async fn watch(watch: Watch) {
             let failures = failures.entry(number).or_default();
             *failures += 1;
             watch.pool.app.counters().router_probes_failed.one();
-            warn!("the zenoh router did not answer, {failures} of {FAILURES_MAX} times");
+            let robots = router.as_ref().map_or(0, |router| router.robots.len());
+            warn!(
+                router = number,
+                robots, "the zenoh router did not answer, {failures} of {FAILURES_MAX} times"
+            );
             if *failures >= FAILURES_MAX && !watch.stop.is_cancelled() {
                 *failures = 0;
                 reopen(&watch.pool, router.as_ref()).await;
@@ -88,7 +93,19 @@ async fn answers(watch: &Watch, router: &Arc<Router>) -> bool {
 /// one address, as long as it has robots.
 async fn reopen(pool: &RouterPool, former: Option<&Arc<Router>>) {
     let _turn = pool.turn.lock().await;
+    let current = pool.current();
+    let mut robots = pool.app.enrolment_registry().robots();
     if let Some(former) = former {
+        // It was superseded since it was probed.
+        if current.iter().all(|router| router.number != former.number) {
+            return;
+        }
+        // With the newer ones, so that the sizes of routers stay in their order.
+        let of_them = current
+            .iter()
+            .filter(|router| router.number >= former.number);
+        let known: HashSet<&RobotKey> = of_them.flat_map(|router| &router.robots).collect();
+        robots = known.into_iter().cloned().collect();
         let robot_count = robots_on(former).await;
         let is_behind_gate = former.credentials.is_some();
         if robot_count == 0 {
@@ -98,8 +115,6 @@ async fn reopen(pool: &RouterPool, former: Option<&Arc<Router>>) {
             return;
         }
     }
-    let robots = former.map(|former| former.robots.iter().cloned().collect());
-    let robots = robots.unwrap_or_else(|| pool.app.enrolment_registry().robots());
     match pool.open(robots).await {
         Ok(()) => {
             pool.app.counters().router_reopened.one();
@@ -192,7 +207,9 @@ mod tests {
             while robots_on(&router).await > 0 {
                 tokio::time::sleep(Duration::from_millis(20)).await;
             }
+            // Without a gate it is opened again; behind one it is superseded, and closed now.
             reopen(&pool, Some(&router)).await;
+            pool.close_idle().await;
             let numbers = pool.routers.all();
             assert!(numbers.iter().all(|open| open.number != router.number));
             for router in pool.routers.all() {

@@ -136,7 +136,8 @@ mod tests {
                 let sizes: Vec<usize> = open.iter().map(|(robots, _)| robots.len()).collect();
                 prop_assert!(sizes.windows(2).all(|two| two[0] >= 2 * two[1]), "{:?}", sizes);
                 prop_assert!(open.len() <= 1 + fleet.len().ilog2() as usize, "{:?}", sizes);
-                let most = (fleet.len() as f64).log(1.5) + 1.0;
+                let count = f64::from(u32::try_from(fleet.len()).unwrap());
+                let most = count.log(1.5) + 1.0;
                 prop_assert!(moves.values().all(|&moves| f64::from(moves) <= most));
                 prop_assert_eq!(to_open(&groups(&open, signing), &fleet), None);
             }

@@ -102,9 +102,9 @@ impl RouterPool {
     pub(super) fn current(&self) -> Vec<Arc<Router>> {
         let all = self.routers.all();
         let is_superseded = superseded(&self.groups(&all));
-        let with = all.iter().zip(is_superseded);
-        with.filter_map(|(router, is_superseded)| (!is_superseded).then(|| Arc::clone(router)))
-            .collect()
+        let with = all.into_iter().zip(is_superseded);
+        let current = with.filter(|(_, is_superseded)| !is_superseded);
+        current.map(|(router, _)| router).collect()
     }
 
     async fn let_everybody_in(&self) {
@@ -124,7 +124,8 @@ impl RouterPool {
         }
     }
 
-    async fn close_idle(&self) {
+    /// Closes superseded routers that have no robots or are too many.
+    pub(super) async fn close_idle(&self) {
         let all = self.routers.all();
         let is_superseded = superseded(&self.groups(&all));
         let mut counted = Vec::new();

@@ -52,12 +52,21 @@ impl Declared {
                 .wait()
         };
         let reaching = routers.reaching(robot);
-        let publishers = reaching.iter().map(|router| declare(&router.session));
-        let publishers = publishers.collect::<zenoh::Result<Vec<_>>>()?;
-        Ok(Self {
-            version,
-            publishers,
-        })
+        let (mut publishers, mut failure) = (Vec::new(), None);
+        // One that is closing fails; the robot may be on another.
+        for router in reaching {
+            match declare(&router.session) {
+                Ok(publisher) => publishers.push(publisher),
+                Err(error) => failure = Some(error),
+            }
+        }
+        match failure {
+            Some(error) if publishers.is_empty() => Err(error),
+            Some(_) | None => Ok(Self {
+                version,
+                publishers,
+            }),
+        }
     }
 }
 

@@ -282,7 +282,7 @@ async fn merged_with_kills(app: &App) -> u32 {
         );
         restarted.load_map().await.unwrap();
         assert_eq!(said(&restarted).await, expected, "after {rounds} rounds");
-        if !app.merge_some(7).await.unwrap() {
+        if !app.merge_some(1).await.unwrap() {
             break;
         }
         rounds += 1;

@@ -292,7 +292,7 @@ export const ground: Pick<Texts, Areas> = {
     span: 'Zeitraum',
     play: 'Abspielen',
     hold: 'Anhalten',
-    rounded: 'Zeiten werden auf eine Minute abgerundet, oder auf eine Stunde oder einen Tag, deren Messungen gelöscht oder zu viele sind.',
+    rounded: 'Zeiten werden auf eine Minute abgerundet, oder auf eine Stunde, einen Tag oder Monat, deren Messungen gelöscht oder zu viele sind.',
     compared: (from, to) => `Verglichen: ${from} mit ${to}.`,
     since: { hour: 'vor 1 h', day: 'vor 1 Tag', week: 'vor 7 Tagen' },
     inspect: 'Ort auf der Karte',

@@ -293,7 +293,7 @@ export const ground = {
     span: 'Span',
     play: 'Play',
     hold: 'Pause',
-    rounded: 'Times are rounded down to a minute, or to an hour or day whose measurements are gone or too many.',
+    rounded: 'Times are rounded down to a minute, or to an hour, day or month whose measurements are gone or too many.',
     compared: (from: string, to: string) => `Compared: ${from} with ${to}.`,
     since: { hour: '1 h ago', day: '1 d ago', week: '7 d ago' },
     inspect: 'Place on the map',

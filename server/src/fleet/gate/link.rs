@@ -245,7 +245,7 @@ impl Link {
         failures.failed(self.peer.ip(), self.app.clock().elapsed());
     }
 
-    /// Sends the robot its credentials and opens its session at the newest router; returns the
+    /// Sends the robot its credentials and opens its session at the newest router that knows it; returns the
     /// internal connection.
     async fn open(
         &self,

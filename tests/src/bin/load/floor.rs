@@ -17,7 +17,7 @@ const KEY: &str = "floor";
 /// Number of queries, one after the other.
 const QUERIES: usize = 500;
 /// Maximum time for all of them.
-const QUERIES_TIMEOUT: Duration = Duration::from_secs(60);
+const QUERIES_TIMEOUT: Duration = Duration::from_mins(1);
 /// Payload of queries and answers, bytes: that of an offer of a circle.
 const PAYLOAD_BYTES: usize = 600;
 

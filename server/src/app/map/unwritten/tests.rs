@@ -264,9 +264,8 @@ fn a_portion_has_whole_generations_and_none_that_began_later() {
 fn a_robot_in_many_cells_is_stored_in_several_transactions_each_with_its_watermark() {
     let mut unwritten = Unwritten::default();
     let batch = 100;
-    for first in (0..10_000).step_by(batch) {
-        let begin = i32::try_from(first).unwrap();
-        let count = i32::try_from(batch).unwrap();
+    let count = i32::try_from(batch).unwrap();
+    for begin in (0..10_000).step_by(batch) {
         let cells: Table = (begin..begin + count)
             .map(|ix| (key(1, ix, 0), one(1.0)))
             .collect();
