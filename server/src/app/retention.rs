@@ -61,7 +61,7 @@ pub async fn run(app: App, config: RetentionConfig, stop: CancellationToken) {
 impl App {
     /// Archives, if an archive is configured, and removes all measurements beyond the limits of age or
     /// number. A failure of the archive raises an alert. `file_rows_max` is
-    /// [`FILE_ROWS_MAX`](super::archive::FILE_ROWS_MAX), and less in tests.
+    /// [`FILE_ROWS_MAX`], and less in tests.
     ///
     /// # Errors
     /// The database failed.
