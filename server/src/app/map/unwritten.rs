@@ -26,15 +26,16 @@ pub(super) const UNWRITTEN_SUMS_MAX: usize = 200_000;
 /// Maximum number of segments in unwritten sums, which a killed server adds again when it starts.
 pub(super) const UNWRITTEN_SEGMENTS_MAX: u64 = 1_000_000;
 
-/// Number of sums from which a robot's further segments are added to another generation.
-const GENERATION_SUMS: usize = 2_000;
+/// Number of sums from which a robot's further segments are added to another generation, and beyond which
+/// a transaction takes no further generation: receipts wait for it.
+pub(super) const TRANSACTION_SUMS: usize = 2_000;
 
 /// The unwritten sums of all robots.
 #[derive(Debug)]
 pub(super) struct Unwritten {
     /// The generations of each robot, oldest first; at least one.
     robots: BTreeMap<i64, VecDeque<Generation>>,
-    /// [`GENERATION_SUMS`], and fewer in tests.
+    /// [`TRANSACTION_SUMS`], and fewer in tests.
     generation_sums: usize,
     /// Stored watermarks by robot.
     watermarks: HashMap<i64, i64>,
@@ -77,7 +78,7 @@ impl Default for Unwritten {
     fn default() -> Self {
         Self {
             robots: BTreeMap::new(),
-            generation_sums: GENERATION_SUMS,
+            generation_sums: TRANSACTION_SUMS,
             watermarks: HashMap::new(),
             sums: 0,
             segments: 0,

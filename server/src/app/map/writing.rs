@@ -7,14 +7,13 @@ use std::time::Duration;
 
 use tokio_util::sync::CancellationToken;
 
+use super::unwritten::TRANSACTION_SUMS;
 use super::{MapChange, UnwrittenCounts};
 use crate::app::App;
 use crate::db::{self, DbError};
 
 /// Interval at which unwritten sums are stored.
 const WRITE_EVERY: Duration = Duration::from_secs(10);
-/// Number of sums in a transaction beyond which it takes no further ones: receipts wait for it.
-const SUMS_WRITTEN_MAX: usize = 2_000;
 
 /// Stores unwritten sums periodically until the stop.
 pub async fn run(app: App, stop: CancellationToken) {
@@ -53,7 +52,7 @@ impl App {
         let portion = {
             let unwritten = self.maps().unwritten();
             let until = *until.get_or_insert(unwritten.additions());
-            unwritten.portion(until, SUMS_WRITTEN_MAX)
+            unwritten.portion(until, TRANSACTION_SUMS)
         };
         if portion.steps.is_empty() {
             return Ok(false);

@@ -278,11 +278,11 @@ fn a_robot_in_many_cells_is_stored_in_several_transactions_each_with_its_waterma
     let until = unwritten.additions();
     let mut marks = vec![0];
     loop {
-        let portion = unwritten.portion(until, GENERATION_SUMS);
+        let portion = unwritten.portion(until, TRANSACTION_SUMS);
         let [step] = portion.steps.as_slice() else {
             break;
         };
-        assert!(portion.sums.len() <= GENERATION_SUMS + batch);
+        assert!(portion.sums.len() <= TRANSACTION_SUMS + batch);
         assert_eq!(Some(&step.from_pk), marks.last());
         marks.push(step.to_pk);
         unwritten.written(&portion.steps);
