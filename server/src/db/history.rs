@@ -8,6 +8,24 @@ use tread_api::mission::{Actor, MissionEvent, MissionState};
 use super::missions::{cause, state};
 use super::{DbError, corrupt, from_us, parse, to_us, unsigned};
 
+/// Returns the actor, both states and the cause of an event as they are stored.
+fn columns(
+    event: &MissionEvent,
+) -> (
+    &'static str,
+    Option<&'static str>,
+    &'static str,
+    &'static str,
+) {
+    let from = event.from.map(MissionState::as_str);
+    let (actor, to, cause) = (
+        event.actor.as_str(),
+        event.to.as_str(),
+        event.cause.as_str(),
+    );
+    (actor, from, to, cause)
+}
+
 /// Adds the first event of a new mission, and a second one that happened at once.
 pub async fn begin(
     db: &mut SqliteConnection,
@@ -16,19 +34,10 @@ pub async fn begin(
     second: Option<&MissionEvent>,
 ) -> Result<(), DbError> {
     let id = id.to_string();
-    let texts = |event: &MissionEvent| {
-        let from = event.from.map(MissionState::as_str);
-        (
-            event.actor.as_str(),
-            from,
-            event.to.as_str(),
-            event.cause.as_str(),
-        )
-    };
-    let (at_us, (actor, from, to, cause)) = (to_us(first.at), texts(first));
+    let (at_us, (actor, from, to, cause)) = (to_us(first.at), columns(first));
     let then_at_us = second.map(|event| to_us(event.at).max(at_us));
     let (then_actor, then_from, then_to, then_cause) = second
-        .map(texts)
+        .map(columns)
         .map_or((None, None, None, None), |(actor, from, to, cause)| {
             (Some(actor), from, Some(to), Some(cause))
         });
@@ -62,9 +71,8 @@ pub async fn add_event(
     id: MissionId,
     event: &MissionEvent,
 ) -> Result<(), DbError> {
-    let (id, at_us, actor) = (id.to_string(), to_us(event.at), event.actor.as_str());
-    let (from, to) = (event.from.map(MissionState::as_str), event.to.as_str());
-    let cause = event.cause.as_str();
+    let (id, at_us) = (id.to_string(), to_us(event.at));
+    let (actor, from, to, cause) = columns(event);
     sqlx::query!(
         "INSERT INTO mission_events (mission, at_us, actor, from_state, to_state, cause, reason)
          VALUES (?1,
