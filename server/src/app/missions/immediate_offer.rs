@@ -75,7 +75,7 @@ impl App {
     /// Returns whether the reconciler would offer a new mission at once, as the only open one of its
     /// robot: the robot is heard, is not stopped or teleoperated, and not restrained since a
     /// restoration.
-    pub(super) async fn may_offer_at_once(
+    pub(super) async fn may_offer_immediately(
         &self,
         tx: &mut Tx,
         row: &MissionRow,

@@ -166,7 +166,7 @@ impl App {
         };
         // It would start by itself once the robot is free again.
         row.mission.pause_wanted = self.is_operator_controlled(tx, &row.mission).await?;
-        let is_offered = open.is_empty() && self.may_offer_at_once(tx, &row).await?;
+        let is_offered = open.is_empty() && self.may_offer_immediately(tx, &row).await?;
         insert(tx, &row, is_offered).await?;
         Ok(Enqueued { row, is_offered })
     }
