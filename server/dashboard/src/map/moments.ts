@@ -1,4 +1,4 @@
-// The times at which the friction map is looked at: minutes, or ends of hours or days. Pure.
+// The times at which the friction map is looked at: minutes, or ends of hours, days or months. Pure.
 
 export type Span = 'hour' | 'day' | 'week' | 'month';
 export const SPANS: readonly Span[] = ['hour', 'day', 'week', 'month'];

@@ -1,4 +1,4 @@
-// The time of the friction map: the present, or the end of a minute, hour or day that is past; and its play.
+// The time of the friction map: the present, or the end of a minute, hour, day or month that is past; and its play.
 import { momentsOf, momentsWith, type Span } from '../map/moments';
 
 /** How long each time is shown while they play, milliseconds. */

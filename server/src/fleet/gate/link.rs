@@ -245,8 +245,8 @@ impl Link {
         failures.failed(self.peer.ip(), self.app.clock().elapsed());
     }
 
-    /// Sends the robot its credentials and opens its session at the newest router that knows it; returns the
-    /// internal connection.
+    /// Sends the robot its credentials and opens its session at the newest router that knows it;
+    /// returns the internal connection.
     async fn open(
         &self,
         robot: &RobotKey,
