@@ -20,6 +20,7 @@ pub mod counters;
 pub mod db;
 mod doctor;
 mod error_text;
+mod file_error;
 mod file_owner;
 pub mod fleet;
 pub mod formats;

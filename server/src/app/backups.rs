@@ -28,6 +28,7 @@ use crate::backup::manifest::{ArchivedFile, FORMAT};
 use crate::backup::{ArchiveError, Filter, Manifest, Source, folder};
 use crate::build;
 use crate::db::{DbError, copy};
+use crate::file_error::FileError;
 use crate::paths::folder_of;
 
 /// Interval of reports about a copy in progress.
@@ -60,16 +61,8 @@ pub enum BackupError {
         free_mib: u64,
     },
     /// A file operation failed.
-    #[error("cannot {action} `{}`", path.display())]
-    File {
-        /// The operation.
-        action: &'static str,
-        /// The file.
-        path: PathBuf,
-        /// The cause.
-        #[source]
-        cause: io::Error,
-    },
+    #[error(transparent)]
+    File(#[from] FileError),
     /// The database cannot be copied.
     #[error("cannot copy the database")]
     Copy(#[source] DbError),
@@ -85,15 +78,6 @@ pub enum BackupError {
     /// A task of the backup panicked.
     #[error("the backup was interrupted")]
     Interrupted,
-}
-
-fn file_error(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> BackupError {
-    let path = path.to_owned();
-    move |cause| BackupError::File {
-        action,
-        path,
-        cause,
-    }
 }
 
 /// What is backed up, and to where.
@@ -161,11 +145,11 @@ impl BackupLock {
         let path = beside(database, LOCK_ENDING);
         let mut options = OpenOptions::new();
         let options = options.write(true).create(true).truncate(false).mode(0o600);
-        let file = options.open(&path).map_err(file_error("open", &path))?;
+        let file = options.open(&path).map_err(FileError::of("open", &path))?;
         match file.try_lock() {
             Ok(()) => Ok(Self { _file: file }),
             Err(TryLockError::WouldBlock) => Err(BackupError::UnderWay),
-            Err(TryLockError::Error(cause)) => Err(file_error("lock", &path)(cause)),
+            Err(TryLockError::Error(cause)) => Err(FileError::of("lock", &path)(cause).into()),
         }
     }
 }
@@ -181,7 +165,7 @@ impl Drop for CopyFile {
 }
 
 fn free_bytes(folder: &Path) -> Result<u64, BackupError> {
-    let found = statvfs(folder).map_err(|code| file_error("examine", folder)(code.into()))?;
+    let found = statvfs(folder).map_err(|code| FileError::of("examine", folder)(code.into()))?;
     let free = found.blocks_available();
     Ok(free.saturating_mul(found.fragment_size()))
 }
@@ -206,7 +190,7 @@ pub fn check_space(folder: &Path, needed_bytes: u64) -> Result<(), BackupError> 
 fn check_all_space(order: &Order, target: &Path, size: u64) -> Result<(), BackupError> {
     let (here, there) = (folder_of(&order.database), folder_of(target));
     let disk = |folder: &Path| {
-        let about = fs::metadata(folder).map_err(file_error("examine", folder));
+        let about = fs::metadata(folder).map_err(FileError::of("examine", folder));
         about.map(|about| about.dev())
     };
     if disk(here)? == disk(there)? {
@@ -237,7 +221,7 @@ pub async fn make(
     // Left behind by a process that was killed.
     match fs::remove_file(&copy.0) {
         Err(error) if error.kind() != io::ErrorKind::NotFound => {
-            return Err(file_error("remove", &copy.0)(error));
+            return Err(FileError::of("remove", &copy.0)(error).into());
         }
         Ok(()) | Err(_) => {}
     }

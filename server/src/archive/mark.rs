@@ -6,6 +6,7 @@ use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::Path;
 
 use super::SegmentArchiveError;
+use crate::file_error::FileError;
 use crate::paths::folder_of;
 
 /// Keys that were archived without a gap, both included.
@@ -21,7 +22,7 @@ impl Mark {
         let text = match fs::read_to_string(path) {
             Ok(text) => text,
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
-            Err(error) => return Err(SegmentArchiveError::file("read", path)(error)),
+            Err(error) => return Err(FileError::of("read", path)(error).into()),
         };
         let keys = text.trim_end().split_once(' ');
         let mark = keys.and_then(|(first, last)| {
@@ -36,7 +37,7 @@ impl Mark {
     }
 
     /// Writes the mark, so that it survives a power cut.
-    pub(super) fn write(self, path: &Path) -> Result<(), SegmentArchiveError> {
+    pub(super) fn write(self, path: &Path) -> Result<(), FileError> {
         let mut new = path.as_os_str().to_owned();
         new.push(".new");
         let new = Path::new(&new);
@@ -49,6 +50,6 @@ impl Mark {
             fs::rename(new, path)?;
             File::open(folder_of(path))?.sync_all()
         };
-        written().map_err(SegmentArchiveError::file("write", path))
+        written().map_err(FileError::of("write", path))
     }
 }

@@ -35,6 +35,7 @@ use tread_api::ids::{RobotId, SiteId, TerrainId};
 use self::mark::Mark;
 use self::read::OpenFile;
 pub use self::write::{Finished, Writer};
+use crate::file_error::FileError;
 
 /// Number of rows of a row group, which is read and checked as a whole.
 pub const ROW_GROUP_ROWS: usize = 16_384;
@@ -161,16 +162,8 @@ pub struct Found {
 #[derive(Debug, thiserror::Error)]
 pub enum SegmentArchiveError {
     /// An operation on a file failed.
-    #[error("cannot {action} `{}`", path.display())]
-    File {
-        /// The operation.
-        action: &'static str,
-        /// The file or folder.
-        path: PathBuf,
-        /// The cause.
-        #[source]
-        cause: io::Error,
-    },
+    #[error(transparent)]
+    File(#[from] FileError),
     /// A file is damaged, or was not written by this program.
     #[error("`{}` is damaged or no file of this archive: {what}", path.display())]
     Damaged {
@@ -215,17 +208,6 @@ pub enum SegmentArchiveError {
     },
 }
 
-impl SegmentArchiveError {
-    fn file(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Self {
-        let path = path.to_owned();
-        move |cause| Self::File {
-            action,
-            path,
-            cause,
-        }
-    }
-}
-
 /// Files of the archive and their folder.
 #[derive(Debug, Clone)]
 pub struct SegmentArchive {
@@ -248,19 +230,19 @@ impl SegmentArchive {
         self.folder.join(keys.name())
     }
 
-    fn create_folder(&self) -> Result<(), SegmentArchiveError> {
+    fn create_folder(&self) -> Result<(), FileError> {
         let mut builder = DirBuilder::new();
         let created = builder.recursive(true).mode(0o700).create(&self.folder);
-        created.map_err(SegmentArchiveError::file("create", &self.folder))
+        created.map_err(FileError::of("create", &self.folder))
     }
 
     /// Returns the names in the folder; none if the folder does not exist.
     fn names(&self) -> Result<Vec<String>, SegmentArchiveError> {
-        let failed = || SegmentArchiveError::file("read the folder", &self.folder);
+        let failed = || FileError::of("read the folder", &self.folder);
         let entries = match fs::read_dir(&self.folder) {
             Ok(entries) => entries,
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
-            Err(error) => return Err(failed()(error)),
+            Err(error) => return Err(failed()(error).into()),
         };
         let mut names = Vec::new();
         for entry in entries {
@@ -319,7 +301,7 @@ impl SegmentArchive {
         let unfinished: Vec<&String> = names.iter().filter(is_unfinished).collect();
         for name in &unfinished {
             let path = self.folder.join(name);
-            fs::remove_file(&path).map_err(SegmentArchiveError::file("remove", &path))?;
+            fs::remove_file(&path).map_err(FileError::of("remove", &path))?;
         }
         Ok(unfinished.len())
     }
@@ -377,14 +359,14 @@ impl SegmentArchive {
         });
         let target = targets.find(|target| !target.exists());
         let target = target.unwrap_or_else(|| self.folder.join(name));
-        fs::rename(&path, &target).map_err(SegmentArchiveError::file("rename", &path))?;
+        fs::rename(&path, &target).map_err(FileError::of("rename", &path))?;
         Ok(target)
     }
 
-    fn sync_folder(&self) -> Result<(), SegmentArchiveError> {
+    fn sync_folder(&self) -> Result<(), FileError> {
         let folder = &self.folder;
         let synced = File::open(folder).and_then(|folder| folder.sync_all());
-        synced.map_err(SegmentArchiveError::file("sync", folder))
+        synced.map_err(FileError::of("sync", folder))
     }
 
     /// Records that the measurements with these keys are archived.
@@ -399,7 +381,7 @@ impl SegmentArchive {
             Some(_) | None => keys.first,
         };
         let last = keys.last;
-        Mark { first, last }.write(&self.mark)
+        Ok(Mark { first, last }.write(&self.mark)?)
     }
 
     /// Reads at most `limit` measurements by their keys. The search ends earlier after

@@ -12,6 +12,7 @@ use tread_api::ids::{RobotId, SiteId, TerrainId};
 use super::fault::{Fault, fault, guarded};
 use super::rows::{Columns, Names, Values};
 use super::{ArchivedSegment, Found, KeyRange, SegmentArchiveError, Selection, checksum, schema};
+use crate::file_error::FileError;
 
 /// A row group: its keys, its bytes in the file, and their checksum.
 #[derive(Debug, Clone)]
@@ -35,7 +36,7 @@ impl OpenFile {
     /// Opens a file that contains these keys.
     pub(super) fn open(path: &Path, keys: KeyRange) -> Result<Self, SegmentArchiveError> {
         let opened = File::open(path);
-        let file = opened.map_err(SegmentArchiveError::file("open", path))?;
+        let file = opened.map_err(FileError::of("open", path))?;
         guarded(path, || {
             let footer_at = checksum::check_footer(&file)?;
             let reader = SerializedFileReader::new(file.try_clone()?)?;

@@ -15,6 +15,7 @@ use tread_api::friction::{Information, Segment};
 
 use super::checksum::{self, Summed};
 use super::{ArchivedSegment, KeyRange, ROW_GROUP_ROWS, SegmentArchiveError, read_path, schema};
+use crate::file_error::FileError;
 
 /// Writes the measurements of one file.
 pub struct Writer {
@@ -64,9 +65,9 @@ impl Finished {
         read_path(&self.partial.0, self.keys, after, limit)
     }
 
-    pub(super) fn rename(&self, target: &Path) -> Result<(), SegmentArchiveError> {
+    pub(super) fn rename(&self, target: &Path) -> Result<(), FileError> {
         let path = &self.partial.0;
-        fs::rename(path, target).map_err(SegmentArchiveError::file("rename", path))
+        fs::rename(path, target).map_err(FileError::of("rename", path))
     }
 }
 
@@ -80,7 +81,7 @@ impl Writer {
         // Read again for the checksum of the footer.
         options.read(true).write(true).create(true).truncate(true);
         let opened = options.mode(0o600).open(&path);
-        let file = opened.map_err(SegmentArchiveError::file("create", &path))?;
+        let file = opened.map_err(FileError::of("create", &path))?;
         let partial = Partial(path);
         let written = |file| {
             let columns = Arc::new(schema::columns()?);
@@ -158,7 +159,7 @@ impl Writer {
             checksum::seal_footer(file)?;
             file.sync_all()
         };
-        sealed(summed.file()).map_err(SegmentArchiveError::file("write", &partial.0))?;
+        sealed(summed.file()).map_err(FileError::of("write", &partial.0))?;
         Ok(Finished { keys, partial })
     }
 }

@@ -16,6 +16,7 @@ use tar::{Builder, EntryType, Header};
 pub use self::extraction::{Extracted, extract, manifest, verify};
 use super::encryption::{EncryptionError, Filter};
 use super::manifest::{ArchivedFile, FORMAT, Manifest};
+use crate::file_error::FileError;
 use crate::paths::folder_of;
 
 /// Name of the manifest's entry, the first of an archive.
@@ -43,16 +44,8 @@ pub const AUTHORITY_FILES_MAX: usize = 64;
 #[derive(Debug, thiserror::Error)]
 pub enum ArchiveError {
     /// A file operation failed.
-    #[error("cannot {action} `{}`", path.display())]
-    File {
-        /// The operation.
-        action: &'static str,
-        /// The file.
-        path: PathBuf,
-        /// The cause.
-        #[source]
-        cause: io::Error,
-    },
+    #[error(transparent)]
+    File(#[from] FileError),
     /// Encryption or decryption failed.
     #[error(transparent)]
     Encryption(#[from] EncryptionError),
@@ -97,15 +90,6 @@ pub enum ArchiveError {
     /// The file on the disk differs from the written data.
     #[error("the backup `{}` does not read back as it was written: the disk is unreliable", .0.display())]
     NotReadBack(PathBuf),
-}
-
-fn file_error(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> ArchiveError {
-    let path = path.to_owned();
-    move |cause| ArchiveError::File {
-        action,
-        path,
-        cause,
-    }
 }
 
 /// Content of an archive.
@@ -224,7 +208,7 @@ fn hex(bytes: &[u8]) -> String {
 /// # Errors
 /// It cannot be read.
 pub fn describe_file(path: &Path, name: &str) -> Result<ArchivedFile, ArchiveError> {
-    let failed = || file_error("read", path);
+    let failed = || FileError::of("read", path);
     let mut file = Hashing::new(File::open(path).map_err(failed())?);
     let mut piece = vec![0; PIECE_BYTES];
     while file.read(&mut piece).map_err(failed())? > 0 {}
@@ -261,7 +245,7 @@ pub fn write(
     let _ = fs::remove_file(&partial);
     let written = write_new(&partial, source, encryption, progress).and_then(|archived| {
         read_back(&partial, &archived)?;
-        fs::rename(&partial, target).map_err(file_error("rename to", target))?;
+        fs::rename(&partial, target).map_err(FileError::of("rename to", target))?;
         sync_folder(target)?;
         Ok(archived)
     });
@@ -282,10 +266,10 @@ pub fn partial_name(target: &Path) -> PathBuf {
 ///
 /// # Errors
 /// The folder cannot be synced.
-pub fn sync_folder(file: &Path) -> Result<(), ArchiveError> {
+pub fn sync_folder(file: &Path) -> Result<(), FileError> {
     let folder = folder_of(file);
     let synced = File::open(folder).and_then(|folder| folder.sync_all());
-    synced.map_err(file_error("sync", folder))
+    synced.map_err(FileError::of("sync", folder))
 }
 
 fn write_new(
@@ -294,7 +278,7 @@ fn write_new(
     encryption: Option<&Filter>,
     progress: &mut dyn FnMut(u64),
 ) -> Result<Archived, ArchiveError> {
-    let failed = || file_error("write", partial);
+    let failed = || FileError::of("write", partial);
     let mut options = OpenOptions::new();
     let file = options.write(true).create_new(true).mode(MODE);
     let file = file.open(partial).map_err(failed())?;
@@ -319,7 +303,7 @@ fn write_new(
         let input = BufWriter::with_capacity(PIECE_BYTES, input);
         let packed = pack(input, partial, source, progress);
         // This closes the command's input; otherwise the command would wait for more.
-        let packed = packed.and_then(|mut input| input.flush().map_err(failed()));
+        let packed = packed.and_then(|mut input| Ok(input.flush().map_err(failed())?));
         (packed, copying.join())
     });
     let copied = copied.unwrap_or_else(|_panic| Err(io::Error::other("a thread panicked")));
@@ -340,7 +324,7 @@ fn pack<W: Write>(
     source: &Source<'_>,
     progress: &mut dyn FnMut(u64),
 ) -> Result<W, ArchiveError> {
-    let failed = || file_error("write", partial);
+    let failed = || FileError::of("write", partial);
     let mut tar = Builder::new(output);
     let manifest = source.manifest;
     let time_s = u64::try_from(manifest.taken_at.as_second()).unwrap_or_default();
@@ -352,7 +336,7 @@ fn pack<W: Write>(
         append(&mut tar, &name, (bytes, time_s), &**content).map_err(failed())?;
     }
     let copy = source.database;
-    let opened = File::open(copy).map_err(file_error("read", copy))?;
+    let opened = File::open(copy).map_err(FileError::of("read", copy))?;
     let counting = Counting {
         inner: BufReader::with_capacity(PIECE_BYTES, opened),
         bytes: 0,
@@ -363,7 +347,7 @@ fn pack<W: Write>(
     let sum = hex(ring::digest::digest(&SHA256, &text).as_ref());
     let size = (sum.len() as u64, time_s);
     append(&mut tar, MANIFEST_SUM_NAME, size, sum.as_bytes()).map_err(failed())?;
-    tar.into_inner().map_err(failed())
+    Ok(tar.into_inner().map_err(failed())?)
 }
 
 /// Reader that reports its progress.
@@ -398,7 +382,7 @@ fn append<W: Write>(
 
 /// Reads a file from the disk and compares it with the written data.
 fn read_back(partial: &Path, written: &Archived) -> Result<(), ArchiveError> {
-    let file = File::open(partial).map_err(file_error("read", partial))?;
+    let file = File::open(partial).map_err(FileError::of("read", partial))?;
     // Otherwise the check would only read the cache of the operating system. If the call fails, the
     // check is weaker, but the backup is the same.
     let _ = posix_fadvise(&file, 0, 0, PosixFadviseAdvice::POSIX_FADV_DONTNEED);

@@ -12,10 +12,11 @@ use tokio_util::sync::CancellationToken;
 use tracing::{error, info};
 use tread_api::robot::Severity;
 
-use super::{BackupError, Order, file_error, make};
+use super::{BackupError, Order, make};
 use crate::app::App;
 use crate::backup::{Filter, folder};
 use crate::config::backup::BackupConfig;
+use crate::file_error::FileError;
 
 /// Code of the alert about a backup that could not be made.
 pub const BACKUP_FAILED_ALERT: &str = "backup-failed";
@@ -174,7 +175,7 @@ impl Scheduler {
         let path = config.folder.clone();
         let mut builder = DirBuilder::new();
         let made = builder.recursive(true).mode(0o700).create(&path);
-        made.map_err(file_error("create", &path))?;
+        made.map_err(FileError::of("create", &path))?;
         let order = Order {
             database,
             authority,

@@ -11,11 +11,11 @@ use tar::Archive;
 
 use super::{
     AUTHORITY_FILE_BYTES_MAX, AUTHORITY_FILES_MAX, AUTHORITY_FOLDER, ArchiveError, Archived,
-    Hashing, MANIFEST_BYTES_MAX, MANIFEST_NAME, MANIFEST_SUM_NAME, MODE, PIECE_BYTES, file_error,
-    hex,
+    Hashing, MANIFEST_BYTES_MAX, MANIFEST_NAME, MANIFEST_SUM_NAME, MODE, PIECE_BYTES, hex,
 };
 use crate::backup::encryption::{Filter, Filtered, Opening};
 use crate::backup::manifest::{ArchivedFile, FORMAT, Manifest};
+use crate::file_error::FileError;
 
 /// Extracted content of an archive.
 #[derive(Debug)]
@@ -32,7 +32,7 @@ pub struct Extracted {
 /// [`ArchiveError`].
 pub fn manifest(path: &Path, key: Option<&Filter>) -> Result<Manifest, ArchiveError> {
     let mut archive = open(path, key)?;
-    let mut entries = archive.entries().map_err(file_error("read", path))?;
+    let mut entries = archive.entries().map_err(FileError::of("read", path))?;
     Ok(next_manifest(path, &mut entries)?.0)
 }
 
@@ -42,7 +42,7 @@ fn open(
     path: &Path,
     key: Option<&Filter>,
 ) -> Result<Archive<Opening<BufReader<File>>>, ArchiveError> {
-    let file = File::open(path).map_err(file_error("read", path))?;
+    let file = File::open(path).map_err(FileError::of("read", path))?;
     let Some(filter) = key else {
         let input = BufReader::with_capacity(PIECE_BYTES, file);
         return Ok(Archive::new(Opening::Plain(input)));
@@ -82,7 +82,7 @@ fn next_manifest(
     }
     let mut text = Vec::new();
     let read = entry.take(MANIFEST_BYTES_MAX).read_to_end(&mut text);
-    read.map_err(file_error("read", path))?;
+    read.map_err(FileError::of("read", path))?;
     let head: Head = serde_json::from_slice(&text).map_err(|cause| no_backup(cause.to_string()))?;
     if head.format > FORMAT {
         return Err(ArchiveError::Newer {
@@ -114,9 +114,9 @@ pub fn extract(
     let file = options.write(true).create_new(true).mode(MODE);
     let mut file = file
         .open(database)
-        .map_err(file_error("create", database))?;
+        .map_err(FileError::of("create", database))?;
     let extracted = extract_into(path, key, (&mut file, database), progress).and_then(|found| {
-        file.sync_all().map_err(file_error("write", database))?;
+        file.sync_all().map_err(FileError::of("write", database))?;
         Ok(found)
     });
     if extracted.is_err() {
@@ -141,7 +141,7 @@ fn extract_into(
     (output, database): (&mut dyn Write, &Path),
     progress: &mut dyn FnMut(u64),
 ) -> Result<Extracted, ArchiveError> {
-    let unreadable = || file_error("read", path);
+    let unreadable = || FileError::of("read", path);
     let mut archive = open(path, key)?;
     let mut entries = archive.entries().map_err(unreadable())?;
     let (manifest, read_manifest) = next_manifest(path, &mut entries)?;
@@ -173,7 +173,7 @@ fn extract_into(
             break;
         }
         let written = output.write_all(&piece[..read]);
-        written.map_err(file_error("write", database))?;
+        written.map_err(FileError::of("write", database))?;
         progress(entry.bytes);
     }
     compare(&manifest.database, &entry.done().1)?;
@@ -212,7 +212,7 @@ fn next_entry<'entries>(
 ) -> Result<tar::Entry<'entries, Opening<BufReader<File>>>, ArchiveError> {
     let missing = || ArchiveError::Incomplete(expected.name.clone());
     let entry = entries.next().ok_or_else(missing)?;
-    let entry = entry.map_err(file_error("read", path))?;
+    let entry = entry.map_err(FileError::of("read", path))?;
     if &*entry.path_bytes() == expected.name.as_bytes() {
         Ok(entry)
     } else {
