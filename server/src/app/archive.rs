@@ -16,6 +16,7 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use jiff::Timestamp;
 use jiff::tz::TimeZone;
@@ -42,6 +43,8 @@ pub const FILE_ROWS_MAX: u32 = 1_000_000;
 const CHUNK_ROWS: u32 = 16_384;
 /// Maximum number of requests that read files at the same time; each holds one row group in memory.
 const READERS_MAX: usize = 2;
+/// Maximum time for which a request waits until it may read files.
+const READ_WAIT_MAX: Duration = Duration::from_secs(5);
 /// Suffix of the mark, after the name of the database.
 const MARK_ENDING: &str = ".archived";
 
@@ -88,8 +91,11 @@ impl Archive {
         &self,
         work: impl FnOnce(&SegmentArchive) -> Result<T, SegmentArchiveError> + Send + 'static,
     ) -> Result<T, AppError> {
-        // Never closed, so that this waits for a turn.
-        let turn = Arc::clone(&self.readers).acquire_owned().await;
+        let turn = Arc::clone(&self.readers).acquire_owned();
+        let Ok(turn) = tokio::time::timeout(READ_WAIT_MAX, turn).await else {
+            let folder = self.files.folder().to_owned();
+            return Err(AppError::Archive(SegmentArchiveError::Busy { folder }));
+        };
         self.off_thread(move |files| {
             let _turn = turn;
             work(files)
@@ -356,5 +362,39 @@ impl Written {
             Self::Named(keys) => files.read_file(*keys, after, limit),
             Self::Finished(finished) => finished.read(after, limit),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn a_reader_whose_disk_hangs_keeps_its_turn_and_others_are_refused_in_time() {
+        let folder = tempfile::tempdir().unwrap();
+        let archive = Archive::new(
+            folder.path().join("archive"),
+            &folder.path().join("tread.db"),
+        );
+        let (release, hanging) = std::sync::mpsc::channel::<()>();
+        let hanging = Arc::new(Mutex::new(hanging));
+        for _ in 0..READERS_MAX {
+            let hanging = Arc::clone(&hanging);
+            let reading = archive.read_in_turn(move |_| {
+                // Ends when the other side is dropped.
+                let _ = hanging.lock().unwrap().recv();
+                Ok(())
+            });
+            // The request is gone; its thread is not.
+            let gone = tokio::time::timeout(Duration::from_millis(10), reading).await;
+            assert!(gone.is_err());
+        }
+        let refused = archive.read_in_turn(|_| Ok(())).await;
+        assert!(matches!(
+            refused,
+            Err(AppError::Archive(SegmentArchiveError::Busy { .. }))
+        ));
+        drop(release);
+        archive.read_in_turn(|_| Ok(())).await.unwrap();
     }
 }

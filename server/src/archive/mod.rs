@@ -200,6 +200,15 @@ pub enum SegmentArchiveError {
         /// A key that is in both files.
         key: i64,
     },
+    /// Other requests read the archive for too long.
+    #[error(
+        "other requests read the archive `{}`, or its disk does not answer: ask again later",
+        folder.display()
+    )]
+    Busy {
+        /// The folder.
+        folder: PathBuf,
+    },
     /// A new file has other contents than were written to it.
     #[error("a new file in `{}` does not contain what was written: examine the disk", folder.display())]
     NotAsWritten {
