@@ -131,14 +131,18 @@ impl App {
         Some(archive.lock().failure.is_some())
     }
 
-    /// Removes what a killed server left unfinished.
+    /// Removes what a killed server left unfinished, and checks that files can be written, long before
+    /// the first measurements are due.
     pub(super) async fn prepare_archive(&self) -> Result<(), AppError> {
         let Some(archive) = self.archive() else {
             return Ok(());
         };
-        let removed = archive
-            .off_thread(SegmentArchive::remove_unfinished)
-            .await?;
+        let preparing = |files: &SegmentArchive| {
+            let removed = files.remove_unfinished()?;
+            files.check_writable()?;
+            Ok(removed)
+        };
+        let removed = archive.off_thread(preparing).await?;
         if removed > 0 {
             let folder = archive.files.folder().display();
             info!("removed {removed} unfinished files of a former run from the archive `{folder}`");

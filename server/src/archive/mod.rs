@@ -23,9 +23,9 @@ mod tests;
 mod write;
 
 use std::collections::BTreeSet;
-use std::fs::{self, DirBuilder, File};
+use std::fs::{self, DirBuilder, File, OpenOptions};
 use std::io;
-use std::os::unix::fs::DirBuilderExt as _;
+use std::os::unix::fs::{DirBuilderExt as _, OpenOptionsExt as _};
 use std::path::{Path, PathBuf};
 
 use parquet::errors::ParquetError;
@@ -50,6 +50,8 @@ const PREFIX: &str = "segments-";
 const ENDING: &str = ".parquet";
 /// End of the name of a file that is being written.
 const PARTIAL_ENDING: &str = ".parquet.partial";
+/// Name of a file that is created and removed at once. It is one of those that are removed if they remain.
+const PROBE_NAME: &str = "segments-probe.parquet.partial";
 /// End of the name of a file whose keys were given to other measurements.
 const SUPERSEDED_ENDING: &str = ".superseded";
 /// End of the name of a file that a person has given up.
@@ -313,6 +315,21 @@ impl SegmentArchive {
             fs::remove_file(&path).map_err(FileError::of("remove", &path))?;
         }
         Ok(unfinished.len())
+    }
+
+    /// Checks that the folder is the right one and that files can be written there. Creates it if it is
+    /// missing and nothing was archived yet.
+    ///
+    /// # Errors
+    /// The last archived file is missing, or no file can be written.
+    pub fn check_writable(&self) -> Result<(), SegmentArchiveError> {
+        self.check_end(&self.list()?, i64::MAX)?;
+        self.create_folder()?;
+        let path = self.folder.join(PROBE_NAME);
+        let mut options = OpenOptions::new();
+        let created = options.write(true).create(true).mode(0o600).open(&path);
+        created.map_err(FileError::of("create", &path))?;
+        Ok(fs::remove_file(&path).map_err(FileError::of("remove", &path))?)
     }
 
     /// Begins a file with these keys, under a temporary name.

@@ -376,3 +376,26 @@ fn a_search_ends_after_so_many_files_and_goes_on_from_there() {
         .unwrap();
     assert_eq!((rest.segments.len(), rest.searched_to), (3, count));
 }
+
+#[test]
+fn a_folder_is_examined_before_anything_is_written_and_nothing_remains_of_that() {
+    let folder = tempfile::tempdir().unwrap();
+    let good = archive(folder.path());
+    good.check_writable().unwrap();
+    let entries = fs::read_dir(good.folder()).unwrap();
+    assert_eq!(entries.count(), 0);
+    // The kernel lets nobody make a folder there, not even root.
+    let mark = folder.path().join("other.archived");
+    let wrong = SegmentArchive::new("/proc/archive".into(), mark);
+    assert!(wrong.list().unwrap().files.is_empty());
+    let refused = wrong.check_writable().unwrap_err().to_string();
+    assert!(refused.contains("/proc/archive"), "{refused}");
+    // Where the disk of the archive is not mounted, no folder is made in its place.
+    write(&good, &rows(1, 3));
+    fs::remove_dir_all(good.folder()).unwrap();
+    assert!(matches!(
+        good.check_writable(),
+        Err(SegmentArchiveError::Missing { key: 3, .. })
+    ));
+    assert!(!good.folder().exists());
+}
