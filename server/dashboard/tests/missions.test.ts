@@ -78,7 +78,31 @@ test('a circle is drawn with the mouse, tried, sent, driven, and shown with what
   await page.locator('[data-test="detail"]').getByText(`${rms.toFixed(1)} mm`).first().waitFor();
   await shot(page, 'history');
   await replayed(page, ended);
+  await staysClosed(page);
 });
+
+/** Closes a mission while the server has not answered: the answer does not open it again. */
+async function staysClosed(page: Page): Promise<void> {
+  let release = () => {};
+  const held = new Promise<void>((resolve) => (release = resolve));
+  const address = /\/v1\/missions\/[0-9a-f-]{36}$/;
+  await page.route(address, async (route) => {
+    await held;
+    await route.continue();
+  });
+  const asked = page.waitForRequest(address);
+  await page.locator('.ended button').first().click();
+  await asked;
+  const detail = page.locator('[data-test="detail"]');
+  await detail.getByRole('button', { name: 'Close' }).click();
+  await detail.waitFor({ state: 'detached' });
+  const planned = page.waitForResponse(/\/path$/);
+  release();
+  await planned;
+  await page.waitForTimeout(300);
+  expect(await detail.count()).toBe(0);
+  await page.unroute(address);
+}
 
 /** Goes along the time line of an ended mission, by keys and by itself. */
 async function replayed(page: Page, mission: MissionDetail): Promise<void> {

@@ -100,8 +100,18 @@ test('a webhook is made, tested, changed, disabled and removed on the page, and 
   await press('Replace the secret for good');
   await eventually('another secret', async () => (await note.locator('code').innerText()).trim() !== secret);
   const next = (await note.locator('code').innerText()).trim();
+  // The answer about this test is held until the next one is over.
+  let release = () => {};
+  const held = new Promise<void>((resolve) => (release = resolve));
+  let holds = 0;
+  await page.route(/\/deliveries/, async (route) => {
+    const answer = await route.fetch();
+    holds += 1;
+    if (holds === 1) await held;
+    await route.fulfill({ response: answer });
+  });
   await press('Send a test');
-  await eventually('the test of the new secret', async () => received.length === 2);
+  await eventually('the test of the new secret', async () => received.length === 2 && holds === 1);
   const [, second] = received;
   expect(second && genuine(next, second) && !genuine(secret, second)).toBe(true);
   await note.getByRole('button', { name: 'Dismiss' }).click();
@@ -120,6 +130,12 @@ test('a webhook is made, tested, changed, disabled and removed on the page, and 
   status = 500;
   await press('Send a test');
   await card.getByText(/^The test has not arrived: .*500.*It is sent again\.$/).waitFor();
+  // An older answer that comes now changes neither what is said of the newer test nor the log.
+  const answered = page.waitForResponse(/\/deliveries/);
+  release();
+  await answered;
+  await page.waitForTimeout(700);
+  await card.getByText(/^The test has not arrived: /).waitFor();
   expect((await newest.innerText()).replace(/\s+/g, ' ')).toMatch(/ test: waits 1 attempt, HTTP status 500, next attempt \d{4}-\d\d-\d\d/);
   await press('Disable');
   await card.getByText('disabled', { exact: true }).waitFor();

@@ -58,6 +58,8 @@ export class View {
   wanted = $state.raw<{ points: PointM[] } | null>(null);
 
   #cells: CellFriction[] = [];
+  /** Number of the last mission that was asked for. */
+  #asked = 0;
   /** What of the map can be seen, and what of it was read. */
   #seen: Bounds | null = null;
   #window: Window | null = null;
@@ -187,12 +189,15 @@ export class View {
     return modelLabel(configuration, this.configurations, (one) => this.modelOf(one));
   }
 
+  /** Opens a mission, unless another is opened or it is closed before the server has answered. */
   async open(mission: string): Promise<void> {
+    const mine = (this.#asked += 1);
     try {
       const detail = await ask<MissionDetail>(`/v1/missions/${mission}`);
       // What a robot has refused may have no path at all.
       const path = `/v1/missions/${mission}/path`;
       const plan = detail.state === 'rejected' ? null : await ask<PlannedPath>(path).catch(() => null);
+      if (mine !== this.#asked) return;
       this.detail = detail;
       this.plan = plan;
       this.detailProblem = null;
@@ -202,12 +207,14 @@ export class View {
         this.replay = hasEnded(detail) ? new Replay(detail, plan, () => (this.fleet.isDirty = true)) : null;
       }
     } catch (error) {
+      if (mine !== this.#asked) return;
       this.detailProblem = sentence(error);
     }
     this.fleet.isDirty = true;
   }
 
   close(): void {
+    this.#asked += 1;
     this.detail = null;
     this.plan = null;
     this.replay?.pause();
