@@ -79,9 +79,10 @@ export function drawGround(context: CanvasRenderingContext2D, camera: Camera, sc
   const palette = PALETTES[scene.theme];
   context.fillStyle = palette.ground;
   context.fillRect(0, 0, camera.width, camera.height);
-  if (scene.showTerrains) drawTerrains(context, camera, scene, palette);
+  if (scene.showTerrains) drawTerrains(context, camera, scene);
   if (scene.friction) drawFriction(context, camera, scene.friction);
   drawGrid(context, camera, palette);
+  if (scene.showTerrains) labelTerrains(context, camera, scene, palette);
   if (scene.inspected && scene.friction) drawInspected(context, camera, scene.inspected, scene.friction.cellM, palette);
   if (scene.showFence && scene.fence) drawFence(context, camera, scene.fence, palette);
   drawPaths(context, camera, scene, palette);
@@ -127,11 +128,8 @@ function label(
   context.fillText(text, x, y);
 }
 
-function drawTerrains(context: CanvasRenderingContext2D, camera: Camera, scene: Scene, palette: Palette): void {
-  context.font = '12px system-ui, sans-serif';
-  context.textAlign = 'center';
-  const terrains = [...scene.terrains].sort((a, b) => a.layer - b.layer);
-  for (const terrain of terrains) {
+function drawTerrains(context: CanvasRenderingContext2D, camera: Camera, scene: Scene): void {
+  for (const terrain of [...scene.terrains].sort((a, b) => a.layer - b.layer)) {
     trace(context, camera, terrain.polygon);
     context.closePath();
     context.fillStyle = groundFill(terrain.class, scene.theme);
@@ -140,7 +138,13 @@ function drawTerrains(context: CanvasRenderingContext2D, camera: Camera, scene: 
     context.strokeStyle = groundLine(terrain.class, scene.theme);
     context.stroke();
   }
-  for (const terrain of terrains) {
+}
+
+/** Writes the names of terrains, above the friction measured there. */
+function labelTerrains(context: CanvasRenderingContext2D, camera: Camera, scene: Scene, palette: Palette): void {
+  context.font = '12px system-ui, sans-serif';
+  context.textAlign = 'center';
+  for (const terrain of scene.terrains) {
     const at = camera.toPx(labelPlace(terrain.polygon));
     const text = `${terrain.name} · ${texts.terrains.classes[terrain.class]}`;
     // From far names would only cover each other.

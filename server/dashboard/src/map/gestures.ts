@@ -13,7 +13,7 @@ const REST_PX = 10;
 /** Factor of one step of the wheel, per pixel. */
 const WHEEL_FACTOR = 0.0015;
 
-export interface Hands {
+export interface GestureHandlers {
   draft(): Draft | null;
   changed(): void;
   /** The camera moved. */
@@ -30,8 +30,8 @@ type Drag =
   | { what: 'point'; index: number; from: PointPx }
   | { what: 'circle'; from: PointPx };
 
-/** Lets hands work on a canvas; gives what ends it. */
-export function attach(canvas: HTMLCanvasElement, camera: Camera, hands: Hands): () => void {
+/** Calls handlers for gestures of mouse and fingers on a canvas; returns what detaches them. */
+export function attach(canvas: HTMLCanvasElement, camera: Camera, handlers: GestureHandlers): () => void {
   const pointers = new Map<number, PointPx>();
   let drag: Drag | null = null;
 
@@ -50,7 +50,7 @@ export function attach(canvas: HTMLCanvasElement, camera: Camera, hands: Hands):
       drag = null;
       return;
     }
-    const draft = hands.draft();
+    const draft = handlers.draft();
     const near = draft && draft.kind !== 'circle' ? draft.nearest(camera.toM(at), REACH_PX / camera.scale) : null;
     if (draft && near !== null) {
       draft.mark();
@@ -70,19 +70,19 @@ export function attach(canvas: HTMLCanvasElement, camera: Camera, hands: Hands):
     wasLongPress = false;
     clearTimeout(resting);
     resting = setTimeout(() => {
-      if (drag?.what !== 'point' || hands.draft() !== draft) return;
+      if (drag?.what !== 'point' || handlers.draft() !== draft) return;
       drag = null;
       wasLongPress = true;
       // Where it was before the finger trembled.
       draft.undo();
       draft.remove(index);
-      hands.changed();
+      handlers.changed();
     }, LONG_PRESS_MS);
   };
 
   const move = (event: PointerEvent) => {
     const at = place(event);
-    hands.over(at);
+    handlers.over(at);
     const before = pointers.get(event.pointerId);
     if (!before) return;
     pointers.set(event.pointerId, at);
@@ -90,16 +90,16 @@ export function attach(canvas: HTMLCanvasElement, camera: Camera, hands: Hands):
       pinch(event.pointerId, before, at);
       return;
     }
-    const draft = hands.draft();
+    const draft = handlers.draft();
     if (drag?.what === 'press' && distance(drag.from, at) > CLICK_PX) drag = { what: 'pan', at: drag.from };
     if (drag?.what === 'pan') {
       camera.pan(at.x - drag.at.x, at.y - drag.at.y);
       drag.at = at;
-      hands.moved();
+      handlers.moved();
     } else if (drag?.what === 'point' && draft) {
       if (distance(drag.from, at) > REST_PX) clearTimeout(resting);
       draft.move(drag.index, camera.toM(at));
-      hands.changed();
+      handlers.changed();
     } else if (drag?.what === 'circle' && draft && distance(drag.from, at) > CLICK_PX) {
       drawCircle(draft, drag.from, at);
     }
@@ -110,7 +110,7 @@ export function attach(canvas: HTMLCanvasElement, camera: Camera, hands: Hands):
     if (!isDrawing) draft.mark();
     isDrawing = true;
     draft.setCircle(camera.toM(from), distance(from, to) / camera.scale);
-    hands.changed();
+    handlers.changed();
   };
 
   const pinch = (moved: number, before: PointPx, at: PointPx) => {
@@ -120,7 +120,7 @@ export function attach(canvas: HTMLCanvasElement, camera: Camera, hands: Hands):
     const is = distance(at, other);
     camera.pan((at.x - before.x) / 2, (at.y - before.y) / 2);
     if (was > 1 && is > 1) camera.zoom(is / was, { x: (at.x + other.x) / 2, y: (at.y + other.y) / 2 });
-    hands.moved();
+    handlers.moved();
   };
 
   const up = (event: PointerEvent) => {
@@ -130,12 +130,12 @@ export function attach(canvas: HTMLCanvasElement, camera: Camera, hands: Hands):
     isDrawing = false;
     drag = null;
     if (held?.what !== 'press') return;
-    const draft = hands.draft();
+    const draft = handlers.draft();
     if (draft && draft.kind !== 'circle') {
       draft.add(camera.toM(held.from));
-      hands.changed();
+      handlers.changed();
     } else {
-      hands.clicked(held.from, event.ctrlKey || event.metaKey || event.shiftKey);
+      handlers.clicked(held.from, event.ctrlKey || event.metaKey || event.shiftKey);
     }
   };
 
@@ -150,11 +150,11 @@ export function attach(canvas: HTMLCanvasElement, camera: Camera, hands: Hands):
     event.preventDefault();
     const lines = event.deltaMode === WheelEvent.DOM_DELTA_LINE ? 16 : 1;
     camera.zoom(Math.exp(-event.deltaY * lines * WHEEL_FACTOR), place(event));
-    hands.moved();
+    handlers.moved();
   };
 
   const menu = (event: MouseEvent) => {
-    const draft = hands.draft();
+    const draft = handlers.draft();
     if (!draft) return;
     event.preventDefault();
     if (wasLongPress) {
@@ -164,10 +164,10 @@ export function attach(canvas: HTMLCanvasElement, camera: Camera, hands: Hands):
     const near = draft.nearest(camera.toM(place(event)), REACH_PX / camera.scale);
     if (near === null || draft.kind === 'circle') return;
     draft.remove(near);
-    hands.changed();
+    handlers.changed();
   };
 
-  const leave = () => hands.over(null);
+  const leave = () => handlers.over(null);
 
   canvas.addEventListener('pointerdown', down);
   canvas.addEventListener('pointermove', move);

@@ -1,7 +1,7 @@
-// Teleoperation: the socket, the lease, and what the hands want. Whatever goes wrong means zero.
+// Teleoperation: the socket, the lease, and the motion that the operator commands. Whatever goes wrong means zero.
 import type { DriveUpdate, DriveView, Lease } from '../api/schema';
 import { texts } from '../texts';
-import { KEYS, clamped, wishOfAxes, wishOfKeys, type Wish } from './hands';
+import { KEYS, clamped, inputOfAxes, inputOfKeys, type DriveInput } from './drive_input';
 
 /** Time between two drive commands, milliseconds; the server asks for 50 to 100. */
 const COMMAND_MS = 80;
@@ -21,13 +21,13 @@ export class Drive {
   /** Shares of the robot's own limits. */
   speedShare = $state(0.5);
   turnShare = $state(0.5);
-  wish = $state.raw<Wish>({ forward: 0, left: 0 });
+  input = $state.raw<DriveInput>({ forward: 0, left: 0 });
   gamepad = $state<string | null>(null);
 
   #socket: WebSocket | null = null;
   #client = '';
   #pressed = new Set<string>();
-  #stick: Wish | null = null;
+  #stick: DriveInput | null = null;
   #timer: ReturnType<typeof setInterval> | undefined;
   #limits = { linear_m_s: 0, angular_rad_s: 0 };
   #wasZero = true;
@@ -95,13 +95,13 @@ export class Drive {
   }
 
   /** The touch stick: where it is, or null when it is let go. */
-  stick(wish: Wish | null): void {
-    this.#stick = wish && clamped(wish);
-    if (wish) this.said = null;
+  stick(input: DriveInput | null): void {
+    this.#stick = input && clamped(input);
+    if (input) this.said = null;
     this.#command();
   }
 
-  /** Zero at once, by whatever wanted something. */
+  /** Commands zero at once, whatever was commanded. */
   letGo(): void {
     this.#pressed.clear();
     this.#stick = null;
@@ -125,7 +125,7 @@ export class Drive {
     this.#pressed.clear();
     this.#stick = null;
     this.#wasZero = true;
-    this.wish = { forward: 0, left: 0 };
+    this.input = { forward: 0, left: 0 };
     this.gamepad = null;
   }
 
@@ -146,7 +146,7 @@ export class Drive {
       this.lease = null;
       this.#pressed.clear();
       this.#stick = null;
-      this.wish = { forward: 0, left: 0 };
+      this.input = { forward: 0, left: 0 };
       this.said = texts.drive.released(update.released.cause, update.released.detail);
       this.isTakenByOther = update.released.cause === 'taken';
     } else if ('refused' in update) {
@@ -164,24 +164,24 @@ export class Drive {
     }
   }
 
-  #wanted(): Wish {
+  #readInput(): DriveInput {
     if (document.hidden || !document.hasFocus()) return { forward: 0, left: 0 };
     if (this.#stick) return this.#stick;
-    if (this.#pressed.size > 0) return wishOfKeys(this.#pressed);
+    if (this.#pressed.size > 0) return inputOfKeys(this.#pressed);
     const pad = navigator.getGamepads().find((pad) => pad?.connected);
     this.gamepad = pad?.id ?? null;
-    return pad ? wishOfAxes(pad.axes[0] ?? 0, pad.axes[1] ?? 0) : { forward: 0, left: 0 };
+    return pad ? inputOfAxes(pad.axes[0] ?? 0, pad.axes[1] ?? 0) : { forward: 0, left: 0 };
   }
 
   #command(): void {
     if (!this.hasLease) return;
-    this.wish = this.#wanted();
-    const isZero = this.wish.forward === 0 && this.wish.left === 0;
+    this.input = this.#readInput();
+    const isZero = this.input.forward === 0 && this.input.left === 0;
     this.#wasZero = isZero;
     this.#send({
       drive: {
-        linear_m_s: this.wish.forward * this.speedShare * this.#limits.linear_m_s,
-        angular_rad_s: this.wish.left * this.turnShare * this.#limits.angular_rad_s,
+        linear_m_s: this.input.forward * this.speedShare * this.#limits.linear_m_s,
+        angular_rad_s: this.input.left * this.turnShare * this.#limits.angular_rad_s,
         for_ms: FOR_MS,
       },
     });
