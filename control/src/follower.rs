@@ -332,6 +332,7 @@ impl Follower {
         self.governor.set_sliding(bounds, errors.heading_rad);
         let input = GovernorInput {
             lag_m: errors.distance_m(),
+            along_track_m: errors.along_track_m,
             saturated: self.saturated,
         };
         let reference = self.governor.step(&self.plan, &input, dt_s);

@@ -26,6 +26,9 @@ const RISE_MAX_1_S: f64 = 1.0;
 const LAG_FREE_M: f64 = 0.10;
 /// Distance between robot and reference from which the reference waits (σ target 0), metres.
 const LAG_FULL_M: f64 = 0.40;
+/// Minimum σ beside the path, however large the cross-track error: the robot must drive to come back
+/// to its path.
+const CROSS_TRACK_RATE_MIN: f64 = 0.3;
 /// Target of σ while the wheels are saturated.
 const SATURATED_RATE: f64 = 0.5;
 
@@ -95,8 +98,24 @@ pub struct GovernorInput {
     /// Distance between the robot and its reference, metres; a non-finite value makes the reference
     /// wait.
     pub lag_m: f64,
+    /// Part of this distance along the path, metres, of either sign. The reference waits for a robot
+    /// that is behind or ahead, and only slows down for one that is beside it.
+    pub along_track_m: f64,
     /// Whether the wheels cannot follow their commands.
     pub saturated: bool,
+}
+
+impl GovernorInput {
+    /// Returns the largest σ at this distance from the reference.
+    fn rate_for_lag(&self) -> f64 {
+        if !(self.lag_m.is_finite() && self.along_track_m.is_finite()) {
+            return 0.0;
+        }
+        let rate_at =
+            |lag_m: f64| ((LAG_FULL_M - lag_m) / (LAG_FULL_M - LAG_FREE_M)).clamp(0.0, 1.0);
+        let beside = CROSS_TRACK_RATE_MIN * rate_at(self.along_track_m.abs());
+        rate_at(self.lag_m).max(beside)
+    }
 }
 
 /// Acceleration bounds of a robot that slides, and its heading error to the path in radians.
@@ -252,11 +271,7 @@ impl Governor {
     pub fn step(&mut self, plan: &Plan, input: &GovernorInput, dt_s: f64) -> ReferenceSample {
         let planned = plan.sample(self.clock_s);
         let floor_m_s = planned.speed_m_s.max(SPEED_FLOOR_M_S);
-        let wait = if input.lag_m.is_finite() {
-            ((LAG_FULL_M - input.lag_m) / (LAG_FULL_M - LAG_FREE_M)).clamp(0.0, 1.0)
-        } else {
-            0.0
-        };
+        let wait = input.rate_for_lag();
         let target = if self.stopping {
             0.0
         } else {

@@ -154,6 +154,22 @@ fn a_lost_pose_stops_and_then_fails_the_mission() {
 proptest! {
     #![proptest_config(ProptestConfig { cases: 24, ..ProptestConfig::default() })]
     #[test]
+    fn a_robot_beside_its_path_comes_back_to_it(
+        beside_m in -0.47..0.47_f64, ahead_m in -0.2..0.2_f64, heading_rad in -0.3..0.3_f64,
+        stiffness in 0.5..20.0_f64,
+    ) {
+        let mut follower = follower(&circle(Direction::CounterClockwise, 0.2), ON_CIRCLE);
+        let start = Pose {
+            x_m: ON_CIRCLE.x_m + beside_m,
+            y_m: ON_CIRCLE.y_m + ahead_m,
+            heading_rad: ON_CIRCLE.heading_rad + heading_rad,
+        };
+        let mut robot = SimRobot::new(start, stiffness, 7, false);
+        let last = robot.drive(&mut follower, 60.0, |_, _, _| {});
+        prop_assert_eq!(last.status, FollowerStatus::Done, "{:?}", last);
+    }
+
+    #[test]
     fn every_start_pose_ends_well(
         x_m in -8.0..8.0_f64, y_m in -8.0..8.0_f64, heading_rad in -PI..PI,
         stiffness in 0.5..20.0_f64, round: bool,

@@ -174,7 +174,8 @@ proptest! {
                 governor.stop();
             }
             for _ in 0..20 {
-                let now = governor.step(&plan, &GovernorInput { lag_m, saturated }, dt_s);
+                let input = GovernorInput { lag_m, along_track_m: lag_m, saturated };
+                let now = governor.step(&plan, &input, dt_s);
                 prop_assert!(now.arc_m >= before.arc_m - 1.0e-9);
                 let change_m_s2 = (now.speed_m_s - before.speed_m_s).abs() / dt_s;
                 prop_assert!(change_m_s2 < 2.0 * hardest_m_s2, "{change_m_s2} m/s²");
@@ -213,6 +214,7 @@ fn the_governor_waits_for_a_robot_that_lags() {
     }
     let lag = GovernorInput {
         lag_m: 1.0,
+        along_track_m: 1.0,
         saturated: false,
     };
     for _ in 0..500 {

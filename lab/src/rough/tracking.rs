@@ -332,7 +332,7 @@ pub fn run(trial: &Trial<'_>) -> anyhow::Result<Errors> {
     let (mut squares, mut located, mut count) = (0.0, 0.0, 0.0);
     let mut governor = Governor::new(&model);
     let course = Course::Plan(trial.plan.clone());
-    let (mut lag_m, mut saturated) = (0.0, false);
+    let mut governed = GovernorInput::default();
     let end_s = LATE_MAX * trial.plan.duration_s();
     while !governor.is_at_end(trial.plan) {
         let time_s = now.as_secs_f64() - SETTLES.as_secs_f64();
@@ -366,14 +366,13 @@ pub fn run(trial: &Trial<'_>) -> anyhow::Result<Errors> {
             Knowing::Nothing => None,
             Knowing::Own => known.theta(),
         };
-        let reference = governor.step(trial.plan, &GovernorInput { lag_m, saturated }, dt_s);
+        let reference = governor.step(trial.plan, &governed, dt_s);
         // Pure pursuit follows the path without a time reference.
-        lag_m = match trial.law {
-            Law::Pursuit(_) => 0.0,
-            Law::Kanayama(_) | Law::Yi2007 | Law::Shipped(_) => {
-                TrackingErrors::between(&reference, &measured).distance_m()
-            }
-        };
+        if !matches!(trial.law, Law::Pursuit(_)) {
+            let errors = TrackingErrors::between(&reference, &measured);
+            governed.lag_m = errors.distance_m();
+            governed.along_track_m = errors.along_track_m;
+        }
         let input = LawInput {
             course: &course,
             time_s: governor.clock_s(),
@@ -383,7 +382,7 @@ pub fn run(trial: &Trial<'_>) -> anyhow::Result<Errors> {
             felt: known.felt,
         };
         let (wanted, output) = driver.step(&input, dt_s);
-        saturated = output.is_some_and(|output| output.saturated);
+        governed.saturated = output.is_some_and(|output| output.saturated);
         let passed = gate(
             &GateInput {
                 command: Some(wanted),
