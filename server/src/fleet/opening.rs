@@ -111,6 +111,11 @@ impl Opener {
     }
 }
 
+/// Size of the receive buffers that zenoh keeps for each session, bytes: it allocates as many of
+/// [`BATCH_BYTES`] as fit, and further ones while these are in use. Its default of 64 KiB kept seven
+/// for each robot, however little this says.
+const RECEIVE_BUFFERS_BYTES: usize = 2 * BATCH_BYTES as usize;
+
 /// Range for free ports, below those that the system uses for outgoing connections.
 const PORTS: Range<u16> = 20_000..32_768;
 /// Number of ports that are tried before the system is asked for one.
@@ -170,6 +175,10 @@ fn config(address: SocketAddr) -> zenoh::Result<Config> {
         ),
         ("transport/link/tx/batch_size", BATCH_BYTES.to_string()),
         ("transport/link/tx/lease", SESSION_LEASE_MS.to_string()),
+        (
+            "transport/link/rx/buffer_size",
+            RECEIVE_BUFFERS_BYTES.to_string(),
+        ),
         (
             "transport/link/rx/max_message_size",
             MESSAGE_BYTES_MAX.to_string(),
