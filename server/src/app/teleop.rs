@@ -123,10 +123,25 @@ impl Holds {
     }
 }
 
+/// A lease in the robot's presence, until it is dropped: no mission is resumed or begun meanwhile.
+#[derive(Debug)]
+struct Granted {
+    app: App,
+    key: RobotKey,
+    id: Uuid,
+}
+
+impl Drop for Granted {
+    fn drop(&mut self) {
+        self.app.presences().lease_over(&self.key, self.id);
+    }
+}
+
 /// A lease that the robot granted to this session.
 #[derive(Debug)]
 struct ActiveLease {
     lease: Lease,
+    granted: Granted,
     boot: BootId,
     since: Duration,
     publisher: Box<dyn DrivePublisher>,
@@ -243,9 +258,18 @@ impl Session {
             active.lease = lease.clone();
             return Ok(lease);
         }
+        // Before the missions are held: what is created later is held from the begin.
+        let granted = Granted {
+            id: self
+                .app
+                .presences()
+                .lease_granted(&self.key, &lease.driver.name),
+            app: self.app.clone(),
+            key: self.key.clone(),
+        };
         let publisher = self.app.robot_link().drive.open(&self.key).await;
         let Some(publisher) = publisher else {
-            self.give_back(lease);
+            self.give_back(lease, granted);
             let detail = "the network to the robot is not open";
             return Err(refused(DriveRefusal::Unreachable, detail));
         };
@@ -253,6 +277,7 @@ impl Session {
         info!(robot.id = %self.key.1, "robot `{}` is teleoperated by `{name}`", self.key.1);
         self.active = Some(ActiveLease {
             lease: lease.clone(),
+            granted,
             boot: answer.boot,
             since: self.app.clock().elapsed(),
             publisher,
@@ -349,19 +374,20 @@ impl Session {
         let _ = self.send(Twist::default(), STAND_FOR);
         match self.active.take() {
             Some(active) => {
-                self.give_back(active.lease);
+                self.give_back(active.lease, active.granted);
                 true
             }
             None => false,
         }
     }
 
-    /// Releases a lease on the robot in the background.
-    fn give_back(&self, lease: Lease) {
+    /// Releases a lease on the robot in the background; it is over when the robot has answered.
+    fn give_back(&self, lease: Lease, granted: Granted) {
         let (app, key) = (self.app.clone(), self.key.clone());
         let ending = app.supervisor().stop_token();
         let supervisor = app.supervisor().clone();
         supervisor.spawn_passing("release", async move {
+            let _granted = granted;
             let command = ReleaseLease {
                 request: Uuid::new_v4(),
                 holder: lease.driver,

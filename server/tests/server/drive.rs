@@ -18,7 +18,7 @@ use tread_api::safety::Lease;
 use tread_api::wire::safety::LeaseCommand;
 use tread_server::app::teleop::SESSIONS_PER_IDENTITY_MAX;
 
-use crate::harness::{PATIENCE, Yard, database, eventually};
+use crate::harness::{PATIENCE, Yard, database, eventually, time};
 use crate::robot::Robot;
 
 fn request(yard: &Yard, robot: &str, token: &str) -> ClientRequestBuilder {
@@ -442,6 +442,42 @@ async fn a_viewer_watches_and_stops_but_does_not_drive_and_a_revoked_token_ends_
         .delete(yard.url(&format!("/v1/tokens/{}", viewer.token.id)));
     assert!(yard.send(revoke).await.0.is_success());
     assert_eq!(socket.closed().await, 1008);
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_lease_holds_missions_from_its_grant_not_from_the_first_state_that_shows_it() {
+    let yard = Yard::start_at(time("2026-11-01T00:00:00Z")).await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let first = yard.create_mission(&robot.id).await;
+    yard.mission_becomes(first.id, MissionState::Active).await;
+    robot.show_no_lease();
+    let mut driver = Socket::open(&yard, "rover-1").await;
+    driver.acquire("Ann").await;
+    let paused = yard.mission_becomes(first.id, MissionState::Paused).await;
+    assert!(paused.mission.pause_wanted);
+    let resume = format!("/v1/missions/{}/resume", first.id);
+    let (status, body) = yard.post(&resume, &Value::Null).await;
+    assert_eq!(status, 409, "{body}");
+    assert!(body["detail"].as_str().unwrap().contains("Ann"), "{body}");
+    let second = yard.create_mission(&robot.id).await;
+    assert!(second.pause_wanted);
+    assert_eq!(second.state, MissionState::Queued);
+
+    // With the lease ends what it prevented.
+    driver.send(&json!({"release": {}})).await;
+    stands(&robot).await;
+    eventually("the mission may be resumed", async || {
+        let (status, body) = yard.post(&resume, &Value::Null).await;
+        if status == 202 {
+            Ok(())
+        } else {
+            Err((status, body))
+        }
+    })
+    .await;
+    yard.mission_becomes(first.id, MissionState::Active).await;
+    assert!(yard.mission(second.id).await.mission.pause_wanted);
     yard.server.stop().await.unwrap();
 }
 

@@ -67,6 +67,7 @@ pub(crate) struct Robot {
     state: Arc<Mutex<RobotState>>,
     heard: Arc<Mutex<Heard>>,
     beating: Arc<AtomicBool>,
+    shows_lease: Arc<AtomicBool>,
     _token: zenoh::liveliness::LivelinessToken,
     supervisor: Supervisor,
 }
@@ -192,6 +193,8 @@ impl Robot {
         let said = Arc::clone(&state);
         let beating = Arc::new(AtomicBool::new(true));
         let beats = Arc::clone(&beating);
+        let shows_lease = Arc::new(AtomicBool::new(true));
+        let shows = Arc::clone(&shows_lease);
         let supervisor = Supervisor::new();
         let stop = supervisor.stop_token();
         let clock = Instant::now();
@@ -204,7 +207,12 @@ impl Robot {
                     state.robot_time = time("2026-11-01T00:00:00Z") + clock.elapsed();
                     state.monotonic_us = Some(u64::try_from(clock.elapsed().as_micros()).unwrap());
                     state.control_loop.ticks += u64::from(beats.load(Ordering::Relaxed));
-                    wire::encode(&*state).unwrap()
+                    let mut shown = state.clone();
+                    shown
+                        .safety
+                        .lease
+                        .take_if(|_| !shows.load(Ordering::Relaxed));
+                    wire::encode(&shown).unwrap()
                 };
                 let _ = publisher.put(payload).wait();
                 tokio::time::sleep(Duration::from_millis(50)).await;
@@ -217,6 +225,7 @@ impl Robot {
             state,
             heard,
             beating,
+            shows_lease,
             _token: token,
             supervisor,
         };
@@ -338,6 +347,11 @@ impl Robot {
 
     pub(crate) fn state(&self) -> RobotState {
         self.state.lock().unwrap().clone()
+    }
+
+    /// Lets its states arrive as if a lease had been granted after each of them.
+    pub(crate) fn show_no_lease(&self) {
+        self.shows_lease.store(false, Ordering::Relaxed);
     }
 
     /// Lets the control loop stand still while the agent speaks on.

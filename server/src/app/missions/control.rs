@@ -95,8 +95,8 @@ impl App {
             || safety.is_some_and(|safety| safety.stop.is_some())
         {
             "a stop is in force; clear it first".to_owned()
-        } else if let Some(lease) = safety.and_then(|safety| safety.lease.as_ref()) {
-            format!("`{}` teleoperates it", lease.driver.name)
+        } else if let Some(driver) = presence.driver() {
+            format!("`{driver}` teleoperates it")
         } else {
             return Ok(());
         };

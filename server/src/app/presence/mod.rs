@@ -7,7 +7,7 @@ mod looks;
 mod news;
 mod offsets;
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -18,6 +18,7 @@ use tread_api::link::LinkQuality;
 use tread_api::robot::{Aged, LinkCause, LinkState, MissionProgress, RobotLive};
 use tread_api::safety::StandingState;
 use tread_api::wire::state::{FrictionReport, RobotState};
+use uuid::Uuid;
 
 pub use self::duplicate_agent::DuplicateAgent;
 use self::duplicate_agent::OtherRun;
@@ -83,6 +84,9 @@ pub struct Presence {
     progress: Option<MissionProgress>,
     friction: Option<(LiveFriction, Duration)>,
     link_counts: LinkCounts,
+    /// Names of the drivers to whom the robot has granted its lease, until it is over. The robot's
+    /// states show the lease later.
+    drivers: BTreeMap<Uuid, String>,
 }
 
 impl Presence {
@@ -156,7 +160,15 @@ impl Presence {
     /// Returns whether a stop is in force on the robot, or a person teleoperates it.
     pub fn is_operator_controlled(&self) -> bool {
         let safety = self.state().map(|state| &state.safety);
-        safety.is_some_and(|safety| safety.stop.is_some() || safety.lease.is_some())
+        safety.is_some_and(|safety| safety.stop.is_some()) || self.driver().is_some()
+    }
+
+    /// Returns the name of the driver who teleoperates the robot, according to its state or to the
+    /// lease that it granted.
+    pub fn driver(&self) -> Option<&str> {
+        let shown = self.state().and_then(|state| state.safety.lease.as_ref());
+        let shown = shown.map(|lease| lease.driver.name.as_str());
+        shown.or_else(|| self.drivers.values().next().map(String::as_str))
     }
 
     /// Returns whether a message came within [`OFFLINE_TIMEOUT`], or a liveliness token is there.
@@ -318,6 +330,22 @@ impl Presences {
     /// Records a robot that sent a hello to an earlier run of this server.
     pub fn know(&self, key: RobotKey) {
         self.lock().entry(key).or_default().welcomed = true;
+    }
+
+    /// Records that a robot granted its lease to a driver; returns what identifies this lease.
+    pub fn lease_granted(&self, key: &RobotKey, driver: &str) -> Uuid {
+        let id = Uuid::new_v4();
+        if let Some(presence) = self.lock().get_mut(key) {
+            presence.drivers.insert(id, driver.to_owned());
+        }
+        id
+    }
+
+    /// Records that a lease is over.
+    pub fn lease_over(&self, key: &RobotKey, id: Uuid) {
+        if let Some(presence) = self.lock().get_mut(key) {
+            presence.drivers.remove(&id);
+        }
     }
 
     /// Records the time from a command to a robot's answer.
