@@ -14,6 +14,9 @@ pub const CELL_MAX_M: f64 = 100.0;
 /// Maximum length of the name of a site, terrain, robot or base, characters.
 pub const NAME_LENGTH_MAX: usize = 200;
 
+/// Revision of a site's first grid.
+pub const GRID_REVISION_FIRST: u32 = 1;
+
 /// Grid of square cells in which the friction of a site is stored.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(try_from = "GridFields")]

@@ -73,6 +73,58 @@ pub struct RobotState {
     pub safety: SafetyStatus,
 }
 
+/// Maximum magnitude of a speed that a state can show, metres per second; far above that of any
+/// skid-steered robot.
+const SPEED_MAX_M_S: f64 = 100.0;
+/// Maximum magnitude of a turn rate that a state can show, radians per second.
+const TURN_RATE_MAX_RAD_S: f64 = 1_000.0;
+/// Maximum voltage that a state can show, volts.
+const VOLTAGE_MAX_V: f64 = 10_000.0;
+/// Maximum magnitude of a heading that is wrapped to ±π, radians; a larger one has no direction left.
+const HEADING_MAX_RAD: f64 = 1.0e6;
+
+impl RobotState {
+    /// Removes pose, velocity and battery values that no robot can have, as a broken sensor or
+    /// driver gives them, and wraps the heading to ±π. The rest still counts as a heartbeat.
+    pub fn remove_impossible_values(&mut self) {
+        self.pose = self.pose.take().and_then(|pose| {
+            let value = possible_pose(pose.value)?;
+            Some(Aged { value, ..pose })
+        });
+        self.twist.take_if(|twist| !is_possible_twist(&twist.value));
+        self.battery = self.battery.take().and_then(possible_battery);
+    }
+}
+
+fn possible_pose(pose: Pose) -> Option<Pose> {
+    use std::f64::consts::{PI, TAU};
+    if !pose.position().is_on_the_map() || pose.heading_rad.abs() > HEADING_MAX_RAD {
+        return None;
+    }
+    let heading_rad = match pose.heading_rad {
+        heading_rad if heading_rad.abs() <= PI => heading_rad,
+        heading_rad => (heading_rad + PI).rem_euclid(TAU) - PI,
+    };
+    Some(Pose {
+        heading_rad,
+        ..pose
+    })
+}
+
+fn is_possible_twist(twist: &Twist) -> bool {
+    twist.linear_m_s.abs() <= SPEED_MAX_M_S && twist.angular_rad_s.abs() <= TURN_RATE_MAX_RAD_S
+}
+
+fn possible_battery(battery: Battery) -> Option<Battery> {
+    let is_voltage = |voltage_v: &f64| (0.0..=VOLTAGE_MAX_V).contains(voltage_v);
+    (0.0..=1.0)
+        .contains(&battery.charge_ratio)
+        .then(|| Battery {
+            voltage_v: battery.voltage_v.filter(is_voltage),
+            ..battery
+        })
+}
+
 /// State rate that the server requests while somebody watches or drives a robot, Hz.
 pub const WATCHED_STATE_RATE_HZ: f64 = 10.0;
 /// Maximum state rate that an agent takes from a request, Hz.
@@ -156,6 +208,29 @@ mod tests {
     use crate::wire;
 
     proptest! {
+        #[test]
+        fn a_state_shows_only_values_that_a_robot_can_have(
+            x_m: f64, y_m: f64, heading_rad: f64, charge_ratio: f64, voltage_v: f64,
+        ) {
+            let pose = possible_pose(Pose { x_m, y_m, heading_rad });
+            if let Some(pose) = pose {
+                prop_assert!(pose.position().is_on_the_map());
+                prop_assert!(pose.heading_rad.abs() <= std::f64::consts::PI);
+            }
+            let battery = Battery { charge_ratio, voltage_v: Some(voltage_v), charging: false };
+            if let Some(battery) = possible_battery(battery) {
+                prop_assert!((0.0..=1.0).contains(&battery.charge_ratio));
+                prop_assert!(battery.voltage_v.is_none_or(|voltage_v| voltage_v >= 0.0));
+            }
+        }
+
+        #[test]
+        fn a_heading_keeps_its_direction(turns in -100..100_i32, heading_rad in -3.1..3.1_f64) {
+            let unwrapped = heading_rad + f64::from(turns) * std::f64::consts::TAU;
+            let pose = possible_pose(Pose { x_m: 1.0, y_m: 2.0, heading_rad: unwrapped }).unwrap();
+            prop_assert!((pose.heading_rad - heading_rad).abs() < 1.0e-9);
+        }
+
         #[test]
         fn a_state_rate_survives_the_wire_and_only_a_positive_finite_rate_is_valid(
             rate_hz in any::<f64>(),

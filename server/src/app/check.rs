@@ -75,6 +75,20 @@ impl App {
         let row = db::robots::find(&mut tx, site_row.pk, &robot).await?;
         let unknown = || AppError::UnknownRobot(site.clone(), robot.clone());
         let row = row.ok_or_else(unknown)?;
+        if let Some(replaced) = replaces {
+            let found = db::missions::find(&mut tx, replaced).await?;
+            let found = found.filter(|found| found.robot_pk == row.pk);
+            let state = found
+                .ok_or(AppError::UnknownMission(replaced))?
+                .mission
+                .state;
+            if state.is_terminal() {
+                return Err(AppError::MissionEnded {
+                    id: replaced,
+                    state,
+                });
+            }
+        }
         let fence = control_fence(&db::geofences::present(&mut tx, site_row.pk).await?);
         let place = start::Place {
             priority,

@@ -3,7 +3,9 @@
 use tread_api::ids::SiteId;
 use tread_api::page::Page;
 use tread_api::rights::Scope;
-use tread_api::site::{CELL_MAX_M, CELL_MIN_M, CreateSite, GeoOrigin, Grid, Site};
+use tread_api::site::{
+    CELL_MAX_M, CELL_MIN_M, CreateSite, GRID_REVISION_FIRST, GeoOrigin, Grid, Site,
+};
 
 use super::{App, AppError, name_or, page, site_row};
 use crate::db;
@@ -60,7 +62,7 @@ impl App {
             name: name_or(name, id.as_str())?,
             id,
             grid: Grid {
-                revision: 1,
+                revision: GRID_REVISION_FIRST,
                 cell_m,
             },
             terrain_revision: 0,

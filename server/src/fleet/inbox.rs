@@ -392,9 +392,10 @@ fn process(app: &App, limits: &RateLimits, message: &Published) {
         presences.friction(key, &report, message.at.monotonic)
     } else {
         let named = |state: &RobotState| state.robot == *robot;
-        let Some(state) = read(app, limits, message, named) else {
+        let Some(mut state) = read(app, limits, message, named) else {
             return;
         };
+        state.remove_impossible_values();
         let (presences, at) = (app.presences(), message.at);
         presences.state(key, state, at.monotonic, at.wall)
     };

@@ -49,6 +49,10 @@ impl<S: Send + Sync, T: DeserializeOwned + Serialize> FromRequest<S> for Json<T>
             return Err(Problem::new(ProblemType::UnsupportedMediaType)
                 .detail("send the body with `content-type: application/json`"));
         }
+        if is_encoded(request.headers()) {
+            return Err(Problem::new(ProblemType::UnsupportedMediaType)
+                .detail("send the body as it is, without `content-encoding`"));
+        }
         let limit = request.extensions().get::<BodyLimit>().copied();
         let limit = limit.unwrap_or(BodyLimit(super::BODY_MAX));
         let slot = request.extensions().get::<AuditSlot>().cloned();
@@ -95,6 +99,12 @@ fn is_json(headers: &HeaderMap) -> bool {
         .and_then(|value| value.split(';').next())
         .map(str::trim);
     essence.is_some_and(|essence| essence.eq_ignore_ascii_case("application/json"))
+}
+
+/// Returns whether a body is compressed, which no route decodes.
+fn is_encoded(headers: &HeaderMap) -> bool {
+    let mut encodings = headers.get_all(header::CONTENT_ENCODING).iter();
+    encodings.any(|encoding| !encoding.as_bytes().eq_ignore_ascii_case(b"identity"))
 }
 
 /// Reads a whole body, or discards one that is too large.

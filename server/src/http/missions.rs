@@ -207,7 +207,7 @@ pub(super) async fn replace(
     security(("token" = ["dispatch"])),
     operation_id = "check_trajectory", request_body = CheckTrajectory,
     responses((status = 200, body = TrajectoryCheck), (status = 404, body = ProblemBody),
-        (status = 422, body = ProblemBody)))]
+        (status = 409, body = ProblemBody), (status = 422, body = ProblemBody)))]
 pub(super) async fn check(
     State(app): State<App>,
     Subject(subject): Subject,

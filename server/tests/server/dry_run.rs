@@ -4,6 +4,7 @@ use reqwest::StatusCode;
 use serde_json::{Value, json};
 use tread_api::geometry::Pose;
 use tread_api::robot::Aged;
+use uuid::Uuid;
 
 use crate::harness::{Yard, circle, eventually};
 use crate::robot::Robot;
@@ -223,6 +224,9 @@ async fn a_dry_run_plans_from_the_end_of_what_is_driven_before() {
     let mut body = wanted.clone();
     body["replaces"] = back.clone();
     assert_eq!(check(&body).await["after_mission"], driven);
+    body["replaces"] = json!(Uuid::now_v7());
+    let (status, said) = yard.post("/v1/trajectories/check", &body).await;
+    assert_eq!(status, StatusCode::NOT_FOUND, "{said}");
     let mut body = wanted.clone();
     body["start"] = json!({"x_m": 1.0, "y_m": 1.0, "heading_rad": 0.0});
     assert_eq!(check(&body).await["start_source"], "request");

@@ -5,7 +5,7 @@ use std::borrow::Cow;
 use jiff::{SignedDuration, Timestamp};
 use serde_json::value::{RawValue, to_raw_value};
 use tread_api::friction::Segment;
-use tread_api::site::Grid;
+use tread_api::site::{GRID_REVISION_FIRST, Grid};
 
 use crate::friction::Sums;
 
@@ -90,7 +90,7 @@ pub(super) fn prepared<'segment>(
     skew: Skew,
 ) -> Result<Prepared<'segment>, String> {
     segment.validate().map_err(|invalid| invalid.to_string())?;
-    if segment.grid_revision > grid.revision {
+    if !(GRID_REVISION_FIRST..=grid.revision).contains(&segment.grid_revision) {
         return Err(format!("the site has no grid {}", segment.grid_revision));
     }
     if segment.grid_revision == grid.revision && !grid.center_of(segment.cell).is_on_the_map() {
