@@ -59,6 +59,9 @@ pub(crate) enum ClientError {
         site: String,
         read: usize,
     },
+    /// No webhook has this name or identifier.
+    #[error("there is no webhook `{name}`")]
+    NoSuchWebhook { name: String },
     /// Several missions have an identifier that begins or ends like this.
     #[error("`{part}` stands for {} missions:{}", .candidates.len(), listed(.candidates))]
     AmbiguousMission {
@@ -297,7 +300,7 @@ impl ClientError {
     pub(crate) fn exit(&self) -> Exit {
         match self {
             Self::Address { .. } | Self::AmbiguousMission { .. } => Exit::Usage,
-            Self::NoSuchMission { .. } => Exit::NotFound,
+            Self::NoSuchMission { .. } | Self::NoSuchWebhook { .. } => Exit::NotFound,
             Self::Unreachable { .. } | Self::Untrusted { .. } | Self::NoWebSocket { .. } => {
                 Exit::Unreachable
             }
@@ -322,6 +325,7 @@ impl ClientError {
             Self::NoSuchMission { .. } => {
                 Some("`tread missions` lists the newest missions of the site")
             }
+            Self::NoSuchWebhook { .. } => Some("`tread webhooks` lists them"),
             Self::AmbiguousMission { .. } => {
                 Some("give more of the identifier; its end is what differs")
             }
@@ -350,6 +354,7 @@ impl ClientError {
             | Self::Unreachable { .. }
             | Self::Silent { .. }
             | Self::NoSuchMission { .. }
+            | Self::NoSuchWebhook { .. }
             | Self::AmbiguousMission { .. }
             | Self::NoWebSocket { .. }
             | Self::NotUnderstood { .. } => None,

@@ -9,7 +9,7 @@ use tread_api::page::PAGE_LIMIT_DEFAULT;
 use tread_api::webhook::{CreatedWebhook, Delivery, DeliveryState, Webhook, WebhookSettings};
 
 use crate::args::{NamedWebhook, WebhooksAction, WebhooksArguments};
-use crate::client::Client;
+use crate::client::{Client, ClientError};
 use crate::output::{Output, note, or_dash, render, table};
 
 /// Interval between looks at a test that is under way.
@@ -81,10 +81,10 @@ async fn find(client: &Client, named: &NamedWebhook) -> anyhow::Result<Webhook> 
         webhook.name == named.name || webhook.id.to_string() == named.name.to_lowercase()
     };
     let found = client.webhooks().await?.into_iter().find(is_it);
-    found.with_context(|| {
-        let name = &named.name;
-        format!("there is no webhook `{name}`; `tread webhooks` lists them")
-    })
+    let unknown = || ClientError::NoSuchWebhook {
+        name: named.name.clone(),
+    };
+    found.ok_or_else(|| unknown().into())
 }
 
 fn show_secret(created: &CreatedWebhook, output: Output) -> anyhow::Result<()> {

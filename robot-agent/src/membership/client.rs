@@ -40,7 +40,7 @@ pub enum MembershipError {
     #[error("no key could be made, or it could not sign")]
     Key(#[source] rcgen::Error),
     /// No server answers at the address.
-    #[error("no server answers at `{server}`")]
+    #[error("no connection to a server that is trusted at `{server}`")]
     Unreachable {
         /// Address of the server.
         server: String,

@@ -30,7 +30,7 @@ use super::sites::SITES_MAX;
 use super::{App, AppError};
 use crate::archive::{
     ArchivedSegment, Finished, Found, KeyRange, SegmentArchive, SegmentArchiveError, Selection,
-    Writer,
+    Writer, mark_of,
 };
 use crate::db;
 use crate::error_text::chain;
@@ -45,8 +45,6 @@ const CHUNK_ROWS: u32 = 16_384;
 const READERS_MAX: usize = 2;
 /// Maximum time for which a request waits until it may read files.
 const READ_WAIT_MAX: Duration = Duration::from_secs(5);
-/// Suffix of the mark, after the name of the database.
-const MARK_ENDING: &str = ".archived";
 
 /// The archive and what is known of it.
 #[derive(Debug)]
@@ -66,10 +64,8 @@ struct State {
 
 impl Archive {
     pub(super) fn new(folder: PathBuf, database: &Path) -> Self {
-        let mut mark = database.as_os_str().to_owned();
-        mark.push(MARK_ENDING);
         Self {
-            files: Arc::new(SegmentArchive::new(folder, mark.into())),
+            files: Arc::new(SegmentArchive::new(folder, mark_of(database))),
             readers: Arc::new(Semaphore::new(READERS_MAX)),
             state: Mutex::default(),
         }

@@ -44,6 +44,8 @@ pub const SEARCHED_ROWS_MAX: usize = 64 * ROW_GROUP_ROWS;
 /// Maximum number of files that one request opens.
 pub const SEARCHED_FILES_MAX: usize = 512;
 
+/// Suffix of the mark, after the name of the database.
+const MARK_ENDING: &str = ".archived";
 /// Beginning of the name of a file.
 const PREFIX: &str = "segments-";
 /// End of the name of a file.
@@ -217,6 +219,13 @@ pub enum SegmentArchiveError {
         /// The folder.
         folder: PathBuf,
     },
+}
+
+/// Returns the file of the mark, beside the database.
+pub fn mark_of(database: &Path) -> PathBuf {
+    let mut mark = database.as_os_str().to_owned();
+    mark.push(MARK_ENDING);
+    mark.into()
 }
 
 /// Files of the archive and their folder.

@@ -84,7 +84,7 @@ fn folder_finding(folder: &Path) -> Finding {
 }
 
 /// Writes a file as large as a few pages, syncs it and removes it.
-fn try_to_write(folder: &Path) -> io::Result<()> {
+pub(super) fn try_to_write(folder: &Path) -> io::Result<()> {
     let file = folder.join(format!(".tread-doctor.{}", std::process::id()));
     let written = || {
         let mut options = OpenOptions::new();

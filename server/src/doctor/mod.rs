@@ -1,10 +1,11 @@
-//! `tread-server doctor` examines configuration, files, database, certificates, ports, clock and
-//! limits of a server. It works before the first start, beside a running server and after a
+//! `tread-server doctor` examines configuration, files, database, archive, certificates, ports, clock
+//! and limits of a server. It works before the first start, beside a running server and after a
 //! failure.
 //!
 //! It changes nothing: it removes its test file, and opens the database for reading only. Each
 //! finding states the fault and the remedy.
 
+mod archive;
 mod certificates;
 mod clock;
 mod database;
@@ -111,6 +112,7 @@ async fn examine(args: DoctorArgs) -> Vec<Finding> {
     findings.extend(files::findings(&examined));
     let (of_database, newest) = database::findings(&examined).await;
     findings.extend(of_database);
+    findings.extend(archive::finding(&examined));
     findings.extend(clock::findings(&examined, newest));
     findings.extend(certificates::findings(&examined));
     findings.extend(ports::findings(&examined).await);

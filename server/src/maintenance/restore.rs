@@ -249,9 +249,13 @@ impl Drop for Restoring {
     }
 }
 
+/// Returns a name that no other file has: of two restorations within a second, the second has a number.
 fn aside_name(path: &Path, now: Timestamp) -> PathBuf {
     let time = now.strftime("%Y%m%dT%H%M%SZ");
-    with_ending(path, &format!("{ASIDE}{time}"))
+    let first = with_ending(path, &format!("{ASIDE}{time}"));
+    let numbered = (2_u32..).map(|number| with_ending(&first, &format!("-{number}")));
+    let mut names = std::iter::once(first.clone()).chain(numbered);
+    names.find(|name| !name.exists()).unwrap_or(first)
 }
 
 /// Moves the log of a database into its file, so that one file contains the complete database. A

@@ -85,7 +85,8 @@ impl App {
                 length_m,
                 configuration: found.configuration,
                 normalisation: reading.normalisation(),
-                known_ratio: (known_m / length_m).min(1.0),
+                // The sum of nothing is −0.
+                known_ratio: (known_m / length_m + 0.0).min(1.0),
                 pieces,
             }
         };
