@@ -1,9 +1,10 @@
 //! Tread's server: accepts missions over REST, sends them to robots over zenoh, stores the friction
 //! measurements of the robots, and serves the friction map.
 //!
-//! * [`http`] is the REST API and uses no SQL; [`app`] contains the use cases; [`db`] contains the
-//!   SQL and no decisions. Only [`fleet`] calls zenoh, only [`oidc`] the OpenID provider, and
-//!   only [`webhooks`] the receivers of alerts. [`friction`] is pure.
+//! * [`http`] is the REST API and uses no SQL; [`app`] contains the use cases; [`db`] chooses the
+//!   engine of the store, which contains the SQL and no decisions. Only [`fleet`] calls zenoh, only
+//!   [`oidc`] the OpenID provider, and only [`webhooks`] the receivers of alerts. [`friction`] is
+//!   pure.
 //! * [`Server::start`] runs the server inside another program; [`run_from_args`] is the whole
 //!   program, which runs until a signal.
 
@@ -64,9 +65,9 @@ use self::authority::Authorities;
 use self::clock::Clock;
 pub use self::config::{Config, ServerArgs};
 use self::config::{RobotsConfig, TlsSource};
-use self::db::Db;
 use self::db::failure::StorageFailure;
 use self::db::lock::DatabaseLock;
+use self::db::{Db, DbError};
 use self::fleet::{Fleet, Security};
 use self::http::serve::Serving;
 use self::http::tls::{Issuer, Tls};
@@ -321,8 +322,8 @@ fn listen_for_http(address: SocketAddr) -> anyhow::Result<TcpListener> {
 fn not_readable(error: anyhow::Error, database: &std::path::Path) -> anyhow::Error {
     let failure = error
         .chain()
-        .find_map(|cause| cause.downcast_ref::<sqlx::Error>())
-        .and_then(StorageFailure::of);
+        .find_map(|cause| cause.downcast_ref::<DbError>())
+        .and_then(DbError::failure);
     let advice = failure.map_or(
         "`tread-server doctor --deep` examines it",
         StorageFailure::advice,

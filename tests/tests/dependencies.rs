@@ -12,7 +12,7 @@ use syn::visit::Visit;
 use tread_tests::repository::{files, root};
 
 /// Crates whose modules are read.
-const CRATES: [&str; 8] = [
+const CRATES: [&str; 10] = [
     "api",
     "cli",
     "control",
@@ -20,11 +20,13 @@ const CRATES: [&str; 8] = [
     "robot-agent",
     "ros2",
     "server",
+    "store",
+    "store-sqlite",
     "telemetry",
 ];
 
 /// Crates of this workspace that a crate may depend on, tests aside.
-const CRATE_RULES: [(&str, &[&str]); 8] = [
+const CRATE_RULES: [(&str, &[&str]); 10] = [
     ("api", &[]),
     ("control", &[]),
     ("ros2", &[]),
@@ -38,7 +40,18 @@ const CRATE_RULES: [(&str, &[&str]); 8] = [
             "tread-telemetry",
         ],
     ),
-    ("server", &["tread-api", "tread-control", "tread-telemetry"]),
+    ("store", &["tread-api"]),
+    ("store-sqlite", &["tread-api", "tread-store"]),
+    (
+        "server",
+        &[
+            "tread-api",
+            "tread-control",
+            "tread-store",
+            "tread-store-sqlite",
+            "tread-telemetry",
+        ],
+    ),
     ("cli", &["tread-agent", "tread-api", "tread-server"]),
     (
         "lab",
@@ -47,13 +60,15 @@ const CRATE_RULES: [(&str, &[&str]); 8] = [
 ];
 
 /// Crates that are shipped. None of them may contain the agent's test support.
-const SHIPPED: [&str; 7] = [
+const SHIPPED: [&str; 9] = [
     "api",
     "cli",
     "control",
     "robot-agent",
     "ros2",
     "server",
+    "store",
+    "store-sqlite",
     "telemetry",
 ];
 
@@ -322,6 +337,23 @@ fn no_crate_depends_on_one_that_it_must_not_know() {
             );
         }
     }
+}
+
+#[test]
+fn only_the_engines_of_the_store_contain_sql_and_only_one_module_chooses_an_engine() {
+    for name in SHIPPED {
+        let speaks_sql = dependencies_of(name).contains_key("sqlx");
+        assert_eq!(speaks_sql, name.starts_with("store-"), "{name}");
+    }
+    let naming: Vec<String> = files()
+        .into_iter()
+        .filter(|name| name.starts_with("server/src/") || name.starts_with("cli/src/"))
+        .filter(|name| {
+            let text = fs::read(root().join(name)).expect("it can be read");
+            String::from_utf8_lossy(&text).contains("tread_store_sqlite")
+        })
+        .collect();
+    assert_eq!(naming, ["server/src/db.rs"]);
 }
 
 #[test]

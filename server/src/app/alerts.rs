@@ -322,12 +322,12 @@ impl App {
         alerts: Vec<Alert>,
     ) -> Result<(), DbError> {
         let app = self.clone();
-        let committed = tx.commit_then(move |outcome| {
+        tx.commit_then(move |outcome| {
             if outcome == Outcome::Written {
                 app.show_alerts(&alerts);
             }
-        });
-        Ok(committed.await?)
+        })
+        .await
     }
 
     /// Publishes alerts that were written to the feed of events.

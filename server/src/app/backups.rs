@@ -226,7 +226,7 @@ pub async fn make(
         Ok(()) | Err(_) => {}
     }
     let size = copy::size_bytes(&order.database).await;
-    let size = size.map_err(BackupError::Copy)?;
+    let size = size.map_err(|cause| BackupError::Copy(cause.into()))?;
     check_all_space(&order, &target, size)?;
     watch_copy(&order.database, &copy.0, |bytes| {
         progress(Progress::Copying { bytes, of: size });
@@ -234,7 +234,7 @@ pub async fn make(
     .await?;
     progress(Progress::Checking);
     let contents = copy::examine(&copy.0).await;
-    let contents = contents.map_err(BackupError::Examine)?;
+    let contents = contents.map_err(|cause| BackupError::Examine(cause.into()))?;
     let archiving = tokio::task::spawn_blocking(move || {
         let authority = match &order.authority {
             Some(folder) => copies::read_files(folder)?,
@@ -277,7 +277,7 @@ async fn watch_copy(database: &Path, target: &Path, tell: impl Fn(u64)) -> Resul
     let mut ticks = tokio::time::interval(PROGRESS_EVERY);
     loop {
         tokio::select! {
-            copied = &mut copying => return copied.map_err(BackupError::Copy),
+            copied = &mut copying => return copied.map_err(|cause| BackupError::Copy(cause.into())),
             _ = ticks.tick() => tell(fs::metadata(target).map_or(0, |about| about.len())),
         }
     }

@@ -10,7 +10,7 @@ use tread_api::trajectory::Place;
 
 use crate::archive::SegmentArchiveError;
 use crate::authority::{AuthorityError, RotationRefused};
-use crate::db::DbError;
+use crate::db::{DbError, EngineError};
 
 /// Reason why a use case failed.
 #[derive(Debug, thiserror::Error)]
@@ -314,8 +314,8 @@ impl AppError {
     }
 }
 
-impl From<sqlx::Error> for AppError {
-    fn from(error: sqlx::Error) -> Self {
+impl From<EngineError> for AppError {
+    fn from(error: EngineError) -> Self {
         Self::Storage(error.into())
     }
 }

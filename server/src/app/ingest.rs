@@ -554,7 +554,8 @@ async fn count_refused(tx: &mut Tx, robot_pk: i64, receipt: &Receipt) -> Result<
         return Ok(());
     };
     let count = receipt.refused.len() as u64;
-    db::robots::count_refused(tx, robot_pk, count, &last.reason).await
+    db::robots::count_refused(tx, robot_pk, count, &last.reason).await?;
+    Ok(())
 }
 
 /// Returns the refusal of a whole batch; `None` if its records are to be checked one by one.

@@ -98,14 +98,14 @@ impl MapTurn {
         alerts: Vec<Alert>,
     ) -> Result<(), DbError> {
         let Self { app, order } = self;
-        let committed = tx.commit_then(move |outcome| {
+        tx.commit_then(move |outcome| {
             if outcome == Outcome::Written {
                 app.apply(change);
                 app.show_alerts(&alerts);
             }
             drop(order);
-        });
-        Ok(committed.await?)
+        })
+        .await
     }
 }
 

@@ -12,6 +12,7 @@ use std::time::Duration;
 use tokio_util::sync::CancellationToken;
 
 use super::{App, AppError};
+use crate::db::DbError;
 
 /// Delay before memory is read again after a failure.
 const RETRY: Duration = Duration::from_secs(1);
@@ -31,7 +32,7 @@ pub async fn run(app: App, stop: CancellationToken) {
             let settled = tokio::select! {
                 biased;
                 () = stop.cancelled() => return,
-                settled = settling => settled.unwrap_or_else(|_elapsed| Err(sqlx::Error::WorkerCrashed.into())),
+                settled = settling => settled.unwrap_or_else(|_elapsed| Err(DbError::unanswered().into())),
             };
             let Err(cause) = settled else { break };
             app.log_failure("read again what memory mirrors of the database", &cause);

@@ -45,7 +45,7 @@ use super::own_alert::OwnAlert;
 use super::{App, AppError, page, site_row};
 use crate::app::presence::RobotKey;
 pub use crate::db::stops::StopFilter;
-use crate::db::{self, Tx};
+use crate::db::{self, DbError, Tx};
 
 /// Time within which a robot must confirm a stop; later it is shown as unconfirmed.
 pub const STOP_CONFIRM_MAX: Duration = Duration::from_millis(STOP_CONFIRM_MAX_MS);
@@ -92,7 +92,7 @@ async fn alerted(tx: &mut Tx) -> Result<HashSet<RobotKey>, AppError> {
 /// Runs a look-up for at most [`LOOK_UP_MAX`].
 async fn looked_up(looking_up: impl Future<Output = Result<(), AppError>>) -> Result<(), AppError> {
     let looked_up = tokio::time::timeout(LOOK_UP_MAX, looking_up).await;
-    looked_up.unwrap_or_else(|_elapsed| Err(sqlx::Error::PoolTimedOut.into()))
+    looked_up.unwrap_or_else(|_elapsed| Err(DbError::busy().into()))
 }
 
 impl App {

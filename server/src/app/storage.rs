@@ -267,7 +267,7 @@ impl App {
             }
         }
         let found = tokio::time::timeout(EXAMINE_MAX, self.db().quick_check()).await;
-        let found = found.unwrap_or_else(|_elapsed| Err(sqlx::Error::WorkerCrashed.into()));
+        let found = found.unwrap_or_else(|_elapsed| Err(DbError::unanswered()));
         let condition = {
             let mut inner = self.storage().lock();
             // Damage found by this examination itself is not new.

@@ -11,7 +11,6 @@
 
 pub mod copies;
 mod file;
-mod issued;
 mod rotation;
 
 use std::fmt::Write as _;
@@ -35,8 +34,8 @@ use webpki::{EndEntityCert, KeyUsage};
 use x509_parser::prelude::{FromDer as _, X509Certificate};
 
 pub use self::file::{AuthorityError, CERTIFICATE_FILE, KEY_FILE, NEXT_CERTIFICATE_FILE};
-pub use self::issued::Issued;
 pub use self::rotation::{Authorities, Retiring, RotationError, RotationRefused, Trusted};
+pub use tread_store::Issued;
 
 /// Validity period of the authority's certificate.
 const AUTHORITY_LASTS: SignedDuration = SignedDuration::from_hours(20 * 365 * 24);

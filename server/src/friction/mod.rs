@@ -5,25 +5,21 @@
 //! Ageing therefore changes no stored value, and estimates do not depend on the order or number of
 //! uploads. [`index`] holds the statistics in memory.
 
-pub mod epochs;
-pub mod fixed;
 pub mod fuse;
 pub mod index;
 mod joined;
 pub mod raster;
 mod seen;
-pub mod sums;
 pub mod traction_limit;
 pub mod weights;
 
 use jiff::Timestamp;
 use tread_api::friction::{FrictionBounds, FusedFriction, NORMAL_90, ValueEstimate};
+pub use tread_store::friction::{Epoch, Horizons, Sums, epoch_h, epoch_h_at, epochs, fixed, sums};
 
-pub use self::epochs::{Epoch, Horizons, epoch_h, epoch_h_at};
 pub use self::fuse::{Fused, Fuser, fuse};
 pub use self::raster::Raster;
 pub use self::seen::{Estimate, Ground, Seen};
-pub use self::sums::Sums;
 
 impl Fused {
     /// Converts the estimate to its API type, with its age at `now_us`, microseconds since 1970.

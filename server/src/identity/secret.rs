@@ -10,8 +10,8 @@
 use std::fmt;
 
 use sha2::{Digest as _, Sha256};
-use subtle::ConstantTimeEq as _;
 use tread_api::identity::Role;
+pub use tread_store::Fingerprint;
 
 /// Number of random bytes in a secret.
 pub const SECRET_RANDOM_BYTES: usize = 32;
@@ -128,42 +128,13 @@ impl Secret {
 
     /// Returns the SHA-256 of the text, which is what the database stores.
     pub fn fingerprint(&self) -> Fingerprint {
-        Fingerprint(Sha256::digest(&self.text).into())
+        Fingerprint::of(&self.text)
     }
 
     /// Returns the leading random digits, by which failed attempts are counted.
     pub fn prefix(&self) -> &str {
         let begin = BRAND.len() + 2;
         &self.text[begin..begin + PREFIX_DIGITS]
-    }
-}
-
-/// SHA-256 of a secret's text. A secret has 256 random bits, which cannot be found by search, so no
-/// slow password hash is needed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub struct Fingerprint([u8; 32]);
-
-impl Fingerprint {
-    /// Reads a hash from the database; `None` unless it has 32 bytes.
-    pub fn from_kept(hash: &[u8]) -> Option<Self> {
-        hash.try_into().ok().map(Self)
-    }
-
-    /// Returns the whole hash, to store it in the database.
-    pub fn as_bytes(&self) -> &[u8] {
-        &self.0
-    }
-
-    /// Returns the first 8 bytes, the key of the database look-up. The time of a look-up may reveal
-    /// how many of these bits match a stored hash; [`Self::matches`] compares the rest in constant
-    /// time.
-    pub fn lookup(&self) -> &[u8] {
-        &self.0[..8]
-    }
-
-    /// Returns whether this equals the stored hash `kept`, compared in constant time.
-    pub fn matches(&self, kept: &[u8]) -> bool {
-        self.0.ct_eq(kept).into()
     }
 }
 

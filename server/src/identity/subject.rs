@@ -2,9 +2,8 @@
 //! apply: a token or a person, each with all its sessions. Also defines how people and tokens are
 //! named where only a name is recorded, so that a token cannot be confused with a person.
 
-use std::fmt;
-
-use tread_api::ids::{PersonId, TokenId};
+use tread_api::ids::PersonId;
+pub use tread_store::SubjectId;
 
 /// Prefix of people's names, followed by a colon. It keeps the names that people choose at the
 /// provider apart from the names of tokens, which must not have it.
@@ -20,34 +19,6 @@ pub fn name_of_person(name: &str) -> String {
 pub fn may_name_token(name: &str) -> bool {
     let kind = name.split(':').next().unwrap_or_default().trim();
     !kind.eq_ignore_ascii_case(PEOPLE) && name.parse::<PersonId>().is_err()
-}
-
-/// Subject with limits of its own.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum SubjectId {
-    /// A token, with the sessions that were opened with it.
-    Token(TokenId),
-    /// A person who signed in at the provider, with all their sessions.
-    Person(PersonId),
-}
-
-impl fmt::Display for SubjectId {
-    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Token(token) => token.fmt(formatter),
-            Self::Person(person) => person.fmt(formatter),
-        }
-    }
-}
-
-impl SubjectId {
-    /// Returns the token; `None` for a person.
-    pub const fn token(self) -> Option<TokenId> {
-        match self {
-            Self::Token(token) => Some(token),
-            Self::Person(_) => None,
-        }
-    }
 }
 
 #[cfg(test)]

@@ -17,7 +17,6 @@ use anyhow::{Context as _, bail, ensure};
 use clap::Args;
 use jiff::Timestamp;
 use serde_json::json;
-use sqlx::Connection as _;
 use tread_api::enrolment::Enrolment;
 use tread_api::identity::{AuditEntry, Token};
 use tread_api::rights::Scope;
@@ -261,14 +260,7 @@ fn aside_name(path: &Path, now: Timestamp) -> PathBuf {
 /// Moves the log of a database into its file, so that one file contains the complete database. A
 /// damaged database keeps its log.
 async fn settle_log(database: &Path) {
-    let settling = async {
-        let mut connection = copy::connect(database, false).await?;
-        sqlx::query("PRAGMA wal_checkpoint(TRUNCATE)")
-            .execute(&mut connection)
-            .await?;
-        connection.close().await
-    };
-    if let Err(error) = settling.await {
+    if let Err(error) = copy::settle_log(database).await {
         eprintln!("the log of the old database stays beside it: {error}");
     }
 }

@@ -21,7 +21,7 @@ use tread_server::app::ingest::{Upload, Writer};
 use tread_server::app::{App, AppError};
 use tread_server::clock::Clock;
 use tread_server::config::{FrictionConfig, StorageConfig};
-use tread_server::db::{self, Db, DbError, Tx};
+use tread_server::db::{self, Db, DbError, EngineError, Tx};
 use uuid::Uuid;
 
 /// Where the ground's time begins.
@@ -102,7 +102,7 @@ impl Ground {
     /// One transaction.
     pub(crate) async fn write(
         &self,
-        what: impl AsyncFnOnce(&mut Tx) -> Result<(), DbError>,
+        what: impl AsyncFnOnce(&mut Tx) -> Result<(), EngineError>,
     ) -> Result<(), AppError> {
         let mut tx = self.app.db().write("test").await?;
         what(&mut tx).await?;
@@ -135,7 +135,7 @@ impl Ground {
             Err(Refusal {
                 code: RefusalCode::Busy,
                 ..
-            }) => Err(AppError::Storage(sqlx::Error::PoolTimedOut.into())),
+            }) => Err(AppError::Storage(DbError::Busy)),
             Err(refusal) => panic!("{refusal:?}"),
         }
     }

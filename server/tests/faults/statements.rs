@@ -35,7 +35,8 @@ pub(crate) fn not_in(executed: &Statements) -> Vec<String> {
 }
 
 fn all_writes() -> Vec<String> {
-    let folder = PathBuf::from(std::env::var_os("CARGO_MANIFEST_DIR").unwrap()).join(".sqlx");
+    let folder = PathBuf::from(std::env::var_os("CARGO_MANIFEST_DIR").unwrap())
+        .join("../store-sqlite/.sqlx");
     let mut writes = Vec::new();
     for entry in std::fs::read_dir(folder).unwrap() {
         let text = std::fs::read_to_string(entry.unwrap().path()).unwrap();

@@ -455,7 +455,7 @@ async fn a_stop_that_is_written_down_late_is_history_and_of_history_the_newest_i
 
 /// A database as it was before a migration, with these rows, brought up to date.
 async fn migrated(first_later: &str, rows: &str) -> sqlx::SqliteConnection {
-    let folder = folder_of_the_crate().join("../migrations");
+    let folder = folder_of_the_crate().join("../store-sqlite/migrations");
     let mut files: Vec<_> = std::fs::read_dir(folder)
         .unwrap()
         .map(|entry| entry.unwrap().path())

@@ -39,7 +39,7 @@ use super::identity::tokens::{DEAD_KEPT, FORGET_MAX};
 use super::{App, AppError, page, site_row};
 use crate::authority::{Authorities, CertificateError, Issued, RobotName, RobotRequest};
 use crate::db::enrolments::{Counting, Renewal};
-use crate::db::{self, DbError, Outcome, Tx};
+use crate::db::{self, DbError, EngineError, Outcome, Tx};
 use crate::identity::secret::Kind;
 
 /// Maximum numbers of join tokens that are valid at once.
@@ -148,8 +148,8 @@ impl From<DbError> for EnrolError {
     }
 }
 
-impl From<sqlx::Error> for EnrolError {
-    fn from(cause: sqlx::Error) -> Self {
+impl From<EngineError> for EnrolError {
+    fn from(cause: EngineError) -> Self {
         Self::App(cause.into())
     }
 }
@@ -346,13 +346,13 @@ impl App {
         alerts: Vec<Alert>,
     ) -> Result<(), DbError> {
         let (app, enrolment) = (self.clone(), enrolment.clone());
-        let committed = tx.commit_then(move |outcome| {
+        tx.commit_then(move |outcome| {
             if outcome == Outcome::Written {
                 app.enrolment_registry().note(&enrolment);
                 app.show_alerts(&alerts);
             }
-        });
-        Ok(committed.await?)
+        })
+        .await
     }
 
     /// Renews the certificate of a robot that has joined.

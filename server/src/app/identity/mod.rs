@@ -40,7 +40,7 @@ use super::{App, AppError};
 use crate::config::AuditConfig;
 use crate::connections::Purpose;
 use crate::db::sessions::Owner;
-use crate::db::{self, DbError, Tx};
+use crate::db::{self, DbError, EngineError, Tx};
 use crate::identity::attempts::{Attempts, Source};
 use crate::identity::secret::{Fingerprint, Kind, SECRET_RANDOM_BYTES, Secret};
 use crate::identity::subject::SubjectId;
@@ -118,6 +118,12 @@ pub enum SignInError {
     Storage(#[from] DbError),
 }
 
+impl From<EngineError> for SignInError {
+    fn from(cause: EngineError) -> Self {
+        Self::Storage(cause.into())
+    }
+}
+
 impl App {
     /// Returns the credential of a secret.
     ///
@@ -181,7 +187,7 @@ impl App {
         };
         let turn = tokio::time::timeout(LOOK_UP_WAIT_MAX, turns.acquire()).await;
         let turn = turn.ok().and_then(Result::ok);
-        turn.ok_or(DbError::Sqlite(sqlx::Error::PoolTimedOut))
+        turn.ok_or(DbError::Busy)
     }
 
     /// Reads the valid tokens and sessions from the database: caches all valid tokens, and ends

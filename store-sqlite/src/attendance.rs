@@ -1,0 +1,57 @@
+//! Attendance of robots: which ones were on the network and have not left by themselves.
+
+use sqlx::SqliteConnection;
+use tread_api::ids::{RobotId, SiteId};
+
+use super::{EngineError, parse};
+
+/// Attendance of one robot.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Expected {
+    /// The robot's site.
+    pub site: SiteId,
+    /// The robot.
+    pub robot: RobotId,
+    /// Whether it was on the network and has not left by itself.
+    pub is_present: bool,
+    /// Whether the requested alert is raised about it.
+    pub is_alerted: bool,
+}
+
+/// Returns the attendance of all robots, with whether their alert of this code is raised.
+pub async fn all(db: &mut SqliteConnection, code: &str) -> Result<Vec<Expected>, EngineError> {
+    let rows = sqlx::query!(
+        r#"SELECT sites.id AS site, robots.id AS robot, robots.is_present AS "is_present: bool",
+               EXISTS (SELECT 1 FROM alerts WHERE alerts.robot_pk = robots.pk
+                   AND alerts.code = ? AND alerts.cleared_at_us IS NULL) AS "is_alerted!: bool"
+           FROM robots JOIN sites ON sites.pk = robots.site_pk"#,
+        code,
+    );
+    let rows = rows.fetch_all(db).await?;
+    rows.into_iter()
+        .map(|row| {
+            Ok(Expected {
+                site: parse("site", &row.site)?,
+                robot: parse("robot", &row.robot)?,
+                is_present: row.is_present,
+                is_alerted: row.is_alerted,
+            })
+        })
+        .collect()
+}
+
+/// Stores whether a robot is on the network.
+pub async fn set_present(
+    db: &mut SqliteConnection,
+    robot_pk: i64,
+    is_present: bool,
+) -> Result<(), EngineError> {
+    sqlx::query!(
+        "UPDATE robots SET is_present = ? WHERE pk = ?",
+        is_present,
+        robot_pk
+    )
+    .execute(db)
+    .await?;
+    Ok(())
+}

@@ -1,0 +1,104 @@
+//! Deferred segments: measurements with times in the future, kept until the clock of their run is
+//! known.
+
+use serde_json::value::RawValue;
+use sqlx::SqliteConnection;
+use tread_api::friction::Segment;
+
+use super::{EngineError, from_json, unsigned};
+
+/// A deferred segment.
+#[derive(Debug, Clone)]
+pub struct DeferredSegment {
+    /// Its sequence number within its run.
+    pub seq: i64,
+    /// The segment, with the times of the robot's clock.
+    pub segment: Segment,
+}
+
+/// Origin of a segment.
+#[derive(Debug, Clone, Copy)]
+pub struct Origin {
+    /// Key of the run of the agent.
+    pub boot_pk: i64,
+    /// Sequence number within that run.
+    pub seq: i64,
+    /// Key of the site.
+    pub site_pk: i64,
+    /// Key of the robot.
+    pub robot_pk: i64,
+}
+
+/// Defers a segment; `false` if it is deferred or on the map already.
+pub async fn put(
+    db: &mut SqliteConnection,
+    origin: Origin,
+    (ended_at_us, received_at_us): (i64, i64),
+    measurement: &RawValue,
+) -> Result<bool, EngineError> {
+    let Origin {
+        boot_pk,
+        seq,
+        site_pk,
+        robot_pk,
+    } = origin;
+    let text = measurement.get();
+    let done = sqlx::query!(
+        "INSERT INTO deferred_segments
+             (boot_pk, seq, site_pk, robot_pk, ended_at_us, received_at_us, measurement)
+         SELECT ?1, ?2, ?3, ?4, ?5, ?6, ?7
+         WHERE COALESCE((SELECT last_seq FROM segment_ranges WHERE boot_pk = ?1 AND first_seq <= ?2
+                 ORDER BY first_seq DESC LIMIT 1) < ?2, TRUE)
+             AND NOT EXISTS (SELECT 1 FROM segments_removed
+                 WHERE boot_pk = ?1 AND ?2 BETWEEN from_seq AND to_seq)
+         ON CONFLICT DO NOTHING",
+        boot_pk,
+        seq,
+        site_pk,
+        robot_pk,
+        ended_at_us,
+        received_at_us,
+        text,
+    )
+    .execute(db)
+    .await?;
+    Ok(done.rows_affected() == 1)
+}
+
+/// Returns the number of a robot's deferred segments.
+pub async fn count(db: &mut SqliteConnection, robot_pk: i64) -> Result<u64, EngineError> {
+    let count = sqlx::query_scalar!(
+        r#"SELECT COUNT(*) AS "count!: i64" FROM deferred_segments WHERE robot_pk = ?"#,
+        robot_pk
+    );
+    unsigned("count", count.fetch_one(db).await?)
+}
+
+/// Removes and returns at most `limit` deferred segments of a run that ended before a time of its
+/// robot's clock.
+pub async fn take(
+    db: &mut SqliteConnection,
+    boot_pk: i64,
+    ended_before_us: i64,
+    limit: u32,
+) -> Result<Vec<DeferredSegment>, EngineError> {
+    let rows = sqlx::query!(
+        r#"DELETE FROM deferred_segments WHERE boot_pk = ?1 AND seq IN (
+               SELECT seq FROM deferred_segments WHERE boot_pk = ?1 AND ended_at_us <= ?2
+               ORDER BY seq LIMIT ?3)
+           RETURNING seq AS "seq!", measurement AS "measurement!""#,
+        boot_pk,
+        ended_before_us,
+        limit,
+    )
+    .fetch_all(db)
+    .await?;
+    rows.into_iter()
+        .map(|row| {
+            Ok(DeferredSegment {
+                seq: row.seq,
+                segment: from_json("measurement", &row.measurement)?,
+            })
+        })
+        .collect()
+}

@@ -1,0 +1,207 @@
+//! States of open missions without their trajectories, for the reconciler.
+
+use jiff::Timestamp;
+use sqlx::SqliteConnection;
+use tread_api::ids::{BootId, MissionId, PlanHash, RobotId, SiteId};
+use tread_api::mission::{LinkPolicy, Mission, MissionState};
+
+use super::super::{EngineError, corrupt, from_json, from_us, parse, to_us, unsigned};
+use super::state;
+
+/// State of an open mission, without its trajectory, which may be long.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Standing {
+    /// The mission.
+    pub id: MissionId,
+    /// The robot's site.
+    pub site: SiteId,
+    /// The robot.
+    pub robot: RobotId,
+    /// Its state.
+    pub state: MissionState,
+    /// Reason of that state.
+    pub reason: Option<String>,
+    /// Run of the agent that accepted it.
+    pub boot: Option<BootId>,
+    /// Whether it is to be paused.
+    pub pause_wanted: bool,
+    /// Priority; higher ones are driven first.
+    pub priority: i32,
+    /// Present revision and its plan hash.
+    pub content: (u32, PlanHash),
+    /// Revision that the robot does not have completely yet, and its plan hash.
+    pub replacement: Option<(u32, PlanHash)>,
+    /// Time since which its robot has not been heard; `None` while it is heard.
+    pub silent_since: Option<Timestamp>,
+    /// Time for which its robot may be unheard before the mission is lost, seconds; `None` for the
+    /// default.
+    pub lost_after_s: Option<f64>,
+    /// Behaviour of its robot without a connection to the server.
+    pub link_policy: LinkPolicy,
+    /// Duration of the robot's plan, seconds.
+    pub duration_s: Option<f64>,
+}
+
+impl From<&Mission> for Standing {
+    fn from(mission: &Mission) -> Self {
+        Self {
+            id: mission.id,
+            site: mission.site.clone(),
+            robot: mission.robot.clone(),
+            state: mission.state,
+            reason: mission.reason.clone(),
+            boot: mission.boot,
+            pause_wanted: mission.pause_wanted,
+            priority: mission.priority,
+            content: (mission.revision, mission.plan_hash),
+            replacement: mission
+                .replacement
+                .as_ref()
+                .map(|replacement| (replacement.revision, replacement.plan_hash)),
+            silent_since: None,
+            lost_after_s: mission.lost_after_s,
+            link_policy: mission.link_policy,
+            duration_s: mission.plan.map(|plan| plan.duration_s),
+        }
+    }
+}
+
+struct RawStanding {
+    id: String,
+    site: String,
+    robot: String,
+    state: String,
+    reason: Option<String>,
+    boot: Option<String>,
+    pause_wanted: bool,
+    priority: i64,
+    revision: i64,
+    plan_hash: String,
+    replacement_revision: Option<i64>,
+    replacement_hash: Option<String>,
+    silent_since_us: Option<i64>,
+    lost_after_s: Option<f64>,
+    link_policy: String,
+    duration_s: Option<f64>,
+}
+
+impl TryFrom<RawStanding> for Standing {
+    type Error = EngineError;
+
+    fn try_from(raw: RawStanding) -> Result<Self, EngineError> {
+        Ok(Self {
+            id: parse("mission", &raw.id)?,
+            site: parse("site", &raw.site)?,
+            robot: parse("robot", &raw.robot)?,
+            state: state(&raw.state)?,
+            reason: raw.reason,
+            boot: raw
+                .boot
+                .as_deref()
+                .map(|boot| parse("boot", boot))
+                .transpose()?,
+            pause_wanted: raw.pause_wanted,
+            priority: i32::try_from(raw.priority)
+                .map_err(|_range| corrupt("priority", raw.priority))?,
+            content: (
+                unsigned("mission revision", raw.revision)?,
+                parse("plan hash", &raw.plan_hash)?,
+            ),
+            replacement: match (raw.replacement_revision, raw.replacement_hash) {
+                (Some(revision), Some(hash)) => Some((
+                    unsigned("mission revision", revision)?,
+                    parse("plan hash", &hash)?,
+                )),
+                (Some(_), None) | (None, _) => None,
+            },
+            silent_since: raw.silent_since_us.map(from_us).transpose()?,
+            lost_after_s: raw.lost_after_s,
+            link_policy: from_json("link policy", &raw.link_policy)?,
+            duration_s: raw.duration_s,
+        })
+    }
+}
+
+macro_rules! standings {
+    ($condition:tt $(, $argument:expr)* $(,)?) => {
+        sqlx::query_as!(
+            RawStanding,
+            r#"SELECT missions.id, sites.id AS site, robots.id AS robot, missions.state,
+                   missions.reason, missions.boot,
+                   missions.pause_wanted AS "pause_wanted: bool", missions.priority,
+                   missions.revision,
+                   missions.plan_hash,
+                   missions.replacement ->> 'revision' AS "replacement_revision: i64",
+                   missions.replacement ->> 'plan_hash' AS "replacement_hash: String",
+                   missions.silent_since_us, missions.lost_after_s, missions.link_policy,
+                   missions.plan ->> 'duration_s' AS "duration_s: f64"
+               FROM missions
+               JOIN robots ON robots.pk = missions.robot_pk
+               JOIN sites ON sites.pk = robots.site_pk "# + $condition
+            $(, $argument)*
+        )
+    };
+}
+
+fn standings(raw: Vec<RawStanding>) -> Result<Vec<Standing>, EngineError> {
+    raw.into_iter().map(Standing::try_from).collect()
+}
+
+/// Returns all missions in progress: active ones, and those that await their robot's answer.
+pub async fn in_progress(db: &mut SqliteConnection) -> Result<Vec<Standing>, EngineError> {
+    let raw = standings!("WHERE missions.state IN ('offered', 'active', 'paused', 'cancelling')")
+        .fetch_all(db)
+        .await?;
+    standings(raw)
+}
+
+/// Returns the first queued mission of each robot without an active one; held missions are skipped.
+pub async fn next_in_queues(db: &mut SqliteConnection) -> Result<Vec<Standing>, EngineError> {
+    let raw = standings!(
+        "WHERE missions.id IN (
+             SELECT id FROM (
+                 SELECT id, ROW_NUMBER() OVER (PARTITION BY robot_pk ORDER BY priority DESC, id)
+                     AS place
+                 FROM missions WHERE state = 'queued' AND pause_wanted = 0)
+             WHERE place = 1)
+           AND NOT EXISTS (
+             SELECT 1 FROM missions AS other WHERE other.robot_pk = missions.robot_pk
+               AND other.state IN ('offered', 'active', 'paused', 'cancelling'))"
+    )
+    .fetch_all(db)
+    .await?;
+    standings(raw)
+}
+
+/// Returns the queued missions whose latest start has passed.
+pub async fn overdue(
+    db: &mut SqliteConnection,
+    now: Timestamp,
+    limit: u32,
+) -> Result<Vec<Standing>, EngineError> {
+    let now_us = to_us(now);
+    let raw = standings!(
+        "WHERE missions.state = 'queued' AND missions.latest_start_us < ? LIMIT ?",
+        now_us,
+        limit,
+    )
+    .fetch_all(db)
+    .await?;
+    standings(raw)
+}
+
+/// Returns a robot's open missions, the active one first, then in the order of the queue.
+pub async fn open_of_robot(
+    db: &mut SqliteConnection,
+    robot_pk: i64,
+) -> Result<Vec<Standing>, EngineError> {
+    let raw = standings!(
+        "WHERE missions.robot_pk = ? AND missions.state IN
+             ('queued', 'offered', 'active', 'paused', 'cancelling')
+         ORDER BY missions.state = 'queued', missions.priority DESC, missions.id",
+        robot_pk,
+    )
+    .fetch_all(db)
+    .await?;
+    standings(raw)
+}

@@ -1,0 +1,50 @@
+//! Rows of tokens, which contain the hash of a secret and never the secret.
+
+/// A token as it is stored.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct TokenRow<T> {
+    /// The hash of the secret.
+    pub hash: Vec<u8>,
+    /// The token.
+    pub token: T,
+}
+
+/// Defines look-ups of tokens: by identifier, and by the first bytes of the hash of the secret.
+/// `$rows!` selects the columns of a token.
+macro_rules! look_up_tokens {
+    ($table:tt, $rows:ident, $what:tt, $id:ty, $token:ty) => {
+        /// Returns a token by its identifier.
+        pub async fn find(
+            db: &mut SqliteConnection,
+            id: $id,
+        ) -> Result<Option<$token>, EngineError> {
+            let id = id.to_string();
+            let raw = $rows!("WHERE id = ?", id).fetch_optional(db).await?;
+            raw.map(<$token>::try_from).transpose()
+        }
+
+        /// Returns the token whose hash has the same first bytes.
+        pub async fn by_lookup(
+            db: &mut SqliteConnection,
+            fingerprint: &Fingerprint,
+        ) -> Result<Option<TokenRow<$token>>, EngineError> {
+            let lookup = fingerprint.lookup();
+            let row = sqlx::query!(
+                "SELECT id, hash FROM " + $table + " WHERE lookup = ?",
+                lookup
+            )
+            .fetch_optional(&mut *db)
+            .await?;
+            let Some(row) = row else {
+                return Ok(None);
+            };
+            let token = find(db, parse($what, &row.id)?).await?;
+            Ok(token.map(|token| TokenRow {
+                hash: row.hash,
+                token,
+            }))
+        }
+    };
+}
+
+pub(super) use look_up_tokens;

@@ -1,0 +1,502 @@
+//! Raw measurements, in the order of their commits.
+//!
+//! Their values have a table of typed columns; what the measurements of a range have in common is in
+//! the ledger ([`super::segment_ranges`]).
+
+use std::collections::BTreeSet;
+use std::sync::LazyLock;
+
+use futures_util::{Stream, StreamExt as _};
+use jiff::Timestamp;
+use sqlx::SqliteConnection;
+use tread_api::friction::{Information, Segment, StoredSegment, ThetaErrors};
+use tread_api::ids::{RobotId, TerrainId};
+
+use super::rows::{Row, RowsStatement};
+use super::segment_ranges::{self, NewRange};
+use super::{EngineError, corrupt, from_us, ground, parse, robots_text, to_us, unsigned};
+
+/// A measurement to be stored.
+#[derive(Debug, Clone, Copy)]
+pub struct NewSegment<'segment> {
+    /// Key of the run of the agent.
+    pub boot_pk: i64,
+    /// Its sequence number within that run.
+    pub seq: i64,
+    /// Key of the robot.
+    pub robot_pk: i64,
+    /// Key of the site.
+    pub site_pk: i64,
+    /// Key of the configuration.
+    pub configuration_pk: i64,
+    /// The measurement.
+    pub segment: &'segment Segment,
+    /// Its begin and end, by the server's clock, nanoseconds since 1970.
+    pub times_ns: (i64, i64),
+}
+
+impl NewSegment<'_> {
+    /// Returns whether the ledger may name this and the next measurement in one range.
+    fn is_followed_by(&self, next: &Self) -> bool {
+        let whole = |new: &Self| (new.boot_pk, new.robot_pk, new.site_pk, new.configuration_pk);
+        let shared = |segment: &Segment| (segment.mission, segment.grid_revision);
+        self.seq.checked_add(1) == Some(next.seq)
+            && whole(self) == whole(next)
+            && shared(self.segment) == shared(next.segment)
+            && self.segment.terrain == next.segment.terrain
+    }
+}
+
+/// Number of columns of a measurement.
+const COLUMNS: usize = 18;
+
+static INSERT: LazyLock<RowsStatement> = LazyLock::new(|| {
+    RowsStatement::new(
+        "INSERT INTO segment_values (pk, started_at_ns, ended_at_ns, ix, iy, theta_information,
+             theta_weighted, independent_information, robot_error_ratio, tyre_error_ratio,
+             track_information, track_weighted, rolling_information, rolling_weighted,
+             mu_peak_lower_bound, samples, distance_m, saturation_ratio)",
+        COLUMNS,
+        "",
+    )
+});
+
+/// Keys of measurements that were added together; empty if `last` is before `first`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Added {
+    /// Key of the first one.
+    pub first: i64,
+    /// Key of the last one.
+    pub last: i64,
+}
+
+/// Stores measurements, none of which is stored yet.
+///
+/// # Errors
+/// The database failed, for example because a measurement is stored already.
+pub async fn insert(
+    db: &mut SqliteConnection,
+    segments: &[NewSegment<'_>],
+    received_at: Timestamp,
+) -> Result<Added, EngineError> {
+    let (last, last_us) = segment_ranges::last(db).await?.unwrap_or((0, i64::MIN));
+    // Times are in the order of commits, whatever the clock did.
+    let received_at_us = to_us(received_at).max(last_us);
+    let mut ranges = Vec::new();
+    let mut next_pk = last + 1;
+    for range in segments.chunk_by(NewSegment::is_followed_by) {
+        let Some(first) = range.first() else { continue };
+        let (first_pk, count) = (next_pk, range.len() as u64);
+        next_pk = next_pk.saturating_add_unsigned(count);
+        ranges.push(NewRange {
+            first_pk,
+            first_seq: first.seq,
+            count,
+            boot_pk: first.boot_pk,
+            robot_pk: first.robot_pk,
+            site_pk: first.site_pk,
+            configuration_pk: first.configuration_pk,
+            mission: first.segment.mission,
+            grid_revision: first.segment.grid_revision,
+            terrain: first.segment.terrain.as_ref(),
+        });
+    }
+    segment_ranges::insert(db, &ranges, received_at_us).await?;
+    let rows: Vec<(i64, &NewSegment<'_>)> = (last + 1..).zip(segments).collect();
+    INSERT.execute(db, &rows, bind).await?;
+    Ok(Added {
+        first: last + 1,
+        last: next_pk - 1,
+    })
+}
+
+fn bind(row: &mut Row<'_>, &(pk, new): &(i64, &NewSegment<'_>)) -> Result<(), EngineError> {
+    let (segment, (started_at_ns, ended_at_ns)) = (new.segment, new.times_ns);
+    let errors = segment.theta_errors;
+    let (track, rolling) = (segment.effective_track_ratio, segment.rolling_resistance);
+    row.add(pk)?
+        .add(started_at_ns)?
+        .add(ended_at_ns)?
+        .add(segment.cell.ix)?
+        .add(segment.cell.iy)?
+        .add(segment.theta.information)?
+        .add(segment.theta.weighted)?
+        .add(errors.map(|errors| errors.independent_information))?
+        .add(errors.map(|errors| errors.robot_ratio))?
+        .add(errors.map(|errors| errors.tyre_ratio))?
+        .add(track.map(|pair| pair.information))?
+        .add(track.map(|pair| pair.weighted))?
+        .add(rolling.map(|pair| pair.information))?
+        .add(rolling.map(|pair| pair.weighted))?
+        .add(segment.mu_peak_lower_bound)?
+        .add(i64::from(segment.samples))?
+        .add(segment.distance_m)?
+        .add(segment.saturation_ratio)?;
+    Ok(())
+}
+
+/// Filter of a list of measurements.
+#[derive(Debug, Clone, Default)]
+pub struct SegmentFilter {
+    /// Only those of this robot.
+    pub robot: Option<RobotId>,
+    /// Only those on this terrain.
+    pub terrain: Option<TerrainId>,
+    /// Only those of these robots.
+    pub robots: Option<BTreeSet<RobotId>>,
+    /// Only those with a larger key (cursor).
+    pub after: i64,
+}
+
+/// A row of the statement of `measurements!`.
+struct Raw {
+    pk: i64,
+    robot_pk: i64,
+    site_pk: i64,
+    configuration_pk: i64,
+    robot: String,
+    boot: String,
+    seq: i64,
+    received_at_us: i64,
+    configuration: String,
+    mission: Option<String>,
+    grid_revision: i64,
+    terrain: String,
+    terrain_revision: i64,
+    started_at_ns: i64,
+    ended_at_ns: i64,
+    ix: i64,
+    iy: i64,
+    theta_information: f64,
+    theta_weighted: f64,
+    independent_information: Option<f64>,
+    robot_error_ratio: Option<f64>,
+    tyre_error_ratio: Option<f64>,
+    track_information: Option<f64>,
+    track_weighted: Option<f64>,
+    rolling_information: Option<f64>,
+    rolling_weighted: Option<f64>,
+    mu_peak_lower_bound: Option<f64>,
+    samples: i64,
+    distance_m: f64,
+    saturation_ratio: f64,
+}
+
+fn pair(information: Option<f64>, weighted: Option<f64>) -> Option<Information> {
+    let (information, weighted) = information.zip(weighted)?;
+    Some(Information {
+        information,
+        weighted,
+    })
+}
+
+fn from_ns(ns: i64) -> Result<Timestamp, EngineError> {
+    Timestamp::from_nanosecond(ns.into()).map_err(|_range| corrupt("time", ns))
+}
+
+impl Raw {
+    fn segment(&self) -> Result<Segment, EngineError> {
+        let errors = self.independent_information.zip(self.robot_error_ratio);
+        let mission = self.mission.as_deref().map(|id| parse("mission", id));
+        Ok(Segment {
+            configuration: parse("configuration", &self.configuration)?,
+            mission: mission.transpose()?,
+            started_at: from_ns(self.started_at_ns)?,
+            ended_at: from_ns(self.ended_at_ns)?,
+            grid_revision: unsigned("revision", self.grid_revision)?,
+            cell: ground::cell(self.ix, self.iy)?,
+            terrain: ground::terrain(&self.terrain, self.terrain_revision)?,
+            theta: Information {
+                information: self.theta_information,
+                weighted: self.theta_weighted,
+            },
+            theta_errors: errors.zip(self.tyre_error_ratio).map(
+                |((independent_information, robot_ratio), tyre_ratio)| ThetaErrors {
+                    independent_information,
+                    robot_ratio,
+                    tyre_ratio,
+                },
+            ),
+            effective_track_ratio: pair(self.track_information, self.track_weighted),
+            rolling_resistance: pair(self.rolling_information, self.rolling_weighted),
+            mu_peak_lower_bound: self.mu_peak_lower_bound,
+            samples: unsigned("number", self.samples)?,
+            distance_m: self.distance_m,
+            saturation_ratio: self.saturation_ratio,
+        })
+    }
+}
+
+impl TryFrom<Raw> for StoredSegment {
+    type Error = EngineError;
+
+    fn try_from(raw: Raw) -> Result<Self, EngineError> {
+        Ok(Self {
+            id: raw.pk,
+            robot: parse("robot", &raw.robot)?,
+            boot: parse("boot", &raw.boot)?,
+            seq: unsigned("number", raw.seq)?,
+            received_at: from_us(raw.received_at_us)?,
+            segment: raw.segment()?,
+        })
+    }
+}
+
+/// Reads measurements range by range; a cross join keeps its order. The first argument is a key: only
+/// later measurements are read. Of the ranges that begin before it only the last can reach beyond it.
+macro_rules! measurements {
+    ($condition:tt, $after:expr, $($argument:expr),* $(,)?) => {
+        sqlx::query_as!(
+            Raw,
+            r#"SELECT segment_values.pk AS "pk!", segment_ranges.robot_pk AS "robot_pk!",
+                   segment_ranges.site_pk AS "site_pk!",
+                   segment_ranges.configuration_pk AS "configuration_pk!", robots.id AS "robot!",
+                   boots.id AS "boot!",
+                   segment_ranges.first_seq + segment_values.pk - segment_ranges.first_pk
+                       AS "seq!: i64",
+                   received_at_us AS "received_at_us!", configurations.id AS "configuration!",
+                   mission AS "mission?", grid_revision AS "grid_revision!",
+                   terrain AS "terrain!", terrain_revision AS "terrain_revision!",
+                   started_at_ns AS "started_at_ns!", ended_at_ns AS "ended_at_ns!", ix AS "ix!",
+                   iy AS "iy!", theta_information AS "theta_information!",
+                   theta_weighted AS "theta_weighted!",
+                   independent_information AS "independent_information?",
+                   robot_error_ratio AS "robot_error_ratio?",
+                   tyre_error_ratio AS "tyre_error_ratio?",
+                   track_information AS "track_information?", track_weighted AS "track_weighted?",
+                   rolling_information AS "rolling_information?",
+                   rolling_weighted AS "rolling_weighted?",
+                   mu_peak_lower_bound AS "mu_peak_lower_bound?", samples AS "samples!",
+                   distance_m AS "distance_m!", saturation_ratio AS "saturation_ratio!"
+               FROM segment_ranges
+               CROSS JOIN robots ON robots.pk = segment_ranges.robot_pk
+               CROSS JOIN boots ON boots.pk = segment_ranges.boot_pk
+               CROSS JOIN configurations ON configurations.pk = segment_ranges.configuration_pk
+               CROSS JOIN segment_values ON segment_values.pk
+                   BETWEEN segment_ranges.first_pk AND segment_ranges.last_pk
+               WHERE segment_ranges.first_pk >= COALESCE(
+                       (SELECT MAX(first_pk) FROM segment_ranges WHERE first_pk <= ?1), 0)
+                   AND segment_values.pk > ?1 "# + $condition
+                + " ORDER BY segment_ranges.first_pk, segment_values.pk LIMIT ?2",
+            $after,
+            $($argument),*
+        )
+    };
+}
+
+/// Range of stored measurements; it changes whenever one is added or removed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Extent {
+    /// Key of the oldest one; measurements are removed from the oldest on.
+    pub first: Option<i64>,
+    /// Key of the newest one.
+    pub last: Option<i64>,
+    /// Time at which the newest one was received, microseconds since 1970: keys may restart after
+    /// all were removed.
+    pub last_at_us: Option<i64>,
+}
+
+/// Returns the range of measurements of a robot or terrain; without a filter of all sites, since a
+/// needless reload of a list costs less than an index.
+pub async fn extent(
+    db: &mut SqliteConnection,
+    site_pk: i64,
+    filter: &SegmentFilter,
+) -> Result<Extent, EngineError> {
+    let robot = filter.robot.as_ref().map(RobotId::as_str);
+    let terrain = filter.terrain.as_ref().map(TerrainId::as_str);
+    let (first, last) = match (robot, terrain) {
+        (Some(robot), _) => {
+            let row = sqlx::query!(
+                r#"SELECT
+                       (SELECT MIN(first_pk) FROM segment_ranges WHERE robot_pk = robots.pk) AS "first: i64",
+                       (SELECT MAX(last_pk) FROM segment_ranges WHERE robot_pk = robots.pk) AS "last: i64"
+                   FROM robots WHERE site_pk = ? AND id = ?"#,
+                site_pk,
+                robot,
+            );
+            let row = row.fetch_optional(&mut *db).await?;
+            row.map_or((None, None), |row| (row.first, row.last))
+        }
+        (None, Some(terrain)) => {
+            let row = sqlx::query!(
+                r#"SELECT
+                       (SELECT MIN(first_pk) FROM segment_ranges WHERE site_pk = ?1 AND terrain = ?2)
+                           AS "first: i64",
+                       (SELECT MAX(last_pk) FROM segment_ranges WHERE site_pk = ?1 AND terrain = ?2)
+                           AS "last: i64""#,
+                site_pk,
+                terrain,
+            );
+            let row = row.fetch_one(&mut *db).await?;
+            (row.first, row.last)
+        }
+        (None, None) => segment_ranges::ends(db).await?.unzip(),
+    };
+    let last_at_us = match last {
+        Some(last) => segment_ranges::received_at_us(db, last).await?,
+        None => None,
+    };
+    Ok(Extent {
+        first,
+        last,
+        last_at_us,
+    })
+}
+
+/// Returns a site's measurements in the order of their commits.
+pub async fn list(
+    db: &mut SqliteConnection,
+    site_pk: i64,
+    filter: &SegmentFilter,
+    limit: u32,
+) -> Result<Vec<StoredSegment>, EngineError> {
+    let robot = filter.robot.as_ref().map(RobotId::as_str);
+    let terrain = filter.terrain.as_ref().map(TerrainId::as_str);
+    let named = robots_text(filter.robots.as_ref())?;
+    // One statement per kind of filter, so that each uses its own index. A plus sign excludes a
+    // column from the choice of index.
+    let raw = match (robot, terrain) {
+        (Some(robot), _) => {
+            measurements!(
+            "AND segment_ranges.robot_pk = (SELECT pk FROM robots WHERE site_pk = ?3 AND id = ?4)
+                 AND (?5 IS NULL OR terrain = ?5)
+                 AND (?6 IS NULL OR robots.id IN (SELECT value FROM json_each(?6)))",
+            filter.after,
+            limit,
+            site_pk,
+            robot,
+            terrain,
+            named,
+        )
+            .fetch_all(db)
+            .await?
+        }
+        (None, Some(terrain)) => {
+            measurements!(
+                "AND segment_ranges.site_pk = ?3 AND terrain = ?4
+                 AND (?5 IS NULL OR robots.id IN (SELECT value FROM json_each(?5)))",
+                filter.after,
+                limit,
+                site_pk,
+                terrain,
+                named,
+            )
+            .fetch_all(db)
+            .await?
+        }
+        (None, None) => {
+            measurements!(
+                "AND +segment_ranges.site_pk = ?3
+                 AND (?4 IS NULL OR robots.id IN (SELECT value FROM json_each(?4)))",
+                filter.after,
+                limit,
+                site_pk,
+                named,
+            )
+            .fetch_all(db)
+            .await?
+        }
+    };
+    raw.into_iter().map(StoredSegment::try_from).collect()
+}
+
+/// A measurement with the keys of what it names.
+#[derive(Debug)]
+pub struct KeyedSegment {
+    /// Its key.
+    pub pk: i64,
+    /// Key of the robot.
+    pub robot_pk: i64,
+    /// The robot.
+    pub robot: RobotId,
+    /// Key of the site.
+    pub site_pk: i64,
+    /// Key of the configuration.
+    pub configuration_pk: i64,
+    /// The measurement.
+    pub segment: Segment,
+}
+
+impl TryFrom<Raw> for KeyedSegment {
+    type Error = EngineError;
+
+    fn try_from(raw: Raw) -> Result<Self, EngineError> {
+        Ok(Self {
+            pk: raw.pk,
+            robot_pk: raw.robot_pk,
+            robot: parse("robot", &raw.robot)?,
+            site_pk: raw.site_pk,
+            configuration_pk: raw.configuration_pk,
+            segment: raw.segment()?,
+        })
+    }
+}
+
+/// Returns all measurements of a robot after a key, in the order of their commits.
+pub fn of_robot(
+    db: &mut SqliteConnection,
+    robot_pk: i64,
+    after: i64,
+) -> impl Stream<Item = Result<KeyedSegment, EngineError>> {
+    let rows = measurements!(
+        "AND segment_ranges.robot_pk = ?3",
+        after,
+        i64::MAX,
+        robot_pk,
+    );
+    rows.fetch(db).map(|raw| KeyedSegment::try_from(raw?))
+}
+
+/// Returns the key of the first measurement that was received at a time or later, if none that was
+/// can have been removed; else `None`. Keys are in the order of receipt, begin at 1 and have no
+/// gaps; the first ones are removed first, the last one never is.
+pub async fn first_since(
+    db: &mut SqliteConnection,
+    at: Timestamp,
+) -> Result<Option<i64>, EngineError> {
+    let at_us = to_us(at);
+    let Some((first, last)) = segment_ranges::ends(db).await? else {
+        return Ok(None);
+    };
+    let (mut low, mut high) = (first, last + 1);
+    while low < high {
+        let middle = low + (high - low) / 2;
+        let received = segment_ranges::received_at_us(db, middle).await?;
+        if received.is_some_and(|received| received < at_us) {
+            low = middle + 1;
+        } else {
+            high = middle;
+        }
+    }
+    let is_known = low <= last && (low > first || first == 1);
+    Ok(is_known.then_some(low))
+}
+
+/// Returns at most `limit` measurements of a site in the order of their commits, after a key.
+pub async fn of_site(
+    db: &mut SqliteConnection,
+    site_pk: i64,
+    after: i64,
+    limit: u32,
+) -> Result<Vec<KeyedSegment>, EngineError> {
+    let rows = measurements!("AND +segment_ranges.site_pk = ?3", after, limit, site_pk);
+    let rows = rows.fetch_all(db).await?;
+    rows.into_iter().map(KeyedSegment::try_from).collect()
+}
+
+/// Returns at most `limit` measurements of all sites in the order of their commits, after a key and up
+/// to another one, each with the key of its site.
+pub async fn of_all_sites(
+    db: &mut SqliteConnection,
+    (after, until): (i64, i64),
+    limit: u32,
+) -> Result<Vec<(i64, StoredSegment)>, EngineError> {
+    let rows = measurements!("AND segment_values.pk <= ?3", after, limit, until);
+    let rows = rows.fetch_all(db).await?;
+    let with_site = |raw: Raw| Ok((raw.site_pk, raw.try_into()?));
+    rows.into_iter().map(with_site).collect()
+}
+
+#[cfg(test)]
+mod tests;

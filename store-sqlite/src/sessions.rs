@@ -1,0 +1,414 @@
+//! Sessions of browsers, each belonging to a token or to a person who signed in at an OpenID
+//! provider.
+
+use jiff::Timestamp;
+use sqlx::SqliteConnection;
+use tread_api::identity::Person;
+use tread_api::ids::{PersonId, SessionId, TokenId};
+
+use super::{EngineError, corrupt, from_json, from_us, parse, to_json, to_us};
+use tread_store::Fingerprint;
+
+/// A person as stored with a session.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct SignedIn {
+    /// Identity at the provider.
+    pub person: Person,
+    /// Name at the time of sign-in.
+    pub name: String,
+    /// Groups at the time of sign-in that had a grant.
+    pub groups: Vec<String>,
+}
+
+/// Owner of a session.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Owner {
+    /// The token that it was opened with.
+    Token(TokenId),
+    /// A person.
+    Person(SignedIn),
+}
+
+/// A session as it is stored.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct SessionRow {
+    /// The session.
+    pub id: SessionId,
+    /// Its owner.
+    pub owner: Owner,
+    /// The hash of its secret.
+    pub hash: Vec<u8>,
+    /// When it was opened.
+    pub created_at: Timestamp,
+    /// Time from which it is refused.
+    pub expires_at: Timestamp,
+    /// Time of its last use; only for a person's session.
+    pub last_used_at: Option<Timestamp>,
+}
+
+/// A session to be stored.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct NewSession {
+    /// The session.
+    pub id: SessionId,
+    /// Its owner.
+    pub owner: Owner,
+    /// The hash of its secret.
+    pub fingerprint: Fingerprint,
+    /// When it was opened.
+    pub created_at: Timestamp,
+    /// Time from which it is refused.
+    pub expires_at: Timestamp,
+}
+
+struct Raw {
+    id: String,
+    token_id: Option<String>,
+    person_id: Option<String>,
+    issuer: Option<String>,
+    subject: Option<String>,
+    name: Option<String>,
+    groups: Option<String>,
+    hash: Vec<u8>,
+    created_at_us: i64,
+    expires_at_us: i64,
+    last_used_at_us: Option<i64>,
+}
+
+impl TryFrom<Raw> for SessionRow {
+    type Error = EngineError;
+
+    fn try_from(raw: Raw) -> Result<Self, EngineError> {
+        let owner = match (&raw.token_id, &raw.person_id) {
+            (Some(token), None) => Owner::Token(parse("token", token)?),
+            (None, Some(person)) => {
+                let missing = || corrupt("session's person", &raw.id);
+                let groups = raw.groups.as_deref().ok_or_else(missing)?;
+                Owner::Person(SignedIn {
+                    person: Person {
+                        id: parse("person", person)?,
+                        issuer: raw.issuer.ok_or_else(missing)?,
+                        subject: raw.subject.ok_or_else(missing)?,
+                    },
+                    name: raw.name.ok_or_else(missing)?,
+                    groups: from_json("groups", groups)?,
+                })
+            }
+            (Some(_), Some(_)) | (None, None) => return Err(corrupt("session's owner", &raw.id)),
+        };
+        Ok(Self {
+            id: parse("session", &raw.id)?,
+            owner,
+            hash: raw.hash,
+            created_at: from_us(raw.created_at_us)?,
+            expires_at: from_us(raw.expires_at_us)?,
+            last_used_at: raw.last_used_at_us.map(from_us).transpose()?,
+        })
+    }
+}
+
+macro_rules! sessions {
+    ($condition:tt $(, $argument:expr)* $(,)?) => {
+        sqlx::query_as!(
+            Raw,
+            r#"SELECT id, token_id, person_id, issuer, subject, name, groups, hash, created_at_us,
+                   expires_at_us, last_used_at_us
+               FROM sessions "# + $condition
+            $(, $argument)*
+        )
+    };
+}
+
+/// Stores a new session.
+pub async fn insert(db: &mut SqliteConnection, session: &NewSession) -> Result<(), EngineError> {
+    let id = session.id.to_string();
+    let (token, signed_in) = match &session.owner {
+        Owner::Token(token) => (Some(token.to_string()), None),
+        Owner::Person(signed_in) => (None, Some(signed_in)),
+    };
+    let person = signed_in.map(|signed_in| signed_in.person.id.to_string());
+    let issuer = signed_in.map(|signed_in| &signed_in.person.issuer);
+    let subject = signed_in.map(|signed_in| &signed_in.person.subject);
+    let name = signed_in.map(|signed_in| &signed_in.name);
+    let groups = signed_in.map(|signed_in| to_json("groups", &signed_in.groups));
+    let groups = groups.transpose()?;
+    let (lookup, hash) = (session.fingerprint.lookup(), session.fingerprint.as_bytes());
+    let (created_at_us, expires_at_us) = (to_us(session.created_at), to_us(session.expires_at));
+    sqlx::query!(
+        "INSERT INTO sessions (id, token_id, person_id, issuer, subject, name, groups, lookup, hash,
+             created_at_us, expires_at_us)
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        id,
+        token,
+        person,
+        issuer,
+        subject,
+        name,
+        groups,
+        lookup,
+        hash,
+        created_at_us,
+        expires_at_us,
+    )
+    .execute(db)
+    .await?;
+    Ok(())
+}
+
+/// Returns the session whose hash has the same first bytes.
+pub async fn by_lookup(
+    db: &mut SqliteConnection,
+    fingerprint: &Fingerprint,
+) -> Result<Option<SessionRow>, EngineError> {
+    let lookup = fingerprint.lookup();
+    let raw = sessions!("WHERE lookup = ?", lookup)
+        .fetch_optional(db)
+        .await?;
+    raw.map(SessionRow::try_from).transpose()
+}
+
+/// Returns a session by its identifier.
+pub async fn find(
+    db: &mut SqliteConnection,
+    id: SessionId,
+) -> Result<Option<SessionRow>, EngineError> {
+    let id = id.to_string();
+    let raw = sessions!("WHERE id = ?", id).fetch_optional(db).await?;
+    raw.map(SessionRow::try_from).transpose()
+}
+
+/// Filter of a list of people's sessions.
+#[derive(Debug, Clone)]
+pub struct OfPeople<'filter> {
+    /// Those of this provider.
+    pub issuer: &'filter str,
+    /// Groups whose grants are within the requested scope.
+    pub within: &'filter [&'filter str],
+    /// Groups whose grants are not within it; sessions with one of them are left out.
+    pub elsewhere: &'filter [&'filter str],
+    /// Whether to include sessions whose groups have no grant any more.
+    pub any: bool,
+    /// Only those that are valid at this time.
+    pub at: Timestamp,
+    /// Only those before this one.
+    pub before: Option<SessionId>,
+}
+
+/// Returns sessions of people, newest first.
+pub async fn list(
+    db: &mut SqliteConnection,
+    filter: &OfPeople<'_>,
+    limit: u32,
+) -> Result<Vec<SessionRow>, EngineError> {
+    let at_us = to_us(filter.at);
+    let before = filter.before.map(|id| id.to_string());
+    let within = to_json("groups", &filter.within)?;
+    let elsewhere = to_json("groups", &filter.elsewhere)?;
+    let raw = sessions!(
+        "WHERE issuer = ?1 AND expires_at_us > ?2 AND (?3 IS NULL OR id < ?3)
+           AND NOT EXISTS (
+               SELECT 1 FROM json_each(sessions.groups) AS own
+               WHERE own.value IN (SELECT value FROM json_each(?4)))
+           AND (?5 OR EXISTS (
+               SELECT 1 FROM json_each(sessions.groups) AS own
+               WHERE own.value IN (SELECT value FROM json_each(?6))))
+         ORDER BY id DESC LIMIT ?7",
+        filter.issuer,
+        at_us,
+        before,
+        elsewhere,
+        filter.any,
+        within,
+        limit,
+    )
+    .fetch_all(db)
+    .await?;
+    raw.into_iter().map(SessionRow::try_from).collect()
+}
+
+/// Returns the number of people's sessions that are valid at a time.
+pub async fn count_of_people(db: &mut SqliteConnection, at: Timestamp) -> Result<i64, EngineError> {
+    let at_us = to_us(at);
+    let row = sqlx::query!(
+        r#"SELECT COUNT(*) AS "count!: i64" FROM sessions
+           WHERE person_id IS NOT NULL AND expires_at_us > ?"#,
+        at_us
+    )
+    .fetch_one(db)
+    .await?;
+    Ok(row.count)
+}
+
+/// Returns every session that is valid at a time.
+pub async fn all_valid(
+    db: &mut SqliteConnection,
+    at: Timestamp,
+) -> Result<Vec<SessionId>, EngineError> {
+    let at_us = to_us(at);
+    let ids = sqlx::query_scalar!("SELECT id FROM sessions WHERE expires_at_us > ?", at_us)
+        .fetch_all(db)
+        .await?;
+    ids.iter().map(|id| parse("session", id)).collect()
+}
+
+/// Stores the last use of a person's session.
+pub async fn touch(
+    db: &mut SqliteConnection,
+    id: SessionId,
+    at: Timestamp,
+) -> Result<(), EngineError> {
+    let (id, at_us) = (id.to_string(), to_us(at));
+    sqlx::query!(
+        "UPDATE sessions SET last_used_at_us =
+             MAX(?, created_at_us, COALESCE(last_used_at_us, created_at_us))
+         WHERE id = ? AND person_id IS NOT NULL",
+        at_us,
+        id
+    )
+    .execute(db)
+    .await?;
+    Ok(())
+}
+
+/// Deletes a session.
+pub async fn delete(db: &mut SqliteConnection, id: SessionId) -> Result<(), EngineError> {
+    let id = id.to_string();
+    sqlx::query!("DELETE FROM sessions WHERE id = ?", id)
+        .execute(db)
+        .await?;
+    Ok(())
+}
+
+/// Deletes sessions that have expired.
+pub async fn forget_expired(db: &mut SqliteConnection, at: Timestamp) -> Result<(), EngineError> {
+    let at_us = to_us(at);
+    sqlx::query!("DELETE FROM sessions WHERE expires_at_us <= ?", at_us)
+        .execute(db)
+        .await?;
+    Ok(())
+}
+
+/// Returns the oldest sessions of a token or person beyond the newest `kept`.
+pub async fn surplus(
+    db: &mut SqliteConnection,
+    (token, person): (Option<TokenId>, Option<PersonId>),
+    kept: u32,
+) -> Result<Vec<SessionId>, EngineError> {
+    let token = token.map(|id| id.to_string());
+    let person = person.map(|id| id.to_string());
+    let ids = sqlx::query_scalar!(
+        "SELECT id FROM sessions WHERE token_id = ? OR person_id = ?
+         ORDER BY id DESC LIMIT -1 OFFSET ?",
+        token,
+        person,
+        kept
+    )
+    .fetch_all(db)
+    .await?;
+    ids.iter().map(|id| parse("session", id)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use sqlx::Connection as _;
+    use tread_api::ids::OidcSubject;
+
+    use super::*;
+    use crate::{Db, schema};
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn sessions_of_before_there_were_people_stay() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("tread.db");
+        let mut old = schema::open_before(&path, 20_261_122_163_000).await;
+        let (id, token) = (
+            "0192f0c1-2b3c-7d4e-8f50-617283940a1b",
+            "0192f0c1-2b3c-7d4e-8f50-617283940a1c",
+        );
+        for statement in [
+            format!(
+                "INSERT INTO tokens (id, name, role, lookup, hash, created_at_us, created_by, expires_at_us)
+                 VALUES ('{token}', 'desk', 'viewer', x'0101010101010101', zeroblob(32), 1, 'test', 9)"
+            ),
+            format!(
+                "INSERT INTO sessions (id, token_id, lookup, hash, created_at_us, expires_at_us)
+                 VALUES ('{id}', '{token}', x'0202020202020202', zeroblob(32), 2, 8)"
+            ),
+        ] {
+            sqlx::raw_sql(sqlx::AssertSqlSafe(statement))
+                .execute(&mut old)
+                .await
+                .unwrap();
+        }
+        old.close().await.unwrap();
+        let db = Db::open(&path).await.unwrap();
+        let mut tx = db.read("db").await.unwrap();
+        let kept = find(&mut tx, id.parse().unwrap()).await.unwrap().unwrap();
+        assert_eq!(kept.owner, Owner::Token(token.parse().unwrap()));
+        assert_eq!(kept.expires_at.as_microsecond(), 8);
+        assert_eq!(kept.created_at.as_microsecond(), 2);
+        drop(tx);
+        db.close().await;
+    }
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn somebody_whose_group_gives_nothing_any_more_is_listed_by_the_others() {
+        let folder = tempfile::tempdir().unwrap();
+        let db = Db::open(&folder.path().join("tread.db")).await.unwrap();
+        let mut tx = db.write("test").await.unwrap();
+        let issuer = "https://login.test";
+        for (number, groups) in [
+            (1, vec!["admins", "night"]),
+            (2, vec!["night"]),
+            (3, vec!["yard"]),
+        ] {
+            let subject = format!("person {number}");
+            let id = PersonId::of(OidcSubject {
+                issuer,
+                subject: &subject,
+            });
+            let signed_in = SignedIn {
+                person: Person {
+                    id,
+                    issuer: issuer.to_owned(),
+                    subject,
+                },
+                name: "anna".to_owned(),
+                groups: groups.into_iter().map(str::to_owned).collect(),
+            };
+            let session = NewSession {
+                id: format!("0192f0c1-2b3c-7d4e-8f50-61728394000{number}")
+                    .parse()
+                    .unwrap(),
+                owner: Owner::Person(signed_in),
+                fingerprint: Fingerprint::of(&number.to_string()),
+                created_at: Timestamp::UNIX_EPOCH,
+                expires_at: Timestamp::from_second(1_000).unwrap(),
+            };
+            insert(&mut tx, &session).await.unwrap();
+        }
+        // The group `night` was removed from the configuration.
+        for (within, elsewhere, any, expected) in [
+            (&["admins", "yard"][..], &[][..], true, &[3, 2, 1][..]),
+            (&["yard"], &["admins"], false, &[3]),
+            (&[], &["admins", "yard"], false, &[]),
+        ] {
+            let filter = OfPeople {
+                issuer,
+                within,
+                elsewhere,
+                any,
+                at: Timestamp::UNIX_EPOCH,
+                before: None,
+            };
+            let kept = list(&mut tx, &filter, 10).await.unwrap();
+            let listed = kept.iter().map(|kept| {
+                let text = kept.id.to_string();
+                text[text.len() - 1..].parse::<u8>().unwrap()
+            });
+            assert_eq!(listed.collect::<Vec<_>>(), expected, "{within:?}");
+        }
+        drop(tx);
+        db.close().await;
+    }
+}

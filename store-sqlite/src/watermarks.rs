@@ -1,0 +1,57 @@
+//! Watermarks: up to which raw measurement those of a robot are in the stored sums.
+
+use std::collections::HashMap;
+
+use sqlx::SqliteConnection;
+
+use super::{EngineError, corrupt};
+
+/// Step of a robot's watermark, from the key of one raw measurement to that of a later one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct WatermarkStep {
+    /// Key of the robot.
+    pub robot_pk: i64,
+    /// The stored watermark; 0 if there is none.
+    pub from_pk: i64,
+    /// The next watermark.
+    pub to_pk: i64,
+}
+
+/// Moves a watermark.
+///
+/// # Errors
+/// The stored watermark is another one, so the sums of the step may be stored already.
+pub async fn advance(db: &mut SqliteConnection, step: WatermarkStep) -> Result<(), EngineError> {
+    let WatermarkStep {
+        robot_pk,
+        from_pk,
+        to_pk,
+    } = step;
+    let done = sqlx::query!(
+        "INSERT INTO watermarks (robot_pk, segment_pk) VALUES (?1, ?3)
+         ON CONFLICT (robot_pk) DO UPDATE SET segment_pk = excluded.segment_pk
+             WHERE segment_pk = ?2",
+        robot_pk,
+        from_pk,
+        to_pk,
+    )
+    .execute(db)
+    .await?;
+    if done.rows_affected() == 1 {
+        Ok(())
+    } else {
+        Err(corrupt("watermark that was moved by others", from_pk))
+    }
+}
+
+/// Returns all watermarks by the keys of their robots.
+pub async fn all(db: &mut SqliteConnection) -> Result<HashMap<i64, i64>, EngineError> {
+    let rows = sqlx::query!(
+        r#"SELECT robot_pk AS "robot_pk!", segment_pk AS "segment_pk!" FROM watermarks"#
+    );
+    let rows = rows.fetch_all(db).await?;
+    Ok(rows
+        .into_iter()
+        .map(|row| (row.robot_pk, row.segment_pk))
+        .collect())
+}

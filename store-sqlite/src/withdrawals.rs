@@ -1,0 +1,79 @@
+//! Withdrawals: hours of robots whose measurements are not on the map.
+
+use jiff::Timestamp;
+use sqlx::SqliteConnection;
+
+use super::{EngineError, from_us, to_us, unsigned};
+
+/// Withdrawn hours of a robot, both ends included.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct WithdrawalRow {
+    /// Its number.
+    pub pk: i64,
+    /// Key of the robot.
+    pub robot_pk: i64,
+    /// First hour, since 1970.
+    pub from_h: i64,
+    /// Last hour, since 1970.
+    pub to_h: i64,
+    /// Reason.
+    pub reason: String,
+    /// Author.
+    pub by: String,
+    /// Time of the withdrawal.
+    pub at: Timestamp,
+}
+
+impl WithdrawalRow {
+    /// Returns whether what a robot measured in an hour is withdrawn.
+    pub fn includes(&self, robot_pk: i64, hour: i64) -> bool {
+        self.robot_pk == robot_pk && (self.from_h..=self.to_h).contains(&hour)
+    }
+}
+
+/// Returns all withdrawals, oldest first.
+pub async fn all(db: &mut SqliteConnection) -> Result<Vec<WithdrawalRow>, EngineError> {
+    let rows = sqlx::query!(
+        r#"SELECT pk AS "pk!", robot_pk, from_h, to_h, reason, withdrawn_by, withdrawn_at_us
+           FROM withdrawals ORDER BY pk"#
+    );
+    let rows = rows.fetch_all(db).await?;
+    rows.into_iter()
+        .map(|row| {
+            Ok(WithdrawalRow {
+                pk: row.pk,
+                robot_pk: row.robot_pk,
+                from_h: row.from_h,
+                to_h: row.to_h,
+                reason: row.reason,
+                by: row.withdrawn_by,
+                at: from_us(row.withdrawn_at_us)?,
+            })
+        })
+        .collect()
+}
+
+/// Returns the number of withdrawals.
+pub async fn count(db: &mut SqliteConnection) -> Result<usize, EngineError> {
+    let count = sqlx::query_scalar!(r#"SELECT COUNT(*) AS "count!: i64" FROM withdrawals"#);
+    unsigned("count", count.fetch_one(db).await?)
+}
+
+/// Adds a withdrawal; returns its number.
+pub async fn insert(db: &mut SqliteConnection, row: &WithdrawalRow) -> Result<i64, EngineError> {
+    let at_us = to_us(row.at);
+    let done = sqlx::query!(
+        "INSERT INTO withdrawals (robot_pk, from_h, to_h, reason, withdrawn_by, withdrawn_at_us)
+         VALUES (?1, ?2, ?3, ?4, ?5, MAX(?6, COALESCE(
+             (SELECT withdrawn_at_us FROM withdrawals ORDER BY pk DESC LIMIT 1), ?6)))",
+        row.robot_pk,
+        row.from_h,
+        row.to_h,
+        row.reason,
+        row.by,
+        at_us,
+    )
+    .execute(db)
+    .await?;
+    Ok(done.last_insert_rowid())
+}
