@@ -3,9 +3,9 @@
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
 use tread_api::geometry::Point;
-use tread_api::ids::{AlertCode, AlertId, MissionId, RobotId, SiteId};
-use tread_api::rights::Scope;
+use tread_api::ids::{AlertCode, AlertId, RobotId, SiteId};
 use tread_api::robot::{Alert, AlertReport, Severity};
+pub use tread_store::alerts::{AlertFilter, AlertLocation};
 
 use super::{EngineError, corrupt, from_us, parse, scope_text, to_us};
 
@@ -64,23 +64,6 @@ macro_rules! alerts {
 
 fn rows(raw: Vec<Raw>) -> Result<Vec<Alert>, EngineError> {
     raw.into_iter().map(Alert::try_from).collect()
-}
-
-/// Which alerts to list.
-#[derive(Debug, Clone, Default)]
-pub struct AlertFilter {
-    /// Only those of this site.
-    pub site: Option<SiteId>,
-    /// Only those of robots of this name.
-    pub robot: Option<RobotId>,
-    /// Only those of this kind.
-    pub kind: Option<AlertCode>,
-    /// Only those that have not cleared.
-    pub raised: bool,
-    /// Only those older than this one (cursor).
-    pub before: Option<AlertId>,
-    /// Only those about sites and robots in this scope.
-    pub within: Scope,
 }
 
 /// Returns alerts, newest first.
@@ -195,15 +178,6 @@ pub async fn raise(
     .execute(db)
     .await?;
     Ok(())
-}
-
-/// Mission and place of an alert, as far as they are known.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct AlertLocation {
-    /// The mission.
-    pub mission: Option<MissionId>,
-    /// The robot's position in the site frame.
-    pub place: Option<Point>,
 }
 
 /// Stores mission and place of an alert.

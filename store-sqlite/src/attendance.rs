@@ -1,22 +1,9 @@
 //! Attendance of robots: which ones were on the network and have not left by themselves.
 
 use sqlx::SqliteConnection;
-use tread_api::ids::{RobotId, SiteId};
+pub use tread_store::attendance::Expected;
 
 use super::{EngineError, parse};
-
-/// Attendance of one robot.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Expected {
-    /// The robot's site.
-    pub site: SiteId,
-    /// The robot.
-    pub robot: RobotId,
-    /// Whether it was on the network and has not left by itself.
-    pub is_present: bool,
-    /// Whether the requested alert is raised about it.
-    pub is_alerted: bool,
-}
 
 /// Returns the attendance of all robots, with whether their alert of this code is raised.
 pub async fn all(db: &mut SqliteConnection, code: &str) -> Result<Vec<Expected>, EngineError> {

@@ -6,6 +6,7 @@ use sqlx::SqliteConnection;
 use tread_api::audit::{AuditChain, FIRST_PREVIOUS_HASH, hash_after};
 use tread_api::identity::{AuditEntry, AuditOrder, Role};
 use tread_api::ids::TokenId;
+pub use tread_store::audit::AuditFilter;
 
 use super::tokens::role;
 use super::{EngineError, from_json, from_us, parse, to_json, to_us, unsigned};
@@ -59,19 +60,6 @@ impl TryFrom<Raw> for AuditEntry {
             hash: raw.hash,
         })
     }
-}
-
-/// Filter and order of a list of entries.
-#[derive(Debug, Clone, Default)]
-pub struct AuditFilter {
-    /// Only those of the token or person of this name.
-    pub who: Option<String>,
-    /// Only those of refused requests.
-    pub refused: bool,
-    /// Order of the list.
-    pub order: AuditOrder,
-    /// Only those after this one in that order (cursor).
-    pub beyond: Option<u64>,
 }
 
 /// Returns entries in the requested order.

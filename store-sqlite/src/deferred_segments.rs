@@ -3,31 +3,9 @@
 
 use serde_json::value::RawValue;
 use sqlx::SqliteConnection;
-use tread_api::friction::Segment;
+pub use tread_store::deferred_segments::{DeferredSegment, Origin};
 
 use super::{EngineError, from_json, unsigned};
-
-/// A deferred segment.
-#[derive(Debug, Clone)]
-pub struct DeferredSegment {
-    /// Its sequence number within its run.
-    pub seq: i64,
-    /// The segment, with the times of the robot's clock.
-    pub segment: Segment,
-}
-
-/// Origin of a segment.
-#[derive(Debug, Clone, Copy)]
-pub struct Origin {
-    /// Key of the run of the agent.
-    pub boot_pk: i64,
-    /// Sequence number within that run.
-    pub seq: i64,
-    /// Key of the site.
-    pub site_pk: i64,
-    /// Key of the robot.
-    pub robot_pk: i64,
-}
 
 /// Defers a segment; `false` if it is deferred or on the map already.
 pub async fn put(

@@ -6,6 +6,7 @@ use jiff::Timestamp;
 use sqlx::SqliteConnection;
 use tread_api::enrolment::Enrolment;
 use tread_api::ids::{RobotId, SiteId};
+pub use tread_store::enrolments::{Counting, Renewal};
 
 use super::{EngineError, from_json, from_us, parse, robots_text, to_json, to_us};
 use tread_store::Issued;
@@ -150,17 +151,6 @@ pub async fn insert(
     Ok(())
 }
 
-/// Certificates of an enrolment that are accepted for a renewal.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Counting {
-    /// None: the enrolment is not in force.
-    None,
-    /// Any certificate of a trusted authority: none are recorded.
-    Any,
-    /// These certificates.
-    These(Issued),
-}
-
 /// Returns which certificates of an enrolment are accepted for a renewal.
 pub async fn counting(
     db: &mut SqliteConnection,
@@ -194,19 +184,6 @@ pub async fn forget_certificates(db: &mut SqliteConnection) -> Result<u64, Engin
     .execute(db)
     .await?;
     Ok(done.rows_affected())
-}
-
-/// A renewal.
-#[derive(Debug, Clone, Copy)]
-pub struct Renewal<'renewal> {
-    /// Time of the request.
-    pub at: Timestamp,
-    /// Expiry of the next certificate.
-    pub expires_at: Timestamp,
-    /// Fingerprint of the authority that signed the certificate shown for the renewal.
-    pub authority: &'renewal str,
-    /// Certificates that are accepted from now on.
-    pub issued: &'renewal Issued,
 }
 
 /// Stores a renewal of an enrolment that is in force; false if it no longer is.

@@ -2,22 +2,10 @@
 
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
+pub use tread_store::idempotency::{OwnKey, StoredAnswer};
 use uuid::Uuid;
 
 use super::{EngineError, parse, to_us};
-use tread_store::SubjectId;
-
-/// An answer that was given under an idempotency key.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct StoredAnswer {
-    /// Hash of the request that was answered.
-    pub request_hash: Uuid,
-    /// The answer, JSON.
-    pub answer: String,
-}
-
-/// An idempotency key with its sender.
-pub type OwnKey<'key> = (SubjectId, &'key str);
 
 /// Returns the answer given to this sender under a key, or to the same request before keys had
 /// owners.

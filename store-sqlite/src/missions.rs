@@ -5,26 +5,14 @@ mod standing;
 use futures_util::StreamExt as _;
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
-use tread_api::ids::{BootId, MissionId, RobotId, SiteId};
-use tread_api::mission::{
-    Cause, DrivenPath, Mission, MissionQuality, MissionState, PlanSummary, Replacement,
-};
-use tread_api::rights::Scope;
-use tread_api::robot::MissionProgress;
+use tread_api::ids::{MissionId, RobotId, SiteId};
+use tread_api::mission::{Cause, DrivenPath, Mission, MissionQuality, MissionState, Replacement};
+pub use tread_store::missions::{Facts, Inserted, MissionFilter, MissionRow};
 
 pub use self::standing::{Standing, in_progress, next_in_queues, open_of_robot, overdue};
 use super::{
     EngineError, corrupt, from_json, from_us, parse, scope_text, to_json, to_us, unsigned,
 };
-
-/// A mission with the database key of its robot.
-#[derive(Debug, Clone, PartialEq)]
-pub struct MissionRow {
-    /// Database key of the robot.
-    pub robot_pk: i64,
-    /// The mission, with the progress that was last reported durably.
-    pub mission: Mission,
-}
 
 struct Raw {
     id: String,
@@ -130,17 +118,6 @@ macro_rules! missions {
     };
 }
 
-/// State in which a mission is inserted.
-#[derive(Debug, Clone, Copy)]
-pub struct Inserted<'reason> {
-    /// The state.
-    pub state: MissionState,
-    /// Why it is in this state.
-    pub cause: Cause,
-    /// The same for people.
-    pub reason: Option<&'reason str>,
-}
-
 /// Adds a mission in a state that counts instead of its own.
 pub async fn insert(
     db: &mut SqliteConnection,
@@ -190,21 +167,6 @@ pub async fn find(
         .fetch_optional(db)
         .await?;
     raw.map(MissionRow::try_from).transpose()
-}
-
-/// Filter of a list of missions.
-#[derive(Debug, Clone, Default)]
-pub struct MissionFilter {
-    /// Only those of this site.
-    pub site: Option<SiteId>,
-    /// Only those of robots of this name.
-    pub robot: Option<RobotId>,
-    /// Only those in this state.
-    pub state: Option<MissionState>,
-    /// Only those older than this one (cursor).
-    pub before: Option<MissionId>,
-    /// Only those of sites and robots in this scope.
-    pub within: Scope,
 }
 
 /// Returns missions, newest first, until there are `limit` or their trajectories exceed `bytes_max`
@@ -269,21 +231,6 @@ pub async fn compare_and_set(
     .execute(db)
     .await?;
     Ok(result.rows_affected() == 1)
-}
-
-/// Facts from a robot's answer or report; `None` leaves the stored value unchanged.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Facts {
-    /// Run of the agent that accepted it.
-    pub boot: Option<BootId>,
-    /// Summary of the robot's plan.
-    pub plan: Option<PlanSummary>,
-    /// Progress.
-    pub progress: Option<MissionProgress>,
-    /// Time at which it began; only the first value counts.
-    pub started_at: Option<Timestamp>,
-    /// Time at which it ended; only the first value counts.
-    pub ended_at: Option<Timestamp>,
 }
 
 /// Adds facts to a mission; its times never decrease from its creation to its end.

@@ -1,42 +1,11 @@
 //! Restorations of backups, and the robots that await what follows from one.
 
-use jiff::Timestamp;
 use sqlx::SqliteConnection;
-use tread_api::ids::{RobotId, SiteId};
+pub use tread_store::restorations::{
+    Changed, ENROLMENTS_SKIPPED, REVISIONS_SKIPPED, Restoration, Restrained,
+};
 
 use super::{EngineError, from_us, parse, to_us, unsigned};
-
-/// Number of revisions of terrains and geofences that are skipped at a restoration: more than
-/// anybody draws between a backup and its restoration.
-pub const REVISIONS_SKIPPED: i64 = 1_000_000;
-/// Number of enrolments of a robot that are skipped at a restoration.
-pub const ENROLMENTS_SKIPPED: i64 = 1_000;
-
-/// A restoration.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Restoration {
-    /// Time of the restoration.
-    pub restored_at: Timestamp,
-    /// Time of the backup.
-    pub taken_at: Timestamp,
-    /// Version of the server that made the backup.
-    pub version: String,
-}
-
-/// Numbers of what a restoration changed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Changed {
-    /// Robots that await their release.
-    pub robots: u64,
-    /// Sessions that were ended.
-    pub sessions: u64,
-    /// Join tokens that were revoked.
-    pub join_tokens: u64,
-    /// Deliveries to webhooks that are not sent any more.
-    pub deliveries: u64,
-    /// Robots of which the next certificate counts.
-    pub certificates: u64,
-}
 
 /// Makes a database that was restored from a backup fit for robots and people that went on after
 /// the backup.
@@ -137,21 +106,6 @@ pub async fn enrolment_floor(db: &mut SqliteConnection) -> Result<u32, EngineErr
         r#"SELECT COALESCE(MAX(enrolment_floor), 0) AS "floor!: i64" FROM restorations"#
     );
     unsigned("number", floor.fetch_one(db).await?)
-}
-
-/// A robot that is restrained since a restoration.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Restrained {
-    /// Its key.
-    pub pk: i64,
-    /// Its site.
-    pub site: SiteId,
-    /// The robot.
-    pub robot: RobotId,
-    /// Whether it awaits its release by an operator, and is not retired.
-    pub awaits_release: bool,
-    /// Whether it is to say how its open missions ended.
-    pub outcomes_wanted: bool,
 }
 
 /// Returns all robots that are restrained since a restoration; retired ones too.

@@ -5,47 +5,13 @@ use std::collections::{BTreeSet, HashMap};
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
 use tread_api::ids::{BootId, ConfigurationId, RobotId, SiteId, Tag};
-use tread_api::robot::{Capabilities, RobotModel, UnmappedMeasurements};
+use tread_api::robot::UnmappedMeasurements;
+pub use tread_store::robots::{Introduction, RobotRow};
 
 use super::{EngineError, from_json, from_us, parse, robots_text, to_json, to_us, unsigned};
 
 /// Maximum number of runs removed with each new one.
 const FORGET_MAX: u32 = 50;
-
-/// A robot as stored.
-#[derive(Debug, Clone)]
-pub struct RobotRow {
-    /// Its database key.
-    pub pk: i64,
-    /// Its site.
-    pub site: SiteId,
-    /// The robot.
-    pub id: RobotId,
-    /// Model and tyres as last declared.
-    pub model: RobotModel,
-    /// Identifier of this model with these tyres.
-    pub configuration: ConfigurationId,
-    /// Display name; the identifier until it is renamed.
-    pub name: String,
-    /// Tags, sorted.
-    pub tags: Vec<Tag>,
-    /// Time at which it was retired; `None` if it is not.
-    pub retired_at: Option<Timestamp>,
-    /// Since when it awaits its release after a restoration; `None` if it does not.
-    pub awaits_release_since: Option<Timestamp>,
-    /// What the base and its agent can do.
-    pub capabilities: Capabilities,
-    /// Version of the agent.
-    pub agent_version: String,
-    /// The run of the agent that said hello last.
-    pub boot: BootId,
-    /// First hello.
-    pub first_seen_at: Timestamp,
-    /// Last hello.
-    pub last_hello_at: Timestamp,
-    /// Counts of its refused and deferred measurements.
-    pub measurements: UnmappedMeasurements,
-}
 
 struct Raw {
     pk: i64,
@@ -187,23 +153,6 @@ pub async fn list(
     .fetch_all(db)
     .await?;
     rows.into_iter().map(RobotRow::try_from).collect()
-}
-
-/// Content of a robot's hello.
-#[derive(Debug, Clone, Copy)]
-pub struct Introduction<'hello> {
-    /// The robot.
-    pub id: &'hello RobotId,
-    /// This run of the agent.
-    pub boot: BootId,
-    /// Version of the agent.
-    pub agent_version: &'hello str,
-    /// Model and tyres.
-    pub model: &'hello RobotModel,
-    /// What the base and its agent can do.
-    pub capabilities: &'hello Capabilities,
-    /// Time of the hello.
-    pub at: Timestamp,
 }
 
 /// Stores a robot's hello and the run of its agent; keeps `runs_kept` runs.

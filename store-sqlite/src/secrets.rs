@@ -1,13 +1,6 @@
 //! Rows of tokens, which contain the hash of a secret and never the secret.
 
-/// A token as it is stored.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct TokenRow<T> {
-    /// The hash of the secret.
-    pub hash: Vec<u8>,
-    /// The token.
-    pub token: T,
-}
+pub use tread_store::secrets::TokenRow;
 
 /// Defines look-ups of tokens: by identifier, and by the first bytes of the hash of the secret.
 /// `$rows!` selects the columns of a token.

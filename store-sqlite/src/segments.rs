@@ -3,7 +3,6 @@
 //! Their values have a table of typed columns; what the measurements of a range have in common is in
 //! the ledger ([`super::segment_ranges`]).
 
-use std::collections::BTreeSet;
 use std::sync::LazyLock;
 
 use futures_util::{Stream, StreamExt as _};
@@ -11,41 +10,11 @@ use jiff::Timestamp;
 use sqlx::SqliteConnection;
 use tread_api::friction::{Information, Segment, StoredSegment, ThetaErrors};
 use tread_api::ids::{RobotId, TerrainId};
+pub use tread_store::segments::{Added, Extent, KeyedSegment, NewSegment, SegmentFilter};
 
 use super::rows::{Row, RowsStatement};
 use super::segment_ranges::{self, NewRange};
 use super::{EngineError, corrupt, from_us, ground, parse, robots_text, to_us, unsigned};
-
-/// A measurement to be stored.
-#[derive(Debug, Clone, Copy)]
-pub struct NewSegment<'segment> {
-    /// Key of the run of the agent.
-    pub boot_pk: i64,
-    /// Its sequence number within that run.
-    pub seq: i64,
-    /// Key of the robot.
-    pub robot_pk: i64,
-    /// Key of the site.
-    pub site_pk: i64,
-    /// Key of the configuration.
-    pub configuration_pk: i64,
-    /// The measurement.
-    pub segment: &'segment Segment,
-    /// Its begin and end, by the server's clock, nanoseconds since 1970.
-    pub times_ns: (i64, i64),
-}
-
-impl NewSegment<'_> {
-    /// Returns whether the ledger may name this and the next measurement in one range.
-    fn is_followed_by(&self, next: &Self) -> bool {
-        let whole = |new: &Self| (new.boot_pk, new.robot_pk, new.site_pk, new.configuration_pk);
-        let shared = |segment: &Segment| (segment.mission, segment.grid_revision);
-        self.seq.checked_add(1) == Some(next.seq)
-            && whole(self) == whole(next)
-            && shared(self.segment) == shared(next.segment)
-            && self.segment.terrain == next.segment.terrain
-    }
-}
 
 /// Number of columns of a measurement.
 const COLUMNS: usize = 18;
@@ -60,15 +29,6 @@ static INSERT: LazyLock<RowsStatement> = LazyLock::new(|| {
         "",
     )
 });
-
-/// Keys of measurements that were added together; empty if `last` is before `first`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Added {
-    /// Key of the first one.
-    pub first: i64,
-    /// Key of the last one.
-    pub last: i64,
-}
 
 /// Stores measurements, none of which is stored yet.
 ///
@@ -133,19 +93,6 @@ fn bind(row: &mut Row<'_>, &(pk, new): &(i64, &NewSegment<'_>)) -> Result<(), En
         .add(segment.distance_m)?
         .add(segment.saturation_ratio)?;
     Ok(())
-}
-
-/// Filter of a list of measurements.
-#[derive(Debug, Clone, Default)]
-pub struct SegmentFilter {
-    /// Only those of this robot.
-    pub robot: Option<RobotId>,
-    /// Only those on this terrain.
-    pub terrain: Option<TerrainId>,
-    /// Only those of these robots.
-    pub robots: Option<BTreeSet<RobotId>>,
-    /// Only those with a larger key (cursor).
-    pub after: i64,
 }
 
 /// A row of the statement of `measurements!`.
@@ -284,18 +231,6 @@ macro_rules! measurements {
     };
 }
 
-/// Range of stored measurements; it changes whenever one is added or removed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub struct Extent {
-    /// Key of the oldest one; measurements are removed from the oldest on.
-    pub first: Option<i64>,
-    /// Key of the newest one.
-    pub last: Option<i64>,
-    /// Time at which the newest one was received, microseconds since 1970: keys may restart after
-    /// all were removed.
-    pub last_at_us: Option<i64>,
-}
-
 /// Returns the range of measurements of a robot or terrain; without a filter of all sites, since a
 /// needless reload of a list costs less than an index.
 pub async fn extent(
@@ -399,23 +334,6 @@ pub async fn list(
         }
     };
     raw.into_iter().map(StoredSegment::try_from).collect()
-}
-
-/// A measurement with the keys of what it names.
-#[derive(Debug)]
-pub struct KeyedSegment {
-    /// Its key.
-    pub pk: i64,
-    /// Key of the robot.
-    pub robot_pk: i64,
-    /// The robot.
-    pub robot: RobotId,
-    /// Key of the site.
-    pub site_pk: i64,
-    /// Key of the configuration.
-    pub configuration_pk: i64,
-    /// The measurement.
-    pub segment: Segment,
 }
 
 impl TryFrom<Raw> for KeyedSegment {

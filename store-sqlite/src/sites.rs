@@ -4,20 +4,10 @@ use sqlx::SqliteConnection;
 use tread_api::ids::SiteId;
 use tread_api::rights::Scope;
 use tread_api::site::{GeoOrigin, Grid, Site};
+pub use tread_store::sites::SiteRow;
 
 use super::{EngineError, from_json, from_us, parse, scope_text, to_json, to_us, unsigned};
 use tread_store::friction::Horizons;
-
-/// A site with its key in the database.
-#[derive(Debug, Clone)]
-pub struct SiteRow {
-    /// Its database key.
-    pub pk: i64,
-    /// The site.
-    pub site: Site,
-    /// Horizons before which the epochs of its map are merged.
-    pub horizons: Horizons,
-}
 
 struct Raw {
     pk: i64,

@@ -6,8 +6,8 @@
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
 use tread_api::ids::{RobotId, SiteId, StopId};
-use tread_api::rights::Scope;
 use tread_api::stop::Stop;
+pub use tread_store::stops::StopFilter;
 
 use super::{EngineError, from_us, parse, scope_text, to_json, to_us};
 
@@ -67,21 +67,6 @@ macro_rules! stops {
 
 fn rows(raw: Vec<Raw>) -> Result<Vec<Stop>, EngineError> {
     raw.into_iter().map(Stop::try_from).collect()
-}
-
-/// Filter of a list of stops.
-#[derive(Debug, Clone, Default)]
-pub struct StopFilter {
-    /// Only those of this site.
-    pub site: Option<SiteId>,
-    /// Only those of robots of this name.
-    pub robot: Option<RobotId>,
-    /// Only open ones, at most one of each robot.
-    pub in_force: bool,
-    /// Only those older than this one (cursor).
-    pub before: Option<StopId>,
-    /// Only those of sites and robots in this scope.
-    pub within: Scope,
 }
 
 /// Returns stops, newest first.

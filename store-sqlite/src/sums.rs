@@ -6,33 +6,13 @@ use std::sync::LazyLock;
 use futures_util::TryStreamExt as _;
 use sqlx::SqliteConnection;
 use tread_api::friction::Information;
-use tread_api::site::Cell;
-use tread_api::terrain::TerrainRef;
+pub use tread_store::sums::{StoredHour, SumKey, SumRow};
 
 use super::rows::{Row, RowsStatement};
 use super::{EngineError, ground, unsigned};
 use tread_store::friction::fixed::Fixed;
 use tread_store::friction::sums::{Pair, Pass, TELLING_DEVIATIONS};
 use tread_store::friction::{Horizons, Sums};
-
-/// Key of one sum.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub struct SumKey {
-    /// Key of the robot.
-    pub robot_pk: i64,
-    /// Time of the measurement's end, hours since 1970.
-    pub epoch_h: i64,
-    /// The cell.
-    pub cell: Cell,
-    /// The terrain; `None` outside of all terrains.
-    pub terrain: Option<TerrainRef>,
-    /// Revision of the grid of the cell.
-    pub grid_revision: u32,
-    /// Key of the site.
-    pub site_pk: i64,
-    /// Key of the configuration.
-    pub configuration_pk: i64,
-}
 
 /// Number of columns.
 const COLUMNS: usize = 35;
@@ -161,15 +141,6 @@ pub async fn add<'sums>(
     Ok(())
 }
 
-/// A stored sum of one robot, configuration and hour in one cell.
-#[derive(Debug, Clone, PartialEq)]
-pub struct SumRow {
-    /// Its key.
-    pub key: SumKey,
-    /// The sums.
-    pub sums: Sums,
-}
-
 struct Raw {
     site_pk: i64,
     ix: i64,
@@ -277,17 +248,6 @@ pub async fn each(
         take(SumRow::try_from(raw)?);
     }
     Ok(())
-}
-
-/// An hour of a robot under which sums are stored.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct StoredHour {
-    /// Key of the robot.
-    pub robot_pk: i64,
-    /// Hours since 1970.
-    pub epoch_h: i64,
-    /// Horizons of the robot's site.
-    pub horizons: Horizons,
 }
 
 /// Returns at most `limit` hours whose sums are to be merged into their days or months, those of a robot

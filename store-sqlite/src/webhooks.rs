@@ -2,8 +2,9 @@
 
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
-use tread_api::ids::{AlertCode, AlertId, DeliveryId, SiteId, WebhookId};
+use tread_api::ids::{AlertCode, DeliveryId, SiteId, WebhookId};
 use tread_api::webhook::{Delivery, DeliveryState, NoticeEvent, Webhook, WebhookSettings};
+pub use tread_store::webhooks::{Due, DueTimes, NewDelivery, Outcome, Receiver};
 
 use super::{EngineError, corrupt, from_json, from_us, parse, to_json, to_us, unsigned};
 
@@ -184,17 +185,6 @@ pub async fn delete(db: &mut SqliteConnection, id: WebhookId) -> Result<bool, En
     Ok(done.rows_affected() == 1)
 }
 
-/// A webhook that is to be sent something.
-#[derive(Clone, PartialEq, Eq)]
-pub struct Receiver {
-    /// The webhook.
-    pub id: WebhookId,
-    /// Its URL.
-    pub url: String,
-    /// Its secret.
-    pub secret: String,
-}
-
 /// Returns the enabled webhooks that are to be sent alerts of a kind, of a site or, without one,
 /// about the server itself.
 pub async fn interested(
@@ -221,25 +211,6 @@ pub async fn interested(
         })
     });
     receivers.collect()
-}
-
-/// A delivery to be queued.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct NewDelivery {
-    /// Its identifier.
-    pub id: DeliveryId,
-    /// The webhook.
-    pub webhook: WebhookId,
-    /// The alert; `None` for a test.
-    pub alert: Option<AlertId>,
-    /// What it tells.
-    pub event: NoticeEvent,
-    /// Kind of the alert.
-    pub kind: AlertCode,
-    /// Body, JSON.
-    pub body: String,
-    /// Time when it is queued.
-    pub at: Timestamp,
 }
 
 /// Queues a delivery; has no effect if it is queued already.
@@ -289,35 +260,6 @@ pub async fn drop_oldest(
     Ok(done.rows_affected())
 }
 
-/// A delivery that is to be sent now.
-#[derive(Clone, PartialEq, Eq)]
-pub struct Due {
-    /// The webhook.
-    pub webhook: WebhookId,
-    /// Its URL.
-    pub url: String,
-    /// Its secret.
-    pub secret: String,
-    /// The delivery.
-    pub id: DeliveryId,
-    /// Body, JSON.
-    pub body: String,
-    /// Number of attempts so far.
-    pub attempts: u32,
-    /// Time when it was queued.
-    pub created_at: Timestamp,
-}
-
-/// Times of a search for deliveries that are due.
-#[derive(Debug, Clone, Copy)]
-pub struct DueTimes {
-    /// Present time.
-    pub now: Timestamp,
-    /// Latest time to which a delivery can have been put off; a later one shows that the clock was
-    /// set back.
-    pub latest: Timestamp,
-}
-
 /// Returns of each webhook the oldest delivery that is due. Of a webhook that is not enabled only
 /// tests are sent.
 pub async fn due(db: &mut SqliteConnection, times: DueTimes) -> Result<Vec<Due>, EngineError> {
@@ -349,25 +291,6 @@ pub async fn due(db: &mut SqliteConnection, times: DueTimes) -> Result<Vec<Due>,
         })
     });
     due.collect()
-}
-
-/// What became of a delivery by an attempt.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Outcome {
-    /// The webhook.
-    pub webhook: WebhookId,
-    /// The delivery.
-    pub id: DeliveryId,
-    /// State after the attempt.
-    pub state: DeliveryState,
-    /// Time of the attempt.
-    pub at: Timestamp,
-    /// Time from which it is sent again, if it is pending.
-    pub due_at: Timestamp,
-    /// Status of the answer, if there was one.
-    pub status: Option<u16>,
-    /// Why the attempt failed.
-    pub detail: Option<String>,
 }
 
 /// Stores the outcome of an attempt. A delivery that was dropped meanwhile only counts if it has

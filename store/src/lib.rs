@@ -3,19 +3,36 @@
 //!
 //! [`friction`] holds the sums of the map, which an engine adds up as the server does in memory.
 
+pub mod alerts;
+pub mod attendance;
+pub mod audit;
+pub mod deferred_segments;
+pub mod enrolments;
 pub mod error;
 pub mod failure;
-mod fingerprint;
 pub mod friction;
+pub mod idempotency;
 mod issued;
 mod limited;
 pub mod metrics;
+pub mod missions;
 mod outcome;
+pub mod restorations;
+pub mod robots;
+pub mod secrets;
+pub mod segments;
+pub mod sessions;
+pub mod sites;
+pub mod stops;
 mod subject;
+pub mod sums;
+pub mod watermarks;
+pub mod webhooks;
+pub mod withdrawals;
 
 pub use self::error::DbError;
-pub use self::fingerprint::Fingerprint;
 pub use self::issued::Issued;
 pub use self::limited::limited;
 pub use self::outcome::{Disk, Outcome};
+pub use self::secrets::Fingerprint;
 pub use self::subject::SubjectId;

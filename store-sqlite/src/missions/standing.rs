@@ -2,69 +2,10 @@
 
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
-use tread_api::ids::{BootId, MissionId, PlanHash, RobotId, SiteId};
-use tread_api::mission::{LinkPolicy, Mission, MissionState};
+pub use tread_store::missions::Standing;
 
 use super::super::{EngineError, corrupt, from_json, from_us, parse, to_us, unsigned};
 use super::state;
-
-/// State of an open mission, without its trajectory, which may be long.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Standing {
-    /// The mission.
-    pub id: MissionId,
-    /// The robot's site.
-    pub site: SiteId,
-    /// The robot.
-    pub robot: RobotId,
-    /// Its state.
-    pub state: MissionState,
-    /// Reason of that state.
-    pub reason: Option<String>,
-    /// Run of the agent that accepted it.
-    pub boot: Option<BootId>,
-    /// Whether it is to be paused.
-    pub pause_wanted: bool,
-    /// Priority; higher ones are driven first.
-    pub priority: i32,
-    /// Present revision and its plan hash.
-    pub content: (u32, PlanHash),
-    /// Revision that the robot does not have completely yet, and its plan hash.
-    pub replacement: Option<(u32, PlanHash)>,
-    /// Time since which its robot has not been heard; `None` while it is heard.
-    pub silent_since: Option<Timestamp>,
-    /// Time for which its robot may be unheard before the mission is lost, seconds; `None` for the
-    /// default.
-    pub lost_after_s: Option<f64>,
-    /// Behaviour of its robot without a connection to the server.
-    pub link_policy: LinkPolicy,
-    /// Duration of the robot's plan, seconds.
-    pub duration_s: Option<f64>,
-}
-
-impl From<&Mission> for Standing {
-    fn from(mission: &Mission) -> Self {
-        Self {
-            id: mission.id,
-            site: mission.site.clone(),
-            robot: mission.robot.clone(),
-            state: mission.state,
-            reason: mission.reason.clone(),
-            boot: mission.boot,
-            pause_wanted: mission.pause_wanted,
-            priority: mission.priority,
-            content: (mission.revision, mission.plan_hash),
-            replacement: mission
-                .replacement
-                .as_ref()
-                .map(|replacement| (replacement.revision, replacement.plan_hash)),
-            silent_since: None,
-            lost_after_s: mission.lost_after_s,
-            link_policy: mission.link_policy,
-            duration_s: mission.plan.map(|plan| plan.duration_s),
-        }
-    }
-}
 
 struct RawStanding {
     id: String,

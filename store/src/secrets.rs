@@ -1,4 +1,4 @@
-//! What is stored of a secret.
+//! What is stored of secrets.
 
 use sha2::{Digest as _, Sha256};
 use subtle::ConstantTimeEq as _;
@@ -35,4 +35,13 @@ impl Fingerprint {
     pub fn matches(&self, kept: &[u8]) -> bool {
         self.0.ct_eq(kept).into()
     }
+}
+
+/// A token as it is stored.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct TokenRow<T> {
+    /// The hash of the secret.
+    pub hash: Vec<u8>,
+    /// The token.
+    pub token: T,
 }

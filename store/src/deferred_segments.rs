@@ -1,0 +1,25 @@
+//! Segments that wait for the time of their robot.
+
+use tread_api::friction::Segment;
+
+/// A deferred segment.
+#[derive(Debug, Clone)]
+pub struct DeferredSegment {
+    /// Its sequence number within its run.
+    pub seq: i64,
+    /// The segment, with the times of the robot's clock.
+    pub segment: Segment,
+}
+
+/// Origin of a segment.
+#[derive(Debug, Clone, Copy)]
+pub struct Origin {
+    /// Key of the run of the agent.
+    pub boot_pk: i64,
+    /// Sequence number within that run.
+    pub seq: i64,
+    /// Key of the site.
+    pub site_pk: i64,
+    /// Key of the robot.
+    pub robot_pk: i64,
+}
