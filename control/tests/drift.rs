@@ -179,6 +179,7 @@ fn a_cross_slope_leaves_no_steady_error_on_a_straight() {
         };
         config.quiet.integral_1_m3 *= integral_share;
         config.noisy.integral_1_m3 *= integral_share;
+        config.steady.integral_1_m3 *= integral_share;
         config
     };
     let robot = Robot {

@@ -81,7 +81,7 @@ fn the_loop_keeps_margins_from_slippery_to_firm_ground() {
                 servo_lag_s: 0.05,
                 loop_s: 0.02,
             };
-            for gains in [config.quiet, config.noisy] {
+            for gains in [config.quiet, config.noisy, config.steady] {
                 let found = margins(gains, plant);
                 assert!(
                     found.phase_deg > 20.0 && found.delay_s > 0.06 && found.gain > 1.7,

@@ -43,6 +43,11 @@ pub struct TrackerConfig {
     pub quiet: CrossGains,
     /// Gains across the path for a noisy pose.
     pub noisy: CrossGains,
+    /// Gains across the path for a noisy pose on a path of constant sideslip.
+    pub steady: CrossGains,
+    /// Change of the sideslip over the last metres at which `noisy` and `steady` have equal weight,
+    /// radians.
+    pub steady_middle_rad: f64,
     /// Pose noise at which both gain sets have equal weight, as amplitude density `σ√T` of white
     /// noise, m·√s.
     pub noise_middle_m_sqrt_s: f64,
@@ -86,28 +91,35 @@ impl Default for TrackerConfig {
         Self {
             along_track_gain_1_s: 3.0,
             quiet: CrossGains {
-                cross_1_m2: 20.0,
-                heading_1_m: 8.0,
+                cross_1_m2: 21.0,
+                heading_1_m: 8.5,
                 integral_1_m3: 28.0,
-                yaw_rate: 0.7,
+                yaw_rate: 0.55,
             },
             noisy: CrossGains {
-                cross_1_m2: 14.0,
-                heading_1_m: 9.0,
-                integral_1_m3: 7.0,
+                cross_1_m2: 18.0,
+                heading_1_m: 9.4,
+                integral_1_m3: 12.0,
+                yaw_rate: 0.75,
+            },
+            steady: CrossGains {
+                cross_1_m2: 4.0,
+                heading_1_m: 5.0,
+                integral_1_m3: 0.3,
                 yaw_rate: 0.6,
             },
+            steady_middle_rad: 1.0e-2,
             noise_middle_m_sqrt_s: 7.0e-4,
             position_middle_m: 4.0e-3,
             integral_max_1_m: 0.5,
             servo_lag_s: 0.05,
             adaptation_gain: 1400.0,
             friction_curve: FrictionCurve::yi2007(),
-            beyond_gain: 20_000.0,
+            beyond_gain: 22_000.0,
             adaptation_rate_max_1_s: 0.3,
             adaptation_pull_1_s: 10.0,
             theta_max: 4.0,
-            slope_gain_1_m2: 0.7,
+            slope_gain_1_m2: 0.6,
             slope_drift_max_rad: 0.15,
             center_gain: 1.0,
             center_max_m: 0.1,
@@ -142,6 +154,9 @@ impl TrackerConfig {
             ("quiet.heading_1_m", self.quiet.heading_1_m),
             ("noisy.cross_1_m2", self.noisy.cross_1_m2),
             ("noisy.heading_1_m", self.noisy.heading_1_m),
+            ("steady.cross_1_m2", self.steady.cross_1_m2),
+            ("steady.heading_1_m", self.steady.heading_1_m),
+            ("steady_middle_rad", self.steady_middle_rad),
             ("noise_middle_m_sqrt_s", self.noise_middle_m_sqrt_s),
             ("position_middle_m", self.position_middle_m),
             ("theta_max", self.theta_max),
@@ -150,8 +165,10 @@ impl TrackerConfig {
         let at_least_zero = [
             ("quiet.yaw_rate", self.quiet.yaw_rate),
             ("noisy.yaw_rate", self.noisy.yaw_rate),
+            ("steady.yaw_rate", self.steady.yaw_rate),
             ("quiet.integral_1_m3", self.quiet.integral_1_m3),
             ("noisy.integral_1_m3", self.noisy.integral_1_m3),
+            ("steady.integral_1_m3", self.steady.integral_1_m3),
             ("integral_max_1_m", self.integral_max_1_m),
             ("servo_lag_s", self.servo_lag_s),
             ("adaptation_gain", self.adaptation_gain),
@@ -183,6 +200,7 @@ impl TrackerConfig {
         for (integral, yaw_rate, gains) in [
             ("quiet.integral_1_m3", "quiet.yaw_rate", self.quiet),
             ("noisy.integral_1_m3", "noisy.yaw_rate", self.noisy),
+            ("steady.integral_1_m3", "steady.yaw_rate", self.steady),
         ] {
             if gains.yaw_rate >= 1.0 {
                 return Err(TrackerError::OutOfRange {

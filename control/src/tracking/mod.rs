@@ -18,7 +18,7 @@
 //! the turn needs, lead for the wheel servo and half a sample, and lead for slip relaxation, `vθ/g`
 //! along the path and `(vθ/g)·4 I_G/(m(W² + L²))` in yaw. An inner loop on the measured turn rate,
 //! of gain below one, keeps the stability margin where slip is slow. Gains depend on the noise of
-//! the pose.
+//! the pose, and on how steady the path's sideslip is.
 //!
 //! A slope and a rotation centre off the middle of the wheels cause sideslip too. Both are adapted
 //! by the same function (`drift`). All that is adapted integrates the cross-track error, as the
@@ -35,7 +35,9 @@ mod config;
 mod drift;
 mod knowledge;
 mod noise;
+mod output;
 mod sideslip;
+mod steadiness;
 mod turn;
 
 use crate::geometry::{Twist, wrap_angle_rad};
@@ -44,12 +46,14 @@ use crate::reference::ReferenceSample;
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 use crate::twist_limits::TwistLimits;
 
-use action::IntegralAction;
+use action::{Free, IntegralAction};
 pub use config::{CrossGains, TrackerConfig, TrackerError};
 use drift::Drift;
 pub use knowledge::ThetaKnowledge;
 use noise::NoiseLevel;
+pub use output::{TrackerOutput, TrackingErrors};
 use sideslip::{Belief, Sideslip};
+use steadiness::Steadiness;
 
 /// Maximum speed backwards, to come back to a reference that was overrun, metres per second.
 const REVERSE_MAX_M_S: f64 = 0.15;
@@ -83,58 +87,6 @@ const PULL_TIME_S: f64 = 2.0;
 const KNOWN_FROM_START_M: f64 = 1.0;
 /// Maximum magnitude of χ̂'s rate of change, per second.
 const BEYOND_RATE_MAX_1_S: f64 = 1.0;
-
-/// Tracking errors: reference minus robot, in the frame of the reference.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct TrackingErrors {
-    /// Along-track error `e_x`, metres; positive if the reference is ahead of the robot.
-    pub along_track_m: f64,
-    /// Cross-track error `e_y`, metres; positive if the reference is to the left of the robot.
-    pub cross_track_m: f64,
-    /// Reference heading minus robot heading, radians, in (−π, π].
-    pub heading_rad: f64,
-}
-
-impl TrackingErrors {
-    /// Computes the errors in the frame of the reference.
-    pub fn between(reference: &ReferenceSample, measured: &Measured) -> Self {
-        let robot = reference.pose.body_from_site(measured.pose.point());
-        Self {
-            along_track_m: -robot.x_m,
-            cross_track_m: -robot.y_m,
-            heading_rad: wrap_angle_rad(reference.pose.heading_rad - measured.pose.heading_rad),
-        }
-    }
-
-    /// Returns the distance between robot and reference, metres.
-    pub fn distance_m(&self) -> f64 {
-        self.along_track_m.hypot(self.cross_track_m)
-    }
-}
-
-/// Output of the law in one tick.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct TrackerOutput {
-    /// Wheel speeds to command, within all limits.
-    pub wheel_speeds: WheelSpeeds,
-    /// Twist of these wheel speeds by the low-speed kinematics.
-    pub twist: Twist,
-    /// Errors in the frame of the reference.
-    pub errors: TrackingErrors,
-    /// Adapted θ̂; not a measurement of θ.
-    pub theta_loop: f64,
-    /// Adapted χ̂: fraction, 0 to 1, of the modelled friction loss beyond the peak.
-    pub beyond_loop: f64,
-    /// Adapted d̂: sideslip of a robot across the slope, as a vector along the site's axes `[x, y]`
-    /// that points downhill, radians.
-    pub slope_loop_rad: [f64; 2],
-    /// Adapted rotation centre `x̂_c` ahead of the middle of the wheels, metres.
-    pub center_loop_m: f64,
-    /// Confidence in the known θ, 0 to 1; 0 without one.
-    pub confidence: f64,
-    /// Whether the wheel speed limit cut the command.
-    pub saturated: bool,
-}
 
 /// Speed limits that cut a command.
 #[derive(Debug, Clone, Copy)]
@@ -175,6 +127,7 @@ pub struct Tracker {
     /// Distance driven while adapting, metres.
     adapted_m: f64,
     noise: NoiseLevel,
+    steadiness: Steadiness,
     was_cut: bool,
     held_from_outside: bool,
     /// Part of the last command cut by the acceleration limits.
@@ -203,6 +156,7 @@ impl Tracker {
             pull: Pull::default(),
             adapted_m: 0.0,
             noise: NoiseLevel::default(),
+            steadiness: Steadiness::default(),
             was_cut: false,
             held_from_outside: false,
             carried: Twist::default(),
@@ -248,11 +202,6 @@ impl Tracker {
         let knowledge = knowledge.filter(|known| known.confidence() > 0.0);
         self.apply_knowledge(knowledge, dt_s);
         let theta = self.theta;
-        let density = self.noise.update(measured, dt_s);
-        let noise = density / config.noise_middle_m_sqrt_s.powi(2)
-            + (measured.position_std_dev_m / config.position_middle_m).powi(2);
-        let gains = CrossGains::blend(config.quiet, config.noisy, 1.0 / (1.0 + noise));
-
         let speed_m_s = reference.speed_m_s;
         let belief = Belief {
             theta,
@@ -260,6 +209,15 @@ impl Tracker {
         };
         let sideslip = Sideslip::of(reference, belief, &config.friction_curve, &self.model);
         let drift = self.drift.sideslip(reference);
+        let density = self.noise.update(measured, dt_s);
+        let noise = density / config.noise_middle_m_sqrt_s.powi(2)
+            + (measured.position_std_dev_m / config.position_middle_m).powi(2);
+        let quiet_share = 1.0 / (1.0 + noise);
+        let moving = CrossGains::blend(config.quiet, config.noisy, quiet_share);
+        let steadiness = self
+            .steadiness
+            .update(reference, theta, &drift, &config, dt_s);
+        let gains = CrossGains::blend(config.steady, moving, (1.0 - quiet_share) * steadiness);
         let mut course = measured.pose;
         course.heading_rad += sideslip.angle_rad + drift.angle_rad;
         let forward = course.body_from_site(reference.pose.point());
@@ -281,7 +239,9 @@ impl Tracker {
         let confidence = knowledge.map_or(0.0, |known| known.confidence());
         if !held {
             self.adapted_m += speed_m_s * dt_s;
-            let action = IntegralAction::divide(&gains, &config, reference, (&sideslip, &drift));
+            let free = self.free(&sideslip, cross_track_m);
+            let action =
+                IntegralAction::divide(&gains, &config, reference, (&sideslip, &drift), free);
             self.integrate(action.integral_1_m3 * cross_track_m * speed_m_s * dt_s);
             let error_m = if cross_track_m.abs() < ADAPTATION_DEAD_ZONE_M {
                 0.0
@@ -290,8 +250,7 @@ impl Tracker {
             };
             let share = action.adaptation_share;
             self.adapt(&sideslip, share * error_m, knowledge, dt_s);
-            // Slope and rotation centre are not adapted while they return to zero.
-            if self.pull.left_s <= 0.0 || !self.pull.forgets_drift {
+            if free.drift {
                 self.drift.adapt(&drift, &config, share * error_m, dt_s);
             }
         }
@@ -373,6 +332,24 @@ impl Tracker {
         if self.forgets {
             self.beyond = (self.beyond + BEYOND_RATE_MAX_1_S * dt_s).min(1.0);
             self.forgets = self.beyond < 1.0;
+        }
+    }
+
+    /// Returns which adapted values can follow a cross-track error.
+    fn free(&self, sideslip: &Sideslip, cross_track_m: f64) -> Free {
+        let within = |value: f64, most: f64, drift_m_s: f64| {
+            let rises = cross_track_m * drift_m_s > 0.0;
+            if rises { value < most } else { value > 0.0 }
+        };
+        Free {
+            theta: within(
+                self.theta,
+                self.config.theta_max,
+                sideslip.drift_per_theta_m_s,
+            ),
+            beyond: !self.forgets && within(self.beyond, 1.0, sideslip.drift_per_beyond_m_s),
+            // Slope and rotation centre are not adapted while they return to zero.
+            drift: self.pull.left_s <= 0.0 || !self.pull.forgets_drift,
         }
     }
 
