@@ -155,13 +155,13 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 24, ..ProptestConfig::default() })]
     #[test]
     fn a_robot_beside_its_path_comes_back_to_it(
-        beside_m in -0.47..0.47_f64, ahead_m in -0.2..0.2_f64, heading_rad in -0.3..0.3_f64,
+        beside_m in -0.47..0.47_f64, forward_m in -0.2..0.2_f64, heading_rad in -0.3..0.3_f64,
         stiffness in 0.5..20.0_f64,
     ) {
         let mut follower = follower(&circle(Direction::CounterClockwise, 0.2), ON_CIRCLE);
         let start = Pose {
             x_m: ON_CIRCLE.x_m + beside_m,
-            y_m: ON_CIRCLE.y_m + ahead_m,
+            y_m: ON_CIRCLE.y_m + forward_m,
             heading_rad: ON_CIRCLE.heading_rad + heading_rad,
         };
         let mut robot = SimRobot::new(start, stiffness, 7, false);

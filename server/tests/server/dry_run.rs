@@ -224,7 +224,7 @@ async fn a_dry_run_plans_from_the_end_of_what_is_driven_before() {
     let mut body = wanted.clone();
     body["replaces"] = back.clone();
     assert_eq!(check(&body).await["after_mission"], driven);
-    body["replaces"] = json!(Uuid::now_v7());
+    body["replaces"] = json!(Uuid::new_v4());
     let (status, said) = yard.post("/v1/trajectories/check", &body).await;
     assert_eq!(status, StatusCode::NOT_FOUND, "{said}");
     let mut body = wanted.clone();

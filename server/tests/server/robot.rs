@@ -194,7 +194,7 @@ impl Robot {
         let beating = Arc::new(AtomicBool::new(true));
         let beats = Arc::clone(&beating);
         let shows_lease = Arc::new(AtomicBool::new(true));
-        let shows = Arc::clone(&shows_lease);
+        let is_lease_shown = Arc::clone(&shows_lease);
         let supervisor = Supervisor::new();
         let stop = supervisor.stop_token();
         let clock = Instant::now();
@@ -207,12 +207,10 @@ impl Robot {
                     state.robot_time = time("2026-11-01T00:00:00Z") + clock.elapsed();
                     state.monotonic_us = Some(u64::try_from(clock.elapsed().as_micros()).unwrap());
                     state.control_loop.ticks += u64::from(beats.load(Ordering::Relaxed));
-                    let mut shown = state.clone();
-                    shown
-                        .safety
-                        .lease
-                        .take_if(|_| !shows.load(Ordering::Relaxed));
-                    wire::encode(&shown).unwrap()
+                    let mut sent = state.clone();
+                    let is_hidden = !is_lease_shown.load(Ordering::Relaxed);
+                    sent.safety.lease.take_if(|_| is_hidden);
+                    wire::encode(&sent).unwrap()
                 };
                 let _ = publisher.put(payload).wait();
                 tokio::time::sleep(Duration::from_millis(50)).await;
