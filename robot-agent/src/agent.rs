@@ -323,12 +323,6 @@ impl RunningAgent {
         self.outbox.status()
     }
 
-    /// Whether a server has been reached since the start.
-    #[cfg(any(test, feature = "testing"))]
-    pub fn has_connected(&self) -> bool {
-        *self.is_connected.borrow()
-    }
-
     /// Tells the service manager that started this process, if any, that the agent is ready once its
     /// loop ticks, and from then on that the loop ticks, until the stop.
     ///

@@ -80,7 +80,10 @@ impl Yard {
             server,
             agent,
         };
-        eventually("the robot is there", || yard.agent.has_connected()).await;
+        // The connection alone does not mean that the server has its hello.
+        let key = ("yard".parse().unwrap(), ROBOT.parse().unwrap());
+        let presences = yard.server.app().presences();
+        eventually("the robot is there", || presences.is_known(&key)).await;
         yard
     }
 
