@@ -454,8 +454,11 @@ async fn a_lease_holds_missions_from_its_grant_not_from_the_first_state_that_sho
     robot.show_no_lease();
     let mut driver = Socket::open(&yard, "rover-1").await;
     driver.acquire("Ann").await;
-    let paused = yard.mission_becomes(first.id, MissionState::Paused).await;
-    assert!(paused.mission.pause_wanted);
+    eventually("the mission is held", async || {
+        let held = yard.mission(first.id).await.mission;
+        if held.pause_wanted { Ok(()) } else { Err(held) }
+    })
+    .await;
     let resume = format!("/v1/missions/{}/resume", first.id);
     let (status, body) = yard.post(&resume, &Value::Null).await;
     assert_eq!(status, 409, "{body}");
@@ -476,7 +479,7 @@ async fn a_lease_holds_missions_from_its_grant_not_from_the_first_state_that_sho
         }
     })
     .await;
-    yard.mission_becomes(first.id, MissionState::Active).await;
+    assert!(!yard.mission(first.id).await.mission.pause_wanted);
     assert!(yard.mission(second.id).await.mission.pause_wanted);
     yard.server.stop().await.unwrap();
 }
