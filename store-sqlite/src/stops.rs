@@ -69,7 +69,7 @@ fn rows(raw: Vec<Raw>) -> Result<Vec<Stop>, EngineError> {
     raw.into_iter().map(Stop::try_from).collect()
 }
 
-/// Returns stops, newest first.
+/// Returns stops, newest first. A robot names its own stops, so identifiers do not rise with time.
 pub async fn list(
     db: &mut SqliteConnection,
     filter: &StopFilter,
@@ -82,10 +82,12 @@ pub async fn list(
     let raw = stops!(
         "WHERE (?1 IS NULL OR sites.id = ?1) AND (?2 IS NULL OR robots.id = ?2)
            AND (?3 = FALSE OR (stops.cleared_at_us IS NULL AND stops.replaced_by IS NULL))
-           AND (?4 IS NULL OR stops.id < ?4)
+           AND (?4 IS NULL OR (stops.wanted_at_us, stops.id) <
+               (SELECT earlier.wanted_at_us, earlier.id FROM stops AS earlier
+                WHERE earlier.id = ?4))
            AND (?6 IS NULL OR sites.id IN (SELECT value FROM json_each(?6))
                OR sites.id || '/' || robots.id IN (SELECT value FROM json_each(?6)))
-         ORDER BY stops.id DESC LIMIT ?5",
+         ORDER BY stops.wanted_at_us DESC, stops.id DESC LIMIT ?5",
         site,
         robot,
         filter.in_force,
@@ -103,7 +105,7 @@ pub async fn in_force(db: &mut SqliteConnection) -> Result<Vec<Stop>, EngineErro
     let raw = stops!(
         "WHERE stops.cleared_at_us IS NULL AND stops.replaced_by IS NULL
            AND robots.retired_at_us IS NULL
-         ORDER BY stops.id"
+         ORDER BY stops.wanted_at_us, stops.id"
     )
     .fetch_all(db)
     .await?;

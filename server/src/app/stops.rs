@@ -277,7 +277,7 @@ impl App {
                 stops.push(stop);
             }
         }
-        stops.sort_by_key(|stop| std::cmp::Reverse(stop.id));
+        stops.sort_by_key(|stop| std::cmp::Reverse((stop.wanted_at, stop.id)));
         let shown = stops.into_iter().map(|stop| self.with_confirmation(stop));
         Ok(page(shown.collect(), limit, |stop: &Stop| {
             stop.id.to_string()

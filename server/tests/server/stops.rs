@@ -337,7 +337,8 @@ async fn a_stop_that_the_robot_forgot_is_sent_again_and_one_of_its_own_is_adopte
     })
     .await;
 
-    let own = uuid::Uuid::from_u128(7);
+    // A robot's identifiers do not rise with time.
+    let own = uuid::Uuid::from_u128(u128::MAX);
     robot.say(|state| {
         state.safety.stop = Some(tread_api::safety::StopLatch {
             id: tread_api::ids::StopId::from_uuid(own),
@@ -357,6 +358,18 @@ async fn a_stop_that_the_robot_forgot_is_sent_again_and_one_of_its_own_is_adopte
     .await;
     let (status, body) = yard.post(CLEAR, &json!({"stop": own})).await;
     assert_eq!(status, StatusCode::OK, "{body}");
+    let later = yard.stop_robot(&json!({})).await;
+    yard.stop_becomes("the later one is written", |stop| stop.id == later.id)
+        .await;
+    let mut listed = Vec::new();
+    let mut next = Some("/v1/stops?limit=1".to_owned());
+    while let Some(path) = next {
+        let page: Page<Stop> = yard.get(&path).await;
+        listed.extend(page.items.iter().map(|stop| stop.id.as_uuid()));
+        let cursor = page.next_cursor;
+        next = cursor.map(|cursor| format!("/v1/stops?limit=1&cursor={cursor}"));
+    }
+    assert_eq!(listed, [later.id.as_uuid(), own, stop.id.as_uuid()]);
     yard.server.stop().await.unwrap();
 }
 

@@ -75,16 +75,21 @@ impl Unrecorded {
         }
     }
 
-    /// Returns the stops that a filter lets through.
+    /// Returns the stops that a filter lets through. All are newer than a stop that is recorded.
     pub(super) fn list(&self, filter: &StopFilter) -> Vec<Stop> {
         let kept = self.lock();
+        let order_of = |stop: &Stop| (stop.wanted_at, stop.id);
+        let named = |id: StopId| kept.values().find(|stop| stop.id == id);
+        let is_before = |stop: &Stop, id: StopId| {
+            named(id).is_some_and(|named| order_of(stop) < order_of(named))
+        };
         let wanted = kept.values().filter(|stop| {
             filter.site.as_ref().is_none_or(|site| *site == stop.site)
                 && filter
                     .robot
                     .as_ref()
                     .is_none_or(|robot| *robot == stop.robot)
-                && filter.before.is_none_or(|before| stop.id < before)
+                && filter.before.is_none_or(|before| is_before(stop, before))
                 && filter.within.includes_robot(&stop.site, &stop.robot)
         });
         wanted.cloned().collect()
