@@ -125,13 +125,13 @@ impl Holds {
 
 /// A lease in the robot's presence, until it is dropped: no mission is resumed or begun meanwhile.
 #[derive(Debug)]
-struct Granted {
+struct LeaseGuard {
     app: App,
     key: RobotKey,
     id: Uuid,
 }
 
-impl Drop for Granted {
+impl Drop for LeaseGuard {
     fn drop(&mut self) {
         self.app.presences().lease_over(&self.key, self.id);
     }
@@ -141,7 +141,7 @@ impl Drop for Granted {
 #[derive(Debug)]
 struct ActiveLease {
     lease: Lease,
-    granted: Granted,
+    granted: LeaseGuard,
     boot: BootId,
     since: Duration,
     publisher: Box<dyn DrivePublisher>,
@@ -258,8 +258,8 @@ impl Session {
             active.lease = lease.clone();
             return Ok(lease);
         }
-        // Before the missions are held: what is created later is held from the begin.
-        let granted = Granted {
+        // Before the missions are held: what is created later is held at once.
+        let granted = LeaseGuard {
             id: self
                 .app
                 .presences()
@@ -382,7 +382,7 @@ impl Session {
     }
 
     /// Releases a lease on the robot in the background; it is over when the robot has answered.
-    fn give_back(&self, lease: Lease, granted: Granted) {
+    fn give_back(&self, lease: Lease, granted: LeaseGuard) {
         let (app, key) = (self.app.clone(), self.key.clone());
         let ending = app.supervisor().stop_token();
         let supervisor = app.supervisor().clone();

@@ -141,7 +141,7 @@ impl App {
         }
         // Robots without an open stop.
         tending.alerts.extend(alerted);
-        tending.again.sort_by_key(|stop| stop.id);
+        tending.again.sort_by_key(|stop| (stop.wanted_at, stop.id));
         Ok(tending)
     }
 
