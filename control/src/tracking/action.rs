@@ -19,7 +19,7 @@ const SPEED_MIN_M_S: f64 = 0.05;
 /// Which values can follow the present error. One at its bound, or one that is returning to its
 /// initial value, cannot: its share of the integral action would be lost.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Free {
+pub(super) struct CanFollow {
     /// θ̂.
     pub(super) theta: bool,
     /// χ̂.
@@ -44,7 +44,7 @@ impl IntegralAction {
         config: &TrackerConfig,
         reference: &ReferenceSample,
         (sideslip, drift): (&Sideslip, &DriftSideslip),
-        free: Free,
+        free: CanFollow,
     ) -> Self {
         let speed_m_s = reference.speed_m_s.max(SPEED_MIN_M_S);
         let square = |drift_m_s: f64| (drift_m_s / speed_m_s).powi(2);
@@ -94,12 +94,12 @@ mod tests {
         let drift = DriftSideslip::default();
         let divide =
             |free| IntegralAction::divide(&gains, &config, &reference, (&sideslip, &drift), free);
-        let all = Free {
+        let all = CanFollow {
             theta: true,
             beyond: true,
             drift: true,
         };
-        let bounded = Free {
+        let bounded = CanFollow {
             beyond: false,
             ..all
         };

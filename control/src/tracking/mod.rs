@@ -46,7 +46,7 @@ use crate::reference::ReferenceSample;
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 use crate::twist_limits::TwistLimits;
 
-use action::{Free, IntegralAction};
+use action::{CanFollow, IntegralAction};
 pub use config::{CrossGains, TrackerConfig, TrackerError};
 use drift::Drift;
 pub use knowledge::ThetaKnowledge;
@@ -336,12 +336,12 @@ impl Tracker {
     }
 
     /// Returns which adapted values can follow a cross-track error.
-    fn free(&self, sideslip: &Sideslip, cross_track_m: f64) -> Free {
+    fn free(&self, sideslip: &Sideslip, cross_track_m: f64) -> CanFollow {
         let within = |value: f64, most: f64, drift_m_s: f64| {
             let rises = cross_track_m * drift_m_s > 0.0;
             if rises { value < most } else { value > 0.0 }
         };
-        Free {
+        CanFollow {
             theta: within(
                 self.theta,
                 self.config.theta_max,
