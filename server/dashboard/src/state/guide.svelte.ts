@@ -1,6 +1,7 @@
 // The guide through the first steps: whether it is shown, and which of them the state of the fleet has done.
+import { untrack } from 'svelte';
 import type { CellFriction, Mission, PlannedPath } from '../api/schema';
-import { ask, list } from '../api/client';
+import { Problem, ask, list } from '../api/client';
 import { around, doneOf, followed, measuredSince, nextOf, type Sent } from '../guide';
 import type { PointM } from '../map/camera';
 import type { Fleet } from './fleet.svelte';
@@ -13,6 +14,10 @@ const SENT_KEY = 'tread-sent';
 const LOOK_MS = 2_000;
 /** Cells along a path that are looked through. */
 const CELLS_MAX = 5_000;
+/** Looks in vain after which a mission counts as one that shows no friction: 40 s of driving. */
+const LOOKS_MAX = 20;
+/** Looks in vain after which that is said of a mission that has ended: its last values may be under way. */
+const LAST_LOOKS = 2;
 
 export class Guide {
   #kept = $state(localStorage.getItem(GUIDE_KEY));
@@ -23,7 +28,8 @@ export class Guide {
   friction = $state.raw<PointM[]>([]);
   /** The path of that mission. */
   #path: PointM[] = [];
-  #timer: ReturnType<typeof setInterval> | undefined;
+  /** How often nothing was found that was measured on it. */
+  #looks = $state(0);
   #isLooking = false;
 
   constructor(
@@ -56,6 +62,12 @@ export class Guide {
     return mission?.ended_at != null && mission.started_at == null;
   }
 
+  /** Whether it has ended, or was driven for a while, and nothing was measured: another one may show friction. */
+  get isUnmeasured(): boolean {
+    const mission = this.sent && this.fleet.missions.get(this.sent.id);
+    return this.done.mission && !this.done.friction && (this.#looks >= LOOKS_MAX || (mission?.ended_at != null && this.#looks >= LAST_LOOKS));
+  }
+
   readonly done = $derived.by(() =>
     doneOf(
       this.fleet.robots.map((entry) => entry.robot),
@@ -65,13 +77,15 @@ export class Guide {
   );
   readonly next = $derived(nextOf(this.done));
 
+  /** A value of its own: it stays the same while robots and missions change. */
+  readonly #isMissing = $derived(this.isShown && this.done.mission && !this.done.friction);
+
   /** Looks for friction as long as that is what is missing; ends with what it gives back. */
   follow(): () => void {
-    if (this.isShown && this.done.mission && !this.done.friction) {
-      void this.#look();
-      this.#timer = setInterval(() => void this.#look(), LOOK_MS);
-    }
-    return () => clearInterval(this.#timer);
+    if (!this.#isMissing) return () => undefined;
+    untrack(() => void this.#look());
+    const timer = setInterval(() => void this.#look(), LOOK_MS);
+    return () => clearInterval(timer);
   }
 
   /** Brings the mission onto the map, with all friction that was measured on it. */
@@ -88,6 +102,8 @@ export class Guide {
     const { id, site, robot } = mission;
     this.#sent = { id, site, robot, started_at: mission.started_at ?? null };
     this.friction = [];
+    this.#path = [];
+    this.#looks = 0;
     localStorage.setItem(SENT_KEY, JSON.stringify(this.#sent));
     // Whoever begins with the guide has it until it is closed.
     if (this.#kept === null && this.isShown) this.isShown = true;
@@ -98,24 +114,36 @@ export class Guide {
     if (!sent?.started_at || this.#isLooking || document.hidden) return;
     this.#isLooking = true;
     try {
-      const path = await ask<PlannedPath>(`/v1/missions/${sent.id}/path`);
-      this.#path = path.points;
-      const place = around(path.points, fleet.cellM);
-      if (!place) return;
-      const query = new URLSearchParams({
-        x_min_m: String(place.xMin),
-        y_min_m: String(place.yMin),
-        x_max_m: String(place.xMax),
-        y_max_m: String(place.yMax),
-      });
+      const path = await pathOf(sent.id);
+      const place = around(path, fleet.cellM);
+      const query = new URLSearchParams();
+      if (place) {
+        query.set('x_min_m', String(place.xMin));
+        query.set('y_min_m', String(place.yMin));
+        query.set('x_max_m', String(place.xMax));
+        query.set('y_max_m', String(place.yMax));
+      }
       const cells = await list<CellFriction>(`/v1/sites/${sent.site}/friction/cells?${query}`, CELLS_MAX);
       const configuration = fleet.byId.get(sent.robot)?.robot.configuration;
-      if (this.sent?.id === sent.id) this.friction = measuredSince(cells.items, sent.started_at, configuration);
+      if (this.sent?.id !== sent.id) return;
+      this.#path = path;
+      this.friction = measuredSince(cells.items, sent.started_at, configuration);
+      if (this.friction.length === 0) this.#looks += 1;
     } catch {
-      // Its path or the map is not there yet, or the server is lost, which is said elsewhere.
+      // The server is lost, which is said elsewhere.
     } finally {
       this.#isLooking = false;
     }
+  }
+}
+
+/** The path of a mission; empty where it cannot be planned any more, as after a change of the map. */
+async function pathOf(mission: string): Promise<PointM[]> {
+  try {
+    return (await ask<PlannedPath>(`/v1/missions/${mission}/path`)).points;
+  } catch (error) {
+    if (error instanceof Problem && !error.isLost) return [];
+    throw error;
   }
 }
 

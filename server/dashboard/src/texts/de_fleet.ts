@@ -47,6 +47,9 @@ export const fleet: Pick<Texts, Areas> = {
     waits: (robot) => `Sie ist gesendet. ${robot} hat noch nicht begonnen.`,
     failed: 'Diese Mission endete, bevor sie begann. Zeichnen Sie eine andere.',
     friction: 'Der Roboter misst während der Fahrt. Die ersten Werte kommen nach Sekunden.',
+    unmeasured:
+      'Noch ist nichts gemessen: Auf einem gleichmäßigen Kreis sieht Schlupf wie ein Unterschied der Räder aus. Senden Sie einen Pfad mit geraden Stücken und Kurven nach beiden Seiten.',
+    drawingPath: 'Setzen Sie Punkte eines Pfads mit Kurven nach beiden Seiten, und drücken Sie dann Senden.',
     show: 'Auf der Karte zeigen',
     all: 'Alles erledigt: So verbessert jede Mission die Karte.',
     at: (step, of, what) => `Schritt ${step} von ${of}: ${what}`,

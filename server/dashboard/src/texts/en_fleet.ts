@@ -43,6 +43,9 @@ export const fleet = {
     waits: (robot: string) => `It was sent. ${robot} has not begun yet.`,
     failed: 'That mission ended before it began. Draw another one.',
     friction: 'The robot measures while it drives. The first values come within seconds.',
+    unmeasured:
+      'Nothing was measured yet: on a steady circle, slip looks like a difference of the wheels. Send a path with straight parts and turns to both sides.',
+    drawingPath: 'Set points of a path with turns to both sides, then press Send.',
     show: 'Show it on the map',
     all: 'All done: this is how every mission improves the map.',
     /** All of it in one line, for small screens. */
