@@ -144,7 +144,7 @@ async fn fill(db: &Db, epoch_h: i64) -> anyhow::Result<()> {
     )
     .bind(SIDE_CELLS)
     .bind(epoch_h)
-    .execute(&mut *tx)
+    .execute(&mut **tx.as_sqlite().expect("it is a file"))
     .await?;
     tx.commit().await?;
     Ok(())

@@ -4,7 +4,7 @@ use std::sync::LazyLock;
 
 pub use tread_api::release::{VERSION, commit};
 
-use crate::db::schema;
+use crate::db::file::schema;
 
 /// Returns the schema of the database that this program works with: its newest migration.
 pub fn schema() -> i64 {

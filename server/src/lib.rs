@@ -66,7 +66,7 @@ use self::clock::Clock;
 pub use self::config::{Config, ServerArgs};
 use self::config::{RobotsConfig, TlsSource};
 use self::db::failure::StorageFailure;
-use self::db::lock::DatabaseLock;
+use self::db::file::lock::DatabaseLock;
 use self::db::{Db, DbError};
 use self::fleet::{Fleet, Security};
 use self::http::serve::Serving;

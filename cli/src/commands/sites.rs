@@ -29,7 +29,14 @@ fn describe(status: &Value, address: &str) -> String {
     let schema = status["schema"].as_i64();
     add("schema", schema.map(|schema| schema.to_string()));
     add("up for", status["uptime_ms"].as_u64().map(age));
-    add("sqlite", text("sqlite_version"));
+    let database = &status["database"];
+    let engine = database["engine"]
+        .as_str()
+        .zip(database["version"].as_str());
+    add(
+        "database",
+        engine.map(|(engine, version)| format!("{engine} {version}")),
+    );
     let present = status["robots_present"].as_u64();
     add("robots present", present.map(|count| count.to_string()));
     let backup = &status["backup"];

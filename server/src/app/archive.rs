@@ -43,6 +43,8 @@ pub const FILE_ROWS_MAX: u32 = 1_000_000;
 const CHUNK_ROWS: u32 = 16_384;
 /// Maximum number of requests that read files at the same time; each holds one row group in memory.
 const READERS_MAX: usize = 2;
+/// Name of the mark in the folder, without its ending, where no database file has it beside it.
+const MARK_IN_FOLDER: &str = "tread";
 /// Maximum time for which a request waits until it may read files.
 const READ_WAIT_MAX: Duration = Duration::from_secs(5);
 
@@ -63,9 +65,11 @@ struct State {
 }
 
 impl Archive {
-    pub(super) fn new(folder: PathBuf, database: &Path) -> Self {
+    /// Opens the archive in a folder. Its mark is beside the database file, else in the folder.
+    pub(super) fn new(folder: PathBuf, database: Option<&Path>) -> Self {
+        let mark = mark_of(database.unwrap_or(&folder.join(MARK_IN_FOLDER)));
         Self {
-            files: Arc::new(SegmentArchive::new(folder, mark_of(database))),
+            files: Arc::new(SegmentArchive::new(folder, mark)),
             readers: Arc::new(Semaphore::new(READERS_MAX)),
             state: Mutex::default(),
         }
@@ -374,7 +378,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let archive = Archive::new(
             folder.path().join("archive"),
-            &folder.path().join("tread.db"),
+            Some(&folder.path().join("tread.db")),
         );
         let (release, hanging) = std::sync::mpsc::channel::<()>();
         let hanging = Arc::new(Mutex::new(hanging));

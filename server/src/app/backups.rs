@@ -27,7 +27,8 @@ use crate::backup::archive::{self, DATABASE_NAME, describe_authority_file, descr
 use crate::backup::manifest::{ArchivedFile, FORMAT};
 use crate::backup::{ArchiveError, Filter, Manifest, Source, folder};
 use crate::build;
-use crate::db::{DbError, copy};
+use crate::db::DbError;
+use crate::db::file::copy;
 use crate::file_error::FileError;
 use crate::paths::folder_of;
 

@@ -10,7 +10,7 @@ use tread_api::trajectory::Place;
 
 use crate::archive::SegmentArchiveError;
 use crate::authority::{AuthorityError, RotationRefused};
-use crate::db::{DbError, EngineError};
+use crate::db::DbError;
 
 /// Reason why a use case failed.
 #[derive(Debug, thiserror::Error)]
@@ -311,11 +311,5 @@ impl AppError {
             | Self::Archive(_)
             | Self::Storage(_) => None,
         }
-    }
-}
-
-impl From<EngineError> for AppError {
-    fn from(error: EngineError) -> Self {
-        Self::Storage(error.into())
     }
 }

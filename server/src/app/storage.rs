@@ -291,7 +291,7 @@ impl App {
 
     /// Raises and clears the alerts about the storage.
     fn show_condition(&self, condition: &StorageCondition) {
-        let path = self.db().path().display();
+        let path = self.db().name();
         let unwritable = condition.unwritable.as_ref().map(|why| {
             format!(
                 "nothing can be stored in `{path}`: {why}; missions and measurements wait, Stop and \

@@ -133,7 +133,7 @@ impl App {
             pending: 0,
         };
         let inserted = db::webhooks::insert(&mut tx, &webhook, secret.reveal()).await;
-        inserted.map_err(|error| taken(error.into(), &webhook.name))?;
+        inserted.map_err(|error| taken(error, &webhook.name))?;
         tx.commit().await?;
         Ok(CreatedWebhook {
             webhook,
@@ -154,7 +154,7 @@ impl App {
         known(&mut tx, id).await?;
         let settings = self.checked(&mut tx, settings).await?;
         let replaced = db::webhooks::replace(&mut tx, id, &settings).await;
-        if !replaced.map_err(|error| taken(error.into(), &settings.name))? {
+        if !replaced.map_err(|error| taken(error, &settings.name))? {
             return Err(AppError::UnknownWebhook(id));
         }
         let webhook = known(&mut tx, id).await?;

@@ -5,7 +5,7 @@ use tread_api::diagnosis::Finding;
 
 use super::Examined;
 use crate::db::failure::StorageFailure;
-use crate::db::inspection::{InspectError, Inspection, Schema, inspect};
+use crate::db::file::inspection::{InspectError, Inspection, Schema, inspect};
 use crate::error_text::chain;
 
 const RESTORE: &str = "stop the server, keep the file, and restore a backup; or bring what can be \

@@ -22,7 +22,7 @@ use tread_api::diagnosis::Finding;
 
 use crate::clock::Clock;
 use crate::config::{Config, ServerArgs};
-use crate::db::lock;
+use crate::db::file::lock;
 use crate::error_text::chain;
 
 /// Arguments of `tread-server doctor`.

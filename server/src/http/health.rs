@@ -163,8 +163,8 @@ pub struct ServerStatus {
     pub schema: i64,
     /// Time since the start, milliseconds.
     pub uptime_ms: u64,
-    /// Version of the SQLite library.
-    pub sqlite_version: String,
+    /// Its database.
+    pub database: DatabaseStatus,
     /// The storage as it was checked last.
     pub storage: StorageStatus,
     /// What waits in each queue: messages of robots (`hellos`, `presence`, `states`,
@@ -181,6 +181,15 @@ pub struct ServerStatus {
     pub robots_present: usize,
     /// What it has counted since the start.
     pub counters: CounterValues,
+}
+
+/// The engine of the database.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct DatabaseStatus {
+    /// Name of the engine: `SQLite`.
+    pub engine: String,
+    /// Version of the engine.
+    pub version: String,
 }
 
 fn ok() -> Json<Health> {
@@ -222,7 +231,13 @@ pub(super) async fn status(
         commit: build::commit().map(str::to_owned),
         schema: build::schema(),
         uptime_ms: whole_ms(app.uptime()),
-        sqlite_version: app.db().sqlite_version().to_owned(),
+        database: {
+            let (engine, version) = app.db().engine();
+            DatabaseStatus {
+                engine: engine.name().to_owned(),
+                version: version.to_owned(),
+            }
+        },
         storage: app.storage_condition().into(),
         queues: queues
             .into_iter()

@@ -10,8 +10,9 @@ use clap::Args;
 use super::ServerFiles;
 use crate::build;
 use crate::clock::Clock;
-use crate::db::lock::DatabaseLock;
-use crate::db::{self, Db, schema};
+use crate::db::file::lock::DatabaseLock;
+use crate::db::file::{refuse_newer, schema};
+use crate::db::{self, Db};
 use crate::file_owner;
 
 /// Exit code of `--check` when migrations are due.
@@ -83,7 +84,7 @@ pub(crate) async fn run(args: MigrateArgs) -> anyhow::Result<Compared> {
         build::VERSION
     )?;
     let missing = schema::missing_after(found.schema);
-    if let Err(newer) = db::refuse_newer(&path, &found) {
+    if let Err(newer) = refuse_newer(&path, &found) {
         eprintln!("error: {newer}");
         return Ok(Compared::Newer);
     }
@@ -106,7 +107,7 @@ pub(crate) async fn run(args: MigrateArgs) -> anyhow::Result<Compared> {
     let database = Db::open(&path).await?;
     let noting = async {
         let mut tx = database.write("migrate").await?;
-        schema::note_version(&mut tx, build::VERSION, Clock::system().now()).await?;
+        db::schema::note_version(&mut tx, build::VERSION, Clock::system().now()).await?;
         tx.commit().await?;
         Ok::<_, db::DbError>(())
     };

@@ -28,9 +28,10 @@ use crate::backup::archive::{self, sync_folder};
 use crate::backup::{Filter, Manifest};
 use crate::build;
 use crate::clock::Clock;
-use crate::db::lock::DatabaseLock;
+use crate::db::file::lock::DatabaseLock;
+use crate::db::file::{copy, schema};
 use crate::db::restorations::{Changed, Restoration};
-use crate::db::{self, Db, DbError, copy, schema};
+use crate::db::{self, Db, DbError};
 use crate::file_owner;
 use crate::paths::folder_of;
 

@@ -21,7 +21,7 @@ use tread_server::app::ingest::{Upload, Writer};
 use tread_server::app::{App, AppError};
 use tread_server::clock::Clock;
 use tread_server::config::{FrictionConfig, StorageConfig};
-use tread_server::db::{self, Db, DbError, EngineError, Tx};
+use tread_server::db::{self, Db, DbError, Tx};
 use uuid::Uuid;
 
 /// Where the ground's time begins.
@@ -102,7 +102,7 @@ impl Ground {
     /// One transaction.
     pub(crate) async fn write(
         &self,
-        what: impl AsyncFnOnce(&mut Tx) -> Result<(), EngineError>,
+        what: impl AsyncFnOnce(&mut Tx) -> Result<(), DbError>,
     ) -> Result<(), AppError> {
         let mut tx = self.app.db().write("test").await?;
         what(&mut tx).await?;
@@ -145,7 +145,7 @@ impl Ground {
         assert_eq!(self.app.db().quick_check().await.unwrap(), None);
         let mut tx = self.app.db().read("test").await.unwrap();
         let broken = sqlx::query("PRAGMA foreign_key_check")
-            .fetch_all(&mut *tx)
+            .fetch_all(&mut **tx.as_sqlite().unwrap())
             .await
             .unwrap();
         assert!(

@@ -19,8 +19,9 @@ use tread_api::wire::ingest::Record;
 use tread_server::app::{App, Dependencies};
 use tread_server::config::RetentionConfig;
 use tread_server::db::alerts::AlertFilter;
+use tread_server::db::file::copy;
 use tread_server::db::segments::SegmentFilter;
-use tread_server::db::{Db, copy, segment_ranges};
+use tread_server::db::{Db, segment_ranges};
 
 use crate::harness::{Yard, client, eventually, measured, segment, site, time};
 use crate::ingest::Writer;
@@ -337,7 +338,7 @@ async fn a_crash_between_the_file_and_the_removal_changes_no_list() {
 async fn keys_that_are_given_again_after_a_restoration_supersede_their_files() {
     let ground = Ground::start(4).await;
     let backup = ground.folder.path().join("backup.db");
-    copy::copy_into(ground.app().db().path(), &backup)
+    copy::copy_into(ground.app().db().path().unwrap(), &backup)
         .await
         .unwrap();
     for day in 4..14 {

@@ -230,7 +230,10 @@ async fn alerts_of_unconfirmed_stops_are_what_the_stops_say() {
 
 async fn count(writer: &Writer, what: &'static str) -> i64 {
     let mut tx = writer.app.db().read("test").await.unwrap();
-    let (count,): (i64,) = sqlx::query_as(what).fetch_one(&mut *tx).await.unwrap();
+    let (count,): (i64,) = sqlx::query_as(what)
+        .fetch_one(&mut **tx.as_sqlite().unwrap())
+        .await
+        .unwrap();
     count
 }
 
@@ -499,7 +502,7 @@ async fn tokens_keep_their_roles_and_hold_everywhere() {
             VALUES ('s', '0192f0c1-2b3c-7d4e-8f50-617283940a1a', x'0404040404040404',
                     zeroblob(32), 0, 9);";
     let mut db = migrated("20261122131500", rows).await;
-    let tokens = db::tokens::list(&mut db, &Scope::EVERYWHERE, None, 10).await;
+    let tokens = tread_store_sqlite::tokens::list(&mut db, &Scope::EVERYWHERE, None, 10).await;
     let tokens: Vec<_> = tokens
         .unwrap()
         .into_iter()

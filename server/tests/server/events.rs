@@ -104,7 +104,7 @@ async fn a_mission_that_does_not_read_keeps_no_other_from_being_sent() {
     let mut tx = yard.server.app().db().write("test").await.unwrap();
     sqlx::query("UPDATE missions SET trajectory = '{' WHERE id = ?")
         .bind(damaged.to_string())
-        .execute(&mut *tx)
+        .execute(&mut **tx.as_sqlite().unwrap())
         .await
         .unwrap();
     let step: MissionEvent = serde_json::from_value(json!({

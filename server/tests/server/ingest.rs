@@ -377,7 +377,7 @@ async fn times_of_a_wrong_clock_are_put_right_and_nothing_of_it_is_lost() {
         let (started_at_ns, ended_at_ns): (i64, i64) =
             sqlx::query_as("SELECT started_at_ns, ended_at_ns FROM segments WHERE seq = ?")
                 .bind(i64::from(number))
-                .fetch_one(&mut *tx)
+                .fetch_one(&mut **tx.as_sqlite().unwrap())
                 .await
                 .unwrap();
         let expected = shifted(counts_s).as_nanosecond();

@@ -16,8 +16,9 @@ use tread_api::ids::{RobotId, SiteId};
 use tread_api::keys;
 use tread_api::wire::hello::Welcome;
 use tread_api::wire::ingest::Receipt;
+use tread_server::db::file::{OpenError, copy, schema};
 use tread_server::db::restorations::{Restoration, begin};
-use tread_server::db::{self, Db, copy, schema};
+use tread_server::db::{self, Db};
 use zenoh::Wait as _;
 
 use crate::backups::{run, words};
@@ -101,12 +102,12 @@ async fn make_present(target: &Path) {
         "INSERT INTO idempotency_keys (owner, key, request_hash, answer, created_at_us) VALUES
              ('o', 'k', 'h', '{}', 1)",
     ] {
-        let made = sqlx::raw_sql(statement).execute(&mut *tx).await;
+        let made = sqlx::raw_sql(statement).execute(&mut **tx.as_sqlite().unwrap()).await;
         made.unwrap();
     }
     begin(&mut tx, &restoration).await.unwrap();
     let now: Timestamp = restoration.restored_at;
-    schema::note_version(&mut tx, &restoration.version, now)
+    db::schema::note_version(&mut tx, &restoration.version, now)
         .await
         .unwrap();
     tx.commit().await.unwrap();
@@ -207,16 +208,19 @@ async fn a_newer_database_is_refused_with_the_version_to_install() {
          VALUES (?, 'newer', TRUE, x'00', 0)",
     )
     .bind(newer)
-    .execute(&mut *tx)
+    .execute(&mut **tx.as_sqlite().unwrap())
     .await
     .unwrap();
-    schema::note_version(&mut tx, "9.8.7", Timestamp::UNIX_EPOCH)
+    db::schema::note_version(&mut tx, "9.8.7", Timestamp::UNIX_EPOCH)
         .await
         .unwrap();
     tx.commit().await.unwrap();
     database.close().await;
     let refused = Db::open(&path).await.unwrap_err();
-    assert!(matches!(refused, db::OpenError::Newer { .. }), "{refused}");
+    assert!(
+        matches!(refused, db::OpenError::Sqlite(OpenError::Newer { .. })),
+        "{refused}"
+    );
     let text = refused.to_string();
     for part in ["9.8.7 or newer", "tread-server restore", &newer.to_string()] {
         assert!(text.contains(part), "{part} in {text}");

@@ -149,7 +149,10 @@ async fn health_and_readiness_are_reported() {
     assert_eq!(yard.get::<Value>("/readyz").await["status"], "ok");
     let status: Value = yard.get("/v1/server").await;
     assert!(
-        status["sqlite_version"].as_str().unwrap().starts_with("3."),
+        status["database"]["version"]
+            .as_str()
+            .unwrap()
+            .starts_with("3."),
         "{status}"
     );
     yard.server.stop().await.unwrap();

@@ -36,7 +36,7 @@ async fn damage(yard: &Yard, table: &'static str) {
     let mut tx = db.read("test").await.unwrap();
     let (page,): (i64,) = sqlx::query_as("SELECT rootpage FROM sqlite_schema WHERE name = ?")
         .bind(table)
-        .fetch_one(&mut *tx)
+        .fetch_one(&mut **tx.as_sqlite().unwrap())
         .await
         .unwrap();
     drop(tx);

@@ -39,7 +39,7 @@ use super::identity::tokens::{DEAD_KEPT, FORGET_MAX};
 use super::{App, AppError, page, site_row};
 use crate::authority::{Authorities, CertificateError, Issued, RobotName, RobotRequest};
 use crate::db::enrolments::{Counting, Renewal};
-use crate::db::{self, DbError, EngineError, Outcome, Tx};
+use crate::db::{self, DbError, Outcome, Tx};
 use crate::identity::secret::Kind;
 
 /// Maximum numbers of join tokens that are valid at once.
@@ -144,12 +144,6 @@ pub enum EnrolError {
 
 impl From<DbError> for EnrolError {
     fn from(cause: DbError) -> Self {
-        Self::App(cause.into())
-    }
-}
-
-impl From<EngineError> for EnrolError {
-    fn from(cause: EngineError) -> Self {
         Self::App(cause.into())
     }
 }

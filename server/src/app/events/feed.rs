@@ -94,7 +94,7 @@ impl Feed {
         self.last_step = Some(last);
         let moved: Vec<MissionId> = self.moved.keys().copied().collect();
         for id in moved {
-            let row = match db::missions::find(&mut tx, id).await.map_err(DbError::from) {
+            let row = match db::missions::find(&mut tx, id).await {
                 Ok(row) => row,
                 // A corrupt row stays unreadable; the mission's transitions are published all the
                 // same.

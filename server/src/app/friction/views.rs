@@ -80,7 +80,7 @@ impl App {
             return Ok(Some(row));
         }
         let found =
-            db::robots::find(&mut *self.db().read("friction").await?, site_pk, robot).await?;
+            db::robots::find(&mut self.db().read("friction").await?, site_pk, robot).await?;
         Ok(found.map(|row| self.views().robots.keep(generation, key, row)))
     }
 }

@@ -40,7 +40,7 @@ use super::{App, AppError};
 use crate::config::AuditConfig;
 use crate::connections::Purpose;
 use crate::db::sessions::Owner;
-use crate::db::{self, DbError, EngineError, Tx};
+use crate::db::{self, DbError, Tx};
 use crate::identity::attempts::{Attempts, Source};
 use crate::identity::secret::{Fingerprint, Kind, SECRET_RANDOM_BYTES, Secret};
 use crate::identity::subject::SubjectId;
@@ -116,12 +116,6 @@ pub enum SignInError {
     /// The database failed.
     #[error("the database failed")]
     Storage(#[from] DbError),
-}
-
-impl From<EngineError> for SignInError {
-    fn from(cause: EngineError) -> Self {
-        Self::Storage(cause.into())
-    }
 }
 
 impl App {

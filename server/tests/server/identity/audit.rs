@@ -250,7 +250,10 @@ async fn whoever_changes_a_row_of_the_database_is_found_by_its_number() {
 
     let change = async |statement: &'static str| {
         let mut tx = yard.server.app().db().write("test").await.unwrap();
-        sqlx::query(statement).execute(&mut *tx).await.unwrap();
+        sqlx::query(statement)
+            .execute(&mut **tx.as_sqlite().unwrap())
+            .await
+            .unwrap();
         tx.commit().await.unwrap();
         verified(&yard).await
     };

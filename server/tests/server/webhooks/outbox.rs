@@ -188,7 +188,7 @@ async fn what_waits_too_long_is_given_up_and_what_is_deleted_is_gone() {
     assert_eq!(gone["type"], "/problems/unknown-webhook", "{gone}");
     let mut tx = yard.server.app().db().read("test").await.unwrap();
     let (left,): (i64,) = sqlx::query_as("SELECT COUNT(*) FROM webhook_deliveries")
-        .fetch_one(&mut *tx)
+        .fetch_one(&mut **tx.as_sqlite().unwrap())
         .await
         .unwrap();
     assert_eq!(left, 0);

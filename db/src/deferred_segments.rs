@@ -1,0 +1,14 @@
+//! Deferred segments: measurements with times in the future, kept until the clock of their run is
+//! known.
+
+use serde_json::value::RawValue;
+pub use tread_store::deferred_segments::{DeferredSegment, Origin};
+
+use super::{DbError, Tx, forward};
+
+forward! {
+    deferred_segments;
+    fn put(origin: Origin, times_us: (i64, i64), measurement: &RawValue) -> bool;
+    fn count(robot_pk: i64) -> u64;
+    fn take(boot_pk: i64, ended_before_us: i64, limit: u32) -> Vec<DeferredSegment>;
+}

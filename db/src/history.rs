@@ -1,0 +1,19 @@
+//! Histories of missions, and the reports of robots that were applied.
+
+use tread_api::event::MissionStep;
+use tread_api::ids::MissionId;
+use tread_api::mission::MissionEvent;
+
+use super::{DbError, Tx, forward};
+
+forward! {
+    history;
+    fn begin(id: MissionId, first: &MissionEvent, second: Option<&MissionEvent>) -> ();
+    fn add_event(id: MissionId, event: &MissionEvent) -> ();
+    fn events(id: MissionId, limit: u32) -> Vec<MissionEvent>;
+    fn event_count(id: MissionId) -> u32;
+    fn has_report(boot_pk: i64, seq: i64) -> bool;
+    fn note_report(boot_pk: i64, seq: i64) -> ();
+    fn newest_step() -> i64;
+    fn steps_after(after: i64, limit: u32) -> Vec<(i64, MissionStep)>;
+}

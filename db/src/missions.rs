@@ -1,0 +1,29 @@
+//! Missions: their content, state and outcome.
+
+use jiff::Timestamp;
+use tread_api::ids::MissionId;
+use tread_api::mission::{Cause, DrivenPath, MissionQuality, MissionState, Replacement};
+pub use tread_store::missions::Standing;
+pub use tread_store::missions::{Facts, Inserted, MissionFilter, MissionRow};
+
+use super::{DbError, Tx, forward};
+
+forward! {
+    missions;
+    fn insert(row: &MissionRow, inserted: Inserted<'_>) -> ();
+    fn find(id: MissionId) -> Option<MissionRow>;
+    fn list(filter: &MissionFilter, limit: u32, bytes_max: usize) -> (Vec<MissionRow>, bool);
+    fn compare_and_set(id: MissionId, from: MissionState, to: MissionState, cause: Cause, reason: Option<&str>) -> bool;
+    fn add_facts(id: MissionId, facts: Facts) -> ();
+    fn want_pause(id: MissionId, wanted: bool) -> bool;
+    fn set_replacement(id: MissionId, replacement: Option<&Replacement>) -> ();
+    fn swap_content(id: MissionId, from: u32, to: &Replacement) -> bool;
+    fn set_silence(id: MissionId, since: Option<Timestamp>) -> ();
+    fn add_outcome(id: MissionId, quality: Option<&MissionQuality>, driven: Option<&DrivenPath>) -> ();
+    fn outcome(id: MissionId) -> (Option<MissionQuality>, Option<DrivenPath>);
+    fn counts() -> Vec<(MissionState, u64)>;
+    fn in_progress() -> Vec<Standing>;
+    fn next_in_queues() -> Vec<Standing>;
+    fn overdue(now: Timestamp, limit: u32) -> Vec<Standing>;
+    fn open_of_robot(robot_pk: i64) -> Vec<Standing>;
+}

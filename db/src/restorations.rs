@@ -1,0 +1,18 @@
+//! Restorations of backups, and the robots that await what follows from one.
+
+pub use tread_store::restorations::{
+    Changed, ENROLMENTS_SKIPPED, REVISIONS_SKIPPED, Restoration, Restrained,
+};
+
+use super::{DbError, Tx, forward};
+
+forward! {
+    restorations;
+    fn begin(restoration: &Restoration) -> Changed;
+    fn newest() -> Option<Restoration>;
+    fn enrolment_floor() -> u32;
+    fn restrained() -> Vec<Restrained>;
+    fn awaiting_count() -> u64;
+    fn release(robot_pk: i64) -> bool;
+    fn note_outcomes(robot_pk: i64) -> ();
+}

@@ -1,0 +1,31 @@
+//! Raw measurements, in the order of their commits.
+
+use jiff::Timestamp;
+use tread_api::friction::StoredSegment;
+pub use tread_store::segments::{Added, Extent, KeyedSegment, NewSegment, SegmentFilter};
+
+use futures_util::{Stream, StreamExt as _};
+
+use super::{DbError, Tx, forward};
+
+forward! {
+    segments;
+    fn insert(segments: &[NewSegment<'_>], received_at: Timestamp) -> Added;
+    fn extent(site_pk: i64, filter: &SegmentFilter) -> Extent;
+    fn list(site_pk: i64, filter: &SegmentFilter, limit: u32) -> Vec<StoredSegment>;
+    fn first_since(at: Timestamp) -> Option<i64>;
+    fn of_site(site_pk: i64, after: i64, limit: u32) -> Vec<KeyedSegment>;
+    fn of_all_sites(range: (i64, i64), limit: u32) -> Vec<(i64, StoredSegment)>;
+}
+
+/// Returns all measurements of a robot after a key, in the order of their commits.
+pub fn of_robot(
+    tx: &mut Tx,
+    robot_pk: i64,
+    after: i64,
+) -> impl Stream<Item = Result<KeyedSegment, DbError>> {
+    match tx {
+        Tx::Sqlite(tx) => tread_store_sqlite::segments::of_robot(tx, robot_pk, after)
+            .map(|row| row.map_err(DbError::from)),
+    }
+}

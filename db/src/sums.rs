@@ -1,0 +1,30 @@
+//! Sums of measurements per cell, ground, robot, configuration and hour of measuring, up to the
+//! watermark of each robot ([`super::watermarks`]).
+
+use tread_store::friction::Sums;
+pub use tread_store::sums::{StoredHour, SumKey, SumRow};
+
+use super::{DbError, Tx, forward};
+
+forward! {
+    sums;
+    fn each(take: impl FnMut(SumRow)) -> ();
+    fn unmerged(limit: u32) -> Vec<StoredHour>;
+    fn of_hour(hour: (i64, i64), limit: usize) -> Vec<SumRow>;
+    fn remove(key: &SumKey) -> bool;
+    fn remove_hours(robot_pk: i64, hours: (i64, i64)) -> u64;
+}
+
+/// Adds sums to those that are stored, bit for bit as [`Sums::add`] does.
+///
+/// # Errors
+/// The engine failed.
+pub async fn add<'sums>(
+    tx: &mut Tx,
+    sums: impl Iterator<Item = (&'sums SumKey, &'sums Sums)>,
+) -> Result<(), DbError> {
+    match tx {
+        Tx::Sqlite(tx) => tread_store_sqlite::sums::add(tx, sums).await?,
+    }
+    Ok(())
+}
