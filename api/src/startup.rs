@@ -49,3 +49,33 @@ pub fn apply_environment() -> io::Result<()> {
     let failed: Error = same.args(words).envs(missing.into_iter().flatten()).exec();
     Err(failed)
 }
+
+/// File in which Linux shows the signals that this process ignores.
+const STATUS_FILE: &str = "/proc/self/status";
+/// Bit of SIGHUP in the mask of ignored signals.
+const HANGUP_BIT: u64 = 1;
+
+/// Returns whether this process was started to ignore SIGHUP, as by `nohup`: then it must not stop
+/// when its terminal is closed.
+pub fn ignores_hangup() -> bool {
+    let status = std::fs::read_to_string(STATUS_FILE).unwrap_or_default();
+    mask_of_ignored(&status).is_some_and(|mask| mask & HANGUP_BIT != 0)
+}
+
+fn mask_of_ignored(status: &str) -> Option<u64> {
+    let mut lines = status.lines();
+    let mask = lines.find_map(|line| line.strip_prefix("SigIgn:"))?;
+    u64::from_str_radix(mask.trim(), 16).ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_mask_of_ignored_signals_is_found() {
+        let status = "Name:\tsh\nSigBlk:\t0000000000000001\nSigIgn:\t0000000000001001\n";
+        assert_eq!(mask_of_ignored(status), Some(0x1001));
+        assert_eq!(mask_of_ignored("Name:\tsh\n"), None);
+    }
+}

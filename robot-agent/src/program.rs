@@ -8,7 +8,7 @@ use anyhow::Context;
 use clap::{Parser, Subcommand};
 use tracing::{error, info, warn};
 use tracing_subscriber::EnvFilter;
-use tread_api::startup::apply_environment;
+use tread_api::startup::{apply_environment, ignores_hangup};
 
 use crate::agent::{Agent, RunningAgent};
 use crate::config::{AgentConfig, Flags, LogFormat};
@@ -91,6 +91,9 @@ fn init_logging(flags: &Flags) {
     let subscriber = tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_writer(std::io::stderr)
+        // A line that cannot be written, as on a full disk or a closed pipe, is lost. Otherwise the library
+        // says so by `eprintln`, which panics then.
+        .log_internal_errors(false)
         .with_ansi(std::io::stderr().is_terminal());
     // A process with a subscriber keeps it.
     let _ = match flags.log_format {
@@ -137,7 +140,11 @@ async fn wait(agent: &RunningAgent) -> anyhow::Result<()> {
     use tokio::signal::unix::{SignalKind, signal};
     let mut terminate = signal(SignalKind::terminate()).context("no signal handler")?;
     let mut interrupt = signal(SignalKind::interrupt()).context("no signal handler")?;
+    // The terminal that the agent was started from may be closed: the robot must brake all the same.
+    let ignores_hangup = ignores_hangup();
+    let mut hangup = signal(SignalKind::hangup()).context("no signal handler")?;
     tokio::select! {
+        _ = hangup.recv(), if !ignores_hangup => info!("stopping by SIGHUP"),
         _ = terminate.recv() => info!("stopping by SIGTERM"),
         _ = interrupt.recv() => info!("stopping by ctrl-c"),
         ended = agent.failed() => return Err(ended.into()),

@@ -25,6 +25,8 @@ pub(crate) fn start(args: &ServerArgs) -> anyhow::Result<()> {
     };
     let lines = tracing_subscriber::fmt::layer()
         .with_writer(std::io::stderr)
+        // A line that cannot be written is lost; the library would say so by `eprintln`, which panics then.
+        .log_internal_errors(false)
         .with_ansi(std::io::stderr().is_terminal());
     let registry = tracing_subscriber::registry().with(filter);
     // The only possible error is that an embedding program started logging before.

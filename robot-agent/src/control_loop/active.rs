@@ -79,6 +79,8 @@ pub(super) struct Active {
     stopped_because: EndReason,
     /// Revision that takes over once the robot has stopped.
     next: Option<Box<Job>>,
+    /// Whether a further revision was announced while one waits.
+    is_another_announced: bool,
     /// Signed cross-track error in this tick, metres, and whether a wheel speed was saturated.
     tracked: Option<(f64, bool)>,
 }
@@ -108,6 +110,7 @@ impl Active {
             is_pause_reported: false,
             stopped_because: EndReason::Cancelled,
             next: None,
+            is_another_announced: false,
             tracked: None,
         }
     }
@@ -205,9 +208,25 @@ impl Active {
         self.is_on_hold() && self.standing_ticks >= STANDING_TICKS
     }
 
+    /// Holds the mission for a revision that is being planned. If one waits already, the hold goes on
+    /// after that one took over.
+    pub(super) fn announce_replacement(&mut self) {
+        self.is_another_announced = self.next.is_some();
+        self.hold(Hold::Replacement, true);
+    }
+
+    /// Ends the hold for a revision that does not come. One that waits still takes over.
+    pub(super) fn withdraw_replacement(&mut self) {
+        self.is_another_announced = false;
+        if self.next.is_none() {
+            self.hold(Hold::Replacement, false);
+        }
+    }
+
     /// Stores the next revision, which replaces the active one when the robot has stopped. Returns
     /// a revision that was waiting already.
     pub(super) fn replace_at_rest(&mut self, next: Box<Job>) -> Option<Box<Job>> {
+        self.is_another_announced = false;
         self.hold(Hold::Replacement, true);
         self.next.replace(next)
     }
@@ -234,7 +253,8 @@ impl Active {
             ..progress_of(&next)
         };
         let old = std::mem::replace(&mut self.job, next);
-        self.hold(Hold::Replacement, false);
+        let is_another_announced = std::mem::take(&mut self.is_another_announced);
+        self.hold(Hold::Replacement, is_another_announced);
         if self.is_on_hold() {
             self.job.follower.set_pace(0.0);
         }

@@ -190,6 +190,44 @@ fn a_revision_that_comes_at_the_very_end_is_driven_and_one_that_does_not_come_ho
 }
 
 #[test]
+fn a_revision_announced_while_another_waits_keeps_the_hold_after_that_one_took_over() {
+    let (mut bench, mission, plan) = driving();
+    bench.replace(1, 2, &plan, &trajectory(OTHER)).unwrap();
+    bench.tick();
+    let hold = LoopCommand::Hold(mission, super::channels::Hold::Replacement);
+    bench.ends.commands.send(hold).unwrap();
+    let snapshot = |bench: &Bench| bench.ends.shared.snapshot();
+    let until = bench.now + 3 * SECOND;
+    while snapshot(&bench).mission.unwrap().revision == 1 {
+        bench.tick();
+        assert!(bench.now < until, "the second revision did not take over");
+    }
+    // The planner of the third one waits for just this.
+    assert!(snapshot(&bench).is_on_hold);
+    let release = LoopCommand::Release(mission, super::channels::Hold::Replacement);
+    bench.ends.commands.send(release).unwrap();
+    assert_eq!(run_to_end(&mut bench), EndReason::Reached);
+}
+
+#[test]
+fn a_revision_that_waits_takes_over_though_the_one_announced_after_it_does_not_come() {
+    let (mut bench, mission, plan) = driving();
+    bench.replace(1, 2, &plan, &trajectory(OTHER)).unwrap();
+    bench.tick();
+    for command in [LoopCommand::Hold, LoopCommand::Release] {
+        let command = command(mission, super::channels::Hold::Replacement);
+        bench.ends.commands.send(command).unwrap();
+        bench.tick();
+    }
+    let until = bench.now + 3 * SECOND;
+    while bench.ends.shared.snapshot().mission.unwrap().revision == 1 {
+        bench.tick();
+        assert!(bench.now < until, "the second revision did not take over");
+    }
+    assert_eq!(run_to_end(&mut bench), EndReason::Reached);
+}
+
+#[test]
 fn the_mission_link_watchdog_ends_a_mission_that_minds_silence_and_no_other() {
     for (silence_s, expected) in [
         (None, EndReason::Reached),

@@ -38,6 +38,14 @@ impl ProgressWatch {
         self.dug_in_at
     }
 
+    /// Forgets the comparison that has begun, since wheels or position are known to be wrong. The next one
+    /// begins with the next fix; what was detected stays.
+    pub(crate) fn suspend(&mut self) {
+        self.from = None;
+        self.wheels_m = 0.0;
+        self.against = 0;
+    }
+
     /// Adds the mean distance of the wheels, metres, negative for backward travel.
     pub(crate) fn note_wheels(&mut self, forward_m: f64) {
         if self.from.is_some() && forward_m.is_finite() {
@@ -108,6 +116,28 @@ mod tests {
         );
         drive(&mut watch, &mut at, 4.0 * WINDOW_M + 0.1, 0.95);
         assert!(watch.dug_in_at().is_none());
+    }
+
+    #[test]
+    fn a_channel_that_is_known_to_be_wrong_neither_raises_nor_ends_it() {
+        let (mut watch, mut at) = (ProgressWatch::default(), Point::default());
+        drive(&mut watch, &mut at, 2.0 * WINDOW_M + 0.1, 0.0);
+        // The wheels are frozen at the speed that they had, and the robot stands.
+        for _ in 0..100 {
+            watch.note_wheels(0.03);
+            watch.suspend();
+        }
+        drive(&mut watch, &mut at, 5.0, 0.9);
+        assert!(watch.dug_in_at().is_none());
+        drive(&mut watch, &mut at, 4.0 * WINDOW_M + 0.1, 0.0);
+        assert!(watch.dug_in_at().is_some());
+        for _ in 0..100 {
+            watch.note_wheels(0.03);
+            at.x_m += 1.0;
+            watch.note_fix(at);
+            watch.suspend();
+        }
+        assert!(watch.dug_in_at().is_some());
     }
 
     #[test]

@@ -1,5 +1,6 @@
 //! The program as a service manager sees it that waits for messages.
 
+use std::fs::File;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
@@ -25,6 +26,10 @@ impl Drop for Program {
 }
 
 fn start(manager: &ServiceManager, folder: &Path, flags: &[&str]) -> Program {
+    start_with_log(manager, folder, flags, Stdio::null())
+}
+
+fn start_with_log(manager: &ServiceManager, folder: &Path, flags: &[&str], log: Stdio) -> Program {
     let mut program = Command::new(env!("CARGO_BIN_EXE_tread-agent"));
     program
         // Nobody is there, and it does not matter.
@@ -33,7 +38,7 @@ fn start(manager: &ServiceManager, folder: &Path, flags: &[&str]) -> Program {
         .args(flags)
         .env_remove("RUST_LOG")
         .stdin(Stdio::null())
-        .stderr(Stdio::null());
+        .stderr(log);
     manager.attend(&mut program, WATCHDOG);
     Program(program.spawn().unwrap())
 }
@@ -61,6 +66,27 @@ async fn the_service_manager_hears_ready_then_of_the_loop_then_of_the_stop() {
     assert!(asked.unwrap().success());
     let stopping = manager.next("STOPPING=1", WAIT_MAX).await;
     assert!(stopping.is_some(), "it says that it stops");
+    let ended = tokio::task::spawn_blocking(move || program.0.wait().unwrap()).await;
+    assert_eq!(ended.unwrap().code(), Some(0));
+}
+
+/// Its log is on a full disk, or the program that read it has gone.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_agent_whose_log_cannot_be_written_goes_on_and_stops_when_its_terminal_is_closed() {
+    let folder = tempfile::tempdir().unwrap();
+    let manager = ServiceManager::listen(folder.path()).unwrap();
+    let full = File::options().write(true).open("/dev/full").unwrap();
+    let mut program = start_with_log(&manager, folder.path(), &["--log=debug"], full.into());
+    assert!(manager.next("READY=1", WAIT_MAX).await.is_some());
+    for message in 0..MESSAGES {
+        let fed = manager.next("WATCHDOG=1", WAIT_MAX).await;
+        assert!(fed.is_some(), "message {message} did not come");
+    }
+    let asked = Command::new("kill")
+        .args(["-HUP", &program.0.id().to_string()])
+        .status();
+    assert!(asked.unwrap().success());
+    assert!(manager.next("STOPPING=1", WAIT_MAX).await.is_some());
     let ended = tokio::task::spawn_blocking(move || program.0.wait().unwrap()).await;
     assert_eq!(ended.unwrap().code(), Some(0));
 }

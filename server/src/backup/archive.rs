@@ -313,6 +313,7 @@ fn write_new(
     filter.check(status)?;
     packed?;
     let (file, archived) = file.done();
+    filter.check_size(archived.bytes, source.manifest.database.bytes)?;
     file.finish().map_err(failed())?;
     Ok(archived)
 }

@@ -24,7 +24,24 @@ pub enum EncryptionError {
         /// Its exit status.
         status: ExitStatus,
     },
+    /// The command succeeded and wrote nothing, or far too little.
+    #[error(
+        "`{command}` wrote {written_bytes} bytes of an archive of more than {archive_bytes}: it must \
+         write all of it to its standard output, not to a file"
+    )]
+    TooLittle {
+        /// The command.
+        command: String,
+        /// Size of its output, bytes.
+        written_bytes: u64,
+        /// Minimum size of the archive, bytes.
+        archive_bytes: u64,
+    },
 }
+
+/// Ratio by which a program that also compresses makes no archive smaller: databases are hardly
+/// compressible beyond a tenth of this.
+const COMPRESSION_MAX: u64 = 1_000;
 
 /// A shell command that encrypts, or decrypts, its standard input to its standard output.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -42,6 +59,26 @@ impl Filter {
         started.map_err(|cause| EncryptionError::Start {
             command: self.0.clone(),
             cause,
+        })
+    }
+
+    /// Checks that the command can have written a whole archive, which nobody can read back without the
+    /// key.
+    ///
+    /// # Errors
+    /// [`EncryptionError::TooLittle`].
+    pub fn check_size(
+        &self,
+        written_bytes: u64,
+        archive_bytes: u64,
+    ) -> Result<(), EncryptionError> {
+        if written_bytes > archive_bytes / COMPRESSION_MAX {
+            return Ok(());
+        }
+        Err(EncryptionError::TooLittle {
+            command: self.0.clone(),
+            written_bytes,
+            archive_bytes,
         })
     }
 

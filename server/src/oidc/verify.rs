@@ -6,6 +6,7 @@
 //! | `iss` | the provider |
 //! | `aud` | this client alone; `azp`, if present, too |
 //! | `exp`, `iat` | not expired, not issued in the future, with a tolerance of [`LEEWAY`] |
+//! | `nbf` | if present, not in the future, with the same tolerance (RFC 7519, section 4.1.5) |
 //! | `nonce` | the one of this sign-in |
 //! | `at_hash` | if present, the hash of the access token in the same answer |
 
@@ -72,6 +73,9 @@ pub enum InvalidIdToken {
     /// The subject is empty or longer than [`SUBJECT_MAX`].
     #[error("the ID token's `sub` is empty or too long")]
     Subject,
+    /// The token is not valid yet (`nbf`).
+    #[error("the ID token's `nbf` is yet to come, or is no number")]
+    NotYetValid,
     /// The payload cannot be parsed.
     #[error("the ID token's claims do not read")]
     Unreadable,
@@ -146,6 +150,13 @@ pub fn claims(
         return Err(InvalidIdToken::Subject);
     }
     let claims = payload(id_token).ok_or(InvalidIdToken::Unreadable)?;
+    let latest_s = latest.timestamp() as f64;
+    if !claims
+        .get("nbf")
+        .is_none_or(|from| from.as_f64().is_some_and(|from_s| from_s <= latest_s))
+    {
+        return Err(InvalidIdToken::NotYetValid);
+    }
     Ok((subject.to_owned(), claims))
 }
 
@@ -211,6 +222,7 @@ mod tests {
             with(&json!({"exp": NOW_S - 59, "iat": NOW_S - 400})),
             with(&json!({"iat": NOW_S + 60})),
             with(&json!({"azp": "tread"})),
+            with(&json!({"nbf": NOW_S + 60})),
             with(&json!({"aud": ["tread"]})),
         ] {
             look(&signer.sign(&header(), &fine), &signer).unwrap();
@@ -229,6 +241,8 @@ mod tests {
             json!({"nonce": null}),
             json!({"exp": NOW_S - 61}),
             json!({"iat": NOW_S + 61}),
+            json!({"nbf": NOW_S + 61}),
+            json!({"nbf": "now"}),
             json!({"at_hash": "AAAAAAAAAAAAAAAAAAAAAA"}),
             json!({"sub": ""}),
             json!({"sub": "x".repeat(SUBJECT_MAX + 1)}),

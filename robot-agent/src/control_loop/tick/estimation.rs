@@ -241,12 +241,17 @@ impl Estimation {
     fn take_samples(&mut self, samples: &[CheckedSample]) -> Taken {
         let mut taken = Taken::default();
         for sample in samples {
+            if !sample.shows_progress {
+                self.progress.suspend();
+            }
             self.take_motion(sample, &mut taken);
             let Some(fix) = sample.fix else {
                 continue;
             };
             self.check_gap(sample.at);
-            self.progress.note_fix(fix.pose.point());
+            if sample.shows_progress {
+                self.progress.note_fix(fix.pose.point());
+            }
             match self.localisation.correct(&fix) {
                 FixOutcome::Started | FixOutcome::Fused | FixOutcome::Restarted => {
                     self.last_fix = Some(sample.at);

@@ -140,15 +140,22 @@ impl MissionStage {
             }
             LoopCommand::Hold(mission, hold) => {
                 if let Some(active) = self.of(mission) {
-                    active.hold(hold, true);
                     if hold == Hold::Replacement {
+                        active.announce_replacement();
                         self.replacement_until = Some(tick.now.monotonic + REPLACEMENT_MAX);
+                    } else {
+                        active.hold(hold, true);
                     }
                 }
             }
             LoopCommand::Release(mission, hold) => {
                 if let Some(active) = self.of(mission) {
-                    active.hold(hold, false);
+                    if hold == Hold::Replacement {
+                        active.withdraw_replacement();
+                        self.replacement_until = None;
+                    } else {
+                        active.hold(hold, false);
+                    }
                 }
             }
             LoopCommand::Replace(job) => match self.of(job.mission) {

@@ -44,6 +44,9 @@ pub(super) struct CheckedSample {
     pub(super) fix: Option<PositionFix>,
     /// Whether no sensor contradicts another, so that the estimator may use the sample.
     pub(super) may_learn: bool,
+    /// Whether neither wheels nor position are known to be wrong, so that they show whether the robot
+    /// makes progress.
+    pub(super) shows_progress: bool,
 }
 
 /// Output of the stage.
@@ -124,6 +127,10 @@ impl Sensing {
         }
     }
 
+    fn is_right(&self, subject: Subject) -> bool {
+        self.findings.about(subject).is_none()
+    }
+
     fn check(&mut self, sample: &drive::SensorSample) -> CheckedSample {
         self.monitor.take(&Sample {
             at: sample.at,
@@ -155,6 +162,7 @@ impl Sensing {
                 noise: sample.position_noise,
             }),
             may_learn: self.findings.consequence().is_none(),
+            shows_progress: self.is_right(Subject::Wheels) && self.is_right(Subject::Position),
         }
     }
 

@@ -124,6 +124,27 @@ fn a_command_that_fails_leaves_no_archive() {
 }
 
 #[test]
+fn a_command_that_writes_elsewhere_or_nothing_leaves_no_archive() {
+    let made = make(None);
+    let found = manifest(&made.archive, None).unwrap();
+    let copy = made.folder.path().join("copy.db");
+    let source = Source {
+        manifest: &found,
+        database: &copy,
+        authority: &[],
+    };
+    let elsewhere = format!("cat >{}", made.folder.path().join("mine").display());
+    for command in ["cat >/dev/null", &elsewhere] {
+        let target = made.folder.path().join("encrypted.tar");
+        let failed = write(&target, &source, Some(&filter(command)), &mut |_bytes| {});
+        let failed = failed.unwrap_err().to_string();
+        assert!(failed.contains("wrote 0 bytes"), "{failed}");
+        assert!(failed.contains("standard output"), "{failed}");
+        assert!(!target.exists() && !partial_name(&target).exists());
+    }
+}
+
+#[test]
 fn damage_anywhere_is_found() {
     let made = make(None);
     let intact = extracted(&made, None).unwrap();

@@ -58,7 +58,7 @@ impl MissionStage {
             active.stop(EndReason::ServerSilent);
         }
         if self.replacement_until.is_some_and(|until| now > until) {
-            active.hold(Hold::Replacement, false);
+            active.withdraw_replacement();
             self.replacement_until = None;
         }
     }
