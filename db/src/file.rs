@@ -1,3 +1,3 @@
-//! What only a database in a file has: its lock, copies of it, and the inspection of a file that is not open.
+//! What only a database in a file has: copies of it, and its schema while it is not open.
 
-pub use tread_store_sqlite::{OpenError, copy, inspection, lock, refuse_newer, schema};
+pub use tread_store_sqlite::{OpenError, copy, refuse_newer, schema};

@@ -4,6 +4,7 @@
 //! transaction of either engine. What only a database in a file has is in [`file`].
 
 mod forward;
+pub mod lock;
 
 pub mod alerts;
 pub mod attendance;
@@ -14,6 +15,7 @@ pub mod file;
 pub mod geofences;
 pub mod history;
 pub mod idempotency;
+pub mod inspection;
 pub mod join_tokens;
 pub mod missions;
 pub mod removed;
@@ -37,7 +39,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use tread_store::metrics::DatabaseMetrics;
-pub use tread_store::{DbError, Disk, Outcome, failure, limited, secrets};
+pub use tread_store::{DbError, Disk, Location, Outcome, failure, limited, secrets};
 
 use self::forward::forward;
 
@@ -46,6 +48,8 @@ use self::forward::forward;
 pub enum Tx {
     /// On a file of SQLite.
     Sqlite(tread_store_sqlite::Tx),
+    /// On a PostgreSQL database.
+    Postgres(tread_store_postgres::Tx),
 }
 
 impl Tx {
@@ -56,6 +60,7 @@ impl Tx {
     pub async fn commit(self) -> Result<(), DbError> {
         match self {
             Self::Sqlite(tx) => tx.commit().await,
+            Self::Postgres(tx) => tx.commit().await,
         }
     }
 
@@ -70,6 +75,7 @@ impl Tx {
     ) -> Result<(), DbError> {
         match self {
             Self::Sqlite(tx) => tx.commit_then(then).await,
+            Self::Postgres(tx) => tx.commit_then(then).await,
         }
     }
 
@@ -77,6 +83,7 @@ impl Tx {
     pub fn as_sqlite(&mut self) -> Option<&mut tread_store_sqlite::Tx> {
         match self {
             Self::Sqlite(tx) => Some(tx),
+            Self::Postgres(_) => None,
         }
     }
 }
@@ -87,6 +94,9 @@ pub enum OpenError {
     /// A file of SQLite cannot be opened.
     #[error(transparent)]
     Sqlite(#[from] tread_store_sqlite::OpenError),
+    /// A PostgreSQL database cannot be opened.
+    #[error(transparent)]
+    Postgres(#[from] tread_store_postgres::OpenError),
 }
 
 /// The open database; clones share it.
@@ -94,24 +104,40 @@ pub enum OpenError {
 pub enum Db {
     /// A file of SQLite.
     Sqlite(tread_store_sqlite::Db),
+    /// A PostgreSQL database.
+    Postgres(tread_store_postgres::Db),
 }
 
 impl Db {
-    /// Opens a file of SQLite, creates it if it is missing, and applies migrations.
+    /// Opens the database, creates a file that is missing, and applies migrations.
     ///
     /// # Errors
-    /// [`OpenError`] names file or folder.
-    pub async fn open(path: &Path) -> Result<Self, OpenError> {
-        Ok(Self::Sqlite(tread_store_sqlite::Db::open(path).await?))
+    /// [`OpenError`] names file or address, without a password.
+    pub async fn open(location: impl Into<Location>) -> Result<Self, OpenError> {
+        Ok(match location.into() {
+            Location::File(path) => Self::Sqlite(tread_store_sqlite::Db::open(&path).await?),
+            Location::Postgres(address) => {
+                Self::Postgres(tread_store_postgres::Db::open(&address).await?)
+            }
+        })
     }
 
     /// As [`Db::open`], with a given maximum time for a commit.
     ///
     /// # Errors
     /// As [`Db::open`].
-    pub async fn open_with(path: &Path, commit_max: Duration) -> Result<Self, OpenError> {
-        let opened = tread_store_sqlite::Db::open_with(path, commit_max).await?;
-        Ok(Self::Sqlite(opened))
+    pub async fn open_with(
+        location: impl Into<Location>,
+        commit_max: Duration,
+    ) -> Result<Self, OpenError> {
+        Ok(match location.into() {
+            Location::File(path) => {
+                Self::Sqlite(tread_store_sqlite::Db::open_with(&path, commit_max).await?)
+            }
+            Location::Postgres(address) => {
+                Self::Postgres(tread_store_postgres::Db::open_with(&address, commit_max).await?)
+            }
+        })
     }
 
     /// Returns the generation: a counter of all commits but those of [`Db::write_uncounted`]. Data
@@ -119,6 +145,7 @@ impl Db {
     pub fn generation(&self) -> u64 {
         match self {
             Self::Sqlite(db) => db.generation(),
+            Self::Postgres(db) => db.generation(),
         }
     }
 
@@ -126,6 +153,7 @@ impl Db {
     pub fn unknown_outcomes(&self) -> u64 {
         match self {
             Self::Sqlite(db) => db.unknown_outcomes(),
+            Self::Postgres(db) => db.unknown_outcomes(),
         }
     }
 
@@ -133,6 +161,7 @@ impl Db {
     pub async fn outcome_unknown(&self) {
         match self {
             Self::Sqlite(db) => db.outcome_unknown().await,
+            Self::Postgres(db) => db.outcome_unknown().await,
         }
     }
 
@@ -144,6 +173,7 @@ impl Db {
     pub async fn await_commits(&self) -> Result<(), DbError> {
         match self {
             Self::Sqlite(db) => db.await_commits().await,
+            Self::Postgres(db) => db.await_commits().await,
         }
     }
 
@@ -151,6 +181,7 @@ impl Db {
     pub fn path(&self) -> Option<&Path> {
         match self {
             Self::Sqlite(db) => Some(db.path()),
+            Self::Postgres(_) => None,
         }
     }
 
@@ -158,6 +189,7 @@ impl Db {
     pub fn name(&self) -> String {
         match self {
             Self::Sqlite(db) => db.path().display().to_string(),
+            Self::Postgres(db) => db.address().to_owned(),
         }
     }
 
@@ -165,6 +197,7 @@ impl Db {
     pub fn engine(&self) -> (Engine, &str) {
         match self {
             Self::Sqlite(db) => (Engine::Sqlite, db.sqlite_version()),
+            Self::Postgres(db) => (Engine::Postgres, db.server_version()),
         }
     }
 
@@ -176,6 +209,7 @@ impl Db {
     pub async fn write(&self, kind: &'static str) -> Result<Tx, DbError> {
         match self {
             Self::Sqlite(db) => Ok(Tx::Sqlite(db.write(kind).await?)),
+            Self::Postgres(db) => Ok(Tx::Postgres(db.write(kind).await?)),
         }
     }
 
@@ -187,6 +221,7 @@ impl Db {
     pub async fn write_uncounted(&self, kind: &'static str) -> Result<Tx, DbError> {
         match self {
             Self::Sqlite(db) => Ok(Tx::Sqlite(db.write_uncounted(kind).await?)),
+            Self::Postgres(db) => Ok(Tx::Postgres(db.write_uncounted(kind).await?)),
         }
     }
 
@@ -197,6 +232,7 @@ impl Db {
     pub async fn read(&self, kind: &'static str) -> Result<Tx, DbError> {
         match self {
             Self::Sqlite(db) => Ok(Tx::Sqlite(db.read(kind).await?)),
+            Self::Postgres(db) => Ok(Tx::Postgres(db.read(kind).await?)),
         }
     }
 
@@ -204,6 +240,7 @@ impl Db {
     pub fn metrics(&self) -> &DatabaseMetrics {
         match self {
             Self::Sqlite(db) => db.metrics(),
+            Self::Postgres(db) => db.metrics(),
         }
     }
 
@@ -215,6 +252,7 @@ impl Db {
     pub async fn checkpoint(&self) -> Result<(), DbError> {
         match self {
             Self::Sqlite(db) => db.checkpoint().await,
+            Self::Postgres(db) => db.checkpoint().await,
         }
     }
 
@@ -225,6 +263,7 @@ impl Db {
     pub async fn probe_write(&self) -> Result<(), DbError> {
         match self {
             Self::Sqlite(db) => db.probe_write().await,
+            Self::Postgres(db) => db.probe_write().await,
         }
     }
 
@@ -235,6 +274,7 @@ impl Db {
     pub async fn probe_tables(&self) -> Result<(), DbError> {
         match self {
             Self::Sqlite(db) => db.probe_tables().await,
+            Self::Postgres(db) => db.probe_tables().await,
         }
     }
 
@@ -245,6 +285,7 @@ impl Db {
     pub async fn quick_check(&self) -> Result<Option<String>, DbError> {
         match self {
             Self::Sqlite(db) => db.quick_check().await,
+            Self::Postgres(db) => db.quick_check().await,
         }
     }
 
@@ -253,6 +294,7 @@ impl Db {
     pub async fn disk(&self) -> Option<Disk> {
         match self {
             Self::Sqlite(db) => db.disk().await,
+            Self::Postgres(db) => db.disk().await,
         }
     }
 
@@ -260,6 +302,7 @@ impl Db {
     pub async fn close(&self) {
         match self {
             Self::Sqlite(db) => db.close().await,
+            Self::Postgres(db) => db.close().await,
         }
     }
 }
@@ -269,6 +312,8 @@ impl Db {
 pub enum Engine {
     /// SQLite, in a file.
     Sqlite,
+    /// PostgreSQL.
+    Postgres,
 }
 
 impl Engine {
@@ -276,6 +321,7 @@ impl Engine {
     pub fn name(self) -> &'static str {
         match self {
             Self::Sqlite => "SQLite",
+            Self::Postgres => "PostgreSQL",
         }
     }
 }

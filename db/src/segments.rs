@@ -4,6 +4,7 @@ use jiff::Timestamp;
 use tread_api::friction::StoredSegment;
 pub use tread_store::segments::{Added, Extent, KeyedSegment, NewSegment, SegmentFilter};
 
+use futures_util::future::Either;
 use futures_util::{Stream, StreamExt as _};
 
 use super::{DbError, Tx, forward};
@@ -25,7 +26,13 @@ pub fn of_robot(
     after: i64,
 ) -> impl Stream<Item = Result<KeyedSegment, DbError>> {
     match tx {
-        Tx::Sqlite(tx) => tread_store_sqlite::segments::of_robot(tx, robot_pk, after)
-            .map(|row| row.map_err(DbError::from)),
+        Tx::Sqlite(tx) => {
+            let rows = tread_store_sqlite::segments::of_robot(tx, robot_pk, after);
+            Either::Left(rows.map(|row| row.map_err(DbError::from)))
+        }
+        Tx::Postgres(tx) => {
+            let rows = tread_store_postgres::segments::of_robot(tx, robot_pk, after);
+            Either::Right(rows.map(|row| row.map_err(DbError::from)))
+        }
     }
 }

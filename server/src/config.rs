@@ -15,6 +15,7 @@ use std::path::{Path, PathBuf};
 use clap::{Args, ValueEnum};
 use serde::Deserialize;
 use tread_api::ids::{ConfigurationId, SiteId};
+use tread_store::Location;
 use tread_telemetry::TelemetryError;
 pub use tread_telemetry::TracingConfig;
 
@@ -51,7 +52,7 @@ pub struct ServerArgs {
     /// Address of the zenoh router that robots connect to; port 0 selects a free port
     #[arg(long, value_name = "ADDRESS")]
     pub zenoh: Option<SocketAddr>,
-    /// Database file, created when missing
+    /// Database: a file, created when missing, or the address `postgres://…` of a PostgreSQL database
     #[arg(long, value_name = "FILE")]
     pub database: Option<PathBuf>,
     /// Site that is created when missing
@@ -84,8 +85,8 @@ pub struct Config {
     pub metrics: Option<SocketAddr>,
     /// Address that robots connect to; a loopback address unless `robots` is set.
     pub zenoh: SocketAddr,
-    /// Path of the database file.
-    pub database: PathBuf,
+    /// The database: a file, or a PostgreSQL database.
+    pub database: Location,
     /// Site that is created at the start if missing.
     pub site: SiteId,
     /// Weights of measurements by robot and age.
@@ -445,6 +446,20 @@ pub enum ConfigError {
         "`credential:{0}` was not passed by the service manager: put it into /etc/credstore/{0}, with          `LoadCredential={0}` in the unit, or give the path of a file"
     )]
     NoCredential(String),
+    /// Two listeners have the same address.
+    #[error("`{}` and `{}` are both {address}: give one of them another port", keys[0], keys[1])]
+    SameAddress {
+        /// Configuration keys.
+        keys: [&'static str; 2],
+        /// The address.
+        address: SocketAddr,
+    },
+    /// `[backup]` is set for a PostgreSQL database.
+    #[error(
+        "`[backup]` copies a database file; a PostgreSQL database is backed up by its own tools, such as \
+         `pg_dump` (docs/postgresql.md): remove `[backup]`"
+    )]
+    BackupOfPostgres,
     /// An entry of `robots.names` is neither a host name nor an IP address.
     #[error("`robots.names` has `{0}`, which is neither a host name nor an address")]
     PortName(String),
@@ -495,7 +510,8 @@ impl Config {
                 .database
                 .clone()
                 .or(file.database)
-                .unwrap_or_else(|| DATABASE_DEFAULT.into()),
+                .unwrap_or_else(|| DATABASE_DEFAULT.into())
+                .into(),
             site: args
                 .site
                 .clone()
@@ -554,9 +570,28 @@ impl Config {
             .robots
             .is_none()
             .then_some(("zenoh", self.zenoh, ROBOTS));
+        if self.database.is_postgres() && self.backup.is_some() {
+            return Err(ConfigError::BackupOfPostgres);
+        }
         for (key, address, cure) in [http, zenoh, metrics].into_iter().flatten() {
             if !address.ip().is_loopback() {
                 return Err(ConfigError::NotLoopback { key, address, cure });
+            }
+        }
+        let listened = [
+            ("http", Some(self.http)),
+            ("zenoh", Some(self.zenoh)),
+            ("metrics", self.metrics),
+        ];
+        for (place, (key, address)) in listened.iter().enumerate() {
+            let same = |other: &&(&'static str, Option<SocketAddr>)| {
+                address.is_some_and(|address| address.port() != 0 && other.1 == Some(address))
+            };
+            if let Some((other, Some(address))) = listened[..place].iter().find(same) {
+                return Err(ConfigError::SameAddress {
+                    keys: [*other, *key],
+                    address: *address,
+                });
             }
         }
         if let Some(robots) = &self.robots {

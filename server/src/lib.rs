@@ -50,7 +50,8 @@ use anyhow::Context as _;
 use jiff::SignedDuration;
 use tokio::net::TcpListener;
 use tokio::sync::mpsc;
-use tracing::{info, warn};
+use tokio_util::sync::CancellationToken;
+use tracing::{error, info, warn};
 use tread_api::ids::SiteId;
 use tread_telemetry::Telemetry;
 
@@ -66,8 +67,8 @@ use self::clock::Clock;
 pub use self::config::{Config, ServerArgs};
 use self::config::{RobotsConfig, TlsSource};
 use self::db::failure::StorageFailure;
-use self::db::file::lock::DatabaseLock;
-use self::db::{Db, DbError};
+use self::db::lock::DatabaseLock;
+use self::db::{Db, DbError, Location};
 use self::fleet::{Fleet, Security};
 use self::http::serve::Serving;
 use self::http::tls::{Issuer, Tls};
@@ -122,13 +123,14 @@ impl Server {
         let names = config.names();
         let proxies = TrustedProxies::new(config.web.trusted_proxies.clone());
         let schedule = backup_schedule(&config);
-        let lock = DatabaseLock::take(&config.database)?;
+        let lock = DatabaseLock::take(&config.database).await?;
         // Only with the lock: this completes an interrupted rotation of the authority.
         let security = config.robots.as_ref().map(security).transpose()?;
         let tls = open_tls(&config, security.as_ref(), &clock)?;
         let db = Db::open(&config.database).await?;
         let supervisor = Supervisor::new();
         let stop = || supervisor.stop_token();
+        supervisor.spawn_vital("lock", keep_lock(lock.lost(), stop()));
         let (of_fleet, fleet_clock) = (security.clone(), clock.clone());
         let fleet = Fleet::open(config.zenoh, of_fleet, fleet_clock, supervisor.clone())?;
         let enrolment_service = |security: Security, robots: &RobotsConfig| EnrolmentService {
@@ -242,11 +244,18 @@ fn serve_metrics(
     Ok(address)
 }
 
+/// Ends when another server has the lock of the database, or at the stop.
+async fn keep_lock(lost: impl Future<Output = String>, stop: CancellationToken) {
+    if let Some(reason) = stop.run_until_cancelled(lost).await {
+        error!("the lock of the database is lost: {reason}");
+    }
+}
+
 /// Returns the schedule of the server's own backups; `None` if it makes none.
 fn backup_schedule(config: &Config) -> Option<backups::Schedule> {
     Some(backups::Schedule {
         config: config.backup.clone()?,
-        database: config.database.clone(),
+        database: config.database.file()?.to_owned(),
         authority: config
             .robots
             .as_ref()
@@ -319,7 +328,7 @@ fn listen_for_http(address: SocketAddr) -> anyhow::Result<TcpListener> {
 }
 
 /// Adds to an error of reading the database which file it is, and what to do.
-fn not_readable(error: anyhow::Error, database: &std::path::Path) -> anyhow::Error {
+fn not_readable(error: anyhow::Error, database: &Location) -> anyhow::Error {
     let failure = error
         .chain()
         .find_map(|cause| cause.downcast_ref::<DbError>())
@@ -328,10 +337,7 @@ fn not_readable(error: anyhow::Error, database: &std::path::Path) -> anyhow::Err
         "`tread-server doctor --deep` examines it",
         StorageFailure::advice,
     );
-    error.context(format!(
-        "cannot read the database `{}`: {advice}",
-        database.display()
-    ))
+    error.context(format!("cannot read the database `{database}`: {advice}"))
 }
 
 fn security(robots: &RobotsConfig) -> anyhow::Result<Security> {
@@ -394,7 +400,7 @@ impl RunningServer {
         let _ended = tokio::task::spawn_blocking(move || app.finish_traces()).await;
         self.fleet.close().await;
         self.app.db().close().await;
-        drop(self.lock);
+        self.lock.release().await;
         Ok(stopped?)
     }
 }

@@ -8,7 +8,7 @@ use clap::Parser as _;
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use tokio::signal::unix::{SignalKind, signal};
 use tracing::{info, warn};
-use tread_api::startup::apply_environment;
+use tread_api::startup::{apply_environment, ignores_hangup};
 
 use crate::{Config, Server, ServerArgs, build, doctor, health, init, logging, maintenance};
 
@@ -42,6 +42,9 @@ enum Action {
     Backup(maintenance::backup::BackupArgs),
     /// Restore a backup; no server may run on the database
     Restore(maintenance::restore::RestoreArgs),
+    /// Hold robots and list what to review after the tools of the database have restored it; `restore` does
+    /// this by itself
+    MarkRestored(maintenance::mark_restored::MarkRestoredArgs),
     /// Show or apply the changes of the database's schema that this version needs
     Migrate(maintenance::migrate::MigrateArgs),
 }
@@ -79,6 +82,9 @@ pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode 
             run_beside_server(maintenance::backup::run(args))
         }
         Some(Action::Restore(args)) => run_beside_server(maintenance::restore::run(args)),
+        Some(Action::MarkRestored(args)) => {
+            run_beside_server(maintenance::mark_restored::run(args))
+        }
         Some(Action::Migrate(args)) => {
             return maintenance::migrate::exit_code(run_beside_server(maintenance::migrate::run(
                 args,
@@ -141,11 +147,14 @@ pub fn run(args: &ServerArgs) -> anyhow::Result<()> {
     let ended = runtime.block_on(async {
         let mut terminate = signal(SignalKind::terminate())?;
         let mut interrupt = signal(SignalKind::interrupt())?;
+        let ignores_hangup = ignores_hangup();
+        let mut hangup = signal(SignalKind::hangup())?;
         let server = Server::start(config).await?;
         server.tell_service_manager();
         tokio::select! {
             _ = terminate.recv() => info!("asked to stop"),
             _ = interrupt.recv() => info!("asked to stop"),
+            _ = hangup.recv(), if !ignores_hangup => info!("asked to stop: its terminal is closed"),
             () = server.failed() => {}
         }
         server.stop().await

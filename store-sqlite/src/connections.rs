@@ -18,6 +18,7 @@ use sqlx::{ConnectOptions as _, Connection as _, FromRow, SqliteConnection};
 use tokio::runtime::Handle;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::{Instant, timeout};
+use tread_store::Outcome;
 
 use super::failure;
 
@@ -343,5 +344,15 @@ impl DerefMut for Lent {
         let opened = self.opened.as_mut();
         let connection = opened.and_then(|opened| opened.connection.as_mut());
         connection.expect("only a commit takes it, with the whole")
+    }
+}
+
+/// Returns the outcome of a commit that ended so.
+pub(super) fn outcome_of(committed: &Result<(), sqlx::Error>) -> Outcome {
+    match committed {
+        Ok(()) => Outcome::Written,
+        // SQLite itself reports that it did not commit.
+        Err(sqlx::Error::Database(_)) => Outcome::Nothing,
+        Err(_) => Outcome::Unknown,
     }
 }

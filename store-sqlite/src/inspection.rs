@@ -3,47 +3,18 @@
 use std::fs;
 use std::path::Path;
 
-use jiff::Timestamp;
 use sqlx::migrate::Migrator;
 use sqlx::sqlite::SqliteConnectOptions;
 use sqlx::{AssertSqlSafe, ConnectOptions as _, Connection as _, SqliteConnection};
 
 use tread_store::failure::StorageFailure;
+pub use tread_store::inspection::{Inspection, Schema};
 
 use super::failure;
 use super::{BUSY_TIMEOUT, EngineError, times};
 
 /// Migrations of this version.
 static MIGRATIONS: Migrator = sqlx::migrate!();
-
-/// Schema of a database against that of this version.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Schema {
-    /// Both are the same, with this version of it.
-    Current(i64),
-    /// It has no tables.
-    Empty,
-    /// It lacks migrations.
-    Older {
-        /// Number of those.
-        pending: usize,
-    },
-    /// It has this migration, which this version does not know.
-    Newer(i64),
-    /// It has another migration of this version.
-    Differs(i64),
-}
-
-/// What was found.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Inspection {
-    /// Its schema.
-    pub schema: Schema,
-    /// The newest time that it holds; `None` if it has another schema or holds none.
-    pub newest: Option<Timestamp>,
-    /// SQLite's finding if it is damaged.
-    pub damage: Option<String>,
-}
 
 /// Reason why a database cannot be inspected.
 #[derive(Debug, thiserror::Error)]

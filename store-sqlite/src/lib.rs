@@ -4,69 +4,103 @@
 //! ([`Db::read`], each transaction a snapshot). `synchronous=FULL`: a commit that returned
 //! survives a power cut.
 
+#[path = "../../store/sql/alerts.rs"]
 pub mod alerts;
+#[path = "../../store/sql/attendance.rs"]
 pub mod attendance;
+#[path = "../../store/sql/audit.rs"]
 pub mod audit;
 mod connections;
 pub mod copy;
+#[path = "../../store/sql/deferred_segments.rs"]
 pub mod deferred_segments;
+#[path = "../../store/sql/enrolments.rs"]
 pub mod enrolments;
 mod error;
 mod failure;
+#[path = "../../store/sql/geofences.rs"]
 pub mod geofences;
+#[path = "../../store/sql/ground.rs"]
 mod ground;
+#[path = "../../store/sql/history.rs"]
 pub mod history;
+#[path = "../../store/sql/idempotency.rs"]
 pub mod idempotency;
 pub mod inspection;
+#[path = "../../store/sql/join_tokens.rs"]
 pub mod join_tokens;
 pub mod lock;
+#[path = "../../store/sql/missions.rs"]
 pub mod missions;
 mod private;
+#[path = "../../store/sql/removed.rs"]
 pub mod removed;
+#[path = "../../store/sql/restorations.rs"]
 pub mod restorations;
+#[path = "../../store/sql/robots.rs"]
 pub mod robots;
 mod rows;
 pub mod schema;
+#[path = "../../store/sql/secrets.rs"]
 pub mod secrets;
+#[path = "../../store/sql/segment_ranges.rs"]
 pub mod segment_ranges;
+mod segment_rows;
+#[path = "../../store/sql/segments.rs"]
 pub mod segments;
+#[path = "../../store/sql/sessions.rs"]
 pub mod sessions;
+#[path = "../../store/sql/sites.rs"]
 pub mod sites;
+#[path = "../../store/sql/stops.rs"]
 pub mod stops;
+#[path = "../../store/sql/sum_columns.rs"]
+mod sum_columns;
+mod sum_rows;
+#[path = "../../store/sql/sums.rs"]
 pub mod sums;
+#[path = "../../store/sql/terrains.rs"]
 pub mod terrains;
+#[path = "../../store/sql/times.rs"]
 pub mod times;
+#[path = "../../store/sql/tokens.rs"]
 pub mod tokens;
+#[path = "../../store/sql/transaction.rs"]
+mod transaction;
+#[path = "../../store/sql/values.rs"]
+mod values;
+#[path = "../../store/sql/watermarks.rs"]
 pub mod watermarks;
+#[path = "../../store/sql/webhooks.rs"]
 pub mod webhooks;
+#[path = "../../store/sql/withdrawals.rs"]
 pub mod withdrawals;
 
-use std::collections::BTreeSet;
-use std::fmt::Display;
-use std::ops::{Deref, DerefMut};
 use std::path::{Path, PathBuf};
-use std::str::FromStr;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-use jiff::Timestamp;
 use nix::sys::statvfs::statvfs;
-use serde::Serialize;
-use serde::de::DeserializeOwned;
+use sqlx::AssertSqlSafe;
 use sqlx::migrate::MigrateError;
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqliteSynchronous};
-use sqlx::{AssertSqlSafe, SqliteConnection};
-use tokio::sync::{Notify, Semaphore};
+use tokio::sync::Semaphore;
 use tokio::time::Instant;
-use tread_api::ids::RobotId;
 use tread_api::release::VERSION;
-use tread_api::rights::Scope;
 use tread_store::metrics::DatabaseMetrics;
-use tread_store::{DbError, Disk, Outcome};
+use tread_store::{DbError, Disk};
 
 use self::connections::{COMMIT_TIMEOUT, Connections, Lent};
 pub use self::error::EngineError;
+pub use self::transaction::Tx;
+use self::transaction::{Commits, Noted};
+use self::values::{
+    corrupt, from_json, from_us, parse, robots_text, scope_text, to_json, to_us, unsigned,
+};
+
+/// Connection that the statements of all aggregates run on.
+pub(crate) type Connection = sqlx::SqliteConnection;
 
 /// Minimum version of SQLite: earlier ones have a bug that can lose a write-ahead log.
 pub const SQLITE_VERSION_MIN: (u32, u32, u32) = (3, 51, 3);
@@ -91,115 +125,6 @@ const WRITER_CACHE_KIB: u32 = 32 * 1_024;
 const DISK_TIMEOUT: Duration = Duration::from_secs(2);
 /// Maximum time that SQLite waits for a lock of another process.
 const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
-
-/// A transaction on the database, rolled back unless it is committed.
-#[derive(Debug)]
-pub struct Tx {
-    inner: Lent,
-    noted: Noted,
-    commits: Arc<Commits>,
-    /// Whether its commit increments the generation.
-    is_counted: bool,
-}
-
-/// Returns the outcome of a commit that ended so.
-fn outcome_of(committed: &Result<(), sqlx::Error>) -> Outcome {
-    match committed {
-        Ok(()) => Outcome::Written,
-        // SQLite itself reports that it did not commit.
-        Err(sqlx::Error::Database(_)) => Outcome::Nothing,
-        Err(_) => Outcome::Unknown,
-    }
-}
-
-/// Counts of commits.
-#[derive(Debug, Default)]
-struct Commits {
-    generation: AtomicU64,
-    unknown: AtomicU64,
-    became_unknown: Notify,
-}
-
-/// Records the duration of a transaction when it ends.
-#[derive(Debug)]
-struct Noted {
-    metrics: DatabaseMetrics,
-    kind: &'static str,
-    writes: bool,
-    began_at: Instant,
-}
-
-impl Drop for Noted {
-    fn drop(&mut self) {
-        let took = self.began_at.elapsed();
-        self.metrics.transaction(self.kind, self.writes, took);
-    }
-}
-
-impl Tx {
-    /// Commits the transaction.
-    ///
-    /// # Errors
-    /// SQLite failed; nothing is written, or the outcome is unknown.
-    pub async fn commit(self) -> Result<(), DbError> {
-        self.commit_then(|_outcome| {}).await
-    }
-
-    /// Commits the transaction and then calls `then` with the outcome. Both are one task of its
-    /// own, so cancellation of the caller interrupts neither.
-    ///
-    /// # Errors
-    /// As [`Tx::commit`].
-    pub async fn commit_then(
-        self,
-        then: impl FnOnce(Outcome) + Send + 'static,
-    ) -> Result<(), DbError> {
-        let Self {
-            inner,
-            noted,
-            commits,
-            is_counted,
-        } = self;
-        #[expect(
-            clippy::disallowed_methods,
-            reason = "ends with the commit; whoever waits for it may go away, and what follows it must not be left out"
-        )]
-        let committing = tokio::spawn(async move {
-            let committed = inner.commit().await;
-            let outcome = outcome_of(&committed);
-            if is_counted {
-                commits.generation.fetch_add(1, Ordering::AcqRel);
-            }
-            if outcome == Outcome::Unknown {
-                commits.unknown.fetch_add(1, Ordering::AcqRel);
-            }
-            then(outcome);
-            if outcome == Outcome::Unknown {
-                commits.became_unknown.notify_one();
-            }
-            drop(noted);
-            committed
-        });
-        committing
-            .await
-            .unwrap_or(Err(sqlx::Error::WorkerCrashed))
-            .map_err(|cause| EngineError::from(cause).into())
-    }
-}
-
-impl Deref for Tx {
-    type Target = SqliteConnection;
-
-    fn deref(&self) -> &SqliteConnection {
-        &self.inner
-    }
-}
-
-impl DerefMut for Tx {
-    fn deref_mut(&mut self) -> &mut SqliteConnection {
-        &mut self.inner
-    }
-}
 
 /// Reason why the database cannot be opened.
 #[derive(Debug, thiserror::Error)]
@@ -602,7 +527,7 @@ impl Db {
 ///
 /// # Errors
 /// [`OpenError::Newer`].
-pub fn refuse_newer(path: &Path, found: &schema::FileSchema) -> Result<(), OpenError> {
+pub fn refuse_newer(path: &Path, found: &schema::FoundSchema) -> Result<(), OpenError> {
     let known = schema::known();
     let Some(newer) = found.schema.filter(|schema| *schema > known) else {
         return Ok(());
@@ -628,48 +553,9 @@ fn is_new_enough(version: &str) -> bool {
     (next(), next(), next()) >= SQLITE_VERSION_MIN
 }
 
-/// Converts a time to microseconds since 1970, as stored.
-fn to_us(time: Timestamp) -> i64 {
-    time.as_microsecond()
-}
-
-fn from_us(time_us: i64) -> Result<Timestamp, EngineError> {
-    Timestamp::from_microsecond(time_us).map_err(|_range| corrupt("time", time_us))
-}
-
-fn corrupt(what: &'static str, value: impl Display) -> EngineError {
-    EngineError::Corrupt {
-        what,
-        value: value.to_string(),
-    }
-}
-
-fn parse<T: FromStr>(what: &'static str, text: &str) -> Result<T, EngineError> {
-    text.parse().map_err(|_error| corrupt(what, text))
-}
-
-fn to_json<T: Serialize>(what: &'static str, value: &T) -> Result<String, EngineError> {
-    serde_json::to_string(value).map_err(|_error| EngineError::DoesNotFit(what))
-}
-
-fn from_json<T: DeserializeOwned>(what: &'static str, text: &str) -> Result<T, EngineError> {
-    serde_json::from_str(text).map_err(|_error| corrupt(what, text))
-}
-
-/// Converts a scope to the parameter of statements: `NULL` for everywhere.
-fn scope_text(scope: &Scope) -> Result<Option<String>, EngineError> {
-    let names = scope.names();
-    names.map(|names| to_json("scope", &names)).transpose()
-}
-
-/// Converts a list of robots to the parameter of statements: `NULL` for all.
-fn robots_text(robots: Option<&BTreeSet<RobotId>>) -> Result<Option<String>, EngineError> {
-    robots.map(|robots| to_json("robots", robots)).transpose()
-}
-
-fn unsigned<T: TryFrom<i64>>(what: &'static str, value: i64) -> Result<T, EngineError> {
-    T::try_from(value).map_err(|_range| corrupt(what, value))
-}
-
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod tests_of_segments;
+#[cfg(test)]
+mod tests_of_sessions;

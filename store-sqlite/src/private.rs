@@ -2,8 +2,8 @@
 //! what the fleet does, and writing them allows to create tokens.
 
 use std::ffi::OsString;
-use std::fs::{self, OpenOptions, Permissions};
-use std::io;
+use std::fs::{self, File, OpenOptions, Permissions};
+use std::io::{self, Read as _};
 use std::os::unix::fs::{OpenOptionsExt as _, PermissionsExt as _};
 use std::path::{Path, PathBuf};
 
@@ -15,6 +15,18 @@ const OWNERS: u32 = 0o600;
 const OF_OTHERS: u32 = 0o077;
 /// Suffixes of the database's files. SQLite gives those beside it the mode of the database.
 const ENDINGS: [&str; 4] = ["", "-wal", "-shm", "-journal"];
+
+/// Begin of every database file.
+const MAGIC: &[u8; 16] = b"SQLite format 3\0";
+
+/// Returns whether a file has contents of another kind than a database.
+fn is_foreign(mut file: File) -> io::Result<bool> {
+    let mut begin = Vec::new();
+    file.by_ref()
+        .take(MAGIC.len() as u64)
+        .read_to_end(&mut begin)?;
+    Ok(!begin.is_empty() && begin != MAGIC)
+}
 
 fn beside(path: &Path, ending: &str) -> PathBuf {
     let mut name = OsString::from(path);
@@ -34,7 +46,11 @@ pub(super) fn keep(path: &Path) -> io::Result<()> {
         .create(true)
         .truncate(false)
         .mode(OWNERS);
-    options.open(path)?;
+    let file = options.read(true).open(path)?;
+    if is_foreign(file)? {
+        // SQLite refuses it; whoever may use it is nobody's business here.
+        return Ok(());
+    }
     for ending in ENDINGS {
         let file = beside(path, ending);
         let Ok(found) = fs::metadata(&file) else {
@@ -58,6 +74,17 @@ pub(super) fn keep(path: &Path) -> io::Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_file_of_another_kind_keeps_its_mode() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("notes.txt");
+        fs::write(&path, "not a database").unwrap();
+        fs::set_permissions(&path, Permissions::from_mode(0o644)).unwrap();
+        keep(&path).unwrap();
+        let mode = fs::metadata(&path).unwrap().permissions().mode();
+        assert_eq!(mode & 0o777, 0o644);
+    }
 
     #[test]
     fn what_others_could_read_is_taken_away_from_them() {

@@ -7,6 +7,8 @@ use jiff::Timestamp;
 use sqlx::migrate::Migrator;
 use sqlx::{Connection as _, SqliteConnection};
 
+pub use tread_store::inspection::FoundSchema;
+
 use super::copy::{connect, schema_with};
 use super::{EngineError, to_us};
 
@@ -23,20 +25,11 @@ pub fn known() -> i64 {
     MIGRATOR.iter().map(|one| one.version).max().unwrap_or(0)
 }
 
-/// Schema of a database file.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct FileSchema {
-    /// Its newest migration; `None` for an empty file.
-    pub schema: Option<i64>,
-    /// Version of the server that opened it first with its schema or later, if it says so.
-    pub version: Option<String>,
-}
-
 /// Reads the schema of a file, which must exist, and changes nothing.
 ///
 /// # Errors
 /// The file cannot be read.
-pub async fn of_file(file: &Path) -> Result<FileSchema, EngineError> {
+pub async fn of_file(file: &Path) -> Result<FoundSchema, EngineError> {
     let mut connection = connect(file, false).await?;
     let found = of_connection(&mut connection).await;
     connection.close().await.map_err(EngineError::Sqlite)?;
@@ -45,14 +38,14 @@ pub async fn of_file(file: &Path) -> Result<FileSchema, EngineError> {
 
 pub(super) async fn of_connection(
     connection: &mut SqliteConnection,
-) -> Result<FileSchema, EngineError> {
+) -> Result<FoundSchema, EngineError> {
     let schema = schema_with(&mut *connection).await?;
     // A database of before this table has none; whatever a later version made of it is no failure.
     let newest: Result<Option<(String,)>, _> =
         sqlx::query_as("SELECT version FROM server_versions ORDER BY pk DESC LIMIT 1")
             .fetch_optional(connection)
             .await;
-    Ok(FileSchema {
+    Ok(FoundSchema {
         schema,
         version: newest.ok().flatten().map(|(version,)| version),
     })

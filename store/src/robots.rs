@@ -5,7 +5,7 @@ use tread_api::ids::{BootId, ConfigurationId, RobotId, SiteId, Tag};
 use tread_api::robot::{Capabilities, RobotModel, UnmappedMeasurements};
 
 /// A robot as stored.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct RobotRow {
     /// Its database key.
     pub pk: i64,

@@ -5,7 +5,7 @@ use tread_api::site::Site;
 use crate::friction::Horizons;
 
 /// A site with its key in the database.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct SiteRow {
     /// Its database key.
     pub pk: i64,

@@ -12,7 +12,7 @@ use syn::visit::Visit;
 use tread_tests::repository::{files, root};
 
 /// Crates whose modules are read.
-const CRATES: [&str; 11] = [
+const CRATES: [&str; 12] = [
     "api",
     "cli",
     "control",
@@ -22,12 +22,13 @@ const CRATES: [&str; 11] = [
     "ros2",
     "server",
     "store",
+    "store-postgres",
     "store-sqlite",
     "telemetry",
 ];
 
 /// Crates of this workspace that a crate may depend on, tests aside.
-const CRATE_RULES: [(&str, &[&str]); 11] = [
+const CRATE_RULES: [(&str, &[&str]); 12] = [
     ("api", &[]),
     ("control", &[]),
     ("ros2", &[]),
@@ -42,8 +43,17 @@ const CRATE_RULES: [(&str, &[&str]); 11] = [
         ],
     ),
     ("store", &["tread-api"]),
+    ("store-postgres", &["tread-api", "tread-store"]),
     ("store-sqlite", &["tread-api", "tread-store"]),
-    ("db", &["tread-api", "tread-store", "tread-store-sqlite"]),
+    (
+        "db",
+        &[
+            "tread-api",
+            "tread-store",
+            "tread-store-postgres",
+            "tread-store-sqlite",
+        ],
+    ),
     (
         "server",
         &[
@@ -62,7 +72,7 @@ const CRATE_RULES: [(&str, &[&str]); 11] = [
 ];
 
 /// Crates that are shipped. None of them may contain the agent's test support.
-const SHIPPED: [&str; 10] = [
+const SHIPPED: [&str; 11] = [
     "api",
     "cli",
     "control",
@@ -71,6 +81,7 @@ const SHIPPED: [&str; 10] = [
     "ros2",
     "server",
     "store",
+    "store-postgres",
     "store-sqlite",
     "telemetry",
 ];
@@ -183,6 +194,21 @@ impl<'ast> Visit<'ast> for Names<'_> {
     }
 }
 
+/// Returns the file of a module that an attribute names: the engines of the store share some.
+fn path_of(attributes: &[syn::Attribute]) -> Option<String> {
+    let named = attributes.iter().find(|one| one.path().is_ident("path"))?;
+    let syn::Meta::NameValue(named) = &named.meta else {
+        return None;
+    };
+    let syn::Expr::Lit(literal) = &named.value else {
+        return None;
+    };
+    let syn::Lit::Str(path) = &literal.lit else {
+        return None;
+    };
+    Some(path.value())
+}
+
 /// Reads a module's file and those of its children.
 fn read(file: &Path, folder: &Path, module: &[String], modules: &mut Modules) {
     let text =
@@ -203,6 +229,13 @@ fn read(file: &Path, folder: &Path, module: &[String], modules: &mut Modules) {
             continue;
         }
         let name = child.ident.to_string();
+        if let (Some(path), Some(beside)) = (path_of(&child.attrs), file.parent()) {
+            let file = beside.join(path);
+            // Its children lie beside it, as those of a `mod.rs`.
+            let folder = file.parent().unwrap_or(beside);
+            read(&file, folder, &[module, &[name]].concat(), modules);
+            continue;
+        }
         let beside = folder.join(format!("{name}.rs"));
         let below = folder.join(&name);
         let within = below.join("mod.rs");

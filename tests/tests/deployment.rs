@@ -55,7 +55,7 @@ fn the_example_of_the_packages_is_a_configuration() {
     let config = tread_server::Config::load(&args).unwrap();
     assert_eq!(
         config.database,
-        std::path::Path::new("/var/lib/tread/tread.db")
+        std::path::Path::new("/var/lib/tread/tread.db").into()
     );
     assert!(config.metrics.is_some(), "the compose file scrapes it");
 }

@@ -32,7 +32,7 @@ impl ServerWithRobots {
             http: "127.0.0.1:0".parse().unwrap(),
             metrics: None,
             zenoh: "127.0.0.1:0".parse().unwrap(),
-            database: folder.path().join("tread.db"),
+            database: folder.path().join("tread.db").into(),
             site: "yard".parse().unwrap(),
             friction: FrictionConfig::default(),
             retention: RetentionConfig::default(),

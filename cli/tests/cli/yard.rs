@@ -39,7 +39,7 @@ impl Yard {
             http: "127.0.0.1:0".parse().unwrap(),
             metrics: None,
             zenoh: "127.0.0.1:0".parse().unwrap(),
-            database: at("tread.db"),
+            database: at("tread.db").into(),
             site: "yard".parse().unwrap(),
             friction: FrictionConfig::default(),
             retention: RetentionConfig::default(),

@@ -43,8 +43,6 @@ pub const FILE_ROWS_MAX: u32 = 1_000_000;
 const CHUNK_ROWS: u32 = 16_384;
 /// Maximum number of requests that read files at the same time; each holds one row group in memory.
 const READERS_MAX: usize = 2;
-/// Name of the mark in the folder, without its ending, where no database file has it beside it.
-const MARK_IN_FOLDER: &str = "tread";
 /// Maximum time for which a request waits until it may read files.
 const READ_WAIT_MAX: Duration = Duration::from_secs(5);
 
@@ -67,7 +65,7 @@ struct State {
 impl Archive {
     /// Opens the archive in a folder. Its mark is beside the database file, else in the folder.
     pub(super) fn new(folder: PathBuf, database: Option<&Path>) -> Self {
-        let mark = mark_of(database.unwrap_or(&folder.join(MARK_IN_FOLDER)));
+        let mark = mark_of(&folder, database);
         Self {
             files: Arc::new(SegmentArchive::new(folder, mark)),
             readers: Arc::new(Semaphore::new(READERS_MAX)),

@@ -45,6 +45,8 @@ pub const SEARCHED_ROWS_MAX: usize = 64 * ROW_GROUP_ROWS;
 pub const SEARCHED_FILES_MAX: usize = 512;
 
 /// Suffix of the mark, after the name of the database.
+/// Name of the mark in the folder of the archive, without its ending.
+const MARK_IN_FOLDER: &str = "tread";
 const MARK_ENDING: &str = ".archived";
 /// Beginning of the name of a file.
 const PREFIX: &str = "segments-";
@@ -221,9 +223,10 @@ pub enum SegmentArchiveError {
     },
 }
 
-/// Returns the file of the mark, beside the database.
-pub fn mark_of(database: &Path) -> PathBuf {
-    let mut mark = database.as_os_str().to_owned();
+/// Returns the file of the mark: beside the database file, or in the folder where there is none.
+pub fn mark_of(folder: &Path, database: Option<&Path>) -> PathBuf {
+    let in_folder = folder.join(MARK_IN_FOLDER);
+    let mut mark = database.unwrap_or(&in_folder).as_os_str().to_owned();
     mark.push(MARK_ENDING);
     mark.into()
 }

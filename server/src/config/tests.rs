@@ -141,3 +141,25 @@ fn a_flag_wins_over_the_file_and_the_file_over_the_built_in_value() {
     assert_eq!((config.http.port(), config.zenoh.port()), (3, 2));
     assert_eq!(config.site.as_str(), SITE_DEFAULT);
 }
+
+#[test]
+fn listeners_with_the_same_address_are_named() {
+    let both = load("http = \"127.0.0.1:8420\"\nmetrics = \"127.0.0.1:8420\"\n");
+    let error = both.unwrap_err().to_string();
+    assert!(
+        error.contains("`http` and `metrics` are both 127.0.0.1:8420"),
+        "{error}"
+    );
+    load("http = \"127.0.0.1:0\"\nzenoh = \"127.0.0.1:0\"\n").unwrap();
+    load("http = \"127.0.0.1:8420\"\nzenoh = \"127.0.0.2:8420\"\n").unwrap();
+}
+
+#[test]
+fn a_database_is_a_file_or_an_address_of_postgresql_that_the_server_does_not_back_up() {
+    let config = load("database = \"postgres://tread@127.0.0.1/fleet\"\n").unwrap();
+    assert!(config.database.is_postgres());
+    let text = "database = \"postgres://u:hunter2@h/d\"\n[backup]\nfolder = \"/tmp\"\n";
+    let error = load(text).unwrap_err().to_string();
+    assert!(error.contains("pg_dump"), "{error}");
+    assert!(!error.contains("hunter2"), "{error}");
+}

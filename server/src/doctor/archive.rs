@@ -15,7 +15,10 @@ const NAME: &str = "archive";
 /// Returns the finding; `None` without an archive.
 pub(super) fn finding(examined: &Examined) -> Option<Finding> {
     let folder = examined.config.retention.archive.as_deref()?;
-    Some(examine(folder, &mark_of(&examined.config.database)))
+    Some(examine(
+        folder,
+        &mark_of(folder, examined.config.database.file()),
+    ))
 }
 
 fn examine(folder: &Path, mark: &Path) -> Finding {

@@ -5,7 +5,7 @@ use tread_api::diagnosis::Finding;
 
 use super::Examined;
 use crate::db::failure::StorageFailure;
-use crate::db::file::inspection::{InspectError, Inspection, Schema, inspect};
+use crate::db::inspection::{InspectError, Inspection, Schema, inspect};
 use crate::error_text::chain;
 
 const RESTORE: &str = "stop the server, keep the file, and restore a backup; or bring what can be \
@@ -13,9 +13,14 @@ const RESTORE: &str = "stop the server, keep the file, and restore a backup; or 
 
 /// Returns the findings, and the newest time in the database.
 pub(super) async fn findings(examined: &Examined) -> (Vec<Finding>, Option<Timestamp>) {
-    let path = &examined.config.database;
-    let shown = path.display();
-    let inspected = inspect(path, examined.server_process.is_some(), examined.is_deep).await;
+    let location = &examined.config.database;
+    let shown = location;
+    let inspected = inspect(
+        location,
+        examined.server_process.is_some(),
+        examined.is_deep,
+    )
+    .await;
     let inspection = match inspected {
         Ok(Some(inspection)) => inspection,
         Ok(None) => {
@@ -33,14 +38,11 @@ pub(super) async fn findings(examined: &Examined) -> (Vec<Finding>, Option<Times
             RESTORE,
         )),
         (None, true) => {
-            findings.push(Finding::ok(
-                "database content",
-                "the whole file can be read",
-            ));
+            findings.push(Finding::ok("database content", "all of it can be read"));
         }
         (None, false) => findings.push(Finding::ok(
             "database content",
-            "every table can be read; --deep reads the whole file",
+            "every table can be read; --deep reads all of it",
         )),
     }
     (findings, newest)

@@ -23,11 +23,13 @@ const OF_OTHERS: u32 = 0o077;
 const OF_ALL: u32 = 0o007;
 
 pub(super) fn findings(examined: &Examined) -> Vec<Finding> {
-    let database = &examined.config.database;
-    let folder = folder_of(database);
-    let mut findings = vec![folder_finding(folder)];
-    if folder.is_dir() {
-        findings.push(disk(examined, folder));
+    let mut findings = Vec::new();
+    if let Some(database) = examined.config.database.file() {
+        let folder = folder_of(database);
+        findings.push(folder_finding(folder));
+        if folder.is_dir() {
+            findings.push(disk(examined, folder));
+        }
     }
     findings.extend(secrets(examined));
     findings.push(owners(examined));
@@ -143,10 +145,12 @@ fn disk(examined: &Examined, folder: &Path) -> Finding {
 fn secrets(examined: &Examined) -> Vec<Finding> {
     let config = &examined.config;
     let mut secret: Vec<PathBuf> = Vec::new();
-    for ending in ["", "-wal", "-shm"] {
-        let mut name = config.database.clone().into_os_string();
-        name.push(ending);
-        secret.push(name.into());
+    if let Some(database) = config.database.file() {
+        for ending in ["", "-wal", "-shm"] {
+            let mut name = database.as_os_str().to_owned();
+            name.push(ending);
+            secret.push(name.into());
+        }
     }
     if let Some(TlsSource::Files(files)) = &config.tls {
         secret.push(files.key.clone());
@@ -188,8 +192,10 @@ fn secrets(examined: &Examined) -> Vec<Finding> {
 fn owners(examined: &Examined) -> Finding {
     let config = &examined.config;
     let mut files: Vec<PathBuf> = examined.config_file.iter().cloned().collect();
-    files.push(config.database.clone());
-    files.push(folder_of(&config.database).to_owned());
+    if let Some(database) = config.database.file() {
+        files.push(database.to_owned());
+        files.push(folder_of(database).to_owned());
+    }
     if let Some(TlsSource::Files(tls)) = &config.tls {
         // Root owns credentials, and the service manager passes them.
         let files_of_user = [&tls.certificate, &tls.key].into_iter();

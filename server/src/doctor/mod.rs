@@ -22,7 +22,7 @@ use tread_api::diagnosis::Finding;
 
 use crate::clock::Clock;
 use crate::config::{Config, ServerArgs};
-use crate::db::file::lock;
+use crate::db::lock;
 use crate::error_text::chain;
 
 /// Arguments of `tread-server doctor`.
@@ -31,7 +31,7 @@ pub(crate) struct DoctorArgs {
     /// Configuration file of the server, TOML
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// Database file
+    /// Database: a file, or the address `postgres://…` of a PostgreSQL database
     #[arg(long, value_name = "FILE")]
     database: Option<PathBuf>,
     /// Read the whole database (`PRAGMA quick_check`), which takes seconds for each gigabyte

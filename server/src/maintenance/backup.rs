@@ -7,7 +7,7 @@ use std::sync::Mutex;
 use anyhow::{Context as _, ensure};
 use clap::Args;
 
-use super::ServerFiles;
+use super::{ServerFiles, file_of};
 use crate::app::backups::{self, Order, Progress};
 use crate::backup::Filter;
 use crate::clock::Clock;
@@ -41,15 +41,17 @@ pub(crate) struct BackupArgs {
 /// The configuration is invalid, or the backup could not be made.
 pub(crate) async fn run(args: BackupArgs) -> anyhow::Result<()> {
     let config = args.files.load()?;
+    let database = file_of(config.database, "back up")?;
     ensure!(
-        config.database.exists(),
+        database.exists(),
         "there is no database `{}`: name it by `--database` or in the configuration",
-        config.database.display()
+        database.display()
     );
     let configured = config.backup.and_then(|backup| backup.encrypt);
     let command = args.encrypt.or(configured).filter(|_| !args.plain);
+    let is_encrypted = command.is_some();
     let order = Order {
-        database: config.database,
+        database,
         authority: config.robots.map(|robots| robots.authority),
         target: args.to,
         encryption: command.map(Filter),
@@ -71,11 +73,20 @@ pub(crate) async fn run(args: BackupArgs) -> anyhow::Result<()> {
             .map(|(table, count)| format!("{count} {table}"))
             .collect();
         let files = made.manifest.authority.len();
-        eprintln!(
-            "{} bytes, read back: {}; {files} files of the authority",
-            made.bytes,
-            rows.join(", ")
-        );
+        let rows = rows.join(", ");
+        if is_encrypted {
+            eprintln!(
+                "{} bytes, encrypted from: {rows}; {files} files of the authority. What the command \
+                 encrypted cannot be read back without the key: try `tread-server restore --decrypt` \
+                 into an empty folder",
+                made.bytes
+            );
+        } else {
+            eprintln!(
+                "{} bytes, read back: {rows}; {files} files of the authority",
+                made.bytes
+            );
+        }
         if made.manifest.authority.iter().any(|file| {
             Path::new(&file.name)
                 .extension()

@@ -2,6 +2,7 @@
 //! A server applies them at its start.
 
 use std::io::{self, Write as _};
+use std::path::Path;
 use std::process::ExitCode;
 
 use anyhow::{Context as _, ensure};
@@ -10,8 +11,8 @@ use clap::Args;
 use super::ServerFiles;
 use crate::build;
 use crate::clock::Clock;
-use crate::db::file::lock::DatabaseLock;
-use crate::db::file::{refuse_newer, schema};
+use crate::db::lock::DatabaseLock;
+use crate::db::schema::{self, refuse_newer};
 use crate::db::{self, Db};
 use crate::file_owner;
 
@@ -61,14 +62,13 @@ pub(crate) fn exit_code(ended: anyhow::Result<Compared>) -> ExitCode {
 /// The configuration is invalid, the file cannot be read, a server runs on it, or a migration
 /// failed.
 pub(crate) async fn run(args: MigrateArgs) -> anyhow::Result<Compared> {
-    let path = args.files.load()?.database;
+    let location = args.files.load()?.database;
     ensure!(
-        path.exists(),
-        "there is no database `{}`: name it by `--database` or in the configuration",
-        path.display()
+        location.file().is_none_or(Path::exists),
+        "there is no database `{location}`: name it by `--database` or in the configuration"
     );
-    let found = schema::of_file(&path).await;
-    let found = found.with_context(|| format!("cannot read `{}`", path.display()))?;
+    let found = schema::of(&location).await;
+    let found = found.with_context(|| format!("cannot read `{location}`"))?;
     let mut out = io::stdout().lock();
     let of_file = found
         .schema
@@ -76,15 +76,15 @@ pub(crate) async fn run(args: MigrateArgs) -> anyhow::Result<Compared> {
     let by = found.version.as_ref();
     let by = by.map(|version| format!(", last opened by tread-server {version}"));
     let by = by.unwrap_or_default();
-    writeln!(out, "schema of `{}`: {of_file}{by}", path.display())?;
+    writeln!(out, "schema of `{location}`: {of_file}{by}")?;
     writeln!(
         out,
         "schema of this program: {}, tread-server {}",
-        schema::known(),
+        schema::known(&location),
         build::VERSION
     )?;
-    let missing = schema::missing_after(found.schema);
-    if let Err(newer) = refuse_newer(&path, &found) {
+    let missing = schema::missing_after(&location, found.schema);
+    if let Err(newer) = refuse_newer(&location, &found) {
         eprintln!("error: {newer}");
         return Ok(Compared::Newer);
     }
@@ -103,8 +103,8 @@ pub(crate) async fn run(args: MigrateArgs) -> anyhow::Result<Compared> {
         )?;
         return Ok(Compared::Due);
     }
-    let _lock = DatabaseLock::take(&path)?;
-    let database = Db::open(&path).await?;
+    let lock = DatabaseLock::take(&location).await?;
+    let database = Db::open(&location).await?;
     let noting = async {
         let mut tx = database.write("migrate").await?;
         db::schema::note_version(&mut tx, build::VERSION, Clock::system().now()).await?;
@@ -113,8 +113,11 @@ pub(crate) async fn run(args: MigrateArgs) -> anyhow::Result<Compared> {
     };
     let noted = noting.await;
     database.close().await;
+    lock.release().await;
     noted.context("cannot write the database")?;
-    file_owner::chown_database(&path)?;
+    if let Some(path) = location.file() {
+        file_owner::chown_database(path)?;
+    }
     writeln!(out, "applied {} migrations", missing.len())?;
     Ok(Compared::Same)
 }

@@ -16,22 +16,19 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, bail, ensure};
 use clap::Args;
 use jiff::Timestamp;
-use serde_json::json;
-use tread_api::enrolment::Enrolment;
-use tread_api::identity::{AuditEntry, Token};
-use tread_api::rights::Scope;
 
-use super::ServerFiles;
+use super::review::{self, Review};
+use super::{ServerFiles, file_of};
 use crate::app::backups::check_space;
 use crate::authority::{AuthorityError, CERTIFICATE_FILE, copies};
 use crate::backup::archive::{self, sync_folder};
 use crate::backup::{Filter, Manifest};
 use crate::build;
 use crate::clock::Clock;
-use crate::db::file::lock::DatabaseLock;
+use crate::db::Location;
 use crate::db::file::{copy, schema};
-use crate::db::restorations::{Changed, Restoration};
-use crate::db::{self, Db, DbError};
+use crate::db::lock::DatabaseLock;
+use crate::db::restorations::Restoration;
 use crate::file_owner;
 use crate::paths::folder_of;
 
@@ -41,8 +38,6 @@ const RESTORING_ENDING: &str = ".restoring";
 const ASIDE: &str = ".before-restore-";
 /// Free space that must remain besides the database, for its log and for migrations, bytes.
 const RESERVE_BYTES: u64 = 128 * 1024 * 1024;
-/// Maximum number of tokens that are listed; also the size of the page that is read.
-const TOKENS_MAX: u32 = 10_000;
 /// Step of the progress between printed lines, per cent.
 const STEP_PERCENT: u64 = 10;
 
@@ -77,13 +72,6 @@ enum AuthorityFate {
     Restored(PathBuf, Option<PathBuf>),
 }
 
-/// Entries of a restored database that people must review.
-struct Review {
-    changed: Changed,
-    tokens: Vec<Token>,
-    enrolments: Vec<Enrolment>,
-}
-
 /// Restores a backup.
 ///
 /// # Errors
@@ -91,9 +79,10 @@ struct Review {
 /// file cannot be written.
 pub(crate) async fn run(args: RestoreArgs) -> anyhow::Result<()> {
     let config = args.files.clone().load()?;
-    let database = config.database;
+    let database = file_of(config.database, "restore")?;
     let key = args.decrypt.clone().map(Filter);
-    let _lock = DatabaseLock::take(&database)
+    let _lock = DatabaseLock::take(&Location::from(&database))
+        .await
         .context("a server uses the database: stop it before you restore a backup")?;
     ensure!(
         args.force || !database.exists(),
@@ -127,7 +116,9 @@ pub(crate) async fn run(args: RestoreArgs) -> anyhow::Result<()> {
         taken_at: manifest.taken_at,
         version: manifest.version.clone(),
     };
-    let review = prepare(&restoring.path, &restoration, &args.from).await?;
+    let name = args.from.file_name().unwrap_or_default();
+    let name = name.to_string_lossy();
+    let review = review::prepare(&Location::from(&restoring.path), &restoration, &name).await?;
     let authority = match &config.robots {
         Some(robots) => restore_authority(
             &robots.authority,
@@ -298,63 +289,6 @@ fn show_step(percent: u64) {
     }
 }
 
-/// Applies migrations, and adapts the database to robots and people that continued after the
-/// backup.
-async fn prepare(path: &Path, restoration: &Restoration, from: &Path) -> anyhow::Result<Review> {
-    let database = Db::open(path).await?;
-    let prepared = prepare_in(&database, restoration, from).await;
-    database.close().await;
-    prepared.context("cannot prepare the database")
-}
-
-async fn prepare_in(
-    database: &Db,
-    restoration: &Restoration,
-    from: &Path,
-) -> Result<Review, DbError> {
-    let mut tx = database.write("restore").await?;
-    let changed = db::restorations::begin(&mut tx, restoration).await?;
-    let entry = audit_entry(restoration, from, changed);
-    db::audit::append(&mut tx, &[entry]).await?;
-    let tokens = db::tokens::list(&mut tx, &Scope::EVERYWHERE, None, TOKENS_MAX).await?;
-    let enrolments = db::enrolments::all_newest(&mut tx).await?;
-    tx.commit().await?;
-    Ok(Review {
-        changed,
-        tokens,
-        enrolments,
-    })
-}
-
-/// Returns the entry with which the audit log continues from the backup. It names the backup's
-/// time.
-fn audit_entry(restoration: &Restoration, from: &Path, changed: Changed) -> AuditEntry {
-    let name = from.file_name().unwrap_or_default().to_string_lossy();
-    AuditEntry {
-        id: 0,
-        at: restoration.restored_at,
-        since: None,
-        count: 1,
-        who: Some("tread-server restore".to_owned()),
-        token: None,
-        person: None,
-        role: None,
-        address: "127.0.0.1".to_owned(),
-        method: "RESTORE".to_owned(),
-        route: "tread-server restore".to_owned(),
-        path: name.into_owned(),
-        status: 200,
-        request_id: String::new(),
-        what: Some(json!({
-            "backup_taken_at": restoration.taken_at,
-            "backup_version": restoration.version,
-            "robots_awaiting_release": changed.robots,
-        })),
-        previous_hash: None,
-        hash: None,
-    }
-}
-
 /// Restores the authority if there is none, or if `replace` is set. An existing authority otherwise
 /// stays, since it is newer than the backup and robots trust it.
 fn restore_authority(
@@ -399,69 +333,7 @@ fn tell(
     if let Some(aside) = aside {
         writeln!(out, "the old database is `{}`", aside.display())?;
     }
-    let Changed {
-        robots,
-        sessions,
-        join_tokens,
-        deliveries,
-        certificates,
-    } = review.changed;
-    writeln!(
-        out,
-        "ended: {sessions} sessions, {join_tokens} join tokens, {deliveries} deliveries to webhooks; \
-         the server accepts the next certificate of {certificates} robots"
-    )?;
-    writeln!(
-        out,
-        "\nreview: what was created or revoked after the backup is unknown to this database"
-    )?;
-    for token in review
-        .tokens
-        .iter()
-        .filter(|token| token.revoked_at.is_none())
-    {
-        let rights = token.role.map(|role| role.to_string());
-        let rights = rights.unwrap_or_else(|| {
-            let rights: Vec<&str> = token
-                .rights
-                .iter()
-                .map(tread_api::rights::Right::as_str)
-                .collect();
-            rights.join(",")
-        });
-        let Token {
-            id,
-            name,
-            created_at,
-            expires_at,
-            ..
-        } = token;
-        writeln!(
-            out,
-            "  token `{name}` ({rights}) of {created_at:.0}, until {expires_at:.0}: tread tokens revoke {id}"
-        )?;
-    }
-    let in_force = review
-        .enrolments
-        .iter()
-        .filter(|it| it.revoked_at.is_none());
-    for enrolment in in_force {
-        let Enrolment {
-            site,
-            robot,
-            enrolled_at,
-            ..
-        } = enrolment;
-        writeln!(
-            out,
-            "  robot `{robot}` of site `{site}`, joined {enrolled_at:.0}: tread robots revoke {robot} --site {site}"
-        )?;
-    }
-    writeln!(
-        out,
-        "\nno mission is sent to {robots} robots until they are released. Start the server; when the \
-         robots are back:\n  tread status\n  tread missions\n  tread robots release --all"
-    )
+    review.write(out)
 }
 
 fn tell_authority(

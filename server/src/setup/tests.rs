@@ -36,7 +36,10 @@ fn without_any_choice_the_server_is_for_this_machine_alone() {
     assert_eq!(addresses(&choices), ["127.0.0.1:8420", "127.0.0.1:7447"]);
     let config = read(choices);
     assert!(config.tls.is_none() && config.robots.is_none());
-    assert_eq!(config.database, folder.path().join("tread-data/tread.db"));
+    assert_eq!(
+        config.database,
+        folder.path().join("tread-data/tread.db").into()
+    );
 }
 
 #[test]

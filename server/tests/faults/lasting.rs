@@ -190,7 +190,7 @@ fn config(folder: &std::path::Path) -> Config {
         http: "127.0.0.1:0".parse().unwrap(),
         metrics: None,
         zenoh: "127.0.0.1:0".parse().unwrap(),
-        database: folder.join("tread.db"),
+        database: folder.join("tread.db").into(),
         site: "yard".parse().unwrap(),
         friction: FrictionConfig::default(),
         normalisations: Vec::new(),

@@ -313,7 +313,7 @@ pub(crate) fn config(folder: &Path, zenoh: &str) -> Config {
         http: "127.0.0.1:0".parse().unwrap(),
         metrics: Some("127.0.0.1:0".parse().unwrap()),
         zenoh: zenoh.parse().unwrap(),
-        database: database(folder),
+        database: crate::postgres::database_of(folder).unwrap_or_else(|| database(folder).into()),
         site: site(),
         friction: FrictionConfig::default(),
         normalisations: Vec::new(),

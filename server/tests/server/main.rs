@@ -60,6 +60,8 @@ mod page;
 #[cfg(test)]
 mod pictures;
 #[cfg(test)]
+mod postgres;
+#[cfg(test)]
 mod program;
 #[cfg(test)]
 mod releases;

@@ -36,6 +36,14 @@ impl Fixed {
         Some((hi, lo))
     }
 
+    /// Splits the number as [`Self::halves`] does, with whole units beyond 64 bits brought to the end of
+    /// the range: a sum that overflows in the database becomes the same.
+    pub fn clamped_halves(self) -> (i64, i64) {
+        let end = if self.0 < 0 { i64::MIN } else { i64::MAX };
+        let hi = i64::try_from(self.0 >> 32).unwrap_or(end);
+        (hi, i64::try_from(self.0 & 0xFFFF_FFFF).unwrap_or_default())
+    }
+
     /// Returns the nearest floating-point number.
     #[expect(
         clippy::cast_precision_loss,

@@ -1,0 +1,69 @@
+//! The lock that one server holds on a database, so that no second one works on it.
+
+use std::future::pending;
+
+use futures_util::future::Either;
+
+use super::Location;
+
+/// Reason why a server may not use a database.
+#[derive(Debug, thiserror::Error)]
+pub enum LockError {
+    /// A file of SQLite cannot be locked.
+    #[error(transparent)]
+    Sqlite(#[from] tread_store_sqlite::lock::LockError),
+    /// A PostgreSQL database cannot be locked.
+    #[error(transparent)]
+    Postgres(#[from] tread_store_postgres::lock::LockError),
+}
+
+/// Exclusive use of a database by this process, until it is dropped.
+#[derive(Debug)]
+pub enum DatabaseLock {
+    /// Of a file of SQLite.
+    Sqlite(tread_store_sqlite::lock::DatabaseLock),
+    /// Of a PostgreSQL database.
+    Postgres(tread_store_postgres::lock::DatabaseLock),
+}
+
+impl DatabaseLock {
+    /// Locks a database; a file may not exist yet.
+    ///
+    /// # Errors
+    /// [`LockError`] says who uses it, or why it cannot be locked.
+    pub async fn take(location: &Location) -> Result<Self, LockError> {
+        Ok(match location {
+            Location::File(path) => {
+                Self::Sqlite(tread_store_sqlite::lock::DatabaseLock::take(path)?)
+            }
+            Location::Postgres(address) => {
+                Self::Postgres(tread_store_postgres::lock::DatabaseLock::take(address).await?)
+            }
+        })
+    }
+
+    /// Waits until another server has the lock, and returns why this one must stop. A file stays locked as
+    /// long as it is open.
+    pub fn lost(&self) -> impl Future<Output = String> + Send + 'static {
+        match self {
+            Self::Sqlite(_) => Either::Left(pending()),
+            Self::Postgres(lock) => Either::Right(lock.lost()),
+        }
+    }
+
+    /// Releases the lock.
+    pub async fn release(self) {
+        match self {
+            Self::Sqlite(lock) => drop(lock),
+            Self::Postgres(lock) => lock.release().await,
+        }
+    }
+}
+
+/// Returns the process of the server that holds the lock of a file; `None` if none does, or it is not
+/// known.
+pub fn holder_of(location: &Location) -> Option<u32> {
+    location
+        .file()
+        .and_then(tread_store_sqlite::lock::holder_of)
+}

@@ -1,0 +1,178 @@
+//! The same tests with PostgreSQL as the engine:
+//! `TREAD_TEST_ENGINE=postgres store-postgres/with-postgres cargo nextest run -p tread-server --test server`.
+//! Tests that look into a database file need the other engine.
+
+use std::hash::{DefaultHasher, Hash as _, Hasher as _};
+use std::path::Path;
+use std::{env, thread};
+
+use reqwest::StatusCode;
+use serde_json::json;
+use sqlx::{AssertSqlSafe, Connection as _, PgConnection};
+use tokio::io::copy_bidirectional;
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::watch;
+use tread_api::friction::StoredSegment;
+use tread_api::mission::MissionState;
+use tread_api::page::Page;
+use tread_api::stop::Stop;
+use tread_server::db::Location;
+
+use crate::drive::{Socket, driven_at};
+use crate::harness::{Yard, circle, eventually, measured, segment};
+use crate::robot::Robot;
+
+/// Variable with the engine of the servers: `postgres`, or a file of SQLite.
+const ENGINE: &str = "TREAD_TEST_ENGINE";
+/// Variable with the address of a server on which tests may create databases.
+const SERVER: &str = "TREAD_TEST_POSTGRES";
+/// Code of the error that the database exists.
+const EXISTS: &str = "42P04";
+
+/// Returns the database that belongs to a folder, which is created when it is missing; `None` if the
+/// tests run with SQLite.
+pub(crate) fn database_of(folder: &Path) -> Option<Location> {
+    if env::var(ENGINE).ok()? != "postgres" {
+        return None;
+    }
+    let admin = env::var(SERVER).expect("TREAD_TEST_POSTGRES names a server");
+    Some(created(&admin, folder))
+}
+
+fn created(admin: &str, folder: &Path) -> Location {
+    let admin = admin.to_owned();
+    let mut hasher = DefaultHasher::new();
+    folder.hash(&mut hasher);
+    let name = format!("tread_server_{:x}", hasher.finish());
+    let (server, _database) = admin.rsplit_once('/').expect("it is an address");
+    let address = format!("{server}/{name}");
+    // Tests make configurations where they cannot wait.
+    thread::spawn(move || create(&admin, &name))
+        .join()
+        .expect("the database is there");
+    Location::Postgres(address)
+}
+
+fn create(admin: &str, name: &str) {
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .expect("a runtime");
+    runtime.block_on(async {
+        let mut connection = PgConnection::connect(admin).await.expect("a connection");
+        let statement = AssertSqlSafe(format!("CREATE DATABASE {name}"));
+        let created = sqlx::raw_sql(statement).execute(&mut connection).await;
+        let code = created.err().map(|error| {
+            let code = error.as_database_error().and_then(|error| error.code());
+            code.map(|code| code.into_owned())
+        });
+        assert!(
+            code.is_none() || code == Some(Some(EXISTS.to_owned())),
+            "{code:?}"
+        );
+    });
+}
+
+/// A relay to the PostgreSQL server that can be cut.
+struct Relay {
+    port: u16,
+    is_open: watch::Sender<bool>,
+}
+
+impl Relay {
+    async fn to(server: String) -> Self {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let port = listener.local_addr().unwrap().port();
+        let (is_open, mut open) = watch::channel(true);
+        tokio::spawn(async move {
+            while let Ok((mut client, _)) = listener.accept().await {
+                if !*open.borrow_and_update() {
+                    continue;
+                }
+                let (server, mut open) = (server.clone(), open.clone());
+                tokio::spawn(async move {
+                    let mut server = TcpStream::connect(server).await.unwrap();
+                    tokio::select! {
+                        _ = copy_bidirectional(&mut client, &mut server) => {}
+                        _ = open.wait_for(|is_open| !is_open) => {}
+                    }
+                });
+            }
+        });
+        Self { port, is_open }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn robots_are_driven_and_stopped_while_postgresql_is_away_and_nothing_acknowledged_is_lost() {
+    let Ok(admin) = env::var(SERVER) else {
+        eprintln!("this test was NOT RUN: {SERVER} names no PostgreSQL server");
+        return;
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let Location::Postgres(address) = created(&admin, folder.path()) else {
+        unreachable!("it is one of PostgreSQL")
+    };
+    let (user, rest) = address.rsplit_once('@').unwrap();
+    let (server, name) = rest.split_once('/').unwrap();
+    let relay = Relay::to(server.to_owned()).await;
+    let through = format!("{user}@127.0.0.1:{}/{name}", relay.port);
+    let yard = Yard::start_configured(|config, _| config.database = Location::Postgres(through));
+    let yard = yard.await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let mission = yard.create_mission(&robot.id).await;
+    yard.mission_becomes(mission.id, MissionState::Active).await;
+    let mut socket = Socket::open(&yard, "rover-2").await;
+    let other = Robot::join(&yard, "rover-2").await;
+    robot
+        .upload(vec![measured(1, segment((2, 2), 0.2, 10))])
+        .await
+        .unwrap();
+
+    relay.is_open.send_replace(false);
+    let away = eventually("the server notices", async || {
+        let (status, body) = yard.get_value("/readyz").await;
+        (status == StatusCode::SERVICE_UNAVAILABLE)
+            .then_some(())
+            .ok_or(body)
+    });
+    away.await;
+    socket.acquire("desk").await;
+    socket.drive(0.4).await;
+    driven_at(&other, 0.4).await;
+    let (status, stop) = yard
+        .post("/v1/sites/yard/robots/rover-2/stop", &json!({}))
+        .await;
+    assert_eq!(status, StatusCode::OK, "{stop}");
+    let url = yard.url("/v1/missions");
+    let refused = yard
+        .client()
+        .post(url)
+        .json(&circle(&other.id))
+        .send()
+        .await
+        .unwrap();
+    assert_eq!(refused.status(), StatusCode::SERVICE_UNAVAILABLE);
+    // The robot keeps a measurement that is not acknowledged.
+    let second = vec![measured(2, segment((2, 2), 0.2, 20))];
+    robot.upload(second.clone()).await.unwrap_err();
+
+    relay.is_open.send_replace(true);
+    let back = eventually("the server is ready", async || {
+        let (status, body) = yard.get_value("/readyz").await;
+        (status == StatusCode::OK).then_some(()).ok_or(body)
+    });
+    back.await;
+    eventually("the measurement is taken", async || {
+        robot.upload(second.clone()).await
+    })
+    .await;
+    let detail = yard.mission(mission.id).await;
+    assert_eq!(detail.mission.state, MissionState::Active, "{detail:?}");
+    let stored: Page<StoredSegment> = yard.get("/v1/sites/yard/segments?limit=10").await;
+    assert_eq!(stored.items.len(), 2);
+    let stops: Page<Stop> = yard.get("/v1/stops?in_force=true").await;
+    assert_eq!(stops.items.len(), 1);
+    drop((robot, other));
+    yard.server.stop().await.unwrap();
+}

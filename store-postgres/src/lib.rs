@@ -1,0 +1,374 @@
+//! The store in a PostgreSQL database. Contains SQL and no decisions.
+//!
+//! Most statements are those of the SQLite engine, from `store/sql`: the first migration defines the
+//! functions of SQLite that they use. A write ([`Db::write`]) begins with a lock that only one
+//! transaction of the whole database holds, so every write sees all earlier ones, and keys rise in the
+//! order of commits. A read ([`Db::read`]) is a snapshot.
+
+#[path = "../../store/sql/alerts.rs"]
+pub mod alerts;
+#[path = "../../store/sql/attendance.rs"]
+pub mod attendance;
+#[path = "../../store/sql/audit.rs"]
+pub mod audit;
+mod connections;
+mod copy_rows;
+#[path = "../../store/sql/deferred_segments.rs"]
+pub mod deferred_segments;
+#[path = "../../store/sql/enrolments.rs"]
+pub mod enrolments;
+mod error;
+mod failure;
+#[path = "../../store/sql/geofences.rs"]
+pub mod geofences;
+#[path = "../../store/sql/ground.rs"]
+mod ground;
+#[path = "../../store/sql/history.rs"]
+pub mod history;
+#[path = "../../store/sql/idempotency.rs"]
+pub mod idempotency;
+pub mod inspection;
+#[path = "../../store/sql/join_tokens.rs"]
+pub mod join_tokens;
+pub mod lock;
+#[path = "../../store/sql/missions.rs"]
+pub mod missions;
+pub mod open;
+#[path = "../../store/sql/removed.rs"]
+pub mod removed;
+#[path = "../../store/sql/restorations.rs"]
+pub mod restorations;
+#[path = "../../store/sql/robots.rs"]
+pub mod robots;
+pub mod schema;
+#[path = "../../store/sql/secrets.rs"]
+pub mod secrets;
+#[path = "../../store/sql/segment_ranges.rs"]
+pub mod segment_ranges;
+mod segment_rows;
+#[path = "../../store/sql/segments.rs"]
+pub mod segments;
+#[path = "../../store/sql/sessions.rs"]
+pub mod sessions;
+#[path = "../../store/sql/sites.rs"]
+pub mod sites;
+#[path = "../../store/sql/stops.rs"]
+pub mod stops;
+#[path = "../../store/sql/sum_columns.rs"]
+mod sum_columns;
+mod sum_rows;
+#[path = "../../store/sql/sums.rs"]
+pub mod sums;
+#[path = "../../store/sql/terrains.rs"]
+pub mod terrains;
+#[path = "../../store/sql/times.rs"]
+pub mod times;
+#[path = "../../store/sql/tokens.rs"]
+pub mod tokens;
+#[path = "../../store/sql/transaction.rs"]
+mod transaction;
+#[path = "../../store/sql/values.rs"]
+mod values;
+#[path = "../../store/sql/watermarks.rs"]
+pub mod watermarks;
+#[path = "../../store/sql/webhooks.rs"]
+pub mod webhooks;
+#[path = "../../store/sql/withdrawals.rs"]
+pub mod withdrawals;
+
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+use sqlx::AssertSqlSafe;
+use tokio::time::{Instant, timeout};
+use tread_store::failure::StorageFailure;
+use tread_store::metrics::DatabaseMetrics;
+use tread_store::{DbError, Disk};
+
+use self::connections::{Bounds, COMMIT_TIMEOUT, Connections, Lent};
+pub use self::error::EngineError;
+pub use self::open::{OpenError, refuse_newer};
+pub use self::transaction::Tx;
+use self::transaction::{Commits, Noted};
+use self::values::{
+    corrupt, from_json, from_us, parse, robots_text, scope_text, to_json, to_us, unsigned,
+};
+
+/// Connection that the statements of all aggregates run on.
+pub(crate) type Connection = sqlx::PgConnection;
+
+/// Number of connections that write: one, since only one transaction may write anyway.
+const WRITERS_MAX: u32 = 1;
+/// Number of connections that read at the same time.
+const READERS_MAX: u32 = 8;
+/// Bounds of writes. A statement waits for the disk and for no client.
+const WRITER_BOUNDS: Bounds = Bounds {
+    statement: Duration::from_mins(1),
+    idle: Duration::from_mins(1),
+};
+/// Bounds of reads, some of which stream a whole table to where it is processed.
+const READER_BOUNDS: Bounds = Bounds {
+    statement: Duration::from_mins(15),
+    idle: Duration::from_mins(15),
+};
+/// Maximum time for the server to report the size of the database.
+const DISK_TIMEOUT: Duration = Duration::from_secs(2);
+/// Begins a write. The number is the lock of writers, "treaddb" in ASCII. The server releases the lock
+/// after it has made the commit visible, and each later statement sees what is visible when it begins.
+const BEGIN_WRITE: &str = "BEGIN ISOLATION LEVEL READ COMMITTED READ WRITE; SELECT pg_advisory_xact_lock(32776877049668706)";
+/// Begins a read: its first statement takes the snapshot of all.
+const BEGIN_READ: &str = "BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY";
+
+/// The open database; clones share it.
+#[derive(Debug, Clone)]
+pub struct Db {
+    writer: Connections,
+    readers: Connections,
+    address: String,
+    version: String,
+    metrics: DatabaseMetrics,
+    commits: Arc<Commits>,
+}
+
+impl Db {
+    /// Connects to the database of an address, `postgres://USER:PASSWORD@HOST:PORT/NAME`, and applies
+    /// migrations.
+    ///
+    /// # Errors
+    /// [`OpenError`] names the address without its password.
+    pub async fn open(url: &str) -> Result<Self, OpenError> {
+        Self::open_with(url, COMMIT_TIMEOUT).await
+    }
+
+    /// As [`Db::open`], with a given maximum time for a commit.
+    ///
+    /// # Errors
+    /// As [`Db::open`].
+    pub async fn open_with(url: &str, commit_max: Duration) -> Result<Self, OpenError> {
+        let open::Prepared {
+            options,
+            address,
+            version,
+        } = open::prepare(url).await?;
+        let pool = |bounds, connections_max| {
+            Connections::new(options.clone(), bounds, connections_max, commit_max)
+        };
+        Ok(Self {
+            writer: pool(WRITER_BOUNDS, WRITERS_MAX),
+            readers: pool(READER_BOUNDS, READERS_MAX),
+            address,
+            version,
+            metrics: DatabaseMetrics::default(),
+            commits: Arc::default(),
+        })
+    }
+
+    /// Returns the generation: a counter of all commits but those of [`Db::write_uncounted`]. Data that
+    /// those do not change are unchanged while it is the same. It counts the commits of this process.
+    pub fn generation(&self) -> u64 {
+        self.commits.generation.load(Ordering::Acquire)
+    }
+
+    /// Returns the number of commits of unknown outcome.
+    pub fn unknown_outcomes(&self) -> u64 {
+        self.commits.unknown.load(Ordering::Acquire)
+    }
+
+    /// Waits for the next commit of unknown outcome.
+    pub async fn outcome_unknown(&self) {
+        self.commits.became_unknown.notified().await;
+    }
+
+    /// Waits until every earlier commit has ended, in whatever way, and increments the generation:
+    /// data read meanwhile may be from before.
+    ///
+    /// # Errors
+    /// The turn to write did not come in time: such a commit goes on, or another process writes.
+    pub async fn await_commits(&self) -> Result<(), DbError> {
+        // A transaction whose connection was lost holds the lock as long as it may still be committed.
+        drop(self.write("refresh").await?);
+        self.commits.generation.fetch_add(1, Ordering::AcqRel);
+        Ok(())
+    }
+
+    /// Returns the address of the database, without a password.
+    pub fn address(&self) -> &str {
+        &self.address
+    }
+
+    /// Returns the version of the PostgreSQL server when the database was opened.
+    pub fn server_version(&self) -> &str {
+        &self.version
+    }
+
+    /// Begins a write transaction; waits until no other transaction writes. Await nothing but the
+    /// database before the commit. `kind` names the use case in the metrics.
+    ///
+    /// # Errors
+    /// The turn to write did not come in time, or PostgreSQL failed.
+    pub async fn write(&self, kind: &'static str) -> Result<Tx, DbError> {
+        let asked_at = Instant::now();
+        let inner = self.writer.begin(BEGIN_WRITE).await;
+        let inner = inner.map_err(EngineError::from)?;
+        self.metrics.write_wait(asked_at.elapsed());
+        let tx = self.timed(inner, kind, true);
+        Ok(Tx {
+            is_counted: true,
+            ..tx
+        })
+    }
+
+    /// Begins a write transaction that [`Db::generation`] does not count, since it changes no site,
+    /// terrain or robot: of uploads, missions, alerts, identities and the audit log.
+    ///
+    /// # Errors
+    /// As [`Db::write`].
+    pub async fn write_uncounted(&self, kind: &'static str) -> Result<Tx, DbError> {
+        Ok(Tx {
+            is_counted: false,
+            ..self.write(kind).await?
+        })
+    }
+
+    fn timed(&self, inner: Lent, kind: &'static str, writes: bool) -> Tx {
+        let noted = Noted {
+            metrics: self.metrics.clone(),
+            kind,
+            writes,
+            began_at: Instant::now(),
+        };
+        Tx {
+            inner,
+            noted,
+            commits: Arc::clone(&self.commits),
+            is_counted: false,
+        }
+    }
+
+    /// Returns the metrics of the database.
+    pub fn metrics(&self) -> &DatabaseMetrics {
+        &self.metrics
+    }
+
+    /// Begins to read one snapshot. `kind` names the use case in the metrics.
+    ///
+    /// # Errors
+    /// No connection became free in time, or PostgreSQL failed.
+    pub async fn read(&self, kind: &'static str) -> Result<Tx, DbError> {
+        let inner = self.readers.begin(BEGIN_READ).await;
+        let inner = inner.map_err(EngineError::from)?;
+        Ok(self.timed(inner, kind, false))
+    }
+
+    /// Does nothing: PostgreSQL makes its checkpoints by itself.
+    ///
+    /// # Errors
+    /// None.
+    #[expect(clippy::unused_async, reason = "as the other engine")]
+    pub async fn checkpoint(&self) -> Result<(), DbError> {
+        Ok(())
+    }
+
+    /// Makes a write without effect, as durable as any other.
+    ///
+    /// # Errors
+    /// The database cannot be written.
+    pub async fn probe_write(&self) -> Result<(), DbError> {
+        let mut tx = self.write_uncounted("storage").await?;
+        sqlx::query!("UPDATE write_probe SET writes = writes + 1")
+            .execute(&mut *tx)
+            .await
+            .map_err(EngineError::from)?;
+        tx.commit().await
+    }
+
+    /// Reads from every table, which detects a lost or damaged one.
+    ///
+    /// # Errors
+    /// A table cannot be read.
+    pub async fn probe_tables(&self) -> Result<(), DbError> {
+        let mut tx = self.read("storage").await?;
+        for table in tables(&mut tx).await? {
+            let look = AssertSqlSafe(format!("SELECT 1 FROM {table} LIMIT 1"));
+            sqlx::query(look)
+                .persistent(false)
+                .fetch_optional(&mut *tx)
+                .await
+                .map_err(EngineError::from)?;
+        }
+        Ok(())
+    }
+
+    /// Reads every row of every table, which is slow. Returns the first finding, if any.
+    ///
+    /// # Errors
+    /// The database cannot be read, for another reason than damage.
+    pub async fn quick_check(&self) -> Result<Option<String>, DbError> {
+        let mut tx = self.read("storage").await?;
+        for table in tables(&mut tx).await? {
+            let all = AssertSqlSafe(format!("SELECT COUNT(whole.*) FROM {table} AS whole"));
+            let counted = sqlx::query(all).persistent(false).execute(&mut *tx).await;
+            match counted.map_err(EngineError::from) {
+                Ok(_) => {}
+                Err(EngineError::Postgres(error))
+                    if failure::of(&error) == Some(StorageFailure::Damaged) =>
+                {
+                    return Ok(Some(format!("table {table}: {error}")));
+                }
+                Err(error) => return Err(error.into()),
+            }
+        }
+        Ok(None)
+    }
+
+    /// Returns the size of the database; `None` if the server does not report it in time. The free space
+    /// on the server's disk is not known.
+    pub async fn disk(&self) -> Option<Disk> {
+        let asking = async {
+            let mut tx = self.read("storage").await.ok()?;
+            let size = sqlx::query_scalar!("SELECT pg_database_size(current_database())");
+            size.fetch_one(&mut *tx).await.ok()?
+        };
+        let bytes = timeout(DISK_TIMEOUT, asking).await.ok()??;
+        Some(Disk {
+            free_bytes: None,
+            database_bytes: u64::try_from(bytes).ok(),
+            log_bytes: None,
+        })
+    }
+
+    /// Closes all connections after their present work.
+    pub async fn close(&self) {
+        self.readers.close().await;
+        self.writer.close().await;
+    }
+}
+
+/// Returns the names of all tables, quoted.
+async fn tables(db: &mut Connection) -> Result<Vec<String>, EngineError> {
+    let tables = sqlx::query_scalar!(
+        r#"SELECT quote_ident(schemaname) || '.' || quote_ident(tablename) AS "table!"
+           FROM pg_tables WHERE schemaname = current_schema() ORDER BY tablename"#
+    );
+    let tables = tables.fetch_all(db).await?;
+    if tables.is_empty() {
+        // The database was emptied, or the address leads to another one now.
+        failure::note(&sqlx::Error::WorkerCrashed);
+        return Err(corrupt("schema", "no tables"));
+    }
+    Ok(tables)
+}
+
+#[cfg(test)]
+mod testing;
+#[cfg(test)]
+mod tests;
+#[cfg(test)]
+mod tests_of_opening;
+#[cfg(test)]
+mod tests_of_parity;
+#[cfg(test)]
+mod tests_of_segments;
+#[cfg(test)]
+mod tests_of_sums;

@@ -1,0 +1,156 @@
+//! Lock of a database: allows one server at a time.
+//!
+//! PostgreSQL serves any number of programs, but a server keeps the map in memory and alone decides what
+//! its robots do. The lock belongs to a connection of its own, and PostgreSQL releases it when that ends,
+//! as at its restart: it is taken again then, and [`DatabaseLock::lost`] returns only if
+//! another server was faster. Programs that only read do not take it.
+
+use std::future::pending;
+use std::time::Duration;
+
+use sqlx::PgConnection;
+use sqlx::postgres::PgConnectOptions;
+use tokio::sync::watch;
+use tokio::task::JoinHandle;
+use tokio::time::{sleep, timeout};
+use tracing::warn;
+
+use super::{OpenError, connections, open};
+
+/// Interval at which a server looks whether it still has the lock.
+const LOOK_INTERVAL: Duration = Duration::from_secs(2);
+/// Maximum time for an answer about it.
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
+/// Takes the lock, whose number is "treadsrv" in ASCII. PostgreSQL ends the connection of a machine that
+/// does not answer any more after 25 s, and with it the lock.
+const TAKE: &str = "SELECT pg_try_advisory_lock(8390880524716175990),
+    set_config('tcp_keepalives_idle', '10', FALSE), set_config('tcp_keepalives_interval', '5', FALSE),
+    set_config('tcp_keepalives_count', '3', FALSE)";
+/// Says who has it: address of the client, and since when it is connected.
+const IN_USE_BY: &str = "SELECT COALESCE(host(client_addr), 'this machine'),
+        to_char(backend_start AT TIME ZONE 'UTC', 'YYYY-MM-DD HH24:MI:SS')
+    FROM pg_locks JOIN pg_stat_activity USING (pid)
+    WHERE locktype = 'advisory' AND granted AND objsubid = 1
+        AND database = (SELECT oid FROM pg_database WHERE datname = current_database())
+        AND (CAST(classid AS BIGINT) << 32) | CAST(objid AS BIGINT) = 8390880524716175990
+    LIMIT 1";
+
+/// Reason why a server may not use a database.
+#[derive(Debug, thiserror::Error)]
+pub enum LockError {
+    /// Another server uses it.
+    #[error(
+        "the database `{address}` is used by another server{holder}: stop that one first, or give \
+         this one a database of its own"
+    )]
+    InUse {
+        /// The address, without a password.
+        address: String,
+        /// ` (at ADDRESS, since TIME)`, or empty if it is not known.
+        holder: String,
+    },
+    /// The database cannot be opened.
+    #[error(transparent)]
+    Open(OpenError),
+}
+
+/// Exclusive use of a database by this process, until it is released or dropped, or another server was
+/// faster after the connection was lost.
+#[derive(Debug)]
+pub struct DatabaseLock {
+    keeping: JoinHandle<()>,
+    lost: watch::Receiver<Option<String>>,
+}
+
+impl DatabaseLock {
+    /// Locks the database of an address.
+    ///
+    /// # Errors
+    /// [`LockError::InUse`] says who holds the lock; [`LockError::Open`].
+    pub async fn take(url: &str) -> Result<Self, LockError> {
+        let (options, address) = open::options_of(url).map_err(LockError::Open)?;
+        let connection = locked(&options, &address).await?;
+        let (losing, lost) = watch::channel(None);
+        #[expect(
+            clippy::disallowed_methods,
+            reason = "ends with the lock, which aborts it; the lock outlives all other tasks of a server"
+        )]
+        let keeping = tokio::spawn(async move {
+            let in_use = keep(connection, &options, &address).await;
+            losing.send_replace(Some(in_use.to_string()));
+        });
+        Ok(Self { keeping, lost })
+    }
+
+    /// Waits until another server has the lock, and returns why this one must stop.
+    pub fn lost(&self) -> impl Future<Output = String> + Send + 'static {
+        let mut lost = self.lost.clone();
+        async move {
+            let reason = lost.wait_for(Option::is_some).await.ok();
+            match reason.and_then(|reason| reason.clone()) {
+                Some(reason) => reason,
+                // The lock was released.
+                None => pending().await,
+            }
+        }
+    }
+
+    /// Releases the lock, and waits until its connection is closed here.
+    pub async fn release(mut self) {
+        self.keeping.abort();
+        // It was aborted, or has ended.
+        let _ = (&mut self.keeping).await;
+    }
+}
+
+impl Drop for DatabaseLock {
+    fn drop(&mut self) {
+        self.keeping.abort();
+    }
+}
+
+/// Looks whether the lock is held, and takes it again when its connection was lost. Returns when
+/// another server has it.
+async fn keep(
+    mut connection: PgConnection,
+    options: &PgConnectOptions,
+    address: &str,
+) -> LockError {
+    loop {
+        sleep(LOOK_INTERVAL).await;
+        let looking = sqlx::query("SELECT 1").execute(&mut connection);
+        if matches!(timeout(ANSWER_TIMEOUT, looking).await, Ok(Ok(_))) {
+            continue;
+        }
+        warn!("the connection that holds the lock of the database is lost");
+        connection = loop {
+            match locked(options, address).await {
+                Ok(connection) => break connection,
+                Err(in_use @ LockError::InUse { .. }) => return in_use,
+                // PostgreSQL is away, as every transaction notices too.
+                Err(LockError::Open(_)) => sleep(LOOK_INTERVAL).await,
+            }
+        };
+    }
+}
+
+/// Opens a connection that holds the lock.
+async fn locked(options: &PgConnectOptions, address: &str) -> Result<PgConnection, LockError> {
+    let refused = |cause| LockError::Open(open::refused(address, cause));
+    let mut connection = connections::connect(options).await.map_err(refused)?;
+    let taking = sqlx::query_as(TAKE).fetch_one(&mut connection).await;
+    let (is_taken, _, _, _): (bool, String, String, String) = taking.map_err(refused)?;
+    if is_taken {
+        return Ok(connection);
+    }
+    let found: Result<Option<(String, String)>, _> = sqlx::query_as(IN_USE_BY)
+        .fetch_optional(&mut connection)
+        .await;
+    let holder = found.ok().flatten();
+    Err(LockError::InUse {
+        address: address.to_owned(),
+        holder: holder.map_or_else(String::new, |(client, since)| {
+            format!(" (at {client}, since {since} UTC)")
+        }),
+    })
+}
