@@ -4,7 +4,20 @@
 //! by the measured wheel speeds, and its outputs are compared with the other sensors. The residuals
 //! r of a block b are linearised about the parameters `p_b` that were in use during the block:
 //! `r(p) = r_b − J_b (p − p_b)`. Earlier blocks lose weight when ln K moves away from the value at
-//! which they were linearised. With `C = (Σ Jᵀ W J + prior information)⁻¹` the covariance is the
+//! which they were linearised: a step Δ of ln K multiplies their weights by
+//!
+//! ```text
+//! exp(−3 Δ² / (R² + σ²/2))      R = LINEAR_RANGE, σ² = variance of ln K before the step
+//! ```
+//!
+//! R is the range in which the expansion is accurate. σ belongs beside it: the truth is expected at
+//! the squared distance `σ² + Δ²` from `p_b`, and at σ² from the new values. As long as Δ is below σ,
+//! the old expansion is nearly as close to the truth as a new one, and to forget it loses its
+//! information for nothing. With R alone an estimate with little information, as on tyres that slide
+//! most of the time, never gets more: each block moves it by more than R, which deletes all earlier
+//! blocks, so that the next one moves it as far.
+//!
+//! With `C = (Σ Jᵀ W J + prior information)⁻¹` the covariance is the
 //! robust one, `C (Σ g gᵀ + prior information) C`: the empirical scatter of the blocks' scores
 //! `g = Jᵀ W r` replaces the assumption of white residuals and a true model.
 
@@ -27,8 +40,11 @@ const NOISY_SQUARE: f64 = 0.8;
 const NOISE_BLOCKS_MIN: u32 = 6;
 /// Maximum standardised residual in that mean square.
 const RESIDUAL_MAX: f64 = 5.0;
-/// Change of ln K that makes older linearisations count e⁻³ times as much.
+/// Change of a well-known ln K that makes older linearisations count e⁻³ times as much.
 const LINEAR_RANGE: f64 = 0.1;
+/// Fraction of the variance of ln K that is added to the square of that range. With all of it, noise
+/// of the wheel speeds that the first expansions took for slip is kept as well.
+const DOUBT_SHARE: f64 = 0.5;
 /// Maximum magnitude of the change of ln K at the end of one block.
 const STEP_MAX: f64 = 0.4;
 /// Range in which parameters stay, in standard deviations of their prior.
@@ -309,7 +325,8 @@ impl Hypothesis {
         for own in std::iter::once(&mut self.model).chain(&mut self.perturbed) {
             own.shift(&step);
         }
-        let keeps = (-3.0 * (step[index::STIFFNESS] / LINEAR_RANGE).powi(2)).exp();
+        let range_square = LINEAR_RANGE.powi(2) + DOUBT_SHARE * self.scale().nominal_variance();
+        let keeps = (-3.0 * step[index::STIFFNESS].powi(2) / range_square).exp();
         for scale in &mut self.scales {
             scale.weaken(keeps);
         }

@@ -318,8 +318,13 @@ impl Scale {
     pub(super) fn variances(&self, prior: &Prior) -> (f64, f64) {
         let of_stiffness = self.of_stiffness;
         let known = (prior.information * of_stiffness).dot(&of_stiffness);
-        let nominal = of_stiffness[index::STIFFNESS];
+        let nominal = self.nominal_variance();
         ((self.scattered() + known).max(nominal), known)
+    }
+
+    /// Returns the nominal variance of ln K at the last solution, the diagonal element of C.
+    pub(super) fn nominal_variance(&self) -> f64 {
+        self.of_stiffness[index::STIFFNESS].max(0.0)
     }
 
     /// Returns the part of ln K's variance that the scatter of the blocks' scores contributes.

@@ -247,6 +247,52 @@ fn the_last_block_before_a_change_of_the_ground_counts_for_no_segment() {
     assert!(left.abs() < 0.5 * of_block, "{left} of {of_block}");
 }
 
+/// Noise of the default sensors.
+fn with_noise(sample: SensorSample, random: &mut impl RngExt) -> SensorSample {
+    let noise = SensorNoise::default();
+    // The sum of twelve uniform values has a variance of 1.
+    let mut normal =
+        |std_dev: f64| (0..12).map(|_| random.random::<f64>() - 0.5).sum::<f64>() * std_dev;
+    SensorSample {
+        gyro_rad_s: sample.gyro_rad_s + normal(noise.gyro_rad_s),
+        acceleration: sample.acceleration.map(|acceleration| BodyAcceleration {
+            forward_m_s2: acceleration.forward_m_s2 + normal(noise.accelerometer_m_s2),
+            left_m_s2: acceleration.left_m_s2 + normal(noise.accelerometer_m_s2),
+        }),
+        body_speed_m_s: sample
+            .body_speed_m_s
+            .map(|speed| speed + normal(noise.body_speed_m_s)),
+        ..sample
+    }
+}
+
+#[test]
+fn an_estimate_with_little_information_keeps_it_and_gets_more() {
+    let mut estimates = 0;
+    for seed in 0..8 {
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        let mut robot = Simulated::new(|values| {
+            values[index::STIFFNESS] = 12.0_f64.ln();
+            values[index::PEAK] = 0.35_f64.ln();
+        });
+        let mut identification = identification();
+        for _ in 0..6_000 {
+            let mut sample = with_noise(robot.sample(), &mut random);
+            sample.wheel_torques = None;
+            identification.update(&sample, &SensorNoise::default(), SAMPLE_S);
+        }
+        let Some(found) = identification.identified() else {
+            continue;
+        };
+        let own = found.own_ratio.hypot(found.robot_ratio);
+        let error = (found.theta * 12.0).ln();
+        assert!(error.abs() < 1.96 * own, "seed {seed}: {error} of {own}");
+        estimates += u32::from(own < 0.3);
+    }
+    // Turns slide most of the time, and only what all of them tell together is enough.
+    assert!(estimates >= 7, "{estimates} of 8");
+}
+
 /// Returns the mean of two samples, whose wheel speeds have the errors of a filter or an analogue
 /// sensor: each sample has its own.
 fn noisy(samples: [SensorSample; 2], std_dev_rad_s: f64, random: &mut impl RngExt) -> SensorSample {
