@@ -69,7 +69,7 @@ const MODEL_TORQUE_MU: f64 = 0.025;
 /// the model's equations: a relative one, of ln θ, and an absolute one, of θ, which is a slip per
 /// friction coefficient and dominates where θ is small.
 const MODEL_LN_THETA_STD_DEV: f64 = 0.03;
-const MODEL_THETA_STD_DEV: f64 = 0.006;
+const MODEL_THETA_STD_DEV: f64 = 0.012;
 /// Minimum duration of the block with which a segment ends, seconds; a shorter one is not used.
 const SHORT_BLOCK_S: f64 = 0.5;
 /// Mean square of standardised residuals above which the model does not describe the robot and no
