@@ -4,8 +4,10 @@
 
 use std::hash::{DefaultHasher, Hash as _, Hasher as _};
 use std::path::Path;
+use std::process::Command;
 use std::{env, thread};
 
+use jiff::Timestamp;
 use reqwest::StatusCode;
 use serde_json::json;
 use sqlx::{AssertSqlSafe, Connection as _, PgConnection};
@@ -16,8 +18,9 @@ use tread_api::friction::StoredSegment;
 use tread_api::mission::MissionState;
 use tread_api::page::Page;
 use tread_api::stop::Stop;
-use tread_server::db::Location;
+use tread_server::db::{self, Db, Location};
 
+use crate::backups::{run, words};
 use crate::drive::{Socket, driven_at};
 use crate::harness::{Yard, circle, eventually, measured, segment};
 use crate::robot::Robot;
@@ -175,4 +178,88 @@ async fn robots_are_driven_and_stopped_while_postgresql_is_away_and_nothing_ackn
     assert_eq!(stops.items.len(), 1);
     drop((robot, other));
     yard.server.stop().await.unwrap();
+}
+
+/// Runs a program of PostgreSQL's.
+fn tool(name: &str, arguments: &[&str]) {
+    let ran = Command::new(name).args(arguments).output().unwrap();
+    let said = String::from_utf8_lossy(&ran.stderr);
+    assert!(ran.status.success(), "{name}: {said}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_dump_is_restored_into_another_database_and_holds_the_robots_once_it_is_marked() {
+    let Ok(admin) = env::var(SERVER) else {
+        eprintln!("this test was NOT RUN: {SERVER} names no PostgreSQL server");
+        return;
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let (first, second) = (
+        created(&admin, &folder.path().join("first")),
+        created(&admin, &folder.path().join("second")),
+    );
+    let address = |location: &Location| match location {
+        Location::Postgres(address) => address.clone(),
+        Location::File(_) => unreachable!("it is one of PostgreSQL"),
+    };
+    let used = first.clone();
+    let yard = Yard::start_configured(|config, _| config.database = used).await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let mission = yard.create_mission(&robot.id).await;
+    let taken_at = Timestamp::now().to_string();
+    let run = async |arguments: Vec<String>| {
+        let running = tokio::task::spawn_blocking(move || {
+            let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
+            run(&arguments)
+        });
+        running.await.unwrap()
+    };
+    let mark = |location: &Location, at: &str| {
+        [
+            "mark-restored",
+            "--database",
+            &address(location),
+            "--taken-at",
+            at,
+        ]
+        .map(str::to_owned)
+        .to_vec()
+    };
+    let refused = words(&run(mark(&first, &taken_at)).await);
+    assert!(refused.contains("a server uses the database"), "{refused}");
+    drop(robot);
+    yard.server.stop().await.unwrap();
+
+    let dump = folder.path().join("fleet.dump").display().to_string();
+    tool(
+        "pg_dump",
+        &["--format=custom", "--file", &dump, &address(&first)],
+    );
+    tool(
+        "pg_restore",
+        &["--no-owner", "--dbname", &address(&second), &dump],
+    );
+    let future = words(&run(mark(&second, "2999-01-01T00:00:00Z")).await);
+    assert!(future.contains("yet to come"), "{future}");
+    let marked = run(mark(&second, &taken_at)).await;
+    let said = words(&marked);
+    assert!(marked.status.success(), "{said}");
+    assert!(said.contains("tread robots release --all"), "{said}");
+    assert!(
+        !said.contains(admin.split(['/', ':', '@']).nth(4).unwrap()),
+        "{said}"
+    );
+    let database = Db::open(&second).await.unwrap();
+    let mut tx = database.read("test").await.unwrap();
+    assert_eq!(db::restorations::awaiting_count(&mut tx).await.unwrap(), 1);
+    let found = db::missions::find(&mut tx, mission.id).await.unwrap();
+    assert_eq!(found.unwrap().mission.trajectory, mission.trajectory);
+    drop(tx);
+    database.close().await;
+    let checked = ["migrate", "--check", "--database", &address(&second)].map(str::to_owned);
+    let checked = run(checked.to_vec()).await;
+    assert_eq!(checked.status.code(), Some(0), "{}", words(&checked));
+    let copied = ["backup", "--to", &dump, "--database", &address(&second)].map(str::to_owned);
+    let copied = words(&run(copied.to_vec()).await);
+    assert!(copied.contains("docs/postgresql.md"), "{copied}");
 }
