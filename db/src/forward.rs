@@ -12,7 +12,10 @@ macro_rules! forward {
         pub async fn $name(tx: &mut Tx, $($argument: $type),*) -> Result<$result, DbError> {
             let done = match tx {
                 Tx::Sqlite(tx) => tread_store_sqlite::$module::$name(tx, $($argument),*).await?,
-                Tx::Postgres(tx) => tread_store_postgres::$module::$name(tx, $($argument),*).await?,
+                // Boxed: such a future is large, and every caller would contain it, whatever the engine.
+                Tx::Postgres(tx) => {
+                    Box::pin(tread_store_postgres::$module::$name(tx, $($argument),*)).await?
+                }
             };
             Ok(done)
         }

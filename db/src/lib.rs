@@ -60,7 +60,7 @@ impl Tx {
     pub async fn commit(self) -> Result<(), DbError> {
         match self {
             Self::Sqlite(tx) => tx.commit().await,
-            Self::Postgres(tx) => tx.commit().await,
+            Self::Postgres(tx) => Box::pin(tx.commit()).await,
         }
     }
 
@@ -75,7 +75,7 @@ impl Tx {
     ) -> Result<(), DbError> {
         match self {
             Self::Sqlite(tx) => tx.commit_then(then).await,
-            Self::Postgres(tx) => tx.commit_then(then).await,
+            Self::Postgres(tx) => Box::pin(tx.commit_then(then)).await,
         }
     }
 
@@ -209,7 +209,7 @@ impl Db {
     pub async fn write(&self, kind: &'static str) -> Result<Tx, DbError> {
         match self {
             Self::Sqlite(db) => Ok(Tx::Sqlite(db.write(kind).await?)),
-            Self::Postgres(db) => Ok(Tx::Postgres(db.write(kind).await?)),
+            Self::Postgres(db) => Ok(Tx::Postgres(Box::pin(db.write(kind)).await?)),
         }
     }
 
@@ -221,7 +221,7 @@ impl Db {
     pub async fn write_uncounted(&self, kind: &'static str) -> Result<Tx, DbError> {
         match self {
             Self::Sqlite(db) => Ok(Tx::Sqlite(db.write_uncounted(kind).await?)),
-            Self::Postgres(db) => Ok(Tx::Postgres(db.write_uncounted(kind).await?)),
+            Self::Postgres(db) => Ok(Tx::Postgres(Box::pin(db.write_uncounted(kind)).await?)),
         }
     }
 
@@ -232,7 +232,7 @@ impl Db {
     pub async fn read(&self, kind: &'static str) -> Result<Tx, DbError> {
         match self {
             Self::Sqlite(db) => Ok(Tx::Sqlite(db.read(kind).await?)),
-            Self::Postgres(db) => Ok(Tx::Postgres(db.read(kind).await?)),
+            Self::Postgres(db) => Ok(Tx::Postgres(Box::pin(db.read(kind)).await?)),
         }
     }
 

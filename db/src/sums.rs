@@ -25,7 +25,7 @@ pub async fn add<'sums>(
 ) -> Result<(), DbError> {
     match tx {
         Tx::Sqlite(tx) => tread_store_sqlite::sums::add(tx, sums).await?,
-        Tx::Postgres(tx) => tread_store_postgres::sums::add(tx, sums).await?,
+        Tx::Postgres(tx) => Box::pin(tread_store_postgres::sums::add(tx, sums)).await?,
     }
     Ok(())
 }

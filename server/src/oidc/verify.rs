@@ -150,7 +150,8 @@ pub fn claims(
         return Err(InvalidIdToken::Subject);
     }
     let claims = payload(id_token).ok_or(InvalidIdToken::Unreadable)?;
-    let latest_s = latest.timestamp() as f64;
+    // Until 2106, and from then on no token is refused for this.
+    let latest_s = u32::try_from(latest.timestamp()).map_or(f64::INFINITY, f64::from);
     if !claims
         .get("nbf")
         .is_none_or(|from| from.as_f64().is_some_and(|from_s| from_s <= latest_s))

@@ -2,22 +2,25 @@
 //! `TREAD_TEST_ENGINE=postgres store-postgres/with-postgres cargo nextest run -p tread-server --test server`.
 //! Tests that look into a database file need the other engine.
 
+use std::borrow::Cow;
 use std::hash::{DefaultHasher, Hash as _, Hasher as _};
 use std::path::Path;
 use std::process::Command;
 use std::{env, thread};
 
-use jiff::Timestamp;
 use reqwest::StatusCode;
 use serde_json::json;
+use sqlx::error::DatabaseError;
 use sqlx::{AssertSqlSafe, Connection as _, PgConnection};
 use tokio::io::copy_bidirectional;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::watch;
+use tokio::task::JoinSet;
 use tread_api::friction::StoredSegment;
 use tread_api::mission::MissionState;
 use tread_api::page::Page;
 use tread_api::stop::Stop;
+use tread_server::clock::Clock;
 use tread_server::db::{self, Db, Location};
 
 use crate::backups::{run, words};
@@ -66,8 +69,8 @@ fn create(admin: &str, name: &str) {
         let statement = AssertSqlSafe(format!("CREATE DATABASE {name}"));
         let created = sqlx::raw_sql(statement).execute(&mut connection).await;
         let code = created.err().map(|error| {
-            let code = error.as_database_error().and_then(|error| error.code());
-            code.map(|code| code.into_owned())
+            let code = error.as_database_error().and_then(DatabaseError::code);
+            code.map(Cow::into_owned)
         });
         assert!(
             code.is_none() || code == Some(Some(EXISTS.to_owned())),
@@ -87,13 +90,18 @@ impl Relay {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let port = listener.local_addr().unwrap().port();
         let (is_open, mut open) = watch::channel(true);
+        #[expect(
+            clippy::disallowed_methods,
+            reason = "ends with the test, whose process has nothing else"
+        )]
         tokio::spawn(async move {
+            let mut relayed = JoinSet::new();
             while let Ok((mut client, _)) = listener.accept().await {
                 if !*open.borrow_and_update() {
                     continue;
                 }
                 let (server, mut open) = (server.clone(), open.clone());
-                tokio::spawn(async move {
+                relayed.spawn(async move {
                     let mut server = TcpStream::connect(server).await.unwrap();
                     tokio::select! {
                         _ = copy_bidirectional(&mut client, &mut server) => {}
@@ -125,8 +133,8 @@ async fn robots_are_driven_and_stopped_while_postgresql_is_away_and_nothing_ackn
     let robot = Robot::join(&yard, "rover-1").await;
     let mission = yard.create_mission(&robot.id).await;
     yard.mission_becomes(mission.id, MissionState::Active).await;
-    let mut socket = Socket::open(&yard, "rover-2").await;
     let other = Robot::join(&yard, "rover-2").await;
+    let mut socket = Socket::open(&yard, "rover-2").await;
     robot
         .upload(vec![measured(1, segment((2, 2), 0.2, 10))])
         .await
@@ -206,7 +214,7 @@ async fn a_dump_is_restored_into_another_database_and_holds_the_robots_once_it_i
     let yard = Yard::start_configured(|config, _| config.database = used).await;
     let robot = Robot::join(&yard, "rover-1").await;
     let mission = yard.create_mission(&robot.id).await;
-    let taken_at = Timestamp::now().to_string();
+    let taken_at = Clock::system().now().to_string();
     let run = async |arguments: Vec<String>| {
         let running = tokio::task::spawn_blocking(move || {
             let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
