@@ -1,7 +1,7 @@
 //! The database of a fleet, whichever engine it has. Contains no SQL.
 //!
 //! [`Db`] and [`Tx`] are enums over the engines. Each aggregate is a module whose functions take a
-//! transaction of either engine. What only a database in a file has is in [`file`].
+//! transaction of either engine. What only a database in a file has is in [`mod@file`].
 
 mod forward;
 pub mod lock;
