@@ -50,7 +50,7 @@ impl Tx {
     /// Commits the transaction.
     ///
     /// # Errors
-    /// the engine failed; nothing is written, or the outcome is unknown.
+    /// The engine failed; nothing is written, or the outcome is unknown.
     pub async fn commit(self) -> Result<(), DbError> {
         self.commit_then(|_outcome| {}).await
     }

@@ -44,9 +44,9 @@ pub const SEARCHED_ROWS_MAX: usize = 64 * ROW_GROUP_ROWS;
 /// Maximum number of files that one request opens.
 pub const SEARCHED_FILES_MAX: usize = 512;
 
-/// Suffix of the mark, after the name of the database.
-/// Name of the mark in the folder of the archive, without its ending.
+/// Name of the mark in the folder of the archive, without its suffix.
 const MARK_IN_FOLDER: &str = "tread";
+/// Suffix of the mark, after the name of the database.
 const MARK_ENDING: &str = ".archived";
 /// Beginning of the name of a file.
 const PREFIX: &str = "segments-";
