@@ -201,6 +201,14 @@ impl Db {
         }
     }
 
+    /// Returns the schema of this program for the engine: its newest migration, which an open database has.
+    pub fn schema(&self) -> i64 {
+        match self {
+            Self::Sqlite(_) => tread_store_sqlite::schema::known(),
+            Self::Postgres(_) => tread_store_postgres::schema::known(),
+        }
+    }
+
     /// Begins a write transaction; waits until no other one is open. Await nothing but the database
     /// before the commit. `kind` names the use case in the metrics.
     ///

@@ -229,7 +229,7 @@ pub(super) async fn status(
     Json(ServerStatus {
         version: build::VERSION.to_owned(),
         commit: build::commit().map(str::to_owned),
-        schema: build::schema(),
+        schema: app.db().schema(),
         uptime_ms: whole_ms(app.uptime()),
         database: {
             let (engine, version) = app.db().engine();
