@@ -198,7 +198,7 @@ impl App {
         let info = Info::new([
             ("version", build::VERSION.to_owned()),
             ("commit", build::commit().unwrap_or("unknown").to_owned()),
-            ("schema", build::schema().to_string()),
+            ("schema", self.db().schema().to_string()),
         ]);
         registry.register("tread_build", "Version, commit and schema", info);
         let awaiting = self.restoration().map_or(0, |(_, awaiting)| awaiting);
