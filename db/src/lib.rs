@@ -31,6 +31,7 @@ pub mod sums;
 pub mod terrains;
 pub mod times;
 pub mod tokens;
+pub mod transfer;
 pub mod watermarks;
 pub mod webhooks;
 pub mod withdrawals;

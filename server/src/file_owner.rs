@@ -1,5 +1,5 @@
-//! Owners of the files that root creates for the service's user. `init`, `restore` and `migrate` run
-//! as root on a machine with packages. The server runs as another user.
+//! Owners of the files that root creates for the service's user. `init`, `restore`, `copy` and
+//! `migrate` run as root on a machine with packages. The server runs as another user.
 
 use std::fs;
 use std::os::unix::fs::{MetadataExt as _, lchown};

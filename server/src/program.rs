@@ -45,6 +45,9 @@ enum Action {
     /// Hold robots and list what to review after the tools of the database have restored it; `restore` does
     /// this by itself
     MarkRestored(maintenance::mark_restored::MarkRestoredArgs),
+    /// Copy everything into a new database, from SQLite to PostgreSQL or back, and compare both; no
+    /// server may run on either
+    Copy(maintenance::copy::CopyArgs),
     /// Show or apply the changes of the database's schema that this version needs
     Migrate(maintenance::migrate::MigrateArgs),
 }
@@ -85,6 +88,7 @@ pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode 
         Some(Action::MarkRestored(args)) => {
             run_beside_server(maintenance::mark_restored::run(args))
         }
+        Some(Action::Copy(args)) => run_beside_server(maintenance::copy::run(args)),
         Some(Action::Migrate(args)) => {
             return maintenance::migrate::exit_code(run_beside_server(maintenance::migrate::run(
                 args,

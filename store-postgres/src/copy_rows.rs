@@ -40,7 +40,7 @@ impl CopyRows {
     pub(super) async fn write(
         mut self,
         db: &mut Connection,
-        statement: &'static str,
+        statement: &str,
     ) -> Result<u64, EngineError> {
         self.bytes.extend(END.to_be_bytes());
         let mut copying = db.copy_in_raw(statement).await?;
@@ -61,6 +61,16 @@ impl CopyRow<'_> {
             Some(value) => self.value(&value.to_be_bytes()),
             None => self.null(),
         }
+    }
+
+    /// Adds a `BOOLEAN`.
+    pub(super) fn boolean(&mut self, value: bool) -> &mut Self {
+        self.value(&[value.into()])
+    }
+
+    /// Adds a `BYTEA`.
+    pub(super) fn bytes(&mut self, value: &[u8]) -> &mut Self {
+        self.value(value)
     }
 
     /// Adds a `TEXT`.

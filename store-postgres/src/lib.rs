@@ -67,6 +67,9 @@ pub mod times;
 pub mod tokens;
 #[path = "../../store/sql/transaction.rs"]
 mod transaction;
+#[path = "../../store/sql/transfer.rs"]
+pub mod transfer;
+mod transfer_rows;
 #[path = "../../store/sql/values.rs"]
 mod values;
 #[path = "../../store/sql/watermarks.rs"]
@@ -372,3 +375,5 @@ mod tests_of_parity;
 mod tests_of_segments;
 #[cfg(test)]
 mod tests_of_sums;
+#[cfg(test)]
+mod tests_of_transfer;

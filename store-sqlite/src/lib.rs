@@ -67,6 +67,9 @@ pub mod times;
 pub mod tokens;
 #[path = "../../store/sql/transaction.rs"]
 mod transaction;
+#[path = "../../store/sql/transfer.rs"]
+pub mod transfer;
+mod transfer_rows;
 #[path = "../../store/sql/values.rs"]
 mod values;
 #[path = "../../store/sql/watermarks.rs"]

@@ -28,6 +28,7 @@ pub mod sites;
 pub mod stops;
 mod subject;
 pub mod sums;
+pub mod transfer;
 pub mod watermarks;
 pub mod webhooks;
 pub mod withdrawals;

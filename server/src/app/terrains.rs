@@ -76,7 +76,8 @@ impl App {
         self.put_terrain(tx, site_pk, terrain).await
     }
 
-    /// Replaces all of a terrain except its identifier.
+    /// Replaces all of a terrain except its identifier. A request that changes nothing makes no new
+    /// revision: measurements would be told apart that were made on the same ground.
     pub async fn replace_terrain(
         &self,
         site: &SiteId,
@@ -92,8 +93,17 @@ impl App {
         let name = name_or(name, id.as_str())?;
         let mut tx = self.db().write("terrains").await?;
         let site_pk = site_row(&mut tx, site).await?.pk;
-        if db::terrains::find(&mut tx, site_pk, id).await?.is_none() {
+        let Some(present) = db::terrains::find(&mut tx, site_pk, id).await? else {
             return Err(AppError::UnknownTerrain(site.clone(), id.clone()));
+        };
+        let is_same = (
+            &present.name,
+            present.class,
+            &present.polygon,
+            present.layer,
+        ) == (&name, class, &polygon, layer);
+        if is_same {
+            return Ok(present);
         }
         let revision = db::terrains::last_revision(&mut tx, site_pk, id).await? + 1;
         let (id, updated_at) = (id.clone(), self.clock().now());

@@ -47,7 +47,7 @@ pub const SEARCHED_FILES_MAX: usize = 512;
 /// Name of the mark in the folder of the archive, without its suffix.
 const MARK_IN_FOLDER: &str = "tread";
 /// Suffix of the mark, after the name of the database.
-const MARK_ENDING: &str = ".archived";
+pub const MARK_ENDING: &str = ".archived";
 /// Beginning of the name of a file.
 const PREFIX: &str = "segments-";
 /// End of the name of a file.

@@ -1,11 +1,13 @@
-//! Commands on the database and its backups: `tread-server backup`, `restore`,
+//! Commands on the database and its backups: `tread-server backup`, `copy`, `restore`,
 //! `mark-restored` and `migrate`.
 
 pub(crate) mod backup;
+pub(crate) mod copy;
 pub(crate) mod mark_restored;
 pub(crate) mod migrate;
 pub(crate) mod restore;
 mod review;
+mod unfinished;
 
 use std::path::PathBuf;
 

@@ -8,7 +8,6 @@
 //!
 //! It does not change the old database before the new one is complete, and never removes it.
 
-use std::ffi::OsString;
 use std::fs;
 use std::io::{self, IsTerminal as _, Write};
 use std::path::{Path, PathBuf};
@@ -18,6 +17,7 @@ use clap::Args;
 use jiff::Timestamp;
 
 use super::review::{self, Review};
+use super::unfinished::{BESIDE, Unfinished, with_ending};
 use super::{ServerFiles, file_of};
 use crate::app::backups::check_space;
 use crate::authority::{AuthorityError, CERTIFICATE_FILE, copies};
@@ -102,9 +102,9 @@ pub(crate) async fn run(args: RestoreArgs) -> anyhow::Result<()> {
         manifest.database.bytes.saturating_add(RESERVE_BYTES),
     )?;
     let now = Clock::system().now();
-    let restoring = Restoring::begin(&database)?;
-    let extracted = extract(&args.from, key.as_ref(), &restoring.path).await?;
-    let contents = copy::examine(&restoring.path).await;
+    let restoring = Unfinished::begin(&database, RESTORING_ENDING)?;
+    let extracted = extract(&args.from, key.as_ref(), restoring.path()).await?;
+    let contents = copy::examine(restoring.path()).await;
     let contents = contents.context("the database in the backup is damaged")?;
     ensure!(
         (contents.schema, &contents.rows) == (manifest.schema, &manifest.rows),
@@ -118,7 +118,7 @@ pub(crate) async fn run(args: RestoreArgs) -> anyhow::Result<()> {
     };
     let name = args.from.file_name().unwrap_or_default();
     let name = name.to_string_lossy();
-    let review = review::prepare(&Location::from(&restoring.path), &restoration, &name).await?;
+    let review = review::prepare(&Location::from(restoring.path()), &restoration, &name).await?;
     let authority = match &config.robots {
         Some(robots) => restore_authority(
             &robots.authority,
@@ -127,7 +127,7 @@ pub(crate) async fn run(args: RestoreArgs) -> anyhow::Result<()> {
         )?,
         None => AuthorityFate::None,
     };
-    let aside = restoring.finish(&database, now).await?;
+    let aside = replace(&database, restoring, now).await?;
     file_owner::chown_database(&database)?;
     if let AuthorityFate::Restored(folder, aside) = &authority {
         for folder in aside.iter().chain([folder]) {
@@ -154,90 +154,37 @@ fn refuse_newer(manifest: &Manifest) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The database during its restoration; removed on drop unless it is finished.
-struct Restoring {
-    path: PathBuf,
-    is_finished: bool,
-}
-
-fn with_ending(path: &Path, ending: &str) -> PathBuf {
-    let mut name = OsString::from(path);
-    name.push(ending);
-    name.into()
-}
-
-fn remove_if_there(path: &Path) -> io::Result<()> {
-    match fs::remove_file(path) {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
-        Ok(()) | Err(_) => Ok(()),
+/// Moves the old database aside, and the new one to its place. Returns the path of the old one.
+async fn replace(
+    database: &Path,
+    restoring: Unfinished,
+    now: Timestamp,
+) -> anyhow::Result<Option<PathBuf>> {
+    let moved = |path: &Path| format!("cannot move `{}` aside", path.display());
+    restoring.check_closed()?;
+    let is_there = database.exists();
+    let to = aside_name(database, now);
+    if is_there {
+        settle_log(database).await;
     }
-}
-
-/// Suffixes of SQLite's files beside a database.
-const BESIDE: [&str; 3] = ["-wal", "-shm", "-journal"];
-
-impl Restoring {
-    /// Removes the files of an interrupted restoration.
-    fn begin(database: &Path) -> anyhow::Result<Self> {
-        let path = with_ending(database, RESTORING_ENDING);
-        let restoring = Self {
-            path,
-            is_finished: false,
-        };
-        let removed = restoring.remove();
-        removed.with_context(|| format!("cannot remove `{}`", restoring.path.display()))?;
-        Ok(restoring)
-    }
-
-    fn remove(&self) -> io::Result<()> {
-        for ending in BESIDE {
-            remove_if_there(&with_ending(&self.path, ending))?;
-        }
-        remove_if_there(&self.path)
-    }
-
-    /// Moves the old database aside, and the new one to its place. Returns the path of the old one.
-    async fn finish(mut self, database: &Path, now: Timestamp) -> anyhow::Result<Option<PathBuf>> {
-        let moved = |path: &Path| format!("cannot move `{}` aside", path.display());
-        // SQLite removes its log when the last connection closes. If a log remains, the database is
-        // incomplete without it.
-        for ending in BESIDE {
-            let beside = with_ending(&self.path, ending);
-            ensure!(!beside.exists(), "`{}` is still in use", beside.display());
-        }
-        let mut aside = None;
-        if database.exists() {
-            let to = aside_name(database, now);
-            settle_log(database).await;
-            // SQLite would use a log beside the new database as that database's log. After a crash
-            // here the old database lacks its log, which is among the files that were moved aside.
-            for ending in BESIDE {
-                let beside = with_ending(database, ending);
-                if beside.exists() {
-                    let renamed = fs::rename(&beside, with_ending(&to, ending));
-                    renamed.with_context(|| moved(&beside))?;
-                }
-            }
-            // The link keeps a database under this name at every moment: a server that starts
-            // meanwhile must not create an empty one.
-            fs::hard_link(database, &to).with_context(|| moved(database))?;
-            aside = Some(to);
-        }
-        let renamed = fs::rename(&self.path, database);
-        renamed.with_context(|| format!("cannot write `{}`", database.display()))?;
-        self.is_finished = true;
-        sync_folder(database)?;
-        Ok(aside)
-    }
-}
-
-impl Drop for Restoring {
-    fn drop(&mut self) {
-        if !self.is_finished {
-            // The next restoration removes files that remain.
-            let _ = self.remove();
+    // SQLite would use a log beside the new database as that database's log, also where there is no
+    // old one. After a crash here the old database lacks its log, which is among the files that were
+    // moved aside.
+    for ending in BESIDE {
+        let beside = with_ending(database, ending);
+        if beside.exists() {
+            let renamed = fs::rename(&beside, with_ending(&to, ending));
+            renamed.with_context(|| moved(&beside))?;
         }
     }
+    if is_there {
+        // The link keeps a database under this name at every moment: a server that starts
+        // meanwhile must not create an empty one.
+        fs::hard_link(database, &to).with_context(|| moved(database))?;
+    }
+    restoring.finish(database)?;
+    sync_folder(database)?;
+    Ok(is_there.then_some(to))
 }
 
 /// Returns a name that no other file has: of two restorations within a second, the second has a number.

@@ -20,6 +20,8 @@ mod conditions;
 #[cfg(test)]
 mod control;
 #[cfg(test)]
+mod copies;
+#[cfg(test)]
 mod drive;
 #[cfg(test)]
 mod dry_run;

@@ -31,7 +31,7 @@ use crate::robot::Robot;
 /// Variable with the engine of the servers: `postgres`, or a file of SQLite.
 const ENGINE: &str = "TREAD_TEST_ENGINE";
 /// Variable with the address of a server on which tests may create databases.
-const SERVER: &str = "TREAD_TEST_POSTGRES";
+pub(crate) const SERVER: &str = "TREAD_TEST_POSTGRES";
 /// Code of the error that the database exists.
 const EXISTS: &str = "42P04";
 
@@ -45,7 +45,8 @@ pub(crate) fn database_of(folder: &Path) -> Option<Location> {
     Some(created(&admin, folder))
 }
 
-fn created(admin: &str, folder: &Path) -> Location {
+/// Returns a new database of a server, named after a folder.
+pub(crate) fn created(admin: &str, folder: &Path) -> Location {
     let admin = admin.to_owned();
     let mut hasher = DefaultHasher::new();
     folder.hash(&mut hasher);
@@ -57,6 +58,14 @@ fn created(admin: &str, folder: &Path) -> Location {
         .join()
         .expect("the database is there");
     Location::Postgres(address)
+}
+
+/// Returns the address of a database on a server.
+pub(crate) fn address_of(location: &Location) -> String {
+    match location {
+        Location::Postgres(address) => address.clone(),
+        Location::File(_) => unreachable!("it is one of PostgreSQL"),
+    }
 }
 
 fn create(admin: &str, name: &str) {
@@ -121,9 +130,7 @@ async fn robots_are_driven_and_stopped_while_postgresql_is_away_and_nothing_ackn
         return;
     };
     let folder = tempfile::tempdir().unwrap();
-    let Location::Postgres(address) = created(&admin, folder.path()) else {
-        unreachable!("it is one of PostgreSQL")
-    };
+    let address = address_of(&created(&admin, folder.path()));
     let (user, rest) = address.rsplit_once('@').unwrap();
     let (server, name) = rest.split_once('/').unwrap();
     let relay = Relay::to(server.to_owned()).await;
@@ -206,10 +213,6 @@ async fn a_dump_is_restored_into_another_database_and_holds_the_robots_once_it_i
         created(&admin, &folder.path().join("first")),
         created(&admin, &folder.path().join("second")),
     );
-    let address = |location: &Location| match location {
-        Location::Postgres(address) => address.clone(),
-        Location::File(_) => unreachable!("it is one of PostgreSQL"),
-    };
     let used = first.clone();
     let yard = Yard::start_configured(|config, _| config.database = used).await;
     let robot = Robot::join(&yard, "rover-1").await;
@@ -226,7 +229,7 @@ async fn a_dump_is_restored_into_another_database_and_holds_the_robots_once_it_i
         [
             "mark-restored",
             "--database",
-            &address(location),
+            &address_of(location),
             "--taken-at",
             at,
         ]
@@ -241,11 +244,11 @@ async fn a_dump_is_restored_into_another_database_and_holds_the_robots_once_it_i
     let dump = folder.path().join("fleet.dump").display().to_string();
     tool(
         "pg_dump",
-        &["--format=custom", "--file", &dump, &address(&first)],
+        &["--format=custom", "--file", &dump, &address_of(&first)],
     );
     tool(
         "pg_restore",
-        &["--no-owner", "--dbname", &address(&second), &dump],
+        &["--no-owner", "--dbname", &address_of(&second), &dump],
     );
     let future = words(&run(mark(&second, "2999-01-01T00:00:00Z")).await);
     assert!(future.contains("yet to come"), "{future}");
@@ -264,10 +267,10 @@ async fn a_dump_is_restored_into_another_database_and_holds_the_robots_once_it_i
     assert_eq!(found.unwrap().mission.trajectory, mission.trajectory);
     drop(tx);
     database.close().await;
-    let checked = ["migrate", "--check", "--database", &address(&second)].map(str::to_owned);
+    let checked = ["migrate", "--check", "--database", &address_of(&second)].map(str::to_owned);
     let checked = run(checked.to_vec()).await;
     assert_eq!(checked.status.code(), Some(0), "{}", words(&checked));
-    let copied = ["backup", "--to", &dump, "--database", &address(&second)].map(str::to_owned);
+    let copied = ["backup", "--to", &dump, "--database", &address_of(&second)].map(str::to_owned);
     let copied = words(&run(copied.to_vec()).await);
     assert!(copied.contains("docs/postgresql.md"), "{copied}");
 }

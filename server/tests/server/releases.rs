@@ -52,6 +52,18 @@ fn unpack(packed: &Path, into: &Path) {
     fs::write(into, content).unwrap();
 }
 
+/// Writes the database of the present version, with rows in almost every table.
+pub(crate) fn present_database(into: &Path) {
+    let version = env!("CARGO_PKG_VERSION");
+    let packed = fixtures().join(format!("releases/{version}/tread.db.gz"));
+    unpack(&packed, into);
+}
+
+/// Writes a database that lacks migrations.
+pub(crate) fn earlier_database(into: &Path) {
+    unpack(&fixtures().join("state-before-renaming/tread.db.gz"), into);
+}
+
 async fn open(file: &Path) -> SqliteConnection {
     let options = SqliteConnectOptions::new().filename(file);
     options.read_only(true).connect().await.unwrap()
@@ -83,7 +95,7 @@ async fn rows(connection: &mut SqliteConnection) -> BTreeMap<String, i64> {
 async fn make_present(target: &Path) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("tread.db");
-    unpack(&fixtures().join("state-before-renaming/tread.db.gz"), &path);
+    earlier_database(&path);
     let database = Db::open(&path).await.unwrap();
     let mut tx = database.write("test").await.unwrap();
     let restoration = Restoration {

@@ -93,6 +93,26 @@ async fn lists_come_in_pages_without_gaps_or_repetitions() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_terrain_that_is_saved_unchanged_keeps_its_revision() {
+    let yard = Yard::start().await;
+    let polygon = json!([{"x_m": 0, "y_m": 0}, {"x_m": 9, "y_m": 0}, {"x_m": 9, "y_m": 9}]);
+    let lawn = json!({"id": "lawn", "name": "Lawn", "class": "grass", "polygon": polygon});
+    let (status, made) = yard.post("/v1/sites/yard/terrains", &lawn).await;
+    assert_eq!(status, StatusCode::CREATED, "{made}");
+    let replace = async |body: Value| {
+        let request = yard.client().put(yard.url("/v1/sites/yard/terrains/lawn"));
+        let (status, terrain) = yard.send(request.json(&body)).await;
+        assert_eq!(status, StatusCode::OK, "{terrain}");
+        terrain
+    };
+    let same = json!({"name": "Lawn", "class": "grass", "polygon": polygon, "layer": 0});
+    assert_eq!(replace(same).await, made);
+    let higher = json!({"name": "Lawn", "class": "grass", "polygon": polygon, "layer": 1});
+    assert_eq!(replace(higher).await["revision"], 2);
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_robot_shows_with_its_link_and_a_new_terrain_reaches_it() {
     let yard = Yard::start().await;
     let robot = Robot::join(&yard, "rover-1").await;

@@ -263,7 +263,7 @@ async fn sessions_and_join_tokens_end_and_numbers_that_were_given_are_not_given_
         .send(
             yard.client()
                 .put(yard.url("/v1/sites/yard/terrains/lawn"))
-                .json(&json!({"class": "grass", "polygon": square})),
+                .json(&json!({"class": "grass", "polygon": square, "layer": 1})),
         )
         .await;
     assert!(status.is_success(), "{again}");
