@@ -17,6 +17,9 @@ use crate::enroll::{self, EnrollArgs};
 use crate::recording::report::{self, ReplayArgs};
 use crate::recording::salvage::{self, RecoverArgs};
 
+/// Exit code for invalid arguments.
+const USAGE: u8 = 2;
+
 /// Drives one robot and measures the friction of the ground.
 #[derive(Debug, Parser)]
 #[command(name = "tread-agent", version = tread_api::release::long_version(), args_conflicts_with_subcommands = true)]
@@ -57,10 +60,13 @@ pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode 
         Err(message) => {
             // Help and version are printed here too; a failure to print cannot be reported.
             let _ = message.print();
-            return ExitCode::from(u8::try_from(message.exit_code()).unwrap_or(2));
+            return ExitCode::from(u8::try_from(message.exit_code()).unwrap_or(USAGE));
         }
     };
-    init_logging(&words.flags);
+    if let Err(cause) = init_logging(&words.flags) {
+        eprintln!("error: {cause:#}");
+        return ExitCode::from(USAGE);
+    }
     let ended = match words.action {
         Some(Action::Enroll(args)) => run_enroll(args),
         Some(Action::Doctor(args)) => match doctor::run(&args) {
@@ -86,8 +92,14 @@ pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode 
     }
 }
 
-fn init_logging(flags: &Flags) {
-    let filter = EnvFilter::try_new(&flags.log).unwrap_or_else(|_| EnvFilter::new("info"));
+fn init_logging(flags: &Flags) -> anyhow::Result<()> {
+    let log = &flags.log;
+    let filter = EnvFilter::try_new(log);
+    let filter = filter.with_context(|| {
+        format!(
+            "the log filter `{log}` is invalid; give a level, such as `info`, or `info,zenoh=warn`"
+        )
+    })?;
     let subscriber = tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_writer(std::io::stderr)
@@ -100,6 +112,7 @@ fn init_logging(flags: &Flags) {
         LogFormat::Human => subscriber.try_init(),
         LogFormat::Json => subscriber.json().try_init(),
     };
+    Ok(())
 }
 
 fn run_enroll(args: EnrollArgs) -> anyhow::Result<()> {

@@ -13,6 +13,7 @@ use tread_agent::membership::{self, Enrolment, Membership, Trust};
 use tread_api::ids::{RobotId, SiteId};
 use tread_api::robot::LinkState;
 
+use crate::database::FleetDatabase;
 use crate::ports::free_address;
 use crate::process::{Process, Usage};
 use crate::relay::Relay;
@@ -42,6 +43,9 @@ pub struct Fleet {
     /// A `tread-agent` that every agent runs, if it is another one.
     agent_program: Option<PathBuf>,
     folder: TempDir,
+    database: FleetDatabase,
+    /// The same, as the server reaches it.
+    database_of_server: FleetDatabase,
     http: SocketAddr,
     zenoh: SocketAddr,
     server: Option<Process>,
@@ -140,7 +144,8 @@ impl Fleet {
             std::fs::write(&path, text).expect("the temporary folder can be written");
             path
         });
-        let token = first_token(node, folder.path(), config.as_deref(), init);
+        let database = FleetDatabase::of(folder.path());
+        let token = first_token(node, &database, config.as_deref(), init);
         Self {
             rest: Rest::new(format!("http://{http}"), &token),
             token,
@@ -148,6 +153,8 @@ impl Fleet {
             server_node: None,
             agent_program: None,
             folder,
+            database_of_server: database.clone(),
+            database,
             http,
             zenoh,
             server: None,
@@ -274,9 +281,31 @@ impl Fleet {
         &self.token
     }
 
-    /// The database file.
-    pub fn database(&self) -> PathBuf {
-        database(self.folder.path())
+    /// The database.
+    pub fn database(&self) -> &FleetDatabase {
+        &self.database
+    }
+
+    /// The file of the database.
+    ///
+    /// # Panics
+    /// It is a PostgreSQL database.
+    pub fn database_file(&self) -> PathBuf {
+        self.database.file().to_owned()
+    }
+
+    /// Lets the server reach its PostgreSQL database through a relay, by starting it again; `None` if the
+    /// database is a file.
+    ///
+    /// # Panics
+    /// The server does not get ready.
+    pub async fn put_database_behind_relay(&mut self) -> Option<Relay> {
+        let relay = Relay::start(self.database.server()?).await;
+        let relay = relay.expect("a free port");
+        self.database_of_server = self.database.reached_at(relay.address());
+        self.kill_server();
+        self.start_server().await;
+        Some(relay)
     }
 
     /// What the server process has used; `None` when it does not run.
@@ -343,7 +372,7 @@ impl Fleet {
             "server".to_owned(),
             format!("--http={}", self.http),
             format!("--zenoh={}", self.zenoh),
-            format!("--database={}", self.database().display()),
+            format!("--database={}", self.database_of_server.argument()),
             format!("--site={SITE}"),
         ];
         if let Some(config) = &self.config {
@@ -523,16 +552,17 @@ impl Fleet {
     }
 }
 
-fn database(folder: &Path) -> PathBuf {
-    folder.join("tread.db")
-}
-
 /// Makes the database with an admin's token in it, as one does before a server's first start.
-fn first_token(node: &Path, folder: &Path, config: Option<&Path>, flags: &[&str]) -> String {
+fn first_token(
+    node: &Path,
+    database: &FleetDatabase,
+    config: Option<&Path>,
+    flags: &[&str],
+) -> String {
     let made = Command::new(node)
         .args(["server", "init"])
         .args(flags)
-        .arg(format!("--database={}", database(folder).display()))
+        .arg(format!("--database={}", database.argument()))
         .args(config.map(|config| format!("--config={}", config.display())))
         .output()
         .expect("the node can be started");

@@ -1,4 +1,4 @@
-//! A whole fleet under test: real server, real zenoh, real SQLite, simulated robots that run the
+//! A whole fleet under test: real server, real zenoh, a real database, simulated robots that run the
 //! real agent, each in a process of its own, so that any of them can be killed or cut off.
 //!
 //! * [`fleet`]: starts and stops the processes.
@@ -7,6 +7,7 @@
 //! * [`relay`]: a network between robot and server that can be cut.
 //! * [`wait`]: waits for a state with a bound, and says what was seen last.
 //! * [`chaos`]: runs in which things fail at random, from a seed of [`random`].
+//! * [`database`]: the database of a fleet, of either engine.
 //! * [`stored`]: what a database holds of measurements.
 //! * [`scenario`]: fleets in a simulated time, from which figures are read.
 //! * [`collector`]: receives traces as a collector does.
@@ -22,6 +23,9 @@ pub mod bare_router;
 pub mod chaos;
 pub mod collector;
 pub mod damage;
+pub mod database;
+#[path = "../../server/tests/engine/mod.rs"]
+mod engine;
 pub mod fleet;
 pub mod light_robot;
 pub mod markdown;

@@ -1,12 +1,11 @@
 //! What a database holds of measurements, read beside its server.
 
-use std::path::Path;
 use std::time::Duration;
 
-use anyhow::ensure;
-use sqlx::sqlite::SqliteConnectOptions;
-use sqlx::{ConnectOptions as _, Connection as _, Row as _};
+use anyhow::{Context as _, ensure};
 use tokio::time::Instant;
+
+use crate::database::FleetDatabase;
 
 /// Longest wait for the sums of what was uploaded: the server stores them every few seconds.
 const SUMS_WAIT_MAX: Duration = Duration::from_secs(30);
@@ -29,22 +28,19 @@ pub struct Stored {
 ///
 /// # Errors
 /// It cannot be read.
-pub async fn count(database: &Path) -> anyhow::Result<Stored> {
-    let options = SqliteConnectOptions::new().filename(database);
-    let mut connection = options.read_only(true).connect().await?;
-    let row = sqlx::query(
+pub async fn count(database: &FleetDatabase) -> anyhow::Result<Stored> {
+    let rows = database.rows(
         "SELECT count(*), count(*) - count(DISTINCT boot_pk || ':' || seq), \
-         (SELECT coalesce(sum(segments), 0) FROM cell_sums), \
+         (SELECT CAST(coalesce(sum(segments), 0) AS BIGINT) FROM cell_sums), \
          (SELECT count(*) FROM cell_sums) FROM segments",
-    )
-    .fetch_one(&mut connection)
-    .await?;
-    connection.close().await?;
+    );
+    let counted: Option<(i64, i64, i64, i64)> = rows.await?.pop();
+    let (segments, doubles, in_sums, sums) = counted.context("no row of counts")?;
     Ok(Stored {
-        segments: row.try_get(0)?,
-        doubles: row.try_get(1)?,
-        in_sums: row.try_get(2)?,
-        sums: row.try_get(3)?,
+        segments,
+        doubles,
+        in_sums,
+        sums,
     })
 }
 
@@ -52,19 +48,16 @@ pub async fn count(database: &Path) -> anyhow::Result<Stored> {
 ///
 /// # Errors
 /// The database cannot be read, or the numbers differ for too long.
-pub async fn await_sums(database: &Path) -> anyhow::Result<()> {
+pub async fn await_sums(database: &FleetDatabase) -> anyhow::Result<()> {
     let begin = Instant::now();
-    let options = SqliteConnectOptions::new().filename(database);
-    let mut connection = options.read_only(true).connect().await?;
     loop {
-        let row = sqlx::query(
+        let rows = database.rows(
             "SELECT (SELECT count(*) FROM segments), \
-             (SELECT coalesce(sum(segments), 0) FROM cell_sums)",
+             (SELECT CAST(coalesce(sum(segments), 0) AS BIGINT) FROM cell_sums)",
         );
-        let row = row.fetch_one(&mut connection).await?;
-        let (segments, in_sums): (i64, i64) = (row.try_get(0)?, row.try_get(1)?);
+        let counted: Option<(i64, i64)> = rows.await?.pop();
+        let (segments, in_sums) = counted.context("no row of counts")?;
         if segments == in_sums {
-            connection.close().await?;
             return Ok(());
         }
         ensure!(

@@ -397,6 +397,20 @@ async fn an_agent_without_a_server_stops_in_an_orderly_way() {
         .expect("stopped in time");
 }
 
+#[test]
+fn a_log_filter_that_cannot_be_read_is_refused() {
+    let output = Command::new(env!("CARGO_BIN_EXE_tread-agent"))
+        .args(["--log", "info,zenoh=loud", "--site", "yard"])
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(2), "{said}");
+    assert!(
+        said.contains("the log filter `info,zenoh=loud` is invalid"),
+        "{said}"
+    );
+}
+
 fn spawn_process(rig: &Rig, folder: &Path) -> Child {
     Command::new(env!("CARGO_BIN_EXE_tread-agent"))
         .args([

@@ -26,6 +26,9 @@ mod drive;
 #[cfg(test)]
 mod dry_run;
 #[cfg(test)]
+#[path = "../engine/mod.rs"]
+mod engine;
+#[cfg(test)]
 mod events;
 #[cfg(test)]
 mod exports;

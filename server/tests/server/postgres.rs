@@ -2,16 +2,12 @@
 //! `TREAD_TEST_ENGINE=postgres store-postgres/with-postgres cargo nextest run -p tread-server --test server`.
 //! Tests that look into a database file need the other engine.
 
-use std::borrow::Cow;
-use std::hash::{DefaultHasher, Hash as _, Hasher as _};
+use std::env;
 use std::path::Path;
 use std::process::Command;
-use std::{env, thread};
 
 use reqwest::StatusCode;
 use serde_json::json;
-use sqlx::error::DatabaseError;
-use sqlx::{AssertSqlSafe, Connection as _, PgConnection};
 use tokio::io::copy_bidirectional;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::watch;
@@ -25,39 +21,20 @@ use tread_server::db::{self, Db, Location};
 
 use crate::backups::{run, words};
 use crate::drive::{Socket, driven_at};
+use crate::engine;
+pub(crate) use crate::engine::SERVER;
 use crate::harness::{Yard, circle, eventually, measured, segment};
 use crate::robot::Robot;
-
-/// Variable with the engine of the servers: `postgres`, or a file of SQLite.
-const ENGINE: &str = "TREAD_TEST_ENGINE";
-/// Variable with the address of a server on which tests may create databases.
-pub(crate) const SERVER: &str = "TREAD_TEST_POSTGRES";
-/// Code of the error that the database exists.
-const EXISTS: &str = "42P04";
 
 /// Returns the database that belongs to a folder, which is created when it is missing; `None` if the
 /// tests run with SQLite.
 pub(crate) fn database_of(folder: &Path) -> Option<Location> {
-    if env::var(ENGINE).ok()? != "postgres" {
-        return None;
-    }
-    let admin = env::var(SERVER).expect("TREAD_TEST_POSTGRES names a server");
-    Some(created(&admin, folder))
+    engine::address_for(folder).map(Location::Postgres)
 }
 
 /// Returns a new database of a server, named after a folder.
 pub(crate) fn created(admin: &str, folder: &Path) -> Location {
-    let admin = admin.to_owned();
-    let mut hasher = DefaultHasher::new();
-    folder.hash(&mut hasher);
-    let name = format!("tread_server_{:x}", hasher.finish());
-    let (server, _database) = admin.rsplit_once('/').expect("it is an address");
-    let address = format!("{server}/{name}");
-    // Tests make configurations where they cannot wait.
-    thread::spawn(move || create(&admin, &name))
-        .join()
-        .expect("the database is there");
-    Location::Postgres(address)
+    Location::Postgres(engine::created(admin, folder))
 }
 
 /// Returns the address of a database on a server.
@@ -66,26 +43,6 @@ pub(crate) fn address_of(location: &Location) -> String {
         Location::Postgres(address) => address.clone(),
         Location::File(_) => unreachable!("it is one of PostgreSQL"),
     }
-}
-
-fn create(admin: &str, name: &str) {
-    let runtime = tokio::runtime::Builder::new_current_thread()
-        .enable_all()
-        .build()
-        .expect("a runtime");
-    runtime.block_on(async {
-        let mut connection = PgConnection::connect(admin).await.expect("a connection");
-        let statement = AssertSqlSafe(format!("CREATE DATABASE {name}"));
-        let created = sqlx::raw_sql(statement).execute(&mut connection).await;
-        let code = created.err().map(|error| {
-            let code = error.as_database_error().and_then(DatabaseError::code);
-            code.map(Cow::into_owned)
-        });
-        assert!(
-            code.is_none() || code == Some(Some(EXISTS.to_owned())),
-            "{code:?}"
-        );
-    });
 }
 
 /// A relay to the PostgreSQL server that can be cut.

@@ -1,6 +1,6 @@
 //! Random interleavings of everything that can happen to missions, against a simple reference.
 //!
-//! Real use cases, real reconciler, real SQLite; the network and the robots are simulated in this
+//! Real use cases, real reconciler, a real database (SQLite, or PostgreSQL, see [`engine`]); the network and the robots are simulated in this
 //! process, and so is the time. Messages are lost, delayed, doubled and reordered; robots, server
 //! and links go down at any moment. After every step the history that the server wrote is checked
 //! against the reference; at the end of a run the network heals, and every mission must end, with
@@ -8,6 +8,8 @@
 //! was held for that must not be resumed before somebody says so.
 
 mod dice;
+#[path = "../engine/mod.rs"]
+mod engine;
 mod network;
 mod reference;
 mod robot;
@@ -15,7 +17,6 @@ mod safety;
 mod samples;
 
 use std::collections::HashSet;
-use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -33,7 +34,7 @@ use tread_server::app::reconciler::Reconciler;
 use tread_server::app::robot_link::RobotLink;
 use tread_server::app::{App, AppError, Dependencies};
 use tread_server::clock::Clock;
-use tread_server::db::Db;
+use tread_server::db::{Db, Location};
 use tread_server::supervisor::Supervisor;
 
 use self::dice::Dice;
@@ -53,7 +54,7 @@ const HEAL_STEPS: usize = 600;
 struct Storm {
     world: Shared,
     clock: Clock,
-    path: PathBuf,
+    database: Location,
     app: App,
     writer: Writer,
     reconciler: Reconciler,
@@ -63,11 +64,11 @@ struct Storm {
     boots: u64,
 }
 
-async fn app_on(path: &Path, clock: &Clock, site: &SiteId, robots: RobotLink) -> App {
+async fn app_on(database: &Location, clock: &Clock, site: &SiteId, robots: RobotLink) -> App {
     let app = App::new(Dependencies {
         robots,
         ..Dependencies::on_database(
-            Db::open(path).await.expect("the database opens"),
+            Db::open(database).await.expect("the database opens"),
             clock.clone(),
         )
     });
@@ -81,8 +82,9 @@ async fn app_on(path: &Path, clock: &Clock, site: &SiteId, robots: RobotLink) ->
 /// What the server did wrong, with the seed.
 pub(crate) async fn run(seed: u64, steps: usize) -> Result<usize, String> {
     let folder = tempfile::tempdir().map_err(|error| error.to_string())?;
-    let path = folder.path().join("storm.db");
-    let mut storm = Storm::start(seed, path).await;
+    let file = || Location::from(folder.path().join("storm.db"));
+    let database = engine::address_for(folder.path()).map_or_else(file, Location::Postgres);
+    let mut storm = Storm::start(seed, database).await;
     let weathered = storm.weather(steps).await;
     storm
         .supervisor
@@ -94,7 +96,7 @@ pub(crate) async fn run(seed: u64, steps: usize) -> Result<usize, String> {
 }
 
 impl Storm {
-    async fn start(seed: u64, path: PathBuf) -> Self {
+    async fn start(seed: u64, database: Location) -> Self {
         let site: SiteId = "yard".parse().expect("it is an identifier");
         let clock = Clock::manual("2026-11-01T00:00:00Z".parse().expect("it is a time"));
         let robots = (0..ROBOTS).map(|index| {
@@ -111,13 +113,13 @@ impl Storm {
         }));
         let supervisor = Supervisor::new();
         let robots = safety::robot_link(&world, &supervisor);
-        let app = app_on(&path, &clock, &site, robots).await;
+        let app = app_on(&database, &clock, &site, robots).await;
         let mut storm = Self {
             reconciler: Reconciler::new(app.clone()),
             writer: Writer::new(app.clone()),
             world,
             clock,
-            path,
+            database,
             app,
             supervisor,
             reference: Reference::default(),
@@ -366,7 +368,7 @@ impl Storm {
     async fn restart_server(&mut self) {
         self.app.db().close().await;
         let robots = safety::robot_link(&self.world, &self.supervisor);
-        self.app = app_on(&self.path, &self.clock, &self.site, robots).await;
+        self.app = app_on(&self.database, &self.clock, &self.site, robots).await;
         self.writer = Writer::new(self.app.clone());
         self.reconciler = Reconciler::new(self.app.clone());
         for index in 0..ROBOTS {

@@ -2,8 +2,6 @@
 
 use std::path::Path;
 
-use sqlx::ConnectOptions as _;
-use sqlx::sqlite::SqliteConnectOptions;
 use tread_agent::missions::MissionSlot;
 use tread_agent::outbox::{Limits, Outbox};
 use tread_api::ids::{BootId, RobotId};
@@ -11,6 +9,7 @@ use tread_api::mission::{Cause, MissionDetail, MissionState};
 use tread_api::wire::ingest::MissionPhase;
 
 use super::{Followed, RunReport, Violation};
+use crate::database::FleetDatabase;
 use crate::fleet::Fleet;
 
 /// State and cause of a mission's end.
@@ -196,7 +195,7 @@ pub(super) async fn judge_disks(fleet: &Fleet, robot: &RobotId, report: &mut Run
     let mut note = |kind: &'static str, text: String| {
         report.violations.push(Violation { kind, text });
     };
-    match server_side(&fleet.database()).await {
+    match server_side(fleet.database()).await {
         Ok((steps, records)) => {
             if let Some(text) = two_at_once(&steps) {
                 note("two_at_once", text);
@@ -213,22 +212,16 @@ pub(super) async fn judge_disks(fleet: &Fleet, robot: &RobotId, report: &mut Run
 }
 
 /// The history of all missions in its order, and the names of all records that were taken.
-async fn server_side(database: &Path) -> Result<(Vec<Step>, Vec<(String, i64)>), sqlx::Error> {
-    let options = SqliteConnectOptions::new()
-        .filename(database)
-        .read_only(true);
-    let mut db = options.connect().await?;
-    let steps = sqlx::query_as("SELECT mission, to_state FROM mission_events ORDER BY pk")
-        .fetch_all(&mut db)
-        .await?;
-    let records = sqlx::query_as(
+async fn server_side(
+    database: &FleetDatabase,
+) -> Result<(Vec<Step>, Vec<(String, i64)>), sqlx::Error> {
+    let steps = database.rows("SELECT mission, to_state FROM mission_events ORDER BY pk");
+    let records = database.rows(
         "SELECT boots.id, seq FROM (SELECT boot_pk, seq FROM segments UNION ALL
              SELECT boot_pk, seq FROM reports_seen) AS taken
          JOIN boots ON boots.pk = taken.boot_pk ORDER BY boots.id, seq",
-    )
-    .fetch_all(&mut db)
-    .await?;
-    Ok((steps, records))
+    );
+    Ok((steps.await?, records.await?))
 }
 
 /// What of the robot's records is not at the server, or there twice. A process that is killed

@@ -48,6 +48,8 @@ pub struct RunReport {
     pub agent_kills: u64,
     /// How often the network was cut.
     pub cuts: u64,
+    /// How often the network between server and database was cut.
+    pub database_cuts: u64,
     /// Requests to change a mission that were answered.
     pub requests: u64,
     /// What must not have happened.
@@ -73,8 +75,9 @@ struct Followed {
 pub async fn run(node: &Path, seed: u64) -> RunReport {
     let robot: RobotId = "rover-1".parse().expect("it is an identifier");
     let mut fleet = Fleet::start_with(node).await;
+    let database_relay = fleet.put_database_behind_relay().await;
     let relay = fleet.start_agent_behind_relay(&robot, 0.0).await;
-    let plan = RunPlan::new(seed, robot.as_str(), now());
+    let plan = RunPlan::new(seed, robot.as_str(), (now(), database_relay.is_some()));
     let mut report = RunReport {
         seed,
         ..RunReport::default()
@@ -95,6 +98,7 @@ pub async fn run(node: &Path, seed: u64) -> RunReport {
         let mut stage = Stage {
             fleet: &mut fleet,
             relay: &relay,
+            database_relay: database_relay.as_ref(),
             robot: &robot,
             report: &mut report,
             random: &mut random,
@@ -102,6 +106,9 @@ pub async fn run(node: &Path, seed: u64) -> RunReport {
         stage.act(action, &mut followed).await;
     }
     relay.heal();
+    if let Some(relay) = &database_relay {
+        relay.heal();
+    }
     let details = ended(&fleet, &followed).await;
     report.ends = details.iter().map(judge::end_of).collect();
     let memory = robots_memory(&mut fleet, &robot, &details).await;
@@ -135,6 +142,7 @@ async fn send(fleet: &Fleet, body: &Value) -> MissionId {
 struct Stage<'run> {
     fleet: &'run mut Fleet,
     relay: &'run Relay,
+    database_relay: Option<&'run Relay>,
     robot: &'run RobotId,
     report: &'run mut RunReport,
     random: &'run mut Random,
@@ -159,6 +167,12 @@ impl Stage<'_> {
             }
             Action::Heal => self.relay.heal(),
             Action::Reset => self.relay.reset(),
+            Action::CutDatabase => {
+                self.report.database_cuts += 1;
+                self.database_network(Relay::cut);
+            }
+            Action::HealDatabase => self.database_network(Relay::heal),
+            Action::ResetDatabase => self.database_network(Relay::reset),
             Action::Cancel(index) => {
                 // Even an answer that was lost may have been taken.
                 followed[index].is_cancel_asked = true;
@@ -180,6 +194,12 @@ impl Stage<'_> {
         }
     }
 
+    fn database_network(&self, act: impl FnOnce(&Relay)) {
+        if let Some(relay) = self.database_relay {
+            act(relay);
+        }
+    }
+
     async fn request(&mut self, mission: MissionId, verb: &str, body: &Value) {
         let path = format!("/v1/missions/{mission}/{verb}");
         let answer = self.fleet.rest.call(Method::POST, &path, Some(body)).await;
@@ -187,7 +207,9 @@ impl Stage<'_> {
             return;
         };
         self.report.requests += 1;
-        let is_fair = status.is_success() || status == reqwest::StatusCode::CONFLICT;
+        let is_away =
+            self.database_relay.is_some() && status == reqwest::StatusCode::SERVICE_UNAVAILABLE;
+        let is_fair = status.is_success() || status == reqwest::StatusCode::CONFLICT || is_away;
         if !is_fair {
             self.report.violations.push(Violation {
                 kind: "policy",

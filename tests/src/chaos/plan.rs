@@ -42,6 +42,10 @@ pub(super) enum Action {
     Heal,
     /// Every connection is reset, and new ones do not pass while it is cut.
     Reset,
+    /// The same between the server and its database.
+    CutDatabase,
+    HealDatabase,
+    ResetDatabase,
     Cancel(usize),
     Pause(usize),
     Resume(usize),
@@ -94,8 +98,13 @@ fn asked(random: &mut Random, robot: &str, now: jiff::Timestamp) -> Asked {
 }
 
 impl RunPlan {
-    /// The run of a seed; `now` is what latest starts are counted from.
-    pub(super) fn new(seed: u64, robot: &str, now: jiff::Timestamp) -> Self {
+    /// The run of a seed; `now` is what latest starts are counted from. The network to the database fails
+    /// too if it has one.
+    pub(super) fn new(
+        seed: u64,
+        robot: &str,
+        (now, has_database_network): (jiff::Timestamp, bool),
+    ) -> Self {
         let mut random = Random::new(seed);
         let missions = (0..MISSIONS)
             .map(|_| asked(&mut random, robot, now))
@@ -132,6 +141,20 @@ impl RunPlan {
             }
             // Whatever was paused is to end.
             actions.push((BREAKING + Duration::from_secs(5), Action::Resume(mission)));
+        }
+        if has_database_network {
+            // Nothing else differs from the run of this seed on a file.
+            let mut random = Random::new(!seed);
+            let (from_s, for_s) = (
+                random.between(0.0..BREAKING.as_secs_f64()),
+                random.between(0.05..AWAY_MAX_S),
+            );
+            let at = Duration::from_secs_f64;
+            actions.push((at(from_s), Action::CutDatabase));
+            actions.push((at(from_s + for_s), Action::HealDatabase));
+            if random.chance(0.5) {
+                actions.push((at(from_s + for_s * random.share()), Action::ResetDatabase));
+            }
         }
         actions.sort_by_key(|(at, _)| *at);
         Self { missions, actions }

@@ -137,7 +137,7 @@ async fn until_killed(
         working.spawn(work.go_on(fleet.zenoh_endpoint(), receipts.clone()));
     }
     drop(receipts);
-    enough(&fleet.database(), &mut received).await;
+    enough(&fleet.database_file(), &mut received).await;
     fleet.kill_server();
     drop(received);
     let mut works = working.join_all().await;
@@ -201,7 +201,7 @@ async fn a_server_that_is_killed_between_receipts_and_sums_says_the_same_to_the_
         receive(received, RECEIPTS).await;
     })
     .await;
-    let left = stored::count(&fleet.database()).await.unwrap();
+    let left = stored::count(fleet.database()).await.unwrap();
     assert!(left.in_sums < left.segments, "{left:?}");
 
     // After some were stored, and before all were.
@@ -214,7 +214,7 @@ async fn a_server_that_is_killed_between_receipts_and_sums_says_the_same_to_the_
         receive(received, RECEIPTS).await;
     })
     .await;
-    let left = stored::count(&fleet.database()).await.unwrap();
+    let left = stored::count(fleet.database()).await.unwrap();
     assert!(left.in_sums > 0 && left.in_sums < left.segments, "{left:?}");
 
     // At once after the start, before it has stored what followed the watermarks.
@@ -238,7 +238,7 @@ async fn a_server_that_is_killed_between_receipts_and_sums_says_the_same_to_the_
     fleet.start_server().await;
     let of_killed = map(&fleet, begin).await;
     fleet.stop_server().await.unwrap();
-    let left = stored::count(&fleet.database()).await.unwrap();
+    let left = stored::count(fleet.database()).await.unwrap();
     let all = i64::try_from(BATCHES * RECORDS_PER_BATCH).unwrap() * i64::try_from(ROBOTS).unwrap();
     assert_eq!(
         (left.segments, left.doubles),
@@ -260,7 +260,7 @@ async fn a_server_that_is_killed_between_receipts_and_sums_says_the_same_to_the_
     }
     assert_eq!(map(&other, begin).await, of_killed, "to the bit");
     assert_eq!(of_killed.len(), 37);
-    await_sums(&other.database()).await.unwrap();
-    let expected = sums(&other.database()).await;
-    assert_eq!(sums(&fleet.database()).await, expected, "to the bit");
+    await_sums(other.database()).await.unwrap();
+    let expected = sums(&other.database_file()).await;
+    assert_eq!(sums(&fleet.database_file()).await, expected, "to the bit");
 }

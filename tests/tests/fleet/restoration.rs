@@ -38,8 +38,8 @@ async fn server_command(arguments: Vec<String>) {
 
 /// The sums of a database, each as one text, sorted, once all segments are in them.
 async fn sums(fleet: &Fleet) -> Vec<String> {
-    await_sums(&fleet.database()).await.unwrap();
-    let options = SqliteConnectOptions::new().filename(fleet.database());
+    await_sums(fleet.database()).await.unwrap();
+    let options = SqliteConnectOptions::new().filename(fleet.database_file());
     let mut connection = options.read_only(true).connect().await.unwrap();
     let columns: Vec<&str> = SUMS.split(", ").map(str::trim).collect();
     let quoted: Vec<String> = columns
@@ -123,7 +123,7 @@ async fn robots_and_a_restored_server_agree_again_and_nothing_is_done_twice() {
     let look = || segments(&fleet);
     eventually("it measures", DRIVE, look, |found| found.len() > 2).await;
     let target = fleet.file("backup.tar").display().to_string();
-    let database = format!("--database={}", fleet.database().display());
+    let database = format!("--database={}", fleet.database_file().display());
     server_command(vec![
         "backup".to_owned(),
         database.clone(),

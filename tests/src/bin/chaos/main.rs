@@ -5,6 +5,9 @@
 //! policies of their own, requests to cancel, pause, resume and replace them, `kill -9` of either
 //! process, and cuts of the network, silent or with a reset. A seed that fails is printed with all
 //! that is known, and `--seed` runs it alone.
+//!
+//! With `TREAD_TEST_ENGINE=postgres store-postgres/with-postgres` before it, the server has a PostgreSQL
+//! database, and the network between both is cut too.
 
 use std::collections::BTreeMap;
 use std::io::Write;
@@ -44,6 +47,7 @@ struct Details {
     server_kills: u64,
     agent_kills: u64,
     cuts: u64,
+    database_cuts: u64,
     requests: u64,
     ends: BTreeMap<String, u64>,
     failures: Vec<RunReport>,
@@ -109,6 +113,7 @@ fn tell(arguments: &Arguments, reports: Vec<RunReport>, broken: u64) -> anyhow::
         server_kills: total(|report| report.server_kills),
         agent_kills: total(|report| report.agent_kills),
         cuts: total(|report| report.cuts),
+        database_cuts: total(|report| report.database_cuts),
         requests: total(|report| report.requests),
         ends,
         failures: reports
@@ -117,11 +122,12 @@ fn tell(arguments: &Arguments, reports: Vec<RunReport>, broken: u64) -> anyhow::
             .collect(),
     };
     let words = format!(
-        "{} missions, {} server kills, {} agent kills, {} cuts, {} requests; ends: {:?}\n",
+        "{} missions, {} server kills, {} agent kills, {} cuts, {} of the database, {} requests; ends: {:?}\n",
         details.missions,
         details.server_kills,
         details.agent_kills,
         details.cuts,
+        details.database_cuts,
         details.requests,
         details.ends
     );

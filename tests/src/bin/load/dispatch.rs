@@ -136,7 +136,7 @@ pub(crate) async fn send_missions(
         Some(collector) => parts(&sent, collector).await?,
         None => Vec::new(),
     };
-    let mut fsyncs_ms = fsyncs_ms(&fleet.database())?;
+    let mut fsyncs_ms = fsyncs_ms(&fleet.file("tread.db"))?;
     #[expect(clippy::cast_precision_loss, reason = "microseconds far below 2^53")]
     let quantile_ms = |quantile: f64| latencies_us.value_at_quantile(quantile) as f64 / 1e3;
     Ok(Dispatch {

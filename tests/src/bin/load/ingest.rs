@@ -1,6 +1,5 @@
 //! Segments per second, with receipts, and whether each acknowledged one is stored exactly once.
 
-use std::path::PathBuf;
 use std::time::Duration;
 
 use anyhow::{Context, ensure};
@@ -9,6 +8,7 @@ use nix::sys::statfs::{TMPFS_MAGIC, statfs};
 use serde::Serialize;
 use tokio::task::JoinSet;
 use tokio::time::{Instant, MissedTickBehavior};
+use tread_tests::database::FleetDatabase;
 use tread_tests::fleet::Fleet;
 use tread_tests::light_robot::LightRobot;
 use tread_tests::process::{Usage, usage_of};
@@ -67,7 +67,7 @@ pub(crate) trait Server {
     /// What its process has used; `None` when it is gone.
     fn usage(&self) -> Option<Usage>;
     /// Its database.
-    fn database(&self) -> PathBuf;
+    fn database(&self) -> FleetDatabase;
 }
 
 impl Server for Fleet {
@@ -75,8 +75,8 @@ impl Server for Fleet {
         self.server_usage()
     }
 
-    fn database(&self) -> PathBuf {
-        Self::database(self)
+    fn database(&self) -> FleetDatabase {
+        Self::database(self).clone()
     }
 }
 
@@ -147,7 +147,7 @@ pub(crate) async fn measure(
         counted_twice: (stored.in_sums - stored.segments).unsigned_abs()
             + stored.doubles.cast_unsigned(),
         sums_per_robot: figure(stored.sums.cast_unsigned()) / figure(robots_count as u64),
-        is_on_disk: statfs(&database)?.filesystem_type() != TMPFS_MAGIC,
+        is_on_disk: statfs(&database.folder())?.filesystem_type() != TMPFS_MAGIC,
         server: used,
         generator,
     })

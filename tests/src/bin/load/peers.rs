@@ -8,6 +8,7 @@ use anyhow::Context as _;
 use serde::{Deserialize, Serialize};
 use tempfile::TempDir;
 use tread_api::wire::{self, hello::Welcome};
+use tread_tests::database::FleetDatabase;
 use tread_tests::ports::free_address;
 use tread_tests::process::{Process, Usage};
 use tread_tests::wait::{SHORT, eventually};
@@ -103,7 +104,7 @@ impl Server for PythonService {
         self.process.usage()
     }
 
-    fn database(&self) -> PathBuf {
-        database(&self.folder)
+    fn database(&self) -> FleetDatabase {
+        FleetDatabase::File(database(&self.folder))
     }
 }

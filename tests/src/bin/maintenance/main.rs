@@ -162,7 +162,7 @@ fn size_of(path: &Path) -> u64 {
 }
 
 fn log_of(fleet: &Fleet) -> PathBuf {
-    let mut name = fleet.database().into_os_string();
+    let mut name = fleet.database_file().into_os_string();
     name.push("-wal");
     name.into()
 }
@@ -211,7 +211,7 @@ async fn measure_backup(
     let log = log_of(fleet);
     let (before, before_s) = during(&uploads, Duration::from_secs(arguments.seconds)).await;
     details.log_before_mib = mib(size_of(&log));
-    details.database_mib = mib(size_of(&fleet.database()));
+    details.database_mib = mib(size_of(&fleet.database_file()));
     eprintln!("the backup of {:.0} MiB", details.database_mib);
     let watch = Watch::start(log.clone());
     let target = fleet.file("backup.tar");
@@ -219,7 +219,7 @@ async fn measure_backup(
     command
         .args(["server", "backup", "--quiet", "--to"])
         .arg(&target);
-    command.arg("--database").arg(fleet.database());
+    command.arg("--database").arg(fleet.database_file());
     let begin = Instant::now();
     let ended = tokio::task::spawn_blocking(move || command.output()).await??;
     let took_s = begin.elapsed().as_secs_f64();
@@ -246,10 +246,10 @@ async fn measure_backup(
     details.server_memory_peak_mib = mib(usage.memory_peak_bytes);
     let ratio = details.receipt_p99_during_ms / details.receipt_p99_before_ms;
     // Sums are stored behind the receipts. A difference that stays is counted below.
-    if let Err(error) = stored::await_sums(&fleet.database()).await {
+    if let Err(error) = stored::await_sums(fleet.database()).await {
         eprintln!("{error}");
     }
-    let stored = stored::count(&fleet.database()).await?;
+    let stored = stored::count(fleet.database()).await?;
     checks.extend([
         Check::of("p99 of receipts during the backup / before", ratio).at_most(RECEIPT_RATIO_MAX),
         Check::of(
@@ -287,7 +287,7 @@ async fn grow(arguments: &Arguments, fleet: &Fleet, uploads: &Uploads) -> anyhow
     eprintln!("filling the database");
     uploads.set_rate(GROWTH_FACTOR * f64::from(arguments.segments_per_second))?;
     let begin = Instant::now();
-    while mib(size_of(&fleet.database())) < f64::from(arguments.megabytes) {
+    while mib(size_of(&fleet.database_file())) < f64::from(arguments.megabytes) {
         ensure!(begin.elapsed() < GROWTH_MAX, "the database does not grow");
         tokio::time::sleep(LOOK_EVERY).await;
     }
@@ -313,7 +313,7 @@ async fn measure_restoration(
     command
         .args(["server", "restore", "--force", "--from"])
         .arg(backup);
-    command.arg("--database").arg(fleet.database());
+    command.arg("--database").arg(fleet.database_file());
     let begin = Instant::now();
     let ended = tokio::task::spawn_blocking(move || command.output()).await??;
     details.restore_s = begin.elapsed().as_secs_f64();
@@ -435,7 +435,7 @@ impl Away {
 
 /// The numbers of a run's records have no gap: what is missing was lost.
 async fn missing_records(fleet: &Fleet) -> anyhow::Result<u64> {
-    let options = SqliteConnectOptions::new().filename(fleet.database());
+    let options = SqliteConnectOptions::new().filename(fleet.database_file());
     let mut connection = options.read_only(true).connect().await?;
     let rows = sqlx::query(
         "SELECT COUNT(*), MAX(seq) + 1 FROM (
