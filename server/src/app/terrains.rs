@@ -77,7 +77,7 @@ impl App {
     }
 
     /// Replaces all of a terrain except its identifier. A request that changes nothing makes no new
-    /// revision: measurements would be told apart that were made on the same ground.
+    /// revision: measurements on the same ground belong together.
     pub async fn replace_terrain(
         &self,
         site: &SiteId,

@@ -184,7 +184,8 @@ async fn a_server_goes_on_in_postgresql_where_it_ended_in_a_file() {
         "{copied:?}"
     );
     let robot = Robot::join(&yard, "rover-1").await;
-    yard.mission_becomes(mission.id, MissionState::Active).await;
+    let copied = yard.mission(mission.id).await.mission;
+    assert_eq!(copied.trajectory, mission.trajectory);
     // Keys go on after those of the file.
     robot.upload(records(101)).await.unwrap();
     let other = Robot::join(&yard, "rover-2").await;
