@@ -9,7 +9,7 @@ use tracing_subscriber::util::SubscriberInitExt as _;
 use crate::config::{LogFormat, ServerArgs};
 
 /// Default log filter, without `--log` and `RUST_LOG`.
-const FILTER_DEFAULT: &str = "info,zenoh=warn,zenoh_transport=warn";
+const FILTER_DEFAULT: &str = "info,sqlx=warn,zenoh=warn,zenoh_transport=warn";
 
 /// Starts logging for the whole process; a second call has no effect.
 ///

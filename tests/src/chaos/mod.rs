@@ -155,7 +155,12 @@ impl Stage<'_> {
                 self.report.server_kills += 1;
                 self.fleet.kill_server();
             }
-            Action::StartServer => self.fleet.start_server().await,
+            Action::StartServer => {
+                // A server that does not reach its database at its start ends, and its service manager
+                // starts it until it does.
+                self.database_network(Relay::heal);
+                self.fleet.start_server().await;
+            }
             Action::KillAgent => {
                 self.report.agent_kills += 1;
                 self.fleet.kill_agent(self.robot);
