@@ -27,7 +27,7 @@ forward! {
     fn tables() -> Vec<Table>;
     fn count(table: &Table) -> u64;
     fn rows(table: &Table, after: Option<&[Value]>, limit: u32) -> Vec<Row>;
-    fn lift_bounds() -> ();
+    fn disable_timeouts() -> ();
     fn clear(table: &Table) -> ();
     fn insert(table: &Table, rows: &[Row]) -> ();
     fn finish(tables: &[Table]) -> ();
@@ -154,7 +154,7 @@ pub async fn copy(
         return Err(CopyError::Damaged(found));
     }
     let mut source = from.read("copy").await.map_err(&reading)?;
-    lift_bounds(&mut source).await.map_err(&reading)?;
+    disable_timeouts(&mut source).await.map_err(&reading)?;
     let read_tables = tables(&mut source).await.map_err(&reading)?;
     let tx = to.write("copy").await.map_err(&writing)?;
     let mut target = Target {
@@ -162,7 +162,7 @@ pub async fn copy(
         tx,
         uncommitted: 0,
     };
-    lift_bounds(&mut target.tx).await.map_err(&writing)?;
+    disable_timeouts(&mut target.tx).await.map_err(&writing)?;
     let written_tables = tables(&mut target.tx).await.map_err(&writing)?;
     for (read, written) in read_tables.iter().zip(&written_tables) {
         if !written.takes_rows_of(read) {

@@ -6,7 +6,7 @@ use sqlx::{AssertSqlSafe, Postgres, Row as _};
 use tread_store::transfer::{Column, ColumnType, Row, Table, Value};
 
 use super::copy_rows::CopyRows;
-use super::{Connection, EngineError, corrupt};
+use super::{Connection, EngineError, column_names, corrupt};
 
 /// Returns the columns of a table; none if the table does not exist.
 pub(super) async fn columns(db: &mut Connection, table: &str) -> Result<Vec<Column>, EngineError> {
@@ -35,13 +35,6 @@ pub(super) async fn columns(db: &mut Connection, table: &str) -> Result<Vec<Colu
         })
     });
     columns.collect()
-}
-
-/// Returns the quoted names of some columns.
-pub(super) fn names(table: &Table, places: &[usize]) -> String {
-    let names = places.iter().map(|place| &table.columns[*place].name);
-    let quoted: Vec<String> = names.map(|name| format!(r#""{name}""#)).collect();
-    quoted.join(", ")
 }
 
 /// Binds a value of a primary key to the next place of a statement.
@@ -115,7 +108,7 @@ pub async fn insert(db: &mut Connection, table: &Table, rows: &[Row]) -> Result<
     let statement = format!(
         r#"COPY "{}" ({}) FROM STDIN (FORMAT binary)"#,
         table.name,
-        names(table, &all)
+        column_names::quoted(table, &all)
     );
     copied.write(db, &statement).await.map(|_written| ())
 }
@@ -142,12 +135,12 @@ fn place(table: &Table, row: &Row, column: &str) -> String {
     format!("column {column} of {name}, row {key:?}")
 }
 
-/// Lifts the time limits of statements and of pauses between them, until the transaction ends: a copy
-/// waits for the other database, and its size has no limit.
+/// Disables the timeouts of statements and of idle transactions until the transaction ends: a copy waits
+/// for the other database, and its size has no limit.
 ///
 /// # Errors
 /// The database failed.
-pub async fn lift_bounds(db: &mut Connection) -> Result<(), EngineError> {
+pub async fn disable_timeouts(db: &mut Connection) -> Result<(), EngineError> {
     for statement in [
         "SET LOCAL statement_timeout = 0",
         "SET LOCAL idle_in_transaction_session_timeout = 0",

@@ -10,6 +10,8 @@ pub mod alerts;
 pub mod attendance;
 #[path = "../../store/sql/audit.rs"]
 pub mod audit;
+#[path = "../../store/sql/column_names.rs"]
+mod column_names;
 mod connections;
 pub mod copy;
 #[path = "../../store/sql/deferred_segments.rs"]

@@ -6,7 +6,7 @@ use sqlx::{Row as _, Sqlite, TypeInfo as _, ValueRef as _};
 use tread_store::transfer::{Column, ColumnType, Row, Table, Value};
 
 use super::rows::RowsStatement;
-use super::{Connection, EngineError, corrupt};
+use super::{Connection, EngineError, column_names, corrupt};
 
 /// Returns the columns of a table; none if the table does not exist.
 pub(super) async fn columns(db: &mut Connection, table: &str) -> Result<Vec<Column>, EngineError> {
@@ -31,13 +31,6 @@ pub(super) async fn columns(db: &mut Connection, table: &str) -> Result<Vec<Colu
         })
     });
     columns.collect()
-}
-
-/// Returns the quoted names of some columns.
-pub(super) fn names(table: &Table, places: &[usize]) -> String {
-    let names = places.iter().map(|place| &table.columns[*place].name);
-    let quoted: Vec<String> = names.map(|name| format!(r#""{name}""#)).collect();
-    quoted.join(", ")
 }
 
 /// Binds a value to the next place of a statement.
@@ -84,7 +77,11 @@ pub(super) fn decode(row: &SqliteRow, table: &Table) -> Result<Row, EngineError>
 /// The database failed, for instance because a row is stored already.
 pub async fn insert(db: &mut Connection, table: &Table, rows: &[Row]) -> Result<(), EngineError> {
     let all: Vec<usize> = (0..table.columns.len()).collect();
-    let into = format!(r#"INSERT INTO "{}" ({})"#, table.name, names(table, &all));
+    let into = format!(
+        r#"INSERT INTO "{}" ({})"#,
+        table.name,
+        column_names::quoted(table, &all)
+    );
     let statement = RowsStatement::new(&into, all.len(), "");
     let writing = statement.execute(db, rows, |bound, row| {
         for value in row {
@@ -101,11 +98,11 @@ pub async fn insert(db: &mut Connection, table: &Table, rows: &[Row]) -> Result<
     writing.await.map(|_written| ())
 }
 
-/// Does nothing: statements of SQLite have no time limits.
+/// Does nothing: statements of SQLite have no timeouts.
 ///
 /// # Errors
 /// None.
-pub async fn lift_bounds(_db: &mut Connection) -> Result<(), EngineError> {
+pub async fn disable_timeouts(_db: &mut Connection) -> Result<(), EngineError> {
     Ok(())
 }
 

@@ -7,9 +7,8 @@ use std::sync::Arc;
 use sqlx::AssertSqlSafe;
 pub use tread_store::transfer::{Row, TABLES, Table, Value};
 
-use super::transfer_rows::{self, names};
-pub use super::transfer_rows::{finish, insert, lift_bounds};
-use super::{Connection, EngineError, corrupt, unsigned};
+pub use super::transfer_rows::{disable_timeouts, finish, insert};
+use super::{Connection, EngineError, column_names, corrupt, transfer_rows, unsigned};
 
 /// Returns the tables that a copy contains, in the order of [`TABLES`].
 ///
@@ -56,7 +55,8 @@ pub async fn rows(
     limit: u32,
 ) -> Result<Vec<Row>, EngineError> {
     let all: Vec<usize> = (0..table.columns.len()).collect();
-    let (columns, key) = (names(table, &all), names(table, &table.key()));
+    let columns = column_names::quoted(table, &all);
+    let key = column_names::quoted(table, &table.key());
     let condition = after.map_or_else(String::new, |after| {
         let places: Vec<String> = (1..=after.len()).map(|place| format!("${place}")).collect();
         format!("WHERE ({key}) > ({})", places.join(", "))
