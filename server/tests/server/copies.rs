@@ -1,7 +1,6 @@
 //! `tread-server copy`: everything that a database holds is in the copy, of either engine, and a server
 //! goes on with it.
 
-use std::env;
 use std::path::Path;
 
 use tread_api::friction::StoredSegment;
@@ -11,7 +10,7 @@ use tread_server::db::Location;
 
 use crate::backups::{run, words};
 use crate::harness::{Yard, eventually, measured, segment};
-use crate::postgres::{SERVER, address_of, created};
+use crate::postgres::{address_of, created, server_of_tests};
 use crate::releases::present_database;
 use crate::robot::Robot;
 
@@ -124,8 +123,7 @@ async fn a_database_that_a_server_uses_or_that_is_older_is_not_copied() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_rows_of_a_release_are_the_same_in_postgresql_and_back_in_a_file() {
-    let Ok(admin) = env::var(SERVER) else {
-        eprintln!("this test was NOT RUN: {SERVER} names no PostgreSQL server");
+    let Some(admin) = server_of_tests() else {
         return;
     };
     let folder = tempfile::tempdir().unwrap();
@@ -149,8 +147,7 @@ async fn the_rows_of_a_release_are_the_same_in_postgresql_and_back_in_a_file() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_server_goes_on_in_postgresql_where_it_ended_in_a_file() {
-    let Ok(admin) = env::var(SERVER) else {
-        eprintln!("this test was NOT RUN: {SERVER} names no PostgreSQL server");
+    let Some(admin) = server_of_tests() else {
         return;
     };
     let folder = tempfile::tempdir().unwrap();

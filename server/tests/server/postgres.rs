@@ -32,6 +32,16 @@ pub(crate) fn database_of(folder: &Path) -> Option<Location> {
     engine::address_for(folder).map(Location::Postgres)
 }
 
+/// Returns the address of the server on which tests create databases; `None`, which it reports, without
+/// one.
+pub(crate) fn server_of_tests() -> Option<String> {
+    let server = env::var(SERVER).ok();
+    if server.is_none() {
+        eprintln!("this test was NOT RUN: {SERVER} names no PostgreSQL server");
+    }
+    server
+}
+
 /// Returns a new database of a server, named after a folder.
 pub(crate) fn created(admin: &str, folder: &Path) -> Location {
     Location::Postgres(engine::created(admin, folder))
@@ -82,8 +92,7 @@ impl Relay {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn robots_are_driven_and_stopped_while_postgresql_is_away_and_nothing_acknowledged_is_lost() {
-    let Ok(admin) = env::var(SERVER) else {
-        eprintln!("this test was NOT RUN: {SERVER} names no PostgreSQL server");
+    let Some(admin) = server_of_tests() else {
         return;
     };
     let folder = tempfile::tempdir().unwrap();
@@ -161,8 +170,7 @@ fn tool(name: &str, arguments: &[&str]) {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_dump_is_restored_into_another_database_and_holds_the_robots_once_it_is_marked() {
-    let Ok(admin) = env::var(SERVER) else {
-        eprintln!("this test was NOT RUN: {SERVER} names no PostgreSQL server");
+    let Some(admin) = server_of_tests() else {
         return;
     };
     let folder = tempfile::tempdir().unwrap();
