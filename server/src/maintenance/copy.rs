@@ -83,6 +83,9 @@ pub(crate) async fn run(args: CopyArgs) -> anyhow::Result<()> {
     );
     let locked_to = DatabaseLock::take(&to).await;
     let locked_to = locked_to.with_context(|| format!("cannot have `{to}` alone"))?;
+    if !quiet {
+        eprintln!("checking `{from}`");
+    }
     let copying = async {
         let source = Db::open(&from).await?;
         let copied = match &to {
