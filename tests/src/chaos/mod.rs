@@ -230,7 +230,17 @@ async fn ended(fleet: &Fleet, followed: &[Followed]) -> Vec<MissionDetail> {
     loop {
         let mut details: Vec<MissionDetail> = Vec::new();
         for mission in followed {
-            details.push(fleet.rest.mission(mission.id).await);
+            let path = format!("/v1/missions/{}", mission.id);
+            let answer = fleet.rest.call(Method::GET, &path, None).await;
+            let Some((status, body)) = answer.filter(|(status, _)| status.is_success()) else {
+                panic!(
+                    "no mission from the server, which has ended: {}: {:#?}",
+                    fleet.has_server_ended(),
+                    fleet.log_tail("server")
+                );
+            };
+            let detail = serde_json::from_value(body);
+            details.push(detail.unwrap_or_else(|error| panic!("{status}: {error}")));
         }
         let all_ended = details
             .iter()
