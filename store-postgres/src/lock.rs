@@ -3,7 +3,8 @@
 //! PostgreSQL serves any number of programs, but a server keeps the map in memory and alone decides what
 //! its robots do. The lock belongs to a connection of its own, and PostgreSQL releases it when that ends,
 //! as at its restart: it is taken again then, and [`DatabaseLock::lost`] returns only if
-//! another server was faster. Programs that only read do not take it.
+//! another server was faster. After a network failure PostgreSQL may still have the old session, which is
+//! ended first: a server does not stop because of itself. Programs that only read do not take the lock.
 
 use std::future::pending;
 use std::time::Duration;
@@ -12,7 +13,7 @@ use sqlx::PgConnection;
 use sqlx::postgres::PgConnectOptions;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
-use tokio::time::{sleep, timeout};
+use tokio::time::{Instant, sleep, timeout};
 use tracing::warn;
 
 use super::{OpenError, connections, open};
@@ -21,11 +22,17 @@ use super::{OpenError, connections, open};
 const LOOK_INTERVAL: Duration = Duration::from_secs(2);
 /// Maximum time for an answer about it.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
+/// Interval at which the lock is tried while a session ends that holds it.
+const ENDING_INTERVAL: Duration = Duration::from_millis(100);
 /// Takes the lock, whose number is "treadsrv" in ASCII. PostgreSQL ends the connection of a machine that
 /// does not answer any more after 25 s, and with it the lock.
 const TAKE: &str = "SELECT pg_try_advisory_lock(8390880524716175990),
     set_config('tcp_keepalives_idle', '10', FALSE), set_config('tcp_keepalives_interval', '5', FALSE),
-    set_config('tcp_keepalives_count', '3', FALSE)";
+    set_config('tcp_keepalives_count', '3', FALSE), pg_backend_pid(),
+    (SELECT CAST(backend_start AS TEXT) FROM pg_stat_activity WHERE pid = pg_backend_pid())";
+/// Ends a session, and returns whether it was there. Another one with its process number is spared.
+const END_SESSION: &str = "SELECT pg_terminate_backend(pid) FROM pg_stat_activity
+    WHERE pid = $1 AND CAST(backend_start AS TEXT) = $2";
 /// Says who has it: address of the client, and since when it is connected.
 const IN_USE_BY: &str = "SELECT COALESCE(host(client_addr), 'this machine'),
         to_char(backend_start AT TIME ZONE 'UTC', 'YYYY-MM-DD HH24:MI:SS')
@@ -34,6 +41,9 @@ const IN_USE_BY: &str = "SELECT COALESCE(host(client_addr), 'this machine'),
         AND database = (SELECT oid FROM pg_database WHERE datname = current_database())
         AND (CAST(classid AS BIGINT) << 32) | CAST(objid AS BIGINT) = 8390880524716175990
     LIMIT 1";
+
+/// A session of PostgreSQL: the number of its process, and when it began.
+type Session = (i32, String);
 
 /// Reason why a server may not use a database.
 #[derive(Debug, thiserror::Error)]
@@ -69,14 +79,14 @@ impl DatabaseLock {
     /// [`LockError::InUse`] says who holds the lock; [`LockError::Open`].
     pub async fn take(url: &str) -> Result<Self, LockError> {
         let (options, address) = open::options_of(url).map_err(LockError::Open)?;
-        let connection = locked(&options, &address).await?;
+        let locked = locked(&options, &address).await?;
         let (losing, lost) = watch::channel(None);
         #[expect(
             clippy::disallowed_methods,
             reason = "ends with the lock, which aborts it; the lock outlives all other tasks of a server"
         )]
         let keeping = tokio::spawn(async move {
-            let in_use = keep(connection, &options, &address).await;
+            let in_use = keep(locked, &options, &address).await;
             losing.send_replace(Some(in_use.to_string()));
         });
         Ok(Self { keeping, lost })
@@ -112,7 +122,7 @@ impl Drop for DatabaseLock {
 /// Looks whether the lock is held, and takes it again when its connection was lost. Returns when
 /// another server has it.
 async fn keep(
-    mut connection: PgConnection,
+    (mut connection, mut session): (PgConnection, Session),
     options: &PgConnectOptions,
     address: &str,
 ) -> LockError {
@@ -123,9 +133,9 @@ async fn keep(
             continue;
         }
         warn!("the connection that holds the lock of the database is lost");
-        connection = loop {
-            match locked(options, address).await {
-                Ok(connection) => break connection,
+        (connection, session) = loop {
+            match locked_again(options, address, &session).await {
+                Ok(locked) => break locked,
                 Err(in_use @ LockError::InUse { .. }) => return in_use,
                 // PostgreSQL is away, as every transaction notices too.
                 Err(LockError::Open(_)) => sleep(LOOK_INTERVAL).await,
@@ -134,14 +144,51 @@ async fn keep(
     }
 }
 
+/// Takes the lock again after this process lost its connection. PostgreSQL may not have noticed the loss:
+/// the session of that connection is ended if it still has the lock.
+async fn locked_again(
+    options: &PgConnectOptions,
+    address: &str,
+    lost: &Session,
+) -> Result<(PgConnection, Session), LockError> {
+    let in_use = match locked(options, address).await {
+        Err(in_use @ LockError::InUse { .. }) => in_use,
+        locked @ (Ok(_) | Err(LockError::Open(_))) => return locked,
+    };
+    let refused = |cause| LockError::Open(open::refused(address, cause));
+    let mut connection = connections::connect(options).await.map_err(refused)?;
+    let ending: Option<(bool,)> = sqlx::query_as(END_SESSION)
+        .bind(lost.0)
+        .bind(&lost.1)
+        .fetch_optional(&mut connection)
+        .await
+        .map_err(refused)?;
+    if ending.is_none() {
+        return Err(in_use);
+    }
+    let began = Instant::now();
+    loop {
+        match locked(options, address).await {
+            Err(LockError::InUse { .. }) if began.elapsed() < ANSWER_TIMEOUT => {
+                sleep(ENDING_INTERVAL).await;
+            }
+            locked => return locked,
+        }
+    }
+}
+
 /// Opens a connection that holds the lock.
-async fn locked(options: &PgConnectOptions, address: &str) -> Result<PgConnection, LockError> {
+async fn locked(
+    options: &PgConnectOptions,
+    address: &str,
+) -> Result<(PgConnection, Session), LockError> {
+    type Taken = (bool, String, String, String, i32, String);
     let refused = |cause| LockError::Open(open::refused(address, cause));
     let mut connection = connections::connect(options).await.map_err(refused)?;
     let taking = sqlx::query_as(TAKE).fetch_one(&mut connection).await;
-    let (is_taken, _, _, _): (bool, String, String, String) = taking.map_err(refused)?;
+    let (is_taken, _, _, _, process, since): Taken = taking.map_err(refused)?;
     if is_taken {
-        return Ok(connection);
+        return Ok((connection, (process, since)));
     }
     let found: Result<Option<(String, String)>, _> = sqlx::query_as(IN_USE_BY)
         .fetch_optional(&mut connection)
@@ -153,4 +200,34 @@ async fn locked(options: &PgConnectOptions, address: &str) -> Result<PgConnectio
             format!(" (at {client}, since {since} UTC)")
         }),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::with_database;
+
+    #[tokio::test]
+    async fn a_lost_session_of_the_same_server_does_not_keep_the_lock_and_that_of_another_does() {
+        let test = "a_lost_session_of_the_same_server_does_not_keep_the_lock";
+        with_database(test, async |database| {
+            let (options, address) = open::options_of(&database.url).unwrap();
+            // Its connection is open, as PostgreSQL sees one that was lost.
+            let (_lost, session) = locked(&options, &address).await.unwrap();
+            let other = (session.0, "2000-01-01 00:00:00+00".to_owned());
+            let refused = locked_again(&options, &address, &other).await;
+            assert!(
+                matches!(refused, Err(LockError::InUse { .. })),
+                "{refused:?}"
+            );
+            let (_again, new) = locked_again(&options, &address, &session).await.unwrap();
+            assert_ne!(session, new);
+            let refused = locked(&options, &address).await;
+            assert!(
+                matches!(refused, Err(LockError::InUse { .. })),
+                "{refused:?}"
+            );
+        })
+        .await;
+    }
 }
