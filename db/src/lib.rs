@@ -7,6 +7,7 @@ mod forward;
 pub mod lock;
 
 pub mod alerts;
+pub mod archive_mark;
 pub mod attendance;
 pub mod audit;
 pub mod deferred_segments;
@@ -39,6 +40,7 @@ pub mod withdrawals;
 use std::path::Path;
 use std::time::Duration;
 
+use tread_store::failure::StorageFailure;
 use tread_store::metrics::DatabaseMetrics;
 pub use tread_store::{DbError, Disk, Location, Outcome, failure, limited, secrets};
 
@@ -326,6 +328,22 @@ pub enum Engine {
 }
 
 impl Engine {
+    /// Returns the engine of a database at a location.
+    pub fn at(location: &Location) -> Self {
+        match location {
+            Location::File(_) => Self::Sqlite,
+            Location::Postgres(_) => Self::Postgres,
+        }
+    }
+
+    /// Returns what to do about a failure of its storage, for operators.
+    pub fn advice(self, failure: StorageFailure) -> &'static str {
+        match self {
+            Self::Sqlite => failure.advice_for_file(),
+            Self::Postgres => failure.advice_for_postgres(),
+        }
+    }
+
     /// Returns the name of the engine.
     pub fn name(self) -> &'static str {
         match self {

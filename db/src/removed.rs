@@ -10,6 +10,7 @@ forward! {
     removed;
     fn last_before(before: Timestamp, begins_until_pk: i64) -> Option<i64>;
     fn remove(until_pk: i64) -> (u64, HashSet<i64>);
+    fn release_removed() -> Option<u64>;
     fn boots() -> HashSet<i64>;
     fn within(boot_pk: i64, range: (i64, i64)) -> Vec<(i64, i64)>;
     fn newest_seq(boot_pk: i64) -> Option<i64>;

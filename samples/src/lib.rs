@@ -1,6 +1,7 @@
-//! What tests, benchmarks and reports send to a server, and the service manager that tests play. No
-//! program depends on it.
+//! What tests, benchmarks and reports send to a server, the service manager that tests play, and the S3
+//! storage that they start. No program depends on it.
 
+pub mod s3;
 pub mod service_manager;
 
 use tread_api::robot::{RobotLimits, RobotModel};

@@ -22,6 +22,7 @@ pub use tread_telemetry::TracingConfig;
 use self::backup::BackupConfig;
 use self::oidc::{OidcConfig, OidcConfigError};
 use self::webhooks::WebhooksConfig;
+use crate::archive::ArchiveLocation;
 use crate::authority::is_port_name;
 use crate::friction::index::Normalisation;
 pub use crate::friction::weights::FrictionConfig;
@@ -222,9 +223,9 @@ pub struct RetentionConfig {
     /// Maximum number of raw measurements, within [`SEGMENTS_MAX_RANGE`]; beyond it the oldest are
     /// deleted.
     pub segments_max: i64,
-    /// Folder of Parquet files to which raw measurements are written before they are deleted; without
-    /// it they are only deleted.
-    pub archive: Option<PathBuf>,
+    /// Folder of Parquet files to which raw measurements are written before they are deleted, or a bucket
+    /// of S3-compatible storage, `s3://BUCKET/PREFIX`; without it they are only deleted.
+    pub archive: Option<ArchiveLocation>,
 }
 
 /// Range of the retention time of raw measurements, in days.

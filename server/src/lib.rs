@@ -62,13 +62,13 @@ use self::app::{
     App, Dependencies, backups, checkpoints, events, ingest, memory, merging, reconciler,
     retention, storage, sums,
 };
+use self::archive::SegmentArchive;
 use self::authority::Authorities;
 use self::clock::Clock;
 pub use self::config::{Config, ServerArgs};
 use self::config::{RobotsConfig, TlsSource};
-use self::db::failure::StorageFailure;
 use self::db::lock::DatabaseLock;
-use self::db::{Db, DbError, Location};
+use self::db::{Db, DbError, Engine, Location};
 use self::fleet::{Fleet, Security};
 use self::http::serve::Serving;
 use self::http::tls::{Issuer, Tls};
@@ -143,6 +143,9 @@ impl Server {
             .as_ref()
             .map(|oidc| People::new(oidc, clock.clone()))
             .transpose()?;
+        let archive = config.retention.archive.clone();
+        let archive = archive.map(|location| SegmentArchive::new(location, db.path()));
+        let archive = archive.transpose()?;
         let app = App::new(Dependencies {
             db,
             clock,
@@ -156,7 +159,7 @@ impl Server {
             webhooks: config.webhooks,
             people,
             audit: config.audit,
-            archive: config.retention.archive.clone(),
+            archive,
             telemetry: Telemetry::start(&config.tracing, "tread-server")?,
         });
         let remembered = remember(&app, &config.site).await;
@@ -333,10 +336,10 @@ fn not_readable(error: anyhow::Error, database: &Location) -> anyhow::Error {
         .chain()
         .find_map(|cause| cause.downcast_ref::<DbError>())
         .and_then(DbError::failure);
-    let advice = failure.map_or(
-        "`tread-server doctor --deep` examines it",
-        StorageFailure::advice,
-    );
+    let engine = Engine::at(database);
+    let advice = failure.map_or("`tread-server doctor --deep` examines it", |failure| {
+        engine.advice(failure)
+    });
     error.context(format!("cannot read the database `{database}`: {advice}"))
 }
 

@@ -1,10 +1,13 @@
 //! Looks at a database without changing it, beside a running server or without one.
 
+use jiff::Timestamp;
 use sqlx::{AssertSqlSafe, Connection as _};
 use tread_store::failure::StorageFailure;
 pub use tread_store::inspection::{Inspection, Schema};
 
-use super::{Connection, EngineError, OpenError, connections, failure, open, schema, times};
+use super::{
+    Connection, EngineError, OpenError, archive_mark, connections, failure, open, schema, times,
+};
 
 /// Reason why a database cannot be inspected.
 #[derive(Debug, thiserror::Error)]
@@ -51,14 +54,18 @@ async fn look(db: &mut Connection, is_deep: bool) -> Result<Inspection, InspectE
     let begun = snapshot.execute(&mut *db).await;
     begun.map_err(InspectError::Postgres)?;
     let schema = schema(db).await.map_err(InspectError::Postgres)?;
-    let newest = match schema {
-        Schema::Current(_) => times::newest(db).await,
-        Schema::Empty | Schema::Older { .. } | Schema::Newer(_) | Schema::Differs(_) => Ok(None),
+    let read = match schema {
+        Schema::Current(_) => read_values(db).await,
+        Schema::Empty | Schema::Older { .. } | Schema::Newer(_) | Schema::Differs(_) => {
+            Ok((None, None))
+        }
     };
     let damaged = |error: &sqlx::Error| failure::of(error) == Some(StorageFailure::Damaged);
-    let (newest, mut damage) = match newest {
-        Ok(newest) => (newest, None),
-        Err(EngineError::Postgres(error)) if damaged(&error) => (None, Some(error.to_string())),
+    let ((newest, archived), mut damage) = match read {
+        Ok(read) => (read, None),
+        Err(EngineError::Postgres(error)) if damaged(&error) => {
+            ((None, None), Some(error.to_string()))
+        }
         Err(EngineError::Postgres(error)) => return Err(InspectError::Postgres(error)),
         Err(error) => return Err(InspectError::Value(error)),
     };
@@ -72,8 +79,17 @@ async fn look(db: &mut Connection, is_deep: bool) -> Result<Inspection, InspectE
     Ok(Inspection {
         schema,
         newest,
+        archived,
         damage,
     })
+}
+
+/// Returns the newest time, and which measurements were archived.
+async fn read_values(
+    db: &mut Connection,
+) -> Result<(Option<Timestamp>, Option<(i64, i64)>), EngineError> {
+    let newest = times::newest(&mut *db).await?;
+    Ok((newest, archive_mark::get(db).await?))
 }
 
 async fn schema(db: &mut Connection) -> Result<Schema, sqlx::Error> {
@@ -100,7 +116,9 @@ async fn schema(db: &mut Connection) -> Result<Schema, sqlx::Error> {
 /// Reads one row of every table, or all rows.
 async fn read_tables(db: &mut Connection, is_deep: bool) -> Result<(), sqlx::Error> {
     let tables: Vec<(String,)> = sqlx::query_as(
-        "SELECT quote_ident(tablename) FROM pg_tables WHERE schemaname = current_schema()",
+        "SELECT quote_ident(relname) FROM pg_class
+         WHERE relnamespace = CAST(current_schema() AS regnamespace)
+             AND relkind IN ('r', 'p') AND NOT relispartition",
     )
     .fetch_all(&mut *db)
     .await?;

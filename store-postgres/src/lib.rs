@@ -7,6 +7,8 @@
 
 #[path = "../../store/sql/alerts.rs"]
 pub mod alerts;
+#[path = "../../store/sql/archive_mark.rs"]
+pub mod archive_mark;
 #[path = "../../store/sql/attendance.rs"]
 pub mod attendance;
 #[path = "../../store/sql/audit.rs"]
@@ -36,6 +38,7 @@ pub mod lock;
 #[path = "../../store/sql/missions.rs"]
 pub mod missions;
 pub mod open;
+mod partitions;
 #[path = "../../store/sql/removed.rs"]
 pub mod removed;
 #[path = "../../store/sql/restorations.rs"]
@@ -353,8 +356,10 @@ impl Db {
 /// Returns the names of all tables, quoted.
 async fn tables(db: &mut Connection) -> Result<Vec<String>, EngineError> {
     let tables = sqlx::query_scalar!(
-        r#"SELECT quote_ident(schemaname) || '.' || quote_ident(tablename) AS "table!"
-           FROM pg_tables WHERE schemaname = current_schema() ORDER BY tablename"#
+        r#"SELECT quote_ident(nspname) || '.' || quote_ident(relname) AS "table!"
+           FROM pg_class JOIN pg_namespace ON pg_namespace.oid = relnamespace
+           WHERE nspname = current_schema() AND relkind IN ('r', 'p') AND NOT relispartition
+           ORDER BY relname"#
     );
     let tables = tables.fetch_all(db).await?;
     if tables.is_empty() {
@@ -373,6 +378,8 @@ mod tests;
 mod tests_of_opening;
 #[cfg(test)]
 mod tests_of_parity;
+#[cfg(test)]
+mod tests_of_partitions;
 #[cfg(test)]
 mod tests_of_segments;
 #[cfg(test)]

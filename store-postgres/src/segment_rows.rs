@@ -4,6 +4,8 @@ use jiff::Timestamp;
 use tread_store::segments::{Added, NewSegment};
 
 use super::copy_rows::CopyRows;
+use super::partitions;
+pub use super::partitions::drop_removed as release_removed;
 use super::segment_ranges::{self, NewRange};
 use super::{Connection, EngineError, ground, to_us};
 
@@ -36,6 +38,11 @@ pub async fn insert(
     let received_at_us = to_us(received_at).max(last_us);
     let ranges = segment_ranges::following(last, segments);
     insert_ranges(db, &ranges, received_at_us).await?;
+    let added = Added {
+        first: last + 1,
+        last: last.saturating_add_unsigned(segments.len() as u64),
+    };
+    partitions::prepare(db, (added.first, added.last)).await?;
     let mut rows = CopyRows::new(COLUMNS);
     for (pk, new) in (last + 1..).zip(segments) {
         let (segment, (started_at_ns, ended_at_ns)) = (new.segment, new.times_ns);
@@ -62,10 +69,16 @@ pub async fn insert(
             .real(segment.saturation_ratio);
     }
     rows.write(db, COPY).await?;
-    Ok(Added {
-        first: last + 1,
-        last: last.saturating_add_unsigned(segments.len() as u64),
-    })
+    Ok(added)
+}
+
+/// Does nothing: values that are no longer in the ledger remain until their partition is dropped.
+///
+/// # Errors
+/// None.
+#[expect(clippy::unused_async, reason = "as the other engine")]
+pub(super) async fn remove_values(_db: &mut Connection, _until_pk: i64) -> Result<(), EngineError> {
+    Ok(())
 }
 
 /// Stores ranges of measurements that were received at one time.

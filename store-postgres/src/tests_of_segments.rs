@@ -21,7 +21,7 @@ use crate::{removed, segment_ranges, segments};
 const CASES: usize = 15;
 
 /// Rows that measurements name, for both engines.
-const NAMED: &str = "
+pub(crate) const NAMED: &str = "
     INSERT INTO sites (pk, id, name, grid_revision, cell_m, created_at_us)
         VALUES (1, 'yard', 'Yard', 2, 0.5, 1), (2, 'field', 'Field', 2, 0.5, 1);
     INSERT INTO configurations (pk, id) VALUES (9, '00000000-0000-0000-0000-000000000001');
@@ -38,7 +38,7 @@ fn information() -> impl Strategy<Value = Information> {
     })
 }
 
-fn segment() -> impl Strategy<Value = Segment> {
+pub(crate) fn segment() -> impl Strategy<Value = Segment> {
     let named = (
         prop::bool::weighted(0.1),
         prop::option::weighted(0.8, prop::bool::weighted(0.1)),

@@ -50,7 +50,9 @@ async fn both_engines_have_the_same_tables_and_none_is_forgotten() {
                 assert!(!here.key().is_empty(), "{}", here.name);
             }
             let found: Vec<(String,)> = sqlx::query_as(
-                "SELECT CAST(tablename AS TEXT) FROM pg_tables WHERE schemaname = 'public'",
+                "SELECT CAST(relname AS TEXT) FROM pg_class
+                 WHERE relnamespace = CAST('public' AS regnamespace)
+                     AND relkind IN ('r', 'p') AND NOT relispartition",
             )
             .fetch_all(&mut *postgres)
             .await

@@ -6,7 +6,10 @@ use sqlx::{AssertSqlSafe, Postgres, Row as _};
 use tread_store::transfer::{Column, ColumnType, Row, Table, Value};
 
 use super::copy_rows::CopyRows;
-use super::{Connection, EngineError, column_names, corrupt};
+use super::{Connection, EngineError, column_names, corrupt, partitions};
+
+/// The table that has partitions.
+const PARTITIONED: &str = "segment_values";
 
 /// Returns the columns of a table; none if the table does not exist.
 pub(super) async fn columns(db: &mut Connection, table: &str) -> Result<Vec<Column>, EngineError> {
@@ -70,12 +73,19 @@ pub(super) fn decode(row: &PgRow, table: &Table) -> Result<Row, EngineError> {
     values.collect()
 }
 
-/// Writes rows, which have all columns of the table.
+/// Writes rows, which have all columns of the table, in the order of their primary keys.
 ///
 /// # Errors
 /// A value is none of its column's type, or the database failed, for instance because a row is stored
 /// already.
 pub async fn insert(db: &mut Connection, table: &Table, rows: &[Row]) -> Result<(), EngineError> {
+    if table.name == PARTITIONED
+        && let (Some(first), Some(last)) = (rows.first(), rows.last())
+        && let ([Value::Integer(first)], [Value::Integer(last)]) =
+            (&*table.key_of(first), &*table.key_of(last))
+    {
+        partitions::prepare(db, (*first, *last)).await?;
+    }
     let all: Vec<usize> = (0..table.columns.len()).collect();
     let width = i16::try_from(all.len()).map_err(|_too_many| EngineError::DoesNotFit("table"))?;
     let mut copied = CopyRows::new(width);

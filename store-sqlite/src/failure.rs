@@ -65,7 +65,9 @@ pub(super) fn advice_on(error: &io::Error) -> &'static str {
             "its disk is mounted read-only: see `dmesg`, repair the file system, and mount it for \
              writing"
         }
-        io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => StorageFailure::Full.advice(),
+        io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => {
+            StorageFailure::Full.advice_for_file()
+        }
         io::ErrorKind::NotFound => "create its folder first",
         _ => "see `dmesg` for what the disk answers",
     }
@@ -75,7 +77,7 @@ pub(super) fn advice_on(error: &io::Error) -> &'static str {
 pub(super) fn advice_on_database(error: &sqlx::Error) -> &'static str {
     match (error, of(error)) {
         (sqlx::Error::Io(error), _) => advice_on(error),
-        (_, Some(failure)) => failure.advice(),
+        (_, Some(failure)) => failure.advice_for_file(),
         (_, None) => "see docs/runbook.md",
     }
 }

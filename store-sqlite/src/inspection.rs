@@ -3,6 +3,7 @@
 use std::fs;
 use std::path::Path;
 
+use jiff::Timestamp;
 use sqlx::migrate::Migrator;
 use sqlx::sqlite::SqliteConnectOptions;
 use sqlx::{AssertSqlSafe, ConnectOptions as _, Connection as _, SqliteConnection};
@@ -11,7 +12,7 @@ use tread_store::failure::StorageFailure;
 pub use tread_store::inspection::{Inspection, Schema};
 
 use super::failure;
-use super::{BUSY_TIMEOUT, EngineError, times};
+use super::{BUSY_TIMEOUT, EngineError, archive_mark, times};
 
 /// Migrations of this version.
 static MIGRATIONS: Migrator = sqlx::migrate!();
@@ -77,19 +78,28 @@ async fn look(
 ) -> Result<Inspection, InspectError> {
     let schema = schema(connection).await.map_err(InspectError::Sqlite)?;
     let damage = damage(connection, is_deep).await?;
-    let newest = match (schema, &damage) {
-        (Schema::Current(_), None) => times::newest(connection).await,
-        (_, _) => Ok(None),
+    let read = match (schema, &damage) {
+        (Schema::Current(_), None) => read_values(connection).await,
+        (_, _) => Ok((None, None)),
     };
-    let newest = newest.map_err(|error| match error {
+    let (newest, archived) = read.map_err(|error| match error {
         EngineError::Sqlite(error) => InspectError::Sqlite(error),
         EngineError::Corrupt { .. } | EngineError::DoesNotFit(_) => InspectError::Value(error),
     })?;
     Ok(Inspection {
         schema,
         newest,
+        archived,
         damage,
     })
+}
+
+/// Returns the newest time, and which measurements were archived.
+async fn read_values(
+    connection: &mut SqliteConnection,
+) -> Result<(Option<Timestamp>, Option<(i64, i64)>), EngineError> {
+    let newest = times::newest(&mut *connection).await?;
+    Ok((newest, archive_mark::get(connection).await?))
 }
 
 async fn schema(connection: &mut SqliteConnection) -> Result<Schema, sqlx::Error> {

@@ -6,6 +6,8 @@
 
 #[path = "../../store/sql/alerts.rs"]
 pub mod alerts;
+#[path = "../../store/sql/archive_mark.rs"]
+pub mod archive_mark;
 #[path = "../../store/sql/attendance.rs"]
 pub mod attendance;
 #[path = "../../store/sql/audit.rs"]

@@ -83,6 +83,23 @@ static INSERT_RANGES: LazyLock<RowsStatement> = LazyLock::new(|| {
     )
 });
 
+/// Removes the values of measurements up to a key, which are no longer in the ledger.
+pub(super) async fn remove_values(db: &mut Connection, until_pk: i64) -> Result<(), EngineError> {
+    sqlx::query!("DELETE FROM segment_values WHERE pk <= $1", until_pk)
+        .execute(db)
+        .await?;
+    Ok(())
+}
+
+/// Does nothing, since values are removed at once.
+///
+/// # Errors
+/// None.
+#[expect(clippy::unused_async, reason = "as the other engine")]
+pub async fn release_removed(_db: &mut Connection) -> Result<Option<u64>, EngineError> {
+    Ok(Some(0))
+}
+
 /// Stores ranges of measurements that were received at one time.
 async fn insert_ranges(
     db: &mut Connection,

@@ -6,6 +6,8 @@ use std::collections::HashSet;
 use futures_util::TryStreamExt as _;
 use jiff::Timestamp;
 
+pub use super::segment_rows::release_removed;
+use super::segment_rows::remove_values;
 use super::{Connection, EngineError, segment_ranges, to_us};
 
 /// Returns the key of the last measurement that was received before a time and lies in a range that
@@ -36,9 +38,10 @@ pub async fn remove(
            WHERE first_pk <= $1 ORDER BY first_pk"#,
         until_pk
     );
-    let mut boots = HashSet::new();
+    let (mut removed, mut boots) = (0, HashSet::new());
     for range in ranges.fetch_all(&mut *db).await? {
         let last = range.last_pk.min(until_pk);
+        removed += (last - range.first_pk).unsigned_abs() + 1;
         let seqs = (range.first_seq, range.first_seq + (last - range.first_pk));
         note(db, range.boot_pk, seqs).await?;
         boots.insert(range.boot_pk);
@@ -58,10 +61,8 @@ pub async fn remove(
     )
     .execute(&mut *db)
     .await?;
-    let removed = sqlx::query!("DELETE FROM segment_values WHERE pk <= $1", until_pk)
-        .execute(db)
-        .await?;
-    Ok((removed.rows_affected(), boots))
+    remove_values(db, until_pk).await?;
+    Ok((removed, boots))
 }
 
 /// Records a range, joined with the ranges that it touches.

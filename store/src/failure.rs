@@ -58,8 +58,8 @@ impl StorageFailure {
         }
     }
 
-    /// Returns what to do about it, for operators.
-    pub const fn advice(self) -> &'static str {
+    /// Returns what to do about it at a database file, for operators.
+    pub const fn advice_for_file(self) -> &'static str {
         match self {
             Self::Full => "make room on its disk (`df -h`, `df -i`)",
             Self::Io => {
@@ -73,6 +73,22 @@ impl StorageFailure {
             }
             Self::Busy => "end the other process that uses the file (`fuser FILE`)",
             Self::Connection => "see the log; start the server again if it lasts",
+        }
+    }
+
+    /// Returns what to do about it at a PostgreSQL server, for operators.
+    pub const fn advice_for_postgres(self) -> &'static str {
+        match self {
+            Self::Full => "make room on the disk of PostgreSQL",
+            Self::Io => "see PostgreSQL's log, and whether its disk fails or is mounted read-only",
+            Self::Memory => "give PostgreSQL more memory, or permit fewer connections to it",
+            Self::Damaged => {
+                "stop the server and restore a dump; PostgreSQL's log names the damaged page"
+            }
+            Self::Busy => {
+                "see in `pg_stat_activity` which session holds a lock, and how busy PostgreSQL is"
+            }
+            Self::Connection => "see whether PostgreSQL runs and can be reached from this machine",
         }
     }
 }

@@ -27,6 +27,9 @@ pub struct Inspection {
     pub schema: Schema,
     /// The newest time that it holds; `None` if it has another schema or holds none.
     pub newest: Option<Timestamp>,
+    /// First and last key of the measurements that were archived; `None` if it has another schema or
+    /// nothing was archived.
+    pub archived: Option<(i64, i64)>,
     /// The engine's finding if it is damaged.
     pub damage: Option<String>,
 }

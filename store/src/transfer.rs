@@ -3,7 +3,7 @@
 use sha2::{Digest as _, Sha256};
 
 /// Tables that a copy contains. None refers to a row of a later one.
-pub const TABLES: [&str; 31] = [
+pub const TABLES: [&str; 32] = [
     "sites",
     "terrains",
     "terrain_revisions",
@@ -33,13 +33,14 @@ pub const TABLES: [&str; 31] = [
     "idempotency_keys",
     "webhooks",
     "webhook_deliveries",
+    "archive_mark",
     "restorations",
     "server_versions",
 ];
 
 /// Tables that a copy does not contain, because each database has its own: what a migration or a check
-/// of the storage writes.
-pub const OWN_TABLES: [&str; 2] = ["_sqlx_migrations", "write_probe"];
+/// of the storage writes, and how PostgreSQL divides a table.
+pub const OWN_TABLES: [&str; 3] = ["_sqlx_migrations", "write_probe", "segment_partitions"];
 
 /// Tables of [`TABLES`] that may have rows in a new database, which the copy replaces: migrations insert
 /// them.

@@ -5,8 +5,10 @@
 //! due ─► a file has them already? ─► compare ─► removable
 //!         no │                          │ other contents
 //!            └──► write a file ◄────────┘
-//!                  └─► compare with the database ─► rename, mark ─► removable
+//!                  └─► compare with the database ─► rename or upload, mark ─► removable
 //! ```
+//!
+//! An uploaded file is read from its bucket and compared once more.
 //!
 //! A measurement is removable once its file was compared with the database in this run of the server.
 //! So a crash between two steps repeats some of them and loses nothing. After a restoration of an older
@@ -14,7 +16,6 @@
 //! when the file with the same keys is written, and until then no list shows them, since a list reads
 //! files only up to the database's first key.
 
-use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -30,7 +31,7 @@ use super::sites::SITES_MAX;
 use super::{App, AppError};
 use crate::archive::{
     ArchivedSegment, Finished, Found, KeyRange, SegmentArchive, SegmentArchiveError, Selection,
-    Writer, mark_of,
+    Writer,
 };
 use crate::db;
 use crate::error_text::chain;
@@ -63,11 +64,9 @@ struct State {
 }
 
 impl Archive {
-    /// Opens the archive in a folder. Its mark is beside the database file, else in the folder.
-    pub(super) fn new(folder: PathBuf, database: Option<&Path>) -> Self {
-        let mark = mark_of(&folder, database);
+    pub(super) fn new(files: SegmentArchive) -> Self {
         Self {
-            files: Arc::new(SegmentArchive::new(folder, mark)),
+            files: Arc::new(files),
             readers: Arc::new(Semaphore::new(READERS_MAX)),
             state: Mutex::default(),
         }
@@ -91,7 +90,7 @@ impl Archive {
     ) -> Result<T, AppError> {
         let turn = Arc::clone(&self.readers).acquire_owned();
         let Ok(turn) = tokio::time::timeout(READ_WAIT_MAX, turn).await else {
-            let folder = self.files.folder().to_owned();
+            let folder = self.files.shown();
             return Err(AppError::Archive(SegmentArchiveError::Busy { folder }));
         };
         self.off_thread(move |files| {
@@ -135,17 +134,52 @@ impl App {
         let Some(archive) = self.archive() else {
             return Ok(());
         };
-        let preparing = |files: &SegmentArchive| {
+        let mark = self.archive_mark(archive).await?;
+        let preparing = move |files: &SegmentArchive| {
             let removed = files.remove_unfinished()?;
-            files.check_writable()?;
+            files.check_writable(mark)?;
             Ok(removed)
         };
         let removed = archive.off_thread(preparing).await?;
         if removed > 0 {
-            let folder = archive.files.folder().display();
+            let folder = archive.files.shown();
+            let folder = folder.display();
             info!("removed {removed} unfinished files of a former run from the archive `{folder}`");
         }
         Ok(())
+    }
+
+    /// Returns the mark: which measurements were archived. Moves that of a former version into the
+    /// database.
+    async fn archive_mark(&self, archive: &Archive) -> Result<Option<KeyRange>, AppError> {
+        if let Some(mark) = self.stored_mark().await? {
+            return Ok(Some(mark));
+        }
+        let former = archive.off_thread(SegmentArchive::former_mark).await?;
+        if let Some(mark) = former {
+            self.set_archive_mark(mark).await?;
+            archive
+                .off_thread(SegmentArchive::remove_former_mark)
+                .await?;
+        }
+        Ok(former)
+    }
+
+    async fn stored_mark(&self) -> Result<Option<KeyRange>, AppError> {
+        let reading = async {
+            let mut tx = self.db().read("archive").await?;
+            db::archive_mark::get(&mut tx).await
+        };
+        let mark = db::limited(reading).await?;
+        Ok(mark.map(|(first, last)| KeyRange { first, last }))
+    }
+
+    /// Records that the measurements with these keys are archived.
+    async fn set_archive_mark(&self, keys: KeyRange) -> Result<(), AppError> {
+        let mark = keys.joined_to(self.stored_mark().await?);
+        let mut tx = self.db().write_uncounted("archive").await?;
+        db::archive_mark::set(&mut tx, (mark.first, mark.last)).await?;
+        Ok(tx.commit().await?)
     }
 
     /// Brings the measurements that are due, or at least the first of them, into the archive. One file
@@ -162,18 +196,17 @@ impl App {
             return Ok(());
         }
         let first = due.first;
+        let mark = self.stored_mark().await?;
         let listing = move |files: &SegmentArchive| {
             let listed = files.list()?;
-            files.check_end(&listed, first)?;
+            files.check_end(&listed, mark, first)?;
             Ok(listed)
         };
         let listed = archive.off_thread(listing).await?;
         if let Some(&keys) = listed.files.iter().find(|keys| keys.contains(first))
             && self.is_same(archive, &Written::Named(keys), first).await?
         {
-            archive
-                .off_thread(move |files| files.set_mark(keys))
-                .await?;
+            self.set_archive_mark(keys).await?;
             archive.lock().removable = Some(keys);
             return Ok(());
         }
@@ -220,16 +253,12 @@ impl App {
         let finished = Arc::new(finished);
         let written = Written::Finished(Arc::clone(&finished));
         if !self.is_same(archive, &written, keys.first).await? {
-            let folder = archive.files.folder().to_owned();
+            let folder = archive.files.shown();
             return Err(AppError::Archive(SegmentArchiveError::NotAsWritten {
                 folder,
             }));
         }
-        let publishing = move |files: &SegmentArchive| {
-            let superseded = files.publish(&finished)?;
-            files.set_mark(keys)?;
-            Ok(superseded)
-        };
+        let publishing = move |files: &SegmentArchive| files.publish(&finished);
         for path in archive.off_thread(publishing).await? {
             warn!(
                 "the file of the archive is now `{}`: its keys were given to other measurements after a \
@@ -237,6 +266,17 @@ impl App {
                 path.display()
             );
         }
+        if archive.files.is_copied()
+            && !self
+                .is_same(archive, &Written::Named(keys), keys.first)
+                .await?
+        {
+            let folder = archive.files.shown();
+            return Err(AppError::Archive(SegmentArchiveError::NotAsWritten {
+                folder,
+            }));
+        }
+        self.set_archive_mark(keys).await?;
         let count = keys.count().unsigned_abs();
         self.counters().segments_archived.add(count);
         info!(
@@ -298,8 +338,9 @@ impl App {
         selection: Selection,
         limit: usize,
     ) -> Result<Found, AppError> {
+        let mark = self.stored_mark().await?;
         let found = archive
-            .read_in_turn(move |files| files.read(&selection, limit))
+            .read_in_turn(move |files| files.read(&selection, mark, limit))
             .await;
         found.inspect_err(|_| self.counters().archive_failures.one())
     }
@@ -326,7 +367,8 @@ impl App {
         }
         let failure = failure.map(|cause| chain(cause));
         archive.lock().failure.clone_from(&failure);
-        let folder = archive.files.folder().display();
+        let folder = archive.files.shown();
+        let folder = folder.display();
         let text = failure.map(|why| {
             format!(
                 "old measurements cannot be archived in `{folder}`, so none is removed from the \
@@ -370,14 +412,13 @@ impl Written {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::archive::ArchiveLocation;
 
     #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
     async fn a_reader_whose_disk_hangs_keeps_its_turn_and_others_are_refused_in_time() {
         let folder = tempfile::tempdir().unwrap();
-        let archive = Archive::new(
-            folder.path().join("archive"),
-            Some(&folder.path().join("tread.db")),
-        );
+        let location = ArchiveLocation::Folder(folder.path().join("archive"));
+        let archive = Archive::new(SegmentArchive::new(location, None).unwrap());
         let (release, hanging) = std::sync::mpsc::channel::<()>();
         let hanging = Arc::new(Mutex::new(hanging));
         for _ in 0..READERS_MAX {

@@ -1,13 +1,12 @@
 //! What the use cases are created from.
 
-use std::path::PathBuf;
-
 use tread_telemetry::Telemetry;
 
 use super::App;
 use super::enrolment::EnrolmentService;
 use super::identity::people::People;
 use super::robot_link::RobotLink;
+use crate::archive::SegmentArchive;
 use crate::clock::Clock;
 use crate::config::webhooks::WebhooksConfig;
 use crate::config::{AuditConfig, FrictionConfig, StorageConfig};
@@ -38,8 +37,8 @@ pub struct Dependencies {
     pub people: Option<People>,
     /// Where the audit log is written beside the database.
     pub audit: AuditConfig,
-    /// Folder of the archive of raw measurements; without it old ones are only removed.
-    pub archive: Option<PathBuf>,
+    /// Archive of raw measurements; without it old ones are only removed.
+    pub archive: Option<SegmentArchive>,
     /// Sender of traces of missions; its default sends none.
     pub telemetry: Telemetry,
 }

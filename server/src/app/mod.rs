@@ -163,7 +163,7 @@ impl App {
             Arc::clone(&counters),
         );
         let hub = Hub::new(clock.now());
-        let archive = archive.map(|folder| Archive::new(folder, db.path()));
+        let archive = archive.map(Archive::new);
         let run_id = clock.new_id::<Uuid>();
         let inner = Inner {
             db,

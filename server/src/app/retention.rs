@@ -92,6 +92,7 @@ impl App {
         stop: &CancellationToken,
         removed: &mut u64,
     ) -> Result<(), AppError> {
+        self.release_removed().await?;
         self.prepare_archive().await?;
         while !stop.is_cancelled() {
             let Some(next) = db::limited(self.due(config, REMOVED_MAX)).await? else {
@@ -113,6 +114,25 @@ impl App {
             }
         }
         Ok(())
+    }
+
+    /// Lets the database release the space of the measurements that were removed in earlier passes: no
+    /// reader has a snapshot from before their removal any more.
+    async fn release_removed(&self) -> Result<(), AppError> {
+        let mut tx = self.db().write_uncounted("retention").await?;
+        match db::removed::release_removed(&mut tx).await? {
+            Some(0) => Ok(()),
+            Some(partitions) => {
+                tracing::info!("{partitions} partitions of removed measurements were dropped");
+                Ok(tx.commit().await?)
+            }
+            None => {
+                tracing::info!(
+                    "readers use the partitions of removed measurements: they are dropped later"
+                );
+                Ok(())
+            }
+        }
     }
 
     /// Returns the keys of at most `limit` measurements beyond the limits of age or number.

@@ -10,8 +10,9 @@
 //! they report that nothing can be stored.
 
 mod growth;
+mod repeats;
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -23,11 +24,12 @@ use tread_api::robot::{Alert, Severity};
 use tread_api::webhook::NoticeEvent;
 
 use self::growth::Growth;
+use self::repeats::Repeats;
 use super::App;
 use crate::config::StorageConfig;
-use crate::db::DbError;
 use crate::db::alerts::AlertFilter;
 use crate::db::failure::{self, StorageFailure};
+use crate::db::{DbError, Engine};
 use crate::error_text::chain;
 
 /// Interval between checks of the storage.
@@ -50,9 +52,6 @@ const EXAMINE_MAX: Duration = Duration::from_mins(10);
 const DISK_LOW_HYSTERESIS: f64 = 0.1;
 /// Maximum number of cleared alerts about the server that are kept.
 const CLEARED_KEPT_MAX: usize = 100;
-/// Minimum interval between log entries about the same failure: a full disk fails the same
-/// transactions many times a second.
-const LOG_EVERY: Duration = Duration::from_secs(30);
 /// Maximum length of SQLite's finding in an alert, characters.
 const FINDING_MAX: usize = 200;
 
@@ -111,8 +110,7 @@ struct Inner {
     checked_at: Option<Duration>,
     /// Time of the last examination, and the number of damage reports at that time.
     examined: Option<(Duration, u64)>,
-    /// Time of the last log entry of each failure, and the number of those suppressed since.
-    logged: HashMap<&'static str, (Duration, u64)>,
+    repeats: Repeats,
     growth: Growth,
     /// End of the validity of the REST API's certificate.
     certificate_ends: Option<Timestamp>,
@@ -184,20 +182,10 @@ impl Storage {
 impl App {
     /// Logs that a background task failed and will be repeated; repeats are counted.
     pub(crate) fn log_failure(&self, what: &'static str, cause: &dyn std::error::Error) {
-        let now = self.clock().elapsed();
-        let left_out = {
-            let mut inner = self.storage().lock();
-            match inner.logged.get_mut(what) {
-                Some((at, left_out)) if now.saturating_sub(*at) < LOG_EVERY => {
-                    *left_out += 1;
-                    return;
-                }
-                // There are only as many keys as callers of this function.
-                Some(_) | None => inner.logged.insert(what, (now, 0)),
-            }
-        };
-        let repeats = left_out.map_or(0, |(_, count)| count);
-        error!(repeats, "cannot {what}: {}", chain(cause));
+        let (now, reason) = (self.clock().elapsed(), chain(cause));
+        let logged = self.storage().lock().repeats.note(now, what, &reason);
+        let Some(repeats) = logged else { return };
+        error!(repeats, "cannot {what}: {reason}");
     }
 
     /// Returns the result of the last check.
@@ -218,8 +206,9 @@ impl App {
         if checked_at.is_some_and(|at| now.saturating_sub(at) < shared_for) {
             return self.storage_condition();
         }
-        let written = limited(self.db().probe_write()).await;
-        let read = limited(self.db().probe_tables()).await;
+        let (engine, _version) = self.db().engine();
+        let written = limited(engine, self.db().probe_write()).await;
+        let read = limited(engine, self.db().probe_tables()).await;
         let disk = self.db().disk().await.unwrap_or_default();
         let disk_free_bytes = disk.free_bytes;
         let condition = {
@@ -230,10 +219,13 @@ impl App {
                 .map(|bytes| inner.growth.note(now, bytes));
             let is_damaged = inner.has_new_damage();
             let condition = &mut inner.condition;
-            condition.unwritable = unwritable(written.and(read).err());
+            condition.unwritable = unwritable(engine, written.and(read).err());
             if is_damaged && condition.damaged.is_none() {
-                let text = "SQLite met a damaged page; the whole file is being checked";
-                condition.damaged = Some(text.to_owned());
+                let text = format!(
+                    "{} met a damaged page; the whole database is being checked",
+                    engine.name()
+                );
+                condition.damaged = Some(text);
             }
             condition.disk_free_bytes = disk_free_bytes;
             condition.database_bytes = disk.database_bytes;
@@ -403,30 +395,34 @@ impl Inner {
 }
 
 /// Returns what failed, and what to do about it.
-fn why_and_cure(failure: StorageFailure) -> String {
-    format!("{}: {}", failure.explanation(), failure.advice())
+fn why_and_cure(engine: Engine, failure: StorageFailure) -> String {
+    format!("{}: {}", failure.explanation(), engine.advice(failure))
 }
 
 /// Runs a check with a time limit; on failure returns the reason, for people.
-async fn limited(probe: impl Future<Output = Result<(), DbError>>) -> Result<(), String> {
+async fn limited(
+    engine: Engine,
+    probe: impl Future<Output = Result<(), DbError>>,
+) -> Result<(), String> {
     match tokio::time::timeout(CHECK_TIMEOUT, probe).await {
         Ok(Ok(())) => Ok(()),
         Ok(Err(cause)) => {
             tracing::debug!("a check of the storage failed: {cause:?}");
             let unknown = || "the database answers with an error, see the log".to_owned();
-            Err(cause.failure().map_or_else(unknown, why_and_cure))
+            let failure = cause.failure();
+            Err(failure.map_or_else(unknown, |failure| why_and_cure(engine, failure)))
         }
-        Err(_elapsed) => Err(why_and_cure(StorageFailure::Busy)),
+        Err(_elapsed) => Err(why_and_cure(engine, StorageFailure::Busy)),
     }
 }
 
 /// Returns why nothing can be stored, from the checks and from recent failures.
-fn unwritable(found: Option<String>) -> Option<String> {
+fn unwritable(engine: Engine, found: Option<String>) -> Option<String> {
     let recent = || {
         let (failure, since) = failure::last()?;
         // Damage has an alert of its own: writes elsewhere succeed.
         let counts = failure != StorageFailure::Damaged && since < RECOVERED_AFTER;
-        counts.then(|| why_and_cure(failure))
+        counts.then(|| why_and_cure(engine, failure))
     };
     found.or_else(recent)
 }

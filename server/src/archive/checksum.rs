@@ -6,19 +6,21 @@ use std::fs::File;
 use std::io::{self, Write};
 use std::os::unix::fs::FileExt as _;
 
+use bytes::Bytes;
 use flate2::Crc;
+
+use super::fault::Fault;
+use super::source::{Source, invalid};
 
 /// What stands before the checksum in the footer.
 const FOOTER_LABEL: &str = "footer-crc32:";
 /// The text in place of the checksum while it is computed.
 const ZEROS: &str = "00000000";
 /// Bytes after the footer: its length, and the magic number.
-const TAIL_BYTES: usize = 8;
+const TAIL_BYTES: u64 = 8;
 const MAGIC: &[u8] = b"PAR1";
 /// Maximum length of a footer, bytes.
 const FOOTER_MAX_BYTES: u64 = 16 * 1024 * 1024;
-/// Number of bytes that are read at a time.
-const READ_BYTES: usize = 64 * 1024;
 
 /// A file whose written bytes are summed.
 #[derive(Debug)]
@@ -47,6 +49,10 @@ impl Summed {
     pub(super) fn file(&self) -> &File {
         &self.file
     }
+
+    pub(super) fn into_file(self) -> File {
+        self.file
+    }
 }
 
 impl Write for Summed {
@@ -67,10 +73,6 @@ pub(super) fn placeholder() -> String {
     format!("{FOOTER_LABEL}{ZEROS}")
 }
 
-fn invalid(what: &'static str) -> io::Error {
-    io::Error::new(io::ErrorKind::InvalidData, what)
-}
-
 /// A footer, the position of its first byte in the file, and that of its checksum in the footer.
 struct Footer {
     bytes: Vec<u8>,
@@ -79,22 +81,20 @@ struct Footer {
 }
 
 impl Footer {
-    fn read(file: &File) -> io::Result<Self> {
-        let length = file.metadata()?.len();
-        let tail_at = length.checked_sub(TAIL_BYTES as u64);
+    fn read(source: &Source) -> Result<Self, Fault> {
+        let length = source.length()?;
+        let tail_at = length.checked_sub(TAIL_BYTES);
         let tail_at = tail_at.ok_or_else(|| invalid("it is too short"))?;
-        let mut tail = [0; TAIL_BYTES];
-        file.read_exact_at(&mut tail, tail_at)?;
-        let (size, magic) = tail.split_at(4);
+        let tail = source.read((tail_at, length))?;
+        let (size, magic) = tail.split_at(tail.len() - MAGIC.len());
         if magic != MAGIC {
-            return Err(invalid("it does not end like a Parquet file"));
+            return Err(invalid("it does not end like a Parquet file").into());
         }
         let size = size.try_into().map(u32::from_le_bytes).unwrap_or_default();
         let begin = tail_at.checked_sub(size.into());
         let begin = begin.filter(|_| u64::from(size) <= FOOTER_MAX_BYTES);
         let begin = begin.ok_or_else(|| invalid("its footer has an impossible length"))?;
-        let mut bytes = vec![0; usize::try_from(size).unwrap_or_default()];
-        file.read_exact_at(&mut bytes, begin)?;
+        let bytes = Vec::from(source.read((begin, tail_at))?);
         let label = FOOTER_LABEL.as_bytes();
         let label_at = bytes.windows(label.len()).rposition(|part| part == label);
         let checksum_at = label_at.map(|at| at + label.len());
@@ -117,36 +117,44 @@ impl Footer {
     }
 }
 
-/// Writes the checksum of the footer into it.
-pub(super) fn seal_footer(file: &File) -> io::Result<()> {
-    let mut footer = Footer::read(file)?;
+/// Writes the checksum of the footer of a file on a disk into it.
+pub(super) fn seal_footer(file: &File) -> Result<(), Fault> {
+    let mut footer = Footer::read(&Source::File(file.try_clone()?))?;
     let (_, right) = footer.sum();
-    file.write_all_at(right.as_bytes(), footer.begin + footer.checksum_at as u64)
+    file.write_all_at(right.as_bytes(), footer.begin + footer.checksum_at as u64)?;
+    Ok(())
 }
 
-/// Checks the checksum of the footer. Returns where the footer begins.
-pub(super) fn check_footer(file: &File) -> io::Result<u64> {
-    let mut footer = Footer::read(file)?;
+/// A footer whose checksum is right.
+pub(super) struct CheckedFooter {
+    /// Position of its first byte in the file.
+    pub(super) begin: u64,
+    /// Its bytes, without its length and the magic number.
+    pub(super) bytes: Vec<u8>,
+}
+
+/// Reads the footer and checks its checksum.
+pub(super) fn read_footer(source: &Source) -> Result<CheckedFooter, Fault> {
+    let mut footer = Footer::read(source)?;
     let (former, right) = footer.sum();
     if former != right.as_bytes() {
-        return Err(invalid("the checksum of its footer is wrong"));
+        return Err(invalid("the checksum of its footer is wrong").into());
     }
-    Ok(footer.begin)
+    let place = footer.checksum_at..footer.checksum_at + former.len();
+    footer.bytes[place].copy_from_slice(&former);
+    Ok(CheckedFooter {
+        begin: footer.begin,
+        bytes: footer.bytes,
+    })
 }
 
-/// Checks the bytes from `begin` to before `end`.
-pub(super) fn check_bytes(file: &File, (begin, end): (u64, u64), sum: u32) -> io::Result<()> {
+/// Reads the bytes from `begin` to before `end` and checks them.
+pub(super) fn read_checked(source: &Source, place: (u64, u64), sum: u32) -> Result<Bytes, Fault> {
+    let bytes = source.read(place)?;
     let mut crc = Crc::new();
-    let mut buffer = vec![0; READ_BYTES];
-    let mut at = begin;
-    while at < end {
-        let count = usize::try_from(end - at).map_or(READ_BYTES, |left| left.min(READ_BYTES));
-        file.read_exact_at(&mut buffer[..count], at)?;
-        crc.update(&buffer[..count]);
-        at += count as u64;
-    }
+    crc.update(&bytes);
     if crc.sum() == sum {
-        return Ok(());
+        return Ok(bytes);
     }
-    Err(invalid("the checksum of its rows is wrong"))
+    Err(invalid("the checksum of its rows is wrong").into())
 }

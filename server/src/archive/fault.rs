@@ -7,6 +7,7 @@ use std::path::Path;
 use parquet::errors::ParquetError;
 
 use super::SegmentArchiveError;
+use super::bucket::Failure;
 
 /// What is wrong with the content of a file.
 #[derive(Debug, thiserror::Error)]
@@ -14,6 +15,9 @@ pub(super) enum Fault {
     /// It cannot be read.
     #[error("{0}")]
     Read(#[from] io::Error),
+    /// The storage does not answer, or refuses.
+    #[error("{0}")]
+    Storage(Failure),
     /// It is no Parquet.
     #[error("{0}")]
     Parquet(#[from] ParquetError),
@@ -34,8 +38,14 @@ pub(super) fn guarded<T>(
 ) -> Result<T, SegmentArchiveError> {
     let done = catch_unwind(AssertUnwindSafe(work));
     let done = done.unwrap_or_else(|_panic| Err(fault("it cannot be decoded")));
-    done.map_err(|wrong| SegmentArchiveError::Damaged {
-        path: path.to_owned(),
-        what: wrong.to_string(),
+    done.map_err(|wrong| match wrong {
+        Fault::Storage(cause) => SegmentArchiveError::Bucket {
+            bucket: path.display().to_string(),
+            cause,
+        },
+        Fault::Read(_) | Fault::Parquet(_) | Fault::Content(_) => SegmentArchiveError::Damaged {
+            path: path.to_owned(),
+            what: wrong.to_string(),
+        },
     })
 }

@@ -1,4 +1,5 @@
-//! Archive of raw measurements: Parquet files in one folder, for programs of any kind.
+//! Archive of raw measurements: Parquet files in one folder, or in a bucket of S3-compatible storage, for
+//! programs of any kind.
 //!
 //! A file holds the measurements of a range of keys, without gaps and in their order. Its name has the
 //! first and the last key.
@@ -8,34 +9,44 @@
 //!  removed at the start                     when the keys are given to other measurements
 //! ```
 //!
+//! For a bucket the unfinished file is on the disk, without a name; an upload is there as a whole or not at
+//! all.
+//!
 //! The files contain checksums of each row group and of the footer, since Parquet has none that
-//! its writers must write. Each file names the last key of the file before it, and the *mark* beside
-//! the database has the last archived key, so that a missing file or disk is noticed.
+//! its writers must write. Each file names the last key of the file before it, and the *mark* in the
+//! database has the last archived key, so that a missing file or disk is noticed.
 
+mod bucket;
 mod checksum;
 mod fault;
-mod mark;
+mod folder;
+mod location;
+mod mark_file;
 mod read;
 mod rows;
 mod schema;
+mod source;
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod tests_of_buckets;
 mod write;
 
 use std::collections::BTreeSet;
-use std::fs::{self, DirBuilder, File, OpenOptions};
-use std::io;
-use std::os::unix::fs::{DirBuilderExt as _, OpenOptionsExt as _};
 use std::path::{Path, PathBuf};
 
 use parquet::errors::ParquetError;
 use tread_api::friction::StoredSegment;
 use tread_api::ids::{RobotId, SiteId, TerrainId};
 
-use self::mark::Mark;
+use self::bucket::{Bucket, Failure};
+use self::folder::Folder;
+pub use self::location::{ArchiveLocation, BucketLocation};
 use self::read::OpenFile;
+use self::source::Source;
 pub use self::write::{Finished, Writer};
 use crate::file_error::FileError;
+use crate::paths::folder_of;
 
 /// Number of rows of a row group, which is read and checked as a whole.
 pub const ROW_GROUP_ROWS: usize = 16_384;
@@ -44,10 +55,6 @@ pub const SEARCHED_ROWS_MAX: usize = 64 * ROW_GROUP_ROWS;
 /// Maximum number of files that one request opens.
 pub const SEARCHED_FILES_MAX: usize = 512;
 
-/// Name of the mark in the folder of the archive, without its suffix.
-const MARK_IN_FOLDER: &str = "tread";
-/// Suffix of the mark, after the name of the database.
-pub const MARK_ENDING: &str = ".archived";
 /// Beginning of the name of a file.
 const PREFIX: &str = "segments-";
 /// End of the name of a file.
@@ -83,6 +90,19 @@ impl KeyRange {
     /// Returns the number of keys.
     pub fn count(self) -> i64 {
         self.last - self.first + 1
+    }
+
+    /// Returns the mark after a file with these keys was added to what a mark names.
+    pub fn joined_to(self, mark: Option<Self>) -> Self {
+        match mark {
+            Some(mark) if mark.first <= self.first && self.first <= mark.last.saturating_add(1) => {
+                Self {
+                    first: mark.first,
+                    last: self.last,
+                }
+            }
+            Some(_) | None => self,
+        }
     }
 
     fn overlaps(self, other: Self) -> bool {
@@ -187,6 +207,22 @@ pub enum SegmentArchiveError {
         #[source]
         cause: ParquetError,
     },
+    /// The storage of a bucket does not answer, or refuses.
+    #[error("`{bucket}`: {cause}")]
+    Bucket {
+        /// The bucket or an object.
+        bucket: String,
+        /// The cause.
+        cause: Failure,
+    },
+    /// The settings in the environment give no access to a bucket.
+    #[error("`{bucket}` cannot be used with the environment variables AWS_...: {cause}")]
+    Settings {
+        /// The bucket.
+        bucket: String,
+        /// The cause.
+        cause: Failure,
+    },
     /// Archived measurements are missing.
     #[error(
         "the archive `{}` lacks the measurement {key}, which was archived: its disk is not mounted, or \
@@ -223,55 +259,91 @@ pub enum SegmentArchiveError {
     },
 }
 
-/// Returns the file of the mark: beside the database file, or in the folder where there is none.
-pub fn mark_of(folder: &Path, database: Option<&Path>) -> PathBuf {
-    let in_folder = folder.join(MARK_IN_FOLDER);
-    let mut mark = database.unwrap_or(&in_folder).as_os_str().to_owned();
-    mark.push(MARK_ENDING);
-    mark.into()
+/// Where the files are.
+#[derive(Debug, Clone)]
+enum Storage {
+    /// In a folder.
+    Folder(Folder),
+    /// In a bucket; the folder is that of unfinished files.
+    Bucket(Bucket, PathBuf),
 }
 
-/// Files of the archive and their folder.
+/// Files of the archive and where they are.
 #[derive(Debug, Clone)]
 pub struct SegmentArchive {
-    folder: PathBuf,
-    mark: PathBuf,
+    storage: Storage,
+    mark_file: Option<PathBuf>,
 }
 
 impl SegmentArchive {
-    /// Names the folder of the files, and the file of the mark, which lies beside the database.
-    pub fn new(folder: PathBuf, mark: PathBuf) -> Self {
-        Self { folder, mark }
+    /// Names the place of the files, and the file of the database if it has one. Creates nothing and
+    /// makes no request.
+    ///
+    /// # Errors
+    /// The environment has settings for a bucket that cannot be used.
+    pub fn new(
+        location: ArchiveLocation,
+        database: Option<&Path>,
+    ) -> Result<Self, SegmentArchiveError> {
+        let mut mark_file = database.map(mark_file::beside);
+        let storage = match location {
+            ArchiveLocation::Folder(path) => {
+                mark_file.get_or_insert_with(|| mark_file::within(&path));
+                Storage::Folder(Folder::new(path))
+            }
+            ArchiveLocation::Bucket(location) => {
+                let beside = database.map(folder_of).map(Path::to_owned);
+                let unfinished = beside.unwrap_or_else(std::env::temp_dir);
+                Storage::Bucket(Bucket::open(location)?, unfinished)
+            }
+        };
+        Ok(Self { storage, mark_file })
     }
 
-    /// Returns the folder.
-    pub fn folder(&self) -> &Path {
-        &self.folder
+    /// Returns where the files are, as shown to people.
+    pub fn shown(&self) -> PathBuf {
+        match &self.storage {
+            Storage::Folder(folder) => folder.path().to_owned(),
+            Storage::Bucket(bucket, _) => bucket.shown(),
+        }
     }
 
     fn path_of(&self, keys: KeyRange) -> PathBuf {
-        self.folder.join(keys.name())
+        self.shown().join(keys.name())
     }
 
-    fn create_folder(&self) -> Result<(), FileError> {
-        let mut builder = DirBuilder::new();
-        let created = builder.recursive(true).mode(0o700).create(&self.folder);
-        created.map_err(FileError::of("create", &self.folder))
-    }
-
-    /// Returns the names in the folder; none if the folder does not exist.
+    /// Returns the names of all files; none if there is no folder yet.
     fn names(&self) -> Result<Vec<String>, SegmentArchiveError> {
-        let failed = || FileError::of("read the folder", &self.folder);
-        let entries = match fs::read_dir(&self.folder) {
-            Ok(entries) => entries,
-            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
-            Err(error) => return Err(failed()(error).into()),
-        };
-        let mut names = Vec::new();
-        for entry in entries {
-            names.extend(entry.map_err(failed())?.file_name().into_string());
+        match &self.storage {
+            Storage::Folder(folder) => Ok(folder.names()?),
+            Storage::Bucket(bucket, _) => bucket.names(),
         }
-        Ok(names)
+    }
+
+    fn open(&self, keys: KeyRange) -> Result<OpenFile, SegmentArchiveError> {
+        let name = keys.name();
+        let source = match &self.storage {
+            Storage::Folder(folder) => Source::File(folder.open(&name)?),
+            Storage::Bucket(bucket, _) => Source::Object(bucket.open_object(&name)?),
+        };
+        OpenFile::open(self.path_of(keys), source, keys)
+    }
+
+    /// Returns the mark that a former version wrote beside the database; `None` if there is none.
+    ///
+    /// # Errors
+    /// It cannot be read.
+    pub fn former_mark(&self) -> Result<Option<KeyRange>, SegmentArchiveError> {
+        self.mark_file.as_deref().map_or(Ok(None), mark_file::read)
+    }
+
+    /// Removes the mark of a former version, after the database has it.
+    ///
+    /// # Errors
+    /// It cannot be removed.
+    pub fn remove_former_mark(&self) -> Result<(), SegmentArchiveError> {
+        let removed = self.mark_file.as_deref().map_or(Ok(()), mark_file::remove);
+        Ok(removed?)
     }
 
     /// Returns the archived files in the order of their keys.
@@ -288,19 +360,24 @@ impl SegmentArchive {
         files.sort_unstable_by_key(|keys| (keys.first, keys.last));
         match files.windows(2).find(|pair| pair[0].overlaps(pair[1])) {
             Some(pair) => Err(SegmentArchiveError::Overlap {
-                folder: self.folder.clone(),
+                folder: self.shown(),
                 key: pair[1].first,
             }),
             None => Ok(Listing { files, lost }),
         }
     }
 
-    /// Checks that the last archived measurement before a key is in one of the files.
+    /// Checks that the last of the measurements of a mark before a key is in one of the files.
     ///
     /// # Errors
     /// It is not.
-    pub fn check_end(&self, listing: &Listing, before: i64) -> Result<(), SegmentArchiveError> {
-        let Some(mark) = Mark::read(&self.mark)? else {
+    pub fn check_end(
+        &self,
+        listing: &Listing,
+        mark: Option<KeyRange>,
+        before: i64,
+    ) -> Result<(), SegmentArchiveError> {
+        let Some(mark) = mark else {
             return Ok(());
         };
         let key = mark.last.min(before - 1);
@@ -308,7 +385,7 @@ impl SegmentArchive {
             return Ok(());
         }
         Err(SegmentArchiveError::Missing {
-            folder: self.folder.clone(),
+            folder: self.shown(),
             key,
         })
     }
@@ -318,30 +395,30 @@ impl SegmentArchive {
     /// # Errors
     /// The folder cannot be read, or a file cannot be removed.
     pub fn remove_unfinished(&self) -> Result<usize, SegmentArchiveError> {
-        let names = self.names()?;
+        let Storage::Folder(folder) = &self.storage else {
+            return Ok(0);
+        };
+        let names = folder.names()?;
         let is_unfinished =
             |name: &&String| name.starts_with(PREFIX) && name.ends_with(PARTIAL_ENDING);
         let unfinished: Vec<&String> = names.iter().filter(is_unfinished).collect();
         for name in &unfinished {
-            let path = self.folder.join(name);
-            fs::remove_file(&path).map_err(FileError::of("remove", &path))?;
+            folder.remove(name)?;
         }
         Ok(unfinished.len())
     }
 
-    /// Checks that the folder is the right one and that files can be written there. Creates it if it is
-    /// missing and nothing was archived yet.
+    /// Checks that the place of the files is the right one and that files can be written there. Creates a
+    /// folder that is missing if nothing was archived yet.
     ///
     /// # Errors
     /// The last archived file is missing, or no file can be written.
-    pub fn check_writable(&self) -> Result<(), SegmentArchiveError> {
-        self.check_end(&self.list()?, i64::MAX)?;
-        self.create_folder()?;
-        let path = self.folder.join(PROBE_NAME);
-        let mut options = OpenOptions::new();
-        let created = options.write(true).create(true).mode(0o600).open(&path);
-        created.map_err(FileError::of("create", &path))?;
-        Ok(fs::remove_file(&path).map_err(FileError::of("remove", &path))?)
+    pub fn check_writable(&self, mark: Option<KeyRange>) -> Result<(), SegmentArchiveError> {
+        self.check_end(&self.list()?, mark, i64::MAX)?;
+        match &self.storage {
+            Storage::Folder(folder) => Ok(folder.probe(PROBE_NAME)?),
+            Storage::Bucket(bucket, _) => bucket.probe(PROBE_NAME),
+        }
     }
 
     /// Begins a file with these keys, under a temporary name.
@@ -349,19 +426,34 @@ impl SegmentArchive {
     /// # Errors
     /// The file cannot be created.
     pub fn begin(&self, keys: KeyRange) -> Result<Writer, SegmentArchiveError> {
-        self.create_folder()?;
-        let preceding = self.list()?.preceding(keys);
+        let preceding = self.list()?.preceding(keys).unwrap_or_default();
         let name = keys.name();
         let name = name.strip_suffix(ENDING).unwrap_or(&name);
-        let path = self.folder.join(format!("{name}{PARTIAL_ENDING}"));
-        Writer::create(path, keys, preceding.unwrap_or_default())
+        match &self.storage {
+            Storage::Folder(folder) => {
+                folder.create()?;
+                let path = folder.path_of(&format!("{name}{PARTIAL_ENDING}"));
+                Writer::create(path, keys, preceding, false)
+            }
+            Storage::Bucket(_, unfinished) => {
+                let process = std::process::id();
+                let path = unfinished.join(format!("{name}.{process}{PARTIAL_ENDING}"));
+                Writer::create(path, keys, preceding, true)
+            }
+        }
+    }
+
+    /// Returns whether a published file is a copy of the finished one, which was not compared with the
+    /// database.
+    pub fn is_copied(&self) -> bool {
+        matches!(self.storage, Storage::Bucket(..))
     }
 
     /// Gives a written file its name, after it has renamed files with the same keys. Returns the new
     /// names of these.
     ///
     /// # Errors
-    /// A file cannot be renamed.
+    /// A file cannot be renamed or uploaded.
     pub fn publish(&self, file: &Finished) -> Result<Vec<PathBuf>, SegmentArchiveError> {
         let keys = file.keys;
         let mut superseded = Vec::new();
@@ -371,55 +463,38 @@ impl SegmentArchive {
         // Its first measurements are in no other file, and would no longer be listed.
         if found.any(|found| found.first < keys.first && found.overlaps(keys)) {
             return Err(SegmentArchiveError::Overlap {
-                folder: self.folder.clone(),
+                folder: self.shown(),
                 key: keys.first,
             });
         }
-        for name in names {
-            if KeyRange::of_name(&name).is_some_and(|found| found.overlaps(keys)) {
-                superseded.push(self.supersede(&name)?);
+        for name in &names {
+            if KeyRange::of_name(name).is_some_and(|found| found.overlaps(keys)) {
+                superseded.push(self.supersede(name, &names)?);
             }
         }
-        let path = self.path_of(keys);
-        file.rename(&path)?;
-        self.sync_folder()?;
+        match &self.storage {
+            Storage::Folder(folder) => {
+                file.rename(&folder.path_of(&keys.name()))?;
+                folder.sync()?;
+            }
+            Storage::Bucket(bucket, _) => bucket.upload(file.file(), &keys.name())?,
+        }
         Ok(superseded)
     }
 
-    fn supersede(&self, name: &str) -> Result<PathBuf, SegmentArchiveError> {
-        let path = self.folder.join(name);
+    fn supersede(&self, name: &str, present: &[String]) -> Result<PathBuf, SegmentArchiveError> {
         let numbers = 0..SUPERSEDED_MAX;
         let mut targets = numbers.map(|number| match number {
-            0 => self.folder.join(format!("{name}{SUPERSEDED_ENDING}")),
-            _ => self
-                .folder
-                .join(format!("{name}.{number}{SUPERSEDED_ENDING}")),
+            0 => format!("{name}{SUPERSEDED_ENDING}"),
+            _ => format!("{name}.{number}{SUPERSEDED_ENDING}"),
         });
-        let target = targets.find(|target| !target.exists());
-        let target = target.unwrap_or_else(|| self.folder.join(name));
-        fs::rename(&path, &target).map_err(FileError::of("rename", &path))?;
-        Ok(target)
-    }
-
-    fn sync_folder(&self) -> Result<(), FileError> {
-        let folder = &self.folder;
-        let synced = File::open(folder).and_then(|folder| folder.sync_all());
-        synced.map_err(FileError::of("sync", folder))
-    }
-
-    /// Records that the measurements with these keys are archived.
-    ///
-    /// # Errors
-    /// The mark cannot be written.
-    pub fn set_mark(&self, keys: KeyRange) -> Result<(), SegmentArchiveError> {
-        let first = match Mark::read(&self.mark)? {
-            Some(mark) if mark.first <= keys.first && keys.first <= mark.last.saturating_add(1) => {
-                mark.first
-            }
-            Some(_) | None => keys.first,
-        };
-        let last = keys.last;
-        Ok(Mark { first, last }.write(&self.mark)?)
+        let target = targets.find(|target| !present.contains(target));
+        let target = target.unwrap_or_else(|| name.to_owned());
+        match &self.storage {
+            Storage::Folder(folder) => folder.rename(name, &target)?,
+            Storage::Bucket(bucket, _) => bucket.rename(name, &target)?,
+        }
+        Ok(self.shown().join(target))
     }
 
     /// Reads at most `limit` measurements by their keys. The search ends earlier after
@@ -427,9 +502,14 @@ impl SegmentArchive {
     ///
     /// # Errors
     /// A file cannot be read, is damaged or missing.
-    pub fn read(&self, selection: &Selection, limit: usize) -> Result<Found, SegmentArchiveError> {
+    pub fn read(
+        &self,
+        selection: &Selection,
+        mark: Option<KeyRange>,
+        limit: usize,
+    ) -> Result<Found, SegmentArchiveError> {
         let listing = self.list()?;
-        self.check_end(&listing, selection.before)?;
+        self.check_end(&listing, mark, selection.before)?;
         let mut found = Found {
             segments: Vec::new(),
             searched_to: selection.after,
@@ -444,9 +524,9 @@ impl SegmentArchive {
                 return Ok(found);
             }
             opened += 1;
-            let file = OpenFile::open(&self.path_of(keys), keys)?;
+            let file = self.open(keys)?;
             if let Some(key) = file.missing_before(listing.preceding(keys))? {
-                let folder = self.folder.clone();
+                let folder = self.shown();
                 return Err(SegmentArchiveError::Missing { folder, key });
             }
             if !file.read(selection, limit, &mut rows_left, &mut found)? {
@@ -455,6 +535,31 @@ impl SegmentArchive {
         }
         found.searched_to = found.searched_to.max(selection.before - 1);
         Ok(found)
+    }
+
+    /// Checks that no file is missing or damaged, without a change: of each file the footer, or all of it.
+    /// Returns the number of files.
+    ///
+    /// # Errors
+    /// The first fault that is found.
+    pub fn examine(
+        &self,
+        mark: Option<KeyRange>,
+        is_deep: bool,
+    ) -> Result<usize, SegmentArchiveError> {
+        let listing = self.list()?;
+        self.check_end(&listing, mark, i64::MAX)?;
+        for &keys in &listing.files {
+            let file = self.open(keys)?;
+            if let Some(key) = file.missing_before(listing.preceding(keys))? {
+                let folder = self.shown();
+                return Err(SegmentArchiveError::Missing { folder, key });
+            }
+            if is_deep {
+                file.check_rows()?;
+            }
+        }
+        Ok(listing.files.len())
     }
 
     /// Reads all measurements of one file after a key, at most `limit`.
@@ -467,14 +572,23 @@ impl SegmentArchive {
         after: i64,
         limit: usize,
     ) -> Result<Vec<ArchivedSegment>, SegmentArchiveError> {
-        read_path(&self.path_of(keys), keys, after, limit)
+        read_all(&self.open(keys)?, after, limit)
     }
 }
 
-/// Reads all measurements of a file after a key, at most `limit`.
-fn read_path(
-    path: &Path,
+/// Reads all measurements of a file after a key, at most `limit`. `path` is shown in errors.
+fn read_source(
+    path: PathBuf,
+    source: Source,
     keys: KeyRange,
+    after: i64,
+    limit: usize,
+) -> Result<Vec<ArchivedSegment>, SegmentArchiveError> {
+    read_all(&OpenFile::open(path, source, keys)?, after, limit)
+}
+
+fn read_all(
+    file: &OpenFile,
     after: i64,
     limit: usize,
 ) -> Result<Vec<ArchivedSegment>, SegmentArchiveError> {
@@ -488,6 +602,6 @@ fn read_path(
     };
     let mut found = Found::default();
     let mut rows_left = usize::MAX;
-    OpenFile::open(path, keys)?.read(&selection, limit, &mut rows_left, &mut found)?;
+    file.read(&selection, limit, &mut rows_left, &mut found)?;
     Ok(found.segments)
 }

@@ -1,18 +1,18 @@
 //! Reads a file: only the row groups that may contain what is wanted, and only after their checksums.
 
-use std::fs::File;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
+use std::sync::Arc;
 
 use parquet::data_type::Int64Type;
-use parquet::file::metadata::{KeyValue, RowGroupMetaData};
-use parquet::file::reader::FileReader as _;
-use parquet::file::serialized_reader::SerializedFileReader;
+use parquet::file::metadata::{KeyValue, ParquetMetaData, ParquetMetaDataReader, RowGroupMetaData};
+use parquet::file::properties::ReaderProperties;
+use parquet::file::serialized_reader::SerializedRowGroupReader;
 use tread_api::ids::{RobotId, SiteId, TerrainId};
 
 use super::fault::{Fault, fault, guarded};
 use super::rows::{Columns, Names, Values};
+use super::source::{Source, Window};
 use super::{ArchivedSegment, Found, KeyRange, SegmentArchiveError, Selection, checksum, schema};
-use crate::file_error::FileError;
 
 /// A row group: its keys, its bytes in the file, and their checksum.
 #[derive(Debug, Clone)]
@@ -25,22 +25,24 @@ struct Group {
 /// A file whose footer was checked.
 pub(super) struct OpenFile {
     path: PathBuf,
-    file: File,
-    reader: SerializedFileReader<File>,
+    source: Source,
+    metadata: ParquetMetaData,
     groups: Vec<Group>,
     /// Last key of the file before, 0 if there was none.
     follows: i64,
 }
 
 impl OpenFile {
-    /// Opens a file that contains these keys.
-    pub(super) fn open(path: &Path, keys: KeyRange) -> Result<Self, SegmentArchiveError> {
-        let opened = File::open(path);
-        let file = opened.map_err(FileError::of("open", path))?;
-        guarded(path, || {
-            let footer_at = checksum::check_footer(&file)?;
-            let reader = SerializedFileReader::new(file.try_clone()?)?;
-            let about = reader.metadata().file_metadata();
+    /// Reads the footer of a file that contains these keys. `path` is shown in errors.
+    pub(super) fn open(
+        path: PathBuf,
+        source: Source,
+        keys: KeyRange,
+    ) -> Result<Self, SegmentArchiveError> {
+        guarded(&path.clone(), || {
+            let footer = checksum::read_footer(&source)?;
+            let metadata = ParquetMetaDataReader::decode_metadata(&footer.bytes)?;
+            let about = metadata.file_metadata();
             let said = about.key_value_metadata().map_or(&[][..], Vec::as_slice);
             if value_of(said, schema::FORMAT_KEY) != Some(schema::FORMAT) {
                 return Err(fault("it is not of this format"));
@@ -51,15 +53,15 @@ impl OpenFile {
             let follows = value_of(said, schema::FOLLOWS_KEY);
             let follows = follows.and_then(|follows| follows.parse().ok());
             let groups = value_of(said, schema::ROW_GROUPS_KEY).unwrap_or_default();
-            let counts = reader.metadata().row_groups().iter();
+            let counts = metadata.row_groups().iter();
             let counts: Vec<i64> = counts.map(RowGroupMetaData::num_rows).collect();
-            let groups = groups_of(groups, &counts, keys, footer_at);
+            let groups = groups_of(groups, &counts, keys, footer.begin);
             Ok(Self {
-                path: path.to_owned(),
+                path,
                 groups: groups.ok_or_else(|| fault("its row groups do not have its keys"))?,
-                file,
+                source,
                 follows: follows.ok_or_else(|| fault("it does not name the file before"))?,
-                reader,
+                metadata,
             })
         })
     }
@@ -78,6 +80,16 @@ impl OpenFile {
             Some(last) => Ok((last < self.follows).then_some(self.follows)),
             None => Ok(None),
         }
+    }
+
+    /// Checks the checksums of all rows.
+    pub(super) fn check_rows(&self) -> Result<(), SegmentArchiveError> {
+        for group in &self.groups {
+            guarded(&self.path, || {
+                checksum::read_checked(&self.source, group.bytes, group.sum).map(drop)
+            })?;
+        }
+        Ok(())
     }
 
     /// Adds the selected measurements to those found. Returns whether the search goes on after this
@@ -117,10 +129,14 @@ impl OpenFile {
         Ok(true)
     }
 
+    fn row_group(&self, index: usize) -> Result<&RowGroupMetaData, Fault> {
+        let group = self.metadata.row_groups().get(index);
+        group.ok_or_else(|| fault("a row group is missing"))
+    }
+
     /// Returns whether a row group may have selected rows, by the statistics of its columns.
     fn may_contain(&self, index: usize, selection: &Selection) -> Result<bool, Fault> {
-        let group = self.reader.metadata().row_groups().get(index);
-        let group = group.ok_or_else(|| fault("a row group is missing"))?;
+        let group = self.row_group(index)?;
         let site = selection.site.as_ref().map(SiteId::as_str);
         let robot = selection.robot.as_ref().map(RobotId::as_str);
         let terrain = selection.terrain.as_ref().map(TerrainId::as_str);
@@ -146,11 +162,16 @@ impl OpenFile {
     ) -> Result<Vec<ArchivedSegment>, Fault> {
         let about = self.groups.get(index);
         let about = about.ok_or_else(|| fault("a row group is missing"))?;
-        checksum::check_bytes(&self.file, about.bytes, about.sum)?;
-        let group = self.reader.get_row_group(index)?;
+        let bytes = checksum::read_checked(&self.source, about.bytes, about.sum)?;
+        let group = SerializedRowGroupReader::new(
+            Arc::new(Window::new(about.bytes.0, bytes)),
+            self.row_group(index)?,
+            self.metadata.page_index_for_row_group(index),
+            Arc::new(ReaderProperties::builder().build()),
+        )?;
         let skipped = place(keys.first - about.keys.first);
         let rows = skipped..skipped + place(keys.count());
-        let mut columns = Columns::new(group.as_ref(), rows);
+        let mut columns = Columns::new(&group, rows);
         let ids = columns.each::<Int64Type>()?;
         if !ids.iter().copied().eq(keys.first..=keys.last) {
             return Err(fault("its rows do not have its keys"));

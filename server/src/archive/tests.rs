@@ -1,8 +1,10 @@
 //! What was written is read to the bit, and a damaged file never reads as another one.
 
-mod samples;
+pub(super) mod samples;
 
+use std::cell::Cell;
 use std::fs;
+use std::ops::Deref;
 use std::os::unix::fs::PermissionsExt as _;
 
 use proptest::prelude::*;
@@ -11,11 +13,47 @@ use tread_api::friction::{Information, ThetaErrors};
 use self::samples::{numbered, rows, stored};
 use super::*;
 
-fn archive(folder: &Path) -> SegmentArchive {
-    SegmentArchive::new(folder.join("archive"), folder.join("tread.db.archived"))
+/// An archive with its mark, as a database has it.
+struct Marked {
+    files: SegmentArchive,
+    mark: Cell<Option<KeyRange>>,
 }
 
-fn write(archive: &SegmentArchive, rows: &[ArchivedSegment]) -> KeyRange {
+impl Deref for Marked {
+    type Target = SegmentArchive;
+
+    fn deref(&self) -> &SegmentArchive {
+        &self.files
+    }
+}
+
+impl Marked {
+    fn folder(&self) -> PathBuf {
+        self.shown()
+    }
+
+    fn read(&self, selection: &Selection, limit: usize) -> Result<Found, SegmentArchiveError> {
+        self.files.read(selection, self.mark.get(), limit)
+    }
+
+    fn check_writable(&self) -> Result<(), SegmentArchiveError> {
+        self.files.check_writable(self.mark.get())
+    }
+}
+
+fn in_folder(folder: &Path) -> Marked {
+    let database = folder.with_file_name("tread.db");
+    Marked {
+        files: SegmentArchive::new(folder.to_owned().into(), Some(&database)).unwrap(),
+        mark: Cell::new(None),
+    }
+}
+
+fn archive(folder: &Path) -> Marked {
+    in_folder(&folder.join("archive"))
+}
+
+fn write(archive: &Marked, rows: &[ArchivedSegment]) -> KeyRange {
     let (first, last) = (rows[0].stored.id, rows[rows.len() - 1].stored.id);
     let mut writer = archive.begin(KeyRange { first, last }).unwrap();
     for part in rows.chunks(1_000) {
@@ -24,7 +62,7 @@ fn write(archive: &SegmentArchive, rows: &[ArchivedSegment]) -> KeyRange {
     let finished = writer.finish().unwrap();
     let keys = finished.keys();
     assert_eq!(archive.publish(&finished).unwrap(), Vec::<PathBuf>::new());
-    archive.set_mark(keys).unwrap();
+    archive.mark.set(Some(keys.joined_to(archive.mark.get())));
     keys
 }
 
@@ -221,9 +259,8 @@ fn the_owner_alone_can_use_the_files() {
     let archive = archive(folder.path());
     let keys = write(&archive, &rows(1, 3));
     let mode = |path: &Path| fs::metadata(path).unwrap().permissions().mode() & 0o777;
-    assert_eq!(mode(archive.folder()), 0o700);
+    assert_eq!(mode(&archive.folder()), 0o700);
     assert_eq!(mode(&archive.path_of(keys)), 0o600);
-    assert_eq!(mode(&folder.path().join("tread.db.archived")), 0o600);
     let name = "segments-0000000000000000001-0000000000000000003.parquet";
     assert!(archive.folder().join(name).exists());
 }
@@ -385,8 +422,7 @@ fn a_folder_is_examined_before_anything_is_written_and_nothing_remains_of_that()
     let entries = fs::read_dir(good.folder()).unwrap();
     assert_eq!(entries.count(), 0);
     // The kernel lets nobody make a folder there, not even root.
-    let mark = folder.path().join("other.archived");
-    let wrong = SegmentArchive::new("/proc/archive".into(), mark);
+    let wrong = in_folder(Path::new("/proc/archive"));
     assert!(wrong.list().unwrap().files.is_empty());
     let refused = wrong.check_writable().unwrap_err().to_string();
     assert!(refused.contains("/proc/archive"), "{refused}");
@@ -398,4 +434,48 @@ fn a_folder_is_examined_before_anything_is_written_and_nothing_remains_of_that()
         Err(SegmentArchiveError::Missing { key: 3, .. })
     ));
     assert!(!good.folder().exists());
+}
+
+#[test]
+fn the_mark_of_a_former_version_is_read_and_removed() {
+    let folder = tempfile::tempdir().unwrap();
+    let database = folder.path().join("tread.db");
+    let archived = folder.path().join("archive");
+    let beside = SegmentArchive::new(archived.clone().into(), Some(&database)).unwrap();
+    let within = SegmentArchive::new(archived.clone().into(), None).unwrap();
+    fs::create_dir(&archived).unwrap();
+    for (archive, file) in [
+        (beside, folder.path().join("tread.db.archived")),
+        (within, archived.join("tread.archived")),
+    ] {
+        assert_eq!(archive.former_mark().unwrap(), None);
+        fs::write(&file, "3 90\n").unwrap();
+        let mark = KeyRange { first: 3, last: 90 };
+        assert_eq!(archive.former_mark().unwrap(), Some(mark));
+        archive.remove_former_mark().unwrap();
+        assert_eq!(archive.former_mark().unwrap(), None);
+        for damaged in ["", "3", "9 3", "a b"] {
+            fs::write(&file, damaged).unwrap();
+            assert!(archive.former_mark().is_err(), "{damaged}");
+        }
+    }
+}
+
+proptest! {
+    #[test]
+    fn a_mark_names_no_key_of_a_gap(
+        files in prop::collection::vec((1_i64..20, 0_i64..5), 1..8),
+    ) {
+        let mut mark: Option<KeyRange> = None;
+        for (first, more) in files {
+            let keys = KeyRange { first, last: first + more };
+            let joined = keys.joined_to(mark);
+            prop_assert_eq!(joined.last, keys.last);
+            // All its keys are those of the file or of the former mark.
+            for key in joined.first..keys.first {
+                prop_assert!(mark.is_some_and(|mark| mark.contains(key)));
+            }
+            mark = Some(joined);
+        }
+    }
 }

@@ -1,7 +1,6 @@
 //! Writes a file under a temporary name.
 
 use std::fs::{self, File, OpenOptions};
-use std::io;
 use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -14,7 +13,9 @@ use parquet::file::writer::{SerializedFileWriter, SerializedRowGroupWriter};
 use tread_api::friction::{Information, Segment};
 
 use super::checksum::{self, Summed};
-use super::{ArchivedSegment, KeyRange, ROW_GROUP_ROWS, SegmentArchiveError, read_path, schema};
+use super::fault::guarded;
+use super::source::Source;
+use super::{ArchivedSegment, KeyRange, ROW_GROUP_ROWS, SegmentArchiveError, read_source, schema};
 use crate::file_error::FileError;
 
 /// Writes the measurements of one file.
@@ -33,17 +34,23 @@ pub struct Writer {
 pub struct Finished {
     /// Keys of its measurements.
     pub(super) keys: KeyRange,
+    file: File,
     partial: Partial,
 }
 
-/// Removes the temporary file if the work ends early.
+/// The temporary file, which is removed if the work ends early.
 #[derive(Debug)]
-struct Partial(PathBuf);
+struct Partial {
+    path: PathBuf,
+    is_removed: bool,
+}
 
 impl Drop for Partial {
     fn drop(&mut self) {
-        // If it stays, the next start removes it.
-        let _ = fs::remove_file(&self.0);
+        if !self.is_removed {
+            // If it stays, the next start removes it.
+            let _ = fs::remove_file(&self.path);
+        }
     }
 }
 
@@ -62,33 +69,48 @@ impl Finished {
         after: i64,
         limit: usize,
     ) -> Result<Vec<ArchivedSegment>, SegmentArchiveError> {
-        read_path(&self.partial.0, self.keys, after, limit)
+        let path = &self.partial.path;
+        let file = self.file.try_clone();
+        let source = Source::File(file.map_err(FileError::of("open", path))?);
+        read_source(path.clone(), source, self.keys, after, limit)
+    }
+
+    pub(super) fn file(&self) -> &File {
+        &self.file
     }
 
     pub(super) fn rename(&self, target: &Path) -> Result<(), FileError> {
-        let path = &self.partial.0;
+        let path = &self.partial.path;
         fs::rename(path, target).map_err(FileError::of("rename", path))
     }
 }
 
 impl Writer {
+    /// Begins a file at a path, which is gone at once if the file is only `uploaded`.
     pub(super) fn create(
         path: PathBuf,
         keys: KeyRange,
         follows: i64,
+        uploaded: bool,
     ) -> Result<Self, SegmentArchiveError> {
         let mut options = OpenOptions::new();
         // Read again for the checksum of the footer.
         options.read(true).write(true).create(true).truncate(true);
         let opened = options.mode(0o600).open(&path);
         let file = opened.map_err(FileError::of("create", &path))?;
-        let partial = Partial(path);
+        if uploaded {
+            fs::remove_file(&path).map_err(FileError::of("remove", &path))?;
+        }
+        let partial = Partial {
+            path,
+            is_removed: uploaded,
+        };
         let written = |file| {
             let columns = Arc::new(schema::columns()?);
             let properties = Arc::new(schema::properties(follows, checksum::placeholder())?);
             SerializedFileWriter::new(Summed::new(file), columns, properties)
         };
-        let file = written(file).map_err(encoding(&partial.0))?;
+        let file = written(file).map_err(encoding(&partial.path))?;
         Ok(Self {
             keys,
             file,
@@ -119,7 +141,7 @@ impl Writer {
 
     /// Writes a row group to the disk; syncing each keeps the disk free for the database's commits.
     fn write_group(&mut self, rows: &[ArchivedSegment]) -> Result<(), SegmentArchiveError> {
-        let failed = encoding(&self.partial.0);
+        let failed = encoding(&self.partial.path);
         let mut written = || {
             let mut group = self.file.next_row_group()?;
             let columns = Columns {
@@ -154,13 +176,16 @@ impl Writer {
         } = self;
         let key = schema::ROW_GROUPS_KEY.to_owned();
         file.append_key_value_metadata(KeyValue::new(key, groups.join(",")));
-        let summed = file.into_inner().map_err(encoding(&partial.0))?;
-        let sealed = |file: &File| -> io::Result<()> {
-            checksum::seal_footer(file)?;
-            file.sync_all()
-        };
-        sealed(summed.file()).map_err(FileError::of("write", &partial.0))?;
-        Ok(Finished { keys, partial })
+        let summed = file.into_inner().map_err(encoding(&partial.path))?;
+        let file = summed.into_file();
+        guarded(&partial.path, || checksum::seal_footer(&file))?;
+        file.sync_all()
+            .map_err(FileError::of("write", &partial.path))?;
+        Ok(Finished {
+            keys,
+            file,
+            partial,
+        })
     }
 }
 

@@ -44,7 +44,10 @@ fn how_long_measurements_are_kept_is_bounded() {
     let kept = load("[retention]\narchive = \"/srv/measurements\"")
         .unwrap()
         .retention;
-    assert_eq!(kept.archive, Some("/srv/measurements".into()));
+    assert_eq!(
+        kept.archive,
+        Some(std::path::PathBuf::from("/srv/measurements").into())
+    );
     for wrong in [
         "segments_days = 0",
         "segments_max = 10",

@@ -1,6 +1,5 @@
 //! Examines the schema of the database, and whether the database is readable.
 
-use jiff::Timestamp;
 use tread_api::diagnosis::Finding;
 
 use super::Examined;
@@ -11,8 +10,8 @@ use crate::error_text::chain;
 const RESTORE: &str = "stop the server, keep the file, and restore a backup; or bring what can be \
                        read into a new file: `sqlite3 FILE .recover | sqlite3 NEW`";
 
-/// Returns the findings, and the newest time in the database.
-pub(super) async fn findings(examined: &Examined) -> (Vec<Finding>, Option<Timestamp>) {
+/// Returns the findings, and what the database says.
+pub(super) async fn findings(examined: &Examined) -> (Vec<Finding>, Option<Inspection>) {
     let location = &examined.config.database;
     let shown = location;
     let inspected = inspect(
@@ -29,7 +28,6 @@ pub(super) async fn findings(examined: &Examined) -> (Vec<Finding>, Option<Times
         }
         Err(error) => return (vec![unreadable(&shown.to_string(), &error)], None),
     };
-    let newest = inspection.newest;
     let mut findings = vec![schema(&shown.to_string(), &inspection)];
     match (&inspection.damage, examined.is_deep) {
         (Some(damage), _) => findings.push(Finding::problem(
@@ -45,7 +43,7 @@ pub(super) async fn findings(examined: &Examined) -> (Vec<Finding>, Option<Times
             "every table can be read; --deep reads all of it",
         )),
     }
-    (findings, newest)
+    (findings, Some(inspection))
 }
 
 fn schema(shown: &str, inspection: &Inspection) -> Finding {

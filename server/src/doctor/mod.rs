@@ -34,7 +34,7 @@ pub(crate) struct DoctorArgs {
     /// Database: a file, or the address `postgres://…` of a PostgreSQL database
     #[arg(long, value_name = "FILE")]
     database: Option<PathBuf>,
-    /// Read the whole database (`PRAGMA quick_check`), which takes seconds for each gigabyte
+    /// Read the whole database and the whole archive, which takes seconds for each gigabyte
     #[arg(long)]
     deep: bool,
     /// Print one JSON object
@@ -110,9 +110,11 @@ async fn examine(args: DoctorArgs) -> Vec<Finding> {
         None => Finding::skipped("server", "it does not run on this database"),
     });
     findings.extend(files::findings(&examined));
-    let (of_database, newest) = database::findings(&examined).await;
+    let (of_database, inspection) = database::findings(&examined).await;
     findings.extend(of_database);
-    findings.extend(archive::finding(&examined));
+    let archived = inspection.as_ref().and_then(|found| found.archived);
+    findings.extend(archive::finding(&examined, archived).await);
+    let newest = inspection.and_then(|found| found.newest);
     findings.extend(clock::findings(&examined, newest));
     findings.extend(certificates::findings(&examined));
     findings.extend(ports::findings(&examined).await);

@@ -13,7 +13,6 @@ use tokio::time::Instant;
 
 use super::unfinished::{Unfinished, check_absent, with_ending};
 use crate::app::backups::check_space;
-use crate::archive::{MARK_ENDING, mark_of};
 use crate::backup::archive::sync_folder;
 use crate::db::lock::DatabaseLock;
 use crate::db::schema::{self, refuse_newer};
@@ -108,8 +107,7 @@ pub(crate) async fn run(args: CopyArgs) -> anyhow::Result<()> {
         file_owner::chown_database(file)?;
     }
     let copied = copied.with_context(|| format!("`{from}` was not copied to `{to}`"))?;
-    let mark = carry_mark(&from, &to)?;
-    tell(&copied, (&from, &to), mark).context("cannot print")
+    tell(&copied, (&from, &to)).context("cannot print")
 }
 
 /// Returns whether two names lead to one file.
@@ -229,11 +227,7 @@ impl Shown {
     }
 }
 
-fn tell(
-    copied: &[Copied],
-    (from, to): (&Location, &Location),
-    mark: Option<String>,
-) -> io::Result<()> {
+fn tell(copied: &[Copied], (from, to): (&Location, &Location)) -> io::Result<()> {
     let mut out = io::stdout().lock();
     writeln!(out, "{:24} {:>14}  SHA-256 of the rows", "table", "rows")?;
     for one in copied.iter().filter(|one| one.contents.rows > 0) {
@@ -249,46 +243,9 @@ fn tell(
         "{rows} rows of {} tables were read back from `{to}` and are those of `{from}`",
         copied.len()
     )?;
-    if let Some(mark) = mark {
-        writeln!(out, "{mark}")?;
-    }
     writeln!(
         out,
         "next: name it as `database` in the configuration. Start no server on `{from}` any more: the robots \
          would get the missions of both"
     )
-}
-
-/// Takes along which measurements were archived, which is written beside a database file. Returns what
-/// people must do about it.
-fn carry_mark(from: &Location, to: &Location) -> anyhow::Result<Option<String>> {
-    let in_folder = mark_of(Path::new("FOLDER"), None);
-    let in_folder = in_folder.display();
-    let (source, target) = match (from.file(), to.file()) {
-        (None, None) => return Ok(None),
-        (None, Some(to)) => {
-            let target = with_ending(to, MARK_ENDING);
-            return Ok(Some(format!(
-                "if measurements were archived in FOLDER (`archive` in `[retention]`), copy `{in_folder}` to `{}`",
-                target.display()
-            )));
-        }
-        (Some(from), to) => (
-            with_ending(from, MARK_ENDING),
-            to.map(|to| with_ending(to, MARK_ENDING)),
-        ),
-    };
-    if !source.exists() {
-        return Ok(None);
-    }
-    let Some(target) = target else {
-        return Ok(Some(format!(
-            "measurements were archived: copy `{}` to `{in_folder}` in their folder (`archive` in `[retention]`)",
-            source.display()
-        )));
-    };
-    let written = fs::copy(&source, &target);
-    written.with_context(|| format!("cannot write `{}`", target.display()))?;
-    file_owner::chown_database(&target)?;
-    Ok(None)
 }

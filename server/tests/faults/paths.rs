@@ -279,6 +279,18 @@ pub(crate) const PATHS: &[WritePath] = &[
         },
     },
     WritePath {
+        name: "archive mark",
+        prepare: nothing,
+        act: |ground, number| {
+            Box::pin(async move {
+                let mut tx = ground.app.db().write_uncounted("archive").await?;
+                let last = i64::try_from(number).unwrap() + 1;
+                db::archive_mark::set(&mut tx, (1, last)).await?;
+                Ok(tx.commit().await?)
+            })
+        },
+    },
+    WritePath {
         name: "retention",
         prepare: |ground, number| {
             Box::pin(async move {

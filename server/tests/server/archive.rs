@@ -1,5 +1,6 @@
 //! Old measurements are archived before they are removed, and lists go on through the archive.
 
+mod buckets;
 mod failures;
 
 use std::fs;
@@ -17,6 +18,7 @@ use tread_api::rights::Scope;
 use tread_api::terrain::TerrainRef;
 use tread_api::wire::ingest::Record;
 use tread_server::app::{App, Dependencies};
+use tread_server::archive::SegmentArchive;
 use tread_server::config::RetentionConfig;
 use tread_server::db::alerts::AlertFilter;
 use tread_server::db::file::copy;
@@ -34,7 +36,7 @@ const OF_A_DAY: u64 = 40;
 fn week(archive: &Path) -> RetentionConfig {
     RetentionConfig {
         segments_days: 7,
-        archive: Some(archive.to_owned()),
+        archive: Some(archive.to_owned().into()),
         ..RetentionConfig::default()
     }
 }
@@ -93,8 +95,9 @@ impl Ground {
     }
 
     async fn restarted_on(&self, db: Db) -> App {
+        let archive = SegmentArchive::new(self.archive().into(), db.path()).unwrap();
         let app = App::new(Dependencies {
-            archive: Some(self.archive()),
+            archive: Some(archive),
             ..Dependencies::on_database(db, self.app().clock().clone())
         });
         app.load_map().await.unwrap();

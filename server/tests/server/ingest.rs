@@ -14,6 +14,7 @@ use tread_api::wire::hello::Hello;
 use tread_api::wire::ingest::{Batch, Receipt, Record};
 use tread_server::app::ingest::{self, UPLOADS_WAITING_MAX, Upload};
 use tread_server::app::{App, Dependencies};
+use tread_server::archive::SegmentArchive;
 use tread_server::clock::Clock;
 use tread_server::db::sums::SumRow;
 use tread_server::db::{self, Db};
@@ -45,6 +46,8 @@ impl Writer {
         let folder = tempfile::tempdir().unwrap();
         let db = Db::open(&database(folder.path())).await.unwrap();
         let clock = Clock::manual(time("2026-11-01T00:00:00Z"));
+        let archive =
+            archive.map(|location| SegmentArchive::new(location.into(), db.path()).unwrap());
         let app = App::new(Dependencies {
             archive,
             ..Dependencies::on_database(db, clock)

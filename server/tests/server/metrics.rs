@@ -63,7 +63,7 @@ async fn alert_rules_and_dashboard_name_only_metrics_that_exist() {
             keep: 1,
             encrypt: None,
         });
-        config.retention.archive = Some(folder.join("archive"));
+        config.retention.archive = Some(folder.join("archive").into());
     })
     .await;
     eventually("the server has made a backup", async || {

@@ -111,6 +111,7 @@ async fn make_present(target: &Path) {
              '0192f0c1-2b3c-7d4e-8f50-617283940a1b', 'test', 'test', '{}', 'pending', 1, 1)",
         "INSERT INTO withdrawals (robot_pk, from_h, to_h, reason, withdrawn_by, withdrawn_at_us)
              SELECT MIN(pk), 1, 2, 'a test', 't', 1 FROM robots",
+        "INSERT INTO archive_mark (id, first_pk, last_pk) VALUES (1, 1, 1)",
         "INSERT INTO idempotency_keys (owner, key, request_hash, answer, created_at_us) VALUES
              ('o', 'k', 'h', '{}', 1)",
     ] {

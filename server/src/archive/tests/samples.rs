@@ -119,7 +119,7 @@ pub(super) fn numbered(first: i64, mut rows: Vec<ArchivedSegment>) -> Vec<Archiv
     rows
 }
 
-pub(super) fn rows(first: i64, count: i64) -> Vec<ArchivedSegment> {
+pub(in crate::archive) fn rows(first: i64, count: i64) -> Vec<ArchivedSegment> {
     let row = |key: i64| ArchivedSegment {
         site: if key % 5 == 0 { "quarry" } else { "yard" }
             .parse()
