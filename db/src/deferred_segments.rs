@@ -10,5 +10,6 @@ forward! {
     deferred_segments;
     fn put(origin: Origin, times_us: (i64, i64), measurement: &RawValue) -> bool;
     fn count(robot_pk: i64) -> u64;
+    fn is_any() -> bool;
     fn take(boot_pk: i64, ended_before_us: i64, limit: u32) -> Vec<DeferredSegment>;
 }

@@ -4,6 +4,8 @@
 //! partitions, and retention, which drops them as a whole, keeps values little longer than it must. The
 //! ledger ([`super::segment_ranges`]) says which measurements there are; values of others are never read.
 
+use std::time::Duration;
+
 use jiff::SignedDuration;
 use sqlx::AssertSqlSafe;
 
@@ -15,10 +17,13 @@ const KEYS_MIN: i64 = 1_000_000;
 const KEYS_MAX: i64 = 50_000_000;
 /// Time whose measurements a partition should have.
 const SPAN: SignedDuration = SignedDuration::from_hours(7 * 24);
+/// Age of a snapshot from which it may be older than the removal of what is dropped; less than the interval
+/// of the removals.
+const SNAPSHOT_MAX: Duration = Duration::from_mins(9);
 /// Maximum time for which the drop of a partition waits for readers; others wait behind it.
 const LOCK_TIMEOUT: &str = "SET LOCAL lock_timeout = '1s'";
-/// PostgreSQL's code for a lock that did not come in time.
-const LOCK_NOT_AVAILABLE: &str = "55P03";
+/// PostgreSQL's codes for a lock that did not come in time, and for one that never would.
+const LOCK_FAILURES: [&str; 2] = ["55P03", "40P01"];
 
 /// Creates the partitions that keys from `first` to `last` need, of which all earlier ones have theirs.
 pub(super) async fn prepare(
@@ -85,8 +90,8 @@ pub(super) async fn add(db: &mut Connection, (first, last): (i64, i64)) -> Resul
 /// Drops the partitions without measurements in the ledger. Returns how many; `None` if readers kept a
 /// lock for too long, then the transaction must end without a commit.
 ///
-/// A snapshot that is older than the removal of their measurements would miss values: call this before a
-/// removal and not after it.
+/// A snapshot that is older than the removal of their measurements would miss values, so nothing is dropped
+/// while a transaction is open since [`SNAPSHOT_MAX`]. Call this before a removal and not after it.
 pub async fn drop_removed(db: &mut Connection) -> Result<Option<u64>, EngineError> {
     let Some((first, _last)) = segment_ranges::ends(db).await? else {
         return Ok(Some(0));
@@ -99,14 +104,26 @@ pub async fn drop_removed(db: &mut Connection) -> Result<Option<u64>, EngineErro
     if unused.is_empty() {
         return Ok(Some(0));
     }
+    let is_read = sqlx::query_scalar!(
+        r#"SELECT EXISTS (SELECT 1 FROM pg_stat_activity
+               WHERE datname = current_database() AND pid <> pg_backend_pid()
+                   AND backend_type = 'client backend'
+                   AND xact_start < now() - make_interval(secs => $1)) AS "is_read!""#,
+        SNAPSHOT_MAX.as_secs_f64(),
+    );
+    if is_read.fetch_one(&mut *db).await? {
+        return Ok(None);
+    }
     sqlx::query(LOCK_TIMEOUT).execute(&mut *db).await?;
     for first in &unused {
-        let statement = format!("DROP TABLE segment_values_{first}");
+        let statement = format!("DROP TABLE IF EXISTS segment_values_{first}");
         let dropping = sqlx::query(AssertSqlSafe(statement)).persistent(false);
         match dropping.execute(&mut *db).await {
             Ok(_) => {}
             Err(sqlx::Error::Database(error))
-                if error.code().as_deref() == Some(LOCK_NOT_AVAILABLE) =>
+                if error
+                    .code()
+                    .is_some_and(|code| LOCK_FAILURES.contains(&&*code)) =>
             {
                 return Ok(None);
             }

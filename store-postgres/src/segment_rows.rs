@@ -1,28 +1,13 @@
 //! Writing of measurements, and the statement that reads them.
 
 use jiff::Timestamp;
+use tread_api::friction::Segment;
 use tread_store::segments::{Added, NewSegment};
 
-use super::copy_rows::CopyRows;
 use super::partitions;
 pub use super::partitions::drop_removed as release_removed;
 use super::segment_ranges::{self, NewRange};
 use super::{Connection, EngineError, ground, to_us};
-
-/// Columns of a measurement.
-const COPY: &str = "COPY segment_values (pk, started_at_ns, ended_at_ns, ix, iy, theta_information,
-         theta_weighted, independent_information, robot_error_ratio, tyre_error_ratio,
-         track_information, track_weighted, rolling_information, rolling_weighted,
-         mu_peak_lower_bound, samples, distance_m, saturation_ratio)
-     FROM STDIN (FORMAT binary)";
-const COLUMNS: i16 = 18;
-
-/// Columns of a range.
-const COPY_RANGES: &str = "COPY segment_ranges (first_pk, last_pk, first_seq, last_seq, boot_pk,
-         robot_pk, site_pk, configuration_pk, mission, grid_revision, terrain, terrain_revision,
-         received_at_us)
-     FROM STDIN (FORMAT binary)";
-const RANGE_COLUMNS: i16 = 13;
 
 /// Stores measurements, none of which is stored yet.
 ///
@@ -43,41 +28,76 @@ pub async fn insert(
         last: last.saturating_add_unsigned(segments.len() as u64),
     };
     partitions::prepare(db, (added.first, added.last)).await?;
-    let mut rows = CopyRows::new(COLUMNS);
-    for (pk, new) in (last + 1..).zip(segments) {
-        let (segment, (started_at_ns, ended_at_ns)) = (new.segment, new.times_ns);
-        let errors = segment.theta_errors;
-        let (track, rolling) = (segment.effective_track_ratio, segment.rolling_resistance);
-        rows.row()
-            .integer(pk)
-            .integer(started_at_ns)
-            .integer(ended_at_ns)
-            .integer(segment.cell.ix)
-            .integer(segment.cell.iy)
-            .real(segment.theta.information)
-            .real(segment.theta.weighted)
-            .real(errors.map(|errors| errors.independent_information))
-            .real(errors.map(|errors| errors.robot_ratio))
-            .real(errors.map(|errors| errors.tyre_ratio))
-            .real(track.map(|pair| pair.information))
-            .real(track.map(|pair| pair.weighted))
-            .real(rolling.map(|pair| pair.information))
-            .real(rolling.map(|pair| pair.weighted))
-            .real(segment.mu_peak_lower_bound)
-            .integer(segment.samples)
-            .real(segment.distance_m)
-            .real(segment.saturation_ratio);
-    }
-    rows.write(db, COPY).await?;
+    insert_values(db, last + 1, segments).await?;
     Ok(added)
 }
 
-/// Does nothing: values that are no longer in the ledger remain until their partition is dropped.
+/// Stores the values of measurements with keys from `first` on.
 ///
-/// # Errors
-/// None.
-#[expect(clippy::unused_async, reason = "as the other engine")]
-pub(super) async fn remove_values(_db: &mut Connection, _until_pk: i64) -> Result<(), EngineError> {
+/// By arrays and not by COPY: sqlx ends a COPY with a message of its own, which TCP delays by 40 ms since
+/// sqlx does not set `TCP_NODELAY`.
+async fn insert_values(
+    db: &mut Connection,
+    first: i64,
+    segments: &[NewSegment<'_>],
+) -> Result<(), EngineError> {
+    let integers =
+        |of: &dyn Fn(&NewSegment<'_>) -> i64| -> Vec<i64> { segments.iter().map(of).collect() };
+    let reals = |of: &dyn Fn(&Segment) -> f64| -> Vec<f64> {
+        segments.iter().map(|new| of(new.segment)).collect()
+    };
+    let some_reals = |of: &dyn Fn(&Segment) -> Option<f64>| -> Vec<Option<f64>> {
+        segments.iter().map(|new| of(new.segment)).collect()
+    };
+    let keys: Vec<i64> = (first..).take(segments.len()).collect();
+    sqlx::query!(
+        "INSERT INTO segment_values (pk, started_at_ns, ended_at_ns, ix, iy, theta_information,
+             theta_weighted, independent_information, robot_error_ratio, tyre_error_ratio,
+             track_information, track_weighted, rolling_information, rolling_weighted,
+             mu_peak_lower_bound, samples, distance_m, saturation_ratio)
+         SELECT * FROM UNNEST(CAST($1 AS BIGINT[]), CAST($2 AS BIGINT[]), CAST($3 AS BIGINT[]),
+             CAST($4 AS BIGINT[]), CAST($5 AS BIGINT[]), CAST($6 AS DOUBLE PRECISION[]),
+             CAST($7 AS DOUBLE PRECISION[]), CAST($8 AS DOUBLE PRECISION[]),
+             CAST($9 AS DOUBLE PRECISION[]), CAST($10 AS DOUBLE PRECISION[]),
+             CAST($11 AS DOUBLE PRECISION[]), CAST($12 AS DOUBLE PRECISION[]),
+             CAST($13 AS DOUBLE PRECISION[]), CAST($14 AS DOUBLE PRECISION[]),
+             CAST($15 AS DOUBLE PRECISION[]), CAST($16 AS BIGINT[]),
+             CAST($17 AS DOUBLE PRECISION[]), CAST($18 AS DOUBLE PRECISION[]))",
+        &keys,
+        &integers(&|new| new.times_ns.0),
+        &integers(&|new| new.times_ns.1),
+        &integers(&|new| new.segment.cell.ix.into()),
+        &integers(&|new| new.segment.cell.iy.into()),
+        &reals(&|segment| segment.theta.information),
+        &reals(&|segment| segment.theta.weighted),
+        &some_reals(&|segment| Some(segment.theta_errors?.independent_information)) as _,
+        &some_reals(&|segment| Some(segment.theta_errors?.robot_ratio)) as _,
+        &some_reals(&|segment| Some(segment.theta_errors?.tyre_ratio)) as _,
+        &some_reals(&|segment| Some(segment.effective_track_ratio?.information)) as _,
+        &some_reals(&|segment| Some(segment.effective_track_ratio?.weighted)) as _,
+        &some_reals(&|segment| Some(segment.rolling_resistance?.information)) as _,
+        &some_reals(&|segment| Some(segment.rolling_resistance?.weighted)) as _,
+        &some_reals(&|segment| segment.mu_peak_lower_bound) as _,
+        &integers(&|new| new.segment.samples.into()),
+        &reals(&|segment| segment.distance_m),
+        &reals(&|segment| segment.saturation_ratio),
+    )
+    .execute(db)
+    .await?;
+    Ok(())
+}
+
+/// Removes the values of measurements up to a key, which are no longer in the ledger, if they are in the
+/// partition of a database that had none before, which may be as large as all others. Other values remain
+/// until their partition is dropped.
+pub(super) async fn remove_values(db: &mut Connection, until_pk: i64) -> Result<(), EngineError> {
+    sqlx::query!(
+        "DELETE FROM segment_values WHERE pk <= $1
+             AND pk <= (SELECT last_pk FROM segment_partitions WHERE first_pk = 0)",
+        until_pk
+    )
+    .execute(db)
+    .await?;
     Ok(())
 }
 
@@ -87,27 +107,41 @@ async fn insert_ranges(
     ranges: &[NewRange<'_>],
     received_at_us: i64,
 ) -> Result<(), EngineError> {
-    let mut rows = CopyRows::new(RANGE_COLUMNS);
-    for range in ranges {
-        let after = range.count.saturating_sub(1);
-        let (terrain, terrain_revision) = ground::columns(range.terrain);
-        let mission = range.mission.map(|mission| mission.to_string());
-        rows.row()
-            .integer(range.first_pk)
-            .integer(range.first_pk.saturating_add_unsigned(after))
-            .integer(range.first_seq)
-            .integer(range.first_seq.saturating_add_unsigned(after))
-            .integer(range.boot_pk)
-            .integer(range.robot_pk)
-            .integer(range.site_pk)
-            .integer(range.configuration_pk)
-            .text(mission.as_deref())
-            .integer(range.grid_revision)
-            .text(Some(terrain))
-            .integer(terrain_revision)
-            .integer(received_at_us);
-    }
-    rows.write(db, COPY_RANGES).await?;
+    let integers =
+        |of: &dyn Fn(&NewRange<'_>) -> i64| -> Vec<i64> { ranges.iter().map(of).collect() };
+    let after = |range: &NewRange<'_>| range.count.saturating_sub(1);
+    let missions: Vec<Option<String>> = ranges
+        .iter()
+        .map(|range| range.mission.map(|mission| mission.to_string()))
+        .collect();
+    let terrains: Vec<String> = ranges
+        .iter()
+        .map(|range| ground::columns(range.terrain).0.to_owned())
+        .collect();
+    sqlx::query!(
+        "INSERT INTO segment_ranges (first_pk, last_pk, first_seq, last_seq, boot_pk, robot_pk,
+             site_pk, configuration_pk, mission, grid_revision, terrain, terrain_revision,
+             received_at_us)
+         SELECT *, CAST($13 AS BIGINT) FROM UNNEST(CAST($1 AS BIGINT[]), CAST($2 AS BIGINT[]),
+             CAST($3 AS BIGINT[]), CAST($4 AS BIGINT[]), CAST($5 AS BIGINT[]),
+             CAST($6 AS BIGINT[]), CAST($7 AS BIGINT[]), CAST($8 AS BIGINT[]), CAST($9 AS TEXT[]),
+             CAST($10 AS BIGINT[]), CAST($11 AS TEXT[]), CAST($12 AS BIGINT[]))",
+        &integers(&|range| range.first_pk),
+        &integers(&|range| range.first_pk.saturating_add_unsigned(after(range))),
+        &integers(&|range| range.first_seq),
+        &integers(&|range| range.first_seq.saturating_add_unsigned(after(range))),
+        &integers(&|range| range.boot_pk),
+        &integers(&|range| range.robot_pk),
+        &integers(&|range| range.site_pk),
+        &integers(&|range| range.configuration_pk),
+        &missions as _,
+        &integers(&|range| range.grid_revision.into()),
+        &terrains,
+        &integers(&|range| ground::columns(range.terrain).1.into()),
+        received_at_us,
+    )
+    .execute(db)
+    .await?;
     Ok(())
 }
 

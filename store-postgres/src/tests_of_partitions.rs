@@ -208,9 +208,19 @@ async fn measurements_of_a_database_without_partitions_remain() {
         upload(&db, 2, 1).await;
         assert_eq!(partitions(database).await, [(0, 9, 3), (10, 1_000_009, 2)]);
         assert_eq!(keys(&db).await, [7, 8, 9, 10, 11]);
+        // It may be as large as all that follow, so its values are removed at once.
+        remove_until(&db, 8).await;
+        assert_eq!(partitions(database).await, [(0, 9, 1), (10, 1_000_009, 2)]);
+        assert_eq!(keys(&db).await, [9, 10, 11]);
         remove_until(&db, 9).await;
         assert_eq!(release(&db).await, Some(1));
         assert_eq!(keys(&db).await, [10, 11]);
+        // A partition that somebody has dropped by hand is no error.
+        remove_until(&db, 10).await;
+        database
+            .run("INSERT INTO segment_partitions VALUES (3, 4)")
+            .await;
+        assert_eq!(release(&db).await, Some(1));
         db.close().await;
     })
     .await;

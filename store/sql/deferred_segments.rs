@@ -52,6 +52,12 @@ pub async fn count(db: &mut Connection, robot_pk: i64) -> Result<u64, EngineErro
     unsigned("count", count.fetch_one(db).await?)
 }
 
+/// Returns whether there is any deferred segment.
+pub async fn is_any(db: &mut Connection) -> Result<bool, EngineError> {
+    let first = sqlx::query_scalar!("SELECT seq FROM deferred_segments LIMIT 1");
+    Ok(first.fetch_optional(db).await?.is_some())
+}
+
 /// Removes and returns at most `limit` deferred segments of a run that ended before a time of its
 /// robot's clock.
 pub async fn take(

@@ -17,6 +17,8 @@ use crate::drive::ros2::settings::{Effort, JointSettings, Ros2Settings};
 
 /// Ratio to a side's load below which a force against the motion counts as none.
 const AGAINST_MIN: f64 = 0.02;
+/// Ratio to a side's load up to which a force counts as zero.
+const ZERO_MAX: f64 = 1e-6;
 /// Realistic friction coefficients of scrubbing wheels, drive train included.
 const FRICTION: std::ops::RangeInclusive<f64> = 0.1..=1.5;
 /// Ratio of the wheels' impulse to the robot's momentum. Heavy rotors behind a high gear ratio can
@@ -57,7 +59,25 @@ pub(super) fn findings(
             )
         }),
     };
-    Some(of_signs(&pull, joints).unwrap_or_else(|| of_size(&pull, effort, model)))
+    let found = of_zero(&pull).or_else(|| of_signs(&pull, joints));
+    Some(found.unwrap_or_else(|| of_size(&pull, effort, model)))
+}
+
+/// Returns the finding on joints whose effort is zero while their wheels scrub.
+fn of_zero(pull: &Pull) -> Option<Finding> {
+    let is_zero = pull
+        .friction
+        .iter()
+        .all(|friction| friction.abs() <= ZERO_MAX);
+    is_zero.then(|| {
+        let text = "the joints' effort is zero in a turn on the spot: it is not measured (`effort = \
+                    \"none\"`)";
+        Finding::wrong("torque", "drive.ros2.joints.effort", text).with_line(
+            "drive.ros2.joints",
+            "effort",
+            "\"none\"",
+        )
+    })
 }
 
 fn friction(model: &RobotModel, turned: &DriveSummary) -> Option<[f64; 2]> {
@@ -274,6 +294,15 @@ mod tests {
             key(Effort::Torque, 0.5, [0.0, 1.0]),
             Some("drive.ros2.joints.effort")
         );
+    }
+
+    #[test]
+    fn an_effort_that_is_zero_in_motion_is_not_measured() {
+        for effort in [Effort::Torque, Effort::Current(0.4)] {
+            let wrong = found(effort, 0.5, [0.0, 0.0]).unwrap();
+            assert_eq!(wrong.key, Some("drive.ros2.joints.effort"));
+            assert!(wrong.text.contains("not measured"), "{}", wrong.text);
+        }
     }
 
     #[test]

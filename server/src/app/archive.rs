@@ -61,6 +61,8 @@ struct State {
     removable: Option<KeyRange>,
     /// Why the last attempt failed, if it did.
     failure: Option<String>,
+    /// Whether a file could be written since the start and the last failure.
+    is_writable: bool,
 }
 
 impl Archive {
@@ -135,9 +137,14 @@ impl App {
             return Ok(());
         };
         let mark = self.archive_mark(archive).await?;
+        // A bucket may keep every version of an object, so nothing is written there without need.
+        let is_known = archive.files.is_copied() && archive.lock().is_writable;
         let preparing = move |files: &SegmentArchive| {
             let removed = files.remove_unfinished()?;
-            files.check_writable(mark)?;
+            files.check_present(mark)?;
+            if !is_known {
+                files.check_writable()?;
+            }
             Ok(removed)
         };
         let removed = archive.off_thread(preparing).await?;
@@ -366,7 +373,11 @@ impl App {
             self.counters().archive_failures.one();
         }
         let failure = failure.map(|cause| chain(cause));
-        archive.lock().failure.clone_from(&failure);
+        {
+            let mut state = archive.lock();
+            state.is_writable = failure.is_none();
+            state.failure.clone_from(&failure);
+        }
         let folder = archive.files.shown();
         let folder = folder.display();
         let text = failure.map(|why| {

@@ -297,6 +297,8 @@ impl Writer {
         let turn = app.map_turn_to_change().await?;
         let mut tx = app.db().write_uncounted("ingest").await?;
         let now = self.app.clock().now();
+        // One look for the group, since there are hardly ever some.
+        let is_any_deferred = db::deferred_segments::is_any(&mut tx).await?;
         for (index, upload) in group.iter().enumerate() {
             let batch = &upload.batch;
             let Admitted {
@@ -321,7 +323,7 @@ impl Writer {
                 robot: &batch.robot,
                 ready,
             };
-            if batch.robot_time.is_some() {
+            if is_any_deferred && batch.robot_time.is_some() {
                 for (keys, ready) in released(&mut tx, boot_pk, &grid, skew).await? {
                     // The key was cached when the segment was deferred.
                     let id = ready.segment.configuration;

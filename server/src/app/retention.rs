@@ -92,8 +92,14 @@ impl App {
         stop: &CancellationToken,
         removed: &mut u64,
     ) -> Result<(), AppError> {
-        self.release_removed().await?;
-        self.prepare_archive().await?;
+        if let Err(cause) = self.release_removed().await {
+            // Measurements are archived and removed nevertheless.
+            self.log_failure("drop the partitions of removed measurements", &cause);
+        }
+        tokio::select! {
+            () = stop.cancelled() => return Ok(()),
+            prepared = self.prepare_archive() => prepared?,
+        }
         while !stop.is_cancelled() {
             let Some(next) = db::limited(self.due(config, REMOVED_MAX)).await? else {
                 break;

@@ -291,9 +291,7 @@ impl App {
             )
         });
         let damaged = condition.damaged.as_ref().map(|finding| {
-            format!(
-                "the database `{path}` is damaged, restore a backup of it; SQLite says: {finding}"
-            )
+            format!("the database `{path}` is damaged, restore a backup of it: {finding}")
         });
         let disk = condition.is_disk_low.then(|| {
             let limit = self.storage().config.disk_free_min_mib;

@@ -13,6 +13,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use object_store::aws::{AmazonS3, AmazonS3Builder, AmazonS3ConfigKey, Checksum};
+use object_store::list::{PaginatedListOptions, PaginatedListStore as _};
 use object_store::path::Path;
 use object_store::{
     ClientConfigKey, GetOptions, GetRange, ObjectStore as _, ObjectStoreExt as _, PutPayload,
@@ -23,25 +24,23 @@ use tokio::runtime::Handle;
 use super::SegmentArchiveError;
 use super::fault::Fault;
 use super::location::BucketLocation;
+use super::reason::reason;
 
 /// Maximum time for a connection.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
-/// Maximum time for one request; a part of [`PART_BYTES`] needs it on a slow line.
+/// Maximum time for one request; a part of [`PART_BYTES`] on a line of 0.7 Mbit/s.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(60);
 /// Maximum number of repetitions of a request, and maximum time after which it is repeated.
 const RETRIES_MAX: usize = 3;
 const RETRY_TIMEOUT: Duration = Duration::from_secs(30);
-/// Number of bytes of a part of an upload; at least 5 MiB by the rules of S3.
-const PART_BYTES: usize = 8 * 1024 * 1024;
+/// Number of bytes of a part of an upload, the least by the rules of S3.
+const PART_BYTES: usize = 5 * 1024 * 1024;
 /// Maximum number of parts that are sent at the same time.
-const PARTS_MAX: usize = 2;
+const PARTS_MAX: usize = 1;
 /// Number of bytes at the end of an object that are read first; most footers are shorter.
 const TAIL_BYTES: u64 = 128 * 1024;
 /// Maximum number of names in the listing of a bucket.
 const NAMES_MAX: usize = 1_000_000;
-
-/// A failure of the storage.
-pub(super) type Failure = Box<object_store::Error>;
 
 /// A bucket.
 #[derive(Debug, Clone)]
@@ -89,7 +88,7 @@ impl Bucket {
             .build();
         let built = built.map_err(|cause| SegmentArchiveError::Settings {
             bucket: location.to_string(),
-            cause: Box::new(cause),
+            reason: reason(&cause),
         })?;
         Ok(Self {
             store: Arc::new(built),
@@ -106,21 +105,37 @@ impl Bucket {
         Path::from(self.location.prefix.as_str()).join(name)
     }
 
-    fn failed(&self, cause: object_store::Error) -> SegmentArchiveError {
+    fn failed(&self, cause: &object_store::Error) -> SegmentArchiveError {
         SegmentArchiveError::Bucket {
             bucket: self.location.to_string(),
-            cause: Box::new(cause),
+            reason: reason(cause),
         }
     }
 
-    /// Returns the names directly below the prefix.
-    pub(super) fn names(&self) -> Result<Vec<String>, SegmentArchiveError> {
-        let prefix = Path::from(self.location.prefix.as_str());
-        let listed = wait(self.store.list_with_delimiter(Some(&prefix)));
-        let listed = listed.map_err(|cause| self.failed(cause))?;
-        let objects = listed.objects.iter().take(NAMES_MAX);
-        let names = objects.filter_map(|object| object.location.filename());
-        Ok(names.map(str::to_owned).collect())
+    /// Returns the names directly below the prefix of the bucket that begin with a text; others, which may
+    /// be of any program, are not asked for.
+    pub(super) fn names(&self, beginning: &str) -> Result<Vec<String>, SegmentArchiveError> {
+        let prefix = self.path_of(beginning).to_string();
+        let listing = async {
+            let mut names = Vec::new();
+            let mut page_token = None;
+            loop {
+                let options = PaginatedListOptions {
+                    delimiter: Some("/".into()),
+                    page_token,
+                    ..PaginatedListOptions::default()
+                };
+                let page = self.store.list_paginated(Some(&prefix), options).await?;
+                let objects = page.result.objects.iter();
+                let found = objects.filter_map(|object| object.location.filename());
+                names.extend(found.map(str::to_owned));
+                page_token = page.page_token;
+                if page_token.is_none() || names.len() >= NAMES_MAX {
+                    return Ok(names);
+                }
+            }
+        };
+        wait(listing).map_err(|cause| self.failed(&cause))
     }
 
     /// Writes an object with a name and removes it.
@@ -132,7 +147,7 @@ impl Bucket {
                 .await?;
             self.store.delete(&path).await
         };
-        wait(probing).map_err(|cause| self.failed(cause))
+        wait(probing).map_err(|cause| self.failed(&cause))
     }
 
     /// Stores a file as an object, which is there as a whole or not at all.
@@ -166,11 +181,11 @@ impl Bucket {
             }
             upload.finish().await.map(|_done| ())
         };
-        wait(uploading).map_err(|cause| self.failed(cause))
+        wait(uploading).map_err(|cause| self.failed(&cause))
     }
 
     fn unreadable(&self, error: io::Error) -> SegmentArchiveError {
-        self.failed(object_store::Error::Generic {
+        self.failed(&object_store::Error::Generic {
             store: "S3",
             source: Box::new(error),
         })
@@ -179,7 +194,7 @@ impl Bucket {
     /// Gives an object another name.
     pub(super) fn rename(&self, from: &str, to: &str) -> Result<(), SegmentArchiveError> {
         let (from, to) = (self.path_of(from), self.path_of(to));
-        wait(self.store.rename(&from, &to)).map_err(|cause| self.failed(cause))
+        wait(self.store.rename(&from, &to)).map_err(|cause| self.failed(&cause))
     }
 
     /// Opens an object and reads its end.
@@ -194,7 +209,7 @@ impl Bucket {
             let length = found.meta.size;
             Ok((length, found.bytes().await?))
         };
-        let (length, tail) = wait(reading).map_err(|cause| self.failed(cause))?;
+        let (length, tail) = wait(reading).map_err(|cause| self.failed(&cause))?;
         Ok(Object {
             bucket: self.clone(),
             path,
@@ -229,7 +244,7 @@ impl Object {
             return Ok(self.tail.slice(begin..end));
         }
         let reading = self.bucket.store.get_range(&self.path, begin..end);
-        wait(reading).map_err(|cause| Fault::Storage(Box::new(cause)))
+        wait(reading).map_err(|cause| Fault::Storage(reason(&cause)))
     }
 }
 

@@ -7,7 +7,6 @@ use std::path::Path;
 use parquet::errors::ParquetError;
 
 use super::SegmentArchiveError;
-use super::bucket::Failure;
 
 /// What is wrong with the content of a file.
 #[derive(Debug, thiserror::Error)]
@@ -17,7 +16,7 @@ pub(super) enum Fault {
     Read(#[from] io::Error),
     /// The storage does not answer, or refuses.
     #[error("{0}")]
-    Storage(Failure),
+    Storage(String),
     /// It is no Parquet.
     #[error("{0}")]
     Parquet(#[from] ParquetError),
@@ -39,9 +38,9 @@ pub(super) fn guarded<T>(
     let done = catch_unwind(AssertUnwindSafe(work));
     let done = done.unwrap_or_else(|_panic| Err(fault("it cannot be decoded")));
     done.map_err(|wrong| match wrong {
-        Fault::Storage(cause) => SegmentArchiveError::Bucket {
+        Fault::Storage(reason) => SegmentArchiveError::Bucket {
             bucket: path.display().to_string(),
-            cause,
+            reason,
         },
         Fault::Read(_) | Fault::Parquet(_) | Fault::Content(_) => SegmentArchiveError::Damaged {
             path: path.to_owned(),

@@ -38,6 +38,9 @@ pub enum LocationError {
     /// It is empty.
     #[error("the archive needs a folder, or s3://BUCKET/PREFIX")]
     Empty,
+    /// It is an address of another kind.
+    #[error("`{0}`: the archive is a folder, or s3://BUCKET/PREFIX")]
+    Scheme(String),
     /// The name of the bucket is impossible.
     #[error(
         "`{0}` names no bucket: write s3://BUCKET/PREFIX with 3 to 63 lower-case letters, digits, hyphens \
@@ -58,6 +61,7 @@ impl FromStr for ArchiveLocation {
         let Some(rest) = text.strip_prefix(SCHEME) else {
             return match text {
                 "" => Err(LocationError::Empty),
+                other if other.contains("://") => Err(LocationError::Scheme(other.to_owned())),
                 folder => Ok(Self::Folder(folder.into())),
             };
         };
@@ -155,6 +159,7 @@ mod tests {
         );
         for (text, expected) in [
             ("", LocationError::Empty),
+            ("S3://abc", LocationError::Scheme("S3://abc".to_owned())),
             ("s3://", LocationError::Bucket("s3://".to_owned())),
             ("s3://No", LocationError::Bucket("s3://No".to_owned())),
             ("s3://-ab", LocationError::Bucket("s3://-ab".to_owned())),

@@ -23,6 +23,7 @@ mod folder;
 mod location;
 mod mark_file;
 mod read;
+mod reason;
 mod rows;
 mod schema;
 mod source;
@@ -34,12 +35,15 @@ mod write;
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use parquet::errors::ParquetError;
+use tokio::time::Instant;
 use tread_api::friction::StoredSegment;
 use tread_api::ids::{RobotId, SiteId, TerrainId};
+use uuid::Uuid;
 
-use self::bucket::{Bucket, Failure};
+use self::bucket::Bucket;
 use self::folder::Folder;
 pub use self::location::{ArchiveLocation, BucketLocation};
 use self::read::OpenFile;
@@ -61,6 +65,8 @@ const PREFIX: &str = "segments-";
 const ENDING: &str = ".parquet";
 /// End of the name of a file that is being written.
 const PARTIAL_ENDING: &str = ".parquet.partial";
+/// Time after which one request searches no further, if it has searched something.
+pub const SEARCH_MAX: Duration = Duration::from_secs(4);
 /// Name of a file that is created and removed at once. It is one of those that are removed if they remain.
 const PROBE_NAME: &str = "segments-probe.parquet.partial";
 /// End of the name of a file whose keys were given to other measurements.
@@ -208,20 +214,26 @@ pub enum SegmentArchiveError {
         cause: ParquetError,
     },
     /// The storage of a bucket does not answer, or refuses.
-    #[error("`{bucket}`: {cause}")]
+    #[error("the storage of `{bucket}` does not answer, or refuses: {reason}")]
     Bucket {
         /// The bucket or an object.
         bucket: String,
-        /// The cause.
-        cause: Failure,
+        /// The reason.
+        reason: String,
     },
     /// The settings in the environment give no access to a bucket.
-    #[error("`{bucket}` cannot be used with the environment variables AWS_...: {cause}")]
+    #[error("`{bucket}` cannot be used with the environment variables AWS_...: {reason}")]
     Settings {
         /// The bucket.
         bucket: String,
-        /// The cause.
-        cause: Failure,
+        /// The reason.
+        reason: String,
+    },
+    /// There are too many superseded files with the same keys.
+    #[error("`{}` has {SUPERSEDED_MAX} superseded files like this: remove some", path.display())]
+    Superseded {
+        /// The file that cannot be renamed.
+        path: PathBuf,
     },
     /// Archived measurements are missing.
     #[error(
@@ -257,6 +269,11 @@ pub enum SegmentArchiveError {
         /// The folder.
         folder: PathBuf,
     },
+}
+
+/// Returns the mark that a former version wrote beside a database file; `None` if there is none.
+pub fn former_mark(database: &Path) -> Option<PathBuf> {
+    Some(mark_file::beside(database)).filter(|mark| mark.exists())
 }
 
 /// Where the files are.
@@ -316,7 +333,7 @@ impl SegmentArchive {
     fn names(&self) -> Result<Vec<String>, SegmentArchiveError> {
         match &self.storage {
             Storage::Folder(folder) => Ok(folder.names()?),
-            Storage::Bucket(bucket, _) => bucket.names(),
+            Storage::Bucket(bucket, _) => bucket.names(PREFIX),
         }
     }
 
@@ -408,13 +425,20 @@ impl SegmentArchive {
         Ok(unfinished.len())
     }
 
-    /// Checks that the place of the files is the right one and that files can be written there. Creates a
-    /// folder that is missing if nothing was archived yet.
+    /// Checks that the place of the files is the right one.
     ///
     /// # Errors
-    /// The last archived file is missing, or no file can be written.
-    pub fn check_writable(&self, mark: Option<KeyRange>) -> Result<(), SegmentArchiveError> {
-        self.check_end(&self.list()?, mark, i64::MAX)?;
+    /// It cannot be read, or the last archived file is missing.
+    pub fn check_present(&self, mark: Option<KeyRange>) -> Result<(), SegmentArchiveError> {
+        self.check_end(&self.list()?, mark, i64::MAX)
+    }
+
+    /// Checks that files can be written. Creates a folder that is missing; call
+    /// [`SegmentArchive::check_present`] before.
+    ///
+    /// # Errors
+    /// No file can be written.
+    pub fn check_writable(&self) -> Result<(), SegmentArchiveError> {
         match &self.storage {
             Storage::Folder(folder) => Ok(folder.probe(PROBE_NAME)?),
             Storage::Bucket(bucket, _) => bucket.probe(PROBE_NAME),
@@ -436,8 +460,7 @@ impl SegmentArchive {
                 Writer::create(path, keys, preceding, false)
             }
             Storage::Bucket(_, unfinished) => {
-                let process = std::process::id();
-                let path = unfinished.join(format!("{name}.{process}{PARTIAL_ENDING}"));
+                let path = unfinished.join(format!("{name}.{}{PARTIAL_ENDING}", Uuid::new_v4()));
                 Writer::create(path, keys, preceding, true)
             }
         }
@@ -489,7 +512,9 @@ impl SegmentArchive {
             _ => format!("{name}.{number}{SUPERSEDED_ENDING}"),
         });
         let target = targets.find(|target| !present.contains(target));
-        let target = target.unwrap_or_else(|| name.to_owned());
+        let target = target.ok_or_else(|| SegmentArchiveError::Superseded {
+            path: self.shown().join(name),
+        })?;
         match &self.storage {
             Storage::Folder(folder) => folder.rename(name, &target)?,
             Storage::Bucket(bucket, _) => bucket.rename(name, &target)?,
@@ -498,7 +523,7 @@ impl SegmentArchive {
     }
 
     /// Reads at most `limit` measurements by their keys. The search ends earlier after
-    /// [`SEARCHED_ROWS_MAX`] rows or [`SEARCHED_FILES_MAX`] files; [`Found::searched_to`] says where.
+    /// [`SEARCHED_ROWS_MAX`] rows, [`SEARCHED_FILES_MAX`] files or [`SEARCH_MAX`]; [`Found::searched_to`] says where.
     ///
     /// # Errors
     /// A file cannot be read, is damaged or missing.
@@ -514,13 +539,16 @@ impl SegmentArchive {
             segments: Vec::new(),
             searched_to: selection.after,
         };
-        let mut rows_left = SEARCHED_ROWS_MAX;
+        let mut budget = Budget {
+            rows: SEARCHED_ROWS_MAX,
+            ends_at: Some(Instant::now() + SEARCH_MAX),
+        };
         let mut opened = 0;
         for &keys in &listing.files {
             if keys.last <= selection.after || selection.before <= keys.first {
                 continue;
             }
-            if opened >= SEARCHED_FILES_MAX {
+            if opened >= SEARCHED_FILES_MAX || budget.is_over(selection, &found) {
                 return Ok(found);
             }
             opened += 1;
@@ -529,7 +557,7 @@ impl SegmentArchive {
                 let folder = self.shown();
                 return Err(SegmentArchiveError::Missing { folder, key });
             }
-            if !file.read(selection, limit, &mut rows_left, &mut found)? {
+            if !file.read(selection, limit, &mut budget, &mut found)? {
                 return Ok(found);
             }
         }
@@ -549,7 +577,10 @@ impl SegmentArchive {
     ) -> Result<usize, SegmentArchiveError> {
         let listing = self.list()?;
         self.check_end(&listing, mark, i64::MAX)?;
-        for &keys in &listing.files {
+        // After a restoration there are files of keys that the database does not know.
+        let known = listing.files.iter();
+        let known = known.filter(|keys| mark.is_none_or(|mark| keys.first <= mark.last));
+        for &keys in known.clone() {
             let file = self.open(keys)?;
             if let Some(key) = file.missing_before(listing.preceding(keys))? {
                 let folder = self.shown();
@@ -559,7 +590,7 @@ impl SegmentArchive {
                 file.check_rows()?;
             }
         }
-        Ok(listing.files.len())
+        Ok(known.count())
     }
 
     /// Reads all measurements of one file after a key, at most `limit`.
@@ -573,6 +604,22 @@ impl SegmentArchive {
         limit: usize,
     ) -> Result<Vec<ArchivedSegment>, SegmentArchiveError> {
         read_all(&self.open(keys)?, after, limit)
+    }
+}
+
+/// How far a search may go.
+struct Budget {
+    /// Number of rows that may still be read.
+    rows: usize,
+    /// Time at which it ends after some progress.
+    ends_at: Option<Instant>,
+}
+
+impl Budget {
+    /// Returns whether the time is over and something was searched.
+    fn is_over(&self, selection: &Selection, found: &Found) -> bool {
+        let is_late = self.ends_at.is_some_and(|end| end <= Instant::now());
+        is_late && found.searched_to > selection.after
     }
 }
 
@@ -601,7 +648,10 @@ fn read_all(
         before: i64::MAX,
     };
     let mut found = Found::default();
-    let mut rows_left = usize::MAX;
-    file.read(&selection, limit, &mut rows_left, &mut found)?;
+    let mut budget = Budget {
+        rows: usize::MAX,
+        ends_at: None,
+    };
+    file.read(&selection, limit, &mut budget, &mut found)?;
     Ok(found.segments)
 }

@@ -12,7 +12,9 @@ use tread_api::ids::{RobotId, SiteId, TerrainId};
 use super::fault::{Fault, fault, guarded};
 use super::rows::{Columns, Names, Values};
 use super::source::{Source, Window};
-use super::{ArchivedSegment, Found, KeyRange, SegmentArchiveError, Selection, checksum, schema};
+use super::{
+    ArchivedSegment, Budget, Found, KeyRange, SegmentArchiveError, Selection, checksum, schema,
+};
 
 /// A row group: its keys, its bytes in the file, and their checksum.
 #[derive(Debug, Clone)]
@@ -98,7 +100,7 @@ impl OpenFile {
         &self,
         selection: &Selection,
         limit: usize,
-        rows_left: &mut usize,
+        budget: &mut Budget,
         found: &mut Found,
     ) -> Result<bool, SegmentArchiveError> {
         for (index, group) in self.groups.iter().enumerate() {
@@ -109,11 +111,14 @@ impl OpenFile {
             }
             let is_needed = guarded(&self.path, || self.may_contain(index, selection))?;
             if is_needed {
-                if found.segments.len() >= limit || *rows_left == 0 {
+                if found.segments.len() >= limit
+                    || budget.rows == 0
+                    || budget.is_over(selection, found)
+                {
                     return Ok(false);
                 }
                 let keys = KeyRange { first, last };
-                *rows_left = rows_left.saturating_sub(place(keys.count()));
+                budget.rows = budget.rows.saturating_sub(place(keys.count()));
                 let wanted = limit - found.segments.len();
                 let read = || self.read_group(index, keys, selection, wanted);
                 let segments = guarded(&self.path, read)?;

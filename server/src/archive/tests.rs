@@ -37,7 +37,8 @@ impl Marked {
     }
 
     fn check_writable(&self) -> Result<(), SegmentArchiveError> {
-        self.files.check_writable(self.mark.get())
+        self.check_present(self.mark.get())?;
+        self.files.check_writable()
     }
 }
 

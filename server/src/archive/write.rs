@@ -95,7 +95,13 @@ impl Writer {
     ) -> Result<Self, SegmentArchiveError> {
         let mut options = OpenOptions::new();
         // Read again for the checksum of the footer.
-        options.read(true).write(true).create(true).truncate(true);
+        options.read(true).write(true);
+        if uploaded {
+            // In a folder that others may use, no file of theirs is followed or replaced.
+            options.create_new(true);
+        } else {
+            options.create(true).truncate(true);
+        }
         let opened = options.mode(0o600).open(&path);
         let file = opened.map_err(FileError::of("create", &path))?;
         if uploaded {

@@ -58,7 +58,7 @@ fn examine(
     };
     let writable = match &folder {
         Some(folder) => of_folder(folder, mark.is_some()),
-        None => match archive.check_writable(None) {
+        None => match archive.list().and_then(|_| archive.check_writable()) {
             Ok(()) => {
                 let shown = archive.shown();
                 Finding::ok(
@@ -69,7 +69,7 @@ fn examine(
             Err(error) => unreachable(&error),
         },
     };
-    if !writable.holds() || folder.is_some_and(|folder| !folder.exists()) {
+    if !writable.holds() || folder.as_ref().is_some_and(|folder| !folder.exists()) {
         return vec![writable];
     }
     let content = match archive.examine(mark, is_deep) {
@@ -81,6 +81,7 @@ fn examine(
             CONTENT,
             format!("its {count} files are there; --deep reads all of them"),
         ),
+        Err(error @ SegmentArchiveError::Bucket { .. }) => unreachable(&error),
         Err(error) => damaged(&error),
     };
     vec![writable, content]
@@ -91,7 +92,8 @@ fn unreachable(error: &SegmentArchiveError) -> Finding {
         NAME,
         chain(error),
         format!(
-            "set AWS_ENDPOINT_URL, AWS_REGION and the credentials in the environment of the server, and \
+            "see whether the storage can be reached; set AWS_ENDPOINT_URL, AWS_REGION and the credentials \
+             in the environment of the server, and \
              permit it to list, read, write and delete objects; {KEEPS}"
         ),
     )
@@ -101,8 +103,8 @@ fn damaged(error: &SegmentArchiveError) -> Finding {
     Finding::problem(
         CONTENT,
         chain(error),
-        "mount the right disk or restore the file from its copy; docs/runbook.md says what to do \
-         without one",
+        "mount the right disk, name the right folder or bucket, or restore the file from its copy; \
+         docs/runbook.md says what to do without one",
     )
 }
 

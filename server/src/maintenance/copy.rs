@@ -13,6 +13,7 @@ use tokio::time::Instant;
 
 use super::unfinished::{Unfinished, check_absent, with_ending};
 use crate::app::backups::check_space;
+use crate::archive::former_mark;
 use crate::backup::archive::sync_folder;
 use crate::db::lock::DatabaseLock;
 use crate::db::schema::{self, refuse_newer};
@@ -80,6 +81,13 @@ pub(crate) async fn run(args: CopyArgs) -> anyhow::Result<()> {
         "`{from}` is of an older version: `tread-server migrate --database FROM` brings it up to date; make a \
          backup before"
     );
+    if let Some(mark) = from.file().and_then(former_mark) {
+        anyhow::bail!(
+            "`{}` says which measurements were archived, and the database does not yet: start this version of \
+             the server on it once, with its archive",
+            mark.display()
+        );
+    }
     let locked_to = DatabaseLock::take(&to).await;
     let locked_to = locked_to.with_context(|| format!("cannot have `{to}` alone"))?;
     if !quiet {
