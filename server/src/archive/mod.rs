@@ -18,8 +18,10 @@
 
 mod bucket;
 mod checksum;
+mod error;
 mod fault;
 mod folder;
+mod keys;
 mod location;
 mod mark_file;
 mod read;
@@ -37,19 +39,20 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use parquet::errors::ParquetError;
 use tokio::time::Instant;
 use tread_api::friction::StoredSegment;
 use tread_api::ids::{RobotId, SiteId, TerrainId};
 use uuid::Uuid;
 
 use self::bucket::Bucket;
+pub use self::error::SegmentArchiveError;
 use self::folder::Folder;
+use self::keys::{ENDING, PREFIX};
+pub use self::keys::{KeyRange, Listing};
 pub use self::location::{ArchiveLocation, BucketLocation};
 use self::read::OpenFile;
 use self::source::Source;
 pub use self::write::{Finished, Writer};
-use crate::file_error::FileError;
 use crate::paths::folder_of;
 
 /// Number of rows of a row group, which is read and checked as a whole.
@@ -59,10 +62,6 @@ pub const SEARCHED_ROWS_MAX: usize = 64 * ROW_GROUP_ROWS;
 /// Maximum number of files that one request opens.
 pub const SEARCHED_FILES_MAX: usize = 512;
 
-/// Beginning of the name of a file.
-const PREFIX: &str = "segments-";
-/// End of the name of a file.
-const ENDING: &str = ".parquet";
 /// End of the name of a file that is being written.
 const PARTIAL_ENDING: &str = ".parquet.partial";
 /// Time after which one request searches no further, if it has searched something.
@@ -75,85 +74,6 @@ const SUPERSEDED_ENDING: &str = ".superseded";
 const LOST_ENDING: &str = ".lost";
 /// Maximum number of superseded files with the same keys.
 const SUPERSEDED_MAX: u32 = 1_000;
-/// Number of digits of a key in a name, enough for every key.
-const KEY_DIGITS: usize = 19;
-
-/// Keys of measurements, both ends included.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub struct KeyRange {
-    /// The first key.
-    pub first: i64,
-    /// The last key.
-    pub last: i64,
-}
-
-impl KeyRange {
-    /// Returns whether a key is one of these.
-    pub fn contains(self, key: i64) -> bool {
-        (self.first..=self.last).contains(&key)
-    }
-
-    /// Returns the number of keys.
-    pub fn count(self) -> i64 {
-        self.last - self.first + 1
-    }
-
-    /// Returns the mark after a file with these keys was added to what a mark names.
-    pub fn joined_to(self, mark: Option<Self>) -> Self {
-        match mark {
-            Some(mark) if mark.first <= self.first && self.first <= mark.last.saturating_add(1) => {
-                Self {
-                    first: mark.first,
-                    last: self.last,
-                }
-            }
-            Some(_) | None => self,
-        }
-    }
-
-    fn overlaps(self, other: Self) -> bool {
-        self.first <= other.last && other.first <= self.last
-    }
-
-    /// Returns the name of the file with these keys.
-    fn name(self) -> String {
-        let Self { first, last } = self;
-        format!("{PREFIX}{first:0KEY_DIGITS$}-{last:0KEY_DIGITS$}{ENDING}")
-    }
-
-    /// Returns the keys in the name of a file; `None` for other names.
-    fn of_name(name: &str) -> Option<Self> {
-        let keys = name.strip_prefix(PREFIX)?.strip_suffix(ENDING)?;
-        let (first, last) = keys.split_once('-')?;
-        let is_key = |key: &str| key.len() == KEY_DIGITS && key.bytes().all(|c| c.is_ascii_digit());
-        if !(is_key(first) && is_key(last)) {
-            return None;
-        }
-        let (first, last) = (first.parse().ok()?, last.parse().ok()?);
-        (1 <= first && first <= last).then_some(Self { first, last })
-    }
-}
-
-/// What the folder contains.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
-pub struct Listing {
-    /// Keys of the files, in their order.
-    pub files: Vec<KeyRange>,
-    /// Keys of the files that a person has given up.
-    pub lost: Vec<KeyRange>,
-}
-
-impl Listing {
-    fn all(&self) -> impl Iterator<Item = KeyRange> {
-        self.files.iter().chain(&self.lost).copied()
-    }
-
-    /// Returns the last key before those of a file; `None` if there is none.
-    fn preceding(&self, keys: KeyRange) -> Option<i64> {
-        let all = self.all().map(|found| found.last);
-        all.filter(|last| *last < keys.first).max()
-    }
-}
 
 /// A measurement with its site, as it is archived.
 #[derive(Debug, Clone, PartialEq)]
@@ -188,87 +108,6 @@ pub struct Found {
     pub segments: Vec<ArchivedSegment>,
     /// All archived measurements up to this key were searched.
     pub searched_to: i64,
-}
-
-/// Failure of the archive.
-#[derive(Debug, thiserror::Error)]
-pub enum SegmentArchiveError {
-    /// An operation on a file failed.
-    #[error(transparent)]
-    File(#[from] FileError),
-    /// A file is damaged, or was not written by this program.
-    #[error("`{}` is damaged or no file of this archive: {what}", path.display())]
-    Damaged {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong.
-        what: String,
-    },
-    /// Measurements cannot be encoded.
-    #[error("cannot write measurements to `{}`", path.display())]
-    Encoding {
-        /// The file.
-        path: PathBuf,
-        /// The cause.
-        #[source]
-        cause: ParquetError,
-    },
-    /// The storage of a bucket does not answer, or refuses.
-    #[error("the storage of `{bucket}` does not answer, or refuses: {reason}")]
-    Bucket {
-        /// The bucket or an object.
-        bucket: String,
-        /// The reason.
-        reason: String,
-    },
-    /// The settings in the environment give no access to a bucket.
-    #[error("`{bucket}` cannot be used with the environment variables AWS_...: {reason}")]
-    Settings {
-        /// The bucket.
-        bucket: String,
-        /// The reason.
-        reason: String,
-    },
-    /// There are too many superseded files with the same keys.
-    #[error("`{}` has {SUPERSEDED_MAX} superseded files like this: remove some", path.display())]
-    Superseded {
-        /// The file that cannot be renamed.
-        path: PathBuf,
-    },
-    /// Archived measurements are missing.
-    #[error(
-        "the archive `{}` lacks the measurement {key}, which was archived: its disk is not mounted, or \
-         a file was removed", folder.display()
-    )]
-    Missing {
-        /// The folder.
-        folder: PathBuf,
-        /// Key of a missing measurement.
-        key: i64,
-    },
-    /// Two files contain the same keys.
-    #[error("`{}` has two files with the measurement {key}: move one of them away", folder.display())]
-    Overlap {
-        /// The folder.
-        folder: PathBuf,
-        /// A key that is in both files.
-        key: i64,
-    },
-    /// Other requests read the archive for too long.
-    #[error(
-        "other requests read the archive `{}`, or its disk does not answer: ask again later",
-        folder.display()
-    )]
-    Busy {
-        /// The folder.
-        folder: PathBuf,
-    },
-    /// A new file has other contents than were written to it.
-    #[error("a new file in `{}` does not contain what was written: examine the disk", folder.display())]
-    NotAsWritten {
-        /// The folder.
-        folder: PathBuf,
-    },
 }
 
 /// Returns the mark that a former version wrote beside a database file; `None` if there is none.
