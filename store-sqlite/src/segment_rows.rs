@@ -95,7 +95,6 @@ pub(super) async fn remove_values(db: &mut Connection, until_pk: i64) -> Result<
 ///
 /// # Errors
 /// None.
-#[expect(clippy::unused_async, reason = "as the other engine")]
 pub async fn release_removed(_db: &mut Connection) -> Result<Option<u64>, EngineError> {
     Ok(Some(0))
 }

@@ -291,14 +291,13 @@ impl Writer {
         let mut outcomes: Vec<Outcome> = Vec::with_capacity(group.len());
         let records = group.iter().map(|upload| upload.batch.records.len());
         let mut candidates = Vec::with_capacity(records.sum());
-        let mut tally = Tally::default();
-        let app = self.app.clone();
+        let (mut tally, app) = (Tally::default(), self.app.clone());
         app.bound_unwritten_sums().await?;
         let turn = app.map_turn_to_change().await?;
         let mut tx = app.db().write_uncounted("ingest").await?;
-        let now = self.app.clock().now();
-        // One look for the group, since there are hardly ever some.
+        // One look for deferred segments of the whole group: there are hardly ever some.
         let is_any_deferred = db::deferred_segments::is_any(&mut tx).await?;
+        let now = app.clock().now();
         for (index, upload) in group.iter().enumerate() {
             let batch = &upload.batch;
             let Admitted {

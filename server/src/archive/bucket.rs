@@ -29,7 +29,7 @@ use super::reason::reason;
 /// Maximum time for a connection.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
 /// Maximum time for one request; a part of [`PART_BYTES`] on a line of 0.7 Mbit/s.
-const REQUEST_TIMEOUT: Duration = Duration::from_secs(60);
+const REQUEST_TIMEOUT: Duration = Duration::from_mins(1);
 /// Maximum number of repetitions of a request, and maximum time after which it is repeated.
 const RETRIES_MAX: usize = 3;
 const RETRY_TIMEOUT: Duration = Duration::from_secs(30);

@@ -28,6 +28,7 @@ impl KeyRange {
     }
 
     /// Returns the mark after a file with these keys was added to what a mark names.
+    #[must_use]
     pub fn joined_to(self, mark: Option<Self>) -> Self {
         match mark {
             Some(mark) if mark.first <= self.first && self.first <= mark.last.saturating_add(1) => {

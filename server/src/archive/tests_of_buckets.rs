@@ -1,7 +1,7 @@
 //! Files in a bucket of a server that is not ours.
 
 use std::io::Write as _;
-use std::time::Instant;
+use tokio::time::Instant;
 
 use object_store::ObjectStoreExt as _;
 use object_store::aws::AmazonS3Builder;
