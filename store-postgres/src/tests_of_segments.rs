@@ -208,9 +208,9 @@ async fn the_speed_of_writing_and_reading_measurements() {
             let mut runner = TestRunner::deterministic();
             let some = segment().new_tree(&mut runner).unwrap().current();
             let mut seq = 0;
-            for rows in [500, 5_000] {
+            for rows in [50, 500, 5_000] {
                 let (begun, mut written) = (Instant::now(), 0);
-                while begun.elapsed().as_secs() < 5 {
+                while begun.elapsed().as_secs() < 2 {
                     let new = |seq| NewSegment {
                         boot_pk: 1,
                         seq,
@@ -230,7 +230,10 @@ async fn the_speed_of_writing_and_reading_measurements() {
                     written += upload.len() as u128;
                 }
                 let rate = written * 1_000 / begun.elapsed().as_millis();
-                eprintln!("{rows} rows a transaction: {rate} rows/s");
+                eprintln!(
+                    "{rows} rows a transaction: {rate} rows/s, {} us each",
+                    begun.elapsed().as_micros() / (written / rows as u128)
+                );
             }
             database.run("ANALYZE").await;
             for after in [0, seq / 2, seq - 6_000] {
