@@ -2,6 +2,8 @@
 //! `TREAD_TEST_ENGINE=postgres store-postgres/with-postgres cargo nextest run -p tread-server --test server`.
 //! Tests that look into a database file need the other engine.
 
+mod outages;
+
 use std::env;
 use std::path::Path;
 use std::process::Command;
