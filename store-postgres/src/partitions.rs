@@ -9,7 +9,7 @@ use std::time::Duration;
 use jiff::SignedDuration;
 use sqlx::AssertSqlSafe;
 
-use super::{Connection, EngineError, from_us, segment_ranges, segments};
+use super::{Connection, EngineError, from_us, segment_ranges};
 
 /// Smallest number of keys of a partition.
 const KEYS_MIN: i64 = 1_000_000;
@@ -53,7 +53,7 @@ async fn keys_of_span(db: &mut Connection) -> Result<i64, EngineError> {
     };
     let begin = from_us(received_at_us)?.checked_sub(SPAN);
     let first = match begin {
-        Ok(begin) => segments::first_since(db, begin).await?,
+        Ok(begin) => segment_ranges::first_since(db, begin).await?,
         Err(_before_all_times) => None,
     };
     let ends = segment_ranges::ends(db).await?;

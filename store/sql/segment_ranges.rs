@@ -5,11 +5,12 @@ use std::collections::HashMap;
 
 use futures_util::future::ready;
 use futures_util::{Stream, TryStreamExt as _};
+use jiff::Timestamp;
 use tread_api::ids::MissionId;
 use tread_api::terrain::TerrainRef;
 use tread_store::segments::NewSegment;
 
-use super::{Connection, EngineError};
+use super::{Connection, EngineError, to_us};
 
 /// A range to be stored.
 #[derive(Debug, Clone, Copy)]
@@ -90,6 +91,28 @@ pub async fn received_at_us(db: &mut Connection, pk: i64) -> Result<Option<i64>,
         pk
     );
     Ok(at_us.fetch_optional(db).await?)
+}
+
+/// Returns the key of the first measurement that was received at a time or later, if none that was
+/// can have been removed; else `None`. Keys are in the order of receipt, begin at 1 and have no
+/// gaps; the first ones are removed first, the last one never is.
+pub async fn first_since(db: &mut Connection, at: Timestamp) -> Result<Option<i64>, EngineError> {
+    let at_us = to_us(at);
+    let Some((first, last)) = ends(db).await? else {
+        return Ok(None);
+    };
+    let (mut low, mut high) = (first, last + 1);
+    while low < high {
+        let middle = low + (high - low) / 2;
+        let received = received_at_us(db, middle).await?;
+        if received.is_some_and(|received| received < at_us) {
+            low = middle + 1;
+        } else {
+            high = middle;
+        }
+    }
+    let is_known = low <= last && (low > first || first == 1);
+    Ok(is_known.then_some(low))
 }
 
 /// Returns the stored ranges of a run's sequence numbers that touch a range, both ends included.

@@ -9,11 +9,11 @@ use tread_api::friction::{Information, Segment, StoredSegment, ThetaErrors};
 use tread_api::ids::{RobotId, TerrainId};
 pub use tread_store::segments::{Added, Extent, KeyedSegment, NewSegment, SegmentFilter};
 
+pub use super::segment_ranges::first_since;
 pub use super::segment_rows::insert;
 use super::segment_rows::measurements;
 use super::{
-    Connection, EngineError, corrupt, from_us, ground, parse, robots_text, segment_ranges, to_us,
-    unsigned,
+    Connection, EngineError, corrupt, from_us, ground, parse, robots_text, segment_ranges, unsigned,
 };
 
 /// Limit beyond every number of measurements; a statement may add to it.
@@ -246,28 +246,6 @@ pub fn of_robot(
         robot_pk,
     );
     rows.fetch(db).map(|raw| KeyedSegment::try_from(raw?))
-}
-
-/// Returns the key of the first measurement that was received at a time or later, if none that was
-/// can have been removed; else `None`. Keys are in the order of receipt, begin at 1 and have no
-/// gaps; the first ones are removed first, the last one never is.
-pub async fn first_since(db: &mut Connection, at: Timestamp) -> Result<Option<i64>, EngineError> {
-    let at_us = to_us(at);
-    let Some((first, last)) = segment_ranges::ends(db).await? else {
-        return Ok(None);
-    };
-    let (mut low, mut high) = (first, last + 1);
-    while low < high {
-        let middle = low + (high - low) / 2;
-        let received = segment_ranges::received_at_us(db, middle).await?;
-        if received.is_some_and(|received| received < at_us) {
-            low = middle + 1;
-        } else {
-            high = middle;
-        }
-    }
-    let is_known = low <= last && (low > first || first == 1);
-    Ok(is_known.then_some(low))
 }
 
 /// Returns at most `limit` measurements of a site in the order of their commits, after a key.

@@ -23,7 +23,7 @@ use crate::robot::Robot;
 
 /// How long PostgreSQL is stopped; longer than the server's limits of its statements and of its health. The
 /// variable gives other seconds.
-const STOPPED: Duration = Duration::from_secs(12);
+const STOPPED: Duration = Duration::from_secs(8);
 const STOPPED_VARIABLE: &str = "TREAD_POSTGRES_STOPPED_S";
 
 /// A PostgreSQL server of this test alone.
@@ -87,6 +87,8 @@ impl OwnPostgres {
         let program = Path::new(options.split(' ').next().unwrap());
         let control = program.with_file_name("pg_ctl");
         let owner = fs::metadata(&self.data).unwrap();
+        // Where nobody reaps the process, `pg_ctl` would wait for its end.
+        let _ = fs::remove_file(self.data.join("postmaster.pid"));
         let mut restart = if nix::unistd::geteuid().is_root() {
             let mut as_owner = Command::new("setpriv");
             as_owner.arg(format!("--reuid={}", owner.uid()));
@@ -108,6 +110,7 @@ impl OwnPostgres {
 
 impl Drop for OwnPostgres {
     fn drop(&mut self) {
+        self.signal(Signal::SIGCONT);
         drop(self.keeper.stdin.take());
         // Its end is that of PostgreSQL.
         let _ = self.keeper.wait();
@@ -161,11 +164,11 @@ async fn a_stopped_and_a_killed_postgresql_lose_nothing_that_was_acknowledged() 
     let mission = yard.create_mission(&robot.id).await;
     yard.mission_becomes(mission.id, MissionState::Active).await;
     let other = Robot::join(&yard, "rover-2").await;
-    let mut socket = Socket::open(&yard, "rover-2").await;
     acknowledged(&robot, 1).await;
 
     postgres.signal(Signal::SIGSTOP);
     ready_is(&yard, StatusCode::SERVICE_UNAVAILABLE).await;
+    let mut socket = Socket::open(&yard, "rover-2").await;
     socket.acquire("desk").await;
     socket.drive(0.4).await;
     driven_at(&other, 0.4).await;
