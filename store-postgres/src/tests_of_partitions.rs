@@ -215,7 +215,7 @@ async fn measurements_of_a_database_without_partitions_remain() {
         remove_until(&db, 9).await;
         assert_eq!(release(&db).await, Some(1));
         assert_eq!(keys(&db).await, [10, 11]);
-        // A partition that somebody has dropped by hand is no error.
+        // A partition that an operator has dropped is no error.
         remove_until(&db, 10).await;
         database
             .run("INSERT INTO segment_partitions VALUES (3, 4)")

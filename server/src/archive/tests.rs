@@ -67,7 +67,7 @@ fn write(archive: &Marked, rows: &[ArchivedSegment]) -> KeyRange {
     keys
 }
 
-fn everything(after: i64, before: i64) -> Selection {
+pub(super) fn everything(after: i64, before: i64) -> Selection {
     Selection {
         site: None,
         robot: None,

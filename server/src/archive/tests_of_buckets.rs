@@ -8,6 +8,7 @@ use object_store::aws::AmazonS3Builder;
 use object_store::path::Path as Key;
 use tread_samples::s3::S3Server;
 
+use super::tests::everything;
 use super::tests::samples::rows;
 use super::*;
 
@@ -47,17 +48,6 @@ fn write(archive: &SegmentArchive, rows: &[ArchivedSegment]) -> (KeyRange, Vec<P
     let finished = writer.finish().unwrap();
     assert_eq!(finished.read(first - 1, usize::MAX).unwrap(), rows);
     (finished.keys(), archive.publish(&finished).unwrap())
-}
-
-fn everything(after: i64, before: i64) -> Selection {
-    Selection {
-        site: None,
-        robot: None,
-        terrain: None,
-        robots: None,
-        after,
-        before,
-    }
 }
 
 /// Runs a test whose calls wait on a blocking thread, as the server does.
