@@ -59,6 +59,11 @@ impl S3Server {
         server
     }
 
+    /// Returns the number of its process, for signals.
+    pub fn process(&self) -> u32 {
+        self.process.id()
+    }
+
     /// Returns its address.
     pub fn endpoint(&self) -> String {
         format!("http://127.0.0.1:{}", self.port)

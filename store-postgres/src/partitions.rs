@@ -8,8 +8,9 @@ use std::time::Duration;
 
 use jiff::SignedDuration;
 use sqlx::AssertSqlSafe;
+use tread_store::failure::StorageFailure;
 
-use super::{Connection, EngineError, from_us, segment_ranges};
+use super::{Connection, EngineError, failure, from_us, segment_ranges};
 
 /// Smallest number of keys of a partition.
 const KEYS_MIN: i64 = 1_000_000;
@@ -22,8 +23,6 @@ const SPAN: SignedDuration = SignedDuration::from_hours(7 * 24);
 const SNAPSHOT_MAX: Duration = Duration::from_mins(9);
 /// Maximum time for which the drop of a partition waits for readers; others wait behind it.
 const LOCK_TIMEOUT: &str = "SET LOCAL lock_timeout = '1s'";
-/// PostgreSQL's codes for a lock that did not come in time, and for one that never would.
-const LOCK_FAILURES: [&str; 2] = ["55P03", "40P01"];
 
 /// Creates the partitions that keys from `first` to `last` need, of which all earlier ones have theirs.
 pub(super) async fn prepare(
@@ -120,13 +119,8 @@ pub async fn drop_removed(db: &mut Connection) -> Result<Option<u64>, EngineErro
         let dropping = sqlx::query(AssertSqlSafe(statement)).persistent(false);
         match dropping.execute(&mut *db).await {
             Ok(_) => {}
-            Err(sqlx::Error::Database(error))
-                if error
-                    .code()
-                    .is_some_and(|code| LOCK_FAILURES.contains(&&*code)) =>
-            {
-                return Ok(None);
-            }
+            // No lock in time, or none ever.
+            Err(error) if failure::of(&error) == Some(StorageFailure::Busy) => return Ok(None),
             Err(error) => return Err(error.into()),
         }
     }

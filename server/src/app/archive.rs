@@ -46,6 +46,9 @@ const CHUNK_ROWS: u32 = 16_384;
 const READERS_MAX: usize = 2;
 /// Maximum time for which a request waits until it may read files.
 const READ_WAIT_MAX: Duration = Duration::from_secs(5);
+/// Maximum time for which a request reads files: more than a search may take, and with the wait less than a
+/// request may take.
+const READ_MAX: Duration = Duration::from_secs(8);
 
 /// The archive and what is known of it.
 #[derive(Debug)]
@@ -90,16 +93,20 @@ impl Archive {
         &self,
         work: impl FnOnce(&SegmentArchive) -> Result<T, SegmentArchiveError> + Send + 'static,
     ) -> Result<T, AppError> {
+        let busy = || {
+            let folder = self.files.shown();
+            AppError::Archive(SegmentArchiveError::Busy { folder })
+        };
         let turn = Arc::clone(&self.readers).acquire_owned();
         let Ok(turn) = tokio::time::timeout(READ_WAIT_MAX, turn).await else {
-            let folder = self.files.shown();
-            return Err(AppError::Archive(SegmentArchiveError::Busy { folder }));
+            return Err(busy());
         };
-        self.off_thread(move |files| {
+        let reading = self.off_thread(move |files| {
             let _turn = turn;
             work(files)
-        })
-        .await
+        });
+        let read = tokio::time::timeout(READ_MAX, reading).await;
+        read.unwrap_or_else(|_elapsed| Err(busy()))
     }
 
     /// Runs work on files on a blocking thread.

@@ -106,6 +106,7 @@ struct Inner {
     hub: Hub,
     keys_in_flight: InFlight,
     just_offered: JustOffered,
+    recalls: AtomicU64,
     checks: Semaphore,
     identity: Identity,
     maps: Maps,
@@ -178,6 +179,7 @@ impl App {
             hub,
             keys_in_flight: InFlight::default(),
             just_offered: JustOffered::default(),
+            recalls: AtomicU64::new(0),
             checks: Semaphore::new(check::CHECKS_MAX),
             identity: Identity::new(people, audit),
             maps: Maps::default(),
@@ -267,6 +269,25 @@ impl App {
     pub fn wake(&self) {
         self.inner.changed.notify_one();
         self.announce();
+    }
+
+    /// Commits a change of what a robot is to do. A command that was decided before, and is not sent yet,
+    /// is decided again.
+    async fn commit_recalling(&self, tx: Tx) -> Result<(), DbError> {
+        let app = self.clone();
+        // Also after an unknown outcome.
+        tx.commit_then(move |_outcome| app.recall()).await
+    }
+
+    fn recall(&self) {
+        self.inner.recalls.fetch_add(1, Ordering::AcqRel);
+        self.wake();
+    }
+
+    /// Returns how often commands were recalled. To be read before the state that a command follows from,
+    /// and compared right before the command is sent.
+    fn recalls(&self) -> u64 {
+        self.inner.recalls.load(Ordering::Acquire)
     }
 
     /// Wakes only the feed of events.

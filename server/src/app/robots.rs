@@ -120,8 +120,8 @@ impl App {
             if outcome == Outcome::Written {
                 app.show_alerts(&ended);
                 app.robots_changed();
-                app.wake();
             }
+            app.recall();
         });
         committed.await?;
         Ok(self.with_live(row, alerts))

@@ -241,7 +241,7 @@ impl App {
             .filter(|stop| (&stop.site, &stop.robot) == (site, robot))
             .ok_or(AppError::UnknownStop(id))?;
         db::stops::ask_clear(&mut tx, id, &by, self.clock().now()).await?;
-        tx.commit().await?;
+        self.commit_recalling(tx).await?;
         let unreachable = || AppError::RobotUnreachable(robot.clone());
         let command = ClearStop { stop: id, by };
         let answer = self.commands().send(&key, &command).await;

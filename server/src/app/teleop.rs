@@ -198,9 +198,7 @@ impl App {
             let reason = format!("`{name}` teleoperates the robot");
             hold_all(&mut tx, robot_pk, &reason, self.clock().now()).await?;
         }
-        tx.commit().await?;
-        self.wake();
-        Ok(())
+        Ok(self.commit_recalling(tx).await?)
     }
 }
 

@@ -54,8 +54,8 @@ pub enum SegmentArchiveError {
     },
     /// Archived measurements are missing.
     #[error(
-        "the archive `{}` lacks the measurement {key}, which was archived: its disk is not mounted, or \
-         a file was removed", folder.display()
+        "the archive `{}` lacks the measurement {key}, which was archived: a file was removed, or this is \
+         not the storage that was written to (a disk that is not mounted, another bucket)", folder.display()
     )]
     Missing {
         /// The folder.
@@ -71,9 +71,9 @@ pub enum SegmentArchiveError {
         /// A key that is in both files.
         key: i64,
     },
-    /// Other requests read the archive for too long.
+    /// Other requests read the archive for too long, or its storage does not answer.
     #[error(
-        "other requests read the archive `{}`, or its disk does not answer: ask again later",
+        "other requests read the archive `{}`, or its storage does not answer: ask again later",
         folder.display()
     )]
     Busy {
@@ -81,7 +81,7 @@ pub enum SegmentArchiveError {
         folder: PathBuf,
     },
     /// A new file has other contents than were written to it.
-    #[error("a new file in `{}` does not contain what was written: examine the disk", folder.display())]
+    #[error("a new file in `{}` does not contain what was written: examine the storage", folder.display())]
     NotAsWritten {
         /// The folder.
         folder: PathBuf,

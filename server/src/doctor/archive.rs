@@ -74,12 +74,10 @@ fn examine(
     }
     let content = match archive.examine(mark, is_deep) {
         Ok(0) => Finding::ok(CONTENT, "nothing is archived yet"),
-        Ok(count) if is_deep => {
-            Finding::ok(CONTENT, format!("all of its {count} files can be read"))
-        }
+        Ok(count) if is_deep => Finding::ok(CONTENT, format!("all files can be read ({count})")),
         Ok(count) => Finding::ok(
             CONTENT,
-            format!("its {count} files are there; --deep reads all of them"),
+            format!("all files are there ({count}); --deep reads them"),
         ),
         Err(error @ SegmentArchiveError::Bucket { .. }) => unreachable(&error),
         Err(error) => damaged(&error),

@@ -7,6 +7,7 @@ mod storm;
 #[cfg(test)]
 mod tests {
     use super::storm;
+    use super::storm::overtaking::{Wish, grant_before_the_offer};
 
     #[tokio::test]
     async fn no_storm_leaves_a_mission_stuck_revived_or_doubled() {
@@ -15,6 +16,16 @@ mod tests {
             missions += storm::run(seed, 250).await.unwrap();
         }
         assert!(missions > 100, "only {missions} missions were asked for");
+    }
+
+    #[tokio::test]
+    async fn what_a_person_wants_is_not_overtaken_by_an_offer_that_was_decided_before() {
+        for seed in [2, 11, 103, 153, 163] {
+            storm::run(seed, 1_000).await.unwrap();
+        }
+        for wish in Wish::ALL {
+            grant_before_the_offer(wish).await.unwrap();
+        }
     }
 
     /// Stops that came to a robot in another order than they were asked for in.

@@ -11,6 +11,8 @@ mod dice;
 #[path = "../engine/mod.rs"]
 mod engine;
 mod network;
+#[cfg(test)]
+pub(crate) mod overtaking;
 mod reference;
 mod robot;
 mod safety;
@@ -250,8 +252,14 @@ impl Storm {
             return Ok(());
         };
         match verb {
-            0 => allowed(self.app.cancel_mission(id).await),
-            1 => allowed(self.app.pause_mission(id).await),
+            0 => {
+                let cancelled = self.app.cancel_mission(id).await;
+                self.hold_if(id, cancelled)
+            }
+            1 => {
+                let paused = self.app.pause_mission(id).await;
+                self.hold_if(id, paused)
+            }
             2 | 3 => self.resume(id).await,
             _ => {
                 #[expect(clippy::cast_precision_loss, reason = "below 5")]
@@ -260,6 +268,14 @@ impl Storm {
                 allowed(self.app.replace_mission(id, request).await)
             }
         }
+    }
+
+    /// From now on the mission may not be driven by a command of the server, if that was granted.
+    fn hold_if<T>(&self, id: MissionId, granted: Result<T, AppError>) -> Result<(), String> {
+        if granted.is_ok() {
+            with(&self.world, |world| world.held.insert(id));
+        }
+        allowed(granted)
     }
 
     fn heartbeat(&mut self, index: usize) {

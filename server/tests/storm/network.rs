@@ -28,7 +28,7 @@ pub(super) struct World {
     pub(super) late: Vec<Late>,
     pub(super) dice: Dice,
     pub(super) calm: bool,
-    /// Missions that a stop or a driver has held, and that nobody has let go on since.
+    /// Missions that a person has held or ended, and that nobody has let go on since.
     pub(super) held: HashSet<MissionId>,
     /// What the server set in motion by itself, if it ever does.
     pub(super) wrong: Option<String>,

@@ -160,8 +160,7 @@ impl App {
 
     async fn written(&self, mut tx: Tx, id: MissionId) -> Result<MissionDetail, AppError> {
         let detail = self.mission_detail(&mut tx, id).await?;
-        tx.commit().await?;
-        self.wake();
+        self.commit_recalling(tx).await?;
         Ok(detail)
     }
 }

@@ -25,6 +25,8 @@ pub(in crate::app) struct OfferedNow {
     pub(in crate::app) row: MissionRow,
     /// What the map says along its trajectory.
     pub(in crate::app) prior: Option<PathPrior>,
+    /// [`App::recalls`] before the mission was stored or read.
+    pub(in crate::app) recalls: u64,
 }
 
 /// Missions whose creation and offer are committed, for the reconciler.

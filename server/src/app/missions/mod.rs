@@ -39,6 +39,10 @@ struct Enqueued {
     row: MissionRow,
     /// Whether the same transaction set it to `offered`.
     is_offered: bool,
+    /// Whether other missions were ended for it.
+    has_ended_others: bool,
+    /// [`App::recalls`] before its transaction.
+    recalls: u64,
 }
 
 impl App {
@@ -58,16 +62,22 @@ impl App {
     }
 
     /// Sends what follows the commit of a new mission on its way.
-    fn enqueued(
-        &self,
-        Enqueued { row, is_offered }: Enqueued,
-        prior: Option<EarlyPrior>,
-    ) -> Mission {
+    fn enqueued(&self, enqueued: Enqueued, prior: Option<EarlyPrior>) -> Mission {
+        let Enqueued { row, recalls, .. } = enqueued;
         let mission = row.mission.clone();
-        if let Some(EarlyPrior(prior)) = prior.filter(|_| is_offered) {
-            self.just_offered().add(OfferedNow { row, prior });
+        if let Some(EarlyPrior(prior)) = prior.filter(|_| enqueued.is_offered) {
+            let offered = OfferedNow {
+                row,
+                prior,
+                recalls,
+            };
+            self.just_offered().add(offered);
         }
-        self.wake();
+        if enqueued.has_ended_others {
+            self.recall();
+        } else {
+            self.wake();
+        }
         self.trace_stored(&mission);
         mission
     }
@@ -87,6 +97,7 @@ impl App {
     /// Inserts a mission into its robot's queue, according to its start policy.
     async fn enqueue(&self, tx: &mut Tx, request: CreateMission) -> Result<Enqueued, AppError> {
         check_figures(&request)?;
+        let recalls = self.recalls();
         let CreateMission {
             site,
             robot,
@@ -114,6 +125,7 @@ impl App {
             });
         }
         let mut open = db::missions::open_of_robot(tx, robot_row.pk).await?;
+        let mut has_ended_others = false;
         match (start_policy, open.first()) {
             (StartPolicy::Append, _) | (_, None) => {}
             (StartPolicy::Refuse, Some(other)) => {
@@ -127,6 +139,7 @@ impl App {
                 let reason = format!("mission `{id}` was asked for in its place");
                 let why = (Change::Supersede, Actor::Client, reason.as_str());
                 end_each(tx, &open, why, created_at).await?;
+                has_ended_others = true;
                 open = db::missions::open_of_robot(tx, robot_row.pk).await?;
             }
         }
@@ -168,7 +181,12 @@ impl App {
         row.mission.pause_wanted = self.is_operator_controlled(tx, &row.mission).await?;
         let is_offered = open.is_empty() && self.may_offer_immediately(tx, &row).await?;
         insert(tx, &row, is_offered).await?;
-        Ok(Enqueued { row, is_offered })
+        Ok(Enqueued {
+            row,
+            is_offered,
+            has_ended_others,
+            recalls,
+        })
     }
 
     /// Returns whether a mission's robot is stopped or teleoperated.

@@ -116,23 +116,47 @@ pub(super) async fn offer(app: App, standing: Standing) -> Result<Finished, AppE
             Err(error) => return Err(error.into()),
         }
     }
-    let mut tx = app.db().read("reconciler").await?;
-    let row = db::missions::find(&mut tx, standing.id).await?;
-    drop(tx);
-    // It was cancelled meanwhile.
-    let Some(row) = row.filter(|row| row.mission.state == MissionState::Offered) else {
+    let recalls = app.recalls();
+    let Some(row) = offered_row(&app, standing.id).await? else {
         return Ok(Finished::Settled);
     };
     let named = (&row.mission.site, &row.mission.robot);
     let prior = app.prior_along(named, &row.mission.trajectory).await?;
-    send_offer(app, OfferedNow { row, prior }).await
+    let offered = OfferedNow {
+        row,
+        prior,
+        recalls,
+    };
+    send_offer(app, offered).await
+}
+
+async fn row_of(app: &App, id: MissionId) -> Result<Option<MissionRow>, AppError> {
+    let mut tx = app.db().read("reconciler").await?;
+    Ok(db::missions::find(&mut tx, id).await?)
+}
+
+/// Returns a mission that is to be offered; `None` if it was cancelled meanwhile.
+async fn offered_row(app: &App, id: MissionId) -> Result<Option<MissionRow>, AppError> {
+    let row = row_of(app, id).await?;
+    Ok(row.filter(|row| row.mission.state == MissionState::Offered))
 }
 
 /// Sends the offer of a mission that is set to `offered`, and stores the answer.
-pub(super) async fn send_offer(
-    app: App,
-    OfferedNow { row, prior }: OfferedNow,
-) -> Result<Finished, AppError> {
+pub(super) async fn send_offer(app: App, offered: OfferedNow) -> Result<Finished, AppError> {
+    let OfferedNow {
+        mut row,
+        prior,
+        mut recalls,
+    } = offered;
+    // A person may have held or cancelled it since it was read. Nothing is awaited between the last
+    // comparison and the sending.
+    while app.recalls() != recalls {
+        recalls = app.recalls();
+        let Some(again) = offered_row(&app, row.mission.id).await? else {
+            return Ok(Finished::Settled);
+        };
+        row = again;
+    }
     let start_within_ms = start_within_ms(&app, &row);
     let mission = row.mission;
     let place = app.trace_offer(&mission);
@@ -218,9 +242,8 @@ async fn take_offer_answer(
 
 /// Sends a new revision of an active mission and stores the answer.
 pub(super) async fn replace(app: App, standing: Standing) -> Result<Finished, AppError> {
-    let mut tx = app.db().read("reconciler").await?;
-    let row = db::missions::find(&mut tx, standing.id).await?;
-    drop(tx);
+    let recalls = app.recalls();
+    let row = row_of(&app, standing.id).await?;
     let Some(row) = row.filter(|row| !row.mission.state.is_terminal()) else {
         return Ok(Finished::Settled);
     };
@@ -240,6 +263,9 @@ pub(super) async fn replace(app: App, standing: Standing) -> Result<Finished, Ap
         link_policy: row.mission.link_policy,
         on_hold: row.mission.pause_wanted,
     };
+    if app.recalls() != recalls {
+        return Ok(Finished::Again);
+    }
     app.counters().offers_sent.one();
     let key = (row.mission.site.clone(), row.mission.robot.clone());
     let Ok(answer) = app.commands().send(&key, &command).await else {
@@ -290,9 +316,21 @@ pub(super) async fn adopt_shown(app: &App, standing: &Standing) -> Result<(), Ap
     Ok(())
 }
 
-/// Commands a robot to pause or to resume a mission.
-pub(super) async fn hold(app: App, standing: Standing, held: bool) -> Result<Finished, AppError> {
+/// Commands a robot to pause or to resume a mission, as it was read after so many recalls.
+pub(super) async fn hold(
+    app: App,
+    standing: Standing,
+    held: bool,
+    recalls: u64,
+) -> Result<Finished, AppError> {
     let (mission, (revision, _)) = (standing.id, standing.content);
+    // A person may have held it again since. A pause does no harm.
+    if !held && app.recalls() != recalls {
+        let row = row_of(&app, mission).await?;
+        if row.is_none_or(|row| row.mission.pause_wanted) {
+            return Ok(Finished::Settled);
+        }
+    }
     let key = (standing.site.clone(), standing.robot.clone());
     let answer = if held {
         let command = Pause { mission, revision };

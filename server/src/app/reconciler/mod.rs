@@ -114,6 +114,8 @@ pub struct Reconciler {
     finishing: mpsc::Receiver<(Job, Finished)>,
     under_way: HashSet<Job>,
     retries: HashMap<Job, Retry>,
+    /// [`App::recalls`] before the missions were read last.
+    recalls: u64,
     memories: HashMap<MissionId, Memory>,
     /// Stops to be sent again, as read last.
     stops: Vec<Stop>,
@@ -142,6 +144,7 @@ impl Reconciler {
             finishing,
             under_way: HashSet::new(),
             retries: HashMap::new(),
+            recalls: 0,
             memories: HashMap::new(),
             stops: Vec::new(),
             foreign: HashMap::new(),
@@ -275,6 +278,7 @@ impl Reconciler {
 
     /// Starts what open missions need, and returns them.
     async fn serve_missions(&mut self) -> Result<Vec<Standing>, AppError> {
+        self.recalls = self.app.recalls();
         let mut tx = self.app.db().read("reconciler").await?;
         let restrained = db::restorations::restrained(&mut tx).await?;
         let mut open = db::missions::in_progress(&mut tx).await?;
@@ -452,7 +456,7 @@ impl Reconciler {
                 let held = mission.pause_wanted;
                 let job = Job::Hold(mission.id, held);
                 if self.is_due(&job) {
-                    self.start(job, hold(app, mission, held));
+                    self.start(job, hold(app, mission, held, self.recalls));
                 }
             }
             Need::Offer => {

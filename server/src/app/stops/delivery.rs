@@ -166,8 +166,7 @@ impl Settling {
         let writing = async {
             let mut tx = self.app.db().write("stops").await?;
             self.app.record_stops(&mut tx, stops).await?;
-            tx.commit().await?;
-            Ok::<(), AppError>(())
+            Ok::<(), AppError>(self.app.commit_recalling(tx).await?)
         };
         match db::limited(writing).await {
             Ok(()) => {

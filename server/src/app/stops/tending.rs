@@ -58,6 +58,7 @@ impl App {
             for id in cleared {
                 db::stops::clear(&mut tx, id, now).await?;
             }
+            let holds_missions = !adopted.is_empty();
             for key in adopted {
                 self.adopt_shown_stop(&mut tx, &key).await?;
             }
@@ -66,6 +67,9 @@ impl App {
                 shown.extend(self.settle_alert(&mut tx, &key, true).await?);
             }
             self.commit_alerts(tx, shown).await?;
+            if holds_missions {
+                self.recall();
+            }
             for stop in &lost {
                 let robot = &stop.robot;
                 warn!(robot.id = %robot, "robot `{robot}` no longer shows its stop; the stop is sent again");
