@@ -247,6 +247,27 @@ impl Db {
         }
     }
 
+    /// Makes this process the server of the database, which it has locked: what was so before cannot write
+    /// to a PostgreSQL database any more.
+    ///
+    /// # Errors
+    /// The database cannot be written.
+    pub async fn claim(&self) -> Result<(), DbError> {
+        match self {
+            // The lock of a file lasts as long as the process.
+            Self::Sqlite(_) => Ok(()),
+            Self::Postgres(db) => db.claim().await,
+        }
+    }
+
+    /// Waits until a write has failed since another server has claimed the database.
+    pub async fn taken_over(&self) {
+        match self {
+            Self::Sqlite(_) => std::future::pending().await,
+            Self::Postgres(db) => db.taken_over().await,
+        }
+    }
+
     /// Returns the metrics of the database.
     pub fn metrics(&self) -> &DatabaseMetrics {
         match self {

@@ -1,8 +1,10 @@
 //! The lock that one server holds on a database, so that no second one works on it.
 
 use std::future::pending;
+use std::time::Duration;
 
 use futures_util::future::Either;
+use tread_store_postgres::lock::LockError as InUse;
 
 use super::Location;
 
@@ -40,6 +42,30 @@ impl DatabaseLock {
                 Self::Postgres(tread_store_postgres::lock::DatabaseLock::take(address).await?)
             }
         })
+    }
+
+    /// As [`DatabaseLock::take`], but waits while another server has the lock of a PostgreSQL database, and
+    /// takes over from one that has been silent for `silence_max`. `waiting` is called with the reason at
+    /// each attempt.
+    ///
+    /// # Errors
+    /// [`LockError`]: a file is in use, or the address cannot be read.
+    pub async fn wait(
+        location: &Location,
+        silence_max: Duration,
+        mut waiting: impl FnMut(&str),
+    ) -> Result<Self, LockError> {
+        let Location::Postgres(address) = location else {
+            return Self::take(location).await;
+        };
+        let waiting = |reason: &InUse| match reason {
+            InUse::InUse { address, holder } => {
+                waiting(&format!("another server{holder} uses `{address}`"));
+            }
+            InUse::Open(cause) => waiting(&cause.to_string()),
+        };
+        let lock = tread_store_postgres::lock::DatabaseLock::wait(address, silence_max, waiting);
+        Ok(Self::Postgres(lock.await?))
     }
 
     /// Waits until another server has the lock, and returns why this one must stop. A file stays locked as

@@ -54,8 +54,8 @@ mod state_rate;
 mod supervisor;
 
 pub use agent::{Agent, RunningAgent};
-pub use config::AgentConfig;
 pub use config::recording::{FILE_MIB_RANGE, FILES_RANGE, RecordingConfig};
+pub use config::{AgentConfig, Servers};
 pub use control_loop::channels::Fault;
 pub use program::{command_line, run_from_args};
 pub use realtime::{PRIORITY_RANGE, RealtimeConfig, RealtimeError};

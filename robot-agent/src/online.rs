@@ -3,10 +3,12 @@
 
 use std::ops::ControlFlow;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
 use tokio::sync::{mpsc, watch};
+use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 use tracing::{error, info, warn};
 use tread_api::robot::Capabilities;
@@ -16,7 +18,9 @@ use crate::config::AgentConfig;
 use crate::control_loop::channels::Shared;
 use crate::dispatcher::Dispatcher;
 use crate::fleet::uploader::{self, Backoff};
-use crate::fleet::{self, COMMANDS_MAX, FleetLink, Identity, Listeners, Note, Noted};
+use crate::fleet::{
+    self, Attempt, COMMANDS_MAX, FleetLink, Identity, Listeners, Note, Noted, Rotation,
+};
 use crate::membership::{Membership, ServerTrust};
 use crate::outbox::Outbox;
 use crate::reporter::{Reporter, every, publish_states};
@@ -29,6 +33,12 @@ const LAST_WORD_WAIT: Duration = Duration::from_millis(100);
 const CLOCK_WRONG_AFTER: SignedDuration = SignedDuration::from_secs(10);
 /// Pause after the link failed for a reason of this machine, such as no free port.
 const LINK_FAILED_REST: Duration = Duration::from_secs(1);
+
+/// Silence after which one of several servers is left if its link has broken too: a server that changes
+/// its router takes less.
+const LOST_GRACE: Duration = Duration::from_millis(300);
+/// Interval between two looks at the silence of the server.
+const SILENCE_LOOK_EVERY: Duration = Duration::from_millis(50);
 
 /// Waits for the next certificate; never returns without a membership.
 async fn renewed(membership: &mut Option<watch::Receiver<Arc<Membership>>>) {
@@ -55,6 +65,17 @@ pub(crate) struct Online {
     pub(crate) heard: watch::Sender<ServerTrust>,
 }
 
+/// What lasts from link to link.
+struct Links {
+    servers: Rotation,
+    listeners: Listeners,
+    membership: Option<watch::Receiver<Arc<Membership>>>,
+    /// Whether the present link has broken and no server has been heard since.
+    is_lost: Arc<AtomicBool>,
+    /// Links to servers that were left, while they are closed.
+    closing: JoinSet<()>,
+}
+
 fn hear(heard: &watch::Sender<ServerTrust>, trust: ServerTrust) {
     heard.send_if_modified(|present| std::mem::replace(present, trust) != trust);
 }
@@ -66,10 +87,18 @@ impl Online {
         let (shared, clock) = (Arc::clone(shared), Arc::clone(clock));
         let heard = self.heard.clone();
         let publish_rate = Arc::clone(&self.reporter.publish_rate);
+        let is_lost = Arc::new(AtomicBool::new(false));
+        let lost = Arc::clone(&is_lost);
         let note: Note = Arc::new(move |noted| match noted {
-            Noted::ServerHeard => shared.note_server_heard(clock.monotonic()),
+            Noted::ServerHeard => {
+                lost.store(false, Ordering::Relaxed);
+                shared.note_server_heard(clock.monotonic());
+            }
             Noted::CommandLost => Shared::count(&shared.lost_commands),
-            Noted::ServerLost => publish_rate.end_request(),
+            Noted::ServerLost => {
+                lost.store(true, Ordering::Relaxed);
+                publish_rate.end_request();
+            }
             Noted::Trust(trust) => hear(&heard, ServerTrust::Is(trust)),
             Noted::Distrusted => hear(&heard, ServerTrust::Distrusted),
         });
@@ -88,52 +117,55 @@ impl Online {
             commands,
         };
         let answering = Arc::clone(&self.dispatcher).run(commands_in, self.stop.clone());
-        let mut membership = self.membership.take();
-        let linking = async { while self.link(&mut membership, &listeners).await.is_continue() {} };
+        let mut links = Links {
+            servers: Rotation::new(self.config.servers.endpoints()),
+            listeners,
+            membership: self.membership.take(),
+            is_lost,
+            closing: JoinSet::new(),
+        };
+        let linking = async { while self.link(&mut links).await.is_continue() {} };
         tokio::join!(answering, linking);
     }
 
-    /// Runs one link until requested to stop, or until it must be reopened with another
-    /// certificate. The robot goes on driving in between, as in every outage.
-    async fn link(
-        &self,
-        membership: &mut Option<watch::Receiver<Arc<Membership>>>,
-        listeners: &Listeners,
-    ) -> ControlFlow<()> {
+    /// Runs one link until requested to stop, until it must be reopened with another certificate, or
+    /// until the server is left for another one. The robot goes on driving in between, as in every outage.
+    async fn link(&self, links: &mut Links) -> ControlFlow<()> {
         // The server that requested it was that of the link before.
         self.reporter.publish_rate.end_request();
+        let membership = &mut links.membership;
         let shown = membership
             .as_mut()
             .map(|it| Arc::clone(&it.borrow_and_update()));
         let connecting = FleetLink::connect(
-            &self.config.server,
+            &mut links.servers,
             shown.as_deref(),
             self.identity.clone(),
-            listeners.clone(),
-            &self.stop,
+            links.listeners.clone(),
         );
         let connected = tokio::select! {
             connected = connecting => connected,
+            () = self.stop.cancelled() => return ControlFlow::Break(()),
             // The present certificate may be the reason why no server is reached.
             () = renewed(membership) => return ControlFlow::Continue(()),
         };
-        let link = match connected {
-            Ok(Some(link)) => Arc::new(link),
-            Ok(None) if self.stop.is_cancelled() => return ControlFlow::Break(()),
-            Ok(None) => return ControlFlow::Continue(()),
+        let link: Arc<FleetLink> = match connected {
+            Ok(Attempt::Reached(link)) => Arc::from(link),
+            Ok(Attempt::Failed { is_distrusted }) => {
+                let pause = links.servers.failed(is_distrusted);
+                return self.rest(&mut links.membership, pause).await;
+            }
             Err(cause) => {
                 error!(
                     error = &cause as &dyn std::error::Error,
                     "the fleet link failed; it is tried again"
                 );
-                tokio::select! {
-                    () = tokio::time::sleep(LINK_FAILED_REST) => {}
-                    () = renewed(membership) => {}
-                    () = self.stop.cancelled() => return ControlFlow::Break(()),
-                }
-                return ControlFlow::Continue(());
+                links.servers.leave();
+                return self.rest(&mut links.membership, LINK_FAILED_REST).await;
             }
         };
+        links.servers.reached();
+        links.is_lost.store(false, Ordering::Relaxed);
         let (welcomed, is_welcome) = watch::channel(false);
         let _ = self.connected.send(true);
         let reporter = &self.reporter;
@@ -157,14 +189,61 @@ impl Online {
         let next = tokio::select! {
             () = working => ControlFlow::Break(()),
             () = self.stop.cancelled() => ControlFlow::Break(()),
-            () = renewed(membership) => ControlFlow::Continue(()),
+            () = renewed(&mut links.membership) => ControlFlow::Continue(()),
             () = link.lost_for_good() => ControlFlow::Continue(()),
+            silence = self.silent(&links.servers, &links.is_lost) => {
+                let silent = links.servers.endpoint().to_owned();
+                links.servers.leave();
+                warn!(
+                    "the server at {silent} has been silent for {:.1} s; the next one is {}",
+                    silence.as_secs_f64(), links.servers.endpoint(),
+                );
+                link.leave();
+                // What does not answer takes its time to close.
+                links.closing.spawn(async move { link.close().await });
+                while links.closing.try_join_next().is_some() {}
+                return ControlFlow::Continue(());
+            }
         };
         if self.stop.is_cancelled() {
             self.take_leave(&link).await;
         }
         link.close().await;
         next
+    }
+
+    /// Waits before another attempt to connect.
+    async fn rest(
+        &self,
+        membership: &mut Option<watch::Receiver<Arc<Membership>>>,
+        pause: Duration,
+    ) -> ControlFlow<()> {
+        tokio::select! {
+            () = tokio::time::sleep(pause) => ControlFlow::Continue(()),
+            () = renewed(membership) => ControlFlow::Continue(()),
+            () = self.stop.cancelled() => ControlFlow::Break(()),
+        }
+    }
+
+    /// Waits until the server of a new link is to be left for another one, and returns how long it was
+    /// silent; never returns if there is no other.
+    async fn silent(&self, servers: &Rotation, is_lost: &AtomicBool) -> Duration {
+        if !servers.has_others() {
+            return std::future::pending().await;
+        }
+        let clock = &self.dispatcher.clock;
+        let begun = clock.monotonic();
+        loop {
+            tokio::time::sleep(SILENCE_LOOK_EVERY).await;
+            let now = clock.monotonic();
+            let silence = self.dispatcher.shared.server_silence(now);
+            let silence = silence.min(now.saturating_sub(begun));
+            let timeout = self.config.server_timeout;
+            let is_lost = is_lost.load(Ordering::Relaxed);
+            if silence >= timeout || is_lost && silence >= LOST_GRACE.min(timeout) {
+                return silence;
+            }
+        }
     }
 
     /// Publishes that the agent stops on purpose, so that the server raises no alert. If this

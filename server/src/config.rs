@@ -56,6 +56,10 @@ pub struct ServerArgs {
     /// Database: a file, created when missing, or the address `postgres://…` of a PostgreSQL database
     #[arg(long, value_name = "FILE")]
     pub database: Option<PathBuf>,
+    /// Wait while another server uses the PostgreSQL database, and take over when that one ends or is
+    /// silent
+    #[arg(long)]
+    pub standby: bool,
     /// Site that is created when missing
     #[arg(long)]
     pub site: Option<SiteId>,
@@ -88,6 +92,8 @@ pub struct Config {
     pub zenoh: SocketAddr,
     /// The database: a file, or a PostgreSQL database.
     pub database: Location,
+    /// Whether the start waits while another server uses the database.
+    pub standby: bool,
     /// Site that is created at the start if missing.
     pub site: SiteId,
     /// Weights of measurements by robot and age.
@@ -365,6 +371,8 @@ struct File {
     metrics: Option<SocketAddr>,
     zenoh: Option<SocketAddr>,
     database: Option<PathBuf>,
+    #[serde(default)]
+    standby: bool,
     site: Option<SiteId>,
     #[serde(default)]
     friction: FrictionConfig,
@@ -461,6 +469,12 @@ pub enum ConfigError {
          `pg_dump` (docs/postgresql.md): remove `[backup]`"
     )]
     BackupOfPostgres,
+    /// `standby` is set for a database file.
+    #[error(
+        "`standby` needs a PostgreSQL database, which two machines can reach: a file has one server \
+         (docs/postgresql.md#standby)"
+    )]
+    StandbyOfFile,
     /// An entry of `robots.names` is neither a host name nor an IP address.
     #[error("`robots.names` has `{0}`, which is neither a host name nor an address")]
     PortName(String),
@@ -513,6 +527,7 @@ impl Config {
                 .or(file.database)
                 .unwrap_or_else(|| DATABASE_DEFAULT.into())
                 .into(),
+            standby: args.standby || file.standby,
             site: args
                 .site
                 .clone()
@@ -573,6 +588,9 @@ impl Config {
             .then_some(("zenoh", self.zenoh, ROBOTS));
         if self.database.is_postgres() && self.backup.is_some() {
             return Err(ConfigError::BackupOfPostgres);
+        }
+        if !self.database.is_postgres() && self.standby {
+            return Err(ConfigError::StandbyOfFile);
         }
         for (key, address, cure) in [http, zenoh, metrics].into_iter().flatten() {
             if !address.ip().is_loopback() {

@@ -40,11 +40,13 @@ mod program;
 mod rate_limit;
 mod service_manager;
 mod setup;
+mod standby;
 pub mod supervisor;
 pub mod webhooks;
 
 use std::net::SocketAddr;
 use std::sync::Arc;
+use std::time::Duration;
 
 use anyhow::Context as _;
 use jiff::SignedDuration;
@@ -67,15 +69,19 @@ use self::authority::Authorities;
 use self::clock::Clock;
 pub use self::config::{Config, ServerArgs};
 use self::config::{RobotsConfig, TlsSource};
-use self::db::lock::DatabaseLock;
+use self::db::lock::{DatabaseLock, LockError};
 use self::db::{Db, DbError, Engine, Location};
 use self::fleet::{Fleet, Security};
 use self::http::serve::Serving;
 use self::http::tls::{Issuer, Tls};
 use self::identity::address::TrustedProxies;
 pub use self::program::{command_line, run, run_from_args};
+use self::standby::Standby;
 use self::supervisor::Supervisor;
 use self::webhooks::{Resolver, Sender, SystemResolver};
+
+/// Silence of the server that has the database after which a standby takes over.
+const STANDBY_SILENCE_MAX: Duration = Duration::from_secs(3);
 
 /// Entry point that starts servers.
 #[derive(Debug, Clone, Copy)]
@@ -123,14 +129,15 @@ impl Server {
         let names = config.names();
         let proxies = TrustedProxies::new(config.web.trusted_proxies.clone());
         let schedule = backup_schedule(&config);
-        let lock = DatabaseLock::take(&config.database).await?;
+        let lock = take_lock(&config).await?;
         // Only with the lock: this completes an interrupted rotation of the authority.
         let security = config.robots.as_ref().map(security).transpose()?;
         let tls = open_tls(&config, security.as_ref(), &clock)?;
         let db = Db::open(&config.database).await?;
+        db.claim().await?;
         let supervisor = Supervisor::new();
         let stop = || supervisor.stop_token();
-        supervisor.spawn_vital("lock", keep_lock(lock.lost(), stop()));
+        supervisor.spawn_vital("lock", keep_lock(lock.lost(), db.clone(), stop()));
         let (of_fleet, fleet_clock) = (security.clone(), clock.clone());
         let fleet = Fleet::open(config.zenoh, of_fleet, fleet_clock, supervisor.clone())?;
         let enrolment_service = |security: Security, robots: &RobotsConfig| EnrolmentService {
@@ -247,10 +254,27 @@ fn serve_metrics(
     Ok(address)
 }
 
-/// Ends when another server has the lock of the database, or at the stop.
-async fn keep_lock(lost: impl Future<Output = String>, stop: CancellationToken) {
-    if let Some(reason) = stop.run_until_cancelled(lost).await {
-        error!("the lock of the database is lost: {reason}");
+/// Locks the database; a standby waits until it can.
+///
+/// # Errors
+/// Another server uses it, or it cannot be locked.
+async fn take_lock(config: &Config) -> Result<DatabaseLock, LockError> {
+    if !config.standby {
+        return DatabaseLock::take(&config.database).await;
+    }
+    let mut standby = Standby::default();
+    let waiting = |reason: &str| standby.waits(reason);
+    let lock = DatabaseLock::wait(&config.database, STANDBY_SILENCE_MAX, waiting).await?;
+    standby.takes_over();
+    Ok(lock)
+}
+
+/// Ends when another server has the lock of the database, or has claimed it, or at the stop.
+async fn keep_lock(lost: impl Future<Output = String>, db: Db, stop: CancellationToken) {
+    tokio::select! {
+        () = stop.cancelled() => {}
+        reason = lost => error!("the lock of the database is lost: {reason}"),
+        () = db.taken_over() => error!("another server has taken over the database: this one ends"),
     }
 }
 

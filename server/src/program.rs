@@ -153,7 +153,14 @@ pub fn run(args: &ServerArgs) -> anyhow::Result<()> {
         let mut interrupt = signal(SignalKind::interrupt())?;
         let ignores_hangup = ignores_hangup();
         let mut hangup = signal(SignalKind::hangup())?;
-        let server = Server::start(config).await?;
+        let starting = Server::start(config);
+        // A standby may wait for long.
+        let server = tokio::select! {
+            started = starting => started?,
+            _ = terminate.recv() => return Ok(()),
+            _ = interrupt.recv() => return Ok(()),
+            _ = hangup.recv(), if !ignores_hangup => return Ok(()),
+        };
         server.tell_service_manager();
         tokio::select! {
             _ = terminate.recv() => info!("asked to stop"),

@@ -39,6 +39,8 @@ fn of_code(code: &str) -> Option<StorageFailure> {
         "XX001" | "XX002" => Some(StorageFailure::Damaged),
         // The server accepts no writes (a standby), or has ended a transaction that was idle.
         "25006" | "25P03" | "3D000" => Some(StorageFailure::Connection),
+        // Another server has taken over.
+        super::TAKEN_OVER => Some(StorageFailure::Busy),
         _ => match code.get(..2)? {
             "58" => Some(StorageFailure::Io),
             // Connections, authorisation, and shutdown of the server.

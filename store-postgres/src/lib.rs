@@ -84,11 +84,12 @@ pub mod webhooks;
 #[path = "../../store/sql/withdrawals.rs"]
 pub mod withdrawals;
 
-use std::sync::Arc;
 use std::sync::atomic::Ordering;
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use sqlx::AssertSqlSafe;
+use tokio::sync::watch;
 use tokio::time::{Instant, timeout};
 use tread_store::failure::StorageFailure;
 use tread_store::metrics::DatabaseMetrics;
@@ -125,6 +126,8 @@ const DISK_TIMEOUT: Duration = Duration::from_secs(2);
 /// Begins a write. The number is the lock of writers, "treaddb" in ASCII. The server releases the lock
 /// after it has made the commit visible, and each later statement sees what is visible when it begins.
 const BEGIN_WRITE: &str = "BEGIN ISOLATION LEVEL READ COMMITTED READ WRITE; SELECT pg_advisory_xact_lock(32776877049668706)";
+/// PostgreSQL's code, of `check_server_epoch`, for a server that another one has taken the place of.
+const TAKEN_OVER: &str = "TR001";
 /// Begins a read: its first statement takes the snapshot of all.
 const BEGIN_READ: &str = "BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY";
 
@@ -137,6 +140,15 @@ pub struct Db {
     version: String,
     metrics: DatabaseMetrics,
     commits: Arc<Commits>,
+    claim: Arc<Claim>,
+}
+
+/// Proof that this process is the server of the database.
+#[derive(Debug, Default)]
+struct Claim {
+    /// What begins a write, with the epoch of this server; unset for a program that is no server.
+    begin_write: OnceLock<String>,
+    is_taken_over: watch::Sender<bool>,
 }
 
 impl Db {
@@ -169,6 +181,7 @@ impl Db {
             version,
             metrics: DatabaseMetrics::default(),
             commits: Arc::default(),
+            claim: Arc::default(),
         })
     }
 
@@ -217,7 +230,13 @@ impl Db {
     /// The turn to write did not come in time, or PostgreSQL failed.
     pub async fn write(&self, kind: &'static str) -> Result<Tx, DbError> {
         let asked_at = Instant::now();
-        let inner = self.writer.begin(BEGIN_WRITE).await;
+        let begin = self.claim.begin_write.get().map_or(BEGIN_WRITE, |it| it);
+        let inner = self.writer.begin(begin).await;
+        if let Err(sqlx::Error::Database(error)) = &inner
+            && error.code().as_deref() == Some(TAKEN_OVER)
+        {
+            self.claim.is_taken_over.send_replace(true);
+        }
         let inner = inner.map_err(EngineError::from)?;
         self.metrics.write_wait(asked_at.elapsed());
         let tx = self.timed(inner, kind, true);
@@ -237,6 +256,32 @@ impl Db {
             is_counted: false,
             ..self.write(kind).await?
         })
+    }
+
+    /// Makes this process the server of the database: all that were so before cannot write any more. To be
+    /// called once, with the lock.
+    ///
+    /// # Errors
+    /// The database cannot be written.
+    pub async fn claim(&self) -> Result<(), DbError> {
+        let mut tx = self.write_uncounted("lock").await?;
+        let epoch =
+            sqlx::query_scalar!("UPDATE server_epoch SET epoch = epoch + 1 RETURNING epoch");
+        let epoch = epoch.fetch_one(&mut *tx).await.map_err(EngineError::from)?;
+        tx.commit().await?;
+        // Set once: a second claim of the same process keeps the first epoch, and fails with it.
+        let _ = self
+            .claim
+            .begin_write
+            .set(format!("{BEGIN_WRITE}; SELECT check_server_epoch({epoch})"));
+        Ok(())
+    }
+
+    /// Waits until a write has failed since another server has claimed the database.
+    pub async fn taken_over(&self) {
+        let mut is_taken_over = self.claim.is_taken_over.subscribe();
+        // The sender lives as long as this database.
+        let _ = is_taken_over.wait_for(|is| *is).await;
     }
 
     fn timed(&self, inner: Lent, kind: &'static str, writes: bool) -> Tx {

@@ -5,6 +5,11 @@
 //! as at its restart: it is taken again then, and [`DatabaseLock::lost`] returns only if
 //! another server was faster. After a network failure PostgreSQL may still have the old session, which is
 //! ended first: a server does not stop because of itself. Programs that only read do not take the lock.
+//!
+//! A standby waits for the lock ([`DatabaseLock::wait`]). The session that holds it asks something every
+//! [`LOOK_INTERVAL`], so a server that is frozen, or cut off, shows as a session that was silent for
+//! longer: the standby ends all sessions of that server then, also one in the middle of a write. A server
+//! that wakes up writes no more, since the new one has claimed the database ([`super::Db::claim`]).
 
 use std::future::pending;
 use std::time::Duration;
@@ -19,7 +24,9 @@ use tracing::warn;
 use super::{OpenError, connections, open};
 
 /// Interval at which a server looks whether it still has the lock.
-const LOOK_INTERVAL: Duration = Duration::from_secs(2);
+const LOOK_INTERVAL: Duration = Duration::from_millis(500);
+/// Interval at which a standby tries to take the lock.
+const STANDBY_INTERVAL: Duration = Duration::from_millis(250);
 /// Maximum time for an answer about it.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
 /// Interval at which the lock is tried while a session ends that holds it.
@@ -41,6 +48,19 @@ const IN_USE_BY: &str = "SELECT COALESCE(host(client_addr), 'this machine'),
         AND database = (SELECT oid FROM pg_database WHERE datname = current_database())
         AND (CAST(classid AS BIGINT) << 32) | CAST(objid AS BIGINT) = 8390880524716175990
     LIMIT 1";
+
+/// Returns the name of the process that has the lock, and for how many seconds the session that holds it
+/// has been silent.
+const HOLDER: &str = "SELECT application_name,
+        CAST(EXTRACT(EPOCH FROM clock_timestamp() - state_change) AS DOUBLE PRECISION)
+    FROM pg_locks JOIN pg_stat_activity USING (pid)
+    WHERE locktype = 'advisory' AND granted AND objsubid = 1
+        AND database = (SELECT oid FROM pg_database WHERE datname = current_database())
+        AND (CAST(classid AS BIGINT) << 32) | CAST(objid AS BIGINT) = 8390880524716175990
+    LIMIT 1";
+/// Ends all sessions of a process.
+const END_PROCESS: &str = "SELECT COUNT(pg_terminate_backend(pid)) FROM pg_stat_activity
+    WHERE datname = current_database() AND application_name = $1 AND pid <> pg_backend_pid()";
 
 /// A session of PostgreSQL: the number of its process, and when it began.
 type Session = (i32, String);
@@ -80,6 +100,42 @@ impl DatabaseLock {
     pub async fn take(url: &str) -> Result<Self, LockError> {
         let (options, address) = open::options_of(url).map_err(LockError::Open)?;
         let locked = locked(&options, &address).await?;
+        Ok(Self::keeping(locked, options, address))
+    }
+
+    /// Waits until the server that has the lock ends, or has not said anything for a time, and takes the
+    /// lock then. `waiting` is called with the reason at each attempt. A database that cannot be reached
+    /// is tried again.
+    ///
+    /// # Errors
+    /// [`LockError::Open`]: the address cannot be read.
+    pub async fn wait(
+        url: &str,
+        silence_max: Duration,
+        mut waiting: impl FnMut(&LockError),
+    ) -> Result<Self, LockError> {
+        let (options, address) = open::options_of(url).map_err(LockError::Open)?;
+        loop {
+            match locked(&options, &address).await {
+                Ok(locked) => return Ok(Self::keeping(locked, options, address)),
+                Err(reason) => {
+                    waiting(&reason);
+                    if matches!(reason, LockError::InUse { .. })
+                        && let Err(cause) = end_silent(&options, silence_max).await
+                    {
+                        warn!("the server that has the database cannot be examined: {cause}");
+                    }
+                }
+            }
+            sleep(STANDBY_INTERVAL).await;
+        }
+    }
+
+    fn keeping(
+        locked: (PgConnection, Session),
+        options: PgConnectOptions,
+        address: String,
+    ) -> Self {
         let (losing, lost) = watch::channel(None);
         #[expect(
             clippy::disallowed_methods,
@@ -89,7 +145,7 @@ impl DatabaseLock {
             let in_use = keep(locked, &options, &address).await;
             losing.send_replace(Some(in_use.to_string()));
         });
-        Ok(Self { keeping, lost })
+        Self { keeping, lost }
     }
 
     /// Waits until another server has the lock, and returns why this one must stop.
@@ -142,6 +198,29 @@ async fn keep(
             }
         };
     }
+}
+
+/// Ends the sessions of the server that has the lock, if it has been silent for longer than permitted.
+async fn end_silent(options: &PgConnectOptions, silence_max: Duration) -> Result<(), sqlx::Error> {
+    let mut connection = connections::connect(options).await?;
+    let holder: Option<(String, f64)> = sqlx::query_as(HOLDER)
+        .fetch_optional(&mut connection)
+        .await?;
+    let Some((process, silence_s)) = holder else {
+        return Ok(());
+    };
+    if silence_s < silence_max.as_secs_f64() {
+        return Ok(());
+    }
+    let (ended,): (i64,) = sqlx::query_as(END_PROCESS)
+        .bind(&process)
+        .fetch_one(&mut connection)
+        .await?;
+    warn!(
+        "`{process}` has the lock of the database and was silent for {silence_s:.1} s: its {ended} \
+         sessions are ended"
+    );
+    Ok(())
 }
 
 /// Takes the lock again after this process lost its connection. PostgreSQL may not have noticed the loss:
@@ -205,7 +284,84 @@ async fn locked(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Db;
     use crate::testing::with_database;
+
+    /// Time after which a standby of these tests takes over.
+    const SILENCE_MAX: Duration = Duration::from_secs(1);
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn a_standby_waits_for_a_server_that_answers_and_takes_over_from_one_that_ends() {
+        let test = "a_standby_waits_for_a_server_that_answers";
+        with_database(test, async |database| {
+            let lock = DatabaseLock::take(&database.url).await.unwrap();
+            let mut reasons = 0;
+            let waiting = DatabaseLock::wait(&database.url, SILENCE_MAX, |reason| {
+                assert!(matches!(reason, LockError::InUse { .. }), "{reason}");
+                reasons += 1;
+            });
+            let waited = timeout(3 * SILENCE_MAX, waiting).await;
+            assert!(
+                waited.is_err(),
+                "it has not taken over from a server that lives"
+            );
+            assert!(reasons > 3, "{reasons}");
+            lock.release().await;
+            let waiting = DatabaseLock::wait(&database.url, SILENCE_MAX, |_reason| {});
+            timeout(SILENCE_MAX, waiting).await.unwrap().unwrap();
+        })
+        .await;
+    }
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn a_standby_takes_over_from_a_server_that_is_frozen_within_a_write() {
+        let test = "a_standby_takes_over_from_a_server_that_is_frozen";
+        with_database(test, async |database| {
+            drop(Db::open(&database.url).await.unwrap());
+            // Another process, which holds lock and turn to write and does nothing any more.
+            let (options, address) = open::options_of(&database.url).unwrap();
+            let frozen = options.application_name("tread-server frozen");
+            let _lock = locked(&frozen, &address).await.unwrap();
+            let mut writing = connections::connect(&frozen).await.unwrap();
+            sqlx::raw_sql(crate::BEGIN_WRITE)
+                .execute(&mut writing)
+                .await
+                .unwrap();
+            let begun = Instant::now();
+            let waiting = DatabaseLock::wait(&database.url, SILENCE_MAX, |_reason| {});
+            let _lock = timeout(4 * SILENCE_MAX, waiting).await.unwrap().unwrap();
+            assert!(begun.elapsed() >= SILENCE_MAX / 2, "{:?}", begun.elapsed());
+            let db = Db::open(&database.url).await.unwrap();
+            db.claim().await.unwrap();
+            db.probe_write().await.unwrap();
+            let cut = sqlx::query("SELECT 1").execute(&mut writing).await;
+            assert!(cut.is_err(), "its session has ended");
+            db.close().await;
+        })
+        .await;
+    }
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn a_server_that_was_taken_over_writes_no_more_and_notices() {
+        let test = "a_server_that_was_taken_over_writes_no_more";
+        with_database(test, async |database| {
+            let old = Db::open(&database.url).await.unwrap();
+            old.claim().await.unwrap();
+            old.probe_write().await.unwrap();
+            let new = Db::open(&database.url).await.unwrap();
+            new.probe_write().await.unwrap();
+            assert!(timeout(SILENCE_MAX, old.taken_over()).await.is_err());
+            new.claim().await.unwrap();
+            let refused = format!("{:?}", old.probe_write().await.unwrap_err());
+            assert!(refused.contains("taken over"), "{refused}");
+            timeout(SILENCE_MAX, old.taken_over()).await.unwrap();
+            new.probe_write().await.unwrap();
+            old.read("test").await.unwrap();
+            old.close().await;
+            new.close().await;
+        })
+        .await;
+    }
 
     #[tokio::test]
     async fn a_lost_session_of_the_same_server_does_not_keep_the_lock_and_that_of_another_does() {

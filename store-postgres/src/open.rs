@@ -3,12 +3,14 @@
 use std::fmt;
 use std::io;
 use std::str::FromStr as _;
+use std::sync::LazyLock;
 use std::time::Duration;
 
 use sqlx::migrate::MigrateError;
 use sqlx::postgres::PgConnectOptions;
 use sqlx::{Connection as _, PgConnection};
 use tread_api::release::VERSION;
+use uuid::Uuid;
 
 use super::{EngineError, connections, schema};
 
@@ -20,8 +22,10 @@ const MIGRATION_LOCK_TIMEOUT: Duration = Duration::from_mins(2);
 const STATEMENTS_MAX: usize = 512;
 /// Begins of an address.
 const SCHEMES: [&str; 2] = ["postgres://", "postgresql://"];
-/// Name of our connections in the list of the server's (`pg_stat_activity`).
+/// Begin of the name of our connections in the list of the server's (`pg_stat_activity`).
 const APPLICATION: &str = "tread-server";
+/// Name of this process there, which all its sessions have and no others.
+static PROCESS: LazyLock<String> = LazyLock::new(|| format!("{APPLICATION} {}", Uuid::new_v4()));
 
 /// Reason why the database cannot be opened. None contains the password.
 #[derive(Debug, thiserror::Error)]
@@ -168,7 +172,7 @@ pub(super) fn options_of(url: &str) -> Result<(PgConnectOptions, String), OpenEr
     }
     let options = PgConnectOptions::from_str(url).map_err(OpenError::Address)?;
     let options = options
-        .application_name(APPLICATION)
+        .application_name(&PROCESS)
         .statement_cache_capacity(STATEMENTS_MAX);
     let address = Address(&options).to_string();
     Ok((options, address))

@@ -37,10 +37,11 @@ async fn connections_have_the_settings_that_keep_commits_and_bound_waits() {
                 ("statement_timeout", "1min"),
                 ("lock_timeout", "10s"),
                 ("idle_in_transaction_session_timeout", "1min"),
-                ("application_name", "tread-server"),
             ] {
                 assert_eq!(setting(&mut writing, name).await, expected, "{name}");
             }
+            let name = setting(&mut writing, "application_name").await;
+            assert!(name.starts_with("tread-server "), "{name}");
             let mut reading = db.read("db").await.unwrap();
             assert_eq!(
                 setting(&mut reading, "transaction_isolation").await,
@@ -171,7 +172,7 @@ async fn a_commit_whose_server_process_is_ended_has_an_unknown_outcome() {
                          PERFORM pg_stat_clear_snapshot();
                      END LOOP;
                      PERFORM pg_terminate_backend(pid) FROM pg_stat_activity
-                         WHERE datname = current_database() AND application_name = 'tread-server';
+                         WHERE datname = current_database() AND application_name LIKE 'tread-server %';
                  END $$",
             );
             let (committed, ()) = tokio::join!(committing, ending);
@@ -286,7 +287,7 @@ async fn connections_that_the_server_has_ended_are_replaced() {
                 database
                     .run(
                         "SELECT pg_terminate_backend(pid) FROM pg_stat_activity
-                     WHERE datname = current_database() AND application_name = 'tread-server'",
+                     WHERE datname = current_database() AND application_name LIKE 'tread-server %'",
                     )
                     .await;
             }

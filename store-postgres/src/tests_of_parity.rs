@@ -700,7 +700,8 @@ async fn tables_columns_and_indexes_are_the_same() {
                  is_nullable = 'NO'
              FROM information_schema.columns JOIN pg_tables ON tablename = table_name
              WHERE table_schema = current_schema() AND schemaname = table_schema
-                 AND table_name NOT IN ('_sqlx_migrations', 'write_probe', 'segment_partitions')
+                 AND table_name NOT IN
+                     ('_sqlx_migrations', 'write_probe', 'segment_partitions', 'server_epoch')
              ORDER BY 1, 2",
         )
         .fetch_all(&mut *both.postgres)

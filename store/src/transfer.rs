@@ -40,7 +40,12 @@ pub const TABLES: [&str; 32] = [
 
 /// Tables that a copy does not contain, because each database has its own: what a migration or a check
 /// of the storage writes, and how PostgreSQL divides a table.
-pub const OWN_TABLES: [&str; 3] = ["_sqlx_migrations", "write_probe", "segment_partitions"];
+pub const OWN_TABLES: [&str; 4] = [
+    "_sqlx_migrations",
+    "write_probe",
+    "segment_partitions",
+    "server_epoch",
+];
 
 /// Tables of [`TABLES`] that may have rows in a new database, which the copy replaces: migrations insert
 /// them.

@@ -57,6 +57,7 @@ impl Yard {
                 ..WebhooksConfig::default()
             },
             backup: None,
+            standby: false,
             audit: tread_server::config::AuditConfig::default(),
             tracing: tread_server::config::TracingConfig::default(),
             web: WebConfig::default(),

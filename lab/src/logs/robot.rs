@@ -102,7 +102,7 @@ impl Robot {
             config: Some(file.to_owned()),
             site: "recorded".parse().ok(),
             robot: "recorded".parse().ok(),
-            server: Some("tcp/127.0.0.1:7447".to_owned()),
+            server: vec!["tcp/127.0.0.1:7447".to_owned()],
             data_dir: Some(PathBuf::from("no-such-folder")),
             start: Some(Pose::default()),
             ..Flags::default()

@@ -8,6 +8,7 @@ use tread_api::robot::RobotModel;
 use tread_telemetry::TracingConfig;
 
 use super::ros2::Ros2File;
+use super::servers::ServerFile;
 
 /// `robot.toml`.
 #[derive(Debug, Clone, Default, Deserialize)]
@@ -15,7 +16,8 @@ use super::ros2::Ros2File;
 pub(super) struct FileConfig {
     pub(super) site: Option<SiteId>,
     pub(super) robot: Option<RobotId>,
-    pub(super) server: Option<String>,
+    pub(super) server: Option<ServerFile>,
+    pub(super) server_timeout_s: Option<f64>,
     pub(super) data_dir: Option<PathBuf>,
     pub(super) rate_hz: Option<f64>,
     pub(super) state_rate_hz: Option<f64>,

@@ -8,6 +8,7 @@ mod place;
 mod realtime;
 pub(crate) mod recording;
 mod ros2;
+mod servers;
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -21,9 +22,9 @@ use tread_control::geometry::Pose;
 
 use file::{DriveFile, DriveKind, FileConfig};
 pub(crate) use place::place;
-use place::place_at;
 
 use self::recording::RecordingConfig;
+pub use self::servers::{SERVERS_MAX, Servers};
 use crate::drive::ros2::settings::{Effort, Ros2Settings};
 use crate::geometry::{control_model, paper_robot};
 use crate::membership::{Membership, MembershipFileError};
@@ -37,6 +38,11 @@ use tread_telemetry::{TelemetryError, TracingConfig};
 
 /// Default endpoint of the server.
 pub const SERVER_DEFAULT: &str = "tcp/127.0.0.1:7447";
+/// Permitted silence of one of several servers before the agent connects to the next, seconds. A
+/// server sends a message every 0.25 s.
+pub const SERVER_TIMEOUT_S_RANGE: std::ops::RangeInclusive<f64> = 0.5..=60.0;
+/// Default of it, seconds.
+pub const SERVER_TIMEOUT_DEFAULT_S: f64 = 1.0;
 /// Permitted rate of the loop, Hz.
 pub const RATE_HZ_RANGE: std::ops::RangeInclusive<f64> = 20.0..=200.0;
 /// Permitted rate of publication, Hz.
@@ -118,9 +124,10 @@ pub struct Flags {
     /// The robot's identifier within its site
     #[arg(long)]
     pub robot: Option<RobotId>,
-    /// The server's zenoh endpoint [default: that of `enroll`, or tcp/127.0.0.1:7447]
-    #[arg(long)]
-    pub server: Option<String>,
+    /// The server's zenoh endpoint, or several of one fleet separated by commas, the preferred one
+    /// first [default: that of `enroll`, or tcp/127.0.0.1:7447]
+    #[arg(long, value_delimiter = ',')]
+    pub server: Vec<String>,
     /// Folder of the outbox: measurements that wait for upload
     #[arg(long)]
     pub data_dir: Option<PathBuf>,
@@ -247,8 +254,11 @@ pub struct AgentConfig {
     pub site: SiteId,
     /// The robot.
     pub robot: RobotId,
-    /// The server's zenoh endpoint.
-    pub server: String,
+    /// The servers' zenoh endpoints.
+    pub servers: Servers,
+    /// Silence of one of several servers after which the agent connects to the next, within
+    /// [`SERVER_TIMEOUT_S_RANGE`].
+    pub server_timeout: Duration,
     /// The robot's certificate, for an endpoint that requires one.
     pub membership: Option<Membership>,
     /// Folder of the files that outlive the process.
@@ -294,7 +304,7 @@ impl AgentConfig {
         let flags = Flags {
             site: Some(scenario.site.clone()),
             robot: Some(robot),
-            server: Some(server),
+            server: vec![server],
             data_dir: Some(data_dir),
             ..Flags::default()
         };
@@ -423,13 +433,19 @@ fn assemble(
         key: "model",
         problem: refused.to_string(),
     })?;
-    let server = flags
-        .server
-        .clone()
-        .or(file.server)
-        .or(joined.map(|joined| joined.endpoint.clone()))
-        .unwrap_or_else(|| SERVER_DEFAULT.to_owned());
-    let membership = place_at(&server, &site, &robot, membership)?;
+    let named = Some(flags.server.clone()).filter(|named| !named.is_empty());
+    let servers = named
+        .or(file.server.map(Vec::from))
+        .or(joined.map(|joined| vec![joined.endpoint.clone()]))
+        .unwrap_or_else(|| vec![SERVER_DEFAULT.to_owned()]);
+    let servers = Servers::new(servers)?;
+    let membership = servers.credentials(&site, &robot, membership)?;
+    let server_timeout_s = file.server_timeout_s.unwrap_or(SERVER_TIMEOUT_DEFAULT_S);
+    within(
+        "server_timeout_s",
+        server_timeout_s,
+        &SERVER_TIMEOUT_S_RANGE,
+    )?;
     let required_owners = file.required_owners.unwrap_or_default();
     if required_owners.len() > LIMITS_MAX {
         return Err(ConfigError::OutOfRange {
@@ -459,7 +475,8 @@ fn assemble(
         drive,
         site,
         robot,
-        server,
+        servers,
+        server_timeout: Duration::from_secs_f64(server_timeout_s),
         membership,
         data_dir,
         rate_hz,

@@ -15,7 +15,8 @@ const GOOD: &str = "site = \"yard\"\nrobot = \"rover-1\"\ndata_dir = \"/tmp/rove
 #[test]
 fn defaults_fill_what_a_short_file_leaves_open() {
     let config = load(GOOD, &[]).unwrap();
-    assert_eq!(config.server, SERVER_DEFAULT);
+    assert_eq!(config.servers.endpoints(), [SERVER_DEFAULT]);
+    assert_eq!(config.server_timeout, Duration::from_secs(1));
     assert_eq!(config.period(), Duration::from_millis(10));
     assert_eq!(config.model, paper_robot());
     let drive = config.drive.simulated().unwrap();
@@ -104,7 +105,8 @@ fn another_machine_is_spoken_to_by_tls_alone_and_that_only_after_joining() {
         "tcp/localhost:1#so_sndbuf=9000",
     ] {
         let config = load(GOOD, &["--server", good]).unwrap();
-        assert_eq!((config.server.as_str(), config.membership), (good, None));
+        assert_eq!(config.servers.endpoints(), [good]);
+        assert_eq!(config.membership, None);
     }
     for (bad, cure) in [
         ("tcp/192.0.2.7:7447", "without TLS"),
@@ -115,6 +117,37 @@ fn another_machine_is_spoken_to_by_tls_alone_and_that_only_after_joining() {
         let refused = load(GOOD, &["--server", bad]).unwrap_err();
         assert!(refused.contains(cure), "{refused}");
     }
+}
+
+#[test]
+fn several_servers_of_one_fleet_are_named_in_the_order_of_preference() {
+    let (one, two) = ("tcp/127.0.0.1:1", "tcp/127.0.0.1:2");
+    let list = format!("{GOOD}server = [\"{one}\", \"{two}\"]\nserver_timeout_s = 2.5\n");
+    let config = load(&list, &[]).unwrap();
+    assert_eq!(config.servers.endpoints(), [one, two]);
+    assert!(config.servers.are_several());
+    assert_eq!(config.server_timeout, Duration::from_millis(2_500));
+    let config = load(&list, &["--server", &format!("{two},{one}")]).unwrap();
+    assert_eq!(config.servers.endpoints(), [two, one]);
+    for (line, words) in [
+        ("server = []", "0 servers"),
+        ("server = [\"tcp/[::1]:1\", \"tcp/[::1]:1\"]", "named twice"),
+        ("server = [\"tls/a:1\", \"tcp/[::1]:1\"]", "all by `tls/`"),
+        (
+            "server = [\"tcp/[::1]:1\", \"tcp/192.0.2.7:1\"]",
+            "without TLS",
+        ),
+        ("server = 7447", "an endpoint such as"),
+        ("server_timeout_s = 0.1", "server_timeout_s"),
+    ] {
+        let refused = load(&format!("{GOOD}{line}\n"), &[]).unwrap_err();
+        assert!(refused.contains(words), "{refused}");
+    }
+    let many: Vec<_> = (0..=SERVERS_MAX)
+        .map(|port| format!("tcp/[::1]:{port}"))
+        .collect();
+    let refused = load(GOOD, &["--server", &many.join(",")]).unwrap_err();
+    assert!(refused.contains("9 servers"), "{refused}");
 }
 
 #[test]

@@ -7,6 +7,7 @@
 
 mod command;
 mod error;
+pub mod rotation;
 mod session;
 mod tunnel;
 pub mod uploader;
@@ -38,6 +39,7 @@ use zenoh::query::{ConsolidationMode, Querier, Query};
 pub use self::command::IncomingCommand;
 pub(crate) use self::error::zenoh_failed;
 pub use self::error::{AskError, LinkError, may_pass_later};
+pub use self::rotation::Rotation;
 pub use self::session::{session_config, start_jitter};
 pub use self::tunnel::{DialError, Tunnel};
 use crate::membership::Membership;
@@ -51,8 +53,8 @@ pub const HELLO_TIMEOUT: Duration = Duration::from_secs(2);
 pub const UPLOAD_TIMEOUT: Duration = Duration::from_secs(10);
 /// Longest wait for a session to close.
 pub const CLOSE_MAX: Duration = Duration::from_secs(3);
-/// Pause after a failed attempt to open a session.
-const OPEN_REST: Duration = Duration::from_millis(100);
+/// Longest wait for a session with a server that accepted the connection, or that needs no tunnel.
+const OPEN_MAX: Duration = Duration::from_secs(6);
 /// Capacity for replies to one query; there is one server.
 const REPLIES_MAX: usize = 4;
 
@@ -111,6 +113,26 @@ pub struct Listeners {
     pub commands: mpsc::Sender<IncomingCommand>,
 }
 
+impl Listeners {
+    /// Returns listeners that take nothing but stops after the agent has left the server.
+    fn until(&self, left: &CancellationToken) -> Self {
+        let (note, urgent) = (Arc::clone(&self.note), Arc::clone(&self.urgent));
+        let (no_note, no_drive) = (left.clone(), left.clone());
+        Self {
+            note: Arc::new(move |noted| {
+                if !no_note.is_cancelled() {
+                    note(noted);
+                }
+            }),
+            urgent: Arc::new(move |message| match message {
+                Urgent::Drive(_) | Urgent::Limit(..) if no_drive.is_cancelled() => {}
+                Urgent::Stop(_) | Urgent::Drive(_) | Urgent::Limit(..) => urgent(message),
+            }),
+            commands: self.commands.clone(),
+        }
+    }
+}
+
 impl std::fmt::Debug for Listeners {
     fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         formatter.write_str("Listeners")
@@ -130,6 +152,8 @@ pub struct FleetLink {
     ingest: Querier<'static>,
     _alive: LivelinessToken,
     server_seen: watch::Receiver<u64>,
+    /// Cancelled when the agent has turned to another server.
+    left: CancellationToken,
     /// Tunnel of the session; must outlive it.
     tunnel: Option<Tunnel>,
 }
@@ -138,36 +162,43 @@ pub struct FleetLink {
 /// even after another one has been opened.
 pub type Commands = mpsc::Receiver<IncomingCommand>;
 
-/// Opens a session, retrying until it succeeds; `None` once cancelled. Blocks its thread.
-fn open(config: &zenoh::Config, given_up: &CancellationToken) -> Option<zenoh::Session> {
-    while !given_up.is_cancelled() {
-        match zenoh::open(config.clone()).wait() {
-            Ok(session) if given_up.is_cancelled() => {
-                let _ = session.close().wait();
-            }
-            Ok(session) => return Some(session),
-            Err(cause) => {
-                debug!("the server is not reached: {cause}");
-                std::thread::sleep(OPEN_REST);
-            }
-        }
-    }
-    None
+/// Result of an attempt to connect.
+#[derive(Debug)]
+pub enum Attempt {
+    /// The server was reached.
+    Reached(Box<FleetLink>),
+    /// It was not.
+    Failed {
+        /// Since the robot does not trust its authority.
+        is_distrusted: bool,
+    },
 }
 
-/// Opens a session on a thread of its own, which can be abandoned, since opening blocks until the
-/// server is reachable. `None` once requested to stop.
-async fn open_session(
-    config: zenoh::Config,
-    stop: &CancellationToken,
-) -> Result<Option<zenoh::Session>, LinkError> {
+/// Opens a session. Blocks its thread.
+fn open(config: zenoh::Config, given_up: &CancellationToken) -> Option<zenoh::Session> {
+    match zenoh::open(config).wait() {
+        Ok(session) if given_up.is_cancelled() => {
+            let _ = session.close().wait();
+            None
+        }
+        Ok(session) => Some(session),
+        Err(cause) => {
+            debug!("the server is not reached: {cause}");
+            None
+        }
+    }
+}
+
+/// Opens a session on a thread of its own, which can be abandoned, since opening blocks. `None` if the
+/// server is not reached within [`OPEN_MAX`].
+async fn open_session(config: zenoh::Config) -> Result<Option<zenoh::Session>, LinkError> {
     let (opened, opening) = oneshot::channel();
-    let given_up = stop.child_token();
+    let given_up = CancellationToken::new();
     let _give_up = given_up.clone().drop_guard();
     std::thread::Builder::new()
         .name("fleet-connect".to_owned())
         .spawn(move || {
-            let session = open(&config, &given_up);
+            let session = open(config, &given_up);
             // Without a receiver the session is closed by being dropped.
             let _ = opened.send(session);
         })
@@ -175,9 +206,8 @@ async fn open_session(
             action: "start a thread",
             problem: cause.to_string(),
         })?;
-    let session = tokio::select! {
-        () = stop.cancelled() => return Ok(None),
-        session = opening => session,
+    let Ok(session) = tokio::time::timeout(OPEN_MAX, opening).await else {
+        return Ok(None);
     };
     session.map_err(|_| LinkError::Zenoh {
         action: "open a session",
@@ -198,53 +228,57 @@ pub fn check_endpoint(server: &str) -> Result<(), LinkError> {
 }
 
 impl FleetLink {
-    /// Connects, retrying until it succeeds, and declares all publishers, queriers and subscribers;
-    /// `None` once requested to stop. If the future is dropped, its thread ends soon.
+    /// Makes one attempt to connect to a server, and declares all publishers, queriers and subscribers.
+    /// If the future is dropped, its thread ends soon.
     ///
     /// # Errors
     /// [`LinkError`] for an invalid endpoint or certificate, or when zenoh refuses a declaration.
     pub async fn connect(
-        server: &str,
+        servers: &mut Rotation,
         membership: Option<&Membership>,
         identity: Identity,
         listeners: Listeners,
-        stop: &CancellationToken,
-    ) -> Result<Option<Self>, LinkError> {
-        let Some(membership) = membership else {
-            let session = open_session(session_config(server)?, stop).await?;
-            return Self::introduce(session, server, identity, listeners, None).await;
+    ) -> Result<Attempt, LinkError> {
+        let endpoint = servers.endpoint().to_owned();
+        let mut tunnel = None;
+        let mut config = match membership {
+            None => session_config(&endpoint)?,
+            Some(membership) => {
+                let (note, logged) = (&listeners.note, servers.logged());
+                match Tunnel::open_once(&endpoint, membership, note, logged).await? {
+                    Ok(opened) => tunnel.insert(opened).session_config()?,
+                    Err(cause) => {
+                        return Ok(Attempt::Failed {
+                            is_distrusted: matches!(cause, DialError::Distrusted(_)),
+                        });
+                    }
+                }
+            }
         };
-        loop {
-            let tunnel = tokio::select! {
-                () = stop.cancelled() => return Ok(None),
-                tunnel = Tunnel::open_noting(server, membership, &listeners.note) => tunnel?,
-            };
-            let session = tokio::select! {
-                session = open_session(tunnel.session_config()?, stop) => session?,
-                () = tunnel.stale() => continue,
-            };
-            return Self::introduce(session, server, identity, listeners, Some(tunnel)).await;
+        if servers.has_others() {
+            session::try_once(&mut config)?;
         }
-    }
-
-    /// Declares all publishers, queriers and subscribers; `None` without a session.
-    async fn introduce(
-        session: Option<zenoh::Session>,
-        server: &str,
-        identity: Identity,
-        listeners: Listeners,
-        tunnel: Option<Tunnel>,
-    ) -> Result<Option<Self>, LinkError> {
-        let Some(session) = session else {
-            return Ok(None);
+        let session = match &tunnel {
+            None => open_session(config).await?,
+            Some(tunnel) => tokio::select! {
+                session = open_session(config) => session?,
+                () = tunnel.stale() => None,
+            },
         };
-        info!(server, "connected to `{server}`");
+        let Some(session) = session else {
+            return Ok(Attempt::Failed {
+                is_distrusted: false,
+            });
+        };
+        info!(server = endpoint, "connected to `{endpoint}`");
         let declaring = tokio::task::spawn_blocking(move || {
             Self::declare(session, identity, &listeners, tunnel)
         });
-        declaring
-            .await
-            .map_or(Ok(None), |declared| declared.map(Some))
+        let link = declaring.await.map_err(|_| LinkError::Zenoh {
+            action: "declare what the agent sends and receives",
+            problem: "its thread died".to_owned(),
+        })?;
+        Ok(Attempt::Reached(Box::new(link?)))
     }
 
     fn declare(
@@ -254,8 +288,11 @@ impl FleetLink {
         tunnel: Option<Tunnel>,
     ) -> Result<Self, LinkError> {
         let (site, robot) = (&identity.site, &identity.robot);
+        let left = CancellationToken::new();
+        let listeners = &listeners.until(&left);
         let command_sender = listeners.commands.clone();
         let (noted, urgent) = (Arc::clone(&listeners.note), Arc::clone(&listeners.urgent));
+        let is_left = left.clone();
         let own_run = identity.boot.to_string();
         let take_query = move |query: Query| {
             // Addressed to another run of the agent: no reply.
@@ -277,8 +314,11 @@ impl FleetLink {
                 return;
             }
             let payload = query.payload().map(|bytes| bytes.to_bytes().into_owned());
+            // A stop counts whoever sends it.
             if let (Verb::Stop, Some(payload)) = (verb, &payload) {
                 urgent(Urgent::Stop(payload));
+            } else if is_left.is_cancelled() {
+                return;
             }
             let command = IncomingCommand {
                 verb,
@@ -348,6 +388,7 @@ impl FleetLink {
             ingest,
             _alive: alive,
             server_seen,
+            left,
             tunnel,
         })
     }
@@ -512,6 +553,11 @@ impl FleetLink {
             Some(tunnel) => tunnel.stale().await,
             None => std::future::pending().await,
         }
+    }
+
+    /// Takes nothing but stops from this server any more, since the agent turns to another one.
+    pub fn leave(&self) {
+        self.left.cancel();
     }
 
     /// Closes the session; the server sees the robot's liveliness token disappear.

@@ -129,6 +129,16 @@ pub fn session_config(server: &str) -> Result<zenoh::Config, LinkError> {
     Ok(config)
 }
 
+/// Has a session opened by one attempt alone, without repetitions.
+///
+/// # Errors
+/// [`LinkError`] if zenoh refuses the setting.
+pub(super) fn try_once(config: &mut zenoh::Config) -> Result<(), LinkError> {
+    config
+        .insert_json5("connect/timeout_ms", "0")
+        .map_err(zenoh_failed("take its configuration"))
+}
+
 #[cfg(test)]
 mod tests {
     use uuid::Uuid;

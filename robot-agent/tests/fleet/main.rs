@@ -10,6 +10,7 @@ mod control;
 mod recording;
 mod rig;
 mod safety;
+mod servers;
 mod service_manager;
 mod state_rate;
 mod support;

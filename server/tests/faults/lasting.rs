@@ -201,6 +201,7 @@ fn config(folder: &std::path::Path) -> Config {
         oidc: None,
         webhooks: tread_server::config::webhooks::WebhooksConfig::default(),
         backup: None,
+        standby: false,
         audit: tread_server::config::AuditConfig::default(),
         tracing: tread_server::config::TracingConfig::default(),
         web: WebConfig::default(),

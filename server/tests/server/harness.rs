@@ -324,6 +324,7 @@ pub(crate) fn config(folder: &Path, zenoh: &str) -> Config {
         oidc: None,
         webhooks: WebhooksConfig::default(),
         backup: None,
+        standby: false,
         audit: tread_server::config::AuditConfig::default(),
         tracing: tread_server::config::TracingConfig::default(),
         web: WebConfig {

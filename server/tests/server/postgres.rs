@@ -3,6 +3,7 @@
 //! Tests that look into a database file need the other engine.
 
 mod outages;
+mod standby;
 
 use std::env;
 use std::path::Path;

@@ -31,6 +31,7 @@ use tread_api::tunnel::{RouterCredentials, splice};
 
 pub use self::dial::DialError;
 use self::dial::{Connection, Dialer};
+use super::rotation::Logged;
 use super::session::{self, SessionUser};
 use super::{LinkError, Note, Noted};
 use crate::membership::Membership;
@@ -139,50 +140,63 @@ impl Tunnel {
     /// used, or no local port can be opened.
     pub async fn open(endpoint: &str, membership: &Membership) -> Result<Self, LinkError> {
         let nobody: Note = Arc::new(|_noted| {});
-        Self::open_noting(endpoint, membership, &nobody).await
-    }
-
-    /// Opens a tunnel as [`Tunnel::open`] does, and reports [`Noted::Distrusted`] once if the
-    /// server's certificate is by an authority that the robot does not trust.
-    ///
-    /// # Errors
-    /// As [`Tunnel::open`].
-    pub(super) async fn open_noting(
-        endpoint: &str,
-        membership: &Membership,
-        note: &Note,
-    ) -> Result<Self, LinkError> {
-        let dialer = Dialer::new(endpoint, membership)?;
         let mut pause = RETRY_FIRST;
-        let (mut is_distrusted, mut is_invalid) = (false, false);
-        let (connection, credentials) = loop {
-            match dialer.dial(&[]).await {
-                Ok(dialled) => break dialled,
+        let mut logged = Logged::default();
+        loop {
+            match Self::open_once(endpoint, membership, &nobody, &mut logged).await? {
+                Ok(tunnel) => return Ok(tunnel),
                 Err(cause) => {
-                    debug!(
-                        error = &cause as &dyn std::error::Error,
-                        "no tunnel yet: {cause}"
-                    );
-                    if matches!(cause, DialError::Distrusted(_)) && !is_distrusted {
-                        is_distrusted = true;
-                        warn!(
-                            "the server at {endpoint} shows a certificate of another authority than \
-                             this robot trusts; it is tried again"
-                        );
-                        note(Noted::Distrusted);
-                    }
-                    if cause.is_about_validity() && !is_invalid {
-                        is_invalid = true;
-                        warn!(
-                            error = &cause as &dyn std::error::Error,
-                            "no link to {endpoint}: {cause}; it is tried again"
-                        );
-                    }
                     tokio::time::sleep(pause).await;
                     pause = next_pause(pause, &cause);
                 }
             }
-        };
+        }
+    }
+
+    /// Makes one attempt to open a tunnel. Logs, and reports as [`Noted::Distrusted`], that the server's
+    /// certificate is by an authority that the robot does not trust, unless that was logged before.
+    ///
+    /// # Errors
+    /// As [`Tunnel::open`]; the inner error if the server could not be reached.
+    pub(super) async fn open_once(
+        endpoint: &str,
+        membership: &Membership,
+        note: &Note,
+        logged: &mut Logged,
+    ) -> Result<Result<Self, DialError>, LinkError> {
+        let dialer = Dialer::new(endpoint, membership)?;
+        match dialer.dial(&[]).await {
+            Ok(dialled) => Self::through(dialer, dialled).map(Ok),
+            Err(cause) => {
+                debug!(
+                    error = &cause as &dyn std::error::Error,
+                    "no tunnel yet: {cause}"
+                );
+                if matches!(cause, DialError::Distrusted(_)) && !logged.distrusted {
+                    logged.distrusted = true;
+                    warn!(
+                        "the server at {endpoint} shows a certificate of another authority than \
+                         this robot trusts; it is tried again"
+                    );
+                    note(Noted::Distrusted);
+                }
+                if cause.is_about_validity() && !logged.invalid {
+                    logged.invalid = true;
+                    warn!(
+                        error = &cause as &dyn std::error::Error,
+                        "no link to {endpoint}: {cause}; it is tried again"
+                    );
+                }
+                Ok(Err(cause))
+            }
+        }
+    }
+
+    /// Opens the local port of a tunnel.
+    fn through(
+        dialer: Dialer,
+        (connection, credentials): (Connection, RouterCredentials),
+    ) -> Result<Self, LinkError> {
         let (_, lower) = uuid::Uuid::new_v4().as_u64_pair();
         let user = SessionUser {
             session_id: credentials.session_prefix.session_id(lower),
