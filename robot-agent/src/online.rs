@@ -133,6 +133,7 @@ impl Online {
     async fn link(&self, links: &mut Links) -> ControlFlow<()> {
         // The server that requested it was that of the link before.
         self.reporter.publish_rate.end_request();
+        let began = self.dispatcher.clock.monotonic();
         let membership = &mut links.membership;
         let shown = membership
             .as_mut()
@@ -152,7 +153,8 @@ impl Online {
         let link: Arc<FleetLink> = match connected {
             Ok(Attempt::Reached(link)) => Arc::from(link),
             Ok(Attempt::Failed { is_distrusted }) => {
-                let pause = links.servers.failed(is_distrusted);
+                let now = self.dispatcher.clock.monotonic();
+                let pause = links.servers.failed((began, now), is_distrusted);
                 return self.rest(&mut links.membership, pause).await;
             }
             Err(cause) => {
@@ -160,7 +162,7 @@ impl Online {
                     error = &cause as &dyn std::error::Error,
                     "the fleet link failed; it is tried again"
                 );
-                links.servers.leave();
+                links.servers.leave(self.dispatcher.clock.monotonic());
                 return self.rest(&mut links.membership, LINK_FAILED_REST).await;
             }
         };
@@ -193,7 +195,7 @@ impl Online {
             () = link.lost_for_good() => ControlFlow::Continue(()),
             silence = self.silent(&links.servers, &links.is_lost) => {
                 let silent = links.servers.endpoint().to_owned();
-                links.servers.leave();
+                links.servers.leave(self.dispatcher.clock.monotonic());
                 warn!(
                     "the server at {silent} has been silent for {:.1} s; the next one is {}",
                     silence.as_secs_f64(), links.servers.endpoint(),

@@ -1,5 +1,7 @@
 //! A server and its robots, each a process, in a folder of their own.
 
+mod pair;
+
 use std::collections::HashMap;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -19,6 +21,7 @@ use crate::process::{Process, Usage};
 use crate::relay::Relay;
 use crate::rest::Rest;
 use crate::wait::{SHORT, eventually};
+use pair::Other;
 
 /// The site of every fleet.
 pub const SITE: &str = "yard";
@@ -49,6 +52,10 @@ pub struct Fleet {
     http: SocketAddr,
     zenoh: SocketAddr,
     server: Option<Process>,
+    /// Name of the server's log.
+    server_name: &'static str,
+    /// The other server of a pair.
+    other: Option<Other>,
     agents: HashMap<RobotId, Process>,
     agent_flags: Vec<String>,
     server_environment: Vec<(String, String)>,
@@ -158,6 +165,8 @@ impl Fleet {
             http,
             zenoh,
             server: None,
+            server_name: "server",
+            other: None,
             agents: HashMap::new(),
             agent_flags: Vec::new(),
             server_environment: Vec::new(),
@@ -187,11 +196,15 @@ impl Fleet {
         SITE.parse().expect("it is an identifier")
     }
 
-    /// Where the server's router listens.
+    /// Where the server's router listens, and that of the other server if there is one.
     pub fn zenoh_endpoint(&self) -> String {
         let is_tls = self.has_certificates && self.config.is_some();
         let protocol = if is_tls { "tls" } else { "tcp" };
-        format!("{protocol}/{}", self.zenoh)
+        let own = format!("{protocol}/{}", self.zenoh);
+        match &self.other {
+            Some(other) => format!("{own},{protocol}/{}", other.zenoh),
+            None => own,
+        }
     }
 
     /// Where robots connect.
@@ -368,21 +381,8 @@ impl Fleet {
     /// # Panics
     /// If it does not get ready.
     pub async fn start_server(&mut self) {
-        let mut arguments = vec![
-            "server".to_owned(),
-            format!("--http={}", self.http),
-            format!("--zenoh={}", self.zenoh),
-            format!("--database={}", self.database_of_server.argument()),
-            format!("--site={SITE}"),
-        ];
-        if let Some(config) = &self.config {
-            arguments.push(format!("--config={}", config.display()));
-        }
-        let environment = &self.server_environment;
-        let node = self.server_node.as_ref().unwrap_or(&self.node);
-        let started = self.start_process("server", (node, &arguments), environment);
-        self.server = Some(started);
-        let log = self.folder.path().join("server.log");
+        self.server = Some(self.server_process(self.server_name, (self.http, self.zenoh)));
+        let log = self.folder.path().join(format!("{}.log", self.server_name));
         let look = || async {
             let ready = self.rest.call(reqwest::Method::GET, "/readyz", None).await;
             match ready {
@@ -391,6 +391,25 @@ impl Fleet {
             }
         };
         _ = eventually("the server is ready", SHORT, look, Result::is_ok).await;
+    }
+
+    /// Starts the process of a server.
+    fn server_process(&self, name: &str, (http, zenoh): (SocketAddr, SocketAddr)) -> Process {
+        let mut arguments = vec![
+            "server".to_owned(),
+            format!("--http={http}"),
+            format!("--zenoh={zenoh}"),
+            format!("--database={}", self.database_of_server.argument()),
+            format!("--site={SITE}"),
+        ];
+        if let Some(config) = &self.config {
+            arguments.push(format!("--config={}", config.display()));
+        }
+        if self.other.is_some() {
+            arguments.push("--standby".to_owned());
+        }
+        let node = self.server_node.as_ref().unwrap_or(&self.node);
+        self.start_process(name, (node, &arguments), &self.server_environment)
     }
 
     /// Ends the server as a power cut would.

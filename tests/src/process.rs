@@ -99,15 +99,17 @@ impl Process {
         _ = self.child.wait();
     }
 
+    /// Sends a signal to the process; does nothing if it has ended.
+    pub fn signal(&self, signal: Signal) {
+        _ = kill(Pid::from_raw(self.child.id().cast_signed()), signal);
+    }
+
     /// Asks the process to stop and waits until it has.
     ///
     /// # Errors
     /// It has not stopped within [`STOP_WAIT_MAX`]; it is killed then.
     pub async fn stop(&mut self) -> anyhow::Result<ExitStatus> {
-        _ = kill(
-            Pid::from_raw(self.child.id().cast_signed()),
-            Signal::SIGTERM,
-        );
+        self.signal(Signal::SIGTERM);
         let deadline = Instant::now() + STOP_WAIT_MAX;
         loop {
             if let Some(status) = self.child.try_wait()? {

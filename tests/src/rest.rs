@@ -40,6 +40,13 @@ impl Rest {
         Self { address, http }
     }
 
+    /// The same client of a server at another address.
+    #[must_use]
+    pub fn at(&self, address: String) -> Self {
+        let http = self.http.clone();
+        Self { address, http }
+    }
+
     /// Sends a request and returns status and body; `None` if nobody answers.
     pub async fn call(
         &self,

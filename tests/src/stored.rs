@@ -1,9 +1,12 @@
 //! What a database holds of measurements, read beside its server.
 
+use std::path::Path;
 use std::time::Duration;
 
 use anyhow::{Context as _, ensure};
 use tokio::time::Instant;
+use tread_agent::outbox::{Limits, Outbox};
+use tread_api::ids::{BootId, RobotId};
 
 use crate::database::FleetDatabase;
 
@@ -22,6 +25,45 @@ pub struct Stored {
     pub in_sums: i64,
     /// Stored sums of cells.
     pub sums: i64,
+}
+
+/// Names of all records that a database has taken, as boot and number within it, sorted.
+///
+/// # Errors
+/// It cannot be read.
+pub async fn records(database: &FleetDatabase) -> Result<Vec<(String, i64)>, sqlx::Error> {
+    let records = database.rows(
+        "SELECT boots.id, seq FROM (SELECT boot_pk, seq FROM segments UNION ALL
+             SELECT boot_pk, seq FROM reports_seen) AS taken
+         JOIN boots ON boots.pk = taken.boot_pk ORDER BY boots.id, seq",
+    );
+    records.await
+}
+
+/// Compares the records that a robot wrote into its folder with those that were taken, of that robot alone,
+/// and says what is wrong. A process that is killed loses nothing that it had written, so all that was ever
+/// appended must have arrived.
+pub fn lost_records(folder: &Path, robot: &RobotId, records: Vec<(String, i64)>) -> Option<String> {
+    let boot = BootId::from_uuid(uuid::Uuid::nil());
+    let folder = folder.join("outbox");
+    let outbox = match Outbox::open(&folder, Limits::default(), robot.clone(), boot) {
+        Ok(outbox) => outbox,
+        Err(cause) => return Some(format!("the outbox cannot be read: {cause}")),
+    };
+    let (appended, status) = (outbox.appended(), outbox.status());
+    let arrived = records.len() as u64;
+    let mut distinct = records;
+    distinct.dedup();
+    let is_whole = appended == arrived
+        && distinct.len() as u64 == arrived
+        && (status.pending, status.dropped, status.refused) == (0, 0, 0);
+    (!is_whole).then(|| {
+        format!(
+            "the robot wrote {appended} records, {arrived} are at the server, {} of them \
+             distinct; {status:?}",
+            distinct.len()
+        )
+    })
 }
 
 /// Counts what a database holds now.

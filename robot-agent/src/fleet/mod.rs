@@ -257,6 +257,12 @@ impl FleetLink {
         };
         if servers.has_others() {
             session::try_once(&mut config)?;
+            // A session that is opened to a closed port waits for seconds.
+            if tunnel.is_none() && !session::is_listening(&endpoint).await {
+                return Ok(Attempt::Failed {
+                    is_distrusted: false,
+                });
+            }
         }
         let session = match &tunnel {
             None => open_session(config).await?,

@@ -3,6 +3,9 @@
 //! The agent stays with the server that it reached. When that one falls silent, or an attempt to reach
 //! it fails, the next of the list is tried, and after the last one the first. There is no way back to a
 //! preferred server while the present one answers: robots would move twice for each restart.
+//!
+//! A server that is gone refuses at once, while one that is frozen takes seconds of each attempt. So one
+//! that fell silent, or took long to fail, is passed over for a while as long as there are others.
 
 use std::time::Duration;
 
@@ -12,6 +15,11 @@ const PAUSE_MAX: Duration = Duration::from_millis(300);
 /// Longest pause while the robot trusts the authority of none of them. A server counts each attempt
 /// as a failure of its address, which other robots may share.
 const DISTRUSTED_PAUSE_MAX: Duration = Duration::from_secs(10);
+
+/// Time for which a server is passed over that fell silent or took long to fail.
+const PASSED_OVER: Duration = Duration::from_secs(5);
+/// Duration of an attempt from which it counts as long.
+const LONG: Duration = Duration::from_secs(1);
 
 /// What was logged about a server since it was reached last.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -27,9 +35,9 @@ pub struct Logged {
 pub struct Rotation {
     endpoints: Vec<String>,
     logged: Vec<Logged>,
+    /// Until when each is passed over.
+    passed_over_until: Vec<Duration>,
     at: usize,
-    /// Number of attempts that have failed since a server was reached.
-    failed: usize,
     /// Whether all of the present round failed since the robot trusts no authority of theirs.
     is_distrusted: bool,
     pause: Duration,
@@ -41,8 +49,8 @@ impl Rotation {
         Self {
             endpoints: endpoints.to_vec(),
             logged: vec![Logged::default(); endpoints.len()],
+            passed_over_until: vec![Duration::ZERO; endpoints.len()],
             at: 0,
-            failed: 0,
             is_distrusted: true,
             pause: PAUSE_FIRST,
         }
@@ -66,23 +74,25 @@ impl Rotation {
     /// Notes that the server was reached.
     pub fn reached(&mut self) {
         *self.logged() = Logged::default();
-        self.begin_round();
-        self.failed = 0;
+        self.passed_over_until[self.at] = Duration::ZERO;
+        self.is_distrusted = true;
         self.pause = PAUSE_FIRST;
     }
 
-    /// Goes on to the next server, since the present one fell silent.
-    pub fn leave(&mut self) {
-        self.at = (self.at + 1) % self.endpoints.len();
+    /// Goes on to the next server, since the present one fell silent before `now`.
+    pub fn leave(&mut self, now: Duration) {
+        self.passed_over_until[self.at] = now + PASSED_OVER;
+        self.next(now);
     }
 
-    /// Goes on to the next server after a failed attempt. Returns the pause before that one is tried:
-    /// none until all have been.
-    pub fn failed(&mut self, is_distrusted: bool) -> Duration {
+    /// Goes on to the next server after an attempt that failed at `now`. Returns the pause before that one
+    /// is tried: none until all have been.
+    pub fn failed(&mut self, (began, now): (Duration, Duration), is_distrusted: bool) -> Duration {
         self.is_distrusted &= is_distrusted;
-        self.failed += 1;
-        self.leave();
-        if !self.failed.is_multiple_of(self.endpoints.len()) {
+        if now.saturating_sub(began) >= LONG {
+            self.passed_over_until[self.at] = now + PASSED_OVER;
+        }
+        if !self.next(now) {
             return Duration::ZERO;
         }
         let longest = if self.is_distrusted {
@@ -92,17 +102,25 @@ impl Rotation {
         };
         let pause = self.pause.min(longest);
         self.pause = (2 * pause).min(longest);
-        self.begin_round();
+        self.is_distrusted = true;
         pause
     }
 
-    fn begin_round(&mut self) {
-        self.is_distrusted = true;
+    /// Goes on to the next server that is not passed over, or to the one that will be so no longer first.
+    /// Returns whether another round begins with it.
+    fn next(&mut self, now: Duration) -> bool {
+        let (count, before) = (self.endpoints.len(), self.at);
+        let following = (1..=count).map(|step| (before + step) % count);
+        let remaining = |at: &usize| self.passed_over_until[*at].saturating_sub(now);
+        self.at = following.min_by_key(remaining).unwrap_or(before);
+        self.at <= before
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeSet;
+
     use proptest::prelude::*;
 
     use super::*;
@@ -112,59 +130,97 @@ mod tests {
         Rotation::new(&endpoints)
     }
 
+    /// Attempts that fail, of so many seconds: the servers, and the pauses in milliseconds.
+    fn attempts(
+        rotation: &mut Rotation,
+        now: &mut Duration,
+        took_s: &[f64],
+    ) -> (String, Vec<u128>) {
+        let (mut tried, mut pauses) = (String::new(), Vec::new());
+        for took_s in took_s {
+            tried.push_str(&rotation.endpoint()[5..6]);
+            let began = *now;
+            *now += Duration::from_secs_f64(*took_s);
+            let pause = rotation.failed((began, *now), false);
+            *now += pause;
+            pauses.push(pause.as_millis());
+        }
+        (tried, pauses)
+    }
+
     #[test]
     fn the_first_is_preferred_and_the_next_follows_without_a_pause() {
-        let mut rotation = servers(3);
-        let mut tried = Vec::new();
-        let mut pauses = Vec::new();
-        for _ in 0..6 {
-            tried.push(rotation.endpoint().to_owned());
-            pauses.push(rotation.failed(false).as_millis());
-        }
-        let names = ["tls/s0:7447", "tls/s1:7447", "tls/s2:7447"];
-        assert_eq!(tried, [names, names].concat());
+        let (mut rotation, mut now) = (servers(3), Duration::ZERO);
+        let (tried, pauses) = attempts(&mut rotation, &mut now, &[0.0; 6]);
+        assert_eq!(tried, "012012");
         assert_eq!(pauses, [0, 0, 100, 0, 0, 200]);
+    }
+
+    #[test]
+    fn a_server_that_fell_silent_or_takes_long_is_passed_over_for_a_while() {
+        let (mut rotation, mut now) = (servers(2), Duration::ZERO);
+        rotation.reached();
+        rotation.leave(now);
+        let (tried, pauses) = attempts(&mut rotation, &mut now, &[0.1; 5]);
+        assert_eq!(tried, "11111");
+        assert_eq!(pauses, [100, 200, 300, 300, 300]);
+        now += PASSED_OVER;
+        // The first takes long, and then the other one does: the first will be tried again sooner.
+        let (tried, _) = attempts(
+            &mut rotation,
+            &mut now,
+            &[0.1, 2.5, 0.1, 0.1, 2.5, 0.1, 0.1],
+        );
+        assert_eq!(tried, "1011100");
+        // One fell silent while the other was passed over.
+        rotation.reached();
+        rotation.leave(now);
+        let (tried, _) = attempts(&mut rotation, &mut now, &[0.1; 4]);
+        assert_eq!(tried, "1111");
     }
 
     #[test]
     fn servers_of_a_foreign_authority_are_tried_rarely() {
         let mut rotation = servers(2);
-        let pauses = |rotation: &mut Rotation, distrusted: [bool; 2]| {
+        let now = Duration::ZERO;
+        let longest = |rotation: &mut Rotation, distrusted: [bool; 2]| {
             let mut longest = Duration::ZERO;
             for _ in 0..20 {
                 for is_distrusted in distrusted {
-                    longest = longest.max(rotation.failed(is_distrusted));
+                    longest = longest.max(rotation.failed((now, now), is_distrusted));
                 }
             }
             longest
         };
-        assert_eq!(pauses(&mut rotation, [true, true]), DISTRUSTED_PAUSE_MAX);
+        assert_eq!(longest(&mut rotation, [true, true]), DISTRUSTED_PAUSE_MAX);
         rotation.reached();
-        assert_eq!(pauses(&mut rotation, [true, false]), PAUSE_MAX);
+        assert_eq!(longest(&mut rotation, [true, false]), PAUSE_MAX);
     }
 
     proptest! {
         #[test]
-        fn each_server_is_tried_in_each_round_and_each_round_ends_with_a_pause(
+        fn each_server_is_tried_again_and_each_round_ends_with_a_pause(
             count in 1_usize..=8,
             before in proptest::collection::vec(any::<Option<bool>>(), 0..20),
         ) {
-            let mut rotation = servers(count);
+            let (mut rotation, mut now) = (servers(count), Duration::ZERO);
             for step in before {
                 match step {
                     Some(is_distrusted) => {
-                        rotation.failed(is_distrusted);
+                        rotation.failed((now, now), is_distrusted);
                     }
-                    None => rotation.leave(),
+                    None => rotation.leave(now),
                 }
             }
             rotation.reached();
-            let mut tried = std::collections::BTreeSet::new();
-            for attempt in 1..=count {
+            now += 2 * PASSED_OVER;
+            let mut tried = BTreeSet::new();
+            let mut pauses = 0;
+            for _ in 0..count {
                 tried.insert(rotation.endpoint().to_owned());
-                prop_assert_eq!(rotation.failed(false).is_zero(), attempt < count);
+                pauses += usize::from(!rotation.failed((now, now), false).is_zero());
             }
-            prop_assert_eq!(tried.len(), count);
+            prop_assert_eq!((tried.len(), pauses), (count, 1));
         }
     }
 }

@@ -25,6 +25,9 @@ const SEND_BUFFER_BYTES: u32 = 32_768;
 /// Kernel send buffer towards the tunnel, bytes; the tunnel has another one.
 const TUNNEL_SEND_BUFFER_BYTES: u32 = 4 * 1024;
 
+/// Longest time to find out whether something listens.
+const LISTENING_MAX: Duration = Duration::from_secs(1);
+
 /// Longest pause before the first attempt to connect.
 const START_JITTER_MAX: Duration = Duration::from_millis(300);
 
@@ -127,6 +130,17 @@ pub fn session_config(server: &str) -> Result<zenoh::Config, LinkError> {
             .map_err(zenoh_failed("take its configuration"))?;
     }
     Ok(config)
+}
+
+/// Returns whether something accepts connections at an endpoint; true for one that is not of TCP.
+pub(super) async fn is_listening(endpoint: &str) -> bool {
+    let Some(rest) = endpoint.strip_prefix("tcp/") else {
+        return true;
+    };
+    let address = rest.split(['?', '#']).next().unwrap_or(rest);
+    let connecting = tokio::net::TcpStream::connect(address);
+    let connected = tokio::time::timeout(LISTENING_MAX, connecting).await;
+    connected.is_ok_and(|connected| connected.is_ok())
 }
 
 /// Has a session opened by one attempt alone, without repetitions.

@@ -472,7 +472,7 @@ impl Storm {
                         | Cause::RobotForgot
                         | Cause::Rejected
                         | Cause::Expired
-                );
+                ) || self.reference.cancelled_in_queue.contains(id);
                 if !same && !decided_here {
                     return Err(format!(
                         "mission {id}: the robot says {phase:?}, the server {state:?} by {cause:?}"

@@ -1,6 +1,6 @@
 //! What must hold of missions, whatever happens, judged by the history that the server wrote.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, HashMap, HashSet};
 
 use tread_api::ids::{MissionId, RobotId};
 use tread_api::mission::{Cause, MissionState};
@@ -10,6 +10,9 @@ use tread_server::db::{self, Db};
 #[derive(Debug, Default)]
 pub(super) struct Reference {
     pub(super) missions: BTreeMap<MissionId, (RobotId, MissionState, Cause)>,
+    /// Missions that were cancelled while they waited: the server decided that without the robot, which an
+    /// offer may reach later.
+    pub(super) cancelled_in_queue: HashSet<MissionId>,
     last_step: i64,
 }
 
@@ -28,6 +31,9 @@ impl Reference {
             let moved = before != Some(step.step.to);
             if moved && before.is_some_and(MissionState::is_terminal) {
                 return Err(format!("revived: {step:?}"));
+            }
+            if (before, step.step.to) == (Some(MissionState::Queued), MissionState::Cancelled) {
+                self.cancelled_in_queue.insert(step.mission);
             }
             let cause = match self.missions.get(&step.mission) {
                 Some(&(_, _, cause)) if !moved => cause,

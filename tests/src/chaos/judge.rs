@@ -1,16 +1,14 @@
 //! What must hold after a run, whatever failed in it.
 
-use std::path::Path;
-
 use tread_agent::missions::MissionSlot;
-use tread_agent::outbox::{Limits, Outbox};
-use tread_api::ids::{BootId, RobotId};
+use tread_api::ids::RobotId;
 use tread_api::mission::{Cause, MissionDetail, MissionState};
 use tread_api::wire::ingest::MissionPhase;
 
 use super::{Followed, RunReport, Violation};
 use crate::database::FleetDatabase;
 use crate::fleet::Fleet;
+use crate::stored::{self, lost_records};
 
 /// State and cause of a mission's end.
 pub(super) fn end_of(detail: &MissionDetail) -> String {
@@ -216,37 +214,7 @@ async fn server_side(
     database: &FleetDatabase,
 ) -> Result<(Vec<Step>, Vec<(String, i64)>), sqlx::Error> {
     let steps = database.rows("SELECT mission, to_state FROM mission_events ORDER BY pk");
-    let records = database.rows(
-        "SELECT boots.id, seq FROM (SELECT boot_pk, seq FROM segments UNION ALL
-             SELECT boot_pk, seq FROM reports_seen) AS taken
-         JOIN boots ON boots.pk = taken.boot_pk ORDER BY boots.id, seq",
-    );
-    Ok((steps.await?, records.await?))
-}
-
-/// What of the robot's records is not at the server, or there twice. A process that is killed
-/// loses nothing that it had written, so all that was ever appended must have arrived.
-fn lost_records(folder: &Path, robot: &RobotId, records: Vec<(String, i64)>) -> Option<String> {
-    let boot = BootId::from_uuid(uuid::Uuid::nil());
-    let folder = folder.join("outbox");
-    let outbox = match Outbox::open(&folder, Limits::default(), robot.clone(), boot) {
-        Ok(outbox) => outbox,
-        Err(cause) => return Some(format!("the outbox cannot be read: {cause}")),
-    };
-    let (appended, status) = (outbox.appended(), outbox.status());
-    let arrived = records.len() as u64;
-    let mut distinct = records;
-    distinct.dedup();
-    let is_whole = appended == arrived
-        && distinct.len() as u64 == arrived
-        && (status.pending, status.dropped, status.refused) == (0, 0, 0);
-    (!is_whole).then(|| {
-        format!(
-            "the robot wrote {appended} records, {arrived} are at the server, {} of them \
-             distinct; {status:?}",
-            distinct.len()
-        )
-    })
+    Ok((steps.await?, stored::records(database).await?))
 }
 
 #[cfg(test)]

@@ -21,6 +21,7 @@ use std::time::Duration;
 
 use jiff::SignedDuration;
 use tokio::sync::mpsc;
+use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 use tracing::debug;
 use tread_api::ids::{MissionId, SiteId, StopId};
@@ -46,6 +47,10 @@ pub const PERIOD: Duration = Duration::from_millis(500);
 /// Minimum interval between two looks at what is not a step of a mission: definitions of sites,
 /// attendance, expiry. With them in each pass, a new mission would wait for them.
 const UPKEEP_EVERY: Duration = Duration::from_millis(100);
+/// Duration of reading all open missions from which reports of robots count as delayed by the database.
+const ANSWER_DELAY: Duration = Duration::from_millis(500);
+/// Time since which a database answers that has not answered yet.
+const NEVER: Duration = Duration::MAX;
 /// Maximum number of commands under way at once.
 const COMMANDS_MAX: usize = 64;
 /// Maximum number of stops under way at once, in addition to other commands.
@@ -129,6 +134,8 @@ pub struct Reconciler {
     /// Since when each of those that are to say how their missions ended is heard, and how often it
     /// was asked.
     asked: HashMap<RobotKey, (Duration, u32)>,
+    /// Time since which the database answers without delay.
+    answering_since: Duration,
     /// Time from which the upkeep may run again, and whether a pass has left it out.
     upkeep_due: Duration,
     is_upkeep_owed: bool,
@@ -153,6 +160,7 @@ impl Reconciler {
             delays: Delays::default(),
             restrained: HashMap::new(),
             asked: HashMap::new(),
+            answering_since: Duration::ZERO,
             upkeep_due: Duration::ZERO,
             is_upkeep_owed: false,
         }
@@ -279,11 +287,17 @@ impl Reconciler {
     /// Starts what open missions need, and returns them.
     async fn serve_missions(&mut self) -> Result<Vec<Standing>, AppError> {
         self.recalls = self.app.recalls();
-        let mut tx = self.app.db().read("reconciler").await?;
-        let restrained = db::restorations::restrained(&mut tx).await?;
-        let mut open = db::missions::in_progress(&mut tx).await?;
-        open.extend(db::missions::next_in_queues(&mut tx).await?);
-        drop(tx);
+        let begun = Instant::now();
+        // Remains if this is given up.
+        let before = std::mem::replace(&mut self.answering_since, NEVER);
+        let read = self.read_missions().await;
+        let is_prompt = read.is_ok() && begun.elapsed() <= ANSWER_DELAY && before != NEVER;
+        self.answering_since = if is_prompt {
+            before
+        } else {
+            self.app.clock().elapsed()
+        };
+        let (restrained, open) = read?;
         // Before a mission of a robot that was released is offered, so that nobody sees it driven while
         // its robot counts as one that awaits its release.
         self.app.show_awaiting(&restrained);
@@ -295,6 +309,15 @@ impl Reconciler {
             self.serve(mission.clone()).await?;
         }
         Ok(open)
+    }
+
+    /// Reads the robots that are restrained, and the missions that may need something.
+    async fn read_missions(&self) -> Result<(Vec<Restrained>, Vec<Standing>), AppError> {
+        let mut tx = self.app.db().read("reconciler").await?;
+        let restrained = db::restorations::restrained(&mut tx).await?;
+        let mut open = db::missions::in_progress(&mut tx).await?;
+        open.extend(db::missions::next_in_queues(&mut tx).await?);
+        Ok((restrained, open))
     }
 
     /// Sends unconfirmed stops again. Continues even if everything else fails.
@@ -423,6 +446,7 @@ impl Reconciler {
         let now = Now {
             elapsed: self.app.clock().elapsed(),
             wall: self.app.clock().now(),
+            answering_since: self.answering_since,
         };
         let heard = is_heard(&presence, now.elapsed);
         self.note_silence(&mut mission, heard).await?;

@@ -92,6 +92,16 @@ pub(super) struct Now {
     pub(super) elapsed: Duration,
     /// Wall-clock time, for what must survive a restart.
     pub(super) wall: Timestamp,
+    /// Monotonic time since which the database answers without delay: what robots reported before may
+    /// still wait for it.
+    pub(super) answering_since: Duration,
+}
+
+impl Now {
+    /// Returns whether a robot's report is overdue that had so much time since then.
+    fn is_beyond(self, grace: Duration, since: Duration) -> bool {
+        self.elapsed.saturating_sub(since.max(self.answering_since)) > grace
+    }
 }
 
 /// Returns whether a robot's link is online or stale, so that it can be commanded.
@@ -151,18 +161,17 @@ pub(super) fn decide(mission: &Standing, presence: &Presence, memory: Memory, no
     if !heard && mission.state != MissionState::Queued {
         return if is_lost(mission, presence, memory, now) {
             Need::Settle(Change::LoseRobot)
-        } else if is_lost_by_restart(mission, presence, false, now.elapsed) {
+        } else if is_lost_by_restart(mission, presence, false, now) {
             Need::Settle(Change::LoseRun)
         } else {
             Need::Wait
         };
     }
     let said = driven(mission, presence);
-    let longer_than =
-        |grace: Duration| move |since: Duration| now.elapsed.saturating_sub(since) > grace;
+    let longer_than = |grace: Duration| move |since: Duration| now.is_beyond(grace, since);
     let ended_there = memory.ended_since.is_some_and(longer_than(RESTART_GRACE));
     let forgotten = memory.absent_since.is_some_and(longer_than(FORGET_GRACE));
-    let restarted = is_lost_by_restart(mission, presence, said.is_some(), now.elapsed);
+    let restarted = is_lost_by_restart(mission, presence, said.is_some(), now);
     match mission.state {
         MissionState::Queued | MissionState::Offered if heard => {
             if mission.state == MissionState::Offered && said.is_some_and(of_present(mission)) {
@@ -261,19 +270,14 @@ fn is_lost(mission: &Standing, presence: &Presence, memory: Memory, now: Now) ->
 
 /// Returns whether the agent's run that took a mission has ended, its records have arrived or are
 /// overdue, and its successor does not drive the mission.
-fn is_lost_by_restart(
-    mission: &Standing,
-    presence: &Presence,
-    is_driven: bool,
-    now: Duration,
-) -> bool {
+fn is_lost_by_restart(mission: &Standing, presence: &Presence, is_driven: bool, now: Now) -> bool {
     let (Some(taken_by), Some((present, since))) = (mission.boot, presence.boot()) else {
         return false;
     };
     let uploaded = presence
         .state()
         .is_some_and(|state| state.outbox.pending == 0);
-    let patient_enough = now.saturating_sub(since) > RESTART_GRACE;
+    let patient_enough = now.is_beyond(RESTART_GRACE, since);
     taken_by != present && !is_driven && (uploaded || patient_enough)
 }
 

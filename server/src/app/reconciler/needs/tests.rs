@@ -16,6 +16,7 @@ fn now() -> Now {
     Now {
         elapsed: ELAPSED,
         wall: "2026-11-01T12:00:00Z".parse().unwrap(),
+        answering_since: Duration::ZERO,
     }
 }
 
@@ -211,6 +212,27 @@ fn a_mission_that_ended_on_the_robot_without_a_record_does_not_stay_open() {
 }
 
 #[test]
+fn a_robot_is_not_blamed_for_reports_that_wait_for_the_database() {
+    let ended = Memory {
+        ended_since: Some(LONG_AGO),
+        absent_since: Some(LONG_AGO),
+        ..Memory::default()
+    };
+    let active = mission(MissionState::Active, None);
+    let robot = presence(&IDLE);
+    let settled = decide(&active, &robot, ended, now());
+    assert!(
+        matches!(settled, Need::Settle(Change::Forget)),
+        "{settled:?}"
+    );
+    let delayed = Now {
+        answering_since: JUST,
+        ..now()
+    };
+    assert_eq!(decide(&active, &robot, ended, delayed), Need::Wait);
+}
+
+#[test]
 fn what_has_ended_needs_nothing() {
     for state in MissionState::ALL
         .into_iter()
@@ -334,6 +356,7 @@ fn a_step_of_the_wall_clock_loses_no_robot_and_keeps_none() {
     for hours in [-5, 0, 5] {
         let after = |passed: u64| Now {
             elapsed: ELAPSED + Duration::from_secs(passed),
+            answering_since: Duration::ZERO,
             wall: now().wall + jiff::SignedDuration::from_hours(hours),
         };
         assert_eq!(decided(now(), after(150)), Need::Wait, "{hours} h");
