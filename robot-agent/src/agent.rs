@@ -92,9 +92,7 @@ impl Agent {
     ) -> Result<RunningAgent, StartError> {
         config.realtime.lock_memory.then(lock_memory).transpose()?;
         let model = control_model(&config.model)?;
-        for endpoint in config.servers.endpoints() {
-            fleet::check_endpoint(endpoint)?;
-        }
+        fleet::check_endpoints(config.servers.endpoints())?;
         let base = Base::new(&config.drive, model, &clock)?;
         let boot = BootId::from_uuid(Uuid::new_v4());
         // Before anything else is written to the folder, whose files distinguish a first start from

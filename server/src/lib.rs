@@ -133,8 +133,7 @@ impl Server {
         // Only with the lock: this completes an interrupted rotation of the authority.
         let security = config.robots.as_ref().map(security).transpose()?;
         let tls = open_tls(&config, security.as_ref(), &clock)?;
-        let db = Db::open(&config.database).await?;
-        db.claim().await?;
+        let db = open_claimed(&config).await?;
         let supervisor = Supervisor::new();
         let stop = || supervisor.stop_token();
         supervisor.spawn_vital("lock", keep_lock(lock.lost(), db.clone(), stop()));
@@ -267,6 +266,22 @@ async fn take_lock(config: &Config) -> Result<DatabaseLock, LockError> {
     let lock = DatabaseLock::wait(&config.database, STANDBY_SILENCE_MAX, waiting).await?;
     standby.takes_over();
     Ok(lock)
+}
+
+/// Opens the database that is locked, and claims it.
+///
+/// # Errors
+/// It cannot be opened, or a standby cannot write to it.
+async fn open_claimed(config: &Config) -> anyhow::Result<Db> {
+    let db = Db::open(&config.database).await?;
+    match db.claim().await {
+        // Stop and teleoperation work without the disk, and nobody else takes over.
+        Err(error) if !config.standby => {
+            warn!("cannot claim the database: {}", error_text::chain(&error));
+        }
+        claimed => claimed?,
+    }
+    Ok(db)
 }
 
 /// Ends when another server has the lock of the database, or has claimed it, or at the stop.

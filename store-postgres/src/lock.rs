@@ -322,9 +322,9 @@ mod tests {
             let (options, address) = open::options_of(&database.url).unwrap();
             let frozen = options.application_name("tread-server frozen");
             let _lock = locked(&frozen, &address).await.unwrap();
-            let mut writing = connections::connect(&frozen).await.unwrap();
+            let mut write = connections::connect(&frozen).await.unwrap();
             sqlx::raw_sql(crate::BEGIN_WRITE)
-                .execute(&mut writing)
+                .execute(&mut write)
                 .await
                 .unwrap();
             let begun = Instant::now();
@@ -334,7 +334,7 @@ mod tests {
             let db = Db::open(&database.url).await.unwrap();
             db.claim().await.unwrap();
             db.probe_write().await.unwrap();
-            let cut = sqlx::query("SELECT 1").execute(&mut writing).await;
+            let cut = sqlx::query("SELECT 1").execute(&mut write).await;
             assert!(cut.is_err(), "its session has ended");
             db.close().await;
         })

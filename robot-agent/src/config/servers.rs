@@ -86,10 +86,13 @@ impl Servers {
                 problem: "servers of one fleet are reached all by `tls/` or all without".to_owned(),
             });
         }
-        let mut credentials = None;
-        for endpoint in &self.0 {
-            credentials = place_at(endpoint, site, robot, membership.clone())?;
+        let (last, others) = self.0.split_last().ok_or(ConfigError::Missing {
+            key: "server",
+            flag: "server",
+        })?;
+        for endpoint in others {
+            place_at(endpoint, site, robot, membership.clone())?;
         }
-        Ok(credentials)
+        place_at(last, site, robot, membership)
     }
 }

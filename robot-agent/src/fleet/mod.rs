@@ -215,11 +215,15 @@ async fn open_session(config: zenoh::Config) -> Result<Option<zenoh::Session>, L
     })
 }
 
-/// Checks that a text is an endpoint that the agent can connect to.
+/// Checks that texts are endpoints that the agent can connect to.
 ///
 /// # Errors
-/// [`LinkError::Endpoint`].
-pub fn check_endpoint(server: &str) -> Result<(), LinkError> {
+/// [`LinkError::Endpoint`] names the first that is none.
+pub fn check_endpoints(servers: &[String]) -> Result<(), LinkError> {
+    servers.iter().try_for_each(|server| check_endpoint(server))
+}
+
+fn check_endpoint(server: &str) -> Result<(), LinkError> {
     if server.starts_with("tls/") {
         tunnel::check_endpoint(server)
     } else {

@@ -24,6 +24,7 @@ pub mod missions;
 mod own_alert;
 mod planned_path;
 pub mod presence;
+mod recalls;
 pub mod reconciler;
 pub mod restoration;
 pub mod retention;
@@ -269,25 +270,6 @@ impl App {
     pub fn wake(&self) {
         self.inner.changed.notify_one();
         self.announce();
-    }
-
-    /// Commits a change of what a robot is to do. A command that was decided before, and is not sent yet,
-    /// is decided again.
-    async fn commit_recalling(&self, tx: Tx) -> Result<(), DbError> {
-        let app = self.clone();
-        // Also after an unknown outcome.
-        tx.commit_then(move |_outcome| app.recall()).await
-    }
-
-    fn recall(&self) {
-        self.inner.recalls.fetch_add(1, Ordering::AcqRel);
-        self.wake();
-    }
-
-    /// Returns how often commands were recalled. To be read before the state that a command follows from,
-    /// and compared right before the command is sent.
-    fn recalls(&self) -> u64 {
-        self.inner.recalls.load(Ordering::Acquire)
     }
 
     /// Wakes only the feed of events.

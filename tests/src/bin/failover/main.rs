@@ -64,11 +64,11 @@ struct Details {
 #[derive(Debug, Default)]
 struct Times {
     /// Until the other server was ready.
-    ready_s: Vec<f64>,
+    ready: Vec<f64>,
     /// Until each robot was online there.
-    online_s: Vec<f64>,
+    online: Vec<f64>,
     /// From the waking of a frozen server until it had ended.
-    ended_s: Vec<f64>,
+    ended: Vec<f64>,
 }
 
 /// Waits until something is so, and returns how long that took, seconds.
@@ -108,13 +108,13 @@ async fn fail(
     let ready = until(fleet, "the standby is ready", began, async || {
         is_ready(fleet).await
     });
-    times.ready_s.push(ready.await?);
+    times.ready.push(ready.await?);
     for robot in robots {
         let online = until(fleet, "the robot is online", began, async || {
             let seen = fleet.rest.robot(robot).await;
             seen.is_some_and(|seen| seen.link == LinkState::Online)
         });
-        times.online_s.push(online.await?);
+        times.online.push(online.await?);
     }
     if signal == Signal::SIGSTOP {
         tokio::time::sleep(DRIVING).await;
@@ -123,7 +123,7 @@ async fn fail(
         let ended = until(fleet, "the woken server ends", began, async || {
             fleet.has_other_server_ended()
         });
-        times.ended_s.push(ended.await?);
+        times.ended.push(ended.await?);
     }
     fleet.start_other_server();
     Ok(())
@@ -168,17 +168,13 @@ async fn main() -> anyhow::Result<ExitCode> {
     let failures = judge(&mut fleet, &robots, &missions).await?;
     let lost = failures.len() as u64;
     let mut checks = vec![
-        Check::of("all online after a kill, s", worst(&mut killed.online_s)).at_most(KILLED_MAX_S),
-        Check::shown("the same, median, s", quantile(&mut killed.online_s, 0.5)),
-        Check::shown("standby ready after a kill, s", worst(&mut killed.ready_s)),
-        Check::of("all online after a freeze, s", worst(&mut frozen.online_s))
-            .at_most(FROZEN_MAX_S),
-        Check::shown("the same, median, s", quantile(&mut frozen.online_s, 0.5)),
-        Check::shown(
-            "standby ready after a freeze, s",
-            worst(&mut frozen.ready_s),
-        ),
-        Check::of("woken server has ended, s", worst(&mut frozen.ended_s)).at_most(WOKEN_MAX_S),
+        Check::of("all online after a kill, s", worst(&mut killed.online)).at_most(KILLED_MAX_S),
+        Check::shown("the same, median, s", quantile(&mut killed.online, 0.5)),
+        Check::shown("standby ready after a kill, s", worst(&mut killed.ready)),
+        Check::of("all online after a freeze, s", worst(&mut frozen.online)).at_most(FROZEN_MAX_S),
+        Check::shown("the same, median, s", quantile(&mut frozen.online, 0.5)),
+        Check::shown("standby ready after a freeze, s", worst(&mut frozen.ready)),
+        Check::of("woken server has ended, s", worst(&mut frozen.ended)).at_most(WOKEN_MAX_S),
     ];
     checks.push(
         Check::of_count(
