@@ -51,7 +51,7 @@ const IN_USE_BY: &str = "SELECT COALESCE(host(client_addr), 'this machine'),
 
 /// Returns the name of the process that has the lock, and for how many seconds the session that holds it
 /// has been silent.
-const HOLDER: &str = "SELECT application_name,
+const OWNER: &str = "SELECT application_name,
         CAST(EXTRACT(EPOCH FROM clock_timestamp() - state_change) AS DOUBLE PRECISION)
     FROM pg_locks JOIN pg_stat_activity USING (pid)
     WHERE locktype = 'advisory' AND granted AND objsubid = 1
@@ -203,7 +203,7 @@ async fn keep(
 /// Ends the sessions of the server that has the lock, if it has been silent for longer than permitted.
 async fn end_silent(options: &PgConnectOptions, silence_max: Duration) -> Result<(), sqlx::Error> {
     let mut connection = connections::connect(options).await?;
-    let holder: Option<(String, f64)> = sqlx::query_as(HOLDER)
+    let holder: Option<(String, f64)> = sqlx::query_as(OWNER)
         .fetch_optional(&mut connection)
         .await?;
     let Some((process, silence_s)) = holder else {
