@@ -70,6 +70,8 @@ struct Links {
     servers: Rotation,
     listeners: Listeners,
     membership: Option<watch::Receiver<Arc<Membership>>>,
+    /// The certificate of the attempt before.
+    shown: Option<Arc<Membership>>,
     /// Whether the present link has broken and no server has been heard since.
     is_lost: Arc<AtomicBool>,
     /// Links to servers that were left, while they are closed.
@@ -121,6 +123,7 @@ impl Online {
             servers: Rotation::new(self.config.servers.endpoints()),
             listeners,
             membership: self.membership.take(),
+            shown: None,
             is_lost,
             closing: JoinSet::new(),
         };
@@ -138,6 +141,10 @@ impl Online {
         let shown = membership
             .as_mut()
             .map(|it| Arc::clone(&it.borrow_and_update()));
+        let before = std::mem::replace(&mut links.shown, shown.clone());
+        if before.as_ref().map(Arc::as_ptr) != shown.as_ref().map(Arc::as_ptr) {
+            links.servers.begin_anew();
+        }
         let connecting = FleetLink::connect(
             &mut links.servers,
             shown.as_deref(),
@@ -162,8 +169,11 @@ impl Online {
                     error = &cause as &dyn std::error::Error,
                     "the fleet link failed; it is tried again"
                 );
-                links.servers.leave(self.dispatcher.clock.monotonic());
-                return self.rest(&mut links.membership, LINK_FAILED_REST).await;
+                // It is of this machine, and no fault of the server.
+                let now = self.dispatcher.clock.monotonic();
+                let pause = links.servers.failed((now, now), false);
+                let pause = pause.max(LINK_FAILED_REST);
+                return self.rest(&mut links.membership, pause).await;
             }
         };
         links.servers.reached();

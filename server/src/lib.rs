@@ -52,6 +52,7 @@ use anyhow::Context as _;
 use jiff::SignedDuration;
 use tokio::net::TcpListener;
 use tokio::sync::mpsc;
+use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 use tracing::{error, info, warn};
 use tread_api::ids::SiteId;
@@ -129,11 +130,11 @@ impl Server {
         let names = config.names();
         let proxies = TrustedProxies::new(config.web.trusted_proxies.clone());
         let schedule = backup_schedule(&config);
-        let lock = take_lock(&config).await?;
+        let (lock, _feeding) = take_lock(&config).await?;
         // Only with the lock: this completes an interrupted rotation of the authority.
         let security = config.robots.as_ref().map(security).transpose()?;
         let tls = open_tls(&config, security.as_ref(), &clock)?;
-        let db = open_claimed(&config).await?;
+        let db = open_claimed(&config, lock.lost()).await?;
         let supervisor = Supervisor::new();
         let stop = || supervisor.stop_token();
         supervisor.spawn_vital("lock", keep_lock(lock.lost(), db.clone(), stop()));
@@ -253,28 +254,34 @@ fn serve_metrics(
     Ok(address)
 }
 
-/// Locks the database; a standby waits until it can.
+/// Locks the database; a standby waits until it can, and its watchdog is fed from then on until the other
+/// value is dropped.
 ///
 /// # Errors
 /// Another server uses it, or it cannot be locked.
-async fn take_lock(config: &Config) -> Result<DatabaseLock, LockError> {
+async fn take_lock(config: &Config) -> Result<(DatabaseLock, JoinSet<()>), LockError> {
     if !config.standby {
-        return DatabaseLock::take(&config.database).await;
+        let lock = DatabaseLock::take(&config.database).await?;
+        return Ok((lock, JoinSet::new()));
     }
     let mut standby = Standby::default();
     let waiting = |reason: &str| standby.waits(reason);
     let lock = DatabaseLock::wait(&config.database, STANDBY_SILENCE_MAX, waiting).await?;
-    standby.takes_over();
-    Ok(lock)
+    Ok((lock, standby.takes_over()))
 }
 
 /// Opens the database that is locked, and claims it.
 ///
 /// # Errors
-/// It cannot be opened, or a standby cannot write to it.
-async fn open_claimed(config: &Config) -> anyhow::Result<Db> {
+/// It cannot be opened, or a standby cannot write to it, or the lock was lost.
+async fn open_claimed(config: &Config, lost: impl Future<Output = String>) -> anyhow::Result<Db> {
     let db = Db::open(&config.database).await?;
-    match db.claim().await {
+    let claimed = tokio::select! {
+        biased;
+        reason = lost => anyhow::bail!("the lock of the database is lost: {reason}"),
+        claimed = db.claim() => claimed,
+    };
+    match claimed {
         // Stop and teleoperation work without the disk, and nobody else takes over.
         Err(error) if !config.standby => {
             warn!("cannot claim the database: {}", error_text::chain(&error));

@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use sd_notify::NotifyState;
+use tokio::task::JoinSet;
 use tokio::time::Instant;
 use tracing::info;
 
@@ -10,6 +11,9 @@ use crate::service_manager::notify;
 
 /// Interval of the log lines of a standby that waits for the same reason.
 const LOG_EVERY: Duration = Duration::from_mins(10);
+
+/// Interval at which the watchdog is fed while it takes over.
+const FEED_EVERY: Duration = Duration::from_secs(5);
 
 /// A server that waits until it can use the database.
 #[derive(Debug, Default)]
@@ -37,11 +41,20 @@ impl Standby {
         notify(&[NotifyState::Watchdog]);
     }
 
-    /// Says that it takes over, if it has waited.
-    pub(crate) fn takes_over(&self) {
+    /// Says that it takes over, if it has waited, and feeds the watchdog until what it returns is dropped:
+    /// migrations and the map may take long.
+    pub(crate) fn takes_over(&self) -> JoinSet<()> {
+        let mut feeding = JoinSet::new();
         if self.logged.is_some() {
             info!("standby: takes over the database");
             notify(&[NotifyState::Status("standby: takes over")]);
+            feeding.spawn(async {
+                loop {
+                    notify(&[NotifyState::Watchdog]);
+                    tokio::time::sleep(FEED_EVERY).await;
+                }
+            });
         }
+        feeding
     }
 }

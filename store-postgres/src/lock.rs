@@ -29,6 +29,10 @@ const LOOK_INTERVAL: Duration = Duration::from_millis(500);
 const STANDBY_INTERVAL: Duration = Duration::from_millis(250);
 /// Maximum time for an answer about it.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
+/// Maximum time between two looks of a standby at a silent server: PostgreSQL may have stood still itself.
+const LOOK_GAP_MAX: Duration = Duration::from_secs(2);
+/// Maximum time for an attempt to take the lock: that for a connection and an answer.
+const ATTEMPT_TIMEOUT: Duration = Duration::from_secs(15);
 /// Interval at which the lock is tried while a session ends that holds it.
 const ENDING_INTERVAL: Duration = Duration::from_millis(100);
 /// Takes the lock, whose number is "treadsrv" in ASCII. PostgreSQL ends the connection of a machine that
@@ -49,18 +53,19 @@ const IN_USE_BY: &str = "SELECT COALESCE(host(client_addr), 'this machine'),
         AND (CAST(classid AS BIGINT) << 32) | CAST(objid AS BIGINT) = 8390880524716175990
     LIMIT 1";
 
-/// Returns the name of the process that has the lock, and for how many seconds the session that holds it
-/// has been silent.
-const OWNER: &str = "SELECT application_name,
-        CAST(EXTRACT(EPOCH FROM clock_timestamp() - state_change) AS DOUBLE PRECISION)
+/// Returns the process that has the lock, the number of the session that holds it, and the time of that
+/// session's last statement.
+const OWNER: &str = "SELECT application_name, pid, CAST(state_change AS TEXT)
     FROM pg_locks JOIN pg_stat_activity USING (pid)
     WHERE locktype = 'advisory' AND granted AND objsubid = 1
         AND database = (SELECT oid FROM pg_database WHERE datname = current_database())
         AND (CAST(classid AS BIGINT) << 32) | CAST(objid AS BIGINT) = 8390880524716175990
     LIMIT 1";
-/// Ends all sessions of a process.
+/// Ends all sessions of a process, if one of them has asked nothing since.
 const END_PROCESS: &str = "SELECT COUNT(pg_terminate_backend(pid)) FROM pg_stat_activity
-    WHERE datname = current_database() AND application_name = $1 AND pid <> pg_backend_pid()";
+    WHERE datname = current_database() AND application_name = $1 AND pid <> pg_backend_pid()
+        AND EXISTS (SELECT FROM pg_stat_activity
+            WHERE pid = $2 AND CAST(state_change AS TEXT) = $3)";
 
 /// A session of PostgreSQL: the number of its process, and when it began.
 type Session = (i32, String);
@@ -115,15 +120,22 @@ impl DatabaseLock {
         mut waiting: impl FnMut(&LockError),
     ) -> Result<Self, LockError> {
         let (options, address) = open::options_of(url).map_err(LockError::Open)?;
+        let mut watch = Watch::default();
         loop {
-            match locked(&options, &address).await {
+            match bounded(&address, locked(&options, &address)).await {
                 Ok(locked) => return Ok(Self::keeping(locked, options, address)),
                 Err(reason) => {
                     waiting(&reason);
-                    if matches!(reason, LockError::InUse { .. })
-                        && let Err(cause) = end_silent(&options, silence_max).await
-                    {
-                        warn!("the server that has the database cannot be examined: {cause}");
+                    if matches!(reason, LockError::InUse { .. }) {
+                        let ending = watch.end_silent(&options, silence_max);
+                        match timeout(ANSWER_TIMEOUT, ending).await {
+                            Ok(Ok(())) => {}
+                            Ok(Err(cause)) => watch.fails(&cause),
+                            Err(_elapsed) => watch = Watch::default(),
+                        }
+                    } else {
+                        // What was seen before says nothing about the time without answers.
+                        watch = Watch::default();
                     }
                 }
             }
@@ -190,7 +202,7 @@ async fn keep(
         }
         warn!("the connection that holds the lock of the database is lost");
         (connection, session) = loop {
-            match locked_again(options, address, &session).await {
+            match bounded(address, locked_again(options, address, &session)).await {
                 Ok(locked) => break locked,
                 Err(in_use @ LockError::InUse { .. }) => return in_use,
                 // PostgreSQL is away, as every transaction notices too.
@@ -200,27 +212,83 @@ async fn keep(
     }
 }
 
-/// Ends the sessions of the server that has the lock, if it has been silent for longer than permitted.
-async fn end_silent(options: &PgConnectOptions, silence_max: Duration) -> Result<(), sqlx::Error> {
-    let mut connection = connections::connect(options).await?;
-    let holder: Option<(String, f64)> = sqlx::query_as(OWNER)
-        .fetch_optional(&mut connection)
-        .await?;
-    let Some((process, silence_s)) = holder else {
-        return Ok(());
-    };
-    if silence_s < silence_max.as_secs_f64() {
-        return Ok(());
+/// Limits the time for an attempt to take the lock.
+async fn bounded<T>(
+    address: &str,
+    attempt: impl Future<Output = Result<T, LockError>>,
+) -> Result<T, LockError> {
+    let attempt = timeout(ATTEMPT_TIMEOUT, attempt).await;
+    attempt.unwrap_or_else(|_elapsed| {
+        let cause = std::io::Error::from(std::io::ErrorKind::TimedOut).into();
+        Err(LockError::Open(open::refused(address, cause)))
+    })
+}
+
+/// What a standby has seen of the session that holds the lock.
+#[derive(Debug, Default)]
+struct Watch {
+    /// Process, session, and the time of its last statement by the clock of PostgreSQL, and since when this
+    /// standby has seen that and nothing newer, by its own clock.
+    seen: Option<(Owner, Instant)>,
+    /// When it looked last: a look that comes late says nothing about the time before.
+    looked_at: Option<Instant>,
+    has_warned: bool,
+}
+
+/// Name of the process that has the lock, the number of its session, and the time of the session's last
+/// statement, which is unknown without the rights to see it.
+type Owner = (String, i32, Option<String>);
+
+impl Watch {
+    /// Ends the sessions of the server that has the lock, if it has asked nothing for longer than permitted.
+    /// A step of any clock changes nothing: only whether there was a statement counts.
+    async fn end_silent(
+        &mut self,
+        options: &PgConnectOptions,
+        silence_max: Duration,
+    ) -> Result<(), sqlx::Error> {
+        let mut connection = connections::connect(options).await?;
+        let owner: Option<Owner> = sqlx::query_as(OWNER)
+            .fetch_optional(&mut connection)
+            .await?;
+        let before = self.looked_at.replace(Instant::now());
+        let is_late = before.is_none_or(|before| before.elapsed() > LOOK_GAP_MAX);
+        let since = match (&self.seen, &owner) {
+            (Some((seen, since)), Some(owner)) if seen == owner && !is_late => *since,
+            _ => {
+                self.seen = owner.map(|owner| (owner, Instant::now()));
+                return Ok(());
+            }
+        };
+        let Some((process, session, Some(asked_at))) = owner else {
+            self.fails(&"the user may not see its last statement");
+            return Ok(());
+        };
+        let silence = since.elapsed();
+        if silence < silence_max {
+            return Ok(());
+        }
+        let ended = sqlx::query_as(END_PROCESS)
+            .bind(&process)
+            .bind(session)
+            .bind(&asked_at)
+            .fetch_one(&mut connection);
+        let (ended,): (i64,) = ended.await?;
+        self.seen = None;
+        warn!(
+            "`{process}` has the lock of the database and was silent for {:.1} s: its {ended} sessions \
+             are ended",
+            silence.as_secs_f64()
+        );
+        Ok(())
     }
-    let (ended,): (i64,) = sqlx::query_as(END_PROCESS)
-        .bind(&process)
-        .fetch_one(&mut connection)
-        .await?;
-    warn!(
-        "`{process}` has the lock of the database and was silent for {silence_s:.1} s: its {ended} \
-         sessions are ended"
-    );
-    Ok(())
+
+    /// Logs once that the server cannot be watched.
+    fn fails(&mut self, cause: &dyn std::fmt::Display) {
+        if !std::mem::replace(&mut self.has_warned, true) {
+            warn!("the server that has the database cannot be watched: {cause}");
+        }
+    }
 }
 
 /// Takes the lock again after this process lost its connection. PostgreSQL may not have noticed the loss:

@@ -16,7 +16,9 @@ const PAUSE_MAX: Duration = Duration::from_millis(300);
 /// as a failure of its address, which other robots may share.
 const DISTRUSTED_PAUSE_MAX: Duration = Duration::from_secs(10);
 
-/// Time for which a server is passed over that fell silent or took long to fail.
+/// Time for which a server is passed over that fell silent: it may be a gap of the radio alone.
+const LEFT_FOR: Duration = Duration::from_secs(1);
+/// Time for which a server is passed over that took long to fail.
 const PASSED_OVER: Duration = Duration::from_secs(5);
 /// Duration of an attempt from which it counts as long.
 const LONG: Duration = Duration::from_secs(1);
@@ -81,15 +83,23 @@ impl Rotation {
 
     /// Goes on to the next server, since the present one fell silent before `now`.
     pub fn leave(&mut self, now: Duration) {
-        self.passed_over_until[self.at] = now + PASSED_OVER;
+        self.passed_over_until[self.at] = now + LEFT_FOR;
         self.next(now);
+    }
+
+    /// Forgets what was wrong with the servers, since the robot has another certificate.
+    pub fn begin_anew(&mut self) {
+        self.logged.fill(Logged::default());
+        self.passed_over_until.fill(Duration::ZERO);
     }
 
     /// Goes on to the next server after an attempt that failed at `now`. Returns the pause before that one
     /// is tried: none until all have been.
     pub fn failed(&mut self, (began, now): (Duration, Duration), is_distrusted: bool) -> Duration {
         self.is_distrusted &= is_distrusted;
-        if now.saturating_sub(began) >= LONG {
+        if is_distrusted {
+            self.passed_over_until[self.at] = now + DISTRUSTED_PAUSE_MAX;
+        } else if now.saturating_sub(began) >= LONG {
             self.passed_over_until[self.at] = now + PASSED_OVER;
         }
         if !self.next(now) {
@@ -162,8 +172,8 @@ mod tests {
         rotation.reached();
         rotation.leave(now);
         let (tried, pauses) = attempts(&mut rotation, &mut now, &[0.1; 5]);
-        assert_eq!(tried, "11111");
-        assert_eq!(pauses, [100, 200, 300, 300, 300]);
+        assert_eq!(tried, "11110");
+        assert_eq!(pauses, [100, 200, 300, 0, 300]);
         now += PASSED_OVER;
         // The first takes long, and then the other one does: the first will be tried again sooner.
         let (tried, _) = attempts(

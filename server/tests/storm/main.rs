@@ -28,6 +28,12 @@ mod tests {
         }
     }
 
+    /// A robot stood for an operator under an earlier revision, and its report of that came late.
+    #[tokio::test]
+    async fn a_pause_that_was_reported_of_an_earlier_revision_can_be_resumed() {
+        storm::run(362, 1_000).await.unwrap();
+    }
+
     /// Stops that came to a robot in another order than they were asked for in.
     #[tokio::test]
     async fn a_stop_that_was_cleared_with_a_later_one_does_not_hold_missions_for_ever() {

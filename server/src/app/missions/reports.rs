@@ -260,7 +260,11 @@ fn shown_of(reporting: Reporting, report: &MissionReport) -> Option<MissionProgr
 /// is then no longer wanted. `at` is the time at which the stop or lease began. It must end before
 /// anybody can resume, so this time tells both orders apart with a margin larger than clock errors;
 /// the time at which the robot stopped does not.
-async fn was_resumed_since(tx: &mut Tx, id: MissionId, at: Timestamp) -> Result<bool, DbError> {
+pub(in crate::app) async fn was_resumed_since(
+    tx: &mut Tx,
+    id: MissionId,
+    at: Timestamp,
+) -> Result<bool, DbError> {
     let events = db::history::events(tx, id, EVENTS_MAX).await?;
     let mut newest_first = events.iter().rev();
     let resumed = newest_first.find(|event| event.cause == Cause::ResumeRequested);

@@ -1,5 +1,8 @@
 //! Commands that the reconciler sends to robots, and the changes that follow from the answers.
 
+use std::time::Duration;
+
+use jiff::SignedDuration;
 use tracing::warn;
 use tread_api::ids::MissionId;
 use tread_api::mission::{Actor, Cause, MissionState};
@@ -10,7 +13,7 @@ use tread_api::wire::reply::{Acknowledgement, Answer, CommandRefusalCode, OfferR
 use tread_telemetry::Place;
 
 use crate::app::missions::immediate_offer::OfferedNow;
-use crate::app::missions::reports::adopt;
+use crate::app::missions::reports::{adopt, was_resumed_since};
 use crate::app::missions::transitions::Change;
 use crate::app::missions::{Step, add_note, take_step};
 use crate::app::presence::{DuplicateAgent, RobotKey};
@@ -33,8 +36,14 @@ pub(super) enum Finished {
     EndedThere,
 }
 
-/// Changes a mission's state without its robot.
-pub(super) async fn settle(app: &App, mission: &Standing, change: Change) -> Result<(), AppError> {
+/// Changes a mission's state without a report of its robot, which has shown that state for a time if it is
+/// the robot's.
+pub(super) async fn settle(
+    app: &App,
+    mission: &Standing,
+    change: Change,
+    shown_for: Duration,
+) -> Result<(), AppError> {
     // A robot that shows a mission is in the run that took it.
     let taken_by = || app.presences().get(&key_of(mission)).boot();
     let facts = Facts {
@@ -48,7 +57,17 @@ pub(super) async fn settle(app: &App, mission: &Standing, change: Change) -> Res
     let mut tx = app.db().write_uncounted("reconciler").await?;
     let step = server_step(app, change, None, facts);
     let mut alerts = Vec::new();
-    if let Some(state) = take_step(&mut tx, mission, step).await?
+    let moved = take_step(&mut tx, mission, step).await?;
+    let is_for_safety = |shown: MissionProgress| shown.is_paused_for_safety();
+    if moved == Some(MissionState::Paused) && facts.progress.is_some_and(is_for_safety) {
+        let shown_for = SignedDuration::try_from(shown_for).unwrap_or_default();
+        let since = app.clock().now() - shown_for;
+        // Only a person resumes it, or has done so already.
+        if !was_resumed_since(&mut tx, mission.id, since).await? {
+            db::missions::want_pause(&mut tx, mission.id, true).await?;
+        }
+    }
+    if let Some(state) = moved
         && let Some(robot_pk) = db::robots::pk_of(&mut tx, &mission.site, &mission.robot).await?
     {
         let ended = (mission.id, state, change.reason());
@@ -324,10 +343,19 @@ pub(super) async fn hold(
     recalls: u64,
 ) -> Result<Finished, AppError> {
     let (mission, (revision, _)) = (standing.id, standing.content);
-    // A person may have held it again since. A pause does no harm.
-    if !held && app.recalls() != recalls {
+    // A person may have held or ended it since. A pause does no harm. Nothing is awaited between the last
+    // comparison and the sending.
+    let mut recalls = recalls;
+    while !held && app.recalls() != recalls {
+        recalls = app.recalls();
         let row = row_of(&app, mission).await?;
-        if row.is_none_or(|row| row.mission.pause_wanted) {
+        let is_to_be_driven = row.is_some_and(|row| {
+            let state = row.mission.state;
+            matches!(state, MissionState::Active | MissionState::Paused)
+                && !row.mission.pause_wanted
+                && row.mission.revision == revision
+        });
+        if !is_to_be_driven {
             return Ok(Finished::Settled);
         }
     }

@@ -49,6 +49,8 @@ pub const PERIOD: Duration = Duration::from_millis(500);
 const UPKEEP_EVERY: Duration = Duration::from_millis(100);
 /// Duration of reading all open missions from which reports of robots count as delayed by the database.
 const ANSWER_DELAY: Duration = Duration::from_millis(500);
+/// Maximum time for which delays that follow each other excuse robots: every mission ends.
+const EXCUSED_MAX: Duration = Duration::from_mins(1);
 /// Time since which a database answers that has not answered yet.
 const NEVER: Duration = Duration::MAX;
 /// Maximum number of commands under way at once.
@@ -136,6 +138,8 @@ pub struct Reconciler {
     asked: HashMap<RobotKey, (Duration, u32)>,
     /// Time since which the database answers without delay.
     answering_since: Duration,
+    /// Time of the first delay of those that have followed each other.
+    delayed_since: Option<Duration>,
     /// Time from which the upkeep may run again, and whether a pass has left it out.
     upkeep_due: Duration,
     is_upkeep_owed: bool,
@@ -161,6 +165,7 @@ impl Reconciler {
             restrained: HashMap::new(),
             asked: HashMap::new(),
             answering_since: Duration::ZERO,
+            delayed_since: None,
             upkeep_due: Duration::ZERO,
             is_upkeep_owed: false,
         }
@@ -292,11 +297,7 @@ impl Reconciler {
         let before = std::mem::replace(&mut self.answering_since, NEVER);
         let read = self.read_missions().await;
         let is_prompt = read.is_ok() && begun.elapsed() <= ANSWER_DELAY && before != NEVER;
-        self.answering_since = if is_prompt {
-            before
-        } else {
-            self.app.clock().elapsed()
-        };
+        self.note_answer(is_prompt, before);
         let (restrained, open) = read?;
         // Before a mission of a robot that was released is offered, so that nobody sees it driven while
         // its robot counts as one that awaits its release.
@@ -309,6 +310,21 @@ impl Reconciler {
             self.serve(mission.clone()).await?;
         }
         Ok(open)
+    }
+
+    /// Notes whether the database answered without delay; `before` is [`Reconciler::answering_since`].
+    fn note_answer(&mut self, is_prompt: bool, before: Duration) {
+        let now = self.app.clock().elapsed();
+        if is_prompt {
+            self.answering_since = before;
+            if now.saturating_sub(before) > EXCUSED_MAX {
+                self.delayed_since = None;
+            }
+            return;
+        }
+        let since = *self.delayed_since.get_or_insert(now);
+        let is_excused = now.saturating_sub(since) < EXCUSED_MAX;
+        self.answering_since = if is_excused { now } else { before.min(now) };
     }
 
     /// Reads the robots that are restrained, and the missions that may need something.
@@ -468,7 +484,11 @@ impl Reconciler {
         }
         match need {
             Need::Wait => {}
-            Need::Settle(change) => settle(&self.app, &mission, change).await?,
+            Need::Settle(change) => {
+                let shown_since = memory.differs_from.unwrap_or(now.elapsed);
+                let shown_for = now.elapsed.saturating_sub(shown_since);
+                settle(&self.app, &mission, change, shown_for).await?;
+            }
             Need::Adopt => adopt_shown(&self.app, &mission).await?,
             Need::Replace => {
                 let job = Job::Replace(mission.id);

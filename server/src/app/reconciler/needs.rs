@@ -234,8 +234,15 @@ fn in_progress(mission: &Standing, said: Option<MissionProgress>, differs: bool)
         (false, true) => Need::Pause,
         (true, false) => Need::Resume,
         // The robot paused it because of a stop or a teleoperation: only a person resumes it. The
-        // robot's report of the pause will set what is wanted here accordingly.
-        (false, false) if said.is_some_and(|said| said.is_paused_for_safety()) => Need::Wait,
+        // robot's report of the pause sets what is wanted here accordingly; its state does if the report
+        // is slow, or was of an earlier revision.
+        (false, false) if said.is_some_and(|said| said.is_paused_for_safety()) => {
+            if differs {
+                Need::Settle(Change::Pause)
+            } else {
+                Need::Wait
+            }
+        }
         // A late or repeated command has taken effect on the robot; the wanted one is sent again.
         (false, false) if differs => Need::Resume,
         (true, true) if differs => Need::Pause,

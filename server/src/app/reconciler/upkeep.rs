@@ -115,7 +115,7 @@ impl Reconciler {
             if self.restrain(&key, heard, expires) != expires {
                 continue;
             }
-            settle(&self.app, &mission, Change::Expire).await?;
+            settle(&self.app, &mission, Change::Expire, Duration::ZERO).await?;
         }
         Ok(())
     }

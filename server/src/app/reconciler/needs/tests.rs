@@ -286,7 +286,8 @@ fn what_is_wanted_of_a_mission_in_progress_is_sent_until_the_robot_has_done_it()
             paused_by: Some(cause),
             ..holding
         };
-        assert_eq!(needs(active, false, &held, LONG_AGO), Need::Wait);
+        assert_eq!(needs(active, false, &held, JUST), Need::Wait);
+        assert_eq!(needs(active, false, &held, LONG_AGO), pause);
         assert_eq!(needs(paused, false, &held, LONG_AGO), Need::Resume);
     }
 }
