@@ -39,11 +39,14 @@ const ENDING_INTERVAL: Duration = Duration::from_millis(100);
 /// does not answer any more after 25 s, and with it the lock.
 const TAKE: &str = "SELECT pg_try_advisory_lock(8390880524716175990),
     set_config('tcp_keepalives_idle', '10', FALSE), set_config('tcp_keepalives_interval', '5', FALSE),
-    set_config('tcp_keepalives_count', '3', FALSE), pg_backend_pid(),
-    (SELECT CAST(backend_start AS TEXT) FROM pg_stat_activity WHERE pid = pg_backend_pid())";
-/// Ends a session, and returns whether it was there. Another one with its process number is spared.
-const END_SESSION: &str = "SELECT pg_terminate_backend(pid) FROM pg_stat_activity
-    WHERE pid = $1 AND CAST(backend_start AS TEXT) = $2";
+    set_config('tcp_keepalives_count', '3', FALSE)";
+/// Ends the session that has the lock, if it is another one of this process.
+const END_OWN: &str = "SELECT pg_terminate_backend(pid)
+    FROM pg_locks JOIN pg_stat_activity USING (pid)
+    WHERE locktype = 'advisory' AND granted AND objsubid = 1
+        AND database = (SELECT oid FROM pg_database WHERE datname = current_database())
+        AND (CAST(classid AS BIGINT) << 32) | CAST(objid AS BIGINT) = 8390880524716175990
+        AND application_name = current_setting('application_name') AND pid <> pg_backend_pid()";
 /// Says who has it: address of the client, and since when it is connected.
 const IN_USE_BY: &str = "SELECT COALESCE(host(client_addr), 'this machine'),
         to_char(backend_start AT TIME ZONE 'UTC', 'YYYY-MM-DD HH24:MI:SS')
@@ -66,9 +69,6 @@ const END_PROCESS: &str = "SELECT COUNT(pg_terminate_backend(pid)) FROM pg_stat_
     WHERE datname = current_database() AND application_name = $1 AND pid <> pg_backend_pid()
         AND EXISTS (SELECT FROM pg_stat_activity
             WHERE pid = $2 AND CAST(state_change AS TEXT) = $3)";
-
-/// A session of PostgreSQL: the number of its process, and when it began.
-type Session = (i32, String);
 
 /// Reason why a server may not use a database.
 #[derive(Debug, thiserror::Error)]
@@ -143,11 +143,7 @@ impl DatabaseLock {
         }
     }
 
-    fn keeping(
-        locked: (PgConnection, Session),
-        options: PgConnectOptions,
-        address: String,
-    ) -> Self {
+    fn keeping(locked: PgConnection, options: PgConnectOptions, address: String) -> Self {
         let (losing, lost) = watch::channel(None);
         #[expect(
             clippy::disallowed_methods,
@@ -190,7 +186,7 @@ impl Drop for DatabaseLock {
 /// Looks whether the lock is held, and takes it again when its connection was lost. Returns when
 /// another server has it.
 async fn keep(
-    (mut connection, mut session): (PgConnection, Session),
+    mut connection: PgConnection,
     options: &PgConnectOptions,
     address: &str,
 ) -> LockError {
@@ -201,8 +197,8 @@ async fn keep(
             continue;
         }
         warn!("the connection that holds the lock of the database is lost");
-        (connection, session) = loop {
-            match bounded(address, locked_again(options, address, &session)).await {
+        connection = loop {
+            match bounded(address, locked_again(options, address)).await {
                 Ok(locked) => break locked,
                 Err(in_use @ LockError::InUse { .. }) => return in_use,
                 // PostgreSQL is away, as every transaction notices too.
@@ -291,22 +287,19 @@ impl Watch {
     }
 }
 
-/// Takes the lock again after this process lost its connection. PostgreSQL may not have noticed the loss:
-/// the session of that connection is ended if it still has the lock.
+/// Takes the lock again after this process lost its connection. PostgreSQL may not have noticed the loss: a
+/// session of this process that still has the lock is ended.
 async fn locked_again(
     options: &PgConnectOptions,
     address: &str,
-    lost: &Session,
-) -> Result<(PgConnection, Session), LockError> {
+) -> Result<PgConnection, LockError> {
     let in_use = match locked(options, address).await {
         Err(in_use @ LockError::InUse { .. }) => in_use,
         locked @ (Ok(_) | Err(LockError::Open(_))) => return locked,
     };
     let refused = |cause| LockError::Open(open::refused(address, cause));
     let mut connection = connections::connect(options).await.map_err(refused)?;
-    let ending: Option<(bool,)> = sqlx::query_as(END_SESSION)
-        .bind(lost.0)
-        .bind(&lost.1)
+    let ending: Option<(bool,)> = sqlx::query_as(END_OWN)
         .fetch_optional(&mut connection)
         .await
         .map_err(refused)?;
@@ -325,17 +318,13 @@ async fn locked_again(
 }
 
 /// Opens a connection that holds the lock.
-async fn locked(
-    options: &PgConnectOptions,
-    address: &str,
-) -> Result<(PgConnection, Session), LockError> {
-    type Taken = (bool, String, String, String, i32, String);
+async fn locked(options: &PgConnectOptions, address: &str) -> Result<PgConnection, LockError> {
     let refused = |cause| LockError::Open(open::refused(address, cause));
     let mut connection = connections::connect(options).await.map_err(refused)?;
     let taking = sqlx::query_as(TAKE).fetch_one(&mut connection).await;
-    let (is_taken, _, _, _, process, since): Taken = taking.map_err(refused)?;
+    let (is_taken, ..): (bool, String, String, String) = taking.map_err(refused)?;
     if is_taken {
-        return Ok((connection, (process, since)));
+        return Ok(connection);
     }
     let found: Result<Option<(String, String)>, _> = sqlx::query_as(IN_USE_BY)
         .fetch_optional(&mut connection)
@@ -354,6 +343,16 @@ mod tests {
     use super::*;
     use crate::Db;
     use crate::testing::with_database;
+
+    /// Takes the lock once the session before has ended.
+    async fn taken(options: &PgConnectOptions, address: &str) -> PgConnection {
+        loop {
+            match locked(options, address).await {
+                Ok(locked) => return locked,
+                Err(_) => sleep(ENDING_INTERVAL).await,
+            }
+        }
+    }
 
     /// Time after which a standby of these tests takes over.
     const SILENCE_MAX: Duration = Duration::from_secs(1);
@@ -436,21 +435,17 @@ mod tests {
         let test = "a_lost_session_of_the_same_server_does_not_keep_the_lock";
         with_database(test, async |database| {
             let (options, address) = open::options_of(&database.url).unwrap();
+            let refused = |locked: &Result<PgConnection, LockError>| {
+                assert!(matches!(locked, Err(LockError::InUse { .. })), "{locked:?}");
+            };
+            let other = options.clone().application_name("tread-server other");
+            let others = locked(&other, &address).await.unwrap();
+            refused(&locked_again(&options, &address).await);
+            drop(others);
+            let _lost = taken(&options, &address).await;
             // Its connection is open, as PostgreSQL sees one that was lost.
-            let (_lost, session) = locked(&options, &address).await.unwrap();
-            let other = (session.0, "2000-01-01 00:00:00+00".to_owned());
-            let refused = locked_again(&options, &address, &other).await;
-            assert!(
-                matches!(refused, Err(LockError::InUse { .. })),
-                "{refused:?}"
-            );
-            let (_again, new) = locked_again(&options, &address, &session).await.unwrap();
-            assert_ne!(session, new);
-            let refused = locked(&options, &address).await;
-            assert!(
-                matches!(refused, Err(LockError::InUse { .. })),
-                "{refused:?}"
-            );
+            let _again = locked_again(&options, &address).await.unwrap();
+            refused(&locked(&other, &address).await);
         })
         .await;
     }
