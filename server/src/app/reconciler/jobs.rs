@@ -16,7 +16,7 @@ use crate::app::missions::immediate_offer::OfferedNow;
 use crate::app::missions::reports::{adopt, was_resumed_since};
 use crate::app::missions::transitions::Change;
 use crate::app::missions::{Step, add_note, take_step};
-use crate::app::presence::{DuplicateAgent, RobotKey};
+use crate::app::presence::RobotKey;
 use crate::app::stops::{StopDelivery, send_stop};
 use crate::app::terrains::site_definition;
 use crate::app::{App, AppError};
@@ -433,58 +433,6 @@ pub(super) async fn cancel(app: App, mission: Standing) -> Result<Finished, AppE
     }
     app.wake();
     Ok(Finished::Settled)
-}
-
-/// Commands a robot to end a mission that is not among its open ones in the database.
-pub(super) async fn disown(
-    app: App,
-    key: RobotKey,
-    mission: MissionId,
-) -> Result<Finished, AppError> {
-    let mut tx = app.db().read("reconciler").await?;
-    let row = db::missions::find(&mut tx, mission).await?;
-    drop(tx);
-    let own = row.filter(|row| (&row.mission.site, &row.mission.robot) == (&key.0, &key.1));
-    let reason = match own {
-        Some(row) if !row.mission.state.is_terminal() => return Ok(Finished::Settled),
-        Some(row) => format!(
-            "it has ended at the server: it is {}, {}",
-            row.mission.state.as_str(),
-            row.mission.cause.as_str()
-        ),
-        None => "it is no mission of this robot".to_owned(),
-    };
-    warn!(
-        mission.id = %mission, robot.id = %key.1,
-        "robot `{}` drives mission `{mission}`, and gets a cancel: {reason}", key.1
-    );
-    app.counters().missions_disowned.one();
-    let command = Cancel { mission, reason };
-    // The answer is ignored: the robot's next states show whether it has ended; if not, the cancel
-    // is sent again.
-    let _ = app.commands().send(&key, &command).await;
-    Ok(Finished::Again)
-}
-
-/// Sends a cancel of its mission to a second agent that runs under a robot's name. Settled if that
-/// agent drives no mission; otherwise the job runs again until it has ended.
-pub(super) async fn end_duplicate_agent(app: App, duplicate: DuplicateAgent) -> Finished {
-    let DuplicateAgent { key, boot, mission } = duplicate;
-    let Some(mission) = mission else {
-        return Finished::Settled;
-    };
-    warn!(
-        mission.id = %mission, robot.id = %key.1,
-        "a second agent drives mission `{mission}` under the name of robot `{}`, as boot {boot}, \
-         and gets a cancel", key.1
-    );
-    app.counters().missions_disowned.one();
-    let reason = "another agent has taken this robot's name".to_owned();
-    let command = Cancel { mission, reason };
-    // The answer is ignored: the agent's next states show whether it has ended; if not, the cancel
-    // is sent again.
-    let _ = app.commands().send_to(&key, Some(boot), &command).await;
-    Finished::Again
 }
 
 /// Sends a stop again, and stores the robot's confirmation.

@@ -10,6 +10,7 @@
 pub(super) mod attendance;
 pub(super) mod conditions;
 pub(super) mod delays;
+mod foreign;
 mod jobs;
 pub mod needs;
 mod outcomes;
@@ -31,8 +32,9 @@ use tread_api::stop::Stop;
 use self::attendance::Attendance;
 use self::conditions::Conditions;
 use self::delays::Delays;
+use self::foreign::disown;
 use self::jobs::{
-    Finished, adopt_shown, cancel, disown, hold, offer, replace, send_offer, settle, stop_again,
+    Finished, adopt_shown, cancel, hold, offer, replace, send_offer, settle, stop_again,
 };
 use self::needs::{Memory, Need, Now, Silence, decide, is_absent, is_heard, is_held_otherwise};
 use super::missions::transitions::Change;

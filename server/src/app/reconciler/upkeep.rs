@@ -7,7 +7,8 @@ use std::time::Duration;
 use tread_api::ids::SiteId;
 use tread_api::rights::Scope;
 
-use super::jobs::{end_duplicate_agent, push_site, settle};
+use super::foreign::end_duplicate_agent;
+use super::jobs::{push_site, settle};
 use super::needs::{Need, is_heard};
 use super::{Job, Reconciler, key_of, outcomes};
 use crate::app::AppError;
