@@ -30,7 +30,7 @@ const STANDBY_INTERVAL: Duration = Duration::from_millis(250);
 /// Maximum time for an answer about it.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
 /// Maximum time between two looks of a standby at a silent server: PostgreSQL may have stood still itself.
-const LOOK_GAP_MAX: Duration = Duration::from_secs(2);
+const LOOK_GAP_MAX: Duration = Duration::from_secs(1);
 /// Maximum time for an attempt to take the lock: that for a connection and an answer.
 const ATTEMPT_TIMEOUT: Duration = Duration::from_secs(15);
 /// Interval at which the lock is tried while a session ends that holds it.

@@ -25,7 +25,7 @@ use tread_tests::stored::{self, lost_records};
 use tread_tests::wait::{DRIVE, SHORT};
 
 /// Longest time until all robots are online at the other server: after a kill, and after a freeze, of which
-/// the standby waits 3 s.
+/// the standby waits 2 s.
 const KILLED_MAX_S: f64 = 2.0;
 const FROZEN_MAX_S: f64 = 5.0;
 /// Longest time until a server that was woken up has ended.
