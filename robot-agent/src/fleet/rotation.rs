@@ -17,7 +17,7 @@ const PAUSE_MAX: Duration = Duration::from_millis(300);
 const DISTRUSTED_PAUSE_MAX: Duration = Duration::from_secs(10);
 
 /// Time for which a server is passed over that fell silent: it may be a gap of the radio alone.
-const LEFT_FOR: Duration = Duration::from_secs(1);
+const LEFT_FOR: Duration = Duration::from_millis(300);
 /// Time for which a server is passed over that took long to fail.
 const PASSED_OVER: Duration = Duration::from_secs(5);
 /// Duration of an attempt from which it counts as long.
@@ -172,8 +172,8 @@ mod tests {
         rotation.reached();
         rotation.leave(now);
         let (tried, pauses) = attempts(&mut rotation, &mut now, &[0.1; 5]);
-        assert_eq!(tried, "11110");
-        assert_eq!(pauses, [100, 200, 300, 300, 0]);
+        assert_eq!(tried, "11010");
+        assert_eq!(pauses, [100, 200, 0, 300, 0]);
         now += PASSED_OVER;
         // The first takes long, and then the other one does: the first will be tried again sooner.
         let (tried, _) = attempts(
