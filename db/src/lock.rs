@@ -4,7 +4,7 @@ use std::future::pending;
 use std::time::Duration;
 
 use futures_util::future::Either;
-use tread_store_postgres::lock::LockError as InUse;
+use tread_store_postgres::lock::LockError as PostgresLockError;
 
 use super::Location;
 
@@ -58,11 +58,11 @@ impl DatabaseLock {
         let Location::Postgres(address) = location else {
             return Self::take(location).await;
         };
-        let waiting = |reason: &InUse| match reason {
-            InUse::InUse { address, holder } => {
+        let waiting = |reason: &PostgresLockError| match reason {
+            PostgresLockError::InUse { address, holder } => {
                 waiting(&format!("another server{holder} uses `{address}`"));
             }
-            InUse::Open(cause) => waiting(&cause.to_string()),
+            PostgresLockError::Open(cause) => waiting(&cause.to_string()),
         };
         let lock = tread_store_postgres::lock::DatabaseLock::wait(address, silence_max, waiting);
         Ok(Self::Postgres(lock.await?))

@@ -40,30 +40,38 @@ const ENDING_INTERVAL: Duration = Duration::from_millis(100);
 const TAKE: &str = "SELECT pg_try_advisory_lock(8390880524716175990),
     set_config('tcp_keepalives_idle', '10', FALSE), set_config('tcp_keepalives_interval', '5', FALSE),
     set_config('tcp_keepalives_count', '3', FALSE)";
+/// Selects something of the session that has the lock, with further conditions.
+macro_rules! select_owner {
+    ($columns:literal, $further:literal) => {
+        concat!(
+            "SELECT ",
+            $columns,
+            " FROM pg_locks JOIN pg_stat_activity USING (pid)
+            WHERE locktype = 'advisory' AND granted AND objsubid = 1
+                AND database = (SELECT oid FROM pg_database WHERE datname = current_database())
+                AND (CAST(classid AS BIGINT) << 32) | CAST(objid AS BIGINT) = 8390880524716175990 ",
+            $further
+        )
+    };
+}
 /// Ends the session that has the lock, if it is another one of this process.
-const END_OWN: &str = "SELECT pg_terminate_backend(pid)
-    FROM pg_locks JOIN pg_stat_activity USING (pid)
-    WHERE locktype = 'advisory' AND granted AND objsubid = 1
-        AND database = (SELECT oid FROM pg_database WHERE datname = current_database())
-        AND (CAST(classid AS BIGINT) << 32) | CAST(objid AS BIGINT) = 8390880524716175990
-        AND application_name = current_setting('application_name') AND pid <> pg_backend_pid()";
+const END_OWN: &str = select_owner!(
+    "pg_terminate_backend(pid)",
+    "AND application_name = current_setting('application_name') AND pid <> pg_backend_pid()"
+);
 /// Says who has it: address of the client, and since when it is connected.
-const IN_USE_BY: &str = "SELECT COALESCE(host(client_addr), 'this machine'),
-        to_char(backend_start AT TIME ZONE 'UTC', 'YYYY-MM-DD HH24:MI:SS')
-    FROM pg_locks JOIN pg_stat_activity USING (pid)
-    WHERE locktype = 'advisory' AND granted AND objsubid = 1
-        AND database = (SELECT oid FROM pg_database WHERE datname = current_database())
-        AND (CAST(classid AS BIGINT) << 32) | CAST(objid AS BIGINT) = 8390880524716175990
-    LIMIT 1";
+const IN_USE_BY: &str = select_owner!(
+    "COALESCE(host(client_addr), 'this machine'),
+        to_char(backend_start AT TIME ZONE 'UTC', 'YYYY-MM-DD HH24:MI:SS')",
+    "LIMIT 1"
+);
 
 /// Returns the process that has the lock, the number of the session that holds it, and the time of that
 /// session's last statement.
-const OWNER: &str = "SELECT application_name, pid, CAST(state_change AS TEXT)
-    FROM pg_locks JOIN pg_stat_activity USING (pid)
-    WHERE locktype = 'advisory' AND granted AND objsubid = 1
-        AND database = (SELECT oid FROM pg_database WHERE datname = current_database())
-        AND (CAST(classid AS BIGINT) << 32) | CAST(objid AS BIGINT) = 8390880524716175990
-    LIMIT 1";
+const OWNER: &str = select_owner!(
+    "application_name, pid, CAST(state_change AS TEXT)",
+    "LIMIT 1"
+);
 /// Ends all sessions of a process, if one of them has asked nothing since.
 const END_PROCESS: &str = "SELECT COUNT(pg_terminate_backend(pid)) FROM pg_stat_activity
     WHERE datname = current_database() AND application_name = $1 AND pid <> pg_backend_pid()
