@@ -36,6 +36,13 @@ async fn driven_yard() -> Yard {
                 pass.terrain = None;
                 pass.mu_peak_lower_bound = None;
             }
+            if ix == 2 {
+                pass.theta_errors = Some(tread_api::friction::ThetaErrors {
+                    independent_information: 2.5e4,
+                    robot_ratio: 0.0625,
+                    tyre_ratio: 0.25,
+                });
+            }
             if ix == 1 {
                 let layer = tread_api::friction::Information {
                     information: 100.0,
@@ -164,6 +171,14 @@ async fn measurements_are_the_same_as_json_csv_and_parquet() {
         let weighted_theta: f64 = comma["theta_weighted"].parse().unwrap();
         assert_eq!(weighted_theta.to_bits(), weighted.to_bits());
         assert_eq!(comma["ended_at"], stored.segment.ended_at.to_string());
+        let errors = stored.segment.theta_errors;
+        let ratio = errors.map_or(Field::Null, |errors| Field::Double(errors.robot_ratio));
+        assert_eq!(field(row, "theta_robot_error_ratio"), ratio);
+        let ratio = errors.map(|errors| errors.tyre_ratio.to_string());
+        assert_eq!(comma["theta_tyre_error_ratio"], ratio.unwrap_or_default());
+        let independent = errors.map(|errors| errors.independent_information.to_string());
+        let column = &comma["theta_independent_information"];
+        assert_eq!(column, &independent.unwrap_or_default());
     }
     let of_one = format!("{SEGMENTS}?format=csv&robot=rover-2&terrain=lawn");
     let of_one = comma_rows(&fetched(&yard, &of_one).await.1);

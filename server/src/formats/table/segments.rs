@@ -22,6 +22,9 @@ pub const COLUMNS: &[Column] = &[
     some("terrain_revision", Kind::Integer),
     each("theta_information", Kind::Number),
     each("theta_weighted", Kind::Number),
+    some("theta_independent_information", Kind::Number),
+    some("theta_robot_error_ratio", Kind::Number),
+    some("theta_tyre_error_ratio", Kind::Number),
     some("effective_track_ratio_information", Kind::Number),
     some("effective_track_ratio_weighted", Kind::Number),
     some("rolling_resistance_information", Kind::Number),
@@ -59,6 +62,14 @@ pub fn row(entry: &StoredSegment) -> Row {
         Value::optional(terrain, |terrain| Value::Integer(terrain.revision.into())),
     ];
     row.extend(pair(Some(segment.theta)));
+    let errors = segment.theta_errors;
+    row.extend([
+        Value::optional(errors, |errors| {
+            Value::Number(errors.independent_information)
+        }),
+        Value::optional(errors, |errors| Value::Number(errors.robot_ratio)),
+        Value::optional(errors, |errors| Value::Number(errors.tyre_ratio)),
+    ]);
     row.extend(pair(segment.effective_track_ratio));
     row.extend(pair(segment.rolling_resistance));
     row.extend([
