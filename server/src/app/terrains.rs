@@ -78,11 +78,15 @@ impl App {
 
     /// Replaces all of a terrain except its identifier. A request that changes nothing makes no new
     /// revision: measurements on the same ground belong together.
+    ///
+    /// # Errors
+    /// [`AppError::ChangedMeanwhile`] if its revision is another one than `expected`.
     pub async fn replace_terrain(
         &self,
         site: &SiteId,
         id: &TerrainId,
         request: ReplaceTerrain,
+        expected: Option<u64>,
     ) -> Result<Terrain, AppError> {
         let ReplaceTerrain {
             name,
@@ -96,6 +100,7 @@ impl App {
         let Some(present) = db::terrains::find(&mut tx, site_pk, id).await? else {
             return Err(AppError::UnknownTerrain(site.clone(), id.clone()));
         };
+        check_revision(&present, expected)?;
         let is_same = (
             &present.name,
             present.class,
@@ -133,16 +138,38 @@ impl App {
     }
 
     /// Deletes a terrain; measurements made on it are kept.
-    pub async fn delete_terrain(&self, site: &SiteId, id: &TerrainId) -> Result<(), AppError> {
+    ///
+    /// # Errors
+    /// [`AppError::ChangedMeanwhile`] if its revision is another one than `expected`.
+    pub async fn delete_terrain(
+        &self,
+        site: &SiteId,
+        id: &TerrainId,
+        expected: Option<u64>,
+    ) -> Result<(), AppError> {
         let mut tx = self.db().write("terrains").await?;
         let site_pk = site_row(&mut tx, site).await?.pk;
-        if !db::terrains::delete(&mut tx, site_pk, id).await? {
+        let Some(present) = db::terrains::find(&mut tx, site_pk, id).await? else {
             return Err(AppError::UnknownTerrain(site.clone(), id.clone()));
-        }
+        };
+        check_revision(&present, expected)?;
+        db::terrains::delete(&mut tx, site_pk, id).await?;
         db::sites::count_terrain_change(&mut tx, site_pk).await?;
         tx.commit().await?;
         self.wake();
         Ok(())
+    }
+}
+
+fn check_revision(present: &Terrain, expected: Option<u64>) -> Result<(), AppError> {
+    let revision = u64::from(present.revision);
+    match expected.filter(|&expected| expected != revision) {
+        Some(expected) => Err(AppError::ChangedMeanwhile {
+            what: "terrain",
+            present: revision,
+            expected,
+        }),
+        None => Ok(()),
     }
 }
 

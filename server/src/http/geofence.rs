@@ -1,14 +1,15 @@
 //! `/v1/sites/{site}/geofence`.
 
 use axum::extract::State;
-use axum::http::{HeaderMap, header};
-use axum::response::{IntoResponse, Response};
+use axum::http::{HeaderMap, StatusCode};
+use axum::response::Response;
 use tread_api::ids::SiteId;
-use tread_api::problem::{ProblemBody, ProblemType};
+use tread_api::problem::ProblemBody;
 use tread_api::safety::{Geofence, ReplaceGeofence};
 
 use super::extract::{Json, Path};
 use super::problem::Problem;
+use super::revision;
 use crate::app::App;
 
 /// Get the geofence of a site.
@@ -41,29 +42,12 @@ pub(super) async fn replace(
     headers: HeaderMap,
     Json(request): Json<ReplaceGeofence>,
 ) -> Result<Response, Problem> {
-    let expected = expected(&headers)?;
+    let expected = revision::expected(&headers)?;
     Ok(tagged(
         app.replace_geofence(&site, request, expected).await?,
     ))
 }
 
 fn tagged(geofence: Geofence) -> Response {
-    let tag = format!("\"{}\"", geofence.revision);
-    ([(header::ETAG, tag)], Json(geofence)).into_response()
-}
-
-fn expected(headers: &HeaderMap) -> Result<Option<u64>, Problem> {
-    let Some(tag) = headers.get(header::IF_MATCH) else {
-        return Ok(None);
-    };
-    let text = tag.to_str().unwrap_or_default().trim().trim_matches('"');
-    if text == "*" {
-        return Ok(None);
-    }
-    let wrong = |_error| {
-        Problem::new(ProblemType::InvalidHeader)
-            .detail("If-Match is the revision, as in the ETag")
-            .field("if-match")
-    };
-    text.parse().map(Some).map_err(wrong)
+    revision::tagged(StatusCode::OK, geofence.revision, geofence)
 }

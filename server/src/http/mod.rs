@@ -19,6 +19,7 @@ mod missions;
 mod negotiate;
 mod page;
 pub mod problem;
+mod revision;
 mod robots;
 pub mod serve;
 mod sites;

@@ -1,7 +1,8 @@
 //! `/v1/sites/{site}/terrains`.
 
 use axum::extract::State;
-use axum::http::StatusCode;
+use axum::http::{HeaderMap, StatusCode};
+use axum::response::Response;
 use tread_api::ids::{SiteId, TerrainId};
 use tread_api::page::Page;
 use tread_api::problem::ProblemBody;
@@ -9,6 +10,7 @@ use tread_api::terrain::{CreateTerrain, ReplaceTerrain, Terrain};
 
 use super::extract::{Json, Path, Query, page_limit};
 use super::problem::Problem;
+use super::revision;
 use super::sites::PageQuery;
 use crate::app::App;
 
@@ -36,8 +38,9 @@ pub(super) async fn list(
 pub(super) async fn get(
     State(app): State<App>,
     Path((site, terrain)): Path<(SiteId, TerrainId)>,
-) -> Result<Json<Terrain>, Problem> {
-    Ok(Json(app.terrain(&site, &terrain).await?))
+) -> Result<Response, Problem> {
+    let found = app.terrain(&site, &terrain).await?;
+    Ok(tagged(StatusCode::OK, found))
 }
 
 /// Create a terrain.
@@ -51,39 +54,53 @@ pub(super) async fn create(
     State(app): State<App>,
     Path(site): Path<SiteId>,
     Json(request): Json<CreateTerrain>,
-) -> Result<(StatusCode, Json<Terrain>), Problem> {
-    Ok((
-        StatusCode::CREATED,
-        Json(app.create_terrain(&site, request).await?),
-    ))
+) -> Result<Response, Problem> {
+    let created = app.create_terrain(&site, request).await?;
+    Ok(tagged(StatusCode::CREATED, created))
 }
 
 /// Replace a terrain.
+///
+/// With `If-Match`, only if the revision is still that one.
 #[utoipa::path(put, path = "/v1/sites/{site}/terrains/{terrain}", tag = "terrains",
     security(("token" = ["configure"])),
     operation_id = "replace_terrain",
-    params(("site" = SiteId, Path), ("terrain" = TerrainId, Path)),
+    params(("site" = SiteId, Path), ("terrain" = TerrainId, Path),
+        ("if-match" = Option<String>, Header, description = "The revision that is replaced")),
     request_body = ReplaceTerrain,
     responses((status = 200, body = Terrain), (status = 404, body = ProblemBody),
-        (status = 422, body = ProblemBody)))]
+        (status = 412, body = ProblemBody), (status = 422, body = ProblemBody)))]
 pub(super) async fn replace(
     State(app): State<App>,
     Path((site, terrain)): Path<(SiteId, TerrainId)>,
+    headers: HeaderMap,
     Json(request): Json<ReplaceTerrain>,
-) -> Result<Json<Terrain>, Problem> {
-    Ok(Json(app.replace_terrain(&site, &terrain, request).await?))
+) -> Result<Response, Problem> {
+    let expected = revision::expected(&headers)?;
+    let replacing = app.replace_terrain(&site, &terrain, request, expected);
+    Ok(tagged(StatusCode::OK, replacing.await?))
 }
 
 /// Delete a terrain; its measurements stay.
+///
+/// With `If-Match`, only if the revision is still that one.
 #[utoipa::path(delete, path = "/v1/sites/{site}/terrains/{terrain}", tag = "terrains",
     security(("token" = ["configure"])),
     operation_id = "delete_terrain",
-    params(("site" = SiteId, Path), ("terrain" = TerrainId, Path)),
-    responses((status = 204), (status = 404, body = ProblemBody)))]
+    params(("site" = SiteId, Path), ("terrain" = TerrainId, Path),
+        ("if-match" = Option<String>, Header, description = "The revision that is deleted")),
+    responses((status = 204), (status = 404, body = ProblemBody),
+        (status = 412, body = ProblemBody)))]
 pub(super) async fn delete(
     State(app): State<App>,
     Path((site, terrain)): Path<(SiteId, TerrainId)>,
+    headers: HeaderMap,
 ) -> Result<StatusCode, Problem> {
-    app.delete_terrain(&site, &terrain).await?;
+    let expected = revision::expected(&headers)?;
+    app.delete_terrain(&site, &terrain, expected).await?;
     Ok(StatusCode::NO_CONTENT)
+}
+
+fn tagged(status: StatusCode, terrain: Terrain) -> Response {
+    revision::tagged(status, terrain.revision.into(), terrain)
 }

@@ -113,6 +113,57 @@ async fn a_terrain_that_is_saved_unchanged_keeps_its_revision() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_terrain_that_changed_meanwhile_is_neither_replaced_nor_deleted() {
+    let yard = Yard::start().await;
+    let polygon = json!([{"x_m": 0, "y_m": 0}, {"x_m": 9, "y_m": 0}, {"x_m": 0, "y_m": 9}]);
+    let body = json!({"id": "lawn", "class": "grass", "polygon": polygon});
+    let request = yard.client().post(yard.url("/v1/sites/yard/terrains"));
+    let created = request.json(&body).send().await.unwrap();
+    assert_eq!(created.status(), StatusCode::CREATED);
+    let tag = created.headers()[reqwest::header::ETAG]
+        .to_str()
+        .unwrap()
+        .to_owned();
+    assert_eq!(tag, "\"1\"");
+
+    let path = "/v1/sites/yard/terrains/lawn";
+    let put = |class: &str, tag: &str| {
+        let request = yard
+            .client()
+            .put(yard.url(path))
+            .header("if-match", tag.to_owned());
+        request.json(&json!({"class": class, "polygon": polygon}))
+    };
+    assert_eq!(yard.send(put("gravel", &tag)).await.0, StatusCode::OK);
+    let (status, said) = yard.send(put("ice", &tag)).await;
+    assert_eq!(status, StatusCode::PRECONDITION_FAILED, "{said}");
+    assert!(
+        said["detail"].as_str().unwrap().contains("terrain"),
+        "{said}"
+    );
+    let delete = |tag: &str| {
+        let request = yard.client().delete(yard.url(path));
+        request.header("if-match", tag.to_owned())
+    };
+    let (status, said) = yard.send(delete(&tag)).await;
+    assert_eq!(status, StatusCode::PRECONDITION_FAILED, "{said}");
+    let present = yard.client().get(yard.url(path)).send().await.unwrap();
+    let tag = present.headers()[reqwest::header::ETAG]
+        .to_str()
+        .unwrap()
+        .to_owned();
+    assert_eq!(tag, "\"2\"");
+    assert_eq!(present.json::<Value>().await.unwrap()["class"], "gravel");
+    assert_eq!(
+        yard.send(put("ice", "W/\"2\"")).await.0,
+        StatusCode::BAD_REQUEST
+    );
+    assert_eq!(yard.send(delete(&tag)).await.0, StatusCode::NO_CONTENT);
+    assert_eq!(yard.send(put("ice", "*")).await.0, StatusCode::NOT_FOUND);
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_robot_shows_with_its_link_and_a_new_terrain_reaches_it() {
     let yard = Yard::start().await;
     let robot = Robot::join(&yard, "rover-1").await;
