@@ -9,6 +9,7 @@ use super::{DbError, Tx, forward};
 forward! {
     sums;
     fn each(take: impl FnMut(SumRow)) -> ();
+    fn of_block(site_pk: i64, block: (i32, i32), take: impl FnMut(SumRow)) -> ();
     fn unmerged(limit: u32) -> Vec<StoredHour>;
     fn of_hour(hour: (i64, i64), limit: usize) -> Vec<SumRow>;
     fn remove(key: &SumKey) -> bool;

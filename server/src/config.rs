@@ -104,6 +104,8 @@ pub struct Config {
     pub retention: RetentionConfig,
     /// Limits of the storage.
     pub storage: StorageConfig,
+    /// Memory for the friction map.
+    pub map: MapConfig,
     /// Certificate of the REST API; `None` serves plain HTTP on a loopback address.
     pub tls: Option<TlsSource>,
     /// Host names, origins and proxies of the REST API.
@@ -310,6 +312,40 @@ impl StorageConfig {
     }
 }
 
+/// `[map]`: memory for the friction map.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct MapConfig {
+    /// Maximum memory for the cells of the map in MiB, within [`MAP_MEMORY_MAX_MIB_RANGE`]; cells
+    /// beyond it are read from the database when they are needed.
+    pub memory_max_mib: u64,
+}
+
+/// Range of the maximum memory for the map, in MiB.
+pub const MAP_MEMORY_MAX_MIB_RANGE: std::ops::RangeInclusive<u64> = 64..=1_000_000_000;
+
+impl Default for MapConfig {
+    fn default() -> Self {
+        Self {
+            memory_max_mib: 4_096,
+        }
+    }
+}
+
+impl MapConfig {
+    #[expect(clippy::cast_precision_loss, reason = "for a message")]
+    fn check(self) -> Result<(), ConfigError> {
+        if MAP_MEMORY_MAX_MIB_RANGE.contains(&self.memory_max_mib) {
+            return Ok(());
+        }
+        Err(ConfigError::OutOfRange {
+            key: "map.memory_max_mib",
+            range: "64 to 1e9",
+            value: self.memory_max_mib as f64,
+        })
+    }
+}
+
 /// Checks the ranges of `[friction]`.
 fn check_friction(friction: FrictionConfig) -> Result<(), ConfigError> {
     let FrictionConfig {
@@ -382,6 +418,8 @@ struct File {
     retention: RetentionConfig,
     #[serde(default)]
     storage: StorageConfig,
+    #[serde(default)]
+    map: MapConfig,
     tls: Option<TlsSource>,
     #[serde(default)]
     web: WebConfig,
@@ -537,6 +575,7 @@ impl Config {
             normalisations: normalisations(file.normalisations)?,
             retention: file.retention,
             storage: file.storage,
+            map: file.map,
             tls: file.tls,
             web: file.web,
             audit: file.audit,
@@ -624,6 +663,7 @@ impl Config {
         }
         self.retention.check()?;
         self.storage.check()?;
+        self.map.check()?;
         self.webhooks.check()?;
         self.tracing.check()?;
         if let Some(backup) = &self.backup {

@@ -69,7 +69,7 @@ use self::archive::SegmentArchive;
 use self::authority::Authorities;
 use self::clock::Clock;
 pub use self::config::{Config, ServerArgs};
-use self::config::{RobotsConfig, TlsSource};
+use self::config::{RetentionConfig, RobotsConfig, TlsSource};
 use self::db::lock::{DatabaseLock, LockError};
 use self::db::{Db, DbError, Engine, Location};
 use self::fleet::{Fleet, Security};
@@ -152,13 +152,15 @@ impl Server {
             .map(|oidc| People::new(oidc, clock.clone()))
             .transpose()?;
         let archive = config.retention.archive.clone();
-        let archive = archive.map(|location| SegmentArchive::new(location, db.path()));
-        let archive = archive.transpose()?;
+        let archive = archive
+            .map(|to| SegmentArchive::new(to, db.path()))
+            .transpose()?;
         let app = App::new(Dependencies {
             db,
             clock,
             friction: config.friction,
             storage: config.storage,
+            map: config.map,
             normalisations: config.normalisations,
             robots: fleet.robot_link(),
             enrolment: security
@@ -183,11 +185,9 @@ impl Server {
         supervisor.spawn_vital("events", events::run(app.clone(), stop()));
         let asking = app::watched::run(app.clone(), stop());
         supervisor.spawn_vital("watched robots", asking);
-        look_after_database(&app, &supervisor);
+        look_after_database(&app, config.retention, &supervisor);
         let telling = app::friction::live::run(app.clone(), stop());
         supervisor.spawn_vital("map", telling);
-        let removing = retention::run(app.clone(), config.retention, stop());
-        supervisor.spawn_vital("retention", removing);
         supervisor.spawn_vital("audit", audit::run(app.clone(), stop()));
         supervisor.spawn_vital("tokens", app::identity::run(app.clone(), stop()));
         let finding = app::identity::people::run(app.clone(), stop());
@@ -315,13 +315,16 @@ fn backup_schedule(config: &Config) -> Option<backups::Schedule> {
 }
 
 /// Starts the tasks that maintain the database and keep the state in memory consistent with it.
-fn look_after_database(app: &App, supervisor: &Supervisor) {
+fn look_after_database(app: &App, retention: RetentionConfig, supervisor: &Supervisor) {
     let stop = || supervisor.stop_token();
     supervisor.spawn_vital("memory", memory::run(app.clone(), stop()));
     supervisor.spawn_vital("checkpoints", checkpoints::run(app.clone(), stop()));
     supervisor.spawn_vital("storage", storage::run(app.clone(), stop()));
     supervisor.spawn_vital("merging", merging::run(app.clone(), stop()));
     supervisor.spawn_vital("sums", sums::run(app.clone(), stop()));
+    supervisor.spawn_vital("map blocks", app::map_blocks::run(app.clone(), stop()));
+    let removing = retention::run(app.clone(), retention, stop());
+    supervisor.spawn_vital("retention", removing);
 }
 
 /// Loads the state in memory from the database.

@@ -28,6 +28,37 @@ pub async fn each(db: &mut Connection, mut take: impl FnMut(SumRow)) -> Result<(
     Ok(())
 }
 
+/// Calls `take` with every sum of a block of a site's cells, given by its row and column, in no
+/// particular order, one at a time.
+pub async fn of_block(
+    db: &mut Connection,
+    site_pk: i64,
+    (row, column): (i32, i32),
+    mut take: impl FnMut(SumRow),
+) -> Result<(), EngineError> {
+    let mut rows = sqlx::query_as!(
+        RawSum,
+        r#"SELECT site_pk AS "site_pk!", ix AS "ix!", iy AS "iy!", grid_revision AS "grid_revision!",
+               terrain AS "terrain!", terrain_revision AS "terrain_revision!",
+               robot_pk AS "robot_pk!", configuration_pk AS "configuration_pk!",
+               epoch_h AS "epoch_h!", information_hi, information_lo, weighted_hi, weighted_lo,
+               square_hi, square_lo, track_information_hi, track_information_lo,
+               track_weighted_hi, track_weighted_lo, rolling_information_hi,
+               rolling_information_lo, rolling_weighted_hi, rolling_weighted_lo, segments,
+               samples, mu_peak, newest_at_us, newest_information, newest_weighted, newest_mu,
+               pass_at_us, robot_error_hi, robot_error_lo, tyre_error_hi, tyre_error_lo
+           FROM cell_sums WHERE site_pk = $1 AND iy >> 6 = $2 AND ix >> 6 = $3"#,
+        site_pk,
+        i64::from(row),
+        i64::from(column),
+    )
+    .fetch(db);
+    while let Some(raw) = rows.try_next().await? {
+        take(SumRow::try_from(raw)?);
+    }
+    Ok(())
+}
+
 /// Returns at most `limit` sums of one robot and hour, in the order of the table.
 pub async fn of_hour(
     db: &mut Connection,

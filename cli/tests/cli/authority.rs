@@ -10,7 +10,7 @@ use tread_api::rights::Scope;
 use tread_server::app::identity::tokens::FirstAdmin;
 use tread_server::authority::Authority;
 use tread_server::config::{
-    FrictionConfig, RetentionConfig, RobotsConfig, StorageConfig, WebConfig,
+    FrictionConfig, MapConfig, RetentionConfig, RobotsConfig, StorageConfig, WebConfig,
 };
 use tread_server::{Config, RunningServer, Server};
 
@@ -37,6 +37,7 @@ impl ServerWithRobots {
             friction: FrictionConfig::default(),
             retention: RetentionConfig::default(),
             storage: StorageConfig::default(),
+            map: MapConfig::default(),
             normalisations: Vec::new(),
             tls: None,
             robots: Some(RobotsConfig {

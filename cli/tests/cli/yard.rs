@@ -10,7 +10,7 @@ use tread_agent::{Agent, AgentConfig, RunningAgent};
 use tread_server::app::identity::tokens::FirstAdmin;
 use tread_server::config::webhooks::WebhooksConfig;
 use tread_server::config::{
-    FrictionConfig, RetentionConfig, StorageConfig, TlsFiles, TlsSource, WebConfig,
+    FrictionConfig, MapConfig, RetentionConfig, StorageConfig, TlsFiles, TlsSource, WebConfig,
 };
 use tread_server::{Config, RunningServer, Server};
 
@@ -44,6 +44,7 @@ impl Yard {
             friction: FrictionConfig::default(),
             retention: RetentionConfig::default(),
             storage: StorageConfig::default(),
+            map: MapConfig::default(),
             normalisations: Vec::new(),
             tls: Some(TlsSource::Files(TlsFiles {
                 certificate: at("cert.pem"),

@@ -9,7 +9,7 @@ use super::robot_link::RobotLink;
 use crate::archive::SegmentArchive;
 use crate::clock::Clock;
 use crate::config::webhooks::WebhooksConfig;
-use crate::config::{AuditConfig, FrictionConfig, StorageConfig};
+use crate::config::{AuditConfig, FrictionConfig, MapConfig, StorageConfig};
 use crate::db::Db;
 use crate::friction::index::Normalisation;
 use crate::supervisor::Supervisor;
@@ -39,6 +39,8 @@ pub struct Dependencies {
     pub audit: AuditConfig,
     /// Archive of raw measurements; without it old ones are only removed.
     pub archive: Option<SegmentArchive>,
+    /// Memory for the map.
+    pub map: MapConfig,
     /// Sender of traces of missions; its default sends none.
     pub telemetry: Telemetry,
 }
@@ -59,6 +61,7 @@ impl Dependencies {
             people: None,
             audit: AuditConfig::default(),
             archive: None,
+            map: MapConfig::default(),
             telemetry: Telemetry::default(),
         }
     }

@@ -227,6 +227,18 @@ pub enum AppError {
         /// What is wrong.
         detail: String,
     },
+    /// An answer needs more of the map in memory at once than one request may have.
+    #[error(
+        "this would need more than {mib_max} MiB of the map at once: ask for less ground, or raise \
+         `memory_max_mib` in the server's `[map]`"
+    )]
+    LookTooLarge {
+        /// What one request may have, MiB.
+        mib_max: usize,
+    },
+    /// Nobody waits for the answer any more.
+    #[error("nobody waits for the answer")]
+    Abandoned,
     /// The answer cannot be encoded in the requested format.
     #[error("the answer cannot be written: {0}")]
     Unwritable(String),
@@ -307,6 +319,8 @@ impl AppError {
             | Self::KeyInFlight
             | Self::KeyReused
             | Self::TooMany { .. }
+            | Self::LookTooLarge { .. }
+            | Self::Abandoned
             | Self::Unwritable(_)
             | Self::Archive(_)
             | Self::Storage(_) => None,

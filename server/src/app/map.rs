@@ -1,23 +1,29 @@
 //! The friction map in memory: the stored sums, and those that are stored behind the receipts
-//! ([`unwritten`]). It is loaded at the start and changed with each commit.
+//! ([`unwritten`]). It is loaded at the start and changed with each commit. The cells of some blocks
+//! are in memory, as far as `[map] memory_max_mib` allows ([`blocks`]).
 //!
 //! To change sums, a task takes the [`MapTurn`], writes, and commits with [`MapTurn::commit`]:
 //! commit and change in memory are one task, which cancellation of the caller does not interrupt.
 //! After a commit of unknown outcome no turn is given until memory was read again (see
 //! [`super::memory`]).
 
+pub mod blocks;
 mod reading;
 mod unwritten;
 pub mod writing;
 
 use std::collections::{HashMap, HashSet};
 use std::sync::{Arc, Mutex as StdMutex, MutexGuard, PoisonError, RwLock};
+use std::time::Duration;
 
 use tokio::sync::{Mutex, OwnedMutexGuard};
 use tread_api::ids::{ConfigurationId, RobotId};
 use tread_api::robot::Alert;
 use tread_api::site::Cell;
 
+pub use self::blocks::BlockCounts;
+pub(super) use self::blocks::Pins;
+use self::blocks::{BlockMemory, KeyNames};
 use self::unwritten::Unwritten;
 pub use self::unwritten::UnwrittenCounts;
 use super::App;
@@ -30,15 +36,23 @@ use crate::friction::index::{Labelled, SiteMap};
 use crate::friction::{Horizons, Sums};
 
 /// The maps of all sites.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct Maps {
-    sites: RwLock<HashMap<i64, SiteMap>>,
-    /// Changes only while `order` is held.
+    sites: RwLock<Sites>,
+    /// Changes only while `order` is held. Locked after `sites`.
     unwritten: StdMutex<Unwritten>,
     /// Held from before a transaction that changes sums until memory shows the change, so that
     /// database and memory change in the same order. Its value is the number of commits of unknown
     /// outcome at the last reading of memory.
     order: Arc<Mutex<u64>>,
+    memory: BlockMemory,
+}
+
+/// The map of each site by its key.
+#[derive(Debug, Default)]
+struct Sites {
+    maps: HashMap<i64, SiteMap>,
+    names: KeyNames,
 }
 
 /// Exclusive right to change sums, in the database and then in memory.
@@ -110,22 +124,32 @@ impl MapTurn {
 }
 
 impl Maps {
+    /// Creates maps whose blocks of cells take at most about `memory_max_mib` MiB of memory.
+    pub(super) fn new(memory_max_mib: u64) -> Self {
+        Self {
+            sites: RwLock::default(),
+            unwritten: StdMutex::default(),
+            order: Arc::default(),
+            memory: BlockMemory::new(memory_max_mib),
+        }
+    }
+
     /// Creates a site's map if it does not exist.
     pub(super) fn ensure(&self, row: &SiteRow) {
         let mut sites = self.sites.write().unwrap_or_else(PoisonError::into_inner);
-        ensure(&mut sites, row);
+        sites.ensure(row);
     }
 
     /// Changes a site's map.
     fn change(&self, row: &SiteRow, change: impl FnOnce(&mut SiteMap)) {
         let mut sites = self.sites.write().unwrap_or_else(PoisonError::into_inner);
-        change(ensure(&mut sites, row));
+        change(sites.ensure(row));
     }
 
     /// Reads a site's map; an empty one if it does not exist.
     pub(super) fn look<T>(&self, row: &SiteRow, look: impl FnOnce(&SiteMap) -> T) -> T {
         let sites = self.sites.read().unwrap_or_else(PoisonError::into_inner);
-        match sites.get(&row.pk) {
+        match sites.maps.get(&row.pk) {
             Some(map) => look(map),
             None => look(&SiteMap::new(row.site.grid.revision, row.horizons)),
         }
@@ -136,34 +160,64 @@ impl Maps {
             .lock()
             .unwrap_or_else(PoisonError::into_inner)
     }
+
+    /// Adds sums to the unwritten ones and to their maps. Both at once, so that a block that is read
+    /// meanwhile has them once.
+    fn add(&self, folded: &[Folded], added: Added, now: Duration) {
+        let mut sites = self.sites.write().unwrap_or_else(PoisonError::into_inner);
+        let sums = folded.iter().map(|part| (&part.key, &*part.cells));
+        self.unwritten().add(sums, added, now);
+        sites.add(folded, SiteMap::add_cells);
+        self.memory.wake_if_full(&sites);
+    }
 }
 
-fn ensure<'maps>(sites: &'maps mut HashMap<i64, SiteMap>, row: &SiteRow) -> &'maps mut SiteMap {
-    sites
-        .entry(row.pk)
-        .or_insert_with(|| SiteMap::new(row.site.grid.revision, row.horizons))
-}
+impl Sites {
+    fn ensure(&mut self, row: &SiteRow) -> &mut SiteMap {
+        self.maps
+            .entry(row.pk)
+            .or_insert_with(|| SiteMap::new(row.site.grid.revision, row.horizons))
+    }
 
-/// Adds sums to their maps.
-fn add(sites: &mut HashMap<i64, SiteMap>, folded: &[Folded]) {
-    for Folded {
-        key,
-        robot,
-        configuration,
-        cells,
-    } in folded
-    {
-        if let Some(map) = sites.get_mut(&key.site_pk) {
-            let labelled = Labelled {
-                cell: key.cell,
-                grid_revision: key.grid_revision,
-                terrain: &key.terrain,
-                configuration: *configuration,
+    /// Returns about how many bytes the cells of all maps take.
+    fn bytes(&self) -> usize {
+        self.maps.values().map(|map| map.size().1).sum()
+    }
+
+    /// Adds sums to their maps.
+    fn add(
+        &mut self,
+        folded: &[Folded],
+        add: impl Fn(&mut SiteMap, Labelled<'_>, &[(Cell, Sums)]),
+    ) {
+        for part in folded {
+            let Folded {
+                key,
                 robot,
-                epoch_h: key.epoch_h,
-            };
-            map.add_cells(labelled, cells);
+                configuration,
+                cells,
+            } = part;
+            self.names.note(part);
+            if let Some(map) = self.maps.get_mut(&key.site_pk) {
+                add(map, labelled(key, robot, *configuration), cells);
+            }
         }
+    }
+}
+
+/// Returns the labels of a sum.
+fn labelled<'names>(
+    key: &'names SumKey,
+    robot: &'names RobotId,
+    configuration: ConfigurationId,
+) -> Labelled<'names> {
+    Labelled {
+        cell: key.cell,
+        grid_revision: key.grid_revision,
+        terrain: &key.terrain,
+        configuration,
+        robot,
+        epoch_h: key.epoch_h,
     }
 }
 
@@ -186,11 +240,7 @@ impl App {
             MapChange::Nothing => {}
             MapChange::Add(folded, added) => {
                 if !folded.is_empty() {
-                    let sums = folded.iter().map(|part| (&part.key, &*part.cells));
-                    let now = self.clock().elapsed();
-                    self.maps().unwritten().add(sums, added, now);
-                    let sites = self.maps().sites.write();
-                    add(&mut sites.unwrap_or_else(PoisonError::into_inner), &folded);
+                    self.maps().add(&folded, added, self.clock().elapsed());
                 }
             }
             MapChange::Store(steps) => self.maps().unwritten().written(&steps),

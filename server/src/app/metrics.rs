@@ -85,6 +85,7 @@ impl App {
         let mut registry = Registry::default();
         self.register_storage(&mut registry);
         self.register_sums(&mut registry);
+        self.register_map_blocks(&mut registry);
         // Metrics from memory are shown also while the database cannot be read.
         for registered in [
             self.register_fleet(&mut registry).await,
@@ -191,6 +192,30 @@ impl App {
         let age = ConstGauge::new(age.unwrap_or_default().as_secs_f64());
         let help = "Age of the oldest of these sums";
         registry.register_with_unit("tread_map_sums_unwritten_age", help, Unit::Seconds, age);
+    }
+
+    /// Registers the blocks of the map's cells.
+    fn register_map_blocks(&self, registry: &mut Registry) {
+        let blocks = self.map_blocks();
+        let help = "Blocks of 64 by 64 cells of the map with measurements";
+        let driven = ConstGauge::new(count(blocks.driven));
+        registry.register("tread_map_blocks", help, driven);
+        let help = "Blocks of the map whose cells are in memory";
+        let in_memory = ConstGauge::new(count(blocks.in_memory));
+        registry.register("tread_map_blocks_in_memory", help, in_memory);
+        let help = "Memory of the map's cells, about";
+        let bytes = ConstGauge::new(count(blocks.bytes));
+        registry.register_with_unit("tread_map_cells", help, Unit::Bytes, bytes);
+        let help =
+            "Blocks of the map that were read from the database because a request needed them";
+        registry.register(
+            "tread_map_blocks_read",
+            help,
+            ConstCounter::new(blocks.read),
+        );
+        let help = "Blocks of the map that left memory because others needed the room";
+        let evicted = ConstCounter::new(blocks.evicted);
+        registry.register("tread_map_blocks_evicted", help, evicted);
     }
 
     /// Registers version, commit and schema.

@@ -59,10 +59,10 @@ pub use self::dependencies::Dependencies;
 use self::enrolment::Membership;
 pub use self::error::AppError;
 use self::events::Hub;
-use self::friction::{MapNews, Pictures, Timelines, Views};
+use self::friction::{CellCounts, LookTurns, MapNews, Pictures, Timelines, Views};
 use self::identity::Identity;
 use self::map::Maps;
-pub use self::map::{UnwrittenCounts, writing as sums};
+pub use self::map::{BlockCounts, UnwrittenCounts, blocks as map_blocks, writing as sums};
 use self::missions::idempotency::InFlight;
 use self::missions::immediate_offer::JustOffered;
 use self::presence::Presences;
@@ -119,7 +119,8 @@ struct Inner {
     run_id: Uuid,
     started_at: Duration,
     normalisations: Vec<Arc<Normalisation>>,
-    map_readers: Semaphore,
+    look_turns: LookTurns,
+    cell_counts: CellCounts,
     pictures: Pictures,
     timelines: Timelines,
     views: Views,
@@ -154,6 +155,7 @@ impl App {
             people,
             audit,
             archive,
+            map,
             telemetry,
         } = dependencies;
         let started_at = clock.elapsed();
@@ -183,14 +185,15 @@ impl App {
             recalls: AtomicU64::new(0),
             checks: Semaphore::new(check::CHECKS_MAX),
             identity: Identity::new(people, audit),
-            maps: Maps::default(),
+            maps: Maps::new(map.memory_max_mib),
             membership: Membership::new(enrolment),
             metrics: Metrics::default(),
             robots_generation: AtomicU64::new(1),
             run_id,
             started_at,
             normalisations: normalisations.into_iter().map(Arc::new).collect(),
-            map_readers: Semaphore::new(friction::MAP_READERS_MAX),
+            look_turns: LookTurns::default(),
+            cell_counts: CellCounts::default(),
             pictures: Pictures::default(),
             timelines: Timelines::default(),
             views: Views::default(),
@@ -316,9 +319,12 @@ impl App {
         self.inner.checks.acquire().await.ok()
     }
 
-    /// Waits for a turn to read the map. `None` cannot occur, since the semaphore is never closed.
-    async fn map_turn(&self) -> Option<SemaphorePermit<'_>> {
-        self.inner.map_readers.acquire().await.ok()
+    fn look_turns(&self) -> &LookTurns {
+        &self.inner.look_turns
+    }
+
+    fn cell_counts(&self) -> &CellCounts {
+        &self.inner.cell_counts
     }
 
     fn pictures(&self) -> &Pictures {

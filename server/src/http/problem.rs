@@ -166,7 +166,10 @@ impl From<AppError> for Problem {
             AppError::KeyReused => ProblemType::IdempotencyKeyReused,
             AppError::TooMany { .. } => ProblemType::TooMany,
             AppError::Invalid { .. } => ProblemType::InvalidBody,
-            AppError::InvalidQuery { .. } => ProblemType::InvalidQuery,
+            AppError::InvalidQuery { .. } | AppError::LookTooLarge { .. } => {
+                ProblemType::InvalidQuery
+            }
+            AppError::Abandoned => ProblemType::Unavailable,
             AppError::NoRandomness(_) | AppError::Unwritable(_) | AppError::AuthorityFiles(_) => {
                 error!("a request failed: {app_error}");
                 ProblemType::Internal

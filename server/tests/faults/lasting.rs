@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use serde_json::Value;
 use tread_server::app::identity::tokens::FirstAdmin;
-use tread_server::config::{FrictionConfig, RetentionConfig, StorageConfig, WebConfig};
+use tread_server::config::{FrictionConfig, MapConfig, RetentionConfig, StorageConfig, WebConfig};
 use tread_server::db::stops::StopFilter;
 use tread_server::{Config, RunningServer, Server};
 
@@ -196,6 +196,7 @@ fn config(folder: &std::path::Path) -> Config {
         normalisations: Vec::new(),
         retention: RetentionConfig::default(),
         storage: StorageConfig::default(),
+        map: MapConfig::default(),
         tls: None,
         robots: None,
         oidc: None,

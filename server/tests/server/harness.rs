@@ -26,7 +26,7 @@ use tread_server::authority::Authority;
 use tread_server::clock::Clock;
 use tread_server::config::webhooks::WebhooksConfig;
 use tread_server::config::{
-    FrictionConfig, RobotsConfig, StorageConfig, TlsFiles, TlsSource, WebConfig,
+    FrictionConfig, MapConfig, RobotsConfig, StorageConfig, TlsFiles, TlsSource, WebConfig,
 };
 use tread_server::counters::CounterValues;
 use tread_server::webhooks::Resolver;
@@ -236,9 +236,19 @@ impl Yard {
 
     /// The same with a clock that stands at another time.
     pub(crate) async fn restart_at(self, wall: Timestamp) -> Self {
+        self.restart_configured_at(wall, |_| {}).await
+    }
+
+    /// The same with a configuration of one's own.
+    pub(crate) async fn restart_configured_at(
+        self,
+        wall: Timestamp,
+        change: impl FnOnce(&mut Config),
+    ) -> Self {
         let zenoh = self.server.zenoh_endpoint();
         self.server.stop().await.unwrap();
-        let config = config(self.folder.path(), zenoh.trim_start_matches("tcp/"));
+        let mut config = config(self.folder.path(), zenoh.trim_start_matches("tcp/"));
+        change(&mut config);
         let server = Server::start_with_clock(config, Clock::manual(wall));
         Self::of(self.folder, server.await.unwrap()).await
     }
@@ -319,6 +329,8 @@ pub(crate) fn config(folder: &Path, zenoh: &str) -> Config {
         normalisations: Vec::new(),
         retention: tread_server::config::RetentionConfig::default(),
         storage: StorageConfig::default(),
+        // Each answer is read from the database, with the sums that are not stored yet.
+        map: MapConfig { memory_max_mib: 0 },
         tls: None,
         robots: None,
         oidc: None,

@@ -13,9 +13,10 @@ use tread_api::page::Page;
 use tread_api::wire::hello::Hello;
 use tread_api::wire::ingest::{Batch, Receipt, Record};
 use tread_server::app::ingest::{self, UPLOADS_WAITING_MAX, Upload};
-use tread_server::app::{App, Dependencies};
+use tread_server::app::{App, Dependencies, map_blocks};
 use tread_server::archive::SegmentArchive;
 use tread_server::clock::Clock;
+use tread_server::config::MapConfig;
 use tread_server::db::sums::SumRow;
 use tread_server::db::{self, Db};
 use tread_server::supervisor::Supervisor;
@@ -55,6 +56,18 @@ impl Writer {
         Self::with(app, Some(folder)).await
     }
 
+    /// The same, with a map of which nothing stays in memory.
+    pub(crate) async fn start_without_memory() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let db = Db::open(&database(folder.path())).await.unwrap();
+        let clock = Clock::manual(time("2026-11-01T00:00:00Z"));
+        let app = App::new(Dependencies {
+            map: MapConfig { memory_max_mib: 0 },
+            ..Dependencies::on_database(db, clock)
+        });
+        Self::with(app, Some(folder)).await
+    }
+
     /// The writer on a database that is open already.
     pub(crate) async fn on(app: App) -> Self {
         Self::with(app, None).await
@@ -77,6 +90,8 @@ impl Writer {
         let supervisor = Supervisor::new();
         let writer = ingest::run(app.clone(), uploads_in, supervisor.stop_token());
         supervisor.spawn_vital("ingest", writer);
+        let evicting = map_blocks::run(app.clone(), supervisor.stop_token());
+        supervisor.spawn_vital("map blocks", evicting);
         Self {
             _folder: folder,
             app,

@@ -51,6 +51,8 @@ mod live;
 #[cfg(test)]
 mod map;
 #[cfg(test)]
+mod map_blocks;
+#[cfg(test)]
 mod metrics;
 #[cfg(test)]
 mod missions;

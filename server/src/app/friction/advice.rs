@@ -1,6 +1,7 @@
 //! Cells whose measurement would improve the map most, and each robot's contribution to the map.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use jiff::Timestamp;
 use tread_api::friction::{RobotContribution, VisitSuggestion};
@@ -12,10 +13,11 @@ use tread_api::site::Cell;
 
 use super::cells::Area;
 use super::drawn::Drawn;
-use super::{App, AppError, Asked, Reading, SiteView, page, terrain_ref};
+use super::{App, AppError, Asked, Look, Reading, SiteView, page, terrain_ref};
+use crate::db::sites::SiteRow;
 use crate::friction::Ground;
 use crate::friction::epochs::HOUR_S;
-use crate::friction::index::{Contribution, SiteMap};
+use crate::friction::index::{Block, Cells, Contribution, SiteMap};
 
 /// Maximum number of cells that one request for visits may cover.
 const LOOKED_AT_MAX: f64 = 262_144.0;
@@ -48,18 +50,32 @@ impl App {
             });
         }
         let (min, max) = area.cells(&grid)?;
-        let looking = move |app: &Self, [reading]: &[Reading; 1]| {
+        let looking = move |look: &Look<'_>, [reading]: &[Reading; 1]| {
             let drawn = Drawn::new(&view.terrains);
-            let found = app.maps().look(&view.row, |map| {
-                let rows = min.iy..=max.iy;
-                let cells = rows.flat_map(|iy| (min.ix..=max.ix).map(move |ix| Cell { ix, iy }));
-                let suggestion = |cell: Cell| {
-                    let center = grid.center_of(cell);
-                    suggested(map, &drawn, reading, cell, center)
-                };
-                cells.filter_map(suggestion).collect::<Vec<_>>()
+            let (low, high) = (Block::of(min), Block::of(max));
+            let rows = low.row..=high.row;
+            let blocks = rows.flat_map(|row| {
+                let columns = low.column..=high.column;
+                columns.map(move |column| Block { row, column })
             });
-            (found, reading.as_of)
+            let mut found = Vec::new();
+            for block in blocks {
+                let (first, last) = (block.first(), block.last());
+                let rows = first.iy.max(min.iy)..=last.iy.min(max.iy);
+                let columns = first.ix.max(min.ix)..=last.ix.min(max.ix);
+                found.extend(look.cells(&view.row, |map| {
+                    let cells = rows.clone().flat_map(|iy| {
+                        let columns = columns.clone();
+                        columns.map(move |ix| Cell { ix, iy })
+                    });
+                    let suggestion = |cell: Cell| {
+                        let center = grid.center_of(cell);
+                        suggested(map, &drawn, reading, cell, center)
+                    };
+                    cells.filter_map(suggestion).collect::<Vec<_>>()
+                })?);
+            }
+            Ok((found, reading.as_of))
         };
         let (mut found, as_of) = self.read_map(&row, [reading], looking).await?;
         found.sort_by(|left, right| {
@@ -84,10 +100,11 @@ impl App {
         let reading = Reading::new(self, &Asked::default())?;
         let view = self.site_view(site).await?;
         let (after, named) = (cursor.map(str::to_owned), within.limit_of(site));
-        let looking = move |app: &Self| {
-            let (biases, contributions) = app.maps().look(&view.row, |map| {
+        let looking = move |look: &Look<'_>| {
+            let (biases, contributions) = look.map(&view.row, |map| {
                 (biases(map, &view, &reading), map.contributions())
             });
+            let cells = look.app().cell_counts().of(look, &view.row)?;
             let is_wanted = |found: &Contribution| {
                 let after = after.as_deref();
                 let is_named = named
@@ -99,23 +116,68 @@ impl App {
             let listed = contributions.into_iter().filter(is_wanted);
             let shown = listed.map(|found| RobotContribution {
                 bias_ratio: biases.get(&found.robot).copied(),
+                cells: cells.get(&found.robot).copied().unwrap_or_default(),
                 robot: found.robot,
-                cells: found.cells,
                 segments: found.segments,
                 first_at: time(Timestamp::from_second(found.first_epoch_h * HOUR_S)),
                 newest_at: time(Timestamp::from_microsecond(found.newest_at_us)),
             });
-            shown.collect()
+            Ok::<Vec<_>, AppError>(shown.collect())
         };
-        let found = self.off_thread(looking).await;
+        let found = self.look(looking).await?;
         Ok(page(found, limit, |found: &RobotContribution| {
             found.robot.to_string()
         }))
     }
 }
 
+/// Number of cells that each robot has measured, of each block of each site. Only blocks that have
+/// changed since are counted again.
+#[derive(Debug, Default)]
+pub(in crate::app) struct CellCounts(Mutex<HashMap<(i64, Block), Counted>>);
+
+/// Cells of a block by robot.
+#[derive(Debug, Clone)]
+struct Counted {
+    /// Number of the newest change when they were counted.
+    change: u64,
+    cells: BTreeMap<RobotId, u64>,
+}
+
+impl CellCounts {
+    fn lock(&self) -> MutexGuard<'_, HashMap<(i64, Block), Counted>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Returns the number of cells of a site that each robot has measured.
+    fn of(&self, look: &Look<'_>, row: &SiteRow) -> Result<BTreeMap<RobotId, u64>, AppError> {
+        let blocks: Vec<(Block, u64)> = look.map(row, |map| map.changes().blocks().collect());
+        let mut all = BTreeMap::new();
+        for (block, newest) in blocks {
+            let key = (row.pk, block);
+            let known = self.lock().get(&key).cloned();
+            let counted = if let Some(known) = known.filter(|known| known.change >= newest) {
+                known
+            } else {
+                let counted = look.cells(row, |map| {
+                    let mut cells = BTreeMap::new();
+                    map.count_cells(block, &mut cells);
+                    let change = map.map().changes().newest_of(block);
+                    Counted { change, cells }
+                })?;
+                self.lock().insert(key, counted.clone());
+                counted
+            };
+            for (robot, count) in counted.cells {
+                *all.entry(robot).or_default() += count;
+            }
+        }
+        Ok(all)
+    }
+}
+
 fn suggested(
-    map: &SiteMap,
+    map: Cells<'_>,
     drawn: &Drawn<'_>,
     reading: &Reading,
     cell: Cell,

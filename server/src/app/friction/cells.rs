@@ -11,12 +11,16 @@ use tread_api::site::{CELL_MAX_M, Cell, Grid};
 use tread_api::terrain::{Terrain, TerrainRef};
 
 use super::drawn::{Drawn, is_here};
-use super::{App, AppError, Asked, Reading, SiteView, page, site_row, terrain_ref};
+use super::{App, AppError, Asked, Look, Reading, SiteView, page, site_row, terrain_ref};
 use crate::friction::Ground;
-use crate::friction::index::{Group, SiteMap};
+use crate::friction::index::{Block, Cells, Group};
 
 /// Maximum number of squares that a box with a resolution may have.
 pub const CELLS_MAX: f64 = 4_194_304.0;
+/// Number of cells along a row that are joined into squares at a time.
+const SQUARES_WIDTH_CELLS: i32 = 1_024;
+/// Number of cells that are compared in one look at the map.
+const CELLS_AT_ONCE: usize = 4_096;
 
 /// An axis-aligned rectangle in the site frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -127,8 +131,8 @@ impl App {
             .unwrap_or(usize::MAX)
             .saturating_add(1);
         let of_site = row.clone();
-        let looking = move |app: &Self, [reading]: &[Reading; 1]| {
-            app.maps().look(&row, |map| {
+        let looking = move |look: &Look<'_>, [reading]: &[Reading; 1]| {
+            look.cells(&row, |map| {
                 let found = squares(map, factor, bounds, after, wanted);
                 let cells = page(found, limit, |(cell, _)| format!("{},{}", cell.ix, cell.iy));
                 let squares = cells.items.into_iter();
@@ -154,63 +158,10 @@ impl App {
         let view = self.site_view(site).await?;
         let cell = view.cell_at(point)?;
         let row = view.row.clone();
-        let looking = move |app: &Self, [reading]: &[Reading; 1]| {
-            app.known_at_point(&view, reading, (cell, point))
+        let looking = move |look: &Look<'_>, [reading]: &[Reading; 1]| {
+            known_at_point(look, &view, reading, (cell, point))
         };
         self.read_map(&row, [reading], looking).await
-    }
-
-    fn known_at_point(
-        &self,
-        view: &SiteView,
-        reading: &Reading,
-        (cell, point): (Cell, Point),
-    ) -> PointFriction {
-        let drawn = Drawn::new(&view.terrains);
-        let terrain = drawn.at(point);
-        let measured = self.measured_at_point(view, reading, cell, terrain);
-        // The prior of the terrain's class is needed only where nothing was measured.
-        let models = match terrain {
-            Some(terrain) if measured.is_empty() => {
-                let classes = self.classes(view, reading);
-                let models = classes.models(view, reading, terrain).into_iter();
-                let expected = models.map(|model| ModelFriction {
-                    prior: classes.prior(terrain, model.configuration),
-                    friction: None,
-                    ..model
-                });
-                expected.filter(|model| model.prior.is_some()).collect()
-            }
-            _ => measured,
-        };
-        PointFriction {
-            as_of: reading.as_of,
-            cell,
-            terrain: terrain.map(terrain_ref),
-            models,
-        }
-    }
-
-    /// Returns the friction measured in a cell, on the given terrain alone, per robot model.
-    pub(super) fn measured_at_point(
-        &self,
-        view: &SiteView,
-        reading: &Reading,
-        cell: Cell,
-        terrain: Option<&Terrain>,
-    ) -> Vec<ModelFriction> {
-        self.maps().look(&view.row, |map| {
-            let groups = map.cell(cell, reading.choice()).into_iter();
-            let here = groups.filter(|group| is_here(view, group.terrain, terrain));
-            let models = same_ground(here).into_iter().map(|group| ModelFriction {
-                configuration: group.configuration,
-                model: view.model(group.configuration),
-                friction: reading.fused(group, Ground::Cell),
-                prior: None,
-                normalisation: reading.normalisation(),
-            });
-            models.collect()
-        })
     }
 
     /// Returns the differences of friction between two times, for cells that were measured in
@@ -240,33 +191,97 @@ impl App {
         let wanted = usize::try_from(cells.limit).unwrap_or(usize::MAX);
         let limit = cells.limit;
         let of_site = row.clone();
-        let looking = move |app: &Self, [early, late]: &[Reading; 2]| {
-            app.maps().look(&row, |map| {
-                let measured = map.cells_in(min, max, after).filter(|&cell| {
-                    let newest = map.newest_at_us(cell, late.choice());
-                    newest.is_some_and(|newest_us| newest_us >= early.now_us)
-                });
-                let found: Vec<Cell> = measured.take(wanted.saturating_add(1)).collect();
-                let cells = page(found, limit, |cell| format!("{},{}", cell.ix, cell.iy));
-                let items = cells
-                    .items
-                    .into_iter()
-                    .flat_map(|cell| differences(map, cell, early, late));
-                DifferencePage {
-                    items: items.collect(),
-                    next_cursor: cells.next_cursor,
-                    from: early.as_of,
-                    as_of: late.as_of,
+        let looking = move |look: &Look<'_>, [early, late]: &[Reading; 2]| {
+            let (mut found, mut after) = (Vec::new(), after);
+            let mut at_once = CELLS_AT_ONCE;
+            while found.len() <= wanted {
+                let (some, last) = smaller(&mut at_once, |at_once| {
+                    look.cells(&row, |map| {
+                        let cells = map.cells_in(min, max, after).take(at_once);
+                        let cells: Vec<Cell> = cells.collect();
+                        let measured = cells.iter().copied().filter(|&cell| {
+                            let newest = map.newest_at_us(cell, late.choice());
+                            newest.is_some_and(|newest_us| newest_us >= early.now_us)
+                        });
+                        let some = measured.map(|cell| (cell, differences(map, cell, early, late)));
+                        (some.collect::<Vec<_>>(), cells.last().copied())
+                    })
+                })?;
+                found.extend(some);
+                match last {
+                    Some(_) => after = last,
+                    None => break,
                 }
+            }
+            let cells = page(found, limit, |(cell, _)| format!("{},{}", cell.ix, cell.iy));
+            let items = cells.items.into_iter().flat_map(|(_, of_cell)| of_cell);
+            Ok(DifferencePage {
+                items: items.collect(),
+                next_cursor: cells.next_cursor,
+                from: early.as_of,
+                as_of: late.as_of,
             })
         };
         self.read_map(&of_site, [early, late], looking).await
     }
 }
 
+fn known_at_point(
+    look: &Look<'_>,
+    view: &SiteView,
+    reading: &Reading,
+    (cell, point): (Cell, Point),
+) -> Result<PointFriction, AppError> {
+    let drawn = Drawn::new(&view.terrains);
+    let terrain = drawn.at(point);
+    let measured = measured_at_point(look, view, reading, cell, terrain)?;
+    // The prior of the terrain's class is needed only where nothing was measured.
+    let models = match terrain {
+        Some(terrain) if measured.is_empty() => {
+            let classes = look.app().classes(view, reading);
+            let models = classes.models(view, reading, terrain).into_iter();
+            let expected = models.map(|model| ModelFriction {
+                prior: classes.prior(terrain, model.configuration),
+                friction: None,
+                ..model
+            });
+            expected.filter(|model| model.prior.is_some()).collect()
+        }
+        _ => measured,
+    };
+    Ok(PointFriction {
+        as_of: reading.as_of,
+        cell,
+        terrain: terrain.map(terrain_ref),
+        models,
+    })
+}
+
+/// Returns the friction measured in a cell, on the given terrain alone, per robot model.
+pub(super) fn measured_at_point(
+    look: &Look<'_>,
+    view: &SiteView,
+    reading: &Reading,
+    cell: Cell,
+    terrain: Option<&Terrain>,
+) -> Result<Vec<ModelFriction>, AppError> {
+    look.cells(&view.row, |map| {
+        let groups = map.cell(cell, reading.choice()).into_iter();
+        let here = groups.filter(|group| is_here(view, group.terrain, terrain));
+        let models = same_ground(here).into_iter().map(|group| ModelFriction {
+            configuration: group.configuration,
+            model: view.model(group.configuration),
+            friction: reading.fused(group, Ground::Cell),
+            prior: None,
+            normalisation: reading.normalisation(),
+        });
+        models.collect()
+    })
+}
+
 /// Returns the friction of a square, per terrain and configuration.
 pub(super) fn of_square(
-    map: &SiteMap,
+    map: Cells<'_>,
     reading: &Reading,
     (cell, parts): CellGroup,
     size_m: f64,
@@ -289,7 +304,7 @@ pub(super) fn of_square(
     groups.into_iter().filter_map(entry).collect()
 }
 
-fn differences(map: &SiteMap, cell: Cell, early: &Reading, late: &Reading) -> Vec<CellDifference> {
+fn differences(map: Cells<'_>, cell: Cell, early: &Reading, late: &Reading) -> Vec<CellDifference> {
     type Key = (Option<TerrainRef>, ConfigurationId);
     let key = |group: &Group<'_>| -> Key { (group.terrain.cloned(), group.configuration) };
     let mut before: BTreeMap<Key, _> = map
@@ -376,7 +391,7 @@ pub(super) type CellGroup = (Cell, Option<Vec<Cell>>);
 
 /// Returns the squares that hold measurements, row by row.
 pub(super) fn squares(
-    map: &SiteMap,
+    map: Cells<'_>,
     factor: i32,
     (min, max): (Cell, Cell),
     after: Option<Cell>,
@@ -394,6 +409,7 @@ pub(super) fn squares(
         ix: first(square).ix.saturating_add(factor - 1),
         iy: first(square).iy.saturating_add(factor - 1),
     };
+    let at_once = (SQUARES_WIDTH_CELLS / factor).max(1);
     let mut found: Vec<CellGroup> = Vec::new();
     let mut row = after.map_or(min.iy, |after| after.iy.max(min.iy));
     while row <= max.iy && found.len() < wanted {
@@ -406,22 +422,40 @@ pub(super) fn squares(
             break;
         };
         row = next.iy.div_euclid(factor);
-        let low = first(Cell {
-            ix: min.ix,
-            iy: row,
-        });
-        let high = last(Cell {
-            ix: max.ix,
-            iy: row,
-        });
-        let mut columns: BTreeMap<i32, Vec<Cell>> = BTreeMap::new();
-        for cell in map.cells_in(low, high, None) {
-            let column = columns.entry(cell.ix.div_euclid(factor)).or_default();
-            column.push(cell);
-        }
         let is_new = |ix: i32| after.is_none_or(|after| (row, ix) > (after.iy, after.ix));
-        let squares = columns.into_iter().filter(|&(ix, _)| is_new(ix));
-        found.extend(squares.map(|(ix, cells)| (Cell { ix, iy: row }, Some(cells))));
+        let of_row = after.filter(|after| after.iy == row);
+        let mut from = of_row.map_or(min.ix, |after| after.ix.saturating_add(1).max(min.ix));
+        // Some columns at a time, so that no more cells are needed than wanted.
+        while from <= max.ix && found.len() < wanted && !map.is_incomplete() {
+            let to = from.saturating_add(at_once - 1).min(max.ix);
+            let low = first(Cell { ix: from, iy: row });
+            let high = last(Cell { ix: to, iy: row });
+            let mut columns: BTreeMap<i32, Vec<Cell>> = BTreeMap::new();
+            for cell in map.cells_in(low, high, None) {
+                let column = columns.entry(cell.ix.div_euclid(factor)).or_default();
+                column.push(cell);
+            }
+            let squares = columns.into_iter().filter(|&(ix, _)| is_new(ix));
+            found.extend(squares.map(|(ix, cells)| (Cell { ix, iy: row }, Some(cells))));
+            // The next block with measurements determines the next column of squares.
+            let Some(next) = to.checked_add(1) else { break };
+            let low = first(Cell { ix: next, iy: row });
+            let high = last(Cell {
+                ix: max.ix,
+                iy: row,
+            });
+            match map
+                .map()
+                .changes()
+                .first_column((Block::of(low), Block::of(high)))
+            {
+                Some(column) => {
+                    let begin = Block { row: 0, column }.first().ix;
+                    from = begin.div_euclid(factor).max(next);
+                }
+                None => break,
+            }
+        }
         let Some(next) = row.checked_add(1) else {
             break;
         };
@@ -429,6 +463,19 @@ pub(super) fn squares(
     }
     found.truncate(wanted);
     found
+}
+
+/// Looks at fewer cells at once as long as they need too much memory.
+pub(super) fn smaller<T>(
+    at_once: &mut usize,
+    look: impl Fn(usize) -> Result<T, AppError>,
+) -> Result<T, AppError> {
+    loop {
+        match look(*at_once) {
+            Err(AppError::LookTooLarge { .. }) if *at_once > 1 => *at_once = at_once.div_ceil(8),
+            found => return found,
+        }
+    }
 }
 
 fn read_cursor(cursor: &str) -> Result<Cell, AppError> {

@@ -7,9 +7,9 @@ use tread_api::friction::{CellFriction, StoredSegment};
 use tread_api::ids::SiteId;
 use tread_api::site::{Cell, Grid, Site};
 
-use super::cells::{Area, factor, of_square, squares};
+use super::cells::{Area, factor, of_square, smaller, squares};
 use super::raster::PictureAsked;
-use super::{App, AppError, MOVED, Reading};
+use super::{App, AppError, Look, MOVED, Reading};
 use crate::app::segments::Batch;
 use crate::app::site_row;
 use crate::db;
@@ -18,7 +18,7 @@ use crate::db::sites::SiteRow;
 use crate::formats::table::{TableError, Writer};
 use crate::friction::index::{SiteMap, Stamp};
 
-/// Number of cells per chunk.
+/// Maximum number of cells per chunk.
 const CELLS_PIECE: usize = 4_096;
 /// Number of measurements per chunk, which is a row group of a Parquet file.
 const SEGMENTS_PIECE: u32 = 4_096;
@@ -47,6 +47,8 @@ pub struct CellExport {
     /// State of the map for which `reading` was made.
     stamp: Stamp,
     after: Option<Cell>,
+    /// Maximum number of cells of the next chunk.
+    at_once: usize,
     stage: Stage,
     state: (String, String),
     writer: Box<dyn Writer<CellFriction>>,
@@ -94,6 +96,7 @@ impl App {
             bounds,
             stamp,
             after: None,
+            at_once: CELLS_PIECE,
             stage: Stage::Begin,
             writer: writer_of(&row.site, as_of)?,
             row,
@@ -150,10 +153,10 @@ impl CellExport {
     /// A chunk cannot be encoded.
     pub async fn next(self) -> Result<Option<(Vec<u8>, Self)>, AppError> {
         let app = self.app.clone();
-        app.off_thread(move |app| self.step(app)).await
+        app.look(move |look| self.step(look)).await
     }
 
-    fn step(mut self, app: &App) -> Result<Option<(Vec<u8>, Self)>, AppError> {
+    fn step(mut self, look: &Look<'_>) -> Result<Option<(Vec<u8>, Self)>, AppError> {
         let bytes = match self.stage {
             Stage::Begin => {
                 self.stage = Stage::Entries;
@@ -163,15 +166,20 @@ impl CellExport {
                 let size_m = self.row.site.grid.cell_m * f64::from(self.factor);
                 // Summed again for each chunk, so that a slow client keeps no sums in memory.
                 let mut reading = self.reading.clone();
-                reading.sum(app);
-                let (entries, last) = app.maps().look(&self.row, |map| {
-                    let found = squares(map, self.factor, self.bounds, self.after, CELLS_PIECE);
-                    let last = found.last().map(|(cell, _)| *cell);
-                    let found = found.into_iter();
-                    let entries = found.flat_map(|square| of_square(map, &reading, square, size_m));
-                    (entries.collect::<Vec<_>>(), last)
-                });
-                let stamp = app.maps().look(&self.row, SiteMap::stamp);
+                reading.sum(look.app());
+                let mut at_once = self.at_once;
+                let (entries, last) = smaller(&mut at_once, |at_once| {
+                    look.cells(&self.row, |map| {
+                        let found = squares(map, self.factor, self.bounds, self.after, at_once);
+                        let last = found.last().map(|(cell, _)| *cell);
+                        let found = found.into_iter();
+                        let entries =
+                            found.flat_map(|square| of_square(map, &reading, square, size_m));
+                        (entries.collect::<Vec<_>>(), last)
+                    })
+                })?;
+                self.at_once = at_once;
+                let stamp = look.map(&self.row, SiteMap::stamp);
                 if self.reading.as_of.is_some() && stamp != self.stamp {
                     return Err(AppError::Unwritable(MOVED.to_owned()));
                 }
@@ -223,7 +231,7 @@ impl SegmentExport {
             Stage::Begin | Stage::End | Stage::Over => Batch::default(),
         };
         let app = self.app.clone();
-        app.off_thread(move |_app| self.step(&found)).await
+        app.look(move |_look| self.step(&found)).await
     }
 
     fn step(mut self, found: &Batch) -> Result<Option<(Vec<u8>, Self)>, AppError> {

@@ -8,9 +8,10 @@ use tread_api::friction::{FrictionAt, ModelFriction, PointHistory, TerrainHistor
 use tread_api::geometry::Point;
 use tread_api::ids::{SiteId, TerrainId};
 
+use super::cells::measured_at_point;
 use super::drawn::Drawn;
 use super::timelines::MEASUREMENTS_MAX;
-use super::{App, AppError, Asked, MOVED, READS_MAX, Reading, SiteView, terrain_ref};
+use super::{App, AppError, Asked, Look, MOVED, READS_MAX, Reading, SiteView, terrain_ref};
 use crate::friction::Epoch;
 use crate::friction::index::{SiteMap, Timeline};
 
@@ -89,8 +90,8 @@ impl App {
         let view = self.site_view(site).await?;
         let terrain = view.find(site, id)?.clone();
         let of_terrain = terrain_ref(&terrain);
-        let known = move |app: &Self, view: &SiteView, reading: &Reading| {
-            app.measured_models(view, reading, &terrain)
+        let known = move |look: &Look<'_>, view: &SiteView, reading: &Reading| {
+            Ok(look.app().measured_models(view, reading, &terrain))
         };
         let items = self.known_at(&view, reading, times, known).await?;
         Ok(TerrainHistory {
@@ -114,8 +115,8 @@ impl App {
         let cell = view.cell_at(point)?;
         let terrain = Drawn::new(&view.terrains).at(point).cloned();
         let of_terrain = terrain.as_ref().map(terrain_ref);
-        let known = move |app: &Self, view: &SiteView, reading: &Reading| {
-            app.measured_at_point(view, reading, cell, terrain.as_ref())
+        let known = move |look: &Look<'_>, view: &SiteView, reading: &Reading| {
+            measured_at_point(look, view, reading, cell, terrain.as_ref())
         };
         let items = self.known_at(&view, reading, times, known).await?;
         Ok(PointHistory {
@@ -131,19 +132,22 @@ impl App {
         view: &Arc<SiteView>,
         reading: Reading,
         times: Checked,
-        models: impl Fn(&Self, &SiteView, &Reading) -> Vec<ModelFriction> + Send + Sync + 'static,
+        models: impl Fn(&Look<'_>, &SiteView, &Reading) -> Result<Vec<ModelFriction>, AppError>
+        + Send
+        + Sync
+        + 'static,
     ) -> Result<Vec<FrictionAt>, AppError> {
         let shared = Arc::new((reading, times, models));
         for _ in 0..READS_MAX {
             let stamp = self.maps().look(&view.row, SiteMap::stamp);
             let timelines = self.timelines_of(view, &shared.1).await?;
             let (view_then, shared) = (Arc::clone(view), Arc::clone(&shared));
-            let looking = move |app: &Self| {
+            let looking = move |look: &Look<'_>| {
                 let (reading, times, models) = &*shared;
-                let models = |reading: &Reading| models(app, &view_then, reading);
-                known_at(app, &view_then, reading, times, &timelines, models)
+                let models = |reading: &Reading| models(look, &view_then, reading);
+                known_at(look, &view_then, reading, times, &timelines, models)
             };
-            let known = self.off_thread(looking).await;
+            let known = self.look(looking).await?;
             if self.maps().look(&view.row, SiteMap::stamp) == stamp {
                 return Ok(known);
             }
@@ -181,31 +185,31 @@ impl App {
 
 /// Returns what is known at each time, the oldest first.
 fn known_at(
-    app: &App,
+    look: &Look<'_>,
     view: &SiteView,
     reading: &Reading,
     times: &Checked,
     timelines: &BTreeMap<Epoch, Arc<Timeline>>,
-    models: impl Fn(&Reading) -> Vec<ModelFriction>,
-) -> Vec<FrictionAt> {
+    models: impl Fn(&Reading) -> Result<Vec<ModelFriction>, AppError>,
+) -> Result<Vec<FrictionAt>, AppError> {
     let mut then = reading.clone();
     let known = |(index, &at): (usize, &Timestamp)| {
         // The present is read without a time, so that all received measurements count.
         if index == times.past_count() {
-            return FrictionAt {
+            return Ok(FrictionAt {
                 at,
                 as_of: at,
-                models: models(reading),
-            };
+                models: models(reading)?,
+            });
         }
-        let epoch = app.maps().look(&view.row, |map| map.epoch_at(at));
+        let epoch = look.map(&view.row, |map| map.epoch_at(at));
         then.move_to(at, epoch, timelines.get(&epoch).cloned());
         then.advance_sum();
-        FrictionAt {
+        Ok(FrictionAt {
             at,
             as_of: then.as_of.unwrap_or(at),
-            models: models(&then),
-        }
+            models: models(&then)?,
+        })
     };
     times.times.iter().enumerate().map(known).collect()
 }

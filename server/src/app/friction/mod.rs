@@ -6,6 +6,7 @@ mod drawn;
 mod export;
 mod history;
 pub mod live;
+mod look;
 mod path;
 mod pictures;
 mod prior;
@@ -25,10 +26,13 @@ use tread_api::page::Page;
 use tread_api::site::Cell;
 use tread_api::terrain::{Terrain, TerrainRef};
 
+pub(super) use self::advice::CellCounts;
 pub use self::cells::{Area, CELLS_MAX, CellsAsked};
 pub use self::export::{CellExport, SegmentExport};
 pub use self::history::Times;
 pub(super) use self::live::MapNews;
+use self::look::Look;
+pub(super) use self::look::LookTurns;
 pub use self::pictures::Picture;
 pub(super) use self::pictures::Pictures;
 use self::prior::Classes;
@@ -49,8 +53,6 @@ const UNKNOWN_MODEL: &str = "not declared";
 const READS_MAX: usize = 3;
 /// Why an answer about the past is given up.
 const MOVED: &str = "hours of the map were merged or withdrawn while it was read";
-/// Maximum number of map requests that are worked on at once; further ones wait.
-pub(in crate::app) const MAP_READERS_MAX: usize = 4;
 
 /// A site with its terrains and model names, as read from the database for the map's answers.
 #[derive(Debug)]
@@ -106,51 +108,33 @@ impl SiteView {
 }
 
 impl App {
-    /// Runs work on the map on a blocking thread, so that computing under the map's lock does not
-    /// block other requests.
-    pub(in crate::app) async fn off_thread<T: Send + 'static>(
-        &self,
-        work: impl FnOnce(&Self) -> T + Send + 'static,
-    ) -> T {
-        let _turn = self.map_turn().await;
-        let app = self.clone();
-        match tokio::task::spawn_blocking(move || work(&app)).await {
-            Ok(done) => done,
-            Err(broken) => match broken.try_into_panic() {
-                Ok(panic) => std::panic::resume_unwind(panic),
-                // The runtime is shutting down, and this task with it.
-                Err(_cancelled) => std::future::pending().await,
-            },
-        }
-    }
-
     /// Reads a site's map for an answer, on a blocking thread. Times of the readings are rounded
     /// first; if meanwhile measurements of the map have moved to other epochs, all is done again.
     ///
     /// # Errors
-    /// The database failed.
+    /// The database failed, or those of `work`.
     async fn read_map<T: Send + 'static, const N: usize>(
         &self,
         row: &SiteRow,
         readings: [Reading; N],
-        look: impl Fn(&Self, &[Reading; N]) -> T + Send + Sync + 'static,
+        work: impl Fn(&Look<'_>, &[Reading; N]) -> Result<T, AppError> + Send + Sync + 'static,
     ) -> Result<T, AppError> {
         let is_past = readings.iter().any(|reading| reading.as_of.is_some());
-        let look = Arc::new(look);
+        let work = Arc::new(work);
         for _ in 0..READS_MAX {
             let stamp = self.maps().look(row, SiteMap::stamp);
             let mut readings = readings.clone();
             for reading in &mut readings {
                 reading.of_site(self, row).await?;
             }
-            let look = Arc::clone(&look);
-            let looking = move |app: &Self| {
+            let work = Arc::clone(&work);
+            let looking = move |look: &Look<'_>| {
                 for reading in &mut readings {
-                    reading.sum(app);
+                    reading.sum(look.app());
                 }
-                look(app, &readings)
+                work(look, &readings)
             };
-            let answer = self.off_thread(looking).await;
+            let answer = self.look(looking).await?;
             if !is_past || self.maps().look(row, SiteMap::stamp) == stamp {
                 return Ok(answer);
             }
@@ -170,8 +154,8 @@ impl App {
         let view = self.site_view(site).await?;
         let row = view.row.clone();
         let cursor = cursor.map(str::to_owned);
-        let listing = move |app: &Self, [reading]: &[Reading; 1]| {
-            let classes = app.classes(&view, reading);
+        let listing = move |look: &Look<'_>, [reading]: &[Reading; 1]| {
+            let classes = look.app().classes(&view, reading);
             let wanted = |terrain: &&Terrain| {
                 cursor
                     .as_deref()
@@ -183,10 +167,10 @@ impl App {
                 let models = classes.models(&view, reading, terrain);
                 terrain_friction(terrain, models, reading.as_of)
             });
-            Page {
+            Ok(Page {
                 items: items.collect(),
                 next_cursor,
-            }
+            })
         };
         self.read_map(&row, [reading], listing).await
     }
@@ -202,9 +186,10 @@ impl App {
         let view = self.site_view(site).await?;
         let terrain = view.find(site, id)?.clone();
         let row = view.row.clone();
-        let looking = move |app: &Self, [reading]: &[Reading; 1]| {
-            let models = app.classes(&view, reading).models(&view, reading, &terrain);
-            terrain_friction(&terrain, models, reading.as_of)
+        let looking = move |look: &Look<'_>, [reading]: &[Reading; 1]| {
+            let classes = look.app().classes(&view, reading);
+            let models = classes.models(&view, reading, &terrain);
+            Ok(terrain_friction(&terrain, models, reading.as_of))
         };
         self.read_map(&row, [reading], looking).await
     }
@@ -271,10 +256,11 @@ impl App {
         for site in self.all_sites().await? {
             let view = self.site_view(&site).await?;
             let reading = reading.clone();
-            let looking = move |app: &Self| {
+            let looking = move |look: &Look<'_>| {
                 let mut known = Vec::new();
                 for terrain in &view.terrains {
-                    let models = app.measured_models(&view, &reading, terrain).into_iter();
+                    let models = look.app().measured_models(&view, &reading, terrain);
+                    let models = models.into_iter();
                     known.extend(models.filter_map(|model| {
                         let friction = model.friction?;
                         Some(KnownGround {
@@ -289,7 +275,7 @@ impl App {
                 }
                 known
             };
-            let known = self.off_thread(looking).await;
+            let known = self.look(looking).await;
             let room = limit - found.len();
             left_out += known.len().saturating_sub(room);
             found.extend(known.into_iter().take(room));

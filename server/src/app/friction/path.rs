@@ -17,8 +17,8 @@ use tread_api::wire::command::{CellPrior, CellTractionLimit, PRIOR_CELLS_MAX, Pa
 use tread_control::robot::RobotModel as PlannedModel;
 
 use super::drawn::{Drawn, Near};
-use super::{App, AppError, Asked, Reading, SiteView};
-use crate::friction::index::{CompiledFilter, Room, SiteMap};
+use super::{App, AppError, Asked, Look, Reading, SiteView};
+use crate::friction::index::{Cells, CompiledFilter, Room};
 use crate::friction::traction_limit;
 
 /// Maximum length of a path, metres.
@@ -34,6 +34,8 @@ const CIRCLE_CORNERS: u32 = 256;
 const DEVIATION_RATIO_MAX: f64 = 0.5;
 /// Number of cells to either side of a path whose measurements also count for the ground under it.
 const NEAR_CELLS: i32 = 2;
+/// Number of places along a path that are read in one look at the map.
+const PLACES_AT_ONCE: usize = 1_024;
 /// Maximum number of cells near a path that are read; beyond it only the path's own cells count.
 const NEAR_MAX: usize = 20_000;
 
@@ -65,14 +67,17 @@ impl App {
         let length_m = checked_length(&points)?;
         let cut = cut(&points, &view.row.site.grid)?;
         let row = view.row.clone();
-        let looking = move |app: &Self, [reading]: &[Reading; 1]| {
+        let looking = move |look: &Look<'_>, [reading]: &[Reading; 1]| {
             let drawn = Drawn::new(&view.terrains);
             let near = drawn_near(&drawn, &cut);
-            let mut pieces: Vec<PathPiece> = app.maps().look(&view.row, |map| {
-                let mut reader = CellReader::new(map, (&view, &drawn, &near), reading);
-                let piece = |cut: &Cut| described(cut, reader.known_at(cut).as_ref());
-                cut.iter().map(piece).collect()
-            });
+            let mut pieces: Vec<PathPiece> = Vec::with_capacity(cut.len());
+            for some in cut.chunks(PLACES_AT_ONCE) {
+                pieces.extend(look.cells(&view.row, |map| {
+                    let mut reader = CellReader::new(map, (&view, &drawn, &near), reading);
+                    let piece = |cut: &Cut| described(cut, reader.known_at(cut).as_ref());
+                    some.iter().map(piece).collect::<Vec<_>>()
+                })?);
+            }
             set_speeds(&mut pieces, &cut, length_m, &found.model);
             let known_m: f64 = pieces
                 .iter()
@@ -80,7 +85,7 @@ impl App {
                 .filter(|(piece, _)| piece.theta.is_some())
                 .map(|(_, cut)| cut.length_m)
                 .sum();
-            PathFriction {
+            Ok(PathFriction {
                 as_of: reading.as_of,
                 length_m,
                 configuration: found.configuration,
@@ -88,7 +93,7 @@ impl App {
                 // The sum of nothing is −0.
                 known_ratio: (known_m / length_m + 0.0).min(1.0),
                 pieces,
-            }
+            })
         };
         self.read_map(&row, [reading], looking).await
     }
@@ -121,76 +126,96 @@ impl App {
         else {
             return Ok(None);
         };
-        let looking = move |app: &Self| app.prior_of(&view, &reading, &cut);
-        Ok(self.off_thread(looking).await)
+        let looking = move |look: &Look<'_>| prior_of(look, &view, &reading, &cut);
+        self.look_for_robot(looking).await
     }
+}
 
-    fn prior_of(&self, view: &SiteView, reading: &Reading, cut: &[Cut]) -> Option<PathPrior> {
-        let drawn = Drawn::new(&view.terrains);
-        let mut cells: BTreeMap<(i32, i32), CellPrior> = BTreeMap::new();
-        let mut traction_limits: BTreeMap<(i32, i32), CellTractionLimit> = BTreeMap::new();
+/// What is known at a place along a path.
+struct KnownPlace {
+    /// Number of the ground at the centre of the cell.
+    ground: u16,
+    known: Option<FusedFriction>,
+    /// Whether measurements in the cell are of one ground.
+    has_one_ground: bool,
+}
+
+/// Returns the prior of the ground along a path.
+fn prior_of(
+    look: &Look<'_>,
+    view: &SiteView,
+    reading: &Reading,
+    cut: &[Cut],
+) -> Result<Option<PathPrior>, AppError> {
+    let drawn = Drawn::new(&view.terrains);
+    let places: Vec<Cut> = {
         let near = near(cut, &view.row.site.grid);
-        let around = drawn_near(&drawn, cut.iter().chain(&near));
-        self.maps().look(&view.row, |map| {
+        cut.iter().copied().chain(near).collect()
+    };
+    let around = drawn_near(&drawn, &places);
+    let mut known: Vec<KnownPlace> = Vec::with_capacity(places.len());
+    for some in places.chunks(PLACES_AT_ONCE) {
+        known.extend(look.cells(&view.row, |map| {
             let mut reader = CellReader::new(map, (view, &drawn, &around), reading);
-            let mut grounds: BTreeMap<u16, f64> = BTreeMap::new();
-            for place in cut.iter().chain(&near) {
-                let Some(known) = reader.known_at(place).filter(is_measured) else {
-                    continue;
-                };
-                let mu = traction_limit_mu(Some(&known));
-                let least = grounds.entry(around.ground_at(place.middle)).or_insert(mu);
-                *least = least.min(mu);
-            }
-            for cut in cut {
-                let (cell, known) = (cut.cell, reader.known_at(cut));
-                let ground = around.ground_at(cut.middle);
-                let least_mu = grounds.get(&ground).copied().unwrap_or(f64::INFINITY);
-                let mu = traction_limit_mu(known.as_ref()).min(least_mu);
-                let key = (cell.iy, cell.ix);
-                let limit = traction_limits
-                    .entry(key)
-                    .or_insert(CellTractionLimit { cell, mu });
-                limit.mu = limit.mu.min(mu);
-            }
-            // The smoothed path may leave the straight line between corners, so the cells beside it
-            // are included.
-            for place in cut.iter().chain(&near) {
-                let cell = place.cell;
-                let key = (cell.iy, cell.ix);
-                if cells.len() >= PRIOR_CELLS_MAX || cells.contains_key(&key) {
-                    continue;
-                }
-                let has_one_ground = map.cell(cell, reading.choice()).len() == 1;
-                let measured = reader
-                    .known_at(place)
-                    .filter(|known| has_one_ground && is_measured(known));
-                if let Some(known) = measured {
-                    let prior = CellPrior {
-                        cell,
-                        theta: known.theta,
-                        std_dev: known.std_dev,
-                    };
-                    cells.insert(key, prior);
-                }
-            }
-        });
-        let traction_limit_least_mu = traction_limits.values().map(|limit| limit.mu);
-        let traction_limit_least_mu = traction_limit_least_mu.fold(f64::INFINITY, f64::min);
-        let traction_limits: Vec<CellTractionLimit> = traction_limits
-            .into_values()
-            .take(PRIOR_CELLS_MAX)
-            .collect();
-        let cells: Vec<CellPrior> = cells.into_values().collect();
-        let prior = PathPrior {
-            grid_revision: view.row.site.grid.revision,
-            traction_limit_mu: traction_limit_least_mu,
-            robot_bias_ratio: self.friction_config().robot_bias_ratio,
-            cells,
-            traction_limits,
-        };
-        Some(prior).filter(|prior| !prior.cells.is_empty() && prior.is_possible())
+            let known = some.iter().map(|place| KnownPlace {
+                ground: around.ground_at(place.middle),
+                known: reader.known_at(place),
+                has_one_ground: map.cell(place.cell, reading.choice()).len() == 1,
+            });
+            known.collect::<Vec<_>>()
+        })?);
     }
+    let mut grounds: BTreeMap<u16, f64> = BTreeMap::new();
+    for place in &known {
+        if let Some(measured) = place.known.as_ref().filter(|known| is_measured(known)) {
+            let mu = traction_limit_mu(Some(measured));
+            let least = grounds.entry(place.ground).or_insert(mu);
+            *least = least.min(mu);
+        }
+    }
+    let mut traction_limits: BTreeMap<(i32, i32), CellTractionLimit> = BTreeMap::new();
+    for (cut, place) in cut.iter().zip(&known) {
+        let cell = cut.cell;
+        let least_mu = grounds.get(&place.ground).copied().unwrap_or(f64::INFINITY);
+        let mu = traction_limit_mu(place.known.as_ref()).min(least_mu);
+        let limit = traction_limits
+            .entry((cell.iy, cell.ix))
+            .or_insert(CellTractionLimit { cell, mu });
+        limit.mu = limit.mu.min(mu);
+    }
+    // The smoothed path may leave the straight line between corners, so the cells beside it are
+    // included.
+    let mut cells: BTreeMap<(i32, i32), CellPrior> = BTreeMap::new();
+    for (Cut { cell, .. }, place) in places.iter().zip(&known) {
+        let key = (cell.iy, cell.ix);
+        if cells.len() >= PRIOR_CELLS_MAX || cells.contains_key(&key) {
+            continue;
+        }
+        let measured = place.known.as_ref().filter(|known| is_measured(known));
+        if let Some(known) = measured.filter(|_| place.has_one_ground) {
+            let prior = CellPrior {
+                cell: *cell,
+                theta: known.theta,
+                std_dev: known.std_dev,
+            };
+            cells.insert(key, prior);
+        }
+    }
+    let traction_limit_least_mu = traction_limits.values().map(|limit| limit.mu);
+    let traction_limit_least_mu = traction_limit_least_mu.fold(f64::INFINITY, f64::min);
+    let traction_limits: Vec<CellTractionLimit> = traction_limits
+        .into_values()
+        .take(PRIOR_CELLS_MAX)
+        .collect();
+    let cells: Vec<CellPrior> = cells.into_values().collect();
+    let prior = PathPrior {
+        grid_revision: view.row.site.grid.revision,
+        traction_limit_mu: traction_limit_least_mu,
+        robot_bias_ratio: look.app().friction_config().robot_bias_ratio,
+        cells,
+        traction_limits,
+    };
+    Ok(Some(prior).filter(|prior| !prior.cells.is_empty() && prior.is_possible()))
 }
 
 /// Returns points along a trajectory, dense enough to determine its cells.
@@ -404,7 +429,7 @@ fn drawn_near<'view, 'cut>(
 
 /// Reads the map at one place after another.
 struct CellReader<'map> {
-    map: &'map SiteMap,
+    map: Cells<'map>,
     near: &'map Near<'map>,
     filter: CompiledFilter<'map>,
     reading: &'map Reading,
@@ -413,11 +438,13 @@ struct CellReader<'map> {
 
 impl<'map> CellReader<'map> {
     fn new(
-        map: &'map SiteMap,
+        map: Cells<'map>,
         (view, drawn, near): (&'map SiteView, &Drawn<'_>, &'map Near<'map>),
         reading: &'map Reading,
     ) -> Self {
-        let filter = map.filter(reading.choice(), |found| drawn.ground_of(view, found));
+        let filter = map
+            .map()
+            .filter(reading.choice(), |found| drawn.ground_of(view, found));
         Self {
             map,
             near,

@@ -13,14 +13,16 @@ use tread_api::site::{Cell, Grid};
 
 use super::cells::{Area, factor};
 use super::drawn::Drawn;
-use super::{App, AppError, Asked, Reading, SiteView};
+use super::{AppError, Asked, Look, Reading, SiteView};
 use crate::friction::Raster;
-use crate::friction::index::{Block, CELLS_PER_BLOCK, CellSummary, CompiledFilter, Room, SiteMap};
+use crate::friction::index::{Block, CELLS_PER_BLOCK, CellSummary, Cells, CompiledFilter, Room};
 
 /// Maximum number of squares in one picture.
 pub const SQUARES_MAX: u64 = 1 << 20;
 /// Maximum number of cached blocks, of all sites and models; 72 KiB each.
 const BLOCKS_MAX: usize = 1_024;
+/// Number of cells along a row of squares of several cells for which the map's lock is held at a time.
+const LOOK_CELLS: i32 = 2_048;
 
 /// The content of a requested picture.
 #[derive(Debug, Clone, Default)]
@@ -92,12 +94,13 @@ pub(super) struct Frame<'view> {
 }
 
 impl Frame<'_> {
-    fn filter(&self, map: &SiteMap) -> CompiledFilter<'_> {
+    fn filter(&self, map: Cells<'_>) -> CompiledFilter<'_> {
         let choice = crate::friction::index::Choice {
             configuration: Some(self.configuration),
             ..self.reading.choice()
         };
-        map.filter(choice, |found| self.drawn.ground_of(self.view, found))
+        map.map()
+            .filter(choice, |found| self.drawn.ground_of(self.view, found))
     }
 
     fn grounds(&self, block: Block) -> Arc<[u16]> {
@@ -110,8 +113,8 @@ impl Frame<'_> {
             .collect()
     }
 
-    fn block(&self, app: &App, block: Block) -> Arc<Vec<CellSummary>> {
-        let (row, reading) = (&self.view.row, self.reading);
+    fn block(&self, look: &Look<'_>, block: Block) -> Result<Arc<Vec<CellSummary>>, AppError> {
+        let (app, row, reading) = (look.app(), &self.view.row, self.reading);
         // Blocks as of a past time are not cached.
         let key = reading.as_of.is_none().then(|| BlockKey {
             site_pk: row.pk,
@@ -127,13 +130,13 @@ impl Frame<'_> {
             None => self.grounds(block),
         };
         let of_now = found.filter(|kept| kept.now_us == reading.now_us);
-        let (change, squares) = app.maps().look(row, |map| {
-            let newest = map.changes().newest_of(block);
-            let (mut squares, places) = match of_now {
-                Some(kept) if kept.change == newest => return (newest, kept.squares),
+        let (change, squares) = look.cells(row, |map| {
+            let newest = map.map().changes().newest_of(block);
+            let (mut squares, places) = match &of_now {
+                Some(kept) if kept.change == newest => return (newest, Arc::clone(&kept.squares)),
                 Some(kept) => {
-                    let places = map.changes().since(block, kept.change);
-                    (kept.squares, places)
+                    let places = map.map().changes().since(block, kept.change);
+                    (Arc::clone(&kept.squares), places)
                 }
                 None => (
                     Arc::new(vec![CellSummary::default(); CELLS_PER_BLOCK]),
@@ -147,7 +150,7 @@ impl Frame<'_> {
                 map.fuse_block(which, &grounds, &filter, reading.fused_at(), kept);
             }
             (newest, squares)
-        });
+        })?;
         if let Some(key) = key {
             let kept = Kept {
                 change,
@@ -159,11 +162,15 @@ impl Frame<'_> {
             };
             app.pictures().blocks.keep(key, kept);
         }
-        squares
+        Ok(squares)
     }
 
     /// Returns the squares of a box of single cells, row by row.
-    fn cells(&self, app: &App, (min, max): (Cell, Cell)) -> Vec<CellSummary> {
+    fn cells(
+        &self,
+        look: &Look<'_>,
+        (min, max): (Cell, Cell),
+    ) -> Result<Vec<CellSummary>, AppError> {
         let columns = usize::try_from(max.ix - min.ix + 1).unwrap_or_default();
         let rows = usize::try_from(max.iy - min.iy + 1).unwrap_or_default();
         let mut squares = vec![CellSummary::default(); columns * rows];
@@ -171,7 +178,7 @@ impl Frame<'_> {
         for row in low.row..=high.row {
             for column in low.column..=high.column {
                 let block = Block { row, column };
-                let kept = self.block(app, block);
+                let kept = self.block(look, block)?;
                 let (first, last) = (block.first(), block.last());
                 let (from_ix, to_ix) = (first.ix.max(min.ix), last.ix.min(max.ix));
                 for iy in first.iy.max(min.iy)..=last.iy.min(max.iy) {
@@ -183,12 +190,17 @@ impl Frame<'_> {
                 }
             }
         }
-        squares
+        Ok(squares)
     }
 
     /// Returns the squares of a box, each of `factor` × `factor` cells, row by row; these are not
     /// cached.
-    fn merged(&self, app: &App, (min, max): (Cell, Cell), factor: i32) -> Vec<CellSummary> {
+    fn merged(
+        &self,
+        look: &Look<'_>,
+        (min, max): (Cell, Cell),
+        factor: i32,
+    ) -> Result<Vec<CellSummary>, AppError> {
         let grid = self.view.row.site.grid;
         let coarse = Grid {
             cell_m: grid.cell_m * f64::from(factor),
@@ -197,125 +209,128 @@ impl Frame<'_> {
         let near = self
             .drawn
             .near(coarse.center_of(min), coarse.center_of(max));
-        let mut room = Room::default();
         let mut squares = Vec::new();
+        let columns: Vec<i32> = (min.ix..=max.ix).collect();
+        let at_once = usize::try_from(LOOK_CELLS / factor)
+            .unwrap_or_default()
+            .max(1);
         for iy in min.iy..=max.iy {
-            // The lock is released after each row.
-            app.maps().look(&self.view.row, |map| {
-                let filter = self.filter(map);
-                for ix in min.ix..=max.ix {
-                    let ground = near.ground_at(coarse.center_of(Cell { ix, iy }));
-                    let low = Cell {
-                        ix: ix.saturating_mul(factor),
-                        iy: iy.saturating_mul(factor),
+            for some in columns.chunks(at_once) {
+                squares.extend(look.cells(&self.view.row, |map| {
+                    let filter = self.filter(map);
+                    let mut room = Room::default();
+                    let square = |&ix: &i32| {
+                        let ground = near.ground_at(coarse.center_of(Cell { ix, iy }));
+                        let low = Cell {
+                            ix: ix.saturating_mul(factor),
+                            iy: iy.saturating_mul(factor),
+                        };
+                        let high = Cell {
+                            ix: low.ix.saturating_add(factor - 1),
+                            iy: low.iy.saturating_add(factor - 1),
+                        };
+                        let at = self.reading.fused_at();
+                        map.fuse_square((low, high), (ground, &filter), at, &mut room)
                     };
-                    let high = Cell {
-                        ix: low.ix.saturating_add(factor - 1),
-                        iy: low.iy.saturating_add(factor - 1),
-                    };
-                    let which = (ground, &filter);
-                    let at = self.reading.fused_at();
-                    squares.push(map.fuse_square((low, high), which, at, &mut room));
-                }
-            });
+                    some.iter().map(square).collect::<Vec<_>>()
+                })?);
+            }
         }
-        squares
+        Ok(squares)
     }
 }
 
-impl App {
-    /// Returns the map of a site as squares; runs on the calling thread.
-    pub(super) fn raster(
-        &self,
-        view: &SiteView,
-        reading: &Reading,
-        picture: &PictureAsked,
-    ) -> Result<Raster, AppError> {
-        let grid = view.row.site.grid;
-        let reference = reading.reference();
-        let (extent, configuration) = self.maps().look(&view.row, |map| {
-            let first = || map.configurations().first().copied();
-            (map.extent(), reference.or_else(first))
-        });
-        let whole = Area {
-            min: Point {
-                x_m: -COORDINATE_MAX_M,
-                y_m: -COORDINATE_MAX_M,
-            },
-            max: Point {
-                x_m: COORDINATE_MAX_M,
-                y_m: COORDINATE_MAX_M,
-            },
-        };
-        let factor = factor(&grid, picture.resolution_m)?;
-        let size_m = grid.cell_m * f64::from(factor);
-        let bounds = match (picture.area, extent) {
-            (Some(area), _) => Some(area.cells(&Grid {
-                cell_m: size_m,
-                ..grid
-            })?),
-            (None, Some((min, max))) => {
-                let (lowest, highest) = whole.cells(&grid)?;
-                let square = |ix: i32, iy: i32| Cell {
-                    ix: ix.div_euclid(factor),
-                    iy: iy.div_euclid(factor),
-                };
-                let min = square(min.ix.max(lowest.ix), min.iy.max(lowest.iy));
-                let max = square(max.ix.min(highest.ix), max.iy.min(highest.iy));
-                Some((min, max))
-            }
-            (None, None) => None,
-        };
-        let mut raster = Raster {
-            site: view.row.site.clone(),
-            configuration,
-            model: configuration.map_or_else(String::new, |found| view.model(found)),
-            normalisation: reading.normalisation(),
-            as_of_us: reading.now_us,
-            first: Cell { ix: 0, iy: 0 },
-            columns: 0,
-            rows: 0,
-            size_m,
-            squares: Vec::new(),
-        };
-        let Some((min, max)) = bounds else {
-            return Ok(raster);
-        };
-        let length = |low: i32, high: i32| (i64::from(high) - i64::from(low) + 1).unsigned_abs();
-        let (columns, rows) = (length(min.ix, max.ix), length(min.iy, max.iy));
-        let count = columns.saturating_mul(rows);
-        if count > SQUARES_MAX {
-            return Err(AppError::InvalidQuery {
-                parameter: "resolution_m",
-                detail: format!(
-                    "this would be {count} squares; a picture may have {SQUARES_MAX}: take a \
-                     smaller box or a larger `resolution_m`"
-                ),
-            });
+/// Returns the map of a site as squares.
+pub(super) fn raster(
+    look: &Look<'_>,
+    view: &SiteView,
+    reading: &Reading,
+    picture: &PictureAsked,
+) -> Result<Raster, AppError> {
+    let grid = view.row.site.grid;
+    let reference = reading.reference();
+    let (extent, configuration) = look.map(&view.row, |map| {
+        let first = || map.configurations().first().copied();
+        (map.extent(), reference.or_else(first))
+    });
+    let whole = Area {
+        min: Point {
+            x_m: -COORDINATE_MAX_M,
+            y_m: -COORDINATE_MAX_M,
+        },
+        max: Point {
+            x_m: COORDINATE_MAX_M,
+            y_m: COORDINATE_MAX_M,
+        },
+    };
+    let factor = factor(&grid, picture.resolution_m)?;
+    let size_m = grid.cell_m * f64::from(factor);
+    let bounds = match (picture.area, extent) {
+        (Some(area), _) => Some(area.cells(&Grid {
+            cell_m: size_m,
+            ..grid
+        })?),
+        (None, Some((min, max))) => {
+            let (lowest, highest) = whole.cells(&grid)?;
+            let square = |ix: i32, iy: i32| Cell {
+                ix: ix.div_euclid(factor),
+                iy: iy.div_euclid(factor),
+            };
+            let min = square(min.ix.max(lowest.ix), min.iy.max(lowest.iy));
+            let max = square(max.ix.min(highest.ix), max.iy.min(highest.iy));
+            Some((min, max))
         }
-        raster.first = min;
-        raster.columns = usize::try_from(columns).unwrap_or_default();
-        raster.rows = usize::try_from(rows).unwrap_or_default();
-        raster.squares = match configuration {
-            None => vec![CellSummary::default(); raster.columns * raster.rows],
-            Some(configuration) => {
-                let frame = Frame {
-                    view,
-                    reading,
-                    drawn: Drawn::new(&view.terrains),
-                    configuration,
-                };
-                if factor == 1 {
-                    frame.cells(self, (min, max))
-                } else {
-                    frame.merged(self, (min, max), factor)
-                }
-            }
-        };
-        Ok(if picture.area.is_none() {
-            raster.trimmed()
-        } else {
-            raster
-        })
+        (None, None) => None,
+    };
+    let mut raster = Raster {
+        site: view.row.site.clone(),
+        configuration,
+        model: configuration.map_or_else(String::new, |found| view.model(found)),
+        normalisation: reading.normalisation(),
+        as_of_us: reading.now_us,
+        first: Cell { ix: 0, iy: 0 },
+        columns: 0,
+        rows: 0,
+        size_m,
+        squares: Vec::new(),
+    };
+    let Some((min, max)) = bounds else {
+        return Ok(raster);
+    };
+    let length = |low: i32, high: i32| (i64::from(high) - i64::from(low) + 1).unsigned_abs();
+    let (columns, rows) = (length(min.ix, max.ix), length(min.iy, max.iy));
+    let count = columns.saturating_mul(rows);
+    if count > SQUARES_MAX {
+        return Err(AppError::InvalidQuery {
+            parameter: "resolution_m",
+            detail: format!(
+                "this would be {count} squares; a picture may have {SQUARES_MAX}: take a \
+                 smaller box or a larger `resolution_m`"
+            ),
+        });
     }
+    raster.first = min;
+    raster.columns = usize::try_from(columns).unwrap_or_default();
+    raster.rows = usize::try_from(rows).unwrap_or_default();
+    raster.squares = match configuration {
+        None => vec![CellSummary::default(); raster.columns * raster.rows],
+        Some(configuration) => {
+            let frame = Frame {
+                view,
+                reading,
+                drawn: Drawn::new(&view.terrains),
+                configuration,
+            };
+            if factor == 1 {
+                frame.cells(look, (min, max))?
+            } else {
+                frame.merged(look, (min, max), factor)?
+            }
+        }
+    };
+    Ok(if picture.area.is_none() {
+        raster.trimmed()
+    } else {
+        raster
+    })
 }

@@ -9,8 +9,9 @@ use futures_util::TryStreamExt as _;
 use tread_api::ids::{ConfigurationId, RobotId};
 use tread_api::rights::Scope;
 
+use super::blocks::BlockMemory;
 use super::unwritten::Unwritten;
-use super::{Folded, Maps, add, ensure};
+use super::{Folded, Maps, Sites};
 use crate::app::App;
 use crate::db::segments::{Added, KeyedSegment};
 use crate::db::sums::SumKey;
@@ -19,9 +20,12 @@ use crate::db::{self, DbError, Tx};
 use crate::friction::index::SiteMap;
 use crate::friction::{Sums, epoch_h};
 
+/// Number of sums after which cells leave memory if all together need too much of it.
+const EVICT_EVERY: usize = 10_000;
+
 /// What was read.
 struct Read {
-    sites: HashMap<i64, SiteMap>,
+    sites: Sites,
     unwritten: Unwritten,
 }
 
@@ -50,7 +54,7 @@ impl App {
         let mut order = Arc::clone(&self.maps().order).lock_owned().await;
         let mut tx = self.db().read("map").await?;
         let now = self.clock().elapsed();
-        let read = read(&mut tx, now).await?;
+        let read = read(&mut tx, now, &self.maps().memory).await?;
         self.removed().extend(db::removed::boots(&mut tx).await?);
         drop(tx);
         self.maps().replace(read);
@@ -63,28 +67,32 @@ impl Maps {
     /// Replaces the maps by those read from the database.
     fn replace(&self, mut read: Read) {
         let mut sites = self.sites.write().unwrap_or_else(PoisonError::into_inner);
-        for (pk, before) in sites.drain() {
-            match read.sites.get_mut(&pk) {
+        for (pk, before) in sites.maps.drain() {
+            match read.sites.maps.get_mut(&pk) {
                 Some(map) => map.follow(&before),
                 None => {
-                    read.sites.insert(pk, before);
+                    read.sites.maps.insert(pk, before);
                 }
             }
         }
         *sites = read.sites;
-        *self.unwritten() = read.unwritten;
+        let mut unwritten = self.unwritten();
+        read.unwritten.follow(&mut unwritten);
+        *unwritten = read.unwritten;
     }
 }
 
-async fn read(tx: &mut Tx, now: Duration) -> Result<Read, DbError> {
-    let mut sites = HashMap::new();
+/// Reads all sums. Cells stay in memory as far as there is room; a block that has left it once gets
+/// no further sums, so it is read again as a whole when it is needed.
+async fn read(tx: &mut Tx, now: Duration, memory: &BlockMemory) -> Result<Read, DbError> {
+    let mut sites = Sites::default();
     let mut after = String::new();
     loop {
         let rows = db::sites::list(tx, &Scope::EVERYWHERE, &after, 100).await?;
         let Some(last) = rows.last() else { break };
         after = last.site.id.to_string();
         for row in &rows {
-            ensure(&mut sites, row);
+            sites.ensure(row);
         }
     }
     let names = Names {
@@ -92,10 +100,15 @@ async fn read(tx: &mut Tx, now: Duration) -> Result<Read, DbError> {
         configurations: db::robots::configurations_by_key(tx).await?,
         withdrawals: db::withdrawals::all(tx).await?,
     };
+    let mut added = 0_usize;
     db::sums::each(tx, |row| {
         // The foreign keys of a sum guarantee both names.
         if let Some(folded) = names.named(row.key, row.sums) {
-            add(&mut sites, std::slice::from_ref(&folded));
+            sites.add(std::slice::from_ref(&folded), SiteMap::load_cells);
+            added += 1;
+            if added.is_multiple_of(EVICT_EVERY) {
+                memory.evict(&mut sites);
+            }
         }
     })
     .await?;
@@ -115,10 +128,15 @@ async fn read(tx: &mut Tx, now: Duration) -> Result<Read, DbError> {
             };
             if let Some(folded) = names.folded(row)? {
                 unwritten.add([(&folded.key, &*folded.cells)], keys, now);
-                add(&mut sites, std::slice::from_ref(&folded));
+                sites.add(std::slice::from_ref(&folded), SiteMap::load_cells);
+                added += 1;
+                if added.is_multiple_of(EVICT_EVERY) {
+                    memory.evict(&mut sites);
+                }
             }
         }
     }
+    memory.evict(&mut sites);
     Ok(Read { sites, unwritten })
 }
 

@@ -3,13 +3,14 @@
 //! ```text
 //! commit of segments ─► added here and to the map ─► stored with the robot's watermark ─► removed
 //! kill ─► nothing here; the segments that follow each watermark are added again
+//! block of cells read ─► those that its snapshot of the stored sums lacks are added to it
 //! ```
 //!
 //! The sums of a robot are stored up to a watermark, so those of the same segments are stored in one
 //! transaction, for which receipts wait. A robot that has driven through many cells therefore has
 //! several generations of sums, each of the segments after those of the one before.
 
-use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque};
 use std::time::Duration;
 
 use foldhash::fast::RandomState;
@@ -19,6 +20,7 @@ use crate::db::segments::Added;
 use crate::db::sums::SumKey;
 use crate::db::watermarks::WatermarkStep;
 use crate::friction::Sums;
+use crate::friction::index::Block;
 
 /// Maximum number of unwritten sums, about 300 bytes each; beyond it sums are stored before further
 /// receipts.
@@ -43,16 +45,34 @@ pub(super) struct Unwritten {
     segments: u64,
     /// Number of additions so far.
     additions: u64,
+    /// Numbers of the reads of blocks that have begun and not ended.
+    reads: BTreeSet<u64>,
+    /// Number of the next one.
+    next_read: u64,
+    /// Generations that were stored while blocks were read, in the order in which they were: the
+    /// snapshots of those reads may lack them.
+    stored_meanwhile: VecDeque<StoredMeanwhile>,
 }
 
 /// Sums of some segments of one robot.
 #[derive(Debug)]
 struct Generation {
     sums: HashMap<SumKey, Sums, RandomState>,
+    /// Site and block of each of the sums, and of sums that were removed since.
+    blocks: HashSet<(i64, Block), RandomState>,
     /// Keys between which all segments in `sums` are.
     keys: Added,
     /// Number of the first addition, and its time.
     began: (u64, Duration),
+}
+
+/// A generation that was stored while blocks were read.
+#[derive(Debug)]
+pub(super) struct StoredMeanwhile {
+    robot_pk: i64,
+    generation: Generation,
+    /// Number of the first read that began after it was stored.
+    until_read: u64,
 }
 
 /// How much is unwritten.
@@ -83,6 +103,9 @@ impl Default for Unwritten {
             sums: 0,
             segments: 0,
             additions: 0,
+            reads: BTreeSet::new(),
+            next_read: 0,
+            stored_meanwhile: VecDeque::new(),
         }
     }
 }
@@ -120,6 +143,7 @@ impl Unwritten {
             if !generations.back().is_some_and(has_room) {
                 generations.push_back(Generation {
                     sums: HashMap::default(),
+                    blocks: HashSet::default(),
                     keys: added,
                     began: (self.additions, at),
                 });
@@ -136,6 +160,7 @@ impl Unwritten {
                     present.add(sums);
                 } else {
                     newest.sums.insert(key.clone(), *sums);
+                    newest.blocks.insert((key.site_pk, Block::of(*cell)));
                     self.sums += 1;
                 }
             }
@@ -188,11 +213,69 @@ impl Unwritten {
             while let Some(stored) = generations.pop_front_if(is_stored) {
                 self.sums -= stored.sums.len();
                 self.segments -= stored.segments();
+                if !self.reads.is_empty() {
+                    self.stored_meanwhile.push_back(StoredMeanwhile {
+                        robot_pk: step.robot_pk,
+                        generation: stored,
+                        until_read: self.next_read,
+                    });
+                }
             }
             if generations.is_empty() {
                 self.robots.remove(&step.robot_pk);
             }
         }
+    }
+
+    /// Begins a read of blocks: sums that are stored until its end are still found by
+    /// [`Self::since`]. Returns its number.
+    pub(super) fn begin_read(&mut self) -> u64 {
+        let number = self.next_read;
+        self.next_read += 1;
+        self.reads.insert(number);
+        number
+    }
+
+    /// Ends a read of blocks. Returns what was kept for it alone.
+    pub(super) fn end_read(&mut self, number: u64) -> Vec<StoredMeanwhile> {
+        self.reads.remove(&number);
+        let oldest = self.reads.first().copied().unwrap_or(self.next_read);
+        let is_over = |stored: &mut StoredMeanwhile| stored.until_read <= oldest;
+        let over = std::iter::from_fn(|| self.stored_meanwhile.pop_front_if(is_over));
+        over.collect()
+    }
+
+    /// Takes over the reads that have begun before memory was read again; each of them will find that
+    /// its map is another one.
+    pub(super) fn follow(&mut self, before: &mut Self) {
+        self.reads = std::mem::take(&mut before.reads);
+        self.next_read = before.next_read;
+    }
+
+    /// Returns the sums of a block that are not in the stored sums as of a snapshot with these
+    /// watermarks. A read must have begun before that snapshot.
+    pub(super) fn since<'all>(
+        &'all self,
+        watermarks: &'all HashMap<i64, i64>,
+        site_pk: i64,
+        block: Block,
+    ) -> impl Iterator<Item = (&'all SumKey, &'all Sums)> {
+        let stored = self.stored_meanwhile.iter();
+        let stored = stored.map(|stored| (stored.robot_pk, &stored.generation));
+        let unwritten = self.robots.iter().flat_map(|(&robot_pk, generations)| {
+            generations
+                .iter()
+                .map(move |generation| (robot_pk, generation))
+        });
+        let since = stored
+            .chain(unwritten)
+            .filter(move |(robot_pk, generation)| {
+                // A generation is stored whole, with its last key as the watermark.
+                let stored_to = watermarks.get(robot_pk).copied().unwrap_or_default();
+                generation.keys.last > stored_to && generation.blocks.contains(&(site_pk, block))
+            });
+        let sums = since.flat_map(|(_, generation)| &generation.sums);
+        sums.filter(move |(key, _)| key.site_pk == site_pk && Block::of(key.cell) == block)
     }
 
     /// Removes the sums of a robot between two hours, both included.

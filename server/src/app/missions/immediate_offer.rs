@@ -6,6 +6,7 @@
 
 use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use tread_api::robot::LinkState;
 use tread_api::trajectory::Trajectory;
@@ -16,6 +17,9 @@ use crate::app::{App, AppError};
 use crate::db::missions::MissionRow;
 use crate::db::{self, Tx};
 
+/// Maximum time for reading the map beside the commit of a mission: blocks that are not in memory may
+/// take longer, and then the reconciler reads them.
+const EARLY_PRIOR_MAX: Duration = Duration::from_millis(500);
 /// Maximum number of missions in [`JustOffered`]; the reconciler reads the others from the database.
 const JUST_OFFERED_MAX: usize = 64;
 
@@ -70,8 +74,9 @@ impl App {
         if link == LinkState::Offline {
             return None;
         }
-        let prior = self.prior_along((&key.0, &key.1), trajectory).await;
-        prior.ok().map(EarlyPrior)
+        let reading = self.prior_along((&key.0, &key.1), trajectory);
+        let prior = tokio::time::timeout(EARLY_PRIOR_MAX, reading).await;
+        prior.ok()?.ok().map(EarlyPrior)
     }
 
     /// Returns whether the reconciler would offer a new mission at once, as the only open one of its

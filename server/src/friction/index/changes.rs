@@ -104,6 +104,71 @@ impl Changes {
         }
     }
 
+    /// Records a change of some cell of a block.
+    pub(super) fn note_block(&mut self, block: Block) {
+        self.newest += 1;
+        self.blocks.insert(
+            block,
+            OfBlock {
+                newest: self.newest,
+                kept_after: self.newest,
+                kept: VecDeque::new(),
+            },
+        );
+    }
+
+    /// Forgets which cells of a block have changed until now.
+    pub(super) fn forget(&mut self, block: Block) {
+        if let Some(found) = self.blocks.get_mut(&block) {
+            found.kept_after = found.newest;
+            found.kept = VecDeque::new();
+        }
+    }
+
+    /// Returns whether any change of a block was recorded.
+    pub fn contains(&self, block: Block) -> bool {
+        self.blocks.contains_key(&block)
+    }
+
+    /// Returns the number of blocks with any change.
+    pub fn block_count(&self) -> usize {
+        self.blocks.len()
+    }
+
+    /// Returns the rows with any change between two rows, both included.
+    pub(super) fn rows(&self, between: Option<(i32, i32)>) -> impl Iterator<Item = i32> + '_ {
+        let (mut next, last) = between.map_or((None, i32::MIN), |(low, high)| (Some(low), high));
+        std::iter::from_fn(move || {
+            let from = Block {
+                row: next?,
+                column: i32::MIN,
+            };
+            let (found, _) = self.blocks.range(from..).next()?;
+            next = found.row.checked_add(1);
+            (found.row <= last).then_some(found.row)
+        })
+    }
+
+    /// Returns the lowest column with any change in the rectangle of blocks from `low` to `high`,
+    /// both included.
+    pub fn first_column(&self, (low, high): (Block, Block)) -> Option<i32> {
+        let rows = self.rows(Some((low.row, high.row)));
+        let columns = (low.column, high.column);
+        let firsts = rows.filter_map(|row| self.row(row, columns).next());
+        firsts.map(|block| block.column).min()
+    }
+
+    /// Returns the blocks with any change of a row between two columns, both included.
+    pub(super) fn row(
+        &self,
+        row: i32,
+        (low, high): (i32, i32),
+    ) -> impl Iterator<Item = Block> + '_ {
+        let at = |column| Block { row, column };
+        let found = (low <= high).then(|| self.blocks.range(at(low)..=at(high)));
+        found.into_iter().flatten().map(|(&block, _)| block)
+    }
+
     /// Continues the numbering of the map `before`, and records a change of all cells of both.
     pub(super) fn follow(&mut self, before: &Self) {
         self.newest = self.newest.max(before.newest);

@@ -1,9 +1,11 @@
 //! The friction map in memory: all sums, indexed by cell and by terrain.
 //!
 //! The index equals the stored sums with those that are stored behind the receipts, and is updated
-//! with each commit. Cells are sorted row by row, so a rectangle is a few ranges of neighbours. Each
-//! sum of a (cell, terrain, robot, configuration, epoch) takes 168 bytes in addition to its key.
+//! with each commit. The sums of all ground are always in memory, those of cells only for some
+//! blocks ([`cells`]). Each sum of a (cell, terrain, robot, configuration, epoch) takes 168 bytes in
+//! addition to its key.
 
+mod cells;
 mod changes;
 mod names;
 mod part;
@@ -11,13 +13,14 @@ mod partial;
 mod summaries;
 
 use std::collections::BTreeMap;
-use std::ops::Bound;
 
 use jiff::Timestamp;
 use tread_api::ids::{ConfigurationId, RobotId};
 use tread_api::site::Cell;
 use tread_api::terrain::TerrainRef;
 
+use self::cells::Blocks;
+pub use self::cells::{Absent, BlockBuilder, BlockCells, Cells, Pin};
 pub use self::changes::{BLOCK_CELLS, Block, Changes};
 use self::names::{Names, Number};
 use self::part::{Part, PartKey};
@@ -51,8 +54,8 @@ pub struct SiteMap {
     names: Names,
     grid_revision: u32,
     horizons: Horizons,
-    /// Sums by cell; the key has row and column, shifted to unsigned numbers, see [`place`].
-    cells: BTreeMap<u64, Box<[Part]>>,
+    /// Sums by cell, of some of the blocks that `changes` lists; the others are absent.
+    blocks: Blocks,
     /// Sums over all cells, for terrains.
     totals: BTreeMap<PartKey, Sums>,
     changes: Changes,
@@ -62,17 +65,10 @@ pub struct SiteMap {
     segments: BTreeMap<i32, u64>,
 }
 
+/// Returns row and column of a cell as one number, which rises row by row.
 fn place(cell: Cell) -> u64 {
     let unsigned = |index: i32| u64::from((index ^ i32::MIN).cast_unsigned());
     unsigned(cell.iy) << 32 | unsigned(cell.ix)
-}
-
-fn cell_at(place: u64) -> Cell {
-    let signed = |bits: u64| (u32::try_from(bits).unwrap_or_default().cast_signed()) ^ i32::MIN;
-    Cell {
-        ix: signed(place & 0xFFFF_FFFF),
-        iy: signed(place >> 32),
-    }
 }
 
 /// Changes whenever measurements may have left a map or moved to another epoch.
@@ -182,20 +178,41 @@ impl SiteMap {
 
     /// Adds sums that agree in all labels but their cells; `labelled.cell` is ignored.
     pub fn add_cells(&mut self, labelled: Labelled<'_>, cells: &[(Cell, Sums)]) {
+        self.add_noting(labelled, cells, Changes::note);
+    }
+
+    /// The same for sums that were measured before the map is looked at for the first time: which cells
+    /// have changed is not recorded.
+    pub fn load_cells(&mut self, labelled: Labelled<'_>, cells: &[(Cell, Sums)]) {
+        self.add_noting(labelled, cells, |changes, cell| {
+            changes.note_block(Block::of(cell));
+        });
+    }
+
+    fn add_noting(
+        &mut self,
+        labelled: Labelled<'_>,
+        cells: &[(Cell, Sums)],
+        note: impl Fn(&mut Changes, Cell),
+    ) {
         if labelled.grid_revision != self.grid_revision {
             return;
         }
-        let epoch_h = self.horizons.epoch_of(labelled.epoch_h).first_h;
-        let key = PartKey {
-            terrain: self.names.terrains.number(labelled.terrain),
-            configuration: self.names.configurations.number(&labelled.configuration),
-            robot: self.names.robots.number(labelled.robot),
-            epoch_h: i32::try_from(epoch_h).unwrap_or(i32::MAX),
-        };
+        let key = self.key(labelled);
         let mut all: Option<Sums> = None;
         for (cell, sums) in cells {
-            self.add_part(*cell, key, sums);
-            self.changes.note(*cell);
+            let block = Block::of(*cell);
+            if self.blocks.add(*cell, key, sums) {
+                note(&mut self.changes, *cell);
+            } else if self.changes.contains(block) {
+                // Absent: it is read with these sums when it is needed.
+                self.changes.note_block(block);
+            } else {
+                // Nothing is stored of a block that was never driven on, so this is all of it.
+                self.blocks.insert(block, BlockCells::default());
+                self.blocks.add(*cell, key, sums);
+                note(&mut self.changes, *cell);
+            }
             match &mut all {
                 Some(all) => all.add(sums),
                 None => all = Some(*sums),
@@ -210,18 +227,71 @@ impl SiteMap {
         }
     }
 
-    fn add_part(&mut self, cell: Cell, key: PartKey, sums: &Sums) {
-        let parts = self.cells.entry(place(cell)).or_default();
-        match parts.binary_search_by_key(&key, |part| part.key) {
-            Ok(index) => parts[index].add(sums),
-            Err(index) => {
-                let mut longer = Vec::with_capacity(parts.len() + 1);
-                longer.extend_from_slice(&parts[..index]);
-                longer.push(Part::new(key, sums));
-                longer.extend_from_slice(&parts[index..]);
-                *parts = longer.into_boxed_slice();
+    /// Returns the key of sums with these labels.
+    fn key(&mut self, labelled: Labelled<'_>) -> PartKey {
+        PartKey {
+            terrain: self.names.terrains.number(labelled.terrain),
+            configuration: self.names.configurations.number(&labelled.configuration),
+            robot: self.names.robots.number(labelled.robot),
+            epoch_h: self.bucket(labelled.epoch_h),
+        }
+    }
+
+    /// Returns the same; `None` if a name is new to the map.
+    fn found_key(&self, labelled: Labelled<'_>) -> Option<PartKey> {
+        Some(PartKey {
+            terrain: self.names.terrains.find(labelled.terrain)?,
+            configuration: self.names.configurations.find(&labelled.configuration)?,
+            robot: self.names.robots.find(labelled.robot)?,
+            epoch_h: self.bucket(labelled.epoch_h),
+        })
+    }
+
+    /// Returns the first hour of the epoch that an hour belongs to.
+    fn bucket(&self, hour: i64) -> i32 {
+        let first_h = self.horizons.epoch_of(hour).first_h;
+        i32::try_from(first_h).unwrap_or(i32::MAX)
+    }
+
+    /// Puts the cells of an absent block into memory, which were made with the present
+    /// [`Self::stamp`], and adds those sums to them that they lack.
+    pub fn insert<'sums>(
+        &mut self,
+        block: Block,
+        cells: BlockCells,
+        lacking: impl IntoIterator<Item = (Labelled<'sums>, &'sums Sums)>,
+    ) {
+        self.blocks.insert(block, cells);
+        for (labelled, sums) in lacking {
+            if labelled.grid_revision == self.grid_revision {
+                let key = self.key(labelled);
+                self.blocks.add(labelled.cell, key, sums);
             }
         }
+    }
+
+    /// Keeps a block in memory as long as the returned pin exists, and returns its bytes; `None` if it
+    /// is absent or nothing was ever measured in it.
+    pub fn pin(&self, block: Block) -> Option<(Pin, usize)> {
+        self.blocks.pin(block)
+    }
+
+    /// Returns the number of blocks in memory, and about how many bytes they take.
+    pub fn size(&self) -> (usize, usize) {
+        self.blocks.size()
+    }
+
+    /// Returns the blocks that may leave memory, with the number of the look that used each last and
+    /// its bytes.
+    pub fn idle_blocks(&self) -> impl Iterator<Item = (u64, Block, usize)> + '_ {
+        self.blocks.idle()
+    }
+
+    /// Takes the cells of a block out of memory, unless it is pinned.
+    pub fn evict(&mut self, block: Block) -> Option<BlockCells> {
+        let evicted = self.blocks.take(block)?;
+        self.changes.forget(block);
+        Some(evicted)
     }
 
     fn count_segments(&mut self) {
@@ -239,20 +309,11 @@ impl SiteMap {
         };
         let goes =
             |key: &PartKey| key.robot == robot && (from_h..=to_h).contains(&i64::from(key.epoch_h));
-        let mut changed = Vec::new();
-        for (&place, parts) in &mut self.cells {
-            if parts.iter().any(|part| goes(&part.key)) {
-                let kept = parts.iter().filter(|part| !goes(&part.key));
-                *parts = kept.copied().collect();
-                changed.push(cell_at(place));
-            }
-        }
-        self.cells.retain(|_place, parts| !parts.is_empty());
+        self.blocks.remove(goes);
         self.totals.retain(|key, _sums| !goes(key));
         self.count_segments();
-        for cell in changed {
-            self.changes.note(cell);
-        }
+        // A block may have been absent, or been read after the removal from the database.
+        self.changes.note_all();
     }
 
     /// Merges the epochs before these horizons; none is ever divided again.
@@ -269,20 +330,7 @@ impl SiteMap {
                 ..key
             }
         };
-        for parts in self.cells.values_mut() {
-            if parts.iter().all(|part| bucket(part.key) == part.key) {
-                continue;
-            }
-            let mut merged: Vec<Part> = Vec::with_capacity(parts.len());
-            for part in &*parts {
-                let key = bucket(part.key);
-                match merged.last_mut().filter(|last| last.key == key) {
-                    Some(last) => last.add(&part.sums()),
-                    None => merged.push(part.moved(key)),
-                }
-            }
-            *parts = merged.into_boxed_slice();
-        }
+        self.blocks.merge(bucket);
         let mut totals: BTreeMap<PartKey, Sums> = BTreeMap::new();
         for (&key, sums) in &self.totals {
             let total = totals.entry(bucket(key));
@@ -318,85 +366,14 @@ impl SiteMap {
         &self.changes
     }
 
-    /// Returns the number of sums of (cell, terrain, robot, configuration, epoch).
+    /// Returns the number of sums of (cell, terrain, robot, configuration, epoch) in memory.
     pub fn part_count(&self) -> usize {
-        self.cells.values().map(|parts| parts.len()).sum()
-    }
-
-    /// Returns the measurements of one cell, per terrain and configuration.
-    pub fn cell(&self, cell: Cell, choice: Choice<'_>) -> Vec<Group<'_>> {
-        self.groups(&self.parts_at(place(cell), choice.when()), choice)
-    }
-
-    /// Returns the end of the newest pass through a cell, microseconds since 1970; `None` without
-    /// one.
-    pub fn newest_at_us(&self, cell: Cell, choice: Choice<'_>) -> Option<i64> {
-        let parts = self.parts_at(place(cell), choice.when());
-        let counted = parts.iter().filter(|part| self.counts(&part.key, &choice));
-        counted.map(|part| part.newest_at_us).max()
+        self.blocks.part_count()
     }
 
     /// Returns the robot with this rank in the order of names.
     pub fn robot_of_rank(&self, rank: u32) -> Option<&RobotId> {
         self.names.robots.numbers.keys().nth(rank as usize)
-    }
-
-    /// Returns the measurements of several cells together, summed per robot and epoch, per terrain
-    /// and configuration.
-    pub fn area(&self, cells: &[Cell], choice: Choice<'_>) -> Vec<Group<'_>> {
-        let mut sums: BTreeMap<PartKey, Sums> = BTreeMap::new();
-        for &cell in cells {
-            for part in &*self.parts_at(place(cell), choice.when()) {
-                if self.counts(&part.key, &choice) {
-                    sums.entry(part.key)
-                        .and_modify(|sums| sums.add(&part.sums()))
-                        .or_insert_with(|| part.sums());
-                }
-            }
-        }
-        let parts: Vec<Part> = sums
-            .iter()
-            .map(|(&key, sums)| Part::new(key, sums))
-            .collect();
-        self.groups(&parts, choice)
-    }
-
-    /// Returns the cells with measurements in the rectangle from `min` to `max`, both included, row
-    /// by row; those after the cell `after` if it is given.
-    pub fn cells_in(
-        &self,
-        min: Cell,
-        max: Cell,
-        after: Option<Cell>,
-    ) -> impl Iterator<Item = Cell> + '_ {
-        let start = match after {
-            Some(after) if place(after) >= place(min) => Bound::Excluded(place(after)),
-            Some(_) | None => Bound::Included(place(min)),
-        };
-        let mut next = start;
-        std::iter::from_fn(move || {
-            loop {
-                let last = Bound::Included(place(max));
-                if let (Bound::Included(low) | Bound::Excluded(low), Bound::Included(high)) =
-                    (next, last)
-                    && (low > high || (low == high && matches!(next, Bound::Excluded(_))))
-                {
-                    return None;
-                }
-                let (&found, _parts) = self.cells.range((next, last)).next()?;
-                let cell = cell_at(found);
-                if cell.ix < min.ix {
-                    next = Bound::Included(place(Cell { ix: min.ix, ..cell }));
-                } else if cell.ix > max.ix {
-                    // Continue with the next row, if there is one.
-                    let iy = cell.iy.checked_add(1)?;
-                    next = Bound::Included(place(Cell { ix: min.ix, iy }));
-                } else {
-                    next = Bound::Excluded(found);
-                    return Some(cell);
-                }
-            }
-        })
     }
 
     /// Returns the measurements of all terrain revisions that satisfy `is_wanted`, as one ground,
@@ -495,31 +472,16 @@ impl SiteMap {
     /// Returns the contribution of each robot to the map, sorted by robot.
     pub fn contributions(&self) -> Vec<Contribution> {
         let mut found: BTreeMap<Number, Contribution> = BTreeMap::new();
-        let mut note = |key: &PartKey, cells: u64, sums: Option<&Sums>| {
+        for (key, sums) in &self.totals {
             let entry = found.entry(key.robot).or_insert_with(|| Contribution {
                 robot: self.names.robots.name(key.robot).clone(),
-                cells: 0,
                 segments: 0,
                 first_epoch_h: i64::MAX,
                 newest_at_us: i64::MIN,
             });
-            entry.cells += cells;
-            if let Some(sums) = sums {
-                entry.segments += sums.segments;
-                entry.first_epoch_h = entry.first_epoch_h.min(i64::from(key.epoch_h));
-                entry.newest_at_us = entry.newest_at_us.max(sums.newest_at_us);
-            }
-        };
-        for (key, sums) in &self.totals {
-            note(key, 0, Some(sums));
-        }
-        for parts in self.cells.values() {
-            let mut robots: Vec<&PartKey> = parts.iter().map(|part| &part.key).collect();
-            robots.sort_unstable_by_key(|key| key.robot);
-            robots.dedup_by_key(|key| key.robot);
-            for key in robots {
-                note(key, 1, None);
-            }
+            entry.segments += sums.segments;
+            entry.first_epoch_h = entry.first_epoch_h.min(i64::from(key.epoch_h));
+            entry.newest_at_us = entry.newest_at_us.max(sums.newest_at_us);
         }
         let mut contributions: Vec<Contribution> = found.into_values().collect();
         contributions.sort_unstable_by(|left, right| left.robot.cmp(&right.robot));
@@ -532,8 +494,6 @@ impl SiteMap {
 pub struct Contribution {
     /// Identifier of the robot.
     pub robot: RobotId,
-    /// Number of cells that it has measured.
-    pub cells: u64,
     /// Number of its segments.
     pub segments: u64,
     /// First hour of its first epoch.
@@ -552,15 +512,12 @@ mod tests {
     }
 
     #[test]
-    fn places_sort_row_by_row_and_give_back_their_cell() {
+    fn places_sort_row_by_row() {
         let cells = [(5, -2), (-7, -1), (3, -1), (i32::MIN, 0), (0, 0), (4, 9)];
         let places: Vec<u64> = cells
             .iter()
             .map(|&(ix, iy)| place(Cell { ix, iy }))
             .collect();
         assert!(places.is_sorted(), "{places:?}");
-        for ((ix, iy), place) in cells.into_iter().zip(places) {
-            assert_eq!(cell_at(place), Cell { ix, iy });
-        }
     }
 }

@@ -78,8 +78,8 @@ impl Part {
             sums.tyre_error,
         ];
         for (index, fixed) in fixed.into_iter().enumerate() {
-            // The database refuses larger sums before.
-            let (hi, lo) = fixed.halves().unwrap_or((i64::MAX, 0));
+            // Clamped as the database does, so that sums read again are the same.
+            let (hi, lo) = fixed.clamped_halves();
             part.hi[index] = hi;
             part.lo[index] = u32::try_from(lo).unwrap_or_default();
         }

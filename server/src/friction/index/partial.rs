@@ -152,12 +152,6 @@ impl SiteMap {
         self.segments.get(&first_h).copied().unwrap_or(0)
     }
 
-    /// Returns the parts of a cell that count at a time.
-    pub(super) fn parts_at<'map>(&'map self, place: u64, when: When<'_>) -> Cow<'map, [Part]> {
-        let parts = self.cells.get(&place);
-        self.parts_then((place, parts.map_or(&[], |parts| &**parts)), when)
-    }
-
     /// Returns those of a cell's parts that count at a time.
     pub(super) fn parts_then<'map>(
         &'map self,
@@ -226,7 +220,7 @@ mod tests {
     use proptest::prelude::*;
     use uuid::Uuid;
 
-    use super::super::{At, Choice, Group, Labelled, Room};
+    use super::super::{Absent, At, Choice, Group, Labelled, Room};
     use super::*;
     use crate::friction::Seen;
     use crate::friction::epochs::{DAY_H, Horizons};
@@ -359,6 +353,7 @@ mod tests {
                 ..Choice::default()
             };
             let present = Choice { as_of: None, partial: None, ..choice };
+            let absent = Absent::default();
             let cells = [0, 1, 2].map(|ix| Cell { ix, iy: 0 });
             let is_lawn = |_: &TerrainRef| true;
             prop_assert_eq!(
@@ -366,21 +361,21 @@ mod tests {
                 named(&expected, expected.terrain(is_lawn, present))
             );
             prop_assert_eq!(
-                named(&map, map.area(&cells, choice)),
-                named(&expected, expected.area(&cells, present))
+                named(&map, map.cells(&absent, 1).area(&cells, choice)),
+                named(&expected, expected.cells(&absent, 1).area(&cells, present))
             );
             let config = FrictionConfig::default();
             let at = At { config: &config, now_us: as_of_us };
             let ground_of = |found: Option<&TerrainRef>| Some(found.map_or(0, |_| 1));
             for cell in cells {
                 prop_assert_eq!(
-                    named(&map, map.cell(cell, choice)),
-                    named(&expected, expected.cell(cell, present))
+                    named(&map, map.cells(&absent, 1).cell(cell, choice)),
+                    named(&expected, expected.cells(&absent, 1).cell(cell, present))
                 );
-                prop_assert_eq!(map.newest_at_us(cell, choice), expected.newest_at_us(cell, present));
+                prop_assert_eq!(map.cells(&absent, 1).newest_at_us(cell, choice), expected.cells(&absent, 1).newest_at_us(cell, present));
                 let seen = |map: &SiteMap, choice| {
                     let filter = map.filter(choice, ground_of);
-                    map.fuse_cell(cell, (1, &filter), at, &mut Room::default())
+                    map.cells(&absent, 1).fuse_cell(cell, (1, &filter), at, &mut Room::default())
                 };
                 prop_assert_eq!(seen(&map, choice), seen(&expected, present));
             }

@@ -7,7 +7,7 @@ use tread_api::terrain::TerrainRef;
 use super::changes::{BLOCK_CELLS, Block};
 use super::part::{Part, PartKey};
 use super::partial::When;
-use super::{Choice, SiteMap, Sums, place};
+use super::{Cells, Choice, SiteMap, Sums};
 use crate::friction::weights::FrictionConfig;
 use crate::friction::{Fused, Fuser, Ground, Seen};
 
@@ -137,111 +137,6 @@ impl SiteMap {
         }
     }
 
-    /// Recomputes the squares of a block, those with the indices `places` or all of them. `grounds`
-    /// has the number of the ground at the centre of each cell. `grounds` and `squares` are row by
-    /// row, with [`BLOCK_CELLS`] per row.
-    pub fn fuse_block(
-        &self,
-        (block, places): (Block, Option<&[u16]>),
-        grounds: &[u16],
-        filter: &CompiledFilter<'_>,
-        at: At<'_>,
-        squares: &mut [CellSummary],
-    ) {
-        if places.is_none() {
-            squares.fill(CellSummary::default());
-        }
-        let mut room = Room::default();
-        let mut put = |place: u16, parts: &[Part]| {
-            let index = usize::from(place);
-            if let (Some(&ground), Some(square)) = (grounds.get(index), squares.get_mut(index)) {
-                *square = self.square(parts, (ground, filter), at, &mut room);
-            }
-        };
-        if let Some(places) = places {
-            for &one in places {
-                put(one, &self.parts_at(place(block.cell(one)), filter.when));
-            }
-            return;
-        }
-        let (first, last) = (block.first(), block.last());
-        for iy in first.iy..=last.iy {
-            let row = place(Cell { iy, ..first })..=place(Cell { iy, ..last });
-            for (&at_place, parts) in self.cells.range(row) {
-                let parts = self.parts_then((at_place, parts), filter.when);
-                put(Block::place(super::cell_at(at_place)), &parts);
-            }
-        }
-    }
-
-    /// Returns the estimate of one square with the cells from `min` to `max`, both included, on the
-    /// given ground.
-    pub fn fuse_square(
-        &self,
-        (min, max): (Cell, Cell),
-        (ground, filter): (u16, &CompiledFilter<'_>),
-        at: At<'_>,
-        room: &mut Room,
-    ) -> CellSummary {
-        let mut sums: std::collections::BTreeMap<PartKey, Sums> = std::collections::BTreeMap::new();
-        for cell in self.cells_in(min, max, None) {
-            for part in &*self.parts_at(place(cell), filter.when) {
-                if filter.sees(&part.key, ground).is_some() {
-                    let added = part.sums();
-                    let entry = sums.entry(part.key);
-                    entry.and_modify(|sums| sums.add(&added)).or_insert(added);
-                }
-            }
-        }
-        let parts: Vec<Part> = sums
-            .iter()
-            .map(|(&key, sums)| Part::new(key, sums))
-            .collect();
-        self.gather(&parts, (ground, filter), room);
-        let fused = room
-            .fuser
-            .fuse(&mut room.seen, Ground::Area, at.config, at.now_us)
-            .map(|fused| fused.with_uninformative(room.uninformative_passes));
-        fused.map_or_else(CellSummary::default, |fused| CellSummary::of(&fused))
-    }
-
-    /// Fuses the measurements of a cell on the ground with the number in `which`; `None` without
-    /// any.
-    pub fn fuse_cell(
-        &self,
-        cell: Cell,
-        which: (u16, &CompiledFilter<'_>),
-        at: At<'_>,
-        room: &mut Room,
-    ) -> Option<Fused> {
-        let parts = self.parts_at(place(cell), which.1.when);
-        self.fuse_parts(&parts, which, at, room)
-    }
-
-    fn fuse_parts(
-        &self,
-        parts: &[Part],
-        which: (u16, &CompiledFilter<'_>),
-        at: At<'_>,
-        room: &mut Room,
-    ) -> Option<Fused> {
-        self.gather(parts, which, room);
-        let (fuser, seen) = (&mut room.fuser, &mut room.seen);
-        let known = fuser.fuse(seen, Ground::Cell, at.config, at.now_us)?;
-        Some(known.with_uninformative(room.uninformative_passes))
-    }
-
-    fn square(
-        &self,
-        parts: &[Part],
-        which: (u16, &CompiledFilter<'_>),
-        at: At<'_>,
-        room: &mut Room,
-    ) -> CellSummary {
-        let fused = self.fuse_parts(parts, which, at, room);
-        fused.map_or_else(CellSummary::default, |fused| CellSummary::of(&fused))
-    }
-
     fn gather(
         &self,
         parts: &[Part],
@@ -289,6 +184,109 @@ impl SiteMap {
         found.retain(|(segments, _)| *segments > 0);
         found.sort_unstable_by(|left, right| right.0.cmp(&left.0).then(left.1.cmp(&right.1)));
         found.into_iter().map(|(_, name)| name).collect()
+    }
+}
+
+impl Cells<'_> {
+    /// Recomputes the squares of a block, those with the indices `places` or all of them. `grounds`
+    /// has the number of the ground at the centre of each cell. `grounds` and `squares` are row by
+    /// row, with [`BLOCK_CELLS`] per row.
+    pub fn fuse_block(
+        self,
+        (block, places): (Block, Option<&[u16]>),
+        grounds: &[u16],
+        filter: &CompiledFilter<'_>,
+        at: At<'_>,
+        squares: &mut [CellSummary],
+    ) {
+        if places.is_none() {
+            squares.fill(CellSummary::default());
+        }
+        let mut room = Room::default();
+        let mut put = |place: u16, parts: &[Part]| {
+            let index = usize::from(place);
+            if let (Some(&ground), Some(square)) = (grounds.get(index), squares.get_mut(index)) {
+                *square = self.square(parts, (ground, filter), at, &mut room);
+            }
+        };
+        if let Some(places) = places {
+            for &one in places {
+                put(one, &self.parts_at(block.cell(one), filter.when));
+            }
+            return;
+        }
+        for (&one, parts) in self.of_block(block).into_iter().flatten() {
+            let at_place = super::place(block.cell(one));
+            put(one, &self.map().parts_then((at_place, parts), filter.when));
+        }
+    }
+
+    /// Returns the estimate of one square with the cells from `min` to `max`, both included, on the
+    /// given ground.
+    pub fn fuse_square(
+        self,
+        (min, max): (Cell, Cell),
+        (ground, filter): (u16, &CompiledFilter<'_>),
+        at: At<'_>,
+        room: &mut Room,
+    ) -> CellSummary {
+        let mut sums: std::collections::BTreeMap<PartKey, Sums> = std::collections::BTreeMap::new();
+        for cell in self.cells_in(min, max, None) {
+            for part in &*self.parts_at(cell, filter.when) {
+                if filter.sees(&part.key, ground).is_some() {
+                    let added = part.sums();
+                    let entry = sums.entry(part.key);
+                    entry.and_modify(|sums| sums.add(&added)).or_insert(added);
+                }
+            }
+        }
+        let parts: Vec<Part> = sums
+            .iter()
+            .map(|(&key, sums)| Part::new(key, sums))
+            .collect();
+        self.map().gather(&parts, (ground, filter), room);
+        let fused = room
+            .fuser
+            .fuse(&mut room.seen, Ground::Area, at.config, at.now_us)
+            .map(|fused| fused.with_uninformative(room.uninformative_passes));
+        fused.map_or_else(CellSummary::default, |fused| CellSummary::of(&fused))
+    }
+
+    /// Fuses the measurements of a cell on the ground with the number in `which`; `None` without
+    /// any.
+    pub fn fuse_cell(
+        self,
+        cell: Cell,
+        which: (u16, &CompiledFilter<'_>),
+        at: At<'_>,
+        room: &mut Room,
+    ) -> Option<Fused> {
+        let parts = self.parts_at(cell, which.1.when);
+        self.fuse_parts(&parts, which, at, room)
+    }
+
+    fn fuse_parts(
+        self,
+        parts: &[Part],
+        which: (u16, &CompiledFilter<'_>),
+        at: At<'_>,
+        room: &mut Room,
+    ) -> Option<Fused> {
+        self.map().gather(parts, which, room);
+        let (fuser, seen) = (&mut room.fuser, &mut room.seen);
+        let known = fuser.fuse(seen, Ground::Cell, at.config, at.now_us)?;
+        Some(known.with_uninformative(room.uninformative_passes))
+    }
+
+    fn square(
+        self,
+        parts: &[Part],
+        which: (u16, &CompiledFilter<'_>),
+        at: At<'_>,
+        room: &mut Room,
+    ) -> CellSummary {
+        let fused = self.fuse_parts(parts, which, at, room);
+        fused.map_or_else(CellSummary::default, |fused| CellSummary::of(&fused))
     }
 }
 

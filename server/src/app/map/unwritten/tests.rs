@@ -17,17 +17,34 @@ enum Act {
     Store {
         limit: usize,
         transactions: usize,
+        /// Whether a block's snapshot is taken between the first commit and its change of memory.
+        is_seen_between: bool,
     },
+    /// A block is about to be read, by one of two readers.
+    BeginRead(usize),
+    /// Its snapshot is taken.
+    Snapshot(usize),
+    /// It is put into memory.
+    EndRead(usize),
     Withdraw(i64, (i64, i64)),
     Kill,
 }
 
 fn act() -> impl Strategy<Value = Act> {
-    let segment = (0_i64..4, 0_i32..3, 0_i64..4, 0.0_f64..1e6);
+    // Two blocks.
+    let segment = (0_i64..4, 62_i32..66, 0_i64..4, 0.0_f64..1e6);
     prop_oneof![
         5 => prop::collection::vec(segment, 0..8).prop_map(Act::Commit),
-        3 => (1_usize..6, 1_usize..4)
-            .prop_map(|(limit, transactions)| Act::Store { limit, transactions }),
+        3 => (1_usize..6, 1_usize..4, any::<bool>()).prop_map(
+            |(limit, transactions, is_seen_between)| Act::Store {
+                limit,
+                transactions,
+                is_seen_between,
+            }
+        ),
+        3 => (0_usize..2).prop_map(Act::BeginRead),
+        3 => (0_usize..2).prop_map(Act::Snapshot),
+        3 => (0_usize..2).prop_map(Act::EndRead),
         1 => (0_i64..4, 0_i64..4, 0_i64..4)
             .prop_map(|(robot, from, hours)| Act::Withdraw(robot, (from, from + hours))),
         2 => Just(Act::Kill),
@@ -102,6 +119,18 @@ struct Server {
     watermarks: HashMap<i64, i64>,
     withdrawals: Vec<(i64, (i64, i64))>,
     unwritten: Unwritten,
+    /// Numbers of two reads of blocks.
+    reads: [Option<u64>; 2],
+    /// Their snapshots, once they are taken.
+    snapshots: [Option<Snapshot>; 2],
+}
+
+/// What a snapshot has of the stored sums, with the number of withdrawals in memory at the time.
+#[derive(Debug, Clone)]
+struct Snapshot {
+    stored: Table,
+    watermarks: HashMap<i64, i64>,
+    withdrawals: usize,
 }
 
 impl Server {
@@ -136,12 +165,20 @@ impl Server {
                 let added = Added { first, last };
                 add(&mut self.unwritten, &folded, added);
             }
+            Act::BeginRead(of) => {
+                if self.reads[of].is_none() {
+                    self.reads[of] = Some(self.unwritten.begin_read());
+                }
+            }
+            Act::Snapshot(of) => self.take_snapshot(of),
+            Act::EndRead(of) => self.end_read(of),
             Act::Store {
                 limit,
                 transactions,
+                is_seen_between,
             } => {
                 let until = self.unwritten.additions();
-                for _ in 0..transactions {
+                for transaction in 0..transactions {
                     let portion = self.unwritten.portion(until, limit);
                     for (key, sums) in &portion.sums {
                         add_to(&mut self.stored, key, sums);
@@ -149,6 +186,9 @@ impl Server {
                     for step in &portion.steps {
                         let before = self.watermarks.insert(step.robot_pk, step.to_pk);
                         assert_eq!(before.unwrap_or_default(), step.from_pk);
+                    }
+                    if is_seen_between && transaction == 0 {
+                        self.take_snapshot(0);
                     }
                     self.unwritten.written(&portion.steps);
                 }
@@ -164,6 +204,7 @@ impl Server {
                 let generation_sums = self.unwritten.generation_sums;
                 self.unwritten = Unwritten::following(self.watermarks.clone());
                 self.unwritten.generation_sums = generation_sums;
+                (self.reads, self.snapshots) = ([None; 2], [None, None]);
                 for (pk, (key, sums)) in (1..).zip(&self.segments) {
                     let watermark = self.watermarks.get(&key.robot_pk);
                     if pk > watermark.copied().unwrap_or_default() && !self.is_withdrawn(key) {
@@ -176,6 +217,44 @@ impl Server {
                 }
             }
         }
+    }
+
+    fn take_snapshot(&mut self, of: usize) {
+        if self.reads[of].is_some() {
+            self.snapshots[of] = Some(Snapshot {
+                stored: self.stored.clone(),
+                watermarks: self.watermarks.clone(),
+                withdrawals: self.withdrawals.len(),
+            });
+        }
+    }
+
+    /// Checks that the snapshot's blocks with the unwritten sums are those of all segments.
+    fn end_read(&mut self, of: usize) {
+        let Some(snapshot) = self.snapshots[of].take() else {
+            return;
+        };
+        if snapshot.withdrawals == self.withdrawals.len() {
+            for column in 0..2 {
+                let block = Block { row: 0, column };
+                let is_of_block = |key: &SumKey| Block::of(key.cell) == block;
+                let mut read = snapshot.stored.clone();
+                read.retain(|key, _| is_of_block(key));
+                for (key, sums) in self.unwritten.since(&snapshot.watermarks, 1, block) {
+                    add_to(&mut read, key, sums);
+                }
+                let mut expected = self.expected();
+                expected.retain(|key, _| is_of_block(key));
+                assert_eq!(read, expected);
+            }
+        }
+        let number = self.reads[of].take().unwrap();
+        self.unwritten.end_read(number);
+        // What the other reader needs is kept, and nothing without one.
+        let other = self.reads[1 - of];
+        let kept = self.unwritten.stored_meanwhile.iter();
+        let mut needed = kept.map(|stored| other.is_some_and(|other| stored.until_read > other));
+        assert!(needed.all(|is_needed| is_needed));
     }
 
     /// The sums of all segments that are not withdrawn.

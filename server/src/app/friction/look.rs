@@ -1,0 +1,172 @@
+//! Looks at the map on a blocking thread, so that computing under the map's lock does not block other
+//! requests. Blocks of cells that a look needs and that are not in memory are read first, without
+//! a turn to compute.
+
+use std::cell::RefCell;
+use std::sync::Arc;
+
+use tokio::runtime::Handle;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio_util::sync::CancellationToken;
+
+use super::{App, AppError};
+use crate::app::map::Pins;
+use crate::db::sites::SiteRow;
+use crate::friction::index::{Absent, Cells, SiteMap};
+
+/// Maximum number of answers that are computed at once.
+const COMPUTING_MAX: usize = 4;
+/// Maximum number of requests that compute or wait for blocks, and of robots' missions. Each has a
+/// thread, so both together are far fewer than the runtime has.
+const LOOKING_MAX: usize = 64;
+
+/// Turns to look at the maps.
+#[derive(Debug)]
+pub(in crate::app) struct LookTurns {
+    computing: Arc<Semaphore>,
+    requests: Arc<Semaphore>,
+    robots: Arc<Semaphore>,
+}
+
+impl Default for LookTurns {
+    fn default() -> Self {
+        Self {
+            computing: Arc::new(Semaphore::new(COMPUTING_MAX)),
+            requests: Arc::new(Semaphore::new(LOOKING_MAX)),
+            robots: Arc::new(Semaphore::new(LOOKING_MAX)),
+        }
+    }
+}
+
+impl LookTurns {
+    /// Waits for a turn to compute. `None` cannot occur, since the semaphore is never closed.
+    async fn computing(&self) -> Option<OwnedSemaphorePermit> {
+        Arc::clone(&self.computing).acquire_owned().await.ok()
+    }
+
+    /// Waits for a place for a request or a robot's mission, as [`Self::computing`].
+    async fn place(&self, is_for_robot: bool) -> Option<OwnedSemaphorePermit> {
+        let places = if is_for_robot {
+            &self.robots
+        } else {
+            &self.requests
+        };
+        Arc::clone(places).acquire_owned().await.ok()
+    }
+}
+
+/// A turn to compute with the map, on a blocking thread.
+pub(in crate::app) struct Look<'app> {
+    app: &'app App,
+    runtime: Handle,
+    /// The turn; `None` while blocks are read.
+    turn: RefCell<Option<OwnedSemaphorePermit>>,
+    /// Whether the map is read for a robot's mission, which waits for no request.
+    is_for_robot: bool,
+    /// Nobody waits for the answer any more.
+    abandoned: CancellationToken,
+}
+
+impl<'app> Look<'app> {
+    /// Returns the use cases.
+    pub(in crate::app) fn app(&self) -> &'app App {
+        self.app
+    }
+
+    /// Looks at a site's map without its cells.
+    pub(super) fn map<T>(&self, row: &SiteRow, look: impl FnOnce(&SiteMap) -> T) -> T {
+        self.app.maps().look(row, look)
+    }
+
+    /// Looks at the cells of a site's map. `look` is called again after blocks were read that it
+    /// needed, so it must not change anything.
+    ///
+    /// # Errors
+    /// The database failed; [`AppError::LookTooLarge`] if it needs too much at once;
+    /// [`AppError::Abandoned`] if nobody waits for the answer.
+    pub(super) fn cells<T>(
+        &self,
+        row: &SiteRow,
+        look: impl Fn(Cells<'_>) -> T,
+    ) -> Result<T, AppError> {
+        let mut pins = Pins::default();
+        let mut reader = None;
+        let found = loop {
+            let absent = Absent::default();
+            let answer = self.app.maps().look_at_cells(row, &absent, &look);
+            let absent = absent.into_blocks();
+            if absent.is_empty() {
+                break answer;
+            }
+            if self.abandoned.is_cancelled() {
+                return Err(AppError::Abandoned);
+            }
+            // Others compute meanwhile.
+            drop(self.turn.take());
+            let reading = async {
+                if reader.is_none() {
+                    reader = self.app.maps().reader(self.is_for_robot).await;
+                }
+                self.app.read_blocks(row, &absent, &mut pins).await?;
+                Ok::<_, AppError>(self.app.look_turns().computing().await)
+            };
+            *self.turn.borrow_mut() = self.runtime.block_on(reading)?;
+        };
+        if !pins.is_empty() {
+            drop(pins);
+            self.app.maps().evict();
+        }
+        Ok(found)
+    }
+}
+
+impl App {
+    /// Runs work on the map on a blocking thread.
+    pub(in crate::app) async fn look<T: Send + 'static>(
+        &self,
+        work: impl FnOnce(&Look<'_>) -> T + Send + 'static,
+    ) -> T {
+        self.look_for(false, work).await
+    }
+
+    /// Runs work on the map for a robot's mission on a blocking thread.
+    pub(super) async fn look_for_robot<T: Send + 'static>(
+        &self,
+        work: impl FnOnce(&Look<'_>) -> T + Send + 'static,
+    ) -> T {
+        self.look_for(true, work).await
+    }
+
+    async fn look_for<T: Send + 'static>(
+        &self,
+        is_for_robot: bool,
+        work: impl FnOnce(&Look<'_>) -> T + Send + 'static,
+    ) -> T {
+        let turns = self.look_turns();
+        let place = turns.place(is_for_robot).await;
+        let turn = turns.computing().await;
+        let abandoned = CancellationToken::new();
+        let _waiting = abandoned.clone().drop_guard();
+        let (app, runtime) = (self.clone(), Handle::current());
+        let looking = move || {
+            let look = Look {
+                app: &app,
+                runtime,
+                turn: RefCell::new(turn),
+                is_for_robot,
+                abandoned,
+            };
+            let done = work(&look);
+            drop(place);
+            done
+        };
+        match tokio::task::spawn_blocking(looking).await {
+            Ok(done) => done,
+            Err(broken) => match broken.try_into_panic() {
+                Ok(panic) => std::panic::resume_unwind(panic),
+                // The runtime is shutting down, and this task with it.
+                Err(_cancelled) => std::future::pending().await,
+            },
+        }
+    }
+}

@@ -1,0 +1,441 @@
+//! Reads blocks of cells into memory when a look at the map needs them, and takes those out of it
+//! that were not used for longest when all together need too much.
+//!
+//! ```text
+//! stored sums ──snapshot──► cells of a block ──with the unwritten sums──► map ──► evicted
+//! ```
+//!
+//! A block is read without the [`super::MapTurn`], so that uploads never wait for it. The watermarks
+//! that are read in the same snapshot tell which of the unwritten sums are not in the stored ones:
+//! those of generations that end after the watermark of their robot. Generations that are stored
+//! meanwhile are kept until the read is over ([`super::unwritten`]). If sums were removed or merged in
+//! the map meanwhile, the block is read again.
+
+use std::collections::{BTreeSet, HashMap};
+use std::sync::PoisonError;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+use tokio::sync::{Notify, Semaphore, SemaphorePermit};
+use tokio_util::sync::CancellationToken;
+use tread_api::ids::{ConfigurationId, RobotId};
+
+use super::{Folded, Maps, Sites, labelled};
+use crate::app::{App, AppError};
+use crate::db::sites::SiteRow;
+use crate::db::sums::{SumKey, SumRow};
+use crate::db::{self, DbError};
+use crate::friction::index::{Absent, Block, BlockBuilder, BlockCells, Cells, Pin, SiteMap, Stamp};
+
+/// Bytes of a MiB.
+const MIB: usize = 1 << 20;
+/// Minimum of the memory that one look may take.
+const LOOK_BYTES_MIN: usize = 64 * MIB;
+/// One look may take this share of the memory.
+const LOOK_SHARE: usize = 8;
+/// Number of requests that may have blocks read for them at a time, and of robots' missions; each
+/// uses a connection to the database, one block after another.
+const READERS_MAX: usize = 2;
+/// Maximum number of blocks that are read in one snapshot.
+const BLOCKS_AT_ONCE: usize = 16;
+/// Number of sums after which a snapshot reads no further block.
+const SUMS_AT_ONCE: usize = 32_768;
+/// Maximum number of times that a block is read because sums were removed or merged meanwhile.
+const READ_AGAIN_MAX: usize = 5;
+/// Minimum time between two evictions after uploads.
+const EVICT_EVERY_MIN: Duration = Duration::from_millis(100);
+/// Number of blocks that are evicted at a time under the lock of the map.
+const EVICTED_AT_ONCE: usize = 256;
+
+/// The memory for blocks.
+#[derive(Debug)]
+pub(super) struct BlockMemory {
+    limit_bytes: usize,
+    /// Number of looks so far.
+    looks: AtomicU64,
+    readers: Semaphore,
+    readers_for_robots: Semaphore,
+    /// Blocks take more than the limit.
+    full: Notify,
+    read: AtomicU64,
+    evicted: AtomicU64,
+}
+
+/// What the blocks of all maps take, and what happened to them since the start.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct BlockCounts {
+    /// Number of blocks with measurements.
+    pub driven: usize,
+    /// Number of those whose cells are in memory.
+    pub in_memory: usize,
+    /// About how many bytes these take.
+    pub bytes: usize,
+    /// Number of blocks that were read from the database.
+    pub read: u64,
+    /// Number of blocks that left memory.
+    pub evicted: u64,
+}
+
+/// Names of the database keys of robots and configurations that are on any map.
+#[derive(Debug, Default)]
+pub(super) struct KeyNames {
+    robots: HashMap<i64, RobotId>,
+    configurations: HashMap<i64, ConfigurationId>,
+}
+
+impl KeyNames {
+    pub(super) fn note(&mut self, folded: &Folded) {
+        let key = &folded.key;
+        let robot = self.robots.entry(key.robot_pk);
+        robot.or_insert_with(|| folded.robot.clone());
+        self.configurations
+            .entry(key.configuration_pk)
+            .or_insert(folded.configuration);
+    }
+
+    fn of(&self, key: &SumKey) -> Option<(&RobotId, ConfigurationId)> {
+        let robot = self.robots.get(&key.robot_pk)?;
+        let configuration = self.configurations.get(&key.configuration_pk)?;
+        Some((robot, *configuration))
+    }
+}
+
+impl BlockMemory {
+    pub(super) fn new(limit_mib: u64) -> Self {
+        let limit_mib = usize::try_from(limit_mib).unwrap_or(usize::MAX);
+        Self {
+            limit_bytes: limit_mib.saturating_mul(MIB),
+            looks: AtomicU64::new(0),
+            readers: Semaphore::new(READERS_MAX),
+            readers_for_robots: Semaphore::new(READERS_MAX),
+            full: Notify::new(),
+            read: AtomicU64::new(0),
+            evicted: AtomicU64::new(0),
+        }
+    }
+
+    /// Returns how many bytes of blocks one look may need.
+    fn look_bytes_max(&self) -> usize {
+        (self.limit_bytes / LOOK_SHARE).max(LOOK_BYTES_MIN)
+    }
+
+    fn next_look(&self) -> u64 {
+        self.looks.fetch_add(1, Ordering::Relaxed)
+    }
+
+    /// Wakes the task that evicts blocks if they take too much.
+    pub(super) fn wake_if_full(&self, sites: &Sites) {
+        if sites.bytes() > self.limit_bytes {
+            self.full.notify_one();
+        }
+    }
+
+    /// Returns the blocks to evict, those first that were not used for longest, and as many that it
+    /// is done rarely; none if all fit.
+    fn surplus(&self, sites: &Sites) -> Vec<(i64, Block)> {
+        let bytes = sites.bytes();
+        if bytes <= self.limit_bytes {
+            return Vec::new();
+        }
+        let of_map = |(&pk, map): (&i64, &SiteMap)| {
+            let idle = map.idle_blocks();
+            let idle = idle.map(|(look, block, bytes)| (look, pk, block, bytes));
+            idle.collect::<Vec<_>>()
+        };
+        let mut idle: Vec<_> = sites.maps.iter().flat_map(of_map).collect();
+        idle.sort_unstable();
+        let mut spare = bytes - (self.limit_bytes - self.limit_bytes / 8);
+        let enough = idle.into_iter().take_while(move |(_, _, _, bytes)| {
+            let is_needed = spare > 0;
+            spare = spare.saturating_sub(*bytes);
+            is_needed
+        });
+        enough.map(|(_, pk, block, _)| (pk, block)).collect()
+    }
+
+    /// Takes these blocks out of memory, unless something uses them by now.
+    fn take(&self, sites: &mut Sites, blocks: &[(i64, Block)]) -> Vec<BlockCells> {
+        let mut taken = Vec::new();
+        for (pk, block) in blocks {
+            let map = sites.maps.get_mut(pk);
+            taken.extend(map.and_then(|map| map.evict(*block)));
+        }
+        let count = u64::try_from(taken.len()).unwrap_or_default();
+        self.evicted.fetch_add(count, Ordering::Relaxed);
+        taken
+    }
+
+    /// Evicts blocks of maps that nobody else has yet.
+    pub(super) fn evict(&self, sites: &mut Sites) {
+        let surplus = self.surplus(sites);
+        self.take(sites, &surplus);
+    }
+}
+
+/// Blocks that are kept in memory as long as this exists.
+#[derive(Debug, Default)]
+pub(in crate::app) struct Pins {
+    pins: Vec<Pin>,
+    bytes: usize,
+}
+
+impl Pins {
+    /// Returns whether nothing is kept.
+    pub(in crate::app) fn is_empty(&self) -> bool {
+        self.pins.is_empty()
+    }
+
+    /// Keeps a block in memory; `false` if it is absent.
+    fn add(&mut self, map: &SiteMap, block: Block) -> bool {
+        let Some((pin, bytes)) = map.pin(block) else {
+            return !map.changes().contains(block);
+        };
+        self.pins.push(pin);
+        self.bytes += bytes;
+        true
+    }
+}
+
+/// Blocks that were read in one snapshot.
+struct Snapshot {
+    stamp: Stamp,
+    blocks: Vec<(Block, BlockCells)>,
+    watermarks: HashMap<i64, i64>,
+}
+
+/// A read of blocks: generations of unwritten sums that are stored meanwhile are kept until it is
+/// dropped.
+struct Reading<'maps> {
+    maps: &'maps Maps,
+    number: u64,
+}
+
+impl Drop for Reading<'_> {
+    fn drop(&mut self) {
+        let ended = self.maps.unwritten().end_read(self.number);
+        drop(ended);
+    }
+}
+
+impl Maps {
+    /// Looks at the cells of a site's map; blocks that were absent are noted in `absent`, and then
+    /// what `look` returned is to be discarded.
+    pub(in crate::app) fn look_at_cells<T>(
+        &self,
+        row: &SiteRow,
+        absent: &Absent,
+        look: impl FnOnce(Cells<'_>) -> T,
+    ) -> T {
+        let number = self.memory.next_look();
+        self.look(row, |map| look(map.cells(absent, number)))
+    }
+
+    /// Takes blocks out of memory if all together need too much of it.
+    pub(in crate::app) fn evict(&self) {
+        let surplus = {
+            let sites = self.sites.read().unwrap_or_else(PoisonError::into_inner);
+            self.memory.surplus(&sites)
+        };
+        for some in surplus.chunks(EVICTED_AT_ONCE) {
+            let taken = {
+                let mut sites = self.sites.write().unwrap_or_else(PoisonError::into_inner);
+                self.memory.take(&mut sites, some)
+            };
+            drop(taken);
+        }
+    }
+
+    /// Waits for a place among those for whom blocks are read. `None` cannot occur, since the
+    /// semaphores are never closed.
+    pub(in crate::app) async fn reader(&self, is_for_robot: bool) -> Option<SemaphorePermit<'_>> {
+        let readers = if is_for_robot {
+            &self.memory.readers_for_robots
+        } else {
+            &self.memory.readers
+        };
+        readers.acquire().await.ok()
+    }
+
+    fn begin_read(&self) -> Reading<'_> {
+        let number = self.unwritten().begin_read();
+        Reading { maps: self, number }
+    }
+
+    /// Keeps those of the blocks that are in memory there, and returns the absent ones.
+    fn pin(&self, row: &SiteRow, blocks: &[Block], pins: &mut Pins) -> Vec<Block> {
+        self.look(row, |map| {
+            let absent = blocks.iter().filter(|&&block| !pins.add(map, block));
+            absent.copied().collect()
+        })
+    }
+
+    /// Adds a stored sum to a block; `false` if a name is new to the map.
+    fn build(&self, row: &SiteRow, block: &mut BlockBuilder, sum: &SumRow) -> bool {
+        let sites = self.sites.read().unwrap_or_else(PoisonError::into_inner);
+        let map = sites.maps.get(&row.pk);
+        let named = map.zip(sites.names.of(&sum.key));
+        let added = named.map(|(map, (robot, configuration))| {
+            block.add(map, labelled(&sum.key, robot, configuration), &sum.sums)
+        });
+        added.unwrap_or_default()
+    }
+
+    /// Puts the blocks of a snapshot into memory, with the sums that are unwritten in it, and keeps them
+    /// there; `false` if sums were removed or merged since.
+    ///
+    /// # Errors
+    /// A sum has a name that the map does not know.
+    fn insert(&self, row: &SiteRow, snapshot: Snapshot, pins: &mut Pins) -> Result<bool, DbError> {
+        let Snapshot {
+            stamp,
+            blocks,
+            watermarks,
+        } = snapshot;
+        let mut sites = self.sites.write().unwrap_or_else(PoisonError::into_inner);
+        let sites = &mut *sites;
+        let Some(map) = sites.maps.get_mut(&row.pk) else {
+            return Ok(false);
+        };
+        if map.stamp() != stamp {
+            return Ok(false);
+        }
+        let unwritten = self.unwritten();
+        for (block, cells) in blocks {
+            // Another look may have read it meanwhile.
+            if pins.add(map, block) {
+                continue;
+            }
+            let since = unwritten.since(&watermarks, row.pk, block);
+            let since = since.map(|(key, sums)| {
+                let (robot, configuration) = sites.names.of(key)?;
+                Some((labelled(key, robot, configuration), sums))
+            });
+            let since: Option<Vec<_>> = since.collect();
+            map.insert(block, cells, since.ok_or_else(|| unnamed(row, block))?);
+            pins.add(map, block);
+        }
+        Ok(true)
+    }
+}
+
+fn unnamed(row: &SiteRow, block: Block) -> DbError {
+    DbError::Corrupt {
+        what: "sum of a block whose robot or terrain is new to the map",
+        value: format!(
+            "{}: row {}, column {}",
+            row.site.id, block.row, block.column
+        ),
+    }
+}
+
+impl App {
+    /// Reads blocks of a map into memory, and keeps them there for one look, as long as `pins` exist:
+    /// as many as it may have at once, and at least one.
+    ///
+    /// # Errors
+    /// [`AppError::LookTooLarge`] if it has as many as it may already; [`DbError::Unsettled`] if sums
+    /// are removed or merged again and again; those of the database.
+    pub(in crate::app) async fn read_blocks(
+        &self,
+        row: &SiteRow,
+        blocks: &BTreeSet<Block>,
+        pins: &mut Pins,
+    ) -> Result<(), AppError> {
+        let maps = self.maps();
+        let bytes_max = maps.memory.look_bytes_max();
+        if pins.bytes > bytes_max {
+            return Err(AppError::LookTooLarge {
+                mib_max: bytes_max / MIB,
+            });
+        }
+        let mut tries = 0;
+        let mut rest: Vec<Block> = blocks.iter().rev().copied().collect();
+        while !rest.is_empty() && pins.bytes <= bytes_max {
+            let some = rest.split_off(rest.len().saturating_sub(BLOCKS_AT_ONCE));
+            // Another look may have read them meanwhile.
+            let absent = maps.pin(row, &some, pins);
+            if absent.is_empty() {
+                continue;
+            }
+            let _reading = maps.begin_read();
+            let snapshot = db::limited(self.snapshot_of(row, &absent)).await?;
+            let count = snapshot.blocks.len();
+            if maps.insert(row, snapshot, pins)? {
+                let read = u64::try_from(count).unwrap_or_default();
+                maps.memory.read.fetch_add(read, Ordering::Relaxed);
+                tries = 0;
+                rest.extend(absent.get(count..).unwrap_or_default());
+            } else if tries >= READ_AGAIN_MAX {
+                return Err(DbError::Unsettled.into());
+            } else {
+                tries += 1;
+                rest.extend(absent);
+            }
+        }
+        Ok(())
+    }
+
+    /// Reads the first of some blocks, and further ones as long as they are small.
+    async fn snapshot_of(&self, row: &SiteRow, absent: &[Block]) -> Result<Snapshot, DbError> {
+        let maps = self.maps();
+        let stamp = maps.look(row, SiteMap::stamp);
+        let mut tx = self.db().read("map block").await?;
+        let watermarks = db::watermarks::all(&mut tx).await?;
+        let mut blocks = Vec::with_capacity(absent.len());
+        let mut sums = 0;
+        for &block in absent {
+            let mut cells = BlockBuilder::default();
+            let mut is_known = true;
+            let at = (block.row, block.column);
+            db::sums::of_block(&mut tx, row.pk, at, |sum| {
+                sums += 1;
+                is_known &= maps.build(row, &mut cells, &sum);
+            })
+            .await?;
+            if !is_known {
+                return Err(unnamed(row, block));
+            }
+            blocks.push((block, cells.build()));
+            if sums >= SUMS_AT_ONCE {
+                break;
+            }
+        }
+        Ok(Snapshot {
+            stamp,
+            blocks,
+            watermarks,
+        })
+    }
+
+    /// Returns what the blocks of all maps take, and what happened to them.
+    pub fn map_blocks(&self) -> BlockCounts {
+        let maps = self.maps();
+        let sites = maps.sites.read().unwrap_or_else(PoisonError::into_inner);
+        let mut counts = BlockCounts {
+            read: maps.memory.read.load(Ordering::Relaxed),
+            evicted: maps.memory.evicted.load(Ordering::Relaxed),
+            ..BlockCounts::default()
+        };
+        for map in sites.maps.values() {
+            let (in_memory, bytes) = map.size();
+            counts.driven += map.changes().block_count();
+            counts.in_memory += in_memory;
+            counts.bytes += bytes;
+        }
+        counts
+    }
+}
+
+/// Evicts blocks whenever uploads have made all together too large, until the stop.
+pub async fn run(app: App, stop: CancellationToken) {
+    loop {
+        tokio::select! {
+            biased;
+            () = stop.cancelled() => return,
+            () = app.maps().memory.full.notified() => {}
+        }
+        app.look(|look| look.app().maps().evict()).await;
+        // Blocks that looks keep may be most of them.
+        tokio::time::sleep(EVICT_EVERY_MIN).await;
+    }
+}
