@@ -319,14 +319,6 @@ impl App {
         self.inner.checks.acquire().await.ok()
     }
 
-    fn look_turns(&self) -> &LookTurns {
-        &self.inner.look_turns
-    }
-
-    fn cell_counts(&self) -> &CellCounts {
-        &self.inner.cell_counts
-    }
-
     fn pictures(&self) -> &Pictures {
         &self.inner.pictures
     }

@@ -104,7 +104,7 @@ impl App {
             let (biases, contributions) = look.map(&view.row, |map| {
                 (biases(map, &view, &reading), map.contributions())
             });
-            let cells = look.app().cell_counts().of(look, &view.row)?;
+            let cells = look.app().inner.cell_counts.of(look, &view.row)?;
             let is_wanted = |found: &Contribution| {
                 let after = after.as_deref();
                 let is_named = named

@@ -93,7 +93,7 @@ impl<'app> Look<'app> {
         let mut reader = None;
         let found = loop {
             let absent = Absent::default();
-            let answer = self.app.maps().look_at_cells(row, &absent, &look);
+            let answer = self.app.maps().read_cells(row, &absent, &look);
             let absent = absent.into_blocks();
             if absent.is_empty() {
                 break answer;
@@ -121,6 +121,10 @@ impl<'app> Look<'app> {
 }
 
 impl App {
+    fn look_turns(&self) -> &LookTurns {
+        &self.inner.look_turns
+    }
+
     /// Runs work on the map on a blocking thread.
     pub(in crate::app) async fn look<T: Send + 'static>(
         &self,

@@ -8,6 +8,7 @@ mod history;
 pub mod live;
 mod look;
 mod path;
+mod path_prior;
 mod pictures;
 mod prior;
 mod raster;

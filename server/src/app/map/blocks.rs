@@ -220,7 +220,7 @@ impl Drop for Reading<'_> {
 impl Maps {
     /// Looks at the cells of a site's map; blocks that were absent are noted in `absent`, and then
     /// what `look` returned is to be discarded.
-    pub(in crate::app) fn look_at_cells<T>(
+    pub(in crate::app) fn read_cells<T>(
         &self,
         row: &SiteRow,
         absent: &Absent,
