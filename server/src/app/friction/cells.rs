@@ -11,6 +11,7 @@ use tread_api::site::{CELL_MAX_M, Cell, Grid};
 use tread_api::terrain::{Terrain, TerrainRef};
 
 use super::drawn::{Drawn, is_here};
+use super::look::smaller;
 use super::{App, AppError, Asked, Look, Reading, SiteView, page, site_row, terrain_ref};
 use crate::friction::Ground;
 use crate::friction::index::{Block, Cells, Group};
@@ -132,16 +133,29 @@ impl App {
             .saturating_add(1);
         let of_site = row.clone();
         let looking = move |look: &Look<'_>, [reading]: &[Reading; 1]| {
-            look.cells(&row, |map| {
-                let found = squares(map, factor, bounds, after, wanted);
-                let cells = page(found, limit, |(cell, _)| format!("{},{}", cell.ix, cell.iy));
-                let squares = cells.items.into_iter();
-                let items = squares.flat_map(|square| of_square(map, reading, square, size_m));
-                MapPage {
-                    items: items.collect(),
-                    next_cursor: cells.next_cursor,
-                    as_of: reading.as_of,
+            let (mut found, mut after, mut at_once) = (Vec::new(), after, wanted);
+            while found.len() < wanted {
+                let rest = wanted - found.len();
+                let some = smaller(&mut at_once, |at_once| {
+                    look.cells(&row, |map| {
+                        let some = squares(map, factor, bounds, after, at_once.min(rest));
+                        let described =
+                            |square: CellGroup| (square.0, of_square(map, reading, square, size_m));
+                        some.into_iter().map(described).collect::<Vec<_>>()
+                    })
+                })?;
+                match some.last() {
+                    Some((last, _)) => after = Some(*last),
+                    None => break,
                 }
+                found.extend(some);
+            }
+            let cells = page(found, limit, |(cell, _)| format!("{},{}", cell.ix, cell.iy));
+            let items = cells.items.into_iter().flat_map(|(_, of_square)| of_square);
+            Ok(MapPage {
+                items: items.collect(),
+                next_cursor: cells.next_cursor,
+                as_of: reading.as_of,
             })
         };
         self.read_map(&of_site, [reading], looking).await
@@ -463,19 +477,6 @@ pub(super) fn squares(
     }
     found.truncate(wanted);
     found
-}
-
-/// Looks at fewer cells at once as long as they need too much memory.
-pub(super) fn smaller<T>(
-    at_once: &mut usize,
-    look: impl Fn(usize) -> Result<T, AppError>,
-) -> Result<T, AppError> {
-    loop {
-        match look(*at_once) {
-            Err(AppError::LookTooLarge { .. }) if *at_once > 1 => *at_once = at_once.div_ceil(8),
-            found => return found,
-        }
-    }
 }
 
 fn read_cursor(cursor: &str) -> Result<Cell, AppError> {

@@ -7,7 +7,8 @@ use tread_api::friction::{CellFriction, StoredSegment};
 use tread_api::ids::SiteId;
 use tread_api::site::{Cell, Grid, Site};
 
-use super::cells::{Area, factor, of_square, smaller, squares};
+use super::cells::{Area, factor, of_square, squares};
+use super::look::smaller;
 use super::raster::PictureAsked;
 use super::{App, AppError, Look, MOVED, Reading};
 use crate::app::segments::Batch;

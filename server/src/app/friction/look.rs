@@ -174,3 +174,36 @@ impl App {
         }
     }
 }
+
+/// Looks at fewer things at once as long as they need too much memory.
+pub(super) fn smaller<T>(
+    at_once: &mut usize,
+    look: impl Fn(usize) -> Result<T, AppError>,
+) -> Result<T, AppError> {
+    loop {
+        match look(*at_once) {
+            Err(AppError::LookTooLarge { .. }) if *at_once > 1 => *at_once = at_once.div_ceil(8),
+            found => return found,
+        }
+    }
+}
+
+/// Returns what is found for each of some places, a number of them at once or fewer.
+pub(super) fn in_parts<P, T>(
+    places: &[P],
+    mut at_once: usize,
+    look: impl Fn(&[P]) -> Result<Vec<T>, AppError>,
+) -> Result<Vec<T>, AppError> {
+    let mut found = Vec::with_capacity(places.len());
+    let mut rest = places;
+    while !rest.is_empty() {
+        let some = smaller(&mut at_once, |at_once| {
+            let some = rest.get(..at_once).unwrap_or(rest);
+            Ok((some.len(), look(some)?))
+        });
+        let (count, some) = some?;
+        found.extend(some);
+        rest = rest.get(count..).unwrap_or_default();
+    }
+    Ok(found)
+}

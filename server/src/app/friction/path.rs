@@ -13,6 +13,7 @@ use tread_api::site::{Cell, Grid};
 use tread_control::robot::RobotModel as PlannedModel;
 
 use super::drawn::{Drawn, Near};
+use super::look::in_parts;
 use super::{App, AppError, Asked, Look, Reading, SiteView};
 use crate::friction::index::{Cells, CompiledFilter, Room};
 use crate::friction::traction_limit;
@@ -60,14 +61,13 @@ impl App {
         let looking = move |look: &Look<'_>, [reading]: &[Reading; 1]| {
             let drawn = Drawn::new(&view.terrains);
             let near = drawn_near(&drawn, &cut);
-            let mut pieces: Vec<PathPiece> = Vec::with_capacity(cut.len());
-            for some in cut.chunks(PLACES_AT_ONCE) {
-                pieces.extend(look.cells(&view.row, |map| {
+            let mut pieces: Vec<PathPiece> = in_parts(&cut, PLACES_AT_ONCE, |some| {
+                look.cells(&view.row, |map| {
                     let mut reader = CellReader::new(map, (&view, &drawn, &near), reading);
                     let piece = |cut: &Cut| described(cut, reader.known_at(cut).as_ref());
-                    some.iter().map(piece).collect::<Vec<_>>()
-                })?);
-            }
+                    some.iter().map(piece).collect()
+                })
+            })?;
             set_speeds(&mut pieces, &cut, length_m, &found.model);
             let known_m: f64 = pieces
                 .iter()

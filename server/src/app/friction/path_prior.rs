@@ -10,6 +10,7 @@ use tread_api::trajectory::{Trajectory, Waypoint};
 use tread_api::wire::command::{CellPrior, CellTractionLimit, PRIOR_CELLS_MAX, PathPrior};
 
 use super::drawn::Drawn;
+use super::look::in_parts;
 use super::path::{
     CellReader, Cut, PLACES_AT_ONCE, checked_length, cut, drawn_near, is_measured,
     traction_limit_mu,
@@ -77,18 +78,17 @@ fn prior_of(
         cut.iter().copied().chain(near).collect()
     };
     let around = drawn_near(&drawn, &places);
-    let mut known: Vec<KnownPlace> = Vec::with_capacity(places.len());
-    for some in places.chunks(PLACES_AT_ONCE) {
-        known.extend(look.cells(&view.row, |map| {
+    let known: Vec<KnownPlace> = in_parts(&places, PLACES_AT_ONCE, |some| {
+        look.cells(&view.row, |map| {
             let mut reader = CellReader::new(map, (view, &drawn, &around), reading);
             let known = some.iter().map(|place| KnownPlace {
                 ground: around.ground_at(place.middle),
                 known: reader.known_at(place),
                 has_one_ground: map.cell(place.cell, reading.choice()).len() == 1,
             });
-            known.collect::<Vec<_>>()
-        })?);
-    }
+            known.collect()
+        })
+    })?;
     let mut grounds: BTreeMap<u16, f64> = BTreeMap::new();
     for place in &known {
         if let Some(measured) = place.known.as_ref().filter(|known| is_measured(known)) {

@@ -13,6 +13,7 @@ use tread_api::site::{Cell, Grid};
 
 use super::cells::{Area, factor};
 use super::drawn::Drawn;
+use super::look::in_parts;
 use super::{AppError, Asked, Look, Reading, SiteView};
 use crate::friction::Raster;
 use crate::friction::index::{Block, CELLS_PER_BLOCK, CellSummary, Cells, CompiledFilter, Room};
@@ -215,8 +216,8 @@ impl Frame<'_> {
             .unwrap_or_default()
             .max(1);
         for iy in min.iy..=max.iy {
-            for some in columns.chunks(at_once) {
-                squares.extend(look.cells(&self.view.row, |map| {
+            squares.extend(in_parts(&columns, at_once, |some| {
+                look.cells(&self.view.row, |map| {
                     let filter = self.filter(map);
                     let mut room = Room::default();
                     let square = |&ix: &i32| {
@@ -232,9 +233,9 @@ impl Frame<'_> {
                         let at = self.reading.fused_at();
                         map.fuse_square((low, high), (ground, &filter), at, &mut room)
                     };
-                    some.iter().map(square).collect::<Vec<_>>()
-                })?);
-            }
+                    some.iter().map(square).collect()
+                })
+            })?);
         }
         Ok(squares)
     }
