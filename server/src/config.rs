@@ -449,6 +449,12 @@ pub enum ConfigError {
         #[source]
         cause: std::io::Error,
     },
+    /// The file is not text.
+    #[error("configuration file `{}` is not text in UTF-8: save it as that", path.display())]
+    NotText {
+        /// Path of the file.
+        path: PathBuf,
+    },
     /// The file is not valid TOML, or has an unknown key or a value of the wrong type.
     #[error("configuration file `{}`, line {line}: {message}", path.display())]
     Invalid {
@@ -690,9 +696,13 @@ impl RobotsConfig {
 }
 
 fn read(path: &Path) -> Result<File, ConfigError> {
-    let text = std::fs::read_to_string(path).map_err(|cause| ConfigError::Unreadable {
-        path: path.to_owned(),
-        cause,
+    let text = std::fs::read_to_string(path).map_err(|cause| {
+        let path = path.to_owned();
+        if cause.kind() == std::io::ErrorKind::InvalidData {
+            ConfigError::NotText { path }
+        } else {
+            ConfigError::Unreadable { path, cause }
+        }
     })?;
     toml::from_str(&text).map_err(|error| {
         let start = error.span().map_or(0, |span| span.start);

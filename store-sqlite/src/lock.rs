@@ -48,6 +48,15 @@ pub enum LockError {
         /// Number of its hard links.
         names: u64,
     },
+    /// The path is that of a folder.
+    #[error(
+        "the database `{}` is a folder: give a file in it, such as `{}`",
+        path.display(), path.join("tread.db").display()
+    )]
+    Folder {
+        /// The folder.
+        path: PathBuf,
+    },
     /// The lock file cannot be created.
     #[error("cannot lock the database with `{}`: {}", path.display(), advice_on(source))]
     File {
@@ -72,7 +81,13 @@ impl DatabaseLock {
     /// [`LockError::InUse`] names the process that holds the lock; [`LockError::HardLinks`]; or
     /// [`LockError::File`].
     pub fn take(database: &Path) -> Result<Self, LockError> {
-        let names = fs::metadata(database).map_or(1, |there| there.nlink());
+        let there = fs::metadata(database);
+        if there.as_ref().is_ok_and(fs::Metadata::is_dir) {
+            return Err(LockError::Folder {
+                path: database.to_owned(),
+            });
+        }
+        let names = there.map_or(1, |there| there.nlink());
         if names > 1 {
             return Err(LockError::HardLinks {
                 path: database.to_owned(),
@@ -188,6 +203,8 @@ mod tests {
         assert!(DatabaseLock::take(&link).is_err());
         drop(first);
         DatabaseLock::take(&link).unwrap();
+        let refused = DatabaseLock::take(folder.path()).unwrap_err().to_string();
+        assert!(refused.contains("is a folder"), "{refused}");
     }
 
     #[test]

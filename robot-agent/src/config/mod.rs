@@ -63,6 +63,12 @@ pub enum ConfigError {
         #[source]
         source: std::io::Error,
     },
+    /// The file is not text.
+    #[error("the configuration `{file}` is not text in UTF-8: save it as that")]
+    NotText {
+        /// The file.
+        file: String,
+    },
     /// The text does not parse, or a key is not known.
     #[error("in the configuration `{file}`: {problem}")]
     Malformed {
@@ -99,6 +105,12 @@ pub enum ConfigError {
     /// The endpoint requires a certificate, and the robot has none.
     #[error("`{0}` wants a certificate: join the fleet with `tread-agent enroll`")]
     NotEnrolled(String),
+    /// The endpoint is a URL of the REST API.
+    #[error(
+        "`{0}` is an address of the REST API; `server` is where robots connect: `tls/HOST:7447`, or \
+         `tcp/127.0.0.1:7447` on the server's own machine"
+    )]
+    RestAddress(String),
     /// The endpoint is another machine without encryption.
     #[error("`{0}` is another machine without TLS: join the fleet with `tread-agent enroll`")]
     ClearText(String),
@@ -343,9 +355,13 @@ fn read_file(flags: &Flags) -> Result<FileConfig, ConfigError> {
         return Ok(FileConfig::default());
     };
     let file = path.display().to_string();
-    let text = std::fs::read_to_string(path).map_err(|source| ConfigError::Unreadable {
-        file: file.clone(),
-        source,
+    let text = std::fs::read_to_string(path).map_err(|source| {
+        let file = file.clone();
+        if source.kind() == std::io::ErrorKind::InvalidData {
+            ConfigError::NotText { file }
+        } else {
+            ConfigError::Unreadable { file, source }
+        }
     })?;
     file::parse(&text).map_err(|refused| ConfigError::Malformed {
         file,

@@ -41,6 +41,9 @@ pub(super) fn place_at(
     robot: &RobotId,
     membership: Option<Membership>,
 ) -> Result<Option<Membership>, ConfigError> {
+    if server.starts_with("http://") || server.starts_with("https://") {
+        return Err(ConfigError::RestAddress(server.to_owned()));
+    }
     if !server.starts_with("tls/") {
         return if is_here(server) {
             Ok(None)

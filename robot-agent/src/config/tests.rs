@@ -110,6 +110,8 @@ fn another_machine_is_spoken_to_by_tls_alone_and_that_only_after_joining() {
     }
     for (bad, cure) in [
         ("tcp/192.0.2.7:7447", "without TLS"),
+        ("https://tread.example:8420", "tls/HOST:7447"),
+        ("http://127.0.0.1:8420", "tcp/127.0.0.1:7447"),
         ("udp/tread.example:7447", "without TLS"),
         ("tcp/localhost.example:7447", "without TLS"),
         ("tls/tread.example:7447", "tread-agent enroll"),

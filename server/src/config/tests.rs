@@ -1,6 +1,10 @@
 use super::*;
 
 pub(super) fn load(text: &str) -> Result<Config, ConfigError> {
+    load_bytes(text.as_bytes())
+}
+
+fn load_bytes(text: &[u8]) -> Result<Config, ConfigError> {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("tread.toml");
     std::fs::write(&path, text).unwrap();
@@ -22,6 +26,27 @@ fn an_unknown_key_is_named_with_its_file_and_line() {
     assert!(
         nested.contains("line 2") && nested.contains("bias"),
         "{nested}"
+    );
+}
+
+#[test]
+fn a_file_that_is_no_text_is_called_that() {
+    let error = load_bytes(b"site = \"yard\" # \xff\n")
+        .unwrap_err()
+        .to_string();
+    assert!(error.contains("UTF-8"), "{error}");
+}
+
+#[test]
+fn the_memory_for_the_map_is_bounded() {
+    let default = load("").unwrap().map;
+    assert_eq!(default.memory_max_mib, 4_096);
+    let small = load("[map]\nmemory_max_mib = 64").unwrap().map;
+    assert_eq!(small.memory_max_mib, 64);
+    let error = load("[map]\nmemory_max_mib = 63").unwrap_err().to_string();
+    assert!(
+        error.contains("map.memory_max_mib") && error.contains("64 to 1e9"),
+        "{error}"
     );
 }
 
