@@ -21,7 +21,7 @@ use crate::process::{Process, Usage};
 use crate::relay::Relay;
 use crate::rest::Rest;
 use crate::wait::{SHORT, eventually};
-use pair::Other;
+use pair::{Network, Other};
 
 /// The site of every fleet.
 pub const SITE: &str = "yard";
@@ -56,6 +56,8 @@ pub struct Fleet {
     server_name: &'static str,
     /// The other server of a pair.
     other: Option<Other>,
+    /// The network of the server, in a pair.
+    network: Option<Network>,
     agents: HashMap<RobotId, Process>,
     agent_flags: Vec<String>,
     server_environment: Vec<(String, String)>,
@@ -167,6 +169,7 @@ impl Fleet {
             server: None,
             server_name: "server",
             other: None,
+            network: None,
             agents: HashMap::new(),
             agent_flags: Vec::new(),
             server_environment: Vec::new(),
@@ -200,10 +203,12 @@ impl Fleet {
     pub fn zenoh_endpoint(&self) -> String {
         let is_tls = self.has_certificates && self.config.is_some();
         let protocol = if is_tls { "tls" } else { "tcp" };
-        let own = format!("{protocol}/{}", self.zenoh);
-        match &self.other {
-            Some(other) => format!("{own},{protocol}/{}", other.zenoh),
-            None => own,
+        match self.network.as_ref().zip(self.other.as_ref()) {
+            Some((own, other)) => {
+                let (own, other) = (own.robots.address(), other.network.robots.address());
+                format!("{protocol}/{own},{protocol}/{other}")
+            }
+            None => format!("{protocol}/{}", self.zenoh),
         }
     }
 
@@ -381,7 +386,8 @@ impl Fleet {
     /// # Panics
     /// If it does not get ready.
     pub async fn start_server(&mut self) {
-        self.server = Some(self.server_process(self.server_name, (self.http, self.zenoh)));
+        let place = (self.http, self.zenoh, self.network.as_ref());
+        self.server = Some(self.server_process(self.server_name, place));
         let log = self.folder.path().join(format!("{}.log", self.server_name));
         let look = || async {
             let ready = self.rest.call(reqwest::Method::GET, "/readyz", None).await;
@@ -393,13 +399,21 @@ impl Fleet {
         _ = eventually("the server is ready", SHORT, look, Result::is_ok).await;
     }
 
-    /// Starts the process of a server.
-    fn server_process(&self, name: &str, (http, zenoh): (SocketAddr, SocketAddr)) -> Process {
+    /// Starts the process of a server with these addresses, and the network of one of a pair.
+    fn server_process(
+        &self,
+        name: &str,
+        (http, zenoh, network): (SocketAddr, SocketAddr, Option<&Network>),
+    ) -> Process {
+        let database = match network {
+            Some(network) => self.database.reached_at(network.database.address()),
+            None => self.database_of_server.clone(),
+        };
         let mut arguments = vec![
             "server".to_owned(),
             format!("--http={http}"),
             format!("--zenoh={zenoh}"),
-            format!("--database={}", self.database_of_server.argument()),
+            format!("--database={}", database.argument()),
             format!("--site={SITE}"),
         ];
         if let Some(config) = &self.config {

@@ -6,12 +6,13 @@ mod plan;
 use std::path::Path;
 use std::time::Duration;
 
+use nix::sys::signal::Signal;
 use reqwest::Method;
 use serde::Serialize;
 use serde_json::{Value, json};
 use tokio::time::Instant;
 use tread_api::ids::{MissionId, RobotId};
-use tread_api::mission::MissionDetail;
+use tread_api::mission::{MissionDetail, MissionState};
 
 use crate::fleet::Fleet;
 use crate::light_robot::now;
@@ -73,11 +74,35 @@ struct Followed {
 /// # Panics
 /// If the fleet does not start at all.
 pub async fn run(node: &Path, seed: u64) -> RunReport {
-    let robot: RobotId = "rover-1".parse().expect("it is an identifier");
+    let robot = robot();
     let mut fleet = Fleet::start_with(node).await;
-    let database_relay = fleet.put_database_behind_relay().await;
-    let relay = fleet.start_agent_behind_relay(&robot, 0.0).await;
-    let plan = RunPlan::new(seed, robot.as_str(), (now(), database_relay.is_some()));
+    let database = fleet.put_database_behind_relay().await;
+    let robots = fleet.start_agent_behind_relay(&robot, 0.0).await;
+    run_on(fleet, Some(Relays { database, robots }), seed).await
+}
+
+/// The same with two servers on one PostgreSQL database, of which one is killed, frozen or cut off.
+///
+/// # Panics
+/// If the fleet does not start at all.
+pub async fn run_pair(node: &Path, seed: u64) -> RunReport {
+    let mut fleet = Fleet::start_pair_with(node)
+        .await
+        .unwrap_or_else(|error| panic!("{error:#}"));
+    fleet.start_agent(&robot(), 0.0).await;
+    run_on(fleet, None, seed).await
+}
+
+fn robot() -> RobotId {
+    "rover-1".parse().expect("it is an identifier")
+}
+
+async fn run_on(mut fleet: Fleet, relays: Option<Relays>, seed: u64) -> RunReport {
+    let robot = robot();
+    let has_database_network = relays
+        .as_ref()
+        .is_none_or(|relays| relays.database.is_some());
+    let plan = RunPlan::new(seed, robot.as_str(), (now(), has_database_network));
     let mut report = RunReport {
         seed,
         ..RunReport::default()
@@ -85,7 +110,7 @@ pub async fn run(node: &Path, seed: u64) -> RunReport {
     let mut followed = Vec::new();
     for asked in &plan.missions {
         followed.push(Followed {
-            id: send(&fleet, &asked.body).await,
+            id: send(&mut fleet, &asked.body).await,
             asked: asked.clone(),
             is_cancel_asked: false,
         });
@@ -97,19 +122,15 @@ pub async fn run(node: &Path, seed: u64) -> RunReport {
         report.actions.push(format!("{at:?} {action:?}"));
         let mut stage = Stage {
             fleet: &mut fleet,
-            relay: &relay,
-            database_relay: database_relay.as_ref(),
+            relays: relays.as_ref(),
             robot: &robot,
             report: &mut report,
             random: &mut random,
         };
         stage.act(action, &mut followed).await;
     }
-    relay.heal();
-    if let Some(relay) = &database_relay {
-        relay.heal();
-    }
-    let details = ended(&fleet, &followed).await;
+    mend(&fleet, relays.as_ref());
+    let details = ended(&mut fleet, &followed).await;
     report.ends = details.iter().map(judge::end_of).collect();
     let memory = robots_memory(&mut fleet, &robot, &details).await;
     judge::judge(&followed, &details, memory.as_ref(), &mut report);
@@ -117,17 +138,33 @@ pub async fn run(node: &Path, seed: u64) -> RunReport {
     if report.violations.is_empty() {
         report.actions.clear();
     } else {
-        report.logs = ["server", robot.as_str()]
-            .iter()
-            .flat_map(|name| fleet.log_tail(name))
-            .collect();
+        report.logs = fleet.servers_log_tail();
+        report.logs.extend(fleet.log_tail(robot.as_str()));
     }
     report
 }
 
+/// The network of a single server.
+struct Relays {
+    /// Between the server and a PostgreSQL database.
+    database: Option<Relay>,
+    /// Between the robot and the server.
+    robots: Relay,
+}
+
+/// Lets everything go on and reach everything.
+fn mend(fleet: &Fleet, relays: Option<&Relays>) {
+    fleet.mend_servers();
+    if let Some(relays) = relays {
+        relays.robots.heal();
+        relays.database.iter().for_each(Relay::heal);
+    }
+}
+
 /// Sends a mission until the server has taken it.
-async fn send(fleet: &Fleet, body: &Value) -> MissionId {
+async fn send(fleet: &mut Fleet, body: &Value) -> MissionId {
     for _ in 0..SEND_TRIES_MAX {
+        fleet.tend_pair().await;
         let answer = fleet.rest.call(Method::POST, "/v1/missions", Some(body));
         if let Some((status, answer)) = answer.await
             && status.is_success()
@@ -141,8 +178,8 @@ async fn send(fleet: &Fleet, body: &Value) -> MissionId {
 
 struct Stage<'run> {
     fleet: &'run mut Fleet,
-    relay: &'run Relay,
-    database_relay: Option<&'run Relay>,
+    /// `None` with a pair of servers.
+    relays: Option<&'run Relays>,
     robot: &'run RobotId,
     report: &'run mut RunReport,
     random: &'run mut Random,
@@ -153,7 +190,10 @@ impl Stage<'_> {
         match action {
             Action::KillServer => {
                 self.report.server_kills += 1;
-                self.fleet.kill_server();
+                self.fail_server();
+            }
+            Action::StartServer | Action::HealDatabase if self.relays.is_none() => {
+                self.fleet.mend_servers();
             }
             Action::StartServer => {
                 // A server that does not reach its database at its start ends, and its service manager
@@ -165,13 +205,18 @@ impl Stage<'_> {
                 self.report.agent_kills += 1;
                 self.fleet.kill_agent(self.robot);
             }
-            Action::StartAgent => self.fleet.spawn_agent_behind(self.robot, 0.0, self.relay),
+            Action::StartAgent => match self.relays {
+                Some(Relays { robots, .. }) => {
+                    self.fleet.spawn_agent_behind(self.robot, 0.0, robots);
+                }
+                None => self.fleet.spawn_agent(self.robot, 0.0),
+            },
             Action::Cut => {
                 self.report.cuts += 1;
-                self.relay.cut();
+                self.robots_network(Relay::cut);
             }
-            Action::Heal => self.relay.heal(),
-            Action::Reset => self.relay.reset(),
+            Action::Heal => self.robots_network(Relay::heal),
+            Action::Reset => self.robots_network(Relay::reset),
             Action::CutDatabase => {
                 self.report.database_cuts += 1;
                 self.database_network(Relay::cut);
@@ -199,21 +244,41 @@ impl Stage<'_> {
         }
     }
 
-    fn database_network(&self, act: impl FnOnce(&Relay)) {
-        if let Some(relay) = self.database_relay {
-            act(relay);
+    /// Kills the server; one of a pair may also be frozen or cut off.
+    fn fail_server(&mut self) {
+        if self.relays.is_some() || self.random.chance(0.4) {
+            self.fleet.kill_server();
+        } else if self.random.chance(0.5) {
+            self.fleet.signal_server(Signal::SIGSTOP);
+        } else {
+            self.fleet.cut_server_off();
+        }
+    }
+
+    fn database_network(&self, act: impl Fn(&Relay)) {
+        match self.relays {
+            Some(relays) => relays.database.iter().for_each(act),
+            None => self.fleet.networks().0.for_each(act),
+        }
+    }
+
+    fn robots_network(&self, act: impl Fn(&Relay)) {
+        match self.relays {
+            Some(relays) => act(&relays.robots),
+            None => self.fleet.networks().1.for_each(act),
         }
     }
 
     async fn request(&mut self, mission: MissionId, verb: &str, body: &Value) {
         let path = format!("/v1/missions/{mission}/{verb}");
+        self.fleet.tend_pair().await;
         let answer = self.fleet.rest.call(Method::POST, &path, Some(body)).await;
         let Some((status, answer)) = answer else {
             return;
         };
         self.report.requests += 1;
-        let is_away =
-            self.database_relay.is_some() && status == reqwest::StatusCode::SERVICE_UNAVAILABLE;
+        let has_network = self.relays.is_none_or(|relays| relays.database.is_some());
+        let is_away = has_network && status == reqwest::StatusCode::SERVICE_UNAVAILABLE;
         let is_fair = status.is_success() || status == reqwest::StatusCode::CONFLICT || is_away;
         if !is_fair {
             self.report.violations.push(Violation {
@@ -225,31 +290,42 @@ impl Stage<'_> {
 }
 
 /// The missions once all have ended, or as they stand when time is up.
-async fn ended(fleet: &Fleet, followed: &[Followed]) -> Vec<MissionDetail> {
+async fn ended(fleet: &mut Fleet, followed: &[Followed]) -> Vec<MissionDetail> {
     let deadline = Instant::now() + END_WAIT_MAX;
     loop {
-        let mut details: Vec<MissionDetail> = Vec::new();
-        for mission in followed {
-            let path = format!("/v1/missions/{}", mission.id);
-            let answer = fleet.rest.call(Method::GET, &path, None).await;
-            let Some((status, body)) = answer.filter(|(status, _)| status.is_success()) else {
-                panic!(
-                    "no mission from the server, which has ended: {}: {:#?}",
-                    fleet.has_server_ended(),
-                    fleet.log_tail("server")
-                );
-            };
-            let detail = serde_json::from_value(body);
-            details.push(detail.unwrap_or_else(|error| panic!("{status}: {error}")));
-        }
-        let all_ended = details
-            .iter()
-            .all(|detail| detail.mission.state.is_terminal());
-        if all_ended || Instant::now() > deadline {
-            return details;
+        fleet.tend_pair().await;
+        let details = details(fleet, followed).await;
+        let is_late = Instant::now() > deadline;
+        match details {
+            Some(details) => {
+                let mut states = details.iter().map(|detail| detail.mission.state);
+                if is_late || states.all(MissionState::is_terminal) {
+                    return details;
+                }
+            }
+            // The servers of a pair exchange places.
+            None if fleet.is_pair() && !is_late => {}
+            None => panic!(
+                "no mission from the server, which has ended: {}: {:#?}",
+                fleet.has_server_ended(),
+                fleet.servers_log_tail()
+            ),
         }
         tokio::time::sleep(LOOK_EVERY).await;
     }
+}
+
+/// The missions as the server has them; `None` if it does not answer.
+async fn details(fleet: &Fleet, followed: &[Followed]) -> Option<Vec<MissionDetail>> {
+    let mut details: Vec<MissionDetail> = Vec::new();
+    for mission in followed {
+        let path = format!("/v1/missions/{}", mission.id);
+        let answer = fleet.rest.call(Method::GET, &path, None).await;
+        let (status, body) = answer.filter(|(status, _)| status.is_success())?;
+        let detail = serde_json::from_value(body);
+        details.push(detail.unwrap_or_else(|error| panic!("{status}: {error}")));
+    }
+    Some(details)
 }
 
 /// What the robot itself remembers, once it has uploaded everything.
@@ -260,6 +336,7 @@ async fn robots_memory(
 ) -> Option<tread_agent::missions::MissionSlot> {
     let deadline = Instant::now() + END_WAIT_MAX;
     loop {
+        fleet.tend_pair().await;
         let live = fleet.rest.robot(robot).await.and_then(|robot| robot.live);
         let is_quiet = live.is_some_and(|live| {
             live.heard_age_ms < 1_000 && live.outbox.pending == 0 && live.mission.is_none()

@@ -5,18 +5,39 @@ use std::path::Path;
 
 use anyhow::Context as _;
 use nix::sys::signal::Signal;
+use reqwest::Method;
 
 use super::Fleet;
 use crate::ports::free_address;
 use crate::process::Process;
+use crate::relay::Relay;
 
 /// The server of a pair that stands by, or does not run.
 #[derive(Debug)]
 pub(super) struct Other {
     name: &'static str,
     http: SocketAddr,
-    pub(super) zenoh: SocketAddr,
+    zenoh: SocketAddr,
+    pub(super) network: Network,
     process: Option<Process>,
+}
+
+/// The network of one server of a pair.
+#[derive(Debug)]
+pub(super) struct Network {
+    /// Between the server and the database.
+    pub(super) database: Relay,
+    /// Between robots and the server.
+    pub(super) robots: Relay,
+}
+
+impl Network {
+    async fn start(database: SocketAddr, zenoh: SocketAddr) -> anyhow::Result<Self> {
+        Ok(Self {
+            database: Relay::start(database).await?,
+            robots: Relay::start(zenoh).await?,
+        })
+    }
 }
 
 impl Fleet {
@@ -30,14 +51,17 @@ impl Fleet {
     pub async fn start_pair_with(node: &Path) -> anyhow::Result<Self> {
         let folder = tempfile::tempdir()?;
         let mut fleet = Self::new(node, folder, None, &[]);
-        fleet.database.server().context(
+        let database = fleet.database.server().context(
             "two servers need PostgreSQL: put `TREAD_TEST_ENGINE=postgres store-postgres/with-postgres` \
              before the command",
         )?;
+        fleet.network = Some(Network::start(database, fleet.zenoh).await?);
+        let zenoh = free_address();
         fleet.other = Some(Other {
             name: "other-server",
             http: free_address(),
-            zenoh: free_address(),
+            zenoh,
+            network: Network::start(database, zenoh).await?,
             process: None,
         });
         fleet.start_server().await;
@@ -49,16 +73,25 @@ impl Fleet {
     /// Starts the server that does not work, which stands by then.
     pub fn start_other_server(&mut self) {
         if let Some(other) = &self.other {
-            let started = self.server_process(other.name, (other.http, other.zenoh));
+            let place = (other.http, other.zenoh, Some(&other.network));
+            let started = self.server_process(other.name, place);
             if let Some(other) = &mut self.other {
                 other.process = Some(started);
             }
         }
     }
 
+    /// Whether there are two servers.
+    pub fn is_pair(&self) -> bool {
+        self.other.is_some()
+    }
+
     /// Exchanges the two servers: [`Fleet::rest`] asks the one that stood by from now on.
     pub fn exchange_servers(&mut self) {
-        let Some(other) = &mut self.other else { return };
+        let (Some(other), Some(network)) = (&mut self.other, &mut self.network) else {
+            return;
+        };
+        std::mem::swap(network, &mut other.network);
         std::mem::swap(&mut self.server_name, &mut other.name);
         std::mem::swap(&mut self.http, &mut other.http);
         std::mem::swap(&mut self.zenoh, &mut other.zenoh);
@@ -70,6 +103,68 @@ impl Fleet {
     pub fn signal_server(&self, signal: Signal) {
         if let Some(server) = &self.server {
             server.signal(signal);
+        }
+    }
+
+    /// Does what service managers and a load balancer would: starts a server that has ended, and from
+    /// now on [`Fleet::rest`] asks the one that is ready.
+    pub async fn tend_pair(&mut self) {
+        if self.other.is_none() {
+            return;
+        }
+        if self.has_server_ended() {
+            let place = (self.http, self.zenoh, self.network.as_ref());
+            self.server = Some(self.server_process(self.server_name, place));
+        }
+        if self.has_other_server_ended() {
+            self.start_other_server();
+        }
+        if self.is_ready().await {
+            return;
+        }
+        self.exchange_servers();
+        if !self.is_ready().await {
+            self.exchange_servers();
+        }
+    }
+
+    async fn is_ready(&self) -> bool {
+        let ready = self.rest.call(Method::GET, "/readyz", None).await;
+        ready.is_some_and(|(status, _)| status.is_success())
+    }
+
+    /// The network between the server and the database, and between robots and each of the servers.
+    pub fn networks(&self) -> (impl Iterator<Item = &Relay>, impl Iterator<Item = &Relay>) {
+        let other = self.other.iter().map(|other| &other.network);
+        let both = self.network.iter().chain(other);
+        let of_server = self.network.iter().map(|network| &network.database);
+        (of_server, both.map(|network| &network.robots))
+    }
+
+    /// Lets both servers go on and reach everything.
+    pub fn mend_servers(&self) {
+        self.signal_server(Signal::SIGCONT);
+        self.wake_other_server();
+        let other = self.other.iter().map(|other| &other.network);
+        for network in self.network.iter().chain(other) {
+            network.database.heal();
+            network.robots.heal();
+        }
+    }
+
+    /// Cuts the server off from database and robots, without telling anybody.
+    pub fn cut_server_off(&self) {
+        if let Some(network) = &self.network {
+            network.database.cut();
+            network.robots.cut();
+        }
+    }
+
+    /// Connects the other server again that was cut off.
+    pub fn reconnect_other_server(&self) {
+        if let Some(Other { network, .. }) = &self.other {
+            network.database.heal();
+            network.robots.heal();
         }
     }
 

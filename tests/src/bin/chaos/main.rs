@@ -7,7 +7,8 @@
 //! that is known, and `--seed` runs it alone.
 //!
 //! With `TREAD_TEST_ENGINE=postgres store-postgres/with-postgres` before it, the server has a PostgreSQL
-//! database, and the network between both is cut too.
+//! database, and the network between both is cut too. With `--pair` a second server stands by, and the first
+//! is killed, frozen or cut off from everything.
 
 use std::collections::BTreeMap;
 use std::io::Write;
@@ -18,7 +19,7 @@ use clap::Parser;
 use serde::Serialize;
 use tokio::sync::Semaphore;
 use tokio::task::JoinSet;
-use tread_tests::chaos::{RunReport, run};
+use tread_tests::chaos::{RunReport, run, run_pair};
 use tread_tests::process::node;
 use tread_tests::report::{self, Check};
 
@@ -32,6 +33,9 @@ struct Arguments {
     /// The first seed
     #[arg(long, default_value_t = 1)]
     seed: u64,
+    /// Two servers on one PostgreSQL database
+    #[arg(long)]
+    pair: bool,
     /// Runs at the same time
     #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u32).range(1..=64))]
     at_once: u32,
@@ -58,12 +62,17 @@ async fn main() -> anyhow::Result<ExitCode> {
     let arguments = Arguments::parse();
     let node = Arc::new(node()?);
     let room = Arc::new(Semaphore::new(arguments.at_once as usize));
+    let is_pair = arguments.pair;
     let mut runs = JoinSet::new();
     for seed in arguments.seed..arguments.seed + arguments.runs {
         let (node, room) = (Arc::clone(&node), Arc::clone(&room));
         runs.spawn(async move {
             let _place = room.acquire().await;
-            run(&node, seed).await
+            if is_pair {
+                run_pair(&node, seed).await
+            } else {
+                run(&node, seed).await
+            }
         });
     }
     let mut reports = Vec::new();

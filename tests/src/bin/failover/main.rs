@@ -1,8 +1,9 @@
-//! `failover`: how soon a standby has the robots of a server that was killed or frozen, and whether anything
-//! is lost, doubled or driven twice.
+//! `failover`: how soon a standby has the robots of a server that was killed, frozen or cut off, and whether
+//! anything is lost, doubled or driven twice.
 //!
 //! Two servers on one PostgreSQL database, and robots on missions that know both. In each trial the server
-//! that works is killed, or stopped in its tracks and woken up after the other has taken over. What is timed
+//! that works is killed, or stopped in its tracks, or cut off from database and robots, and woken up or
+//! connected again after the other has taken over. What is timed
 //! is what a client of the other server's REST API sees, so the poll is in the figures. Afterwards every
 //! mission must have succeeded once, and every record of the robots must be there once.
 
@@ -24,11 +25,11 @@ use tread_tests::report::{self, Check, figure, quantile};
 use tread_tests::stored::{self, lost_records};
 use tread_tests::wait::{DRIVE, SHORT};
 
-/// Longest time until all robots are online at the other server: after a kill, and after a freeze, of which
-/// the standby waits 2 s.
+/// Longest time until all robots are online at the other server: after a kill, and after a freeze or a cut,
+/// of which the standby waits 2 s.
 const KILLED_MAX_S: f64 = 2.0;
 const FROZEN_MAX_S: f64 = 5.0;
-/// Longest time until a server that was woken up has ended.
+/// Longest time until a server that was woken up, or connected again, has ended.
 const WOKEN_MAX_S: f64 = 5.0;
 /// Time between two looks.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
@@ -60,6 +61,15 @@ struct Details {
     failures: Vec<String>,
 }
 
+/// What happens to the server that works.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Failure {
+    Kill,
+    Freeze,
+    /// It reaches neither database nor robots, and runs.
+    Cut,
+}
+
 /// Times from a failure, seconds.
 #[derive(Debug, Default)]
 struct Times {
@@ -67,7 +77,7 @@ struct Times {
     ready: Vec<f64>,
     /// Until each robot was online there.
     online: Vec<f64>,
-    /// From the waking of a frozen server until it had ended.
+    /// From the waking of a frozen server, or the mending of its network, until it had ended.
     ended: Vec<f64>,
 }
 
@@ -98,12 +108,16 @@ async fn is_ready(fleet: &Fleet) -> bool {
 async fn fail(
     fleet: &mut Fleet,
     robots: &[RobotId],
-    signal: Signal,
+    failure: Failure,
     times: &mut Times,
 ) -> anyhow::Result<()> {
     tokio::time::sleep(DRIVING).await;
     let began = Instant::now();
-    fleet.signal_server(signal);
+    match failure {
+        Failure::Kill => fleet.signal_server(Signal::SIGKILL),
+        Failure::Freeze => fleet.signal_server(Signal::SIGSTOP),
+        Failure::Cut => fleet.cut_server_off(),
+    }
     fleet.exchange_servers();
     let ready = until(fleet, "the standby is ready", began, async || {
         is_ready(fleet).await
@@ -116,11 +130,14 @@ async fn fail(
         });
         times.online.push(online.await?);
     }
-    if signal == Signal::SIGSTOP {
+    if failure != Failure::Kill {
         tokio::time::sleep(DRIVING).await;
         let began = Instant::now();
-        fleet.wake_other_server();
-        let ended = until(fleet, "the woken server ends", began, async || {
+        match failure {
+            Failure::Cut => fleet.reconnect_other_server(),
+            Failure::Kill | Failure::Freeze => fleet.wake_other_server(),
+        }
+        let ended = until(fleet, "the server that is back ends", began, async || {
             fleet.has_other_server_ended()
         });
         times.ended.push(ended.await?);
@@ -152,18 +169,19 @@ async fn main() -> anyhow::Result<ExitCode> {
         fleet.start_agent(&robot, f64::from(number) * APART_M).await;
         robots.push(robot);
     }
-    // Longer than all trials take; what is left of them is cancelled.
-    let for_s = f64::from(arguments.trials) * 40.0;
+    // Longer than all trials take.
+    let for_s = f64::from(arguments.trials) * 60.0;
     let mut missions = Vec::new();
     for (number, robot) in (0..).zip(&robots) {
         missions.push(send(&fleet, robot, number, for_s).await);
         // It waits for the first one to end.
         missions.push(send(&fleet, robot, number, 1.0).await);
     }
-    let (mut killed, mut frozen) = (Times::default(), Times::default());
+    let [mut killed, mut frozen, mut cut] = <[Times; 3]>::default();
     for _ in 0..arguments.trials {
-        fail(&mut fleet, &robots, Signal::SIGKILL, &mut killed).await?;
-        fail(&mut fleet, &robots, Signal::SIGSTOP, &mut frozen).await?;
+        fail(&mut fleet, &robots, Failure::Kill, &mut killed).await?;
+        fail(&mut fleet, &robots, Failure::Freeze, &mut frozen).await?;
+        fail(&mut fleet, &robots, Failure::Cut, &mut cut).await?;
     }
     let failures = judge(&mut fleet, &robots, &missions).await?;
     let lost = failures.len() as u64;
@@ -175,6 +193,13 @@ async fn main() -> anyhow::Result<ExitCode> {
         Check::shown("the same, median, s", quantile(&mut frozen.online, 0.5)),
         Check::shown("standby ready after a freeze, s", worst(&mut frozen.ready)),
         Check::of("woken server has ended, s", worst(&mut frozen.ended)).at_most(WOKEN_MAX_S),
+        Check::of("all online after a cut, s", worst(&mut cut.online)).at_most(FROZEN_MAX_S),
+        Check::shown("the same, median, s", quantile(&mut cut.online, 0.5)),
+        Check::of(
+            "server that was cut off has ended, s",
+            worst(&mut cut.ended),
+        )
+        .at_most(WOKEN_MAX_S),
     ];
     checks.push(
         Check::of_count(
