@@ -167,6 +167,9 @@ impl Maps {
         let mut sites = self.sites.write().unwrap_or_else(PoisonError::into_inner);
         let sums = folded.iter().map(|part| (&part.key, &*part.cells));
         self.unwritten().add(sums, added, now);
+        for map in sites.maps.values_mut() {
+            map.set_look(self.memory.looks());
+        }
         sites.add(folded, SiteMap::add_cells);
         self.memory.wake_if_full(&sites);
     }

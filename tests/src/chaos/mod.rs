@@ -10,7 +10,7 @@ use nix::sys::signal::Signal;
 use reqwest::Method;
 use serde::Serialize;
 use serde_json::{Value, json};
-use tokio::time::Instant;
+use tokio::time::{Instant, timeout};
 use tread_api::ids::{MissionId, RobotId};
 use tread_api::mission::{MissionDetail, MissionState};
 
@@ -22,6 +22,8 @@ use plan::{Action, Asked, RunPlan};
 
 /// Longest time for every mission to end once nothing is broken any more.
 const END_WAIT_MAX: Duration = Duration::from_secs(90);
+/// Longest wait for the answer to a request.
+const ANSWER_MAX: Duration = Duration::from_secs(15);
 /// Time between two looks.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
 /// Tries to send a mission to a server that is away.
@@ -187,6 +189,13 @@ struct Stage<'run> {
 
 impl Stage<'_> {
     async fn act(&mut self, action: Action, followed: &mut [Followed]) {
+        if matches!(
+            action,
+            Action::KillServer | Action::CutDatabase | Action::ResetDatabase
+        ) {
+            // The one that works by now.
+            self.fleet.tend_pair().await;
+        }
         match action {
             Action::KillServer => {
                 self.report.server_kills += 1;
@@ -272,8 +281,9 @@ impl Stage<'_> {
     async fn request(&mut self, mission: MissionId, verb: &str, body: &Value) {
         let path = format!("/v1/missions/{mission}/{verb}");
         self.fleet.tend_pair().await;
-        let answer = self.fleet.rest.call(Method::POST, &path, Some(body)).await;
-        let Some((status, answer)) = answer else {
+        let asked = self.fleet.rest.call(Method::POST, &path, Some(body));
+        // A server that is frozen says nothing.
+        let Ok(Some((status, answer))) = timeout(ANSWER_MAX, asked).await else {
             return;
         };
         self.report.requests += 1;

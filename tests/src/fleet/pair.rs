@@ -2,15 +2,20 @@
 
 use std::net::SocketAddr;
 use std::path::Path;
+use std::time::Duration;
 
 use anyhow::Context as _;
 use nix::sys::signal::Signal;
 use reqwest::Method;
+use tokio::time::timeout;
 
 use super::Fleet;
 use crate::ports::free_address;
 use crate::process::Process;
 use crate::relay::Relay;
+
+/// Longest time for an answer of a server that is ready.
+const READY_MAX: Duration = Duration::from_secs(1);
 
 /// The server of a pair that stands by, or does not run.
 #[derive(Debug)]
@@ -129,8 +134,10 @@ impl Fleet {
     }
 
     async fn is_ready(&self) -> bool {
-        let ready = self.rest.call(Method::GET, "/readyz", None).await;
-        ready.is_some_and(|(status, _)| status.is_success())
+        // A frozen server takes connections, and says nothing.
+        let asked = self.rest.call(Method::GET, "/readyz", None);
+        let ready = timeout(READY_MAX, asked).await;
+        ready.is_ok_and(|ready| ready.is_some_and(|(status, _)| status.is_success()))
     }
 
     /// The network between the server and the database, and between robots and each of the servers.

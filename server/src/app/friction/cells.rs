@@ -423,7 +423,8 @@ pub(super) fn squares(
         ix: first(square).ix.saturating_add(factor - 1),
         iy: first(square).iy.saturating_add(factor - 1),
     };
-    let at_once = (SQUARES_WIDTH_CELLS / factor).max(1);
+    let wide = i32::try_from(wanted).unwrap_or(i32::MAX);
+    let at_once = (SQUARES_WIDTH_CELLS / factor).min(wide).max(1);
     let mut found: Vec<CellGroup> = Vec::new();
     let mut row = after.map_or(min.iy, |after| after.iy.max(min.iy));
     while row <= max.iy && found.len() < wanted {

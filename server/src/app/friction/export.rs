@@ -232,7 +232,7 @@ impl SegmentExport {
             Stage::Begin | Stage::End | Stage::Over => Batch::default(),
         };
         let app = self.app.clone();
-        app.look(move |_look| self.step(&found)).await
+        app.compute(move || self.step(&found)).await
     }
 
     fn step(mut self, found: &Batch) -> Result<Option<(Vec<u8>, Self)>, AppError> {

@@ -7,6 +7,7 @@ use std::sync::Arc;
 
 use tokio::runtime::Handle;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::task::JoinError;
 use tokio_util::sync::CancellationToken;
 
 use super::{App, AppError};
@@ -90,13 +91,27 @@ impl<'app> Look<'app> {
         look: impl Fn(Cells<'_>) -> T,
     ) -> Result<T, AppError> {
         let mut pins = Pins::default();
+        let found = self.cells_with(row, look, &mut pins);
+        if !pins.is_empty() {
+            drop(pins);
+            self.app.maps().evict();
+        }
+        found
+    }
+
+    fn cells_with<T>(
+        &self,
+        row: &SiteRow,
+        look: impl Fn(Cells<'_>) -> T,
+        pins: &mut Pins,
+    ) -> Result<T, AppError> {
         let mut reader = None;
-        let found = loop {
+        loop {
             let absent = Absent::default();
             let answer = self.app.maps().read_cells(row, &absent, &look);
             let absent = absent.into_blocks();
             if absent.is_empty() {
-                break answer;
+                return Ok(answer);
             }
             if self.abandoned.is_cancelled() {
                 return Err(AppError::Abandoned);
@@ -107,16 +122,13 @@ impl<'app> Look<'app> {
                 if reader.is_none() {
                     reader = self.app.maps().reader(self.is_for_robot).await;
                 }
-                self.app.read_blocks(row, &absent, &mut pins).await?;
-                Ok::<_, AppError>(self.app.look_turns().computing().await)
+                let read = self.app.read_blocks(row, &absent, pins).await;
+                (read, self.app.look_turns().computing().await)
             };
-            *self.turn.borrow_mut() = self.runtime.block_on(reading)?;
-        };
-        if !pins.is_empty() {
-            drop(pins);
-            self.app.maps().evict();
+            let (read, turn) = self.runtime.block_on(reading);
+            *self.turn.borrow_mut() = turn;
+            read?;
         }
-        Ok(found)
     }
 }
 
@@ -139,6 +151,20 @@ impl App {
         work: impl FnOnce(&Look<'_>) -> T + Send + 'static,
     ) -> T {
         self.look_for(true, work).await
+    }
+
+    /// Runs work beside the map on a blocking thread, which waits for no blocks.
+    pub(super) async fn compute<T: Send + 'static>(
+        &self,
+        work: impl FnOnce() -> T + Send + 'static,
+    ) -> T {
+        let turn = self.look_turns().computing().await;
+        let computing = move || {
+            let done = work();
+            drop(turn);
+            done
+        };
+        done(tokio::task::spawn_blocking(computing).await).await
     }
 
     async fn look_for<T: Send + 'static>(
@@ -164,14 +190,19 @@ impl App {
             drop(place);
             done
         };
-        match tokio::task::spawn_blocking(looking).await {
-            Ok(done) => done,
-            Err(broken) => match broken.try_into_panic() {
-                Ok(panic) => std::panic::resume_unwind(panic),
-                // The runtime is shutting down, and this task with it.
-                Err(_cancelled) => std::future::pending().await,
-            },
-        }
+        done(tokio::task::spawn_blocking(looking).await).await
+    }
+}
+
+/// Returns what a blocking thread has returned.
+async fn done<T>(ended: Result<T, JoinError>) -> T {
+    match ended {
+        Ok(done) => done,
+        Err(broken) => match broken.try_into_panic() {
+            Ok(panic) => std::panic::resume_unwind(panic),
+            // The runtime is shutting down, and this task with it.
+            Err(_cancelled) => std::future::pending().await,
+        },
     }
 }
 

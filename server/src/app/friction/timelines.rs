@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use jiff::Timestamp;
 
-use super::{App, AppError, Look};
+use super::{App, AppError};
 use crate::app::ingest::SKEW_MIN;
 use crate::db::segments::KeyedSegment;
 use crate::db::sites::SiteRow;
@@ -148,8 +148,8 @@ impl App {
                 break;
             }
             let withdrawals = Arc::clone(&withdrawals);
-            let adding = move |_: &Look<'_>| kept.with(&rows, &withdrawals);
-            kept = self.look(adding).await;
+            let adding = move || kept.with(&rows, &withdrawals);
+            kept = self.compute(adding).await;
             if batch % KEPT_EVERY == 0 {
                 self.timelines().keep(kept.clone());
             }

@@ -31,6 +31,8 @@ use crate::friction::index::{Absent, Block, BlockBuilder, BlockCells, Cells, Pin
 const MIB: usize = 1 << 20;
 /// Minimum of the memory that one look may take.
 const LOOK_BYTES_MIN: usize = 64 * MIB;
+/// The same with a memory of 0, which tests have: a few small blocks.
+const LOOK_BYTES_WITHOUT_MEMORY: usize = 16_384;
 /// One look may take this share of the memory.
 const LOOK_SHARE: usize = 8;
 /// Number of requests that may have blocks read for them at a time, and of robots' missions; each
@@ -116,7 +118,23 @@ impl BlockMemory {
 
     /// Returns how many bytes of blocks one look may need.
     fn look_bytes_max(&self) -> usize {
-        (self.limit_bytes / LOOK_SHARE).max(LOOK_BYTES_MIN)
+        match self.limit_bytes / LOOK_SHARE {
+            0 => LOOK_BYTES_WITHOUT_MEMORY,
+            share => share.max(LOOK_BYTES_MIN),
+        }
+    }
+
+    /// Returns the number of sums after which a snapshot reads no further block.
+    fn sums_at_once(&self) -> usize {
+        match self.limit_bytes {
+            0 => 1,
+            _ => SUMS_AT_ONCE,
+        }
+    }
+
+    /// Returns the number of looks so far.
+    pub(super) fn looks(&self) -> u64 {
+        self.looks.load(Ordering::Relaxed)
     }
 
     fn next_look(&self) -> u64 {
@@ -299,6 +317,7 @@ impl Maps {
         if map.stamp() != stamp {
             return Ok(false);
         }
+        map.set_look(self.memory.looks());
         let unwritten = self.unwritten();
         for (block, cells) in blocks {
             // Another look may have read it meanwhile.
@@ -330,7 +349,7 @@ fn unnamed(row: &SiteRow, block: Block) -> DbError {
 
 impl App {
     /// Reads blocks of a map into memory, and keeps them there for one look, as long as `pins` exist:
-    /// as many as it may have at once, and at least one.
+    /// at least the first, and further ones while less than half of what it may have at once is kept.
     ///
     /// # Errors
     /// [`AppError::LookTooLarge`] if it has as many as it may already; [`DbError::Unsettled`] if sums
@@ -349,12 +368,16 @@ impl App {
             });
         }
         let mut tries = 0;
+        // The next one is the last.
         let mut rest: Vec<Block> = blocks.iter().rev().copied().collect();
-        while !rest.is_empty() && pins.bytes <= bytes_max {
-            let some = rest.split_off(rest.len().saturating_sub(BLOCKS_AT_ONCE));
+        let mut is_first = true;
+        while !rest.is_empty() && (is_first || pins.bytes < bytes_max / 2) {
+            let mut some = rest.split_off(rest.len().saturating_sub(BLOCKS_AT_ONCE));
+            some.reverse();
             // Another look may have read them meanwhile.
             let absent = maps.pin(row, &some, pins);
             if absent.is_empty() {
+                is_first = false;
                 continue;
             }
             let _reading = maps.begin_read();
@@ -363,13 +386,13 @@ impl App {
             if maps.insert(row, snapshot, pins)? {
                 let read = u64::try_from(count).unwrap_or_default();
                 maps.memory.read.fetch_add(read, Ordering::Relaxed);
-                tries = 0;
-                rest.extend(absent.get(count..).unwrap_or_default());
+                (tries, is_first) = (0, false);
+                rest.extend(absent.get(count..).unwrap_or_default().iter().rev());
             } else if tries >= READ_AGAIN_MAX {
                 return Err(DbError::Unsettled.into());
             } else {
                 tries += 1;
-                rest.extend(absent);
+                rest.extend(absent.into_iter().rev());
             }
         }
         Ok(())
@@ -382,6 +405,7 @@ impl App {
         let mut tx = self.db().read("map block").await?;
         let watermarks = db::watermarks::all(&mut tx).await?;
         let mut blocks = Vec::with_capacity(absent.len());
+        let sums_max = maps.memory.sums_at_once();
         let mut sums = 0;
         for &block in absent {
             let mut cells = BlockBuilder::default();
@@ -396,7 +420,7 @@ impl App {
                 return Err(unnamed(row, block));
             }
             blocks.push((block, cells.build()));
-            if sums >= SUMS_AT_ONCE {
+            if sums >= sums_max {
                 break;
             }
         }
@@ -434,8 +458,13 @@ pub async fn run(app: App, stop: CancellationToken) {
             () = stop.cancelled() => return,
             () = app.maps().memory.full.notified() => {}
         }
-        app.look(|look| look.app().maps().evict()).await;
-        // Blocks that looks keep may be most of them.
-        tokio::time::sleep(EVICT_EVERY_MIN).await;
+        let evicting = app.clone();
+        let evicting = tokio::task::spawn_blocking(move || evicting.maps().evict());
+        // Blocks that looks keep may be most of them, so that not much is evicted.
+        let evicted = async { tokio::join!(evicting, tokio::time::sleep(EVICT_EVERY_MIN)) };
+        tokio::select! {
+            () = stop.cancelled() => return,
+            (_, ()) = evicted => {}
+        }
     }
 }

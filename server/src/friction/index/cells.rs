@@ -171,7 +171,8 @@ impl Blocks {
         true
     }
 
-    pub(super) fn insert(&mut self, block: Block, cells: BlockCells) {
+    pub(super) fn insert(&mut self, block: Block, cells: BlockCells, look: u64) {
+        cells.used.store(look, Ordering::Relaxed);
         self.bytes += cells.bytes();
         if let Some(before) = self.present.insert(block, cells) {
             self.bytes -= before.bytes();
@@ -350,8 +351,10 @@ impl<'map> Cells<'map> {
             of_row.first().iy.max(first_iy)..=of_row.last().iy.min(max.iy)
         });
         let found = lines.flat_map(move |iy| {
-            let row = Block::of(Cell { iy, ..min }).row;
-            let blocks = self.map.changes.row(row, columns);
+            // Of the line of `after` nothing before it is needed.
+            let of_line = after.filter(|after| after.iy == iy);
+            let begun = of_line.map_or(columns.0, |after| Block::of(after).column.max(columns.0));
+            let blocks = self.map.changes.of_line(iy, (begun, columns.1));
             blocks.flat_map(move |block| {
                 let cells = self.of_block(block);
                 if cells.is_none() {

@@ -65,11 +65,27 @@ impl Block {
 /// Recorded changes of one block.
 #[derive(Debug, Default)]
 struct OfBlock {
+    /// One bit for each line of cells in which anything was ever measured.
+    lines: u64,
     newest: u64,
     /// Number of the newest change that is no longer recorded; all later ones are.
     kept_after: u64,
     /// Number of each change, and index of its cell in the block; oldest first.
     kept: VecDeque<(u64, u16)>,
+}
+
+impl OfBlock {
+    /// Makes `newest` the number of the newest change, of which it is not known which cells it was of.
+    fn forget_until(&mut self, newest: u64) {
+        self.newest = newest;
+        self.kept_after = newest;
+        self.kept = VecDeque::new();
+    }
+}
+
+/// Returns the bit of a line of cells within its block.
+fn line(iy: i32) -> u64 {
+    1 << iy.rem_euclid(BLOCK_CELLS)
 }
 
 /// Changes of a map, numbered consecutively from 1.
@@ -83,6 +99,7 @@ impl Changes {
     pub(super) fn note(&mut self, cell: Cell) {
         self.newest += 1;
         let block = self.blocks.entry(Block::of(cell)).or_default();
+        block.lines |= line(cell.iy);
         block.newest = self.newest;
         if block.kept.len() >= KEPT_MAX
             && let Some((oldest, _place)) = block.kept.pop_front()
@@ -96,38 +113,36 @@ impl Changes {
     pub(super) fn note_all(&mut self) {
         self.newest += 1;
         for block in self.blocks.values_mut() {
-            *block = OfBlock {
-                newest: self.newest,
-                kept_after: self.newest,
-                kept: VecDeque::new(),
-            };
+            block.forget_until(self.newest);
         }
     }
 
-    /// Records a change of some cell of a block.
-    pub(super) fn note_block(&mut self, block: Block) {
+    /// Records a change of any cell of the block of this one, in which something was measured.
+    pub(super) fn note_block_of(&mut self, cell: Cell) {
         self.newest += 1;
-        self.blocks.insert(
-            block,
-            OfBlock {
-                newest: self.newest,
-                kept_after: self.newest,
-                kept: VecDeque::new(),
-            },
-        );
+        let block = self.blocks.entry(Block::of(cell)).or_default();
+        block.lines |= line(cell.iy);
+        block.forget_until(self.newest);
     }
 
     /// Forgets which cells of a block have changed until now.
     pub(super) fn forget(&mut self, block: Block) {
         if let Some(found) = self.blocks.get_mut(&block) {
-            found.kept_after = found.newest;
-            found.kept = VecDeque::new();
+            found.forget_until(found.newest);
         }
     }
 
     /// Returns whether any change of a block was recorded.
     pub fn contains(&self, block: Block) -> bool {
         self.blocks.contains_key(&block)
+    }
+
+    /// Returns the blocks between two columns, both included, with measurements in a line of cells.
+    pub(super) fn of_line(&self, iy: i32, columns: (i32, i32)) -> impl Iterator<Item = Block> + '_ {
+        let row = iy.div_euclid(BLOCK_CELLS);
+        let blocks = self.range(row, columns);
+        let of_line = blocks.filter(move |(_, found)| found.lines & line(iy) != 0);
+        of_line.map(|(&block, _)| block)
     }
 
     /// Returns the number of blocks with any change.
@@ -159,14 +174,14 @@ impl Changes {
     }
 
     /// Returns the blocks with any change of a row between two columns, both included.
-    pub(super) fn row(
-        &self,
-        row: i32,
-        (low, high): (i32, i32),
-    ) -> impl Iterator<Item = Block> + '_ {
+    pub(super) fn row(&self, row: i32, columns: (i32, i32)) -> impl Iterator<Item = Block> + '_ {
+        self.range(row, columns).map(|(&block, _)| block)
+    }
+
+    fn range(&self, row: i32, (low, high): (i32, i32)) -> impl Iterator<Item = (&Block, &OfBlock)> {
         let at = |column| Block { row, column };
         let found = (low <= high).then(|| self.blocks.range(at(low)..=at(high)));
-        found.into_iter().flatten().map(|(&block, _)| block)
+        found.into_iter().flatten()
     }
 
     /// Continues the numbering of the map `before`, and records a change of all cells of both.

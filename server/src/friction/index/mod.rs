@@ -63,6 +63,8 @@ pub struct SiteMap {
     removals: u64,
     /// Number of measurements of each epoch.
     segments: BTreeMap<i32, u64>,
+    /// Number of the newest look when cells were changed last.
+    look: u64,
 }
 
 /// Returns row and column of a cell as one number, which rises row by row.
@@ -184,9 +186,7 @@ impl SiteMap {
     /// The same for sums that were measured before the map is looked at for the first time: which cells
     /// have changed is not recorded.
     pub fn load_cells(&mut self, labelled: Labelled<'_>, cells: &[(Cell, Sums)]) {
-        self.add_noting(labelled, cells, |changes, cell| {
-            changes.note_block(Block::of(cell));
-        });
+        self.add_noting(labelled, cells, Changes::note_block_of);
     }
 
     fn add_noting(
@@ -206,10 +206,10 @@ impl SiteMap {
                 note(&mut self.changes, *cell);
             } else if self.changes.contains(block) {
                 // Absent: it is read with these sums when it is needed.
-                self.changes.note_block(block);
+                self.changes.note_block_of(*cell);
             } else {
                 // Nothing is stored of a block that was never driven on, so this is all of it.
-                self.blocks.insert(block, BlockCells::default());
+                self.blocks.insert(block, BlockCells::default(), self.look);
                 self.blocks.add(*cell, key, sums);
                 note(&mut self.changes, *cell);
             }
@@ -261,13 +261,18 @@ impl SiteMap {
         cells: BlockCells,
         lacking: impl IntoIterator<Item = (Labelled<'sums>, &'sums Sums)>,
     ) {
-        self.blocks.insert(block, cells);
+        self.blocks.insert(block, cells, self.look);
         for (labelled, sums) in lacking {
             if labelled.grid_revision == self.grid_revision {
                 let key = self.key(labelled);
                 self.blocks.add(labelled.cell, key, sums);
             }
         }
+    }
+
+    /// Counts blocks that come into memory from now on as used by this look.
+    pub fn set_look(&mut self, look: u64) {
+        self.look = look;
     }
 
     /// Keeps a block in memory as long as the returned pin exists, and returns its bytes; `None` if it

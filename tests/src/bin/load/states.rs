@@ -26,6 +26,8 @@ use crate::{Arguments, batches, light_id, period_of, start_fleet, start_light_ro
 
 /// Robots, and states of each per second.
 const FLEETS: [(u32, f64); 2] = [(1_000, 10.0), (5_000, 2.0)];
+/// Robots of the largest fleet that gets certificates without `--tls`: 5 000 robots take half an hour to join.
+const CERTIFICATES_MAX: u32 = 1_000;
 /// Processor time for each state over that of the bare router, at the most, microseconds.
 const OVER_ROUTER_MAX_US: f64 = 25.0;
 /// Memory over that of the bare router, at the most, MB.
@@ -62,7 +64,8 @@ pub(crate) struct OfFleet {
     router: Used,
     server: Used,
     /// The same with certificates.
-    tls: Used,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    tls: Option<Used>,
 }
 
 /// What was measured.
@@ -89,14 +92,22 @@ pub(crate) async fn measure(arguments: &Arguments, node: &Path) -> anyhow::Resul
         let publishing = publish(light, period);
         let mut server = used(|| fleet.server_usage(), &publishing, seconds).await?;
         say("the server", &server);
-        server.dispatch = Some(dispatch::send_missions(arguments, &mut fleet, None).await?);
+        let dispatch = dispatch::send_missions(arguments, &mut fleet, None).await?;
+        eprintln!(
+            "{robots} robots at {state_rate_hz} Hz: {}",
+            dispatch.words()
+        );
+        server.dispatch = Some(dispatch);
         drop((publishing, fleet));
-        let fleet = start_fleet(node, true).await;
-        let light = start_light_robots(&fleet, robots, true).await?;
-        let publishing = publish(light, period);
-        let tls = used(|| fleet.server_usage(), &publishing, seconds).await?;
-        say("the server, with certificates", &tls);
-        drop((publishing, fleet));
+        let mut tls = None;
+        if arguments.tls || robots <= CERTIFICATES_MAX {
+            let fleet = start_fleet(node, true).await;
+            let light = start_light_robots(&fleet, robots, true).await?;
+            let publishing = publish(light, period);
+            let with = used(|| fleet.server_usage(), &publishing, seconds).await?;
+            say("the server, with certificates", &with);
+            tls = Some(with);
+        }
         fleets.push(OfFleet {
             robots,
             state_rate_hz,
@@ -233,7 +244,7 @@ impl States {
             let dispatch = server.dispatch.as_ref();
             let p99_ms = dispatch.map_or(f64::NAN, |dispatch| dispatch.p99_ms);
             let over = "CPU per state over a bare router, us";
-            vec![
+            let mut checks = vec![
                 Check::of(named(over), over_us).at_most(OVER_ROUTER_MAX_US),
                 Check::of(named("memory over a bare router, MB"), over_mb)
                     .at_most(OVER_ROUTER_MAX_MB),
@@ -245,14 +256,19 @@ impl States {
                     router.cpu_us_per_state,
                 ),
                 Check::shown(named("CPU per state, us"), server.cpu_us_per_state),
-                Check::shown(
-                    named("CPU per state with certificates, us"),
-                    tls.cpu_us_per_state,
-                ),
                 Check::shown(named("memory of a bare router, MB"), router.memory_peak_mb),
                 Check::shown(named("memory, MB"), server.memory_peak_mb),
-                Check::shown(named("memory with certificates, MB"), tls.memory_peak_mb),
-            ]
+            ];
+            if let Some(tls) = tls {
+                checks.extend([
+                    Check::shown(
+                        named("CPU per state with certificates, us"),
+                        tls.cpu_us_per_state,
+                    ),
+                    Check::shown(named("memory with certificates, MB"), tls.memory_peak_mb),
+                ]);
+            }
+            checks
         };
         self.fleets.iter().flat_map(of_fleet).collect()
     }
@@ -271,12 +287,10 @@ impl States {
         ]);
         for fleet in &self.fleets {
             let router = &fleet.router;
-            let rows = [
-                ("a bare router", router),
-                ("the server", &fleet.server),
-                ("the server, with certificates", &fleet.tls),
-            ];
-            for (process, used) in rows {
+            let tls = fleet.tls.as_ref();
+            let tls = tls.map(|tls| ("the server, with certificates", tls));
+            let rows = [("a bare router", router), ("the server", &fleet.server)];
+            for (process, used) in rows.into_iter().chain(tls) {
                 let over = |value: f64, of: f64| match process {
                     "a bare router" => String::new(),
                     _ => format!("{:.1}", value - of),

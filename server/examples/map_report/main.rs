@@ -5,6 +5,8 @@
 //! 1 if a goal is missed. With `--memory-max-mib 64` most of the map is not in memory, and the goals of
 //! time do not apply.
 
+mod figures;
+
 use std::alloc::System;
 use std::path::Path;
 use std::process::ExitCode;
@@ -39,6 +41,8 @@ use tread_server::http;
 use tread_server::identity::origin::Names;
 use tread_server::supervisor::Supervisor;
 use uuid::Uuid;
+
+use self::figures::{Check, Figure, writeln_out};
 
 #[global_allocator]
 static ALLOCATOR: &StatsAlloc<System> = &INSTRUMENTED_SYSTEM;
@@ -477,48 +481,4 @@ fn main() -> anyhow::Result<ExitCode> {
     } else {
         ExitCode::FAILURE
     })
-}
-
-/// A figure with its goal, and whether it reaches it.
-struct Check {
-    name: &'static str,
-    goal: String,
-    value: f64,
-    holds: bool,
-}
-
-/// A figure before it is held against its limit, so that the two cannot be swapped.
-#[derive(Clone, Copy)]
-struct Figure {
-    name: &'static str,
-    value: f64,
-}
-
-impl Figure {
-    fn of(name: &'static str, value: f64) -> Self {
-        Self { name, value }
-    }
-
-    fn at_most(self, most: f64) -> Check {
-        self.check(format!("<= {most}"), self.value <= most)
-    }
-
-    fn at_least(self, least: f64) -> Check {
-        self.check(format!(">= {least}"), self.value >= least)
-    }
-
-    fn check(self, goal: String, holds: bool) -> Check {
-        let Self { name, value } = self;
-        Check {
-            name,
-            goal,
-            value,
-            holds,
-        }
-    }
-}
-
-fn writeln_out(line: &str) -> std::io::Result<()> {
-    use std::io::Write as _;
-    writeln!(std::io::stdout(), "{line}")
 }
