@@ -33,6 +33,8 @@ const MIB: usize = 1 << 20;
 const LOOK_BYTES_MIN: usize = 64 * MIB;
 /// The same with a memory of 0, which tests have: a few small blocks.
 const LOOK_BYTES_WITHOUT_MEMORY: usize = 16_384;
+/// One look may have so many blocks, however large: with fewer none could go from one to the next.
+const LOOK_BLOCKS_MIN: usize = 4;
 /// One look may take this share of the memory.
 const LOOK_SHARE: usize = 8;
 /// Number of requests that may have blocks read for them at a time, and of robots' missions; each
@@ -362,7 +364,7 @@ impl App {
     ) -> Result<(), AppError> {
         let maps = self.maps();
         let bytes_max = maps.memory.look_bytes_max();
-        if pins.bytes > bytes_max {
+        if pins.bytes > bytes_max && pins.pins.len() >= LOOK_BLOCKS_MIN {
             return Err(AppError::LookTooLarge {
                 mib_max: bytes_max / MIB,
             });
