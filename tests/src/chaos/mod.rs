@@ -131,7 +131,7 @@ async fn run_on(mut fleet: Fleet, relays: Option<Relays>, seed: u64) -> RunRepor
         };
         stage.act(action, &mut followed).await;
     }
-    mend(&fleet, relays.as_ref());
+    mend(&mut fleet, relays.as_ref());
     let details = ended(&mut fleet, &followed).await;
     report.ends = details.iter().map(judge::end_of).collect();
     let memory = robots_memory(&mut fleet, &robot, &details).await;
@@ -155,8 +155,10 @@ struct Relays {
 }
 
 /// Lets everything go on and reach everything.
-fn mend(fleet: &Fleet, relays: Option<&Relays>) {
+fn mend(fleet: &mut Fleet, relays: Option<&Relays>) {
     fleet.mend_servers();
+    fleet.database_networks().for_each(Relay::heal);
+    fleet.robot_networks().for_each(Relay::heal);
     if let Some(relays) = relays {
         relays.robots.heal();
         relays.database.iter().for_each(Relay::heal);
@@ -201,9 +203,7 @@ impl Stage<'_> {
                 self.report.server_kills += 1;
                 self.fail_server();
             }
-            Action::StartServer | Action::HealDatabase if self.relays.is_none() => {
-                self.fleet.mend_servers();
-            }
+            Action::StartServer if self.relays.is_none() => self.fleet.mend_servers(),
             Action::StartServer => {
                 // A server that does not reach its database at its start ends, and its service manager
                 // starts it until it does.
@@ -229,6 +229,10 @@ impl Stage<'_> {
             Action::CutDatabase => {
                 self.report.database_cuts += 1;
                 self.database_network(Relay::cut);
+            }
+            // Another server may work by now.
+            Action::HealDatabase if self.relays.is_none() => {
+                self.fleet.database_networks().for_each(Relay::heal);
             }
             Action::HealDatabase => self.database_network(Relay::heal),
             Action::ResetDatabase => self.database_network(Relay::reset),
@@ -267,14 +271,14 @@ impl Stage<'_> {
     fn database_network(&self, act: impl Fn(&Relay)) {
         match self.relays {
             Some(relays) => relays.database.iter().for_each(act),
-            None => self.fleet.networks().0.for_each(act),
+            None => self.fleet.database_network().into_iter().for_each(act),
         }
     }
 
     fn robots_network(&self, act: impl Fn(&Relay)) {
         match self.relays {
             Some(relays) => act(&relays.robots),
-            None => self.fleet.networks().1.for_each(act),
+            None => self.fleet.robot_networks().for_each(act),
         }
     }
 

@@ -34,6 +34,8 @@ pub(super) struct Network {
     pub(super) database: Relay,
     /// Between robots and the server.
     pub(super) robots: Relay,
+    /// Whether the server is cut off from both, until it is connected again.
+    is_cut_off: bool,
 }
 
 impl Network {
@@ -41,7 +43,18 @@ impl Network {
         Ok(Self {
             database: Relay::start(database).await?,
             robots: Relay::start(zenoh).await?,
+            is_cut_off: false,
         })
+    }
+}
+
+impl Network {
+    /// Ends the time in which the server is cut off, if it is.
+    fn reconnect(&mut self) {
+        if std::mem::take(&mut self.is_cut_off) {
+            self.database.heal();
+            self.robots.heal();
+        }
     }
 }
 
@@ -140,38 +153,50 @@ impl Fleet {
         ready.is_ok_and(|ready| ready.is_some_and(|(status, _)| status.is_success()))
     }
 
-    /// The network between the server and the database, and between robots and each of the servers.
-    pub fn networks(&self) -> (impl Iterator<Item = &Relay>, impl Iterator<Item = &Relay>) {
-        let other = self.other.iter().map(|other| &other.network);
-        let both = self.network.iter().chain(other);
-        let of_server = self.network.iter().map(|network| &network.database);
-        (of_server, both.map(|network| &network.robots))
+    /// The network between the server and the database.
+    pub fn database_network(&self) -> Option<&Relay> {
+        self.network.as_ref().map(|network| &network.database)
     }
 
-    /// Lets both servers go on and reach everything.
-    pub fn mend_servers(&self) {
+    /// The networks between the database and the servers that are not cut off.
+    pub fn database_networks(&self) -> impl Iterator<Item = &Relay> {
+        self.networks_in_use().map(|network| &network.database)
+    }
+
+    /// The networks between robots and the servers that are not cut off.
+    pub fn robot_networks(&self) -> impl Iterator<Item = &Relay> {
+        self.networks_in_use().map(|network| &network.robots)
+    }
+
+    fn networks_in_use(&self) -> impl Iterator<Item = &Network> {
+        let other = self.other.iter().map(|other| &other.network);
+        let both = self.network.iter().chain(other);
+        both.filter(|network| !network.is_cut_off)
+    }
+
+    /// Lets servers go on that were stopped in their tracks, and connects those again that were cut off.
+    pub fn mend_servers(&mut self) {
         self.signal_server(Signal::SIGCONT);
         self.wake_other_server();
-        let other = self.other.iter().map(|other| &other.network);
-        for network in self.network.iter().chain(other) {
-            network.database.heal();
-            network.robots.heal();
+        let other = self.other.iter_mut().map(|other| &mut other.network);
+        for network in self.network.iter_mut().chain(other) {
+            network.reconnect();
         }
     }
 
     /// Cuts the server off from database and robots, without telling anybody.
-    pub fn cut_server_off(&self) {
-        if let Some(network) = &self.network {
+    pub fn cut_server_off(&mut self) {
+        if let Some(network) = &mut self.network {
+            network.is_cut_off = true;
             network.database.cut();
             network.robots.cut();
         }
     }
 
     /// Connects the other server again that was cut off.
-    pub fn reconnect_other_server(&self) {
-        if let Some(Other { network, .. }) = &self.other {
-            network.database.heal();
-            network.robots.heal();
+    pub fn reconnect_other_server(&mut self) {
+        if let Some(other) = &mut self.other {
+            other.network.reconnect();
         }
     }
 
