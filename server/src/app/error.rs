@@ -232,7 +232,7 @@ pub enum AppError {
         "this would need more than {mib_max} MiB of the map at once: ask for less ground, or raise \
          `memory_max_mib` in the server's `[map]`"
     )]
-    LookTooLarge {
+    MapReadTooLarge {
         /// What one request may have, MiB.
         mib_max: usize,
     },
@@ -319,7 +319,7 @@ impl AppError {
             | Self::KeyInFlight
             | Self::KeyReused
             | Self::TooMany { .. }
-            | Self::LookTooLarge { .. }
+            | Self::MapReadTooLarge { .. }
             | Self::Abandoned
             | Self::Unwritable(_)
             | Self::Archive(_)

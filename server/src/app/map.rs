@@ -168,7 +168,7 @@ impl Maps {
         let sums = folded.iter().map(|part| (&part.key, &*part.cells));
         self.unwritten().add(sums, added, now);
         for map in sites.maps.values_mut() {
-            map.set_look(self.memory.looks());
+            map.set_lru_time(self.memory.lru_time());
         }
         sites.add(folded, SiteMap::add_cells);
         self.memory.wake_if_full(&sites);

@@ -59,7 +59,7 @@ pub use self::dependencies::Dependencies;
 use self::enrolment::Membership;
 pub use self::error::AppError;
 use self::events::Hub;
-use self::friction::{CellCounts, LookTurns, MapNews, Pictures, Timelines, Views};
+use self::friction::{CellCounts, MapNews, Pictures, ReaderSlots, Timelines, Views};
 use self::identity::Identity;
 use self::map::Maps;
 pub use self::map::{BlockCounts, UnwrittenCounts, blocks as map_blocks, writing as sums};
@@ -119,7 +119,7 @@ struct Inner {
     run_id: Uuid,
     started_at: Duration,
     normalisations: Vec<Arc<Normalisation>>,
-    look_turns: LookTurns,
+    reader_slots: ReaderSlots,
     cell_counts: CellCounts,
     pictures: Pictures,
     timelines: Timelines,
@@ -192,7 +192,7 @@ impl App {
             run_id,
             started_at,
             normalisations: normalisations.into_iter().map(Arc::new).collect(),
-            look_turns: LookTurns::default(),
+            reader_slots: ReaderSlots::default(),
             cell_counts: CellCounts::default(),
             pictures: Pictures::default(),
             timelines: Timelines::default(),

@@ -166,7 +166,7 @@ impl From<AppError> for Problem {
             AppError::KeyReused => ProblemType::IdempotencyKeyReused,
             AppError::TooMany { .. } => ProblemType::TooMany,
             AppError::Invalid { .. } => ProblemType::InvalidBody,
-            AppError::InvalidQuery { .. } | AppError::LookTooLarge { .. } => {
+            AppError::InvalidQuery { .. } | AppError::MapReadTooLarge { .. } => {
                 ProblemType::InvalidQuery
             }
             AppError::Abandoned => ProblemType::Unavailable,

@@ -13,7 +13,7 @@ use tread_api::site::Cell;
 
 use super::cells::Area;
 use super::drawn::Drawn;
-use super::{App, AppError, Asked, Look, Reading, SiteView, page, terrain_ref};
+use super::{App, AppError, Asked, MapReader, Reading, SiteView, page, terrain_ref};
 use crate::db::sites::SiteRow;
 use crate::friction::Ground;
 use crate::friction::epochs::HOUR_S;
@@ -50,7 +50,7 @@ impl App {
             });
         }
         let (min, max) = area.cells(&grid)?;
-        let looking = move |look: &Look<'_>, [reading]: &[Reading; 1]| {
+        let looking = move |reader: &MapReader<'_>, [reading]: &[Reading; 1]| {
             let drawn = Drawn::new(&view.terrains);
             let (low, high) = (Block::of(min), Block::of(max));
             let rows = low.row..=high.row;
@@ -63,7 +63,7 @@ impl App {
                 let (first, last) = (block.first(), block.last());
                 let rows = first.iy.max(min.iy)..=last.iy.min(max.iy);
                 let columns = first.ix.max(min.ix)..=last.ix.min(max.ix);
-                found.extend(look.cells(&view.row, |map| {
+                found.extend(reader.cells(&view.row, |map| {
                     let cells = rows.clone().flat_map(|iy| {
                         let columns = columns.clone();
                         columns.map(move |ix| Cell { ix, iy })
@@ -100,11 +100,11 @@ impl App {
         let reading = Reading::new(self, &Asked::default())?;
         let view = self.site_view(site).await?;
         let (after, named) = (cursor.map(str::to_owned), within.limit_of(site));
-        let looking = move |look: &Look<'_>| {
-            let (biases, contributions) = look.map(&view.row, |map| {
+        let looking = move |reader: &MapReader<'_>| {
+            let (biases, contributions) = reader.map(&view.row, |map| {
                 (biases(map, &view, &reading), map.contributions())
             });
-            let cells = look.app().inner.cell_counts.of(look, &view.row)?;
+            let cells = reader.app().inner.cell_counts.of(reader, &view.row)?;
             let is_wanted = |found: &Contribution| {
                 let after = after.as_deref();
                 let is_named = named
@@ -124,7 +124,7 @@ impl App {
             });
             Ok::<Vec<_>, AppError>(shown.collect())
         };
-        let found = self.look(looking).await?;
+        let found = self.with_map_reader(looking).await?;
         Ok(page(found, limit, |found: &RobotContribution| {
             found.robot.to_string()
         }))
@@ -150,8 +150,12 @@ impl CellCounts {
     }
 
     /// Returns the number of cells of a site that each robot has measured.
-    fn of(&self, look: &Look<'_>, row: &SiteRow) -> Result<BTreeMap<RobotId, u64>, AppError> {
-        let blocks: Vec<(Block, u64)> = look.map(row, |map| map.changes().blocks().collect());
+    fn of(
+        &self,
+        reader: &MapReader<'_>,
+        row: &SiteRow,
+    ) -> Result<BTreeMap<RobotId, u64>, AppError> {
+        let blocks: Vec<(Block, u64)> = reader.map(row, |map| map.changes().blocks().collect());
         let mut all = BTreeMap::new();
         for (block, newest) in blocks {
             let key = (row.pk, block);
@@ -159,7 +163,7 @@ impl CellCounts {
             let counted = if let Some(known) = known.filter(|known| known.change >= newest) {
                 known
             } else {
-                let counted = look.cells(row, |map| {
+                let counted = reader.cells(row, |map| {
                     let mut cells = BTreeMap::new();
                     map.count_cells(block, &mut cells);
                     let change = map.map().changes().newest_of(block);

@@ -11,8 +11,8 @@ use tread_api::site::{CELL_MAX_M, Cell, Grid};
 use tread_api::terrain::{Terrain, TerrainRef};
 
 use super::drawn::{Drawn, is_here};
-use super::look::smaller;
-use super::{App, AppError, Asked, Look, Reading, SiteView, page, site_row, terrain_ref};
+use super::map_reader::smaller;
+use super::{App, AppError, Asked, MapReader, Reading, SiteView, page, site_row, terrain_ref};
 use crate::friction::Ground;
 use crate::friction::index::{Block, Cells, Group};
 
@@ -20,7 +20,7 @@ use crate::friction::index::{Block, Cells, Group};
 pub const CELLS_MAX: f64 = 4_194_304.0;
 /// Number of cells along a row that are joined into squares at a time.
 const SQUARES_WIDTH_CELLS: i32 = 1_024;
-/// Number of cells that are compared in one look at the map.
+/// Number of cells that are compared in one read of the map.
 const CELLS_AT_ONCE: usize = 4_096;
 
 /// An axis-aligned rectangle in the site frame.
@@ -132,12 +132,12 @@ impl App {
             .unwrap_or(usize::MAX)
             .saturating_add(1);
         let of_site = row.clone();
-        let looking = move |look: &Look<'_>, [reading]: &[Reading; 1]| {
+        let looking = move |reader: &MapReader<'_>, [reading]: &[Reading; 1]| {
             let (mut found, mut after, mut at_once) = (Vec::new(), after, wanted);
             while found.len() < wanted {
                 let rest = wanted - found.len();
                 let some = smaller(&mut at_once, |at_once| {
-                    look.cells(&row, |map| {
+                    reader.cells(&row, |map| {
                         let some = squares(map, factor, bounds, after, at_once.min(rest));
                         let described =
                             |square: CellGroup| (square.0, of_square(map, reading, square, size_m));
@@ -172,8 +172,8 @@ impl App {
         let view = self.site_view(site).await?;
         let cell = view.cell_at(point)?;
         let row = view.row.clone();
-        let looking = move |look: &Look<'_>, [reading]: &[Reading; 1]| {
-            known_at_point(look, &view, reading, (cell, point))
+        let looking = move |reader: &MapReader<'_>, [reading]: &[Reading; 1]| {
+            known_at_point(reader, &view, reading, (cell, point))
         };
         self.read_map(&row, [reading], looking).await
     }
@@ -205,12 +205,12 @@ impl App {
         let wanted = usize::try_from(cells.limit).unwrap_or(usize::MAX);
         let limit = cells.limit;
         let of_site = row.clone();
-        let looking = move |look: &Look<'_>, [early, late]: &[Reading; 2]| {
+        let looking = move |reader: &MapReader<'_>, [early, late]: &[Reading; 2]| {
             let (mut found, mut after) = (Vec::new(), after);
             let mut at_once = CELLS_AT_ONCE;
             while found.len() <= wanted {
                 let (some, last) = smaller(&mut at_once, |at_once| {
-                    look.cells(&row, |map| {
+                    reader.cells(&row, |map| {
                         let cells = map.cells_in(min, max, after).take(at_once);
                         let cells: Vec<Cell> = cells.collect();
                         let measured = cells.iter().copied().filter(|&cell| {
@@ -241,18 +241,18 @@ impl App {
 }
 
 fn known_at_point(
-    look: &Look<'_>,
+    reader: &MapReader<'_>,
     view: &SiteView,
     reading: &Reading,
     (cell, point): (Cell, Point),
 ) -> Result<PointFriction, AppError> {
     let drawn = Drawn::new(&view.terrains);
     let terrain = drawn.at(point);
-    let measured = measured_at_point(look, view, reading, cell, terrain)?;
+    let measured = measured_at_point(reader, view, reading, cell, terrain)?;
     // The prior of the terrain's class is needed only where nothing was measured.
     let models = match terrain {
         Some(terrain) if measured.is_empty() => {
-            let classes = look.app().classes(view, reading);
+            let classes = reader.app().classes(view, reading);
             let models = classes.models(view, reading, terrain).into_iter();
             let expected = models.map(|model| ModelFriction {
                 prior: classes.prior(terrain, model.configuration),
@@ -273,13 +273,13 @@ fn known_at_point(
 
 /// Returns the friction measured in a cell, on the given terrain alone, per robot model.
 pub(super) fn measured_at_point(
-    look: &Look<'_>,
+    reader: &MapReader<'_>,
     view: &SiteView,
     reading: &Reading,
     cell: Cell,
     terrain: Option<&Terrain>,
 ) -> Result<Vec<ModelFriction>, AppError> {
-    look.cells(&view.row, |map| {
+    reader.cells(&view.row, |map| {
         let groups = map.cell(cell, reading.choice()).into_iter();
         let here = groups.filter(|group| is_here(view, group.terrain, terrain));
         let models = same_ground(here).into_iter().map(|group| ModelFriction {

@@ -8,9 +8,9 @@ use tread_api::ids::SiteId;
 use tread_api::site::{Cell, Grid, Site};
 
 use super::cells::{Area, factor, of_square, squares};
-use super::look::smaller;
+use super::map_reader::smaller;
 use super::raster::PictureAsked;
-use super::{App, AppError, Look, MOVED, Reading};
+use super::{App, AppError, MOVED, MapReader, Reading};
 use crate::app::segments::Batch;
 use crate::app::site_row;
 use crate::db;
@@ -154,10 +154,10 @@ impl CellExport {
     /// A chunk cannot be encoded.
     pub async fn next(self) -> Result<Option<(Vec<u8>, Self)>, AppError> {
         let app = self.app.clone();
-        app.look(move |look| self.step(look)).await
+        app.with_map_reader(move |reader| self.step(reader)).await
     }
 
-    fn step(mut self, look: &Look<'_>) -> Result<Option<(Vec<u8>, Self)>, AppError> {
+    fn step(mut self, reader: &MapReader<'_>) -> Result<Option<(Vec<u8>, Self)>, AppError> {
         let bytes = match self.stage {
             Stage::Begin => {
                 self.stage = Stage::Entries;
@@ -167,10 +167,10 @@ impl CellExport {
                 let size_m = self.row.site.grid.cell_m * f64::from(self.factor);
                 // Summed again for each chunk, so that a slow client keeps no sums in memory.
                 let mut reading = self.reading.clone();
-                reading.sum(look.app());
+                reading.sum(reader.app());
                 let mut at_once = self.at_once;
                 let (entries, last) = smaller(&mut at_once, |at_once| {
-                    look.cells(&self.row, |map| {
+                    reader.cells(&self.row, |map| {
                         let found = squares(map, self.factor, self.bounds, self.after, at_once);
                         let last = found.last().map(|(cell, _)| *cell);
                         let found = found.into_iter();
@@ -180,7 +180,7 @@ impl CellExport {
                     })
                 })?;
                 self.at_once = at_once;
-                let stamp = look.map(&self.row, SiteMap::stamp);
+                let stamp = reader.map(&self.row, SiteMap::stamp);
                 if self.reading.as_of.is_some() && stamp != self.stamp {
                     return Err(AppError::Unwritable(MOVED.to_owned()));
                 }

@@ -11,7 +11,7 @@ use tread_api::ids::{SiteId, TerrainId};
 use super::cells::measured_at_point;
 use super::drawn::Drawn;
 use super::timelines::MEASUREMENTS_MAX;
-use super::{App, AppError, Asked, Look, MOVED, READS_MAX, Reading, SiteView, terrain_ref};
+use super::{App, AppError, Asked, MOVED, MapReader, READS_MAX, Reading, SiteView, terrain_ref};
 use crate::friction::Epoch;
 use crate::friction::index::{SiteMap, Timeline};
 
@@ -90,8 +90,8 @@ impl App {
         let view = self.site_view(site).await?;
         let terrain = view.find(site, id)?.clone();
         let of_terrain = terrain_ref(&terrain);
-        let known = move |look: &Look<'_>, view: &SiteView, reading: &Reading| {
-            Ok(look.app().measured_models(view, reading, &terrain))
+        let known = move |reader: &MapReader<'_>, view: &SiteView, reading: &Reading| {
+            Ok(reader.app().measured_models(view, reading, &terrain))
         };
         let items = self.known_at(&view, reading, times, known).await?;
         Ok(TerrainHistory {
@@ -115,8 +115,8 @@ impl App {
         let cell = view.cell_at(point)?;
         let terrain = Drawn::new(&view.terrains).at(point).cloned();
         let of_terrain = terrain.as_ref().map(terrain_ref);
-        let known = move |look: &Look<'_>, view: &SiteView, reading: &Reading| {
-            measured_at_point(look, view, reading, cell, terrain.as_ref())
+        let known = move |reader: &MapReader<'_>, view: &SiteView, reading: &Reading| {
+            measured_at_point(reader, view, reading, cell, terrain.as_ref())
         };
         let items = self.known_at(&view, reading, times, known).await?;
         Ok(PointHistory {
@@ -132,7 +132,7 @@ impl App {
         view: &Arc<SiteView>,
         reading: Reading,
         times: Checked,
-        models: impl Fn(&Look<'_>, &SiteView, &Reading) -> Result<Vec<ModelFriction>, AppError>
+        models: impl Fn(&MapReader<'_>, &SiteView, &Reading) -> Result<Vec<ModelFriction>, AppError>
         + Send
         + Sync
         + 'static,
@@ -142,12 +142,12 @@ impl App {
             let stamp = self.maps().look(&view.row, SiteMap::stamp);
             let timelines = self.timelines_of(view, &shared.1).await?;
             let (view_then, shared) = (Arc::clone(view), Arc::clone(&shared));
-            let looking = move |look: &Look<'_>| {
+            let looking = move |reader: &MapReader<'_>| {
                 let (reading, times, models) = &*shared;
-                let models = |reading: &Reading| models(look, &view_then, reading);
-                known_at(look, &view_then, reading, times, &timelines, models)
+                let models = |reading: &Reading| models(reader, &view_then, reading);
+                known_at(reader, &view_then, reading, times, &timelines, models)
             };
-            let known = self.look(looking).await?;
+            let known = self.with_map_reader(looking).await?;
             if self.maps().look(&view.row, SiteMap::stamp) == stamp {
                 return Ok(known);
             }
@@ -185,7 +185,7 @@ impl App {
 
 /// Returns what is known at each time, the oldest first.
 fn known_at(
-    look: &Look<'_>,
+    reader: &MapReader<'_>,
     view: &SiteView,
     reading: &Reading,
     times: &Checked,
@@ -202,7 +202,7 @@ fn known_at(
                 models: models(reading)?,
             });
         }
-        let epoch = look.map(&view.row, |map| map.epoch_at(at));
+        let epoch = reader.map(&view.row, |map| map.epoch_at(at));
         then.move_to(at, epoch, timelines.get(&epoch).cloned());
         then.advance_sum();
         Ok(FrictionAt {

@@ -1,6 +1,6 @@
-//! Looks at the map on a blocking thread, so that computing under the map's lock does not block other
-//! requests. Blocks of cells that a look needs and that are not in memory are read first, without
-//! a turn to compute.
+//! Reads the map on a blocking thread, so that computing under the map's lock does not block other
+//! requests. Blocks of cells that are needed and not in memory are loaded from the database first,
+//! without a turn to compute.
 
 use std::cell::RefCell;
 use std::sync::Arc;
@@ -19,48 +19,48 @@ use crate::friction::index::{Absent, Cells, SiteMap};
 const COMPUTING_MAX: usize = 4;
 /// Maximum number of requests that compute or wait for blocks, and of robots' missions. Each has a
 /// thread, so both together are far fewer than the runtime has.
-const LOOKING_MAX: usize = 64;
+const READERS_MAX: usize = 64;
 
-/// Turns to look at the maps.
+/// Limits of the number of map readers.
 #[derive(Debug)]
-pub(in crate::app) struct LookTurns {
+pub(in crate::app) struct ReaderSlots {
     computing: Arc<Semaphore>,
     requests: Arc<Semaphore>,
     robots: Arc<Semaphore>,
 }
 
-impl Default for LookTurns {
+impl Default for ReaderSlots {
     fn default() -> Self {
         Self {
             computing: Arc::new(Semaphore::new(COMPUTING_MAX)),
-            requests: Arc::new(Semaphore::new(LOOKING_MAX)),
-            robots: Arc::new(Semaphore::new(LOOKING_MAX)),
+            requests: Arc::new(Semaphore::new(READERS_MAX)),
+            robots: Arc::new(Semaphore::new(READERS_MAX)),
         }
     }
 }
 
-impl LookTurns {
+impl ReaderSlots {
     /// Waits for a turn to compute. `None` cannot occur, since the semaphore is never closed.
     async fn computing(&self) -> Option<OwnedSemaphorePermit> {
         Arc::clone(&self.computing).acquire_owned().await.ok()
     }
 
-    /// Waits for a place for a request or a robot's mission, as [`Self::computing`].
-    async fn place(&self, is_for_robot: bool) -> Option<OwnedSemaphorePermit> {
-        let places = if is_for_robot {
+    /// Waits for a slot for a request or a robot's mission, as [`Self::computing`].
+    async fn slot(&self, is_for_robot: bool) -> Option<OwnedSemaphorePermit> {
+        let slots = if is_for_robot {
             &self.robots
         } else {
             &self.requests
         };
-        Arc::clone(places).acquire_owned().await.ok()
+        Arc::clone(slots).acquire_owned().await.ok()
     }
 }
 
-/// A turn to compute with the map, on a blocking thread.
-pub(in crate::app) struct Look<'app> {
+/// Reads maps on a blocking thread.
+pub(in crate::app) struct MapReader<'app> {
     app: &'app App,
     runtime: Handle,
-    /// The turn; `None` while blocks are read.
+    /// The turn to compute; `None` while blocks are loaded.
     turn: RefCell<Option<OwnedSemaphorePermit>>,
     /// Whether the map is read for a robot's mission, which waits for no request.
     is_for_robot: bool,
@@ -68,30 +68,30 @@ pub(in crate::app) struct Look<'app> {
     abandoned: CancellationToken,
 }
 
-impl<'app> Look<'app> {
+impl<'app> MapReader<'app> {
     /// Returns the use cases.
     pub(in crate::app) fn app(&self) -> &'app App {
         self.app
     }
 
-    /// Looks at a site's map without its cells.
-    pub(super) fn map<T>(&self, row: &SiteRow, look: impl FnOnce(&SiteMap) -> T) -> T {
-        self.app.maps().look(row, look)
+    /// Reads a site's map without its cells.
+    pub(super) fn map<T>(&self, row: &SiteRow, read: impl FnOnce(&SiteMap) -> T) -> T {
+        self.app.maps().look(row, read)
     }
 
-    /// Looks at the cells of a site's map. `look` is called again after blocks were read that it
+    /// Reads the cells of a site's map. `read` is called again after blocks were loaded that it
     /// needed, so it must not change anything.
     ///
     /// # Errors
-    /// The database failed; [`AppError::LookTooLarge`] if it needs too much at once;
+    /// The database failed; [`AppError::MapReadTooLarge`] if it needs too much at once;
     /// [`AppError::Abandoned`] if nobody waits for the answer.
     pub(super) fn cells<T>(
         &self,
         row: &SiteRow,
-        look: impl Fn(Cells<'_>) -> T,
+        read: impl Fn(Cells<'_>) -> T,
     ) -> Result<T, AppError> {
         let mut pins = Pins::default();
-        let found = self.cells_with(row, look, &mut pins);
+        let found = self.cells_with(row, read, &mut pins);
         if !pins.is_empty() {
             drop(pins);
             self.app.maps().evict();
@@ -102,13 +102,13 @@ impl<'app> Look<'app> {
     fn cells_with<T>(
         &self,
         row: &SiteRow,
-        look: impl Fn(Cells<'_>) -> T,
+        read: impl Fn(Cells<'_>) -> T,
         pins: &mut Pins,
     ) -> Result<T, AppError> {
-        let mut reader = None;
+        let mut turn = None;
         loop {
             let absent = Absent::default();
-            let answer = self.app.maps().read_cells(row, &absent, &look);
+            let answer = self.app.maps().read_cells(row, &absent, &read);
             let absent = absent.into_blocks();
             if absent.is_empty() {
                 return Ok(answer);
@@ -118,39 +118,39 @@ impl<'app> Look<'app> {
             }
             // Others compute meanwhile.
             drop(self.turn.take());
-            let reading = async {
-                if reader.is_none() {
-                    reader = self.app.maps().reader(self.is_for_robot).await;
+            let loading = async {
+                if turn.is_none() {
+                    turn = self.app.maps().load_turn(self.is_for_robot).await;
                 }
-                let read = self.app.read_blocks(row, &absent, pins).await;
-                (read, self.app.look_turns().computing().await)
+                let loaded = self.app.load_blocks(row, &absent, pins).await;
+                (loaded, self.app.reader_slots().computing().await)
             };
-            let (read, turn) = self.runtime.block_on(reading);
-            *self.turn.borrow_mut() = turn;
-            read?;
+            let (loaded, computing) = self.runtime.block_on(loading);
+            *self.turn.borrow_mut() = computing;
+            loaded?;
         }
     }
 }
 
 impl App {
-    fn look_turns(&self) -> &LookTurns {
-        &self.inner.look_turns
+    fn reader_slots(&self) -> &ReaderSlots {
+        &self.inner.reader_slots
     }
 
     /// Runs work on the map on a blocking thread.
-    pub(in crate::app) async fn look<T: Send + 'static>(
+    pub(in crate::app) async fn with_map_reader<T: Send + 'static>(
         &self,
-        work: impl FnOnce(&Look<'_>) -> T + Send + 'static,
+        work: impl FnOnce(&MapReader<'_>) -> T + Send + 'static,
     ) -> T {
-        self.look_for(false, work).await
+        self.run_map_reader(false, work).await
     }
 
     /// Runs work on the map for a robot's mission on a blocking thread.
-    pub(super) async fn look_for_robot<T: Send + 'static>(
+    pub(super) async fn with_map_reader_for_robot<T: Send + 'static>(
         &self,
-        work: impl FnOnce(&Look<'_>) -> T + Send + 'static,
+        work: impl FnOnce(&MapReader<'_>) -> T + Send + 'static,
     ) -> T {
-        self.look_for(true, work).await
+        self.run_map_reader(true, work).await
     }
 
     /// Runs work beside the map on a blocking thread, which waits for no blocks.
@@ -158,7 +158,7 @@ impl App {
         &self,
         work: impl FnOnce() -> T + Send + 'static,
     ) -> T {
-        let turn = self.look_turns().computing().await;
+        let turn = self.reader_slots().computing().await;
         let computing = move || {
             let done = work();
             drop(turn);
@@ -167,30 +167,30 @@ impl App {
         done(tokio::task::spawn_blocking(computing).await).await
     }
 
-    async fn look_for<T: Send + 'static>(
+    async fn run_map_reader<T: Send + 'static>(
         &self,
         is_for_robot: bool,
-        work: impl FnOnce(&Look<'_>) -> T + Send + 'static,
+        work: impl FnOnce(&MapReader<'_>) -> T + Send + 'static,
     ) -> T {
-        let turns = self.look_turns();
-        let place = turns.place(is_for_robot).await;
-        let turn = turns.computing().await;
+        let slots = self.reader_slots();
+        let slot = slots.slot(is_for_robot).await;
+        let turn = slots.computing().await;
         let abandoned = CancellationToken::new();
         let _waiting = abandoned.clone().drop_guard();
         let (app, runtime) = (self.clone(), Handle::current());
-        let looking = move || {
-            let look = Look {
+        let reading = move || {
+            let reader = MapReader {
                 app: &app,
                 runtime,
                 turn: RefCell::new(turn),
                 is_for_robot,
                 abandoned,
             };
-            let done = work(&look);
-            drop(place);
+            let done = work(&reader);
+            drop(slot);
             done
         };
-        done(tokio::task::spawn_blocking(looking).await).await
+        done(tokio::task::spawn_blocking(reading).await).await
     }
 }
 
@@ -206,14 +206,14 @@ async fn done<T>(ended: Result<T, JoinError>) -> T {
     }
 }
 
-/// Looks at fewer things at once as long as they need too much memory.
+/// Reads fewer things at once as long as they need too much memory.
 pub(super) fn smaller<T>(
     at_once: &mut usize,
-    look: impl Fn(usize) -> Result<T, AppError>,
+    read: impl Fn(usize) -> Result<T, AppError>,
 ) -> Result<T, AppError> {
     loop {
-        match look(*at_once) {
-            Err(AppError::LookTooLarge { .. }) if *at_once > 1 => *at_once = at_once.div_ceil(8),
+        match read(*at_once) {
+            Err(AppError::MapReadTooLarge { .. }) if *at_once > 1 => *at_once = at_once.div_ceil(8),
             found => return found,
         }
     }
@@ -223,14 +223,14 @@ pub(super) fn smaller<T>(
 pub(super) fn in_parts<P, T>(
     places: &[P],
     mut at_once: usize,
-    look: impl Fn(&[P]) -> Result<Vec<T>, AppError>,
+    read: impl Fn(&[P]) -> Result<Vec<T>, AppError>,
 ) -> Result<Vec<T>, AppError> {
     let mut found = Vec::with_capacity(places.len());
     let mut rest = places;
     while !rest.is_empty() {
         let some = smaller(&mut at_once, |at_once| {
             let some = rest.get(..at_once).unwrap_or(rest);
-            Ok((some.len(), look(some)?))
+            Ok((some.len(), read(some)?))
         });
         let (count, some) = some?;
         found.extend(some);

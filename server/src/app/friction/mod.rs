@@ -6,7 +6,7 @@ mod drawn;
 mod export;
 mod history;
 pub mod live;
-mod look;
+mod map_reader;
 mod path;
 mod path_prior;
 mod pictures;
@@ -32,8 +32,8 @@ pub use self::cells::{Area, CELLS_MAX, CellsAsked};
 pub use self::export::{CellExport, SegmentExport};
 pub use self::history::Times;
 pub(super) use self::live::MapNews;
-use self::look::Look;
-pub(super) use self::look::LookTurns;
+use self::map_reader::MapReader;
+pub(super) use self::map_reader::ReaderSlots;
 pub use self::pictures::Picture;
 pub(super) use self::pictures::Pictures;
 use self::prior::Classes;
@@ -118,7 +118,7 @@ impl App {
         &self,
         row: &SiteRow,
         readings: [Reading; N],
-        work: impl Fn(&Look<'_>, &[Reading; N]) -> Result<T, AppError> + Send + Sync + 'static,
+        work: impl Fn(&MapReader<'_>, &[Reading; N]) -> Result<T, AppError> + Send + Sync + 'static,
     ) -> Result<T, AppError> {
         let is_past = readings.iter().any(|reading| reading.as_of.is_some());
         let work = Arc::new(work);
@@ -129,13 +129,13 @@ impl App {
                 reading.of_site(self, row).await?;
             }
             let work = Arc::clone(&work);
-            let looking = move |look: &Look<'_>| {
+            let looking = move |reader: &MapReader<'_>| {
                 for reading in &mut readings {
-                    reading.sum(look.app());
+                    reading.sum(reader.app());
                 }
-                work(look, &readings)
+                work(reader, &readings)
             };
-            let answer = self.look(looking).await?;
+            let answer = self.with_map_reader(looking).await?;
             if !is_past || self.maps().look(row, SiteMap::stamp) == stamp {
                 return Ok(answer);
             }
@@ -155,8 +155,8 @@ impl App {
         let view = self.site_view(site).await?;
         let row = view.row.clone();
         let cursor = cursor.map(str::to_owned);
-        let listing = move |look: &Look<'_>, [reading]: &[Reading; 1]| {
-            let classes = look.app().classes(&view, reading);
+        let listing = move |reader: &MapReader<'_>, [reading]: &[Reading; 1]| {
+            let classes = reader.app().classes(&view, reading);
             let wanted = |terrain: &&Terrain| {
                 cursor
                     .as_deref()
@@ -187,8 +187,8 @@ impl App {
         let view = self.site_view(site).await?;
         let terrain = view.find(site, id)?.clone();
         let row = view.row.clone();
-        let looking = move |look: &Look<'_>, [reading]: &[Reading; 1]| {
-            let classes = look.app().classes(&view, reading);
+        let looking = move |reader: &MapReader<'_>, [reading]: &[Reading; 1]| {
+            let classes = reader.app().classes(&view, reading);
             let models = classes.models(&view, reading, &terrain);
             Ok(terrain_friction(&terrain, models, reading.as_of))
         };
@@ -257,10 +257,10 @@ impl App {
         for site in self.all_sites().await? {
             let view = self.site_view(&site).await?;
             let reading = reading.clone();
-            let looking = move |look: &Look<'_>| {
+            let looking = move |reader: &MapReader<'_>| {
                 let mut known = Vec::new();
                 for terrain in &view.terrains {
-                    let models = look.app().measured_models(&view, &reading, terrain);
+                    let models = reader.app().measured_models(&view, &reading, terrain);
                     let models = models.into_iter();
                     known.extend(models.filter_map(|model| {
                         let friction = model.friction?;
@@ -276,7 +276,7 @@ impl App {
                 }
                 known
             };
-            let known = self.look(looking).await;
+            let known = self.with_map_reader(looking).await;
             let room = limit - found.len();
             left_out += known.len().saturating_sub(room);
             found.extend(known.into_iter().take(room));

@@ -13,8 +13,8 @@ use tread_api::site::{Cell, Grid};
 use tread_control::robot::RobotModel as PlannedModel;
 
 use super::drawn::{Drawn, Near};
-use super::look::in_parts;
-use super::{App, AppError, Asked, Look, Reading, SiteView};
+use super::map_reader::in_parts;
+use super::{App, AppError, Asked, MapReader, Reading, SiteView};
 use crate::friction::index::{Cells, CompiledFilter, Room};
 use crate::friction::traction_limit;
 
@@ -27,7 +27,7 @@ const PIECES_MAX: usize = 100_000;
 /// Relative standard deviation of θ (σ/θ) above which a place counts as unmeasured; the same as the
 /// estimator's.
 const DEVIATION_RATIO_MAX: f64 = 0.5;
-/// Number of places along a path that are read in one look at the map.
+/// Number of places along a path that are read in one read of the map.
 pub(super) const PLACES_AT_ONCE: usize = 1_024;
 
 impl App {
@@ -58,13 +58,13 @@ impl App {
         let length_m = checked_length(&points)?;
         let cut = cut(&points, &view.row.site.grid)?;
         let row = view.row.clone();
-        let looking = move |look: &Look<'_>, [reading]: &[Reading; 1]| {
+        let looking = move |reader: &MapReader<'_>, [reading]: &[Reading; 1]| {
             let drawn = Drawn::new(&view.terrains);
             let near = drawn_near(&drawn, &cut);
             let mut pieces: Vec<PathPiece> = in_parts(&cut, PLACES_AT_ONCE, |some| {
-                look.cells(&view.row, |map| {
-                    let mut reader = CellReader::new(map, (&view, &drawn, &near), reading);
-                    let piece = |cut: &Cut| described(cut, reader.known_at(cut).as_ref());
+                reader.cells(&view.row, |map| {
+                    let mut cells = CellReader::new(map, (&view, &drawn, &near), reading);
+                    let piece = |cut: &Cut| described(cut, cells.known_at(cut).as_ref());
                     some.iter().map(piece).collect()
                 })
             })?;

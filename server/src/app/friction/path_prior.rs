@@ -10,12 +10,12 @@ use tread_api::trajectory::{Trajectory, Waypoint};
 use tread_api::wire::command::{CellPrior, CellTractionLimit, PRIOR_CELLS_MAX, PathPrior};
 
 use super::drawn::Drawn;
-use super::look::in_parts;
+use super::map_reader::in_parts;
 use super::path::{
     CellReader, Cut, PLACES_AT_ONCE, checked_length, cut, drawn_near, is_measured,
     traction_limit_mu,
 };
-use super::{App, AppError, Asked, Look, Reading, SiteView};
+use super::{App, AppError, Asked, MapReader, Reading, SiteView};
 
 /// Number of sides of the polygon by which a circle is approximated.
 const CIRCLE_CORNERS: u32 = 256;
@@ -51,8 +51,8 @@ impl App {
         else {
             return Ok(None);
         };
-        let looking = move |look: &Look<'_>| prior_of(look, &view, &reading, &cut);
-        self.look_for_robot(looking).await
+        let looking = move |reader: &MapReader<'_>| prior_of(reader, &view, &reading, &cut);
+        self.with_map_reader_for_robot(looking).await
     }
 }
 
@@ -67,7 +67,7 @@ struct KnownPlace {
 
 /// Returns the prior of the ground along a path.
 fn prior_of(
-    look: &Look<'_>,
+    reader: &MapReader<'_>,
     view: &SiteView,
     reading: &Reading,
     cut: &[Cut],
@@ -79,11 +79,11 @@ fn prior_of(
     };
     let around = drawn_near(&drawn, &places);
     let known: Vec<KnownPlace> = in_parts(&places, PLACES_AT_ONCE, |some| {
-        look.cells(&view.row, |map| {
-            let mut reader = CellReader::new(map, (view, &drawn, &around), reading);
+        reader.cells(&view.row, |map| {
+            let mut cells = CellReader::new(map, (view, &drawn, &around), reading);
             let known = some.iter().map(|place| KnownPlace {
                 ground: around.ground_at(place.middle),
-                known: reader.known_at(place),
+                known: cells.known_at(place),
                 has_one_ground: map.cell(place.cell, reading.choice()).len() == 1,
             });
             known.collect()
@@ -135,7 +135,7 @@ fn prior_of(
     let prior = PathPrior {
         grid_revision: view.row.site.grid.revision,
         traction_limit_mu: traction_limit_least_mu,
-        robot_bias_ratio: look.app().friction_config().robot_bias_ratio,
+        robot_bias_ratio: reader.app().friction_config().robot_bias_ratio,
         cells,
         traction_limits,
     };

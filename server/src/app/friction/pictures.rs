@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use tread_api::ids::SiteId;
 
 use super::raster::{Blocks, PictureAsked, raster};
-use super::{App, AppError, Look, Reading};
+use super::{App, AppError, MapReader, Reading};
 use crate::db::sites::SiteRow;
 use crate::friction::Raster;
 use crate::friction::index::{Block, Stamp};
@@ -112,15 +112,15 @@ impl App {
         let reading = Reading::new(self, &asked.asked)?;
         let view = self.site_view(site).await?;
         let row = view.row.clone();
-        let drawing = move |look: &Look<'_>, [reading]: &[Reading; 1]| {
-            let app = look.app();
+        let drawing = move |reader: &MapReader<'_>, [reading]: &[Reading; 1]| {
+            let app = reader.app();
             let key = format!("{}/{format}/{asked:?}", view.row.pk);
             // Read before the squares are made, so that a change meanwhile makes the picture stale.
             let state = app.state_of(&view.row, reading, &asked);
             if let Some(picture) = app.pictures().find(&key, state) {
                 return Ok(picture);
             }
-            let mut raster = raster(look, &view, reading, &asked)?;
+            let mut raster = raster(reader, &view, reading, &asked)?;
             let bytes: Arc<[u8]> = write(&raster)?.into();
             raster.squares = Vec::new();
             let of = Arc::new(raster);

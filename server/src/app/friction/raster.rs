@@ -13,8 +13,8 @@ use tread_api::site::{Cell, Grid};
 
 use super::cells::{Area, factor};
 use super::drawn::Drawn;
-use super::look::in_parts;
-use super::{AppError, Asked, Look, Reading, SiteView};
+use super::map_reader::in_parts;
+use super::{AppError, Asked, MapReader, Reading, SiteView};
 use crate::friction::Raster;
 use crate::friction::index::{Block, CELLS_PER_BLOCK, CellSummary, Cells, CompiledFilter, Room};
 
@@ -23,7 +23,7 @@ pub const SQUARES_MAX: u64 = 1 << 20;
 /// Maximum number of cached blocks, of all sites and models; 72 KiB each.
 const BLOCKS_MAX: usize = 1_024;
 /// Number of cells along a row of squares of several cells for which the map's lock is held at a time.
-const LOOK_CELLS: i32 = 2_048;
+const CELLS_PER_READ: i32 = 2_048;
 
 /// The content of a requested picture.
 #[derive(Debug, Clone, Default)]
@@ -114,8 +114,12 @@ impl Frame<'_> {
             .collect()
     }
 
-    fn block(&self, look: &Look<'_>, block: Block) -> Result<Arc<Vec<CellSummary>>, AppError> {
-        let (app, row, reading) = (look.app(), &self.view.row, self.reading);
+    fn block(
+        &self,
+        reader: &MapReader<'_>,
+        block: Block,
+    ) -> Result<Arc<Vec<CellSummary>>, AppError> {
+        let (app, row, reading) = (reader.app(), &self.view.row, self.reading);
         // Blocks as of a past time are not cached.
         let key = reading.as_of.is_none().then(|| BlockKey {
             site_pk: row.pk,
@@ -131,7 +135,7 @@ impl Frame<'_> {
             None => self.grounds(block),
         };
         let of_now = found.filter(|kept| kept.now_us == reading.now_us);
-        let (change, squares) = look.cells(row, |map| {
+        let (change, squares) = reader.cells(row, |map| {
             let newest = map.map().changes().newest_of(block);
             let (mut squares, places) = match &of_now {
                 Some(kept) if kept.change == newest => return (newest, Arc::clone(&kept.squares)),
@@ -169,7 +173,7 @@ impl Frame<'_> {
     /// Returns the squares of a box of single cells, row by row.
     fn cells(
         &self,
-        look: &Look<'_>,
+        reader: &MapReader<'_>,
         (min, max): (Cell, Cell),
     ) -> Result<Vec<CellSummary>, AppError> {
         let columns = usize::try_from(max.ix - min.ix + 1).unwrap_or_default();
@@ -179,7 +183,7 @@ impl Frame<'_> {
         for row in low.row..=high.row {
             for column in low.column..=high.column {
                 let block = Block { row, column };
-                let kept = self.block(look, block)?;
+                let kept = self.block(reader, block)?;
                 let (first, last) = (block.first(), block.last());
                 let (from_ix, to_ix) = (first.ix.max(min.ix), last.ix.min(max.ix));
                 for iy in first.iy.max(min.iy)..=last.iy.min(max.iy) {
@@ -198,7 +202,7 @@ impl Frame<'_> {
     /// cached.
     fn merged(
         &self,
-        look: &Look<'_>,
+        reader: &MapReader<'_>,
         (min, max): (Cell, Cell),
         factor: i32,
     ) -> Result<Vec<CellSummary>, AppError> {
@@ -212,12 +216,12 @@ impl Frame<'_> {
             .near(coarse.center_of(min), coarse.center_of(max));
         let mut squares = Vec::new();
         let columns: Vec<i32> = (min.ix..=max.ix).collect();
-        let at_once = usize::try_from(LOOK_CELLS / factor)
+        let at_once = usize::try_from(CELLS_PER_READ / factor)
             .unwrap_or_default()
             .max(1);
         for iy in min.iy..=max.iy {
             squares.extend(in_parts(&columns, at_once, |some| {
-                look.cells(&self.view.row, |map| {
+                reader.cells(&self.view.row, |map| {
                     let filter = self.filter(map);
                     let mut room = Room::default();
                     let square = |&ix: &i32| {
@@ -243,14 +247,14 @@ impl Frame<'_> {
 
 /// Returns the map of a site as squares.
 pub(super) fn raster(
-    look: &Look<'_>,
+    reader: &MapReader<'_>,
     view: &SiteView,
     reading: &Reading,
     picture: &PictureAsked,
 ) -> Result<Raster, AppError> {
     let grid = view.row.site.grid;
     let reference = reading.reference();
-    let (extent, configuration) = look.map(&view.row, |map| {
+    let (extent, configuration) = reader.map(&view.row, |map| {
         let first = || map.configurations().first().copied();
         (map.extent(), reference.or_else(first))
     });
@@ -323,9 +327,9 @@ pub(super) fn raster(
                 configuration,
             };
             if factor == 1 {
-                frame.cells(look, (min, max))?
+                frame.cells(reader, (min, max))?
             } else {
-                frame.merged(look, (min, max), factor)?
+                frame.merged(reader, (min, max), factor)?
             }
         }
     };

@@ -1,5 +1,5 @@
-//! Reads blocks of cells into memory when a look at the map needs them, and takes those out of it
-//! that were not used for longest when all together need too much.
+//! Loads blocks of cells into memory when a reader of the map needs them, and evicts the least recently
+//! used ones when all together need too much.
 //!
 //! ```text
 //! stored sums ──snapshot──► cells of a block ──with the unwritten sums──► map ──► evicted
@@ -29,17 +29,17 @@ use crate::friction::index::{Absent, Block, BlockBuilder, BlockCells, Cells, Pin
 
 /// Bytes of a MiB.
 const MIB: usize = 1 << 20;
-/// Minimum of the memory that one look may take.
-const LOOK_BYTES_MIN: usize = 64 * MIB;
+/// Minimum of the memory that one read may take.
+const READ_BYTES_MIN: usize = 64 * MIB;
 /// The same with a memory of 0, which tests have: a few small blocks.
-const LOOK_BYTES_WITHOUT_MEMORY: usize = 16_384;
-/// One look may have so many blocks, however large: with fewer none could go from one to the next.
-const LOOK_BLOCKS_MIN: usize = 4;
-/// One look may take this share of the memory.
-const LOOK_SHARE: usize = 8;
-/// Number of requests that may have blocks read for them at a time, and of robots' missions; each
+const READ_BYTES_WITHOUT_MEMORY: usize = 16_384;
+/// One read may have so many blocks, however large: with fewer none could go from one to the next.
+const READ_BLOCKS_MIN: usize = 4;
+/// One read may take this share of the memory.
+const READ_SHARE: usize = 8;
+/// Number of requests that may have blocks loaded for them at a time, and of robots' missions; each
 /// uses a connection to the database, one block after another.
-const READERS_MAX: usize = 2;
+const LOADS_MAX: usize = 2;
 /// Maximum number of blocks that are read in one snapshot.
 const BLOCKS_AT_ONCE: usize = 16;
 /// Number of sums after which a snapshot reads no further block.
@@ -55,10 +55,10 @@ const EVICTED_AT_ONCE: usize = 256;
 #[derive(Debug)]
 pub(super) struct BlockMemory {
     limit_bytes: usize,
-    /// Number of looks so far.
-    looks: AtomicU64,
-    readers: Semaphore,
-    readers_for_robots: Semaphore,
+    /// Number of reads of maps so far, the clock of their last uses.
+    lru_clock: AtomicU64,
+    load_turns: Semaphore,
+    load_turns_of_robots: Semaphore,
     /// Blocks take more than the limit.
     full: Notify,
     read: AtomicU64,
@@ -109,20 +109,20 @@ impl BlockMemory {
         let limit_mib = usize::try_from(limit_mib).unwrap_or(usize::MAX);
         Self {
             limit_bytes: limit_mib.saturating_mul(MIB),
-            looks: AtomicU64::new(0),
-            readers: Semaphore::new(READERS_MAX),
-            readers_for_robots: Semaphore::new(READERS_MAX),
+            lru_clock: AtomicU64::new(0),
+            load_turns: Semaphore::new(LOADS_MAX),
+            load_turns_of_robots: Semaphore::new(LOADS_MAX),
             full: Notify::new(),
             read: AtomicU64::new(0),
             evicted: AtomicU64::new(0),
         }
     }
 
-    /// Returns how many bytes of blocks one look may need.
-    fn look_bytes_max(&self) -> usize {
-        match self.limit_bytes / LOOK_SHARE {
-            0 => LOOK_BYTES_WITHOUT_MEMORY,
-            share => share.max(LOOK_BYTES_MIN),
+    /// Returns how many bytes of blocks one read may need.
+    fn read_bytes_max(&self) -> usize {
+        match self.limit_bytes / READ_SHARE {
+            0 => READ_BYTES_WITHOUT_MEMORY,
+            share => share.max(READ_BYTES_MIN),
         }
     }
 
@@ -134,13 +134,13 @@ impl BlockMemory {
         }
     }
 
-    /// Returns the number of looks so far.
-    pub(super) fn looks(&self) -> u64 {
-        self.looks.load(Ordering::Relaxed)
+    /// Returns the time on the clock of last uses.
+    pub(super) fn lru_time(&self) -> u64 {
+        self.lru_clock.load(Ordering::Relaxed)
     }
 
-    fn next_look(&self) -> u64 {
-        self.looks.fetch_add(1, Ordering::Relaxed)
+    fn tick(&self) -> u64 {
+        self.lru_clock.fetch_add(1, Ordering::Relaxed)
     }
 
     /// Wakes the task that evicts blocks if they take too much.
@@ -150,16 +150,16 @@ impl BlockMemory {
         }
     }
 
-    /// Returns the blocks to evict, those first that were not used for longest, and as many that it
-    /// is done rarely; none if all fit.
-    fn surplus(&self, sites: &Sites) -> Vec<(i64, Block)> {
+    /// Returns the blocks to evict, the least recently used first, and so many that it is done rarely;
+    /// none if all fit.
+    fn eviction_candidates(&self, sites: &Sites) -> Vec<(i64, Block)> {
         let bytes = sites.bytes();
         if bytes <= self.limit_bytes {
             return Vec::new();
         }
         let of_map = |(&pk, map): (&i64, &SiteMap)| {
             let idle = map.idle_blocks();
-            let idle = idle.map(|(look, block, bytes)| (look, pk, block, bytes));
+            let idle = idle.map(|(used, block, bytes)| (used, pk, block, bytes));
             idle.collect::<Vec<_>>()
         };
         let mut idle: Vec<_> = sites.maps.iter().flat_map(of_map).collect();
@@ -187,8 +187,8 @@ impl BlockMemory {
 
     /// Evicts blocks of maps that nobody else has yet.
     pub(super) fn evict(&self, sites: &mut Sites) {
-        let surplus = self.surplus(sites);
-        self.take(sites, &surplus);
+        let candidates = self.eviction_candidates(sites);
+        self.take(sites, &candidates);
     }
 }
 
@@ -238,25 +238,25 @@ impl Drop for Reading<'_> {
 }
 
 impl Maps {
-    /// Looks at the cells of a site's map; blocks that were absent are noted in `absent`, and then
-    /// what `look` returned is to be discarded.
+    /// Reads the cells of a site's map; blocks that were absent are noted in `absent`, and then what
+    /// `read` returned is to be discarded.
     pub(in crate::app) fn read_cells<T>(
         &self,
         row: &SiteRow,
         absent: &Absent,
-        look: impl FnOnce(Cells<'_>) -> T,
+        read: impl FnOnce(Cells<'_>) -> T,
     ) -> T {
-        let number = self.memory.next_look();
-        self.look(row, |map| look(map.cells(absent, number)))
+        let number = self.memory.tick();
+        self.look(row, |map| read(map.cells(absent, number)))
     }
 
     /// Takes blocks out of memory if all together need too much of it.
     pub(in crate::app) fn evict(&self) {
-        let surplus = {
+        let candidates = {
             let sites = self.sites.read().unwrap_or_else(PoisonError::into_inner);
-            self.memory.surplus(&sites)
+            self.memory.eviction_candidates(&sites)
         };
-        for some in surplus.chunks(EVICTED_AT_ONCE) {
+        for some in candidates.chunks(EVICTED_AT_ONCE) {
             let taken = {
                 let mut sites = self.sites.write().unwrap_or_else(PoisonError::into_inner);
                 self.memory.take(&mut sites, some)
@@ -265,15 +265,18 @@ impl Maps {
         }
     }
 
-    /// Waits for a place among those for whom blocks are read. `None` cannot occur, since the
+    /// Waits for a turn to have blocks loaded. `None` cannot occur, since the
     /// semaphores are never closed.
-    pub(in crate::app) async fn reader(&self, is_for_robot: bool) -> Option<SemaphorePermit<'_>> {
-        let readers = if is_for_robot {
-            &self.memory.readers_for_robots
+    pub(in crate::app) async fn load_turn(
+        &self,
+        is_for_robot: bool,
+    ) -> Option<SemaphorePermit<'_>> {
+        let turns = if is_for_robot {
+            &self.memory.load_turns_of_robots
         } else {
-            &self.memory.readers
+            &self.memory.load_turns
         };
-        readers.acquire().await.ok()
+        turns.acquire().await.ok()
     }
 
     fn begin_read(&self) -> Reading<'_> {
@@ -319,10 +322,10 @@ impl Maps {
         if map.stamp() != stamp {
             return Ok(false);
         }
-        map.set_look(self.memory.looks());
+        map.set_lru_time(self.memory.lru_time());
         let unwritten = self.unwritten();
         for (block, cells) in blocks {
-            // Another look may have read it meanwhile.
+            // Another reader may have loaded it meanwhile.
             if pins.add(map, block) {
                 continue;
             }
@@ -350,22 +353,22 @@ fn unnamed(row: &SiteRow, block: Block) -> DbError {
 }
 
 impl App {
-    /// Reads blocks of a map into memory, and keeps them there for one look, as long as `pins` exist:
+    /// Loads blocks of a map into memory, and keeps them there for one read, as long as `pins` exist:
     /// at least the first, and further ones while less than half of what it may have at once is kept.
     ///
     /// # Errors
-    /// [`AppError::LookTooLarge`] if it has as many as it may already; [`DbError::Unsettled`] if sums
+    /// [`AppError::MapReadTooLarge`] if it has as many as it may already; [`DbError::Unsettled`] if sums
     /// are removed or merged again and again; those of the database.
-    pub(in crate::app) async fn read_blocks(
+    pub(in crate::app) async fn load_blocks(
         &self,
         row: &SiteRow,
         blocks: &BTreeSet<Block>,
         pins: &mut Pins,
     ) -> Result<(), AppError> {
         let maps = self.maps();
-        let bytes_max = maps.memory.look_bytes_max();
-        if pins.bytes > bytes_max && pins.pins.len() >= LOOK_BLOCKS_MIN {
-            return Err(AppError::LookTooLarge {
+        let bytes_max = maps.memory.read_bytes_max();
+        if pins.bytes > bytes_max && pins.pins.len() >= READ_BLOCKS_MIN {
+            return Err(AppError::MapReadTooLarge {
                 mib_max: bytes_max / MIB,
             });
         }
@@ -376,7 +379,7 @@ impl App {
         while !rest.is_empty() && (is_first || pins.bytes < bytes_max / 2) {
             let mut some = rest.split_off(rest.len().saturating_sub(BLOCKS_AT_ONCE));
             some.reverse();
-            // Another look may have read them meanwhile.
+            // Another reader may have loaded them meanwhile.
             let absent = maps.pin(row, &some, pins);
             if absent.is_empty() {
                 is_first = false;
@@ -462,7 +465,7 @@ pub async fn run(app: App, stop: CancellationToken) {
         }
         let evicting = app.clone();
         let evicting = tokio::task::spawn_blocking(move || evicting.maps().evict());
-        // Blocks that looks keep may be most of them, so that not much is evicted.
+        // Blocks that readers keep may be most of them, so that not much is evicted.
         let evicted = async { tokio::join!(evicting, tokio::time::sleep(EVICT_EVERY_MIN)) };
         tokio::select! {
             () = stop.cancelled() => return,

@@ -36,8 +36,20 @@ pub struct BlockCells {
     cells: BTreeMap<u16, Box<[Part]>>,
     parts: usize,
     pins: Arc<()>,
-    /// Number of the look that used it last.
+    /// Time of its last use, see [`SiteMap::cells`].
     used: AtomicU64,
+}
+
+/// Adds up neighbours with the same key.
+fn added_up(parts: impl Iterator<Item = Part>) -> Vec<Part> {
+    let mut added: Vec<Part> = Vec::new();
+    for part in parts {
+        match added.last_mut().filter(|last| last.key == part.key) {
+            Some(last) => last.add(&part.sums()),
+            None => added.push(part),
+        }
+    }
+    added
 }
 
 impl BlockCells {
@@ -45,13 +57,7 @@ impl BlockCells {
         sums.sort_unstable_by_key(|(place, part)| (*place, part.key));
         let mut block = Self::default();
         for of_cell in sums.chunk_by(|left, right| left.0 == right.0) {
-            let mut parts: Vec<Part> = Vec::with_capacity(of_cell.len());
-            for (_, part) in of_cell {
-                match parts.last_mut().filter(|last| last.key == part.key) {
-                    Some(last) => last.add(&part.sums()),
-                    None => parts.push(*part),
-                }
-            }
+            let parts = added_up(of_cell.iter().map(|(_, part)| *part));
             block.parts += parts.len();
             block.cells.insert(of_cell[0].0, parts.into_boxed_slice());
         }
@@ -97,14 +103,7 @@ impl BlockCells {
             if parts.iter().all(|part| bucket(part.key) == part.key) {
                 continue;
             }
-            let mut merged: Vec<Part> = Vec::with_capacity(parts.len());
-            for part in &*parts {
-                let key = bucket(part.key);
-                match merged.last_mut().filter(|last| last.key == key) {
-                    Some(last) => last.add(&part.sums()),
-                    None => merged.push(part.moved(key)),
-                }
-            }
+            let merged = added_up(parts.iter().map(|part| part.moved(bucket(part.key))));
             self.parts -= parts.len() - merged.len();
             *parts = merged.into_boxed_slice();
         }
@@ -171,8 +170,8 @@ impl Blocks {
         true
     }
 
-    pub(super) fn insert(&mut self, block: Block, cells: BlockCells, look: u64) {
-        cells.used.store(look, Ordering::Relaxed);
+    pub(super) fn insert(&mut self, block: Block, cells: BlockCells, used: u64) {
+        cells.used.store(used, Ordering::Relaxed);
         self.bytes += cells.bytes();
         if let Some(before) = self.present.insert(block, cells) {
             self.bytes -= before.bytes();
@@ -210,8 +209,8 @@ impl Blocks {
         Some((Pin(Arc::clone(&found.pins)), found.bytes()))
     }
 
-    /// Returns the blocks that nothing keeps in memory, with the number of the look that used each
-    /// last and its bytes.
+    /// Returns the blocks that nothing keeps in memory, with the time of the last use
+    /// of each and its bytes.
     pub(super) fn idle(&self) -> impl Iterator<Item = (u64, Block, usize)> + '_ {
         let is_idle = |cells: &BlockCells| Arc::strong_count(&cells.pins) == 1;
         let idle = self.present.iter().filter(move |(_, cells)| is_idle(cells));
@@ -219,7 +218,7 @@ impl Blocks {
     }
 }
 
-/// The blocks that a look at a map needed and that were not in memory.
+/// The blocks that a reader of a map needed and that were not in memory.
 #[derive(Debug, Default)]
 pub struct Absent(RefCell<BTreeSet<Block>>);
 
@@ -239,22 +238,23 @@ impl Absent {
     }
 }
 
-/// The cells of a map, for one look. What it returns is incomplete if a block was absent.
+/// The cells of a map, for one read. What it returns is incomplete if a block was absent.
 #[derive(Debug, Clone, Copy)]
 pub struct Cells<'map> {
     map: &'map SiteMap,
     absent: &'map Absent,
-    /// Number of this look.
-    look: u64,
+    /// Time of this read.
+    time: u64,
 }
 
 impl SiteMap {
-    /// Returns the cells for the look number `look`, which notes absent blocks in `absent`.
-    pub fn cells<'map>(&'map self, absent: &'map Absent, look: u64) -> Cells<'map> {
+    /// Returns the cells for a read at a time of any clock that never goes back; absent blocks are noted
+    /// in `absent`.
+    pub fn cells<'map>(&'map self, absent: &'map Absent, time: u64) -> Cells<'map> {
         Cells {
             map: self,
             absent,
-            look,
+            time,
         }
     }
 }
@@ -274,7 +274,7 @@ impl<'map> Cells<'map> {
     /// absent.
     pub(super) fn of_block(self, block: Block) -> Option<&'map BTreeMap<u16, Box<[Part]>>> {
         if let Some(found) = self.map.blocks.present.get(&block) {
-            found.used.store(self.look, Ordering::Relaxed);
+            found.used.store(self.time, Ordering::Relaxed);
             return Some(&found.cells);
         }
         if self.map.changes.contains(block) {

@@ -63,8 +63,8 @@ pub struct SiteMap {
     removals: u64,
     /// Number of measurements of each epoch.
     segments: BTreeMap<i32, u64>,
-    /// Number of the newest look when cells were changed last.
-    look: u64,
+    /// Time of the last use of blocks that come into memory.
+    lru_time: u64,
 }
 
 /// Returns row and column of a cell as one number, which rises row by row.
@@ -209,7 +209,8 @@ impl SiteMap {
                 self.changes.note_block_of(*cell);
             } else {
                 // Nothing is stored of a block that was never driven on, so this is all of it.
-                self.blocks.insert(block, BlockCells::default(), self.look);
+                self.blocks
+                    .insert(block, BlockCells::default(), self.lru_time);
                 self.blocks.add(*cell, key, sums);
                 note(&mut self.changes, *cell);
             }
@@ -261,7 +262,7 @@ impl SiteMap {
         cells: BlockCells,
         lacking: impl IntoIterator<Item = (Labelled<'sums>, &'sums Sums)>,
     ) {
-        self.blocks.insert(block, cells, self.look);
+        self.blocks.insert(block, cells, self.lru_time);
         for (labelled, sums) in lacking {
             if labelled.grid_revision == self.grid_revision {
                 let key = self.key(labelled);
@@ -270,9 +271,9 @@ impl SiteMap {
         }
     }
 
-    /// Counts blocks that come into memory from now on as used by this look.
-    pub fn set_look(&mut self, look: u64) {
-        self.look = look;
+    /// Counts blocks that come into memory from now on as used at this time, see [`Self::cells`].
+    pub fn set_lru_time(&mut self, time: u64) {
+        self.lru_time = time;
     }
 
     /// Keeps a block in memory as long as the returned pin exists, and returns its bytes; `None` if it
@@ -286,8 +287,8 @@ impl SiteMap {
         self.blocks.size()
     }
 
-    /// Returns the blocks that may leave memory, with the number of the look that used each last and
-    /// its bytes.
+    /// Returns the blocks that may leave memory, with the time of the last use of each and its
+    /// bytes.
     pub fn idle_blocks(&self) -> impl Iterator<Item = (u64, Block, usize)> + '_ {
         self.blocks.idle()
     }
