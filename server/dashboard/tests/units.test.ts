@@ -83,7 +83,9 @@ test('what is typed in feet is sent exactly, and comes back as it was typed', as
     const mission = await api<MissionDetail>(`/v1/missions/${sent.id}`);
     return mission.revision > sent.revision || mission.replacement ? mission : null;
   });
-  expect(replaced.trajectory).toEqual(sent.trajectory);
+  // The pose from which it was planned is the robot's at that time, and the robot drives.
+  const typedAgain = { circle: { ...circle, options: { ...circle.options, expected_start: expect.anything() } } };
+  expect(replaced.trajectory).toEqual(typedAgain);
   await api(`/v1/missions/${sent.id}/cancel`, 'POST').catch(() => undefined);
 });
 
