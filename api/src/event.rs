@@ -5,7 +5,8 @@
 //! line the value that a client sends as `Last-Event-ID` to resume. A stream begins with a
 //! snapshot: `snapshot_begin`, the present state of everything that matches the filters,
 //! `snapshot_end`. If the server still keeps the events since the given `Last-Event-ID`, the stream
-//! begins with those events instead. Before the server ends a stream it sends [`Event::End`].
+//! begins with those events instead. After an event of another server, or of one that was restarted since, it
+//! begins with the steps of missions that have followed it, and then has the snapshot. Before the server ends a stream it sends [`Event::End`].
 
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;

@@ -18,6 +18,7 @@ pub mod history;
 pub mod idempotency;
 pub mod inspection;
 pub mod join_tokens;
+pub mod leader;
 pub mod missions;
 pub mod removed;
 pub mod restorations;
@@ -248,15 +249,38 @@ impl Db {
     }
 
     /// Makes this process the server of the database, which it has locked: what was so before cannot write
-    /// to a PostgreSQL database any more.
+    /// to a PostgreSQL database any more. Standbys of such a database send to `advertise_url` what only this
+    /// server can answer.
     ///
     /// # Errors
     /// The database cannot be written.
-    pub async fn claim(&self) -> Result<(), DbError> {
+    pub async fn claim(&self, advertise_url: Option<&str>) -> Result<(), DbError> {
         match self {
             // The lock of a file lasts as long as the process.
             Self::Sqlite(_) => Ok(()),
-            Self::Postgres(db) => db.claim().await,
+            Self::Postgres(db) => db.claim(advertise_url).await,
+        }
+    }
+
+    /// Opens a PostgreSQL database to read it beside the server that has it; `None` for a file, which has one
+    /// server. Every write fails. [`Db::follow`] makes its generation that of the database.
+    ///
+    /// # Errors
+    /// [`OpenError`]: also if its schema is not the one of this program.
+    pub async fn open_to_read(location: &Location) -> Result<Option<Self>, OpenError> {
+        Ok(match location {
+            Location::File(_) => None,
+            Location::Postgres(address) => Some(Self::Postgres(
+                tread_store_postgres::Db::open_to_read(address).await?,
+            )),
+        })
+    }
+
+    /// Makes the generation that of a PostgreSQL database, which other processes write.
+    pub fn follow(&self, generation: i64) {
+        match self {
+            Self::Sqlite(_) => {}
+            Self::Postgres(db) => db.follow(generation),
         }
     }
 

@@ -45,24 +45,24 @@ impl DatabaseLock {
     }
 
     /// As [`DatabaseLock::take`], but waits while another server has the lock of a PostgreSQL database, and
-    /// takes over from one that has been silent for `silence_max`. `waiting` is called with the reason at
-    /// each attempt.
+    /// takes over from one that has been silent for `silence_max`. `waiting` is called at each attempt with
+    /// the reason, and whether another server has the lock.
     ///
     /// # Errors
     /// [`LockError`]: a file is in use, or the address cannot be read.
     pub async fn wait(
         location: &Location,
         silence_max: Duration,
-        mut waiting: impl FnMut(&str),
+        mut waiting: impl FnMut(&str, bool),
     ) -> Result<Self, LockError> {
         let Location::Postgres(address) = location else {
             return Self::take(location).await;
         };
         let waiting = |reason: &PostgresLockError| match reason {
             PostgresLockError::InUse { address, holder } => {
-                waiting(&format!("another server{holder} uses `{address}`"));
+                waiting(&format!("another server{holder} uses `{address}`"), true);
             }
-            PostgresLockError::Open(cause) => waiting(&cause.to_string()),
+            PostgresLockError::Open(cause) => waiting(&cause.to_string(), false),
         };
         let lock = tread_store_postgres::lock::DatabaseLock::wait(address, silence_max, waiting);
         Ok(Self::Postgres(lock.await?))

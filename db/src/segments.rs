@@ -16,6 +16,7 @@ forward! {
     fn list(site_pk: i64, filter: &SegmentFilter, limit: u32) -> Vec<StoredSegment>;
     fn first_since(at: Timestamp) -> Option<i64>;
     fn of_site(site_pk: i64, after: i64, limit: u32) -> Vec<KeyedSegment>;
+    fn after(after: i64, limit: u32) -> Vec<KeyedSegment>;
     fn of_all_sites(range: (i64, i64), limit: u32) -> Vec<(i64, StoredSegment)>;
 }
 

@@ -208,6 +208,12 @@ pub struct WebConfig {
     pub allowed_origins: Vec<Origin>,
     /// Whether a proxy in front of this server terminates TLS, so that browsers use `https`.
     pub behind_https: bool,
+    /// Origin at which standbys of the same database reach this server's REST API, such as
+    /// `https://server-a.example.org:8420`; they forward to it what they cannot answer by themselves.
+    pub advertise_url: Option<Origin>,
+    /// File with the CA certificates (PEM) by which a standby recognises the other server; those of the
+    /// machine when absent, or the fleet's own if that issues the certificates.
+    pub advertise_authorities: Option<PathBuf>,
     /// Addresses and networks of the proxies in front of this server. Only their `X-Forwarded-For`
     /// entries are used to determine the client address of a request.
     pub trusted_proxies: Vec<Network>,

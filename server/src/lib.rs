@@ -59,8 +59,8 @@ use tread_api::ids::SiteId;
 use tread_telemetry::Telemetry;
 
 use self::app::enrolment::EnrolmentService;
-use self::app::identity::audit;
 use self::app::identity::people::People;
+use self::app::identity::{READ_AGAIN, audit};
 use self::app::{
     App, Dependencies, backups, checkpoints, events, ingest, memory, merging, reconciler,
     retention, storage, sums,
@@ -76,8 +76,10 @@ use self::fleet::{Fleet, Security};
 use self::http::serve::Serving;
 use self::http::tls::{Issuer, Tls};
 use self::identity::address::TrustedProxies;
+use self::identity::origin::Origin;
 pub use self::program::{command_line, run, run_from_args};
 use self::standby::Standby;
+use self::standby::serving::StandbyServing;
 use self::supervisor::Supervisor;
 use self::webhooks::{Resolver, Sender, SystemResolver};
 
@@ -131,10 +133,11 @@ impl Server {
         let names = config.names();
         let proxies = TrustedProxies::new(config.web.trusted_proxies.clone());
         let schedule = backup_schedule(&config);
-        let (lock, _feeding) = take_lock(&config).await?;
+        let (lock, standby, _feeding) = take_lock(&config, &clock).await?;
         // Only with the lock: this completes an interrupted rotation of the authority.
         let security = config.robots.as_ref().map(security).transpose()?;
-        let tls = open_tls(&config, security.as_ref(), &clock)?;
+        let authorities = security.as_ref().map(|security| &security.authorities);
+        let tls = open_tls(&config, authorities, &clock)?;
         let db = open_claimed(&config, lock.lost()).await?;
         let supervisor = Supervisor::new();
         let stop = || supervisor.stop_token();
@@ -171,8 +174,10 @@ impl Server {
             audit: config.audit,
             archive,
             telemetry: Telemetry::start(&config.tracing, "tread-server")?,
+            is_standby: false,
         });
-        let remembered = remember(&app, &config.site).await;
+        let remembered = remember(&app, &config.site, standby.as_ref()).await;
+        drop(standby);
         remembered.map_err(|error| not_readable(error, &config.database))?;
         let sender = Sender::new(app.webhook_rules().clone(), resolver)?;
         let listener = listen_for_http(config.http)?;
@@ -188,10 +193,7 @@ impl Server {
         look_after_database(&app, config.retention, &supervisor);
         let telling = app::friction::live::run(app.clone(), stop());
         supervisor.spawn_vital("map", telling);
-        supervisor.spawn_vital("audit", audit::run(app.clone(), stop()));
-        supervisor.spawn_vital("tokens", app::identity::run(app.clone(), stop()));
-        let finding = app::identity::people::run(app.clone(), stop());
-        supervisor.spawn_vital("provider", finding);
+        look_after_identities(&app, &supervisor);
         let backing_up = backups::run(app.clone(), schedule, stop());
         supervisor.spawn_vital("backups", backing_up);
         let sending = app::webhooks::delivery::run(app.clone(), sender, stop());
@@ -239,36 +241,55 @@ fn serve_metrics(
     app: &App,
     supervisor: &Supervisor,
 ) -> anyhow::Result<SocketAddr> {
+    let serving = listen_for_metrics(address, app)?;
+    let address = serving.listener.local_addr()?;
+    let stop = supervisor.stop_token();
+    let serving = http::serve::run(serving, app.clone(), supervisor.clone(), stop);
+    supervisor.spawn_vital("metrics", serving);
+    Ok(address)
+}
+
+fn listen_for_metrics(address: SocketAddr, app: &App) -> anyhow::Result<Serving> {
     let listener = http::serve::listen(address)
         .with_context(|| format!("cannot listen for metrics on {address}"))?;
-    let address = listener.local_addr()?;
-    let serving = Serving {
+    info!("metrics on http://{}/metrics", listener.local_addr()?);
+    Ok(Serving {
         listener,
         router: http::metrics_router(app.clone()),
         tls: None,
         proxies: Arc::default(),
-    };
-    let stop = supervisor.stop_token();
-    let serving = http::serve::run(serving, app.clone(), supervisor.clone(), stop);
-    supervisor.spawn_vital("metrics", serving);
-    info!("metrics on http://{address}/metrics");
-    Ok(address)
+    })
 }
 
-/// Locks the database; a standby waits until it can, and its watchdog is fed from then on until the other
-/// value is dropped.
+/// Locks the database; a standby waits until it can, and answers requests meanwhile: it returns what has the
+/// map then. From then on until the last value is dropped, its watchdog is fed.
 ///
 /// # Errors
 /// Another server uses it, or it cannot be locked.
-async fn take_lock(config: &Config) -> Result<(DatabaseLock, JoinSet<()>), LockError> {
+async fn take_lock(
+    config: &Config,
+    clock: &Clock,
+) -> Result<(DatabaseLock, Option<App>, JoinSet<()>), LockError> {
     if !config.standby {
         let lock = DatabaseLock::take(&config.database).await?;
-        return Ok((lock, JoinSet::new()));
+        return Ok((lock, None, JoinSet::new()));
     }
+    let mut serving = None;
     let mut standby = Standby::default();
-    let waiting = |reason: &str| standby.waits(reason);
+    let waiting = |reason: &str, is_in_use: bool| {
+        standby.waits(reason);
+        // Whoever takes over at once has nothing to serve before.
+        if is_in_use && serving.is_none() {
+            serving = Some(StandbyServing::start(config.clone(), clock.clone()));
+        }
+    };
     let lock = DatabaseLock::wait(&config.database, STANDBY_SILENCE_MAX, waiting).await?;
-    Ok((lock, standby.takes_over()))
+    let feeding = standby.takes_over();
+    let served = match serving {
+        Some(serving) => serving.end().await,
+        None => None,
+    };
+    Ok((lock, served, feeding))
 }
 
 /// Opens the database that is locked, and claims it.
@@ -277,10 +298,11 @@ async fn take_lock(config: &Config) -> Result<(DatabaseLock, JoinSet<()>), LockE
 /// It cannot be opened, or a standby cannot write to it, or the lock was lost.
 async fn open_claimed(config: &Config, lost: impl Future<Output = String>) -> anyhow::Result<Db> {
     let db = Db::open(&config.database).await?;
+    let advertise_url = config.web.advertise_url.as_ref().map(Origin::as_str);
     let claimed = tokio::select! {
         biased;
         reason = lost => anyhow::bail!("the lock of the database is lost: {reason}"),
-        claimed = db.claim() => claimed,
+        claimed = db.claim(advertise_url) => claimed,
     };
     match claimed {
         // Stop and teleoperation work without the disk, and nobody else takes over.
@@ -327,23 +349,40 @@ fn look_after_database(app: &App, retention: RetentionConfig, supervisor: &Super
     supervisor.spawn_vital("retention", removing);
 }
 
-/// Loads the state in memory from the database.
+/// Starts the tasks of tokens, sessions, the OpenID provider and the audit log.
+fn look_after_identities(app: &App, supervisor: &Supervisor) {
+    let stop = || supervisor.stop_token();
+    supervisor.spawn_vital("audit", audit::run(app.clone(), stop()));
+    let reading = app::identity::run(app.clone(), READ_AGAIN, stop());
+    supervisor.spawn_vital("tokens", reading);
+    let finding = app::identity::people::run(app.clone(), stop());
+    supervisor.spawn_vital("provider", finding);
+}
+
+/// Loads the state in memory from the database, and the map from the standby that this process was, if any.
 ///
 /// # Errors
 /// The site, robots, map or enrolments cannot be read.
-async fn remember(app: &App, site: &SiteId) -> anyhow::Result<()> {
+async fn remember(app: &App, site: &SiteId, standby: Option<&App>) -> anyhow::Result<()> {
     // A failure only loses the protection against a clock set back; Stop must work all the same.
     if let Err(error) = app.continue_time().await {
         app.log_failure("continue the time of the database", &error);
     }
     app.ensure_site(site).await?;
     app.note_version().await?;
+    app.begin_events().await?;
     app.know_restoration().await?;
     app.know_robots().await?;
     if !app.presences().known().is_empty() {
         app.note_restart();
     }
-    app.load_map().await?;
+    let has_map = match standby {
+        Some(standby) => app.take_map(standby).await?,
+        None => false,
+    };
+    if !has_map {
+        app.load_map().await?;
+    }
     app.know_enrolments().await?;
     // Without this cache each token is looked up at its first use.
     if let Err(error) = app.know_tokens().await {
@@ -355,13 +394,13 @@ async fn remember(app: &App, site: &SiteId) -> anyhow::Result<()> {
 /// Reads the certificate of the REST API, or has the fleet's authority issue it.
 fn open_tls(
     config: &Config,
-    security: Option<&Security>,
+    authorities: Option<&Arc<Authorities>>,
     clock: &Clock,
 ) -> anyhow::Result<Option<Arc<Tls>>> {
-    let tls = match (&config.tls, security) {
+    let tls = match (&config.tls, authorities) {
         (Some(TlsSource::Files(files)), _) => Some(Tls::load(files.clone())?),
-        (Some(TlsSource::Authority), Some(security)) => Some(Tls::issued(Issuer {
-            authorities: Arc::clone(&security.authorities),
+        (Some(TlsSource::Authority), Some(authorities)) => Some(Tls::issued(Issuer {
+            authorities: Arc::clone(authorities),
             names: config.certificate_names(),
             clock: clock.clone(),
         })?),

@@ -34,6 +34,7 @@ pub mod idempotency;
 pub mod inspection;
 #[path = "../../store/sql/join_tokens.rs"]
 pub mod join_tokens;
+pub mod leader;
 pub mod lock;
 #[path = "../../store/sql/missions.rs"]
 pub mod missions;
@@ -85,7 +86,7 @@ pub mod webhooks;
 pub mod withdrawals;
 
 use std::sync::atomic::Ordering;
-use std::sync::{Arc, OnceLock};
+use std::sync::{Arc, LazyLock, OnceLock};
 use std::time::Duration;
 
 use sqlx::AssertSqlSafe;
@@ -126,6 +127,8 @@ const DISK_TIMEOUT: Duration = Duration::from_secs(2);
 /// Begins a write. The number is the lock of writers, "treaddb" in ASCII. The server releases the lock
 /// after it has made the commit visible, and each later statement sees what is visible when it begins.
 const BEGIN_WRITE: &str = "BEGIN ISOLATION LEVEL READ COMMITTED READ WRITE; SELECT pg_advisory_xact_lock(32776877049668706)";
+/// Follows it, if the write changes a site, terrain or robot: other processes see by it that one has.
+const COUNT_WRITE: &str = "; UPDATE server_epoch SET generation = generation + 1";
 /// PostgreSQL's code, of `check_server_epoch`, for a server that another one has taken the place of.
 const TAKEN_OVER: &str = "TR001";
 /// Begins a read: its first statement takes the snapshot of all.
@@ -143,12 +146,46 @@ pub struct Db {
     claim: Arc<Claim>,
 }
 
-/// Proof that this process is the server of the database.
+/// What this process may write.
 #[derive(Debug, Default)]
 struct Claim {
     /// What begins a write, with the epoch of this server; unset for a program that is no server.
-    begin_write: OnceLock<String>,
+    begin_write: OnceLock<BeginWrite>,
     is_taken_over: watch::Sender<bool>,
+}
+
+/// Statements that begin a write.
+#[derive(Debug)]
+struct BeginWrite {
+    counted: String,
+    uncounted: String,
+}
+
+impl BeginWrite {
+    /// Returns those of the server with an epoch.
+    fn of_server(epoch: i64) -> Self {
+        let uncounted = format!("{BEGIN_WRITE}; SELECT check_server_epoch({epoch})");
+        Self {
+            counted: format!("{uncounted}{COUNT_WRITE}"),
+            uncounted,
+        }
+    }
+
+    /// Returns those of a program that is no server.
+    fn of_program() -> Self {
+        Self {
+            counted: format!("{BEGIN_WRITE}{COUNT_WRITE}"),
+            uncounted: BEGIN_WRITE.to_owned(),
+        }
+    }
+
+    /// Returns those of a program that only reads: PostgreSQL refuses each change.
+    fn of_reader() -> Self {
+        Self {
+            counted: BEGIN_READ.to_owned(),
+            uncounted: BEGIN_READ.to_owned(),
+        }
+    }
 }
 
 impl Db {
@@ -166,15 +203,31 @@ impl Db {
     /// # Errors
     /// As [`Db::open`].
     pub async fn open_with(url: &str, commit_max: Duration) -> Result<Self, OpenError> {
+        Ok(Self::of(open::prepare(url).await?, commit_max))
+    }
+
+    /// Connects to the database of an address to read it, beside the server that has it, and changes nothing.
+    /// [`Db::follow`] makes its generation that of the database.
+    ///
+    /// # Errors
+    /// [`OpenError`]: also if its schema is not the one of this program.
+    pub async fn open_to_read(url: &str) -> Result<Self, OpenError> {
+        let db = Self::of(open::prepare_to_read(url).await?, COMMIT_TIMEOUT);
+        // Nobody else has it yet.
+        let _ = db.claim.begin_write.set(BeginWrite::of_reader());
+        Ok(db)
+    }
+
+    fn of(prepared: open::Prepared, commit_max: Duration) -> Self {
         let open::Prepared {
             options,
             address,
             version,
-        } = open::prepare(url).await?;
+        } = prepared;
         let pool = |bounds, connections_max| {
             Connections::new(options.clone(), bounds, connections_max, commit_max)
         };
-        Ok(Self {
+        Self {
             writer: pool(WRITER_BOUNDS, WRITERS_MAX),
             readers: pool(READER_BOUNDS, READERS_MAX),
             address,
@@ -182,7 +235,13 @@ impl Db {
             metrics: DatabaseMetrics::default(),
             commits: Arc::default(),
             claim: Arc::default(),
-        })
+        }
+    }
+
+    /// Makes the generation that of the database, which other processes write.
+    pub fn follow(&self, generation: i64) {
+        let generation = u64::try_from(generation).unwrap_or_default();
+        self.commits.generation.store(generation, Ordering::Release);
     }
 
     /// Returns the generation: a counter of all commits but those of [`Db::write_uncounted`]. Data that
@@ -229,8 +288,18 @@ impl Db {
     /// # Errors
     /// The turn to write did not come in time, or PostgreSQL failed.
     pub async fn write(&self, kind: &'static str) -> Result<Tx, DbError> {
+        self.begin_write(kind, true).await
+    }
+
+    async fn begin_write(&self, kind: &'static str, is_counted: bool) -> Result<Tx, DbError> {
+        static OF_PROGRAM: LazyLock<BeginWrite> = LazyLock::new(BeginWrite::of_program);
         let asked_at = Instant::now();
-        let begin = self.claim.begin_write.get().map_or(BEGIN_WRITE, |it| it);
+        let begin = self.claim.begin_write.get().unwrap_or(&OF_PROGRAM);
+        let begin = if is_counted {
+            &begin.counted
+        } else {
+            &begin.uncounted
+        };
         let inner = self.writer.begin(begin).await;
         if let Err(sqlx::Error::Database(error)) = &inner
             && error.code().as_deref() == Some(TAKEN_OVER)
@@ -240,10 +309,7 @@ impl Db {
         let inner = inner.map_err(EngineError::from)?;
         self.metrics.write_wait(asked_at.elapsed());
         let tx = self.timed(inner, kind, true);
-        Ok(Tx {
-            is_counted: true,
-            ..tx
-        })
+        Ok(Tx { is_counted, ..tx })
     }
 
     /// Begins a write transaction that [`Db::generation`] does not count, since it changes no site,
@@ -252,28 +318,20 @@ impl Db {
     /// # Errors
     /// As [`Db::write`].
     pub async fn write_uncounted(&self, kind: &'static str) -> Result<Tx, DbError> {
-        Ok(Tx {
-            is_counted: false,
-            ..self.write(kind).await?
-        })
+        self.begin_write(kind, false).await
     }
 
     /// Makes this process the server of the database: all that were so before cannot write any more. To be
-    /// called once, with the lock.
+    /// called once, with the lock. Standbys send to `advertise_url` what only this server can answer.
     ///
     /// # Errors
     /// The database cannot be written.
-    pub async fn claim(&self) -> Result<(), DbError> {
+    pub async fn claim(&self, advertise_url: Option<&str>) -> Result<(), DbError> {
         let mut tx = self.write_uncounted("lock").await?;
-        let epoch =
-            sqlx::query_scalar!("UPDATE server_epoch SET epoch = epoch + 1 RETURNING epoch");
-        let epoch = epoch.fetch_one(&mut *tx).await.map_err(EngineError::from)?;
+        let epoch = leader::claim(&mut tx, advertise_url).await?;
         tx.commit().await?;
         // Set once: a second claim of the same process keeps the first epoch, and fails with it.
-        let _ = self
-            .claim
-            .begin_write
-            .set(format!("{BEGIN_WRITE}; SELECT check_server_epoch({epoch})"));
+        let _ = self.claim.begin_write.set(BeginWrite::of_server(epoch));
         Ok(())
     }
 

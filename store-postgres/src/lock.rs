@@ -407,7 +407,7 @@ mod tests {
             let _lock = timeout(4 * SILENCE_MAX, waiting).await.unwrap().unwrap();
             assert!(begun.elapsed() >= SILENCE_MAX / 2, "{:?}", begun.elapsed());
             let db = Db::open(&database.url).await.unwrap();
-            db.claim().await.unwrap();
+            db.claim(None).await.unwrap();
             db.probe_write().await.unwrap();
             let cut = sqlx::query("SELECT 1").execute(&mut write).await;
             assert!(cut.is_err(), "its session has ended");
@@ -421,12 +421,12 @@ mod tests {
         let test = "a_server_that_was_taken_over_writes_no_more";
         with_database(test, async |database| {
             let old = Db::open(&database.url).await.unwrap();
-            old.claim().await.unwrap();
+            old.claim(None).await.unwrap();
             old.probe_write().await.unwrap();
             let new = Db::open(&database.url).await.unwrap();
             new.probe_write().await.unwrap();
             assert!(timeout(SILENCE_MAX, old.taken_over()).await.is_err());
-            new.claim().await.unwrap();
+            new.claim(None).await.unwrap();
             let refused = format!("{:?}", old.probe_write().await.unwrap_err());
             assert!(refused.contains("taken over"), "{refused}");
             timeout(SILENCE_MAX, old.taken_over()).await.unwrap();

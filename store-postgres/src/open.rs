@@ -24,8 +24,12 @@ const STATEMENTS_MAX: usize = 512;
 const SCHEMES: [&str; 2] = ["postgres://", "postgresql://"];
 /// Begin of the name of our connections in the list of the server's (`pg_stat_activity`).
 const APPLICATION: &str = "tread-server";
-/// Name of this process there, which all its sessions have and no others.
-static PROCESS: LazyLock<String> = LazyLock::new(|| format!("{APPLICATION} {}", Uuid::new_v4()));
+/// Begin of the names of sessions that follow the database of another process.
+const STANDBY: &str = "tread-standby";
+/// Number of this process, which no other has.
+static NUMBER: LazyLock<Uuid> = LazyLock::new(Uuid::new_v4);
+/// Name of this process there, which all its sessions have and no others; those that only read have another.
+static PROCESS: LazyLock<String> = LazyLock::new(|| format!("{APPLICATION} {}", *NUMBER));
 
 /// Reason why the database cannot be opened. None contains the password.
 #[derive(Debug, thiserror::Error)]
@@ -109,6 +113,19 @@ pub enum OpenError {
         known: i64,
         /// Version of this program.
         version: &'static str,
+    },
+    /// A program that only reads found another schema than its own.
+    #[error(
+        "the database `{address}` has the schema {found}, and this version reads {known}: the server that \
+         has it must be of the same version"
+    )]
+    OtherSchema {
+        /// The address, without a password.
+        address: String,
+        /// Its schema; 0 for none.
+        found: i64,
+        /// The schema of this program.
+        known: i64,
     },
     /// A migration failed.
     #[error(
@@ -196,6 +213,37 @@ pub(super) async fn prepare(url: &str) -> Result<Prepared, OpenError> {
     })
 }
 
+/// Connects, looks at the server, and refuses another schema than that of this program.
+///
+/// # Errors
+/// See [`OpenError`].
+pub(super) async fn prepare_to_read(url: &str) -> Result<Prepared, OpenError> {
+    let (options, address) = options_of(url)?;
+    let connecting = connections::connect(&options).await;
+    let mut connection = connecting.map_err(|cause| refused(&address, cause))?;
+    let looking = async {
+        let version = look(&mut connection, &address).await?;
+        Ok((version, found(&mut connection, &address).await?))
+    };
+    let looked = looking.await;
+    // It was opened for reading, so an error of closing it loses nothing.
+    let _ = connection.close().await;
+    let (version, schema) = looked?;
+    let (found, known) = (schema.schema.unwrap_or_default(), schema::known());
+    if found != known {
+        return Err(OpenError::OtherSchema {
+            address,
+            found,
+            known,
+        });
+    }
+    Ok(Prepared {
+        options: options.application_name(&format!("{STANDBY} {}", *NUMBER)),
+        address,
+        version,
+    })
+}
+
 /// Reads the schema of the database of an address, and changes nothing.
 ///
 /// # Errors
@@ -249,19 +297,21 @@ pub(super) fn refused(address: &str, cause: sqlx::Error) -> OpenError {
     }
 }
 
-/// Looks at the server and brings the schema up to date. Returns the server's version.
-async fn update(connection: &mut PgConnection, address: &str) -> Result<String, OpenError> {
-    let failed = |cause| OpenError::Open {
-        address: address.to_owned(),
-        cause,
-    };
+/// Looks at the server. Returns its version.
+///
+/// # Errors
+/// It is too old, or the database has another encoding.
+async fn look(connection: &mut PgConnection, address: &str) -> Result<String, OpenError> {
     let (number, version, encoding): (i32, String, String) = sqlx::query_as(
         "SELECT CAST(current_setting('server_version_num') AS INTEGER),
              current_setting('server_version'), current_setting('server_encoding')",
     )
     .fetch_one(&mut *connection)
     .await
-    .map_err(failed)?;
+    .map_err(|cause| OpenError::Open {
+        address: address.to_owned(),
+        cause,
+    })?;
     if number < VERSION_MIN {
         return Err(OpenError::TooOld(version));
     }
@@ -271,6 +321,16 @@ async fn update(connection: &mut PgConnection, address: &str) -> Result<String, 
             found: encoding,
         });
     }
+    Ok(version)
+}
+
+/// Looks at the server and brings the schema up to date. Returns the server's version.
+async fn update(connection: &mut PgConnection, address: &str) -> Result<String, OpenError> {
+    let failed = |cause| OpenError::Open {
+        address: address.to_owned(),
+        cause,
+    };
+    let version = look(connection, address).await?;
     refuse_newer(address, &found(&mut *connection, address).await?)?;
     let waiting = sqlx::AssertSqlSafe(format!(
         "SET lock_timeout = {}",

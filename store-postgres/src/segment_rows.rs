@@ -157,7 +157,8 @@ macro_rules! measurements {
     ($condition:tt, $after:expr, $($argument:expr),* $(,)?) => {
         sqlx::query_as!(
             Raw,
-            r#"SELECT measured.pk AS "pk!", named.robot_pk AS "robot_pk!",
+            r#"SELECT measured.pk AS "pk!", named.first_pk AS "range_pk!",
+                   named.robot_pk AS "robot_pk!",
                    named.site_pk AS "site_pk!", named.configuration_pk AS "configuration_pk!",
                    named.robot AS "robot!", named.boot AS "boot!",
                    named.first_seq + measured.pk - named.first_pk AS "seq!: i64",

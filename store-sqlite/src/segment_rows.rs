@@ -133,7 +133,8 @@ macro_rules! measurements {
     ($condition:tt, $after:expr, $($argument:expr),* $(,)?) => {
         sqlx::query_as!(
             Raw,
-            r#"SELECT segment_values.pk AS "pk!", segment_ranges.robot_pk AS "robot_pk!",
+            r#"SELECT segment_values.pk AS "pk!", segment_ranges.first_pk AS "range_pk!",
+                   segment_ranges.robot_pk AS "robot_pk!",
                    segment_ranges.site_pk AS "site_pk!",
                    segment_ranges.configuration_pk AS "configuration_pk!", robots.id AS "robot!",
                    boots.id AS "boot!",

@@ -22,6 +22,7 @@ const EVERYTHING: i64 = i64::MAX - 1;
 /// A row of the statement of `measurements!`.
 struct Raw {
     pk: i64,
+    range_pk: i64,
     robot_pk: i64,
     site_pk: i64,
     configuration_pk: i64,
@@ -224,6 +225,7 @@ impl TryFrom<Raw> for KeyedSegment {
     fn try_from(raw: Raw) -> Result<Self, EngineError> {
         Ok(Self {
             pk: raw.pk,
+            range_pk: raw.range_pk,
             robot_pk: raw.robot_pk,
             robot: parse("robot", &raw.robot)?,
             site_pk: raw.site_pk,
@@ -283,4 +285,20 @@ pub async fn of_all_sites(
     wanted
         .map(|raw| Ok((raw.site_pk, raw.try_into()?)))
         .collect()
+}
+
+/// Returns at most `limit` measurements of all sites in the order of their commits, after a key.
+pub async fn after(
+    db: &mut Connection,
+    after: i64,
+    limit: u32,
+) -> Result<Vec<KeyedSegment>, EngineError> {
+    let rows = measurements!(
+        "AND segment_ranges.first_pk <= $3",
+        after,
+        i64::from(limit),
+        i64::MAX
+    );
+    let rows = rows.fetch_all(db).await?;
+    rows.into_iter().map(KeyedSegment::try_from).collect()
 }

@@ -75,6 +75,8 @@ pub struct Extent {
 pub struct KeyedSegment {
     /// Its key.
     pub pk: i64,
+    /// Key of the first measurement of its range: those of a range were committed together.
+    pub range_pk: i64,
     /// Key of the robot.
     pub robot_pk: i64,
     /// The robot.

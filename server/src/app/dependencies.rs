@@ -43,6 +43,8 @@ pub struct Dependencies {
     pub map: MapConfig,
     /// Sender of traces of missions; its default sends none.
     pub telemetry: Telemetry,
+    /// Whether another server writes the database, and this one follows it.
+    pub is_standby: bool,
 }
 
 impl Dependencies {
@@ -63,6 +65,7 @@ impl Dependencies {
             archive: None,
             map: MapConfig::default(),
             telemetry: Telemetry::default(),
+            is_standby: false,
         }
     }
 }

@@ -17,7 +17,7 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
-use tread_api::event::{Event, StreamEnd};
+use tread_api::event::{Event, StreamEnd, Topic};
 use tread_api::ids::RobotId;
 
 pub use self::feed::{FEED_PERIOD, run};
@@ -46,6 +46,8 @@ pub(super) const SHARES: Bounds = Bounds {
     viewers: CLIENTS_MAX - CLIENTS_AT_WORK,
     each: CLIENTS_PER_IDENTITY_MAX,
 };
+/// Maximum number of transitions of missions that are sent to a client that comes from another run of the server.
+const STEPS_MISSED_MAX: u32 = 1_000;
 /// Maximum number of raised alerts in a snapshot.
 const ALERTS_MAX: u32 = 10_000;
 
@@ -56,6 +58,8 @@ pub struct Subscription {
     id: u64,
     events: mpsc::Receiver<Arc<Sent>>,
     waiting: Arc<AtomicUsize>,
+    /// Transitions of missions to send before the snapshot, that the client has not read elsewhere.
+    steps: VecDeque<Arc<Sent>>,
     /// Snapshot to send first; `None` if the events kept are enough.
     snapshot: Option<Reading>,
     /// Events that the client missed, or that were published since the snapshot.
@@ -74,6 +78,9 @@ impl Drop for Subscription {
 impl Subscription {
     /// Returns the next event; `None` after the end.
     pub async fn next(&mut self) -> Option<Arc<Sent>> {
+        if let Some(step) = self.steps.pop_front() {
+            return Some(step);
+        }
         if let Some(event) = self.snapshot.as_mut().and_then(Reading::next) {
             return Some(event);
         }
@@ -160,6 +167,7 @@ impl App {
             id,
             events,
             waiting,
+            steps: VecDeque::new(),
             snapshot: None,
             first: VecDeque::new(),
             has_begun,
@@ -171,8 +179,13 @@ impl App {
             missed
         } else {
             let (snapshot, since) = self.snapshot_for(&filter).await?;
+            let covered = snapshot.covered();
+            if let Some(last) = last {
+                let missed = self.steps_missed(last, covered.step, &filter).await?;
+                subscription.steps = missed;
+            }
             // The buffer may hold events that the snapshot includes already.
-            subscription.covered = snapshot.covered();
+            subscription.covered = covered.seq;
             subscription.snapshot = Some(snapshot);
             since
         };
@@ -180,6 +193,50 @@ impl App {
         let newest = subscription.first.back().map_or(0, |event| event.seq);
         subscription.covered = subscription.covered.max(newest);
         Ok(subscription)
+    }
+
+    /// Begins the order of events: all transitions of missions so far are in every snapshot.
+    ///
+    /// # Errors
+    /// The database failed.
+    pub async fn begin_events(&self) -> Result<(), AppError> {
+        let mut tx = self.db().read("events").await?;
+        self.hub()
+            .begin_after(db::history::newest_step(&mut tx).await?);
+        Ok(())
+    }
+
+    /// Returns the transitions of missions that a client has not read from another run of the server or
+    /// another server of the same database, up to one that a snapshot includes; none of more than
+    /// [`STEPS_MISSED_MAX`].
+    async fn steps_missed(
+        &self,
+        last: &str,
+        until: i64,
+        filter: &EventFilter,
+    ) -> Result<VecDeque<Arc<Sent>>, AppError> {
+        let after = self.hub().step_elsewhere(last);
+        let Some(after) = after.filter(|_| filter.wants(Topic::Missions)) else {
+            return Ok(VecDeque::new());
+        };
+        let mut tx = self.db().read("events").await?;
+        let mut steps = db::history::steps_after(&mut tx, after, STEPS_MISSED_MAX + 1).await?;
+        steps.retain(|(pk, _)| *pk <= until);
+        if steps.len() > STEPS_MISSED_MAX as usize {
+            return Ok(VecDeque::new());
+        }
+        // A client that leaves in between goes on after the last that it has read.
+        let read_before = last.rsplit_once('-').map_or(last, |(before, _)| before);
+        let missed = steps.into_iter().map(|(pk, step)| {
+            let about = Some((step.site.clone(), Some(step.robot.clone())));
+            let event = Event::Step(Box::new(step));
+            Sent {
+                id: Some(format!("{read_before}-{pk}")),
+                ..unnumbered(&event, Some(Topic::Missions), about)
+            }
+        });
+        let wanted = |step: &Sent| filter.lets_through(step.topic, step.about.as_ref());
+        Ok(missed.filter(wanted).map(Arc::new).collect())
     }
 
     /// Returns the first name in a filter that is not known, with its query parameter.

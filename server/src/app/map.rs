@@ -7,7 +7,10 @@
 //! After a commit of unknown outcome no turn is given until memory was read again (see
 //! [`super::memory`]).
 
+mod block_memory;
 pub mod blocks;
+pub mod following;
+mod names;
 mod reading;
 mod unwritten;
 pub mod writing;
@@ -21,9 +24,11 @@ use tread_api::ids::{ConfigurationId, RobotId};
 use tread_api::robot::Alert;
 use tread_api::site::Cell;
 
+use self::block_memory::BlockMemory;
 pub use self::blocks::BlockCounts;
 pub(super) use self::blocks::Pins;
-use self::blocks::{BlockMemory, KeyNames};
+use self::following::Follower;
+use self::names::KeyNames;
 use self::unwritten::Unwritten;
 pub use self::unwritten::UnwrittenCounts;
 use super::App;
@@ -46,6 +51,8 @@ pub(super) struct Maps {
     /// outcome at the last reading of memory.
     order: Arc<Mutex<u64>>,
     memory: BlockMemory,
+    /// In a standby: what it has read of the database that another server writes.
+    follower: Option<Follower>,
 }
 
 /// The map of each site by its key.
@@ -124,14 +131,21 @@ impl MapTurn {
 }
 
 impl Maps {
-    /// Creates maps whose blocks of cells take at most about `memory_max_mib` MiB of memory.
-    pub(super) fn new(memory_max_mib: u64) -> Self {
+    /// Creates maps whose blocks of cells take at most about `memory_max_mib` MiB of memory. Those of a
+    /// standby follow a database that another server writes.
+    pub(super) fn new(memory_max_mib: u64, is_standby: bool) -> Self {
         Self {
             sites: RwLock::default(),
             unwritten: StdMutex::default(),
             order: Arc::default(),
             memory: BlockMemory::new(memory_max_mib),
+            follower: is_standby.then(Follower::default),
         }
+    }
+
+    /// Returns what a standby has read; `None` in the server that has the database.
+    fn follower(&self) -> Option<&Follower> {
+        self.follower.as_ref()
     }
 
     /// Creates a site's map if it does not exist.

@@ -90,6 +90,7 @@ impl App {
         self.register_map_blocks(&mut registry);
         // Metrics from memory are shown also while the database cannot be read.
         for registered in [
+            self.register_standbys(&mut registry).await,
             self.register_fleet(&mut registry).await,
             self.register_terrains(&mut registry).await,
         ] {

@@ -33,6 +33,7 @@ pub mod robots;
 pub mod segments;
 pub mod shares;
 pub mod sites;
+mod start;
 pub mod stops;
 pub mod storage;
 pub mod teleop;
@@ -62,7 +63,9 @@ use self::events::Hub;
 use self::friction::{CellCounts, MapNews, Pictures, ReaderSlots, Timelines, Views};
 use self::identity::Identity;
 use self::map::Maps;
-pub use self::map::{BlockCounts, UnwrittenCounts, blocks as map_blocks, writing as sums};
+pub use self::map::{
+    BlockCounts, UnwrittenCounts, blocks as map_blocks, following, writing as sums,
+};
 use self::missions::idempotency::InFlight;
 use self::missions::immediate_offer::JustOffered;
 use self::presence::Presences;
@@ -157,6 +160,7 @@ impl App {
             archive,
             map,
             telemetry,
+            is_standby,
         } = dependencies;
         let started_at = clock.elapsed();
         let presences = Arc::default();
@@ -185,7 +189,7 @@ impl App {
             recalls: AtomicU64::new(0),
             checks: Semaphore::new(check::CHECKS_MAX),
             identity: Identity::new(people, audit),
-            maps: Maps::new(map.memory_max_mib),
+            maps: Maps::new(map.memory_max_mib, is_standby),
             membership: Membership::new(enrolment),
             metrics: Metrics::default(),
             robots_generation: AtomicU64::new(1),
@@ -237,7 +241,7 @@ impl App {
     }
 
     /// Returns the supervisor of tasks that outlive their request.
-    fn supervisor(&self) -> &Supervisor {
+    pub fn supervisor(&self) -> &Supervisor {
         &self.inner.robots.supervisor
     }
 
@@ -382,30 +386,6 @@ impl App {
 
     fn friction_config(&self) -> &FrictionConfig {
         &self.inner.friction
-    }
-
-    /// Stores the version of this server, unless the last one to open the database was the same.
-    ///
-    /// # Errors
-    /// The database failed.
-    pub async fn note_version(&self) -> Result<(), AppError> {
-        let mut tx = self.db().write("mod").await?;
-        let now = self.clock().now();
-        db::schema::note_version(&mut tx, crate::build::VERSION, now).await?;
-        Ok(tx.commit().await?)
-    }
-
-    /// Continues the clock after the newest time in the database, so that time does not go back
-    /// over a restart either.
-    ///
-    /// # Errors
-    /// The database failed.
-    pub async fn continue_time(&self) -> Result<(), AppError> {
-        let mut tx = self.db().read("mod").await?;
-        let newest = db::times::newest(&mut tx).await?;
-        let newest_id = db::times::newest_id(&mut tx).await?;
-        self.clock().continue_after(newest, newest_id);
-        Ok(())
     }
 }
 

@@ -308,8 +308,20 @@ impl Authorities {
         Self::load_from(Folder::new(folder))
     }
 
+    /// Reads the authorities from a folder that another program may change.
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn read(folder: &Path) -> Result<Self, AuthorityError> {
+        Self::read_from(Folder::new(folder))
+    }
+
     pub(super) fn load_from(folder: Folder) -> Result<Self, AuthorityError> {
         folder.recover()?;
+        Self::read_from(folder)
+    }
+
+    fn read_from(folder: Folder) -> Result<Self, AuthorityError> {
         let kept = folder.read()?;
         let mut trusted = Trusted::one(Arc::new(kept.present));
         trusted.retired = kept.retired;

@@ -190,9 +190,11 @@ pub struct DatabaseStatus {
     pub engine: String,
     /// Version of the engine.
     pub version: String,
+    /// Standbys that follow the database; `null` for one that has one server, and while it does not answer.
+    pub standbys: Option<u64>,
 }
 
-fn ok() -> Json<Health> {
+pub(super) fn ok() -> Json<Health> {
     Json(Health {
         status: "ok".to_owned(),
     })
@@ -226,6 +228,7 @@ pub(super) async fn status(
     Subject(subject): Subject,
 ) -> Json<ServerStatus> {
     let queues = app.queue_depths().await;
+    let standbys = app.standbys().await.ok().flatten();
     Json(ServerStatus {
         version: build::VERSION.to_owned(),
         commit: build::commit().map(str::to_owned),
@@ -236,6 +239,7 @@ pub(super) async fn status(
             DatabaseStatus {
                 engine: engine.name().to_owned(),
                 version: version.to_owned(),
+                standbys,
             }
         },
         storage: app.storage_condition().into(),

@@ -9,6 +9,7 @@ mod drive;
 mod etag;
 mod events;
 pub mod extract;
+pub mod forward;
 mod friction;
 mod geofence;
 mod guarded;
@@ -23,6 +24,7 @@ mod revision;
 mod robots;
 pub mod serve;
 mod sites;
+pub mod standby;
 mod stops;
 mod subject;
 mod terrains;
@@ -151,24 +153,30 @@ fn routes() -> OpenApiRouter<App> {
         .routes(routes!(limits::list))
         .routes(routes!(limits::set, limits::end))
         .routes(routes!(geofence::get, geofence::replace))
+        .routes(routes!(friction::robots))
+        .routes(routes!(friction::segments))
+        .routes(routes!(withdrawals::create))
+        .routes(routes!(withdrawals::list))
+        .merge(map_routes())
+        .layer(Extension(BodyLimit(BODY_MAX)))
+        .merge(missions)
+        .merge(session)
+        .merge(joining)
+}
+
+/// Routes that need nothing but the map and the database, which a standby has too.
+fn map_routes() -> OpenApiRouter<App> {
+    OpenApiRouter::new()
         .routes(routes!(friction::terrains))
         .routes(routes!(friction::terrain))
         .routes(routes!(friction::history::terrain_history))
         .routes(routes!(friction::history::point_history))
-        .routes(routes!(friction::robots))
         .routes(routes!(friction::places::cells))
         .routes(routes!(friction::places::point))
         .routes(routes!(friction::places::path))
         .routes(routes!(friction::places::difference))
         .routes(routes!(friction::places::visits))
         .routes(routes!(friction::map::map))
-        .routes(routes!(friction::segments))
-        .routes(routes!(withdrawals::create))
-        .routes(routes!(withdrawals::list))
-        .layer(Extension(BodyLimit(BODY_MAX)))
-        .merge(missions)
-        .merge(session)
-        .merge(joining)
 }
 
 /// Returns the OpenAPI description.
@@ -237,16 +245,21 @@ pub fn router(app: App, names: Names) -> Router {
         Some(foreign_pages) => router.layer(foreign_pages),
         None => router,
     };
-    router
+    let router = router
         .layer(from_fn_with_state(app.clone(), measure))
         .layer(from_fn(bound_time))
         .layer(CatchPanicLayer::custom(broken))
         .layer(from_fn_with_state(app.clone(), count_panics))
-        .layer(from_fn_with_state(names, browser::set_headers))
+        .layer(from_fn_with_state(names, browser::set_headers));
+    with_request_id(router).with_state(app)
+}
+
+/// Names each request in its answer and in the log.
+fn with_request_id(router: Router<App>) -> Router<App> {
+    router
         .layer(TraceLayer::new_for_http().make_span_with(span))
         .layer(PropagateRequestIdLayer::new(REQUEST_ID))
         .layer(SetRequestIdLayer::new(REQUEST_ID, MakeRequestUuid))
-        .with_state(app)
 }
 
 /// Creates the router of the Prometheus metrics, for an address of its own.

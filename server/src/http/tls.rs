@@ -183,9 +183,17 @@ impl Tls {
 
 /// Keeps the certificate up to date until the stop, and raises an alert before it expires.
 pub async fn watch(tls: Arc<Tls>, app: App, stop: CancellationToken) {
+    keep(&tls, stop, |tls| {
+        app.note_certificate(tls.certificate().as_ref(), &tls.origin());
+    })
+    .await;
+}
+
+/// Keeps the certificate up to date until the stop, and calls `looked` after each look at it.
+pub async fn keep(tls: &Tls, stop: CancellationToken, looked: impl Fn(&Tls)) {
     let mut seen = tls.changed_at();
     loop {
-        app.note_certificate(tls.certificate().as_ref(), &tls.origin());
+        looked(tls);
         tokio::select! {
             () = stop.cancelled() => return,
             () = tokio::time::sleep(LOOK_EVERY) => {}

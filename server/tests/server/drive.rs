@@ -22,7 +22,11 @@ use crate::harness::{PATIENCE, Yard, database, eventually, time};
 use crate::robot::Robot;
 
 fn request(yard: &Yard, robot: &str, token: &str) -> ClientRequestBuilder {
-    let url = yard.url(&format!("/v1/sites/yard/robots/{robot}/drive"));
+    request_at(&yard.url(""), robot, token)
+}
+
+fn request_at(server: &str, robot: &str, token: &str) -> ClientRequestBuilder {
+    let url = format!("{server}/v1/sites/yard/robots/{robot}/drive");
     let url = url.replace("http://", "ws://").parse().unwrap();
     ClientRequestBuilder::new(url).with_header("authorization", format!("Bearer {token}"))
 }
@@ -36,7 +40,14 @@ impl Socket {
     }
 
     async fn open_as(yard: &Yard, robot: &str, token: &str) -> Self {
-        let (socket, _) = connect_async(request(yard, robot, token)).await.unwrap();
+        Self::open_at(&yard.url(""), robot, token).await
+    }
+
+    /// The same at the URL of a server.
+    pub(crate) async fn open_at(server: &str, robot: &str, token: &str) -> Self {
+        let (socket, _) = connect_async(request_at(server, robot, token))
+            .await
+            .unwrap();
         let mut socket = Self(socket);
         let first = socket.update().await;
         assert!(matches!(first, DriveUpdate::Welcome { .. }), "{first:?}");

@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use reqwest::StatusCode;
 use serde_json::json;
+use tread_api::event::{Event, MissionStep};
 use tread_api::ids::MissionId;
 use tread_api::mission::{MissionEvent, MissionState};
 use tread_api::wire::ingest::MissionPhase;
@@ -26,6 +27,84 @@ pub(crate) async fn read_until(
     };
     let read = tokio::time::timeout(Duration::from_secs(15), reading).await;
     assert!(read.is_ok(), "{text}");
+}
+
+/// The steps of missions in the text of a stream, in their order.
+pub(crate) fn steps_in(text: &str) -> Vec<MissionStep> {
+    let bodies = text.lines().filter_map(|line| line.strip_prefix("data: "));
+    let events = bodies.filter_map(|body| serde_json::from_str(body).ok());
+    let mut steps = Vec::new();
+    for event in events {
+        if let Event::Step(step) = event {
+            steps.push(*step);
+        }
+    }
+    steps
+}
+
+/// The identifier of the last event in the text of a stream.
+pub(crate) fn last_id(text: &str) -> String {
+    let mut ids = text.lines().filter_map(|line| line.strip_prefix("id: "));
+    ids.next_back().unwrap().to_owned()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_client_of_the_server_before_reads_each_step_that_it_missed_once() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let path = "/v1/events?topics=missions";
+    let mut stream = yard.client().get(yard.url(path)).send().await.unwrap();
+    let first = yard.create_mission(&robot.id).await;
+    let mut read = String::new();
+    read_until(&mut stream, &mut read, |text| {
+        steps_in(text)
+            .iter()
+            .any(|step| step.step.to == MissionState::Active)
+    })
+    .await;
+    drop(stream);
+    robot.report(0, &first, MissionPhase::Succeeded).await;
+    yard.mission_becomes(first.id, MissionState::Succeeded)
+        .await;
+    let second = yard.create_mission(&robot.id).await;
+    yard.mission_becomes(second.id, MissionState::Active).await;
+    let yard = yard.restart().await;
+    let third = yard.create_mission(&robot.id).await;
+    let resume = async |last: &str, text: &mut String| {
+        let asking = yard.client().get(yard.url(path));
+        let mut stream = asking.header("last-event-id", last).send().await.unwrap();
+        let is_there = |text: &str| {
+            let mut steps = steps_in(text).into_iter();
+            text.contains("event: snapshot_end") && steps.any(|step| step.mission == third.id)
+        };
+        read_until(&mut stream, text, is_there).await;
+    };
+    let mut rest = String::new();
+    resume(&last_id(&read), &mut rest).await;
+    // One that leaves after the first of these steps goes on after it.
+    let (part, _) = rest.split_at(rest.find("\n\n").unwrap() + 2);
+    let mut again = part.to_owned();
+    resume(&last_id(part), &mut again).await;
+    let mut stored = Vec::new();
+    for id in [first.id, second.id, third.id] {
+        let events = yard.mission(id).await.events;
+        stored.extend(events.into_iter().map(|step| (id, step)));
+    }
+    for rest in [rest, again] {
+        let steps = steps_in(&read).into_iter().chain(steps_in(&rest));
+        let mut steps: Vec<_> = steps.map(|step| (step.mission, step.step)).collect();
+        let count = steps.len();
+        steps.retain(|step| stored.contains(step));
+        assert_eq!(steps.len(), count, "all are in the history: {steps:?}");
+        // The stream may have ended before the newest.
+        let missing = stored.iter().filter(|step| !steps.contains(step));
+        let missing: Vec<_> = missing.filter(|(id, _)| *id != third.id).collect();
+        assert!(missing.is_empty(), "{missing:?}");
+        let repeated = steps.iter().enumerate();
+        let repeated = repeated.filter(|(at, step)| steps[..*at].contains(step));
+        assert_eq!(repeated.count(), 0, "{steps:?}");
+    }
+    yard.server.stop().await.unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -168,7 +168,7 @@ impl Yard {
         Self::of(folder, Server::start(config).await.unwrap()).await
     }
 
-    async fn of(folder: Arc<TempDir>, server: RunningServer) -> Self {
+    pub(crate) async fn of(folder: Arc<TempDir>, server: RunningServer) -> Self {
         let admin = FirstAdmin {
             name: "tests".to_owned(),
             valid_days: 1,
@@ -343,7 +343,7 @@ pub(crate) fn config(folder: &Path, zenoh: &str) -> Config {
             hosts: vec!["tread.test".to_owned()],
             allowed_origins: vec!["https://dash.test".parse().unwrap()],
             behind_https: false,
-            trusted_proxies: Vec::new(),
+            ..WebConfig::default()
         },
     }
 }

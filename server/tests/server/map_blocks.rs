@@ -16,7 +16,7 @@ use crate::robot::Robot;
 
 /// Everything that is read from the map, over several blocks of cells; a Parquet file has row groups of
 /// other sizes where memory is short.
-const PATHS: [&str; 14] = [
+pub(crate) const PATHS: [&str; 14] = [
     "cells?limit=1000",
     "cells?limit=7&cursor=-40,-70",
     "cells?limit=1000&resolution_m=8&x_min_m=-100&x_max_m=100&y_min_m=-100&y_max_m=100",
@@ -33,12 +33,12 @@ const PATHS: [&str; 14] = [
     "map?format=png&resolution_m=16",
 ];
 
-fn at() -> Timestamp {
+pub(crate) fn at() -> Timestamp {
     segment((0, 0), 0.2, 0).ended_at + SignedDuration::from_hours(9)
 }
 
 /// Two robots on 70 cells of sixteen blocks, within eight hours.
-async fn drive(yard: &Yard) {
+pub(crate) async fn drive(yard: &Yard) {
     for (name, bias) in [("rover-2", 0.0), ("rover-1", 0.02)] {
         let robot = Robot::join(yard, name).await;
         let passes = (0..140).map(|seq| {
@@ -56,16 +56,26 @@ async fn drive(yard: &Yard) {
     }
 }
 
-async fn answers(yard: &Yard) -> Vec<(String, Vec<u8>)> {
+/// What a server at a URL answers to these paths.
+pub(crate) async fn answers_at(
+    client: &reqwest::Client,
+    server: &str,
+    paths: &[&str],
+) -> Vec<(String, Vec<u8>)> {
     let mut answers = Vec::new();
-    for path in PATHS {
-        let url = yard.url(&format!("/v1/sites/yard/friction/{path}"));
-        let response = yard.client().get(url).send().await.unwrap();
+    for &path in paths {
+        let url = format!("{server}/v1/sites/yard/friction/{path}");
+        let response = client.get(url).send().await.unwrap();
         let (status, body) = (response.status(), response.bytes().await.unwrap());
         let said = String::from_utf8_lossy(&body).into_owned();
         assert_eq!(status, StatusCode::OK, "{path}: {said}");
         answers.push((path.to_owned(), body.to_vec()));
     }
+    answers
+}
+
+async fn answers(yard: &Yard) -> Vec<(String, Vec<u8>)> {
+    let mut answers = answers_at(yard.client(), &yard.url(""), &PATHS).await;
     let along = json!({"robot": "rover-1", "points": [{"x_m": -90, "y_m": -75},
                        {"x_m": 60, "y_m": 70}, {"x_m": 81, "y_m": -50}]});
     let (status, body) = yard.post("/v1/sites/yard/friction/path", &along).await;
@@ -75,7 +85,7 @@ async fn answers(yard: &Yard) -> Vec<(String, Vec<u8>)> {
     answers
 }
 
-fn assert_same(found: &[(String, Vec<u8>)], expected: &[(String, Vec<u8>)], when: &str) {
+pub(crate) fn assert_same(found: &[(String, Vec<u8>)], expected: &[(String, Vec<u8>)], when: &str) {
     for ((path, found), (_, expected)) in found.iter().zip(expected) {
         let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
         assert!(

@@ -4,6 +4,7 @@
 
 mod outages;
 mod standby;
+mod standby_api;
 
 use std::env;
 use std::path::Path;

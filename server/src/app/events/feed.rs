@@ -25,8 +25,8 @@ const ROWS_PERIOD: Duration = Duration::from_secs(1);
 /// Publishes until the stop.
 pub async fn run(app: App, stop: CancellationToken) {
     let mut feed = Feed {
+        last_step: app.hub().newest().step,
         app: app.clone(),
-        last_step: None,
         moved: HashMap::new(),
         rows: HashMap::new(),
         rows_of: (0, None),
@@ -50,7 +50,7 @@ type Rows = HashMap<RobotKey, (RobotRow, Vec<Alert>)>;
 
 struct Feed {
     app: App,
-    last_step: Option<i64>,
+    last_step: i64,
     /// Missions that changed state and are not published yet, and whether they have ended; at most
     /// [`STEPS_MAX`] more than after the poll before.
     moved: HashMap<MissionId, bool>,
@@ -71,11 +71,7 @@ impl Feed {
 
     async fn steps(&mut self) -> Result<(), AppError> {
         let mut tx = self.app.db().read("events").await?;
-        let Some(mut last) = self.last_step else {
-            // Transitions before the start are in every snapshot.
-            self.last_step = Some(db::history::newest_step(&mut tx).await?);
-            return Ok(());
-        };
+        let mut last = self.last_step;
         // Transitions that could not be read before are published first.
         let room = if self.moved.is_empty() { STEPS_MAX } else { 0 };
         let steps = db::history::steps_after(&mut tx, last, room).await?;
@@ -88,10 +84,10 @@ impl Feed {
             *self.moved.entry(step.mission).or_default() |= has_ended;
             let robot = (step.site.clone(), step.robot.clone());
             let event = Event::Step(Box::new(step));
-            self.app.hub().publish(&event, Topic::Missions, robot);
+            self.app.hub().publish_step(&event, pk, robot);
         }
         // Each transition is published once, even if the rest fails.
-        self.last_step = Some(last);
+        self.last_step = last;
         let moved: Vec<MissionId> = self.moved.keys().copied().collect();
         for id in moved {
             let row = match db::missions::find(&mut tx, id).await {

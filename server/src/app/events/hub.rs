@@ -13,7 +13,7 @@ use tread_api::event::{Event, Topic};
 use tread_api::friction::MapChange;
 use tread_api::robot::Alert;
 
-use super::sent::{About, EventFilter, Sent, unnumbered};
+use super::sent::{About, EventFilter, Position, Sent, unnumbered};
 use super::snapshot::{SNAPSHOT_READ_MAX, Snapshots};
 use crate::app::presence::RobotKey;
 
@@ -28,6 +28,17 @@ pub const KEPT_BYTES_MAX: usize = 16 * 1024 * 1024;
 /// How long a client that was dropped may take to read its end.
 const LINGER: Duration = Duration::from_secs(5);
 
+/// Parses the identifier of an event: the run of the server, and its place there.
+fn read_id(id: &str) -> Option<(&str, Position)> {
+    let (rest, step) = id.rsplit_once('-')?;
+    let (run, seq) = rest.rsplit_once('-')?;
+    let at = Position {
+        seq: seq.parse().ok()?,
+        step: step.parse().ok()?,
+    };
+    Some((run, at))
+}
+
 /// The clients, and the newest events.
 #[derive(Debug)]
 pub struct Hub {
@@ -40,6 +51,8 @@ pub struct Hub {
 #[derive(Debug, Default)]
 pub(super) struct HubState {
     pub(super) seq: u64,
+    /// Key of the newest transition of a mission that was published, or was there before.
+    step: i64,
     pub(super) kept: VecDeque<Arc<Sent>>,
     pub(super) kept_bytes: usize,
     pub(super) clients: HashMap<u64, Client>,
@@ -123,9 +136,24 @@ impl Hub {
         state.clients.values().map(waiting).max().unwrap_or(0)
     }
 
-    /// Returns the sequence number of the newest event.
-    pub(super) fn newest(&self) -> u64 {
-        self.lock().seq
+    /// Returns the newest event.
+    pub(super) fn newest(&self) -> Position {
+        let state = self.lock();
+        Position {
+            seq: state.seq,
+            step: state.step,
+        }
+    }
+
+    /// Says that all transitions up to one are in every snapshot and are not published.
+    pub(super) fn begin_after(&self, step: i64) {
+        self.lock().step = step;
+    }
+
+    /// Returns the identifier of an event.
+    pub(super) fn id_of(&self, at: Position) -> String {
+        let Position { seq, step } = at;
+        format!("{}-{seq}-{step}", self.run)
     }
 
     /// Returns a number that changes whenever the last client has left.
@@ -145,16 +173,28 @@ impl Hub {
     }
 
     pub(super) fn publish(&self, event: &Event, topic: Topic, (site, robot): RobotKey) {
-        self.publish_about(event, topic, Some((site, Some(robot))));
+        self.publish_about(event, (topic, None), Some((site, Some(robot))));
+    }
+
+    /// Publishes a transition of a mission, which has this key.
+    pub(super) fn publish_step(&self, event: &Event, step: i64, (site, robot): RobotKey) {
+        let about = Some((site, Some(robot)));
+        self.publish_about(event, (Topic::Missions, Some(step)), about);
     }
 
     /// Publishes an event about a robot, a site, or, with neither, the server.
-    fn publish_about(&self, event: &Event, topic: Topic, about: Option<About>) {
+    fn publish_about(
+        &self,
+        event: &Event,
+        (topic, step): (Topic, Option<i64>),
+        about: Option<About>,
+    ) {
         let mut state = self.lock();
         state.seq += 1;
-        let seq = state.seq;
+        state.step = step.unwrap_or(state.step);
+        let (seq, step) = (state.seq, state.step);
         let sent = Arc::new(Sent {
-            id: Some(format!("{}-{seq}", self.run)),
+            id: Some(self.id_of(Position { seq, step })),
             seq,
             ..unnumbered(event, Some(topic), about)
         });
@@ -180,14 +220,14 @@ impl Hub {
     pub(in crate::app) fn map(&self, change: &MapChange) {
         let about = (change.site.clone(), None);
         let event = Event::Map(Box::new(change.clone()));
-        self.publish_about(&event, Topic::Map, Some(about));
+        self.publish_about(&event, (Topic::Map, None), Some(about));
     }
 
     /// Publishes the present state of an alert.
     pub(in crate::app) fn alert(&self, alert: &Alert) {
         let about = alert.robot_key().map(|(site, robot)| (site, Some(robot)));
         let event = Event::Alert(Box::new(alert.clone()));
-        self.publish_about(&event, Topic::Alerts, about);
+        self.publish_about(&event, (Topic::Alerts, None), about);
     }
 
     /// Drops clients that do not read their snapshot in time, and closes the connections of those
@@ -212,12 +252,18 @@ impl Hub {
 
     /// Returns the events that a client missed since `last`; `None` if they are no longer kept.
     pub(super) fn missed(&self, last: &str, filter: &EventFilter) -> Option<VecDeque<Arc<Sent>>> {
-        let (run, seq) = last.rsplit_once('-')?;
-        let seq: u64 = seq.parse().ok()?;
+        let (run, at) = read_id(last)?;
         if run != self.run {
             return None;
         }
-        self.since(seq, filter)
+        self.since(at.seq, filter)
+    }
+
+    /// Returns the key of the last transition that a client has read from another run of the server, or
+    /// from another server of the same database; `None` for an event of this run.
+    pub(super) fn step_elsewhere(&self, last: &str) -> Option<i64> {
+        let (run, at) = read_id(last)?;
+        (run != self.run).then_some(at.step)
     }
 
     /// Returns the events since `seq` that pass a filter; `None` if they are no longer kept.

@@ -6,6 +6,15 @@ use tread_api::event::{Event, Topic};
 use tread_api::ids::{RobotId, SiteId};
 use tread_api::rights::Scope;
 
+/// A place in the order of events.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Position {
+    /// Number of the event in this run of the server.
+    pub(super) seq: u64,
+    /// Key of the newest transition of a mission up to it, the same for every server of a database.
+    pub(super) step: i64,
+}
+
 /// One encoded event.
 #[derive(Debug)]
 pub struct Sent {

@@ -17,7 +17,7 @@ use tread_api::robot::Alert;
 
 use super::super::{App, AppError};
 use super::ALERTS_MAX;
-use super::sent::{EventFilter, Sent, unnumbered};
+use super::sent::{EventFilter, Position, Sent, unnumbered};
 use crate::app::enrolment::FLEET_ROBOTS_MAX;
 use crate::app::presence::RobotKey;
 use crate::db;
@@ -38,8 +38,8 @@ const MISSIONS_BYTES_MAX: usize = 4 * 1024 * 1024;
 /// Present state at one event, for all clients of the same topics, site and scope.
 #[derive(Debug)]
 pub(super) struct Snapshot {
-    /// Sequence number of the newest event that is included.
-    covered: u64,
+    /// The newest event that is included.
+    covered: Position,
     events: Vec<Arc<Sent>>,
     bytes: usize,
 }
@@ -53,8 +53,8 @@ pub(super) struct Reading {
 }
 
 impl Reading {
-    /// Returns the sequence number of the newest event that the snapshot includes.
-    pub(super) fn covered(&self) -> u64 {
+    /// Returns the newest event that the snapshot includes.
+    pub(super) fn covered(&self) -> Position {
         self.snapshot.covered
     }
 
@@ -115,7 +115,7 @@ impl App {
         });
         let mut shared = usable.filter_map(|built| built.snapshot.upgrade());
         let found = shared.find_map(|snapshot| {
-            let since = self.hub().since(snapshot.covered, filter)?;
+            let since = self.hub().since(snapshot.covered.seq, filter)?;
             Some((snapshot, since))
         });
         let (snapshot, since) = match found {
@@ -135,7 +135,7 @@ impl App {
                     snapshot: Arc::downgrade(&snapshot),
                 });
                 // Events that are no longer kept are in the client's own buffer.
-                let since = self.hub().since(snapshot.covered, filter);
+                let since = self.hub().since(snapshot.covered.seq, filter);
                 (snapshot, since.unwrap_or_default())
             }
         };
@@ -203,7 +203,7 @@ impl App {
         }
         drop(tx);
         events.push(Sent {
-            id: Some(format!("{}-{covered}", self.hub().run)),
+            id: Some(self.hub().id_of(covered)),
             ..unnumbered(&Event::SnapshotEnd, None, None)
         });
         let bytes = events.iter().map(|event| event.text.len()).sum();

@@ -59,8 +59,10 @@ const LOOK_UP_TURNS: usize = 2;
 const STOP_LOOK_UP_TURNS: usize = 1;
 /// Maximum time that a look-up waits for its turn.
 const LOOK_UP_WAIT_MAX: Duration = Duration::from_secs(5);
-/// Interval at which valid tokens and sessions are read again.
-const READ_AGAIN: Duration = Duration::from_secs(2);
+/// Interval at which valid tokens and sessions are read again: of other processes only `init` changes them.
+pub const READ_AGAIN: Duration = Duration::from_secs(2);
+/// The same in a standby, where another server changes them.
+pub const READ_AGAIN_BY_STANDBY: Duration = Duration::from_millis(500);
 
 /// State of authentication in memory.
 #[derive(Debug)]
@@ -337,12 +339,12 @@ impl App {
     }
 }
 
-/// Reads the valid tokens and sessions periodically until the stop.
-pub async fn run(app: App, stop: CancellationToken) {
+/// Reads the valid tokens and sessions at an interval until the stop.
+pub async fn run(app: App, every: Duration, stop: CancellationToken) {
     loop {
         tokio::select! {
             () = stop.cancelled() => return,
-            () = tokio::time::sleep(READ_AGAIN) => {}
+            () = tokio::time::sleep(every) => {}
         }
         if let Err(error) = db::limited(app.know_tokens()).await {
             app.log_failure("read the valid tokens", &error);

@@ -13,57 +13,30 @@
 
 use std::collections::{BTreeSet, HashMap};
 use std::sync::PoisonError;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-use tokio::sync::{Notify, Semaphore, SemaphorePermit};
+use tokio::sync::SemaphorePermit;
 use tokio_util::sync::CancellationToken;
-use tread_api::ids::{ConfigurationId, RobotId};
 
-use super::{Folded, Maps, Sites, labelled};
+use super::block_memory::MIB;
+use super::{Maps, labelled};
 use crate::app::{App, AppError};
 use crate::db::sites::SiteRow;
-use crate::db::sums::{SumKey, SumRow};
-use crate::db::{self, DbError};
+use crate::db::sums::SumRow;
+use crate::db::{self, DbError, Tx};
 use crate::friction::index::{Absent, Block, BlockBuilder, BlockCells, Cells, Pin, SiteMap, Stamp};
 
-/// Bytes of a MiB.
-const MIB: usize = 1 << 20;
-/// Minimum of the memory that one read may take.
-const READ_BYTES_MIN: usize = 64 * MIB;
-/// The same with a memory of 0, which tests have: a few small blocks.
-const READ_BYTES_WITHOUT_MEMORY: usize = 16_384;
 /// One read may have so many blocks, however large: with fewer none could go from one to the next.
 const READ_BLOCKS_MIN: usize = 4;
-/// One read may take this share of the memory.
-const READ_SHARE: usize = 8;
-/// Number of requests that may have blocks loaded for them at a time, and of robots' missions; each
-/// uses a connection to the database, one block after another.
-const LOADS_MAX: usize = 2;
 /// Maximum number of blocks that are read in one snapshot.
 const BLOCKS_AT_ONCE: usize = 16;
-/// Number of sums after which a snapshot reads no further block.
-const SUMS_AT_ONCE: usize = 32_768;
 /// Maximum number of times that a block is read because sums were removed or merged meanwhile.
 const READ_AGAIN_MAX: usize = 5;
 /// Minimum time between two evictions after uploads.
 const EVICT_EVERY_MIN: Duration = Duration::from_millis(100);
 /// Number of blocks that are evicted at a time under the lock of the map.
 const EVICTED_AT_ONCE: usize = 256;
-
-/// The memory for blocks.
-#[derive(Debug)]
-pub(super) struct BlockMemory {
-    limit_bytes: usize,
-    /// Number of reads of maps so far, the clock of their last uses.
-    lru_clock: AtomicU64,
-    load_turns: Semaphore,
-    load_turns_of_robots: Semaphore,
-    /// Blocks take more than the limit.
-    full: Notify,
-    read: AtomicU64,
-    evicted: AtomicU64,
-}
 
 /// What the blocks of all maps take, and what happened to them since the start.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -78,118 +51,6 @@ pub struct BlockCounts {
     pub read: u64,
     /// Number of blocks that left memory.
     pub evicted: u64,
-}
-
-/// Names of the database keys of robots and configurations that are on any map.
-#[derive(Debug, Default)]
-pub(super) struct KeyNames {
-    robots: HashMap<i64, RobotId>,
-    configurations: HashMap<i64, ConfigurationId>,
-}
-
-impl KeyNames {
-    pub(super) fn note(&mut self, folded: &Folded) {
-        let key = &folded.key;
-        let robot = self.robots.entry(key.robot_pk);
-        robot.or_insert_with(|| folded.robot.clone());
-        self.configurations
-            .entry(key.configuration_pk)
-            .or_insert(folded.configuration);
-    }
-
-    fn of(&self, key: &SumKey) -> Option<(&RobotId, ConfigurationId)> {
-        let robot = self.robots.get(&key.robot_pk)?;
-        let configuration = self.configurations.get(&key.configuration_pk)?;
-        Some((robot, *configuration))
-    }
-}
-
-impl BlockMemory {
-    pub(super) fn new(limit_mib: u64) -> Self {
-        let limit_mib = usize::try_from(limit_mib).unwrap_or(usize::MAX);
-        Self {
-            limit_bytes: limit_mib.saturating_mul(MIB),
-            lru_clock: AtomicU64::new(0),
-            load_turns: Semaphore::new(LOADS_MAX),
-            load_turns_of_robots: Semaphore::new(LOADS_MAX),
-            full: Notify::new(),
-            read: AtomicU64::new(0),
-            evicted: AtomicU64::new(0),
-        }
-    }
-
-    /// Returns how many bytes of blocks one read may need.
-    fn read_bytes_max(&self) -> usize {
-        match self.limit_bytes / READ_SHARE {
-            0 => READ_BYTES_WITHOUT_MEMORY,
-            share => share.max(READ_BYTES_MIN),
-        }
-    }
-
-    /// Returns the number of sums after which a snapshot reads no further block.
-    fn sums_at_once(&self) -> usize {
-        match self.limit_bytes {
-            0 => 1,
-            _ => SUMS_AT_ONCE,
-        }
-    }
-
-    /// Returns the time on the clock of last uses.
-    pub(super) fn lru_time(&self) -> u64 {
-        self.lru_clock.load(Ordering::Relaxed)
-    }
-
-    fn tick(&self) -> u64 {
-        self.lru_clock.fetch_add(1, Ordering::Relaxed)
-    }
-
-    /// Wakes the task that evicts blocks if they take too much.
-    pub(super) fn wake_if_full(&self, sites: &Sites) {
-        if sites.bytes() > self.limit_bytes {
-            self.full.notify_one();
-        }
-    }
-
-    /// Returns the blocks to evict, the least recently used first, and so many that it is done rarely;
-    /// none if all fit.
-    fn eviction_candidates(&self, sites: &Sites) -> Vec<(i64, Block)> {
-        let bytes = sites.bytes();
-        if bytes <= self.limit_bytes {
-            return Vec::new();
-        }
-        let of_map = |(&pk, map): (&i64, &SiteMap)| {
-            let idle = map.idle_blocks();
-            let idle = idle.map(|(used, block, bytes)| (used, pk, block, bytes));
-            idle.collect::<Vec<_>>()
-        };
-        let mut idle: Vec<_> = sites.maps.iter().flat_map(of_map).collect();
-        idle.sort_unstable();
-        let mut spare = bytes - (self.limit_bytes - self.limit_bytes / 8);
-        let enough = idle.into_iter().take_while(move |(_, _, _, bytes)| {
-            let is_needed = spare > 0;
-            spare = spare.saturating_sub(*bytes);
-            is_needed
-        });
-        enough.map(|(_, pk, block, _)| (pk, block)).collect()
-    }
-
-    /// Takes these blocks out of memory, unless something uses them by now.
-    fn take(&self, sites: &mut Sites, blocks: &[(i64, Block)]) -> Vec<BlockCells> {
-        let mut taken = Vec::new();
-        for (pk, block) in blocks {
-            let map = sites.maps.get_mut(pk);
-            taken.extend(map.and_then(|map| map.evict(*block)));
-        }
-        let count = u64::try_from(taken.len()).unwrap_or_default();
-        self.evicted.fetch_add(count, Ordering::Relaxed);
-        taken
-    }
-
-    /// Evicts blocks of maps that nobody else has yet.
-    pub(super) fn evict(&self, sites: &mut Sites) {
-        let candidates = self.eviction_candidates(sites);
-        self.take(sites, &candidates);
-    }
 }
 
 /// Blocks that are kept in memory as long as this exists.
@@ -304,23 +165,29 @@ impl Maps {
     }
 
     /// Puts the blocks of a snapshot into memory, with the sums that are unwritten in it, and keeps them
-    /// there; `false` if sums were removed or merged since.
+    /// there. Returns their number; `None` if sums were removed or merged since.
     ///
     /// # Errors
     /// A sum has a name that the map does not know.
-    fn insert(&self, row: &SiteRow, snapshot: Snapshot, pins: &mut Pins) -> Result<bool, DbError> {
+    fn insert(
+        &self,
+        row: &SiteRow,
+        snapshot: Snapshot,
+        pins: &mut Pins,
+    ) -> Result<Option<usize>, DbError> {
         let Snapshot {
             stamp,
             blocks,
             watermarks,
         } = snapshot;
+        let count = blocks.len();
         let mut sites = self.sites.write().unwrap_or_else(PoisonError::into_inner);
         let sites = &mut *sites;
         let Some(map) = sites.maps.get_mut(&row.pk) else {
-            return Ok(false);
+            return Ok(None);
         };
         if map.stamp() != stamp {
-            return Ok(false);
+            return Ok(None);
         }
         map.set_lru_time(self.memory.lru_time());
         let unwritten = self.unwritten();
@@ -338,7 +205,7 @@ impl Maps {
             map.insert(block, cells, since.ok_or_else(|| unnamed(row, block))?);
             pins.add(map, block);
         }
-        Ok(true)
+        Ok(Some(count))
     }
 }
 
@@ -385,10 +252,8 @@ impl App {
                 is_first = false;
                 continue;
             }
-            let _reading = maps.begin_read();
-            let snapshot = db::limited(self.snapshot_of(row, &absent)).await?;
-            let count = snapshot.blocks.len();
-            if maps.insert(row, snapshot, pins)? {
+            let loading = db::limited(self.load_some(row, &absent, pins));
+            if let Some(count) = loading.await? {
                 let read = u64::try_from(count).unwrap_or_default();
                 maps.memory.read.fetch_add(read, Ordering::Relaxed);
                 (tries, is_first) = (0, false);
@@ -403,12 +268,49 @@ impl App {
         Ok(())
     }
 
-    /// Reads the first of some blocks, and further ones as long as they are small.
-    async fn snapshot_of(&self, row: &SiteRow, absent: &[Block]) -> Result<Snapshot, DbError> {
+    /// Loads the first of some blocks, and further ones as long as they are small. Returns their number;
+    /// `None` if sums were removed or merged meanwhile.
+    async fn load_some(
+        &self,
+        row: &SiteRow,
+        absent: &[Block],
+        pins: &mut Pins,
+    ) -> Result<Option<usize>, DbError> {
         let maps = self.maps();
-        let stamp = maps.look(row, SiteMap::stamp);
-        let mut tx = self.db().read("map block").await?;
-        let watermarks = db::watermarks::all(&mut tx).await?;
+        let _reading = maps.begin_read();
+        let snapshot = match maps.follower() {
+            None => {
+                let stamp = maps.look(row, SiteMap::stamp);
+                let mut tx = self.db().read("map block").await?;
+                self.snapshot_of(&mut tx, (row, stamp), absent).await?
+            }
+            Some(follower) => {
+                let mut turn = follower.turn().await;
+                let mut tx = self.db().read("map block").await?;
+                if !self.follow_in(&mut tx, &mut turn).await? {
+                    return Err(DbError::Unsettled);
+                }
+                let stamp = maps.look(row, SiteMap::stamp);
+                let snapshot = self.snapshot_of(&mut tx, (row, stamp), absent).await?;
+                if maps.unwritten().is_divided_by(&snapshot.watermarks) {
+                    return Err(DbError::Unsettled);
+                }
+                // Before anything is added that is in this snapshot.
+                return maps.insert(row, snapshot, pins);
+            }
+        };
+        maps.insert(row, snapshot, pins)
+    }
+
+    /// Reads the first of some blocks of a map with this stamp, and further ones as long as they are small.
+    async fn snapshot_of(
+        &self,
+        tx: &mut Tx,
+        (row, stamp): (&SiteRow, Stamp),
+        absent: &[Block],
+    ) -> Result<Snapshot, DbError> {
+        let maps = self.maps();
+        let watermarks = db::watermarks::all(tx).await?;
         let mut blocks = Vec::with_capacity(absent.len());
         let sums_max = maps.memory.sums_at_once();
         let mut sums = 0;
@@ -416,7 +318,7 @@ impl App {
             let mut cells = BlockBuilder::default();
             let mut is_known = true;
             let at = (block.row, block.column);
-            db::sums::of_block(&mut tx, row.pk, at, |sum| {
+            db::sums::of_block(tx, row.pk, at, |sum| {
                 sums += 1;
                 is_known &= maps.build(row, &mut cells, &sum);
             })

@@ -6,19 +6,16 @@ use std::sync::{Arc, PoisonError};
 use std::time::Duration;
 
 use futures_util::TryStreamExt as _;
-use tread_api::ids::{ConfigurationId, RobotId};
 use tread_api::rights::Scope;
 
-use super::blocks::BlockMemory;
+use super::block_memory::BlockMemory;
+use super::names::Names;
 use super::unwritten::Unwritten;
-use super::{Folded, Maps, Sites};
+use super::{Maps, Sites, following};
 use crate::app::App;
-use crate::db::segments::{Added, KeyedSegment};
-use crate::db::sums::SumKey;
-use crate::db::withdrawals::WithdrawalRow;
+use crate::db::segments::Added;
 use crate::db::{self, DbError, Tx};
 use crate::friction::index::SiteMap;
-use crate::friction::{Sums, epoch_h};
 
 /// Number of sums after which cells leave memory if all together need too much of it.
 const EVICT_EVERY: usize = 10_000;
@@ -27,13 +24,8 @@ const EVICT_EVERY: usize = 10_000;
 struct Read {
     sites: Sites,
     unwritten: Unwritten,
-}
-
-/// Database keys of what a segment names.
-struct Names {
-    robots: HashMap<i64, RobotId>,
-    configurations: HashMap<i64, ConfigurationId>,
-    withdrawals: Vec<WithdrawalRow>,
+    names: Names,
+    watermarks: HashMap<i64, i64>,
 }
 
 impl App {
@@ -52,39 +44,68 @@ impl App {
     /// The database failed; memory is unchanged.
     pub(in crate::app) async fn load_map_again(&self, ended: u64) -> Result<(), DbError> {
         let mut order = Arc::clone(&self.maps().order).lock_owned().await;
+        let maps = self.maps();
+        let mut following = match maps.follower() {
+            Some(follower) => Some(follower.turn().await),
+            None => None,
+        };
         let mut tx = self.db().read("map").await?;
         let now = self.clock().elapsed();
-        let read = read(&mut tx, now, &self.maps().memory).await?;
+        let empty = match following {
+            Some(_) => Unwritten::of_ranges(),
+            None => Unwritten::default(),
+        };
+        let read = read(&mut tx, now, (&maps.memory, empty)).await?;
         self.removed().extend(db::removed::boots(&mut tx).await?);
+        if let Some(following) = &mut following {
+            let leader = db::leader::get(&mut tx).await?;
+            let last = db::segment_ranges::last(&mut tx).await?;
+            let (last_pk, _) = last.unwrap_or_default();
+            self.db().follow(leader.generation);
+            let (names, watermarks) = (read.names, read.watermarks);
+            **following = following::Read::from(last_pk, &leader, names, watermarks);
+        }
         drop(tx);
-        self.maps().replace(read);
+        maps.replace(read.sites, read.unwritten);
         *order = ended;
         Ok(())
     }
 }
 
 impl Maps {
+    /// Takes all maps out, and the unwritten sums in a form in which this process can store them.
+    pub(super) fn take(&self) -> (Sites, Unwritten) {
+        let mut sites = self.sites.write().unwrap_or_else(PoisonError::into_inner);
+        let mut unwritten = std::mem::take(&mut *self.unwritten());
+        unwritten.may_be_stored();
+        (std::mem::take(&mut *sites), unwritten)
+    }
+
     /// Replaces the maps by those read from the database.
-    fn replace(&self, mut read: Read) {
+    pub(super) fn replace(&self, mut read: Sites, mut read_unwritten: Unwritten) {
         let mut sites = self.sites.write().unwrap_or_else(PoisonError::into_inner);
         for (pk, before) in sites.maps.drain() {
-            match read.sites.maps.get_mut(&pk) {
+            match read.maps.get_mut(&pk) {
                 Some(map) => map.follow(&before),
                 None => {
-                    read.sites.maps.insert(pk, before);
+                    read.maps.insert(pk, before);
                 }
             }
         }
-        *sites = read.sites;
+        *sites = read;
         let mut unwritten = self.unwritten();
-        read.unwritten.follow(&mut unwritten);
-        *unwritten = read.unwritten;
+        read_unwritten.follow(&mut unwritten);
+        *unwritten = read_unwritten;
     }
 }
 
 /// Reads all sums. Cells stay in memory as far as there is room; a block that has left it once gets
 /// no further sums, so it is read again as a whole when it is needed.
-async fn read(tx: &mut Tx, now: Duration, memory: &BlockMemory) -> Result<Read, DbError> {
+async fn read(
+    tx: &mut Tx,
+    now: Duration,
+    (memory, mut unwritten): (&BlockMemory, Unwritten),
+) -> Result<Read, DbError> {
     let mut sites = Sites::default();
     let mut after = String::new();
     loop {
@@ -95,11 +116,7 @@ async fn read(tx: &mut Tx, now: Duration, memory: &BlockMemory) -> Result<Read, 
             sites.ensure(row);
         }
     }
-    let names = Names {
-        robots: db::robots::ids_by_key(tx).await?,
-        configurations: db::robots::configurations_by_key(tx).await?,
-        withdrawals: db::withdrawals::all(tx).await?,
-    };
+    let names = Names::read(tx).await?;
     let mut added = 0_usize;
     db::sums::each(tx, |row| {
         // The foreign keys of a sum guarantee both names.
@@ -113,7 +130,7 @@ async fn read(tx: &mut Tx, now: Duration, memory: &BlockMemory) -> Result<Read, 
     })
     .await?;
     let watermarks = db::watermarks::all(tx).await?;
-    let mut unwritten = Unwritten::following(watermarks.clone());
+    unwritten.start_at(watermarks.clone());
     for (robot_pk, last_pk) in db::segment_ranges::last_keys(tx).await? {
         let watermark = watermarks.get(&robot_pk).copied().unwrap_or_default();
         // A damaged table of measurements does not keep a server from starting that needs none.
@@ -122,8 +139,9 @@ async fn read(tx: &mut Tx, now: Duration, memory: &BlockMemory) -> Result<Read, 
         }
         let mut following = pin!(db::segments::of_robot(tx, robot_pk, watermark));
         while let Some(row) = following.try_next().await? {
+            // What was committed together is stored together.
             let keys = Added {
-                first: row.pk,
+                first: row.range_pk,
                 last: row.pk,
             };
             if let Some(folded) = names.folded(row)? {
@@ -137,48 +155,10 @@ async fn read(tx: &mut Tx, now: Duration, memory: &BlockMemory) -> Result<Read, 
         }
     }
     memory.evict(&mut sites);
-    Ok(Read { sites, unwritten })
-}
-
-impl Names {
-    fn named(&self, key: SumKey, sums: Sums) -> Option<Folded> {
-        Some(Folded {
-            robot: self.robots.get(&key.robot_pk)?.clone(),
-            configuration: *self.configurations.get(&key.configuration_pk)?,
-            cells: vec![(key.cell, sums)],
-            key,
-        })
-    }
-
-    /// Returns the sum of a stored segment, as it was added before its receipt; `None` if it is
-    /// withdrawn.
-    fn folded(&self, row: KeyedSegment) -> Result<Option<Folded>, DbError> {
-        let KeyedSegment {
-            pk,
-            robot_pk,
-            site_pk,
-            configuration_pk,
-            segment,
-            ..
-        } = row;
-        // It was checked in the transaction that stored it.
-        let sums = Sums::of(&segment).ok_or_else(|| DbError::Corrupt {
-            what: "measurement out of range",
-            value: pk.to_string(),
-        })?;
-        let key = SumKey {
-            robot_pk,
-            epoch_h: epoch_h(segment.ended_at),
-            cell: segment.cell,
-            terrain: segment.terrain,
-            grid_revision: segment.grid_revision,
-            site_pk,
-            configuration_pk,
-        };
-        let is_withdrawn = |row: &WithdrawalRow| row.includes(robot_pk, key.epoch_h);
-        if self.withdrawals.iter().any(is_withdrawn) {
-            return Ok(None);
-        }
-        Ok(self.named(key, sums))
-    }
+    Ok(Read {
+        sites,
+        unwritten,
+        names,
+        watermarks,
+    })
 }

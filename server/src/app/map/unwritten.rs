@@ -117,12 +117,37 @@ impl Generation {
 }
 
 impl Unwritten {
-    /// Creates unwritten sums that follow stored watermarks.
-    pub(super) fn following(watermarks: HashMap<i64, i64>) -> Self {
+    /// Creates unwritten sums of a standby: those of each range of the ledger are a generation, since another
+    /// server stores them up to the end of any.
+    pub(super) fn of_ranges() -> Self {
         Self {
-            watermarks,
+            generation_sums: 0,
             ..Self::default()
         }
+    }
+
+    /// Makes the unwritten sums of a standby those of the server that it becomes, in which no block is read.
+    pub(super) fn may_be_stored(&mut self) {
+        self.generation_sums = TRANSACTION_SUMS;
+        self.reads.clear();
+        self.stored_meanwhile.clear();
+    }
+
+    /// Sets the stored watermarks, which all sums follow that are added.
+    pub(super) fn start_at(&mut self, watermarks: HashMap<i64, i64>) {
+        self.watermarks = watermarks;
+    }
+
+    /// Returns whether a generation is stored in part by these watermarks, so that [`Self::since`] cannot
+    /// tell what is stored.
+    pub(super) fn is_divided_by(&self, watermarks: &HashMap<i64, i64>) -> bool {
+        self.robots.iter().any(|(robot_pk, generations)| {
+            let stored_to = watermarks.get(robot_pk).copied().unwrap_or_default();
+            let is_divided = |generation: &Generation| {
+                generation.keys.first <= stored_to && stored_to < generation.keys.last
+            };
+            generations.iter().any(is_divided)
+        })
     }
 
     /// Adds sums of segments that were committed together, with the keys of these. The keys of sums

@@ -4,7 +4,7 @@ use prometheus_client::metrics::counter::ConstCounter;
 use prometheus_client::metrics::gauge::ConstGauge;
 use prometheus_client::registry::{Registry, Unit};
 
-use super::{App, count};
+use super::{App, AppError, count};
 
 impl App {
     /// Registers the sums that are not stored yet.
@@ -45,5 +45,18 @@ impl App {
         let help = "Blocks of the map that left memory because others needed the room";
         let evicted = ConstCounter::new(blocks.evicted);
         registry.register("tread_map_blocks_evicted", help, evicted);
+    }
+
+    /// Registers how many standbys follow the database, or, in a standby, how old its map is.
+    pub(super) async fn register_standbys(&self, registry: &mut Registry) -> Result<(), AppError> {
+        if let Some(age) = self.map_age() {
+            let help = "Time since the map of this standby was up to date";
+            let age = ConstGauge::new(age.as_secs_f64());
+            registry.register_with_unit("tread_standby_map_age", help, Unit::Seconds, age);
+        } else if let Some(standbys) = self.standbys().await? {
+            let help = "Standbys that follow the database of this server";
+            registry.register("tread_standbys", help, ConstGauge::new(standbys));
+        }
+        Ok(())
     }
 }

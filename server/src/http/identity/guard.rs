@@ -449,7 +449,7 @@ fn say_how(response: &mut Response) {
 }
 
 /// Returns the secret in a request, and how it was shown; a header takes precedence over a cookie.
-fn shown(headers: &HeaderMap, is_tls: bool) -> Option<(&str, Shown)> {
+pub(in crate::http) fn shown(headers: &HeaderMap, is_tls: bool) -> Option<(&str, Shown)> {
     if let Some(value) = headers.get(header::AUTHORIZATION) {
         let text = value.to_str().unwrap_or_default();
         let (scheme, secret) = text.split_once(' ').unwrap_or_default();

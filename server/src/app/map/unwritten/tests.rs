@@ -202,7 +202,8 @@ impl Server {
             }
             Act::Kill => {
                 let generation_sums = self.unwritten.generation_sums;
-                self.unwritten = Unwritten::following(self.watermarks.clone());
+                self.unwritten = Unwritten::default();
+                self.unwritten.start_at(self.watermarks.clone());
                 self.unwritten.generation_sums = generation_sums;
                 (self.reads, self.snapshots) = ([None; 2], [None, None]);
                 for (pk, (key, sums)) in (1..).zip(&self.segments) {

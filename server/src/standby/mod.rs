@@ -1,4 +1,7 @@
-//! What a standby says while it waits for the database: in its log, and to the service manager.
+//! A standby while it waits for the database: what it says in its log and to the service manager, and the
+//! requests that it answers meanwhile ([`serving`]).
+
+pub(crate) mod serving;
 
 use std::time::Duration;
 

@@ -1,0 +1,148 @@
+//! The REST API of a standby: it answers what concerns the map alone, and has the server that has the database
+//! answer everything else.
+//!
+//! What it would refuse is forwarded too, so the other server decides about it, counts it and audits it.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::body::Body;
+use axum::extract::{Request, State};
+use axum::http::request::Parts;
+use axum::http::{Method, StatusCode};
+use axum::middleware::{from_fn, from_fn_with_state};
+use axum::response::{IntoResponse as _, Response};
+use axum::routing::get;
+use axum::{Extension, Router};
+use tower::ServiceExt as _;
+use tower_http::catch_panic::CatchPanicLayer;
+use tread_api::problem::ProblemType;
+
+use super::extract::{BodyLimit, Json};
+use super::forward::{ForwardError, Forwarder};
+use super::health::Health;
+use super::identity::browser;
+use super::identity::guard::{self, Guard, Peer};
+use super::problem::Problem;
+use super::{
+    Access, BODY_MAX, bound_time, broken, count_panics, map_routes, measure, with_request_id,
+};
+use crate::app::App;
+use crate::connections::Slot;
+use crate::identity::origin::Names;
+
+/// Maximum age of the map of a standby that is ready.
+const MAP_AGE_MAX: Duration = Duration::from_secs(2);
+
+/// What answers the requests to a standby.
+#[derive(Debug, Clone)]
+struct Standby {
+    app: App,
+    map: Router,
+    forwarder: Forwarder,
+    is_tls: bool,
+}
+
+/// Creates the router of a standby with these host names.
+pub fn router(app: App, names: Names, forwarder: Forwarder) -> Router {
+    let (map, openapi) = map_routes()
+        .layer(Extension(BodyLimit(BODY_MAX)))
+        .split_for_parts();
+    let is_tls = names.is_tls;
+    let names = Arc::new(names);
+    let guard = Guard::new(app.clone(), Access::of(&openapi), Arc::clone(&names));
+    let map = map
+        .layer(from_fn_with_state(guard, guard::stand))
+        .layer(Extension(Arc::clone(&names)))
+        .fallback(async || StatusCode::NOT_FOUND)
+        .method_not_allowed_fallback(async || StatusCode::NOT_FOUND);
+    let map = match browser::foreign_pages(&names.allowed_origins) {
+        Some(foreign_pages) => map.layer(foreign_pages),
+        None => map,
+    };
+    let map = map
+        .layer(from_fn_with_state(app.clone(), measure))
+        .layer(from_fn(bound_time))
+        .layer(CatchPanicLayer::custom(broken))
+        .layer(from_fn_with_state(app.clone(), count_panics))
+        .layer(from_fn_with_state(names, browser::set_headers))
+        .with_state(app.clone());
+    let standby = Standby {
+        app: app.clone(),
+        map,
+        forwarder,
+        is_tls,
+    };
+    let router = Router::new()
+        .route("/healthz", get(super::health::healthz))
+        .route("/readyz", get(readyz))
+        .fallback(move |request: Request| answer(standby.clone(), request));
+    with_request_id(router).with_state(app)
+}
+
+/// Answers from the map, or forwards the request.
+async fn answer(standby: Standby, request: Request) -> Response {
+    let is_read = matches!(*request.method(), Method::GET | Method::HEAD);
+    let (parts, body) = request.into_parts();
+    let own = if is_read {
+        let copy = Request::from_parts(parts.clone(), Body::empty());
+        let Ok(own) = standby.map.clone().oneshot(copy).await;
+        if own.status().is_success() || own.status() == StatusCode::NOT_MODIFIED {
+            return own;
+        }
+        Some(own)
+    } else {
+        None
+    };
+    if let Err(full) = standby.prove(&parts).await {
+        return full.into_response();
+    }
+    let request = Request::from_parts(parts, body);
+    match (standby.forwarder.forward(&standby.app, request).await, own) {
+        (Ok(answer), _) => answer,
+        (Err(error), Some(own)) if own.status() != StatusCode::NOT_FOUND => {
+            tracing::debug!("a refused request was not forwarded: {error}");
+            own
+        }
+        (Err(error), _) => Problem::from(error).into_response(),
+    }
+}
+
+impl Standby {
+    /// Counts the connection of a request among those of its token or session, so that no flood of others
+    /// displaces it. The server that has the database decides what it may do.
+    ///
+    /// # Errors
+    /// The token has as many connections as it may.
+    async fn prove(&self, parts: &Parts) -> Result<(), Problem> {
+        let (Some(slot), Some(&Peer(address)), Some((text, shown))) = (
+            parts.extensions.get::<Arc<Slot>>(),
+            parts.extensions.get::<Peer>(),
+            guard::shown(&parts.headers, self.is_tls),
+        ) else {
+            return Ok(());
+        };
+        let purpose = guard::purpose_of_path(&parts.method, parts.uri.path());
+        let found = self.app.authenticate(address, text, shown, purpose).await;
+        let Ok(credential) = found else { return Ok(()) };
+        slot.prove(credential.subject, purpose)
+            .map_err(|full| Problem::new(ProblemType::TooManyRequests).detail(full.to_string()))
+    }
+}
+
+/// Says whether this standby can answer all requests, alone or by the other server.
+async fn readyz(State(app): State<App>) -> Result<Json<Health>, Problem> {
+    let unavailable = |detail: String| Err(Problem::new(ProblemType::Unavailable).detail(detail));
+    match app.map_age() {
+        Some(age) if age <= MAP_AGE_MAX => {}
+        Some(age) => {
+            let seconds = age.as_secs();
+            return unavailable(format!("standby: its map was up to date {seconds} s ago"));
+        }
+        None => return unavailable("standby: it reads the map".to_owned()),
+    }
+    if app.leader_url().is_none() {
+        return unavailable(ForwardError::NoAddress.to_string());
+    }
+    Ok(super::health::ok())
+}

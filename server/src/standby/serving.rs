@@ -1,0 +1,190 @@
+//! What a standby answers while it waits for the database: it follows the map, and forwards to the server that
+//! has the database what it cannot answer ([`crate::http::standby`]).
+
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use anyhow::Context as _;
+use tokio::task::JoinSet;
+use tokio_util::sync::CancellationToken;
+use tracing::{info, warn};
+
+use crate::app::identity::READ_AGAIN_BY_STANDBY;
+use crate::app::robot_link::RobotLink;
+use crate::app::{App, Dependencies, following, identity, map_blocks};
+use crate::authority::Authorities;
+use crate::clock::Clock;
+use crate::config::{Config, TlsSource};
+use crate::db::Db;
+use crate::http;
+use crate::http::forward::Forwarder;
+use crate::http::serve::Serving;
+use crate::identity::address::TrustedProxies;
+use crate::supervisor::Supervisor;
+use crate::{listen_for_http, listen_for_metrics, open_tls};
+
+/// Delay after a failure.
+const RETRY: Duration = Duration::from_secs(2);
+
+/// The tasks of a standby that answers requests.
+#[derive(Debug)]
+pub(crate) struct StandbyServing {
+    tasks: JoinSet<()>,
+    stop: CancellationToken,
+    serving: Arc<Mutex<Option<App>>>,
+}
+
+impl StandbyServing {
+    /// Begins to answer requests; tries again as long as that fails.
+    pub(crate) fn start(config: Config, clock: Clock) -> Self {
+        let stop = CancellationToken::new();
+        let serving = Arc::default();
+        let mut tasks = JoinSet::new();
+        tasks.spawn(serve(config, clock, (stop.clone(), Arc::clone(&serving))));
+        Self {
+            tasks,
+            stop,
+            serving,
+        }
+    }
+
+    /// Accepts no further connections, and frees the addresses; what is open ends soon. Returns what has the
+    /// map, if it was read.
+    pub(crate) async fn end(mut self) -> Option<App> {
+        self.stop.cancel();
+        // A panic has been logged, and frees the addresses too.
+        let _ = self.tasks.join_next().await;
+        lock(&self.serving).take()
+    }
+}
+
+fn lock(serving: &Mutex<Option<App>>) -> MutexGuard<'_, Option<App>> {
+    serving.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Answers requests until the stop; `shown` has the use cases while that works.
+async fn serve(
+    config: Config,
+    clock: Clock,
+    (stop, shown): (CancellationToken, Arc<Mutex<Option<App>>>),
+) {
+    let mut logged = String::new();
+    loop {
+        let serving = serve_once(&config, &clock, (&stop, &shown));
+        let Err(error) = serving.await else { return };
+        lock(&shown).take();
+        let reason = format!("{error:#}");
+        if reason != logged {
+            warn!("standby: it answers no requests: {reason}");
+            logged = reason;
+        }
+        tokio::select! {
+            biased;
+            () = stop.cancelled() => return,
+            () = tokio::time::sleep(RETRY) => {}
+        }
+    }
+}
+
+/// Answers requests until the stop.
+///
+/// # Errors
+/// It cannot begin, or a task has failed.
+async fn serve_once(
+    config: &Config,
+    clock: &Clock,
+    (stop, shown): (&CancellationToken, &Mutex<Option<App>>),
+) -> anyhow::Result<()> {
+    let supervisor = Supervisor::new();
+    let serving = serve_with(config, clock, (&supervisor, shown));
+    let served = tokio::select! {
+        biased;
+        () = stop.cancelled() => Ok(()),
+        served = serving => served,
+    };
+    // Connections end by themselves.
+    supervisor.stop_token().cancel();
+    served
+}
+
+async fn serve_with(
+    config: &Config,
+    clock: &Clock,
+    (supervisor, shown): (&Supervisor, &Mutex<Option<App>>),
+) -> anyhow::Result<()> {
+    let db = Db::open_to_read(&config.database).await?;
+    let db = db.context("a file has one server")?;
+    let authorities = config.robots.as_ref();
+    let authorities = authorities.map(|robots| Authorities::read(&robots.authority));
+    let authorities = authorities.transpose()?.map(Arc::new);
+    let tls = open_tls(config, authorities.as_ref(), clock)?;
+    let forwarder = forwarder(config, authorities.as_deref())?;
+    let app = App::new(Dependencies {
+        friction: config.friction,
+        normalisations: config.normalisations.clone(),
+        map: config.map,
+        robots: RobotLink::unconnected(supervisor.clone()),
+        is_standby: true,
+        ..Dependencies::on_database(db, clock.clone())
+    });
+    app.load_map().await?;
+    *lock(shown) = Some(app.clone());
+    if let Err(error) = app.know_tokens().await {
+        app.log_failure("read the valid tokens", &error);
+    }
+    let listener = listen_for_http(config.http)?;
+    let address = listener.local_addr()?;
+    let scheme = if tls.is_some() { "https" } else { "http" };
+    let serving = Serving {
+        listener,
+        router: http::standby::router(app.clone(), config.names(), forwarder),
+        tls: tls.clone(),
+        proxies: Arc::new(TrustedProxies::new(config.web.trusted_proxies.clone())),
+    };
+    let metrics = config.metrics;
+    let metrics = metrics.map(|address| listen_for_metrics(address, &app));
+    let metrics = metrics.transpose()?;
+    let stop = || supervisor.stop_token();
+    let run = |serving| http::serve::run(serving, app.clone(), supervisor.clone(), stop());
+    supervisor.spawn_vital("map", following::run(app.clone(), stop()));
+    supervisor.spawn_vital("map blocks", map_blocks::run(app.clone(), stop()));
+    let reading = identity::run(app.clone(), READ_AGAIN_BY_STANDBY, stop());
+    supervisor.spawn_vital("tokens", reading);
+    if let Some(tls) = tls {
+        let stop = stop();
+        let keeping = async move { http::tls::keep(&tls, stop, |_tls| {}).await };
+        supervisor.spawn_vital_unwatched("certificate", keeping);
+    }
+    info!("standby: answers on {scheme}://{address}");
+    if config.web.advertise_url.is_none() {
+        warn!(
+            "standby: no `[web] advertise_url`: after it has taken over, other standbys cannot forward to it"
+        );
+    }
+    let serving_metrics = async {
+        match metrics {
+            Some(metrics) => run(metrics).await,
+            None => std::future::pending().await,
+        }
+    };
+    tokio::select! {
+        () = run(serving) => {}
+        () = serving_metrics => {}
+        () = supervisor.stopping() => {}
+    }
+    anyhow::bail!("a task of the standby has ended")
+}
+
+/// Creates the client of the server that has the database.
+fn forwarder(config: &Config, authorities: Option<&Authorities>) -> anyhow::Result<Forwarder> {
+    let trusted = match (&config.web.advertise_authorities, &config.tls, authorities) {
+        (Some(file), _, _) => Some(std::fs::read(file).with_context(|| {
+            format!("cannot read `advertise_authorities`, `{}`", file.display())
+        })?),
+        (None, Some(TlsSource::Authority), Some(authorities)) => {
+            Some(authorities.present().bundle_pem().into_bytes())
+        }
+        (None, _, _) => None,
+    };
+    Ok(Forwarder::new(trusted.as_deref())?)
+}
