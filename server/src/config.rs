@@ -519,6 +519,12 @@ pub enum ConfigError {
          `pg_dump` (docs/postgresql.md): remove `[backup]`"
     )]
     BackupOfPostgres,
+    /// Another machine would send tokens in the clear.
+    #[error(
+        "`web.advertise_url`, `{0}`: standbys send the tokens of their clients there, so it must begin with \
+         `https://`, or be an address of this machine such as 127.0.0.1"
+    )]
+    AdvertisedInTheClear(Origin),
     /// `standby` is set for a database file.
     #[error(
         "`standby` needs a PostgreSQL database, which two machines can reach: a file has one server \
@@ -606,7 +612,8 @@ impl Config {
     /// of `[web]` and of `[robots]`, each once.
     pub fn certificate_names(&self) -> Vec<String> {
         let of_robots = self.robots.iter().flat_map(|robots| &robots.names);
-        let all = self.web.hosts.iter().chain(of_robots);
+        let hosts = self.hosts();
+        let all = hosts.iter().chain(of_robots);
         let mut names: Vec<String> = Vec::new();
         for name in all.filter(|name| is_port_name(name)) {
             if !names.contains(name) {
@@ -616,10 +623,17 @@ impl Config {
         names
     }
 
+    /// Returns the host names of this server, with that at which standbys reach it.
+    fn hosts(&self) -> Vec<String> {
+        let advertised = self.web.advertise_url.as_ref().map(Origin::host);
+        let hosts = self.web.hosts.iter().map(String::as_str);
+        hosts.chain(advertised).map(str::to_owned).collect()
+    }
+
     /// Returns the host names of this server and the allowed origins.
     pub fn names(&self) -> Names {
         Names {
-            hosts: self.web.hosts.clone(),
+            hosts: self.hosts(),
             allowed_origins: self.web.allowed_origins.clone(),
             is_tls: self.tls.is_some() || self.web.behind_https,
         }
@@ -663,6 +677,11 @@ impl Config {
                     address: *address,
                 });
             }
+        }
+        if let Some(url) = &self.web.advertise_url
+            && !url.is_safe()
+        {
+            return Err(ConfigError::AdvertisedInTheClear(url.clone()));
         }
         if let Some(robots) = &self.robots {
             robots.check()?;

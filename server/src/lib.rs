@@ -175,9 +175,9 @@ impl Server {
             archive,
             telemetry: Telemetry::start(&config.tracing, "tread-server")?,
             is_standby: false,
+            standby,
         });
-        let remembered = remember(&app, &config.site, standby.as_ref()).await;
-        drop(standby);
+        let remembered = remember(&app, &config.site).await;
         remembered.map_err(|error| not_readable(error, &config.database))?;
         let sender = Sender::new(app.webhook_rules().clone(), resolver)?;
         let listener = listen_for_http(config.http)?;
@@ -359,11 +359,11 @@ fn look_after_identities(app: &App, supervisor: &Supervisor) {
     supervisor.spawn_vital("provider", finding);
 }
 
-/// Loads the state in memory from the database, and the map from the standby that this process was, if any.
+/// Loads the state in memory from the database; the map may be that of the standby that this process was.
 ///
 /// # Errors
 /// The site, robots, map or enrolments cannot be read.
-async fn remember(app: &App, site: &SiteId, standby: Option<&App>) -> anyhow::Result<()> {
+async fn remember(app: &App, site: &SiteId) -> anyhow::Result<()> {
     // A failure only loses the protection against a clock set back; Stop must work all the same.
     if let Err(error) = app.continue_time().await {
         app.log_failure("continue the time of the database", &error);
@@ -376,11 +376,7 @@ async fn remember(app: &App, site: &SiteId, standby: Option<&App>) -> anyhow::Re
     if !app.presences().known().is_empty() {
         app.note_restart();
     }
-    let has_map = match standby {
-        Some(standby) => app.take_map(standby).await?,
-        None => false,
-    };
-    if !has_map {
+    if !app.take_map().await? {
         app.load_map().await?;
     }
     app.know_enrolments().await?;

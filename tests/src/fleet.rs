@@ -58,6 +58,8 @@ pub struct Fleet {
     other: Option<Other>,
     /// The network of the server, in a pair.
     network: Option<Network>,
+    /// Whether the servers of a pair say where their REST API is, so that a standby forwards to it.
+    is_advertised: bool,
     agents: HashMap<RobotId, Process>,
     agent_flags: Vec<String>,
     server_environment: Vec<(String, String)>,
@@ -170,6 +172,7 @@ impl Fleet {
             server_name: "server",
             other: None,
             network: None,
+            is_advertised: false,
             agents: HashMap::new(),
             agent_flags: Vec::new(),
             server_environment: Vec::new(),
@@ -416,7 +419,12 @@ impl Fleet {
             format!("--database={}", database.argument()),
             format!("--site={SITE}"),
         ];
-        if let Some(config) = &self.config {
+        if self.is_advertised {
+            let path = self.folder.path().join(format!("{name}.toml"));
+            let text = format!("[web]\nadvertise_url = \"http://{http}\"\n");
+            std::fs::write(&path, text).expect("the temporary folder can be written");
+            arguments.push(format!("--config={}", path.display()));
+        } else if let Some(config) = &self.config {
             arguments.push(format!("--config={}", config.display()));
         }
         if self.other.is_some() {

@@ -45,6 +45,8 @@ pub struct Dependencies {
     pub telemetry: Telemetry,
     /// Whether another server writes the database, and this one follows it.
     pub is_standby: bool,
+    /// The use cases of the standby that this process was, which have the map.
+    pub standby: Option<App>,
 }
 
 impl Dependencies {
@@ -66,6 +68,7 @@ impl Dependencies {
             map: MapConfig::default(),
             telemetry: Telemetry::default(),
             is_standby: false,
+            standby: None,
         }
     }
 }

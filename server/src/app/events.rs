@@ -23,8 +23,8 @@ use tread_api::ids::RobotId;
 pub use self::feed::{FEED_PERIOD, run};
 use self::hub::Client;
 pub use self::hub::{CLIENT_BUFFER, CLIENT_BYTES_MAX, Hub, KEPT_BYTES_MAX, KEPT_EVENTS_MAX};
-use self::sent::unnumbered;
 pub use self::sent::{EventFilter, Sent};
+use self::sent::{Position, unnumbered};
 use self::snapshot::Reading;
 pub use self::snapshot::SNAPSHOT_BYTES_MAX;
 use super::enrolment::FLEET_ROBOTS_MAX;
@@ -47,7 +47,7 @@ pub(super) const SHARES: Bounds = Bounds {
     each: CLIENTS_PER_IDENTITY_MAX,
 };
 /// Maximum number of transitions of missions that are sent to a client that comes from another run of the server.
-const STEPS_MISSED_MAX: u32 = 1_000;
+const STEPS_MISSED_MAX: u32 = 500;
 /// Maximum number of raised alerts in a snapshot.
 const ALERTS_MAX: u32 = 10_000;
 
@@ -207,31 +207,28 @@ impl App {
     }
 
     /// Returns the transitions of missions that a client has not read from another run of the server or
-    /// another server of the same database, up to one that a snapshot includes; none of more than
-    /// [`STEPS_MISSED_MAX`].
+    /// another server of the same database, up to one that a snapshot includes; only the newest
+    /// [`STEPS_MISSED_MAX`] of the whole fleet are looked at.
     async fn steps_missed(
         &self,
         last: &str,
         until: i64,
         filter: &EventFilter,
     ) -> Result<VecDeque<Arc<Sent>>, AppError> {
-        let after = self.hub().step_elsewhere(last);
-        let Some(after) = after.filter(|_| filter.wants(Topic::Missions)) else {
+        let read = self.hub().read_elsewhere(last);
+        let Some((run, at)) = read.filter(|_| filter.wants(Topic::Missions)) else {
             return Ok(VecDeque::new());
         };
+        let after = at.step.max(until - i64::from(STEPS_MISSED_MAX));
         let mut tx = self.db().read("events").await?;
-        let mut steps = db::history::steps_after(&mut tx, after, STEPS_MISSED_MAX + 1).await?;
-        steps.retain(|(pk, _)| *pk <= until);
-        if steps.len() > STEPS_MISSED_MAX as usize {
-            return Ok(VecDeque::new());
-        }
-        // A client that leaves in between goes on after the last that it has read.
-        let read_before = last.rsplit_once('-').map_or(last, |(before, _)| before);
-        let missed = steps.into_iter().map(|(pk, step)| {
-            let about = Some((step.site.clone(), Some(step.robot.clone())));
-            let event = Event::Step(Box::new(step));
+        let steps = db::history::steps_after(&mut tx, after, STEPS_MISSED_MAX).await?;
+        let missed = steps.into_iter().filter(|(pk, _)| *pk <= until);
+        let missed = missed.map(|(step, content)| {
+            let about = Some((content.site.clone(), Some(content.robot.clone())));
+            let event = Event::Step(Box::new(content));
             Sent {
-                id: Some(format!("{read_before}-{pk}")),
+                // A client that leaves in between goes on after the last that it has read.
+                id: Some(hub::id_of(run, Position { step, ..at })),
                 ..unnumbered(&event, Some(Topic::Missions), about)
             }
         });

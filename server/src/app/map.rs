@@ -143,9 +143,30 @@ impl Maps {
         }
     }
 
-    /// Returns what a standby has read; `None` in the server that has the database.
+    /// Returns what a standby has read; `None` in the server that has the database, also if it was a standby.
     fn follower(&self) -> Option<&Follower> {
-        self.follower.as_ref()
+        let follower = self.follower.as_ref();
+        follower.filter(|follower| !follower.is_over())
+    }
+
+    /// Makes the map of a standby that of the server that it becomes: from now on nothing follows the
+    /// database.
+    fn end_following(&self) {
+        let _sites = self.sites.write().unwrap_or_else(PoisonError::into_inner);
+        if let Some(follower) = &self.follower {
+            follower.end();
+            self.unwritten().may_be_stored();
+        }
+    }
+
+    /// Adds the sums of a range of the ledger that a standby has read; `false` if it is the server now.
+    fn add_followed(&self, folded: &[Folded], range: Added, now: Duration) -> bool {
+        let mut sites = self.sites.write().unwrap_or_else(PoisonError::into_inner);
+        if self.follower().is_none() {
+            return false;
+        }
+        self.add_to(&mut sites, folded, range, now);
+        true
     }
 
     /// Creates a site's map if it does not exist.
@@ -179,13 +200,17 @@ impl Maps {
     /// meanwhile has them once.
     fn add(&self, folded: &[Folded], added: Added, now: Duration) {
         let mut sites = self.sites.write().unwrap_or_else(PoisonError::into_inner);
+        self.add_to(&mut sites, folded, added, now);
+    }
+
+    fn add_to(&self, sites: &mut Sites, folded: &[Folded], added: Added, now: Duration) {
         let sums = folded.iter().map(|part| (&part.key, &*part.cells));
         self.unwritten().add(sums, added, now);
         for map in sites.maps.values_mut() {
             map.set_lru_time(self.memory.lru_time());
         }
         sites.add(folded, SiteMap::add_cells);
-        self.memory.wake_if_full(&sites);
+        self.memory.wake_if_full(sites);
     }
 }
 

@@ -113,7 +113,8 @@ struct Inner {
     recalls: AtomicU64,
     checks: Semaphore,
     identity: Identity,
-    maps: Maps,
+    /// Those of the standby that this process was, if it was one.
+    maps: Arc<Maps>,
     membership: Membership,
     metrics: Metrics,
     /// Incremented with each change of robots' rows.
@@ -161,6 +162,7 @@ impl App {
             map,
             telemetry,
             is_standby,
+            standby,
         } = dependencies;
         let started_at = clock.elapsed();
         let presences = Arc::default();
@@ -189,7 +191,10 @@ impl App {
             recalls: AtomicU64::new(0),
             checks: Semaphore::new(check::CHECKS_MAX),
             identity: Identity::new(people, audit),
-            maps: Maps::new(map.memory_max_mib, is_standby),
+            maps: match standby {
+                Some(standby) => Arc::clone(&standby.inner.maps),
+                None => Arc::new(Maps::new(map.memory_max_mib, is_standby)),
+            },
             membership: Membership::new(enrolment),
             metrics: Metrics::default(),
             robots_generation: AtomicU64::new(1),

@@ -1,24 +1,28 @@
 //! Forwards requests to the server that has the database, as a reverse proxy does.
 
 use std::net::IpAddr;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::pin::pin;
+use std::sync::{Arc, Mutex, PoisonError, RwLock};
 use std::time::Duration;
 
 use axum::body::{Body, HttpBody as _};
 use axum::extract::Request;
 use axum::http::uri::PathAndQuery;
-use axum::http::{HeaderMap, HeaderName, HeaderValue, Response, StatusCode, header};
+use axum::http::{HeaderMap, HeaderName, HeaderValue, Response, StatusCode, Uri, header};
 use axum::response::IntoResponse as _;
 use hyper::upgrade::OnUpgrade;
 use hyper_util::rt::TokioIo;
 use reqwest::{Certificate, Url, redirect};
+use tokio::io::{AsyncRead, AsyncWrite, AsyncWriteExt as _};
 use tokio::time::Instant;
+use tokio_util::sync::CancellationToken;
 use tracing::{debug, warn};
 use tread_api::problem::ProblemType;
 
 use super::identity::guard::Peer;
 use super::problem::Problem;
 use crate::app::App;
+use crate::connections::{AtWork, Slot};
 use crate::error_text;
 
 /// Maximum time for a connection, TLS included.
@@ -27,6 +31,16 @@ const CONNECT_MAX: Duration = Duration::from_secs(2);
 const ANSWER_MAX: Duration = Duration::from_secs(17);
 /// Maximum number of idle connections.
 const IDLE_MAX: usize = 32;
+/// Time after which an idle connection is closed: before the other server does.
+const IDLE_TIMEOUT: Duration = Duration::from_secs(8);
+/// Maximum time to close a forwarded connection after one side has.
+const CLOSE_MAX: Duration = Duration::from_secs(1);
+/// Interval of checks of the other server.
+const CHECK_EVERY: Duration = Duration::from_secs(1);
+/// Silence of the other server after which a standby is not ready.
+pub(super) const SILENCE_MAX: Duration = Duration::from_secs(5);
+/// Interval at which CA certificates are read again while the other server does not answer.
+const RENEW_EVERY: Duration = Duration::from_secs(10);
 /// Interval of log lines about a server that cannot be asked.
 const LOG_EVERY: Duration = Duration::from_secs(10);
 /// Name by which forwarded requests are recognised (RFC 9110, `Via`).
@@ -58,9 +72,9 @@ pub enum ForwardError {
         "this server is a standby, and so is the one that is said to have the database; try again"
     )]
     Loop,
-    /// The address is none.
-    #[error("`{0}` is no address of a server")]
-    Address(String),
+    /// The path is written in an unusual way.
+    #[error("this path cannot be forwarded: write it without `..`, `\\` and the like")]
+    Path,
     /// The other server does not answer.
     #[error(
         "this server is a standby, and the one that has the database does not answer; try again"
@@ -70,16 +84,66 @@ pub enum ForwardError {
 
 impl From<ForwardError> for Problem {
     fn from(error: ForwardError) -> Self {
-        Self::new(ProblemType::Unavailable).detail(error.to_string())
+        let kind = match error {
+            ForwardError::Path => ProblemType::InvalidPath,
+            ForwardError::NoAddress | ForwardError::Loop | ForwardError::NoAnswer => {
+                ProblemType::Unavailable
+            }
+        };
+        Self::new(kind).detail(error.to_string())
     }
+}
+
+/// How a request may share connections with others: the other server limits the rate of a connection.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Sharing {
+    /// With those of all whose tokens or sessions are valid.
+    Known,
+    /// With none: a stop, or whoever is not known.
+    Alone,
 }
 
 /// Client of the server that has the database.
 #[derive(Debug, Clone)]
 pub struct Forwarder {
-    client: reqwest::Client,
+    inner: Arc<Inner>,
+}
+
+#[derive(Debug)]
+struct Inner {
+    clients: RwLock<Clients>,
+    /// When it answered last.
+    reached_at: Mutex<Option<Instant>>,
     /// When a failure was logged last.
-    logged_at: Arc<Mutex<Option<Instant>>>,
+    logged_at: Mutex<Option<Instant>>,
+}
+
+#[derive(Debug)]
+struct Clients {
+    known: reqwest::Client,
+    alone: reqwest::Client,
+}
+
+impl Clients {
+    fn new(authorities_pem: Option<&[u8]>) -> Result<Self, reqwest::Error> {
+        let client = |idle_max| {
+            let mut builder = reqwest::Client::builder()
+                .connect_timeout(CONNECT_MAX)
+                .pool_max_idle_per_host(idle_max)
+                .pool_idle_timeout(IDLE_TIMEOUT)
+                .redirect(redirect::Policy::none())
+                .no_proxy()
+                .tcp_nodelay(true);
+            if let Some(pem) = authorities_pem {
+                builder = builder.tls_certs_only(Certificate::from_pem_bundle(pem)?);
+            }
+            builder.build()
+        };
+        Ok(Self {
+            known: client(IDLE_MAX)?,
+            alone: client(0)?,
+        })
+    }
 }
 
 impl Forwarder {
@@ -90,28 +154,67 @@ impl Forwarder {
     pub fn new(authorities_pem: Option<&[u8]>) -> Result<Self, reqwest::Error> {
         // Fails if a provider is installed already, which is then the same one.
         let _first = rustls::crypto::ring::default_provider().install_default();
-        let mut builder = reqwest::Client::builder()
-            .connect_timeout(CONNECT_MAX)
-            .pool_max_idle_per_host(IDLE_MAX)
-            .redirect(redirect::Policy::none())
-            .no_proxy()
-            .tcp_nodelay(true);
-        if let Some(pem) = authorities_pem {
-            builder = builder.tls_certs_only(Certificate::from_pem_bundle(pem)?);
-        }
-        let client = builder.build()?;
+        let inner = Inner {
+            clients: RwLock::new(Clients::new(authorities_pem)?),
+            reached_at: Mutex::default(),
+            logged_at: Mutex::default(),
+        };
         Ok(Self {
-            client,
-            logged_at: Arc::default(),
+            inner: Arc::new(inner),
         })
+    }
+
+    /// Trusts other CA certificates from now on.
+    ///
+    /// # Errors
+    /// As [`Forwarder::new`]; the former ones stay.
+    pub fn renew(&self, authorities_pem: Option<&[u8]>) -> Result<(), reqwest::Error> {
+        let clients = Clients::new(authorities_pem)?;
+        let mut present = self.inner.clients.write();
+        *present
+            .as_deref_mut()
+            .unwrap_or_else(|poisoned| poisoned.get_mut()) = clients;
+        Ok(())
+    }
+
+    fn client(&self, sharing: Sharing) -> reqwest::Client {
+        let clients = self
+            .inner
+            .clients
+            .read()
+            .unwrap_or_else(PoisonError::into_inner);
+        match sharing {
+            Sharing::Known => clients.known.clone(),
+            Sharing::Alone => clients.alone.clone(),
+        }
+    }
+
+    /// Asks the other server whether it lives.
+    pub async fn check(&self, app: &App) {
+        let Some(leader) = app.leader_url() else {
+            return;
+        };
+        let asking = self.client(Sharing::Known).get(format!("{leader}/healthz"));
+        let asking = asking.timeout(CONNECT_MAX).send();
+        match asking.await.and_then(reqwest::Response::error_for_status) {
+            Ok(_answer) => self.reached(),
+            Err(cause) => self.failed(&leader, &cause),
+        }
+    }
+
+    fn reached(&self) {
+        let mut reached_at = lock(&self.inner.reached_at);
+        *reached_at = Some(Instant::now());
+    }
+
+    /// Returns for how long the other server has not answered; `None` if it never has.
+    pub fn silence(&self) -> Option<Duration> {
+        lock(&self.inner.reached_at).map(|at| at.elapsed())
     }
 
     /// Logs why the other server cannot be asked, now and then.
     fn failed(&self, leader: &str, cause: &dyn std::error::Error) {
-        let mut logged_at = self
-            .logged_at
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner);
+        let mut logged_at = lock(&self.inner.logged_at);
         if logged_at.is_none_or(|at| at.elapsed() >= LOG_EVERY) {
             *logged_at = Some(Instant::now());
             let cause = error_text::chain(cause);
@@ -127,24 +230,20 @@ impl Forwarder {
     pub(super) async fn forward(
         &self,
         app: &App,
+        sharing: Sharing,
         request: Request,
     ) -> Result<Response<Body>, ForwardError> {
         let leader = app.leader_url().ok_or(ForwardError::NoAddress)?;
         let (mut parts, body) = request.into_parts();
-        if parts
-            .headers
-            .get_all(header::VIA)
-            .iter()
-            .any(|via| via == VIA)
-        {
+        let is_own = |via: &HeaderValue| via.to_str().is_ok_and(|via| via.contains(VIA));
+        if parts.headers.get_all(header::VIA).iter().any(is_own) {
             return Err(ForwardError::Loop);
         }
-        let path = parts.uri.path_and_query().map_or("/", PathAndQuery::as_str);
-        let url = Url::parse(&format!("{leader}{path}"));
-        let url = url.map_err(|_malformed| ForwardError::Address(leader.clone()))?;
+        let url = url_at(&leader, &parts.uri)?;
         let upgrade = parts.extensions.remove::<OnUpgrade>();
         let protocol = parts.headers.get(header::UPGRADE).cloned();
         let peer = parts.extensions.get::<Peer>().map(|peer| peer.0);
+        let slot = parts.extensions.get::<Arc<Slot>>().map(Slot::hold);
         let mut headers = parts.headers;
         remove_those_of_connection(&mut headers);
         if let Some(protocol) = protocol {
@@ -153,11 +252,17 @@ impl Forwarder {
         }
         headers.append(header::VIA, HeaderValue::from_static(VIA));
         name_client(&mut headers, peer);
-        let mut asking = self.client.request(parts.method, url).headers(headers);
+        let client = self.client(sharing);
+        let mut asking = client.request(parts.method, url).headers(headers);
         if !body.is_end_stream() {
             asking = asking.body(reqwest::Body::wrap_stream(body.into_data_stream()));
         }
-        let answer = tokio::time::timeout(ANSWER_MAX, asking.send()).await;
+        let answer = tokio::select! {
+            biased;
+            // The client asks again, and this server answers then.
+            () = app.supervisor().stopping() => return Err(ForwardError::NoAnswer),
+            answer = tokio::time::timeout(ANSWER_MAX, asking.send()) => answer,
+        };
         let answer = match answer {
             Ok(Ok(answer)) => answer,
             Ok(Err(cause)) => {
@@ -169,8 +274,9 @@ impl Forwarder {
                 return Err(ForwardError::NoAnswer);
             }
         };
+        self.reached();
         if answer.status() == StatusCode::SWITCHING_PROTOCOLS {
-            return Ok(join(app, upgrade, answer));
+            return Ok(join(app, (upgrade, slot), answer));
         }
         let mut answer = Response::from(answer).map(Body::new);
         remove_those_of_connection(answer.headers_mut());
@@ -178,8 +284,62 @@ impl Forwarder {
     }
 }
 
-/// Forwards both directions of a connection that has changed its protocol.
-fn join(app: &App, upgrade: Option<OnUpgrade>, answer: reqwest::Response) -> Response<Body> {
+fn lock<T>(of: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
+    of.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Returns the same path at another server. What a URL would write in another way is refused, since a filter
+/// before this server has seen it as it came.
+fn url_at(leader: &str, asked: &Uri) -> Result<Url, ForwardError> {
+    let path = asked.path_and_query().map_or("/", PathAndQuery::as_str);
+    let url = Url::parse(&format!("{leader}{path}"));
+    let url = url.map_err(|_malformed| ForwardError::Path)?;
+    if url.path() == asked.path() && url.query() == asked.query() {
+        Ok(url)
+    } else {
+        Err(ForwardError::Path)
+    }
+}
+
+/// Keeps asking the other server whether it lives, and reads again by what to recognise it while it does not
+/// answer, until the stop.
+pub async fn run(
+    forwarder: Forwarder,
+    app: App,
+    renew: impl Fn(&Forwarder) -> anyhow::Result<()>,
+    stop: CancellationToken,
+) {
+    let mut renewed_at = Instant::now();
+    loop {
+        tokio::select! {
+            biased;
+            () = stop.cancelled() => return,
+            () = forwarder.check(&app) => {}
+        }
+        let is_silent = forwarder
+            .silence()
+            .is_none_or(|silence| silence >= SILENCE_MAX);
+        if is_silent && renewed_at.elapsed() >= RENEW_EVERY {
+            renewed_at = Instant::now();
+            if let Err(cause) = renew(&forwarder) {
+                warn!("cannot read by which authorities to recognise the other server: {cause:#}");
+            }
+        }
+        tokio::select! {
+            biased;
+            () = stop.cancelled() => return,
+            () = tokio::time::sleep(CHECK_EVERY) => {}
+        }
+    }
+}
+
+/// Forwards both directions of a connection that has changed its protocol, which counts as at work as long
+/// as that lasts.
+fn join(
+    app: &App,
+    (upgrade, at_work): (Option<OnUpgrade>, Option<AtWork>),
+    answer: reqwest::Response,
+) -> Response<Body> {
     let Some(upgrade) = upgrade else {
         return Problem::new(ProblemType::Internal).into_response();
     };
@@ -188,21 +348,43 @@ fn join(app: &App, upgrade: Option<OnUpgrade>, answer: reqwest::Response) -> Res
     *response.headers_mut() = answer.headers().clone();
     let stop = app.supervisor().stop_token();
     app.pass_by("forwarded connection", async move {
-        let (Ok(ours), Ok(mut theirs)) = tokio::join!(upgrade, answer.upgrade()) else {
+        let (Ok(ours), Ok(theirs)) = tokio::join!(upgrade, answer.upgrade()) else {
             debug!("a connection that was to be forwarded is closed");
             return;
         };
-        let mut ours = TokioIo::new(ours);
         tokio::select! {
             () = stop.cancelled() => {}
-            copied = tokio::io::copy_bidirectional(&mut ours, &mut theirs) => {
-                if let Err(cause) = copied {
-                    debug!("a forwarded connection broke: {cause}");
-                }
-            }
+            () = copy_both(TokioIo::new(ours), theirs) => {}
         }
+        drop(at_work);
     });
     response
+}
+
+/// Copies both directions. When one has ended, the other ends soon: a side that does not close keeps nothing
+/// open.
+async fn copy_both(
+    ours: impl AsyncRead + AsyncWrite + Unpin,
+    theirs: impl AsyncRead + AsyncWrite + Unpin,
+) {
+    let (mut from_client, mut to_client) = tokio::io::split(ours);
+    let (mut from_server, mut to_server) = tokio::io::split(theirs);
+    let asked = async {
+        _ = tokio::io::copy(&mut from_client, &mut to_server).await;
+        _ = to_server.shutdown().await;
+    };
+    let answered = async {
+        _ = tokio::io::copy(&mut from_server, &mut to_client).await;
+        _ = to_client.shutdown().await;
+    };
+    let (mut asked, mut answered) = (pin!(asked), pin!(answered));
+    let rest = tokio::select! {
+        () = asked.as_mut() => tokio::time::timeout(CLOSE_MAX, answered).await,
+        () = answered.as_mut() => tokio::time::timeout(CLOSE_MAX, asked).await,
+    };
+    if rest.is_err() {
+        debug!("one side of a forwarded connection does not close it");
+    }
 }
 
 /// Removes the headers that concern a connection alone, also those that it names itself.
@@ -230,6 +412,20 @@ fn name_client(headers: &mut HeaderMap, peer: Option<IpAddr>) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_path_is_forwarded_as_it_came_or_refused() {
+        let at = |path: &str| url_at("https://a.example.org:8420", &path.parse().unwrap());
+        for path in ["/v1/missions?limit=3&site=a%20b", "/", "/docs/", "/v1/x?"] {
+            let url = at(path).unwrap();
+            assert_eq!(url.as_str(), format!("https://a.example.org:8420{path}"));
+        }
+        for path in ["/v1/../metrics", "/a/%2e%2e/b", "*", "/a\\b"] {
+            if path.parse::<Uri>().is_ok() {
+                assert!(matches!(at(path), Err(ForwardError::Path)), "{path}");
+            }
+        }
+    }
 
     #[test]
     fn headers_of_the_connection_are_not_forwarded_and_all_others_are() {

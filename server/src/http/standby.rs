@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use axum::body::Body;
-use axum::extract::{Request, State};
+use axum::extract::Request;
 use axum::http::request::Parts;
 use axum::http::{Method, StatusCode};
 use axum::middleware::{from_fn, from_fn_with_state};
@@ -19,7 +19,7 @@ use tower_http::catch_panic::CatchPanicLayer;
 use tread_api::problem::ProblemType;
 
 use super::extract::{BodyLimit, Json};
-use super::forward::{ForwardError, Forwarder};
+use super::forward::{ForwardError, Forwarder, SILENCE_MAX, Sharing};
 use super::health::Health;
 use super::identity::browser;
 use super::identity::guard::{self, Guard, Peer};
@@ -28,11 +28,13 @@ use super::{
     Access, BODY_MAX, bound_time, broken, count_panics, map_routes, measure, with_request_id,
 };
 use crate::app::App;
-use crate::connections::Slot;
+use crate::connections::{Purpose, Slot};
 use crate::identity::origin::Names;
 
-/// Maximum age of the map of a standby that is ready.
+/// Maximum age of the map of a standby that is ready, and answers from it.
 const MAP_AGE_MAX: Duration = Duration::from_secs(2);
+/// Maximum time to find out whose a request is.
+const PROVE_MAX: Duration = Duration::from_millis(250);
 
 /// What answers the requests to a standby.
 #[derive(Debug, Clone)]
@@ -73,18 +75,23 @@ pub fn router(app: App, names: Names, forwarder: Forwarder) -> Router {
         forwarder,
         is_tls,
     };
+    let checked = standby.clone();
     let router = Router::new()
         .route("/healthz", get(super::health::healthz))
-        .route("/readyz", get(readyz))
+        .route(
+            "/readyz",
+            get(async move || ready(&checked.app, &checked.forwarder)),
+        )
         .fallback(move |request: Request| answer(standby.clone(), request));
     with_request_id(router).with_state(app)
 }
 
-/// Answers from the map, or forwards the request.
+/// Answers from the map if that is up to date, or forwards the request.
 async fn answer(standby: Standby, request: Request) -> Response {
     let is_read = matches!(*request.method(), Method::GET | Method::HEAD);
     let (parts, body) = request.into_parts();
-    let own = if is_read {
+    // While the database does not answer, neither the map nor who may read it is known.
+    let own = if is_read && standby.is_up_to_date() {
         let copy = Request::from_parts(parts.clone(), Body::empty());
         let Ok(own) = standby.map.clone().oneshot(copy).await;
         if own.status().is_success() || own.status() == StatusCode::NOT_MODIFIED {
@@ -94,11 +101,13 @@ async fn answer(standby: Standby, request: Request) -> Response {
     } else {
         None
     };
-    if let Err(full) = standby.prove(&parts).await {
-        return full.into_response();
-    }
+    let sharing = match standby.prove(&parts).await {
+        Ok(sharing) => sharing,
+        Err(full) => return full.into_response(),
+    };
     let request = Request::from_parts(parts, body);
-    match (standby.forwarder.forward(&standby.app, request).await, own) {
+    let forwarded = standby.forwarder.forward(&standby.app, sharing, request);
+    match (forwarded.await, own) {
         (Ok(answer), _) => answer,
         (Err(error), Some(own)) if own.status() != StatusCode::NOT_FOUND => {
             tracing::debug!("a refused request was not forwarded: {error}");
@@ -109,29 +118,40 @@ async fn answer(standby: Standby, request: Request) -> Response {
 }
 
 impl Standby {
+    fn is_up_to_date(&self) -> bool {
+        self.app.map_age().is_some_and(|age| age <= MAP_AGE_MAX)
+    }
+
     /// Counts the connection of a request among those of its token or session, so that no flood of others
-    /// displaces it. The server that has the database decides what it may do.
+    /// displaces it. The server that has the database decides what it may do; this one does not wait long to
+    /// know whose it is.
     ///
     /// # Errors
     /// The token has as many connections as it may.
-    async fn prove(&self, parts: &Parts) -> Result<(), Problem> {
+    async fn prove(&self, parts: &Parts) -> Result<Sharing, Problem> {
         let (Some(slot), Some(&Peer(address)), Some((text, shown))) = (
             parts.extensions.get::<Arc<Slot>>(),
             parts.extensions.get::<Peer>(),
             guard::shown(&parts.headers, self.is_tls),
         ) else {
-            return Ok(());
+            return Ok(Sharing::Alone);
         };
         let purpose = guard::purpose_of_path(&parts.method, parts.uri.path());
-        let found = self.app.authenticate(address, text, shown, purpose).await;
-        let Ok(credential) = found else { return Ok(()) };
+        let looking = self.app.authenticate(address, text, shown, purpose);
+        let Ok(Ok(credential)) = tokio::time::timeout(PROVE_MAX, looking).await else {
+            return Ok(Sharing::Alone);
+        };
         slot.prove(credential.subject, purpose)
-            .map_err(|full| Problem::new(ProblemType::TooManyRequests).detail(full.to_string()))
+            .map_err(|full| Problem::new(ProblemType::TooManyRequests).detail(full.to_string()))?;
+        Ok(match purpose {
+            Purpose::Stop => Sharing::Alone,
+            Purpose::Other => Sharing::Known,
+        })
     }
 }
 
 /// Says whether this standby can answer all requests, alone or by the other server.
-async fn readyz(State(app): State<App>) -> Result<Json<Health>, Problem> {
+fn ready(app: &App, forwarder: &Forwarder) -> Result<Json<Health>, Problem> {
     let unavailable = |detail: String| Err(Problem::new(ProblemType::Unavailable).detail(detail));
     match app.map_age() {
         Some(age) if age <= MAP_AGE_MAX => {}
@@ -143,6 +163,12 @@ async fn readyz(State(app): State<App>) -> Result<Json<Health>, Problem> {
     }
     if app.leader_url().is_none() {
         return unavailable(ForwardError::NoAddress.to_string());
+    }
+    if forwarder
+        .silence()
+        .is_none_or(|silence| silence >= SILENCE_MAX)
+    {
+        return unavailable(ForwardError::NoAnswer.to_string());
     }
     Ok(super::health::ok())
 }

@@ -29,6 +29,21 @@ impl Origin {
     pub fn as_str(&self) -> &str {
         &self.0
     }
+
+    /// Returns its host: a name, or an address, IPv6 in brackets.
+    pub fn host(&self) -> &str {
+        let (_, authority) = self.0.split_once("://").unwrap_or_default();
+        split_host(authority).map_or(authority, |(host, _)| host)
+    }
+
+    /// Returns whether nobody between can read what is sent there: by TLS, or on this machine.
+    pub fn is_safe(&self) -> bool {
+        let is_here = match address_of(self.host()) {
+            Some(address) => address.is_loopback(),
+            None => self.host() == "localhost",
+        };
+        self.0.starts_with("https://") || is_here
+    }
 }
 
 impl fmt::Display for Origin {

@@ -10,6 +10,7 @@ use tokio_util::sync::CancellationToken;
 use tracing::{info, warn};
 
 use crate::app::identity::READ_AGAIN_BY_STANDBY;
+use crate::app::identity::people::People;
 use crate::app::robot_link::RobotLink;
 use crate::app::{App, Dependencies, following, identity, map_blocks};
 use crate::authority::Authorities;
@@ -118,35 +119,38 @@ async fn serve_with(
     let authorities = authorities.map(|robots| Authorities::read(&robots.authority));
     let authorities = authorities.transpose()?.map(Arc::new);
     let tls = open_tls(config, authorities.as_ref(), clock)?;
-    let forwarder = forwarder(config, authorities.as_deref())?;
+    let forwarder = Forwarder::new(trusted(config)?.as_deref())?;
+    // Before the map is read, which takes long: another program may have the address.
+    let listener = listen_for_http(config.http)?;
+    let address = listener.local_addr()?;
+    let people = config.oidc.as_ref();
+    let people = people.map(|oidc| People::new(oidc, clock.clone()));
     let app = App::new(Dependencies {
         friction: config.friction,
         normalisations: config.normalisations.clone(),
         map: config.map,
         robots: RobotLink::unconnected(supervisor.clone()),
+        people: people.transpose()?,
         is_standby: true,
         ..Dependencies::on_database(db, clock.clone())
     });
+    let metrics = config.metrics;
+    let metrics = metrics.map(|address| listen_for_metrics(address, &app));
+    let metrics = metrics.transpose()?;
     app.load_map().await?;
     *lock(shown) = Some(app.clone());
     if let Err(error) = app.know_tokens().await {
         app.log_failure("read the valid tokens", &error);
     }
-    let listener = listen_for_http(config.http)?;
-    let address = listener.local_addr()?;
     let scheme = if tls.is_some() { "https" } else { "http" };
     let serving = Serving {
         listener,
-        router: http::standby::router(app.clone(), config.names(), forwarder),
+        router: http::standby::router(app.clone(), config.names(), forwarder.clone()),
         tls: tls.clone(),
         proxies: Arc::new(TrustedProxies::new(config.web.trusted_proxies.clone())),
     };
-    let metrics = config.metrics;
-    let metrics = metrics.map(|address| listen_for_metrics(address, &app));
-    let metrics = metrics.transpose()?;
     let stop = || supervisor.stop_token();
     let run = |serving| http::serve::run(serving, app.clone(), supervisor.clone(), stop());
-    supervisor.spawn_vital("map", following::run(app.clone(), stop()));
     supervisor.spawn_vital("map blocks", map_blocks::run(app.clone(), stop()));
     let reading = identity::run(app.clone(), READ_AGAIN_BY_STANDBY, stop());
     supervisor.spawn_vital("tokens", reading);
@@ -155,6 +159,13 @@ async fn serve_with(
         let keeping = async move { http::tls::keep(&tls, stop, |_tls| {}).await };
         supervisor.spawn_vital_unwatched("certificate", keeping);
     }
+    let of_other = config.clone();
+    let renew = move |forwarder: &Forwarder| {
+        let trusted = trusted(&of_other)?;
+        Ok(forwarder.renew(trusted.as_deref())?)
+    };
+    let checking = http::forward::run(forwarder, app.clone(), renew, stop());
+    supervisor.spawn_vital_unwatched("other server", checking);
     info!("standby: answers on {scheme}://{address}");
     if config.web.advertise_url.is_none() {
         warn!(
@@ -171,20 +182,28 @@ async fn serve_with(
         () = run(serving) => {}
         () = serving_metrics => {}
         () = supervisor.stopping() => {}
+        () = following::run(app.clone(), stop()) => {
+            anyhow::bail!("another server has the database now, or segments are missing: it reads the map again");
+        }
     }
     anyhow::bail!("a task of the standby has ended")
 }
 
-/// Creates the client of the server that has the database.
-fn forwarder(config: &Config, authorities: Option<&Authorities>) -> anyhow::Result<Forwarder> {
-    let trusted = match (&config.web.advertise_authorities, &config.tls, authorities) {
-        (Some(file), _, _) => Some(std::fs::read(file).with_context(|| {
-            format!("cannot read `advertise_authorities`, `{}`", file.display())
-        })?),
-        (None, Some(TlsSource::Authority), Some(authorities)) => {
-            Some(authorities.present().bundle_pem().into_bytes())
+/// Reads the CA certificates (PEM) by which the server that has the database is recognised; `None` for those
+/// of the machine.
+fn trusted(config: &Config) -> anyhow::Result<Option<Vec<u8>>> {
+    if let Some(file) = &config.web.advertise_authorities {
+        let read = std::fs::read(file);
+        let file = file.display();
+        return Ok(Some(read.with_context(|| {
+            format!("cannot read `advertise_authorities`, `{file}`")
+        })?));
+    }
+    match (&config.tls, &config.robots) {
+        (Some(TlsSource::Authority), Some(robots)) => {
+            let authorities = Authorities::read(&robots.authority)?;
+            Ok(Some(authorities.present().bundle_pem().into_bytes()))
         }
-        (None, _, _) => None,
-    };
-    Ok(Forwarder::new(trusted.as_deref())?)
+        _ => Ok(None),
+    }
 }

@@ -11,8 +11,10 @@ use tokio::time::timeout;
 
 use super::Fleet;
 use crate::ports::free_address;
-use crate::process::Process;
+use crate::process::{Process, Usage};
 use crate::relay::Relay;
+use crate::rest::Rest;
+use crate::wait::{SHORT, eventually};
 
 /// Longest time for an answer of a server that is ready.
 const READY_MAX: Duration = Duration::from_secs(1);
@@ -67,8 +69,31 @@ impl Fleet {
     /// # Panics
     /// The first does not get ready.
     pub async fn start_pair_with(node: &Path) -> anyhow::Result<Self> {
+        Self::start_pair(node, false).await
+    }
+
+    /// The same, and the one that stands by answers requests: it forwards to the other what it cannot answer.
+    ///
+    /// # Errors
+    /// As [`Fleet::start_pair_with`].
+    ///
+    /// # Panics
+    /// One of them does not get ready.
+    pub async fn start_forwarding_pair_with(node: &Path) -> anyhow::Result<Self> {
+        let fleet = Self::start_pair(node, true).await?;
+        let standby = fleet.standby().context("there are two servers")?;
+        let look = || async {
+            let answer = standby.call(Method::GET, "/readyz", None).await;
+            answer.is_some_and(|(status, _)| status.is_success())
+        };
+        eventually("the standby is ready", SHORT, look, |is_ready| *is_ready).await;
+        Ok(fleet)
+    }
+
+    async fn start_pair(node: &Path, is_advertised: bool) -> anyhow::Result<Self> {
         let folder = tempfile::tempdir()?;
         let mut fleet = Self::new(node, folder, None, &[]);
+        fleet.is_advertised = is_advertised;
         let database = fleet.database.server().context(
             "two servers need PostgreSQL: put `TREAD_TEST_ENGINE=postgres store-postgres/with-postgres` \
              before the command",
@@ -97,6 +122,19 @@ impl Fleet {
                 other.process = Some(started);
             }
         }
+    }
+
+    /// Returns a client of the server that stands by.
+    pub fn standby(&self) -> Option<Rest> {
+        let other = self.other.as_ref()?;
+        Some(self.rest.at(format!("http://{}", other.http)))
+    }
+
+    /// What the processes of both servers have used so far.
+    pub fn servers_usage(&self) -> Vec<Usage> {
+        let other = self.other.as_ref().and_then(|other| other.process.as_ref());
+        let both = self.server.iter().chain(other);
+        both.filter_map(Process::usage).collect()
     }
 
     /// Whether there are two servers.

@@ -25,13 +25,26 @@ pub const CLIENT_BYTES_MAX: usize = 4 * 1024 * 1024;
 pub const KEPT_EVENTS_MAX: usize = 8_192;
 /// Maximum number of bytes of those recent events.
 pub const KEPT_BYTES_MAX: usize = 16 * 1024 * 1024;
+/// Maximum length of the name of a run.
+const RUN_LENGTH_MAX: usize = 16;
 /// How long a client that was dropped may take to read its end.
 const LINGER: Duration = Duration::from_secs(5);
 
-/// Parses the identifier of an event: the run of the server, and its place there.
+/// Returns the identifier of an event of a run.
+pub(super) fn id_of(run: &str, Position { seq, step }: Position) -> String {
+    format!("{run}-{seq}-{step}")
+}
+
+/// Parses the identifier of an event: the run of the server, and its place there. `None` for what no server
+/// has given.
 fn read_id(id: &str) -> Option<(&str, Position)> {
     let (rest, step) = id.rsplit_once('-')?;
     let (run, seq) = rest.rsplit_once('-')?;
+    let is_run =
+        |run: &str| run.len() <= RUN_LENGTH_MAX && run.bytes().all(|byte| byte.is_ascii_hexdigit());
+    if !is_run(run) {
+        return None;
+    }
     let at = Position {
         seq: seq.parse().ok()?,
         step: step.parse().ok()?,
@@ -152,8 +165,7 @@ impl Hub {
 
     /// Returns the identifier of an event.
     pub(super) fn id_of(&self, at: Position) -> String {
-        let Position { seq, step } = at;
-        format!("{}-{seq}-{step}", self.run)
+        id_of(&self.run, at)
     }
 
     /// Returns a number that changes whenever the last client has left.
@@ -259,11 +271,10 @@ impl Hub {
         self.since(at.seq, filter)
     }
 
-    /// Returns the key of the last transition that a client has read from another run of the server, or
+    /// Returns the run and the place of an event that a client has read from another run of the server, or
     /// from another server of the same database; `None` for an event of this run.
-    pub(super) fn step_elsewhere(&self, last: &str) -> Option<i64> {
-        let (run, at) = read_id(last)?;
-        (run != self.run).then_some(at.step)
+    pub(super) fn read_elsewhere<'id>(&self, last: &'id str) -> Option<(&'id str, Position)> {
+        read_id(last).filter(|(run, _)| *run != self.run)
     }
 
     /// Returns the events since `seq` that pass a filter; `None` if they are no longer kept.
@@ -276,5 +287,26 @@ impl Hub {
         let missed = state.kept.iter().filter(|event| event.seq > seq);
         let wanted = missed.filter(|event| filter.lets_through(event.topic, event.about.as_ref()));
         Some(wanted.cloned().collect())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_identifier_is_read_as_a_server_has_given_it_and_no_other_text_is() {
+        let hub = Hub::new(Timestamp::UNIX_EPOCH);
+        let at = Position { seq: 7, step: 41 };
+        let own = hub.id_of(at);
+        assert_eq!(read_id(&own), Some(("0", at)));
+        assert_eq!(hub.read_elsewhere(&own), None);
+        assert_eq!(hub.read_elsewhere("65f2-7-41"), Some(("65f2", at)));
+        let long = format!("{}-7-41", "a".repeat(RUN_LENGTH_MAX + 1));
+        for wrong in [
+            "", "-", "7-41", "x-7-41", "65f2-7", "65f2--7", "65f2-7-", &long,
+        ] {
+            assert_eq!(hub.read_elsewhere(wrong), None, "{wrong}");
+        }
     }
 }

@@ -12,7 +12,7 @@ use tread_api::terrain::{Terrain, TerrainRef};
 
 use super::drawn::{Drawn, is_here};
 use super::map_reader::smaller;
-use super::{App, AppError, Asked, MapReader, Reading, SiteView, page, site_row, terrain_ref};
+use super::{App, AppError, Asked, MapReader, Reading, SiteView, page, terrain_ref};
 use crate::friction::Ground;
 use crate::friction::index::{Block, Cells, Group};
 
@@ -119,7 +119,7 @@ impl App {
         } = cells;
         let reading = Reading::new(self, asked)?;
         let after = cursor.map(read_cursor).transpose()?;
-        let row = site_row(&mut self.db().read("friction").await?, site).await?;
+        let row = self.site_view(site).await?.row.clone();
         let grid = row.site.grid;
         let factor = factor(&grid, resolution_m)?;
         check_count(&area, resolution_m)?;
@@ -199,7 +199,7 @@ impl App {
             });
         }
         let after = cells.cursor.map(read_cursor).transpose()?;
-        let row = site_row(&mut self.db().read("friction").await?, site).await?;
+        let row = self.site_view(site).await?.row.clone();
         let early = late.at(from);
         let (min, max) = cells.area.cells(&row.site.grid)?;
         let wanted = usize::try_from(cells.limit).unwrap_or(usize::MAX);

@@ -71,7 +71,7 @@ impl App {
         ) -> Result<Box<dyn Writer<CellFriction>>, TableError>,
     ) -> Result<CellExport, AppError> {
         let mut reading = Reading::new(self, &asked.asked)?;
-        let row = site_row(&mut self.db().read("friction").await?, site).await?;
+        let row = self.site_view(site).await?.row.clone();
         let grid = row.site.grid;
         let factor = factor(&grid, asked.resolution_m)?;
         let area = match asked.area {

@@ -337,6 +337,10 @@ impl AuditLog {
 impl App {
     /// Queues an entry for the audit log without waiting.
     pub fn audit(&self, entry: AuditEntry) {
+        // What a standby refuses it forwards, so the other server notes it.
+        if self.is_standby() {
+            return;
+        }
         let log = &self.identity().audit;
         let taken = log.lock().add(entry, self.clock().elapsed());
         match taken {

@@ -296,6 +296,10 @@ impl App {
     }
 
     fn used(&self, credential: &Credential) {
+        // A standby cannot store it.
+        if self.is_standby() {
+            return;
+        }
         let now = self.clock().now();
         if credential.touch(now) {
             let used = match (credential.subject, credential.session) {

@@ -71,12 +71,6 @@ impl BlockMemory {
         self.lru_clock.load(Ordering::Relaxed)
     }
 
-    /// Goes on where the clock of last uses of another memory is, whose blocks come here.
-    pub(super) fn continue_clock(&self, other: &Self) {
-        self.lru_clock
-            .fetch_max(other.lru_time(), Ordering::Relaxed);
-    }
-
     pub(super) fn tick(&self) -> u64 {
         self.lru_clock.fetch_add(1, Ordering::Relaxed)
     }

@@ -295,7 +295,7 @@ impl App {
                 if maps.unwritten().is_divided_by(&snapshot.watermarks) {
                     return Err(DbError::Unsettled);
                 }
-                // Before anything is added that is in this snapshot.
+                // In its turn: nothing is added in between that is in this snapshot.
                 return maps.insert(row, snapshot, pins);
             }
         };

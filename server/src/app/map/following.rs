@@ -9,6 +9,7 @@
 //! ledger is a generation of its own, since that server moves its watermarks between ranges.
 
 use std::collections::HashMap;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex as StdMutex, PoisonError};
 use std::time::Duration;
 
@@ -26,6 +27,7 @@ use crate::db::segments::{Added, KeyedSegment};
 use crate::db::sites::SiteRow;
 use crate::db::watermarks::WatermarkStep;
 use crate::db::{self, DbError, Tx};
+use crate::friction::index::SiteMap;
 
 /// Interval at which the map is brought up to date.
 const FOLLOW_EVERY: Duration = Duration::from_millis(250);
@@ -33,6 +35,8 @@ const FOLLOW_EVERY: Duration = Duration::from_millis(250);
 const FORGET_EVERY: Duration = Duration::from_secs(2);
 /// Maximum time to count the standbys.
 const STANDBYS_MAX: Duration = Duration::from_millis(500);
+/// Maximum time that the server that was a standby waits for the map.
+const TURN_MAX: Duration = Duration::from_secs(1);
 /// Number of segments that are read at a time.
 const SEGMENTS_AT_ONCE: u32 = 10_000;
 
@@ -41,6 +45,8 @@ const SEGMENTS_AT_ONCE: u32 = 10_000;
 pub(super) struct Follower {
     read: Mutex<Read>,
     seen: StdMutex<Seen>,
+    /// Whether the process is the server now; set under the lock of the maps.
+    is_over: AtomicBool,
 }
 
 /// Up to where the database was read.
@@ -50,14 +56,13 @@ pub(super) struct Read {
     last_pk: i64,
     /// Number of the last withdrawal on the map.
     last_withdrawal: i64,
-    /// Generation of sites, terrains and robots; `None` before the first.
-    generation: Option<i64>,
+    /// The server that has the database, and its generation of sites, terrains and robots; `None` before the
+    /// map was read.
+    leader: Option<Leader>,
     names: Names,
     watermarks: HashMap<i64, i64>,
     /// When watermarks were read, on the monotonic clock.
     watermarks_at: Duration,
-    /// Whether the server that this process became has the map now.
-    is_over: bool,
 }
 
 /// What was seen of the server that has the database, and when the map was up to date.
@@ -68,22 +73,21 @@ struct Seen {
 }
 
 impl Read {
-    /// Returns what a map that was just read follows.
-    pub(super) fn from(
+    /// Begins after a map that was just read.
+    pub(super) fn begin(
+        &mut self,
         last_pk: i64,
-        leader: &Leader,
-        names: Names,
-        watermarks: HashMap<i64, i64>,
-    ) -> Self {
-        Self {
+        leader: Leader,
+        (names, watermarks): (Names, HashMap<i64, i64>),
+    ) {
+        *self = Self {
             last_pk,
             last_withdrawal: names.last_withdrawal(),
-            generation: Some(leader.generation),
+            leader: Some(leader),
             names,
             watermarks,
             watermarks_at: Duration::ZERO,
-            is_over: false,
-        }
+        };
     }
 }
 
@@ -93,51 +97,48 @@ impl Follower {
         self.read.lock().await
     }
 
-    fn saw(&self, leader: Leader, at: Duration) {
-        let mut seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
-        *seen = Seen {
-            leader,
-            at: Some(at),
-        };
+    pub(super) fn is_over(&self) -> bool {
+        self.is_over.load(Ordering::Acquire)
+    }
+
+    pub(super) fn end(&self) {
+        self.is_over.store(true, Ordering::Release);
+    }
+
+    fn seen(&self) -> std::sync::MutexGuard<'_, Seen> {
+        self.seen.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
 impl App {
-    /// Brings the map of a standby up to date.
+    /// Brings the map of a standby up to date; `false` if it has to be read as a whole, since another server
+    /// has the database now, or the database has lost what is on the map, or removed what is not.
     ///
     /// # Errors
     /// The database failed.
-    pub async fn follow(&self) -> Result<(), DbError> {
+    pub async fn follow(&self) -> Result<bool, DbError> {
         let Some(follower) = self.maps().follower() else {
-            return Ok(());
+            return Ok(true);
         };
         let mut turn = follower.turn().await;
-        if turn.is_over {
-            return Ok(());
-        }
         let mut tx = self.db().read("follow").await?;
-        let has_gap = !self.follow_in(&mut tx, &mut turn).await?;
-        drop((tx, turn));
-        if has_gap {
-            tracing::info!(
-                "measurements were removed that this standby has not read: it reads the map again"
-            );
-            self.load_map().await?;
-        }
-        Ok(())
+        self.follow_in(&mut tx, &mut turn).await
     }
 
-    /// Brings the map up to what a snapshot contains; `false` if it cannot, since segments were removed that
-    /// are not on it, or another has it now.
+    /// Brings the map up to what a snapshot contains; `false` if it cannot.
     pub(super) async fn follow_in(&self, tx: &mut Tx, read: &mut Read) -> Result<bool, DbError> {
-        if read.is_over {
+        let (Some(follower), Some(before)) = (self.maps().follower(), read.leader.clone()) else {
+            return Ok(false);
+        };
+        let leader = db::leader::get(tx).await?;
+        // Whoever has the database now may have other segments with the same keys, and another schema.
+        if leader.epoch != before.epoch || leader.generation < before.generation {
             return Ok(false);
         }
-        let leader = db::leader::get(tx).await?;
-        if read.generation != Some(leader.generation) {
+        if leader.generation != before.generation {
             self.follow_sites(tx, read).await?;
-            read.generation = Some(leader.generation);
             self.db().follow(leader.generation);
+            read.leader = Some(leader.clone());
         }
         if !self.follow_segments(tx, read).await? {
             return Ok(false);
@@ -147,9 +148,10 @@ impl App {
             read.watermarks_at = now;
             self.forget_stored(db::watermarks::all(tx).await?, read);
         }
-        if let Some(follower) = self.maps().follower() {
-            follower.saw(leader, now);
-        }
+        *follower.seen() = Seen {
+            leader,
+            at: Some(now),
+        };
         Ok(true)
     }
 
@@ -159,16 +161,8 @@ impl App {
         let sites = db::sites::list(tx, &Scope::EVERYWHERE, "", SITES_MAX).await?;
         for site in &sites {
             self.maps().ensure(site);
-            let is_merged = self
-                .maps()
-                .look(site, |map| map.horizons() == site.horizons);
-            if !is_merged {
-                self.apply(MapChange::MergeBefore(
-                    Box::new(site.clone()),
-                    site.horizons,
-                ));
-            }
         }
+        // Before hours are merged into days, of which a withdrawal takes a part no more.
         let after = read.last_withdrawal;
         if read.names.last_withdrawal() > after {
             let places = places(tx, &sites).await?;
@@ -185,6 +179,12 @@ impl App {
             }
             read.last_withdrawal = read.names.last_withdrawal();
         }
+        for site in sites {
+            let horizons = site.horizons;
+            if self.maps().look(&site, SiteMap::horizons) != horizons {
+                self.apply(MapChange::MergeBefore(Box::new(site), horizons));
+            }
+        }
         Ok(())
     }
 
@@ -192,45 +192,47 @@ impl App {
     async fn follow_segments(&self, tx: &mut Tx, read: &mut Read) -> Result<bool, DbError> {
         loop {
             let rows = db::segments::after(tx, read.last_pk, SEGMENTS_AT_ONCE).await?;
-            let (Some(first), Some(last)) = (rows.first(), rows.last()) else {
-                return Ok(true);
+            let Some(first) = rows.first() else {
+                let last = db::segment_ranges::last(tx).await?;
+                // The ledger keeps its last range for ever.
+                return Ok(last.map_or(0, |(last_pk, _)| last_pk) >= read.last_pk);
             };
             // Keys have no gaps, and the first are removed first.
             if first.pk != read.last_pk + 1 {
                 return Ok(false);
             }
             let is_last = rows.len() < SEGMENTS_AT_ONCE as usize;
-            let last_pk = last.pk;
-            if !rows.iter().all(|row| read.names.knows(row)) {
-                read.names = Names::read(tx).await?;
+            if !self.add_segments(rows, read)? {
+                return Ok(false);
             }
-            self.add_segments(rows, &read.names)?;
-            read.last_pk = last_pk;
             if is_last {
                 return Ok(true);
             }
         }
     }
 
-    fn add_segments(&self, rows: Vec<KeyedSegment>, names: &Names) -> Result<(), DbError> {
+    /// Adds segments range by range; `false` if this process is the server now.
+    fn add_segments(&self, rows: Vec<KeyedSegment>, read: &mut Read) -> Result<bool, DbError> {
+        let now = self.clock().elapsed();
         let mut rows = rows.into_iter().peekable();
         while let Some(first) = rows.next() {
             let range_pk = first.range_pk;
-            let mut keys = Added {
+            let mut range = Added {
                 first: range_pk,
                 last: first.pk,
             };
             let mut folded = Vec::new();
-            folded.extend(names.folded(first)?);
+            folded.extend(read.names.folded(first)?);
             while let Some(row) = rows.next_if(|row| row.range_pk == range_pk) {
-                keys.last = row.pk;
-                folded.extend(names.folded(row)?);
+                range.last = row.pk;
+                folded.extend(read.names.folded(row)?);
             }
-            if !folded.is_empty() {
-                self.apply(MapChange::Add(folded, keys));
+            if !folded.is_empty() && !self.maps().add_followed(&folded, range, now) {
+                return Ok(false);
             }
+            read.last_pk = range.last;
         }
-        Ok(())
+        Ok(true)
     }
 
     /// Removes sums from the unwritten ones that are stored now.
@@ -263,53 +265,63 @@ impl App {
     }
 
     /// Takes the map over from the standby that this process was, after all that the database has. `false` if
-    /// it has to be read.
+    /// it has to be read. Requests to the standby that are under way read the same map.
     ///
     /// # Errors
     /// The database failed.
-    pub async fn take_map(&self, standby: &Self) -> Result<bool, DbError> {
-        let Some(follower) = standby.maps().follower() else {
+    pub async fn take_map(&self) -> Result<bool, DbError> {
+        let maps = self.maps();
+        let Some(follower) = maps.follower() else {
             return Ok(false);
         };
-        let mut order = Arc::clone(&self.maps().order).lock_owned().await;
+        let mut order = Arc::clone(&maps.order).lock_owned().await;
         let ended = self.db().unknown_outcomes();
-        let mut turn = follower.turn().await;
+        // A read may hang on a connection to a machine that is gone.
+        let taken = match tokio::time::timeout(TURN_MAX, follower.turn()).await {
+            Ok(mut turn) => self.bring_up(&mut turn).await,
+            Err(_elapsed) => Ok(false),
+        };
+        maps.end_following();
+        *order = ended;
+        taken
+    }
+
+    /// Brings the map of a standby up to date as the server that has the database now.
+    async fn bring_up(&self, read: &mut Read) -> Result<bool, DbError> {
         let mut tx = self.db().read("map").await?;
-        if turn.generation.is_none() || !standby.follow_in(&mut tx, &mut turn).await? {
+        let Some(leader) = &mut read.leader else {
+            return Ok(false);
+        };
+        // This server has counted the epoch up, and whoever had the database last was the one before.
+        leader.epoch += 1;
+        if !self.follow_in(&mut tx, read).await? {
             return Ok(false);
         }
         let watermarks = db::watermarks::all(&mut tx).await?;
-        if standby.maps().unwritten().is_divided_by(&watermarks) {
+        if self.maps().unwritten().is_divided_by(&watermarks) {
             return Ok(false);
         }
-        standby.forget_stored(watermarks, &mut turn);
+        self.forget_stored(watermarks, read);
         self.removed().extend(db::removed::boots(&mut tx).await?);
-        drop(tx);
-        let (sites, unwritten) = standby.maps().take();
-        *turn = Read {
-            is_over: true,
-            ..Read::default()
-        };
-        self.maps().memory.continue_clock(&standby.maps().memory);
-        self.maps().replace(sites, unwritten);
-        *order = ended;
         Ok(true)
     }
 
     /// Returns the address of the server that has the database, as it says itself; `None` if it says none, or
     /// in that server.
     pub fn leader_url(&self) -> Option<String> {
-        let follower = self.maps().follower()?;
-        let seen = follower.seen.lock().unwrap_or_else(PoisonError::into_inner);
-        seen.leader.advertise_url.clone()
+        self.maps().follower()?.seen().leader.advertise_url.clone()
     }
 
     /// Returns for how long the map of a standby has not been up to date; `None` before it was for the first
     /// time, or in the server that has the database.
     pub fn map_age(&self) -> Option<Duration> {
-        let follower = self.maps().follower()?;
-        let seen = follower.seen.lock().unwrap_or_else(PoisonError::into_inner);
-        Some(self.clock().elapsed().saturating_sub(seen.at?))
+        let at = self.maps().follower()?.seen().at?;
+        Some(self.clock().elapsed().saturating_sub(at))
+    }
+
+    /// Returns whether another server has the database, and this one follows it.
+    pub(in crate::app) fn is_standby(&self) -> bool {
+        self.maps().follower().is_some()
     }
 }
 
@@ -326,7 +338,7 @@ async fn places<'sites>(
     Ok(places)
 }
 
-/// Brings the map of a standby up to date periodically, until the stop.
+/// Brings the map of a standby up to date periodically, until the stop, or until it has to be read as a whole.
 pub async fn run(app: App, stop: CancellationToken) {
     loop {
         tokio::select! {
@@ -334,8 +346,15 @@ pub async fn run(app: App, stop: CancellationToken) {
             () = stop.cancelled() => return,
             () = tokio::time::sleep(FOLLOW_EVERY) => {}
         }
-        if let Err(cause) = db::limited(app.follow()).await {
-            app.log_failure("follow the database", &cause);
+        let followed = tokio::select! {
+            biased;
+            () = stop.cancelled() => return,
+            followed = db::limited(app.follow()) => followed,
+        };
+        match followed {
+            Ok(true) => {}
+            Ok(false) => return,
+            Err(cause) => app.log_failure("follow the database", &cause),
         }
     }
 }

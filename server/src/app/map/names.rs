@@ -52,12 +52,6 @@ impl Names {
         })
     }
 
-    /// Returns whether the robot and the configuration of a segment are known.
-    pub(super) fn knows(&self, row: &KeyedSegment) -> bool {
-        self.robots.contains_key(&row.robot_pk)
-            && self.configurations.contains_key(&row.configuration_pk)
-    }
-
     /// Returns the number of the last withdrawal; 0 without any.
     pub(super) fn last_withdrawal(&self) -> i64 {
         self.withdrawals.last().map_or(0, |last| last.pk)
@@ -82,11 +76,12 @@ impl Names {
     pub(super) fn folded(&self, row: KeyedSegment) -> Result<Option<Folded>, DbError> {
         let KeyedSegment {
             pk,
+            range_pk: _,
             robot_pk,
+            robot,
             site_pk,
             configuration_pk,
             segment,
-            ..
         } = row;
         // It was checked in the transaction that stored it.
         let sums = Sums::of(&segment).ok_or_else(|| DbError::Corrupt {
@@ -106,6 +101,11 @@ impl Names {
         if self.withdrawals.iter().any(is_withdrawn) {
             return Ok(None);
         }
-        Ok(self.named(key, sums))
+        Ok(Some(Folded {
+            robot,
+            configuration: segment.configuration,
+            cells: vec![(key.cell, sums)],
+            key,
+        }))
     }
 }

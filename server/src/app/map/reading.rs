@@ -11,7 +11,7 @@ use tread_api::rights::Scope;
 use super::block_memory::BlockMemory;
 use super::names::Names;
 use super::unwritten::Unwritten;
-use super::{Maps, Sites, following};
+use super::{Maps, Sites};
 use crate::app::App;
 use crate::db::segments::Added;
 use crate::db::{self, DbError, Tx};
@@ -63,7 +63,7 @@ impl App {
             let (last_pk, _) = last.unwrap_or_default();
             self.db().follow(leader.generation);
             let (names, watermarks) = (read.names, read.watermarks);
-            **following = following::Read::from(last_pk, &leader, names, watermarks);
+            following.begin(last_pk, leader, (names, watermarks));
         }
         drop(tx);
         maps.replace(read.sites, read.unwritten);
@@ -73,16 +73,8 @@ impl App {
 }
 
 impl Maps {
-    /// Takes all maps out, and the unwritten sums in a form in which this process can store them.
-    pub(super) fn take(&self) -> (Sites, Unwritten) {
-        let mut sites = self.sites.write().unwrap_or_else(PoisonError::into_inner);
-        let mut unwritten = std::mem::take(&mut *self.unwritten());
-        unwritten.may_be_stored();
-        (std::mem::take(&mut *sites), unwritten)
-    }
-
     /// Replaces the maps by those read from the database.
-    pub(super) fn replace(&self, mut read: Sites, mut read_unwritten: Unwritten) {
+    fn replace(&self, mut read: Sites, mut read_unwritten: Unwritten) {
         let mut sites = self.sites.write().unwrap_or_else(PoisonError::into_inner);
         for (pk, before) in sites.maps.drain() {
             match read.maps.get_mut(&pk) {
@@ -144,13 +136,15 @@ async fn read(
                 first: row.range_pk,
                 last: row.pk,
             };
-            if let Some(folded) = names.folded(row)? {
-                unwritten.add([(&folded.key, &*folded.cells)], keys, now);
-                sites.add(std::slice::from_ref(&folded), SiteMap::load_cells);
-                added += 1;
-                if added.is_multiple_of(EVICT_EVERY) {
-                    memory.evict(&mut sites);
-                }
+            let Some(folded) = names.folded(row)? else {
+                unwritten.cover(robot_pk, keys);
+                continue;
+            };
+            unwritten.add([(&folded.key, &*folded.cells)], keys, now);
+            sites.add(std::slice::from_ref(&folded), SiteMap::load_cells);
+            added += 1;
+            if added.is_multiple_of(EVICT_EVERY) {
+                memory.evict(&mut sites);
             }
         }
     }

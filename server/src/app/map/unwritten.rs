@@ -111,6 +111,18 @@ impl Default for Unwritten {
 }
 
 impl Generation {
+    /// Adds a later generation of the same robot.
+    fn join(&mut self, later: Self) {
+        for (key, sums) in later.sums {
+            let present = self.sums.entry(key);
+            present
+                .and_modify(|present| present.add(&sums))
+                .or_insert(sums);
+        }
+        self.blocks.extend(later.blocks);
+        self.keys.last = self.keys.last.max(later.keys.last);
+    }
+
     fn segments(&self) -> u64 {
         self.sums.values().map(|sums| sums.segments).sum()
     }
@@ -126,11 +138,35 @@ impl Unwritten {
         }
     }
 
-    /// Makes the unwritten sums of a standby those of the server that it becomes, in which no block is read.
+    /// Makes the unwritten sums of a standby those of the server that it becomes: small generations of a
+    /// robot are joined.
     pub(super) fn may_be_stored(&mut self) {
         self.generation_sums = TRANSACTION_SUMS;
-        self.reads.clear();
-        self.stored_meanwhile.clear();
+        for generations in self.robots.values_mut() {
+            let mut joined: VecDeque<Generation> = VecDeque::new();
+            for generation in generations.drain(..) {
+                match joined.back_mut() {
+                    Some(last) if last.sums.len() < TRANSACTION_SUMS => {
+                        self.sums -= last.sums.len() + generation.sums.len();
+                        last.join(generation);
+                        self.sums += last.sums.len();
+                    }
+                    Some(_) | None => joined.push_back(generation),
+                }
+            }
+            *generations = joined;
+        }
+    }
+
+    /// Says that the segments with these keys are in the newest generation of a robot, if those before them
+    /// are that were committed with them, although they add nothing to it.
+    pub(super) fn cover(&mut self, robot_pk: i64, keys: Added) {
+        let newest = self.robots.get_mut(&robot_pk);
+        if let Some(newest) = newest.and_then(VecDeque::back_mut)
+            && newest.keys.last >= keys.first
+        {
+            newest.keys.last = newest.keys.last.max(keys.last);
+        }
     }
 
     /// Sets the stored watermarks, which all sums follow that are added.

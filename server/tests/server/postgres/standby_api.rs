@@ -5,6 +5,8 @@ use std::time::Duration;
 
 use reqwest::StatusCode;
 use serde_json::{Value, json};
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::net::TcpStream;
 use tokio::runtime::Handle;
 use tokio::task::JoinSet;
 use tokio::time::Instant;
@@ -13,9 +15,10 @@ use tread_api::mission::{Mission, MissionDetail, MissionState};
 use tread_server::app::identity::tokens::FirstAdmin;
 use tread_server::clock::Clock;
 use tread_server::config::{Config, MapConfig};
+use tread_server::db::Location;
 use tread_server::{RunningServer, Server};
 
-use super::{created, server_of_tests};
+use super::{Relay, address_of, created, server_of_tests};
 use crate::drive::{Socket, driven_at};
 use crate::events::{last_id, read_until, steps_in};
 use crate::harness::{Yard, circle, client, config, eventually, measured, segment};
@@ -37,6 +40,8 @@ struct Pair {
     standby: String,
     config: Config,
     clock: Clock,
+    /// Whether the server says that it is where nobody answers.
+    is_alone: bool,
     client: reqwest::Client,
     /// What is compared.
     paths: Vec<&'static str>,
@@ -50,10 +55,21 @@ impl Pair {
         (clock, map): (Clock, MapConfig),
         advertised: Option<SocketAddr>,
     ) -> Self {
+        Self::start_with(admin, (clock, map), advertised, |_| {}).await
+    }
+
+    /// The same, with a configuration of the standby's own.
+    async fn start_with(
+        admin: &str,
+        (clock, map): (Clock, MapConfig),
+        advertised: Option<SocketAddr>,
+        change: impl FnOnce(&mut Config),
+    ) -> Self {
         let folder = std::sync::Arc::new(tempfile::tempdir().unwrap());
         let mut config = config(folder.path(), "127.0.0.1:0");
         config.database = created(admin, folder.path());
         config.http = free_address();
+        let is_alone = advertised.is_some();
         let advertised = advertised.unwrap_or(config.http);
         config.web.advertise_url = Some(format!("http://{advertised}").parse().unwrap());
         let mut of_standby = config.clone();
@@ -63,6 +79,7 @@ impl Pair {
         of_standby.standby = true;
         of_standby.http = free_address();
         of_standby.map = map;
+        change(&mut of_standby);
         let mut pair = Self {
             client: client(Some(yard.admin())),
             paths: PATHS.into_iter().filter(|path| *path != "robots").collect(),
@@ -70,6 +87,7 @@ impl Pair {
             standby: format!("http://{}", of_standby.http),
             config: of_standby,
             clock,
+            is_alone,
             taking_over: JoinSet::new(),
         };
         pair.start_standby().await;
@@ -85,7 +103,13 @@ impl Pair {
     }
 
     async fn is_ready(&self) {
-        let url = format!("{}/readyz", self.standby);
+        // A standby that cannot forward is not ready, and answers from its map all the same.
+        let path = if self.is_alone {
+            "/v1/sites/yard/friction/cells"
+        } else {
+            "/readyz"
+        };
+        let url = format!("{}{path}", self.standby);
         eventually("the standby is ready", async || {
             let answer = self.yard.client().get(&url).send().await;
             match answer {
@@ -231,6 +255,86 @@ async fn the_server_judges(pair: &Pair) {
     assert_eq!(status, StatusCode::UNAUTHORIZED);
     let (status, _) = pair.send(by_admin.get(at("/nothing/here"))).await;
     assert_eq!(status, StatusCode::NOT_FOUND);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_standby_that_has_lost_the_database_answers_nothing_by_itself() {
+    let Some(admin) = server_of_tests() else {
+        return;
+    };
+    let (_, server) = admin.rsplit_once('@').unwrap();
+    let relay = Relay::to(server.split('/').next().unwrap().to_owned()).await;
+    let through = |config: &mut Config| {
+        let address = address_of(&config.database);
+        let (user, rest) = address.rsplit_once('@').unwrap();
+        let (_, name) = rest.split_once('/').unwrap();
+        let through = format!("{user}@127.0.0.1:{}/{name}", relay.port);
+        config.database = Location::Postgres(through);
+    };
+    let clock = Clock::system();
+    let pair = Pair::start_with(&admin, (clock, MapConfig::default()), None, through);
+    let pair = Box::pin(pair).await;
+    let yard = &pair.yard;
+    let viewer = yard.token("screen", Role::Viewer).await;
+    let as_viewer = client(Some(&viewer.secret));
+    let map = format!("{}/v1/sites/yard/friction/cells", pair.standby);
+    assert_eq!(pair.send(as_viewer.get(&map)).await.0, StatusCode::OK);
+    relay.is_open.send_replace(false);
+    let ready = format!("{}/readyz", pair.standby);
+    eventually("the standby is not ready", async || {
+        let (status, body) = pair.send(as_viewer.get(&ready)).await;
+        (status == StatusCode::SERVICE_UNAVAILABLE)
+            .then_some(())
+            .ok_or(body)
+    })
+    .await;
+    // The server answers instead, and knows what has happened meanwhile.
+    assert_eq!(pair.send(as_viewer.get(&map)).await.0, StatusCode::OK);
+    let path = format!("/v1/tokens/{}", viewer.token.id);
+    let revoked = yard.client().delete(yard.url(&path));
+    assert!(pair.send(revoked).await.0.is_success());
+    let (status, _) = pair.send(as_viewer.get(&map)).await;
+    assert_eq!(status, StatusCode::UNAUTHORIZED);
+    relay.is_open.send_replace(true);
+    pair.is_ready().await;
+    let begun = Instant::now();
+    eventually("the token is refused by the standby", async || {
+        let (status, _) = pair.send(as_viewer.get(&map)).await;
+        (status == StatusCode::UNAUTHORIZED)
+            .then_some(())
+            .ok_or(status)
+    })
+    .await;
+    assert!(begun.elapsed() <= FOLLOWED_MAX, "{:?}", begun.elapsed());
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_request_that_a_standby_has_forwarded_already_is_not_forwarded_again() {
+    let Some(admin) = server_of_tests() else {
+        return;
+    };
+    let clock = Clock::system();
+    let pair = Pair::start(&admin, (clock, MapConfig::default()), None).await;
+    let asking = pair.client.get(format!("{}/v1/missions", pair.standby));
+    let asking = asking.header("via", "1.1 tread-standby, 1.1 proxy.example.org");
+    let (status, body) = pair.send(asking).await;
+    assert_eq!(status, StatusCode::SERVICE_UNAVAILABLE, "{body}");
+    let said = body["detail"].as_str().unwrap();
+    assert!(said.contains("so is the one"), "{said}");
+    for path in ["/v1/../v1/missions", "/v1/%2e%2e/metrics"] {
+        let raw = raw_get(pair.config.http, path).await;
+        assert!(raw.starts_with("HTTP/1.1 400 "), "{path}: {raw}");
+    }
+}
+
+/// What a server answers to a path that no client library would send.
+async fn raw_get(server: SocketAddr, path: &str) -> String {
+    let mut stream = TcpStream::connect(server).await.unwrap();
+    let request = format!("GET {path} HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n\r\n");
+    stream.write_all(request.as_bytes()).await.unwrap();
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).await.unwrap();
+    answer
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

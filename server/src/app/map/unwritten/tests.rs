@@ -387,3 +387,72 @@ fn sums_are_stored_before_further_receipts_when_too_many_segments_are_unwritten(
     unwritten.written(&all.steps);
     assert!(!unwritten.is_full());
 }
+
+/// Segments with consecutive keys that were committed together.
+fn range(first: i64, last: i64) -> Added {
+    Added { first, last }
+}
+
+#[test]
+fn a_standby_keeps_ranges_apart_until_it_stores_them_itself() {
+    let mut unwritten = Unwritten::of_ranges();
+    unwritten.start_at(HashMap::from([(1, 10)]));
+    for (keys, ix) in [(range(11, 14), 0), (range(15, 15), 1), (range(16, 20), 0)] {
+        let cells = [(Cell { ix, iy: 0 }, one(0.5))];
+        unwritten.add([(&key(1, ix, 5), &cells[..])], keys, Duration::ZERO);
+    }
+    for (watermark, is_divided) in [
+        (10, false),
+        (13, true),
+        (14, false),
+        (15, false),
+        (18, true),
+        (20, false),
+    ] {
+        let watermarks = HashMap::from([(1, watermark)]);
+        assert_eq!(
+            unwritten.is_divided_by(&watermarks),
+            is_divided,
+            "{watermark}"
+        );
+    }
+    let since = |unwritten: &Unwritten, watermark| {
+        let watermarks = HashMap::from([(1, watermark)]);
+        let mut sums = Table::new();
+        for (key, of) in unwritten.since(&watermarks, 1, Block { row: 0, column: 0 }) {
+            add_to(&mut sums, key, of);
+        }
+        sums.values().map(|sums| sums.segments).sum::<u64>()
+    };
+    assert_eq!((since(&unwritten, 10), since(&unwritten, 15)), (3, 1));
+    assert_eq!(unwritten.counts().sums, 3);
+    unwritten.may_be_stored();
+    // Two of the three are of one cell.
+    assert_eq!(
+        (unwritten.counts().sums, unwritten.counts().segments),
+        (2, 3)
+    );
+    assert_eq!(since(&unwritten, 10), 3);
+    let portion = unwritten.portion(unwritten.additions(), TRANSACTION_SUMS);
+    let step = WatermarkStep {
+        robot_pk: 1,
+        from_pk: 10,
+        to_pk: 20,
+    };
+    assert_eq!(portion.steps, [step]);
+    assert_eq!(portion.sums.len(), 2);
+    unwritten.written(&portion.steps);
+    assert_eq!(unwritten.counts(), UnwrittenCounts::default());
+}
+
+#[test]
+fn segments_that_are_withdrawn_belong_to_the_generation_of_their_range() {
+    let mut unwritten = Unwritten::default();
+    let cells = [(Cell { ix: 0, iy: 0 }, one(0.5))];
+    unwritten.add([(&key(1, 0, 5), &cells[..])], range(11, 12), Duration::ZERO);
+    unwritten.cover(1, range(11, 13));
+    // Of another range, of which nothing was added.
+    unwritten.cover(1, range(14, 15));
+    let portion = unwritten.portion(unwritten.additions(), TRANSACTION_SUMS);
+    assert_eq!(portion.steps[0].to_pk, 13);
+}
