@@ -83,9 +83,9 @@ use self::standby::serving::StandbyServing;
 use self::supervisor::Supervisor;
 use self::webhooks::{Resolver, Sender, SystemResolver};
 
-/// Silence of the server that has the database after which a standby takes over: four questions that it has
+/// Silence of the server that has the database after which a standby takes over: five questions that it has
 /// not asked, and longer than its robots wait for its pulse.
-const STANDBY_SILENCE_MAX: Duration = Duration::from_secs(2);
+const STANDBY_SILENCE_MAX: Duration = Duration::from_millis(1_250);
 
 /// Entry point that starts servers.
 #[derive(Debug, Clone, Copy)]

@@ -24,13 +24,13 @@ use tracing::warn;
 use super::{OpenError, connections, open};
 
 /// Interval at which a server looks whether it still has the lock.
-const LOOK_INTERVAL: Duration = Duration::from_millis(500);
+const LOOK_INTERVAL: Duration = Duration::from_millis(250);
 /// Interval at which a standby tries to take the lock.
 const STANDBY_INTERVAL: Duration = Duration::from_millis(250);
 /// Maximum time for an answer about it.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
 /// Maximum time between two looks of a standby at a silent server: PostgreSQL may have stood still itself.
-const LOOK_GAP_MAX: Duration = Duration::from_secs(1);
+const LOOK_GAP_MAX: Duration = Duration::from_millis(750);
 /// Maximum time for an attempt to take the lock: that for a connection and an answer.
 const ATTEMPT_TIMEOUT: Duration = Duration::from_secs(15);
 /// Interval at which the lock is tried while a session ends that holds it.
@@ -137,7 +137,12 @@ impl DatabaseLock {
                     if matches!(reason, LockError::InUse { .. }) {
                         let ending = watch.end_silent(&options, silence_max);
                         match timeout(ANSWER_TIMEOUT, ending).await {
-                            Ok(Ok(())) => {}
+                            Ok(Ok(Silence::Ended)) => {
+                                // Its lock is free as soon as PostgreSQL has ended its session.
+                                sleep(ENDING_INTERVAL).await;
+                                continue;
+                            }
+                            Ok(Ok(Silence::Short)) => {}
                             Ok(Err(cause)) => watch.fails(&cause),
                             Err(_elapsed) => watch = Watch::default(),
                         }
@@ -239,18 +244,27 @@ struct Watch {
     has_warned: bool,
 }
 
+/// What became of a server that may be silent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Silence {
+    /// It has asked something lately, or nobody knows.
+    Short,
+    /// Its sessions are ended.
+    Ended,
+}
+
 /// Name of the process that has the lock, the number of its session, and the time of the session's last
 /// statement, which is unknown without the rights to see it.
 type Owner = (String, i32, Option<String>);
 
 impl Watch {
-    /// Ends the sessions of the server that has the lock, if it has asked nothing for longer than permitted.
-    /// A step of any clock changes nothing: only whether there was a statement counts.
+    /// Ends the sessions of the server that has the lock, if it has asked nothing for longer than permitted,
+    /// and says whether it has. A step of any clock changes nothing: only whether there was a statement counts.
     async fn end_silent(
         &mut self,
         options: &PgConnectOptions,
         silence_max: Duration,
-    ) -> Result<(), sqlx::Error> {
+    ) -> Result<Silence, sqlx::Error> {
         let mut connection = connections::connect(options).await?;
         let owner: Option<Owner> = sqlx::query_as(OWNER)
             .fetch_optional(&mut connection)
@@ -261,16 +275,16 @@ impl Watch {
             (Some((seen, since)), Some(owner)) if seen == owner && !is_late => *since,
             _ => {
                 self.seen = owner.map(|owner| (owner, Instant::now()));
-                return Ok(());
+                return Ok(Silence::Short);
             }
         };
         let Some((process, session, Some(asked_at))) = owner else {
             self.fails(&"the user may not see its last statement");
-            return Ok(());
+            return Ok(Silence::Short);
         };
         let silence = since.elapsed();
         if silence < silence_max {
-            return Ok(());
+            return Ok(Silence::Short);
         }
         let ended = sqlx::query_as(END_PROCESS)
             .bind(&process)
@@ -284,7 +298,7 @@ impl Watch {
              are ended",
             silence.as_secs_f64()
         );
-        Ok(())
+        Ok(Silence::Ended)
     }
 
     /// Logs once that the server cannot be watched.

@@ -68,6 +68,7 @@ fn config(listen: &str) -> zenoh::Result<zenoh::Config> {
         ("transport/unicast/accept_pending", SESSIONS_MAX.to_string()),
         ("scouting/multicast/enabled", "false".to_owned()),
         ("scouting/gossip/enabled", "false".to_owned()),
+        ("scouting/delay", "0".to_owned()),
         ("timestamping/enabled", "false".to_owned()),
     ] {
         config.insert_json5(key, &value)?;

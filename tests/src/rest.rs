@@ -68,6 +68,13 @@ impl Rest {
         ))
     }
 
+    /// Reads the body of a successful answer as it is; `None` if there is none.
+    pub async fn bytes(&self, path: &str) -> Option<Vec<u8>> {
+        let request = self.http.get(format!("{}{path}", self.address));
+        let response = request.send().await.ok()?.error_for_status().ok()?;
+        Some(response.bytes().await.ok()?.to_vec())
+    }
+
     /// Reads something that must be there.
     ///
     /// # Panics

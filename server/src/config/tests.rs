@@ -191,3 +191,26 @@ fn a_database_is_a_file_or_an_address_of_postgresql_that_the_server_does_not_bac
     assert!(error.contains("pg_dump"), "{error}");
     assert!(!error.contains("hunter2"), "{error}");
 }
+
+#[test]
+fn an_advertised_url_is_a_name_of_the_server_and_is_reached_by_tls() {
+    let tls = "[tls]\ncertificate = \"c.pem\"\nkey = \"k.pem\"\n";
+    let advertised = |url: &str| load(&format!("{tls}[web]\nadvertise_url = \"{url}\"\n"));
+    let config = advertised("https://server-a.example.org:8420").unwrap();
+    let name = "server-a.example.org".to_owned();
+    assert_eq!(config.names().hosts, [name.clone()]);
+    assert_eq!(config.certificate_names(), [name]);
+    for here in [
+        "http://127.0.0.1:8420",
+        "http://[::1]:8420",
+        "http://localhost",
+    ] {
+        advertised(here).unwrap();
+    }
+    for wrong in ["http://server-a.example.org", "http://10.0.0.1:8420"] {
+        let error = advertised(wrong).unwrap_err().to_string();
+        assert!(error.contains("https://"), "{wrong}: {error}");
+    }
+    let error = advertised("server-a").unwrap_err().to_string();
+    assert!(error.contains("is no origin"), "{error}");
+}

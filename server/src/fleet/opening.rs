@@ -186,6 +186,8 @@ fn config(address: SocketAddr) -> zenoh::Result<Config> {
         // Discovery and advertising are disabled.
         ("scouting/multicast/enabled", "false".to_owned()),
         ("scouting/gossip/enabled", "false".to_owned()),
+        // Else every router waits half a second for others, which there are none of.
+        ("scouting/delay", "0".to_owned()),
         // A router with timestamping compares the time of every message with its clock, and logs an
         // error for each after the machine's clock was set back. These times are not used.
         ("timestamping/enabled", "false".to_owned()),

@@ -25,6 +25,7 @@ mod floor;
 mod ingest;
 mod peers;
 mod saturation;
+mod sizes;
 mod states;
 
 use std::ops::Range;
@@ -73,6 +74,9 @@ pub(crate) struct Arguments {
     /// Measure the cost of states of many robots beside a bare zenoh router, and nothing else
     #[arg(long, conflicts_with = "saturate")]
     states: bool,
+    /// Weigh segments and states, on the way and on the disk, and nothing else
+    #[arg(long, conflicts_with_all = ["saturate", "states", "markdown"])]
+    sizes: bool,
     /// Segments of each upload with `--saturate`
     #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u16).range(1..=1_000))]
     records: u16,
@@ -119,6 +123,10 @@ async fn main() -> anyhow::Result<ExitCode> {
             return report::tell_markdown(&states.table().markdown(), &checks);
         }
         return report::tell_with(arguments.json, &states, states.words(), &checks);
+    }
+    if arguments.sizes {
+        let sizes = sizes::measure(&node).await?;
+        return report::tell_with(arguments.json, &sizes, sizes.words(), &sizes.checks());
     }
     let collector = Collector::default();
     let mut fleet = start_traced_fleet(&node, arguments.tls, &collector).await?;

@@ -118,7 +118,7 @@ async fn scans(fleet: &Fleet) -> anyhow::Result<i64> {
         .database()
         .rows(
             "SELECT CAST(SUM(COALESCE(idx_scan, 0)) AS BIGINT) FROM pg_stat_user_tables
-             WHERE relname IN ('cell_sums', 'sites', 'terrains')",
+             WHERE relname IN ('cell_sums', 'terrains')",
         )
         .await?;
     Ok(rows.first().context("PostgreSQL counts scans")?.0)
