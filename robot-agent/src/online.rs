@@ -145,12 +145,23 @@ impl Online {
         if before.as_ref().map(Arc::as_ptr) != shown.as_ref().map(Arc::as_ptr) {
             links.servers.begin_anew();
         }
+        let attempt_max = links.servers.attempt_max();
         let connecting = FleetLink::connect(
             &mut links.servers,
             shown.as_deref(),
             self.identity.clone(),
             links.listeners.clone(),
         );
+        let connecting = async {
+            let Some(max) = attempt_max else {
+                return connecting.await;
+            };
+            let connected = tokio::time::timeout(max, connecting).await;
+            let failed = Attempt::Failed {
+                is_distrusted: false,
+            };
+            connected.unwrap_or(Ok(failed))
+        };
         let connected = tokio::select! {
             connected = connecting => connected,
             () = self.stop.cancelled() => return ControlFlow::Break(()),

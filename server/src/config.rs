@@ -626,8 +626,9 @@ impl Config {
     /// Returns the host names of this server, with that at which standbys reach it.
     fn hosts(&self) -> Vec<String> {
         let advertised = self.web.advertise_url.as_ref().map(Origin::host);
+        let bare = advertised.map(|host| host.trim_matches(['[', ']']).trim_end_matches('.'));
         let hosts = self.web.hosts.iter().map(String::as_str);
-        hosts.chain(advertised).map(str::to_owned).collect()
+        hosts.chain(bare).map(str::to_owned).collect()
     }
 
     /// Returns the host names of this server and the allowed origins.

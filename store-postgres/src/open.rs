@@ -238,7 +238,9 @@ pub(super) async fn prepare_to_read(url: &str) -> Result<Prepared, OpenError> {
         });
     }
     Ok(Prepared {
-        options: options.application_name(&format!("{STANDBY} {}", *NUMBER)),
+        options: options
+            .application_name(&format!("{STANDBY} {}", *NUMBER))
+            .options([("default_transaction_read_only", "on")]),
         address,
         version,
     })

@@ -5,7 +5,8 @@
 //! preferred server while the present one answers: robots would move twice for each restart.
 //!
 //! A server that is gone refuses at once, while one that is frozen takes seconds of each attempt. So one
-//! that fell silent, or took long to fail, is passed over for a while as long as there are others.
+//! that fell silent, or took long to fail, is passed over for a while as long as there are others, and the first
+//! attempts to reach one that fell silent are short.
 
 use std::time::Duration;
 
@@ -20,6 +21,11 @@ const DISTRUSTED_PAUSE_MAX: Duration = Duration::from_secs(10);
 const LEFT_FOR: Duration = Duration::from_millis(300);
 /// Time for which a server is passed over that took long to fail.
 const PASSED_OVER: Duration = Duration::from_secs(5);
+/// Maximum time of the first attempt to reach a server that fell silent; each further one may take twice as
+/// long.
+const SILENT_FIRST: Duration = Duration::from_millis(600);
+/// Number of such attempts, after which one may take as long as any.
+const SILENT_ATTEMPTS: u32 = 3;
 /// Duration of an attempt from which it counts as long.
 const LONG: Duration = Duration::from_secs(1);
 
@@ -39,6 +45,8 @@ pub struct Rotation {
     logged: Vec<Logged>,
     /// Until when each is passed over.
     passed_over_until: Vec<Duration>,
+    /// Number of attempts to reach each since it fell silent; `None` for one that has not.
+    silent_attempts: Vec<Option<u32>>,
     at: usize,
     /// Whether all of the present round failed since the robot trusts no authority of theirs.
     is_distrusted: bool,
@@ -52,6 +60,7 @@ impl Rotation {
             endpoints: endpoints.to_vec(),
             logged: vec![Logged::default(); endpoints.len()],
             passed_over_until: vec![Duration::ZERO; endpoints.len()],
+            silent_attempts: vec![None; endpoints.len()],
             at: 0,
             is_distrusted: true,
             pause: PAUSE_FIRST,
@@ -77,13 +86,22 @@ impl Rotation {
     pub fn reached(&mut self) {
         *self.logged() = Logged::default();
         self.passed_over_until[self.at] = Duration::ZERO;
+        self.silent_attempts[self.at] = None;
         self.is_distrusted = true;
         self.pause = PAUSE_FIRST;
+    }
+
+    /// Returns the maximum time of the next attempt; `None` if it has no bound of its own. A server that is
+    /// frozen takes connections, and says nothing.
+    pub fn attempt_max(&self) -> Option<Duration> {
+        let made = self.silent_attempts[self.at].filter(|made| *made < SILENT_ATTEMPTS)?;
+        self.has_others().then(|| SILENT_FIRST * 2_u32.pow(made))
     }
 
     /// Goes on to the next server, since the present one fell silent before `now`.
     pub fn leave(&mut self, now: Duration) {
         self.passed_over_until[self.at] = now + LEFT_FOR;
+        self.silent_attempts[self.at] = Some(0);
         self.next(now);
     }
 
@@ -91,12 +109,16 @@ impl Rotation {
     pub fn begin_anew(&mut self) {
         self.logged.fill(Logged::default());
         self.passed_over_until.fill(Duration::ZERO);
+        self.silent_attempts.fill(None);
     }
 
     /// Goes on to the next server after an attempt that failed at `now`. Returns the pause before that one
     /// is tried: none until all have been.
     pub fn failed(&mut self, (began, now): (Duration, Duration), is_distrusted: bool) -> Duration {
         self.is_distrusted &= is_distrusted;
+        if let Some(made) = &mut self.silent_attempts[self.at] {
+            *made = made.saturating_add(1);
+        }
         if is_distrusted {
             self.passed_over_until[self.at] = now + DISTRUSTED_PAUSE_MAX;
         } else if now.saturating_sub(began) >= LONG {
@@ -187,6 +209,34 @@ mod tests {
         rotation.leave(now);
         let (tried, _) = attempts(&mut rotation, &mut now, &[0.1; 4]);
         assert_eq!(tried, "0000");
+    }
+
+    #[test]
+    fn the_first_attempts_to_reach_a_server_that_fell_silent_are_short() {
+        let mut rotation = servers(2);
+        let now = Duration::ZERO;
+        assert_eq!(rotation.attempt_max(), None);
+        rotation.leave(now);
+        assert_eq!(
+            (rotation.endpoint(), rotation.attempt_max()),
+            ("tls/s1:7447", None)
+        );
+        let mut bounds_ms = Vec::new();
+        for _ in 0..5 {
+            // The other one refuses, and this one has been silent for long enough.
+            rotation.at = 0;
+            bounds_ms.push(rotation.attempt_max().map(|max| max.as_millis()));
+            rotation.failed((now, now), false);
+        }
+        assert_eq!(bounds_ms, [Some(600), Some(1_200), Some(2_400), None, None]);
+        rotation.at = 0;
+        rotation.reached();
+        rotation.leave(now);
+        rotation.at = 0;
+        assert_eq!(rotation.attempt_max(), Some(SILENT_FIRST));
+        let mut alone = servers(1);
+        alone.leave(now);
+        assert_eq!(alone.attempt_max(), None);
     }
 
     #[test]

@@ -159,6 +159,16 @@ impl Maps {
         }
     }
 
+    /// Removes sums from the unwritten ones that another server has stored; `false` if this is the server now.
+    fn forget_followed(&self, steps: &[WatermarkStep]) -> bool {
+        let _sites = self.sites.write().unwrap_or_else(PoisonError::into_inner);
+        if self.follower().is_none() {
+            return false;
+        }
+        self.unwritten().written(steps);
+        true
+    }
+
     /// Adds the sums of a range of the ledger that a standby has read; `false` if it is the server now.
     fn add_followed(&self, folded: &[Folded], range: Added, now: Duration) -> bool {
         let mut sites = self.sites.write().unwrap_or_else(PoisonError::into_inner);

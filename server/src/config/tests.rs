@@ -197,9 +197,10 @@ fn an_advertised_url_is_a_name_of_the_server_and_is_reached_by_tls() {
     let tls = "[tls]\ncertificate = \"c.pem\"\nkey = \"k.pem\"\n";
     let advertised = |url: &str| load(&format!("{tls}[web]\nadvertise_url = \"{url}\"\n"));
     let config = advertised("https://server-a.example.org:8420").unwrap();
-    let name = "server-a.example.org".to_owned();
-    assert_eq!(config.names().hosts, [name.clone()]);
-    assert_eq!(config.certificate_names(), [name]);
+    assert_eq!(config.names().hosts, ["server-a.example.org"]);
+    assert_eq!(config.certificate_names(), ["server-a.example.org"]);
+    let config = advertised("https://[2001:db8::1]:8420").unwrap();
+    assert_eq!(config.certificate_names(), ["2001:db8::1"]);
     for here in [
         "http://127.0.0.1:8420",
         "http://[::1]:8420",

@@ -26,6 +26,8 @@ use crate::authority::Trusted;
 
 /// Maximum number of superseded routers that still have robots.
 const SUPERSEDED_MAX: usize = 8;
+/// Minimum interval between two openings: robots that join at about the same time share a router.
+const OPEN_EVERY: Duration = Duration::from_millis(500);
 /// Interval of checks for unused routers.
 const LOOK_EVERY: Duration = Duration::from_secs(5);
 
@@ -72,10 +74,18 @@ impl RouterPool {
             if let Some(rotated) = &mut rotated {
                 rotated.mark_unchanged();
             }
-            {
+            let is_opened = {
                 let _turn = self.turn.lock().await;
-                self.let_everybody_in().await;
+                let is_opened = self.let_everybody_in().await;
                 self.close_idle().await;
+                is_opened
+            };
+            if is_opened {
+                tokio::select! {
+                    biased;
+                    () = stop.cancelled() => return,
+                    () = tokio::time::sleep(OPEN_EVERY) => {}
+                }
             }
             tokio::select! {
                 biased;
@@ -107,20 +117,25 @@ impl RouterPool {
         current.map(|(router, _)| router).collect()
     }
 
-    async fn let_everybody_in(&self) {
+    /// Opens a router for the robots that have none; returns whether it did.
+    async fn let_everybody_in(&self) -> bool {
         let all = self.routers.all();
         let fleet = self.app.enrolment_registry().robots();
         let Some(robots) = to_open(&self.groups(&all), &fleet) else {
-            return;
+            return false;
         };
         let count = robots.len();
         match self.open(robots.into_iter().collect()).await {
             Ok(()) => {
                 self.app.counters().routers_opened.one();
                 info!("another zenoh router was opened, for {count} robots");
+                true
             }
             // The next check tries again.
-            Err(failed) => error!("cannot open another router: {failed}"),
+            Err(failed) => {
+                error!("cannot open another router: {failed}");
+                false
+            }
         }
     }
 

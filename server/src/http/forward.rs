@@ -72,6 +72,12 @@ pub enum ForwardError {
         "this server is a standby, and so is the one that is said to have the database; try again"
     )]
     Loop,
+    /// The other server does not answer a change that it may have received.
+    #[error(
+        "the server that has the database does not answer, and may have done this: see whether it has before \
+         you try again"
+    )]
+    Uncertain,
     /// The path is written in an unusual way.
     #[error("this path cannot be forwarded: write it without `..`, `\\` and the like")]
     Path,
@@ -86,9 +92,10 @@ impl From<ForwardError> for Problem {
     fn from(error: ForwardError) -> Self {
         let kind = match error {
             ForwardError::Path => ProblemType::InvalidPath,
-            ForwardError::NoAddress | ForwardError::Loop | ForwardError::NoAnswer => {
-                ProblemType::Unavailable
-            }
+            ForwardError::NoAddress
+            | ForwardError::Loop
+            | ForwardError::NoAnswer
+            | ForwardError::Uncertain => ProblemType::Unavailable,
         };
         Self::new(kind).detail(error.to_string())
     }
@@ -195,7 +202,8 @@ impl Forwarder {
             return;
         };
         let asking = self.client(Sharing::Known).get(format!("{leader}/healthz"));
-        let asking = asking.timeout(CONNECT_MAX).send();
+        // A standby says then that it is none.
+        let asking = asking.header(header::VIA, VIA).timeout(CONNECT_MAX).send();
         match asking.await.and_then(reqwest::Response::error_for_status) {
             Ok(_answer) => self.reached(),
             Err(cause) => self.failed(&leader, &cause),
@@ -233,12 +241,25 @@ impl Forwarder {
         sharing: Sharing,
         request: Request,
     ) -> Result<Response<Body>, ForwardError> {
-        let leader = app.leader_url().ok_or(ForwardError::NoAddress)?;
         let (mut parts, body) = request.into_parts();
-        let is_own = |via: &HeaderValue| via.to_str().is_ok_and(|via| via.contains(VIA));
-        if parts.headers.get_all(header::VIA).iter().any(is_own) {
+        if is_forwarded(&parts.headers) {
             return Err(ForwardError::Loop);
         }
+        let is_safe = parts.method.is_safe();
+        let unanswered = if is_safe {
+            ForwardError::NoAnswer
+        } else {
+            ForwardError::Uncertain
+        };
+        let Some(leader) = app.leader_url() else {
+            // After the takeover this server is the other one.
+            let is_over = app.supervisor().stop_token().is_cancelled();
+            return Err(if is_over {
+                ForwardError::NoAnswer
+            } else {
+                ForwardError::NoAddress
+            });
+        };
         let url = url_at(&leader, &parts.uri)?;
         let upgrade = parts.extensions.remove::<OnUpgrade>();
         let protocol = parts.headers.get(header::UPGRADE).cloned();
@@ -260,21 +281,25 @@ impl Forwarder {
         let answer = tokio::select! {
             biased;
             // The client asks again, and this server answers then.
-            () = app.supervisor().stopping() => return Err(ForwardError::NoAnswer),
+            () = app.supervisor().stopping() => return Err(unanswered),
             answer = tokio::time::timeout(ANSWER_MAX, asking.send()) => answer,
         };
         let answer = match answer {
             Ok(Ok(answer)) => answer,
             Ok(Err(cause)) => {
                 self.failed(&leader, &cause);
-                return Err(ForwardError::NoAnswer);
+                let is_sent = !cause.is_connect();
+                return Err(if is_sent {
+                    unanswered
+                } else {
+                    ForwardError::NoAnswer
+                });
             }
             Err(elapsed) => {
                 self.failed(&leader, &elapsed);
-                return Err(ForwardError::NoAnswer);
+                return Err(unanswered);
             }
         };
-        self.reached();
         if answer.status() == StatusCode::SWITCHING_PROTOCOLS {
             return Ok(join(app, (upgrade, slot), answer));
         }
@@ -288,13 +313,19 @@ fn lock<T>(of: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
     of.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Returns the same path at another server. What a URL would write in another way is refused, since a filter
-/// before this server has seen it as it came.
+/// Returns whether a standby has forwarded a request.
+pub(super) fn is_forwarded(headers: &HeaderMap) -> bool {
+    let is_own = |via: &HeaderValue| via.to_str().is_ok_and(|via| via.contains(VIA));
+    headers.get_all(header::VIA).iter().any(is_own)
+}
+
+/// Returns the same path at another server. A path that a URL would write in another way is refused, since a
+/// filter before this server has seen it as it came.
 fn url_at(leader: &str, asked: &Uri) -> Result<Url, ForwardError> {
     let path = asked.path_and_query().map_or("/", PathAndQuery::as_str);
     let url = Url::parse(&format!("{leader}{path}"));
     let url = url.map_err(|_malformed| ForwardError::Path)?;
-    if url.path() == asked.path() && url.query() == asked.query() {
+    if url.path() == asked.path() {
         Ok(url)
     } else {
         Err(ForwardError::Path)
@@ -416,10 +447,18 @@ mod tests {
     #[test]
     fn a_path_is_forwarded_as_it_came_or_refused() {
         let at = |path: &str| url_at("https://a.example.org:8420", &path.parse().unwrap());
-        for path in ["/v1/missions?limit=3&site=a%20b", "/", "/docs/", "/v1/x?"] {
+        for path in [
+            "/v1/missions?limit=3&site=a%20b",
+            "/",
+            "/docs/",
+            "/v1/x?",
+            "/c?cursor=-40,-70",
+        ] {
             let url = at(path).unwrap();
             assert_eq!(url.as_str(), format!("https://a.example.org:8420{path}"));
         }
+        let named = at("/v1/audit?who=O'Brien").unwrap();
+        assert_eq!(named.query_pairs().next().unwrap().1, "O'Brien");
         for path in ["/v1/../metrics", "/a/%2e%2e/b", "*", "/a\\b"] {
             if path.parse::<Uri>().is_ok() {
                 assert!(matches!(at(path), Err(ForwardError::Path)), "{path}");

@@ -9,7 +9,7 @@ use std::time::Duration;
 use axum::body::Body;
 use axum::extract::Request;
 use axum::http::request::Parts;
-use axum::http::{Method, StatusCode};
+use axum::http::{HeaderMap, Method, StatusCode};
 use axum::middleware::{from_fn, from_fn_with_state};
 use axum::response::{IntoResponse as _, Response};
 use axum::routing::get;
@@ -19,7 +19,7 @@ use tower_http::catch_panic::CatchPanicLayer;
 use tread_api::problem::ProblemType;
 
 use super::extract::{BodyLimit, Json};
-use super::forward::{ForwardError, Forwarder, SILENCE_MAX, Sharing};
+use super::forward::{self, ForwardError, Forwarder, SILENCE_MAX, Sharing};
 use super::health::Health;
 use super::identity::browser;
 use super::identity::guard::{self, Guard, Peer};
@@ -77,7 +77,7 @@ pub fn router(app: App, names: Names, forwarder: Forwarder) -> Router {
     };
     let checked = standby.clone();
     let router = Router::new()
-        .route("/healthz", get(super::health::healthz))
+        .route("/healthz", get(healthz))
         .route(
             "/readyz",
             get(async move || ready(&checked.app, &checked.forwarder)),
@@ -119,7 +119,9 @@ async fn answer(standby: Standby, request: Request) -> Response {
 
 impl Standby {
     fn is_up_to_date(&self) -> bool {
-        self.app.map_age().is_some_and(|age| age <= MAP_AGE_MAX)
+        let ages = [self.app.map_age(), self.app.tokens_age()];
+        ages.iter()
+            .all(|age| age.is_some_and(|age| age <= MAP_AGE_MAX))
     }
 
     /// Counts the connection of a request among those of its token or session, so that no flood of others
@@ -148,6 +150,14 @@ impl Standby {
             Purpose::Other => Sharing::Known,
         })
     }
+}
+
+/// Says that the process lives, and to another standby that this is not the server.
+async fn healthz(headers: HeaderMap) -> Result<Json<Health>, Problem> {
+    if forward::is_forwarded(&headers) {
+        return Err(ForwardError::Loop.into());
+    }
+    Ok(super::health::ok())
 }
 
 /// Says whether this standby can answer all requests, alone or by the other server.

@@ -1,10 +1,12 @@
 //! What a standby answers while it waits for the database: it follows the map, and forwards to the server that
 //! has the database what it cannot answer ([`crate::http::standby`]).
 
+use std::panic::AssertUnwindSafe;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use anyhow::Context as _;
+use futures_util::FutureExt as _;
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 use tracing::{info, warn};
@@ -72,9 +74,12 @@ async fn serve(
     let mut logged = String::new();
     loop {
         let serving = serve_once(&config, &clock, (&stop, &shown));
-        let Err(error) = serving.await else { return };
+        let reason = match AssertUnwindSafe(serving).catch_unwind().await {
+            Ok(Ok(())) => return,
+            Ok(Err(error)) => format!("{error:#}"),
+            Err(_panic) => "it panicked".to_owned(),
+        };
         lock(&shown).take();
-        let reason = format!("{error:#}");
         if reason != logged {
             warn!("standby: it answers no requests: {reason}");
             logged = reason;
@@ -97,15 +102,14 @@ async fn serve_once(
     (stop, shown): (&CancellationToken, &Mutex<Option<App>>),
 ) -> anyhow::Result<()> {
     let supervisor = Supervisor::new();
+    // Connections end by themselves then.
+    let _ending = supervisor.stop_token().drop_guard();
     let serving = serve_with(config, clock, (&supervisor, shown));
-    let served = tokio::select! {
+    tokio::select! {
         biased;
         () = stop.cancelled() => Ok(()),
         served = serving => served,
-    };
-    // Connections end by themselves.
-    supervisor.stop_token().cancel();
-    served
+    }
 }
 
 async fn serve_with(

@@ -73,6 +73,8 @@ pub(super) struct Identity {
     turns: Semaphore,
     stop_turns: Semaphore,
     people: Option<People>,
+    /// When the valid tokens and sessions were read last, on the monotonic clock.
+    read_at: Mutex<Option<Duration>>,
 }
 
 impl Identity {
@@ -84,6 +86,7 @@ impl Identity {
             turns: Semaphore::new(LOOK_UP_TURNS),
             stop_turns: Semaphore::new(STOP_LOOK_UP_TURNS),
             people,
+            read_at: Mutex::default(),
         }
     }
 }
@@ -200,7 +203,18 @@ impl App {
             valid.join(self.valid().await?);
         }
         known.read_again(valid, generation, began_at);
+        let mut read_at = self.identity().read_at.lock();
+        *read_at
+            .as_deref_mut()
+            .unwrap_or_else(|poisoned| poisoned.get_mut()) = Some(began_at);
         Ok(())
+    }
+
+    /// Returns the time since the valid tokens and sessions were read; `None` if they never were.
+    pub fn tokens_age(&self) -> Option<Duration> {
+        let read_at = self.identity().read_at.lock();
+        let at = *read_at.unwrap_or_else(PoisonError::into_inner);
+        Some(self.clock().elapsed().saturating_sub(at?))
     }
 
     async fn valid(&self) -> Result<Valid, AppError> {

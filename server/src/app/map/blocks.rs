@@ -165,14 +165,15 @@ impl Maps {
     }
 
     /// Puts the blocks of a snapshot into memory, with the sums that are unwritten in it, and keeps them
-    /// there. Returns their number; `None` if sums were removed or merged since.
+    /// there. Returns their number; `None` if sums were removed or merged since, or if the snapshot was
+    /// `followed` by a standby that is the server now.
     ///
     /// # Errors
     /// A sum has a name that the map does not know.
     fn insert(
         &self,
         row: &SiteRow,
-        snapshot: Snapshot,
+        (snapshot, is_followed): (Snapshot, bool),
         pins: &mut Pins,
     ) -> Result<Option<usize>, DbError> {
         let Snapshot {
@@ -182,6 +183,9 @@ impl Maps {
         } = snapshot;
         let count = blocks.len();
         let mut sites = self.sites.write().unwrap_or_else(PoisonError::into_inner);
+        if is_followed && self.follower().is_none() {
+            return Ok(None);
+        }
         let sites = &mut *sites;
         let Some(map) = sites.maps.get_mut(&row.pk) else {
             return Ok(None);
@@ -296,10 +300,10 @@ impl App {
                     return Err(DbError::Unsettled);
                 }
                 // In its turn: nothing is added in between that is in this snapshot.
-                return maps.insert(row, snapshot, pins);
+                return maps.insert(row, (snapshot, true), pins);
             }
         };
-        maps.insert(row, snapshot, pins)
+        maps.insert(row, (snapshot, false), pins)
     }
 
     /// Reads the first of some blocks of a map with this stamp, and further ones as long as they are small.

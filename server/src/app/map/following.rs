@@ -146,7 +146,9 @@ impl App {
         let now = self.clock().elapsed();
         if now.saturating_sub(read.watermarks_at) >= FORGET_EVERY {
             read.watermarks_at = now;
-            self.forget_stored(db::watermarks::all(tx).await?, read);
+            if !self.forget_stored(db::watermarks::all(tx).await?, read) {
+                return Ok(false);
+            }
         }
         *follower.seen() = Seen {
             leader,
@@ -235,8 +237,8 @@ impl App {
         Ok(true)
     }
 
-    /// Removes sums from the unwritten ones that are stored now.
-    fn forget_stored(&self, watermarks: HashMap<i64, i64>, read: &mut Read) {
+    /// Removes sums from the unwritten ones that are stored now; `false` if this process is the server now.
+    fn forget_stored(&self, watermarks: HashMap<i64, i64>, read: &mut Read) -> bool {
         let step = |(&robot_pk, &to_pk): (&i64, &i64)| {
             let from_pk = read.watermarks.get(&robot_pk).copied().unwrap_or_default();
             (to_pk > from_pk).then_some(WatermarkStep {
@@ -246,8 +248,8 @@ impl App {
             })
         };
         let steps: Vec<WatermarkStep> = watermarks.iter().filter_map(step).collect();
-        self.apply(MapChange::Store(steps));
         read.watermarks = watermarks;
+        self.maps().forget_followed(&steps)
     }
 
     /// Returns the number of standbys that follow the database of this server; `None` for a database that has
@@ -301,7 +303,9 @@ impl App {
         if self.maps().unwritten().is_divided_by(&watermarks) {
             return Ok(false);
         }
-        self.forget_stored(watermarks, read);
+        if !self.forget_stored(watermarks, read) {
+            return Ok(false);
+        }
         self.removed().extend(db::removed::boots(&mut tx).await?);
         Ok(true)
     }
