@@ -28,6 +28,7 @@ use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
 use tokio::sync::{Semaphore, SemaphorePermit};
+use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 use tread_api::identity::Token;
 use tread_api::ids::SessionId;
@@ -73,8 +74,8 @@ pub(super) struct Identity {
     turns: Semaphore,
     stop_turns: Semaphore,
     people: Option<People>,
-    /// When the valid tokens and sessions were read last, on the monotonic clock.
-    read_at: Mutex<Option<Duration>>,
+    /// When the valid tokens and sessions were read last.
+    read_at: Mutex<Option<Instant>>,
 }
 
 impl Identity {
@@ -197,6 +198,7 @@ impl App {
     pub async fn know_tokens(&self) -> Result<(), AppError> {
         let known = &self.identity().known;
         let (generation, began_at) = (known.generation(), self.clock().elapsed());
+        let asked_at = Instant::now();
         let mut valid = self.valid().await?;
         if known.any_gone(&valid, began_at) {
             // SQLite can return no row for lack of memory, but not twice in a row.
@@ -206,7 +208,7 @@ impl App {
         let mut read_at = self.identity().read_at.lock();
         *read_at
             .as_deref_mut()
-            .unwrap_or_else(|poisoned| poisoned.get_mut()) = Some(began_at);
+            .unwrap_or_else(|poisoned| poisoned.get_mut()) = Some(asked_at);
         Ok(())
     }
 
@@ -214,7 +216,7 @@ impl App {
     pub fn tokens_age(&self) -> Option<Duration> {
         let read_at = self.identity().read_at.lock();
         let at = *read_at.unwrap_or_else(PoisonError::into_inner);
-        Some(self.clock().elapsed().saturating_sub(at?))
+        Some(at?.elapsed())
     }
 
     async fn valid(&self) -> Result<Valid, AppError> {

@@ -14,6 +14,7 @@ use std::sync::{Arc, Mutex as StdMutex, PoisonError};
 use std::time::Duration;
 
 use tokio::sync::{Mutex, MutexGuard};
+use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 use tread_api::ids::RobotId;
 use tread_api::rights::Scope;
@@ -69,7 +70,7 @@ pub(super) struct Read {
 #[derive(Debug, Default)]
 struct Seen {
     leader: Leader,
-    at: Option<Duration>,
+    at: Option<Instant>,
 }
 
 impl Read {
@@ -152,7 +153,7 @@ impl App {
         }
         *follower.seen() = Seen {
             leader,
-            at: Some(now),
+            at: Some(Instant::now()),
         };
         Ok(true)
     }
@@ -320,7 +321,7 @@ impl App {
     /// time, or in the server that has the database.
     pub fn map_age(&self) -> Option<Duration> {
         let at = self.maps().follower()?.seen().at?;
-        Some(self.clock().elapsed().saturating_sub(at))
+        Some(at.elapsed())
     }
 
     /// Returns whether another server has the database, and this one follows it.

@@ -78,6 +78,7 @@ impl Pair {
         let yard = Yard::of(folder, server.unwrap()).await;
         of_standby.standby = true;
         of_standby.http = free_address();
+        of_standby.metrics = Some(free_address());
         of_standby.map = map;
         change(&mut of_standby);
         let mut pair = Self {
@@ -222,6 +223,29 @@ async fn the_map_of_a_standby_is_that_of_the_server() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_standby_without_memory_for_its_map_reads_the_same_from_the_database() {
     Box::pin(maps_agree(MapConfig { memory_max_mib: 0 })).await;
+}
+
+/// The server counts its standby, which says how old its map is.
+async fn both_have_metrics(pair: &Pair) {
+    let Pair { yard, .. } = pair;
+    let metrics = async |address: SocketAddr| {
+        let url = format!("http://{address}/metrics");
+        client(None)
+            .get(url)
+            .send()
+            .await
+            .unwrap()
+            .text()
+            .await
+            .unwrap()
+    };
+    let of_server = metrics(yard.server.metrics_address().unwrap()).await;
+    assert!(of_server.contains("\ntread_standbys 1\n"), "{of_server}");
+    let of_standby = metrics(pair.config.metrics.unwrap()).await;
+    assert!(
+        of_standby.contains("\ntread_standby_map_age_seconds 0."),
+        "{of_standby}"
+    );
 }
 
 /// The server judges who may do what, and the standby knows it soon.
@@ -371,6 +395,8 @@ async fn what_a_standby_cannot_answer_the_server_answers_until_the_standby_takes
         .send(by_admin.get(at(&format!("/v1/missions/{id}"))))
         .await;
     assert_eq!((status, &found["id"]), (StatusCode::OK, &mission["id"]));
+
+    both_have_metrics(&pair).await;
 
     // Teleoperation and Stop go through it too.
     let mut socket = Socket::open_at(&pair.standby, "rover-2", yard.admin()).await;
