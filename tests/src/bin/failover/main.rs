@@ -28,7 +28,7 @@ use tread_tests::wait::{DRIVE, SHORT};
 /// Longest time until all robots are online at the other server: after a kill, and after a freeze or a cut,
 /// of which the standby waits 1.25 s.
 const KILLED_MAX_S: f64 = 1.5;
-const FROZEN_MAX_S: f64 = 3.0;
+const FROZEN_MAX_S: f64 = 4.0;
 /// Longest time until a server that was woken up, or connected again, has ended.
 const WOKEN_MAX_S: f64 = 5.0;
 /// Time between two looks.

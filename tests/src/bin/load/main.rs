@@ -93,7 +93,7 @@ pub(crate) struct Arguments {
     #[arg(long, default_value_t = 25, value_parser = clap::value_parser!(u32).range(1..=1_000))]
     missions: u32,
     /// Connect all robots by TLS with certificates of their own; with `--states` also the largest fleet, which
-    /// takes half an hour
+    /// takes long
     #[arg(long)]
     tls: bool,
     /// Print one JSON object instead of a table

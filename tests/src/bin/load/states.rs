@@ -26,7 +26,7 @@ use crate::{Arguments, batches, light_id, period_of, start_fleet, start_light_ro
 
 /// Robots, and states of each per second.
 const FLEETS: [(u32, f64); 2] = [(1_000, 10.0), (5_000, 2.0)];
-/// Robots of the largest fleet that gets certificates without `--tls`: 5 000 robots take half an hour to join.
+/// Robots of the largest fleet that gets certificates without `--tls`: 5 000 robots take minutes to join.
 const CERTIFICATES_MAX: u32 = 1_000;
 /// Processor time for each state over that of the bare router, at the most, microseconds.
 const OVER_ROUTER_MAX_US: f64 = 25.0;
