@@ -227,8 +227,7 @@ fn with_problems(mut openapi: OpenApi) -> OpenApi {
 pub fn router(app: App, names: Names) -> Router {
     let (router, openapi) = routes().split_for_parts();
     let openapi = with_problems(openapi);
-    let names = Arc::new(names);
-    let guard = Guard::new(app.clone(), Access::of(&openapi), Arc::clone(&names));
+    let access = Access::of(&openapi);
     let router = router
         .merge(page::routes())
         .merge(
@@ -238,20 +237,31 @@ pub fn router(app: App, names: Names) -> Router {
                 .config(utoipa_swagger_ui::Config::default().validator_url("none")),
         )
         .fallback(not_found)
-        .method_not_allowed_fallback(method_not_allowed)
+        .method_not_allowed_fallback(method_not_allowed);
+    let router = behind_guard(router, &app, (access, Arc::new(names)));
+    with_request_id(router).with_state(app)
+}
+
+/// Puts the guard before routes with these requirements, and measures and bounds each request.
+fn behind_guard(
+    router: Router<App>,
+    app: &App,
+    (access, names): (Access, Arc<Names>),
+) -> Router<App> {
+    let guard = Guard::new(app.clone(), access, Arc::clone(&names));
+    let router = router
         .layer(from_fn_with_state(guard, guard::stand))
         .layer(Extension(Arc::clone(&names)));
     let router = match browser::foreign_pages(&names.allowed_origins) {
         Some(foreign_pages) => router.layer(foreign_pages),
         None => router,
     };
-    let router = router
+    router
         .layer(from_fn_with_state(app.clone(), measure))
         .layer(from_fn(bound_time))
         .layer(CatchPanicLayer::custom(broken))
         .layer(from_fn_with_state(app.clone(), count_panics))
-        .layer(from_fn_with_state(names, browser::set_headers));
-    with_request_id(router).with_state(app)
+        .layer(from_fn_with_state(names, browser::set_headers))
 }
 
 /// Names each request in its answer and in the log.

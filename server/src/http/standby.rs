@@ -10,23 +10,18 @@ use axum::body::Body;
 use axum::extract::Request;
 use axum::http::request::Parts;
 use axum::http::{HeaderMap, Method, StatusCode};
-use axum::middleware::{from_fn, from_fn_with_state};
 use axum::response::{IntoResponse as _, Response};
 use axum::routing::get;
 use axum::{Extension, Router};
 use tower::ServiceExt as _;
-use tower_http::catch_panic::CatchPanicLayer;
 use tread_api::problem::ProblemType;
 
 use super::extract::{BodyLimit, Json};
 use super::forward::{self, ForwardError, Forwarder, SILENCE_MAX, Sharing};
 use super::health::Health;
-use super::identity::browser;
-use super::identity::guard::{self, Guard, Peer};
+use super::identity::guard::{self, Peer};
 use super::problem::Problem;
-use super::{
-    Access, BODY_MAX, bound_time, broken, count_panics, map_routes, measure, with_request_id,
-};
+use super::{Access, BODY_MAX, behind_guard, map_routes, with_request_id};
 use crate::app::App;
 use crate::connections::{Purpose, Slot};
 use crate::identity::origin::Names;
@@ -51,24 +46,11 @@ pub fn router(app: App, names: Names, forwarder: Forwarder) -> Router {
         .layer(Extension(BodyLimit(BODY_MAX)))
         .split_for_parts();
     let is_tls = names.is_tls;
-    let names = Arc::new(names);
-    let guard = Guard::new(app.clone(), Access::of(&openapi), Arc::clone(&names));
     let map = map
-        .layer(from_fn_with_state(guard, guard::stand))
-        .layer(Extension(Arc::clone(&names)))
         .fallback(async || StatusCode::NOT_FOUND)
         .method_not_allowed_fallback(async || StatusCode::NOT_FOUND);
-    let map = match browser::foreign_pages(&names.allowed_origins) {
-        Some(foreign_pages) => map.layer(foreign_pages),
-        None => map,
-    };
-    let map = map
-        .layer(from_fn_with_state(app.clone(), measure))
-        .layer(from_fn(bound_time))
-        .layer(CatchPanicLayer::custom(broken))
-        .layer(from_fn_with_state(app.clone(), count_panics))
-        .layer(from_fn_with_state(names, browser::set_headers))
-        .with_state(app.clone());
+    let map = behind_guard(map, &app, (Access::of(&openapi), Arc::new(names)));
+    let map = map.with_state(app.clone());
     let standby = Standby {
         app: app.clone(),
         map,
