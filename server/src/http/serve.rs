@@ -39,7 +39,7 @@ const HEAD_MAX: usize = 64 * 1024;
 /// Maximum time for open requests after the stop.
 const DRAIN_TIMEOUT: Duration = Duration::from_secs(5);
 /// Header in which proxies name their client.
-const FORWARDED_FOR: HeaderName = HeaderName::from_static("x-forwarded-for");
+pub(super) const FORWARDED_FOR: HeaderName = HeaderName::from_static("x-forwarded-for");
 /// Connections that the system may keep until they are accepted: as many as may be open. One that finds
 /// no room there tries again after a second.
 const BACKLOG: u32 = 4_096;
