@@ -263,7 +263,7 @@ impl Db {
     }
 
     /// Opens a PostgreSQL database to read it beside the server that has it; `None` for a file, which has one
-    /// server. Every write fails. [`Db::follow`] makes its generation that of the database.
+    /// server. Every write fails. [`Db::set_generation`] makes its generation that of the database.
     ///
     /// # Errors
     /// [`OpenError`]: also if its schema is not the one of this program.
@@ -277,10 +277,10 @@ impl Db {
     }
 
     /// Makes the generation that of a PostgreSQL database, which other processes write.
-    pub fn follow(&self, generation: i64) {
+    pub fn set_generation(&self, generation: i64) {
         match self {
             Self::Sqlite(_) => {}
-            Self::Postgres(db) => db.follow(generation),
+            Self::Postgres(db) => db.set_generation(generation),
         }
     }
 

@@ -62,7 +62,7 @@ use self::app::enrolment::EnrolmentService;
 use self::app::identity::people::People;
 use self::app::identity::{READ_AGAIN, audit};
 use self::app::{
-    App, Dependencies, backups, checkpoints, events, ingest, memory, merging, reconciler,
+    App, Dependencies, Role, backups, checkpoints, events, ingest, memory, merging, reconciler,
     retention, storage, sums,
 };
 use self::archive::SegmentArchive;
@@ -174,8 +174,7 @@ impl Server {
             audit: config.audit,
             archive,
             telemetry: Telemetry::start(&config.tracing, "tread-server")?,
-            is_standby: false,
-            standby,
+            role: standby.map_or(Role::Active, Role::Successor),
         });
         let remembered = remember(&app, &config.site).await;
         remembered.map_err(|error| not_readable(error, &config.database))?;

@@ -207,7 +207,7 @@ impl Db {
     }
 
     /// Connects to the database of an address to read it, beside the server that has it, and changes nothing.
-    /// [`Db::follow`] makes its generation that of the database.
+    /// [`Db::set_generation`] makes its generation that of the database.
     ///
     /// # Errors
     /// [`OpenError`]: also if its schema is not the one of this program.
@@ -239,7 +239,7 @@ impl Db {
     }
 
     /// Makes the generation that of the database, which other processes write.
-    pub fn follow(&self, generation: i64) {
+    pub fn set_generation(&self, generation: i64) {
         let generation = u64::try_from(generation).unwrap_or_default();
         self.commits.generation.store(generation, Ordering::Release);
     }

@@ -43,10 +43,20 @@ pub struct Dependencies {
     pub map: MapConfig,
     /// Sender of traces of missions; its default sends none.
     pub telemetry: Telemetry,
-    /// Whether another server writes the database, and this one follows it.
-    pub is_standby: bool,
-    /// The use cases of the standby that this process was, which have the map.
-    pub standby: Option<App>,
+    /// Whether it is the server that has the database.
+    pub role: Role,
+}
+
+/// What a process is to its database.
+#[derive(Debug, Default)]
+pub enum Role {
+    /// The server that has it.
+    #[default]
+    Active,
+    /// The same, after it was a standby, whose map it takes over.
+    Successor(App),
+    /// A standby: another server writes the database, and this one follows it.
+    Standby,
 }
 
 impl Dependencies {
@@ -67,8 +77,7 @@ impl Dependencies {
             archive: None,
             map: MapConfig::default(),
             telemetry: Telemetry::default(),
-            is_standby: false,
-            standby: None,
+            role: Role::Active,
         }
     }
 }

@@ -56,7 +56,7 @@ use uuid::Uuid;
 use self::allowance::Allowances;
 use self::archive::Archive;
 use self::backups::Backups;
-pub use self::dependencies::Dependencies;
+pub use self::dependencies::{Dependencies, Role};
 use self::enrolment::Membership;
 pub use self::error::AppError;
 use self::events::Hub;
@@ -161,8 +161,7 @@ impl App {
             archive,
             map,
             telemetry,
-            is_standby,
-            standby,
+            role,
         } = dependencies;
         let started_at = clock.elapsed();
         let presences = Arc::default();
@@ -191,9 +190,10 @@ impl App {
             recalls: AtomicU64::new(0),
             checks: Semaphore::new(check::CHECKS_MAX),
             identity: Identity::new(people, audit),
-            maps: match standby {
-                Some(standby) => Arc::clone(&standby.inner.maps),
-                None => Arc::new(Maps::new(map.memory_max_mib, is_standby)),
+            maps: match role {
+                Role::Active => Arc::new(Maps::new(map.memory_max_mib, false)),
+                Role::Standby => Arc::new(Maps::new(map.memory_max_mib, true)),
+                Role::Successor(standby) => Arc::clone(&standby.inner.maps),
             },
             membership: Membership::new(enrolment),
             metrics: Metrics::default(),

@@ -14,7 +14,7 @@ use tracing::{info, warn};
 use crate::app::identity::READ_AGAIN_BY_STANDBY;
 use crate::app::identity::people::People;
 use crate::app::robot_link::RobotLink;
-use crate::app::{App, Dependencies, following, identity, map_blocks};
+use crate::app::{App, Dependencies, Role, following, identity, map_blocks};
 use crate::authority::Authorities;
 use crate::clock::Clock;
 use crate::config::{Config, TlsSource};
@@ -135,7 +135,7 @@ async fn serve_with(
         map: config.map,
         robots: RobotLink::unconnected(supervisor.clone()),
         people: people.transpose()?,
-        is_standby: true,
+        role: Role::Standby,
         ..Dependencies::on_database(db, clock.clone())
     });
     let metrics = config.metrics;

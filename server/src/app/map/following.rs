@@ -138,7 +138,7 @@ impl App {
         }
         if leader.generation != before.generation {
             self.follow_sites(tx, read).await?;
-            self.db().follow(leader.generation);
+            self.db().set_generation(leader.generation);
             read.leader = Some(leader.clone());
         }
         if !self.follow_segments(tx, read).await? {

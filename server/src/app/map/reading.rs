@@ -61,7 +61,7 @@ impl App {
             let leader = db::leader::get(&mut tx).await?;
             let last = db::segment_ranges::last(&mut tx).await?;
             let (last_pk, _) = last.unwrap_or_default();
-            self.db().follow(leader.generation);
+            self.db().set_generation(leader.generation);
             let (names, watermarks) = (read.names, read.watermarks);
             following.begin(last_pk, leader, (names, watermarks));
         }
