@@ -12,6 +12,7 @@ mod demo;
 mod exit;
 mod manual;
 mod output;
+mod signals;
 mod socket;
 
 use std::process::ExitCode;

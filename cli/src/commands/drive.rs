@@ -13,7 +13,6 @@ use anyhow::{Context, bail};
 use crossterm::event::{KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 use crossterm::{cursor, execute, terminal};
 use futures_util::{SinkExt as _, StreamExt as _};
-use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 use tokio::time::{Instant, MissedTickBehavior};
 use tokio_tungstenite::tungstenite::{Error, Message};
@@ -28,6 +27,7 @@ use super::robots::{link_name, mode_name};
 use crate::args::DriveArguments;
 use crate::client::Client;
 use crate::output::{age, line, signed};
+use crate::signals::EndSignals;
 use crate::socket::{self, Socket};
 
 /// Period of drive commands.
@@ -156,6 +156,7 @@ pub(super) async fn run(arguments: &DriveArguments, client: &Client) -> anyhow::
     };
     send(&mut socket, &wanted).await?;
     line(HELP)?;
+    let mut signals = EndSignals::listen()?;
     let terminal = RawTerminal::enter()?;
     let (keyboard, mut pressed) = Keyboard::read();
     let ended = Driving {
@@ -166,7 +167,7 @@ pub(super) async fn run(arguments: &DriveArguments, client: &Client) -> anyhow::
         has_lease: false,
         is_refused: false,
     }
-    .run(&mut socket, &mut pressed)
+    .run(&mut socket, &mut pressed, &mut signals)
     .await;
     drop(terminal);
     // The server stops the robot when the socket closes, whether or not this message arrives.
@@ -207,15 +208,13 @@ impl Driving<'_> {
         mut self,
         socket: &mut Socket,
         pressed: &mut mpsc::Receiver<KeyEvent>,
+        signals: &mut EndSignals,
     ) -> anyhow::Result<ExitCode> {
-        let mut terminate = signal(SignalKind::terminate())?;
-        let mut hang_up = signal(SignalKind::hangup())?;
         let mut ticks = tokio::time::interval(SEND_PERIOD);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Skip);
         loop {
             tokio::select! {
-                _ = terminate.recv() => return Ok(ExitCode::SUCCESS),
-                _ = hang_up.recv() => return Ok(ExitCode::SUCCESS),
+                () = signals.next() => return Ok(ExitCode::SUCCESS),
                 key = pressed.recv() => {
                     let Some(key) = key else {
                         bail!("the terminal's input ended");

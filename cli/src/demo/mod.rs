@@ -29,6 +29,7 @@ use crate::args::DemoArguments;
 use crate::client::{Client, ClientError, Reading, Trusted};
 use crate::credentials::{self, Store};
 use crate::output::{json_line, line, note};
+use crate::signals::EndSignals;
 
 /// Maximum time until the server is ready, and until all robots are online.
 const START_WAIT_MAX: Duration = Duration::from_secs(30);
@@ -36,12 +37,10 @@ const START_WAIT_MAX: Duration = Duration::from_secs(30);
 const UPLOAD_WAIT_MAX: Duration = Duration::from_secs(10);
 /// Polling period of the fleet.
 const LOOK_EVERY: Duration = Duration::from_millis(200);
-/// What is wrong if Ctrl-C cannot be awaited.
-const NO_CTRL_C: &str = "cannot wait for Ctrl-C";
 /// Number of newest missions that are polled.
 const MISSIONS_MAX: u32 = 1_000;
 
-/// Runs a fleet until its missions have ended, its time is over or Ctrl-C is pressed.
+/// Runs a fleet until its missions have ended, its time is over or it is asked to end, as by Ctrl-C.
 pub(crate) async fn run(arguments: DemoArguments) -> anyhow::Result<ExitCode> {
     let scenario = match &arguments.scenario {
         Some(file) => Scenario::load(file)?,
@@ -55,6 +54,8 @@ pub(crate) async fn run(arguments: DemoArguments) -> anyhow::Result<ExitCode> {
         }
     };
 
+    // Before anything starts that it must stop.
+    let mut signals = EndSignals::listen()?;
     tell("starting server, database and router …");
     let mut processes = Processes::start_server(folder.path(), arguments.port, &scenario.site)?;
     let token = credentials::read_token(&processes.token_file())?;
@@ -67,10 +68,7 @@ pub(crate) async fn run(arguments: DemoArguments) -> anyhow::Result<ExitCode> {
     };
     let began = tokio::select! {
         began = demo.begin(&mut processes, folder.path(), arguments.scenario.as_deref()) => Some(began),
-        interrupted = tokio::signal::ctrl_c() => {
-            interrupted.context(NO_CTRL_C)?;
-            None
-        }
+        () = signals.next() => None,
     };
     let outcome = match began {
         None => None,
@@ -78,7 +76,7 @@ pub(crate) async fn run(arguments: DemoArguments) -> anyhow::Result<ExitCode> {
         Some(Ok((terrains, missions))) => {
             tell(&welcome(&client, &processes, folder.path(), missions.len()));
             let watch = Watch::new(&demo, &terrains, missions, &arguments);
-            Some(watch.watch_until_end(&mut processes).await)
+            Some(watch.watch_until_end(&mut processes, &mut signals).await)
         }
     };
     tell("stopping …");
@@ -300,7 +298,7 @@ impl Demo<'_> {
 /// Results of a demo.
 struct Ended {
     report: Report,
-    /// Ctrl-C was pressed before the demo was done.
+    /// It was asked to end before the demo was done.
     is_cut_short: bool,
 }
 
@@ -343,17 +341,18 @@ impl<'demo> Watch<'demo> {
         }
     }
 
-    /// Shows the fleet until the demo is done or Ctrl-C is pressed, and returns its results.
-    async fn watch_until_end(mut self, processes: &mut Processes) -> anyhow::Result<Ended> {
+    /// Shows the fleet until the demo is done or a signal asks it to end, and returns its results.
+    async fn watch_until_end(
+        mut self,
+        processes: &mut Processes,
+        signals: &mut EndSignals,
+    ) -> anyhow::Result<Ended> {
         let is_cut_short = tokio::select! {
             done = self.until_done(processes) => {
                 done?;
                 false
             }
-            interrupted = tokio::signal::ctrl_c() => {
-                interrupted.context(NO_CTRL_C)?;
-                true
-            }
+            () = signals.next() => true,
         };
         self.progress.finish();
         if is_cut_short {

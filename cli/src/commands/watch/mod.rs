@@ -14,7 +14,6 @@ mod view;
 use std::io::{self, IsTerminal as _};
 use std::process::ExitCode;
 
-use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 use tread_api::event::{Event, StreamEnd};
 
@@ -24,6 +23,7 @@ use self::screen::Screen;
 use crate::args::WatchArguments;
 use crate::client::Client;
 use crate::output::{Output, json_line, line, note};
+use crate::signals::EndSignals;
 
 pub(super) async fn run(
     arguments: &WatchArguments,
@@ -34,7 +34,7 @@ pub(super) async fn run(
     let feed = Feed::new(client, site, arguments.robot.as_ref());
     let (to, news) = mpsc::channel(NEWS_MAX);
     let in_terminal = io::stdout().is_terminal() && io::stdin().is_terminal();
-    let mut terminate = signal(SignalKind::terminate())?;
+    let mut signals = EndSignals::listen()?;
     let shown = async {
         if output.is_json() || arguments.lines || !in_terminal {
             print(news, output).await
@@ -45,8 +45,7 @@ pub(super) async fn run(
     tokio::select! {
         ended = feed.run(to) => ended,
         ended = shown => ended,
-        _ = tokio::signal::ctrl_c() => Ok(()),
-        _ = terminate.recv() => Ok(()),
+        () = signals.next() => Ok(()),
     }?;
     Ok(ExitCode::SUCCESS)
 }
