@@ -6,6 +6,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use futures_util::StreamExt as _;
+use futures_util::stream::FuturesUnordered;
 use jiff::{SignedDuration, Timestamp};
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
@@ -19,7 +21,8 @@ use crate::control_loop::channels::Shared;
 use crate::dispatcher::Dispatcher;
 use crate::fleet::uploader::{self, Backoff};
 use crate::fleet::{
-    self, Attempt, COMMANDS_MAX, FleetLink, Identity, Listeners, Note, Noted, Rotation,
+    self, Attempt, COMMANDS_MAX, FleetLink, Identity, LinkError, Listeners, Note, Noted, Rotation,
+    Server,
 };
 use crate::membership::{Membership, ServerTrust};
 use crate::outbox::Outbox;
@@ -145,23 +148,7 @@ impl Online {
         if before.as_ref().map(Arc::as_ptr) != shown.as_ref().map(Arc::as_ptr) {
             links.servers.begin_anew();
         }
-        let attempt_max = links.servers.attempt_max();
-        let connecting = FleetLink::connect(
-            &mut links.servers,
-            shown.as_deref(),
-            self.identity.clone(),
-            links.listeners.clone(),
-        );
-        let connecting = async {
-            let Some(max) = attempt_max else {
-                return connecting.await;
-            };
-            let connected = tokio::time::timeout(max, connecting).await;
-            let failed = Attempt::Failed {
-                is_distrusted: false,
-            };
-            connected.unwrap_or(Ok(failed))
-        };
+        let connecting = self.connect(&mut links.servers, shown.as_deref(), &links.listeners);
         let connected = tokio::select! {
             connected = connecting => connected,
             () = self.stop.cancelled() => return ControlFlow::Break(()),
@@ -233,6 +220,45 @@ impl Online {
         }
         link.close().await;
         next
+    }
+
+    /// Makes one attempt to connect to the server whose turn it is. If that takes long, the others are tried
+    /// beside it, and whichever is reached first is the one.
+    async fn connect(
+        &self,
+        servers: &mut Rotation,
+        membership: Option<&Membership>,
+        listeners: &Listeners,
+    ) -> Result<Attempt, LinkError> {
+        let has_others = servers.has_others();
+        let attempt = async |server: &mut Server| {
+            let (identity, listeners) = (self.identity.clone(), listeners.clone());
+            FleetLink::connect(server, has_others, membership, identity, listeners).await
+        };
+        let now = || self.dispatcher.clock.monotonic();
+        let (present, others) = servers.turn(now());
+        let beside = others.into_iter().map(async |mut beside| {
+            loop {
+                tokio::time::sleep(beside.pause).await;
+                let began = now();
+                let is_distrusted = match attempt(beside.server).await {
+                    Ok(Attempt::Reached(link)) => return (beside.at, link),
+                    Ok(Attempt::Failed { is_distrusted }) => is_distrusted,
+                    // Its own turn shows it.
+                    Err(_) => false,
+                };
+                beside.failed((began, now()), is_distrusted);
+            }
+        });
+        let mut beside: FuturesUnordered<_> = beside.collect();
+        let (at, link) = tokio::select! {
+            biased;
+            connected = attempt(present) => return connected,
+            Some(reached) = beside.next() => reached,
+        };
+        drop(beside);
+        servers.go_to(at);
+        Ok(Attempt::Reached(link))
     }
 
     /// Waits before another attempt to connect.

@@ -44,15 +44,15 @@ mod standby;
 pub mod supervisor;
 pub mod webhooks;
 
+use std::future::pending;
 use std::net::SocketAddr;
+use std::pin::pin;
 use std::sync::Arc;
-use std::time::Duration;
 
 use anyhow::Context as _;
 use jiff::SignedDuration;
 use tokio::net::TcpListener;
 use tokio::sync::mpsc;
-use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 use tracing::{error, info, warn};
 use tread_api::ids::SiteId;
@@ -70,7 +70,7 @@ use self::authority::Authorities;
 use self::clock::Clock;
 pub use self::config::{Config, ServerArgs};
 use self::config::{RetentionConfig, RobotsConfig, TlsSource};
-use self::db::lock::{DatabaseLock, LockError};
+use self::db::lock::DatabaseLock;
 use self::db::{Db, DbError, Engine, Location};
 use self::fleet::{Fleet, Security};
 use self::http::serve::Serving;
@@ -78,14 +78,9 @@ use self::http::tls::{Issuer, Tls};
 use self::identity::address::TrustedProxies;
 use self::identity::origin::Origin;
 pub use self::program::{command_line, run, run_from_args};
-use self::standby::Standby;
-use self::standby::serving::StandbyServing;
+use self::standby::Taken;
 use self::supervisor::Supervisor;
 use self::webhooks::{Resolver, Sender, SystemResolver};
-
-/// Silence of the server that has the database after which a standby takes over: five questions that it has
-/// not asked, and longer than its robots wait for its pulse.
-const STANDBY_SILENCE_MAX: Duration = Duration::from_millis(1_250);
 
 /// Entry point that starts servers.
 #[derive(Debug, Clone, Copy)]
@@ -125,15 +120,48 @@ impl Server {
     /// # Errors
     /// As [`Server::start`].
     pub async fn start_with(
-        mut config: Config,
+        config: Config,
         clock: Clock,
         resolver: Arc<dyn Resolver>,
     ) -> anyhow::Result<RunningServer> {
+        let started = Self::start_until(pending(), config, clock, resolver).await?;
+        started.context("nobody asked it to stop")
+    }
+
+    /// Starts a server, or a standby that waits to become one; `None` if it is asked to stop before. A standby
+    /// completes open requests then.
+    ///
+    /// # Errors
+    /// As [`Server::start`].
+    pub async fn start_until(
+        asked: impl Future<Output = ()>,
+        mut config: Config,
+        clock: Clock,
+        resolver: Arc<dyn Resolver>,
+    ) -> anyhow::Result<Option<RunningServer>> {
         config.check_credentials()?;
+        let mut asked = pin!(asked);
+        let Some(taken) = standby::take_lock(asked.as_mut(), &config, &clock).await? else {
+            return Ok(None);
+        };
+        let starting = Box::pin(Self::start_locked(taken, config, clock, resolver));
+        tokio::select! {
+            started = starting => started.map(Some),
+            () = asked => Ok(None),
+        }
+    }
+
+    /// Starts a server on the database that is locked.
+    async fn start_locked(
+        taken: Taken,
+        config: Config,
+        clock: Clock,
+        resolver: Arc<dyn Resolver>,
+    ) -> anyhow::Result<RunningServer> {
+        let Taken { lock, standby, .. } = &taken;
         let names = config.names();
         let proxies = TrustedProxies::new(config.web.trusted_proxies.clone());
         let schedule = backup_schedule(&config);
-        let (lock, standby, _feeding) = take_lock(&config, &clock).await?;
         // Only with the lock: this completes an interrupted rotation of the authority.
         let security = config.robots.as_ref().map(security).transpose()?;
         let authorities = security.as_ref().map(|security| &security.authorities);
@@ -174,7 +202,7 @@ impl Server {
             audit: config.audit,
             archive,
             telemetry: Telemetry::start(&config.tracing, "tread-server")?,
-            role: standby.map_or(Role::Active, Role::Successor),
+            role: standby.clone().map_or(Role::Active, Role::Successor),
         });
         let remembered = remember(&app, &config.site).await;
         remembered.map_err(|error| not_readable(error, &config.database))?;
@@ -226,7 +254,7 @@ impl Server {
             app,
             fleet,
             supervisor,
-            lock,
+            lock: taken.lock,
         })
     }
 }
@@ -258,37 +286,6 @@ fn listen_for_metrics(address: SocketAddr, app: &App) -> anyhow::Result<Serving>
         tls: None,
         proxies: Arc::default(),
     })
-}
-
-/// Locks the database; a standby waits until it can, and answers requests meanwhile: it returns what has the
-/// map then. From then on until the last value is dropped, its watchdog is fed.
-///
-/// # Errors
-/// Another server uses it, or it cannot be locked.
-async fn take_lock(
-    config: &Config,
-    clock: &Clock,
-) -> Result<(DatabaseLock, Option<App>, JoinSet<()>), LockError> {
-    if !config.standby {
-        let lock = DatabaseLock::take(&config.database).await?;
-        return Ok((lock, None, JoinSet::new()));
-    }
-    let mut serving = None;
-    let mut standby = Standby::default();
-    let waiting = |reason: &str, is_in_use: bool| {
-        standby.waits(reason);
-        // Whoever takes over at once has nothing to serve before.
-        if is_in_use && serving.is_none() {
-            serving = Some(StandbyServing::start(config.clone(), clock.clone()));
-        }
-    };
-    let lock = DatabaseLock::wait(&config.database, STANDBY_SILENCE_MAX, waiting).await?;
-    let feeding = standby.takes_over();
-    let served = match serving {
-        Some(serving) => serving.end().await,
-        None => None,
-    };
-    Ok((lock, served, feeding))
 }
 
 /// Opens the database that is locked, and claims it.

@@ -2,6 +2,7 @@
 
 use std::ffi::OsString;
 use std::process::ExitCode;
+use std::sync::Arc;
 use std::time::Duration;
 
 use clap::Parser as _;
@@ -10,6 +11,8 @@ use tokio::signal::unix::{SignalKind, signal};
 use tracing::{info, warn};
 use tread_api::startup::{apply_environment, ignores_hangup};
 
+use crate::clock::Clock;
+use crate::webhooks::SystemResolver;
 use crate::{Config, Server, ServerArgs, build, doctor, health, init, logging, maintenance};
 
 /// Nice value of the lowest priority.
@@ -153,19 +156,22 @@ pub fn run(args: &ServerArgs) -> anyhow::Result<()> {
         let mut interrupt = signal(SignalKind::interrupt())?;
         let ignores_hangup = ignores_hangup();
         let mut hangup = signal(SignalKind::hangup())?;
-        let starting = Server::start(config);
+        let mut asked = async || {
+            tokio::select! {
+                _ = terminate.recv() => info!("asked to stop"),
+                _ = interrupt.recv() => info!("asked to stop"),
+                _ = hangup.recv(), if !ignores_hangup => info!("asked to stop: its terminal is closed"),
+            }
+        };
         // A standby may wait for long.
-        let server = tokio::select! {
-            started = starting => started?,
-            _ = terminate.recv() => return Ok(()),
-            _ = interrupt.recv() => return Ok(()),
-            _ = hangup.recv(), if !ignores_hangup => return Ok(()),
+        let (clock, resolver) = (Clock::system(), Arc::new(SystemResolver));
+        let started = Server::start_until(asked(), config, clock, resolver).await?;
+        let Some(server) = started else {
+            return Ok(());
         };
         server.tell_service_manager();
         tokio::select! {
-            _ = terminate.recv() => info!("asked to stop"),
-            _ = interrupt.recv() => info!("asked to stop"),
-            _ = hangup.recv(), if !ignores_hangup => info!("asked to stop: its terminal is closed"),
+            () = asked() => {}
             () = server.failed() => {}
         }
         server.stop().await

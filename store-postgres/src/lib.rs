@@ -90,6 +90,7 @@ use std::sync::{Arc, LazyLock, OnceLock};
 use std::time::Duration;
 
 use sqlx::AssertSqlSafe;
+use sqlx::postgres::PgConnectOptions;
 use tokio::sync::watch;
 use tokio::time::{Instant, timeout};
 use tread_store::failure::StorageFailure;
@@ -112,6 +113,9 @@ pub(crate) type Connection = sqlx::PgConnection;
 const WRITERS_MAX: u32 = 1;
 /// Number of connections that read at the same time.
 const READERS_MAX: u32 = 8;
+/// Number of connections that are opened with the database, for its first transactions.
+const WRITERS_FIRST: usize = 1;
+const READERS_FIRST: usize = 2;
 /// Bounds of writes. A statement waits for the disk and for no client.
 const WRITER_BOUNDS: Bounds = Bounds {
     statement: Duration::from_mins(1),
@@ -203,7 +207,18 @@ impl Db {
     /// # Errors
     /// As [`Db::open`].
     pub async fn open_with(url: &str, commit_max: Duration) -> Result<Self, OpenError> {
-        Ok(Self::of(open::prepare(url).await?, commit_max))
+        let (options, address) = open::options_of(url)?;
+        let mut db = Self::of(options.clone(), address.clone(), commit_max);
+        let opening = async {
+            tokio::join!(
+                db.writer.open_first(WRITERS_FIRST),
+                db.readers.open_first(READERS_FIRST)
+            );
+            Ok(())
+        };
+        let preparing = open::prepare(&options, &address);
+        (db.version, ()) = tokio::try_join!(preparing, opening)?;
+        Ok(db)
     }
 
     /// Connects to the database of an address to read it, beside the server that has it, and changes nothing.
@@ -212,18 +227,16 @@ impl Db {
     /// # Errors
     /// [`OpenError`]: also if its schema is not the one of this program.
     pub async fn open_to_read(url: &str) -> Result<Self, OpenError> {
-        let db = Self::of(open::prepare_to_read(url).await?, COMMIT_TIMEOUT);
+        let prepared = open::prepare_to_read(url).await?;
+        let mut db = Self::of(prepared.options, prepared.address, COMMIT_TIMEOUT);
+        db.version = prepared.version;
         // Nobody else has it yet.
         let _ = db.claim.begin_write.set(BeginWrite::of_reader());
         Ok(db)
     }
 
-    fn of(prepared: open::Prepared, commit_max: Duration) -> Self {
-        let open::Prepared {
-            options,
-            address,
-            version,
-        } = prepared;
+    /// A database of which no connection is open, and the version is not known yet.
+    fn of(options: PgConnectOptions, address: String, commit_max: Duration) -> Self {
         let pool = |bounds, connections_max| {
             Connections::new(options.clone(), bounds, connections_max, commit_max)
         };
@@ -231,7 +244,7 @@ impl Db {
             writer: pool(WRITER_BOUNDS, WRITERS_MAX),
             readers: pool(READER_BOUNDS, READERS_MAX),
             address,
-            version,
+            version: String::new(),
             metrics: DatabaseMetrics::default(),
             commits: Arc::default(),
             claim: Arc::default(),

@@ -12,6 +12,7 @@
 //! that wakes up writes no more, since the new one has claimed the database ([`super::Db::claim`]).
 
 use std::future::pending;
+use std::io;
 use std::time::Duration;
 
 use sqlx::PgConnection;
@@ -24,17 +25,19 @@ use tracing::warn;
 use super::{OpenError, connections, open};
 
 /// Interval at which a server looks whether it still has the lock.
-const LOOK_INTERVAL: Duration = Duration::from_millis(250);
+const LOOK_INTERVAL: Duration = Duration::from_millis(100);
 /// Interval at which a standby tries to take the lock.
-const STANDBY_INTERVAL: Duration = Duration::from_millis(250);
+const STANDBY_INTERVAL: Duration = Duration::from_millis(100);
+/// Interval at which a standby tries to reach PostgreSQL.
+const RETRY_INTERVAL: Duration = Duration::from_millis(250);
 /// Maximum time for an answer about it.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
 /// Maximum time between two looks of a standby at a silent server: PostgreSQL may have stood still itself.
-const LOOK_GAP_MAX: Duration = Duration::from_millis(750);
+const LOOK_GAP_MAX: Duration = Duration::from_millis(500);
 /// Maximum time for an attempt to take the lock: that for a connection and an answer.
 const ATTEMPT_TIMEOUT: Duration = Duration::from_secs(15);
 /// Interval at which the lock is tried while a session ends that holds it.
-const ENDING_INTERVAL: Duration = Duration::from_millis(100);
+const ENDING_INTERVAL: Duration = Duration::from_millis(20);
 /// Takes the lock, whose number is "treadsrv" in ASCII. PostgreSQL ends the connection of a machine that
 /// does not answer any more after 25 s, and with it the lock.
 const TAKE: &str = "SELECT pg_try_advisory_lock(8390880524716175990),
@@ -66,10 +69,9 @@ const IN_USE_BY: &str = select_owner!(
     "LIMIT 1"
 );
 
-/// Returns the process that has the lock, the number of the session that holds it, and the time of that
-/// session's last statement.
-const OWNER: &str = select_owner!(
-    "application_name, pid, CAST(state_change AS TEXT)",
+/// Returns the session that holds the lock: see [`Session`].
+const SESSION: &str = select_owner!(
+    "application_name AS process, pid, CAST(state_change AS TEXT) AS asked_at",
     "LIMIT 1"
 );
 /// Ends all sessions of a process, if one of them has asked nothing since.
@@ -130,29 +132,25 @@ impl DatabaseLock {
         let (options, address) = open::options_of(url).map_err(LockError::Open)?;
         let mut watch = Watch::default();
         loop {
-            match bounded(&address, locked(&options, &address)).await {
-                Ok(locked) => return Ok(Self::keeping(locked, options, address)),
+            let attempt = watch.attempt(&options, &address, silence_max);
+            let pause = match bounded(&address, attempt).await {
+                Ok(Attempt::Taken(locked)) => {
+                    return Ok(Self::keeping(locked, options, address));
+                }
+                // Its lock is free as soon as PostgreSQL has ended its session.
+                Ok(Attempt::Ended) => ENDING_INTERVAL,
+                Ok(Attempt::InUse(holder)) => {
+                    waiting(&in_use(&address, Some(holder)));
+                    STANDBY_INTERVAL
+                }
                 Err(reason) => {
                     waiting(&reason);
-                    if matches!(reason, LockError::InUse { .. }) {
-                        let ending = watch.end_silent(&options, silence_max);
-                        match timeout(ANSWER_TIMEOUT, ending).await {
-                            Ok(Ok(Silence::Ended)) => {
-                                // Its lock is free as soon as PostgreSQL has ended its session.
-                                sleep(ENDING_INTERVAL).await;
-                                continue;
-                            }
-                            Ok(Ok(Silence::Short)) => {}
-                            Ok(Err(cause)) => watch.fails(&cause),
-                            Err(_elapsed) => watch = Watch::default(),
-                        }
-                    } else {
-                        // What was seen before says nothing about the time without answers.
-                        watch = Watch::default();
-                    }
+                    // What was seen before says nothing about the time without answers.
+                    watch.forget();
+                    RETRY_INTERVAL
                 }
-            }
-            sleep(STANDBY_INTERVAL).await;
+            };
+            sleep(pause).await;
         }
     }
 
@@ -228,7 +226,7 @@ async fn bounded<T>(
 ) -> Result<T, LockError> {
     let attempt = timeout(ATTEMPT_TIMEOUT, attempt).await;
     attempt.unwrap_or_else(|_elapsed| {
-        let cause = std::io::Error::from(std::io::ErrorKind::TimedOut).into();
+        let cause = io::Error::from(io::ErrorKind::TimedOut).into();
         Err(LockError::Open(open::refused(address, cause)))
     })
 }
@@ -236,73 +234,144 @@ async fn bounded<T>(
 /// What a standby has seen of the session that holds the lock.
 #[derive(Debug, Default)]
 struct Watch {
-    /// Process, session, and the time of its last statement by the clock of PostgreSQL, and since when this
-    /// standby has seen that and nothing newer, by its own clock.
-    seen: Option<(Owner, Instant)>,
+    /// Connection on which it asks, which has the lock once it is free; opened again after a failure.
+    connection: Option<PgConnection>,
+    /// The session that holds the lock, and since when this standby has seen nothing newer of it, by its own
+    /// clock.
+    seen: Option<(Session, Instant)>,
     /// When it looked last: a look that comes late says nothing about the time before.
     looked_at: Option<Instant>,
     has_warned: bool,
 }
 
-/// What became of a server that may be silent.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Silence {
-    /// It has asked something lately, or nobody knows.
-    Short,
-    /// Its sessions are ended.
+/// Outcome of an attempt of a standby to take the lock.
+#[derive(Debug)]
+enum Attempt {
+    /// This connection holds the lock.
+    Taken(PgConnection),
+    /// The sessions of a server that was silent are ended.
     Ended,
+    /// The server that has the lock has asked something lately, or nobody knows.
+    InUse(Holder),
 }
 
-/// Name of the process that has the lock, the number of its session, and the time of the session's last
-/// statement, which is unknown without the rights to see it.
-type Owner = (String, i32, Option<String>);
+/// Session that holds the lock.
+#[derive(Debug, Clone, PartialEq, Eq, sqlx::FromRow)]
+struct Session {
+    /// Name of its process.
+    process: String,
+    pid: i32,
+    /// Time of its last statement by the clock of PostgreSQL; unknown without the rights to see it.
+    asked_at: Option<String>,
+}
+
+/// Address of a session's client, and since when it is connected.
+type Holder = (String, String);
 
 impl Watch {
-    /// Ends the sessions of the server that has the lock, if it has asked nothing for longer than permitted,
-    /// and says whether it has. A step of any clock changes nothing: only whether there was a statement counts.
-    async fn end_silent(
+    /// Tries to take the lock once, and ends the sessions of the server that has it if that one has asked
+    /// nothing for longer than permitted.
+    ///
+    /// # Errors
+    /// PostgreSQL cannot be asked.
+    async fn attempt(
         &mut self,
         options: &PgConnectOptions,
+        address: &str,
         silence_max: Duration,
-    ) -> Result<Silence, sqlx::Error> {
-        let mut connection = connections::connect(options).await?;
-        let owner: Option<Owner> = sqlx::query_as(OWNER)
-            .fetch_optional(&mut connection)
+    ) -> Result<Attempt, LockError> {
+        let refused = |cause| LockError::Open(open::refused(address, cause));
+        let connection = match self.connection.take() {
+            Some(connection) => connection,
+            None => connections::connect(options).await.map_err(refused)?,
+        };
+        let asking = self.ask(connection, silence_max);
+        let no_answer = |_elapsed| sqlx::Error::from(io::Error::from(io::ErrorKind::TimedOut));
+        let asked = timeout(ANSWER_TIMEOUT, asking).await.map_err(no_answer);
+        asked.flatten().map_err(refused)
+    }
+
+    async fn ask(
+        &mut self,
+        mut connection: PgConnection,
+        silence_max: Duration,
+    ) -> Result<Attempt, sqlx::Error> {
+        if try_lock(&mut connection).await? {
+            return Ok(Attempt::Taken(connection));
+        }
+        let attempt = match self.end_silent(&mut connection, silence_max).await? {
+            Some(_ended) => Attempt::Ended,
+            None => Attempt::InUse(holder(&mut connection).await?),
+        };
+        self.connection = Some(connection);
+        Ok(attempt)
+    }
+
+    /// Ends the sessions of the server that has the lock, if it was silent, and returns their number. A step
+    /// of any clock changes nothing: only whether there was a statement counts.
+    async fn end_silent(
+        &mut self,
+        connection: &mut PgConnection,
+        silence_max: Duration,
+    ) -> Result<Option<i64>, sqlx::Error> {
+        let session: Option<Session> = sqlx::query_as(SESSION)
+            .fetch_optional(&mut *connection)
             .await?;
         let before = self.looked_at.replace(Instant::now());
         let is_late = before.is_none_or(|before| before.elapsed() > LOOK_GAP_MAX);
-        let since = match (&self.seen, &owner) {
-            (Some((seen, since)), Some(owner)) if seen == owner && !is_late => *since,
+        let since = match (&self.seen, &session) {
+            (Some((seen, since)), Some(session)) if seen == session && !is_late => *since,
             _ => {
-                self.seen = owner.map(|owner| (owner, Instant::now()));
-                return Ok(Silence::Short);
+                self.seen = session.map(|session| (session, Instant::now()));
+                return Ok(None);
             }
         };
-        let Some((process, session, Some(asked_at))) = owner else {
-            self.fails(&"the user may not see its last statement");
-            return Ok(Silence::Short);
+        let Some(Session {
+            process,
+            pid,
+            asked_at: Some(asked_at),
+        }) = session
+        else {
+            self.warn_once(&"the user may not see its last statement");
+            return Ok(None);
         };
         let silence = since.elapsed();
         if silence < silence_max {
-            return Ok(Silence::Short);
+            return Ok(None);
         }
         let ended = sqlx::query_as(END_PROCESS)
             .bind(&process)
-            .bind(session)
+            .bind(pid)
             .bind(&asked_at)
-            .fetch_one(&mut connection);
-        let (ended,): (i64,) = ended.await?;
+            .fetch_one(connection);
+        let (ended,): (i64,) = match ended.await {
+            Ok(ended) => ended,
+            // It may lack the right to end sessions of others.
+            Err(sqlx::Error::Database(cause)) => {
+                self.warn_once(&cause);
+                return Ok(None);
+            }
+            Err(cause) => return Err(cause),
+        };
         self.seen = None;
         warn!(
             "`{process}` has the lock of the database and was silent for {:.1} s: its {ended} sessions \
              are ended",
             silence.as_secs_f64()
         );
-        Ok(Silence::Ended)
+        Ok(Some(ended))
+    }
+
+    /// Forgets connection and session, after a failure.
+    fn forget(&mut self) {
+        *self = Self {
+            has_warned: self.has_warned,
+            ..Self::default()
+        };
     }
 
     /// Logs once that the server cannot be watched.
-    fn fails(&mut self, cause: &dyn std::fmt::Display) {
+    fn warn_once(&mut self, cause: &dyn std::fmt::Display) {
         if !std::mem::replace(&mut self.has_warned, true) {
             warn!("the server that has the database cannot be watched: {cause}");
         }
@@ -332,7 +401,7 @@ async fn locked_again(
     loop {
         match locked(options, address).await {
             Err(LockError::InUse { .. }) if began.elapsed() < ANSWER_TIMEOUT => {
-                sleep(ENDING_INTERVAL).await;
+                sleep(LOOK_INTERVAL).await;
             }
             locked => return locked,
         }
@@ -343,21 +412,35 @@ async fn locked_again(
 async fn locked(options: &PgConnectOptions, address: &str) -> Result<PgConnection, LockError> {
     let refused = |cause| LockError::Open(open::refused(address, cause));
     let mut connection = connections::connect(options).await.map_err(refused)?;
-    let taking = sqlx::query_as(TAKE).fetch_one(&mut connection).await;
-    let (is_taken, ..): (bool, String, String, String) = taking.map_err(refused)?;
-    if is_taken {
+    if try_lock(&mut connection).await.map_err(refused)? {
         return Ok(connection);
     }
-    let found: Result<Option<(String, String)>, _> = sqlx::query_as(IN_USE_BY)
-        .fetch_optional(&mut connection)
-        .await;
-    let holder = found.ok().flatten();
-    Err(LockError::InUse {
+    Err(in_use(address, holder(&mut connection).await.ok()))
+}
+
+/// Takes the lock on a connection, if it is free.
+async fn try_lock(connection: &mut PgConnection) -> Result<bool, sqlx::Error> {
+    let taking = sqlx::query_as(TAKE).fetch_one(connection);
+    let (is_taken, ..): (bool, String, String, String) = taking.await?;
+    Ok(is_taken)
+}
+
+/// Returns who holds the lock; empty texts if it has become free.
+async fn holder(connection: &mut PgConnection) -> Result<Holder, sqlx::Error> {
+    let found = sqlx::query_as(IN_USE_BY).fetch_optional(connection).await?;
+    Ok(found.unwrap_or_default())
+}
+
+fn in_use(address: &str, holder: Option<Holder>) -> LockError {
+    let (client, since) = holder.unwrap_or_default();
+    LockError::InUse {
         address: address.to_owned(),
-        holder: holder.map_or_else(String::new, |(client, since)| {
+        holder: if client.is_empty() {
+            String::new()
+        } else {
             format!(" (at {client}, since {since} UTC)")
-        }),
-    })
+        },
+    }
 }
 
 #[cfg(test)]

@@ -195,22 +195,20 @@ pub(super) fn options_of(url: &str) -> Result<(PgConnectOptions, String), OpenEr
     Ok((options, address))
 }
 
-/// Connects, looks at the server, and applies migrations.
+/// Connects, looks at the server, applies migrations, and returns the server's version.
 ///
 /// # Errors
 /// See [`OpenError`].
-pub(super) async fn prepare(url: &str) -> Result<Prepared, OpenError> {
-    let (options, address) = options_of(url)?;
-    let connecting = connections::connect(&options).await;
-    let mut connection = connecting.map_err(|cause| refused(&address, cause))?;
-    let prepared = update(&mut connection, &address).await;
+pub(super) async fn prepare(
+    options: &PgConnectOptions,
+    address: &str,
+) -> Result<String, OpenError> {
+    let connecting = connections::connect(options).await;
+    let mut connection = connecting.map_err(|cause| refused(address, cause))?;
+    let version = update(&mut connection, address).await;
     // What it had to do is done, so an error of closing it loses nothing.
     let _ = connection.close().await;
-    Ok(Prepared {
-        version: prepared?,
-        options,
-        address,
-    })
+    version
 }
 
 /// Connects, looks at the server, and refuses another schema than that of this program.

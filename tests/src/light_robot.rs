@@ -261,6 +261,23 @@ impl LightRobot {
         })
     }
 
+    /// Goes on with the same boot at another server.
+    ///
+    /// # Errors
+    /// The server does not answer or does not welcome it; then the robot stays as it is.
+    pub async fn reconnect(&mut self, endpoint: &str) -> anyhow::Result<()> {
+        let session = open_session(endpoint).await?;
+        let (site, id, boot) = (self.site.clone(), self.id.clone(), self.boot);
+        let welcome = introduce(&session, &site, &id, boot).await?;
+        let announced = Self::announce(session, welcome, (site, id), boot).await?;
+        *self = Self {
+            next_record: self.next_record,
+            next_state: self.next_state,
+            ..announced
+        };
+        Ok(())
+    }
+
     /// Says hello once more.
     ///
     /// # Errors

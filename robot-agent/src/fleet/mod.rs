@@ -39,7 +39,7 @@ use zenoh::query::{ConsolidationMode, Querier, Query};
 pub use self::command::IncomingCommand;
 pub(crate) use self::error::zenoh_failed;
 pub use self::error::{AskError, LinkError, may_pass_later};
-pub use self::rotation::Rotation;
+pub use self::rotation::{Beside, Rotation, Server};
 pub use self::session::{session_config, start_jitter};
 pub use self::tunnel::{DialError, Tunnel};
 use crate::membership::Membership;
@@ -232,24 +232,27 @@ fn check_endpoint(server: &str) -> Result<(), LinkError> {
 }
 
 impl FleetLink {
-    /// Makes one attempt to connect to a server, and declares all publishers, queriers and subscribers.
+    /// Makes one attempt to connect to a server, and declares all publishers, queriers and subscribers. If it
+    /// has others, zenoh does not repeat the attempt.
     /// If the future is dropped, its thread ends soon.
     ///
     /// # Errors
     /// [`LinkError`] for an invalid endpoint or certificate, or when zenoh refuses a declaration.
     pub async fn connect(
-        servers: &mut Rotation,
+        server: &mut Server,
+        has_others: bool,
         membership: Option<&Membership>,
         identity: Identity,
         listeners: Listeners,
     ) -> Result<Attempt, LinkError> {
-        let endpoint = servers.endpoint().to_owned();
+        let Server {
+            endpoint, logged, ..
+        } = server;
         let mut tunnel = None;
         let mut config = match membership {
-            None => session_config(&endpoint)?,
+            None => session_config(endpoint)?,
             Some(membership) => {
-                let (note, logged) = (&listeners.note, servers.logged());
-                match Tunnel::open_once(&endpoint, membership, note, logged).await? {
+                match Tunnel::open_once(endpoint, membership, &listeners.note, logged).await? {
                     Ok(opened) => tunnel.insert(opened).session_config()?,
                     Err(cause) => {
                         return Ok(Attempt::Failed {
@@ -259,10 +262,10 @@ impl FleetLink {
                 }
             }
         };
-        if servers.has_others() {
+        if has_others {
             session::try_once(&mut config)?;
             // A session that is opened to a closed port waits for seconds.
-            if tunnel.is_none() && !session::is_listening(&endpoint).await {
+            if tunnel.is_none() && !session::is_listening(endpoint).await {
                 return Ok(Attempt::Failed {
                     is_distrusted: false,
                 });

@@ -4,9 +4,10 @@
 //! it fails, the next of the list is tried, and after the last one the first. There is no way back to a
 //! preferred server while the present one answers: robots would move twice for each restart.
 //!
-//! A server that is gone refuses at once, while one that is frozen takes seconds of each attempt. So one
-//! that fell silent, or took long to fail, is passed over for a while as long as there are others, and the first
-//! attempts to reach one that fell silent are short.
+//! A server that is gone refuses at once, while one that is frozen or cut off takes seconds of each attempt.
+//! So the others are tried beside an attempt that takes longer, and whichever is reached first is the one, as
+//! for the addresses of a host (RFC 8305). One that fell silent, or took long to fail, is passed over for a
+//! while.
 
 use std::time::Duration;
 
@@ -21,13 +22,11 @@ const DISTRUSTED_PAUSE_MAX: Duration = Duration::from_secs(10);
 const LEFT_FOR: Duration = Duration::from_millis(300);
 /// Time for which a server is passed over that took long to fail.
 const PASSED_OVER: Duration = Duration::from_secs(5);
-/// Maximum time of the first attempt to reach a server that fell silent; each further one may take twice as
-/// long.
-const SILENT_FIRST: Duration = Duration::from_millis(600);
-/// Number of such attempts, after which one may take as long as any.
-const SILENT_ATTEMPTS: u32 = 3;
 /// Duration of an attempt from which it counts as long.
 const LONG: Duration = Duration::from_secs(1);
+/// Duration of an attempt after which the next server is tried beside it, and the pause between two attempts
+/// to reach that one.
+const BESIDE_EVERY: Duration = Duration::from_millis(200);
 
 /// What was logged about a server since it was reached last.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -38,15 +37,50 @@ pub struct Logged {
     pub(super) invalid: bool,
 }
 
+/// A server that the agent may connect to.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Server {
+    pub(super) endpoint: String,
+    pub(super) logged: Logged,
+    /// Until when it is passed over.
+    passed_over_until: Duration,
+}
+
+impl Server {
+    /// Notes an attempt that failed.
+    fn failed(&mut self, (began, now): (Duration, Duration), is_distrusted: bool) {
+        if is_distrusted {
+            self.passed_over_until = now + DISTRUSTED_PAUSE_MAX;
+        } else if now.saturating_sub(began) >= LONG {
+            self.passed_over_until = now + PASSED_OVER;
+        }
+    }
+}
+
+/// A server that is tried beside the one whose turn it is.
+#[derive(Debug)]
+pub struct Beside<'rotation> {
+    /// Its place in the list.
+    pub at: usize,
+    /// The server.
+    pub server: &'rotation mut Server,
+    /// Time until the next attempt to reach it.
+    pub pause: Duration,
+}
+
+impl Beside<'_> {
+    /// Notes an attempt that failed at `now`.
+    pub fn failed(&mut self, (began, now): (Duration, Duration), is_distrusted: bool) {
+        self.server.failed((began, now), is_distrusted);
+        let passed_over = self.server.passed_over_until.saturating_sub(now);
+        self.pause = passed_over.max(BESIDE_EVERY);
+    }
+}
+
 /// The server that is connected to, among those that the agent knows.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Rotation {
-    endpoints: Vec<String>,
-    logged: Vec<Logged>,
-    /// Until when each is passed over.
-    passed_over_until: Vec<Duration>,
-    /// Number of attempts to reach each since it fell silent; `None` for one that has not.
-    silent_attempts: Vec<Option<u32>>,
+    servers: Vec<Server>,
     at: usize,
     /// Whether all of the present round failed since the robot trusts no authority of theirs.
     is_distrusted: bool,
@@ -56,11 +90,12 @@ pub struct Rotation {
 impl Rotation {
     /// Begins with the first endpoint, of which there must be one.
     pub fn new(endpoints: &[String]) -> Self {
+        let server = |endpoint: &String| Server {
+            endpoint: endpoint.clone(),
+            ..Server::default()
+        };
         Self {
-            endpoints: endpoints.to_vec(),
-            logged: vec![Logged::default(); endpoints.len()],
-            passed_over_until: vec![Duration::ZERO; endpoints.len()],
-            silent_attempts: vec![None; endpoints.len()],
+            servers: endpoints.iter().map(server).collect(),
             at: 0,
             is_distrusted: true,
             pause: PAUSE_FIRST,
@@ -69,61 +104,66 @@ impl Rotation {
 
     /// Returns whether there is more than one server.
     pub fn has_others(&self) -> bool {
-        self.endpoints.len() > 1
+        self.servers.len() > 1
     }
 
     /// Returns the endpoint to connect to.
     pub fn endpoint(&self) -> &str {
-        self.endpoints.get(self.at).map_or("", String::as_str)
+        let server = self.servers.get(self.at);
+        server.map_or("", |server| &server.endpoint)
     }
 
-    /// Returns what was logged about the server to connect to.
-    pub fn logged(&mut self) -> &mut Logged {
-        &mut self.logged[self.at]
+    /// Returns the server to connect to at `now`, and those to try beside it if that takes long, the next ones
+    /// first.
+    pub fn turn(&mut self, now: Duration) -> (&mut Server, Vec<Beside<'_>>) {
+        let (before, rest) = self.servers.split_at_mut(self.at);
+        let [present, after @ ..] = rest else {
+            unreachable!("a rotation has a server, and is at one of them");
+        };
+        let after = after.iter_mut().enumerate();
+        let after = after.map(|(step, server)| (self.at + 1 + step, server));
+        let others = after.chain(before.iter_mut().enumerate());
+        let beside = others.zip(1..).map(|((at, server), turn)| {
+            let passed_over = server.passed_over_until.saturating_sub(now);
+            let pause = passed_over.max(turn * BESIDE_EVERY);
+            Beside { at, server, pause }
+        });
+        (present, beside.collect())
+    }
+
+    /// Goes to a server that was reached beside the one whose turn it was.
+    pub fn go_to(&mut self, at: usize) {
+        self.at = at;
     }
 
     /// Notes that the server was reached.
     pub fn reached(&mut self) {
-        *self.logged() = Logged::default();
-        self.passed_over_until[self.at] = Duration::ZERO;
-        self.silent_attempts[self.at] = None;
+        let server = &mut self.servers[self.at];
+        server.logged = Logged::default();
+        server.passed_over_until = Duration::ZERO;
         self.is_distrusted = true;
         self.pause = PAUSE_FIRST;
     }
 
-    /// Returns the maximum time of the next attempt; `None` if it has no bound of its own. A server that is
-    /// frozen takes connections, and says nothing.
-    pub fn attempt_max(&self) -> Option<Duration> {
-        let made = self.silent_attempts[self.at].filter(|made| *made < SILENT_ATTEMPTS)?;
-        self.has_others().then(|| SILENT_FIRST * 2_u32.pow(made))
-    }
-
     /// Goes on to the next server, since the present one fell silent before `now`.
     pub fn leave(&mut self, now: Duration) {
-        self.passed_over_until[self.at] = now + LEFT_FOR;
-        self.silent_attempts[self.at] = Some(0);
+        self.servers[self.at].passed_over_until = now + LEFT_FOR;
         self.next(now);
     }
 
     /// Forgets what was wrong with the servers, since the robot has another certificate.
     pub fn begin_anew(&mut self) {
-        self.logged.fill(Logged::default());
-        self.passed_over_until.fill(Duration::ZERO);
-        self.silent_attempts.fill(None);
+        for server in &mut self.servers {
+            server.logged = Logged::default();
+            server.passed_over_until = Duration::ZERO;
+        }
     }
 
     /// Goes on to the next server after an attempt that failed at `now`. Returns the pause before that one
     /// is tried: none until all have been.
     pub fn failed(&mut self, (began, now): (Duration, Duration), is_distrusted: bool) -> Duration {
         self.is_distrusted &= is_distrusted;
-        if let Some(made) = &mut self.silent_attempts[self.at] {
-            *made = made.saturating_add(1);
-        }
-        if is_distrusted {
-            self.passed_over_until[self.at] = now + DISTRUSTED_PAUSE_MAX;
-        } else if now.saturating_sub(began) >= LONG {
-            self.passed_over_until[self.at] = now + PASSED_OVER;
-        }
+        self.servers[self.at].failed((began, now), is_distrusted);
         if !self.next(now) {
             return Duration::ZERO;
         }
@@ -141,9 +181,9 @@ impl Rotation {
     /// Goes on to the next server that is not passed over, or to the one that will be so no longer first.
     /// Returns whether another round begins with it.
     fn next(&mut self, now: Duration) -> bool {
-        let (count, before) = (self.endpoints.len(), self.at);
+        let (count, before) = (self.servers.len(), self.at);
         let following = (1..=count).map(|step| (before + step) % count);
-        let remaining = |at: &usize| self.passed_over_until[*at].saturating_sub(now);
+        let remaining = |at: &usize| self.servers[*at].passed_over_until.saturating_sub(now);
         self.at = following.min_by_key(remaining).unwrap_or(before);
         self.at <= before
     }
@@ -211,32 +251,32 @@ mod tests {
         assert_eq!(tried, "0000");
     }
 
+    /// Servers to try beside the one whose turn it is, and the pauses before, milliseconds.
+    fn beside(rotation: &mut Rotation, now: Duration) -> Vec<(usize, u128)> {
+        let (_, others) = rotation.turn(now);
+        let of = |beside: &Beside<'_>| (beside.at, beside.pause.as_millis());
+        others.iter().map(of).collect()
+    }
+
     #[test]
-    fn the_first_attempts_to_reach_a_server_that_fell_silent_are_short() {
-        let mut rotation = servers(2);
-        let now = Duration::ZERO;
-        assert_eq!(rotation.attempt_max(), None);
+    fn the_others_are_tried_beside_an_attempt_that_takes_long() {
+        let (mut rotation, now) = (servers(3), Duration::ZERO);
+        assert_eq!(beside(&mut rotation, now), [(1, 200), (2, 400)]);
         rotation.leave(now);
-        assert_eq!(
-            (rotation.endpoint(), rotation.attempt_max()),
-            ("tls/s1:7447", None)
-        );
-        let mut bounds_ms = Vec::new();
-        for _ in 0..5 {
-            // The other one refuses, and this one has been silent for long enough.
-            rotation.at = 0;
-            bounds_ms.push(rotation.attempt_max().map(|max| max.as_millis()));
-            rotation.failed((now, now), false);
-        }
-        assert_eq!(bounds_ms, [Some(600), Some(1_200), Some(2_400), None, None]);
-        rotation.at = 0;
+        assert_eq!(rotation.endpoint(), "tls/s1:7447");
+        assert_eq!(beside(&mut rotation, now), [(2, 200), (0, 400)]);
+        let (_, mut others) = rotation.turn(now);
+        others[0].failed((now, now), true);
+        others[1].failed((now, now + LONG), false);
+        let pauses = others.iter().map(|beside| beside.pause);
+        let pauses: Vec<_> = pauses.collect();
+        assert_eq!(pauses, [DISTRUSTED_PAUSE_MAX, PASSED_OVER]);
+        assert_eq!(beside(&mut rotation, now), [(2, 10_000), (0, 6_000)]);
+        rotation.go_to(2);
         rotation.reached();
-        rotation.leave(now);
-        rotation.at = 0;
-        assert_eq!(rotation.attempt_max(), Some(SILENT_FIRST));
-        let mut alone = servers(1);
-        alone.leave(now);
-        assert_eq!(alone.attempt_max(), None);
+        assert_eq!(rotation.endpoint(), "tls/s2:7447");
+        assert_eq!(beside(&mut rotation, now + LONG), [(0, 5_000), (1, 400)]);
+        assert!(beside(&mut servers(1), now).is_empty());
     }
 
     #[test]

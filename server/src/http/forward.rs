@@ -118,6 +118,8 @@ pub struct Forwarder {
 #[derive(Debug)]
 struct Inner {
     clients: RwLock<Clients>,
+    /// Cancelled when answers of the other server are not awaited any more.
+    given_up: CancellationToken,
     /// When it answered last.
     reached_at: Mutex<Option<Instant>>,
     /// When a failure was logged last.
@@ -153,15 +155,20 @@ impl Clients {
 }
 
 impl Forwarder {
-    /// Creates a client that trusts these CA certificates (PEM); those of the machine if `None`.
+    /// Creates a client that trusts these CA certificates (PEM); those of the machine if `None`. When
+    /// `given_up` is cancelled, answers are not awaited any more.
     ///
     /// # Errors
     /// The certificates cannot be read.
-    pub fn new(authorities_pem: Option<&[u8]>) -> Result<Self, reqwest::Error> {
+    pub fn new(
+        authorities_pem: Option<&[u8]>,
+        given_up: CancellationToken,
+    ) -> Result<Self, reqwest::Error> {
         // Fails if a provider is installed already, which is then the same one.
         let _first = rustls::crypto::ring::default_provider().install_default();
         let inner = Inner {
             clients: RwLock::new(Clients::new(authorities_pem)?),
+            given_up,
             reached_at: Mutex::default(),
             logged_at: Mutex::default(),
         };
@@ -252,8 +259,7 @@ impl Forwarder {
         };
         let Some(leader) = app.leader_url() else {
             // After the takeover this server is the other one.
-            let is_over = app.supervisor().stop_token().is_cancelled();
-            return Err(if is_over {
+            return Err(if self.inner.given_up.is_cancelled() {
                 ForwardError::NoAnswer
             } else {
                 ForwardError::NoAddress
@@ -280,7 +286,7 @@ impl Forwarder {
         let answer = tokio::select! {
             biased;
             // The client asks again, and this server answers then.
-            () = app.supervisor().stopping() => return Err(unanswered),
+            () = self.inner.given_up.cancelled() => return Err(unanswered),
             answer = tokio::time::timeout(ANSWER_MAX, asking.send()) => answer,
         };
         let answer = match answer {

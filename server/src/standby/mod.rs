@@ -8,9 +8,18 @@ use std::time::Duration;
 use sd_notify::NotifyState;
 use tokio::task::JoinSet;
 use tokio::time::Instant;
-use tracing::info;
+use tracing::{info, warn};
 
+use self::serving::StandbyServing;
+use crate::app::App;
+use crate::clock::Clock;
+use crate::config::Config;
+use crate::db::lock::{DatabaseLock, LockError};
 use crate::service_manager::notify;
+
+/// Silence of the server that has the database after which a standby takes over: ten questions that it has
+/// not asked, and as long as its robots wait for its pulse.
+const SILENCE_MAX: Duration = Duration::from_secs(1);
 
 /// Interval of the log lines of a standby that waits for the same reason.
 const LOG_EVERY: Duration = Duration::from_mins(10);
@@ -18,9 +27,72 @@ const LOG_EVERY: Duration = Duration::from_mins(10);
 /// Interval at which the watchdog is fed while it takes over.
 const FEED_EVERY: Duration = Duration::from_secs(5);
 
+/// The lock of the database, and what a standby has that took it.
+#[derive(Debug)]
+pub(crate) struct Taken {
+    /// The lock.
+    pub(crate) lock: DatabaseLock,
+    /// What has the map, if this process was a standby that had read it.
+    pub(crate) standby: Option<App>,
+    /// Feeds the watchdog until it is dropped, if this process was a standby.
+    _feeding: JoinSet<()>,
+}
+
+/// Locks the database; a standby waits until it can, and answers requests meanwhile. `None` if it is asked to
+/// stop before.
+///
+/// # Errors
+/// Another server uses it, or it cannot be locked.
+pub(crate) async fn take_lock(
+    asked: impl Future<Output = ()>,
+    config: &Config,
+    clock: &Clock,
+) -> Result<Option<Taken>, LockError> {
+    if !config.standby {
+        let lock = DatabaseLock::take(&config.database).await?;
+        return Ok(Some(Taken {
+            lock,
+            standby: None,
+            _feeding: JoinSet::new(),
+        }));
+    }
+    let mut serving = None;
+    let mut standby = Standby::default();
+    let waiting = |reason: &str, is_in_use: bool| {
+        standby.waits(reason);
+        // Whoever takes over at once has nothing to serve before.
+        if is_in_use && serving.is_none() {
+            serving = Some(StandbyServing::start(config.clone(), clock.clone()));
+        }
+    };
+    let lock = tokio::select! {
+        lock = DatabaseLock::wait(&config.database, SILENCE_MAX, waiting) => Some(lock?),
+        () = asked => None,
+    };
+    let Some(lock) = lock else {
+        notify(&[NotifyState::Stopping]);
+        if let Some(serving) = serving
+            && let Err(error) = serving.stop().await
+        {
+            warn!("standby: {error}");
+        }
+        return Ok(None);
+    };
+    let feeding = standby.takes_over();
+    let served = match serving {
+        Some(serving) => serving.end().await,
+        None => None,
+    };
+    Ok(Some(Taken {
+        lock,
+        standby: served,
+        _feeding: feeding,
+    }))
+}
+
 /// A server that waits until it can use the database.
 #[derive(Debug, Default)]
-pub(crate) struct Standby {
+struct Standby {
     /// The reason that was logged last, and when.
     logged: Option<(String, Instant)>,
 }
@@ -28,7 +100,7 @@ pub(crate) struct Standby {
 impl Standby {
     /// Says why it waits. To be called often: it feeds the watchdog of the service manager too, since a
     /// standby that waits does what it is for.
-    pub(crate) fn waits(&mut self, reason: &str) {
+    fn waits(&mut self, reason: &str) {
         let is_new =
             |(logged, at): &(String, Instant)| logged != reason || at.elapsed() >= LOG_EVERY;
         if self.logged.as_ref().is_none_or(is_new) {
@@ -46,7 +118,7 @@ impl Standby {
 
     /// Says that it takes over, if it has waited, and feeds the watchdog until what it returns is dropped:
     /// migrations and the map may take long.
-    pub(crate) fn takes_over(&self) -> JoinSet<()> {
+    fn takes_over(&self) -> JoinSet<()> {
         let mut feeding = JoinSet::new();
         if self.logged.is_some() {
             info!("standby: takes over the database");

@@ -23,7 +23,7 @@ use crate::http;
 use crate::http::forward::Forwarder;
 use crate::http::serve::Serving;
 use crate::identity::address::TrustedProxies;
-use crate::supervisor::Supervisor;
+use crate::supervisor::{Stopped, Supervisor};
 use crate::{listen_for_http, listen_for_metrics, open_tls};
 
 /// Delay after a failure.
@@ -34,52 +34,94 @@ const RETRY: Duration = Duration::from_secs(2);
 pub(crate) struct StandbyServing {
     tasks: JoinSet<()>,
     stop: CancellationToken,
-    serving: Arc<Mutex<Option<App>>>,
+    /// Cancelled when answers of the other server are not awaited any more.
+    given_up: CancellationToken,
+    shown: Arc<Mutex<Shown>>,
+}
+
+/// What others see of it while it answers requests.
+#[derive(Debug, Default)]
+struct Shown {
+    /// The use cases, once they have the map.
+    with_map: Option<App>,
+    /// Of the connections that were accepted.
+    supervisor: Option<Supervisor>,
 }
 
 impl StandbyServing {
     /// Begins to answer requests; tries again as long as that fails.
     pub(crate) fn start(config: Config, clock: Clock) -> Self {
-        let stop = CancellationToken::new();
-        let serving = Arc::default();
+        let (stop, given_up) = (CancellationToken::new(), CancellationToken::new());
+        let shown = Arc::default();
         let mut tasks = JoinSet::new();
-        tasks.spawn(serve(config, clock, (stop.clone(), Arc::clone(&serving))));
+        let tokens = (stop.clone(), given_up.clone());
+        tasks.spawn(serve(config, clock, tokens, Arc::clone(&shown)));
         Self {
             tasks,
             stop,
-            serving,
+            given_up,
+            shown,
         }
     }
 
     /// Accepts no further connections, and frees the addresses; what is open ends soon. Returns what has the
     /// map, if it was read.
     pub(crate) async fn end(mut self) -> Option<App> {
+        self.given_up.cancel();
         self.stop.cancel();
         // A panic has been logged, and frees the addresses too.
         let _ = self.tasks.join_next().await;
-        lock(&self.serving).take()
+        lock(&self.shown).with_map.take()
+    }
+
+    /// Accepts no further connections, and completes open requests.
+    ///
+    /// # Errors
+    /// A task failed, or they take too long.
+    pub(crate) async fn stop(mut self) -> Result<(), Stopped> {
+        self.stop.cancel();
+        // A panic has been logged.
+        let _ = self.tasks.join_next().await;
+        let supervisor = lock(&self.shown).supervisor.take();
+        match supervisor {
+            Some(supervisor) => supervisor.stop().await,
+            None => Ok(()),
+        }
     }
 }
 
-fn lock(serving: &Mutex<Option<App>>) -> MutexGuard<'_, Option<App>> {
-    serving.lock().unwrap_or_else(PoisonError::into_inner)
+fn lock(shown: &Mutex<Shown>) -> MutexGuard<'_, Shown> {
+    shown.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Answers requests until the stop; `shown` has the use cases while that works.
+/// Answers requests until the stop.
 async fn serve(
     config: Config,
     clock: Clock,
-    (stop, shown): (CancellationToken, Arc<Mutex<Option<App>>>),
+    (stop, given_up): (CancellationToken, CancellationToken),
+    shown: Arc<Mutex<Shown>>,
 ) {
     let mut logged = String::new();
     loop {
-        let serving = serve_once(&config, &clock, (&stop, &shown));
-        let reason = match AssertUnwindSafe(serving).catch_unwind().await {
-            Ok(Ok(())) => return,
+        let given_up = given_up.child_token();
+        let serving = serve_once(&config, &clock, (&stop, &given_up), &shown);
+        let served = AssertUnwindSafe(serving).catch_unwind().await;
+        if !stop.is_cancelled() {
+            given_up.cancel();
+        }
+        let reason = match served {
+            Ok(Ok(())) if stop.is_cancelled() => return,
+            Ok(Ok(())) => {
+                info!(
+                    "standby: another server has the database now, or segments are missing: it begins anew"
+                );
+                lock(&shown).with_map.take();
+                continue;
+            }
             Ok(Err(error)) => format!("{error:#}"),
             Err(_panic) => "it panicked".to_owned(),
         };
-        lock(&shown).take();
+        lock(&shown).with_map.take();
         if reason != logged {
             warn!("standby: it answers no requests: {reason}");
             logged = reason;
@@ -92,19 +134,21 @@ async fn serve(
     }
 }
 
-/// Answers requests until the stop.
+/// Answers requests until the stop, or until it has to begin anew.
 ///
 /// # Errors
 /// It cannot begin, or a task has failed.
 async fn serve_once(
     config: &Config,
     clock: &Clock,
-    (stop, shown): (&CancellationToken, &Mutex<Option<App>>),
+    (stop, given_up): (&CancellationToken, &CancellationToken),
+    shown: &Mutex<Shown>,
 ) -> anyhow::Result<()> {
     let supervisor = Supervisor::new();
+    lock(shown).supervisor = Some(supervisor.clone());
     // Connections end by themselves then.
     let _ending = supervisor.stop_token().drop_guard();
-    let serving = serve_with(config, clock, (&supervisor, shown));
+    let serving = serve_with(config, clock, (&supervisor, given_up), shown);
     tokio::select! {
         biased;
         () = stop.cancelled() => Ok(()),
@@ -115,7 +159,8 @@ async fn serve_once(
 async fn serve_with(
     config: &Config,
     clock: &Clock,
-    (supervisor, shown): (&Supervisor, &Mutex<Option<App>>),
+    (supervisor, given_up): (&Supervisor, &CancellationToken),
+    shown: &Mutex<Shown>,
 ) -> anyhow::Result<()> {
     let db = Db::open_to_read(&config.database).await?;
     let db = db.context("a file has one server")?;
@@ -123,8 +168,8 @@ async fn serve_with(
     let authorities = authorities.map(|robots| Authorities::read(&robots.authority));
     let authorities = authorities.transpose()?.map(Arc::new);
     let tls = open_tls(config, authorities.as_ref(), clock)?;
-    let forwarder = Forwarder::new(trusted(config)?.as_deref())?;
-    // Before the map is read, which takes long: another program may have the address.
+    let forwarder = Forwarder::new(trusted(config)?.as_deref(), given_up.clone())?;
+    // Requests are forwarded while the map is read, which takes long.
     let listener = listen_for_http(config.http)?;
     let address = listener.local_addr()?;
     let people = config.oidc.as_ref();
@@ -141,11 +186,7 @@ async fn serve_with(
     let metrics = config.metrics;
     let metrics = metrics.map(|address| listen_for_metrics(address, &app));
     let metrics = metrics.transpose()?;
-    app.load_map().await?;
-    *lock(shown) = Some(app.clone());
-    if let Err(error) = app.know_tokens().await {
-        app.log_failure("read the valid tokens", &error);
-    }
+    app.know_leader().await?;
     let scheme = if tls.is_some() { "https" } else { "http" };
     let serving = Serving {
         listener,
@@ -155,9 +196,6 @@ async fn serve_with(
     };
     let stop = || supervisor.stop_token();
     let run = |serving| http::serve::run(serving, app.clone(), supervisor.clone(), stop());
-    supervisor.spawn_vital("map blocks", map_blocks::run(app.clone(), stop()));
-    let reading = identity::run(app.clone(), READ_AGAIN_BY_STANDBY, stop());
-    supervisor.spawn_vital("tokens", reading);
     if let Some(tls) = tls {
         let stop = stop();
         let keeping = async move { http::tls::keep(&tls, stop, |_tls| {}).await };
@@ -186,11 +224,28 @@ async fn serve_with(
         () = run(serving) => {}
         () = serving_metrics => {}
         () = supervisor.stopping() => {}
-        () = following::run(app.clone(), stop()) => {
-            anyhow::bail!("another server has the database now, or segments are missing: it reads the map again");
-        }
+        followed = follow(&app, supervisor, shown) => return followed,
     }
     anyhow::bail!("a task of the standby has ended")
+}
+
+/// Reads the map and follows the database, until the map has to be read as a whole again, or the stop.
+///
+/// # Errors
+/// The map cannot be read.
+async fn follow(app: &App, supervisor: &Supervisor, shown: &Mutex<Shown>) -> anyhow::Result<()> {
+    app.load_map().await?;
+    lock(shown).with_map = Some(app.clone());
+    if let Err(error) = app.know_tokens().await {
+        app.log_failure("read the valid tokens", &error);
+    }
+    let stop = || supervisor.stop_token();
+    supervisor.spawn_vital("map blocks", map_blocks::run(app.clone(), stop()));
+    let reading = identity::run(app.clone(), READ_AGAIN_BY_STANDBY, stop());
+    supervisor.spawn_vital("tokens", reading);
+    info!("standby: it has the map");
+    following::run(app.clone(), stop()).await;
+    Ok(())
 }
 
 /// Reads the CA certificates (PEM) by which the server that has the database is recognised; `None` for those

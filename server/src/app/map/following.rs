@@ -311,6 +311,18 @@ impl App {
         Ok(true)
     }
 
+    /// Reads which server has the database, to which a standby forwards before it has the map.
+    ///
+    /// # Errors
+    /// The database failed.
+    pub async fn know_leader(&self) -> Result<(), DbError> {
+        if let Some(follower) = self.maps().follower() {
+            let mut tx = self.db().read("follow").await?;
+            follower.seen().leader = db::leader::get(&mut tx).await?;
+        }
+        Ok(())
+    }
+
     /// Returns the address of the server that has the database, as it says itself; `None` if it says none, or
     /// in that server.
     pub fn leader_url(&self) -> Option<String> {

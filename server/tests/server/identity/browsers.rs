@@ -7,7 +7,7 @@ use tread_api::identity::Role;
 use crate::harness::{Yard, client, time};
 
 /// Signs in and gives the cookie to send.
-async fn sign_in(yard: &Yard, token: &str) -> String {
+pub(crate) async fn sign_in(yard: &Yard, token: &str) -> String {
     let asked = client(None)
         .post(yard.url("/v1/session"))
         .json(&json!({ "token": token }));
@@ -23,7 +23,7 @@ async fn sign_in(yard: &Yard, token: &str) -> String {
     given.split(';').next().unwrap().to_owned()
 }
 
-fn by_cookie(yard: &Yard, method: Method, path: &str, cookie: &str) -> RequestBuilder {
+pub(crate) fn by_cookie(yard: &Yard, method: Method, path: &str, cookie: &str) -> RequestBuilder {
     let asked = client(None).request(method, yard.url(path));
     asked.header(header::COOKIE, cookie)
 }

@@ -1,7 +1,7 @@
 //! Who may do what: the table of rights, tokens, browsers, the audit log, connections, TLS, and joining robots.
 
 mod audit;
-mod browsers;
+pub(crate) mod browsers;
 mod connections;
 mod enrolment;
 mod every_route;

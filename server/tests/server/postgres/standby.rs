@@ -1,6 +1,7 @@
 //! Two servers on one database: one works, and the other waits until it may.
 
 use std::fs::{self, File};
+use std::net::{SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::Duration;
@@ -8,6 +9,8 @@ use std::time::Duration;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use reqwest::StatusCode;
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::net::TcpStream;
 use tokio::time::Instant;
 
 use super::{address_of, created, server_of_tests};
@@ -26,9 +29,24 @@ struct Program {
 
 impl Program {
     fn start(folder: &Path, name: &str, database: &str) -> Self {
+        Self::start_at(folder, name, database, "127.0.0.1:0".parse().unwrap())
+    }
+
+    /// Starts one that tells standbys that it is at this address.
+    fn start_at(folder: &Path, name: &str, database: &str, http: SocketAddr) -> Self {
+        let config = folder.join(format!("{name}.toml"));
+        fs::write(
+            &config,
+            format!("[web]\nadvertise_url = \"http://{http}\"\n"),
+        )
+        .unwrap();
         let log = folder.join(format!("{name}.log"));
         let mut command = Command::new(env!("CARGO_BIN_EXE_tread-server"));
-        command.args(["--standby", "--http=127.0.0.1:0", "--zenoh=127.0.0.1:0"]);
+        command.args(["--standby", "--zenoh=127.0.0.1:0"]);
+        command.arg(format!("--http={http}"));
+        if http.port() != 0 {
+            command.arg("--config").arg(config);
+        }
         command.args(["--site=yard", "--database", database]);
         command.env_remove("RUST_LOG").stdin(Stdio::null());
         command
@@ -89,6 +107,17 @@ impl Drop for Program {
     }
 }
 
+/// Creates the first admin's token.
+fn init(database: &str) -> String {
+    let mut init = Command::new(env!("CARGO_BIN_EXE_tread-server"));
+    let init = init
+        .args(["init", "--database", database])
+        .output()
+        .unwrap();
+    assert!(init.status.success());
+    String::from_utf8(init.stdout).unwrap().trim().to_owned()
+}
+
 async fn create_terrain(address: &str, token: &str, name: &str) -> StatusCode {
     let terrain = serde_json::json!({
         "id": name, "class": "grass",
@@ -113,13 +142,7 @@ async fn a_standby_takes_over_from_a_server_that_was_killed_and_from_one_that_is
     };
     let folder = tempfile::tempdir().unwrap();
     let database = address_of(&created(&admin, folder.path()));
-    let mut init = Command::new(env!("CARGO_BIN_EXE_tread-server"));
-    let init = init
-        .args(["init", "--database", &database])
-        .output()
-        .unwrap();
-    assert!(init.status.success());
-    let token = String::from_utf8(init.stdout).unwrap().trim().to_owned();
+    let token = init(&database);
 
     let first = Program::start(folder.path(), "first", &database);
     let address = first.address().await;
@@ -154,4 +177,44 @@ async fn a_standby_takes_over_from_a_server_that_was_killed_and_from_one_that_is
     assert!(found.contains("sand") && found.contains("grass"), "{found}");
     third.signal(Signal::SIGTERM);
     assert!(third.ends().await.success(), "{}", third.said());
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_standby_that_is_asked_to_stop_completes_open_requests() {
+    let Some(admin) = server_of_tests() else {
+        return;
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let database = address_of(&created(&admin, folder.path()));
+    let token = init(&database);
+    let free = || {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        listener.local_addr().unwrap()
+    };
+    let (at_first, at_second) = (free(), free());
+    let first = Program::start_at(folder.path(), "first", &database, at_first);
+    first.address().await;
+    let mut second = Program::start_at(folder.path(), "second", &database, at_second);
+    second.says("standby: it has the map").await;
+
+    let body = r#"{"id": "quarry"}"#;
+    let mut stream = TcpStream::connect(at_second).await.unwrap();
+    let head = format!(
+        "POST /v1/sites HTTP/1.1\r\nhost: localhost\r\nauthorization: Bearer {token}\r\n\
+         content-type: application/json\r\ncontent-length: {}\r\nconnection: close\r\n\r\n",
+        body.len()
+    );
+    let (begin, rest) = body.split_at(8);
+    stream.write_all(head.as_bytes()).await.unwrap();
+    stream.write_all(begin.as_bytes()).await.unwrap();
+    // It has begun with the request: an answer to a later one is there.
+    terrains(&format!("http://{at_second}"), &token).await;
+    second.signal(Signal::SIGTERM);
+    second.says("asked to stop").await;
+    stream.write_all(rest.as_bytes()).await.unwrap();
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).await.unwrap();
+    assert!(answer.starts_with("HTTP/1.1 201 "), "{answer}");
+    assert!(second.ends().await.success(), "{}", second.said());
+    assert!(TcpStream::connect(at_second).await.is_err());
 }

@@ -1,9 +1,10 @@
 //! What a standby answers while another server has the database.
 
 use std::net::{SocketAddr, TcpListener};
+use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use reqwest::StatusCode;
+use reqwest::{Method, StatusCode, header};
 use serde_json::{Value, json};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
@@ -22,6 +23,7 @@ use super::{Relay, address_of, created, server_of_tests};
 use crate::drive::{Socket, driven_at};
 use crate::events::{last_id, read_until, steps_in};
 use crate::harness::{Yard, circle, client, config, eventually, measured, segment};
+use crate::identity::browsers::{by_cookie, sign_in};
 use crate::map_blocks::{PATHS, answers_at, assert_same, at, drive};
 use crate::robot::Robot;
 
@@ -277,6 +279,24 @@ async fn the_server_judges(pair: &Pair) {
     assert!(begun.elapsed() <= FOLLOWED_MAX, "{:?}", begun.elapsed());
     let (status, _) = pair.send(client(None).get(at(map_path))).await;
     assert_eq!(status, StatusCode::UNAUTHORIZED);
+    let cookie = sign_in(yard, yard.admin()).await;
+    let sees = async || {
+        let asked = client(None).get(at(map_path));
+        pair.send(asked.header(header::COOKIE, &cookie)).await.0
+    };
+    assert_eq!(sees().await, StatusCode::OK);
+    let out = by_cookie(yard, Method::DELETE, "/v1/session", &cookie);
+    let out = out.header("sec-fetch-site", "same-origin");
+    assert!(out.send().await.unwrap().status().is_success());
+    let begun = Instant::now();
+    eventually("the session is refused by the standby", async || {
+        let status = sees().await;
+        (status == StatusCode::UNAUTHORIZED)
+            .then_some(())
+            .ok_or(status)
+    })
+    .await;
+    assert!(begun.elapsed() <= FOLLOWED_MAX, "{:?}", begun.elapsed());
     let (status, _) = pair.send(by_admin.get(at("/nothing/here"))).await;
     assert_eq!(status, StatusCode::NOT_FOUND);
 }
@@ -349,6 +369,43 @@ async fn a_request_that_a_standby_has_forwarded_already_is_not_forwarded_again()
         let raw = raw_get(pair.config.http, path).await;
         assert!(raw.starts_with("HTTP/1.1 400 "), "{path}: {raw}");
     }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_standby_forwards_while_it_reads_the_map() {
+    let Some(admin) = server_of_tests() else {
+        return;
+    };
+    let mut pair = Pair::start(&admin, (Clock::system(), MapConfig::default()), None).await;
+    // Another one cannot read sums for a while.
+    let sql = "BEGIN; LOCK TABLE cell_sums IN ACCESS EXCLUSIVE MODE; SELECT pg_sleep(4); COMMIT";
+    let mut locking = Command::new("psql")
+        .args([&address_of(&pair.config.database), "--command", sql])
+        .stdout(Stdio::null())
+        .spawn()
+        .unwrap();
+    pair.config.http = free_address();
+    pair.config.metrics = None;
+    pair.standby = format!("http://{}", pair.config.http);
+    let (config, clock) = (pair.config.clone(), pair.clock.clone());
+    let runtime = Handle::current();
+    pair.taking_over
+        .spawn_blocking(move || runtime.block_on(Server::start_with_clock(config, clock)));
+    let sites = format!("{}/v1/sites", pair.standby);
+    eventually("it forwards", async || {
+        let answer = pair.yard.client().get(&sites).send().await;
+        match answer {
+            Ok(answer) if answer.status() == StatusCode::OK => Ok(()),
+            other => Err(other.map(|answer| answer.status())),
+        }
+    })
+    .await;
+    let ready = pair.client.get(format!("{}/readyz", pair.standby));
+    let (status, body) = pair.send(ready).await;
+    assert_eq!(status, StatusCode::SERVICE_UNAVAILABLE, "{body}");
+    assert!(locking.try_wait().unwrap().is_none(), "sums can be read");
+    assert!(locking.wait().unwrap().success());
+    pair.is_ready().await;
 }
 
 /// What a server answers to a path that no client library would send.
