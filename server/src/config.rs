@@ -123,6 +123,16 @@ pub struct Config {
     pub tracing: TracingConfig,
     /// Backups that the server makes by itself; `None` for none.
     pub backup: Option<BackupConfig>,
+    /// Where states, friction and map changes are published once more; `None` for nowhere.
+    pub republish: Option<RepublishConfig>,
+}
+
+/// `[republish]`: a zenoh router for programs that are no robots.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RepublishConfig {
+    /// Loopback address of the router, such as zenohd's, at which it takes connections without TLS.
+    pub router: SocketAddr,
 }
 
 /// `[robots]`: enrolment and authentication of robots by certificates.
@@ -438,6 +448,7 @@ struct File {
     #[serde(default)]
     tracing: TracingConfig,
     backup: Option<BackupConfig>,
+    republish: Option<RepublishConfig>,
 }
 
 /// Error of reading the configuration.
@@ -602,6 +613,7 @@ impl Config {
             webhooks: file.webhooks,
             tracing: file.tracing,
             backup: file.backup,
+            republish: file.republish,
         };
         config.resolve_credentials(credentials::folder().as_deref())?;
         config.check()?;
@@ -646,7 +658,11 @@ impl Config {
                            use an address of this machine such as 127.0.0.1";
         const ROBOTS: &str = "give `authority` under `[robots]` (`tread-server init` makes it), or \
                               use an address of this machine such as 127.0.0.1";
+        const ROUTER: &str =
+            "let the router listen on 127.0.0.1 for this server, and with TLS for other machines";
         let metrics = self.metrics.map(|address| ("metrics", address, HERE));
+        let republish = self.republish;
+        let republish = republish.map(|to| ("republish.router", to.router, ROUTER));
         let http = self.tls.is_none().then_some(("http", self.http, TLS));
         let zenoh = self
             .robots
@@ -658,7 +674,7 @@ impl Config {
         if !self.database.is_postgres() && self.standby {
             return Err(ConfigError::StandbyOfFile);
         }
-        for (key, address, cure) in [http, zenoh, metrics].into_iter().flatten() {
+        for (key, address, cure) in [http, zenoh, metrics, republish].into_iter().flatten() {
             if !address.ip().is_loopback() {
                 return Err(ConfigError::NotLoopback { key, address, cure });
             }
@@ -667,6 +683,7 @@ impl Config {
             ("http", Some(self.http)),
             ("zenoh", Some(self.zenoh)),
             ("metrics", self.metrics),
+            ("republish.router", self.republish.map(|to| to.router)),
         ];
         for (place, (key, address)) in listened.iter().enumerate() {
             let same = |other: &&(&'static str, Option<SocketAddr>)| {

@@ -212,7 +212,8 @@ impl Server {
 
         let (uploads, uploads_in) = mpsc::channel(ingest::UPLOADS_WAITING_MAX);
         supervisor.spawn_vital("ingest", ingest::run(app.clone(), uploads_in, stop()));
-        fleet.listen(&app, uploads).await?;
+        let republish_at = config.republish.map(|to| to.router);
+        fleet.listen(&app, uploads, republish_at).await?;
         supervisor.spawn_vital("reconciler", reconciler::run(app.clone(), stop()));
         supervisor.spawn_vital("events", events::run(app.clone(), stop()));
         let asking = app::watched::run(app.clone(), stop());

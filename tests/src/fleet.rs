@@ -220,6 +220,11 @@ impl Fleet {
         self.zenoh
     }
 
+    /// Whether robots need certificates.
+    pub fn has_certificates(&self) -> bool {
+        self.has_certificates
+    }
+
     /// A new join token, for that robot or for any new one.
     pub async fn join_token(&self, robot: Option<&RobotId>) -> String {
         let request = json!({"site": SITE, "robot": robot});

@@ -46,6 +46,7 @@ impl ServerWithRobots {
                 certificate_s: 3_600,
             }),
             backup: None,
+            republish: None,
             standby: false,
             audit: tread_server::config::AuditConfig::default(),
             tracing: tread_server::config::TracingConfig::default(),

@@ -58,6 +58,7 @@ impl Yard {
                 ..WebhooksConfig::default()
             },
             backup: None,
+            republish: None,
             standby: false,
             audit: tread_server::config::AuditConfig::default(),
             tracing: tread_server::config::TracingConfig::default(),

@@ -141,7 +141,7 @@ impl Rig {
         }
         let (uploads, uploads_in) = mpsc::channel(1);
         drop(uploads_in);
-        fleet.listen(&app, uploads).await.unwrap();
+        fleet.listen(&app, uploads, None).await.unwrap();
         Self {
             stranger: Authority::generate("fleet", clock.now()).unwrap(),
             app,

@@ -12,11 +12,17 @@ use tread_api::{keys, wire};
 use zenoh::Wait as _;
 
 use super::publishers::Publishers;
+use super::republish::Republisher;
 use super::routers::Routers;
 use crate::app::App;
 
 /// Publishes until the stop.
-pub(super) async fn run(app: App, routers: Arc<Routers>, stop: CancellationToken) {
+pub(super) async fn run(
+    app: App,
+    routers: Arc<Routers>,
+    republisher: Option<Republisher>,
+    stop: CancellationToken,
+) {
     let mut news = app.map_news();
     let mut publishers = Publishers::new(keys::map);
     // Number of changes that were missed, and number published by site.
@@ -44,14 +50,22 @@ pub(super) async fn run(app: App, routers: Arc<Routers>, stop: CancellationToken
             change.boxes.clear();
         }
         publishers.look_again(&routers);
-        publish(&change, &routers, &mut publishers);
+        publish(&change, &routers, &mut publishers, republisher.as_ref());
     }
 }
 
-fn publish(change: &MapChange, routers: &Routers, publishers: &mut Publishers) {
+fn publish(
+    change: &MapChange,
+    routers: &Routers,
+    publishers: &mut Publishers,
+    republisher: Option<&Republisher>,
+) {
     let Ok(payload) = wire::encode(change) else {
         return;
     };
+    if let Some(republisher) = republisher {
+        republisher.publish(&keys::map(&change.site), payload.clone().into());
+    }
     publishers.declare(routers, std::slice::from_ref(&change.site));
     for publisher in publishers.of(&change.site) {
         if let Err(error) = publisher.put(payload.clone()).wait() {

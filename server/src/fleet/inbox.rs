@@ -17,6 +17,7 @@ use zenoh::{Session, Wait as _};
 use super::gate::{CUT_OFF, Links};
 use super::rate_limits::{Appeared, Kind, Place, RateLimits};
 use super::received::{Asked, count_refusal, explained, log_refusal, next, refuse_key};
+use super::republish::Republisher;
 use super::{requests, tokens};
 use crate::app::App;
 use crate::app::ingest::Upload;
@@ -53,6 +54,8 @@ pub(super) struct Channels {
     limits: RateLimits,
     /// Links of the robots; `None` without a gate.
     links: Option<Links>,
+    /// Where states and friction are published once more.
+    republisher: Option<Republisher>,
 }
 
 #[derive(Debug)]
@@ -123,6 +126,15 @@ impl Channels {
             uploads,
             limits,
             links,
+            republisher: None,
+        }
+    }
+
+    /// Publishes states and friction once more.
+    pub(super) fn republished(self, republisher: Option<Republisher>) -> Self {
+        Self {
+            republisher,
+            ..self
         }
     }
 }
@@ -255,6 +267,9 @@ pub(super) fn declare(session: &Session, channels: &Channels, router: u64) -> ze
                 };
                 if sample.payload().len() > STATE_BYTES_MAX {
                     return to.app.counters().refused_malformed.one();
+                }
+                if let Some(republisher) = &to.republisher {
+                    republisher.publish(key, sample.payload().clone());
                 }
                 let clock = to.app.clock();
                 let published = Published {

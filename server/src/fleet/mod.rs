@@ -21,6 +21,7 @@ mod publishers;
 mod pulse;
 mod rate_limits;
 mod received;
+mod republish;
 mod requests;
 mod router;
 mod router_groups;
@@ -43,6 +44,7 @@ use tread_api::wire::PAYLOAD_BYTES_MAX;
 use self::commands::ZenohCommands;
 use self::gate::Gate;
 use self::opening::{Opener, with_free_port};
+use self::republish::Republisher;
 use self::router_pool::RouterPool;
 use self::routers::Routers;
 use self::teleop::ZenohDrive;
@@ -203,29 +205,38 @@ impl Fleet {
     }
 
     /// Opens the router and starts the tasks of the network: listening to robots, the heartbeat of
-    /// the server, and the watch of the routers. Only the first call has an effect.
+    /// the server, and the watch of the routers. States, friction and map changes are also published at the
+    /// zenoh router `republish_at`. Only the first call has an effect.
     ///
     /// # Errors
     /// [`FleetError::Open`] if zenoh refuses.
-    pub async fn listen(&self, app: &App, uploads: mpsc::Sender<Upload>) -> Result<(), FleetError> {
+    pub async fn listen(
+        &self,
+        app: &App,
+        uploads: mpsc::Sender<Upload>,
+        republish_at: Option<SocketAddr>,
+    ) -> Result<(), FleetError> {
         let opener = self.opener.lock().ok().and_then(|mut opener| opener.take());
         let Some(opener) = opener else {
             return Ok(());
         };
         let gate = self.gate.lock().ok().and_then(|mut gate| gate.take());
         let links = gate.as_ref().map(|_| gate::Links::new(self.byte_rate));
+        let republisher =
+            republish_at.map(|router| Republisher::start(router, app, &self.supervisor));
+        let channels = inbox::Channels::new(&self.supervisor, app, uploads, links.clone());
         let pool = Arc::new(RouterPool {
             app: app.clone(),
             routers: Arc::clone(&self.routers),
             opener,
-            channels: inbox::Channels::new(&self.supervisor, app, uploads, links.clone()),
+            channels: channels.republished(republisher.clone()),
             turn: Mutex::new(()),
         });
         pool.open(app.enrolment_registry().robots()).await?;
         let stop = || self.supervisor.stop_token();
         let pulse = pulse::run(app.clone(), Arc::clone(&self.routers), stop());
         self.supervisor.spawn_vital("pulse", pulse);
-        let changes = changes::run(app.clone(), Arc::clone(&self.routers), stop());
+        let changes = changes::run(app.clone(), Arc::clone(&self.routers), republisher, stop());
         self.supervisor.spawn_vital("changes", changes);
         if let (Some(gate), Some(links)) = (gate, links) {
             let keeping = Arc::clone(&pool).run(stop());

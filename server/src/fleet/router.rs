@@ -236,7 +236,7 @@ mod tests {
         let mut fleet = opening.unwrap();
         fleet.probe_period = Duration::from_millis(50);
         let (uploads, _uploads_in) = mpsc::channel(1);
-        fleet.listen(&app, uploads).await.unwrap();
+        fleet.listen(&app, uploads, None).await.unwrap();
         let answers = async |wanted: bool| {
             let looking = async {
                 loop {

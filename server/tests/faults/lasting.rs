@@ -202,6 +202,7 @@ fn config(folder: &std::path::Path) -> Config {
         oidc: None,
         webhooks: tread_server::config::webhooks::WebhooksConfig::default(),
         backup: None,
+        republish: None,
         standby: false,
         audit: tread_server::config::AuditConfig::default(),
         tracing: tread_server::config::TracingConfig::default(),

@@ -336,6 +336,7 @@ pub(crate) fn config(folder: &Path, zenoh: &str) -> Config {
         oidc: None,
         webhooks: WebhooksConfig::default(),
         backup: None,
+        republish: None,
         standby: false,
         audit: tread_server::config::AuditConfig::default(),
         tracing: tread_server::config::TracingConfig::default(),

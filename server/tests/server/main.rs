@@ -73,6 +73,8 @@ mod program;
 #[cfg(test)]
 mod releases;
 #[cfg(test)]
+mod republish;
+#[cfg(test)]
 mod request_bodies;
 #[cfg(test)]
 mod resources;

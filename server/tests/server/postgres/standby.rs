@@ -12,8 +12,10 @@ use reqwest::StatusCode;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
 use tokio::time::Instant;
+use tread_server::db::lock::DatabaseLock;
+use tread_server::db::schema;
 
-use super::{address_of, created, server_of_tests};
+use super::{address_of, created, server_of_tests, tool};
 use crate::harness::{client, eventually};
 
 /// Time within which a standby is to answer after the other server was killed, and after it was frozen;
@@ -217,4 +219,30 @@ async fn a_standby_that_is_asked_to_stop_completes_open_requests() {
     assert!(answer.starts_with("HTTP/1.1 201 "), "{answer}");
     assert!(second.ends().await.success(), "{}", second.said());
     assert!(TcpStream::connect(at_second).await.is_err());
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_standby_of_the_next_release_waits_for_the_server_and_brings_its_schema_up_to_date() {
+    let Some(admin) = server_of_tests() else {
+        return;
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let location = created(&admin, folder.path());
+    let database = address_of(&location);
+    let token = init(&database);
+    // As the release before left it, whose server runs.
+    let sql = "ALTER TABLE server_epoch DROP COLUMN advertise_url, DROP COLUMN generation;
+        DELETE FROM _sqlx_migrations WHERE version = 5";
+    tool("psql", &[&database, "--quiet", "--command", sql]);
+    let lock = DatabaseLock::take(&location).await.unwrap();
+    let next = Program::start(folder.path(), "next", &database);
+    next.says("standby: another server").await;
+    next.says("standby: it answers no requests").await;
+    assert!(!next.said().contains("takes over"), "{}", next.said());
+    lock.release().await;
+    let address = next.address().await;
+    assert!(create_terrain(&address, &token, "sand").await.is_success());
+    assert!(terrains(&address, &token).await.contains("sand"));
+    let found = schema::of(&location).await.unwrap();
+    assert_eq!(found.schema, Some(schema::known(&location)));
 }

@@ -30,6 +30,9 @@ use crate::robot::Robot;
 /// Time within which the map of a standby is that of the server after a receipt.
 const FOLLOWED_MAX: Duration = Duration::from_secs(1);
 
+/// Missions that are created while a stream of events begins.
+const CONCURRENT: usize = 10;
+
 /// An address that nobody has.
 fn free_address() -> SocketAddr {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
@@ -495,14 +498,28 @@ async fn what_a_standby_cannot_answer_the_server_answers_until_the_standby_takes
         .unwrap();
     assert_eq!(found.status(), StatusCode::OK);
     assert_eq!(format!("http://{}", server.http_address()), standby);
-    let another = by_admin.post(format!("{standby}/v1/missions"));
-    let another = another.json(&circle(&robot.id)).send().await.unwrap();
-    let another: Mission = another.json().await.unwrap();
+    let create = || {
+        let creating = by_admin.post(format!("{standby}/v1/missions"));
+        let creating = creating.json(&circle(&robot.id)).send();
+        async { creating.await.unwrap().json::<Mission>().await.unwrap() }
+    };
+    // Others create missions while the client goes on.
+    let mut creating: JoinSet<Mission> = (0..CONCURRENT).map(|_| create()).collect();
+    let first = creating.join_next().await.unwrap().unwrap();
+    created.push(first.id);
     let url = format!("{standby}/v1/events?topics=missions");
     let resumed = by_admin
         .get(url)
         .header("last-event-id", last_id(&read_before));
     let mut resumed = resumed.send().await.unwrap();
+    created.extend(
+        creating
+            .join_all()
+            .await
+            .into_iter()
+            .map(|mission| mission.id),
+    );
+    let another = create().await;
     let mut rest = String::new();
     read_until(&mut resumed, &mut rest, |text| {
         let mut steps = steps_in(text).into_iter();

@@ -118,7 +118,7 @@ pub(crate) async fn send_missions(
     let mut agents = Vec::new();
     for number in 0..arguments.agents {
         let robot: RobotId = format!("driver-{number}").parse()?;
-        if arguments.tls {
+        if fleet.has_certificates() {
             fleet.join(&robot).await;
         }
         fleet.start_agent(&robot, f64::from(number) * 20.0).await;

@@ -1,0 +1,164 @@
+//! Publishes once more, on a zenoh router of this machine, what robots publish and where maps change.
+//!
+//! The server's own routers are for robots alone. A site's subscribers, such as a dashboard or a bridge, find
+//! states and friction at that router under the same keys, and nothing that they do there reaches a robot: the
+//! server reads nothing from it.
+
+use std::collections::HashMap;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
+use tracing::{debug, info, warn};
+use zenoh::bytes::ZBytes;
+use zenoh::pubsub::Publisher;
+use zenoh::qos::CongestionControl;
+use zenoh::{Session, Wait as _};
+
+use super::opening::{client_config, close};
+use crate::app::App;
+use crate::app::enrolment::FLEET_ROBOTS_MAX;
+use crate::supervisor::Supervisor;
+
+/// Maximum number of messages that wait: one second of a thousand robots at 10 Hz.
+const WAITING_MAX: usize = 10_000;
+/// Maximum number of messages that are published before others have their turn.
+const AT_ONCE_MAX: usize = 1_000;
+/// Maximum number of declared publishers: states and friction of all robots, and room for maps.
+const PUBLISHERS_MAX: usize = 3 * FLEET_ROBOTS_MAX as usize;
+/// Maximum time of one attempt to reach the router, and the pause before the next.
+const OPEN_TIMEOUT: Duration = Duration::from_secs(3);
+const RETRY: Duration = Duration::from_secs(2);
+/// Interval of log lines about messages that were dropped.
+const LOG_EVERY: Duration = Duration::from_secs(60);
+
+/// Handle to publish messages at the router; clones share its queue.
+#[derive(Debug, Clone)]
+pub(super) struct Republisher {
+    messages: mpsc::Sender<Message>,
+    dropped: Arc<AtomicU64>,
+}
+
+#[derive(Debug)]
+struct Message {
+    key: String,
+    payload: ZBytes,
+}
+
+impl Republisher {
+    /// Starts the task that publishes at a router, which is tried again until it is reached.
+    pub(super) fn start(router: SocketAddr, app: &App, supervisor: &Supervisor) -> Self {
+        let (messages, messages_in) = mpsc::channel(WAITING_MAX);
+        app.metrics().queues().show("republished", &messages);
+        let dropped = Arc::default();
+        let publishing = run(
+            (router, supervisor.clone()),
+            messages_in,
+            Arc::clone(&dropped),
+            supervisor.stop_token(),
+        );
+        supervisor.spawn_vital("republisher", publishing);
+        Self { messages, dropped }
+    }
+
+    /// Hands a message over. One that finds no room is dropped and counted: the next one follows soon.
+    pub(super) fn publish(&self, key: &str, payload: ZBytes) {
+        let key = key.to_owned();
+        if self.messages.try_send(Message { key, payload }).is_err() {
+            self.dropped.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+}
+
+async fn run(
+    (router, supervisor): (SocketAddr, Supervisor),
+    mut messages: mpsc::Receiver<Message>,
+    dropped: Arc<AtomicU64>,
+    stop: CancellationToken,
+) {
+    let mut is_logged = false;
+    let session = loop {
+        let opening = supervisor.blocking(move || open(router));
+        let opened = tokio::select! {
+            biased;
+            () = stop.cancelled() => return,
+            opened = opening => opened,
+        };
+        let reason = match opened {
+            Some(Ok(session)) => break session,
+            Some(Err(error)) => error.to_string(),
+            None => "it panicked".to_owned(),
+        };
+        if !std::mem::replace(&mut is_logged, true) {
+            warn!("cannot republish at the zenoh router {router}, which is tried again: {reason}");
+        }
+        // A state that is seconds old is of no use.
+        while messages.try_recv().is_ok() {}
+        tokio::select! {
+            biased;
+            () = stop.cancelled() => return,
+            () = tokio::time::sleep(RETRY) => {}
+        }
+    };
+    info!("states, friction and map changes are republished at the zenoh router {router}");
+    let mut publishers = HashMap::new();
+    let mut waiting = Vec::new();
+    let mut log = tokio::time::interval(LOG_EVERY);
+    loop {
+        tokio::select! {
+            biased;
+            () = stop.cancelled() => break,
+            _ = log.tick() => {
+                let dropped = dropped.swap(0, Ordering::Relaxed);
+                if dropped > 0 {
+                    warn!("{dropped} messages were not republished at {router}: its queue was full");
+                }
+            }
+            count = messages.recv_many(&mut waiting, AT_ONCE_MAX) => {
+                if count == 0 {
+                    stop.cancelled().await;
+                    break;
+                }
+                for message in waiting.drain(..) {
+                    if let Err(error) = publish(&session, &mut publishers, message) {
+                        debug!("a message was not republished at {router}: {error}");
+                    }
+                }
+                tokio::task::yield_now().await;
+            }
+        }
+    }
+    drop(publishers);
+    close(session).await;
+}
+
+/// Opens a session, which connects again by itself when the router was away. Blocks its thread.
+fn open(router: SocketAddr) -> zenoh::Result<Session> {
+    zenoh::open(client_config(router, None, OPEN_TIMEOUT.as_millis())?).wait()
+}
+
+/// Publishes a message by a declared publisher: an undeclared key costs the router more.
+fn publish(
+    session: &Session,
+    publishers: &mut HashMap<String, Publisher<'static>>,
+    message: Message,
+) -> zenoh::Result<()> {
+    let Message { key, payload } = message;
+    if let Some(publisher) = publishers.get(&key) {
+        return publisher.put(payload).wait();
+    }
+    if publishers.len() >= PUBLISHERS_MAX {
+        // Robots that left long ago are among them; the others are declared again.
+        publishers.clear();
+    }
+    let declaring = session
+        .declare_publisher(key.clone())
+        .congestion_control(CongestionControl::Drop);
+    let publisher = declaring.wait()?;
+    publisher.put(payload).wait()?;
+    publishers.insert(key, publisher);
+    Ok(())
+}
