@@ -50,7 +50,9 @@ mod tests {
     #[tokio::test]
     async fn a_signal_between_two_waits_ends_the_second() {
         let mut signals = EndSignals::listen().unwrap();
-        for sent in [Signal::SIGINT, Signal::SIGTERM, Signal::SIGHUP] {
+        // As by `nohup`.
+        let hangup = (!signals.ignores_hangup).then_some(Signal::SIGHUP);
+        for sent in [Signal::SIGINT, Signal::SIGTERM].into_iter().chain(hangup) {
             // The first wait is given up, as by the end of what a command did meanwhile.
             let given_up = tokio::time::timeout(Duration::from_millis(1), signals.next()).await;
             assert!(given_up.is_err(), "{sent} has not been sent");

@@ -161,10 +161,12 @@ impl Connections {
     /// Opens so many connections at once for the first transactions: each takes a tenth of a second with TLS,
     /// since sqlx 0.9.0 does not set `TCP_NODELAY`. A failure shows at the first transaction.
     pub(super) async fn open_first(&self, count: usize) {
-        let opening = (0..count).map(|_| self.inner.connect());
-        for opened in join_all(opening).await.into_iter().flatten() {
-            self.inner.give_back(opened);
-        }
+        let open = async |_| {
+            if let Ok(opened) = self.inner.connect().await {
+                self.inner.give_back(opened);
+            }
+        };
+        join_all((0..count).map(open)).await;
     }
 
     /// Closes all connections after their present work, waiting at most [`CLOSE_TIMEOUT`].

@@ -116,6 +116,8 @@ const READERS_MAX: u32 = 8;
 /// Number of connections that are opened with the database, for its first transactions.
 const WRITERS_FIRST: usize = 1;
 const READERS_FIRST: usize = 2;
+/// Maximum time for these.
+const FIRST_TIMEOUT: Duration = Duration::from_millis(500);
 /// Bounds of writes. A statement waits for the disk and for no client.
 const WRITER_BOUNDS: Bounds = Bounds {
     statement: Duration::from_mins(1),
@@ -213,11 +215,13 @@ impl Db {
             tokio::join!(
                 db.writer.open_first(WRITERS_FIRST),
                 db.readers.open_first(READERS_FIRST)
-            );
-            Ok(())
+            )
         };
+        // Transactions open what is missing after that.
+        let opening = timeout(FIRST_TIMEOUT, opening);
         let preparing = open::prepare(&options, &address);
-        (db.version, ()) = tokio::try_join!(preparing, opening)?;
+        let (prepared, _opened) = tokio::join!(preparing, opening);
+        db.version = prepared?;
         Ok(db)
     }
 

@@ -7,8 +7,8 @@
 //! ended first: a server does not stop because of itself. Programs that only read do not take the lock.
 //!
 //! A standby waits for the lock ([`DatabaseLock::wait`]). The session that holds it asks something every
-//! [`LOOK_INTERVAL`], so a server that is frozen, or cut off, shows as a session that was silent for
-//! longer: the standby ends all sessions of that server then, also one in the middle of a write. A server
+//! [`LOOK_INTERVAL`], so a server that is frozen, or cut off, shows as a process whose sessions were all silent
+//! for longer: the standby ends all sessions of that server then, also one in the middle of a write. A server
 //! that wakes up writes no more, since the new one has claimed the database ([`super::Db::claim`]).
 
 use std::future::pending;
@@ -34,6 +34,8 @@ const RETRY_INTERVAL: Duration = Duration::from_millis(250);
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
 /// Maximum time between two looks of a standby at a silent server: PostgreSQL may have stood still itself.
 const LOOK_GAP_MAX: Duration = Duration::from_millis(500);
+/// Number of late looks in a row after which it is said that a silent server would not be noticed.
+const LATE_LOOKS_MAX: u32 = 20;
 /// Maximum time for an attempt to take the lock: that for a connection and an answer.
 const ATTEMPT_TIMEOUT: Duration = Duration::from_secs(15);
 /// Interval at which the lock is tried while a session ends that holds it.
@@ -62,23 +64,21 @@ const END_OWN: &str = select_owner!(
     "pg_terminate_backend(pid)",
     "AND application_name = current_setting('application_name') AND pid <> pg_backend_pid()"
 );
-/// Says who has it: address of the client, and since when it is connected.
-const IN_USE_BY: &str = select_owner!(
-    "COALESCE(host(client_addr), 'this machine'),
-        to_char(backend_start AT TIME ZONE 'UTC', 'YYYY-MM-DD HH24:MI:SS')",
-    "LIMIT 1"
-);
-
 /// Returns the session that holds the lock: see [`Session`].
 const SESSION: &str = select_owner!(
-    "application_name AS process, pid, CAST(state_change AS TEXT) AS asked_at",
+    "application_name AS process, pid,
+        (SELECT CAST(MAX(own.state_change) AS TEXT) FROM pg_stat_activity AS own
+            WHERE own.datname = current_database()
+                AND own.application_name = pg_stat_activity.application_name) AS asked_at,
+        COALESCE(host(client_addr), 'this machine') AS client,
+        to_char(backend_start AT TIME ZONE 'UTC', 'YYYY-MM-DD HH24:MI:SS') AS since",
     "LIMIT 1"
 );
-/// Ends all sessions of a process, if one of them has asked nothing since.
+/// Ends all sessions of a process, if none of them has asked anything since.
 const END_PROCESS: &str = "SELECT COUNT(pg_terminate_backend(pid)) FROM pg_stat_activity
     WHERE datname = current_database() AND application_name = $1 AND pid <> pg_backend_pid()
-        AND EXISTS (SELECT FROM pg_stat_activity
-            WHERE pid = $2 AND CAST(state_change AS TEXT) = $3)";
+        AND (SELECT CAST(MAX(own.state_change) AS TEXT) FROM pg_stat_activity AS own
+            WHERE own.datname = current_database() AND own.application_name = $1) = $2";
 
 /// Reason why a server may not use a database.
 #[derive(Debug, thiserror::Error)]
@@ -114,7 +114,7 @@ impl DatabaseLock {
     /// [`LockError::InUse`] says who holds the lock; [`LockError::Open`].
     pub async fn take(url: &str) -> Result<Self, LockError> {
         let (options, address) = open::options_of(url).map_err(LockError::Open)?;
-        let locked = locked(&options, &address).await?;
+        let locked = bounded(&address, locked(&options, &address)).await?;
         Ok(Self::keeping(locked, options, address))
     }
 
@@ -140,7 +140,7 @@ impl DatabaseLock {
                 // Its lock is free as soon as PostgreSQL has ended its session.
                 Ok(Attempt::Ended) => ENDING_INTERVAL,
                 Ok(Attempt::InUse(holder)) => {
-                    waiting(&in_use(&address, Some(holder)));
+                    waiting(&in_use(&address, holder));
                     STANDBY_INTERVAL
                 }
                 Err(reason) => {
@@ -241,6 +241,8 @@ struct Watch {
     seen: Option<(Session, Instant)>,
     /// When it looked last: a look that comes late says nothing about the time before.
     looked_at: Option<Instant>,
+    /// Number of looks in a row that came late.
+    late_looks: u32,
     has_warned: bool,
 }
 
@@ -252,7 +254,7 @@ enum Attempt {
     /// The sessions of a server that was silent are ended.
     Ended,
     /// The server that has the lock has asked something lately, or nobody knows.
-    InUse(Holder),
+    InUse(Option<Session>),
 }
 
 /// Session that holds the lock.
@@ -261,12 +263,14 @@ struct Session {
     /// Name of its process.
     process: String,
     pid: i32,
-    /// Time of its last statement by the clock of PostgreSQL; unknown without the rights to see it.
+    /// Time of the last statement of any session of that process by the clock of PostgreSQL; unknown without
+    /// the rights to see it.
     asked_at: Option<String>,
+    /// Address of its client.
+    client: String,
+    /// When it was connected; unknown without the rights to see it.
+    since: Option<String>,
 }
-
-/// Address of a session's client, and since when it is connected.
-type Holder = (String, String);
 
 impl Watch {
     /// Tries to take the lock once, and ends the sessions of the server that has it if that one has asked
@@ -299,67 +303,74 @@ impl Watch {
         if try_lock(&mut connection).await? {
             return Ok(Attempt::Taken(connection));
         }
-        let attempt = match self.end_silent(&mut connection, silence_max).await? {
-            Some(_ended) => Attempt::Ended,
-            None => Attempt::InUse(holder(&mut connection).await?),
+        let session = holder(&mut connection).await?;
+        let is_silent = self.is_silent(session.as_ref(), silence_max);
+        let is_ended = match &session {
+            Some(session) if is_silent => self.end(session, &mut connection).await?,
+            Some(_) | None => false,
         };
         self.connection = Some(connection);
-        Ok(attempt)
+        Ok(if is_ended {
+            Attempt::Ended
+        } else {
+            Attempt::InUse(session)
+        })
     }
 
-    /// Ends the sessions of the server that has the lock, if it was silent, and returns their number. A step
-    /// of any clock changes nothing: only whether there was a statement counts.
-    async fn end_silent(
-        &mut self,
-        connection: &mut PgConnection,
-        silence_max: Duration,
-    ) -> Result<Option<i64>, sqlx::Error> {
-        let session: Option<Session> = sqlx::query_as(SESSION)
-            .fetch_optional(&mut *connection)
-            .await?;
+    /// Returns whether the server that has the lock has asked nothing for longer than permitted. A step of any
+    /// clock changes nothing: only whether there was a statement counts.
+    fn is_silent(&mut self, session: Option<&Session>, silence_max: Duration) -> bool {
         let before = self.looked_at.replace(Instant::now());
         let is_late = before.is_none_or(|before| before.elapsed() > LOOK_GAP_MAX);
-        let since = match (&self.seen, &session) {
-            (Some((seen, since)), Some(session)) if seen == session && !is_late => *since,
-            _ => {
-                self.seen = session.map(|session| (session, Instant::now()));
-                return Ok(None);
-            }
-        };
-        let Some(Session {
-            process,
-            pid,
-            asked_at: Some(asked_at),
-        }) = session
-        else {
-            self.warn_once(&"the user may not see its last statement");
-            return Ok(None);
-        };
-        let silence = since.elapsed();
-        if silence < silence_max {
-            return Ok(None);
+        self.late_looks = if is_late { self.late_looks + 1 } else { 0 };
+        if self.late_looks > LATE_LOOKS_MAX {
+            self.warn_once(&"PostgreSQL answers too slowly");
         }
+        match (&self.seen, session) {
+            (Some((seen, since)), Some(session)) if seen == session && !is_late => {
+                if session.asked_at.is_none() {
+                    self.warn_once(&"the user may not see its last statement");
+                    return false;
+                }
+                since.elapsed() >= silence_max
+            }
+            _ => {
+                self.seen = session.map(|session| (session.clone(), Instant::now()));
+                false
+            }
+        }
+    }
+
+    /// Ends the sessions of a server that was silent; returns whether it was silent until then.
+    async fn end(
+        &mut self,
+        session: &Session,
+        connection: &mut PgConnection,
+    ) -> Result<bool, sqlx::Error> {
+        let process = &session.process;
         let ended = sqlx::query_as(END_PROCESS)
-            .bind(&process)
-            .bind(pid)
-            .bind(&asked_at)
+            .bind(process)
+            .bind(&session.asked_at)
             .fetch_one(connection);
         let (ended,): (i64,) = match ended.await {
             Ok(ended) => ended,
             // It may lack the right to end sessions of others.
             Err(sqlx::Error::Database(cause)) => {
                 self.warn_once(&cause);
-                return Ok(None);
+                return Ok(false);
             }
             Err(cause) => return Err(cause),
         };
-        self.seen = None;
-        warn!(
-            "`{process}` has the lock of the database and was silent for {:.1} s: its {ended} sessions \
-             are ended",
-            silence.as_secs_f64()
-        );
-        Ok(Some(ended))
+        let silent = self.seen.take();
+        if ended > 0 {
+            let silence = silent.map_or(Duration::ZERO, |(_, since)| since.elapsed());
+            warn!(
+                "`{process}` has the lock of the database and was silent for {:.1} s: its {ended} sessions \
+                 are ended",
+                silence.as_secs_f64()
+            );
+        }
+        Ok(ended > 0)
     }
 
     /// Forgets connection and session, after a failure.
@@ -415,7 +426,8 @@ async fn locked(options: &PgConnectOptions, address: &str) -> Result<PgConnectio
     if try_lock(&mut connection).await.map_err(refused)? {
         return Ok(connection);
     }
-    Err(in_use(address, holder(&mut connection).await.ok()))
+    let holder = holder(&mut connection).await.ok().flatten();
+    Err(in_use(address, holder))
 }
 
 /// Takes the lock on a connection, if it is free.
@@ -425,21 +437,19 @@ async fn try_lock(connection: &mut PgConnection) -> Result<bool, sqlx::Error> {
     Ok(is_taken)
 }
 
-/// Returns who holds the lock; empty texts if it has become free.
-async fn holder(connection: &mut PgConnection) -> Result<Holder, sqlx::Error> {
-    let found = sqlx::query_as(IN_USE_BY).fetch_optional(connection).await?;
-    Ok(found.unwrap_or_default())
+/// Returns the session that holds the lock; `None` if it has become free.
+async fn holder(connection: &mut PgConnection) -> Result<Option<Session>, sqlx::Error> {
+    sqlx::query_as(SESSION).fetch_optional(connection).await
 }
 
-fn in_use(address: &str, holder: Option<Holder>) -> LockError {
-    let (client, since) = holder.unwrap_or_default();
+fn in_use(address: &str, holder: Option<Session>) -> LockError {
+    let holder = holder.and_then(|holder| {
+        let since = holder.since?;
+        Some(format!(" (at {}, since {since} UTC)", holder.client))
+    });
     LockError::InUse {
         address: address.to_owned(),
-        holder: if client.is_empty() {
-            String::new()
-        } else {
-            format!(" (at {client}, since {since} UTC)")
-        },
+        holder: holder.unwrap_or_default(),
     }
 }
 

@@ -34,8 +34,9 @@ use zenoh::query::ConsolidationMode;
 /// Longest wait for the server's answer to anything.
 const ANSWER_WAIT_MAX: Duration = Duration::from_secs(5);
 
-/// Maximum number of times that a robot says hello again.
-const HELLO_TRIES_MAX: u32 = 3;
+/// Maximum number of times that a robot says hello, which an agent does without end: while thousands join, the
+/// server opens routers one after the other.
+const HELLO_TRIES_MAX: u32 = 12;
 
 /// A session as agents open it: a client of one router, nothing discovered.
 ///

@@ -18,7 +18,7 @@ use std::time::Duration;
 
 use serde::Serialize;
 use tokio::sync::{mpsc, oneshot, watch};
-use tokio_util::sync::CancellationToken;
+use tokio_util::sync::{CancellationToken, DropGuard};
 use tracing::{debug, info, warn};
 use tread_api::enrolment::TrustId;
 use tread_api::ids::{BootId, OwnerId, RobotId, SiteId};
@@ -154,6 +154,8 @@ pub struct FleetLink {
     server_seen: watch::Receiver<u64>,
     /// Cancelled when the agent has turned to another server.
     left: CancellationToken,
+    /// Cancels it with the link: also with one that was not the first to reach a server.
+    _leaving: DropGuard,
     /// Tunnel of the session; must outlive it.
     tunnel: Option<Tunnel>,
 }
@@ -401,6 +403,7 @@ impl FleetLink {
             ingest,
             _alive: alive,
             server_seen,
+            _leaving: left.clone().drop_guard(),
             left,
             tunnel,
         })

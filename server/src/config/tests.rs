@@ -171,6 +171,20 @@ fn a_flag_wins_over_the_file_and_the_file_over_the_built_in_value() {
 }
 
 #[test]
+fn a_router_for_subscribers_is_on_this_machine() {
+    let at = |address: &str| load(&format!("[republish]\nrouter = \"{address}\"\n"));
+    let config = at("127.0.0.1:7448").unwrap();
+    let router = "127.0.0.1:7448".parse().unwrap();
+    assert_eq!(config.republish, Some(RepublishConfig { router }));
+    assert_eq!(load("").unwrap().republish, None);
+    let error = at("192.168.1.2:7448").unwrap_err().to_string();
+    assert!(
+        error.contains("`republish.router` is 192.168.1.2:7448, which other machines can reach"),
+        "{error}"
+    );
+}
+
+#[test]
 fn listeners_with_the_same_address_are_named() {
     let both = load("http = \"127.0.0.1:8420\"\nmetrics = \"127.0.0.1:8420\"\n");
     let error = both.unwrap_err().to_string();
@@ -179,6 +193,9 @@ fn listeners_with_the_same_address_are_named() {
         "{error}"
     );
     load("http = \"127.0.0.1:0\"\nzenoh = \"127.0.0.1:0\"\n").unwrap();
+    let own = load("zenoh = \"127.0.0.1:7447\"\n[republish]\nrouter = \"127.0.0.1:7447\"\n");
+    let error = own.unwrap_err().to_string();
+    assert!(error.contains("`zenoh` and `republish.router`"), "{error}");
     load("http = \"127.0.0.1:8420\"\nzenoh = \"127.0.0.2:8420\"\n").unwrap();
 }
 

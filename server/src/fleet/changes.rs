@@ -64,7 +64,7 @@ fn publish(
         return;
     };
     if let Some(republisher) = republisher {
-        republisher.publish(&keys::map(&change.site), payload.clone().into());
+        republisher.publish(keys::map(&change.site), payload.clone());
     }
     publishers.declare(routers, std::slice::from_ref(&change.site));
     for publisher in publishers.of(&change.site) {

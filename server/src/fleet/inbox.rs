@@ -54,8 +54,6 @@ pub(super) struct Channels {
     limits: RateLimits,
     /// Links of the robots; `None` without a gate.
     links: Option<Links>,
-    /// Where states and friction are published once more.
-    republisher: Option<Republisher>,
 }
 
 #[derive(Debug)]
@@ -94,6 +92,7 @@ impl Channels {
         app: &App,
         uploads_out: mpsc::Sender<Upload>,
         links: Option<Links>,
+        republisher: Option<Republisher>,
     ) -> Self {
         let (presence, presence_in) = mpsc::channel(PRESENCE_WAITING_MAX);
         let (states, states_in) = mpsc::channel(STATES_WAITING_MAX);
@@ -109,7 +108,8 @@ impl Channels {
         let limits = RateLimits::default();
         let watching = watch_presence(app.clone(), presence_in, limits.clone(), stop());
         supervisor.spawn_vital("presence", watching);
-        let reading = read_states(app.clone(), states_in, limits.clone(), stop());
+        let to = (app.clone(), republisher);
+        let reading = read_states(to, states_in, limits.clone(), stop());
         supervisor.spawn_vital("states", reading);
         let replies = requests::Replies::new(app.clone(), limits.clone(), supervisor.clone());
         supervisor.spawn_vital(
@@ -126,15 +126,6 @@ impl Channels {
             uploads,
             limits,
             links,
-            republisher: None,
-        }
-    }
-
-    /// Publishes states and friction once more.
-    pub(super) fn republished(self, republisher: Option<Republisher>) -> Self {
-        Self {
-            republisher,
-            ..self
         }
     }
 }
@@ -268,9 +259,6 @@ pub(super) fn declare(session: &Session, channels: &Channels, router: u64) -> ze
                 if sample.payload().len() > STATE_BYTES_MAX {
                     return to.app.counters().refused_malformed.one();
                 }
-                if let Some(republisher) = &to.republisher {
-                    republisher.publish(key, sample.payload().clone());
-                }
                 let clock = to.app.clock();
                 let published = Published {
                     kind,
@@ -364,7 +352,7 @@ fn gone(app: &App, token: &str) {
 }
 
 async fn read_states(
-    app: App,
+    (app, republisher): (App, Option<Republisher>),
     mut published: mpsc::Receiver<Published>,
     limits: RateLimits,
     stop: CancellationToken,
@@ -380,7 +368,16 @@ async fn read_states(
             return;
         }
         for message in messages.drain(..) {
-            process(&app, &limits, &message);
+            let is_taken = process(&app, &limits, &message);
+            if let Some(republisher) = republisher.as_ref().filter(|_| is_taken) {
+                let (site, robot) = message.place.robot();
+                let key = if message.kind == Kind::Friction {
+                    keys::friction(site, robot)
+                } else {
+                    keys::state(site, robot)
+                };
+                republisher.publish(key, message.payload);
+            }
         }
         if received < STATES_AT_ONCE_MAX {
             tokio::time::sleep(STATES_PAUSE).await;
@@ -391,24 +388,24 @@ async fn read_states(
     }
 }
 
-/// Records a state or a friction report of a robot.
-fn process(app: &App, limits: &RateLimits, message: &Published) {
+/// Records a state or a friction report of a robot; returns whether it was taken.
+fn process(app: &App, limits: &RateLimits, message: &Published) -> bool {
     let key = message.place.robot();
     if !app.admits(key) {
-        return;
+        return false;
     }
     let (_, robot) = key;
     let heard = if message.kind == Kind::Friction {
         let named = |report: &FrictionReport| report.robot == *robot;
         let Some(report) = read(app, limits, message, named) else {
-            return;
+            return false;
         };
         let presences = app.presences();
         presences.friction(key, &report, message.at.monotonic)
     } else {
         let named = |state: &RobotState| state.robot == *robot;
         let Some(mut state) = read(app, limits, message, named) else {
-            return;
+            return false;
         };
         state.remove_impossible_values();
         let (presences, at) = (app.presences(), message.at);
@@ -417,9 +414,16 @@ fn process(app: &App, limits: &RateLimits, message: &Published) {
     match heard {
         Heard::News => app.wake(),
         Heard::Nothing => {}
-        Heard::Stranger => refuse_stranger(app, key),
-        Heard::Other => app.counters().refused_other_run.one(),
+        Heard::Stranger => {
+            refuse_stranger(app, key);
+            return false;
+        }
+        Heard::Other => {
+            app.counters().refused_other_run.one();
+            return false;
+        }
     }
+    true
 }
 
 fn read<T: serde::de::DeserializeOwned>(

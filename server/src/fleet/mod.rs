@@ -224,12 +224,17 @@ impl Fleet {
         let links = gate.as_ref().map(|_| gate::Links::new(self.byte_rate));
         let republisher =
             republish_at.map(|router| Republisher::start(router, app, &self.supervisor));
-        let channels = inbox::Channels::new(&self.supervisor, app, uploads, links.clone());
         let pool = Arc::new(RouterPool {
             app: app.clone(),
             routers: Arc::clone(&self.routers),
             opener,
-            channels: channels.republished(republisher.clone()),
+            channels: inbox::Channels::new(
+                &self.supervisor,
+                app,
+                uploads,
+                links.clone(),
+                republisher.clone(),
+            ),
             turn: Mutex::new(()),
         });
         pool.open(app.enrolment_registry().robots()).await?;

@@ -7,13 +7,12 @@
 use std::collections::HashMap;
 use std::net::SocketAddr;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::time::Duration;
 
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 use tracing::{debug, info, warn};
-use zenoh::bytes::ZBytes;
 use zenoh::pubsub::Publisher;
 use zenoh::qos::CongestionControl;
 use zenoh::{Session, Wait as _};
@@ -25,6 +24,8 @@ use crate::supervisor::Supervisor;
 
 /// Maximum number of messages that wait: one second of a thousand robots at 10 Hz.
 const WAITING_MAX: usize = 10_000;
+/// Maximum size of the messages that wait, bytes.
+const WAITING_BYTES_MAX: usize = 32 * 1024 * 1024;
 /// Maximum number of messages that are published before others have their turn.
 const AT_ONCE_MAX: usize = 1_000;
 /// Maximum number of declared publishers: states and friction of all robots, and room for maps.
@@ -39,13 +40,23 @@ const LOG_EVERY: Duration = Duration::from_secs(60);
 #[derive(Debug, Clone)]
 pub(super) struct Republisher {
     messages: mpsc::Sender<Message>,
-    dropped: Arc<AtomicU64>,
+    queue: Arc<Queue>,
+}
+
+/// State of the queue.
+#[derive(Debug, Default)]
+struct Queue {
+    /// Whether the router was reached; before, nothing waits.
+    is_open: AtomicBool,
+    /// Size of the payloads that wait.
+    bytes: AtomicUsize,
+    dropped: AtomicU64,
 }
 
 #[derive(Debug)]
 struct Message {
     key: String,
-    payload: ZBytes,
+    payload: Vec<u8>,
 }
 
 impl Republisher {
@@ -53,22 +64,29 @@ impl Republisher {
     pub(super) fn start(router: SocketAddr, app: &App, supervisor: &Supervisor) -> Self {
         let (messages, messages_in) = mpsc::channel(WAITING_MAX);
         app.metrics().queues().show("republished", &messages);
-        let dropped = Arc::default();
+        let queue = Arc::default();
         let publishing = run(
             (router, supervisor.clone()),
             messages_in,
-            Arc::clone(&dropped),
+            Arc::clone(&queue),
             supervisor.stop_token(),
         );
         supervisor.spawn_vital("republisher", publishing);
-        Self { messages, dropped }
+        Self { messages, queue }
     }
 
     /// Hands a message over. One that finds no room is dropped and counted: the next one follows soon.
-    pub(super) fn publish(&self, key: &str, payload: ZBytes) {
-        let key = key.to_owned();
-        if self.messages.try_send(Message { key, payload }).is_err() {
-            self.dropped.fetch_add(1, Ordering::Relaxed);
+    pub(super) fn publish(&self, key: String, payload: Vec<u8>) {
+        let queue = &self.queue;
+        if !queue.is_open.load(Ordering::Acquire) {
+            return;
+        }
+        let size = payload.len();
+        let waiting = queue.bytes.fetch_add(size, Ordering::Relaxed) + size;
+        let message = Message { key, payload };
+        if waiting > WAITING_BYTES_MAX || self.messages.try_send(message).is_err() {
+            queue.bytes.fetch_sub(size, Ordering::Relaxed);
+            queue.dropped.fetch_add(1, Ordering::Relaxed);
         }
     }
 }
@@ -76,7 +94,7 @@ impl Republisher {
 async fn run(
     (router, supervisor): (SocketAddr, Supervisor),
     mut messages: mpsc::Receiver<Message>,
-    dropped: Arc<AtomicU64>,
+    queue: Arc<Queue>,
     stop: CancellationToken,
 ) {
     let mut is_logged = false;
@@ -95,14 +113,13 @@ async fn run(
         if !std::mem::replace(&mut is_logged, true) {
             warn!("cannot republish at the zenoh router {router}, which is tried again: {reason}");
         }
-        // A state that is seconds old is of no use.
-        while messages.try_recv().is_ok() {}
         tokio::select! {
             biased;
             () = stop.cancelled() => return,
             () = tokio::time::sleep(RETRY) => {}
         }
     };
+    queue.is_open.store(true, Ordering::Release);
     info!("states, friction and map changes are republished at the zenoh router {router}");
     let mut publishers = HashMap::new();
     let mut waiting = Vec::new();
@@ -112,7 +129,7 @@ async fn run(
             biased;
             () = stop.cancelled() => break,
             _ = log.tick() => {
-                let dropped = dropped.swap(0, Ordering::Relaxed);
+                let dropped = queue.dropped.swap(0, Ordering::Relaxed);
                 if dropped > 0 {
                     warn!("{dropped} messages were not republished at {router}: its queue was full");
                 }
@@ -123,6 +140,7 @@ async fn run(
                     break;
                 }
                 for message in waiting.drain(..) {
+                    queue.bytes.fetch_sub(message.payload.len(), Ordering::Relaxed);
                     if let Err(error) = publish(&session, &mut publishers, message) {
                         debug!("a message was not republished at {router}: {error}");
                     }

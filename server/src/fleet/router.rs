@@ -186,7 +186,7 @@ mod tests {
                     supervisor: supervisor.clone(),
                     next: AtomicU64::new(0),
                 },
-                channels: Channels::new(&supervisor, &app, uploads, None),
+                channels: Channels::new(&supervisor, &app, uploads, None, None),
                 turn: Mutex::new(()),
             };
             pool.open(Vec::new()).await.unwrap();

@@ -49,7 +49,10 @@ pub(crate) async fn take_lock(
     clock: &Clock,
 ) -> Result<Option<Taken>, LockError> {
     if !config.standby {
-        let lock = DatabaseLock::take(&config.database).await?;
+        let lock = tokio::select! {
+            lock = DatabaseLock::take(&config.database) => lock?,
+            () = asked => return Ok(None),
+        };
         return Ok(Some(Taken {
             lock,
             standby: None,

@@ -18,7 +18,7 @@ use crate::app::{App, Dependencies, Role, following, identity, map_blocks};
 use crate::authority::Authorities;
 use crate::clock::Clock;
 use crate::config::{Config, TlsSource};
-use crate::db::Db;
+use crate::db::{self, Db};
 use crate::http;
 use crate::http::forward::Forwarder;
 use crate::http::serve::Serving;
@@ -26,6 +26,8 @@ use crate::identity::address::TrustedProxies;
 use crate::supervisor::{Stopped, Supervisor};
 use crate::{listen_for_http, listen_for_metrics, open_tls};
 
+/// Interval at which a standby that reads the map looks which server has the database.
+const LOOK_FOR_LEADER_EVERY: Duration = Duration::from_millis(500);
 /// Delay after a failure.
 const RETRY: Duration = Duration::from_secs(2);
 
@@ -186,7 +188,7 @@ async fn serve_with(
     let metrics = config.metrics;
     let metrics = metrics.map(|address| listen_for_metrics(address, &app));
     let metrics = metrics.transpose()?;
-    app.know_leader().await?;
+    db::limited(app.know_leader()).await?;
     let scheme = if tls.is_some() { "https" } else { "http" };
     let serving = Serving {
         listener,
@@ -221,9 +223,10 @@ async fn serve_with(
         }
     };
     tokio::select! {
+        biased;
+        () = supervisor.stopping() => {}
         () = run(serving) => {}
         () = serving_metrics => {}
-        () = supervisor.stopping() => {}
         followed = follow(&app, supervisor, shown) => return followed,
     }
     anyhow::bail!("a task of the standby has ended")
@@ -234,7 +237,10 @@ async fn serve_with(
 /// # Errors
 /// The map cannot be read.
 async fn follow(app: &App, supervisor: &Supervisor, shown: &Mutex<Shown>) -> anyhow::Result<()> {
-    app.load_map().await?;
+    tokio::select! {
+        loaded = app.load_map() => loaded?,
+        () = look_for_leader(app) => {}
+    }
     lock(shown).with_map = Some(app.clone());
     if let Err(error) = app.know_tokens().await {
         app.log_failure("read the valid tokens", &error);
@@ -246,6 +252,16 @@ async fn follow(app: &App, supervisor: &Supervisor, shown: &Mutex<Shown>) -> any
     info!("standby: it has the map");
     following::run(app.clone(), stop()).await;
     Ok(())
+}
+
+/// Reads again and again which server has the database, while the map is read. Returns never.
+async fn look_for_leader(app: &App) {
+    loop {
+        tokio::time::sleep(LOOK_FOR_LEADER_EVERY).await;
+        if let Err(cause) = db::limited(app.know_leader()).await {
+            app.log_failure("read which server has the database", &cause);
+        }
+    }
 }
 
 /// Reads the CA certificates (PEM) by which the server that has the database is recognised; `None` for those

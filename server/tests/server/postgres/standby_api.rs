@@ -1,5 +1,6 @@
 //! What a standby answers while another server has the database.
 
+use std::io::{BufRead as _, BufReader, Write as _};
 use std::net::{SocketAddr, TcpListener};
 use std::process::{Command, Stdio};
 use std::time::Duration;
@@ -381,12 +382,21 @@ async fn a_standby_forwards_while_it_reads_the_map() {
     };
     let mut pair = Pair::start(&admin, (Clock::system(), MapConfig::default()), None).await;
     // Another one cannot read sums for a while.
-    let sql = "BEGIN; LOCK TABLE cell_sums IN ACCESS EXCLUSIVE MODE; SELECT pg_sleep(4); COMMIT";
     let mut locking = Command::new("psql")
-        .args([&address_of(&pair.config.database), "--command", sql])
-        .stdout(Stdio::null())
+        .args([&address_of(&pair.config.database), "--quiet"])
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
         .spawn()
         .unwrap();
+    let (mut asking, said) = (
+        locking.stdin.take().unwrap(),
+        locking.stdout.take().unwrap(),
+    );
+    let lock = "BEGIN; LOCK TABLE cell_sums IN ACCESS EXCLUSIVE MODE;\n\\echo locked\n";
+    asking.write_all(lock.as_bytes()).unwrap();
+    let mut line = String::new();
+    BufReader::new(said).read_line(&mut line).unwrap();
+    assert_eq!(line, "locked\n");
     pair.config.http = free_address();
     pair.config.metrics = None;
     pair.standby = format!("http://{}", pair.config.http);
@@ -406,7 +416,8 @@ async fn a_standby_forwards_while_it_reads_the_map() {
     let ready = pair.client.get(format!("{}/readyz", pair.standby));
     let (status, body) = pair.send(ready).await;
     assert_eq!(status, StatusCode::SERVICE_UNAVAILABLE, "{body}");
-    assert!(locking.try_wait().unwrap().is_none(), "sums can be read");
+    asking.write_all(b"COMMIT;\n").unwrap();
+    drop(asking);
     assert!(locking.wait().unwrap().success());
     pair.is_ready().await;
 }

@@ -18,6 +18,8 @@ const UPLOADERS: u32 = 10;
 const BATCH: usize = 250;
 /// Longest wait for a connection or a receipt before the other server is tried.
 const ANSWER_MAX: Duration = Duration::from_secs(2);
+/// Longest time from the first attempt of an upload to its receipt.
+const UPLOAD_MAX: Duration = Duration::from_mins(2);
 /// Pause after an attempt to connect that failed.
 const RETRY: Duration = Duration::from_millis(200);
 
@@ -132,6 +134,10 @@ async fn upload(
             timeout(ANSWER_MAX, robot.upload(&batch)).await,
             Ok(Ok(_receipt))
         ) {
+            anyhow::ensure!(
+                began.elapsed() < UPLOAD_MAX,
+                "no server takes an upload within {UPLOAD_MAX:?}"
+            );
             at = (at + 1) % endpoints.len();
             let reconnecting = robot.reconnect(&endpoints[at]);
             if !matches!(timeout(ANSWER_MAX, reconnecting).await, Ok(Ok(()))) {
