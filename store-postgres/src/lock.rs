@@ -524,6 +524,42 @@ mod tests {
     }
 
     #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn a_standby_of_a_role_that_may_not_watch_waits_and_ends_nobody() {
+        let test = "a_standby_of_a_role_that_may_not_watch";
+        with_database(test, async |database| {
+            let (options, address) = open::options_of(&database.url).unwrap();
+            let mut by_owner = connections::connect(&options).await.unwrap();
+            let created = "DROP ROLE IF EXISTS tread_limited; CREATE ROLE tread_limited LOGIN PASSWORD 'limited'";
+            sqlx::raw_sql(created).execute(&mut by_owner).await.unwrap();
+            let other = options.clone().application_name("tread-server other");
+            let owner = locked(&other, &address).await.unwrap();
+            let limited = options.username("tread_limited").password("limited");
+            let mut watch = Watch::default();
+            for _ in 0..3 {
+                let attempt = watch.attempt(&limited, &address, Duration::ZERO).await;
+                let Ok(Attempt::InUse(Some(session))) = attempt else {
+                    panic!("{attempt:?}");
+                };
+                assert_eq!((session.asked_at, session.since), (None, None));
+            }
+            assert!(watch.has_warned);
+            drop(owner);
+            let mut locked = loop {
+                match watch.attempt(&limited, &address, Duration::ZERO).await {
+                    Ok(Attempt::Taken(locked)) => break locked,
+                    Ok(Attempt::InUse(_)) => sleep(ENDING_INTERVAL).await,
+                    attempt => panic!("{attempt:?}"),
+                }
+            };
+            sqlx::raw_sql("SELECT 1").execute(&mut locked).await.unwrap();
+            sqlx::Connection::close(locked).await.unwrap();
+            let dropped = sqlx::raw_sql("DROP ROLE tread_limited");
+            dropped.execute(&mut by_owner).await.unwrap();
+        })
+        .await;
+    }
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
     async fn a_server_that_was_taken_over_writes_no_more_and_notices() {
         let test = "a_server_that_was_taken_over_writes_no_more";
         with_database(test, async |database| {
