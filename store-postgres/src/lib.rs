@@ -210,7 +210,7 @@ impl Db {
     /// As [`Db::open`].
     pub async fn open_with(url: &str, commit_max: Duration) -> Result<Self, OpenError> {
         let (options, address) = open::options_of(url)?;
-        let mut db = Self::of(options.clone(), address.clone(), commit_max);
+        let mut db = Self::of(&options, address.clone(), commit_max);
         let opening = async {
             tokio::join!(
                 db.writer.open_first(WRITERS_FIRST),
@@ -232,7 +232,7 @@ impl Db {
     /// [`OpenError`]: also if its schema is not the one of this program.
     pub async fn open_to_read(url: &str) -> Result<Self, OpenError> {
         let prepared = open::prepare_to_read(url).await?;
-        let mut db = Self::of(prepared.options, prepared.address, COMMIT_TIMEOUT);
+        let mut db = Self::of(&prepared.options, prepared.address, COMMIT_TIMEOUT);
         db.version = prepared.version;
         // Nobody else has it yet.
         let _ = db.claim.begin_write.set(BeginWrite::of_reader());
@@ -240,7 +240,7 @@ impl Db {
     }
 
     /// A database of which no connection is open, and the version is not known yet.
-    fn of(options: PgConnectOptions, address: String, commit_max: Duration) -> Self {
+    fn of(options: &PgConnectOptions, address: String, commit_max: Duration) -> Self {
         let pool = |bounds, connections_max| {
             Connections::new(options.clone(), bounds, connections_max, commit_max)
         };

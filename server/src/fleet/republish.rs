@@ -34,7 +34,7 @@ const PUBLISHERS_MAX: usize = 3 * FLEET_ROBOTS_MAX as usize;
 const OPEN_TIMEOUT: Duration = Duration::from_secs(3);
 const RETRY: Duration = Duration::from_secs(2);
 /// Interval of log lines about messages that were dropped.
-const LOG_EVERY: Duration = Duration::from_secs(60);
+const LOG_EVERY: Duration = Duration::from_mins(1);
 
 /// Handle to publish messages at the router; clones share its queue.
 #[derive(Debug, Clone)]

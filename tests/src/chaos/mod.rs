@@ -366,7 +366,8 @@ async fn robots_memory(
     let slot = memory.load().ok()?;
     // What the server remembers of the ends may still have been on its way.
     for detail in details {
-        _ = fleet.rest.mission(detail.mission.id).await;
+        let path = format!("/v1/missions/{}", detail.mission.id);
+        _ = fleet.rest.call(Method::GET, &path, None).await;
     }
     Some(slot)
 }

@@ -13,6 +13,7 @@ use tokio::runtime::Handle;
 use tokio::task::JoinSet;
 use tokio::time::Instant;
 use tread_api::identity::Role;
+use tread_api::ids::{MissionId, RobotId};
 use tread_api::mission::{Mission, MissionDetail, MissionState};
 use tread_server::app::identity::tokens::FirstAdmin;
 use tread_server::clock::Clock;
@@ -432,6 +433,59 @@ async fn raw_get(server: SocketAddr, path: &str) -> String {
     answer
 }
 
+/// Goes on with the stream of events of a server that has ended, while others create missions: no step of a
+/// mission is missing, and none comes twice.
+async fn goes_on(
+    by_admin: &reqwest::Client,
+    standby: &str,
+    (robot, read_before): (&RobotId, &str),
+    mut created: Vec<MissionId>,
+) {
+    let create = || {
+        let creating = by_admin.post(format!("{standby}/v1/missions"));
+        let creating = creating.json(&circle(robot)).send();
+        async { creating.await.unwrap().json::<Mission>().await.unwrap() }
+    };
+    // Others create missions while the client goes on.
+    let mut creating: JoinSet<Mission> = (0..CONCURRENT).map(|_| create()).collect();
+    let first = creating.join_next().await.unwrap().unwrap();
+    created.push(first.id);
+    let url = format!("{standby}/v1/events?topics=missions");
+    let resumed = by_admin
+        .get(url)
+        .header("last-event-id", last_id(read_before));
+    let mut resumed = resumed.send().await.unwrap();
+    created.extend(
+        creating
+            .join_all()
+            .await
+            .into_iter()
+            .map(|mission| mission.id),
+    );
+    let another = create().await;
+    let mut rest = String::new();
+    read_until(&mut resumed, &mut rest, |text| {
+        let mut steps = steps_in(text).into_iter();
+        steps.any(|step| step.mission == another.id)
+    })
+    .await;
+    let mut steps = steps_in(read_before);
+    steps.extend(steps_in(&rest));
+    for id in created {
+        let detail: MissionDetail = by_admin
+            .get(format!("{standby}/v1/missions/{id}"))
+            .send()
+            .await
+            .unwrap()
+            .json()
+            .await
+            .unwrap();
+        let read = steps.iter().filter(|step| step.mission == id);
+        let read: Vec<_> = read.map(|step| step.step.clone()).collect();
+        assert_eq!(read, detail.events, "no gap, and none twice");
+    }
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_a_standby_cannot_answer_the_server_answers_until_the_standby_takes_over() {
     let Some(admin) = server_of_tests() else {
@@ -484,7 +538,7 @@ async fn what_a_standby_cannot_answer_the_server_answers_until_the_standby_takes
     the_server_judges(&pair).await;
 
     // What happens from here on, a client reads from the next server.
-    let mut created = vec![id.parse().unwrap()];
+    let mut created: Vec<MissionId> = vec![id.parse().unwrap()];
     for _ in 0..3 {
         created.push(yard.create_mission(&robot.id).await.id);
     }
@@ -509,48 +563,6 @@ async fn what_a_standby_cannot_answer_the_server_answers_until_the_standby_takes
         .unwrap();
     assert_eq!(found.status(), StatusCode::OK);
     assert_eq!(format!("http://{}", server.http_address()), standby);
-    let create = || {
-        let creating = by_admin.post(format!("{standby}/v1/missions"));
-        let creating = creating.json(&circle(&robot.id)).send();
-        async { creating.await.unwrap().json::<Mission>().await.unwrap() }
-    };
-    // Others create missions while the client goes on.
-    let mut creating: JoinSet<Mission> = (0..CONCURRENT).map(|_| create()).collect();
-    let first = creating.join_next().await.unwrap().unwrap();
-    created.push(first.id);
-    let url = format!("{standby}/v1/events?topics=missions");
-    let resumed = by_admin
-        .get(url)
-        .header("last-event-id", last_id(&read_before));
-    let mut resumed = resumed.send().await.unwrap();
-    created.extend(
-        creating
-            .join_all()
-            .await
-            .into_iter()
-            .map(|mission| mission.id),
-    );
-    let another = create().await;
-    let mut rest = String::new();
-    read_until(&mut resumed, &mut rest, |text| {
-        let mut steps = steps_in(text).into_iter();
-        steps.any(|step| step.mission == another.id)
-    })
-    .await;
-    let mut steps = steps_in(&read_before);
-    steps.extend(steps_in(&rest));
-    for id in created {
-        let detail: MissionDetail = by_admin
-            .get(format!("{standby}/v1/missions/{id}"))
-            .send()
-            .await
-            .unwrap()
-            .json()
-            .await
-            .unwrap();
-        let read = steps.iter().filter(|step| step.mission == id);
-        let read: Vec<_> = read.map(|step| step.step.clone()).collect();
-        assert_eq!(read, detail.events, "no gap, and none twice");
-    }
+    goes_on(&by_admin, &standby, (&robot.id, &read_before), created).await;
     server.stop().await.unwrap();
 }
