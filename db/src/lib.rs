@@ -250,15 +250,15 @@ impl Db {
 
     /// Makes this process the server of the database, which it has locked: what was so before cannot write
     /// to a PostgreSQL database any more. Standbys of such a database send to `advertise_url` what only this
-    /// server can answer.
+    /// server can answer. Returns the epoch of a server of a PostgreSQL database.
     ///
     /// # Errors
     /// The database cannot be written.
-    pub async fn claim(&self, advertise_url: Option<&str>) -> Result<(), DbError> {
+    pub async fn claim(&self, advertise_url: Option<&str>) -> Result<Option<i64>, DbError> {
         match self {
             // The lock of a file lasts as long as the process.
-            Self::Sqlite(_) => Ok(()),
-            Self::Postgres(db) => db.claim(advertise_url).await,
+            Self::Sqlite(_) => Ok(None),
+            Self::Postgres(db) => Ok(Some(db.claim(advertise_url).await?)),
         }
     }
 

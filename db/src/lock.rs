@@ -68,6 +68,14 @@ impl DatabaseLock {
         Ok(Self::Postgres(lock.await?))
     }
 
+    /// Notes the epoch of this server, if its database has one: once another one has a newer epoch, this one does
+    /// not take the lock again after it lost its connection.
+    pub fn claimed(&self, epoch: Option<i64>) {
+        if let (Self::Postgres(lock), Some(epoch)) = (self, epoch) {
+            lock.claimed(epoch);
+        }
+    }
+
     /// Waits until another server has the lock, and returns why this one must stop. A file stays locked as
     /// long as it is open.
     pub fn lost(&self) -> impl Future<Output = String> + Send + 'static {

@@ -166,7 +166,7 @@ impl Server {
         let security = config.robots.as_ref().map(security).transpose()?;
         let authorities = security.as_ref().map(|security| &security.authorities);
         let tls = open_tls(&config, authorities, &clock)?;
-        let db = open_claimed(&config, lock.lost()).await?;
+        let db = open_claimed(&config, lock).await?;
         let supervisor = Supervisor::new();
         let stop = || supervisor.stop_token();
         supervisor.spawn_vital("lock", keep_lock(lock.lost(), db.clone(), stop()));
@@ -293,12 +293,12 @@ fn listen_for_metrics(address: SocketAddr, app: &App) -> anyhow::Result<Serving>
 ///
 /// # Errors
 /// It cannot be opened, or a standby cannot write to it, or the lock was lost.
-async fn open_claimed(config: &Config, lost: impl Future<Output = String>) -> anyhow::Result<Db> {
+async fn open_claimed(config: &Config, lock: &DatabaseLock) -> anyhow::Result<Db> {
     let db = Db::open(&config.database).await?;
     let advertise_url = config.web.advertise_url.as_ref().map(Origin::as_str);
     let claimed = tokio::select! {
         biased;
-        reason = lost => anyhow::bail!("the lock of the database is lost: {reason}"),
+        reason = lock.lost() => anyhow::bail!("the lock of the database is lost: {reason}"),
         claimed = db.claim(advertise_url) => claimed,
     };
     match claimed {
@@ -306,7 +306,7 @@ async fn open_claimed(config: &Config, lost: impl Future<Output = String>) -> an
         Err(error) if !config.standby => {
             warn!("cannot claim the database: {}", error_text::chain(&error));
         }
-        claimed => claimed?,
+        claimed => lock.claimed(claimed?),
     }
     Ok(db)
 }

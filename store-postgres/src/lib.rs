@@ -13,6 +13,7 @@ pub mod archive_mark;
 pub mod attendance;
 #[path = "../../store/sql/audit.rs"]
 pub mod audit;
+mod begin;
 #[path = "../../store/sql/column_names.rs"]
 mod column_names;
 mod connections;
@@ -97,6 +98,7 @@ use tread_store::failure::StorageFailure;
 use tread_store::metrics::DatabaseMetrics;
 use tread_store::{DbError, Disk};
 
+use self::begin::{BEGIN_READ, BeginWrite};
 use self::connections::{Bounds, COMMIT_TIMEOUT, Connections, Lent};
 pub use self::error::EngineError;
 pub use self::open::{OpenError, refuse_newer};
@@ -130,15 +132,8 @@ const READER_BOUNDS: Bounds = Bounds {
 };
 /// Maximum time for the server to report the size of the database.
 const DISK_TIMEOUT: Duration = Duration::from_secs(2);
-/// Begins a write. The number is the lock of writers, "treaddb" in ASCII. The server releases the lock
-/// after it has made the commit visible, and each later statement sees what is visible when it begins.
-const BEGIN_WRITE: &str = "BEGIN ISOLATION LEVEL READ COMMITTED READ WRITE; SELECT pg_advisory_xact_lock(32776877049668706)";
-/// Follows it, if the write changes a site, terrain or robot: other processes see by it that one has.
-const COUNT_WRITE: &str = "; UPDATE server_epoch SET generation = generation + 1";
 /// PostgreSQL's code, of `check_server_epoch`, for a server that another one has taken the place of.
 const TAKEN_OVER: &str = "TR001";
-/// Begins a read: its first statement takes the snapshot of all.
-const BEGIN_READ: &str = "BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY";
 
 /// The open database; clones share it.
 #[derive(Debug, Clone)]
@@ -158,40 +153,6 @@ struct Claim {
     /// What begins a write, with the epoch of this server; unset for a program that is no server.
     begin_write: OnceLock<BeginWrite>,
     is_taken_over: watch::Sender<bool>,
-}
-
-/// Statements that begin a write.
-#[derive(Debug)]
-struct BeginWrite {
-    counted: String,
-    uncounted: String,
-}
-
-impl BeginWrite {
-    /// Returns those of the server with an epoch.
-    fn of_server(epoch: i64) -> Self {
-        let uncounted = format!("{BEGIN_WRITE}; SELECT check_server_epoch({epoch})");
-        Self {
-            counted: format!("{uncounted}{COUNT_WRITE}"),
-            uncounted,
-        }
-    }
-
-    /// Returns those of a program that is no server.
-    fn of_program() -> Self {
-        Self {
-            counted: format!("{BEGIN_WRITE}{COUNT_WRITE}"),
-            uncounted: BEGIN_WRITE.to_owned(),
-        }
-    }
-
-    /// Returns those of a program that only reads: PostgreSQL refuses each change.
-    fn of_reader() -> Self {
-        Self {
-            counted: BEGIN_READ.to_owned(),
-            uncounted: BEGIN_READ.to_owned(),
-        }
-    }
 }
 
 impl Db {
@@ -339,17 +300,18 @@ impl Db {
     }
 
     /// Makes this process the server of the database: all that were so before cannot write any more. To be
-    /// called once, with the lock. Standbys send to `advertise_url` what only this server can answer.
+    /// called once, with the lock. Standbys send to `advertise_url` what only this server can answer. Returns its
+    /// epoch.
     ///
     /// # Errors
     /// The database cannot be written.
-    pub async fn claim(&self, advertise_url: Option<&str>) -> Result<(), DbError> {
+    pub async fn claim(&self, advertise_url: Option<&str>) -> Result<i64, DbError> {
         let mut tx = self.write_uncounted("lock").await?;
         let epoch = leader::claim(&mut tx, advertise_url).await?;
         tx.commit().await?;
         // Set once: a second claim of the same process keeps the first epoch, and fails with it.
         let _ = self.claim.begin_write.set(BeginWrite::of_server(epoch));
-        Ok(())
+        Ok(epoch)
     }
 
     /// Waits until a write has failed since another server has claimed the database.

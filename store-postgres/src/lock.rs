@@ -13,6 +13,7 @@
 
 use std::future::pending;
 use std::io;
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use sqlx::PgConnection;
@@ -105,6 +106,7 @@ pub enum LockError {
 pub struct DatabaseLock {
     keeping: JoinHandle<()>,
     lost: watch::Receiver<Option<String>>,
+    epoch: Arc<OnceLock<i64>>,
 }
 
 impl DatabaseLock {
@@ -156,15 +158,28 @@ impl DatabaseLock {
 
     fn keeping(locked: PgConnection, options: PgConnectOptions, address: String) -> Self {
         let (losing, lost) = watch::channel(None);
+        let epoch = Arc::new(OnceLock::new());
+        let own_epoch = Arc::clone(&epoch);
         #[expect(
             clippy::disallowed_methods,
             reason = "ends with the lock, which aborts it; the lock outlives all other tasks of a server"
         )]
         let keeping = tokio::spawn(async move {
-            let in_use = keep(locked, &options, &address).await;
+            let in_use = keep(locked, &options, &address, &own_epoch).await;
             losing.send_replace(Some(in_use.to_string()));
         });
-        Self { keeping, lost }
+        Self {
+            keeping,
+            lost,
+            epoch,
+        }
+    }
+
+    /// Notes the epoch of this server: once another one has a newer epoch, this one does not take the lock again
+    /// after it lost its connection.
+    pub fn claimed(&self, epoch: i64) {
+        // A process claims once.
+        let _ = self.epoch.set(epoch);
     }
 
     /// Waits until another server has the lock, and returns why this one must stop.
@@ -200,6 +215,7 @@ async fn keep(
     mut connection: PgConnection,
     options: &PgConnectOptions,
     address: &str,
+    epoch: &OnceLock<i64>,
 ) -> LockError {
     loop {
         sleep(LOOK_INTERVAL).await;
@@ -209,7 +225,8 @@ async fn keep(
         }
         warn!("the connection that holds the lock of the database is lost");
         connection = loop {
-            match bounded(address, locked_again(options, address)).await {
+            let own = epoch.get().copied();
+            match bounded(address, locked_again(options, address, own)).await {
                 Ok(locked) => break locked,
                 Err(in_use @ LockError::InUse { .. }) => return in_use,
                 // PostgreSQL is away, as every transaction notices too.
@@ -389,12 +406,24 @@ impl Watch {
     }
 }
 
-/// Takes the lock again after this process lost its connection. PostgreSQL may not have noticed the loss: a
-/// session of this process that still has the lock is ended.
+/// Takes the lock again after this process lost its connection, unless another server has a newer epoch: that
+/// one may have lost its connection too. PostgreSQL may not have noticed the loss: a session of this process that
+/// still has the lock is ended.
 async fn locked_again(
     options: &PgConnectOptions,
     address: &str,
+    epoch: Option<i64>,
 ) -> Result<PgConnection, LockError> {
+    if let Some(own) = epoch {
+        let refused = |cause| LockError::Open(open::refused(address, cause));
+        let mut connection = connections::connect(options).await.map_err(refused)?;
+        let newest = sqlx::query_scalar("SELECT epoch FROM server_epoch");
+        let newest: i64 = newest.fetch_one(&mut connection).await.map_err(refused)?;
+        if newest > own {
+            let holder = holder(&mut connection).await.ok().flatten();
+            return Err(in_use(address, holder));
+        }
+    }
     let in_use = match locked(options, address).await {
         Err(in_use @ LockError::InUse { .. }) => in_use,
         locked @ (Ok(_) | Err(LockError::Open(_))) => return locked,
@@ -454,150 +483,4 @@ fn in_use(address: &str, holder: Option<Session>) -> LockError {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::Db;
-    use crate::testing::with_database;
-
-    /// Takes the lock once the session before has ended.
-    async fn taken(options: &PgConnectOptions, address: &str) -> PgConnection {
-        loop {
-            match locked(options, address).await {
-                Ok(locked) => return locked,
-                Err(_) => sleep(ENDING_INTERVAL).await,
-            }
-        }
-    }
-
-    /// Time after which a standby of these tests takes over.
-    const SILENCE_MAX: Duration = Duration::from_secs(1);
-
-    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-    async fn a_standby_waits_for_a_server_that_answers_and_takes_over_from_one_that_ends() {
-        let test = "a_standby_waits_for_a_server_that_answers";
-        with_database(test, async |database| {
-            let lock = DatabaseLock::take(&database.url).await.unwrap();
-            let mut reasons = 0;
-            let waiting = DatabaseLock::wait(&database.url, SILENCE_MAX, |reason| {
-                assert!(matches!(reason, LockError::InUse { .. }), "{reason}");
-                reasons += 1;
-            });
-            let waited = timeout(3 * SILENCE_MAX, waiting).await;
-            assert!(
-                waited.is_err(),
-                "it has not taken over from a server that lives"
-            );
-            assert!(reasons > 3, "{reasons}");
-            lock.release().await;
-            let waiting = DatabaseLock::wait(&database.url, SILENCE_MAX, |_reason| {});
-            timeout(SILENCE_MAX, waiting).await.unwrap().unwrap();
-        })
-        .await;
-    }
-
-    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-    async fn a_standby_takes_over_from_a_server_that_is_frozen_within_a_write() {
-        let test = "a_standby_takes_over_from_a_server_that_is_frozen";
-        with_database(test, async |database| {
-            drop(Db::open(&database.url).await.unwrap());
-            // Another process, which holds lock and turn to write and does nothing any more.
-            let (options, address) = open::options_of(&database.url).unwrap();
-            let frozen = options.application_name("tread-server frozen");
-            let _lock = locked(&frozen, &address).await.unwrap();
-            let mut write = connections::connect(&frozen).await.unwrap();
-            sqlx::raw_sql(crate::BEGIN_WRITE)
-                .execute(&mut write)
-                .await
-                .unwrap();
-            let begun = Instant::now();
-            let waiting = DatabaseLock::wait(&database.url, SILENCE_MAX, |_reason| {});
-            let _lock = timeout(4 * SILENCE_MAX, waiting).await.unwrap().unwrap();
-            assert!(begun.elapsed() >= SILENCE_MAX / 2, "{:?}", begun.elapsed());
-            let db = Db::open(&database.url).await.unwrap();
-            db.claim(None).await.unwrap();
-            db.probe_write().await.unwrap();
-            let cut = sqlx::query("SELECT 1").execute(&mut write).await;
-            assert!(cut.is_err(), "its session has ended");
-            db.close().await;
-        })
-        .await;
-    }
-
-    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-    async fn a_standby_of_a_role_that_may_not_watch_waits_and_ends_nobody() {
-        let test = "a_standby_of_a_role_that_may_not_watch";
-        with_database(test, async |database| {
-            let (options, address) = open::options_of(&database.url).unwrap();
-            let mut by_owner = connections::connect(&options).await.unwrap();
-            let created = "DROP ROLE IF EXISTS tread_limited; CREATE ROLE tread_limited LOGIN PASSWORD 'limited'";
-            sqlx::raw_sql(created).execute(&mut by_owner).await.unwrap();
-            let other = options.clone().application_name("tread-server other");
-            let owner = locked(&other, &address).await.unwrap();
-            let limited = options.username("tread_limited").password("limited");
-            let mut watch = Watch::default();
-            for _ in 0..3 {
-                let attempt = watch.attempt(&limited, &address, Duration::ZERO).await;
-                let Ok(Attempt::InUse(Some(session))) = attempt else {
-                    panic!("{attempt:?}");
-                };
-                assert_eq!((session.asked_at, session.since), (None, None));
-            }
-            assert!(watch.has_warned);
-            drop(owner);
-            let mut locked = loop {
-                match watch.attempt(&limited, &address, Duration::ZERO).await {
-                    Ok(Attempt::Taken(locked)) => break locked,
-                    Ok(Attempt::InUse(_)) => sleep(ENDING_INTERVAL).await,
-                    attempt => panic!("{attempt:?}"),
-                }
-            };
-            sqlx::raw_sql("SELECT 1").execute(&mut locked).await.unwrap();
-            sqlx::Connection::close(locked).await.unwrap();
-            let dropped = sqlx::raw_sql("DROP ROLE tread_limited");
-            dropped.execute(&mut by_owner).await.unwrap();
-        })
-        .await;
-    }
-
-    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-    async fn a_server_that_was_taken_over_writes_no_more_and_notices() {
-        let test = "a_server_that_was_taken_over_writes_no_more";
-        with_database(test, async |database| {
-            let old = Db::open(&database.url).await.unwrap();
-            old.claim(None).await.unwrap();
-            old.probe_write().await.unwrap();
-            let new = Db::open(&database.url).await.unwrap();
-            new.probe_write().await.unwrap();
-            assert!(timeout(SILENCE_MAX, old.taken_over()).await.is_err());
-            new.claim(None).await.unwrap();
-            let refused = format!("{:?}", old.probe_write().await.unwrap_err());
-            assert!(refused.contains("taken over"), "{refused}");
-            timeout(SILENCE_MAX, old.taken_over()).await.unwrap();
-            new.probe_write().await.unwrap();
-            old.read("test").await.unwrap();
-            old.close().await;
-            new.close().await;
-        })
-        .await;
-    }
-
-    #[tokio::test]
-    async fn a_lost_session_of_the_same_server_does_not_keep_the_lock_and_that_of_another_does() {
-        let test = "a_lost_session_of_the_same_server_does_not_keep_the_lock";
-        with_database(test, async |database| {
-            let (options, address) = open::options_of(&database.url).unwrap();
-            let refused = |locked: &Result<PgConnection, LockError>| {
-                assert!(matches!(locked, Err(LockError::InUse { .. })), "{locked:?}");
-            };
-            let other = options.clone().application_name("tread-server other");
-            let others = locked(&other, &address).await.unwrap();
-            refused(&locked_again(&options, &address).await);
-            drop(others);
-            let _lost = taken(&options, &address).await;
-            // Its connection is open, as PostgreSQL sees one that was lost.
-            let _again = locked_again(&options, &address).await.unwrap();
-            refused(&locked(&other, &address).await);
-        })
-        .await;
-    }
-}
+mod tests;

@@ -9,6 +9,7 @@ mod access;
 #[cfg(test)]
 mod access_tests;
 mod changes;
+mod client;
 mod commands;
 mod credentials;
 mod gate;
@@ -264,7 +265,7 @@ impl Fleet {
     /// Closes the network; robots keep trying to come back.
     pub async fn close(self) {
         for router in self.routers.all() {
-            opening::close(router.session.clone()).await;
+            client::close(router.session.clone()).await;
         }
     }
 }

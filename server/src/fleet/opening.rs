@@ -10,8 +10,6 @@ use std::ops::Range;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use tracing::warn;
-use tread_api::tunnel::RouterCredentials;
 use tread_api::wire::{BATCH_BYTES, SESSION_LEASE_MS};
 use uuid::Uuid;
 use zenoh::{Config, Session, Wait as _};
@@ -121,17 +119,6 @@ const PORTS: Range<u16> = 20_000..32_768;
 /// Number of ports that are tried before the system is asked for one.
 const PORT_TRIES_MAX: u32 = 32;
 
-/// Closes a session; gives up after a timeout.
-pub(super) async fn close(session: Session) {
-    let closing = tokio::task::spawn_blocking(move || session.close().wait());
-    match tokio::time::timeout(SESSION_TIMEOUT, closing).await {
-        Ok(Ok(Ok(()))) => {}
-        Ok(Ok(Err(error))) => warn!("zenoh did not close cleanly: {error}"),
-        Ok(Err(_panic)) => warn!("zenoh panicked while closing"),
-        Err(_elapsed) => warn!("zenoh did not close in time"),
-    }
-}
-
 /// Finds a free port, since zenoh does not report the one it chose for 0. The range is one from
 /// which the system takes no ports for outgoing connections, so that the port is still free when
 /// zenoh listens.
@@ -199,36 +186,6 @@ fn config(address: SocketAddr) -> zenoh::Result<Config> {
     ];
     for (key, value) in settings {
         config.insert_json5(key, &value)?;
-    }
-    Ok(config)
-}
-
-/// Returns the configuration of a local client that probes a router.
-///
-/// # Errors
-/// Zenoh rejects a setting.
-pub(super) fn client_config(
-    address: SocketAddr,
-    credentials: Option<&RouterCredentials>,
-    timeout_ms: u128,
-) -> zenoh::Result<Config> {
-    let mut config = Config::default();
-    for (key, value) in [
-        ("mode", "\"client\"".to_owned()),
-        ("connect/endpoints", format!("[\"tcp/{address}\"]")),
-        ("connect/timeout_ms", timeout_ms.to_string()),
-        ("scouting/multicast/enabled", "false".to_owned()),
-        ("scouting/gossip/enabled", "false".to_owned()),
-    ] {
-        config.insert_json5(key, &value)?;
-    }
-    if let Some(credentials) = credentials {
-        let text = |text: &str| serde_json::Value::from(text).to_string();
-        config.insert_json5("transport/auth/usrpwd/user", &text(&credentials.user))?;
-        config.insert_json5(
-            "transport/auth/usrpwd/password",
-            &text(&credentials.password),
-        )?;
     }
     Ok(config)
 }

@@ -17,7 +17,7 @@ use zenoh::pubsub::Publisher;
 use zenoh::qos::CongestionControl;
 use zenoh::{Session, Wait as _};
 
-use super::opening::{client_config, close};
+use super::client::{client_config, close};
 use crate::app::App;
 use crate::app::enrolment::FLEET_ROBOTS_MAX;
 use crate::supervisor::Supervisor;

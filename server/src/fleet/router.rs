@@ -12,7 +12,7 @@ use tracing::{error, warn};
 use tread_api::tunnel::RouterCredentials;
 use zenoh::Wait as _;
 
-use super::opening::client_config;
+use super::client::client_config;
 use super::probe::PROBE_KEY;
 use super::router_pool::{RouterPool, robots_on};
 use super::routers::Router;

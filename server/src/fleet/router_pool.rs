@@ -16,8 +16,9 @@ use tokio::sync::{Mutex, watch};
 use tokio_util::sync::CancellationToken;
 use tracing::{error, info};
 
+use super::client;
 use super::inbox::Channels;
-use super::opening::{self, Opener};
+use super::opening::Opener;
 use super::router_groups::{Group, superseded, to_open};
 use super::routers::{Router, Routers};
 use crate::app::App;
@@ -50,7 +51,7 @@ impl RouterPool {
     pub(super) async fn open(&self, robots: Vec<RobotKey>) -> Result<(), super::FleetError> {
         let router = self.opener.open(robots).await?;
         if let Err(failed) = self.opener.declare(&router, &self.channels).await {
-            opening::close(router.session.clone()).await;
+            client::close(router.session.clone()).await;
             return Err(failed);
         }
         self.routers.add(router);
@@ -60,7 +61,7 @@ impl RouterPool {
     /// Closes a router; its robots reconnect to another.
     pub(super) async fn close(&self, number: u64) {
         if let Some(router) = self.routers.remove(number) {
-            opening::close(router.session.clone()).await;
+            client::close(router.session.clone()).await;
             self.channels.router_closed(number);
         }
     }

@@ -10,7 +10,6 @@ use axum::extract::Request;
 use axum::http::uri::PathAndQuery;
 use axum::http::{HeaderMap, HeaderName, HeaderValue, Response, StatusCode, Uri, header};
 use axum::response::IntoResponse as _;
-use futures_util::{StreamExt as _, stream};
 use hyper::upgrade::OnUpgrade;
 use hyper_util::rt::TokioIo;
 use reqwest::{Certificate, Url, redirect};
@@ -20,6 +19,7 @@ use tokio_util::sync::CancellationToken;
 use tracing::{debug, warn};
 use tread_api::problem::ProblemType;
 
+use super::forward_body::cut_short;
 use super::identity::guard::Peer;
 use super::problem::Problem;
 use super::serve::FORWARDED_FOR;
@@ -311,40 +311,8 @@ impl Forwarder {
         }
         let mut answer = Response::from(answer).map(Body::new);
         remove_those_of_connection(answer.headers_mut());
-        Ok(self.cut_short(app, answer))
-    }
-
-    /// Ends the body of an answer when the other server is given up, and a stream of events also at the stop:
-    /// its client goes on at another server. Other bodies break off, so that no part passes for the whole.
-    fn cut_short(&self, app: &App, answer: Response<Body>) -> Response<Body> {
-        if answer.body().is_end_stream() {
-            return answer;
-        }
-        let (parts, body) = answer.into_parts();
-        let content = parts.headers.get(header::CONTENT_TYPE);
-        let is_events =
-            content.is_some_and(|content| content.as_bytes().starts_with(b"text/event-stream"));
-        let given_up = self.inner.given_up.clone();
-        let body = body.into_data_stream();
-        let body = if is_events {
-            let stop = app.supervisor().stop_token();
-            Body::from_stream(body.take_until(async move {
-                tokio::select! {
-                    () = given_up.cancelled() => {}
-                    () = stop.cancelled() => {}
-                }
-            }))
-        } else {
-            let is_given_up = given_up.clone();
-            let broken = move |()| {
-                let cause = || axum::Error::new(ForwardError::NoAnswer);
-                std::future::ready(is_given_up.is_cancelled().then(|| Err(cause())))
-            };
-            let rest = stream::once(std::future::ready(())).filter_map(broken);
-            let whole = body.take_until(given_up.cancelled_owned());
-            Body::from_stream(whole.chain(rest))
-        };
-        Response::from_parts(parts, body)
+        let stop = app.supervisor().stop_token();
+        Ok(cut_short(answer, self.inner.given_up.clone(), stop))
     }
 }
 

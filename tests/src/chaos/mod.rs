@@ -133,8 +133,11 @@ async fn run_on(mut fleet: Fleet, relays: Option<Relays>, seed: u64) -> RunRepor
     }
     mend(&mut fleet, relays.as_ref());
     let details = ended(&mut fleet, &followed).await;
+    await_quiet(&mut fleet, &robot).await;
+    // What the robot reported late is in it now.
+    let details = details_now(&mut fleet, &followed).await.unwrap_or(details);
     report.ends = details.iter().map(judge::end_of).collect();
-    let memory = robots_memory(&mut fleet, &robot, &details).await;
+    let memory = robots_memory(&mut fleet, &robot).await;
     judge::judge(&followed, &details, memory.as_ref(), &mut report);
     judge::judge_disks(&fleet, &robot, &mut report).await;
     if report.violations.is_empty() {
@@ -342,12 +345,8 @@ async fn details(fleet: &Fleet, followed: &[Followed]) -> Option<Vec<MissionDeta
     Some(details)
 }
 
-/// What the robot itself remembers, once it has uploaded everything.
-async fn robots_memory(
-    fleet: &mut Fleet,
-    robot: &RobotId,
-    details: &[MissionDetail],
-) -> Option<tread_agent::missions::MissionSlot> {
+/// Waits until the robot has uploaded everything and drives no mission, or until that takes too long.
+async fn await_quiet(fleet: &mut Fleet, robot: &RobotId) {
     let deadline = Instant::now() + END_WAIT_MAX;
     loop {
         fleet.tend_pair().await;
@@ -356,18 +355,32 @@ async fn robots_memory(
             live.heard_age_ms < 1_000 && live.outbox.pending == 0 && live.mission.is_none()
         });
         if is_quiet || Instant::now() > deadline {
-            break;
+            return;
         }
         tokio::time::sleep(LOOK_EVERY).await;
     }
+}
+
+/// What the robot itself remembers.
+async fn robots_memory(
+    fleet: &mut Fleet,
+    robot: &RobotId,
+) -> Option<tread_agent::missions::MissionSlot> {
     // An agent that is asked to stop has written everything.
     _ = fleet.stop_agent(robot).await;
     let memory = tread_agent::missions::memory::Memory::new(&fleet.robot_folder(robot));
-    let slot = memory.load().ok()?;
-    // What the server remembers of the ends may still have been on its way.
-    for detail in details {
-        let path = format!("/v1/missions/{}", detail.mission.id);
-        _ = fleet.rest.call(Method::GET, &path, None).await;
+    memory.load().ok()
+}
+
+/// The missions as the server has them at last; `None` if none answers in time.
+async fn details_now(fleet: &mut Fleet, followed: &[Followed]) -> Option<Vec<MissionDetail>> {
+    let deadline = Instant::now() + END_WAIT_MAX;
+    loop {
+        fleet.tend_pair().await;
+        let found = details(fleet, followed).await;
+        if found.is_some() || Instant::now() > deadline {
+            return found;
+        }
+        tokio::time::sleep(LOOK_EVERY).await;
     }
-    Some(slot)
 }
