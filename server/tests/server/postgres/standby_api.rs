@@ -211,6 +211,8 @@ async fn maps_agree(map: MapConfig) {
     yard.server.stop().await.unwrap();
     let server = pair.taking_over.join_next().await.unwrap().unwrap();
     let server = server.unwrap();
+    // The standby closes its connections.
+    pair.client = client(Some(&again.secret));
     let found = answers_at(&pair.client, &standby, &pair.paths).await;
     assert_same(&found, &expected, "after it has taken over");
     server.app().write_sums().await.unwrap();

@@ -23,7 +23,7 @@ const UPLOAD_MAX: Duration = Duration::from_mins(2);
 /// Pause after an attempt to connect that failed.
 const RETRY: Duration = Duration::from_millis(200);
 
-/// Robots that upload until they are told to end.
+/// Robots that upload until they are asked to end.
 #[derive(Debug)]
 pub(crate) struct Uploads {
     tasks: JoinSet<anyhow::Result<Uploaded>>,
