@@ -234,9 +234,8 @@ fn check_endpoint(server: &str) -> Result<(), LinkError> {
 }
 
 impl FleetLink {
-    /// Makes one attempt to connect to a server, and declares all publishers, queriers and subscribers. If it
-    /// has others, zenoh does not repeat the attempt.
-    /// If the future is dropped, its thread ends soon.
+    /// Makes one attempt to connect to a server, and declares all publishers, queriers and subscribers. zenoh
+    /// does not repeat the attempt if the agent has other servers. If the future is dropped, its thread ends soon.
     ///
     /// # Errors
     /// [`LinkError`] for an invalid endpoint or certificate, or when zenoh refuses a declaration.
