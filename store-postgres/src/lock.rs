@@ -414,9 +414,9 @@ async fn locked_again(
     address: &str,
     epoch: Option<i64>,
 ) -> Result<PgConnection, LockError> {
+    let refused = |cause| LockError::Open(open::refused(address, cause));
+    let mut connection = connections::connect(options).await.map_err(refused)?;
     if let Some(own) = epoch {
-        let refused = |cause| LockError::Open(open::refused(address, cause));
-        let mut connection = connections::connect(options).await.map_err(refused)?;
         let newest = sqlx::query_scalar("SELECT epoch FROM server_epoch");
         let newest: i64 = newest.fetch_one(&mut connection).await.map_err(refused)?;
         if newest > own {
@@ -424,28 +424,22 @@ async fn locked_again(
             return Err(in_use(address, holder));
         }
     }
-    let in_use = match locked(options, address).await {
-        Err(in_use @ LockError::InUse { .. }) => in_use,
-        locked @ (Ok(_) | Err(LockError::Open(_))) => return locked,
-    };
-    let refused = |cause| LockError::Open(open::refused(address, cause));
-    let mut connection = connections::connect(options).await.map_err(refused)?;
+    if try_lock(&mut connection).await.map_err(refused)? {
+        return Ok(connection);
+    }
     let ending: Option<(bool,)> = sqlx::query_as(END_OWN)
         .fetch_optional(&mut connection)
         .await
         .map_err(refused)?;
-    if ending.is_none() {
-        return Err(in_use);
-    }
     let began = Instant::now();
-    loop {
-        match locked(options, address).await {
-            Err(LockError::InUse { .. }) if began.elapsed() < ANSWER_TIMEOUT => {
-                sleep(LOOK_INTERVAL).await;
-            }
-            locked => return locked,
+    while ending.is_some() && began.elapsed() < ANSWER_TIMEOUT {
+        if try_lock(&mut connection).await.map_err(refused)? {
+            return Ok(connection);
         }
+        sleep(LOOK_INTERVAL).await;
     }
+    let holder = holder(&mut connection).await.ok().flatten();
+    Err(in_use(address, holder))
 }
 
 /// Opens a connection that holds the lock.
