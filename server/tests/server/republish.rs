@@ -1,7 +1,6 @@
 //! States, friction and map changes at a zenoh router for subscribers.
 
 use std::net::{SocketAddr, TcpListener};
-use std::time::Duration;
 
 use tokio::sync::mpsc;
 use tread_api::friction::MapChange;
@@ -85,7 +84,6 @@ async fn subscribers_receive_what_robots_publish_also_after_their_router_was_awa
 
     session.close().wait().unwrap();
     first.close().wait().unwrap();
-    tokio::time::sleep(Duration::from_millis(200)).await;
     let second = router(address);
     let (session, mut hearing) = subscriber(address);
     next_of(&mut hearing, &state_key).await;
