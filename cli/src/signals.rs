@@ -6,7 +6,7 @@ use tread_api::startup::ignores_hangup;
 
 /// Listens to SIGINT, SIGTERM and SIGHUP from its creation on. One that comes while nobody waits is kept for
 /// the next wait; a new listener would miss it.
-pub(crate) struct EndSignals {
+pub(crate) struct ShutdownSignals {
     interrupt: Signal,
     terminate: Signal,
     hangup: Signal,
@@ -14,7 +14,7 @@ pub(crate) struct EndSignals {
     ignores_hangup: bool,
 }
 
-impl EndSignals {
+impl ShutdownSignals {
     /// # Errors
     /// The system refuses it.
     pub(crate) fn listen() -> anyhow::Result<Self> {
@@ -49,7 +49,7 @@ mod tests {
     /// One test, because signals reach every listener of the process.
     #[tokio::test]
     async fn a_signal_between_two_waits_ends_the_second() {
-        let mut signals = EndSignals::listen().unwrap();
+        let mut signals = ShutdownSignals::listen().unwrap();
         // As by `nohup`.
         let hangup = (!signals.ignores_hangup).then_some(Signal::SIGHUP);
         for sent in [Signal::SIGINT, Signal::SIGTERM].into_iter().chain(hangup) {

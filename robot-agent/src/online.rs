@@ -223,7 +223,7 @@ impl Online {
     }
 
     /// Makes one attempt to connect to the server whose turn it is. If that takes long, the others are tried
-    /// beside it, and whichever is reached first is the one.
+    /// in parallel with it, and whichever is reached first is the one.
     async fn connect(
         &self,
         servers: &mut Rotation,
@@ -236,28 +236,28 @@ impl Online {
             FleetLink::connect(server, has_others, membership, identity, listeners).await
         };
         let now = || self.dispatcher.clock.monotonic();
-        let (present, others) = servers.turn(now());
-        let beside = others.into_iter().map(async |mut beside| {
+        let (present, others) = servers.attempts(now());
+        let parallel = others.into_iter().map(async |mut parallel| {
             loop {
-                tokio::time::sleep(beside.pause).await;
+                tokio::time::sleep(parallel.pause).await;
                 let began = now();
-                let is_distrusted = match attempt(beside.server).await {
-                    Ok(Attempt::Reached(link)) => return (beside.at, link),
+                let is_distrusted = match attempt(parallel.server).await {
+                    Ok(Attempt::Reached(link)) => return (parallel.at, link),
                     Ok(Attempt::Failed { is_distrusted }) => is_distrusted,
                     // Its own turn shows it.
                     Err(_) => false,
                 };
-                beside.failed((began, now()), is_distrusted);
+                parallel.failed((began, now()), is_distrusted);
             }
         });
-        let mut beside: FuturesUnordered<_> = beside.collect();
+        let mut parallel: FuturesUnordered<_> = parallel.collect();
         let (at, link) = tokio::select! {
             biased;
             connected = attempt(present) => return connected,
-            Some(reached) = beside.next() => reached,
+            Some(reached) = parallel.next() => reached,
         };
-        drop(beside);
-        servers.go_to(at);
+        drop(parallel);
+        servers.select(at);
         Ok(Attempt::Reached(link))
     }
 

@@ -78,7 +78,7 @@ use self::http::tls::{Issuer, Tls};
 use self::identity::address::TrustedProxies;
 use self::identity::origin::Origin;
 pub use self::program::{command_line, run, run_from_args};
-use self::standby::Taken;
+use self::standby::AcquiredLock;
 use self::supervisor::Supervisor;
 use self::webhooks::{Resolver, Sender, SystemResolver};
 
@@ -153,12 +153,12 @@ impl Server {
 
     /// Starts a server on the database that is locked.
     async fn start_locked(
-        taken: Taken,
+        taken: AcquiredLock,
         config: Config,
         clock: Clock,
         resolver: Arc<dyn Resolver>,
     ) -> anyhow::Result<RunningServer> {
-        let Taken { lock, standby, .. } = &taken;
+        let AcquiredLock { lock, standby, .. } = &taken;
         let names = config.names();
         let proxies = TrustedProxies::new(config.web.trusted_proxies.clone());
         let schedule = backup_schedule(&config);

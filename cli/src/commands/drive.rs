@@ -27,7 +27,7 @@ use super::robots::{link_name, mode_name};
 use crate::args::DriveArguments;
 use crate::client::Client;
 use crate::output::{age, line, signed};
-use crate::signals::EndSignals;
+use crate::signals::ShutdownSignals;
 use crate::socket::{self, Socket};
 
 /// Period of drive commands.
@@ -156,7 +156,7 @@ pub(super) async fn run(arguments: &DriveArguments, client: &Client) -> anyhow::
     };
     send(&mut socket, &wanted).await?;
     line(HELP)?;
-    let mut signals = EndSignals::listen()?;
+    let mut signals = ShutdownSignals::listen()?;
     let terminal = RawTerminal::enter()?;
     let (keyboard, mut pressed) = Keyboard::read();
     let ended = Driving {
@@ -208,7 +208,7 @@ impl Driving<'_> {
         mut self,
         socket: &mut Socket,
         pressed: &mut mpsc::Receiver<KeyEvent>,
-        signals: &mut EndSignals,
+        signals: &mut ShutdownSignals,
     ) -> anyhow::Result<ExitCode> {
         let mut ticks = tokio::time::interval(SEND_PERIOD);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Skip);

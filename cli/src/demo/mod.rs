@@ -29,7 +29,7 @@ use crate::args::DemoArguments;
 use crate::client::{Client, ClientError, Reading, Trusted};
 use crate::credentials::{self, Store};
 use crate::output::{json_line, line, note};
-use crate::signals::EndSignals;
+use crate::signals::ShutdownSignals;
 
 /// Maximum time until the server is ready, and until all robots are online.
 const START_WAIT_MAX: Duration = Duration::from_secs(30);
@@ -55,7 +55,7 @@ pub(crate) async fn run(arguments: DemoArguments) -> anyhow::Result<ExitCode> {
     };
 
     // Before anything starts that it must stop.
-    let mut signals = EndSignals::listen()?;
+    let mut signals = ShutdownSignals::listen()?;
     tell("starting server, database and router …");
     let mut processes = Processes::start_server(folder.path(), arguments.port, &scenario.site)?;
     let token = credentials::read_token(&processes.token_file())?;
@@ -345,7 +345,7 @@ impl<'demo> Watch<'demo> {
     async fn watch_until_end(
         mut self,
         processes: &mut Processes,
-        signals: &mut EndSignals,
+        signals: &mut ShutdownSignals,
     ) -> anyhow::Result<Ended> {
         let is_cut_short = tokio::select! {
             done = self.until_done(processes) => {

@@ -5,7 +5,7 @@
 //! preferred server while the present one answers: robots would move twice for each restart.
 //!
 //! A server that is gone refuses at once, while one that is frozen or cut off takes seconds of each attempt.
-//! So the others are tried beside an attempt that takes longer, and whichever is reached first is the one, as
+//! So the others are tried in parallel with an attempt that takes longer, and whichever is reached first is the one, as
 //! for the addresses of a host (RFC 8305). One that fell silent, or took long to fail, is passed over for a
 //! while.
 
@@ -24,9 +24,9 @@ const LEFT_FOR: Duration = Duration::from_millis(300);
 const PASSED_OVER: Duration = Duration::from_secs(5);
 /// Duration of an attempt from which it counts as long.
 const LONG: Duration = Duration::from_secs(1);
-/// Duration of an attempt after which the next server is tried beside it, and the pause between two attempts
+/// Duration of an attempt after which the next server is tried in parallel (the connection attempt delay of RFC 8305), and the pause between two attempts
 /// to reach that one.
-const BESIDE_EVERY: Duration = Duration::from_millis(200);
+const ATTEMPT_DELAY: Duration = Duration::from_millis(200);
 
 /// What was logged about a server since it was reached last.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -57,9 +57,9 @@ impl Server {
     }
 }
 
-/// A server that is tried beside the one whose turn it is.
+/// A server that is tried in parallel with the one whose turn it is.
 #[derive(Debug)]
-pub struct Beside<'rotation> {
+pub struct ParallelAttempt<'rotation> {
     /// Its place in the list.
     pub at: usize,
     /// The server.
@@ -68,12 +68,12 @@ pub struct Beside<'rotation> {
     pub pause: Duration,
 }
 
-impl Beside<'_> {
+impl ParallelAttempt<'_> {
     /// Notes an attempt that failed at `now`.
     pub fn failed(&mut self, (began, now): (Duration, Duration), is_distrusted: bool) {
         self.server.failed((began, now), is_distrusted);
         let passed_over = self.server.passed_over_until.saturating_sub(now);
-        self.pause = passed_over.max(BESIDE_EVERY);
+        self.pause = passed_over.max(ATTEMPT_DELAY);
     }
 }
 
@@ -113,9 +113,9 @@ impl Rotation {
         server.map_or("", |server| &server.endpoint)
     }
 
-    /// Returns the server to connect to at `now`, and those to try beside it if that takes long, the next ones
+    /// Returns the server to connect to at `now`, and those to try in parallel if that takes long, the next ones
     /// first.
-    pub fn turn(&mut self, now: Duration) -> (&mut Server, Vec<Beside<'_>>) {
+    pub fn attempts(&mut self, now: Duration) -> (&mut Server, Vec<ParallelAttempt<'_>>) {
         let (before, rest) = self.servers.split_at_mut(self.at);
         let [present, after @ ..] = rest else {
             unreachable!("a rotation has a server, and is at one of them");
@@ -123,16 +123,16 @@ impl Rotation {
         let after = after.iter_mut().enumerate();
         let after = after.map(|(step, server)| (self.at + 1 + step, server));
         let others = after.chain(before.iter_mut().enumerate());
-        let beside = others.zip(1..).map(|((at, server), turn)| {
+        let parallel = others.zip(1..).map(|((at, server), turn)| {
             let passed_over = server.passed_over_until.saturating_sub(now);
-            let pause = passed_over.max(turn * BESIDE_EVERY);
-            Beside { at, server, pause }
+            let pause = passed_over.max(turn * ATTEMPT_DELAY);
+            ParallelAttempt { at, server, pause }
         });
-        (present, beside.collect())
+        (present, parallel.collect())
     }
 
-    /// Goes to a server that was reached beside the one whose turn it was.
-    pub fn go_to(&mut self, at: usize) {
+    /// Goes to a server that was reached in parallel with the one whose turn it was.
+    pub fn select(&mut self, at: usize) {
         self.at = at;
     }
 
@@ -251,32 +251,32 @@ mod tests {
         assert_eq!(tried, "0000");
     }
 
-    /// Servers to try beside the one whose turn it is, and the pauses before, milliseconds.
-    fn beside(rotation: &mut Rotation, now: Duration) -> Vec<(usize, u128)> {
-        let (_, others) = rotation.turn(now);
-        let of = |beside: &Beside<'_>| (beside.at, beside.pause.as_millis());
+    /// Servers to try in parallel with the one whose turn it is, and the pauses before, milliseconds.
+    fn parallel(rotation: &mut Rotation, now: Duration) -> Vec<(usize, u128)> {
+        let (_, others) = rotation.attempts(now);
+        let of = |attempt: &ParallelAttempt<'_>| (attempt.at, attempt.pause.as_millis());
         others.iter().map(of).collect()
     }
 
     #[test]
-    fn the_others_are_tried_beside_an_attempt_that_takes_long() {
+    fn the_others_are_tried_in_parallel_with_an_attempt_that_takes_long() {
         let (mut rotation, now) = (servers(3), Duration::ZERO);
-        assert_eq!(beside(&mut rotation, now), [(1, 200), (2, 400)]);
+        assert_eq!(parallel(&mut rotation, now), [(1, 200), (2, 400)]);
         rotation.leave(now);
         assert_eq!(rotation.endpoint(), "tls/s1:7447");
-        assert_eq!(beside(&mut rotation, now), [(2, 200), (0, 400)]);
-        let (_, mut others) = rotation.turn(now);
+        assert_eq!(parallel(&mut rotation, now), [(2, 200), (0, 400)]);
+        let (_, mut others) = rotation.attempts(now);
         others[0].failed((now, now), true);
         others[1].failed((now, now + LONG), false);
-        let pauses = others.iter().map(|beside| beside.pause);
+        let pauses = others.iter().map(|attempt| attempt.pause);
         let pauses: Vec<_> = pauses.collect();
         assert_eq!(pauses, [DISTRUSTED_PAUSE_MAX, PASSED_OVER]);
-        assert_eq!(beside(&mut rotation, now), [(2, 10_000), (0, 6_000)]);
-        rotation.go_to(2);
+        assert_eq!(parallel(&mut rotation, now), [(2, 10_000), (0, 6_000)]);
+        rotation.select(2);
         rotation.reached();
         assert_eq!(rotation.endpoint(), "tls/s2:7447");
-        assert_eq!(beside(&mut rotation, now + LONG), [(0, 5_000), (1, 400)]);
-        assert!(beside(&mut servers(1), now).is_empty());
+        assert_eq!(parallel(&mut rotation, now + LONG), [(0, 5_000), (1, 400)]);
+        assert!(parallel(&mut servers(1), now).is_empty());
     }
 
     #[test]

@@ -29,7 +29,7 @@ const FEED_EVERY: Duration = Duration::from_secs(5);
 
 /// The lock of the database, and what a standby has that took it.
 #[derive(Debug)]
-pub(crate) struct Taken {
+pub(crate) struct AcquiredLock {
     /// The lock.
     pub(crate) lock: DatabaseLock,
     /// What has the map, if this process was a standby that had read it.
@@ -47,13 +47,13 @@ pub(crate) async fn take_lock(
     asked: impl Future<Output = ()>,
     config: &Config,
     clock: &Clock,
-) -> Result<Option<Taken>, LockError> {
+) -> Result<Option<AcquiredLock>, LockError> {
     if !config.standby {
         let lock = tokio::select! {
             lock = DatabaseLock::take(&config.database) => lock?,
             () = asked => return Ok(None),
         };
-        return Ok(Some(Taken {
+        return Ok(Some(AcquiredLock {
             lock,
             standby: None,
             _feeding: JoinSet::new(),
@@ -86,7 +86,7 @@ pub(crate) async fn take_lock(
         Some(serving) => serving.end().await,
         None => None,
     };
-    Ok(Some(Taken {
+    Ok(Some(AcquiredLock {
         lock,
         standby: served,
         _feeding: feeding,

@@ -27,7 +27,7 @@ use crate::supervisor::{Stopped, Supervisor};
 use crate::{listen_for_http, listen_for_metrics, open_tls};
 
 /// Interval at which a standby that reads the map looks which server has the database.
-const LOOK_FOR_LEADER_EVERY: Duration = Duration::from_millis(500);
+const LEADER_REFRESH_INTERVAL: Duration = Duration::from_millis(500);
 /// Delay after a failure.
 const RETRY: Duration = Duration::from_secs(2);
 
@@ -38,12 +38,12 @@ pub(crate) struct StandbyServing {
     stop: CancellationToken,
     /// Cancelled when answers of the other server are not awaited any more.
     given_up: CancellationToken,
-    shown: Arc<Mutex<Shown>>,
+    shown: Arc<Mutex<ServingState>>,
 }
 
 /// What others see of it while it answers requests.
 #[derive(Debug, Default)]
-struct Shown {
+struct ServingState {
     /// The use cases, once they have the map.
     with_map: Option<App>,
     /// Of the connections that were accepted.
@@ -92,7 +92,7 @@ impl StandbyServing {
     }
 }
 
-fn lock(shown: &Mutex<Shown>) -> MutexGuard<'_, Shown> {
+fn lock(shown: &Mutex<ServingState>) -> MutexGuard<'_, ServingState> {
     shown.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -101,7 +101,7 @@ async fn serve(
     config: Config,
     clock: Clock,
     (stop, given_up): (CancellationToken, CancellationToken),
-    shown: Arc<Mutex<Shown>>,
+    shown: Arc<Mutex<ServingState>>,
 ) {
     let mut logged = String::new();
     loop {
@@ -144,7 +144,7 @@ async fn serve_once(
     config: &Config,
     clock: &Clock,
     (stop, given_up): (&CancellationToken, &CancellationToken),
-    shown: &Mutex<Shown>,
+    shown: &Mutex<ServingState>,
 ) -> anyhow::Result<()> {
     let supervisor = Supervisor::new();
     lock(shown).supervisor = Some(supervisor.clone());
@@ -162,7 +162,7 @@ async fn serve_with(
     config: &Config,
     clock: &Clock,
     (supervisor, given_up): (&Supervisor, &CancellationToken),
-    shown: &Mutex<Shown>,
+    shown: &Mutex<ServingState>,
 ) -> anyhow::Result<()> {
     let db = Db::open_to_read(&config.database).await?;
     let db = db.context("a file has one server")?;
@@ -236,10 +236,14 @@ async fn serve_with(
 ///
 /// # Errors
 /// The map cannot be read.
-async fn follow(app: &App, supervisor: &Supervisor, shown: &Mutex<Shown>) -> anyhow::Result<()> {
+async fn follow(
+    app: &App,
+    supervisor: &Supervisor,
+    shown: &Mutex<ServingState>,
+) -> anyhow::Result<()> {
     tokio::select! {
         loaded = app.load_map() => loaded?,
-        () = look_for_leader(app) => {}
+        () = refresh_leader(app) => {}
     }
     lock(shown).with_map = Some(app.clone());
     if let Err(error) = app.know_tokens().await {
@@ -255,9 +259,9 @@ async fn follow(app: &App, supervisor: &Supervisor, shown: &Mutex<Shown>) -> any
 }
 
 /// Reads again and again which server has the database, while the map is read. Returns never.
-async fn look_for_leader(app: &App) {
+async fn refresh_leader(app: &App) {
     loop {
-        tokio::time::sleep(LOOK_FOR_LEADER_EVERY).await;
+        tokio::time::sleep(LEADER_REFRESH_INTERVAL).await;
         if let Err(cause) = db::limited(app.know_leader()).await {
             app.log_failure("read which server has the database", &cause);
         }

@@ -23,7 +23,7 @@ use self::screen::Screen;
 use crate::args::WatchArguments;
 use crate::client::Client;
 use crate::output::{Output, json_line, line, note};
-use crate::signals::EndSignals;
+use crate::signals::ShutdownSignals;
 
 pub(super) async fn run(
     arguments: &WatchArguments,
@@ -34,7 +34,7 @@ pub(super) async fn run(
     let feed = Feed::new(client, site, arguments.robot.as_ref());
     let (to, news) = mpsc::channel(NEWS_MAX);
     let in_terminal = io::stdout().is_terminal() && io::stdin().is_terminal();
-    let mut signals = EndSignals::listen()?;
+    let mut signals = ShutdownSignals::listen()?;
     let shown = async {
         if output.is_json() || arguments.lines || !in_terminal {
             print(news, output).await
