@@ -15,7 +15,6 @@ use jiff::SignedDuration;
 use tokio::sync::watch;
 use tracing::{error, info};
 use tread_api::ids::BootId;
-use tread_api::wire::ingest::{MissionPhase, MissionReport, RecordContent};
 use tread_api::wire::state::{FrictionReport, RobotState};
 use tread_control::robot::RobotModel;
 use tread_telemetry::Telemetry;
@@ -100,7 +99,8 @@ impl Agent {
         let stops = LatchFile::new(&config.data_dir).load(&clock);
         let outbox_folder = config.data_dir.join("outbox");
         let outbox = Outbox::open(&outbox_folder, config.outbox, config.robot.clone(), boot)?;
-        let missions = recall_missions(&config, &outbox, &clock)?;
+        let memory = Memory::new(&config.data_dir);
+        let missions = Missions::recall(memory, &outbox, clock.wall())?;
         let identity = identity_of(&config, boot);
         let (loop_ends, ends) = loop_channels();
         let AgentEnds {
@@ -256,44 +256,6 @@ fn renew_membership(
     };
     supervisor.spawn("renewal", renewal.run(supervisor.stop_token()));
     (heard, Some(membership))
-}
-
-/// Reads the mission memory; a mission that was active when the agent died is reported as failed.
-fn recall_missions(
-    config: &AgentConfig,
-    outbox: &Outbox,
-    clock: &SharedClock,
-) -> Result<Arc<Missions>, StartError> {
-    let memory = Memory::new(&config.data_dir);
-    let mut slot = memory.load()?;
-    let interrupted = slot.active().cloned();
-    if let Some(active) = &interrupted {
-        let phase = slot.begin_end(active.mission, MissionPhase::Failed);
-        let reason = if phase == MissionPhase::Cancelled {
-            "cancelled on request; the agent restarted meanwhile"
-        } else {
-            "the agent restarted during the mission"
-        };
-        let report = MissionReport {
-            mission: active.mission,
-            revision: active.revision,
-            plan_hash: active.plan_hash,
-            at: clock.wall(),
-            phase,
-            since: None,
-            reason: Some(reason.to_owned()),
-            progress: None,
-            quality: None,
-            driven: None,
-        };
-        outbox.append(&RecordContent::Mission(report))?;
-        slot.end(active.mission, phase);
-    }
-    let missions = Missions::new(slot, memory);
-    if interrupted.is_some() {
-        missions.save();
-    }
-    Ok(missions)
 }
 
 impl RunningAgent {

@@ -2,12 +2,16 @@
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
+use jiff::Timestamp;
 use tracing::error;
 use tread_api::wire::hello::SiteDefinition;
+use tread_api::wire::ingest::{MissionPhase, MissionReport, RecordContent};
 
 use crate::control_loop::site_view::SiteView;
-use crate::missions::MissionSlot;
 use crate::missions::memory::Memory;
+use crate::missions::{ActiveMission, MissionSlot};
+use crate::outbox::Outbox;
+use crate::start_error::StartError;
 
 /// The robot's missions, shared by dispatcher and recorder.
 #[derive(Debug)]
@@ -22,6 +26,41 @@ impl Missions {
             slot: Mutex::new(slot),
             memory,
         })
+    }
+
+    /// Reads the memory after a start. An end that may not be in the outbox is reported again; a
+    /// mission that was active when the agent died is reported as failed.
+    ///
+    /// # Errors
+    /// [`StartError`] if the memory cannot be read or the outbox does not take the report.
+    pub(crate) fn recall(
+        memory: Memory,
+        outbox: &Outbox,
+        now: Timestamp,
+    ) -> Result<Arc<Self>, StartError> {
+        let mut slot = memory.load()?;
+        let kept = slot.unrecorded_end().cloned();
+        let mut reports: Vec<MissionReport> = kept.into_iter().collect();
+        if let Some(active) = slot.active() {
+            let is_over = reports.iter().any(|kept| kept.mission == active.mission);
+            if !is_over {
+                reports.push(interrupted(active, now));
+            }
+        }
+        for report in &reports {
+            outbox.append(&RecordContent::Mission(report.clone()))?;
+            slot.end(report.mission, report.phase);
+        }
+        let is_changed = !reports.is_empty();
+        if is_changed {
+            outbox.sync()?;
+            slot.end_is_recorded();
+        }
+        let missions = Self::new(slot, memory);
+        if is_changed {
+            missions.save();
+        }
+        Ok(missions)
     }
 
     pub(crate) fn slot(&self) -> MutexGuard<'_, MissionSlot> {
@@ -41,6 +80,33 @@ impl Missions {
     }
 }
 
+/// Report on a mission that was active when the agent died.
+fn interrupted(active: &ActiveMission, now: Timestamp) -> MissionReport {
+    let (phase, reason) = if active.is_cancelled {
+        (
+            MissionPhase::Cancelled,
+            "cancelled on request; the agent restarted meanwhile",
+        )
+    } else {
+        (
+            MissionPhase::Failed,
+            "the agent restarted during the mission",
+        )
+    };
+    MissionReport {
+        mission: active.mission,
+        revision: active.revision,
+        plan_hash: active.plan_hash,
+        at: now,
+        phase,
+        since: None,
+        reason: Some(reason.to_owned()),
+        progress: None,
+        quality: None,
+        driven: None,
+    }
+}
+
 /// The active site definition, for the parts outside the loop.
 #[derive(Debug, Default)]
 pub(crate) struct SiteCell {
@@ -55,5 +121,101 @@ impl SiteCell {
     /// Returns the view that was given to the loop last.
     pub(crate) fn view(&self) -> Option<Arc<SiteView>> {
         self.lock().as_ref().map(|(_, view)| Arc::clone(view))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tread_api::ids::{BootId, MissionId, PlanHash};
+    use tread_api::mission::PlanSummary;
+    use uuid::Uuid;
+
+    use super::*;
+    use crate::outbox::Limits;
+
+    const NOW: Timestamp = Timestamp::UNIX_EPOCH;
+
+    fn active() -> ActiveMission {
+        ActiveMission {
+            mission: MissionId::from_uuid(Uuid::from_u128(7)),
+            revision: 1,
+            plan_hash: PlanHash::from_uuid(Uuid::from_u128(8)),
+            plan: PlanSummary {
+                length_m: 1.0,
+                duration_s: 2.0,
+                speed_peak_m_s: 0.5,
+                begin: None,
+            },
+            is_cancelled: false,
+        }
+    }
+
+    fn succeeded() -> MissionReport {
+        MissionReport {
+            phase: MissionPhase::Succeeded,
+            reason: None,
+            ..interrupted(&active(), NOW)
+        }
+    }
+
+    fn outbox(folder: &std::path::Path) -> Outbox {
+        let robot = "rover-1".parse().unwrap();
+        let boot = BootId::from_uuid(Uuid::from_u128(1));
+        Outbox::open(&folder.join("outbox"), Limits::default(), robot, boot).unwrap()
+    }
+
+    fn reports(outbox: &Outbox) -> Vec<MissionReport> {
+        let pending = outbox.pending(100).unwrap();
+        let records = pending.map(|pending| pending.batch.records);
+        let of = |record: tread_api::wire::ingest::Record| match record.content {
+            RecordContent::Mission(report) => report,
+            RecordContent::Segment(segment) => panic!("a segment: {segment:?}"),
+        };
+        records.unwrap_or_default().into_iter().map(of).collect()
+    }
+
+    /// Starts twice from a memory and returns what the outbox has then.
+    fn started_twice(slot: &MissionSlot, in_outbox: &[MissionReport]) -> Vec<MissionReport> {
+        let folder = tempfile::tempdir().unwrap();
+        let memory = Memory::new(folder.path());
+        memory.save(slot).unwrap();
+        let outbox = outbox(folder.path());
+        for report in in_outbox {
+            let content = RecordContent::Mission(report.clone());
+            outbox.append(&content).unwrap();
+        }
+        for _ in 0..2 {
+            let missions = Missions::recall(memory.clone(), &outbox, NOW).unwrap();
+            let slot = missions.slot().clone();
+            assert_eq!(slot.active(), None);
+            assert_eq!(slot.unrecorded_end(), None);
+            assert_eq!(slot.ended().count(), 1);
+            assert_eq!(memory.load().unwrap(), slot);
+        }
+        reports(&outbox)
+    }
+
+    #[test]
+    fn a_mission_that_was_active_when_the_agent_died_has_failed() {
+        let mut slot = MissionSlot::default();
+        assert!(slot.take(active()));
+        assert_eq!(started_twice(&slot, &[]), [interrupted(&active(), NOW)]);
+    }
+
+    #[test]
+    fn an_agent_that_died_while_it_recorded_an_end_reports_that_end_alone() {
+        let mut slot = MissionSlot::default();
+        assert!(slot.take(active()));
+        slot.begin_end(active().mission, MissionPhase::Succeeded);
+        slot.keep_end(succeeded());
+        // Before the outbox had it, and after.
+        assert_eq!(started_twice(&slot, &[]), [succeeded()]);
+        assert_eq!(
+            started_twice(&slot, &[succeeded()]),
+            [succeeded(), succeeded()]
+        );
+        // The memory was saved for another reason meanwhile.
+        slot.end(active().mission, MissionPhase::Succeeded);
+        assert_eq!(started_twice(&slot, &[]), [succeeded()]);
     }
 }

@@ -109,12 +109,7 @@ impl Recorder {
                 report.reason = reason.text().map(str::to_owned);
                 report.quality = Some(job.driven.quality());
                 report.driven = Some(job.driven.path());
-                // The record before the memory: a crash between them repeats the report, and loses
-                // none.
-                unsaved.push_back(RecordContent::Mission(report));
-                self.save(unsaved);
-                self.missions.slot().end(mission, phase);
-                self.missions.save();
+                self.record_end(report, unsaved);
             }
             LoopEvent::Segment(closed) => {
                 let segment = segment_of(&closed, self.configuration);
@@ -125,6 +120,16 @@ impl Recorder {
             }
             LoopEvent::Retired(site) => drop(site),
         }
+    }
+
+    /// Records the end of a mission. The memory has the report before the outbox: an agent that is
+    /// killed in between reports this end when it starts, instead of an interruption.
+    fn record_end(&self, report: MissionReport, unsaved: &mut VecDeque<RecordContent>) {
+        self.missions.slot().keep_end(report.clone());
+        self.missions.save();
+        self.missions.slot().end(report.mission, report.phase);
+        unsaved.push_back(RecordContent::Mission(report));
+        self.save(unsaved);
     }
 
     /// Sends the span of a mission from its start to its end.
@@ -170,6 +175,24 @@ impl Recorder {
                 return;
             }
             unsaved.pop_front();
+        }
+        self.settle_end();
+    }
+
+    /// Drops the report of the last end from the memory once the outbox has it on disk.
+    fn settle_end(&self) {
+        if self.missions.slot().unrecorded_end().is_none() {
+            return;
+        }
+        match self.outbox.sync() {
+            Ok(()) => {
+                self.missions.slot().end_is_recorded();
+                self.missions.save();
+            }
+            Err(cause) => error!(
+                error = &cause as &dyn std::error::Error,
+                "the end of a mission is not on disk"
+            ),
         }
     }
 }
