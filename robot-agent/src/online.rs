@@ -174,6 +174,8 @@ impl Online {
                 return self.rest(&mut links.membership, pause).await;
             }
         };
+        let server = links.servers.endpoint();
+        info!(server, "connected to `{server}`");
         links.servers.reached();
         links.is_lost.store(false, Ordering::Relaxed);
         let (welcomed, is_welcome) = watch::channel(false);

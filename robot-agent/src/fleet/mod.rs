@@ -19,7 +19,7 @@ use std::time::Duration;
 use serde::Serialize;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::{CancellationToken, DropGuard};
-use tracing::{debug, info, warn};
+use tracing::{debug, warn};
 use tread_api::enrolment::TrustId;
 use tread_api::ids::{BootId, OwnerId, RobotId, SiteId};
 use tread_api::keys::{self, Key, Verb};
@@ -284,7 +284,6 @@ impl FleetLink {
                 is_distrusted: false,
             });
         };
-        info!(server = endpoint, "connected to `{endpoint}`");
         let declaring = tokio::task::spawn_blocking(move || {
             Self::declare(session, identity, &listeners, tunnel)
         });

@@ -92,3 +92,22 @@ async fn a_server_that_is_gone_is_left_at_once_and_one_that_never_was_is_passed_
     agent.stop().await;
     first.stop().await;
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn another_server_is_tried_beside_one_that_accepts_connections_and_says_nothing() {
+    let two = Two::new();
+    let config = two.config();
+    let address = two.rig.endpoint();
+    let address = address.strip_prefix("tcp/").unwrap();
+    // The kernel accepts for it, as for a server whose process is stopped. zenoh waits 2.5 s for it.
+    let frozen = std::net::TcpListener::bind(address).unwrap();
+    let second = two.serve_second();
+    let _pulse = second.pulse();
+    let begun = Instant::now();
+    let agent = Agent::start(config).unwrap();
+    Two::hellos(&two.memory, 1).await;
+    assert!(begun.elapsed() < MOVE_MAX, "{:?}", begun.elapsed());
+    agent.stop().await;
+    second.stop().await;
+    drop(frozen);
+}
