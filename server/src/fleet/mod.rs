@@ -238,7 +238,7 @@ impl Fleet {
             ),
             turn: Mutex::new(()),
         });
-        pool.open(app.enrolment_registry().robots()).await?;
+        pool.open_for_all().await?;
         let stop = || self.supervisor.stop_token();
         let pulse = pulse::run(app.clone(), Arc::clone(&self.routers), stop());
         self.supervisor.spawn_vital("pulse", pulse);

@@ -14,6 +14,7 @@ use zenoh::Wait as _;
 
 use super::client::client_config;
 use super::probe::PROBE_KEY;
+use super::router_groups::{to_open, to_reopen};
 use super::router_pool::{RouterPool, robots_on};
 use super::routers::Router;
 use crate::app::presence::RobotKey;
@@ -94,18 +95,17 @@ async fn answers(watch: &Watch, router: &Arc<Router>) -> bool {
 async fn reopen(pool: &RouterPool, former: Option<&Arc<Router>>) {
     let _turn = pool.turn.lock().await;
     let current = pool.current();
-    let mut robots = pool.app.enrolment_registry().robots();
+    let mut robots = to_open(&[], &pool.app.enrolment_registry().robots()).unwrap_or_default();
     if let Some(former) = former {
         // It was superseded since it was probed.
         if current.iter().all(|router| router.number != former.number) {
             return;
         }
-        // With the newer ones, so that the sizes of routers stay in their order.
-        let of_them = current
+        let newer = current
             .iter()
-            .filter(|router| router.number >= former.number);
-        let known: HashSet<&RobotKey> = of_them.flat_map(|router| &router.robots).collect();
-        robots = known.into_iter().cloned().collect();
+            .filter(|router| router.number > former.number);
+        let newer: Vec<&HashSet<RobotKey>> = newer.map(|router| &router.robots).collect();
+        robots = to_reopen(&former.robots, &newer);
         let robot_count = robots_on(former).await;
         let is_behind_gate = former.credentials.is_some();
         if robot_count == 0 {
@@ -115,7 +115,7 @@ async fn reopen(pool: &RouterPool, former: Option<&Arc<Router>>) {
             return;
         }
     }
-    match pool.open(robots).await {
+    match pool.open(robots.into_iter().collect()).await {
         Ok(()) => {
             pool.app.counters().router_reopened.one();
             warn!("the zenoh router was opened again");

@@ -13,13 +13,22 @@
 //!  1000 2 1                            ─►  1000 4      those with 2 and 1 are superseded
 //! ```
 //!
-//! Each router thus has at least twice as many robots as the next newer one, so `n` robots have at most
-//! `log2(n) + 1` routers. A router that supersedes another has more than 1.5 times its robots, so a robot
-//! moves at most `log1.5(n)` times however many join.
+//! A router has at most [`ROBOTS_MAX`] robots: zenoh copies the configuration of a router, with all of
+//! its rules, for each session that it accepts. Two that are neighbours in age are left apart if
+//! together they have more.
+//!
+//! So of two neighbours the older one has at least twice as many robots as the newer one, or together
+//! they have more than [`ROBOTS_MAX`]: `n` robots have at most `2 n / ROBOTS_MAX + log2(ROBOTS_MAX) + 1`
+//! routers. A router that supersedes another has more than 1.5 times its robots, so a robot moves at most
+//! `log1.5(ROBOTS_MAX)` times however many join.
 
 use std::collections::{BTreeSet, HashSet};
 
 use crate::app::presence::RobotKey;
+
+/// Maximum number of robots of a router. Copying the rules of one robot takes about 6 µs, so a session
+/// of a full router takes 1.5 ms.
+pub(super) const ROBOTS_MAX: usize = 256;
 
 /// What counts of an open router.
 #[derive(Debug, Clone, Copy)]
@@ -30,27 +39,41 @@ pub(super) struct Group<'router> {
     pub(super) is_of_signing: bool,
 }
 
-/// Returns the robots of the router that is to be opened for robots of the fleet that no router
-/// includes; `None` if there is none and a router of the signing authority is open. `open` are the
-/// routers, oldest first.
+/// Returns the robots, at most [`ROBOTS_MAX`], of the next router that is to be opened for robots of the
+/// fleet that no router includes; `None` if there is none and a router of the signing authority is open.
+/// `open` are the routers, oldest first.
 pub(super) fn to_open(open: &[Group<'_>], fleet: &[RobotKey]) -> Option<BTreeSet<RobotKey>> {
     let current: Vec<&Group<'_>> = open.iter().filter(|group| group.is_of_signing).collect();
     let is_known = |robot: &RobotKey| current.iter().any(|group| group.robots.contains(robot));
-    let mut robots: BTreeSet<RobotKey> = fleet
-        .iter()
-        .filter(|robot| !is_known(robot))
-        .cloned()
-        .collect();
+    let unknown = fleet.iter().filter(|robot| !is_known(robot));
+    let mut robots: BTreeSet<RobotKey> = unknown.take(ROBOTS_MAX).cloned().collect();
     if robots.is_empty() && !current.is_empty() {
         return None;
     }
     for group in current.iter().rev() {
-        if group.robots.len() >= 2 * robots.len().max(1) {
+        let is_large = group.robots.len() >= 2 * robots.len().max(1);
+        if is_large || group.robots.len() + robots.len() > ROBOTS_MAX {
             break;
         }
         robots.extend(group.robots.iter().cloned());
     }
     Some(robots)
+}
+
+/// Returns the robots of the router that replaces `former`: its own, and those of newer routers as far as
+/// they fit, newest first, so that the sizes stay in their order. `newer` are oldest first.
+pub(super) fn to_reopen(
+    former: &HashSet<RobotKey>,
+    newer: &[&HashSet<RobotKey>],
+) -> BTreeSet<RobotKey> {
+    let mut robots: BTreeSet<RobotKey> = former.iter().cloned().collect();
+    for group in newer.iter().rev() {
+        if group.len() + robots.len() > ROBOTS_MAX {
+            break;
+        }
+        robots.extend(group.iter().cloned());
+    }
+    robots
 }
 
 /// Returns for each router whether it is superseded: newer routers of the signing authority include
@@ -99,22 +122,27 @@ mod tests {
         of.collect()
     }
 
-    /// Opens a router if one is needed, and closes those that are superseded. Returns its robots.
-    fn change(open: &mut Vec<Open>, fleet: &[RobotKey], signing: u32) -> BTreeSet<RobotKey> {
-        let opened = to_open(&groups(open, signing), fleet);
-        if let Some(robots) = &opened {
+    /// Opens routers while they are needed, and closes those that are superseded. Returns the robots of
+    /// the new ones.
+    fn change(open: &mut Vec<Open>, fleet: &[RobotKey], signing: u32) -> Vec<RobotKey> {
+        let mut moved = Vec::new();
+        while let Some(robots) = to_open(&groups(open, signing), fleet) {
             open.push((robots.iter().cloned().collect(), signing));
+            moved.extend(robots);
+            let mut superseded = superseded(&groups(open, signing)).into_iter();
+            open.retain(|_router| !superseded.next().unwrap());
         }
-        let mut superseded = superseded(&groups(open, signing)).into_iter();
-        open.retain(|_router| !superseded.next().unwrap());
-        opened.unwrap_or_default()
+        moved
     }
 
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(32))]
         #[test]
-        fn every_robot_has_a_router_and_routers_and_moves_grow_with_the_logarithm(
-            batches in prop::collection::vec((1_usize..40, prop::bool::weighted(0.05)), 1..60),
+        fn every_robot_has_one_router_and_routers_and_moves_are_bounded(
+            batches in prop::collection::vec(
+                (prop_oneof![9 => 1_usize..40, 1 => 200..700_usize], prop::bool::weighted(0.05)),
+                1..60,
+            ),
         ) {
             let (mut open, mut fleet, mut signing) = (Vec::new(), Vec::new(), 0);
             let mut moves = std::collections::BTreeMap::new();
@@ -134,10 +162,14 @@ mod tests {
                     prop_assert_eq!(open.iter().filter(|open| is_in(open)).count(), 1);
                 }
                 let sizes: Vec<usize> = open.iter().map(|(robots, _)| robots.len()).collect();
-                prop_assert!(sizes.windows(2).all(|two| two[0] >= 2 * two[1]), "{:?}", sizes);
-                prop_assert!(open.len() <= 1 + fleet.len().ilog2() as usize, "{:?}", sizes);
-                let count = f64::from(u32::try_from(fleet.len()).unwrap());
-                let most = count.log(1.5) + 1.0;
+                let in_order = |two: &[usize]| {
+                    two[0] >= 2 * two[1] || two[0] + two[1] > ROBOTS_MAX
+                };
+                prop_assert!(sizes.windows(2).all(in_order), "{:?}", sizes);
+                prop_assert!(sizes.iter().all(|&size| size <= ROBOTS_MAX), "{:?}", sizes);
+                let most = 2 * fleet.len() / ROBOTS_MAX + ROBOTS_MAX.ilog2() as usize + 1;
+                prop_assert!(open.len() <= most, "{:?}", sizes);
+                let most = f64::from(u32::try_from(ROBOTS_MAX).unwrap()).log(1.5) + 1.0;
                 prop_assert!(moves.values().all(|&moves| f64::from(moves) <= most));
                 prop_assert_eq!(to_open(&groups(&open, signing), &fleet), None);
             }
@@ -157,5 +189,15 @@ mod tests {
         assert_eq!(opened.len(), 3);
         open.push((opened.into_iter().collect(), 1));
         assert_eq!(superseded(&groups(&open, 1)), [true, false]);
+    }
+
+    #[test]
+    fn a_router_that_replaces_another_one_takes_over_newer_ones_as_far_as_they_fit() {
+        let of = |numbers: std::ops::Range<usize>| numbers.map(robot).collect::<HashSet<_>>();
+        let (former, large, small) = (of(0..100), of(100..250), of(250..300));
+        let robots = to_reopen(&former, &[&large, &small]);
+        assert_eq!(robots.len(), 150);
+        assert!(small.iter().all(|robot| robots.contains(robot)));
+        assert_eq!(to_reopen(&former, &[&large]).len(), 250);
     }
 }

@@ -2,7 +2,7 @@
 //!
 //! ```text
 //!  robots join, or another authority signs
-//!                ─► a new router beside the others (`router_groups`) ─► robots come to it as they
+//!                ─► new routers beside the others (`router_groups`) ─► robots come to it as they
 //!                                           reconnect (each at the latest when it renews)
 //!  an authority is retired ─► routers whose passwords derive from its key are closed
 //!  a superseded router without robots ─► closed
@@ -25,7 +25,8 @@ use crate::app::App;
 use crate::app::presence::RobotKey;
 use crate::authority::Trusted;
 
-/// Maximum number of superseded routers that still have robots.
+/// Maximum number of superseded routers that still have robots, beyond the number of the others: the
+/// authority that signs may change while all of them have robots.
 const SUPERSEDED_MAX: usize = 8;
 /// Minimum interval between two openings: robots that join at about the same time share a router.
 const OPEN_EVERY: Duration = Duration::from_millis(500);
@@ -58,6 +59,25 @@ impl RouterPool {
         Ok(())
     }
 
+    /// Opens routers for all robots of the fleet.
+    ///
+    /// # Errors
+    /// [`super::FleetError`].
+    pub(super) async fn open_for_all(&self) -> Result<(), super::FleetError> {
+        let fleet = self.app.enrolment_registry().robots();
+        if self.opener.authorities.is_none() {
+            // Without a gate there is one address, and so one router.
+            return self.open(fleet).await;
+        }
+        loop {
+            let all = self.routers.all();
+            match to_open(&self.groups(&all), &fleet) {
+                Some(robots) => self.open(robots.into_iter().collect()).await?,
+                None => return Ok(()),
+            }
+        }
+    }
+
     /// Closes a router; its robots reconnect to another.
     pub(super) async fn close(&self, number: u64) {
         if let Some(router) = self.routers.remove(number) {
@@ -87,6 +107,8 @@ impl RouterPool {
                     () = stop.cancelled() => return,
                     () = tokio::time::sleep(OPEN_EVERY) => {}
                 }
+                // One has room for some of the robots alone.
+                continue;
             }
             tokio::select! {
                 biased;
@@ -151,10 +173,11 @@ impl RouterPool {
                 counted.push((counts, robots_on(router).await, router.number));
             }
         }
+        let most = SUPERSEDED_MAX + all.len() - counted.len();
         let mut left = counted.len();
         counted.sort_unstable();
         for (counts, robot_count, number) in counted {
-            if counts && robot_count > 0 && left <= SUPERSEDED_MAX {
+            if counts && robot_count > 0 && left <= most {
                 break;
             }
             self.close(number).await;
