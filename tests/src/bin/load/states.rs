@@ -8,6 +8,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use anyhow::Context as _;
+use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use serde::Serialize;
 use tempfile::TempDir;
 use tokio::task::JoinSet;
@@ -28,6 +29,11 @@ use crate::{Arguments, batches, light_id, period_of, start_fleet, start_light_ro
 const FLEETS: [(u32, f64); 2] = [(1_000, 10.0), (5_000, 2.0)];
 /// Robots of the largest fleet that gets certificates without `--tls`: 5 000 robots take minutes to join.
 const CERTIFICATES_MAX: u32 = 1_000;
+/// Files that this program opens for each robot with a certificate: three connections and the port of its
+/// tunnel.
+const FILES_OF_ROBOT: u64 = 4;
+/// Files that it opens besides.
+const FILES_BESIDES: u64 = 300;
 /// Processor time for each state over that of the bare router, at the most, microseconds.
 const OVER_ROUTER_MAX_US: f64 = 25.0;
 /// Memory over that of the bare router, at the most, MB.
@@ -65,7 +71,16 @@ pub(crate) struct OfFleet {
     server: Used,
     /// The same with certificates.
     #[serde(skip_serializing_if = "Option::is_none")]
-    tls: Option<Used>,
+    tls: Option<WithCertificates>,
+}
+
+/// What was measured of a fleet with certificates.
+#[derive(Debug, Serialize)]
+struct WithCertificates {
+    /// Robots, fewer than those without certificates if the limit of open files allows no more.
+    robots: u32,
+    #[serde(flatten)]
+    used: Used,
 }
 
 /// What was measured.
@@ -101,12 +116,16 @@ pub(crate) async fn measure(arguments: &Arguments, node: &Path) -> anyhow::Resul
         drop((publishing, fleet));
         let mut tls = None;
         if arguments.tls || robots <= CERTIFICATES_MAX {
+            let robots = robots.min(certificates_max()?);
             let fleet = start_fleet(node, true).await;
+            let begin = Instant::now();
             let light = start_light_robots(&fleet, robots, true).await?;
+            let joined_s = begin.elapsed().as_secs_f64();
             let publishing = publish(light, period);
-            let with = used(|| fleet.server_usage(), &publishing, seconds).await?;
-            say("the server, with certificates", &with);
-            tls = Some(with);
+            let used = used(|| fleet.server_usage(), &publishing, seconds).await?;
+            let what = format!("the server, {robots} with certificates, joined in {joined_s:.0} s");
+            say(&what, &used);
+            tls = Some(WithCertificates { robots, used });
         }
         fleets.push(OfFleet {
             robots,
@@ -117,6 +136,14 @@ pub(crate) async fn measure(arguments: &Arguments, node: &Path) -> anyhow::Resul
         });
     }
     Ok(States { fleets })
+}
+
+/// Returns the largest number of robots with certificates for which this process may open its files.
+fn certificates_max() -> anyhow::Result<u32> {
+    let (_, most) = getrlimit(Resource::RLIMIT_NOFILE)?;
+    setrlimit(Resource::RLIMIT_NOFILE, most, most)?;
+    let robots = most.saturating_sub(FILES_BESIDES) / FILES_OF_ROBOT;
+    Ok(u32::try_from(robots).unwrap_or(u32::MAX))
 }
 
 /// Robots that publish until this is dropped.
@@ -263,9 +290,13 @@ impl States {
                 checks.extend([
                     Check::shown(
                         named("CPU per state with certificates, us"),
-                        tls.cpu_us_per_state,
+                        tls.used.cpu_us_per_state,
                     ),
-                    Check::shown(named("memory with certificates, MB"), tls.memory_peak_mb),
+                    Check::shown(
+                        named("memory with certificates, MB"),
+                        tls.used.memory_peak_mb,
+                    ),
+                    Check::shown(named("robots with certificates"), f64::from(tls.robots)),
                 ]);
             }
             checks
@@ -288,16 +319,19 @@ impl States {
         for fleet in &self.fleets {
             let router = &fleet.router;
             let tls = fleet.tls.as_ref();
-            let tls = tls.map(|tls| ("the server, with certificates", tls));
-            let rows = [("a bare router", router), ("the server", &fleet.server)];
-            for (process, used) in rows.into_iter().chain(tls) {
+            let tls = tls.map(|tls| (tls.robots, "the server, with certificates", &tls.used));
+            let rows = [
+                (fleet.robots, "a bare router", router),
+                (fleet.robots, "the server", &fleet.server),
+            ];
+            for (robots, process, used) in rows.into_iter().chain(tls) {
                 let over = |value: f64, of: f64| match process {
                     "a bare router" => String::new(),
                     _ => format!("{:.1}", value - of),
                 };
                 let dispatch = used.dispatch.as_ref();
                 table.row([
-                    format!("{} at {} Hz", fleet.robots, fleet.state_rate_hz),
+                    format!("{robots} at {} Hz", fleet.state_rate_hz),
                     process.to_owned(),
                     format!("{:.0}", used.states_per_second),
                     format!("{:.1}", used.cpu_us_per_state),
