@@ -259,14 +259,14 @@ fn what_cannot_be_driven_is_refused_with_its_place() {
             speed_m_s: 1.01,
             ..round
         }),
-        PlanError::SpeedAboveLimit { place: 0, .. }
+        PlanError::SpeedAboveLimit { waypoint: None, .. }
     ));
     assert!(matches!(
         circle(CircleSpec {
             speed_m_s: f64::NAN,
             ..round
         }),
-        PlanError::NotFinite { place: 0, .. }
+        PlanError::NotFinite { waypoint: None, .. }
     ));
     let through = |places: &[(f64, f64)]| {
         plan(Trajectory::Waypoints(WaypointsSpec {
@@ -281,11 +281,14 @@ fn what_cannot_be_driven_is_refused_with_its_place() {
     assert_eq!(through(&[(1.0, 1.0)]), PlanError::TooFewWaypoints(1));
     assert_eq!(
         through(&[(1.0, 1.0), (2.0, 1.0), (2.0, 1.0)]),
-        PlanError::DuplicateWaypoint { place: 2 }
+        PlanError::DuplicateWaypoint { waypoint: 2 }
     );
     assert!(matches!(
         through(&[(1.0, 1.0), (2.0, f64::NAN)]),
-        PlanError::NotFinite { place: 1, .. }
+        PlanError::NotFinite {
+            waypoint: Some(1),
+            ..
+        }
     ));
     let many: Vec<_> = (0..=100_000_u32)
         .map(|index| (f64::from(index), 0.0))

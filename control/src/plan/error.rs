@@ -11,12 +11,12 @@ use crate::path::RADIUS_MIN_M;
 pub enum PlanError {
     /// A value is NaN, infinite, or a coordinate beyond [`super::COORDINATE_MAX_M`]; also a
     /// traction limit not above zero.
-    #[error("{what} at {place} is not a usable number: {value}")]
+    #[error("{what}{} is not a usable number: {value}", at(*waypoint))]
     NotFinite {
         /// Name of the value.
         what: &'static str,
-        /// Index of the waypoint, 0 for a circle, the start or an option.
-        place: usize,
+        /// Index of the waypoint; `None` for a value of a circle, of the start or of an option.
+        waypoint: Option<usize>,
         /// Rejected value.
         value: f64,
     },
@@ -34,24 +34,27 @@ pub enum PlanError {
     #[error("a path may have at most {WAYPOINTS_MAX} waypoints, not {0}")]
     TooManyWaypoints(usize),
     /// Two consecutive waypoints are closer than [`super::WAYPOINT_SPACING_MIN_M`].
-    #[error("waypoint {place} is at the same place as the one before")]
+    #[error("waypoint {waypoint} is at the same place as the one before")]
     DuplicateWaypoint {
         /// Index of the second of the two.
-        place: usize,
+        waypoint: usize,
     },
     /// A speed is zero or negative.
-    #[error("the speed at {place} must be above zero, not {speed_m_s} m/s")]
+    #[error("the speed{} must be above zero, not {speed_m_s} m/s", at(*waypoint))]
     SpeedNotPositive {
-        /// Index of the waypoint, 0 for a circle, a path's own speed or the approach speed.
-        place: usize,
+        /// Index of the waypoint; `None` for the speed of a circle, a path or the approach.
+        waypoint: Option<usize>,
         /// Requested speed, metres per second.
         speed_m_s: f64,
     },
     /// A speed is above the robot's limit.
-    #[error("the speed at {place} is {speed_m_s} m/s, above the robot's limit of {limit_m_s} m/s")]
+    #[error(
+        "the speed{} is {speed_m_s} m/s, above the robot's limit of {limit_m_s} m/s",
+        at(*waypoint)
+    )]
     SpeedAboveLimit {
-        /// Index of the waypoint, 0 for a circle, a path's own speed or the approach speed.
-        place: usize,
+        /// Index of the waypoint; `None` for the speed of a circle, a path or the approach.
+        waypoint: Option<usize>,
         /// Requested speed, metres per second.
         speed_m_s: f64,
         /// Smaller of the linear speed limit and 85 % of the wheels' speed limit, metres per
@@ -59,10 +62,10 @@ pub enum PlanError {
         limit_m_s: f64,
     },
     /// The path would turn tighter than [`RADIUS_MIN_M`].
-    #[error("the path turns too sharply near waypoint {place}")]
+    #[error("the path turns too sharply {}", near(*waypoint))]
     TooTight {
-        /// Index of the waypoint at the start of the sharp turn; 0 on the approach to a circle.
-        place: usize,
+        /// Index of the waypoint at the start of the sharp turn; `None` on the approach to a circle.
+        waypoint: Option<usize>,
     },
     /// The path is longer than [`LENGTH_MAX_M`]; the value is its length, metres.
     #[error("the path is {0} m long, above the limit of {LENGTH_MAX_M} m")]
@@ -70,4 +73,43 @@ pub enum PlanError {
     /// Depth or period of the excitation is out of its range.
     #[error("the excitation cannot be driven")]
     Excitation(#[from] ExcitationError),
+}
+
+fn at(waypoint: Option<usize>) -> String {
+    waypoint.map_or_else(String::new, |waypoint| format!(" at waypoint {waypoint}"))
+}
+
+fn near(waypoint: Option<usize>) -> String {
+    waypoint.map_or_else(
+        || "on the approach to the circle".to_owned(),
+        |waypoint| format!("near waypoint {waypoint}"),
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn errors_name_the_waypoint_where_there_is_one() {
+        let speed = |waypoint| PlanError::SpeedNotPositive {
+            waypoint,
+            speed_m_s: -1.0,
+        };
+        let tight = |waypoint| PlanError::TooTight { waypoint };
+        for (error, text) in [
+            (speed(None), "the speed must be above zero, not -1 m/s"),
+            (
+                speed(Some(2)),
+                "the speed at waypoint 2 must be above zero, not -1 m/s",
+            ),
+            (
+                tight(None),
+                "the path turns too sharply on the approach to the circle",
+            ),
+            (tight(Some(1)), "the path turns too sharply near waypoint 1"),
+        ] {
+            assert_eq!(error.to_string(), text);
+        }
+    }
 }

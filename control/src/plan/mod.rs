@@ -136,13 +136,13 @@ impl Plan {
         options: &PlanOptions<'_>,
     ) -> Result<Self, PlanError> {
         if let Some(speed_m_s) = options.approach_speed_m_s {
-            check_speed(speed_m_s, 0, model)?;
+            check_speed(speed_m_s, None, model)?;
         }
         let limited = match options.least_traction_limit_mu() {
             Some(mu) if !(mu.is_finite() && mu > 0.0) => {
                 return Err(PlanError::NotFinite {
                     what: "the traction limit",
-                    place: 0,
+                    waypoint: None,
                     value: mu,
                 });
             }
@@ -151,11 +151,11 @@ impl Plan {
         };
         let unlimited = model;
         let model = &limited;
-        check_coordinate("the start pose", 0, start.point())?;
+        check_coordinate("the start pose", None, start.point())?;
         if !start.heading_rad.is_finite() {
             return Err(PlanError::NotFinite {
                 what: "the start pose",
-                place: 0,
+                waypoint: None,
                 value: start.heading_rad,
             });
         }
@@ -173,14 +173,14 @@ impl Plan {
         (model, unlimited): (&RobotModel, &RobotModel),
         options: &PlanOptions<'_>,
     ) -> Result<Self, PlanError> {
-        check_coordinate("the centre", 0, circle.center)?;
+        check_coordinate("the centre", None, circle.center)?;
         if !(circle.radius_m >= RADIUS_MIN_M && circle.radius_m <= COORDINATE_MAX_M) {
             return Err(PlanError::Radius(circle.radius_m));
         }
         if !(circle.turns > 0.0 && circle.turns.is_finite()) {
             return Err(PlanError::Turns(circle.turns));
         }
-        check_speed(circle.speed_m_s, 0, model)?;
+        check_speed(circle.speed_m_s, None, model)?;
         let length_m = std::f64::consts::TAU * circle.radius_m * circle.turns;
         if length_m > LENGTH_MAX_M {
             return Err(PlanError::TooLong(length_m));
@@ -193,7 +193,7 @@ impl Plan {
             speed_m_s: approach_m_s,
         };
         let (legs, join_rad) = join_circle(&target, start, &on_approach(model, options))
-            .ok_or(PlanError::TooTight { place: 0 })?;
+            .ok_or(PlanError::TooTight { waypoint: None })?;
         let arc = Piece::Arc {
             center: circle.center,
             radius_m: circle.radius_m,
@@ -207,7 +207,7 @@ impl Plan {
             .map(Piece::Polynomial)
             .chain([arc])
             .collect();
-        let path = Path::new(pieces).map_err(|_| PlanError::TooTight { place: 0 })?;
+        let path = Path::new(pieces).map_err(|_| PlanError::TooTight { waypoint: None })?;
         let speeds = [
             SpeedFrom {
                 arc_m: 0.0,
@@ -234,23 +234,23 @@ impl Plan {
         if points.len() > WAYPOINTS_MAX {
             return Err(PlanError::TooManyWaypoints(points.len()));
         }
-        check_speed(spec.speed_m_s, 0, model)?;
+        check_speed(spec.speed_m_s, None, model)?;
         for (place, waypoint) in points.iter().enumerate() {
-            check_coordinate("the waypoint", place, waypoint.point)?;
+            check_coordinate("the position", Some(place), waypoint.point)?;
             if let Some(heading_rad) = waypoint.heading_rad.filter(|value| !value.is_finite()) {
                 return Err(PlanError::NotFinite {
                     what: "the heading",
-                    place,
+                    waypoint: Some(place),
                     value: heading_rad,
                 });
             }
             if let Some(speed_m_s) = waypoint.speed_m_s {
-                check_speed(speed_m_s, place, model)?;
+                check_speed(speed_m_s, Some(place), model)?;
             }
             if place > 0
                 && points[place - 1].point.distance_m(waypoint.point) < WAYPOINT_SPACING_MIN_M
             {
-                return Err(PlanError::DuplicateWaypoint { place });
+                return Err(PlanError::DuplicateWaypoint { waypoint: place });
             }
         }
         // Waypoints at the robot's position are skipped; the last waypoint is never skipped.
@@ -259,7 +259,7 @@ impl Plan {
             .take_while(|waypoint| waypoint.point.distance_m(start.point()) < ON_START_M)
             .count();
         if points[first].point.distance_m(start.point()) < WAYPOINT_SPACING_MIN_M {
-            return Err(PlanError::DuplicateWaypoint { place: first });
+            return Err(PlanError::DuplicateWaypoint { waypoint: first });
         }
         let mut knots: Vec<Knot> = points[first..]
             .iter()
@@ -270,7 +270,7 @@ impl Plan {
             .collect();
         let too_tight = |error: PathError| match error {
             PathError::TooTight { piece } => PlanError::TooTight {
-                place: (piece + first).saturating_sub(1),
+                waypoint: Some((piece + first).saturating_sub(1)),
             },
         };
         let mut approach_pieces = usize::from(first == 0);
@@ -521,10 +521,18 @@ impl Plan {
     }
 }
 
-fn check_coordinate(what: &'static str, place: usize, point: Point) -> Result<(), PlanError> {
+fn check_coordinate(
+    what: &'static str,
+    waypoint: Option<usize>,
+    point: Point,
+) -> Result<(), PlanError> {
     for value in [point.x_m, point.y_m] {
         if !value.is_finite() || value.abs() > COORDINATE_MAX_M {
-            return Err(PlanError::NotFinite { what, place, value });
+            return Err(PlanError::NotFinite {
+                what,
+                waypoint,
+                value,
+            });
         }
     }
     Ok(())
@@ -539,23 +547,30 @@ fn on_approach(model: &RobotModel, options: &PlanOptions<'_>) -> RobotModel {
     }
 }
 
-fn check_speed(speed_m_s: f64, place: usize, model: &RobotModel) -> Result<(), PlanError> {
+fn check_speed(
+    speed_m_s: f64,
+    waypoint: Option<usize>,
+    model: &RobotModel,
+) -> Result<(), PlanError> {
     if !speed_m_s.is_finite() {
         return Err(PlanError::NotFinite {
             what: "the speed",
-            place,
+            waypoint,
             value: speed_m_s,
         });
     }
     if speed_m_s <= 0.0 {
-        return Err(PlanError::SpeedNotPositive { place, speed_m_s });
+        return Err(PlanError::SpeedNotPositive {
+            waypoint,
+            speed_m_s,
+        });
     }
     let limits = model.limits();
     let rim_max_m_s = WHEEL_SHARE * limits.wheel_speed_max_rad_s * model.wheel_radius_m();
     let limit_m_s = limits.linear_max_m_s.min(rim_max_m_s);
     if speed_m_s > limit_m_s {
         return Err(PlanError::SpeedAboveLimit {
-            place,
+            waypoint,
             speed_m_s,
             limit_m_s,
         });

@@ -471,12 +471,12 @@ fn binding(plan: &Plan, slowed: &Slowed) -> Binding {
 }
 
 fn place_of(error: PlanError, trajectory: &Trajectory) -> Option<Place> {
-    let index = match error {
-        PlanError::NotFinite { place, .. }
-        | PlanError::DuplicateWaypoint { place }
-        | PlanError::SpeedNotPositive { place, .. }
-        | PlanError::SpeedAboveLimit { place, .. }
-        | PlanError::TooTight { place } => place,
+    let waypoint = match error {
+        PlanError::DuplicateWaypoint { waypoint } => Some(waypoint),
+        PlanError::NotFinite { waypoint, .. }
+        | PlanError::SpeedNotPositive { waypoint, .. }
+        | PlanError::SpeedAboveLimit { waypoint, .. }
+        | PlanError::TooTight { waypoint } => waypoint,
         PlanError::Radius(_)
         | PlanError::Turns(_)
         | PlanError::TooFewWaypoints(_)
@@ -490,10 +490,13 @@ fn place_of(error: PlanError, trajectory: &Trajectory) -> Option<Place> {
             waypoint: None,
             point: circle.center,
         }),
-        Trajectory::Waypoints(waypoints) => waypoints.points.get(index).map(|point| Place {
-            arc_m: None,
-            waypoint: Some(index),
-            point: point.position(),
-        }),
+        Trajectory::Waypoints(waypoints) => {
+            let index = waypoint?;
+            waypoints.points.get(index).map(|point| Place {
+                arc_m: None,
+                waypoint: Some(index),
+                point: point.position(),
+            })
+        }
     }
 }
