@@ -62,6 +62,9 @@ const STEADY_FOR: Duration = Duration::from_secs(2);
 const REST: Duration = Duration::from_secs(1);
 /// Maximum number of attempts at a motion if the base falls silent during it.
 const TRIES_MAX: u32 = 5;
+/// Maximum distance that a rim covers in all attempts at one motion, metres: two metres are to be free
+/// around the robot.
+const MOTION_MAX_M: f64 = 1.9;
 /// Maximum wait for closing the session on the robot's bus.
 const CLOSE_MAX: Duration = Duration::from_secs(2);
 /// Rim speed of the motions, metres per second.
@@ -73,7 +76,8 @@ pub(crate) struct DoctorArgs {
     /// The configuration file of the robot
     #[arg(long, env = "TREAD_AGENT_CONFIG")]
     config: PathBuf,
-    /// Move the robot: it turns on the spot and drives a metre forward, at 0.2 m/s
+    /// Move the robot at 0.2 m/s: it turns on the spot and drives a metre forward, two if the base falls
+    /// silent meanwhile and the motion is repeated
     #[arg(long = "move")]
     moves: bool,
     /// Print one JSON object
@@ -287,16 +291,24 @@ impl ExaminedDrive {
     }
 
     /// Drives with these wheel speeds and summarises the messages. If the base falls silent, it is
-    /// commanded to zero and the motion is repeated, at most [`TRIES_MAX`] times.
+    /// commanded to zero and the motion is repeated from there, at most [`TRIES_MAX`] times and within
+    /// [`MOTION_MAX_M`].
     fn drive_for(
         &mut self,
         command: WheelSpeeds,
         settings: &Ros2Settings,
         heard: &Heard,
     ) -> DriveSummary {
+        let mut driven_m = 0.0;
         for _ in 0..TRIES_MAX {
+            if !has_room(driven_m) {
+                break;
+            }
+            let began = self.clock.monotonic();
             let messages = self.try_to_drive(command, heard);
             self.ramp(WheelSpeeds::default());
+            let moved = self.clock.monotonic().saturating_sub(began);
+            driven_m += RIM_M_S * moved.as_secs_f64();
             self.hold(WheelSpeeds::default(), REST);
             if let Some([starting, steady]) = messages {
                 return drove::drove(command, settings, &starting, &steady);
@@ -318,8 +330,27 @@ impl ExaminedDrive {
     }
 }
 
+/// Whether a whole motion stays within [`MOTION_MAX_M`] after rims have covered `driven_m` metres.
+fn has_room(driven_m: f64) -> bool {
+    let whole = 2 * RAMP + SETTLE + STEADY_AFTER + STEADY_FOR;
+    driven_m + RIM_M_S * whole.as_secs_f64() <= MOTION_MAX_M
+}
+
 /// Whether the newest odometry pose heads along the x axis of its frame.
 fn heads_along_x(settings: &Ros2Settings, heard: &Heard) -> bool {
     let heading_rad = drove::newest_heading_rad(settings, &heard.taken());
     heading_rad.is_some_and(twist_frame::is_along_x)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_motion_that_is_repeated_stays_within_the_free_space() {
+        assert!(has_room(0.0));
+        // Once more after a whole motion, and not a third time.
+        assert!(has_room(0.9));
+        assert!(!has_room(1.0));
+    }
 }
