@@ -314,7 +314,8 @@ pub struct AuditEntry {
     pub path: String,
     /// HTTP status of the answer.
     pub status: u16,
-    /// `x-request-id` of the answer, which is in the server's log too.
+    /// `x-request-id` of the answer, of the newest one if the entry stands for several requests; it is in
+    /// the server's log too.
     pub request_id: String,
     /// Body of the request without secrets, shortened if it was long; `null` without one.
     pub what: Option<serde_json::Value>,

@@ -28,9 +28,9 @@ impl WheelSpeeds {
 /// Drive torques per side, sum over both wheels of a side; positive drives forward.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct WheelTorques {
-    /// Left wheels, newton metres.
+    /// Sum over the left wheels, newton metres, positive forward.
     pub left_n_m: f64,
-    /// Right wheels, newton metres.
+    /// Sum over the right wheels, newton metres, positive forward.
     pub right_n_m: f64,
 }
 

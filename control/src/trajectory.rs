@@ -47,7 +47,8 @@ pub struct Waypoint {
     pub point: Point,
     /// Speed from here to the next point, metres per second; None for [`WaypointsSpec::speed_m_s`].
     pub speed_m_s: Option<f64>,
-    /// Direction of the path at this point, radians counter-clockwise from x; None leaves it free.
+    /// Direction of the path at this point, any finite angle, radians counter-clockwise from x; the
+    /// robot's heading differs from it by the sideslip. None leaves it free.
     pub heading_rad: Option<f64>,
 }
 

@@ -1,4 +1,4 @@
-//! The mark of the archive: which measurements were archived.
+//! The mark of the archive: first and last key of the segments that were archived without a gap.
 
 use super::{DbError, Tx, forward};
 

@@ -18,7 +18,7 @@ use thread_priority::{ThreadPriority, ThreadPriorityValue};
 /// the loop depends on them.
 pub const PRIORITY_RANGE: std::ops::RangeInclusive<u8> = 1..=49;
 
-/// `[realtime]`: what is asked of the operating system's scheduler.
+/// `[realtime]`: priority of the loop, and whether memory is locked.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct RealtimeConfig {
     /// Priority of the loop's thread by `SCHED_FIFO`, within [`PRIORITY_RANGE`]; `None` for the
@@ -28,7 +28,7 @@ pub struct RealtimeConfig {
     pub lock_memory: bool,
 }
 
-/// Why the scheduler does not give what was configured.
+/// Why the operating system refuses the priority or the locked memory.
 #[derive(Debug, thiserror::Error)]
 pub enum RealtimeError {
     /// The priority is not permitted.

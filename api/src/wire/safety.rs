@@ -39,7 +39,7 @@ pub struct Stop {
 /// as `moving` while the robot moves. The robot does not start to move by itself afterwards.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ClearStop {
-    /// Newest stop that the sender knows.
+    /// Stop to be cleared: the newest that the sender knows.
     pub stop: StopId,
     /// Name of the person who clears the stop.
     #[serde(deserialize_with = "crate::text::bounded::<_, {crate::stop::STOP_TEXT_MAX}>")]

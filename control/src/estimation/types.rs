@@ -85,11 +85,14 @@ pub struct TyrePrior {
     pub unexplained_ratio: f64,
 }
 
-/// Uncertainty of the robot's model: relative standard deviations. These errors are common to all
-/// measurements of a robot and cannot be separated from θ on one ground.
+/// Prior of the robot's mass and yaw inertia, relative to those of the model.
+///
+/// The estimator corrects it by the apparent mass and the identification, as far as the sensors show
+/// them. What remains is an error that all measurements of the robot have in common.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ModelUncertainty {
-    /// Standard deviation of the mass, relative to the model's; it scales θ from measured torques.
+    /// Standard deviation of the mass, relative to the model's. An error of the mass scales θ from
+    /// measured torques. 0: the mass is exact, and the apparent mass is not used.
     pub mass_ratio: f64,
     /// Mean payload, relative to the model's mass.
     #[serde(default)]

@@ -2,7 +2,8 @@
 //!
 //! The limit is the speed from which the robot still stops within its free distance `d`,
 //! `v t + v²/2a = d`, with the reaction time `t` and the deceleration `a` that the lower bound of
-//! friction allows. A robot outside may only move, slowly, where its clearance increases.
+//! friction allows. A robot outside may only drive slowly to where its clearance increases, or
+//! turn on the spot.
 
 use super::{Fence, MARGIN_M, disc_radius_m};
 use crate::geometry::{Pose, Twist};
@@ -43,8 +44,9 @@ pub struct FenceInput {
 /// Clearance and speed limit of a robot.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FenceVerdict {
-    /// Clearance of the robot's disc with its margin, metres; negative outside, −∞ for input that
-    /// is not finite.
+    /// Distance from the robot's disc, enlarged by the margin and twice the standard deviation of the
+    /// position, to the fence, metres; negative outside, ∞ without a fence, −∞ for input that is not
+    /// finite.
     pub clearance_m: f64,
     /// Maximum speed along the robot's arc, metres per second; None while the fence is out of
     /// reach.

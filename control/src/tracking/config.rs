@@ -67,7 +67,8 @@ pub struct TrackerConfig {
     pub beyond_gain: f64,
     /// Maximum magnitude of θ̂̇ by the gradient, per second.
     pub adaptation_rate_max_1_s: f64,
-    /// Rate p of the pull of θ̂ towards a newly known θ at full confidence, per second.
+    /// Rate p of the pull of θ̂ to a known θ, per second: `c p (c θ − θ̂)` for 2 s with the confidence c. Which
+    /// θ pulls is decided when knowledge is applied.
     pub adaptation_pull_1_s: f64,
     /// Maximum θ̂, above 0.
     pub theta_max: f64,

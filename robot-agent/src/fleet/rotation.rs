@@ -136,7 +136,7 @@ impl Rotation {
         self.at = at;
     }
 
-    /// Notes that the server was reached.
+    /// Notes that the present server was reached: its failures are forgotten, and pauses begin anew.
     pub fn reached(&mut self) {
         let server = &mut self.servers[self.at];
         server.logged = Logged::default();

@@ -34,7 +34,7 @@ pub struct SensorSpec {
     pub body_speed_m_s: f64,
     /// Position, each coordinate, metres.
     pub position_m: f64,
-    /// Heading of a position fix, radians.
+    /// Standard deviation of the heading of a position fix, radians.
     pub heading_rad: f64,
     /// Bound of the constant relative error of the torque scale, drawn uniformly from ± this value.
     pub torque_scale_ratio: f64,

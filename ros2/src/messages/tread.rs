@@ -1,7 +1,9 @@
-//! `tread_msgs`: what no message of ROS holds. Only recordings know them, with their definitions.
+//! `tread_msgs`: messages for values that no standard ROS message has. They occur in recordings alone,
+//! which contain their definitions.
 //!
-//! What is absent has its bit of `present` cleared and holds NaN, which nobody draws; a number
-//! that is there may be NaN too.
+//! A value that is absent has its bit of `present` cleared. A number then holds NaN, and `fault` and
+//! `gate` hold 0, which is also their first value; so check the bit first. A number that is present may
+//! be NaN too.
 
 use super::record;
 use crate::cdr::Sequence;
@@ -170,9 +172,10 @@ record! {
         segment_weighted: f64,
         /// What the agent did: 0 idle, 1 tracking, 2 teleoperated, 3 stopped, 4 at fault.
         mode: u8,
-        /// What is broken: 0 the base is silent, 1 the position is lost.
+        /// Fault: 0 the base is silent, 1 the position is lost. Valid only if `present` has its bit.
         fault: u8,
-        /// The strictest cause for which the gate reduced the command, by its place in the list.
+        /// Number of the strictest cause for which the gate reduced the command, as the agent's recording
+        /// codec assigns it for good. Valid only if `present` has its bit.
         gate: u8,
         /// When commands of a driver were judged in it, nanoseconds of the agent's monotonic clock.
         judged_ns: u64,

@@ -326,10 +326,12 @@ impl PresentCertificate {
         self.is_retired
     }
 
-    /// Verifies that `proof` is a signature of the renewal request by the key of this certificate.
+    /// Verifies that `proof` is a signature (ECDSA P-256 with SHA-256, DER) of the renewal message of the
+    /// request, by the key of this certificate.
     ///
     /// # Errors
-    /// [`CertificateError::Proof`] if it is not.
+    /// [`CertificateError::Proof`] if it is not, [`CertificateError::Unreadable`] if the certificate cannot
+    /// be parsed.
     pub fn check_proof(&self, request_pem: &str, proof: &[u8]) -> Result<(), CertificateError> {
         let leaf =
             EndEntityCert::try_from(&self.certificate).map_err(|_| CertificateError::Unreadable)?;

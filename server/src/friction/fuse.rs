@@ -31,8 +31,8 @@ use super::weights::FrictionConfig;
 
 /// Minimum θ that the map states; a smaller estimate is raised to it (K = 10⁶).
 pub const THETA_MIN: f64 = 1.0e-6;
-/// Maximum standard deviation of θ; beyond it there is no estimate. It is the whole range of θ (K ≥
-/// 0.1).
+/// Maximum standard deviation of θ; beyond it there is no estimate, since θ 10 is K 0.1, less than of any
+/// ground to drive on.
 pub const THETA_STD_DEV_MAX: f64 = 10.0;
 /// Maximum peak friction coefficient that is accepted from one robot alone.
 pub const MU_ALONE_MAX: f64 = 0.4;

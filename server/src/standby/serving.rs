@@ -1,5 +1,5 @@
-//! What a standby answers while it waits for the database: it follows the map, and forwards to the server that
-//! has the database what it cannot answer ([`crate::http::standby`]).
+//! What a standby does while it waits for the database: it follows the map, answers from it, and forwards all
+//! other requests to the server that has the database ([`crate::http::standby`]).
 
 use std::panic::AssertUnwindSafe;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};

@@ -1,4 +1,4 @@
-//! Fourth stage: chooses the driver, applies the speed limits and the gate, and gives the command.
+//! Fourth stage: takes the wheel speeds of the mission or of the teleoperator through speed limits and gate.
 
 use std::time::Duration;
 

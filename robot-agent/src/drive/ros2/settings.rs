@@ -59,7 +59,7 @@ pub struct BusSettings {
     pub mode: BusMode,
     /// zenoh endpoint on this machine.
     pub endpoint: String,
-    /// ROS domain, used with `rmw_zenoh_cpp`.
+    /// `ROS_DOMAIN_ID`, 0 to 232; used with `rmw_zenoh_cpp` only.
     pub domain: u32,
     /// Namespace of the bridge, or of the agent's node.
     pub namespace: Name,

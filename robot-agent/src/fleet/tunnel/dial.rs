@@ -37,7 +37,9 @@ const PROTOCOL: &str = "tls";
 /// Key of the send buffer's size in an endpoint, as in zenoh.
 const SEND_BUFFER_KEY: &str = "so_sndbuf";
 
-/// Why a connection could not be made; another attempt may succeed.
+/// Why a connection could not be made. The agent tries again after each of them;
+/// [`DialError::Unreachable`] and [`DialError::TooSlow`] may pass by themselves, and the others need
+/// another clock, certificate, trust or version.
 #[derive(Debug, thiserror::Error)]
 pub enum DialError {
     /// The name cannot be resolved, no process listens there, or the handshake failed.

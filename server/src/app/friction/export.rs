@@ -211,8 +211,8 @@ pub struct SegmentExport {
 }
 
 impl SegmentExport {
-    /// Returns a hashable state of what is exported; it differs after measurements are added or
-    /// removed.
+    /// Returns what an `ETag` is made of: it differs for another site or filter, and after segments are
+    /// added or removed.
     pub fn state(&self) -> impl Hash + use<> {
         self.state.clone()
     }

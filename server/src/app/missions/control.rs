@@ -1,7 +1,9 @@
 //! Requests on an existing mission: pause, resume, replace, cancel.
 //!
-//! Each only stores the wanted state; the reconciler sends it to the robot, and the robot's answer
-//! changes the mission's state. All are idempotent.
+//! On an active mission each only stores the wanted state; the reconciler sends it to the robot, and
+//! the robot's answer changes the mission's state. A queued mission changes at once. Pause and resume are
+//! idempotent, and so is cancel until the mission has ended; each replacement of a queued mission makes
+//! a new revision.
 
 use jiff::Timestamp;
 use tread_api::ids::MissionId;

@@ -103,7 +103,7 @@ pub struct At<'config> {
     pub now_us: i64,
 }
 
-/// Buffers that are reused from square to square.
+/// Buffers that are reused for each square of the picture.
 #[derive(Debug, Default)]
 pub struct Room {
     fuser: Fuser<u32>,
