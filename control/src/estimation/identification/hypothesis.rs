@@ -45,6 +45,8 @@ const LINEAR_RANGE: f64 = 0.1;
 /// Fraction of the variance of ln K that is added to the square of that range. With all of it, noise
 /// of the wheel speeds that the first expansions took for slip is kept as well.
 const DOUBT_SHARE: f64 = 0.5;
+/// Minimum factor by which the last block changed the weights of the others for these to be restored.
+const KEPT_MIN: f64 = 1.0e-3;
 /// Maximum magnitude of the change of ln K at the end of one block.
 const STEP_MAX: f64 = 0.4;
 /// Range in which parameters stay, in standard deviations of their prior.
@@ -119,6 +121,8 @@ pub(super) struct Hypothesis {
     compared: u32,
     noise_square: f64,
     cost: f64,
+    /// Factor by which the step after the last block changed the weights of all blocks.
+    last_kept: f64,
     /// Number of complete blocks.
     age: u32,
     /// Whether the last normal equations could be solved at any time scale: otherwise noise hides
@@ -143,6 +147,7 @@ impl Hypothesis {
             noise_square: 0.0,
             is_determined: true,
             cost: 0.0,
+            last_kept: 1.0,
             age: 0,
         }
     }
@@ -296,6 +301,7 @@ impl Hypothesis {
     /// the prior. Returns false if a parameter is not finite.
     pub(super) fn end_block(&mut self, prior: &Prior) -> bool {
         let values = self.values;
+        self.last_kept = 1.0;
         self.scales
             .iter_mut()
             .for_each(|scale| scale.end_block(&values));
@@ -313,14 +319,7 @@ impl Hypothesis {
             .max(step[index::STIFFNESS].abs() / STEP_MAX)
             .max(1.0);
         let before = self.values;
-        self.values += step;
-        for place in 0..PARAMETERS {
-            let most = PRIOR_RANGE * prior.std_devs[place];
-            let mean = prior.first_mean[place];
-            self.values[place] = self.values[place].clamp(mean - most, mean + most);
-        }
-        self.values[index::SHAPE] = self.values[index::SHAPE].max(SHAPE_MIN);
-        self.values[index::BEND] = self.values[index::BEND].max(0.0);
+        self.values = in_range(before + step, prior);
         let step = self.values - before;
         for own in std::iter::once(&mut self.model).chain(&mut self.perturbed) {
             own.shift(&step);
@@ -330,6 +329,7 @@ impl Hypothesis {
         for scale in &mut self.scales {
             scale.weaken(keeps);
         }
+        self.last_kept = keeps;
         self.values.iter().all(|value| value.is_finite())
     }
 
@@ -387,10 +387,22 @@ impl Hypothesis {
         }))
     }
 
-    /// Drops the last block and the open one, which may contain samples of two grounds.
-    pub(super) fn drop_last_block(&mut self) {
+    /// Drops the last block and the open one, which may contain samples of two grounds, and takes the
+    /// parameters from the others with their former weights: those that the last block led to may have
+    /// followed the next ground.
+    pub(super) fn drop_last_block(&mut self, prior: &Prior) {
         self.scales.iter_mut().for_each(Scale::drop_last_block);
         self.drop_block();
+        if self.last_kept >= KEPT_MIN {
+            let restored = self.last_kept.recip();
+            self.scales
+                .iter_mut()
+                .for_each(|scale| scale.weaken(restored));
+            self.last_kept = 1.0;
+        }
+        if let Some(values) = self.solve(prior) {
+            self.values = in_range(values, prior);
+        }
     }
 
     /// Ends the segment and returns ln K from its own blocks.
@@ -453,4 +465,16 @@ impl Hypothesis {
             ..prior.clone()
         })
     }
+}
+
+/// Limits parameters to their ranges.
+fn in_range(mut values: Values, prior: &Prior) -> Values {
+    for place in 0..PARAMETERS {
+        let most = PRIOR_RANGE * prior.std_devs[place];
+        let mean = prior.first_mean[place];
+        values[place] = values[place].clamp(mean - most, mean + most);
+    }
+    values[index::SHAPE] = values[index::SHAPE].max(SHAPE_MIN);
+    values[index::BEND] = values[index::BEND].max(0.0);
+    values
 }

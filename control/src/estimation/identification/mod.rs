@@ -67,9 +67,10 @@ const MODEL_ACCELERATION_M_S2: f64 = 0.075;
 const MODEL_TORQUE_MU: f64 = 0.025;
 /// Standard deviations of the error that all estimates share because real contacts do not follow
 /// the model's equations: a relative one, of ln θ, and an absolute one, of θ, which is a slip per
-/// friction coefficient and dominates where θ is small.
+/// friction coefficient and dominates where θ is small: without and with measured torque, which shows
+/// some of what the equations miss.
 const MODEL_LN_THETA_STD_DEV: f64 = 0.03;
-const MODEL_THETA_STD_DEV: f64 = 0.012;
+const MODEL_THETA_STD_DEVS: [f64; 2] = [0.020, 0.014];
 /// Minimum duration of the block with which a segment ends, seconds; a shorter one is not used.
 const SHORT_BLOCK_S: f64 = 0.5;
 /// Mean square of standardised residuals above which the model does not describe the robot and no
@@ -90,19 +91,6 @@ pub(super) struct Identified {
     pub(super) tyres_ratio: f64,
     /// Duration of the measurements in the estimate, seconds.
     pub(super) duration_s: f64,
-}
-
-impl Identified {
-    fn new(ln_stiffness: f64, own: f64, of_robot: f64, duration_s: f64) -> Self {
-        let theta = (-ln_stiffness).exp();
-        Self {
-            theta,
-            own_ratio: own.max(0.0).sqrt(),
-            robot_ratio: of_robot.max(0.0).sqrt(),
-            tyres_ratio: MODEL_LN_THETA_STD_DEV.hypot(MODEL_THETA_STD_DEV / theta),
-            duration_s,
-        }
-    }
 }
 
 /// Identification of a robot and its ground from samples of its sensors.
@@ -556,8 +544,15 @@ impl Identification {
         let variance = square / weights - mean * mean;
         let of_prior = (known / weights).min(variance);
         let is_known = mean.is_finite() && variance.is_finite() && variance > 0.0;
-        let duration_s = f64::from(best.age()) * BLOCK_S;
-        is_known.then(|| Identified::new(mean, variance - of_prior, of_prior, duration_s))
+        let theta = (-mean).exp();
+        let model = MODEL_THETA_STD_DEVS[usize::from(self.has_torque)];
+        is_known.then(|| Identified {
+            theta,
+            own_ratio: (variance - of_prior).max(0.0).sqrt(),
+            robot_ratio: of_prior.max(0.0).sqrt(),
+            tyres_ratio: MODEL_LN_THETA_STD_DEV.hypot(model / theta),
+            duration_s: f64::from(best.age()) * BLOCK_S,
+        })
     }
 
     /// Returns the newest estimate of the robot's own parameters, of this ground or an earlier one.

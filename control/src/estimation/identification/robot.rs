@@ -8,7 +8,7 @@ use crate::estimation::{IdentifiedRobot, IdentifiedValue};
 /// equations: of masses relative to the configured mass, of yaw inertia per mass relative to the
 /// configured one, and of the centre of mass relative to wheelbase and track width.
 const MODEL_MASS_RATIO: f64 = 0.03;
-const MODEL_INERTIA_RATIO: f64 = 0.02;
+const MODEL_INERTIA_RATIO: f64 = 0.025;
 const MODEL_CENTRE_RATIO: f64 = 0.006;
 /// Fraction of the initial prior variance above which an estimate counts as prior-dominated.
 const PRIOR_SHARE_MAX: f64 = 0.5;

@@ -18,6 +18,9 @@ const BLOCK_FORGETS: f64 = 0.002;
 const HUBER: f64 = 3.0;
 /// Weight of each new squared residual in the exponentially weighted mean square of its channel.
 const SQUARE_GAIN: f64 = 0.005;
+/// Minimum of that mean square in the weights: residuals that are smaller than sensors and model errors
+/// are assumed to make them get more weight, but not without bound.
+const SQUARE_MIN: f64 = 0.3;
 /// Maximum squared standardised residual in that mean.
 const SQUARE_MAX: f64 = 100.0;
 /// Standard deviations of their difference by which the estimates of two scales may differ.
@@ -178,7 +181,7 @@ impl Scale {
             ground: Blocks::none(),
             segment: Blocks::none(),
             last: Blocks::none(),
-            squares: [0.0; CHANNELS],
+            squares: [1.0; CHANNELS],
             of_stiffness: Values::zeros(),
             ln_stiffness: 0.0,
         }
@@ -236,7 +239,7 @@ impl Scale {
         }
     }
 
-    /// Adds a comparison to the open block, with Huber's weight.
+    /// Adds a comparison to the open block, with Huber's weight relative to the channel's residuals.
     ///
     /// The noise e of an output and its slopes ∂e/∂p are correlated, which adds the mean of
     /// −e ∂e/∂p to the score. That of the added noise, which is independent, cancels it.
@@ -244,7 +247,7 @@ impl Scale {
         let Residual { value, slopes } = &compared.residual;
         let square = (value / compared.std_dev).powi(2);
         let seen = &mut self.squares[channel];
-        let std_dev = compared.std_dev * seen.max(1.0).sqrt();
+        let std_dev = compared.std_dev * seen.max(SQUARE_MIN).sqrt();
         *seen += SQUARE_GAIN * f64::from(self.length) * (square.min(SQUARE_MAX) - *seen);
         let standardised = value.abs() / std_dev;
         let weight = std_dev.powi(-2) * (HUBER / standardised.max(HUBER));

@@ -11,7 +11,7 @@ impl Identification {
     /// another ground.
     pub(in super::super) fn drop_last_block(&mut self) {
         for hypothesis in &mut self.hypotheses {
-            hypothesis.drop_last_block();
+            hypothesis.drop_last_block(&self.prior);
         }
         self.segment_s = (self.segment_s - std::mem::take(&mut self.last_block_s)).max(0.0);
         self.block_s = 0.0;

@@ -243,8 +243,8 @@ fn the_last_block_before_a_change_of_the_ground_counts_for_no_segment() {
     };
     let (before, with, without) = (theta(0, false), theta(1, false), theta(1, true));
     let (of_block, left) = ((with / before).ln(), (without / before).ln());
-    assert!(of_block > 0.05, "{of_block}: the block must matter");
-    assert!(left.abs() < 0.5 * of_block, "{left} of {of_block}");
+    assert!(of_block > 0.02, "{of_block}: the block must matter");
+    assert!(left.abs() < 0.1 * of_block, "{left} of {of_block}");
 }
 
 /// Noise of the default sensors.
@@ -318,30 +318,47 @@ fn noisy(samples: [SensorSample; 2], std_dev_rad_s: f64, random: &mut impl RngEx
     }
 }
 
+/// Returns ln of the estimated over the true θ after 20 s with white noise of the wheel speeds, and its
+/// standard deviation; None without an estimate. `samples` are averaged in each of the sensor's.
+fn error_with_noise(
+    stiffness: f64,
+    (samples, std_dev_rad_s): (u16, f64),
+    seed: u64,
+) -> Option<(f64, f64)> {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let mut robot = with_stiffness(stiffness);
+    let mut identification = identification();
+    for _ in 0..4_000 / samples {
+        let first = robot.sample();
+        let second = if samples == 2 { robot.sample() } else { first };
+        let sample = noisy([first, second], std_dev_rad_s, &mut random);
+        let time_s = f64::from(samples) * SAMPLE_S;
+        identification.update(&sample, &SensorNoise::default(), time_s);
+    }
+    let found = identification.identified()?;
+    let own = found.own_ratio.hypot(found.robot_ratio);
+    Some(((found.theta * stiffness).ln(), own.hypot(found.tyres_ratio)))
+}
+
 #[test]
 fn white_noise_of_the_wheel_speeds_is_not_taken_for_slip() {
-    for (stiffness, error_max) in [(1.0_f64, 0.05), (4.0, 0.08), (12.0, 0.25)] {
-        for (samples, std_dev_rad_s) in [(1, 0.02), (1, 0.05), (2, 0.02)] {
-            let mut random = ChaCha8Rng::seed_from_u64(1);
-            let mut robot = with_stiffness(stiffness);
-            let mut identification = identification();
-            for _ in 0..4_000 / samples {
-                let first = robot.sample();
-                let second = if samples == 2 { robot.sample() } else { first };
-                let sample = noisy([first, second], std_dev_rad_s, &mut random);
-                let time_s = f64::from(samples) * SAMPLE_S;
-                identification.update(&sample, &SensorNoise::default(), time_s);
+    const SEEDS: u32 = 8;
+    for (stiffness, bias_max) in [(1.0_f64, 0.04), (4.0, 0.11), (12.0, 0.15)] {
+        for noise in [(1, 0.02), (1, 0.05), (2, 0.02)] {
+            let case = format!("K {stiffness}, {noise:?}");
+            let (mut sum, mut count, mut covered) = (0.0, 0, 0);
+            for seed in 0..SEEDS {
+                let Some((error, std_dev)) = error_with_noise(stiffness, noise, seed.into()) else {
+                    assert!(stiffness > 10.0, "{case}: nothing");
+                    continue;
+                };
+                sum += error;
+                count += 1;
+                covered += u32::from(error.abs() < 1.96 * std_dev);
             }
-            let case = format!("K {stiffness}, {std_dev_rad_s} rad/s, {samples}");
-            let Some(found) = identification.identified() else {
-                assert!(stiffness > 10.0, "{case}: nothing");
-                continue;
-            };
-            let error = (found.theta * stiffness).ln();
-            let own = found.own_ratio.hypot(found.robot_ratio);
-            let ratio = own.hypot(found.tyres_ratio);
-            assert!(error.abs() < error_max, "{case}: {error}");
-            assert!(error.abs() < 1.96 * ratio, "{case}: {error} of {ratio}");
+            assert_eq!(covered, count, "{case}: an interval without θ");
+            let bias = sum / f64::from(count.max(1));
+            assert!(bias.abs() < bias_max, "{case}: {bias}");
         }
     }
 }
