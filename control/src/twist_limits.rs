@@ -19,6 +19,25 @@ pub struct Slowing {
     pub angular_rad_s2: f64,
 }
 
+/// Change of a command, or of one of its speeds.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Change<T> {
+    /// The present command.
+    pub from: T,
+    /// The wanted command.
+    pub to: T,
+}
+
+impl<T> Change<T> {
+    /// Applies a conversion to both commands.
+    pub fn map<U>(self, convert: impl Fn(T) -> U) -> Change<U> {
+        Change {
+            from: convert(self.from),
+            to: convert(self.to),
+        }
+    }
+}
+
 /// Speed and acceleration limits of a commanded twist and of its wheel speeds.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TwistLimits {
@@ -60,52 +79,52 @@ impl TwistLimits {
             .min(share(wheels_rad_s, limits.wheel_speed_max_rad_s))
     }
 
-    /// Returns the command after `dt_s` seconds from `previous` towards `target`: v and ω speed up
-    /// within the acceleration limits, slow down within `slowing`, and every wheel keeps its own
-    /// limits. `target` is not passed.
+    /// Returns the command after `dt_s` seconds of a change: v and ω speed up within the
+    /// acceleration limits, slow down within `slowing`, and every wheel keeps its own limits. The
+    /// wanted twist is not passed.
     ///
-    /// Both twists must be finite and `target` within the speed limits. If `previous` is within the
-    /// speed limits, the result is too.
-    pub fn step(&self, previous: Twist, target: Twist, slowing: Slowing, dt_s: f64) -> Twist {
+    /// Both twists must be finite and the wanted one within the speed limits. If the present one is
+    /// within the speed limits, the result is too.
+    pub fn step(&self, change: Change<Twist>, slowing: Slowing, dt_s: f64) -> Twist {
         let limits = self.model.limits();
         let free = Twist {
             linear_m_s: Step {
                 up_max: limits.linear_acceleration_max_m_s2 * dt_s,
                 down_max: slowing.linear_m_s2 * dt_s,
             }
-            .towards(target.linear_m_s, previous.linear_m_s),
+            .towards(change.map(|twist| twist.linear_m_s)),
             angular_rad_s: Step {
                 up_max: self.model.angular_acceleration_max_rad_s2() * dt_s,
                 down_max: slowing.angular_rad_s2 * dt_s,
             }
-            .towards(target.angular_rad_s, previous.angular_rad_s),
+            .towards(change.map(|twist| twist.angular_rad_s)),
         };
-        let from = self.model.wheel_speeds_from_twist(previous);
-        let to = self.model.wheel_speeds_from_twist(free);
-        let share = self.wheel_share(from, to, dt_s);
+        let Change { from, .. } = change;
+        let wheels =
+            Change { from, to: free }.map(|twist| self.model.wheel_speeds_from_twist(twist));
+        let share = self.wheel_share(wheels, dt_s);
         if share >= 1.0 {
             return free;
         }
         Twist {
-            linear_m_s: previous.linear_m_s + share * (free.linear_m_s - previous.linear_m_s),
-            angular_rad_s: previous.angular_rad_s
-                + share * (free.angular_rad_s - previous.angular_rad_s),
+            linear_m_s: from.linear_m_s + share * (free.linear_m_s - from.linear_m_s),
+            angular_rad_s: from.angular_rad_s + share * (free.angular_rad_s - from.angular_rad_s),
         }
     }
 
     /// Returns the fraction, at most 1, of a change of wheel speeds that the wheels' speed and
     /// acceleration limits allow. The speed limits are convex, so every command between two allowed
     /// ones is allowed.
-    fn wheel_share(&self, from: WheelSpeeds, to: WheelSpeeds, dt_s: f64) -> f64 {
+    fn wheel_share(&self, wheels: Change<WheelSpeeds>, dt_s: f64) -> f64 {
         let limits = self.model.limits();
         let change_max_rad_s = limits.wheel_acceleration_max_rad_s2 * dt_s;
         let speed_max_rad_s = limits.wheel_speed_max_rad_s;
         [
-            (from.left_rad_s, to.left_rad_s),
-            (from.right_rad_s, to.right_rad_s),
+            wheels.map(|wheels| wheels.left_rad_s),
+            wheels.map(|wheels| wheels.right_rad_s),
         ]
         .into_iter()
-        .fold(1.0, |share: f64, (from, to)| {
+        .fold(1.0, |share: f64, Change { from, to }| {
             let change = (to - from).abs();
             let room = if to.abs() > from.abs() {
                 (speed_max_rad_s - from * to.signum()).max(0.0)
@@ -132,28 +151,24 @@ struct Step {
 }
 
 impl Step {
-    /// Returns `previous` moved towards `target`. A change of sign first uses `down_max` to reach
-    /// zero, then the rest of the step with `up_max`.
-    fn towards(self, target: f64, previous: f64) -> f64 {
+    /// Returns `from` moved towards `to`. A change of sign first uses `down_max` to reach zero,
+    /// then the rest of the step with `up_max`.
+    fn towards(self, Change { from, to }: Change<f64>) -> f64 {
         let Self { up_max, down_max } = self;
-        if previous * target >= 0.0 {
-            let sign = if previous.abs() > 0.0 {
-                previous
-            } else {
-                target
-            };
-            let gap = target.abs() - previous.abs();
+        if from * to >= 0.0 {
+            let sign = if from.abs() > 0.0 { from } else { to };
+            let gap = to.abs() - from.abs();
             return if (-down_max..=up_max).contains(&gap) {
-                target
+                to
             } else {
-                (previous.abs() + gap.clamp(-down_max, up_max)).copysign(sign)
+                (from.abs() + gap.clamp(-down_max, up_max)).copysign(sign)
             };
         }
-        if previous.abs() >= down_max {
-            return (previous.abs() - down_max).copysign(previous);
+        if from.abs() >= down_max {
+            return (from.abs() - down_max).copysign(from);
         }
-        let left = 1.0 - previous.abs() / down_max;
-        target.abs().min(up_max * left).copysign(target)
+        let left = 1.0 - from.abs() / down_max;
+        to.abs().min(up_max * left).copysign(to)
     }
 }
 
@@ -185,7 +200,7 @@ mod tests {
         ) {
             let model = RobotModel::yi2007();
             let limits = TwistLimits::of(&model);
-            let next = limits.step(from, to, limits.slowing_by_wheels(), dt_s);
+            let next = limits.step(Change { from, to }, limits.slowing_by_wheels(), dt_s);
             let linear = model.limits().linear_acceleration_max_m_s2 * dt_s;
             let angular = model.angular_acceleration_max_rad_s2() * dt_s;
             for (before, after, wanted, most) in [
@@ -205,7 +220,7 @@ mod tests {
             let limits = TwistLimits::of(&RobotModel::yi2007());
             let mut now = from;
             for _ in 0..600 {
-                now = limits.step(now, to, limits.slowing_by_wheels(), 0.01);
+                now = limits.step(Change { from: now, to }, limits.slowing_by_wheels(), 0.01);
             }
             prop_assert!((now.linear_m_s - to.linear_m_s).abs() < 1.0e-9);
             prop_assert!((now.angular_rad_s - to.angular_rad_s).abs() < 1.0e-9);
@@ -223,6 +238,7 @@ mod tests {
             linear_m_s: -0.4,
             angular_rad_s: 0.3,
         };
-        assert_eq!(limits.step(from, to, limits.slowing_by_wheels(), 0.0), from);
+        let change = Change { from, to };
+        assert_eq!(limits.step(change, limits.slowing_by_wheels(), 0.0), from);
     }
 }

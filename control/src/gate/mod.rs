@@ -13,7 +13,7 @@ pub mod teleoperation;
 
 use crate::measured::WheelSpeeds;
 use crate::robot::RobotModel;
-use crate::twist_limits::{Slowing, TwistLimits};
+use crate::twist_limits::{Change, Slowing, TwistLimits};
 
 /// Cause of a reduced command; later ones are stricter.
 #[derive(
@@ -302,9 +302,13 @@ pub fn gate_with(input: &GateInput, reasons: &Reasons, limits: &GateLimits) -> G
     }
     if input.feedback_age_s > LATE_SHARE * limits.feedback_age_max_s {
         let model = &limits.model;
-        let twist = |wheels: WheelSpeeds| model.twist_from_wheel_speeds(wheels);
-        let steady = teleoperation::no_faster(twist(previous), twist(target));
-        if steady != twist(target) {
+        let change = Change {
+            from: previous,
+            to: target,
+        }
+        .map(|wheels| model.twist_from_wheel_speeds(wheels));
+        let steady = teleoperation::no_faster(change);
+        if steady != change.to {
             target = model.wheel_speeds_from_twist(steady);
             note(GateCause::Acceleration);
         }
@@ -314,7 +318,11 @@ pub fn gate_with(input: &GateInput, reasons: &Reasons, limits: &GateLimits) -> G
         is_capped,
         real_m_s: reasons.real_m_s,
     };
-    let wheel_speeds = ramped(previous, target, step, limits);
+    let change = Change {
+        from: previous,
+        to: target,
+    };
+    let wheel_speeds = ramped(change, step, limits);
     let is_short = |got: f64, wanted: f64| (got - wanted).abs() > 1.0e-9;
     if is_short(wheel_speeds.left_rad_s, target.left_rad_s)
         || is_short(wheel_speeds.right_rad_s, target.right_rad_s)
@@ -377,23 +385,18 @@ fn scaled(speeds: WheelSpeeds, share: f64) -> WheelSpeeds {
     }
 }
 
-/// Returns the wheel speeds after `dt_s` from `previous` towards `target`.
+/// Returns the wheel speeds after one tick of a change.
 ///
 /// A nonzero target is approached within the limits of the twist, and slowing down within the
 /// wheels' limit, or within the braking limit along the path if a cap applies. For a zero target
 /// both sides are reduced by the same fraction, so that the robot stays on its arc.
-fn ramped(
-    previous: WheelSpeeds,
-    target: WheelSpeeds,
-    step: Step,
-    limits: &GateLimits,
-) -> WheelSpeeds {
+fn ramped(change: Change<WheelSpeeds>, step: Step, limits: &GateLimits) -> WheelSpeeds {
     let up = limits.wheel_acceleration_max_rad_s2 * step.dt_s;
     let braking = limits.wheel_braking_max_rad_s2 * step.dt_s;
-    if target == WheelSpeeds::default() {
-        let share = rest_share(previous, braking, up);
-        let slip = slip_share(previous, step.real_m_s, limits.wheel_radius_m, up);
-        return scaled(previous, 1.0 - share.max(slip));
+    if change.to == WheelSpeeds::default() {
+        let share = rest_share(change.from, braking, up);
+        let slip = slip_share(change.from, step.real_m_s, limits.wheel_radius_m, up);
+        return scaled(change.from, 1.0 - share.max(slip));
     }
     let twist_limits = TwistLimits::of(&limits.model);
     let by_wheels = twist_limits.slowing_by_wheels();
@@ -406,12 +409,11 @@ fn ramped(
         by_wheels
     };
     let model = &limits.model;
-    let from = model.twist_from_wheel_speeds(previous);
-    let to = model.twist_from_wheel_speeds(target);
-    let next = twist_limits.step(from, to, slowing, step.dt_s);
-    if next == to {
+    let twists = change.map(|wheels| model.twist_from_wheel_speeds(wheels));
+    let next = twist_limits.step(twists, slowing, step.dt_s);
+    if next == twists.to {
         // Returned as it is: conversion to a twist and back would round it.
-        return target;
+        return change.to;
     }
     model.wheel_speeds_from_twist(next)
 }

@@ -11,7 +11,7 @@
 use super::SLIP_LEAST_M_S;
 use crate::geometry::Twist;
 use crate::robot::RobotModel;
-use crate::twist_limits::{Slowing, TwistLimits};
+use crate::twist_limits::{Change, Slowing, TwistLimits};
 
 /// Age of commands up to which the full speed is allowed, seconds.
 pub const AGE_FULL_S: f64 = 0.15;
@@ -97,32 +97,32 @@ pub fn within_limits(twist: Twist, model: &RobotModel) -> (Twist, bool) {
     (within, over_ratio > 1.0)
 }
 
-/// Returns the twist after one tick of `dt_s` seconds from `previous` towards `target` within the
-/// robot's acceleration limits; decelerations may be twice as large.
-pub fn approach(previous: Twist, target: Twist, model: &RobotModel, dt_s: f64) -> Twist {
+/// Returns the twist after one tick of `dt_s` seconds of a change within the robot's acceleration
+/// limits; decelerations may be twice as large.
+pub fn approach(change: Change<Twist>, model: &RobotModel, dt_s: f64) -> Twist {
     let dt_s = if dt_s.is_finite() { dt_s.max(0.0) } else { 0.0 };
     let slowing = Slowing {
         linear_m_s2: 2.0 * model.limits().linear_acceleration_max_m_s2,
         angular_rad_s2: 2.0 * model.angular_acceleration_max_rad_s2(),
     };
-    TwistLimits::of(model).step(previous, target, slowing, dt_s)
+    TwistLimits::of(model).step(change, slowing, dt_s)
 }
 
-/// Limits a target to the magnitude and direction of the present command, per component.
+/// Limits the wanted command to the magnitude and direction of the present one, per component.
 ///
 /// Used near the end of a command: a robot that still gains speed when its driver falls silent
 /// would otherwise continue to accelerate.
-pub fn no_faster(previous: Twist, target: Twist) -> Twist {
-    let least = |previous: f64, target: f64| {
-        if previous * target > 0.0 {
-            target.abs().min(previous.abs()).copysign(target)
+pub fn no_faster(change: Change<Twist>) -> Twist {
+    let least = |Change { from, to }: Change<f64>| {
+        if from * to > 0.0 {
+            to.abs().min(from.abs()).copysign(to)
         } else {
             0.0
         }
     };
     Twist {
-        linear_m_s: least(previous.linear_m_s, target.linear_m_s),
-        angular_rad_s: least(previous.angular_rad_s, target.angular_rad_s),
+        linear_m_s: least(change.map(|twist| twist.linear_m_s)),
+        angular_rad_s: least(change.map(|twist| twist.angular_rad_s)),
     }
 }
 
@@ -176,7 +176,7 @@ mod tests {
             let target = Twist { linear_m_s: to, angular_rad_s: -to };
             let mut now = Twist { linear_m_s: from, angular_rad_s: from };
             for _ in 0..300 {
-                let next = approach(now, target, &model, 0.01);
+                let next = approach(Change { from: now, to: target }, &model, 0.01);
                 let (low, high) = (now.linear_m_s.min(to), now.linear_m_s.max(to));
                 prop_assert!((low - 1.0e-12..=high + 1.0e-12).contains(&next.linear_m_s));
                 now = next;
@@ -193,9 +193,9 @@ mod tests {
             wanted_m_s in -1.0..1.0_f64, wanted_rad_s in -2.0..2.0_f64,
             real_m_s in -1.0..1.0_f64,
         ) {
-            let previous = Twist { linear_m_s, angular_rad_s };
-            let target = Twist { linear_m_s: wanted_m_s, angular_rad_s: wanted_rad_s };
-            let steady = no_faster(previous, target);
+            let from = Twist { linear_m_s, angular_rad_s };
+            let to = Twist { linear_m_s: wanted_m_s, angular_rad_s: wanted_rad_s };
+            let steady = no_faster(Change { from, to });
             prop_assert!(steady.linear_m_s.abs() <= linear_m_s.abs().min(wanted_m_s.abs()));
             prop_assert!(steady.angular_rad_s.abs() <= angular_rad_s.abs().min(wanted_rad_s.abs()));
             prop_assert!(steady.linear_m_s * linear_m_s >= 0.0);

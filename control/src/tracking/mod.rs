@@ -44,7 +44,7 @@ use crate::geometry::{Twist, wrap_angle_rad};
 use crate::measured::{Measured, WheelSpeeds};
 use crate::reference::ReferenceSample;
 use crate::robot::{GRAVITY_M_S2, RobotModel};
-use crate::twist_limits::TwistLimits;
+use crate::twist_limits::{Change, TwistLimits};
 
 use action::{CanFollow, IntegralAction};
 pub use config::{CrossGains, TrackerConfig, TrackerError};
@@ -271,14 +271,16 @@ impl Tracker {
             + gains.yaw_rate * (wanted_rad_s - measured.twist.angular_rad_s)
             + (lead_s + slip_lead_s * yaw_shape) * reference.turn_acceleration_rad_s2
             + sideslip.rims.angular_rad_s;
-        let wanted = Twist {
-            linear_m_s,
-            angular_rad_s,
+        let change = Change {
+            from: self
+                .commanded
+                .unwrap_or_else(|| self.model.twist_from_wheel_speeds(measured.wheel_speeds)),
+            to: Twist {
+                linear_m_s,
+                angular_rad_s,
+            },
         };
-        let before = self
-            .commanded
-            .unwrap_or_else(|| self.model.twist_from_wheel_speeds(measured.wheel_speeds));
-        let (wheel_speeds, cut) = self.within_limits(before, wanted, dt_s);
+        let (wheel_speeds, cut) = self.within_limits(change, dt_s);
         self.commanded = Some(self.model.twist_from_wheel_speeds(wheel_speeds));
         self.was_cut = cut.by_wheels || cut.in_yaw;
         TrackerOutput {
@@ -397,7 +399,8 @@ impl Tracker {
 
     /// Returns the wheel speeds nearest to the wanted twist within every limit, and which speed
     /// limit cut it.
-    fn within_limits(&mut self, before: Twist, wanted: Twist, dt_s: f64) -> (WheelSpeeds, Cut) {
+    fn within_limits(&mut self, change: Change<Twist>, dt_s: f64) -> (WheelSpeeds, Cut) {
+        let Change { from, to: wanted } = change;
         let limits = self.model.limits();
         let reverse_max_m_s = REVERSE_MAX_M_S.min(limits.linear_max_m_s);
         let angular_max_rad_s = limits.angular_max_rad_s;
@@ -409,17 +412,14 @@ impl Tracker {
         };
         let turns_too_fast = wanted.angular_rad_s.abs() > angular_max_rad_s;
         let (wheels, saturated) = desaturated(&self.model, bounded);
-        let target = self.model.twist_from_wheel_speeds(wheels);
+        let to = self.model.twist_from_wheel_speeds(wheels);
         let twist_limits = TwistLimits::of(&self.model);
-        let next = twist_limits.step(before, target, twist_limits.slowing_by_wheels(), dt_s);
-        let cut = |wanted: f64, got: f64, most: f64| (wanted - got).clamp(-most, most);
+        let next = twist_limits.step(Change { from, to }, twist_limits.slowing_by_wheels(), dt_s);
+        let most = CARRIED_MAX;
         self.carried = Twist {
-            linear_m_s: cut(target.linear_m_s, next.linear_m_s, CARRIED_MAX.linear_m_s),
-            angular_rad_s: cut(
-                target.angular_rad_s,
-                next.angular_rad_s,
-                CARRIED_MAX.angular_rad_s,
-            ),
+            linear_m_s: (to.linear_m_s - next.linear_m_s).clamp(-most.linear_m_s, most.linear_m_s),
+            angular_rad_s: (to.angular_rad_s - next.angular_rad_s)
+                .clamp(-most.angular_rad_s, most.angular_rad_s),
         };
         (
             self.model.wheel_speeds_from_twist(next),

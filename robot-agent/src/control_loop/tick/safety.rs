@@ -8,6 +8,7 @@ use tread_control::gate::{GateCause, GateInput, GateLimits, GateOutput, Reasons,
 use tread_control::geometry::Twist;
 use tread_control::measured::WheelSpeeds;
 use tread_control::robot::RobotModel;
+use tread_control::twist_limits::Change;
 
 use super::demands::Demands;
 use super::estimation::{Estimated, real_m_s};
@@ -149,13 +150,15 @@ impl Safety {
         }
         let wanted = teleoperation.wanted_at(judged_us);
         let command = self.command.unwrap_or_default();
-        let previous = self.model.twist_from_wheel_speeds(command);
-        let mut target = wanted.unwrap_or_default();
+        let mut change = Change {
+            from: self.model.twist_from_wheel_speeds(command),
+            to: wanted.unwrap_or_default(),
+        };
         let ends_soon = teleoperation.ends_soon(judged_us);
         if ends_soon {
-            target = no_faster(previous, target);
+            change.to = no_faster(change);
         }
-        let mut twist = approach(previous, target, &self.model, input.tick.dt_s);
+        let mut twist = approach(change, &self.model, input.tick.dt_s);
         if ends_soon {
             twist = no_faster_than_real(twist, input.real_m_s());
         }
