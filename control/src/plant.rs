@@ -362,12 +362,12 @@ impl Plant {
     }
 
     fn runge_kutta(&mut self, command: WheelSpeeds, ground: &Ground, step_s: f64) {
-        let start = pack(&self.state);
+        let start = self.state;
         let rates_1 = self.rates(&start, command, ground);
         let rates_2 = self.rates(&advance(&start, &rates_1, 0.5 * step_s), command, ground);
         let rates_3 = self.rates(&advance(&start, &rates_2, 0.5 * step_s), command, ground);
         let rates_4 = self.rates(&advance(&start, &rates_3, step_s), command, ground);
-        let mut end = start;
+        let mut end = pack(&start);
         for index in 0..end.len() {
             end[index] += step_s / 6.0
                 * (rates_1[index] + 2.0 * (rates_2[index] + rates_3[index]) + rates_4[index]);
@@ -375,9 +375,8 @@ impl Plant {
         self.state = unpack(&end);
     }
 
-    fn rates(&self, packed: &Rates, command: WheelSpeeds, ground: &Ground) -> Rates {
-        let state = unpack(packed);
-        let contact = self.contact_forces(&state, ground);
+    fn rates(&self, state: &PlantState, command: WheelSpeeds, ground: &Ground) -> Rates {
+        let contact = self.contact_forces(state, ground);
         let (sin, cos) = state.pose.heading_rad.sin_cos();
         let (forward_m_s, left_m_s, yaw) =
             (state.forward_m_s, state.left_m_s, state.yaw_rate_rad_s);
@@ -491,10 +490,10 @@ fn unpack(packed: &Rates) -> PlantState {
     }
 }
 
-fn advance(start: &Rates, rates: &Rates, step_s: f64) -> Rates {
-    let mut end = *start;
+fn advance(start: &PlantState, rates: &Rates, step_s: f64) -> PlantState {
+    let mut end = pack(start);
     for (value, rate) in end.iter_mut().zip(rates) {
         *value += step_s * rate;
     }
-    end
+    unpack(&end)
 }

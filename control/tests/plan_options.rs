@@ -8,6 +8,7 @@ use tread_control::geometry::{Point, Pose};
 use tread_control::measured::Measured;
 use tread_control::plan::{
     Plan, PlanError, PlanOptions, SlowedBy, TractionLimitCell, TractionLimitMap,
+    TractionLimitMapSpec,
 };
 use tread_control::robot::{GRAVITY_M_S2, RobotModel};
 use tread_control::trajectory::{CircleSpec, Direction, Trajectory, Waypoint, WaypointsSpec};
@@ -139,7 +140,12 @@ fn a_plan_is_slow_only_where_the_ice_is_and_brakes_before_it() {
         iy,
         mu: if ix >= 5 { ICE_MU } else { HIGH_MU },
     });
-    let map = TractionLimitMap::new(1.0, squares.collect(), 0.14).unwrap();
+    let map = TractionLimitMap::new(TractionLimitMapSpec {
+        square_m: 1.0,
+        squares: squares.collect(),
+        elsewhere_mu: 0.14,
+    })
+    .unwrap();
     let along = PlanOptions {
         traction_limits: Some(&map),
         ..PlanOptions::default()

@@ -5,7 +5,7 @@
 
 use tread_api::{geometry as wire, robot, safety, trajectory};
 use tread_control::excitation::ExcitationSpec;
-use tread_control::fence::Fence;
+use tread_control::fence::{Fence, FenceSpec};
 use tread_control::geometry as control;
 use tread_control::plan::PlanOptions;
 use tread_control::robot::{Limits, RobotModel, RobotModelError, RobotModelSpec};
@@ -54,7 +54,10 @@ pub fn fence_of(geofence: &safety::Geofence) -> Fence {
         };
         polygons.iter().map(corners).collect()
     };
-    Fence::new(rings(&geofence.keep_in), rings(&geofence.keep_out))
+    Fence::new(&FenceSpec {
+        keep_in: rings(&geofence.keep_in),
+        keep_out: rings(&geofence.keep_out),
+    })
 }
 
 /// Returns the position of a pose as a point of the wire.

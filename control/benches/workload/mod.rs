@@ -2,7 +2,7 @@
 //! work.
 
 use tread_control::estimation::{Estimator, EstimatorPrior, SensorNoise, SensorSample};
-use tread_control::fence::{Fence, FenceInput};
+use tread_control::fence::{Fence, FenceInput, FenceSpec};
 use tread_control::follower::{Follower, FollowerConfig, FollowerOutput};
 use tread_control::friction::FrictionCurve;
 use tread_control::gate::{GateInput, GateLimits, Reasons, gate_with};
@@ -109,7 +109,10 @@ impl Robot {
     pub(crate) fn fenced(mut self) -> Self {
         let keep_out = [(2.7, 0.0), (-2.7, 0.0), (0.0, 2.6), (0.0, -2.6)];
         let keep_out = keep_out.map(|(x_m, y_m)| ring(x_m, y_m, 0.25, 100));
-        self.fence = Fence::new(vec![ring(0.0, 0.0, 4.8, 600)], keep_out.to_vec());
+        self.fence = Fence::new(&FenceSpec {
+            keep_in: vec![ring(0.0, 0.0, 4.8, 600)],
+            keep_out: keep_out.to_vec(),
+        });
         self
     }
 

@@ -3,7 +3,7 @@
 use nalgebra::{SMatrix, SVector};
 
 use super::offsets::OffsetKnowledge;
-use super::regression::{Normal, drive_known, inflation};
+use super::regression::{Normal, Solution, drive_known, inflation};
 use super::rows::{OFFSETS, ParameterMatrix, Parameters, Tangent, index};
 use super::sums::Sums;
 use super::{THETA_FIRST, THETA_RANGE, TyrePrior};
@@ -16,18 +16,19 @@ const REGULAR_SHARE: f64 = 1.0e-3;
 
 impl OffsetKnowledge {
     /// Returns the estimate updated with the sums of a ground, with θ and κ of the ground
-    /// marginalised. `theta` and the tyres in `found` serve as weights only. Works without
-    /// excitation of θ, too.
+    /// marginalised. θ and the tyres of `solution` serve as weights only. Works without excitation
+    /// of θ, too.
     pub(super) fn with_ground(
         &self,
         sums: &Sums,
         tyres: &TyrePrior,
-        theta: f64,
-        found: &TyrePrior,
+        solution: Option<&Solution>,
     ) -> Self {
         if sums.blocks == 0 {
             return *self;
         }
+        let found = solution.map_or(*tyres, |solution| solution.tyres(tyres));
+        let theta = solution.map_or(THETA_FIRST, |solution| solution.theta);
         let theta = theta.clamp(*THETA_RANGE.start(), *THETA_RANGE.end());
         let channels = sums.channels();
         let tangent = Tangent::at(theta, found.at(theta));

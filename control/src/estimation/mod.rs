@@ -449,11 +449,7 @@ impl Estimator {
     fn refresh_offsets(&mut self, solution: Option<&Solution>) {
         self.are_offsets_due = false;
         let sums = self.sums();
-        let theta_ground = solution.map_or(THETA_FIRST, |found| found.theta);
-        let tyres = solution.map_or(self.tyres, |found| found.tyres(&self.tyres));
-        let offsets = self
-            .offsets
-            .with_ground(&sums, &self.tyres, theta_ground, &tyres);
+        let offsets = self.offsets.with_ground(&sums, &self.tyres, solution);
         let (radius_offset, radius_difference) = offsets.values();
         self.estimate = Estimate {
             effective_track_ratio: sums.effective_track(&offsets).map(|track| track.value),
@@ -570,12 +566,9 @@ impl Estimator {
             .solve(&self.ground, None)
             .filter(|found| found.theta > 0.0);
         let tyres = before.map_or(self.tyres, |found| found.tyres(&self.tyres));
-        let offsets = self.offsets.with_ground(
-            &self.ground,
-            &self.tyres,
-            before.map_or(THETA_FIRST, |found| found.theta),
-            &tyres,
-        );
+        let offsets = self
+            .offsets
+            .with_ground(&self.ground, &self.tyres, before.as_ref());
         let whole = self.ground.plus(&segment);
         let theta = match &mut self.identification {
             Some(identification) => identification
@@ -647,11 +640,9 @@ impl Estimator {
     /// segment is dropped; close it first.
     pub fn begin_ground(&mut self) {
         let found = self.solve(&self.ground, None);
-        let theta = found.map_or(THETA_FIRST, |found| found.theta);
-        let tyres = found.map_or(self.tyres, |found| found.tyres(&self.tyres));
         self.offsets = self
             .offsets
-            .with_ground(&self.ground, &self.tyres, theta, &tyres)
+            .with_ground(&self.ground, &self.tyres, found.as_ref())
             .on_new_ground();
         self.ground = Sums::default();
         self.claims = Claims::default();

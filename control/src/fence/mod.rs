@@ -34,6 +34,22 @@ pub struct Fence {
     keep_out: Vec<Ring>,
 }
 
+/// Polygons of a fence; each is a list of corners in order, in the site frame.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct FenceSpec {
+    /// Polygons of which a robot must stay inside any one.
+    pub keep_in: Vec<Vec<Point>>,
+    /// Polygons outside which a robot must stay.
+    pub keep_out: Vec<Vec<Point>>,
+}
+
+/// Path of a disc's centre.
+struct CentrePath<F> {
+    /// Centre at an arc length of 0 to `length_m`, metres.
+    point_at: F,
+    length_m: f64,
+}
+
 /// First point of a path at which a robot's disc leaves the allowed ground.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Breach {
@@ -46,7 +62,7 @@ pub struct Breach {
     pub depth_m: f64,
 }
 
-/// Polygon of a fence, by its index in the list given to [`Fence::new`].
+/// Polygon of a fence, by its index in the list of [`FenceSpec`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FencePolygon {
     /// Polygon inside which a robot must stay.
@@ -75,13 +91,13 @@ pub fn disc_radius_m(model: &RobotModel) -> f64 {
 }
 
 impl Fence {
-    /// Creates a fence; each polygon is a list of corners in order, in the site frame.
-    pub fn new(keep_in: Vec<Vec<Point>>, keep_out: Vec<Vec<Point>>) -> Self {
+    /// Creates a fence.
+    pub fn new(spec: &FenceSpec) -> Self {
         let rings =
-            |polygons: Vec<Vec<Point>>| polygons.iter().map(|corners| Ring::new(corners)).collect();
+            |polygons: &[Vec<Point>]| polygons.iter().map(|corners| Ring::new(corners)).collect();
         Self {
-            keep_in: rings(keep_in),
-            keep_out: rings(keep_out),
+            keep_in: rings(&spec.keep_in),
+            keep_out: rings(&spec.keep_out),
         }
     }
 
@@ -149,16 +165,18 @@ impl Fence {
     /// allowed ground, or None.
     pub fn plan_breach(&self, plan: &Plan, model: &RobotModel) -> Option<Breach> {
         let radius_m = disc_radius_m(model) + MARGIN_M;
-        let point_at = |arc_m: f64| plan.path().sample(arc_m).pose.point();
-        self.first_breach(point_at, plan.length_m(), radius_m)
+        let path = CentrePath {
+            point_at: |arc_m| plan.path().sample(arc_m).pose.point(),
+            length_m: plan.length_m(),
+        };
+        self.first_breach(&path, radius_m)
     }
 
     /// Returns the first point of a path at which a disc of `radius_m` leaves the allowed ground,
-    /// or None. `point_at` gives the disc's centre for an arc length of 0 to `length_m`.
-    pub fn first_breach(
+    /// or None.
+    fn first_breach(
         &self,
-        point_at: impl Fn(f64) -> Point,
-        length_m: f64,
+        path: &CentrePath<impl Fn(f64) -> Point>,
         radius_m: f64,
     ) -> Option<Breach> {
         if self.is_empty() {
@@ -166,7 +184,7 @@ impl Fence {
         }
         let mut arc_m = 0.0;
         loop {
-            let point = point_at(arc_m);
+            let point = (path.point_at)(arc_m);
             let depth_m = radius_m - self.clearance_m(point);
             // NaN counts as a breach.
             if depth_m > 0.0 || depth_m.is_nan() {
@@ -176,11 +194,11 @@ impl Fence {
                     depth_m,
                 });
             }
-            if arc_m >= length_m {
+            if arc_m >= path.length_m {
                 return None;
             }
             // Clearance falls by at most the distance driven.
-            arc_m = (arc_m + (-depth_m).max(BREACH_STEP_M)).min(length_m);
+            arc_m = (arc_m + (-depth_m).max(BREACH_STEP_M)).min(path.length_m);
         }
     }
 }

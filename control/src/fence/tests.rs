@@ -19,10 +19,17 @@ fn square(x_m: f64, y_m: f64, half_m: f64) -> Vec<Point> {
 }
 
 fn yard() -> Fence {
-    Fence::new(
-        vec![square(0.0, 0.0, 5.0), square(8.0, 0.0, 4.0)],
-        vec![square(2.0, 2.0, 0.5)],
-    )
+    Fence::new(&FenceSpec {
+        keep_in: vec![square(0.0, 0.0, 5.0), square(8.0, 0.0, 4.0)],
+        keep_out: vec![square(2.0, 2.0, 0.5)],
+    })
+}
+
+fn within(corners: Vec<Point>) -> Fence {
+    Fence::new(&FenceSpec {
+        keep_in: vec![corners],
+        ..FenceSpec::default()
+    })
 }
 
 proptest! {
@@ -113,7 +120,7 @@ fn a_concave_polygon_is_inside_where_it_is() {
     let mut turned = corners.clone();
     turned.reverse();
     for corners in [corners, turned] {
-        let fence = Fence::new(vec![corners], Vec::new());
+        let fence = within(corners);
         for (x_m, y_m, clearance_m) in [
             (0.5, 2.0, 0.5),
             (3.0, 0.5, 0.5),
@@ -134,10 +141,7 @@ fn a_concave_polygon_is_inside_where_it_is() {
 
 #[test]
 fn along_a_fence_is_free_and_towards_it_is_slow() {
-    let (fence, model) = (
-        Fence::new(vec![square(0.0, 0.0, 5.0)], Vec::new()),
-        RobotModel::yi2007(),
-    );
+    let (fence, model) = (within(square(0.0, 0.0, 5.0)), RobotModel::yi2007());
     let gap_m = disc_radius_m(&model) + MARGIN_M + 0.05;
     let at = |heading_rad: f64| FenceInput {
         pose: Pose {
@@ -189,22 +193,26 @@ fn from_outside_only_the_way_back_is_open() {
 #[test]
 fn a_path_that_crosses_is_named_by_its_place() {
     let fence = yard();
-    let line = |y_m: f64| {
-        move |arc_m: f64| Point {
+    let line = |y_m: f64| CentrePath {
+        point_at: move |arc_m: f64| Point {
             x_m: arc_m - 4.0,
             y_m,
-        }
+        },
+        length_m: 10.0,
     };
-    assert_eq!(fence.first_breach(line(-1.0), 10.0, 0.3), None);
-    let breach = fence.first_breach(line(2.0), 10.0, 0.3).unwrap();
+    assert_eq!(fence.first_breach(&line(-1.0), 0.3), None);
+    let breach = fence.first_breach(&line(2.0), 0.3).unwrap();
     assert!((breach.point.x_m - 1.2).abs() < 0.05, "{breach:?}");
     assert!((breach.arc_m - 5.2).abs() < 0.05, "{breach:?}");
-    let nowhere = |_: f64| Point {
-        x_m: f64::NAN,
-        y_m: 0.0,
+    let nowhere = CentrePath {
+        point_at: |_: f64| Point {
+            x_m: f64::NAN,
+            y_m: 0.0,
+        },
+        length_m: 1.0,
     };
-    assert!(fence.first_breach(nowhere, 1.0, 0.3).is_some());
-    assert_eq!(Fence::default().first_breach(nowhere, 1.0, 0.3), None);
+    assert!(fence.first_breach(&nowhere, 0.3).is_some());
+    assert_eq!(Fence::default().first_breach(&nowhere, 0.3), None);
 }
 
 #[test]
@@ -257,5 +265,9 @@ fn a_fence_without_room_stops_every_way_of_driving() {
         };
         assert_eq!(fence.judge(&input, &model).speed_max_m_s, Some(0.0));
     }
-    assert!(fence.first_breach(|_| Point::default(), 1.0, 0.3).is_some());
+    let path = CentrePath {
+        point_at: |_: f64| Point::default(),
+        length_m: 1.0,
+    };
+    assert!(fence.first_breach(&path, 0.3).is_some());
 }

@@ -23,7 +23,7 @@ use crate::trajectory::{CircleSpec, Trajectory, WaypointsSpec};
 
 pub use error::PlanError;
 pub use slowed::{SLOWED_MAX, Slowed, SlowedBy};
-pub use traction_limit::{TractionLimitCell, TractionLimitMap};
+pub use traction_limit::{TractionLimitCell, TractionLimitMap, TractionLimitMapSpec};
 
 use limits::{Blame, NodeBounds, Shares, WHEEL_SHARE, node_limits, with_excitation};
 use slowed::{CellBounds, Stretches};
@@ -112,6 +112,14 @@ struct SpeedFrom {
     speed_m_s: f64,
 }
 
+/// The robot to plan for.
+#[derive(Clone, Copy)]
+struct Models<'a> {
+    /// With the least traction limit of the options applied.
+    limited: &'a RobotModel,
+    unlimited: &'a RobotModel,
+}
+
 impl Plan {
     /// Plans a trajectory from the pose of a stopped robot.
     ///
@@ -149,8 +157,10 @@ impl Plan {
             Some(mu) => model.within_traction_limit(mu),
             None => *model,
         };
-        let unlimited = model;
-        let model = &limited;
+        let models = Models {
+            limited: &limited,
+            unlimited: model,
+        };
         check_coordinate("the start pose", None, start.point())?;
         if !start.heading_rad.is_finite() {
             return Err(PlanError::NotFinite {
@@ -160,19 +170,18 @@ impl Plan {
             });
         }
         match trajectory {
-            Trajectory::Circle(circle) => Self::circle(circle, start, (model, unlimited), options),
-            Trajectory::Waypoints(waypoints) => {
-                Self::waypoints(waypoints, start, (model, unlimited), options)
-            }
+            Trajectory::Circle(circle) => Self::circle(circle, start, models, options),
+            Trajectory::Waypoints(waypoints) => Self::waypoints(waypoints, start, models, options),
         }
     }
 
     fn circle(
         circle: &CircleSpec,
         start: Pose,
-        (model, unlimited): (&RobotModel, &RobotModel),
+        models: Models<'_>,
         options: &PlanOptions<'_>,
     ) -> Result<Self, PlanError> {
+        let model = models.limited;
         check_coordinate("the centre", None, circle.center)?;
         if !(circle.radius_m >= RADIUS_MIN_M && circle.radius_m <= COORDINATE_MAX_M) {
             return Err(PlanError::Radius(circle.radius_m));
@@ -218,15 +227,16 @@ impl Plan {
                 speed_m_s: circle.speed_m_s,
             },
         ];
-        Self::timed(path, &speeds, approach_pieces, (model, unlimited), options)
+        Self::timed(path, &speeds, approach_pieces, models, options)
     }
 
     fn waypoints(
         spec: &WaypointsSpec,
         start: Pose,
-        (model, unlimited): (&RobotModel, &RobotModel),
+        models: Models<'_>,
         options: &PlanOptions<'_>,
     ) -> Result<Self, PlanError> {
+        let model = models.limited;
         let points = &spec.points;
         if points.len() < 2 {
             return Err(PlanError::TooFewWaypoints(points.len()));
@@ -311,7 +321,7 @@ impl Plan {
                 speed_m_s: asked.unwrap_or(spec.speed_m_s),
             });
         }
-        Self::timed(path, &speeds, approach_pieces, (model, unlimited), options)
+        Self::timed(path, &speeds, approach_pieces, models, options)
     }
 
     #[expect(
@@ -324,7 +334,10 @@ impl Plan {
         path: Path,
         speeds: &[SpeedFrom],
         approach_pieces: usize,
-        (model, unlimited): (&RobotModel, &RobotModel),
+        Models {
+            limited: model,
+            unlimited,
+        }: Models<'_>,
         options: &PlanOptions<'_>,
     ) -> Result<Self, PlanError> {
         let length_m = path.length_m();

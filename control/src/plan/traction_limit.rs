@@ -13,34 +13,34 @@ pub struct TractionLimitCell {
     pub mu: f64,
 }
 
+/// Content of a [`TractionLimitMap`].
+#[derive(Debug, Clone, PartialEq)]
+pub struct TractionLimitMapSpec {
+    /// Side length of a square, metres.
+    pub square_m: f64,
+    /// Known squares, in any order.
+    pub squares: Vec<TractionLimitCell>,
+    /// Lower bound of the peak friction coefficient away from all squares.
+    pub elsewhere_mu: f64,
+}
+
 /// Lower bounds of the peak friction coefficient by position, on a grid of squares in the site
 /// frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TractionLimitMap {
-    square_m: f64,
-    /// Sorted by `(iy, ix)`.
-    squares: Box<[TractionLimitCell]>,
-    elsewhere_mu: f64,
+    /// The squares are sorted by `(iy, ix)`.
+    spec: TractionLimitMapSpec,
 }
 
 impl TractionLimitMap {
-    /// Creates a map of squares with side `square_m`; `elsewhere_mu` holds away from all squares.
-    /// Returns None if a value is not finite or not above zero.
-    pub fn new(
-        square_m: f64,
-        mut squares: Vec<TractionLimitCell>,
-        elsewhere_mu: f64,
-    ) -> Option<Self> {
+    /// Creates a map. Returns None if a value is not finite or not above zero.
+    pub fn new(mut spec: TractionLimitMapSpec) -> Option<Self> {
         let is_possible = |value: f64| value.is_finite() && value > 0.0;
-        let all = is_possible(square_m)
-            && is_possible(elsewhere_mu)
-            && squares.iter().all(|square| is_possible(square.mu));
-        squares.sort_by_key(|square| (square.iy, square.ix));
-        all.then(|| Self {
-            square_m,
-            squares: squares.into_boxed_slice(),
-            elsewhere_mu,
-        })
+        let all = is_possible(spec.square_m)
+            && is_possible(spec.elsewhere_mu)
+            && spec.squares.iter().all(|square| is_possible(square.mu));
+        spec.squares.sort_by_key(|square| (square.iy, square.ix));
+        all.then_some(Self { spec })
     }
 
     /// Returns the minimum over the square at a point and its eight neighbours, so that a robot
@@ -51,15 +51,14 @@ impl TractionLimitMap {
             clippy::cast_possible_truncation,
             reason = "saturates, and no plan is as far away"
         )]
-        let index = |coordinate_m: f64| (coordinate_m / self.square_m).floor() as i32;
+        let index = |coordinate_m: f64| (coordinate_m / self.spec.square_m).floor() as i32;
         let (ix, iy) = (index(point.x_m), index(point.y_m));
         let mut least = f64::INFINITY;
         for row in iy.saturating_sub(1)..=iy.saturating_add(1) {
             let from = (row, ix.saturating_sub(1));
-            let first = self
-                .squares
-                .partition_point(|square| (square.iy, square.ix) < from);
-            let near = self.squares[first..]
+            let squares = &self.spec.squares;
+            let first = squares.partition_point(|square| (square.iy, square.ix) < from);
+            let near = squares[first..]
                 .iter()
                 .take_while(|square| square.iy == row && square.ix <= ix.saturating_add(1));
             least = near.fold(least, |least, square| least.min(square.mu));
@@ -67,14 +66,14 @@ impl TractionLimitMap {
         if least.is_finite() {
             least
         } else {
-            self.elsewhere_mu
+            self.spec.elsewhere_mu
         }
     }
 
     /// Returns the minimum over all squares and `elsewhere_mu`.
     pub fn least(&self) -> f64 {
-        let squares = self.squares.iter().map(|square| square.mu);
-        squares.fold(self.elsewhere_mu, f64::min)
+        let squares = self.spec.squares.iter().map(|square| square.mu);
+        squares.fold(self.spec.elsewhere_mu, f64::min)
     }
 }
 
@@ -91,7 +90,8 @@ mod tests {
             x_m in -8.0..8.0_f64, y_m in -8.0..8.0_f64, square_m in 0.5..2.0_f64,
         ) {
             let list = squares.iter().map(|(&(ix, iy), &mu)| TractionLimitCell { ix, iy, mu });
-            let map = TractionLimitMap::new(square_m, list.collect(), 0.14).unwrap();
+            let spec = TractionLimitMapSpec { square_m, squares: list.collect(), elsewhere_mu: 0.14 };
+            let map = TractionLimitMap::new(spec).unwrap();
             let (ix, iy) = ((x_m / square_m).floor(), (y_m / square_m).floor());
             let near = squares.iter().filter(|((column, row), _)| {
                 (f64::from(*column) - ix).abs() < 1.5 && (f64::from(*row) - iy).abs() < 1.5
@@ -112,9 +112,27 @@ mod tests {
                 iy: 0,
                 mu: bad,
             };
-            assert_eq!(TractionLimitMap::new(1.0, vec![square], 0.14), None);
-            assert_eq!(TractionLimitMap::new(bad, Vec::new(), 0.14), None);
-            assert_eq!(TractionLimitMap::new(1.0, Vec::new(), bad), None);
+            let good = TractionLimitMapSpec {
+                square_m: 1.0,
+                squares: Vec::new(),
+                elsewhere_mu: 0.14,
+            };
+            for spec in [
+                TractionLimitMapSpec {
+                    squares: vec![square],
+                    ..good.clone()
+                },
+                TractionLimitMapSpec {
+                    square_m: bad,
+                    ..good.clone()
+                },
+                TractionLimitMapSpec {
+                    elsewhere_mu: bad,
+                    ..good.clone()
+                },
+            ] {
+                assert_eq!(TractionLimitMap::new(spec), None);
+            }
         }
     }
 }

@@ -5,7 +5,7 @@
 
 use tread_api::site::{Cell, Grid};
 use tread_api::wire::command::{CellTractionLimit, PathPrior};
-use tread_control::plan::{TractionLimitCell, TractionLimitMap};
+use tread_control::plan::{TractionLimitCell, TractionLimitMap, TractionLimitMapSpec};
 use tread_control::tracking::ThetaKnowledge;
 
 /// Difference of the robot's and the map's θ, in standard deviations, beyond which the robot's own
@@ -67,7 +67,11 @@ impl Prior {
             iy: limit.cell.iy,
             mu: limit.mu,
         });
-        TractionLimitMap::new(grid.cell_m, squares.collect(), elsewhere_mu)
+        TractionLimitMap::new(TractionLimitMapSpec {
+            square_m: grid.cell_m,
+            squares: squares.collect(),
+            elsewhere_mu,
+        })
     }
 
     /// Returns the relative standard deviation of one robot's θ around the map's.

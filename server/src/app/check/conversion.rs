@@ -5,7 +5,7 @@ use tread_api::robot::RobotModel;
 use tread_api::safety::Geofence;
 use tread_api::trajectory::{Direction, Trajectory, Waypoint};
 use tread_control::excitation::ExcitationSpec;
-use tread_control::fence::Fence;
+use tread_control::fence::{Fence, FenceSpec};
 use tread_control::geometry as control;
 use tread_control::plan::PlanOptions;
 use tread_control::robot::{self, RobotModelError, RobotModelSpec};
@@ -24,7 +24,10 @@ pub(in crate::app) fn control_fence(geofence: &Geofence) -> Fence {
         };
         polygons.iter().map(ring).collect()
     };
-    Fence::new(rings(&geofence.keep_in), rings(&geofence.keep_out))
+    Fence::new(&FenceSpec {
+        keep_in: rings(&geofence.keep_in),
+        keep_out: rings(&geofence.keep_out),
+    })
 }
 
 /// Converts a robot model to the planner's type.

@@ -2,7 +2,7 @@
 
 use tread_api::site::Grid;
 use tread_api::wire::command::PathPrior;
-use tread_control::plan::{PlanOptions, TractionLimitCell, TractionLimitMap};
+use tread_control::plan::{PlanOptions, TractionLimitCell, TractionLimitMap, TractionLimitMapSpec};
 
 /// Traction limits of a plan; without any the robot model's own limits alone apply.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -24,11 +24,14 @@ impl Traction {
             iy: limit.cell.iy,
             mu: limit.mu,
         });
-        let cells = is_of_grid
-            .then(|| TractionLimitMap::new(grid.cell_m, cells.collect(), prior.traction_limit_mu));
+        let spec = is_of_grid.then(|| TractionLimitMapSpec {
+            square_m: grid.cell_m,
+            squares: cells.collect(),
+            elsewhere_mu: prior.traction_limit_mu,
+        });
         Self {
             least_mu: Some(prior.traction_limit_mu),
-            cells: cells.flatten(),
+            cells: spec.and_then(TractionLimitMap::new),
         }
     }
 
