@@ -92,23 +92,31 @@ impl Prior {
     }
 }
 
-/// Fuses both estimates of θ; returns the measured one alone if they differ by more than
-/// [`CONTRADICTION_STD_DEVS`].
-pub(crate) fn fused(
-    measured: Option<ThetaKnowledge>,
-    prior: Option<ThetaKnowledge>,
-) -> Option<ThetaKnowledge> {
-    match (measured, prior) {
-        (Some(measured), Some(prior)) => {
-            let apart = (measured.theta - prior.theta).abs();
-            let std_dev = measured.std_dev.hypot(prior.std_dev);
-            if apart > CONTRADICTION_STD_DEVS * std_dev {
-                Some(measured)
-            } else {
-                Some(measured.fused(prior))
+/// Estimates of θ of one place.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct ThetaSources {
+    /// The robot's own.
+    pub(crate) measured: Option<ThetaKnowledge>,
+    /// The map's.
+    pub(crate) prior: Option<ThetaKnowledge>,
+}
+
+impl ThetaSources {
+    /// Fuses both estimates; returns the measured one alone if they differ by more than
+    /// [`CONTRADICTION_STD_DEVS`].
+    pub(crate) fn fused(self) -> Option<ThetaKnowledge> {
+        match (self.measured, self.prior) {
+            (Some(measured), Some(prior)) => {
+                let apart = (measured.theta - prior.theta).abs();
+                let std_dev = measured.std_dev.hypot(prior.std_dev);
+                if apart > CONTRADICTION_STD_DEVS * std_dev {
+                    Some(measured)
+                } else {
+                    Some(measured.fused(prior))
+                }
             }
+            (measured, prior) => measured.or(prior),
         }
-        (measured, prior) => measured.or(prior),
     }
 }
 
@@ -204,6 +212,7 @@ mod tests {
 
     #[test]
     fn both_words_count_and_a_contradicted_map_does_not() {
+        let fused = |measured, prior| ThetaSources { measured, prior }.fused();
         let measured = knowledge(0.21, 0.02);
         let both = fused(Some(measured), Some(knowledge(0.19, 0.02))).unwrap();
         assert!((both.theta - 0.2).abs() < 1e-9 && both.std_dev < 0.02);

@@ -51,6 +51,14 @@ pub(super) struct DriveSummary {
     pub(super) is_heard: bool,
 }
 
+/// Both motions of the examination.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Drives {
+    /// Turn on the spot to the left.
+    pub(super) turned: DriveSummary,
+    pub(super) forward: DriveSummary,
+}
+
 /// Linear velocity as written in the odometry message, and the heading of its pose.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct PlanarTwist {

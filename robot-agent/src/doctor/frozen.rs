@@ -4,7 +4,7 @@
 //! The robot turned and drove, so every value that depends on motion must have changed. A frozen
 //! sensor differs from a robot that did not move in that another sensor measured the motion.
 
-use super::drove::{DriveSummary, Ranges};
+use super::drove::{DriveSummary, Drives, Ranges};
 use super::finding::Finding;
 use crate::drive::ros2::settings::Ros2Settings;
 
@@ -34,7 +34,7 @@ pub(super) struct Frozen {
 impl Frozen {
     /// Detects the sensors that were frozen during both motions; `gyro_bias_rad_s` is the gyro's
     /// offset.
-    pub(super) fn of(turned: &DriveSummary, forward: &DriveSummary, gyro_bias_rad_s: f64) -> Self {
+    pub(super) fn of(Drives { turned, forward }: &Drives, gyro_bias_rad_s: f64) -> Self {
         let ranges = turned.ranges.with(&forward.ranges);
         let turn_rad_s = turned.turn_rad_s.unwrap_or(gyro_bias_rad_s) - gyro_bias_rad_s;
         let seen = Seen::of(&ranges, turn_rad_s, forward);
@@ -64,12 +64,7 @@ impl Frozen {
     }
 
     /// Returns a finding for each frozen sensor.
-    pub(super) fn findings(
-        self,
-        settings: &Ros2Settings,
-        turned: &DriveSummary,
-        forward: &DriveSummary,
-    ) -> Vec<Finding> {
+    pub(super) fn findings(self, settings: &Ros2Settings, drives: &Drives) -> Vec<Finding> {
         let mut findings = Vec::new();
         if self.joints() {
             let which = match (self.left, self.right) {
@@ -82,7 +77,7 @@ impl Frozen {
             } else {
                 "drive.ros2.odometry.topic"
             };
-            let moved = moved(turned, forward);
+            let moved = moved(drives);
             let text = format!(
                 "{which} the same speed all the time, though the robot moved ({moved}): they froze"
             );
@@ -117,7 +112,7 @@ impl Frozen {
 }
 
 /// Describes the motion measured by all sensors but the wheels, for people.
-fn moved(turned: &DriveSummary, forward: &DriveSummary) -> String {
+fn moved(Drives { turned, forward }: &Drives) -> String {
     let mut parts = Vec::new();
     if let Some(turn_rad_s) = turned.turn_rad_s {
         parts.push(format!("turned at {turn_rad_s:.2} rad/s"));
@@ -172,7 +167,7 @@ mod tests {
     use crate::drive::ros2::tests::settings;
 
     /// Returns both motions of a robot with some frozen sensors, which moved or not.
-    fn robot(frozen: Frozen, moves: bool, noise: f64) -> [DriveSummary; 2] {
+    fn robot(frozen: Frozen, moves: bool, noise: f64) -> Drives {
         let mut random = 1_u32;
         let mut measured = |value: f64, is_frozen: bool| {
             if is_frozen {
@@ -181,7 +176,7 @@ mod tests {
             random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
             value + noise * (f64::from(random >> 8) / f64::from(1_u32 << 24) - 0.5)
         };
-        [(-1.0, 1.0), (1.0, 1.0)].map(|(left, right): (f64, f64)| {
+        let [turned, forward] = [(-1.0, 1.0), (1.0, 1.0)].map(|(left, right): (f64, f64)| {
             let scale = if moves { 1.0 } else { 0.0 };
             let (turn, forward) = (scale * (right - left), scale * (left + right));
             let mut drove = DriveSummary {
@@ -217,12 +212,12 @@ mod tests {
                     .add(measured(0.3 * turn * share, frozen.position));
             }
             drove
-        })
+        });
+        Drives { turned, forward }
     }
 
     fn found(frozen: Frozen, moves: bool, noise: f64) -> Frozen {
-        let [turned, forward] = robot(frozen, moves, noise);
-        Frozen::of(&turned, &forward, 0.0)
+        Frozen::of(&robot(frozen, moves, noise), 0.0)
     }
 
     #[test]
@@ -266,9 +261,8 @@ mod tests {
                 "drive.ros2.odometry.topic",
             ),
         ] {
-            let [turned, forward] = robot(frozen, true, 0.01);
-            let findings =
-                Frozen::of(&turned, &forward, 0.0).findings(&settings(), &turned, &forward);
+            let drives = robot(frozen, true, 0.01);
+            let findings = Frozen::of(&drives, 0.0).findings(&settings(), &drives);
             let keys: Vec<_> = findings.iter().filter_map(|finding| finding.key).collect();
             assert_eq!(keys, [key], "{frozen:?}");
         }
@@ -281,11 +275,11 @@ mod tests {
 
     #[test]
     fn a_gyro_with_a_bias_did_not_see_a_robot_turn_that_stood() {
-        let [mut turned, forward] = robot(Frozen::default(), false, 0.0);
-        turned.turn_rad_s = Some(0.3);
-        turned.ranges.gyro.add(0.3);
-        assert_eq!(Frozen::of(&turned, &forward, 0.3), Frozen::default());
-        let found = Frozen::of(&turned, &forward, 0.0);
+        let mut drives = robot(Frozen::default(), false, 0.0);
+        drives.turned.turn_rad_s = Some(0.3);
+        drives.turned.ranges.gyro.add(0.3);
+        assert_eq!(Frozen::of(&drives, 0.3), Frozen::default());
+        let found = Frozen::of(&drives, 0.0);
         assert!(found.left && found.right, "{found:?}");
     }
 

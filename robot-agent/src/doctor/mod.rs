@@ -32,7 +32,7 @@ use tread_control::measured::WheelSpeeds;
 use tread_control::robot::RobotModel;
 use tread_control::twist_limits::TwistLimits;
 
-use self::drove::DriveSummary;
+use self::drove::{DriveSummary, Drives};
 use self::finding::Finding;
 use self::heard::{Heard, Message};
 use self::parameters::Parameters;
@@ -226,9 +226,8 @@ impl ExaminedDrive {
             findings.push(finding);
             return findings;
         }
-        findings.extend(moving::findings(
-            settings, model, &turned, &forward, bias_rad_s,
-        ));
+        let drives = Drives { turned, forward };
+        findings.extend(moving::findings(settings, model, &drives, bias_rad_s));
         findings.push(if findings.iter().all(|finding| finding.holds) {
             self.parameters.finding()
         } else {

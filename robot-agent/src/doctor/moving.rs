@@ -7,7 +7,7 @@
 use tread_control::measured::WheelSpeeds;
 use tread_control::robot::RobotModel;
 
-use super::drove::DriveSummary;
+use super::drove::{DriveSummary, Drives};
 use super::finding::Finding;
 use super::frozen::Frozen;
 use super::signs::{self, Answers};
@@ -45,10 +45,10 @@ fn directions(said: WheelSpeeds, drove: &DriveSummary) -> [i8; 2] {
 pub(super) fn findings(
     settings: &Ros2Settings,
     model: &RobotModel,
-    turned: &DriveSummary,
-    forward: &DriveSummary,
+    drives: &Drives,
     gyro_bias_rad_s: f64,
 ) -> Vec<Finding> {
+    let Drives { turned, forward } = drives;
     if !(turned.is_heard && forward.is_heard) {
         return vec![Finding::wrong(
             "wheels",
@@ -64,8 +64,8 @@ pub(super) fn findings(
             "the wheels said nothing while they were commanded to move",
         )];
     };
-    let frozen = Frozen::of(turned, forward, gyro_bias_rad_s);
-    let mut findings = frozen.findings(settings, turned, forward);
+    let frozen = Frozen::of(drives, gyro_bias_rad_s);
+    let mut findings = frozen.findings(settings, drives);
     if frozen.left || frozen.right {
         let text = "sides, signs, radius and track: they need the joints";
         findings.push(Finding::skipped("sides", text));
@@ -111,25 +111,20 @@ pub(super) fn findings(
         .map(|ground_m_s| 2.0 * ground_m_s / (going.left_rad_s + going.right_rad_s));
     findings.extend(radius_m.map(|radius_m| of_radius(model, radius_m)));
     let radius_m = radius_m.unwrap_or(model.wheel_radius_m());
-    let turned_of_track = DriveSummary {
-        turn_blocks: if frozen.gyro {
-            Vec::new()
-        } else {
-            turned.turn_blocks.clone()
-        },
-        ..turned.clone()
-    };
+    let mut of_track = drives.clone();
+    if frozen.gyro {
+        of_track.turned.turn_blocks.clear();
+    }
     findings.extend(track::findings(
         settings,
         model,
-        &turned_of_track,
-        forward,
+        &of_track,
         track::Calibration {
             radius_m,
             gyro_bias_rad_s,
         },
     ));
-    findings.extend(pulling::findings(settings, model, turned, forward));
+    findings.extend(pulling::findings(settings, model, drives));
     findings
 }
 
@@ -233,7 +228,7 @@ mod tests {
     }
 
     /// Returns both motions of the paper's robot without any fault.
-    fn healthy() -> [DriveSummary; 2] {
+    fn healthy() -> Drives {
         let turn_rad_s = 2.0 * 0.2 / RobotModel::yi2007().effective_track_m();
         let turned = DriveSummary {
             commanded: speeds(-2.5, 2.5),
@@ -275,40 +270,36 @@ mod tests {
             is_heard: true,
             ..DriveSummary::default()
         };
-        [turned, forward]
-    }
-
-    fn keys(turned: &DriveSummary, forward: &DriveSummary) -> Vec<&'static str> {
-        let found = findings(&settings(), &RobotModel::yi2007(), turned, forward, 0.0);
-        found.iter().filter_map(|finding| finding.key).collect()
+        Drives { turned, forward }
     }
 
     /// The paper's base, with its own track width and radius.
-    fn keys_of(change: impl Fn(&mut DriveSummary, &mut DriveSummary)) -> Vec<&'static str> {
-        let [mut turned, mut forward] = healthy();
-        change(&mut turned, &mut forward);
-        keys(&turned, &forward)
+    fn keys_of(change: impl Fn(&mut Drives)) -> Vec<&'static str> {
+        let mut drives = healthy();
+        change(&mut drives);
+        let found = findings(&settings(), &RobotModel::yi2007(), &drives, 0.0);
+        found.iter().filter_map(|finding| finding.key).collect()
     }
 
     #[test]
     fn nothing_is_wrong_with_a_healthy_robot() {
-        assert_eq!(keys_of(|_, _| {}), Vec::<&str>::new());
+        assert_eq!(keys_of(|_| {}), Vec::<&str>::new());
     }
 
     #[test]
     fn frozen_joints_of_a_robot_that_moved_are_not_a_command_that_nobody_takes() {
-        let still = |turned: &mut DriveSummary, forward: &mut DriveSummary| {
-            for drove in [turned, forward] {
+        let still = |drives: &mut Drives| {
+            for drove in [&mut drives.turned, &mut drives.forward] {
                 drove.wheels = Some(speeds(0.0, 0.0));
                 drove.ranges.left = moving([0.0, 0.0]);
                 drove.ranges.right = moving([0.0, 0.0]);
             }
         };
         assert_eq!(keys_of(still), ["drive.ros2.joints.topic"]);
-        let of_a_robot_that_stood = keys_of(|turned, forward| {
-            still(turned, forward);
-            turned.turn_rad_s = Some(0.001);
-            for drove in [turned, forward] {
+        let of_a_robot_that_stood = keys_of(|drives| {
+            still(drives);
+            drives.turned.turn_rad_s = Some(0.001);
+            for drove in [&mut drives.turned, &mut drives.forward] {
                 drove.ranges.gyro = moving([0.0, 0.001]);
                 drove.ranges.odometry_forward = moving([0.0, 0.0]);
             }
@@ -318,10 +309,10 @@ mod tests {
 
     #[test]
     fn frozen_odometry_is_not_a_radius_of_zero() {
-        let frozen = keys_of(|turned, forward| {
-            forward.odometry_m_s = Some(0.0);
-            forward.twist = None;
-            for drove in [turned, forward] {
+        let frozen = keys_of(|drives| {
+            drives.forward.odometry_m_s = Some(0.0);
+            drives.forward.twist = None;
+            for drove in [&mut drives.turned, &mut drives.forward] {
                 drove.ranges.odometry_forward = moving([0.0, 0.0]);
                 drove.ranges.odometry_turn = moving([0.0, 0.0]);
             }
@@ -331,7 +322,7 @@ mod tests {
 
     #[test]
     fn a_twist_of_the_world_is_neither_a_radius_nor_a_sign() {
-        let world = keys_of(|_, forward| {
+        let world = keys_of(|Drives { forward, .. }| {
             let heading_rad: f64 = 2.8;
             forward.odometry_m_s = Some(0.2 * heading_rad.cos());
             forward.twist = Some(PlanarTwist {
@@ -345,7 +336,7 @@ mod tests {
 
     #[test]
     fn one_side_inverted_is_a_sign_and_no_twist_after_a_turn_half_around() {
-        let inverted = keys_of(|turned, forward| {
+        let inverted = keys_of(|Drives { turned, forward }| {
             turned.wheels = Some(speeds(2.5, 2.5));
             forward.wheels = Some(speeds(-2.5001, 2.5));
             forward.twist = Some(PlanarTwist {
@@ -360,21 +351,13 @@ mod tests {
 
     #[test]
     fn a_radius_is_reported_from_the_distance_over_ground_with_the_line_that_mends_it() {
-        let [turned, mut forward] = healthy();
-        let turned = DriveSummary {
-            turn_rad_s: turned.turn_rad_s.map(|rate| 1.25 * rate),
-            turn_blocks: turned
-                .turn_blocks
-                .iter()
-                .map(|block| TurnBlock {
-                    turn_rad_s: 1.25 * block.turn_rad_s,
-                    ..*block
-                })
-                .collect(),
-            ..turned
-        };
-        forward.odometry_m_s = Some(0.25);
-        let found = findings(&settings(), &RobotModel::yi2007(), &turned, &forward, 0.0);
+        let mut drives = healthy();
+        drives.turned.turn_rad_s = drives.turned.turn_rad_s.map(|rate| 1.25 * rate);
+        for block in &mut drives.turned.turn_blocks {
+            block.turn_rad_s *= 1.25;
+        }
+        drives.forward.odometry_m_s = Some(0.25);
+        let found = findings(&settings(), &RobotModel::yi2007(), &drives, 0.0);
         let wrong: Vec<_> = found.iter().filter(|finding| !finding.holds).collect();
         let [wrong] = wrong.as_slice() else {
             panic!("{found:#?}");
@@ -385,7 +368,7 @@ mod tests {
 
     #[test]
     fn one_side_that_stands_is_named() {
-        let keys = keys_of(|turned, forward| {
+        let keys = keys_of(|Drives { turned, forward }| {
             turned.wheels = Some(speeds(0.0, 2.5));
             forward.wheels = Some(speeds(0.001, 2.5));
         });

@@ -11,7 +11,7 @@
 
 use tread_control::robot::RobotModel;
 
-use super::drove::{AccelerationPhase, DriveSummary};
+use super::drove::{AccelerationPhase, DriveSummary, Drives};
 use super::finding::Finding;
 use crate::drive::ros2::settings::{Effort, JointSettings, Ros2Settings};
 
@@ -41,8 +41,7 @@ struct Pull {
 pub(super) fn findings(
     settings: &Ros2Settings,
     model: &RobotModel,
-    turned: &DriveSummary,
-    forward: &DriveSummary,
+    Drives { turned, forward }: &Drives,
 ) -> Option<Finding> {
     let joints = settings.joints.as_ref()?;
     let effort = joints.effort;
@@ -236,7 +235,7 @@ mod tests {
             }),
             ..DriveSummary::default()
         };
-        findings(&settings, &model, &turned, &forward)
+        findings(&settings, &model, &Drives { turned, forward })
     }
 
     fn key(effort: Effort, friction: f64, factors: [f64; 2]) -> Option<&'static str> {

@@ -15,7 +15,7 @@
 //! cannot be distinguished from another ground: the finding states the range, for comparison with a
 //! tape measure.
 
-use super::drove::{DriveSummary, TurnBlock};
+use super::drove::{Drives, TurnBlock};
 use super::finding::Finding;
 use crate::drive::ros2::settings::{CommandKind, Ros2Settings};
 use tread_control::robot::RobotModel;
@@ -145,8 +145,7 @@ struct Obeyed {
 pub(super) fn findings(
     settings: &Ros2Settings,
     model: &RobotModel,
-    turned: &DriveSummary,
-    forward: &DriveSummary,
+    Drives { turned, forward }: &Drives,
     calibration: Calibration,
 ) -> Vec<Finding> {
     let (Some(turning), Some(going)) = (turned.wheels, forward.wheels) else {

@@ -18,7 +18,7 @@ use super::sensing::{CheckedSample, Sensed};
 use super::{Tick, age_s};
 use crate::control_loop::channels::{ClosedSegment, Fault};
 use crate::control_loop::gain::GroundRecord;
-use crate::control_loop::prior::{Prior, fused};
+use crate::control_loop::prior::{Prior, ThetaSources};
 use crate::control_loop::progress::ProgressWatch;
 use crate::control_loop::segments::{CutInput, Place, SegmentCutter};
 use crate::control_loop::site_view::{GroundUnderWheels, SiteView};
@@ -405,7 +405,11 @@ impl Ground {
         GroundRecord {
             traction_limit_mu: prior.traction_limit_mu(),
             is_on_the_map: mapped.is_some(),
-            given: fused(self.measured, mapped),
+            given: ThetaSources {
+                measured: self.measured,
+                prior: mapped,
+            }
+            .fused(),
             measured: self.measured,
         }
     }

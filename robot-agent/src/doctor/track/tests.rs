@@ -3,6 +3,7 @@ use tread_control::measured::WheelSpeeds;
 use tread_control::robot::{RobotModel, RobotModelSpec};
 
 use super::*;
+use crate::doctor::DriveSummary;
 use crate::drive::ros2::tests::settings;
 
 /// Independent model of a robot, with the forces of its four contacts computed individually.
@@ -46,7 +47,7 @@ impl Truth {
 
     /// Returns the measurements of both motions with the track width `command_m` in the
     /// configured command.
-    fn drive(&self, command_m: f64, noise: f64, bias_rad_s: f64) -> [DriveSummary; 2] {
+    fn drive(&self, command_m: f64, noise: f64, bias_rad_s: f64) -> Drives {
         let commanded = 0.2 / self.radius_m;
         let wheels_rad_s = commanded * self.base_track_m / command_m;
         let turn_rad_s = self.turn_rad_s(wheels_rad_s * self.radius_m);
@@ -61,19 +62,19 @@ impl Truth {
                 turn_rad_s: turn_rad_s * (1.0 + sign) + bias_rad_s,
             }
         });
-        [
-            DriveSummary {
+        Drives {
+            turned: DriveSummary {
                 commanded: speeds(-commanded, commanded),
                 wheels: Some(speeds(-wheels_rad_s, wheels_rad_s)),
                 turn_blocks: blocks.collect(),
                 ..DriveSummary::default()
             },
-            DriveSummary {
+            forward: DriveSummary {
                 commanded: speeds(commanded, commanded),
                 wheels: Some(speeds(commanded, commanded)),
                 ..DriveSummary::default()
             },
-        ]
+        }
     }
 
     fn examined(&self, model_m: f64, command_m: f64, noise: f64, bias_rad_s: f64) -> Vec<Finding> {
@@ -86,12 +87,10 @@ impl Truth {
         let model = RobotModel::try_from(spec).unwrap();
         let mut settings = settings();
         settings.command.base_track_m = command_m;
-        let [turned, forward] = self.drive(command_m, noise, bias_rad_s);
         findings(
             &settings,
             &model,
-            &turned,
-            &forward,
+            &self.drive(command_m, noise, bias_rad_s),
             Calibration {
                 radius_m: self.radius_m,
                 gyro_bias_rad_s: bias_rad_s,
@@ -207,7 +206,7 @@ proptest! {
     ) {
         let wheelbase_m = wheelbase_share * track_m;
         let truth = Truth { track_m, wheelbase_m, radius_m: 0.1, ratio, base_track_m: track_m };
-        let [turned, _] = truth.drive(track_m, noise, 0.0);
+        let turned = truth.drive(track_m, noise, 0.0).turned;
         let calibration = Calibration { radius_m: 0.1, gyro_bias_rad_s: 0.0 };
         let found = EffectiveTrack::measured(&turned.turn_blocks, calibration).unwrap();
         let expected_m = track_m + ratio * wheelbase_m.powi(2) / track_m;

@@ -2,6 +2,8 @@
 //!
 //! Pure. A message that is not entirely valid is refused as a whole, with the reason.
 
+use std::ops::RangeInclusive;
+
 use tread_control::geometry::{Pose, wrap_angle_rad};
 use tread_control::localisation::FixNoise;
 use tread_control::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
@@ -17,14 +19,16 @@ use super::settings::{
 };
 use crate::drive::Battery;
 
-/// Largest accepted speed or rate, m/s or rad/s.
-const RATE_MAX: f64 = 100.0;
-/// Largest accepted acceleration, m/s².
-const ACCELERATION_MAX_M_S2: f64 = 200.0;
+/// Accepted speeds and rates, m/s or rad/s.
+const RATE_RANGE: RangeInclusive<f64> = -100.0..=100.0;
+/// Accepted accelerations, m/s².
+const ACCELERATION_RANGE_M_S2: RangeInclusive<f64> = -200.0..=200.0;
 /// Largest accepted torque, N m.
 const TORQUE_MAX_N_M: f64 = 1.0e5;
-/// Largest accepted coordinate, metres.
-const PLACE_MAX_M: f64 = 1.0e6;
+/// Accepted coordinates, metres.
+const PLACE_RANGE_M: RangeInclusive<f64> = -1.0e6..=1.0e6;
+/// Largest accepted voltage.
+const VOLTAGE_MAX_V: f64 = 1000.0;
 /// Largest accepted standard deviation: metres (or m/s), radians.
 const DEVIATION_MAX: f64 = 10.0;
 /// Lower bounds of a fix's standard deviations, metres and radians; smaller ones are raised to
@@ -95,10 +99,10 @@ pub struct Position {
 /// Stamp and content of a message. The stamp is not used for a battery.
 pub type Reading = (Time, Content);
 
-/// Returns the value if its magnitude is at most `most`.
-fn bounded(value: f64, most: f64) -> Result<f64, Refusal> {
-    // NaN fails every comparison.
-    if value.abs() <= most {
+/// Returns the value if it is within its range.
+fn bounded(value: f64, range: &RangeInclusive<f64>) -> Result<f64, Refusal> {
+    // No range contains NaN.
+    if range.contains(&value) {
         Ok(value)
     } else {
         Err(Refusal::Value)
@@ -133,8 +137,8 @@ fn check_frame(frame: &str, expected: &str) -> Result<(), Refusal> {
 /// Converts a ROS pose to a planar pose.
 fn flat(pose: &messages::Pose) -> Result<Pose, Refusal> {
     Ok(Pose {
-        x_m: bounded(pose.position.x, PLACE_MAX_M)?,
-        y_m: bounded(pose.position.y, PLACE_MAX_M)?,
+        x_m: bounded(pose.position.x, &PLACE_RANGE_M)?,
+        y_m: bounded(pose.position.y, &PLACE_RANGE_M)?,
         heading_rad: pose.orientation.yaw_rad().ok_or(Refusal::Value)?,
     })
 }
@@ -203,7 +207,7 @@ pub fn joints(bytes: &[u8], settings: &JointSettings) -> Result<Option<Reading>,
             let index = message.name.iter().position(|name| name == known);
             let index = index.ok_or(Refusal::Joints)?;
             let turned = message.velocity.get(index).ok_or(Refusal::Joints)?;
-            speed_rad_s += bounded(turned / settings.gear_ratio, RATE_MAX)?;
+            speed_rad_s += bounded(turned / settings.gear_ratio, &RATE_RANGE)?;
             let effort = message.effort.get(index).filter(|_| has_effort);
             torque_n_m = match (settings.effort.torque_n_m(), effort) {
                 (Some(constant), Some(effort)) => {
@@ -261,11 +265,11 @@ pub fn imu(bytes: &[u8], settings: &ImuSettings) -> Result<Reading, Refusal> {
         None
     } else {
         let felt = message.linear_acceleration;
-        let most = ACCELERATION_MAX_M_S2;
+        let range = ACCELERATION_RANGE_M_S2;
         // Without an orientation the unit is assumed to be level.
         let up = up.unwrap_or_default();
-        let x = bounded(felt.x, most)? - GRAVITY_M_S2 * up.x;
-        let y = flip * (bounded(felt.y, most)? - GRAVITY_M_S2 * up.y);
+        let x = bounded(felt.x, &range)? - GRAVITY_M_S2 * up.x;
+        let y = flip * (bounded(felt.y, &range)? - GRAVITY_M_S2 * up.y);
         let (sin, cos) = settings.yaw_rad.sin_cos();
         Some(BodyAcceleration {
             forward_m_s2: cos * x - sin * y,
@@ -277,7 +281,7 @@ pub fn imu(bytes: &[u8], settings: &ImuSettings) -> Result<Reading, Refusal> {
         None => None,
     };
     let inertial = Inertial {
-        yaw_rate_rad_s: flip * bounded(message.angular_velocity.z, RATE_MAX)?,
+        yaw_rate_rad_s: flip * bounded(message.angular_velocity.z, &RATE_RANGE)?,
         yaw_rate_std_dev: std_dev(message.angular_velocity_covariance[8])?,
         acceleration,
         acceleration_std_dev,
@@ -300,9 +304,9 @@ pub fn odometry(bytes: &[u8], settings: &OdometrySettings) -> Result<Reading, Re
         None => None,
     };
     let motion = Motion {
-        forward_m_s: bounded(twist.linear.x, RATE_MAX)?,
+        forward_m_s: bounded(twist.linear.x, &RATE_RANGE)?,
         forward_std_dev: std_dev(covariance[0][0])?,
-        yaw_rate_rad_s: bounded(twist.angular.z, RATE_MAX)?,
+        yaw_rate_rad_s: bounded(twist.angular.z, &RATE_RANGE)?,
         position,
     };
     Ok((message.header.stamp, Content::Motion(motion)))
@@ -330,7 +334,7 @@ pub fn battery(bytes: &[u8]) -> Result<Option<Reading>, Refusal> {
     }
     let charge_ratio = f64::from(message.percentage);
     let voltage_v = f64::from(message.voltage);
-    if !(0.0..=1.0).contains(&charge_ratio) || !(0.0..=RATE_MAX * 10.0).contains(&voltage_v) {
+    if !(0.0..=1.0).contains(&charge_ratio) || !(0.0..=VOLTAGE_MAX_V).contains(&voltage_v) {
         return Err(Refusal::Value);
     }
     let battery = Battery {
