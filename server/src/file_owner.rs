@@ -10,28 +10,38 @@ use nix::unistd::Uid;
 
 use crate::paths::folder_of;
 
+/// Owner of a file.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Owner {
+    pub(crate) uid: u32,
+    pub(crate) gid: u32,
+}
+
 /// Returns user and group of a folder that another user owns, if this process runs as root.
 ///
 /// # Errors
 /// The folder cannot be examined.
-pub(crate) fn service_owner(folder: &Path) -> anyhow::Result<Option<(u32, u32)>> {
+pub(crate) fn service_owner(folder: &Path) -> anyhow::Result<Option<Owner>> {
     if !Uid::effective().is_root() {
         return Ok(None);
     }
     let found =
         fs::metadata(folder).with_context(|| format!("cannot look at `{}`", folder.display()))?;
-    Ok((found.uid() != 0).then(|| (found.uid(), found.gid())))
+    Ok((found.uid() != 0).then(|| Owner {
+        uid: found.uid(),
+        gid: found.gid(),
+    }))
 }
 
 /// Changes the owner of root's files: a file, or a folder with everything in it.
 ///
 /// # Errors
 /// A file cannot be examined, or its owner cannot be changed.
-pub(crate) fn chown_recursively(path: &Path, owner: (u32, u32)) -> anyhow::Result<()> {
+pub(crate) fn chown_recursively(path: &Path, owner: Owner) -> anyhow::Result<()> {
     let named = || format!("cannot change the owner of `{}`", path.display());
     let found = fs::symlink_metadata(path).with_context(named)?;
     if found.uid() == 0 {
-        lchown(path, Some(owner.0), Some(owner.1)).with_context(named)?;
+        lchown(path, Some(owner.uid), Some(owner.gid)).with_context(named)?;
     }
     if found.is_dir() {
         for entry in fs::read_dir(path).with_context(named)? {

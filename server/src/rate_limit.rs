@@ -14,6 +14,13 @@ pub(crate) struct RateLimit {
     pub(crate) interval: Duration,
 }
 
+impl RateLimit {
+    /// Creates a limit.
+    pub(crate) const fn new(burst: u32, interval: Duration) -> Self {
+        Self { burst, interval }
+    }
+}
+
 /// Used part of a rate limit; the default is unused. All times are durations since one monotonic
 /// origin.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

@@ -6,6 +6,7 @@
 
 use std::fs::File;
 use std::io;
+use std::ops::Range;
 use std::os::unix::fs::FileExt as _;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -233,17 +234,17 @@ impl Object {
         self.length
     }
 
-    /// Reads the bytes from `begin` to before `end`, which are within the object.
-    pub(super) fn read(&self, (begin, end): (u64, u64)) -> Result<Bytes, Fault> {
+    /// Reads a range of bytes, which is within the object.
+    pub(super) fn read(&self, range: Range<u64>) -> Result<Bytes, Fault> {
         let tail_at = self.length.saturating_sub(self.tail.len() as u64);
         let place = |at: u64| {
             at.checked_sub(tail_at)
                 .and_then(|at| usize::try_from(at).ok())
         };
-        if let (Some(begin), Some(end)) = (place(begin), place(end)) {
+        if let (Some(begin), Some(end)) = (place(range.start), place(range.end)) {
             return Ok(self.tail.slice(begin..end));
         }
-        let reading = self.bucket.store.get_range(&self.path, begin..end);
+        let reading = self.bucket.store.get_range(&self.path, range);
         wait(reading).map_err(|cause| Fault::Storage(reason(&cause)))
     }
 }

@@ -4,6 +4,7 @@
 
 use std::fs::File;
 use std::io::{self, Write};
+use std::ops::Range;
 use std::os::unix::fs::FileExt as _;
 
 use bytes::Bytes;
@@ -85,7 +86,7 @@ impl Footer {
         let length = source.length()?;
         let tail_at = length.checked_sub(TAIL_BYTES);
         let tail_at = tail_at.ok_or_else(|| invalid("it is too short"))?;
-        let tail = source.read((tail_at, length))?;
+        let tail = source.read(tail_at..length)?;
         let (size, magic) = tail.split_at(tail.len() - MAGIC.len());
         if magic != MAGIC {
             return Err(invalid("it does not end like a Parquet file").into());
@@ -94,7 +95,7 @@ impl Footer {
         let begin = tail_at.checked_sub(size.into());
         let begin = begin.filter(|_| u64::from(size) <= FOOTER_MAX_BYTES);
         let begin = begin.ok_or_else(|| invalid("its footer has an impossible length"))?;
-        let bytes = Vec::from(source.read((begin, tail_at))?);
+        let bytes = Vec::from(source.read(begin..tail_at)?);
         let label = FOOTER_LABEL.as_bytes();
         let label_at = bytes.windows(label.len()).rposition(|part| part == label);
         let checksum_at = label_at.map(|at| at + label.len());
@@ -148,9 +149,9 @@ pub(super) fn read_footer(source: &Source) -> Result<CheckedFooter, Fault> {
     })
 }
 
-/// Reads the bytes from `begin` to before `end` and checks them.
-pub(super) fn read_checked(source: &Source, place: (u64, u64), sum: u32) -> Result<Bytes, Fault> {
-    let bytes = source.read(place)?;
+/// Reads a range of bytes and checks them.
+pub(super) fn read_checked(source: &Source, range: Range<u64>, sum: u32) -> Result<Bytes, Fault> {
+    let bytes = source.read(range)?;
     let mut crc = Crc::new();
     crc.update(&bytes);
     if crc.sum() == sum {

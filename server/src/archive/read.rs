@@ -1,5 +1,6 @@
 //! Reads a file: only the row groups that may contain what is wanted, and only after their checksums.
 
+use std::ops::Range;
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -20,7 +21,7 @@ use super::{
 #[derive(Debug, Clone)]
 struct Group {
     keys: KeyRange,
-    bytes: (u64, u64),
+    bytes: Range<u64>,
     sum: u32,
 }
 
@@ -88,7 +89,7 @@ impl OpenFile {
     pub(super) fn check_rows(&self) -> Result<(), SegmentArchiveError> {
         for group in &self.groups {
             guarded(&self.path, || {
-                checksum::read_checked(&self.source, group.bytes, group.sum).map(drop)
+                checksum::read_checked(&self.source, group.bytes.clone(), group.sum).map(drop)
             })?;
         }
         Ok(())
@@ -167,9 +168,9 @@ impl OpenFile {
     ) -> Result<Vec<ArchivedSegment>, Fault> {
         let about = self.groups.get(index);
         let about = about.ok_or_else(|| fault("a row group is missing"))?;
-        let bytes = checksum::read_checked(&self.source, about.bytes, about.sum)?;
+        let bytes = checksum::read_checked(&self.source, about.bytes.clone(), about.sum)?;
         let group = SerializedRowGroupReader::new(
-            Arc::new(Window::new(about.bytes.0, bytes)),
+            Arc::new(Window::new(about.bytes.start, bytes)),
             self.row_group(index)?,
             self.metadata.page_index_for_row_group(index),
             Arc::new(ReaderProperties::builder().build()),
@@ -221,7 +222,7 @@ fn groups_of(said: &str, counts: &[i64], keys: KeyRange, footer_at: u64) -> Opti
                 first,
                 last: next - 1,
             },
-            bytes: (begin, end),
+            bytes: begin..end,
             sum,
         });
         (first, begin) = (next, end);

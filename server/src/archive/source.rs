@@ -2,6 +2,7 @@
 
 use std::fs::File;
 use std::io;
+use std::ops::Range;
 use std::os::unix::fs::FileExt as _;
 
 use bytes::buf::Reader;
@@ -33,8 +34,9 @@ impl Source {
         }
     }
 
-    /// Reads the bytes from `begin` to before `end`.
-    pub(super) fn read(&self, (begin, end): (u64, u64)) -> Result<Bytes, Fault> {
+    /// Reads a range of bytes.
+    pub(super) fn read(&self, range: Range<u64>) -> Result<Bytes, Fault> {
+        let Range { start: begin, end } = range;
         let count = end
             .checked_sub(begin)
             .filter(|_| end <= self.length().unwrap_or(0));
@@ -48,7 +50,7 @@ impl Source {
                 file.read_exact_at(&mut bytes, begin)?;
                 Ok(bytes.into())
             }
-            Self::Object(object) => object.read((begin, end)),
+            Self::Object(object) => object.read(range),
         }
     }
 }

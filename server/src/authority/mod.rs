@@ -145,12 +145,6 @@ fn named(name: &str) -> DistinguishedName {
     names
 }
 
-/// Sets the validity period; certificates have whole seconds.
-fn set_times(params: &mut CertificateParams, from: Timestamp, until: Timestamp) {
-    params.not_before = SystemTime::from(from).into();
-    params.not_after = SystemTime::from(until).into();
-}
-
 fn later(now: Timestamp, span: SignedDuration) -> Timestamp {
     now.checked_add(span).unwrap_or(Timestamp::MAX)
 }
@@ -168,11 +162,8 @@ impl Authority {
         let key = KeyPair::generate()?;
         let mut params = CertificateParams::default();
         params.distinguished_name = named(name);
-        set_times(
-            &mut params,
-            earlier(now, BEHIND_MAX),
-            later(now, AUTHORITY_LASTS),
-        );
+        params.not_before = SystemTime::from(earlier(now, BEHIND_MAX)).into();
+        params.not_after = SystemTime::from(later(now, AUTHORITY_LASTS)).into();
         params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
         params.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::CrlSign];
         let signed = params.self_signed(&key)?;
@@ -246,11 +237,8 @@ impl Authority {
         let mut params =
             CertificateParams::new(vec![name.text()]).map_err(CertificateError::Signing)?;
         params.distinguished_name = named(&name.text());
-        set_times(
-            &mut params,
-            earlier(now, SignedDuration::from_mins(1)),
-            expires_at,
-        );
+        params.not_before = SystemTime::from(earlier(now, SignedDuration::from_mins(1))).into();
+        params.not_after = SystemTime::from(expires_at).into();
         params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
         params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ClientAuth];
         params.use_authority_key_identifier_extension = true;
@@ -279,11 +267,8 @@ impl Authority {
         let key = KeyPair::generate()?;
         let mut params = CertificateParams::new(all)?;
         params.distinguished_name = named("tread-server");
-        set_times(
-            &mut params,
-            earlier(now, BEHIND_MAX),
-            later(now, PORT_LASTS),
-        );
+        params.not_before = SystemTime::from(earlier(now, BEHIND_MAX)).into();
+        params.not_after = SystemTime::from(later(now, PORT_LASTS)).into();
         params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
         params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ServerAuth];
         params.use_authority_key_identifier_extension = true;

@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::thread;
 
+use jiff::Timestamp;
 use nix::fcntl::{PosixFadviseAdvice, posix_fadvise};
 use ring::digest::{Context, SHA256};
 use tar::{Builder, EntryType, Header};
@@ -328,13 +329,13 @@ fn pack<W: Write>(
     let failed = || FileError::of("write", partial);
     let mut tar = Builder::new(output);
     let manifest = source.manifest;
-    let time_s = u64::try_from(manifest.taken_at.as_second()).unwrap_or_default();
+    let taken_at = manifest.taken_at;
     let text = serde_json::to_vec_pretty(manifest).map_err(io::Error::from);
     let text = text.map_err(failed())?;
-    append(&mut tar, MANIFEST_NAME, (text.len() as u64, time_s), &*text).map_err(failed())?;
+    append(&mut tar, MANIFEST_NAME, text.len() as u64, taken_at, &*text).map_err(failed())?;
     for (name, content) in source.authority {
         let (name, bytes) = (format!("{AUTHORITY_FOLDER}{name}"), content.len() as u64);
-        append(&mut tar, &name, (bytes, time_s), &**content).map_err(failed())?;
+        append(&mut tar, &name, bytes, taken_at, &**content).map_err(failed())?;
     }
     let copy = source.database;
     let opened = File::open(copy).map_err(FileError::of("read", copy))?;
@@ -343,11 +344,11 @@ fn pack<W: Write>(
         bytes: 0,
         progress,
     };
-    let size = (manifest.database.bytes, time_s);
-    append(&mut tar, DATABASE_NAME, size, counting).map_err(failed())?;
+    let bytes = manifest.database.bytes;
+    append(&mut tar, DATABASE_NAME, bytes, taken_at, counting).map_err(failed())?;
     let sum = hex(ring::digest::digest(&SHA256, &text).as_ref());
-    let size = (sum.len() as u64, time_s);
-    append(&mut tar, MANIFEST_SUM_NAME, size, sum.as_bytes()).map_err(failed())?;
+    let bytes = sum.len() as u64;
+    append(&mut tar, MANIFEST_SUM_NAME, bytes, taken_at, sum.as_bytes()).map_err(failed())?;
     Ok(tar.into_inner().map_err(failed())?)
 }
 
@@ -370,14 +371,15 @@ impl<R: Read> Read for Counting<'_, R> {
 fn append<W: Write>(
     tar: &mut Builder<W>,
     name: &str,
-    (bytes, time_s): (u64, u64),
+    bytes: u64,
+    changed_at: Timestamp,
     content: impl Read,
 ) -> io::Result<()> {
     let mut header = Header::new_gnu();
     header.set_entry_type(EntryType::Regular);
     header.set_size(bytes);
     header.set_mode(MODE);
-    header.set_mtime(time_s);
+    header.set_mtime(u64::try_from(changed_at.as_second()).unwrap_or_default());
     tar.append_data(&mut header, name, content.take(bytes))
 }
 

@@ -54,18 +54,6 @@ struct Limit {
     waiting_max: u32,
 }
 
-impl Limit {
-    const fn new(burst: u32, interval_ms: u64, waiting_max: u32) -> Self {
-        Self {
-            rate: RateLimit {
-                burst,
-                interval: Duration::from_millis(interval_ms),
-            },
-            waiting_max,
-        }
-    }
-}
-
 impl Kind {
     const COUNT: usize = 5;
 
@@ -82,11 +70,23 @@ impl Kind {
     const fn limit(self) -> Limit {
         match self {
             // Agents publish states at 5 Hz and friction at 2 Hz by default.
-            Self::State | Self::Friction => Limit::new(200, 10, 32),
-            Self::Hello => Limit::new(20, 200, 4),
+            Self::State | Self::Friction => Limit {
+                rate: RateLimit::new(200, Duration::from_millis(10)),
+                waiting_max: 32,
+            },
+            Self::Hello => Limit {
+                rate: RateLimit::new(20, Duration::from_millis(200)),
+                waiting_max: 4,
+            },
             // An agent sends the next batch after the receipt for the preceding one.
-            Self::Upload => Limit::new(400, 5, 8),
-            Self::Token => Limit::new(40, 1_000, u32::MAX),
+            Self::Upload => Limit {
+                rate: RateLimit::new(400, Duration::from_millis(5)),
+                waiting_max: 8,
+            },
+            Self::Token => Limit {
+                rate: RateLimit::new(40, Duration::from_secs(1)),
+                waiting_max: u32::MAX,
+            },
         }
     }
 }

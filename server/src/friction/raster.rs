@@ -6,7 +6,7 @@ use tread_api::ids::ConfigurationId;
 use tread_api::site::{Cell, Site};
 
 use super::index::{CellSummary, KnownCell};
-use super::traction_limit::traction_limit_mu;
+use super::traction_limit::{TractionEstimate, traction_limit_mu};
 
 /// Raster of the map in squares of one or more cells.
 #[derive(Debug, Clone, PartialEq)]
@@ -84,7 +84,9 @@ impl KnownCell {
     /// Returns the friction coefficient up to which a plan may use traction; the cautious default
     /// for `None`.
     pub fn traction_limit_mu(known: Option<&Self>) -> f64 {
-        let upper = |known: &Self| known.theta + NORMAL_90 * known.std_dev;
-        traction_limit_mu(known.and_then(|known| known.mu_peak), known.map(upper))
+        traction_limit_mu(TractionEstimate {
+            mu_peak: known.and_then(|known| known.mu_peak),
+            theta_upper_95: known.map(|known| known.theta + NORMAL_90 * known.std_dev),
+        })
     }
 }

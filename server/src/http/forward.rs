@@ -19,7 +19,7 @@ use tokio_util::sync::CancellationToken;
 use tracing::{debug, warn};
 use tread_api::problem::ProblemType;
 
-use super::forward_body::cut_short;
+use super::forward_body::{EndTokens, cut_short};
 use super::identity::guard::Peer;
 use super::problem::Problem;
 use super::serve::FORWARDED_FOR;
@@ -311,8 +311,11 @@ impl Forwarder {
         }
         let mut answer = Response::from(answer).map(Body::new);
         remove_those_of_connection(answer.headers_mut());
-        let stop = app.supervisor().stop_token();
-        Ok(cut_short(answer, self.inner.given_up.clone(), stop))
+        let tokens = EndTokens {
+            stop: app.supervisor().stop_token(),
+            given_up: self.inner.given_up.clone(),
+        };
+        Ok(cut_short(answer, tokens))
     }
 }
 

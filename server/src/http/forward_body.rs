@@ -7,6 +7,15 @@ use axum::http::{Response, header};
 use futures_util::{StreamExt as _, stream};
 use tokio_util::sync::CancellationToken;
 
+/// Tokens that end the answers of a standby.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct EndTokens {
+    /// Cancelled when the server stops.
+    pub(crate) stop: CancellationToken,
+    /// Cancelled when answers of the other server are not awaited any more.
+    pub(crate) given_up: CancellationToken,
+}
+
 /// Cause of a body that breaks off.
 #[derive(Debug, thiserror::Error)]
 #[error("the server that has the database does not answer any more")]
@@ -14,14 +23,11 @@ struct GivenUp;
 
 /// Ends the body of an answer when the other server is given up, and a stream of events also at the stop:
 /// its client goes on at another server. Other bodies break off, so that no part passes for the whole.
-pub(super) fn cut_short(
-    answer: Response<Body>,
-    given_up: CancellationToken,
-    stop: CancellationToken,
-) -> Response<Body> {
+pub(super) fn cut_short(answer: Response<Body>, tokens: EndTokens) -> Response<Body> {
     if answer.body().is_end_stream() {
         return answer;
     }
+    let EndTokens { stop, given_up } = tokens;
     let (parts, body) = answer.into_parts();
     let content = parts.headers.get(header::CONTENT_TYPE);
     let is_events =
@@ -62,24 +68,23 @@ mod tests {
 
     #[tokio::test]
     async fn a_stream_of_events_ends_and_other_bodies_break_off() {
-        let token = CancellationToken::new;
         for content_type in ["text/event-stream", "text/csv"] {
-            let given_up = token();
-            let answer = cut_short(unfinished(content_type), given_up.clone(), token());
-            given_up.cancel();
+            let tokens = EndTokens::default();
+            let answer = cut_short(unfinished(content_type), tokens.clone());
+            tokens.given_up.cancel();
             let whole = to_bytes(answer.into_body(), usize::MAX).await;
             let is_events = content_type == "text/event-stream";
             assert_eq!(whole.is_ok(), is_events, "{content_type}: {whole:?}");
         }
         // A stop ends streams alone.
-        let stop = token();
-        let answer = cut_short(unfinished("text/event-stream"), token(), stop.clone());
-        stop.cancel();
+        let tokens = EndTokens::default();
+        let answer = cut_short(unfinished("text/event-stream"), tokens.clone());
+        tokens.stop.cancel();
         to_bytes(answer.into_body(), usize::MAX).await.unwrap();
         let whole = Response::new(Body::from("whole"));
-        let stop = token();
-        stop.cancel();
-        let answer = cut_short(whole, token(), stop);
+        let tokens = EndTokens::default();
+        tokens.stop.cancel();
+        let answer = cut_short(whole, tokens);
         assert_eq!(
             to_bytes(answer.into_body(), usize::MAX).await.unwrap(),
             "whole"

@@ -10,7 +10,7 @@ mod etag;
 mod events;
 pub mod extract;
 pub mod forward;
-mod forward_body;
+pub(crate) mod forward_body;
 mod friction;
 mod geofence;
 mod guarded;

@@ -286,7 +286,7 @@ impl Prepared {
         let Some(owner) = file_owner::service_owner(data_dir)? else {
             return Ok(());
         };
-        lchown(&self.new, None, Some(owner.1))
+        lchown(&self.new, None, Some(owner.gid))
             .with_context(|| format!("cannot give `{}` to its group", self.new.display()))?;
         file_owner::chown_recursively(data_dir, owner)
     }

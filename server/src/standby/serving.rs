@@ -21,6 +21,7 @@ use crate::config::{Config, TlsSource};
 use crate::db::{self, Db};
 use crate::http;
 use crate::http::forward::Forwarder;
+use crate::http::forward_body::EndTokens;
 use crate::http::serve::Serving;
 use crate::identity::address::TrustedProxies;
 use crate::supervisor::{Stopped, Supervisor};
@@ -35,9 +36,7 @@ const RETRY: Duration = Duration::from_secs(2);
 #[derive(Debug)]
 pub(crate) struct StandbyServing {
     tasks: JoinSet<()>,
-    stop: CancellationToken,
-    /// Cancelled when answers of the other server are not awaited any more.
-    given_up: CancellationToken,
+    tokens: EndTokens,
     shown: Arc<Mutex<ServingState>>,
 }
 
@@ -53,15 +52,12 @@ struct ServingState {
 impl StandbyServing {
     /// Begins to answer requests; tries again as long as that fails.
     pub(crate) fn start(config: Config, clock: Clock) -> Self {
-        let (stop, given_up) = (CancellationToken::new(), CancellationToken::new());
-        let shown = Arc::default();
+        let (tokens, shown) = (EndTokens::default(), Arc::default());
         let mut tasks = JoinSet::new();
-        let tokens = (stop.clone(), given_up.clone());
-        tasks.spawn(serve(config, clock, tokens, Arc::clone(&shown)));
+        tasks.spawn(serve(config, clock, tokens.clone(), Arc::clone(&shown)));
         Self {
             tasks,
-            stop,
-            given_up,
+            tokens,
             shown,
         }
     }
@@ -69,8 +65,8 @@ impl StandbyServing {
     /// Accepts no further connections, and frees the addresses; what is open ends soon. Returns what has the
     /// map, if it was read.
     pub(crate) async fn end(mut self) -> Option<App> {
-        self.given_up.cancel();
-        self.stop.cancel();
+        self.tokens.given_up.cancel();
+        self.tokens.stop.cancel();
         // A panic has been logged, and frees the addresses too.
         let _ = self.tasks.join_next().await;
         lock(&self.shown).with_map.take()
@@ -81,7 +77,7 @@ impl StandbyServing {
     /// # Errors
     /// A task failed, or they take too long.
     pub(crate) async fn stop(mut self) -> Result<(), Stopped> {
-        self.stop.cancel();
+        self.tokens.stop.cancel();
         // A panic has been logged.
         let _ = self.tasks.join_next().await;
         let supervisor = lock(&self.shown).supervisor.take();
@@ -100,16 +96,19 @@ fn lock(shown: &Mutex<ServingState>) -> MutexGuard<'_, ServingState> {
 async fn serve(
     config: Config,
     clock: Clock,
-    (stop, given_up): (CancellationToken, CancellationToken),
+    EndTokens { stop, given_up }: EndTokens,
     shown: Arc<Mutex<ServingState>>,
 ) {
     let mut logged = String::new();
     loop {
-        let given_up = given_up.child_token();
-        let serving = serve_once(&config, &clock, (&stop, &given_up), &shown);
+        let tokens = EndTokens {
+            stop: stop.clone(),
+            given_up: given_up.child_token(),
+        };
+        let serving = serve_once(&config, &clock, &tokens, &shown);
         let served = AssertUnwindSafe(serving).catch_unwind().await;
         if !stop.is_cancelled() {
-            given_up.cancel();
+            tokens.given_up.cancel();
         }
         let reason = match served {
             Ok(Ok(())) if stop.is_cancelled() => return,
@@ -143,7 +142,7 @@ async fn serve(
 async fn serve_once(
     config: &Config,
     clock: &Clock,
-    (stop, given_up): (&CancellationToken, &CancellationToken),
+    EndTokens { stop, given_up }: &EndTokens,
     shown: &Mutex<ServingState>,
 ) -> anyhow::Result<()> {
     let supervisor = Supervisor::new();

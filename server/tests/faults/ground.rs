@@ -201,7 +201,7 @@ impl Ground {
         let mut said = Vec::new();
         for as_of in [None, Some(now() - Duration::from_hours(39))] {
             let cells = CellsAsked {
-                area: Area::new((None, None), (None, None)).unwrap(),
+                area: Area::WHOLE,
                 resolution_m: None,
                 cursor: None,
                 limit: 1_000,

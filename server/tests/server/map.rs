@@ -257,7 +257,7 @@ pub(crate) async fn restarted(app: &App) -> App {
 /// What the map says of all cells.
 pub(crate) async fn said(app: &App) -> MapPage<CellFriction> {
     let cells = CellsAsked {
-        area: Area::new((None, None), (None, None)).unwrap(),
+        area: Area::WHOLE,
         resolution_m: None,
         cursor: None,
         limit: 1_000,

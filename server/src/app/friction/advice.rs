@@ -4,14 +4,14 @@ use std::collections::{BTreeMap, HashMap};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use jiff::Timestamp;
-use tread_api::friction::{RobotContribution, VisitSuggestion};
+use tread_api::friction::{CellBox, RobotContribution, VisitSuggestion};
 use tread_api::geometry::Point;
 use tread_api::ids::{RobotId, SiteId};
 use tread_api::page::{MapPage, Page};
 use tread_api::rights::Scope;
 use tread_api::site::Cell;
 
-use super::cells::Area;
+use super::area::Area;
 use super::drawn::Drawn;
 use super::{App, AppError, Asked, MapReader, Reading, SiteView, page, terrain_ref};
 use crate::db::sites::SiteRow;
@@ -49,7 +49,7 @@ impl App {
                 detail: format!("this box has {count} cells; at most {LOOKED_AT_MAX} here"),
             });
         }
-        let (min, max) = area.cells(&grid)?;
+        let CellBox { min, max } = area.cells(&grid)?;
         let looking = move |reader: &MapReader<'_>, [reading]: &[Reading; 1]| {
             let drawn = Drawn::new(&view.terrains);
             let (low, high) = (Block::of(min), Block::of(max));

@@ -3,13 +3,14 @@
 use std::collections::BTreeMap;
 
 use jiff::Timestamp;
-use tread_api::friction::{CellDifference, CellFriction, ModelFriction, PointFriction};
-use tread_api::geometry::{COORDINATE_MAX_M, Point};
+use tread_api::friction::{CellBox, CellDifference, CellFriction, ModelFriction, PointFriction};
+use tread_api::geometry::Point;
 use tread_api::ids::{ConfigurationId, SiteId};
 use tread_api::page::{DifferencePage, MapPage};
 use tread_api::site::{CELL_MAX_M, Cell, Grid};
 use tread_api::terrain::{Terrain, TerrainRef};
 
+use super::area::Area;
 use super::drawn::{Drawn, is_here};
 use super::map_reader::smaller;
 use super::{App, AppError, Asked, MapReader, Reading, SiteView, page, terrain_ref};
@@ -22,72 +23,6 @@ pub const CELLS_MAX: f64 = 4_194_304.0;
 const SQUARES_WIDTH_CELLS: i32 = 1_024;
 /// Number of cells that are compared in one read of the map.
 const CELLS_AT_ONCE: usize = 4_096;
-
-/// An axis-aligned rectangle in the site frame.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Area {
-    /// The corner with the lowest coordinates.
-    pub min: Point,
-    /// The corner with the highest coordinates.
-    pub max: Point,
-}
-
-impl Area {
-    /// Makes an area from bounds in metres; without any it is the whole map.
-    ///
-    /// # Errors
-    /// A bound is not on the map, or a lower bound is above the upper one.
-    pub fn new(
-        min: (Option<f64>, Option<f64>),
-        max: (Option<f64>, Option<f64>),
-    ) -> Result<Self, AppError> {
-        for (parameter, low, high) in [("x_max_m", min.0, max.0), ("y_max_m", min.1, max.1)] {
-            let low = low.unwrap_or(-COORDINATE_MAX_M);
-            let high = high.unwrap_or(COORDINATE_MAX_M);
-            let bounds = -COORDINATE_MAX_M..=COORDINATE_MAX_M;
-            if !bounds.contains(&low) || !bounds.contains(&high) {
-                return Err(AppError::InvalidQuery {
-                    parameter,
-                    detail: format!(
-                        "a box lies on the map, within {COORDINATE_MAX_M} m of the origin"
-                    ),
-                });
-            }
-            if low > high {
-                return Err(AppError::InvalidQuery {
-                    parameter,
-                    detail: format!("the box is inside out: {low} m to {high} m"),
-                });
-            }
-        }
-        let point = |(x_m, y_m): (Option<f64>, Option<f64>), otherwise: f64| Point {
-            x_m: x_m.unwrap_or(otherwise),
-            y_m: y_m.unwrap_or(otherwise),
-        };
-        Ok(Self {
-            min: point(min, -COORDINATE_MAX_M),
-            max: point(max, COORDINATE_MAX_M),
-        })
-    }
-
-    /// The first and last cell of the box in a grid with cells of this size.
-    pub(super) fn cells(&self, grid: &Grid) -> Result<(Cell, Cell), AppError> {
-        let cell = |point| {
-            grid.cell_at(point).ok_or_else(|| AppError::InvalidQuery {
-                parameter: "x_min_m",
-                detail: "the box must be on the map".to_owned(),
-            })
-        };
-        Ok((cell(self.min)?, cell(self.max)?))
-    }
-
-    /// Returns the number of squares of side `size_m` in the area; a float, since it may be very
-    /// large.
-    pub(super) fn count(&self, size_m: f64) -> f64 {
-        let count = |low: f64, high: f64| ((high - low) / size_m).floor() + 1.0;
-        count(self.min.x_m, self.max.x_m) * count(self.min.y_m, self.max.y_m)
-    }
-}
 
 /// The cells that a request asks for.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -201,7 +136,7 @@ impl App {
         let after = cells.cursor.map(read_cursor).transpose()?;
         let row = self.site_view(site).await?.row.clone();
         let early = late.at(from);
-        let (min, max) = cells.area.cells(&row.site.grid)?;
+        let area = cells.area.cells(&row.site.grid)?;
         let wanted = usize::try_from(cells.limit).unwrap_or(usize::MAX);
         let limit = cells.limit;
         let of_site = row.clone();
@@ -211,7 +146,7 @@ impl App {
             while found.len() <= wanted {
                 let (some, last) = smaller(&mut at_once, |at_once| {
                     reader.cells(&row, |map| {
-                        let cells = map.cells_in(min, max, after).take(at_once);
+                        let cells = map.cells_in(area, after).take(at_once);
                         let cells: Vec<Cell> = cells.collect();
                         let measured = cells.iter().copied().filter(|&cell| {
                             let newest = map.newest_at_us(cell, late.choice());
@@ -407,14 +342,15 @@ pub(super) type CellGroup = (Cell, Option<Vec<Cell>>);
 pub(super) fn squares(
     map: Cells<'_>,
     factor: i32,
-    (min, max): (Cell, Cell),
+    area: CellBox,
     after: Option<Cell>,
     wanted: usize,
 ) -> Vec<CellGroup> {
     if factor == 1 {
-        let cells = map.cells_in(min, max, after).take(wanted);
+        let cells = map.cells_in(area, after).take(wanted);
         return cells.map(|cell| (cell, None)).collect();
     }
+    let CellBox { min, max } = area;
     let first = |square: Cell| Cell {
         ix: square.ix.saturating_mul(factor),
         iy: square.iy.saturating_mul(factor),
@@ -429,11 +365,14 @@ pub(super) fn squares(
     let mut row = after.map_or(min.iy, |after| after.iy.max(min.iy));
     while row <= max.iy && found.len() < wanted {
         // The next grid row with measurements determines the next row of squares.
-        let low = first(Cell {
-            ix: min.ix,
-            iy: row,
-        });
-        let Some(next) = map.cells_in(low, last(max), None).next() else {
+        let rest = CellBox {
+            min: first(Cell {
+                ix: min.ix,
+                iy: row,
+            }),
+            max: last(max),
+        };
+        let Some(next) = map.cells_in(rest, None).next() else {
             break;
         };
         row = next.iy.div_euclid(factor);
@@ -443,10 +382,12 @@ pub(super) fn squares(
         // Some columns at a time, so that no more cells are needed than wanted.
         while from <= max.ix && found.len() < wanted && !map.is_incomplete() {
             let to = from.saturating_add(at_once - 1).min(max.ix);
-            let low = first(Cell { ix: from, iy: row });
-            let high = last(Cell { ix: to, iy: row });
+            let some = CellBox {
+                min: first(Cell { ix: from, iy: row }),
+                max: last(Cell { ix: to, iy: row }),
+            };
             let mut columns: BTreeMap<i32, Vec<Cell>> = BTreeMap::new();
-            for cell in map.cells_in(low, high, None) {
+            for cell in map.cells_in(some, None) {
                 let column = columns.entry(cell.ix.div_euclid(factor)).or_default();
                 column.push(cell);
             }

@@ -3,11 +3,12 @@
 use std::hash::Hash;
 
 use jiff::Timestamp;
-use tread_api::friction::{CellFriction, StoredSegment};
+use tread_api::friction::{CellBox, CellFriction, StoredSegment};
 use tread_api::ids::SiteId;
 use tread_api::site::{Cell, Grid, Site};
 
-use super::cells::{Area, factor, of_square, squares};
+use super::area::Area;
+use super::cells::{factor, of_square, squares};
 use super::map_reader::smaller;
 use super::raster::PictureAsked;
 use super::{App, AppError, MOVED, MapReader, Reading};
@@ -44,7 +45,7 @@ pub struct CellExport {
     row: SiteRow,
     reading: Reading,
     factor: i32,
-    bounds: (Cell, Cell),
+    bounds: CellBox,
     /// State of the map for which `reading` was made.
     stamp: Stamp,
     after: Option<Cell>,
@@ -74,10 +75,7 @@ impl App {
         let row = self.site_view(site).await?.row.clone();
         let grid = row.site.grid;
         let factor = factor(&grid, asked.resolution_m)?;
-        let area = match asked.area {
-            Some(area) => area,
-            None => Area::new((None, None), (None, None))?,
-        };
+        let area = asked.area.unwrap_or(Area::WHOLE);
         let coarse = Grid {
             cell_m: grid.cell_m * f64::from(factor),
             ..grid

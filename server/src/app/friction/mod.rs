@@ -1,6 +1,7 @@
 //! The friction map's answers, computed from the stored sums at the time of the request.
 
 mod advice;
+mod area;
 mod cells;
 mod drawn;
 mod export;
@@ -28,7 +29,9 @@ use tread_api::site::Cell;
 use tread_api::terrain::{Terrain, TerrainRef};
 
 pub(super) use self::advice::CellCounts;
-pub use self::cells::{Area, CELLS_MAX, CellsAsked};
+pub use self::area::Area;
+pub(crate) use self::area::AreaBounds;
+pub use self::cells::{CELLS_MAX, CellsAsked};
 pub use self::export::{CellExport, SegmentExport};
 pub use self::history::Times;
 pub(super) use self::live::MapNews;

@@ -16,7 +16,7 @@ use super::drawn::{Drawn, Near};
 use super::map_reader::in_parts;
 use super::{App, AppError, Asked, MapReader, Reading, SiteView};
 use crate::friction::index::{Cells, CompiledFilter, Room};
-use crate::friction::traction_limit;
+use crate::friction::traction_limit::{self, TractionEstimate};
 
 /// Maximum length of a path, metres.
 const LENGTH_MAX_M: f64 = 10_000.0;
@@ -97,12 +97,12 @@ pub(super) fn is_measured(known: &FusedFriction) -> bool {
 
 /// Returns the friction coefficient that a plan may use.
 pub(in crate::app) fn traction_limit_mu(known: Option<&FusedFriction>) -> f64 {
-    traction_limit::traction_limit_mu(
-        known.and_then(|known| known.mu_peak_lower_bound),
-        known
+    traction_limit::traction_limit_mu(TractionEstimate {
+        mu_peak: known.and_then(|known| known.mu_peak_lower_bound),
+        theta_upper_95: known
             .filter(|known| is_measured(known))
             .map(|known| known.bounds.theta_upper_95),
-    )
+    })
 }
 
 fn in_body(error: AppError) -> AppError {

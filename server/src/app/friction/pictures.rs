@@ -134,7 +134,7 @@ impl App {
     pub(super) fn state_of(&self, row: &SiteRow, reading: &Reading, asked: &PictureAsked) -> State {
         let grid = row.site.grid;
         let bounds = asked.area.and_then(|area| area.cells(&grid).ok());
-        let bounds = bounds.map(|(min, max)| (Block::of(min), Block::of(max)));
+        let bounds = bounds.map(|cells| (Block::of(cells.min), Block::of(cells.max)));
         self.maps().look(row, |map| State {
             change: match bounds {
                 // The default model, the one driven most, depends on the whole map.

@@ -7,11 +7,12 @@
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use tread_api::geometry::{COORDINATE_MAX_M, Point};
+use tread_api::friction::CellBox;
 use tread_api::ids::ConfigurationId;
 use tread_api::site::{Cell, Grid};
 
-use super::cells::{Area, factor};
+use super::area::Area;
+use super::cells::factor;
 use super::drawn::Drawn;
 use super::map_reader::in_parts;
 use super::{AppError, Asked, MapReader, Reading, SiteView};
@@ -174,7 +175,7 @@ impl Frame<'_> {
     fn cells(
         &self,
         reader: &MapReader<'_>,
-        (min, max): (Cell, Cell),
+        CellBox { min, max }: CellBox,
     ) -> Result<Vec<CellSummary>, AppError> {
         let columns = usize::try_from(max.ix - min.ix + 1).unwrap_or_default();
         let rows = usize::try_from(max.iy - min.iy + 1).unwrap_or_default();
@@ -203,7 +204,7 @@ impl Frame<'_> {
     fn merged(
         &self,
         reader: &MapReader<'_>,
-        (min, max): (Cell, Cell),
+        CellBox { min, max }: CellBox,
         factor: i32,
     ) -> Result<Vec<CellSummary>, AppError> {
         let grid = self.view.row.site.grid;
@@ -226,16 +227,17 @@ impl Frame<'_> {
                     let mut room = Room::default();
                     let square = |&ix: &i32| {
                         let ground = near.ground_at(coarse.center_of(Cell { ix, iy }));
-                        let low = Cell {
+                        let min = Cell {
                             ix: ix.saturating_mul(factor),
                             iy: iy.saturating_mul(factor),
                         };
-                        let high = Cell {
-                            ix: low.ix.saturating_add(factor - 1),
-                            iy: low.iy.saturating_add(factor - 1),
+                        let max = Cell {
+                            ix: min.ix.saturating_add(factor - 1),
+                            iy: min.iy.saturating_add(factor - 1),
                         };
+                        let cells = CellBox { min, max };
                         let at = self.reading.fused_at();
-                        map.fuse_square((low, high), (ground, &filter), at, &mut room)
+                        map.fuse_square(cells, (ground, &filter), at, &mut room)
                     };
                     some.iter().map(square).collect()
                 })
@@ -258,16 +260,6 @@ pub(super) fn raster(
         let first = || map.configurations().first().copied();
         (map.extent(), reference.or_else(first))
     });
-    let whole = Area {
-        min: Point {
-            x_m: -COORDINATE_MAX_M,
-            y_m: -COORDINATE_MAX_M,
-        },
-        max: Point {
-            x_m: COORDINATE_MAX_M,
-            y_m: COORDINATE_MAX_M,
-        },
-    };
     let factor = factor(&grid, picture.resolution_m)?;
     let size_m = grid.cell_m * f64::from(factor);
     let bounds = match (picture.area, extent) {
@@ -276,14 +268,15 @@ pub(super) fn raster(
             ..grid
         })?),
         (None, Some((min, max))) => {
-            let (lowest, highest) = whole.cells(&grid)?;
+            let whole = Area::WHOLE.cells(&grid)?;
             let square = |ix: i32, iy: i32| Cell {
                 ix: ix.div_euclid(factor),
                 iy: iy.div_euclid(factor),
             };
-            let min = square(min.ix.max(lowest.ix), min.iy.max(lowest.iy));
-            let max = square(max.ix.min(highest.ix), max.iy.min(highest.iy));
-            Some((min, max))
+            Some(CellBox {
+                min: square(min.ix.max(whole.min.ix), min.iy.max(whole.min.iy)),
+                max: square(max.ix.min(whole.max.ix), max.iy.min(whole.max.iy)),
+            })
         }
         (None, None) => None,
     };
@@ -299,9 +292,10 @@ pub(super) fn raster(
         size_m,
         squares: Vec::new(),
     };
-    let Some((min, max)) = bounds else {
+    let Some(bounds) = bounds else {
         return Ok(raster);
     };
+    let CellBox { min, max } = bounds;
     let length = |low: i32, high: i32| (i64::from(high) - i64::from(low) + 1).unsigned_abs();
     let (columns, rows) = (length(min.ix, max.ix), length(min.iy, max.iy));
     let count = columns.saturating_mul(rows);
@@ -327,9 +321,9 @@ pub(super) fn raster(
                 configuration,
             };
             if factor == 1 {
-                frame.cells(reader, (min, max))?
+                frame.cells(reader, bounds)?
             } else {
-                frame.merged(reader, (min, max), factor)?
+                frame.merged(reader, bounds, factor)?
             }
         }
     };

@@ -179,7 +179,15 @@ fn another_file_and_a_newer_format_are_refused_with_words() {
     assert!(refused.contains("no backup"), "{refused}");
     let mut tar = Builder::new(Vec::new());
     let text = br#"{"format": 2, "version": "9.9.9", "unknown": 1}"#;
-    append(&mut tar, MANIFEST_NAME, (text.len() as u64, 0), &text[..]).unwrap();
+    let bytes = text.len() as u64;
+    append(
+        &mut tar,
+        MANIFEST_NAME,
+        bytes,
+        Timestamp::UNIX_EPOCH,
+        &text[..],
+    )
+    .unwrap();
     fs::write(&made.archive, tar.into_inner().unwrap()).unwrap();
     let refused = extracted(&made, None).unwrap_err().to_string();
     assert!(refused.contains("9.9.9"), "{refused}");

@@ -9,6 +9,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use tread_api::friction::CellBox;
 use tread_api::ids::RobotId;
 use tread_api::site::Cell;
 
@@ -325,13 +326,12 @@ impl<'map> Cells<'map> {
         self.map.groups(&parts, choice)
     }
 
-    /// Returns the cells with measurements in the rectangle from `min` to `max`, both included, row
-    /// by row; those after the cell `after` if it is given. Ends at the first absent block, with
-    /// which it notes some of those that would follow.
+    /// Returns the cells with measurements in a box, row by row; those after the cell `after` if it
+    /// is given. Ends at the first absent block, with which it notes some of those that would
+    /// follow.
     pub fn cells_in(
         self,
-        min: Cell,
-        max: Cell,
+        CellBox { min, max }: CellBox,
         after: Option<Cell>,
     ) -> impl Iterator<Item = Cell> + use<'map> {
         let first_iy = after.map_or(min.iy, |after| after.iy.max(min.iy));

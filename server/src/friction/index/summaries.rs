@@ -1,6 +1,7 @@
 //! Summaries of cells for raster images: one estimate per cell, for one configuration and the
 //! ground at the cell's centre. Allocates nothing per cell, except as of a past time.
 
+use tread_api::friction::CellBox;
 use tread_api::site::Cell;
 use tread_api::terrain::TerrainRef;
 
@@ -221,17 +222,16 @@ impl Cells<'_> {
         }
     }
 
-    /// Returns the estimate of one square with the cells from `min` to `max`, both included, on the
-    /// given ground.
+    /// Returns the estimate of one square with the cells of a box on the given ground.
     pub fn fuse_square(
         self,
-        (min, max): (Cell, Cell),
+        area: CellBox,
         (ground, filter): (u16, &CompiledFilter<'_>),
         at: At<'_>,
         room: &mut Room,
     ) -> CellSummary {
         let mut sums: std::collections::BTreeMap<PartKey, Sums> = std::collections::BTreeMap::new();
-        for cell in self.cells_in(min, max, None) {
+        for cell in self.cells_in(area, None) {
             for part in &*self.parts_at(cell, filter.when) {
                 if filter.sees(&part.key, ground).is_some() {
                     let added = part.sums();

@@ -14,7 +14,7 @@ use tread_api::site::Site;
 use utoipa::IntoParams;
 
 use super::streamed::{CSV_MEDIA_TYPE, JSON_MEDIA_TYPE, PARQUET_MEDIA_TYPE, streamed};
-use crate::app::friction::{Area, Asked, CellExport, Picture, PictureAsked};
+use crate::app::friction::{Area, AreaBounds, Asked, CellExport, Picture, PictureAsked};
 use crate::app::{App, AppError};
 use crate::formats::nav2::{self, SpeedScale};
 use crate::formats::png::{self, PngError};
@@ -151,11 +151,16 @@ fn within(
 
 impl MapQuery {
     fn asked(&self) -> Result<PictureAsked, Problem> {
-        let bounds = ((self.x_min_m, self.y_min_m), (self.x_max_m, self.y_max_m));
-        let area = if bounds == ((None, None), (None, None)) {
+        let bounds = AreaBounds {
+            x_min_m: self.x_min_m,
+            y_min_m: self.y_min_m,
+            x_max_m: self.x_max_m,
+            y_max_m: self.y_max_m,
+        };
+        let area = if bounds == AreaBounds::default() {
             None
         } else {
-            Some(Area::new(bounds.0, bounds.1)?)
+            Some(Area::new(bounds)?)
         };
         Ok(PictureAsked {
             asked: Asked {

@@ -17,7 +17,7 @@ use utoipa::IntoParams;
 use super::asked;
 use super::map::say_as_of;
 use crate::app::App;
-use crate::app::friction::{Area, CellsAsked};
+use crate::app::friction::{Area, AreaBounds, CellsAsked};
 use crate::http::etag;
 use crate::http::extract::{Json, Path, Query, page_limit};
 use crate::http::problem::Problem;
@@ -68,10 +68,12 @@ pub(in crate::http) async fn cells(
 ) -> Result<Response, Problem> {
     let asked = asked(query.as_of, query.configuration, query.normalisation);
     let cells = CellsAsked {
-        area: Area::new(
-            (query.x_min_m, query.y_min_m),
-            (query.x_max_m, query.y_max_m),
-        )?,
+        area: Area::new(AreaBounds {
+            x_min_m: query.x_min_m,
+            y_min_m: query.y_min_m,
+            x_max_m: query.x_max_m,
+            y_max_m: query.y_max_m,
+        })?,
         resolution_m: query.resolution_m,
         cursor: query.cursor.as_deref(),
         limit: page_limit(query.limit)?,
@@ -182,10 +184,12 @@ pub(in crate::http) async fn difference(
 ) -> Result<Response, Problem> {
     let asked = asked(None, query.configuration, query.normalisation);
     let cells = CellsAsked {
-        area: Area::new(
-            (query.x_min_m, query.y_min_m),
-            (query.x_max_m, query.y_max_m),
-        )?,
+        area: Area::new(AreaBounds {
+            x_min_m: query.x_min_m,
+            y_min_m: query.y_min_m,
+            x_max_m: query.x_max_m,
+            y_max_m: query.y_max_m,
+        })?,
         resolution_m: None,
         cursor: query.cursor.as_deref(),
         limit: page_limit(query.limit)?,
@@ -233,10 +237,12 @@ pub(in crate::http) async fn visits(
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let asked = asked(query.as_of, query.configuration, query.normalisation);
-    let area = Area::new(
-        (Some(query.x_min_m), Some(query.y_min_m)),
-        (Some(query.x_max_m), Some(query.y_max_m)),
-    )?;
+    let area = Area::new(AreaBounds {
+        x_min_m: Some(query.x_min_m),
+        y_min_m: Some(query.y_min_m),
+        x_max_m: Some(query.x_max_m),
+        y_max_m: Some(query.y_max_m),
+    })?;
     let limit = page_limit(query.limit)?;
     let found = app.visits_worth_most(&site, &asked, area, limit).await?;
     Ok(say_as_of(etag::json(&headers, &found), found.as_of))

@@ -12,21 +12,21 @@ use super::browser::COOKIE;
 use crate::http::page;
 
 /// All routes that need no credential.
-pub const PUBLIC: [(&str, &str); 14] = [
-    ("GET", page::ROOT),
-    ("GET", page::FILES),
-    ("GET", "/healthz"),
-    ("GET", "/readyz"),
-    ("POST", "/v1/session"),
-    ("GET", "/v1/sign-in"),
-    ("GET", "/v1/sign-in/oidc"),
-    ("GET", "/v1/sign-in/oidc/callback"),
-    ("POST", "/v1/enrolments"),
-    ("POST", "/v1/enrolments/renew"),
-    ("GET", "/openapi.json"),
-    ("GET", "/docs"),
-    ("GET", "/docs/"),
-    ("GET", "/docs/{*rest}"),
+pub const PUBLIC: [(Method, &str); 14] = [
+    (Method::GET, page::ROOT),
+    (Method::GET, page::FILES),
+    (Method::GET, "/healthz"),
+    (Method::GET, "/readyz"),
+    (Method::POST, "/v1/session"),
+    (Method::GET, "/v1/sign-in"),
+    (Method::GET, "/v1/sign-in/oidc"),
+    (Method::GET, "/v1/sign-in/oidc/callback"),
+    (Method::POST, "/v1/enrolments"),
+    (Method::POST, "/v1/enrolments/renew"),
+    (Method::GET, "/openapi.json"),
+    (Method::GET, "/docs"),
+    (Method::GET, "/docs/"),
+    (Method::GET, "/docs/{*rest}"),
 ];
 /// Security scheme by which each route names its right.
 const TOKEN_SCHEME: &str = "token";
@@ -60,12 +60,14 @@ impl Access {
         let paths = description["paths"].as_object();
         for (path, operations) in paths.into_iter().flatten() {
             for (method, operation) in operations.as_object().into_iter().flatten() {
-                let method = method.to_ascii_uppercase();
-                if PUBLIC.contains(&(&method, path)) {
+                let Ok(method) = method.to_ascii_uppercase().parse::<Method>() else {
+                    continue;
+                };
+                if PUBLIC.contains(&(method.clone(), path.as_str())) {
                     continue;
                 }
                 if let Some(right) = right_of(operation) {
-                    access.insert(path, &method, Needed::Right(right));
+                    access.insert(path, method, Needed::Right(right));
                 } else {
                     tracing::error!("{method} {path} names no right and is refused");
                 }
@@ -77,15 +79,13 @@ impl Access {
     /// Returns a table of one route that needs no credential.
     pub(in crate::http) fn open(path: &str) -> Self {
         let mut access = Self::default();
-        access.insert(path, "GET", Needed::Nothing);
+        access.insert(path, Method::GET, Needed::Nothing);
         access
     }
 
-    fn insert(&mut self, path: &str, method: &str, needed: Needed) {
-        if let Ok(method) = method.parse() {
-            let methods = self.routes.entry(path.to_owned()).or_default();
-            methods.push((method, needed));
-        }
+    fn insert(&mut self, path: &str, method: Method, needed: Needed) {
+        let methods = self.routes.entry(path.to_owned()).or_default();
+        methods.push((method, needed));
     }
 
     /// Returns the requirement of a route; `None` for a method that it does not have.

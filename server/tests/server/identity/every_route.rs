@@ -115,7 +115,10 @@ fn filled(path: &str) -> String {
 
 #[test]
 fn every_operation_names_one_right_or_is_on_the_named_list() {
-    assert_eq!(PUBLIC, OPEN);
+    let public = PUBLIC
+        .each_ref()
+        .map(|(method, path)| (method.as_str(), *path));
+    assert_eq!(public, OPEN);
     let access = tread_server::http::access();
     for operation in operations() {
         let Operation {

@@ -186,10 +186,10 @@ proptest! {
         }
         let never = Absent::default();
         let all = kept.cells(&never, 1);
-        let (min, max) = (Cell { ix: -70, iy: -70 }, Cell { ix: 70, iy: 70 });
-        let cells: Vec<Cell> = all.cells_in(min, max, None).collect();
+        let area = CellBox { min: Cell { ix: -70, iy: -70 }, max: Cell { ix: 70, iy: 70 } };
+        let cells: Vec<Cell> = all.cells_in(area, None).collect();
         prop_assert_eq!(&look(&mut evicting, &stored, |map| {
-            map.cells_in(min, max, None).collect::<Vec<_>>()
+            map.cells_in(area, None).collect::<Vec<_>>()
         }), &cells);
         let choice = Choice::default();
         for &cell in &cells {
@@ -207,7 +207,7 @@ proptest! {
                 map.fuse_block((block, None), &[0; CELLS_PER_BLOCK], &filter, at, &mut of_block);
                 made.extend(of_block);
             }
-            made.push(map.fuse_square((min, max), (1, &filter), at, &mut Room::default()));
+            made.push(map.fuse_square(area, (1, &filter), at, &mut Room::default()));
             made
         };
         prop_assert_eq!(look(&mut evicting, &stored, squares), squares(all));
@@ -235,12 +235,13 @@ proptest! {
             let key = (0, 0, ix, iy, 0, 0);
             map.add(Named::of(key).labelled(key), &measured(0.3, 0.1, 0));
         }
-        let (min, max) = (Cell { ix: x.0, iy: y.0 }, Cell { ix: x.1, iy: y.1 });
+        let area = CellBox { min: Cell { ix: x.0, iy: y.0 }, max: Cell { ix: x.1, iy: y.1 } };
+        let CellBox { min, max } = area;
         let after = after.map(|(ix, iy)| Cell { ix, iy });
         let absent = Absent::default();
         let found: Vec<(i32, i32)> = map
             .cells(&absent, 1)
-            .cells_in(min, max, after)
+            .cells_in(area, after)
             .map(|cell| (cell.iy, cell.ix))
             .collect();
         let mut expected: Vec<(i32, i32)> = driven
