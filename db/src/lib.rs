@@ -43,7 +43,7 @@ use std::time::Duration;
 
 use tread_store::failure::StorageFailure;
 use tread_store::metrics::DatabaseMetrics;
-pub use tread_store::{DbError, Disk, Location, Outcome, failure, limited, secrets};
+pub use tread_store::{DbError, Disk, Location, Outcome, RecordKey, failure, limited, secrets};
 
 use self::forward::forward;
 

@@ -3,6 +3,7 @@
 
 use tread_store::friction::Sums;
 pub use tread_store::sums::{StoredHour, SumKey, SumRow};
+use tread_store::withdrawals::Hours;
 
 use super::{DbError, Tx, forward};
 
@@ -13,7 +14,7 @@ forward! {
     fn unmerged(limit: u32) -> Vec<StoredHour>;
     fn of_hour(hour: (i64, i64), limit: usize) -> Vec<SumRow>;
     fn remove(key: &SumKey) -> bool;
-    fn remove_hours(robot_pk: i64, hours: (i64, i64)) -> u64;
+    fn remove_hours(robot_pk: i64, hours: Hours) -> u64;
 }
 
 /// Adds sums to those that are stored, bit for bit as [`Sums::add`] does.

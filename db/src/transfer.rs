@@ -139,14 +139,22 @@ impl Target<'_> {
     }
 }
 
+/// Databases of a copy.
+#[derive(Debug, Clone, Copy)]
+pub struct Databases<'db> {
+    /// Database that is read.
+    pub from: &'db Db,
+    /// Database that is written.
+    pub to: &'db Db,
+}
+
 /// Copies everything into a database that has the present schema and no rows. Calls `progress` now and
 /// then.
 ///
 /// # Errors
 /// [`CopyError`]: a PostgreSQL database is unchanged then, a file contains a part.
 pub async fn copy(
-    from: &Db,
-    to: &Db,
+    Databases { from, to }: Databases<'_>,
     mut progress: impl FnMut(Progress),
 ) -> Result<Vec<Copied>, CopyError> {
     let (reading, writing) = (read_error("schema"), write_error("schema"));

@@ -1,6 +1,6 @@
 //! Withdrawals: hours of robots whose measurements are not on the map.
 
-pub use tread_store::withdrawals::WithdrawalRow;
+pub use tread_store::withdrawals::{Hours, WithdrawalRow};
 
 use super::{DbError, Tx, forward};
 

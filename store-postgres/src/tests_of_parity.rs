@@ -8,7 +8,7 @@ use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 use tread_api::ids::{RobotId, SiteId};
 use tread_api::rights::Scope;
-use tread_store::{Fingerprint, Issued, SubjectId};
+use tread_store::{Fingerprint, Issued, RecordKey, SubjectId};
 
 use crate::testing::with_database;
 use crate::{
@@ -223,9 +223,13 @@ async fn sites_terrains_and_robots_are_the_same() {
         both!(both, robots::measured_count(1));
         for boot in 10..40 {
             let pk = both!(both, robots::boot_key(1, id(boot), 4));
-            assert!(!both!(both, history::has_report(pk, 7)));
-            both!(both, history::note_report(pk, 7));
-            assert!(both!(both, history::has_report(pk, 7)));
+            let key = RecordKey {
+                boot_pk: pk,
+                seq: 7,
+            };
+            assert!(!both!(both, history::has_report(key)));
+            both!(both, history::note_report(key));
+            assert!(both!(both, history::has_report(key)));
         }
         both!(both, robots::find_boot(1, id(10)));
         both!(both, robots::find_boot(1, id(39)));
@@ -430,8 +434,7 @@ async fn missions_and_restorations_are_the_same() {
         let row = withdrawals::WithdrawalRow {
             pk: 0,
             robot_pk: 1,
-            from_h: 3,
-            to_h: 9,
+            hours: withdrawals::Hours { from_h: 3, to_h: 9 },
             reason: "Ä".to_owned(),
             by: "anna".to_owned(),
             at: at(3),
@@ -575,7 +578,6 @@ async fn identities_are_the_same() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-#[expect(clippy::too_many_lines, reason = "one call after the other")]
 async fn records_and_webhooks_are_the_same() {
     with_both("records_and_webhooks_are_the_same", async |both| {
         let entry = |second: i64, status: u16| {
@@ -670,8 +672,7 @@ async fn records_and_webhooks_are_the_same() {
 
         let raw = serde_json::value::RawValue::from_string("{\"a\":0.1}".to_owned()).unwrap();
         let origin = |seq| deferred_segments::Origin {
-            boot_pk: 1,
-            seq,
+            key: RecordKey { boot_pk: 1, seq },
             site_pk: 1,
             robot_pk: 1,
         };

@@ -12,6 +12,7 @@ use tread_api::terrain::TerrainRef;
 use tread_store::friction::fixed::Fixed;
 use tread_store::friction::sums::{Pair, Pass};
 use tread_store::friction::{Horizons, Sums};
+use tread_store::withdrawals::Hours;
 
 use crate::sums::{SumKey, add, each, of_hour, remove, remove_hours, unmerged};
 use crate::testing::{TestDatabase, with_database};
@@ -252,7 +253,11 @@ async fn hours_to_be_merged_are_listed_robot_by_robot() {
             assert_eq!(of_one.len(), 1);
             assert!(remove(&mut tx, &of_one[0].key).await.unwrap());
             assert!(!remove(&mut tx, &of_one[0].key).await.unwrap());
-            assert_eq!(remove_hours(&mut tx, 2, (24, 745)).await.unwrap(), 3);
+            let hours = Hours {
+                from_h: 24,
+                to_h: 745,
+            };
+            assert_eq!(remove_hours(&mut tx, 2, hours).await.unwrap(), 3);
             assert_eq!(all(&mut tx).await.len(), 14);
             drop(tx);
             db.close().await;

@@ -2,6 +2,7 @@
 //! known.
 
 use serde_json::value::RawValue;
+use tread_store::RecordKey;
 pub use tread_store::deferred_segments::{DeferredSegment, Origin};
 
 use super::{Connection, EngineError, from_json, unsigned};
@@ -14,8 +15,7 @@ pub async fn put(
     measurement: &RawValue,
 ) -> Result<bool, EngineError> {
     let Origin {
-        boot_pk,
-        seq,
+        key: RecordKey { boot_pk, seq },
         site_pk,
         robot_pk,
     } = origin;

@@ -3,6 +3,7 @@
 use tread_api::event::MissionStep;
 use tread_api::ids::MissionId;
 use tread_api::mission::{Actor, MissionEvent, MissionState};
+use tread_store::RecordKey;
 
 use super::missions::{cause, state};
 use super::{Connection, EngineError, corrupt, from_us, parse, to_us, unsigned};
@@ -149,22 +150,22 @@ pub async fn event_count(db: &mut Connection, id: MissionId) -> Result<u32, Engi
 }
 
 /// Returns whether a report was applied before.
-pub async fn has_report(db: &mut Connection, boot_pk: i64, seq: i64) -> Result<bool, EngineError> {
+pub async fn has_report(db: &mut Connection, key: RecordKey) -> Result<bool, EngineError> {
     let found = sqlx::query_scalar!(
         r#"SELECT EXISTS (SELECT 1 FROM reports_seen WHERE boot_pk = $1 AND seq = $2)
                AS "found!: bool""#,
-        boot_pk,
-        seq,
+        key.boot_pk,
+        key.seq,
     );
     Ok(found.fetch_one(db).await?)
 }
 
 /// Records that a report was applied.
-pub async fn note_report(db: &mut Connection, boot_pk: i64, seq: i64) -> Result<(), EngineError> {
+pub async fn note_report(db: &mut Connection, key: RecordKey) -> Result<(), EngineError> {
     sqlx::query!(
         "INSERT INTO reports_seen (boot_pk, seq) VALUES ($1, $2)",
-        boot_pk,
-        seq
+        key.boot_pk,
+        key.seq
     )
     .execute(db)
     .await?;

@@ -3,6 +3,7 @@
 
 use futures_util::TryStreamExt as _;
 pub use tread_store::sums::{StoredHour, SumKey, SumRow};
+use tread_store::withdrawals::Hours;
 
 use super::sum_columns::RawSum;
 pub use super::sum_rows::{add, unmerged};
@@ -118,17 +119,17 @@ pub async fn remove(db: &mut Connection, key: &SumKey) -> Result<bool, EngineErr
     Ok(done.rows_affected() == 1)
 }
 
-/// Removes the sums of a robot between two hours, both included. Returns their number.
+/// Removes the sums of a robot in these hours. Returns their number.
 pub async fn remove_hours(
     db: &mut Connection,
     robot_pk: i64,
-    (from_h, to_h): (i64, i64),
+    hours: Hours,
 ) -> Result<u64, EngineError> {
     let done = sqlx::query!(
         "DELETE FROM cell_sums WHERE robot_pk = $1 AND epoch_h BETWEEN $2 AND $3",
         robot_pk,
-        from_h,
-        to_h,
+        hours.from_h,
+        hours.to_h,
     )
     .execute(db)
     .await?;

@@ -1,6 +1,6 @@
 //! Withdrawals: hours of robots whose measurements are not on the map.
 
-pub use tread_store::withdrawals::WithdrawalRow;
+pub use tread_store::withdrawals::{Hours, WithdrawalRow};
 
 use super::{Connection, EngineError, from_us, to_us, unsigned};
 
@@ -16,8 +16,10 @@ pub async fn all(db: &mut Connection) -> Result<Vec<WithdrawalRow>, EngineError>
             Ok(WithdrawalRow {
                 pk: row.pk,
                 robot_pk: row.robot_pk,
-                from_h: row.from_h,
-                to_h: row.to_h,
+                hours: Hours {
+                    from_h: row.from_h,
+                    to_h: row.to_h,
+                },
                 reason: row.reason,
                 by: row.withdrawn_by,
                 at: from_us(row.withdrawn_at_us)?,
@@ -41,8 +43,8 @@ pub async fn insert(db: &mut Connection, row: &WithdrawalRow) -> Result<i64, Eng
              (SELECT withdrawn_at_us FROM withdrawals ORDER BY pk DESC LIMIT 1), $6)))
          RETURNING pk AS "pk!""#,
         row.robot_pk,
-        row.from_h,
-        row.to_h,
+        row.hours.from_h,
+        row.hours.to_h,
         row.reason,
         row.by,
         at_us,

@@ -2,6 +2,8 @@
 
 use tread_api::friction::Segment;
 
+use crate::RecordKey;
+
 /// A deferred segment.
 #[derive(Debug, Clone)]
 pub struct DeferredSegment {
@@ -14,10 +16,8 @@ pub struct DeferredSegment {
 /// Origin of a segment.
 #[derive(Debug, Clone, Copy)]
 pub struct Origin {
-    /// Key of the run of the agent.
-    pub boot_pk: i64,
-    /// Sequence number within that run.
-    pub seq: i64,
+    /// Key of its record.
+    pub key: RecordKey,
     /// Key of the site.
     pub site_pk: i64,
     /// Key of the robot.

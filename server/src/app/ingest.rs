@@ -40,7 +40,7 @@ use crate::db::deferred_segments::Origin;
 use crate::db::segments::{Added, NewSegment};
 use crate::db::sums::SumKey;
 use crate::db::withdrawals::WithdrawalRow;
-use crate::db::{self, DbError, Tx};
+use crate::db::{self, DbError, RecordKey, Tx};
 use crate::friction::epoch_h_at;
 
 /// Maximum number of uploads that wait for the writer.
@@ -108,7 +108,7 @@ pub struct Writer {
 struct Candidate<'group> {
     /// Index of the upload whose receipt counts it; `None` for a segment that was deferred.
     upload: Option<usize>,
-    keys: (i64, i64),
+    key: RecordKey,
     site_pk: i64,
     robot_pk: i64,
     configuration_pk: i64,
@@ -118,7 +118,7 @@ struct Candidate<'group> {
 
 impl Candidate<'_> {
     fn row(&self) -> NewSegment<'_> {
-        let (boot_pk, seq) = self.keys;
+        let RecordKey { boot_pk, seq } = self.key;
         NewSegment {
             boot_pk,
             seq,
@@ -313,9 +313,9 @@ impl Writer {
             };
             let (site_pk, robot_pk, grid) = (of.site_pk, of.robot_pk, of.grid);
             let skew = Skew::of(batch.robot_time, now);
-            let candidate = |upload, keys, configuration_pk, ready| Candidate {
+            let candidate = |upload, key, configuration_pk, ready| Candidate {
                 upload,
-                keys,
+                key,
                 site_pk,
                 robot_pk,
                 configuration_pk,
@@ -323,11 +323,11 @@ impl Writer {
                 ready,
             };
             if is_any_deferred && batch.robot_time.is_some() {
-                for (keys, ready) in released(&mut tx, boot_pk, &grid, skew).await? {
+                for (key, ready) in released(&mut tx, boot_pk, &grid, skew).await? {
                     // The key was cached when the segment was deferred.
                     let id = ready.segment.configuration;
                     let found = db::robots::note_measured(&mut tx, robot_pk, id).await?;
-                    candidates.push(candidate(None, keys, found, ready));
+                    candidates.push(candidate(None, key, found, ready));
                     configurations.insert(id, found);
                 }
             }
@@ -339,21 +339,19 @@ impl Writer {
             for record in &batch.records {
                 let seq = record.seq;
                 let mut refuse = |reason| receipt.refused.push(RefusedRecord { seq, reason });
-                let Some(seq_key) = i64::try_from(seq).ok().filter(|_| seq < SEQ_MAX) else {
+                let Some(key) = record_key(boot_pk, seq) else {
                     refuse("seq is beyond 2^53".to_owned());
                     continue;
                 };
-                let keys = (boot_pk, seq_key);
                 match &record.content {
                     RecordContent::Segment(segment) => {
                         match possible(segment, &grid, skew, &configurations) {
                             Ok((configuration, Prepared::Ready(ready))) => {
-                                candidates.push(candidate(Some(index), keys, configuration, ready));
+                                candidates.push(candidate(Some(index), key, configuration, ready));
                             }
                             Ok((_, Prepared::Ahead(measurement))) => {
                                 let origin = Origin {
-                                    boot_pk,
-                                    seq: seq_key,
+                                    key,
                                     site_pk,
                                     robot_pk,
                                 };
@@ -372,7 +370,7 @@ impl Writer {
                     }
                     RecordContent::Mission(report) => {
                         let of = self.reporting(upload, robot_pk, report, (now, skew));
-                        let taken = self.apply_report(&mut tx, of, keys, report, &mut tally);
+                        let taken = self.apply_report(&mut tx, of, key, report, &mut tally);
                         let taken = taken.await?;
                         tally.note_report(taken, seq, &mut receipt);
                     }
@@ -395,12 +393,12 @@ impl Writer {
         &self,
         tx: &mut Tx,
         of: Reporting,
-        keys: (i64, i64),
+        key: RecordKey,
         report: &MissionReport,
         tally: &mut Tally,
     ) -> Result<Option<Result<Taken, Foreign>>, DbError> {
         let robot_pk = of.robot_pk;
-        let taken = take_new_report(tx, of, keys, report).await?;
+        let taken = take_new_report(tx, of, key, report).await?;
         if let Some(Ok(taken)) = &taken {
             let alerts = self.app.alert_report(tx, robot_pk, report, taken);
             tally.alerts.extend(alerts.await?);
@@ -465,7 +463,7 @@ impl Writer {
         let mut folded: Vec<Folded> = Vec::new();
         for candidate in candidates {
             // A segment that occurs twice in this group is new once.
-            let is_new = stored.insert(candidate.keys);
+            let is_new = stored.insert(candidate.key);
             let upload = candidate.upload.and_then(|upload| outcomes.get_mut(upload));
             if let Some(Ok(receipt)) = upload {
                 if is_new {
@@ -485,7 +483,9 @@ impl Writer {
                 sums,
             } = &candidate.ready;
             let epoch_h = epoch_h_at(us_of(times_ns.1));
-            let is_withdrawn = |row: &WithdrawalRow| row.includes(candidate.robot_pk, epoch_h);
+            let is_withdrawn = |row: &WithdrawalRow| {
+                row.robot_pk == candidate.robot_pk && row.hours.contains(epoch_h)
+            };
             if withdrawals.iter().any(is_withdrawn) {
                 continue;
             }
@@ -511,6 +511,12 @@ impl Writer {
         let added = db::segments::insert(tx, &rows, now).await?;
         Ok((folded, added))
     }
+}
+
+/// Returns the key of a record; `None` if its number is beyond [`SEQ_MAX`].
+fn record_key(boot_pk: i64, seq: u64) -> Option<RecordKey> {
+    let seq = i64::try_from(seq).ok().filter(|_| seq < SEQ_MAX)?;
+    Some(RecordKey { boot_pk, seq })
 }
 
 /// Returns the configurations that a batch measured with.
@@ -575,14 +581,17 @@ async fn released(
     boot_pk: i64,
     grid: &Grid,
     skew: Skew,
-) -> Result<Vec<((i64, i64), Ready<'static>)>, DbError> {
+) -> Result<Vec<(RecordKey, Ready<'static>)>, DbError> {
     let waiting = db::deferred_segments::take(tx, boot_pk, skew.latest_us(), RELEASED_MAX).await?;
     let ready = |waiting: db::deferred_segments::DeferredSegment| match prepared(
         Cow::Owned(waiting.segment),
         grid,
         skew,
     ) {
-        Ok(Prepared::Ready(ready)) => Some(((boot_pk, waiting.seq), ready)),
+        Ok(Prepared::Ready(ready)) => {
+            let seq = waiting.seq;
+            Some((RecordKey { boot_pk, seq }, ready))
+        }
         // It was valid when it arrived, and its time is no longer in the future.
         Ok(Prepared::Ahead(_)) | Err(_) => None,
     };
@@ -616,16 +625,16 @@ async fn defer(
 async fn take_new_report(
     tx: &mut Tx,
     reporting: Reporting,
-    (boot_pk, seq): (i64, i64),
+    key: RecordKey,
     report: &MissionReport,
 ) -> Result<Option<Result<Taken, Foreign>>, DbError> {
-    if db::history::has_report(tx, boot_pk, seq).await? {
+    if db::history::has_report(tx, key).await? {
         return Ok(None);
     }
     let taken = take_report(tx, reporting, report).await?;
     // A refused report is not recorded, so that it is refused again and not counted as a duplicate.
     if taken.is_ok() {
-        db::history::note_report(tx, boot_pk, seq).await?;
+        db::history::note_report(tx, key).await?;
     }
     Ok(Some(taken))
 }

@@ -36,6 +36,7 @@ use crate::db::segments::Added;
 use crate::db::sites::SiteRow;
 use crate::db::sums::SumKey;
 use crate::db::watermarks::WatermarkStep;
+use crate::db::withdrawals::Hours;
 use crate::db::{DbError, Outcome, Tx};
 use crate::friction::index::{Labelled, SiteMap};
 use crate::friction::{Horizons, Sums};
@@ -102,8 +103,7 @@ pub(super) struct Withdrawn {
     pub(super) site: SiteRow,
     pub(super) robot: RobotId,
     pub(super) robot_pk: i64,
-    /// First and last hour.
-    pub(super) hours: (i64, i64),
+    pub(super) hours: Hours,
 }
 
 impl MapTurn {

@@ -14,7 +14,7 @@ use tread_api::rights::Scope;
 use super::map::{MapChange, Withdrawn};
 use super::{App, AppError, page, people_line, site_row};
 use crate::db;
-use crate::db::withdrawals::WithdrawalRow;
+use crate::db::withdrawals::{Hours, WithdrawalRow};
 use crate::friction::epochs::HOUR_S;
 use crate::friction::{Horizons, epoch_h};
 
@@ -41,9 +41,11 @@ impl App {
         let unknown = || AppError::UnknownRobot(site.clone(), robot.clone());
         let found = db::robots::find(&mut tx, site_row.pk, robot).await?;
         let robot_pk = found.ok_or_else(unknown)?.pk;
-        let from_h = from.map_or(0, epoch_h).max(0);
-        let to_h = to.map_or(epoch_h(now), epoch_h);
-        check_hours((from_h, to_h), site_row.horizons)?;
+        let hours = Hours {
+            from_h: from.map_or(0, epoch_h).max(0),
+            to_h: to.map_or(epoch_h(now), epoch_h),
+        };
+        check_hours(hours, site_row.horizons)?;
         let count = db::withdrawals::count(&mut tx).await?;
         if count >= WITHDRAWALS_MAX {
             return Err(AppError::TooMany {
@@ -54,19 +56,18 @@ impl App {
         let mut row = WithdrawalRow {
             pk: 0,
             robot_pk,
-            from_h,
-            to_h,
+            hours,
             reason,
             by: by.to_owned(),
             at: now,
         };
         row.pk = db::withdrawals::insert(&mut tx, &row).await?;
-        let removed = db::sums::remove_hours(&mut tx, robot_pk, (from_h, to_h)).await?;
+        let removed = db::sums::remove_hours(&mut tx, robot_pk, hours).await?;
         let change = MapChange::Withdraw(Box::new(Withdrawn {
             site: site_row,
             robot: robot.clone(),
             robot_pk,
-            hours: (from_h, to_h),
+            hours,
         }));
         turn.commit(tx, change, Vec::new()).await?;
         tracing::info!(robot.id = %robot, "{removed} sums of robot `{robot}` were withdrawn");
@@ -93,7 +94,7 @@ impl App {
     }
 }
 
-fn check_hours((from_h, to_h): (i64, i64), horizons: Horizons) -> Result<(), AppError> {
+fn check_hours(Hours { from_h, to_h }: Hours, horizons: Horizons) -> Result<(), AppError> {
     let time = |hour: i64| Timestamp::from_second(hour * HOUR_S).unwrap_or(Timestamp::MAX);
     if to_h < from_h {
         return Err(AppError::Invalid {
@@ -125,8 +126,8 @@ fn to_api(row: WithdrawalRow, robot: RobotId) -> Withdrawal {
     Withdrawal {
         id: row.pk,
         robot,
-        from: time(row.from_h),
-        before: time(row.to_h + 1),
+        from: time(row.hours.from_h),
+        before: time(row.hours.to_h + 1),
         reason: row.reason,
         by: row.by,
         at: row.at,

@@ -17,7 +17,7 @@ use crate::archive::former_mark;
 use crate::backup::archive::sync_folder;
 use crate::db::lock::DatabaseLock;
 use crate::db::schema::{self, refuse_newer};
-use crate::db::transfer::{self, Copied, Progress};
+use crate::db::transfer::{self, Copied, Databases, Progress};
 use crate::db::{Db, Location};
 use crate::file_owner;
 use crate::paths::folder_of;
@@ -148,7 +148,11 @@ async fn interruption() -> anyhow::Error {
 async fn into(source: &Db, to: &Location, quiet: bool) -> anyhow::Result<Vec<Copied>> {
     let target = Db::open_with(to, COMMIT_TIMEOUT).await?;
     let mut shown = Shown::new(quiet);
-    let copied = transfer::copy(source, &target, |progress| shown.show(&progress)).await;
+    let databases = Databases {
+        from: source,
+        to: &target,
+    };
+    let copied = transfer::copy(databases, |progress| shown.show(&progress)).await;
     shown.end();
     target.close().await;
     Ok(copied?)

@@ -17,7 +17,6 @@ use tread_api::webhook::{DeliveryState, NoticeEvent, Webhook};
 use tread_server::app::AppError;
 use tread_server::authority::Issued;
 use tread_server::config::RetentionConfig;
-use tread_server::db;
 use tread_server::db::alerts::AlertLocation;
 use tread_server::db::deferred_segments::Origin;
 use tread_server::db::enrolments::Renewal;
@@ -27,7 +26,8 @@ use tread_server::db::restorations::Restoration;
 use tread_server::db::robots::Introduction;
 use tread_server::db::sessions::{NewSession, OfPeople, Owner, SignedIn};
 use tread_server::db::webhooks::{NewDelivery, Outcome};
-use tread_server::db::withdrawals::WithdrawalRow;
+use tread_server::db::withdrawals::{Hours, WithdrawalRow};
+use tread_server::db::{self, RecordKey};
 use tread_server::identity::secret::{Fingerprint, Kind, Secret};
 use tread_server::identity::subject::SubjectId;
 
@@ -228,7 +228,7 @@ pub(crate) const PATHS: &[WritePath] = &[
                 db::history::add_event(tx, id, &event).await?;
                 let boot_pk = db::robots::boot_key(tx, ground.robot_pk, boot(), RUNS_KEPT).await?;
                 let seq = i64::try_from(number).unwrap_or_default();
-                db::history::note_report(tx, boot_pk, seq).await
+                db::history::note_report(tx, RecordKey { boot_pk, seq }).await
             }))
         },
     },
@@ -262,9 +262,9 @@ pub(crate) const PATHS: &[WritePath] = &[
         act: |ground, number| {
             Box::pin(ground.write(async move |tx| {
                 let boot_pk = db::robots::boot_key(tx, ground.robot_pk, boot(), RUNS_KEPT).await?;
+                let seq = i64::try_from(10 * number + 5).unwrap_or_default();
                 let origin = Origin {
-                    boot_pk,
-                    seq: i64::try_from(10 * number + 5).unwrap_or_default(),
+                    key: RecordKey { boot_pk, seq },
                     site_pk: ground.site_pk,
                     robot_pk: ground.robot_pk,
                 };
@@ -549,17 +549,17 @@ pub(crate) const PATHS: &[WritePath] = &[
         act: |ground, _number| {
             Box::pin(ground.write(async move |tx| {
                 // Hours in which nothing was measured.
+                let hours = Hours { from_h: 1, to_h: 2 };
                 let row = WithdrawalRow {
                     pk: 0,
                     robot_pk: ground.robot_pk,
-                    from_h: 1,
-                    to_h: 2,
+                    hours,
                     reason: "a test".to_owned(),
                     by: "a test".to_owned(),
                     at: now(),
                 };
                 db::withdrawals::insert(tx, &row).await?;
-                db::sums::remove_hours(tx, ground.robot_pk, (1, 2))
+                db::sums::remove_hours(tx, ground.robot_pk, hours)
                     .await
                     .map(|_| ())
             }))

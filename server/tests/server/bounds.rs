@@ -21,8 +21,8 @@ use tread_api::wire::hello::Hello;
 use tread_api::wire::ingest::Record;
 use tread_server::app::App;
 use tread_server::app::stops::StopReason;
-use tread_server::db;
 use tread_server::db::stops::StopFilter;
+use tread_server::db::{self, RecordKey};
 use uuid::Uuid;
 
 use crate::harness::{
@@ -278,7 +278,8 @@ async fn a_robot_begins_few_runs_and_those_of_which_nothing_is_kept_are_forgotte
         let boot_pk = db::robots::boot_key(&mut tx, robot_pk, boot(20_000 + number), 5)
             .await
             .unwrap();
-        db::history::note_report(&mut tx, boot_pk, 1).await.unwrap();
+        let key = RecordKey { boot_pk, seq: 1 };
+        db::history::note_report(&mut tx, key).await.unwrap();
     }
     tx.commit().await.unwrap();
     // The five newest, the one that said hello, and the one of which a measurement is kept.

@@ -196,7 +196,7 @@ fn counted(row: &KeyedSegment, of: Identity, withdrawals: &[WithdrawalRow]) -> O
         && segment.grid_revision == of.grid_revision
         && !withdrawals
             .iter()
-            .any(|found| found.includes(row.robot_pk, hour));
+            .any(|found| found.robot_pk == row.robot_pk && found.hours.contains(hour));
     let sums = is_on_map.then(|| Sums::of(segment)).flatten();
     sums.map(|sums| Measurement {
         ended_at_us: segment.ended_at.as_microsecond(),

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, HashMap};
 use super::Candidate;
 use super::keys::Keys;
 use crate::app::retention::Removed;
-use crate::db::{self, DbError, Tx};
+use crate::db::{self, DbError, RecordKey, Tx};
 
 /// Recognises segments of a group of uploads that are stored already, or twice in the group.
 #[derive(Debug, Default)]
@@ -23,18 +23,16 @@ impl Deduplication {
         keys: &mut Keys,
     ) -> Result<Self, DbError> {
         let mut spans: HashMap<i64, (i64, i64)> = HashMap::new();
-        for &Candidate {
-            keys: (boot_pk, seq),
-            ..
-        } in candidates
-        {
+        for candidate in candidates {
+            let RecordKey { boot_pk, seq } = candidate.key;
             let span = spans.entry(boot_pk).or_insert((seq, seq));
             *span = (span.0.min(seq), span.1.max(seq));
         }
         let mut found = Self::default();
         for (boot_pk, span) in spans {
             let newest = keys.newest_seq(tx, boot_pk).await?;
-            keys.note_seq(boot_pk, span.1);
+            let seq = span.1;
+            keys.note_seq(RecordKey { boot_pk, seq });
             if newest.is_none_or(|newest| newest < span.0) {
                 continue;
             }
@@ -49,9 +47,9 @@ impl Deduplication {
         Ok(found)
     }
 
-    /// Adds a segment by its run and sequence number. Returns whether it was unknown.
-    pub(super) fn insert(&mut self, (boot_pk, seq): (i64, i64)) -> bool {
-        self.boots.entry(boot_pk).or_default().insert(seq)
+    /// Adds a segment. Returns whether it was unknown.
+    pub(super) fn insert(&mut self, key: RecordKey) -> bool {
+        self.boots.entry(key.boot_pk).or_default().insert(key.seq)
     }
 }
 

@@ -9,7 +9,7 @@ use super::Upload;
 use crate::app::App;
 use crate::app::presence::RobotKey;
 use crate::app::robots::RUNS_KEPT_MAX;
-use crate::db::{self, DbError, Tx};
+use crate::db::{self, DbError, RecordKey, Tx};
 
 /// Number of cached keys above which the cache is emptied.
 const KEYS_MAX: usize = 100_000;
@@ -128,10 +128,10 @@ impl Keys {
         Ok(newest)
     }
 
-    /// Notes that segments of a run up to a sequence number are about to be stored.
-    pub(super) fn note_seq(&mut self, boot_pk: i64, seq: i64) {
-        let newest = self.newest_seqs.entry(boot_pk).or_default();
-        *newest = (*newest).max(Some(seq));
+    /// Notes that segments of a run up to this one are about to be stored.
+    pub(super) fn note_seq(&mut self, last: RecordKey) {
+        let newest = self.newest_seqs.entry(last.boot_pk).or_default();
+        *newest = (*newest).max(Some(last.seq));
     }
 
     /// Returns the key of a configuration that a robot measures with, or why it is refused.

@@ -177,7 +177,7 @@ impl App {
                     site: (*site).clone(),
                     robot: robot.clone(),
                     robot_pk: row.robot_pk,
-                    hours: (row.from_h, row.to_h),
+                    hours: row.hours,
                 })));
             }
             read.last_withdrawal = read.names.last_withdrawal();

@@ -97,8 +97,8 @@ impl Names {
             site_pk,
             configuration_pk,
         };
-        let is_withdrawn = |row: &WithdrawalRow| row.includes(robot_pk, key.epoch_h);
-        if self.withdrawals.iter().any(is_withdrawn) {
+        let mut withdrawals = self.withdrawals.iter();
+        if withdrawals.any(|row| row.robot_pk == robot_pk && row.hours.contains(key.epoch_h)) {
             return Ok(None);
         }
         Ok(Some(Folded {

@@ -19,6 +19,7 @@ use tread_api::site::Cell;
 use crate::db::segments::Added;
 use crate::db::sums::SumKey;
 use crate::db::watermarks::WatermarkStep;
+use crate::db::withdrawals::Hours;
 use crate::friction::Sums;
 use crate::friction::index::Block;
 
@@ -339,8 +340,8 @@ impl Unwritten {
         sums.filter(move |(key, _)| key.site_pk == site_pk && Block::of(key.cell) == block)
     }
 
-    /// Removes the sums of a robot between two hours, both included.
-    pub(super) fn withdraw(&mut self, robot_pk: i64, (from_h, to_h): (i64, i64)) {
+    /// Removes the sums of a robot in these hours.
+    pub(super) fn withdraw(&mut self, robot_pk: i64, hours: Hours) {
         let Some(mut generations) = self.robots.remove(&robot_pk) else {
             return;
         };
@@ -349,7 +350,7 @@ impl Unwritten {
             self.segments -= generation.segments();
             generation
                 .sums
-                .retain(|key, _| !(from_h..=to_h).contains(&key.epoch_h));
+                .retain(|key, _| !hours.contains(key.epoch_h));
             self.sums += generation.sums.len();
             self.segments += generation.segments();
         }

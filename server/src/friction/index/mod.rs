@@ -18,6 +18,7 @@ use jiff::Timestamp;
 use tread_api::ids::{ConfigurationId, RobotId};
 use tread_api::site::Cell;
 use tread_api::terrain::TerrainRef;
+use tread_store::withdrawals::Hours;
 
 use self::cells::Blocks;
 pub use self::cells::{Absent, BlockBuilder, BlockCells, Cells, Pin};
@@ -307,14 +308,13 @@ impl SiteMap {
         }
     }
 
-    /// Removes the measurements of a robot from hour `from_h` to hour `to_h`, both included.
-    pub fn withdraw(&mut self, robot: &RobotId, (from_h, to_h): (i64, i64)) {
+    /// Removes the measurements of a robot in these hours.
+    pub fn withdraw(&mut self, robot: &RobotId, hours: Hours) {
         self.removals += 1;
         let Some(&robot) = self.names.robots.numbers.get(robot) else {
             return;
         };
-        let goes =
-            |key: &PartKey| key.robot == robot && (from_h..=to_h).contains(&i64::from(key.epoch_h));
+        let goes = |key: &PartKey| key.robot == robot && hours.contains(i64::from(key.epoch_h));
         self.blocks.remove(goes);
         self.totals.retain(|key, _sums| !goes(key));
         self.count_segments();

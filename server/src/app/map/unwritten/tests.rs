@@ -5,7 +5,6 @@ use proptest::prelude::*;
 use tread_api::site::Cell;
 
 use super::*;
-use crate::db::withdrawals::WithdrawalRow;
 use crate::friction::fixed::Fixed;
 use crate::friction::sums::{Pair, Pass};
 
@@ -26,7 +25,7 @@ enum Act {
     Snapshot(usize),
     /// It is put into memory.
     EndRead(usize),
-    Withdraw(i64, (i64, i64)),
+    Withdraw(i64, Hours),
     Kill,
 }
 
@@ -46,7 +45,10 @@ fn act() -> impl Strategy<Value = Act> {
         3 => (0_usize..2).prop_map(Act::Snapshot),
         3 => (0_usize..2).prop_map(Act::EndRead),
         1 => (0_i64..4, 0_i64..4, 0_i64..4)
-            .prop_map(|(robot, from, hours)| Act::Withdraw(robot, (from, from + hours))),
+            .prop_map(|(robot, from_h, span_h)| {
+                let to_h = from_h + span_h;
+                Act::Withdraw(robot, Hours { from_h, to_h })
+            }),
         2 => Just(Act::Kill),
     ]
 }
@@ -117,7 +119,7 @@ struct Server {
     segments: Vec<(SumKey, Sums)>,
     stored: Table,
     watermarks: HashMap<i64, i64>,
-    withdrawals: Vec<(i64, (i64, i64))>,
+    withdrawals: Vec<(i64, Hours)>,
     unwritten: Unwritten,
     /// Numbers of two reads of blocks.
     reads: [Option<u64>; 2],
@@ -135,18 +137,9 @@ struct Snapshot {
 
 impl Server {
     fn is_withdrawn(&self, key: &SumKey) -> bool {
-        self.withdrawals.iter().any(|&(robot_pk, (from_h, to_h))| {
-            let row = WithdrawalRow {
-                pk: 1,
-                robot_pk,
-                from_h,
-                to_h,
-                reason: String::new(),
-                by: String::new(),
-                at: jiff::Timestamp::UNIX_EPOCH,
-            };
-            row.includes(key.robot_pk, key.epoch_h)
-        })
+        let mut withdrawals = self.withdrawals.iter();
+        withdrawals
+            .any(|(robot_pk, hours)| *robot_pk == key.robot_pk && hours.contains(key.epoch_h))
     }
 
     fn run(&mut self, act: Act) {
@@ -193,12 +186,11 @@ impl Server {
                     self.unwritten.written(&portion.steps);
                 }
             }
-            Act::Withdraw(robot_pk, (from_h, to_h)) => {
-                self.withdrawals.push((robot_pk, (from_h, to_h)));
-                self.stored.retain(|key, _| {
-                    key.robot_pk != robot_pk || !(from_h..=to_h).contains(&key.epoch_h)
-                });
-                self.unwritten.withdraw(robot_pk, (from_h, to_h));
+            Act::Withdraw(robot_pk, hours) => {
+                self.withdrawals.push((robot_pk, hours));
+                self.stored
+                    .retain(|key, _| key.robot_pk != robot_pk || !hours.contains(key.epoch_h));
+                self.unwritten.withdraw(robot_pk, hours);
             }
             Act::Kill => {
                 let generation_sums = self.unwritten.generation_sums;

@@ -4,6 +4,7 @@ use jiff::Timestamp;
 use proptest::prelude::*;
 use tread_api::ids::{ConfigurationId, RobotId};
 use tread_api::terrain::TerrainRef;
+use tread_store::withdrawals::Hours;
 use uuid::Uuid;
 
 use super::super::{At, CELLS_PER_BLOCK, CellSummary, Horizons, Labelled, Room};
@@ -141,12 +142,15 @@ fn take(step: &Step, kept: &mut SiteMap, evicting: &mut SiteMap, stored: &mut BT
             entry.and_modify(|stored| stored.add(&sums)).or_insert(sums);
         }
         Step::Withdraw(of, oldest, newest) => {
-            let hours = (newest_h() - oldest, newest_h() - newest);
+            let hours = Hours {
+                from_h: newest_h() - oldest,
+                to_h: newest_h() - newest,
+            };
             kept.withdraw(&robot(of), hours);
             evicting.withdraw(&robot(of), hours);
             stored.retain(|key, _| {
                 let first_h = i64::from(kept.bucket(newest_h() - key.1));
-                key.0 != of || !(hours.0..=hours.1).contains(&first_h)
+                key.0 != of || !hours.contains(first_h)
             });
         }
         Step::Merge(days, months) => {
@@ -265,7 +269,11 @@ fn squares_of_a_block_that_left_memory_are_made_again_only_after_a_change() {
     let before = map.changes().newest_of(block);
     map.evict(block);
     assert_eq!(map.changes().newest_of(block), before);
-    map.withdraw(&robot(0), (0, i64::MAX));
+    let hours = Hours {
+        from_h: 0,
+        to_h: i64::MAX,
+    };
+    map.withdraw(&robot(0), hours);
     assert!(map.changes().newest_of(block) > before);
     assert_eq!(
         map.changes().since(block, before),
