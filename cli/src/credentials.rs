@@ -72,6 +72,15 @@ pub(crate) struct Store {
     file: PathBuf,
 }
 
+/// Entry of the file.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Entry<'text> {
+    /// Address of a server, or [`LAST_SERVER`].
+    pub(crate) key: &'text str,
+    /// What is stored for it.
+    pub(crate) value: &'text str,
+}
+
 impl Store {
     /// Returns the credentials file of the user; `None` without a home directory.
     pub(crate) fn of_user() -> Option<Self> {
@@ -98,7 +107,10 @@ impl Store {
 
     /// Stores the server of the last login.
     pub(crate) fn keep_last_server(&self, address: &str) -> anyhow::Result<()> {
-        self.last_login().keep(LAST_SERVER, address)
+        self.last_login().keep(Entry {
+            key: LAST_SERVER,
+            value: address,
+        })
     }
 
     /// Deletes the server of the last login if it is this one.
@@ -115,10 +127,10 @@ impl Store {
         Ok(self.read()?.remove(address))
     }
 
-    /// Stores the token for a server.
-    pub(crate) fn keep(&self, address: &str, token: &str) -> anyhow::Result<()> {
+    /// Stores an entry.
+    pub(crate) fn keep(&self, entry: Entry<'_>) -> anyhow::Result<()> {
         self.change(|kept| {
-            kept.insert(address.to_owned(), token.to_owned());
+            kept.insert(entry.key.to_owned(), entry.value.to_owned());
             true
         })
     }
@@ -199,12 +211,22 @@ mod tests {
         (folder, Store { file })
     }
 
+    fn keep(store: &Store, key: &str) {
+        let entry = Entry { key, value: "one" };
+        store.keep(entry).unwrap();
+    }
+
     #[test]
     fn a_token_is_kept_for_its_server_alone_and_nobody_else_can_read_it() {
         let (_folder, store) = store();
         assert_eq!(store.find("http://a").unwrap(), None);
-        store.keep("http://a", "one").unwrap();
-        store.keep("http://b", "two").unwrap();
+        keep(&store, "http://a");
+        store
+            .keep(Entry {
+                key: "http://b",
+                value: "two",
+            })
+            .unwrap();
         assert_eq!(store.find("http://a").unwrap().as_deref(), Some("one"));
         assert_eq!(std::fs::metadata(store.path()).unwrap().mode() & OTHERS, 0);
         store.forget("http://a", Some("another")).unwrap();
@@ -217,7 +239,7 @@ mod tests {
     #[test]
     fn a_file_that_others_can_read_is_not_used() {
         let (_folder, store) = store();
-        store.keep("http://a", "one").unwrap();
+        keep(&store, "http://a");
         let open = std::fs::Permissions::from_mode(0o644);
         std::fs::set_permissions(store.path(), open).unwrap();
         let said = store.find("http://a").unwrap_err().to_string();
@@ -230,7 +252,7 @@ mod tests {
         std::thread::scope(|scope| {
             for number in 0..8 {
                 let store = &store;
-                scope.spawn(move || store.keep(&format!("http://{number}"), "x").unwrap());
+                scope.spawn(move || keep(store, &format!("http://{number}")));
             }
         });
         assert_eq!(store.read().unwrap().len(), 8);

@@ -10,7 +10,7 @@ use tread_api::rights::{Grant, Rights, Scope};
 
 use crate::args::{Connection, SessionsAction, TokensAction, TokensArguments};
 use crate::client::{Client, address_of};
-use crate::credentials::{self, Store};
+use crate::credentials::{self, Entry, Store};
 use crate::output::{Output, line, note, or_dash, render, table};
 
 /// Maximum length of a token that is read, bytes.
@@ -34,11 +34,11 @@ pub(super) async fn login(connection: &Connection, output: Output) -> anyhow::Re
     let client = client.for_people(!output.is_json());
     let session = client.session().await?;
     let store = store()?;
-    store.keep(client.address(), &token)?;
+    let key = client.address();
+    store.keep(Entry { key, value: &token })?;
     if let Some(fingerprint) = showing.ca_fingerprint {
-        store
-            .fingerprints()
-            .keep(client.address(), &fingerprint.to_string())?;
+        let value = &fingerprint.to_string();
+        store.fingerprints().keep(Entry { key, value })?;
     }
     store.keep_last_server(client.address())?;
     note(&format!(

@@ -27,7 +27,7 @@ use self::progress::Progress;
 use self::report::Report;
 use crate::args::DemoArguments;
 use crate::client::{Client, ClientError, Reading, Trusted};
-use crate::credentials::{self, Store};
+use crate::credentials::{self, Entry, Store};
 use crate::output::{json_line, line, note};
 use crate::signals::ShutdownSignals;
 
@@ -60,7 +60,7 @@ pub(crate) async fn run(arguments: DemoArguments) -> anyhow::Result<ExitCode> {
     let mut processes = Processes::start_server(folder.path(), arguments.port, &scenario.site)?;
     let token = credentials::read_token(&processes.token_file())?;
     let client = Client::new(&processes.api_address(), Some(&token), Trusted::System)?;
-    let _signed_in = SignedIn::keep(client.address(), &token);
+    let _signed_in = SignedIn::keep(&client, token);
     let demo = Demo {
         scenario: &scenario,
         robots: &robots,
@@ -133,18 +133,21 @@ struct SignedIn {
 }
 
 impl SignedIn {
-    fn keep(address: &str, token: &str) -> Self {
-        let store = Store::of_user().filter(|store| match store.keep(address, token) {
+    fn keep(client: &Client, token: String) -> Self {
+        let entry = Entry {
+            key: client.address(),
+            value: &token,
+        };
+        let store = Store::of_user().filter(|store| match store.keep(entry) {
             Ok(()) => true,
             Err(error) => {
                 note(&format!("other commands need --token-file: {error:#}"));
                 false
             }
         });
-        let (address, token) = (address.to_owned(), token.to_owned());
         Self {
             store,
-            address,
+            address: client.address().to_owned(),
             token,
         }
     }

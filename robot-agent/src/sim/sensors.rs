@@ -112,8 +112,8 @@ impl Sensors {
         radius * (std::f64::consts::TAU * self.random.random::<f64>()).cos()
     }
 
-    fn noisy(&mut self, value: f64, std_dev: f64) -> f64 {
-        value + std_dev * self.normal()
+    fn noise(&mut self, std_dev: f64) -> f64 {
+        std_dev * self.normal()
     }
 
     /// Samples the sensors of the base.
@@ -128,33 +128,31 @@ impl Sensors {
         let wheel_noise = spec.wheel_speed_rad_s;
         let body_speed_m_s = index
             .is_multiple_of(SAMPLES_PER_BODY_SPEED)
-            .then(|| self.noisy(state.forward_m_s, spec.body_speed_m_s));
+            .then(|| state.forward_m_s + self.noise(spec.body_speed_m_s));
         let position = index.is_multiple_of(SAMPLES_PER_POSITION).then(|| Pose {
-            x_m: self.noisy(state.pose.x_m, spec.position_m),
-            y_m: self.noisy(state.pose.y_m, spec.position_m),
-            heading_rad: self.noisy(state.pose.heading_rad, spec.heading_rad),
+            x_m: state.pose.x_m + self.noise(spec.position_m),
+            y_m: state.pose.y_m + self.noise(spec.position_m),
+            heading_rad: state.pose.heading_rad + self.noise(spec.heading_rad),
         });
         let torque_noise_n_m = self.torque_noise_n_m;
         SensorSample {
             at,
-            yaw_rate_rad_s: Some(self.noisy(means.yaw_rate_rad_s, spec.gyro_rad_s)),
+            yaw_rate_rad_s: Some(means.yaw_rate_rad_s + self.noise(spec.gyro_rad_s)),
             acceleration: Some(BodyAcceleration {
-                forward_m_s2: self.noisy(
-                    acceleration.forward_m_s2 + self.bias.forward_m_s2,
-                    spec.acceleration_m_s2,
-                ),
-                left_m_s2: self.noisy(
-                    acceleration.left_m_s2 + self.bias.left_m_s2,
-                    spec.acceleration_m_s2,
-                ),
+                forward_m_s2: acceleration.forward_m_s2
+                    + self.bias.forward_m_s2
+                    + self.noise(spec.acceleration_m_s2),
+                left_m_s2: acceleration.left_m_s2
+                    + self.bias.left_m_s2
+                    + self.noise(spec.acceleration_m_s2),
             }),
             wheel_speeds: Some(WheelSpeeds {
-                left_rad_s: self.noisy(means.wheel_speeds.left_rad_s, wheel_noise),
-                right_rad_s: self.noisy(means.wheel_speeds.right_rad_s, wheel_noise),
+                left_rad_s: means.wheel_speeds.left_rad_s + self.noise(wheel_noise),
+                right_rad_s: means.wheel_speeds.right_rad_s + self.noise(wheel_noise),
             }),
             wheel_torques: Some(WheelTorques {
-                left_n_m: self.noisy(torques.left_n_m * self.torque_scale, torque_noise_n_m),
-                right_n_m: self.noisy(torques.right_n_m * self.torque_scale, torque_noise_n_m),
+                left_n_m: torques.left_n_m * self.torque_scale + self.noise(torque_noise_n_m),
+                right_n_m: torques.right_n_m * self.torque_scale + self.noise(torque_noise_n_m),
             }),
             body_speed_m_s,
             tilt_rad: None,
@@ -172,7 +170,7 @@ mod tests {
     fn noise_has_the_standard_deviation_that_was_asked_for() {
         let mut sensors = Sensors::new(SensorSpec::default(), &RobotModel::yi2007(), 5);
         let count = 20_000;
-        let values: Vec<f64> = (0..count).map(|_| sensors.noisy(3.0, 0.5)).collect();
+        let values: Vec<f64> = (0..count).map(|_| 3.0 + sensors.noise(0.5)).collect();
         let mean = values.iter().sum::<f64>() / f64::from(count);
         let variance = values
             .iter()

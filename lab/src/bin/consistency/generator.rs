@@ -6,6 +6,7 @@
 //! with 2 cm of noise and wild ones among them, the accelerometer shakes and leans.
 
 use std::collections::VecDeque;
+use std::ops::RangeInclusive;
 use std::time::Duration;
 
 use rand::{RngExt, SeedableRng};
@@ -125,7 +126,9 @@ impl Build {
     };
 
     fn other(random: &mut ChaCha8Rng) -> Self {
-        let mut between = |least: f64, most: f64| least + (most - least) * random.random::<f64>();
+        let mut between = |range: RangeInclusive<f64>| {
+            range.start() + (range.end() - range.start()) * random.random::<f64>()
+        };
         let one_of = |of: &[f64], at: f64| {
             #[expect(
                 clippy::cast_precision_loss,
@@ -136,7 +139,7 @@ impl Build {
             let index = (at * of.len() as f64) as usize;
             of[index.min(of.len() - 1)]
         };
-        let encoder_counts = one_of(&[512.0, 1_024.0, 4_096.0, 16_384.0], between(0.0, 1.0));
+        let encoder_counts = one_of(&[512.0, 1_024.0, 4_096.0, 16_384.0], between(0.0..=1.0));
         #[expect(
             clippy::cast_possible_truncation,
             clippy::cast_sign_loss,
@@ -148,27 +151,27 @@ impl Build {
             clippy::cast_sign_loss,
             reason = "a few steps"
         )]
-        let command_delay_steps = between(0.0, 8.0) as usize;
+        let command_delay_steps = between(0.0..=8.0) as usize;
         Self {
             encoder_counts,
-            wheels_filter_s: between(0.0, 0.06),
+            wheels_filter_s: between(0.0..=0.06),
             command_delay_steps,
-            wheels_lag_s: between(0.04, 0.14),
-            wheels_most_rad_s2: between(30.0, 100.0),
-            slip_s: (between(0.03, 0.1), between(0.03, 0.1)),
-            mu: between(0.35, 0.9),
-            gyro_noise_rad_s: between(0.001, 0.02),
-            acceleration_noise_m_s2: between(0.05, 0.4),
-            odometry_noise_m_s: between(0.01, 0.05),
-            steps_per_odometry: steps(one_of(&[2.0, 5.0, 10.0], between(0.0, 1.0))),
-            steps_per_pose: steps(one_of(&[5.0, 10.0, 10.0, 20.0], between(0.0, 1.0))),
-            pose_late: (between(1.0, 8.0), between(9.0, 25.0)),
-            pose_noise: (between(0.005, 0.025), between(0.002, 0.01)),
-            pose_wander_m: between(0.0, 0.02),
-            most_m_s2: between(0.4, 1.5),
-            most_rad_s2: between(1.5, 4.0),
-            fastest: between(0.6, 1.2),
-            low_rad_s: between(7.0, 12.0),
+            wheels_lag_s: between(0.04..=0.14),
+            wheels_most_rad_s2: between(30.0..=100.0),
+            slip_s: (between(0.03..=0.1), between(0.03..=0.1)),
+            mu: between(0.35..=0.9),
+            gyro_noise_rad_s: between(0.001..=0.02),
+            acceleration_noise_m_s2: between(0.05..=0.4),
+            odometry_noise_m_s: between(0.01..=0.05),
+            steps_per_odometry: steps(one_of(&[2.0, 5.0, 10.0], between(0.0..=1.0))),
+            steps_per_pose: steps(one_of(&[5.0, 10.0, 10.0, 20.0], between(0.0..=1.0))),
+            pose_late: (between(1.0..=8.0), between(9.0..=25.0)),
+            pose_noise: (between(0.005..=0.025), between(0.002..=0.01)),
+            pose_wander_m: between(0.0..=0.02),
+            most_m_s2: between(0.4..=1.5),
+            most_rad_s2: between(1.5..=4.0),
+            fastest: between(0.6..=1.2),
+            low_rad_s: between(7.0..=12.0),
         }
     }
 }
@@ -287,8 +290,8 @@ impl Robot {
         radius * (std::f64::consts::TAU * self.chance()).cos()
     }
 
-    fn between(&mut self, least: f64, most: f64) -> f64 {
-        least + (most - least) * self.chance()
+    fn between(&mut self, range: RangeInclusive<f64>) -> f64 {
+        range.start() + (range.end() - range.start()) * self.chance()
     }
 
     /// Whether it is on ice, or left it a moment ago.
@@ -384,17 +387,17 @@ impl Robot {
             } else if chance < 0.22 {
                 Twist {
                     linear_m_s: 0.0,
-                    angular_rad_s: self.between(-1.2, 1.2),
+                    angular_rad_s: self.between(-1.2..=1.2),
                 }
             } else if chance < 0.3 {
                 Twist {
-                    linear_m_s: self.between(-0.6, -0.2),
-                    angular_rad_s: self.between(-0.5, 0.5),
+                    linear_m_s: self.between(-0.6..=-0.2),
+                    angular_rad_s: self.between(-0.5..=0.5),
                 }
             } else {
                 Twist {
-                    linear_m_s: self.between(0.25, self.build.fastest),
-                    angular_rad_s: self.between(-0.9, 0.9),
+                    linear_m_s: self.between(0.25..=self.build.fastest),
+                    angular_rad_s: self.between(-0.9..=0.9),
                 }
             };
             #[expect(
@@ -402,7 +405,7 @@ impl Robot {
                 clippy::cast_sign_loss,
                 reason = "small"
             )]
-            let steps = self.between(100.0, 600.0) as u64;
+            let steps = self.between(100.0..=600.0) as u64;
             self.until = self.step + steps;
         }
         let toward = |from: f64, to: f64, most: f64| from + (to - from).clamp(-most, most);
@@ -421,13 +424,13 @@ impl Robot {
         if self.kit.meets_ice && self.step >= self.ice_until {
             self.mu = self.build.mu;
             if self.chance() < 0.0002 {
-                self.mu = self.between(0.015, 0.06);
+                self.mu = self.between(0.015..=0.06);
                 #[expect(
                     clippy::cast_possible_truncation,
                     clippy::cast_sign_loss,
                     reason = "small"
                 )]
-                let steps = self.between(200.0, 2_000.0) as u64;
+                let steps = self.between(200.0..=2_000.0) as u64;
                 self.ice_until = self.step + steps;
                 self.ice_ended = self.ice_until;
             }
@@ -557,8 +560,8 @@ impl Robot {
         };
         let said = pose;
         if self.chance() < 0.005 {
-            pose.x_m += self.between(-3.0, 3.0);
-            pose.y_m += self.between(-3.0, 3.0);
+            pose.x_m += self.between(-3.0..=3.0);
+            pose.y_m += self.between(-3.0..=3.0);
         }
         let about = self.rotated_about;
         match self.fault {
@@ -582,7 +585,7 @@ impl Robot {
         if self.fault.is_none() {
             self.said.position = Some(said);
         }
-        let late = self.between(self.build.pose_late.0, self.build.pose_late.1);
+        let late = self.between(self.build.pose_late.0..=self.build.pose_late.1);
         #[expect(
             clippy::cast_possible_truncation,
             clippy::cast_sign_loss,
