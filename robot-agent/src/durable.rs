@@ -77,8 +77,12 @@ fn new_path(folder: &Path, name: &str) -> std::path::PathBuf {
 }
 
 fn put_in_place(folder: &Path, name: &str, mut file: File, content: &[u8]) -> io::Result<()> {
-    file.write_all(content)?;
-    file.sync_data()?;
+    let written = file.write_all(content).and_then(|()| file.sync_data());
+    if written.is_err() {
+        // A part of a file would take the last space of a full disk. Another error counts more.
+        let _ = fs::remove_file(new_path(folder, name));
+    }
+    written?;
     fs::rename(new_path(folder, name), folder.join(name))?;
     File::open(folder).and_then(|folder| folder.sync_all())
 }

@@ -1,5 +1,6 @@
 //! State shared by several parts of the agent: its missions and its site.
 
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use jiff::Timestamp;
@@ -17,14 +18,18 @@ use crate::start_error::StartError;
 #[derive(Debug)]
 pub(crate) struct Missions {
     slot: Mutex<MissionSlot>,
-    memory: Memory,
+    /// Locked during a write, so that no older state replaces a newer one.
+    memory: Mutex<Memory>,
+    /// Whether the last write failed.
+    is_unsaved: AtomicBool,
 }
 
 impl Missions {
     pub(crate) fn new(slot: MissionSlot, memory: Memory) -> Arc<Self> {
         Arc::new(Self {
             slot: Mutex::new(slot),
-            memory,
+            memory: Mutex::new(memory),
+            is_unsaved: AtomicBool::new(false),
         })
     }
 
@@ -69,13 +74,23 @@ impl Missions {
 
     /// Saves the missions on disk. Blocks.
     pub(crate) fn save(&self) {
-        // The lock is not held during the disk write.
+        let memory = self.memory.lock().unwrap_or_else(PoisonError::into_inner);
+        // The slot is not locked during the disk write.
         let slot = self.slot().clone();
-        if let Err(cause) = self.memory.save(&slot) {
+        let saved = memory.save(&slot);
+        self.is_unsaved.store(saved.is_err(), Ordering::Relaxed);
+        if let Err(cause) = saved {
             error!(
                 error = &cause as &dyn std::error::Error,
-                "cannot save the missions"
+                "cannot save the missions; it is tried again"
             );
+        }
+    }
+
+    /// Saves the missions if the last attempt failed. Blocks.
+    pub(crate) fn save_again(&self) {
+        if self.is_unsaved.load(Ordering::Relaxed) {
+            self.save();
         }
     }
 }
@@ -217,5 +232,42 @@ mod tests {
         // The memory was saved for another reason meanwhile.
         slot.end(active().mission, MissionPhase::Succeeded);
         assert_eq!(started_twice(&slot, &[]), [succeeded()]);
+    }
+
+    #[test]
+    fn what_several_threads_save_is_never_damaged_and_the_newest_stays() {
+        let folder = tempfile::tempdir().unwrap();
+        let memory = Memory::new(folder.path());
+        let missions = Missions::new(MissionSlot::default(), memory.clone());
+        std::thread::scope(|scope| {
+            for thread in 0..4_u128 {
+                let (missions, memory) = (&missions, &memory);
+                scope.spawn(move || {
+                    for number in 0..25 {
+                        let mission = Uuid::from_u128(100 * thread + number);
+                        missions.slot().cancel(MissionId::from_uuid(mission));
+                        missions.save();
+                        let is_there = |slot: &MissionSlot| {
+                            let mut ended = slot.ended();
+                            ended.any(|ended| ended.mission == MissionId::from_uuid(mission))
+                        };
+                        assert!(is_there(&memory.load().unwrap()));
+                    }
+                });
+            }
+        });
+        assert_eq!(memory.load().unwrap(), *missions.slot());
+    }
+
+    #[test]
+    fn what_could_not_be_saved_is_saved_again() {
+        let folder = tempfile::tempdir().unwrap();
+        let memory = Memory::new(&folder.path().join("later"));
+        let missions = Missions::new(MissionSlot::default(), memory.clone());
+        missions.slot().cancel(active().mission);
+        missions.save();
+        std::fs::create_dir(folder.path().join("later")).unwrap();
+        missions.save_again();
+        assert_eq!(memory.load().unwrap(), *missions.slot());
     }
 }

@@ -42,8 +42,10 @@ impl Recorder {
         loop {
             let event = match events.recv_timeout(RETRY_EVERY) {
                 Ok(event) => Some(event),
-                Err(RecvTimeoutError::Timeout) if unsaved.is_empty() => continue,
-                Err(RecvTimeoutError::Timeout) => None,
+                Err(RecvTimeoutError::Timeout) => {
+                    self.missions.save_again();
+                    None
+                }
                 Err(RecvTimeoutError::Disconnected) => break,
             };
             if let Some(event) = event {
@@ -123,8 +125,11 @@ impl Recorder {
     }
 
     /// Records the end of a mission. The memory has the report before the outbox: an agent that is
-    /// killed in between reports this end when it starts, instead of an interruption.
+    /// killed in between reports this end when it starts, instead of an interruption. The state counts
+    /// the record as pending from the beginning: a robot without mission and without records has
+    /// forgotten its mission.
     fn record_end(&self, report: MissionReport, unsaved: &mut VecDeque<RecordContent>) {
+        let _expected = self.outbox.expect_record();
         self.missions.slot().keep_end(report.clone());
         self.missions.save();
         self.missions.slot().end(report.mission, report.phase);

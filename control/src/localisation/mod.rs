@@ -213,8 +213,7 @@ impl Localisation {
     /// Predicts the state over `dt_s` seconds with the measured rates of gyro and wheels.
     ///
     /// The motion is that of at most 0.5 s; call [`Self::lose_track`] after a longer gap. An invalid rate
-    /// is counted, and the last valid one is used. If `dt_s` is not above zero, nothing but the count
-    /// changes.
+    /// is counted, and the last valid one is used; if `dt_s` is not above 0, nothing else changes.
     pub fn predict(&mut self, gyro_rad_s: f64, wheels: WheelSpeeds, dt_s: f64) {
         if !(dt_s.is_finite() && dt_s > 0.0) {
             self.invalid += 1;

@@ -22,6 +22,7 @@ mod store;
 
 use std::fs::{self, File, TryLockError};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -97,12 +98,24 @@ struct Shared {
     /// Serialises syncs, so that no older head overwrites a newer one.
     syncing: Mutex<()>,
     dead_letters: Mutex<DeadLetters>,
+    /// Number of records that will be appended soon.
+    expected: AtomicU64,
     /// Notified when a record is appended, for the uploader.
     arrived: Notify,
     /// Notified when a change must be synced.
     unsynced: Notify,
     /// Lock held while the outbox is open, so that no second agent writes here.
     _lock: File,
+}
+
+/// Guard of a record that will be appended soon.
+#[derive(Debug)]
+pub(crate) struct ExpectedRecord(Arc<Shared>);
+
+impl Drop for ExpectedRecord {
+    fn drop(&mut self) {
+        self.0.expected.fetch_sub(1, Ordering::Relaxed);
+    }
 }
 
 fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -155,6 +168,7 @@ impl Outbox {
                 store: Mutex::new(store),
                 syncing: Mutex::default(),
                 dead_letters: Mutex::new(dead_letters),
+                expected: AtomicU64::new(0),
                 arrived: Notify::new(),
                 unsynced: Notify::new(),
                 _lock: lock,
@@ -264,12 +278,19 @@ impl Outbox {
         Ok(())
     }
 
+    /// Counts a record as pending that will be appended soon, until the guard is dropped.
+    pub(crate) fn expect_record(&self) -> ExpectedRecord {
+        self.shared.expected.fetch_add(1, Ordering::Relaxed);
+        ExpectedRecord(Arc::clone(&self.shared))
+    }
+
     /// Returns the numbers of records that wait, were dropped and were refused.
     pub fn status(&self) -> OutboxStatus {
         let store = locked(&self.shared.store);
         let head = store.head();
+        let stored: u64 = store.pending_records().try_into().unwrap_or(u64::MAX);
         OutboxStatus {
-            pending: store.pending_records().try_into().unwrap_or(u64::MAX),
+            pending: stored.saturating_add(self.shared.expected.load(Ordering::Relaxed)),
             dropped: head.dropped,
             refused: head.refused,
         }

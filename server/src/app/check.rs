@@ -490,13 +490,10 @@ fn place_of(error: PlanError, trajectory: &Trajectory) -> Option<Place> {
             waypoint: None,
             point: circle.center,
         }),
-        Trajectory::Waypoints(waypoints) => {
-            let index = waypoint?;
-            waypoints.points.get(index).map(|point| Place {
-                arc_m: None,
-                waypoint: Some(index),
-                point: point.position(),
-            })
-        }
+        Trajectory::Waypoints(waypoints) => waypoints.points.get(waypoint?).map(|point| Place {
+            arc_m: None,
+            waypoint,
+            point: point.position(),
+        }),
     }
 }

@@ -7,6 +7,7 @@ use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 use std::time::Duration;
 
+use futures_util::future::join_all;
 use tokio_util::sync::CancellationToken;
 use tracing::{error, warn};
 use tread_api::tunnel::RouterCredentials;
@@ -53,8 +54,13 @@ pub(super) async fn watch(watch: Watch) {
         if current.is_empty() {
             silent.push(None);
         }
-        for router in current {
-            if answers(&watch, &router).await {
+        // All at once: one that does not answer takes seconds.
+        let probed = current.into_iter().map(async |router| {
+            let answers = answers(&watch, &router).await;
+            (router, answers)
+        });
+        for (router, answers) in join_all(probed).await {
+            if answers {
                 failures.remove(&Some(router.number));
             } else {
                 silent.push(Some(router));

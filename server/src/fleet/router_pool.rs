@@ -19,7 +19,7 @@ use tracing::{error, info};
 use super::client;
 use super::inbox::Channels;
 use super::opening::Opener;
-use super::router_groups::{Group, superseded, to_open};
+use super::router_groups::{Group, ROBOTS_MAX, superseded, to_open};
 use super::routers::{Router, Routers};
 use crate::app::App;
 use crate::app::presence::RobotKey;
@@ -95,17 +95,23 @@ impl RouterPool {
             if let Some(rotated) = &mut rotated {
                 rotated.mark_unchanged();
             }
-            let is_opened = {
+            let opened = {
                 let _turn = self.turn.lock().await;
-                let is_opened = self.let_everybody_in().await;
+                let opened = self.let_everybody_in().await;
                 self.close_idle().await;
-                is_opened
+                opened
             };
-            if is_opened {
+            if let Some(robot_count) = opened {
+                // A full one is not waited for: nobody who joins now would have room in it.
+                let pause = if robot_count < ROBOTS_MAX {
+                    OPEN_EVERY
+                } else {
+                    Duration::ZERO
+                };
                 tokio::select! {
                     biased;
                     () = stop.cancelled() => return,
-                    () = tokio::time::sleep(OPEN_EVERY) => {}
+                    () = tokio::time::sleep(pause) => {}
                 }
                 // One has room for some of the robots alone.
                 continue;
@@ -140,24 +146,23 @@ impl RouterPool {
         current.map(|(router, _)| router).collect()
     }
 
-    /// Opens a router for the robots that have none; returns whether it did.
-    async fn let_everybody_in(&self) -> bool {
+    /// Opens a router for robots that have none, as far as it has room for them; returns the number of its
+    /// robots if it did.
+    async fn let_everybody_in(&self) -> Option<usize> {
         let all = self.routers.all();
         let fleet = self.app.enrolment_registry().robots();
-        let Some(robots) = to_open(&self.groups(&all), &fleet) else {
-            return false;
-        };
+        let robots = to_open(&self.groups(&all), &fleet)?;
         let count = robots.len();
         match self.open(robots.into_iter().collect()).await {
             Ok(()) => {
                 self.app.counters().routers_opened.one();
                 info!("another zenoh router was opened, for {count} robots");
-                true
+                Some(count)
             }
             // The next check tries again.
             Err(failed) => {
                 error!("cannot open another router: {failed}");
-                false
+                None
             }
         }
     }
