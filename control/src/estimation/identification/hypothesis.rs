@@ -21,6 +21,7 @@
 //! robust one, `C (Σ g gᵀ + prior information) C`: the empirical scatter of the blocks' scores
 //! `g = Jᵀ W r` replaces the assumption of white residuals and a true model.
 
+use super::fast_changes::FastChanges;
 use super::model::{CHANNELS, Input, State};
 use super::parameters::{Number, PARAMETERS, Prior, Robot, SHAPE_MIN, Values, index};
 use super::scale::{Compared, Residual, Scale};
@@ -31,15 +32,8 @@ use crate::robot::RobotModel;
 const SCALES: [u32; 3] = [1, 4, 10];
 /// Channels of the accelerations.
 const ACCELERATIONS: std::ops::RangeInclusive<usize> = 1..=2;
-/// Weight of each new square in the mean squares that tell the noise of the wheel speeds, once many
-/// are known.
-const NOISE_GAIN: f64 = 0.005;
-/// Mean square of the accelerations' residuals at high frequencies, standardised, from which the
-/// wheel speeds may have noise that matters, and the minimum number of blocks for it.
-const NOISY_SQUARE: f64 = 0.8;
+/// Minimum number of blocks before noise of the wheel speeds is detected.
 const NOISE_BLOCKS_MIN: u32 = 6;
-/// Maximum standardised residual in that mean square.
-const RESIDUAL_MAX: f64 = 5.0;
 /// Change of a well-known ln K that makes older linearisations count e⁻³ times as much.
 const LINEAR_RANGE: f64 = 0.1;
 /// Fraction of the variance of ln K that is added to the square of that range. With all of it, noise
@@ -96,8 +90,8 @@ pub(super) struct Measured {
     pub(super) value: f64,
     /// Standard deviation of sensor noise and model error together, in the same unit.
     pub(super) std_dev: f64,
-    /// Standard deviation of sensor noise alone.
-    pub(super) sensor_std_dev: f64,
+    /// Minimum of the mean square of the channel's standardised residuals in its weights.
+    pub(super) square_min: f64,
 }
 
 /// Estimator that started at one value of K: the model's state, the estimated parameters and their
@@ -111,15 +105,8 @@ pub(super) struct Hypothesis {
     /// The normal equations at each time scale, and the one that is used.
     scales: [Scale; SCALES.len()],
     used: usize,
-    /// The last residuals of the accelerations and the last changes by the added noise,
-    /// standardised.
-    last: [[f64; 2]; 2],
-    /// Exponentially weighted mean squares, halved, of their differences from one comparison to the
-    /// next, without sensor noise. Noise of the wheel speeds shows there, near the contacts'
-    /// resonance at 5 to 10 Hz; other errors of the model change more slowly.
-    residual_square: f64,
-    compared: u32,
-    noise_square: f64,
+    /// Fast changes of the accelerations: what is measured, the output, and what the added noise adds.
+    fast: FastChanges,
     cost: f64,
     /// Factor by which the step after the last block changed the weights of all blocks.
     last_kept: f64,
@@ -141,10 +128,7 @@ impl Hypothesis {
             perturbed: None,
             scales: SCALES.map(Scale::new),
             used: 0,
-            last: [[0.0; 2]; 2],
-            residual_square: 0.0,
-            compared: 0,
-            noise_square: 0.0,
+            fast: FastChanges::new(),
             is_determined: true,
             cost: 0.0,
             last_kept: 1.0,
@@ -172,6 +156,7 @@ impl Hypothesis {
 
     /// Drops the measurements of the open block.
     pub(super) fn drop_block(&mut self) {
+        self.fast.drop_block();
         self.scales.iter_mut().for_each(Scale::drop_block);
     }
 
@@ -253,19 +238,14 @@ impl Hypothesis {
         };
         let changed = perturbed.map_or(0.0, |perturbed| perturbed.value - output.value);
         if let Some(place) = ACCELERATIONS.into_iter().position(|own| own == channel) {
-            let of_sensor = (measured.sensor_std_dev / std_dev).powi(2);
-            let limited = |value: f64| (value / std_dev).clamp(-RESIDUAL_MAX, RESIDUAL_MAX);
-            let now = [limited(residual.value), limited(changed)];
-            let before = std::mem::replace(&mut self.last[place], now);
-            let [own, of_noise] = [0, 1].map(|part| 0.5 * (now[part] - before[part]).powi(2));
-            self.compared = self.compared.saturating_add(1);
-            let gain = f64::from(self.compared).recip().max(NOISE_GAIN);
-            self.residual_square += gain * (own - of_sensor - self.residual_square);
-            self.noise_square += gain * (of_noise - self.noise_square);
+            self.fast.add(
+                place,
+                [measured.value, output.value, changed].map(|value| value / std_dev),
+            );
         }
         if let Some(perturbed) = perturbed {
             let off = (changed / std_dev).powi(2).min(COST_MAX);
-            let ratio = self.noise_ratio();
+            let ratio = self.fast.noise_ratio();
             noise.value = ratio * changed;
             noise.slopes = (slopes(perturbed) - residual.slopes) * ratio;
             self.cost -= ratio * ratio * off;
@@ -274,22 +254,12 @@ impl Hypothesis {
             residual,
             noise,
             std_dev,
+            square_min: measured.square_min,
         };
         for scale in &mut self.scales {
             scale.add(channel, &compared);
         }
         self.cost += square.min(COST_MAX);
-    }
-
-    /// Returns the ratio of the wheel speeds' noise to the added noise, at most 1: at high frequencies
-    /// residuals are not smaller than what the noise does.
-    fn noise_ratio(&self) -> f64 {
-        if self.noise_square > 0.0 {
-            let ratio = self.residual_square / self.noise_square;
-            ratio.clamp(0.0, 1.0).sqrt()
-        } else {
-            0.0
-        }
     }
 
     /// Ends a comparison of the means since the last call.
@@ -302,6 +272,7 @@ impl Hypothesis {
     pub(super) fn end_block(&mut self, prior: &Prior) -> bool {
         let values = self.values;
         self.last_kept = 1.0;
+        self.fast.end_block();
         self.scales
             .iter_mut()
             .for_each(|scale| scale.end_block(&values));
@@ -357,10 +328,10 @@ impl Hypothesis {
         self.is_determined
     }
 
-    /// Returns whether the accelerations' residuals at high frequencies are larger than those of a
-    /// robot whose wheel speeds have no noise.
+    /// Returns whether fast changes of the output are for the most part none that the accelerometer
+    /// feels: noise of the wheel speeds.
     pub(super) fn is_noisy(&self) -> bool {
-        self.age >= NOISE_BLOCKS_MIN && self.residual_square > NOISY_SQUARE
+        self.age >= NOISE_BLOCKS_MIN && self.fast.is_noise()
     }
 
     /// Returns the variance of ln K, and the part of it that the prior contributes. The first is at

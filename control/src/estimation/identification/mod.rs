@@ -11,9 +11,11 @@
 
 mod change;
 mod dual;
+mod fast_changes;
 mod hypothesis;
 mod model;
 mod parameters;
+mod recent;
 mod robot;
 mod scale;
 mod segment;
@@ -73,6 +75,9 @@ const MODEL_LN_THETA_STD_DEV: f64 = 0.03;
 const MODEL_THETA_STD_DEVS: [f64; 2] = [0.020, 0.014];
 /// Minimum duration of the block with which a segment ends, seconds; a shorter one is not used.
 const SHORT_BLOCK_S: f64 = 0.5;
+/// Minimum of the mean square of a channel's standardised residuals in its weights, without and with
+/// noise of the wheel speeds: that biases θ, and the more the less the assumed model errors count.
+const WEIGHT_SQUARE_MINS: [f64; 2] = [0.3, 1.0];
 /// Mean square of standardised residuals above which the model does not describe the robot and no
 /// estimate is returned.
 const SQUARE_MAX: f64 = 30.0;
@@ -301,11 +306,12 @@ impl Identification {
         self.is_moving |= rims_m_s[0].max(rims_m_s[1]) > STANDING_M_S;
         self.add(sample, measured, rims_m_s, time_s);
         let share = time_s / COMPARED_S;
+        let square_min = self.weight_square_min();
         let speed = sample.body_speed_m_s.map(|value| Measured {
             channel: CHANNELS - 1,
             value,
             std_dev: noise.body_speed_m_s,
-            sensor_std_dev: noise.body_speed_m_s,
+            square_min,
         });
         for hypothesis in &mut self.hypotheses {
             let forward = hypothesis.advance(&self.model, &input, perturbed.as_ref(), share);
@@ -359,16 +365,9 @@ impl Identification {
             torque,
             torque,
         ];
-        let of_torque_n_m = torque_n_m * noise.torque_mu;
-        let sensors = [
-            noise.gyro_rad_s,
-            noise.accelerometer_m_s2,
-            noise.accelerometer_m_s2,
-            of_torque_n_m,
-            of_torque_n_m,
-        ];
         let (sums, measured_s, compared_s) = (self.sums, self.measured_s, self.compared_s);
         let least = self.least_cost();
+        let square_min = self.weight_square_min();
         let mut explained = [None; COMPARED];
         for hypothesis in &mut self.hypotheses {
             let is_best = hypothesis.cost() <= least;
@@ -392,7 +391,7 @@ impl Identification {
                         channel,
                         value: sums[channel] / compared_s,
                         std_dev: std_devs[channel],
-                        sensor_std_dev: sensors[channel] / root,
+                        square_min,
                     },
                 );
             }
@@ -412,6 +411,11 @@ impl Identification {
             self.robot = self.identify_robot().or(self.robot);
         }
         changed
+    }
+
+    /// Returns the minimum of the mean square of a channel's standardised residuals in its weights.
+    fn weight_square_min(&self) -> f64 {
+        WEIGHT_SQUARE_MINS[usize::from(self.wheel_noise.is_excess_given)]
     }
 
     /// Returns the motion at the waiting sample.
@@ -471,7 +475,8 @@ impl Identification {
     /// Begins anew with noise of the wheel speeds taken into account if residuals may come from it.
     fn look_for_noise(&mut self) {
         let is_noisy = self.best().is_some_and(Hypothesis::is_noisy);
-        if !is_noisy || self.wheel_noise.is_excess_given {
+        let is_measured = self.wheel_noise.significant_density().is_some();
+        if !is_noisy || !is_measured || self.wheel_noise.is_excess_given {
             return;
         }
         self.wheel_noise.is_excess_given = true;

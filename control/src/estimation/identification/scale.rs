@@ -18,9 +18,6 @@ const BLOCK_FORGETS: f64 = 0.002;
 const HUBER: f64 = 3.0;
 /// Weight of each new squared residual in the exponentially weighted mean square of its channel.
 const SQUARE_GAIN: f64 = 0.005;
-/// Minimum of that mean square in the weights: residuals that are smaller than sensors and model errors
-/// are assumed to make them get more weight, but not without bound.
-const SQUARE_MIN: f64 = 0.3;
 /// Maximum squared standardised residual in that mean.
 const SQUARE_MAX: f64 = 100.0;
 /// Standard deviations of their difference by which the estimates of two scales may differ.
@@ -123,6 +120,9 @@ pub(super) struct Compared {
     pub(super) noise: Residual,
     /// Standard deviation of the residual without that noise.
     pub(super) std_dev: f64,
+    /// Minimum of the mean square of standardised residuals in the weights: residuals that are smaller
+    /// than sensors and model errors are assumed to make them get more weight, but not without bound.
+    pub(super) square_min: f64,
 }
 
 /// Sums of one channel over the open mean.
@@ -131,6 +131,7 @@ struct Mean {
     residual: Residual,
     noise: Residual,
     std_dev: f64,
+    square_min: f64,
     count: u32,
 }
 
@@ -140,6 +141,7 @@ impl Mean {
             residual: Residual::none(),
             noise: Residual::none(),
             std_dev: 1.0,
+            square_min: 1.0,
             count: 0,
         }
     }
@@ -210,6 +212,7 @@ impl Scale {
         mean.residual.add(&compared.residual);
         mean.noise.add(&compared.noise);
         mean.std_dev = compared.std_dev;
+        mean.square_min = compared.square_min;
         mean.count += 1;
     }
 
@@ -233,6 +236,7 @@ impl Scale {
                     residual: mean.residual.times(share),
                     noise: mean.noise.times(share),
                     std_dev: mean.std_dev,
+                    square_min: mean.square_min,
                 };
                 self.compare(channel, &compared);
             }
@@ -247,7 +251,7 @@ impl Scale {
         let Residual { value, slopes } = &compared.residual;
         let square = (value / compared.std_dev).powi(2);
         let seen = &mut self.squares[channel];
-        let std_dev = compared.std_dev * seen.max(SQUARE_MIN).sqrt();
+        let std_dev = compared.std_dev * seen.max(compared.square_min).sqrt();
         *seen += SQUARE_GAIN * f64::from(self.length) * (square.min(SQUARE_MAX) - *seen);
         let standardised = value.abs() / std_dev;
         let weight = std_dev.powi(-2) * (HUBER / standardised.max(HUBER));

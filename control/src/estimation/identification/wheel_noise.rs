@@ -13,8 +13,9 @@
 //! noise that cancels in sums: its spectrum rises as `x = 4 sin²(ω/2)`, of which the filters see the
 //! means 1.75 and 3.6, while white noise has the same power in both. So the two are distinguished by
 //! extrapolation to x = 0. Wheels that truly move at 10 Hz, as behind noisy positions, count as noise
-//! here; but the accelerometer feels them too, so that residuals do not grow, and `hypothesis`
-//! reduces the correction.
+//! here; the accelerometer feels them too, by which the module `fast_changes` tells the two apart.
+
+use super::recent::RecentBlocks;
 
 /// The filters, and the squares of their norms.
 const MIDDLE: [f64; 8] = [1.0, 1.0, -3.0, -3.0, 3.0, 3.0, -1.0, -1.0];
@@ -27,13 +28,10 @@ const HIGH_X: f64 = 3.6;
 /// Minimum time over which wheel speeds are averaged before differences are taken, seconds. Noise
 /// matters below 25 Hz.
 const MEAN_S: f64 = 0.02;
-/// Limit of one block's value, relative to the mean of the blocks or its standard deviation: a jerk
-/// of the wheels, as at the start of a drive, is no noise.
-const BLOCK_MAX: f64 = 4.0;
-/// Weight of the newest block once many are known: the reciprocal of a number of blocks.
-const GAIN_MIN: f64 = 0.005;
 /// Minimum number of blocks before the noise is taken into account.
-const BLOCKS_MIN: u32 = 4;
+const BLOCKS_MIN: usize = 4;
+/// Standard errors by which the density must be above 0 to be more than chance.
+const SIGNIFICANT: f64 = 4.0;
 /// Minimum time of one sample for which noise is given, seconds.
 const SAMPLE_MIN_S: f64 = 1.0e-3;
 
@@ -45,10 +43,8 @@ pub(super) struct WheelNoise {
     time_s: f64,
     /// Sum over the open block, (rad/s)²·s, and the number of values in it.
     open: (f64, f64),
-    /// Mean of the blocks' densities, (rad/s)²·s, and of the squares about it.
-    mean: f64,
-    square: f64,
-    blocks: u32,
+    /// The blocks' densities, (rad/s)²·s.
+    blocks: RecentBlocks,
     excess: Excess,
     /// Whether [`WheelNoise::excess`] gives noise.
     pub(super) is_excess_given: bool,
@@ -116,9 +112,7 @@ impl WheelNoise {
             sum_rad: [0.0; 2],
             time_s: 0.0,
             open: (0.0, 0.0),
-            mean: 0.0,
-            square: 0.0,
-            blocks: 0,
+            blocks: RecentBlocks::new(),
             excess: Excess {
                 bits: 0x9e37_79b9,
                 before_rad_s: [0.0; 2],
@@ -165,28 +159,24 @@ impl WheelNoise {
         if !is_moving || count < 1.0 {
             return;
         }
-        let mut value = sum / count;
-        if self.blocks >= BLOCKS_MIN {
-            let most = BLOCK_MAX * self.mean.max(self.std_dev());
-            value = value.clamp(-most, most);
-        }
-        self.blocks = self.blocks.saturating_add(1);
-        let gain = f64::from(self.blocks).recip().max(GAIN_MIN);
-        let off = value - self.mean;
-        self.mean += gain * off;
-        self.square += gain * ((1.0 - gain) * off * off - self.square);
-    }
-
-    /// Standard deviation of the mean.
-    fn std_dev(&self) -> f64 {
-        let blocks = f64::from(self.blocks).min(GAIN_MIN.recip());
-        (self.square / (blocks - 1.0).max(1.0)).sqrt()
+        self.blocks.add(sum / count);
     }
 
     /// Returns the most that the noise's density can be, (rad/s)²·s; None before it is known, and if
     /// the speeds have no such noise.
     fn density(&self) -> Option<f64> {
-        (self.blocks >= BLOCKS_MIN && self.mean > 0.0).then_some(self.mean)
+        let known = self
+            .blocks
+            .median()
+            .filter(|_| self.blocks.count() >= BLOCKS_MIN);
+        known.filter(|density| *density > 0.0)
+    }
+
+    /// Returns that density if it is more than chance: of smooth speeds and of differences of encoder
+    /// counts, whose noise cancels in sums, it is as often below 0 as above.
+    pub(super) fn significant_density(&self) -> Option<f64> {
+        let least = SIGNIFICANT * self.blocks.std_error();
+        self.density().filter(|density| *density > least)
     }
 
     /// Returns noise of the sample before the newest, left and right: of its wheel speeds, radians
