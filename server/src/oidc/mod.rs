@@ -102,9 +102,12 @@ pub enum ExchangeError {
     /// No discovery has succeeded yet.
     #[error("the OpenID provider is not known yet")]
     Unknown,
-    /// The provider did not give a valid answer.
+    /// The provider cannot be reached, takes too long, or answers with the status of a failure.
     #[error("the OpenID provider does not answer")]
     Unanswered(#[source] Box<dyn std::error::Error + Send + Sync>),
+    /// The answer of the token endpoint or the user info endpoint is not what OpenID Connect defines.
+    #[error("the OpenID provider's answer is malformed")]
+    Malformed(#[source] Box<dyn std::error::Error + Send + Sync>),
     /// The provider's keys could not be fetched, now or within the retry interval.
     #[error("the OpenID provider does not say which keys it has")]
     KeysUnknown,
@@ -377,7 +380,10 @@ impl Provider {
         {
             let said = self.http.claims(endpoint.url(), access_token.secret());
             let said = said.await;
-            let said = said.map_err(|error| ExchangeError::Unanswered(Box::new(error)))?;
+            let said = said.map_err(|error| match error {
+                HttpError::NoObject => ExchangeError::Malformed(Box::new(error)),
+                error => ExchangeError::Unanswered(Box::new(error)),
+            })?;
             claims = with_user_info((claims, said), &subject, &self.groups_claim)?;
         }
         let id_token = id_token.to_string();
@@ -452,7 +458,7 @@ fn with_user_info(
 
 type TokenError = RequestTokenError<HttpError, StandardErrorResponse<CoreErrorResponseType>>;
 
-/// Distinguishes a refused code from a failed request.
+/// Distinguishes a refused code, a malformed answer and a failed request.
 fn refused(error: TokenError) -> ExchangeError {
     match error {
         RequestTokenError::ServerResponse(said) => {
@@ -460,9 +466,10 @@ fn refused(error: TokenError) -> ExchangeError {
             let said = said.as_str().unwrap_or_default();
             ExchangeError::Refused(tread_api::text::cleaned(said, 80))
         }
-        error @ (RequestTokenError::Request(_)
-        | RequestTokenError::Parse(..)
-        | RequestTokenError::Other(_)) => ExchangeError::Unanswered(Box::new(error)),
+        error @ RequestTokenError::Parse(..) => ExchangeError::Malformed(Box::new(error)),
+        error @ (RequestTokenError::Request(_) | RequestTokenError::Other(_)) => {
+            ExchangeError::Unanswered(Box::new(error))
+        }
     }
 }
 

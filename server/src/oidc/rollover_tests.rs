@@ -51,7 +51,7 @@ impl Signer {
 /// OpenID provider on the loopback whose answers the test sets.
 struct Fake {
     listener: TcpListener,
-    /// Number of the key that signs ID tokens.
+    /// Number of the key that signs ID tokens; 0 if the token endpoint answers with malformed JSON.
     signs_by: AtomicUsize,
     /// Numbers of the published keys; `None` if requests for keys fail.
     tells: Mutex<Option<Vec<usize>>>,
@@ -142,6 +142,9 @@ impl Fake {
                 published.map(
                     |numbers| json!({"keys": numbers.into_iter().map(key).collect::<Vec<_>>()}),
                 )
+            }
+            "/token" if self.signs_by.load(Ordering::SeqCst) == 0 => {
+                Some(json!({"access_token": 7, "token_type": "Bearer"}))
             }
             "/token" => {
                 // The test uses the nonce as the code, to identify the sign-in.
@@ -291,6 +294,24 @@ async fn a_discovery_that_takes_long_does_not_bring_the_former_keys_back() {
         let (discovered, signed_in) = tokio::join!(discovery, sign_in);
         discovered.unwrap();
         assert_eq!(signed_in.unwrap(), "anna");
+        assert_eq!(fake.signs_in(&provider, 2).await.unwrap(), "anna");
+    })
+    .await;
+}
+
+#[tokio::test]
+async fn a_malformed_answer_of_the_provider_is_not_called_silence() {
+    let fake = Fake::new().await;
+    let provider = fake.provider();
+    with_fake(&fake, async {
+        provider.discover().await.unwrap();
+        fake.signs_by.store(0, Ordering::SeqCst);
+        let malformed = fake.signs_in(&provider, 1).await;
+        assert!(
+            matches!(malformed, Err(ExchangeError::Malformed(_))),
+            "{malformed:?}"
+        );
+        fake.signs_by.store(1, Ordering::SeqCst);
         assert_eq!(fake.signs_in(&provider, 2).await.unwrap(), "anna");
     })
     .await;

@@ -32,10 +32,11 @@ use crate::robot::RobotModel;
 const SCALES: [u32; 3] = [1, 4, 10];
 /// Channels of the accelerations.
 const ACCELERATIONS: std::ops::RangeInclusive<usize> = 1..=2;
-/// Minimum number of blocks before noise of the wheel speeds is detected.
-const NOISE_BLOCKS_MIN: u32 = 6;
 /// Change of a well-known ln K that makes older linearisations count e⁻³ times as much.
 const LINEAR_RANGE: f64 = 0.1;
+/// Number of blocks in which a starting value may move to the true one; noise of the wheel speeds moves
+/// it later as well.
+const SETTLES_BLOCKS: u32 = 6;
 /// Fraction of the variance of ln K that is added to the square of that range. With all of it, noise
 /// of the wheel speeds that the first expansions took for slip is kept as well.
 const DOUBT_SHARE: f64 = 0.5;
@@ -199,6 +200,10 @@ impl Hypothesis {
         let values = std::array::from_fn(|place| Number::parameter(self.values[place], place));
         let robot = Robot::new(&values, model);
         let (current, own) = (&self.model, &mut self.perturbed);
+        if perturbed.is_none() {
+            // Noise that is none for a time begins with the state of the robot of then.
+            *own = None;
+        }
         let perturbed = perturbed.map(|input| {
             let own = own.get_or_insert_with(|| current.clone());
             own.advance(&robot, input, share)
@@ -301,6 +306,9 @@ impl Hypothesis {
             scale.weaken(keeps);
         }
         self.last_kept = keeps;
+        if self.age <= SETTLES_BLOCKS && step[index::STIFFNESS].abs() > LINEAR_RANGE {
+            self.fast.forget();
+        }
         self.values.iter().all(|value| value.is_finite())
     }
 
@@ -331,7 +339,7 @@ impl Hypothesis {
     /// Returns whether fast changes of the output are for the most part none that the accelerometer
     /// feels: noise of the wheel speeds.
     pub(super) fn is_noisy(&self) -> bool {
-        self.age >= NOISE_BLOCKS_MIN && self.fast.is_noise()
+        self.fast.is_noise()
     }
 
     /// Returns the variance of ln K, and the part of it that the prior contributes. The first is at

@@ -472,7 +472,7 @@ impl Identification {
         }
     }
 
-    /// Begins anew with noise of the wheel speeds taken into account if residuals may come from it.
+    /// Begins anew with noise of the wheel speeds taken into account if there is any that matters.
     fn look_for_noise(&mut self) {
         let is_noisy = self.best().is_some_and(Hypothesis::is_noisy);
         let is_measured = self.wheel_noise.significant_density().is_some();
@@ -482,6 +482,9 @@ impl Identification {
         self.wheel_noise.is_excess_given = true;
         // What was identified so far took the noise for slip.
         self.prior = Prior::new(self.prior.first_mean, self.prior.std_devs);
+        self.robot = None;
+        self.segment_s = 0.0;
+        self.last_block_s = 0.0;
         let state = self.state();
         self.begin(&state);
     }

@@ -343,31 +343,24 @@ fn error_with_noise(
 #[test]
 fn white_noise_of_the_wheel_speeds_is_not_taken_for_slip() {
     const SEEDS: u32 = 16;
-    let (mut all, mut all_covered) = (0, 0);
-    for (stiffness, bias_max) in [(1.0_f64, 0.03), (4.0, 0.08), (12.0, 0.12)] {
+    for (stiffness, bias_max) in [(1.0_f64, 0.02), (4.0, 0.06), (12.0, 0.08)] {
         for noise in [(1, 0.02), (1, 0.05), (2, 0.02)] {
             let case = format!("K {stiffness}, {noise:?}");
             let (mut sum, mut count, mut covered) = (0.0, 0, 0);
             for seed in 0..SEEDS {
                 let Some((error, std_dev)) = error_with_noise(stiffness, noise, seed.into()) else {
-                    assert!(stiffness > 10.0, "{case}: nothing");
                     continue;
                 };
                 sum += error;
                 count += 1;
                 covered += u32::from(error.abs() < 1.96 * std_dev);
             }
-            assert!(covered + 1 >= count, "{case}: {covered} of {count} with θ");
-            let bias = sum / f64::from(count.max(1));
+            assert!(count >= SEEDS - SEEDS / 8, "{case}: {count} estimates");
+            assert_eq!(covered, count, "{case}: an interval without θ");
+            let bias = sum / f64::from(count);
             assert!(bias.abs() < bias_max, "{case}: {bias}");
-            all += count;
-            all_covered += covered;
         }
     }
-    assert!(
-        f64::from(all_covered) >= 0.97 * f64::from(all),
-        "{all_covered} of {all} intervals have θ"
-    );
 }
 
 #[test]

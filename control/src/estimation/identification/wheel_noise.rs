@@ -7,7 +7,7 @@
 //! which the module `hypothesis` learns the bias and subtracts it (simulation extrapolation: Cook
 //! and Stefanski, Journal of the American Statistical Association 89, 1994).
 //!
-//! An upper limit of the density is measured from wheel speeds alone, by the power of two filters:
+//! The density is estimated from wheel speeds alone, by the power of two filters:
 //! third differences of sums of two values, around 10 Hz, and fourth differences, at higher
 //! frequencies. A smooth motion passes neither. Speeds that are differences of encoder counts have
 //! noise that cancels in sums: its spectrum rises as `x = 4 sin²(ω/2)`, of which the filters see the
@@ -162,7 +162,7 @@ impl WheelNoise {
         self.blocks.add(sum / count);
     }
 
-    /// Returns the most that the noise's density can be, (rad/s)²·s; None before it is known, and if
+    /// Returns the noise's density if all fast changes are noise, (rad/s)²·s; None before it is known, and if
     /// the speeds have no such noise.
     fn density(&self) -> Option<f64> {
         let known = self

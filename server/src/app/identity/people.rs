@@ -82,7 +82,7 @@ pub enum PersonError {
     /// The provider declined the sign-in.
     #[error("the provider has not signed you in: {0}")]
     Declined(String),
-    /// The provider's answer failed verification; the reason is only in the log.
+    /// The provider's answer is malformed or failed verification; the reason is only in the log.
     #[error("the provider's answer cannot be used; the server's log says why")]
     NotBelieved,
     /// None of the person's groups has a grant.
@@ -389,7 +389,10 @@ impl App {
                 self.log_failure("sign people in", &error);
                 PersonError::Unavailable
             }
-            ExchangeError::Refused(_) | ExchangeError::Invalid(_) | ExchangeError::UserInfo(_) => {
+            ExchangeError::Malformed(_)
+            | ExchangeError::Refused(_)
+            | ExchangeError::Invalid(_)
+            | ExchangeError::UserInfo(_) => {
                 self.log_failure("believe the OpenID provider", &error);
                 PersonError::NotBelieved
             }

@@ -72,7 +72,11 @@ fn next_manifest(
     };
     let entry = match entries.next() {
         Some(Ok(entry)) => entry,
-        Some(Err(cause)) => return Err(no_backup(cause.to_string())),
+        // The operating system's error; otherwise the text would quote bytes of the file.
+        Some(Err(cause)) if cause.raw_os_error().is_some() => {
+            return Err(FileError::of("read", path)(cause).into());
+        }
+        Some(Err(_not_tar)) => return Err(no_backup("it is no tar archive".to_owned())),
         None => return Err(no_backup("it is empty".to_owned())),
     };
     if &*entry.path_bytes() != MANIFEST_NAME.as_bytes() {

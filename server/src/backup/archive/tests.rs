@@ -177,6 +177,16 @@ fn another_file_and_a_newer_format_are_refused_with_words() {
     fs::write(&made.archive, vec![7; 5_000]).unwrap();
     let refused = extracted(&made, None).unwrap_err().to_string();
     assert!(refused.contains("no backup"), "{refused}");
+    // As an encrypted archive is.
+    let noise: Vec<u8> = (0..4_096_u32)
+        .map(|place| (place.wrapping_mul(2_654_435_761) >> 11).to_le_bytes()[0] | 0x80)
+        .collect();
+    fs::write(&made.archive, noise).unwrap();
+    let refused = extracted(&made, None).unwrap_err().to_string();
+    assert!(
+        refused.is_ascii() && refused.contains("`--decrypt COMMAND`"),
+        "{refused}"
+    );
     let mut tar = Builder::new(Vec::new());
     let text = br#"{"format": 2, "version": "9.9.9", "unknown": 1}"#;
     let bytes = text.len() as u64;
