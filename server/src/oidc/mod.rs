@@ -382,7 +382,10 @@ impl Provider {
             let said = said.await;
             let said = said.map_err(|error| match error {
                 HttpError::NoObject => ExchangeError::Malformed(Box::new(error)),
-                error => ExchangeError::Unanswered(Box::new(error)),
+                error @ (HttpError::Failed(_)
+                | HttpError::TooLarge
+                | HttpError::Status(_)
+                | HttpError::NoAnswer) => ExchangeError::Unanswered(Box::new(error)),
             })?;
             claims = with_user_info((claims, said), &subject, &self.groups_claim)?;
         }
