@@ -12,8 +12,9 @@
 //! The motion of the body gives a lower bound of friction: four wheels of equal load that
 //! accelerate the body with `a_y = vω` and turn it with `I_G ω̇` have a mean square of at least
 //! `a_y² + (2 I_G ω̇/(m √(W² + L²)))²`, so at least one wheel had its root over g as friction
-//! coefficient μ. The bound is too high where the heading turns without the course, or where turn
-//! rates are noisy. The result only ever slows the robot.
+//! coefficient μ. A hit gives the same for an instant, so the demonstrated acceleration rises to it
+//! at a limited rate, and never falls. The bound is too high where the heading turns without the
+//! course, or where turn rates are noisy. The result only ever slows the robot.
 
 use crate::friction::SLIP_LINEAR;
 use crate::measured::Measured;
@@ -21,6 +22,9 @@ use crate::robot::{GRAVITY_M_S2, RobotModel};
 
 /// Time constant of the low-pass filter of turn rates, seconds.
 const SMOOTHING_S: f64 = 0.05;
+/// Shortest time in which the demonstrated acceleration rises to what the plan needs along the path,
+/// seconds. A hit moves the body for a few hundredths of a second, a bend for longer.
+const SHOWN_S: f64 = 0.3;
 /// Factor by which the lead that linear slip explains is enlarged.
 const EXPLAINED_RATIO: f64 = 1.2;
 /// Tolerated relative difference of left and right rolling radius before it is measured.
@@ -120,8 +124,9 @@ impl Sliding {
         self.smoothed = Some(smoothed);
         let yaw_rad_s2 = change_rad_s / SMOOTHING_S;
         let across_m_s2 = measured.twist.linear_m_s * smoothed.turn_rad_s;
-        let shown_m_s2 = across_m_s2.hypot(yaw_rad_s2 * Self::lever_m(model));
-        self.shown_m_s2 = self.shown_m_s2.max(shown_m_s2);
+        let used_m_s2 = across_m_s2.hypot(yaw_rad_s2 * Self::lever_m(model));
+        let enough_m_s2 = RobotModel::longitudinal_traction_m_s2(self.assumed_mu);
+        self.shown_m_s2 += (used_m_s2 - self.shown_m_s2).clamp(0.0, enough_m_s2 * dt_s / SHOWN_S);
 
         let rim_m_s =
             0.5 * model.wheel_radius_m() * (wheels.left_rad_s.abs() + wheels.right_rad_s.abs());
@@ -146,7 +151,7 @@ impl Sliding {
         let left_over_rad_s = (smoothed.forward_rad_s - radii_rad_s).abs() - explained_rad_s;
         self.left_over_rad = (self.left_over_rad + left_over_rad_s * dt_s).max(0.0);
         // The ground has given what the plan needs along the path, so it is as good as assumed.
-        let is_enough = self.shown_m_s2 >= RobotModel::longitudinal_traction_m_s2(self.assumed_mu);
+        let is_enough = self.shown_m_s2 >= enough_m_s2;
         self.slides |= self.left_over_rad > SLIDING_RAD && !is_enough;
     }
 
@@ -242,6 +247,28 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn a_hit_is_not_taken_for_friction() {
+        let mut drive = driven(0.4, 2.0, 0.5, [1.0; 2]);
+        let bounds = |drive: &[Measured]| {
+            let mut sliding = Sliding::new(RobotModel::yi2007(), ASSUMED_MU);
+            for tick in drive {
+                sliding.step(tick, DT_S);
+            }
+            sliding.bounds().expect("slides")
+        };
+        let without = bounds(&drive);
+        // 3 rad/s for 0.03 s, as from a hit on a corner.
+        for tick in &mut drive[50..53] {
+            tick.twist.angular_rad_s += 3.0;
+        }
+        let with = bounds(&drive);
+        assert!(
+            with.across_m_s2 < 1.5 * without.across_m_s2,
+            "{with:?}, without the hit {without:?}"
+        );
     }
 
     #[test]

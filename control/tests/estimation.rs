@@ -352,6 +352,23 @@ fn samples_out_of_order_stale_or_impossible_do_no_harm() {
 }
 
 #[test]
+fn wheels_that_strike_an_obstacle_do_not_show_friction() {
+    let mut robot = SimRobot::new(Pose::default(), 2.0, 5, true);
+    let bends = [(1.0, 0.6, 0.3), (1.0, 0.2, -0.3)];
+    for _ in 0..5 {
+        drive(&mut robot, &bends);
+    }
+    let before = robot.estimator.estimate().mu_peak_lower_bound.unwrap();
+    // The obstacle holds the wheels for half a second with the load of a side.
+    robot.struck_n_m = robot.model.side_load_n() * robot.model.wheel_radius_m();
+    drive(&mut robot, &[(0.5, 0.6, 0.0)]);
+    robot.struck_n_m = 0.0;
+    drive(&mut robot, &bends);
+    let after = robot.estimator.estimate().mu_peak_lower_bound.unwrap();
+    assert!(after < before + 0.05, "{before} before, {after} after");
+}
+
+#[test]
 fn a_gap_between_samples_is_not_averaged_over() {
     let mut robot = SimRobot::new(Pose::default(), 2.0, 5, true);
     drive(&mut robot, &[(10.0, 0.6, 0.3)]);

@@ -35,6 +35,7 @@ mod block;
 mod change;
 mod contacts;
 mod curved;
+mod demonstrated_friction;
 mod excitation;
 mod expectation;
 mod ground_offsets;
@@ -330,6 +331,7 @@ impl Estimator {
     /// linear range.
     fn take(&mut self, mut block: Block) -> (bool, bool) {
         block.judge_slip(&self.bound);
+        block.mu_seen /= self.torque_scale_upper_bound();
         self.pending.add(&block);
         let row = block.turning_row().filter(|_| block.is_linear);
         if let (Some(row), Some(before)) = (row, self.turning_before) {
@@ -517,6 +519,13 @@ impl Estimator {
             value,
             std_dev: sum.sqrt().recip(),
         }
+    }
+
+    /// Returns the upper end of the 95 % interval of the torque scale: the ground gives at least the
+    /// measured friction coefficient divided by it.
+    fn torque_scale_upper_bound(&self) -> f64 {
+        let scale = self.torque_scale();
+        (scale.value + NORMAL_95 * scale.std_dev).max(1.0)
     }
 
     /// Returns the largest slip at which the prior of the tyres is valid on ground of this θ.

@@ -2,6 +2,7 @@
 
 use super::ValueWithStdDev;
 use super::block::Block;
+use super::demonstrated_friction::DemonstratedFriction;
 use super::offsets::OffsetKnowledge;
 use super::rows::{Channel, Row, index};
 
@@ -28,7 +29,7 @@ pub(super) struct Sums {
     signal_2: f64,
     fast_blocks: f64,
     saturated_blocks: f64,
-    mu_seen: f64,
+    friction: DemonstratedFriction,
     /// Sum of the squares of the blocks' slip.
     slip_square: f64,
     track_square: f64,
@@ -46,7 +47,7 @@ impl Sums {
     pub(super) fn add(&mut self, block: &Block) {
         self.fast_blocks += 1.0;
         if block.force.is_some() {
-            self.mu_seen = self.mu_seen.max(block.mu_seen);
+            self.friction.add(block.mu_seen);
         }
         if !block.is_linear {
             self.saturated_blocks += 1.0;
@@ -111,7 +112,7 @@ impl Sums {
             signal_2: self.signal_2 + other.signal_2,
             fast_blocks: self.fast_blocks + other.fast_blocks,
             saturated_blocks: self.saturated_blocks + other.saturated_blocks,
-            mu_seen: self.mu_seen.max(other.mu_seen),
+            friction: self.friction.plus(&other.friction),
             slip_square: self.slip_square + other.slip_square,
             track_square: self.track_square + other.track_square,
             track_product: self.track_product + other.track_product,
@@ -157,9 +158,10 @@ impl Sums {
         }
     }
 
-    /// Returns the lower bound of the peak friction coefficient; `None` before any force.
+    /// Returns the lower bound of the peak friction coefficient; `None` before enough blocks with
+    /// force.
     pub(super) fn mu_peak(&self) -> Option<f64> {
-        (self.mu_seen > 0.0).then_some(self.mu_seen)
+        self.friction.lower_bound()
     }
 
     /// Returns the fraction of blocks beyond the linear range.

@@ -316,7 +316,8 @@ pub struct Estimate {
     pub theta: Option<ThetaMeasurement>,
     /// Whether the last block brought no new information on θ.
     pub no_new_information: bool,
-    /// Lower bound of the peak friction coefficient; `None` before any force.
+    /// Lower bound of the peak friction coefficient: what several blocks used, for the heaviest load
+    /// that the torques allow; `None` before as many blocks with force.
     pub mu_peak_lower_bound: Option<f64>,
     /// Ratio of effective to geometric track width; `None` before enough turning.
     pub effective_track_ratio: Option<f64>,

@@ -94,6 +94,8 @@ pub(crate) struct SimRobot {
     /// Errors of the left and right torque constants.
     pub(crate) torque_gain: [f64; 2],
     pub(crate) accelerometer_offset: f64,
+    /// Torque of an obstacle on the left wheels, newton metres.
+    pub(crate) struck_n_m: f64,
     limits: GateLimits,
     is_gated: bool,
     command: WheelSpeeds,
@@ -136,6 +138,7 @@ impl SimRobot {
             ground_changes: 0,
             torque_gain,
             accelerometer_offset,
+            struck_n_m: 0.0,
             limits: GateLimits::of(&model),
             is_gated: true,
             command: WheelSpeeds::default(),
@@ -266,7 +269,9 @@ impl SimRobot {
             body_speed_m_s: (body_speed && self.rng.random::<bool>())
                 .then(|| state.forward_m_s + self.gauss(noise.body_speed_m_s)),
             wheel_torques: self.torque.then(|| WheelTorques {
-                left_n_m: self.torque_gain[0] * torques.left_n_m + self.gauss(torque_noise),
+                left_n_m: self.torque_gain[0] * torques.left_n_m
+                    + self.struck_n_m
+                    + self.gauss(torque_noise),
                 right_n_m: self.torque_gain[1] * torques.right_n_m + self.gauss(torque_noise),
             }),
         };
