@@ -339,7 +339,7 @@ impl Follower {
         let tracked = self.tracker.step(&reference, measured, knowledge, dt_s);
         self.saturated = tracked.saturated;
         self.last_errors = tracked.errors;
-        self.watch_progress(&reference, tracked.twist.linear_m_s, dt_s);
+        self.watch_progress(&reference, tracked.twist, dt_s);
         self.advance(&reference, measured, dt_s);
         if self.status.is_final() {
             return self.at_rest();
@@ -401,11 +401,11 @@ impl Follower {
     }
 
     /// Checks whether the robot itself makes progress along its path.
-    fn watch_progress(&mut self, reference: &ReferenceSample, commanded_m_s: f64, dt_s: f64) {
+    fn watch_progress(&mut self, reference: &ReferenceSample, commanded: Twist, dt_s: f64) {
         let tick = ProgressTick {
             robot_m: reference.arc_m - self.last_errors.along_track_m,
             allowed_m_s: self.governor.allowed_speed_m_s(&self.plan),
-            commanded_m_s,
+            commanded_m_s: commanded.linear_m_s,
             reference_m_s: reference.speed_m_s,
             dt_s,
         };

@@ -10,6 +10,7 @@
 //! yaw counterpart, reach thousands per second at standstill: steps are split so that pole times
 //! step stays within the fourth-order Runge-Kutta method's stable and accurate range.
 
+mod means;
 mod tyres;
 
 use thiserror::Error;
@@ -19,6 +20,7 @@ use crate::geometry::{Pose, Twist};
 use crate::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
+use means::MeanSums;
 pub use tyres::{TyreRise, Tyres};
 
 /// Reference speed u₀ below which slip is regularised, metres per second.
@@ -143,44 +145,6 @@ pub struct PlantMeans {
     pub yaw_rate_rad_s: f64,
     /// Specific force at the centre of mass in the body frame, as an accelerometer measures it.
     pub acceleration: BodyAcceleration,
-}
-
-/// Integrals over one call of [`Plant::step`], from which [`PlantMeans`] are computed.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-struct MeanSums {
-    left_rad: f64,
-    right_rad: f64,
-    yaw_rad: f64,
-    /// `∫ẏφ̇ dt` here and `∫ẋφ̇ dt` below, metres per second.
-    left_turned_m_s: f64,
-    forward_turned_m_s: f64,
-}
-
-impl MeanSums {
-    fn add(&mut self, before: &PlantState, after: &PlantState, step_s: f64) {
-        let half_s = 0.5 * step_s;
-        for state in [before, after] {
-            self.left_rad += half_s * state.wheel_speeds.left_rad_s;
-            self.right_rad += half_s * state.wheel_speeds.right_rad_s;
-            self.yaw_rad += half_s * state.yaw_rate_rad_s;
-            self.left_turned_m_s += half_s * state.left_m_s * state.yaw_rate_rad_s;
-            self.forward_turned_m_s += half_s * state.forward_m_s * state.yaw_rate_rad_s;
-        }
-    }
-
-    fn means(&self, start: &PlantState, end: &PlantState, span_s: f64) -> PlantMeans {
-        PlantMeans {
-            wheel_speeds: WheelSpeeds {
-                left_rad_s: self.left_rad / span_s,
-                right_rad_s: self.right_rad / span_s,
-            },
-            yaw_rate_rad_s: self.yaw_rad / span_s,
-            acceleration: BodyAcceleration {
-                forward_m_s2: (end.forward_m_s - start.forward_m_s - self.left_turned_m_s) / span_s,
-                left_m_s2: (end.left_m_s - start.left_m_s + self.forward_turned_m_s) / span_s,
-            },
-        }
-    }
 }
 
 /// Sums of all contact forces on the body, and the largest combined slip.
@@ -310,18 +274,16 @@ impl Plant {
             left_rad_s: bounded(command.left_rad_s),
             right_rad_s: bounded(command.right_rad_s),
         };
-        let start = self.state;
-        let mut sums = MeanSums::default();
+        let mut sums = MeanSums::new(self.state);
         let mut left_s = dt_s;
-        let mut contact = self.contact_forces(&start, ground);
+        let mut contact = self.contact_forces(&self.state, ground);
         let (mut left_n_s, mut right_n_s) = (0.0, 0.0);
         for _ in 0..STEPS_MAX {
             // Equal parts, so that no short step is left over.
             let parts = (left_s / self.stable_step_s(ground)).ceil().max(1.0);
             let step_s = left_s / parts;
-            let before = self.state;
             self.runge_kutta(command, ground, step_s);
-            sums.add(&before, &self.state, step_s);
+            sums.add(&self.state, step_s);
             let after = self.contact_forces(&self.state, ground);
             left_n_s +=
                 0.5 * step_s * (contact.left_side_longitudinal_n + after.left_side_longitudinal_n);
@@ -335,7 +297,7 @@ impl Plant {
             }
         }
         let span_s = dt_s - left_s;
-        self.means = sums.means(&start, &self.state, span_s);
+        self.means = sums.means(span_s);
         self.side_longitudinal_n = [left_n_s / span_s, right_n_s / span_s];
         self.contact = contact;
     }

@@ -67,16 +67,37 @@ pub struct SpeedProfile {
     length_m: f64,
 }
 
+/// Input of [`SpeedProfile::new`].
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct ProfileInput<'a> {
+    /// Length of the path, metres.
+    pub(crate) length_m: f64,
+    /// Limits at the nodes of an even grid along the path, at least two.
+    pub(crate) limits: &'a [NodeLimits],
+    /// Number of nodes at the start that keep to the limits within time T; the others keep to those
+    /// within distance D (see module).
+    pub(crate) brisk: usize,
+    /// Maximum jerk, metres per second cubed.
+    pub(crate) jerk_max_m_s3: f64,
+}
+
+/// Time T and distance D, see module.
+#[derive(Debug, Clone, Copy)]
+struct Reach {
+    window_s: f64,
+    /// D as a number of cells.
+    cells: usize,
+}
+
 impl SpeedProfile {
-    /// Computes the timing over an even grid of at least two nodes, from zero speed to zero speed.
-    /// The first `brisk` nodes keep to the limits within time T, the others to those within
-    /// distance D (see module).
-    pub(crate) fn new(
-        length_m: f64,
-        limits: &[NodeLimits],
-        brisk: usize,
-        jerk_max_m_s3: f64,
-    ) -> Self {
+    /// Computes the timing from zero speed to zero speed.
+    pub(crate) fn new(input: &ProfileInput<'_>) -> Self {
+        let &ProfileInput {
+            length_m,
+            limits,
+            brisk,
+            jerk_max_m_s3,
+        } = input;
         let cells = limits.len().saturating_sub(1).max(1);
         let cell_m = length_m / cells as f64;
         let hardest_m_s2 = limits
@@ -86,11 +107,21 @@ impl SpeedProfile {
         let fastest_m_s = limits.iter().map(|node| node.speed_m_s).fold(0.0, f64::max);
         let window_s = 2.0 * hardest_m_s2 / jerk_max_m_s3;
         // One cell more than the distance, to cover limits between nodes.
-        let reach = ((window_s * fastest_m_s / cell_m).ceil() + 1.0).min(cells as f64) as usize;
-        let spans = spans(limits, cell_m, reach, brisk, window_s);
+        let reach = Reach {
+            window_s,
+            cells: ((window_s * fastest_m_s / cell_m).ceil() + 1.0).min(cells as f64) as usize,
+        };
+        let spans = spans(limits, cell_m, reach, brisk);
         let speeds = lowest_within(limits, &spans, |node| node.speed_m_s);
         let accelerations = lowest_within(limits, &spans, |node| node.acceleration_m_s2);
-        let energies = quickest(&speeds, &accelerations, cell_m);
+        let lowest = speeds.into_iter().zip(accelerations);
+        let lowest: Vec<NodeLimits> = lowest
+            .map(|(speed_m_s, acceleration_m_s2)| NodeLimits {
+                speed_m_s,
+                acceleration_m_s2,
+            })
+            .collect();
+        let energies = quickest(&lowest, cell_m);
         Self {
             nodes: time_nodes(&energies, cell_m),
             window_s,
@@ -143,12 +174,14 @@ impl SpeedProfile {
 
 /// Returns `E = v²/2` at every node of the quickest timing under limits, by a forward and a
 /// backward pass.
-fn quickest(speeds_m_s: &[f64], accelerations_m_s2: &[f64], cell_m: f64) -> Vec<f64> {
-    let mut energies: Vec<f64> = speeds_m_s.iter().map(|speed| 0.5 * speed * speed).collect();
+fn quickest(limits: &[NodeLimits], cell_m: f64) -> Vec<f64> {
+    let energy = |node: &NodeLimits| 0.5 * node.speed_m_s * node.speed_m_s;
+    let mut energies: Vec<f64> = limits.iter().map(energy).collect();
     energies[0] = 0.0;
     let last = energies.len() - 1;
     energies[last] = 0.0;
-    let gain = |cell: usize| accelerations_m_s2[cell].min(accelerations_m_s2[cell + 1]) * cell_m;
+    let acceleration_m_s2 = |node: usize| limits[node].acceleration_m_s2;
+    let gain = |cell: usize| acceleration_m_s2(cell).min(acceleration_m_s2(cell + 1)) * cell_m;
     for cell in 0..last {
         energies[cell + 1] = energies[cell + 1].min(energies[cell] + gain(cell));
     }
@@ -160,21 +193,14 @@ fn quickest(speeds_m_s: &[f64], accelerations_m_s2: &[f64], cell_m: f64) -> Vec<
 
 /// Returns, for each node, the first and last node whose limits it keeps to; both are
 /// non-decreasing.
-fn spans(
-    limits: &[NodeLimits],
-    cell_m: f64,
-    reach: usize,
-    brisk: usize,
-    window_s: f64,
-) -> Vec<(usize, usize)> {
+fn spans(limits: &[NodeLimits], cell_m: f64, reach: Reach, brisk: usize) -> Vec<(usize, usize)> {
+    let Reach { window_s, cells } = reach;
     let last = limits.len() - 1;
-    let within_reach = |index: usize| (index.saturating_sub(reach), (index + reach).min(last));
+    let within_reach = |index: usize| (index.saturating_sub(cells), (index + cells).min(last));
     if brisk == 0 {
         return (0..=last).map(within_reach).collect();
     }
-    let speeds: Vec<f64> = limits.iter().map(|node| node.speed_m_s).collect();
-    let accelerations: Vec<f64> = limits.iter().map(|node| node.acceleration_m_s2).collect();
-    let timed = time_nodes(&quickest(&speeds, &accelerations, cell_m), cell_m);
+    let timed = time_nodes(&quickest(limits, cell_m), cell_m);
     let (mut before, mut after) = (0, 0);
     let mut first = 0;
     (0..=last)
@@ -280,8 +306,13 @@ mod tests {
             let cells = limits.len() - 1;
             let length_m = CELL_M * cells as f64;
             let brisk = (brisk_share * limits.len() as f64) as usize;
-            let cautious = SpeedProfile::new(length_m, &limits, 0, jerk_m_s3);
-            let quick = SpeedProfile::new(length_m, &limits, brisk, jerk_m_s3);
+            let profile = |brisk: usize| SpeedProfile::new(&ProfileInput {
+                length_m,
+                limits: &limits,
+                brisk,
+                jerk_max_m_s3: jerk_m_s3,
+            });
+            let (cautious, quick) = (profile(0), profile(brisk));
             prop_assert!(quick.duration_s() <= cautious.duration_s() + 1.0e-9);
             let (mut time_s, mut before_m_s2) = (0.0, 0.0);
             while time_s < quick.duration_s() {

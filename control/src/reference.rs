@@ -69,10 +69,14 @@ pub struct ReferenceSample {
     pub arc_m: f64,
 }
 
-impl ReferenceSample {
-    /// Returns the reference at a plan sample for another speed and acceleration than planned.
-    fn at(planned: &PlanSample, speed_m_s: f64, acceleration_m_s2: f64) -> Self {
-        let path = &planned.path;
+impl From<&PlanSample> for ReferenceSample {
+    fn from(planned: &PlanSample) -> Self {
+        let &PlanSample {
+            path,
+            arc_m,
+            speed_m_s,
+            acceleration_m_s2,
+        } = planned;
         Self {
             pose: path.pose,
             speed_m_s,
@@ -81,14 +85,8 @@ impl ReferenceSample {
             turn_acceleration_rad_s2: path.curvature_1_m * acceleration_m_s2
                 + path.curvature_slope_1_m2 * speed_m_s * speed_m_s,
             curvature_1_m: path.curvature_1_m,
-            arc_m: planned.arc_m,
+            arc_m,
         }
-    }
-}
-
-impl From<&PlanSample> for ReferenceSample {
-    fn from(planned: &PlanSample) -> Self {
-        Self::at(planned, planned.speed_m_s, planned.acceleration_m_s2)
     }
 }
 
@@ -339,10 +337,12 @@ impl Governor {
     }
 
     fn reference(&self, planned: &PlanSample) -> ReferenceSample {
-        let speed_m_s = self.rate * planned.speed_m_s;
-        let acceleration_m_s2 = self.rate * self.rate * planned.acceleration_m_s2
-            + self.rate_slope_1_s * planned.speed_m_s;
-        ReferenceSample::at(planned, speed_m_s, acceleration_m_s2)
+        ReferenceSample::from(&PlanSample {
+            speed_m_s: self.rate * planned.speed_m_s,
+            acceleration_m_s2: self.rate * self.rate * planned.acceleration_m_s2
+                + self.rate_slope_1_s * planned.speed_m_s,
+            ..*planned
+        })
     }
 }
 

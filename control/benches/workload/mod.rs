@@ -142,8 +142,7 @@ impl Robot {
     pub(crate) fn tick(&mut self) -> FollowerOutput {
         let dt_s = LOOP_S / f64::from(SAMPLES);
         for sample in self.samples {
-            self.localisation
-                .predict(sample.gyro_rad_s, sample.wheel_speeds, dt_s);
+            self.localisation.predict(&sample, dt_s);
             self.estimator.update(&sample, dt_s);
         }
         if self.ticks.is_multiple_of(5) {

@@ -59,6 +59,13 @@ struct Ends {
     rim_m_s: [[f64; 2]; 2],
 }
 
+/// Friction coefficients and rim speeds of the sides in one sample, `[left, right]`.
+#[derive(Debug, Clone, Copy)]
+struct Sides {
+    mu: [f64; 2],
+    rim_m_s: [f64; 2],
+}
+
 impl Ends {
     /// Returns 0 for a sample at the beginning of a block, 1 at its end, else `None`. `span` is
     /// relative to the block's start.
@@ -73,12 +80,12 @@ impl Ends {
         }
     }
 
-    fn add(&mut self, end: usize, time_s: f64, mu: [f64; 2], rim_m_s: [f64; 2]) {
+    fn add(&mut self, end: usize, time_s: f64, sides: Sides) {
         self.samples[end] += 1.0;
         self.time_s[end] += time_s;
         for side in 0..2 {
-            self.mu[end][side] += mu[side];
-            self.rim_m_s[end][side] += rim_m_s[side];
+            self.mu[end][side] += sides.mu[side];
+            self.rim_m_s[end][side] += sides.rim_m_s[side];
         }
     }
 
@@ -350,8 +357,11 @@ impl BlockBuilder {
             self.with_torque += 1;
             let middle_s = self.duration_s - 0.5 * dt_s;
             if let Some(end) = Ends::of(SampleSpan { middle_s, dt_s }) {
-                self.ends
-                    .add(end, middle_s, [left_mu, right_mu], [left_m_s, right_m_s]);
+                let sides = Sides {
+                    mu: [left_mu, right_mu],
+                    rim_m_s: [left_m_s, right_m_s],
+                };
+                self.ends.add(end, middle_s, sides);
             }
             self.left_mu += left_mu;
             self.right_mu += right_mu;
@@ -620,7 +630,8 @@ mod tests {
                 let middle_s = (f64::from(sample) + 0.5) * dt_s;
                 if let Some(end) = Ends::of(SampleSpan { middle_s, dt_s }) {
                     let mu = from + slope * middle_s;
-                    ends.add(end, middle_s, [mu, -mu], [rim, rim + slope * middle_s]);
+                    let rim_m_s = [rim, rim + slope * middle_s];
+                    ends.add(end, middle_s, Sides { mu: [mu, -mu], rim_m_s });
                 }
             }
             let rate = ends.rate(0.01, [rim, rim]);

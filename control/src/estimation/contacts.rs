@@ -43,17 +43,26 @@ pub(super) struct MeanSlip {
     pub(super) lateral: f64,
 }
 
+/// Slip compliance and curvature of the tyres' friction curve.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct TyreCurve {
+    /// θ.
+    pub(super) theta: f64,
+    /// κ, per slip.
+    pub(super) curvature: f64,
+}
+
 impl Loss {
     /// Computes the loss at a mean rim speed above zero, for a robot that drives forward. `slip` is
-    /// the mean slip of linear tyres at `theta`.
+    /// the mean slip of linear tyres of the same θ.
     pub(super) fn of(
         turn: &Turn,
         swing: &[Moment],
         slip: MeanSlip,
-        theta: f64,
+        tyres: TyreCurve,
         model: &RobotModel,
-        curvature: f64,
     ) -> Self {
+        let TyreCurve { theta, curvature } = tyres;
         let apart = (turn.rim_difference_m_s - model.track_width_m() * turn.yaw_rate_rad_s)
             / turn.rim_m_s
             - turn.radius_difference;
@@ -136,23 +145,28 @@ impl<F: Fn(&Loss) -> f64> BendInput<'_, F> {
         if prior.mean <= 0.0 && prior.std_dev <= 0.0 {
             return (Bends::default(), [0.0; 3]);
         }
-        let at = |theta: f64, curvature: f64| {
+        let at = |tyres: TyreCurve| {
             let slip = MeanSlip {
-                forward: theta * self.mu.forward,
-                lateral: theta * self.mu.lateral,
+                forward: tyres.theta * self.mu.forward,
+                lateral: tyres.theta * self.mu.lateral,
             };
-            let loss = Loss::of(self.turn, self.swing, slip, theta, model, curvature);
+            let loss = Loss::of(self.turn, self.swing, slip, tyres, model);
             [loss.mean / loss.left, (self.uneven_m_s)(&loss) / loss.left]
         };
         let theta = self.theta;
         let curvatures = Curvatures::of(prior);
-        let known = curvatures.nodes().map(|curvature| at(theta, curvature));
+        let known = curvatures
+            .nodes()
+            .map(|curvature| at(TyreCurve { theta, curvature }));
         let [share, square_share] = curvatures.split(known.map(|[share, _]| share));
         let bends = curvatures
             .split(known.map(|[share, uneven_m_s]| self.force_m_s * share + uneven_m_s / theta));
         // Linear in θ between the two values, at the mean κ.
-        let here = at(theta, prior.mean);
-        let there = at(THETA_STEP * theta, prior.mean);
+        let at_mean = |theta: f64| {
+            let curvature = prior.mean;
+            at(TyreCurve { theta, curvature })
+        };
+        let (here, there) = (at_mean(theta), at_mean(THETA_STEP * theta));
         let slope = [0, 1].map(|part| (there[part] - here[part]) / ((THETA_STEP - 1.0) * theta));
         let alone_m_s = here[1] - slope[1] * theta;
         let of_theta_m_s = slope[0] * self.force_m_s;
@@ -212,7 +226,8 @@ mod tests {
                 }
             }
             let forces = MeanSlip { forward: longitudinal_force, lateral: lateral_force };
-            let loss = Loss::of(&turn, &still, forces, 0.2, &model, curvature);
+            let tyres = TyreCurve { theta: 0.2, curvature };
+            let loss = Loss::of(&turn, &still, forces, tyres, &model);
             let found_m = (moment_m + curvature * loss.moment_m) / loss.left;
             prop_assert!((found_m - straight_moment_m).abs() < 2.0e-5);
             let found_longitudinal = (longitudinal_force + curvature * loss.forward) / loss.left;

@@ -15,7 +15,7 @@
 
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
-use super::contacts::{BendInput, Loss, MeanSlip};
+use super::contacts::{BendInput, Loss, MeanSlip, TyreCurve};
 use super::curved::{CurvatureAtSlip, Curvatures, SLIP_MIN, SideSlips, Turn, stiffness_difference};
 use super::rows::{Regressors, Row, index};
 use super::types::Curvature;
@@ -191,9 +191,9 @@ impl LongitudinalFilter {
         let gyro_rad_s = step.gyro_rad_s / count;
         let sideways = Sideways {
             theta: bound.theta,
-            bend: sideways_bend(&step, gyro_rad_s, model, bound.theta, bound.curvature),
+            bend: sideways_bend(&step, gyro_rad_s, model, bound),
         };
-        self.predict(&step, forward_m_s2, gyro_rad_s, noise, sideways);
+        self.predict(&step, gyro_rad_s, noise, sideways);
         let mut rows: Rows = [None; 3];
         let gained_m_s2 = forward_m_s2 - std::mem::replace(&mut self.last_ahead_m_s2, forward_m_s2);
         // When turning on the spot, the mean of the rim speeds is zero, so check both sides.
@@ -220,11 +220,12 @@ impl LongitudinalFilter {
             }));
             let mut regressors = Regressors::zeros();
             regressors[index::GYRO_OFFSET] = 1.0;
-            rows[2] = Some(Row::white(
+            rows[2] = Some(Row {
                 regressors,
-                gyro_rad_s,
-                noise.gyro_rad_s.powi(2) / count,
-            ));
+                response: gyro_rad_s,
+                innovation_variance: noise.gyro_rad_s.powi(2) / count,
+                ..Row::default()
+            });
         } else if step.body_samples > 0.0 {
             // Correct for the time between the middle of the step and the samples.
             let late_s = step.body_time_s / step.body_samples - 0.5 * step.duration_s;
@@ -242,14 +243,8 @@ impl LongitudinalFilter {
 
     /// Propagates the speed from the mean of the last step to that of this one, by the acceleration
     /// with a triangular weight that rises over the last step and falls over this one.
-    fn predict(
-        &mut self,
-        step: &Step,
-        forward_m_s2: f64,
-        gyro_rad_s: f64,
-        noise: &SensorNoise,
-        sideways: Sideways,
-    ) {
+    fn predict(&mut self, step: &Step, gyro_rad_s: f64, noise: &SensorNoise, sideways: Sideways) {
+        let forward_m_s2 = step.forward_m_s2 / step.samples;
         let late_m_s = step.forward_late_m_s / step.samples;
         let early_m_s = forward_m_s2 * step.duration_s - late_m_s;
         let span_s = 0.5 * (self.last_duration_s + step.duration_s);
@@ -380,23 +375,15 @@ impl LongitudinalFilter {
             innovation_variance,
             // An error of this row persists in the following innovations and decays.
             force_noise: force_noise * 2.0 / (2.0 - gain),
-            bend: [0.0; 3],
-            common_noise: Regressors::zeros(),
-            ramp_noise: 0.0,
-            rate_noise: 0.0,
+            ..Row::default()
         }
     }
 }
 
 /// Returns the increase of the sideslip by curvature in a step, per θκ and θκ², relative to that of
 /// linear tyres; zero when driving straight.
-fn sideways_bend(
-    step: &Step,
-    gyro_rad_s: f64,
-    model: &RobotModel,
-    theta: f64,
-    known: Curvature,
-) -> [f64; 2] {
+fn sideways_bend(step: &Step, gyro_rad_s: f64, model: &RobotModel, bound: &SlipBound) -> [f64; 2] {
+    let theta = bound.theta;
     let rim_m_s = step.harmonic_m_s.abs() / step.samples;
     if step.usable < step.samples || gyro_rad_s.abs() < TURNING_MIN_RAD_S {
         return [0.0; 2];
@@ -408,7 +395,7 @@ fn sideways_bend(
         radius_difference: 0.0,
     };
     let lateral = theta * rim_m_s * gyro_rad_s / GRAVITY_M_S2;
-    let curvatures = Curvatures::of(known);
+    let curvatures = Curvatures::of(bound.curvature);
     curvatures.split(curvatures.nodes().map(|curvature| {
         let loss = Loss::of(
             &turn,
@@ -417,9 +404,8 @@ fn sideways_bend(
                 forward: 0.0,
                 lateral,
             },
-            theta,
+            TyreCurve { theta, curvature },
             model,
-            curvature,
         );
         (loss.mean + loss.lateral / lateral) / loss.left
     }))

@@ -65,7 +65,7 @@ use payload::PayloadMonitor;
 use regression::{Shared, Solution, SolveInput, solve};
 use rows::Row;
 pub use segment::SegmentStatistics;
-use segment::{Claims, SegmentTheta};
+use segment::{Claims, SegmentTheta, SegmentVariance};
 use sums::Sums;
 pub use types::{
     CommonError, Estimate, EstimatorPrior, IdentifiedRobot, IdentifiedValue, ModelUncertainty,
@@ -578,12 +578,12 @@ impl Estimator {
         let offsets = self
             .offsets
             .with_ground(&self.ground, &self.tyres, before.as_ref());
-        let whole = self.ground.plus(&segment);
+        self.ground = self.ground.plus(&segment);
         let theta = match &mut self.identification {
             Some(identification) => identification
                 .close_segment()
                 .map(|found| self.claims.identified(&found)),
-            None => self.segment_of_rows(&segment, &whole, before.as_ref(), (&offsets, &tyres)),
+            None => self.segment_of_rows(&segment, before.as_ref(), (&offsets, &tyres)),
         };
         let statistics = SegmentStatistics::of(
             &segment,
@@ -591,26 +591,24 @@ impl Estimator {
             theta.filter(|found| found.own_information > 0.0),
             self.accelerometer_offset_mu(),
         );
-        self.ground = whole;
         self.segment = Sums::default();
         self.pending = Sums::default();
         self.refresh();
         statistics
     }
 
-    /// Returns θ of a segment from its rows; None unless all blocks of the ground are a
-    /// measurement.
+    /// Returns θ of a segment of this ground from its rows; None unless all blocks of the ground
+    /// are a measurement.
     fn segment_of_rows(
         &mut self,
         segment: &Sums,
-        whole: &Sums,
         before: Option<&Solution>,
         (offsets, tyres): (&OffsetKnowledge, &TyrePrior),
     ) -> Option<SegmentTheta> {
         // A segment is no measurement if all blocks of the ground together are none.
         let ground = self
-            .solve(whole, None)
-            .filter(|found| self.is_measurement(found, whole))?;
+            .solve(&self.ground, None)
+            .filter(|found| self.is_measurement(found, &self.ground))?;
         let input = SolveInput {
             offsets,
             tyres,
@@ -636,9 +634,10 @@ impl Estimator {
         };
         Some(SegmentTheta {
             theta: scale * found.theta,
-            information: self
-                .claims
-                .add(square * found.variance, square * shared.all),
+            information: self.claims.add(SegmentVariance {
+                total: square * found.variance,
+                shared: square * shared.all,
+            }),
             own_information: (square * (own_variance - of_offsets)).recip(),
             common_ratio,
             duration_s: segment.duration_s,

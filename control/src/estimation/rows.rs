@@ -167,8 +167,9 @@ impl Bends {
     }
 }
 
-/// One linear equation: response = regressors · parameters + noise.
-#[derive(Debug, Clone, Copy, PartialEq)]
+/// One linear equation: response = regressors · parameters + noise. By default the regressors are
+/// free of noise.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Row {
     pub(super) regressors: Regressors,
     pub(super) response: f64,
@@ -186,22 +187,6 @@ pub(super) struct Row {
     pub(super) ramp_noise: f64,
     /// Variance of the force's rate, the regressor of θℓ.
     pub(super) rate_noise: f64,
-}
-
-impl Row {
-    /// Creates a row with noise-free regressors.
-    pub(super) fn white(regressors: Regressors, response: f64, innovation_variance: f64) -> Self {
-        Self {
-            regressors,
-            response,
-            innovation_variance,
-            force_noise: 0.0,
-            bend: [0.0; 3],
-            common_noise: Regressors::zeros(),
-            ramp_noise: 0.0,
-            rate_noise: 0.0,
-        }
-    }
 }
 
 /// Sums over the rows of one kind.

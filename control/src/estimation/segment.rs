@@ -60,6 +60,15 @@ pub(super) struct SegmentTheta {
     pub(super) duration_s: f64,
 }
 
+/// Variance of the θ of one segment.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct SegmentVariance {
+    /// Variance σ².
+    pub(super) total: f64,
+    /// Covariance c with the θ of the segments before.
+    pub(super) shared: f64,
+}
+
 /// Information that the segments of one ground state together.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Claims {
@@ -71,12 +80,15 @@ pub(super) struct Claims {
 
 impl Claims {
     /// Returns the information w that the next segment states: the largest one for which the
-    /// variance of the fused θ is at most `1/(W + w)`. `variance` σ² is that of this segment's θ,
-    /// `shared` c its covariance with the segments before.
+    /// variance of the fused θ is at most `1/(W + w)`.
     ///
     /// With weights W and w the fused variance is `(W²V + w²σ² + 2Wwc)/(W + w)²`; the condition is
     /// a quadratic inequality in w.
-    pub(super) fn add(&mut self, variance: f64, shared: f64) -> f64 {
+    pub(super) fn add(&mut self, segment: SegmentVariance) -> f64 {
+        let SegmentVariance {
+            total: variance,
+            shared,
+        } = segment;
         let (sum, own) = (self.information, variance.recip());
         let room = 1.0 - 2.0 * sum * shared;
         let slack = sum * (1.0 - sum * self.variance).max(0.0);
@@ -99,7 +111,10 @@ impl Claims {
             [found.own_ratio, found.tyres_ratio].map(|ratio| (ratio * found.theta).powi(2));
         SegmentTheta {
             theta: found.theta,
-            information: self.add(own + tyres, tyres),
+            information: self.add(SegmentVariance {
+                total: own + tyres,
+                shared: tyres,
+            }),
             own_information: own.recip(),
             common_ratio: CommonError {
                 robot: found.robot_ratio,
@@ -172,7 +187,7 @@ mod tests {
             let mut variance_sum = 0.0;
             for (variance, correlation) in segments {
                 let shared = 0.1 * correlation;
-                let weight = claims.add(variance, shared);
+                let weight = claims.add(SegmentVariance { total: variance, shared });
                 prop_assert!((0.0..=variance.recip()).contains(&weight));
                 let before: f64 = weights.iter().sum();
                 variance_sum += weight * (weight * variance + 2.0 * before * shared);
@@ -188,7 +203,8 @@ mod tests {
         ) {
             let mut claims = Claims::default();
             for variance in variances {
-                prop_assert!((claims.add(variance, 0.0) * variance - 1.0).abs() < 1.0e-9);
+                let alone = SegmentVariance { total: variance, shared: 0.0 };
+                prop_assert!((claims.add(alone) * variance - 1.0).abs() < 1.0e-9);
             }
         }
     }

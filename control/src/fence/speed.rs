@@ -116,9 +116,16 @@ pub(super) fn along_arc(pose: Pose, arc: Arc) -> Pose {
     }
 }
 
+/// Disc around a robot.
+#[derive(Debug, Clone, Copy)]
+struct Disc {
+    pose: Pose,
+    radius_m: f64,
+}
+
 impl Fence {
     /// Returns the free distance of a disc along its arc, metres, at most `most_m`; 0 outside.
-    fn free_distance_m(&self, pose: Pose, twist: Twist, radius_m: f64, most_m: f64) -> f64 {
+    fn free_distance_m(&self, disc: Disc, twist: Twist, most_m: f64) -> f64 {
         if twist.linear_m_s.abs() < 1.0e-6 {
             return most_m;
         }
@@ -127,13 +134,13 @@ impl Fence {
         let mut distance_m = 0.0;
         for _ in 0..STEPS_MAX {
             let at = along_arc(
-                pose,
+                disc.pose,
                 Arc {
                     curvature_1_m,
                     distance_m: direction * distance_m,
                 },
             );
-            let clearance_m = self.clearance_m(at.point()) - radius_m;
+            let clearance_m = self.clearance_m(at.point()) - disc.radius_m;
             if clearance_m < STEP_MIN_M {
                 return distance_m;
             }
@@ -209,9 +216,13 @@ impl Fence {
                 speed_max_m_s: None,
             };
         }
+        let disc = Disc {
+            pose: input.pose,
+            radius_m,
+        };
         let free_m = [input.present, input.wanted]
             .into_iter()
-            .map(|twist| self.free_distance_m(input.pose, twist, radius_m, reach_m))
+            .map(|twist| self.free_distance_m(disc, twist, reach_m))
             .fold(reach_m, f64::min);
         if free_m >= reach_m {
             return FenceVerdict {

@@ -340,7 +340,9 @@ pub fn gate_with(input: &GateInput, reasons: &Reasons, limits: &GateLimits) -> G
 ///
 /// The centre decelerates at the braking limit, also in a turn, where one side must decelerate
 /// faster than the centre: by at most twice the limit.
-fn rest_share(previous: WheelSpeeds, braking: f64, up: f64) -> f64 {
+fn rest_share(previous: WheelSpeeds, step: Step, limits: &GateLimits) -> f64 {
+    let up = limits.wheel_acceleration_max_rad_s2 * step.dt_s;
+    let braking = limits.wheel_braking_max_rad_s2 * step.dt_s;
     let fastest_rad_s = previous.magnitude_max_rad_s();
     let centre_rad_s = 0.5 * (previous.left_rad_s + previous.right_rad_s).abs();
     if fastest_rad_s <= braking {
@@ -356,9 +358,10 @@ fn rest_share(previous: WheelSpeeds, braking: f64, up: f64) -> f64 {
 /// Returns the fraction by which the wheels exceed the robot's measured speed, at most what they
 /// may change in a tick. Without this reduction a robot that gains speed by slip would be
 /// accelerated while it brakes.
-fn slip_share(previous: WheelSpeeds, real_m_s: Option<f64>, radius_m: f64, up: f64) -> f64 {
-    let centre_m_s = 0.5 * radius_m * (previous.left_rad_s + previous.right_rad_s);
-    let Some(real_m_s) = real_m_s.filter(|real_m_s| real_m_s.is_finite()) else {
+fn slip_share(previous: WheelSpeeds, step: Step, limits: &GateLimits) -> f64 {
+    let up = limits.wheel_acceleration_max_rad_s2 * step.dt_s;
+    let centre_m_s = 0.5 * limits.wheel_radius_m * (previous.left_rad_s + previous.right_rad_s);
+    let Some(real_m_s) = step.real_m_s.filter(|real_m_s| real_m_s.is_finite()) else {
         return 0.0;
     };
     if centre_m_s.abs() < SLIP_LEAST_M_S {
@@ -391,11 +394,9 @@ fn scaled(speeds: WheelSpeeds, share: f64) -> WheelSpeeds {
 /// wheels' limit, or within the braking limit along the path if a cap applies. For a zero target
 /// both sides are reduced by the same fraction, so that the robot stays on its arc.
 fn ramped(change: Change<WheelSpeeds>, step: Step, limits: &GateLimits) -> WheelSpeeds {
-    let up = limits.wheel_acceleration_max_rad_s2 * step.dt_s;
-    let braking = limits.wheel_braking_max_rad_s2 * step.dt_s;
     if change.to == WheelSpeeds::default() {
-        let share = rest_share(change.from, braking, up);
-        let slip = slip_share(change.from, step.real_m_s, limits.wheel_radius_m, up);
+        let share = rest_share(change.from, step, limits);
+        let slip = slip_share(change.from, step, limits);
         return scaled(change.from, 1.0 - share.max(slip));
     }
     let twist_limits = TwistLimits::of(&limits.model);

@@ -23,11 +23,17 @@ const POSITION_RANGE_M: std::ops::RangeInclusive<f64> = 1.0e-3..=0.2;
 /// Bounds of the estimated heading noise, radians.
 const HEADING_RANGE_RAD: std::ops::RangeInclusive<f64> = 1.0e-3..=0.1;
 
+/// Pose of a fix, and pose of the filter at the same time.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct PosePair {
+    pub(super) fix: Pose,
+    pub(super) filter: Pose,
+}
+
 /// Fix, and the pose of the filter after it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Anchor {
-    fix: Pose,
-    filter: Pose,
+    poses: PosePair,
     age_s: f64,
 }
 
@@ -72,23 +78,18 @@ impl FixNoiseEstimate {
         self.anchor = None;
     }
 
-    /// Compares a fix with the previous one; `filter` is the pose that the filter predicts for it
+    /// Compares a fix with the previous one; the pose of the filter is the one that it predicts
     /// from the previous one.
-    pub(super) fn compare(&mut self, fix: Pose, filter: Pose) {
+    pub(super) fn compare(&mut self, now: PosePair) {
         let Some(anchor) = self.anchor.filter(|anchor| anchor.age_s <= APART_MAX_S) else {
             return;
         };
-        let apart = |end: f64, begin: f64, end_filter: f64, begin_filter: f64| {
-            (end - begin) - (end_filter - begin_filter)
+        let before = anchor.poses;
+        let apart = |of: fn(Pose) -> f64| {
+            (of(now.fix) - of(before.fix)) - (of(now.filter) - of(before.filter))
         };
-        let x_m = apart(fix.x_m, anchor.fix.x_m, filter.x_m, anchor.filter.x_m);
-        let y_m = apart(fix.y_m, anchor.fix.y_m, filter.y_m, anchor.filter.y_m);
-        let turned_rad = wrap_angle_rad(apart(
-            fix.heading_rad,
-            anchor.fix.heading_rad,
-            filter.heading_rad,
-            anchor.filter.heading_rad,
-        ));
+        let (x_m, y_m) = (apart(|pose| pose.x_m), apart(|pose| pose.y_m));
+        let turned_rad = wrap_angle_rad(apart(|pose| pose.heading_rad));
         // A difference of two values has twice the variance of one.
         let position_m2 = 0.25 * (x_m * x_m + y_m * y_m);
         let heading_rad2 = 0.5 * turned_rad * turned_rad;
@@ -103,12 +104,8 @@ impl FixNoiseEstimate {
     }
 
     /// Records a fix that was used, and the pose of the filter after it.
-    pub(super) fn anchor(&mut self, fix: Pose, filter: Pose) {
-        self.anchor = Some(Anchor {
-            fix,
-            filter,
-            age_s: 0.0,
-        });
+    pub(super) fn anchor(&mut self, poses: PosePair) {
+        self.anchor = Some(Anchor { poses, age_s: 0.0 });
     }
 }
 
@@ -120,6 +117,7 @@ mod tests {
 
     use super::super::{FixOutcome, Localisation, LocalisationNoise, PositionFix};
     use super::*;
+    use crate::estimation::SensorSample;
     use crate::measured::WheelSpeeds;
     use crate::robot::RobotModel;
 
@@ -167,8 +165,12 @@ mod tests {
                 self.truth.x_m += LOOP_S * speed_m_s * middle_rad.cos();
                 self.truth.y_m += LOOP_S * speed_m_s * middle_rad.sin();
                 self.truth.heading_rad += LOOP_S * turn_rad_s;
-                let gyro_rad_s = turn_rad_s + self.normal(0.003);
-                self.filter.predict(gyro_rad_s, wheels, LOOP_S);
+                let sample = SensorSample {
+                    wheel_speeds: wheels,
+                    gyro_rad_s: turn_rad_s + self.normal(0.003),
+                    ..SensorSample::default()
+                };
+                self.filter.predict(&sample, LOOP_S);
                 if tick % ticks_per_fix != 0 {
                     continue;
                 }
@@ -245,7 +247,7 @@ mod tests {
         let mut filter = Localisation::new(RobotModel::yi2007(), LocalisationNoise::default());
         let before = filter.fix_noise.noise();
         for tick in 0..100_u8 {
-            filter.predict(0.0, WheelSpeeds::default(), LOOP_S);
+            filter.predict(&SensorSample::default(), LOOP_S);
             filter.correct(&PositionFix {
                 pose: Pose {
                     x_m: if tick % 2 == 0 { 0.3 } else { -0.3 },

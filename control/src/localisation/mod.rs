@@ -25,10 +25,10 @@ mod fix_noise;
 
 use nalgebra::{Matrix3, Matrix3x6, Matrix6, Vector3, Vector6};
 
+use crate::estimation::SensorSample;
 use crate::geometry::{Pose, Twist, wrap_angle_rad};
-use crate::measured::WheelSpeeds;
 use crate::robot::RobotModel;
-use fix_noise::FixNoiseEstimate;
+use fix_noise::{FixNoiseEstimate, PosePair};
 
 /// Number of consecutive refused fixes after which the filter restarts.
 pub const REFUSED_MAX: u32 = 20;
@@ -214,13 +214,14 @@ impl Localisation {
     ///
     /// The motion is that of at most 0.5 s; call [`Self::lose_track`] after a longer gap. An invalid rate
     /// is counted, and the last valid one is used; if `dt_s` is not above 0, nothing else changes.
-    pub fn predict(&mut self, gyro_rad_s: f64, wheels: WheelSpeeds, dt_s: f64) {
+    pub fn predict(&mut self, sample: &SensorSample, dt_s: f64) {
         if !(dt_s.is_finite() && dt_s > 0.0) {
             self.invalid += 1;
             return;
         }
         self.fix_age_s += dt_s;
         self.fix_noise.wait(dt_s);
+        let (gyro_rad_s, wheels) = (sample.gyro_rad_s, sample.wheel_speeds);
         let wheel_m_s =
             0.5 * self.model.wheel_radius_m() * (wheels.left_rad_s + wheels.right_rad_s);
         // After a refused sample the last rates apply; the covariance grows.
@@ -294,7 +295,7 @@ impl Localisation {
         }
         let moved = self.carried(fix);
         if let Some(filter) = self.pose().filter(|_| fix.noise.is_none()) {
-            self.fix_noise.compare(moved, filter);
+            self.fix_noise.compare(PosePair { fix: moved, filter });
         }
         let fix_noise = fix.noise.unwrap_or_else(|| self.fix_noise.noise());
         if !self.started {
@@ -341,9 +342,9 @@ impl Localisation {
         FixOutcome::Fused
     }
 
-    fn anchor(&mut self, moved: Pose) {
+    fn anchor(&mut self, fix: Pose) {
         if let Some(filter) = self.pose() {
-            self.fix_noise.anchor(moved, filter);
+            self.fix_noise.anchor(PosePair { fix, filter });
         }
     }
 
@@ -405,10 +406,20 @@ mod tests {
         }
     }
 
+    fn straight(speed_rad_s: f64) -> SensorSample {
+        SensorSample {
+            wheel_speeds: crate::measured::WheelSpeeds {
+                left_rad_s: speed_rad_s,
+                right_rad_s: speed_rad_s,
+            },
+            ..SensorSample::default()
+        }
+    }
+
     #[test]
     fn nothing_is_known_before_the_first_fix() {
         let mut filter = filter();
-        filter.predict(0.0, WheelSpeeds::default(), 0.01);
+        filter.predict(&SensorSample::default(), 0.01);
         assert!(filter.pose().is_none() && filter.fix_age_s().is_infinite());
         assert_eq!(filter.correct(&fix(1.0, 2.0)), FixOutcome::Started);
         assert!((filter.pose().unwrap().x_m - 1.0).abs() < 1.0e-12);
@@ -419,28 +430,24 @@ mod tests {
         let mut filter = filter();
         filter.correct(&fix(0.0, 0.0));
         for _ in 1..REFUSED_MAX {
-            filter.predict(0.0, WheelSpeeds::default(), 0.05);
+            filter.predict(&SensorSample::default(), 0.05);
             assert_eq!(filter.correct(&fix(50.0, 0.0)), FixOutcome::Outlier);
             assert!(filter.pose().unwrap().x_m.abs() < 0.01);
         }
-        filter.predict(0.0, WheelSpeeds::default(), 0.05);
+        filter.predict(&SensorSample::default(), 0.05);
         assert_eq!(filter.correct(&fix(50.0, 0.0)), FixOutcome::Restarted);
         assert!((filter.pose().unwrap().x_m - 50.0).abs() < 1.0e-9);
     }
 
     #[test]
     fn after_a_silence_a_fix_is_believed_as_far_as_the_robot_can_have_come() {
-        let wheels = |speed_rad_s: f64| WheelSpeeds {
-            left_rad_s: speed_rad_s,
-            right_rad_s: speed_rad_s,
-        };
         let speed_m_s = 0.5;
         let speed_rad_s = speed_m_s / RobotModel::yi2007().wheel_radius_m();
         let driven = |is_silence_known: bool, speed_rad_s: f64, jump_m: f64| {
             let mut filter = filter();
             filter.correct(&fix(0.0, 0.0));
             for _ in 0..20 {
-                filter.predict(0.0, wheels(speed_rad_s), 0.05);
+                filter.predict(&straight(speed_rad_s), 0.05);
                 let x_m = filter.pose().unwrap().x_m;
                 filter.correct(&fix(x_m, 0.0));
             }
@@ -448,7 +455,7 @@ mod tests {
             if is_silence_known {
                 filter.lose_track(1.5);
             }
-            filter.predict(0.0, wheels(0.0), 0.2);
+            filter.predict(&straight(0.0), 0.2);
             filter.correct(&fix(x_m + jump_m, 0.0))
         };
         assert_eq!(driven(true, speed_rad_s, 0.3), FixOutcome::Fused);
@@ -462,15 +469,13 @@ mod tests {
         let moved_by = |position_m: f64| {
             let mut filter = filter();
             filter.correct(&fix(0.0, 0.0));
-            filter.predict(0.0, WheelSpeeds::default(), 0.05);
-            let noise = Some(FixNoise {
+            filter.predict(&SensorSample::default(), 0.05);
+            let mut fix = fix(0.02, 0.0);
+            fix.noise = Some(FixNoise {
                 position_m,
                 heading_rad: 0.01,
             });
-            let outcome = filter.correct(&PositionFix {
-                noise,
-                ..fix(0.02, 0.0)
-            });
+            let outcome = filter.correct(&fix);
             (outcome, filter.pose().unwrap().x_m)
         };
         let (_, by_good) = moved_by(0.005);
@@ -484,14 +489,9 @@ mod tests {
     fn samples_that_are_no_numbers_are_counted_and_do_no_harm() {
         let mut filter = filter();
         filter.correct(&fix(0.0, 0.0));
-        filter.predict(
-            f64::NAN,
-            WheelSpeeds {
-                left_rad_s: f64::INFINITY,
-                right_rad_s: 0.0,
-            },
-            0.01,
-        );
+        let mut sample = straight(f64::INFINITY);
+        sample.gyro_rad_s = f64::NAN;
+        filter.predict(&sample, 0.01);
         assert_eq!(filter.correct(&fix(f64::NAN, 0.0)), FixOutcome::Invalid);
         assert_eq!(filter.invalid(), 3);
         assert!(filter.pose().unwrap().is_finite());

@@ -3,7 +3,7 @@
 use std::f64::consts::{FRAC_PI_2, TAU};
 
 use super::leg_time::{LegTime, Ring};
-use super::polynomial::Derivatives;
+use super::polynomial::{Derivatives, Ends};
 use super::{Path, Piece, Polynomial};
 use crate::geometry::{Point, Pose, wrap_angle_rad};
 use crate::robot::RobotModel;
@@ -142,7 +142,16 @@ pub(crate) fn join(
         };
         let still = Point::default();
         let bound_s = best.as_ref().map_or(bound_s, |(best_s, _)| *best_s);
-        let Some(last) = leg(behind, forward.y_m.atan2(forward.x_m), end, run_in_m, 1.0) else {
+        let last_start = Pose {
+            x_m: behind.x_m,
+            y_m: behind.y_m,
+            heading_rad: forward.y_m.atan2(forward.x_m),
+        };
+        let shape = LegShape {
+            length_m: run_in_m,
+            start_pace: 1.0,
+        };
+        let Some(last) = leg(last_start, end, shape) else {
             continue;
         };
         let Some(last_s) = timing.of_leg_s(&last, false, bound_s) else {
@@ -188,16 +197,22 @@ fn curve(
         if turn_s + least_m / timing.speed_m_s > bound_s {
             continue;
         }
-        let shapes = STRETCHES
-            .into_iter()
-            .flat_map(|stretch| START_PACES.map(|pace| (stretch, pace)));
-        for (stretch, pace) in shapes {
-            let timed =
-                leg(start.point(), heading_rad, end, stretch * chord_m, pace).and_then(|leg| {
-                    timing
-                        .of_leg_s(&leg, true, bound_s - turn_s)
-                        .map(|time_s| (time_s + turn_s, leg))
-                });
+        let turned = Pose {
+            heading_rad,
+            ..start
+        };
+        let shapes = STRETCHES.into_iter().flat_map(|stretch| {
+            START_PACES.map(|start_pace| LegShape {
+                length_m: stretch * chord_m,
+                start_pace,
+            })
+        });
+        for shape in shapes {
+            let timed = leg(turned, end, shape).and_then(|leg| {
+                timing
+                    .of_leg_s(&leg, true, bound_s - turn_s)
+                    .map(|time_s| (time_s + turn_s, leg))
+            });
             if let Some((time_s, leg)) = timed
                 && Path::new(vec![Piece::Polynomial(leg)]).is_ok()
             {
@@ -219,21 +234,27 @@ fn spot_turn_s(start: Pose, heading_rad: f64, model: &RobotModel) -> f64 {
     }
 }
 
-/// Returns a leg of parameter length `length_m` over the end's parameter speed. It starts with
-/// `start_pace` times that parameter speed and zero higher derivatives.
-fn leg(
-    start: Point,
-    heading_rad: f64,
-    end: &Derivatives,
+/// Shape of a leg.
+#[derive(Debug, Clone, Copy)]
+struct LegShape {
+    /// Parameter length times the end's parameter speed, metres.
     length_m: f64,
+    /// Parameter speed at the start, relative to that at the end.
     start_pace: f64,
-) -> Option<Polynomial> {
-    let (sin, cos) = heading_rad.sin_cos();
+}
+
+/// Returns a leg of a shape, with zero second and higher derivatives at its start.
+fn leg(start: Pose, end: &Derivatives, shape: LegShape) -> Option<Polynomial> {
+    let (sin, cos) = start.heading_rad.sin_cos();
     let pace = end[1].x_m.hypot(end[1].y_m);
     let still = Point::default();
     let forward = Point {
-        x_m: start_pace * pace * cos,
-        y_m: start_pace * pace * sin,
+        x_m: shape.start_pace * pace * cos,
+        y_m: shape.start_pace * pace * sin,
     };
-    Polynomial::nonic(&[start, forward, still, still, still], end, length_m / pace)
+    let ends = Ends {
+        start: [start.point(), forward, still, still, still],
+        end: *end,
+    };
+    Polynomial::nonic(&ends, shape.length_m / pace)
 }

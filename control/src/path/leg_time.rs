@@ -11,17 +11,34 @@ use crate::robot::RobotModel;
 
 /// Number of steps in summing a leg's time.
 const TIME_STEPS: usize = 48;
-/// Number of steps in summing the time of one piece of a spline.
-const PIECE_TIME_STEPS: usize = 10;
 /// Minimum parameter speed of a curve relative to that at its end; below it a cusp is near.
 const ADVANCE_SHARE_MIN: f64 = 0.05;
-/// Minimum radius of a leg, metres.
-const LEG_RADIUS_MIN_M: f64 = 2.0 * RADIUS_MIN_M;
-/// Fraction of the limits assumed in the bends of a spline, to prefer splines that do not need the
-/// full limits.
-const SPLINE_LIMIT_SHARE: f64 = 0.5;
+/// How the time of a leg is summed.
+const LEG: Timing = Timing {
+    steps: TIME_STEPS,
+    radius_min_m: 2.0 * RADIUS_MIN_M,
+    limit_share: 1.0,
+};
+/// How the time of one piece of a spline is summed: below the full limits, to prefer splines that
+/// do not need them.
+const PIECE: Timing = Timing {
+    steps: 10,
+    radius_min_m: RADIUS_MIN_M,
+    limit_share: 0.5,
+};
 /// Distance to its circle below which a leg counts as on it, metres.
 const ON_RING_M: f64 = 0.03;
+
+/// How the time of a curve is summed.
+#[derive(Debug, Clone, Copy)]
+struct Timing {
+    /// Number of steps.
+    steps: usize,
+    /// Minimum radius, metres; a tighter curve has no time.
+    radius_min_m: f64,
+    /// Fraction of the robot's limits that is assumed in bends.
+    limit_share: f64,
+}
 
 /// Circle to join; the part of a leg on it counts no time.
 #[derive(Debug, Clone, Copy)]
@@ -61,8 +78,7 @@ impl LegTime<'_> {
         let mut parts = [Part::default(); TIME_STEPS];
         let (mut least_s, mut counted, mut off_m) = (0.0, 0, 0.0);
         for (step, part) in parts.iter_mut().enumerate() {
-            let (fastest_m_s, length_m, place) =
-                step_of(leg, (step, TIME_STEPS), LEG_RADIUS_MIN_M, self.model, 1.0)?;
+            let (fastest_m_s, length_m, place) = LEG.step_of(leg, step, self.model)?;
             let fastest_m_s = fastest_m_s.min(self.speed_m_s);
             *part = Part {
                 length_m,
@@ -132,38 +148,34 @@ impl LegTime<'_> {
 /// Returns the estimated time of a piece of a spline, seconds; None if it is too tight to drive.
 pub(super) fn piece_time_s(piece: &Polynomial, speed_m_s: f64, model: &RobotModel) -> Option<f64> {
     let mut time_s = 0.0;
-    for step in 0..PIECE_TIME_STEPS {
-        let (fastest_m_s, length_m, _) = step_of(
-            piece,
-            (step, PIECE_TIME_STEPS),
-            RADIUS_MIN_M,
-            model,
-            SPLINE_LIMIT_SHARE,
-        )?;
+    for step in 0..PIECE.steps {
+        let (fastest_m_s, length_m, _) = PIECE.step_of(piece, step, model)?;
         time_s += length_m / fastest_m_s.min(speed_m_s);
     }
     Some(time_s)
 }
 
-/// Returns maximum speed, length and middle point of one of `steps` steps; None if it is too tight.
-fn step_of(
-    curve: &Polynomial,
-    (step, steps): (usize, usize),
-    radius_min_m: f64,
-    model: &RobotModel,
-    limit_share: f64,
-) -> Option<(f64, f64, Point)> {
-    let limits = model.limits();
-    let width = curve.span() / steps as f64;
-    let parameter = (step as f64 + 0.5) * width;
-    let at = curve.sample(parameter);
-    let bend = at.curvature_1_m.abs().max(1.0e-6);
-    let advance = curve.advance(parameter);
-    if bend > radius_min_m.recip() || advance < ADVANCE_SHARE_MIN * curve.advance(curve.span()) {
-        return None;
+impl Timing {
+    /// Returns maximum speed, length and middle point of one step; None if it is too tight.
+    fn step_of(
+        &self,
+        curve: &Polynomial,
+        step: usize,
+        model: &RobotModel,
+    ) -> Option<(f64, f64, Point)> {
+        let limits = model.limits();
+        let width = curve.span() / self.steps as f64;
+        let parameter = (step as f64 + 0.5) * width;
+        let at = curve.sample(parameter);
+        let bend = at.curvature_1_m.abs().max(1.0e-6);
+        let advance = curve.advance(parameter);
+        let is_cusp_near = advance < ADVANCE_SHARE_MIN * curve.advance(curve.span());
+        if bend > self.radius_min_m.recip() || is_cusp_near {
+            return None;
+        }
+        let fastest_m_s = (self.limit_share * limits.lateral_acceleration_max_m_s2 / bend)
+            .sqrt()
+            .min(self.limit_share * limits.angular_max_rad_s / bend);
+        Some((fastest_m_s, advance * width, at.pose.point()))
     }
-    let fastest_m_s = (limit_share * limits.lateral_acceleration_max_m_s2 / bend)
-        .sqrt()
-        .min(limit_share * limits.angular_max_rad_s / bend);
-    Some((fastest_m_s, advance * width, at.pose.point()))
 }

@@ -13,6 +13,8 @@ mod polynomial;
 mod route;
 mod spline;
 
+use std::ops::Range;
+
 use thiserror::Error;
 
 use crate::geometry::{Point, Pose};
@@ -127,7 +129,7 @@ impl Path {
                     for interval in 0..count {
                         let parameter = span * interval as f64 / count as f64;
                         let parameter_end = span * (interval + 1) as f64 / count as f64;
-                        check_turn(polynomial, parameter, parameter_end, piece)?;
+                        check_turn(polynomial, parameter..parameter_end, piece)?;
                         nodes.push(Node {
                             arc_m,
                             piece,
@@ -229,10 +231,10 @@ fn interval_count(span: f64) -> usize {
 
 fn check_turn(
     polynomial: &Polynomial,
-    start: f64,
-    end: f64,
+    parameters: Range<f64>,
     piece: usize,
 ) -> Result<(), PathError> {
+    let Range { start, end } = parameters;
     let mut before_rad = None;
     for share in [0.0, 0.25, 0.5, 0.75, 1.0] {
         let parameter = start + share * (end - start);

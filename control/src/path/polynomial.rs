@@ -21,6 +21,13 @@ const GAUSS: [(f64, f64); 5] = [
 /// Position and its first four derivatives by the parameter.
 pub(crate) type Derivatives = [Point; 5];
 
+/// Position and `N` − 1 derivatives by the parameter at both ends of a curve.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Ends<const N: usize> {
+    pub(crate) start: [Point; N],
+    pub(crate) end: [Point; N],
+}
+
 /// Curve over the parameter range 0 to `span`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Polynomial {
@@ -32,7 +39,8 @@ pub(crate) struct Polynomial {
 
 impl Polynomial {
     /// Returns the quintic with given position, first and second derivative at both ends.
-    pub(crate) fn quintic(start: [Point; 3], end: [Point; 3], span: f64) -> Self {
+    pub(crate) fn quintic(ends: &Ends<3>, span: f64) -> Self {
+        let Ends { start, end } = ends;
         let axis = |of: fn(&Point) -> f64| {
             let [p_0, v_0, a_0] = [
                 of(&start[0]),
@@ -60,7 +68,7 @@ impl Polynomial {
 
     /// Returns the polynomial of degree nine with given derivatives up to the fourth at both ends;
     /// None if the linear system cannot be solved.
-    pub(crate) fn nonic(start: &Derivatives, end: &Derivatives, span: f64) -> Option<Self> {
+    pub(crate) fn nonic(ends: &Ends<5>, span: f64) -> Option<Self> {
         const FACTORIALS: [f64; 5] = [1.0, 1.0, 2.0, 6.0, 24.0];
         let falling = |power: usize, order: usize| {
             (0..order)
@@ -73,7 +81,7 @@ impl Polynomial {
             let mut unit = [0.0; COEFFICIENTS];
             let mut scale = 1.0;
             for order in 0..5 {
-                unit[order] = of(&start[order]) * scale / FACTORIALS[order];
+                unit[order] = of(&ends.start[order]) * scale / FACTORIALS[order];
                 scale *= span;
             }
             let mut scale = 1.0;
@@ -82,7 +90,7 @@ impl Polynomial {
                 let low: f64 = (order..5)
                     .map(|power| unit[power] * falling(power, order))
                     .sum();
-                right[order] = of(&end[order]) * scale - low;
+                right[order] = of(&ends.end[order]) * scale - low;
                 scale *= span;
             }
             let high = solver.solve(&right)?;

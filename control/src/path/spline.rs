@@ -9,6 +9,7 @@
 use nalgebra::{Matrix2, Matrix4, Vector4};
 
 use super::Polynomial;
+use super::polynomial::Ends;
 use crate::geometry::Point;
 
 /// Point that the spline passes through.
@@ -66,10 +67,11 @@ pub(crate) fn min_jerk_spline(knots: &[Knot], exponent: f64) -> Vec<Polynomial> 
         .map(|chord_m| chord_m.powf(exponent))
         .collect();
     let (unit, unit_gap) = unit_cost();
-    let mut diagonal = vec![Matrix2::zeros(); count];
-    let mut above = vec![Matrix2::zeros(); count - 1];
-    // Columns are x and y.
-    let mut right = vec![Matrix2::zeros(); count];
+    let mut system = System {
+        diagonal: vec![Matrix2::zeros(); count],
+        above: vec![Matrix2::zeros(); count - 1],
+        right: vec![Matrix2::zeros(); count],
+    };
     for (index, &span) in spans.iter().enumerate() {
         let scale = Vector4::new(span, span * span, span, span * span);
         let factor = span.powi(-5);
@@ -78,9 +80,10 @@ pub(crate) fn min_jerk_spline(knots: &[Knot], exponent: f64) -> Vec<Polynomial> 
         });
         let (start, end) = (knots[index].point, knots[index + 1].point);
         let gap = [end.x_m - start.x_m, end.y_m - start.y_m];
-        diagonal[index] += block.fixed_view::<2, 2>(0, 0);
-        diagonal[index + 1] += block.fixed_view::<2, 2>(2, 2);
-        above[index] += block.fixed_view::<2, 2>(0, 2);
+        system.diagonal[index] += block.fixed_view::<2, 2>(0, 0);
+        system.diagonal[index + 1] += block.fixed_view::<2, 2>(2, 2);
+        system.above[index] += block.fixed_view::<2, 2>(0, 2);
+        let right = &mut system.right;
         for row in 0..2 {
             for (axis, gap) in gap.iter().enumerate() {
                 right[index][(row, axis)] -= factor * scale[row] * unit_gap[row] * gap;
@@ -92,8 +95,8 @@ pub(crate) fn min_jerk_spline(knots: &[Knot], exponent: f64) -> Vec<Polynomial> 
         let near = index.saturating_sub(1)..(index + 1).min(spans.len());
         chords_m[near.clone()].iter().sum::<f64>() / spans[near].iter().sum::<f64>()
     };
-    fix_tangents(knots, pace, &mut diagonal, &mut above, &mut right);
-    let solution = solve(diagonal, &above, right);
+    system.fix_tangents(knots, pace);
+    let solution = system.solve();
     let state = |index: usize| {
         let values: &Matrix2<f64> = &solution[index];
         [
@@ -111,73 +114,90 @@ pub(crate) fn min_jerk_spline(knots: &[Knot], exponent: f64) -> Vec<Polynomial> 
     spans
         .iter()
         .enumerate()
-        .map(|(index, &span)| Polynomial::quintic(state(index), state(index + 1), span))
+        .map(|(index, &span)| {
+            let ends = Ends {
+                start: state(index),
+                end: state(index + 1),
+            };
+            Polynomial::quintic(&ends, span)
+        })
         .collect()
 }
 
-/// Replaces the unknown tangents of knots with given headings; their length is the mean parameter
-/// speed of the adjacent chords.
-fn fix_tangents(
-    knots: &[Knot],
-    pace: impl Fn(usize) -> f64,
-    diagonal: &mut [Matrix2<f64>],
-    above: &mut [Matrix2<f64>],
-    right: &mut [Matrix2<f64>],
-) {
-    for (index, knot) in knots.iter().enumerate() {
-        let Some(heading_rad) = knot.heading_rad else {
-            continue;
-        };
-        let (sin, cos) = heading_rad.sin_cos();
-        let pace = pace(index);
-        for (axis, value) in [pace * cos, pace * sin].into_iter().enumerate() {
-            right[index][(1, axis)] -= diagonal[index][(1, 0)] * value;
-            right[index][(0, axis)] = value;
-            for row in 0..2 {
-                if index > 0 {
-                    right[index - 1][(row, axis)] -= above[index - 1][(row, 0)] * value;
-                }
-                if index + 1 < knots.len() {
-                    right[index + 1][(row, axis)] -= above[index][(0, row)] * value;
-                }
-            }
-        }
-        // The row becomes `tangent = value`. Rows already replaced are zero here, so that a fixed
-        // neighbour stays fixed.
-        diagonal[index][(0, 0)] = 1.0;
-        diagonal[index][(0, 1)] = 0.0;
-        diagonal[index][(1, 0)] = 0.0;
-        if index > 0 {
-            above[index - 1][(0, 0)] = 0.0;
-            above[index - 1][(1, 0)] = 0.0;
-        }
-        if index + 1 < knots.len() {
-            above[index][(0, 0)] = 0.0;
-            above[index][(0, 1)] = 0.0;
-        }
-    }
+/// Symmetric positive definite block-tridiagonal system.
+#[derive(Debug, Clone)]
+struct System {
+    diagonal: Vec<Matrix2<f64>>,
+    above: Vec<Matrix2<f64>>,
+    /// Right-hand side; columns are x and y.
+    right: Vec<Matrix2<f64>>,
 }
 
-/// Solves a symmetric positive definite block-tridiagonal system by block elimination.
-fn solve(
-    mut diagonal: Vec<Matrix2<f64>>,
-    above: &[Matrix2<f64>],
-    mut right: Vec<Matrix2<f64>>,
-) -> Vec<Matrix2<f64>> {
-    let invert = |block: &Matrix2<f64>| block.try_inverse().unwrap_or_else(Matrix2::zeros);
-    for index in 1..diagonal.len() {
-        let factor = above[index - 1].transpose() * invert(&diagonal[index - 1]);
-        let reduced = factor * above[index - 1];
-        diagonal[index] -= reduced;
-        let carried = factor * right[index - 1];
-        right[index] -= carried;
-    }
-    for index in (0..diagonal.len()).rev() {
-        if index + 1 < right.len() {
-            let known = above[index] * right[index + 1];
-            right[index] -= known;
+impl System {
+    /// Replaces the unknown tangents of knots with given headings; their length is the mean parameter
+    /// speed of the adjacent chords.
+    fn fix_tangents(&mut self, knots: &[Knot], pace: impl Fn(usize) -> f64) {
+        let Self {
+            diagonal,
+            above,
+            right,
+        } = self;
+        for (index, knot) in knots.iter().enumerate() {
+            let Some(heading_rad) = knot.heading_rad else {
+                continue;
+            };
+            let (sin, cos) = heading_rad.sin_cos();
+            let pace = pace(index);
+            for (axis, value) in [pace * cos, pace * sin].into_iter().enumerate() {
+                right[index][(1, axis)] -= diagonal[index][(1, 0)] * value;
+                right[index][(0, axis)] = value;
+                for row in 0..2 {
+                    if index > 0 {
+                        right[index - 1][(row, axis)] -= above[index - 1][(row, 0)] * value;
+                    }
+                    if index + 1 < knots.len() {
+                        right[index + 1][(row, axis)] -= above[index][(0, row)] * value;
+                    }
+                }
+            }
+            // The row becomes `tangent = value`. Rows already replaced are zero here, so that a fixed
+            // neighbour stays fixed.
+            diagonal[index][(0, 0)] = 1.0;
+            diagonal[index][(0, 1)] = 0.0;
+            diagonal[index][(1, 0)] = 0.0;
+            if index > 0 {
+                above[index - 1][(0, 0)] = 0.0;
+                above[index - 1][(1, 0)] = 0.0;
+            }
+            if index + 1 < knots.len() {
+                above[index][(0, 0)] = 0.0;
+                above[index][(0, 1)] = 0.0;
+            }
         }
-        right[index] = invert(&diagonal[index]) * right[index];
     }
-    right
+
+    /// Solves the system by block elimination.
+    fn solve(self) -> Vec<Matrix2<f64>> {
+        let Self {
+            mut diagonal,
+            above,
+            mut right,
+        } = self;
+        let invert = |block: &Matrix2<f64>| block.try_inverse().unwrap_or_else(Matrix2::zeros);
+        for index in 1..diagonal.len() {
+            let factor = above[index - 1].transpose() * invert(&diagonal[index - 1]);
+            let reduced = factor * above[index - 1];
+            diagonal[index] -= reduced;
+            let carried = factor * right[index - 1];
+            right[index] -= carried;
+        }
+        for index in (0..diagonal.len()).rev() {
+            if index + 1 < right.len() {
+                let known = above[index] * right[index + 1];
+                right[index] -= known;
+            }
+            right[index] = invert(&diagonal[index]) * right[index];
+        }
+        right
+    }
 }

@@ -17,7 +17,7 @@ use crate::path::{
     CircleTarget, Knot, Path, PathError, PathSample, Piece, RADIUS_MIN_M, from_here, join_circle,
     joined_from_afar,
 };
-use crate::profile::{NodeLimits, SpeedProfile};
+use crate::profile::{NodeLimits, ProfileInput, SpeedProfile};
 use crate::robot::RobotModel;
 use crate::trajectory::{CircleSpec, Trajectory, WaypointsSpec};
 
@@ -409,7 +409,12 @@ impl Plan {
             Some(_) => 0,
             None => (approach_end_m / cell_m).ceil() as usize,
         };
-        let profile = SpeedProfile::new(length_m, &nodes, brisk, jerk_m_s3);
+        let profile = SpeedProfile::new(&ProfileInput {
+            length_m,
+            limits: &nodes,
+            brisk,
+            jerk_max_m_s3: jerk_m_s3,
+        });
         let mut plan = Self {
             excitation,
             approach_length_m: path.piece_start_m(approach_pieces),

@@ -21,15 +21,14 @@ pub struct CrossGains {
 }
 
 impl CrossGains {
-    /// Returns the mean of two sets with weight `share` for the first and 1 − `share` for the
-    /// second.
-    pub(super) fn blend(first: Self, second: Self, share: f64) -> Self {
-        let mix = |one: f64, other: f64| other + share * (one - other);
+    /// Returns the mean with another set, of weight `share`; this one has the weight 1 − `share`.
+    pub(super) fn towards(self, other: Self, share: f64) -> Self {
+        let mix = |own: f64, other: f64| own + share * (other - own);
         Self {
-            cross_1_m2: mix(first.cross_1_m2, second.cross_1_m2),
-            heading_1_m: mix(first.heading_1_m, second.heading_1_m),
-            integral_1_m3: mix(first.integral_1_m3, second.integral_1_m3),
-            yaw_rate: mix(first.yaw_rate, second.yaw_rate),
+            cross_1_m2: mix(self.cross_1_m2, other.cross_1_m2),
+            heading_1_m: mix(self.heading_1_m, other.heading_1_m),
+            integral_1_m3: mix(self.integral_1_m3, other.integral_1_m3),
+            yaw_rate: mix(self.yaw_rate, other.yaw_rate),
         }
     }
 }

@@ -44,6 +44,15 @@ pub(super) struct DriftSideslip {
     pub(super) per_center_1_s: f64,
 }
 
+/// One tick of adaptation.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct AdaptationTick {
+    /// Cross-track error times the share of the gains, metres.
+    pub(super) error_m: f64,
+    /// Duration, seconds.
+    pub(super) dt_s: f64,
+}
+
 impl Drift {
     /// Moves both towards zero by a fraction, 0 to 1.
     pub(super) fn forget(&mut self, share: f64) {
@@ -70,15 +79,14 @@ impl Drift {
         }
     }
 
-    /// Moves both along the gradient, bounded in rate and range. `error_m` is the cross-track error
-    /// times the share of the gains.
+    /// Moves both along the gradient, bounded in rate and range.
     pub(super) fn adapt(
         &mut self,
         sideslip: &DriftSideslip,
         config: &TrackerConfig,
-        error_m: f64,
-        dt_s: f64,
+        tick: AdaptationTick,
     ) {
+        let AdaptationTick { error_m, dt_s } = tick;
         let rates = sideslip
             .per_slope_m_s
             .map(|drift_m_s| config.slope_gain_1_m2 * error_m * drift_m_s);

@@ -48,7 +48,7 @@ use crate::twist_limits::{Change, TwistLimits};
 
 use action::{CanFollow, IntegralAction};
 pub use config::{CrossGains, TrackerConfig, TrackerError};
-use drift::Drift;
+use drift::{AdaptationTick, Drift};
 pub use knowledge::ThetaKnowledge;
 use noise::NoiseLevel;
 pub use output::{TrackerOutput, TrackingErrors};
@@ -213,11 +213,11 @@ impl Tracker {
         let noise = density / config.noise_middle_m_sqrt_s.powi(2)
             + (measured.position_std_dev_m / config.position_middle_m).powi(2);
         let quiet_share = 1.0 / (1.0 + noise);
-        let moving = CrossGains::blend(config.quiet, config.noisy, quiet_share);
+        let moving = config.noisy.towards(config.quiet, quiet_share);
         let steadiness = self
             .steadiness
-            .update(reference, theta, &drift, &config, dt_s);
-        let gains = CrossGains::blend(config.steady, moving, (1.0 - quiet_share) * steadiness);
+            .update(reference, belief, &drift, &config, dt_s);
+        let gains = moving.towards(config.steady, (1.0 - quiet_share) * steadiness);
         let mut course = measured.pose;
         course.heading_rad += sideslip.angle_rad + drift.angle_rad;
         let forward = course.body_from_site(reference.pose.point());
@@ -248,10 +248,13 @@ impl Tracker {
             } else {
                 cross_track_m
             };
-            let share = action.adaptation_share;
-            self.adapt(&sideslip, share * error_m, knowledge, dt_s);
+            let tick = AdaptationTick {
+                error_m: action.adaptation_share * error_m,
+                dt_s,
+            };
+            self.adapt(&sideslip, knowledge, tick);
             if free.drift {
-                self.drift.adapt(&drift, &config, share * error_m, dt_s);
+                self.drift.adapt(&drift, &config, tick);
             }
         }
 
@@ -362,15 +365,14 @@ impl Tracker {
     }
 
     /// Adapts `θ̂̇ = ρ e_y φ + pull·c (cθ − θ̂)` and `χ̂̇ = ρ_χ e_y φ_χ`, c the confidence, φ and
-    /// `φ_χ` the drifts per θ and per χ; bounded in rate and range. `error_m` is `e_y` times the
-    /// share of the gains.
+    /// `φ_χ` the drifts per θ and per χ; bounded in rate and range.
     fn adapt(
         &mut self,
         sideslip: &Sideslip,
-        error_m: f64,
         knowledge: Option<ThetaKnowledge>,
-        dt_s: f64,
+        tick: AdaptationTick,
     ) {
+        let AdaptationTick { error_m, dt_s } = tick;
         let config = &self.config;
         // At the bound of the modelled sideslip a larger θ̂ or χ̂ has no effect and would wind up.
         let most = if sideslip.is_at_end {

@@ -49,14 +49,15 @@ impl Sideslip {
         model: &RobotModel,
     ) -> Self {
         let speed_m_s = reference.speed_m_s;
-        let at = |speed_m_s: f64, turn_rad_s: f64| {
-            Instant::of(speed_m_s, turn_rad_s, belief, friction_curve, model)
-        };
-        let now = at(speed_m_s, reference.turn_rad_s);
-        let then = at(
-            (speed_m_s + RATE_SPAN_S * reference.acceleration_m_s2).max(0.0),
-            reference.turn_rad_s + RATE_SPAN_S * reference.turn_acceleration_rad_s2,
-        );
+        let at = |twist: Twist| Instant::of(twist, belief, friction_curve, model);
+        let now = at(Twist {
+            linear_m_s: speed_m_s,
+            angular_rad_s: reference.turn_rad_s,
+        });
+        let then = at(Twist {
+            linear_m_s: (speed_m_s + RATE_SPAN_S * reference.acceleration_m_s2).max(0.0),
+            angular_rad_s: reference.turn_rad_s + RATE_SPAN_S * reference.turn_acceleration_rad_s2,
+        });
         let angle_rad = -belief.theta * now.per_theta;
         Self {
             angle_rad,
@@ -81,13 +82,13 @@ struct Instant {
 
 impl Instant {
     fn of(
-        speed_m_s: f64,
-        turn_rad_s: f64,
+        twist: Twist,
         belief: Belief,
         friction_curve: &FrictionCurve,
         model: &RobotModel,
     ) -> Self {
-        let asked_1_m = turn_rad_s / speed_m_s.max(SPEED_MIN_M_S);
+        let speed_m_s = twist.linear_m_s;
+        let asked_1_m = twist.angular_rad_s / speed_m_s.max(SPEED_MIN_M_S);
         let theta = belief.theta.max(THETA_LOOK_MIN);
         let compliance_m = theta * speed_m_s * speed_m_s / GRAVITY_M_S2;
         let turn = Turn::steady(

@@ -275,7 +275,7 @@ impl SimRobot {
                 right_n_m: self.torque_gain[1] * torques.right_n_m + self.gauss(torque_noise),
             }),
         };
-        self.localisation.predict(gyro_rad_s, wheel_speeds, dt_s);
+        self.localisation.predict(&sample, dt_s);
         if self.estimator.update(&sample, dt_s).ground_changed {
             self.ground_changes += 1;
             self.estimator.close_segment();

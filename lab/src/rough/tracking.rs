@@ -260,7 +260,6 @@ impl Known {
                     .map_or(0.0, |last| sample.at.saturating_sub(last).as_secs_f64());
                 self.wheels = wheel_speeds;
                 self.felt = sample.acceleration.unwrap_or(self.felt);
-                self.localisation.predict(gyro_rad_s, wheel_speeds, dt_s);
                 let taken = SensorSample {
                     wheel_speeds,
                     gyro_rad_s,
@@ -268,6 +267,7 @@ impl Known {
                     body_speed_m_s: sample.body_speed_m_s,
                     wheel_torques: sample.wheel_torques,
                 };
+                self.localisation.predict(&taken, dt_s);
                 if self.estimator.update(&taken, dt_s).ground_changed {
                     // As the agent does.
                     self.estimator.close_segment();

@@ -188,6 +188,7 @@ mod tests {
     use super::super::parameters;
     use super::*;
     use crate::estimation::{EstimatorPrior, SensorNoise};
+    use crate::geometry::Twist;
 
     const SAMPLE_S: f64 = 0.01;
     const SAMPLES: u32 = 5;
@@ -208,10 +209,10 @@ mod tests {
     impl Drive {
         fn new(seed: u64) -> Self {
             let model = RobotModel::yi2007();
-            let (mut values, _) =
-                parameters::prior(&EstimatorPrior::default(), &SensorNoise::default());
+            let mut values =
+                parameters::prior(&EstimatorPrior::default(), &SensorNoise::default()).mean;
             values[index::STIFFNESS] = 3.0_f64.ln();
-            let state = State::rolling(0.0, 0.0);
+            let state = State::rolling(Twist::default());
             let mut monitor = ChangeMonitor::default();
             monitor.follow(&values, &model, state);
             Self {

@@ -85,13 +85,13 @@ impl<const N: usize> Dual<N> {
         Self { value, derivatives }
     }
 
-    /// Applies a function by the chain rule, given the function's value and slope at this value.
+    /// Returns the derivatives of a function by the chain rule, given its slope at this value.
     #[inline(always)]
-    fn function(mut self, value: f64, slope: f64) -> Self {
+    fn chained(mut self, slope: f64) -> [f64; N] {
         for derivative in &mut self.derivatives {
             *derivative *= slope;
         }
-        Self { value, ..self }
+        self.derivatives
     }
 
     #[inline(always)]
@@ -149,7 +149,10 @@ impl<const N: usize> Neg for Dual<N> {
 
     #[inline(always)]
     fn neg(self) -> Self {
-        self.function(-self.value, -1.0)
+        Self {
+            value: -self.value,
+            derivatives: self.chained(-1.0),
+        }
     }
 }
 
@@ -178,7 +181,10 @@ impl<const N: usize> Mul<f64> for Dual<N> {
 
     #[inline(always)]
     fn mul(self, other: f64) -> Self {
-        self.function(self.value * other, other)
+        Self {
+            value: self.value * other,
+            derivatives: self.chained(other),
+        }
     }
 }
 
@@ -198,25 +204,31 @@ impl<const N: usize> Real for Dual<N> {
 
     #[inline(always)]
     fn exp(self) -> Self {
-        let exp = self.value.exp();
-        self.function(exp, exp)
+        let value = self.value.exp();
+        let derivatives = self.chained(value);
+        Self { value, derivatives }
     }
 
     #[inline(always)]
     fn ln(self) -> Self {
-        self.function(self.value.ln(), self.value.recip())
+        Self {
+            value: self.value.ln(),
+            derivatives: self.chained(self.value.recip()),
+        }
     }
 
     #[inline(always)]
     fn sqrt(self) -> Self {
-        let sqrt = self.value.sqrt();
-        self.function(sqrt, 0.5 / sqrt)
+        let value = self.value.sqrt();
+        let derivatives = self.chained(0.5 / value);
+        Self { value, derivatives }
     }
 
     #[inline(always)]
     fn recip(self) -> Self {
-        let recip = self.value.recip();
-        self.function(recip, -recip * recip)
+        let value = self.value.recip();
+        let derivatives = self.chained(-value * value);
+        Self { value, derivatives }
     }
 }
 

@@ -25,6 +25,7 @@ mod tests;
 mod wheel_noise;
 
 use super::{EstimatorPrior, GAP_MAX_S, IdentifiedRobot, SensorNoise, SensorSample};
+use crate::geometry::Twist;
 use crate::robot::RobotModel;
 
 use change::{COMPARED, ChangeMonitor, Explained, Motion};
@@ -146,10 +147,9 @@ impl Identification {
         if !is_uncertain {
             return None;
         }
-        let (mean, std_devs) = parameters::prior(prior, noise);
         let mut identification = Self {
             model,
-            prior: Prior::new(mean, std_devs),
+            prior: parameters::prior(prior, noise),
             hypotheses: Vec::with_capacity(STARTS.len()),
             heading_rad: 0.0,
             acceleration_m_s2: [0.0; 2],
@@ -168,7 +168,7 @@ impl Identification {
             wheel_noise: WheelNoise::new(),
             has_torque: false,
         };
-        identification.begin(&State::rolling(0.0, 0.0));
+        identification.begin(&State::rolling(Twist::default()));
         Some(identification)
     }
 
@@ -209,14 +209,15 @@ impl Identification {
     /// Returns the state of motion of a robot without slip at the waiting sample; at rest if there
     /// is none.
     fn state(&self) -> State<f64> {
-        self.waiting.map_or(State::rolling(0.0, 0.0), |waiting| {
+        let twist = self.waiting.map_or_else(Twist::default, |waiting| {
             let wheels = waiting.sample.wheel_speeds;
             let mean_rad_s = 0.5 * (wheels.left_rad_s + wheels.right_rad_s);
-            State::rolling(
-                mean_rad_s * self.model.wheel_radius_m(),
-                waiting.sample.gyro_rad_s,
-            )
-        })
+            Twist {
+                linear_m_s: mean_rad_s * self.model.wheel_radius_m(),
+                angular_rad_s: waiting.sample.gyro_rad_s,
+            }
+        });
+        State::rolling(twist)
     }
 
     /// Records a gap before the next sample: drops the open block and its sums, and keeps the
@@ -481,7 +482,7 @@ impl Identification {
         }
         self.wheel_noise.is_excess_given = true;
         // What was identified so far took the noise for slip.
-        self.prior = Prior::new(self.prior.first_mean, self.prior.std_devs);
+        self.prior.reset();
         self.robot = None;
         self.segment_s = 0.0;
         self.last_block_s = 0.0;

@@ -12,6 +12,7 @@
 
 use super::dual::Real;
 use super::parameters::Robot;
+use crate::geometry::Twist;
 use crate::robot::GRAVITY_M_S2;
 
 /// Number of channels: turn rate, acceleration (forward, left), torque (left, right), body speed.
@@ -49,12 +50,12 @@ pub(super) struct State<T> {
 }
 
 impl<T: Real> State<T> {
-    /// Creates the state of a robot that rolls without slip at these speeds; 0 and 0 is at rest.
-    pub(super) fn rolling(forward_m_s: f64, turn_rad_s: f64) -> Self {
+    /// Creates the state of a robot that rolls without slip.
+    pub(super) fn rolling(twist: Twist) -> Self {
         let zero = T::constant(0.0);
         Self {
-            speed_m_s: [T::constant(forward_m_s), zero],
-            turn_rad_s: T::constant(turn_rad_s),
+            speed_m_s: [T::constant(twist.linear_m_s), zero],
+            turn_rad_s: T::constant(twist.angular_rad_s),
             deflections: [[zero; 2]; 4],
         }
     }
@@ -63,8 +64,11 @@ impl<T: Real> State<T> {
 impl State<f64> {
     /// Returns the same motion without deflections, as constants of another type.
     pub(super) fn constants<T: Real>(&self) -> State<T> {
-        let [forward_m_s, left_m_s] = self.speed_m_s;
-        let mut own = State::rolling(forward_m_s, self.turn_rad_s);
+        let [linear_m_s, left_m_s] = self.speed_m_s;
+        let mut own = State::rolling(Twist {
+            linear_m_s,
+            angular_rad_s: self.turn_rad_s,
+        });
         own.speed_m_s[1] = T::constant(left_m_s);
         own
     }

@@ -78,14 +78,10 @@ pub(super) struct Prior {
 }
 
 impl Prior {
-    /// Creates the initial prior of independent parameters.
-    pub(super) fn new(mean: Values, std_devs: Values) -> Self {
-        Self {
-            mean,
-            information: Square::from_diagonal(&std_devs.map(|std_dev| std_dev.powi(-2))),
-            std_devs,
-            first_mean: mean,
-        }
+    /// Resets to the initial prior of independent parameters.
+    pub(super) fn reset(&mut self) {
+        self.mean = self.first_mean;
+        self.information = Square::from_diagonal(&self.std_devs.map(|std_dev| std_dev.powi(-2)));
     }
 }
 
@@ -145,8 +141,8 @@ const SPEED_OFFSET_STD_DEV: f64 = 0.005;
 /// Minimum standard deviation, used where the configuration gives 0.
 const STD_DEV_MIN: f64 = 1.0e-4;
 
-/// Returns mean and standard deviation of each parameter before any measurement.
-pub(super) fn prior(prior: &EstimatorPrior, noise: &SensorNoise) -> (Values, Values) {
+/// Returns the initial prior, before any measurement.
+pub(super) fn prior(prior: &EstimatorPrior, noise: &SensorNoise) -> Prior {
     let tyres = &prior.tyres;
     let payload = 1.0 + prior.model.payload_ratio;
     // Variance of the logarithm of a log-normal distribution with that mean and standard deviation.
@@ -202,12 +198,18 @@ pub(super) fn prior(prior: &EstimatorPrior, noise: &SensorNoise) -> (Values, Val
         (index::HEIGHT, HEIGHT),
         (index::SPEED_OFFSET, (0.0, SPEED_OFFSET_STD_DEV)),
     ];
-    let (mut means, mut std_devs) = (Values::zeros(), Values::zeros());
+    let mut initial = Prior {
+        mean: Values::zeros(),
+        information: Square::zeros(),
+        std_devs: Values::zeros(),
+        first_mean: Values::zeros(),
+    };
     for (place, (mean, std_dev)) in table {
-        means[place] = mean;
-        std_devs[place] = std_dev.max(STD_DEV_MIN);
+        initial.first_mean[place] = mean;
+        initial.std_devs[place] = std_dev.max(STD_DEV_MIN);
     }
-    (means, std_devs)
+    initial.reset();
+    initial
 }
 
 /// The parameters of a robot in SI units.

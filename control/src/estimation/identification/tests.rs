@@ -18,13 +18,13 @@ struct Simulated {
 
 impl Simulated {
     fn new(change: impl Fn(&mut parameters::Values)) -> Self {
-        let (mut values, _) =
-            parameters::prior(&EstimatorPrior::default(), &SensorNoise::default());
+        let mut values =
+            parameters::prior(&EstimatorPrior::default(), &SensorNoise::default()).mean;
         change(&mut values);
         let values = std::array::from_fn(|place| values[place]);
         Self {
             robot: Robot::new(&values, &RobotModel::yi2007()),
-            state: State::rolling(0.0, 0.0),
+            state: State::rolling(Twist::default()),
             heading_rad: 0.0,
             acceleration_m_s2: [0.0; 2],
             time_s: 0.0,
@@ -165,9 +165,8 @@ fn a_gyro_that_froze_leads_to_no_theta_or_to_a_wide_interval() {
         }
         identification.update(&sample, &SensorNoise::default(), SAMPLE_S);
     }
-    let truth = (-parameters::prior(&EstimatorPrior::default(), &SensorNoise::default()).0
-        [index::STIFFNESS])
-        .exp();
+    let prior = parameters::prior(&EstimatorPrior::default(), &SensorNoise::default());
+    let truth = (-prior.mean[index::STIFFNESS]).exp();
     if let Some(found) = identification.identified() {
         let ratio = found
             .own_ratio

@@ -218,8 +218,7 @@ impl SeededRobot {
                 right_n_m: self.torque_gain[1] * torques.right_n_m + self.gauss(torque_noise),
             }),
         };
-        self.localisation
-            .predict(gyro_rad_s, wheel_speeds, SAMPLE_S);
+        self.localisation.predict(&sample, SAMPLE_S);
         self.samples += 1;
         if self.samples.is_multiple_of(SAMPLES_PER_FIX) {
             self.fix();

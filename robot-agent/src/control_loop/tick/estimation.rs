@@ -274,10 +274,9 @@ impl Estimation {
         if dt_s <= 0.0 {
             return;
         }
-        let (gyro_rad_s, wheel_speeds) = (motion.gyro_rad_s, motion.wheel_speeds);
-        let forward_m_s = self.model.twist_from_wheel_speeds(wheel_speeds).linear_m_s;
-        self.progress.note_wheels(forward_m_s * dt_s);
-        self.localisation.predict(gyro_rad_s, wheel_speeds, dt_s);
+        let twist = self.model.twist_from_wheel_speeds(motion.wheel_speeds);
+        self.progress.note_wheels(twist.linear_m_s * dt_s);
+        self.localisation.predict(&motion, dt_s);
         // With wheels on two kinds of ground there is no single θ to estimate.
         if self.ground_under_wheels == Some(GroundUnderWheels::Mixed) || !sample.may_learn {
             return;
