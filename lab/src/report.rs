@@ -79,6 +79,19 @@ impl Figure {
     }
 }
 
+/// A number of cases. Its share of all follows: `Part(part).of(whole)`. So part and whole cannot be
+/// swapped.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Part(pub usize);
+
+impl Part {
+    /// Returns the share of a whole; 0 of nothing.
+    #[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
+    pub fn of(self, whole: usize) -> f64 {
+        self.0 as f64 / whole.max(1) as f64
+    }
+}
+
 /// A table of a report: for people in a terminal by [`Display`], for a page by
 /// [`Table::markdown`].
 #[derive(Debug, Clone, PartialEq, Eq)]

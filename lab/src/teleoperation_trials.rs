@@ -59,18 +59,21 @@ struct Trial<'bench> {
     random: &'bench mut ChaCha8Rng,
     report: &'bench mut HandReport,
     under_way: Vec<UnderWay>,
+    /// Number of the last command.
+    seq: u64,
     /// The end of the command that was taken last, and whether its silence was counted.
     last_end: Option<(u64, bool)>,
 }
 
 impl Trial<'_> {
-    fn send(&mut self, epoch: u64, seq: u64, twist: Twist) {
+    fn send(&mut self, epoch: u64, twist: Twist) {
+        self.seq += 1;
         let now_us = self.bench.now_us();
         let until_us = now_us + self.random.random_range(100_000..600_000_u64);
         let command = DriveCommand {
             boot: boot(),
             epoch,
-            seq,
+            seq: self.seq,
             sent_us: now_us,
             until_us,
             twist,
@@ -151,11 +154,10 @@ impl Trial<'_> {
         };
         let began_us = self.bench.now_us();
         let silent_from_us = began_us + self.random.random_range(300_000..2_000_000_u64);
-        let (mut next_us, mut seq) = (began_us, 0);
+        let mut next_us = began_us;
         while self.bench.now_us() < silent_from_us {
             if self.bench.now_us() >= next_us {
-                seq += 1;
-                self.send(epoch, seq, twist);
+                self.send(epoch, twist);
                 next_us += SEND_EVERY_US;
             }
             self.tick();
@@ -247,6 +249,7 @@ pub fn run(TrialRun { trials, seed }: TrialRun) -> Result<HandReport, BenchError
             random: &mut random,
             report: &mut report,
             under_way: Vec::new(),
+            seq: 0,
             last_end: None,
         };
         trial.run(u128::from(number));

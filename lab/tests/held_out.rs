@@ -12,7 +12,7 @@ use tread_control::robot::GRAVITY_M_S2;
 use tread_lab::held_out::process::{
     Contacts, OdeError, OdePlant, OdeProgram, OdeRobot, STEPS_PER_SAMPLE,
 };
-use tread_lab::held_out::truth::{PullDirection, pull, step_differences, unequal_loads};
+use tread_lab::held_out::truth::{PullDirection, PullInput, pull, step_differences, unequal_loads};
 use tread_lab::held_out::{drawn, run};
 use tread_lab::parallel::in_parallel;
 use tread_lab::rough::spec::{Deviations, MAKES};
@@ -34,7 +34,12 @@ fn a_known_pull_shows_the_true_theta_in_both_directions() {
     let Some(program) = program() else { return };
     for stiffness in [0.457, 18.4] {
         for direction in PullDirection::ALL {
-            let found = pull(&program, stiffness, direction, 0.6).unwrap();
+            let input = PullInput {
+                stiffness,
+                direction,
+                over_peak: 0.6,
+            };
+            let found = pull(&program, input).unwrap();
             let error = found.theta_measured() / found.theta - 1.0;
             assert!(error.abs() < 0.01, "{found:?}");
             assert!(
@@ -48,7 +53,12 @@ fn a_known_pull_shows_the_true_theta_in_both_directions() {
 #[test]
 fn no_contact_gives_more_than_the_limit_of_friction() {
     let Some(program) = program() else { return };
-    let found = pull(&program, 3.0, PullDirection::Longitudinal, 1.25).unwrap();
+    let input = PullInput {
+        stiffness: 3.0,
+        direction: PullDirection::Longitudinal,
+        over_peak: 1.25,
+    };
+    let found = pull(&program, input).unwrap();
     assert!(
         (found.mu_of_contacts / found.mu - 0.8).abs() < 0.01,
         "{found:?}"

@@ -199,8 +199,9 @@ proptest! {
         let eta = Vector2::new(case.velocity.forward_m_s, -0.167 * case.velocity.yaw_rate_rad_s);
         let shape = terms(&case).shape;
         let tau = Vector2::new(tau_1, tau_2);
-        let inputs = reduced.inputs(tau, eta, &shape).unwrap();
-        let rates = reduced.rates_from_inputs(eta, inputs, &shape);
+        let velocity = reduced.velocity(eta);
+        let inputs = reduced.inputs(tau, &velocity, &shape).unwrap();
+        let rates = reduced.rates_from_inputs(&velocity, inputs, &shape);
         let stiffness = case.setting.curve.stiffness();
         prop_assert!(close(rates[0], stiffness * tau_1) && close(rates[1], stiffness * tau_2));
     }
@@ -209,10 +210,11 @@ proptest! {
     fn the_reduced_model_is_the_constrained_four_wheel_sum(case in case()) {
         let reduced = Reduced::new(case.setting, 0.167).unwrap();
         let eta = Vector2::new(case.velocity.forward_m_s, -0.167 * case.velocity.yaw_rate_rad_s);
-        let slips = SideSlips::of(&reduced.velocity(eta), case.wheels, &case.setting.model);
+        let velocity = reduced.velocity(eta);
+        let slips = SideSlips::of(&velocity, case.wheels, &case.setting.model);
         let shape = SlipShape::at(slips, &case.setting.curve).unwrap();
         let inputs = shape.inputs(case.wheels, case.setting.model.wheel_radius_m());
-        let closed = reduced.rates_from_inputs(eta, inputs, &shape);
+        let closed = reduced.rates_from_inputs(&velocity, inputs, &shape);
         let sum = reduced.rates_from_wheels(eta, case.wheels);
         prop_assert!(close(closed[0], sum[0]) && close(closed[1], sum[1]));
         let back = reduced.wheel_speeds(inputs, &shape).unwrap();
@@ -300,6 +302,7 @@ fn the_law_refuses_standstill_and_gains_that_are_none() {
         Err(ReducedError::Centre(_))
     ));
     let reduced = Reduced::new(setting, 0.167).unwrap();
-    let still = reduced.inputs(Vector2::zeros(), Vector2::zeros(), &SlipShape::linear());
-    assert_eq!(still, Err(ReducedError::Singular));
+    let still = reduced.velocity(Vector2::zeros());
+    let inputs = reduced.inputs(Vector2::zeros(), &still, &SlipShape::linear());
+    assert_eq!(inputs, Err(ReducedError::Singular));
 }

@@ -18,6 +18,7 @@ pub(super) struct MeanSums {
 }
 
 impl MeanSums {
+    /// Begins at a state.
     pub(super) fn new(start: PlantState) -> Self {
         Self {
             start,
@@ -39,6 +40,7 @@ impl MeanSums {
         }
     }
 
+    /// Returns the means over `span_s` seconds, the whole time up to the last state.
     pub(super) fn means(&self, span_s: f64) -> PlantMeans {
         let (start, end) = (&self.start, &self.last);
         PlantMeans {

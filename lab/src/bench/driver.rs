@@ -11,7 +11,7 @@ use tread_control::tracking::{
 use crate::bench::Law;
 use crate::bench::course::Course;
 use crate::bench::kanayama::Kanayama;
-use crate::bench::paper_law::PaperLaw;
+use crate::bench::paper_law::{PaperLaw, desired};
 use crate::bench::pursuit::Pursuit;
 
 /// Input of a law in one tick.
@@ -88,7 +88,10 @@ impl Driver {
         match &mut self.0 {
             Kind::Kanayama(law) => (law.step(reference, measured, dt_s), None),
             Kind::Pursuit(law) => (law.step(course, measured), None),
-            Kind::Paper(law) => (law.step(course, time_s, measured, felt, dt_s), None),
+            Kind::Paper(law) => {
+                let desired = desired(course, time_s);
+                (law.step(&desired, measured, felt, dt_s), None)
+            }
             Kind::Shipped(law) => {
                 let output = law.step(reference, measured, knowledge, dt_s);
                 (output.wheel_speeds, Some(output))

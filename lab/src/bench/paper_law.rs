@@ -56,8 +56,7 @@ impl PaperLaw {
     /// Computes the wheel speeds of one tick of `dt_s` seconds.
     pub fn step(
         &mut self,
-        course: &Course,
-        time_s: f64,
+        desired: &DesiredPoint,
         measured: &Measured,
         felt: BodyAcceleration,
         dt_s: f64,
@@ -71,8 +70,7 @@ impl PaperLaw {
             zeta: self.zeta,
             theta: self.theta,
         };
-        let desired = desired(course, time_s);
-        let Ok(output) = self.law.evaluate(&input, &desired) else {
+        let Ok(output) = self.law.evaluate(&input, desired) else {
             // Singular at standstill: drive forward until it is not.
             let twist = Twist {
                 linear_m_s: 0.1,
@@ -85,10 +83,11 @@ impl PaperLaw {
         self.theta =
             (self.theta + output.theta_rate_1_s * dt_s).clamp(THETA_RANGE[0], THETA_RANGE[1]);
         let eta = Vector2::new(input.forward_m_s, input.left_m_s);
+        let velocity = self.reduced.velocity(eta);
         let shape = SlipShape::linear();
         let wheels = self
             .reduced
-            .inputs(tau, eta, &shape)
+            .inputs(tau, &velocity, &shape)
             .and_then(|inputs| self.reduced.wheel_speeds(inputs, &shape));
         // Where no forward wheel speed gives τ, the last wheel speeds apply.
         if let Ok(wheels) = wheels {
@@ -103,7 +102,7 @@ impl PaperLaw {
 }
 
 /// Returns the course as motion of point D, with its jerk by a central difference.
-fn desired(course: &Course, time_s: f64) -> DesiredPoint {
+pub(super) fn desired(course: &Course, time_s: f64) -> DesiredPoint {
     let derivatives = |time_s: f64| {
         let sample = course.sample(time_s);
         let (sin, cos) = sample.pose.heading_rad.sin_cos();

@@ -16,7 +16,7 @@ use clap::Parser;
 use serde::Serialize;
 use tread_lab::parallel::in_parallel;
 use tread_lab::random::Random;
-use tread_lab::report::{Check, Table, checks_json, page_markdown, percent};
+use tread_lab::report::{Check, Part, Table, checks_json, page_markdown, percent};
 use tread_lab::rough::ground_change::{ChangeTrial, run};
 use tread_lab::rough::run::Course;
 use tread_lab::rough::sensors::SensorSpec;
@@ -66,6 +66,13 @@ struct Quiet {
     drives: usize,
 }
 
+/// Change of K.
+#[derive(Debug, Clone, Copy)]
+struct StiffnessChange {
+    from: f64,
+    to: f64,
+}
+
 /// Drives with a change.
 #[derive(Debug, Serialize)]
 struct Changed {
@@ -98,11 +105,6 @@ fn trial(seed: u64, has_torque: bool) -> ChangeTrial {
     }
 }
 
-#[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
-fn share(part: usize, of: usize) -> f64 {
-    part as f64 / of.max(1) as f64
-}
-
 fn quiet(arguments: &Arguments, has_torque: bool) -> anyhow::Result<Quiet> {
     let drives = arguments.hours * QUIET_PER_HOUR / 2;
     let seeds = (arguments.seed..).take(drives as usize);
@@ -121,7 +123,12 @@ fn quiet(arguments: &Arguments, has_torque: bool) -> anyhow::Result<Quiet> {
     Ok(line)
 }
 
-fn changed(arguments: &Arguments, from: f64, to: f64, has_torque: bool) -> anyhow::Result<Changed> {
+fn changed(
+    arguments: &Arguments,
+    change: StiffnessChange,
+    has_torque: bool,
+) -> anyhow::Result<Changed> {
+    let StiffnessChange { from, to } = change;
     let seeds = (arguments.seed..).take(arguments.runs as usize);
     let trials: Vec<ChangeTrial> = seeds
         .map(|seed| {
@@ -153,9 +160,9 @@ fn changed(arguments: &Arguments, from: f64, to: f64, has_torque: bool) -> anyho
         to,
         has_torque,
         drives: trials.len(),
-        known: share(known, trials.len()),
-        in_time: share(in_time, trials.len()),
-        detected: share(delays.len(), trials.len()),
+        known: Part(known).of(trials.len()),
+        in_time: Part(in_time).of(trials.len()),
+        detected: Part(delays.len()).of(trials.len()),
         delay_s: delays.get(delays.len() / 2).copied(),
     })
 }
@@ -216,7 +223,8 @@ fn main() -> anyhow::Result<ExitCode> {
     let mut lines = Vec::new();
     for (from, to) in [(5.0, 1.0), (1.0, 5.0)] {
         for has_torque in [true, false] {
-            lines.push(changed(&arguments, from, to, has_torque)?);
+            let change = StiffnessChange { from, to };
+            lines.push(changed(&arguments, change, has_torque)?);
         }
     }
     let mut checks: Vec<Check> = quiet

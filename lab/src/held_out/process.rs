@@ -1,5 +1,6 @@
 //! The robot of `lab/ode/robot.cpp` as a plant: compiles it, starts it and speaks with it.
 
+use std::fmt;
 use std::io::{self, BufRead, BufReader, Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
@@ -296,16 +297,17 @@ impl OdePlant {
             slip_over_peak: 0.0,
             failure: None,
         };
-        plant.ask::<0>(&robot.line(), "ready")?;
+        plant.ask::<0>(format_args!("{}", robot.line()), "ready")?;
         Ok(plant)
     }
 
     /// Sends a command and returns the numbers of the answer, which must begin with `word`.
     fn ask<const COUNT: usize>(
         &mut self,
-        command: &str,
+        command: fmt::Arguments<'_>,
         word: &str,
     ) -> Result<[f64; COUNT], OdeError> {
+        let command = command.to_string();
         writeln!(self.to, "{command}").map_err(io_error("write to the simulator"))?;
         let mut answer = String::new();
         (&mut self.from)
@@ -323,7 +325,7 @@ impl OdePlant {
         numbers
             .and_then(|numbers| numbers.try_into().ok())
             .ok_or_else(|| OdeError::Answer {
-                command: command.to_owned(),
+                command,
                 answer: answer.trim().to_owned(),
             })
     }
@@ -335,8 +337,8 @@ impl OdePlant {
     pub fn advance(&mut self, command: WheelSpeeds) -> Result<Means, OdeError> {
         let steps = self.steps_per_sample;
         let (left, right) = (command.left_rad_s, command.right_rad_s);
-        let line = format!("drive {left} {right} {steps}");
-        let numbers = self.ask::<STATE_NUMBERS>(&line, "state")?;
+        let command = format_args!("drive {left} {right} {steps}");
+        let numbers = self.ask::<STATE_NUMBERS>(command, "state")?;
         let [
             x_m,
             y_m,
@@ -387,7 +389,7 @@ impl OdePlant {
     /// The process ended.
     pub fn pull(&mut self, force_n: [f64; 2]) -> Result<(), OdeError> {
         let [forward_n, left_n] = force_n;
-        self.ask::<0>(&format!("pull {forward_n} {left_n}"), "ok")?;
+        self.ask::<0>(format_args!("pull {forward_n} {left_n}"), "ok")?;
         Ok(())
     }
 
@@ -396,7 +398,7 @@ impl OdePlant {
     /// # Errors
     /// The process ended.
     pub fn contacts(&mut self) -> Result<[WheelContact; WHEELS], OdeError> {
-        let numbers = self.ask::<{ WHEELS * WHEEL_NUMBERS }>("wheels", "wheels")?;
+        let numbers = self.ask::<{ WHEELS * WHEEL_NUMBERS }>(format_args!("wheels"), "wheels")?;
         Ok(std::array::from_fn(|wheel| {
             let of = |number: usize| numbers[wheel * WHEEL_NUMBERS + number];
             WheelContact {

@@ -91,6 +91,17 @@ impl Pull {
     }
 }
 
+/// Input of [`pull`].
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PullInput {
+    /// K of the simulator's ground.
+    pub stiffness: f64,
+    /// Direction of the pull.
+    pub direction: PullDirection,
+    /// Force over the limit of friction.
+    pub over_peak: f64,
+}
+
 fn robot_of(make: Make, deviations: Deviations) -> anyhow::Result<RobotOf> {
     Ok(RobotOf {
         model: make.model()?,
@@ -159,22 +170,27 @@ pub fn pulls(program: &OdeProgram, stiffness: f64) -> anyhow::Result<Vec<Pull>> 
     let mut found = Vec::new();
     for direction in PullDirection::ALL {
         for over_peak in PULLS {
-            found.push(pull(program, stiffness, direction, over_peak)?);
+            let input = PullInput {
+                stiffness,
+                direction,
+                over_peak,
+            };
+            found.push(pull(program, input)?);
         }
     }
     Ok(found)
 }
 
-/// Pulls a robot that drives straight by a force, in units of the friction limit.
+/// Pulls a robot that drives straight by a force.
 ///
 /// # Errors
 /// The simulation failed.
-pub fn pull(
-    program: &OdeProgram,
-    stiffness: f64,
-    direction: PullDirection,
-    over_peak: f64,
-) -> anyhow::Result<Pull> {
+pub fn pull(program: &OdeProgram, input: PullInput) -> anyhow::Result<Pull> {
+    let PullInput {
+        stiffness,
+        direction,
+        over_peak,
+    } = input;
     let mut deviations = Deviations::none(stiffness);
     deviations.curve.mu_peak = PULL_MU_PEAK;
     deviations.relaxation_m = 0.04;

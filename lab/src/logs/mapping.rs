@@ -162,6 +162,22 @@ impl Mapping {
     }
 }
 
+/// Type of which only one topic is read.
+#[derive(Debug, Clone, Copy)]
+struct TopicType {
+    name: &'static str,
+    /// What to do if several topics are of it.
+    advice: &'static str,
+}
+
+/// Topics that are chosen, as far as there are any.
+#[derive(Debug, Clone, Copy)]
+struct Chosen<'a> {
+    joints: Option<&'a str>,
+    imu: Option<&'a str>,
+    odometry: Option<&'a str>,
+}
+
 /// Topics of a recording, to choose from.
 struct Choice<'a> {
     contents: &'a Contents,
@@ -235,9 +251,9 @@ impl<'a> Choice<'a> {
     fn unambiguous(
         &mut self,
         asked: Option<&str>,
-        kind: &'static str,
-        advice: &'static str,
+        kind: TopicType,
     ) -> Result<Option<String>, MappingError> {
+        let TopicType { name: kind, advice } = kind;
         let count = self.of_types(&[kind]).len();
         if asked.is_none() && count > 1 {
             return Err(MappingError::Missing {
@@ -296,15 +312,19 @@ pub fn choose(
     let asked = topic_of(&wishes.wheels, joints_of.map(|joints| &joints.topic));
     let joints = choice.unambiguous(
         asked.as_deref(),
-        JOINT_STATE,
-        "say which has the wheels by `--wheels TOPIC`",
+        TopicType {
+            name: JOINT_STATE,
+            advice: "say which has the wheels by `--wheels TOPIC`",
+        },
     )?;
     let imu_of = configured.and_then(|settings| settings.imu.as_ref());
     let asked = topic_of(&wishes.imu, imu_of.map(|imu| &imu.topic));
     let imu = choice.unambiguous(
         asked.as_deref(),
-        IMU,
-        "say which is the robot's by `--imu TOPIC`",
+        TopicType {
+            name: IMU,
+            advice: "say which is the robot's by `--imu TOPIC`",
+        },
     )?;
     let odometry_of = configured.and_then(|settings| settings.odometry.as_ref());
     let asked = topic_of(
@@ -315,8 +335,10 @@ pub fn choose(
     let odometry = if is_odometry_of_use {
         choice.unambiguous(
             asked.as_deref(),
-            ODOMETRY,
-            "say which by `--odometry TOPIC`",
+            TopicType {
+                name: ODOMETRY,
+                advice: "say which by `--odometry TOPIC`",
+            },
         )?
     } else {
         None
@@ -326,13 +348,12 @@ pub fn choose(
     let pose = choice.optional(asked.as_deref(), &[COVARIANT_POSE, POSE], "--pose")?;
     let is_over_ground = wishes.is_over_ground
         || odometry_of.is_some_and(|odometry| odometry.motion_of == MotionOf::Ground);
-    check_whole(
-        &choice,
-        joints.as_deref(),
-        imu.as_deref(),
-        odometry.as_deref(),
-        is_over_ground,
-    )?;
+    let chosen = Chosen {
+        joints: joints.as_deref(),
+        imu: imu.as_deref(),
+        odometry: odometry.as_deref(),
+    };
+    check_whole(&choice, chosen, is_over_ground)?;
     if let Some(topic) = odometry.as_deref().filter(|_| joints.is_none())
         && wishes.odometry_track_m.is_none()
         && configured.is_none()
@@ -378,9 +399,7 @@ pub fn choose(
 /// Whether wheel speeds and a yaw rate that is not computed from them are there.
 fn check_whole(
     choice: &Choice<'_>,
-    joints: Option<&str>,
-    imu: Option<&str>,
-    odometry: Option<&str>,
+    chosen: Chosen<'_>,
     is_over_ground: bool,
 ) -> Result<(), MappingError> {
     let missing = |problem: String, advice| MappingError::Missing {
@@ -388,7 +407,7 @@ fn check_whole(
         advice,
         found: choice.found(),
     };
-    match (joints, imu, odometry) {
+    match (chosen.joints, chosen.imu, chosen.odometry) {
         (None, _, None) => Err(missing(
             format!("no topic has wheel speeds: none is of the type {JOINT_STATE} or {ODOMETRY}"),
             "record the wheels' joint states",

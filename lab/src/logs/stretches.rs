@@ -200,7 +200,11 @@ pub fn motion(fed: &[Fed], model: &RobotModel) -> Motion {
             };
             *time_s += counted_s;
         }
-        if let Some(mean_m_s) = bin.add(0.5 * (rims_m_s[0] + rims_m_s[1]), counted_s) {
+        let driven = Bin {
+            distance_m: 0.5 * (rims_m_s[0] + rims_m_s[1]) * counted_s,
+            time_s: counted_s,
+        };
+        if let Some(mean_m_s) = bin.add(driven) {
             let change_m_s = before_m_s
                 .replace(mean_m_s)
                 .map_or(0.0, |before| mean_m_s - before);
@@ -235,10 +239,10 @@ struct Bin {
 }
 
 impl Bin {
-    /// Adds a speed; returns the mean if the bin is full, and begins the next.
-    fn add(&mut self, speed_m_s: f64, time_s: f64) -> Option<f64> {
-        self.distance_m += speed_m_s * time_s;
-        self.time_s += time_s;
+    /// Adds what was driven; returns the mean if the bin is full, and begins the next.
+    fn add(&mut self, driven: Self) -> Option<f64> {
+        self.distance_m += driven.distance_m;
+        self.time_s += driven.time_s;
         if self.time_s < ACCELERATED_BIN_S - 1.0e-9 {
             return None;
         }

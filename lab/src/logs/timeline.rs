@@ -168,18 +168,29 @@ fn samples(arrived: &[Arrived], settings: &Ros2Settings) -> Vec<Fed> {
     fed
 }
 
-fn between(before: &Wheels, after: &Wheels, share: f64) -> Wheels {
-    let mix = |before: f64, after: f64| before + share * (after - before);
-    let torques = before.torques.zip(after.torques);
-    Wheels {
-        speeds: WheelSpeeds {
-            left_rad_s: mix(before.speeds.left_rad_s, after.speeds.left_rad_s),
-            right_rad_s: mix(before.speeds.right_rad_s, after.speeds.right_rad_s),
-        },
-        torques: torques.map(|(before, after)| WheelTorques {
-            left_n_m: mix(before.left_n_m, after.left_n_m),
-            right_n_m: mix(before.right_n_m, after.right_n_m),
-        }),
+/// Wheel speeds between two messages, on a straight line.
+#[derive(Debug, Clone, Copy)]
+struct Interpolation {
+    before: Wheels,
+    after: Wheels,
+}
+
+impl Interpolation {
+    /// Returns the wheel speeds after a share of the time between the messages.
+    fn at(&self, share: f64) -> Wheels {
+        let Self { before, after } = self;
+        let mix = |before: f64, after: f64| before + share * (after - before);
+        let torques = before.torques.zip(after.torques);
+        Wheels {
+            speeds: WheelSpeeds {
+                left_rad_s: mix(before.speeds.left_rad_s, after.speeds.left_rad_s),
+                right_rad_s: mix(before.speeds.right_rad_s, after.speeds.right_rad_s),
+            },
+            torques: torques.map(|(before, after)| WheelTorques {
+                left_n_m: mix(before.left_n_m, after.left_n_m),
+                right_n_m: mix(before.right_n_m, after.right_n_m),
+            }),
+        }
     }
 }
 
@@ -200,13 +211,13 @@ fn interpolate(arrived: Vec<Arrived>) -> Vec<Arrived> {
                     reason = "a number of steps within a third of a second"
                 )]
                 let steps = (gap_s / INTERPOLATED_S).round() as u32;
+                let line = Interpolation {
+                    before,
+                    after: wheels,
+                };
                 added.extend((1..steps).map(|step| Arrived {
                     at: before_at + gap * step / steps,
-                    content: Content::Wheels(between(
-                        &before,
-                        &wheels,
-                        f64::from(step) / f64::from(steps),
-                    )),
+                    content: Content::Wheels(line.at(f64::from(step) / f64::from(steps))),
                 }));
             }
         }

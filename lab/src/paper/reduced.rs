@@ -89,10 +89,9 @@ impl Reduced {
     }
 
     /// Returns `E₁ + g₁ᵀe₂` of (20).
-    fn input_matrix(&self, eta: Vector2<f64>, shape: &SlipShape) -> Matrix2<f64> {
-        let velocity = self.velocity(eta);
-        let mut matrix = e_1(&velocity, shape, &self.setting);
-        let yaw = e_2(&velocity, shape, &self.setting) / self.centre_forward_m;
+    fn input_matrix(&self, velocity: &BodyVelocity, shape: &SlipShape) -> Matrix2<f64> {
+        let mut matrix = e_1(velocity, shape, &self.setting);
+        let yaw = e_2(velocity, shape, &self.setting) / self.centre_forward_m;
         matrix[(1, 0)] -= yaw[0];
         matrix[(1, 1)] -= yaw[1];
         matrix
@@ -107,32 +106,34 @@ impl Reduced {
         )
     }
 
-    /// Returns η̇ from the inputs v by (20), metres per second squared.
+    /// Returns η̇ from the inputs v by (20), metres per second squared. The velocity is that of η
+    /// ([`Self::velocity`]).
     pub fn rates_from_inputs(
         &self,
-        eta: Vector2<f64>,
+        velocity: &BodyVelocity,
         inputs: Vector2<f64>,
         shape: &SlipShape,
     ) -> Vector2<f64> {
         let model = &self.setting.model;
         let scale_n = 0.25 * model.mass_kg() * GRAVITY_M_S2 * self.setting.curve.stiffness();
         let masses_kg = self.masses_kg();
-        (self.input_matrix(eta, shape) * inputs + self.offset(shape))
+        (self.input_matrix(velocity, shape) * inputs + self.offset(shape))
             .component_div(&masses_kg)
             .scale(scale_n)
     }
 
-    /// Returns the inputs v that make `η̇ = Kτ`, (21).
+    /// Returns the inputs v that make `η̇ = Kτ`, (21). The velocity is that of η
+    /// ([`Self::velocity`]).
     ///
     /// # Errors
     /// [`ReducedError::Singular`] near standstill.
     pub fn inputs(
         &self,
         tau: Vector2<f64>,
-        eta: Vector2<f64>,
+        velocity: &BodyVelocity,
         shape: &SlipShape,
     ) -> Result<Vector2<f64>, ReducedError> {
-        let matrix = self.input_matrix(eta, shape);
+        let matrix = self.input_matrix(velocity, shape);
         if matrix.determinant().abs() < DETERMINANT_MIN {
             return Err(ReducedError::Singular);
         }

@@ -118,18 +118,24 @@ pub struct BoundInput<'drive> {
 pub fn bounds(input: &BoundInput<'_>) -> Option<Vec<f64>> {
     let wheels = wheels(input)?;
     let truth = measure(input, &wheels, input.deviations, None)?;
+    let derivative = |moved: &[Sample], step: f64| -> Vec<Sample> {
+        let pairs = truth.iter().zip(moved);
+        pairs
+            .map(|(from, to)| std::array::from_fn(|channel| (to[channel] - from[channel]) / step))
+            .collect()
+    };
     let mut columns = Vec::with_capacity(PARAMETERS.len() + OTHERS);
     for (std_dev, change) in PARAMETERS {
         let step = STEP_RATIO * std_dev;
         let mut deviations = input.deviations;
         change(&mut deviations, step);
         let moved = measure(input, &wheels, deviations, None)?;
-        columns.push(derivative(&truth, &moved, step));
+        columns.push(derivative(&moved, step));
     }
     let others = Shape::ALL.into_iter();
     for shape in others.filter(|shape| *shape != input.deviations.curve.shape) {
         let moved = measure(input, &wheels, input.deviations, Some((shape, STEP_RATIO)))?;
-        columns.push(derivative(&truth, &moved, STEP_RATIO));
+        columns.push(derivative(&moved, STEP_RATIO));
     }
     information(input, &truth, &columns)
 }
@@ -189,13 +195,6 @@ fn measure(
         ]
     };
     Some(wheels.iter().map(of_sample).collect())
-}
-
-fn derivative(from: &[Sample], to: &[Sample], step: f64) -> Vec<Sample> {
-    let pairs = from.iter().zip(to);
-    pairs
-        .map(|(from, to)| std::array::from_fn(|channel| (to[channel] - from[channel]) / step))
-        .collect()
 }
 
 /// Returns the covariance of all parameters before the drive.

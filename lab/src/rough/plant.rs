@@ -316,12 +316,7 @@ impl Plant {
             let rim_m_s = (self.wheels_rad_s[contact.side] * self.radius_m[contact.side]).abs();
             let damped =
                 damping * (1.0 - rim_m_s / DAMPED_BELOW_M_S).max(0.0) / self.spec.relaxation_m;
-            let velocity = slip_velocity(
-                &contact,
-                self.speed_m_s,
-                self.yaw_rate_rad_s,
-                self.wheels_rad_s[contact.side] * self.radius_m[contact.side],
-            );
+            let velocity = self.slip_velocity(&contact);
             let most_n = curve.mu_peak * contact.load_n;
             let mut force = [0, 1].map(|axis| {
                 let gives = velocity[axis] - rim_m_s * contact.deflection[axis];
@@ -403,12 +398,22 @@ impl Plant {
         });
     }
 
+    /// Returns the negative sliding velocity of a contact patch over the ground, `[forward, left]`,
+    /// metres per second.
+    fn slip_velocity(&self, contact: &Contact) -> [f64; 2] {
+        let rim_m_s = self.wheels_rad_s[contact.side] * self.radius_m[contact.side];
+        let [forward_m_s, left_m_s] = self.speed_m_s;
+        [
+            rim_m_s - (forward_m_s - self.yaw_rate_rad_s * contact.y_m),
+            -(left_m_s + self.yaw_rate_rad_s * contact.x_m),
+        ]
+    }
+
     fn deflect(&mut self) {
         let length_m = self.spec.relaxation_m;
-        let (speed, yaw_rate) = (self.speed_m_s, self.yaw_rate_rad_s);
-        for contact in &mut self.contacts {
+        let velocities = self.contacts.map(|contact| self.slip_velocity(&contact));
+        for (contact, velocity) in self.contacts.iter_mut().zip(velocities) {
             let rim_m_s = self.wheels_rad_s[contact.side] * self.radius_m[contact.side];
-            let velocity = slip_velocity(contact, speed, yaw_rate, rim_m_s);
             contact.slip_m_s = velocity[0].hypot(velocity[1]);
             let share = STEP_S / length_m;
             for (axis, deflection) in contact.deflection.iter_mut().enumerate() {
@@ -453,15 +458,6 @@ impl Plant {
     pub fn wheels_rad_s(&self) -> [f64; 2] {
         self.wheels_rad_s
     }
-}
-
-/// Returns the negative sliding velocity of a contact patch over the ground, `[forward, left]`,
-/// metres per second.
-fn slip_velocity(contact: &Contact, speed: [f64; 2], yaw_rate: f64, rim_m_s: f64) -> [f64; 2] {
-    [
-        rim_m_s - (speed[0] - yaw_rate * contact.y_m),
-        -(speed[1] + yaw_rate * contact.x_m),
-    ]
 }
 
 #[cfg(test)]

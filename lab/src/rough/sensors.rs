@@ -15,7 +15,7 @@ use tread_control::robot::{GRAVITY_M_S2, RobotModel};
 
 use super::means::Means;
 use super::plant::Truth;
-use super::width::Width;
+use super::width::{Middle, Width};
 use crate::random::Random;
 
 /// Time between two samples of the fast sensors.
@@ -23,9 +23,9 @@ pub const SAMPLE_PERIOD: Duration = Duration::from_millis(10);
 /// Correlation time of the slow position error, in seconds.
 pub const POSITION_WANDERS_S: f64 = 20.0;
 /// Middle of the drawn sampling periods of positions, in seconds.
-const PERIOD_MIDDLE_S: f64 = 0.1;
+const PERIOD_MIDDLE_S: Middle = Middle(0.1);
 /// Geometric middle of the shortest and the longest delay of positions, in seconds.
-const DELAY_MIDDLE_S: f64 = 0.0447;
+const DELAY_MIDDLE_S: Middle = Middle(0.0447);
 /// Error of an outlier, in metres.
 const OUTLIER_M: f64 = 1.0;
 
@@ -123,7 +123,7 @@ impl SensorSpec {
                 DELAY_MIDDLE_S,
             )),
             outlier_share: width
-                .value(random.one_of(&[0.0, 0.002]).unwrap_or(0.0), 0.001)
+                .value(random.one_of(&[0.0, 0.002]).unwrap_or(0.0), Middle(0.001))
                 .max(0.0),
             ..usual
         }

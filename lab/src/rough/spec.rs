@@ -6,7 +6,7 @@ use serde::Serialize;
 use tread_control::robot::{Limits, RobotModel, RobotModelError, RobotModelSpec};
 
 use super::curve::{Curve, Shape};
-use super::width::Width;
+use super::width::{Middle, Width};
 use crate::random::Random;
 
 /// Make of a robot, from its description package and data sheet.
@@ -206,7 +206,7 @@ impl Deviations {
 }
 
 /// Geometric middle of the grounds' stiffnesses 0.7 and 12.
-const STIFFNESS_MIDDLE: f64 = 2.898;
+const STIFFNESS_MIDDLE: Middle = Middle(2.898);
 /// Least inertia of a side's rotors and wheels at the rim, relative to half the mass: that of the
 /// wheels alone.
 const ROTOR_RATIO_MIN: f64 = 0.002;

@@ -9,6 +9,10 @@ use std::ops::Range;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Width(f64);
 
+/// Middle of some values, which stays where it is.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Middle(pub f64);
+
 impl Default for Width {
     fn default() -> Self {
         Self(1.0)
@@ -48,14 +52,14 @@ impl Width {
 
     /// Moves one of some values away from their middle.
     #[must_use]
-    pub fn value(self, value: f64, middle: f64) -> f64 {
+    pub fn value(self, value: f64, Middle(middle): Middle) -> f64 {
         value + (self.0 - 1.0) * (value - middle)
     }
 
     /// Moves one of some values away from their middle, on a logarithmic scale; both must be above
     /// zero.
     #[must_use]
-    pub fn log_value(self, value: f64, middle: f64) -> f64 {
+    pub fn log_value(self, value: f64, Middle(middle): Middle) -> f64 {
         value * (value / middle).powf(self.0 - 1.0)
     }
 }
@@ -84,7 +88,7 @@ mod tests {
             let of_log = (log.end / log.start).ln();
             prop_assert!((of_log - factor * (high / low).ln()).abs() < 1.0e-9);
             let middle = (low * high).sqrt();
-            prop_assert!((width.log_value(high, middle) / log.end - 1.0).abs() < 1.0e-9);
+            prop_assert!((width.log_value(high, Middle(middle)) / log.end - 1.0).abs() < 1.0e-9);
         }
 
         #[test]

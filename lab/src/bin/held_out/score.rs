@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use serde::Serialize;
 use tread_api::friction::NORMAL_95;
 use tread_lab::held_out::process::Contacts;
-use tread_lab::report::Check;
+use tread_lab::report::{Check, Part};
 use tread_lab::rough::run::{Outcome, Trial};
 
 /// Relative half-width above which an estimate counts as abstaining.
@@ -91,11 +91,11 @@ impl Line {
             drives: drives.len(),
             answers,
             estimates,
-            abstained: 1.0 - share(estimates, answers),
+            abstained: 1.0 - Part(estimates).of(answers),
             of_estimates: (estimates > 0).then(|| Figures {
-                coverage: share(covered, estimates),
-                below: share(below, estimates),
-                above: share(above, estimates),
+                coverage: Part(covered).of(estimates),
+                below: Part(below).of(estimates),
+                above: Part(above).of(estimates),
                 error: median(&mut errors),
                 half_width: median(&mut widths),
             }),
@@ -209,9 +209,4 @@ pub(crate) fn markdown(lines: &[Line]) -> String {
 fn median(figures: &mut [f64]) -> f64 {
     figures.sort_by(f64::total_cmp);
     figures.get(figures.len() / 2).copied().unwrap_or(0.0)
-}
-
-#[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
-fn share(part: usize, of: usize) -> f64 {
-    part as f64 / of.max(1) as f64
 }

@@ -237,9 +237,8 @@ fn checks(rows: &[Row], lyapunov_rise: f64) -> Vec<Check> {
     ]
 }
 
-fn write(folder: &Path, name: &str, text: &str) -> anyhow::Result<()> {
-    let file = folder.join(name);
-    fs::write(&file, text).with_context(|| format!("cannot write `{}`", file.display()))
+fn write(file: &Path, text: &str) -> anyhow::Result<()> {
+    fs::write(file, text).with_context(|| format!("cannot write `{}`", file.display()))
 }
 
 fn write_tracking(folder: &Path, rows: &[Row]) -> anyhow::Result<()> {
@@ -265,8 +264,8 @@ fn write_tracking(folder: &Path, rows: &[Row]) -> anyhow::Result<()> {
             state.theta
         );
     }
-    write(folder, "fig6_tracking.csv", &fig_6)?;
-    write(folder, "fig7_state.csv", &fig_7)?;
+    write(&folder.join("fig6_tracking.csv"), &fig_6)?;
+    write(&folder.join("fig7_state.csv"), &fig_7)?;
     let curve = |name, pick: &dyn Fn(&Row) -> [f64; 2]| Curve {
         name,
         points: rows.iter().map(pick).collect(),
@@ -328,7 +327,7 @@ fn write_tracking(folder: &Path, rows: &[Row]) -> anyhow::Result<()> {
         ),
     ];
     for (name, plot) in &plots {
-        write(folder, name, &svg::render(plot))?;
+        write(&folder.join(name), &svg::render(plot))?;
     }
     Ok(())
 }
@@ -343,7 +342,7 @@ fn write_circle(folder: &Path, rows: &[CircleRow]) -> anyhow::Result<()> {
             row.time_s
         );
     }
-    write(folder, "fig5_circle.csv", &table)?;
+    write(&folder.join("fig5_circle.csv"), &table)?;
     let plot = Plot {
         title: "Fig. 5(b): 60 and 120 rpm, K = 5",
         x_label: "X, m",
@@ -360,5 +359,5 @@ fn write_circle(folder: &Path, rows: &[CircleRow]) -> anyhow::Result<()> {
             },
         ],
     };
-    write(folder, "fig5_circle.svg", &svg::render(&plot))
+    write(&folder.join("fig5_circle.svg"), &svg::render(&plot))
 }

@@ -2,10 +2,10 @@
 
 use serde::Serialize;
 use tread_api::friction::NORMAL_95;
-use tread_lab::report::{Check, Table, percent};
+use tread_lab::report::{Check, Part, Table, percent};
 use tread_lab::rough::run::{PARAMETERS, estimates};
 
-use super::score::{Drive, median, share, verdict, yes_or_no};
+use super::score::{Drive, median, verdict, yes_or_no};
 
 /// Coverage that each parameter must have.
 const COVERAGE_MIN: f64 = 0.9;
@@ -42,9 +42,9 @@ pub(crate) fn parameter_lines(has_torque: bool, drives: &[Drive]) -> Vec<Paramet
             name,
             has_torque,
             estimates: widths.len(),
-            coverage: share(covered, widths.len()),
+            coverage: Part(covered).of(widths.len()),
             half_width: median(&mut widths),
-            prior_dominated: share(prior, widths.len()),
+            prior_dominated: Part(prior).of(widths.len()),
         }
     };
     PARAMETERS

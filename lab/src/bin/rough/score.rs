@@ -4,7 +4,7 @@ use std::ops::RangeInclusive;
 
 use serde::Serialize;
 use tread_api::friction::{NORMAL_95, ThetaEstimate};
-use tread_lab::report::{Check, Table, percent};
+use tread_lab::report::{Check, Part, Table, percent};
 use tread_lab::rough::run::{ASKED_AT_S, Outcome, Trial};
 
 /// Relative half-width above which an estimate counts as missing.
@@ -91,15 +91,15 @@ impl Line {
             name: name.into(),
             has_torque,
             estimates: errors.len(),
-            coverage: share(covered, errors.len()),
+            coverage: Part(covered).of(errors.len()),
             error: median(&mut errors),
             half_width: median(&mut widths),
-            abstained: 1.0 - share(errors.len(), asked),
-            abstained_at_end: 1.0 - share(last, drives.len()),
+            abstained: 1.0 - Part(errors.len()).of(asked),
+            abstained_at_end: 1.0 - Part(last).of(drives.len()),
             beyond_half_peak: median(&mut beyond),
             bound: (!bounds.is_empty()).then(|| median(&mut bounds)),
             over_bound: (!over.is_empty()).then(|| median(&mut over)),
-            abstained_needlessly: (useful > 0).then(|| share(missing, useful)),
+            abstained_needlessly: (useful > 0).then(|| Part(missing).of(useful)),
         }
     }
 
@@ -246,9 +246,4 @@ fn half_width(said: &ThetaEstimate) -> f64 {
 pub(crate) fn median(figures: &mut [f64]) -> f64 {
     figures.sort_by(f64::total_cmp);
     figures.get(figures.len() / 2).copied().unwrap_or(0.0)
-}
-
-#[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
-pub(crate) fn share(part: usize, of: usize) -> f64 {
-    part as f64 / of.max(1) as f64
 }
