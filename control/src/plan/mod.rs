@@ -430,14 +430,7 @@ impl Plan {
         let steps = (plan.duration_s() / 0.05).ceil().min(GRID_MAX as f64) as usize + 1;
         for step in 0..=steps {
             let share = step as f64 / steps as f64;
-            let sample = plan.sample(plan.duration_s() * share);
-            let turn_rad_s = (sample.speed_m_s * sample.path.curvature_1_m).abs();
-            plan.peak_speed_m_s = plan.peak_speed_m_s.max(sample.speed_m_s);
-            plan.peak_acceleration_m_s2 = plan
-                .peak_acceleration_m_s2
-                .max(sample.acceleration_m_s2.abs());
-            plan.peak_lateral_m_s2 = plan.peak_lateral_m_s2.max(turn_rad_s * sample.speed_m_s);
-            plan.peak_angular_rad_s = plan.peak_angular_rad_s.max(turn_rad_s);
+            plan.note_peaks(plan.duration_s() * share);
             // A requested excitation does not count as slowing, so the timing without it is
             // checked.
             let timing = plan.profile.sample(plan.profile.duration_s() * share);
@@ -451,6 +444,18 @@ impl Plan {
             plan.stretches.note(&timing, &cell);
         }
         Ok(plan)
+    }
+
+    /// Raises the peak values to those at a time, seconds.
+    fn note_peaks(&mut self, time_s: f64) {
+        let sample = self.sample(time_s);
+        let turn_rad_s = (sample.speed_m_s * sample.path.curvature_1_m).abs();
+        self.peak_speed_m_s = self.peak_speed_m_s.max(sample.speed_m_s);
+        self.peak_acceleration_m_s2 = self
+            .peak_acceleration_m_s2
+            .max(sample.acceleration_m_s2.abs());
+        self.peak_lateral_m_s2 = self.peak_lateral_m_s2.max(turn_rad_s * sample.speed_m_s);
+        self.peak_angular_rad_s = self.peak_angular_rad_s.max(turn_rad_s);
     }
 
     /// Returns the plan at a time since its start, seconds; before 0 and after the end the speed is
