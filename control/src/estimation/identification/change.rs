@@ -17,7 +17,7 @@ use crate::robot::RobotModel;
 const OFFSETS: [f64; 2] = [-1.0, 1.0];
 /// Threshold h of the CUSUM, without and with measured torque, and its drift k: squares of standard
 /// deviations. Without torque less is known of the robot, so that what the model misses lasts longer.
-const THRESHOLDS: [f64; 2] = [220.0, 150.0];
+const THRESHOLDS: [f64; 2] = [220.0, 125.0];
 const DRIFT: f64 = 2.0;
 /// Limit of one channel's squared standardised residual.
 const SQUARE_MAX: f64 = 25.0;
