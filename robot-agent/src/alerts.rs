@@ -218,7 +218,12 @@ impl Alerts {
                 Fault::BaseSilent => "base-silent",
                 Fault::PositionLost => "position-lost",
             };
-            alert(code, Severity::Critical, fault.text().to_owned())
+            let unheard = causes.base.and_then(Counts::unheard);
+            let text = match unheard {
+                Some(unheard) => format!("{}: {unheard}", fault.text()),
+                None => fault.text().to_owned(),
+            };
+            alert(code, Severity::Critical, text)
         });
         let dropped = causes.base.and_then(|base| {
             let (refusal, text) = self.dropping.look(base)?;

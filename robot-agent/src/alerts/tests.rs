@@ -131,6 +131,24 @@ fn a_base_that_started_again_and_a_second_commander_are_alerts() {
 }
 
 #[test]
+fn a_base_that_is_not_heard_is_an_alert_with_the_topics_that_never_came() {
+    let settings = crate::drive::ros2::tests::settings();
+    let counts = Counts::of(&settings);
+    counts.take(Source::Imu);
+    let said = Alerts::default().judge(&Causes {
+        base: Some(&counts),
+        fault: Some(Fault::BaseSilent),
+        ..Causes::default()
+    });
+    assert_eq!(codes(&said), ["base-silent"]);
+    let text = &said[0].text;
+    assert!(
+        text.contains("`/joint_states` (joints)") && !text.contains("imu"),
+        "{text}"
+    );
+}
+
+#[test]
 fn a_robot_that_was_unloaded_is_an_alert_with_both_masses() {
     let apparent = |value| ValueWithStdDev {
         value,

@@ -96,7 +96,7 @@ impl Ros2Drive {
         tap: Option<&Arc<dyn Tap>>,
     ) -> Result<(Self, Bus), LinkError> {
         let settings = Arc::new(settings);
-        let (counts, outlet) = (Arc::new(Counts::default()), Arc::new(Outlet::default()));
+        let (counts, outlet) = (Arc::new(Counts::of(&settings)), Arc::new(Outlet::default()));
         let arrivals = Arc::new(Arrivals::default());
         let (to_loop, arrived) = sync_channel(WAITING_MAX);
         let inlets = Inlet::all(&settings, &counts, &to_loop, &arrivals, clock);

@@ -6,6 +6,9 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use tread_ros2::cdr::CdrError;
 use tread_ros2::rmw::KeyMismatch;
 
+use super::inlet::topic_of;
+use super::settings::Ros2Settings;
+
 /// An event on a topic that is read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Notice {
@@ -203,9 +206,37 @@ pub struct Counts {
     dropped: [[AtomicU64; Refusal::ALL.len()]; Source::ALL.len()],
     noted: [[AtomicU64; Notice::ALL.len()]; Source::ALL.len()],
     foreign_commands: AtomicU64,
+    /// Names of the configured topics.
+    topics: [Option<String>; Source::ALL.len()],
 }
 
 impl Counts {
+    /// Creates the counts of the topics that the settings name.
+    pub fn of(settings: &Ros2Settings) -> Self {
+        Self {
+            topics: Source::ALL.map(|source| Some(topic_of(settings, source)?.to_string())),
+            ..Self::default()
+        }
+    }
+
+    /// Returns a description of the configured topics on which no message has come since the start,
+    /// for people; `None` if there was one on each.
+    pub fn unheard(&self) -> Option<String> {
+        let is_unheard = |source: &Source| {
+            let mut dropped = self.dropped[*source as usize].iter();
+            self.taken(*source) == 0 && dropped.all(|count| count.load(Ordering::Relaxed) == 0)
+        };
+        let topics: Vec<String> = Source::ALL
+            .into_iter()
+            .filter(is_unheard)
+            .filter_map(|source| {
+                let topic = self.topics[source as usize].as_ref()?;
+                Some(format!("`{topic}` ({})", source.section()))
+            })
+            .collect();
+        (!topics.is_empty()).then(|| format!("no message has come on {}", topics.join(", ")))
+    }
+
     /// Counts a message that was used.
     pub fn take(&self, source: Source) {
         self.taken[source as usize].fetch_add(1, Ordering::Relaxed);
