@@ -18,7 +18,7 @@ use tracing::{info, warn};
 use uuid::{ContextV7, Uuid};
 
 pub use self::floor::{ClockSteps, STEP_BACK_HELD_MAX, STEP_NOTED_MIN};
-use self::floor::{Floor, Step};
+use self::floor::{Floor, Mark, Step};
 
 /// A clock with one of three sources: the machine, a simulated site, or a test that sets the time.
 #[derive(Debug, Clone)]
@@ -178,8 +178,11 @@ impl Clock {
         let Some(newest) = newest else { return };
         let step = {
             let mut floor = lock(&self.floor);
-            let (wall, elapsed) = (self.source.wall(), self.source.elapsed());
-            floor.continue_after(newest.as_microsecond(), wall.as_microsecond(), elapsed)
+            let machine = Mark {
+                wall_us: self.source.wall().as_microsecond(),
+                elapsed: self.source.elapsed(),
+            };
+            floor.continue_after(newest.as_microsecond(), machine)
         };
         if let Some(step) = step {
             log_step(step);

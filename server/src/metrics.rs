@@ -41,6 +41,19 @@ impl MetricConstructor<Histogram> for Bounds {
 /// Histograms of durations in seconds, by labels.
 type Durations<L> = Family<L, Histogram, Bounds>;
 
+/// An answered HTTP request.
+#[derive(Debug, Clone, Copy)]
+pub struct AnsweredRequest<'request> {
+    /// Its method.
+    pub method: &'request str,
+    /// Pattern of its route.
+    pub route: &'request str,
+    /// Status of the response.
+    pub status: u16,
+    /// Time until the response.
+    pub took: Duration,
+}
+
 /// Labels of an HTTP request.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
 struct OfRequest {
@@ -88,20 +101,19 @@ impl Default for Metrics {
 }
 
 impl Metrics {
-    /// Records a request: its method, the pattern of its route, the status of the response, and its
-    /// duration.
-    pub fn request(&self, method: &str, route: &str, status: u16, took: Duration) {
+    /// Records a request.
+    pub fn request(&self, answered: &AnsweredRequest<'_>) {
         let of = OfRequest {
             // Clients choose the method, so unknown ones share a label.
             method: METHODS
                 .into_iter()
-                .find(|known| *known == method)
+                .find(|known| *known == answered.method)
                 .unwrap_or("other"),
-            route: route.to_owned(),
-            status,
+            route: answered.route.to_owned(),
+            status: answered.status,
         };
         let histogram = self.requests.get_or_create(&of);
-        histogram.observe(took.as_secs_f64());
+        histogram.observe(answered.took.as_secs_f64());
     }
 
     /// Records a refused request by the type of its problem.
@@ -208,7 +220,12 @@ mod tests {
     fn whoever_asks_does_not_choose_how_many_series_there_are() {
         let metrics = Metrics::default();
         for method in ["GET", "BREW", "WHEN"] {
-            metrics.request(method, "/v1/robots", 200, Duration::from_millis(4));
+            metrics.request(&AnsweredRequest {
+                method,
+                route: "/v1/robots",
+                status: 200,
+                took: Duration::from_millis(4),
+            });
         }
         let mut registry = Registry::default();
         metrics.register(&mut registry, Vec::new());

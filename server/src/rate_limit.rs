@@ -5,6 +5,9 @@
 
 use std::time::Duration;
 
+/// Maximum delay of an event by [`Bucket::take_delayed`].
+const DELAY_MAX: Duration = Duration::from_secs(1);
+
 /// Rate limit with a burst.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct RateLimit {
@@ -50,16 +53,11 @@ impl Bucket {
         has_one
     }
 
-    /// Returns the delay after which an event may take place, at most `delay_max`. Counts the event
-    /// if its delay is below `delay_max`.
-    pub(crate) fn take_delayed(
-        &mut self,
-        limit: RateLimit,
-        now: Duration,
-        delay_max: Duration,
-    ) -> Duration {
-        let delay = self.delay(limit, now).min(delay_max);
-        if delay < delay_max {
+    /// Returns the delay after which an event may take place, at most [`DELAY_MAX`]. Counts the event
+    /// if its delay is below it.
+    pub(crate) fn take_delayed(&mut self, limit: RateLimit, now: Duration) -> Duration {
+        let delay = self.delay(limit, now).min(DELAY_MAX);
+        if delay < DELAY_MAX {
             self.full_at = self.full_at.max(now) + limit.interval;
         }
         delay
@@ -119,15 +117,14 @@ mod tests {
             interval_ms in 1..300_u64,
         ) {
             let limit = RateLimit { burst, interval: Duration::from_millis(interval_ms) };
-            let delay_max = Duration::from_secs(1);
             let (mut asked, mut used) = (Bucket::default(), Bucket::default());
             let mut now = Duration::ZERO;
             for gap_ms in gaps_ms {
                 now += Duration::from_millis(gap_ms);
                 let is_free = asked.has_one(limit, now);
-                let delay = asked.take_delayed(limit, now, delay_max);
-                prop_assert!(delay <= delay_max && is_free == delay.is_zero());
-                if delay < delay_max {
+                let delay = asked.take_delayed(limit, now);
+                prop_assert!(delay <= DELAY_MAX && is_free == delay.is_zero());
+                if delay < DELAY_MAX {
                     prop_assert!(used.take(limit, now + delay));
                 }
             }

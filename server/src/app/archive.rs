@@ -254,7 +254,11 @@ impl App {
         let mut writer = archive.off_thread(move |files| files.begin(keys)).await?;
         let mut after = keys.first - 1;
         while after < keys.last {
-            let rows = self.rows_of(after, keys.last).await?;
+            let rest = KeyRange {
+                first: after + 1,
+                ..keys
+            };
+            let rows = self.rows_of(rest).await?;
             let Some(last) = rows.last() else { break };
             after = last.stored.id;
             let adding = move |_: &SegmentArchive| {
@@ -301,12 +305,13 @@ impl App {
         Ok(())
     }
 
-    /// Returns the next measurements of the database after a key and up to another one.
-    async fn rows_of(&self, after: i64, until: i64) -> Result<Vec<ArchivedSegment>, AppError> {
+    /// Returns the first measurements of the database in a range of keys.
+    async fn rows_of(&self, keys: KeyRange) -> Result<Vec<ArchivedSegment>, AppError> {
+        let range = (keys.first - 1, keys.last);
         let reading = async {
             let mut tx = self.db().read("archive").await?;
             let sites = db::sites::list(&mut tx, &Scope::EVERYWHERE, "", SITES_MAX).await?;
-            let rows = db::segments::of_all_sites(&mut tx, (after, until), CHUNK_ROWS).await?;
+            let rows = db::segments::of_all_sites(&mut tx, range, CHUNK_ROWS).await?;
             Ok::<_, AppError>((sites, rows))
         };
         let (sites, rows) = db::limited(reading).await?;
@@ -331,7 +336,11 @@ impl App {
         let last = file.keys().last;
         let mut after = first - 1;
         while after < last {
-            let rows = self.rows_of(after, last).await?;
+            let rest = KeyRange {
+                first: after + 1,
+                last,
+            };
+            let rows = self.rows_of(rest).await?;
             let Some(end) = rows.last().map(|row| row.stored.id) else {
                 return Ok(false);
             };

@@ -229,7 +229,7 @@ pub async fn make(
     let size = copy::size_bytes(&order.database).await;
     let size = size.map_err(|cause| BackupError::Copy(cause.into()))?;
     check_all_space(&order, &target, size)?;
-    watch_copy(&order.database, &copy.0, |bytes| {
+    watch_copy(&order.database, &copy, |bytes| {
         progress(Progress::Copying { bytes, of: size });
     })
     .await?;
@@ -272,7 +272,11 @@ pub async fn make(
 }
 
 /// Copies the database, and reports the size of the copy meanwhile.
-async fn watch_copy(database: &Path, target: &Path, tell: impl Fn(u64)) -> Result<(), BackupError> {
+async fn watch_copy(
+    database: &Path,
+    CopyFile(target): &CopyFile,
+    tell: impl Fn(u64),
+) -> Result<(), BackupError> {
     let copying = copy::copy_into(database, target);
     tokio::pin!(copying);
     let mut ticks = tokio::time::interval(PROGRESS_EVERY);

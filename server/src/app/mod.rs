@@ -462,11 +462,22 @@ fn name_or(name: Option<String>, id: &str) -> Result<String, AppError> {
     let Some(name) = name else {
         return Ok(id.to_owned());
     };
-    people_line("name", &name, tread_api::site::NAME_LENGTH_MAX)
+    people_line(PeopleField::Name, &name, tread_api::site::NAME_LENGTH_MAX)
+}
+
+/// Field of a request that is a line of text for people.
+#[derive(Debug, Clone, Copy)]
+enum PeopleField {
+    Name,
+    Reason,
 }
 
 /// Checks and trims a line of text for people.
-fn people_line(field: &'static str, given: &str, length_max: usize) -> Result<String, AppError> {
+fn people_line(field: PeopleField, given: &str, length_max: usize) -> Result<String, AppError> {
+    let field = match field {
+        PeopleField::Name => "name",
+        PeopleField::Reason => "reason",
+    };
     let line = tread_api::text::line(given, length_max);
     line.map(str::to_owned).map_err(|wrong| AppError::Invalid {
         field,

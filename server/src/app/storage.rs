@@ -24,7 +24,7 @@ use tread_api::robot::{Alert, Severity};
 use tread_api::webhook::NoticeEvent;
 
 use self::growth::Growth;
-use self::repeats::Repeats;
+use self::repeats::{Failure, Repeats};
 use super::App;
 use crate::config::StorageConfig;
 use crate::db::alerts::AlertFilter;
@@ -183,7 +183,11 @@ impl App {
     /// Logs that a background task failed and will be repeated; repeats are counted.
     pub(crate) fn log_failure(&self, what: &'static str, cause: &dyn std::error::Error) {
         let (now, reason) = (self.clock().elapsed(), chain(cause));
-        let logged = self.storage().lock().repeats.note(now, what, &reason);
+        let failure = Failure {
+            what,
+            reason: &reason,
+        };
+        let logged = self.storage().lock().repeats.note(now, failure);
         let Some(repeats) = logged else { return };
         error!(repeats, "cannot {what}: {reason}");
     }

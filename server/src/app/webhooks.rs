@@ -19,7 +19,7 @@ use tread_api::webhook::{
 };
 
 use super::identity::new_secret;
-use super::{App, AppError, page, people_line, site_row};
+use super::{App, AppError, PeopleField, page, people_line, site_row};
 use crate::config::webhooks::WebhooksConfig;
 use crate::db::webhooks::NewDelivery;
 use crate::db::{self, DbError, Tx};
@@ -355,7 +355,7 @@ impl App {
             check_kind(tx, kind).await?;
         }
         Ok(WebhookSettings {
-            name: people_line("name", &settings.name, WEBHOOK_NAME_MAX)?,
+            name: people_line(PeopleField::Name, &settings.name, WEBHOOK_NAME_MAX)?,
             url: url.to_string(),
             kinds,
             sites,

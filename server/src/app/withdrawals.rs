@@ -12,7 +12,7 @@ use tread_api::page::Page;
 use tread_api::rights::Scope;
 
 use super::map::{MapChange, Withdrawn};
-use super::{App, AppError, page, people_line, site_row};
+use super::{App, AppError, PeopleField, page, people_line, site_row};
 use crate::db;
 use crate::db::withdrawals::{Hours, WithdrawalRow};
 use crate::friction::epochs::HOUR_S;
@@ -33,7 +33,7 @@ impl App {
         by: &str,
     ) -> Result<Withdrawal, AppError> {
         let CreateWithdrawal { from, to, reason } = request;
-        let reason = people_line("reason", &reason, REASON_LENGTH_MAX)?;
+        let reason = people_line(PeopleField::Reason, &reason, REASON_LENGTH_MAX)?;
         let now = self.clock().now();
         let turn = self.map_turn_to_change().await?;
         let mut tx = self.db().write("withdrawals").await?;

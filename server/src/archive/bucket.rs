@@ -24,6 +24,7 @@ use tokio::runtime::Handle;
 
 use super::SegmentArchiveError;
 use super::fault::Fault;
+use super::folder::Rename;
 use super::location::BucketLocation;
 use super::reason::reason;
 
@@ -193,8 +194,8 @@ impl Bucket {
     }
 
     /// Gives an object another name.
-    pub(super) fn rename(&self, from: &str, to: &str) -> Result<(), SegmentArchiveError> {
-        let (from, to) = (self.path_of(from), self.path_of(to));
+    pub(super) fn rename(&self, names: Rename<'_>) -> Result<(), SegmentArchiveError> {
+        let (from, to) = (self.path_of(names.from), self.path_of(names.to));
         wait(self.store.rename(&from, &to)).map_err(|cause| self.failed(&cause))
     }
 

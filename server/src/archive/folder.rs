@@ -7,6 +7,13 @@ use std::path::{Path, PathBuf};
 
 use crate::file_error::FileError;
 
+/// Present and new name of a file or an object.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Rename<'name> {
+    pub(super) from: &'name str,
+    pub(super) to: &'name str,
+}
+
 /// A folder, which is created with its first file.
 #[derive(Debug, Clone)]
 pub(super) struct Folder {
@@ -67,9 +74,9 @@ impl Folder {
         File::open(&path).map_err(FileError::of("open", &path))
     }
 
-    pub(super) fn rename(&self, from: &str, to: &str) -> Result<(), FileError> {
-        let path = self.path_of(from);
-        fs::rename(&path, self.path_of(to)).map_err(FileError::of("rename", &path))
+    pub(super) fn rename(&self, names: Rename<'_>) -> Result<(), FileError> {
+        let path = self.path_of(names.from);
+        fs::rename(&path, self.path_of(names.to)).map_err(FileError::of("rename", &path))
     }
 
     /// Makes renamed files survive a power cut.

@@ -46,7 +46,7 @@ use uuid::Uuid;
 
 use self::bucket::Bucket;
 pub use self::error::SegmentArchiveError;
-use self::folder::Folder;
+use self::folder::{Folder, Rename};
 use self::keys::{ENDING, PREFIX};
 pub use self::keys::{KeyRange, Listing};
 pub use self::location::{ArchiveLocation, BucketLocation};
@@ -354,9 +354,13 @@ impl SegmentArchive {
         let target = target.ok_or_else(|| SegmentArchiveError::Superseded {
             path: self.shown().join(name),
         })?;
+        let names = Rename {
+            from: name,
+            to: &target,
+        };
         match &self.storage {
-            Storage::Folder(folder) => folder.rename(name, &target)?,
-            Storage::Bucket(bucket, _) => bucket.rename(name, &target)?,
+            Storage::Folder(folder) => folder.rename(names)?,
+            Storage::Bucket(bucket, _) => bucket.rename(names)?,
         }
         Ok(self.shown().join(target))
     }

@@ -25,6 +25,13 @@ struct Group {
     sum: u32,
 }
 
+/// Rows of a row group: the index of the group, and the keys of the rows.
+#[derive(Debug, Clone, Copy)]
+struct Part {
+    group: usize,
+    keys: KeyRange,
+}
+
 /// A file whose footer was checked.
 pub(super) struct OpenFile {
     path: PathBuf,
@@ -121,7 +128,8 @@ impl OpenFile {
                 let keys = KeyRange { first, last };
                 budget.rows = budget.rows.saturating_sub(place(keys.count()));
                 let wanted = limit - found.segments.len();
-                let read = || self.read_group(index, keys, selection, wanted);
+                let part = Part { group: index, keys };
+                let read = || self.read_part(part, selection, wanted);
                 let segments = guarded(&self.path, read)?;
                 let is_full = segments.len() >= wanted;
                 found.segments.extend(segments);
@@ -158,14 +166,14 @@ impl OpenFile {
             }))
     }
 
-    /// Reads the selected rows of a row group with keys of a range, at most `limit`.
-    fn read_group(
+    /// Reads the selected rows of a part of a row group, at most `limit`.
+    fn read_part(
         &self,
-        index: usize,
-        keys: KeyRange,
+        part: Part,
         selection: &Selection,
         limit: usize,
     ) -> Result<Vec<ArchivedSegment>, Fault> {
+        let Part { group: index, keys } = part;
         let about = self.groups.get(index);
         let about = about.ok_or_else(|| fault("a row group is missing"))?;
         let bytes = checksum::read_checked(&self.source, about.bytes.clone(), about.sum)?;
@@ -187,9 +195,8 @@ impl OpenFile {
         let Some((&first, &last)) = chosen.first().zip(chosen.last()) else {
             return Ok(Vec::new());
         };
-        columns.narrow(first..last + 1);
-        let values = Values::read(&mut columns)?;
-        let segment = |row: usize| names.segment(row, ids[row], &values, row - first);
+        let values = Values::read(&mut columns, first..last + 1)?;
+        let segment = |row: usize| names.segment(row, ids[row], &values);
         chosen.into_iter().map(segment).collect()
     }
 }

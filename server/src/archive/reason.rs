@@ -20,7 +20,9 @@ pub(super) fn reason(failure: &object_store::Error) -> String {
     let status = whole
         .split_once("status code: ")
         .map(|(_, rest)| rest.split(':').next().unwrap_or(rest));
-    let answer = element(&whole, "Code").map(|code| match element(&whole, "Message") {
+    let answer = Answer(&whole);
+    let code = answer.element("Code");
+    let answer = code.map(|code| match answer.element("Message") {
         Some(message) => format!("{code}: {message}"),
         None => code.to_owned(),
     });
@@ -32,11 +34,17 @@ pub(super) fn reason(failure: &object_store::Error) -> String {
     shortened(&reason)
 }
 
-/// Returns the content of an element of an answer in XML.
-fn element<'text>(text: &'text str, name: &str) -> Option<&'text str> {
-    let (_, rest) = text.split_once(&format!("<{name}>"))?;
-    let (content, _) = rest.split_once(&format!("</{name}>"))?;
-    Some(content)
+/// Answer of the storage, in XML.
+#[derive(Clone, Copy)]
+struct Answer<'text>(&'text str);
+
+impl<'text> Answer<'text> {
+    /// Returns the content of an element.
+    fn element(self, name: &str) -> Option<&'text str> {
+        let (_, rest) = self.0.split_once(&format!("<{name}>"))?;
+        let (content, _) = rest.split_once(&format!("</{name}>"))?;
+        Some(content)
+    }
 }
 
 /// Returns the text of the first cause, which is the most exact one.

@@ -59,14 +59,14 @@ impl Names {
         (0..self.sites.len()).filter(is_chosen).collect()
     }
 
-    /// Returns the measurement of a row, whose values are those of another index.
+    /// Returns the measurement of a row.
     pub(super) fn segment(
         &self,
         row: usize,
         id: i64,
         values: &Values,
-        of: usize,
     ) -> Result<ArchivedSegment, Fault> {
+        let of = row - values.first_row;
         let terrain = self.terrains[row]
             .as_ref()
             .zip(values.terrain_revisions[of]);
@@ -93,6 +93,8 @@ impl Names {
 
 /// The other columns of some rows, in the order of the schema.
 pub(super) struct Values {
+    /// Index of their first row among those of [`Names`].
+    first_row: usize,
     terrain_revisions: Vec<Option<i64>>,
     boots: Vec<ByteArray>,
     seqs: Vec<i64>,
@@ -120,9 +122,12 @@ pub(super) struct Values {
 type Pairs = (Vec<Option<f64>>, Vec<Option<f64>>);
 
 impl Values {
-    /// Reads the columns after those of [`Names`].
-    pub(super) fn read(columns: &mut Columns<'_>) -> Result<Self, Fault> {
+    /// Reads the columns after those of [`Names`], of some of their rows.
+    pub(super) fn read(columns: &mut Columns<'_>, rows: Range<usize>) -> Result<Self, Fault> {
+        let first_row = rows.start;
+        columns.narrow(rows);
         Ok(Self {
+            first_row,
             terrain_revisions: columns.some::<Int64Type>()?,
             boots: columns.each::<ByteArrayType>()?,
             seqs: columns.each::<Int64Type>()?,
@@ -219,7 +224,7 @@ impl<'group> Columns<'group> {
     }
 
     /// Reads only some of the rows of the following columns.
-    pub(super) fn narrow(&mut self, within: Range<usize>) {
+    fn narrow(&mut self, within: Range<usize>) {
         let begin = self.rows.start;
         self.rows = begin + within.start..begin + within.end;
     }

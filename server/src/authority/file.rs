@@ -170,12 +170,23 @@ impl Authority {
     /// [`AuthorityError::Unreadable`] if there is none, [`AuthorityError::Open`] if other users can
     /// read its key, [`AuthorityError::Unusable`] if certificate and key do not fit.
     pub fn load(folder: &Path) -> Result<Self, AuthorityError> {
-        load(folder, CERTIFICATE_FILE, KEY_FILE)
+        let names = FileNames {
+            certificate: CERTIFICATE_FILE,
+            key: KEY_FILE,
+        };
+        load(folder, names)
     }
 }
 
-fn load(folder: &Path, certificate: &str, key: &str) -> Result<Authority, AuthorityError> {
-    let (certificate, key) = (folder.join(certificate), folder.join(key));
+/// Names of the files of an authority.
+#[derive(Clone, Copy)]
+struct FileNames {
+    certificate: &'static str,
+    key: &'static str,
+}
+
+fn load(folder: &Path, names: FileNames) -> Result<Authority, AuthorityError> {
+    let (certificate, key) = (folder.join(names.certificate), folder.join(names.key));
     let mode = fs::metadata(&key).map_err(unreadable(&key))?.permissions();
     if mode.mode() & 0o077 != 0 {
         return Err(AuthorityError::Open(key));
@@ -246,8 +257,16 @@ impl Step {
     /// Applies the step without `fsync` of the folder; idempotent.
     fn take(&self, folder: &Path) -> io::Result<()> {
         match self {
-            Self::Write(name, mode, text) => replace(folder, name, *mode, text),
-            Self::Rename(name, to) => rename(&folder.join(name), &folder.join(to)),
+            Self::Write(name, mode, text) => replace(&folder.join(name), *mode, text),
+            Self::Rename(name, to) => match fs::rename(folder.join(name), folder.join(to)) {
+                // It was renamed before.
+                Err(cause)
+                    if cause.kind() == io::ErrorKind::NotFound && folder.join(to).exists() =>
+                {
+                    Ok(())
+                }
+                renamed => renamed,
+            },
             Self::Remove(name) => remove(&folder.join(name)),
         }
     }
@@ -288,15 +307,22 @@ fn replacing(next: &Authority) -> Vec<Step> {
     ]
 }
 
-/// Returns the steps that complete a replacement, given the fingerprints of the authorities that it
-/// retires: the present one, and the new one of a rotation.
-fn completing_replacement(present: Option<&str>, next: Option<&str>) -> Vec<Step> {
+/// Fingerprints of the authorities that a replacement retires.
+struct Replaced {
+    present: Option<String>,
+    /// New authority, during a rotation.
+    next: Option<String>,
+}
+
+/// Returns the steps that complete a replacement.
+fn completing_replacement(replaced: &Replaced) -> Vec<Step> {
+    let Replaced { present, next } = replaced;
     let retire =
         |file: &'static str, fingerprint: &str| Step::Rename(file, retired_name(fingerprint));
     let mut steps = Vec::new();
-    steps.extend(next.map(|next| retire(NEXT_CERTIFICATE_FILE, next)));
+    steps.extend(next.iter().map(|it| retire(NEXT_CERTIFICATE_FILE, it)));
     steps.extend([Step::Remove(NEXT_KEY_FILE), Step::Remove(ROTATION_FILE)]);
-    steps.extend(present.map(|present| retire(CERTIFICATE_FILE, present)));
+    steps.extend(present.iter().map(|it| retire(CERTIFICATE_FILE, it)));
     steps.extend([
         Step::Rename(REPLACING_KEY_FILE, KEY_FILE.to_owned()),
         Step::Rename(REPLACING_CERTIFICATE_FILE, CERTIFICATE_FILE.to_owned()),
@@ -446,9 +472,10 @@ impl Folder {
     }
 
     fn rest_of_replacement(&self) -> Vec<Step> {
-        let present = self.fingerprint_in(CERTIFICATE_FILE);
-        let next = self.fingerprint_in(NEXT_CERTIFICATE_FILE);
-        completing_replacement(present.as_deref(), next.as_deref())
+        completing_replacement(&Replaced {
+            present: self.fingerprint_in(CERTIFICATE_FILE),
+            next: self.fingerprint_in(NEXT_CERTIFICATE_FILE),
+        })
     }
 
     /// Retries to make the last step durable, and applies the steps that follow it.
@@ -501,8 +528,11 @@ impl Folder {
 fn read(folder: &Path) -> Result<Kept, AuthorityError> {
     let present = Authority::load(folder)?;
     let next = if folder.join(NEXT_CERTIFICATE_FILE).exists() {
-        let next = load(folder, NEXT_CERTIFICATE_FILE, NEXT_KEY_FILE)?;
-        Some((next, read_started(folder)?))
+        let names = FileNames {
+            certificate: NEXT_CERTIFICATE_FILE,
+            key: NEXT_KEY_FILE,
+        };
+        Some((load(folder, names)?, read_started(folder)?))
     } else {
         None
     };
@@ -565,25 +595,17 @@ fn write(path: &Path, mode: u32, text: &str) -> io::Result<()> {
 }
 
 /// Replaces a file atomically, by way of a temporary file.
-fn replace(folder: &Path, name: &str, mode: u32, text: &str) -> io::Result<()> {
-    let new = folder.join(format!("{name}.new"));
+fn replace(path: &Path, mode: u32, text: &str) -> io::Result<()> {
+    let new = path.with_added_extension("new");
     remove(&new)?;
     write(&new, mode, text)?;
-    fs::rename(new, folder.join(name))
+    fs::rename(new, path)
 }
 
 fn remove(path: &Path) -> io::Result<()> {
     match fs::remove_file(path) {
         Err(cause) if cause.kind() != io::ErrorKind::NotFound => Err(cause),
         Ok(()) | Err(_) => Ok(()),
-    }
-}
-
-/// Renames a file; succeeds if it was renamed before.
-fn rename(from: &Path, to: &Path) -> io::Result<()> {
-    match fs::rename(from, to) {
-        Err(cause) if cause.kind() == io::ErrorKind::NotFound && to.exists() => Ok(()),
-        renamed => renamed,
     }
 }
 

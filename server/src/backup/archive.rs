@@ -14,7 +14,7 @@ use nix::fcntl::{PosixFadviseAdvice, posix_fadvise};
 use ring::digest::{Context, SHA256};
 use tar::{Builder, EntryType, Header};
 
-pub use self::extraction::{Extracted, extract, manifest, verify};
+pub use self::extraction::{Extracted, Extraction, extract, manifest, verify};
 use super::encryption::{EncryptionError, Filter};
 use super::manifest::{ArchivedFile, FORMAT, Manifest};
 use crate::file_error::FileError;
@@ -314,7 +314,7 @@ fn write_new(
     filter.check(status)?;
     packed?;
     let (file, archived) = file.done();
-    filter.check_size(archived.bytes, source.manifest.database.bytes)?;
+    filter.check_size(&archived, &source.manifest.database)?;
     file.finish().map_err(failed())?;
     Ok(archived)
 }

@@ -4,6 +4,9 @@
 use std::io::{self, BufReader, Read};
 use std::process::{Child, ChildStdout, Command, ExitStatus, Stdio};
 
+use super::archive::Archived;
+use super::manifest::ArchivedFile;
+
 /// Reason why an archive cannot be encrypted or decrypted.
 #[derive(Debug, thiserror::Error)]
 pub enum EncryptionError {
@@ -69,9 +72,10 @@ impl Filter {
     /// [`EncryptionError::TooLittle`].
     pub fn check_size(
         &self,
-        written_bytes: u64,
-        archive_bytes: u64,
+        written: &Archived,
+        database: &ArchivedFile,
     ) -> Result<(), EncryptionError> {
+        let (written_bytes, archive_bytes) = (written.bytes, database.bytes);
         if written_bytes > archive_bytes / COMPRESSION_MAX {
             return Ok(());
         }

@@ -39,9 +39,9 @@ pub struct ClockSteps {
 
 /// Simultaneous readings of wall clock (microseconds since 1970) and monotonic clock.
 #[derive(Debug, Clone, Copy)]
-struct Mark {
-    wall_us: i64,
-    elapsed: Duration,
+pub(super) struct Mark {
+    pub(super) wall_us: i64,
+    pub(super) elapsed: Duration,
 }
 
 /// State of the non-decreasing wall time.
@@ -125,12 +125,8 @@ impl Floor {
 
     /// Continues after the newest time of an earlier run, unless the machine's clock is more than
     /// [`STEP_BACK_HELD_MAX`] behind it. Returns the step to log, if any.
-    pub(super) fn continue_after(
-        &mut self,
-        newest_us: i64,
-        wall_us: i64,
-        elapsed: Duration,
-    ) -> Option<Step> {
+    pub(super) fn continue_after(&mut self, newest_us: i64, machine: Mark) -> Option<Step> {
+        let Mark { wall_us, elapsed } = machine;
         let ahead_us = newest_us.saturating_sub(wall_us);
         if ahead_us > micros(STEP_BACK_HELD_MAX) {
             return Some(Step::DatabaseAhead { by_us: ahead_us });
@@ -190,7 +186,11 @@ mod tests {
         let (issued_us, step) = floor.issue(begin_us - back_us, after(0), true);
         assert_eq!(issued_us, begin_us - back_us);
         assert_eq!(step, Some(Step::BackFollowed { by_us: back_us }));
-        let ahead = floor.continue_after(begin_us, begin_us - back_us, after(0));
+        let machine = Mark {
+            wall_us: begin_us - back_us,
+            elapsed: after(0),
+        };
+        let ahead = floor.continue_after(begin_us, machine);
         assert_eq!(ahead, Some(Step::DatabaseAhead { by_us: back_us }));
     }
 
@@ -212,7 +212,11 @@ mod tests {
     fn a_run_takes_up_after_the_newest_time_of_the_database() {
         let mut floor = Floor::default();
         let newest_us = 5_000 * SECOND_US;
-        let said = floor.continue_after(newest_us, newest_us - 10 * SECOND_US, after(0));
+        let machine = Mark {
+            wall_us: newest_us - 10 * SECOND_US,
+            elapsed: after(0),
+        };
+        let said = floor.continue_after(newest_us, machine);
         assert_eq!(
             said,
             Some(Step::BackHeld {

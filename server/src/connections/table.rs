@@ -22,8 +22,6 @@ const REQUESTS_OF_CONNECTION: RateLimit = RateLimit {
     burst: 50,
     interval: Duration::from_millis(20),
 };
-/// Maximum delay of one request; the next request of the connection is not read during it.
-const REQUEST_DELAY_MAX: Duration = Duration::from_secs(1);
 /// Number of identities with a stored rate from which those with an unused limit are dropped.
 const RATES_MAX: usize = 4_096;
 
@@ -81,21 +79,21 @@ impl Table {
         self.next
     }
 
-    /// Returns the delay of the next request on connection `id`. `now` is the time since the
-    /// table's creation.
+    /// Returns the delay of the next request on connection `id`, during which the connection is not
+    /// read. `now` is the time since the table's creation.
     pub(super) fn delay(&mut self, id: u64, purpose: Purpose, now: Duration) -> Duration {
         let Some(entry) = self.entries.get_mut(&id) else {
             return Duration::ZERO;
         };
         let (Some(identity), Purpose::Other) = (entry.known, purpose) else {
             let limit = REQUESTS_OF_CONNECTION;
-            return entry.rate.take_delayed(limit, now, REQUEST_DELAY_MAX);
+            return entry.rate.take_delayed(limit, now);
         };
         if self.rates.len() >= RATES_MAX {
             self.rates.retain(|_, rate| !rate.is_full(now));
         }
         let rate = self.rates.entry(identity).or_default();
-        rate.take_delayed(REQUESTS_OF_IDENTITY, now, REQUEST_DELAY_MAX)
+        rate.take_delayed(REQUESTS_OF_IDENTITY, now)
     }
 
     /// Inserts a connection, whose phase must be unproven.

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use rustls::pki_types::CertificateDer;
+use rustls::pki_types::{CertificateDer, TrustAnchor};
 use tread_api::diagnosis::Finding;
 use webpki::EndEntityCert;
 
@@ -183,7 +183,9 @@ fn names(
 fn issuers(shown: &str, certificates: &[CertificateDer<'static>]) -> Finding {
     for pair in certificates.windows(2) {
         let [one, next] = pair else { continue };
-        if !is_signed_by(one, next) {
+        let is_signed =
+            webpki::anchor_from_trusted_cert(next).is_ok_and(|issuer| is_signed_by(one, issuer));
+        if !is_signed {
             return Finding::problem(
                 "certificate chain",
                 format!(
@@ -199,20 +201,17 @@ fn issuers(shown: &str, certificates: &[CertificateDer<'static>]) -> Finding {
     Finding::ok("certificate chain", format!("it leads to `{from}`"))
 }
 
-fn is_signed_by(one: &CertificateDer<'_>, next: &CertificateDer<'_>) -> bool {
-    let (Ok(leaf), Ok(anchor)) = (
-        EndEntityCert::try_from(one),
-        webpki::anchor_from_trusted_cert(next),
-    ) else {
+fn is_signed_by(certificate: &CertificateDer<'_>, issuer: TrustAnchor<'_>) -> bool {
+    let Ok(leaf) = EndEntityCert::try_from(certificate) else {
         return false;
     };
-    let Some(read) = Certificate::read(one) else {
+    let Some(read) = Certificate::read(certificate) else {
         return false;
     };
     let seconds = u64::try_from(read.not_after.as_second()).unwrap_or_default();
     let at = rustls::pki_types::UnixTime::since_unix_epoch(std::time::Duration::from_secs(seconds));
     let provider = rustls::crypto::ring::default_provider();
-    let anchors = [anchor];
+    let anchors = [issuer];
     let verified = leaf.verify_for_usage(
         provider.signature_verification_algorithms.all,
         &anchors,

@@ -31,14 +31,14 @@ pub(super) fn findings(examined: &Examined, newest: Option<Timestamp>) -> Vec<Fi
             format!("it says {now:.0}; whether it is synchronised is not known here"),
         ),
     }];
-    findings.extend(newest.and_then(|newest| behind(now, newest)));
+    findings.extend(newest.and_then(|newest| behind(now, newest.duration_since(now))));
     findings
 }
 
-/// Returns a finding if the database holds times in the future.
-fn behind(now: Timestamp, newest: Timestamp) -> Option<Finding> {
-    let ahead = newest.duration_since(now);
+/// Returns a finding if the database's newest time is ahead of the clock.
+fn behind(now: Timestamp, ahead: SignedDuration) -> Option<Finding> {
     (ahead > AHEAD_MAX).then(|| {
+        let newest = now + ahead;
         Finding::problem(
             "clock",
             format!(
@@ -87,9 +87,9 @@ mod tests {
     #[test]
     fn a_clock_behind_the_database_is_found_and_a_short_step_is_not() {
         let now: Timestamp = "2026-11-02T10:00:00Z".parse().unwrap();
-        assert_eq!(behind(now, now + SignedDuration::from_secs(5)), None);
-        assert_eq!(behind(now, now - SignedDuration::from_hours(1)), None);
-        let found = behind(now, now + SignedDuration::from_hours(1)).unwrap();
+        assert_eq!(behind(now, SignedDuration::from_secs(5)), None);
+        assert_eq!(behind(now, -SignedDuration::from_hours(1)), None);
+        let found = behind(now, SignedDuration::from_hours(1)).unwrap();
         assert!(found.text.contains("3600 s before"), "{found:?}");
         assert!(!found.holds());
     }

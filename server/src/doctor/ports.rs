@@ -27,6 +27,14 @@ enum Port {
     Impossible(io::Error),
 }
 
+/// Port of the configuration: its name in findings, its key, and its address.
+#[derive(Clone, Copy)]
+struct Configured {
+    name: &'static str,
+    key: &'static str,
+    address: SocketAddr,
+}
+
 fn look(address: SocketAddr) -> Port {
     match TcpListener::bind(address) {
         Ok(_) => Port::Free,
@@ -40,17 +48,19 @@ pub(super) async fn findings(examined: &Examined) -> Vec<Finding> {
     let mut findings = rest(examined).await;
     findings.push(robots(examined).await);
     if let Some(address) = config.metrics {
+        let port = Configured {
+            name: "port of metrics",
+            key: "metrics",
+            address,
+        };
         findings.push(match look(address) {
             Port::Taken => match probe::get(address, false, "/metrics").await {
-                Some(answer) if answer.text.contains("tread_uptime") => Finding::ok(
-                    "port of metrics",
-                    format!("our server answers on {address}"),
-                ),
-                Some(_) | None => taken("port of metrics", "metrics", address),
+                Some(answer) if answer.text.contains("tread_uptime") => {
+                    Finding::ok(port.name, format!("our server answers on {address}"))
+                }
+                Some(_) | None => port.taken(),
             },
-            other @ (Port::Free | Port::Impossible(_)) => {
-                not_taken(examined, "port of metrics", "metrics", address, other)
-            }
+            other @ (Port::Free | Port::Impossible(_)) => port.not_taken(examined, other),
         });
     }
     findings
@@ -58,28 +68,32 @@ pub(super) async fn findings(examined: &Examined) -> Vec<Finding> {
 
 /// Examines the port of the REST API.
 async fn rest(examined: &Examined) -> Vec<Finding> {
-    const NAME: &str = "port of REST";
     let address = examined.config.http;
+    let port = Configured {
+        name: "port of REST",
+        key: "http",
+        address,
+    };
     match look(address) {
         Port::Taken => {}
         other @ (Port::Free | Port::Impossible(_)) => {
-            return vec![not_taken(examined, NAME, "http", address, other)];
+            return vec![port.not_taken(examined, other)];
         }
     }
     let is_tls = examined.config.tls.is_some();
     let Some(answer) = probe::get(address, is_tls, "/healthz").await else {
-        return vec![taken(NAME, "http", address)];
+        return vec![port.taken()];
     };
     if !answer.is_health() {
-        return vec![taken(NAME, "http", address)];
+        return vec![port.taken()];
     }
     let mut findings = vec![Finding::ok(
-        NAME,
+        port.name,
         format!("a Tread server answers on {address}"),
     )];
     if examined.server_process.is_none() {
         findings = vec![Finding::problem(
-            NAME,
+            port.name,
             format!("a Tread server answers on {address}, and it does not use this database"),
             "stop that server, or give this one another address by `http`",
         )];
@@ -152,24 +166,28 @@ fn served(examined: &Examined, answer: &Answer) -> Option<Finding> {
 
 /// Examines the robots' port.
 async fn robots(examined: &Examined) -> Finding {
-    const NAME: &str = "port of robots";
     let address = examined.config.zenoh;
+    let port = Configured {
+        name: "port of robots",
+        key: "zenoh",
+        address,
+    };
     match look(address) {
         Port::Taken => {}
         other @ (Port::Free | Port::Impossible(_)) => {
-            return not_taken(examined, NAME, "zenoh", address, other);
+            return port.not_taken(examined, other);
         }
     }
     let Some(robots) = &examined.config.robots else {
         let is_ours = examined.server_process.is_some() && probe::is_open(address).await;
         return if is_ours {
-            Finding::ok(NAME, format!("it accepts connections on {address}"))
+            Finding::ok(port.name, format!("it accepts connections on {address}"))
         } else {
-            taken(NAME, "zenoh", address)
+            port.taken()
         };
     };
     let Some(leaf) = probe::certificate(address).await else {
-        return taken(NAME, "zenoh", address);
+        return port.taken();
     };
     let issuer = Certificate::read(&leaf).map(|read| read.issuer);
     let authority = Authority::load(&robots.authority).ok();
@@ -179,60 +197,58 @@ async fn robots(examined: &Examined) -> Finding {
         .map(|read| read.subject);
     if issuer.is_some() && issuer == subject {
         Finding::ok(
-            NAME,
+            port.name,
             format!("it answers on {address} with a certificate of the fleet's authority"),
         )
     } else {
         Finding::problem(
-            NAME,
+            port.name,
             format!("what answers on {address} shows no certificate of the fleet's authority"),
             "stop the other program, or give the robots another address by `zenoh`",
         )
     }
 }
 
-fn taken(name: &'static str, key: &str, address: SocketAddr) -> Finding {
-    let port = address.port();
-    Finding::problem(
-        name,
-        format!("another program has {address}"),
-        format!(
-            "`ss -ltnp sport = :{port}` shows which; stop it, or take another address by `{key}`"
-        ),
-    )
-}
-
-#[expect(
-    clippy::wildcard_enum_match_arm,
-    reason = "of all other errors the message says enough"
-)]
-fn not_taken(
-    examined: &Examined,
-    name: &'static str,
-    key: &str,
-    address: SocketAddr,
-    port: Port,
-) -> Finding {
-    match (port, examined.server_process) {
-        (Port::Taken, _) => taken(name, key, address),
-        (Port::Free, Some(process)) if address.port() != 0 => Finding::problem(
+impl Configured {
+    fn taken(self) -> Finding {
+        let Self { name, key, address } = self;
+        let port = address.port();
+        Finding::problem(
             name,
-            format!("the server, process {process}, does not have {address}"),
-            "it was started with another configuration, is still starting, or hangs: see its log",
-        ),
-        (Port::Free, _) => Finding::ok(name, format!("{address} is free")),
-        (Port::Impossible(error), _) => {
-            let step = match error.kind() {
-                io::ErrorKind::PermissionDenied => format!(
-                    "ports below 1024 are for root: take another by `{key}`, or give the server \
-                     CAP_NET_BIND_SERVICE"
-                ),
-                io::ErrorKind::AddrNotAvailable => format!(
-                    "`{key}` must be an address of this machine (`ip address`), or 0.0.0.0 for all"
-                ),
-                _ => format!("take another address by `{key}`"),
-            };
-            Finding::problem(name, format!("cannot listen on {address}: {error}"), step)
+            format!("another program has {address}"),
+            format!(
+                "`ss -ltnp sport = :{port}` shows which; stop it, or take another address by `{key}`"
+            ),
+        )
+    }
+
+    #[expect(
+        clippy::wildcard_enum_match_arm,
+        reason = "of all other errors the message says enough"
+    )]
+    fn not_taken(self, examined: &Examined, port: Port) -> Finding {
+        let Self { name, key, address } = self;
+        match (port, examined.server_process) {
+            (Port::Taken, _) => self.taken(),
+            (Port::Free, Some(process)) if address.port() != 0 => Finding::problem(
+                name,
+                format!("the server, process {process}, does not have {address}"),
+                "it was started with another configuration, is still starting, or hangs: see its log",
+            ),
+            (Port::Free, _) => Finding::ok(name, format!("{address} is free")),
+            (Port::Impossible(error), _) => {
+                let step = match error.kind() {
+                    io::ErrorKind::PermissionDenied => format!(
+                        "ports below 1024 are for root: take another by `{key}`, or give the server \
+                         CAP_NET_BIND_SERVICE"
+                    ),
+                    io::ErrorKind::AddrNotAvailable => format!(
+                        "`{key}` must be an address of this machine (`ip address`), or 0.0.0.0 for all"
+                    ),
+                    _ => format!("take another address by `{key}`"),
+                };
+                Finding::problem(name, format!("cannot listen on {address}: {error}"), step)
+            }
         }
     }
 }

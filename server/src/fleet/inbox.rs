@@ -16,7 +16,9 @@ use zenoh::{Session, Wait as _};
 
 use super::gate::{CUT_OFF, Links};
 use super::rate_limits::{Appeared, Kind, Place, RateLimits};
-use super::received::{Asked, count_refusal, explained, log_refusal, next, refuse_key};
+use super::received::{
+    Asked, RefusedMessage, count_refusal, explained, log_refusal, next, refuse_key,
+};
 use super::republish::Republisher;
 use super::{requests, tokens};
 use crate::app::App;
@@ -453,7 +455,11 @@ fn read<T: serde::de::DeserializeOwned>(
     } else {
         keys::state(site, robot)
     };
-    log_refusal(app, limits, message.place.robot(), &key, &why);
+    let refused = RefusedMessage {
+        key: &key,
+        why: &why,
+    };
+    log_refusal(app, limits, message.place.robot(), refused);
     None
 }
 

@@ -30,8 +30,21 @@ pub(super) async fn next<T>(
     }
 }
 
+/// A refused message: its key, and the reason.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct RefusedMessage<'text> {
+    pub(super) key: &'text str,
+    pub(super) why: &'text str,
+}
+
 /// Logs a refused message, at a limited rate per robot, with the number of those not logged.
-pub(super) fn log_refusal(app: &App, limits: &RateLimits, robot: &RobotKey, key: &str, why: &str) {
+pub(super) fn log_refusal(
+    app: &App,
+    limits: &RateLimits,
+    robot: &RobotKey,
+    refused: RefusedMessage<'_>,
+) {
+    let RefusedMessage { key, why } = refused;
     if let Some(repeats) = limits.log_refused(robot, app.clock().elapsed()) {
         warn!(repeats, "a message on `{key}` was refused: {why}");
     }

@@ -17,7 +17,9 @@ use zenoh::Wait as _;
 use zenoh::query::Query;
 
 use super::rate_limits::RateLimits;
-use super::received::{Asked, count_refusal, explained, log_refusal, next, refuse_key};
+use super::received::{
+    Asked, RefusedMessage, count_refusal, explained, log_refusal, next, refuse_key,
+};
 use crate::app::App;
 use crate::app::ingest::Upload;
 use crate::supervisor::Supervisor;
@@ -110,7 +112,11 @@ impl Replies {
             }
         };
         if let Err(refusal) = &body {
-            log_refusal(&self.app, &self.limits, &of, key, &refusal.detail);
+            let refused = RefusedMessage {
+                key,
+                why: &refusal.detail,
+            };
+            log_refusal(&self.app, &self.limits, &of, refused);
         }
         Some((site, body))
     }

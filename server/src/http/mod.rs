@@ -62,6 +62,7 @@ use self::problem::{Problem, Refused};
 use crate::app::App;
 use crate::app::metrics::MEDIA_TYPE;
 use crate::identity::origin::Names;
+use crate::metrics::AnsweredRequest;
 
 /// Maximum size of the body of `POST /v1/missions`, bytes: the longest waypoint path.
 pub const MISSION_BODY_MAX: usize = 16 * 1024 * 1024;
@@ -293,12 +294,15 @@ async fn metrics(State(app): State<App>) -> Result<Response, Problem> {
 async fn measure(State(app): State<App>, request: Request, next: Next) -> Response {
     let route = request.extensions().get::<MatchedPath>();
     let route = route.map_or("none", MatchedPath::as_str).to_owned();
-    let method = request.method().as_str().to_owned();
+    let method = request.method().clone();
     let asked_at = app.clock().elapsed();
     let response = next.run(request).await;
-    let took = app.clock().elapsed().saturating_sub(asked_at);
-    let status = response.status().as_u16();
-    app.metrics().request(&method, &route, status, took);
+    app.metrics().request(&AnsweredRequest {
+        method: method.as_str(),
+        route: &route,
+        status: response.status().as_u16(),
+        took: app.clock().elapsed().saturating_sub(asked_at),
+    });
     if let Some(Refused(kind)) = response.extensions().get() {
         app.metrics().request_refused(*kind);
     }

@@ -38,6 +38,15 @@ impl PendingKey {
     }
 }
 
+/// What a browser presents when the provider redirects it back.
+#[derive(Clone, Copy)]
+pub struct Presented<'browser> {
+    /// Its cookie, as [`Pending::cookie`].
+    pub cookie: &'browser str,
+    /// The `state` that the provider returned.
+    pub state: &'browser str,
+}
+
 /// A sign-in that is in progress at the provider.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Pending {
@@ -85,12 +94,13 @@ impl Pending {
         &self.cookie
     }
 
-    /// Restores the sign-in from the browser's cookie and the `state` that the provider returned.
+    /// Restores the sign-in from what the browser presents.
     ///
     /// Returns `None` if `state` was not derived from `cookie` with `key`, or if the sign-in began
     /// [`SIGN_IN_LASTS`] ago or earlier.
-    pub fn resume(key: &PendingKey, cookie: &str, state: &str, now: Timestamp) -> Option<Self> {
+    pub fn resume(key: &PendingKey, presented: Presented<'_>, now: Timestamp) -> Option<Self> {
         use subtle::ConstantTimeEq as _;
+        let Presented { cookie, state } = presented;
         if cookie.len() > COOKIE_MAX {
             return None;
         }
@@ -121,24 +131,36 @@ mod tests {
     #[test]
     fn a_sign_in_goes_on_with_its_own_cookie_and_state_for_ten_minutes() {
         let pending = Pending::begin(&key(1), &[2; SIGN_IN_RANDOM_BYTES], time(0));
-        let resume = |key: &PendingKey, cookie: &str, state: &str, second| {
-            Pending::resume(key, cookie, state, time(second))
+        let resume = |key: &PendingKey, presented: Presented<'_>, second| {
+            Pending::resume(key, presented, time(second))
         };
         let (cookie, state) = (pending.cookie(), pending.state.as_str());
-        assert_eq!(resume(&key(1), cookie, state, 599), Some(pending.clone()));
-        assert_eq!(resume(&key(1), cookie, state, 600), None, "too late");
-        assert_eq!(resume(&key(2), cookie, state, 0), None, "another server's");
+        let own = Presented { cookie, state };
+        assert_eq!(resume(&key(1), own, 599), Some(pending.clone()));
+        assert_eq!(resume(&key(1), own, 600), None, "too late");
+        assert_eq!(resume(&key(2), own, 0), None, "another server's");
         let other = Pending::begin(&key(1), &[3; SIGN_IN_RANDOM_BYTES], time(0));
-        assert_eq!(resume(&key(1), other.cookie(), state, 0), None);
-        assert_eq!(resume(&key(1), cookie, &other.state, 0), None);
-        assert_eq!(resume(&key(1), cookie, "", 0), None);
+        for state in [&other.state, ""] {
+            let presented = Presented { cookie, state };
+            assert_eq!(resume(&key(1), presented, 0), None);
+        }
+        let cookie_of_other = Presented {
+            cookie: other.cookie(),
+            ..own
+        };
+        assert_eq!(resume(&key(1), cookie_of_other, 0), None);
         // Changing the time of the cookie changes the state that it needs.
         let later = cookie.replacen("1800000000", "1800000600", 1);
         assert_ne!(later, cookie);
-        assert_eq!(resume(&key(1), &later, state, 600), None);
+        let later = Presented {
+            cookie: &later,
+            ..own
+        };
+        assert_eq!(resume(&key(1), later, 600), None);
         for odd in ["", ".", "1800000000", &"9".repeat(COOKIE_MAX + 1)] {
-            let state = Pending::of(&key(1), odd.to_owned()).state;
-            assert_eq!(resume(&key(1), odd, &state, 0), None, "{odd}");
+            let state = &Pending::of(&key(1), odd.to_owned()).state;
+            let presented = Presented { cookie: odd, state };
+            assert_eq!(resume(&key(1), presented, 0), None, "{odd}");
         }
     }
 

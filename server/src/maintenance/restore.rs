@@ -21,7 +21,7 @@ use super::unfinished::{BESIDE, Unfinished, with_ending};
 use super::{ServerFiles, file_of};
 use crate::app::backups::check_space;
 use crate::authority::{AuthorityError, CERTIFICATE_FILE, copies};
-use crate::backup::archive::{self, sync_folder};
+use crate::backup::archive::{self, Extraction, sync_folder};
 use crate::backup::{Filter, Manifest};
 use crate::build;
 use crate::clock::Clock;
@@ -103,7 +103,7 @@ pub(crate) async fn run(args: RestoreArgs) -> anyhow::Result<()> {
     )?;
     let now = Clock::system().now();
     let restoring = Unfinished::begin(&database, RESTORING_ENDING)?;
-    let extracted = extract(&args.from, key.as_ref(), restoring.path()).await?;
+    let extracted = extract(&args.from, key.as_ref(), &restoring).await?;
     let contents = copy::examine(restoring.path()).await;
     let contents = contents.context("the database in the backup is damaged")?;
     ensure!(
@@ -207,13 +207,18 @@ async fn settle_log(database: &Path) {
 async fn extract(
     from: &Path,
     key: Option<&Filter>,
-    target: &Path,
+    restoring: &Unfinished,
 ) -> anyhow::Result<archive::Extracted> {
-    let (from, key, target) = (from.to_owned(), key.cloned(), target.to_owned());
+    let (from, key, database) = (from.to_owned(), key.cloned(), restoring.path().to_owned());
     let extracting = tokio::task::spawn_blocking(move || {
         let of = archive::manifest(&from, key.as_ref())?.database.bytes;
         let mut shown = None;
-        archive::extract(&from, key.as_ref(), &target, &mut |bytes| {
+        let extraction = Extraction {
+            archive: &from,
+            key: key.as_ref(),
+            database: &database,
+        };
+        archive::extract(&extraction, &mut |bytes| {
             let percent = (bytes.saturating_mul(100) / of.max(1)).min(100);
             let step = percent / STEP_PERCENT * STEP_PERCENT;
             if shown != Some(step) {

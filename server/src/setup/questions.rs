@@ -17,6 +17,10 @@ const TRIES_MAX: u32 = 5;
 /// Maximum number of bytes of an answer.
 const ANSWER_BYTES_MAX: u64 = 4_096;
 
+/// Answer to a question that Enter stands for.
+#[derive(Clone, Copy)]
+struct DefaultAnswer<'text>(&'text str);
+
 /// A person who answers.
 pub(super) struct Questions<'a> {
     input: &'a mut dyn BufRead,
@@ -39,7 +43,7 @@ impl<'a> Questions<'a> {
     fn ask<T>(
         &mut self,
         question: &str,
-        default: &str,
+        DefaultAnswer(default): DefaultAnswer<'_>,
         read: impl Fn(&str) -> Result<T, String>,
     ) -> anyhow::Result<T> {
         for _ in 0..TRIES_MAX {
@@ -123,7 +127,7 @@ pub(super) fn ask(
         .say("This writes a configuration for a Tread server. Enter takes what is in brackets.")?;
     let config = questions.ask(
         "Configuration file",
-        &defaults.config.display().to_string(),
+        DefaultAnswer(&defaults.config.display().to_string()),
         path,
     )?;
     let data_dir = if let Some(folder) = &args.data_dir {
@@ -132,13 +136,13 @@ pub(super) fn ask(
         let default = defaults.data_dir(&config);
         questions.ask(
             "Folder of database and authority",
-            &default.display().to_string(),
+            DefaultAnswer(&default.display().to_string()),
             path,
         )?
     };
     let site = match &args.site {
         Some(site) => site.clone(),
-        None => questions.ask("Site", SITE_DEFAULT, parsed)?,
+        None => questions.ask("Site", DefaultAnswer(SITE_DEFAULT), parsed)?,
     };
     let tls = match args.tls {
         Some(tls) => tls,
@@ -151,7 +155,7 @@ pub(super) fn ask(
                  3  by a proxy on this machine that ends TLS\n  \
                  4  from this machine alone, without TLS",
             )?;
-            questions.ask("One of 1 to 4", "1", way)?
+            questions.ask("One of 1 to 4", DefaultAnswer("1"), way)?
         }
     };
     let names = if tls == TlsChoice::Loopback || !args.names.is_empty() {
@@ -160,7 +164,7 @@ pub(super) fn ask(
         let default = defaults.host_name.as_deref().unwrap_or("");
         questions.ask(
             "Names and addresses by which others find this server, separated by commas",
-            default,
+            DefaultAnswer(default),
             names,
         )?
     };
@@ -172,15 +176,23 @@ pub(super) fn ask(
     let [http, zenoh] = tls.addresses();
     let http = match args.http {
         Some(http) => http,
-        None => questions.ask("Address of the REST API", &http.to_string(), parsed)?,
+        None => questions.ask(
+            "Address of the REST API",
+            DefaultAnswer(&http.to_string()),
+            parsed,
+        )?,
     };
     let zenoh = match args.zenoh {
         Some(zenoh) => zenoh,
-        None => questions.ask("Address that robots connect to", &zenoh.to_string(), parsed)?,
+        None => questions.ask(
+            "Address that robots connect to",
+            DefaultAnswer(&zenoh.to_string()),
+            parsed,
+        )?,
     };
     let token_file = questions.ask(
         "File for the admin's token",
-        &defaults.token_file(&config).display().to_string(),
+        DefaultAnswer(&defaults.token_file(&config).display().to_string()),
         path,
     )?;
     let choices = Choices {
@@ -195,7 +207,7 @@ pub(super) fn ask(
     };
     choices.check()?;
     questions.say(&format!("\n{}", super::text::toml(&choices)))?;
-    if !questions.ask("Write this configuration?", "yes", is_yes)? {
+    if !questions.ask("Write this configuration?", DefaultAnswer("yes"), is_yes)? {
         bail!("nothing was written");
     }
     Ok(choices)
@@ -207,10 +219,14 @@ fn ask_files(names: &[String], questions: &mut Questions<'_>) -> anyhow::Result<
         let files = TlsFiles {
             certificate: questions.ask(
                 "Certificate, PEM, with its intermediate certificates",
-                "/etc/tread/fullchain.pem",
+                DefaultAnswer("/etc/tread/fullchain.pem"),
                 path,
             )?,
-            key: questions.ask("Its private key, PEM", "/etc/tread/key.pem", path)?,
+            key: questions.ask(
+                "Its private key, PEM",
+                DefaultAnswer("/etc/tread/key.pem"),
+                path,
+            )?,
         };
         match check_files(&files, names) {
             Ok(()) => return Ok(files),

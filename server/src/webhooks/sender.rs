@@ -168,7 +168,7 @@ impl Sender {
         let addresses = self.addresses(&url).await?;
         let client = self.client(&url, addresses).await?;
         let timestamp_s = outgoing.at.as_second();
-        let signed = signature(&outgoing.secret, timestamp_s, &outgoing.body);
+        let signed = signature(outgoing);
         Ok(client
             .post(url)
             .header(header::CONTENT_TYPE, "application/json")

@@ -143,6 +143,7 @@ impl App {
         let looking = move |reader: &MapReader<'_>, [early, late]: &[Reading; 2]| {
             let (mut found, mut after) = (Vec::new(), after);
             let mut at_once = CELLS_AT_ONCE;
+            let compared = Compared { early, late };
             while found.len() <= wanted {
                 let (some, last) = smaller(&mut at_once, |at_once| {
                     reader.cells(&row, |map| {
@@ -152,7 +153,7 @@ impl App {
                             let newest = map.newest_at_us(cell, late.choice());
                             newest.is_some_and(|newest_us| newest_us >= early.now_us)
                         });
-                        let some = measured.map(|cell| (cell, differences(map, cell, early, late)));
+                        let some = measured.map(|cell| (cell, compared.differences(map, cell)));
                         (some.collect::<Vec<_>>(), cells.last().copied())
                     })
                 })?;
@@ -253,33 +254,44 @@ pub(super) fn of_square(
     groups.into_iter().filter_map(entry).collect()
 }
 
-fn differences(map: Cells<'_>, cell: Cell, early: &Reading, late: &Reading) -> Vec<CellDifference> {
-    type Key = (Option<TerrainRef>, ConfigurationId);
-    let key = |group: &Group<'_>| -> Key { (group.terrain.cloned(), group.configuration) };
-    let mut before: BTreeMap<Key, _> = map
-        .cell(cell, early.choice())
-        .into_iter()
-        .filter_map(|group| Some((key(&group), early.fused(group, Ground::Cell)?)))
-        .collect();
-    let after = map.cell(cell, late.choice()).into_iter();
-    let both = after.map(|group| {
-        let key = key(&group);
-        let before = before.remove(&key);
-        let after = late.fused(group, Ground::Cell);
-        let z_score = before.zip(after).map(|(before, after)| {
-            (after.theta - before.theta) / before.std_dev.hypot(after.std_dev)
+/// Readings of the map as of two times.
+#[derive(Clone, Copy)]
+struct Compared<'reading> {
+    early: &'reading Reading,
+    late: &'reading Reading,
+}
+
+impl Compared<'_> {
+    /// Returns the differences of friction in a cell, per terrain and configuration.
+    fn differences(self, map: Cells<'_>, cell: Cell) -> Vec<CellDifference> {
+        type Key = (Option<TerrainRef>, ConfigurationId);
+        let Self { early, late } = self;
+        let key = |group: &Group<'_>| -> Key { (group.terrain.cloned(), group.configuration) };
+        let mut before: BTreeMap<Key, _> = map
+            .cell(cell, early.choice())
+            .into_iter()
+            .filter_map(|group| Some((key(&group), early.fused(group, Ground::Cell)?)))
+            .collect();
+        let after = map.cell(cell, late.choice()).into_iter();
+        let both = after.map(|group| {
+            let key = key(&group);
+            let before = before.remove(&key);
+            let after = late.fused(group, Ground::Cell);
+            let z_score = before.zip(after).map(|(before, after)| {
+                (after.theta - before.theta) / before.std_dev.hypot(after.std_dev)
+            });
+            CellDifference {
+                cell,
+                terrain: key.0,
+                configuration: key.1,
+                before,
+                after,
+                z_score,
+                normalisation: late.normalisation(),
+            }
         });
-        CellDifference {
-            cell,
-            terrain: key.0,
-            configuration: key.1,
-            before,
-            after,
-            z_score,
-            normalisation: late.normalisation(),
-        }
-    });
-    both.collect()
+        both.collect()
+    }
 }
 
 /// Joins groups of the same configuration, measured on several revisions of the same ground.

@@ -5,6 +5,7 @@ use tread_api::geometry::Point;
 use tread_api::ids::TerrainId;
 use tread_api::terrain::{Terrain, TerrainRef, TerrainShape, terrain_at};
 
+use super::area::Area;
 use super::{SiteView, terrain_ref};
 use crate::friction::index::GROUND_NONE;
 
@@ -63,8 +64,9 @@ impl<'view> Drawn<'view> {
         u16::try_from(place + 1).ok()
     }
 
-    /// Returns the terrains whose bounding boxes touch a box.
-    pub(super) fn near(&self, low: Point, high: Point) -> Near<'view> {
+    /// Returns the terrains whose bounding boxes touch an area.
+    pub(super) fn near(&self, area: Area) -> Near<'view> {
+        let Area { min, max } = area;
         let touches = |terrain: &Terrain| {
             let corners = terrain.polygon.corners();
             let span = |of: fn(&Point) -> f64| {
@@ -73,7 +75,7 @@ impl<'view> Drawn<'view> {
                 (least, values.fold(f64::NEG_INFINITY, f64::max))
             };
             let (x, y) = (span(|corner| corner.x_m), span(|corner| corner.y_m));
-            x.0 <= high.x_m && x.1 >= low.x_m && y.0 <= high.y_m && y.1 >= low.y_m
+            x.0 <= max.x_m && x.1 >= min.x_m && y.0 <= max.y_m && y.1 >= min.y_m
         };
         let mut found: Vec<(u16, &'view Terrain)> = (1..)
             .zip(self.terrains)
@@ -88,7 +90,7 @@ impl<'view> Drawn<'view> {
     }
 }
 
-/// Terrains whose bounding boxes touch a box, in order of precedence.
+/// Terrains whose bounding boxes touch an area, in order of precedence.
 pub(super) struct Near<'view> {
     found: Vec<(u16, &'view Terrain)>,
 }

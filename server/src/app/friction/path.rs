@@ -12,6 +12,7 @@ use tread_api::robot::RobotModel;
 use tread_api::site::{Cell, Grid};
 use tread_control::robot::RobotModel as PlannedModel;
 
+use super::area::Area;
 use super::drawn::{Drawn, Near};
 use super::map_reader::in_parts;
 use super::{App, AppError, Asked, MapReader, Reading, SiteView};
@@ -170,7 +171,7 @@ pub(super) fn cut(points: &[Point], grid: &Grid) -> Result<Vec<Cut>, AppError> {
         }
         let curvature_1_m = match index {
             0 => 0.0,
-            _ => curvature(points[index - 1], begin, end),
+            _ => curvature(points, index),
         };
         let at = |share: f64| Point {
             x_m: begin.x_m + share * (end.x_m - begin.x_m),
@@ -216,8 +217,10 @@ fn crossings((from_m, to_m): (f64, f64), cell_m: f64) -> Vec<f64> {
     shares
 }
 
-/// Returns the curvature of the circle through three points, per metre; infinite for a reversal.
-fn curvature(a: Point, b: Point, c: Point) -> f64 {
+/// Returns the curvature of the circle through a corner and the points beside it, per metre; infinite
+/// for a reversal.
+fn curvature(points: &[Point], corner: usize) -> f64 {
+    let (a, b, c) = (points[corner - 1], points[corner], points[corner + 1]);
     let (ab, bc, ca) = (a.distance_m(b), b.distance_m(c), c.distance_m(a));
     let doubled_area =
         ((b.x_m - a.x_m) * (c.y_m - a.y_m) - (b.y_m - a.y_m) * (c.x_m - a.x_m)).abs();
@@ -239,7 +242,7 @@ pub(super) fn drawn_near<'view, 'cut>(
     drawn: &Drawn<'view>,
     places: impl IntoIterator<Item = &'cut Cut>,
 ) -> Near<'view> {
-    let (mut low, mut high) = (
+    let (mut min, mut max) = (
         Point {
             x_m: f64::INFINITY,
             y_m: f64::INFINITY,
@@ -250,10 +253,10 @@ pub(super) fn drawn_near<'view, 'cut>(
         },
     );
     for Cut { middle, .. } in places {
-        (low.x_m, low.y_m) = (low.x_m.min(middle.x_m), low.y_m.min(middle.y_m));
-        (high.x_m, high.y_m) = (high.x_m.max(middle.x_m), high.y_m.max(middle.y_m));
+        (min.x_m, min.y_m) = (min.x_m.min(middle.x_m), min.y_m.min(middle.y_m));
+        (max.x_m, max.y_m) = (max.x_m.max(middle.x_m), max.y_m.max(middle.y_m));
     }
-    drawn.near(low, high)
+    drawn.near(Area { min, max })
 }
 
 /// Reads the map at one place after another.

@@ -107,8 +107,10 @@ impl Frame<'_> {
 
     fn grounds(&self, block: Block) -> Arc<[u16]> {
         let grid = self.view.row.site.grid;
-        let (low, high) = (grid.center_of(block.first()), grid.center_of(block.last()));
-        let near = self.drawn.near(low, high);
+        let near = self.drawn.near(Area {
+            min: grid.center_of(block.first()),
+            max: grid.center_of(block.last()),
+        });
         let places = 0..u16::try_from(CELLS_PER_BLOCK).unwrap_or(u16::MAX);
         places
             .map(|place| near.ground_at(grid.center_of(block.cell(place))))
@@ -212,9 +214,10 @@ impl Frame<'_> {
             cell_m: grid.cell_m * f64::from(factor),
             ..grid
         };
-        let near = self
-            .drawn
-            .near(coarse.center_of(min), coarse.center_of(max));
+        let near = self.drawn.near(Area {
+            min: coarse.center_of(min),
+            max: coarse.center_of(max),
+        });
         let mut squares = Vec::new();
         let columns: Vec<i32> = (min.ix..=max.ix).collect();
         let at_once = usize::try_from(CELLS_PER_READ / factor)

@@ -35,7 +35,7 @@ use crate::identity::address::network_of;
 use crate::identity::claims::{NAME_MAX, groups, shown_name};
 use crate::identity::grants::Grants;
 use crate::identity::origin::{Origin, Provenance};
-use crate::identity::pending::{Pending, PendingKey, SIGN_IN_RANDOM_BYTES};
+use crate::identity::pending::{Pending, PendingKey, Presented, SIGN_IN_RANDOM_BYTES};
 use crate::identity::secret::Secret;
 use crate::identity::subject::name_of_person;
 use crate::oidc::{ExchangeError, Provider, SignedInThere};
@@ -368,7 +368,10 @@ impl App {
         let people = self.people().ok_or(PersonError::NotConfigured)?;
         let now = self.clock().now();
         let pending = cookie
-            .and_then(|cookie| Pending::resume(&people.key, cookie, &answer.state, now))
+            .and_then(|cookie| {
+                let state = &answer.state;
+                Pending::resume(&people.key, Presented { cookie, state }, now)
+            })
             .filter(|pending| !people.is_used(&pending.state))
             .ok_or(PersonError::NotBegun)?;
         if let Some(issuer) = &answer.issuer

@@ -12,7 +12,7 @@ use tread_api::rights::{Right, Rights, Scope};
 use super::quota::{Count, Quota};
 use super::sessions::still_holds;
 use super::{Credential, new_secret};
-use crate::app::{App, AppError, page, people_line, site_row};
+use crate::app::{App, AppError, PeopleField, page, people_line, site_row};
 use crate::db::{self, Tx};
 use crate::identity::secret::Kind;
 use crate::identity::subject::{SubjectId, may_name_token};
@@ -184,7 +184,7 @@ impl App {
         (created_by, within): (&str, &Scope),
     ) -> Result<CreatedToken, AppError> {
         let now = self.clock().now();
-        let name = people_line("name", &request.name, TOKEN_NAME_MAX)?;
+        let name = people_line(PeopleField::Name, &request.name, TOKEN_NAME_MAX)?;
         if !may_name_token(&name) {
             let detail =
                 "no token is called like a person (`oidc:NAME`) or by a person's identifier";

@@ -98,9 +98,9 @@ pub(super) struct Now {
 }
 
 impl Now {
-    /// Returns whether a robot's report is overdue that had so much time since then.
-    fn is_beyond(self, grace: Duration, since: Duration) -> bool {
-        self.elapsed.saturating_sub(since.max(self.answering_since)) > grace
+    /// Returns the time that a robot has had for a report since then.
+    fn time_since(self, since: Duration) -> Duration {
+        self.elapsed.saturating_sub(since.max(self.answering_since))
     }
 }
 
@@ -168,7 +168,7 @@ pub(super) fn decide(mission: &Standing, presence: &Presence, memory: Memory, no
         };
     }
     let said = driven(mission, presence);
-    let longer_than = |grace: Duration| move |since: Duration| now.is_beyond(grace, since);
+    let longer_than = |grace: Duration| move |since: Duration| now.time_since(since) > grace;
     let ended_there = memory.ended_since.is_some_and(longer_than(RESTART_GRACE));
     let forgotten = memory.absent_since.is_some_and(longer_than(FORGET_GRACE));
     let restarted = is_lost_by_restart(mission, presence, said.is_some(), now);
@@ -284,7 +284,7 @@ fn is_lost_by_restart(mission: &Standing, presence: &Presence, is_driven: bool, 
     let uploaded = presence
         .state()
         .is_some_and(|state| state.outbox.pending == 0);
-    let patient_enough = now.is_beyond(RESTART_GRACE, since);
+    let patient_enough = now.time_since(since) > RESTART_GRACE;
     taken_by != present && !is_driven && (uploaded || patient_enough)
 }
 

@@ -9,6 +9,13 @@ const LOG_EVERY: Duration = Duration::from_secs(30);
 /// programs may differ every time.
 const REASONS_MAX: usize = 8;
 
+/// A failure: what failed, and why.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Failure<'text> {
+    pub(super) what: &'static str,
+    pub(super) reason: &'text str,
+}
+
 /// Failures that were logged.
 #[derive(Debug, Default)]
 pub(super) struct Repeats {
@@ -24,9 +31,9 @@ struct Logged {
 }
 
 impl Repeats {
-    /// Returns how many failures were left out since the last entry if one is to be logged now, of `what`
-    /// failed for a reason.
-    pub(super) fn note(&mut self, now: Duration, what: &'static str, reason: &str) -> Option<u64> {
+    /// Returns how many failures like this were left out since the last entry if it is to be logged now.
+    pub(super) fn note(&mut self, now: Duration, failure: Failure<'_>) -> Option<u64> {
+        let Failure { what, reason } = failure;
         let is_recent = |one: &Logged| now.saturating_sub(one.at) < LOG_EVERY;
         let known = self
             .logged
@@ -69,18 +76,30 @@ mod tests {
     use super::*;
 
     const SECOND: Duration = Duration::from_secs(1);
+    const CLOCK: Failure<'_> = Failure {
+        what: "sign in",
+        reason: "wrong clock",
+    };
+    const SECRET: Failure<'_> = Failure {
+        reason: "wrong secret",
+        ..CLOCK
+    };
+    const READ: Failure<'_> = Failure {
+        what: "read",
+        ..CLOCK
+    };
 
     #[test]
     fn each_reason_is_logged_at_once_and_its_repeats_are_counted() {
         let mut repeats = Repeats::default();
-        assert_eq!(repeats.note(SECOND, "sign in", "wrong clock"), Some(0));
+        assert_eq!(repeats.note(SECOND, CLOCK), Some(0));
         for _ in 0..5 {
-            assert_eq!(repeats.note(2 * SECOND, "sign in", "wrong clock"), None);
+            assert_eq!(repeats.note(2 * SECOND, CLOCK), None);
         }
-        assert_eq!(repeats.note(2 * SECOND, "sign in", "wrong secret"), Some(0));
-        assert_eq!(repeats.note(2 * SECOND, "read", "wrong clock"), Some(0));
-        assert_eq!(repeats.note(31 * SECOND, "sign in", "wrong clock"), Some(5));
-        assert_eq!(repeats.note(32 * SECOND, "sign in", "wrong clock"), None);
+        assert_eq!(repeats.note(2 * SECOND, SECRET), Some(0));
+        assert_eq!(repeats.note(2 * SECOND, READ), Some(0));
+        assert_eq!(repeats.note(31 * SECOND, CLOCK), Some(5));
+        assert_eq!(repeats.note(32 * SECOND, CLOCK), None);
     }
 
     #[test]
@@ -89,7 +108,11 @@ mod tests {
         let (mut logged, mut left_out, failures) = (0, 0, 10_000_u64);
         for failure in 0..failures {
             let now = SECOND * u32::try_from(failure / 100).unwrap();
-            if let Some(count) = repeats.note(now, "sign in", &failure.to_string()) {
+            let failure = Failure {
+                reason: &failure.to_string(),
+                ..CLOCK
+            };
+            if let Some(count) = repeats.note(now, failure) {
                 logged += 1;
                 left_out += count;
             }

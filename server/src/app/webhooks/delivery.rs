@@ -247,7 +247,7 @@ impl Dispatcher {
         let next = if has_arrived {
             Next::Delivered
         } else {
-            next(id, attempts, created_at, at)
+            next(id, attempts, at, at.duration_since(created_at))
         };
         let (state, due_at) = match next {
             Next::Delivered => (DeliveryState::Delivered, at),
@@ -331,11 +331,11 @@ enum Next {
     Again(Timestamp),
 }
 
-/// Decides what follows an attempt that failed, the `attempts`-th of a delivery.
-fn next(id: DeliveryId, attempts: u32, created_at: Timestamp, at: Timestamp) -> Next {
+/// Decides what follows an attempt that failed, the `attempts`-th of a delivery, which had this age then.
+fn next(id: DeliveryId, attempts: u32, at: Timestamp, age: SignedDuration) -> Next {
     let due_at = at.checked_add(backoff(id, attempts));
     let due_at = due_at.unwrap_or(Timestamp::MAX);
-    if attempts >= ATTEMPTS_MAX || due_at.duration_since(created_at) > AGE_MAX {
+    if attempts >= ATTEMPTS_MAX || due_at.duration_since(at) + age > AGE_MAX {
         Next::GivenUp
     } else {
         Next::Again(due_at)
@@ -386,7 +386,7 @@ mod tests {
             let (mut at, mut attempts) = (begin, 0);
             loop {
                 attempts += 1;
-                match next(delivery(bits), attempts, begin, at) {
+                match next(delivery(bits), attempts, at, at.duration_since(begin)) {
                     Next::Again(due_at) => {
                         prop_assert!(due_at > at);
                         at = due_at;

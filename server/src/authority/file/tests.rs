@@ -94,8 +94,10 @@ fn a_crash_between_any_two_steps_leaves_the_authority_replaced_or_not_in_a_rotat
             trusted_before.insert(0, next.fingerprint());
         }
         let mut steps = replacing(&last);
-        let of_next = is_rotating.then_some(&*next.fingerprint);
-        steps.extend(completing_replacement(Some(&former.fingerprint), of_next));
+        steps.extend(completing_replacement(&Replaced {
+            present: Some(former.fingerprint.clone()),
+            next: is_rotating.then(|| next.fingerprint.clone()),
+        }));
         assert_eq!(steps.len(), 7 + usize::from(is_rotating));
         let steps_done = steps_done.min(steps.len());
         apply_all(&folder, &steps[..steps_done]);

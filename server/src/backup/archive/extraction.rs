@@ -26,6 +26,17 @@ pub struct Extracted {
     pub authority: Vec<(String, Vec<u8>)>,
 }
 
+/// An archive that is to be extracted.
+#[derive(Debug, Clone, Copy)]
+pub struct Extraction<'paths> {
+    /// The archive.
+    pub archive: &'paths Path,
+    /// Command that decrypts it, if it is encrypted.
+    pub key: Option<&'paths Filter>,
+    /// New file for its database.
+    pub database: &'paths Path,
+}
+
 /// Reads the manifest of an archive.
 ///
 /// # Errors
@@ -109,17 +120,20 @@ fn next_manifest(
 /// # Errors
 /// [`ArchiveError`]; the file of the database is removed.
 pub fn extract(
-    path: &Path,
-    key: Option<&Filter>,
-    database: &Path,
+    extraction: &Extraction<'_>,
     progress: &mut dyn FnMut(u64),
 ) -> Result<Extracted, ArchiveError> {
+    let Extraction {
+        archive,
+        key,
+        database,
+    } = *extraction;
     let mut options = OpenOptions::new();
     let file = options.write(true).create_new(true).mode(MODE);
     let mut file = file
         .open(database)
         .map_err(FileError::of("create", database))?;
-    let extracted = extract_into(path, key, (&mut file, database), progress).and_then(|found| {
+    let extracted = extract_into(archive, key, (&mut file, database), progress).and_then(|found| {
         file.sync_all().map_err(FileError::of("write", database))?;
         Ok(found)
     });

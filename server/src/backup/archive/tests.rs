@@ -52,7 +52,12 @@ fn make(encryption: Option<&Filter>) -> Made {
 fn extracted(made: &Made, key: Option<&Filter>) -> Result<Extracted, ArchiveError> {
     let target = made.folder.path().join("restored.db");
     let _ = fs::remove_file(&target);
-    let extracted = extract(&made.archive, key, &target, &mut |_bytes| {});
+    let extraction = Extraction {
+        archive: &made.archive,
+        key,
+        database: &target,
+    };
+    let extracted = extract(&extraction, &mut |_bytes| {});
     match &extracted {
         Ok(_) => assert_eq!(fs::read(&target).unwrap(), made.database),
         Err(_) => assert!(!target.exists(), "nothing is left behind"),

@@ -11,6 +11,7 @@
 //! checked. The router itself checks the password.
 
 use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _};
+use tokio::net::TcpStream;
 use tread_api::tunnel::RouterCredentials;
 use zenoh_buffers::reader::HasReader as _;
 use zenoh_codec::{RCodec as _, Zenoh080};
@@ -76,7 +77,7 @@ pub(super) async fn read_init(
 /// [`OpeningRefused`]; the messages that the router has received by then do not open a session.
 pub(super) async fn pass_opening(
     robot: &mut (impl AsyncRead + AsyncWrite + Unpin),
-    router: &mut (impl AsyncRead + AsyncWrite + Unpin),
+    router: &mut TcpStream,
     init: &Init,
     credentials: &RouterCredentials,
 ) -> Result<(), OpeningRefused> {

@@ -9,10 +9,10 @@ fn point(x_m: f64, y_m: f64) -> Point {
 #[test]
 fn curvature_is_that_of_the_circle_through_the_points() {
     let on = |angle: f64| point(5.0 * angle.cos(), 5.0 * angle.sin());
-    assert!((curvature(on(0.0), on(0.1), on(0.3)) - 0.2).abs() < 1e-9);
-    let straight = curvature(point(0.0, 0.0), point(1.0, 0.0), point(3.0, 0.0));
+    assert!((curvature(&[on(0.0), on(0.1), on(0.3)], 1) - 0.2).abs() < 1e-9);
+    let straight = curvature(&[point(0.0, 0.0), point(1.0, 0.0), point(3.0, 0.0)], 1);
     assert!(straight.abs() < 1e-12);
-    let back = curvature(point(0.0, 0.0), point(1.0, 0.0), point(0.5, 0.0));
+    let back = curvature(&[point(0.0, 0.0), point(1.0, 0.0), point(0.5, 0.0)], 1);
     assert!(back.is_infinite());
 }
 
