@@ -430,6 +430,7 @@ fn security(robots: &RobotsConfig) -> anyhow::Result<Security> {
     Ok(Security {
         authorities: Arc::new(authorities),
         names: robots.names.clone(),
+        robots_per_router: robots.robots_per_router.into(),
     })
 }
 

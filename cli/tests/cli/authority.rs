@@ -44,6 +44,7 @@ impl ServerWithRobots {
                 authority,
                 names: Vec::new(),
                 certificate_s: 3_600,
+                robots_per_router: 256,
             }),
             backup: None,
             republish: None,

@@ -115,6 +115,7 @@ impl Rig {
         let security = Security {
             authorities: Arc::clone(&authorities),
             names: Vec::new(),
+            robots_per_router: 256,
         };
         let supervisor = Supervisor::new();
         let address = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));

@@ -116,6 +116,8 @@ pub struct Security {
     pub authorities: Arc<Authorities>,
     /// Host names of the port, for its certificate.
     pub names: Vec<String>,
+    /// Maximum number of robots of a router, at least 1.
+    pub robots_per_router: usize,
 }
 
 /// The open network.
@@ -146,6 +148,7 @@ impl Fleet {
     ) -> Result<Self, FleetError> {
         let routers = Arc::new(Routers::default());
         let is_tls = security.is_some();
+        let robots_max = security.as_ref().map_or(usize::MAX, |it| it.robots_per_router);
         let (address, authorities, gate) = match security {
             None => {
                 let address = with_free_port(address)?;
@@ -164,6 +167,7 @@ impl Fleet {
             opener: std::sync::Mutex::new(Some(Opener {
                 address,
                 authorities,
+                robots_max,
                 supervisor: supervisor.clone(),
                 next: AtomicU64::new(0),
             })),

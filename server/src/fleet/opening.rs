@@ -34,6 +34,8 @@ pub(super) struct Opener {
     pub(super) address: SocketAddr,
     /// Authorities, from whose keys the passwords of robots derive; `None` without a gate.
     pub(super) authorities: Option<Arc<Authorities>>,
+    /// Maximum number of robots of a router behind the gate.
+    pub(super) robots_max: usize,
     pub(super) supervisor: Supervisor,
     pub(super) next: AtomicU64,
 }

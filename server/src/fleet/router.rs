@@ -101,7 +101,9 @@ async fn answers(watch: &Watch, router: &Arc<Router>) -> bool {
 async fn reopen(pool: &RouterPool, former: Option<&Arc<Router>>) {
     let _turn = pool.turn.lock().await;
     let current = pool.current();
-    let mut robots = to_open(&[], &pool.app.enrolment_registry().robots()).unwrap_or_default();
+    let robots_max = pool.opener.robots_max;
+    let fleet = pool.app.enrolment_registry().robots();
+    let mut robots = to_open(&[], &fleet, robots_max).unwrap_or_default();
     if let Some(former) = former {
         // It was superseded since it was probed.
         if current.iter().all(|router| router.number != former.number) {
@@ -111,7 +113,7 @@ async fn reopen(pool: &RouterPool, former: Option<&Arc<Router>>) {
             .iter()
             .filter(|router| router.number > former.number);
         let newer: Vec<&HashSet<RobotKey>> = newer.map(|router| &router.robots).collect();
-        robots = to_reopen(&former.robots, &newer);
+        robots = to_reopen(&former.robots, &newer, robots_max);
         let robot_count = robots_on(former).await;
         let is_behind_gate = former.credentials.is_some();
         if robot_count == 0 {
@@ -189,6 +191,7 @@ mod tests {
                 opener: Opener {
                     address: with_free_port(address).unwrap(),
                     authorities: authorities.map(Arc::new),
+                    robots_max: 256,
                     supervisor: supervisor.clone(),
                     next: AtomicU64::new(0),
                 },

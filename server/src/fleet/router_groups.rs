@@ -13,21 +13,18 @@
 //!  1000 2 1                            ─►  1000 4      those with 2 and 1 are superseded
 //! ```
 //!
-//! A router has at most [`ROBOTS_MAX`] robots: zenoh copies the configuration of a router, with all of
-//! its rules, for each session that it accepts. One that would have more takes over as many small
-//! routers as fit, and then as many new robots as there is room for.
+//! A router has a maximum number of robots, `robots_max`: zenoh copies the configuration of a router,
+//! with all of its rules, for each session that it accepts. One that would have more takes over as many
+//! small routers as fit, and then as many new robots as there is room for.
 //!
-//! So a router that is left behind a full one has about half of [`ROBOTS_MAX`] robots or more: `n` robots
-//! have at most `2 n / ROBOTS_MAX + log2(ROBOTS_MAX) + 1` routers. A router that supersedes another has more than 1.5 times its robots or is full, so a robot moves at most
-//! `log1.5(ROBOTS_MAX) + 1` times however many join, the last time to a full one.
+//! So a router that is left behind a full one has about half of the maximum or more: `n` robots have at
+//! most `2 n / robots_max + log2(robots_max) + 1` routers. A router that supersedes another has more
+//! than 1.5 times its robots or is full, so a robot moves at most `log1.5(robots_max) + 1` times however
+//! many join, the last time to a full one.
 
 use std::collections::{BTreeSet, HashSet};
 
 use crate::app::presence::RobotKey;
-
-/// Maximum number of robots of a router. Copying the rules of one robot takes about 6 µs, so a session
-/// of a full router takes 1.5 ms.
-pub(super) const ROBOTS_MAX: usize = 256;
 
 /// What counts of an open router.
 #[derive(Debug, Clone, Copy)]
@@ -38,10 +35,14 @@ pub(super) struct Group<'router> {
     pub(super) is_of_signing: bool,
 }
 
-/// Returns the robots, at most [`ROBOTS_MAX`], of the next router that is to be opened for robots of the
+/// Returns the robots, at most `robots_max`, of the next router that is to be opened for robots of the
 /// fleet that no router includes; `None` if there is none and a router of the signing authority is open.
 /// `open` are the routers, oldest first.
-pub(super) fn to_open(open: &[Group<'_>], fleet: &[RobotKey]) -> Option<BTreeSet<RobotKey>> {
+pub(super) fn to_open(
+    open: &[Group<'_>],
+    fleet: &[RobotKey],
+    robots_max: usize,
+) -> Option<BTreeSet<RobotKey>> {
     let current: Vec<&Group<'_>> = open.iter().filter(|group| group.is_of_signing).collect();
     let known: HashSet<&RobotKey> = current.iter().flat_map(|group| group.robots).collect();
     let unknown: BTreeSet<&RobotKey> = fleet
@@ -51,17 +52,17 @@ pub(super) fn to_open(open: &[Group<'_>], fleet: &[RobotKey]) -> Option<BTreeSet
     if unknown.is_empty() && !current.is_empty() {
         return None;
     }
-    let wanted = unknown.len().clamp(1, ROBOTS_MAX);
+    let wanted = unknown.len().clamp(1, robots_max);
     let mut robots = BTreeSet::new();
     for group in current.iter().rev() {
         let is_large = group.robots.len() >= 2 * (wanted + robots.len());
         // There must be room for one robot at least that no router includes.
-        if is_large || group.robots.len() + robots.len() >= ROBOTS_MAX {
+        if is_large || group.robots.len() + robots.len() >= robots_max {
             break;
         }
         robots.extend(group.robots.iter().cloned());
     }
-    let room = ROBOTS_MAX - robots.len();
+    let room = robots_max - robots.len();
     robots.extend(unknown.into_iter().take(room).cloned());
     Some(robots)
 }
@@ -71,10 +72,11 @@ pub(super) fn to_open(open: &[Group<'_>], fleet: &[RobotKey]) -> Option<BTreeSet
 pub(super) fn to_reopen(
     former: &HashSet<RobotKey>,
     newer: &[&HashSet<RobotKey>],
+    robots_max: usize,
 ) -> BTreeSet<RobotKey> {
     let mut robots: BTreeSet<RobotKey> = former.iter().cloned().collect();
     for group in newer.iter().rev() {
-        if group.len() + robots.len() > ROBOTS_MAX {
+        if group.len() + robots.len() > robots_max {
             break;
         }
         robots.extend(group.iter().cloned());
@@ -110,6 +112,8 @@ mod tests {
 
     use super::*;
 
+    const ROBOTS_MAX: usize = 256;
+
     fn robot(number: usize) -> RobotKey {
         (
             "yard".parse().unwrap(),
@@ -132,7 +136,7 @@ mod tests {
     /// the new ones.
     fn change(open: &mut Vec<Open>, fleet: &[RobotKey], signing: u32) -> Vec<RobotKey> {
         let mut moved = Vec::new();
-        while let Some(robots) = to_open(&groups(open, signing), fleet) {
+        while let Some(robots) = to_open(&groups(open, signing), fleet, ROBOTS_MAX) {
             open.push((robots.iter().cloned().collect(), signing));
             moved.extend(robots);
             let mut superseded = superseded(&groups(open, signing)).into_iter();
@@ -173,7 +177,7 @@ mod tests {
                 prop_assert!(open.len() <= most, "{:?}", sizes);
                 let most = f64::from(u32::try_from(ROBOTS_MAX).unwrap()).log(1.5) + 2.0;
                 prop_assert!(moves.values().all(|&moves| f64::from(moves) <= most));
-                prop_assert_eq!(to_open(&groups(&open, signing), &fleet), None);
+                prop_assert_eq!(to_open(&groups(&open, signing), &fleet, ROBOTS_MAX), None);
             }
         }
     }
@@ -202,7 +206,7 @@ mod tests {
             [false],
             "nobody else takes its robots yet"
         );
-        let opened = to_open(&groups(&open, 1), &fleet).unwrap();
+        let opened = to_open(&groups(&open, 1), &fleet, ROBOTS_MAX).unwrap();
         assert_eq!(opened.len(), 3);
         open.push((opened.into_iter().collect(), 1));
         assert_eq!(superseded(&groups(&open, 1)), [true, false]);
@@ -212,9 +216,9 @@ mod tests {
     fn a_router_that_replaces_another_one_takes_over_newer_ones_as_far_as_they_fit() {
         let of = |numbers: std::ops::Range<usize>| numbers.map(robot).collect::<HashSet<_>>();
         let (former, large, small) = (of(0..100), of(100..250), of(250..300));
-        let robots = to_reopen(&former, &[&large, &small]);
+        let robots = to_reopen(&former, &[&large, &small], ROBOTS_MAX);
         assert_eq!(robots.len(), 150);
         assert!(small.iter().all(|robot| robots.contains(robot)));
-        assert_eq!(to_reopen(&former, &[&large]).len(), 250);
+        assert_eq!(to_reopen(&former, &[&large], ROBOTS_MAX).len(), 250);
     }
 }

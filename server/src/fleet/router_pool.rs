@@ -19,7 +19,7 @@ use tracing::{error, info};
 use super::client;
 use super::inbox::Channels;
 use super::opening::Opener;
-use super::router_groups::{Group, ROBOTS_MAX, superseded, to_open};
+use super::router_groups::{Group, superseded, to_open};
 use super::routers::{Router, Routers};
 use crate::app::App;
 use crate::app::presence::RobotKey;
@@ -59,10 +59,11 @@ impl RouterPool {
         Ok(())
     }
 
-    /// Opens routers for all robots of the fleet.
+    /// Opens routers for all robots of the fleet. One that fails after the first is opened by
+    /// [`Self::run`] later.
     ///
     /// # Errors
-    /// [`super::FleetError`].
+    /// [`super::FleetError`] of the first one.
     pub(super) async fn open_for_all(&self) -> Result<(), super::FleetError> {
         let fleet = self.app.enrolment_registry().robots();
         if self.opener.authorities.is_none() {
@@ -71,8 +72,15 @@ impl RouterPool {
         }
         loop {
             let all = self.routers.all();
-            match to_open(&self.groups(&all), &fleet) {
-                Some(robots) => self.open(robots.into_iter().collect()).await?,
+            match to_open(&self.groups(&all), &fleet, self.opener.robots_max) {
+                Some(robots) => match self.open(robots.into_iter().collect()).await {
+                    Ok(()) => {}
+                    Err(failed) if all.is_empty() => return Err(failed),
+                    Err(failed) => {
+                        error!("cannot open another router: {failed}");
+                        return Ok(());
+                    }
+                },
                 None => return Ok(()),
             }
         }
@@ -103,7 +111,7 @@ impl RouterPool {
             };
             if let Some(robot_count) = opened {
                 // A full one is not waited for: nobody who joins now would have room in it.
-                let pause = if robot_count < ROBOTS_MAX {
+                let pause = if robot_count < self.opener.robots_max {
                     OPEN_EVERY
                 } else {
                     Duration::ZERO
@@ -151,7 +159,7 @@ impl RouterPool {
     async fn let_everybody_in(&self) -> Option<usize> {
         let all = self.routers.all();
         let fleet = self.app.enrolment_registry().robots();
-        let robots = to_open(&self.groups(&all), &fleet)?;
+        let robots = to_open(&self.groups(&all), &fleet, self.opener.robots_max)?;
         let count = robots.len();
         match self.open(robots.into_iter().collect()).await {
             Ok(()) => {

@@ -137,6 +137,7 @@ impl Yard {
             authority,
             names: Vec::new(),
             certificate_s: 3_600,
+            robots_per_router: 256,
         });
         let server = Server::start_with_clock(config, Clock::manual(wall));
         Self::of(folder, server.await.unwrap()).await
@@ -363,7 +364,7 @@ pub(crate) fn circle(robot: &RobotId) -> Value {
 }
 
 pub(crate) fn model() -> RobotModel {
-    rover("test rover", "lugged")
+    rover("test rover")
 }
 
 /// A measurement of θ 0.2 with a standard deviation of 0.01, an hour apart for each 3600 of

@@ -328,3 +328,49 @@ async fn a_link_that_fails_on_the_robot_itself_is_tried_again_until_it_can_be_ma
     .await;
     fleet.robot_is_online(&robot).await;
 }
+
+/// Waits until a stop is in force on these robots.
+async fn robots_are_stopped(fleet: &Fleet, robots: &[RobotId]) {
+    for robot in robots {
+        let seen = || fleet.rest.robot(robot);
+        eventually("the robot is stopped", SHORT, seen, |seen| {
+            let live = seen.as_ref().and_then(|seen| seen.live.as_ref());
+            live.is_some_and(|live| live.safety.stop.is_some())
+        })
+        .await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn robots_of_several_routers_drive_are_stopped_and_come_back_after_a_restart_of_the_server() {
+    let node = Path::new(env!("CARGO_BIN_EXE_node"));
+    let config = "[robots]\nauthority = \"authority\"\nrobots_per_router = 2\n";
+    let mut fleet = Fleet::start_in_environment(node, config, &[]).await;
+    let robots: Vec<RobotId> = (1..=5)
+        .map(|number| format!("rover-{number}").parse().unwrap())
+        .collect();
+    for (robot, x_m) in robots.iter().zip([0.0, 20.0, 40.0, 60.0, 80.0]) {
+        fleet.join(robot).await;
+        fleet.start_agent(robot, x_m).await;
+    }
+    assert!(fleet.counter("routers_opened").await >= 2);
+    let mut missions = Vec::new();
+    for (robot, x_m) in robots.iter().zip([0.0, 20.0, 40.0, 60.0, 80.0]) {
+        missions.push(fleet.rest.send(robot, bend(x_m)).await);
+    }
+    for mission in missions {
+        let reached = [MissionState::Succeeded];
+        fleet.rest.mission_reaches(mission, &reached, DRIVE).await;
+    }
+
+    fleet.kill_server();
+    fleet.start_server().await;
+    for robot in &robots {
+        fleet.robot_is_online(robot).await;
+    }
+    fleet
+        .rest
+        .post("/v1/stop", &json!({"site": fleet.site()}))
+        .await;
+    robots_are_stopped(&fleet, &robots).await;
+}
