@@ -14,6 +14,7 @@ test('a stranger sees the sign-in and nothing else', async () => {
   const page = await open({ as: null });
   await page.getByLabel('Token').waitFor();
   expect(await page.getByRole('button').allInnerTexts()).toEqual(['Sign in']);
+  expect(await page.getByLabel('Token').evaluate((field) => field === document.activeElement)).toBe(true);
   await shot(page, 'sign-in');
 });
 
