@@ -29,6 +29,10 @@ pub struct Finding {
     pub next_step: Option<String>,
 }
 
+/// The remedy of a [`Finding`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct NextStep<S>(pub S);
+
 impl Finding {
     fn new(name: &str, verdict: Verdict, text: impl Into<String>) -> Self {
         Self {
@@ -53,17 +57,25 @@ impl Finding {
 
     /// Returns a warning with its remedy.
     #[must_use]
-    pub fn warning(name: &str, text: impl Into<String>, next_step: impl Into<String>) -> Self {
-        Self::new(name, Verdict::Warning, text).with_next_step(next_step)
+    pub fn warning(
+        name: &str,
+        text: impl Into<String>,
+        next_step: NextStep<impl Into<String>>,
+    ) -> Self {
+        Self::new(name, Verdict::Warning, text).with(next_step)
     }
 
     /// Returns a problem with its remedy.
     #[must_use]
-    pub fn problem(name: &str, text: impl Into<String>, next_step: impl Into<String>) -> Self {
-        Self::new(name, Verdict::Problem, text).with_next_step(next_step)
+    pub fn problem(
+        name: &str,
+        text: impl Into<String>,
+        next_step: NextStep<impl Into<String>>,
+    ) -> Self {
+        Self::new(name, Verdict::Problem, text).with(next_step)
     }
 
-    fn with_next_step(self, next_step: impl Into<String>) -> Self {
+    fn with(self, NextStep(next_step): NextStep<impl Into<String>>) -> Self {
         Self {
             next_step: Some(next_step.into()),
             ..self

@@ -124,8 +124,11 @@ impl Polygon {
         if let Some(index) = corners.iter().position(|corner| !corner.is_on_the_map()) {
             return Err(InvalidPolygon::OffTheMap(index));
         }
-        let side = |index: usize| (corners[index], corners[(index + 1) % count]);
-        let has_no_length = |&index: &usize| side(index).0 == side(index).1;
+        let side = |index: usize| Side {
+            from: corners[index],
+            to: corners[(index + 1) % count],
+        };
+        let has_no_length = |&index: &usize| side(index).from == side(index).to;
         if let Some(index) = (0..count).find(has_no_length) {
             return Err(InvalidPolygon::DuplicateCorner(index, (index + 1) % count));
         }
@@ -133,16 +136,16 @@ impl Polygon {
             for second in first + 1..count {
                 let neighbours = second == first + 1 || (first == 0 && second == count - 1);
                 let crossing = if neighbours {
-                    folds_back(side(first), side(second))
+                    side(first).folds_back(side(second))
                 } else {
-                    touches(side(first), side(second))
+                    side(first).touches(side(second))
                 };
                 if crossing {
                     return Err(InvalidPolygon::SelfCrossing {
                         first,
-                        from: side(first).0,
+                        from: side(first).from,
                         second,
-                        onto: side(second).0,
+                        onto: side(second).from,
                     });
                 }
             }
@@ -166,7 +169,13 @@ impl Polygon {
         let doubled: f64 = self
             .0
             .windows(2)
-            .map(|pair| cross(origin, pair[0], pair[1]))
+            .map(|pair| {
+                let side = Side {
+                    from: origin,
+                    to: pair[0],
+                };
+                side.cross(pair[1])
+            })
             .sum();
         doubled.abs() / 2.0
     }
@@ -202,43 +211,58 @@ impl From<Polygon> for Vec<Point> {
     }
 }
 
-/// Returns twice the signed area of the triangle; positive when `c` lies left of `a` → `b`.
-fn cross(a: Point, b: Point, c: Point) -> f64 {
-    (b.x_m - a.x_m) * (c.y_m - a.y_m) - (b.y_m - a.y_m) * (c.x_m - a.x_m)
+/// Side of a polygon, or of a triangle.
+#[derive(Debug, Clone, Copy)]
+struct Side {
+    from: Point,
+    to: Point,
 }
 
-/// Whether two sides without a common corner have a point in common.
-fn touches(first: (Point, Point), second: (Point, Point)) -> bool {
-    let (a, b) = first;
-    let (c, d) = second;
-    let (abc, abd) = (cross(a, b, c), cross(a, b, d));
-    let (cda, cdb) = (cross(c, d, a), cross(c, d, b));
-    let opposite = |left: f64, right: f64| (left > 0.0) != (right > 0.0);
-    if abc != 0.0 && abd != 0.0 && cda != 0.0 && cdb != 0.0 {
-        return opposite(abc, abd) && opposite(cda, cdb);
+impl Side {
+    /// Returns twice the signed area of the triangle with a third point; positive when that lies to
+    /// the left.
+    fn cross(self, point: Point) -> f64 {
+        let Self { from, to } = self;
+        (to.x_m - from.x_m) * (point.y_m - from.y_m) - (to.y_m - from.y_m) * (point.x_m - from.x_m)
     }
-    (abc == 0.0 && within_box(a, b, c))
-        || (abd == 0.0 && within_box(a, b, d))
-        || (cda == 0.0 && within_box(c, d, a))
-        || (cdb == 0.0 && within_box(c, d, b))
-}
 
-/// Whether two neighbouring sides overlap, instead of sharing only their corner.
-fn folds_back(first: (Point, Point), second: (Point, Point)) -> bool {
-    let (start, shared, end) = if first.1 == second.0 {
-        (first.0, first.1, second.1)
-    } else {
-        (first.1, first.0, second.0)
-    };
-    let along = (start.x_m - shared.x_m) * (end.x_m - shared.x_m)
-        + (start.y_m - shared.y_m) * (end.y_m - shared.y_m);
-    cross(start, shared, end) == 0.0 && along > 0.0
-}
+    /// Whether two sides without a common corner have a point in common.
+    fn touches(self, other: Self) -> bool {
+        let (from, to) = (self.cross(other.from), self.cross(other.to));
+        let (own_from, own_to) = (other.cross(self.from), other.cross(self.to));
+        let opposite = |left: f64, right: f64| (left > 0.0) != (right > 0.0);
+        if from != 0.0 && to != 0.0 && own_from != 0.0 && own_to != 0.0 {
+            return opposite(from, to) && opposite(own_from, own_to);
+        }
+        (from == 0.0 && self.has_in_box(other.from))
+            || (to == 0.0 && self.has_in_box(other.to))
+            || (own_from == 0.0 && other.has_in_box(self.from))
+            || (own_to == 0.0 && other.has_in_box(self.to))
+    }
 
-fn within_box(a: Point, b: Point, point: Point) -> bool {
-    let between =
-        |low: f64, high: f64, value: f64| value >= low.min(high) && value <= low.max(high);
-    between(a.x_m, b.x_m, point.x_m) && between(a.y_m, b.y_m, point.y_m)
+    /// Whether two neighbouring sides overlap, instead of sharing only their corner.
+    fn folds_back(self, other: Self) -> bool {
+        let (start, shared, end) = if self.to == other.from {
+            (self.from, self.to, other.to)
+        } else {
+            (self.to, self.from, other.from)
+        };
+        let along = (start.x_m - shared.x_m) * (end.x_m - shared.x_m)
+            + (start.y_m - shared.y_m) * (end.y_m - shared.y_m);
+        let side = Self {
+            from: start,
+            to: shared,
+        };
+        side.cross(end) == 0.0 && along > 0.0
+    }
+
+    /// Whether a point lies in the box around the side.
+    fn has_in_box(self, point: Point) -> bool {
+        let Self { from, to } = self;
+        let between =
+            |low: f64, high: f64, value: f64| value >= low.min(high) && value <= low.max(high);
+        between(from.x_m, to.x_m, point.x_m) && between(from.y_m, to.y_m, point.y_m)
+    }
 }
 
 #[cfg(test)]

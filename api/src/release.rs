@@ -58,11 +58,12 @@ pub enum Peer {
 impl Peer {
     /// Judges the version that a peer states.
     pub fn of(version: &str) -> Self {
-        Self::between(VERSION, version)
+        minor_release(VERSION).map_or(Self::Unknown, |own| Self::seen_by(own, version))
     }
 
-    fn between(own: &str, other: &str) -> Self {
-        let (Some(own), Some(other)) = (minor_release(own), minor_release(other)) else {
+    /// Judges the version that a peer states to a program of the release `own`.
+    fn seen_by(own: (u64, u64), version: &str) -> Self {
+        let Some(other) = minor_release(version) else {
             return Self::Unknown;
         };
         if own.0 == other.0 && own.1.abs_diff(other.1) <= RELEASES_APART_MAX {
@@ -114,7 +115,8 @@ mod tests {
             ("0.1.0", "0.1", Peer::Unknown),
             ("0.1.0", "0.1.0.0", Peer::Unknown),
         ] {
-            assert_eq!(Peer::between(own, other), peer, "{own} {other}");
+            let release = minor_release(own).unwrap();
+            assert_eq!(Peer::seen_by(release, other), peer, "{own} {other}");
         }
         assert_eq!(Peer::of(VERSION), Peer::Supported);
     }

@@ -124,7 +124,8 @@ const PARTS_OF_A_STEP: f64 = 1.0e6;
     clippy::cast_sign_loss,
     reason = "clamped to numbers of 37 bits"
 )]
-fn parts(share: f64, steps: f64) -> u64 {
+fn parts(share: f64, steps: u16) -> u64 {
+    let steps = f64::from(steps);
     ((share * steps).clamp(0.0, steps) * PARTS_OF_A_STEP + 0.5) as u64
 }
 
@@ -140,9 +141,9 @@ fn codes(square: &TileSquare) -> (u16, u8, u8) {
     let std_dev = share(square.std_dev, STD_DEV_LOW_LOG, STD_DEV_SPAN_LOG);
     let count = f64::from(square.segments.max(1)).log2() * COUNT_STEPS;
     (
-        ((parts(theta, 65_534.0) + STEP / 2) / STEP) as u16 + 1,
-        parts(std_dev, 255.0).div_ceil(STEP) as u8,
-        ((parts(count / 255.0, 255.0) + STEP / 2) / STEP) as u8,
+        ((parts(theta, 65_534) + STEP / 2) / STEP) as u16 + 1,
+        parts(std_dev, 255).div_ceil(STEP) as u8,
+        ((parts(count / 255.0, 255) + STEP / 2) / STEP) as u8,
     )
 }
 

@@ -2,7 +2,7 @@
 //! known.
 
 use serde_json::value::RawValue;
-pub use tread_store::deferred_segments::{DeferredSegment, Origin};
+pub use tread_store::deferred_segments::{DeferredFilter, DeferredSegment, Origin};
 
 use super::{DbError, Tx, forward};
 
@@ -11,5 +11,5 @@ forward! {
     fn put(origin: Origin, times_us: (i64, i64), measurement: &RawValue) -> bool;
     fn count(robot_pk: i64) -> u64;
     fn is_any() -> bool;
-    fn take(boot_pk: i64, ended_before_us: i64, limit: u32) -> Vec<DeferredSegment>;
+    fn take(filter: DeferredFilter, limit: u32) -> Vec<DeferredSegment>;
 }

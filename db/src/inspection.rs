@@ -1,7 +1,7 @@
 //! Looks at a database without changing it, beside a running server or without one.
 
 use tread_store::failure::StorageFailure;
-pub use tread_store::inspection::{Inspection, Schema};
+pub use tread_store::inspection::{InspectOptions, Inspection, Schema};
 
 use super::Location;
 
@@ -26,22 +26,18 @@ impl InspectError {
     }
 }
 
-/// Inspects a database; `None` if there is no file. `is_in_use` says that a server runs on a file,
-/// `is_deep` that all of it is to be read.
+/// Inspects a database; `None` if there is no file.
 ///
 /// # Errors
 /// [`InspectError`]: the database cannot be opened or read.
 pub async fn inspect(
     location: &Location,
-    is_in_use: bool,
-    is_deep: bool,
+    options: InspectOptions,
 ) -> Result<Option<Inspection>, InspectError> {
     Ok(match location {
-        Location::File(path) => {
-            tread_store_sqlite::inspection::inspect(path, is_in_use, is_deep).await?
-        }
+        Location::File(path) => tread_store_sqlite::inspection::inspect(path, options).await?,
         Location::Postgres(address) => {
-            Some(tread_store_postgres::inspection::inspect(address, is_deep).await?)
+            Some(tread_store_postgres::inspection::inspect(address, options.is_deep).await?)
         }
     })
 }

@@ -2,9 +2,9 @@
 
 use jiff::Timestamp;
 use tread_api::ids::MissionId;
-use tread_api::mission::{Cause, DrivenPath, MissionQuality, MissionState, Replacement};
+use tread_api::mission::{DrivenPath, MissionQuality, MissionState, Replacement};
 pub use tread_store::missions::Standing;
-pub use tread_store::missions::{Facts, Inserted, MissionFilter, MissionRow};
+pub use tread_store::missions::{Facts, Inserted, MissionFilter, MissionRow, Transition};
 
 use super::{DbError, Tx, forward};
 
@@ -13,7 +13,7 @@ forward! {
     fn insert(row: &MissionRow, inserted: Inserted<'_>) -> ();
     fn find(id: MissionId) -> Option<MissionRow>;
     fn list(filter: &MissionFilter, limit: u32, bytes_max: usize) -> (Vec<MissionRow>, bool);
-    fn compare_and_set(id: MissionId, from: MissionState, to: MissionState, cause: Cause, reason: Option<&str>) -> bool;
+    fn compare_and_set(id: MissionId, transition: Transition<'_>) -> bool;
     fn add_facts(id: MissionId, facts: Facts) -> ();
     fn want_pause(id: MissionId, wanted: bool) -> bool;
     fn set_replacement(id: MissionId, replacement: Option<&Replacement>) -> ();

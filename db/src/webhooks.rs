@@ -3,7 +3,7 @@
 use jiff::Timestamp;
 use tread_api::ids::{AlertCode, DeliveryId, SiteId, WebhookId};
 use tread_api::webhook::{Delivery, Webhook, WebhookSettings};
-pub use tread_store::webhooks::{Due, DueTimes, NewDelivery, Outcome, Receiver};
+pub use tread_store::webhooks::{AgeLimit, Due, DueTimes, NewDelivery, Outcome, Receiver};
 
 use super::{DbError, Tx, forward};
 
@@ -23,7 +23,7 @@ forward! {
     fn due(times: DueTimes) -> Vec<Due>;
     fn note_attempt(outcome: &Outcome) -> ();
     fn has_older(than: Timestamp) -> bool;
-    fn give_up_older(than: Timestamp, at: Timestamp) -> u64;
+    fn give_up_older(limit: AgeLimit) -> u64;
     fn forget(webhook: WebhookId, kept: u32) -> ();
     fn deliveries(webhook: WebhookId, before: Option<DeliveryId>, limit: u32) -> Vec<Delivery>;
 }

@@ -343,8 +343,9 @@ impl Online {
         match link.hello(&hello).await {
             Ok(welcome) => {
                 info!("the server welcomes `{}`", self.identity.robot);
-                let own = self.dispatcher.clock.wall();
-                if let Some(text) = clock_warning(own, welcome.server_time) {
+                let server = welcome.server_time;
+                let ahead = self.dispatcher.clock.wall().duration_since(server);
+                if let Some(text) = clock_warning(server, ahead) {
                     warn!("{text}");
                 }
                 self.dispatcher.take_welcome(welcome.site)
@@ -361,15 +362,16 @@ impl Online {
     }
 }
 
-/// Returns what is wrong with the clocks; `None` if they agree.
-fn clock_warning(own: Timestamp, server: Timestamp) -> Option<String> {
-    let ahead = own.duration_since(server);
+/// Returns what is wrong with the clocks; `None` if they agree. `ahead` is by how much the robot's
+/// is ahead of the server's.
+fn clock_warning(server: Timestamp, ahead: SignedDuration) -> Option<String> {
     (ahead.abs() >= CLOCK_WRONG_AFTER).then(|| {
         let direction = if ahead.is_negative() {
             "behind"
         } else {
             "ahead of"
         };
+        let own = server + ahead;
         format!(
             "this robot's clock is {} s {direction} the server's: it says {own:.0}, and the server \
              {server:.0}; set the wrong one, and have both synchronised (chrony); this agent takes \
@@ -387,14 +389,11 @@ mod tests {
     fn a_clock_an_hour_off_is_said_with_its_direction_and_what_to_do() {
         let server: Timestamp = "2026-11-02T10:00:00Z".parse().unwrap();
         let hour = SignedDuration::from_hours(1);
-        assert_eq!(clock_warning(server, server), None);
-        assert_eq!(
-            clock_warning(server + SignedDuration::from_secs(9), server),
-            None
-        );
-        let behind = clock_warning(server - hour, server).unwrap();
+        assert_eq!(clock_warning(server, SignedDuration::ZERO), None);
+        assert_eq!(clock_warning(server, SignedDuration::from_secs(9)), None);
+        let behind = clock_warning(server, -hour).unwrap();
         assert!(behind.contains("3600 s behind the server's"), "{behind}");
-        let ahead = clock_warning(server + hour, server).unwrap();
+        let ahead = clock_warning(server, hour).unwrap();
         assert!(
             ahead.contains("3600 s ahead of") && ahead.contains("chrony"),
             "{ahead}"

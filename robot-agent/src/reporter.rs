@@ -90,11 +90,10 @@ fn wire_standing(report: &StandingReport) -> Option<StandingStatus> {
     })
 }
 
-fn aged<T>(value: T, at: Duration, now: Duration) -> Aged<T> {
-    let age = now.saturating_sub(at).as_millis();
+fn aged<T>(value: T, age: Duration) -> Aged<T> {
     Aged {
         value,
-        age_ms: u64::try_from(age).unwrap_or(u64::MAX),
+        age_ms: u64::try_from(age.as_millis()).unwrap_or(u64::MAX),
     }
 }
 
@@ -130,10 +129,10 @@ impl Reporter {
             fault: snapshot.fault.map(|fault| fault.text().to_owned()),
             pose: snapshot
                 .pose
-                .map(|(pose, at)| aged(wire_pose(pose), at, now)),
+                .map(|(pose, at)| aged(wire_pose(pose), now.saturating_sub(at))),
             twist: snapshot
                 .twist
-                .map(|(twist, at)| aged(wire_twist(twist), at, now)),
+                .map(|(twist, at)| aged(wire_twist(twist), now.saturating_sub(at))),
             mission: snapshot.mission,
             terrain_revision: snapshot.terrain_revision,
             outbox,

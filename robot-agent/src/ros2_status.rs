@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use tread_api::ids::MissionId;
-use tread_control::geometry::{Pose, wrap_angle_rad};
+use tread_control::geometry::Pose;
 use tread_ros2::cdr::{Sequence, encode};
 use tread_ros2::messages::{
     DiagnosticArray, DiagnosticStatus, Float64MultiArray, KeyValue, Level, MultiArrayDimension,
@@ -125,7 +125,7 @@ impl Outward {
         }
         self.plan = poses_of(&given.plan);
         for pose in &mut self.plan {
-            *pose = seen_from(self.settings.site_from_frame, *pose);
+            *pose = self.settings.frame_pose(*pose);
         }
         self.mission = driven;
         true
@@ -135,7 +135,7 @@ impl Outward {
         let Some((pose, _)) = snapshot.pose else {
             return;
         };
-        let pose = seen_from(self.settings.site_from_frame, pose);
+        let pose = self.settings.frame_pose(pose);
         let is_near = |last: &Pose| last.point().distance_m(pose.point()) < SPACING_M;
         if self.driven.last().is_some_and(is_near) {
             return;
@@ -181,16 +181,6 @@ impl Outward {
             message,
             values: of_drops.chain(foreign).collect(),
         }
-    }
-}
-
-/// Transforms a pose from the site frame to a frame whose pose in the site is given.
-fn seen_from(site_from_frame: Pose, pose: Pose) -> Pose {
-    let point = site_from_frame.body_from_site(pose.point());
-    Pose {
-        x_m: point.x_m,
-        y_m: point.y_m,
-        heading_rad: wrap_angle_rad(pose.heading_rad - site_from_frame.heading_rad),
     }
 }
 

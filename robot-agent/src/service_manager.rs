@@ -48,14 +48,6 @@ struct Feeding {
 }
 
 impl Feeding {
-    fn new(timeout: Duration, now: Duration) -> Self {
-        Self {
-            every: timeout / MESSAGES_PER_TIMEOUT,
-            ticks: 0,
-            at: now,
-        }
-    }
-
     /// Returns whether a message is due: the interval is over, and the loop has ticked in it.
     fn is_due(&mut self, ticks: u64, now: Duration) -> bool {
         let is_due = ticks != self.ticks && now.saturating_sub(self.at) >= self.every;
@@ -111,7 +103,11 @@ impl Teller {
             let look_every = timeout / (MESSAGES_PER_TIMEOUT * LOOKS_PER_MESSAGE);
             look_every.clamp(LOOK_EVERY_MIN, LOOK_EVERY_MAX)
         });
-        let mut feeding = timeout.map(|timeout| Feeding::new(timeout, self.clock.monotonic()));
+        let mut feeding = timeout.map(|timeout| Feeding {
+            every: timeout / MESSAGES_PER_TIMEOUT,
+            ticks: 0,
+            at: self.clock.monotonic(),
+        });
         let mut said = None;
         while !self.shared.stop.load(Ordering::Relaxed) {
             std::thread::sleep(look_every);
@@ -171,7 +167,11 @@ mod tests {
     /// Times, in milliseconds, of the messages to a watchdog, with a loop that ticks 100 times a
     /// second until it stands still.
     fn fed_at_ms(stands_from_ms: u64, stands_until_ms: u64, end_ms: u64) -> Vec<u64> {
-        let mut feeding = Feeding::new(TIMEOUT, Duration::ZERO);
+        let mut feeding = Feeding {
+            every: TIMEOUT / MESSAGES_PER_TIMEOUT,
+            ticks: 0,
+            at: Duration::ZERO,
+        };
         let looks = (0..end_ms).step_by(50);
         let fed = looks.filter(|&now_ms| {
             let ticked_ms = if now_ms < stands_from_ms {

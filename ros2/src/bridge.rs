@@ -6,12 +6,14 @@
 
 use crate::names::Name;
 
-/// The key of a topic; `namespace` is that of the bridge, not of the robot's nodes.
-pub fn topic_key(namespace: &Name, topic: &Name) -> String {
-    if namespace.as_str().is_empty() {
-        topic.as_str().to_owned()
-    } else {
-        format!("{}/{}", namespace.as_str(), topic.as_str())
+impl Name {
+    /// The key of this topic; `namespace` is that of the bridge, not of the robot's nodes.
+    pub fn bridge_key(&self, namespace: &Self) -> String {
+        if namespace.as_str().is_empty() {
+            self.as_str().to_owned()
+        } else {
+            format!("{}/{}", namespace.as_str(), self.as_str())
+        }
     }
 }
 
@@ -23,7 +25,7 @@ mod tests {
     fn a_topic_is_below_the_bridges_namespace() {
         let topic = Name::topic("/cmd_vel", &Name::default()).unwrap();
         let robot = Name::namespace("/robot7").unwrap();
-        assert_eq!(topic_key(&robot, &topic), "robot7/cmd_vel");
-        assert_eq!(topic_key(&Name::default(), &topic), "cmd_vel");
+        assert_eq!(topic.bridge_key(&robot), "robot7/cmd_vel");
+        assert_eq!(topic.bridge_key(&Name::default()), "cmd_vel");
     }
 }

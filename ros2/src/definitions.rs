@@ -234,9 +234,9 @@ fn add_used<'a>(fields: &'a str, known: &mut Vec<&'a str>, text: &mut String) ->
 
 /// The schema of a message, with all that it consists of; none for one that is not known here.
 ///
-/// `package` and `name` are those of its type, such as `nav_msgs` and `Path`.
-pub fn schema(package: &str, name: &str) -> Option<String> {
-    let fields = fields_of(&format!("{package}/{name}"))?;
+/// `name` is that of its type with its package, such as `nav_msgs/Path`.
+pub fn schema(name: &str) -> Option<String> {
+    let fields = fields_of(name)?;
     let mut text = fields.to_owned();
     add_used(fields, &mut Vec::new(), &mut text)?;
     Some(text)
@@ -249,9 +249,8 @@ mod tests {
     #[test]
     fn every_definition_has_all_that_it_consists_of() {
         for (name, _) in DEFINITIONS {
-            let (package, name) = name.split_once('/').unwrap();
-            assert!(schema(package, name).is_some(), "{name}");
+            assert!(schema(name).is_some(), "{name}");
         }
-        assert_eq!(schema("nav_msgs", "Nothing"), None);
+        assert_eq!(schema("nav_msgs/Nothing"), None);
     }
 }

@@ -6,11 +6,11 @@ pub mod service_manager;
 
 use tread_api::robot::{RobotLimits, RobotModel};
 
-/// A rover of 50 kg by this name, on these tyres.
-pub fn rover(name: &str, tyres: &str) -> RobotModel {
+/// A rover of 50 kg by this name, on lugged tyres.
+pub fn rover(name: &str) -> RobotModel {
     RobotModel {
         name: name.to_owned(),
-        tyres: tyres.to_owned(),
+        tyres: "lugged".to_owned(),
         mass_kg: 50.0,
         track_width_m: 0.6,
         wheelbase_m: 0.5,

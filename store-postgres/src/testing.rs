@@ -15,9 +15,21 @@ const VARIABLE: &str = "TREAD_TEST_POSTGRES";
 /// Lock that is held while the template is made.
 const TEMPLATE_LOCK: i64 = 1;
 
+/// Address of the server.
+pub(crate) struct AdminUrl(pub(crate) String);
+
+impl AdminUrl {
+    /// Returns the address of a database of the server.
+    pub(crate) fn of(&self, database: &str) -> String {
+        let (server, _database) = self.0.rsplit_once('/').unwrap();
+        format!("{server}/{database}")
+    }
+}
+
 /// A database of one test.
 pub(crate) struct TestDatabase {
-    admin: String,
+    /// Address of its server.
+    pub(crate) admin: AdminUrl,
     name: String,
     /// Its address.
     pub(crate) url: String,
@@ -33,19 +45,13 @@ async fn run(db: &mut PgConnection, statement: String) {
     done.unwrap();
 }
 
-/// Returns the address of another database of the same server.
-pub(crate) fn url_of(admin: &str, name: &str) -> String {
-    let (server, _database) = admin.rsplit_once('/').unwrap();
-    format!("{server}/{name}")
-}
-
 /// Returns the address of the server; `None`, which it reports, if no server was named.
-pub(crate) fn admin_url(test: &str) -> Option<String> {
+pub(crate) fn admin_url(test: &str) -> Option<AdminUrl> {
     let admin = env::var(VARIABLE).ok();
     if admin.is_none() {
         eprintln!("`{test}` was NOT RUN: {VARIABLE} names no PostgreSQL server");
     }
-    admin
+    admin.map(AdminUrl)
 }
 
 /// Runs a test with a database that has the present schema, and drops the database. Without a server it
@@ -54,14 +60,14 @@ pub(crate) async fn with_database(test: &str, body: impl AsyncFnOnce(&TestDataba
     let Some(admin) = admin_url(test) else { return };
     let template = template(&admin).await;
     let name = format!("tread_test_{}", Uuid::new_v4().simple());
-    let mut server = connect(&admin).await;
+    let mut server = connect(&admin.0).await;
     run(
         &mut server,
         format!("CREATE DATABASE {name} TEMPLATE {template}"),
     )
     .await;
     let database = TestDatabase {
-        url: url_of(&admin, &name),
+        url: admin.of(&name),
         admin,
         name,
     };
@@ -88,14 +94,14 @@ impl TestDatabase {
     }
 
     async fn drop(self) {
-        let mut server = connect(&self.admin).await;
+        let mut server = connect(&self.admin.0).await;
         let name = &self.name;
         run(&mut server, format!("DROP DATABASE {name} WITH (FORCE)")).await;
     }
 }
 
 /// Returns the name of a database with the present schema, which the first test makes.
-async fn template(admin: &str) -> String {
+async fn template(admin: &AdminUrl) -> String {
     let checksums = schema::migrator()
         .iter()
         .flat_map(|one| one.checksum.iter());
@@ -103,7 +109,7 @@ async fn template(admin: &str) -> String {
         hash.wrapping_mul(31).wrapping_add(u64::from(*byte))
     });
     let name = format!("tread_template_{hash:x}");
-    let mut server = connect(admin).await;
+    let mut server = connect(&admin.0).await;
     run(
         &mut server,
         format!("SELECT pg_advisory_lock({TEMPLATE_LOCK})"),
@@ -119,7 +125,7 @@ async fn template(admin: &str) -> String {
         let statement = format!("DROP DATABASE IF EXISTS {unfinished} WITH (FORCE)");
         run(&mut server, statement).await;
         run(&mut server, format!("CREATE DATABASE {unfinished}")).await;
-        let db = Db::open(&url_of(admin, &unfinished)).await.unwrap();
+        let db = Db::open(&admin.of(&unfinished)).await.unwrap();
         db.close().await;
         let statement = format!("ALTER DATABASE {unfinished} RENAME TO {name}");
         run(&mut server, statement).await;

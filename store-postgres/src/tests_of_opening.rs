@@ -6,7 +6,7 @@ use tokio::time::sleep;
 
 use crate::inspection::{Schema, inspect};
 use crate::lock::{DatabaseLock, LockError};
-use crate::testing::{admin_url, url_of, with_database};
+use crate::testing::{admin_url, with_database};
 use crate::{Db, OpenError, schema};
 
 const PASSWORD: &str = "hunter2";
@@ -55,9 +55,9 @@ async fn what_is_wrong_with_user_or_database_is_said() {
     let Some(admin) = admin_url("what_is_wrong_with_user_or_database_is_said") else {
         return;
     };
-    let error = refusal(&url_of(&admin, "there_is_none")).await;
+    let error = refusal(&admin.of("there_is_none")).await;
     assert!(matches!(error, OpenError::NoDatabase { .. }), "{error:?}");
-    let (user, server) = admin.split_once('@').unwrap();
+    let (user, server) = admin.0.split_once('@').unwrap();
     let (user, _password) = user.rsplit_once(':').unwrap();
     let error = refusal(&format!("{user}:{PASSWORD}@{server}")).await;
     assert!(
@@ -191,7 +191,7 @@ async fn a_database_that_is_newer_or_stores_no_unicode_is_refused() {
                     "CREATE DATABASE {other} ENCODING SQL_ASCII TEMPLATE template0 LOCALE 'C'"
                 ))
                 .await;
-            let error = refusal(&url_of(&database.url, &other)).await;
+            let error = refusal(&database.admin.of(&other)).await;
             assert!(matches!(error, OpenError::Encoding { .. }), "{error:?}");
             database.run(&format!("DROP DATABASE {other}")).await;
         },

@@ -368,16 +368,15 @@ async fn missions_and_restorations_are_the_same() {
         both!(both, history::steps_after(2, 10));
         both_in_any_order!(both, missions::next_in_queues());
         both_in_any_order!(both, missions::overdue(at(101), 10));
-        let (queued, offered) = (of(json!("queued")), of(json!("offered")));
-        let cause = of(json!("offered"));
-        assert!(both!(
-            both,
-            missions::compare_and_set(id(2), queued, offered, cause, None)
-        ));
-        assert!(!both!(
-            both,
-            missions::compare_and_set(id(2), queued, offered, cause, None)
-        ));
+        let queued = of(json!("queued"));
+        let transition = missions::Transition {
+            from: queued,
+            to: of(json!("offered")),
+            cause: of(json!("offered")),
+            reason: None,
+        };
+        assert!(both!(both, missions::compare_and_set(id(2), transition)));
+        assert!(!both!(both, missions::compare_and_set(id(2), transition)));
         let replacement = of(json!({"revision": 2, "plan_hash": hash,
             "trajectory": trajectory}));
         both!(both, missions::set_replacement(id(2), Some(&replacement)));
@@ -600,7 +599,11 @@ async fn records_and_webhooks_are_the_same() {
                 both!(both, audit::list(&filter, 10));
             }
         }
-        both!(both, audit::forget(at(0), 1, 10));
+        let kept = audit::AuditRetention {
+            since: at(0),
+            newest_max: 1,
+        };
+        both!(both, audit::forget(kept, 10));
         both!(both, audit::chain());
         let owner = SubjectId::Token(id(1));
         let answer = idempotency::StoredAnswer {
@@ -661,7 +664,11 @@ async fn records_and_webhooks_are_the_same() {
         both!(both, webhooks::note_attempt(&outcome));
         both!(both, webhooks::deliveries(id(1), Some(id(9)), 10));
         both!(both, webhooks::has_older(at(4)));
-        both!(both, webhooks::give_up_older(at(4), at(9)));
+        let limit = webhooks::AgeLimit {
+            now: at(9),
+            oldest: at(4),
+        };
+        both!(both, webhooks::give_up_older(limit));
         both!(both, webhooks::pending_count());
         both!(both, webhooks::list(Some(id(3)), 10));
         both!(both, webhooks::count());

@@ -11,8 +11,12 @@ use crate::testing::{TestDatabase, with_database};
 use crate::tests_of_segments::{NAMED, segment};
 use crate::{Db, partitions, removed, schema, segment_ranges, segments};
 
-/// Stores measurements of one robot that follow those before, received at a second.
-async fn upload(db: &Db, count: i64, second: i64) {
+fn at(second: i64) -> Timestamp {
+    Timestamp::from_second(second).unwrap()
+}
+
+/// Stores measurements of one robot that follow those before.
+async fn upload(db: &Db, count: i64, received_at: Timestamp) {
     let mut runner = TestRunner::deterministic();
     let some = segment().new_tree(&mut runner).unwrap().current();
     let mut tx = db.write("db").await.unwrap();
@@ -28,8 +32,8 @@ async fn upload(db: &Db, count: i64, second: i64) {
         times_ns: (seq, seq),
     };
     let segments: Vec<_> = (next..next + count).map(new).collect();
-    let at = Timestamp::from_second(second).unwrap();
-    segments::insert(&mut tx, &segments, at).await.unwrap();
+    let inserted = segments::insert(&mut tx, &segments, received_at).await;
+    inserted.unwrap();
     tx.commit().await.unwrap();
 }
 
@@ -94,7 +98,7 @@ async fn removed_measurements_leave_the_lists_at_once_and_the_disk_with_their_pa
         partitions::add(&mut tx, (4, 9)).await.unwrap();
         tx.commit().await.unwrap();
         // One upload for all partitions, and for one that is created for it.
-        upload(&db, 12, 1).await;
+        upload(&db, 12, at(1)).await;
         let created = (10, 1_000_009, 3);
         assert_eq!(partitions(database).await, [(1, 3, 3), (4, 9, 6), created]);
         assert_eq!(keys(&db).await, (1..=12).collect::<Vec<_>>());
@@ -114,7 +118,7 @@ async fn removed_measurements_leave_the_lists_at_once_and_the_disk_with_their_pa
             [(1, 9)]
         );
         drop(tx);
-        upload(&db, 2, 2).await;
+        upload(&db, 2, at(2)).await;
         assert_eq!(keys(&db).await, [10, 11, 12, 13, 14]);
         db.close().await;
     })
@@ -130,7 +134,7 @@ async fn a_reader_delays_the_drop_of_a_partition_and_loses_nothing() {
         let mut tx = db.write("db").await.unwrap();
         partitions::add(&mut tx, (1, 3)).await.unwrap();
         tx.commit().await.unwrap();
-        upload(&db, 6, 1).await;
+        upload(&db, 6, at(1)).await;
         let mut reader = db.read("db").await.unwrap();
         let filter = SegmentFilter::default();
         let before = segments::list(&mut reader, 1, &filter, 99).await.unwrap();
@@ -143,7 +147,7 @@ async fn a_reader_delays_the_drop_of_a_partition_and_loses_nothing() {
             segments::list(&mut reader, 1, &filter, 99).await.unwrap(),
             before
         );
-        upload(&db, 1, 2).await;
+        upload(&db, 1, at(2)).await;
         drop(reader);
         assert_eq!(release(&db).await, Some(1));
         assert_eq!(keys(&db).await, [4, 5, 6, 7]);
@@ -205,7 +209,7 @@ async fn measurements_of_a_database_without_partitions_remain() {
         let db = database.open().await;
         assert_eq!(partitions(database).await, [(0, 9, 3)]);
         assert_eq!(keys(&db).await, [7, 8, 9]);
-        upload(&db, 2, 1).await;
+        upload(&db, 2, at(1)).await;
         assert_eq!(partitions(database).await, [(0, 9, 3), (10, 1_000_009, 2)]);
         assert_eq!(keys(&db).await, [7, 8, 9, 10, 11]);
         // It may be as large as all that follow, so its values are removed at once.

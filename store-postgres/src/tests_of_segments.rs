@@ -13,7 +13,7 @@ use tread_api::friction::{Information, Segment, ThetaErrors};
 use tread_api::site::Cell;
 use tread_api::terrain::TerrainRef;
 
-use crate::segments::{NewSegment, SegmentFilter};
+use crate::segments::{NewSegment, RobotCursor, SegmentFilter, SiteCursor};
 use crate::testing::with_database;
 use crate::{removed, segment_ranges, segments};
 
@@ -163,14 +163,19 @@ async fn measurements_are_stored_listed_and_removed_as_by_the_other_engine() {
                 ours,
                 segments::first_since(Timestamp::from_second(4).unwrap())
             );
-            let of_robot: Vec<_> = segments::of_robot(&mut ours, 1, 4)
+            let (robot_pk, site_pk, after) = (1, 1, 4);
+            let of_robot: Vec<_> = segments::of_robot(&mut ours, RobotCursor { robot_pk, after })
                 .try_collect()
                 .await
                 .unwrap();
-            let of_site = segments::of_site(&mut ours, 1, 4, u32::MAX).await.unwrap();
-            let theirs_of_site = tread_store_sqlite::segments::of_site(&mut theirs, 1, 4, u32::MAX)
+            let cursor = SiteCursor { site_pk, after };
+            let of_site = segments::of_site(&mut ours, cursor, u32::MAX)
                 .await
                 .unwrap();
+            let theirs_of_site =
+                tread_store_sqlite::segments::of_site(&mut theirs, cursor, u32::MAX)
+                    .await
+                    .unwrap();
             assert_eq!(format!("{of_site:?}"), format!("{theirs_of_site:?}"));
             assert_eq!(format!("{of_site:?}"), format!("{of_robot:?}"));
             if let Some((first, last)) = ends {
@@ -236,7 +241,8 @@ async fn the_speed_of_writing_and_reading_measurements() {
             for after in [0, seq / 2, seq - 6_000] {
                 let mut tx = db.read("db").await.unwrap();
                 let begun = Instant::now();
-                let found = segments::of_site(&mut tx, 1, after, 5_000).await.unwrap();
+                let cursor = SiteCursor { site_pk: 1, after };
+                let found = segments::of_site(&mut tx, cursor, 5_000).await.unwrap();
                 eprintln!(
                     "{} of {seq} rows after {after}: {:?}",
                     found.len(),
@@ -245,7 +251,11 @@ async fn the_speed_of_writing_and_reading_measurements() {
             }
             let mut tx = db.read("db").await.unwrap();
             let begun = Instant::now();
-            let all: Vec<_> = segments::of_robot(&mut tx, 1, 0)
+            let cursor = RobotCursor {
+                robot_pk: 1,
+                after: 0,
+            };
+            let all: Vec<_> = segments::of_robot(&mut tx, cursor)
                 .try_collect()
                 .await
                 .unwrap();

@@ -24,7 +24,7 @@ const CASES: usize = 40;
 fn fixed() -> impl Strategy<Value = Fixed> {
     let hi = prop_oneof![-4_i64..4, -(1_i64 << 58)..1_i64 << 58];
     let lo = prop_oneof![Just(0_i64), Just(0xFFFF_FFFF), 0..1_i64 << 32];
-    (hi, lo).prop_map(|(hi, lo)| Fixed::from_halves(hi, lo))
+    (hi, lo).prop_map(|(hi, lo)| Fixed::from_units(hi) + Fixed::from_steps(lo))
 }
 
 fn pair() -> impl Strategy<Value = Pair> {
@@ -156,7 +156,7 @@ async fn stored_sums_equal_those_in_memory_to_the_bit_in_any_batches() {
 fn unit(hi: i64) -> Sums {
     let mut runner = TestRunner::deterministic();
     let some = sums().new_tree(&mut runner).unwrap().current();
-    let information = Fixed::from_halves(hi, 0xFFFF_FFFF);
+    let information = Fixed::from_units(hi) + Fixed::from_steps(0xFFFF_FFFF);
     Sums {
         theta: Pair {
             information,

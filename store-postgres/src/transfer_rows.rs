@@ -100,7 +100,7 @@ pub async fn insert(db: &mut Connection, table: &Table, rows: &[Row]) -> Result<
                 }
                 (Value::Real(value), ColumnType::Real) => bound.real(*value),
                 (Value::Text(value), ColumnType::Text) => {
-                    check_text(value, table, row, &column.name)?;
+                    check_text(value, table, row, column)?;
                     bound.text(Some(value))
                 }
                 (Value::Bytes(value), ColumnType::Bytes) => bound.bytes(value),
@@ -124,9 +124,9 @@ pub async fn insert(db: &mut Connection, table: &Table, rows: &[Row]) -> Result<
 }
 
 /// Refuses a text that PostgreSQL cannot store.
-fn check_text(text: &str, table: &Table, row: &Row, column: &str) -> Result<(), EngineError> {
+fn check_text(text: &str, table: &Table, row: &Row, column: &Column) -> Result<(), EngineError> {
     if text.contains('\0') {
-        let place = place(table, row, column);
+        let place = place(table, row, &column.name);
         return Err(corrupt(
             "text that PostgreSQL can store, with U+0000 at",
             place,

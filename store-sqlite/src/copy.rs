@@ -39,6 +39,15 @@ pub struct CopyContents {
     pub rows: BTreeMap<String, u64>,
 }
 
+/// Paths of a copy.
+#[derive(Debug, Clone, Copy)]
+pub struct CopyPaths<'path> {
+    /// The database.
+    pub database: &'path Path,
+    /// The new file.
+    pub target: &'path Path,
+}
+
 /// Maximum size of a copy: that of the database with its log.
 ///
 /// # Errors
@@ -61,7 +70,7 @@ pub async fn size_bytes(database: &Path) -> Result<u64, EngineError> {
 ///
 /// # Errors
 /// The database cannot be read, or the file not be written; then the file is removed.
-pub async fn copy_into(database: &Path, target: &Path) -> Result<(), EngineError> {
+pub async fn copy_into(CopyPaths { database, target }: CopyPaths<'_>) -> Result<(), EngineError> {
     let Some(name) = target.to_str() else {
         return Err(corrupt("file name", target.display()));
     };

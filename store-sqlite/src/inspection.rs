@@ -9,7 +9,7 @@ use sqlx::sqlite::SqliteConnectOptions;
 use sqlx::{AssertSqlSafe, ConnectOptions as _, Connection as _, SqliteConnection};
 
 use tread_store::failure::StorageFailure;
-pub use tread_store::inspection::{Inspection, Schema};
+pub use tread_store::inspection::{InspectOptions, Inspection, Schema};
 
 use super::failure;
 use super::{BUSY_TIMEOUT, EngineError, archive_mark, times};
@@ -42,14 +42,13 @@ impl InspectError {
     }
 }
 
-/// Inspects a database; `None` if the file does not exist. `is_deep` reads the whole file.
+/// Inspects a database; `None` if the file does not exist.
 ///
 /// # Errors
 /// [`InspectError`]: the file cannot be opened or read.
 pub async fn inspect(
     path: &Path,
-    is_in_use: bool,
-    is_deep: bool,
+    InspectOptions { is_in_use, is_deep }: InspectOptions,
 ) -> Result<Option<Inspection>, InspectError> {
     match fs::metadata(path) {
         Ok(_) => {}

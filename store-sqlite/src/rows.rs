@@ -37,10 +37,24 @@ impl Row<'_> {
     }
 }
 
+/// Text of a statement around its rows.
+pub(super) struct RowsText<'text> {
+    /// Everything before `VALUES`.
+    pub(super) into: &'text str,
+    /// Number of columns of a row.
+    pub(super) columns: usize,
+    /// What follows the rows.
+    pub(super) then: &'text str,
+}
+
 impl RowsStatement {
-    /// Makes a statement from `into`, everything before `VALUES` with as many columns as `columns`,
-    /// and `then`, which follows the rows.
-    pub(super) fn new(into: &str, columns: usize, then: &str) -> Self {
+    /// Makes a statement.
+    pub(super) fn new(statement: &RowsText<'_>) -> Self {
+        let &RowsText {
+            into,
+            columns,
+            then,
+        } = statement;
         let row = format!("({})", vec!["?"; columns].join(","));
         let text = |rows| {
             let rows = vec![row.as_str(); rows].join(",");

@@ -5,7 +5,7 @@ use std::sync::LazyLock;
 use jiff::Timestamp;
 use tread_store::segments::{Added, NewSegment};
 
-use super::rows::{Row, RowsStatement};
+use super::rows::{Row, RowsStatement, RowsText};
 use super::segment_ranges::{self, NewRange};
 use super::{Connection, EngineError, ground, to_us};
 
@@ -13,14 +13,15 @@ use super::{Connection, EngineError, ground, to_us};
 const COLUMNS: usize = 18;
 
 static INSERT: LazyLock<RowsStatement> = LazyLock::new(|| {
-    RowsStatement::new(
-        "INSERT INTO segment_values (pk, started_at_ns, ended_at_ns, ix, iy, theta_information,
+    RowsStatement::new(&RowsText {
+        into:
+            "INSERT INTO segment_values (pk, started_at_ns, ended_at_ns, ix, iy, theta_information,
              theta_weighted, independent_information, robot_error_ratio, tyre_error_ratio,
              track_information, track_weighted, rolling_information, rolling_weighted,
              mu_peak_lower_bound, samples, distance_m, saturation_ratio)",
-        COLUMNS,
-        "",
-    )
+        columns: COLUMNS,
+        then: "",
+    })
 });
 
 /// Stores measurements, none of which is stored yet.
@@ -74,13 +75,14 @@ fn bind(row: &mut Row<'_>, &(pk, new): &(i64, &NewSegment<'_>)) -> Result<(), En
 const RANGE_COLUMNS: usize = 13;
 
 static INSERT_RANGES: LazyLock<RowsStatement> = LazyLock::new(|| {
-    RowsStatement::new(
-        "INSERT INTO segment_ranges (first_pk, last_pk, first_seq, last_seq, boot_pk, robot_pk,
+    RowsStatement::new(&RowsText {
+        into:
+            "INSERT INTO segment_ranges (first_pk, last_pk, first_seq, last_seq, boot_pk, robot_pk,
              site_pk, configuration_pk, mission, grid_revision, terrain, terrain_revision,
              received_at_us)",
-        RANGE_COLUMNS,
-        "",
-    )
+        columns: RANGE_COLUMNS,
+        then: "",
+    })
 });
 
 /// Removes the values of measurements up to a key, which are no longer in the ledger.

@@ -6,24 +6,24 @@ use tread_store::friction::sums::TELLING_DEVIATIONS;
 use tread_store::friction::{Horizons, Sums};
 use tread_store::sums::{StoredHour, SumKey};
 
-use super::rows::{Row, RowsStatement};
+use super::rows::{Row, RowsStatement, RowsText};
 use super::{Connection, EngineError, ground};
 
 /// Number of columns.
 const COLUMNS: usize = 35;
 
 static ADD: LazyLock<RowsStatement> = LazyLock::new(|| {
-    RowsStatement::new(
-        "INSERT INTO cell_sums (site_pk, iy, ix, grid_revision, terrain, terrain_revision,
+    RowsStatement::new(&RowsText {
+        into: "INSERT INTO cell_sums (site_pk, iy, ix, grid_revision, terrain, terrain_revision,
              robot_pk, configuration_pk, epoch_h, information_hi, information_lo, weighted_hi,
              weighted_lo, square_hi, square_lo, track_information_hi, track_information_lo,
              track_weighted_hi, track_weighted_lo, rolling_information_hi, rolling_information_lo,
              rolling_weighted_hi, rolling_weighted_lo, segments, samples, mu_peak, newest_at_us,
              newest_information, newest_weighted, newest_mu, pass_at_us, robot_error_hi,
              robot_error_lo, tyre_error_hi, tyre_error_lo)",
-        COLUMNS,
-        &added(),
-    )
+        columns: COLUMNS,
+        then: &added(),
+    })
 });
 
 /// Fixed-point numbers, each in two columns.

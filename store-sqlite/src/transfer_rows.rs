@@ -5,7 +5,7 @@ use sqlx::sqlite::{SqliteArguments, SqliteRow};
 use sqlx::{Row as _, Sqlite, TypeInfo as _, ValueRef as _};
 use tread_store::transfer::{Column, ColumnType, Row, Table, Value};
 
-use super::rows::RowsStatement;
+use super::rows::{RowsStatement, RowsText};
 use super::{Connection, EngineError, column_names, corrupt};
 
 /// Returns the columns of a table; none if the table does not exist.
@@ -82,7 +82,11 @@ pub async fn insert(db: &mut Connection, table: &Table, rows: &[Row]) -> Result<
         table.name,
         column_names::quoted(table, &all)
     );
-    let statement = RowsStatement::new(&into, all.len(), "");
+    let statement = RowsStatement::new(&RowsText {
+        into: &into,
+        columns: all.len(),
+        then: "",
+    });
     let writing = statement.execute(db, rows, |bound, row| {
         for value in row {
             match value {

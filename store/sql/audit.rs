@@ -1,11 +1,10 @@
 //! The audit log: who changed what, and who was refused, in a chain of hashes
 //! ([`tread_api::audit`]).
 
-use jiff::Timestamp;
 use tread_api::audit::{AuditChain, FIRST_PREVIOUS_HASH, hash_after};
 use tread_api::identity::{AuditEntry, AuditOrder, Role};
 use tread_api::ids::TokenId;
-pub use tread_store::audit::AuditFilter;
+pub use tread_store::audit::{AuditFilter, AuditRetention};
 
 use super::tokens::role;
 use super::{Connection, EngineError, from_json, from_us, parse, to_json, to_us, unsigned};
@@ -213,21 +212,20 @@ async fn insert(db: &mut Connection, entry: &AuditEntry) -> Result<(), EngineErr
     Ok(())
 }
 
-/// Deletes at most `limit` of the oldest entries: those older than a time, or beyond the newest
-/// `kept`. Keeps number and hash of the last one deleted, so that the rest can be verified.
+/// Deletes at most `limit` of the oldest entries, of those that are not `kept`. Keeps number and hash of
+/// the last one deleted, so that the rest can be verified.
 pub async fn forget(
     db: &mut Connection,
-    before: Timestamp,
-    kept: u32,
+    kept: AuditRetention,
     limit: u32,
 ) -> Result<(), EngineError> {
-    let before_us = to_us(before);
+    let since_us = to_us(kept.since);
     let gone = sqlx::query!(
         "SELECT id, hash FROM audit
          WHERE id <= (SELECT MAX(id) FROM audit) - $1 OR at_us < $2
          ORDER BY id LIMIT $3",
-        i64::from(kept),
-        before_us,
+        i64::from(kept.newest_max),
+        since_us,
         i64::from(limit),
     )
     .fetch_all(&mut *db)

@@ -3,7 +3,7 @@
 
 use serde_json::value::RawValue;
 use tread_store::RecordKey;
-pub use tread_store::deferred_segments::{DeferredSegment, Origin};
+pub use tread_store::deferred_segments::{DeferredFilter, DeferredSegment, Origin};
 
 use super::{Connection, EngineError, from_json, unsigned};
 
@@ -58,12 +58,10 @@ pub async fn is_any(db: &mut Connection) -> Result<bool, EngineError> {
     Ok(first.fetch_optional(db).await?.is_some())
 }
 
-/// Removes and returns at most `limit` deferred segments of a run that ended before a time of its
-/// robot's clock.
+/// Removes and returns at most `limit` deferred segments.
 pub async fn take(
     db: &mut Connection,
-    boot_pk: i64,
-    ended_before_us: i64,
+    filter: DeferredFilter,
     limit: u32,
 ) -> Result<Vec<DeferredSegment>, EngineError> {
     let rows = sqlx::query!(
@@ -71,8 +69,8 @@ pub async fn take(
                SELECT seq FROM deferred_segments WHERE boot_pk = $1 AND ended_at_us <= $2
                ORDER BY seq LIMIT $3)
            RETURNING seq AS "seq!", measurement AS "measurement!""#,
-        boot_pk,
-        ended_before_us,
+        filter.boot_pk,
+        filter.ended_before_us,
         i64::from(limit),
     )
     .fetch_all(db)

@@ -7,7 +7,7 @@ use futures_util::StreamExt as _;
 use jiff::Timestamp;
 use tread_api::ids::{MissionId, RobotId, SiteId};
 use tread_api::mission::{Cause, DrivenPath, Mission, MissionQuality, MissionState, Replacement};
-pub use tread_store::missions::{Facts, Inserted, MissionFilter, MissionRow};
+pub use tread_store::missions::{Facts, Inserted, MissionFilter, MissionRow, Transition};
 
 pub use self::standing::{Standing, in_progress, next_in_queues, open_of_robot, overdue};
 use super::{
@@ -211,18 +211,15 @@ pub async fn list(
 pub async fn compare_and_set(
     db: &mut Connection,
     id: MissionId,
-    from: MissionState,
-    to: MissionState,
-    cause: Cause,
-    reason: Option<&str>,
+    transition: Transition<'_>,
 ) -> Result<bool, EngineError> {
-    let (id, from, to) = (id.to_string(), from.as_str(), to.as_str());
-    let cause = cause.as_str();
+    let (id, from) = (id.to_string(), transition.from.as_str());
+    let (to, cause) = (transition.to.as_str(), transition.cause.as_str());
     let result = sqlx::query!(
         "UPDATE missions SET state = $1, cause = $2, reason = $3 WHERE id = $4 AND state = $5",
         to,
         cause,
-        reason,
+        transition.reason,
         id,
         from,
     )

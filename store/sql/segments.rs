@@ -7,7 +7,9 @@ use futures_util::{Stream, StreamExt as _};
 use jiff::Timestamp;
 use tread_api::friction::{Information, Segment, StoredSegment, ThetaErrors};
 use tread_api::ids::{RobotId, TerrainId};
-pub use tread_store::segments::{Added, Extent, KeyedSegment, NewSegment, SegmentFilter};
+pub use tread_store::segments::{
+    Added, Extent, KeyedSegment, NewSegment, RobotCursor, SegmentFilter, SiteCursor,
+};
 
 pub use super::segment_ranges::first_since;
 pub use super::segment_rows::insert;
@@ -54,14 +56,6 @@ struct Raw {
     saturation_ratio: f64,
 }
 
-fn pair(information: Option<f64>, weighted: Option<f64>) -> Option<Information> {
-    let (information, weighted) = information.zip(weighted)?;
-    Some(Information {
-        information,
-        weighted,
-    })
-}
-
 fn from_ns(ns: i64) -> Result<Timestamp, EngineError> {
     Timestamp::from_nanosecond(ns.into()).map_err(|_range| corrupt("time", ns))
 }
@@ -69,6 +63,8 @@ fn from_ns(ns: i64) -> Result<Timestamp, EngineError> {
 impl Raw {
     fn segment(&self) -> Result<Segment, EngineError> {
         let errors = self.independent_information.zip(self.robot_error_ratio);
+        let track = self.track_information.zip(self.track_weighted);
+        let rolling = self.rolling_information.zip(self.rolling_weighted);
         let mission = self.mission.as_deref().map(|id| parse("mission", id));
         Ok(Segment {
             configuration: parse("configuration", &self.configuration)?,
@@ -89,8 +85,14 @@ impl Raw {
                     tyre_ratio,
                 },
             ),
-            effective_track_ratio: pair(self.track_information, self.track_weighted),
-            rolling_resistance: pair(self.rolling_information, self.rolling_weighted),
+            effective_track_ratio: track.map(|(information, weighted)| Information {
+                information,
+                weighted,
+            }),
+            rolling_resistance: rolling.map(|(information, weighted)| Information {
+                information,
+                weighted,
+            }),
             mu_peak_lower_bound: self.mu_peak_lower_bound,
             samples: unsigned("number", self.samples)?,
             distance_m: self.distance_m,
@@ -235,33 +237,31 @@ impl TryFrom<Raw> for KeyedSegment {
     }
 }
 
-/// Returns all measurements of a robot after a key, in the order of their commits.
+/// Returns all measurements of a robot after a cursor, in the order of their commits.
 pub fn of_robot(
     db: &mut Connection,
-    robot_pk: i64,
-    after: i64,
+    cursor: RobotCursor,
 ) -> impl Stream<Item = Result<KeyedSegment, EngineError>> {
     let rows = measurements!(
         "AND segment_ranges.robot_pk = $3",
-        after,
+        cursor.after,
         EVERYTHING,
-        robot_pk,
+        cursor.robot_pk,
     );
     rows.fetch(db).map(|raw| KeyedSegment::try_from(raw?))
 }
 
-/// Returns at most `limit` measurements of a site in the order of their commits, after a key.
+/// Returns at most `limit` measurements of a site in the order of their commits, after a cursor.
 pub async fn of_site(
     db: &mut Connection,
-    site_pk: i64,
-    after: i64,
+    cursor: SiteCursor,
     limit: u32,
 ) -> Result<Vec<KeyedSegment>, EngineError> {
     let rows = measurements!(
         "AND +segment_ranges.site_pk = $3",
-        after,
+        cursor.after,
         i64::from(limit),
-        site_pk
+        cursor.site_pk
     );
     let rows = rows.fetch_all(db).await?;
     rows.into_iter().map(KeyedSegment::try_from).collect()

@@ -60,23 +60,23 @@ impl TryFrom<RawSum> for SumRow {
             site_pk: raw.site_pk,
             configuration_pk: raw.configuration_pk,
         };
-        let fixed = Fixed::from_halves;
+        let (units, steps) = (Fixed::from_units, Fixed::from_steps);
         let newest_theta = raw.newest_information.zip(raw.newest_weighted);
         let sums = Sums {
             theta: Pair {
-                information: fixed(raw.information_hi, raw.information_lo),
-                weighted: fixed(raw.weighted_hi, raw.weighted_lo),
+                information: units(raw.information_hi) + steps(raw.information_lo),
+                weighted: units(raw.weighted_hi) + steps(raw.weighted_lo),
             },
-            theta_square: fixed(raw.square_hi, raw.square_lo),
-            robot_error: fixed(raw.robot_error_hi, raw.robot_error_lo),
-            tyre_error: fixed(raw.tyre_error_hi, raw.tyre_error_lo),
+            theta_square: units(raw.square_hi) + steps(raw.square_lo),
+            robot_error: units(raw.robot_error_hi) + steps(raw.robot_error_lo),
+            tyre_error: units(raw.tyre_error_hi) + steps(raw.tyre_error_lo),
             track: Pair {
-                information: fixed(raw.track_information_hi, raw.track_information_lo),
-                weighted: fixed(raw.track_weighted_hi, raw.track_weighted_lo),
+                information: units(raw.track_information_hi) + steps(raw.track_information_lo),
+                weighted: units(raw.track_weighted_hi) + steps(raw.track_weighted_lo),
             },
             rolling: Pair {
-                information: fixed(raw.rolling_information_hi, raw.rolling_information_lo),
-                weighted: fixed(raw.rolling_weighted_hi, raw.rolling_weighted_lo),
+                information: units(raw.rolling_information_hi) + steps(raw.rolling_information_lo),
+                weighted: units(raw.rolling_weighted_hi) + steps(raw.rolling_weighted_lo),
             },
             segments: unsigned("count", raw.segments)?,
             samples: unsigned("count", raw.samples)?,

@@ -3,7 +3,7 @@
 use jiff::Timestamp;
 use tread_api::ids::{AlertCode, DeliveryId, SiteId, WebhookId};
 use tread_api::webhook::{Delivery, DeliveryState, NoticeEvent, Webhook, WebhookSettings};
-pub use tread_store::webhooks::{Due, DueTimes, NewDelivery, Outcome, Receiver};
+pub use tread_store::webhooks::{AgeLimit, Due, DueTimes, NewDelivery, Outcome, Receiver};
 
 use super::{
     Connection, EngineError, corrupt, from_json, from_us, parse, to_json, to_us, unsigned,
@@ -326,20 +326,16 @@ pub async fn has_older(db: &mut Connection, than: Timestamp) -> Result<bool, Eng
     Ok(found.fetch_one(db).await?)
 }
 
-/// Gives up the waiting deliveries that were queued before a time; returns how many.
-pub async fn give_up_older(
-    db: &mut Connection,
-    than: Timestamp,
-    at: Timestamp,
-) -> Result<u64, EngineError> {
-    let (than_us, at_us) = (to_us(than), to_us(at));
+/// Gives up the waiting deliveries beyond a limit; returns how many.
+pub async fn give_up_older(db: &mut Connection, limit: AgeLimit) -> Result<u64, EngineError> {
+    let (oldest_us, now_us) = (to_us(limit.oldest), to_us(limit.now));
     let done = sqlx::query!(
         "UPDATE webhook_deliveries
          SET state = 'failed', ended_at_us = $2,
              detail = 'given up: it waited too long; ' || COALESCE(detail, 'it was never sent')
          WHERE state = 'pending' AND created_at_us < $1",
-        than_us,
-        at_us,
+        oldest_us,
+        now_us,
     )
     .execute(db)
     .await?;

@@ -1,5 +1,6 @@
-//! The audit log: filters.
+//! The audit log: filters, and which entries are kept.
 
+use jiff::Timestamp;
 use tread_api::identity::AuditOrder;
 
 /// Filter and order of a list of entries.
@@ -13,4 +14,13 @@ pub struct AuditFilter {
     pub order: AuditOrder,
     /// Only those after this one in that order (cursor).
     pub beyond: Option<u64>,
+}
+
+/// Which entries are kept.
+#[derive(Debug, Clone, Copy)]
+pub struct AuditRetention {
+    /// Only those since this time.
+    pub since: Timestamp,
+    /// At most this many, the newest.
+    pub newest_max: u32,
 }

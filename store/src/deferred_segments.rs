@@ -13,6 +13,15 @@ pub struct DeferredSegment {
     pub segment: Segment,
 }
 
+/// Filter of the deferred segments that are taken.
+#[derive(Debug, Clone, Copy)]
+pub struct DeferredFilter {
+    /// Only those of this run of the agent.
+    pub boot_pk: i64,
+    /// Only those that ended before this time of its robot's clock, microseconds since 1970.
+    pub ended_before_us: i64,
+}
+
 /// Origin of a segment.
 #[derive(Debug, Clone, Copy)]
 pub struct Origin {

@@ -20,6 +20,15 @@ pub enum Schema {
     Differs(i64),
 }
 
+/// How a database is inspected.
+#[derive(Debug, Clone, Copy)]
+pub struct InspectOptions {
+    /// A server runs on it.
+    pub is_in_use: bool,
+    /// All of it is read.
+    pub is_deep: bool,
+}
+
 /// What was found.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Inspection {

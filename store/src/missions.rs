@@ -26,6 +26,19 @@ pub struct Inserted<'reason> {
     pub reason: Option<&'reason str>,
 }
 
+/// Transition of a mission from one state to another.
+#[derive(Debug, Clone, Copy)]
+pub struct Transition<'reason> {
+    /// State that is left.
+    pub from: MissionState,
+    /// State that is entered.
+    pub to: MissionState,
+    /// Why it is entered.
+    pub cause: Cause,
+    /// The same for people.
+    pub reason: Option<&'reason str>,
+}
+
 /// Filter of a list of missions.
 #[derive(Debug, Clone, Default)]
 pub struct MissionFilter {

@@ -58,6 +58,24 @@ pub struct SegmentFilter {
     pub after: i64,
 }
 
+/// Cursor in the measurements of a site.
+#[derive(Debug, Clone, Copy)]
+pub struct SiteCursor {
+    /// Key of the site.
+    pub site_pk: i64,
+    /// Only those with a larger key.
+    pub after: i64,
+}
+
+/// Cursor in the measurements of a robot.
+#[derive(Debug, Clone, Copy)]
+pub struct RobotCursor {
+    /// Key of the robot.
+    pub robot_pk: i64,
+    /// Only those with a larger key.
+    pub after: i64,
+}
+
 /// Range of stored measurements; it changes whenever one is added or removed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Extent {

@@ -63,6 +63,15 @@ pub struct DueTimes {
     pub latest: Timestamp,
 }
 
+/// Limit of the age of waiting deliveries.
+#[derive(Debug, Clone, Copy)]
+pub struct AgeLimit {
+    /// Present time.
+    pub now: Timestamp,
+    /// Time before which none may have been queued.
+    pub oldest: Timestamp,
+}
+
 /// What became of a delivery by an attempt.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Outcome {

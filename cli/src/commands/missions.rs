@@ -82,11 +82,7 @@ pub(super) fn list(missions: &[Mission]) -> String {
             mission.id.to_string(),
             mission.robot.to_string(),
             state(mission),
-            or_dash(
-                mission
-                    .progress
-                    .map(|progress| percent(progress.driven_m, progress.length_m)),
-            ),
+            or_dash(mission.progress.map(percent)),
             trajectory(&mission.trajectory),
             format!("{:.0}", mission.created_at),
             mission.reason.clone().unwrap_or_default(),

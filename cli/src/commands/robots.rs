@@ -102,7 +102,7 @@ pub(super) fn list(robots: &[Robot]) -> String {
             or_dash(pose.map(|pose| fixed(pose.value.y_m, 2))),
             or_dash(twist.map(|twist| fixed(twist.value.linear_m_s, 2))),
             or_dash(mission.map(|mission| mission.id)),
-            or_dash(mission.map(|mission| percent(mission.driven_m, mission.length_m))),
+            or_dash(mission.map(percent)),
             or_dash(live.and_then(theta)),
             or_dash(live.map(|live| format!("{} ago", age(live.heard_age_ms)))),
         ]);
@@ -302,9 +302,11 @@ pub(super) fn steps_come(progress: MissionProgress, steps: usize) -> Option<usiz
     Some((share.clamp(0.0, 1.0) * steps as f64).round() as usize)
 }
 
-pub(super) fn percent(part: f64, whole: f64) -> String {
-    if whole > 0.0 {
-        format!("{} %", fixed(100.0 * (part / whole).min(1.0), 0))
+/// Returns the progress of a mission in per cent; `-` while its length is unknown.
+pub(super) fn percent(progress: MissionProgress) -> String {
+    if progress.length_m > 0.0 {
+        let share = progress.driven_m / progress.length_m;
+        format!("{} %", fixed(100.0 * share.min(1.0), 0))
     } else {
         "-".to_owned()
     }

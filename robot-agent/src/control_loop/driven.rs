@@ -5,6 +5,8 @@
 //! dropped points is added to the tolerance reported with the path. [`Driven::quality`] and
 //! [`Driven::path`] allocate and are called outside the loop.
 
+mod stretch;
+
 use tread_api::geometry::Point as WirePoint;
 use tread_api::mission::{
     DRIVEN_POINTS_MAX, DrivenPath, MissionQuality, THETA_SAMPLES_MAX, ThetaSample,
@@ -12,6 +14,7 @@ use tread_api::mission::{
 use tread_control::gate::GateCause;
 use tread_control::geometry::Point;
 
+use self::stretch::Stretch;
 use super::gain::{Gain, GroundRecord};
 use super::surface::Comparison;
 
@@ -151,19 +154,17 @@ impl Driven {
             self.gate_stops = self.gate_stops.saturating_add(1);
         }
         self.was_held_by_gate = is_held_by_gate;
-        if tick.driven_m.is_finite() {
-            self.distance_m += tick.driven_m.max(0.0);
-        }
-        if let Some(at) = tick.at.filter(|at| at.is_finite()) {
-            let time_s = self.duration_s;
-            self.add_point(Passed { at, time_s });
-        }
-        self.add_theta(tick);
         let driven_m = if tick.driven_m.is_finite() {
             tick.driven_m.max(0.0)
         } else {
             0.0
         };
+        self.distance_m += driven_m;
+        if let Some(at) = tick.at.filter(|at| at.is_finite()) {
+            let time_s = self.duration_s;
+            self.add_point(Passed { at, time_s });
+        }
+        self.add_theta(tick);
         self.gain
             .add(&tick.ground, (tick.dt_s, driven_m), self.duration_s);
     }
@@ -192,11 +193,11 @@ impl Driven {
         let mut kept = 1;
         for index in 1..self.points.len() {
             if index % 2 == 1
-                && let Some(&after) = self.points.get(index + 1)
+                && let Some(&to) = self.points.get(index + 1)
             {
                 // `kept` never exceeds `index`, so only entries already read are overwritten.
-                let (before, at) = (self.points[kept - 1].at, self.points[index].at);
-                let off_m = distance_from_line_m(at, before, after.at);
+                let from = self.points[kept - 1];
+                let off_m = Stretch { from, to }.distance_m(self.points[index].at);
                 farthest_m = farthest_m.max(off_m);
                 continue;
             }
@@ -284,42 +285,8 @@ impl Driven {
     }
 }
 
-/// Returns the distance of a point from the segment between two others, metres.
-fn distance_from_line_m(point: Point, from: Point, to: Point) -> f64 {
-    let (along_x, along_y) = (to.x_m - from.x_m, to.y_m - from.y_m);
-    let length_squared_m2 = along_x * along_x + along_y * along_y;
-    if length_squared_m2 <= 0.0 {
-        return point.distance_m(from);
-    }
-    let share =
-        ((point.x_m - from.x_m) * along_x + (point.y_m - from.y_m) * along_y) / length_squared_m2;
-    let share = share.clamp(0.0, 1.0);
-    point.distance_m(Point {
-        x_m: from.x_m + share * along_x,
-        y_m: from.y_m + share * along_y,
-    })
-}
-
-/// Returns the error of dropping a point between two that are kept, as a multiple of the tolerance:
-/// the larger of its distance from their line over [`LINE_TOLERANCE_M`] and of its distance from
-/// uniform motion between them over [`MOTION_TOLERANCE_M`]. Above 1 the point must be kept.
-fn shortfall(passed: Passed, from: Passed, to: Passed) -> f64 {
-    let off_line = distance_from_line_m(passed.at, from.at, to.at) / LINE_TOLERANCE_M;
-    let lasted_s = to.time_s - from.time_s;
-    let share = if lasted_s > 0.0 {
-        (passed.time_s - from.time_s) / lasted_s
-    } else {
-        0.0
-    };
-    let evenly = Point {
-        x_m: from.at.x_m + share * (to.at.x_m - from.at.x_m),
-        y_m: from.at.y_m + share * (to.at.y_m - from.at.y_m),
-    };
-    off_line.max(passed.at.distance_m(evenly) / MOTION_TOLERANCE_M)
-}
-
 /// Returns the points without those within tolerance of the rest (Douglas–Peucker with
-/// [`shortfall`] as the distance).
+/// [`Stretch::shortfall`] as the distance).
 fn thinned(points: &[Passed]) -> Vec<Passed> {
     let Some(last) = points.len().checked_sub(1) else {
         return Vec::new();
@@ -328,17 +295,16 @@ fn thinned(points: &[Passed]) -> Vec<Passed> {
     keep[0] = true;
     keep[last] = true;
     let mut stretches = vec![(0, last)];
-    while let Some((from, to)) = stretches.pop() {
-        let inner = (from + 1..to).map(|index| {
-            let missed = shortfall(points[index], points[from], points[to]);
-            (index, missed)
-        });
+    while let Some((first, last)) = stretches.pop() {
+        let (from, to) = (points[first], points[last]);
+        let shortfall = |index: usize| Stretch { from, to }.shortfall(points[index]);
+        let inner = (first + 1..last).map(|index| (index, shortfall(index)));
         if let Some((farthest, missed)) = inner.max_by(|a, b| a.1.total_cmp(&b.1))
             && missed > 1.0
         {
             keep[farthest] = true;
-            stretches.push((from, farthest));
-            stretches.push((farthest, to));
+            stretches.push((first, farthest));
+            stretches.push((farthest, last));
         }
     }
     let kept = points.iter().zip(keep).filter(|(_, keep)| *keep);
@@ -368,13 +334,19 @@ mod tests {
     }
 
     fn distance_from_path_m(point: Point, path: &DrivenPath) -> f64 {
-        let own = |point: &WirePoint| Point {
-            x_m: point.x_m,
-            y_m: point.y_m,
+        let passed = |point: &WirePoint| Passed {
+            at: Point {
+                x_m: point.x_m,
+                y_m: point.y_m,
+            },
+            time_s: 0.0,
         };
         let lines = path.points.windows(2);
         lines
-            .map(|pair| distance_from_line_m(point, own(&pair[0]), own(&pair[1])))
+            .map(|pair| {
+                let (from, to) = (passed(&pair[0]), passed(&pair[1]));
+                Stretch { from, to }.distance_m(point)
+            })
             .fold(f64::INFINITY, f64::min)
     }
 

@@ -51,7 +51,7 @@ pub(crate) fn run(
         period_us = u64::try_from(period.as_micros()).unwrap_or(0),
         "control loop runs"
     );
-    let mut pace = Pace::new(period, drive.arrivals(), clock.monotonic());
+    let mut pace = Pace::new(period, drive.arrivals(), clock);
     let mut stop_requested_at = None;
     let mut standing_ticks = 0;
     loop {

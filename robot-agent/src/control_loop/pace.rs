@@ -30,7 +30,11 @@ pub(super) struct Pace {
 
 impl Pace {
     /// Creates the schedule; the calling thread is the one that samples wake.
-    pub(super) fn new(period: Duration, arrivals: Option<Arc<Arrivals>>, now: Duration) -> Self {
+    pub(super) fn new(
+        period: Duration,
+        arrivals: Option<Arc<Arrivals>>,
+        clock: &SharedClock,
+    ) -> Self {
         if let Some(arrivals) = &arrivals {
             arrivals.attend();
         }
@@ -38,7 +42,7 @@ impl Pace {
             period,
             seen: 0,
             arrivals,
-            deadline: now,
+            deadline: clock.monotonic(),
         }
     }
 
@@ -96,7 +100,7 @@ mod tests {
     #[test]
     fn a_loop_without_a_base_that_tells_keeps_its_own_rate() {
         let clock = SystemClock::shared();
-        let mut pace = Pace::new(PERIOD, None, clock.monotonic());
+        let mut pace = Pace::new(PERIOD, None, &clock);
         let began = clock.monotonic();
         for _ in 0..10 {
             pace.begin(clock.monotonic());
@@ -109,7 +113,7 @@ mod tests {
     fn a_sample_brings_the_tick_on_and_silence_does_not_stop_it() {
         let clock = SystemClock::shared();
         let arrivals = Arc::new(Arrivals::default());
-        let mut pace = Pace::new(PERIOD, Some(Arc::clone(&arrivals)), clock.monotonic());
+        let mut pace = Pace::new(PERIOD, Some(Arc::clone(&arrivals)), &clock);
         // One that is there already is waited for only as long as the rate wants it.
         pace.begin(clock.monotonic());
         let began = clock.monotonic();
@@ -128,7 +132,7 @@ mod tests {
         let clock = SystemClock::shared();
         let arrivals = Arc::new(Arrivals::default());
         let slow = Duration::from_millis(400);
-        let mut pace = Pace::new(slow, Some(Arc::clone(&arrivals)), clock.monotonic());
+        let mut pace = Pace::new(slow, Some(Arc::clone(&arrivals)), &clock);
         let began = clock.monotonic();
         pace.begin(began);
         std::thread::scope(|scope| {

@@ -199,6 +199,15 @@ impl DriveSummary {
     }
 }
 
+/// Messages of one motion.
+#[derive(Debug)]
+pub(super) struct MotionMessages {
+    /// Those of the acceleration.
+    pub(super) starting: Vec<Message>,
+    /// Those of the steady part.
+    pub(super) steady: Vec<Message>,
+}
+
 /// Running mean.
 #[derive(Debug, Clone, Copy, Default)]
 struct Mean {
@@ -217,13 +226,13 @@ impl Mean {
     }
 }
 
-/// Summarises the messages of the acceleration (`starting`) and of the steady part (`messages`).
+/// Summarises a motion.
 pub(super) fn drove(
     commanded: WheelSpeeds,
     settings: &Ros2Settings,
-    starting: &[Message],
-    messages: &[Message],
+    messages: &MotionMessages,
 ) -> DriveSummary {
+    let MotionMessages { starting, steady } = messages;
     let (mut left, mut right) = (Mean::default(), Mean::default());
     let (mut left_torque, mut right_torque) = (Mean::default(), Mean::default());
     let (mut gyro, mut odometry_turn, mut speed) =
@@ -233,7 +242,7 @@ pub(super) fn drove(
         .odometry
         .as_ref()
         .map(|odometry| odometry.motion_of);
-    for message in messages {
+    for message in steady {
         let Ok(Some((stamp, content))) = decoded(settings, message.source, &message.payload) else {
             continue;
         };
@@ -266,15 +275,15 @@ pub(super) fn drove(
         }
     }
     let mut ranges = Ranges::default();
-    for message in starting.iter().chain(messages) {
+    for message in starting.iter().chain(steady) {
         if let Ok(Some((_, content))) = decoded(settings, message.source, &message.payload) {
             ranges.add(settings, &content);
         }
     }
     DriveSummary {
         commanded,
-        twist: planar_twist(messages),
-        turn_blocks: turn_blocks(settings, messages),
+        twist: planar_twist(steady),
+        turn_blocks: turn_blocks(settings, steady),
         ranges,
         wheels: left
             .value()

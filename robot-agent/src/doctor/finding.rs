@@ -4,6 +4,10 @@ use std::fmt::Write as _;
 
 use serde::Serialize;
 
+/// Key of `robot.toml` with its table, such as `drive.ros2.command.topic`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Key(pub(super) &'static str);
+
 /// A line of `robot.toml`, ready to be copied into its table.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub(crate) struct Line {
@@ -44,7 +48,7 @@ impl Finding {
         }
     }
 
-    pub(super) fn wrong(name: &'static str, key: &'static str, text: impl Into<String>) -> Self {
+    pub(super) fn wrong(name: &'static str, Key(key): Key, text: impl Into<String>) -> Self {
         Self {
             holds: false,
             key: Some(key),
@@ -61,12 +65,8 @@ impl Finding {
     }
 
     /// Adds a line that corrects the problem.
-    pub(super) fn with_line(
-        mut self,
-        table: &'static str,
-        key: &'static str,
-        value: impl Into<String>,
-    ) -> Self {
+    pub(super) fn with_line(mut self, Key(path): Key, value: impl Into<String>) -> Self {
+        let (table, key) = path.rsplit_once('.').unwrap_or(("", path));
         self.lines.push(Line {
             table,
             key,
@@ -119,13 +119,13 @@ mod tests {
     fn lines_of_all_findings_are_tables_that_toml_reads() {
         let left = list(&["front \"left\"".to_owned(), "rear".to_owned()]);
         let findings = [
-            Finding::wrong("command", "drive.ros2.command.track_width_m", "")
-                .with_line("drive.ros2.command", "track_width_m", "0.430")
-                .with_line("drive.ros2.joints", "left", left),
+            Finding::wrong("command", Key("drive.ros2.command.track_width_m"), "")
+                .with_line(Key("drive.ros2.command.track_width_m"), "0.430")
+                .with_line(Key("drive.ros2.joints.left"), left),
             Finding::ok("imu", "all is well"),
-            Finding::wrong("signs", "drive.ros2.command.turn_sign", "")
-                .with_line("drive.ros2.command", "turn_sign", "-1")
-                .with_line("drive.ros2.command", "track_width_m", "0.5"),
+            Finding::wrong("signs", Key("drive.ros2.command.turn_sign"), "")
+                .with_line(Key("drive.ros2.command.turn_sign"), "-1")
+                .with_line(Key("drive.ros2.command.track_width_m"), "0.5"),
         ];
         let text = robot_toml(&findings);
         let read: toml::Value = toml::from_str(&text).unwrap();

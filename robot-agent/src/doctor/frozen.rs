@@ -5,7 +5,7 @@
 //! sensor differs from a robot that did not move in that another sensor measured the motion.
 
 use super::drove::{DriveSummary, Drives, Ranges};
-use super::finding::Finding;
+use super::finding::{Finding, Key};
 use crate::drive::ros2::settings::Ros2Settings;
 
 /// Yaw rate that shows that the robot turned, rad/s.
@@ -81,12 +81,12 @@ impl Frozen {
             let text = format!(
                 "{which} the same speed all the time, though the robot moved ({moved}): they froze"
             );
-            findings.push(Finding::wrong("joints", key, text));
+            findings.push(Finding::wrong("joints", Key(key), text));
         }
         if self.gyro {
             let text =
                 "the gyro says the same turn rate all the time, though the wheels turned: it froze";
-            findings.push(Finding::wrong("imu", "drive.ros2.imu.topic", text));
+            findings.push(Finding::wrong("imu", Key("drive.ros2.imu.topic"), text));
         }
         // If the odometry gives the wheel speeds, the finding on the wheels covers it.
         if self.odometry && (settings.joints.is_some() || !self.joints()) {
@@ -94,7 +94,7 @@ impl Frozen {
                 "the odometry says the same motion all the time, though the robot moved: it froze";
             findings.push(Finding::wrong(
                 "odometry",
-                "drive.ros2.odometry.topic",
+                Key("drive.ros2.odometry.topic"),
                 text,
             ));
         }
@@ -105,7 +105,7 @@ impl Frozen {
                 "drive.ros2.odometry.topic"
             };
             let text = "the position never changes, though the robot moved: it froze";
-            findings.push(Finding::wrong("pose", key, text));
+            findings.push(Finding::wrong("pose", Key(key), text));
         }
         findings
     }

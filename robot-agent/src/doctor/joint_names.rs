@@ -1,6 +1,6 @@
 //! Collects joint names, and guesses which are those of the left and the right wheels. Pure.
 
-use super::finding::{Finding, list};
+use super::finding::{Finding, Key, list};
 use crate::drive::ros2::settings::JointSettings;
 
 /// Largest number of names that are printed.
@@ -59,11 +59,11 @@ impl JointNames {
             self.text(),
             missing.join(", ")
         );
-        let finding = Finding::wrong("joints", key, text);
+        let finding = Finding::wrong("joints", Key(key), text);
         Some(match self.sides() {
             Some((left, right)) => finding
-                .with_line("drive.ros2.joints", "left", list(&left))
-                .with_line("drive.ros2.joints", "right", list(&right)),
+                .with_line(Key("drive.ros2.joints.left"), list(&left))
+                .with_line(Key("drive.ros2.joints.right"), list(&right)),
             None => finding,
         })
     }

@@ -6,7 +6,7 @@ use tread_ros2::cdr::decode;
 use tread_ros2::messages::{Imu, JointState, Odometry, PoseWithCovarianceStamped};
 use tread_ros2::rmw::{KeyMismatch, check_key};
 
-use super::finding::Finding;
+use super::finding::{Finding, Key};
 use super::heard::Message;
 use super::joint_names::JointNames;
 use crate::drive::ros2::inlet::{decoded, topic_of, type_of};
@@ -34,13 +34,13 @@ const GYRO_BIAS_MAX_RAD_S: f64 = 0.01;
 const WHEEL_STANDING_RAD_S: f64 = 0.1;
 
 /// Returns the finding's name and the key of a source's section.
-fn names(source: Source) -> (&'static str, &'static str) {
+fn names(source: Source) -> (&'static str, Key) {
     match source {
-        Source::Odometry => ("odometry", "drive.ros2.odometry.topic"),
-        Source::Imu => ("imu", "drive.ros2.imu.topic"),
-        Source::Joints => ("joints", "drive.ros2.joints.topic"),
-        Source::Pose => ("pose", "drive.ros2.pose.topic"),
-        Source::Battery => ("battery", "drive.ros2.battery.topic"),
+        Source::Odometry => ("odometry", Key("drive.ros2.odometry.topic")),
+        Source::Imu => ("imu", Key("drive.ros2.imu.topic")),
+        Source::Joints => ("joints", Key("drive.ros2.joints.topic")),
+        Source::Pose => ("pose", Key("drive.ros2.pose.topic")),
+        Source::Battery => ("battery", Key("drive.ros2.battery.topic")),
     }
 }
 
@@ -71,9 +71,9 @@ pub(super) fn findings(
         if of_source.is_empty() {
             // A battery may publish too seldom to be received.
             if source != Source::Battery {
-                let (name, key) = names(source);
+                let (name, topic_key) = names(source);
                 let text = format!("nothing was heard on `{topic}`");
-                findings.push(Finding::wrong(name, key, text));
+                findings.push(Finding::wrong(name, topic_key, text));
             }
             continue;
         }
@@ -158,7 +158,7 @@ fn of_gyro_at_rest(settings: &Ros2Settings, messages: &[Message]) -> Option<Find
          {GYRO_BIAS_MAX_RAD_S} rad/s is good: it has a bias. Let its driver calibrate it at rest; no key of \
          robot.toml can"
     );
-    Some(Finding::wrong("gyro", "drive.ros2.imu.topic", text))
+    Some(Finding::wrong("gyro", Key("drive.ros2.imu.topic"), text))
 }
 
 /// Returns a finding if several nodes publish on a topic or if messages are repeated.
@@ -185,7 +185,7 @@ fn of_writers(source: Source, messages: &[&Message]) -> Option<Finding> {
             .any(|other| other.attachment == message.attachment && other.payload == message.payload)
     };
     let repeated = (0..messages.len()).filter(is_repeated).count();
-    let share = share(repeated, messages.len());
+    let share = figure(repeated) / figure(messages.len()).max(1.0);
     if share > REPEATED_SHARE_MAX {
         let text = format!(
             "{:.0} % of its messages come again: two paths lead here, such as two bridges, or a bridge and a \
@@ -197,9 +197,8 @@ fn of_writers(source: Source, messages: &[&Message]) -> Option<Finding> {
     None
 }
 
-fn share(part: usize, whole: usize) -> f64 {
-    let figure = |count: usize| f64::from(u32::try_from(count).unwrap_or(u32::MAX));
-    figure(part) / figure(whole).max(1.0)
+fn figure(count: usize) -> f64 {
+    f64::from(u32::try_from(count).unwrap_or(u32::MAX))
 }
 
 /// Returns a finding if the stamps of the messages never change.
@@ -229,7 +228,7 @@ fn of_topic(
     if let Some(finding) = of_keys(settings, source, messages) {
         return finding;
     }
-    let count = f64::from(u32::try_from(messages.len()).unwrap_or(u32::MAX));
+    let count = figure(messages.len());
     let mut bad = 0.0;
     let mut worst = None;
     for message in messages {
@@ -268,14 +267,14 @@ fn of_topic(
              good: what writes them is slow, or stamps them by another clock (then `stamps = \
              \"base\"`)"
         );
-        let finding = Finding::wrong(name, "drive.ros2.stamps", text);
+        let finding = Finding::wrong(name, Key("drive.ros2.stamps"), text);
         let other = match settings.timing.stamps {
             StampClock::Host => "\"base\"",
             StampClock::Base => "\"host\"",
         };
         // A moderate difference is a delay, a large one means another clock.
         return if middle_ms.abs() > CLOCK_MIN_MS {
-            finding.with_line("drive.ros2", "stamps", other)
+            finding.with_line(Key("drive.ros2.stamps"), other)
         } else {
             finding
         };
@@ -310,11 +309,11 @@ fn of_keys(settings: &Ros2Settings, source: Source, messages: &[&Message]) -> Op
         }
         Err(KeyMismatch::Hash) => {
             let text = format!("its type is defined otherwise: `{}`", message.key);
-            Some(Finding::wrong(name, "drive.ros2.distribution", text))
+            Some(Finding::wrong(name, Key("drive.ros2.distribution"), text))
         }
         Ok(()) if message.attachment.is_none() => {
             let text = "its messages have no attachment: they are not written by rmw_zenoh_cpp";
-            Some(Finding::wrong(name, "drive.ros2.bus", text))
+            Some(Finding::wrong(name, Key("drive.ros2.bus"), text))
         }
         Ok(()) => None,
     }
@@ -324,22 +323,21 @@ fn of_refusal(source: Source, refusal: Refusal, message: &Message, share: f64) -
     let (name, topic_key) = names(source);
     let percent = 100.0 * share;
     if refusal == Refusal::WrongFrame {
-        let (key, lines) = frames_of(source, &message.payload).unwrap_or((topic_key, Vec::new()));
+        let lines = frames_of(source, &message.payload).unwrap_or_default();
+        let key = lines.first().map_or(topic_key, |(key, _)| *key);
         let frames: Vec<_> = lines
             .iter()
-            .map(|(_, _, frame)| format!("`{frame}`"))
+            .map(|(_, frame)| format!("`{frame}`"))
             .collect();
         let frames = frames.join(" and ");
         let text = format!("it is of the frame {frames}, which the configuration does not name");
         let finding = Finding::wrong(name, key, text);
-        return lines
-            .into_iter()
-            .fold(finding, |finding, (table, key, frame)| {
-                finding.with_line(table, key, format!("{frame:?}"))
-            });
+        return lines.into_iter().fold(finding, |finding, (key, frame)| {
+            finding.with_line(key, format!("{frame:?}"))
+        });
     }
     let key = if refusal == Refusal::Joints {
-        "drive.ros2.joints.left"
+        Key("drive.ros2.joints.left")
     } else {
         topic_key
     };
@@ -347,36 +345,29 @@ fn of_refusal(source: Source, refusal: Refusal, message: &Message, share: f64) -
     Finding::wrong(name, key, text)
 }
 
-/// Table and key of `robot.toml`, and the frame in the message.
-type FrameLine = (&'static str, &'static str, String);
-
-/// Returns the key of a source's frame, and the frames in its message; `None` if there are none.
-fn frames_of(source: Source, payload: &[u8]) -> Option<(&'static str, Vec<FrameLine>)> {
+/// Returns the frames in a source's message with their keys; `None` if there are none.
+fn frames_of(source: Source, payload: &[u8]) -> Option<Vec<(Key, String)>> {
     match source {
         Source::Odometry => {
             let read: Odometry<'_> = decode(payload).ok()?;
-            let table = "drive.ros2.odometry";
-            let lines = vec![
-                (table, "frame", read.header.frame_id.to_owned()),
-                (table, "child_frame", read.child_frame_id.to_owned()),
-            ];
-            Some(("drive.ros2.odometry.frame", lines))
+            let (frame, child_frame) = (read.header.frame_id, read.child_frame_id);
+            Some(vec![
+                (Key("drive.ros2.odometry.frame"), frame.to_owned()),
+                (
+                    Key("drive.ros2.odometry.child_frame"),
+                    child_frame.to_owned(),
+                ),
+            ])
         }
         Source::Imu => {
             let read: Imu<'_> = decode(payload).ok()?;
             let frame = read.header.frame_id.to_owned();
-            Some((
-                "drive.ros2.imu.frame",
-                vec![("drive.ros2.imu", "frame", frame)],
-            ))
+            Some(vec![(Key("drive.ros2.imu.frame"), frame)])
         }
         Source::Pose => {
             let read: PoseWithCovarianceStamped<'_> = decode(payload).ok()?;
             let frame = read.header.frame_id.to_owned();
-            Some((
-                "drive.ros2.pose.frame",
-                vec![("drive.ros2.pose", "frame", frame)],
-            ))
+            Some(vec![(Key("drive.ros2.pose.frame"), frame)])
         }
         Source::Joints | Source::Battery => None,
     }
@@ -406,11 +397,11 @@ fn effort(settings: &Ros2Settings, messages: &[&Message]) -> Option<Finding> {
     if messages.iter().filter(says_torque).count() * 2 < messages.len() {
         return Some(Finding::wrong(
             "effort",
-            "drive.ros2.joints.effort",
+            Key("drive.ros2.joints.effort"),
             "the joints say no effort: friction shows in acceleration and turns alone (`effort = \
              \"none\"` says so)",
         )
-        .with_line("drive.ros2.joints", "effort", "\"none\""));
+        .with_line(Key("drive.ros2.joints.effort"), "\"none\""));
     }
     if messages.iter().all(is_zero) {
         let text =

@@ -32,9 +32,9 @@ use tread_control::measured::WheelSpeeds;
 use tread_control::robot::RobotModel;
 use tread_control::twist_limits::TwistLimits;
 
-use self::drove::{DriveSummary, Drives};
-use self::finding::Finding;
-use self::heard::{Heard, Message};
+use self::drove::{DriveSummary, Drives, MotionMessages};
+use self::finding::{Finding, Key};
+use self::heard::Heard;
 use self::parameters::Parameters;
 use crate::clock::{SharedClock, SystemClock};
 use crate::config::{AgentConfig, DriveConfig, Flags};
@@ -181,7 +181,7 @@ impl ExaminedDrive {
                  stop it, or let both write on topics of their own and put a twist_mux behind them",
                 settings.command.topic
             );
-            Finding::wrong("command", "drive.ros2.command.topic", text)
+            Finding::wrong("command", Key("drive.ros2.command.topic"), text)
         })
     }
 
@@ -309,8 +309,8 @@ impl ExaminedDrive {
             let moved = self.clock.monotonic().saturating_sub(began);
             driven_m += RIM_M_S * moved.as_secs_f64();
             self.hold(WheelSpeeds::default(), REST);
-            if let Some([starting, steady]) = messages {
-                return drove::drove(command, settings, &starting, &steady);
+            if let Some(messages) = messages {
+                return drove::drove(command, settings, &messages);
             }
         }
         DriveSummary::default()
@@ -318,14 +318,17 @@ impl ExaminedDrive {
 
     /// Returns the messages of the acceleration and of the steady motion; `None` if the base fell
     /// silent.
-    fn try_to_drive(&mut self, command: WheelSpeeds, heard: &Heard) -> Option<[Vec<Message>; 2]> {
+    fn try_to_drive(&mut self, command: WheelSpeeds, heard: &Heard) -> Option<MotionMessages> {
         heard.forget();
         let mut is_heard = self.ramp(command) && self.hold_heard(command, SETTLE);
         let starting = heard.taken();
         is_heard = is_heard && self.hold_heard(command, STEADY_AFTER);
         heard.forget();
         is_heard = is_heard && self.hold_heard(command, STEADY_FOR);
-        is_heard.then(|| [starting, heard.taken()])
+        is_heard.then(|| MotionMessages {
+            starting,
+            steady: heard.taken(),
+        })
     }
 }
 

@@ -8,7 +8,7 @@ use tread_control::measured::WheelSpeeds;
 use tread_control::robot::RobotModel;
 
 use super::drove::{DriveSummary, Drives};
-use super::finding::Finding;
+use super::finding::{Finding, Key};
 use super::frozen::Frozen;
 use super::signs::{self, Answers};
 use super::{pulling, track, twist_frame};
@@ -23,21 +23,21 @@ const GOING_SHARE: f64 = 0.3;
 /// Largest accepted relative error of the wheel radius.
 const RADIUS_SHARE: f64 = 0.06;
 
-/// Returns the sign of a wheel's speed, 0 if it stands still.
-fn direction(said: f64, commanded: f64) -> i8 {
-    if said.abs() < STANDING_SHARE * commanded.abs() {
-        0
-    } else if said > 0.0 {
-        1
-    } else {
-        -1
-    }
+/// Returns the sign of a value that is not zero.
+fn sign(value: f64) -> i8 {
+    if value > 0.0 { 1 } else { -1 }
 }
 
+/// Returns the signs of the wheels' speeds, `[left, right]`, 0 for those that stand still.
 fn directions(said: WheelSpeeds, drove: &DriveSummary) -> [i8; 2] {
+    let direction = |of_side: fn(WheelSpeeds) -> f64| {
+        let speed_rad_s = of_side(said);
+        let stands = speed_rad_s.abs() < STANDING_SHARE * of_side(drove.commanded).abs();
+        if stands { 0 } else { sign(speed_rad_s) }
+    };
     [
-        direction(said.left_rad_s, drove.commanded.left_rad_s),
-        direction(said.right_rad_s, drove.commanded.right_rad_s),
+        direction(|speeds| speeds.left_rad_s),
+        direction(|speeds| speeds.right_rad_s),
     ]
 }
 
@@ -52,7 +52,7 @@ pub(super) fn findings(
     if !(turned.is_heard && forward.is_heard) {
         return vec![Finding::wrong(
             "wheels",
-            "drive.ros2.silent_after_ms",
+            Key("drive.ros2.silent_after_ms"),
             "the base fell silent whenever it was moved: its messages come with gaps, or its machine \
              is overloaded",
         )];
@@ -60,7 +60,7 @@ pub(super) fn findings(
     let (Some(turning), Some(going)) = (turned.wheels, forward.wheels) else {
         return vec![Finding::wrong(
             "wheels",
-            "drive.ros2.joints.topic",
+            Key("drive.ros2.joints.topic"),
             "the wheels said nothing while they were commanded to move",
         )];
     };
@@ -71,7 +71,7 @@ pub(super) fn findings(
         findings.push(Finding::skipped("sides", text));
         return findings;
     }
-    let (of_turn, of_forward) = (directions(turning, turned), directions(going, forward));
+    let of_forward = directions(going, forward);
     // By the command, since joints that disagree have no meaningful mean.
     let commanded_rad_s = 0.5 * (forward.commanded.left_rad_s + forward.commanded.right_rad_s);
     let rim_m_s = model.wheel_radius_m() * commanded_rad_s;
@@ -84,20 +84,19 @@ pub(super) fn findings(
         .filter(|_| !frozen.odometry && is_twist_well));
     let turn_rad_s = turned.turn_rad_s.filter(|_| !frozen.gyro);
     let turn_rad_s = turn_rad_s.map(|rate| rate - gyro_bias_rad_s);
-    if let Some(standing) = of_standing(of_turn, of_forward) {
+    let goes = |ground_m_s: &f64| ground_m_s.abs() > GOING_SHARE * rim_m_s.abs();
+    let turns = |rate: &f64| rate.abs() > TURNING_RAD_S;
+    let answers = Answers {
+        turn: directions(turning, turned),
+        forward: of_forward,
+        turned: turn_rad_s.filter(turns).map_or(0, sign),
+        went: ground_m_s.filter(goes).map_or(0, sign),
+    };
+    if let Some(standing) = of_standing(answers) {
         findings.push(standing);
         return findings;
     }
-    let went = ground_m_s.map_or(0, |ground_m_s| way(ground_m_s, GOING_SHARE * rim_m_s.abs()));
-    let sides = signs::finding(
-        Answers {
-            turn: of_turn,
-            forward: of_forward,
-            turned: turn_rad_s.map_or(0, |rate| way(rate, TURNING_RAD_S)),
-            went,
-        },
-        settings,
-    );
+    let sides = signs::finding(answers, settings);
     let is_well = sides.holds;
     findings.push(sides);
     if !is_well {
@@ -105,9 +104,10 @@ pub(super) fn findings(
         findings.push(Finding::skipped("track", text));
         return findings;
     }
-    findings.extend(of_still_body(turn_rad_s, ground_m_s, went, settings));
+    let stays = ground_m_s.is_some() && answers.went == 0;
+    findings.extend(of_still_body(turn_rad_s, stays, settings));
     let radius_m = ground_m_s
-        .filter(|_| went != 0)
+        .filter(|_| answers.went != 0)
         .map(|ground_m_s| 2.0 * ground_m_s / (going.left_rad_s + going.right_rad_s));
     findings.extend(radius_m.map(|radius_m| of_radius(model, radius_m)));
     let radius_m = radius_m.unwrap_or(model.wheel_radius_m());
@@ -128,20 +128,10 @@ pub(super) fn findings(
     findings
 }
 
-/// Returns the sign of a value, 0 if its magnitude is at most `least`.
-fn way(value: f64, least: f64) -> i8 {
-    if value > least {
-        1
-    } else if value < -least {
-        -1
-    } else {
-        0
-    }
-}
-
 /// Returns the finding on wheels that stand still though commanded to turn.
-fn of_standing(of_turn: [i8; 2], of_forward: [i8; 2]) -> Option<Finding> {
-    let stands = |side: usize| of_turn[side] == 0 && of_forward[side] == 0;
+fn of_standing(answers: Answers) -> Option<Finding> {
+    let Answers { turn, forward, .. } = answers;
+    let stands = |side: usize| turn[side] == 0 && forward[side] == 0;
     let text = match (stands(0), stands(1)) {
         (true, true) => {
             "the wheels stand though they are commanded to turn, and nothing else moved: nobody takes the \
@@ -149,23 +139,22 @@ fn of_standing(of_turn: [i8; 2], of_forward: [i8; 2]) -> Option<Finding> {
         }
         (true, false) => "the left wheels stand though they are commanded to turn",
         (false, true) => "the right wheels stand though they are commanded to turn",
-        (false, false) if of_turn.contains(&0) => "the wheels stand when a turn is commanded",
-        (false, false) if of_forward.contains(&0) => {
+        (false, false) if turn.contains(&0) => "the wheels stand when a turn is commanded",
+        (false, false) if forward.contains(&0) => {
             "the wheels stand when a forward speed is commanded"
         }
         (false, false) => return None,
     };
-    Some(Finding::wrong("wheels", "drive.ros2.command.topic", text))
+    Some(Finding::wrong(
+        "wheels",
+        Key("drive.ros2.command.topic"),
+        text,
+    ))
 }
 
 /// Returns the finding on a robot that does not move though its wheels turn, by a sensor that is
-/// not frozen.
-fn of_still_body(
-    turn_rad_s: Option<f64>,
-    ground_m_s: Option<f64>,
-    went: i8,
-    settings: &Ros2Settings,
-) -> Option<Finding> {
+/// not frozen. `stays` is whether it was measured to stay where it is.
+fn of_still_body(turn_rad_s: Option<f64>, stays: bool, settings: &Ros2Settings) -> Option<Finding> {
     let turn_key = if settings.imu.is_some() {
         "drive.ros2.imu.topic"
     } else {
@@ -174,9 +163,9 @@ fn of_still_body(
     if turn_rad_s.is_some_and(|rate| rate.abs() <= TURNING_RAD_S) {
         let text = "the gyro says that the robot does not turn though its wheels do: another axis, or the \
                     wheels spin";
-        return Some(Finding::wrong("imu", turn_key, text));
+        return Some(Finding::wrong("imu", Key(turn_key), text));
     }
-    (ground_m_s.is_some() && went == 0).then(|| {
+    stays.then(|| {
         let key = if settings.pose.is_some() {
             "drive.ros2.pose.topic"
         } else {
@@ -184,7 +173,7 @@ fn of_still_body(
         };
         let text =
             "the robot stays where it is though its wheels turn forward, by its position or odometry";
-        Finding::wrong("ground", key, text)
+        Finding::wrong("ground", Key(key), text)
     })
 }
 
@@ -199,11 +188,8 @@ fn of_radius(model: &RobotModel, radius_m: f64) -> Finding {
         "the wheels roll as with a radius of {radius_m:.3} m, the model says {model_m:.3} m"
     );
     let value = format!("{radius_m:.3}");
-    Finding::wrong("radius", "model.wheel_radius_m", text).with_line(
-        "model",
-        "wheel_radius_m",
-        value,
-    )
+    Finding::wrong("radius", Key("model.wheel_radius_m"), text)
+        .with_line(Key("model.wheel_radius_m"), value)
 }
 
 #[cfg(test)]

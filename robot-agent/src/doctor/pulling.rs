@@ -12,7 +12,7 @@
 use tread_control::robot::RobotModel;
 
 use super::drove::{AccelerationPhase, DriveSummary, Drives};
-use super::finding::Finding;
+use super::finding::{Finding, Key};
 use crate::drive::ros2::settings::{Effort, JointSettings, Ros2Settings};
 
 /// Ratio to a side's load below which a force against the motion counts as none.
@@ -71,9 +71,8 @@ fn of_zero(pull: &Pull) -> Option<Finding> {
     is_zero.then(|| {
         let text = "the joints' effort is zero in a turn on the spot: it is not measured (`effort = \
                     \"none\"`)";
-        Finding::wrong("torque", "drive.ros2.joints.effort", text).with_line(
-            "drive.ros2.joints",
-            "effort",
+        Finding::wrong("torque", Key("drive.ros2.joints.effort"), text).with_line(
+            Key("drive.ros2.joints.effort"),
             "\"none\"",
         )
     })
@@ -124,16 +123,24 @@ fn of_signs(pull: &Pull, joints: &JointSettings) -> Option<Finding> {
         ),
         (false, false) => return None,
     };
-    let wrong = Finding::wrong("torque", key, text);
+    let wrong = Finding::wrong("torque", Key(key), text);
     let lines = [
-        (is_left, "left_effort_sign", joints.left.effort_sign),
-        (is_right, "right_effort_sign", joints.right.effort_sign),
+        (
+            is_left,
+            Key("drive.ros2.joints.left_effort_sign"),
+            joints.left.effort_sign,
+        ),
+        (
+            is_right,
+            Key("drive.ros2.joints.right_effort_sign"),
+            joints.right.effort_sign,
+        ),
     ];
     Some(lines.into_iter().filter(|(is_wrong, _, _)| *is_wrong).fold(
         wrong,
         |finding, (_, key, sign)| {
             let opposite = if sign > 0.0 { "-1" } else { "1" };
-            finding.with_line("drive.ros2.joints", key, opposite)
+            finding.with_line(key, opposite)
         },
     ))
 }
@@ -180,11 +187,11 @@ fn of_size(pull: &Pull, effort: Effort, model: &RobotModel) -> Finding {
         ),
     };
     let text = format!("{turn}{setting_off}: the joints' effort is {verdict}; {hint}");
-    let wrong = Finding::wrong("torque", key, text);
+    let wrong = Finding::wrong("torque", Key(key), text);
     match fits {
         Some(fits) => {
             let value = format!("{fits:.3}");
-            wrong.with_line("drive.ros2.joints", "torque_constant_n_m_a", value)
+            wrong.with_line(Key("drive.ros2.joints.torque_constant_n_m_a"), value)
         }
         None => wrong,
     }

@@ -5,7 +5,7 @@
 //! [`Flip`] changes some of the responses. Every set of flips is tried, and the smallest set that
 //! explains all responses is reported.
 
-use super::finding::{Finding, list};
+use super::finding::{Finding, Key, list};
 use crate::drive::ros2::settings::Ros2Settings;
 
 /// Responses of the robot, 1 or -1 for a direction.
@@ -80,28 +80,28 @@ impl Flip {
         let (command, joints) = (&settings.command, settings.joints.as_ref());
         match (self, joints) {
             (Self::Sides, Some(joints)) => finding
-                .with_line("drive.ros2.joints", "left", list(&joints.right.names))
-                .with_line("drive.ros2.joints", "right", list(&joints.left.names)),
+                .with_line(Key("drive.ros2.joints.left"), list(&joints.right.names))
+                .with_line(Key("drive.ros2.joints.right"), list(&joints.left.names)),
             (Self::LeftJoints, Some(joints)) => {
                 let sign = opposite(joints.left.sign);
-                finding.with_line("drive.ros2.joints", "left_sign", sign)
+                finding.with_line(Key("drive.ros2.joints.left_sign"), sign)
             }
             (Self::RightJoints, Some(joints)) => {
                 let sign = opposite(joints.right.sign);
-                finding.with_line("drive.ros2.joints", "right_sign", sign)
+                finding.with_line(Key("drive.ros2.joints.right_sign"), sign)
             }
             (Self::TurnCommand, _) => {
                 let sign = opposite(command.turn_sign);
-                finding.with_line("drive.ros2.command", "turn_sign", sign)
+                finding.with_line(Key("drive.ros2.command.turn_sign"), sign)
             }
             (Self::ForwardCommand, _) => {
                 let sign = opposite(command.forward_sign);
-                finding.with_line("drive.ros2.command", "forward_sign", sign)
+                finding.with_line(Key("drive.ros2.command.forward_sign"), sign)
             }
             (Self::Gyro, _) => match &settings.imu {
                 Some(imu) => {
                     let upside_down = (!imu.is_upside_down).to_string();
-                    finding.with_line("drive.ros2.imu", "upside_down", upside_down)
+                    finding.with_line(Key("drive.ros2.imu.upside_down"), upside_down)
                 }
                 None => finding,
             },
@@ -163,7 +163,7 @@ pub(super) fn finding(answers: Answers, settings: &Ros2Settings) -> Finding {
     let explanations = explanations(answers);
     let Some(flips) = explanations.first() else {
         let text = "the wheels do not do what they are commanded, in no way that signs explain";
-        return Finding::wrong("sides", "drive.ros2.joints.left", text);
+        return Finding::wrong("sides", Key("drive.ros2.joints.left"), text);
     };
     let Some(first) = flips.first() else {
         return Finding::ok(
@@ -185,7 +185,7 @@ pub(super) fn finding(answers: Answers, settings: &Ros2Settings) -> Finding {
     } else {
         first.key()
     };
-    let finding = Finding::wrong("sides", key, text);
+    let finding = Finding::wrong("sides", Key(key), text);
     if explanations.len() > 1 {
         // Several sets of flips explain the responses, so a person has to decide.
         return finding;

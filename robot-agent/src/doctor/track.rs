@@ -16,7 +16,7 @@
 //! tape measure.
 
 use super::drove::{Drives, TurnBlock};
-use super::finding::Finding;
+use super::finding::{Finding, Key};
 use crate::drive::ros2::settings::{CommandKind, Ros2Settings};
 use tread_control::robot::RobotModel;
 
@@ -174,7 +174,7 @@ fn of_radius_of_base(settings: &Ros2Settings, obeyed: Obeyed) -> Finding {
     let percent = 100.0 * obeyed.forward;
     if settings.command.kind == CommandKind::JointSpeeds {
         let text = format!("driving forward, the wheels turn at {percent:.0} % of their command");
-        return Finding::wrong("command", "drive.ros2.joints.gear_ratio", text);
+        return Finding::wrong("command", Key("drive.ros2.joints.gear_ratio"), text);
     }
     let base_radius_m = settings.command.base_radius_m / obeyed.forward;
     let text = format!(
@@ -182,11 +182,8 @@ fn of_radius_of_base(settings: &Ros2Settings, obeyed: Obeyed) -> Finding {
          radius of about {base_radius_m:.3} m (or the gear is another)"
     );
     let value = format!("{base_radius_m:.3}");
-    Finding::wrong("command", "drive.ros2.command.wheel_radius_m", text).with_line(
-        "drive.ros2.command",
-        "wheel_radius_m",
-        value,
-    )
+    Finding::wrong("command", Key("drive.ros2.command.wheel_radius_m"), text)
+        .with_line(Key("drive.ros2.command.wheel_radius_m"), value)
 }
 
 /// Returns the findings on the track widths of the base and of the model.
@@ -222,7 +219,7 @@ fn of_tracks(
         );
         findings.push(Finding::wrong(
             "turn command",
-            "drive.ros2.command.topic",
+            Key("drive.ros2.command.topic"),
             text,
         ));
     } else if !is_models {
@@ -233,10 +230,13 @@ fn of_tracks(
             100.0 * obeyed.turn,
             100.0 * obeyed.forward,
         );
-        let wrong = Finding::wrong("turn command", "drive.ros2.command.track_width_m", text);
+        let wrong = Finding::wrong(
+            "turn command",
+            Key("drive.ros2.command.track_width_m"),
+            text,
+        );
         findings.push(wrong.with_line(
-            "drive.ros2.command",
-            "track_width_m",
+            Key("drive.ros2.command.track_width_m"),
             format!("{base_m:.3}"),
         ));
     }
@@ -285,9 +285,9 @@ fn of_tracks(
         "wider than tyres that scrub do"
     };
     let text = format!("{shown}: {why}; {range}. Measure the track and the wheelbase with a tape");
-    let mut wrong = Finding::wrong("track", "model.track_width_m", text);
+    let mut wrong = Finding::wrong("track", Key("model.track_width_m"), text);
     if let Some(fits_m) = fits_m {
-        wrong = wrong.with_line("model", "track_width_m", format!("{fits_m:.3}"));
+        wrong = wrong.with_line(Key("model.track_width_m"), format!("{fits_m:.3}"));
     }
     findings.push(wrong);
     findings

@@ -9,7 +9,7 @@ use std::f64::consts::PI;
 use tread_control::geometry::wrap_angle_rad;
 
 use super::drove::PlanarTwist;
-use super::finding::Finding;
+use super::finding::{Finding, Key};
 
 /// Angle up to which a motion counts as straight forward, radians.
 pub(super) const FORWARD_MAX_RAD: f64 = 0.35;
@@ -46,7 +46,7 @@ pub(super) fn finding(twist: &PlanarTwist, rim_m_s: f64, joints: [i8; 2]) -> Opt
              writes it; no key of robot.toml can",
             direction_rad.to_degrees()
         );
-        return Some(Finding::wrong("twist", key, text));
+        return Some(Finding::wrong("twist", Key(key), text));
     }
     // A twist straight backward is a matter of signs.
     if is_along {
@@ -57,7 +57,7 @@ pub(super) fn finding(twist: &PlanarTwist, rim_m_s: f64, joints: [i8; 2]) -> Opt
          robot",
         direction_rad.to_degrees()
     );
-    Some(Finding::wrong("twist", key, text))
+    Some(Finding::wrong("twist", Key(key), text))
 }
 
 #[cfg(test)]

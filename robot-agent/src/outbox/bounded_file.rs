@@ -18,12 +18,11 @@ pub(super) struct BoundedFile {
 }
 
 impl BoundedFile {
-    /// Creates the handle of `<stem>.<ending>` and `<stem>.old.<ending>` in a folder; neither need
-    /// exist.
-    pub(super) fn new(folder: &Path, stem: &str, ending: &str) -> Self {
+    /// Creates the handle of `<stem>.<ending>` and `<stem>.old.<ending>`; neither need exist.
+    pub(super) fn new(stem: &Path, ending: &str) -> Self {
         Self {
-            path: folder.join(format!("{stem}.{ending}")),
-            old_path: folder.join(format!("{stem}.old.{ending}")),
+            path: stem.with_extension(ending),
+            old_path: stem.with_extension(format!("old.{ending}")),
         }
     }
 

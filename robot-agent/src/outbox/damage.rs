@@ -28,7 +28,7 @@ pub(super) struct DamagedBytes(BoundedFile);
 
 impl DamagedBytes {
     pub(super) fn new(folder: &Path) -> Self {
-        Self(BoundedFile::new(folder, "damaged", "bin"))
+        Self(BoundedFile::new(&folder.join("damaged"), "bin"))
     }
 
     /// Whether damaged bytes are kept; the file stays until a person removes it.

@@ -13,35 +13,24 @@ use super::error::{StoreError, failure};
 #[derive(Debug)]
 pub(super) struct DeadLetters(BoundedFile);
 
-#[derive(Serialize)]
-struct DeadLetter<'record> {
-    boot: BootId,
-    seq: u64,
-    reason: &'record str,
+/// A record that was refused.
+#[derive(Debug, Clone, Copy, Serialize)]
+pub(super) struct DeadLetter<'record> {
+    pub(super) boot: BootId,
+    pub(super) seq: u64,
+    pub(super) reason: &'record str,
     /// Content of the record in the outbox, as a JSON string.
-    content: &'record str,
+    pub(super) content: &'record str,
 }
 
 impl DeadLetters {
     pub(super) fn new(folder: &Path) -> Self {
-        Self(BoundedFile::new(folder, "dead-letters", "jsonl"))
+        Self(BoundedFile::new(&folder.join("dead-letters"), "jsonl"))
     }
 
     /// Writes one record and waits until it is on disk.
-    pub(super) fn write(
-        &mut self,
-        boot: BootId,
-        seq: u64,
-        reason: &str,
-        content: &str,
-    ) -> Result<(), StoreError> {
-        let letter = DeadLetter {
-            boot,
-            seq,
-            reason,
-            content,
-        };
-        let line = serde_json::to_vec(&letter).map_err(io::Error::from);
+    pub(super) fn write(&mut self, letter: &DeadLetter<'_>) -> Result<(), StoreError> {
+        let line = serde_json::to_vec(letter).map_err(io::Error::from);
         self.0
             .append(&line.map_err(failure("write", self.0.path()))?)
     }

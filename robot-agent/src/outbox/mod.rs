@@ -33,7 +33,7 @@ use tread_api::ids::{BootId, RobotId};
 use tread_api::robot::OutboxStatus;
 use tread_api::wire::ingest::{BATCH_RECORDS_MAX, Batch, Receipt, Record, RecordContent};
 
-use dead_letters::DeadLetters;
+use dead_letters::{DeadLetter, DeadLetters};
 pub use error::StoreError;
 pub use frame::CONTENT_BYTES_MAX;
 pub use store::Limits;
@@ -219,7 +219,12 @@ impl Outbox {
                 // Not readable by this version: moved to the dead letters, so that the records
                 // behind it are sent.
                 let text = String::from_utf8_lossy(&content);
-                self.dead_letter(name.boot, name.seq, &cause, &text)?;
+                self.dead_letter(&DeadLetter {
+                    boot: name.boot,
+                    seq: name.seq,
+                    reason: &cause,
+                    content: &text,
+                })?;
                 locked(&self.shared.store).settle(Settled {
                     through_ordinal: name.ordinal,
                     refused: 1,
@@ -255,7 +260,12 @@ impl Outbox {
                 continue;
             };
             let content = serde_json::to_string(&record.content).map_err(OutboxError::Content)?;
-            self.dead_letter(sent.batch.boot, record.seq, &refusal.reason, &content)?;
+            self.dead_letter(&DeadLetter {
+                boot: sent.batch.boot,
+                seq: record.seq,
+                reason: &refusal.reason,
+                content: &content,
+            })?;
             refused += 1;
         }
         locked(&self.shared.store).settle(Settled {
@@ -266,15 +276,12 @@ impl Outbox {
         Ok(())
     }
 
-    fn dead_letter(
-        &self,
-        boot: BootId,
-        seq: u64,
-        reason: &str,
-        content: &str,
-    ) -> Result<(), OutboxError> {
+    fn dead_letter(&self, letter: &DeadLetter<'_>) -> Result<(), OutboxError> {
+        let DeadLetter {
+            boot, seq, reason, ..
+        } = *letter;
         warn!(%boot, seq, reason, "record {seq} was refused and moved to the dead letters");
-        locked(&self.shared.dead_letters).write(boot, seq, reason, content)?;
+        locked(&self.shared.dead_letters).write(letter)?;
         Ok(())
     }
 

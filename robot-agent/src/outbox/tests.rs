@@ -385,7 +385,13 @@ fn the_dead_letters_are_bounded() {
     let mut letters = DeadLetters::new(folder.path());
     let content = "x".repeat(300_000);
     for seq in 0..12 {
-        letters.write(boot(1), seq, "too long", &content).unwrap();
+        let letter = DeadLetter {
+            boot: boot(1),
+            seq,
+            reason: "too long",
+            content: &content,
+        };
+        letters.write(&letter).unwrap();
     }
     let bytes: u64 = fs::read_dir(folder.path())
         .unwrap()
@@ -398,11 +404,17 @@ fn the_dead_letters_are_bounded() {
 fn a_dead_letter_that_a_crash_left_half_written_does_not_spoil_the_next() {
     let folder = TempDir::new().unwrap();
     let mut letters = DeadLetters::new(folder.path());
-    letters.write(boot(1), 1, "refused", "{}").unwrap();
+    let letter = |seq| DeadLetter {
+        boot: boot(1),
+        seq,
+        reason: "refused",
+        content: "{}",
+    };
+    letters.write(&letter(1)).unwrap();
     let path = folder.path().join("dead-letters.jsonl");
     let torn = fs::read(&path).unwrap();
     fs::write(&path, &torn[..torn.len() - 9]).unwrap();
-    letters.write(boot(1), 2, "refused", "{}").unwrap();
+    letters.write(&letter(2)).unwrap();
     let text = fs::read_to_string(&path).unwrap();
     let last: serde_json::Value = serde_json::from_str(text.lines().last().unwrap()).unwrap();
     assert_eq!(last["seq"], 2);

@@ -281,13 +281,24 @@ impl Player {
             return;
         }
         self.found.differing += 1;
+        // An output differs if any of its bits does.
+        let pairs = codec::outputs(recorded)
+            .into_iter()
+            .zip(codec::outputs(&replayed));
+        let differences = pairs
+            .filter(|((_, was), (_, is))| was.to_bits() != is.to_bits())
+            .map(|((name, recorded), (_, replayed))| Difference {
+                name,
+                recorded,
+                replayed,
+            });
         if self.found.first_differing.len() < REPORTED_MAX {
             let since = Duration::from_nanos(recorded.monotonic_ns);
             let after = since.saturating_sub(self.began.unwrap_or(since));
             self.found.first_differing.push(DifferingTick {
                 tick: recorded.number,
                 after_s: after.as_secs_f64(),
-                differences: codec::differences(recorded, &replayed),
+                differences: differences.collect(),
             });
         }
     }

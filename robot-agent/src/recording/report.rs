@@ -4,6 +4,7 @@ use std::io::Write;
 use std::path::PathBuf;
 
 use clap::Args;
+use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::VERSION;
@@ -42,32 +43,42 @@ pub(crate) fn run(args: &ReplayArgs) -> anyhow::Result<bool> {
     Ok(holds(&found))
 }
 
-fn checks(found: &Replayed) -> [(&'static str, &'static str, Value, bool); 3] {
-    let gaps = u32::from(found.gap.is_some());
-    [
-        (
-            "ticks run again",
-            ">= 1",
-            json!(found.ticks),
-            found.ticks > 0,
-        ),
-        (
-            "ticks that differ from the record",
-            "0",
-            json!(found.differing),
-            found.differing == 0,
-        ),
-        ("gaps in the record", "0", json!(gaps), gaps == 0),
-    ]
+/// A figure of the replay and its goal.
+#[derive(Debug, Serialize)]
+struct Check {
+    name: &'static str,
+    goal: &'static str,
+    value: u64,
+    holds: bool,
 }
 
-fn check(name: &str, goal: &str, value: &Value, holds: bool) -> Value {
-    json!({ "name": name, "goal": goal, "value": value, "holds": holds })
+fn checks(found: &Replayed) -> [Check; 3] {
+    let gaps = u64::from(found.gap.is_some());
+    [
+        Check {
+            name: "ticks run again",
+            goal: ">= 1",
+            value: found.ticks,
+            holds: found.ticks > 0,
+        },
+        Check {
+            name: "ticks that differ from the record",
+            goal: "0",
+            value: found.differing,
+            holds: found.differing == 0,
+        },
+        Check {
+            name: "gaps in the record",
+            goal: "0",
+            value: gaps,
+            holds: gaps == 0,
+        },
+    ]
 }
 
 /// Whether at least one tick was replayed and none differs or is missing; a torn end is allowed.
 pub(crate) fn holds(found: &Replayed) -> bool {
-    checks(found).iter().all(|(_, _, _, holds)| *holds)
+    checks(found).iter().all(|check| check.holds)
 }
 
 fn tick_json(tick: &DifferingTick) -> Value {
@@ -81,10 +92,6 @@ fn tick_json(tick: &DifferingTick) -> Value {
 
 /// Returns the result as JSON.
 pub(crate) fn object(found: &Replayed) -> Value {
-    let checks: Vec<Value> = checks(found)
-        .into_iter()
-        .map(|(name, goal, value, holds)| check(name, goal, &value, holds))
-        .collect();
     json!({
         "robot": found.head.robot,
         "boot": found.head.boot,
@@ -95,16 +102,22 @@ pub(crate) fn object(found: &Replayed) -> Value {
         "torn": found.torn,
         "gap": found.gap,
         "differing": found.first_differing.iter().map(tick_json).collect::<Vec<_>>(),
-        "checks": checks,
+        "checks": checks(found),
     })
 }
 
 /// Returns the JSON for a record that cannot be read or replayed.
 fn unread(refused: &anyhow::Error) -> Value {
+    let check = Check {
+        name: "records that cannot be run again",
+        goal: "0",
+        value: 1,
+        holds: false,
+    };
     json!({
         "replayed_by": VERSION,
         "refused": format!("{refused:#}"),
-        "checks": [check("records that cannot be run again", "0", &json!(1), false)],
+        "checks": [check],
     })
 }
 

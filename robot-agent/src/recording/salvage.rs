@@ -104,7 +104,7 @@ struct Chunk {
 /// # Errors
 /// [`SalvageError`], or the output cannot be written.
 pub(crate) fn run(args: &RecoverArgs) -> anyhow::Result<()> {
-    let found = salvage(&args.file, &args.into)?;
+    let found = salvage(args)?;
     let mut out = io::stdout().lock();
     if args.json {
         serde_json::to_writer(&mut out, &object(&found))?;
@@ -131,12 +131,12 @@ fn object(found: &Salvaged) -> Value {
     })
 }
 
-/// Copies the readable part of `file` into a new file.
+/// Copies the readable part of a record into a new file.
 ///
 /// # Errors
-/// [`SalvageError`]: `file` is unreadable or without an undamaged chunk, or `into` cannot be
+/// [`SalvageError`]: the file is unreadable or without an undamaged chunk, or the new one cannot be
 /// written.
-pub(crate) fn salvage(file: &Path, into: &Path) -> Result<Salvaged, SalvageError> {
+fn salvage(RecoverArgs { file, into, .. }: &RecoverArgs) -> Result<Salvaged, SalvageError> {
     let bytes = fs::read(file).map_err(|source| SalvageError::Unreadable {
         path: file.to_owned(),
         source,
@@ -321,12 +321,20 @@ mod tests {
         places.map(|(place, _)| place).collect()
     }
 
+    fn args(folder: &TempDir, file: &str) -> RecoverArgs {
+        RecoverArgs {
+            file: folder.path().join(file),
+            into: folder.path().join("whole"),
+            json: false,
+        }
+    }
+
     fn recovered(folder: &TempDir, bytes: &[u8]) -> (PathBuf, Salvaged) {
-        let (damaged, whole) = (folder.path().join("damaged"), folder.path().join("whole"));
-        drop(fs::remove_file(&whole));
-        fs::write(&damaged, bytes).unwrap();
-        let found = salvage(&damaged, &whole).unwrap();
-        (whole, found)
+        let args = args(folder, "damaged");
+        drop(fs::remove_file(&args.into));
+        fs::write(&args.file, bytes).unwrap();
+        let found = salvage(&args).unwrap();
+        (args.into, found)
     }
 
     #[test]
@@ -395,10 +403,11 @@ mod tests {
         let (again, same) = recovered(&folder, &fs::read(copy).unwrap());
         assert_eq!((same.messages, same.ticks), (found.messages, found.ticks));
         assert!(again.exists() && files(folder.path()).len() == 3);
-        let nothing = salvage(&folder.path().join("gone"), &folder.path().join("into"));
+        let nothing = salvage(&args(&folder, "gone"));
         assert!(nothing.unwrap_err().to_string().contains("cannot be read"));
-        fs::write(&file, b"no record").unwrap();
-        let nothing = salvage(&file, &folder.path().join("into")).unwrap_err();
+        let args = args(&folder, "damaged");
+        fs::write(&args.file, b"no record").unwrap();
+        let nothing = salvage(&args).unwrap_err();
         assert!(nothing.to_string().contains("nothing can be recovered"));
     }
 }

@@ -213,11 +213,6 @@ pub(crate) fn poses_of(plan: &Plan) -> Vec<PlanePose> {
         .collect()
 }
 
-/// Creates a key–value pair of a diagnostic status.
-fn value<'text>(key: &'text str, value: &'text str) -> KeyValue<'text> {
-    KeyValue { key, value }
-}
-
 /// Returns the diagnostic level and the description of a state.
 pub(crate) fn state(mode: RobotMode, fault: Option<Fault>) -> (Level, &'static str) {
     match (mode, fault) {
@@ -238,11 +233,12 @@ pub(super) fn diagnostics(frame: &TickFrame, robot: &str, lost: u64, into: &mut 
     let silence_s = seconds(frame.inputs.server_silence);
     let (number, lost) = (frame.number.to_string(), lost.to_string());
     let values = [
-        value("tick", &number),
-        value("gate", gate.as_deref().unwrap_or("open")),
-        value("server silent for, s", &silence_s),
-        value("notes lost", &lost),
+        ("tick", number.as_str()),
+        ("gate", gate.as_deref().unwrap_or("open")),
+        ("server silent for, s", &silence_s),
+        ("notes lost", &lost),
     ];
+    let values = values.map(|(key, value)| KeyValue { key, value });
     let status = [DiagnosticStatus {
         level: level as u8,
         name: "tread_agent: control loop",

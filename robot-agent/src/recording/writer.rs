@@ -139,7 +139,7 @@ pub(super) fn ros_channel<W: Write + Seek>(
     topic: &str,
     (package, name): Kind,
 ) -> Result<u16, McapError> {
-    let text = schema(package, name).unwrap_or_default();
+    let text = schema(&format!("{package}/{name}")).unwrap_or_default();
     let full = format!("{package}/msg/{name}");
     let schema = writer.add_schema(&full, "ros2msg", text.as_bytes())?;
     let metadata = BTreeMap::from([(QOS_KEY.to_owned(), QOS.to_owned())]);
@@ -275,11 +275,8 @@ impl RecordWriter {
 
     fn note(&mut self, notes: &Notes, note: &Note) {
         let lost = notes.lost.load(Ordering::Relaxed);
-        if lost > self.lost
-            && self
-                .said_lost_at
-                .is_none_or(|at| self.is_over(at, RETRY_EVERY))
-        {
+        let is_over = |at| self.clock.monotonic().saturating_sub(at) >= RETRY_EVERY;
+        if lost > self.lost && self.said_lost_at.is_none_or(is_over) {
             warn!(
                 lost,
                 "{lost} notes of the loop are not in the record: the disk is slow"
@@ -289,10 +286,6 @@ impl RecordWriter {
         }
         self.guarded(|writer, open| writer.take(open, note, lost));
         self.turn_over();
-    }
-
-    fn is_over(&self, since: Duration, time: Duration) -> bool {
-        self.clock.monotonic().saturating_sub(since) >= time
     }
 
     /// Runs `work` on the open record, opening one if necessary; closes it after an error.

@@ -5,6 +5,7 @@
 
 use std::collections::BTreeSet;
 use std::path::Path;
+use std::str::Lines;
 
 use serde::{Deserialize, Serialize};
 use tread_api::geometry::{Point, Polygon};
@@ -310,7 +311,7 @@ impl Scenario {
         let at = |table: &str, index: usize, problem: String| {
             format!(
                 "line {}: {table}[{index}]: {problem}",
-                line_of(text, table, index)
+                line_of(text.lines(), table, index)
             )
         };
         if !(tread_api::site::CELL_MIN_M..=tread_api::site::CELL_MAX_M).contains(&self.cell_m) {
@@ -387,10 +388,9 @@ impl Scenario {
 }
 
 /// Returns the line of the `index`-th `[[table]]`; 1 for inline tables.
-fn line_of(text: &str, table: &str, index: usize) -> usize {
+fn line_of(lines: Lines<'_>, table: &str, index: usize) -> usize {
     let header = format!("[[{table}]]");
-    let mut headers = text
-        .lines()
+    let mut headers = lines
         .enumerate()
         .filter(|(_, line)| line.trim_start().starts_with(&header));
     headers.nth(index).map_or(1, |(line, _)| line + 1)

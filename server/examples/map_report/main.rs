@@ -66,7 +66,7 @@ fn site() -> anyhow::Result<SiteId> {
 }
 
 fn model() -> RobotModel {
-    rover("report rover", "lugged")
+    rover("report rover")
 }
 
 fn segment(configuration: ConfigurationId, cell: Cell, robot: u32, at: jiff::Timestamp) -> Segment {

@@ -28,7 +28,7 @@ use crate::backup::manifest::{ArchivedFile, FORMAT};
 use crate::backup::{ArchiveError, Filter, Manifest, Source, folder};
 use crate::build;
 use crate::db::DbError;
-use crate::db::file::copy;
+use crate::db::file::copy::{self, CopyPaths};
 use crate::file_error::FileError;
 use crate::paths::folder_of;
 
@@ -229,10 +229,11 @@ pub async fn make(
     let size = copy::size_bytes(&order.database).await;
     let size = size.map_err(|cause| BackupError::Copy(cause.into()))?;
     check_all_space(&order, &target, size)?;
-    watch_copy(&order.database, &copy, |bytes| {
-        progress(Progress::Copying { bytes, of: size });
-    })
-    .await?;
+    let paths = CopyPaths {
+        database: &order.database,
+        target: &copy.0,
+    };
+    watch_copy(paths, |bytes| progress(Progress::Copying { bytes, of: size })).await?;
     progress(Progress::Checking);
     let contents = copy::examine(&copy.0).await;
     let contents = contents.map_err(|cause| BackupError::Examine(cause.into()))?;
@@ -272,12 +273,9 @@ pub async fn make(
 }
 
 /// Copies the database, and reports the size of the copy meanwhile.
-async fn watch_copy(
-    database: &Path,
-    CopyFile(target): &CopyFile,
-    tell: impl Fn(u64),
-) -> Result<(), BackupError> {
-    let copying = copy::copy_into(database, target);
+async fn watch_copy(paths: CopyPaths<'_>, tell: impl Fn(u64)) -> Result<(), BackupError> {
+    let target = paths.target;
+    let copying = copy::copy_into(paths);
     tokio::pin!(copying);
     let mut ticks = tokio::time::interval(PROGRESS_EVERY);
     loop {

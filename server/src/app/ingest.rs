@@ -36,7 +36,7 @@ use self::prepared::{Prepared, Ready, Skew, prepared, us_of};
 use super::App;
 use super::map::{Folded, MapChange};
 use super::missions::reports::{Foreign, Reporting, Taken, take_report};
-use crate::db::deferred_segments::Origin;
+use crate::db::deferred_segments::{DeferredFilter, Origin};
 use crate::db::segments::{Added, NewSegment};
 use crate::db::sums::SumKey;
 use crate::db::withdrawals::WithdrawalRow;
@@ -582,7 +582,11 @@ async fn released(
     grid: &Grid,
     skew: Skew,
 ) -> Result<Vec<(RecordKey, Ready<'static>)>, DbError> {
-    let waiting = db::deferred_segments::take(tx, boot_pk, skew.latest_us(), RELEASED_MAX).await?;
+    let filter = DeferredFilter {
+        boot_pk,
+        ended_before_us: skew.latest_us(),
+    };
+    let waiting = db::deferred_segments::take(tx, filter, RELEASED_MAX).await?;
     let ready = |waiting: db::deferred_segments::DeferredSegment| match prepared(
         Cow::Owned(waiting.segment),
         grid,

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use nix::errno::Errno;
 use nix::unistd::{AccessFlags, access};
-use tread_api::diagnosis::Finding;
+use tread_api::diagnosis::{Finding, NextStep};
 
 use super::Examined;
 use super::files::try_to_write;
@@ -32,7 +32,7 @@ pub(super) async fn finding(examined: &Examined, archived: Option<(i64, i64)>) -
         vec![Finding::problem(
             CONTENT,
             "its examination broke off",
-            "report this with what `doctor` printed",
+            NextStep("report this with what `doctor` printed"),
         )]
     })
 }
@@ -89,11 +89,11 @@ fn unreachable(error: &SegmentArchiveError) -> Finding {
     Finding::problem(
         NAME,
         chain(error),
-        format!(
+        NextStep(format!(
             "see whether the storage can be reached; set AWS_ENDPOINT_URL, AWS_REGION and the credentials \
              in the environment of the server, and \
              permit it to list, read, write and delete objects; {KEEPS}"
-        ),
+        )),
     )
 }
 
@@ -101,8 +101,10 @@ fn damaged(error: &SegmentArchiveError) -> Finding {
     Finding::problem(
         CONTENT,
         chain(error),
-        "mount the right disk, name the right folder or bucket, or restore the file from its copy; \
-         docs/runbook.md says what to do without one",
+        NextStep(
+            "mount the right disk, name the right folder or bucket, or restore the file from its copy; \
+             docs/runbook.md says what to do without one",
+        ),
     )
 }
 
@@ -114,10 +116,10 @@ fn of_folder(folder: &Path, is_used: bool) -> Finding {
             Err(error) => Finding::problem(
                 NAME,
                 format!("nothing can be written in `{shown}`: {error}"),
-                format!(
+                NextStep(format!(
                     "make room there, mount it for writing, or give it to the user that the server \
                      runs as; {KEEPS}"
-                ),
+                )),
             ),
         };
     }
@@ -125,9 +127,9 @@ fn of_folder(folder: &Path, is_used: bool) -> Finding {
         return Finding::problem(
             NAME,
             format!("measurements were archived, and the folder `{shown}` does not exist"),
-            format!(
+            NextStep(format!(
                 "mount the disk of the archive, or name its folder by [retention] archive; {KEEPS}"
-            ),
+            )),
         );
     }
     let mut ancestors = folder.ancestors().skip(1);
@@ -150,7 +152,9 @@ fn of_folder(folder: &Path, is_used: bool) -> Finding {
                 present.display(),
                 error.desc()
             ),
-            format!("make it, and give it to the user that the server runs as; {KEEPS}"),
+            NextStep(format!(
+                "make it, and give it to the user that the server runs as; {KEEPS}"
+            )),
         ),
     }
 }

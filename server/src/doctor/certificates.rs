@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use rustls::pki_types::{CertificateDer, TrustAnchor};
-use tread_api::diagnosis::Finding;
+use tread_api::diagnosis::{Finding, NextStep};
 use webpki::EndEntityCert;
 
 use super::Examined;
@@ -49,7 +49,9 @@ fn authority(examined: &Examined, folder: &Path) -> Finding {
         return Finding::warning(
             "authority",
             format!("a rotation of the authority in `{shown}` is under way"),
-            "`tread authority` shows which robots are left; then `tread authority finish`",
+            NextStep(
+                "`tread authority` shows which robots are left; then `tread authority finish`",
+            ),
         );
     }
     let authority = match Authority::load(folder) {
@@ -58,8 +60,10 @@ fn authority(examined: &Examined, folder: &Path) -> Finding {
             return Finding::problem(
                 "authority",
                 chain(&error),
-                "run this as the user that the server runs as; `tread-server init` makes an \
-                 authority where there is none; a backup brings a lost one back",
+                NextStep(
+                    "run this as the user that the server runs as; `tread-server init` makes an \
+                     authority where there is none; a backup brings a lost one back",
+                ),
             );
         }
     };
@@ -74,13 +78,15 @@ fn authority(examined: &Examined, folder: &Path) -> Finding {
         (Some(Condition::Expiring), Some(read)) => Finding::warning(
             "authority",
             format!("the authority in `{shown}` expires at {}", read.not_after),
-            "rotate it: `tread authority start`",
+            NextStep("rotate it: `tread authority start`"),
         ),
         (Some(Condition::Expired), Some(read)) => Finding::problem(
             "authority",
             format!("the authority in `{shown}` expired at {}", read.not_after),
-            "set the clock if it is wrong; otherwise `tread authority replace`, and every robot \
-             joins again",
+            NextStep(
+                "set the clock if it is wrong; otherwise `tread authority replace`, and every robot \
+                 joins again",
+            ),
         ),
         (Some(Condition::NotYetValid), Some(read)) => Finding::problem(
             "authority",
@@ -88,7 +94,7 @@ fn authority(examined: &Examined, folder: &Path) -> Finding {
                 "the authority in `{shown}` is valid from {} only, and the clock says {now:.0}",
                 read.not_before
             ),
-            "set the clock",
+            NextStep("set the clock"),
         ),
     }
 }
@@ -104,21 +110,27 @@ fn of_files(examined: &Examined, files: &TlsFiles) -> Vec<Finding> {
     let read = Tls::load(files.clone()).and_then(|_| read_files(files));
     let (certificates, _key) = match read {
         Ok(read) => read,
-        Err(error) => return vec![Finding::problem("certificate", chain(&error), step)],
+        Err(error) => {
+            return vec![Finding::problem(
+                "certificate",
+                chain(&error),
+                NextStep(step),
+            )];
+        }
     };
     let shown = files.certificate.display().to_string();
     let Some(leaf) = certificates.first() else {
         return vec![Finding::problem(
             "certificate",
             format!("`{shown}` holds no certificate"),
-            step,
+            NextStep(step),
         )];
     };
     let Some(certificate) = Certificate::read(leaf) else {
         return vec![Finding::problem(
             "certificate",
             format!("the certificate in `{shown}` does not read"),
-            step,
+            NextStep(step),
         )];
     };
     vec![
@@ -136,13 +148,15 @@ fn validity(examined: &Examined, shown: &str, certificate: &Certificate) -> Find
         Condition::Expiring => Finding::warning(
             "certificate",
             format!("the certificate in `{shown}` expires at {until}"),
-            "replace the file; a running server takes it within a minute",
+            NextStep("replace the file; a running server takes it within a minute"),
         ),
         Condition::Expired => Finding::problem(
             "certificate",
             format!("the certificate in `{shown}` expired at {until}; clients refuse it"),
-            "replace the file, and a running server takes it within a minute; set the clock if it \
-             is wrong",
+            NextStep(
+                "replace the file, and a running server takes it within a minute; set the clock if it \
+                 is wrong",
+            ),
         ),
         Condition::NotYetValid => Finding::problem(
             "certificate",
@@ -150,7 +164,7 @@ fn validity(examined: &Examined, shown: &str, certificate: &Certificate) -> Find
                 "the certificate in `{shown}` is valid from {from} only, and the clock says \
                  {now:.0}"
             ),
-            "set the clock, or replace the file",
+            NextStep("set the clock, or replace the file"),
         ),
     }
 }
@@ -168,13 +182,13 @@ fn names(
         None if hosts.is_empty() => Finding::warning(
             "certificate names",
             format!("`{shown}` is for {names}, and `web.hosts` names none of them"),
-            "add the names by which browsers find the server to `web.hosts`",
+            NextStep("add the names by which browsers find the server to `web.hosts`"),
         ),
         None => Finding::ok("certificate names", format!("`{shown}` is for {names}")),
         Some(host) => Finding::problem(
             "certificate names",
             format!("`{shown}` is for {names}, and not for `{host}` of `web.hosts`"),
-            "get a certificate for that name too, or remove it from `web.hosts`",
+            NextStep("get a certificate for that name too, or remove it from `web.hosts`"),
         ),
     }
 }
@@ -192,7 +206,7 @@ fn issuers(shown: &str, certificates: &[CertificateDer<'static>]) -> Finding {
                     "in `{shown}` a certificate is followed by one that has not signed it; clients \
                      refuse it"
                 ),
-                "put the server's certificate first, then each one's issuer",
+                NextStep("put the server's certificate first, then each one's issuer"),
             );
         }
     }

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 
 use jiff::{SignedDuration, Timestamp};
-use tread_api::diagnosis::Finding;
+use tread_api::diagnosis::{Finding, NextStep};
 
 use super::Examined;
 
@@ -24,7 +24,7 @@ pub(super) fn findings(examined: &Examined, newest: Option<Timestamp>) -> Vec<Fi
         Some(false) => Finding::warning(
             "clock",
             format!("it is not synchronised, and says {now:.0}"),
-            SYNCHRONISE,
+            NextStep(SYNCHRONISE),
         ),
         None => Finding::skipped(
             "clock",
@@ -46,7 +46,7 @@ fn behind(now: Timestamp, ahead: SignedDuration) -> Option<Finding> {
                  set back, or was ahead before",
                 ahead.as_secs()
             ),
-            SYNCHRONISE,
+            NextStep(SYNCHRONISE),
         )
     })
 }

@@ -1,10 +1,10 @@
 //! Examines the schema of the database, and whether the database is readable.
 
-use tread_api::diagnosis::Finding;
+use tread_api::diagnosis::{Finding, NextStep};
 
 use super::Examined;
 use crate::db::failure::StorageFailure;
-use crate::db::inspection::{InspectError, Inspection, Schema, inspect};
+use crate::db::inspection::{InspectError, InspectOptions, Inspection, Schema, inspect};
 use crate::error_text::chain;
 
 const RESTORE: &str = "stop the server, keep the file, and restore a backup; or bring what can be \
@@ -14,13 +14,11 @@ const RESTORE: &str = "stop the server, keep the file, and restore a backup; or 
 pub(super) async fn findings(examined: &Examined) -> (Vec<Finding>, Option<Inspection>) {
     let location = &examined.config.database;
     let shown = location;
-    let inspected = inspect(
-        location,
-        examined.server_process.is_some(),
-        examined.is_deep,
-    )
-    .await;
-    let inspection = match inspected {
+    let options = InspectOptions {
+        is_in_use: examined.server_process.is_some(),
+        is_deep: examined.is_deep,
+    };
+    let inspection = match inspect(location, options).await {
         Ok(Some(inspection)) => inspection,
         Ok(None) => {
             let text = format!("`{shown}` does not exist yet; the server makes it");
@@ -33,7 +31,7 @@ pub(super) async fn findings(examined: &Examined) -> (Vec<Finding>, Option<Inspe
         (Some(damage), _) => findings.push(Finding::problem(
             "database content",
             format!("`{shown}` is damaged: {damage}"),
-            RESTORE,
+            NextStep(RESTORE),
         )),
         (None, true) => {
             findings.push(Finding::ok("database content", "all of it can be read"));
@@ -59,18 +57,22 @@ fn schema(shown: &str, inspection: &Inspection) -> Finding {
         Schema::Older { pending } => Finding::warning(
             "database",
             format!("`{shown}` is of an older version: {pending} migrations are pending"),
-            "back it up; the next start of this version migrates it, and older versions then \
-             refuse it",
+            NextStep(
+                "back it up; the next start of this version migrates it, and older versions then \
+                 refuse it",
+            ),
         ),
         Schema::Newer(version) => Finding::problem(
             "database",
             format!("`{shown}` was opened by a newer version: its schema is {version}"),
-            "install that version again, or restore the backup of before the upgrade",
+            NextStep("install that version again, or restore the backup of before the upgrade"),
         ),
         Schema::Differs(version) => Finding::problem(
             "database",
             format!("`{shown}` has another migration {version} than this program"),
-            "a build that was never released made it: use that build, or restore a backup",
+            NextStep(
+                "a build that was never released made it: use that build, or restore a backup",
+            ),
         ),
     }
 }
@@ -90,5 +92,5 @@ fn unreadable(shown: &str, error: &InspectError) -> Finding {
             "run this as the user that the server runs as; see `dmesg` for what the disk answers"
         }
     };
-    Finding::problem("database", text, step)
+    Finding::problem("database", text, NextStep(step))
 }

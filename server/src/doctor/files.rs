@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use nix::sys::statvfs::{FsFlags, statvfs};
 use nix::unistd::Uid;
-use tread_api::diagnosis::Finding;
+use tread_api::diagnosis::{Finding, NextStep};
 
 use super::Examined;
 use crate::config::TlsSource;
@@ -47,10 +47,10 @@ fn folder_finding(folder: &Path) -> Finding {
         return Finding::problem(
             "folder",
             format!("the folder `{shown}` of the database does not exist"),
-            format!(
+            NextStep(format!(
                 "`mkdir -p {shown}`, and give it to the user that the server runs as; or name \
                  another one by `database`"
-            ),
+            )),
         );
     }
     let is_read_only =
@@ -59,8 +59,10 @@ fn folder_finding(folder: &Path) -> Finding {
         return Finding::problem(
             "folder",
             format!("the disk of `{shown}` is mounted read-only"),
-            "see `dmesg` for why; repair the file system, then mount it for writing \
-             (`mount -o remount,rw …`)",
+            NextStep(
+                "see `dmesg` for why; repair the file system, then mount it for writing \
+                 (`mount -o remount,rw …`)",
+            ),
         );
     }
     match try_to_write(folder) {
@@ -79,7 +81,7 @@ fn folder_finding(folder: &Path) -> Finding {
             Finding::problem(
                 "folder",
                 format!("nothing can be written in `{shown}`: {error}"),
-                step,
+                NextStep(step),
             )
         }
     }
@@ -118,14 +120,16 @@ fn disk(examined: &Examined, folder: &Path) -> Finding {
         return Finding::problem(
             "disk",
             format!("the disk of `{shown}` has no inodes left, so no file can be made"),
-            "remove files there; `df -i` shows who has them",
+            NextStep("remove files there; `df -i` shows who has them"),
         );
     }
     if free == 0 {
         return Finding::problem(
             "disk",
             format!("the disk of `{shown}` is full"),
-            "make room on the disk; robots keep their measurements, and the server continues by itself",
+            NextStep(
+                "make room on the disk; robots keep their measurements, and the server continues by itself",
+            ),
         );
     }
     if free_bytes < limit_bytes {
@@ -134,8 +138,10 @@ fn disk(examined: &Examined, folder: &Path) -> Finding {
             format!(
                 "{free} MiB are free for `{shown}`, less than storage.disk_free_min_mib, {limit}"
             ),
-            "make room, keep raw measurements for a shorter time ([retention]), or lower \
-             storage.disk_free_min_mib",
+            NextStep(
+                "make room, keep raw measurements for a shorter time ([retention]), or lower \
+                 storage.disk_free_min_mib",
+            ),
         );
     }
     Finding::ok("disk", format!("{free} MiB are free for `{shown}`"))
@@ -169,13 +175,17 @@ fn secrets(examined: &Examined) -> Vec<Finding> {
             findings.push(Finding::problem(
                 "file modes",
                 format!("others can use `{shown}`, which has the mode {mode:o}"),
-                format!("`chmod 600 {shown}`, and renew what is in it if others may have read it"),
+                NextStep(format!(
+                    "`chmod 600 {shown}`, and renew what is in it if others may have read it"
+                )),
             ));
         } else if mode & OF_OTHERS != 0 {
             findings.push(Finding::warning(
                 "file modes",
                 format!("the group of `{shown}` can use it, with the mode {mode:o}"),
-                format!("`chmod 600 {shown}`, unless you trust every member of that group"),
+                NextStep(format!(
+                    "`chmod 600 {shown}`, unless you trust every member of that group"
+                )),
             ));
         }
     }
@@ -222,18 +232,20 @@ fn owners(examined: &Examined) -> Finding {
         return Finding::problem(
             "file owners",
             format!("user {user} cannot read `{}`", unreadable.join("`, `")),
-            "give the files to the user that the server runs as (`chown`), and run this as that \
-             user",
+            NextStep(
+                "give the files to the user that the server runs as (`chown`), and run this as that \
+                 user",
+            ),
         );
     }
     match foreign.first() {
         Some((file, owner)) if user.is_root() => Finding::warning(
             "file owners",
             format!("this runs as root, and `{file}` is of user {owner}"),
-            format!(
+            NextStep(format!(
                 "run it as the user that the server runs as, to see what that one sees: \
                  `setpriv --reuid={owner} --clear-groups tread-server doctor …`"
-            ),
+            )),
         ),
         Some(_) | None => Finding::ok("file owners", format!("user {user} can read all files")),
     }

@@ -1,7 +1,7 @@
 //! Examines the limits of the operating system.
 
 use nix::sys::resource::{Resource, getrlimit};
-use tread_api::diagnosis::Finding;
+use tread_api::diagnosis::{Finding, NextStep};
 
 /// Number of open files that a fully loaded server needs: for its connections, those of robots, and
 /// their files.
@@ -12,8 +12,10 @@ pub(super) fn findings() -> Vec<Finding> {
         Ok((_, most)) if most < FILES_NEEDED => Finding::warning(
             "file limit",
             format!("at most {most} files can be open, and a full fleet needs {FILES_NEEDED}"),
-            "raise the hard limit: `LimitNOFILE=` in the unit, or /etc/security/limits.conf; this \
-             is the limit of this shell, the server's may be another",
+            NextStep(
+                "raise the hard limit: `LimitNOFILE=` in the unit, or /etc/security/limits.conf; this \
+                 is the limit of this shell, the server's may be another",
+            ),
         ),
         Ok((_, most)) => Finding::ok("file limit", format!("{most} files can be open")),
         Err(error) => Finding::skipped("file limit", format!("it is not known: {error}")),

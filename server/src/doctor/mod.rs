@@ -18,7 +18,7 @@ use std::io::Write as _;
 use std::path::PathBuf;
 
 use clap::Args;
-use tread_api::diagnosis::Finding;
+use tread_api::diagnosis::{Finding, NextStep};
 
 use crate::clock::Clock;
 use crate::config::{Config, ServerArgs};
@@ -89,7 +89,7 @@ async fn examine(args: DoctorArgs) -> Vec<Finding> {
             return vec![Finding::problem(
                 "configuration",
                 chain(&error),
-                configuration_step(args.config.as_deref()),
+                NextStep(configuration_step(args.config.as_deref())),
             )];
         }
     };

@@ -5,7 +5,7 @@ use std::net::{SocketAddr, TcpListener};
 
 use jiff::SignedDuration;
 use jiff::fmt::rfc2822;
-use tread_api::diagnosis::Finding;
+use tread_api::diagnosis::{Finding, NextStep};
 
 use super::Examined;
 use super::probe::{self, Answer};
@@ -95,7 +95,7 @@ async fn rest(examined: &Examined) -> Vec<Finding> {
         findings = vec![Finding::problem(
             port.name,
             format!("a Tread server answers on {address}, and it does not use this database"),
-            "stop that server, or give this one another address by `http`",
+            NextStep("stop that server, or give this one another address by `http`"),
         )];
     }
     findings.extend(readiness(address, is_tls).await);
@@ -115,7 +115,7 @@ async fn readiness(address: SocketAddr, is_tls: bool) -> Option<Finding> {
     Some(Finding::problem(
         "readiness",
         format!("the server cannot work: {why}"),
-        "see the findings on folder, disk and database, and docs/runbook.md",
+        NextStep("see the findings on folder, disk and database, and docs/runbook.md"),
     ))
 }
 
@@ -127,7 +127,7 @@ fn clock_of(examined: &Examined, answer: &Answer) -> Option<Finding> {
         Finding::warning(
             "clock of the server",
             format!("the server says {said}, {} s off", difference.as_secs()),
-            "ask again; if it lasts, the clock is being set",
+            NextStep("ask again; if it lasts, the clock is being set"),
         )
     })
 }
@@ -147,7 +147,9 @@ fn served(examined: &Examined, answer: &Answer) -> Option<Finding> {
                 files.certificate.display(),
                 read.not_after
             ),
-            "wait a minute: it reads the file again then, and its log says if it cannot use it",
+            NextStep(
+                "wait a minute: it reads the file again then, and its log says if it cannot use it",
+            ),
         ));
     }
     let now = examined.clock.machine_time();
@@ -159,7 +161,7 @@ fn served(examined: &Examined, answer: &Answer) -> Option<Finding> {
         Finding::problem(
             "certificate served",
             format!("the server shows one that is not valid now: {text}"),
-            "see the finding on the certificate, and set the clock if it is wrong",
+            NextStep("see the finding on the certificate, and set the clock if it is wrong"),
         )
     })
 }
@@ -204,7 +206,7 @@ async fn robots(examined: &Examined) -> Finding {
         Finding::problem(
             port.name,
             format!("what answers on {address} shows no certificate of the fleet's authority"),
-            "stop the other program, or give the robots another address by `zenoh`",
+            NextStep("stop the other program, or give the robots another address by `zenoh`"),
         )
     }
 }
@@ -216,9 +218,9 @@ impl Configured {
         Finding::problem(
             name,
             format!("another program has {address}"),
-            format!(
+            NextStep(format!(
                 "`ss -ltnp sport = :{port}` shows which; stop it, or take another address by `{key}`"
-            ),
+            )),
         )
     }
 
@@ -233,7 +235,9 @@ impl Configured {
             (Port::Free, Some(process)) if address.port() != 0 => Finding::problem(
                 name,
                 format!("the server, process {process}, does not have {address}"),
-                "it was started with another configuration, is still starting, or hangs: see its log",
+                NextStep(
+                    "it was started with another configuration, is still starting, or hangs: see its log",
+                ),
             ),
             (Port::Free, _) => Finding::ok(name, format!("{address} is free")),
             (Port::Impossible(error), _) => {
@@ -247,7 +251,11 @@ impl Configured {
                     ),
                     _ => format!("take another address by `{key}`"),
                 };
-                Finding::problem(name, format!("cannot listen on {address}: {error}"), step)
+                Finding::problem(
+                    name,
+                    format!("cannot listen on {address}: {error}"),
+                    NextStep(step),
+                )
             }
         }
     }

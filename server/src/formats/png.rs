@@ -60,6 +60,15 @@ pub enum PngError {
     Encode(#[from] ::png::EncodingError),
 }
 
+/// Rectangle of an image, in pixels.
+#[derive(Debug, Clone, Copy)]
+struct Rectangle {
+    x: usize,
+    y: usize,
+    width: usize,
+    height: usize,
+}
+
 /// RGBA image, initially transparent.
 struct Canvas {
     width: usize,
@@ -75,9 +84,9 @@ impl Canvas {
         }
     }
 
-    fn fill(&mut self, (x, y): (usize, usize), (width, height): (usize, usize), ink: Rgb) {
-        for row in y..y + height {
-            for column in x..x + width {
+    fn fill(&mut self, within: Rectangle, ink: Rgb) {
+        for row in within.y..within.y + within.height {
+            for column in within.x..within.x + within.width {
                 self.put(column, row, ink);
             }
         }
@@ -153,7 +162,7 @@ pub fn encode(raster: &Raster, scale: Option<usize>) -> Result<Vec<u8>, PngError
             }
         }
     }
-    draw_legend(&mut canvas, height, legend);
+    draw_legend(&mut canvas, height);
     write(&canvas, raster)
 }
 
@@ -184,17 +193,40 @@ fn hatched((column, row): (usize, usize), density: usize, ink: Rgb) -> Rgb {
     }
 }
 
-/// Draws a colour bar for θ and a hatched one for the relative standard deviation.
+/// Draws a tick below a colour bar.
+fn draw_tick(canvas: &mut Canvas, (x, y): (usize, usize), text: &str) {
+    let tick = Rectangle {
+        x,
+        y,
+        width: 1,
+        height: 3,
+    };
+    canvas.fill(tick, INK);
+    let width_px = text_width_px(text);
+    let left = x
+        .saturating_sub(width_px / 2)
+        .min(canvas.width - width_px - 1);
+    canvas.write((left, y + 4), text);
+}
+
+/// Draws a colour bar for θ and a hatched one for the relative standard deviation, from a row down to the
+/// end of the image.
 #[expect(
     clippy::cast_precision_loss,
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
     reason = "pixels"
 )]
-fn draw_legend(canvas: &mut Canvas, top: usize, height: usize) {
+fn draw_legend(canvas: &mut Canvas, top: usize) {
     let (_, letters) = LETTER_PX;
     let width = canvas.width;
-    canvas.fill((0, top), (width, height), WHITE);
+    let whole = Rectangle {
+        x: 0,
+        y: top,
+        width,
+        height: canvas.height - top,
+    };
+    canvas.fill(whole, WHITE);
     let title = text_width_px("θ") + MARGIN_PX;
     let left = MARGIN_PX + title.max(text_width_px("σ/θ") + MARGIN_PX);
     let bar = width - left - 2 * MARGIN_PX;
@@ -203,17 +235,19 @@ fn draw_legend(canvas: &mut Canvas, top: usize, height: usize) {
     canvas.write((MARGIN_PX, y), "θ");
     for column in 0..bar {
         let ink = cividis(column as f64 / bar as f64);
-        canvas.fill((left + column, y), (1, BAR_PX), ink);
+        let line = Rectangle {
+            x: left + column,
+            y,
+            width: 1,
+            height: BAR_PX,
+        };
+        canvas.fill(line, ink);
     }
     y += BAR_PX;
     for tick in TICKS {
         let value = tick.parse().unwrap_or(THETA_LOW);
         let x = at((value / THETA_LOW).ln() / (THETA_HIGH / THETA_LOW).ln());
-        canvas.fill((x, y), (1, 3), INK);
-        let text_left = x
-            .saturating_sub(text_width_px(tick) / 2)
-            .min(width - text_width_px(tick) - 1);
-        canvas.write((text_left, y + 4), tick);
+        draw_tick(canvas, (x, y), tick);
     }
     y += letters + 2 + 2 * MARGIN_PX;
     canvas.write((MARGIN_PX, y), "σ/θ");
@@ -227,12 +261,7 @@ fn draw_legend(canvas: &mut Canvas, top: usize, height: usize) {
     y += BAR_PX;
     for least in HATCHED {
         let tick = &format!("{:.0}%", 100.0 * least);
-        let x = at(least / LEGEND_END);
-        canvas.fill((x, y), (1, 3), INK);
-        let text_left = x
-            .saturating_sub(text_width_px(tick) / 2)
-            .min(width - text_width_px(tick) - 1);
-        canvas.write((text_left, y + 4), tick);
+        draw_tick(canvas, (at(least / LEGEND_END), y), tick);
     }
 }
 

@@ -33,9 +33,17 @@ impl Normal {
     }
 }
 
+/// Robots that measure one piece of ground.
+#[derive(Clone, Copy)]
+struct Fleet {
+    robots: u32,
+    /// Visits of each robot.
+    visits: u32,
+}
+
 /// Returns the coverage of three intervals: of a fused cell, of a fused area, and of plain sums of
 /// information.
-fn coverage(robots: u32, visits: u32) -> [f64; 3] {
+fn coverage(Fleet { robots, visits }: Fleet) -> [f64; 3] {
     let mut normal = Normal(SEED ^ u64::from(robots) << 32 ^ u64::from(visits));
     let mut held = [0; 3];
     let runs = VISITS / (robots * visits);
@@ -75,7 +83,7 @@ fn coverage(robots: u32, visits: u32) -> [f64; 3] {
 #[test]
 fn intervals_hold_the_truth_however_robots_and_visits_are_shared_out() {
     for (robots, visits) in [(1, 50), (3, 50), (10, 50), (50, 20)] {
-        let shares = coverage(robots, visits);
+        let shares = coverage(Fleet { robots, visits });
         let [cell, area, naive] = shares.map(|share| 100.0 * share);
         let said = format!(
             "{robots} robots x {visits} visits: cell {cell:.1} %, area {area:.1} %, \

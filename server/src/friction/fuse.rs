@@ -114,13 +114,6 @@ impl<R: Ord + Copy> Fuser<R> {
     }
 }
 
-/// Compares two entries by θ, as a tie-break: two revisions of a terrain may each have a sum of the
-/// same robot and epoch.
-fn by_content<R>(left: &Seen<R>, right: &Seen<R>) -> std::cmp::Ordering {
-    let information = left.theta.information.total_cmp(&right.theta.information);
-    information.then_with(|| left.theta.value.total_cmp(&right.theta.value))
-}
-
 fn fuse_in<R: Ord + Copy>(
     room: &mut Fuser<R>,
     seen: &mut Vec<Seen<R>>,
@@ -134,19 +127,19 @@ fn fuse_in<R: Ord + Copy>(
             .cmp(&left.newest_at_us)
             .then_with(|| left.robot.cmp(&right.robot))
             .then_with(|| right.epoch_h.cmp(&left.epoch_h))
-            .then_with(|| by_content(left, right))
+            .then_with(|| left.cmp_theta(right))
     });
     let passes = seen.iter().map(|one| one.passes).sum();
     let newest_at_us = seen.first()?.newest_at_us;
     let present = match ground {
-        Ground::Cell => Present::of(seen, &mut room.before, config),
+        Ground::Cell => Present::of(seen, room, config),
         Ground::Area => Present::default(),
     };
     seen.sort_unstable_by(|left, right| {
         let by_robot = left.robot.cmp(&right.robot);
         by_robot
             .then_with(|| left.epoch_h.cmp(&right.epoch_h))
-            .then_with(|| by_content(left, right))
+            .then_with(|| left.cmp_theta(right))
     });
     let drift = config.drift_variance_per_s;
     let words = &mut room.room;
@@ -231,12 +224,13 @@ struct Present {
 
 impl Present {
     /// Removes from `seen`, which is sorted newest first, the entries from before the last change
-    /// of the ground. `older` is a buffer.
+    /// of the ground.
     fn of<R: Ord + Copy>(
         seen: &mut Vec<Seen<R>>,
-        older: &mut Vec<Seen<R>>,
+        room: &mut Fuser<R>,
         config: &FrictionConfig,
     ) -> Self {
+        let older = &mut room.before;
         older.clear();
         older.extend_from_slice(seen);
         let (kept, changed_at_us) = keep_present(seen, config);
@@ -245,7 +239,11 @@ impl Present {
             return Self::default();
         };
         let witnesses: u64 = seen.iter().map(|one| one.passes).sum();
-        let lone = lone_witness(seen, &older[kept..], config);
+        let divided = Divided {
+            kept: seen,
+            contradicted: &older[kept..],
+        };
+        let lone = lone_witness(divided, config);
         if witnesses > 1 && lone.is_none() {
             return Self {
                 is_unconfirmed: false,
@@ -288,12 +286,18 @@ impl Present {
     }
 }
 
+/// Entries on both sides of a change of the ground.
+#[derive(Clone, Copy)]
+struct Divided<'seen, R> {
+    kept: &'seen [Seen<R>],
+    contradicted: &'seen [Seen<R>],
+}
+
 /// Returns the only robot that measured less slip while several others measured more; `None` if
 /// there is no such robot. Repeated measurements of it do not confirm the change, so all of its
 /// entries are ignored.
 fn lone_witness<R: Ord + Copy>(
-    kept: &[Seen<R>],
-    contradicted: &[Seen<R>],
+    Divided { kept, contradicted }: Divided<'_, R>,
     config: &FrictionConfig,
 ) -> Option<R> {
     let mut now = WeightedTheta::default();

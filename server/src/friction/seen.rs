@@ -78,6 +78,13 @@ impl<R> Seen<R> {
         self
     }
 
+    /// Compares with another entry by θ, as a tie-break: two revisions of a terrain may each have a sum of
+    /// the same robot and epoch.
+    pub(super) fn cmp_theta(&self, other: &Self) -> std::cmp::Ordering {
+        let information = self.theta.information.total_cmp(&other.theta.information);
+        information.then_with(|| self.theta.value.total_cmp(&other.theta.value))
+    }
+
     /// Returns θ of the newest pass and of the others if they contradict each other, else `None`.
     pub(super) fn contradicted(&self) -> Option<(Known, Known)> {
         let newest = self.newest.filter(|_| self.passes > 1)?;

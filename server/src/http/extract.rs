@@ -14,7 +14,7 @@ use axum::response::{IntoResponse, Response};
 use futures_util::StreamExt as _;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
-use serde_json::value::RawValue;
+use serde_json::value::{RawValue, to_raw_value};
 use tread_api::page::{PAGE_LIMIT_DEFAULT, PAGE_LIMIT_MAX};
 use tread_api::problem::ProblemType;
 
@@ -191,7 +191,7 @@ fn without_place(message: &str) -> &str {
 /// [`BadFrame`].
 pub(super) fn parse_frame<T: DeserializeOwned + Serialize>(text: &str) -> Result<T, BadFrame> {
     let parsed: T = serde_json::from_str(text).map_err(BadFrame::Parser)?;
-    let meant = serde_json::to_vec(&parsed).unwrap_or_default();
+    let meant = to_raw_value(&parsed).unwrap_or_default();
     match list_for_object(text.as_bytes(), &meant) {
         None => Ok(parsed),
         Some(_place) => Err(BadFrame::List),
@@ -212,7 +212,7 @@ pub(super) enum BadFrame {
 /// Refuses a list in place of an object: the parser would assign its entries to the fields in
 /// order, bypassing the check for unknown fields.
 fn refuse_lists_for_objects<T: Serialize>(parsed: &T, body: &[u8]) -> Result<(), Problem> {
-    let meant = serde_json::to_vec(parsed).unwrap_or_default();
+    let meant = to_raw_value(parsed).unwrap_or_default();
     match list_for_object(body, &meant) {
         None => Ok(()),
         Some(place) => {
@@ -231,27 +231,28 @@ fn refuse_lists_for_objects<T: Serialize>(parsed: &T, body: &[u8]) -> Result<(),
 ///
 /// Compares one level of both texts at a time, so that a path of many thousand points needs a
 /// pointer each and no tree.
-fn list_for_object(sent: &[u8], meant: &[u8]) -> Option<String> {
+fn list_for_object(sent: &[u8], meant: &RawValue) -> Option<String> {
+    let meant = meant.get();
     let within = |name: &str, place: String| match place.as_str() {
         "" => name.to_owned(),
         _ => format!("{name}.{place}"),
     };
-    match (sent.trim_ascii_start().first()?, meant.first()?) {
+    match (sent.trim_ascii_start().first()?, meant.as_bytes().first()?) {
         (b'[', b'{') => Some(String::new()),
         (b'[', b'[') => {
             let sent: Vec<&RawValue> = serde_json::from_slice(sent).ok()?;
-            let meant: Vec<&RawValue> = serde_json::from_slice(meant).ok()?;
+            let meant: Vec<&RawValue> = serde_json::from_str(meant).ok()?;
             let mut pairs = sent.iter().zip(meant).enumerate();
             pairs.find_map(|(index, (sent, meant))| {
-                list_for_object(sent.get().as_bytes(), meant.get().as_bytes())
+                list_for_object(sent.get().as_bytes(), meant)
                     .map(|place| within(&index.to_string(), place))
             })
         }
         (b'{', b'{') => {
             let sent: BTreeMap<String, &RawValue> = serde_json::from_slice(sent).ok()?;
-            let meant: BTreeMap<String, &RawValue> = serde_json::from_slice(meant).ok()?;
+            let meant: BTreeMap<String, &RawValue> = serde_json::from_str(meant).ok()?;
             sent.iter().find_map(|(name, sent)| {
-                let meant = meant.get(name)?.get().as_bytes();
+                let meant = meant.get(name)?;
                 list_for_object(sent.get().as_bytes(), meant).map(|place| within(name, place))
             })
         }

@@ -5,43 +5,25 @@ use tread_api::problem::ProblemType;
 
 use super::problem::Problem;
 
-/// A format that a route offers.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Offered<T> {
-    /// Its name in `format=`.
-    pub(super) name: &'static str,
-    /// Its media type.
-    pub(super) media_type: &'static str,
-    /// The route's own value for it.
-    pub(super) format: T,
+/// A format of a response.
+pub(super) trait ResponseFormat: Copy {
+    /// Returns its media type.
+    fn media_type(self) -> &'static str;
 }
 
-/// Makes an offered format.
-pub(super) const fn offered<T: Copy>(
-    name: &'static str,
-    media_type: &'static str,
-    format: T,
-) -> Offered<T> {
-    Offered {
-        name,
-        media_type,
-        format,
-    }
-}
-
-/// Returns the requested format; the first offered one by default.
-pub(super) fn choose<T: Copy>(
-    offered: &[Offered<T>],
+/// Returns the requested format; the first offered one by default. Each has its name in `format=`.
+pub(super) fn choose<T: ResponseFormat>(
+    offered: &[(&'static str, T)],
     format: Option<&str>,
     headers: &HeaderMap,
 ) -> Result<T, Problem> {
     let names = || {
-        let names: Vec<&str> = offered.iter().map(|one| one.name).collect();
+        let names: Vec<&str> = offered.iter().map(|(name, _)| *name).collect();
         names.join("`, `")
     };
     if let Some(format) = format {
-        let found = offered.iter().find(|one| one.name == format);
-        return found.map(|one| one.format).ok_or_else(|| {
+        let found = offered.iter().find(|(name, _)| *name == format);
+        return found.map(|(_, format)| *format).ok_or_else(|| {
             let short: String = format.chars().take(40).collect();
             let detail = format!("there is no format `{short}` here, only `{}`", names());
             Problem::new(ProblemType::InvalidQuery)
@@ -56,16 +38,15 @@ pub(super) fn choose<T: Copy>(
         .collect();
     let weighed = offered
         .iter()
-        .map(|one| (one, weight(&accepted, one.media_type)));
+        .map(|(_, format)| (*format, weight(&accepted, format.media_type())));
     // Of equal weights the first.
-    let best = weighed.filter(|(_, weight)| *weight > 0.0).fold(
-        None::<(&Offered<T>, f64)>,
-        |best, next| match best {
+    let best = weighed
+        .filter(|(_, weight)| *weight > 0.0)
+        .fold(None::<(T, f64)>, |best, next| match best {
             Some(best) if best.1 >= next.1 => Some(best),
             Some(_) | None => Some(next),
-        },
-    );
-    best.map(|(one, _)| one.format).ok_or_else(|| {
+        });
+    best.map(|(format, _)| format).ok_or_else(|| {
         let detail = format!("take one of these with `format=`: `{}`", names());
         Problem::new(ProblemType::NotAcceptable).detail(detail)
     })
@@ -102,11 +83,17 @@ fn weight(accepted: &[&str], media_type: &str) -> f64 {
 mod tests {
     use super::*;
 
-    const OFFERED: [Offered<char>; 3] = [
-        offered("json", "application/json", 'j'),
-        offered("png", "image/png", 'p'),
-        offered("csv", "text/csv", 'c'),
-    ];
+    const OFFERED: [(&str, char); 3] = [("json", 'j'), ("png", 'p'), ("csv", 'c')];
+
+    impl ResponseFormat for char {
+        fn media_type(self) -> &'static str {
+            match self {
+                'j' => "application/json",
+                'p' => "image/png",
+                _ => "text/csv",
+            }
+        }
+    }
 
     fn chosen(format: Option<&str>, accept: Option<&str>) -> Result<char, Problem> {
         let mut headers = HeaderMap::new();

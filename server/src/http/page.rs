@@ -33,7 +33,7 @@ const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; i
 /// One file with its headers.
 struct File {
     name: &'static str,
-    media_type: &'static str,
+    media_type: HeaderValue,
     plain: &'static [u8],
     zipped: Bytes,
     tag: String,
@@ -43,7 +43,7 @@ macro_rules! file {
     ($name:literal, $media_type:literal) => {
         File::new(
             $name,
-            $media_type,
+            HeaderValue::from_static($media_type),
             include_bytes!(concat!("../../dashboard/dist/", $name)),
         )
     };
@@ -60,7 +60,7 @@ static DIST: LazyLock<[File; 4]> = LazyLock::new(|| {
 });
 
 impl File {
-    fn new(name: &'static str, media_type: &'static str, plain: &'static [u8]) -> Self {
+    fn new(name: &'static str, media_type: HeaderValue, plain: &'static [u8]) -> Self {
         let mut encoder = GzEncoder::new(Vec::new(), Compression::best());
         // Writing into memory does not fail.
         let zipped = encoder.write_all(plain).and_then(|()| encoder.finish());
@@ -94,10 +94,7 @@ impl File {
             Body::from(self.plain).into_response()
         };
         let said = response.headers_mut();
-        said.insert(
-            header::CONTENT_TYPE,
-            HeaderValue::from_static(self.media_type),
-        );
+        said.insert(header::CONTENT_TYPE, self.media_type.clone());
         said.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-cache"));
         said.insert(header::VARY, HeaderValue::from_static("accept-encoding"));
         said.insert(
@@ -152,8 +149,8 @@ async fn file(request: Request) -> Response {
 }
 
 /// Returns a refusal as a page for people, without styles and scripts, with a link back.
-pub(in crate::http) fn plain(response: Response, title: &str, detail: &str) -> Response {
-    let (title, detail) = (escaped(title), escaped(detail));
+pub(in crate::http) fn plain(response: Response, kind: ProblemType, detail: &str) -> Response {
+    let (title, detail) = (escaped(kind.title()), escaped(detail));
     let text = format!(
         "<!doctype html><html lang=\"en\"><head><meta charset=\"utf-8\"><title>{title}</title>\
          <meta name=\"viewport\" content=\"width=device-width\"></head><body><main><h1>{title}</h1>\

@@ -53,7 +53,7 @@ pub(crate) fn boot() -> BootId {
 }
 
 fn model() -> RobotModel {
-    rover("test rover", "lugged")
+    rover("test rover")
 }
 
 impl Ground {

@@ -18,14 +18,15 @@ use tread_server::app::AppError;
 use tread_server::authority::Issued;
 use tread_server::config::RetentionConfig;
 use tread_server::db::alerts::AlertLocation;
-use tread_server::db::deferred_segments::Origin;
+use tread_server::db::audit::AuditRetention;
+use tread_server::db::deferred_segments::{DeferredFilter, Origin};
 use tread_server::db::enrolments::Renewal;
 use tread_server::db::idempotency::StoredAnswer;
-use tread_server::db::missions::Facts;
+use tread_server::db::missions::{Facts, Transition};
 use tread_server::db::restorations::Restoration;
 use tread_server::db::robots::Introduction;
 use tread_server::db::sessions::{NewSession, OfPeople, Owner, SignedIn};
-use tread_server::db::webhooks::{NewDelivery, Outcome};
+use tread_server::db::webhooks::{AgeLimit, NewDelivery, Outcome};
 use tread_server::db::withdrawals::{Hours, WithdrawalRow};
 use tread_server::db::{self, RecordKey};
 use tread_server::identity::secret::{Fingerprint, Kind, Secret};
@@ -221,8 +222,13 @@ pub(crate) const PATHS: &[WritePath] = &[
                 db::missions::set_silence(tx, id, Some(now())).await?;
                 db::missions::add_outcome(tx, id, None, None).await?;
                 let queued = MissionState::Queued;
-                db::missions::compare_and_set(tx, id, queued, queued, Cause::Returned, None)
-                    .await?;
+                let transition = Transition {
+                    from: queued,
+                    to: queued,
+                    cause: Cause::Returned,
+                    reason: None,
+                };
+                db::missions::compare_and_set(tx, id, transition).await?;
                 let event = of(json!({"at": now(), "actor": "server", "from": "queued",
                     "to": "queued", "cause": "noted", "reason": "a test"}));
                 db::history::add_event(tx, id, &event).await?;
@@ -272,7 +278,11 @@ pub(crate) const PATHS: &[WritePath] = &[
                 let at_us = later().as_microsecond();
                 db::deferred_segments::put(tx, origin, (at_us, at_us), &measurement.unwrap())
                     .await?;
-                db::deferred_segments::take(tx, boot_pk, 0, 10)
+                let filter = DeferredFilter {
+                    boot_pk,
+                    ended_before_us: 0,
+                };
+                db::deferred_segments::take(tx, filter, 10)
                     .await
                     .map(|_| ())
             }))
@@ -388,7 +398,11 @@ pub(crate) const PATHS: &[WritePath] = &[
                     detail: None,
                 };
                 db::webhooks::note_attempt(tx, &outcome).await?;
-                db::webhooks::give_up_older(tx, later(), now()).await?;
+                let limit = AgeLimit {
+                    now: now(),
+                    oldest: later(),
+                };
+                db::webhooks::give_up_older(tx, limit).await?;
                 db::webhooks::forget(tx, webhook.id, 1).await?;
                 db::webhooks::delete(tx, webhook.id).await.map(|_| ())
             }))
@@ -503,7 +517,11 @@ pub(crate) const PATHS: &[WritePath] = &[
                 let entries = [entry];
                 db::audit::append(tx, &entries).await?;
                 db::audit::append(tx, &entries).await?;
-                db::audit::forget(tx, LONG_AGO, 1, 10).await
+                let kept = AuditRetention {
+                    since: LONG_AGO,
+                    newest_max: 1,
+                };
+                db::audit::forget(tx, kept, 10).await
             }))
         },
     },

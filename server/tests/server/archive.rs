@@ -21,7 +21,7 @@ use tread_server::app::{App, Dependencies};
 use tread_server::archive::SegmentArchive;
 use tread_server::config::RetentionConfig;
 use tread_server::db::alerts::AlertFilter;
-use tread_server::db::file::copy;
+use tread_server::db::file::copy::{self, CopyPaths};
 use tread_server::db::segments::SegmentFilter;
 use tread_server::db::{Db, segment_ranges};
 
@@ -341,9 +341,11 @@ async fn a_crash_between_the_file_and_the_removal_changes_no_list() {
 async fn keys_that_are_given_again_after_a_restoration_supersede_their_files() {
     let ground = Ground::start(4).await;
     let backup = ground.folder.path().join("backup.db");
-    copy::copy_into(ground.app().db().path().unwrap(), &backup)
-        .await
-        .unwrap();
+    let paths = CopyPaths {
+        database: ground.app().db().path().unwrap(),
+        target: &backup,
+    };
+    copy::copy_into(paths).await.unwrap();
     for day in 4..14 {
         ground.a_day(day).await;
     }

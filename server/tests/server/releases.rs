@@ -16,7 +16,8 @@ use tread_api::ids::{RobotId, SiteId};
 use tread_api::keys;
 use tread_api::wire::hello::Welcome;
 use tread_api::wire::ingest::Receipt;
-use tread_server::db::file::{OpenError, copy, schema};
+use tread_server::db::file::copy::{self, CopyPaths};
+use tread_server::db::file::{OpenError, schema};
 use tread_server::db::restorations::{Restoration, begin};
 use tread_server::db::{self, Db};
 use zenoh::Wait as _;
@@ -126,7 +127,11 @@ async fn make_present(target: &Path) {
     tx.commit().await.unwrap();
     database.close().await;
     let copied = folder.path().join("copy.db");
-    copy::copy_into(&path, &copied).await.unwrap();
+    let paths = CopyPaths {
+        database: &path,
+        target: &copied,
+    };
+    copy::copy_into(paths).await.unwrap();
     fs::create_dir_all(target.parent().unwrap()).unwrap();
     // Without a time, so that the same content is the same file.
     let file = fs::File::create(target).unwrap();

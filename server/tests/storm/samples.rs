@@ -17,5 +17,8 @@ pub(super) fn circle(radius_m: f64) -> Trajectory {
 }
 
 pub(super) fn model() -> RobotModel {
-    rover("storm", "any")
+    RobotModel {
+        tyres: "any".to_owned(),
+        ..rover("storm")
+    }
 }

@@ -22,9 +22,14 @@ impl Fixed {
         (steps.abs() <= bound).then_some(Self(steps as i128))
     }
 
-    /// Returns the number with these halves; see [`Self::halves`].
-    pub fn from_halves(hi: i64, lo: i64) -> Self {
-        Self((i128::from(hi) << 32) + i128::from(lo))
+    /// Returns the number of this many whole units, the first one of [`Self::halves`].
+    pub fn from_units(units: i64) -> Self {
+        Self(i128::from(units) << 32)
+    }
+
+    /// Returns the number of this many steps, the second one of [`Self::halves`].
+    pub fn from_steps(steps: i64) -> Self {
+        Self(steps.into())
     }
 
     /// Splits the number into whole units, rounded down, and the rest in steps, 0 to 2³² − 1.
@@ -97,7 +102,7 @@ mod tests {
             let fixed = Fixed::from_f64(value).unwrap();
             let (hi, lo) = fixed.halves().unwrap();
             prop_assert!((0..1_i64 << 32).contains(&lo));
-            prop_assert_eq!(Fixed::from_halves(hi, lo), fixed);
+            prop_assert_eq!(Fixed::from_units(hi) + Fixed::from_steps(lo), fixed);
             prop_assert!((fixed.to_f64() - value).abs() <= 2.0_f64.powi(-33) + value.abs() * 1e-15);
         }
     }

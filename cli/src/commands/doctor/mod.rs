@@ -7,11 +7,11 @@ use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
 use jiff::fmt::rfc2822;
-use jiff::{SignedDuration, Timestamp};
+use jiff::{SignedDuration, Timestamp, Zoned};
 use reqwest::{Method, header};
 use serde::Serialize;
 use serde_json::Value;
-use tread_api::diagnosis::Finding;
+use tread_api::diagnosis::{Finding, NextStep};
 use tread_api::ids::SiteId;
 use tread_api::robot::{Alert, Severity};
 
@@ -77,7 +77,7 @@ fn failed(name: &str, error: &ClientError) -> Finding {
     };
     let next_step = error.next_step();
     let next_step = next_step.unwrap_or("correct what the message names, and ask again");
-    Finding::problem(name, text, next_step)
+    Finding::problem(name, text, NextStep(next_step))
 }
 
 fn root<'a>(
@@ -98,7 +98,9 @@ async fn examine(site: &SiteId, client: &Client) -> Vec<Finding> {
         findings.push(Finding::problem(
             "token",
             "there is none for this server",
-            "sign in with `tread login`, or give a token with --token-file or TREAD_TOKEN",
+            NextStep(
+                "sign in with `tread login`, or give a token with --token-file or TREAD_TOKEN",
+            ),
         ));
         return findings;
     }
@@ -172,7 +174,7 @@ async fn reach(client: &Client) -> Result<Vec<Finding>, ClientError> {
         .and_then(|date| date.to_str().ok())
         .and_then(|date| rfc2822::parse(date).ok());
     let mut findings = vec![Finding::ok("server", text)];
-    findings.extend(said.map(|said| clock(said.timestamp(), now(), took)));
+    findings.extend(said.map(|said| clock(&said, now(), took)));
     findings.extend(readiness(client).await);
     Ok(findings)
 }
@@ -186,12 +188,13 @@ async fn readiness(client: &Client) -> Option<Finding> {
     Some(Finding::problem(
         "readiness",
         format!("the server cannot work: {why}"),
-        "run `tread-server doctor` on its machine",
+        NextStep("run `tread-server doctor` on its machine"),
     ))
 }
 
 /// Compares the server's clock with that of this machine.
-fn clock(said: Timestamp, now: Timestamp, took: Duration) -> Finding {
+fn clock(said: &Zoned, now: Timestamp, took: Duration) -> Finding {
+    let said = said.timestamp();
     // The header has whole seconds, and the server wrote it during the request.
     let slack = SignedDuration::try_from(took).unwrap_or(SignedDuration::ZERO)
         + SignedDuration::from_secs(1);
@@ -213,7 +216,9 @@ fn clock(said: Timestamp, now: Timestamp, took: Duration) -> Finding {
             "the server's is {seconds} s {which} this machine's: it says {said}, and this machine \
              {now:.0}"
         ),
-        "find out which is right, and have the other synchronised (chrony, systemd-timesyncd)",
+        NextStep(
+            "find out which is right, and have the other synchronised (chrony, systemd-timesyncd)",
+        ),
     )
 }
 
@@ -227,7 +232,7 @@ fn token(session: &tread_api::identity::Session, now: Timestamp) -> Finding {
         return Finding::warning(
             "token",
             text,
-            "it expires soon: an admin makes another with `tread tokens create`",
+            NextStep("it expires soon: an admin makes another with `tread tokens create`"),
         );
     }
     Finding::ok("token", text)
@@ -244,7 +249,9 @@ fn of_server(status: &Value) -> Vec<Finding> {
         Finding::warning(
             "version",
             format!("the server is of {version}, and `tread` of {own}"),
-            "install the same version of both: they may not know all of each other's commands",
+            NextStep(
+                "install the same version of both: they may not know all of each other's commands",
+            ),
         )
     });
     let storage = &status["storage"];
@@ -256,7 +263,9 @@ fn of_server(status: &Value) -> Vec<Finding> {
             findings.push(Finding::problem(
                 "storage",
                 format!("the database {text}: {why}"),
-                "run `tread-server doctor` on its machine; docs/runbook.md says what to do",
+                NextStep(
+                    "run `tread-server doctor` on its machine; docs/runbook.md says what to do",
+                ),
             ));
         }
     }
@@ -264,7 +273,7 @@ fn of_server(status: &Value) -> Vec<Finding> {
         findings.push(Finding::warning(
             "storage",
             "less is free on the server's disk than storage.disk_free_min_mib",
-            "make room there",
+            NextStep("make room there"),
         ));
     }
     if let Some(slow) = status["slow_transactions"]["count"]
@@ -277,7 +286,10 @@ fn of_server(status: &Value) -> Vec<Finding> {
         findings.push(Finding::warning(
             "database",
             format!("{slow} transactions were slow; the slowest, `{kind}`, took {longest_ms} ms"),
-            "see whether other programs use the server's disk; docs/runbook.md, TreadDatabaseSlow",
+            NextStep(
+                "see whether other programs use the server's disk; docs/runbook.md, \
+                 TreadDatabaseSlow",
+            ),
         ));
     }
     findings
@@ -294,17 +306,22 @@ fn alerts(alerts: &[Alert]) -> Finding {
     let step = "`tread alerts` lists them; docs/runbook.md has a section for each";
     match (named.as_slice(), alerts.len()) {
         ([], 0) => Finding::ok("alerts", "there are none"),
-        ([], count) => Finding::warning("alerts", format!("{count} warnings are active"), step),
+        ([], count) => Finding::warning(
+            "alerts",
+            format!("{count} warnings are active"),
+            NextStep(step),
+        ),
         (named, count) => Finding::problem(
             "alerts",
             format!("{count} are active; critical: {}", joined(named)),
-            step,
+            NextStep(step),
         ),
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use jiff::tz::TimeZone;
     use serde_json::json;
     use tread_api::diagnosis::Verdict;
 
@@ -315,7 +332,7 @@ mod tests {
         let now: Timestamp = "2026-11-02T10:00:00Z".parse().unwrap();
         let took = Duration::from_millis(20);
         let hour = SignedDuration::from_hours(1);
-        let at = |said| clock(said, now, took);
+        let at = |said: Timestamp| clock(&said.to_zoned(TimeZone::UTC), now, took);
         assert_eq!(at(now).verdict, Verdict::Ok);
         assert!(at(now + hour).text.contains("3600 s ahead of"));
         assert!(at(now - hour).text.contains("3600 s behind"));

@@ -1,7 +1,7 @@
 //! Findings of the doctor about one robot.
 
 use jiff::SignedDuration;
-use tread_api::diagnosis::Finding;
+use tread_api::diagnosis::{Finding, NextStep};
 use tread_api::robot::{LinkState, Robot};
 
 use super::CLOCK_DIFFERENCE_MAX;
@@ -26,7 +26,7 @@ pub(super) fn of_robot(robot: &Robot, server_version: Option<&str>) -> Vec<Findi
         LinkState::Stale => findings.push(Finding::warning(
             &name,
             "some of its heartbeats are missing",
-            "see its radio link; `tread watch` shows whether it lasts",
+            NextStep("see its radio link; `tread watch` shows whether it lasts"),
         )),
         LinkState::Offline => {
             let since = heard.map_or_else(
@@ -40,7 +40,9 @@ pub(super) fn of_robot(robot: &Robot, server_version: Option<&str>) -> Vec<Findi
             findings.push(Finding::problem(
                 &name,
                 format!("it is offline{}; {since}", cause.unwrap_or_default()),
-                "see docs/runbook.md, robot-lost; `tread robots retire` one that never returns",
+                NextStep(
+                    "see docs/runbook.md, robot-lost; `tread robots retire` one that never returns",
+                ),
             ));
         }
     }
@@ -58,22 +60,24 @@ pub(super) fn of_robot(robot: &Robot, server_version: Option<&str>) -> Vec<Findi
                     "its clock is {} s {which} the server's",
                     offset.abs().as_secs()
                 ),
-                "have the robot's clock synchronised (chrony), and start its agent again: an agent \
-                 takes the wall time once",
+                NextStep(
+                    "have the robot's clock synchronised (chrony), and start its agent again: an \
+                     agent takes the wall time once",
+                ),
             ));
         }
         if live.outbox.pending > OUTBOX_LONG {
             findings.push(Finding::warning(
                 &name,
                 format!("{} records wait in its outbox", live.outbox.pending),
-                "see docs/runbook.md, outbox-long",
+                NextStep("see docs/runbook.md, outbox-long"),
             ));
         }
         if live.outbox.dropped > 0 {
             findings.push(Finding::warning(
                 &name,
                 format!("{} of its records were lost", live.outbox.dropped),
-                "see docs/runbook.md, outbox-dropped",
+                NextStep("see docs/runbook.md, outbox-dropped"),
             ));
         }
     }
@@ -86,7 +90,7 @@ pub(super) fn of_robot(robot: &Robot, server_version: Option<&str>) -> Vec<Findi
                 robot.agent_version,
                 server_version.unwrap_or_default()
             ),
-            "bring both to the same version; releases next to each other work together",
+            NextStep("bring both to the same version; releases next to each other work together"),
         ));
     }
     if findings.is_empty() {
@@ -126,7 +130,7 @@ fn link(name: &str, robot: &Robot) -> Option<Finding> {
         Finding::warning(
             name,
             format!("its link is poor; in the last hour: {}", joined(&poor)),
-            "look after its radio link: place of antennas, channel, other traffic",
+            NextStep("look after its radio link: place of antennas, channel, other traffic"),
         )
     })
 }

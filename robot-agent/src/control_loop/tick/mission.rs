@@ -229,7 +229,7 @@ impl MissionStage {
         }
         self.hand_on(released, events);
         self.hold_for_demands(input);
-        self.check_bounds(now, server_silence);
+        self.check_bounds(input);
         self.hold_for_base(now, estimated.fault);
         self.hold_for_sensors(tick.now, input.sensed, events);
         let wanted = self.follow(input, events);

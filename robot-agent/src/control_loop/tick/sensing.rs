@@ -209,16 +209,14 @@ impl Sensed {
 
     /// Whether gyro and wheels were measured within [`BODY_SPEED_AGE_MAX`].
     pub(super) fn is_heard(&self, now: Duration) -> bool {
-        !self.is_base_silent && self.last_sample.is_some_and(|at| is_new(at, now))
+        let is_new = |at: Duration| now.saturating_sub(at) <= BODY_SPEED_AGE_MAX;
+        !self.is_base_silent && self.last_sample.is_some_and(is_new)
     }
 
     /// Returns the speed by odometry over ground, m/s, if recent and without a finding.
     pub(super) fn odometry_m_s(&self, now: Duration) -> Option<f64> {
         let (speed_m_s, at) = self.body_speed?;
-        (is_new(at, now) && self.is_right(Subject::Odometry)).then_some(speed_m_s)
+        let is_new = now.saturating_sub(at) <= BODY_SPEED_AGE_MAX;
+        (is_new && self.is_right(Subject::Odometry)).then_some(speed_m_s)
     }
-}
-
-fn is_new(at: Duration, now: Duration) -> bool {
-    now.saturating_sub(at) <= BODY_SPEED_AGE_MAX
 }

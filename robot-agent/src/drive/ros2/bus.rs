@@ -10,7 +10,6 @@ use std::time::Duration;
 
 use tracing::{debug, info, warn};
 use tread_control::measured::WheelSpeeds;
-use tread_ros2::bridge;
 use tread_ros2::messages::MessageType;
 use tread_ros2::names::Name;
 use tread_ros2::rmw::{self, Attachment, Endpoint, Generation, Node, Quality, Role};
@@ -313,7 +312,7 @@ impl Bus {
             Some(generation) => {
                 rmw::topic_key(bus.domain, topic.name, topic.message_type, generation)
             }
-            None => bridge::topic_key(&bus.namespace, topic.name),
+            None => topic.name.bridge_key(&bus.namespace),
         };
         let publisher = session
             .declare_publisher(key)
@@ -366,7 +365,7 @@ impl Bus {
         let bus = &self.settings.bus;
         match self.generation() {
             Some(_) => rmw::any_type_key(bus.domain, topic),
-            None => bridge::topic_key(&bus.namespace, topic),
+            None => topic.bridge_key(&bus.namespace),
         }
     }
 

@@ -125,32 +125,22 @@ fn is_unmeasured(covariance: &[f64; 9]) -> bool {
     (covariance[0] + 1.0).abs() < f64::EPSILON
 }
 
-fn check_frame(frame: &str, expected: &str) -> Result<(), Refusal> {
-    // tf1 wrote a slash before a frame's name.
-    if frame.strip_prefix('/').unwrap_or(frame) == expected {
-        Ok(())
-    } else {
-        Err(Refusal::WrongFrame)
-    }
+/// Returns the name of a frame without the slash that tf1 wrote before it.
+fn bare(frame: &str) -> &str {
+    frame.strip_prefix('/').unwrap_or(frame)
 }
 
-/// Converts a ROS pose to a planar pose.
-fn flat(pose: &messages::Pose) -> Result<Pose, Refusal> {
+/// Converts a ROS pose to a planar pose in the site frame.
+fn site_pose(site_from_frame: Pose, pose: &messages::Pose) -> Result<Pose, Refusal> {
+    let x_m = bounded(pose.position.x, &PLACE_RANGE_M)?;
+    let y_m = bounded(pose.position.y, &PLACE_RANGE_M)?;
+    let heading_rad = pose.orientation.yaw_rad().ok_or(Refusal::Value)?;
+    let (sin, cos) = site_from_frame.heading_rad.sin_cos();
     Ok(Pose {
-        x_m: bounded(pose.position.x, &PLACE_RANGE_M)?,
-        y_m: bounded(pose.position.y, &PLACE_RANGE_M)?,
-        heading_rad: pose.orientation.yaw_rad().ok_or(Refusal::Value)?,
+        x_m: site_from_frame.x_m + cos * x_m - sin * y_m,
+        y_m: site_from_frame.y_m + sin * x_m + cos * y_m,
+        heading_rad: wrap_angle_rad(site_from_frame.heading_rad + heading_rad),
     })
-}
-
-/// Transforms a pose from an inner frame to the outer one.
-fn within(outer_from_inner: Pose, pose: Pose) -> Pose {
-    let (sin, cos) = outer_from_inner.heading_rad.sin_cos();
-    Pose {
-        x_m: outer_from_inner.x_m + cos * pose.x_m - sin * pose.y_m,
-        y_m: outer_from_inner.y_m + sin * pose.x_m + cos * pose.y_m,
-        heading_rad: wrap_angle_rad(outer_from_inner.heading_rad + pose.heading_rad),
-    }
 }
 
 fn position(
@@ -176,7 +166,7 @@ fn position(
         _ => None,
     };
     Ok(Position {
-        pose: within(site_from_frame, flat(&pose.pose)?),
+        pose: site_pose(site_from_frame, &pose.pose)?,
         noise,
     })
 }
@@ -249,7 +239,9 @@ pub fn joints(bytes: &[u8], settings: &JointSettings) -> Result<Option<Reading>,
 /// [`Refusal`]: the reason why the message is not valid.
 pub fn imu(bytes: &[u8], settings: &ImuSettings) -> Result<Reading, Refusal> {
     let message: Imu<'_> = decode(bytes)?;
-    check_frame(message.header.frame_id, &settings.frame)?;
+    if bare(message.header.frame_id) != settings.frame {
+        return Err(Refusal::WrongFrame);
+    }
     if is_unmeasured(&message.angular_velocity_covariance) {
         return Err(Refusal::Value);
     }
@@ -296,8 +288,10 @@ pub fn imu(bytes: &[u8], settings: &ImuSettings) -> Result<Reading, Refusal> {
 /// [`Refusal`]: the reason why the message is not valid.
 pub fn odometry(bytes: &[u8], settings: &OdometrySettings) -> Result<Reading, Refusal> {
     let message: Odometry<'_> = decode(bytes)?;
-    check_frame(message.header.frame_id, &settings.frame)?;
-    check_frame(message.child_frame_id, &settings.child_frame)?;
+    let is_of_frame = bare(message.header.frame_id) == settings.frame;
+    if !is_of_frame || bare(message.child_frame_id) != settings.child_frame {
+        return Err(Refusal::WrongFrame);
+    }
     let (twist, covariance) = (&message.twist.twist, &message.twist.covariance);
     let position = match settings.site_from_odom {
         Some(site_from_odom) => Some(position(site_from_odom, &message.pose)?),
@@ -318,7 +312,9 @@ pub fn odometry(bytes: &[u8], settings: &OdometrySettings) -> Result<Reading, Re
 /// [`Refusal`]: the reason why the message is not valid.
 pub fn pose(bytes: &[u8], settings: &PoseSettings) -> Result<Reading, Refusal> {
     let message: PoseWithCovarianceStamped<'_> = decode(bytes)?;
-    check_frame(message.header.frame_id, &settings.frame)?;
+    if bare(message.header.frame_id) != settings.frame {
+        return Err(Refusal::WrongFrame);
+    }
     let position = position(settings.site_from_map, &message.pose)?;
     Ok((message.header.stamp, Content::Position(position)))
 }

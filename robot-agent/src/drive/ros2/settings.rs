@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use tread_control::geometry::Pose;
+use tread_control::geometry::{Pose, wrap_angle_rad};
 use tread_ros2::names::Name;
 use tread_ros2::rmw::Generation;
 
@@ -249,4 +249,16 @@ pub struct OutwardSettings {
     pub frame: String,
     /// Pose of that frame in the site.
     pub site_from_frame: Pose,
+}
+
+impl OutwardSettings {
+    /// Transforms a pose from the site frame to the frame of both paths.
+    pub(crate) fn frame_pose(&self, pose: Pose) -> Pose {
+        let point = self.site_from_frame.body_from_site(pose.point());
+        Pose {
+            x_m: point.x_m,
+            y_m: point.y_m,
+            heading_rad: wrap_angle_rad(pose.heading_rad - self.site_from_frame.heading_rad),
+        }
+    }
 }

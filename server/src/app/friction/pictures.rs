@@ -134,13 +134,11 @@ impl App {
     pub(super) fn state_of(&self, row: &SiteRow, reading: &Reading, asked: &PictureAsked) -> State {
         let grid = row.site.grid;
         let bounds = asked.area.and_then(|area| area.cells(&grid).ok());
-        let bounds = bounds.map(|cells| (Block::of(cells.min), Block::of(cells.max)));
+        let bounds = bounds.map(|cells| Block::of(cells.min)..=Block::of(cells.max));
         self.maps().look(row, |map| State {
             change: match bounds {
                 // The default model, the one driven most, depends on the whole map.
-                Some((low, high)) if reading.reference().is_some() => {
-                    map.changes().newest_in(low, high)
-                }
+                Some(blocks) if reading.reference().is_some() => map.changes().newest_in(blocks),
                 Some(_) | None => map.changes().newest(),
             },
             terrain_revision: row.site.terrain_revision,

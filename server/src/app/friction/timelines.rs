@@ -10,7 +10,7 @@ use jiff::Timestamp;
 
 use super::{App, AppError};
 use crate::app::ingest::SKEW_MIN;
-use crate::db::segments::KeyedSegment;
+use crate::db::segments::{KeyedSegment, SiteCursor};
 use crate::db::sites::SiteRow;
 use crate::db::withdrawals::WithdrawalRow;
 use crate::db::{self, Tx};
@@ -142,7 +142,11 @@ impl App {
             if is_whole(&kept) {
                 break;
             }
-            let rows = db::segments::of_site(&mut tx, of.site_pk, kept.read_to, READ_AT_ONCE);
+            let cursor = SiteCursor {
+                site_pk: of.site_pk,
+                after: kept.read_to,
+            };
+            let rows = db::segments::of_site(&mut tx, cursor, READ_AT_ONCE);
             let rows = rows.await?;
             if rows.is_empty() {
                 break;

@@ -31,6 +31,7 @@ use crate::app::{App, AppError, page};
 use crate::config::AuditConfig;
 use crate::db;
 pub use crate::db::audit::AuditFilter;
+use crate::db::audit::AuditRetention;
 use crate::rate_limit::{Bucket, RateLimit};
 
 /// Maximum number of entries that wait for the writer.
@@ -389,8 +390,12 @@ impl App {
                 Used::Session(session) => db::sessions::touch(&mut tx, session, *at).await?,
             }
         }
-        if let Ok(before) = self.clock().now().checked_sub(KEPT) {
-            db::audit::forget(&mut tx, before, ENTRIES_MAX, FORGET_MAX).await?;
+        if let Ok(since) = self.clock().now().checked_sub(KEPT) {
+            let kept = AuditRetention {
+                since,
+                newest_max: ENTRIES_MAX,
+            };
+            db::audit::forget(&mut tx, kept, FORGET_MAX).await?;
         }
         tx.commit().await?;
         if self.identity().audit.is_logged {

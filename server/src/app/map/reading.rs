@@ -13,7 +13,7 @@ use super::names::Names;
 use super::unwritten::Unwritten;
 use super::{Maps, Sites};
 use crate::app::App;
-use crate::db::segments::Added;
+use crate::db::segments::{Added, RobotCursor};
 use crate::db::{self, DbError, Tx};
 use crate::friction::index::SiteMap;
 
@@ -129,7 +129,11 @@ async fn read(
         if last_pk <= watermark {
             continue;
         }
-        let mut following = pin!(db::segments::of_robot(tx, robot_pk, watermark));
+        let cursor = RobotCursor {
+            robot_pk,
+            after: watermark,
+        };
+        let mut following = pin!(db::segments::of_robot(tx, cursor));
         while let Some(row) = following.try_next().await? {
             // What was committed together is stored together.
             let keys = Added {

@@ -24,7 +24,7 @@ use self::transitions::{Change, next};
 use super::check::StartPlace;
 use super::{App, AppError, check_named, site_row};
 pub use crate::db::missions::MissionFilter;
-use crate::db::missions::{Facts, Inserted, MissionRow, Standing};
+use crate::db::missions::{Facts, Inserted, MissionRow, Standing, Transition};
 use crate::db::{self, DbError, Tx};
 
 /// Number of bytes of trajectories after which a page of missions ends, whatever its limit.
@@ -418,7 +418,13 @@ pub(super) async fn take_step(
     };
     let cause = step.change.cause();
     let reason = Some(bounded(step.reason.unwrap_or(step.change.reason())));
-    if !db::missions::compare_and_set(tx, id, from, to, cause, reason.as_deref()).await? {
+    let transition = Transition {
+        from,
+        to,
+        cause,
+        reason: reason.as_deref(),
+    };
+    if !db::missions::compare_and_set(tx, id, transition).await? {
         return Ok(None);
     }
     let ended_at = to

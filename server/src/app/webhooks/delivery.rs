@@ -31,7 +31,7 @@ use tread_api::webhook::DeliveryState;
 use super::{LOG_MAX, body};
 use crate::app::{App, AppError};
 use crate::db;
-use crate::db::webhooks::{Due, DueTimes, Outcome};
+use crate::db::webhooks::{AgeLimit, Due, DueTimes, Outcome};
 use crate::webhooks::{Attempt, OutgoingDelivery, Sender};
 
 /// Interval between looks at the outbox when nothing wakes the task.
@@ -147,7 +147,7 @@ impl Dispatcher {
         drop(tx);
         if has_older {
             let mut tx = self.app.db().write_uncounted("webhooks").await?;
-            let count = db::webhooks::give_up_older(&mut tx, oldest, now).await?;
+            let count = db::webhooks::give_up_older(&mut tx, AgeLimit { now, oldest }).await?;
             tx.commit().await?;
             self.app.counters().webhook_given_up.add(count);
         }

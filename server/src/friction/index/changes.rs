@@ -2,6 +2,7 @@
 //! cells.
 
 use std::collections::{BTreeMap, VecDeque};
+use std::ops::RangeInclusive;
 
 use tread_api::site::Cell;
 
@@ -203,11 +204,11 @@ impl Changes {
         self.blocks.get(&block).map_or(0, |found| found.newest)
     }
 
-    /// Returns the number of the newest change in the rectangle of blocks from `low` to `high`,
-    /// both included; 0 without changes.
-    pub fn newest_in(&self, low: Block, high: Block) -> u64 {
-        let rows = self.blocks.range(low..=high);
-        let columns = low.column..=high.column;
+    /// Returns the number of the newest change in the rectangle between two blocks, both included; 0
+    /// without changes.
+    pub fn newest_in(&self, blocks: RangeInclusive<Block>) -> u64 {
+        let columns = blocks.start().column..=blocks.end().column;
+        let rows = self.blocks.range(blocks);
         let within = rows.filter(|(block, _)| columns.contains(&block.column));
         within.fold(0, |newest, (_, found)| newest.max(found.newest))
     }

@@ -87,7 +87,9 @@ impl Part {
     }
 
     pub(super) fn sums(&self) -> Sums {
-        let fixed = |index: usize| Fixed::from_halves(self.hi[index], i64::from(self.lo[index]));
+        let fixed = |index: usize| {
+            Fixed::from_units(self.hi[index]) + Fixed::from_steps(self.lo[index].into())
+        };
         let pair = |index| Pair {
             information: fixed(index),
             weighted: fixed(index + 1),
@@ -128,7 +130,7 @@ impl Part {
             if hi.unsigned_abs() < 1 << 52 {
                 hi as f64 + f64::from(lo) / STEPS
             } else {
-                Fixed::from_halves(hi, i64::from(lo)).to_f64()
+                (Fixed::from_units(hi) + Fixed::from_steps(lo.into())).to_f64()
             }
         };
         let known = |index: usize| {
@@ -183,7 +185,7 @@ mod tests {
         (any::<bool>(), 0_i64..1 << 60, 0_i64..1 << 32, 0_u32..60).prop_map(
             |(minus, hi, lo, less)| {
                 let hi = hi >> less;
-                Fixed::from_halves(if minus { -hi } else { hi }, lo)
+                Fixed::from_units(if minus { -hi } else { hi }) + Fixed::from_steps(lo)
             },
         )
     }

@@ -23,7 +23,7 @@ use crate::formats::{json, tile};
 use crate::friction::Raster;
 use crate::http::etag;
 use crate::http::extract::{Path, Query};
-use crate::http::negotiate::{Offered, choose, offered};
+use crate::http::negotiate::{ResponseFormat, choose};
 use crate::http::problem::Problem;
 
 /// Header: robot model (configuration) to which θ of a response refers.
@@ -64,36 +64,31 @@ enum ListFormat {
 }
 
 /// PNG first, so that a browser which accepts everything shows it.
-const OFFERED: [Offered<Format>; 8] = [
-    offered("png", png::MEDIA_TYPE, Format::Picture(PictureFormat::Png)),
-    offered("json", JSON_MEDIA_TYPE, Format::List(ListFormat::Json)),
-    offered(
-        "tile",
-        tread_api::tile::MEDIA_TYPE,
-        Format::Picture(PictureFormat::Tile),
-    ),
-    offered(
-        "geojson",
-        json::GEOJSON_MEDIA_TYPE,
-        Format::List(ListFormat::GeoJson),
-    ),
-    offered(
-        "nav2",
-        nav2::YAML_MEDIA_TYPE,
-        Format::Picture(PictureFormat::Nav2),
-    ),
-    offered(
-        "pgm",
-        nav2::PGM_MEDIA_TYPE,
-        Format::Picture(PictureFormat::Pgm),
-    ),
-    offered("csv", CSV_MEDIA_TYPE, Format::List(ListFormat::Csv)),
-    offered(
-        "parquet",
-        PARQUET_MEDIA_TYPE,
-        Format::List(ListFormat::Parquet),
-    ),
+const OFFERED: [(&str, Format); 8] = [
+    ("png", Format::Picture(PictureFormat::Png)),
+    ("json", Format::List(ListFormat::Json)),
+    ("tile", Format::Picture(PictureFormat::Tile)),
+    ("geojson", Format::List(ListFormat::GeoJson)),
+    ("nav2", Format::Picture(PictureFormat::Nav2)),
+    ("pgm", Format::Picture(PictureFormat::Pgm)),
+    ("csv", Format::List(ListFormat::Csv)),
+    ("parquet", Format::List(ListFormat::Parquet)),
 ];
+
+impl ResponseFormat for Format {
+    fn media_type(self) -> &'static str {
+        match self {
+            Self::Picture(PictureFormat::Png) => png::MEDIA_TYPE,
+            Self::Picture(PictureFormat::Tile) => tread_api::tile::MEDIA_TYPE,
+            Self::Picture(PictureFormat::Nav2) => nav2::YAML_MEDIA_TYPE,
+            Self::Picture(PictureFormat::Pgm) => nav2::PGM_MEDIA_TYPE,
+            Self::List(ListFormat::Json) => JSON_MEDIA_TYPE,
+            Self::List(ListFormat::GeoJson) => json::GEOJSON_MEDIA_TYPE,
+            Self::List(ListFormat::Csv) => CSV_MEDIA_TYPE,
+            Self::List(ListFormat::Parquet) => PARQUET_MEDIA_TYPE,
+        }
+    }
+}
 
 /// What of the map, and in which format.
 #[derive(Debug, Clone, Deserialize, IntoParams)]
@@ -199,30 +194,23 @@ impl MapQuery {
 /// Encodes a raster in a format.
 type Write = Box<dyn Fn(&Raster) -> Result<Vec<u8>, AppError> + Send + Sync>;
 
-fn writer(
-    format: PictureFormat,
-    query: &MapQuery,
-) -> Result<(String, &'static str, Write), Problem> {
+fn writer(format: PictureFormat, query: &MapQuery) -> Result<(String, Write), Problem> {
     let (scale, speeds) = (query.scale()?, query.speeds()?);
     Ok(match format {
         PictureFormat::Png => (
             format!("png {scale:?}"),
-            png::MEDIA_TYPE,
             Box::new(move |raster| png::encode(raster, scale).map_err(refused)),
         ),
         PictureFormat::Tile => (
             "tile".to_owned(),
-            tread_api::tile::MEDIA_TYPE,
             Box::new(|raster| Ok(tile::encode(raster))),
         ),
         PictureFormat::Nav2 => (
             format!("nav2 {speeds:?}"),
-            nav2::YAML_MEDIA_TYPE,
             Box::new(move |raster| Ok(nav2::yaml(raster, speeds))),
         ),
         PictureFormat::Pgm => (
             format!("pgm {speeds:?}"),
-            nav2::PGM_MEDIA_TYPE,
             Box::new(move |raster| Ok(nav2::pgm(raster, speeds))),
         ),
     })
@@ -261,14 +249,16 @@ pub(in crate::http) async fn map(
     Query(query): Query<MapQuery>,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    match choose(&OFFERED, query.format.as_deref(), &headers)? {
+    let format = choose(&OFFERED, query.format.as_deref(), &headers)?;
+    let media_type = format.media_type();
+    match format {
         Format::Picture(format) => {
-            let (name, media_type, write) = writer(format, &query)?;
+            let (name, write) = writer(format, &query)?;
             let picture = app.picture(&site, query.asked()?, name, write).await?;
             Ok(answer(&headers, media_type, picture))
         }
         Format::List(format) => {
-            let (asked, media_type) = (query.asked()?, media_type_of(format));
+            let asked = query.asked()?;
             let writer_of = |site: &Site, as_of| list_writer(format, site, (&asked.asked, as_of));
             let export = app.export_cells(&site, &asked, writer_of).await?;
             let (state, as_of) = ((query.format, export.state()), export.as_of());
@@ -276,15 +266,6 @@ pub(in crate::http) async fn map(
             let response = etag::streamed(&headers, media_type, state, make);
             Ok(say_as_of(response, as_of))
         }
-    }
-}
-
-fn media_type_of(format: ListFormat) -> &'static str {
-    match format {
-        ListFormat::Json => JSON_MEDIA_TYPE,
-        ListFormat::GeoJson => json::GEOJSON_MEDIA_TYPE,
-        ListFormat::Csv => CSV_MEDIA_TYPE,
-        ListFormat::Parquet => PARQUET_MEDIA_TYPE,
     }
 }
 

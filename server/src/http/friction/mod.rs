@@ -23,7 +23,7 @@ use self::map::say_as_of;
 use self::streamed::{CSV_MEDIA_TYPE, JSON_MEDIA_TYPE, PARQUET_MEDIA_TYPE, streamed};
 use super::etag;
 use super::extract::{Path, Query, cursor, page_limit};
-use super::negotiate::{Offered, choose, offered};
+use super::negotiate::{ResponseFormat, choose};
 use super::problem::Problem;
 use super::sites::PageQuery;
 use super::subject::Subject;
@@ -168,11 +168,21 @@ enum SegmentFormat {
     Parquet,
 }
 
-const SEGMENT_FORMATS: [Offered<SegmentFormat>; 3] = [
-    offered("json", JSON_MEDIA_TYPE, SegmentFormat::Json),
-    offered("csv", CSV_MEDIA_TYPE, SegmentFormat::Csv),
-    offered("parquet", PARQUET_MEDIA_TYPE, SegmentFormat::Parquet),
+const SEGMENT_FORMATS: [(&str, SegmentFormat); 3] = [
+    ("json", SegmentFormat::Json),
+    ("csv", SegmentFormat::Csv),
+    ("parquet", SegmentFormat::Parquet),
 ];
+
+impl ResponseFormat for SegmentFormat {
+    fn media_type(self) -> &'static str {
+        match self {
+            Self::Json => JSON_MEDIA_TYPE,
+            Self::Csv => CSV_MEDIA_TYPE,
+            Self::Parquet => PARQUET_MEDIA_TYPE,
+        }
+    }
+}
 
 /// List raw measurements in the order of their commits.
 #[utoipa::path(get, path = "/v1/sites/{site}/segments", tag = "friction",
@@ -200,23 +210,20 @@ pub(super) async fn segments(
         robots: subject.scope.limit_of(&site),
         after,
     };
-    let (media_type, writer) = match format {
+    let writer = match format {
         SegmentFormat::Json => {
             let found = app.segments(&site, &filter, limit).await?;
             return Ok(etag::json(&headers, &found));
         }
-        SegmentFormat::Csv => (
-            CSV_MEDIA_TYPE,
-            table::comma(segments::COLUMNS, segments::row),
-        ),
+        SegmentFormat::Csv => table::comma(segments::COLUMNS, segments::row),
         SegmentFormat::Parquet => {
             let said = vec![("tread:site".to_owned(), site.to_string())];
             let writer = table::parquet(segments::COLUMNS, segments::row, said);
-            (PARQUET_MEDIA_TYPE, writer.map_err(AppError::from)?)
+            writer.map_err(AppError::from)?
         }
     };
     let export = app.export_segments(&site, filter, writer).await?;
-    let state = export.state();
+    let (state, media_type) = (export.state(), format.media_type());
     let make = || streamed(media_type, export, SegmentExport::next);
     Ok(etag::streamed(&headers, media_type, state, make))
 }

@@ -97,7 +97,10 @@ pub(super) async fn check(
         },
         Named {
             token: Some(token), ..
-        } => check_token(app, route, &token, who).await,
+        } if route.starts_with("/v1/join-tokens") => check_join_token(app, &token, who).await,
+        Named {
+            token: Some(token), ..
+        } => check_token(app, &token, who).await,
         Named {
             session: Some(session),
             ..
@@ -193,22 +196,18 @@ async fn check_query(
     Ok(())
 }
 
-async fn check_token(
-    app: &App,
-    route: &str,
-    token: &str,
-    who: &Credential,
-) -> Result<(), AppError> {
-    if route.starts_with("/v1/join-tokens") {
-        let Ok(token) = token.parse::<JoinTokenId>() else {
-            return Ok(());
-        };
-        return match app.join_token_place(token).await? {
-            Some((site, Some(robot))) => who.check_robot(&site, &robot),
-            Some((site, None)) => who.check_whole_site(&site),
-            None => Ok(()),
-        };
+async fn check_join_token(app: &App, token: &str, who: &Credential) -> Result<(), AppError> {
+    let Ok(token) = token.parse::<JoinTokenId>() else {
+        return Ok(());
+    };
+    match app.join_token_place(token).await? {
+        Some((site, Some(robot))) => who.check_robot(&site, &robot),
+        Some((site, None)) => who.check_whole_site(&site),
+        None => Ok(()),
     }
+}
+
+async fn check_token(app: &App, token: &str, who: &Credential) -> Result<(), AppError> {
     let Ok(token) = token.parse::<TokenId>() else {
         return Ok(());
     };

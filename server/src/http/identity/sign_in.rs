@@ -165,7 +165,7 @@ fn refused(error: PersonError, headers: &HeaderMap) -> Response {
         .filter_map(|value| value.to_str().ok())
         .any(|accepted| accepted.contains("text/html"));
     if is_person {
-        page::plain(response, kind.title(), &detail)
+        page::plain(response, kind, &detail)
     } else {
         response
     }

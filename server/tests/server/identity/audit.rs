@@ -14,6 +14,7 @@ use tread_api::identity::{AuditEntry, Role};
 use tread_api::page::Page;
 use tread_server::app::identity::audit::SHARE_BURST;
 use tread_server::db;
+use tread_server::db::audit::AuditRetention;
 
 use crate::harness::{Yard, client, eventually};
 
@@ -243,8 +244,11 @@ async fn whoever_changes_a_row_of_the_database_is_found_by_its_number() {
     );
     // The oldest go, and the rest is verified all the same.
     let mut tx = yard.server.app().db().write("test").await.unwrap();
-    let long_ago = Timestamp::UNIX_EPOCH;
-    db::audit::forget(&mut tx, long_ago, 10, 100).await.unwrap();
+    let kept = AuditRetention {
+        since: Timestamp::UNIX_EPOCH,
+        newest_max: 10,
+    };
+    db::audit::forget(&mut tx, kept, 100).await.unwrap();
     tx.commit().await.unwrap();
     assert_eq!(verified(&yard).await, Ok(10));
 

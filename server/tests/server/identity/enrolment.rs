@@ -249,7 +249,7 @@ async fn introduce(yard: &Yard, robot: &str) {
         id: &id,
         boot: BootId::from_uuid(Uuid::from_u128(1)),
         agent_version: "0.0.1",
-        model: &rover("test rover", "lugged"),
+        model: &rover("test rover"),
         capabilities: &Capabilities::default(),
         at: yard.server.app().clock().now(),
     };

@@ -49,12 +49,13 @@ impl MissionStage {
 
     /// Ends the mission after the longest silence of the server, and the hold for a revision after
     /// its bound.
-    pub(super) fn check_bounds(&mut self, now: Duration, server_silence: Duration) {
+    pub(super) fn check_bounds(&mut self, input: &MissionInput<'_>) {
+        let now = input.tick.now.monotonic;
         let Some(active) = &mut self.active else {
             self.replacement_until = None;
             return;
         };
-        if active.minds_silence(server_silence) {
+        if active.minds_silence(input.demands.server_silence) {
             active.stop(EndReason::ServerSilent);
         }
         if self.replacement_until.is_some_and(|until| now > until) {

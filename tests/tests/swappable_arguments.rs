@@ -1,0 +1,190 @@
+//! No function takes two arguments of one type, which a caller could exchange without an error of the
+//! compiler: see `swappable-arguments.txt` for the exceptions.
+//!
+//! Functions of tests do not count, nor do implementations of traits: the trait's own function does.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::fs;
+
+use syn::visit::{self, Visit};
+use tread_tests::repository::{files, root};
+
+/// A type as a text without lifetimes.
+#[derive(Default)]
+struct TypeText(String);
+
+impl<'ast> Visit<'ast> for TypeText {
+    fn visit_ident(&mut self, ident: &'ast syn::Ident) {
+        let _ = write!(self.0, " {ident}");
+    }
+
+    fn visit_lifetime(&mut self, _: &'ast syn::Lifetime) {}
+
+    fn visit_lit_int(&mut self, literal: &'ast syn::LitInt) {
+        self.0.push_str(literal.base10_digits());
+    }
+
+    fn visit_angle_bracketed_generic_arguments(
+        &mut self,
+        arguments: &'ast syn::AngleBracketedGenericArguments,
+    ) {
+        self.0.push('<');
+        visit::visit_angle_bracketed_generic_arguments(self, arguments);
+        self.0.push('>');
+    }
+
+    fn visit_type(&mut self, of: &'ast syn::Type) {
+        let (open, close) = match of {
+            syn::Type::Reference(of) if of.mutability.is_some() => ("&mut(", ")"),
+            syn::Type::Reference(_) => ("&(", ")"),
+            syn::Type::Tuple(_) => ("(", ")"),
+            syn::Type::Slice(_) | syn::Type::Array(_) => ("[", "]"),
+            _ => ("", ","),
+        };
+        self.0.push_str(open);
+        visit::visit_type(self, of);
+        self.0.push_str(close);
+    }
+}
+
+fn text_of(of: &syn::Type) -> String {
+    let mut text = TypeText::default();
+    text.visit_type(of);
+    text.0
+}
+
+fn is_for_tests(attributes: &[syn::Attribute]) -> bool {
+    attributes.iter().any(|attribute| {
+        let is_test = attribute.path().is_ident("test");
+        is_test
+            || attribute.path().is_ident("cfg")
+                && attribute
+                    .parse_args::<syn::Ident>()
+                    .is_ok_and(|condition| condition == "test")
+    })
+}
+
+/// Finds the functions with two arguments of one type.
+#[derive(Default)]
+struct Swappable(Vec<String>);
+
+impl Swappable {
+    fn check(&mut self, signature: &syn::Signature) {
+        let mut types: Vec<String> = signature
+            .inputs
+            .iter()
+            .filter_map(|input| match input {
+                syn::FnArg::Typed(input) => Some(text_of(&input.ty)),
+                syn::FnArg::Receiver(_) => None,
+            })
+            .collect();
+        types.sort();
+        if types.windows(2).any(|pair| pair[0] == pair[1]) {
+            self.0.push(signature.ident.to_string());
+        }
+    }
+}
+
+impl<'ast> Visit<'ast> for Swappable {
+    fn visit_item_fn(&mut self, item: &'ast syn::ItemFn) {
+        if !is_for_tests(&item.attrs) {
+            self.check(&item.sig);
+            visit::visit_item_fn(self, item);
+        }
+    }
+
+    fn visit_impl_item_fn(&mut self, item: &'ast syn::ImplItemFn) {
+        if !is_for_tests(&item.attrs) {
+            self.check(&item.sig);
+            visit::visit_impl_item_fn(self, item);
+        }
+    }
+
+    fn visit_trait_item_fn(&mut self, item: &'ast syn::TraitItemFn) {
+        self.check(&item.sig);
+        visit::visit_trait_item_fn(self, item);
+    }
+
+    fn visit_item_impl(&mut self, item: &'ast syn::ItemImpl) {
+        if item.trait_.is_none() {
+            visit::visit_item_impl(self, item);
+        }
+    }
+
+    fn visit_item_mod(&mut self, item: &'ast syn::ItemMod) {
+        if !is_for_tests(&item.attrs) {
+            visit::visit_item_mod(self, item);
+        }
+    }
+}
+
+fn swappable_of(text: &str) -> Vec<String> {
+    let mut found = Swappable::default();
+    found.visit_file(&syn::parse_file(text).expect("Rust"));
+    found.0
+}
+
+/// Whether a file is compiled into the product or the lab, by its path.
+fn is_of_product(name: &str) -> bool {
+    let mut folders = name.split('/');
+    let is_rust = name.strip_suffix(".rs").is_some();
+    let last = name.rsplit('/').next().unwrap_or(name);
+    is_rust
+        && folders.all(|folder| !["tests", "examples", "benches"].contains(&folder))
+        && !last.contains("tests")
+}
+
+#[test]
+fn two_arguments_of_one_type_are_found_and_others_are_not() {
+    let text = "
+        fn swapped(from_m: f64, to_m: f64) {}
+        fn fine(from_m: f64, at: Duration, list: &[f64], all: [f64; 2], two: Option<f64>) {}
+        fn borrowed<'a>(one: &'a str, other: &str) {}
+        fn sizes(one: [f64; 2], other: [f64; 3]) {}
+        impl Trait for X { fn fixed(&self, a: u8, b: u8) {} }
+        impl X { fn method(&self, a: u8, b: u8) {} }
+        trait T { fn of_trait(&self, a: &mut Vec<u8>, b: &mut Vec<u8>); }
+        #[cfg(test)] mod tests { fn helper(a: u8, b: u8) {} }
+    ";
+    assert_eq!(
+        swappable_of(text),
+        ["swapped", "borrowed", "method", "of_trait"]
+    );
+}
+
+#[test]
+fn no_function_takes_two_arguments_that_could_be_exchanged() {
+    let listed = root().join("tests/swappable-arguments.txt");
+    let listed = fs::read_to_string(listed).expect("the list");
+    let mut reasons: BTreeMap<(String, String), bool> = BTreeMap::new();
+    for line in listed.lines().filter(|line| !line.starts_with('#')) {
+        let parts: Vec<&str> = line.split('\t').collect();
+        let [file, function, reason] = parts[..] else {
+            panic!("a file, a tab, a function, a tab, a reason: {line}");
+        };
+        assert!(reason.len() > 10, "{line}");
+        reasons.insert((file.to_owned(), function.to_owned()), false);
+    }
+    let mut faults = String::new();
+    let names: Vec<String> = files()
+        .into_iter()
+        .filter(|name| is_of_product(name))
+        .collect();
+    assert!(names.len() > 300, "the sources are here");
+    for name in &names {
+        let text = fs::read_to_string(root().join(name)).unwrap();
+        for function in swappable_of(&text) {
+            let key = (name.clone(), function);
+            if let Some(is_used) = reasons.get_mut(&key) {
+                *is_used = true;
+            } else {
+                let _ = writeln!(faults, "{name}: {}", key.1);
+            }
+        }
+    }
+    for ((file, function), _) in reasons.iter().filter(|(_, is_used)| !**is_used) {
+        let _ = writeln!(faults, "{file}: {function} needs no exception");
+    }
+    assert!(faults.is_empty(), "\n{faults}");
+}
