@@ -3,7 +3,7 @@
 use jiff::Timestamp;
 use tread_api::ids::MissionId;
 use tread_api::mission::{DrivenPath, MissionQuality, MissionState, Replacement};
-pub use tread_store::missions::Standing;
+pub use tread_store::missions::OpenMission;
 pub use tread_store::missions::{Facts, Inserted, MissionFilter, MissionRow, Transition};
 
 use super::{DbError, Tx, forward};
@@ -22,8 +22,8 @@ forward! {
     fn add_outcome(id: MissionId, quality: Option<&MissionQuality>, driven: Option<&DrivenPath>) -> ();
     fn outcome(id: MissionId) -> (Option<MissionQuality>, Option<DrivenPath>);
     fn counts() -> Vec<(MissionState, u64)>;
-    fn in_progress() -> Vec<Standing>;
-    fn next_in_queues() -> Vec<Standing>;
-    fn overdue(now: Timestamp, limit: u32) -> Vec<Standing>;
-    fn open_of_robot(robot_pk: i64) -> Vec<Standing>;
+    fn in_progress() -> Vec<OpenMission>;
+    fn next_in_queues() -> Vec<OpenMission>;
+    fn overdue(now: Timestamp, limit: u32) -> Vec<OpenMission>;
+    fn open_of_robot(robot_pk: i64) -> Vec<OpenMission>;
 }

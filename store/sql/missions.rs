@@ -1,7 +1,7 @@
 //! Missions: their content, state and outcome.
 
-#[path = "missions/standing.rs"]
-mod standing;
+#[path = "missions/open_missions.rs"]
+mod open_missions;
 
 use futures_util::StreamExt as _;
 use jiff::Timestamp;
@@ -9,7 +9,7 @@ use tread_api::ids::{MissionId, RobotId, SiteId};
 use tread_api::mission::{Cause, DrivenPath, Mission, MissionQuality, MissionState, Replacement};
 pub use tread_store::missions::{Facts, Inserted, MissionFilter, MissionRow, Transition};
 
-pub use self::standing::{Standing, in_progress, next_in_queues, open_of_robot, overdue};
+pub use self::open_missions::{OpenMission, in_progress, next_in_queues, open_of_robot, overdue};
 use super::{
     Connection, EngineError, corrupt, from_json, from_us, parse, scope_text, to_json, to_us,
     unsigned,

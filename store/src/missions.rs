@@ -71,7 +71,7 @@ pub struct Facts {
 
 /// State of an open mission, without its trajectory, which may be long.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Standing {
+pub struct OpenMission {
     /// The mission.
     pub id: MissionId,
     /// The robot's site.
@@ -103,7 +103,7 @@ pub struct Standing {
     pub duration_s: Option<f64>,
 }
 
-impl From<&Mission> for Standing {
+impl From<&Mission> for OpenMission {
     fn from(mission: &Mission) -> Self {
         Self {
             id: mission.id,

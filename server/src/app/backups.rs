@@ -233,7 +233,10 @@ pub async fn make(
         database: &order.database,
         target: &copy.0,
     };
-    watch_copy(paths, |bytes| progress(Progress::Copying { bytes, of: size })).await?;
+    watch_copy(paths, |bytes| {
+        progress(Progress::Copying { bytes, of: size })
+    })
+    .await?;
     progress(Progress::Checking);
     let contents = copy::examine(&copy.0).await;
     let contents = contents.map_err(|cause| BackupError::Examine(cause.into()))?;

@@ -117,7 +117,11 @@ fn with_a_certificate_the_rest_api_may_be_reached_and_the_rest_may_not() {
     assert!(config.names().is_tls);
     let robots = "[robots]\nauthority = \"ca\"\n";
     assert!(load(&format!("zenoh = \"0.0.0.0:1\"\n{robots}")).is_ok());
-    for wrong in ["names = [\"a b\"]", "certificate_s = 4", "robots_per_router = 0"] {
+    for wrong in [
+        "names = [\"a b\"]",
+        "certificate_s = 4",
+        "robots_per_router = 0",
+    ] {
         let error = load(&format!("{robots}{wrong}")).unwrap_err();
         assert!(error.to_string().contains("robots."), "{error}");
     }

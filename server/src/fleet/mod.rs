@@ -148,7 +148,9 @@ impl Fleet {
     ) -> Result<Self, FleetError> {
         let routers = Arc::new(Routers::default());
         let is_tls = security.is_some();
-        let robots_max = security.as_ref().map_or(usize::MAX, |it| it.robots_per_router);
+        let robots_max = security
+            .as_ref()
+            .map_or(usize::MAX, |it| it.robots_per_router);
         let (address, authorities, gate) = match security {
             None => {
                 let address = with_free_port(address)?;

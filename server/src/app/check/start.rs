@@ -10,7 +10,7 @@ use tread_api::trajectory::{StartSource, Trajectory};
 use super::traction::Traction;
 use super::{Planning, planned};
 use crate::app::AppError;
-use crate::db::missions::Standing;
+use crate::db::missions::OpenMission;
 use crate::db::{self, Tx};
 
 /// Maximum number of earlier missions whose ends are planned. The end of a waypoint mission does
@@ -44,7 +44,7 @@ pub(super) struct Earlier {
 }
 
 /// Returns whether this open mission is driven before one at `place`.
-fn is_before(open: &Standing, place: Place) -> bool {
+fn is_before(open: &OpenMission, place: Place) -> bool {
     match open.state {
         MissionState::Offered | MissionState::Active | MissionState::Paused => true,
         // A mission that is held in the queue is skipped.
@@ -63,7 +63,7 @@ fn is_before(open: &Standing, place: Place) -> bool {
 
 /// Returns those of a robot's open missions, given in driving order, that are driven before one at
 /// `place`.
-fn before(open: &[Standing], place: Place) -> Vec<MissionId> {
+fn before(open: &[OpenMission], place: Place) -> Vec<MissionId> {
     if place.policy == StartPolicy::Replace {
         return Vec::new();
     }
@@ -154,8 +154,8 @@ mod tests {
 
     use super::*;
 
-    fn open(number: u128, state: MissionState, priority: i32, pause_wanted: bool) -> Standing {
-        Standing {
+    fn open(number: u128, state: MissionState, priority: i32, pause_wanted: bool) -> OpenMission {
+        OpenMission {
             id: MissionId::from_uuid(Uuid::from_u128(number)),
             site: "yard".parse().unwrap(),
             robot: "rover-1".parse().unwrap(),

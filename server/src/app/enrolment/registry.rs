@@ -11,14 +11,14 @@ use crate::app::presence::RobotKey;
 
 /// State of a robot's newest enrolment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Standing {
+pub enum EnrolmentStatus {
     /// In force, with the enrolment's number.
     Enrolled(u32),
     /// Revoked, with the number of the enrolment that ended.
     Revoked(u32),
 }
 
-impl Standing {
+impl EnrolmentStatus {
     fn number(self) -> u32 {
         match self {
             Self::Enrolled(number) | Self::Revoked(number) => number,
@@ -29,7 +29,7 @@ impl Standing {
 /// All robots that have ever joined.
 #[derive(Debug)]
 pub struct EnrolmentRegistry {
-    robots: RwLock<HashMap<RobotKey, Standing>>,
+    robots: RwLock<HashMap<RobotKey, EnrolmentStatus>>,
     /// Whether messages of robots that have not joined are refused.
     is_closed: AtomicBool,
     changes: watch::Sender<u64>,
@@ -54,42 +54,42 @@ impl EnrolmentRegistry {
     /// Records an enrolment read from the database; ignored if a newer one, or its end, is recorded
     /// already.
     pub(crate) fn note(&self, enrolment: &Enrolment) {
-        let standing = match enrolment.revoked_at {
-            None => Standing::Enrolled(enrolment.number),
-            Some(_) => Standing::Revoked(enrolment.number),
+        let status = match enrolment.revoked_at {
+            None => EnrolmentStatus::Enrolled(enrolment.number),
+            Some(_) => EnrolmentStatus::Revoked(enrolment.number),
         };
         let key = (enrolment.site.clone(), enrolment.robot.clone());
         let mut robots = self.robots.write().unwrap_or_else(PoisonError::into_inner);
         let present = robots.get(&key).copied();
         let is_late = present.is_some_and(|present| {
-            let ended = present == Standing::Revoked(enrolment.number);
+            let ended = present == EnrolmentStatus::Revoked(enrolment.number);
             present.number() > enrolment.number || ended
         });
         if !is_late {
-            robots.insert(key, standing);
+            robots.insert(key, status);
             drop(robots);
             self.changes.send_modify(|count| *count += 1);
         }
     }
 
     /// Returns the state of a robot's enrolment; `None` if it has never joined.
-    pub fn standing(&self, key: &RobotKey) -> Option<Standing> {
+    pub fn status(&self, key: &RobotKey) -> Option<EnrolmentStatus> {
         let robots = self.robots.read().unwrap_or_else(PoisonError::into_inner);
         robots.get(key).copied()
     }
 
     /// Returns whether messages of a robot are accepted, over any link.
     pub fn may_speak(&self, key: &RobotKey) -> bool {
-        match self.standing(key) {
-            Some(Standing::Enrolled(_)) => true,
-            Some(Standing::Revoked(_)) => false,
+        match self.status(key) {
+            Some(EnrolmentStatus::Enrolled(_)) => true,
+            Some(EnrolmentStatus::Revoked(_)) => false,
             None => !self.is_closed.load(Ordering::Relaxed),
         }
     }
 
     /// Returns whether the robot's newest enrolment has this number and is not revoked.
     pub fn is_in_force(&self, key: &RobotKey, enrolment: u32) -> bool {
-        self.standing(key) == Some(Standing::Enrolled(enrolment))
+        self.status(key) == Some(EnrolmentStatus::Enrolled(enrolment))
     }
 
     /// Returns every robot that has ever joined.
@@ -139,7 +139,7 @@ mod tests {
                 for (number, is_revoked) in order {
                     registry.note(&enrolment(number, is_revoked));
                 }
-                assert_eq!(registry.standing(&key), Some(Standing::Revoked(2)));
+                assert_eq!(registry.status(&key), Some(EnrolmentStatus::Revoked(2)));
                 assert!(!registry.may_speak(&key));
             }
         }

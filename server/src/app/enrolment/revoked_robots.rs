@@ -7,7 +7,7 @@ use std::time::Duration;
 use tread_api::enrolment::Enrolment;
 use tread_api::robot::{Alert, Severity};
 
-use super::registry::Standing;
+use super::registry::EnrolmentStatus;
 use crate::app::own_alert::OwnAlert;
 use crate::app::presence::RobotKey;
 use crate::app::{App, AppError};
@@ -53,7 +53,7 @@ impl App {
         if self.enrolment_registry().may_speak(key) {
             return true;
         }
-        match self.enrolment_registry().standing(key) {
+        match self.enrolment_registry().status(key) {
             Some(_) => {
                 self.counters().refused_revoked_robot.one();
                 self.note_outsider(key);
@@ -66,8 +66,8 @@ impl App {
     /// Raises an alert if the robot is revoked and still tries to connect.
     pub fn note_outsider(&self, key: &RobotKey) {
         let is_out = matches!(
-            self.enrolment_registry().standing(key),
-            Some(Standing::Revoked(_))
+            self.enrolment_registry().status(key),
+            Some(EnrolmentStatus::Revoked(_))
         );
         if is_out {
             let text = "it was put out of the fleet and still tries to connect".to_owned();

@@ -229,9 +229,9 @@ impl App {
         let (mut rows, _more) =
             db::missions::list(tx, &of_site, MISSIONS_MAX, MISSIONS_BYTES_MAX).await?;
         let known: HashSet<MissionId> = rows.iter().map(|row| row.mission.id).collect();
-        for standing in db::missions::in_progress(tx).await? {
-            if !known.contains(&standing.id) {
-                rows.extend(db::missions::find(tx, standing.id).await?);
+        for open in db::missions::in_progress(tx).await? {
+            if !known.contains(&open.id) {
+                rows.extend(db::missions::find(tx, open.id).await?);
             }
         }
         let missions = rows.into_iter().map(|row| self.with_progress(row.mission));

@@ -24,7 +24,7 @@ use self::transitions::{Change, next};
 use super::check::StartPlace;
 use super::{App, AppError, check_named, site_row};
 pub use crate::db::missions::MissionFilter;
-use crate::db::missions::{Facts, Inserted, MissionRow, Standing, Transition};
+use crate::db::missions::{Facts, Inserted, MissionRow, OpenMission, Transition};
 use crate::db::{self, DbError, Tx};
 
 /// Number of bytes of trajectories after which a page of missions ends, whatever its limit.
@@ -143,7 +143,7 @@ impl App {
                 open = db::missions::open_of_robot(tx, robot_row.pk).await?;
             }
         }
-        let is_queued = |other: &&Standing| other.state == MissionState::Queued;
+        let is_queued = |other: &&OpenMission| other.state == MissionState::Queued;
         if open.iter().filter(is_queued).count() >= QUEUE_MAX {
             return Err(AppError::TooMany {
                 what: "missions that wait for it",
@@ -327,10 +327,10 @@ async fn insert(tx: &mut Tx, row: &MissionRow, is_offered: bool) -> Result<(), D
     Ok(())
 }
 
-fn log_step(standing: &Standing, to: MissionState) {
-    let Standing {
+fn log_step(open: &OpenMission, to: MissionState) {
+    let OpenMission {
         id, robot, state, ..
-    } = standing;
+    } = open;
     tracing::info!(
         mission.id = %id, robot.id = %robot,
         "mission `{id}` of robot `{robot}` went from {} to {}", state.as_str(), to.as_str(),
@@ -351,11 +351,11 @@ pub(super) async fn end_all(
 /// Requests the end of these open missions.
 async fn end_each(
     tx: &mut Tx,
-    open: &[Standing],
+    open: &[OpenMission],
     (change, actor, reason): (Change, Actor, &str),
     at: Timestamp,
 ) -> Result<(), DbError> {
-    for open in open {
+    for mission in open {
         let step = Step {
             change,
             actor,
@@ -363,7 +363,7 @@ async fn end_each(
             at,
             facts: Facts::default(),
         };
-        take_step(tx, open, step).await?;
+        take_step(tx, mission, step).await?;
     }
     Ok(())
 }
@@ -409,10 +409,10 @@ pub(super) struct Step<'step> {
 /// Returns the new state; `None` if nothing changed.
 pub(super) async fn take_step(
     tx: &mut Tx,
-    standing: &Standing,
+    open: &OpenMission,
     step: Step<'_>,
 ) -> Result<Option<MissionState>, DbError> {
-    let (id, from) = (standing.id, standing.state);
+    let (id, from) = (open.id, open.state);
     let Some(to) = next(from, step.change) else {
         return Ok(None);
     };
@@ -448,7 +448,7 @@ pub(super) async fn take_step(
         reason,
     };
     db::history::add_event(tx, id, &event).await?;
-    log_step(standing, to);
+    log_step(open, to);
     Ok(Some(to))
 }
 

@@ -114,7 +114,7 @@ impl Change {
             Self::Return => "the robot cannot take it now",
             Self::Accept => "the robot has taken it",
             Self::Reject => "the robot will not take it",
-            Self::Pause => "the robot holds it, standing",
+            Self::Pause => "the robot holds it, at rest",
             Self::Resume => "the robot drives it again",
             Self::RequestCancel => "cancelled by request",
             Self::Supersede => "another mission was asked for in its place",

@@ -16,7 +16,7 @@ use crate::app::own_alert::OwnAlert;
 use crate::app::presence::{RobotKey, Showing};
 use crate::app::{App, AppError};
 use crate::db;
-use crate::db::missions::Standing;
+use crate::db::missions::OpenMission;
 
 /// Code of the alert about a robot that has waited too long on its mission.
 pub(in crate::app) const ROBOT_WAITING_ALERT: &str = "robot-waiting";
@@ -127,13 +127,13 @@ impl Conditions {
     pub(super) async fn end_of_absent(
         &mut self,
         app: &App,
-        open: &[Standing],
+        open: &[OpenMission],
     ) -> Result<(), AppError> {
         let now = app.clock().elapsed();
         let robots = self.robots.iter_mut().flatten();
         for (key, memory) in robots.filter(|(_, memory)| memory.is_waiting) {
             let is_of_robot =
-                |mission: &&Standing| (&mission.site, &mission.robot) == (&key.0, &key.1);
+                |mission: &&OpenMission| (&mission.site, &mission.robot) == (&key.0, &key.1);
             let has_mission = open.iter().filter(is_of_robot).any(is_in_progress);
             if has_mission || app.presences().get(key).link(now) != LinkState::Offline {
                 continue;
@@ -155,7 +155,7 @@ impl Conditions {
 }
 
 /// Returns whether a robot has accepted a mission that has not ended.
-fn is_in_progress(mission: &Standing) -> bool {
+fn is_in_progress(mission: &OpenMission) -> bool {
     matches!(
         mission.state,
         MissionState::Active | MissionState::Paused | MissionState::Cancelling

@@ -17,7 +17,7 @@ use crate::app::own_alert::OwnAlert;
 use crate::app::presence::{Presence, RobotKey};
 use crate::app::{App, AppError};
 use crate::db;
-use crate::db::missions::Standing;
+use crate::db::missions::OpenMission;
 
 /// Code of the alert about a mission that is next and does not begin.
 pub(in crate::app) const MISSION_WAITING_ALERT: &str = "mission-waiting";
@@ -72,7 +72,7 @@ impl Delays {
     ///
     /// # Errors
     /// The database failed; the next check repeats this one.
-    pub(super) async fn look(&mut self, app: &App, open: &[Standing]) -> Result<(), AppError> {
+    pub(super) async fn look(&mut self, app: &App, open: &[OpenMission]) -> Result<(), AppError> {
         let now = app.clock().elapsed();
         let robots = match &mut self.robots {
             Some(robots) => robots,
@@ -118,7 +118,7 @@ impl Delays {
 }
 
 /// Returns whether a mission is the next of a robot that drives none.
-fn is_next(mission: &Standing) -> bool {
+fn is_next(mission: &OpenMission) -> bool {
     matches!(mission.state, MissionState::Queued | MissionState::Offered)
 }
 
@@ -132,7 +132,11 @@ async fn raised(app: &App) -> Result<HashMap<RobotKey, Waiting>, AppError> {
 }
 
 /// Raises the alert about a mission, or clears that of a robot.
-async fn write_down(app: &App, key: &RobotKey, mission: Option<&Standing>) -> Result<(), AppError> {
+async fn write_down(
+    app: &App,
+    key: &RobotKey,
+    mission: Option<&OpenMission>,
+) -> Result<(), AppError> {
     let mut tx = app.db().write("reconciler").await?;
     let Some(robot_pk) = db::robots::pk_of(&mut tx, &key.0, &key.1).await? else {
         return Ok(());
@@ -155,7 +159,7 @@ async fn write_down(app: &App, key: &RobotKey, mission: Option<&Standing>) -> Re
     Ok(app.commit_alerts(tx, changed.into_iter().collect()).await?)
 }
 
-fn waiting_text(app: &App, key: &RobotKey, mission: &Standing) -> String {
+fn waiting_text(app: &App, key: &RobotKey, mission: &OpenMission) -> String {
     let minutes = WAITED_AFTER.as_secs() / 60;
     let presence = app.presences().get(key);
     let why = why(&presence, presence.link(app.clock().elapsed()));

@@ -21,7 +21,7 @@ use crate::app::stops::{StopDelivery, send_stop};
 use crate::app::terrains::site_definition;
 use crate::app::{App, AppError};
 use crate::db;
-use crate::db::missions::{Facts, MissionRow, Standing};
+use crate::db::missions::{Facts, MissionRow, OpenMission};
 
 /// Result of a command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -40,7 +40,7 @@ pub(super) enum Finished {
 /// the robot's.
 pub(super) async fn settle(
     app: &App,
-    mission: &Standing,
+    mission: &OpenMission,
     change: Change,
     shown_for: Duration,
 ) -> Result<(), AppError> {
@@ -81,7 +81,7 @@ pub(super) async fn settle(
 
 /// Returns the progress of the mission's present revision that the robot showed last; it stays true
 /// if the robot never reports an end.
-fn last_progress(app: &App, mission: &Standing) -> Option<MissionProgress> {
+fn last_progress(app: &App, mission: &OpenMission) -> Option<MissionProgress> {
     let progress = app
         .presences()
         .get(&key_of(mission))
@@ -89,7 +89,7 @@ fn last_progress(app: &App, mission: &Standing) -> Option<MissionProgress> {
     progress.filter(|said| (said.revision, said.plan_hash) == mission.content)
 }
 
-fn key_of(mission: &Standing) -> RobotKey {
+fn key_of(mission: &OpenMission) -> RobotKey {
     (mission.site.clone(), mission.robot.clone())
 }
 
@@ -120,11 +120,11 @@ fn start_within_ms(app: &App, row: &MissionRow) -> Option<u64> {
 }
 
 /// Offers a mission to its robot and stores the answer.
-pub(super) async fn offer(app: App, standing: Standing) -> Result<Finished, AppError> {
-    if standing.state == MissionState::Queued {
+pub(super) async fn offer(app: App, open: OpenMission) -> Result<Finished, AppError> {
+    if open.state == MissionState::Queued {
         let mut tx = app.db().write_uncounted("reconciler").await?;
         let step = server_step(&app, Change::Offer, None, Facts::default());
-        match take_step(&mut tx, &standing, step).await {
+        match take_step(&mut tx, &open, step).await {
             Ok(Some(_)) => {
                 tx.commit().await?;
                 app.announce();
@@ -136,7 +136,7 @@ pub(super) async fn offer(app: App, standing: Standing) -> Result<Finished, AppE
         }
     }
     let recalls = app.recalls();
-    let Some(row) = offered_row(&app, standing.id).await? else {
+    let Some(row) = offered_row(&app, open.id).await? else {
         return Ok(Finished::Settled);
     };
     let named = (&row.mission.site, &row.mission.robot);
@@ -260,9 +260,9 @@ async fn take_offer_answer(
 }
 
 /// Sends a new revision of an active mission and stores the answer.
-pub(super) async fn replace(app: App, standing: Standing) -> Result<Finished, AppError> {
+pub(super) async fn replace(app: App, open: OpenMission) -> Result<Finished, AppError> {
     let recalls = app.recalls();
-    let row = row_of(&app, standing.id).await?;
+    let row = row_of(&app, open.id).await?;
     let Some(row) = row.filter(|row| !row.mission.state.is_terminal()) else {
         return Ok(Finished::Settled);
     };
@@ -291,7 +291,7 @@ pub(super) async fn replace(app: App, standing: Standing) -> Result<Finished, Ap
         return Ok(Finished::Again);
     };
     let mut tx = app.db().write_uncounted("reconciler").await?;
-    let row = db::missions::find(&mut tx, standing.id).await?;
+    let row = db::missions::find(&mut tx, open.id).await?;
     let as_sent = |row: &MissionRow| {
         let hash = row.mission.replacement.as_ref().map(|next| next.plan_hash);
         hash == Some(replacement.plan_hash) && !row.mission.state.is_terminal()
@@ -325,9 +325,9 @@ pub(super) async fn replace(app: App, standing: Standing) -> Result<Finished, Ap
 }
 
 /// Makes the revision that the robot shows the present one.
-pub(super) async fn adopt_shown(app: &App, standing: &Standing) -> Result<(), AppError> {
+pub(super) async fn adopt_shown(app: &App, open: &OpenMission) -> Result<(), AppError> {
     let mut tx = app.db().write_uncounted("reconciler").await?;
-    if let Some(row) = db::missions::find(&mut tx, standing.id).await? {
+    if let Some(row) = db::missions::find(&mut tx, open.id).await? {
         adopt(&mut tx, &row, Actor::Robot, app.clock().now()).await?;
         tx.commit().await?;
         app.wake();
@@ -338,11 +338,11 @@ pub(super) async fn adopt_shown(app: &App, standing: &Standing) -> Result<(), Ap
 /// Commands a robot to pause or to resume a mission, as it was read after so many recalls.
 pub(super) async fn hold(
     app: App,
-    standing: Standing,
+    open: OpenMission,
     held: bool,
     recalls: u64,
 ) -> Result<Finished, AppError> {
-    let (mission, (revision, _)) = (standing.id, standing.content);
+    let (mission, (revision, _)) = (open.id, open.content);
     // A person may have held or ended it since. A pause does no harm. Nothing is awaited between the last
     // comparison and the sending.
     let mut recalls = recalls;
@@ -359,7 +359,7 @@ pub(super) async fn hold(
             return Ok(Finished::Settled);
         }
     }
-    let key = (standing.site.clone(), standing.robot.clone());
+    let key = (open.site.clone(), open.robot.clone());
     let answer = if held {
         let command = Pause { mission, revision };
         app.commands().send(&key, &command).await
@@ -387,7 +387,7 @@ pub(super) async fn hold(
 }
 
 /// Commands a robot to end a mission and stores the answer.
-pub(super) async fn cancel(app: App, mission: Standing) -> Result<Finished, AppError> {
+pub(super) async fn cancel(app: App, mission: OpenMission) -> Result<Finished, AppError> {
     let command = Cancel {
         mission: mission.id,
         reason: mission.reason.clone().unwrap_or_default(),
@@ -414,15 +414,15 @@ pub(super) async fn cancel(app: App, mission: Standing) -> Result<Finished, AppE
     let mut tx = app.db().write_uncounted("reconciler").await?;
     if let Some(row) = db::missions::find(&mut tx, mission.id).await? {
         let reason = detail.or(row.mission.reason.as_deref());
-        let standing = (&row.mission).into();
+        let open = (&row.mission).into();
         let facts = Facts {
-            progress: last_progress(&app, &standing),
+            progress: last_progress(&app, &open),
             ..Facts::default()
         };
         let step = server_step(&app, Change::Cancel, reason, facts);
         take_step(
             &mut tx,
-            &standing,
+            &open,
             Step {
                 actor: Actor::Robot,
                 ..step

@@ -41,7 +41,7 @@ use super::missions::transitions::Change;
 use super::{App, AppError};
 use crate::app::presence::RobotKey;
 use crate::db;
-use crate::db::missions::Standing;
+use crate::db::missions::OpenMission;
 use crate::db::restorations::Restrained;
 
 /// Interval between passes when nothing wakes it.
@@ -292,7 +292,7 @@ impl Reconciler {
     }
 
     /// Starts what open missions need, and returns them.
-    async fn serve_missions(&mut self) -> Result<Vec<Standing>, AppError> {
+    async fn serve_missions(&mut self) -> Result<Vec<OpenMission>, AppError> {
         self.recalls = self.app.recalls();
         let begun = Instant::now();
         // Remains if this is given up.
@@ -330,7 +330,7 @@ impl Reconciler {
     }
 
     /// Reads the robots that are restrained, and the missions that may need something.
-    async fn read_missions(&self) -> Result<(Vec<Restrained>, Vec<Standing>), AppError> {
+    async fn read_missions(&self) -> Result<(Vec<Restrained>, Vec<OpenMission>), AppError> {
         let mut tx = self.app.db().read("reconciler").await?;
         let restrained = db::restorations::restrained(&mut tx).await?;
         let mut open = db::missions::in_progress(&mut tx).await?;
@@ -380,7 +380,7 @@ impl Reconciler {
     }
 
     /// Forgets everything about missions that are no longer open.
-    fn forget_all_but(&mut self, missions: &[Standing]) {
+    fn forget_all_but(&mut self, missions: &[OpenMission]) {
         let open: HashSet<MissionId> = missions.iter().map(|mission| mission.id).collect();
         self.memories.retain(|id, _| open.contains(id));
         self.retries.retain(|job, _| match job {
@@ -397,7 +397,7 @@ impl Reconciler {
 
     /// Finds robots that drive a mission that is not among their open ones, and commands them to
     /// end it.
-    fn disown_foreign(&mut self, open: &[Standing]) {
+    fn disown_foreign(&mut self, open: &[OpenMission]) {
         let now = self.app.clock().elapsed();
         let shown = self.app.presences().shown_missions(now);
         let mut own: HashMap<MissionId, (&SiteId, &tread_api::ids::RobotId)> = HashMap::new();
@@ -442,7 +442,7 @@ impl Reconciler {
     }
 
     /// Stores since when a mission's robot has not been heard.
-    async fn note_silence(&self, mission: &mut Standing, heard: bool) -> Result<(), AppError> {
+    async fn note_silence(&self, mission: &mut OpenMission, heard: bool) -> Result<(), AppError> {
         if heard == mission.silent_since.is_none() || mission.state == MissionState::Queued {
             return Ok(());
         }
@@ -458,7 +458,7 @@ impl Reconciler {
         Ok(())
     }
 
-    async fn serve(&mut self, mut mission: Standing) -> Result<(), AppError> {
+    async fn serve(&mut self, mut mission: OpenMission) -> Result<(), AppError> {
         let key = (mission.site.clone(), mission.robot.clone());
         let presence = self.app.presences().get(&key);
         let now = Now {

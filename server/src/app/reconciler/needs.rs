@@ -8,7 +8,7 @@ use tread_api::robot::{LinkState, MissionProgress};
 
 use crate::app::missions::transitions::Change;
 use crate::app::presence::Presence;
-use crate::db::missions::Standing;
+use crate::db::missions::OpenMission;
 
 /// Time for which the records of an earlier run may be under way before a mission counts as lost.
 pub(super) const RESTART_GRACE: Duration = Duration::from_secs(3);
@@ -71,7 +71,7 @@ pub(super) struct Silence {
 impl Silence {
     /// Returns the silence of a mission's robot, continuing `before` if given; `None` while the
     /// robot is heard.
-    pub(super) fn of(mission: &Standing, before: Option<Self>, now: Now) -> Option<Self> {
+    pub(super) fn of(mission: &OpenMission, before: Option<Self>, now: Now) -> Option<Self> {
         let since = mission.silent_since?;
         let silence = || Self {
             before: Duration::try_from(now.wall.duration_since(since)).unwrap_or_default(),
@@ -110,14 +110,14 @@ pub(super) fn is_heard(presence: &Presence, now: Duration) -> bool {
 }
 
 /// Returns the progress of a mission that its robot shows; `None` if it shows another or none.
-pub(super) fn driven(mission: &Standing, presence: &Presence) -> Option<MissionProgress> {
+pub(super) fn driven(mission: &OpenMission, presence: &Presence) -> Option<MissionProgress> {
     let said = presence.state().and_then(|state| state.mission);
     said.filter(|driven| driven.id == mission.id)
 }
 
 /// Returns whether a robot is heard without a mission that it had accepted, and with an empty
 /// outbox. An offer that it still considers, however long, is not yet accepted.
-pub(super) fn is_absent(mission: &Standing, presence: &Presence, now: Duration) -> bool {
+pub(super) fn is_absent(mission: &OpenMission, presence: &Presence, now: Duration) -> bool {
     let is_taken = match mission.state {
         MissionState::Active | MissionState::Paused | MissionState::Cancelling => true,
         MissionState::Queued
@@ -139,7 +139,7 @@ pub(super) fn is_absent(mission: &Standing, presence: &Presence, now: Duration) 
 }
 
 /// Returns whether a robot shows a mission as paused that is active here, or the reverse.
-pub(super) fn is_held_otherwise(mission: &Standing, presence: &Presence) -> bool {
+pub(super) fn is_held_otherwise(mission: &OpenMission, presence: &Presence) -> bool {
     let here = match mission.state {
         MissionState::Active => false,
         MissionState::Paused => true,
@@ -156,7 +156,7 @@ pub(super) fn is_held_otherwise(mission: &Standing, presence: &Presence) -> bool
 }
 
 /// Decides what a mission needs, from its state and its robot's last state.
-pub(super) fn decide(mission: &Standing, presence: &Presence, memory: Memory, now: Now) -> Need {
+pub(super) fn decide(mission: &OpenMission, presence: &Presence, memory: Memory, now: Now) -> Need {
     let heard = is_heard(presence, now.elapsed);
     if !heard && mission.state != MissionState::Queued {
         return if is_lost(mission, presence, memory, now) {
@@ -211,14 +211,14 @@ pub(super) fn decide(mission: &Standing, presence: &Presence, memory: Memory, no
     }
 }
 
-fn of_present(mission: &Standing) -> impl Fn(MissionProgress) -> bool {
+fn of_present(mission: &OpenMission) -> impl Fn(MissionProgress) -> bool {
     let content = mission.content;
     move |said| (said.revision, said.plan_hash) == content
 }
 
 /// Decides what a mission needs that its robot drives or holds; `differs` when the robot has shown
 /// it as paused for [`HOLD_GRACE`] while it is active here, or the reverse.
-fn in_progress(mission: &Standing, said: Option<MissionProgress>, differs: bool) -> Need {
+fn in_progress(mission: &OpenMission, said: Option<MissionProgress>, differs: bool) -> Need {
     let content = said.map(|said| (said.revision, said.plan_hash));
     if mission.replacement.is_some() {
         return if content == mission.replacement {
@@ -251,7 +251,7 @@ fn in_progress(mission: &Standing, said: Option<MissionProgress>, differs: bool)
 }
 
 /// Returns the time for which a robot may be unheard before its mission counts as lost, seconds.
-pub(super) fn lost_after_s(mission: &Standing, said: Option<MissionProgress>) -> f64 {
+pub(super) fn lost_after_s(mission: &OpenMission, said: Option<MissionProgress>) -> f64 {
     match (mission.lost_after_s, mission.link_policy) {
         (Some(lost_after_s), _) => lost_after_s,
         (None, LinkPolicy::StopAfter { silence_s }) => silence_s + LOST_STOPPED_MARGIN_S,
@@ -268,7 +268,7 @@ pub(super) fn lost_after_s(mission: &Standing, said: Option<MissionProgress>) ->
 }
 
 /// Returns whether a mission's robot was unheard for longer than [`lost_after_s`].
-fn is_lost(mission: &Standing, presence: &Presence, memory: Memory, now: Now) -> bool {
+fn is_lost(mission: &OpenMission, presence: &Presence, memory: Memory, now: Now) -> bool {
     let bound_s = lost_after_s(mission, driven(mission, presence));
     memory
         .silence
@@ -277,7 +277,12 @@ fn is_lost(mission: &Standing, presence: &Presence, memory: Memory, now: Now) ->
 
 /// Returns whether the agent's run that took a mission has ended, its records have arrived or are
 /// overdue, and its successor does not drive the mission.
-fn is_lost_by_restart(mission: &Standing, presence: &Presence, is_driven: bool, now: Now) -> bool {
+fn is_lost_by_restart(
+    mission: &OpenMission,
+    presence: &Presence,
+    is_driven: bool,
+    now: Now,
+) -> bool {
     let (Some(taken_by), Some((present, since))) = (mission.boot, presence.boot()) else {
         return false;
     };

@@ -14,7 +14,7 @@ use super::jobs::Finished;
 use crate::app::missions::transitions::Change;
 use crate::app::missions::{Step, take_step};
 use crate::app::{App, AppError};
-use crate::db::missions::{Facts, Standing};
+use crate::db::missions::{Facts, OpenMission};
 use crate::db::restorations::Restrained;
 use crate::db::{self, Tx};
 
@@ -123,7 +123,7 @@ async fn take(
 async fn begin(
     app: &App,
     tx: &mut Tx,
-    mut mission: Standing,
+    mut mission: OpenMission,
     boot: Option<BootId>,
 ) -> Result<(), AppError> {
     let facts = Facts {

@@ -16,7 +16,7 @@ use crate::app::missions::transitions::Change;
 use crate::app::presence::{DuplicateAgent, RobotKey};
 use crate::app::sites::SITES_MAX;
 use crate::db;
-use crate::db::missions::Standing;
+use crate::db::missions::OpenMission;
 use crate::db::restorations::Restrained;
 
 /// Maximum number of missions that expire in one pass.
@@ -31,7 +31,7 @@ const OUTBOX_PATIENCE: Duration = Duration::from_secs(10);
 impl Reconciler {
     /// Looks at everything that is not a step of a mission; `open` are the open missions, if they
     /// could be read.
-    pub(super) async fn upkeep(&mut self, open: Option<&[Standing]>) -> Result<(), AppError> {
+    pub(super) async fn upkeep(&mut self, open: Option<&[OpenMission]>) -> Result<(), AppError> {
         self.ask_restrained();
         self.expire().await?;
         self.end_duplicate_agents();

@@ -18,7 +18,7 @@ use super::links::{CertificateHash, Entry, Links};
 use super::session::{Init, pass_opening, read_init};
 use super::throttle::{BYTES_PER_S, Throttled};
 use crate::app::App;
-use crate::app::enrolment::registry::Standing;
+use crate::app::enrolment::registry::EnrolmentStatus;
 use crate::app::presence::RobotKey;
 use crate::authority::{Authorities, RobotName, named_in};
 use crate::connections::Slot;
@@ -222,8 +222,8 @@ impl Link {
                 self.peer
             );
             // A renewed certificate may be valid; only a robot without one raises an alert.
-            if self.app.enrolment_registry().standing(&robot)
-                == Some(Standing::Revoked(name.enrolment))
+            if self.app.enrolment_registry().status(&robot)
+                == Some(EnrolmentStatus::Revoked(name.enrolment))
             {
                 self.app.note_outsider(&robot);
             }

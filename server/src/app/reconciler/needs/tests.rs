@@ -24,8 +24,8 @@ fn boot(number: u128) -> BootId {
     BootId::from_uuid(Uuid::from_u128(number))
 }
 
-fn mission(state: MissionState, boot: Option<BootId>) -> Standing {
-    Standing {
+fn mission(state: MissionState, boot: Option<BootId>) -> OpenMission {
+    OpenMission {
         id: MissionId::from_uuid(Uuid::from_u128(7)),
         site: "yard".parse().unwrap(),
         robot: "rover-1".parse().unwrap(),
@@ -122,9 +122,9 @@ fn a_mission_is_offered_only_to_a_robot_that_is_heard() {
     assert_eq!(need(MissionState::Queued, None, &IDLE), Need::Offer);
     let nobody = Presence::default();
     for state in MissionState::ALL {
-        let standing = mission(state, Some(boot(1)));
+        let open = mission(state, Some(boot(1)));
         assert_eq!(
-            decide(&standing, &nobody, Memory::default(), now()),
+            decide(&open, &nobody, Memory::default(), now()),
             Need::Wait,
             "{state:?}"
         );
@@ -253,7 +253,7 @@ fn what_is_wanted_of_a_mission_in_progress_is_sent_until_the_robot_has_done_it()
         ..driving
     };
     let needs = |state, pause_wanted, said: &Said, differs_from| {
-        let mission = Standing {
+        let mission = OpenMission {
             pause_wanted,
             ..mission(state, Some(boot(1)))
         };
@@ -294,7 +294,7 @@ fn what_is_wanted_of_a_mission_in_progress_is_sent_until_the_robot_has_done_it()
 
 #[test]
 fn a_new_revision_is_offered_until_the_robot_shows_that_it_holds_it() {
-    let replaced = |next| Standing {
+    let replaced = |next| OpenMission {
         replacement: Some((2, hash(next))),
         ..mission(MissionState::Active, Some(boot(1)))
     };
@@ -304,7 +304,7 @@ fn a_new_revision_is_offered_until_the_robot_shows_that_it_holds_it() {
     });
     let none = Memory::default();
     assert_eq!(decide(&replaced(2), &driving, none, now()), Need::Replace);
-    let shown = Standing {
+    let shown = OpenMission {
         replacement: Some((1, hash(1))),
         ..replaced(2)
     };
@@ -315,7 +315,7 @@ fn a_new_revision_is_offered_until_the_robot_shows_that_it_holds_it() {
 fn a_robot_that_stays_away_past_its_bound_loses_its_mission_in_progress() {
     let away_s = |state, away_s: i64| {
         let since = now().wall - jiff::SignedDuration::from_secs(away_s);
-        let mission = Standing {
+        let mission = OpenMission {
             silent_since: Some(since),
             ..mission(state, Some(boot(1)))
         };
@@ -341,7 +341,7 @@ fn a_robot_that_stays_away_past_its_bound_loses_its_mission_in_progress() {
 
 #[test]
 fn a_step_of_the_wall_clock_loses_no_robot_and_keeps_none() {
-    let silent = Standing {
+    let silent = OpenMission {
         silent_since: Some(now().wall),
         ..mission(MissionState::Active, Some(boot(1)))
     };
@@ -368,7 +368,7 @@ fn a_step_of_the_wall_clock_loses_no_robot_and_keeps_none() {
 
 #[test]
 fn the_bound_of_a_lost_robot_follows_what_was_said_and_what_is_left() {
-    let of = |link_policy, lost_after_s, duration_s| Standing {
+    let of = |link_policy, lost_after_s, duration_s| OpenMission {
         lost_after_s,
         link_policy,
         duration_s,

@@ -1,12 +1,12 @@
 //! States of open missions without their trajectories, for the reconciler.
 
 use jiff::Timestamp;
-pub use tread_store::missions::Standing;
+pub use tread_store::missions::OpenMission;
 
 use super::super::{Connection, EngineError, corrupt, from_json, from_us, parse, to_us, unsigned};
 use super::state;
 
-struct RawStanding {
+struct RawOpenMission {
     id: String,
     site: String,
     robot: String,
@@ -25,10 +25,10 @@ struct RawStanding {
     duration_s: Option<f64>,
 }
 
-impl TryFrom<RawStanding> for Standing {
+impl TryFrom<RawOpenMission> for OpenMission {
     type Error = EngineError;
 
-    fn try_from(raw: RawStanding) -> Result<Self, EngineError> {
+    fn try_from(raw: RawOpenMission) -> Result<Self, EngineError> {
         Ok(Self {
             id: parse("mission", &raw.id)?,
             site: parse("site", &raw.site)?,
@@ -62,10 +62,10 @@ impl TryFrom<RawStanding> for Standing {
     }
 }
 
-macro_rules! standings {
+macro_rules! open_missions {
     ($condition:tt $(, $argument:expr)* $(,)?) => {
         sqlx::query_as!(
-            RawStanding,
+            RawOpenMission,
             r#"SELECT missions.id, sites.id AS site, robots.id AS robot, missions.state,
                    missions.reason, missions.boot,
                    missions.pause_wanted AS "pause_wanted: bool", missions.priority,
@@ -83,21 +83,22 @@ macro_rules! standings {
     };
 }
 
-fn standings(raw: Vec<RawStanding>) -> Result<Vec<Standing>, EngineError> {
-    raw.into_iter().map(Standing::try_from).collect()
+fn open_missions(raw: Vec<RawOpenMission>) -> Result<Vec<OpenMission>, EngineError> {
+    raw.into_iter().map(OpenMission::try_from).collect()
 }
 
 /// Returns all missions in progress: active ones, and those that await their robot's answer.
-pub async fn in_progress(db: &mut Connection) -> Result<Vec<Standing>, EngineError> {
-    let raw = standings!("WHERE missions.state IN ('offered', 'active', 'paused', 'cancelling')")
-        .fetch_all(db)
-        .await?;
-    standings(raw)
+pub async fn in_progress(db: &mut Connection) -> Result<Vec<OpenMission>, EngineError> {
+    let raw =
+        open_missions!("WHERE missions.state IN ('offered', 'active', 'paused', 'cancelling')")
+            .fetch_all(db)
+            .await?;
+    open_missions(raw)
 }
 
 /// Returns the first queued mission of each robot without an active one; held missions are skipped.
-pub async fn next_in_queues(db: &mut Connection) -> Result<Vec<Standing>, EngineError> {
-    let raw = standings!(
+pub async fn next_in_queues(db: &mut Connection) -> Result<Vec<OpenMission>, EngineError> {
+    let raw = open_missions!(
         "WHERE missions.id IN (
              SELECT id FROM (
                  SELECT id, ROW_NUMBER() OVER (PARTITION BY robot_pk ORDER BY priority DESC, id)
@@ -110,7 +111,7 @@ pub async fn next_in_queues(db: &mut Connection) -> Result<Vec<Standing>, Engine
     )
     .fetch_all(db)
     .await?;
-    standings(raw)
+    open_missions(raw)
 }
 
 /// Returns the queued missions whose latest start has passed.
@@ -118,24 +119,24 @@ pub async fn overdue(
     db: &mut Connection,
     now: Timestamp,
     limit: u32,
-) -> Result<Vec<Standing>, EngineError> {
+) -> Result<Vec<OpenMission>, EngineError> {
     let now_us = to_us(now);
-    let raw = standings!(
+    let raw = open_missions!(
         "WHERE missions.state = 'queued' AND missions.latest_start_us < $1 LIMIT $2",
         now_us,
         i64::from(limit),
     )
     .fetch_all(db)
     .await?;
-    standings(raw)
+    open_missions(raw)
 }
 
 /// Returns a robot's open missions, the active one first, then in the order of the queue.
 pub async fn open_of_robot(
     db: &mut Connection,
     robot_pk: i64,
-) -> Result<Vec<Standing>, EngineError> {
-    let raw = standings!(
+) -> Result<Vec<OpenMission>, EngineError> {
+    let raw = open_missions!(
         "WHERE missions.robot_pk = $1 AND missions.state IN
              ('queued', 'offered', 'active', 'paused', 'cancelling')
          ORDER BY missions.state = 'queued', missions.priority DESC, missions.id",
@@ -143,5 +144,5 @@ pub async fn open_of_robot(
     )
     .fetch_all(db)
     .await?;
-    standings(raw)
+    open_missions(raw)
 }
