@@ -46,6 +46,7 @@ pub mod webhooks;
 
 use std::future::pending;
 use std::net::SocketAddr;
+use std::num::NonZeroUsize;
 use std::pin::pin;
 use std::sync::Arc;
 
@@ -430,7 +431,8 @@ fn security(robots: &RobotsConfig) -> anyhow::Result<Security> {
     Ok(Security {
         authorities: Arc::new(authorities),
         names: robots.names.clone(),
-        robots_per_router: robots.robots_per_router.into(),
+        robots_per_router: NonZeroUsize::new(robots.robots_per_router.into())
+            .unwrap_or(NonZeroUsize::MIN),
     })
 }
 

@@ -676,7 +676,13 @@ async fn records_and_webhooks_are_the_same() {
         both!(both, webhooks::deliveries(id(1), None, 10));
         assert!(both!(both, webhooks::delete(id(1))));
         both!(both, webhooks::deliveries(id(1), None, 10));
+    })
+    .await;
+}
 
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn deferred_segments_are_the_same() {
+    with_both("deferred_segments_are_the_same", async |both| {
         let raw = serde_json::value::RawValue::from_string("{\"a\":0.1}".to_owned()).unwrap();
         let origin = |seq| deferred_segments::Origin {
             key: RecordKey { boot_pk: 1, seq },
@@ -684,7 +690,10 @@ async fn records_and_webhooks_are_the_same() {
             robot_pk: 1,
         };
         assert!(both!(both, deferred_segments::put(origin(4), (1, 2), &raw)));
-        assert!(!both!(both, deferred_segments::put(origin(4), (1, 2), &raw)));
+        assert!(!both!(
+            both,
+            deferred_segments::put(origin(4), (1, 2), &raw)
+        ));
         both!(both, deferred_segments::count(1));
     })
     .await;

@@ -158,11 +158,8 @@ async fn measurements_are_stored_listed_and_removed_as_by_the_other_engine() {
                 both!(theirs, ours, segments::extent(site_pk, &filter));
             }
             both!(theirs, ours, segments::of_all_sites((3, 40), 30));
-            both!(
-                theirs,
-                ours,
-                segments::first_since(Timestamp::from_second(4).unwrap())
-            );
+            let since = Timestamp::from_second(4).unwrap();
+            both!(theirs, ours, segments::first_since(since));
             let (robot_pk, site_pk, after) = (1, 1, 4);
             let of_robot: Vec<_> = segments::of_robot(&mut ours, RobotCursor { robot_pk, after })
                 .try_collect()

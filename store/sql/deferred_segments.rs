@@ -70,7 +70,7 @@ pub async fn take(
                ORDER BY seq LIMIT $3)
            RETURNING seq AS "seq!", measurement AS "measurement!""#,
         filter.boot_pk,
-        filter.ended_before_us,
+        filter.ended_until_us,
         i64::from(limit),
     )
     .fetch_all(db)

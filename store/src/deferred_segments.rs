@@ -18,8 +18,8 @@ pub struct DeferredSegment {
 pub struct DeferredFilter {
     /// Only those of this run of the agent.
     pub boot_pk: i64,
-    /// Only those that ended before this time of its robot's clock, microseconds since 1970.
-    pub ended_before_us: i64,
+    /// Only those that ended at this time of its robot's clock, or before, microseconds since 1970.
+    pub ended_until_us: i64,
 }
 
 /// Origin of a segment.

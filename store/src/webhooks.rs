@@ -66,7 +66,7 @@ pub struct DueTimes {
 /// Limit of the age of waiting deliveries.
 #[derive(Debug, Clone, Copy)]
 pub struct AgeLimit {
-    /// Present time.
+    /// Present time, at which those that are too old end.
     pub now: Timestamp,
     /// Time before which none may have been queued.
     pub oldest: Timestamp,

@@ -2,6 +2,7 @@
 //! compiler: see `swappable-arguments.txt` for the exceptions.
 //!
 //! Functions of tests do not count, nor do implementations of traits: the trait's own function does.
+//! Types are compared as they are written, so a `&str` beside an `impl Into<String>` is not found.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -35,12 +36,21 @@ impl<'ast> Visit<'ast> for TypeText {
     }
 
     fn visit_type(&mut self, of: &'ast syn::Type) {
-        let (open, close) = match of {
-            syn::Type::Reference(of) if of.mutability.is_some() => ("&mut(", ")"),
-            syn::Type::Reference(_) => ("&(", ")"),
-            syn::Type::Tuple(_) => ("(", ")"),
-            syn::Type::Slice(_) | syn::Type::Array(_) => ("[", "]"),
-            _ => ("", ","),
+        let (open, close) = if let syn::Type::Reference(of) = of {
+            (
+                if of.mutability.is_some() {
+                    "&mut("
+                } else {
+                    "&("
+                },
+                ")",
+            )
+        } else if matches!(of, syn::Type::Tuple(_)) {
+            ("(", ")")
+        } else if matches!(of, syn::Type::Slice(_) | syn::Type::Array(_)) {
+            ("[", "]")
+        } else {
+            ("", ",")
         };
         self.0.push_str(open);
         visit::visit_type(self, of);

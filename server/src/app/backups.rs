@@ -234,7 +234,7 @@ pub async fn make(
         target: &copy.0,
     };
     watch_copy(paths, |bytes| {
-        progress(Progress::Copying { bytes, of: size })
+        progress(Progress::Copying { bytes, of: size });
     })
     .await?;
     progress(Progress::Checking);

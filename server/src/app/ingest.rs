@@ -584,7 +584,7 @@ async fn released(
 ) -> Result<Vec<(RecordKey, Ready<'static>)>, DbError> {
     let filter = DeferredFilter {
         boot_pk,
-        ended_before_us: skew.latest_us(),
+        ended_until_us: skew.latest_us(),
     };
     let waiting = db::deferred_segments::take(tx, filter, RELEASED_MAX).await?;
     let ready = |waiting: db::deferred_segments::DeferredSegment| match prepared(

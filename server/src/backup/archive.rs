@@ -314,7 +314,7 @@ fn write_new(
     filter.check(status)?;
     packed?;
     let (file, archived) = file.done();
-    filter.check_size(&archived, &source.manifest.database)?;
+    filter.check_size(archived.bytes, &source.manifest.database)?;
     file.finish().map_err(failed())?;
     Ok(archived)
 }

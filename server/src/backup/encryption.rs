@@ -4,7 +4,6 @@
 use std::io::{self, BufReader, Read};
 use std::process::{Child, ChildStdout, Command, ExitStatus, Stdio};
 
-use super::archive::Archived;
 use super::manifest::ArchivedFile;
 
 /// Reason why an archive cannot be encrypted or decrypted.
@@ -29,7 +28,7 @@ pub enum EncryptionError {
     },
     /// The command succeeded and wrote nothing, or far too little.
     #[error(
-        "`{command}` wrote {written_bytes} bytes of an archive of more than {archive_bytes}: it must \
+        "`{command}` wrote {written_bytes} bytes of an archive of a database of {database_bytes}: it must \
          write all of it to its standard output, not to a file"
     )]
     TooLittle {
@@ -37,8 +36,8 @@ pub enum EncryptionError {
         command: String,
         /// Size of its output, bytes.
         written_bytes: u64,
-        /// Minimum size of the archive, bytes.
-        archive_bytes: u64,
+        /// Size of the database in the archive, bytes.
+        database_bytes: u64,
     },
 }
 
@@ -72,17 +71,17 @@ impl Filter {
     /// [`EncryptionError::TooLittle`].
     pub fn check_size(
         &self,
-        written: &Archived,
+        written_bytes: u64,
         database: &ArchivedFile,
     ) -> Result<(), EncryptionError> {
-        let (written_bytes, archive_bytes) = (written.bytes, database.bytes);
-        if written_bytes > archive_bytes / COMPRESSION_MAX {
+        let database_bytes = database.bytes;
+        if written_bytes > database_bytes / COMPRESSION_MAX {
             return Ok(());
         }
         Err(EncryptionError::TooLittle {
             command: self.0.clone(),
             written_bytes,
-            archive_bytes,
+            database_bytes,
         })
     }
 

@@ -7,6 +7,7 @@
 
 use std::collections::BTreeMap;
 use std::net::{Ipv4Addr, SocketAddr};
+use std::num::NonZeroUsize;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -115,7 +116,7 @@ impl Rig {
         let security = Security {
             authorities: Arc::clone(&authorities),
             names: Vec::new(),
-            robots_per_router: 256,
+            robots_per_router: NonZeroUsize::MIN.saturating_add(255),
         };
         let supervisor = Supervisor::new();
         let address = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
@@ -596,6 +597,29 @@ async fn an_opening_that_is_none_ends_the_link_and_harms_nobody() {
     put(&own.zenoh, key.clone(), "here".to_owned());
     witness.published.waits_for(&signed(&key, b"here")).await;
     own.close().await;
+    rig.supervisor.stop().await.unwrap();
+    rig.fleet.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_router_has_no_more_robots_than_configured_and_robots_reach_their_own() {
+    let rig = Rig::start_with(|fleet| {
+        let opener = fleet.opener.get_mut().unwrap();
+        opener.as_mut().unwrap().robots_max = 1;
+    })
+    .await;
+    let sizes = || -> Vec<usize> {
+        let open = rig.fleet.routers.all();
+        open.iter().map(|router| router.robots.len()).collect()
+    };
+    assert_eq!(sizes(), [1; 3], "one for each robot that has ever joined");
+    let registry = rig.app.enrolment_registry();
+    registry.note(&enrolment("rover-4", 1, false));
+    until("a router is open for another one", async || sizes() == [1; 4]).await;
+    for who in [Who::Own, Who::Foreign] {
+        let session = rig.connect(who, 10_000).await.unwrap();
+        session.close().await;
+    }
     rig.supervisor.stop().await.unwrap();
     rig.fleet.close().await;
 }

@@ -34,6 +34,7 @@ mod test_client;
 mod tokens;
 
 use std::net::{SocketAddr, TcpListener};
+use std::num::NonZeroUsize;
 use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
 use std::time::Duration;
@@ -116,8 +117,8 @@ pub struct Security {
     pub authorities: Arc<Authorities>,
     /// Host names of the port, for its certificate.
     pub names: Vec<String>,
-    /// Maximum number of robots of a router, at least 1.
-    pub robots_per_router: usize,
+    /// Maximum number of robots of a router.
+    pub robots_per_router: NonZeroUsize,
 }
 
 /// The open network.
@@ -150,7 +151,7 @@ impl Fleet {
         let is_tls = security.is_some();
         let robots_max = security
             .as_ref()
-            .map_or(usize::MAX, |it| it.robots_per_router);
+            .map_or(usize::MAX, |it| it.robots_per_router.get());
         let (address, authorities, gate) = match security {
             None => {
                 let address = with_free_port(address)?;

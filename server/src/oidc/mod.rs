@@ -387,7 +387,7 @@ impl Provider {
                 | HttpError::Status(_)
                 | HttpError::NoAnswer) => ExchangeError::Unanswered(Box::new(error)),
             })?;
-            claims = with_user_info((claims, said), &subject, &self.groups_claim)?;
+            claims = with_user_info((claims, said), &self.groups_claim)?;
         }
         let id_token = id_token.to_string();
         Ok(SignedInThere {
@@ -434,13 +434,13 @@ impl Provider {
 /// the claim of groups.
 ///
 /// # Errors
-/// [`ExchangeError::UserInfo`] if the user info is not about `subject`.
+/// [`ExchangeError::UserInfo`] if the user info is not about the subject of the ID token.
 fn with_user_info(
     (mut claims, said): (Claims, Claims),
-    subject: &str,
     groups_claim: &str,
 ) -> Result<Claims, ExchangeError> {
-    if said.get("sub").and_then(serde_json::Value::as_str) != Some(subject) {
+    let subject = |of: &Claims| of.get("sub")?.as_str().map(str::to_owned);
+    if subject(&said).is_none_or(|said| subject(&claims) != Some(said)) {
         let detail = "its user info is about somebody else".to_owned();
         return Err(ExchangeError::UserInfo(detail));
     }
@@ -486,15 +486,15 @@ mod tests {
     fn groups_of_the_user_info_count_where_the_id_token_has_none() {
         let claims = |value| serde_json::from_value::<Claims>(value).unwrap();
         let own = || claims(json!({"sub": "7", "name": "Anna", "realm_access": {"other": 1}}));
-        let said = || {
+        let said = |subject: &str| {
             claims(json!({
-                "sub": "7", "name": "Bert", "realm_access": {"roles": ["night"]}, "realm": 3,
+                "sub": subject, "name": "Bert", "realm_access": {"roles": ["night"]}, "realm": 3,
             }))
         };
-        let both = with_user_info((own(), said()), "7", "realm_access.roles").unwrap();
+        let both = with_user_info((own(), said("7")), "realm_access.roles").unwrap();
         let groups = claim(&both, "realm_access.roles");
         assert_eq!(groups, Some(&json!(["night"])));
         assert_eq!(both["name"], "Anna", "the signed one counts");
-        assert!(with_user_info((own(), said()), "8", "realm_access.roles").is_err());
+        assert!(with_user_info((own(), said("8")), "realm_access.roles").is_err());
     }
 }

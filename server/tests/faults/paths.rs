@@ -280,7 +280,7 @@ pub(crate) const PATHS: &[WritePath] = &[
                     .await?;
                 let filter = DeferredFilter {
                     boot_pk,
-                    ended_before_us: 0,
+                    ended_until_us: 0,
                 };
                 db::deferred_segments::take(tx, filter, 10)
                     .await

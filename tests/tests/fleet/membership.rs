@@ -342,7 +342,7 @@ async fn robots_are_stopped(fleet: &Fleet, robots: &[RobotId]) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn robots_of_several_routers_drive_are_stopped_and_come_back_after_a_restart_of_the_server() {
+async fn robots_of_several_routers_drive_come_back_after_a_restart_of_the_server_and_are_stopped() {
     let node = Path::new(env!("CARGO_BIN_EXE_node"));
     let config = "[robots]\nauthority = \"authority\"\nrobots_per_router = 2\n";
     let mut fleet = Fleet::start_in_environment(node, config, &[]).await;
@@ -353,7 +353,6 @@ async fn robots_of_several_routers_drive_are_stopped_and_come_back_after_a_resta
         fleet.join(robot).await;
         fleet.start_agent(robot, x_m).await;
     }
-    assert!(fleet.counter("routers_opened").await >= 2);
     let mut missions = Vec::new();
     for (robot, x_m) in robots.iter().zip([0.0, 20.0, 40.0, 60.0, 80.0]) {
         missions.push(fleet.rest.send(robot, bend(x_m)).await);

@@ -5,6 +5,7 @@ mod outward;
 #[cfg(test)]
 mod tests;
 
+use std::ops::RangeInclusive;
 use std::time::Duration;
 
 use tread_api::robot::RobotModel;
@@ -62,13 +63,11 @@ fn sign(key: &'static str, sign: Option<f64>) -> Result<f64, ConfigError> {
 
 fn milliseconds(
     key: &'static str,
-    given: Option<f64>,
-    default: f64,
-    most: f64,
+    span_ms: f64,
+    range_ms: &RangeInclusive<f64>,
 ) -> Result<Duration, ConfigError> {
-    let span = given.unwrap_or(default);
-    within(key, span, &(SILENT_AFTER_MIN_MS..=most))?;
-    Ok(Duration::from_secs_f64(span * 1.0e-3))
+    within(key, span_ms, range_ms)?;
+    Ok(Duration::from_secs_f64(span_ms * 1.0e-3))
 }
 
 fn place(key: &'static str, [x_m, y_m, heading_rad]: [f64; 3]) -> Result<Pose, ConfigError> {
@@ -84,19 +83,21 @@ fn place(key: &'static str, [x_m, y_m, heading_rad]: [f64; 3]) -> Result<Pose, C
     }
 }
 
-/// Resolves the names of topics; the key is for errors.
+/// A topic's setting: its key, for errors, and its default.
+struct TopicSetting {
+    key: &'static str,
+    default: &'static str,
+}
+
+/// Resolves the names of topics.
 struct Topics {
     namespace: Name,
 }
 
 impl Topics {
-    fn name(
-        &self,
-        key: &'static str,
-        given: Option<&str>,
-        default: &str,
-    ) -> Result<Name, ConfigError> {
-        Name::topic(given.unwrap_or(default), &self.namespace).map_err(named(key))
+    fn name(&self, setting: &TopicSetting, given: Option<&str>) -> Result<Name, ConfigError> {
+        let text = given.unwrap_or(setting.default);
+        Name::topic(text, &self.namespace).map_err(named(setting.key))
     }
 }
 
@@ -125,7 +126,13 @@ impl Ros2File {
         let joints = joints.map(|joints| joints.checked(&topics)).transpose()?;
         let battery = self.battery.as_ref().map(|file| {
             let given = file.topic.as_deref();
-            topics.name("drive.ros2.battery.topic", given, "battery_state")
+            topics.name(
+                &TopicSetting {
+                    key: "drive.ros2.battery.topic",
+                    default: "battery_state",
+                },
+                given,
+            )
         });
         let settings = Ros2Settings {
             timing: self.timing()?,
@@ -197,18 +204,21 @@ impl Ros2File {
     }
 
     fn timing(&self) -> Result<Timing, ConfigError> {
-        let silent_max_ms = SILENT_AFTER_MAX.as_secs_f64() * 1.0e3;
+        let range_ms = SILENT_AFTER_MIN_MS..=SILENT_AFTER_MAX.as_secs_f64() * 1.0e3;
+        let pose_range_ms = SILENT_AFTER_MIN_MS..=POSE_LATE_AFTER_MAX_MS;
+        let silent_ms = self.silent_after_ms.unwrap_or(100.0);
+        let late_ms = self.late_after_ms.unwrap_or(100.0);
         let (silent_key, late_key) = ("drive.ros2.silent_after_ms", "drive.ros2.late_after_ms");
         let pose_key = "drive.ros2.pose_late_after_ms";
-        let pose_ms = self.pose_late_after_ms;
+        let pose_ms = self.pose_late_after_ms.unwrap_or(300.0);
         Ok(Timing {
             stamps: match self.stamps {
                 StampsFile::Host => StampClock::Host,
                 StampsFile::Base => StampClock::Base,
             },
-            silent_after: milliseconds(silent_key, self.silent_after_ms, 100.0, silent_max_ms)?,
-            late_after: milliseconds(late_key, self.late_after_ms, 100.0, silent_max_ms)?,
-            pose_late_after: milliseconds(pose_key, pose_ms, 300.0, POSE_LATE_AFTER_MAX_MS)?,
+            silent_after: milliseconds(silent_key, silent_ms, &range_ms)?,
+            late_after: milliseconds(late_key, late_ms, &range_ms)?,
+            pose_late_after: milliseconds(pose_key, pose_ms, &pose_range_ms)?,
         })
     }
 }
@@ -243,7 +253,13 @@ impl OdometryFile {
         let site = [self.site_x_m, self.site_y_m, self.site_heading_rad];
         let site = place("drive.ros2.odometry.site_x_m", site)?;
         Ok(OdometrySettings {
-            topic: topics.name("drive.ros2.odometry.topic", self.topic.as_deref(), "odom")?,
+            topic: topics.name(
+                &TopicSetting {
+                    key: "drive.ros2.odometry.topic",
+                    default: "odom",
+                },
+                self.topic.as_deref(),
+            )?,
             frame: text(self.frame.as_deref(), "odom"),
             child_frame: text(self.child_frame.as_deref(), "base_link"),
             motion_of: match self.motion_of {
@@ -261,7 +277,13 @@ impl ImuFile {
             return Err(refused("drive.ros2.imu.yaw_rad", "it must be finite"));
         }
         Ok(ImuSettings {
-            topic: topics.name("drive.ros2.imu.topic", self.topic.as_deref(), "imu/data")?,
+            topic: topics.name(
+                &TopicSetting {
+                    key: "drive.ros2.imu.topic",
+                    default: "imu/data",
+                },
+                self.topic.as_deref(),
+            )?,
             frame: text(self.frame.as_deref(), "imu_link"),
             yaw_rad: self.yaw_rad,
             is_upside_down: self.upside_down,
@@ -273,7 +295,13 @@ impl PoseFile {
     fn checked(&self, topics: &Topics) -> Result<PoseSettings, ConfigError> {
         let site = [self.site_x_m, self.site_y_m, self.site_heading_rad];
         Ok(PoseSettings {
-            topic: topics.name("drive.ros2.pose.topic", self.topic.as_deref(), "pose")?,
+            topic: topics.name(
+                &TopicSetting {
+                    key: "drive.ros2.pose.topic",
+                    default: "pose",
+                },
+                self.topic.as_deref(),
+            )?,
             frame: text(self.frame.as_deref(), "map"),
             site_from_map: place("drive.ros2.pose.site_x_m", site)?,
         })
@@ -318,9 +346,11 @@ impl JointsFile {
         }
         Ok(JointSettings {
             topic: topics.name(
-                "drive.ros2.joints.topic",
+                &TopicSetting {
+                    key: "drive.ros2.joints.topic",
+                    default: "joint_states",
+                },
                 self.topic.as_deref(),
-                "joint_states",
             )?,
             left: side(
                 "drive.ros2.joints.left",
@@ -385,7 +415,13 @@ impl CommandFile {
             )
         });
         Ok(CommandSettings {
-            topic: topics.name("drive.ros2.command.topic", self.topic.as_deref(), "cmd_vel")?,
+            topic: topics.name(
+                &TopicSetting {
+                    key: "drive.ros2.command.topic",
+                    default: "cmd_vel",
+                },
+                self.topic.as_deref(),
+            )?,
             kind,
             frame: self.frame.clone().unwrap_or_else(|| "base_link".to_owned()),
             base_radius_m,

@@ -3,7 +3,7 @@
 use tread_control::geometry::Pose;
 
 use super::file::OutwardFile;
-use super::{Topics, refused};
+use super::{TopicSetting, Topics, refused};
 use crate::config::ConfigError;
 use crate::drive::ros2::outward::OutwardTopic;
 use crate::drive::ros2::settings::{OutwardSettings, Ros2Settings};
@@ -30,7 +30,11 @@ impl OutwardFile {
         // Without a source of positions both paths stay empty.
         let (frame, site_from_frame) = frame(others).unwrap_or_default();
         let name = |topic, given: &Option<String>, default| {
-            topics.name(key(topic), given.as_deref(), default)
+            let setting = TopicSetting {
+                key: key(topic),
+                default,
+            };
+            topics.name(&setting, given.as_deref())
         };
         let settings = OutwardSettings {
             plan: name(OutwardTopic::Plan, &self.plan, "tread/plan")?,

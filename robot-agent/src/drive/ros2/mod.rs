@@ -34,7 +34,7 @@ use tread_control::measured::WheelSpeeds;
 use self::assemble::{Arrived, Assembler};
 use self::bus::Bus;
 use self::command_watch::Contest;
-use self::inlet::{Inlet, Tap, WAITING_MAX};
+use self::inlet::{Inlet, Tap, WAITING_MAX, topic_of};
 use self::obedience::{Obedience, Verdict};
 use self::outlet::Outlet;
 use self::refusal::{Counts, Refusal, Source};
@@ -96,7 +96,8 @@ impl Ros2Drive {
         tap: Option<&Arc<dyn Tap>>,
     ) -> Result<(Self, Bus), LinkError> {
         let settings = Arc::new(settings);
-        let (counts, outlet) = (Arc::new(Counts::of(&settings)), Arc::new(Outlet::default()));
+        let topic = |source| Some(topic_of(&settings, source)?.to_string());
+        let (counts, outlet) = (Arc::new(Counts::of(topic)), Arc::new(Outlet::default()));
         let arrivals = Arc::new(Arrivals::default());
         let (to_loop, arrived) = sync_channel(WAITING_MAX);
         let inlets = Inlet::all(&settings, &counts, &to_loop, &arrivals, clock);

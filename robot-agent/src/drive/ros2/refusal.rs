@@ -6,9 +6,6 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use tread_ros2::cdr::CdrError;
 use tread_ros2::rmw::KeyMismatch;
 
-use super::inlet::topic_of;
-use super::settings::Ros2Settings;
-
 /// An event on a topic that is read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Notice {
@@ -211,10 +208,10 @@ pub struct Counts {
 }
 
 impl Counts {
-    /// Creates the counts of the topics that the settings name.
-    pub fn of(settings: &Ros2Settings) -> Self {
+    /// Creates the counts of the configured topics, whose names `topic_of` returns.
+    pub fn of(topic_of: impl Fn(Source) -> Option<String>) -> Self {
         Self {
-            topics: Source::ALL.map(|source| Some(topic_of(settings, source)?.to_string())),
+            topics: Source::ALL.map(topic_of),
             ..Self::default()
         }
     }
