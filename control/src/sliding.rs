@@ -23,7 +23,7 @@ use crate::robot::{GRAVITY_M_S2, RobotModel};
 /// Time constant of the low-pass filter of turn rates, seconds.
 const SMOOTHING_S: f64 = 0.05;
 /// Shortest time in which the demonstrated acceleration rises to what the plan needs along the path,
-/// seconds. A hit moves the body for a few hundredths of a second, a bend for longer.
+/// seconds. A hit shows for about 0.1 s after the low-pass filter, a bend for longer.
 const SHOWN_S: f64 = 0.3;
 /// Factor by which the lead that linear slip explains is enlarged.
 const EXPLAINED_RATIO: f64 = 1.2;

@@ -359,9 +359,9 @@ fn wheels_that_strike_an_obstacle_do_not_show_friction() {
         drive(&mut robot, &bends);
     }
     let before = robot.estimator.estimate().mu_peak_lower_bound.unwrap();
-    // The obstacle holds the wheels for half a second with the load of a side.
+    // The obstacle holds the wheels for 0.4 s with the load of a side.
     robot.struck_n_m = robot.model.side_load_n() * robot.model.wheel_radius_m();
-    drive(&mut robot, &[(0.5, 0.6, 0.0)]);
+    drive(&mut robot, &[(0.4, 0.6, 0.0)]);
     robot.struck_n_m = 0.0;
     drive(&mut robot, &bends);
     let after = robot.estimator.estimate().mu_peak_lower_bound.unwrap();

@@ -16,7 +16,7 @@ use crate::control_loop::surface::Comparison;
 use crate::drive::Battery;
 use crate::drive::ros2::notices::{ForeignCommands, Noticing};
 use crate::drive::ros2::refusal::Notice;
-use crate::drive::ros2::refusal::{Counts, Dropping};
+use crate::drive::ros2::refusal::{Counts, Dropping, Source};
 use crate::outbox::OutboxDamage;
 
 /// Charge below which the battery is low, and charge above which it no longer is.
@@ -192,6 +192,21 @@ fn standing_alert(report: &StandingReport) -> Option<AlertReport> {
     alert(code, Severity::Critical, text)
 }
 
+/// Returns the alert of a fault; that of a silent base names the topics that never came.
+fn fault_alert(fault: Fault, base: Option<&Counts>) -> Option<AlertReport> {
+    let code = match fault {
+        Fault::BaseSilent => "base-silent",
+        Fault::PositionLost => "position-lost",
+    };
+    let base = base.filter(|_| fault == Fault::BaseSilent);
+    let unheard = base.and_then(|base| base.unheard(&Source::OF_BASE));
+    let text = match unheard {
+        Some(unheard) => format!("{}: {unheard}", fault.text()),
+        None => fault.text().to_owned(),
+    };
+    alert(code, Severity::Critical, text)
+}
+
 impl Alerts {
     /// Returns the alerts that are raised now.
     pub(crate) fn judge(&mut self, causes: &Causes<'_>) -> Vec<AlertReport> {
@@ -213,18 +228,9 @@ impl Alerts {
         } else {
             None
         };
-        let fault = causes.fault.and_then(|fault| {
-            let code = match fault {
-                Fault::BaseSilent => "base-silent",
-                Fault::PositionLost => "position-lost",
-            };
-            let unheard = causes.base.and_then(Counts::unheard);
-            let text = match unheard {
-                Some(unheard) => format!("{}: {unheard}", fault.text()),
-                None => fault.text().to_owned(),
-            };
-            alert(code, Severity::Critical, text)
-        });
+        let fault = causes
+            .fault
+            .and_then(|fault| fault_alert(fault, causes.base));
         let dropped = causes.base.and_then(|base| {
             let (refusal, text) = self.dropping.look(base)?;
             let code = format!("base-{}", refusal.code());

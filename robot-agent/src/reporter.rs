@@ -19,7 +19,7 @@ use crate::control_loop::channels::{Shared, Snapshot};
 use crate::control_loop::standing::StandingReport;
 use crate::drive::ros2::notices::{ForeignCommands, Noticing};
 use crate::drive::ros2::refusal::Notice;
-use crate::drive::ros2::refusal::{Counts, Dropping};
+use crate::drive::ros2::refusal::{Counts, Dropping, Source};
 use crate::fleet::{FleetLink, Identity};
 use crate::geometry::{wire_pose, wire_twist};
 use crate::knowledge::SiteCell;
@@ -267,7 +267,7 @@ pub(crate) async fn log_losses(
                 warn!("{text}");
             }
             foreign_said = text;
-            let text = base.unheard();
+            let text = base.unheard(&Source::CONTINUOUS);
             if let Some(text) = text.as_ref().filter(|_| text != unheard_said) {
                 warn!("{text}: does a node publish it under this name? (`tread-agent doctor`)");
             }

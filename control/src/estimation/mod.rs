@@ -522,7 +522,8 @@ impl Estimator {
     }
 
     /// Returns the upper end of the 95 % interval of the torque scale: the ground gives at least the
-    /// measured friction coefficient divided by it.
+    /// measured friction coefficient divided by it. What the accelerometer shows does not depend on the
+    /// load, and is divided all the same.
     fn torque_scale_upper_bound(&self) -> f64 {
         let scale = self.torque_scale();
         (scale.value + NORMAL_95 * scale.std_dev).max(1.0)

@@ -158,8 +158,7 @@ impl Sums {
         }
     }
 
-    /// Returns the lower bound of the peak friction coefficient; `None` before enough blocks with
-    /// force.
+    /// Returns the lower bound of the peak friction coefficient; `None` before any force.
     pub(super) fn mu_peak(&self) -> Option<f64> {
         self.friction.lower_bound()
     }

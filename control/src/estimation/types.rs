@@ -317,7 +317,7 @@ pub struct Estimate {
     /// Whether the last block brought no new information on θ.
     pub no_new_information: bool,
     /// Lower bound of the peak friction coefficient: what several blocks used, for the heaviest load
-    /// that the torques allow; `None` before as many blocks with force.
+    /// that the torques allow; `None` before any force.
     pub mu_peak_lower_bound: Option<f64>,
     /// Ratio of effective to geometric track width; `None` before enough turning.
     pub effective_track_ratio: Option<f64>,

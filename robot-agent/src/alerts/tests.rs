@@ -8,7 +8,6 @@ use tread_control::tracking::ThetaKnowledge;
 
 use super::*;
 use crate::drive::ros2::inlet::topic_of;
-use crate::drive::ros2::refusal::Source;
 
 fn codes(alerts: &[AlertReport]) -> Vec<&str> {
     alerts.iter().map(|alert| alert.code.as_str()).collect()
@@ -135,7 +134,7 @@ fn a_base_that_started_again_and_a_second_commander_are_alerts() {
 fn a_base_that_is_not_heard_is_an_alert_with_the_topics_that_never_came() {
     let settings = crate::drive::ros2::tests::settings();
     let counts = Counts::of(|source| Some(topic_of(&settings, source)?.to_string()));
-    counts.take(Source::Imu);
+    counts.receive(Source::Imu);
     let said = Alerts::default().judge(&Causes {
         base: Some(&counts),
         fault: Some(Fault::BaseSilent),

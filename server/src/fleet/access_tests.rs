@@ -615,7 +615,10 @@ async fn a_router_has_no_more_robots_than_configured_and_robots_reach_their_own(
     assert_eq!(sizes(), [1; 3], "one for each robot that has ever joined");
     let registry = rig.app.enrolment_registry();
     registry.note(&enrolment("rover-4", 1, false));
-    until("a router is open for another one", async || sizes() == [1; 4]).await;
+    until("a router is open for another one", async || {
+        sizes() == [1; 4]
+    })
+    .await;
     for who in [Who::Own, Who::Foreign] {
         let session = rig.connect(who, 10_000).await.unwrap();
         session.close().await;

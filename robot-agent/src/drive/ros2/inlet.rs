@@ -126,6 +126,7 @@ impl Inlet {
 
     /// Checks a message and queues it, or counts the reason for which it is dropped.
     pub fn take(&self, key: &str, attachment: Option<&[u8]>, payload: &[u8]) {
+        self.counts.receive(self.source);
         match self.read(key, attachment, payload) {
             Ok(None) => {}
             Ok(Some(arrived)) => {

@@ -184,6 +184,11 @@ impl Source {
         Self::Battery,
     ];
 
+    /// Topics without which the base counts as silent.
+    pub const OF_BASE: [Self; 3] = [Self::Odometry, Self::Imu, Self::Joints];
+    /// Topics that are published continuously; a battery may be published rarely.
+    pub const CONTINUOUS: [Self; 4] = [Self::Odometry, Self::Imu, Self::Joints, Self::Pose];
+
     /// Returns the name of the topic's section in `robot.toml`.
     pub fn section(self) -> &'static str {
         match self {
@@ -199,6 +204,7 @@ impl Source {
 /// Numbers of messages used and dropped, by topic and reason, and of other events on the bus.
 #[derive(Debug, Default)]
 pub struct Counts {
+    received: [AtomicU64; Source::ALL.len()],
     taken: [AtomicU64; Source::ALL.len()],
     dropped: [[AtomicU64; Refusal::ALL.len()]; Source::ALL.len()],
     noted: [[AtomicU64; Notice::ALL.len()]; Source::ALL.len()],
@@ -216,22 +222,29 @@ impl Counts {
         }
     }
 
-    /// Returns a description of the configured topics on which no message has come since the start,
-    /// for people; `None` if there was one on each.
-    pub fn unheard(&self) -> Option<String> {
+    /// Counts a message that came, whether it is used or not.
+    pub fn receive(&self, source: Source) {
+        self.received[source as usize].fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// Returns a description of those of these topics that are configured and on which no message
+    /// has come since the start, for people; `None` if there is none.
+    pub fn unheard(&self, sources: &[Source]) -> Option<String> {
         let is_unheard = |source: &Source| {
-            let mut dropped = self.dropped[*source as usize].iter();
-            self.taken(*source) == 0 && dropped.all(|count| count.load(Ordering::Relaxed) == 0)
+            let received = &self.received[*source as usize];
+            received.load(Ordering::Relaxed) == 0
         };
-        let topics: Vec<String> = Source::ALL
-            .into_iter()
+        let topics: Vec<String> = sources
+            .iter()
+            .copied()
             .filter(is_unheard)
             .filter_map(|source| {
                 let topic = self.topics[source as usize].as_ref()?;
                 Some(format!("`{topic}` ({})", source.section()))
             })
             .collect();
-        (!topics.is_empty()).then(|| format!("no message has come on {}", topics.join(", ")))
+        let topics = topics.join(", ");
+        (!topics.is_empty()).then(|| format!("no message has come on {topics} since the start"))
     }
 
     /// Counts a message that was used.
