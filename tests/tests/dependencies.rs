@@ -4,12 +4,16 @@
 //! A folder counts as one module among its siblings; what a parent and its children name of each
 //! other does not count. Code that is compiled for tests alone does not either.
 
+mod rust_source;
+
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::fs;
 use std::path::Path;
 
 use syn::visit::Visit;
 use tread_tests::repository::{files, root};
+
+use rust_source::is_for_tests;
 
 /// Crates whose modules are read.
 const CRATES: [&str; 12] = [
@@ -160,15 +164,6 @@ impl Names<'_> {
             }
         }
     }
-}
-
-fn is_for_tests(attributes: &[syn::Attribute]) -> bool {
-    attributes.iter().any(|attribute| {
-        attribute.path().is_ident("cfg")
-            && attribute
-                .parse_args::<syn::Ident>()
-                .is_ok_and(|condition| condition == "test")
-    })
 }
 
 impl<'ast> Visit<'ast> for Names<'_> {

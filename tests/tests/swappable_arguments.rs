@@ -4,12 +4,16 @@
 //! Functions of tests do not count, nor do implementations of traits: the trait's own function does.
 //! Types are compared as they are written, so a `&str` beside an `impl Into<String>` is not found.
 
+mod rust_source;
+
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::fs;
 
 use syn::visit::{self, Visit};
 use tread_tests::repository::{files, root};
+
+use rust_source::is_for_tests;
 
 /// A type as a text without lifetimes.
 #[derive(Default)]
@@ -62,17 +66,6 @@ fn text_of(of: &syn::Type) -> String {
     let mut text = TypeText::default();
     text.visit_type(of);
     text.0
-}
-
-fn is_for_tests(attributes: &[syn::Attribute]) -> bool {
-    attributes.iter().any(|attribute| {
-        let is_test = attribute.path().is_ident("test");
-        is_test
-            || attribute.path().is_ident("cfg")
-                && attribute
-                    .parse_args::<syn::Ident>()
-                    .is_ok_and(|condition| condition == "test")
-    })
 }
 
 /// Finds the functions with two arguments of one type.
