@@ -199,9 +199,9 @@ fn fault_alert(fault: Fault, base: Option<&Counts>) -> Option<AlertReport> {
         Fault::PositionLost => "position-lost",
     };
     let base = base.filter(|_| fault == Fault::BaseSilent);
-    let unheard = base.and_then(|base| base.unheard(&Source::OF_BASE));
-    let text = match unheard {
-        Some(unheard) => format!("{}: {unheard}", fault.text()),
+    let missing = base.and_then(|base| base.topics_without_messages(&Source::OF_BASE));
+    let text = match missing {
+        Some(missing) => format!("{}: {missing}", fault.text()),
         None => fault.text().to_owned(),
     };
     alert(code, Severity::Critical, text)

@@ -242,7 +242,7 @@ pub(crate) async fn log_losses(
     let mut noticing = [Noticing::default(); Notice::ALL.len()];
     let mut noticed = [const { None }; Notice::ALL.len()];
     let (mut foreign, mut foreign_said) = (ForeignCommands::default(), None);
-    let mut unheard_said = None;
+    let mut missing_said = None;
     loop {
         tokio::select! {
             () = tokio::time::sleep(LOSSES_EVERY) => {}
@@ -267,11 +267,11 @@ pub(crate) async fn log_losses(
                 warn!("{text}");
             }
             foreign_said = text;
-            let text = base.unheard(&Source::CONTINUOUS);
-            if let Some(text) = text.as_ref().filter(|_| text != unheard_said) {
+            let text = base.topics_without_messages(&Source::CONTINUOUS);
+            if let Some(text) = text.as_ref().filter(|_| text != missing_said) {
                 warn!("{text}: does a node publish it under this name? (`tread-agent doctor`)");
             }
-            unheard_said = text;
+            missing_said = text;
         }
         let lost = shared.lost_segments.load(Ordering::Relaxed);
         if lost > segments {

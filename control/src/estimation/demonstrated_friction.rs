@@ -60,7 +60,9 @@ mod tests {
 
     proptest! {
         #[test]
-        fn the_bound_is_the_fourth_largest_or_the_smallest_of_fewer_in_any_order(mut all in used(), cut in 0..20_usize) {
+        fn the_bound_is_the_fourth_largest_or_the_smallest_of_fewer_in_any_order(
+            mut all in used(), cut in 0..20_usize,
+        ) {
             let cut = cut.min(all.len());
             let merged = of(&all[..cut]).plus(&of(&all[cut..]));
             prop_assert_eq!(merged, of(&all[cut..]).plus(&of(&all[..cut])));

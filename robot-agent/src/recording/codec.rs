@@ -278,7 +278,7 @@ pub(super) fn outputs(tick: &LoopTick<'_>) -> [(&'static str, f64); 22] {
         ("theta of the law", tick.theta_loop),
         ("theta measured", tick.theta),
         ("standard deviation of theta", tick.theta_std_dev),
-        ("way, m", tick.driven_m),
+        ("driven distance, m", tick.driven_m),
         ("cross-track error, m", tick.cross_track_m),
         ("slip left", tick.slip_left_ratio),
         ("slip right", tick.slip_right_ratio),

@@ -229,15 +229,15 @@ impl Counts {
 
     /// Returns a description of those of these topics that are configured and on which no message
     /// has come since the start, for people; `None` if there is none.
-    pub fn unheard(&self, sources: &[Source]) -> Option<String> {
-        let is_unheard = |source: &Source| {
+    pub fn topics_without_messages(&self, sources: &[Source]) -> Option<String> {
+        let is_missing = |source: &Source| {
             let received = &self.received[*source as usize];
             received.load(Ordering::Relaxed) == 0
         };
         let topics: Vec<String> = sources
             .iter()
             .copied()
-            .filter(is_unheard)
+            .filter(is_missing)
             .filter_map(|source| {
                 let topic = self.topics[source as usize].as_ref()?;
                 Some(format!("`{topic}` ({})", source.section()))
