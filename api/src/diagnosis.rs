@@ -33,10 +33,14 @@ pub struct Finding {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct NextStep<S>(pub S);
 
-impl Finding {
-    fn new(name: &str, verdict: Verdict, text: impl Into<String>) -> Self {
-        Self {
-            name: name.to_owned(),
+/// A question that is about to be answered, see [`Finding::on`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Question<'a>(&'a str);
+
+impl Question<'_> {
+    fn answer(self, verdict: Verdict, text: impl Into<String>) -> Finding {
+        Finding {
+            name: self.0.to_owned(),
             verdict,
             text: text.into(),
             next_step: None,
@@ -45,34 +49,42 @@ impl Finding {
 
     /// Returns the finding that nothing is wrong.
     #[must_use]
-    pub fn ok(name: &str, text: impl Into<String>) -> Self {
-        Self::new(name, Verdict::Ok, text)
+    pub fn ok(self, text: impl Into<String>) -> Finding {
+        self.answer(Verdict::Ok, text)
     }
 
     /// Returns the finding that the question was not examined.
     #[must_use]
-    pub fn skipped(name: &str, text: impl Into<String>) -> Self {
-        Self::new(name, Verdict::Skipped, text)
+    pub fn skipped(self, text: impl Into<String>) -> Finding {
+        self.answer(Verdict::Skipped, text)
     }
 
     /// Returns a warning with its remedy.
     #[must_use]
     pub fn warning(
-        name: &str,
+        self,
         text: impl Into<String>,
         next_step: NextStep<impl Into<String>>,
-    ) -> Self {
-        Self::new(name, Verdict::Warning, text).with(next_step)
+    ) -> Finding {
+        self.answer(Verdict::Warning, text).with(next_step)
     }
 
     /// Returns a problem with its remedy.
     #[must_use]
     pub fn problem(
-        name: &str,
+        self,
         text: impl Into<String>,
         next_step: NextStep<impl Into<String>>,
-    ) -> Self {
-        Self::new(name, Verdict::Problem, text).with(next_step)
+    ) -> Finding {
+        self.answer(Verdict::Problem, text).with(next_step)
+    }
+}
+
+impl Finding {
+    /// Begins the answer to the question of this name.
+    #[must_use]
+    pub fn on(name: &str) -> Question<'_> {
+        Question(name)
     }
 
     fn with(self, NextStep(next_step): NextStep<impl Into<String>>) -> Self {

@@ -2,7 +2,8 @@
 //! compiler: see `swappable-arguments.txt` for the exceptions.
 //!
 //! Functions of tests do not count, nor do implementations of traits: the trait's own function does.
-//! Types are compared as they are written, so a `&str` beside an `impl Into<String>` is not found.
+//! Types are compared as they are written, but for those that a text is passed as, such as `&str` and
+//! `impl Into<String>`: they count as one.
 
 mod rust_source;
 
@@ -62,9 +63,31 @@ impl<'ast> Visit<'ast> for TypeText {
     }
 }
 
+/// The types that a text is passed as, without their spaces and commas.
+const TEXTS: [&str; 7] = [
+    "&(str)",
+    "String",
+    "impl Into<String>",
+    "impl AsRef<str>",
+    "impl Display",
+    "impl fmt Display",
+    "impl std fmt Display",
+];
+
 fn text_of(of: &syn::Type) -> String {
     let mut text = TypeText::default();
     text.visit_type(of);
+    if let syn::Type::ImplTrait(_) = of {
+        text.0.insert_str(0, "impl");
+    }
+    let plain = text
+        .0
+        .replace(',', "")
+        .replace("( ", "(")
+        .replace("< ", "<");
+    if TEXTS.contains(&plain.trim()) {
+        return "text".to_owned();
+    }
     text.0
 }
 
@@ -144,6 +167,8 @@ fn two_arguments_of_one_type_are_found_and_others_are_not() {
         fn swapped(from_m: f64, to_m: f64) {}
         fn fine(from_m: f64, at: Duration, list: &[f64], all: [f64; 2], two: Option<f64>) {}
         fn borrowed<'a>(one: &'a str, other: &str) {}
+        fn texts(one: &str, other: impl Into<String>) {}
+        fn shown(one: String, other: impl Display) {}
         fn sizes(one: [f64; 2], other: [f64; 3]) {}
         impl Trait for X { fn fixed(&self, a: u8, b: u8) {} }
         impl X { fn method(&self, a: u8, b: u8) {} }
@@ -152,7 +177,9 @@ fn two_arguments_of_one_type_are_found_and_others_are_not() {
     ";
     assert_eq!(
         swappable_of(text),
-        ["swapped", "borrowed", "method", "of_trait"]
+        [
+            "swapped", "borrowed", "texts", "shown", "method", "of_trait"
+        ]
     );
 }
 

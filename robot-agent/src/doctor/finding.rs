@@ -36,10 +36,14 @@ pub(crate) struct Finding {
     pub(crate) lines: Vec<Line>,
 }
 
-impl Finding {
-    pub(super) fn ok(name: &'static str, text: impl Into<String>) -> Self {
-        Self {
-            name,
+/// A question that is about to be answered, see [`Finding::on`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Question(&'static str);
+
+impl Question {
+    pub(super) fn ok(self, text: impl Into<String>) -> Finding {
+        Finding {
+            name: self.0,
             holds: true,
             is_skipped: false,
             key: None,
@@ -48,20 +52,27 @@ impl Finding {
         }
     }
 
-    pub(super) fn wrong(name: &'static str, Key(key): Key, text: impl Into<String>) -> Self {
-        Self {
+    pub(super) fn wrong(self, Key(key): Key, text: impl Into<String>) -> Finding {
+        Finding {
             holds: false,
             key: Some(key),
-            ..Self::ok(name, text)
+            ..self.ok(text)
         }
     }
 
     /// A question that could not be examined, because of another finding.
-    pub(super) fn skipped(name: &'static str, text: impl Into<String>) -> Self {
-        Self {
+    pub(super) fn skipped(self, text: impl Into<String>) -> Finding {
+        Finding {
             is_skipped: true,
-            ..Self::ok(name, text)
+            ..self.ok(text)
         }
+    }
+}
+
+impl Finding {
+    /// Begins the answer to the question of this name.
+    pub(super) fn on(name: &'static str) -> Question {
+        Question(name)
     }
 
     /// Adds a line that corrects the problem.
@@ -119,11 +130,13 @@ mod tests {
     fn lines_of_all_findings_are_tables_that_toml_reads() {
         let left = list(&["front \"left\"".to_owned(), "rear".to_owned()]);
         let findings = [
-            Finding::wrong("command", Key("drive.ros2.command.track_width_m"), "")
+            Finding::on("command")
+                .wrong(Key("drive.ros2.command.track_width_m"), "")
                 .with_line(Key("drive.ros2.command.track_width_m"), "0.430")
                 .with_line(Key("drive.ros2.joints.left"), left),
-            Finding::ok("imu", "all is well"),
-            Finding::wrong("signs", Key("drive.ros2.command.turn_sign"), "")
+            Finding::on("imu").ok("all is well"),
+            Finding::on("signs")
+                .wrong(Key("drive.ros2.command.turn_sign"), "")
                 .with_line(Key("drive.ros2.command.turn_sign"), "-1")
                 .with_line(Key("drive.ros2.command.track_width_m"), "0.5"),
         ];

@@ -81,22 +81,18 @@ impl Frozen {
             let text = format!(
                 "{which} the same speed all the time, though the robot moved ({moved}): they froze"
             );
-            findings.push(Finding::wrong("joints", Key(key), text));
+            findings.push(Finding::on("joints").wrong(Key(key), text));
         }
         if self.gyro {
             let text =
                 "the gyro says the same turn rate all the time, though the wheels turned: it froze";
-            findings.push(Finding::wrong("imu", Key("drive.ros2.imu.topic"), text));
+            findings.push(Finding::on("imu").wrong(Key("drive.ros2.imu.topic"), text));
         }
         // If the odometry gives the wheel speeds, the finding on the wheels covers it.
         if self.odometry && (settings.joints.is_some() || !self.joints()) {
             let text =
                 "the odometry says the same motion all the time, though the robot moved: it froze";
-            findings.push(Finding::wrong(
-                "odometry",
-                Key("drive.ros2.odometry.topic"),
-                text,
-            ));
+            findings.push(Finding::on("odometry").wrong(Key("drive.ros2.odometry.topic"), text));
         }
         if self.position {
             let key = if settings.pose.is_some() {
@@ -105,7 +101,7 @@ impl Frozen {
                 "drive.ros2.odometry.topic"
             };
             let text = "the position never changes, though the robot moved: it froze";
-            findings.push(Finding::wrong("pose", Key(key), text));
+            findings.push(Finding::on("pose").wrong(Key(key), text));
         }
         findings
     }

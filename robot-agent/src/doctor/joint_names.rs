@@ -59,7 +59,7 @@ impl JointNames {
             self.text(),
             missing.join(", ")
         );
-        let finding = Finding::wrong("joints", Key(key), text);
+        let finding = Finding::on("joints").wrong(Key(key), text);
         Some(match self.sides() {
             Some((left, right)) => finding
                 .with_line(Key("drive.ros2.joints.left"), list(&left))

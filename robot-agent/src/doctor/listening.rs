@@ -73,7 +73,7 @@ pub(super) fn findings(
             if source != Source::Battery {
                 let (name, topic_key) = names(source);
                 let text = format!("nothing was heard on `{topic}`");
-                findings.push(Finding::wrong(name, topic_key, text));
+                findings.push(Finding::on(name).wrong(topic_key, text));
             }
             continue;
         }
@@ -151,14 +151,14 @@ fn of_gyro_at_rest(settings: &Ros2Settings, messages: &[Message]) -> Option<Find
     let degrees = bias_rad_s.to_degrees();
     if bias_rad_s.abs() <= GYRO_BIAS_MAX_RAD_S {
         let text = format!("the gyro says {bias_rad_s:.4} rad/s ({degrees:.2} °/s) at rest");
-        return Some(Finding::ok("gyro", text));
+        return Some(Finding::on("gyro").ok(text));
     }
     let text = format!(
         "the gyro says {bias_rad_s:.4} rad/s ({degrees:.2} °/s) while the robot stands, at most \
          {GYRO_BIAS_MAX_RAD_S} rad/s is good: it has a bias. Let its driver calibrate it at rest; no key of \
          robot.toml can"
     );
-    Some(Finding::wrong("gyro", Key("drive.ros2.imu.topic"), text))
+    Some(Finding::on("gyro").wrong(Key("drive.ros2.imu.topic"), text))
 }
 
 /// Returns a finding if several nodes publish on a topic or if messages are repeated.
@@ -175,7 +175,7 @@ fn of_writers(source: Source, messages: &[&Message]) -> Option<Finding> {
             "{} nodes write on it, and the agent hears only one: stop the others, or give each its own topic",
             writers.len()
         );
-        return Some(Finding::wrong(name, topic_key, text));
+        return Some(Finding::on(name).wrong(topic_key, text));
     }
     let is_repeated = |index: &usize| {
         let message = messages[*index];
@@ -192,7 +192,7 @@ fn of_writers(source: Source, messages: &[&Message]) -> Option<Finding> {
              router",
             100.0 * share
         );
-        return Some(Finding::wrong(name, topic_key, text));
+        return Some(Finding::on(name).wrong(topic_key, text));
     }
     None
 }
@@ -214,7 +214,7 @@ fn of_stamps(settings: &Ros2Settings, source: Source, messages: &[&Message]) -> 
     stands.then(|| {
         let text =
             "its time stamp stands still: what writes it says the same message again and again";
-        Finding::wrong(name, topic_key, text)
+        Finding::on(name).wrong(topic_key, text)
     })
 }
 
@@ -247,7 +247,7 @@ fn of_topic(
     let rate_hz = count / span.as_secs_f64();
     if is_fast(settings, source) && rate_hz < RATE_MIN_HZ {
         let text = format!("only {rate_hz:.1} messages a second: {RATE_MIN_HZ} are needed");
-        return Finding::wrong(name, topic_key, text);
+        return Finding::on(name).wrong(topic_key, text);
     }
     let mut ages_ms: Vec<f64> = messages
         .iter()
@@ -267,7 +267,7 @@ fn of_topic(
              good: what writes them is slow, or stamps them by another clock (then `stamps = \
              \"base\"`)"
         );
-        let finding = Finding::wrong(name, Key("drive.ros2.stamps"), text);
+        let finding = Finding::on(name).wrong(Key("drive.ros2.stamps"), text);
         let other = match settings.timing.stamps {
             StampClock::Host => "\"base\"",
             StampClock::Base => "\"host\"",
@@ -287,13 +287,10 @@ fn of_topic(
         1.0e3 * gap.as_secs_f64()
     });
     let gap_ms = gaps.fold(0.0, f64::max);
-    Finding::ok(
-        name,
-        format!(
-            "{rate_hz:.1} Hz, {middle_ms:.1} ms old when they come (the 99th of 100 {late_ms:.1} \
+    Finding::on(name).ok(format!(
+        "{rate_hz:.1} Hz, {middle_ms:.1} ms old when they come (the 99th of 100 {late_ms:.1} \
              ms), longest gap {gap_ms:.0} ms"
-        ),
-    )
+    ))
 }
 
 fn of_keys(settings: &Ros2Settings, source: Source, messages: &[&Message]) -> Option<Finding> {
@@ -305,15 +302,15 @@ fn of_keys(settings: &Ros2Settings, source: Source, messages: &[&Message]) -> Op
     match check_key(&message.key, &type_of(source), generation) {
         Err(KeyMismatch::Type) => {
             let text = format!("another type is written on it: `{}`", message.key);
-            Some(Finding::wrong(name, topic_key, text))
+            Some(Finding::on(name).wrong(topic_key, text))
         }
         Err(KeyMismatch::Hash) => {
             let text = format!("its type is defined otherwise: `{}`", message.key);
-            Some(Finding::wrong(name, Key("drive.ros2.distribution"), text))
+            Some(Finding::on(name).wrong(Key("drive.ros2.distribution"), text))
         }
         Ok(()) if message.attachment.is_none() => {
             let text = "its messages have no attachment: they are not written by rmw_zenoh_cpp";
-            Some(Finding::wrong(name, Key("drive.ros2.bus"), text))
+            Some(Finding::on(name).wrong(Key("drive.ros2.bus"), text))
         }
         Ok(()) => None,
     }
@@ -331,7 +328,7 @@ fn of_refusal(source: Source, refusal: Refusal, message: &Message, share: f64) -
             .collect();
         let frames = frames.join(" and ");
         let text = format!("it is of the frame {frames}, which the configuration does not name");
-        let finding = Finding::wrong(name, key, text);
+        let finding = Finding::on(name).wrong(key, text);
         return lines.into_iter().fold(finding, |finding, (key, frame)| {
             finding.with_line(key, format!("{frame:?}"))
         });
@@ -342,7 +339,7 @@ fn of_refusal(source: Source, refusal: Refusal, message: &Message, share: f64) -
         topic_key
     };
     let text = format!("{percent:.0} % of it are {}", refusal.text());
-    Finding::wrong(name, key, text)
+    Finding::on(name).wrong(key, text)
 }
 
 /// Returns the frames in a source's message with their keys; `None` if there are none.
@@ -395,9 +392,7 @@ fn effort(settings: &Ros2Settings, messages: &[&Message]) -> Option<Finding> {
         read.is_ok_and(|read| read.effort.iter().all(|effort| effort == 0.0))
     };
     if messages.iter().filter(says_torque).count() * 2 < messages.len() {
-        return Some(Finding::wrong(
-            "effort",
-            Key("drive.ros2.joints.effort"),
+        return Some(Finding::on("effort").wrong(Key("drive.ros2.joints.effort"),
             "the joints say no effort: friction shows in acceleration and turns alone (`effort = \
              \"none\"` says so)",
         )
@@ -406,7 +401,7 @@ fn effort(settings: &Ros2Settings, messages: &[&Message]) -> Option<Finding> {
     if messages.iter().all(is_zero) {
         let text =
             "the joints' effort is zero at rest: whether it is measured shows in motion (`--move`)";
-        return Some(Finding::skipped("effort", text));
+        return Some(Finding::on("effort").skipped(text));
     }
-    Some(Finding::ok("effort", "the joints say how they pull"))
+    Some(Finding::on("effort").ok("the joints say how they pull"))
 }

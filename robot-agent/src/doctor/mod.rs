@@ -181,7 +181,7 @@ impl ExaminedDrive {
                  stop it, or let both write on topics of their own and put a twist_mux behind them",
                 settings.command.topic
             );
-            Finding::wrong("command", Key("drive.ros2.command.topic"), text)
+            Finding::on("command").wrong(Key("drive.ros2.command.topic"), text)
         })
     }
 
@@ -197,7 +197,7 @@ impl ExaminedDrive {
         let is_unusable = self.drive.must_rest() && findings.iter().any(|finding| !finding.holds);
         if is_unusable || self.other_commander(settings).is_some() {
             let text = "the robot was not moved: mend the findings above first";
-            findings.push(Finding::skipped("moving", text));
+            findings.push(Finding::on("moving").skipped(text));
             return findings;
         }
         let rim_rad_s = RIM_M_S / model.wheel_radius_m();

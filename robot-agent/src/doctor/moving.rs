@@ -50,16 +50,13 @@ pub(super) fn findings(
 ) -> Vec<Finding> {
     let Drives { turned, forward } = drives;
     if !(turned.is_heard && forward.is_heard) {
-        return vec![Finding::wrong(
-            "wheels",
-            Key("drive.ros2.silent_after_ms"),
+        return vec![Finding::on("wheels").wrong(Key("drive.ros2.silent_after_ms"),
             "the base fell silent whenever it was moved: its messages come with gaps, or its machine \
              is overloaded",
         )];
     }
     let (Some(turning), Some(going)) = (turned.wheels, forward.wheels) else {
-        return vec![Finding::wrong(
-            "wheels",
+        return vec![Finding::on("wheels").wrong(
             Key("drive.ros2.joints.topic"),
             "the wheels said nothing while they were commanded to move",
         )];
@@ -68,7 +65,7 @@ pub(super) fn findings(
     let mut findings = frozen.findings(settings, drives);
     if frozen.left || frozen.right {
         let text = "sides, signs, radius and track: they need the joints";
-        findings.push(Finding::skipped("sides", text));
+        findings.push(Finding::on("sides").skipped(text));
         return findings;
     }
     let of_forward = directions(going, forward);
@@ -101,7 +98,7 @@ pub(super) fn findings(
     findings.push(sides);
     if !is_well {
         let text = "radius, track and torque: they need sides and signs";
-        findings.push(Finding::skipped("track", text));
+        findings.push(Finding::on("track").skipped(text));
         return findings;
     }
     let stays = ground_m_s.is_some() && answers.went == 0;
@@ -145,11 +142,7 @@ fn of_standing(answers: Answers) -> Option<Finding> {
         }
         (false, false) => return None,
     };
-    Some(Finding::wrong(
-        "wheels",
-        Key("drive.ros2.command.topic"),
-        text,
-    ))
+    Some(Finding::on("wheels").wrong(Key("drive.ros2.command.topic"), text))
 }
 
 /// Returns the finding on a robot that does not move though its wheels turn, by a sensor that is
@@ -163,7 +156,7 @@ fn of_still_body(turn_rad_s: Option<f64>, stays: bool, settings: &Ros2Settings) 
     if turn_rad_s.is_some_and(|rate| rate.abs() <= TURNING_RAD_S) {
         let text = "the gyro says that the robot does not turn though its wheels do: another axis, or the \
                     wheels spin";
-        return Some(Finding::wrong("imu", Key(turn_key), text));
+        return Some(Finding::on("imu").wrong(Key(turn_key), text));
     }
     stays.then(|| {
         let key = if settings.pose.is_some() {
@@ -173,7 +166,7 @@ fn of_still_body(turn_rad_s: Option<f64>, stays: bool, settings: &Ros2Settings) 
         };
         let text =
             "the robot stays where it is though its wheels turn forward, by its position or odometry";
-        Finding::wrong("ground", Key(key), text)
+        Finding::on("ground").wrong(Key(key), text)
     })
 }
 
@@ -182,13 +175,14 @@ fn of_radius(model: &RobotModel, radius_m: f64) -> Finding {
     let model_m = model.wheel_radius_m();
     if (radius_m / model_m - 1.0).abs() <= RADIUS_SHARE {
         let text = format!("the wheels roll as with a radius of {radius_m:.3} m");
-        return Finding::ok("radius", text);
+        return Finding::on("radius").ok(text);
     }
     let text = format!(
         "the wheels roll as with a radius of {radius_m:.3} m, the model says {model_m:.3} m"
     );
     let value = format!("{radius_m:.3}");
-    Finding::wrong("radius", Key("model.wheel_radius_m"), text)
+    Finding::on("radius")
+        .wrong(Key("model.wheel_radius_m"), text)
         .with_line(Key("model.wheel_radius_m"), value)
 }
 

@@ -48,9 +48,8 @@ impl Parameters {
     /// Returns the finding: the parameters with 95 % intervals, or why there are none.
     pub(super) fn finding(&self) -> Finding {
         match self.estimator.estimate().robot {
-            Some(robot) => Finding::ok(NAME, text(&robot)),
-            None => Finding::skipped(
-                NAME,
+            Some(robot) => Finding::on(NAME).ok(text(&robot)),
+            None => Finding::on(NAME).skipped(
                 "mass, inertia and centre of mass: the motion excited them too little, or \
                  `[estimation]` takes the model as exact",
             ),
@@ -61,7 +60,7 @@ impl Parameters {
 /// Returns the finding for a robot whose other findings make the parameters meaningless.
 pub(super) fn spoiled() -> Finding {
     let text = "mass, inertia and centre of mass: they need the findings above mended";
-    Finding::skipped(NAME, text)
+    Finding::on(NAME).skipped(text)
 }
 
 fn text(robot: &IdentifiedRobot) -> String {

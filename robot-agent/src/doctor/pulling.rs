@@ -71,7 +71,7 @@ fn of_zero(pull: &Pull) -> Option<Finding> {
     is_zero.then(|| {
         let text = "the joints' effort is zero in a turn on the spot: it is not measured (`effort = \
                     \"none\"`)";
-        Finding::wrong("torque", Key("drive.ros2.joints.effort"), text).with_line(
+        Finding::on("torque").wrong(Key("drive.ros2.joints.effort"), text).with_line(
             Key("drive.ros2.joints.effort"),
             "\"none\"",
         )
@@ -123,7 +123,7 @@ fn of_signs(pull: &Pull, joints: &JointSettings) -> Option<Finding> {
         ),
         (false, false) => return None,
     };
-    let wrong = Finding::wrong("torque", Key(key), text);
+    let wrong = Finding::on("torque").wrong(Key(key), text);
     let lines = [
         (
             is_left,
@@ -167,7 +167,7 @@ fn of_size(pull: &Pull, effort: Effort, model: &RobotModel) -> Finding {
     } else if least < *FRICTION.start() || ratio.is_some_and(|it| it < *MOMENTUM_RATIO.start()) {
         "too little"
     } else {
-        return Finding::ok("torque", format!("{turn}{setting_off}"));
+        return Finding::on("torque").ok(format!("{turn}{setting_off}"));
     };
     let (key, hint, fits) = match effort {
         Effort::Current(n_m_a) => {
@@ -187,7 +187,7 @@ fn of_size(pull: &Pull, effort: Effort, model: &RobotModel) -> Finding {
         ),
     };
     let text = format!("{turn}{setting_off}: the joints' effort is {verdict}; {hint}");
-    let wrong = Finding::wrong("torque", Key(key), text);
+    let wrong = Finding::on("torque").wrong(Key(key), text);
     match fits {
         Some(fits) => {
             let value = format!("{fits:.3}");

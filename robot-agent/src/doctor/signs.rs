@@ -163,13 +163,11 @@ pub(super) fn finding(answers: Answers, settings: &Ros2Settings) -> Finding {
     let explanations = explanations(answers);
     let Some(flips) = explanations.first() else {
         let text = "the wheels do not do what they are commanded, in no way that signs explain";
-        return Finding::wrong("sides", Key("drive.ros2.joints.left"), text);
+        return Finding::on("sides").wrong(Key("drive.ros2.joints.left"), text);
     };
     let Some(first) = flips.first() else {
-        return Finding::ok(
-            "sides",
-            "wheels, gyro, ground and command agree on left and forward",
-        );
+        return Finding::on("sides")
+            .ok("wheels, gyro, ground and command agree on left and forward");
     };
     let sentence = |flips: &[Flip]| {
         let texts: Vec<_> = flips.iter().map(|flip| flip.text()).collect();
@@ -185,7 +183,7 @@ pub(super) fn finding(answers: Answers, settings: &Ros2Settings) -> Finding {
     } else {
         first.key()
     };
-    let finding = Finding::wrong("sides", Key(key), text);
+    let finding = Finding::on("sides").wrong(Key(key), text);
     if explanations.len() > 1 {
         // Several sets of flips explain the responses, so a person has to decide.
         return finding;

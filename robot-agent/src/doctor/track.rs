@@ -166,15 +166,13 @@ pub(super) fn findings(
 /// Returns the finding on the wheel radius by which the base converts commands to wheel speeds.
 fn of_radius_of_base(settings: &Ros2Settings, obeyed: Obeyed) -> Finding {
     if (obeyed.forward - 1.0).abs() <= COMMAND_SHARE {
-        return Finding::ok(
-            "command",
-            "driving forward, the wheels turn as fast as they are commanded",
-        );
+        return Finding::on("command")
+            .ok("driving forward, the wheels turn as fast as they are commanded");
     }
     let percent = 100.0 * obeyed.forward;
     if settings.command.kind == CommandKind::JointSpeeds {
         let text = format!("driving forward, the wheels turn at {percent:.0} % of their command");
-        return Finding::wrong("command", Key("drive.ros2.joints.gear_ratio"), text);
+        return Finding::on("command").wrong(Key("drive.ros2.joints.gear_ratio"), text);
     }
     let base_radius_m = settings.command.base_radius_m / obeyed.forward;
     let text = format!(
@@ -182,7 +180,8 @@ fn of_radius_of_base(settings: &Ros2Settings, obeyed: Obeyed) -> Finding {
          radius of about {base_radius_m:.3} m (or the gear is another)"
     );
     let value = format!("{base_radius_m:.3}");
-    Finding::wrong("command", Key("drive.ros2.command.wheel_radius_m"), text)
+    Finding::on("command")
+        .wrong(Key("drive.ros2.command.wheel_radius_m"), text)
         .with_line(Key("drive.ros2.command.wheel_radius_m"), value)
 }
 
@@ -211,17 +210,13 @@ fn of_tracks(
     let mut findings = Vec::new();
     if is_obeyed {
         let text = "in a turn the wheels turn as fast as they are commanded";
-        findings.push(Finding::ok("turn command", text));
+        findings.push(Finding::on("turn command").ok(text));
     } else if settings.command.kind == CommandKind::JointSpeeds {
         let text = format!(
             "in a turn the wheels turn at {:.0} % of their command",
             100.0 * obeyed.turn
         );
-        findings.push(Finding::wrong(
-            "turn command",
-            Key("drive.ros2.command.topic"),
-            text,
-        ));
+        findings.push(Finding::on("turn command").wrong(Key("drive.ros2.command.topic"), text));
     } else if !is_models {
         let text = format!(
             "in a turn the wheels turn at {:.0} % of their command, driving forward at {:.0} %: the base itself \
@@ -230,21 +225,16 @@ fn of_tracks(
             100.0 * obeyed.turn,
             100.0 * obeyed.forward,
         );
-        let wrong = Finding::wrong(
-            "turn command",
-            Key("drive.ros2.command.track_width_m"),
-            text,
-        );
+        let wrong =
+            Finding::on("turn command").wrong(Key("drive.ros2.command.track_width_m"), text);
         findings.push(wrong.with_line(
             Key("drive.ros2.command.track_width_m"),
             format!("{base_m:.3}"),
         ));
     }
     let Some(effective) = effective else {
-        findings.push(Finding::skipped(
-            "track",
-            "the effective track: the turn was not measured",
-        ));
+        findings
+            .push(Finding::on("track").skipped("the effective track: the turn was not measured"));
         return findings;
     };
     let shown = format!(
@@ -265,7 +255,7 @@ fn of_tracks(
         format!("with a wheelbase of {wheelbase_m:.3} m no track turns so: measure both")
     });
     if allows(model_m) {
-        findings.push(Finding::ok("track", format!("{shown}; {range}")));
+        findings.push(Finding::on("track").ok(format!("{shown}; {range}")));
         return findings;
     }
     let fits_m = if allows(base_m) && (base_m - model_m).abs() > SAME_M {
@@ -285,7 +275,7 @@ fn of_tracks(
         "wider than tyres that scrub do"
     };
     let text = format!("{shown}: {why}; {range}. Measure the track and the wheelbase with a tape");
-    let mut wrong = Finding::wrong("track", Key("model.track_width_m"), text);
+    let mut wrong = Finding::on("track").wrong(Key("model.track_width_m"), text);
     if let Some(fits_m) = fits_m {
         wrong = wrong.with_line(Key("model.track_width_m"), format!("{fits_m:.3}"));
     }

@@ -46,7 +46,7 @@ pub(super) fn finding(twist: &PlanarTwist, rim_m_s: f64, joints: [i8; 2]) -> Opt
              writes it; no key of robot.toml can",
             direction_rad.to_degrees()
         );
-        return Some(Finding::wrong("twist", Key(key), text));
+        return Some(Finding::on("twist").wrong(Key(key), text));
     }
     // A twist straight backward is a matter of signs.
     if is_along {
@@ -57,7 +57,7 @@ pub(super) fn finding(twist: &PlanarTwist, rim_m_s: f64, joints: [i8; 2]) -> Opt
          robot",
         direction_rad.to_degrees()
     );
-    Some(Finding::wrong("twist", Key(key), text))
+    Some(Finding::on("twist").wrong(Key(key), text))
 }
 
 #[cfg(test)]

@@ -93,6 +93,9 @@ struct Raw {
     is_json: bool,
 }
 
+/// Topic of a message that is described.
+struct InTopic<'a>(&'a str);
+
 impl Raw {
     /// Parses the message's JSON.
     fn json<T: DeserializeOwned>(&self, part: &Part) -> Result<T, ReadError> {
@@ -100,10 +103,11 @@ impl Raw {
             &self.bytes[..]
         } else {
             let text = codec::text_of(&self.bytes);
-            text.map_err(|refused| part.malformed(&self.topic, refused))?
+            text.map_err(|refused| part.malformed(InTopic(&self.topic), refused))?
                 .as_bytes()
         };
-        serde_json::from_slice(json).map_err(|refused| part.malformed(&self.topic, refused))
+        serde_json::from_slice(json)
+            .map_err(|refused| part.malformed(InTopic(&self.topic), refused))
     }
 }
 
@@ -130,7 +134,7 @@ impl Part {
         }))
     }
 
-    fn malformed(&self, topic: &str, problem: impl std::fmt::Display) -> ReadError {
+    fn malformed(&self, InTopic(topic): InTopic<'_>, problem: impl std::fmt::Display) -> ReadError {
         ReadError::Malformed {
             file: self.file.clone(),
             topic: topic.to_owned(),
@@ -163,7 +167,8 @@ impl Part {
         let spelled: serde_json::Value = raw.json(self)?;
         let found = spelled.get("format").and_then(serde_json::Value::as_u64);
         let found = found.and_then(|found| u32::try_from(found).ok());
-        let found = found.ok_or_else(|| self.malformed(topics::RUN, "it names no format"))?;
+        let found =
+            found.ok_or_else(|| self.malformed(InTopic(topics::RUN), "it names no format"))?;
         if !FORMATS_READ.contains(&found) {
             let version = spelled.get("version").and_then(serde_json::Value::as_str);
             return Err(ReadError::OtherFormat {

@@ -29,8 +29,7 @@ pub(super) async fn finding(examined: &Examined, archived: Option<(i64, i64)>) -
     let examining = move || examine(location, database.as_deref(), archived, is_deep);
     let examined = tokio::task::spawn_blocking(examining).await;
     examined.unwrap_or_else(|_panic| {
-        vec![Finding::problem(
-            CONTENT,
+        vec![Finding::on(CONTENT).problem(
             "its examination broke off",
             NextStep("report this with what `doctor` printed"),
         )]
@@ -61,10 +60,7 @@ fn examine(
         None => match archive.list().and_then(|_| archive.check_writable()) {
             Ok(()) => {
                 let shown = archive.shown();
-                Finding::ok(
-                    NAME,
-                    format!("objects can be written to `{}`", shown.display()),
-                )
+                Finding::on(NAME).ok(format!("objects can be written to `{}`", shown.display()))
             }
             Err(error) => unreachable(&error),
         },
@@ -73,12 +69,11 @@ fn examine(
         return vec![writable];
     }
     let content = match archive.examine(mark, is_deep) {
-        Ok(0) => Finding::ok(CONTENT, "nothing is archived yet"),
-        Ok(count) if is_deep => Finding::ok(CONTENT, format!("all files can be read ({count})")),
-        Ok(count) => Finding::ok(
-            CONTENT,
-            format!("all files are there ({count}); --deep reads them"),
-        ),
+        Ok(0) => Finding::on(CONTENT).ok("nothing is archived yet"),
+        Ok(count) if is_deep => Finding::on(CONTENT).ok(format!("all files can be read ({count})")),
+        Ok(count) => {
+            Finding::on(CONTENT).ok(format!("all files are there ({count}); --deep reads them"))
+        }
         Err(error @ SegmentArchiveError::Bucket { .. }) => unreachable(&error),
         Err(error) => damaged(&error),
     };
@@ -86,9 +81,7 @@ fn examine(
 }
 
 fn unreachable(error: &SegmentArchiveError) -> Finding {
-    Finding::problem(
-        NAME,
-        chain(error),
+    Finding::on(NAME).problem(chain(error),
         NextStep(format!(
             "see whether the storage can be reached; set AWS_ENDPOINT_URL, AWS_REGION and the credentials \
              in the environment of the server, and \
@@ -98,9 +91,7 @@ fn unreachable(error: &SegmentArchiveError) -> Finding {
 }
 
 fn damaged(error: &SegmentArchiveError) -> Finding {
-    Finding::problem(
-        CONTENT,
-        chain(error),
+    Finding::on(CONTENT).problem(chain(error),
         NextStep(
             "mount the right disk, name the right folder or bucket, or restore the file from its copy; \
              docs/runbook.md says what to do without one",
@@ -112,9 +103,8 @@ fn of_folder(folder: &Path, is_used: bool) -> Finding {
     let shown = folder.display();
     if folder.is_dir() {
         return match try_to_write(folder) {
-            Ok(()) => Finding::ok(NAME, format!("files can be created in `{shown}`")),
-            Err(error) => Finding::problem(
-                NAME,
+            Ok(()) => Finding::on(NAME).ok(format!("files can be created in `{shown}`")),
+            Err(error) => Finding::on(NAME).problem(
                 format!("nothing can be written in `{shown}`: {error}"),
                 NextStep(format!(
                     "make room there, mount it for writing, or give it to the user that the server \
@@ -124,8 +114,7 @@ fn of_folder(folder: &Path, is_used: bool) -> Finding {
         };
     }
     if is_used {
-        return Finding::problem(
-            NAME,
+        return Finding::on(NAME).problem(
             format!("measurements were archived, and the folder `{shown}` does not exist"),
             NextStep(format!(
                 "mount the disk of the archive, or name its folder by [retention] archive; {KEEPS}"
@@ -141,12 +130,10 @@ fn of_folder(folder: &Path, is_used: bool) -> Finding {
         Err(Errno::ENOTDIR)
     };
     match permitted {
-        Ok(()) => Finding::ok(
-            NAME,
-            format!("`{shown}` does not exist yet; the server makes it"),
-        ),
-        Err(error) => Finding::problem(
-            NAME,
+        Ok(()) => {
+            Finding::on(NAME).ok(format!("`{shown}` does not exist yet; the server makes it"))
+        }
+        Err(error) => Finding::on(NAME).problem(
             format!(
                 "`{shown}` does not exist, and cannot be made in `{}`: {}",
                 present.display(),

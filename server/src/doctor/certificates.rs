@@ -23,22 +23,17 @@ pub(super) fn findings(examined: &Examined) -> Vec<Finding> {
         Some(TlsSource::Files(files)) => findings.extend(of_files(examined, files)),
         Some(TlsSource::Authority) => {
             let names = examined.config.certificate_names();
-            findings.push(Finding::ok(
-                "certificate",
-                format!(
-                    "the fleet's authority issues it, for localhost, {}",
-                    names.join(", ")
-                ),
-            ));
+            findings.push(Finding::on("certificate").ok(format!(
+                "the fleet's authority issues it, for localhost, {}",
+                names.join(", ")
+            )));
         }
-        None if examined.config.web.behind_https => findings.push(Finding::skipped(
-            "certificate",
-            "the proxy has it: check its expiry there",
-        )),
-        None => findings.push(Finding::skipped(
-            "certificate",
-            "there is none: the REST API is for this machine alone",
-        )),
+        None if examined.config.web.behind_https => findings
+            .push(Finding::on("certificate").skipped("the proxy has it: check its expiry there")),
+        None => findings.push(
+            Finding::on("certificate")
+                .skipped("there is none: the REST API is for this machine alone"),
+        ),
     }
     findings
 }
@@ -46,8 +41,7 @@ pub(super) fn findings(examined: &Examined) -> Vec<Finding> {
 fn authority(examined: &Examined, folder: &Path) -> Finding {
     let shown = folder.display();
     if folder.join(NEXT_CERTIFICATE_FILE).exists() {
-        return Finding::warning(
-            "authority",
+        return Finding::on("authority").warning(
             format!("a rotation of the authority in `{shown}` is under way"),
             NextStep(
                 "`tread authority` shows which robots are left; then `tread authority finish`",
@@ -57,8 +51,7 @@ fn authority(examined: &Examined, folder: &Path) -> Finding {
     let authority = match Authority::load(folder) {
         Ok(authority) => authority,
         Err(error) => {
-            return Finding::problem(
-                "authority",
+            return Finding::on("authority").problem(
                 chain(&error),
                 NextStep(
                     "run this as the user that the server runs as; `tread-server init` makes an \
@@ -73,24 +66,18 @@ fn authority(examined: &Examined, folder: &Path) -> Finding {
     let condition = read.as_ref().map(|read| read.condition(now));
     match (condition, read) {
         (Some(Condition::Valid) | None, _) | (_, None) => {
-            Finding::ok("authority", format!("`{shown}`, SHA-256 {fingerprint}"))
+            Finding::on("authority").ok(format!("`{shown}`, SHA-256 {fingerprint}"))
         }
-        (Some(Condition::Expiring), Some(read)) => Finding::warning(
-            "authority",
-            format!("the authority in `{shown}` expires at {}", read.not_after),
+        (Some(Condition::Expiring), Some(read)) => Finding::on("authority").warning(format!("the authority in `{shown}` expires at {}", read.not_after),
             NextStep("rotate it: `tread authority start`"),
         ),
-        (Some(Condition::Expired), Some(read)) => Finding::problem(
-            "authority",
-            format!("the authority in `{shown}` expired at {}", read.not_after),
+        (Some(Condition::Expired), Some(read)) => Finding::on("authority").problem(format!("the authority in `{shown}` expired at {}", read.not_after),
             NextStep(
                 "set the clock if it is wrong; otherwise `tread authority replace`, and every robot \
                  joins again",
             ),
         ),
-        (Some(Condition::NotYetValid), Some(read)) => Finding::problem(
-            "authority",
-            format!(
+        (Some(Condition::NotYetValid), Some(read)) => Finding::on("authority").problem(format!(
                 "the authority in `{shown}` is valid from {} only, and the clock says {now:.0}",
                 read.not_before
             ),
@@ -111,24 +98,18 @@ fn of_files(examined: &Examined, files: &TlsFiles) -> Vec<Finding> {
     let (certificates, _key) = match read {
         Ok(read) => read,
         Err(error) => {
-            return vec![Finding::problem(
-                "certificate",
-                chain(&error),
-                NextStep(step),
-            )];
+            return vec![Finding::on("certificate").problem(chain(&error), NextStep(step))];
         }
     };
     let shown = files.certificate.display().to_string();
     let Some(leaf) = certificates.first() else {
-        return vec![Finding::problem(
-            "certificate",
-            format!("`{shown}` holds no certificate"),
-            NextStep(step),
-        )];
+        return vec![
+            Finding::on("certificate")
+                .problem(format!("`{shown}` holds no certificate"), NextStep(step)),
+        ];
     };
     let Some(certificate) = Certificate::read(leaf) else {
-        return vec![Finding::problem(
-            "certificate",
+        return vec![Finding::on("certificate").problem(
             format!("the certificate in `{shown}` does not read"),
             NextStep(step),
         )];
@@ -144,23 +125,17 @@ fn validity(examined: &Examined, shown: &str, certificate: &Certificate) -> Find
     let now = examined.clock.machine_time();
     let (from, until) = (certificate.not_before, certificate.not_after);
     match certificate.condition(now) {
-        Condition::Valid => Finding::ok("certificate", format!("`{shown}`, valid until {until}")),
-        Condition::Expiring => Finding::warning(
-            "certificate",
-            format!("the certificate in `{shown}` expires at {until}"),
+        Condition::Valid => Finding::on("certificate").ok(format!("`{shown}`, valid until {until}")),
+        Condition::Expiring => Finding::on("certificate").warning(format!("the certificate in `{shown}` expires at {until}"),
             NextStep("replace the file; a running server takes it within a minute"),
         ),
-        Condition::Expired => Finding::problem(
-            "certificate",
-            format!("the certificate in `{shown}` expired at {until}; clients refuse it"),
+        Condition::Expired => Finding::on("certificate").problem(format!("the certificate in `{shown}` expired at {until}; clients refuse it"),
             NextStep(
                 "replace the file, and a running server takes it within a minute; set the clock if it \
                  is wrong",
             ),
         ),
-        Condition::NotYetValid => Finding::problem(
-            "certificate",
-            format!(
+        Condition::NotYetValid => Finding::on("certificate").problem(format!(
                 "the certificate in `{shown}` is valid from {from} only, and the clock says \
                  {now:.0}"
             ),
@@ -179,14 +154,12 @@ fn names(
     let missing: Vec<&String> = hosts.iter().filter(|host| !is_for(leaf, host)).collect();
     let names = certificate.names.join(", ");
     match missing.first() {
-        None if hosts.is_empty() => Finding::warning(
-            "certificate names",
+        None if hosts.is_empty() => Finding::on("certificate names").warning(
             format!("`{shown}` is for {names}, and `web.hosts` names none of them"),
             NextStep("add the names by which browsers find the server to `web.hosts`"),
         ),
-        None => Finding::ok("certificate names", format!("`{shown}` is for {names}")),
-        Some(host) => Finding::problem(
-            "certificate names",
+        None => Finding::on("certificate names").ok(format!("`{shown}` is for {names}")),
+        Some(host) => Finding::on("certificate names").problem(
             format!("`{shown}` is for {names}, and not for `{host}` of `web.hosts`"),
             NextStep("get a certificate for that name too, or remove it from `web.hosts`"),
         ),
@@ -200,8 +173,7 @@ fn issuers(shown: &str, certificates: &[CertificateDer<'static>]) -> Finding {
         let is_signed =
             webpki::anchor_from_trusted_cert(next).is_ok_and(|issuer| is_signed_by(one, issuer));
         if !is_signed {
-            return Finding::problem(
-                "certificate chain",
+            return Finding::on("certificate chain").problem(
                 format!(
                     "in `{shown}` a certificate is followed by one that has not signed it; clients \
                      refuse it"
@@ -212,7 +184,7 @@ fn issuers(shown: &str, certificates: &[CertificateDer<'static>]) -> Finding {
     }
     let last = certificates.last().and_then(Certificate::read);
     let from = last.map_or_else(String::new, |last| last.issuer);
-    Finding::ok("certificate chain", format!("it leads to `{from}`"))
+    Finding::on("certificate chain").ok(format!("it leads to `{from}`"))
 }
 
 fn is_signed_by(certificate: &CertificateDer<'_>, issuer: TrustAnchor<'_>) -> bool {

@@ -20,16 +20,14 @@ const SYNCHRONISE: &str = "set the clock, and have it synchronised: `apt-get ins
 pub(super) fn findings(examined: &Examined, newest: Option<Timestamp>) -> Vec<Finding> {
     let now = examined.clock.machine_time();
     let mut findings = vec![match is_synchronised() {
-        Some(true) => Finding::ok("clock", format!("it is synchronised, and says {now:.0}")),
-        Some(false) => Finding::warning(
-            "clock",
+        Some(true) => Finding::on("clock").ok(format!("it is synchronised, and says {now:.0}")),
+        Some(false) => Finding::on("clock").warning(
             format!("it is not synchronised, and says {now:.0}"),
             NextStep(SYNCHRONISE),
         ),
-        None => Finding::skipped(
-            "clock",
-            format!("it says {now:.0}; whether it is synchronised is not known here"),
-        ),
+        None => Finding::on("clock").skipped(format!(
+            "it says {now:.0}; whether it is synchronised is not known here"
+        )),
     }];
     findings.extend(newest.and_then(|newest| behind(now, newest.duration_since(now))));
     findings
@@ -39,9 +37,7 @@ pub(super) fn findings(examined: &Examined, newest: Option<Timestamp>) -> Vec<Fi
 fn behind(now: Timestamp, ahead: SignedDuration) -> Option<Finding> {
     (ahead > AHEAD_MAX).then(|| {
         let newest = now + ahead;
-        Finding::problem(
-            "clock",
-            format!(
+        Finding::on("clock").problem(format!(
                 "it says {now:.0}, {} s before the newest time in the database, {newest:.0}: it was \
                  set back, or was ahead before",
                 ahead.as_secs()

@@ -22,53 +22,46 @@ pub(super) async fn findings(examined: &Examined) -> (Vec<Finding>, Option<Inspe
         Ok(Some(inspection)) => inspection,
         Ok(None) => {
             let text = format!("`{shown}` does not exist yet; the server makes it");
-            return (vec![Finding::skipped("database", text)], None);
+            return (vec![Finding::on("database").skipped(text)], None);
         }
         Err(error) => return (vec![unreadable(&shown.to_string(), &error)], None),
     };
     let mut findings = vec![schema(&shown.to_string(), &inspection)];
     match (&inspection.damage, examined.is_deep) {
-        (Some(damage), _) => findings.push(Finding::problem(
-            "database content",
-            format!("`{shown}` is damaged: {damage}"),
-            NextStep(RESTORE),
-        )),
+        (Some(damage), _) => findings.push(
+            Finding::on("database content")
+                .problem(format!("`{shown}` is damaged: {damage}"), NextStep(RESTORE)),
+        ),
         (None, true) => {
-            findings.push(Finding::ok("database content", "all of it can be read"));
+            findings.push(Finding::on("database content").ok("all of it can be read"));
         }
-        (None, false) => findings.push(Finding::ok(
-            "database content",
-            "every table can be read; --deep reads all of it",
-        )),
+        (None, false) => findings.push(
+            Finding::on("database content").ok("every table can be read; --deep reads all of it"),
+        ),
     }
     (findings, Some(inspection))
 }
 
 fn schema(shown: &str, inspection: &Inspection) -> Finding {
     match inspection.schema {
-        Schema::Current(version) => Finding::ok(
-            "database",
-            format!("`{shown}` has the present schema, {version}"),
-        ),
-        Schema::Empty => Finding::ok(
-            "database",
-            format!("`{shown}` is empty; the server makes its tables"),
-        ),
-        Schema::Older { pending } => Finding::warning(
-            "database",
+        Schema::Current(version) => {
+            Finding::on("database").ok(format!("`{shown}` has the present schema, {version}"))
+        }
+        Schema::Empty => {
+            Finding::on("database").ok(format!("`{shown}` is empty; the server makes its tables"))
+        }
+        Schema::Older { pending } => Finding::on("database").warning(
             format!("`{shown}` is of an older version: {pending} migrations are pending"),
             NextStep(
                 "back it up; the next start of this version migrates it, and older versions then \
                  refuse it",
             ),
         ),
-        Schema::Newer(version) => Finding::problem(
-            "database",
+        Schema::Newer(version) => Finding::on("database").problem(
             format!("`{shown}` was opened by a newer version: its schema is {version}"),
             NextStep("install that version again, or restore the backup of before the upgrade"),
         ),
-        Schema::Differs(version) => Finding::problem(
-            "database",
+        Schema::Differs(version) => Finding::on("database").problem(
             format!("`{shown}` has another migration {version} than this program"),
             NextStep(
                 "a build that was never released made it: use that build, or restore a backup",
@@ -92,5 +85,5 @@ fn unreadable(shown: &str, error: &InspectError) -> Finding {
             "run this as the user that the server runs as; see `dmesg` for what the disk answers"
         }
     };
-    Finding::problem("database", text, NextStep(step))
+    Finding::on("database").problem(text, NextStep(step))
 }

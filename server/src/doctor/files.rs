@@ -44,8 +44,7 @@ pub(super) fn findings(examined: &Examined) -> Vec<Finding> {
 fn folder_finding(folder: &Path) -> Finding {
     let shown = folder.display();
     if !folder.is_dir() {
-        return Finding::problem(
-            "folder",
+        return Finding::on("folder").problem(
             format!("the folder `{shown}` of the database does not exist"),
             NextStep(format!(
                 "`mkdir -p {shown}`, and give it to the user that the server runs as; or name \
@@ -56,8 +55,7 @@ fn folder_finding(folder: &Path) -> Finding {
     let is_read_only =
         statvfs(folder).is_ok_and(|found| found.flags().contains(FsFlags::ST_RDONLY));
     if is_read_only {
-        return Finding::problem(
-            "folder",
+        return Finding::on("folder").problem(
             format!("the disk of `{shown}` is mounted read-only"),
             NextStep(
                 "see `dmesg` for why; repair the file system, then mount it for writing \
@@ -66,7 +64,7 @@ fn folder_finding(folder: &Path) -> Finding {
         );
     }
     match try_to_write(folder) {
-        Ok(()) => Finding::ok("folder", format!("files can be created in `{shown}`")),
+        Ok(()) => Finding::on("folder").ok(format!("files can be created in `{shown}`")),
         Err(error) => {
             let step = match error.kind() {
                 io::ErrorKind::PermissionDenied => format!(
@@ -78,8 +76,7 @@ fn folder_finding(folder: &Path) -> Finding {
                 }
                 _ => "see `dmesg` for errors of the disk".to_owned(),
             };
-            Finding::problem(
-                "folder",
+            Finding::on("folder").problem(
                 format!("nothing can be written in `{shown}`: {error}"),
                 NextStep(step),
             )
@@ -107,7 +104,7 @@ fn disk(examined: &Examined, folder: &Path) -> Finding {
     let found = match statvfs(folder) {
         Ok(found) => found,
         Err(error) => {
-            return Finding::skipped("disk", format!("its free space is not known: {error}"));
+            return Finding::on("disk").skipped(format!("its free space is not known: {error}"));
         }
     };
     let free_bytes = found
@@ -117,24 +114,20 @@ fn disk(examined: &Examined, folder: &Path) -> Finding {
     let (free, limit) = (free_bytes / BYTES_PER_MIB, limit_bytes / BYTES_PER_MIB);
     let shown = folder.display();
     if found.files() > 0 && found.files_available() == 0 {
-        return Finding::problem(
-            "disk",
+        return Finding::on("disk").problem(
             format!("the disk of `{shown}` has no inodes left, so no file can be made"),
             NextStep("remove files there; `df -i` shows who has them"),
         );
     }
     if free == 0 {
-        return Finding::problem(
-            "disk",
-            format!("the disk of `{shown}` is full"),
+        return Finding::on("disk").problem(format!("the disk of `{shown}` is full"),
             NextStep(
                 "make room on the disk; robots keep their measurements, and the server continues by itself",
             ),
         );
     }
     if free_bytes < limit_bytes {
-        return Finding::warning(
-            "disk",
+        return Finding::on("disk").warning(
             format!(
                 "{free} MiB are free for `{shown}`, less than storage.disk_free_min_mib, {limit}"
             ),
@@ -144,7 +137,7 @@ fn disk(examined: &Examined, folder: &Path) -> Finding {
             ),
         );
     }
-    Finding::ok("disk", format!("{free} MiB are free for `{shown}`"))
+    Finding::on("disk").ok(format!("{free} MiB are free for `{shown}`"))
 }
 
 /// Examines who may read the secrets.
@@ -172,16 +165,14 @@ fn secrets(examined: &Examined) -> Vec<Finding> {
         let mode = found.mode() & 0o777;
         let shown = file.display();
         if mode & OF_ALL != 0 {
-            findings.push(Finding::problem(
-                "file modes",
+            findings.push(Finding::on("file modes").problem(
                 format!("others can use `{shown}`, which has the mode {mode:o}"),
                 NextStep(format!(
                     "`chmod 600 {shown}`, and renew what is in it if others may have read it"
                 )),
             ));
         } else if mode & OF_OTHERS != 0 {
-            findings.push(Finding::warning(
-                "file modes",
+            findings.push(Finding::on("file modes").warning(
                 format!("the group of `{shown}` can use it, with the mode {mode:o}"),
                 NextStep(format!(
                     "`chmod 600 {shown}`, unless you trust every member of that group"
@@ -190,10 +181,7 @@ fn secrets(examined: &Examined) -> Vec<Finding> {
         }
     }
     if findings.is_empty() {
-        findings.push(Finding::ok(
-            "file modes",
-            "only their owner can use the secrets",
-        ));
+        findings.push(Finding::on("file modes").ok("only their owner can use the secrets"));
     }
     findings
 }
@@ -229,9 +217,7 @@ fn owners(examined: &Examined) -> Finding {
         }
     }
     if !unreadable.is_empty() {
-        return Finding::problem(
-            "file owners",
-            format!("user {user} cannot read `{}`", unreadable.join("`, `")),
+        return Finding::on("file owners").problem(format!("user {user} cannot read `{}`", unreadable.join("`, `")),
             NextStep(
                 "give the files to the user that the server runs as (`chown`), and run this as that \
                  user",
@@ -239,14 +225,13 @@ fn owners(examined: &Examined) -> Finding {
         );
     }
     match foreign.first() {
-        Some((file, owner)) if user.is_root() => Finding::warning(
-            "file owners",
+        Some((file, owner)) if user.is_root() => Finding::on("file owners").warning(
             format!("this runs as root, and `{file}` is of user {owner}"),
             NextStep(format!(
                 "run it as the user that the server runs as, to see what that one sees: \
                  `setpriv --reuid={owner} --clear-groups tread-server doctor …`"
             )),
         ),
-        Some(_) | None => Finding::ok("file owners", format!("user {user} can read all files")),
+        Some(_) | None => Finding::on("file owners").ok(format!("user {user} can read all files")),
     }
 }

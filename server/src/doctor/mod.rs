@@ -86,8 +86,7 @@ async fn examine(args: DoctorArgs) -> Vec<Finding> {
     let config = match resolved {
         Ok(config) => config,
         Err(error) => {
-            return vec![Finding::problem(
-                "configuration",
+            return vec![Finding::on("configuration").problem(
                 chain(&error),
                 NextStep(configuration_step(args.config.as_deref())),
             )];
@@ -104,10 +103,10 @@ async fn examine(args: DoctorArgs) -> Vec<Finding> {
         clock: Clock::system(),
         is_deep: args.deep,
     };
-    let mut findings = vec![Finding::ok("configuration", said)];
+    let mut findings = vec![Finding::on("configuration").ok(said)];
     findings.push(match examined.server_process {
-        Some(process) => Finding::ok("server", format!("it runs, as process {process}")),
-        None => Finding::skipped("server", "it does not run on this database"),
+        Some(process) => Finding::on("server").ok(format!("it runs, as process {process}")),
+        None => Finding::on("server").skipped("it does not run on this database"),
     });
     findings.extend(files::findings(&examined));
     let (of_database, inspection) = database::findings(&examined).await;

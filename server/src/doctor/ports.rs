@@ -56,7 +56,7 @@ pub(super) async fn findings(examined: &Examined) -> Vec<Finding> {
         findings.push(match look(address) {
             Port::Taken => match probe::get(address, false, "/metrics").await {
                 Some(answer) if answer.text.contains("tread_uptime") => {
-                    Finding::ok(port.name, format!("our server answers on {address}"))
+                    Finding::on(port.name).ok(format!("our server answers on {address}"))
                 }
                 Some(_) | None => port.taken(),
             },
@@ -87,13 +87,10 @@ async fn rest(examined: &Examined) -> Vec<Finding> {
     if !answer.is_health() {
         return vec![port.taken()];
     }
-    let mut findings = vec![Finding::ok(
-        port.name,
-        format!("a Tread server answers on {address}"),
-    )];
+    let mut findings =
+        vec![Finding::on(port.name).ok(format!("a Tread server answers on {address}"))];
     if examined.server_process.is_none() {
-        findings = vec![Finding::problem(
-            port.name,
+        findings = vec![Finding::on(port.name).problem(
             format!("a Tread server answers on {address}, and it does not use this database"),
             NextStep("stop that server, or give this one another address by `http`"),
         )];
@@ -107,13 +104,12 @@ async fn rest(examined: &Examined) -> Vec<Finding> {
 async fn readiness(address: SocketAddr, is_tls: bool) -> Option<Finding> {
     let answer = probe::get(address, is_tls, "/readyz").await?;
     if answer.is_health() {
-        return Some(Finding::ok("readiness", "the server can work"));
+        return Some(Finding::on("readiness").ok("the server can work"));
     }
     let body = answer.text.split("\r\n\r\n").nth(1).unwrap_or_default();
     let problem: serde_json::Value = serde_json::from_str(body).unwrap_or_default();
     let why = problem["detail"].as_str().unwrap_or("it does not say why");
-    Some(Finding::problem(
-        "readiness",
+    Some(Finding::on("readiness").problem(
         format!("the server cannot work: {why}"),
         NextStep("see the findings on folder, disk and database, and docs/runbook.md"),
     ))
@@ -124,8 +120,7 @@ fn clock_of(examined: &Examined, answer: &Answer) -> Option<Finding> {
     let said = rfc2822::parse(answer.header("date")?).ok()?.timestamp();
     let difference = examined.clock.machine_time().duration_since(said);
     (difference.abs() > CLOCK_DIFFERENCE_MAX).then(|| {
-        Finding::warning(
-            "clock of the server",
+        Finding::on("clock of the server").warning(
             format!("the server says {said}, {} s off", difference.as_secs()),
             NextStep("ask again; if it lasts, the clock is being set"),
         )
@@ -140,8 +135,7 @@ fn served(examined: &Examined, answer: &Answer) -> Option<Finding> {
         && let Ok((certificates, _key)) = read_files(files)
         && certificates.first() != Some(leaf)
     {
-        return Some(Finding::warning(
-            "certificate served",
+        return Some(Finding::on("certificate served").warning(
             format!(
                 "the server shows another certificate than `{}`, valid until {}",
                 files.certificate.display(),
@@ -156,10 +150,9 @@ fn served(examined: &Examined, answer: &Answer) -> Option<Finding> {
     let is_well = matches!(read.condition(now), Condition::Valid | Condition::Expiring);
     let text = format!("valid until {}", read.not_after);
     Some(if is_well {
-        Finding::ok("certificate served", text)
+        Finding::on("certificate served").ok(text)
     } else {
-        Finding::problem(
-            "certificate served",
+        Finding::on("certificate served").problem(
             format!("the server shows one that is not valid now: {text}"),
             NextStep("see the finding on the certificate, and set the clock if it is wrong"),
         )
@@ -183,7 +176,7 @@ async fn robots(examined: &Examined) -> Finding {
     let Some(robots) = &examined.config.robots else {
         let is_ours = examined.server_process.is_some() && probe::is_open(address).await;
         return if is_ours {
-            Finding::ok(port.name, format!("it accepts connections on {address}"))
+            Finding::on(port.name).ok(format!("it accepts connections on {address}"))
         } else {
             port.taken()
         };
@@ -198,13 +191,11 @@ async fn robots(examined: &Examined) -> Finding {
         .and_then(|authority| Certificate::read(authority.certificate()))
         .map(|read| read.subject);
     if issuer.is_some() && issuer == subject {
-        Finding::ok(
-            port.name,
-            format!("it answers on {address} with a certificate of the fleet's authority"),
-        )
+        Finding::on(port.name).ok(format!(
+            "it answers on {address} with a certificate of the fleet's authority"
+        ))
     } else {
-        Finding::problem(
-            port.name,
+        Finding::on(port.name).problem(
             format!("what answers on {address} shows no certificate of the fleet's authority"),
             NextStep("stop the other program, or give the robots another address by `zenoh`"),
         )
@@ -215,9 +206,7 @@ impl Configured {
     fn taken(self) -> Finding {
         let Self { name, key, address } = self;
         let port = address.port();
-        Finding::problem(
-            name,
-            format!("another program has {address}"),
+        Finding::on(name).problem(format!("another program has {address}"),
             NextStep(format!(
                 "`ss -ltnp sport = :{port}` shows which; stop it, or take another address by `{key}`"
             )),
@@ -232,14 +221,12 @@ impl Configured {
         let Self { name, key, address } = self;
         match (port, examined.server_process) {
             (Port::Taken, _) => self.taken(),
-            (Port::Free, Some(process)) if address.port() != 0 => Finding::problem(
-                name,
-                format!("the server, process {process}, does not have {address}"),
+            (Port::Free, Some(process)) if address.port() != 0 => Finding::on(name).problem(format!("the server, process {process}, does not have {address}"),
                 NextStep(
                     "it was started with another configuration, is still starting, or hangs: see its log",
                 ),
             ),
-            (Port::Free, _) => Finding::ok(name, format!("{address} is free")),
+            (Port::Free, _) => Finding::on(name).ok(format!("{address} is free")),
             (Port::Impossible(error), _) => {
                 let step = match error.kind() {
                     io::ErrorKind::PermissionDenied => format!(
@@ -251,9 +238,7 @@ impl Configured {
                     ),
                     _ => format!("take another address by `{key}`"),
                 };
-                Finding::problem(
-                    name,
-                    format!("cannot listen on {address}: {error}"),
+                Finding::on(name).problem(format!("cannot listen on {address}: {error}"),
                     NextStep(step),
                 )
             }

@@ -77,7 +77,7 @@ fn failed(name: &str, error: &ClientError) -> Finding {
     };
     let next_step = error.next_step();
     let next_step = next_step.unwrap_or("correct what the message names, and ask again");
-    Finding::problem(name, text, NextStep(next_step))
+    Finding::on(name).problem(text, NextStep(next_step))
 }
 
 fn root<'a>(
@@ -95,8 +95,7 @@ async fn examine(site: &SiteId, client: &Client) -> Vec<Finding> {
         Err(error) => return vec![failed("server", &error)],
     };
     if client.token().is_none() {
-        findings.push(Finding::problem(
-            "token",
+        findings.push(Finding::on("token").problem(
             "there is none for this server",
             NextStep(
                 "sign in with `tread login`, or give a token with --token-file or TREAD_TOKEN",
@@ -120,10 +119,9 @@ async fn examine(site: &SiteId, client: &Client) -> Vec<Finding> {
         Err(error) => findings.push(failed("server", &error)),
     }
     match client.robots(site, false).await {
-        Ok(robots) if robots.is_empty() => findings.push(Finding::skipped(
-            "robots",
-            format!("no robot has connected to site `{site}` yet"),
-        )),
+        Ok(robots) if robots.is_empty() => findings.push(
+            Finding::on("robots").skipped(format!("no robot has connected to site `{site}` yet")),
+        ),
         Ok(robots) => findings.extend(
             robots
                 .iter()
@@ -173,7 +171,7 @@ async fn reach(client: &Client) -> Result<Vec<Finding>, ClientError> {
     let said = said
         .and_then(|date| date.to_str().ok())
         .and_then(|date| rfc2822::parse(date).ok());
-    let mut findings = vec![Finding::ok("server", text)];
+    let mut findings = vec![Finding::on("server").ok(text)];
     findings.extend(said.map(|said| clock(&said, now(), took)));
     findings.extend(readiness(client).await);
     Ok(findings)
@@ -182,11 +180,10 @@ async fn reach(client: &Client) -> Result<Vec<Finding>, ClientError> {
 async fn readiness(client: &Client) -> Option<Finding> {
     let answer = client.request(Method::GET, "/readyz").send().await.ok()?;
     if answer.status().is_success() {
-        return Some(Finding::ok("readiness", "the server can work"));
+        return Some(Finding::on("readiness").ok("the server can work"));
     }
     let why = client.refusal(answer).await;
-    Some(Finding::problem(
-        "readiness",
+    Some(Finding::on("readiness").problem(
         format!("the server cannot work: {why}"),
         NextStep("run `tread-server doctor` on its machine"),
     ))
@@ -200,7 +197,7 @@ fn clock(said: &Zoned, now: Timestamp, took: Duration) -> Finding {
         + SignedDuration::from_secs(1);
     let difference = said.duration_since(now);
     if difference.abs() <= CLOCK_DIFFERENCE_MAX + slack {
-        return Finding::ok("clock", "the server's and this machine's agree");
+        return Finding::on("clock").ok("the server's and this machine's agree");
     }
     let (seconds, which) = (
         difference.abs().as_secs(),
@@ -210,8 +207,7 @@ fn clock(said: &Zoned, now: Timestamp, took: Duration) -> Finding {
             "ahead of"
         },
     );
-    Finding::problem(
-        "clock",
+    Finding::on("clock").problem(
         format!(
             "the server's is {seconds} s {which} this machine's: it says {said}, and this machine \
              {now:.0}"
@@ -229,13 +225,12 @@ fn token(session: &tread_api::identity::Session, now: Timestamp) -> Finding {
         session.name, session.rights, session.sites, session.expires_at
     );
     if left < EXPIRING_BEFORE {
-        return Finding::warning(
-            "token",
+        return Finding::on("token").warning(
             text,
             NextStep("it expires soon: an admin makes another with `tread tokens create`"),
         );
     }
-    Finding::ok("token", text)
+    Finding::on("token").ok(text)
 }
 
 /// Examines the server's own status. The server may be of any version.
@@ -244,10 +239,9 @@ fn of_server(status: &Value) -> Vec<Finding> {
     let version = status["version"].as_str().unwrap_or("unknown");
     let own = env!("CARGO_PKG_VERSION");
     findings.push(if version == own {
-        Finding::ok("version", format!("server and `tread` are of {own}"))
+        Finding::on("version").ok(format!("server and `tread` are of {own}"))
     } else {
-        Finding::warning(
-            "version",
+        Finding::on("version").warning(
             format!("the server is of {version}, and `tread` of {own}"),
             NextStep(
                 "install the same version of both: they may not know all of each other's commands",
@@ -260,8 +254,7 @@ fn of_server(status: &Value) -> Vec<Finding> {
         ("unwritable", "cannot be written"),
     ] {
         if let Some(why) = storage[field].as_str() {
-            findings.push(Finding::problem(
-                "storage",
+            findings.push(Finding::on("storage").problem(
                 format!("the database {text}: {why}"),
                 NextStep(
                     "run `tread-server doctor` on its machine; docs/runbook.md says what to do",
@@ -270,8 +263,7 @@ fn of_server(status: &Value) -> Vec<Finding> {
         }
     }
     if storage["disk_low"] == true {
-        findings.push(Finding::warning(
-            "storage",
+        findings.push(Finding::on("storage").warning(
             "less is free on the server's disk than storage.disk_free_min_mib",
             NextStep("make room there"),
         ));
@@ -283,8 +275,7 @@ fn of_server(status: &Value) -> Vec<Finding> {
         let slowest = &status["slow_transactions"]["slowest"][0];
         let kind = slowest["kind"].as_str().unwrap_or("unknown");
         let longest_ms = slowest["longest_ms"].as_u64().unwrap_or_default();
-        findings.push(Finding::warning(
-            "database",
+        findings.push(Finding::on("database").warning(
             format!("{slow} transactions were slow; the slowest, `{kind}`, took {longest_ms} ms"),
             NextStep(
                 "see whether other programs use the server's disk; docs/runbook.md, \
@@ -305,14 +296,11 @@ fn alerts(alerts: &[Alert]) -> Finding {
         .collect();
     let step = "`tread alerts` lists them; docs/runbook.md has a section for each";
     match (named.as_slice(), alerts.len()) {
-        ([], 0) => Finding::ok("alerts", "there are none"),
-        ([], count) => Finding::warning(
-            "alerts",
-            format!("{count} warnings are active"),
-            NextStep(step),
-        ),
-        (named, count) => Finding::problem(
-            "alerts",
+        ([], 0) => Finding::on("alerts").ok("there are none"),
+        ([], count) => {
+            Finding::on("alerts").warning(format!("{count} warnings are active"), NextStep(step))
+        }
+        (named, count) => Finding::on("alerts").problem(
             format!("{count} are active; critical: {}", joined(named)),
             NextStep(step),
         ),

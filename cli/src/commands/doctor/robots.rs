@@ -23,8 +23,7 @@ pub(super) fn of_robot(robot: &Robot, server_version: Option<&str>) -> Vec<Findi
     let heard = robot.live.as_ref().map(|live| live.heard_age_ms);
     match robot.link {
         LinkState::Online => {}
-        LinkState::Stale => findings.push(Finding::warning(
-            &name,
+        LinkState::Stale => findings.push(Finding::on(&name).warning(
             "some of its heartbeats are missing",
             NextStep("see its radio link; `tread watch` shows whether it lasts"),
         )),
@@ -37,8 +36,7 @@ pub(super) fn of_robot(robot: &Robot, server_version: Option<&str>) -> Vec<Findi
                 let name = serde_json::to_value(cause).ok()?;
                 Some(format!(" ({})", name.as_str()?.replace('_', " ")))
             });
-            findings.push(Finding::problem(
-                &name,
+            findings.push(Finding::on(&name).problem(
                 format!("it is offline{}; {since}", cause.unwrap_or_default()),
                 NextStep(
                     "see docs/runbook.md, robot-lost; `tread robots retire` one that never returns",
@@ -54,8 +52,7 @@ pub(super) fn of_robot(robot: &Robot, server_version: Option<&str>) -> Vec<Findi
             } else {
                 "ahead of"
             };
-            findings.push(Finding::problem(
-                &name,
+            findings.push(Finding::on(&name).problem(
                 format!(
                     "its clock is {} s {which} the server's",
                     offset.abs().as_secs()
@@ -67,15 +64,13 @@ pub(super) fn of_robot(robot: &Robot, server_version: Option<&str>) -> Vec<Findi
             ));
         }
         if live.outbox.pending > OUTBOX_LONG {
-            findings.push(Finding::warning(
-                &name,
+            findings.push(Finding::on(&name).warning(
                 format!("{} records wait in its outbox", live.outbox.pending),
                 NextStep("see docs/runbook.md, outbox-long"),
             ));
         }
         if live.outbox.dropped > 0 {
-            findings.push(Finding::warning(
-                &name,
+            findings.push(Finding::on(&name).warning(
                 format!("{} of its records were lost", live.outbox.dropped),
                 NextStep("see docs/runbook.md, outbox-dropped"),
             ));
@@ -83,8 +78,7 @@ pub(super) fn of_robot(robot: &Robot, server_version: Option<&str>) -> Vec<Findi
     }
     findings.extend(link(&name, robot));
     if server_version.is_some_and(|version| version != robot.agent_version) {
-        findings.push(Finding::warning(
-            &name,
+        findings.push(Finding::on(&name).warning(
             format!(
                 "its agent is of {}, and the server of {}",
                 robot.agent_version,
@@ -98,7 +92,7 @@ pub(super) fn of_robot(robot: &Robot, server_version: Option<&str>) -> Vec<Findi
         let round_trip = round_trip.map_or_else(String::new, |round_trip_ms| {
             format!(", it answers within {round_trip_ms:.0} ms")
         });
-        findings.push(Finding::ok(&name, format!("it is online{round_trip}")));
+        findings.push(Finding::on(&name).ok(format!("it is online{round_trip}")));
     }
     findings
 }
@@ -127,8 +121,7 @@ fn link(name: &str, robot: &Robot) -> Option<Finding> {
         poor.push(format!("its last answer took {took_ms:.0} ms"));
     }
     (!poor.is_empty()).then(|| {
-        Finding::warning(
-            name,
+        Finding::on(name).warning(
             format!("its link is poor; in the last hour: {}", joined(&poor)),
             NextStep("look after its radio link: place of antennas, channel, other traffic"),
         )
