@@ -67,24 +67,18 @@ pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode 
         eprintln!("error: {cause:#}");
         return ExitCode::from(USAGE);
     }
+    // Whether the result is good, where a command prints a result.
     let ended = match words.action {
-        Some(Action::Enroll(args)) => run_enroll(args),
-        Some(Action::Doctor(args)) => match doctor::run(&args) {
-            Ok(true) => Ok(()),
-            // The findings have been printed.
-            Ok(false) => return ExitCode::FAILURE,
-            Err(cause) => Err(cause),
-        },
-        Some(Action::Replay(args)) => match report::run(&args) {
-            Ok(true) => Ok(()),
-            Ok(false) => return ExitCode::FAILURE,
-            Err(cause) => Err(cause),
-        },
+        Some(Action::Enroll(args)) => run_enroll(args).map(|()| true),
+        Some(Action::Doctor(args)) => doctor::run(&args),
+        Some(Action::Replay(args)) => report::run(&args),
         Some(Action::Recover(args)) => salvage::run(&args),
-        None => run(&words.flags),
+        None => run(&words.flags).map(|()| true),
     };
     match ended {
-        Ok(()) => ExitCode::SUCCESS,
+        Ok(true) => ExitCode::SUCCESS,
+        // What is wrong has been printed.
+        Ok(false) => ExitCode::FAILURE,
         Err(cause) => {
             error!("{cause:#}");
             ExitCode::FAILURE
