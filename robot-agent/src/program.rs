@@ -9,6 +9,7 @@ use clap::{Parser, Subcommand};
 use tracing::{error, info, warn};
 use tracing_subscriber::EnvFilter;
 use tread_api::startup::{apply_environment, ignores_hangup};
+use tread_telemetry::log_filter;
 
 use crate::agent::{Agent, RunningAgent};
 use crate::config::{AgentConfig, Flags, LogFormat};
@@ -88,7 +89,7 @@ pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode 
 
 fn init_logging(flags: &Flags) -> anyhow::Result<()> {
     let log = &flags.log;
-    let filter = EnvFilter::try_new(log);
+    let filter = EnvFilter::try_new(log_filter(log));
     let filter = filter.with_context(|| {
         format!(
             "the log filter `{log}` is invalid; give a level, such as `info`, or `info,zenoh=warn`"
@@ -157,4 +158,36 @@ async fn wait(agent: &RunningAgent) -> anyhow::Result<()> {
         ended = agent.failed() => return Err(ended.into()),
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use tracing::{Level, enabled};
+    use tracing_subscriber::layer::SubscriberExt as _;
+
+    use super::*;
+
+    #[test]
+    fn of_zenoh_only_errors_are_logged_unless_the_filter_names_it() {
+        let logged = |given: &str| {
+            let filter = EnvFilter::try_new(log_filter(given)).unwrap();
+            let subscriber = tracing_subscriber::registry().with(filter);
+            tracing::subscriber::with_default(subscriber, || {
+                [
+                    enabled!(target: "zenoh_transport::unicast", Level::ERROR),
+                    enabled!(target: "zenoh_transport::unicast", Level::WARN),
+                    enabled!(target: "tread_agent::online", Level::INFO),
+                    enabled!(target: "tread_agent::online", Level::DEBUG),
+                ]
+            })
+        };
+        let default = tread_telemetry::LOG_FILTER_DEFAULT;
+        assert_eq!(logged(default), [true, false, true, false]);
+        let own_detail = "info,tread_agent=debug";
+        assert_eq!(logged(own_detail), [true, false, true, true]);
+        assert_eq!(logged("info,zenoh=warn"), [true, true, true, false]);
+        let of_crate = "info,zenoh_transport=warn";
+        assert_eq!(logged(of_crate), [true, true, true, false]);
+        assert_eq!(logged(""), [true, false, false, false]);
+    }
 }
