@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use jiff::Timestamp;
-use tracing::error;
+use tracing::{error, warn};
 use tread_api::wire::hello::SiteDefinition;
 use tread_api::wire::ingest::{MissionPhase, MissionReport, RecordContent};
 
@@ -33,7 +33,7 @@ impl Missions {
         })
     }
 
-    /// Reads the memory after a start. An end that may not be in the outbox is reported again; a
+    /// Reads the memory after a start. Ends that may not be in the outbox are reported again; a
     /// mission that was active when the agent died is reported as failed.
     ///
     /// # Errors
@@ -44,8 +44,15 @@ impl Missions {
         now: Timestamp,
     ) -> Result<Arc<Self>, StartError> {
         let mut slot = memory.load()?;
-        let kept = slot.unrecorded_end().cloned();
-        let mut reports: Vec<MissionReport> = kept.into_iter().collect();
+        let mut reports: Vec<MissionReport> = slot.unrecorded_ends().cloned().collect();
+        let unreadable = slot.unreadable_ends();
+        if unreadable > 0 {
+            warn!(
+                unreadable,
+                "{unreadable} reports of ended missions in the mission memory cannot be read and are \
+                 dropped: another version of the agent may have written them"
+            );
+        }
         if let Some(active) = slot.active() {
             let is_over = reports.iter().any(|kept| kept.mission == active.mission);
             if !is_over {
@@ -56,10 +63,10 @@ impl Missions {
             outbox.append(&RecordContent::Mission(report.clone()))?;
             slot.end(report.mission, report.phase);
         }
-        let is_changed = !reports.is_empty();
+        let is_changed = !reports.is_empty() || unreadable > 0;
         if is_changed {
             outbox.sync()?;
-            slot.end_is_recorded();
+            slot.ends_are_recorded();
         }
         let missions = Self::new(slot, memory);
         if is_changed {
@@ -203,7 +210,7 @@ mod tests {
             let missions = Missions::recall(memory.clone(), &outbox, NOW).unwrap();
             let slot = missions.slot().clone();
             assert_eq!(slot.active(), None);
-            assert_eq!(slot.unrecorded_end(), None);
+            assert_eq!(slot.unrecorded_ends().count(), 0);
             assert_eq!(slot.ended().count(), 1);
             assert_eq!(memory.load().unwrap(), slot);
         }
@@ -232,6 +239,82 @@ mod tests {
         // The memory was saved for another reason meanwhile.
         slot.end(active().mission, MissionPhase::Succeeded);
         assert_eq!(started_twice(&slot, &[]), [succeeded()]);
+    }
+
+    #[test]
+    fn several_ends_that_the_outbox_did_not_take_are_all_reported() {
+        let mut slot = MissionSlot::default();
+        let mut expected = Vec::new();
+        for number in 10..12 {
+            let mission = MissionId::from_uuid(Uuid::from_u128(number));
+            let active = ActiveMission {
+                mission,
+                ..active()
+            };
+            assert!(slot.take(active));
+            let report = MissionReport {
+                mission,
+                ..succeeded()
+            };
+            slot.begin_end(mission, MissionPhase::Succeeded);
+            slot.keep_end(report.clone());
+            assert!(slot.end(mission, MissionPhase::Succeeded).is_some());
+            expected.push(report);
+        }
+        let folder = tempfile::tempdir().unwrap();
+        let memory = Memory::new(folder.path());
+        memory.save(&slot).unwrap();
+        let outbox = outbox(folder.path());
+        for _ in 0..2 {
+            let missions = Missions::recall(memory.clone(), &outbox, NOW).unwrap();
+            assert_eq!(missions.slot().unrecorded_ends().count(), 0);
+        }
+        assert_eq!(reports(&outbox), expected);
+    }
+
+    #[test]
+    fn an_end_that_cannot_be_read_costs_no_other_one_and_the_agent_starts() {
+        let mut slot = MissionSlot::default();
+        assert!(slot.take(active()));
+        slot.keep_end(succeeded());
+        let mut written = serde_json::to_value(&slot).unwrap();
+        let mut unknown = written["unrecorded_ends"][0].clone();
+        unknown["phase"] = "suspended".into();
+        let ends = written["unrecorded_ends"].as_array_mut().unwrap();
+        ends.insert(0, unknown);
+        let folder = tempfile::tempdir().unwrap();
+        let text = serde_json::to_vec(&written).unwrap();
+        std::fs::write(folder.path().join("missions.json"), text).unwrap();
+        let memory = Memory::new(folder.path());
+        assert_eq!(memory.load().unwrap().unreadable_ends(), 1);
+        let outbox = outbox(folder.path());
+        for _ in 0..2 {
+            let missions = Missions::recall(memory.clone(), &outbox, NOW).unwrap();
+            assert_eq!(missions.slot().active(), None);
+            assert_eq!(memory.load().unwrap(), *missions.slot());
+        }
+        assert_eq!(reports(&outbox), [succeeded()]);
+    }
+
+    #[test]
+    fn the_end_in_a_file_of_an_earlier_agent_is_reported() {
+        // As an agent wrote it that kept only the last end.
+        let earlier = r#"{"active":{"mission":"00000000-0000-0000-0000-000000000007","revision":1,
+            "plan_hash":"00000000-0000-0000-0000-000000000008",
+            "plan":{"length_m":1.0,"duration_s":2.0,"speed_peak_m_s":0.5}},"ended":[],
+            "unrecorded_end":{"mission":"00000000-0000-0000-0000-000000000007","revision":1,
+            "plan_hash":"00000000-0000-0000-0000-000000000008","at":"1970-01-01T00:00:00Z",
+            "phase":"succeeded"}}"#;
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join("missions.json"), earlier).unwrap();
+        let memory = Memory::new(folder.path());
+        let slot = memory.load().unwrap();
+        assert_eq!(slot.unrecorded_ends().collect::<Vec<_>>(), [&succeeded()]);
+        assert_eq!(slot.unreadable_ends(), 0);
+        let outbox = outbox(folder.path());
+        let missions = Missions::recall(memory, &outbox, NOW).unwrap();
+        assert_eq!(missions.slot().active(), None);
+        assert_eq!(reports(&outbox), [succeeded()]);
     }
 
     #[test]

@@ -9,6 +9,7 @@ use clap::{Parser, Subcommand};
 use tracing::{error, info, warn};
 use tracing_subscriber::EnvFilter;
 use tread_api::startup::{apply_environment, ignores_hangup};
+use tread_telemetry::log_filter;
 
 use crate::agent::{Agent, RunningAgent};
 use crate::config::{AgentConfig, Flags, LogFormat};
@@ -67,24 +68,18 @@ pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode 
         eprintln!("error: {cause:#}");
         return ExitCode::from(USAGE);
     }
+    // Whether the result is good, where a command prints a result.
     let ended = match words.action {
-        Some(Action::Enroll(args)) => run_enroll(args),
-        Some(Action::Doctor(args)) => match doctor::run(&args) {
-            Ok(true) => Ok(()),
-            // The findings have been printed.
-            Ok(false) => return ExitCode::FAILURE,
-            Err(cause) => Err(cause),
-        },
-        Some(Action::Replay(args)) => match report::run(&args) {
-            Ok(true) => Ok(()),
-            Ok(false) => return ExitCode::FAILURE,
-            Err(cause) => Err(cause),
-        },
+        Some(Action::Enroll(args)) => run_enroll(args).map(|()| true),
+        Some(Action::Doctor(args)) => doctor::run(&args),
+        Some(Action::Replay(args)) => report::run(&args),
         Some(Action::Recover(args)) => salvage::run(&args),
-        None => run(&words.flags),
+        None => run(&words.flags).map(|()| true),
     };
     match ended {
-        Ok(()) => ExitCode::SUCCESS,
+        Ok(true) => ExitCode::SUCCESS,
+        // What is wrong has been printed.
+        Ok(false) => ExitCode::FAILURE,
         Err(cause) => {
             error!("{cause:#}");
             ExitCode::FAILURE
@@ -94,7 +89,7 @@ pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode 
 
 fn init_logging(flags: &Flags) -> anyhow::Result<()> {
     let log = &flags.log;
-    let filter = EnvFilter::try_new(log);
+    let filter = EnvFilter::try_new(log_filter(log));
     let filter = filter.with_context(|| {
         format!(
             "the log filter `{log}` is invalid; give a level, such as `info`, or `info,zenoh=warn`"
@@ -163,4 +158,36 @@ async fn wait(agent: &RunningAgent) -> anyhow::Result<()> {
         ended = agent.failed() => return Err(ended.into()),
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use tracing::{Level, enabled};
+    use tracing_subscriber::layer::SubscriberExt as _;
+
+    use super::*;
+
+    #[test]
+    fn of_zenoh_only_errors_are_logged_unless_the_filter_names_it() {
+        let logged = |given: &str| {
+            let filter = EnvFilter::try_new(log_filter(given)).unwrap();
+            let subscriber = tracing_subscriber::registry().with(filter);
+            tracing::subscriber::with_default(subscriber, || {
+                [
+                    enabled!(target: "zenoh_transport::unicast", Level::ERROR),
+                    enabled!(target: "zenoh_transport::unicast", Level::WARN),
+                    enabled!(target: "tread_agent::online", Level::INFO),
+                    enabled!(target: "tread_agent::online", Level::DEBUG),
+                ]
+            })
+        };
+        let default = tread_telemetry::LOG_FILTER_DEFAULT;
+        assert_eq!(logged(default), [true, false, true, false]);
+        let own_detail = "info,tread_agent=debug";
+        assert_eq!(logged(own_detail), [true, false, true, true]);
+        assert_eq!(logged("info,zenoh=warn"), [true, true, true, false]);
+        let of_crate = "info,zenoh_transport=warn";
+        assert_eq!(logged(of_crate), [true, true, true, false]);
+        assert_eq!(logged(""), [true, false, false, false]);
+    }
 }

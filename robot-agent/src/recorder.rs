@@ -181,17 +181,17 @@ impl Recorder {
             }
             unsaved.pop_front();
         }
-        self.settle_end();
+        self.settle_ends();
     }
 
-    /// Drops the report of the last end from the memory once the outbox has it on disk.
-    fn settle_end(&self) {
-        if self.missions.slot().unrecorded_end().is_none() {
+    /// Drops the reports of ends from the memory once the outbox has them on disk.
+    fn settle_ends(&self) {
+        if self.missions.slot().unrecorded_ends().next().is_none() {
             return;
         }
         match self.outbox.sync() {
             Ok(()) => {
-                self.missions.slot().end_is_recorded();
+                self.missions.slot().ends_are_recorded();
                 self.missions.save();
             }
             Err(cause) => error!(

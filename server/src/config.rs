@@ -63,7 +63,8 @@ pub struct ServerArgs {
     /// Site that is created when missing
     #[arg(long)]
     pub site: Option<SiteId>,
-    /// Log filter, such as `info` or `tread_server=debug`; `RUST_LOG` when absent
+    /// Log filter, such as `info` or `tread_server=debug`; `RUST_LOG` when absent. Of zenoh only
+    /// errors are logged unless it names zenoh, as `info,zenoh=warn`
     #[arg(long, value_name = "FILTER")]
     pub log: Option<String>,
     /// Format of log lines

@@ -6,23 +6,23 @@ use tracing_subscriber::EnvFilter;
 use tracing_subscriber::layer::SubscriberExt as _;
 use tracing_subscriber::util::SubscriberInitExt as _;
 
-use crate::config::{LogFormat, ServerArgs};
+use tread_telemetry::{LOG_FILTER_DEFAULT, log_filter};
 
-/// Default log filter, without `--log` and `RUST_LOG`.
-const FILTER_DEFAULT: &str = "info,sqlx=warn,zenoh=warn,zenoh_transport=warn";
+use crate::config::{LogFormat, ServerArgs};
 
 /// Starts logging for the whole process; a second call has no effect.
 ///
 /// # Errors
 /// The filter of `--log` or `RUST_LOG` cannot be parsed.
 pub(crate) fn start(args: &ServerArgs) -> anyhow::Result<()> {
-    let filter = match &args.log {
-        Some(filter) => EnvFilter::try_new(filter)?,
+    let given = match &args.log {
+        Some(filter) => filter.clone(),
         None if std::env::var_os(EnvFilter::DEFAULT_ENV).is_some() => {
-            EnvFilter::try_from_default_env()?
+            std::env::var(EnvFilter::DEFAULT_ENV)?
         }
-        None => EnvFilter::try_new(FILTER_DEFAULT)?,
+        None => LOG_FILTER_DEFAULT.to_owned(),
     };
+    let filter = EnvFilter::try_new(log_filter(&given))?;
     let lines = tracing_subscriber::fmt::layer()
         .with_writer(std::io::stderr)
         // A line that cannot be written is lost; the library would say so by `eprintln`, which panics then.
@@ -35,4 +35,32 @@ pub(crate) fn start(args: &ServerArgs) -> anyhow::Result<()> {
         LogFormat::Json => registry.with(lines.json()).try_init(),
     };
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use tracing::{Level, enabled};
+
+    use super::*;
+
+    #[test]
+    fn of_zenoh_only_errors_and_of_sqlx_only_warnings_are_logged_unless_the_filter_names_them() {
+        let logged = |given: &str| {
+            let filter = EnvFilter::try_new(log_filter(given)).unwrap();
+            let subscriber = tracing_subscriber::registry().with(filter);
+            tracing::subscriber::with_default(subscriber, || {
+                [
+                    enabled!(target: "zenoh_link_commons::unicast", Level::WARN),
+                    enabled!(target: "sqlx::query", Level::INFO),
+                    enabled!(target: "sqlx::query", Level::WARN),
+                    enabled!(target: "tread_audit", Level::INFO),
+                ]
+            })
+        };
+        assert_eq!(logged(LOG_FILTER_DEFAULT), [false, false, true, true]);
+        let own_detail = "info,tread_server=debug";
+        assert_eq!(logged(own_detail), [false, false, true, true]);
+        let all = "info,zenoh=warn,sqlx=info";
+        assert_eq!(logged(all), [true, true, true, true]);
+    }
 }

@@ -10,8 +10,11 @@
 //! │  ├─ plan ────── agent
 //! │  └─ drive ───── agent, from start to end
 //! ```
+//!
+//! [`log_filter()`] gives the filter of the log, with the same levels of libraries in both programs.
 
 mod client;
+mod log_filter;
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -34,6 +37,7 @@ use tread_api::wire::trace::TraceParent;
 use uuid::Uuid;
 
 use self::client::Client;
+pub use self::log_filter::{LOG_FILTER_DEFAULT, log_filter};
 
 /// Maximum number of spans in the queue; further spans are dropped.
 const SPANS_WAITING_MAX: usize = 2_048;

@@ -34,7 +34,7 @@ use crate::sim::drive::{Individual, Stall};
 use crate::sim::faults::Fault;
 use crate::sim::scenario::{BUILT_IN_NAME, Scenario, ScenarioError};
 use crate::sim::trace::Trace;
-use tread_telemetry::{TelemetryError, TracingConfig};
+use tread_telemetry::{LOG_FILTER_DEFAULT, TelemetryError, TracingConfig};
 
 /// Default endpoint of the server.
 pub const SERVER_DEFAULT: &str = "tcp/127.0.0.1:7447";
@@ -165,8 +165,9 @@ pub struct Flags {
     /// blocks, and for how many seconds it blocks
     #[arg(long, value_parser = parse_stall)]
     pub stall_s: Option<Stall>,
-    /// Log filter, such as `info,tread_agent=debug`
-    #[arg(long, env = "RUST_LOG", default_value = "info,zenoh=warn")]
+    /// Log filter, such as `info,tread_agent=debug`; of zenoh only errors are logged unless it names
+    /// zenoh, as `info,zenoh=warn`
+    #[arg(long, env = "RUST_LOG", default_value = LOG_FILTER_DEFAULT)]
     pub log: String,
     /// Format of log lines
     #[arg(long, value_enum, default_value_t)]

@@ -60,6 +60,14 @@ impl Question {
         }
     }
 
+    /// A problem that prevents the examination, and that no single key of `robot.toml` causes.
+    pub(super) fn unexaminable(self, text: impl Into<String>) -> Finding {
+        Finding {
+            holds: false,
+            ..self.ok(text)
+        }
+    }
+
     /// A question that could not be examined, because of another finding.
     pub(super) fn skipped(self, text: impl Into<String>) -> Finding {
         Finding {

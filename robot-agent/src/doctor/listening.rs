@@ -3,12 +3,13 @@
 use std::time::Duration;
 
 use tread_ros2::cdr::decode;
-use tread_ros2::messages::{Imu, JointState, Odometry, PoseWithCovarianceStamped};
+use tread_ros2::messages::JointState;
 use tread_ros2::rmw::{KeyMismatch, check_key};
 
 use super::finding::{Finding, Key};
 use super::heard::Message;
 use super::joint_names::JointNames;
+use crate::drive::ros2::frames;
 use crate::drive::ros2::inlet::{decoded, topic_of, type_of};
 use crate::drive::ros2::reading::Content;
 use crate::drive::ros2::refusal::{Refusal, Source};
@@ -238,7 +239,7 @@ fn of_topic(
         }
     }
     if let Some((refusal, message)) = worst.filter(|_| bad > BAD_SHARE_MAX * count) {
-        return of_refusal(source, refusal, message, bad / count);
+        return of_refusal(settings, source, (refusal, message), bad / count);
     }
     let finding = of_writers(source, messages);
     if let Some(finding) = finding.or_else(|| of_stamps(settings, source, messages)) {
@@ -316,21 +317,24 @@ fn of_keys(settings: &Ros2Settings, source: Source, messages: &[&Message]) -> Op
     }
 }
 
-fn of_refusal(source: Source, refusal: Refusal, message: &Message, share: f64) -> Finding {
+fn of_refusal(
+    settings: &Ros2Settings,
+    source: Source,
+    (refusal, message): (Refusal, &Message),
+    share: f64,
+) -> Finding {
     let (name, topic_key) = names(source);
     let percent = 100.0 * share;
     if refusal == Refusal::WrongFrame {
-        let lines = frames_of(source, &message.payload).unwrap_or_default();
-        let key = lines.first().map_or(topic_key, |(key, _)| *key);
-        let frames: Vec<_> = lines
-            .iter()
-            .map(|(_, frame)| format!("`{frame}`"))
-            .collect();
-        let frames = frames.join(" and ");
-        let text = format!("it is of the frame {frames}, which the configuration does not name");
+        let frames = frames::named(settings, source, &message.payload).unwrap_or_default();
+        let key = frames.first().map_or(topic_key, |frame| Key(frame.key));
+        let text = match frames::others(&frames) {
+            Some(others) => format!("its messages have the {others}"),
+            None => "its messages are of another frame".to_owned(),
+        };
         let finding = Finding::on(name).wrong(key, text);
-        return lines.into_iter().fold(finding, |finding, (key, frame)| {
-            finding.with_line(key, format!("{frame:?}"))
+        return frames.into_iter().fold(finding, |finding, frame| {
+            finding.with_line(Key(frame.key), format!("{:?}", frame.received))
         });
     }
     let key = if refusal == Refusal::Joints {
@@ -340,34 +344,6 @@ fn of_refusal(source: Source, refusal: Refusal, message: &Message, share: f64) -
     };
     let text = format!("{percent:.0} % of it are {}", refusal.text());
     Finding::on(name).wrong(key, text)
-}
-
-/// Returns the frames in a source's message with their keys; `None` if there are none.
-fn frames_of(source: Source, payload: &[u8]) -> Option<Vec<(Key, String)>> {
-    match source {
-        Source::Odometry => {
-            let read: Odometry<'_> = decode(payload).ok()?;
-            let (frame, child_frame) = (read.header.frame_id, read.child_frame_id);
-            Some(vec![
-                (Key("drive.ros2.odometry.frame"), frame.to_owned()),
-                (
-                    Key("drive.ros2.odometry.child_frame"),
-                    child_frame.to_owned(),
-                ),
-            ])
-        }
-        Source::Imu => {
-            let read: Imu<'_> = decode(payload).ok()?;
-            let frame = read.header.frame_id.to_owned();
-            Some(vec![(Key("drive.ros2.imu.frame"), frame)])
-        }
-        Source::Pose => {
-            let read: PoseWithCovarianceStamped<'_> = decode(payload).ok()?;
-            let frame = read.header.frame_id.to_owned();
-            Some(vec![(Key("drive.ros2.pose.frame"), frame)])
-        }
-        Source::Joints | Source::Battery => None,
-    }
 }
 
 fn age_ms(settings: &Ros2Settings, source: Source, message: &Message) -> Option<f64> {

@@ -25,7 +25,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
-use anyhow::{Context as _, bail};
+use anyhow::Context as _;
 use clap::Args;
 use tread_control::gate::{GateInput, GateLimits, gate};
 use tread_control::measured::WheelSpeeds;
@@ -88,10 +88,10 @@ pub(crate) struct DoctorArgs {
 /// Examines the robot and prints the findings. Returns whether no problem was found.
 ///
 /// # Errors
-/// The configuration is invalid, the robot has no ROS 2 drive, or standard output cannot be
-/// written.
+/// Standard output cannot be written. A configuration that cannot be read, or a base that cannot be
+/// examined, is a finding.
 pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<bool> {
-    let findings = examine(args)?;
+    let findings = examine(args);
     let robot_toml = finding::robot_toml(&findings);
     let mut out = std::io::stdout().lock();
     if args.json {
@@ -115,19 +115,36 @@ pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<bool> {
     Ok(findings.iter().all(|finding| finding.holds))
 }
 
-fn examine(args: &DoctorArgs) -> anyhow::Result<Vec<Finding>> {
-    let config = AgentConfig::load(&Flags {
+fn examine(args: &DoctorArgs) -> Vec<Finding> {
+    let loaded = AgentConfig::load(&Flags {
         config: Some(args.config.clone()),
         ..Flags::default()
-    })?;
-    let DriveConfig::Ros2(settings) = &config.drive else {
-        bail!("the robot of this configuration is simulated: nothing is to be examined");
+    });
+    let config = match loaded {
+        Ok(config) => config,
+        Err(cause) => {
+            let text = format!("{:#}", anyhow::Error::from(cause));
+            return vec![Finding::on("configuration").unexaminable(text)];
+        }
     };
+    let DriveConfig::Ros2(settings) = &config.drive else {
+        let text = "the robot of this configuration is simulated: nothing is to be examined";
+        return vec![Finding::on("configuration").unexaminable(text)];
+    };
+    examine_base(args, &config, settings)
+        .unwrap_or_else(|cause| vec![Finding::on("base").unexaminable(format!("{cause:#}"))])
+}
+
+fn examine_base(
+    args: &DoctorArgs,
+    config: &AgentConfig,
+    settings: &Ros2Settings,
+) -> anyhow::Result<Vec<Finding>> {
     let model = control_model(&config.model)?;
     let clock = SystemClock::shared();
     let heard = Arc::new(Heard::default());
     let tap: Arc<dyn Tap> = Arc::<Heard>::clone(&heard);
-    let (drive, bus) = Ros2Drive::examined((**settings).clone(), &clock, &tap)?;
+    let (drive, bus) = Ros2Drive::examined(settings.clone(), &clock, &tap)?;
     let speaking = std::thread::Builder::new()
         .name("robot's bus".to_owned())
         .spawn(move || bus.run())

@@ -12,6 +12,7 @@
 //! [`MissionSlot`] is pure: it decides, its callers act. An ended mission never becomes active
 //! again, even by a late offer; [`memory`] keeps that over restarts of the agent.
 
+mod kept_ends;
 pub mod memory;
 #[cfg(test)]
 mod tests;
@@ -26,6 +27,9 @@ use tread_api::wire::ingest::{MissionPhase, MissionReport};
 use tread_api::wire::reply::{
     AcceptedMission, CommandRefusal, CommandRefusalCode, EndedMission, MissionOutcomes,
 };
+
+use self::kept_ends::KeptEnds;
+pub use self::kept_ends::UNRECORDED_ENDS_MAX;
 
 /// Number of ended missions that are remembered; the oldest is dropped first.
 pub const ENDED_MAX: usize = 1_000;
@@ -67,10 +71,15 @@ pub struct MissionSlot {
     /// Phase of the active mission's end, while that is being recorded.
     #[serde(skip)]
     ending: Option<MissionPhase>,
-    /// Report of the last end until the outbox has it on disk. It is saved before the outbox gets
-    /// it, so that an agent that is killed in between reports this end and no other one.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    unrecorded_end: Option<Box<MissionReport>>,
+    /// Reports of ends until the outbox has them on disk, at most [`UNRECORDED_ENDS_MAX`]. Each is
+    /// saved before the outbox gets it, so that an agent that is killed in between reports this end
+    /// and no other one.
+    #[serde(
+        default,
+        alias = "unrecorded_end",
+        skip_serializing_if = "KeptEnds::is_empty"
+    )]
+    unrecorded_ends: KeptEnds,
 }
 
 /// Decision on an offer.
@@ -284,19 +293,24 @@ impl MissionSlot {
         *self.ending.insert(phase)
     }
 
-    /// Keeps the report of an end until [`MissionSlot::end_is_recorded`].
+    /// Keeps the report of an end until [`MissionSlot::ends_are_recorded`].
     pub fn keep_end(&mut self, report: MissionReport) {
-        self.unrecorded_end = Some(Box::new(report));
+        self.unrecorded_ends.keep(report);
     }
 
-    /// Returns the report of the last end, if it may not be in the outbox.
-    pub fn unrecorded_end(&self) -> Option<&MissionReport> {
-        self.unrecorded_end.as_deref()
+    /// Returns the reports of ends that may not be in the outbox, oldest first.
+    pub fn unrecorded_ends(&self) -> impl Iterator<Item = &MissionReport> {
+        self.unrecorded_ends.reports()
     }
 
-    /// Drops the report of the last end: the outbox has it on disk.
-    pub fn end_is_recorded(&mut self) {
-        self.unrecorded_end = None;
+    /// Returns the number of kept reports of ends that this agent cannot read.
+    pub fn unreadable_ends(&self) -> usize {
+        self.unrecorded_ends.unreadable()
+    }
+
+    /// Drops the reports of ends: the outbox has them on disk.
+    pub fn ends_are_recorded(&mut self) {
+        self.unrecorded_ends = KeptEnds::default();
     }
 
     /// Ends the active mission; `None` if it is not this one.

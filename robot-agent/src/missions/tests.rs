@@ -168,3 +168,32 @@ proptest! {
         prop_assert_eq!(newest, count.checked_sub(1).map(id));
     }
 }
+
+#[test]
+fn the_ends_that_wait_for_the_outbox_are_bounded_and_the_newest_stay() {
+    let report = |mission: u128| MissionReport {
+        mission: id(mission),
+        revision: 1,
+        plan_hash: PlanHash::from_uuid(Uuid::from_u128(1)),
+        at: jiff::Timestamp::UNIX_EPOCH,
+        phase: MissionPhase::Succeeded,
+        since: None,
+        reason: None,
+        progress: None,
+        quality: None,
+        driven: None,
+    };
+    let mut slot = MissionSlot::default();
+    let count = UNRECORDED_ENDS_MAX as u128 + 3;
+    for mission in 0..count {
+        slot.keep_end(report(mission));
+        // A report that is kept again takes no further place.
+        slot.keep_end(report(mission));
+    }
+    let kept: Vec<MissionId> = slot.unrecorded_ends().map(|kept| kept.mission).collect();
+    assert_eq!(kept, (3..count).map(id).collect::<Vec<_>>());
+    let again: MissionSlot = serde_json::from_slice(&serde_json::to_vec(&slot).unwrap()).unwrap();
+    assert_eq!(again, slot);
+    slot.ends_are_recorded();
+    assert_eq!(slot, MissionSlot::default());
+}

@@ -99,27 +99,34 @@ struct Chunk {
     messages: Vec<Message>,
 }
 
-/// Copies the readable part and prints its size.
+/// Copies the readable part and prints its size. Returns whether anything was recovered.
 ///
 /// # Errors
-/// [`SalvageError`], or the output cannot be written.
-pub(crate) fn run(args: &RecoverArgs) -> anyhow::Result<()> {
-    let found = salvage(args)?;
+/// [`SalvageError`], unless JSON is printed, which then contains the error; or the output cannot be
+/// written.
+pub(crate) fn run(args: &RecoverArgs) -> anyhow::Result<bool> {
+    let salvaged = salvage(args);
     let mut out = io::stdout().lock();
     if args.json {
-        serde_json::to_writer(&mut out, &object(&found))?;
+        let is_recovered = salvaged.is_ok();
+        let object = match salvaged {
+            Ok(found) => object(&found),
+            Err(refused) => json!({ "refused": format!("{:#}", anyhow::Error::from(refused)) }),
+        };
+        serde_json::to_writer(&mut out, &object)?;
         writeln!(out)?;
-    } else {
-        writeln!(
-            out,
-            "recovered {} messages, {} ticks of them, from {} chunks",
-            found.messages, found.ticks, found.chunks
-        )?;
-        for (first, last) in &found.missing {
-            writeln!(out, "ticks {first} to {last} are missing")?;
-        }
+        return Ok(is_recovered);
     }
-    Ok(())
+    let found = salvaged?;
+    writeln!(
+        out,
+        "recovered {} messages, {} ticks of them, from {} chunks",
+        found.messages, found.ticks, found.chunks
+    )?;
+    for (first, last) in &found.missing {
+        writeln!(out, "ticks {first} to {last} are missing")?;
+    }
+    Ok(true)
 }
 
 fn object(found: &Salvaged) -> Value {

@@ -6,6 +6,7 @@
     reason = "what the helpers of a test cannot do fails the test"
 )]
 
+mod commands;
 mod control;
 mod recording;
 mod rig;

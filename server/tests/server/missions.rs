@@ -112,6 +112,31 @@ async fn what_arrives_late_or_twice_never_reopens_a_mission() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_end_that_its_robot_reports_again_is_nothing_new() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    for (first, phase) in [(0, MissionPhase::Succeeded), (10, MissionPhase::Failed)] {
+        let mission = yard.create_mission(&robot.id).await;
+        yard.mission_becomes(mission.id, MissionState::Active).await;
+        robot.report(first, &mission, phase).await;
+        let before = yard.mission(mission.id).await;
+        assert!(before.mission.state.is_terminal());
+        // In a further record, as of an agent that was killed while it recorded the end.
+        let again = robot.report(first + 1, &mission, phase).await;
+        assert_eq!((again.committed, again.duplicates), (1, 0));
+        assert_eq!(yard.mission(mission.id).await, before);
+        // Another end is noted.
+        robot
+            .report(first + 2, &mission, MissionPhase::Expired)
+            .await;
+        let after = yard.mission(mission.id).await;
+        assert_eq!(after.mission.state, before.mission.state);
+        assert_eq!(after.events.len(), before.events.len() + 1);
+    }
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn two_missions_of_one_robot_run_one_after_the_other() {
     let yard = Yard::start().await;
     let robot = Robot::join(&yard, "rover-1").await;

@@ -12,6 +12,7 @@ use tread_ros2::names::Name;
 use tread_ros2::rmw::{Attachment, check_key};
 
 use super::assemble::Arrived;
+use super::frames;
 use super::reading::{self, Content, Reading};
 use super::refusal::{Counts, Notice, Refusal, Source};
 use super::settings::{Ros2Settings, Scheme};
@@ -139,7 +140,14 @@ impl Inlet {
                     self.arrivals.ring();
                 }
             }
-            Err(refusal) => self.counts.refuse(self.source, refusal),
+            Err(refusal) => {
+                if refusal == Refusal::WrongFrame {
+                    let frames = frames::named(&self.settings, self.source, payload);
+                    let others = frames.and_then(|frames| frames::others(&frames));
+                    self.counts.set_other_frames(self.source, others);
+                }
+                self.counts.refuse(self.source, refusal);
+            }
         }
     }
 

@@ -14,6 +14,7 @@ pub mod assemble;
 pub mod bus;
 mod command;
 mod command_watch;
+pub mod frames;
 pub mod inlet;
 pub mod notices;
 pub mod obedience;

@@ -126,7 +126,7 @@ fn is_unmeasured(covariance: &[f64; 9]) -> bool {
 }
 
 /// Returns the name of a frame without the slash that tf1 wrote before it.
-fn bare(frame: &str) -> &str {
+pub(super) fn bare(frame: &str) -> &str {
     frame.strip_prefix('/').unwrap_or(frame)
 }
 

@@ -2,6 +2,7 @@
 //! and recent changes.
 
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Mutex, PoisonError};
 
 use tread_ros2::cdr::CdrError;
 use tread_ros2::rmw::KeyMismatch;
@@ -209,6 +210,8 @@ pub struct Counts {
     dropped: [[AtomicU64; Refusal::ALL.len()]; Source::ALL.len()],
     noted: [[AtomicU64; Notice::ALL.len()]; Source::ALL.len()],
     foreign_commands: AtomicU64,
+    /// Frames of the last message that was dropped for them, with the configured ones, for people.
+    other_frames: [Mutex<Option<String>>; Source::ALL.len()],
     /// Names of the configured topics.
     topics: [Option<String>; Source::ALL.len()],
 }
@@ -255,6 +258,21 @@ impl Counts {
     /// Counts a message that was dropped.
     pub fn refuse(&self, source: Source, refusal: Refusal) {
         self.dropped[source as usize][refusal as usize].fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// Sets the description of the frames for which a message of a topic is dropped.
+    pub fn set_other_frames(&self, source: Source, others: Option<String>) {
+        let frames = &self.other_frames[source as usize];
+        *frames.lock().unwrap_or_else(PoisonError::into_inner) = others;
+    }
+
+    /// Returns the description of the frames for which a message of a topic was dropped last.
+    fn other_frames(&self, source: Source) -> Option<String> {
+        let frames = &self.other_frames[source as usize];
+        frames
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .clone()
     }
 
     /// Returns the number of messages of a topic that were used.
@@ -327,7 +345,12 @@ impl Dropping {
         let (source, refusal) = self.worst?;
         let times = counts.dropped(source, refusal);
         let (text, section) = (refusal.text(), source.section());
-        let text = format!("{text} are dropped ({section}, {times} so far)");
+        let mut text = format!("{text} are dropped ({section}, {times} so far)");
+        if refusal == Refusal::WrongFrame
+            && let Some(frames) = counts.other_frames(source)
+        {
+            text = format!("{text}: {frames}");
+        }
         Some((refusal, text))
     }
 }

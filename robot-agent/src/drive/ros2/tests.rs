@@ -7,7 +7,7 @@ use tread_ros2::messages::{Header, Imu, JointState, Quaternion, Time, Vector3};
 use tread_ros2::names::Name;
 use tread_ros2::rmw::{Attachment, Generation, topic_key};
 
-use super::refusal::Notice;
+use super::refusal::{Dropping, Notice};
 use super::settings::*;
 use super::*;
 use crate::clock::{Clock as _, ManualClock};
@@ -326,6 +326,25 @@ fn every_bad_message_is_counted_by_its_reason_and_is_no_word_of_the_base() {
         );
         assert_eq!(talk.tell(COMMANDED), WheelSpeeds::default(), "{refusal:?}");
     }
+}
+
+#[test]
+fn the_frame_for_which_messages_are_dropped_is_named_with_the_configured_one() {
+    let mut talk = Talk::new();
+    let counts = talk.drive.counts();
+    let mut dropping = Dropping::default();
+    for _ in 0..3 {
+        talk.say(&Said {
+            frame: "camera",
+            ..GOOD
+        });
+    }
+    let (refusal, text) = dropping.look(&counts).unwrap();
+    assert_eq!(refusal, Refusal::WrongFrame);
+    assert_eq!(
+        text,
+        "messages of another frame are dropped (imu, 3 so far): frame `camera` instead of `imu_link`"
+    );
 }
 
 #[test]

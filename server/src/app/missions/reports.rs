@@ -9,7 +9,7 @@ use tread_api::robot::MissionProgress;
 use tread_api::wire::ingest::{MissionPhase, MissionReport};
 
 use super::transitions::Change;
-use super::{EVENTS_MAX, Step, note, take_step};
+use super::{EVENTS_MAX, Step, bounded, note, take_step};
 use crate::db::missions::{Facts, MissionRow};
 use crate::db::{self, DbError, Tx};
 
@@ -232,6 +232,8 @@ async fn take_phase(
     }
     // The robot's answer to the command has caused this transition already.
     let is_known = open && next_is_reached(change, mission);
+    // An agent that was killed while it recorded this end reports it again.
+    let is_known = is_known || has_ended_so(tx, mission, change, reason).await?;
     if is_known {
         return Ok(None);
     }
@@ -241,6 +243,29 @@ async fn take_phase(
     let text = format!("the robot reported late that it {name}{reason}");
     note(tx, row, Actor::Robot, reporting.now, &text).await?;
     Ok(None)
+}
+
+/// Returns whether the robot's own report has ended the mission already by this change and for this
+/// reason.
+async fn has_ended_so(
+    tx: &mut Tx,
+    mission: &Mission,
+    change: Change,
+    reason: Option<&str>,
+) -> Result<bool, DbError> {
+    if !mission.state.is_terminal() {
+        return Ok(false);
+    }
+    let reason = bounded(reason.unwrap_or(change.reason()));
+    let events = db::history::events(tx, mission.id, EVENTS_MAX).await?;
+    let end = events
+        .iter()
+        .rev()
+        .find(|event| event.to.is_terminal() && event.from != Some(event.to));
+    Ok(end.is_some_and(|end| {
+        (end.actor, end.cause) == (Actor::Robot, change.cause())
+            && end.reason.as_deref() == Some(reason.as_str())
+    }))
 }
 
 /// Returns the progress that the robot showed last, for a report that ends the mission without
