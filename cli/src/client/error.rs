@@ -238,6 +238,14 @@ const NEXT_STEPS: &[(ProblemType, &str)] = &[
         "`tread tokens` and `tread robots join-token list` list tokens",
     ),
     (
+        ProblemType::UnknownSession,
+        "`tread sessions` lists the sessions of people",
+    ),
+    (
+        ProblemType::UnknownWebhook,
+        "`tread webhooks` lists the webhooks",
+    ),
+    (
         ProblemType::StopNotCleared,
         "wait until the robot is at rest, and give its newest stop: `tread clear ROBOT` shows it",
     ),
@@ -422,6 +430,9 @@ mod tests {
             (ProblemType::Unauthenticated, 401, Exit::Refused),
             (ProblemType::Forbidden, 403, Exit::Refused),
             (ProblemType::UnknownRobot, 404, Exit::NotFound),
+            (ProblemType::UnknownToken, 404, Exit::NotFound),
+            (ProblemType::UnknownSession, 404, Exit::NotFound),
+            (ProblemType::UnknownWebhook, 404, Exit::NotFound),
             (ProblemType::RobotBusy, 409, Exit::Conflict),
             (ProblemType::ChangedMeanwhile, 412, Exit::Conflict),
             (ProblemType::BeyondLimits, 422, Exit::Refused),
