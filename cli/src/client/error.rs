@@ -294,6 +294,10 @@ const NEXT_STEPS: &[(ProblemType, &str)] = &[
         "read the object again, and give its new revision with --revision",
     ),
     (
+        ProblemType::RobotsDoNotJoin,
+        "add `[robots]` to the server's configuration, run `tread-server init` with it, and restart the server",
+    ),
+    (
         ProblemType::RobotsLeft,
         "`tread authority` lists them; connect them to the network, or add --force",
     ),
@@ -435,6 +439,7 @@ mod tests {
             (ProblemType::UnknownWebhook, 404, Exit::NotFound),
             (ProblemType::RobotBusy, 409, Exit::Conflict),
             (ProblemType::ChangedMeanwhile, 412, Exit::Conflict),
+            (ProblemType::RobotsDoNotJoin, 409, Exit::Conflict),
             (ProblemType::BeyondLimits, 422, Exit::Refused),
             (ProblemType::RobotUnreachable, 503, Exit::Unreachable),
         ] {
