@@ -9,6 +9,7 @@ mod map;
 mod mission_name;
 mod missions;
 mod safety;
+mod spans;
 mod values;
 mod webhooks;
 
@@ -42,7 +43,8 @@ pub(crate) use self::safety::{
     AlertsAction, AlertsArguments, ClearArguments, DriveArguments, GeofenceArguments, LimitsAction,
     LimitsArguments, StopArguments, StopsArguments, WatchArguments,
 };
-use self::values::duration;
+pub(crate) use self::spans::spelled;
+use self::spans::wait_time;
 pub(crate) use self::values::{HistoryPlace, shield_negative_points, waypoint};
 pub(crate) use self::webhooks::{NamedWebhook, WebhooksAction, WebhooksArguments};
 use crate::credentials;
@@ -317,7 +319,7 @@ pub(crate) struct DemoArguments {
     pub(crate) scenario: Option<PathBuf>,
     /// End when all missions have ended, at the latest after this time; without it, run until
     /// Ctrl-C, which prints the results so far
-    #[arg(long, value_name = "TIME", value_parser = duration)]
+    #[arg(long, value_name = "TIME", value_parser = wait_time)]
     pub(crate) exit_after: Option<Duration>,
     /// Print one JSON object at the end instead of progress and tables
     #[arg(long)]
@@ -337,6 +339,52 @@ mod tests {
     #[test]
     fn the_command_line_has_no_contradictions() {
         Arguments::whole().debug_assert();
+    }
+
+    #[test]
+    fn a_time_of_zero_and_an_unknown_identifier_are_refused_in_words() {
+        for (line, said) in [
+            ("demo --exit-after 0s", "give a time from 1ms"),
+            ("missions wait 0a1b --timeout 0s", "give a time from 1ms"),
+            (
+                "send waypoints --robot r --wait --timeout 0ms 0,0 4,2",
+                "give a time from 1ms",
+            ),
+            (
+                "send waypoints --robot r --start-within 0h 0,0 4,2",
+                "give a time from 1ms",
+            ),
+            (
+                "send waypoints --robot r --stop-after-silence 0s 0,0 4,2",
+                "give a time from 1s to 24h",
+            ),
+            (
+                "send waypoints --robot r --lost-after 0s 0,0 4,2",
+                "give a time from 1s to 24h",
+            ),
+            (
+                "limits rover-1 set lidar --hold --for 0s",
+                "give a time from 1ms to 1h",
+            ),
+            ("friction history lawn --step 0s", "give a time from 1m"),
+            ("watch --every 0s", "give a time from 100ms to 1h"),
+            (
+                "robots join-token --expires 0s",
+                "give a time from 1s to 24h",
+            ),
+            ("tokens revoke nope", "`tread tokens` lists them"),
+            (
+                "robots join-token revoke nope",
+                "`tread robots join-token list` lists them",
+            ),
+            ("sessions end nope", "`tread sessions` lists them"),
+            ("alerts acknowledge nope", "`tread alerts` lists them"),
+            ("clear rover-1 nope", "`tread stops` lists them"),
+        ] {
+            let words = std::iter::once("tread").chain(line.split(' '));
+            let refused = Arguments::try_parse_from(words).unwrap_err().to_string();
+            assert!(refused.contains(said), "`{line}`: {refused}");
+        }
     }
 
     #[test]

@@ -3,6 +3,7 @@
 
 use std::path::PathBuf;
 use std::str::FromStr;
+use std::time::Duration;
 
 use clap::{Args, Subcommand};
 use tread_agent::membership::Fingerprint;
@@ -11,7 +12,9 @@ use tread_api::identity::{Role, TOKEN_DAYS_DEFAULT, TOKEN_DAYS_MAX};
 use tread_api::ids::{JoinTokenId, RobotId, SessionId, Tag, TokenId};
 use tread_api::rights::Right;
 
-use super::{Connection, duration};
+use super::Connection;
+use super::spans::within;
+use super::values::{join_token_id, session_id, token_id};
 use crate::client::Trusted;
 
 /// Options for authentication and for the trust in the server.
@@ -88,6 +91,7 @@ pub(crate) enum TokensAction {
     /// Revoke a token: it is refused from now on, and its open connections are closed
     Revoke {
         /// Identifier of the token, as `tread tokens` lists it
+        #[arg(value_parser = token_id)]
         token: TokenId,
     },
 }
@@ -107,7 +111,7 @@ pub(crate) enum SessionsAction {
     /// End sessions: they are refused from now on, and their open connections are closed
     End {
         /// Identifiers of the sessions, as `tread sessions` lists them
-        #[arg(required = true, value_name = "SESSION")]
+        #[arg(required = true, value_name = "SESSION", value_parser = session_id)]
         sessions: Vec<SessionId>,
     },
 }
@@ -276,6 +280,7 @@ pub(crate) enum JoinTokenAction {
     /// Revoke a join token
     Revoke {
         /// Identifier of the join token, as `list` shows it
+        #[arg(value_parser = join_token_id)]
         join_token: JoinTokenId,
     },
 }
@@ -324,13 +329,9 @@ pub(crate) struct RobotArguments {
     pub(crate) connection: Connection,
 }
 
-/// Parses a validity such as `1h` to minutes, rounded up; an error unless it is 1 minute to 1 day.
+/// Parses a validity such as `1h` to minutes, rounded up.
 fn join_time(text: &str) -> Result<u32, String> {
-    let time = duration(text)?;
-    let minutes = u32::try_from(time.as_secs().div_ceil(60)).unwrap_or(u32::MAX);
-    if (1..=JOIN_MINUTES_MAX).contains(&minutes) {
-        Ok(minutes)
-    } else {
-        Err("it must be a minute to a day".to_owned())
-    }
+    let bounds = Duration::from_secs(1)..=Duration::from_mins(u64::from(JOIN_MINUTES_MAX));
+    let time = within(text, &bounds)?;
+    Ok(u32::try_from(time.as_secs().div_ceil(60)).unwrap_or(JOIN_MINUTES_MAX))
 }

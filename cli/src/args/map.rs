@@ -11,9 +11,9 @@ use tread_api::site::GeoOrigin;
 use tread_api::terrain::TerrainClass;
 
 use super::Connection;
+use super::spans::history_step;
 use super::values::{
-    HistoryPlace, area, duration, earth, finite, history_place, moment, point, positive,
-    terrain_class,
+    HistoryPlace, area, earth, finite, history_place, moment, point, positive, terrain_class,
 };
 use crate::client::{Area, HistoryTimes, Reading};
 
@@ -193,7 +193,7 @@ pub(crate) struct HistoryArguments {
     #[arg(long, value_name = "WHEN", value_parser = moment)]
     to: Option<Timestamp>,
     /// Time between two rows, at least one minute
-    #[arg(long, value_name = "TIME", default_value = "1h", value_parser = duration)]
+    #[arg(long, value_name = "TIME", default_value = "1h", value_parser = history_step)]
     step: Duration,
     #[command(flatten)]
     pub(crate) models: ModelArguments,

@@ -9,7 +9,8 @@ use tread_api::ids::RobotId;
 use tread_api::mission::{LinkPolicy, MissionState, StartPolicy};
 use tread_api::trajectory::Waypoint;
 
-use super::values::{duration, finite, mission_state, point, waypoint};
+use super::spans::{silence, wait_time};
+use super::values::{finite, mission_state, point, waypoint};
 use super::{Connection, MissionName};
 
 #[derive(Debug, Args)]
@@ -42,7 +43,7 @@ pub(crate) struct Order {
     #[arg(long)]
     pub(crate) robot: RobotId,
     /// Let the mission expire if it has not started within this time from now
-    #[arg(long, value_name = "TIME", value_parser = duration)]
+    #[arg(long, value_name = "TIME", value_parser = wait_time)]
     pub(crate) start_within: Option<Duration>,
     /// Effect on the robot's other missions
     #[arg(long, value_enum, default_value_t = Start::Append)]
@@ -51,10 +52,10 @@ pub(crate) struct Order {
     #[arg(long, default_value_t = 0, allow_hyphen_values = true)]
     pub(crate) priority: i32,
     /// Stop the robot when the server was silent for this time; it continues the mission if absent
-    #[arg(long, value_name = "TIME", value_parser = duration)]
+    #[arg(long, value_name = "TIME", value_parser = silence)]
     pub(crate) stop_after_silence: Option<Duration>,
     /// Let the mission fail when the robot was offline for this time
-    #[arg(long, value_name = "TIME", value_parser = duration)]
+    #[arg(long, value_name = "TIME", value_parser = silence)]
     pub(crate) lost_after: Option<Duration>,
     /// Speed of the approach to the trajectory, metres per second; that of the trajectory if absent
     #[arg(long, value_name = "M/S", value_parser = finite, allow_negative_numbers = true)]
@@ -74,7 +75,7 @@ pub(crate) struct Order {
     #[arg(long)]
     pub(crate) wait: bool,
     /// Wait at most for this time; the mission continues
-    #[arg(long, value_name = "TIME", value_parser = duration, requires = "wait")]
+    #[arg(long, value_name = "TIME", value_parser = wait_time, requires = "wait")]
     pub(crate) timeout: Option<Duration>,
     #[command(flatten)]
     pub(crate) connection: Connection,
@@ -181,7 +182,7 @@ pub(crate) enum MissionsAction {
         #[arg(required = true, value_name = "MISSION")]
         missions: Vec<MissionName>,
         /// Wait at most for this time; the missions continue
-        #[arg(long, value_name = "TIME", value_parser = duration)]
+        #[arg(long, value_name = "TIME", value_parser = wait_time)]
         timeout: Option<Duration>,
     },
     /// Pause a mission: its robot brakes along the path and stays at rest

@@ -7,7 +7,8 @@ use clap::{Args, Subcommand};
 use tread_api::ids::{AlertCode, AlertId, OwnerId, RobotId, StopId};
 
 use super::Connection;
-use super::values::{duration, finite, look_interval, positive};
+use super::spans::{limit_time, look_interval};
+use super::values::{alert_id, finite, positive, stop_id};
 
 #[derive(Debug, Args)]
 pub(crate) struct WatchArguments {
@@ -47,6 +48,7 @@ pub(crate) struct ClearArguments {
     /// Robot whose stop is cleared
     pub(crate) robot: RobotId,
     /// Identifier of the stop; if absent, the stop is shown with its reason and not cleared
+    #[arg(value_parser = stop_id)]
     pub(crate) stop: Option<StopId>,
     /// Name of the person who clears, shown to others
     #[arg(long, env = "USER")]
@@ -96,6 +98,7 @@ pub(crate) enum AlertsAction {
     #[command(visible_alias = "ack")]
     Acknowledge {
         /// Alert identifier
+        #[arg(value_parser = alert_id)]
         alert: AlertId,
     },
 }
@@ -143,7 +146,7 @@ pub(crate) enum LimitsAction {
         #[arg(long, value_name = "M/S", value_parser = finite)]
         speed: Option<f64>,
         /// Duration of the limit, at most one hour
-        #[arg(long = "for", value_name = "TIME", value_parser = duration)]
+        #[arg(long = "for", value_name = "TIME", value_parser = limit_time)]
         lasting: Duration,
     },
     /// End the limit of an owner

@@ -1,53 +1,19 @@
 //! Parsers of single values of the command line.
 
 use std::ffi::OsString;
-use std::time::Duration;
+use std::str::FromStr;
 
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use jiff::{SignedDuration, Timestamp};
 use tread_api::geometry::Point;
-use tread_api::ids::TerrainId;
+use tread_api::ids::{AlertId, JoinTokenId, SessionId, StopId, TerrainId, TokenId};
 use tread_api::mission::MissionState;
 use tread_api::site::GeoOrigin;
 use tread_api::terrain::TerrainClass;
 use tread_api::trajectory::Waypoint;
 
+use super::spans::duration;
 use crate::client::Area;
-
-/// Minimum and maximum period of updates of `tread watch`.
-const LOOK_EVERY_MIN: Duration = Duration::from_millis(100);
-const LOOK_EVERY_MAX: Duration = Duration::from_hours(1);
-
-/// Parses a time span such as `500ms`, `90s`, `5m` or `2h`.
-pub(super) fn duration(text: &str) -> Result<Duration, String> {
-    let unit_at = text
-        .find(|letter: char| letter.is_ascii_alphabetic())
-        .unwrap_or(text.len());
-    let (number, unit) = text.split_at(unit_at);
-    let seconds_per_unit = match unit {
-        "ms" => 1e-3,
-        "s" => 1.0,
-        "m" | "min" => 60.0,
-        "h" => 3600.0,
-        _ => return Err("give a number and a unit: 500ms, 90s, 5m or 2h".to_owned()),
-    };
-    let number: f64 = number
-        .parse()
-        .map_err(|_| format!("`{number}` is not a number"))?;
-    Duration::try_from_secs_f64(number * seconds_per_unit).map_err(|error| error.to_string())
-}
-
-/// Parses the update period of `tread watch`, bounded in both directions to limit the load.
-pub(super) fn look_interval(text: &str) -> Result<Duration, String> {
-    let every = duration(text)?;
-    if (LOOK_EVERY_MIN..=LOOK_EVERY_MAX).contains(&every) {
-        Ok(every)
-    } else {
-        Err(format!(
-            "give a time from {LOOK_EVERY_MIN:?} to {LOOK_EVERY_MAX:?}"
-        ))
-    }
-}
 
 /// Parses a finite number; JSON cannot represent any other.
 pub(super) fn finite(text: &str) -> Result<f64, String> {
@@ -116,6 +82,67 @@ pub(super) fn moment(text: &str) -> Result<Timestamp, String> {
     let ago = duration(text).map_err(|_| wrong())?;
     let ago = SignedDuration::try_from(ago).map_err(|_| wrong())?;
     Timestamp::now().checked_sub(ago).map_err(|_| wrong())
+}
+
+/// Objects to which a server gives identifiers, and the command that lists them.
+#[derive(Clone, Copy)]
+struct Identified {
+    object: &'static str,
+    listing: &'static str,
+}
+
+impl Identified {
+    /// Parses an identifier.
+    fn read<T: FromStr>(self, text: &str) -> Result<T, String> {
+        let Self { object, listing } = self;
+        let wrong = |_| format!("this is no identifier of {object}: `{listing}` lists them");
+        text.parse().map_err(wrong)
+    }
+}
+
+/// Parses the identifier of a token.
+pub(super) fn token_id(text: &str) -> Result<TokenId, String> {
+    let tokens = Identified {
+        object: "a token",
+        listing: "tread tokens",
+    };
+    tokens.read(text)
+}
+
+/// Parses the identifier of a join token.
+pub(super) fn join_token_id(text: &str) -> Result<JoinTokenId, String> {
+    let join_tokens = Identified {
+        object: "a join token",
+        listing: "tread robots join-token list",
+    };
+    join_tokens.read(text)
+}
+
+/// Parses the identifier of a session.
+pub(super) fn session_id(text: &str) -> Result<SessionId, String> {
+    let sessions = Identified {
+        object: "a session",
+        listing: "tread sessions",
+    };
+    sessions.read(text)
+}
+
+/// Parses the identifier of an alert.
+pub(super) fn alert_id(text: &str) -> Result<AlertId, String> {
+    let alerts = Identified {
+        object: "an alert",
+        listing: "tread alerts",
+    };
+    alerts.read(text)
+}
+
+/// Parses the identifier of a stop.
+pub(super) fn stop_id(text: &str) -> Result<StopId, String> {
+    let stops = Identified {
+        object: "a stop",
+        listing: "tread stops",
+    };
+    stops.read(text)
 }
 
 /// Parses the name of a mission state.
@@ -233,13 +260,30 @@ mod tests {
         assert!((82_799..=82_801).contains(&apart), "{apart}");
         assert!(moment("yesterday").is_err());
     }
-
     #[test]
-    fn times_are_read_with_their_units() {
-        assert_eq!(duration("500ms"), Ok(Duration::from_millis(500)));
-        assert_eq!(duration("1.5m"), Ok(Duration::from_secs(90)));
-        for wrong in ["", "5", "s", "-5s", "5 days", "nans", "infs"] {
-            assert!(duration(wrong).is_err(), "`{wrong}` was taken");
+    fn a_text_that_is_no_identifier_is_refused_with_the_command_that_lists_them() {
+        let refused = [
+            token_id("nope").unwrap_err(),
+            join_token_id("nope").unwrap_err(),
+            session_id("nope").unwrap_err(),
+            alert_id("nope").unwrap_err(),
+            stop_id("nope").unwrap_err(),
+        ];
+        let listings = [
+            "tokens`",
+            "join-token list`",
+            "sessions`",
+            "alerts",
+            "stops`",
+        ];
+        for (refused, listing) in refused.iter().zip(listings) {
+            assert!(
+                refused.starts_with("this is no identifier of "),
+                "{refused}"
+            );
+            assert!(refused.contains(listing), "{refused}");
         }
+        let whole = "0192f0c1-2b3c-7d4e-8f50-617283940a1b";
+        assert_eq!(token_id(whole).unwrap().to_string(), whole);
     }
 }

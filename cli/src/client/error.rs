@@ -238,6 +238,14 @@ const NEXT_STEPS: &[(ProblemType, &str)] = &[
         "`tread tokens` and `tread robots join-token list` list tokens",
     ),
     (
+        ProblemType::UnknownSession,
+        "`tread sessions` lists the sessions of people",
+    ),
+    (
+        ProblemType::UnknownWebhook,
+        "`tread webhooks` lists the webhooks",
+    ),
+    (
         ProblemType::StopNotCleared,
         "wait until the robot is at rest, and give its newest stop: `tread clear ROBOT` shows it",
     ),
@@ -284,6 +292,10 @@ const NEXT_STEPS: &[(ProblemType, &str)] = &[
     (
         ProblemType::ChangedMeanwhile,
         "read the object again, and give its new revision with --revision",
+    ),
+    (
+        ProblemType::RobotsDoNotJoin,
+        "add `[robots]` to the server's configuration, run `tread-server init` with it, and restart the server",
     ),
     (
         ProblemType::RobotsLeft,
@@ -422,8 +434,12 @@ mod tests {
             (ProblemType::Unauthenticated, 401, Exit::Refused),
             (ProblemType::Forbidden, 403, Exit::Refused),
             (ProblemType::UnknownRobot, 404, Exit::NotFound),
+            (ProblemType::UnknownToken, 404, Exit::NotFound),
+            (ProblemType::UnknownSession, 404, Exit::NotFound),
+            (ProblemType::UnknownWebhook, 404, Exit::NotFound),
             (ProblemType::RobotBusy, 409, Exit::Conflict),
             (ProblemType::ChangedMeanwhile, 412, Exit::Conflict),
+            (ProblemType::RobotsDoNotJoin, 409, Exit::Conflict),
             (ProblemType::BeyondLimits, 422, Exit::Refused),
             (ProblemType::RobotUnreachable, 503, Exit::Unreachable),
         ] {

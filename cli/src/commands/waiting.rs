@@ -12,6 +12,7 @@ use tread_api::mission::{Mission, MissionState};
 
 use super::mission_text::{state, summary};
 use super::robots::steps_come;
+use crate::args::spelled;
 use crate::client::Client;
 use crate::output::{Output, TookTooLong, note};
 
@@ -123,8 +124,9 @@ pub(super) async fn wait(
                 waited.bar.abandon();
             }
             let text = format!(
-                "{left} of {} missions have not ended within {allowed:?}; they continue, see `tread missions`",
-                waited.len()
+                "{left} of {} missions have not ended within {}; they continue, see `tread missions`",
+                waited.len(),
+                spelled(allowed)
             );
             return Err(TookTooLong(text).into());
         }

@@ -50,8 +50,8 @@ pub enum BackupError {
     UnderWay,
     /// A folder has too little free space.
     #[error(
-        "`{}` has {free_mib} MiB free, and the backup needs {needed_mib} MiB there: make room, or \
-         take another folder", folder.display()
+        "`{}` has {free_mib} MiB free, and {needed_mib} MiB are needed there: make room, or take \
+         another folder", folder.display()
     )]
     NoSpace {
         /// The folder.

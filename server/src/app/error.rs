@@ -188,14 +188,14 @@ pub enum AppError {
         depth_m: f64,
     },
     /// The object was changed meanwhile: its revision is not the expected one.
-    #[error("the {what} is at revision {present} now, not {expected}")]
+    #[error("the {what} is at revision {present} now, not {}", one_of(.expected))]
     ChangedMeanwhile {
         /// The kind of object.
         what: &'static str,
         /// Its revision.
         present: u64,
-        /// The revision that was named.
-        expected: u64,
+        /// The revisions that were named.
+        expected: Vec<u64>,
     },
     /// A request with the same idempotency key is being answered.
     #[error("a request with this idempotency key is being answered; ask again in a moment")]
@@ -326,4 +326,13 @@ impl AppError {
             | Self::Storage(_) => None,
         }
     }
+}
+
+/// Returns revisions as words of a sentence.
+fn one_of(expected: &[u64]) -> String {
+    if expected.is_empty() {
+        return "one that the request names".to_owned();
+    }
+    let expected: Vec<String> = expected.iter().map(u64::to_string).collect();
+    expected.join(" or ")
 }

@@ -9,6 +9,7 @@ use tread_control::geometry as control;
 
 use super::check::{control_fence, control_model};
 use super::enrolment::FLEET_ROBOTS_MAX;
+use super::precondition::Precondition;
 use super::{App, AppError, site_row};
 use crate::db;
 use crate::db::robots::RobotRow;
@@ -25,24 +26,18 @@ impl App {
     ///
     /// # Errors
     /// The geofence is invalid, a robot with a known pose would be outside of it, or its present
-    /// revision is not `expected`.
+    /// revision is not one of `expected`.
     pub async fn replace_geofence(
         &self,
         site: &SiteId,
         request: ReplaceGeofence,
-        expected: Option<u64>,
+        expected: &Precondition,
     ) -> Result<Geofence, AppError> {
         let ReplaceGeofence { keep_in, keep_out } = request;
         let mut tx = self.db().write("geofence").await?;
         let site_pk = site_row(&mut tx, site).await?.pk;
         let before = db::geofences::present(&mut tx, site_pk).await?;
-        if let Some(expected) = expected.filter(|expected| *expected != before.revision) {
-            return Err(AppError::ChangedMeanwhile {
-                what: "geofence",
-                present: before.revision,
-                expected,
-            });
-        }
+        expected.check("geofence", before.revision)?;
         let geofence = Geofence {
             revision: before.revision + 1,
             keep_in,

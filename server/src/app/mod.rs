@@ -23,6 +23,7 @@ pub mod metrics;
 pub mod missions;
 mod own_alert;
 mod planned_path;
+pub mod precondition;
 pub mod presence;
 mod recalls;
 pub mod reconciler;

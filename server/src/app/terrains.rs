@@ -8,6 +8,7 @@ use tread_api::terrain::{
 };
 use tread_api::wire::hello::SiteDefinition;
 
+use super::precondition::Precondition;
 use super::{App, AppError, name_or, page, site_row};
 use crate::db::{self, DbError, Tx};
 
@@ -80,13 +81,13 @@ impl App {
     /// revision: measurements on the same ground belong together.
     ///
     /// # Errors
-    /// [`AppError::ChangedMeanwhile`] if its revision is another one than `expected`.
+    /// [`AppError::ChangedMeanwhile`] if its revision is none of `expected`.
     pub async fn replace_terrain(
         &self,
         site: &SiteId,
         id: &TerrainId,
         request: ReplaceTerrain,
-        expected: Option<u64>,
+        expected: &Precondition,
     ) -> Result<Terrain, AppError> {
         let ReplaceTerrain {
             name,
@@ -100,7 +101,7 @@ impl App {
         let Some(present) = db::terrains::find(&mut tx, site_pk, id).await? else {
             return Err(AppError::UnknownTerrain(site.clone(), id.clone()));
         };
-        check_revision(&present, expected)?;
+        expected.check("terrain", present.revision.into())?;
         let is_same = (
             &present.name,
             present.class,
@@ -140,36 +141,24 @@ impl App {
     /// Deletes a terrain; measurements made on it are kept.
     ///
     /// # Errors
-    /// [`AppError::ChangedMeanwhile`] if its revision is another one than `expected`.
+    /// [`AppError::ChangedMeanwhile`] if its revision is none of `expected`.
     pub async fn delete_terrain(
         &self,
         site: &SiteId,
         id: &TerrainId,
-        expected: Option<u64>,
+        expected: &Precondition,
     ) -> Result<(), AppError> {
         let mut tx = self.db().write("terrains").await?;
         let site_pk = site_row(&mut tx, site).await?.pk;
         let Some(present) = db::terrains::find(&mut tx, site_pk, id).await? else {
             return Err(AppError::UnknownTerrain(site.clone(), id.clone()));
         };
-        check_revision(&present, expected)?;
+        expected.check("terrain", present.revision.into())?;
         db::terrains::delete(&mut tx, site_pk, id).await?;
         db::sites::count_terrain_change(&mut tx, site_pk).await?;
         tx.commit().await?;
         self.wake();
         Ok(())
-    }
-}
-
-fn check_revision(present: &Terrain, expected: Option<u64>) -> Result<(), AppError> {
-    let revision = u64::from(present.revision);
-    match expected.filter(|&expected| expected != revision) {
-        Some(expected) => Err(AppError::ChangedMeanwhile {
-            what: "terrain",
-            present: revision,
-            expected,
-        }),
-        None => Ok(()),
     }
 }
 

@@ -35,24 +35,37 @@ pub(super) fn bytes(headers: &HeaderMap, media_type: &'static str, body: Bytes) 
 }
 
 /// Returns a streamed response with a weak `ETag` of `state`, which must change whenever the
-/// response does; 304 without a body if the client has it already.
-pub(super) fn streamed(
+/// response does; 304 without a body if the client has it already, and then `make` is not run.
+///
+/// # Errors
+/// The response cannot be begun.
+pub(super) async fn streamed(
     headers: &HeaderMap,
     media_type: &'static str,
     state: impl Hash,
-    make: impl FnOnce() -> Response,
-) -> Response {
+    make: impl Future<Output = Result<Response, Problem>>,
+) -> Result<Response, Problem> {
     let mut hasher = DefaultHasher::new();
     (media_type, state).hash(&mut hasher);
-    tagged(headers, format!("W/\"{:016x}\"", hasher.finish()), make)
+    let tag = format!("W/\"{:016x}\"", hasher.finish());
+    let response = if is_held(headers, &tag) {
+        StatusCode::NOT_MODIFIED.into_response()
+    } else {
+        make.await?
+    };
+    Ok(with_tag(response, tag))
 }
 
 fn tagged(headers: &HeaderMap, tag: String, make: impl FnOnce() -> Response) -> Response {
-    let mut response = if is_held(headers, &tag) {
+    let response = if is_held(headers, &tag) {
         StatusCode::NOT_MODIFIED.into_response()
     } else {
         make()
     };
+    with_tag(response, tag)
+}
+
+fn with_tag(mut response: Response, tag: String) -> Response {
     let said = response.headers_mut();
     if let Ok(tag) = HeaderValue::try_from(tag) {
         said.insert(header::ETAG, tag);

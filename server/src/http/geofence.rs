@@ -44,7 +44,7 @@ pub(super) async fn replace(
 ) -> Result<Response, Problem> {
     let expected = revision::expected(&headers)?;
     Ok(tagged(
-        app.replace_geofence(&site, request, expected).await?,
+        app.replace_geofence(&site, request, &expected).await?,
     ))
 }
 

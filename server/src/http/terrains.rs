@@ -77,7 +77,7 @@ pub(super) async fn replace(
     Json(request): Json<ReplaceTerrain>,
 ) -> Result<Response, Problem> {
     let expected = revision::expected(&headers)?;
-    let replacing = app.replace_terrain(&site, &terrain, request, expected);
+    let replacing = app.replace_terrain(&site, &terrain, request, &expected);
     Ok(tagged(StatusCode::OK, replacing.await?))
 }
 
@@ -97,7 +97,7 @@ pub(super) async fn delete(
     headers: HeaderMap,
 ) -> Result<StatusCode, Problem> {
     let expected = revision::expected(&headers)?;
-    app.delete_terrain(&site, &terrain, expected).await?;
+    app.delete_terrain(&site, &terrain, &expected).await?;
     Ok(StatusCode::NO_CONTENT)
 }
 

@@ -2,12 +2,14 @@
 //! missing, it restores the authority too.
 //!
 //! ```text
-//! lock ─► manifest ─► space ─► extract, compare checksums ─► examine ─► migrate, prepare for
-//! robots and people that went on ─► move the old database aside ─► rename the new one ─► report
+//! lock ─► manifest ─► remove what an interrupted restoration left ─► space ─► extract, compare
+//! checksums ─► examine ─► migrate, prepare for robots and people that went on ─► move the old
+//! database aside ─► rename the new one ─► report
 //! ```
 //!
 //! It does not change the old database before the new one is complete, and never removes it.
 
+use std::fmt;
 use std::fs;
 use std::io::{self, IsTerminal as _, Write};
 use std::path::{Path, PathBuf};
@@ -36,8 +38,9 @@ use crate::paths::folder_of;
 const RESTORING_ENDING: &str = ".restoring";
 /// Infix of the names of files and folders that were moved aside.
 const ASIDE: &str = ".before-restore-";
-/// Free space that must remain besides the database, for its log and for migrations, bytes.
-const RESERVE_BYTES: u64 = 128 * 1024 * 1024;
+/// Free space for the log of the database while it is prepared, MiB.
+const LOG_MIB: u64 = 16;
+const BYTES_PER_MIB: u64 = 1024 * 1024;
 /// Step of the progress between printed lines, per cent.
 const STEP_PERCENT: u64 = 10;
 
@@ -97,12 +100,11 @@ pub(crate) async fn run(args: RestoreArgs) -> anyhow::Result<()> {
         "the folder `{}` of the database does not exist; create it first",
         folder.display()
     );
-    check_space(
-        folder,
-        manifest.database.bytes.saturating_add(RESERVE_BYTES),
-    )?;
-    let now = Clock::system().now();
+    // What an interrupted restoration left takes the space of this one.
     let restoring = Unfinished::begin(&database, RESTORING_ENDING)?;
+    let needed = NeededSpace::of(&manifest);
+    check_space(folder, needed.bytes()).with_context(|| needed.to_string())?;
+    let now = Clock::system().now();
     let extracted = extract(&args.from, key.as_ref(), &restoring).await?;
     let contents = copy::examine(restoring.path()).await;
     let contents = contents.context("the database in the backup is damaged")?;
@@ -138,6 +140,50 @@ pub(crate) async fn run(args: RestoreArgs) -> anyhow::Result<()> {
     tell(&mut out, (&database, aside), &restoration, &review).context("cannot print")?;
     tell_authority(&mut out, &authority, &manifest).context("cannot print")?;
     Ok(())
+}
+
+/// Space that a restoration needs in the folder of the database.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct NeededSpace {
+    database_mib: u64,
+    /// Migrations may write every table once more.
+    migrations_mib: u64,
+}
+
+impl NeededSpace {
+    fn of(manifest: &Manifest) -> Self {
+        let database_mib = manifest.database.bytes.div_ceil(BYTES_PER_MIB);
+        let is_older = manifest.schema < schema::known();
+        Self {
+            database_mib,
+            migrations_mib: if is_older { database_mib } else { 0 },
+        }
+    }
+
+    fn bytes(self) -> u64 {
+        let mib = self.database_mib.saturating_add(self.migrations_mib);
+        mib.saturating_add(LOG_MIB).saturating_mul(BYTES_PER_MIB)
+    }
+}
+
+impl fmt::Display for NeededSpace {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self {
+            database_mib,
+            migrations_mib,
+        } = self;
+        write!(
+            formatter,
+            "a restoration needs {database_mib} MiB for the database"
+        )?;
+        if *migrations_mib > 0 {
+            write!(
+                formatter,
+                ", {migrations_mib} MiB for the changes of its schema"
+            )?;
+        }
+        write!(formatter, " and {LOG_MIB} MiB for its log")
+    }
 }
 
 /// Refuses a backup whose schema this program does not know.
@@ -317,5 +363,49 @@ fn tell_authority(
                 None => Ok(()),
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use super::*;
+    use crate::backup::manifest::ArchivedFile;
+
+    fn needed(bytes: u64, schema: i64) -> NeededSpace {
+        NeededSpace::of(&Manifest {
+            format: 1,
+            version: "0.1.0".to_owned(),
+            commit: None,
+            schema,
+            taken_at: Timestamp::UNIX_EPOCH,
+            database: ArchivedFile {
+                name: "tread.db".to_owned(),
+                bytes,
+                sha256: String::new(),
+            },
+            rows: BTreeMap::new(),
+            authority: Vec::new(),
+        })
+    }
+
+    #[test]
+    fn a_small_backup_needs_little_space_and_one_of_an_older_schema_twice_its_size() {
+        let small = needed(600_000, schema::known());
+        assert_eq!(small.bytes(), 17 * BYTES_PER_MIB);
+        assert_eq!(
+            small.to_string(),
+            "a restoration needs 1 MiB for the database and 16 MiB for its log"
+        );
+        let old = needed(300 * BYTES_PER_MIB, schema::known() - 1);
+        assert_eq!(old.bytes(), 616 * BYTES_PER_MIB);
+        assert_eq!(
+            old.to_string(),
+            "a restoration needs 300 MiB for the database, 300 MiB for the changes of its schema and \
+             16 MiB for its log"
+        );
+        let absurd = needed(u64::MAX, 0);
+        assert_eq!(absurd.bytes(), u64::MAX);
     }
 }

@@ -77,9 +77,12 @@ pub(crate) fn next_steps(choices: &Choices, fingerprint: Option<&str>, is_starte
     } else {
         let _ = write!(
             text,
-            "a robot on this machine:\n  tread-agent --config robot.toml   # with server = \
-             \"tcp/{}\" in it\n",
-            choices.zenoh
+            "a robot on this machine, which needs no certificate:\n  \
+             tread-agent --config robot.toml   # with site = \"{}\", robot = \"rover-1\" and \
+             server = \"tcp/{}\" in it\n\
+             robots of other machines join a server with `[robots]` in its configuration: \
+             `tread-server init --names NAME` writes one\n",
+            choices.site, choices.zenoh
         );
     }
     text

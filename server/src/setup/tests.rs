@@ -34,6 +34,17 @@ fn without_any_choice_the_server_is_for_this_machine_alone() {
     let folder = tempfile::tempdir().unwrap();
     let choices = Choices::of(&SetupArgs::default(), &defaults(folder.path())).unwrap();
     assert_eq!(addresses(&choices), ["127.0.0.1:8420", "127.0.0.1:7447"]);
+    let steps = next_steps(&choices, None, false);
+    for part in [
+        "site = \"yard\", robot = \"rover-1\" and server = \"tcp/127.0.0.1:7447\"",
+        "`[robots]`",
+    ] {
+        assert!(steps.contains(part), "`{part}` in {steps}");
+    }
+    // Nothing can be enrolled at this server.
+    for part in ["join-token", "enroll"] {
+        assert!(!steps.contains(part), "`{part}` in {steps}");
+    }
     let config = read(choices);
     assert!(config.tls.is_none() && config.robots.is_none());
     assert_eq!(

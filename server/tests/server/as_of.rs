@@ -99,6 +99,50 @@ async fn the_map_is_known_by_the_minute_and_nothing_later_counts() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn pages_as_of_a_time_have_only_cells_that_were_measured_by_then() {
+    let yard = Yard::start_at(begin() + SignedDuration::from_hours(5)).await;
+    draw_lawn(&yard).await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    // The cells that come first in the list were measured last.
+    let back = (0..PASSES).map(|number| {
+        let ix = i32::try_from(PASSES - 1 - number).unwrap();
+        segment((ix, 0), 0.2, 600 * number)
+    });
+    robot.upload(numbered(back)).await.unwrap();
+    let page = async |query: &str| -> (Vec<i32>, Option<String>) {
+        let page: MapPage<CellFriction> = yard.get(&format!("{BASE}/cells?{query}")).await;
+        let cells = page.items.iter().map(|item| item.cell.ix);
+        (cells.collect(), page.next_cursor)
+    };
+    let as_of = after_min(45);
+    for limit in [1, 2, 5, 100] {
+        let query = format!("as_of={as_of}&limit={limit}");
+        let mut all = Vec::new();
+        let mut cursor: Option<String> = None;
+        loop {
+            let at = cursor.map(|cursor| format!("&cursor={cursor}"));
+            let (cells, next) = page(&format!("{query}{}", at.unwrap_or_default())).await;
+            assert!(!cells.is_empty() && cells.len() <= limit, "{cells:?}");
+            all.extend(cells);
+            cursor = next;
+            if cursor.is_none() {
+                break;
+            }
+        }
+        assert_eq!(all, [19, 20, 21, 22, 23], "pages of {limit}");
+    }
+    // A cursor is a place: a list as of another time goes on there.
+    let (cells, cursor) = page("limit=10").await;
+    assert_eq!(cells, (0..10).collect::<Vec<i32>>());
+    let query = format!("as_of={as_of}&limit=2&cursor={}", cursor.unwrap());
+    let (cells, cursor) = page(&query).await;
+    assert_eq!((cells, cursor.as_deref()), (vec![19, 20], Some("20,0")));
+    let (cells, cursor) = page(&format!("as_of={}", after_min(0))).await;
+    assert_eq!((cells, cursor), (Vec::new(), None));
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn days_of_merged_hours_are_divided_too() {
     let (yard, _robot) = driven(SignedDuration::from_hours(24 * 10)).await;
     yard.server.app().move_horizons().await.unwrap();

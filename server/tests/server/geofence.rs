@@ -187,6 +187,11 @@ async fn a_geofence_that_crosses_itself_or_leaves_a_robot_outside_is_refused_by_
     let (status, body) = yard.send(put("\"0\"")).await;
     assert_eq!(status, StatusCode::PRECONDITION_FAILED, "{body}");
     assert_eq!(yard.send(put("first")).await.0, StatusCode::BAD_REQUEST);
+    let (status, body) = yard.send(put("W/\"1\"")).await;
+    assert_eq!(status, StatusCode::PRECONDITION_FAILED, "{body}");
+    for held in ["\"0\", \"1\"", "*"] {
+        assert_eq!(yard.send(put(held)).await.0, StatusCode::OK, "{held}");
+    }
     yard.server.stop().await.unwrap();
 }
 

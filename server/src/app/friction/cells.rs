@@ -21,7 +21,7 @@ use crate::friction::index::{Block, Cells, Group};
 pub const CELLS_MAX: f64 = 4_194_304.0;
 /// Number of cells along a row that are joined into squares at a time.
 const SQUARES_WIDTH_CELLS: i32 = 1_024;
-/// Number of cells that are compared in one read of the map.
+/// Maximum number of cells of one read of the map for a page with fewer entries.
 const CELLS_AT_ONCE: usize = 4_096;
 
 /// The cells that a request asks for.
@@ -38,8 +38,8 @@ pub struct CellsAsked<'query> {
 }
 
 impl App {
-    /// Returns the friction of the cells in an area, row by row. The limit counts cells; a cell
-    /// gives one entry per terrain and robot model.
+    /// Returns the friction of the cells in an area, row by row. The limit counts cells with entries; a
+    /// cell gives one entry per terrain and robot model.
     pub async fn friction_of_cells(
         &self,
         site: &SiteId,
@@ -69,21 +69,32 @@ impl App {
         let of_site = row.clone();
         let looking = move |reader: &MapReader<'_>, [reading]: &[Reading; 1]| {
             let (mut found, mut after, mut at_once) = (Vec::new(), after, wanted);
+            let mut at_once_max = wanted.max(CELLS_AT_ONCE);
             while found.len() < wanted {
-                let rest = wanted - found.len();
-                let some = smaller(&mut at_once, |at_once| {
+                let tried = at_once;
+                let (some, last) = smaller(&mut at_once, |at_once| {
                     reader.cells(&row, |map| {
-                        let some = squares(map, factor, bounds, after, at_once.min(rest));
-                        let described =
-                            |square: CellGroup| (square.0, of_square(map, reading, square, size_m));
-                        some.into_iter().map(described).collect::<Vec<_>>()
+                        let some = squares(map, factor, bounds, after, at_once);
+                        let last = some.last().map(|(square, _)| *square);
+                        let some = some.into_iter();
+                        let some = some.map(|square: CellGroup| {
+                            (square.0, of_square(map, reading, square, size_m))
+                        });
+                        // Nothing that was asked for was measured in the others: a page of them would
+                        // be empty.
+                        let some = some.filter(|(_, entries)| !entries.is_empty());
+                        (some.collect::<Vec<_>>(), last)
                     })
                 })?;
-                match some.last() {
-                    Some((last, _)) => after = Some(*last),
+                found.extend(some);
+                match last {
+                    Some(_) => after = last,
                     None => break,
                 }
-                found.extend(some);
+                if at_once < tried {
+                    at_once_max = at_once;
+                }
+                at_once = at_once.saturating_mul(2).min(at_once_max);
             }
             let cells = page(found, limit, |(cell, _)| format!("{},{}", cell.ix, cell.iy));
             let items = cells.items.into_iter().flat_map(|(_, of_square)| of_square);

@@ -262,8 +262,8 @@ pub(in crate::http) async fn map(
             let writer_of = |site: &Site, as_of| list_writer(format, site, (&asked.asked, as_of));
             let export = app.export_cells(&site, &asked, writer_of).await?;
             let (state, as_of) = ((query.format, export.state()), export.as_of());
-            let make = || streamed(media_type, export, CellExport::next);
-            let response = etag::streamed(&headers, media_type, state, make);
+            let begun = streamed(media_type, export, CellExport::next);
+            let response = etag::streamed(&headers, media_type, state, begun).await?;
             Ok(say_as_of(response, as_of))
         }
     }

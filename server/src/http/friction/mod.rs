@@ -224,6 +224,6 @@ pub(super) async fn segments(
     };
     let export = app.export_segments(&site, filter, writer).await?;
     let (state, media_type) = (export.state(), format.media_type());
-    let make = || streamed(media_type, export, SegmentExport::next);
-    Ok(etag::streamed(&headers, media_type, state, make))
+    let begun = streamed(media_type, export, SegmentExport::next);
+    etag::streamed(&headers, media_type, state, begun).await
 }

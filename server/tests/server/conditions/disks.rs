@@ -10,6 +10,7 @@ use tempfile::TempDir;
 use tread_server::Server;
 
 use super::{PROGRAM, assert_says, is_root, said};
+use crate::backups::back_up;
 use crate::harness::{client, config, database, eventually};
 
 /// Size of the disk of the tests, bytes.
@@ -252,4 +253,52 @@ async fn on_a_read_only_disk_the_server_does_not_start_and_says_why() {
         before,
         "it is as it was"
     );
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_backup_is_restored_to_a_small_disk_over_what_an_interrupted_restoration_left() {
+    if !may_mount() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let server = Server::start(config(folder.path(), "127.0.0.1:0"))
+        .await
+        .unwrap();
+    server.stop().await.unwrap();
+    let backup = back_up(folder.path(), "backup.tar");
+    let disk = folder.path().join("disk");
+    fs::create_dir(&disk).unwrap();
+    let other = folder.path().join("other.tar");
+    fs::write(&other, "no backup").unwrap();
+    // What was left is on the disk before the program runs.
+    let script = "mount -t tmpfs -o \"$1\" tmpfs \"$2\" && \
+                  head -c \"$3\" /dev/zero >\"$2/tread.db.restoring\" && shift 3 && exec \"$@\"";
+    let restore = |options: &str, left: &str, from: &Path| {
+        let output = Command::new("unshare")
+            .args(["--mount", "sh", "-c", script, "sh", options])
+            .arg(&disk)
+            .args([left, PROGRAM, "restore", "--from"])
+            .arg(from)
+            .arg(format!("--database={}", disk.join("tread.db").display()))
+            .stdin(Stdio::null())
+            .output()
+            .unwrap();
+        (output.status.code(), said(&output))
+    };
+    let (code, text) = restore("size=40m", "30M", &backup);
+    assert_eq!(code, Some(0), "{text}");
+    let (code, text) = restore("size=8m", "0", &backup);
+    assert_eq!(code, Some(1), "{text}");
+    assert_says(
+        &text,
+        &[
+            "MiB for the database and 16 MiB for its log",
+            "MiB free",
+            "MiB are needed there: make room",
+        ],
+    );
+    // What is no backup is refused as that, however full the disk is.
+    let (code, text) = restore("size=8m", "0", &other);
+    assert_eq!(code, Some(1), "{text}");
+    assert_says(&text, &["is no backup of tread-server"]);
 }
