@@ -1,6 +1,7 @@
 // Asks the server: one function, one kind of error.
 import type { ProblemBody } from './schema';
 import { withDetail } from '../message';
+import { serverClock } from '../server_clock';
 import { texts } from '../texts';
 
 /** How long an answer may take, milliseconds; the server's own bound is 15 s. */
@@ -55,8 +56,10 @@ export async function ask<T>(path: string, asked: Asked = {}): Promise<T> {
     init.body = JSON.stringify(asked.body);
   }
   let response: Response;
+  const sentAt = performance.now();
   try {
     response = await fetch(path, init);
+    serverClock.heard(response.headers.get('date'), { sentAt, answeredAt: performance.now() });
   } catch {
     throw new Problem(texts.problem.lost, 0);
   }

@@ -3,6 +3,7 @@ import type { CellDifference } from '../api/schema';
 import { list, sentence } from '../api/client';
 import { minute, momentOf } from '../format';
 import { Comparison } from '../map/compare';
+import { serverClock } from '../server_clock';
 import { texts } from '../texts';
 import type { Fleet } from './fleet.svelte';
 
@@ -36,7 +37,7 @@ export class Compare {
 
   begin(): void {
     this.isOn = true;
-    this.from ||= minute(Date.now() - BACK_MS);
+    this.from ||= minute(serverClock.now() - BACK_MS);
     void this.read();
   }
 
@@ -48,7 +49,7 @@ export class Compare {
 
   /** Compares the present with a time that long ago. */
   since(ago_ms: number): void {
-    this.from = minute(Date.now() - ago_ms);
+    this.from = minute(serverClock.now() - ago_ms);
     this.to = '';
     void this.read();
   }
@@ -67,7 +68,7 @@ export class Compare {
     const mine = (this.#asked += 1);
     if (!times) {
       const field = Number.isNaN(momentOf(this.from)) ? texts.map.from : texts.map.to;
-      this.problem = texts.map.momentWrong(field, minute(Date.now() - BACK_MS));
+      this.problem = texts.map.momentWrong(field, minute(serverClock.now() - BACK_MS));
       this.isReading = false;
       return;
     }

@@ -3,6 +3,7 @@ import { SvelteMap } from 'svelte/reactivity';
 import type { Alert, DriveView, Geofence, Mission, MissionStep, Robot, Site, Terrain, TerrainFriction } from '../api/schema';
 import { ask, list, sentence } from '../api/client';
 import { Stream, type Listener } from '../api/stream';
+import { serverClock } from '../server_clock';
 import { signedIn } from './session.svelte';
 import { nameRanks, type NameRanks } from '../roster';
 import { doing } from '../standing';
@@ -48,7 +49,7 @@ export class Fleet implements Listener {
   sites = $state.raw<Site[]>([]);
   site = $state<string | null>(null);
   isLive = $state(false);
-  /** When the stream was lost, wall time; null while it lives or was never there. */
+  /** When the stream was lost, by the server's time; null while it lives or was never there. */
   lostAt = $state<number | null>(null);
   problem = $state<string | null>(null);
   /** A monotonic clock for ages, milliseconds, twice a second. */
@@ -355,7 +356,7 @@ export class Fleet implements Listener {
   link(isLive: boolean): void {
     if (isLive === this.isLive) return;
     this.isLive = isLive;
-    this.lostAt = isLive ? null : Date.now();
+    this.lostAt = isLive ? null : serverClock.now();
     this.isDirty = true;
     if (isLive && this.sites.length === 0) void this.readSites();
   }
