@@ -11,13 +11,18 @@ const PAGE_ENTRIES = 1_000;
 
 /** What went wrong: one plain sentence, and what the server adds to it. */
 export class Problem extends Error {
+  /** The sentence in the language that the page has now. */
+  readonly said: () => string;
+
   constructor(
-    message: string,
+    message: string | (() => string),
     /** 0 when the server did not answer at all. */
     readonly status: number,
     readonly body: ProblemBody | null = null,
   ) {
-    super(message);
+    const said = typeof message === 'string' ? () => message : message;
+    super(said());
+    this.said = said;
   }
 
   get isLost(): boolean {
@@ -27,6 +32,7 @@ export class Problem extends Error {
 
 /** One sentence for people about whatever was thrown, with what the server adds (`message.ts`). */
 export function sentence(error: unknown): string {
+  if (error instanceof Problem) return error.said();
   return error instanceof Error ? error.message : String(error);
 }
 
@@ -61,22 +67,22 @@ export async function ask<T>(path: string, asked: Asked = {}): Promise<T> {
     response = await fetch(path, init);
     serverClock.heard(response.headers.get('date'), { sentAt, answeredAt: performance.now() });
   } catch {
-    throw new Problem(texts.problem.lost, 0);
+    throw new Problem(() => texts.problem.lost, 0);
   }
   if (response.status === 204) return undefined as T;
   let body: unknown;
   try {
     body = await response.json();
   } catch {
-    if (response.ok) throw new Problem(texts.problem.lost, 0);
-    throw new Problem(texts.problem.unreadable(response.status), response.status);
+    if (response.ok) throw new Problem(() => texts.problem.lost, 0);
+    throw new Problem(() => texts.problem.unreadable(response.status), response.status);
   }
   if (response.ok) return body as T;
   const problem = body as ProblemBody;
   if (response.status === 401) {
     for (const listener of ended) listener();
   }
-  throw new Problem(tell(problem), response.status, problem);
+  throw new Problem(() => tell(problem), response.status, problem);
 }
 
 const ended = new Set<() => void>();

@@ -101,6 +101,8 @@ export class Fleet implements Listener {
   #timers: ReturnType<typeof setInterval>[] = [];
   #listsDue: ReturnType<typeof setTimeout> | undefined;
   #seen: Set<string> | null = null;
+  /** Grows with each change of the ground from this page. */
+  #groundChanges = 0;
   /** Robots in the order of lists; null once another one is there, or one is gone. */
   #order: string[] | null = null;
   #namesAreOld = true;
@@ -258,13 +260,14 @@ export class Fleet implements Listener {
     const { site } = this;
     if (!site || document.hidden) return;
     const at = `/v1/sites/${site}`;
+    const changes = this.#groundChanges;
     try {
       const [terrains, friction, fence] = await Promise.all([
         list<Terrain>(`${at}/terrains`, LIST_MAX),
         list<TerrainFriction>(`${at}/friction/terrains`, LIST_MAX),
         ask<Geofence>(`${at}/geofence`),
       ]);
-      if (this.site !== site) return;
+      if (this.site !== site || changes !== this.#groundChanges) return;
       this.terrains = terrains.items;
       this.terrainFriction = friction.items;
       this.fence = fence;
@@ -272,6 +275,26 @@ export class Fleet implements Listener {
     } catch {
       // The stream says already that the server is lost.
     }
+  }
+
+  /** Takes a terrain that was saved or read by itself. */
+  setTerrain(terrain: Terrain): void {
+    const isKnown = this.terrains.some(({ id }) => id === terrain.id);
+    this.terrains = isKnown ? this.terrains.map((known) => (known.id === terrain.id ? terrain : known)) : [...this.terrains, terrain];
+    this.#groundChanged();
+  }
+
+  /** Takes the geofence that was saved. */
+  setFence(fence: Geofence): void {
+    this.fence = fence;
+    this.#groundChanged();
+  }
+
+  /** What was asked for before is older. */
+  #groundChanged(): void {
+    this.#groundChanges += 1;
+    this.isDirty = true;
+    void this.readGround();
   }
 
   /** The site's square, metres. */
