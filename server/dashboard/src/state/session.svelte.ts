@@ -12,7 +12,10 @@ const SIGNED_IN = '#signed-in';
 
 export type Theme = 'light' | 'dark';
 
-class SignedIn {
+/** A token, or a person at the provider. */
+export type SignedInBy = 'token' | 'person';
+
+export class SignedIn {
   session = $state<Session | null>(null);
   /** The provider that people may sign in at, if there is one. */
   oidc = $state<OidcSignIn | null>(null);
@@ -20,6 +23,8 @@ class SignedIn {
   isKnown = $state(false);
   /** Somebody was signed in on this page and no longer is. */
   hasEnded = $state(false);
+  /** How whoever signed out on this page had signed in; null unless somebody just did. */
+  out = $state<SignedInBy | null>(null);
   problem = $state<string | null>(null);
 
   constructor() {
@@ -29,6 +34,10 @@ class SignedIn {
   /** Whether they have a right; with a site, whether they have it for all of this site. */
   may(right: Right, site?: string): boolean {
     return may(this.session, right, site);
+  }
+
+  get by(): SignedInBy {
+    return this.session?.person ? 'person' : 'token';
   }
 
   get name(): string {
@@ -68,6 +77,7 @@ class SignedIn {
     try {
       this.session = await ask<Session>('/v1/session', { method: 'POST', body: { token } });
       this.hasEnded = false;
+      this.out = null;
       localStorage.setItem(SESSION_KEY, 'yes');
     } catch (error) {
       // What the server says of it is for programs.
@@ -77,19 +87,23 @@ class SignedIn {
 
   async signOut(): Promise<void> {
     this.problem = null;
+    const { by } = this;
     try {
       const out = await ask<SignedOut | undefined>('/v1/session', { method: 'DELETE' });
       localStorage.removeItem(SESSION_KEY);
       this.session = null;
+      this.out = by;
       if (out) location.assign(out.provider);
       else await this.lookForWays();
     } catch (error) {
-      this.problem = sentence(error);
+      // It had ended already, which is said.
+      if (!(error instanceof Problem && error.status === 401)) this.problem = sentence(error);
     }
   }
 
   end(): void {
     if (this.session) this.hasEnded = true;
+    this.out = null;
     this.problem = null;
     localStorage.removeItem(SESSION_KEY);
     this.session = null;
