@@ -1,6 +1,6 @@
 // Asks the server: one function, one kind of error.
 import type { ProblemBody } from './schema';
-import { withDetail } from '../message';
+import { withDetail, type Said } from '../message';
 import { serverClock } from '../server_clock';
 import { texts } from '../texts';
 
@@ -10,19 +10,25 @@ const ANSWER_MAX_MS = 16_000;
 const PAGE_ENTRIES = 1_000;
 
 /** What went wrong: one plain sentence, and what the server adds to it. */
-export class Problem extends Error {
-  /** The sentence in the language that the page has now. */
-  readonly said: () => string;
+export class Failure extends Error {
+  readonly said: Said;
 
+  constructor(message: string | Said) {
+    const said = typeof message === 'string' ? () => message : message;
+    super(said());
+    this.said = said;
+  }
+}
+
+/** What went wrong with a request. */
+export class Problem extends Failure {
   constructor(
-    message: string | (() => string),
+    message: string | Said,
     /** 0 when the server did not answer at all. */
     readonly status: number,
     readonly body: ProblemBody | null = null,
   ) {
-    const said = typeof message === 'string' ? () => message : message;
-    super(said());
-    this.said = said;
+    super(message);
   }
 
   get isLost(): boolean {
@@ -32,8 +38,13 @@ export class Problem extends Error {
 
 /** One sentence for people about whatever was thrown, with what the server adds (`message.ts`). */
 export function sentence(error: unknown): string {
-  if (error instanceof Problem) return error.said();
+  if (error instanceof Failure) return error.said();
   return error instanceof Error ? error.message : String(error);
+}
+
+/** The same for what is kept: the language may be another one when it is read. */
+export function saidOf(error: unknown): Said {
+  return () => sentence(error);
 }
 
 /** A sentence in the language of the page by the problem's type, with the server's own words after it. */

@@ -14,6 +14,7 @@ import type { DraftState } from '../address';
 import { Draft, RADIUS_MIN_M, type DraftKind } from '../map/draft';
 import type { PointM } from '../map/camera';
 import { plain } from '../format';
+import type { Said } from '../message';
 import { preferences } from '../preferences.svelte';
 import { NO_FAULTS, type DraftField, type Faults } from '../refusal';
 import { texts } from '../texts';
@@ -67,7 +68,7 @@ export class Editor {
   /** What was discarded last, in case that was not meant. */
   discarded = $state.raw<DraftState | null>(null);
   /** Said after a success. */
-  said = $state<string | null>(null);
+  said = $state<Said | null>(null);
 
   /** What was drawn of the other kind, in case that is wanted after all. */
   #other: Draft | null = null;

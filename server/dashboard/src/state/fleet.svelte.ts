@@ -1,7 +1,8 @@
 // Everything that the page knows of one site, kept by the stream of events.
 import { SvelteMap } from 'svelte/reactivity';
 import type { Alert, DriveView, Geofence, Mission, MissionStep, Robot, Site, Terrain, TerrainFriction } from '../api/schema';
-import { ask, list, sentence } from '../api/client';
+import { ask, list, saidOf } from '../api/client';
+import type { Said } from '../message';
 import { Stream, type Listener } from '../api/stream';
 import { serverClock } from '../server_clock';
 import { signedIn } from './session.svelte';
@@ -51,7 +52,7 @@ export class Fleet implements Listener {
   isLive = $state(false);
   /** When the stream was lost, by the server's time; null while it lives or was never there. */
   lostAt = $state<number | null>(null);
-  problem = $state<string | null>(null);
+  problem = $state<Said | null>(null);
   /** A monotonic clock for ages, milliseconds, twice a second. */
   now = $state(performance.now());
   selected = $state<string | null>(null);
@@ -214,7 +215,7 @@ export class Fleet implements Listener {
       this.problem = null;
       this.siteAlerts.follow(sites.length > 1);
     } catch (error) {
-      this.problem = sentence(error);
+      this.problem = saidOf(error);
       return;
     }
     const kept = localStorage.getItem(SITE_KEY);

@@ -1,6 +1,7 @@
 // Who is signed in, and how the page looks to them.
 import type { OidcSignIn, Right, Session, SignInMethods, SignedOut } from '../api/schema';
-import { Problem, ask, sentence, whenSignedOut } from '../api/client';
+import { Problem, ask, saidOf, whenSignedOut } from '../api/client';
+import type { Said } from '../message';
 import { may } from '../rights';
 import { texts } from '../texts';
 
@@ -25,7 +26,7 @@ export class SignedIn {
   hasEnded = $state(false);
   /** How whoever signed out on this page had signed in; null unless somebody just did. */
   out = $state<SignedInBy | null>(null);
-  problem = $state<string | null>(null);
+  problem = $state<Said | null>(null);
 
   constructor() {
     whenSignedOut(() => this.end());
@@ -56,7 +57,7 @@ export class SignedIn {
         this.session = await ask<Session>('/v1/session');
       } catch (error) {
         if (error instanceof Problem && error.status === 401) this.hasEnded = true;
-        else this.problem = sentence(error);
+        else this.problem = saidOf(error);
       }
     }
     this.isKnown = true;
@@ -81,7 +82,7 @@ export class SignedIn {
       localStorage.setItem(SESSION_KEY, 'yes');
     } catch (error) {
       // What the server says of it is for programs.
-      this.problem = error instanceof Problem && error.status === 401 ? texts.signIn.wrong : sentence(error);
+      this.problem = error instanceof Problem && error.status === 401 ? () => texts.signIn.wrong : saidOf(error);
     }
   }
 
@@ -97,7 +98,7 @@ export class SignedIn {
       else await this.lookForWays();
     } catch (error) {
       // It had ended already, which is said.
-      if (!(error instanceof Problem && error.status === 401)) this.problem = sentence(error);
+      if (!(error instanceof Problem && error.status === 401)) this.problem = saidOf(error);
     }
   }
 
