@@ -13,6 +13,7 @@ import { ask } from '../api/client';
 import type { DraftState } from '../address';
 import { Draft, RADIUS_MIN_M, type DraftKind } from '../map/draft';
 import type { PointM } from '../map/camera';
+import type { Shape } from '../map/shape';
 import { plain } from '../format';
 import type { Said } from '../message';
 import { preferences } from '../preferences.svelte';
@@ -172,19 +173,19 @@ export class Editor {
   get checkProblem(): string | null {
     void this.version;
     const flaw = this.draft && !this.draft.isEmpty ? this.#flaw : null;
-    return flaw?.said ?? (this.#refused === null ? null : refusalText(this.#refused, this.#hasPoints));
+    return flaw?.said ?? (this.#refused === null ? null : refusalText(this.#refused, this.#hasPoints, this.#shape));
   }
 
   /** Why it could not be sent or saved; null unless that was tried. */
   get sendProblem(): string | null {
-    return this.#unsent === null ? null : refusalText(this.#unsent, this.#hasPoints);
+    return this.#unsent === null ? null : refusalText(this.#unsent, this.#hasPoints, this.#shape);
   }
 
   /** Which points and which field of the draft are at fault, by what was typed or by what the server says. */
   readonly faults: Faults = $derived.by(() => {
     void this.version;
     if (!this.draft || this.draft.isEmpty) return NO_FAULTS;
-    const refusal = (error: unknown) => refusalIn(error, this.#hasPoints);
+    const refusal = (error: unknown) => refusalIn(error, this.#hasPoints, this.#shape);
     return this.#flaw?.faults ?? refusal(this.#refused) ?? refusal(this.#unsent) ?? NO_FAULTS;
   });
 
@@ -196,6 +197,11 @@ export class Editor {
 
   get #hasPoints(): boolean {
     return this.draft?.kind !== 'circle';
+  }
+
+  get #shape(): Shape | null {
+    const { draft } = this;
+    return draft && draft.kind !== 'circle' ? { points: draft.points, isArea: draft.kind === 'terrain' } : null;
   }
 
   /** Why the area that is drawn cannot be saved, beside what is wrong with it; null when it can. */
