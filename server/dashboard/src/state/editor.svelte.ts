@@ -21,7 +21,7 @@ import { NO_FAULTS, type DraftField, type Faults } from '../refusal';
 import { texts } from '../texts';
 import { about, inUnit } from '../units';
 import type { Fleet } from './fleet.svelte';
-import { AreaChanged, TerrainChanged, replaceArea, replaceTerrain, type FenceSide } from './ground';
+import { AreaChanged, TerrainChanged, createTerrain, replaceArea, replaceTerrain, type FenceSide } from './ground';
 import { refusalIn, refusalText } from './refused';
 
 /** Wait after a change before the dry run is asked for, milliseconds. */
@@ -430,8 +430,7 @@ export class Editor {
 
   async saveTerrain(): Promise<boolean> {
     const { purpose, draft } = this;
-    const site = this.fleet.site;
-    if (purpose?.what !== 'terrain' || !draft || !site) return false;
+    if (purpose?.what !== 'terrain' || !draft || !this.fleet.site) return false;
     const shape = {
       class: this.terrainClass,
       layer: this.terrainLayer,
@@ -441,7 +440,7 @@ export class Editor {
     const { terrain } = purpose;
     return this.#save(async () => {
       if (terrain) await replaceTerrain(this.fleet, terrain, shape);
-      else this.fleet.setTerrain(await ask<Terrain>(`/v1/sites/${site}/terrains`, { method: 'POST', body: { id: this.terrainId, ...shape } }));
+      else await createTerrain(this.fleet, { id: this.terrainId, ...shape });
     });
   }
 

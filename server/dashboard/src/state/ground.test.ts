@@ -130,3 +130,15 @@ test('an area of an address, which has fewer digits, is the same', async () => {
   await replaceArea(asFleet(fleetOf(lawn(1), stored.fence)), { side: 'keep_out', old: rounded, area: null });
   expect(stored.fence.keep_out).toEqual([]);
 });
+
+test('what was saved for a site that is no longer shown does not come to the other site', async () => {
+  const { stored } = server({ terrain: lawn(3), fence: fenceOf(1, []) });
+  const fleet = fleetOf(lawn(3));
+  const other = lawn(9, { id: 'other' });
+  const editor = new Editor(asFleet(fleet));
+  editor.beginTerrain(lawn(3));
+  const saving = editor.saveTerrain();
+  Object.assign(fleet, { site: 'quarry', terrains: [other] });
+  expect(await saving).toBe(true);
+  expect([stored.terrain.revision, fleet.terrains]).toEqual([4, [other]]);
+});

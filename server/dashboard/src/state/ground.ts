@@ -1,5 +1,5 @@
 // Saving and deleting terrains and areas of the geofence, never over what somebody else changed meanwhile.
-import type { Geofence, ReplaceGeofence, ReplaceTerrain, Terrain } from '../api/schema';
+import type { CreateTerrain, Geofence, ReplaceGeofence, ReplaceTerrain, Terrain } from '../api/schema';
 import { Problem, ask } from '../api/client';
 import type { PointM } from '../map/camera';
 import { texts } from '../texts';
@@ -28,15 +28,27 @@ const isConflict = (error: unknown) => error instanceof Problem && error.status 
 const notDeleted = () => new Problem(() => texts.terrains.notDeleted, PRECONDITION_FAILED);
 const ifMatch = ({ revision }: { revision: number }) => ({ 'if-match': `"${revision}"` });
 
+/** Creates a terrain. */
+export async function createTerrain(ground: Ground, body: CreateTerrain): Promise<void> {
+  const { site } = ground;
+  const made = await ask<Terrain>(`/v1/sites/${site}/terrains`, { method: 'POST', body });
+  if (ground.site === site) ground.setTerrain(made);
+}
+
 /** Replaces a terrain; throws [`TerrainChanged`] if it is no longer the one that was drawn on. */
 export async function replaceTerrain(ground: Ground, old: Terrain, body: ReplaceTerrain): Promise<void> {
-  const path = `/v1/sites/${ground.site}/terrains/${old.id}`;
+  const { site } = ground;
+  const path = `/v1/sites/${site}/terrains/${old.id}`;
+  const keep = (terrain: Terrain) => {
+    // Another site may be shown meanwhile.
+    if (ground.site === site) ground.setTerrain(terrain);
+  };
   try {
-    ground.setTerrain(await ask<Terrain>(path, { method: 'PUT', body, headers: ifMatch(old) }));
+    keep(await ask<Terrain>(path, { method: 'PUT', body, headers: ifMatch(old) }));
   } catch (error) {
     if (!isConflict(error)) throw error;
     const present = await ask<Terrain>(path);
-    ground.setTerrain(present);
+    keep(present);
     throw new TerrainChanged(present);
   }
 }
@@ -68,7 +80,8 @@ export async function replaceArea(ground: Ground, { side, old, area }: FenceEdit
   const body: ReplaceGeofence = { keep_in: fence.keep_in, keep_out: fence.keep_out };
   body[side] = area ? [...others, area] : others;
   try {
-    ground.setFence(await ask<Geofence>(`/v1/sites/${site}/geofence`, { method: 'PUT', body, headers: ifMatch(fence) }));
+    const saved = await ask<Geofence>(`/v1/sites/${site}/geofence`, { method: 'PUT', body, headers: ifMatch(fence) });
+    if (ground.site === site) ground.setFence(saved);
   } catch (error) {
     if (!isConflict(error)) throw error;
     await ground.readGround();
