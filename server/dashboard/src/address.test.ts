@@ -12,6 +12,7 @@ const draft: DraftState = {
     { x_m: -4.25, y_m: NaN },
   ],
   old: null,
+  revision: 7,
   robot: 'rover-1',
   robots: ['rover-1', 'rover-2'],
   speed_m_s: 0.5,

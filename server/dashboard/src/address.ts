@@ -36,6 +36,8 @@ export interface DraftState {
   points: PointM[];
   /** The area of the geofence that it changes. */
   old: PointM[] | null;
+  /** The revision of the terrain that it changes; null for none. */
+  revision: number | null;
   robot: string;
   robots: string[];
   speed_m_s: number;
@@ -219,6 +221,7 @@ function draftOf(text: string | null): DraftState | null {
     radius_m: readNumber(word('radius_m')),
     points: readPoints(word('points')),
     old: typeof of('old') === 'string' ? readPoints(word('old')) : null,
+    revision: Number.isInteger(of('revision')) ? (of('revision') as number) : null,
     robot: word('robot'),
     robots: Array.isArray(robots) ? robots.filter((id): id is string => typeof id === 'string') : [],
     speed_m_s: readNumber(word('speed_m_s')),

@@ -1,6 +1,9 @@
 // Messages about failures: a sentence in the language of the page, and the detail of the server, which is English.
 // A message is one string, so that code that only passes it on does not depend on its parts. Pure.
 
+/** What is said later too, in the language that the page has then. */
+export type Said = () => string;
+
 /** Separates the sentence from the detail. */
 const SEPARATOR = '\n';
 

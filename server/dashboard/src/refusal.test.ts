@@ -61,3 +61,22 @@ test('the words of the server keep everything but its indices', () => {
   expect(counted('near corner 11 at (2.00 m, 0.00 m)')).toBe('near corner 12 at (2.00 m, 0.00 m)');
   expect(counted('a polygon has 3 to 1000 corners, this one has 2')).toBe('a polygon has 3 to 1000 corners, this one has 2');
 });
+
+test('what is wrong is known from the type and the draft, whatever the server’s sentence', () => {
+  const corners = ([[-9, -9], [-5, -9], [-9, -7], [-4, -8]] as const).map(([x_m, y_m]) => ({ x_m, y_m }));
+  const crossed = refusalOf(problem('words of another release', { field: 'polygon' }), true, { points: corners, isArea: true });
+  expect([crossed.kind, crossed.points]).toEqual(['crosses', [2, 4]]);
+  const repeated = refusalOf(problem('words of another release'), true, { points: [...corners, corners[3] ?? { x_m: 0, y_m: 0 }], isArea: false });
+  expect([repeated.kind, repeated.points]).toEqual(['repeats', [5]]);
+  // Another type is no matter of its shape.
+  const busy = refusalOf(problem('busy', { type: '/problems/robot-busy' }), true, { points: corners, isArea: true });
+  expect([busy.kind, busy.points, busy.detail]).toEqual([null, [], 'busy']);
+});
+
+test('a place or a field says which point it is, also if the sentence names something else', () => {
+  const place = { point: { x_m: 1, y_m: 2 }, waypoint: 6 };
+  const outside = refusalOf(problem('the path leaves the geofence near corner 2', { type: '/problems/crosses-geofence', place }), true);
+  expect(outside.points).toEqual([7]);
+  expect(refusalOf(problem('the path turns too sharply near waypoint 6', { place }), true)).toMatchObject({ kind: 'tight', points: [7] });
+  expect(refusalOf(problem('turns and speed do not fit', { field: 'trajectory.circle.speed_m_s' }), false).field).toBe('speed');
+});

@@ -1,6 +1,11 @@
 // What a problem of the API says of a draft: which of its points, and which field. The API counts points
 // from 0, the table of the page from 1. Pure.
+//
+// What is wrong comes from the problem's type and from what is drawn, where comes from its `field` and `place`. The API
+// has no code for a turn that is too sharp, and no field for a part of a circle: only these are looked for in its sentence,
+// and what is not found there is quoted.
 import type { ProblemBody } from './api/schema';
+import { flawOfShape, type Shape } from './map/shape';
 
 /** What a refusal is about, as far as the page has its own words for it. */
 export type Refused = 'crosses' | 'same' | 'repeats' | 'tight' | 'far';
@@ -48,21 +53,23 @@ export interface Refusal extends Faults {
   detail: string | null;
 }
 
-/** Reads a problem about a draft that has points, or about a circle. */
-export function refusalOf(body: ProblemBody, hasPoints: boolean): Refusal {
+/** Reads a problem about a draft that has points, or about a circle; with the shape that is drawn, if that is known. */
+export function refusalOf(body: ProblemBody, hasPoints: boolean, shape: Shape | null = null): Refusal {
   const said = body.detail ?? '';
-  const [, ownField] = FIELDS.find(([words]) => words.test(body.field ?? '') || words.test(said)) ?? [];
-  const field = ownField ?? null;
+  const fieldIn = (text: string) => FIELDS.find(([words]) => words.test(text))?.[1] ?? null;
+  const field = fieldIn(body.field ?? '') ?? fieldIn(said);
   // A circle has no waypoints, whatever it was planned by.
   if (!hasPoints) return { kind: null, points: [], axis: null, field, detail: said.replace(/ near waypoint \d+/, '') || null };
-  for (const [words, kind] of POINTS) {
-    const found = words.exec(said)?.slice(1).map((index) => Number(index) + 1);
-    if (found) return { kind, points: found, axis: axisOf(body), field: null, detail: counted(said) };
-  }
+  const flaw = shape && body.type === '/problems/invalid-body' ? flawOfShape(shape) : null;
+  if (flaw) return { ...flaw, axis: axisOf(body), field: null, detail: counted(said) };
   const path = PATH.exec(body.field ?? '');
   const index = path ? Number(path[1] ?? path[2]) : body.place?.waypoint;
-  const points = index === null || index === undefined ? [] : [index + 1];
-  return { kind: null, points, axis: axisOf(body), field: points.length > 0 ? null : field, detail: said ? counted(said) : null };
+  const points = index === null || index === undefined ? null : [index + 1];
+  for (const [words, kind] of POINTS) {
+    const found = words.exec(said)?.slice(1).map((index) => Number(index) + 1);
+    if (found) return { kind, points: points ?? found, axis: axisOf(body), field: null, detail: counted(said) };
+  }
+  return { kind: null, points: points ?? [], axis: axisOf(body), field: points ? null : field, detail: said ? counted(said) : null };
 }
 
 function axisOf(body: ProblemBody): Axis | null {

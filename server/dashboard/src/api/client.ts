@@ -1,6 +1,7 @@
 // Asks the server: one function, one kind of error.
 import type { ProblemBody } from './schema';
-import { withDetail } from '../message';
+import { withDetail, type Said } from '../message';
+import { serverClock } from '../server_clock';
 import { texts } from '../texts';
 
 /** How long an answer may take, milliseconds; the server's own bound is 15 s. */
@@ -9,9 +10,20 @@ const ANSWER_MAX_MS = 16_000;
 const PAGE_ENTRIES = 1_000;
 
 /** What went wrong: one plain sentence, and what the server adds to it. */
-export class Problem extends Error {
+export class Failure extends Error {
+  readonly said: Said;
+
+  constructor(message: string | Said) {
+    const said = typeof message === 'string' ? () => message : message;
+    super(said());
+    this.said = said;
+  }
+}
+
+/** What went wrong with a request. */
+export class Problem extends Failure {
   constructor(
-    message: string,
+    message: string | Said,
     /** 0 when the server did not answer at all. */
     readonly status: number,
     readonly body: ProblemBody | null = null,
@@ -26,7 +38,13 @@ export class Problem extends Error {
 
 /** One sentence for people about whatever was thrown, with what the server adds (`message.ts`). */
 export function sentence(error: unknown): string {
+  if (error instanceof Failure) return error.said();
   return error instanceof Error ? error.message : String(error);
+}
+
+/** The same for what is kept: the language may be another one when it is read. */
+export function saidOf(error: unknown): Said {
+  return () => sentence(error);
 }
 
 /** A sentence in the language of the page by the problem's type, with the server's own words after it. */
@@ -55,25 +73,27 @@ export async function ask<T>(path: string, asked: Asked = {}): Promise<T> {
     init.body = JSON.stringify(asked.body);
   }
   let response: Response;
+  const sentAt = performance.now();
   try {
     response = await fetch(path, init);
+    serverClock.heard(response.headers.get('date'), { sentAt, answeredAt: performance.now() });
   } catch {
-    throw new Problem(texts.problem.lost, 0);
+    throw new Problem(() => texts.problem.lost, 0);
   }
   if (response.status === 204) return undefined as T;
   let body: unknown;
   try {
     body = await response.json();
   } catch {
-    if (response.ok) throw new Problem(texts.problem.lost, 0);
-    throw new Problem(texts.problem.unreadable(response.status), response.status);
+    if (response.ok) throw new Problem(() => texts.problem.lost, 0);
+    throw new Problem(() => texts.problem.unreadable(response.status), response.status);
   }
   if (response.ok) return body as T;
   const problem = body as ProblemBody;
   if (response.status === 401) {
     for (const listener of ended) listener();
   }
-  throw new Problem(tell(problem), response.status, problem);
+  throw new Problem(() => tell(problem), response.status, problem);
 }
 
 const ended = new Set<() => void>();

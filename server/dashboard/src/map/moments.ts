@@ -17,7 +17,7 @@ const STEPS: Record<Span, { long_ms: number; step_ms: number }> = {
 /** Times of a span up to now, oldest first; each is the end of a minute, an hour or a day. */
 export function momentsOf(span: Span, now_ms: number): number[] {
   const { long_ms, step_ms } = STEPS[span];
-  // The clock of this machine may be ahead of the server's, which says nothing of its future.
+  // The server's time is known to a second only, and the server says nothing of its future.
   const last_ms = Math.floor((now_ms - MINUTE_MS) / step_ms) * step_ms;
   const count = long_ms / step_ms;
   return Array.from({ length: count + 1 }, (_, index) => last_ms - (count - index) * step_ms);

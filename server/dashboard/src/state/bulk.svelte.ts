@@ -1,6 +1,7 @@
 // What is done to several robots at once, with one line of what became of it for each.
 import type { Mission, Stop } from '../api/schema';
-import { ask, sentence } from '../api/client';
+import { Failure, ask, saidOf } from '../api/client';
+import type { Said } from '../message';
 import { stopState, stopWord } from '../standing';
 import { texts } from '../texts';
 import { hasEnded, type Fleet } from './fleet.svelte';
@@ -17,17 +18,17 @@ export type Outcome = 'waiting' | 'unconfirmed' | 'done' | 'nothing' | 'failed';
 export interface Line {
   robot: string;
   outcome: Outcome;
-  text: string;
+  text: Said;
 }
 
 /** What became of one robot. */
 interface Became {
   outcome: 'done' | 'nothing' | 'unconfirmed';
-  text: string;
+  text: Said;
 }
 
-const done = (text: string): Became => ({ outcome: 'done', text });
-const nothing = (text: string): Became => ({ outcome: 'nothing', text });
+const done = (text: Said): Became => ({ outcome: 'done', text });
+const nothing = (text: Said): Became => ({ outcome: 'nothing', text });
 
 export class Bulk {
   deed = $state<Deed | null>(null);
@@ -49,9 +50,9 @@ export class Bulk {
       if (line.outcome !== 'unconfirmed') return line;
       const stop = stops.inForce.get(line.robot);
       // One that is no longer in force was confirmed and cleared.
-      if (!stop) return { ...line, outcome: 'done' as const, text: texts.bulk.cleared };
+      if (!stop) return { ...line, outcome: 'done' as const, text: () => texts.bulk.cleared };
       const state = stopState(stop, byId.get(line.robot)?.robot.live);
-      return state === 'unconfirmed' ? line : { ...line, outcome: 'done' as const, text: stopWord(state) };
+      return state === 'unconfirmed' ? line : { ...line, outcome: 'done' as const, text: () => stopWord(state) };
     });
   });
 
@@ -87,10 +88,10 @@ export class Bulk {
     const all = isWhole ? fleet.stops.stopAll() : null;
     await this.#each('stop', order, async (id) => {
       const problem = await (all ?? fleet.stops.stop(id));
-      if (problem !== null) throw new Error(problem);
+      if (problem !== null) throw new Failure(problem);
       const stop = fleet.stops.inForce.get(id);
-      if (!stop) throw new Error(texts.bulk.notAmong);
-      return { outcome: 'unconfirmed', text: texts.bulk.unconfirmed };
+      if (!stop) throw new Failure(() => texts.bulk.notAmong);
+      return { outcome: 'unconfirmed', text: () => texts.bulk.unconfirmed };
     });
   }
 
@@ -98,11 +99,11 @@ export class Bulk {
     const { stops } = this.fleet;
     await this.#each('clear', ids, async (id) => {
       const stop: Stop | undefined = stops.inForce.get(id);
-      if (!stop) return nothing(texts.bulk.notStopped);
-      if (!stop.confirmed_at) throw new Error(texts.bulk.notConfirmed);
+      if (!stop) return nothing(() => texts.bulk.notStopped);
+      if (!stop.confirmed_at) throw new Failure(() => texts.bulk.notConfirmed);
       const problem = await stops.clear(stop);
-      if (problem !== null) throw new Error(problem);
-      return done(texts.bulk.cleared);
+      if (problem !== null) throw new Failure(problem);
+      return done(() => texts.bulk.cleared);
     });
   }
 
@@ -126,7 +127,7 @@ export class Bulk {
     await this.#each('send', ids, async (id) => {
       const headers = { 'idempotency-key': crypto.randomUUID() };
       this.fleet.sent(await ask<Mission>('/v1/missions', { method: 'POST', body: body(id), headers }));
-      return done(texts.bulk.sent);
+      return done(() => texts.bulk.sent);
     });
   }
 
@@ -139,7 +140,7 @@ export class Bulk {
     await this.#each(verb, ids, async (id) => {
       const missions = meant.get(id) ?? [];
       for (const mission of missions) await ask(`/v1/missions/${mission.id}/${verb}`, { method: 'POST' });
-      return missions.length > 0 ? done(texts.bulk[verb](missions.length)) : nothing(texts.bulk.noMission[verb]);
+      return missions.length > 0 ? done(() => texts.bulk[verb](missions.length)) : nothing(() => texts.bulk.noMission[verb]);
     });
   }
 
@@ -147,7 +148,7 @@ export class Bulk {
   async #each(deed: Deed, ids: string[], act: (id: string) => Promise<Became>): Promise<void> {
     const mine = (this.#run += 1);
     this.#shown = mine;
-    const lines = new Map<string, Line>(ids.map((robot) => [robot, { robot, outcome: 'waiting', text: '' }]));
+    const lines = new Map<string, Line>(ids.map((robot) => [robot, { robot, outcome: 'waiting', text: () => texts.bulk.waiting }]));
     const show = () => {
       this.#noted = [...lines.values()];
     };
@@ -164,9 +165,9 @@ export class Bulk {
           try {
             line = { robot: id, ...(await act(id)) };
           } catch (error) {
-            line = { robot: id, outcome: 'failed', text: sentence(error) };
+            line = { robot: id, outcome: 'failed', text: saidOf(error) };
           }
-        } else line = { robot: id, outcome: 'failed', text: texts.bulk.aborted };
+        } else line = { robot: id, outcome: 'failed', text: () => texts.bulk.aborted };
         lines.set(id, line);
         // Another deed has the lines now.
         if (this.#shown !== mine || performance.now() - shownAt < SHOW_MS) continue;

@@ -1,8 +1,10 @@
 // How the friction map differs between two times: which times, what the server says, and its layer.
 import type { CellDifference } from '../api/schema';
-import { list, sentence } from '../api/client';
+import { list, saidOf } from '../api/client';
+import type { Said } from '../message';
 import { minute, momentOf } from '../format';
 import { Comparison } from '../map/compare';
+import { serverClock } from '../server_clock';
 import { texts } from '../texts';
 import type { Fleet } from './fleet.svelte';
 
@@ -17,7 +19,7 @@ export class Compare {
   from = $state('');
   to = $state('');
   layer = $state.raw<Comparison | null>(null);
-  problem = $state<string | null>(null);
+  problem = $state<Said | null>(null);
   isReading = $state(false);
   isWhole = $state(true);
   /** The times that the server has rounded to, as it states them; the second is null for the present. */
@@ -36,7 +38,7 @@ export class Compare {
 
   begin(): void {
     this.isOn = true;
-    this.from ||= minute(Date.now() - BACK_MS);
+    this.from ||= minute(serverClock.now() - BACK_MS);
     void this.read();
   }
 
@@ -48,7 +50,7 @@ export class Compare {
 
   /** Compares the present with a time that long ago. */
   since(ago_ms: number): void {
-    this.from = minute(Date.now() - ago_ms);
+    this.from = minute(serverClock.now() - ago_ms);
     this.to = '';
     void this.read();
   }
@@ -66,8 +68,9 @@ export class Compare {
     if (!site) return;
     const mine = (this.#asked += 1);
     if (!times) {
-      const field = Number.isNaN(momentOf(this.from)) ? texts.map.from : texts.map.to;
-      this.problem = texts.map.momentWrong(field, minute(Date.now() - BACK_MS));
+      const field = Number.isNaN(momentOf(this.from)) ? 'from' : 'to';
+      const example = minute(serverClock.now() - BACK_MS);
+      this.problem = () => texts.map.momentWrong(texts.map[field], example);
       this.isReading = false;
       return;
     }
@@ -83,7 +86,7 @@ export class Compare {
       this.problem = null;
     } catch (error) {
       if (mine !== this.#asked) return;
-      this.problem = sentence(error);
+      this.problem = saidOf(error);
     }
     this.isReading = false;
     this.fleet.isDirty = true;

@@ -1,5 +1,6 @@
 // Teleoperation: the socket, the lease, and the motion that the operator commands. Whatever goes wrong means zero.
 import type { DriveUpdate, DriveView, Lease } from '../api/schema';
+import type { Said } from '../message';
 import { texts } from '../texts';
 import { KEYS, clamped, inputOfAxes, inputOfKeys, type DriveInput } from './drive_input';
 
@@ -15,7 +16,7 @@ export class Drive {
   lease = $state.raw<Lease | null>(null);
   view = $state.raw<DriveView | null>(null);
   /** Said in one sentence; null when there is nothing to say. */
-  said = $state<string | null>(null);
+  said = $state<Said | null>(null);
   /** Who has the lease that this page was refused. */
   isTakenByOther = $state(false);
   /** Shares of the robot's own limits. */
@@ -37,9 +38,9 @@ export class Drive {
     /** Hears where the robot is, more often than the stream of events says it. */
     readonly heard: (robot: string, view: DriveView) => void,
   ) {
-    addEventListener('blur', () => this.#rest(texts.drive.zero.blur));
+    addEventListener('blur', () => this.#rest(() => texts.drive.zero.blur));
     document.addEventListener('visibilitychange', () => {
-      if (document.hidden) this.#rest(texts.drive.zero.hidden);
+      if (document.hidden) this.#rest(() => texts.drive.zero.hidden);
     });
     addEventListener('pagehide', () => this.close());
   }
@@ -62,7 +63,7 @@ export class Drive {
       if (this.#socket !== socket) return;
       const had = this.hasLease || this.connection === 'connecting';
       this.#off();
-      if (had) this.said ??= texts.drive.zero.lost;
+      if (had) this.said ??= () => texts.drive.zero.lost;
     };
   }
 
@@ -108,7 +109,7 @@ export class Drive {
     this.#command();
   }
 
-  #rest(why: string): void {
+  #rest(why: Said): void {
     if (!this.hasLease) return;
     const moved = !this.#wasZero;
     this.letGo();
@@ -147,20 +148,23 @@ export class Drive {
       this.#pressed.clear();
       this.#stick = null;
       this.input = { forward: 0, left: 0 };
-      this.said = texts.drive.released(update.released.cause, update.released.detail);
+      const { cause, detail } = update.released;
+      this.said = () => texts.drive.released(cause, detail);
       this.isTakenByOther = update.released.cause === 'taken';
     } else if ('refused' in update) {
       // A command that was under way when the lease was lost: why it was lost stays written.
       if (update.refused.cause === 'no_lease' && !this.hasLease) return;
       // That the robot is stopped is shown as long as it is so, with what to do.
       if (update.refused.cause === 'stopped' && this.view?.safety.stop) return;
-      this.said = texts.drive.refused(update.refused.cause, update.refused.detail);
+      const { cause, detail } = update.refused;
+      this.said = () => texts.drive.refused(cause, detail);
       this.isTakenByOther = update.refused.cause === 'leased';
     } else if ('view' in update) {
       this.view = update.view;
       if (this.robot) this.heard(this.robot, update.view);
     } else if ('ended' in update) {
-      this.said = texts.drive.released('ended', update.ended.detail);
+      const { detail } = update.ended;
+      this.said = () => texts.drive.released('ended', detail);
     }
   }
 

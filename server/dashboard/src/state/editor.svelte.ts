@@ -2,25 +2,26 @@
 import type {
   Circle,
   CreateMission,
-  Geofence,
   Mission,
-  ReplaceGeofence,
   Terrain,
   TerrainClass,
   Trajectory,
   TrajectoryCheck,
   Waypoints,
 } from '../api/schema';
-import { Problem, ask, sentence } from '../api/client';
+import { ask } from '../api/client';
 import type { DraftState } from '../address';
 import { Draft, RADIUS_MIN_M, type DraftKind } from '../map/draft';
 import type { PointM } from '../map/camera';
+import type { Shape } from '../map/shape';
 import { plain } from '../format';
+import type { Said } from '../message';
 import { preferences } from '../preferences.svelte';
 import { NO_FAULTS, type DraftField, type Faults } from '../refusal';
 import { texts } from '../texts';
 import { about, inUnit } from '../units';
 import type { Fleet } from './fleet.svelte';
+import { AreaChanged, TerrainChanged, createTerrain, replaceArea, replaceTerrain, type FenceSide } from './ground';
 import { refusalIn, refusalText } from './refused';
 
 /** Wait after a change before the dry run is asked for, milliseconds. */
@@ -32,8 +33,6 @@ export type Purpose =
   | { what: 'terrain'; terrain: Terrain | null }
   /** An area of the geofence; the one that it replaces, or none for a new one. */
   | { what: 'fence'; side: FenceSide; old: PointM[] | null };
-
-export type FenceSide = 'keep_in' | 'keep_out';
 
 /** A speed where none is given, metres per second. */
 const SPEED_DEFAULT_M_S = 0.5;
@@ -70,7 +69,7 @@ export class Editor {
   /** What was discarded last, in case that was not meant. */
   discarded = $state.raw<DraftState | null>(null);
   /** Said after a success. */
-  said = $state<string | null>(null);
+  said = $state<Said | null>(null);
 
   /** What was drawn of the other kind, in case that is wanted after all. */
   #other: Draft | null = null;
@@ -174,19 +173,19 @@ export class Editor {
   get checkProblem(): string | null {
     void this.version;
     const flaw = this.draft && !this.draft.isEmpty ? this.#flaw : null;
-    return flaw?.said ?? (this.#refused === null ? null : refusalText(this.#refused, this.#hasPoints));
+    return flaw?.said ?? (this.#refused === null ? null : refusalText(this.#refused, this.#hasPoints, this.#shape));
   }
 
   /** Why it could not be sent or saved; null unless that was tried. */
   get sendProblem(): string | null {
-    return this.#unsent === null ? null : refusalText(this.#unsent, this.#hasPoints);
+    return this.#unsent === null ? null : refusalText(this.#unsent, this.#hasPoints, this.#shape);
   }
 
   /** Which points and which field of the draft are at fault, by what was typed or by what the server says. */
   readonly faults: Faults = $derived.by(() => {
     void this.version;
     if (!this.draft || this.draft.isEmpty) return NO_FAULTS;
-    const refusal = (error: unknown) => refusalIn(error, this.#hasPoints);
+    const refusal = (error: unknown) => refusalIn(error, this.#hasPoints, this.#shape);
     return this.#flaw?.faults ?? refusal(this.#refused) ?? refusal(this.#unsent) ?? NO_FAULTS;
   });
 
@@ -198,6 +197,11 @@ export class Editor {
 
   get #hasPoints(): boolean {
     return this.draft?.kind !== 'circle';
+  }
+
+  get #shape(): Shape | null {
+    const { draft } = this;
+    return draft && draft.kind !== 'circle' ? { points: draft.points, isArea: draft.kind === 'terrain' } : null;
   }
 
   /** Why the area that is drawn cannot be saved, beside what is wrong with it; null when it can. */
@@ -262,6 +266,7 @@ export class Editor {
       radius_m: draft.radius_m,
       points: draft.points.map((point) => ({ ...point })),
       old: purpose.what === 'fence' ? purpose.old : null,
+      revision: purpose.what === 'terrain' ? (purpose.terrain?.revision ?? null) : null,
       robot: this.robot,
       robots: this.robots,
       speed_m_s: this.speed_m_s,
@@ -303,7 +308,7 @@ export class Editor {
     return true;
   }
 
-  #purposeOf({ what, of, old }: DraftState): Purpose | null {
+  #purposeOf({ what, of, old, revision }: DraftState): Purpose | null {
     if (what === 'mission') return { what };
     if (what === 'keep_in' || what === 'keep_out') return { what: 'fence', side: what, old };
     if (what === 'replace') {
@@ -312,7 +317,8 @@ export class Editor {
     }
     if (of === '') return { what, terrain: null };
     const terrain = this.fleet.terrains.find((known) => known.id === of);
-    return terrain ? { what, terrain } : null;
+    // Also after a reload it is a change of what it was begun on.
+    return terrain ? { what, terrain: { ...terrain, revision: revision ?? terrain.revision } } : null;
   }
 
   /** Ends a draft that was sent or saved. */
@@ -424,70 +430,63 @@ export class Editor {
 
   async saveTerrain(): Promise<boolean> {
     const { purpose, draft } = this;
-    const site = this.fleet.site;
-    if (purpose?.what !== 'terrain' || !draft || !site) return false;
+    if (purpose?.what !== 'terrain' || !draft || !this.fleet.site) return false;
     const shape = {
       class: this.terrainClass,
       layer: this.terrainLayer,
       name: this.terrainName || this.terrainId,
       polygon: draft.points,
     };
-    const at = `/v1/sites/${site}/terrains`;
-    const done = purpose.terrain
-      ? await this.#send(`${at}/${purpose.terrain.id}`, 'PUT', shape)
-      : await this.#send(at, 'POST', { id: this.terrainId, ...shape });
-    if (done) void this.fleet.readGround();
-    return done;
+    const { terrain } = purpose;
+    return this.#save(async () => {
+      if (terrain) await replaceTerrain(this.fleet, terrain, shape);
+      else await createTerrain(this.fleet, { id: this.terrainId, ...shape });
+    });
+  }
+
+  /** The terrain that is drawn, as somebody else has changed it meanwhile; null unless saving it was refused for that. */
+  get conflict(): Terrain | null {
+    return this.#unsent instanceof TerrainChanged ? this.#unsent.present : null;
+  }
+
+  /** Gives up what was drawn for what somebody else has saved. */
+  loadPresent(): void {
+    if (this.conflict) this.beginTerrain(this.conflict);
+  }
+
+  /** Saves what was drawn over what somebody else has saved. */
+  async saveOver(): Promise<void> {
+    if (!this.conflict) return;
+    this.purpose = { what: 'terrain', terrain: this.conflict };
+    if (await this.saveTerrain()) this.finish();
   }
 
   /** Saves the area that is drawn, in the place of the one that it changes. */
   async saveFence(): Promise<boolean> {
     const { purpose, draft } = this;
     if (purpose?.what !== 'fence' || !draft) return false;
-    this.isSending = true;
-    this.#unsent = await this.#putFence(purpose.side, purpose.old, draft.points);
-    this.isSending = false;
-    return this.#unsent === null;
-  }
-
-  /** Deletes an area; why not, if it was not. */
-  async removeFence(side: FenceSide, old: PointM[]): Promise<string | null> {
-    const error = await this.#putFence(side, old, null);
-    return error === null ? null : sentence(error);
-  }
-
-  /** Replaces one area of the geofence, unless somebody changed it meanwhile; what went wrong, or null. */
-  async #putFence(side: FenceSide, old: PointM[] | null, area: PointM[] | null): Promise<unknown> {
-    const { fence, site } = this.fleet;
-    if (!fence || !site) return new Problem(texts.problem.lost, 0);
-    const gone = JSON.stringify(old);
-    const others = fence[side].filter((known) => JSON.stringify(known) !== gone);
-    const body: ReplaceGeofence = { keep_in: fence.keep_in, keep_out: fence.keep_out };
-    body[side] = area ? [...others, area] : others;
-    const headers = { 'if-match': `"${fence.revision}"` };
-    try {
-      const answer = await ask<Geofence>(`/v1/sites/${site}/geofence`, { method: 'PUT', body, headers });
-      this.fleet.fence = answer;
-      this.fleet.isDirty = true;
-      return null;
-    } catch (error) {
-      if (!(error instanceof Problem) || error.status !== 412) return error;
-      await this.fleet.readGround();
-      return new Problem(texts.fence.changed, error.status);
-    }
+    const { side, old } = purpose;
+    const isSaved = await this.#save(() => replaceArea(this.fleet, { side, old, area: draft.points }));
+    // Saved again, it is an area of its own.
+    if (this.#unsent instanceof AreaChanged) this.purpose = { what: 'fence', side, old: null };
+    return isSaved;
   }
 
   async #send(
     path: string,
-    method: 'POST' | 'PUT',
+    method: 'POST',
     body: unknown,
     headers: Record<string, string> = {},
     then: (answer: Mission) => void = () => undefined,
   ): Promise<boolean> {
+    return this.#save(async () => then(await ask<Mission>(path, { method, body, headers })));
+  }
+
+  async #save(save: () => Promise<void>): Promise<boolean> {
     this.isSending = true;
     this.#unsent = null;
     try {
-      then(await ask<Mission>(path, { method, body, headers }));
+      await save();
       return true;
     } catch (error) {
       this.#unsent = error;

@@ -1,8 +1,10 @@
 // Everything that the page knows of one site, kept by the stream of events.
 import { SvelteMap } from 'svelte/reactivity';
 import type { Alert, DriveView, Geofence, Mission, MissionStep, Robot, Site, Terrain, TerrainFriction } from '../api/schema';
-import { ask, list, sentence } from '../api/client';
+import { ask, list, saidOf } from '../api/client';
+import type { Said } from '../message';
 import { Stream, type Listener } from '../api/stream';
+import { serverClock } from '../server_clock';
 import { signedIn } from './session.svelte';
 import { nameRanks, type NameRanks } from '../roster';
 import { doing } from '../standing';
@@ -48,9 +50,9 @@ export class Fleet implements Listener {
   sites = $state.raw<Site[]>([]);
   site = $state<string | null>(null);
   isLive = $state(false);
-  /** When the stream was lost, wall time; null while it lives or was never there. */
+  /** When the stream was lost, by the server's time; null while it lives or was never there. */
   lostAt = $state<number | null>(null);
-  problem = $state<string | null>(null);
+  problem = $state<Said | null>(null);
   /** A monotonic clock for ages, milliseconds, twice a second. */
   now = $state(performance.now());
   selected = $state<string | null>(null);
@@ -100,6 +102,8 @@ export class Fleet implements Listener {
   #timers: ReturnType<typeof setInterval>[] = [];
   #listsDue: ReturnType<typeof setTimeout> | undefined;
   #seen: Set<string> | null = null;
+  /** Grows with each change of the ground from this page. */
+  #groundChanges = 0;
   /** Robots in the order of lists; null once another one is there, or one is gone. */
   #order: string[] | null = null;
   #namesAreOld = true;
@@ -211,7 +215,7 @@ export class Fleet implements Listener {
       this.problem = null;
       this.siteAlerts.follow(sites.length > 1);
     } catch (error) {
-      this.problem = sentence(error);
+      this.problem = saidOf(error);
       return;
     }
     const kept = localStorage.getItem(SITE_KEY);
@@ -257,13 +261,14 @@ export class Fleet implements Listener {
     const { site } = this;
     if (!site || document.hidden) return;
     const at = `/v1/sites/${site}`;
+    const changes = this.#groundChanges;
     try {
       const [terrains, friction, fence] = await Promise.all([
         list<Terrain>(`${at}/terrains`, LIST_MAX),
         list<TerrainFriction>(`${at}/friction/terrains`, LIST_MAX),
         ask<Geofence>(`${at}/geofence`),
       ]);
-      if (this.site !== site) return;
+      if (this.site !== site || changes !== this.#groundChanges) return;
       this.terrains = terrains.items;
       this.terrainFriction = friction.items;
       this.fence = fence;
@@ -271,6 +276,26 @@ export class Fleet implements Listener {
     } catch {
       // The stream says already that the server is lost.
     }
+  }
+
+  /** Takes a terrain that was saved or read by itself. */
+  setTerrain(terrain: Terrain): void {
+    const isKnown = this.terrains.some(({ id }) => id === terrain.id);
+    this.terrains = isKnown ? this.terrains.map((known) => (known.id === terrain.id ? terrain : known)) : [...this.terrains, terrain];
+    this.#groundChanged();
+  }
+
+  /** Takes the geofence that was saved. */
+  setFence(fence: Geofence): void {
+    this.fence = fence;
+    this.#groundChanged();
+  }
+
+  /** What was asked for before is older. */
+  #groundChanged(): void {
+    this.#groundChanges += 1;
+    this.isDirty = true;
+    void this.readGround();
   }
 
   /** The site's square, metres. */
@@ -355,7 +380,7 @@ export class Fleet implements Listener {
   link(isLive: boolean): void {
     if (isLive === this.isLive) return;
     this.isLive = isLive;
-    this.lostAt = isLive ? null : Date.now();
+    this.lostAt = isLive ? null : serverClock.now();
     this.isDirty = true;
     if (isLive && this.sites.length === 0) void this.readSites();
   }

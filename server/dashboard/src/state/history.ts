@@ -3,6 +3,7 @@ import type { FrictionAt, FusedFriction, ModelFriction, PointHistory, TerrainHis
 import { ask } from '../api/client';
 import type { PointM } from '../map/camera';
 import { momentsOf, stepS, type Span } from '../map/moments';
+import { serverClock } from '../server_clock';
 
 /** Friction at one time; null where it was unknown then. */
 export interface Known {
@@ -37,7 +38,7 @@ export async function cellHistory(
 
 /** The times of a span up to the server's present. */
 function timesOf(span: Span): URLSearchParams {
-  const first_ms = momentsOf(span, Date.now())[0] ?? 0;
+  const first_ms = momentsOf(span, serverClock.now())[0] ?? 0;
   return new URLSearchParams({ from: new Date(first_ms).toISOString(), step_s: String(stepS(span)) });
 }
 

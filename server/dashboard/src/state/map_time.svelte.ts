@@ -1,5 +1,6 @@
 // The time of the friction map: the present, or the end of a minute, hour, day or month that is past; and its play.
 import { momentsOf, momentsWith, type Span } from '../map/moments';
+import { serverClock } from '../server_clock';
 
 /** How long each time is shown while they play, milliseconds. */
 const SHOWN_MS = 600;
@@ -7,7 +8,7 @@ const SHOWN_MS = 600;
 export class MapTime {
   span = $state<Span>('day');
   /** Oldest first; behind the last one comes the present. */
-  moments = $state.raw(momentsOf('day', Date.now()));
+  moments = $state.raw(momentsOf('day', serverClock.now()));
   index = $state(this.moments.length);
   isRunning = $state(false);
   /** The time that the server has rounded to, as it states it. */
@@ -28,7 +29,7 @@ export class MapTime {
     const wasPast = this.at_ms !== null;
     this.pause();
     this.span = span;
-    this.moments = momentsOf(span, Date.now());
+    this.moments = momentsOf(span, serverClock.now());
     this.index = this.moments.length;
     if (wasPast) void this.read();
   }
@@ -47,7 +48,7 @@ export class MapTime {
       this.index = this.moments.length;
       return;
     }
-    const { span, moments, index } = momentsWith(wanted.at_ms, wanted.span, Date.now());
+    const { span, moments, index } = momentsWith(wanted.at_ms, wanted.span, serverClock.now());
     this.span = span;
     this.moments = moments;
     this.index = index;
@@ -64,7 +65,7 @@ export class MapTime {
 
   /** From the present on, the times are those up to now. */
   #follow(): void {
-    if (this.at_ms === null) this.moments = momentsOf(this.span, Date.now());
+    if (this.at_ms === null) this.moments = momentsOf(this.span, serverClock.now());
   }
 
   async #run(): Promise<void> {

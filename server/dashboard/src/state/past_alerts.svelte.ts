@@ -1,7 +1,8 @@
 // Alerts of the past, with those that stand: read from the server page by page, the newest first.
 import { SvelteSet } from 'svelte/reactivity';
 import type { Alert } from '../api/schema';
-import { ask, sentence } from '../api/client';
+import { ask, saidOf } from '../api/client';
+import type { Said } from '../message';
 
 /** Alerts of one page. */
 const PAGE = 50;
@@ -17,7 +18,7 @@ export class PastAlerts {
   items = $state.raw<Alert[]>([]);
   /** Kinds of all that was ever read. */
   readonly kinds = new SvelteSet<string>();
-  problem = $state<string | null>(null);
+  problem = $state<Said | null>(null);
   isReading = $state(false);
   hasMore = $state(false);
 
@@ -53,7 +54,7 @@ export class PastAlerts {
       this.problem = null;
     } catch (error) {
       if (mine !== this.#asked) return;
-      this.problem = sentence(error);
+      this.problem = saidOf(error);
     }
     this.isReading = false;
   }

@@ -1,18 +1,19 @@
 // What the page says when the server refuses a draft, with the numbers that points have in the table.
 import { Problem, sentence, tell } from '../api/client';
 import { COORDINATE_MAX_M } from '../map/draft';
+import type { Shape } from '../map/shape';
 import { refusalOf, type Refusal } from '../refusal';
 import { texts } from '../texts';
 import { about } from '../units';
 
 /** What an error says of a draft; null if it is no answer of the server. */
-export function refusalIn(error: unknown, hasPoints: boolean): Refusal | null {
-  return error instanceof Problem && error.body ? refusalOf(error.body, hasPoints) : null;
+export function refusalIn(error: unknown, hasPoints: boolean, shape: Shape | null = null): Refusal | null {
+  return error instanceof Problem && error.body ? refusalOf(error.body, hasPoints, shape) : null;
 }
 
 /** What went wrong, in the page's own words where it has some, else by the problem's type and the server's words. */
-export function refusalText(error: unknown, hasPoints: boolean): string {
-  const refusal = refusalIn(error, hasPoints);
+export function refusalText(error: unknown, hasPoints: boolean, shape: Shape | null = null): string {
+  const refusal = refusalIn(error, hasPoints, shape);
   if (!refusal || !(error instanceof Problem) || !error.body) return sentence(error);
   const { refused } = texts.draw;
   const [first = NaN, second = NaN] = refusal.points;

@@ -1,6 +1,7 @@
 // Who is signed in, and how the page looks to them.
 import type { OidcSignIn, Right, Session, SignInMethods, SignedOut } from '../api/schema';
-import { Problem, ask, sentence, whenSignedOut } from '../api/client';
+import { Problem, ask, saidOf, whenSignedOut } from '../api/client';
+import type { Said } from '../message';
 import { may } from '../rights';
 import { texts } from '../texts';
 
@@ -12,7 +13,10 @@ const SIGNED_IN = '#signed-in';
 
 export type Theme = 'light' | 'dark';
 
-class SignedIn {
+/** A token, or a person at the provider. */
+export type SignedInBy = 'token' | 'person';
+
+export class SignedIn {
   session = $state<Session | null>(null);
   /** The provider that people may sign in at, if there is one. */
   oidc = $state<OidcSignIn | null>(null);
@@ -20,7 +24,9 @@ class SignedIn {
   isKnown = $state(false);
   /** Somebody was signed in on this page and no longer is. */
   hasEnded = $state(false);
-  problem = $state<string | null>(null);
+  /** How whoever signed out on this page had signed in; null unless somebody just did. */
+  out = $state<SignedInBy | null>(null);
+  problem = $state<Said | null>(null);
 
   constructor() {
     whenSignedOut(() => this.end());
@@ -29,6 +35,10 @@ class SignedIn {
   /** Whether they have a right; with a site, whether they have it for all of this site. */
   may(right: Right, site?: string): boolean {
     return may(this.session, right, site);
+  }
+
+  get by(): SignedInBy {
+    return this.session?.person ? 'person' : 'token';
   }
 
   get name(): string {
@@ -47,7 +57,7 @@ class SignedIn {
         this.session = await ask<Session>('/v1/session');
       } catch (error) {
         if (error instanceof Problem && error.status === 401) this.hasEnded = true;
-        else this.problem = sentence(error);
+        else this.problem = saidOf(error);
       }
     }
     this.isKnown = true;
@@ -68,28 +78,33 @@ class SignedIn {
     try {
       this.session = await ask<Session>('/v1/session', { method: 'POST', body: { token } });
       this.hasEnded = false;
+      this.out = null;
       localStorage.setItem(SESSION_KEY, 'yes');
     } catch (error) {
       // What the server says of it is for programs.
-      this.problem = error instanceof Problem && error.status === 401 ? texts.signIn.wrong : sentence(error);
+      this.problem = error instanceof Problem && error.status === 401 ? () => texts.signIn.wrong : saidOf(error);
     }
   }
 
   async signOut(): Promise<void> {
     this.problem = null;
+    const { by } = this;
     try {
       const out = await ask<SignedOut | undefined>('/v1/session', { method: 'DELETE' });
       localStorage.removeItem(SESSION_KEY);
       this.session = null;
+      this.out = by;
       if (out) location.assign(out.provider);
       else await this.lookForWays();
     } catch (error) {
-      this.problem = sentence(error);
+      // It had ended already, which is said.
+      if (!(error instanceof Problem && error.status === 401)) this.problem = saidOf(error);
     }
   }
 
   end(): void {
     if (this.session) this.hasEnded = true;
+    this.out = null;
     this.problem = null;
     localStorage.removeItem(SESSION_KEY);
     this.session = null;

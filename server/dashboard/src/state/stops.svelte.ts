@@ -1,7 +1,8 @@
 // Stops: sent at once, shown until the robot has confirmed, cleared by name.
 import { SvelteMap } from 'svelte/reactivity';
 import type { FleetStop, Robot, Stop } from '../api/schema';
-import { Problem, ask, list, sentence } from '../api/client';
+import { Problem, ask, list, saidOf, sentence } from '../api/client';
+import type { Said } from '../message';
 import { texts } from '../texts';
 
 /** How often stops are read while one is unconfirmed, milliseconds. */
@@ -14,7 +15,7 @@ const STOP_MAX_MS = 3_000;
 export const FLEET = '*';
 
 /** Where a stop that this page sent stands until it is among the stops of the server. */
-export type Sent = { state: 'sending' } | { state: 'failed'; text: string };
+export type Sent = { state: 'sending' } | { state: 'failed'; text: Said };
 /** What is wrong with the stop of a robot. */
 export type StopProblem = 'unconfirmed' | 'failed';
 
@@ -24,7 +25,7 @@ export class Stops {
   /** What was sent from here and not answered yet, or in vain, by robot. */
   readonly sent = new SvelteMap<string, Sent>();
   /** Why a clear did not come about, by robot. */
-  readonly clearProblems = new SvelteMap<string, string>();
+  readonly clearProblems = new SvelteMap<string, Said>();
 
   /** What is wrong with stops, by robot. */
   readonly #problems = $derived.by(() => {
@@ -52,7 +53,7 @@ export class Stops {
   }
 
   /** Stops a robot; why it may not have got it, if so. */
-  async stop(robot: string): Promise<string | null> {
+  async stop(robot: string): Promise<Said | null> {
     this.sent.set(robot, { state: 'sending' });
     try {
       const stop = await ask<Stop>(`/v1/sites/${this.site()}/robots/${robot}/stop`, {
@@ -64,14 +65,14 @@ export class Stops {
       this.sent.delete(robot);
       return null;
     } catch (error) {
-      const text = failureText(this.nameOf(robot), error);
+      const text = () => failureText(this.nameOf(robot), error);
       this.sent.set(robot, { state: 'failed', text });
       return text;
     }
   }
 
   /** Stops all robots of the site; why not, if so. */
-  async stopAll(): Promise<string | null> {
+  async stopAll(): Promise<Said | null> {
     this.sent.set(FLEET, { state: 'sending' });
     try {
       const stopped = await ask<FleetStop>('/v1/stop', {
@@ -83,14 +84,14 @@ export class Stops {
       this.sent.delete(FLEET);
       return null;
     } catch (error) {
-      const text = failureText(texts.stop.everyRobot, error);
+      const text = () => failureText(texts.stop.everyRobot, error);
       this.sent.set(FLEET, { state: 'failed', text });
       return text;
     }
   }
 
   /** Clears a stop; why not, if so. */
-  async clear(stop: Stop): Promise<string | null> {
+  async clear(stop: Stop): Promise<Said | null> {
     this.clearProblems.delete(stop.robot);
     try {
       await ask<Stop>(`/v1/sites/${stop.site}/robots/${stop.robot}/stop/clear`, {
@@ -100,7 +101,7 @@ export class Stops {
       this.inForce.delete(stop.robot);
       return null;
     } catch (error) {
-      const text = sentence(error);
+      const text = saidOf(error);
       this.clearProblems.set(stop.robot, text);
       return text;
     } finally {

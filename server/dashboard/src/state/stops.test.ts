@@ -5,7 +5,7 @@ import { FLEET, Stops } from './stops.svelte';
 const stop = (robot: string, confirmed_at: string | null): Stop =>
   ({ id: `stop-of-${robot}`, site: 'yard', robot, by: 'demo', confirmed_at }) as Stop;
 const AT = '2026-11-22T06:00:00Z';
-const failed = { state: 'failed', text: 'It does not answer.' } as const;
+const failed = { state: 'failed', text: () => 'It does not answer.' } as const;
 
 test('something is wrong with a stop that is not confirmed or that failed, and with no other one', () => {
   const stops = new Stops(() => 'yard', (robot) => robot);

@@ -69,3 +69,9 @@ test('a robot that stands and says the same needs no frame, one that is stopped 
   expect(tracked.update(stopped, 400)).toBe(true);
   expect(tracked.update(stopped, 600)).toBe(false);
 });
+
+test('samples of curves have the time at which they came, and sparse ones are kept from the first on', () => {
+  const tracked = new Tracked(robot(0, 1), 10);
+  for (let at_ms = 210; at_ms <= 2_210; at_ms += 200) tracked.update(robot(at_ms / 1000, 1), at_ms, 900);
+  expect(tracked.samples.map((sample) => sample.at_s)).toEqual([0.01, 1.01, 2.01]);
+});

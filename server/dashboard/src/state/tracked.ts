@@ -16,7 +16,7 @@ const CURVE_SAMPLES = 1_500;
 
 /** One moment of the curves; what was not known is null. */
 export interface Sample {
-  /** Wall time, seconds. */
+  /** Time of the page's monotonic clock, seconds. */
   at_s: number;
   crossTrack_m: number | null;
   speed_m_s: number | null;
@@ -103,8 +103,8 @@ export class Tracked {
     ]);
     if (live) this.#move(live, this.receivedAt, robot.link);
     if (!live || robot.link !== 'online') return;
-    const at_s = Date.now() / 1000;
-    if ((at_s - (this.samples.at(-1)?.at_s ?? 0)) * 1000 < apartMs) return;
+    const at_s = this.receivedAt / 1000;
+    if ((at_s - (this.samples.at(-1)?.at_s ?? -Infinity)) * 1000 < apartMs) return;
     const friction = live.friction?.value;
     this.samples.push({
       at_s,

@@ -1,7 +1,8 @@
 // What is shown: tabs, layers of the map, the mission that is looked at.
 import type { CellFriction, MissionDetail, PlannedPath, RobotModel } from '../api/schema';
 import { LAYER_FIRST } from '../address';
-import { ask, list, sentence, type Listed } from '../api/client';
+import { ask, list, saidOf, type Listed } from '../api/client';
+import type { Said } from '../message';
 import { Layer, type Quantity } from '../map/friction';
 import type { Bounds, PointM } from '../map/camera';
 import { modelLabel } from '../map/models';
@@ -37,13 +38,13 @@ export class View {
   /** Robot models that the friction map knows. */
   configurations = $state.raw<string[]>([]);
   layer = $state.raw<Layer | null>(null);
-  frictionProblem = $state<string | null>(null);
+  frictionProblem = $state<Said | null>(null);
   isReading = $state(false);
   isWhole = $state(true);
   /** The alert that is shown and marked among the others; null for none. */
   alert = $state<string | null>(null);
   detail = $state.raw<MissionDetail | null>(null);
-  detailProblem = $state<string | null>(null);
+  detailProblem = $state<Said | null>(null);
   /** The smooth path of the mission that is looked at, once it is known. */
   plan = $state.raw<PlannedPath | null>(null);
   /** Its time line, once it has ended. */
@@ -143,7 +144,7 @@ export class View {
       if (site === this.fleet.site) this.#take(read, part);
       else this.#readAgain = true;
     } catch (error) {
-      this.frictionProblem = sentence(error);
+      this.frictionProblem = saidOf(error);
     }
     this.isReading = false;
     if (!this.#readAgain) return;
@@ -208,7 +209,7 @@ export class View {
       }
     } catch (error) {
       if (mine !== this.#asked) return;
-      this.detailProblem = sentence(error);
+      this.detailProblem = saidOf(error);
     }
     this.fleet.isDirty = true;
   }

@@ -14,8 +14,16 @@ export const fleet: Pick<Texts, Areas> = {
     provider: (label) => `Mit ${label} anmelden`,
     unavailable: 'Der Anbieter antwortet zurzeit nicht.',
     wrong: 'Der Server kennt dieses Token nicht: Es ist vertippt, abgelaufen oder widerrufen.',
-    again: 'Ihre Anmeldung ist abgelaufen. Melden Sie sich wieder an; Ihre Zeichnung bleibt erhalten.',
+    again: 'Ihre Anmeldung ist beendet. Melden Sie sich wieder an; Ihre Zeichnung bleibt erhalten.',
     out: 'Abmelden',
+    outMeans: {
+      token: 'Meldet diesen Browser ab. Das Token bleibt gültig, auch in anderen Browsern.',
+      person: 'Beendet die Sitzung dieses Browsers und meldet Sie beim Anbieter ab, falls er das erlaubt.',
+    },
+    isOut: {
+      token: 'Dieser Browser ist abgemeldet. Das Token bleibt gültig, bis es abläuft oder widerrufen wird.',
+      person: 'Dieser Browser ist abgemeldet, seine Sitzung ist beendet. Beim Anbieter sind Sie vielleicht noch angemeldet.',
+    },
     as: (name, what) => `${name}, ${what}`,
   },
   settings: {
@@ -297,7 +305,8 @@ export const fleet: Pick<Texts, Areas> = {
     test: 'Probe senden',
     testing: 'Die Probe läuft …',
     testArrived: 'Die Probe ist angekommen.',
-    testFailed: (why) => `Die Probe ist nicht angekommen: ${why}. Sie wird erneut gesendet.`,
+    testFailed: 'Die Probe ist nicht angekommen. Sie wird erneut gesendet.',
+    testFailedBy: (why) => `Die Probe ist nicht angekommen: ${why}. Sie wird erneut gesendet.`,
     testWaits: 'Die Probe wartet: Eine andere Zustellung läuft oder ist gerade fehlgeschlagen.',
     log: 'Protokoll',
     enable: 'Einschalten',

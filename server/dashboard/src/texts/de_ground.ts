@@ -171,6 +171,8 @@ export const ground: Pick<Texts, Areas> = {
     size: (area, corners) => `${area}, ${corners} Eckpunkte`,
     changed:
       'Jemand hat den Geofence inzwischen geändert: Er wird gezeigt, wie er jetzt ist. Ihre Zeichnung bleibt erhalten; speichern Sie noch einmal.',
+    areaChanged:
+      'Jemand hat diesen Bereich inzwischen geändert oder gelöscht: Der Geofence wird gezeigt, wie er jetzt ist. Ihre Zeichnung bleibt erhalten; noch einmal gespeichert ist sie ein neuer Bereich.',
   },
   terrains: {
     none: 'Noch keine Fläche ist gezeichnet.',
@@ -197,6 +199,11 @@ export const ground: Pick<Texts, Areas> = {
     unknown: 'nicht gemessen',
     show: 'Auf der Karte zeigen',
     revision: (n) => `Fassung ${n}`,
+    changed: (name, revision) =>
+      `Jemand anders hat ${name} inzwischen geändert, auf Fassung ${revision}. Ihre Zeichnung bleibt erhalten und ist nicht gespeichert.`,
+    loadPresent: 'Meine verwerfen und die neue Fassung laden',
+    saveOver: 'Durch meine ersetzen',
+    notDeleted: 'Nicht gelöscht: Jemand anders hat das inzwischen geändert. Es wird gezeigt, wie es jetzt ist.',
   },
   map: {
     section: 'Karte',

@@ -23,6 +23,17 @@ export const en = {
   limitNames: limit,
   ...fleet,
   ...ground,
+  /** What is wrong with a field of a form. */
+  form: {
+    missing: 'Fill in this field.',
+    number: 'Enter a number.',
+    address: 'Enter an address that begins with https://.',
+    pattern: (hint: string) => `This field takes ${hint}.`,
+    least: (least: string) => `Enter ${least} or more.`,
+    most: (most: string) => `Enter ${most} or less.`,
+    whole: 'Enter a whole number.',
+    wrong: 'This field has a wrong value.',
+  },
   unit: { s: 's', percent: '%', ms: 'ms', deg: '°', h: 'h', d: 'd', min: 'min', radps: 'rad/s', volt: 'V' },
   /** Two numbers beside each other; where a comma is decimal, it cannot part them. */
   pair: (first: string, second: string) => `${first}, ${second}`,

@@ -13,6 +13,16 @@ export const fleet = {
     wrong: 'The server does not know this token: it is mistyped, expired or revoked.',
     again: 'Your sign-in has ended. Sign in again; what you drew is kept.',
     out: 'Sign out',
+    /** What it does, by how somebody signed in. */
+    outMeans: {
+      token: 'Signs this browser out. The token stays valid, also in other browsers.',
+      person: 'Ends the session of this browser, and signs you out at the provider if the provider allows it.',
+    },
+    /** What it did. A provider that signs people out shows its own page instead. */
+    isOut: {
+      token: 'This browser is signed out. The token stays valid until it expires or is revoked.',
+      person: 'This browser is signed out and its session has ended. You may still be signed in at the provider.',
+    },
     as: (name: string, what: string) => `${name}, ${what}`,
   },
   settings: {
@@ -298,7 +308,8 @@ export const fleet = {
     test: 'Send a test',
     testing: 'The test is under way …',
     testArrived: 'The test has arrived.',
-    testFailed: (why: string) => `The test has not arrived: ${why}. It is sent again.`,
+    testFailed: 'The test has not arrived. It is sent again.',
+    testFailedBy: (why: string) => `The test has not arrived: ${why}. It is sent again.`,
     testWaits: 'The test waits: another delivery is under way or has just failed.',
     log: 'Log',
     enable: 'Enable',

@@ -175,6 +175,8 @@ export const ground = {
     drawOut: 'Where robots may not be',
     size: (area: string, corners: number) => `${area}, ${corners} corners`,
     changed: 'Somebody changed the geofence meanwhile: it is shown as it is now. What you drew is kept; save it again.',
+    areaChanged:
+      'Somebody changed or deleted this area meanwhile: the geofence is shown as it is now. What you drew is kept; saved again, it is a new area.',
   },
   terrains: {
     none: 'No terrain is drawn yet.',
@@ -201,6 +203,12 @@ export const ground = {
     unknown: 'not measured',
     show: 'Show on map',
     revision: (n: number) => `revision ${n}`,
+    /** Of a terrain that somebody else has saved meanwhile. */
+    changed: (name: string, revision: number) =>
+      `Somebody else changed ${name} meanwhile, to revision ${revision}. What you drew is kept and not saved.`,
+    loadPresent: 'Discard mine and load the new state',
+    saveOver: 'Replace it with mine',
+    notDeleted: 'It was not deleted: somebody else changed it meanwhile. It is shown as it is now.',
   },
   map: {
     section: 'Map',

@@ -1,6 +1,7 @@
 // The dictionaries against each other, and the components against texts of their own.
 import { readFileSync, readdirSync } from 'node:fs';
 import { parse } from 'svelte/compiler';
+import ts from 'typescript';
 import { expect, test } from 'vitest';
 import type { ProblemType, Session } from '../api/schema';
 import { de } from './de';
@@ -208,6 +209,20 @@ const READ = ['title', 'placeholder', 'alt', 'label', 'aria-label', 'aria-valuet
 /** Two letters in a row are a word. */
 const WORD = /\p{L}{2}/u;
 
+/** The parts of an expression that may be its value, as far as they are written there. */
+function valuesOf(expression: unknown): string[] {
+  const node = (expression ?? {}) as Record<string, unknown> & { type?: string; value?: unknown };
+  const { type } = node;
+  if (type === 'Literal') return typeof node.value === 'string' ? [node.value] : [];
+  if (type === 'ConditionalExpression') return [node['consequent'], node['alternate']].flatMap(valuesOf);
+  if (type === 'LogicalExpression' || type === 'BinaryExpression') {
+    return type === 'LogicalExpression' || node['operator'] === '+' ? [node['left'], node['right']].flatMap(valuesOf) : [];
+  }
+  if (type === 'TemplateElement') return [(node.value as { cooked: string }).cooked];
+  if (type === 'TemplateLiteral') return [node['quasis'], node['expressions']].flatMap((parts) => (parts as unknown[]).flatMap(valuesOf));
+  return [];
+}
+
 /** Texts that a component has of its own. */
 function literals(source: string): string[] {
   const found: string[] = [];
@@ -220,8 +235,12 @@ function literals(source: string): string[] {
     const { type, name, data, value } = node as { type?: string; name?: string; data?: string; value?: unknown };
     if (type === 'Text' && data && WORD.test(data)) found.push(data.trim());
     if (type === 'StyleDirective') return;
+    if (type === 'ExpressionTag') {
+      const { expression } = node as { expression?: unknown };
+      found.push(...valuesOf(expression).filter((text) => WORD.test(text)));
+    }
     if (type === 'Attribute') {
-      if (name && READ.includes(name) && Array.isArray(value)) look(value);
+      if (name && READ.includes(name)) look(value);
       return;
     }
     for (const part of Object.values(node)) look(part);
@@ -232,7 +251,44 @@ function literals(source: string): string[] {
 
 test('components have no texts of their own', () => {
   expect(literals('<p title="A title">Two <b>{words}</b></p>')).toEqual(['A title', 'Two']);
+  const expressions = "<p title={is ? 'A title' : ''} class={is ? 'bad' : ''}>{is && `Two ${texts.words}`}{say('it')}{is === 'so' ? texts.a : 'else'}</p>";
+  expect(literals(expressions)).toEqual(['A title', 'Two ', 'else']);
   const files = ['App.svelte', ...readdirSync(new URL('parts/', SOURCES)).map((name) => `parts/${name}`)];
   expect(files.length).toBeGreaterThan(30);
   for (const file of files) expect(literals(readFileSync(new URL(file, SOURCES), 'utf8')), file).toEqual([]);
+});
+
+/** Two words beside each other are a text. */
+const TEXT = /\p{L}{2} \p{L}{2}/u;
+/** Texts of sources that nobody reads on the page, or that are in no language. */
+const OF_PROGRAMS = [
+  /^(\d+ )?\d+px system-ui, sans-serif$/,
+  /^linear-gradient\(to right, /,
+  /^tread(-agent)? |^ --token-file /,
+  // What the server is given as the reason of a stop.
+  /^(all )?stopped on the page$/,
+  // The server's words with other numbers.
+  /^ of point $/,
+];
+
+/** Texts in a source in TypeScript. */
+function textsIn(source: string): string[] {
+  const found: string[] = [];
+  const look = (node: ts.Node): void => {
+    if (ts.isStringLiteralLike(node) || ts.isTemplateHead(node) || ts.isTemplateMiddleOrTemplateTail(node)) found.push(node.text);
+    node.forEachChild(look);
+  };
+  look(ts.createSourceFile('source.ts', source, ts.ScriptTarget.Latest));
+  return found.filter((text) => TEXT.test(text) && !OF_PROGRAMS.some((known) => known.test(text)));
+}
+
+test('states and the map have no texts of their own', () => {
+  expect(textsIn("const a = 'It failed.'; const b = `so ${it} is done`; const c = 'one';")).toEqual(['It failed.', ' is done']);
+  const files = ['', 'api/', 'map/', 'state/'].flatMap((folder) =>
+    readdirSync(new URL(folder || './', SOURCES))
+      .filter((name) => /\.ts$/.test(name) && !/\.test\.ts$|\.d\.ts$/.test(name))
+      .map((name) => folder + name),
+  );
+  expect(files.length).toBeGreaterThan(60);
+  for (const file of files) expect(textsIn(readFileSync(new URL(file, SOURCES), 'utf8')), file).toEqual([]);
 });
