@@ -5,6 +5,7 @@ import type { CellFriction, CreatedToken, Mission, Page as ApiPage } from './typ
 import { violations } from './checks';
 import { crowd } from './crowd';
 import { api, browser, eventually, map, shot, token, windowOf } from './harness';
+import { ownServer } from './own_server';
 
 const { open } = browser();
 const NEW = { 'tread-guide': null } as const;
@@ -176,12 +177,36 @@ test('it can be closed, stays closed, and is opened again from the settings', as
   await guideOf(page).waitFor();
 });
 
+/** Lets the server of the demo say that robots can join. */
+async function joinable(page: Page): Promise<void> {
+  await page.route('**/v1/server', async (route) => {
+    const answer = await route.fetch();
+    await route.fulfill({ response: answer, json: { ...((await answer.json()) as object), robots_can_join: true } });
+  });
+}
+
+test('a server without [robots] shows what to add instead of commands that it would refuse', async () => {
+  const own = await ownServer();
+  try {
+    const page = await open({ kept: NEW, as: null, address: `${own.address}/#site=yard` });
+    await page.getByLabel('Token').fill(own.token);
+    await page.getByRole('button', { name: 'Sign in' }).click();
+    await stepOf(page, 'robot', false).getByText('add [robots] to its configuration').waitFor();
+    expect(await guideOf(page).locator('pre').count()).toBe(0);
+    expect(await violations(page)).toEqual([]);
+    await shot(page, 'guide-closed');
+  } finally {
+    await own.end();
+  }
+});
+
 test('an empty fleet is shown how a robot joins, with commands to copy', async () => {
   const sent = JSON.stringify({ id: 'before', site: 'yard', robot: 'rover-1' });
   const prepare = async (page: Page) => {
     await page.context().grantPermissions(['clipboard-read', 'clipboard-write']);
     await page.addInitScript((kept) => localStorage.setItem('tread-sent', kept), sent);
     await crowd(page, 0);
+    await joinable(page);
   };
   const enter = async (page: Page, secret: string) => {
     await page.getByLabel('Token').fill(secret);
@@ -208,7 +233,11 @@ test('an empty fleet is shown how a robot joins, with commands to copy', async (
 });
 
 test('the first steps are German where the page is', async () => {
-  const page = await open({ kept: NEW, as: null, locale: 'de-DE', prepare: (page) => crowd(page, 0) });
+  const prepare = async (page: Page) => {
+    await crowd(page, 0);
+    await joinable(page);
+  };
+  const page = await open({ kept: NEW, as: null, locale: 'de-DE', prepare });
   await page.locator('input[name="token"]').fill(token());
   await page.getByRole('button', { name: 'Anmelden' }).click();
   await guideOf(page).getByText('Nehmen Sie einen Roboter auf').waitFor();

@@ -179,6 +179,8 @@ pub struct ServerStatus {
     pub restoration: Option<RestorationStatus>,
     /// Robots that are on the network now, of those that the token is for.
     pub robots_present: usize,
+    /// Whether robots can join with a join token: the server has `[robots]`, and so an authority.
+    pub robots_can_join: bool,
     /// What it has counted since the start.
     pub counters: CounterValues,
 }
@@ -261,6 +263,7 @@ pub(super) async fn status(
                 robots_awaiting_release: awaiting,
             }),
         robots_present: app.presences().present_count(&subject.scope),
+        robots_can_join: app.trust_id().is_some(),
         counters: app.counters().values(),
     })
 }

@@ -1,6 +1,6 @@
 // The guide through the first steps: whether it is shown, and which of them the state of the fleet has done.
 import { untrack } from 'svelte';
-import type { CellFriction, Mission, PlannedPath } from '../api/schema';
+import type { CellFriction, Mission, PlannedPath, ServerStatus } from '../api/schema';
 import { Problem, ask, list } from '../api/client';
 import { around, doneOf, followed, measuredSince, nextOf, type Sent } from '../guide';
 import type { PointM } from '../map/camera';
@@ -31,6 +31,8 @@ export class Guide {
   /** How often nothing was found that was measured on it. */
   #looks = $state(0);
   #isLooking = false;
+  /** Whether the server lets robots join; null until it has said so. */
+  #canJoin = $state<boolean | null>(null);
 
   constructor(
     readonly fleet: Fleet,
@@ -76,6 +78,21 @@ export class Guide {
     ),
   );
   readonly next = $derived(nextOf(this.done));
+
+  /** Whether the commands for a robot to join would be refused, by a server without `[robots]`. */
+  get isClosed(): boolean {
+    return this.#canJoin === false;
+  }
+
+  /** Asks the server whether robots can join, as long as that is the next step and not known. */
+  async examine(): Promise<void> {
+    if (this.next !== 'robot' || this.#canJoin !== null) return;
+    try {
+      this.#canJoin = (await ask<ServerStatus>('/v1/server')).robots_can_join;
+    } catch {
+      // The server is lost, which is said elsewhere; the commands say themselves what is wrong.
+    }
+  }
 
   /** A value of its own: it stays the same while robots and missions change. */
   readonly #isMissing = $derived(this.isShown && this.done.mission && !this.done.friction);

@@ -44,6 +44,8 @@ export const fleet: Pick<Texts, Areas> = {
     },
     enrol:
       'Nehmen Sie einen Roboter auf: Erzeugen Sie dort, wo die Kommandozeile ist, ein Beitrittstoken, und verwenden Sie es innerhalb einer Stunde auf dem Roboter.',
+    closed:
+      'Dieser Server nimmt keine Roboter von anderen Rechnern auf: Ergänzen Sie [robots] in seiner Konfiguration, und starten Sie ihn neu. Ein Agent auf demselben Rechner braucht keine Aufnahme.',
     commands: 'Befehle, mit denen ein Roboter beitritt',
     askAdmin: 'Kein Roboter ist online. Wer diesen Server verwaltet, nimmt Roboter auf.',
     copy: 'Kopieren',

@@ -42,6 +42,7 @@ export const fleet = {
       friction: 'The friction that it measured is on the map',
     },
     enrol: 'Let a robot join: make a join token where the command line is, and use it on the robot within the hour.',
+    closed: 'This server takes no robots from other machines: add [robots] to its configuration and restart it. An agent on the same machine needs no enrolment.',
     commands: 'Commands for a robot to join',
     askAdmin: 'No robot is online. Whoever administers this server lets robots join.',
     copy: 'Copy',
