@@ -2,8 +2,8 @@
 //! compiler: see `swappable-arguments.txt` for the exceptions.
 //!
 //! Functions of tests do not count, nor do implementations of traits: the trait's own function does.
-//! Types are compared as they are written, but for those that a text is passed as, such as `&str` and
-//! `impl Into<String>`: they count as one.
+//! Types are compared as they are written, but for those that take a text of any type, such as
+//! `impl Into<String>`: they count as the same as `&str`, `String` and each other.
 
 mod rust_source;
 
@@ -63,16 +63,16 @@ impl<'ast> Visit<'ast> for TypeText {
     }
 }
 
-/// The types that a text is passed as, without their spaces and commas.
-const TEXTS: [&str; 7] = [
-    "&(str)",
-    "String",
+/// The types that take a text of any type, as they are written.
+const ANY_TEXTS: [&str; 5] = [
     "impl Into<String>",
     "impl AsRef<str>",
     "impl Display",
     "impl fmt Display",
     "impl std fmt Display",
 ];
+/// The types of a text itself. These two cannot be exchanged with each other.
+const TEXTS: [&str; 2] = ["&(str)", "String"];
 
 fn text_of(of: &syn::Type) -> String {
     let mut text = TypeText::default();
@@ -80,15 +80,16 @@ fn text_of(of: &syn::Type) -> String {
     if let syn::Type::ImplTrait(_) = of {
         text.0.insert_str(0, "impl");
     }
-    let plain = text
-        .0
-        .replace(',', "")
-        .replace("( ", "(")
-        .replace("< ", "<");
-    if TEXTS.contains(&plain.trim()) {
-        return "text".to_owned();
-    }
-    text.0
+    let plain = text.0.replace(',', "");
+    let plain = plain.replace("( ", "(").replace("< ", "<");
+    plain.trim().to_owned()
+}
+
+/// Whether an argument of one type can be passed as one of the other.
+fn are_exchangeable(one: &str, other: &str) -> bool {
+    let is_any = |of: &str| ANY_TEXTS.contains(&of);
+    let is_text = |of: &str| is_any(of) || TEXTS.contains(&of);
+    one == other || (is_any(one) && is_text(other)) || (is_text(one) && is_any(other))
 }
 
 /// Finds the functions with two arguments of one type.
@@ -97,7 +98,7 @@ struct Swappable(Vec<String>);
 
 impl Swappable {
     fn check(&mut self, signature: &syn::Signature) {
-        let mut types: Vec<String> = signature
+        let types: Vec<String> = signature
             .inputs
             .iter()
             .filter_map(|input| match input {
@@ -105,8 +106,11 @@ impl Swappable {
                 syn::FnArg::Receiver(_) => None,
             })
             .collect();
-        types.sort();
-        if types.windows(2).any(|pair| pair[0] == pair[1]) {
+        let mut pairs = types.iter().enumerate();
+        if pairs.any(|(place, one)| {
+            let mut later = types[place + 1..].iter();
+            later.any(|other| are_exchangeable(one, other))
+        }) {
             self.0.push(signature.ident.to_string());
         }
     }
@@ -169,6 +173,7 @@ fn two_arguments_of_one_type_are_found_and_others_are_not() {
         fn borrowed<'a>(one: &'a str, other: &str) {}
         fn texts(one: &str, other: impl Into<String>) {}
         fn shown(one: String, other: impl Display) {}
+        fn owned(one: String, other: &str) {}
         fn sizes(one: [f64; 2], other: [f64; 3]) {}
         impl Trait for X { fn fixed(&self, a: u8, b: u8) {} }
         impl X { fn method(&self, a: u8, b: u8) {} }
