@@ -195,6 +195,7 @@ test('a server without [robots] shows what to add instead of commands that it wo
     expect(await guideOf(page).locator('pre').count()).toBe(0);
     expect(await violations(page)).toEqual([]);
     await shot(page, 'guide-closed');
+    await page.close();
   } finally {
     await own.end();
   }
