@@ -14,7 +14,7 @@ use tread_api::rights::Right;
 
 use super::Connection;
 use super::spans::within;
-use super::values::{join_token_id, session_id, token_id};
+use super::values::{JOIN_TOKENS, SESSIONS, TOKENS, identifier};
 use crate::client::Trusted;
 
 /// Options for authentication and for the trust in the server.
@@ -91,7 +91,7 @@ pub(crate) enum TokensAction {
     /// Revoke a token: it is refused from now on, and its open connections are closed
     Revoke {
         /// Identifier of the token, as `tread tokens` lists it
-        #[arg(value_parser = token_id)]
+        #[arg(value_parser = identifier::<TokenId>(TOKENS))]
         token: TokenId,
     },
 }
@@ -111,7 +111,7 @@ pub(crate) enum SessionsAction {
     /// End sessions: they are refused from now on, and their open connections are closed
     End {
         /// Identifiers of the sessions, as `tread sessions` lists them
-        #[arg(required = true, value_name = "SESSION", value_parser = session_id)]
+        #[arg(required = true, value_name = "SESSION", value_parser = identifier::<SessionId>(SESSIONS))]
         sessions: Vec<SessionId>,
     },
 }
@@ -280,7 +280,7 @@ pub(crate) enum JoinTokenAction {
     /// Revoke a join token
     Revoke {
         /// Identifier of the join token, as `list` shows it
-        #[arg(value_parser = join_token_id)]
+        #[arg(value_parser = identifier::<JoinTokenId>(JOIN_TOKENS))]
         join_token: JoinTokenId,
     },
 }

@@ -8,7 +8,7 @@ use tread_api::ids::{AlertCode, AlertId, OwnerId, RobotId, StopId};
 
 use super::Connection;
 use super::spans::{limit_time, look_interval};
-use super::values::{alert_id, finite, positive, stop_id};
+use super::values::{ALERTS, STOPS, finite, identifier, positive};
 
 #[derive(Debug, Args)]
 pub(crate) struct WatchArguments {
@@ -48,7 +48,7 @@ pub(crate) struct ClearArguments {
     /// Robot whose stop is cleared
     pub(crate) robot: RobotId,
     /// Identifier of the stop; if absent, the stop is shown with its reason and not cleared
-    #[arg(value_parser = stop_id)]
+    #[arg(value_parser = identifier::<StopId>(STOPS))]
     pub(crate) stop: Option<StopId>,
     /// Name of the person who clears, shown to others
     #[arg(long, env = "USER")]
@@ -98,7 +98,7 @@ pub(crate) enum AlertsAction {
     #[command(visible_alias = "ack")]
     Acknowledge {
         /// Alert identifier
-        #[arg(value_parser = alert_id)]
+        #[arg(value_parser = identifier::<AlertId>(ALERTS))]
         alert: AlertId,
     },
 }

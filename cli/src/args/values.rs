@@ -6,7 +6,7 @@ use std::str::FromStr;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use jiff::{SignedDuration, Timestamp};
 use tread_api::geometry::Point;
-use tread_api::ids::{AlertId, JoinTokenId, SessionId, StopId, TerrainId, TokenId};
+use tread_api::ids::TerrainId;
 use tread_api::mission::MissionState;
 use tread_api::site::GeoOrigin;
 use tread_api::terrain::TerrainClass;
@@ -86,63 +86,41 @@ pub(super) fn moment(text: &str) -> Result<Timestamp, String> {
 
 /// Objects to which a server gives identifiers, and the command that lists them.
 #[derive(Clone, Copy)]
-struct Identified {
+pub(super) struct Identified {
     object: &'static str,
     listing: &'static str,
 }
 
-impl Identified {
-    /// Parses an identifier.
-    fn read<T: FromStr>(self, text: &str) -> Result<T, String> {
-        let Self { object, listing } = self;
+pub(super) const TOKENS: Identified = Identified {
+    object: "a token",
+    listing: "tread tokens",
+};
+pub(super) const JOIN_TOKENS: Identified = Identified {
+    object: "a join token",
+    listing: "tread robots join-token list",
+};
+pub(super) const SESSIONS: Identified = Identified {
+    object: "a session",
+    listing: "tread sessions",
+};
+pub(super) const ALERTS: Identified = Identified {
+    object: "an alert",
+    listing: "tread alerts",
+};
+pub(super) const STOPS: Identified = Identified {
+    object: "a stop",
+    listing: "tread stops",
+};
+
+/// Returns the parser of the identifiers of such objects.
+pub(super) fn identifier<T: FromStr>(
+    of: Identified,
+) -> impl Fn(&str) -> Result<T, String> + Clone + Send + Sync + 'static {
+    let Identified { object, listing } = of;
+    move |text| {
         let wrong = |_| format!("this is no identifier of {object}: `{listing}` lists them");
         text.parse().map_err(wrong)
     }
-}
-
-/// Parses the identifier of a token.
-pub(super) fn token_id(text: &str) -> Result<TokenId, String> {
-    let tokens = Identified {
-        object: "a token",
-        listing: "tread tokens",
-    };
-    tokens.read(text)
-}
-
-/// Parses the identifier of a join token.
-pub(super) fn join_token_id(text: &str) -> Result<JoinTokenId, String> {
-    let join_tokens = Identified {
-        object: "a join token",
-        listing: "tread robots join-token list",
-    };
-    join_tokens.read(text)
-}
-
-/// Parses the identifier of a session.
-pub(super) fn session_id(text: &str) -> Result<SessionId, String> {
-    let sessions = Identified {
-        object: "a session",
-        listing: "tread sessions",
-    };
-    sessions.read(text)
-}
-
-/// Parses the identifier of an alert.
-pub(super) fn alert_id(text: &str) -> Result<AlertId, String> {
-    let alerts = Identified {
-        object: "an alert",
-        listing: "tread alerts",
-    };
-    alerts.read(text)
-}
-
-/// Parses the identifier of a stop.
-pub(super) fn stop_id(text: &str) -> Result<StopId, String> {
-    let stops = Identified {
-        object: "a stop",
-        listing: "tread stops",
-    };
-    stops.read(text)
 }
 
 /// Parses the name of a mission state.
@@ -210,6 +188,8 @@ pub(crate) fn waypoint(text: &str) -> Result<Waypoint, String> {
 
 #[cfg(test)]
 mod tests {
+    use tread_api::ids::{AlertId, JoinTokenId, SessionId, StopId, TokenId};
+
     use super::*;
 
     #[test]
@@ -260,14 +240,15 @@ mod tests {
         assert!((82_799..=82_801).contains(&apart), "{apart}");
         assert!(moment("yesterday").is_err());
     }
+
     #[test]
     fn a_text_that_is_no_identifier_is_refused_with_the_command_that_lists_them() {
         let refused = [
-            token_id("nope").unwrap_err(),
-            join_token_id("nope").unwrap_err(),
-            session_id("nope").unwrap_err(),
-            alert_id("nope").unwrap_err(),
-            stop_id("nope").unwrap_err(),
+            identifier::<TokenId>(TOKENS)("nope").unwrap_err(),
+            identifier::<JoinTokenId>(JOIN_TOKENS)("nope").unwrap_err(),
+            identifier::<SessionId>(SESSIONS)("nope").unwrap_err(),
+            identifier::<AlertId>(ALERTS)("nope").unwrap_err(),
+            identifier::<StopId>(STOPS)("nope").unwrap_err(),
         ];
         let listings = [
             "tokens`",
@@ -284,6 +265,9 @@ mod tests {
             assert!(refused.contains(listing), "{refused}");
         }
         let whole = "0192f0c1-2b3c-7d4e-8f50-617283940a1b";
-        assert_eq!(token_id(whole).unwrap().to_string(), whole);
+        assert_eq!(
+            identifier::<TokenId>(TOKENS)(whole).unwrap().to_string(),
+            whole
+        );
     }
 }
