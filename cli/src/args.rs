@@ -2,6 +2,7 @@
 
 #[cfg(test)]
 mod documented;
+mod durations;
 mod examples;
 mod identity;
 mod leading;
@@ -9,7 +10,6 @@ mod map;
 mod mission_name;
 mod missions;
 mod safety;
-mod spans;
 mod values;
 mod webhooks;
 
@@ -24,6 +24,8 @@ use clap_complete::Shell;
 use tread_api::ids::{RobotId, SiteId};
 use tread_server::config::SITE_DEFAULT;
 
+pub(crate) use self::durations::format_duration;
+use self::durations::wait_time;
 use self::identity::Showing;
 pub(crate) use self::identity::{
     AuditAction, AuditArguments, AuthorityAction, AuthorityArguments, JoinTokenAction,
@@ -43,8 +45,6 @@ pub(crate) use self::safety::{
     AlertsAction, AlertsArguments, ClearArguments, DriveArguments, GeofenceArguments, LimitsAction,
     LimitsArguments, StopArguments, StopsArguments, WatchArguments,
 };
-pub(crate) use self::spans::spelled;
-use self::spans::wait_time;
 pub(crate) use self::values::{HistoryPlace, shield_negative_points, waypoint};
 pub(crate) use self::webhooks::{NamedWebhook, WebhooksAction, WebhooksArguments};
 use crate::credentials;

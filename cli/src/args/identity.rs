@@ -13,7 +13,7 @@ use tread_api::ids::{JoinTokenId, RobotId, SessionId, Tag, TokenId};
 use tread_api::rights::Right;
 
 use super::Connection;
-use super::spans::within;
+use super::durations::within;
 use super::values::{JOIN_TOKENS, SESSIONS, TOKENS, identifier};
 use crate::client::Trusted;
 

@@ -11,7 +11,7 @@ use tread_api::site::GeoOrigin;
 use tread_api::terrain::TerrainClass;
 
 use super::Connection;
-use super::spans::history_step;
+use super::durations::history_step;
 use super::values::{
     HistoryPlace, area, earth, finite, history_place, moment, point, positive, terrain_class,
 };

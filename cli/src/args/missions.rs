@@ -9,7 +9,7 @@ use tread_api::ids::RobotId;
 use tread_api::mission::{LinkPolicy, MissionState, StartPolicy};
 use tread_api::trajectory::Waypoint;
 
-use super::spans::{silence, wait_time};
+use super::durations::{silence, wait_time};
 use super::values::{finite, mission_state, point, waypoint};
 use super::{Connection, MissionName};
 

@@ -7,7 +7,7 @@ use clap::{Args, Subcommand};
 use tread_api::ids::{AlertCode, AlertId, OwnerId, RobotId, StopId};
 
 use super::Connection;
-use super::spans::{limit_time, look_interval};
+use super::durations::{limit_time, look_interval};
 use super::values::{ALERTS, STOPS, finite, identifier, positive};
 
 #[derive(Debug, Args)]

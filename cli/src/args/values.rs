@@ -12,7 +12,7 @@ use tread_api::site::GeoOrigin;
 use tread_api::terrain::TerrainClass;
 use tread_api::trajectory::Waypoint;
 
-use super::spans::duration;
+use super::durations::duration;
 use crate::client::Area;
 
 /// Parses a finite number; JSON cannot represent any other.

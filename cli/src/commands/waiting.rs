@@ -12,7 +12,7 @@ use tread_api::mission::{Mission, MissionState};
 
 use super::mission_text::{state, summary};
 use super::robots::steps_come;
-use crate::args::spelled;
+use crate::args::format_duration;
 use crate::client::Client;
 use crate::output::{Output, TookTooLong, note};
 
@@ -126,7 +126,7 @@ pub(super) async fn wait(
             let text = format!(
                 "{left} of {} missions have not ended within {}; they continue, see `tread missions`",
                 waited.len(),
-                spelled(allowed)
+                format_duration(allowed)
             );
             return Err(TookTooLong(text).into());
         }

@@ -1,4 +1,4 @@
-//! Time spans of the command line, such as `500ms`, `90s`, `5m` or `2h`: their parsers, each with its
+//! Durations of the command line, such as `500ms`, `90s`, `5m` or `2h`: their parsers, each with its
 //! bounds, and their notation.
 
 use std::ops::RangeInclusive;
@@ -7,17 +7,20 @@ use std::time::Duration;
 use tread_api::mission::{LINK_SILENCE_MAX_S, LINK_SILENCE_MIN_S};
 
 /// Bounds of a time that this program waits, and of the time within which a mission is to start.
-const WAITS: RangeInclusive<Duration> = Duration::from_millis(1)..=Duration::from_hours(366 * 24);
+const WAIT_BOUNDS: RangeInclusive<Duration> =
+    Duration::from_millis(1)..=Duration::from_hours(366 * 24);
 /// Bounds of the period of updates of `tread watch`, which limit the load.
-const LOOKS: RangeInclusive<Duration> = Duration::from_millis(100)..=Duration::from_hours(1);
+const WATCH_PERIOD_BOUNDS: RangeInclusive<Duration> =
+    Duration::from_millis(100)..=Duration::from_hours(1);
 /// Bounds of the duration of an external limit, as the server has them.
-const LIMITS: RangeInclusive<Duration> = Duration::from_millis(1)..=Duration::from_hours(1);
+const LIMIT_BOUNDS: RangeInclusive<Duration> = Duration::from_millis(1)..=Duration::from_hours(1);
 /// Bounds of the time between two rows of a history, as the server has them.
-const STEPS: RangeInclusive<Duration> = Duration::from_mins(1)..=Duration::from_hours(366 * 24);
-/// Units of a time span, with their milliseconds.
+const HISTORY_STEP_BOUNDS: RangeInclusive<Duration> =
+    Duration::from_mins(1)..=Duration::from_hours(366 * 24);
+/// Units of a duration, with their milliseconds.
 const UNITS: [(&str, u128); 3] = [("h", 3_600_000), ("m", 60_000), ("s", 1_000)];
 
-/// Parses a time span, which may be 0.
+/// Parses a duration, which may be 0.
 pub(super) fn duration(text: &str) -> Result<Duration, String> {
     let unit_at = text
         .find(|letter: char| letter.is_ascii_alphabetic())
@@ -38,34 +41,37 @@ pub(super) fn duration(text: &str) -> Result<Duration, String> {
         .map_err(|_| format!("`{text}` is negative or too long"))
 }
 
-/// Parses a time span with bounds.
+/// Parses a duration with bounds.
 pub(super) fn within(text: &str, bounds: &RangeInclusive<Duration>) -> Result<Duration, String> {
-    let span = duration(text)?;
-    if bounds.contains(&span) {
-        return Ok(span);
+    let time = duration(text)?;
+    if bounds.contains(&time) {
+        return Ok(time);
     }
-    let (min, max) = (spelled(*bounds.start()), spelled(*bounds.end()));
+    let (min, max) = (
+        format_duration(*bounds.start()),
+        format_duration(*bounds.end()),
+    );
     Err(format!("give a time from {min} to {max}"))
 }
 
 /// Parses a time that this program waits, or within which a mission is to start.
 pub(super) fn wait_time(text: &str) -> Result<Duration, String> {
-    within(text, &WAITS)
+    within(text, &WAIT_BOUNDS)
 }
 
 /// Parses the update period of `tread watch`.
 pub(super) fn look_interval(text: &str) -> Result<Duration, String> {
-    within(text, &LOOKS)
+    within(text, &WATCH_PERIOD_BOUNDS)
 }
 
 /// Parses the duration of an external limit.
 pub(super) fn limit_time(text: &str) -> Result<Duration, String> {
-    within(text, &LIMITS)
+    within(text, &LIMIT_BOUNDS)
 }
 
 /// Parses the time between two rows of a history.
 pub(super) fn history_step(text: &str) -> Result<Duration, String> {
-    within(text, &STEPS)
+    within(text, &HISTORY_STEP_BOUNDS)
 }
 
 /// Parses the silence of a server or a robot after which a mission is stopped or fails.
@@ -74,10 +80,10 @@ pub(super) fn silence(text: &str) -> Result<Duration, String> {
     within(text, &(min..=max))
 }
 
-/// Returns a time span as the command line takes it, in its largest whole unit, rounded down to a
+/// Returns a duration as the command line takes it, in its largest whole unit, rounded down to a
 /// millisecond.
-pub(crate) fn spelled(span: Duration) -> String {
-    let millis = span.as_millis();
+pub(crate) fn format_duration(time: Duration) -> String {
+    let millis = time.as_millis();
     let is_whole = |of_unit: u128| millis >= of_unit && millis.is_multiple_of(of_unit);
     let unit = UNITS.into_iter().find(|&(_, of_unit)| is_whole(of_unit));
     match unit {
@@ -100,12 +106,12 @@ mod tests {
     }
 
     #[test]
-    fn a_time_is_spelled_as_it_is_given() {
+    fn a_time_is_formatted_as_it_is_given() {
         for text in ["1ms", "1500ms", "1s", "90s", "5m", "61m", "2h", "8784h"] {
-            assert_eq!(spelled(duration(text).unwrap()), text);
+            assert_eq!(format_duration(duration(text).unwrap()), text);
         }
-        assert_eq!(spelled(Duration::ZERO), "0ms");
-        assert_eq!(spelled(duration("60m").unwrap()), "1h");
+        assert_eq!(format_duration(Duration::ZERO), "0ms");
+        assert_eq!(format_duration(duration("60m").unwrap()), "1h");
     }
 
     #[test]
