@@ -12,9 +12,9 @@
 //! The motion of the body gives a lower bound of friction: four wheels of equal load that
 //! accelerate the body with `a_y = vω` and turn it with `I_G ω̇` have a mean square of at least
 //! `a_y² + (2 I_G ω̇/(m √(W² + L²)))²`, so at least one wheel had its root over g as friction
-//! coefficient μ. A hit gives the same for an instant. So an acceleration that lasts rises to that of
+//! coefficient μ. A hit gives the same for an instant. So the sustained acceleration rises to that of
 //! the body at a limited rate and falls with it at once, and the demonstrated acceleration is the
-//! largest one that lasted: hits do not add up. The bound is too high where the heading turns without the
+//! largest sustained one: hits do not add up. The bound is too high where the heading turns without the
 //! course, or where turn rates are noisy. The result only ever slows the robot.
 
 use crate::friction::SLIP_LINEAR;
@@ -23,7 +23,7 @@ use crate::robot::{GRAVITY_M_S2, RobotModel};
 
 /// Time constant of the low-pass filter of turn rates, seconds.
 const SMOOTHING_S: f64 = 0.05;
-/// Shortest time in which the lasting acceleration rises to what the plan needs along the path,
+/// Shortest time in which the sustained acceleration rises to what the plan needs along the path,
 /// seconds. A hit shows for about 0.1 s after the low-pass filter, a bend for longer.
 const SHOWN_S: f64 = 0.3;
 /// Factor by which the lead that linear slip explains is enlarged.
@@ -86,8 +86,8 @@ pub(crate) struct Sliding {
     smoothed: Option<Smoothed>,
     /// `∫ (ω of the wheels − ω of the body) u dt` and `∫ u² dt` over straight driving.
     straight: [f64; 2],
-    /// The acceleration that lasts at present, and the largest one that did.
-    lasting_m_s2: f64,
+    /// The acceleration that is sustained at present, and the largest one that was.
+    sustained_m_s2: f64,
     shown_m_s2: f64,
     left_over_rad: f64,
     slides: bool,
@@ -102,7 +102,7 @@ impl Sliding {
             assumed_mu,
             smoothed: None,
             straight: [0.0; 2],
-            lasting_m_s2: 0.0,
+            sustained_m_s2: 0.0,
             shown_m_s2: 0.0,
             left_over_rad: 0.0,
             slides: false,
@@ -131,8 +131,8 @@ impl Sliding {
         let used_m_s2 = across_m_s2.hypot(yaw_rad_s2 * Self::lever_m(model));
         let enough_m_s2 = RobotModel::longitudinal_traction_m_s2(self.assumed_mu);
         let rise_m_s2 = enough_m_s2 * dt_s / SHOWN_S;
-        self.lasting_m_s2 = used_m_s2.min(self.lasting_m_s2 + rise_m_s2);
-        self.shown_m_s2 = self.shown_m_s2.max(self.lasting_m_s2);
+        self.sustained_m_s2 = used_m_s2.min(self.sustained_m_s2 + rise_m_s2);
+        self.shown_m_s2 = self.shown_m_s2.max(self.sustained_m_s2);
 
         let rim_m_s =
             0.5 * model.wheel_radius_m() * (wheels.left_rad_s.abs() + wheels.right_rad_s.abs());
