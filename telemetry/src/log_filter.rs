@@ -5,17 +5,17 @@ pub const LOG_FILTER_DEFAULT: &str = "info";
 
 /// Levels of libraries that the given filter does not name. zenoh warns of every link that closes,
 /// which our own lines report by robot.
-const OF_LIBRARIES: &str = "zenoh=error,sqlx=warn";
+const LIBRARY_DIRECTIVES: &str = "zenoh=error,sqlx=warn";
 /// Filter in place of an empty one.
-const OF_EMPTY: &str = "error";
+const EMPTY_FILTER: &str = "error";
 
 /// Returns the complete filter for the given one. Directives for zenoh in it, such as `zenoh=warn`,
 /// replace ours.
 pub fn log_filter(given: &str) -> String {
     let given = if given.trim().is_empty() {
-        OF_EMPTY
+        EMPTY_FILTER
     } else {
         given
     };
-    format!("{OF_LIBRARIES},{given}")
+    format!("{LIBRARY_DIRECTIVES},{given}")
 }
