@@ -6,7 +6,7 @@ use super::AppError;
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Precondition {
     /// Any revision.
-    None,
+    Any,
     /// One of these; without any, no revision.
     OneOf(Vec<u64>),
 }
@@ -25,7 +25,7 @@ impl Precondition {
                     expected: expected.clone(),
                 })
             }
-            Self::None | Self::OneOf(_) => Ok(()),
+            Self::Any | Self::OneOf(_) => Ok(()),
         }
     }
 }

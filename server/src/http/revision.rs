@@ -26,11 +26,11 @@ pub(super) fn expected(headers: &HeaderMap) -> Result<Precondition, Problem> {
     // A value that is not text is no entity tag.
     let lines: Vec<&str> = lines.map(|line| line.to_str().unwrap_or("?")).collect();
     if lines.is_empty() {
-        return Ok(Precondition::None);
+        return Ok(Precondition::Any);
     }
     let list = lines.join(",");
     if list.trim() == "*" {
-        return Ok(Precondition::None);
+        return Ok(Precondition::Any);
     }
     let tags = strong_tags(&list).ok_or_else(|| {
         Problem::new(ProblemType::InvalidHeader)
@@ -93,7 +93,7 @@ mod tests {
     fn if_match_is_any_revision_or_a_list_that_is_compared_strongly() {
         let none: &[&'static str] = &[];
         for lines in [none, &["*"], &[" * "]] {
-            assert_eq!(read(lines), Ok(Precondition::None), "{lines:?}");
+            assert_eq!(read(lines), Ok(Precondition::Any), "{lines:?}");
         }
         let cases: [(&[&'static str], &[u64]); 9] = [
             (&["\"3\""], &[3]),
