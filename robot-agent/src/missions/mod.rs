@@ -15,7 +15,7 @@
 mod kept_ends;
 pub mod memory;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 
 use std::collections::{HashSet, VecDeque};
 

@@ -169,12 +169,12 @@ proptest! {
     }
 }
 
-#[test]
-fn the_ends_that_wait_for_the_outbox_are_bounded_and_the_newest_stay() {
-    let report = |mission: u128| MissionReport {
-        mission: id(mission),
+/// The report of a mission that succeeded.
+pub(crate) fn succeeded(mission: MissionId) -> MissionReport {
+    MissionReport {
+        mission,
         revision: 1,
-        plan_hash: PlanHash::from_uuid(Uuid::from_u128(1)),
+        plan_hash: PlanHash::from_uuid(mission.as_uuid()),
         at: jiff::Timestamp::UNIX_EPOCH,
         phase: MissionPhase::Succeeded,
         since: None,
@@ -182,7 +182,12 @@ fn the_ends_that_wait_for_the_outbox_are_bounded_and_the_newest_stay() {
         progress: None,
         quality: None,
         driven: None,
-    };
+    }
+}
+
+#[test]
+fn the_ends_that_wait_for_the_outbox_are_bounded_and_the_newest_stay() {
+    let report = |number| succeeded(id(number));
     let mut slot = MissionSlot::default();
     let count = UNRECORDED_ENDS_MAX as u128 + 3;
     for mission in 0..count {

@@ -8,13 +8,14 @@ use std::path::Path;
 use proptest::prelude::*;
 use tempfile::TempDir;
 use tread_api::ids::MissionId;
-use tread_api::wire::ingest::{MissionPhase, MissionReport, RefusedRecord};
+use tread_api::wire::ingest::RefusedRecord;
 use uuid::Uuid;
 
 use super::frame::Head;
 use super::recovery::Recovery;
 use super::store::{Settled, Store};
 use super::*;
+use crate::missions::tests::succeeded;
 
 #[derive(Debug, Clone)]
 enum Step {
@@ -279,18 +280,7 @@ fn what_an_earlier_agent_settled_in_between_is_neither_lost_nor_sent_again() {
 }
 
 pub(super) fn report(number: u128) -> RecordContent {
-    RecordContent::Mission(MissionReport {
-        mission: MissionId::from_uuid(Uuid::from_u128(number)),
-        revision: 1,
-        plan_hash: tread_api::ids::PlanHash::from_uuid(Uuid::from_u128(number)),
-        at: jiff::Timestamp::UNIX_EPOCH,
-        phase: MissionPhase::Succeeded,
-        since: None,
-        reason: None,
-        progress: None,
-        quality: None,
-        driven: None,
-    })
+    RecordContent::Mission(succeeded(MissionId::from_uuid(Uuid::from_u128(number))))
 }
 
 pub(super) fn open(folder: &Path, number: u128) -> Result<Outbox, OutboxError> {
