@@ -48,6 +48,10 @@ pub const RATE_HZ_RANGE: std::ops::RangeInclusive<f64> = 20.0..=200.0;
 /// Permitted rate of publication, Hz.
 pub const PUBLISH_HZ_RANGE: std::ops::RangeInclusive<f64> = 0.1..=50.0;
 
+/// Key of `robot.toml` with its table, such as `drive.ros2.command.topic`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Key(pub(crate) &'static str);
+
 /// Why a configuration was refused.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {

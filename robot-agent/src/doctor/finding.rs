@@ -4,9 +4,7 @@ use std::fmt::Write as _;
 
 use serde::Serialize;
 
-/// Key of `robot.toml` with its table, such as `drive.ros2.command.topic`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Key(pub(super) &'static str);
+pub(super) use crate::config::Key;
 
 /// A line of `robot.toml`, ready to be copied into its table.
 #[derive(Debug, Clone, PartialEq, Serialize)]

@@ -20,7 +20,7 @@ use file::{
 };
 
 use super::place::is_here;
-use super::{ConfigError, within};
+use super::{ConfigError, Key, within};
 use crate::drive::SILENT_AFTER_MAX;
 use crate::drive::ros2::settings::{
     BusMode, BusSettings, CommandKind, CommandSettings, Effort, ImuSettings, JOINTS_MAX,
@@ -41,7 +41,7 @@ const RATIO_RANGE: std::ops::RangeInclusive<f64> = 1.0e-3..=1.0e4;
 /// Permitted wheel radius and track width of the base, metres.
 const LENGTH_RANGE_M: std::ops::RangeInclusive<f64> = 1.0e-3..=100.0;
 
-fn refused(key: &'static str, problem: impl Into<String>) -> ConfigError {
+fn refused(Key(key): Key, problem: impl Into<String>) -> ConfigError {
     ConfigError::OutOfRange {
         key,
         problem: problem.into(),
@@ -49,7 +49,7 @@ fn refused(key: &'static str, problem: impl Into<String>) -> ConfigError {
 }
 
 fn named(key: &'static str) -> impl FnOnce(NameError) -> ConfigError {
-    move |problem| refused(key, problem.to_string())
+    move |problem| refused(Key(key), problem.to_string())
 }
 
 fn sign(key: &'static str, sign: Option<f64>) -> Result<f64, ConfigError> {
@@ -57,7 +57,7 @@ fn sign(key: &'static str, sign: Option<f64>) -> Result<f64, ConfigError> {
     if (sign.abs() - 1.0).abs() < f64::EPSILON {
         Ok(sign)
     } else {
-        Err(refused(key, "it is 1 or -1"))
+        Err(refused(Key(key), "it is 1 or -1"))
     }
 }
 
@@ -79,7 +79,7 @@ fn place(key: &'static str, [x_m, y_m, heading_rad]: [f64; 3]) -> Result<Pose, C
     if pose.is_finite() {
         Ok(pose)
     } else {
-        Err(refused(key, "a place is finite numbers"))
+        Err(refused(Key(key), "a place is finite numbers"))
     }
 }
 
@@ -170,11 +170,11 @@ impl Ros2File {
         if !is_here(&endpoint) {
             let problem =
                 format!("`{endpoint}` is another machine: ROS keys never leave the robot");
-            return Err(refused("drive.ros2.endpoint", problem));
+            return Err(refused(Key("drive.ros2.endpoint"), problem));
         }
         if self.domain > DOMAIN_MAX {
             return Err(refused(
-                "drive.ros2.domain",
+                Key("drive.ros2.domain"),
                 format!("it is at most {DOMAIN_MAX}"),
             ));
         }
@@ -229,21 +229,21 @@ fn check_whole(settings: &Ros2Settings) -> Result<(), ConfigError> {
     let is_of_wheels = odometry.is_some_and(|odometry| odometry.motion_of == MotionOf::Wheels);
     if settings.joints.is_none() && !is_of_wheels {
         return Err(refused(
-            "drive.ros2",
+            Key("drive.ros2"),
             "the wheels' speeds come from nowhere: give [drive.ros2.joints], or \
              [drive.ros2.odometry] with motion_of = \"wheels\"",
         ));
     }
     if settings.imu.is_none() && odometry.is_none() {
         return Err(refused(
-            "drive.ros2",
+            Key("drive.ros2"),
             "the turn rate comes from nowhere: give [drive.ros2.imu] or [drive.ros2.odometry]",
         ));
     }
     let gives_position = odometry.is_some_and(|odometry| odometry.site_from_odom.is_some());
     if settings.pose.is_some() && gives_position {
         let problem = "[drive.ros2.pose] gives the position: two would quarrel";
-        return Err(refused("drive.ros2.odometry.gives_position", problem));
+        return Err(refused(Key("drive.ros2.odometry.gives_position"), problem));
     }
     Ok(())
 }
@@ -274,7 +274,7 @@ impl OdometryFile {
 impl ImuFile {
     fn checked(&self, topics: &Topics) -> Result<ImuSettings, ConfigError> {
         if !self.yaw_rad.is_finite() {
-            return Err(refused("drive.ros2.imu.yaw_rad", "it must be finite"));
+            return Err(refused(Key("drive.ros2.imu.yaw_rad"), "it must be finite"));
         }
         Ok(ImuSettings {
             topic: topics.name(
@@ -321,16 +321,19 @@ impl JointsFile {
             (EffortFile::None, _) => Effort::None,
             (EffortFile::Torque, None) => Effort::Torque,
             (EffortFile::Torque, Some(_)) => {
-                return Err(refused(key, "it is for effort = \"current\""));
+                return Err(refused(Key(key), "it is for effort = \"current\""));
             }
             (EffortFile::Current, Some(constant)) => Effort::Current(constant),
             (EffortFile::Current, None) => {
-                return Err(refused(key, "effort = \"current\" needs it"));
+                return Err(refused(Key(key), "effort = \"current\" needs it"));
             }
         };
         let side = |key, names: &[String], [turns, pulls]: [(&'static str, Option<f64>); 2]| {
             if names.is_empty() || names.len() > JOINTS_MAX {
-                return Err(refused(key, format!("1 to {JOINTS_MAX} joints are needed")));
+                return Err(refused(
+                    Key(key),
+                    format!("1 to {JOINTS_MAX} joints are needed"),
+                ));
             }
             Ok(SideJoints {
                 names: names.to_vec(),
@@ -340,7 +343,7 @@ impl JointsFile {
         };
         if self.left.iter().any(|name| self.right.contains(name)) {
             return Err(refused(
-                "drive.ros2.joints.right",
+                Key("drive.ros2.joints.right"),
                 "a joint is on both sides",
             ));
         }
@@ -391,7 +394,7 @@ impl CommandFile {
         };
         if kind == CommandKind::JointSpeeds && joints.is_none() {
             let problem = "\"joint_speeds\" needs [drive.ros2.joints]";
-            return Err(refused("drive.ros2.command.kind", problem));
+            return Err(refused(Key("drive.ros2.command.kind"), problem));
         }
         let base_radius_m = self.wheel_radius_m.unwrap_or(model.wheel_radius_m);
         within(

@@ -3,7 +3,7 @@
 use tread_control::geometry::Pose;
 
 use super::file::OutwardFile;
-use super::{TopicSetting, Topics, refused};
+use super::{Key, TopicSetting, Topics, refused};
 use crate::config::ConfigError;
 use crate::drive::ros2::outward::OutwardTopic;
 use crate::drive::ros2::settings::{OutwardSettings, Ros2Settings};
@@ -49,7 +49,10 @@ impl OutwardFile {
         for topic in OutwardTopic::ALL {
             let name = topic.topic(&settings);
             if taken.contains(&name) {
-                return Err(refused(key(topic), format!("`{name}` is used already")));
+                return Err(refused(
+                    Key(key(topic)),
+                    format!("`{name}` is used already"),
+                ));
             }
             taken.push(name);
         }
