@@ -24,7 +24,7 @@
 use super::fast_changes::FastChanges;
 use super::model::{CHANNELS, Input, State};
 use super::parameters::{Number, PARAMETERS, Prior, Robot, SHAPE_MIN, Values, index};
-use super::scale::{Compared, Residual, Scale};
+use super::scale::{Compared, Residual, Scale, unit_stiffness};
 use super::simulation::Simulation;
 use crate::robot::RobotModel;
 
@@ -40,6 +40,13 @@ const SETTLES_BLOCKS: u32 = 6;
 /// Fraction of the variance of ln K that is added to the square of that range. With all of it, noise
 /// of the wheel speeds that the first expansions took for slip is kept as well.
 const DOUBT_SHARE: f64 = 0.5;
+/// Factors of the blocks' weights below which the variance of ln K is computed again, and the number of
+/// blocks in which the first one applies. A new expansion within the linear range of the last one tells
+/// nearly what that told, and the next block adds what is missing; the first expansions can be far from
+/// each other, and what is left of them says little about the truth.
+const KEPT_NEARLY_ALL: f64 = 0.9;
+const KEPT_LITTLE: f64 = 0.01;
+const CONVERGES_BLOCKS: u32 = 15;
 /// Minimum factor by which the last block changed the weights of the others for these to be restored.
 const KEPT_MIN: f64 = 1.0e-3;
 /// Maximum magnitude of the change of ln K at the end of one block.
@@ -181,6 +188,12 @@ impl Hypothesis {
         self.age
     }
 
+    /// Returns the factor by which the last step changed the weights of all blocks.
+    #[cfg(test)]
+    pub(super) fn kept(&self) -> f64 {
+        self.last_kept
+    }
+
     /// Returns the largest of the channels' mean squares of standardised residuals; about 1 if
     /// noise and model are as assumed.
     pub(super) fn worst_square(&self) -> f64 {
@@ -305,6 +318,14 @@ impl Hypothesis {
         for scale in &mut self.scales {
             scale.weaken(keeps);
         }
+        let limit = if self.age <= CONVERGES_BLOCKS {
+            KEPT_NEARLY_ALL
+        } else {
+            KEPT_LITTLE
+        };
+        if keeps < limit {
+            self.scales[self.used].update_variances(prior);
+        }
         self.last_kept = keeps;
         if self.age <= SETTLES_BLOCKS && step[index::STIFFNESS].abs() > LINEAR_RANGE {
             self.fast.forget();
@@ -405,9 +426,7 @@ impl Hypothesis {
         others.ger(-most.recip(), &of_stiffness, &of_stiffness, 1.0);
         let cholesky = (others + segment.information).cholesky()?;
         let values = cholesky.solve(&(wanted + segment.preferred));
-        let mut stiffness = Values::zeros();
-        stiffness[index::STIFFNESS] = 1.0;
-        let of_stiffness = cholesky.solve(&stiffness);
+        let of_stiffness = cholesky.solve(&unit_stiffness());
         // The segment has too few blocks for a scatter of its own: that of the whole ground is
         // used.
         let whole = (ground.information * scale.of_stiffness).dot(&scale.of_stiffness);

@@ -42,9 +42,10 @@ const COMPARED_S: f64 = 0.05;
 const BLOCK_S: f64 = 1.0;
 /// Minimum number of blocks before a hypothesis is discarded or an estimate is returned.
 const BLOCKS_MIN: u32 = 5;
-/// Excess of a hypothesis's cost over the lowest one from which it is discarded.
+/// Excess of a hypothesis's cost over the lowest one from which it is discarded, relative to the mean
+/// square of the best one's residuals.
 const COST_MARGIN: f64 = 60.0;
-/// Excess of cost over the lowest one that reduces a hypothesis's weight to e⁻¹.
+/// Excess of cost over the lowest one that reduces a hypothesis's weight to e⁻¹, relative likewise.
 const COST_SCALE: f64 = 10.0;
 /// Difference of ln K below which two hypotheses are merged.
 const SAME: f64 = 0.03;
@@ -492,10 +493,9 @@ impl Identification {
 
     /// Discards hypotheses that fit worse than the best one, and all but one of those that agree.
     fn discard(&mut self) {
-        let least = self.least_cost();
-        self.hypotheses.retain(|hypothesis| {
-            hypothesis.age() < BLOCKS_MIN || hypothesis.cost() < least + COST_MARGIN
-        });
+        let most = self.least_cost() + COST_MARGIN * self.residual_square();
+        self.hypotheses
+            .retain(|hypothesis| hypothesis.age() < BLOCKS_MIN || hypothesis.cost() < most);
         let mut index = 1;
         while index < self.hypotheses.len() {
             let is_same = |first: &Hypothesis, second: &Hypothesis| {
@@ -524,6 +524,12 @@ impl Identification {
         costs.fold(f64::INFINITY, f64::min)
     }
 
+    /// Returns the largest of the channels' mean squares of the best hypothesis's standardised
+    /// residuals, at least 1. Where no hypothesis fits, a difference of cost says less.
+    fn residual_square(&self) -> f64 {
+        self.best().map_or(1.0, Hypothesis::worst_square).max(1.0)
+    }
+
     fn best(&self) -> Option<&Hypothesis> {
         self.hypotheses
             .iter()
@@ -539,9 +545,10 @@ impl Identification {
             return None;
         }
         let least = self.least_cost();
+        let cost_scale = COST_SCALE * self.residual_square();
         let (mut weights, mut mean, mut square, mut known) = (0.0, 0.0, 0.0, 0.0);
         for hypothesis in &self.hypotheses {
-            let weight = (-(hypothesis.cost() - least) / COST_SCALE).exp();
+            let weight = (-(hypothesis.cost() - least) / cost_scale).exp();
             let value = hypothesis.values()[index::STIFFNESS];
             let (variance, of_prior) = hypothesis.variances(&self.prior);
             weights += weight;

@@ -297,12 +297,18 @@ impl Scale {
     /// None if they cannot be solved.
     pub(super) fn solve(&mut self, prior: &Prior) -> Option<Values> {
         let cholesky = (self.ground.information + prior.information).cholesky()?;
-        let mut stiffness = Values::zeros();
-        stiffness[index::STIFFNESS] = 1.0;
-        self.of_stiffness = cholesky.solve(&stiffness);
+        self.of_stiffness = cholesky.solve(&unit_stiffness());
         let wanted = cholesky.solve(&(self.ground.preferred + prior.information * prior.mean));
         self.ln_stiffness = wanted[index::STIFFNESS];
         Some(wanted)
+    }
+
+    /// Computes the variances of ln K again, from the weights that the blocks have now. They stay if
+    /// the normal equations cannot be solved.
+    pub(super) fn update_variances(&mut self, prior: &Prior) {
+        if let Some(cholesky) = (self.ground.information + prior.information).cholesky() {
+            self.of_stiffness = cholesky.solve(&unit_stiffness());
+        }
     }
 
     /// Returns whether the last solution agrees with that of the longer scale `other`.
@@ -354,4 +360,11 @@ impl Scale {
         self.last = Blocks::none();
         segment
     }
+}
+
+/// Returns the gradient of ln K with respect to the parameters.
+pub(super) fn unit_stiffness() -> Values {
+    let mut stiffness = Values::zeros();
+    stiffness[index::STIFFNESS] = 1.0;
+    stiffness
 }

@@ -292,6 +292,40 @@ fn an_estimate_with_little_information_keeps_it_and_gets_more() {
     assert!(estimates >= 7, "{estimates} of 8");
 }
 
+#[test]
+fn the_variance_of_an_estimate_that_moved_far_is_that_of_the_blocks_that_are_left() {
+    let mut moved = 0;
+    for stiffness in [0.5_f64, 6.0, 18.4] {
+        for seed in 0..4 {
+            let mut random = ChaCha8Rng::seed_from_u64(seed);
+            let mut robot = with_stiffness(stiffness);
+            let mut identification = identification();
+            for tick in 1..=1_500 {
+                let mut sample = with_noise(robot.sample(), &mut random);
+                sample.wheel_torques = None;
+                identification.update(&sample, &SensorNoise::default(), SAMPLE_S);
+                if tick % 100 != 50 || tick < 100 {
+                    continue;
+                }
+                for hypothesis in &identification.hypotheses {
+                    let prior = &identification.prior;
+                    let (reported, _) = hypothesis.variances(prior);
+                    let [left] = hypothesis
+                        .variances_of(prior, &[scale::unit_stiffness()])
+                        .expect("the prior is proper");
+                    let ratio = (reported / left).sqrt();
+                    assert!(
+                        ratio > 0.9,
+                        "K {stiffness}, {tick}: {ratio} of what is left"
+                    );
+                    moved += u32::from(hypothesis.kept() < 0.5);
+                }
+            }
+        }
+    }
+    assert!(moved > 20, "{moved} far moves");
+}
+
 /// Returns the mean of two samples, whose wheel speeds have the errors of a filter or an analogue
 /// sensor: each sample has its own.
 fn noisy(samples: [SensorSample; 2], std_dev_rad_s: f64, random: &mut impl RngExt) -> SensorSample {
@@ -398,4 +432,34 @@ fn a_jolt_does_not_make_it_forget() {
         after.own_ratio
     );
     assert!((after.theta / before.theta).ln().abs() < 0.1);
+}
+
+#[test]
+fn starting_values_compete_for_longer_where_none_of_them_fits() {
+    let remaining = |shaking_m_s2: f64| {
+        let mut random = ChaCha8Rng::seed_from_u64(5);
+        let mut robot = Simulated::new(|values| {
+            values[index::STIFFNESS] = 18.4_f64.ln();
+            values[index::PEAK] = 0.35_f64.ln();
+        });
+        let mut identification = identification();
+        for tick in 0..650 {
+            let mut sample = with_noise(robot.sample(), &mut random);
+            let sign = if tick % 14 < 7 { 1.0 } else { -1.0 };
+            if let Some(acceleration) = &mut sample.acceleration {
+                acceleration.forward_m_s2 += sign * shaking_m_s2;
+                acceleration.left_m_s2 -= sign * shaking_m_s2;
+            }
+            if let Some(torques) = &mut sample.wheel_torques {
+                torques.left_n_m *= 1.0 + 0.3 * sign * shaking_m_s2;
+            }
+            identification.update(&sample, &SensorNoise::default(), SAMPLE_S);
+        }
+        let square = identification.residual_square();
+        (identification.hypotheses.len(), square)
+    };
+    let (count, square) = remaining(0.0);
+    assert!(count == 1 && square < 1.5, "{count} at {square}");
+    let (count, square) = remaining(0.6);
+    assert!(count > 1 && square > 9.0, "{count} at {square}");
 }
