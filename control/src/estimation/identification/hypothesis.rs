@@ -118,6 +118,8 @@ pub(super) struct Hypothesis {
     cost: f64,
     /// Factor by which the step after the last block changed the weights of all blocks.
     last_kept: f64,
+    /// Variance of ln K with the weights that the blocks had before that step.
+    variance_before: f64,
     /// Number of complete blocks.
     age: u32,
     /// Whether the last normal equations could be solved at any time scale: otherwise noise hides
@@ -140,6 +142,7 @@ impl Hypothesis {
             is_determined: true,
             cost: 0.0,
             last_kept: 1.0,
+            variance_before: f64::INFINITY,
             age: 0,
         }
     }
@@ -315,6 +318,7 @@ impl Hypothesis {
         }
         let range_square = LINEAR_RANGE.powi(2) + DOUBT_SHARE * self.scale().nominal_variance();
         let keeps = (-3.0 * step[index::STIFFNESS].powi(2) / range_square).exp();
+        self.variance_before = self.variances(prior).0;
         for scale in &mut self.scales {
             scale.weaken(keeps);
         }
@@ -367,6 +371,13 @@ impl Hypothesis {
     /// least the nominal variance, the diagonal element of C.
     pub(super) fn variances(&self, prior: &Prior) -> (f64, f64) {
         self.scale().variances(prior)
+    }
+
+    /// Returns the variance of ln K before the step at the end of the last block, infinite before the
+    /// first one. A block of new ground makes a step that leaves little of the blocks before, and what
+    /// was known of the old ground is what the new one is noticed by.
+    pub(super) fn variance_before(&self) -> f64 {
+        self.variance_before
     }
 
     /// Returns the robust variances of linear functions of the parameters, given their gradients.
