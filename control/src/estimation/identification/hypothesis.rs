@@ -41,9 +41,9 @@ const SETTLES_BLOCKS: u32 = 6;
 /// of the wheel speeds that the first expansions took for slip is kept as well.
 const DOUBT_SHARE: f64 = 0.5;
 /// Factors of the blocks' weights below which the variance of ln K is computed again, and the number of
-/// blocks in which the first one applies. A new expansion within the linear range of the last one tells
-/// nearly what that told, and the next block adds what is missing; the first expansions can be far from
-/// each other, and what is left of them says little about the truth.
+/// blocks in which the first one applies. A new expansion within the linear range of the last one says
+/// nearly the same, and the next block adds what is missing; the first expansions can be far from each
+/// other, and what is left of them says little about the truth.
 const KEPT_NEARLY_ALL: f64 = 0.9;
 const KEPT_LITTLE: f64 = 0.01;
 const CONVERGES_BLOCKS: u32 = 15;
