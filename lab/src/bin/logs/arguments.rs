@@ -34,7 +34,7 @@ pub(crate) struct Arguments {
     /// The robot's model, and its topics if it names them: a configuration of the agent
     #[arg(long, value_name = "ROBOT.TOML", conflicts_with_all = ["mass_kg", "track_m", "wheelbase_m", "wheel_radius_m", "yaw_inertia_kg_m2"])]
     robot: Option<PathBuf>,
-    /// Mass with payload, kilograms
+    /// Mass of the data sheet, kilograms; a payload of 10 ± 12 % is assumed beside it
     #[arg(long)]
     mass_kg: Option<f64>,
     /// Distance of the centre lines of left and right wheels, metres
