@@ -24,7 +24,7 @@
 use super::fast_changes::FastChanges;
 use super::model::{CHANNELS, Input, State};
 use super::parameters::{Number, PARAMETERS, Prior, Robot, SHAPE_MIN, Values, index};
-use super::scale::{Compared, Residual, Scale, unit_stiffness};
+use super::scale::{Compared, Residual, Scale, ln_stiffness_gradient};
 use super::simulation::Simulation;
 use crate::robot::RobotModel;
 
@@ -119,7 +119,7 @@ pub(super) struct Hypothesis {
     /// Factor by which the step after the last block changed the weights of all blocks.
     last_kept: f64,
     /// Variance of ln K with the weights that the blocks had before that step.
-    variance_before: f64,
+    variance_before_step: f64,
     /// Number of complete blocks.
     age: u32,
     /// Whether the last normal equations could be solved at any time scale: otherwise noise hides
@@ -142,7 +142,7 @@ impl Hypothesis {
             is_determined: true,
             cost: 0.0,
             last_kept: 1.0,
-            variance_before: f64::INFINITY,
+            variance_before_step: f64::INFINITY,
             age: 0,
         }
     }
@@ -318,7 +318,7 @@ impl Hypothesis {
         }
         let range_square = LINEAR_RANGE.powi(2) + DOUBT_SHARE * self.scale().nominal_variance();
         let keeps = (-3.0 * step[index::STIFFNESS].powi(2) / range_square).exp();
-        self.variance_before = self.variances(prior).0;
+        self.variance_before_step = self.variances(prior).0;
         for scale in &mut self.scales {
             scale.weaken(keeps);
         }
@@ -376,8 +376,8 @@ impl Hypothesis {
     /// Returns the variance of ln K before the step at the end of the last block, infinite before the
     /// first one. A block of new ground makes a step that leaves little of the blocks before, and what
     /// was known of the old ground is what the new one is noticed by.
-    pub(super) fn variance_before(&self) -> f64 {
-        self.variance_before
+    pub(super) fn variance_before_step(&self) -> f64 {
+        self.variance_before_step
     }
 
     /// Returns the robust variances of linear functions of the parameters, given their gradients.
@@ -437,7 +437,7 @@ impl Hypothesis {
         others.ger(-most.recip(), &of_stiffness, &of_stiffness, 1.0);
         let cholesky = (others + segment.information).cholesky()?;
         let values = cholesky.solve(&(wanted + segment.preferred));
-        let of_stiffness = cholesky.solve(&unit_stiffness());
+        let of_stiffness = cholesky.solve(&ln_stiffness_gradient());
         // The segment has too few blocks for a scatter of its own: that of the whole ground is
         // used.
         let whole = (ground.information * scale.of_stiffness).dot(&scale.of_stiffness);

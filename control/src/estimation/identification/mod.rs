@@ -464,7 +464,7 @@ impl Identification {
     fn watch_ground(&mut self) {
         let most = CHANGES_STD_DEVS_MAX[usize::from(self.has_torque)];
         let is_known = |best: &&Hypothesis| {
-            let std_dev = best.variance_before().sqrt();
+            let std_dev = best.variance_before_step().sqrt();
             best.age() >= CHANGES_BLOCKS_MIN && std_dev < most
         };
         let known = self.best().filter(is_known);

@@ -297,7 +297,7 @@ impl Scale {
     /// None if they cannot be solved.
     pub(super) fn solve(&mut self, prior: &Prior) -> Option<Values> {
         let cholesky = (self.ground.information + prior.information).cholesky()?;
-        self.of_stiffness = cholesky.solve(&unit_stiffness());
+        self.of_stiffness = cholesky.solve(&ln_stiffness_gradient());
         let wanted = cholesky.solve(&(self.ground.preferred + prior.information * prior.mean));
         self.ln_stiffness = wanted[index::STIFFNESS];
         Some(wanted)
@@ -307,7 +307,7 @@ impl Scale {
     /// the normal equations cannot be solved.
     pub(super) fn update_variances(&mut self, prior: &Prior) {
         if let Some(cholesky) = (self.ground.information + prior.information).cholesky() {
-            self.of_stiffness = cholesky.solve(&unit_stiffness());
+            self.of_stiffness = cholesky.solve(&ln_stiffness_gradient());
         }
     }
 
@@ -363,7 +363,7 @@ impl Scale {
 }
 
 /// Returns the gradient of ln K with respect to the parameters.
-pub(super) fn unit_stiffness() -> Values {
+pub(super) fn ln_stiffness_gradient() -> Values {
     let mut stiffness = Values::zeros();
     stiffness[index::STIFFNESS] = 1.0;
     stiffness

@@ -311,7 +311,7 @@ fn the_variance_of_an_estimate_that_moved_far_is_that_of_the_blocks_that_are_lef
                     let prior = &identification.prior;
                     let (reported, _) = hypothesis.variances(prior);
                     let [left] = hypothesis
-                        .variances_of(prior, &[scale::unit_stiffness()])
+                        .variances_of(prior, &[scale::ln_stiffness_gradient()])
                         .expect("the prior is proper");
                     let ratio = (reported / left).sqrt();
                     assert!(
