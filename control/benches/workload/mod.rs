@@ -125,6 +125,7 @@ impl Robot {
             self.samples[index] = SensorSample {
                 wheel_speeds: state.wheel_speeds,
                 gyro_rad_s: state.yaw_rate_rad_s,
+                is_specific_force: false,
                 acceleration: Some(self.plant.body_acceleration()),
                 body_speed_m_s: self.ticks.is_multiple_of(10).then_some(state.forward_m_s),
                 wheel_torques: Some(self.plant.wheel_torques()),

@@ -202,6 +202,7 @@ mod tests {
                     right_rad_s: rad_s,
                 },
                 gyro_rad_s: turn_rad_s,
+                is_specific_force: false,
                 acceleration: Some(BodyAcceleration {
                     forward_m_s2,
                     left_m_s2: 0.0,

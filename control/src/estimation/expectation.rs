@@ -124,6 +124,7 @@ fn undisturbed(motion: &Motion, model: &RobotModel, theta: f64, has_torque: bool
             forward_m_s2: motion.acceleration_m_s2,
             left_m_s2: motion.speed_m_s * turn_rad_s,
         }),
+        is_specific_force: false,
         body_speed_m_s: None,
         wheel_torques: has_torque.then_some(WheelTorques {
             left_n_m: torque_n_m * (mean_mu - half_mu),

@@ -438,6 +438,10 @@ impl Estimator {
             no_new_information: !self.excitation.is_present(),
             mu_peak_lower_bound: sums.mu_peak(),
             saturation_share: sums.saturation_share(),
+            misfit_ratio: self
+                .identification
+                .as_ref()
+                .and_then(|found| found.misfit_ratio()),
             dropped_samples: self.dropped_samples,
             robot: self.identification.as_ref().and_then(|found| found.robot()),
             payload_change: self.payload.change(),

@@ -164,7 +164,7 @@ pub(super) struct Curvature {
 
 impl TyrePrior {
     /// Returns the prior of unknown tyres: from linear to as curved as a `LuGre` tyre with a peak
-    /// of 0.5, with the relaxation lengths of small tyres, the rotors of geared motors and an
+    /// of 0.5, with the relaxation lengths of small tyres, the wheels and rotors of geared motors and an
     /// eccentric load. The largest friction coefficient is below the peak on wet grass or loose
     /// gravel (0.3), because slip beyond a peak looks like a small stiffness.
     pub fn unknown() -> Self {
@@ -174,8 +174,8 @@ impl TyrePrior {
             mu_max: Some(0.25),
             relaxation_m: 0.04,
             relaxation_std_dev_m: 0.03,
-            rotor_ratio: 0.05,
-            rotor_std_dev_ratio: 0.04,
+            rotor_ratio: 0.1,
+            rotor_std_dev_ratio: 0.08,
             load_difference_std_dev: 0.05,
             unexplained_ratio: 0.1,
             ..Self::default()
@@ -225,8 +225,11 @@ pub struct SensorSample {
     pub wheel_speeds: WheelSpeeds,
     /// Turn rate, radians per second.
     pub gyro_rad_s: f64,
-    /// Acceleration without gravity, body frame, if measured.
+    /// Acceleration along the ground, body frame, if measured.
     pub acceleration: Option<BodyAcceleration>,
+    /// Whether `acceleration` is the specific force, as of a unit without attitude: on a slope it
+    /// contains gravity's reaction. Otherwise it is without gravity.
+    pub is_specific_force: bool,
     /// Forward speed, metres per second; only in samples with a new measurement.
     pub body_speed_m_s: Option<f64>,
     /// Drive torques per side, if the base measures them.
@@ -329,6 +332,9 @@ pub struct Estimate {
     pub radius_difference: ValueWithStdDev,
     /// Fraction of blocks beyond the linear range of slip, among those with sufficient speed.
     pub saturation_share: f64,
+    /// Root mean square of the residuals of the worst channel, in their assumed standard deviations,
+    /// where it is so large that the model does not describe the robot and there is no θ.
+    pub misfit_ratio: Option<f64>,
     /// Number of samples dropped because they were not finite or not plausible.
     pub dropped_samples: u64,
     /// The robot's own parameters; `None` if the model counts as exact, and before enough blocks.

@@ -260,6 +260,7 @@ impl SimRobot {
         let sample = SensorSample {
             wheel_speeds,
             gyro_rad_s,
+            is_specific_force: false,
             acceleration: Some(BodyAcceleration {
                 forward_m_s2: felt.forward_m_s2
                     + self.accelerometer_offset

@@ -21,6 +21,7 @@ use tread_lab::rough::ground_change::{ChangeTrial, run};
 use tread_lab::rough::run::Course;
 use tread_lab::rough::sensors::SensorSpec;
 use tread_lab::rough::spec::{Deviations, MAKES};
+use tread_lab::rough::width::Width;
 
 /// Time of a drive without a change.
 const QUIET: Duration = Duration::from_mins(10);
@@ -91,7 +92,7 @@ struct Changed {
 
 fn trial(seed: u64, has_torque: bool) -> ChangeTrial {
     let mut random = Random::new(seed ^ 0xc4a6);
-    ChangeTrial {
+    let mut trial = ChangeTrial {
         make: random.one_of(&MAKES).unwrap_or(MAKES[0]),
         deviations: Deviations::drawn(&mut random),
         sensors: SensorSpec::drawn(&mut random, has_torque),
@@ -102,7 +103,11 @@ fn trial(seed: u64, has_torque: bool) -> ChangeTrial {
         seed,
         before: QUIET,
         after: None,
-    }
+    };
+    trial.sensors = trial
+        .sensors
+        .with_drawn_inertial_unit(&mut random, Width::default());
+    trial
 }
 
 fn quiet(arguments: &Arguments, has_torque: bool) -> anyhow::Result<Quiet> {

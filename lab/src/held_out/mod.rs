@@ -35,7 +35,7 @@ pub fn drawn(seed: u64, has_torque: bool) -> Trial {
     let mut deviations = Deviations::drawn_wider(&mut random, width);
     // ODE's own contacts: force-dependent slip up to a limit.
     deviations.curve.shape = Shape::Linear;
-    Trial {
+    let mut trial = Trial {
         make,
         deviations,
         sensors: SensorSpec::drawn_wider(&mut random, has_torque, width),
@@ -45,7 +45,9 @@ pub fn drawn(seed: u64, has_torque: bool) -> Trial {
         seed,
         prior: EstimatorPrior::default(),
         is_bounded: false,
-    }
+    };
+    trial.sensors = trial.sensors.with_drawn_inertial_unit(&mut random, width);
+    trial
 }
 
 /// Runs a drive on these contacts, with so many integration steps in a sample.

@@ -12,7 +12,7 @@ use tread_control::robot::{GRAVITY_M_S2, RobotModel};
 
 use crate::rough::drive::SimulatedPlant;
 use crate::rough::means::Means;
-use crate::rough::plant::{State, Truth};
+use crate::rough::plant::{State, Truth, gravity_m_s2};
 use crate::rough::sensors::SAMPLE_PERIOD;
 use crate::rough::spec::Deviations;
 
@@ -269,6 +269,7 @@ pub struct OdePlant {
     from: BufReader<ChildStdout>,
     steps_per_sample: u32,
     torque_scale: [f64; 2],
+    slope_rad: [f64; 2],
     truth: Truth,
     slip_over_peak: f64,
     failure: Option<String>,
@@ -293,6 +294,7 @@ impl OdePlant {
             from: BufReader::new(from),
             steps_per_sample: robot.steps_per_sample,
             torque_scale: robot.deviations.torque_scale,
+            slope_rad: robot.deviations.slope_rad,
             truth: Truth::default(),
             slip_over_peak: 0.0,
             failure: None,
@@ -349,6 +351,7 @@ impl OdePlant {
             ..,
         ] = numbers;
         let [.., tilt_rad, slip_over_peak, _, _, _, _] = numbers;
+        let [gravity_forward, gravity_left, _] = gravity_m_s2(self.slope_rad, heading_rad);
         self.truth = Truth {
             state: State {
                 pose: Pose {
@@ -363,6 +366,7 @@ impl OdePlant {
             turned_rad: [numbers[13], numbers[14]],
             torque_scale: self.torque_scale,
             tilt_rad,
+            gravity_m_s2: [gravity_forward, gravity_left],
         };
         self.slip_over_peak = slip_over_peak;
         Ok(Means {

@@ -44,10 +44,16 @@ pub fn reasons(motion: &Motion, outcome: &Outcome) -> Vec<Reason> {
         reasons = of_motion(motion, outcome);
     }
     if reasons.is_empty() {
-        let without = if motion.has_torque {
-            ""
+        let (without, help) = if motion.has_torque {
+            (
+                "",
+                "drive figure-8s of 2 to 4 m for a minute, at changing speed; record odometry over ground",
+            )
         } else {
-            "without measured torque "
+            (
+                "without measured torque ",
+                "drive figure-8s of 2 to 4 m for a minute, at changing speed; record the joints' torque and give `--effort torque`, or record odometry over ground",
+            )
         };
         let on_the_way = outcome
             .std_dev_ratios
@@ -59,7 +65,7 @@ pub fn reasons(motion: &Motion, outcome: &Outcome) -> Vec<Reason> {
             reason: format!(
                 "{without}the motion leaves a standard deviation of θ above half of θ{on_the_way}"
             ),
-            help: "drive figure-8s of 2 to 4 m for a minute, at changing speed; record the joints' torque, or odometry over ground",
+            help,
         });
     }
     reasons
@@ -111,6 +117,15 @@ fn of_recording(motion: &Motion, outcome: &Outcome) -> Vec<Reason> {
             code: "implausible",
             reason: format!("{} of the samples are impossible for this robot", percent(dropped)),
             help: "check the joints' unit and gear ratio, the wheel radius, and the limits of the model",
+        });
+    }
+    if let Some(ratio) = outcome.estimate.misfit_ratio {
+        reasons.push(Reason {
+            code: "misfit",
+            reason: format!(
+                "the equations of motion do not describe what the sensors measure: residuals are {ratio:.0} times their expected size"
+            ),
+            help: "check mass, wheel radius and track width, the joints' signs, the inertial unit's mounting and orientation, and that all sensors have one clock",
         });
     }
     reasons
@@ -242,6 +257,37 @@ mod tests {
             found[0].reason.contains("50 %") && found[0].reason.contains("gyro"),
             "{found:?}"
         );
+    }
+
+    #[test]
+    fn a_model_that_does_not_fit_is_the_reason_and_not_the_motion() {
+        let misfit = Outcome {
+            estimate: Estimate {
+                misfit_ratio: Some(7.2),
+                saturation_share: 0.95,
+                ..Estimate::default()
+            },
+            ..outcome()
+        };
+        let found = reasons(&excited(), &misfit);
+        assert_eq!(found.len(), 1, "{found:?}");
+        assert!(
+            found[0].code == "misfit" && found[0].reason.contains("7 times"),
+            "{found:?}"
+        );
+    }
+
+    #[test]
+    fn torque_is_asked_for_only_where_there_is_none() {
+        let help = |has_torque: bool| {
+            let motion = Motion {
+                has_torque,
+                ..excited()
+            };
+            reasons(&motion, &outcome())[0].help
+        };
+        assert!(help(false).contains("--effort torque"));
+        assert!(!help(true).contains("torque"));
     }
 
     #[test]

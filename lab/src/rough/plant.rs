@@ -69,6 +69,26 @@ pub struct Truth {
     pub torque_scale: [f64; 2],
     /// Angle between the robot's vertical axis and the vertical, radians.
     pub tilt_rad: f64,
+    /// Gravitational acceleration along the robot's axes `[forward, left]`.
+    pub gravity_m_s2: [f64; 2],
+}
+
+/// Returns the gravitational acceleration on a plane of these slopes in the frame of a robot with a
+/// heading: forward, left, into the ground.
+pub fn gravity_m_s2(slope_rad: [f64; 2], heading_rad: f64) -> [f64; 3] {
+    let [x_rad, y_rad] = slope_rad;
+    let (rise_x, rise_y) = (x_rad.tan(), y_rad.tan());
+    let upright = (1.0 + rise_x.powi(2) + rise_y.powi(2)).sqrt().recip();
+    let (sin, cos) = heading_rad.sin_cos();
+    let down = [
+        -rise_x * upright * GRAVITY_M_S2,
+        -rise_y * upright * GRAVITY_M_S2,
+    ];
+    [
+        cos * down[0] + sin * down[1],
+        -sin * down[0] + cos * down[1],
+        upright * GRAVITY_M_S2,
+    ]
 }
 
 /// Drive of the wheels in one integration step; values are `[left, right]`.
@@ -196,6 +216,10 @@ impl Plant {
             turned_rad: self.turned_rad,
             torque_scale: self.spec.torque_scale,
             tilt_rad: self.tilt_rad(),
+            gravity_m_s2: {
+                let [forward, left, _] = self.gravity_m_s2();
+                [forward, left]
+            },
         }
     }
 
@@ -230,19 +254,7 @@ impl Plant {
 
     /// Returns the gravitational acceleration in the body frame: forward, left, into the ground.
     fn gravity_m_s2(&self) -> [f64; 3] {
-        let [x_rad, y_rad] = self.spec.slope_rad;
-        let (rise_x, rise_y) = (x_rad.tan(), y_rad.tan());
-        let upright = (1.0 + rise_x.powi(2) + rise_y.powi(2)).sqrt().recip();
-        let (sin, cos) = self.pose.heading_rad.sin_cos();
-        let down = [
-            -rise_x * upright * GRAVITY_M_S2,
-            -rise_y * upright * GRAVITY_M_S2,
-        ];
-        [
-            cos * down[0] + sin * down[1],
-            -sin * down[0] + cos * down[1],
-            upright * GRAVITY_M_S2,
-        ]
+        gravity_m_s2(self.spec.slope_rad, self.pose.heading_rad)
     }
 
     /// Moves the wheel loads towards equilibrium with the moments of the contact forces, by the

@@ -26,6 +26,12 @@ pub const POSITION_WANDERS_S: f64 = 20.0;
 const PERIOD_MIDDLE_S: Middle = Middle(0.1);
 /// Geometric middle of the shortest and the longest delay of positions, in seconds.
 const DELAY_MIDDLE_S: Middle = Middle(0.0447);
+/// Maximum delay of the fast sensors, in seconds.
+pub const DELAY_MAX_S: f64 = 0.08;
+/// Range of the drawn delays of inertial unit and wheels, and the standard deviation of the
+/// accelerometer's delay relative to the gyro's, in seconds.
+const FAST_DELAY_S: std::ops::Range<f64> = 0.0..0.015;
+const ACCELEROMETER_LAGS_S: f64 = 0.002;
 /// Error of an outlier, in metres.
 const OUTLIER_M: f64 = 1.0;
 
@@ -47,6 +53,14 @@ pub struct SensorSpec {
     pub acceleration_m_s2: f64,
     /// Offset of the accelerometer, metres per second squared.
     pub acceleration_offset_m_s2: f64,
+    /// Whether the inertial unit has an attitude, by which gravity is removed from the acceleration.
+    pub has_attitude: bool,
+    /// Delay of the gyro that its time stamps do not include, seconds, from 0 to [`DELAY_MAX_S`].
+    pub gyro_delay_s: f64,
+    /// The same of the accelerometer.
+    pub acceleration_delay_s: f64,
+    /// The same of wheel speeds and torques.
+    pub wheel_delay_s: f64,
     /// White noise of the torque of one side, as a friction coefficient.
     pub torque_mu: f64,
     /// Whether torque is measured.
@@ -81,6 +95,10 @@ impl SensorSpec {
             gyro_walk_rad_s: 1.0e-4,
             acceleration_m_s2: 0.05,
             acceleration_offset_m_s2: 0.02,
+            has_attitude: true,
+            gyro_delay_s: 0.0,
+            acceleration_delay_s: 0.0,
+            wheel_delay_s: 0.0,
             torque_mu: 0.01,
             has_torque,
             body_speed_m_s: 0.02,
@@ -130,6 +148,75 @@ impl SensorSpec {
     }
 }
 
+impl SensorSpec {
+    /// Draws whether the inertial unit has an attitude, and delays of unit and wheels that their time
+    /// stamps do not include.
+    ///
+    /// Low-pass filters of inertial units delay gyro and accelerometer about equally, by 1 to 14 ms
+    /// (MPU-6050 register map, rev. 4.2, register 26); speeds from encoder counts are late by half of
+    /// their period, and buses and time stamps of reception add some milliseconds to both.
+    #[must_use]
+    pub fn with_drawn_inertial_unit(self, random: &mut Random, width: Width) -> Self {
+        let mut delay_s = || random.uniform(width.range(FAST_DELAY_S)).max(0.0);
+        let (gyro_delay_s, wheel_delay_s) = (delay_s(), delay_s());
+        let lag_s = random.normal(width.std_dev(ACCELEROMETER_LAGS_S));
+        Self {
+            gyro_delay_s,
+            acceleration_delay_s: (gyro_delay_s + lag_s).max(0.0),
+            wheel_delay_s,
+            has_attitude: random.chance(0.5),
+            ..self
+        }
+    }
+}
+
+/// True values of the fast sensors at the last samples, the newest first.
+#[derive(Debug, Clone, Default)]
+struct FastHistory {
+    samples: VecDeque<FastValues>,
+}
+
+/// What the fast sensors measure.
+#[derive(Debug, Clone, Copy)]
+struct FastValues {
+    yaw_rate_rad_s: f64,
+    acceleration_m_s2: [f64; 2],
+    turned_rad: [f64; 2],
+    torques_n_m: [f64; 2],
+}
+
+impl FastHistory {
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "a small whole number"
+    )]
+    fn add(&mut self, values: FastValues) {
+        let kept = (DELAY_MAX_S / SAMPLE_PERIOD.as_secs_f64()).ceil() as usize + 1;
+        self.samples.truncate(kept);
+        self.samples.push_front(values);
+    }
+
+    /// Returns a value of `delay_s` seconds ago, interpolated between samples; before the first sample
+    /// that of the first one.
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "a small number, not below 0"
+    )]
+    fn late<const N: usize>(&self, delay_s: f64, of: impl Fn(&FastValues) -> [f64; N]) -> [f64; N] {
+        let periods = delay_s / SAMPLE_PERIOD.as_secs_f64();
+        let whole = periods.floor();
+        let at = |index: usize| {
+            let sample = self.samples.get(index).or_else(|| self.samples.back());
+            sample.map_or([0.0; N], &of)
+        };
+        let (newer, older) = (at(whole as usize), at(whole as usize + 1));
+        let share = periods - whole;
+        std::array::from_fn(|place| newer[place] + share * (older[place] - newer[place]))
+    }
+}
+
 /// Simulated sensors of one robot.
 #[derive(Debug, Clone)]
 pub struct Sensors {
@@ -140,6 +227,7 @@ pub struct Sensors {
     wander_m: [f64; 2],
     counts: [f64; 2],
     torque_noise_n_m: f64,
+    fast: FastHistory,
     next_speed_at: Duration,
     next_position_at: Duration,
     late: VecDeque<(Duration, SensorSample)>,
@@ -161,6 +249,7 @@ impl Sensors {
             ],
             counts: [0.0; 2],
             torque_noise_n_m: spec.torque_mu * load_n * model.wheel_radius_m(),
+            fast: FastHistory::default(),
             next_speed_at: Duration::ZERO,
             next_position_at: Duration::ZERO,
             late: VecDeque::new(),
@@ -220,27 +309,45 @@ impl Sensors {
             self.next_speed_at = at + spec.body_speed_period;
             state.forward_m_s + self.random.normal(spec.body_speed_m_s)
         });
+        let kept = if spec.has_attitude {
+            [0.0; 2]
+        } else {
+            truth.gravity_m_s2
+        };
+        self.fast.add(FastValues {
+            yaw_rate_rad_s: means.yaw_rate_rad_s,
+            acceleration_m_s2: [
+                means.acceleration.forward_m_s2 - kept[0],
+                means.acceleration.left_m_s2 - kept[1],
+            ],
+            turned_rad: truth.turned_rad,
+            torques_n_m: [means.torques.left_n_m, means.torques.right_n_m],
+        });
+        let fast = &self.fast;
+        let [yaw_rate_rad_s] = fast.late(spec.gyro_delay_s, |values| [values.yaw_rate_rad_s]);
+        let acceleration = fast.late(spec.acceleration_delay_s, |values| values.acceleration_m_s2);
+        let turned_rad = fast.late(spec.wheel_delay_s, |values| values.turned_rad);
+        let torques = fast.late(spec.wheel_delay_s, |values| values.torques_n_m);
         let scale = truth.torque_scale;
         let noise_n_m = self.torque_noise_n_m;
         let wheel_torques = spec.has_torque.then(|| WheelTorques {
-            left_n_m: scale[0] * means.torques.left_n_m + self.random.normal(noise_n_m),
-            right_n_m: scale[1] * means.torques.right_n_m + self.random.normal(noise_n_m),
+            left_n_m: scale[0] * torques[0] + self.random.normal(noise_n_m),
+            right_n_m: scale[1] * torques[1] + self.random.normal(noise_n_m),
         });
         let offset = self.acceleration_offset;
         to.push(SensorSample {
             at,
             yaw_rate_rad_s: Some(
-                means.yaw_rate_rad_s + self.gyro_offset_rad_s + self.random.normal(spec.gyro_rad_s),
+                yaw_rate_rad_s + self.gyro_offset_rad_s + self.random.normal(spec.gyro_rad_s),
             ),
             acceleration: Some(BodyAcceleration {
-                forward_m_s2: means.acceleration.forward_m_s2
+                forward_m_s2: acceleration[0]
                     + offset[0]
                     + self.random.normal(spec.acceleration_m_s2),
-                left_m_s2: means.acceleration.left_m_s2
-                    + offset[1]
-                    + self.random.normal(spec.acceleration_m_s2),
+                left_m_s2: acceleration[1] + offset[1] + self.random.normal(spec.acceleration_m_s2),
             }),
-            wheel_speeds: Some(self.wheels(truth.turned_rad)),
+            is_specific_force: !spec.has_attitude,
+            wheel_speeds: Some(self.wheels(turned_rad)),
             wheel_torques,
             body_speed_m_s,
             tilt_rad: Some(truth.tilt_rad),

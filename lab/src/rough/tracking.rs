@@ -233,6 +233,7 @@ impl Base {
                     turned_rad: *turned_rad,
                     torque_scale: [1.0; 2],
                     tilt_rad: 0.0,
+                    gravity_m_s2: [0.0; 2],
                 }
             }
         }
@@ -264,6 +265,7 @@ impl Known {
                     wheel_speeds,
                     gyro_rad_s,
                     acceleration: sample.acceleration,
+                    is_specific_force: sample.is_specific_force,
                     body_speed_m_s: sample.body_speed_m_s,
                     wheel_torques: sample.wheel_torques,
                 };

@@ -28,8 +28,11 @@ pub struct SensorSample {
     pub at: Duration,
     /// Yaw rate of the gyro, rad/s, positive to the left.
     pub yaw_rate_rad_s: Option<f64>,
-    /// Acceleration without gravity, in the robot frame.
+    /// Acceleration along the ground, in the robot frame.
     pub acceleration: Option<BodyAcceleration>,
+    /// Whether `acceleration` is the specific force, as of a unit without attitude; otherwise it is
+    /// without gravity.
+    pub is_specific_force: bool,
     /// Wheel speeds as measured, never as commanded.
     pub wheel_speeds: Option<WheelSpeeds>,
     /// Drive torques of the wheels.
@@ -50,6 +53,7 @@ pub(crate) fn motion_of(sample: &SensorSample) -> Option<estimation::SensorSampl
         wheel_speeds: sample.wheel_speeds.filter(|speeds| speeds.is_finite())?,
         gyro_rad_s: sample.yaw_rate_rad_s.filter(|rate| rate.is_finite())?,
         acceleration: sample.acceleration,
+        is_specific_force: sample.is_specific_force,
         body_speed_m_s: sample.body_speed_m_s,
         wheel_torques: sample.wheel_torques,
     })

@@ -46,6 +46,7 @@ pub(super) fn sample_message(sample: &SensorSample) -> LoopSample {
         at_ns: nanoseconds(sample.at),
         present: bit(sample_bits::YAW_RATE, sample.yaw_rate_rad_s.is_some())
             | bit(sample_bits::ACCELERATION, acceleration.is_some())
+            | bit(sample_bits::SPECIFIC_FORCE, sample.is_specific_force)
             | bit(sample_bits::WHEELS, wheels.is_some())
             | bit(sample_bits::TORQUES, torques.is_some())
             | bit(sample_bits::BODY_SPEED, sample.body_speed_m_s.is_some())
@@ -79,6 +80,7 @@ fn sample_of(message: &LoopSample) -> SensorSample {
             forward_m_s2: message.forward_m_s2,
             left_m_s2: message.left_m_s2,
         }),
+        is_specific_force: has(sample_bits::SPECIFIC_FORCE),
         wheel_speeds: has(sample_bits::WHEELS).then_some(WheelSpeeds {
             left_rad_s: message.wheel_left_rad_s,
             right_rad_s: message.wheel_right_rad_s,
@@ -304,6 +306,7 @@ mod tests {
     prop_compose! {
         fn sample()(
             at_ns in any::<u64>(),
+            is_specific_force in any::<bool>(),
             singles in prop::collection::vec(prop::option::of(any::<f64>()), 3),
             pairs in prop::collection::vec(pair(), 4),
             position in prop::option::of((any::<f64>(), any::<f64>(), any::<f64>())),
@@ -313,6 +316,7 @@ mod tests {
                 yaw_rate_rad_s: singles[0],
                 body_speed_m_s: singles[1],
                 tilt_rad: singles[2],
+                is_specific_force,
                 acceleration: pairs[0].map(|(forward_m_s2, left_m_s2)| BodyAcceleration { forward_m_s2, left_m_s2 }),
                 wheel_speeds: pairs[1].map(|(left_rad_s, right_rad_s)| WheelSpeeds { left_rad_s, right_rad_s }),
                 wheel_torques: pairs[2].map(|(left_n_m, right_n_m)| WheelTorques { left_n_m, right_n_m }),

@@ -9,6 +9,7 @@ use tread_api::robot::RobotMode;
 use tread_control::geometry::Pose as PlanePose;
 use tread_control::geometry::Twist as PlaneTwist;
 use tread_control::plan::Plan;
+use tread_control::robot::GRAVITY_M_S2;
 use tread_ros2::cdr::{Sequence, encode};
 use tread_ros2::messages::{
     DiagnosticArray, DiagnosticStatus, Header, Imu, JointState, KeyValue, Level, Odometry, Path,
@@ -129,7 +130,11 @@ pub(super) fn imu(sample: &SensorSample, wall_ns: i64, into: &mut Vec<u8>) -> bo
         linear_acceleration: Vector3 {
             x: acceleration.forward_m_s2,
             y: acceleration.left_m_s2,
-            z: 0.0,
+            z: if sample.is_specific_force {
+                GRAVITY_M_S2
+            } else {
+                0.0
+            },
         },
         linear_acceleration_covariance: unmeasured(sample.acceleration.is_none()),
         ..Imu::default()

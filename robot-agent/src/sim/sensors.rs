@@ -146,6 +146,7 @@ impl Sensors {
                     + self.bias.left_m_s2
                     + self.noise(spec.acceleration_m_s2),
             }),
+            is_specific_force: false,
             wheel_speeds: Some(WheelSpeeds {
                 left_rad_s: means.wheel_speeds.left_rad_s + self.noise(wheel_noise),
                 right_rad_s: means.wheel_speeds.right_rad_s + self.noise(wheel_noise),

@@ -31,6 +31,8 @@ pub mod sample_bits {
     pub const POSITION: u32 = 1 << 6;
     /// How good the fix is.
     pub const POSITION_NOISE: u32 = 1 << 7;
+    /// The accelerations are the specific force; without this bit they are without gravity.
+    pub const SPECIFIC_FORCE: u32 = 1 << 8;
 }
 
 /// What is there, or true, of a [`LoopTick`].

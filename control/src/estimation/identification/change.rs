@@ -8,9 +8,10 @@
 //! Abrupt Changes, 1993, ch. 2). An error of the model or a sensor makes both residuals large, and
 //! their difference small.
 
+use super::COMPARED_S;
 use super::model::{CHANNELS, Input, State};
-use super::parameters::{PARAMETERS, Robot, Values, index};
-use super::simulation::Simulation;
+use super::parameters::{MODELLED, Robot, Values, index};
+use super::simulation::{DELAYED, Simulation, delays_s};
 use crate::robot::RobotModel;
 
 /// Differences of ln K of the other grounds.
@@ -80,6 +81,8 @@ pub(super) struct ChangeMonitor {
     slow: u32,
     /// Whether torques were compared.
     has_torque: bool,
+    /// Delays of the first channels, seconds.
+    delays_s: [f64; DELAYED],
 }
 
 impl Default for ChangeMonitor {
@@ -89,6 +92,7 @@ impl Default for ChangeMonitor {
             ignored: STARTS_FOR,
             slow: 0,
             has_torque: false,
+            delays_s: [0.0; DELAYED],
         }
     }
 }
@@ -98,10 +102,11 @@ impl ChangeMonitor {
     /// with the robots in the motion `state`.
     pub(super) fn follow(&mut self, values: &Values, model: &RobotModel, state: State<f64>) {
         let robot = |offset: f64| {
-            let mut values: [f64; PARAMETERS] = (*values).into();
+            let mut values = *values;
             values[index::STIFFNESS] += offset;
-            Robot::new(&values, model)
+            robot_of(&values, model)
         };
+        self.delays_s = delays_s(values);
         if let Some(others) = &mut self.others {
             for (other, offset) in others.iter_mut().zip(OFFSETS) {
                 other.robot = robot(offset);
@@ -143,14 +148,13 @@ impl ChangeMonitor {
         false
     }
 
-    /// Adds one comparison of the means since the last call; `ratio` multiplies the outputs of the
-    /// other grounds. While the robot does not roll there is no evidence.
+    /// Adds one comparison of the means over `compared_s` seconds, since the last call. While the robot does not roll there is no evidence.
     ///
     /// Returns whether the ground has changed; after an alarm the detector is reset.
     pub(super) fn compare(
         &mut self,
         explained: &[Option<Explained>; COMPARED],
-        ratio: f64,
+        compared_s: f64,
         motion: Motion,
     ) -> bool {
         let counts = self.note(motion);
@@ -158,7 +162,10 @@ impl ChangeMonitor {
         let threshold = THRESHOLDS[usize::from(self.has_torque)];
         let mut has_changed = false;
         for other in self.others.iter_mut().flatten() {
-            let outputs = other.model.take_mean(ratio);
+            let outputs = other
+                .model
+                .take_outputs(COMPARED_S / compared_s, compared_s);
+            let outputs = outputs.measured(self.delays_s);
             if !counts {
                 continue;
             }
@@ -178,6 +185,14 @@ impl ChangeMonitor {
         }
         has_changed
     }
+}
+
+/// Returns the robot of these parameters, in the units of [`index`].
+fn robot_of(values: &Values, model: &RobotModel) -> Robot<f64> {
+    Robot::new(
+        &std::array::from_fn::<_, MODELLED, _>(|place| values[place]),
+        model,
+    )
 }
 
 #[cfg(test)]
@@ -229,10 +244,10 @@ mod tests {
         /// Drives one comparison on ground of a stiffness, with `scaled` torques. Returns whether the
         /// monitor raises an alarm.
         fn compare(&mut self, stiffness: f64, scaled: f64, motion: Motion) -> bool {
-            let mut values: [f64; PARAMETERS] = self.values.into();
-            let believed = Robot::new(&values, &self.model);
+            let mut values = self.values;
+            let believed = robot_of(&values, &self.model);
             values[index::STIFFNESS] = stiffness.ln();
-            let robot = Robot::new(&values, &self.model);
+            let robot = robot_of(&values, &self.model);
             let share = f64::from(SAMPLES).recip();
             for _ in 0..SAMPLES {
                 self.time_s += SAMPLE_S;
@@ -243,14 +258,15 @@ mod tests {
                     wheels_rad_s2: [rise(0.0), rise(2.0)],
                     heading_rad: 0.0,
                     acceleration_m_s2: [0.0; 2],
+                    is_specific_force: false,
                     time_s: SAMPLE_S,
                 };
                 self.robot.advance(&robot, &input, share);
                 self.believed.advance(&believed, &input, share);
                 self.monitor.advance(&input, share);
             }
-            let truth = self.robot.take_mean(1.0);
-            let outputs = self.believed.take_mean(1.0);
+            let truth = self.robot.take_outputs(1.0, COMPARED_S).means;
+            let outputs = self.believed.take_outputs(1.0, COMPARED_S).means;
             let explained = std::array::from_fn(|channel| {
                 let of_12 = (0..12).map(|_| self.random.random::<f64>() - 0.5);
                 let factor = if channel > 2 { scaled } else { 1.0 };
@@ -260,7 +276,7 @@ mod tests {
                     std_dev: STD_DEVS[channel],
                 })
             });
-            self.monitor.compare(&explained, 1.0, motion)
+            self.monitor.compare(&explained, COMPARED_S, motion)
         }
     }
 

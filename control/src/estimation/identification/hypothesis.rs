@@ -25,7 +25,7 @@ use super::fast_changes::FastChanges;
 use super::model::{CHANNELS, Input, State};
 use super::parameters::{Number, PARAMETERS, Prior, Robot, SHAPE_MIN, Values, index};
 use super::scale::{Compared, Residual, Scale, ln_stiffness_gradient};
-use super::simulation::Simulation;
+use super::simulation::{Predicted, Simulation, delays_s};
 use crate::robot::RobotModel;
 
 /// Numbers of comparisons in the means of the time scales: 0.05, 0.2 and 0.5 s.
@@ -73,20 +73,16 @@ pub(super) struct OfSegment {
 
 /// Output of one channel, and that of the model with noise added to the wheel speeds.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Predicted {
-    output: Number,
-    perturbed: Option<Number>,
+pub(super) struct ChannelOutput {
+    output: Predicted,
+    perturbed: Option<Predicted>,
 }
 
-impl Predicted {
-    /// Returns the output without derivatives.
+impl ChannelOutput {
+    /// Returns the output without slopes.
     pub(super) fn value(&self) -> f64 {
         self.output.value
     }
-}
-
-fn slopes(output: &Number) -> Values {
-    Values::from_row_slice(&output.derivatives)
 }
 
 /// A measurement of one channel.
@@ -212,7 +208,7 @@ impl Hypothesis {
         input: &Input,
         perturbed: Option<&Input>,
         share: f64,
-    ) -> Predicted {
+    ) -> ChannelOutput {
         let values = std::array::from_fn(|place| Number::parameter(self.values[place], place));
         let robot = Robot::new(&values, model);
         let (current, own) = (&self.model, &mut self.perturbed);
@@ -222,32 +218,39 @@ impl Hypothesis {
         }
         let perturbed = perturbed.map(|input| {
             let own = own.get_or_insert_with(|| current.clone());
-            own.advance(&robot, input, share)
+            Predicted::of(&own.advance(&robot, input, share))
         });
-        Predicted {
-            output: self.model.advance(&robot, input, share),
+        ChannelOutput {
+            output: Predicted::of(&self.model.advance(&robot, input, share)),
             perturbed,
         }
     }
 
-    /// Returns the mean outputs since the last call, multiplied by `ratio`, in the order of the
-    /// channels without the body speed, and begins a new mean.
-    pub(super) fn take_mean(&mut self, ratio: f64) -> [Predicted; CHANNELS - 1] {
-        let outputs = self.model.take_mean(ratio);
-        let perturbed = self.perturbed.as_mut().map(|own| own.take_mean(ratio));
-        std::array::from_fn(|channel| Predicted {
+    /// Returns the mean outputs since the last call, `compared_s` seconds ago, in the order of the
+    /// channels without the body speed, and begins a new mean. `ratio` multiplies them.
+    pub(super) fn take_outputs(
+        &mut self,
+        ratio: f64,
+        compared_s: f64,
+    ) -> [ChannelOutput; CHANNELS - 1] {
+        let delays_s = delays_s(&self.values);
+        let take =
+            |own: &mut Simulation<Number>| own.take_outputs(ratio, compared_s).measured(delays_s);
+        let outputs = take(&mut self.model);
+        let perturbed = self.perturbed.as_mut().map(take);
+        std::array::from_fn(|channel| ChannelOutput {
             output: outputs[channel],
             perturbed: perturbed.map(|perturbed| perturbed[channel]),
         })
     }
 
     /// Adds the residual of an output to the open block. A residual that is not finite is ignored.
-    pub(super) fn compare(&mut self, predicted: &Predicted, measured: Measured) {
-        let Predicted { output, perturbed } = predicted;
+    pub(super) fn compare(&mut self, predicted: &ChannelOutput, measured: Measured) {
+        let ChannelOutput { output, perturbed } = predicted;
         let (channel, std_dev) = (measured.channel, measured.std_dev);
         let residual = Residual {
             value: measured.value - output.value,
-            slopes: slopes(output),
+            slopes: output.slopes,
         };
         let square = (residual.value / std_dev).powi(2);
         if !square.is_finite() {
@@ -268,7 +271,7 @@ impl Hypothesis {
             let off = (changed / std_dev).powi(2).min(COST_MAX);
             let ratio = self.fast.noise_ratio();
             noise.value = ratio * changed;
-            noise.slopes = (slopes(perturbed) - residual.slopes) * ratio;
+            noise.slopes = (perturbed.slopes - residual.slopes) * ratio;
             self.cost -= ratio * ratio * off;
         }
         let compared = Compared {

@@ -4,7 +4,7 @@
 //! The rows of the other modules are linear in θ for small slip and average over blocks, which is
 //! exact for a robot that equals its model. For other robots they use a small part of the
 //! measurements, and give no estimate beyond small slip. This module simulates the equations of
-//! motion ([`model`]) with the measured wheel speeds as input, and estimates all 23 unknown
+//! motion ([`model`]) with the measured wheel speeds as input, and estimates all 25 unknown
 //! parameters ([`parameters`]) at once from the other sensors ([`hypothesis`]). The problem is
 //! nonlinear, so three estimators start at different values of K; those that fit worse are
 //! discarded.
@@ -13,6 +13,8 @@ mod change;
 mod dual;
 mod fast_changes;
 mod hypothesis;
+#[cfg(test)]
+mod inertial_tests;
 mod model;
 mod parameters;
 mod recent;
@@ -73,7 +75,7 @@ const MODEL_TORQUE_MU: f64 = 0.025;
 /// the model's equations: a relative one, of ln θ, and an absolute one, of θ, which is a slip per
 /// friction coefficient and dominates where θ is small: without and with measured torque, which shows
 /// some of what the equations miss.
-const MODEL_LN_THETA_STD_DEV: f64 = 0.03;
+const MODEL_LN_THETA_STD_DEV: f64 = 0.04;
 const MODEL_THETA_STD_DEVS: [f64; 2] = [0.020, 0.014];
 /// Minimum duration of the block with which a segment ends, seconds; a shorter one is not used.
 const SHORT_BLOCK_S: f64 = 0.5;
@@ -106,7 +108,9 @@ pub(super) struct Identification {
     model: RobotModel,
     prior: Prior,
     hypotheses: Vec<Hypothesis>,
+    /// Heading since the start, by the gyro without its offset.
     heading_rad: f64,
+    gyro_offset_rad_s: f64,
     acceleration_m_s2: [f64; 2],
     /// The sample that waits for the next one, and the wheel speeds before it.
     waiting: Option<Waiting>,
@@ -153,6 +157,7 @@ impl Identification {
             prior: parameters::prior(prior, noise),
             hypotheses: Vec::with_capacity(STARTS.len()),
             heading_rad: 0.0,
+            gyro_offset_rad_s: 0.0,
             acceleration_m_s2: [0.0; 2],
             waiting: None,
             sums: [0.0; CHANNELS - 1],
@@ -281,7 +286,7 @@ impl Identification {
         let (before_rad_s, before_s) = now.before_rad_s.unwrap_or((wheels_rad_s, time_s));
         let apart_s = 0.5 * (before_s + after_s) + time_s;
         let wheels_rad_s2 = [0, 1].map(|side| (after_rad_s[side] - before_rad_s[side]) / apart_s);
-        self.heading_rad += sample.gyro_rad_s * time_s;
+        self.heading_rad += (sample.gyro_rad_s - self.gyro_offset_rad_s) * time_s;
         let measured = sample
             .acceleration
             .map(|acceleration| [acceleration.forward_m_s2, acceleration.left_m_s2]);
@@ -296,6 +301,7 @@ impl Identification {
             wheels_rad_s2,
             heading_rad: self.heading_rad,
             acceleration_m_s2: self.acceleration_m_s2,
+            is_specific_force: sample.is_specific_force,
             time_s,
         };
         let noise_of_wheels = self.wheel_noise.excess(apart_s);
@@ -374,7 +380,7 @@ impl Identification {
         for hypothesis in &mut self.hypotheses {
             let is_best = hypothesis.cost() <= least;
             // Outputs were weighed by COMPARED_S.
-            let outputs = hypothesis.take_mean(COMPARED_S / compared_s);
+            let outputs = hypothesis.take_outputs(COMPARED_S / compared_s, compared_s);
             for (channel, output) in outputs.into_iter().enumerate() {
                 // Means are of the same time only if nothing is missing.
                 if measured_s[channel] < compared_s - 1.0e-6 {
@@ -402,9 +408,7 @@ impl Identification {
         self.block_s += compared_s;
         self.clear_sums();
         let motion = self.motion();
-        let changed = self
-            .change
-            .compare(&explained, COMPARED_S / compared_s, motion);
+        let changed = self.change.compare(&explained, compared_s, motion);
         if self.block_s >= BLOCK_S - 1.0e-6 {
             self.end_block();
             self.is_robot_due = true;
@@ -456,6 +460,9 @@ impl Identification {
             return;
         }
         self.discard();
+        if let Some(best) = self.best() {
+            self.gyro_offset_rad_s = best.values()[index::GYRO_OFFSET];
+        }
         self.look_for_noise();
         self.watch_ground();
     }
@@ -569,6 +576,13 @@ impl Identification {
             tyres_ratio: MODEL_LN_THETA_STD_DEV.hypot(model / theta),
             duration_s: f64::from(best.age()) * BLOCK_S,
         })
+    }
+
+    /// Returns the root mean square of the best hypothesis's standardised residuals in its worst
+    /// channel, where it is too large for an estimate.
+    pub(super) fn misfit_ratio(&self) -> Option<f64> {
+        let square = self.best()?.worst_square();
+        (square > SQUARE_MAX).then(|| square.sqrt())
     }
 
     /// Returns the newest estimate of the robot's own parameters, of this ground or an earlier one.

@@ -83,9 +83,11 @@ pub(super) struct Input {
     pub(super) wheels_rad_s2: [f64; 2],
     /// Heading relative to the start of identification, radians.
     pub(super) heading_rad: f64,
-    /// Low-pass filtered acceleration without gravity, forward and left, metres per second squared;
-    /// only for the contacts' loads.
+    /// Low-pass filtered measured acceleration, forward and left, metres per second squared; only for
+    /// the contacts' loads.
     pub(super) acceleration_m_s2: [f64; 2],
+    /// Whether measured accelerations are the specific force; otherwise they are without gravity.
+    pub(super) is_specific_force: bool,
     /// Time of the sample, seconds, above 0.
     pub(super) time_s: f64,
 }
@@ -94,8 +96,8 @@ pub(super) struct Input {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Output<T> {
     pub(super) turn_rad_s: T,
-    /// Acceleration as the accelerometer measures it, without gravity on level ground, forward and
-    /// left, metres per second squared.
+    /// Measured acceleration: the specific force along the ground or the acceleration without
+    /// gravity, see [`Input`], forward and left, metres per second squared.
     pub(super) acceleration_m_s2: [T; 2],
     /// Torques of the motors at the wheels, left and right, newton metres.
     pub(super) torques_n_m: [T; 2],
@@ -145,12 +147,19 @@ impl<T: Real> Robot<T> {
     }
 
     /// Returns the contacts with their loads, those of a rigid body on four equal springs.
-    fn contacts(&self, gravity: [T; 2], acceleration_m_s2: [f64; 2]) -> [Contact<T>; 4] {
+    fn contacts(&self, gravity: [T; 2], input: &Input) -> [Contact<T>; 4] {
         let [forward_m, left_m, height_m] = self.centre_m;
         let (base_m, track_m) = (self.wheelbase_m, self.track_m);
+        let specific_force = |axis: usize| {
+            let removed = if input.is_specific_force {
+                T::constant(0.0)
+            } else {
+                -gravity[axis]
+            };
+            removed + input.acceleration_m_s2[axis]
+        };
         let tilt = |offset_m: T, axis: usize, size_m: f64| {
-            (offset_m * GRAVITY_M_S2 - height_m * (-gravity[axis] + acceleration_m_s2[axis]))
-                * (size_m * size_m).recip()
+            (offset_m * GRAVITY_M_S2 - height_m * specific_force(axis)) * (size_m * size_m).recip()
         };
         let (pitch, roll) = (tilt(forward_m, 0, base_m), tilt(left_m, 1, track_m));
         let contact = |(front, left): (f64, f64)| Contact {
@@ -243,7 +252,7 @@ impl<T: Real> Robot<T> {
     /// Deflections lead speeds by half a step (leapfrog integration).
     pub(super) fn advance(&self, state: &mut State<T>, input: &Input) -> Output<T> {
         let gravity = self.gravity_m_s2(input.heading_rad);
-        let contacts = self.contacts(gravity, input.acceleration_m_s2);
+        let contacts = self.contacts(gravity, input);
         #[expect(
             clippy::cast_possible_truncation,
             clippy::cast_sign_loss,
@@ -273,8 +282,12 @@ impl<T: Real> Robot<T> {
             state.turn_rad_s = turn + forces.moment_n_m * per_inertia * step_s;
             output.turn_rad_s = output.turn_rad_s + (turn + state.turn_rad_s) * (0.5 * share);
             for side in 0..2 {
-                output.acceleration_m_s2[side] =
-                    output.acceleration_m_s2[side] + acceleration[side] * share;
+                let measured = if input.is_specific_force {
+                    forces.force_n[side] * per_mass
+                } else {
+                    acceleration[side]
+                };
+                output.acceleration_m_s2[side] = output.acceleration_m_s2[side] + measured * share;
                 let load_n = contacts[2 * side].load_n + contacts[2 * side + 1].load_n;
                 let turns = (rims_m_s[side].value() / RESISTANCE_TURNS_M_S).tanh();
                 let side_n = forces.sides_n[side];

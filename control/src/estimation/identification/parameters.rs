@@ -7,13 +7,16 @@ use crate::estimation::{EstimatorPrior, SensorNoise};
 use crate::robot::RobotModel;
 
 /// Number of parameters.
-pub(super) const PARAMETERS: usize = 23;
+pub(super) const PARAMETERS: usize = 25;
+/// Number of parameters of the equations of motion and of the sensors' scales and offsets: all but the
+/// delays, which are the last ones.
+pub(super) const MODELLED: usize = 23;
 /// Values of all parameters.
 pub(super) type Values = SVector<f64, PARAMETERS>;
 /// Covariance or information of all parameters.
 pub(super) type Square = SMatrix<f64, PARAMETERS, PARAMETERS>;
-/// Value with its derivatives with respect to all parameters.
-pub(super) type Number = Dual<PARAMETERS>;
+/// Value with its derivatives with respect to the first [`MODELLED`] parameters.
+pub(super) type Number = Dual<MODELLED>;
 
 /// Where each parameter is in [`Values`].
 pub(super) mod index {
@@ -61,6 +64,10 @@ pub(super) mod index {
     pub(in super::super) const HEIGHT: usize = 21;
     /// Offset of the measured body speed, metres per second.
     pub(in super::super) const SPEED_OFFSET: usize = 22;
+    /// Delay of the gyro relative to the wheel speeds, and of the accelerometer relative to the gyro,
+    /// seconds.
+    pub(in super::super) const GYRO_DELAY: usize = 23;
+    pub(in super::super) const ACCELEROMETER_DELAY: usize = 24;
 }
 
 /// Normal prior of the parameters at the start of a ground, in the units of [`index`].
@@ -120,7 +127,7 @@ const LN_STIFFNESS: (f64, f64) = (1.1, 2.0);
 const LN_PEAK: (f64, f64) = (-0.6, 0.4);
 /// Means and standard deviations of the curve's shape, `1/n` and `a`.
 const SHAPE: (f64, f64) = (0.3, 0.2);
-const BEND: (f64, f64) = (0.25, 0.25);
+const BEND: (f64, f64) = (0.25, 0.35);
 /// Minimum of `1/n`, at which the curve is practically straight up to its peak.
 pub(super) const SHAPE_MIN: f64 = 0.05;
 /// Standard deviation of the centre of mass's forward position, relative to the wheelbase.
@@ -133,11 +140,16 @@ const SLOPE_STD_DEV: f64 = 0.035;
 /// standard deviation of one side.
 const TORQUE_SCALE_RATIO: f64 = 1.75;
 /// Mean and standard deviation of the gear loss, relative to the transmitted torque.
-const GEAR_LOSS: (f64, f64) = (0.015, 0.01);
+const GEAR_LOSS: (f64, f64) = (0.025, 0.025);
 /// Mean and standard deviation of the rolling resistance coefficient.
-const RESISTANCE: (f64, f64) = (0.025, 0.01);
+const RESISTANCE: (f64, f64) = (0.035, 0.025);
 /// Standard deviation of an offset of the body speed, metres per second.
 const SPEED_OFFSET_STD_DEV: f64 = 0.005;
+/// Standard deviations of the gyro's delay relative to the wheel speeds, and of the accelerometer's
+/// relative to the gyro's, seconds. Filters, the periods of differences, buses and time stamps of
+/// reception delay all of them.
+const GYRO_DELAY_STD_DEV_S: f64 = 0.015;
+const ACCELEROMETER_DELAY_STD_DEV_S: f64 = 0.010;
 /// Minimum standard deviation, used where the configuration gives 0.
 const STD_DEV_MIN: f64 = 1.0e-4;
 
@@ -197,6 +209,11 @@ pub(super) fn prior(prior: &EstimatorPrior, noise: &SensorNoise) -> Prior {
         (index::LEFT_OFFSET, (0.0, noise.accelerometer_offset_m_s2)),
         (index::HEIGHT, HEIGHT),
         (index::SPEED_OFFSET, (0.0, SPEED_OFFSET_STD_DEV)),
+        (index::GYRO_DELAY, (0.0, GYRO_DELAY_STD_DEV_S)),
+        (
+            index::ACCELEROMETER_DELAY,
+            (0.0, ACCELEROMETER_DELAY_STD_DEV_S),
+        ),
     ];
     let mut initial = Prior {
         mean: Values::zeros(),
@@ -245,7 +262,7 @@ pub(super) struct Robot<T> {
 
 impl<T: Real> Robot<T> {
     /// Converts parameters in the units of [`index`] for a robot of this configured model.
-    pub(super) fn new(values: &[T; PARAMETERS], model: &RobotModel) -> Self {
+    pub(super) fn new(values: &[T; MODELLED], model: &RobotModel) -> Self {
         let of = |place: usize| values[place];
         let mass_kg = of(index::MASS).exp() * model.mass_kg();
         let (track_m, wheelbase_m) = (model.track_width_m(), model.wheelbase_m());

@@ -2,7 +2,17 @@
 
 use super::dual::Real;
 use super::model::{CHANNELS, Input, Output, State};
-use super::parameters::{Number, Robot, Values};
+use super::parameters::{MODELLED, Number, Robot, Values, index};
+
+/// Number of channels that can be late: turn rate, acceleration forward and left.
+pub(super) const DELAYED: usize = 3;
+
+/// Returns the delays of these channels relative to the wheel speeds, seconds.
+pub(super) fn delays_s(values: &Values) -> [f64; DELAYED] {
+    let gyro_s = values[index::GYRO_DELAY];
+    let accelerometer_s = gyro_s + values[index::ACCELEROMETER_DELAY];
+    [gyro_s, accelerometer_s, accelerometer_s]
+}
 
 /// A simulated robot that follows the measured wheel speeds.
 #[derive(Debug, Clone, PartialEq)]
@@ -10,6 +20,74 @@ pub(super) struct Simulation<T> {
     pub(super) state: State<T>,
     /// Weighted sum of outputs since the last comparison.
     mean: Output<T>,
+    /// Turn rate and accelerations of the last sample, and those at the last comparison.
+    newest: Option<Delayed<T>>,
+    compared: Option<Delayed<T>>,
+}
+
+/// Outputs of the channels that can be late: turn rate, acceleration forward and left.
+type Delayed<T> = [T; DELAYED];
+
+/// Outputs since the last comparison.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Outputs<T> {
+    /// Means, in the order of the channels without the body speed.
+    pub(super) means: [T; CHANNELS - 1],
+    /// Rates of change of the first channels, which can be late, per second.
+    pub(super) rates: Delayed<T>,
+}
+
+impl<T: Real> Outputs<T> {
+    /// Returns a channel's mean as its sensor gives it with a delay of `delay_s`, to first order.
+    fn late(&self, channel: usize, delay_s: f64) -> T {
+        self.means[channel] - self.rates[channel] * delay_s
+    }
+}
+
+impl Outputs<f64> {
+    /// Returns the means as late sensors give them.
+    pub(super) fn measured(&self, delays_s: [f64; DELAYED]) -> [f64; CHANNELS - 1] {
+        let mut means = self.means;
+        for (channel, delay_s) in delays_s.into_iter().enumerate() {
+            means[channel] = self.late(channel, delay_s);
+        }
+        means
+    }
+}
+
+impl Outputs<Number> {
+    /// Returns the means as late sensors give them, with their slopes.
+    pub(super) fn measured(&self, delays_s: [f64; DELAYED]) -> [Predicted; CHANNELS - 1] {
+        let mut predicted = self.means.map(|mean| Predicted::of(&mean));
+        for (channel, delay_s) in delays_s.into_iter().enumerate() {
+            predicted[channel] = Predicted::of(&self.late(channel, delay_s));
+            let by_delay = -self.rates[channel].value;
+            predicted[channel].slopes[index::GYRO_DELAY] = by_delay;
+            if channel > 0 {
+                predicted[channel].slopes[index::ACCELEROMETER_DELAY] = by_delay;
+            }
+        }
+        predicted
+    }
+}
+
+/// Output of one channel, with its slopes with respect to all parameters.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Predicted {
+    pub(super) value: f64,
+    pub(super) slopes: Values,
+}
+
+impl Predicted {
+    /// Converts an output that has no delay.
+    pub(super) fn of(output: &Number) -> Self {
+        let mut slopes = Values::zeros();
+        slopes.as_mut_slice()[..MODELLED].copy_from_slice(&output.derivatives);
+        Self {
+            value: output.value,
+            slopes,
+        }
+    }
 }
 
 impl<T: Real> Simulation<T> {
@@ -18,6 +96,8 @@ impl<T: Real> Simulation<T> {
         Self {
             state,
             mean: Output::zero(),
+            newest: None,
+            compared: None,
         }
     }
 
@@ -34,16 +114,29 @@ impl<T: Real> Simulation<T> {
             );
             add(&mut self.mean.torques_n_m[axis], output.torques_n_m[axis]);
         }
+        let [forward, left] = output.acceleration_m_s2;
+        self.newest = Some([output.turn_rad_s, forward, left]);
         output.forward_m_s
     }
 
-    /// Returns the outputs since the last call, multiplied by `ratio`, in the order of the channels
-    /// without the body speed, and begins anew.
-    pub(super) fn take_mean(&mut self, ratio: f64) -> [T; CHANNELS - 1] {
+    /// Returns the outputs since the last call, `compared_s` seconds ago, and begins anew. `ratio`
+    /// multiplies the means.
+    pub(super) fn take_outputs(&mut self, ratio: f64, compared_s: f64) -> Outputs<T> {
+        let before = std::mem::replace(&mut self.compared, self.newest);
+        let rates = match (self.newest, before) {
+            (Some(newest), Some(before)) => {
+                std::array::from_fn(|place| (newest[place] - before[place]) * compared_s.recip())
+            }
+            _ => [T::constant(0.0); DELAYED],
+        };
         let mean = std::mem::replace(&mut self.mean, Output::zero());
         let [forward, left] = mean.acceleration_m_s2;
         let [torque_left, torque_right] = mean.torques_n_m;
-        [mean.turn_rad_s, forward, left, torque_left, torque_right].map(|mean| mean * ratio)
+        let means = [mean.turn_rad_s, forward, left, torque_left, torque_right];
+        Outputs {
+            means: means.map(|mean| mean * ratio),
+            rates,
+        }
     }
 }
 

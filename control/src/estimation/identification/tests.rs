@@ -5,19 +5,20 @@ use super::parameters::Robot;
 use super::*;
 use crate::measured::{BodyAcceleration, WheelSpeeds, WheelTorques};
 
-const SAMPLE_S: f64 = 0.01;
+pub(super) const SAMPLE_S: f64 = 0.01;
 
 /// A robot that is as some values of the parameters say, without noise.
-struct Simulated {
+pub(super) struct Simulated {
     robot: Robot<f64>,
     state: State<f64>,
     heading_rad: f64,
     acceleration_m_s2: [f64; 2],
+    pub(super) is_specific_force: bool,
     time_s: f64,
 }
 
 impl Simulated {
-    fn new(change: impl Fn(&mut parameters::Values)) -> Self {
+    pub(super) fn new(change: impl Fn(&mut parameters::Values)) -> Self {
         let mut values =
             parameters::prior(&EstimatorPrior::default(), &SensorNoise::default()).mean;
         change(&mut values);
@@ -27,6 +28,7 @@ impl Simulated {
             state: State::rolling(Twist::default()),
             heading_rad: 0.0,
             acceleration_m_s2: [0.0; 2],
+            is_specific_force: false,
             time_s: 0.0,
         }
     }
@@ -38,7 +40,7 @@ impl Simulated {
         [mean - half, mean + half]
     }
 
-    fn sample(&mut self) -> SensorSample {
+    pub(super) fn sample(&mut self) -> SensorSample {
         let [before, now, after] =
             [-0.5, 0.5, 1.5].map(|offset| Self::wheels_rad_s(self.time_s + offset * SAMPLE_S));
         let rise = |side: usize| (after[side] - before[side]) / (2.0 * SAMPLE_S);
@@ -47,6 +49,7 @@ impl Simulated {
             wheels_rad_s2: [rise(0), rise(1)],
             heading_rad: self.heading_rad,
             acceleration_m_s2: self.acceleration_m_s2,
+            is_specific_force: self.is_specific_force,
             time_s: SAMPLE_S,
         };
         let output = self.robot.advance(&mut self.state, &input);
@@ -61,6 +64,7 @@ impl Simulated {
                 right_rad_s: now[1],
             },
             gyro_rad_s: output.turn_rad_s,
+            is_specific_force: self.is_specific_force,
             acceleration: Some(BodyAcceleration {
                 forward_m_s2,
                 left_m_s2,
@@ -74,7 +78,7 @@ impl Simulated {
     }
 }
 
-fn identification() -> Identification {
+pub(super) fn identification() -> Identification {
     Identification::new(
         RobotModel::yi2007(),
         &SensorNoise::default(),
@@ -231,7 +235,7 @@ fn the_last_block_before_a_change_of_the_ground_counts_for_no_segment() {
         drive(&mut identification, &mut robot, 10);
         identification.close_segment();
         drive(&mut identification, &mut robot, 4);
-        robot.robot.stiffness = 0.5;
+        robot.robot.stiffness = 0.2;
         drive(&mut identification, &mut robot, seconds);
         if is_dropped {
             identification.drop_last_block();
@@ -275,7 +279,7 @@ fn an_estimate_with_little_information_keeps_it_and_gets_more() {
             values[index::PEAK] = 0.35_f64.ln();
         });
         let mut identification = identification();
-        for _ in 0..6_000 {
+        for _ in 0..9_000 {
             let mut sample = with_noise(robot.sample(), &mut random);
             sample.wheel_torques = None;
             identification.update(&sample, &SensorNoise::default(), SAMPLE_S);

@@ -5,16 +5,22 @@ use tread_lab::rough::curve::Shape;
 use tread_lab::rough::run::{Course, Trial};
 use tread_lab::rough::sensors::SensorSpec;
 use tread_lab::rough::spec::{Deviations, MAKES};
+use tread_lab::rough::width::Width;
 
 use crate::Arguments;
 
 /// Friction stiffnesses K of the grounds.
 pub(crate) const GROUNDS: [f64; 3] = [0.7, 3.0, 12.0];
 
+/// Relaxation length of robots with late sensors, metres. A contact with the 2 mm of the other lines
+/// follows the wheels faster than any tyre, so that a late wheel speed would be one that is before its
+/// time.
+const TYRE_RELAXATION_M: f64 = 0.03;
+
 pub(crate) type Change = fn(&mut Deviations, &mut SensorSpec);
 
 /// Single differences, each with its name in the report.
-pub(crate) const CHANGES: [(&str, Change); 24] = [
+pub(crate) const CHANGES: [(&str, Change); 32] = [
     ("nothing", |_, _| {}),
     ("payload 20 %", |robot, _| {
         robot.payload_ratio = 0.2;
@@ -74,6 +80,14 @@ pub(crate) const CHANGES: [(&str, Change); 24] = [
     ("slope -5°", |robot, _| {
         robot.slope_rad = [0.0, -5.0_f64.to_radians()];
     }),
+    ("slope 5°, no attitude", |robot, sensors| {
+        robot.slope_rad = [0.0, 5.0_f64.to_radians()];
+        sensors.has_attitude = false;
+    }),
+    ("slope -5°, no attitude", |robot, sensors| {
+        robot.slope_rad = [0.0, -5.0_f64.to_radians()];
+        sensors.has_attitude = false;
+    }),
     ("rolling resistance 4 %", |robot, _| {
         robot.rolling_resistance_ratio = 0.04;
     }),
@@ -85,6 +99,31 @@ pub(crate) const CHANGES: [(&str, Change); 24] = [
     }),
     ("wheel speed noise 0.05 rad/s", |_, sensors| {
         sensors.wheel_speed_rad_s = 0.05;
+    }),
+    ("gyro 20 ms late", |robot, sensors| {
+        robot.relaxation_m = TYRE_RELAXATION_M;
+        sensors.gyro_delay_s = 0.02;
+    }),
+    ("accelerometer 20 ms late", |robot, sensors| {
+        robot.relaxation_m = TYRE_RELAXATION_M;
+        sensors.acceleration_delay_s = 0.02;
+    }),
+    ("accelerometer 30 ms late", |robot, sensors| {
+        robot.relaxation_m = TYRE_RELAXATION_M;
+        sensors.acceleration_delay_s = 0.03;
+    }),
+    ("gyro and accelerometer 20 ms late", |robot, sensors| {
+        robot.relaxation_m = TYRE_RELAXATION_M;
+        sensors.gyro_delay_s = 0.02;
+        sensors.acceleration_delay_s = 0.02;
+    }),
+    ("wheels and torques 10 ms late", |robot, sensors| {
+        robot.relaxation_m = TYRE_RELAXATION_M;
+        sensors.wheel_delay_s = 0.01;
+    }),
+    ("wheels and torques 20 ms late", |robot, sensors| {
+        robot.relaxation_m = TYRE_RELAXATION_M;
+        sensors.wheel_delay_s = 0.02;
     }),
 ];
 
@@ -123,7 +162,7 @@ pub(crate) fn population(has_torque: bool, arguments: &Arguments) -> Vec<Trial> 
     let trial = |index: u32| {
         let seed = arguments.seed + u64::from(index);
         let mut random = Random::new(seed ^ 0x5eed);
-        Trial {
+        let mut trial = Trial {
             make: random.one_of(&MAKES).unwrap_or(MAKES[0]),
             deviations: Deviations::drawn(&mut random),
             sensors: SensorSpec::drawn(&mut random, has_torque),
@@ -133,7 +172,11 @@ pub(crate) fn population(has_torque: bool, arguments: &Arguments) -> Vec<Trial> 
             seed,
             prior: arguments.prior(),
             is_bounded: index < arguments.bounds,
-        }
+        };
+        trial.sensors = trial
+            .sensors
+            .with_drawn_inertial_unit(&mut random, Width::default());
+        trial
     };
     let runs = arguments.runs.saturating_mul(10);
     (0..runs).map(trial).collect()

@@ -59,6 +59,7 @@ fn inertial(logged_ns: i64, stamp_ns: i64, yaw_rate_rad_s: f64) -> Timed {
             yaw_rate_rad_s,
             yaw_rate_std_dev: None,
             acceleration: None,
+            is_specific_force: false,
             acceleration_std_dev: None,
             tilt_rad: None,
         }),

@@ -163,6 +163,7 @@ impl Assembler {
             at,
             yaw_rate_rad_s,
             acceleration,
+            is_specific_force: inertial.is_some_and(|inertial| inertial.is_specific_force),
             wheel_speeds: Some(wheel_speeds),
             wheel_torques,
             body_speed_m_s: self.ground_speed_m_s.take(),

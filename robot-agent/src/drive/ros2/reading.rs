@@ -66,8 +66,10 @@ pub struct Inertial {
     pub yaw_rate_rad_s: f64,
     /// Standard deviation of the yaw rate, rad/s, if stated.
     pub yaw_rate_std_dev: Option<f64>,
-    /// Acceleration without gravity, if measured.
+    /// Acceleration along the ground, if measured.
     pub acceleration: Option<BodyAcceleration>,
+    /// Whether it is the specific force, because no attitude says how much of it is gravity.
+    pub is_specific_force: bool,
     /// Standard deviation of the acceleration, m/s², if stated.
     pub acceleration_std_dev: Option<f64>,
     /// Tilt against the vertical, radians, if the orientation is measured.
@@ -258,7 +260,7 @@ pub fn imu(bytes: &[u8], settings: &ImuSettings) -> Result<Reading, Refusal> {
     } else {
         let felt = message.linear_acceleration;
         let range = ACCELERATION_RANGE_M_S2;
-        // Without an orientation the unit is assumed to be level.
+        // Without an orientation nothing is removed.
         let up = up.unwrap_or_default();
         let x = bounded(felt.x, &range)? - GRAVITY_M_S2 * up.x;
         let y = flip * (bounded(felt.y, &range)? - GRAVITY_M_S2 * up.y);
@@ -268,6 +270,10 @@ pub fn imu(bytes: &[u8], settings: &ImuSettings) -> Result<Reading, Refusal> {
             left_m_s2: sin * x + cos * y,
         })
     };
+    // Drivers without an attitude state the identity, or that there is none. A simulation without
+    // gravity gives accelerations without it.
+    let has_attitude = up.is_some_and(|up| up.x != 0.0 || up.y != 0.0);
+    let has_gravity = message.linear_acceleration.z.abs() > 0.5 * GRAVITY_M_S2;
     let acceleration_std_dev = match acceleration {
         Some(_) => std_dev(message.linear_acceleration_covariance[0])?,
         None => None,
@@ -276,6 +282,7 @@ pub fn imu(bytes: &[u8], settings: &ImuSettings) -> Result<Reading, Refusal> {
         yaw_rate_rad_s: flip * bounded(message.angular_velocity.z, &RATE_RANGE)?,
         yaw_rate_std_dev: std_dev(message.angular_velocity_covariance[8])?,
         acceleration,
+        is_specific_force: has_gravity && !has_attitude,
         acceleration_std_dev,
         tilt_rad,
     };

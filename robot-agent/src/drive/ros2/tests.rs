@@ -95,6 +95,8 @@ struct Said {
     is_hashed: bool,
     cut: usize,
     covariance: f64,
+    orientation: Quaternion,
+    gravity_m_s2: f64,
 }
 
 const GOOD: Said = Said {
@@ -106,6 +108,16 @@ const GOOD: Said = Said {
     is_hashed: true,
     cut: 0,
     covariance: 1.0e-4,
+    orientation: YAW_ONLY,
+    gravity_m_s2: GRAVITY_M_S2,
+};
+
+/// A heading of 0.3 rad without any tilt, as of a driver that knows none.
+const YAW_ONLY: Quaternion = Quaternion {
+    x: 0.0,
+    y: 0.0,
+    z: 0.149_438_132_473_599_22,
+    w: 0.988_771_077_936_042_4,
 };
 
 impl Talk {
@@ -162,13 +174,13 @@ impl Talk {
         };
         let imu = Imu {
             header: header(said.frame),
-            orientation: Quaternion::yaw(0.3),
+            orientation: said.orientation,
             angular_velocity: turn,
             angular_velocity_covariance: [said.covariance; 9],
             linear_acceleration: Vector3 {
                 x: 0.5,
                 y: 0.0,
-                z: GRAVITY_M_S2,
+                z: said.gravity_m_s2,
             },
             ..Imu::default()
         };
@@ -224,6 +236,32 @@ fn a_good_message_is_a_whole_sample_by_its_stamp() {
     assert!((sample.yaw_rate_rad_s.unwrap() - 0.2).abs() < 1.0e-12);
     assert!(sample.tilt_rad.unwrap() < 1.0e-6);
     assert_eq!(talk.drive.noise().gyro_rad_s, Some(0.01));
+}
+
+#[test]
+fn an_acceleration_is_without_gravity_only_if_an_attitude_says_how_much_that_is() {
+    let leaning = Quaternion {
+        x: 0.0,
+        y: 0.05,
+        z: 0.0,
+        w: (1.0_f64 - 0.05 * 0.05).sqrt(),
+    };
+    let sample = |orientation: Quaternion, gravity_m_s2: f64| {
+        let feedback = Talk::new().say(&Said {
+            orientation,
+            gravity_m_s2,
+            ..GOOD
+        });
+        feedback.samples()[0]
+    };
+    assert!(!sample(leaning, GRAVITY_M_S2).is_specific_force);
+    assert!(sample(YAW_ONLY, GRAVITY_M_S2).is_specific_force);
+    // Four zeros are no orientation.
+    let unknown = sample(Quaternion::default(), GRAVITY_M_S2);
+    assert!(unknown.is_specific_force && unknown.tilt_rad.is_none());
+    assert!((unknown.acceleration.unwrap().forward_m_s2 - 0.5).abs() < 1.0e-9);
+    // A simulation without gravity.
+    assert!(!sample(Quaternion::default(), 0.0).is_specific_force);
 }
 
 #[test]

@@ -167,6 +167,7 @@ impl Sensors {
                 right_rad_s: seen.wheel_speeds.right_rad_s + gauss(noise.wheel_speed_rad_s),
             },
             gyro_rad_s: seen.yaw_rate_rad_s + gauss(noise.gyro_rad_s),
+            is_specific_force: false,
             acceleration: Some(BodyAcceleration {
                 forward_m_s2: felt.forward_m_s2 + gauss(noise.accelerometer_m_s2),
                 left_m_s2: felt.left_m_s2 + gauss(noise.accelerometer_m_s2),
