@@ -8,7 +8,6 @@
 //! Abrupt Changes, 1993, ch. 2). An error of the model or a sensor makes both residuals large, and
 //! their difference small.
 
-use super::COMPARED_S;
 use super::model::{CHANNELS, Input, State};
 use super::parameters::{MODELLED, Robot, Values, index};
 use super::simulation::{DELAYED, Simulation, delays_s};
@@ -162,9 +161,7 @@ impl ChangeMonitor {
         let threshold = THRESHOLDS[usize::from(self.has_torque)];
         let mut has_changed = false;
         for other in self.others.iter_mut().flatten() {
-            let outputs = other
-                .model
-                .take_outputs(COMPARED_S / compared_s, compared_s);
+            let outputs = other.model.take_outputs(compared_s);
             let outputs = outputs.measured(self.delays_s);
             if !counts {
                 continue;
@@ -200,7 +197,7 @@ mod tests {
     use rand::{RngExt, SeedableRng};
     use rand_chacha::ChaCha8Rng;
 
-    use super::super::parameters;
+    use super::super::{COMPARED_S, parameters};
     use super::*;
     use crate::estimation::{EstimatorPrior, SensorNoise};
     use crate::geometry::Twist;
@@ -265,8 +262,8 @@ mod tests {
                 self.believed.advance(&believed, &input, share);
                 self.monitor.advance(&input, share);
             }
-            let truth = self.robot.take_outputs(1.0, COMPARED_S).means;
-            let outputs = self.believed.take_outputs(1.0, COMPARED_S).means;
+            let truth = self.robot.take_outputs(COMPARED_S).means;
+            let outputs = self.believed.take_outputs(COMPARED_S).means;
             let explained = std::array::from_fn(|channel| {
                 let of_12 = (0..12).map(|_| self.random.random::<f64>() - 0.5);
                 let factor = if channel > 2 { scaled } else { 1.0 };

@@ -227,15 +227,10 @@ impl Hypothesis {
     }
 
     /// Returns the mean outputs since the last call, `compared_s` seconds ago, in the order of the
-    /// channels without the body speed, and begins a new mean. `ratio` multiplies them.
-    pub(super) fn take_outputs(
-        &mut self,
-        ratio: f64,
-        compared_s: f64,
-    ) -> [ChannelOutput; CHANNELS - 1] {
+    /// channels without the body speed, and begins a new mean.
+    pub(super) fn take_outputs(&mut self, compared_s: f64) -> [ChannelOutput; CHANNELS - 1] {
         let delays_s = delays_s(&self.values);
-        let take =
-            |own: &mut Simulation<Number>| own.take_outputs(ratio, compared_s).measured(delays_s);
+        let take = |own: &mut Simulation<Number>| own.take_outputs(compared_s).measured(delays_s);
         let outputs = take(&mut self.model);
         let perturbed = self.perturbed.as_mut().map(take);
         std::array::from_fn(|channel| ChannelOutput {

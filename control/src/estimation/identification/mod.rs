@@ -380,7 +380,7 @@ impl Identification {
         for hypothesis in &mut self.hypotheses {
             let is_best = hypothesis.cost() <= least;
             // Outputs were weighed by COMPARED_S.
-            let outputs = hypothesis.take_outputs(COMPARED_S / compared_s, compared_s);
+            let outputs = hypothesis.take_outputs(compared_s);
             for (channel, output) in outputs.into_iter().enumerate() {
                 // Means are of the same time only if nothing is missing.
                 if measured_s[channel] < compared_s - 1.0e-6 {

@@ -1,5 +1,6 @@
 //! The model's state of motion and its outputs since the last comparison.
 
+use super::COMPARED_S;
 use super::dual::Real;
 use super::model::{CHANNELS, Input, Output, State};
 use super::parameters::{MODELLED, Number, Robot, Values, index};
@@ -119,9 +120,9 @@ impl<T: Real> Simulation<T> {
         output.forward_m_s
     }
 
-    /// Returns the outputs since the last call, `compared_s` seconds ago, and begins anew. `ratio`
-    /// multiplies the means.
-    pub(super) fn take_outputs(&mut self, ratio: f64, compared_s: f64) -> Outputs<T> {
+    /// Returns the outputs since the last call, `compared_s` seconds ago, and begins anew. They were
+    /// weighted by [`COMPARED_S`].
+    pub(super) fn take_outputs(&mut self, compared_s: f64) -> Outputs<T> {
         let before = std::mem::replace(&mut self.compared, self.newest);
         let rates = match (self.newest, before) {
             (Some(newest), Some(before)) => {
@@ -134,7 +135,7 @@ impl<T: Real> Simulation<T> {
         let [torque_left, torque_right] = mean.torques_n_m;
         let means = [mean.turn_rad_s, forward, left, torque_left, torque_right];
         Outputs {
-            means: means.map(|mean| mean * ratio),
+            means: means.map(|mean| mean * (COMPARED_S / compared_s)),
             rates,
         }
     }
