@@ -5,11 +5,13 @@ use std::time::Duration;
 
 use tread_agent::drive::{Feedback, SAMPLES_MAX};
 use tread_agent::testing::{Heard, Listener};
-use tread_control::estimation::{Estimate, EstimatorPrior, ThetaMeasurement};
+use tread_control::estimation::{Estimate, EstimatorPrior, NORMAL_95, ThetaMeasurement};
 use tread_control::robot::RobotModel;
 
 use super::timeline::Fed;
 
+/// Largest half-width of a 95 % interval over the value, above which an answer counts as none.
+const HALF_WIDTH_MAX: f64 = 0.6;
 /// Time without samples that is skipped instead of run tick by tick.
 const SKIPPED: Duration = Duration::from_secs(1);
 
@@ -42,9 +44,11 @@ pub struct Outcome {
 }
 
 impl Outcome {
-    /// Returns the measurement of θ at the end.
+    /// Returns the measurement of θ at the end; `None` if its interval is too wide for one.
     pub fn theta(&self) -> Option<ThetaMeasurement> {
-        self.estimate.theta
+        let is_narrow =
+            |found: &ThetaMeasurement| NORMAL_95 * found.std_dev <= HALF_WIDTH_MAX * found.theta;
+        self.estimate.theta.filter(is_narrow)
     }
 }
 

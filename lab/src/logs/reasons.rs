@@ -1,6 +1,6 @@
 //! Why there is no estimate, and which manoeuvre would help.
 //!
-//! The estimator abstains where the standard deviation of θ would be above half of θ, or where
+//! The estimator abstains where the standard deviation of θ would be above 30 % of θ, or where
 //! nothing reached it. It does not say which of many causes that had; they are derived here from what
 //! it does say (samples dropped, slip beyond the linear range, no new information), from the
 //! findings of the consistency monitor, and from how the robot moved.
@@ -63,7 +63,7 @@ pub fn reasons(motion: &Motion, outcome: &Outcome) -> Vec<Reason> {
         reasons.push(Reason {
             code: "uncertain",
             reason: format!(
-                "{without}the motion leaves a standard deviation of θ above half of θ{on_the_way}"
+                "{without}the motion leaves a standard deviation of θ above 30 % of θ{on_the_way}"
             ),
             help,
         });
