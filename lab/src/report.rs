@@ -5,6 +5,9 @@ use std::ops::RangeInclusive;
 
 use serde_json::{Value, json};
 
+/// Half-width of a 95 % interval of θ over its value above which an answer counts as none.
+pub const WIDE_RATIO: f64 = 0.6;
+
 /// One figure that must be reached.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Check {

@@ -6,13 +6,11 @@ use tread_api::friction::NORMAL_95;
 use tread_control::estimation::EstimatorPrior;
 use tread_lab::parallel::in_parallel;
 use tread_lab::random::Random;
+use tread_lab::report::WIDE_RATIO;
 use tread_lab::rough::bound::{BoundInput, bounds};
 use tread_lab::rough::run::{Course, Outcome, Trial, run};
 use tread_lab::rough::sensors::SensorSpec;
 use tread_lab::rough::spec::{Deviations, MAKES};
-
-/// Half-width over value above which an interval says next to nothing.
-const WIDE_RATIO: f64 = 0.6;
 
 /// Robots in which everything differs, with seeds that nothing was chosen on.
 fn population(has_torque: bool, runs: u64) -> Vec<Outcome> {

@@ -9,9 +9,8 @@ use tread_control::estimation::{Estimate, EstimatorPrior, NORMAL_95, ThetaMeasur
 use tread_control::robot::RobotModel;
 
 use super::timeline::Fed;
+use crate::report::WIDE_RATIO;
 
-/// Largest half-width of a 95 % interval over the value, above which an answer counts as none.
-const HALF_WIDTH_MAX: f64 = 0.6;
 /// Time without samples that is skipped instead of run tick by tick.
 const SKIPPED: Duration = Duration::from_secs(1);
 
@@ -47,7 +46,7 @@ impl Outcome {
     /// Returns the measurement of θ at the end; `None` if its interval is too wide for one.
     pub fn theta(&self) -> Option<ThetaMeasurement> {
         let is_narrow =
-            |found: &ThetaMeasurement| NORMAL_95 * found.std_dev <= HALF_WIDTH_MAX * found.theta;
+            |found: &ThetaMeasurement| NORMAL_95 * found.std_dev <= WIDE_RATIO * found.theta;
         self.estimate.theta.filter(is_narrow)
     }
 }

@@ -1,14 +1,17 @@
 //! Why there is no estimate, and which manoeuvre would help.
 //!
-//! The estimator abstains where the standard deviation of θ would be above 30 % of θ, or where
-//! nothing reached it. It does not say which of many causes that had; they are derived here from what
+//! There is no estimate where the 95 % interval would be wider than ± 60 % of θ, or where nothing
+//! reached the estimator. It does not say which of many causes that had; they are derived here from what
 //! it does say (samples dropped, slip beyond the linear range, no new information), from the
 //! findings of the consistency monitor, and from how the robot moved.
 
 use serde::Serialize;
 
+use tread_control::estimation::NORMAL_95;
+
 use super::estimate::Outcome;
 use super::stretches::{ESTIMATOR_GAP_S, Motion};
+use crate::report::WIDE_RATIO;
 
 /// Share of a time, or of samples, from which a cause counts.
 const SHARE: f64 = 0.2;
@@ -58,12 +61,14 @@ pub fn reasons(motion: &Motion, outcome: &Outcome) -> Vec<Reason> {
         let on_the_way = outcome
             .std_dev_ratios
             .map_or_else(String::new, |(least, _)| {
-                format!("; on the way it was {} at best", percent(least))
+                let half_width = percent(NORMAL_95 * least);
+                format!("; on the way it was ± {half_width} at best")
             });
         reasons.push(Reason {
             code: "uncertain",
             reason: format!(
-                "{without}the motion leaves a standard deviation of θ above 30 % of θ{on_the_way}"
+                "{without}the motion leaves a 95 % interval wider than ± {} of θ{on_the_way}",
+                percent(WIDE_RATIO)
             ),
             help,
         });

@@ -21,6 +21,7 @@ use tread_control::estimation::EstimatorPrior;
 use tread_control::geometry::Pose;
 use tread_lab::parallel::in_parallel;
 use tread_lab::random::Random;
+use tread_lab::report::WIDE_RATIO;
 use tread_lab::rough::drive::RoughDrive;
 use tread_lab::rough::run::Course;
 use tread_lab::rough::sensors::SensorSpec;
@@ -37,8 +38,6 @@ const SETTLES: Duration = Duration::from_secs(2);
 const DRIVES: Duration = Duration::from_secs(110);
 /// Edge of a cell, metres.
 const CELL_M: f64 = 1.0;
-/// Half-width of an interval over its value from which on it counts as none.
-const HALF_WIDTH_MAX: f64 = 0.6;
 /// Least share of the cells whose 95 % interval must hold the truth.
 const COVERAGE_MIN: f64 = 0.93;
 
@@ -191,7 +190,7 @@ impl GroundMap {
         };
         let (low, high) = fused.theta.interval_95();
         let half_width = 0.5 * (high - low) / fused.theta.value;
-        if half_width > HALF_WIDTH_MAX {
+        if half_width > WIDE_RATIO {
             return;
         }
         self.estimates += 1;

@@ -5,11 +5,9 @@ use std::fmt::Write as _;
 use serde::Serialize;
 use tread_api::friction::NORMAL_95;
 use tread_lab::held_out::process::Contacts;
-use tread_lab::report::{Check, Part};
+use tread_lab::report::{Check, Part, WIDE_RATIO};
 use tread_lab::rough::run::{Outcome, Trial};
 
-/// Relative half-width above which an estimate counts as abstaining.
-const WIDE_RATIO: f64 = 0.6;
 /// Goal for the coverage of 95 % intervals.
 pub(crate) const COVERAGE_MIN: f64 = 0.85;
 /// Fraction of the time beyond half the slip at the peak above which a drive belongs to the stratum

@@ -4,11 +4,9 @@ use std::ops::RangeInclusive;
 
 use serde::Serialize;
 use tread_api::friction::{NORMAL_95, ThetaEstimate};
-use tread_lab::report::{Check, Part, Table, percent};
+use tread_lab::report::{Check, Part, Table, WIDE_RATIO, percent};
 use tread_lab::rough::run::{ASKED_AT_S, Outcome, Trial};
 
-/// Relative half-width above which an estimate counts as missing.
-const WIDE_RATIO: f64 = 0.6;
 /// Goal for the coverage of a line with a single deviation and of a stratum.
 const LINE_GOAL: RangeInclusive<f64> = 0.9..=1.0;
 /// Goal for the coverage of the population.
