@@ -164,8 +164,8 @@ pub(super) struct Curvature {
 
 impl TyrePrior {
     /// Returns the prior of unknown tyres: from linear to as curved as a `LuGre` tyre with a peak
-    /// of 0.5, with the relaxation lengths of small tyres, the wheels and rotors of geared motors and an
-    /// eccentric load. The largest friction coefficient is below the peak on wet grass or loose
+    /// of 0.5, with the relaxation lengths of small tyres, the wheels and rotors of geared motors and
+    /// an eccentric load. The largest friction coefficient is below the peak on wet grass or loose
     /// gravel (0.3), because slip beyond a peak looks like a small stiffness.
     pub fn unknown() -> Self {
         Self {

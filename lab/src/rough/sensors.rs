@@ -146,9 +146,7 @@ impl SensorSpec {
             ..usual
         }
     }
-}
 
-impl SensorSpec {
     /// Draws whether the inertial unit has an attitude, and delays of unit and wheels that their time
     /// stamps do not include.
     ///

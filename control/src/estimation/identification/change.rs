@@ -80,7 +80,7 @@ pub(super) struct ChangeMonitor {
     slow: u32,
     /// Whether torques were compared.
     has_torque: bool,
-    /// Delays of the first channels, seconds.
+    /// Delays of turn rate and accelerations relative to the wheel speeds, seconds.
     delays_s: [f64; DELAYED],
 }
 
@@ -147,7 +147,8 @@ impl ChangeMonitor {
         false
     }
 
-    /// Adds one comparison of the means over `compared_s` seconds, since the last call. While the robot does not roll there is no evidence.
+    /// Adds one comparison of the means over `compared_s` seconds, since the last call. While the robot
+    /// does not roll there is no evidence.
     ///
     /// Returns whether the ground has changed; after an alarm the detector is reset.
     pub(super) fn compare(

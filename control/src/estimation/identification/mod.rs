@@ -379,7 +379,6 @@ impl Identification {
         let mut explained = [None; COMPARED];
         for hypothesis in &mut self.hypotheses {
             let is_best = hypothesis.cost() <= least;
-            // Outputs were weighed by COMPARED_S.
             let outputs = hypothesis.take_outputs(compared_s);
             for (channel, output) in outputs.into_iter().enumerate() {
                 // Means are of the same time only if nothing is missing.

@@ -101,31 +101,34 @@ pub(crate) const CHANGES: [(&str, Change); 32] = [
         sensors.wheel_speed_rad_s = 0.05;
     }),
     ("gyro 20 ms late", |robot, sensors| {
-        robot.relaxation_m = TYRE_RELAXATION_M;
-        sensors.gyro_delay_s = 0.02;
+        set_delays(robot, sensors, [0.02, 0.0, 0.0]);
     }),
     ("accelerometer 20 ms late", |robot, sensors| {
-        robot.relaxation_m = TYRE_RELAXATION_M;
-        sensors.acceleration_delay_s = 0.02;
+        set_delays(robot, sensors, [0.0, 0.02, 0.0]);
     }),
     ("accelerometer 30 ms late", |robot, sensors| {
-        robot.relaxation_m = TYRE_RELAXATION_M;
-        sensors.acceleration_delay_s = 0.03;
+        set_delays(robot, sensors, [0.0, 0.03, 0.0]);
     }),
     ("gyro and accelerometer 20 ms late", |robot, sensors| {
-        robot.relaxation_m = TYRE_RELAXATION_M;
-        sensors.gyro_delay_s = 0.02;
-        sensors.acceleration_delay_s = 0.02;
+        set_delays(robot, sensors, [0.02, 0.02, 0.0]);
     }),
     ("wheels and torques 10 ms late", |robot, sensors| {
-        robot.relaxation_m = TYRE_RELAXATION_M;
-        sensors.wheel_delay_s = 0.01;
+        set_delays(robot, sensors, [0.0, 0.0, 0.01]);
     }),
     ("wheels and torques 20 ms late", |robot, sensors| {
-        robot.relaxation_m = TYRE_RELAXATION_M;
-        sensors.wheel_delay_s = 0.02;
+        set_delays(robot, sensors, [0.0, 0.0, 0.02]);
     }),
 ];
+
+/// Gives a robot on tyres that deflect delays of gyro, accelerometer, and wheels with torques, seconds.
+fn set_delays(robot: &mut Deviations, sensors: &mut SensorSpec, delays_s: [f64; 3]) {
+    robot.relaxation_m = TYRE_RELAXATION_M;
+    [
+        sensors.gyro_delay_s,
+        sensors.acceleration_delay_s,
+        sensors.wheel_delay_s,
+    ] = delays_s;
+}
 
 fn with_curve(robot: &mut Deviations, shape: Shape, mu_peak: f64) {
     robot.curve.shape = shape;
