@@ -1,18 +1,22 @@
 //! Compares the accelerometer with wheels and gyro: `a_x = v̇` and `a_y = vω`.
 //!
-//! A tilt adds a part of gravity, so only changes are compared: measured and predicted acceleration
-//! pass the same high-pass filter, and a regression with a short memory gives the gain between
-//! them.
+//! A tilt adds a part of gravity, so only changes are compared ([`Tilts`]), and a regression with a
+//! short memory gives the gain between measured and predicted changes.
+
+use nalgebra::{Matrix2x4, Matrix4, Rotation2, Vector2, Vector4};
 
 use super::history::{BIN_S, Means};
 use super::repeats::Repeats;
 use super::{Comparison, Finding, Kind, Subject, Unit};
+use crate::geometry::wrap_angle_rad;
 use crate::measured::BodyAcceleration;
 
 /// Number of bins over which the speed is differentiated.
 const BINS: usize = 4;
 /// Time constant of the high-pass filter, seconds.
 const HIGH_PASS_S: f64 = 3.0;
+/// Information on each tilt at the start, as a number of bins.
+const TILT_INFORMATION: f64 = 0.1;
 /// Time constant of the regression's memory, seconds.
 const MEMORY_S: f64 = 1.5;
 /// Minimum excitation `∫ expected² dt` for a gain, metres squared per second cubed.
@@ -45,31 +49,57 @@ const FROZEN_CHANGE_M_S2: f64 = 0.3;
 /// squared.
 const IMPOSSIBLE_M_S2: f64 = 5.0;
 
-/// Measured and predicted acceleration of one axis, low-pass and high-pass filtered, metres per
-/// second squared.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-struct Axis {
-    felt_low: f64,
-    expected_low: f64,
-    felt: f64,
-    expected: f64,
+/// Separates changes of the measured and the predicted acceleration from what tilts add.
+///
+/// A tilt relative to the robot adds a constant `b` in the body frame, a slope of the ground a constant
+/// `G` in a frame that does not turn, in which the body has the heading ψ. Both are fitted by least
+/// squares with exponential forgetting, `a = b + R(−ψ) G`, and subtracted. Without slope this is a
+/// first-order high-pass filter.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Tilts {
+    information: Matrix4<f64>,
+    /// Information times `[b, G]` of the measured and of the predicted acceleration.
+    weighted: [Vector4<f64>; 2],
 }
 
-impl Axis {
-    fn take(&mut self, comparison: Comparison) {
-        let (felt_m_s2, expected_m_s2) = (comparison.observed, comparison.predicted);
-        let share = BIN_S / HIGH_PASS_S;
-        self.felt_low += share * (felt_m_s2 - self.felt_low);
-        self.expected_low += share * (expected_m_s2 - self.expected_low);
-        self.felt = felt_m_s2 - self.felt_low;
-        self.expected = expected_m_s2 - self.expected_low;
-    }
-
-    fn comparison(self) -> Comparison {
-        Comparison {
-            observed: self.felt,
-            predicted: self.expected,
+impl Default for Tilts {
+    fn default() -> Self {
+        Self {
+            information: Matrix4::zeros(),
+            weighted: [Vector4::zeros(); 2],
         }
+    }
+}
+
+impl Tilts {
+    /// Returns the accelerations `[measured, predicted]` without tilts, each forward and left. A slope
+    /// is subtracted if there is a `heading_rad`.
+    fn remove(
+        &mut self,
+        accelerations: [Vector2<f64>; 2],
+        heading_rad: Option<f64>,
+    ) -> [Vector2<f64>; 2] {
+        let mut of_tilts = Matrix2x4::identity();
+        if let Some(heading_rad) = heading_rad {
+            let turned = Rotation2::new(-heading_rad);
+            of_tilts
+                .fixed_view_mut::<2, 2>(0, 2)
+                .copy_from(turned.matrix());
+        }
+        let keep = (-BIN_S / HIGH_PASS_S).exp();
+        self.information = self.information * keep + of_tilts.transpose() * of_tilts;
+        for (weighted, acceleration) in self.weighted.iter_mut().zip(accelerations) {
+            *weighted = *weighted * keep + of_tilts.transpose() * acceleration;
+        }
+        // On a straight path only the sum of both tilts is determined.
+        let known = self.information + Matrix4::identity() * TILT_INFORMATION;
+        let Some(factors) = known.cholesky() else {
+            return accelerations;
+        };
+        let [measured, predicted] = self
+            .weighted
+            .map(|weighted| of_tilts * factors.solve(&weighted));
+        [accelerations[0] - measured, accelerations[1] - predicted]
     }
 }
 
@@ -81,8 +111,14 @@ pub(super) struct Accelerometer {
     means: [BodyAcceleration; BINS],
     speeds_m_s: [f64; BINS + 1],
     bins: usize,
-    forward: Axis,
-    left: Axis,
+    /// Whether measured accelerations are the specific force.
+    is_specific_force: bool,
+    /// Heading since the last restart, radians.
+    heading_rad: f64,
+    tilts: Tilts,
+    /// Filtered measured and predicted acceleration.
+    forward: Comparison,
+    left: Comparison,
     /// `∫ felt·expected`, `∫ expected²`, `∫ residual²` and `∫ 1`, with exponential forgetting.
     sums: [f64; 4],
     /// Predicted acceleration, `[forward, left]`, when the measurement froze.
@@ -98,7 +134,9 @@ impl Accelerometer {
         *self = Self::default();
     }
 
-    pub(super) fn take(&mut self, felt: BodyAcceleration) {
+    /// Adds a measurement; `is_specific_force` says whether it contains gravity on a slope.
+    pub(super) fn take(&mut self, felt: BodyAcceleration, is_specific_force: bool) {
+        self.is_specific_force = is_specific_force;
         self.sum.forward_m_s2 += felt.forward_m_s2;
         self.sum.left_m_s2 += felt.left_m_s2;
         self.count += 1.0;
@@ -118,6 +156,7 @@ impl Accelerometer {
         let speed_m_s = motion.wheels.linear_m_s;
         self.verdict = None;
         self.is_healthy = false;
+        self.heading_rad = wrap_angle_rad(self.heading_rad + motion.gyro_rad_s * BIN_S);
         if self.count < 1.0 {
             self.bins = 0;
             return;
@@ -146,8 +185,15 @@ impl Accelerometer {
             observed: felt[axis],
             predicted: expected[axis],
         });
-        self.forward.take(axes[0]);
-        self.left.take(axes[1]);
+        let middle_rad = self.heading_rad - 0.5 * bins * BIN_S * motion.gyro_rad_s;
+        let heading_rad = self.is_specific_force.then_some(middle_rad);
+        let [felt, expected] = self
+            .tilts
+            .remove([felt.into(), expected.into()], heading_rad);
+        [self.forward, self.left] = [0, 1].map(|axis: usize| Comparison {
+            observed: felt[axis],
+            predicted: expected[axis],
+        });
         let gain = self.regress();
         if !repeats.is_repeating() {
             self.sign();
@@ -171,10 +217,10 @@ impl Accelerometer {
             1.0
         };
         for axis in [self.forward, self.left] {
-            let residual = axis.felt - before * axis.expected;
+            let residual = axis.observed - before * axis.predicted;
             let new = [
-                axis.felt * axis.expected,
-                axis.expected * axis.expected,
+                axis.observed * axis.predicted,
+                axis.predicted * axis.predicted,
                 residual * residual,
                 1.0,
             ];
@@ -197,15 +243,15 @@ impl Accelerometer {
 
     /// Updates the evidence that measured and predicted acceleration have opposite signs.
     fn sign(&mut self) {
-        let square = self.forward.expected.powi(2) + self.left.expected.powi(2);
+        let square = self.forward.predicted.powi(2) + self.left.predicted.powi(2);
         if square < SIGN_MIN {
             return;
         }
-        let product =
-            self.forward.felt * self.forward.expected + self.left.felt * self.left.expected;
+        let product = self.forward.observed * self.forward.predicted
+            + self.left.observed * self.left.predicted;
         let gain = (product / (square + SIGN_NOISE)).clamp(-1.0, 1.0);
         // Wheels that slip speed up while the body slows down; in a turn the signs still agree.
-        let weight = if self.forward.expected.abs() > self.left.expected.abs() {
+        let weight = if self.forward.predicted.abs() > self.left.predicted.abs() {
             SIGN_FORWARD
         } else {
             1.0
@@ -217,13 +263,13 @@ impl Accelerometer {
     fn inverted(&self) -> Option<Finding> {
         (self.inverted_s >= INVERTED_S).then(|| {
             let axis = self.stronger();
-            finding(Kind::Inverted, axis.comparison())
+            finding(Kind::Inverted, axis)
         })
     }
 
     /// Returns the axis with the larger predicted acceleration.
-    fn stronger(&self) -> Axis {
-        if self.forward.expected.abs() > self.left.expected.abs() {
+    fn stronger(&self) -> Comparison {
+        if self.forward.predicted.abs() > self.left.predicted.abs() {
             self.forward
         } else {
             self.left
@@ -242,8 +288,8 @@ impl Accelerometer {
         };
         let axis = self.stronger();
         let comparison = Comparison {
-            observed: gain * axis.expected,
-            predicted: axis.expected,
+            observed: gain * axis.predicted,
+            predicted: axis.predicted,
         };
         Some(finding(kind, comparison))
     }
@@ -280,5 +326,97 @@ fn finding(kind: Kind, comparison: Comparison) -> Finding {
         observed,
         predicted,
         unit: Unit::MetresPerSecondSquared,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::geometry::Twist;
+    use crate::robot::GRAVITY_M_S2;
+
+    /// A drive along eights on sloped ground with a tilted unit that measures the specific force.
+    #[derive(Debug, Clone, Copy)]
+    struct Drive {
+        speed_m_s: f64,
+        turn_rad_s: f64,
+        lap_s: f64,
+        slope: [f64; 2],
+        /// Offset of the unit, forward and left, metres per second squared.
+        offset_m_s2: [f64; 2],
+        gain: f64,
+    }
+
+    impl Drive {
+        /// Returns how many of the bins of a minute had a verdict, and how many were healthy.
+        fn verdicts(&self) -> (u32, u32) {
+            let mut own = Accelerometer::default();
+            let (mut heading_rad, mut last_m_s) = (0.3_f64, 0.0);
+            let (mut with_verdict, mut healthy) = (0, 0);
+            for bin in 0..1_200_u32 {
+                let time_s = f64::from(bin) * BIN_S;
+                let starts = (time_s / 2.0).min(1.0);
+                let phase = std::f64::consts::TAU * time_s / self.lap_s;
+                let motion = Twist {
+                    linear_m_s: starts * self.speed_m_s * (1.0 + 0.3 * (3.0 * phase).sin()),
+                    angular_rad_s: starts * self.turn_rad_s * (2.0 * phase.sin()).clamp(-1.0, 1.0),
+                };
+                heading_rad += motion.angular_rad_s * BIN_S;
+                let (sin, cos) = heading_rad.sin_cos();
+                let [x, y] = self.slope;
+                let forward_m_s2 = (motion.linear_m_s - last_m_s) / BIN_S;
+                last_m_s = motion.linear_m_s;
+                let of_motion = [forward_m_s2, motion.linear_m_s * motion.angular_rad_s];
+                let of_slope = [x * cos + y * sin, y * cos - x * sin];
+                let felt = [0, 1].map(|axis: usize| {
+                    self.gain * (of_motion[axis] + GRAVITY_M_S2 * of_slope[axis])
+                        + self.offset_m_s2[axis]
+                });
+                let felt = BodyAcceleration {
+                    forward_m_s2: felt[0],
+                    left_m_s2: felt[1],
+                };
+                own.take(felt, true);
+                let means = Means {
+                    gyro_rad_s: motion.angular_rad_s,
+                    wheels: motion,
+                    odometry_m_s: None,
+                };
+                own.step(&means, &Repeats::default());
+                with_verdict += u32::from(own.verdict().is_some());
+                healthy += u32::from(own.is_healthy());
+            }
+            (with_verdict, healthy)
+        }
+    }
+
+    prop_compose! {
+        fn drives()(
+            speed_m_s in 0.7..1.4_f64,
+            turn_rad_s in 0.5..1.0_f64,
+            lap_s in 8.0..20.0_f64,
+            slope in prop::array::uniform2(-0.15..0.15_f64),
+            offset_m_s2 in prop::array::uniform2(-0.3..0.3_f64),
+        ) -> Drive {
+            Drive { speed_m_s, turn_rad_s, lap_s, slope, offset_m_s2, gain: 1.0 }
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn gravity_on_a_slope_is_no_fault_of_a_unit_without_attitude(drive in drives()) {
+            let (with_verdict, healthy) = drive.verdicts();
+            prop_assert_eq!(with_verdict, 0);
+            prop_assert!(healthy > 100, "{}", healthy);
+        }
+
+        #[test]
+        fn an_inverted_unit_is_noticed_on_a_slope(drive in drives()) {
+            let (with_verdict, healthy) = Drive { gain: -1.0, ..drive }.verdicts();
+            prop_assert!(with_verdict > 100, "{}", with_verdict);
+            prop_assert_eq!(healthy, 0);
+        }
     }
 }

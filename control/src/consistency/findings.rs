@@ -150,7 +150,7 @@ pub struct Finding {
 
 /// Value of a channel and its prediction from the other channels, in metres, radians, or one of
 /// these per second.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Comparison {
     pub(super) observed: f64,
     pub(super) predicted: f64,

@@ -60,8 +60,10 @@ pub struct Sample {
     pub gyro_rad_s: Option<f64>,
     /// Measured wheel speeds.
     pub wheel_speeds: Option<WheelSpeeds>,
-    /// Acceleration without gravity, in the body frame.
+    /// Acceleration in the body frame.
     pub acceleration: Option<BodyAcceleration>,
+    /// Whether `acceleration` is the specific force, which contains gravity on a slope.
+    pub is_specific_force: bool,
     /// Forward speed of the body over ground, metres per second.
     pub odometry_m_s: Option<f64>,
     /// Position fix in the site frame; it may be older than earlier samples.
@@ -144,7 +146,7 @@ impl Monitor {
         {
             let words = [felt.forward_m_s2, felt.left_m_s2, 0.0];
             self.repeats.acceleration.take(at, words);
-            self.accelerometer.take(felt);
+            self.accelerometer.take(felt, sample.is_specific_force);
         }
         let wheels = sample.wheel_speeds.filter(|wheels| wheels.is_finite());
         if let (Some(gyro_rad_s), Some(wheels)) = (finite(sample.gyro_rad_s), wheels) {

@@ -8,7 +8,8 @@
 //! ```
 //! q is the ratio of the apparent mass to the model's: torque scale s, true mass m with payload,
 //! and inertia j of rotors and wheels at the rim. c₀ is the rolling resistance coefficient, c₁ and
-//! c₂ are the slope in the directions of heading ψ = 0 and π/2. Each row is a mean over a block.
+//! c₂ are the slope in the directions of heading ψ = 0 and π/2; with the specific force as a, which
+//! contains the slope, both are 0. Each row is a mean over a block.
 //! c₀, c₁ and c₂ are eliminated in each window, because the slope may change between windows, and
 //! the information on q is summed. Measured torques are relative to the model's mass, so q is also
 //! the factor that corrects θ from torques, except for j.

@@ -235,7 +235,13 @@ impl Estimator {
             }
             return UpdateOutcome::default();
         }
-        self.step_longitudinal(sample, dt_s);
+        let level = match &self.identification {
+            Some(identification) if sample.is_specific_force => {
+                identification.without_gravity(sample)
+            }
+            Some(_) | None => *sample,
+        };
+        self.step_longitudinal(&level, dt_s);
         let ground_changed = match &mut self.identification {
             Some(identification) => identification.update(sample, &self.noise, dt_s),
             None => false,
@@ -248,7 +254,7 @@ impl Estimator {
         if self.payload.add(sample, &self.model, &self.noise, dt_s) {
             self.begin_load();
         }
-        self.block.add(sample, &self.model, dt_s);
+        self.block.add(&level, &self.model, dt_s);
         if !self.block.is_full() {
             if self.are_offsets_due && self.block.is_half_full() {
                 // In another tick than θ, because a tick with both takes long.

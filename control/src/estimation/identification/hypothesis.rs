@@ -103,6 +103,8 @@ pub(super) struct Measured {
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Hypothesis {
     values: Values,
+    /// The same in SI units; None since they changed.
+    robot: Option<Robot<Number>>,
     model: Simulation<Number>,
     /// The same with noise added to the wheel speeds; None if they have none.
     perturbed: Option<Simulation<Number>>,
@@ -130,6 +132,7 @@ impl Hypothesis {
         values[index::STIFFNESS] = ln_stiffness;
         Self {
             values,
+            robot: None,
             model: Simulation::new(state.constants()),
             perturbed: None,
             scales: SCALES.map(Scale::new),
@@ -171,6 +174,11 @@ impl Hypothesis {
         &self.scales[self.used]
     }
 
+    fn set_values(&mut self, values: Values) {
+        self.values = values;
+        self.robot = None;
+    }
+
     /// Returns the estimated parameters, in the units of [`index`].
     pub(super) fn values(&self) -> &Values {
         &self.values
@@ -200,30 +208,38 @@ impl Hypothesis {
     }
 
     /// Advances the model by one sample and adds its outputs to the mean with the weight `share`;
-    /// likewise the model with noise, if there is a `perturbed` input. Returns the forward speed at
-    /// the sample's end, metres per second.
+    /// likewise the model with noise, if there is a `perturbed` input.
     pub(super) fn advance(
         &mut self,
         model: &RobotModel,
         input: &Input,
         perturbed: Option<&Input>,
         share: f64,
-    ) -> ChannelOutput {
-        let values = std::array::from_fn(|place| Number::parameter(self.values[place], place));
-        let robot = Robot::new(&values, model);
-        let (current, own) = (&self.model, &mut self.perturbed);
-        if perturbed.is_none() {
-            // Noise that is none for a time begins with the state of the robot of then.
-            *own = None;
-        }
-        let perturbed = perturbed.map(|input| {
-            let own = own.get_or_insert_with(|| current.clone());
-            Predicted::of(&own.advance(&robot, input, share))
+    ) {
+        let values = &self.values;
+        let robot = self.robot.get_or_insert_with(|| {
+            let numbers = std::array::from_fn(|place| Number::parameter(values[place], place));
+            Robot::new(&numbers, model)
         });
-        ChannelOutput {
-            output: Predicted::of(&self.model.advance(&robot, input, share)),
-            perturbed,
+        match perturbed {
+            Some(input) => {
+                let own = self.perturbed.get_or_insert_with(|| self.model.clone());
+                own.advance(robot, input, share);
+            }
+            // Noise that is none for a time begins with the state of the robot of then.
+            None => self.perturbed = None,
         }
+        self.model.advance(robot, input, share);
+    }
+
+    /// Returns the forward speed at the end of the last sample, metres per second; None before the
+    /// first one.
+    pub(super) fn forward_speed(&self) -> Option<ChannelOutput> {
+        let of = |own: &Simulation<Number>| own.forward_m_s().map(Predicted::of);
+        of(&self.model).map(|output| ChannelOutput {
+            output,
+            perturbed: self.perturbed.as_ref().and_then(of),
+        })
     }
 
     /// Returns the mean outputs since the last call, `compared_s` seconds ago, in the order of the
@@ -309,7 +325,7 @@ impl Hypothesis {
             .max(step[index::STIFFNESS].abs() / STEP_MAX)
             .max(1.0);
         let before = self.values;
-        self.values = in_range(before + step, prior);
+        self.set_values(in_range(before + step, prior));
         let step = self.values - before;
         for own in std::iter::once(&mut self.model).chain(&mut self.perturbed) {
             own.shift(&step);
@@ -410,7 +426,7 @@ impl Hypothesis {
             self.last_kept = 1.0;
         }
         if let Some(values) = self.solve(prior) {
-            self.values = in_range(values, prior);
+            self.set_values(in_range(values, prior));
         }
     }
 

@@ -28,11 +28,12 @@ mod wheel_noise;
 
 use super::{EstimatorPrior, GAP_MAX_S, IdentifiedRobot, SensorNoise, SensorSample};
 use crate::geometry::Twist;
+use crate::measured::BodyAcceleration;
 use crate::robot::RobotModel;
 
 use change::{COMPARED, ChangeMonitor, Explained, Motion};
 use hypothesis::{Hypothesis, Measured};
-use model::{CHANNELS, Input, State};
+use model::{CHANNELS, Input, State, gravity_m_s2};
 use parameters::{Prior, index};
 use wheel_noise::WheelNoise;
 
@@ -241,6 +242,22 @@ impl Identification {
         self.is_moving = false;
     }
 
+    /// Returns the sample with its acceleration without gravity, by the estimated slope.
+    pub(super) fn without_gravity(&self, sample: &SensorSample) -> SensorSample {
+        let slope = self.best().map_or([0.0; 2], |best| {
+            [index::SLOPE_X, index::SLOPE_Y].map(|place| best.values()[place])
+        });
+        let [forward_m_s2, left_m_s2] = gravity_m_s2(slope, self.heading_rad);
+        SensorSample {
+            acceleration: sample.acceleration.map(|felt| BodyAcceleration {
+                forward_m_s2: felt.forward_m_s2 + forward_m_s2,
+                left_m_s2: felt.left_m_s2 + left_m_s2,
+            }),
+            is_specific_force: false,
+            ..*sample
+        }
+    }
+
     fn clear_sums(&mut self) {
         self.sums = [0.0; CHANNELS - 1];
         self.measured_s = [0.0; CHANNELS - 1];
@@ -322,9 +339,9 @@ impl Identification {
             square_min,
         });
         for hypothesis in &mut self.hypotheses {
-            let forward = hypothesis.advance(&self.model, &input, perturbed.as_ref(), share);
-            if let Some(speed) = speed {
-                hypothesis.compare(&forward, speed);
+            hypothesis.advance(&self.model, &input, perturbed.as_ref(), share);
+            if let Some((measured, output)) = speed.zip(hypothesis.forward_speed()) {
+                hypothesis.compare(&output, measured);
             }
         }
         self.change.advance(&input, share);

@@ -134,18 +134,17 @@ struct Forces<T> {
     sides_n: [T; 2],
 }
 
-impl<T: Real> Robot<T> {
-    /// Returns gravity's component along the sloped ground, body frame, forward and left, metres
-    /// per second squared.
-    fn gravity_m_s2(&self, heading_rad: f64) -> [T; 2] {
-        let (sin, cos) = heading_rad.sin_cos();
-        let [x, y] = self.slope;
-        [
-            (x * cos + y * sin) * -GRAVITY_M_S2,
-            (y * cos - x * sin) * -GRAVITY_M_S2,
-        ]
-    }
+/// Returns gravity's component along ground of this slope, along the axes of the frame in which the
+/// body has this heading, in the body frame, forward and left, metres per second squared.
+pub(super) fn gravity_m_s2<T: Real>([x, y]: [T; 2], heading_rad: f64) -> [T; 2] {
+    let (sin, cos) = heading_rad.sin_cos();
+    [
+        (x * cos + y * sin) * -GRAVITY_M_S2,
+        (y * cos - x * sin) * -GRAVITY_M_S2,
+    ]
+}
 
+impl<T: Real> Robot<T> {
     /// Returns the contacts with their loads, those of a rigid body on four equal springs.
     fn contacts(&self, gravity: [T; 2], input: &Input) -> [Contact<T>; 4] {
         let [forward_m, left_m, height_m] = self.centre_m;
@@ -251,7 +250,7 @@ impl<T: Real> Robot<T> {
     /// Advances the state by the time of one sample and returns what the sensors would measure.
     /// Deflections lead speeds by half a step (leapfrog integration).
     pub(super) fn advance(&self, state: &mut State<T>, input: &Input) -> Output<T> {
-        let gravity = self.gravity_m_s2(input.heading_rad);
+        let gravity = gravity_m_s2(self.slope, input.heading_rad);
         let contacts = self.contacts(gravity, input);
         #[expect(
             clippy::cast_possible_truncation,

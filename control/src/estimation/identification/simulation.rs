@@ -21,8 +21,9 @@ pub(super) struct Simulation<T> {
     pub(super) state: State<T>,
     /// Weighted sum of outputs since the last comparison.
     mean: Output<T>,
-    /// Turn rate and accelerations of the last sample, and those at the last comparison.
-    newest: Option<Delayed<T>>,
+    /// Outputs of the last sample.
+    newest: Option<Output<T>>,
+    /// Outputs of the last sample before the last comparison.
     compared: Option<Delayed<T>>,
 }
 
@@ -102,10 +103,9 @@ impl<T: Real> Simulation<T> {
         }
     }
 
-    /// Advances the robot by one sample and adds its outputs with the weight `share`. Returns the
-    /// forward speed at the sample's end, metres per second.
-    pub(super) fn advance(&mut self, robot: &Robot<T>, input: &Input, share: f64) -> T {
-        let output = robot.advance(&mut self.state, input);
+    /// Advances the robot by one sample and adds its outputs with the weight `share`.
+    pub(super) fn advance(&mut self, robot: &Robot<T>, input: &Input, share: f64) {
+        let output = self.newest.insert(robot.advance(&mut self.state, input));
         let add = |mean: &mut T, value: T| *mean = *mean + value * share;
         add(&mut self.mean.turn_rad_s, output.turn_rad_s);
         for axis in 0..2 {
@@ -115,16 +115,23 @@ impl<T: Real> Simulation<T> {
             );
             add(&mut self.mean.torques_n_m[axis], output.torques_n_m[axis]);
         }
-        let [forward, left] = output.acceleration_m_s2;
-        self.newest = Some([output.turn_rad_s, forward, left]);
-        output.forward_m_s
+    }
+
+    /// Returns the forward speed at the last sample's end, metres per second; None before the first
+    /// sample.
+    pub(super) fn forward_m_s(&self) -> Option<&T> {
+        self.newest.as_ref().map(|output| &output.forward_m_s)
     }
 
     /// Returns the outputs since the last call, `compared_s` seconds ago, and begins anew. They were
     /// weighted by [`COMPARED_S`].
     pub(super) fn take_outputs(&mut self, compared_s: f64) -> Outputs<T> {
-        let before = std::mem::replace(&mut self.compared, self.newest);
-        let rates = match (self.newest, before) {
+        let newest = self.newest.as_ref().map(|output| {
+            let [forward, left] = output.acceleration_m_s2;
+            [output.turn_rad_s, forward, left]
+        });
+        let before = std::mem::replace(&mut self.compared, newest);
+        let rates = match (newest, before) {
             (Some(newest), Some(before)) => {
                 std::array::from_fn(|place| (newest[place] - before[place]) * compared_s.recip())
             }

@@ -137,6 +137,7 @@ impl Sensing {
             gyro_rad_s: sample.yaw_rate_rad_s,
             wheel_speeds: sample.wheel_speeds,
             acceleration: sample.acceleration,
+            is_specific_force: sample.is_specific_force,
             odometry_m_s: sample.body_speed_m_s,
             position: sample.position,
             position_noise: sample.position_noise,
