@@ -47,6 +47,8 @@ pub enum ProblemType {
     AlreadyExists,
     #[serde(rename = "/problems/beyond-limits")]
     BeyondLimits,
+    #[serde(rename = "/problems/turn-too-sharp")]
+    TurnTooSharp,
     #[serde(rename = "/problems/mission-ended")]
     MissionEnded,
     #[serde(rename = "/problems/mission-state")]
@@ -121,7 +123,7 @@ pub enum ProblemType {
 
 impl ProblemType {
     /// Every problem type.
-    pub const ALL: [Self; 52] = [
+    pub const ALL: [Self; 53] = [
         Self::MalformedBody,
         Self::InvalidBody,
         Self::UnknownField,
@@ -139,6 +141,7 @@ impl ProblemType {
         Self::UnknownMission,
         Self::AlreadyExists,
         Self::BeyondLimits,
+        Self::TurnTooSharp,
         Self::MissionEnded,
         Self::MissionState,
         Self::RobotBusy,
@@ -196,6 +199,7 @@ impl ProblemType {
             Self::UnknownMission => "The mission is not known",
             Self::AlreadyExists => "The identifier is in use",
             Self::BeyondLimits => "The request is impossible for this robot",
+            Self::TurnTooSharp => "The path turns too sharply",
             Self::MissionEnded => "The mission has ended",
             Self::MissionState => "The mission's present state does not allow this",
             Self::RobotBusy => "The robot has another mission",

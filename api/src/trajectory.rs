@@ -11,7 +11,7 @@ pub use self::check::{
     Place, PlannedPath, StartSource, THETA_ASSUMED, TrajectoryCheck,
 };
 pub use self::rules::InvalidTrajectory;
-use self::rules::{CircleFields, WaypointsFields, is_speed};
+use self::rules::{CircleFields, WaypointsFields};
 use crate::geometry::{Point, Pose};
 
 /// Minimum number of waypoints of a path.
@@ -125,7 +125,11 @@ pub struct Waypoints {
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, ToSchema)]
 pub struct TrajectoryOptions {
     /// Speed of the approach to the trajectory, m/s; the speed of the trajectory when absent.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(
+        default,
+        skip_serializing_if = "Option::is_none",
+        deserialize_with = "rules::read_approach_speed"
+    )]
     #[schema(minimum = 0.01, maximum = 50.0)]
     pub approach_speed_m_s: Option<f64>,
     /// Excitation: variation of the speed along the path, so that friction is measurable without
@@ -136,7 +140,11 @@ pub struct TrajectoryOptions {
     /// stands within 5 cm and 0.1 rad of it plans from it, so that the plan is that of the dry run:
     /// of two approaches of similar length, millimetres decide otherwise. No effect when absent, or
     /// if the robot stands elsewhere.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(
+        default,
+        skip_serializing_if = "Option::is_none",
+        deserialize_with = "rules::read_expected_start"
+    )]
     pub expected_start: Option<Pose>,
 }
 
@@ -145,11 +153,17 @@ pub struct TrajectoryOptions {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Excitation {
     /// Maximum decrease of the speed, as a ratio of it; less where the robot's limits require it.
-    #[serde(default = "default_depth")]
+    #[serde(
+        default = "default_depth",
+        deserialize_with = "rules::read_excitation_depth"
+    )]
     #[schema(exclusive_minimum = 0.0, maximum = 0.8, default = 0.5)]
     pub depth_ratio: f64,
     /// Period of the variation, seconds.
-    #[serde(default = "default_period")]
+    #[serde(
+        default = "default_period",
+        deserialize_with = "rules::read_excitation_period"
+    )]
     #[schema(minimum = 1.0, maximum = 20.0, default = 3.0)]
     pub period_s: f64,
 }
@@ -195,30 +209,13 @@ impl TrajectoryOptions {
     /// # Errors
     /// [`InvalidTrajectory`] names the first option that is not.
     pub fn validate(&self) -> Result<(), InvalidTrajectory> {
-        if let Some(speed_m_s) = self
-            .approach_speed_m_s
-            .filter(|&speed_m_s| !is_speed(speed_m_s))
-        {
-            return Err(InvalidTrajectory::ApproachSpeed(speed_m_s));
-        }
-        let is_pose = |pose: &Pose| {
-            pose.position().is_on_the_map() && pose.heading_rad.abs() <= std::f64::consts::TAU
-        };
-        if !self.expected_start.as_ref().is_none_or(is_pose) {
-            return Err(InvalidTrajectory::ExpectedStart);
-        }
+        rules::check_approach_speed(self.approach_speed_m_s)?;
+        rules::check_expected_start(self.expected_start)?;
         let Some(excitation) = self.excitation else {
             return Ok(());
         };
-        let depth = excitation.depth_ratio;
-        if !(depth > 0.0 && depth <= EXCITATION_DEPTH_MAX) {
-            return Err(InvalidTrajectory::ExcitationDepth(depth));
-        }
-        let period_s = excitation.period_s;
-        if !(EXCITATION_PERIOD_MIN_S..=EXCITATION_PERIOD_MAX_S).contains(&period_s) {
-            return Err(InvalidTrajectory::ExcitationPeriod(period_s));
-        }
-        Ok(())
+        rules::check_excitation_depth(excitation.depth_ratio)?;
+        rules::check_excitation_period(excitation.period_s)
     }
 }
 

@@ -1,6 +1,13 @@
 //! Validity rules of trajectories, applied to every field when a trajectory is read.
+//!
+//! A rule about one field is applied while that field is read, so that the parser's error has the
+//! field's path.
 
-use serde::Deserialize;
+use std::f64::consts::TAU;
+use std::fmt;
+
+use serde::de::{DeserializeSeed, Error as _, SeqAccess, Visitor};
+use serde::{Deserialize, Deserializer};
 
 use super::{
     Circle, Direction, EXCITATION_DEPTH_MAX, EXCITATION_PERIOD_MAX_S, EXCITATION_PERIOD_MIN_S,
@@ -8,7 +15,7 @@ use super::{
     TrajectoryOptions, WAYPOINT_SPACING_MIN_M, WAYPOINTS_MAX, WAYPOINTS_MIN, Waypoint, Waypoints,
     one_turn,
 };
-use crate::geometry::{COORDINATE_MAX_M, Point};
+use crate::geometry::{COORDINATE_MAX_M, Point, Pose};
 
 /// Reason why a trajectory is invalid for every robot.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -71,8 +78,102 @@ pub enum InvalidTrajectory {
     DuplicatePoint(usize),
 }
 
-pub(super) fn is_speed(speed_m_s: f64) -> bool {
+fn is_speed(speed_m_s: f64) -> bool {
     (SPEED_MIN_M_S..=SPEED_MAX_M_S).contains(&speed_m_s)
+}
+
+fn check_center(center: Point) -> Result<(), InvalidTrajectory> {
+    if center.is_on_the_map() {
+        Ok(())
+    } else {
+        Err(InvalidTrajectory::Center)
+    }
+}
+
+fn check_radius(radius_m: f64) -> Result<(), InvalidTrajectory> {
+    if (RADIUS_MIN_M..=RADIUS_MAX_M).contains(&radius_m) {
+        Ok(())
+    } else {
+        Err(InvalidTrajectory::Radius(radius_m))
+    }
+}
+
+fn check_turns(turns: f64) -> Result<(), InvalidTrajectory> {
+    if (TURNS_MIN..=TURNS_MAX).contains(&turns) {
+        Ok(())
+    } else {
+        Err(InvalidTrajectory::Turns(turns))
+    }
+}
+
+fn check_speed(speed_m_s: f64) -> Result<(), InvalidTrajectory> {
+    if is_speed(speed_m_s) {
+        Ok(())
+    } else {
+        Err(InvalidTrajectory::Speed(speed_m_s))
+    }
+}
+
+fn check_given_speed(speed_m_s: Option<f64>) -> Result<(), InvalidTrajectory> {
+    speed_m_s.map_or(Ok(()), check_speed)
+}
+
+pub(super) fn check_approach_speed(speed_m_s: Option<f64>) -> Result<(), InvalidTrajectory> {
+    match speed_m_s.filter(|&speed_m_s| !is_speed(speed_m_s)) {
+        Some(speed_m_s) => Err(InvalidTrajectory::ApproachSpeed(speed_m_s)),
+        None => Ok(()),
+    }
+}
+
+pub(super) fn check_expected_start(start: Option<Pose>) -> Result<(), InvalidTrajectory> {
+    let is_pose = |pose: Pose| pose.position().is_on_the_map() && pose.heading_rad.abs() <= TAU;
+    if start.is_none_or(is_pose) {
+        Ok(())
+    } else {
+        Err(InvalidTrajectory::ExpectedStart)
+    }
+}
+
+pub(super) fn check_excitation_depth(depth_ratio: f64) -> Result<(), InvalidTrajectory> {
+    if depth_ratio > 0.0 && depth_ratio <= EXCITATION_DEPTH_MAX {
+        Ok(())
+    } else {
+        Err(InvalidTrajectory::ExcitationDepth(depth_ratio))
+    }
+}
+
+pub(super) fn check_excitation_period(period_s: f64) -> Result<(), InvalidTrajectory> {
+    if (EXCITATION_PERIOD_MIN_S..=EXCITATION_PERIOD_MAX_S).contains(&period_s) {
+        Ok(())
+    } else {
+        Err(InvalidTrajectory::ExcitationPeriod(period_s))
+    }
+}
+
+impl Waypoint {
+    /// Checks this point of a path; `before` are all points before it.
+    fn check_after(&self, before: &[Self]) -> Result<(), InvalidTrajectory> {
+        let index = before.len();
+        let position = self.position();
+        if !position.is_on_the_map() {
+            return Err(InvalidTrajectory::PointOffTheMap(index));
+        }
+        if self
+            .heading_rad
+            .is_some_and(|heading_rad| !heading_rad.is_finite())
+        {
+            return Err(InvalidTrajectory::PointHeading(index));
+        }
+        if let Some(speed_m_s) = self.speed_m_s.filter(|&speed_m_s| !is_speed(speed_m_s)) {
+            return Err(InvalidTrajectory::PointSpeed { index, speed_m_s });
+        }
+        let is_near =
+            |previous: &Self| previous.position().distance_m(position) < WAYPOINT_SPACING_MIN_M;
+        if before.last().is_some_and(is_near) {
+            return Err(InvalidTrajectory::DuplicatePoint(index));
+        }
+        Ok(())
+    }
 }
 
 impl Circle {
@@ -81,22 +182,13 @@ impl Circle {
     /// # Errors
     /// [`InvalidTrajectory`] names the first field that is not.
     pub fn validate(&self) -> Result<(), InvalidTrajectory> {
-        if !self.center.is_on_the_map() {
-            return Err(InvalidTrajectory::Center);
-        }
-        if !(RADIUS_MIN_M..=RADIUS_MAX_M).contains(&self.radius_m) {
-            return Err(InvalidTrajectory::Radius(self.radius_m));
-        }
-        if !(TURNS_MIN..=TURNS_MAX).contains(&self.turns) {
-            return Err(InvalidTrajectory::Turns(self.turns));
-        }
+        check_center(self.center)?;
+        check_radius(self.radius_m)?;
+        check_turns(self.turns)?;
         if self.speed_m_s.is_some() == self.period_s.is_some() {
             return Err(InvalidTrajectory::SpeedOrPeriod);
         }
-        let speed_m_s = self.speed_m_s();
-        if !is_speed(speed_m_s) {
-            return Err(InvalidTrajectory::Speed(speed_m_s));
-        }
+        check_speed(self.speed_m_s())?;
         self.options.validate()
     }
 }
@@ -111,29 +203,9 @@ impl Waypoints {
         if !(WAYPOINTS_MIN..=WAYPOINTS_MAX).contains(&count) {
             return Err(InvalidTrajectory::PointCount(count));
         }
-        if !is_speed(self.speed_m_s) {
-            return Err(InvalidTrajectory::Speed(self.speed_m_s));
-        }
-        let mut previous: Option<Point> = None;
+        check_speed(self.speed_m_s)?;
         for (index, point) in self.points.iter().enumerate() {
-            let position = point.position();
-            if !position.is_on_the_map() {
-                return Err(InvalidTrajectory::PointOffTheMap(index));
-            }
-            if point
-                .heading_rad
-                .is_some_and(|heading_rad| !heading_rad.is_finite())
-            {
-                return Err(InvalidTrajectory::PointHeading(index));
-            }
-            if let Some(speed_m_s) = point.speed_m_s.filter(|&speed_m_s| !is_speed(speed_m_s)) {
-                return Err(InvalidTrajectory::PointSpeed { index, speed_m_s });
-            }
-            let near = |before: Point| before.distance_m(position) < WAYPOINT_SPACING_MIN_M;
-            if previous.is_some_and(near) {
-                return Err(InvalidTrajectory::DuplicatePoint(index));
-            }
-            previous = Some(position);
+            point.check_after(&self.points[..index])?;
         }
         self.options.validate()
     }
@@ -162,17 +234,116 @@ impl Trajectory {
     }
 }
 
+/// Reads a value that a check allows.
+fn checked<'de, D, T>(
+    deserializer: D,
+    check: impl FnOnce(T) -> Result<(), InvalidTrajectory>,
+) -> Result<T, D::Error>
+where
+    D: Deserializer<'de>,
+    T: Deserialize<'de> + Copy,
+{
+    let value = T::deserialize(deserializer)?;
+    check(value).map_err(D::Error::custom)?;
+    Ok(value)
+}
+
+fn read_center<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Point, D::Error> {
+    checked(deserializer, check_center)
+}
+
+fn read_radius<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+    checked(deserializer, check_radius)
+}
+
+fn read_turns<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+    checked(deserializer, check_turns)
+}
+
+fn read_speed<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+    checked(deserializer, check_speed)
+}
+
+fn read_given_speed<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<f64>, D::Error> {
+    checked(deserializer, check_given_speed)
+}
+
+pub(super) fn read_approach_speed<'de, D: Deserializer<'de>>(
+    deserializer: D,
+) -> Result<Option<f64>, D::Error> {
+    checked(deserializer, check_approach_speed)
+}
+
+pub(super) fn read_expected_start<'de, D: Deserializer<'de>>(
+    deserializer: D,
+) -> Result<Option<Pose>, D::Error> {
+    checked(deserializer, check_expected_start)
+}
+
+pub(super) fn read_excitation_depth<'de, D: Deserializer<'de>>(
+    deserializer: D,
+) -> Result<f64, D::Error> {
+    checked(deserializer, check_excitation_depth)
+}
+
+pub(super) fn read_excitation_period<'de, D: Deserializer<'de>>(
+    deserializer: D,
+) -> Result<f64, D::Error> {
+    checked(deserializer, check_excitation_period)
+}
+
+/// Reads the points of a path one by one.
+fn read_points<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<Waypoint>, D::Error> {
+    deserializer.deserialize_seq(Points)
+}
+
+/// Points of a path, each of which is checked as it is read.
+struct Points;
+
+impl<'de> Visitor<'de> for Points {
+    type Value = Vec<Waypoint>;
+
+    fn expecting(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str("a sequence")
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut sequence: A) -> Result<Vec<Waypoint>, A::Error> {
+        let mut points: Vec<Waypoint> = Vec::new();
+        while let Some(point) = sequence.next_element_seed(NextPoint { before: &points })? {
+            points.push(point);
+        }
+        Ok(points)
+    }
+}
+
+/// The point of a path that follows these.
+struct NextPoint<'a> {
+    before: &'a [Waypoint],
+}
+
+impl<'de> DeserializeSeed<'de> for NextPoint<'_> {
+    type Value = Waypoint;
+
+    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<Waypoint, D::Error> {
+        let point = Waypoint::deserialize(deserializer)?;
+        point.check_after(self.before).map_err(D::Error::custom)?;
+        Ok(point)
+    }
+}
+
 #[derive(Deserialize)]
 pub(super) struct CircleFields {
+    #[serde(deserialize_with = "read_center")]
     center: Point,
+    #[serde(deserialize_with = "read_radius")]
     radius_m: f64,
-    #[serde(default)]
+    #[serde(default, deserialize_with = "read_given_speed")]
     speed_m_s: Option<f64>,
     #[serde(default)]
     period_s: Option<f64>,
     #[serde(default)]
     direction: Direction,
-    #[serde(default = "one_turn")]
+    #[serde(default = "one_turn", deserialize_with = "read_turns")]
     turns: f64,
     #[serde(default)]
     options: TrajectoryOptions,
@@ -207,7 +378,9 @@ impl TryFrom<CircleFields> for Circle {
 
 #[derive(Deserialize)]
 pub(super) struct WaypointsFields {
+    #[serde(deserialize_with = "read_points")]
     points: Vec<Waypoint>,
+    #[serde(deserialize_with = "read_speed")]
     speed_m_s: f64,
     #[serde(default)]
     options: TrajectoryOptions,

@@ -270,6 +270,10 @@ const NEXT_STEPS: &[(ProblemType, &str)] = &[
         "change the trajectory; the same command with --check shows its plan",
     ),
     (
+        ProblemType::TurnTooSharp,
+        "move the points apart, or enlarge the radius; the same command with --check shows its plan",
+    ),
+    (
         ProblemType::CrossesGeofence,
         "`tread geofence` shows the areas that robots may use",
     ),
@@ -441,6 +445,7 @@ mod tests {
             (ProblemType::ChangedMeanwhile, 412, Exit::Conflict),
             (ProblemType::RobotsDoNotJoin, 409, Exit::Conflict),
             (ProblemType::BeyondLimits, 422, Exit::Refused),
+            (ProblemType::TurnTooSharp, 422, Exit::Refused),
             (ProblemType::RobotUnreachable, 503, Exit::Unreachable),
         ] {
             let error = refused(kind, status);

@@ -1,10 +1,42 @@
 //! Errors of planning a trajectory.
 
+use std::fmt;
+
 use thiserror::Error;
 
 use super::{LENGTH_MAX_M, WAYPOINTS_MAX};
 use crate::excitation::ExcitationError;
 use crate::path::RADIUS_MIN_M;
+
+/// Value that a plan is made from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum PlanValue {
+    /// Traction limit of the ground.
+    TractionLimit,
+    /// Pose from which the robot starts.
+    StartPose,
+    /// Centre of a circle.
+    Center,
+    /// Position of a waypoint.
+    Position,
+    /// Heading of a waypoint.
+    Heading,
+    /// Speed of a trajectory, of a waypoint or of the approach.
+    Speed,
+}
+
+impl fmt::Display for PlanValue {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str(match self {
+            Self::TractionLimit => "the traction limit",
+            Self::StartPose => "the start pose",
+            Self::Center => "the centre",
+            Self::Position => "the position",
+            Self::Heading => "the heading",
+            Self::Speed => "the speed",
+        })
+    }
+}
 
 /// Reason why a trajectory cannot be planned. Indices count from zero.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
@@ -13,8 +45,8 @@ pub enum PlanError {
     /// traction limit not above zero.
     #[error("{what}{} is not a usable number: {value}", at(*waypoint))]
     NotFinite {
-        /// Name of the value.
-        what: &'static str,
+        /// The value.
+        what: PlanValue,
         /// Index of the waypoint; `None` for a value of a circle, of the start or of an option.
         waypoint: Option<usize>,
         /// Rejected value.

@@ -21,7 +21,7 @@ use crate::profile::{NodeLimits, ProfileInput, SpeedProfile};
 use crate::robot::RobotModel;
 use crate::trajectory::{CircleSpec, Trajectory, WaypointsSpec};
 
-pub use error::PlanError;
+pub use error::{PlanError, PlanValue};
 pub use slowed::{SLOWED_MAX, Slowed, SlowedBy};
 pub use traction_limit::{TractionLimitCell, TractionLimitMap, TractionLimitMapSpec};
 
@@ -149,7 +149,7 @@ impl Plan {
         let limited = match options.least_traction_limit_mu() {
             Some(mu) if !(mu.is_finite() && mu > 0.0) => {
                 return Err(PlanError::NotFinite {
-                    what: "the traction limit",
+                    what: PlanValue::TractionLimit,
                     waypoint: None,
                     value: mu,
                 });
@@ -161,10 +161,10 @@ impl Plan {
             limited: &limited,
             unlimited: model,
         };
-        check_coordinate("the start pose", None, start.point())?;
+        check_coordinate(PlanValue::StartPose, None, start.point())?;
         if !start.heading_rad.is_finite() {
             return Err(PlanError::NotFinite {
-                what: "the start pose",
+                what: PlanValue::StartPose,
                 waypoint: None,
                 value: start.heading_rad,
             });
@@ -182,7 +182,7 @@ impl Plan {
         options: &PlanOptions<'_>,
     ) -> Result<Self, PlanError> {
         let model = models.limited;
-        check_coordinate("the centre", None, circle.center)?;
+        check_coordinate(PlanValue::Center, None, circle.center)?;
         if !(circle.radius_m >= RADIUS_MIN_M && circle.radius_m <= COORDINATE_MAX_M) {
             return Err(PlanError::Radius(circle.radius_m));
         }
@@ -246,10 +246,10 @@ impl Plan {
         }
         check_speed(spec.speed_m_s, None, model)?;
         for (place, waypoint) in points.iter().enumerate() {
-            check_coordinate("the position", Some(place), waypoint.point)?;
+            check_coordinate(PlanValue::Position, Some(place), waypoint.point)?;
             if let Some(heading_rad) = waypoint.heading_rad.filter(|value| !value.is_finite()) {
                 return Err(PlanError::NotFinite {
-                    what: "the heading",
+                    what: PlanValue::Heading,
                     waypoint: Some(place),
                     value: heading_rad,
                 });
@@ -545,7 +545,7 @@ impl Plan {
 }
 
 fn check_coordinate(
-    what: &'static str,
+    what: PlanValue,
     waypoint: Option<usize>,
     point: Point,
 ) -> Result<(), PlanError> {
@@ -577,7 +577,7 @@ fn check_speed(
 ) -> Result<(), PlanError> {
     if !speed_m_s.is_finite() {
         return Err(PlanError::NotFinite {
-            what: "the speed",
+            what: PlanValue::Speed,
             waypoint,
             value: speed_m_s,
         });

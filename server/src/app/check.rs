@@ -2,6 +2,7 @@
 
 mod conversion;
 mod drawn;
+mod refused;
 mod start;
 mod traction;
 
@@ -19,13 +20,14 @@ use tread_control::estimation::{SensorNoise, expected_accuracy};
 use tread_control::excitation::Excitation;
 use tread_control::fence::{Fence, MARGIN_M, disc_radius_m};
 use tread_control::geometry as control;
-use tread_control::plan::{Plan, PlanError, Slowed, SlowedBy};
+use tread_control::plan::{Plan, Slowed, SlowedBy};
 use tread_control::robot;
 use tread_control::trajectory as planned;
 
 pub(super) use self::conversion::{control_fence, control_model};
 use self::conversion::{control_trajectory, plan_options};
 pub(super) use self::drawn::drawn;
+pub(super) use self::refused::Refused;
 pub(super) use self::start::Place as StartPlace;
 use self::start::{Earlier, Start, after, earlier};
 use self::traction::Traction;
@@ -48,7 +50,8 @@ impl App {
     /// missions, unless the request gives a pose.
     ///
     /// # Errors
-    /// [`AppError::Impossible`] names place and reason; site and robot must be known.
+    /// [`AppError::Impossible`], [`AppError::TurnTooSharp`] and [`AppError::CrossesGeofence`] name
+    /// reason and place; site and robot must be known.
     pub async fn check_trajectory(
         &self,
         request: CheckTrajectory,
@@ -136,6 +139,7 @@ impl App {
             Err(_panic) => Err(AppError::Impossible {
                 robot,
                 detail: "the planner broke on it".to_owned(),
+                field: None,
                 place: None,
             }),
         }
@@ -275,36 +279,6 @@ struct AssumedGround {
     has_torque: bool,
 }
 
-/// Reason why a trajectory cannot be driven, and the place.
-pub(super) struct Refused {
-    detail: String,
-    place: Option<Place>,
-    /// Whether the reason is that it leaves the geofence.
-    crosses: bool,
-}
-
-impl Refused {
-    pub(super) fn of(self, robot: RobotId) -> AppError {
-        let Self {
-            detail,
-            place,
-            crosses,
-        } = self;
-        match place {
-            Some(place) if crosses => AppError::CrossesGeofence {
-                robot,
-                detail,
-                place,
-            },
-            place => AppError::Impossible {
-                robot,
-                detail,
-                place,
-            },
-        }
-    }
-}
-
 /// A plan and the robot model that it was made for.
 pub(super) struct Planned {
     model: robot::RobotModel,
@@ -326,11 +300,7 @@ pub(super) fn planned(
     }: Planning<'_>,
     start: Pose,
 ) -> Result<Planned, Refused> {
-    let model = control_model(model).map_err(|error| Refused {
-        detail: error.to_string(),
-        place: None,
-        crosses: false,
-    })?;
+    let model = control_model(model).map_err(|error| Refused::always(error.to_string()))?;
     let start = trajectory.options().planning_start(start);
     let from = control::Pose {
         x_m: start.x_m,
@@ -339,11 +309,7 @@ pub(super) fn planned(
     };
     let options = traction.limiting(&plan_options(trajectory));
     let plan = Plan::with_options(&control_trajectory(trajectory), from, &model, &options)
-        .map_err(|error| Refused {
-            detail: error.to_string(),
-            place: place_of(error, trajectory),
-            crosses: false,
-        })?;
+        .map_err(|error| Refused::unplanned(error, trajectory))?;
     Ok(Planned { model, plan })
 }
 
@@ -428,15 +394,12 @@ fn fenced(
                  where robots may be",
                 point.x_m, point.y_m, -spare_m
             );
-            return Err(Refused {
-                detail,
-                place: Some(Place {
-                    arc_m: Some(arc_m),
-                    waypoint: None,
-                    point,
-                }),
-                crosses: true,
-            });
+            let place = Place {
+                arc_m: Some(arc_m),
+                waypoint: None,
+                point,
+            };
+            return Err(Refused::outside(detail, place));
         }
         arc_m += spare_m.max(step_min_m);
     }
@@ -467,33 +430,5 @@ fn binding(plan: &Plan, slowed: &Slowed) -> Binding {
         from: place(slowed.from_m),
         to: place(slowed.to_m),
         speed_min_m_s: slowed.speed_min_m_s,
-    }
-}
-
-fn place_of(error: PlanError, trajectory: &Trajectory) -> Option<Place> {
-    let waypoint = match error {
-        PlanError::DuplicateWaypoint { waypoint } => Some(waypoint),
-        PlanError::NotFinite { waypoint, .. }
-        | PlanError::SpeedNotPositive { waypoint, .. }
-        | PlanError::SpeedAboveLimit { waypoint, .. }
-        | PlanError::TooTight { waypoint } => waypoint,
-        PlanError::Radius(_)
-        | PlanError::Turns(_)
-        | PlanError::TooFewWaypoints(_)
-        | PlanError::TooManyWaypoints(_)
-        | PlanError::TooLong(_)
-        | PlanError::Excitation(_) => return None,
-    };
-    match trajectory {
-        Trajectory::Circle(circle) => Some(Place {
-            arc_m: None,
-            waypoint: None,
-            point: circle.center,
-        }),
-        Trajectory::Waypoints(waypoints) => waypoints.points.get(waypoint?).map(|point| Place {
-            arc_m: None,
-            waypoint,
-            point: point.position(),
-        }),
     }
 }

@@ -42,6 +42,8 @@ pub enum AppError {
         robot: RobotId,
         /// Which limit.
         detail: String,
+        /// Path of the value in the request's body, if it is a single one.
+        field: Option<Box<str>>,
     },
     /// The mission has ended and cannot be changed.
     #[error("mission `{id}` has ended: it is {}", state.as_str())]
@@ -89,7 +91,19 @@ pub enum AppError {
         robot: RobotId,
         /// Why.
         detail: String,
+        /// Path of the value at fault in the request's body, if it is a single one.
+        field: Option<Box<str>>,
         /// Where.
+        place: Option<Place>,
+    },
+    /// The trajectory turns more sharply than any robot can.
+    #[error("robot `{robot}` cannot drive this: {detail}")]
+    TurnTooSharp {
+        /// The robot.
+        robot: RobotId,
+        /// Near which waypoint.
+        detail: String,
+        /// That waypoint; `None` on the approach to a circle.
         place: Option<Place>,
     },
     /// No alert of that identifier.
@@ -265,7 +279,7 @@ impl AppError {
 
     /// Returns the place on the path that cannot be driven.
     pub fn place(&self) -> Option<Place> {
-        if let Self::Impossible { place, .. } = *self {
+        if let Self::Impossible { place, .. } | Self::TurnTooSharp { place, .. } = *self {
             place
         } else if let Self::CrossesGeofence { place, .. } = *self {
             Some(place)
@@ -281,22 +295,22 @@ impl AppError {
     }
 
     /// Returns the field or parameter with an impossible value.
-    pub fn field(&self) -> Option<&'static str> {
+    pub fn field(&self) -> Option<&str> {
         match self {
             Self::Invalid { field, .. } => Some(field),
+            Self::BeyondLimits { field, .. } | Self::Impossible { field, .. } => field.as_deref(),
             Self::InvalidQuery { parameter, .. } => Some(parameter),
             Self::UnknownSite(_)
             | Self::UnknownRobot(..)
             | Self::UnknownTerrain(..)
             | Self::UnknownMission(_)
             | Self::AlreadyExists { .. }
-            | Self::BeyondLimits { .. }
             | Self::MissionEnded { .. }
             | Self::MissionState { .. }
             | Self::RobotBusy { .. }
             | Self::RobotRetired(_)
             | Self::RobotCannot { .. }
-            | Self::Impossible { .. }
+            | Self::TurnTooSharp { .. }
             | Self::UnknownAlert(_)
             | Self::UnknownToken(_)
             | Self::UnknownSession(_)

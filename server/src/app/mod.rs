@@ -40,6 +40,7 @@ pub mod storage;
 pub mod teleop;
 pub mod terrains;
 mod traces;
+mod trajectory_value;
 pub mod watched;
 pub mod webhooks;
 pub mod withdrawals;

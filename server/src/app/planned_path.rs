@@ -13,8 +13,8 @@ impl App {
     /// it, once the robot has accepted it, and at the begin of the trajectory before that.
     ///
     /// # Errors
-    /// [`AppError::UnknownMission`]; [`AppError::Impossible`] for a trajectory that cannot be
-    /// planned, which its robot refuses too.
+    /// [`AppError::UnknownMission`]; [`AppError::Impossible`] or [`AppError::TurnTooSharp`] for a
+    /// trajectory that cannot be planned, which its robot refuses too.
     pub async fn planned_path(&self, id: MissionId) -> Result<PlannedPath, AppError> {
         let mut tx = self.db().read("planned_path").await?;
         let row = db::missions::find(&mut tx, id)
@@ -43,10 +43,11 @@ impl App {
             Ok(drawn(&planned.plan, &trajectory))
         };
         match tokio::task::spawn_blocking(planning).await {
-            Ok(path) => path.map_err(|refused: Refused| refused.of(mission.robot)),
+            Ok(path) => path.map_err(|refused: Refused| refused.without_field().of(mission.robot)),
             Err(_panic) => Err(AppError::Impossible {
                 robot: mission.robot,
                 detail: "the planner broke on it".to_owned(),
+                field: None,
                 place: None,
             }),
         }

@@ -397,6 +397,34 @@ mod tests {
     }
 
     #[test]
+    fn a_value_out_of_its_range_is_named_with_its_path() {
+        let circle = |values: &str| {
+            format!(r#"{{"circle":{{"center":{{"x_m":0.0,"y_m":0.0}},"radius_m":1.0,{values}}}}}"#)
+        };
+        let waypoints = |points: &str| {
+            format!(r#"{{"waypoints":{{"speed_m_s":0.5,"points":[{{"x_m":0,"y_m":0}},{points}]}}}}"#)
+        };
+        for (trajectory, path) in [
+            (circle(r#""speed_m_s":99"#), "circle.speed_m_s"),
+            (circle(r#""speed_m_s":1,"turns":0"#), "circle.turns"),
+            (
+                circle(r#""speed_m_s":1,"options":{"excitation":{"period_s":0}}"#),
+                "circle.options.excitation.period_s",
+            ),
+            (waypoints(r#"{"x_m":0,"y_m":0}"#), "waypoints.points[1]"),
+            (waypoints(r#"{"x_m":1}"#), "waypoints.points[1]"),
+        ] {
+            let text = format!(r#"{{"site":"a","robot":"b","trajectory":{trajectory}}}"#);
+            let said = problem(&text).to_string();
+            let field = format!(r#"Some(\"trajectory.{path}\")"#);
+            assert!(
+                said.contains("InvalidBody") && said.contains(&field),
+                "{said}"
+            );
+        }
+    }
+
+    #[test]
     fn what_is_impossible_is_named_with_its_path() {
         let said = problem(r#"{"site":"A B","robot":"b","trajectory":{}}"#).to_string();
         assert!(

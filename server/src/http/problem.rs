@@ -83,6 +83,7 @@ const fn status(kind: ProblemType) -> StatusCode {
         ProblemType::InvalidBody
         | ProblemType::UnknownField
         | ProblemType::BeyondLimits
+        | ProblemType::TurnTooSharp
         | ProblemType::CrossesGeofence
         | ProblemType::RobotOutsideGeofence
         | ProblemType::IdempotencyKeyReused => StatusCode::UNPROCESSABLE_ENTITY,
@@ -142,6 +143,7 @@ impl From<AppError> for Problem {
             AppError::BeyondLimits { .. } | AppError::Impossible { .. } => {
                 ProblemType::BeyondLimits
             }
+            AppError::TurnTooSharp { .. } => ProblemType::TurnTooSharp,
             AppError::MissionEnded { .. } => ProblemType::MissionEnded,
             AppError::MissionState { .. } => ProblemType::MissionState,
             AppError::RobotBusy { .. } => ProblemType::RobotBusy,

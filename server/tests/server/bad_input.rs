@@ -221,6 +221,82 @@ async fn each_impossible_request_is_a_clear_problem_and_changes_nothing() {
     yard.server.stop().await.unwrap();
 }
 
+/// Trajectories with one value at fault, the type of the problem, and the value's path.
+fn faulty_trajectories() -> Vec<(Value, &'static str, &'static str)> {
+    let robot = "rover-1".parse().unwrap();
+    let of_circle = |name: &str, value: Value| {
+        let mut body = circle(&robot);
+        body["trajectory"]["circle"][name] = value;
+        body
+    };
+    let by_period = |period_s: f64| {
+        json!({"site": "yard", "robot": "rover-1", "trajectory": {"circle":
+            {"center": {"x_m": 1.0, "y_m": 2.0}, "radius_m": 3.0, "period_s": period_s}}})
+    };
+    let from_origin = |point: Value| waypoints(&json!([{"x_m": 0.0, "y_m": 0.0}, point]));
+    let approach = json!({"approach_speed_m_s": 40.0});
+    let depth = json!({"excitation": {"depth_ratio": 0.9}});
+    vec![
+        (
+            of_circle("radius_m", json!(0.01)),
+            "invalid-body",
+            "circle.radius_m",
+        ),
+        (of_circle("turns", json!(0)), "invalid-body", "circle.turns"),
+        (
+            of_circle("center", json!({"x_m": 2e6, "y_m": 0.0})),
+            "invalid-body",
+            "circle.center",
+        ),
+        (
+            of_circle("speed_m_s", json!(-1.0)),
+            "invalid-body",
+            "circle.speed_m_s",
+        ),
+        (
+            of_circle("options", depth),
+            "invalid-body",
+            "circle.options.excitation.depth_ratio",
+        ),
+        (
+            from_origin(json!({"x_m": 0.0, "y_m": 0.0})),
+            "invalid-body",
+            "waypoints.points[1]",
+        ),
+        (
+            of_circle("speed_m_s", json!(2.5)),
+            "beyond-limits",
+            "circle.speed_m_s",
+        ),
+        (by_period(1.0), "beyond-limits", "circle.period_s"),
+        (
+            of_circle("options", approach),
+            "beyond-limits",
+            "circle.options.approach_speed_m_s",
+        ),
+        (
+            from_origin(json!({"x_m": 4.0, "y_m": 0.0, "speed_m_s": 40.0})),
+            "beyond-limits",
+            "waypoints.points[1].speed_m_s",
+        ),
+    ]
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_value_of_a_trajectory_that_is_at_fault_is_named_with_its_path() {
+    let yard = Yard::start().await;
+    let _robot = Robot::join(&yard, "rover-1").await;
+    for (body, kind, value) in faulty_trajectories() {
+        for path in ["/v1/missions", "/v1/trajectories/check"] {
+            let answer = yard.post(path, &body).await;
+            assert_eq!(answer.1["field"], format!("trajectory.{value}"), "{path}");
+            assert_problem(answer, (422, kind), "", value);
+        }
+    }
+    nothing_changed(&yard).await;
+    yard.server.stop().await.unwrap();
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn bodies_that_cannot_be_read_are_problems_too() {
     let yard = Yard::start().await;

@@ -1,5 +1,7 @@
 //! What a trajectory would ask of a robot, computed before anything moves.
 
+use std::f64::consts::PI;
+
 use reqwest::StatusCode;
 use serde_json::{Value, json};
 use tread_api::geometry::Pose;
@@ -39,7 +41,37 @@ async fn a_dry_run_tells_duration_and_limits_and_refuses_the_impossible_with_its
     let (status, refused) = yard.post("/v1/trajectories/check", &body).await;
     assert_eq!(status, StatusCode::UNPROCESSABLE_ENTITY, "{refused}");
     assert_eq!(refused["place"]["waypoint"], 2, "{refused}");
+    assert_eq!(refused["type"], "/problems/beyond-limits", "{refused}");
     assert!(robot.offers().is_empty(), "nothing moves");
+    yard.server.stop().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_turn_that_is_too_sharp_has_a_type_of_its_own_and_the_waypoint_before_it() {
+    let yard = Yard::start().await;
+    let robot = Robot::join(&yard, "rover-1").await;
+    let refused = async |body: &Value| {
+        let (status, refused) = yard.post("/v1/trajectories/check", body).await;
+        assert_eq!(status, StatusCode::UNPROCESSABLE_ENTITY, "{refused}");
+        assert_eq!(refused["type"], "/problems/turn-too-sharp", "{refused}");
+        assert!(refused["field"].is_null(), "{refused}");
+        refused
+    };
+    // On a line the path would have to turn back to arrive with the heading of its last point.
+    let points = json!([{"x_m": 0.0, "y_m": 0.0, "heading_rad": 0.0},
+        {"x_m": 4.0, "y_m": 0.0, "heading_rad": 0.0}, {"x_m": 8.0, "y_m": 0.0, "heading_rad": PI}]);
+    let mut body = circle(&robot.id);
+    body["trajectory"] = json!({"waypoints": {"speed_m_s": 0.5, "points": points}});
+    body["start"] = json!({"x_m": 0.0, "y_m": 0.0, "heading_rad": 0.0});
+    let place = refused(&body).await["place"].clone();
+    assert_eq!(place["waypoint"], 1, "{place}");
+    assert_eq!(place["point"], json!({"x_m": 4.0, "y_m": 0.0}), "{place}");
+    // No approach can join a circle as small as this one, and no waypoint is at fault.
+    let mut body = circle(&robot.id);
+    body["trajectory"]["circle"]["radius_m"] = json!(0.05);
+    body["start"] = json!({"x_m": 2.0, "y_m": 2.0, "heading_rad": 0.0});
+    let said = refused(&body).await;
+    assert!(said["place"].is_null(), "{said}");
     yard.server.stop().await.unwrap();
 }
 

@@ -22,6 +22,7 @@ use tread_api::wire::command::Offer;
 use self::immediate_offer::{EarlyPrior, OfferedNow};
 use self::transitions::{Change, next};
 use super::check::StartPlace;
+use super::trajectory_value::TrajectoryValue;
 use super::{App, AppError, check_named, site_row};
 pub use crate::db::missions::MissionFilter;
 use crate::db::missions::{Facts, Inserted, MissionRow, OpenMission, Transition};
@@ -373,22 +374,24 @@ pub(super) fn check_limits(
     limits: &RobotLimits,
     trajectory: &Trajectory,
 ) -> Result<(), AppError> {
-    let beyond = |detail| AppError::BeyondLimits {
+    let beyond = |detail, field| AppError::BeyondLimits {
         robot: robot.clone(),
         detail,
+        field,
     };
     let (speed_m_s, limit_m_s) = (trajectory.speed_max_m_s(), limits.linear_max_m_s);
     if speed_m_s > limit_m_s {
-        return Err(beyond(format!(
-            "{speed_m_s} m/s is beyond its limit of {limit_m_s} m/s"
-        )));
+        let detail = format!("{speed_m_s} m/s is beyond its limit of {limit_m_s} m/s");
+        let fastest = TrajectoryValue::of_speed_max(trajectory);
+        return Err(beyond(detail, Some(fastest.path(trajectory).into())));
     }
     if let Trajectory::Circle(circle) = trajectory {
         let (rate_rad_s, limit_rad_s) = (speed_m_s / circle.radius_m, limits.angular_max_rad_s);
         if rate_rad_s > limit_rad_s {
-            return Err(beyond(format!(
+            let detail = format!(
                 "a yaw rate of {rate_rad_s} rad/s is beyond its limit of {limit_rad_s} rad/s"
-            )));
+            );
+            return Err(beyond(detail, None));
         }
     }
     Ok(())
