@@ -1,9 +1,8 @@
 // What a problem of the API says of a draft: which of its points, and which field. The API counts points
 // from 0, the table of the page from 1. Pure.
 //
-// What is wrong comes from the problem's type and from what is drawn, where comes from its `field` and `place`. The API
-// has no code for a turn that is too sharp, and no field for a part of a circle: only these are looked for in its sentence,
-// and what is not found there is quoted.
+// What is wrong comes from the problem's type and from what is drawn, where comes from its `field` and `place`. The API's
+// sentence is only quoted.
 import type { ProblemBody } from './api/schema';
 import { flawOfShape, type Shape } from './map/shape';
 
@@ -24,28 +23,19 @@ export interface Faults {
 
 export const NO_FAULTS: Faults = { points: [], axis: null, field: null };
 
-/** How the server names points in what it says; every number in them is an index. */
-const POINTS: readonly [RegExp, Refused | null][] = [
-  [/\bside from corner (\d+)\b.*\bside from corner (\d+)\b/, 'crosses'],
-  [/\bcorners (\d+) and (\d+) are the same point/, 'same'],
-  [/\bcorner (\d+) is not within/, 'far'],
-  [/\bpoints\[(\d+)\] must be within/, 'far'],
-  [/\bpoints\[(\d+)\] repeats the point before/, 'repeats'],
-  [/\bwaypoint (\d+) is at the same place/, 'repeats'],
-  [/\bnear waypoint (\d+)\b/, 'tight'],
-  [/\bpoints\[(\d+)\]/, null],
-  [/\b(?:corner|waypoint) (\d+)\b/, null],
-];
 /** Paths of a point in `field`, as `polygon[3].x_m` or `/corners/3/x_m`. */
 const PATH = /(?:polygon|corners|points|keep_(?:in|out)(?:\[\d+\]|\/\d+))(?:\[(\d+)\]|\/(\d+))(?:[./](x_m|y_m))?/;
-/** What words of a refusal mean which field. */
-const FIELDS: readonly [RegExp, DraftField][] = [
-  [/\bradius/, 'radius'],
-  [/\bturns\b/, 'turns'],
-  [/\bspeed/, 'speed'],
-  [/\bcentre\b|\bcenter\b/, 'center'],
-  [/\bpriority\b/, 'priority'],
-];
+/** Paths of a field of the form in `field`, as `trajectory.circle.center.x_m`; options of a trajectory have no field. */
+const FORM_PATH = /^(?:trajectory\.(?:circle|waypoints)\.)?(center|radius_m|speed_m_s|period_s|turns|priority)\b/;
+/** Fields of the form by their names in the API. */
+const FIELDS: Readonly<Record<string, DraftField>> = {
+  center: 'center',
+  radius_m: 'radius',
+  speed_m_s: 'speed',
+  period_s: 'speed',
+  turns: 'turns',
+  priority: 'priority',
+};
 
 export interface Refusal extends Faults {
   kind: Refused | null;
@@ -55,25 +45,28 @@ export interface Refusal extends Faults {
 
 /** Reads a problem about a draft that has points, or about a circle; with the shape that is drawn, if that is known. */
 export function refusalOf(body: ProblemBody, hasPoints: boolean, shape: Shape | null = null): Refusal {
-  const said = body.detail ?? '';
-  const fieldIn = (text: string) => FIELDS.find(([words]) => words.test(text))?.[1] ?? null;
-  const field = fieldIn(body.field ?? '') ?? fieldIn(said);
-  // A circle has no waypoints, whatever it was planned by.
-  if (!hasPoints) return { kind: null, points: [], axis: null, field, detail: said.replace(/ near waypoint \d+/, '') || null };
-  const flaw = shape && body.type === '/problems/invalid-body' ? flawOfShape(shape) : null;
-  if (flaw) return { ...flaw, axis: axisOf(body), field: null, detail: counted(said) };
-  const path = PATH.exec(body.field ?? '');
-  const index = path ? Number(path[1] ?? path[2]) : body.place?.waypoint;
-  const points = index === null || index === undefined ? null : [index + 1];
-  for (const [words, kind] of POINTS) {
-    const found = words.exec(said)?.slice(1).map((index) => Number(index) + 1);
-    if (found) return { kind, points: points ?? found, axis: axisOf(body), field: null, detail: counted(said) };
-  }
-  return { kind: null, points: points ?? [], axis: axisOf(body), field: points ? null : field, detail: said ? counted(said) : null };
+  const detail = body.detail ? counted(body.detail) : null;
+  const flaw = hasPoints && shape && body.type === '/problems/invalid-body' ? flawOfShape(shape) : null;
+  if (flaw) return { ...flaw, axis: axisOf(body), field: null, detail };
+  const point = hasPoints ? pointOf(body) : null;
+  if (point === null) return { kind: null, points: [], axis: null, field: fieldOf(body), detail };
+  const kind = body.type === '/problems/turn-too-sharp' ? 'tight' : null;
+  return { kind, points: [point], axis: axisOf(body), field: null, detail };
+}
+
+/** The number of the point in the table; null if the problem names none. */
+function pointOf({ field, place }: ProblemBody): number | null {
+  const path = PATH.exec(field ?? '');
+  const index = path ? Number(path[1] ?? path[2]) : place?.waypoint;
+  return index === null || index === undefined ? null : index + 1;
 }
 
 function axisOf(body: ProblemBody): Axis | null {
   return (PATH.exec(body.field ?? '')?.[3] as Axis | undefined) ?? null;
+}
+
+function fieldOf(body: ProblemBody): DraftField | null {
+  return FIELDS[FORM_PATH.exec(body.field ?? '')?.[1] ?? ''] ?? null;
 }
 
 /** A sentence of the server with the numbers that the table has: indices of the API begin at 0. */

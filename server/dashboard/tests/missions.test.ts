@@ -258,7 +258,7 @@ test('what is no number, and a path too tight, are said in a sentence each, and 
   // This one only the server can tell.
   await type('Radius, m', '0.05');
   await problem.waitFor();
-  expect(await problem.innerText()).toMatch(/^The request is impossible for this robot\.\s+robot `rover-1` cannot drive this: [^\d]+$/);
+  expect(await problem.innerText()).toMatch(/^The path turns too sharply\.\s+robot `rover-1` cannot drive this: [^\d]+$/);
   expect(await page.getByLabel('Radius, m').inputValue()).toBe('0.05');
   // What was drawn of one kind is still there after a look at the other.
   await page.getByRole('radio', { name: 'Waypoints' }).check();

@@ -402,7 +402,7 @@ mod tests {
             format!(r#"{{"circle":{{"center":{{"x_m":0.0,"y_m":0.0}},"radius_m":1.0,{values}}}}}"#)
         };
         let waypoints = |points: &str| {
-            format!(r#"{{"waypoints":{{"speed_m_s":0.5,"points":[{{"x_m":0,"y_m":0}},{points}]}}}}"#)
+            format!(r#"{{"waypoints":{{"speed_m_s":1,"points":[{{"x_m":0,"y_m":0}},{points}]}}}}"#)
         };
         for (trajectory, path) in [
             (circle(r#""speed_m_s":99"#), "circle.speed_m_s"),

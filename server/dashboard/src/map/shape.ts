@@ -1,5 +1,6 @@
 // What makes corners no area, or points no path: the rules of the API (`api/src/geometry.rs`, `api/src/trajectory/rules.rs`).
-// With them the page finds the point that the server refuses, whose place among the points the API has no field for. Pure.
+// With them the page says what is wrong with a shape that the server refuses, and at which points: the API has one type
+// for all of that. Pure.
 import type { PointM } from './camera';
 import { COORDINATE_MAX_M } from './draft';
 

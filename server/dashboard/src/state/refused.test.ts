@@ -3,19 +3,20 @@ import { Problem } from '../api/client';
 import type { ProblemBody } from '../api/schema';
 import { refusalText } from './refused';
 
-const refused = (detail: string) => {
-  const body: ProblemBody = { type: '/problems/invalid-body', title: 'The body is invalid', status: 422, detail };
+const refused = (detail: string, more: Partial<ProblemBody> = {}) => {
+  const body: ProblemBody = { type: '/problems/invalid-body', title: 'The body is invalid', status: 422, detail, ...more };
   return new Problem('as the server says it', 422, body);
 };
+const points = (...pairs: [number, number][]) => pairs.map(([x_m, y_m]) => ({ x_m, y_m }));
 
 test('what the server refuses of points is said in the words of the page, by the numbers of its table', () => {
-  const text = (detail: string) => refusalText(refused(detail), true);
-  expect(text('the side from corner 0 at (0.00 m, 0.00 m) crosses or touches the side from corner 2 at (4.00 m, 0.00 m)')).toBe(
-    'The side from corner 1 crosses or touches the side from corner 3.',
-  );
-  expect(text('corners 2 and 3 are the same point; leave out the closing corner')).toBe('Corners 3 and 4 are the same point.');
-  expect(text('waypoint 1 is at the same place as the one before')).toBe('Point 2 is at the same place as the one before.');
-  expect(text('the path turns too sharply near waypoint 4')).toBe('The path turns too sharply near point 5.');
+  const area = (...pairs: [number, number][]) => refusalText(refused('words'), true, { points: points(...pairs), isArea: true });
+  expect(area([0, 0], [4, 0], [4, 4], [2, 0], [0, 4])).toBe('The side from corner 1 crosses or touches the side from corner 3.');
+  expect(area([0, 0], [4, 0], [4, 4], [4, 4])).toBe('Corners 3 and 4 are the same point.');
+  const path = { points: points([0, 0], [0, 0], [4, 0]), isArea: false };
+  expect(refusalText(refused('words'), true, path)).toBe('Point 2 is at the same place as the one before.');
+  const tight = refused('words', { type: '/problems/turn-too-sharp', place: { point: { x_m: 4, y_m: 0 }, waypoint: 4 } });
+  expect(refusalText(tight, true)).toBe('The path turns too sharply near point 5.');
 });
 
 test('for what the page has no words the server is quoted, with the numbers of the table', () => {

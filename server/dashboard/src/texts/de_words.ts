@@ -263,6 +263,7 @@ export const problemTitles: Record<ProblemType, string> = {
   '/problems/unknown-mission': 'Die Mission ist nicht bekannt',
   '/problems/already-exists': 'Die Kennung ist vergeben',
   '/problems/beyond-limits': 'Das ist für diesen Roboter nicht möglich',
+  '/problems/turn-too-sharp': 'Die Bahn biegt zu scharf ab',
   '/problems/mission-ended': 'Die Mission ist beendet',
   '/problems/mission-state': 'Der Zustand der Mission erlaubt das nicht',
   '/problems/robot-busy': 'Der Roboter hat eine andere Mission',
