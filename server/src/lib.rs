@@ -246,14 +246,7 @@ impl Server {
             .map(|address| serve_metrics(address, &app, &supervisor))
             .transpose()?;
         info!("REST API on {scheme}://{http_address}, described at {scheme}://{http_address}/docs");
-        match app.admin_count().await {
-            Ok(0) => warn!(
-                "nobody can sign in yet: make the first admin's token with `tread-server init`"
-            ),
-            Ok(_) => {}
-            // The server runs already, and must not end because of a message.
-            Err(error) => app.log_failure("count the admins", &error),
-        }
+        app.warn_without_admin().await;
         Ok(RunningServer {
             http_address,
             scheme,

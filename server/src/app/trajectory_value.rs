@@ -91,8 +91,10 @@ mod tests {
     }
 
     fn circle(speed: &str) -> Trajectory {
-        trajectory(json!({"circle": {"center": {"x_m": 0.0, "y_m": 0.0}, "radius_m": 1.0,
-            speed: 4.0, "options": {"approach_speed_m_s": 0.5}}}))
+        trajectory(
+            json!({"circle": {"center": {"x_m": 0.0, "y_m": 0.0}, "radius_m": 1.0,
+            speed: 4.0, "options": {"approach_speed_m_s": 0.5}}}),
+        )
     }
 
     fn fastest(trajectory: &Trajectory) -> String {

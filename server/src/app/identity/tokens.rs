@@ -1,6 +1,7 @@
 //! Tokens: creation, listing and revocation.
 
 use jiff::{SignedDuration, Timestamp};
+use tracing::warn;
 use tread_api::identity::{
     AuditEntry, CreateToken, CreatedToken, Role, TOKEN_DAYS_DEFAULT, TOKEN_DAYS_MAX,
     TOKEN_NAME_MAX, Token,
@@ -171,10 +172,21 @@ impl App {
     }
 
     /// Returns the number of valid admins' tokens.
-    pub async fn admin_count(&self) -> Result<i64, AppError> {
+    async fn admin_count(&self) -> Result<i64, AppError> {
         let mut tx = self.db().read("identity").await?;
         let counts = db::tokens::valid_counts(&mut tx, self.clock().now()).await?;
         Ok(counts.1)
+    }
+
+    /// Logs a warning if nobody can sign in yet, and a failure to read that as an error.
+    pub(crate) async fn warn_without_admin(&self) {
+        match self.admin_count().await {
+            Ok(0) => warn!(
+                "nobody can sign in yet: make the first admin's token with `tread-server init`"
+            ),
+            Ok(_) => {}
+            Err(error) => self.log_failure("count the admins", &error),
+        }
     }
 
     async fn new_token(
