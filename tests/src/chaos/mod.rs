@@ -24,6 +24,8 @@ use plan::{Action, Asked, RunPlan};
 const END_WAIT_MAX: Duration = Duration::from_secs(90);
 /// Longest wait for the answer to a request.
 const ANSWER_MAX: Duration = Duration::from_secs(15);
+/// Longest time for a server to decide on a resumption: the servers of a pair exchange places.
+const RESUMED_WITHIN: Duration = Duration::from_secs(30);
 /// Time between two looks.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
 /// Tries to send a mission to a server that is away.
@@ -250,8 +252,16 @@ impl Stage<'_> {
                     .await;
             }
             Action::Resume(index) => {
-                self.request(followed[index].id, "resume", &Value::Null)
-                    .await;
+                // A paused mission ends only if it is resumed, and there may be no server just now.
+                let deadline = Instant::now() + RESUMED_WITHIN;
+                while self
+                    .request(followed[index].id, "resume", &Value::Null)
+                    .await
+                    == Answered::Not
+                    && Instant::now() < deadline
+                {
+                    tokio::time::sleep(LOOK_EVERY).await;
+                }
             }
             Action::Replace(index) => {
                 let body = json!({"trajectory": plan::path(self.random)});
@@ -285,13 +295,13 @@ impl Stage<'_> {
         }
     }
 
-    async fn request(&mut self, mission: MissionId, verb: &str, body: &Value) {
+    async fn request(&mut self, mission: MissionId, verb: &str, body: &Value) -> Answered {
         let path = format!("/v1/missions/{mission}/{verb}");
         self.fleet.tend_pair().await;
         let asked = self.fleet.rest.call(Method::POST, &path, Some(body));
         // A server that is frozen says nothing.
         let Ok(Some((status, answer))) = timeout(ANSWER_MAX, asked).await else {
-            return;
+            return Answered::Not;
         };
         self.report.requests += 1;
         let has_network = self.relays.is_none_or(|relays| relays.database.is_some());
@@ -303,7 +313,19 @@ impl Stage<'_> {
                 text: format!("{verb} was answered {status}: {answer}"),
             });
         }
+        if is_away {
+            Answered::Not
+        } else {
+            Answered::Decided
+        }
     }
+}
+
+/// Whether a request was answered by a server that could decide on it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Answered {
+    Decided,
+    Not,
 }
 
 /// The missions once all have ended, or as they stand when time is up.

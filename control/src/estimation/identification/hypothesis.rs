@@ -23,7 +23,7 @@
 
 use super::fast_changes::FastChanges;
 use super::model::{CHANNELS, Input, State};
-use super::parameters::{Number, PARAMETERS, Prior, Robot, SHAPE_MIN, Values, index};
+use super::parameters::{Number, Prior, Robot, Values, index};
 use super::scale::{Compared, Residual, Scale, ln_stiffness_gradient};
 use super::simulation::{Predicted, Simulation, delays_s};
 use crate::robot::RobotModel;
@@ -51,8 +51,6 @@ const CONVERGES_BLOCKS: u32 = 15;
 const KEPT_MIN: f64 = 1.0e-3;
 /// Maximum magnitude of the change of ln K at the end of one block.
 const STEP_MAX: f64 = 0.4;
-/// Range in which parameters stay, in standard deviations of their prior.
-const PRIOR_RANGE: f64 = 5.0;
 /// Maximum squared standardised residual in the cost.
 const COST_MAX: f64 = 25.0;
 /// Factor by which each later block multiplies the cost so far.
@@ -325,7 +323,7 @@ impl Hypothesis {
             .max(step[index::STIFFNESS].abs() / STEP_MAX)
             .max(1.0);
         let before = self.values;
-        self.set_values(in_range(before + step, prior));
+        self.set_values(prior.in_range(before + step));
         let step = self.values - before;
         for own in std::iter::once(&mut self.model).chain(&mut self.perturbed) {
             own.shift(&step);
@@ -426,7 +424,7 @@ impl Hypothesis {
             self.last_kept = 1.0;
         }
         if let Some(values) = self.solve(prior) {
-            self.set_values(in_range(values, prior));
+            self.set_values(prior.in_range(values));
         }
     }
 
@@ -488,16 +486,4 @@ impl Hypothesis {
             ..prior.clone()
         })
     }
-}
-
-/// Limits parameters to their ranges.
-fn in_range(mut values: Values, prior: &Prior) -> Values {
-    for place in 0..PARAMETERS {
-        let most = PRIOR_RANGE * prior.std_devs[place];
-        let mean = prior.first_mean[place];
-        values[place] = values[place].clamp(mean - most, mean + most);
-    }
-    values[index::SHAPE] = values[index::SHAPE].max(SHAPE_MIN);
-    values[index::BEND] = values[index::BEND].max(0.0);
-    values
 }

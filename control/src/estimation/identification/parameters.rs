@@ -90,6 +90,18 @@ impl Prior {
         self.mean = self.first_mean;
         self.information = Square::from_diagonal(&self.std_devs.map(|std_dev| std_dev.powi(-2)));
     }
+
+    /// Limits parameters to their ranges.
+    pub(super) fn in_range(&self, mut values: Values) -> Values {
+        for place in 0..PARAMETERS {
+            let most = PRIOR_RANGE * self.std_devs[place];
+            let mean = self.first_mean[place];
+            values[place] = values[place].clamp(mean - most, mean + most);
+        }
+        values[index::SHAPE] = values[index::SHAPE].max(SHAPE_MIN);
+        values[index::BEND] = values[index::BEND].max(0.0);
+        values
+    }
 }
 
 /// Parameters of the ground and of the tyres' friction curve on it. They start from the initial
@@ -150,6 +162,8 @@ const SPEED_OFFSET_STD_DEV: f64 = 0.005;
 /// reception delay all of them.
 const GYRO_DELAY_STD_DEV_S: f64 = 0.015;
 const ACCELEROMETER_DELAY_STD_DEV_S: f64 = 0.010;
+/// Range in which parameters stay, in standard deviations of their initial prior.
+const PRIOR_RANGE: f64 = 5.0;
 /// Minimum standard deviation, used where the configuration gives 0.
 const STD_DEV_MIN: f64 = 1.0e-4;
 

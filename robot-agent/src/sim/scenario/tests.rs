@@ -72,7 +72,7 @@ fn a_mistake_is_named_with_file_line_and_key() {
             "line 18",
             "rover-9",
         ),
-        ("radius_m = 2.0", "radius_m = 0.0", "line 20", "radius_m"),
+        ("radius_m = 2.0", "radius_m = 0.0", "line 22", "radius_m"),
         ("site = \"yard\"", "site = \"Yard!\"", "line 2", "Yard!"),
         ("cell_m = 1.0", "cell_m = 0.0", "cell_m", "0"),
         (
