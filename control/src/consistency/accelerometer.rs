@@ -181,19 +181,13 @@ impl Accelerometer {
         ];
         let mean = |of: fn(&BodyAcceleration) -> f64| self.means.iter().map(of).sum::<f64>() / bins;
         let felt = [mean(|felt| felt.forward_m_s2), mean(|felt| felt.left_m_s2)];
-        let axes = [0, 1].map(|axis: usize| Comparison {
-            observed: felt[axis],
-            predicted: expected[axis],
-        });
+        let axes = comparisons(felt, expected);
         let middle_rad = self.heading_rad - 0.5 * bins * BIN_S * motion.gyro_rad_s;
         let heading_rad = self.is_specific_force.then_some(middle_rad);
         let [felt, expected] = self
             .tilts
             .remove([felt.into(), expected.into()], heading_rad);
-        [self.forward, self.left] = [0, 1].map(|axis: usize| Comparison {
-            observed: felt[axis],
-            predicted: expected[axis],
-        });
+        [self.forward, self.left] = comparisons(felt.into(), expected.into());
         let gain = self.regress();
         if !repeats.is_repeating() {
             self.sign();
@@ -307,6 +301,14 @@ impl Accelerometer {
             .find(|(axis, from)| (axis.predicted - from).abs() > FROZEN_CHANGE_M_S2)
             .map(|(axis, _)| finding(Kind::Frozen, axis))
     }
+}
+
+/// Pairs the axes of the measured and the predicted acceleration.
+fn comparisons(observed: [f64; 2], predicted: [f64; 2]) -> [Comparison; 2] {
+    [0, 1].map(|axis: usize| Comparison {
+        observed: observed[axis],
+        predicted: predicted[axis],
+    })
 }
 
 fn impossible(axes: [Comparison; 2]) -> Option<Finding> {
