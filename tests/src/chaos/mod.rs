@@ -257,7 +257,7 @@ impl Stage<'_> {
                 while self
                     .request(followed[index].id, "resume", &Value::Null)
                     .await
-                    == Answered::Not
+                    == Outcome::Unavailable
                     && Instant::now() < deadline
                 {
                     tokio::time::sleep(LOOK_EVERY).await;
@@ -295,13 +295,13 @@ impl Stage<'_> {
         }
     }
 
-    async fn request(&mut self, mission: MissionId, verb: &str, body: &Value) -> Answered {
+    async fn request(&mut self, mission: MissionId, verb: &str, body: &Value) -> Outcome {
         let path = format!("/v1/missions/{mission}/{verb}");
         self.fleet.tend_pair().await;
         let asked = self.fleet.rest.call(Method::POST, &path, Some(body));
         // A server that is frozen says nothing.
         let Ok(Some((status, answer))) = timeout(ANSWER_MAX, asked).await else {
-            return Answered::Not;
+            return Outcome::Unavailable;
         };
         self.report.requests += 1;
         let has_network = self.relays.is_none_or(|relays| relays.database.is_some());
@@ -314,18 +314,20 @@ impl Stage<'_> {
             });
         }
         if is_away {
-            Answered::Not
+            Outcome::Unavailable
         } else {
-            Answered::Decided
+            Outcome::Decided
         }
     }
 }
 
-/// Whether a request was answered by a server that could decide on it.
+/// Outcome of a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Answered {
+enum Outcome {
+    /// A server decided on it.
     Decided,
-    Not,
+    /// No server answered, or none that reaches its database.
+    Unavailable,
 }
 
 /// The missions once all have ended, or as they stand when time is up.
