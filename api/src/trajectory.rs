@@ -258,11 +258,11 @@ mod tests {
 
     #[test]
     fn a_circle_takes_its_speed_from_the_period() {
-        let circle: Trajectory = serde_json::from_value(json!({
-            "circle": {"center": {"x_m": 0.0, "y_m": 0.0}, "radius_m": 6.0, "period_s": 62.83},
+        let circle: Circle = serde_json::from_value(json!({
+            "center": {"x_m": 0.0, "y_m": 0.0}, "radius_m": 6.0, "period_s": 62.83,
         }))
         .unwrap();
-        assert!((circle.speed_max_m_s() - 0.6).abs() < 1e-3);
+        assert!((circle.speed_m_s() - 0.6).abs() < 1e-3);
     }
 
     #[test]

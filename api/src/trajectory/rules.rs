@@ -219,19 +219,6 @@ impl Trajectory {
             Self::Waypoints(waypoints) => waypoints.options,
         }
     }
-
-    /// Returns the maximum requested speed, including the approach, m/s.
-    pub fn speed_max_m_s(&self) -> f64 {
-        let on_it = match self {
-            Self::Circle(circle) => circle.speed_m_s(),
-            Self::Waypoints(waypoints) => waypoints
-                .points
-                .iter()
-                .filter_map(|point| point.speed_m_s)
-                .fold(waypoints.speed_m_s, f64::max),
-        };
-        on_it.max(self.options().approach_speed_m_s.unwrap_or(0.0))
-    }
 }
 
 /// Reads a value that a check allows.

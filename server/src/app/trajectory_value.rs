@@ -30,8 +30,9 @@ pub(super) enum TrajectoryValue {
 }
 
 impl TrajectoryValue {
-    /// Returns the value that requests the maximum speed.
-    pub(super) fn of_speed_max(trajectory: &Trajectory) -> Self {
+    /// Returns the value that requests the maximum speed, that of the approach included, and this
+    /// speed in metres per second.
+    pub(super) fn of_speed_max(trajectory: &Trajectory) -> (Self, f64) {
         let own_m_s = match trajectory {
             Trajectory::Circle(circle) => circle.speed_m_s(),
             Trajectory::Waypoints(waypoints) => waypoints.speed_m_s,
@@ -49,10 +50,9 @@ impl TrajectoryValue {
         let faster = |fastest: (Self, f64), other: (Self, f64)| {
             if other.1 > fastest.1 { other } else { fastest }
         };
-        let (fastest, _) = of_points
+        of_points
             .chain(of_approach)
-            .fold((Self::Speed, own_m_s), faster);
-        fastest
+            .fold((Self::Speed, own_m_s), faster)
     }
 
     /// Returns the path of the value in a request's body, such as `trajectory.circle.radius_m`.
@@ -98,7 +98,7 @@ mod tests {
     }
 
     fn fastest(trajectory: &Trajectory) -> String {
-        TrajectoryValue::of_speed_max(trajectory).path(trajectory)
+        TrajectoryValue::of_speed_max(trajectory).0.path(trajectory)
     }
 
     #[test]

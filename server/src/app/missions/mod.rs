@@ -379,10 +379,10 @@ pub(super) fn check_limits(
         detail,
         field,
     };
-    let (speed_m_s, limit_m_s) = (trajectory.speed_max_m_s(), limits.linear_max_m_s);
+    let (fastest, speed_m_s) = TrajectoryValue::of_speed_max(trajectory);
+    let limit_m_s = limits.linear_max_m_s;
     if speed_m_s > limit_m_s {
         let detail = format!("{speed_m_s} m/s is beyond its limit of {limit_m_s} m/s");
-        let fastest = TrajectoryValue::of_speed_max(trajectory);
         return Err(beyond(detail, Some(fastest.path(trajectory).into())));
     }
     if let Trajectory::Circle(circle) = trajectory {
