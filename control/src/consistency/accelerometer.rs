@@ -181,13 +181,11 @@ impl Accelerometer {
         ];
         let mean = |of: fn(&BodyAcceleration) -> f64| self.means.iter().map(of).sum::<f64>() / bins;
         let felt = [mean(|felt| felt.forward_m_s2), mean(|felt| felt.left_m_s2)];
-        let axes = comparisons(felt, expected);
+        let accelerations = [felt.into(), expected.into()];
+        let axes = comparisons(accelerations);
         let middle_rad = self.heading_rad - 0.5 * bins * BIN_S * motion.gyro_rad_s;
         let heading_rad = self.is_specific_force.then_some(middle_rad);
-        let [felt, expected] = self
-            .tilts
-            .remove([felt.into(), expected.into()], heading_rad);
-        [self.forward, self.left] = comparisons(felt.into(), expected.into());
+        [self.forward, self.left] = comparisons(self.tilts.remove(accelerations, heading_rad));
         let gain = self.regress();
         if !repeats.is_repeating() {
             self.sign();
@@ -303,8 +301,8 @@ impl Accelerometer {
     }
 }
 
-/// Pairs the axes of the measured and the predicted acceleration.
-fn comparisons(observed: [f64; 2], predicted: [f64; 2]) -> [Comparison; 2] {
+/// Pairs the axes of the accelerations `[measured, predicted]`.
+fn comparisons([observed, predicted]: [Vector2<f64>; 2]) -> [Comparison; 2] {
     [0, 1].map(|axis: usize| Comparison {
         observed: observed[axis],
         predicted: predicted[axis],
