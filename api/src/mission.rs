@@ -25,9 +25,9 @@ pub const LINK_SILENCE_MIN_S: f64 = 1.0;
 /// Maximum silence of the server in [`LinkPolicy::StopAfter`], and maximum `lost_after_s` of a
 /// mission, seconds.
 pub const LINK_SILENCE_MAX_S: f64 = 86_400.0;
-/// Maximum number of points of a driven path; a longer path is thinned out further.
+/// Maximum number of points of a driven path; a longer path is simplified out further.
 pub const DRIVEN_POINTS_MAX: usize = 2_000;
-/// Maximum number of samples of θ in a quality report; more samples are thinned out.
+/// Maximum number of samples of θ in a quality report; more samples are simplified out.
 pub const THETA_SAMPLES_MAX: usize = 64;
 
 /// State of a mission. The last five states are terminal: a mission never leaves them.

@@ -88,7 +88,7 @@ pub enum Right {
     Dispatch,
     /// Acknowledge alerts.
     Acknowledge,
-    /// Change terrains and geofences, tie sites to WGS 84, rename and retire robots, withdraw
+    /// Change terrains and geofences, georeference sites, rename and retire robots, withdraw
     /// measurements.
     Configure,
     /// Create sites, enrol and revoke robots, create and revoke tokens, read the audit log.

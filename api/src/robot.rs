@@ -267,7 +267,7 @@ pub const TAGS_MAX: usize = 16;
 
 /// Body of `PATCH /v1/sites/{site}/robots/{robot}`; absent fields stay unchanged.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
-pub struct ChangeRobot {
+pub struct UpdateRobot {
     /// New name, for people. The robot's identifier never changes.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub name: Option<String>,

@@ -162,7 +162,7 @@ pub struct Site {
     /// Number of changes of the site's geofence.
     #[serde(default)]
     pub geofence_revision: u64,
-    /// Position in WGS 84; absent if the site is not tied to it.
+    /// Position in WGS 84; absent if the site is not georeferenced.
     #[serde(default)]
     pub origin: Option<GeoOrigin>,
     /// Time when the site was created.

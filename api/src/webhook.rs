@@ -108,7 +108,7 @@ impl fmt::Debug for CreatedWebhook {
     }
 }
 
-/// What a delivery tells.
+/// Event that a delivery reports.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum NoticeEvent {
@@ -179,7 +179,7 @@ pub struct Delivery {
     pub id: DeliveryId,
     /// Alert that it is about; `null` for a test.
     pub alert: Option<AlertId>,
-    /// What it tells.
+    /// Event that it reports.
     pub event: NoticeEvent,
     /// Kind of the alert; `test` for a test.
     pub kind: AlertCode,
@@ -208,7 +208,7 @@ pub struct AlertNotice {
     pub v: u32,
     /// Identifier of the delivery. The same delivery may arrive more than once.
     pub delivery: DeliveryId,
-    /// What it tells.
+    /// Event that it reports.
     pub event: NoticeEvent,
     /// Identifier of the alert; `null` for a test.
     pub id: Option<AlertId>,

@@ -45,11 +45,11 @@ pub(crate) use self::safety::{
     AlertsAction, AlertsArguments, ClearArguments, DriveArguments, GeofenceArguments, LimitsAction,
     LimitsArguments, StopArguments, StopsArguments, WatchArguments,
 };
-pub(crate) use self::values::{HistoryPlace, shield_negative_points, waypoint};
+pub(crate) use self::values::{HistoryPlace, protect_negative_points, waypoint};
 pub(crate) use self::webhooks::{NamedWebhook, WebhooksAction, WebhooksArguments};
 use crate::credentials;
 use crate::exit::Exit;
-use crate::output::{failure, note};
+use crate::output::{failure, print_note};
 
 /// Address of the server if neither a flag nor a login names one.
 pub(crate) const SERVER_DEFAULT: &str = "http://127.0.0.1:8420";
@@ -101,7 +101,7 @@ fn refuse_for_programs(error: &clap::Error) -> ! {
     let said = first.collect::<Vec<_>>().join(" ");
     let said = said.strip_prefix("error: ").unwrap_or(&said);
     let next_step = "see the same command with --help for its arguments";
-    note(&failure(said, Exit::Usage, Some(next_step), None).to_string());
+    print_note(&failure(said, Exit::Usage, Some(next_step), None).to_string());
     std::process::exit(error.exit_code())
 }
 
@@ -131,10 +131,10 @@ pub(crate) enum Command {
     },
     /// Run the server; used by `tread demo`
     #[command(hide = true, disable_help_flag = true)]
-    Server(PassedOn),
+    Server(ForwardedArguments),
     /// Run an agent; used by `tread demo`
     #[command(hide = true, disable_help_flag = true)]
-    Agent(PassedOn),
+    Agent(ForwardedArguments),
 }
 
 /// A program whose command line is documented.
@@ -151,12 +151,12 @@ pub(crate) enum Program {
 
 /// Arguments that are passed on to another program.
 #[derive(Debug, Args)]
-pub(crate) struct PassedOn {
+pub(crate) struct ForwardedArguments {
     #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
     rest: Vec<OsString>,
 }
 
-impl PassedOn {
+impl ForwardedArguments {
     /// Returns the arguments in the form in which `program` receives them, its name first.
     pub(crate) fn for_program(self, program: &str) -> Vec<OsString> {
         std::iter::once(program.into()).chain(self.rest).collect()
@@ -402,7 +402,7 @@ mod tests {
             let words = line
                 .split(' ')
                 .map(OsString::from)
-                .map(shield_negative_points);
+                .map(protect_negative_points);
             if let Err(refused) = Arguments::try_parse_from(words) {
                 panic!("`{line}` was refused: {refused}");
             }

@@ -114,8 +114,8 @@ impl Store {
     }
 
     /// Deletes the server of the last login if it is this one.
-    pub(crate) fn forget_last_server(&self, address: &str) -> anyhow::Result<()> {
-        self.last_login().forget(LAST_SERVER, Some(address))
+    pub(crate) fn delete_last_server(&self, address: &str) -> anyhow::Result<()> {
+        self.last_login().remove(LAST_SERVER, Some(address))
     }
 
     /// Returns the path of the file.
@@ -136,7 +136,7 @@ impl Store {
     }
 
     /// Deletes the token of a server; with `only`, only if it equals that token.
-    pub(crate) fn forget(&self, address: &str, only: Option<&str>) -> anyhow::Result<()> {
+    pub(crate) fn remove(&self, address: &str, only: Option<&str>) -> anyhow::Result<()> {
         self.change(|kept| {
             let kept_one = kept.get(address);
             let goes = kept_one.is_some_and(|kept| only.is_none_or(|only| only == kept));
@@ -229,10 +229,10 @@ mod tests {
             .unwrap();
         assert_eq!(store.find("http://a").unwrap().as_deref(), Some("one"));
         assert_eq!(std::fs::metadata(store.path()).unwrap().mode() & OTHERS, 0);
-        store.forget("http://a", Some("another")).unwrap();
+        store.remove("http://a", Some("another")).unwrap();
         assert!(store.find("http://a").unwrap().is_some());
-        store.forget("http://a", Some("one")).unwrap();
-        store.forget("http://b", None).unwrap();
+        store.remove("http://a", Some("one")).unwrap();
+        store.remove("http://b", None).unwrap();
         assert_eq!(store.read().unwrap(), BTreeMap::new());
     }
 

@@ -23,7 +23,7 @@ use crate::output::Output;
 fn main() -> ExitCode {
     // Fails only if a provider is installed already, which is not the case here.
     let _first = rustls::crypto::ring::default_provider().install_default();
-    let words = std::env::args_os().map(args::shield_negative_points);
+    let words = std::env::args_os().map(args::protect_negative_points);
     match Arguments::read(words).command {
         Command::Server(arguments) => {
             die_with_the_demo();

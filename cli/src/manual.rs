@@ -8,7 +8,7 @@ use anyhow::Context as _;
 use clap_complete::Shell;
 
 use crate::args::{Arguments, Program};
-use crate::output::note;
+use crate::output::print_note;
 
 /// Returns a program's name and its command line.
 fn command_line(program: Program) -> (&'static str, clap::Command) {
@@ -35,6 +35,6 @@ pub(crate) fn man_pages(folder: &Path, program: Program) -> anyhow::Result<ExitC
     std::fs::create_dir_all(folder).with_context(named)?;
     clap_mangen::generate_to(command_line, folder).with_context(named)?;
     let page = folder.join(name).with_extension("1");
-    note(&format!("read them with `man -l {}`", page.display()));
+    print_note(&format!("read them with `man -l {}`", page.display()));
     Ok(ExitCode::SUCCESS)
 }

@@ -52,7 +52,7 @@ impl Output {
             return ExitCode::SUCCESS;
         }
         let client_error = error.downcast_ref::<ClientError>();
-        let exit = match (client_error, error.downcast_ref::<TookTooLong>()) {
+        let exit = match (client_error, error.downcast_ref::<WaitTimeout>()) {
             (Some(client_error), _) => client_error.exit(),
             (None, Some(_)) => Exit::TimedOut,
             (None, None) => Exit::WentWrong,
@@ -65,11 +65,11 @@ impl Output {
         };
         if self.json {
             let problem = client_error.and_then(ClientError::problem);
-            note(&failure(&message, exit, next_step, problem).to_string());
+            print_note(&failure(&message, exit, next_step, problem).to_string());
         } else {
-            note(&format!("tread: {message}"));
+            print_note(&format!("tread: {message}"));
             if let Some(next_step) = next_step {
-                note(&format!("next: {next_step}"));
+                print_note(&format!("next: {next_step}"));
             }
         }
         exit.into()
@@ -91,7 +91,7 @@ pub(crate) fn failure(
 /// Error: an awaited event did not happen in the allowed time.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
-pub(crate) struct TookTooLong(pub(crate) String);
+pub(crate) struct WaitTimeout(pub(crate) String);
 
 /// Prints a value as one line of JSON.
 pub(crate) fn json_line<T: Serialize>(value: &T) -> anyhow::Result<()> {
@@ -104,7 +104,7 @@ pub(crate) fn line(text: &str) -> anyhow::Result<()> {
 }
 
 /// Prints a line to standard error.
-pub(crate) fn note(text: &str) {
+pub(crate) fn print_note(text: &str) {
     // An error is ignored: without standard error there is no place to report it.
     _ = writeln!(io::stderr().lock(), "{text}");
 }

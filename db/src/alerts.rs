@@ -16,7 +16,7 @@ forward! {
     fn find(id: AlertId) -> Option<Alert>;
     fn raise(robot_pk: i64, id: AlertId, report: &AlertReport, at: Timestamp) -> ();
     fn locate(id: AlertId, location: AlertLocation) -> ();
-    fn forget(robot_pk: i64, kept: u32) -> ();
+    fn prune(robot_pk: i64, kept: u32) -> ();
     fn clear(robot_pk: i64, code: &AlertCode, at: Timestamp) -> ();
     fn acknowledge(id: AlertId, at: Timestamp) -> ();
 }

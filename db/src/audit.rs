@@ -12,5 +12,5 @@ forward! {
     fn list(filter: &AuditFilter, limit: u32) -> Vec<AuditEntry>;
     fn chain() -> Option<AuditChain>;
     fn append(entries: &[AuditEntry]) -> Vec<AuditEntry>;
-    fn forget(kept: AuditRetention, limit: u32) -> ();
+    fn prune(kept: AuditRetention, limit: u32) -> ();
 }

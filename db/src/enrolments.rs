@@ -17,8 +17,8 @@ forward! {
     fn robot_count() -> i64;
     fn insert(enrolment: &Enrolment, issued: &Issued) -> ();
     fn counting(enrolment: (&SiteId, &RobotId, u32)) -> Counting;
-    fn forget_certificates() -> u64;
+    fn delete_issued_certificates() -> u64;
     fn renew(enrolment: (&SiteId, &RobotId, u32), renewal: Renewal<'_>) -> bool;
-    fn note_authority(enrolment: (&SiteId, &RobotId, u32), authority: &str) -> ();
+    fn record_authority(enrolment: (&SiteId, &RobotId, u32), authority: &str) -> ();
     fn revoke(robot: (&SiteId, &RobotId), by: &str, at: Timestamp) -> ();
 }

@@ -14,7 +14,7 @@ forward! {
     fn events(id: MissionId, limit: u32) -> Vec<MissionEvent>;
     fn event_count(id: MissionId) -> u32;
     fn has_report(key: RecordKey) -> bool;
-    fn note_report(key: RecordKey) -> ();
+    fn record_report(key: RecordKey) -> ();
     fn newest_step() -> i64;
     fn steps_after(after: i64, limit: u32) -> Vec<(i64, MissionStep)>;
 }

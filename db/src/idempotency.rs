@@ -10,5 +10,5 @@ forward! {
     idempotency;
     fn find(key: OwnKey<'_>, request_hash: Uuid) -> Option<StoredAnswer>;
     fn insert(key: OwnKey<'_>, stored: &StoredAnswer, at: Timestamp) -> ();
-    fn forget_before(before: Timestamp, limit: u32) -> ();
+    fn delete_before(before: Timestamp, limit: u32) -> ();
 }

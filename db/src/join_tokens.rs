@@ -20,5 +20,5 @@ forward! {
     fn insert(token: &JoinToken, fingerprint: &Fingerprint) -> ();
     fn use_up(id: JoinTokenId, by: &RobotId, at: Timestamp) -> bool;
     fn revoke(id: JoinTokenId, at: Timestamp) -> ();
-    fn forget_dead(before: Timestamp, limit: u32) -> ();
+    fn delete_ended(before: Timestamp, limit: u32) -> ();
 }

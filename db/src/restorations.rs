@@ -14,5 +14,5 @@ forward! {
     fn restrained() -> Vec<Restrained>;
     fn awaiting_count() -> u64;
     fn release(robot_pk: i64) -> bool;
-    fn note_outcomes(robot_pk: i64) -> ();
+    fn record_outcomes(robot_pk: i64) -> ();
 }

@@ -19,7 +19,7 @@ forward! {
     fn configuration_key(id: &str) -> i64;
     fn measured_configuration(robot_pk: i64, id: ConfigurationId) -> Option<i64>;
     fn measured_count(robot_pk: i64) -> i64;
-    fn note_measured(robot_pk: i64, id: ConfigurationId) -> i64;
+    fn record_measured(robot_pk: i64, id: ConfigurationId) -> i64;
     fn names() -> Vec<(SiteId, RobotId)>;
     fn rename(robot_pk: i64, name: &str) -> ();
     fn set_tags(robot_pk: i64, tags: &BTreeSet<Tag>) -> ();

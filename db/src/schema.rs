@@ -10,7 +10,7 @@ use super::{DbError, Location, OpenError, Tx, forward};
 
 forward! {
     schema;
-    fn note_version(version: &str, at: Timestamp) -> ();
+    fn record_version(version: &str, at: Timestamp) -> ();
 }
 
 /// Returns the schema of this program for a database: its newest migration.

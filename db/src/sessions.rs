@@ -18,6 +18,6 @@ forward! {
     fn all_valid(at: Timestamp) -> Vec<SessionId>;
     fn touch(id: SessionId, at: Timestamp) -> ();
     fn delete(id: SessionId) -> ();
-    fn forget_expired(at: Timestamp) -> ();
+    fn delete_expired(at: Timestamp) -> ();
     fn surplus(owner: (Option<TokenId>, Option<PersonId>), kept: u32) -> Vec<SessionId>;
 }

@@ -21,6 +21,6 @@ forward! {
     fn insert(token: &Token, fingerprint: &Fingerprint) -> ();
     fn revoke(id: TokenId, at: Timestamp) -> ();
     fn touch(id: TokenId, at: Timestamp) -> ();
-    fn forget_dead(before: Timestamp, limit: u32) -> ();
+    fn delete_ended(before: Timestamp, limit: u32) -> ();
     fn all_valid(at: Timestamp) -> Vec<TokenRow<Token>>;
 }

@@ -21,9 +21,9 @@ forward! {
     fn queue(new: &NewDelivery) -> ();
     fn drop_oldest(webhook: WebhookId, pending_max: u32, at: Timestamp) -> u64;
     fn due(times: DueTimes) -> Vec<Due>;
-    fn note_attempt(outcome: &Outcome) -> ();
+    fn record_attempt(outcome: &Outcome) -> ();
     fn has_older(than: Timestamp) -> bool;
-    fn give_up_older(limit: AgeLimit) -> u64;
-    fn forget(webhook: WebhookId, kept: u32) -> ();
+    fn abandon_oldest(limit: AgeLimit) -> u64;
+    fn prune(webhook: WebhookId, kept: u32) -> ();
     fn deliveries(webhook: WebhookId, before: Option<DeliveryId>, limit: u32) -> Vec<Delivery>;
 }

@@ -30,7 +30,7 @@ const SETTLE_MAX: Duration = Duration::from_secs(6);
 
 /// Result of the trials.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct HandReport {
+pub struct TeleoperationReport {
     /// Trials that were run.
     pub trials: u64,
     /// Ends of commands after which the target had to become zero.
@@ -57,7 +57,7 @@ struct UnderWay {
 struct Trial<'bench> {
     bench: &'bench mut Bench,
     random: &'bench mut ChaCha8Rng,
-    report: &'bench mut HandReport,
+    report: &'bench mut TeleoperationReport,
     under_way: Vec<UnderWay>,
     /// Number of the last command.
     seq: u64,
@@ -230,7 +230,7 @@ pub struct TrialRun {
 ///
 /// # Errors
 /// [`BenchError`] when the bench cannot be made; the built-in scenario always can.
-pub fn run(TrialRun { trials, seed }: TrialRun) -> Result<HandReport, BenchError> {
+pub fn run(TrialRun { trials, seed }: TrialRun) -> Result<TeleoperationReport, BenchError> {
     let impossible = |cause: String| BenchError::Impossible(cause);
     let scenario = Scenario::built_in().map_err(|cause| impossible(cause.to_string()))?;
     let start = Pose {
@@ -242,7 +242,7 @@ pub fn run(TrialRun { trials, seed }: TrialRun) -> Result<HandReport, BenchError
         Bench::new(&scenario, start, seed).map_err(|cause| impossible(cause.to_string()))?;
     bench.run_for(10 * PERIOD);
     let mut random = ChaCha8Rng::seed_from_u64(seed);
-    let mut report = HandReport::default();
+    let mut report = TeleoperationReport::default();
     for number in 0..trials {
         let mut trial = Trial {
             bench: &mut bench,

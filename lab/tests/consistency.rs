@@ -79,7 +79,7 @@ fn a_finding_ends_when_the_channel_agrees_in_motion_again() {
     }
     let findings = robot.monitor.findings();
     assert_eq!(findings.consequence(), Some(Consequence::Hold));
-    robot.mend();
+    robot.repair();
     let mut steps = 0;
     while robot.monitor.findings().about(Subject::Gyro).is_some() {
         robot.step();
@@ -151,7 +151,7 @@ fn a_finding_on_the_position_ends_at_rest_and_is_back_at_once_if_motion_shows_it
         relapsed += 1;
         steps_until(&mut robot, Subject::Position, false, 60 * SECOND);
         // A position that is right again in motion is as good as new.
-        robot.mend();
+        robot.repair();
         robot.rest(false);
         drive_for(&mut robot, 60 * SECOND);
         assert_eq!(robot.monitor.findings().iter().count(), 0, "seed {seed}");
@@ -221,7 +221,7 @@ fn while_odometry_is_wrong_the_findings_about_others_end_and_its_own_does_not() 
         };
         robot.break_with(fault);
         steps_until(&mut robot, subject, true, 60 * SECOND);
-        robot.mend();
+        robot.repair();
         steps_until(&mut robot, subject, false, 60 * SECOND);
         assert!(robot.monitor.findings().about(Subject::Odometry).is_some());
         drive_for(&mut robot, 60 * SECOND);

@@ -18,7 +18,7 @@ use tread_control::estimation::EstimatorPrior;
 use tread_control::geometry::Pose;
 use tread_control::robot::RobotModel;
 use tread_lab::logs::analysis::{Analysis, Options, analyse};
-use tread_lab::logs::mapping::{Wishes, choose};
+use tread_lab::logs::mapping::{RequestedTopics, choose};
 use tread_lab::logs::recording::Recording;
 use tread_lab::logs::robot::Robot;
 use tread_lab::logs::statistics::Pair;
@@ -77,7 +77,11 @@ fn record(
     Ok((file.context("a file was written")??.path(), bench.theta()))
 }
 
-fn analysed(file: &Path, wishes: &Wishes, options: &Options) -> anyhow::Result<Analysis> {
+fn analysed(
+    file: &Path,
+    requested_topics: &RequestedTopics,
+    options: &Options,
+) -> anyhow::Result<Analysis> {
     let recording = Recording::open(&[file.to_owned()])?;
     let contents = recording.contents()?;
     let robot = Robot {
@@ -86,7 +90,7 @@ fn analysed(file: &Path, wishes: &Wishes, options: &Options) -> anyhow::Result<A
         settings: None,
         rate_hz: 100.0,
     };
-    let mapping = choose(&recording, &contents, &robot, wishes)?;
+    let mapping = choose(&recording, &contents, &robot, requested_topics)?;
     let begin_ns = contents.topics.iter().map(|topic| topic.first_ns).min();
     let begin_ns = begin_ns.context("it has messages")?;
     Ok(analyse(&recording, &mapping, &robot, options, begin_ns)?)
@@ -97,11 +101,11 @@ fn a_recording_of_the_agent_gives_what_the_agent_said() {
     let folder = tempfile::tempdir().unwrap();
     let (file, said) = record(folder.path(), EstimatorPrior::default()).unwrap();
     let said = said.expect("the robot measures torque");
-    let wishes = Wishes {
+    let requested_topics = RequestedTopics {
         effort: Some(Effort::Torque),
-        ..Wishes::default()
+        ..RequestedTopics::default()
     };
-    let analysis = analysed(&file, &wishes, &OPTIONS).unwrap();
+    let analysis = analysed(&file, &requested_topics, &OPTIONS).unwrap();
     assert!(
         analysis.checks.iter().all(|check| check.holds),
         "{:?}",
@@ -133,7 +137,7 @@ fn a_part_of_a_recording_can_be_chosen_and_standing_is_no_pass() {
         to_s: 1.5,
         ..OPTIONS
     };
-    let analysis = analysed(&file, &Wishes::default(), &standing).unwrap();
+    let analysis = analysed(&file, &RequestedTopics::default(), &standing).unwrap();
     assert_eq!((analysis.passes.len(), analysis.pairs.len()), (0, 0));
     assert!(analysis.overall.theta.is_none());
     let codes: Vec<&str> = analysis

@@ -44,7 +44,7 @@ fn main() -> anyhow::Result<()> {
         files: 2,
     };
     bench.record(config, scenario.site.clone(), robot.id.clone());
-    bench.know_site(site_of(&scenario).map_err(anyhow::Error::msg)?)?;
+    bench.send_site(site_of(&scenario).map_err(anyhow::Error::msg)?)?;
     bench.run_for(STANDS);
     let mission = scenario
         .missions

@@ -28,7 +28,7 @@ fn main() -> anyhow::Result<()> {
             heading_rad: robot.heading_rad,
         };
         let mut bench = Bench::new(&scenario, start, robot.seed)?;
-        bench.know_site(site.clone())?;
+        bench.send_site(site.clone())?;
         bench.run_for(Duration::from_secs(1));
         let missions = scenario
             .missions

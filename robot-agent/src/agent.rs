@@ -41,7 +41,7 @@ use crate::recording::{RecordWriter, RunHead};
 use crate::reporter::{Reporter, log_losses};
 use crate::safety::Safety;
 use crate::safety::latch_file::LatchFile;
-use crate::service_manager::{self, Teller};
+use crate::service_manager::{self, NotifierInputs};
 use crate::start_error::StartError;
 use crate::state_rate::PublishRate;
 use crate::supervisor::{PartEnded, Supervisor};
@@ -290,11 +290,11 @@ impl RunningAgent {
     ///
     /// # Errors
     /// The thread for it cannot be started.
-    pub fn tell_service_manager(&mut self) -> Result<(), StartError> {
+    pub fn notify_service_manager(&mut self) -> Result<(), StartError> {
         if !service_manager::is_there() {
             return Ok(());
         }
-        let teller = Teller {
+        let teller = NotifierInputs {
             identity: self.identity.clone(),
             shared: Arc::clone(&self.shared),
             clock: Arc::clone(&self.reporter.clock),

@@ -14,7 +14,7 @@ use crate::control_loop::overrun::{Overrun, WINDOW_TICKS};
 use crate::control_loop::standing::{Shown, StandingReport};
 use crate::control_loop::surface::Comparison;
 use crate::drive::Battery;
-use crate::drive::ros2::notices::{ForeignCommands, Noticing};
+use crate::drive::ros2::notices::{ForeignCommands, RecentNotices};
 use crate::drive::ros2::refusal::Notice;
 use crate::drive::ros2::refusal::{Counts, Dropping, Source};
 use crate::outbox::OutboxDamage;
@@ -58,7 +58,7 @@ pub(crate) struct Alerts {
     battery_critical: bool,
     outbox_long: bool,
     dropping: Dropping,
-    noticing: [Noticing; Notice::ALL.len()],
+    recent_notices: [RecentNotices; Notice::ALL.len()],
     foreign_commands: ForeignCommands,
 }
 
@@ -232,16 +232,16 @@ impl Alerts {
             .fault
             .and_then(|fault| fault_alert(fault, causes.base));
         let dropped = causes.base.and_then(|base| {
-            let (refusal, text) = self.dropping.look(base)?;
+            let (refusal, text) = self.dropping.check(base)?;
             let code = format!("base-{}", refusal.code());
             alert(&code, Severity::Warning, format!("the base: {text}"))
         });
         let noticed = Notice::ALL.map(|notice| {
-            let text = self.noticing[notice as usize].look(causes.base?, notice)?;
+            let text = self.recent_notices[notice as usize].check(causes.base?, notice)?;
             alert(notice.code(), Severity::Warning, text)
         });
         let foreign = causes.base.and_then(|base| {
-            let text = self.foreign_commands.look(base)?;
+            let text = self.foreign_commands.check(base)?;
             alert("command-second-writer", Severity::Critical, text)
         });
         let long = self.outbox_long.then(|| {

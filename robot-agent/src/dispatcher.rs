@@ -146,7 +146,7 @@ impl Dispatcher {
                 self.answer(command, resume).await;
             }
             Verb::Site => {
-                let site = async |definition| self.take_valid_site(definition);
+                let site = async |definition| self.apply_valid_site(definition);
                 self.answer(command, site).await;
             }
             Verb::Stop => {
@@ -230,10 +230,10 @@ impl Dispatcher {
         command.refuse(&Refusal::from(cause)).await;
     }
 
-    fn take_valid_site(&self, definition: SiteDefinition) -> Result<(), CommandRefusal> {
+    fn apply_valid_site(&self, definition: SiteDefinition) -> Result<(), CommandRefusal> {
         let checked = definition.geofence.validate();
         checked.or_else(|cause| refused(CommandRefusalCode::Impossible, cause.to_string()))?;
-        if !self.take_site(definition) {
+        if !self.apply_site(definition) {
             return Err(loop_is_busy());
         }
         Ok(())
@@ -244,9 +244,9 @@ impl Dispatcher {
     ///
     /// With a geofence beyond the size that a tick can process the robot does not drive without
     /// one, but has no room anywhere until it gets another.
-    pub(crate) fn take_welcome(&self, definition: SiteDefinition) -> bool {
+    pub(crate) fn handle_welcome(&self, definition: SiteDefinition) -> bool {
         match definition.geofence.validate() {
-            Ok(()) => self.take_site(definition),
+            Ok(()) => self.apply_site(definition),
             Err(cause) => {
                 error!("the site's geofence cannot be kept, so the robot stays: {cause}");
                 self.take(SiteView::without_room(definition))
@@ -255,7 +255,7 @@ impl Dispatcher {
     }
 
     /// Applies a site definition; false if the loop's command queue is full.
-    pub(crate) fn take_site(&self, definition: SiteDefinition) -> bool {
+    pub(crate) fn apply_site(&self, definition: SiteDefinition) -> bool {
         self.take(SiteView::new(definition))
     }
 
@@ -295,20 +295,20 @@ impl Dispatcher {
             OfferDecision::Plan => self.plan_and_start(offer, start_by).await,
             OfferDecision::Replace => {
                 let mission = offer.mission;
-                if !self.tell_loop(LoopCommand::Hold(mission, Hold::Replacement)) {
+                if !self.send_to_loop(LoopCommand::Hold(mission, Hold::Replacement)) {
                     return Err(loop_is_busy());
                 }
                 let replaced = self.plan_and_replace(offer).await;
                 if replaced.is_err() {
                     // If it does not arrive, the loop ends the hold by itself after a while.
-                    self.tell_loop(LoopCommand::Release(mission, Hold::Replacement));
+                    self.send_to_loop(LoopCommand::Release(mission, Hold::Replacement));
                 }
                 replaced
             }
         }
     }
 
-    fn tell_loop(&self, command: LoopCommand) -> bool {
+    fn send_to_loop(&self, command: LoopCommand) -> bool {
         self.to_loop.try_send(command).is_ok()
     }
 
@@ -327,7 +327,7 @@ impl Dispatcher {
         } else {
             (LoopCommand::Release(mission, Hold::Pause), "resuming")
         };
-        if !self.tell_loop(command) {
+        if !self.send_to_loop(command) {
             return Err(loop_is_busy());
         }
         info!(mission.id = %mission, "{what} {mission}");
@@ -394,13 +394,13 @@ impl Dispatcher {
             };
         }
         self.shared.show_plan(given_of(&offer, planned.plan));
-        if !self.tell_loop(LoopCommand::Start(planned.job)) {
+        if !self.send_to_loop(LoopCommand::Start(planned.job)) {
             self.missions.slot().release(mission);
             return Err(loop_is_busy());
         }
         // Both commands reach the same tick. If the queue is full, the server pauses the active
         // mission.
-        if offer.on_hold && !self.tell_loop(LoopCommand::Hold(mission, Hold::Pause)) {
+        if offer.on_hold && !self.send_to_loop(LoopCommand::Hold(mission, Hold::Pause)) {
             warn!(mission.id = %mission, "{mission} was to be held, and the control loop is busy");
         }
         info!(
@@ -423,7 +423,7 @@ impl Dispatcher {
         let Some(former) = self.missions.slot().replace(active_of(&offer, plan)) else {
             return refused(CommandRefusalCode::Ended, "the mission ended meanwhile");
         };
-        if !self.tell_loop(LoopCommand::Replace(planned.job)) {
+        if !self.send_to_loop(LoopCommand::Replace(planned.job)) {
             self.missions.slot().restore(former);
             return Err(loop_is_busy());
         }
@@ -468,7 +468,7 @@ impl Dispatcher {
         let decision = self.missions.slot().cancel(mission);
         match decision {
             CancelDecision::Brake => {
-                if !self.tell_loop(LoopCommand::Cancel(mission)) {
+                if !self.send_to_loop(LoopCommand::Cancel(mission)) {
                     return Err(loop_is_busy());
                 }
                 info!(mission.id = %mission, reason = cancel.reason, "cancelling {mission}");

@@ -229,7 +229,7 @@ mod tests {
         let mut slot = MissionSlot::default();
         assert!(slot.take(active()));
         slot.begin_end(active().mission, MissionPhase::Succeeded);
-        slot.keep_end(succeeded());
+        slot.store_end(succeeded());
         // Before the outbox had it, and after.
         assert_eq!(started_twice(&slot, &[]), [succeeded()]);
         assert_eq!(
@@ -257,7 +257,7 @@ mod tests {
                 ..succeeded()
             };
             slot.begin_end(mission, MissionPhase::Succeeded);
-            slot.keep_end(report.clone());
+            slot.store_end(report.clone());
             assert!(slot.end(mission, MissionPhase::Succeeded).is_some());
             expected.push(report);
         }
@@ -276,7 +276,7 @@ mod tests {
     fn an_end_that_cannot_be_read_costs_no_other_one_and_the_agent_starts() {
         let mut slot = MissionSlot::default();
         assert!(slot.take(active()));
-        slot.keep_end(succeeded());
+        slot.store_end(succeeded());
         let mut written = serde_json::to_value(&slot).unwrap();
         let mut unknown = written["unrecorded_ends"][0].clone();
         unknown["phase"] = "suspended".into();

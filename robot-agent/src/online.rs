@@ -81,7 +81,7 @@ struct Links {
     closing: JoinSet<()>,
 }
 
-fn hear(heard: &watch::Sender<ServerTrust>, trust: ServerTrust) {
+fn set_trust(heard: &watch::Sender<ServerTrust>, trust: ServerTrust) {
     heard.send_if_modified(|present| std::mem::replace(present, trust) != trust);
 }
 
@@ -97,15 +97,15 @@ impl Online {
         let note: Note = Arc::new(move |noted| match noted {
             Noted::ServerHeard => {
                 lost.store(false, Ordering::Relaxed);
-                shared.note_server_heard(clock.monotonic());
+                shared.record_server_message(clock.monotonic());
             }
             Noted::CommandLost => Shared::count(&shared.lost_commands),
             Noted::ServerLost => {
                 lost.store(true, Ordering::Relaxed);
                 publish_rate.end_request();
             }
-            Noted::Trust(trust) => hear(&heard, ServerTrust::Is(trust)),
-            Noted::Distrusted => hear(&heard, ServerTrust::Distrusted),
+            Noted::Trust(trust) => set_trust(&heard, ServerTrust::Is(trust)),
+            Noted::Distrusted => set_trust(&heard, ServerTrust::Distrusted),
         });
         tokio::select! {
             // Spreads the connections of robots that are switched on together.
@@ -117,7 +117,7 @@ impl Online {
             note,
             urgent: {
                 let safety = Arc::clone(&self.dispatcher.safety);
-                Arc::new(move |urgent| safety.take_urgent(urgent))
+                Arc::new(move |urgent| safety.handle_urgent(urgent))
             },
             commands,
         };
@@ -146,7 +146,7 @@ impl Online {
             .map(|it| Arc::clone(&it.borrow_and_update()));
         let before = std::mem::replace(&mut links.shown, shown.clone());
         if before.as_ref().map(Arc::as_ptr) != shown.as_ref().map(Arc::as_ptr) {
-            links.servers.begin_anew();
+            links.servers.reset_failures();
         }
         let connecting = self.connect(&mut links.servers, shown.as_deref(), &links.listeners);
         let connected = tokio::select! {
@@ -218,7 +218,7 @@ impl Online {
             }
         };
         if self.stop.is_cancelled() {
-            self.take_leave(&link).await;
+            self.announce_departure(&link).await;
         }
         link.close().await;
         next
@@ -299,7 +299,7 @@ impl Online {
 
     /// Publishes that the agent stops on purpose, so that the server raises no alert. If this
     /// message is lost, the server raises one, as for any robot that disappears.
-    async fn take_leave(&self, link: &FleetLink) {
+    async fn announce_departure(&self, link: &FleetLink) {
         let mut last = self.reporter.state();
         last.leaving = true;
         link.publish_state(&last);
@@ -348,7 +348,7 @@ impl Online {
                 if let Some(text) = clock_warning(server, ahead) {
                     warn!("{text}");
                 }
-                self.dispatcher.take_welcome(welcome.site)
+                self.dispatcher.handle_welcome(welcome.site)
             }
             Err(fleet::AskError::NoAnswer) => false,
             Err(cause) => {

@@ -133,7 +133,7 @@ fn run(flags: &Flags) -> anyhow::Result<()> {
         .context("no runtime")?;
     let ended = runtime.block_on(async {
         let mut agent = Agent::start(config)?;
-        agent.tell_service_manager()?;
+        agent.notify_service_manager()?;
         let ended = wait(&agent).await;
         agent.stop().await;
         ended

@@ -130,7 +130,7 @@ impl Recorder {
     /// forgotten its mission.
     fn record_end(&self, report: MissionReport, unsaved: &mut VecDeque<RecordContent>) {
         let _expected = self.outbox.expect_record();
-        self.missions.slot().keep_end(report.clone());
+        self.missions.slot().store_end(report.clone());
         self.missions.save();
         self.missions.slot().end(report.mission, report.phase);
         unsaved.push_back(RecordContent::Mission(report));

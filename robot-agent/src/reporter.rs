@@ -17,7 +17,7 @@ use crate::alerts::{Alerts, Causes};
 use crate::clock::SharedClock;
 use crate::control_loop::channels::{Shared, Snapshot};
 use crate::control_loop::standing::StandingReport;
-use crate::drive::ros2::notices::{ForeignCommands, Noticing};
+use crate::drive::ros2::notices::{ForeignCommands, RecentNotices};
 use crate::drive::ros2::refusal::Notice;
 use crate::drive::ros2::refusal::{Counts, Dropping, Source};
 use crate::fleet::{FleetLink, Identity};
@@ -239,7 +239,7 @@ pub(crate) async fn log_losses(
 ) {
     let (mut dropping, mut said) = (Dropping::default(), None);
     let (mut segments, mut blocks) = (0, 0);
-    let mut noticing = [Noticing::default(); Notice::ALL.len()];
+    let mut recent_notices = [RecentNotices::default(); Notice::ALL.len()];
     let mut noticed = [const { None }; Notice::ALL.len()];
     let (mut foreign, mut foreign_said) = (ForeignCommands::default(), None);
     let mut missing_said = None;
@@ -248,7 +248,7 @@ pub(crate) async fn log_losses(
             () = tokio::time::sleep(LOSSES_EVERY) => {}
             () = stop.cancelled() => return,
         }
-        let dropped = base.as_deref().and_then(|base| dropping.look(base));
+        let dropped = base.as_deref().and_then(|base| dropping.check(base));
         // The count in it grows as long as there is something new.
         if let Some((_, text)) = dropped.as_ref().filter(|_| dropped != said) {
             warn!("{text}");
@@ -256,13 +256,13 @@ pub(crate) async fn log_losses(
         said = dropped;
         if let Some(base) = base.as_deref() {
             for notice in Notice::ALL {
-                let text = noticing[notice as usize].look(base, notice);
+                let text = recent_notices[notice as usize].check(base, notice);
                 let former = std::mem::replace(&mut noticed[notice as usize], text.clone());
                 if let Some(text) = text.filter(|text| former.as_ref() != Some(text)) {
                     warn!("{text}");
                 }
             }
-            let text = foreign.look(base);
+            let text = foreign.check(base);
             if let Some(text) = text.as_ref().filter(|_| text != foreign_said) {
                 warn!("{text}");
             }

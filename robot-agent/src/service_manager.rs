@@ -60,7 +60,7 @@ impl Feeding {
 
 /// What is read to tell the service manager.
 #[derive(Debug)]
-pub(crate) struct Teller {
+pub(crate) struct NotifierInputs {
     pub(crate) identity: Identity,
     pub(crate) shared: Arc<Shared>,
     pub(crate) clock: SharedClock,
@@ -95,7 +95,7 @@ fn send(messages: &[NotifyState<'_>]) -> io::Result<()> {
     Ok(())
 }
 
-impl Teller {
+impl NotifierInputs {
     /// Tells the service manager until the loop is requested to stop.
     pub(crate) fn run(self) {
         let timeout = sd_notify::watchdog_enabled();

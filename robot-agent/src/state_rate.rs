@@ -106,14 +106,14 @@ impl<'rate> PublishTimes<'rate> {
         loop {
             tokio::select! {
                 () = tokio::time::sleep_until(self.due) => break,
-                () = self.rate.raised.notified() => self.hasten(Instant::now()),
+                () = self.rate.raised.notified() => self.expedite(Instant::now()),
             }
         }
         self.published(Instant::now());
     }
 
     /// Brings the next state forward, after the rate was raised.
-    fn hasten(&mut self, now: Instant) {
+    fn expedite(&mut self, now: Instant) {
         self.due = self.due.min(now + self.rate.period(now));
     }
 
@@ -158,14 +158,14 @@ mod tests {
         let begin = times.due;
         assert_eq!(states_until(&mut times, begin + SECOND), 1);
         rate.request_at(asked(10.0, 2_000), begin + SECOND).unwrap();
-        times.hasten(begin + SECOND);
+        times.expedite(begin + SECOND);
         let raised = states_until(&mut times, begin + 3 * SECOND);
         assert!((19..=20).contains(&raised), "{raised}");
         assert!(states_until(&mut times, begin + 13 * SECOND) <= 2);
         rate.request_at(asked(10.0, 5_000), begin + 13 * SECOND)
             .unwrap();
         rate.end_request();
-        times.hasten(begin + 13 * SECOND);
+        times.expedite(begin + 13 * SECOND);
         assert!(states_until(&mut times, begin + 23 * SECOND) <= 1);
     }
 
@@ -177,7 +177,7 @@ mod tests {
         for tenths in (0..100).step_by(7) {
             let now = begin + tenths * SECOND / 10;
             rate.request_at(asked(10.0, 5_000), now).unwrap();
-            times.hasten(now);
+            times.expedite(now);
             let count = states_until(&mut times, now + 7 * SECOND / 10);
             assert!((6..=8).contains(&count), "{count} after {tenths}");
         }

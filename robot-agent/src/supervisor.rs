@@ -44,7 +44,7 @@ struct EndReport {
 }
 
 impl EndReport {
-    fn note_return(&mut self) {
+    fn record_return(&mut self) {
         self.reason = "it returned";
     }
 }
@@ -97,7 +97,7 @@ impl Supervisor {
         let mut report = self.report(part);
         self.tracker.spawn(async move {
             task.await;
-            report.note_return();
+            report.record_return();
         });
     }
 
@@ -116,7 +116,7 @@ impl Supervisor {
             .spawn(move || {
                 // The panic hook has printed it; the drop reports it.
                 if std::panic::catch_unwind(AssertUnwindSafe(body)).is_ok() {
-                    report.note_return();
+                    report.record_return();
                 }
             })
     }

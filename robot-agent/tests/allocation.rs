@@ -39,7 +39,7 @@ fn no_tick_of_a_recorded_mission_across_cells_and_terrains_allocates() {
     };
     let robot = scenario.robots[0].id.clone();
     bench.record(recording, scenario.site.clone(), robot);
-    bench.know_site(site_of(&scenario).unwrap()).unwrap();
+    bench.send_site(site_of(&scenario).unwrap()).unwrap();
     bench.run_for(Duration::from_secs(1));
     let mission = bench
         .begin(1, &scenario.missions[0].trajectory, None)
@@ -85,7 +85,7 @@ fn no_tick_of_teleoperation_to_a_fence_and_into_silence_allocates() {
     let mut bench = Bench::new(&scenario, start, 3).unwrap();
     let mut site = site_of(&scenario).unwrap();
     site.geofence = fence();
-    bench.know_site(site).unwrap();
+    bench.send_site(site).unwrap();
     bench.run_for(Duration::from_secs(1));
     let lease = bench.lease(&AcquireLease {
         request: Uuid::from_u128(1),

@@ -56,7 +56,7 @@ impl ServiceManager {
     }
 
     /// Reads what has arrived so far.
-    pub fn forget(&self) {
+    pub fn drain(&self) {
         let mut bytes = [0; MESSAGE_BYTES_MAX];
         while self.socket.try_recv(&mut bytes).is_ok() {}
     }

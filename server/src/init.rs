@@ -67,7 +67,7 @@ pub(crate) struct ForgetArgs {
 ///
 /// # Errors
 /// The configuration is invalid, or the database cannot be written.
-pub(crate) async fn forget(args: ForgetArgs) -> anyhow::Result<()> {
+pub(crate) async fn delete_certificate_records(args: ForgetArgs) -> anyhow::Result<()> {
     let config = Config::load(&ServerArgs {
         config: args.config,
         database: args.database,
@@ -76,7 +76,7 @@ pub(crate) async fn forget(args: ForgetArgs) -> anyhow::Result<()> {
     let database = Db::open(&config.database).await?;
     let forgetting = async {
         let mut tx = database.write("init").await?;
-        let count = db::enrolments::forget_certificates(&mut tx).await?;
+        let count = db::enrolments::delete_issued_certificates(&mut tx).await?;
         tx.commit().await?;
         Ok::<_, DbError>(count)
     };

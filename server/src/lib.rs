@@ -142,7 +142,7 @@ impl Server {
     ) -> anyhow::Result<Option<RunningServer>> {
         config.check_credentials()?;
         let mut asked = pin!(asked);
-        let Some(taken) = standby::take_lock(asked.as_mut(), &config, &clock).await? else {
+        let Some(taken) = standby::acquire_lock(asked.as_mut(), &config, &clock).await? else {
             return Ok(None);
         };
         let starting = Box::pin(Self::start_locked(taken, config, clock, resolver));
@@ -170,7 +170,7 @@ impl Server {
         let db = open_claimed(&config, lock).await?;
         let supervisor = Supervisor::new();
         let stop = || supervisor.stop_token();
-        supervisor.spawn_vital("lock", keep_lock(lock.lost(), db.clone(), stop()));
+        supervisor.spawn_vital("lock", hold_lock(lock.lost(), db.clone(), stop()));
         let (of_fleet, fleet_clock) = (security.clone(), clock.clone());
         let fleet = Fleet::open(config.zenoh, of_fleet, fleet_clock, supervisor.clone())?;
         let enrolment_service = |security: Security, robots: &RobotsConfig| EnrolmentService {
@@ -219,10 +219,10 @@ impl Server {
         supervisor.spawn_vital("events", events::run(app.clone(), stop()));
         let asking = app::watched::run(app.clone(), stop());
         supervisor.spawn_vital("watched robots", asking);
-        look_after_database(&app, config.retention, &supervisor);
+        spawn_database_tasks(&app, config.retention, &supervisor);
         let telling = app::friction::live::run(app.clone(), stop());
         supervisor.spawn_vital("map", telling);
-        look_after_identities(&app, &supervisor);
+        spawn_identity_tasks(&app, &supervisor);
         let backing_up = backups::run(app.clone(), schedule, stop());
         supervisor.spawn_vital("backups", backing_up);
         let sending = app::webhooks::delivery::run(app.clone(), sender, stop());
@@ -311,7 +311,7 @@ async fn open_claimed(config: &Config, lock: &DatabaseLock) -> anyhow::Result<Db
 }
 
 /// Ends when another server has the lock of the database, or has claimed it, or at the stop.
-async fn keep_lock(lost: impl Future<Output = String>, db: Db, stop: CancellationToken) {
+async fn hold_lock(lost: impl Future<Output = String>, db: Db, stop: CancellationToken) {
     tokio::select! {
         () = stop.cancelled() => {}
         reason = lost => error!("the lock of the database is lost: {reason}"),
@@ -333,7 +333,7 @@ fn backup_schedule(config: &Config) -> Option<backups::Schedule> {
 }
 
 /// Starts the tasks that maintain the database and keep the state in memory consistent with it.
-fn look_after_database(app: &App, retention: RetentionConfig, supervisor: &Supervisor) {
+fn spawn_database_tasks(app: &App, retention: RetentionConfig, supervisor: &Supervisor) {
     let stop = || supervisor.stop_token();
     supervisor.spawn_vital("memory", memory::run(app.clone(), stop()));
     supervisor.spawn_vital("checkpoints", checkpoints::run(app.clone(), stop()));
@@ -346,7 +346,7 @@ fn look_after_database(app: &App, retention: RetentionConfig, supervisor: &Super
 }
 
 /// Starts the tasks of tokens, sessions, the OpenID provider and the audit log.
-fn look_after_identities(app: &App, supervisor: &Supervisor) {
+fn spawn_identity_tasks(app: &App, supervisor: &Supervisor) {
     let stop = || supervisor.stop_token();
     supervisor.spawn_vital("audit", audit::run(app.clone(), stop()));
     let reading = app::identity::run(app.clone(), READ_AGAIN, stop());
@@ -365,19 +365,19 @@ async fn remember(app: &App, site: &SiteId) -> anyhow::Result<()> {
         app.log_failure("continue the time of the database", &error);
     }
     app.ensure_site(site).await?;
-    app.note_version().await?;
+    app.record_version().await?;
     app.begin_events().await?;
-    app.know_restoration().await?;
-    app.know_robots().await?;
+    app.load_restoration().await?;
+    app.load_robots().await?;
     if !app.presences().known().is_empty() {
-        app.note_restart();
+        app.raise_restart_notice();
     }
-    if !app.take_map().await? {
+    if !app.take_over_map().await? {
         app.load_map().await?;
     }
-    app.know_enrolments().await?;
+    app.load_enrolments().await?;
     // Without this cache each token is looked up at its first use.
-    if let Err(error) = app.know_tokens().await {
+    if let Err(error) = app.load_tokens().await {
         app.log_failure("read the valid tokens", &error);
     }
     Ok(())
@@ -457,7 +457,7 @@ impl RunningServer {
 
     /// Tells the service manager that started this process, if any, that the server is ready, and
     /// from then on that it lives, until the stop.
-    fn tell_service_manager(&self) {
+    fn notify_service_manager(&self) {
         if service_manager::is_there() {
             let address = format!("{}://{}", self.scheme, self.http_address);
             let (supervisor, app) = (&self.supervisor, self.app.clone());

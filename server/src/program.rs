@@ -82,7 +82,9 @@ pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode 
             Ok(false) => return ExitCode::FAILURE,
             Err(error) => Err(error),
         },
-        Some(Action::ForgetCertificates(args)) => run_beside_server(init::forget(args)),
+        Some(Action::ForgetCertificates(args)) => {
+            run_beside_server(init::delete_certificate_records(args))
+        }
         Some(Action::Backup(args)) => {
             lower_priority();
             run_beside_server(maintenance::backup::run(args))
@@ -169,7 +171,7 @@ pub fn run(args: &ServerArgs) -> anyhow::Result<()> {
         let Some(server) = started else {
             return Ok(());
         };
-        server.tell_service_manager();
+        server.notify_service_manager();
         tokio::select! {
             () = asked() => {}
             () = server.failed() => {}

@@ -85,9 +85,9 @@ impl Opened {
     }
 }
 
-/// A connection in a transaction; dropped without [`Lent::commit`] it is rolled back.
+/// A connection in a transaction; dropped without [`TransactionConnection::commit`] it is rolled back.
 #[derive(Debug)]
-pub(super) struct Lent {
+pub(super) struct TransactionConnection {
     opened: Option<Opened>,
     permit: Option<OwnedSemaphorePermit>,
     inner: Arc<Inner>,
@@ -133,7 +133,10 @@ impl Connections {
     ///
     /// # Errors
     /// No connection became free in time, or PostgreSQL failed.
-    pub(super) async fn begin(&self, statements: &str) -> Result<Lent, sqlx::Error> {
+    pub(super) async fn begin(
+        &self,
+        statements: &str,
+    ) -> Result<TransactionConnection, sqlx::Error> {
         let waiting = Arc::clone(&self.inner.permits).acquire_owned();
         let permit = timeout(ACQUIRE_TIMEOUT, waiting)
             .await
@@ -151,7 +154,7 @@ impl Connections {
             Some(begun) => begun?,
             None => begin_on(self.inner.connect().await?, statements).await?,
         };
-        Ok(Lent {
+        Ok(TransactionConnection {
             opened: Some(opened),
             permit: Some(permit),
             inner: Arc::clone(&self.inner),
@@ -244,7 +247,7 @@ impl Inner {
     }
 }
 
-impl Lent {
+impl TransactionConnection {
     /// Commits the transaction.
     ///
     /// # Errors
@@ -265,7 +268,7 @@ impl Lent {
     }
 }
 
-impl Drop for Lent {
+impl Drop for TransactionConnection {
     fn drop(&mut self) {
         let Some(mut opened) = self.opened.take() else {
             return;
@@ -288,7 +291,7 @@ impl Drop for Lent {
     }
 }
 
-impl Deref for Lent {
+impl Deref for TransactionConnection {
     type Target = PgConnection;
 
     fn deref(&self) -> &PgConnection {
@@ -298,7 +301,7 @@ impl Deref for Lent {
     }
 }
 
-impl DerefMut for Lent {
+impl DerefMut for TransactionConnection {
     fn deref_mut(&mut self) -> &mut PgConnection {
         let opened = self.opened.as_mut();
         let opened = opened.expect("only a commit takes it, with the whole");

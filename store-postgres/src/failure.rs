@@ -51,9 +51,9 @@ fn of_code(code: &str) -> Option<StorageFailure> {
 }
 
 /// Records an error.
-pub(super) fn note(error: &sqlx::Error) {
+pub(super) fn record(error: &sqlx::Error) {
     if let Some(failure) = of(error) {
-        failure::note(failure);
+        failure::record(failure);
     }
 }
 

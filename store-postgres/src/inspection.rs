@@ -43,13 +43,13 @@ pub async fn inspect(url: &str, is_deep: bool) -> Result<Inspection, InspectErro
     let connecting = connections::connect(&options).await;
     let connecting = connecting.map_err(|cause| open::refused(&address, cause));
     let mut connection = connecting.map_err(InspectError::Open)?;
-    let inspected = look(&mut connection, is_deep).await;
+    let inspected = inspect_open(&mut connection, is_deep).await;
     // It was opened for reading, so an error of closing it loses nothing.
     let _ = connection.close().await;
     inspected
 }
 
-async fn look(db: &mut Connection, is_deep: bool) -> Result<Inspection, InspectError> {
+async fn inspect_open(db: &mut Connection, is_deep: bool) -> Result<Inspection, InspectError> {
     let snapshot = sqlx::raw_sql("BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY");
     let begun = snapshot.execute(&mut *db).await;
     begun.map_err(InspectError::Postgres)?;

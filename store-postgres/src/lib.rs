@@ -99,7 +99,7 @@ use tread_store::metrics::DatabaseMetrics;
 use tread_store::{DbError, Disk};
 
 use self::begin::{BEGIN_READ, BeginWrite};
-use self::connections::{Bounds, COMMIT_TIMEOUT, Connections, Lent};
+use self::connections::{Bounds, COMMIT_TIMEOUT, Connections, TransactionConnection};
 pub use self::error::EngineError;
 pub use self::open::{OpenError, refuse_newer};
 pub use self::transaction::Tx;
@@ -321,7 +321,7 @@ impl Db {
         let _ = is_taken_over.wait_for(|is| *is).await;
     }
 
-    fn timed(&self, inner: Lent, kind: &'static str, writes: bool) -> Tx {
+    fn timed(&self, inner: TransactionConnection, kind: &'static str, writes: bool) -> Tx {
         let noted = Noted {
             metrics: self.metrics.clone(),
             kind,
@@ -446,7 +446,7 @@ async fn tables(db: &mut Connection) -> Result<Vec<String>, EngineError> {
     let tables = tables.fetch_all(db).await?;
     if tables.is_empty() {
         // The database was emptied, or the address leads to another one now.
-        failure::note(&sqlx::Error::WorkerCrashed);
+        failure::record(&sqlx::Error::WorkerCrashed);
         return Err(corrupt("schema", "no tables"));
     }
     Ok(tables)

@@ -148,7 +148,7 @@ impl DatabaseLock {
                 Err(reason) => {
                     waiting(&reason);
                     // What was seen before says nothing about the time without answers.
-                    watch.forget();
+                    watch.disconnect();
                     RETRY_INTERVAL
                 }
             };
@@ -391,7 +391,7 @@ impl Watch {
     }
 
     /// Forgets connection and session, after a failure.
-    fn forget(&mut self) {
+    fn disconnect(&mut self) {
         *self = Self {
             has_warned: self.has_warned,
             ..Self::default()

@@ -220,7 +220,7 @@ pub(super) async fn prepare_to_read(url: &str) -> Result<Prepared, OpenError> {
     let connecting = connections::connect(&options).await;
     let mut connection = connecting.map_err(|cause| refused(&address, cause))?;
     let looking = async {
-        let version = look(&mut connection, &address).await?;
+        let version = check_server(&mut connection, &address).await?;
         Ok((version, found(&mut connection, &address).await?))
     };
     let looked = looking.await;
@@ -301,7 +301,7 @@ pub(super) fn refused(address: &str, cause: sqlx::Error) -> OpenError {
 ///
 /// # Errors
 /// It is too old, or the database has another encoding.
-async fn look(connection: &mut PgConnection, address: &str) -> Result<String, OpenError> {
+async fn check_server(connection: &mut PgConnection, address: &str) -> Result<String, OpenError> {
     let (number, version, encoding): (i32, String, String) = sqlx::query_as(
         "SELECT CAST(current_setting('server_version_num') AS INTEGER),
              current_setting('server_version'), current_setting('server_encoding')",
@@ -330,7 +330,7 @@ async fn update(connection: &mut PgConnection, address: &str) -> Result<String, 
         address: address.to_owned(),
         cause,
     };
-    let version = look(connection, address).await?;
+    let version = check_server(connection, address).await?;
     refuse_newer(address, &found(&mut *connection, address).await?)?;
     let waiting = sqlx::AssertSqlSafe(format!(
         "SET lock_timeout = {}",

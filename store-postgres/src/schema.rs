@@ -73,7 +73,7 @@ pub fn missing_after(schema: Option<i64>) -> Vec<(i64, &'static str)> {
 }
 
 /// Stores the version of the server that opens the database, unless it was the last one too.
-pub async fn note_version(
+pub async fn record_version(
     db: &mut Connection,
     version: &str,
     at: Timestamp,

@@ -74,7 +74,7 @@ async fn count(tx: &mut Tx) -> i64 {
     count
 }
 
-async fn note(tx: &mut Tx, number: i64) -> Result<(), EngineError> {
+async fn insert(tx: &mut Tx, number: i64) -> Result<(), EngineError> {
     let noting = sqlx::query("INSERT INTO notes (number) VALUES ($1)").bind(number);
     noting.execute(&mut **tx).await?;
     Ok(())
@@ -95,7 +95,7 @@ async fn a_read_is_a_snapshot_and_a_write_sees_all_earlier_ones() {
                 async move {
                     let mut tx = db.write("db").await.unwrap();
                     let next = count(&mut tx).await;
-                    note(&mut tx, next).await.unwrap();
+                    insert(&mut tx, next).await.unwrap();
                     tx.commit().await.unwrap();
                 }
             });
@@ -128,8 +128,8 @@ async fn a_transaction_with_a_failed_statement_is_never_reported_as_committed() 
         async |database| {
             let db = open_with_notes(database).await;
             let mut tx = db.write("db").await.unwrap();
-            note(&mut tx, 1).await.unwrap();
-            let error = DbError::from(note(&mut tx, 1).await.unwrap_err());
+            insert(&mut tx, 1).await.unwrap();
+            let error = DbError::from(insert(&mut tx, 1).await.unwrap_err());
             assert!(error.is_unique_violation() && error.failure().is_none());
             let (sender, receiver) = oneshot::channel();
             tx.commit_then(|outcome| sender.send(outcome).unwrap())
@@ -162,7 +162,7 @@ async fn a_commit_whose_server_process_is_ended_has_an_unknown_outcome() {
                 )
                 .await;
             let mut tx = db.write("db").await.unwrap();
-            note(&mut tx, 1).await.unwrap();
+            insert(&mut tx, 1).await.unwrap();
             let (sender, receiver) = oneshot::channel();
             let committing = tx.commit_then(|outcome| sender.send(outcome).unwrap());
             let ending = database.run(
@@ -253,7 +253,7 @@ async fn a_commit_whose_answer_is_lost_has_an_unknown_outcome_and_may_be_written
             let url = format!("{user}@{address}/{name}?sslmode=disable");
             let db = Db::open(&url).await.unwrap();
             let mut tx = db.write("db").await.unwrap();
-            note(&mut tx, 1).await.unwrap();
+            insert(&mut tx, 1).await.unwrap();
             let (sender, receiver) = oneshot::channel();
             armed.store(true, Ordering::Release);
             let committing = tx.commit_then(|outcome| sender.send(outcome).unwrap());
@@ -281,7 +281,7 @@ async fn connections_that_the_server_has_ended_are_replaced() {
             for _ in 0..3 {
                 let mut tx = db.write("db").await.unwrap();
                 let number = count(&mut tx).await;
-                note(&mut tx, number).await.unwrap();
+                insert(&mut tx, number).await.unwrap();
                 tx.commit().await.unwrap();
                 drop(db.read("db").await.unwrap());
                 database
@@ -318,7 +318,7 @@ async fn probes_find_a_whole_database_whole() {
         let mut tx = db.write("db").await.unwrap();
         for version in ["1.0.0", "1.0.0", "1.0.1"] {
             let at = jiff::Timestamp::UNIX_EPOCH;
-            schema::note_version(&mut tx, version, at).await.unwrap();
+            schema::record_version(&mut tx, version, at).await.unwrap();
         }
         let found = open::schema_of(&database.url).await.unwrap();
         assert_eq!(found.version, None, "before the commit");
@@ -375,7 +375,7 @@ async fn a_writer_that_gives_up_waiting_does_not_keep_the_turn() {
     with_database(test, async |database| {
         let (db, other) = (open_with_notes(database).await, database.open().await);
         let mut tx = db.write("db").await.unwrap();
-        note(&mut tx, 1).await.unwrap();
+        insert(&mut tx, 1).await.unwrap();
         let waiting = timeout(Duration::from_millis(200), other.write("db")).await;
         assert!(waiting.is_err(), "two wrote at once");
         let mut reading = other.read("db").await.unwrap();
@@ -385,7 +385,7 @@ async fn a_writer_that_gives_up_waiting_does_not_keep_the_turn() {
         let mut tx = other.write("db").await.unwrap();
         assert_eq!(count(&mut tx).await, 1);
         // One that is dropped is rolled back, and gives its connection back.
-        note(&mut tx, 2).await.unwrap();
+        insert(&mut tx, 2).await.unwrap();
         drop(tx);
         let mut tx = other.write("db").await.unwrap();
         assert_eq!(count(&mut tx).await, 1);

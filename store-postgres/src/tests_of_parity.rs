@@ -217,8 +217,8 @@ async fn sites_terrains_and_robots_are_the_same() {
         both!(both, robots::model_names());
         let configuration = configurations[&1];
         both!(both, robots::measured_configuration(1, configuration));
-        both!(both, robots::note_measured(1, configuration));
-        both!(both, robots::note_measured(1, configuration));
+        both!(both, robots::record_measured(1, configuration));
+        both!(both, robots::record_measured(1, configuration));
         both!(both, robots::measured_configuration(1, configuration));
         both!(both, robots::measured_count(1));
         for boot in 10..40 {
@@ -228,7 +228,7 @@ async fn sites_terrains_and_robots_are_the_same() {
                 seq: 7,
             };
             assert!(!both!(both, history::has_report(key)));
-            both!(both, history::note_report(key));
+            both!(both, history::record_report(key));
             assert!(both!(both, history::has_report(key)));
         }
         both!(both, robots::find_boot(1, id(10)));
@@ -277,8 +277,8 @@ async fn alerts_and_stops_are_the_same() {
         both!(both, alerts::raised_of(1));
         both!(both, alerts::find(id(2)));
         both!(both, attendance::all("low"));
-        both!(both, alerts::forget(2, 1));
-        both!(both, alerts::forget(2, 0));
+        both!(both, alerts::prune(2, 1));
+        both!(both, alerts::prune(2, 0));
 
         let stop = |number: u8, place: &str, name: &str, second: i64| {
             of::<tread_api::stop::Stop>(json!({
@@ -424,7 +424,7 @@ async fn missions_and_restorations_are_the_same() {
         both!(both, restorations::begin(&restoration));
         both!(both, restorations::newest());
         both!(both, restorations::enrolment_floor());
-        both!(both, restorations::note_outcomes(1));
+        both!(both, restorations::record_outcomes(1));
         both!(both, restorations::release(2));
         both!(both, restorations::release(2));
         both!(both, restorations::awaiting_count());
@@ -523,9 +523,9 @@ async fn identities_are_the_same() {
         both!(both, tokens::revoke(id(1), at(-3)));
         both!(both, tokens::revoke(id(1), at(30)));
         both!(both, tokens::find(id(1)));
-        both!(both, tokens::forget_dead(at(31), 10));
+        both!(both, tokens::delete_ended(at(31), 10));
         both!(both, tokens::list(&Scope::EVERYWHERE, None, 10));
-        both!(both, sessions::forget_expired(at(50)));
+        both!(both, sessions::delete_expired(at(50)));
         both_in_any_order!(both, sessions::all_valid(at(2)));
 
         for (number, name) in [(1, None), (2, Some("rover-2")), (3, Some("rover-9"))] {
@@ -543,7 +543,7 @@ async fn identities_are_the_same() {
         }
         both!(both, join_tokens::valid_count(at(1)));
         both!(both, join_tokens::by_lookup(&secret(3)));
-        both!(both, join_tokens::forget_dead(at(10), 2));
+        both!(both, join_tokens::delete_ended(at(10), 2));
         both!(both, join_tokens::list(&Scope::EVERYWHERE, None, 10));
         let (yard, rover, issued) = (site("yard"), robot("rover-1"), Issued::one("f".to_owned()));
         for number in [1, 2] {
@@ -561,7 +561,7 @@ async fn identities_are_the_same() {
         };
         assert!(both!(both, enrolments::renew((&yard, &rover, 2), renewal)));
         assert!(!both!(both, enrolments::renew((&yard, &rover, 1), renewal)));
-        both!(both, enrolments::note_authority((&yard, &rover, 2), "two"));
+        both!(both, enrolments::record_authority((&yard, &rover, 2), "two"));
         both!(both, enrolments::counting((&yard, &rover, 2)));
         both!(both, enrolments::counting((&yard, &rover, 1)));
         let named = BTreeSet::from([robot("rover-2")]);
@@ -570,7 +570,7 @@ async fn identities_are_the_same() {
         both!(both, enrolments::newest(&yard, &rover));
         both!(both, enrolments::all_newest());
         both!(both, enrolments::robot_count());
-        both!(both, enrolments::forget_certificates());
+        both!(both, enrolments::delete_issued_certificates());
         both!(both, enrolments::counting((&yard, &rover, 2)));
     })
     .await;
@@ -603,7 +603,7 @@ async fn records_and_webhooks_are_the_same() {
             since: at(0),
             newest_max: 1,
         };
-        both!(both, audit::forget(kept, 10));
+        both!(both, audit::prune(kept, 10));
         both!(both, audit::chain());
         let owner = SubjectId::Token(id(1));
         let answer = idempotency::StoredAnswer {
@@ -613,7 +613,7 @@ async fn records_and_webhooks_are_the_same() {
         both!(both, idempotency::find((owner, "key"), id(7)));
         both!(both, idempotency::insert((owner, "key"), &answer, at(1)));
         both!(both, idempotency::find((owner, "key"), id(7)));
-        both!(both, idempotency::forget_before(at(2), 10));
+        both!(both, idempotency::delete_before(at(2), 10));
         both!(both, idempotency::find((owner, "key"), id(7)));
 
         for (number, kinds, places) in [
@@ -661,18 +661,18 @@ async fn records_and_webhooks_are_the_same() {
             status: Some(503),
             detail: Some("Ä".to_owned()),
         };
-        both!(both, webhooks::note_attempt(&outcome));
+        both!(both, webhooks::record_attempt(&outcome));
         both!(both, webhooks::deliveries(id(1), Some(id(9)), 10));
         both!(both, webhooks::has_older(at(4)));
         let limit = webhooks::AgeLimit {
             now: at(9),
             oldest: at(4),
         };
-        both!(both, webhooks::give_up_older(limit));
+        both!(both, webhooks::abandon_oldest(limit));
         both!(both, webhooks::pending_count());
         both!(both, webhooks::list(Some(id(3)), 10));
         both!(both, webhooks::count());
-        both!(both, webhooks::forget(id(1), 1));
+        both!(both, webhooks::prune(id(1), 1));
         both!(both, webhooks::deliveries(id(1), None, 10));
         assert!(both!(both, webhooks::delete(id(1))));
         both!(both, webhooks::deliveries(id(1), None, 10));

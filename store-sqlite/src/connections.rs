@@ -98,9 +98,9 @@ impl Drop for Opened {
     }
 }
 
-/// A connection in a transaction; dropped without [`Lent::commit`] it is rolled back.
+/// A connection in a transaction; dropped without [`TransactionConnection::commit`] it is rolled back.
 #[derive(Debug)]
-pub(super) struct Lent {
+pub(super) struct TransactionConnection {
     opened: Option<Opened>,
     permit: Option<OwnedSemaphorePermit>,
     inner: Arc<Inner>,
@@ -136,7 +136,10 @@ impl Connections {
     ///
     /// # Errors
     /// No connection became free in time, or SQLite failed.
-    pub(super) async fn begin(&self, statement: &'static str) -> Result<Lent, sqlx::Error> {
+    pub(super) async fn begin(
+        &self,
+        statement: &'static str,
+    ) -> Result<TransactionConnection, sqlx::Error> {
         let permit = self.reserve().await?;
         let mut opened = match self.inner.take_idle() {
             Some(opened) => opened,
@@ -147,7 +150,7 @@ impl Connections {
         timeout(BEGIN_TIMEOUT, beginning)
             .await
             .map_err(|_elapsed| sqlx::Error::WorkerCrashed)??;
-        Ok(Lent {
+        Ok(TransactionConnection {
             opened: Some(opened),
             permit: Some(permit),
             inner: Arc::clone(&self.inner),
@@ -282,7 +285,7 @@ impl Inner {
     }
 }
 
-impl Lent {
+impl TransactionConnection {
     /// Commits the transaction.
     ///
     /// # Errors
@@ -301,7 +304,7 @@ impl Lent {
     }
 }
 
-impl Drop for Lent {
+impl Drop for TransactionConnection {
     fn drop(&mut self) {
         let Some(mut opened) = self.opened.take() else {
             return;
@@ -329,7 +332,7 @@ impl Drop for Lent {
     }
 }
 
-impl Deref for Lent {
+impl Deref for TransactionConnection {
     type Target = SqliteConnection;
 
     fn deref(&self) -> &SqliteConnection {
@@ -339,7 +342,7 @@ impl Deref for Lent {
     }
 }
 
-impl DerefMut for Lent {
+impl DerefMut for TransactionConnection {
     fn deref_mut(&mut self) -> &mut SqliteConnection {
         let opened = self.opened.as_mut();
         let connection = opened.and_then(|opened| opened.connection.as_mut());

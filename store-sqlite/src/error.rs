@@ -37,7 +37,7 @@ impl EngineError {
 
 impl From<sqlx::Error> for EngineError {
     fn from(error: sqlx::Error) -> Self {
-        failure::note(&error);
+        failure::record(&error);
         Self::Sqlite(error)
     }
 }

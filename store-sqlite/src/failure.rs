@@ -83,9 +83,9 @@ pub(super) fn advice_on_database(error: &sqlx::Error) -> &'static str {
 }
 
 /// Records an error.
-pub(super) fn note(error: &sqlx::Error) {
+pub(super) fn record(error: &sqlx::Error) {
     if let Some(failure) = of(error) {
-        failure::note(failure);
+        failure::record(failure);
     }
 }
 

@@ -65,13 +65,13 @@ pub async fn inspect(
         // Without a log there is nothing but the file, and no other file is made beside it.
         .immutable(!is_in_use && !has_log);
     let mut connection = options.connect().await.map_err(InspectError::Sqlite)?;
-    let inspected = look(&mut connection, is_deep).await;
+    let inspected = inspect_open(&mut connection, is_deep).await;
     // It was opened for reading, so an error of closing it loses nothing.
     let _ = connection.close().await;
     inspected.map(Some)
 }
 
-async fn look(
+async fn inspect_open(
     connection: &mut SqliteConnection,
     is_deep: bool,
 ) -> Result<Inspection, InspectError> {

@@ -98,7 +98,7 @@ use tread_api::release::VERSION;
 use tread_store::metrics::DatabaseMetrics;
 use tread_store::{DbError, Disk};
 
-use self::connections::{COMMIT_TIMEOUT, Connections, Lent};
+use self::connections::{COMMIT_TIMEOUT, Connections, TransactionConnection};
 pub use self::error::EngineError;
 pub use self::transaction::Tx;
 use self::transaction::{Commits, Noted};
@@ -376,7 +376,7 @@ impl Db {
         })
     }
 
-    fn timed(&self, inner: Lent, kind: &'static str, writes: bool) -> Tx {
+    fn timed(&self, inner: TransactionConnection, kind: &'static str, writes: bool) -> Tx {
         let noted = Noted {
             metrics: self.metrics.clone(),
             kind,
@@ -470,7 +470,7 @@ impl Db {
                 .map_err(EngineError::from)?;
         if tables.is_empty() {
             // The file was removed, so the open connections are useless.
-            failure::note(&sqlx::Error::WorkerCrashed);
+            failure::record(&sqlx::Error::WorkerCrashed);
             return Err(corrupt("schema", "no tables").into());
         }
         for (table,) in tables {

@@ -199,7 +199,7 @@ pub async fn locate(
 }
 
 /// Deletes a robot's oldest cleared alerts beyond `kept` alerts.
-pub async fn forget(db: &mut Connection, robot_pk: i64, kept: u32) -> Result<(), EngineError> {
+pub async fn prune(db: &mut Connection, robot_pk: i64, kept: u32) -> Result<(), EngineError> {
     sqlx::query!(
         "DELETE FROM alerts
          WHERE robot_pk = $1 AND cleared_at_us IS NOT NULL

@@ -214,7 +214,7 @@ async fn insert(db: &mut Connection, entry: &AuditEntry) -> Result<(), EngineErr
 
 /// Deletes at most `limit` of the oldest entries, of those that are not `kept`. Keeps number and hash of
 /// the last one deleted, so that the rest can be verified.
-pub async fn forget(
+pub async fn prune(
     db: &mut Connection,
     kept: AuditRetention,
     limit: u32,

@@ -175,7 +175,7 @@ pub async fn counting(
 /// Deletes the record of the certificates that are accepted for a renewal: the next one of each
 /// robot is accepted if a trusted authority has signed it. Returns the number of enrolments
 /// changed.
-pub async fn forget_certificates(db: &mut Connection) -> Result<u64, EngineError> {
+pub async fn delete_issued_certificates(db: &mut Connection) -> Result<u64, EngineError> {
     let done = sqlx::query!(
         "UPDATE enrolments SET certificates = NULL
          WHERE certificates IS NOT NULL AND revoked_at_us IS NULL"
@@ -212,7 +212,7 @@ pub async fn renew(
 }
 
 /// Stores the authority of the certificate that a robot has shown, if its enrolment is in force.
-pub async fn note_authority(
+pub async fn record_authority(
     db: &mut Connection,
     (site, robot, number): (&SiteId, &RobotId, u32),
     authority: &str,

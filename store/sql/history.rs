@@ -161,7 +161,7 @@ pub async fn has_report(db: &mut Connection, key: RecordKey) -> Result<bool, Eng
 }
 
 /// Records that a report was applied.
-pub async fn note_report(db: &mut Connection, key: RecordKey) -> Result<(), EngineError> {
+pub async fn record_report(db: &mut Connection, key: RecordKey) -> Result<(), EngineError> {
     sqlx::query!(
         "INSERT INTO reports_seen (boot_pk, seq) VALUES ($1, $2)",
         key.boot_pk,

@@ -57,7 +57,7 @@ pub async fn insert(
 }
 
 /// Deletes at most `limit` keys that are older than a time.
-pub async fn forget_before(
+pub async fn delete_before(
     db: &mut Connection,
     before: Timestamp,
     limit: u32,

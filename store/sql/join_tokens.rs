@@ -188,7 +188,7 @@ pub async fn revoke(
 }
 
 /// Deletes at most `limit` join tokens that ended before a time.
-pub async fn forget_dead(
+pub async fn delete_ended(
     db: &mut Connection,
     before: Timestamp,
     limit: u32,

@@ -43,7 +43,7 @@ pub async fn remove(
         let last = range.last_pk.min(until_pk);
         removed += (last - range.first_pk).unsigned_abs() + 1;
         let seqs = (range.first_seq, range.first_seq + (last - range.first_pk));
-        note(db, range.boot_pk, seqs).await?;
+        record(db, range.boot_pk, seqs).await?;
         boots.insert(range.boot_pk);
     }
     sqlx::query!(
@@ -66,7 +66,7 @@ pub async fn remove(
 }
 
 /// Records a range, joined with the ranges that it touches.
-async fn note(
+async fn record(
     db: &mut Connection,
     boot_pk: i64,
     (mut from, mut to): (i64, i64),

@@ -50,7 +50,7 @@ pub async fn begin(db: &mut Connection, restoration: &Restoration) -> Result<Cha
         at_us
     );
     changed.deliveries = done.execute(&mut *db).await?.rows_affected();
-    changed.certificates = super::enrolments::forget_certificates(db).await?;
+    changed.certificates = super::enrolments::delete_issued_certificates(db).await?;
     Ok(changed)
 }
 
@@ -149,7 +149,7 @@ pub async fn release(db: &mut Connection, robot_pk: i64) -> Result<bool, EngineE
 }
 
 /// Stores that a robot has said how its open missions ended.
-pub async fn note_outcomes(db: &mut Connection, robot_pk: i64) -> Result<(), EngineError> {
+pub async fn record_outcomes(db: &mut Connection, robot_pk: i64) -> Result<(), EngineError> {
     sqlx::query!(
         "UPDATE robots SET outcomes_wanted = 0 WHERE pk = $1",
         robot_pk

@@ -238,13 +238,17 @@ pub async fn boot_key(
         boot,
     );
     let pk = pk.fetch_one(&mut *db).await?;
-    forget_runs(db, robot_pk, kept).await?;
+    delete_oldest_runs(db, robot_pk, kept).await?;
     Ok(pk)
 }
 
 /// Removes the oldest runs of a robot beyond `kept`, with the record of their uploads. Runs with
 /// measurements stay, as does the one of the last hello.
-async fn forget_runs(db: &mut Connection, robot_pk: i64, kept: u32) -> Result<(), EngineError> {
+async fn delete_oldest_runs(
+    db: &mut Connection,
+    robot_pk: i64,
+    kept: u32,
+) -> Result<(), EngineError> {
     let over = sqlx::query_scalar!(
         r#"SELECT boots.pk AS "pk!" FROM boots
            WHERE boots.robot_pk = $1
@@ -342,7 +346,7 @@ pub async fn measured_count(db: &mut Connection, robot_pk: i64) -> Result<i64, E
 }
 
 /// Records that a robot measures with a configuration; returns the configuration's key.
-pub async fn note_measured(
+pub async fn record_measured(
     db: &mut Connection,
     robot_pk: i64,
     id: ConfigurationId,

@@ -201,7 +201,7 @@ pub async fn delete(db: &mut Connection, id: SessionId) -> Result<(), EngineErro
 }
 
 /// Deletes sessions that have expired.
-pub async fn forget_expired(db: &mut Connection, at: Timestamp) -> Result<(), EngineError> {
+pub async fn delete_expired(db: &mut Connection, at: Timestamp) -> Result<(), EngineError> {
     let at_us = to_us(at);
     sqlx::query!("DELETE FROM sessions WHERE expires_at_us <= $1", at_us)
         .execute(db)

@@ -204,11 +204,11 @@ pub async fn insert(db: &mut Connection, stops: &[Stop], kept: u32) -> Result<()
     )
     .execute(&mut *db)
     .await?;
-    forget(db, &entries, kept).await
+    prune(db, &entries, kept).await
 }
 
 /// Deletes the oldest stops of robots beyond `kept`; open ones stay.
-async fn forget(db: &mut Connection, entries: &str, kept: u32) -> Result<(), EngineError> {
+async fn prune(db: &mut Connection, entries: &str, kept: u32) -> Result<(), EngineError> {
     sqlx::query!(
         "DELETE FROM stops WHERE id IN (
              SELECT old.id FROM json_each($1) AS entry
@@ -265,7 +265,7 @@ pub async fn adopt(
     .execute(&mut *db)
     .await?;
     let named = to_json("stops", &[(&id, &stop.site, &stop.robot)])?;
-    forget(db, &named, kept).await
+    prune(db, &named, kept).await
 }
 
 /// Stores the confirmations of robots; only the first time counts.

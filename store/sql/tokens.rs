@@ -226,7 +226,7 @@ pub async fn touch(db: &mut Connection, id: TokenId, at: Timestamp) -> Result<()
 }
 
 /// Deletes at most `limit` tokens that expired or were revoked before a time, and their sessions.
-pub async fn forget_dead(
+pub async fn delete_ended(
     db: &mut Connection,
     before: Timestamp,
     limit: u32,

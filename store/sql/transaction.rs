@@ -9,13 +9,13 @@ use tokio::time::Instant;
 use tread_store::metrics::DatabaseMetrics;
 use tread_store::{DbError, Outcome};
 
-use super::connections::{Lent, outcome_of};
+use super::connections::{TransactionConnection, outcome_of};
 use super::{Connection, EngineError};
 
 /// A transaction on the database, rolled back unless it is committed.
 #[derive(Debug)]
 pub struct Tx {
-    pub(super) inner: Lent,
+    pub(super) inner: TransactionConnection,
     pub(super) noted: Noted,
     pub(super) commits: Arc<Commits>,
     /// Whether its commit increments the generation.

@@ -293,7 +293,7 @@ pub async fn due(db: &mut Connection, times: DueTimes) -> Result<Vec<Due>, Engin
 
 /// Stores the outcome of an attempt. A delivery that was dropped meanwhile only counts if it has
 /// arrived.
-pub async fn note_attempt(db: &mut Connection, outcome: &Outcome) -> Result<(), EngineError> {
+pub async fn record_attempt(db: &mut Connection, outcome: &Outcome) -> Result<(), EngineError> {
     let (id, state) = (outcome.id.to_string(), outcome.state.as_str());
     let (at_us, due_at_us) = (to_us(outcome.at), to_us(outcome.due_at));
     let ended_at_us = (outcome.state != DeliveryState::Pending).then_some(at_us);
@@ -327,7 +327,7 @@ pub async fn has_older(db: &mut Connection, than: Timestamp) -> Result<bool, Eng
 }
 
 /// Gives up the waiting deliveries beyond a limit; returns how many.
-pub async fn give_up_older(db: &mut Connection, limit: AgeLimit) -> Result<u64, EngineError> {
+pub async fn abandon_oldest(db: &mut Connection, limit: AgeLimit) -> Result<u64, EngineError> {
     let (oldest_us, now_us) = (to_us(limit.oldest), to_us(limit.now));
     let done = sqlx::query!(
         "UPDATE webhook_deliveries
@@ -343,7 +343,7 @@ pub async fn give_up_older(db: &mut Connection, limit: AgeLimit) -> Result<u64, 
 }
 
 /// Deletes a webhook's oldest deliveries that do not wait, beyond `kept` of them.
-pub async fn forget(db: &mut Connection, webhook: WebhookId, kept: u32) -> Result<(), EngineError> {
+pub async fn prune(db: &mut Connection, webhook: WebhookId, kept: u32) -> Result<(), EngineError> {
     let webhook = webhook.to_string();
     sqlx::query!(
         "DELETE FROM webhook_deliveries

@@ -44,13 +44,13 @@ impl DbError {
     /// Returns the error of work that the database did not complete in time, and records the failure:
     /// connections that are open now are replaced before they are used again.
     pub fn unanswered() -> Self {
-        failure::note(StorageFailure::Connection);
+        failure::record(StorageFailure::Connection);
         Self::Unanswered
     }
 
     /// Returns the error of a database that was busy for too long, and records the failure.
     pub fn busy() -> Self {
-        failure::note(StorageFailure::Busy);
+        failure::record(StorageFailure::Busy);
         Self::Busy
     }
 

@@ -119,7 +119,7 @@ fn now_us() -> u64 {
 }
 
 /// Records a failure.
-pub fn note(failure: StorageFailure) {
+pub fn record(failure: StorageFailure) {
     FAILURES.counts[failure as usize].fetch_add(1, Ordering::AcqRel);
     if failure != StorageFailure::Busy {
         FAILURES.last.store(failure as usize, Ordering::Release);

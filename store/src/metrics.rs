@@ -75,11 +75,11 @@ impl DatabaseMetrics {
         let histogram = self.transactions.get_or_create(&of);
         histogram.observe(took.as_secs_f64());
         if took >= SLOW_AFTER {
-            self.note_slow(kind, writes, took);
+            self.record_slow(kind, writes, took);
         }
     }
 
-    fn note_slow(&self, kind: &'static str, writes: bool, took: Duration) {
+    fn record_slow(&self, kind: &'static str, writes: bool, took: Duration) {
         let mut slow = self.slow.lock().unwrap_or_else(PoisonError::into_inner);
         let is_same = |of: &&mut SlowUseCase| (of.kind, of.writes) == (kind, writes);
         match slow.iter_mut().find(is_same) {

@@ -136,15 +136,15 @@ pub fn quantile(figures: &mut [f64], share: f64) -> f64 {
 ///
 /// # Errors
 /// Nothing can be written.
-pub fn tell(json: bool, checks: &[Check]) -> anyhow::Result<ExitCode> {
-    tell_with(json, &(), "", checks)
+pub fn print(json: bool, checks: &[Check]) -> anyhow::Result<ExitCode> {
+    print_with(json, &(), "", checks)
 }
 
 /// The same with details: fields of the object, or words for people.
 ///
 /// # Errors
 /// Nothing can be written.
-pub fn tell_with(
+pub fn print_with(
     json: bool,
     details: &impl Serialize,
     words: impl Display,
@@ -171,7 +171,7 @@ pub fn tell_with(
 ///
 /// # Errors
 /// Nothing can be written.
-pub fn tell_markdown(tables: &str, checks: &[Check]) -> anyhow::Result<ExitCode> {
+pub fn print_markdown(tables: &str, checks: &[Check]) -> anyhow::Result<ExitCode> {
     let of_lab = |check: &Check| tread_lab::report::Check {
         name: check.name.clone(),
         goal: check.goal.clone(),

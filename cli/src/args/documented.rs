@@ -6,7 +6,7 @@ use tread_tests::markdown::documents;
 use tread_tests::repository::root;
 use tread_tests::shell::commands;
 
-use super::{Arguments, shield_negative_points};
+use super::{Arguments, protect_negative_points};
 
 /// Placeholders in the documentation, with a valid value for each.
 const PLACEHOLDERS: [(&str, &str); 3] = [
@@ -56,7 +56,9 @@ fn ours(mut words: Vec<String>) -> Option<Vec<String>> {
 /// Returns the error of a complete command; `None` if it is valid.
 fn fault(words: &[String]) -> Option<String> {
     let program = program(&words[0])?;
-    let words = words.iter().map(|word| shield_negative_points(word.into()));
+    let words = words
+        .iter()
+        .map(|word| protect_negative_points(word.into()));
     let refused = program.try_get_matches_from(words).err()?;
     let text = refused.to_string();
     let first = text.lines().next().unwrap_or_default().to_owned();

@@ -60,7 +60,7 @@ pub(super) fn wait_time(text: &str) -> Result<Duration, String> {
 }
 
 /// Parses the update period of `tread watch`.
-pub(super) fn look_interval(text: &str) -> Result<Duration, String> {
+pub(super) fn watch_interval(text: &str) -> Result<Duration, String> {
     within(text, &WATCH_PERIOD_BOUNDS)
 }
 
@@ -124,7 +124,7 @@ mod tests {
                 &["0s", "0.5ms", "9000h"],
             ),
             (
-                look_interval,
+                watch_interval,
                 "give a time from 100ms to 1h",
                 &["0s", "61m"],
             ),

@@ -28,10 +28,13 @@ const EXAMPLES: &[(&str, &str)] = &[
         "  tread sites create north-yard --name \"North yard\" --cell 0.5\n  tread sites create quay --origin 53.5413,9.9841 --x-axis 30",
     ),
     (
-        "sites tie",
-        "  tread sites tie north-yard 48.1374,11.5755 --x-axis -12.5",
+        "sites set-origin",
+        "  tread sites set-origin north-yard 48.1374,11.5755 --x-axis -12.5",
     ),
-    ("sites untie", "  tread sites untie north-yard"),
+    (
+        "sites remove-origin",
+        "  tread sites remove-origin north-yard",
+    ),
     ("robots", "  tread robots\n  tread robots rover-1"),
     (
         "robots join-token",
@@ -270,7 +273,7 @@ mod tests {
     use clap::CommandFactory as _;
 
     use super::*;
-    use crate::args::{Arguments, shield_negative_points};
+    use crate::args::{Arguments, protect_negative_points};
 
     fn visible_paths(command: &clap::Command, path: &str, found: &mut Vec<String>) {
         found.push(path.to_owned());
@@ -314,7 +317,7 @@ mod tests {
             assert!(paths.iter().any(|known| known == path), "`{path}` is gone");
             for line in lines.lines() {
                 let words = words(line).into_iter();
-                let words = words.map(|word| shield_negative_points(word.into()));
+                let words = words.map(|word| protect_negative_points(word.into()));
                 let matches = match Arguments::whole().try_get_matches_from(words) {
                     Ok(matches) => matches,
                     Err(refused) => panic!("`{line}` is not understood: {refused}"),

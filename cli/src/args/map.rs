@@ -37,8 +37,8 @@ pub(crate) enum SitesAction {
         /// Side of a cell of the friction map, metres, 1 if absent; it cannot be changed later
         #[arg(long, value_name = "M", value_parser = positive)]
         cell: Option<f64>,
-        /// Position of the origin in WGS 84, degrees north and east; can be set later with `sites
-        /// tie`
+        /// Position of the origin in WGS 84, degrees north and east; can be set later with
+        /// `sites set-origin`
         #[arg(long, value_name = "LAT,LON", value_parser = earth)]
         origin: Option<GeoOrigin>,
         /// Angle from east to the site's x axis, counter-clockwise, degrees
@@ -47,7 +47,7 @@ pub(crate) enum SitesAction {
         x_axis: f64,
     },
     /// Set the position of a site in WGS 84, which exports of its map in WGS 84 need
-    Tie {
+    SetOrigin {
         /// Site identifier
         id: SiteId,
         /// Position of the origin in WGS 84, degrees north and east
@@ -59,7 +59,7 @@ pub(crate) enum SitesAction {
         x_axis: f64,
     },
     /// Remove the position of a site in WGS 84
-    Untie {
+    RemoveOrigin {
         /// Site identifier
         id: SiteId,
     },

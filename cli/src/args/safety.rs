@@ -7,13 +7,13 @@ use clap::{Args, Subcommand};
 use tread_api::ids::{AlertCode, AlertId, OwnerId, RobotId, StopId};
 
 use super::Connection;
-use super::durations::{limit_time, look_interval};
+use super::durations::{limit_time, watch_interval};
 use super::values::{ALERTS, STOPS, finite, identifier, positive};
 
 #[derive(Debug, Args)]
 pub(crate) struct WatchArguments {
     /// Minimum time between two updates of the screen
-    #[arg(long, value_name = "TIME", default_value = "250ms", value_parser = look_interval)]
+    #[arg(long, value_name = "TIME", default_value = "250ms", value_parser = watch_interval)]
     pub(crate) every: Duration,
     /// Show only this robot
     #[arg(long)]

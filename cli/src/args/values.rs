@@ -32,7 +32,7 @@ pub(super) fn positive(text: &str) -> Result<f64, String> {
 }
 
 /// Protects arguments such as `-4,2.5` from being parsed as options, by a space in front.
-pub(crate) fn shield_negative_points(argument: OsString) -> OsString {
+pub(crate) fn protect_negative_points(argument: OsString) -> OsString {
     let is_number = |part: &str| part.trim().parse::<f64>().is_ok();
     let are_numbers =
         |text: &&str| text.starts_with('-') && text.contains(',') && text.split(',').all(is_number);

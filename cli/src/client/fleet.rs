@@ -2,7 +2,7 @@
 
 use reqwest::{Method, Response};
 use tread_api::ids::{RobotId, SiteId};
-use tread_api::robot::{ChangeRobot, Robot};
+use tread_api::robot::{Robot, UpdateRobot};
 use tread_api::site::{CreateSite, GeoOrigin, Site};
 
 use super::{Client, ClientError, STREAM_WAIT_MAX};
@@ -22,7 +22,7 @@ impl Client {
     }
 
     /// Sets the position of a site in WGS 84.
-    pub(crate) async fn tie_site(
+    pub(crate) async fn set_site_origin(
         &self,
         site: &SiteId,
         origin: &GeoOrigin,
@@ -33,7 +33,7 @@ impl Client {
     }
 
     /// Removes the position of a site in WGS 84.
-    pub(crate) async fn untie_site(&self, site: &SiteId) -> Result<Site, ClientError> {
+    pub(crate) async fn remove_site_origin(&self, site: &SiteId) -> Result<Site, ClientError> {
         self.delete(&format!("/v1/sites/{site}/origin")).await
     }
 
@@ -53,11 +53,11 @@ impl Client {
     }
 
     /// Renames, tags, retires or restores a robot.
-    pub(crate) async fn change_robot(
+    pub(crate) async fn update_robot(
         &self,
         site: &SiteId,
         robot: &RobotId,
-        change: &ChangeRobot,
+        change: &UpdateRobot,
     ) -> Result<Robot, ClientError> {
         let path = format!("/v1/sites/{site}/robots/{robot}");
         self.send(self.request(Method::PATCH, &path).json(change))

@@ -13,7 +13,7 @@ use tread_api::page::Page;
 
 use crate::args::{AuditAction, AuditArguments, Noted};
 use crate::client::Client;
-use crate::output::{Output, note, or_dash, render, table};
+use crate::output::{Output, or_dash, print_note, render, table};
 
 /// Maximum number of attempts to verify the log while its oldest entries are being removed.
 const TRIES: u32 = 3;
@@ -120,7 +120,7 @@ async fn export(client: &Client, file: Option<&Path>, after: Option<u64>) -> any
         }
     }
     to.flush().context("cannot write the entries")?;
-    note(&format!("{count} entries"));
+    print_note(&format!("{count} entries"));
     Ok(())
 }
 

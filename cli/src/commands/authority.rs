@@ -10,7 +10,7 @@ use tread_api::enrolment::{
 
 use crate::args::AuthorityAction;
 use crate::client::{Client, ClientError};
-use crate::output::{Output, note, render, table};
+use crate::output::{Output, print_note, render, table};
 
 /// Word that confirms the replacement when typed.
 const CONFIRMED: &str = "replace";
@@ -63,7 +63,7 @@ async fn confirm(present: &FleetAuthority, robots: &[Enrolment]) -> anyhow::Resu
         .iter()
         .map(|enrolment| format!("{}/{}", enrolment.site, enrolment.robot))
         .collect();
-    note(&format!(
+    print_note(&format!(
         "Nothing that {} has signed counts any more, from this moment on. {} robots lose their link, keep \
          to their link policy, and must join again, each by a join token: {}",
         present.signing,
@@ -78,7 +78,7 @@ async fn confirm(present: &FleetAuthority, robots: &[Enrolment]) -> anyhow::Resu
         io::stdin().is_terminal(),
         "confirmation needs a terminal: give --yes"
     );
-    note(&format!("Type `{CONFIRMED}` to go on:"));
+    print_note(&format!("Type `{CONFIRMED}` to go on:"));
     let typed = tokio::task::spawn_blocking(|| {
         let mut typed = String::new();
         io::stdin().read_line(&mut typed).map(|_length| typed)

@@ -66,7 +66,7 @@ impl RawTerminal {
     }
 
     /// Writes a line and moves to the next.
-    fn say(&self, text: &str) -> anyhow::Result<()> {
+    fn print_line(&self, text: &str) -> anyhow::Result<()> {
         self.show(text)?;
         write!(io::stdout(), "\r\n").context("cannot print")
     }
@@ -286,17 +286,18 @@ impl Driving<'_> {
             DriveUpdate::Leased(lease) => {
                 self.has_lease = true;
                 self.terminal
-                    .say(&format!("you hold lease {}", lease.epoch))
+                    .print_line(&format!("you hold lease {}", lease.epoch))
             }
             DriveUpdate::Released { detail, .. } => {
                 self.has_lease = false;
                 self.is_refused = true;
-                self.terminal.say(&format!("the lease has ended: {detail}"))
+                self.terminal
+                    .print_line(&format!("the lease has ended: {detail}"))
             }
             DriveUpdate::Refused { detail, .. } => {
                 // Without a lease the command cannot continue.
                 self.is_refused = !self.has_lease;
-                self.terminal.say(&format!("refused: {detail}"))
+                self.terminal.print_line(&format!("refused: {detail}"))
             }
             DriveUpdate::Stopped(stop) => {
                 let how = if stop.confirmed_at.is_some() {
@@ -308,10 +309,10 @@ impl Driving<'_> {
                     "stopped, {how}; clear it with: tread clear {} {}",
                     stop.robot, stop.id
                 );
-                self.terminal.say(&text)
+                self.terminal.print_line(&text)
             }
             DriveUpdate::View(view) => self.terminal.show(&status(&view)),
-            DriveUpdate::Ended { detail } => self.terminal.say(&format!("ended: {detail}")),
+            DriveUpdate::Ended { detail } => self.terminal.print_line(&format!("ended: {detail}")),
         }
     }
 }

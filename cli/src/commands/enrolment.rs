@@ -4,13 +4,13 @@
 use std::process::ExitCode;
 
 use tread_api::enrolment::{CreateJoinToken, CreatedJoinToken, Enrolment, JoinToken};
-use tread_api::robot::{ChangeRobot, Robot};
+use tread_api::robot::{Robot, UpdateRobot};
 
 use crate::args::{
     JoinTokenAction, JoinTokenArguments, ReleaseArguments, RobotArguments, RobotsAction,
 };
 use crate::client::{Client, ClientError};
-use crate::output::{Output, joined, note, or_dash, render, table};
+use crate::output::{Output, joined, or_dash, print_note, render, table};
 
 pub(super) async fn run(
     action: &RobotsAction,
@@ -25,21 +25,21 @@ pub(super) async fn run(
             output.show(&enrolments, |enrolments| list(enrolments))?;
         }
         RobotsAction::Rename(arguments) => {
-            let change = ChangeRobot {
+            let change = UpdateRobot {
                 name: Some(arguments.name.clone()),
-                ..ChangeRobot::default()
+                ..UpdateRobot::default()
             };
-            let robot = client.change_robot(site, &arguments.robot, &change).await?;
+            let robot = client.update_robot(site, &arguments.robot, &change).await?;
             output.show(&robot, |it| {
                 format!("the name of `{}` is now {}", it.id, it.name)
             })?;
         }
         RobotsAction::Tag(arguments) => {
-            let change = ChangeRobot {
+            let change = UpdateRobot {
                 tags: Some(arguments.tags.clone()),
-                ..ChangeRobot::default()
+                ..UpdateRobot::default()
             };
-            let robot = client.change_robot(site, &arguments.robot, &change).await?;
+            let robot = client.update_robot(site, &arguments.robot, &change).await?;
             output.show(&robot, |it| {
                 if it.tags.is_empty() {
                     return format!("`{}` has no tags", it.id);
@@ -101,12 +101,12 @@ async fn set_retired(
     arguments: &RobotArguments,
     is_retired: bool,
 ) -> Result<Robot, ClientError> {
-    let change = ChangeRobot {
+    let change = UpdateRobot {
         retired: Some(is_retired),
-        ..ChangeRobot::default()
+        ..UpdateRobot::default()
     };
     let site = &arguments.connection.site;
-    client.change_robot(site, &arguments.robot, &change).await
+    client.update_robot(site, &arguments.robot, &change).await
 }
 
 async fn join_token(
@@ -129,7 +129,7 @@ async fn join_token(
                     || "a new robot".to_owned(),
                     |robot| format!("robot `{robot}`"),
                 );
-                note(&format!(
+                print_note(&format!(
                     "join token for {whom} of site `{}`, valid until {}; it is shown only once:",
                     token.site, token.expires_at
                 ));
@@ -172,14 +172,14 @@ async fn join_tokens_of_all(
         }
     }
     if made.is_empty() && !output.is_json() {
-        note("no robot must join again");
+        print_note("no robot must join again");
         return Ok(());
     }
     output.show(&made, |made| secrets(made))?;
     let listed = u32::try_from(made.len()).unwrap_or(u32::MAX);
     let more = authority.robots_to_join.saturating_sub(listed);
     if more > 0 && !output.is_json() {
-        note(&format!(
+        print_note(&format!(
             "{more} more robots must join again: repeat this when these have joined"
         ));
     }

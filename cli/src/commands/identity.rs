@@ -11,7 +11,7 @@ use tread_api::rights::{Grant, Rights, Scope};
 use crate::args::{Connection, SessionsAction, TokensAction, TokensArguments};
 use crate::client::{Client, address_of};
 use crate::credentials::{self, Entry, Store};
-use crate::output::{Output, line, note, or_dash, render, table};
+use crate::output::{Output, line, or_dash, print_note, render, table};
 
 /// Maximum length of a token that is read, bytes.
 const TOKEN_MAX: u64 = 1_024;
@@ -41,7 +41,7 @@ pub(super) async fn login(connection: &Connection, output: Output) -> anyhow::Re
         store.fingerprints().keep(Entry { key, value })?;
     }
     store.keep_last_server(client.address())?;
-    note(&format!(
+    print_note(&format!(
         "stored in {}; commands without --server use {} from now on",
         store.path().display(),
         client.address()
@@ -53,7 +53,7 @@ pub(super) async fn login(connection: &Connection, output: Output) -> anyhow::Re
 fn read_from_input() -> anyhow::Result<String> {
     let input = std::io::stdin();
     if input.is_terminal() {
-        note("paste the token, then press Enter and Ctrl-D:");
+        print_note("paste the token, then press Enter and Ctrl-D:");
     }
     let mut text = String::new();
     input
@@ -68,9 +68,9 @@ fn read_from_input() -> anyhow::Result<String> {
 /// Deletes the stored token of a server; the token stays valid.
 pub(super) fn logout(client: &Client, output: Output) -> anyhow::Result<ExitCode> {
     let store = store()?;
-    store.forget(client.address(), None)?;
-    store.fingerprints().forget(client.address(), None)?;
-    store.forget_last_server(client.address())?;
+    store.remove(client.address(), None)?;
+    store.fingerprints().remove(client.address(), None)?;
+    store.delete_last_server(client.address())?;
     output.show(&json!({"server": client.address()}), |_| {
         format!(
             "deleted the stored token of {}; it stays valid until it is revoked",
@@ -145,7 +145,7 @@ pub(super) async fn tokens(
                     ..
                 } = &created.token;
                 let what = what(*role, *rights);
-                note(&format!(
+                print_note(&format!(
                     "token `{name}`: {what}, {sites}, valid until {expires_at}; it is shown only once:"
                 ));
             }

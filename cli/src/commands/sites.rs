@@ -101,10 +101,10 @@ async fn change(action: SitesAction, client: &Client) -> Result<Site, ClientErro
             };
             client.create_site(&request).await
         }
-        SitesAction::Tie { id, origin, x_axis } => {
-            client.tie_site(&id, &turned(origin, x_axis)).await
+        SitesAction::SetOrigin { id, origin, x_axis } => {
+            client.set_site_origin(&id, &turned(origin, x_axis)).await
         }
-        SitesAction::Untie { id } => client.untie_site(&id).await,
+        SitesAction::RemoveOrigin { id } => client.remove_site_origin(&id).await,
     }
 }
 

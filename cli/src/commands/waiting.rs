@@ -14,7 +14,7 @@ use super::mission_text::{state, summary};
 use super::robots::steps_come;
 use crate::args::format_duration;
 use crate::client::Client;
-use crate::output::{Output, TookTooLong, note};
+use crate::output::{Output, WaitTimeout, print_note};
 
 /// Polling period of the missions.
 const LOOK_EVERY: Duration = Duration::from_millis(250);
@@ -35,7 +35,7 @@ impl Waited {
         if lines {
             let state = state(seen);
             if self.said.as_ref() != Some(&state) {
-                note(&summary(seen));
+                print_note(&summary(seen));
                 self.said = Some(state);
             }
             return;
@@ -62,7 +62,7 @@ impl Waited {
 /// Waits until the missions have ended and returns them in the order of `missions`.
 ///
 /// # Errors
-/// [`TookTooLong`] if they have not ended within `allowed`; the missions continue.
+/// [`WaitTimeout`] if they have not ended within `allowed`; the missions continue.
 /// [`ClientError`](crate::client::ClientError) if a request fails.
 pub(super) async fn wait(
     client: &Client,
@@ -128,7 +128,7 @@ pub(super) async fn wait(
                 waited.len(),
                 format_duration(allowed)
             );
-            return Err(TookTooLong(text).into());
+            return Err(WaitTimeout(text).into());
         }
         tokio::time::sleep(LOOK_EVERY).await;
     }

@@ -10,7 +10,7 @@ use tread_api::webhook::{CreatedWebhook, Delivery, DeliveryState, Webhook, Webho
 
 use crate::args::{NamedWebhook, WebhooksAction, WebhooksArguments};
 use crate::client::{Client, ClientError};
-use crate::output::{Output, note, or_dash, render, table};
+use crate::output::{Output, or_dash, print_note, render, table};
 
 /// Interval between looks at a test that is under way.
 const LOOK_EVERY: Duration = Duration::from_millis(250);
@@ -90,7 +90,7 @@ async fn find(client: &Client, named: &NamedWebhook) -> anyhow::Result<Webhook> 
 fn show_secret(created: &CreatedWebhook, output: Output) -> anyhow::Result<()> {
     if !output.is_json() {
         let Webhook { name, url, .. } = &created.webhook;
-        note(&format!(
+        print_note(&format!(
             "webhook `{name}` to {url}; its secret is shown only once:"
         ));
     }

@@ -28,7 +28,7 @@ use self::report::Report;
 use crate::args::DemoArguments;
 use crate::client::{Client, ClientError, Reading, Trusted};
 use crate::credentials::{self, Entry, Store};
-use crate::output::{json_line, line, note};
+use crate::output::{json_line, line, print_note};
 use crate::signals::ShutdownSignals;
 
 /// Maximum time until the server is ready, and until all robots are online.
@@ -50,7 +50,7 @@ pub(crate) async fn run(arguments: DemoArguments) -> anyhow::Result<ExitCode> {
     let folder = DataFolder::new(arguments.data_dir.clone())?;
     let tell = |text: &str| {
         if !arguments.json {
-            note(text);
+            print_note(text);
         }
     };
 
@@ -141,7 +141,7 @@ impl SignedIn {
         let store = Store::of_user().filter(|store| match store.keep(entry) {
             Ok(()) => true,
             Err(error) => {
-                note(&format!("other commands need --token-file: {error:#}"));
+                print_note(&format!("other commands need --token-file: {error:#}"));
                 false
             }
         });
@@ -157,7 +157,7 @@ impl Drop for SignedIn {
     fn drop(&mut self) {
         if let Some(store) = &self.store {
             // A token that remains is useless: its server has ended.
-            let _ = store.forget(&self.address, Some(&self.token));
+            let _ = store.remove(&self.address, Some(&self.token));
         }
     }
 }
@@ -360,7 +360,7 @@ impl<'demo> Watch<'demo> {
         self.progress.finish();
         if is_cut_short {
             // The last look may be of before, or none.
-            self.look().await?;
+            self.poll().await?;
         }
         let report = self.report().await?;
         Ok(Ended {
@@ -378,7 +378,7 @@ impl<'demo> Watch<'demo> {
         loop {
             ticks.tick().await;
             processes.all_alive()?;
-            let robots = self.look().await?;
+            let robots = self.poll().await?;
             let Some(exit_after) = self.exit_after else {
                 continue;
             };
@@ -401,7 +401,7 @@ impl<'demo> Watch<'demo> {
         Ok(())
     }
 
-    async fn look(&mut self) -> anyhow::Result<Vec<Robot>> {
+    async fn poll(&mut self) -> anyhow::Result<Vec<Robot>> {
         let robots = self.demo.present_robots().await?;
         let site = &self.demo.scenario.site;
         let page = self

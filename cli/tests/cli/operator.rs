@@ -26,12 +26,14 @@ async fn the_ground_is_drawn_changed_and_asked_about_by_commands() {
     let quay = yard.json(&[&quay[..], &["--x-axis", "-30"]].concat()).await;
     let place = |latitude: f64, longitude: f64, x_axis: f64| json!({"latitude_deg": latitude, "longitude_deg": longitude, "x_axis_deg": x_axis});
     assert_eq!(quay["origin"], place(-33.86, 151.21, -30.0));
-    let tied = yard.json(&["sites", "tie", "annex", "48.14,11.57"]).await;
-    assert_eq!(tied["origin"], place(48.14, 11.57, 0.0));
+    let placed = yard
+        .json(&["sites", "set-origin", "annex", "48.14,11.57"])
+        .await;
+    assert_eq!(placed["origin"], place(48.14, 11.57, 0.0));
     let listed = yard.table(&["sites"]).await;
     assert!(listed.contains("48.140000,11.570000 x axis 0°"), "{listed}");
-    let untied = yard.json(&["sites", "untie", "annex"]).await;
-    assert_eq!(untied["origin"], Value::Null);
+    let removed = yard.json(&["sites", "remove-origin", "annex"]).await;
+    assert_eq!(removed["origin"], Value::Null);
 
     let corners = ["0,0", "6,0", "6,4", "-1,4"];
     let create = ["terrains", "create", "sand-pit", "--class", "sand"];

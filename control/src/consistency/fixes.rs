@@ -282,7 +282,7 @@ impl Fixes {
             if with_newest {
                 self.before = Some(anchor);
             }
-            self.forget_jump(fix);
+            self.clear_jump(fix);
             self.agreed = self.agreed.saturating_add(1);
             return true;
         }
@@ -297,7 +297,7 @@ impl Fixes {
             // The first of all fixes was the outlier.
             self.count = 0;
             self.before = None;
-            self.forget_jump(fix);
+            self.clear_jump(fix);
             return true;
         }
         if count >= JUMP_FIXES && self.jump.is_none() {
@@ -306,13 +306,13 @@ impl Fixes {
         if self.jump.is_some() && fix.at_s - since_s >= MOVED_AFTER_S {
             self.count = 0;
             self.before = None;
-            self.forget_jump(fix);
+            self.clear_jump(fix);
             return true;
         }
         false
     }
 
-    fn forget_jump(&mut self, fix: Fix) {
+    fn clear_jump(&mut self, fix: Fix) {
         self.anchor = Some(fix);
         self.elsewhere = None;
         self.jump = None;

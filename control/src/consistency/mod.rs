@@ -271,7 +271,7 @@ impl Monitor {
         if has_relapsed {
             for (track, subject) in self.tracks.iter_mut().zip(Subject::ALL) {
                 if subject.is_of_place() {
-                    track.relapse();
+                    track.reactivate();
                 }
             }
         }

@@ -4,7 +4,7 @@
 //! finding about the position may forbid the robot to move, so it also ends at standstill, when
 //! fixes agree with each other and with a stopped robot for [`REST_CLEAR_S`]. That does not prove
 //! the channel right in motion: until motion does, the track is on probation, and the first
-//! contradiction makes the finding active again. Each such relapse doubles the time required at
+//! contradiction makes the finding active again. Each such reactivate doubles the time required at
 //! standstill.
 
 use super::Finding;
@@ -15,7 +15,7 @@ use super::verdict::Verdict;
 const CLEAR_S: f64 = 2.0;
 
 /// Time for which fixes must agree with each other and with a stopped robot until a finding about
-/// them ends at standstill, seconds; it doubles with each relapse, up to the second value.
+/// them ends at standstill, seconds; it doubles with each reactivate, up to the second value.
 const REST_CLEAR_S: f64 = 10.0;
 const REST_CLEAR_MAX_S: f64 = 600.0;
 /// Maximum number of relapses that are counted.
@@ -72,13 +72,13 @@ impl Track {
         }
     }
 
-    /// Returns the required time of agreement at standstill, seconds, doubled with each relapse.
+    /// Returns the required time of agreement at standstill, seconds, doubled with each reactivate.
     fn rest_s(&self) -> f64 {
         (REST_CLEAR_S * 2.0_f64.powi(self.relapses.cast_signed())).min(REST_CLEAR_MAX_S)
     }
 
     /// Records that a finding that ended at standstill is active again.
-    pub(super) fn relapse(&mut self) {
+    pub(super) fn reactivate(&mut self) {
         self.is_on_probation = false;
         self.relapses = (self.relapses + 1).min(RELAPSES_MAX);
     }

@@ -135,7 +135,7 @@ pub(super) struct Block {
     /// Whether the combined slip is in the linear range.
     pub(super) is_linear: bool,
     /// Combined slip of the slower side from lateral slip and the sides' difference, as computed by
-    /// [`Self::judge_slip`].
+    /// [`Self::check_slip`].
     pub(super) slip: f64,
     /// Geometric lateral slip of the slower side's wheels.
     slip_lateral: f64,
@@ -174,7 +174,7 @@ impl Block {
     /// common longitudinal slip is θμ once θ is known. Before, it comes from the body speed if
     /// torque is measured; this is inaccurate, so the limit is tighter and a sliding robot is
     /// rejected. Without torque it is bounded by `theta_most`.
-    pub(super) fn judge_slip(&mut self, bound: &ThetaBound) {
+    pub(super) fn check_slip(&mut self, bound: &ThetaBound) {
         let turning = 0.5 * self.difference_m_s.abs() / self.slower_m_s;
         let most = SLIP_LINEAR_MAX.min(bound.slip_max);
         let (common, limit) = match (bound.theta, self.force) {

@@ -27,7 +27,7 @@ pub(super) struct Excitation {
 
 impl Excitation {
     /// Adds the differential row of a block.
-    pub(super) fn note_block(&mut self, row: &Row, has_torque: bool) {
+    pub(super) fn add_block(&mut self, row: &Row, has_torque: bool) {
         let scaled = row.regressors[index::THETA] / row.force_noise.sqrt().max(f64::MIN_POSITIVE);
         self.turning_blocks = (self.turning_blocks + 1.0).min(2.0 * MEMORY_BLOCKS);
         let centred = if has_torque {
@@ -43,7 +43,7 @@ impl Excitation {
     }
 
     /// Adds a row of the forward speed.
-    pub(super) fn note_longitudinal(&mut self, row: &Row) {
+    pub(super) fn add_longitudinal_row(&mut self, row: &Row) {
         if row.force_noise > 0.0 {
             self.longitudinal_sum += row.regressors[index::THETA].powi(2) / row.force_noise;
             self.longitudinal_rows += 1.0;

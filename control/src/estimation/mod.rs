@@ -328,7 +328,7 @@ impl Estimator {
             return;
         }
         for row in rows.into_iter().flatten().flatten() {
-            self.excitation.note_longitudinal(&row);
+            self.excitation.add_longitudinal_row(&row);
             self.pending.add_longitudinal(&row, bound.theta);
         }
     }
@@ -336,12 +336,12 @@ impl Estimator {
     /// Adds a block. Returns whether the ground has changed, and whether a wheel slips beyond the
     /// linear range.
     fn take(&mut self, mut block: Block) -> (bool, bool) {
-        block.judge_slip(&self.bound);
+        block.check_slip(&self.bound);
         block.mu_seen /= self.torque_scale_upper_bound();
         self.pending.add(&block);
         let row = block.turning_row().filter(|_| block.is_linear);
         if let (Some(row), Some(before)) = (row, self.turning_before) {
-            self.pending.note_neighbour(&row, &before);
+            self.pending.add_neighbour_covariance(&row, &before);
         }
         self.turning_before = row;
         let innovation = self
@@ -350,7 +350,7 @@ impl Estimator {
         if block.is_linear
             && let Some(row) = block.differential_row()
         {
-            self.excitation.note_block(&row, block.force.is_some());
+            self.excitation.add_block(&row, block.force.is_some());
         }
         // Without an exact model the innovations of rows contain model errors.
         let changed = self.identification.is_none()
@@ -701,7 +701,7 @@ fn measurement(found: Identified) -> Option<ThetaMeasurement> {
 
 /// Rim speeds of the two sides, mirrored in reverse so that the robot drives forward.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Rims {
+struct RimSpeeds {
     left_m_s: f64,
     right_m_s: f64,
     /// 1 forward; −1 in reverse, where the robot's left side becomes the right one.
@@ -710,17 +710,17 @@ struct Rims {
 
 /// Returns the rim speeds; None if a side is slower than [`RIM_SPEED_MIN_M_S`] or the sides turn in
 /// opposite directions.
-fn signed_rims(sample: &SensorSample, model: &RobotModel) -> Option<Rims> {
+fn signed_rims(sample: &SensorSample, model: &RobotModel) -> Option<RimSpeeds> {
     let left_m_s = sample.wheel_speeds.left_rad_s * model.wheel_radius_m();
     let right_m_s = sample.wheel_speeds.right_rad_s * model.wheel_radius_m();
     if left_m_s.min(right_m_s) > RIM_SPEED_MIN_M_S {
-        Some(Rims {
+        Some(RimSpeeds {
             left_m_s,
             right_m_s,
             sign: 1.0,
         })
     } else if left_m_s.max(right_m_s) < -RIM_SPEED_MIN_M_S {
-        Some(Rims {
+        Some(RimSpeeds {
             left_m_s: -right_m_s,
             right_m_s: -left_m_s,
             sign: -1.0,

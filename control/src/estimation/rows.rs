@@ -238,7 +238,7 @@ impl Channel {
     }
 
     /// Adds the covariance of a row with its predecessor, with which it shares a ramp.
-    pub(super) fn note_neighbour(&mut self, row: &Row, before: &Row) {
+    pub(super) fn add_neighbour_covariance(&mut self, row: &Row, before: &Row) {
         let covariance = -0.5 * (row.ramp_noise * before.ramp_noise).sqrt();
         let product = row.regressors * before.regressors.transpose();
         self.neighbours += (product + product.transpose()) * covariance;

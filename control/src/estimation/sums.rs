@@ -66,7 +66,7 @@ impl Sums {
         self.blocks += 1;
         self.duration_s += block.duration_s;
         self.slip_square += block.slip * block.slip;
-        self.note_signal(&row, row.innovation_variance);
+        self.add_signal(&row, row.innovation_variance);
         if block.force.is_some() {
             self.difference.add(&row);
             if let Some(row) = block.mean_row() {
@@ -83,17 +83,17 @@ impl Sums {
     }
 
     /// Adds the covariance of a block's row with that of the block directly before.
-    pub(super) fn note_neighbour(&mut self, row: &Row, before: &Row) {
-        self.turning.note_neighbour(row, before);
+    pub(super) fn add_neighbour_covariance(&mut self, row: &Row, before: &Row) {
+        self.turning.add_neighbour_covariance(row, before);
     }
 
     /// Adds an innovation of the forward speed, with its weight at `theta`.
     pub(super) fn add_longitudinal(&mut self, row: &Row, theta: f64) {
         self.longitudinal.add_standardised(row, theta);
-        self.note_signal(row, row.innovation_variance);
+        self.add_signal(row, row.innovation_variance);
     }
 
-    fn note_signal(&mut self, row: &Row, innovation_variance: f64) {
+    fn add_signal(&mut self, row: &Row, innovation_variance: f64) {
         let signal = row.regressors[index::THETA].powi(2) / innovation_variance;
         self.signal += signal;
         self.signal_2 += signal * signal;

@@ -36,14 +36,14 @@ pub(super) struct Moment {
 
 /// Variation of the motion about its mean within a window.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub(super) struct Swing {
+pub(super) struct MotionVariation {
     /// Means over short intervals.
     moments: [Moment; MOMENTS],
     /// Variance of the samples' `apart`, including sensor noise.
     apart_variance: f64,
 }
 
-impl Swing {
+impl MotionVariation {
     /// Returns the intervals with `apart` scaled to the variance of the samples minus that of their
     /// noise, `apart_noise`.
     pub(super) fn without_noise(&self, apart_noise: f64) -> [Moment; MOMENTS] {
@@ -129,7 +129,7 @@ pub(super) struct TurnMeans {
     pub(super) rim_difference_m_s: f64,
     /// `(u_R + u_L)/2`, metres per second, negative in reverse.
     pub(super) rim_mean_m_s: f64,
-    pub(super) swing: Swing,
+    pub(super) swing: MotionVariation,
     pub(super) duration_s: f64,
     pub(super) samples: f64,
     pub(super) ramp_samples: f64,
@@ -207,13 +207,13 @@ impl TurnWindow {
 }
 
 impl Part {
-    fn swing(&self) -> Swing {
+    fn swing(&self) -> MotionVariation {
         let [apart, square] = self.apart.map(|sum| sum / self.weight_s);
         let (turn_rad_s, longitudinal_mu) = (
             self.turn / self.weight_s,
             self.longitudinal_mu / self.weight_s,
         );
-        Swing {
+        MotionVariation {
             moments: self.moments.map(|sum| {
                 if sum.weight <= 0.0 {
                     return Moment::default();

@@ -90,7 +90,7 @@ impl Group {
         }
     }
 
-    fn look_nearer(&self, point: Point, nearest: &mut Nearest) {
+    fn refine(&self, point: Point, nearest: &mut Nearest) {
         for side in &self.sides {
             let (from, to) = (side.from, side.to);
             let (side_x, side_y) = (to.x_m - from.x_m, to.y_m - from.y_m);
@@ -185,11 +185,11 @@ impl Ring {
             .iter()
             .min_by(|one, other| by_box(one).total_cmp(&by_box(other)));
         if let Some(likely) = likely {
-            likely.look_nearer(point, &mut nearest);
+            likely.refine(point, &mut nearest);
         }
         for group in &self.groups {
             if group.bounds.distance_m2(point) < nearest.distance_m2 {
-                group.look_nearer(point, &mut nearest);
+                group.refine(point, &mut nearest);
             }
         }
         nearest
@@ -215,7 +215,7 @@ mod tests {
             distance_m2: f64::INFINITY,
             point,
         };
-        all.look_nearer(point, &mut nearest);
+        all.refine(point, &mut nearest);
         let distance_m = nearest.distance_m2.sqrt();
         if all.is_crossed(point) {
             distance_m

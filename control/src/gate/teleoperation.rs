@@ -36,7 +36,7 @@ pub struct AgeMeter {
 impl AgeMeter {
     /// Adds the age of one command, seconds: a larger age replaces the worst one, a smaller one
     /// lowers it by [`FORGOTTEN_SHARE`] of the difference. A negative age counts as 0.
-    pub fn note(&mut self, age_s: f64) {
+    pub fn record(&mut self, age_s: f64) {
         // A non-finite age counts as [`AGE_LEAST_S`].
         let age_s = if age_s.is_finite() {
             age_s.max(0.0)
@@ -213,15 +213,15 @@ mod tests {
     fn one_quick_command_does_not_make_up_for_late_ones() {
         let mut meter = AgeMeter::default();
         assert!((meter.speed_share() - 1.0).abs() < 1.0e-12);
-        meter.note(0.5);
+        meter.record(0.5);
         assert!((meter.speed_share() - SHARE_LEAST).abs() < 1.0e-12);
-        meter.note(0.01);
+        meter.record(0.01);
         assert!(meter.speed_share() < 0.3);
         for _ in 0..100 {
-            meter.note(0.01);
+            meter.record(0.01);
         }
         assert!((meter.speed_share() - 1.0).abs() < 1.0e-12);
-        meter.note(f64::NAN);
+        meter.record(f64::NAN);
         assert!(meter.speed_share() < 0.3, "no number is a bad age");
     }
 

@@ -74,7 +74,7 @@ impl FixNoiseEstimate {
     }
 
     /// Discards the last fix, because the motion since is unknown.
-    pub(super) fn forget_motion(&mut self) {
+    pub(super) fn discard_last_fix(&mut self) {
         self.anchor = None;
     }
 

@@ -212,7 +212,7 @@ impl Localisation {
 
     /// Predicts the state over `dt_s` seconds with the measured rates of gyro and wheels.
     ///
-    /// The motion is that of at most 0.5 s; call [`Self::lose_track`] after a longer gap. An invalid rate
+    /// The motion is that of at most 0.5 s; call [`Self::widen_without_measurements`] after a longer gap. An invalid rate
     /// is counted, and the last valid one is used; if `dt_s` is not above 0, nothing else changes.
     pub fn predict(&mut self, sample: &SensorSample, dt_s: f64) {
         if !(dt_s.is_finite() && dt_s > 0.0) {
@@ -271,7 +271,7 @@ impl Localisation {
     /// Enlarges the covariance after `unheard_s` seconds without measurements: the robot may have
     /// stopped, or continued at its last speeds on any curve. Must be called before the prediction
     /// that ends the gap, which replaces these speeds.
-    pub fn lose_track(&mut self, unheard_s: f64) {
+    pub fn widen_without_measurements(&mut self, unheard_s: f64) {
         if !self.started || !unheard_s.is_finite() || unheard_s <= 0.0 {
             return;
         }
@@ -279,7 +279,7 @@ impl Localisation {
         let distance_m = forward_m_s.hypot(left_m_s) * unheard_s;
         let turn_rad = (self.turn_rad_s * unheard_s).hypot(UNHEARD_CURVATURE_PER_M * distance_m);
         let turn_rad = turn_rad.min(std::f64::consts::PI);
-        self.fix_noise.forget_motion();
+        self.fix_noise.discard_last_fix();
         for (index, std_dev) in [distance_m, distance_m, turn_rad].into_iter().enumerate() {
             self.covariance[(index, index)] += std_dev * std_dev;
         }
@@ -453,7 +453,7 @@ mod tests {
             }
             let x_m = filter.pose().unwrap().x_m;
             if is_silence_known {
-                filter.lose_track(1.5);
+                filter.widen_without_measurements(1.5);
             }
             filter.predict(&straight(0.0), 0.2);
             filter.correct(&fix(x_m + jump_m, 0.0))

@@ -430,7 +430,7 @@ impl Plan {
         let steps = (plan.duration_s() / 0.05).ceil().min(GRID_MAX as f64) as usize + 1;
         for step in 0..=steps {
             let share = step as f64 / steps as f64;
-            plan.note_peaks(plan.duration_s() * share);
+            plan.update_peaks(plan.duration_s() * share);
             // A requested excitation does not count as slowing, so the timing without it is
             // checked.
             let timing = plan.profile.sample(plan.profile.duration_s() * share);
@@ -441,13 +441,13 @@ impl Plan {
                 by: bounds[node].by,
                 longitudinal: bounds[node].longitudinal,
             };
-            plan.stretches.note(&timing, &cell);
+            plan.stretches.record(&timing, &cell);
         }
         Ok(plan)
     }
 
     /// Raises the peak values to those at a time, seconds.
-    fn note_peaks(&mut self, time_s: f64) {
+    fn update_peaks(&mut self, time_s: f64) {
         let sample = self.sample(time_s);
         let turn_rad_s = (sample.speed_m_s * sample.path.curvature_1_m).abs();
         self.peak_speed_m_s = self.peak_speed_m_s.max(sample.speed_m_s);

@@ -63,7 +63,7 @@ pub(super) struct Stretches {
 
 impl Stretches {
     /// Adds the planned speed at one point of the path.
-    pub(super) fn note(&mut self, timing: &ProfileSample, cell: &CellBounds) {
+    pub(super) fn record(&mut self, timing: &ProfileSample, cell: &CellBounds) {
         let ProfileSample {
             arc_m, speed_m_s, ..
         } = *timing;

@@ -55,7 +55,7 @@ pub(super) struct AdaptationTick {
 
 impl Drift {
     /// Moves both towards zero by a fraction, 0 to 1.
-    pub(super) fn forget(&mut self, share: f64) {
+    pub(super) fn decay(&mut self, share: f64) {
         let kept = 1.0 - share;
         self.slope_rad = self.slope_rad.map(|slope_rad| kept * slope_rad);
         self.center_forward_m *= kept;

@@ -52,7 +52,7 @@ use drift::{AdaptationTick, Drift};
 pub use knowledge::ThetaKnowledge;
 use noise::NoiseLevel;
 pub use output::{TrackerOutput, TrackingErrors};
-use sideslip::{Belief, Sideslip};
+use sideslip::{AdaptedGround, Sideslip};
 use steadiness::Steadiness;
 
 /// Maximum speed backwards, to come back to a reference that was overrun, metres per second.
@@ -203,11 +203,16 @@ impl Tracker {
         self.apply_knowledge(knowledge, dt_s);
         let theta = self.theta;
         let speed_m_s = reference.speed_m_s;
-        let belief = Belief {
+        let adapted_ground = AdaptedGround {
             theta,
             beyond: self.beyond,
         };
-        let sideslip = Sideslip::of(reference, belief, &config.friction_curve, &self.model);
+        let sideslip = Sideslip::of(
+            reference,
+            adapted_ground,
+            &config.friction_curve,
+            &self.model,
+        );
         let drift = self.drift.sideslip(reference);
         let density = self.noise.update(measured, dt_s);
         let noise = density / config.noise_middle_m_sqrt_s.powi(2)
@@ -216,7 +221,7 @@ impl Tracker {
         let moving = config.noisy.towards(config.quiet, quiet_share);
         let steadiness = self
             .steadiness
-            .update(reference, belief, &drift, &config, dt_s);
+            .update(reference, adapted_ground, &drift, &config, dt_s);
         let gains = moving.towards(config.steady, (1.0 - quiet_share) * steadiness);
         let mut course = measured.pose;
         course.heading_rad += sideslip.angle_rad + drift.angle_rad;
@@ -330,7 +335,7 @@ impl Tracker {
             self.last = Some(now);
             if self.pull.left_s > 0.0 && self.pull.forgets_drift {
                 let share = now.confidence() * self.config.adaptation_pull_1_s * dt_s;
-                self.drift.forget(share.min(1.0));
+                self.drift.decay(share.min(1.0));
             }
         }
         self.pull.left_s = (self.pull.left_s - dt_s).max(0.0);

@@ -17,7 +17,7 @@ const THETA_LOOK_MIN: f64 = 0.02;
 
 /// Adapted parameters of the ground.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Belief {
+pub(super) struct AdaptedGround {
     /// Adapted θ̂.
     pub(super) theta: f64,
     /// Adapted χ̂: fraction of the loss beyond the peak, 0 to 1.
@@ -44,12 +44,12 @@ pub(super) struct Sideslip {
 impl Sideslip {
     pub(super) fn of(
         reference: &ReferenceSample,
-        belief: Belief,
+        adapted_ground: AdaptedGround,
         friction_curve: &FrictionCurve,
         model: &RobotModel,
     ) -> Self {
         let speed_m_s = reference.speed_m_s;
-        let at = |twist: Twist| Instant::of(twist, belief, friction_curve, model);
+        let at = |twist: Twist| Instant::of(twist, adapted_ground, friction_curve, model);
         let now = at(Twist {
             linear_m_s: speed_m_s,
             angular_rad_s: reference.turn_rad_s,
@@ -58,12 +58,12 @@ impl Sideslip {
             linear_m_s: (speed_m_s + RATE_SPAN_S * reference.acceleration_m_s2).max(0.0),
             angular_rad_s: reference.turn_rad_s + RATE_SPAN_S * reference.turn_acceleration_rad_s2,
         });
-        let angle_rad = -belief.theta * now.per_theta;
+        let angle_rad = -adapted_ground.theta * now.per_theta;
         Self {
             angle_rad,
-            rate_rad_s: (-belief.theta * then.per_theta - angle_rad) / RATE_SPAN_S,
+            rate_rad_s: (-adapted_ground.theta * then.per_theta - angle_rad) / RATE_SPAN_S,
             drift_per_theta_m_s: speed_m_s * now.per_theta,
-            drift_per_beyond_m_s: speed_m_s * belief.theta * now.per_theta_beyond,
+            drift_per_beyond_m_s: speed_m_s * adapted_ground.theta * now.per_theta_beyond,
             is_at_end: now.is_at_end,
             rims: now.rims,
         }
@@ -83,13 +83,13 @@ struct Instant {
 impl Instant {
     fn of(
         twist: Twist,
-        belief: Belief,
+        adapted_ground: AdaptedGround,
         friction_curve: &FrictionCurve,
         model: &RobotModel,
     ) -> Self {
         let speed_m_s = twist.linear_m_s;
         let asked_1_m = twist.angular_rad_s / speed_m_s.max(SPEED_MIN_M_S);
-        let theta = belief.theta.max(THETA_LOOK_MIN);
+        let theta = adapted_ground.theta.max(THETA_LOOK_MIN);
         let compliance_m = theta * speed_m_s * speed_m_s / GRAVITY_M_S2;
         let turn = Turn::steady(
             model,
@@ -111,12 +111,12 @@ impl Instant {
             })
         };
         let (straight, slid) = (of_rims(turn.linear), of_rims(turn.beyond));
-        let believed = |one: f64, other: f64| one + belief.beyond * (other - one);
+        let believed = |one: f64, other: f64| one + adapted_ground.beyond * (other - one);
         Self {
             per_theta: believed(linear, beyond),
             per_theta_beyond: beyond - linear,
             is_at_end: turn.linear.sideslip.abs() >= SIDESLIP_MAX
-                || belief.beyond > 0.0 && turn.beyond.sideslip.abs() >= SIDESLIP_MAX,
+                || adapted_ground.beyond > 0.0 && turn.beyond.sideslip.abs() >= SIDESLIP_MAX,
             rims: Twist {
                 linear_m_s: believed(straight.linear_m_s, slid.linear_m_s) - speed_m_s,
                 angular_rad_s: believed(straight.angular_rad_s, slid.angular_rad_s)

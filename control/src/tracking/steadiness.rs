@@ -10,7 +10,7 @@ use crate::robot::GRAVITY_M_S2;
 
 use super::config::TrackerConfig;
 use super::drift::DriftSideslip;
-use super::sideslip::Belief;
+use super::sideslip::AdaptedGround;
 
 /// Distance after which a change of the sideslip is forgotten by a factor e, metres.
 const MEMORY_M: f64 = 3.0;
@@ -38,7 +38,7 @@ impl Steadiness {
     pub(super) fn update(
         &mut self,
         reference: &ReferenceSample,
-        belief: Belief,
+        adapted_ground: AdaptedGround,
         drift: &DriftSideslip,
         config: &TrackerConfig,
         dt_s: f64,
@@ -47,7 +47,7 @@ impl Steadiness {
         // Rate of θv²κ/g = θvω/g.
         let lateral_jerk_m_s3 = reference.acceleration_m_s2 * reference.turn_rad_s
             + speed_m_s * reference.turn_acceleration_rad_s2;
-        let bend_rad_s = belief.theta.max(THETA_MIN) * lateral_jerk_m_s3 / GRAVITY_M_S2;
+        let bend_rad_s = adapted_ground.theta.max(THETA_MIN) * lateral_jerk_m_s3 / GRAVITY_M_S2;
         let rate_rad_s = bend_rad_s.abs() + drift.rate_rad_s.abs();
         let forgotten = (speed_m_s * dt_s / MEMORY_M).min(1.0);
         self.change_rad += rate_rad_s * dt_s - forgotten * self.change_rad;
@@ -71,7 +71,7 @@ mod tests {
             ..DriftSideslip::default()
         };
         let config = TrackerConfig::default();
-        let belief = Belief {
+        let adapted_ground = AdaptedGround {
             theta: 0.0,
             beyond: 1.0,
         };
@@ -87,7 +87,7 @@ mod tests {
                 ..ReferenceSample::default()
             };
             arc_m = next_m;
-            last = steadiness.update(&reference, belief, &drift, &config, DT_S);
+            last = steadiness.update(&reference, adapted_ground, &drift, &config, DT_S);
             if arc_m > 1.0 {
                 most = most.max(last);
             }

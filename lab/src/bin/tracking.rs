@@ -249,7 +249,11 @@ impl Gains for TrackerConfig {
 }
 
 /// Mean of the logarithm of the error over all lines.
-fn badness<P: Gains>(places: &[Place<'_>], arguments: &Arguments, peer: P) -> anyhow::Result<f64> {
+fn mean_log_error<P: Gains>(
+    places: &[Place<'_>],
+    arguments: &Arguments,
+    peer: P,
+) -> anyhow::Result<f64> {
     let (law, config) = peer.law();
     let errors = in_parallel(places, |place| {
         drive(place, arguments, law, config, Knowing::Nothing)
@@ -269,14 +273,14 @@ fn badness<P: Gains>(places: &[Place<'_>], arguments: &Arguments, peer: P) -> an
 /// Steps one gain at a time until none of them helps: the optimum is inside what was tried.
 fn tuned<P: Gains>(places: &[Place<'_>], arguments: &Arguments, from: P) -> anyhow::Result<P> {
     let mut best = from;
-    let mut least = badness(places, arguments, best)?;
+    let mut least = mean_log_error(places, arguments, best)?;
     loop {
         let mut is_better = false;
         for gain in 0..P::GAINS {
             for by in [TUNE_STEP, TUNE_STEP.recip()] {
                 loop {
                     let next = best.scaled(gain, by);
-                    let found = badness(places, arguments, next).unwrap_or(f64::INFINITY);
+                    let found = mean_log_error(places, arguments, next).unwrap_or(f64::INFINITY);
                     if found >= least - 1.0e-3 {
                         break;
                     }

@@ -65,10 +65,10 @@ impl Run<'_> {
     fn tick(&mut self, now: Duration, fed: &Fed) {
         let feedback = std::mem::take(&mut self.feedback);
         let heard = self.listener.step(now, &feedback, fed.noise);
-        self.note(now, &heard);
+        self.record(now, &heard);
     }
 
-    fn note(&mut self, now: Duration, heard: &Heard) {
+    fn record(&mut self, now: Duration, heard: &Heard) {
         let outcome = &mut self.outcome;
         outcome.estimate = heard.estimate;
         outcome.ground_changes = heard.ground_changes;

@@ -65,7 +65,7 @@ pub fn run(trial: &ChangeTrial) -> anyhow::Result<ChangeOutcome> {
     let drive = RoughDrive::new(&model, deviations, sensors, Pose::default(), random)
         .ok_or_else(|| anyhow::anyhow!("the wheels of {} are no rectangle", trial.make.name))?;
     let mut bench = Bench::with_drive(drive, model).with_prior(EstimatorPrior::default());
-    bench.know_site(SiteDefinition {
+    bench.send_site(SiteDefinition {
         grid: Grid {
             revision: 1,
             cell_m: CELL_M,

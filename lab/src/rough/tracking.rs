@@ -250,7 +250,7 @@ struct Known {
 }
 
 impl Known {
-    fn hear(&mut self, feedback: &Feedback) {
+    fn receive(&mut self, feedback: &Feedback) {
         for sample in feedback.samples() {
             if let (Some(gyro_rad_s), Some(wheel_speeds)) =
                 (sample.yaw_rate_rad_s, sample.wheel_speeds)
@@ -346,7 +346,7 @@ pub fn run(trial: &Trial<'_>) -> anyhow::Result<Errors> {
         let truth = base.truth();
         let mut feedback = Feedback::default();
         sensors.sample(&truth, &means, now, &mut feedback);
-        known.hear(&feedback);
+        known.receive(&feedback);
         let Some(measured) = known.measured().filter(|_| time_s >= 0.0) else {
             continue;
         };

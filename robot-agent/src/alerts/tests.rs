@@ -122,8 +122,8 @@ fn a_base_that_started_again_and_a_second_commander_are_alerts() {
         },
     );
     assert!(alerts.judge(&causes).is_empty());
-    counts.note(Source::Joints, Notice::Restarted);
-    counts.note_foreign_command();
+    counts.record(Source::Joints, Notice::Restarted);
+    counts.count_foreign_command();
     let said = alerts.judge(&causes);
     assert_eq!(codes(&said), ["command-second-writer", "base-restarted"]);
     assert!(said[0].text.contains("another node"), "{said:?}");

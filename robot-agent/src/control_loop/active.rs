@@ -285,8 +285,8 @@ impl Active {
         command: WheelSpeeds,
         dt_s: f64,
     ) -> Step {
-        self.note_standing(measured, model, command);
-        let news = self.take_news();
+        self.record_standstill(measured, model, command);
+        let news = self.take_change();
         let status = self.job.follower.status();
         let is_on_the_way = matches!(status, FollowerStatus::Approach | FollowerStatus::Tracking);
         if self.stands_held() && is_on_the_way {
@@ -322,7 +322,7 @@ impl Active {
         }
     }
 
-    fn note_standing(&mut self, measured: &Measured, model: &RobotModel, command: WheelSpeeds) {
+    fn record_standstill(&mut self, measured: &Measured, model: &RobotModel, command: WheelSpeeds) {
         let command_m_s = command.magnitude_max_rad_s() * model.wheel_radius_m();
         let stands = self.is_on_hold()
             && command_m_s < HELD_STANDING
@@ -335,7 +335,7 @@ impl Active {
         };
     }
 
-    fn take_news(&mut self) -> Option<News> {
+    fn take_change(&mut self) -> Option<News> {
         let is_paused = self.holds.pause && self.stands_held();
         if is_paused == self.is_pause_reported || (self.is_pause_reported && self.holds.pause) {
             return None;
@@ -371,7 +371,7 @@ impl Active {
     }
 
     /// Whether the server has been silent for longer than the mission allows.
-    pub(super) fn minds_silence(&self, silence: Duration) -> bool {
+    pub(super) fn is_server_silent_too_long(&self, silence: Duration) -> bool {
         self.job.silence_max.is_some_and(|most| silence > most)
     }
 }

@@ -370,7 +370,7 @@ impl Shared {
     }
 
     /// Records a message from the server at `now`.
-    pub(crate) fn note_server_heard(&self, now: Duration) {
+    pub(crate) fn record_server_message(&self, now: Duration) {
         let now_us = u64::try_from(now.as_micros()).unwrap_or(u64::MAX);
         self.server_heard_us.fetch_max(now_us, Ordering::Relaxed);
     }

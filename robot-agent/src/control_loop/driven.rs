@@ -263,13 +263,13 @@ impl Driven {
         }
     }
 
-    /// Returns the driven path, thinned within [`LINE_TOLERANCE_M`] and [`MOTION_TOLERANCE_M`].
+    /// Returns the driven path, simplified within [`LINE_TOLERANCE_M`] and [`MOTION_TOLERANCE_M`].
     pub(crate) fn path(&self) -> DrivenPath {
         let mut whole = self.points.clone();
         if let Some(last) = self.last.filter(|last| whole.last() != Some(last)) {
             whole.push(last);
         }
-        let passed = thinned(&whole);
+        let passed = simplified(&whole);
         let wire = |passed: &Passed| WirePoint {
             x_m: (passed.at.x_m / RESOLUTION_M).round() * RESOLUTION_M,
             y_m: (passed.at.y_m / RESOLUTION_M).round() * RESOLUTION_M,
@@ -287,7 +287,7 @@ impl Driven {
 
 /// Returns the points without those within tolerance of the rest (Douglas–Peucker with
 /// [`Stretch::shortfall`] as the distance).
-fn thinned(points: &[Passed]) -> Vec<Passed> {
+fn simplified(points: &[Passed]) -> Vec<Passed> {
     let Some(last) = points.len().checked_sub(1) else {
         return Vec::new();
     };

@@ -72,7 +72,7 @@ pub(crate) struct TickFrame {
 
 /// A command that the loop took.
 #[derive(Debug, Clone)]
-pub(crate) enum NotedCommand {
+pub(crate) enum RecordedCommand {
     Start(Arc<JobOrigin>),
     Cancel(MissionId),
     Hold(MissionId, Hold),
@@ -81,7 +81,7 @@ pub(crate) enum NotedCommand {
     Site(Arc<SiteView>),
 }
 
-impl NotedCommand {
+impl RecordedCommand {
     /// Creates the note by sharing the command's data; copies nothing.
     pub(crate) fn of(command: &LoopCommand) -> Self {
         match command {
@@ -103,23 +103,23 @@ impl NotedCommand {
 )]
 pub(crate) enum Note {
     /// A command, with the number of the tick that took it.
-    Command(u64, NotedCommand),
+    Command(u64, RecordedCommand),
     Tick(TickFrame),
 }
 
 /// The loop's end of the queue of notes.
 #[derive(Debug)]
-pub(crate) struct NoteTaker {
+pub(crate) struct RecordSender {
     notes: SyncSender<Note>,
     lost: Arc<AtomicU64>,
     commands: u32,
 }
 
-impl NoteTaker {
+impl RecordSender {
     /// Notes a command taken by tick number `tick`.
     pub(crate) fn command(&mut self, tick: u64, command: &LoopCommand) {
         self.commands += 1;
-        self.send(Note::Command(tick, NotedCommand::of(command)));
+        self.send(Note::Command(tick, RecordedCommand::of(command)));
     }
 
     /// Returns the number of commands since the last noted tick.
@@ -151,10 +151,10 @@ pub(crate) struct Notes {
 }
 
 /// Creates both ends of the queue of notes.
-pub(crate) fn notes() -> (NoteTaker, Notes) {
+pub(crate) fn notes() -> (RecordSender, Notes) {
     let (sender, receiver) = sync_channel(NOTES_MAX);
     let lost = Arc::new(AtomicU64::new(0));
-    let taker = NoteTaker {
+    let taker = RecordSender {
         notes: sender,
         lost: Arc::clone(&lost),
         commands: 0,

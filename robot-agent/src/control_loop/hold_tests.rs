@@ -34,7 +34,7 @@ fn trajectory(text: &str) -> Trajectory {
 pub(crate) fn driving() -> (Bench, MissionId, Plan) {
     let scenario = Scenario::built_in().unwrap();
     let mut bench = Bench::new(&scenario, START, 5).unwrap();
-    bench.know_site(site_of(&scenario).unwrap()).unwrap();
+    bench.send_site(site_of(&scenario).unwrap()).unwrap();
     bench.run_for(SECOND);
     let (pose, _) = bench.ends.shared.snapshot().pose.unwrap();
     let line = trajectory(LINE);
@@ -237,11 +237,11 @@ fn the_mission_link_watchdog_ends_a_mission_that_minds_silence_and_no_other() {
         let mut bench = Bench::new(&scenario, START, 5).unwrap();
         bench.run_for(SECOND);
         bench.silence_max = silence_s.map(Duration::from_secs);
-        bench.ends.shared.note_server_heard(bench.now);
+        bench.ends.shared.record_server_message(bench.now);
         bench.begin(1, &trajectory(LINE), None).unwrap();
         for _ in 0..300 {
             bench.tick();
-            bench.ends.shared.note_server_heard(bench.now);
+            bench.ends.shared.record_server_message(bench.now);
         }
         let silent_from = bench.now;
         assert_eq!(run_to_end(&mut bench), expected);

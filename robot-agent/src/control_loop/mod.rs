@@ -57,7 +57,7 @@ pub(crate) fn run(
     loop {
         let began = clock.monotonic();
         if pace.begin(began) {
-            core.note_overrun();
+            core.count_overrun();
         }
         let stop = core.stop_requested();
         let now = Moment {
@@ -66,7 +66,7 @@ pub(crate) fn run(
         };
         core.tick_by(now, &|| clock.monotonic(), stop, drive.as_mut());
         let ended = clock.monotonic();
-        core.note_tick_time(ended.saturating_sub(began));
+        core.record_tick_time(ended.saturating_sub(began));
         if stop {
             let since = *stop_requested_at.get_or_insert(began);
             standing_ticks = if core.stands() { standing_ticks + 1 } else { 0 };

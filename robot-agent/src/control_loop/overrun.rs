@@ -67,7 +67,7 @@ impl OverrunWatch {
     }
 
     /// Records a tick at `now`, by the monotonic clock.
-    pub(crate) fn note(&mut self, now: Duration) {
+    pub(crate) fn record(&mut self, now: Duration) {
         let since = self
             .last_tick
             .replace(now)
@@ -127,7 +127,7 @@ mod tests {
     impl Loop {
         fn new() -> Self {
             let mut watch = OverrunWatch::new(PERIOD);
-            watch.note(Duration::ZERO);
+            watch.record(Duration::ZERO);
             Self {
                 watch,
                 now: Duration::ZERO,
@@ -137,7 +137,7 @@ mod tests {
         /// Ticks after a time, and says whether the robot is held then.
         fn tick_after(&mut self, gap_ms: u64) -> bool {
             self.now += Duration::from_millis(gap_ms);
-            self.watch.note(self.now);
+            self.watch.record(self.now);
             self.watch.overrun().is_some()
         }
     }

@@ -31,7 +31,7 @@ const MILLISECOND: Duration = Duration::from_millis(1);
 fn bench() -> Bench {
     let scenario = one_ground(2.5);
     let mut bench = bench_at(&scenario, ORIGIN, 1);
-    bench.know_site(site_of(&scenario)).unwrap();
+    bench.send_site(site_of(&scenario)).unwrap();
     bench.run_for(500 * MILLISECOND);
     bench
 }
@@ -226,7 +226,7 @@ fn a_loop_on_a_busy_machine_obeys_in_its_next_tick_and_notices_each_late_one() {
         while clock.monotonic() < began + BUSY_FOR {
             seq += 1;
             let now_us = microseconds(clock.monotonic());
-            safety.take_drive(&command(epoch, seq, now_us, 150 * MILLISECOND));
+            safety.handle_drive(&command(epoch, seq, now_us, 150 * MILLISECOND));
             last_end_us = now_us + 150_000;
             overruns_seen += u32::from(shared.snapshot().overrun.is_some());
             std::thread::sleep(20 * MILLISECOND);

@@ -27,12 +27,12 @@ pub(super) fn everywhere(theta: f64, std_dev: f64, traction_limit_mu: f64) -> Pa
     }
 }
 
-fn knowing_bench(stiffness: f64, seed: u64, prior: Option<&PathPrior>) -> Bench {
+fn bench_with_prior(stiffness: f64, seed: u64, prior: Option<&PathPrior>) -> Bench {
     let scenario = one_ground(stiffness);
     let mut bench = bench_at(&scenario, ORIGIN, seed);
-    bench.know_site(site_of(&scenario)).unwrap();
+    bench.send_site(site_of(&scenario)).unwrap();
     if let Some(prior) = prior {
-        bench.tell(prior);
+        bench.set_prior(prior);
     }
     bench.run_for(Duration::from_millis(500));
     bench
@@ -53,7 +53,7 @@ fn a_wrong_prior_never_comes_onto_the_map() {
     let truth = 0.4;
     for (wrong, seed) in [(0.04, 2), (3.0, 3)] {
         let prior = everywhere(wrong, 0.01 * wrong, 0.5);
-        let mut bench = knowing_bench(2.5, seed, Some(&prior));
+        let mut bench = bench_with_prior(2.5, seed, Some(&prior));
         for (number, path) in [(1, LINE), (2, CIRCLE)] {
             assert_eq!(bench.drive_to_the_end(number, path), EndReason::Reached);
         }
@@ -70,7 +70,7 @@ fn a_wrong_prior_never_comes_onto_the_map() {
 #[test]
 fn a_robot_with_a_prior_knows_the_ground_from_the_first_metre() {
     let estimate_with = |prior: Option<&PathPrior>| {
-        let mut bench = knowing_bench(0.7, 4, prior);
+        let mut bench = bench_with_prior(0.7, 4, prior);
         bench.start(1, LINE, None);
         bench.run_for(Duration::from_millis(300));
         bench.ends.shared.snapshot().theta_loop.unwrap()
@@ -89,7 +89,7 @@ fn a_robot_with_a_prior_knows_the_ground_from_the_first_metre() {
 fn a_low_traction_limit_makes_a_slower_plan() {
     let duration_s = |traction_limit_mu: f64| {
         let prior = everywhere(0.2, 0.02, traction_limit_mu);
-        let mut bench = knowing_bench(5.0, 5, Some(&prior));
+        let mut bench = bench_with_prior(5.0, 5, Some(&prior));
         let begun = bench.now;
         assert_eq!(bench.drive_to_the_end(1, LINE), EndReason::Reached);
         bench.now.saturating_sub(begun).as_secs_f64()

@@ -47,14 +47,14 @@ impl ProgressWatch {
     }
 
     /// Adds the mean distance of the wheels, metres, negative for backward travel.
-    pub(crate) fn note_wheels(&mut self, forward_m: f64) {
+    pub(crate) fn add_wheel_distance(&mut self, forward_m: f64) {
         if self.from.is_some() && forward_m.is_finite() {
             self.wheels_m += forward_m;
         }
     }
 
     /// Adds a position fix, in the site frame; non-finite fixes are ignored.
-    pub(crate) fn note_fix(&mut self, at: Point) {
+    pub(crate) fn add_fix(&mut self, at: Point) {
         if !at.is_finite() {
             return;
         }
@@ -92,9 +92,9 @@ mod tests {
     fn drive(watch: &mut ProgressWatch, at: &mut Point, wheels_m: f64, share: f64) {
         let mut left_m = wheels_m;
         while left_m > 0.0 {
-            watch.note_wheels(0.03);
+            watch.add_wheel_distance(0.03);
             at.x_m += 0.03 * share;
-            watch.note_fix(*at);
+            watch.add_fix(*at);
             left_m -= 0.03;
         }
     }
@@ -107,7 +107,7 @@ mod tests {
         drive(&mut watch, &mut at, 4.0 * WINDOW_M + 0.1, 0.05);
         assert!(watch.dug_in_at().is_some());
         for _ in 0..100 {
-            watch.note_fix(at);
+            watch.add_fix(at);
         }
         drive(&mut watch, &mut at, 5.0, 0.45);
         assert!(
@@ -124,7 +124,7 @@ mod tests {
         drive(&mut watch, &mut at, 2.0 * WINDOW_M + 0.1, 0.0);
         // The wheels are frozen at the speed that they had, and the robot stands.
         for _ in 0..100 {
-            watch.note_wheels(0.03);
+            watch.add_wheel_distance(0.03);
             watch.suspend();
         }
         drive(&mut watch, &mut at, 5.0, 0.9);
@@ -132,9 +132,9 @@ mod tests {
         drive(&mut watch, &mut at, 4.0 * WINDOW_M + 0.1, 0.0);
         assert!(watch.dug_in_at().is_some());
         for _ in 0..100 {
-            watch.note_wheels(0.03);
+            watch.add_wheel_distance(0.03);
             at.x_m += 1.0;
-            watch.note_fix(at);
+            watch.add_fix(at);
             watch.suspend();
         }
         assert!(watch.dug_in_at().is_some());
@@ -154,8 +154,8 @@ mod tests {
                 x_m: if was { at.x_m + 40.0 } else { at.x_m - 0.5 },
                 ..at
             };
-            watch.note_wheels(WINDOW_M);
-            watch.note_fix(wild);
+            watch.add_wheel_distance(WINDOW_M);
+            watch.add_fix(wild);
             assert_eq!(watch.dug_in_at().is_some(), was);
             drive(&mut watch, &mut at, WINDOW_M, share);
             assert_eq!(watch.dug_in_at().is_some(), was);

@@ -43,7 +43,7 @@ fn bench_with(stiffness: f64, seed: u64, kinds: &[FaultKind]) -> Bench {
         })
         .collect();
     bench.drive = drive.unwrap().with_faults(faults);
-    bench.know_site(site_of(&scenario)).unwrap();
+    bench.send_site(site_of(&scenario)).unwrap();
     bench.run_for(Duration::from_millis(500));
     bench
 }
@@ -159,7 +159,7 @@ fn a_robot_whose_sensors_are_right_is_never_doubted() {
     for (stiffness, seed) in [(0.7, 1), (2.5, 2), (8.0, 3)] {
         let scenario = one_ground(stiffness);
         let mut bench = bench_at(&scenario, ORIGIN, seed);
-        bench.know_site(site_of(&scenario)).unwrap();
+        bench.send_site(site_of(&scenario)).unwrap();
         bench.run_for(Duration::from_millis(500));
         for (number, asked) in [(1, LINE), (2, CIRCLE)] {
             bench.start(number, asked, None);
@@ -214,7 +214,7 @@ fn within_a_fence_a_robot_whose_position_was_wrong_goes_on_by_itself_without_mov
         corner(-20.0, 40.0),
     ]);
     definition.geofence.keep_in.push(yard.unwrap());
-    bench.know_site(definition).unwrap();
+    bench.send_site(definition).unwrap();
     let model = tread_control::robot::RobotModel::yi2007();
     let start = bench.drive.truth().pose;
     let individual = Individual::of_seed(5);

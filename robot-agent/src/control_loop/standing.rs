@@ -165,7 +165,7 @@ impl StandingWatch {
 
     /// Resets the watch except for the time of the command, because no sensor is heard: whether the
     /// robot has stopped is unknown until one is.
-    pub(crate) fn forget(&mut self) {
+    pub(crate) fn reset(&mut self) {
         *self = Self {
             commanded: self.commanded,
             ..Self::default()
@@ -369,7 +369,7 @@ mod tests {
         let mut watch = StandingWatch::default();
         let stands = |report: &StandingReport| report.stands.is_some();
         until(&mut watch, 0, |_| rolling(0.0), stands).unwrap();
-        watch.forget();
+        watch.reset();
         let report = watch.report();
         assert!(report.is_to_stand && report.stands.is_none());
         let again = until(&mut watch, 9_000, |_| rolling(0.0), stands);

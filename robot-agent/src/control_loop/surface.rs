@@ -75,7 +75,7 @@ impl SurfaceWatch {
     }
 
     /// Processes the comparison of one cell.
-    pub(crate) fn note(&mut self, comparison: Comparison) {
+    pub(crate) fn record(&mut self, comparison: Comparison) {
         let apart = comparison.z_score().abs();
         if !apart.is_finite() {
             return;
@@ -135,27 +135,27 @@ mod tests {
     fn ice_raises_at_its_second_cell_and_three_cells_as_expected_end_it() {
         let mut watch = SurfaceWatch::default();
         for theta in [0.2, 0.23, 0.17] {
-            watch.note(seen(theta));
+            watch.record(seen(theta));
             assert_eq!(watch.raised(), None, "{theta}");
         }
         // One cell alone may be wrong itself, and so may two that say the opposite.
         for theta in [1.5, 0.2, 1.5, 0.01] {
-            watch.note(seen(theta));
+            watch.record(seen(theta));
             assert_eq!(watch.raised(), None, "{theta}");
         }
         for theta in [1.4, 1.5] {
-            watch.note(seen(theta));
+            watch.record(seen(theta));
         }
         assert_eq!(watch.raised(), Some(seen(1.5)));
         // What neither agrees nor contradicts keeps it as it is, and so does what is no number.
         for theta in [0.2, 0.2, 0.27, 0.2, 0.2, f64::NAN] {
-            watch.note(seen(theta));
+            watch.record(seen(theta));
             assert!(watch.raised().is_some(), "{theta}");
         }
-        watch.note(seen(0.2));
+        watch.record(seen(0.2));
         assert_eq!(watch.raised(), None);
         for theta in [0.01, 0.01] {
-            watch.note(seen(theta));
+            watch.record(seen(theta));
         }
         assert!(watch.raised().is_some(), "more friction is a change too");
         watch.begin_mission();

@@ -94,7 +94,7 @@ fn a_path_and_a_circle_are_driven_to_the_end_and_the_ground_is_measured() {
     for (stiffness, seed) in [(0.7, 1), (2.5, 2), (8.0, 3)] {
         let scenario = one_ground(stiffness);
         let mut bench = bench_at(&scenario, ORIGIN, seed);
-        bench.know_site(site_of(&scenario)).unwrap();
+        bench.send_site(site_of(&scenario)).unwrap();
         bench.run_for(Duration::from_millis(500));
         assert_eq!(
             bench.drive_to_the_end(1, LINE),
@@ -148,7 +148,7 @@ fn segments_keep_to_their_cell_and_ground_and_borders_give_none() {
     };
     let mut bench = bench_at(&scenario, start, 4);
     let site = site_of(&scenario);
-    bench.know_site(site.clone()).unwrap();
+    bench.send_site(site.clone()).unwrap();
     bench.run_for(Duration::from_millis(500));
     let asked = r#"{"waypoints":{"speed_m_s":0.6,"points":[{"x_m":10,"y_m":6},
         {"x_m":13,"y_m":7},{"x_m":16,"y_m":5},{"x_m":19,"y_m":7},{"x_m":22,"y_m":6}]}}"#;
@@ -333,7 +333,7 @@ fn the_terrain_comes_from_the_site_and_not_from_the_scenario() {
         id: "drawn".parse().unwrap(),
         revision: 7,
     };
-    bench.know_site(site).unwrap();
+    bench.send_site(site).unwrap();
     bench.run_for(Duration::from_millis(500));
     assert_eq!(bench.drive_to_the_end(1, LINE), EndReason::Reached);
     assert_eq!(bench.drive_to_the_end(2, CIRCLE), EndReason::Reached);
@@ -357,7 +357,7 @@ fn the_built_in_scenario_shows_every_terrain_in_time() {
             heading_rad: robot.heading_rad,
         };
         let mut bench = bench_at(&scenario, start, robot.seed);
-        bench.know_site(site_of(&scenario)).unwrap();
+        bench.send_site(site_of(&scenario)).unwrap();
         bench.run_for(Duration::from_secs(1));
         let began = bench.now;
         let missions = scenario

@@ -38,10 +38,10 @@ stiffness = {strip}
     .unwrap()
 }
 
-fn knowing(scenario: &Scenario, theta: f64, seed: u64) -> Bench {
+fn bench_with_theta(scenario: &Scenario, theta: f64, seed: u64) -> Bench {
     let mut bench = bench_at(scenario, ORIGIN, seed);
-    bench.know_site(site_of(scenario)).unwrap();
-    bench.tell(&everywhere(theta, 0.02, HIGH_MU));
+    bench.send_site(site_of(scenario)).unwrap();
+    bench.set_prior(&everywhere(theta, 0.02, HIGH_MU));
     bench.run_for(Duration::from_millis(500));
     bench
 }
@@ -49,7 +49,7 @@ fn knowing(scenario: &Scenario, theta: f64, seed: u64) -> Bench {
 #[test]
 fn ground_that_is_not_as_the_map_says_is_reported_while_it_is_so_and_no_longer() {
     for (strip, is_other) in [(0.7, true), (5.0, false)] {
-        let mut bench = knowing(&floor_with_strip(5.0, strip, ""), 0.2, 6);
+        let mut bench = bench_with_theta(&floor_with_strip(5.0, strip, ""), 0.2, 6);
         bench.start(1, LINE, None);
         let (mut seen, mut where_m) = (0, f64::NAN);
         while bench.ended.is_empty() {
@@ -93,7 +93,7 @@ fn ground_that_is_not_as_the_map_says_is_reported_while_it_is_so_and_no_longer()
 fn a_robot_without_a_prior_reports_no_gain() {
     let scenario = floor_with_strip(5.0, 5.0, "");
     let mut bench = bench_at(&scenario, ORIGIN, 7);
-    bench.know_site(site_of(&scenario)).unwrap();
+    bench.send_site(site_of(&scenario)).unwrap();
     bench.run_for(Duration::from_millis(500));
     assert_eq!(bench.drive_to_the_end(1, LINE), EndReason::Reached);
     assert_eq!(bench.last_driven.as_ref().unwrap().quality().prior, None);
@@ -105,7 +105,7 @@ fn wheels_that_turn_without_progress_are_reported_until_they_take_the_robot_on()
     // No friction at all for a while, then a floor.
     let scenario = floor_with_strip(0.004, 0.004, "{ after_s = 9.0, stiffness = 5.0 }");
     let mut bench = bench_at(&scenario, ORIGIN, 8);
-    bench.know_site(site_of(&scenario)).unwrap();
+    bench.send_site(site_of(&scenario)).unwrap();
     bench.run_for(Duration::from_millis(500));
     bench.start(1, LINE, None);
     let is_dug_in = |bench: &Bench| bench.ends.shared.snapshot().dug_in_at.is_some();

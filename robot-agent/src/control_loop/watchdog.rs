@@ -58,7 +58,7 @@ impl TickWatch {
 
     /// Runs one check. After an interval above [`OWN_GAP_MAX`] the time without ticks restarts: the
     /// whole process was suspended or starved, and the loop must have the chance to tick first.
-    pub(crate) fn look(&mut self, ticks: u64, now: Duration) -> Finding {
+    pub(crate) fn check(&mut self, ticks: u64, now: Duration) -> Finding {
         let gap = now.saturating_sub(std::mem::replace(&mut self.looked, now));
         if gap > OWN_GAP_MAX {
             self.since = now;
@@ -96,7 +96,7 @@ pub(crate) fn run(shared: &Arc<Shared>, clock: &SharedClock) {
     while !shared.stop.load(Ordering::Relaxed) {
         std::thread::sleep(LOOK_EVERY);
         let ticks = shared.ticks.load(Ordering::Relaxed);
-        match watch.look(ticks, clock.monotonic()) {
+        match watch.check(ticks, clock.monotonic()) {
             Finding::Fine => {}
             Finding::StandsStill => error!(ticks, "the control loop stands still"),
             Finding::TicksAgain => info!(ticks, "the control loop ticks again"),
@@ -113,9 +113,9 @@ mod tests {
     use super::*;
 
     /// Looks every 100 ms at a loop with so many ticks; the last finding that is not fine.
-    fn look_until(watch: &mut TickWatch, ticks: u64, from_ms: u64, to_ms: u64) -> Vec<Finding> {
+    fn check_until(watch: &mut TickWatch, ticks: u64, from_ms: u64, to_ms: u64) -> Vec<Finding> {
         let looks = (from_ms..=to_ms).step_by(100).map(Duration::from_millis);
-        let findings = looks.map(|now| watch.look(ticks, now));
+        let findings = looks.map(|now| watch.check(ticks, now));
         findings
             .filter(|finding| *finding != Finding::Fine)
             .collect()
@@ -124,24 +124,24 @@ mod tests {
     #[test]
     fn the_loop_watchdog_says_once_that_it_stands_still_and_then_gives_up() {
         let mut watch = TickWatch::new(Duration::ZERO);
-        assert_eq!(look_until(&mut watch, 1, 100, 500), []);
-        assert_eq!(look_until(&mut watch, 1, 600, 900), [Finding::StandsStill]);
+        assert_eq!(check_until(&mut watch, 1, 100, 500), []);
+        assert_eq!(check_until(&mut watch, 1, 600, 900), [Finding::StandsStill]);
         assert_eq!(
-            look_until(&mut watch, 2, 1_000, 1_400),
+            check_until(&mut watch, 2, 1_000, 1_400),
             [Finding::TicksAgain]
         );
         assert_eq!(
-            look_until(&mut watch, 2, 1_500, 2_900),
+            check_until(&mut watch, 2, 1_500, 2_900),
             [Finding::StandsStill]
         );
-        assert_eq!(look_until(&mut watch, 2, 3_000, 3_000), [Finding::GiveUp]);
+        assert_eq!(check_until(&mut watch, 2, 3_000, 3_000), [Finding::GiveUp]);
     }
 
     #[test]
     fn a_process_that_was_frozen_as_a_whole_is_not_given_up() {
         let mut watch = TickWatch::new(Duration::ZERO);
-        assert_eq!(look_until(&mut watch, 1, 100, 300), []);
-        assert_eq!(look_until(&mut watch, 1, 60_000, 60_400), []);
-        assert_eq!(look_until(&mut watch, 2, 60_500, 60_500), []);
+        assert_eq!(check_until(&mut watch, 1, 100, 300), []);
+        assert_eq!(check_until(&mut watch, 1, 60_000, 60_400), []);
+        assert_eq!(check_until(&mut watch, 2, 60_500, 60_500), []);
     }
 }

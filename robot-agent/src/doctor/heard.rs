@@ -36,7 +36,7 @@ impl Heard {
     }
 
     /// Removes all messages.
-    pub(super) fn forget(&self) {
+    pub(super) fn clear(&self) {
         self.messages().clear();
     }
 
@@ -47,7 +47,7 @@ impl Heard {
 }
 
 impl Tap for Heard {
-    fn hear(
+    fn receive(
         &self,
         source: Source,
         arrival: Arrival,

@@ -160,7 +160,7 @@ fn examine_base(
     while heard.is_empty() && examined.clock.monotonic() < until {
         examined.hold(WheelSpeeds::default(), PERIOD);
     }
-    heard.forget();
+    heard.clear();
     examined.hold(WheelSpeeds::default(), LISTEN_FOR);
     let at_rest = heard.taken();
     let mut findings = listening::findings(settings, &at_rest, LISTEN_FOR);
@@ -211,7 +211,8 @@ impl ExaminedDrive {
         bias_rad_s: f64,
         mut findings: Vec<Finding>,
     ) -> Vec<Finding> {
-        let is_unusable = self.drive.must_rest() && findings.iter().any(|finding| !finding.holds);
+        let is_unusable =
+            self.drive.is_rest_required() && findings.iter().any(|finding| !finding.holds);
         if is_unusable || self.other_commander(settings).is_some() {
             let text = "the robot was not moved: mend the findings above first";
             findings.push(Finding::on("moving").skipped(text));
@@ -230,7 +231,7 @@ impl ExaminedDrive {
                 right_rad_s: share * asked.right_rad_s,
             }
         };
-        heard.forget();
+        heard.clear();
         let mut turned = self.drive_for(speeds(-1.0, 1.0), settings, heard);
         // Along the x axis of the odometry's frame, a twist in that frame equals one in the robot
         // frame.
@@ -260,7 +261,7 @@ impl ExaminedDrive {
 
     /// Commands these wheel speeds for `span`; returns false at once if the base falls silent.
     fn hold_heard(&mut self, command: WheelSpeeds, span: Duration) -> bool {
-        self.go(command, span, |drive| !drive.must_rest())
+        self.go(command, span, |drive| !drive.is_rest_required())
     }
 
     fn go(
@@ -336,11 +337,11 @@ impl ExaminedDrive {
     /// Returns the messages of the acceleration and of the steady motion; `None` if the base fell
     /// silent.
     fn try_to_drive(&mut self, command: WheelSpeeds, heard: &Heard) -> Option<MotionMessages> {
-        heard.forget();
+        heard.clear();
         let mut is_heard = self.ramp(command) && self.hold_heard(command, SETTLE);
         let starting = heard.taken();
         is_heard = is_heard && self.hold_heard(command, STEADY_AFTER);
-        heard.forget();
+        heard.clear();
         is_heard = is_heard && self.hold_heard(command, STEADY_FOR);
         is_heard.then(|| MotionMessages {
             starting,

@@ -75,7 +75,7 @@ impl Flip {
         }
     }
 
-    fn mend(self, finding: Finding, settings: &Ros2Settings) -> Finding {
+    fn with_remedy(self, finding: Finding, settings: &Ros2Settings) -> Finding {
         let opposite = |sign: f64| if sign > 0.0 { "-1" } else { "1" };
         let (command, joints) = (&settings.command, settings.joints.as_ref());
         match (self, joints) {
@@ -188,8 +188,8 @@ pub(super) fn finding(answers: Answers, settings: &Ros2Settings) -> Finding {
         // Several sets of flips explain the responses, so a person has to decide.
         return finding;
     }
-    let mend = |finding, flip: &Flip| flip.mend(finding, settings);
-    flips.iter().fold(finding, mend)
+    let remedied = |finding, flip: &Flip| flip.with_remedy(finding, settings);
+    flips.iter().fold(finding, remedied)
 }
 
 #[cfg(test)]

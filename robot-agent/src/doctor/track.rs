@@ -136,7 +136,7 @@ impl Wheels {
 
 /// Ratios of measured to commanded wheel speeds, in the turn and in the drive forward.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Obeyed {
+struct CommandRatios {
     turn: f64,
     forward: f64,
 }
@@ -151,7 +151,7 @@ pub(super) fn findings(
     let (Some(turning), Some(going)) = (turned.wheels, forward.wheels) else {
         return Vec::new();
     };
-    let obeyed = Obeyed {
+    let obeyed = CommandRatios {
         turn: (turning.right_rad_s - turning.left_rad_s)
             / (turned.commanded.right_rad_s - turned.commanded.left_rad_s),
         forward: (going.left_rad_s + going.right_rad_s)
@@ -164,7 +164,7 @@ pub(super) fn findings(
 }
 
 /// Returns the finding on the wheel radius by which the base converts commands to wheel speeds.
-fn of_radius_of_base(settings: &Ros2Settings, obeyed: Obeyed) -> Finding {
+fn of_radius_of_base(settings: &Ros2Settings, obeyed: CommandRatios) -> Finding {
     if (obeyed.forward - 1.0).abs() <= COMMAND_SHARE {
         return Finding::on("command")
             .ok("driving forward, the wheels turn as fast as they are commanded");
@@ -189,7 +189,7 @@ fn of_radius_of_base(settings: &Ros2Settings, obeyed: Obeyed) -> Finding {
 fn of_tracks(
     settings: &Ros2Settings,
     model: &RobotModel,
-    obeyed: Obeyed,
+    obeyed: CommandRatios,
     effective: Option<EffectiveTrack>,
 ) -> Vec<Finding> {
     let (model_m, command_m) = (model.track_width_m(), settings.command.base_track_m);

@@ -99,7 +99,7 @@ pub enum Urgent<'payload> {
 }
 
 /// Callback for urgent messages; must not block.
-pub type TakeUrgent = Arc<dyn Fn(Urgent<'_>) + Send + Sync>;
+pub type HandleUrgent = Arc<dyn Fn(Urgent<'_>) + Send + Sync>;
 
 /// Receivers of what arrives on the link.
 #[derive(Clone)]
@@ -107,7 +107,7 @@ pub struct Listeners {
     /// Called for each event on the link.
     pub note: Note,
     /// Called for each urgent message.
-    pub urgent: TakeUrgent,
+    pub urgent: HandleUrgent,
     /// Receives commands; a command that finds the queue full is dropped, and the server repeats
     /// it.
     pub commands: mpsc::Sender<IncomingCommand>,
@@ -434,7 +434,7 @@ impl FleetLink {
         session: &zenoh::Session,
         site: &SiteId,
         robot: &RobotId,
-        urgent: &TakeUrgent,
+        urgent: &HandleUrgent,
     ) -> Result<(), LinkError> {
         let take = Arc::clone(urgent);
         session

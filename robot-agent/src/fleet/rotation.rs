@@ -152,7 +152,7 @@ impl Rotation {
     }
 
     /// Forgets what was wrong with the servers, since the robot has another certificate.
-    pub fn begin_anew(&mut self) {
+    pub fn reset_failures(&mut self) {
         for server in &mut self.servers {
             server.logged = Logged::default();
             server.passed_over_until = Duration::ZERO;

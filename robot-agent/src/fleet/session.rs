@@ -72,7 +72,7 @@ impl std::fmt::Debug for SessionUser {
 ///
 /// # Errors
 /// [`LinkError`] if zenoh refuses a setting.
-pub(super) fn through_tunnel(
+pub(super) fn tunnel_config(
     local: SocketAddr,
     user: &SessionUser,
 ) -> Result<zenoh::Config, LinkError> {

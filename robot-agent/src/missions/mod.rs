@@ -12,8 +12,8 @@
 //! [`MissionSlot`] is pure: it decides, its callers act. An ended mission never becomes active
 //! again, even by a late offer; [`memory`] keeps that over restarts of the agent.
 
-mod kept_ends;
 pub mod memory;
+mod stored_ends;
 #[cfg(test)]
 pub(crate) mod tests;
 
@@ -28,8 +28,8 @@ use tread_api::wire::reply::{
     AcceptedMission, CommandRefusal, CommandRefusalCode, EndedMission, MissionOutcomes,
 };
 
-use self::kept_ends::KeptEnds;
-pub use self::kept_ends::UNRECORDED_ENDS_MAX;
+use self::stored_ends::StoredEnds;
+pub use self::stored_ends::UNRECORDED_ENDS_MAX;
 
 /// Number of ended missions that are remembered; the oldest is dropped first.
 pub const ENDED_MAX: usize = 1_000;
@@ -77,9 +77,9 @@ pub struct MissionSlot {
     #[serde(
         default,
         alias = "unrecorded_end",
-        skip_serializing_if = "KeptEnds::is_empty"
+        skip_serializing_if = "StoredEnds::is_empty"
     )]
-    unrecorded_ends: KeptEnds,
+    unrecorded_ends: StoredEnds,
 }
 
 /// Decision on an offer.
@@ -294,7 +294,7 @@ impl MissionSlot {
     }
 
     /// Keeps the report of an end until [`MissionSlot::ends_are_recorded`].
-    pub fn keep_end(&mut self, report: MissionReport) {
+    pub fn store_end(&mut self, report: MissionReport) {
         self.unrecorded_ends.keep(report);
     }
 
@@ -310,7 +310,7 @@ impl MissionSlot {
 
     /// Drops the reports of ends: the outbox has them on disk.
     pub fn ends_are_recorded(&mut self) {
-        self.unrecorded_ends = KeptEnds::default();
+        self.unrecorded_ends = StoredEnds::default();
     }
 
     /// Ends the active mission; `None` if it is not this one.

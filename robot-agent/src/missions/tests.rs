@@ -191,9 +191,9 @@ fn the_ends_that_wait_for_the_outbox_are_bounded_and_the_newest_stay() {
     let mut slot = MissionSlot::default();
     let count = UNRECORDED_ENDS_MAX as u128 + 3;
     for mission in 0..count {
-        slot.keep_end(report(mission));
+        slot.store_end(report(mission));
         // A report that is kept again takes no further place.
-        slot.keep_end(report(mission));
+        slot.store_end(report(mission));
     }
     let kept: Vec<MissionId> = slot.unrecorded_ends().map(|kept| kept.mission).collect();
     assert_eq!(kept, (3..count).map(id).collect::<Vec<_>>());

@@ -139,7 +139,7 @@ impl Store {
             has_damage: has_damage || recovery.damaged_bytes > 0 || recovery.lost_records > 0,
         };
         for (scan, bytes) in found.files {
-            store.take_file(&scan, bytes)?;
+            store.add_recovered_file(&scan, bytes)?;
         }
         // Records dropped just before a crash may have reappeared.
         store.make_room(0, 0);
@@ -156,7 +156,7 @@ impl Store {
     }
 
     /// Adds a repaired file of an earlier run.
-    fn take_file(&mut self, scan: &Scan, bytes: u64) -> Result<(), StoreError> {
+    fn add_recovered_file(&mut self, scan: &Scan, bytes: u64) -> Result<(), StoreError> {
         let first_pending = self.head.first_pending;
         for record in &scan.records {
             if record.name.ordinal < first_pending {
@@ -294,7 +294,7 @@ impl Store {
             if !records.is_empty() {
                 return Ok(records);
             }
-            self.lose_oldest();
+            self.drop_damaged_oldest();
         }
         Ok(Vec::new())
     }
@@ -324,7 +324,7 @@ impl Store {
     }
 
     /// Drops the oldest record, whose frame is damaged, and counts it.
-    fn lose_oldest(&mut self) {
+    fn drop_damaged_oldest(&mut self) {
         let Some(&entry) = self.pending.front() else {
             return;
         };

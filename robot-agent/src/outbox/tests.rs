@@ -104,7 +104,7 @@ impl Model {
             .map_or(self.next, |(ordinal, _)| *ordinal)
     }
 
-    fn note_synced(&mut self, folder: &Path) {
+    fn record_synced(&mut self, folder: &Path) {
         self.synced_first = self.first();
         self.synced_next = self.next;
         self.synced_files = log_files(folder);
@@ -150,7 +150,7 @@ proptest! {
         let mut boots = 1;
         let (mut store, _) = Store::open(path, SMALL, boot(boots)).unwrap();
         let mut model = Model::default();
-        model.note_synced(path);
+        model.record_synced(path);
         for step in steps {
             match step {
                 Step::Append { bytes } => {
@@ -183,7 +183,7 @@ proptest! {
                 }
                 Step::Sync => {
                     sync(&mut store);
-                    model.note_synced(path);
+                    model.record_synced(path);
                 }
                 Step::Crash { share } => {
                     drop(store);
@@ -210,7 +210,7 @@ proptest! {
                     model.pending = found.into();
                     model.next = store.next_ordinal();
                     sync(&mut store);
-                    model.note_synced(path);
+                    model.record_synced(path);
                 }
             }
             let expected: Vec<_> = model.pending.iter().cloned().collect();

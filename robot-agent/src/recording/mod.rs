@@ -26,7 +26,7 @@ use tread_control::estimation::EstimatorPrior;
 use crate::config::AgentConfig;
 use crate::config::recording::RecordingConfig;
 use crate::control_loop::channels::Hold;
-use crate::control_loop::frame::NotedCommand;
+use crate::control_loop::frame::RecordedCommand;
 use crate::control_loop::job::JobOrigin;
 use crate::safety::LoopView;
 pub(crate) use writer::RecordWriter;
@@ -136,21 +136,21 @@ pub(crate) enum CommandRecord {
     },
 }
 
-impl From<&NotedCommand> for CommandRecord {
-    fn from(noted: &NotedCommand) -> Self {
+impl From<&RecordedCommand> for CommandRecord {
+    fn from(noted: &RecordedCommand) -> Self {
         match noted {
-            NotedCommand::Start(origin) => Self::Start(origin.as_ref().clone()),
-            NotedCommand::Cancel(mission) => Self::Cancel { mission: *mission },
-            NotedCommand::Hold(mission, hold) => Self::Hold {
+            RecordedCommand::Start(origin) => Self::Start(origin.as_ref().clone()),
+            RecordedCommand::Cancel(mission) => Self::Cancel { mission: *mission },
+            RecordedCommand::Hold(mission, hold) => Self::Hold {
                 mission: *mission,
                 hold: *hold,
             },
-            NotedCommand::Release(mission, hold) => Self::Release {
+            RecordedCommand::Release(mission, hold) => Self::Release {
                 mission: *mission,
                 hold: *hold,
             },
-            NotedCommand::Replace(origin) => Self::Replace(origin.as_ref().clone()),
-            NotedCommand::Site(site) => Self::Site {
+            RecordedCommand::Replace(origin) => Self::Replace(origin.as_ref().clone()),
+            RecordedCommand::Site(site) => Self::Site {
                 definition: site.definition().clone(),
                 is_without_room: site.is_without_room(),
             },

@@ -74,7 +74,7 @@ pub(crate) struct Salvaged {
 }
 
 impl Salvaged {
-    fn note_tick(&mut self, number: u64, last: &mut Option<u64>) {
+    fn record_tick(&mut self, number: u64, last: &mut Option<u64>) {
         self.ticks += 1;
         if let Some(last) = *last
             && number > last + 1
@@ -155,7 +155,7 @@ fn salvage(RecoverArgs { file, into, .. }: &RecoverArgs) -> Result<Salvaged, Sal
         // Bytes between two chunks contain no messages.
         match chunk_at(&bytes, at) {
             Some((place, chunk)) => {
-                chunk.note_channels(&mut known);
+                chunk.add_channels(&mut known);
                 at = place.end;
                 places.push(place.start);
             }
@@ -237,7 +237,7 @@ impl Chunk {
     }
 
     /// Adds the chunk's channel definitions; one that contradicts an earlier one is ignored.
-    fn note_channels(self, known: &mut ChannelAccumulator<'static>) {
+    fn add_channels(self, known: &mut ChannelAccumulator<'static>) {
         for (header, data) in self.schemas {
             let _ = known.add_schema(header, Cow::Owned(data));
         }
@@ -273,7 +273,7 @@ fn write(
             if topic == topics::TICK
                 && let Some(number) = tick_number(&data)
             {
-                found.note_tick(number, &mut last_tick);
+                found.record_tick(number, &mut last_tick);
             }
         }
     }

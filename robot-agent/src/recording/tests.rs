@@ -1,4 +1,4 @@
-//! Records on the bench: run again to the bit, changed, torn, thinned out, and on a disk that
+//! Records on the bench: run again to the bit, changed, torn, simplified out, and on a disk that
 //! refuses.
 
 use std::collections::BTreeMap;
@@ -48,7 +48,7 @@ pub(super) fn bench(config: RecordingConfig) -> Bench {
     let mut bench = Bench::new(&scenario, start, 3).unwrap();
     let robot = "rover-1".parse().unwrap();
     bench.record(config, scenario.site.clone(), robot);
-    bench.know_site(site_of(&scenario).unwrap()).unwrap();
+    bench.send_site(site_of(&scenario).unwrap()).unwrap();
     bench.run_for(SECOND);
     bench
 }
@@ -210,7 +210,7 @@ fn a_day_with_all_that_happens_runs_again_to_the_bit() {
         files: 100,
         ..config(folder.path())
     });
-    bench.tell(&PathPrior {
+    bench.set_prior(&PathPrior {
         grid_revision: 1,
         traction_limit_mu: 0.3,
         robot_bias_ratio: ROBOT_BIAS_RATIO,
@@ -250,7 +250,7 @@ fn a_day_with_all_that_happens_runs_again_to_the_bit() {
         revision: 2,
         ..Geofence::default()
     };
-    bench.know_site(site).unwrap();
+    bench.send_site(site).unwrap();
     bench.run_for(SECOND);
     bench.safety.stop_now(&Stop {
         stop: tread_api::ids::StopId::from_uuid(Uuid::from_u128(9)),

@@ -32,7 +32,7 @@ use tread_ros2::messages::{
 use super::{CommandMessage, CommandRecord, RunHead, SafetyMessage, codec, topics, views};
 use crate::clock::SharedClock;
 use crate::config::recording::RecordingConfig;
-use crate::control_loop::frame::{Note, NotedCommand, Notes, TickFrame};
+use crate::control_loop::frame::{Note, Notes, RecordedCommand, TickFrame};
 use crate::control_loop::job::JobOrigin;
 use crate::safety::LoopView;
 
@@ -255,7 +255,7 @@ impl RecordWriter {
     pub(crate) fn run(mut self, notes: &Notes) {
         loop {
             match notes.notes.recv_timeout(FLUSH_EVERY) {
-                Ok(note) => self.note(notes, &note),
+                Ok(note) => self.record(notes, &note),
                 Err(RecvTimeoutError::Timeout) => {}
                 Err(RecvTimeoutError::Disconnected) => break,
             }
@@ -268,12 +268,12 @@ impl RecordWriter {
     #[cfg(any(test, feature = "testing"))]
     pub(crate) fn drain(&mut self, notes: &Notes) {
         for note in notes.notes.try_iter() {
-            self.note(notes, &note);
+            self.record(notes, &note);
         }
         self.flush_when_due();
     }
 
-    fn note(&mut self, notes: &Notes, note: &Note) {
+    fn record(&mut self, notes: &Notes, note: &Note) {
         let lost = notes.lost.load(Ordering::Relaxed);
         let is_over = |at| self.clock.monotonic().saturating_sub(at) >= RETRY_EVERY;
         if lost > self.lost && self.said_lost_at.is_none_or(is_over) {
@@ -350,7 +350,7 @@ impl RecordWriter {
         &mut self,
         open: &mut OpenRecord,
         tick: u64,
-        noted: &NotedCommand,
+        noted: &RecordedCommand,
     ) -> Result<(), McapError> {
         // Not later than the tick that took the command.
         let wall_ns = self.wall_ns;
@@ -360,13 +360,13 @@ impl RecordWriter {
         };
         open.write_text(topics::COMMAND, wall_ns, &message)?;
         match noted {
-            NotedCommand::Start(origin) | NotedCommand::Replace(origin) => {
+            RecordedCommand::Start(origin) | RecordedCommand::Replace(origin) => {
                 self.write_plan(open, wall_ns, origin)
             }
-            NotedCommand::Cancel(_)
-            | NotedCommand::Hold(..)
-            | NotedCommand::Release(..)
-            | NotedCommand::Site(_) => Ok(()),
+            RecordedCommand::Cancel(_)
+            | RecordedCommand::Hold(..)
+            | RecordedCommand::Release(..)
+            | RecordedCommand::Site(_) => Ok(()),
         }
     }
 

@@ -182,7 +182,7 @@ fn what_is_wrong_is_said_and_is_over_when_it_is() {
     let shared = Arc::new(Shared::default());
     let mut outward = outward(&shared);
     let now = SILENT_SERVER / 2;
-    shared.note_server_heard(now);
+    shared.record_server_message(now);
     let messages = said(&mut outward, now);
     assert!(numbers(&messages).iter().all(|number| number.is_nan()));
     for name in ["control", "link", "estimator", "base"] {
@@ -215,7 +215,7 @@ fn what_is_wrong_is_said_and_is_over_when_it_is() {
         (level, values["imu: late"].as_str()),
         (Level::Ok as u8, "1")
     );
-    outward.counts.note_foreign_command();
+    outward.counts.count_foreign_command();
     let messages = said(&mut outward, now + SILENT_SERVER + 2 * SAY_EVERY);
     let (level, text, values) = part(&messages, "tread_agent: base");
     assert_eq!(level, Level::Error as u8, "{text}");
@@ -297,7 +297,7 @@ fn heard_by_another(tells: bool, look: impl FnOnce(&OutwardSettings, &Observer))
     let (drive, mut bus) = Ros2Drive::new(settings.clone(), &clock).unwrap();
     if tells {
         let shared = Arc::new(Shared::default());
-        shared.note_server_heard(clock.monotonic());
+        shared.record_server_message(clock.monotonic());
         let settings = bus.outward_settings().cloned().unwrap();
         let outward = Outward::new(settings, shared, drive.counts(), "rover-1".to_owned());
         bus.publish(Box::new(outward));

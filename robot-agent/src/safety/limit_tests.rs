@@ -55,7 +55,7 @@ stiffness = {stiffness}
 fn bench(seed: u64) -> Bench {
     let scenario = two_grounds();
     let mut bench = Bench::new(&scenario, START, seed).unwrap();
-    bench.know_site(site_of(&scenario).unwrap()).unwrap();
+    bench.send_site(site_of(&scenario).unwrap()).unwrap();
     bench.run_for(SECOND);
     bench
 }

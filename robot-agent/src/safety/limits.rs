@@ -190,7 +190,7 @@ impl ExternalLimits {
     }
 
     /// Counts a limit that does not parse or is too large.
-    pub(crate) fn note_malformed(&mut self) {
+    pub(crate) fn count_malformed(&mut self) {
         self.refused += 1;
     }
 

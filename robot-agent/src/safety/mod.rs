@@ -95,7 +95,7 @@ impl SafetyCell {
     }
 
     /// Records that the loop has set its target to zero under this stop.
-    pub(crate) fn note_zeroed(&self, stop: u64) {
+    pub(crate) fn record_zeroed(&self, stop: u64) {
         self.zeroed.fetch_max(stop, Ordering::Release);
     }
 
@@ -295,7 +295,7 @@ impl Safety {
     }
 
     /// Processes an urgent message at once.
-    pub(crate) fn take_urgent(&self, urgent: Urgent<'_>) {
+    pub(crate) fn handle_urgent(&self, urgent: Urgent<'_>) {
         match urgent {
             // A stop that does not parse is answered and counted where commands are.
             Urgent::Stop(payload) => {
@@ -303,13 +303,13 @@ impl Safety {
                     self.stop_now(&stop);
                 }
             }
-            Urgent::Drive(payload) => self.take_drive(payload),
-            Urgent::Limit(owner, payload) => self.take_published_limit(owner, payload),
+            Urgent::Drive(payload) => self.handle_drive(payload),
+            Urgent::Limit(owner, payload) => self.handle_published_limit(owner, payload),
         }
     }
 
     /// Processes a drive command; blocks at most for another command.
-    pub(crate) fn take_drive(&self, payload: &[u8]) {
+    pub(crate) fn handle_drive(&self, payload: &[u8]) {
         let command = (payload.len() <= SMALL_PAYLOAD_MAX)
             .then(|| wire::decode::<DriveCommand>(payload).ok())
             .flatten();
@@ -321,13 +321,13 @@ impl Safety {
                         .publish(|view| view.teleoperation = operator.view());
                 }
             }
-            None => operator.note_malformed(),
+            None => operator.count_malformed(),
         }
     }
 
     /// Processes a published limit; `owner` is the owner in its key, which must be that of the
     /// payload.
-    pub(crate) fn take_published_limit(&self, owner: &OwnerId, payload: &[u8]) {
+    pub(crate) fn handle_published_limit(&self, owner: &OwnerId, payload: &[u8]) {
         let limit = (payload.len() <= SMALL_PAYLOAD_MAX)
             .then(|| wire::decode::<ExternalLimit>(payload).ok())
             .flatten()
@@ -335,7 +335,7 @@ impl Safety {
         match limit {
             // A refused limit is counted.
             Some(limit) => drop(self.limit(&limit)),
-            None => lock(&self.limits).note_malformed(),
+            None => lock(&self.limits).count_malformed(),
         }
     }
 

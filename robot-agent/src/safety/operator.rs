@@ -243,7 +243,7 @@ impl Operator {
         self.counts.over_limit += u64::from(is_over);
         self.wanted = Some((within, command.until_us));
         let age_us = now_us.saturating_sub(command.sent_us);
-        self.meter.note(seconds_of(age_us));
+        self.meter.record(seconds_of(age_us));
         if let Some(active) = &mut self.active {
             active.heard_us = now_us;
             active.last_seq = Some(command.seq);
@@ -272,7 +272,7 @@ impl Operator {
     }
 
     /// Counts a drive command that does not parse or is too large.
-    pub(crate) fn note_malformed(&mut self) {
+    pub(crate) fn count_malformed(&mut self) {
         self.counts.malformed += 1;
     }
 

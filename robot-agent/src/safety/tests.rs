@@ -38,7 +38,7 @@ fn bench_in(geofence: Geofence) -> Bench {
     let mut bench = Bench::new(&scenario, START, 5).unwrap();
     let mut site = site_of(&scenario).unwrap();
     site.geofence = geofence;
-    bench.know_site(site).unwrap();
+    bench.send_site(site).unwrap();
     bench.run_for(SECOND);
     bench
 }
@@ -346,7 +346,7 @@ fn a_mission_brakes_before_a_fence_that_was_drawn_across_its_path() {
         keep_out: vec![Polygon::new(corners.to_vec()).unwrap()],
     };
     assert!(bench.drive.truth().pose.x_m < 7.6, "too late for this test");
-    bench.know_site(site).unwrap();
+    bench.send_site(site).unwrap();
     bench.run_for(10 * SECOND);
     let x_m = bench.drive.truth().pose.x_m;
     let radius_m = disc_radius_m(&RobotModel::yi2007());

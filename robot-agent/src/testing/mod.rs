@@ -158,9 +158,9 @@ fn mission_of(number: u128) -> MissionId {
 }
 
 /// Drive whose sensors report NaN.
-struct Nonsense;
+struct NonFiniteDrive;
 
-impl Drive for Nonsense {
+impl Drive for NonFiniteDrive {
     fn read(&mut self, now: Duration) -> Feedback {
         let mut feedback = Feedback::default();
         feedback.push(SensorSample {
@@ -387,13 +387,13 @@ impl<D: SteppedDrive> Bench<D> {
     ///
     /// # Errors
     /// [`BenchError::Gone`] if the loop accepts no commands.
-    pub fn know_site(&mut self, definition: SiteDefinition) -> Result<(), BenchError> {
+    pub fn send_site(&mut self, definition: SiteDefinition) -> Result<(), BenchError> {
         let view = Arc::new(SiteView::new(definition));
         Ok(self.ends.commands.send(LoopCommand::Site(view))?)
     }
 
     /// Sets the prior along the path, from the next mission on.
-    pub fn tell(&mut self, prior: &PathPrior) {
+    pub fn set_prior(&mut self, prior: &PathPrior) {
         self.prior = Some(prior.clone());
     }
 
@@ -512,7 +512,7 @@ impl<D: SteppedDrive> Bench<D> {
             status.map_or(0, |status| status.counts.accepted)
         };
         let before = accepted();
-        self.safety.take_drive(payload);
+        self.safety.handle_drive(payload);
         accepted() > before
     }
 
@@ -552,7 +552,7 @@ impl<D: SteppedDrive> Bench<D> {
     pub fn tick_with_nonsense(&mut self) {
         self.pass_time(PERIOD);
         let now = self.moment();
-        self.core.tick(now, false, &mut Nonsense);
+        self.core.tick(now, false, &mut NonFiniteDrive);
         self.collect();
     }
 

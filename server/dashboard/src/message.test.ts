@@ -1,7 +1,7 @@
 import { readFileSync, readdirSync } from 'node:fs';
 import { expect, test, vi } from 'vitest';
 import type { ProblemBody } from './api/schema';
-import { ask, saidOf, tell } from './api/client';
+import { ask, describe, saidOf } from './api/client';
 import { splitMessage, withDetail } from './message';
 import { preferences } from './preferences.svelte';
 
@@ -19,7 +19,7 @@ test('a sentence and what the server adds are separated again, also within anoth
 
 test('a problem is a sentence by its type, and the words of the server are its detail', () => {
   const body = { type: '/problems/unknown-robot', title: 'the robot is not known', status: 404, detail: 'no `rover-9`' };
-  expect(splitMessage(tell(body as ProblemBody))).toEqual({ sentence: 'The robot is not known.', detail: 'no `rover-9`' });
+  expect(splitMessage(describe(body as ProblemBody))).toEqual({ sentence: 'The robot is not known.', detail: 'no `rover-9`' });
 });
 
 test('what is kept follows the language of the page', async () => {

@@ -356,7 +356,7 @@ impl App {
             ..report.clone()
         };
         db::alerts::raise(tx, robot_pk, id, &report, now).await?;
-        db::alerts::forget(tx, robot_pk, KEPT_MAX).await?;
+        db::alerts::prune(tx, robot_pk, KEPT_MAX).await?;
         let Some(mut alert) = db::alerts::find(tx, id).await? else {
             return Ok(None);
         };

@@ -11,10 +11,10 @@ pub const CERTIFICATE_ALERT: &str = "certificate-expiring";
 impl App {
     /// Raises, changes or clears the alert about the certificate of the REST API; `origin` says
     /// where it comes from.
-    pub fn note_certificate(&self, certificate: Option<&Certificate>, origin: &str) {
+    pub fn update_certificate_alert(&self, certificate: Option<&Certificate>, origin: &str) {
         let now = self.clock().machine_time();
         let ends = certificate.map(|certificate| certificate.not_after);
-        self.storage().note_certificate_end(ends);
+        self.storage().record_certificate_expiry(ends);
         let trouble = certificate.and_then(|certificate| trouble(certificate, origin, now));
         let severity = trouble
             .as_ref()

@@ -145,7 +145,7 @@ pub enum AppError {
         first: String,
     },
     /// The authority's files cannot be written.
-    #[error("the files of the fleet's authority cannot be written: {}", .0.what_became())]
+    #[error("the files of the fleet's authority cannot be written: {}", .0.effect_clause())]
     AuthorityFiles(#[source] AuthorityError),
     /// The operating system provides no random numbers.
     #[error("the operating system gives no random numbers: {0}")]

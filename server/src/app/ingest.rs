@@ -35,7 +35,7 @@ pub(super) use self::prepared::SKEW_MIN;
 use self::prepared::{Prepared, Ready, Skew, prepared, us_of};
 use super::App;
 use super::map::{Folded, MapChange};
-use super::missions::reports::{Foreign, Reporting, Taken, take_report};
+use super::missions::reports::{Foreign, Reporting, Taken, apply_mission_report};
 use crate::db::deferred_segments::{DeferredFilter, Origin};
 use crate::db::segments::{Added, NewSegment};
 use crate::db::sums::SumKey;
@@ -164,7 +164,7 @@ struct Tally {
 }
 
 impl Tally {
-    fn note_report(
+    fn record_report(
         &mut self,
         taken: Option<Result<Taken, Foreign>>,
         seq: u64,
@@ -238,7 +238,7 @@ impl Writer {
         let result = db::limited(self.commit_once(group)).await;
         if result.is_err() {
             // Keys of a transaction that was rolled back are invalid.
-            self.keys.forget();
+            self.keys.clear();
         }
         let (outcomes, tally) = result?;
         let counters = self.app.counters();
@@ -326,7 +326,7 @@ impl Writer {
                 for (key, ready) in released(&mut tx, boot_pk, &grid, skew).await? {
                     // The key was cached when the segment was deferred.
                     let id = ready.segment.configuration;
-                    let found = db::robots::note_measured(&mut tx, robot_pk, id).await?;
+                    let found = db::robots::record_measured(&mut tx, robot_pk, id).await?;
                     candidates.push(candidate(None, key, found, ready));
                     configurations.insert(id, found);
                 }
@@ -372,7 +372,7 @@ impl Writer {
                         let of = self.reporting(upload, robot_pk, report, (now, skew));
                         let taken = self.apply_report(&mut tx, of, key, report, &mut tally);
                         let taken = taken.await?;
-                        tally.note_report(taken, seq, &mut receipt);
+                        tally.record_report(taken, seq, &mut receipt);
                     }
                 }
             }
@@ -398,7 +398,7 @@ impl Writer {
         tally: &mut Tally,
     ) -> Result<Option<Result<Taken, Foreign>>, DbError> {
         let robot_pk = of.robot_pk;
-        let taken = take_new_report(tx, of, key, report).await?;
+        let taken = apply_new_report(tx, of, key, report).await?;
         if let Some(Ok(taken)) = &taken {
             let alerts = self.app.alert_report(tx, robot_pk, report, taken);
             tally.alerts.extend(alerts.await?);
@@ -626,7 +626,7 @@ async fn defer(
 }
 
 /// Applies a report, unless it was applied before; then it returns `None`.
-async fn take_new_report(
+async fn apply_new_report(
     tx: &mut Tx,
     reporting: Reporting,
     key: RecordKey,
@@ -635,10 +635,10 @@ async fn take_new_report(
     if db::history::has_report(tx, key).await? {
         return Ok(None);
     }
-    let taken = take_report(tx, reporting, report).await?;
+    let taken = apply_mission_report(tx, reporting, report).await?;
     // A refused report is not recorded, so that it is refused again and not counted as a duplicate.
     if taken.is_ok() {
-        db::history::note_report(tx, key).await?;
+        db::history::record_report(tx, key).await?;
     }
     Ok(Some(taken))
 }

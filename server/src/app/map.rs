@@ -160,7 +160,7 @@ impl Maps {
     }
 
     /// Removes sums from the unwritten ones that another server has stored; `false` if this is the server now.
-    fn forget_followed(&self, steps: &[WatermarkStep]) -> bool {
+    fn remove_followed(&self, steps: &[WatermarkStep]) -> bool {
         let _sites = self.sites.write().unwrap_or_else(PoisonError::into_inner);
         if self.follower().is_none() {
             return false;
@@ -192,7 +192,7 @@ impl Maps {
     }
 
     /// Reads a site's map; an empty one if it does not exist.
-    pub(super) fn look<T>(&self, row: &SiteRow, look: impl FnOnce(&SiteMap) -> T) -> T {
+    pub(super) fn with_map<T>(&self, row: &SiteRow, look: impl FnOnce(&SiteMap) -> T) -> T {
         let sites = self.sites.read().unwrap_or_else(PoisonError::into_inner);
         match sites.maps.get(&row.pk) {
             Some(map) => look(map),
@@ -249,7 +249,7 @@ impl Sites {
                 configuration,
                 cells,
             } = part;
-            self.names.note(part);
+            self.names.record(part);
             if let Some(map) = self.maps.get_mut(&key.site_pk) {
                 add(map, labelled(key, robot, *configuration), cells);
             }

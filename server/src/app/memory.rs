@@ -56,8 +56,8 @@ impl App {
         let unknown = self.db().unknown_outcomes();
         self.db().await_commits().await?;
         self.load_map_again(unknown).await?;
-        self.know_enrolments().await?;
-        self.know_robots().await?;
+        self.load_enrolments().await?;
+        self.load_robots().await?;
         self.robots_changed();
         self.wake();
         Ok(())

@@ -62,14 +62,14 @@ pub use self::dependencies::{Dependencies, Role};
 use self::enrolment::Membership;
 pub use self::error::AppError;
 use self::events::Hub;
-use self::friction::{CellCounts, MapNews, Pictures, ReaderSlots, Timelines, Views};
+use self::friction::{CellCounts, MapUpdates, Pictures, ReaderSlots, Timelines, Views};
 use self::identity::Identity;
 use self::map::Maps;
 pub use self::map::{
     BlockCounts, UnwrittenCounts, blocks as map_blocks, following, writing as sums,
 };
 use self::missions::idempotency::InFlight;
-use self::missions::immediate_offer::JustOffered;
+use self::missions::immediate_offer::NewOffers;
 use self::presence::Presences;
 use self::restoration::Restored;
 use self::retention::Removed;
@@ -111,7 +111,7 @@ struct Inner {
     announced: Notify,
     hub: Hub,
     keys_in_flight: InFlight,
-    just_offered: JustOffered,
+    new_offers: NewOffers,
     recalls: AtomicU64,
     checks: Semaphore,
     identity: Identity,
@@ -130,7 +130,7 @@ struct Inner {
     pictures: Pictures,
     timelines: Timelines,
     views: Views,
-    news: MapNews,
+    map_updates: MapUpdates,
     removed: Removed,
     storage: Storage,
     unrecorded: Unrecorded,
@@ -188,7 +188,7 @@ impl App {
             announced: Notify::new(),
             hub,
             keys_in_flight: InFlight::default(),
-            just_offered: JustOffered::default(),
+            new_offers: NewOffers::default(),
             recalls: AtomicU64::new(0),
             checks: Semaphore::new(check::CHECKS_MAX),
             identity: Identity::new(people, audit),
@@ -208,7 +208,7 @@ impl App {
             pictures: Pictures::default(),
             timelines: Timelines::default(),
             views: Views::default(),
-            news: MapNews::default(),
+            map_updates: MapUpdates::default(),
             removed: Removed::default(),
             storage: Storage::new(storage),
             unrecorded: Unrecorded::default(),
@@ -321,8 +321,8 @@ impl App {
         &self.inner.keys_in_flight
     }
 
-    fn just_offered(&self) -> &JustOffered {
-        &self.inner.just_offered
+    fn new_offers(&self) -> &NewOffers {
+        &self.inner.new_offers
     }
 
     /// Waits for a turn to plan. `None` cannot occur, since the semaphore is never closed.
@@ -342,8 +342,8 @@ impl App {
         &self.inner.views
     }
 
-    fn news(&self) -> &MapNews {
-        &self.inner.news
+    fn map_updates(&self) -> &MapUpdates {
+        &self.inner.map_updates
     }
 
     fn removed(&self) -> &Removed {

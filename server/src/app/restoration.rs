@@ -31,7 +31,7 @@ impl App {
     ///
     /// # Errors
     /// The database failed.
-    pub async fn know_restoration(&self) -> Result<(), AppError> {
+    pub async fn load_restoration(&self) -> Result<(), AppError> {
         let mut tx = self.db().read("restoration").await?;
         if let Some(newest) = db::restorations::newest(&mut tx).await? {
             let awaiting = db::restorations::awaiting_count(&mut tx).await?;

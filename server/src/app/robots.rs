@@ -8,7 +8,7 @@ use tread_api::mission::Actor;
 use tread_api::page::Page;
 use tread_api::release::Peer;
 use tread_api::rights::Scope;
-use tread_api::robot::{ALERTS_MAX, Alert, ChangeRobot, Robot, RobotModel, TAGS_MAX};
+use tread_api::robot::{ALERTS_MAX, Alert, Robot, RobotModel, TAGS_MAX, UpdateRobot};
 use tread_api::site::NAME_LENGTH_MAX;
 use tread_api::text::is_printable;
 use tread_api::wire::encoding::Encoding;
@@ -82,11 +82,11 @@ impl App {
 
     /// Changes a robot's display name, retires it or ends its retirement. Retiring cancels all its
     /// missions.
-    pub async fn change_robot(
+    pub async fn update_robot(
         &self,
         site: &SiteId,
         id: &RobotId,
-        change: ChangeRobot,
+        change: UpdateRobot,
     ) -> Result<Robot, AppError> {
         let now = self.clock().now();
         let mut tx = self.db().write("robots").await?;
@@ -158,10 +158,10 @@ impl App {
     ///
     /// # Errors
     /// The database failed.
-    pub async fn know_robots(&self) -> Result<(), AppError> {
+    pub async fn load_robots(&self) -> Result<(), AppError> {
         let mut tx = self.db().read("robots").await?;
         for key in db::robots::names(&mut tx).await? {
-            self.presences().know(key);
+            self.presences().register(key);
         }
         Ok(())
     }

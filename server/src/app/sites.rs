@@ -91,7 +91,11 @@ impl App {
     }
 
     /// Sets the position of a site's origin on the earth (WGS 84), or removes it.
-    pub async fn tie_site(&self, id: &SiteId, origin: Option<GeoOrigin>) -> Result<Site, AppError> {
+    pub async fn set_site_origin(
+        &self,
+        id: &SiteId,
+        origin: Option<GeoOrigin>,
+    ) -> Result<Site, AppError> {
         let mut tx = self.db().write("sites").await?;
         let row = site_row(&mut tx, id).await?;
         db::sites::set_origin(&mut tx, row.pk, origin).await?;

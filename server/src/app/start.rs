@@ -8,10 +8,10 @@ impl App {
     ///
     /// # Errors
     /// The database failed.
-    pub async fn note_version(&self) -> Result<(), AppError> {
+    pub async fn record_version(&self) -> Result<(), AppError> {
         let mut tx = self.db().write("start").await?;
         let now = self.clock().now();
-        db::schema::note_version(&mut tx, build::VERSION, now).await?;
+        db::schema::record_version(&mut tx, build::VERSION, now).await?;
         Ok(tx.commit().await?)
     }
 

@@ -19,7 +19,7 @@
 
 mod delivery;
 mod judge;
-mod tending;
+mod reconciliation;
 mod unrecorded;
 
 use std::collections::HashSet;
@@ -234,7 +234,7 @@ impl App {
             .await?
             .is_some_and(|open| open.id == id);
         if !is_open && self.shown_latch(&key).is_some_and(|latch| latch.id == id) {
-            self.adopt_shown_stop(&mut tx, &key).await?;
+            self.adopt_reported_stop(&mut tx, &key).await?;
         }
         let found = db::stops::find(&mut tx, id).await?;
         found
@@ -307,7 +307,7 @@ impl App {
 
     /// Makes the stop that a robot shows its open one: it stopped by itself, was stopped by another
     /// program, or received the stops in another order.
-    async fn adopt_shown_stop(&self, tx: &mut Tx, key: &RobotKey) -> Result<(), AppError> {
+    async fn adopt_reported_stop(&self, tx: &mut Tx, key: &RobotKey) -> Result<(), AppError> {
         let Some(latch) = self.shown_latch(key) else {
             return Ok(());
         };
@@ -374,7 +374,7 @@ impl App {
     }
 
     /// Stores the confirmations of robots, and clears the alerts about these stops.
-    pub(super) async fn note_confirmed(
+    pub(super) async fn record_confirmed(
         &self,
         stops: &[Stop],
         confirmed: &[(StopId, Timestamp)],
@@ -393,7 +393,7 @@ impl App {
 
     /// Stores that a stop was in force on its robot and has been cleared there, or that a later one
     /// was.
-    pub(super) async fn note_over(&self, stop: &Stop) -> Result<(), AppError> {
+    pub(super) async fn record_over(&self, stop: &Stop) -> Result<(), AppError> {
         let mut tx = self.db().write("stops").await?;
         db::stops::end(&mut tx, stop.id, self.clock().now()).await?;
         let ended = self.settle_alert(&mut tx, &key_of(stop), false).await?;
@@ -403,7 +403,7 @@ impl App {
     }
 
     /// Raises the alerts of robots that have not confirmed a stop.
-    pub(super) async fn note_unconfirmed(&self, stops: &[&Stop]) -> Result<(), AppError> {
+    pub(super) async fn alert_unconfirmed(&self, stops: &[&Stop]) -> Result<(), AppError> {
         let mut tx = self.db().read("stops").await?;
         let open = db::stops::in_force(&mut tx).await?;
         let open: HashSet<StopId> = open.into_iter().map(|stop| stop.id).collect();

@@ -133,7 +133,7 @@ impl Storage {
     }
 
     /// Stores the end of the validity of the REST API's certificate.
-    pub(super) fn note_certificate_end(&self, ends: Option<Timestamp>) {
+    pub(super) fn record_certificate_expiry(&self, ends: Option<Timestamp>) {
         self.lock().certificate_ends = ends;
     }
 
@@ -187,7 +187,7 @@ impl App {
             what,
             reason: &reason,
         };
-        let logged = self.storage().lock().repeats.note(now, failure);
+        let logged = self.storage().lock().repeats.record(now, failure);
         let Some(repeats) = logged else { return };
         error!(repeats, "cannot {what}: {reason}");
     }
@@ -220,7 +220,7 @@ impl App {
             inner.checked_at = Some(self.clock().elapsed());
             let growth = disk
                 .database_bytes
-                .map(|bytes| inner.growth.note(now, bytes));
+                .map(|bytes| inner.growth.record(now, bytes));
             let is_damaged = inner.has_new_damage();
             let condition = &mut inner.condition;
             condition.unwritable = unwritable(engine, written.and(read).err());
@@ -313,7 +313,7 @@ impl App {
     }
 
     /// Raises the note for people that the server was restarted.
-    pub(crate) fn note_restart(&self) {
+    pub(crate) fn raise_restart_notice(&self) {
         let text = "the server was restarted; robots connect again by themselves, and streams and \
                     teleoperation must be opened again";
         let severity = Severity::Warning;
@@ -321,7 +321,7 @@ impl App {
     }
 
     /// Ends the note of a restart after its time.
-    fn end_restart_note(&self) {
+    fn end_restart_notice(&self) {
         if self.uptime() >= RESTART_NOTED_FOR {
             self.set_server_alert(SERVER_RESTARTED_ALERT, Severity::Warning, None);
         }
@@ -397,7 +397,7 @@ impl Inner {
 }
 
 /// Returns what failed, and what to do about it.
-fn why_and_cure(engine: Engine, failure: StorageFailure) -> String {
+fn cause_and_remedy(engine: Engine, failure: StorageFailure) -> String {
     format!("{}: {}", failure.explanation(), engine.advice(failure))
 }
 
@@ -412,9 +412,9 @@ async fn limited(
             tracing::debug!("a check of the storage failed: {cause:?}");
             let unknown = || "the database answers with an error, see the log".to_owned();
             let failure = cause.failure();
-            Err(failure.map_or_else(unknown, |failure| why_and_cure(engine, failure)))
+            Err(failure.map_or_else(unknown, |failure| cause_and_remedy(engine, failure)))
         }
-        Err(_elapsed) => Err(why_and_cure(engine, StorageFailure::Busy)),
+        Err(_elapsed) => Err(cause_and_remedy(engine, StorageFailure::Busy)),
     }
 }
 
@@ -424,7 +424,7 @@ fn unwritable(engine: Engine, found: Option<String>) -> Option<String> {
         let (failure, since) = failure::last()?;
         // Damage has an alert of its own: writes elsewhere succeed.
         let counts = failure != StorageFailure::Damaged && since < RECOVERED_AFTER;
-        counts.then(|| why_and_cure(engine, failure))
+        counts.then(|| cause_and_remedy(engine, failure))
     };
     found.or_else(recent)
 }
@@ -445,7 +445,7 @@ fn is_low(free_bytes: Option<u64>, limit_bytes: u64, was_low: bool) -> bool {
 pub async fn run(app: App, stop: CancellationToken) {
     while !stop.is_cancelled() {
         app.check_storage(CHECK_SHARED_FOR).await;
-        app.end_restart_note();
+        app.end_restart_notice();
         tokio::select! {
             () = stop.cancelled() => return,
             () = app.examine_database() => {}

@@ -128,7 +128,7 @@ impl Watched {
         room: usize,
     ) -> (Vec<(RobotKey, BootId)>, bool) {
         let mut robots = self.lock();
-        forget(&mut robots, now);
+        evict_idle(&mut robots, now);
         let mut due: Vec<(Duration, RobotKey, &mut Run)> = Vec::new();
         for (key, robot) in robots.iter_mut().filter(|(_, robot)| robot.watchers > 0) {
             let Some(boot) = online(key) else {
@@ -202,7 +202,7 @@ impl Run {
 
 /// Forgets robots that nobody watches and of whose runs nothing needs to be remembered; of more than
 /// [`REMEMBERED_MAX`] others, those that are due first.
-fn forget(robots: &mut HashMap<RobotKey, Robot>, now: Duration) {
+fn evict_idle(robots: &mut HashMap<RobotKey, Robot>, now: Duration) {
     robots.retain(|_, robot| {
         robot.watchers > 0 || robot.run.as_ref().is_some_and(|run| !run.is_as_new(now))
     });

@@ -287,7 +287,7 @@ impl App {
         let dropped = db::webhooks::drop_oldest(tx, webhook, PENDING_MAX, now).await?;
         if dropped > 0 {
             self.counters().webhook_dropped.add(dropped);
-            db::webhooks::forget(tx, webhook, LOG_MAX).await?;
+            db::webhooks::prune(tx, webhook, LOG_MAX).await?;
         }
         Ok(())
     }

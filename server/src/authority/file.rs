@@ -122,7 +122,7 @@ pub enum AuthorityError {
 
 impl AuthorityError {
     /// Returns a clause for messages that states whether the failed change had an effect.
-    pub fn what_became(&self) -> &'static str {
+    pub fn effect_clause(&self) -> &'static str {
         match self {
             Self::NotTakenBack { .. } => {
                 "nothing has changed, but it could not be taken back for certain, and the next start \
@@ -375,7 +375,7 @@ impl Folder {
         let Err(failed) = self.apply(deciding) else {
             return Ok(());
         };
-        match self.take_back(deciding.name()) {
+        match self.undo_step(deciding.name()) {
             Ok(()) => Err(failed),
             Err(cause) => {
                 let path = self.path.join(deciding.name());
@@ -384,7 +384,7 @@ impl Folder {
         }
     }
 
-    fn take_back(&self, name: &str) -> io::Result<()> {
+    fn undo_step(&self, name: &str) -> io::Result<()> {
         // Either the rename failed, so there is nothing to remove, or the `fsync` did.
         remove(&self.path.join(name))?;
         (self.sync)(&self.path)

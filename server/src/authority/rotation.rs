@@ -351,7 +351,7 @@ impl Authorities {
         self.present.subscribe()
     }
 
-    fn take_turn(&self) -> MutexGuard<'_, ()> {
+    fn wait_for_turn(&self) -> MutexGuard<'_, ()> {
         self.turn.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -361,7 +361,7 @@ impl Authorities {
     /// # Errors
     /// A rotation is in progress, or the folder cannot be written; the set is unchanged then.
     pub fn start(&self, by: &str, now: Timestamp) -> Result<Arc<Trusted>, RotationError> {
-        let _turn = self.take_turn();
+        let _turn = self.wait_for_turn();
         let next = next_authority(now)?;
         let started = Started {
             at: now,
@@ -372,7 +372,7 @@ impl Authorities {
         if let Some(folder) = &self.folder {
             let is_trusted = |fingerprint: &str| present.is_trusted(fingerprint);
             folder.start(&next, &started, is_trusted)?;
-            self.note_settled(Settled::Yes);
+            self.record_settled(Settled::Yes);
         }
         Ok(self.show(trusted))
     }
@@ -384,11 +384,11 @@ impl Authorities {
     /// # Errors
     /// `rotation` is not in progress, or the folder cannot be written; the set is unchanged then.
     pub fn finish(&self, rotation: TrustId) -> Result<Arc<Trusted>, RotationError> {
-        let _turn = self.take_turn();
+        let _turn = self.wait_for_turn();
         let present = self.present();
         let trusted = present.finished(rotation)?;
         if let (Some(folder), Some(retiring)) = (&self.folder, present.retiring()) {
-            self.note_settled(folder.finish(&retiring.authority)?);
+            self.record_settled(folder.finish(&retiring.authority)?);
         }
         Ok(self.show(trusted))
     }
@@ -400,14 +400,14 @@ impl Authorities {
     /// # Errors
     /// Another authority signs, or the folder cannot be written; the set is unchanged then.
     pub fn replace(&self, signing: &str, now: Timestamp) -> Result<Arc<Trusted>, RotationError> {
-        let _turn = self.take_turn();
+        let _turn = self.wait_for_turn();
         let present = self.present();
         present.check_signing(signing)?;
         let next = next_authority(now)?;
         let trusted = present.replaced(Arc::clone(&next));
         if let Some(folder) = &self.folder {
             folder.replace(&next, |fingerprint| present.is_trusted(fingerprint))?;
-            self.note_settled(Settled::Yes);
+            self.record_settled(Settled::Yes);
         }
         Ok(self.show(trusted))
     }
@@ -417,7 +417,7 @@ impl Authorities {
         !self.is_unsettled.load(Ordering::Relaxed)
     }
 
-    fn note_settled(&self, settled: Settled) {
+    fn record_settled(&self, settled: Settled) {
         let is_unsettled = settled == Settled::NotYet;
         self.is_unsettled.store(is_unsettled, Ordering::Relaxed);
     }
@@ -427,10 +427,10 @@ impl Authorities {
     /// # Errors
     /// The disk still does not confirm them.
     pub fn settle(&self) -> Result<(), AuthorityError> {
-        let _turn = self.take_turn();
+        let _turn = self.wait_for_turn();
         if let Some(folder) = self.folder.as_ref().filter(|_| !self.is_settled()) {
             folder.settle()?;
-            self.note_settled(Settled::Yes);
+            self.record_settled(Settled::Yes);
         }
         Ok(())
     }

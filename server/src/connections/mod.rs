@@ -251,7 +251,7 @@ impl Slot {
         if phase != Phase::Unproven {
             table.set_phase(self.id, Phase::Unproven);
         }
-        displaced += table.shed_unproven(address, is_shared, &self.connections.bounds);
+        displaced += table.close_oldest_unproven(address, is_shared, &self.connections.bounds);
         drop(table);
         (at_work, displaced)
     }
@@ -281,7 +281,7 @@ impl Slot {
                 if let Some((address, is_shared)) =
                     entry.map(|entry| (entry.address, entry.is_shared))
                 {
-                    table.shed_unproven(address, is_shared, &self.connections.bounds);
+                    table.close_oldest_unproven(address, is_shared, &self.connections.bounds);
                 }
                 return Err(full);
             }
@@ -315,7 +315,7 @@ impl Drop for AtWork {
                 Phase::Busy => table.set_phase(self.0.id, Phase::Idle),
                 Phase::Stopping => {
                     table.set_phase(self.0.id, Phase::Unproven);
-                    table.shed_unproven(address, is_shared, &self.0.connections.bounds);
+                    table.close_oldest_unproven(address, is_shared, &self.0.connections.bounds);
                 }
                 Phase::Unproven | Phase::Idle => {}
             }

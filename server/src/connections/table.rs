@@ -191,7 +191,7 @@ impl Table {
 
     /// Closes the oldest unproven connections beyond the limits per address and in total. Returns
     /// the number of closed connections.
-    pub(super) fn shed_unproven(
+    pub(super) fn close_oldest_unproven(
         &mut self,
         address: IpAddr,
         is_shared: bool,

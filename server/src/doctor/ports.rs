@@ -35,7 +35,7 @@ struct Configured {
     address: SocketAddr,
 }
 
-fn look(address: SocketAddr) -> Port {
+fn probe(address: SocketAddr) -> Port {
     match TcpListener::bind(address) {
         Ok(_) => Port::Free,
         Err(error) if error.kind() == io::ErrorKind::AddrInUse => Port::Taken,
@@ -53,7 +53,7 @@ pub(super) async fn findings(examined: &Examined) -> Vec<Finding> {
             key: "metrics",
             address,
         };
-        findings.push(match look(address) {
+        findings.push(match probe(address) {
             Port::Taken => match probe::get(address, false, "/metrics").await {
                 Some(answer) if answer.text.contains("tread_uptime") => {
                     Finding::on(port.name).ok(format!("our server answers on {address}"))
@@ -74,7 +74,7 @@ async fn rest(examined: &Examined) -> Vec<Finding> {
         key: "http",
         address,
     };
-    match look(address) {
+    match probe(address) {
         Port::Taken => {}
         other @ (Port::Free | Port::Impossible(_)) => {
             return vec![port.not_taken(examined, other)];
@@ -167,7 +167,7 @@ async fn robots(examined: &Examined) -> Finding {
         key: "zenoh",
         address,
     };
-    match look(address) {
+    match probe(address) {
         Port::Taken => {}
         other @ (Port::Free | Port::Impossible(_)) => {
             return port.not_taken(examined, other);

@@ -139,7 +139,7 @@ impl Rig {
             ("rover-3", 1, true),
         ] {
             app.enrolment_registry()
-                .note(&enrolment(name, number, is_revoked));
+                .record(&enrolment(name, number, is_revoked));
         }
         let (uploads, uploads_in) = mpsc::channel(1);
         drop(uploads_in);
@@ -207,7 +207,7 @@ impl Rig {
 struct Seen(Arc<Mutex<Vec<String>>>);
 
 impl Seen {
-    fn note(&self, key: &str) {
+    fn record(&self, key: &str) {
         self.0
             .lock()
             .unwrap_or_else(PoisonError::into_inner)
@@ -258,7 +258,7 @@ impl Witness {
         let subscriber = session
             .declare_subscriber("tread/**")
             .callback(move |sample| {
-                to.note(&signed(
+                to.record(&signed(
                     sample.key_expr().as_str(),
                     &sample.payload().to_bytes(),
                 ));
@@ -268,13 +268,13 @@ impl Witness {
         let live = session
             .liveliness()
             .declare_subscriber("tread/**")
-            .callback(move |sample| to.note(sample.key_expr().as_str()));
+            .callback(move |sample| to.record(sample.key_expr().as_str()));
         let live = live.wait().unwrap();
         let to = asked.clone();
         let queryable = session
             .declare_queryable("tread/**")
             .callback(move |query| {
-                to.note(query.key_expr().as_str());
+                to.record(query.key_expr().as_str());
                 let _ = query.reply(query.key_expr().clone(), "answer").wait();
             });
         let queryable = queryable.wait().unwrap();
@@ -331,7 +331,7 @@ async fn do_all(
         let keys = expression(&row);
         let to = heard.clone();
         let hearing = session.declare_subscriber(&keys).callback(move |sample| {
-            to.note(&signed(
+            to.record(&signed(
                 sample.key_expr().as_str(),
                 &sample.payload().to_bytes(),
             ));
@@ -375,7 +375,7 @@ async fn try_all(rig: &Rig, who: Who, session: &Session) -> BTreeMap<Cell, bool>
     let to = heard.clone();
     let last = session.declare_subscriber(&inward).callback(move |sample| {
         let round = sample.payload().to_bytes();
-        to.note(&format!("last {}", String::from_utf8_lossy(&round)));
+        to.record(&format!("last {}", String::from_utf8_lossy(&round)));
     });
     kept.push(Box::new(last.wait().unwrap()));
     // Everything before this has reached the router when this has.
@@ -614,7 +614,7 @@ async fn a_router_has_no_more_robots_than_configured_and_robots_reach_their_own(
     };
     assert_eq!(sizes(), [1; 3], "one for each robot that has ever joined");
     let registry = rig.app.enrolment_registry();
-    registry.note(&enrolment("rover-4", 1, false));
+    registry.record(&enrolment("rover-4", 1, false));
     until("a router is open for another one", async || {
         sizes() == [1; 4]
     })

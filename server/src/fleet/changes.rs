@@ -49,7 +49,7 @@ pub(super) async fn run(
             change.everything = true;
             change.boxes.clear();
         }
-        publishers.look_again(&routers);
+        publishers.refresh(&routers);
         publish(&change, &routers, &mut publishers, republisher.as_ref());
     }
 }

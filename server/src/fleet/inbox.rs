@@ -181,7 +181,7 @@ impl Channels {
                 appeared,
             };
             let dropped = &self.app.counters().presence_dropped;
-            hand_over(&self.presence, change, dropped);
+            deliver(&self.presence, change, dropped);
         } else if appeared {
             self.app.counters().rate_limited.one();
             self.log_rate_limited(key, now);
@@ -205,7 +205,7 @@ impl Channels {
     pub(super) fn router_closed(&self, router: u64) {
         self.limits.router_closed(router);
         let change = TokenChange::RouterClosed(router);
-        hand_over(
+        deliver(
             &self.presence,
             change,
             &self.app.counters().presence_dropped,
@@ -213,7 +213,7 @@ impl Channels {
     }
 }
 
-fn hand_over<T>(channel: &mpsc::Sender<T>, message: T, dropped: &Counter) {
+fn deliver<T>(channel: &mpsc::Sender<T>, message: T, dropped: &Counter) {
     // A closed channel means that the server is stopping; nothing important is lost then.
     if let Err(TrySendError::Full(_)) = channel.try_send(message) {
         dropped.one();
@@ -229,7 +229,7 @@ pub(super) fn declare(session: &Session, channels: &Channels, router: u64) -> ze
         .callback(move |query| {
             if let Some(place) = to.admit(query.key_expr().as_str(), Kind::Hello) {
                 let asked = Asked { query, place };
-                hand_over(&to.hellos, asked, &to.app.counters().hellos_dropped);
+                deliver(&to.hellos, asked, &to.app.counters().hellos_dropped);
             }
         })
         .background()
@@ -241,7 +241,7 @@ pub(super) fn declare(session: &Session, channels: &Channels, router: u64) -> ze
         .callback(move |query| {
             if let Some(place) = to.admit(query.key_expr().as_str(), Kind::Upload) {
                 let asked = Asked { query, place };
-                hand_over(&to.uploads, asked, &to.app.counters().ingest_dropped_busy);
+                deliver(&to.uploads, asked, &to.app.counters().ingest_dropped_busy);
             }
         })
         .background()
@@ -271,7 +271,7 @@ pub(super) fn declare(session: &Session, channels: &Channels, router: u64) -> ze
                         wall: clock.now(),
                     },
                 };
-                hand_over(&to.states, published, &to.app.counters().states_dropped);
+                deliver(&to.states, published, &to.app.counters().states_dropped);
             })
             .background()
             .wait()?;

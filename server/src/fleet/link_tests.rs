@@ -69,7 +69,7 @@ async fn a_robot_that_is_put_out_is_cut_off_within_a_second_and_cannot_come_back
     assert_eq!(sessions_on(&router).await, 1);
     rig.app
         .enrolment_registry()
-        .note(&enrolment("rover-1", 2, true));
+        .record(&enrolment("rover-1", 2, true));
     let took = cut(&mut session, &router).await;
     assert!(took < CUT_MAX, "it took {took:?}");
     until("the cut is counted", async || {
@@ -91,7 +91,7 @@ async fn a_robot_on_a_router_that_was_since_replaced_is_cut_off_too() {
     for joined in ["rover-4", "rover-5", "rover-6"] {
         rig.app
             .enrolment_registry()
-            .note(&enrolment(joined, 1, false));
+            .record(&enrolment(joined, 1, false));
     }
     let number = former.number;
     until("another router takes its robots", async || {
@@ -102,7 +102,7 @@ async fn a_robot_on_a_router_that_was_since_replaced_is_cut_off_too() {
     assert_eq!(sessions_on(&former).await, 1, "it stays where it is");
     rig.app
         .enrolment_registry()
-        .note(&enrolment("rover-1", 2, true));
+        .record(&enrolment("rover-1", 2, true));
     let took = cut(&mut session, &former).await;
     assert!(took < CUT_MAX, "it took {took:?}");
     assert!(rig.connect(Who::Own, 300).await.is_none());
@@ -335,7 +335,7 @@ async fn a_robot_that_joins_gets_a_router_of_its_own_and_others_connect_to_their
     let first = rig.fleet.routers.newest().unwrap();
     rig.app
         .enrolment_registry()
-        .note(&enrolment("rover-4", 1, false));
+        .record(&enrolment("rover-4", 1, false));
     until("another router is open", async || {
         rig.fleet.routers.newest().unwrap().number != first.number
     })

@@ -30,7 +30,7 @@ impl Publishers {
     }
 
     /// Forgets closed routers; returns whether the list of routers has changed.
-    pub(super) fn look_again(&mut self, routers: &Routers) -> bool {
+    pub(super) fn refresh(&mut self, routers: &Routers) -> bool {
         if self.version == Some(routers.version()) {
             return false;
         }

@@ -57,7 +57,7 @@ async fn beat(
     ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     loop {
         ticks.tick().await;
-        let has_new_routers = publishers.look_again(routers);
+        let has_new_routers = publishers.refresh(routers);
         if has_new_routers {
             again.notify_one();
         }

@@ -155,7 +155,7 @@ impl Robot {
     }
 
     /// Processes a token if there is room and it does not come too fast; returns whether it did.
-    fn take_token(&mut self, place: &TokenPlace, now: Duration) -> bool {
+    fn handle_token(&mut self, place: &TokenPlace, now: Duration) -> bool {
         let is_taken = self.tokens.len() < TOKENS_MAX && self.take(Kind::Token, now);
         if is_taken {
             self.tokens.push(place.clone());
@@ -250,7 +250,7 @@ impl RateLimits {
         }
         let appeared = self.with(robot, now, |known| {
             let is_excessive = known.declared(place.1, now);
-            if known.tokens.contains(&place) || known.take_token(&place, now) {
+            if known.tokens.contains(&place) || known.handle_token(&place, now) {
                 return Appeared::Taken;
             }
             if known.late.len() >= LATE_TOKENS_MAX {
@@ -303,7 +303,7 @@ impl RateLimits {
         let mut taken = Vec::new();
         for known in self.lock().values_mut() {
             while let Some(newest) = known.late.back().cloned() {
-                if !known.take_token(&newest, now) {
+                if !known.handle_token(&newest, now) {
                     break;
                 }
                 known.late.pop_back();

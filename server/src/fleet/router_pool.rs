@@ -105,7 +105,7 @@ impl RouterPool {
             }
             let opened = {
                 let _turn = self.turn.lock().await;
-                let opened = self.let_everybody_in().await;
+                let opened = self.open_for_waiting_robots().await;
                 self.close_idle().await;
                 opened
             };
@@ -156,7 +156,7 @@ impl RouterPool {
 
     /// Opens a router for robots that have none, as far as it has room for them; returns the number of its
     /// robots if it did.
-    async fn let_everybody_in(&self) -> Option<usize> {
+    async fn open_for_waiting_robots(&self) -> Option<usize> {
         let all = self.routers.all();
         let fleet = self.app.enrolment_registry().robots();
         let robots = to_open(&self.groups(&all), &fleet, self.opener.robots_max)?;

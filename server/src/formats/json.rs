@@ -74,7 +74,7 @@ pub fn features(site: &Site, as_of: Option<Timestamp>) -> Box<dyn Writer<CellFri
             "type": "FeatureCollection",
             "conformsTo": ["http://www.opengis.net/spec/json-fg-1/1.0/conf/core"],
             "coordRefSys": format!("urn:tread:site:{}", site.id),
-            "tread:frame": "metres in the site's own frame, which is not tied to WGS 84",
+            "tread:frame": "metres in the site's own frame, which is not georeferenced",
         }),
     };
     head["tread:as_of"] = json!(as_of);

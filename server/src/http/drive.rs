@@ -360,7 +360,7 @@ impl Connection {
                 };
                 // A client that is gone needs no reason.
                 if self.put(Message::Close(Some(frame))).await.is_ok() {
-                    self.let_it_be_read().await;
+                    self.wait_until_closed().await;
                 }
             }
         }
@@ -368,7 +368,7 @@ impl Connection {
 
     /// Keeps the socket open until the client has closed it too: a client that writes into a closed
     /// socket never reads the reason.
-    async fn let_it_be_read(&mut self) {
+    async fn wait_until_closed(&mut self) {
         let answered = async {
             loop {
                 match self.socket.recv().await {

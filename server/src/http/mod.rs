@@ -132,7 +132,7 @@ fn routes() -> OpenApiRouter<App> {
         .routes(routes!(audit::chain))
         .routes(routes!(sites::list, sites::create))
         .routes(routes!(sites::get))
-        .routes(routes!(sites::tie, sites::untie))
+        .routes(routes!(sites::set_origin, sites::remove_origin))
         .routes(routes!(terrains::list, terrains::create))
         .routes(routes!(terrains::get, terrains::replace, terrains::delete))
         .routes(routes!(robots::list))

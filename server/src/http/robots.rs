@@ -5,7 +5,7 @@ use serde::Deserialize;
 use tread_api::ids::{RobotId, SiteId};
 use tread_api::page::Page;
 use tread_api::problem::ProblemBody;
-use tread_api::robot::{ChangeRobot, Robot};
+use tread_api::robot::{Robot, UpdateRobot};
 use utoipa::IntoParams;
 
 use super::extract::{Json, Path, Query, page_limit};
@@ -76,14 +76,14 @@ pub(super) async fn release(
 /// Retiring cancels all its missions.
 #[utoipa::path(patch, path = "/v1/sites/{site}/robots/{robot}", tag = "robots",
     security(("token" = ["configure"])),
-    operation_id = "change_robot", params(("site" = SiteId, Path), ("robot" = RobotId, Path)),
-    request_body = ChangeRobot,
+    operation_id = "update_robot", params(("site" = SiteId, Path), ("robot" = RobotId, Path)),
+    request_body = UpdateRobot,
     responses((status = 200, body = Robot), (status = 404, body = ProblemBody),
         (status = 422, body = ProblemBody)))]
 pub(super) async fn change(
     State(app): State<App>,
     Path((site, robot)): Path<(SiteId, RobotId)>,
-    Json(request): Json<ChangeRobot>,
+    Json(request): Json<UpdateRobot>,
 ) -> Result<Json<Robot>, Problem> {
-    Ok(Json(app.change_robot(&site, &robot, request).await?))
+    Ok(Json(app.update_robot(&site, &robot, request).await?))
 }

@@ -66,27 +66,27 @@ pub(super) async fn create(
 }
 
 /// Set the position of a site's origin on the earth, so that its map can be given in WGS 84.
-#[utoipa::path(put, path = "/v1/sites/{site}/origin", tag = "sites", operation_id = "tie_site",
+#[utoipa::path(put, path = "/v1/sites/{site}/origin", tag = "sites", operation_id = "set_site_origin",
     security(("token" = ["configure"])),
     params(("site" = SiteId, Path)), request_body = GeoOrigin,
     responses((status = 200, body = Site), (status = 404, body = ProblemBody),
         (status = 422, body = ProblemBody)))]
-pub(super) async fn tie(
+pub(super) async fn set_origin(
     State(app): State<App>,
     Path(site): Path<SiteId>,
     Json(origin): Json<GeoOrigin>,
 ) -> Result<Json<Site>, Problem> {
-    Ok(Json(app.tie_site(&site, Some(origin)).await?))
+    Ok(Json(app.set_site_origin(&site, Some(origin)).await?))
 }
 
 /// Remove the position of a site's origin on the earth.
 #[utoipa::path(delete, path = "/v1/sites/{site}/origin", tag = "sites",
-    operation_id = "untie_site", security(("token" = ["configure"])),
+    operation_id = "remove_site_origin", security(("token" = ["configure"])),
     params(("site" = SiteId, Path)),
     responses((status = 200, body = Site), (status = 404, body = ProblemBody)))]
-pub(super) async fn untie(
+pub(super) async fn remove_origin(
     State(app): State<App>,
     Path(site): Path<SiteId>,
 ) -> Result<Json<Site>, Problem> {
-    Ok(Json(app.tie_site(&site, None).await?))
+    Ok(Json(app.set_site_origin(&site, None).await?))
 }

@@ -184,7 +184,7 @@ impl Tls {
 /// Keeps the certificate up to date until the stop, and raises an alert before it expires.
 pub async fn watch(tls: Arc<Tls>, app: App, stop: CancellationToken) {
     keep(&tls, stop, |tls| {
-        app.note_certificate(tls.certificate().as_ref(), &tls.origin());
+        app.update_certificate_alert(tls.certificate().as_ref(), &tls.origin());
     })
     .await;
 }

@@ -78,7 +78,7 @@ impl Attempts {
     /// [`WINDOW`].
     pub fn failed(&mut self, source: Source, now: Duration) {
         if self.records.len() >= REMEMBERED_MAX && !self.records.contains_key(&source) {
-            self.forget(now);
+            self.make_room(now);
         }
         let fresh = Record {
             failures: 0,
@@ -108,7 +108,7 @@ impl Attempts {
 
     /// Makes room for a record: drops those without a failure for [`FORGOTTEN_AFTER`]; if there are
     /// none, drops the one whose last failure is oldest.
-    fn forget(&mut self, now: Duration) {
+    fn make_room(&mut self, now: Duration) {
         self.records
             .retain(|_, record| now.saturating_sub(record.failed_last) < FORGOTTEN_AFTER);
         if self.records.len() < REMEMBERED_MAX {

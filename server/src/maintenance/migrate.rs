@@ -107,7 +107,7 @@ pub(crate) async fn run(args: MigrateArgs) -> anyhow::Result<Compared> {
     let database = Db::open(&location).await?;
     let noting = async {
         let mut tx = database.write("migrate").await?;
-        db::schema::note_version(&mut tx, build::VERSION, Clock::system().now()).await?;
+        db::schema::record_version(&mut tx, build::VERSION, Clock::system().now()).await?;
         tx.commit().await?;
         Ok::<_, db::DbError>(())
     };

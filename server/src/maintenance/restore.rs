@@ -66,7 +66,7 @@ pub(crate) struct RestoreArgs {
 
 /// Outcome for the authority.
 #[derive(Debug, PartialEq, Eq)]
-enum AuthorityFate {
+enum AuthorityOutcome {
     /// The backup or the configuration has none.
     None,
     /// The existing authority stays.
@@ -127,18 +127,18 @@ pub(crate) async fn run(args: RestoreArgs) -> anyhow::Result<()> {
             &extracted.authority,
             (args.replace_authority, now),
         )?,
-        None => AuthorityFate::None,
+        None => AuthorityOutcome::None,
     };
     let aside = replace(&database, restoring, now).await?;
     file_owner::chown_database(&database)?;
-    if let AuthorityFate::Restored(folder, aside) = &authority {
+    if let AuthorityOutcome::Restored(folder, aside) = &authority {
         for folder in aside.iter().chain([folder]) {
             file_owner::chown_to_parents_owner(folder)?;
         }
     }
     let mut out = io::stdout().lock();
-    tell(&mut out, (&database, aside), &restoration, &review).context("cannot print")?;
-    tell_authority(&mut out, &authority, &manifest).context("cannot print")?;
+    print_outcome(&mut out, (&database, aside), &restoration, &review).context("cannot print")?;
+    print_authority_outcome(&mut out, &authority, &manifest).context("cannot print")?;
     Ok(())
 }
 
@@ -209,7 +209,7 @@ async fn replace(
     let moved = |path: &Path| format!("cannot move `{}` aside", path.display());
     restoring.check_closed()?;
     let is_there = database.exists();
-    let to = aside_name(database, now);
+    let to = unused_name(database, now);
     if is_there {
         settle_log(database).await;
     }
@@ -234,7 +234,7 @@ async fn replace(
 }
 
 /// Returns a name that no other file has: of two restorations within a second, the second has a number.
-fn aside_name(path: &Path, now: Timestamp) -> PathBuf {
+fn unused_name(path: &Path, now: Timestamp) -> PathBuf {
     let time = now.strftime("%Y%m%dT%H%M%SZ");
     let first = with_ending(path, &format!("{ASIDE}{time}"));
     let numbered = (2_u32..).map(|number| with_ending(&first, &format!("-{number}")));
@@ -293,17 +293,17 @@ fn restore_authority(
     folder: &Path,
     files: &[(String, Vec<u8>)],
     (replace, now): (bool, Timestamp),
-) -> Result<AuthorityFate, AuthorityError> {
+) -> Result<AuthorityOutcome, AuthorityError> {
     if files.is_empty() {
-        return Ok(AuthorityFate::None);
+        return Ok(AuthorityOutcome::None);
     }
     let is_there = folder.join(CERTIFICATE_FILE).exists();
     if is_there && !replace {
-        return Ok(AuthorityFate::Kept(folder.to_owned()));
+        return Ok(AuthorityOutcome::Kept(folder.to_owned()));
     }
     let mut aside = None;
     if folder.exists() {
-        let to = aside_name(folder, now);
+        let to = unused_name(folder, now);
         fs::rename(folder, &to).map_err(|cause| AuthorityError::Unwritable {
             path: folder.to_owned(),
             cause,
@@ -311,10 +311,10 @@ fn restore_authority(
         aside = Some(to);
     }
     copies::write_files(folder, files)?;
-    Ok(AuthorityFate::Restored(folder.to_owned(), aside))
+    Ok(AuthorityOutcome::Restored(folder.to_owned(), aside))
 }
 
-fn tell(
+fn print_outcome(
     out: &mut impl Write,
     (database, aside): (&Path, Option<PathBuf>),
     restoration: &Restoration,
@@ -334,25 +334,25 @@ fn tell(
     review.write(out)
 }
 
-fn tell_authority(
+fn print_authority_outcome(
     out: &mut impl Write,
-    fate: &AuthorityFate,
+    fate: &AuthorityOutcome,
     manifest: &Manifest,
 ) -> io::Result<()> {
     match fate {
-        AuthorityFate::None if manifest.authority.is_empty() => Ok(()),
-        AuthorityFate::None => writeln!(
+        AuthorityOutcome::None if manifest.authority.is_empty() => Ok(()),
+        AuthorityOutcome::None => writeln!(
             out,
             "the backup has a fleet's authority, and the configuration names no folder for it \
              (`[robots] authority`): it was left out"
         ),
-        AuthorityFate::Kept(folder) => writeln!(
+        AuthorityOutcome::Kept(folder) => writeln!(
             out,
             "the fleet's authority in `{}` stays, as it is newer; `--replace-authority` takes the one \
              of the backup",
             folder.display()
         ),
-        AuthorityFate::Restored(folder, aside) => {
+        AuthorityOutcome::Restored(folder, aside) => {
             writeln!(
                 out,
                 "the fleet's authority is restored to `{}`",

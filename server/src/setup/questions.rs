@@ -32,7 +32,7 @@ impl<'a> Questions<'a> {
         Self { input, output }
     }
 
-    fn say(&mut self, text: &str) -> anyhow::Result<()> {
+    fn print_line(&mut self, text: &str) -> anyhow::Result<()> {
         writeln!(self.output, "{text}").context("cannot print")
     }
 
@@ -63,7 +63,7 @@ impl<'a> Questions<'a> {
             };
             match read(answer) {
                 Ok(value) => return Ok(value),
-                Err(why) => self.say(&format!("  {why}"))?,
+                Err(why) => self.print_line(&format!("  {why}"))?,
             }
         }
         bail!("no answer to `{question}` could be taken; nothing was written")
@@ -123,8 +123,9 @@ pub(super) fn ask(
     defaults: &Defaults,
     questions: &mut Questions<'_>,
 ) -> anyhow::Result<Choices> {
-    questions
-        .say("This writes a configuration for a Tread server. Enter takes what is in brackets.")?;
+    questions.print_line(
+        "This writes a configuration for a Tread server. Enter takes what is in brackets.",
+    )?;
     let config = questions.ask(
         "Configuration file",
         DefaultAnswer(&defaults.config.display().to_string()),
@@ -148,7 +149,7 @@ pub(super) fn ask(
         Some(tls) => tls,
         None if args.tls_certificate.is_some() => tls_default(args),
         None => {
-            questions.say(
+            questions.print_line(
                 "How do people and programs reach the REST API?\n  \
                  1  by TLS, with a certificate of the fleet's own authority\n  \
                  2  by TLS, with certificate and key from files\n  \
@@ -206,7 +207,7 @@ pub(super) fn ask(
         web: web(tls, files)?,
     };
     choices.check()?;
-    questions.say(&format!("\n{}", super::text::toml(&choices)))?;
+    questions.print_line(&format!("\n{}", super::text::toml(&choices)))?;
     if !questions.ask("Write this configuration?", DefaultAnswer("yes"), is_yes)? {
         bail!("nothing was written");
     }
@@ -230,7 +231,7 @@ fn ask_files(names: &[String], questions: &mut Questions<'_>) -> anyhow::Result<
         };
         match check_files(&files, names) {
             Ok(()) => return Ok(files),
-            Err(why) => questions.say(&format!("  {why:#}"))?,
+            Err(why) => questions.print_line(&format!("  {why:#}"))?,
         }
     }
     bail!("no certificate could be used; nothing was written")

@@ -43,7 +43,7 @@ pub(crate) struct AcquiredLock {
 ///
 /// # Errors
 /// Another server uses it, or it cannot be locked.
-pub(crate) async fn take_lock(
+pub(crate) async fn acquire_lock(
     asked: impl Future<Output = ()>,
     config: &Config,
     clock: &Clock,

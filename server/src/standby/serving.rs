@@ -187,7 +187,7 @@ async fn serve_with(
     let metrics = config.metrics;
     let metrics = metrics.map(|address| listen_for_metrics(address, &app));
     let metrics = metrics.transpose()?;
-    db::limited(app.know_leader()).await?;
+    db::limited(app.load_leader()).await?;
     let scheme = if tls.is_some() { "https" } else { "http" };
     let serving = Serving {
         listener,
@@ -245,7 +245,7 @@ async fn follow(
         () = refresh_leader(app) => {}
     }
     lock(shown).with_map = Some(app.clone());
-    if let Err(error) = app.know_tokens().await {
+    if let Err(error) = app.load_tokens().await {
         app.log_failure("read the valid tokens", &error);
     }
     let stop = || supervisor.stop_token();
@@ -261,7 +261,7 @@ async fn follow(
 async fn refresh_leader(app: &App) {
     loop {
         tokio::time::sleep(LEADER_REFRESH_INTERVAL).await;
-        if let Err(cause) = db::limited(app.know_leader()).await {
+        if let Err(cause) = db::limited(app.load_leader()).await {
             app.log_failure("read which server has the database", &cause);
         }
     }

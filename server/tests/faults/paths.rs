@@ -138,7 +138,7 @@ pub(crate) const PATHS: &[WritePath] = &[
                 let other = BootId::from_uuid(uuid(number));
                 db::robots::boot_key(tx, ground.robot_pk, other, RUNS_KEPT).await?;
                 let configuration: ConfigurationId = of(json!(format!("{number:032x}")));
-                db::robots::note_measured(tx, ground.robot_pk, configuration)
+                db::robots::record_measured(tx, ground.robot_pk, configuration)
                     .await
                     .map(|_| ())
             }))
@@ -150,14 +150,14 @@ pub(crate) const PATHS: &[WritePath] = &[
         act: |ground, number| {
             Box::pin(ground.write(async move |tx| {
                 let version = format!("0.0.{number}");
-                db::schema::note_version(tx, &version, now()).await?;
+                db::schema::record_version(tx, &version, now()).await?;
                 let restoration = Restoration {
                     restored_at: now(),
                     taken_at: LONG_AGO,
                     version,
                 };
                 db::restorations::begin(tx, &restoration).await?;
-                db::restorations::note_outcomes(tx, ground.robot_pk).await?;
+                db::restorations::record_outcomes(tx, ground.robot_pk).await?;
                 db::restorations::release(tx, ground.robot_pk)
                     .await
                     .map(|_| ())
@@ -174,7 +174,7 @@ pub(crate) const PATHS: &[WritePath] = &[
                 let own = (SubjectId::Token(token(7)), &*key);
                 ground.app.create_mission_once(own, request).await?;
                 ground
-                    .write(async |tx| db::idempotency::forget_before(tx, LONG_AGO, 10).await)
+                    .write(async |tx| db::idempotency::delete_before(tx, LONG_AGO, 10).await)
                     .await
             })
         },
@@ -234,7 +234,7 @@ pub(crate) const PATHS: &[WritePath] = &[
                 db::history::add_event(tx, id, &event).await?;
                 let boot_pk = db::robots::boot_key(tx, ground.robot_pk, boot(), RUNS_KEPT).await?;
                 let seq = i64::try_from(number).unwrap_or_default();
-                db::history::note_report(tx, RecordKey { boot_pk, seq }).await
+                db::history::record_report(tx, RecordKey { boot_pk, seq }).await
             }))
         },
     },
@@ -357,7 +357,7 @@ pub(crate) const PATHS: &[WritePath] = &[
                 db::alerts::locate(tx, id, location).await?;
                 db::alerts::acknowledge(tx, id, now()).await?;
                 db::alerts::clear(tx, ground.robot_pk, &report.code, now()).await?;
-                db::alerts::forget(tx, ground.robot_pk, 3).await
+                db::alerts::prune(tx, ground.robot_pk, 3).await
             }))
         },
     },
@@ -397,13 +397,13 @@ pub(crate) const PATHS: &[WritePath] = &[
                     status: Some(200),
                     detail: None,
                 };
-                db::webhooks::note_attempt(tx, &outcome).await?;
+                db::webhooks::record_attempt(tx, &outcome).await?;
                 let limit = AgeLimit {
                     now: now(),
                     oldest: later(),
                 };
-                db::webhooks::give_up_older(tx, limit).await?;
-                db::webhooks::forget(tx, webhook.id, 1).await?;
+                db::webhooks::abandon_oldest(tx, limit).await?;
+                db::webhooks::prune(tx, webhook.id, 1).await?;
                 db::webhooks::delete(tx, webhook.id).await.map(|_| ())
             }))
         },
@@ -452,12 +452,12 @@ pub(crate) const PATHS: &[WritePath] = &[
                     expires_at: later(),
                 };
                 db::sessions::insert(tx, &session).await?;
-                db::sessions::forget_expired(tx, LONG_AGO).await?;
+                db::sessions::delete_expired(tx, LONG_AGO).await?;
                 db::sessions::surplus(tx, (Some(id), None), 20).await?;
                 db::sessions::delete(tx, session.id).await?;
                 db::tokens::touch(tx, id, now()).await?;
                 db::tokens::revoke(tx, id, now()).await?;
-                db::tokens::forget_dead(tx, LONG_AGO, 10).await
+                db::tokens::delete_ended(tx, LONG_AGO, 10).await
             }))
         },
     },
@@ -521,7 +521,7 @@ pub(crate) const PATHS: &[WritePath] = &[
                     since: LONG_AGO,
                     newest_max: 1,
                 };
-                db::audit::forget(tx, kept, 10).await
+                db::audit::prune(tx, kept, 10).await
             }))
         },
     },
@@ -539,7 +539,7 @@ pub(crate) const PATHS: &[WritePath] = &[
                 db::join_tokens::insert(tx, &token, &secret).await?;
                 db::join_tokens::use_up(tx, token.id, &ground.robot, now()).await?;
                 db::join_tokens::revoke(tx, token.id, now()).await?;
-                db::join_tokens::forget_dead(tx, LONG_AGO, 10).await?;
+                db::join_tokens::delete_ended(tx, LONG_AGO, 10).await?;
                 let enrolment = of(json!({
                     "site": ground.site, "robot": ground.robot, "number": number,
                     "enrolled_at": now(), "join_token": token.id, "renewed_at": now(),
@@ -555,8 +555,8 @@ pub(crate) const PATHS: &[WritePath] = &[
                     issued: &issued,
                 };
                 db::enrolments::renew(tx, one, renewal).await?;
-                db::enrolments::forget_certificates(tx).await?;
-                db::enrolments::note_authority(tx, one, "next").await?;
+                db::enrolments::delete_issued_certificates(tx).await?;
+                db::enrolments::record_authority(tx, one, "next").await?;
                 db::enrolments::revoke(tx, (&ground.site, &ground.robot), "a test", now()).await
             }))
         },

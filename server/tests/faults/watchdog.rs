@@ -76,7 +76,7 @@ async fn is_fed_while(fault: Fault) {
     watched.until_ready_is(200).await;
     watched.interposer.arm(fault, 1, true);
     watched.until_ready_is(503).await;
-    watched.manager.forget();
+    watched.manager.drain();
     for message in 0..MESSAGES {
         let fed = watched.manager.next("WATCHDOG=1", WATCHDOG / 2).await;
         assert!(

@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 use tread_api::geometry::Pose;
 use tread_api::ids::MissionId;
 use tread_api::mission::{MissionDetail, MissionState};
-use tread_api::robot::{Aged, ChangeRobot, LinkState};
+use tread_api::robot::{Aged, LinkState, UpdateRobot};
 use tread_api::wire::ingest::{MissionPhase, Record, RecordContent};
 use tread_api::wire::reply::CommandRefusalCode;
 
@@ -103,9 +103,9 @@ async fn a_robot_that_goes_away_raises_an_alert_until_it_is_back_also_over_a_res
     pass(&yard, 11).await;
     there_are(&yard, "robot-lost", 2, true).await;
     // Nobody misses a robot that is retired.
-    let retired = ChangeRobot {
+    let retired = UpdateRobot {
         retired: Some(true),
-        ..ChangeRobot::default()
+        ..UpdateRobot::default()
     };
     let path = yard.url("/v1/sites/yard/robots/rover-1");
     let (status, said) = yard.send(yard.client().patch(path).json(&retired)).await;

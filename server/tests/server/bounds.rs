@@ -279,7 +279,7 @@ async fn a_robot_begins_few_runs_and_those_of_which_nothing_is_kept_are_forgotte
             .await
             .unwrap();
         let key = RecordKey { boot_pk, seq: 1 };
-        db::history::note_report(&mut tx, key).await.unwrap();
+        db::history::record_report(&mut tx, key).await.unwrap();
     }
     tx.commit().await.unwrap();
     // The five newest, the one that said hello, and the one of which a measurement is kept.
@@ -391,7 +391,7 @@ async fn a_robot_raises_few_alerts_and_the_oldest_that_are_over_are_forgotten() 
     let mut tx = app.db().write("test").await.unwrap();
     let robot_pk = db::robots::pk_of(&mut tx, &site(), &robot.id).await;
     let robot_pk = robot_pk.unwrap().unwrap();
-    db::alerts::forget(&mut tx, robot_pk, 5).await.unwrap();
+    db::alerts::prune(&mut tx, robot_pk, 5).await.unwrap();
     tx.commit().await.unwrap();
     let left: Page<Alert> = yard.get("/v1/alerts?limit=1000").await;
     let ids = |alerts: &[Alert]| alerts.iter().map(|alert| alert.id).collect::<Vec<_>>();

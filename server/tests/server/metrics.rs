@@ -90,7 +90,7 @@ async fn alert_rules_and_dashboard_name_only_metrics_that_exist() {
     };
     yard.server
         .app()
-        .note_certificate(Some(&certificate), "a test");
+        .update_certificate_alert(Some(&certificate), "a test");
     let text = page(&yard).await;
     let mut exist = BTreeSet::new();
     for line in text.lines() {

@@ -121,7 +121,7 @@ async fn make_present(target: &Path) {
     }
     begin(&mut tx, &restoration).await.unwrap();
     let now: Timestamp = restoration.restored_at;
-    db::schema::note_version(&mut tx, &restoration.version, now)
+    db::schema::record_version(&mut tx, &restoration.version, now)
         .await
         .unwrap();
     tx.commit().await.unwrap();
@@ -229,7 +229,7 @@ async fn a_newer_database_is_refused_with_the_version_to_install() {
     .execute(&mut **tx.as_sqlite().unwrap())
     .await
     .unwrap();
-    db::schema::note_version(&mut tx, "9.8.7", Timestamp::UNIX_EPOCH)
+    db::schema::record_version(&mut tx, "9.8.7", Timestamp::UNIX_EPOCH)
         .await
         .unwrap();
     tx.commit().await.unwrap();

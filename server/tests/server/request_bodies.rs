@@ -74,7 +74,7 @@ fn examples() -> Vec<(&'static str, Value)> {
             json!({"id": "field", "name": "Field", "cell_m": 2.0, "origin": origin}),
         ),
         (
-            "ask_path_friction",
+            "get_path_friction",
             json!({"robot": "rover-1", "points": [point, {"x_m": 4.0, "y_m": 2.0}],
                 "normalisation": "all", "as_of": "2026-01-01T00:00:00Z"}),
         ),
@@ -82,8 +82,8 @@ fn examples() -> Vec<(&'static str, Value)> {
             "replace_geofence",
             json!({"keep_in": [polygon], "keep_out": [polygon]}),
         ),
-        ("tie_site", origin),
-        ("change_robot", json!({"name": "Rover", "retired": false})),
+        ("set_site_origin", origin),
+        ("update_robot", json!({"name": "Rover", "retired": false})),
         (
             "set_limit",
             json!({"for_ms": 500, "hold": false, "linear_max_m_s": 0.5}),

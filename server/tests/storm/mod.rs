@@ -294,11 +294,11 @@ impl Storm {
             (reachable && fate >= 15).then_some(state)
         });
         if let Some(state) = heard {
-            self.hear(state);
+            self.receive(state);
         }
     }
 
-    fn hear(&self, state: RobotState) {
+    fn receive(&self, state: RobotState) {
         let key = (self.site.clone(), state.robot.clone());
         let (now, wall) = (self.clock.elapsed(), self.clock.now());
         self.app.presences().state(&key, state, now, wall);
@@ -321,7 +321,7 @@ impl Storm {
             }
         });
         if let Some(state) = state {
-            self.hear(state);
+            self.receive(state);
         }
     }
 

@@ -1,4 +1,4 @@
-//! Wishes of people that come between the decision for a command and its sending.
+//! RequestedTopics of people that come between the decision for a command and its sending.
 
 use tread_api::mission::{CreateMission, LinkPolicy, MissionState, StartPolicy};
 use tread_server::db::Location;

@@ -261,7 +261,7 @@ impl Robot {
                     self.says(reply)
                 }
                 LeaseCommand::Release(release) => {
-                    self.take_back(&release);
+                    self.undo_step(&release);
                     self.acknowledges(Ok(()))
                 }
             },
@@ -409,7 +409,7 @@ impl Robot {
         Ok(self.leases)
     }
 
-    fn take_back(&mut self, release: &ReleaseLease) {
+    fn undo_step(&mut self, release: &ReleaseLease) {
         if !self.is_leased_by_other(&release.holder) {
             self.lease = None;
         }

@@ -79,7 +79,7 @@ pub(super) struct Worked {
 
 type Shared = Arc<Mutex<Worked>>;
 
-fn note(worked: &Shared, act: impl FnOnce(&mut Worked)) {
+fn record(worked: &Shared, act: impl FnOnce(&mut Worked)) {
     act(&mut worked.lock().unwrap_or_else(PoisonError::into_inner));
 }
 
@@ -203,7 +203,7 @@ async fn stop(http: SocketAddr, operator: String, (worked, is_over): Begun) {
             Ok(Ok((200, stop))) if stop["confirmed_at"].is_string() => None,
             Ok(Ok((status, answer))) => Some(format!("{status} after {took_ms:.0} ms: {answer}")),
         };
-        note(&worked, |worked| {
+        record(&worked, |worked| {
             worked.stops_ms.push(took_ms);
             if took_ms > SLOW_STOP_MS {
                 worked
@@ -221,7 +221,7 @@ async fn look(rest: Rest, (worked, is_over): Begun) {
     let mut rounds = Rounds::new(LOOK_EVERY, is_over);
     while rounds.next().await.is_some() {
         let asked = timeout(ANSWER_MAX, rest.call(Method::GET, &path, None)).await;
-        note(&worked, |worked| match asked {
+        record(&worked, |worked| match asked {
             Ok(Some((status, robot))) => match robot["live"]["heard_age_ms"].as_f64() {
                 Some(age_ms) => worked.ages_ms.push(age_ms),
                 None => worked.failed_looks.push(format!("{status} {robot}")),
@@ -243,7 +243,7 @@ async fn work(http: SocketAddr, operator: String, (worked, is_over): Begun) {
             Err(_) => Some(format!("no answer in {ANSWER_MAX:?}")),
             Ok(done) => done.err().map(|error| format!("{error:#}")),
         };
-        note(&worked, |worked| {
+        record(&worked, |worked| {
             worked.work_ms.push(took_ms);
             worked.failed_work.extend(failure);
         });
@@ -293,7 +293,7 @@ async fn say_hello(robot: Arc<LightRobot>, (worked, is_over): Begun) {
         let begun = Instant::now();
         let answered = robot.hello().await;
         let took_ms = ms(begun);
-        note(&worked, |worked| {
+        record(&worked, |worked| {
             worked.hellos_ms.push(took_ms);
             let failure = answered.err().map(|error| format!("{error:#}"));
             worked.failed_hellos.extend(failure);
@@ -321,11 +321,11 @@ async fn change(rest: Rest, every: Duration, (worked, is_over): Begun) {
         let asked = rest.call(method.clone(), &path, body.as_ref());
         let Ok(Some((status, answer))) = timeout(ANSWER_MAX, asked).await else {
             let failure = format!("{method} {path}: no answer");
-            note(&worked, |worked| worked.failed_changes.push(failure));
+            record(&worked, |worked| worked.failed_changes.push(failure));
             continue;
         };
         made = answer["token"]["id"].as_str().map(str::to_owned);
-        note(&worked, |worked| {
+        record(&worked, |worked| {
             worked.changes.push(Change {
                 method: method.to_string(),
                 path: path.clone(),

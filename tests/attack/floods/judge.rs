@@ -159,7 +159,7 @@ impl Facts {
     }
 
     /// Prints all; figures of a time are only shown when they are not to be judged.
-    pub(super) fn tell(mut self, is_untimed: bool, json: bool) -> anyhow::Result<ExitCode> {
+    pub(super) fn print(mut self, is_untimed: bool, json: bool) -> anyhow::Result<ExitCode> {
         let timed = std::mem::take(&mut self.timed).into_iter();
         let mut checks = std::mem::take(&mut self.checks);
         checks.extend(timed.map(|check| {
@@ -185,7 +185,7 @@ impl Facts {
         for failure in &self.failures {
             let _ = writeln!(words, "  ! {failure}");
         }
-        report::tell_with(json, &self, words, &checks)
+        report::print_with(json, &self, words, &checks)
     }
 }
 

@@ -174,5 +174,5 @@ pub(crate) async fn run(arguments: &Arguments, json: bool) -> anyhow::Result<Exi
         eprintln!("{}", fleet.log_tail("server").join("\n"));
     }
     let facts = judge::Facts::gather(&fleet, &worked, used, done, seconds).await?;
-    facts.tell(arguments.untimed, json)
+    facts.print(arguments.untimed, json)
 }

@@ -155,5 +155,5 @@ pub(crate) async fn run(arguments: &Arguments, json: bool) -> anyhow::Result<Exi
         count(&sent.sessions),
         count(&sent.openings)
     );
-    report::tell_with(json, &*sent, words, &checks)
+    report::print_with(json, &*sent, words, &checks)
 }

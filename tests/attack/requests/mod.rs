@@ -434,11 +434,11 @@ pub(crate) async fn run(arguments: &Arguments, json: bool) -> anyhow::Result<Exi
     while let Some(asked) = asking.join_next().await {
         seen.add(asked?);
     }
-    tell(&fleet, &target, unknown, seen, json).await
+    print_report(&fleet, &target, unknown, seen, json).await
 }
 
 /// Looks at the server afterwards, and prints all.
-async fn tell(
+async fn print_report(
     fleet: &Fleet,
     target: &Target,
     unknown: Vec<String>,
@@ -493,5 +493,5 @@ async fn tell(
         .iter()
         .map(|failure| format!("  ! {failure}\n"));
     let words = format!("{} requests\n{}", seen.requests, words.collect::<String>());
-    report::tell_with(json, &seen, words, &checks)
+    report::print_with(json, &seen, words, &checks)
 }

@@ -93,10 +93,12 @@ fn against_policy(
         (MissionState::Succeeded, Cause::Succeeded) => true,
         (MissionState::Cancelled, _) => mission.is_cancel_asked,
         (MissionState::Expired, Cause::Expired) => asked.expires,
-        (MissionState::Failed, Cause::RobotLost) => asked.is_soon_lost || asked.minds_silence,
+        (MissionState::Failed, Cause::RobotLost) => {
+            asked.is_soon_lost || asked.is_server_silent_too_long
+        }
         (MissionState::Failed, Cause::AgentRestarted | Cause::RobotForgot) => agent_was_killed,
         (MissionState::Failed, Cause::Failed) => {
-            let is_silence = asked.minds_silence && reason.contains("silent");
+            let is_silence = asked.is_server_silent_too_long && reason.contains("silent");
             is_silence || (agent_was_killed && reason.contains("restart"))
         }
         _ => false,

@@ -133,7 +133,7 @@ async fn run_on(mut fleet: Fleet, relays: Option<Relays>, seed: u64) -> RunRepor
         };
         stage.act(action, &mut followed).await;
     }
-    mend(&mut fleet, relays.as_ref());
+    repair(&mut fleet, relays.as_ref());
     let details = ended(&mut fleet, &followed).await;
     await_quiet(&mut fleet, &robot).await;
     // What the robot reported late is in it now.
@@ -160,8 +160,8 @@ struct Relays {
 }
 
 /// Lets everything go on and reach everything.
-fn mend(fleet: &mut Fleet, relays: Option<&Relays>) {
-    fleet.mend_servers();
+fn repair(fleet: &mut Fleet, relays: Option<&Relays>) {
+    fleet.resume_servers();
     fleet.database_networks().for_each(Relay::heal);
     fleet.robot_networks().for_each(Relay::heal);
     if let Some(relays) = relays {
@@ -208,7 +208,7 @@ impl Stage<'_> {
                 self.report.server_kills += 1;
                 self.fail_server();
             }
-            Action::StartServer if self.relays.is_none() => self.fleet.mend_servers(),
+            Action::StartServer if self.relays.is_none() => self.fleet.resume_servers(),
             Action::StartServer => {
                 // A server that does not reach its database at its start ends, and its service manager
                 // starts it until it does.

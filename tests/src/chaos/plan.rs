@@ -23,7 +23,7 @@ pub(super) struct Asked {
     /// The body of its request.
     pub(super) body: Value,
     /// Whether its robot stops when the server is silent.
-    pub(super) minds_silence: bool,
+    pub(super) is_server_silent_too_long: bool,
     /// Whether it bears a short absence of its robot only.
     pub(super) is_soon_lost: bool,
     /// Whether it may start for a short time only.
@@ -76,10 +76,10 @@ fn asked(random: &mut Random, robot: &str, now: jiff::Timestamp) -> Asked {
     let mut body = json!({
         "site": crate::fleet::SITE, "robot": robot, "trajectory": path(random),
     });
-    let minds_silence = random.chance(0.25);
-    let is_soon_lost = !minds_silence && random.chance(0.25);
+    let is_server_silent_too_long = random.chance(0.25);
+    let is_soon_lost = !is_server_silent_too_long && random.chance(0.25);
     let expires = random.chance(0.2);
-    if minds_silence {
+    if is_server_silent_too_long {
         body["link_policy"] = json!({"stop_after": {"silence_s": SILENCE_S}});
     }
     if is_soon_lost {
@@ -91,7 +91,7 @@ fn asked(random: &mut Random, robot: &str, now: jiff::Timestamp) -> Asked {
     }
     Asked {
         body,
-        minds_silence,
+        is_server_silent_too_long,
         is_soon_lost,
         expires,
     }

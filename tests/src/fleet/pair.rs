@@ -213,7 +213,7 @@ impl Fleet {
     }
 
     /// Lets servers go on that were stopped in their tracks, and connects those again that were cut off.
-    pub fn mend_servers(&mut self) {
+    pub fn resume_servers(&mut self) {
         self.signal_server(Signal::SIGCONT);
         self.wake_other_server();
         let other = self.other.iter_mut().map(|other| &mut other.network);

@@ -126,7 +126,7 @@ fn map(seed: u64, has_torque: bool, robots: u32) -> anyhow::Result<GroundMap> {
         let drive = RoughDrive::new(&model, deviations, sensors, Pose::default(), noise)
             .context("the wheels are no rectangle")?;
         let mut bench = Bench::with_drive(drive, model).with_prior(EstimatorPrior::default());
-        bench.know_site(site())?;
+        bench.send_site(site())?;
         bench.run_for(SETTLES);
         bench.begin(1, &Course::Figure8.trajectory(), None)?;
         bench.run_for(DRIVES);

@@ -22,7 +22,7 @@ use self::lines::Lines;
 use self::screen::Screen;
 use crate::args::WatchArguments;
 use crate::client::Client;
-use crate::output::{Output, json_line, line, note};
+use crate::output::{Output, json_line, line, print_note};
 use crate::signals::ShutdownSignals;
 
 pub(super) async fn run(
@@ -56,10 +56,10 @@ async fn print(mut news: mpsc::Receiver<News>, output: Output) -> anyhow::Result
     while let Some(news) = news.recv().await {
         match news {
             News::Opened => {}
-            News::Lost(why) => note(&format!("{why}; trying again")),
+            News::Lost(why) => print_note(&format!("{why}; trying again")),
             News::Event(event) => {
                 if let Event::End(end) = &*event {
-                    note(ended(*end));
+                    print_note(ended(*end));
                 }
                 if output.is_json() {
                     json_line(&event)?;

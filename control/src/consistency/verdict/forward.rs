@@ -34,7 +34,7 @@ const LEFT: (f64, f64, f64) = (0.12, 0.4, 0.5);
 ///
 /// Returns false if two speeds disagree, even where no sensor can be blamed yet. Returns true if
 /// all agree or nothing can be compared.
-pub(super) fn look(
+pub(super) fn check(
     view: &View<'_>,
     recent: &Recent,
     is_turn_clean: bool,
@@ -54,7 +54,7 @@ pub(super) fn look(
         if let Some(odometry) = means.odometry_m_s.filter(|_| view.uses.odometry)
             && !agrees_with_position(view, recent, seen, &means, odometry)
         {
-            blame(view, seen, &means, odometry, verdicts);
+            isolate_fault(view, seen, &means, odometry, verdicts);
             return false;
         }
         if !view.uses.wheels {
@@ -165,7 +165,13 @@ fn agrees_with_position(
 }
 
 /// Names the wrong one of odometry and fixes, or [`Subject::Motion`] if neither can be excluded.
-fn blame(view: &View<'_>, seen: &Seen, means: &Means, odometry: f64, verdicts: &mut Verdicts) {
+fn isolate_fault(
+    view: &View<'_>,
+    seen: &Seen,
+    means: &Means,
+    odometry: f64,
+    verdicts: &mut Verdicts,
+) {
     let wheels = means.wheels.linear_m_s;
     let position = wheels + seen.forward_error_m_s;
     let commanded = view.commanded(seen);

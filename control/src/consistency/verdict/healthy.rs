@@ -10,7 +10,7 @@ const EXCITED: f64 = 0.1;
 const EXCITED_PLACE: f64 = 0.2;
 
 /// Records which channels agree; called only while nothing contradicts.
-pub(super) fn look(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) {
+pub(super) fn check(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) {
     let standing = |subject: Subject| view.tracks[subject as usize].standing;
     let means = &recent.means;
     let (gyro, wheels) = (means.gyro_rad_s, means.wheels);

@@ -266,9 +266,9 @@ fn compare(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) {
     if view.uses.wheels {
         wheels::locked(view, verdicts);
     }
-    let is_turn_clean = turn::look(view, recent, verdicts);
-    let is_forward_clean = forward::look(view, recent, is_turn_clean, verdicts);
+    let is_turn_clean = turn::check(view, recent, verdicts);
+    let is_forward_clean = forward::check(view, recent, is_turn_clean, verdicts);
     if is_turn_clean && is_forward_clean && verdicts.is_consistent() {
-        healthy::look(view, recent, verdicts);
+        healthy::check(view, recent, verdicts);
     }
 }

@@ -23,7 +23,7 @@ const LEARNED: Tolerance = Tolerance {
 };
 
 /// Compares the turn rates; returns whether nothing contradicts.
-pub(super) fn look(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) -> bool {
+pub(super) fn check(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) -> bool {
     let mut agreed = None;
     for seen in view.seen() {
         let Some(means) = view.history.means(seen.span()) else {
@@ -31,7 +31,7 @@ pub(super) fn look(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) ->
         };
         let heading = means.gyro_rad_s + seen.turn_error_rad_s;
         if view.uses.gyro && !agrees_with_heading(view, recent, seen, &means) {
-            blame(view, seen, &means, verdicts);
+            isolate_fault(view, seen, &means, verdicts);
             return false;
         }
         agreed = agreed.or(Some((heading, seen, means)));
@@ -112,7 +112,7 @@ fn agrees_with_heading(view: &View<'_>, recent: &Recent, seen: &Seen, means: &Me
 }
 
 /// Names the wrong one of gyro and heading, or [`Subject::Motion`] if neither can be excluded.
-fn blame(view: &View<'_>, seen: &Seen, means: &Means, verdicts: &mut Verdicts) {
+fn isolate_fault(view: &View<'_>, seen: &Seen, means: &Means, verdicts: &mut Verdicts) {
     let (gyro, wheels) = (means.gyro_rad_s, means.wheels.angular_rad_s);
     let heading = gyro + seen.turn_error_rad_s;
     let commanded = view.commanded(seen);

@@ -128,7 +128,7 @@ impl ChangeMonitor {
 
     /// Takes the motion during a comparison. Returns whether the comparison counts. Evidence is kept
     /// while one side is slow for a short time, and is dropped at standstill.
-    fn note(&mut self, motion: Motion) -> bool {
+    fn record(&mut self, motion: Motion) -> bool {
         if motion == Motion::Rolling {
             if std::mem::take(&mut self.slow) > 0 {
                 self.ignored = self.ignored.max(RESUMES_FOR);
@@ -157,7 +157,7 @@ impl ChangeMonitor {
         compared_s: f64,
         motion: Motion,
     ) -> bool {
-        let counts = self.note(motion);
+        let counts = self.record(motion);
         self.has_torque |= explained[TORQUES_FROM..].iter().any(Option::is_some);
         let threshold = THRESHOLDS[usize::from(self.has_torque)];
         let mut has_changed = false;

@@ -111,7 +111,7 @@ impl FastChanges {
     }
 
     /// Forgets all blocks, whose outputs were those of other parameters.
-    pub(super) fn forget(&mut self) {
+    pub(super) fn clear(&mut self) {
         let newest = self.newest;
         *self = Self {
             newest,

@@ -344,7 +344,7 @@ impl Hypothesis {
         }
         self.last_kept = keeps;
         if self.age <= SETTLES_BLOCKS && step[index::STIFFNESS].abs() > LINEAR_RANGE {
-            self.fast.forget();
+            self.fast.clear();
         }
         self.values.iter().all(|value| value.is_finite())
     }

@@ -479,7 +479,7 @@ impl Identification {
         if let Some(best) = self.best() {
             self.gyro_offset_rad_s = best.values()[index::GYRO_OFFSET];
         }
-        self.look_for_noise();
+        self.restart_with_wheel_noise();
         self.watch_ground();
     }
 
@@ -498,7 +498,7 @@ impl Identification {
     }
 
     /// Begins anew with noise of the wheel speeds taken into account if there is any that matters.
-    fn look_for_noise(&mut self) {
+    fn restart_with_wheel_noise(&mut self) {
         let is_noisy = self.best().is_some_and(Hypothesis::is_noisy);
         let is_measured = self.wheel_noise.significant_density().is_some();
         if !is_noisy || !is_measured || self.wheel_noise.is_excess_given {

@@ -310,7 +310,7 @@ impl Robot {
         not(test),
         expect(dead_code, reason = "the report program never mends, a test does")
     )]
-    pub(crate) fn mend(&mut self) {
+    pub(crate) fn repair(&mut self) {
         self.fault = None;
     }
 

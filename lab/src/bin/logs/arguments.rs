@@ -8,7 +8,7 @@ use clap::Parser;
 use tread_agent::drive::ros2::settings::Effort;
 use tread_control::estimation::EstimatorPrior;
 use tread_lab::logs::analysis::Options;
-use tread_lab::logs::mapping::{JointNames, Wishes};
+use tread_lab::logs::mapping::{JointNames, RequestedTopics};
 use tread_lab::logs::robot::{Measures, Robot};
 use tread_lab::logs::stretches::PASS_MIN;
 
@@ -140,8 +140,8 @@ impl Arguments {
     }
 
     /// Returns which topics are asked for.
-    pub(crate) fn wishes(&self) -> Wishes {
-        Wishes {
+    pub(crate) fn requested_topics(&self) -> RequestedTopics {
+        RequestedTopics {
             wheels: self.wheels.clone(),
             joints: self.joints.clone(),
             reversed: [self.reverse_left, self.reverse_right],

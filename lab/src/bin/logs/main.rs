@@ -28,7 +28,7 @@ fn main() -> anyhow::Result<ExitCode> {
         return Ok(ExitCode::SUCCESS);
     }
     let robot = arguments.robot()?;
-    let mapping = choose(&recording, &contents, &robot, &arguments.wishes())?;
+    let mapping = choose(&recording, &contents, &robot, &arguments.requested_topics())?;
     let first_ns = contents.topics.iter().map(|topic| topic.first_ns).min();
     let begin_ns = first_ns.context("a recording has messages")?;
     let options = arguments.options()?;

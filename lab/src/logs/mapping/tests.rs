@@ -17,7 +17,7 @@ fn topic(name: &str, kind: &str) -> Topic {
 }
 
 /// Chooses among topics that have no joints to be read.
-fn chosen(topics: Vec<Topic>, wishes: &Wishes) -> Result<Mapping, MappingError> {
+fn chosen(topics: Vec<Topic>, requested_topics: &RequestedTopics) -> Result<Mapping, MappingError> {
     let contents = Contents {
         topics,
         torn: Vec::new(),
@@ -29,52 +29,54 @@ fn chosen(topics: Vec<Topic>, wishes: &Wishes) -> Result<Mapping, MappingError> 
         rate_hz: 100.0,
     };
     let recording = Recording::open(&[]).unwrap();
-    choose(&recording, &contents, &robot, wishes)
+    choose(&recording, &contents, &robot, requested_topics)
 }
 
 #[test]
 fn what_is_missing_or_ambiguous_is_said_with_the_topics_that_there_are() {
     let wheels = || topic("/joint_states", JOINT_STATE);
     let imus = || vec![topic("/a/imu", IMU), topic("/b/imu", IMU), wheels()];
-    let none = Wishes::default();
-    let refused = |topics, wishes: &Wishes| chosen(topics, wishes).unwrap_err().to_string();
+    let none = RequestedTopics::default();
+    let refused = |topics, requested_topics: &RequestedTopics| {
+        chosen(topics, requested_topics).unwrap_err().to_string()
+    };
     let two = refused(imus(), &none);
     assert!(
         two.contains("--imu") && two.contains("/b/imu  sensor_msgs/msg/Imu"),
         "{two}"
     );
-    let wishes = Wishes {
+    let requested_topics = RequestedTopics {
         imu: Some("b/imu".to_owned()),
-        ..Wishes::default()
+        ..RequestedTopics::default()
     };
     // The topics are found, and the next question is which joints are whose.
-    let next = refused(imus(), &wishes);
+    let next = refused(imus(), &requested_topics);
     assert!(next.contains("--joints"), "{next}");
-    let wishes = Wishes {
+    let requested_topics = RequestedTopics {
         imu: Some("/joint_states".to_owned()),
-        ..Wishes::default()
+        ..RequestedTopics::default()
     };
-    let wrong = refused(imus(), &wishes);
+    let wrong = refused(imus(), &requested_topics);
     assert!(
         wrong.contains(JOINT_STATE) && wrong.contains("is needed"),
         "{wrong}"
     );
-    let wishes = Wishes {
+    let requested_topics = RequestedTopics {
         wheels: Some("/wheels".to_owned()),
-        ..Wishes::default()
+        ..RequestedTopics::default()
     };
-    assert!(refused(imus(), &wishes).contains("there is no topic `/wheels`"));
+    assert!(refused(imus(), &requested_topics).contains("there is no topic `/wheels`"));
     assert!(refused(vec![wheels()], &none).contains("yaw rate"));
     assert!(refused(vec![topic("/imu", IMU)], &none).contains("wheel speeds"));
     let odometry = || topic("/odom", ODOMETRY);
     assert!(refused(vec![odometry()], &none).contains("θ needs a gyro"));
     let both = || vec![odometry(), topic("/imu", IMU)];
     assert!(refused(both(), &none).contains("--odometry-track-m"));
-    let wishes = Wishes {
+    let requested_topics = RequestedTopics {
         odometry_track_m: Some(0.8),
-        ..Wishes::default()
+        ..RequestedTopics::default()
     };
-    let mapping = chosen(both(), &wishes).unwrap();
+    let mapping = chosen(both(), &requested_topics).unwrap();
     assert_eq!(mapping.topics(), ["/imu", "/odom"]);
     assert!((mapping.settings.command.base_track_m - 0.8).abs() < 1.0e-12);
 }
@@ -87,19 +89,19 @@ fn several_poses_are_left_out_and_that_is_said() {
         topic("/amcl", COVARIANT_POSE),
         topic("/mocap", POSE),
     ];
-    let mut wishes = Wishes {
+    let mut requested_topics = RequestedTopics {
         odometry_track_m: Some(0.8),
-        ..Wishes::default()
+        ..RequestedTopics::default()
     };
-    let mapping = chosen(topics.clone(), &wishes).unwrap();
+    let mapping = chosen(topics.clone(), &requested_topics).unwrap();
     assert_eq!(mapping.pose, None);
     assert!(
         mapping.notices[0].contains("/amcl, /mocap"),
         "{:?}",
         mapping.notices
     );
-    wishes.pose = Some("/mocap".to_owned());
-    let mapping = chosen(topics, &wishes).unwrap();
+    requested_topics.pose = Some("/mocap".to_owned());
+    let mapping = chosen(topics, &requested_topics).unwrap();
     assert_eq!(mapping.pose, Some(("/mocap".to_owned(), POSE)));
 }
 

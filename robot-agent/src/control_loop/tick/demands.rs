@@ -50,7 +50,7 @@ impl DemandReader {
     /// Reads the demands at `now`, by the monotonic clock.
     pub(super) fn read(&mut self, now: Duration, shared: &Shared) -> Demands {
         if let Some(watch) = &mut self.overrun {
-            watch.note(now);
+            watch.record(now);
         }
         let stop = shared.safety.stop();
         let server_silence = shared.server_silence(now);

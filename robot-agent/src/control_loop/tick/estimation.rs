@@ -170,8 +170,8 @@ impl Estimation {
     pub(super) fn step(&mut self, input: EstimationInput<'_>) -> (Estimated<'_>, Released) {
         let (tick, sensed) = (input.tick, input.sensed);
         let now = tick.now.monotonic;
-        self.take_noise(input.noise);
-        let taken = self.take_samples(sensed.samples());
+        self.apply_noise(input.noise);
+        let taken = self.process_samples(sensed.samples());
         self.measure_slip(sensed, tick);
         let retired = input.site.and_then(|site| self.replace_site(site));
         let ground_at_begin = self.ground();
@@ -220,7 +220,7 @@ impl Estimation {
     }
 
     /// Sets the estimator's noise to that stated by the base, clamped to [`NOISE_RANGE`].
-    fn take_noise(&mut self, stated: StatedNoise) {
+    fn apply_noise(&mut self, stated: StatedNoise) {
         if self.stated_noise == stated {
             return;
         }
@@ -238,19 +238,19 @@ impl Estimation {
         });
     }
 
-    fn take_samples(&mut self, samples: &[CheckedSample]) -> Taken {
+    fn process_samples(&mut self, samples: &[CheckedSample]) -> Taken {
         let mut taken = Taken::default();
         for sample in samples {
             if !sample.shows_progress {
                 self.progress.suspend();
             }
-            self.take_motion(sample, &mut taken);
+            self.process_motion(sample, &mut taken);
             let Some(fix) = sample.fix else {
                 continue;
             };
             self.check_gap(sample.at);
             if sample.shows_progress {
-                self.progress.note_fix(fix.pose.point());
+                self.progress.add_fix(fix.pose.point());
             }
             match self.localisation.correct(&fix) {
                 FixOutcome::Started | FixOutcome::Fused | FixOutcome::Restarted => {
@@ -265,7 +265,7 @@ impl Estimation {
         taken
     }
 
-    fn take_motion(&mut self, sample: &CheckedSample, taken: &mut Taken) {
+    fn process_motion(&mut self, sample: &CheckedSample, taken: &mut Taken) {
         let Some((motion, dt_s)) = sample.motion else {
             return;
         };
@@ -275,7 +275,7 @@ impl Estimation {
             return;
         }
         let twist = self.model.twist_from_wheel_speeds(motion.wheel_speeds);
-        self.progress.note_wheels(twist.linear_m_s * dt_s);
+        self.progress.add_wheel_distance(twist.linear_m_s * dt_s);
         self.localisation.predict(&motion, dt_s);
         // With wheels on two kinds of ground there is no single θ to estimate.
         if self.ground_under_wheels == Some(GroundUnderWheels::Mixed) || !sample.may_learn {
@@ -299,7 +299,8 @@ impl Estimation {
         };
         let gap = at.saturating_sub(integrated_to);
         if gap > self.silent_after {
-            self.localisation.lose_track(gap.as_secs_f64());
+            self.localisation
+                .widen_without_measurements(gap.as_secs_f64());
             self.integrated_to = Some(at);
         }
     }

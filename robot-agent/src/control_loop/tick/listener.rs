@@ -29,7 +29,8 @@ pub struct Heard {
 /// Sensing and estimation of the loop, without missions, safety and a base.
 ///
 /// Nobody knows what the wheels of a recorded robot were commanded, so each tick counts them as
-/// commanded what they were last measured to do: no finding blames wheels for disobedience.
+/// commanded what they were last measured to do: no finding says that the wheels do not follow
+/// their commands.
 #[derive(Debug)]
 pub struct Listener {
     sensing: Sensing,

@@ -239,7 +239,8 @@ impl MissionStage {
             wanted,
             is_active: active.is_some(),
             rests: active.is_none_or(Active::rests),
-            is_long_silent: active.is_some_and(|active| active.minds_silence(beyond_braking)),
+            is_long_silent: active
+                .is_some_and(|active| active.is_server_silent_too_long(beyond_braking)),
         }
     }
 
@@ -287,7 +288,7 @@ impl MissionStage {
                 .hypot(TYRE_DIFFERENCE_SHARE * statistics.common_ratio.tyres),
         };
         active.compare(&comparison);
-        self.surface.note(comparison);
+        self.surface.record(comparison);
     }
 
     /// Runs the active mission; returns its wheel speeds, `None` without a mission or while the

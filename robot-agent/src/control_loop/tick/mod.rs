@@ -36,7 +36,7 @@ use tread_control::robot::RobotModel;
 use super::channels::{COMMANDS_MAX, LoopEnds, Shared};
 use super::outgoing::Outgoing;
 use super::segments::Moment;
-use crate::control_loop::frame::NoteTaker;
+use crate::control_loop::frame::RecordSender;
 use crate::drive::{Drive, SILENT_AFTER_MAX};
 use demands::DemandReader;
 use estimation::{Estimation, EstimationInput};
@@ -121,7 +121,7 @@ impl LoopCore {
     }
 
     /// Starts recording the inputs and outputs of ticks; `None` stops it.
-    pub(crate) fn record_to(&mut self, notes: Option<NoteTaker>) {
+    pub(crate) fn record_to(&mut self, notes: Option<RecordSender>) {
         self.output.record_to(notes);
     }
 
@@ -157,7 +157,7 @@ impl LoopCore {
             is_base_silent: drive.is_silent(),
             commanded,
         });
-        let orders = self.take_orders(tick);
+        let orders = self.receive_commands(tick);
         let (estimated, released) = self.estimation.step(EstimationInput {
             tick,
             sensed: &sensed,
@@ -186,7 +186,7 @@ impl LoopCore {
         drive.write(gated.output.wheel_speeds);
         if demands.is_stopped() {
             // The base has the command, and the gate's target was zero under this stop.
-            self.ends.shared.safety.note_zeroed(demands.stop);
+            self.ends.shared.safety.record_zeroed(demands.stop);
         }
         let recorded = RecordInput {
             tick,
@@ -214,14 +214,14 @@ impl LoopCore {
     }
 
     /// Takes the commands of the rest of the agent.
-    fn take_orders(&mut self, tick: Tick) -> Orders {
+    fn receive_commands(&mut self, tick: Tick) -> Orders {
         let mut orders = Orders::default();
         // Bounded: a tick takes at most the capacity of the channel.
         for _ in 0..COMMANDS_MAX {
             let Ok(command) = self.ends.commands.try_recv() else {
                 break;
             };
-            self.output.note_command(&command);
+            self.output.record_command(&command);
             self.mission
                 .take(command, tick, &mut orders, &mut self.events);
         }
@@ -229,7 +229,7 @@ impl LoopCore {
     }
 
     /// Records the computing time of a tick.
-    pub(crate) fn note_tick_time(&self, took: Duration) {
+    pub(crate) fn record_tick_time(&self, took: Duration) {
         let microseconds = u32::try_from(took.as_micros()).unwrap_or(u32::MAX);
         self.ends
             .shared
@@ -238,7 +238,7 @@ impl LoopCore {
     }
 
     /// Counts a tick that began more than one period late.
-    pub(crate) fn note_overrun(&self) {
+    pub(crate) fn count_overrun(&self) {
         Shared::count(&self.ends.shared.overruns);
     }
 

@@ -21,7 +21,7 @@ use super::safety::Gated;
 use super::sensing::Sensed;
 use super::{STANDING, Tick};
 use crate::control_loop::channels::{LoopCommand, Shared, Snapshot};
-use crate::control_loop::frame::{NoteTaker, TickFrame, TickInputs, TickOutputs};
+use crate::control_loop::frame::{RecordSender, TickFrame, TickInputs, TickOutputs};
 use crate::control_loop::site_view::SiteView;
 use crate::control_loop::standing::{Motion, StandingWatch};
 use crate::drive::{Battery, Feedback, StatedNoise};
@@ -52,7 +52,7 @@ pub(super) struct Output {
     stands: bool,
     ticks: u64,
     /// Recorder of ticks, if they are recorded.
-    notes: Option<NoteTaker>,
+    notes: Option<RecordSender>,
 }
 
 impl Output {
@@ -69,7 +69,7 @@ impl Output {
     }
 
     /// Starts recording ticks; `None` stops it.
-    pub(super) fn record_to(&mut self, notes: Option<NoteTaker>) {
+    pub(super) fn record_to(&mut self, notes: Option<RecordSender>) {
         self.notes = notes;
     }
 
@@ -79,7 +79,7 @@ impl Output {
     }
 
     /// Records a command that the tick takes.
-    pub(super) fn note_command(&mut self, command: &LoopCommand) {
+    pub(super) fn record_command(&mut self, command: &LoopCommand) {
         if let Some(notes) = &mut self.notes {
             notes.command(self.ticks + 1, command);
         }
@@ -95,7 +95,7 @@ impl Output {
         self.count(input);
         let snapshot = self.snapshot(input);
         self.shared.publish(&snapshot);
-        self.note(input, &snapshot);
+        self.record(input, &snapshot);
     }
 
     fn fastest_rim_m_s(&self, wheel_speeds: WheelSpeeds) -> f64 {
@@ -131,7 +131,7 @@ impl Output {
         if is_heard || self.motion.odometry_m_s.is_some() || self.motion.fix.is_some() {
             self.standing.step(now, is_to_stand, &self.motion);
         } else if is_to_stand {
-            self.standing.forget();
+            self.standing.reset();
         } else {
             self.standing.step(now, false, &self.motion);
         }
@@ -180,7 +180,7 @@ impl Output {
     }
 
     /// Records the tick that ends, if ticks are recorded.
-    fn note(&mut self, input: &OutputInput<'_>, snapshot: &Snapshot) {
+    fn record(&mut self, input: &OutputInput<'_>, snapshot: &Snapshot) {
         let Some(notes) = &mut self.notes else {
             return;
         };

@@ -91,7 +91,7 @@ impl Assembler {
         match arrived.content {
             Content::Battery(battery) => self.battery = Some(battery),
             Content::Position(position) => feedback.push(fix(arrived.at, &position)),
-            Content::Inertial(inertial) => self.take_inertial(arrived.at, inertial),
+            Content::Inertial(inertial) => self.add_imu_message(arrived.at, inertial),
             Content::Motion(motion) => {
                 if let Some(position) = motion.position {
                     feedback.push(fix(arrived.at, &position));
@@ -116,7 +116,7 @@ impl Assembler {
         None
     }
 
-    fn take_inertial(&mut self, at: Duration, inertial: Inertial) {
+    fn add_imu_message(&mut self, at: Duration, inertial: Inertial) {
         self.sums.count += 1.0;
         self.sums.yaw_rad_s += inertial.yaw_rate_rad_s;
         if let Some(felt) = inertial.acceleration {

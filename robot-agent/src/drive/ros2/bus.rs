@@ -354,7 +354,7 @@ impl Bus {
         session
             .declare_subscriber(self.key_to_hear(topic))
             .callback(move |sample| {
-                hand_over(&sample, |key, with, said| inlet.take(key, with, said));
+                deliver(&sample, |key, with, said| inlet.take(key, with, said));
             })
             .background()
             .wait()
@@ -375,7 +375,7 @@ impl Bus {
         session
             .declare_subscriber(self.key_to_hear(&self.settings.command.topic))
             .callback(move |sample| {
-                hand_over(&sample, |key, with, said| watch.hear(key, with, said));
+                deliver(&sample, |key, with, said| watch.receive(key, with, said));
             })
             .allowed_origin(Locality::Remote)
             .background()
@@ -388,7 +388,7 @@ impl Bus {
     fn speak(&self, declared: &Declared, outward: Option<&mut (dyn OutwardSource + 'static)>) {
         std::thread::scope(|scope| {
             let telling = outward.and_then(|outward| {
-                let body = || self.tell(&declared.outward_topics, outward);
+                let body = || self.publish_states(&declared.outward_topics, outward);
                 let named = std::thread::Builder::new().name("to the robot".to_owned());
                 let spawned = named.spawn_scoped(scope, body);
                 spawned
@@ -403,7 +403,11 @@ impl Bus {
     }
 
     /// Publishes the agent's state when due, until the loop's end of the outlet is closed.
-    fn tell(&self, outward_topics: &[(OutwardTopic, Writer)], outward: &mut dyn OutwardSource) {
+    fn publish_states(
+        &self,
+        outward_topics: &[(OutwardTopic, Writer)],
+        outward: &mut dyn OutwardSource,
+    ) {
         while !self.outlet.is_closed() {
             let (now, wall_ns) = (self.clock.monotonic(), self.clock.host_wall_ns());
             outward.step(now, wall_ns, &mut |topic, bytes| {
@@ -455,7 +459,7 @@ fn declare_token(session: &zenoh::Session, token: String) -> Result<LivelinessTo
 }
 
 /// Passes a sample's key, attachment and payload to `take`.
-fn hand_over(sample: &zenoh::sample::Sample, take: impl FnOnce(&str, Option<&[u8]>, &[u8])) {
+fn deliver(sample: &zenoh::sample::Sample, take: impl FnOnce(&str, Option<&[u8]>, &[u8])) {
     let attachment = sample.attachment().map(small);
     let payload = sample.payload();
     // A payload above the limit is not assembled.

@@ -40,7 +40,7 @@ pub(super) struct Contest {
 impl Contest {
     /// Updates the state with the total number of foreign commands and whether the agent drives;
     /// returns whether the base is contested.
-    pub(super) fn look(&mut self, now: Duration, foreign_commands: u64, drives: bool) -> bool {
+    pub(super) fn check(&mut self, now: Duration, foreign_commands: u64, drives: bool) -> bool {
         let new = foreign_commands.saturating_sub(self.heard);
         self.heard = foreign_commands;
         for _ in 0..new.min(CONTEST_MIN as u64) {
@@ -115,7 +115,7 @@ impl CommandWatch {
     }
 
     /// Processes a message on the command topic; one that no base accepts as a command is ignored.
-    pub(super) fn hear(&self, key: &str, attachment: Option<&[u8]>, payload: &[u8]) {
+    pub(super) fn receive(&self, key: &str, attachment: Option<&[u8]>, payload: &[u8]) {
         let is_ours = match self.scheme {
             Scheme::RmwZenoh(generation) => {
                 let attachment = attachment.and_then(Attachment::from_bytes);
@@ -128,7 +128,7 @@ impl CommandWatch {
             Scheme::Ros2Dds => self.written().recent.contains(&digest(payload)),
         };
         if !is_ours {
-            self.counts.note_foreign_command();
+            self.counts.count_foreign_command();
         }
     }
 }
@@ -156,7 +156,7 @@ mod tests {
         let (mut contest, mut began, mut ended, mut was) = (Contest::default(), None, None, false);
         for now_ms in (0..span_ms).step_by(10) {
             let now = Duration::from_millis(now_ms);
-            let is = contest.look(now, foreign(now_ms), drives(now_ms));
+            let is = contest.check(now, foreign(now_ms), drives(now_ms));
             if is && !was {
                 began = began.or(Some(now_ms));
             }
@@ -207,11 +207,11 @@ mod tests {
             attachment.to_bytes()
         };
         watch.write_as(Some([1; GID_BYTES]));
-        watch.hear(&key, Some(&from(1)), b"ours");
-        watch.hear(&key, None, b"what no base takes");
-        watch.hear("0/cmd_vel/another/type", Some(&from(2)), b"nor this");
+        watch.receive(&key, Some(&from(1)), b"ours");
+        watch.receive(&key, None, b"what no base takes");
+        watch.receive("0/cmd_vel/another/type", Some(&from(2)), b"nor this");
         assert_eq!(counts.foreign_commands(), 0);
-        watch.hear(&key, Some(&from(2)), b"ours");
+        watch.receive(&key, Some(&from(2)), b"ours");
         assert_eq!(counts.foreign_commands(), 1);
     }
 
@@ -221,11 +221,11 @@ mod tests {
         for index in 0..1_000_u32 {
             watch.wrote(&index.to_le_bytes());
             // It comes back a little later.
-            watch.hear("cmd_vel", None, &index.saturating_sub(20).to_le_bytes());
+            watch.receive("cmd_vel", None, &index.saturating_sub(20).to_le_bytes());
         }
         assert_eq!(counts.foreign_commands(), 0);
-        watch.hear("cmd_vel", None, &1_000_u32.to_le_bytes());
-        watch.hear("cmd_vel", None, &100_u32.to_le_bytes());
+        watch.receive("cmd_vel", None, &1_000_u32.to_le_bytes());
+        watch.receive("cmd_vel", None, &100_u32.to_le_bytes());
         assert_eq!(counts.foreign_commands(), 2);
     }
 }

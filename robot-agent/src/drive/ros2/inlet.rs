@@ -28,7 +28,7 @@ pub const WAITING_MAX: usize = 128;
 /// Receiver of every message as it arrived, besides the loop; must not block.
 pub trait Tap: std::fmt::Debug + Send + Sync {
     /// Called for each message, before any check.
-    fn hear(
+    fn receive(
         &self,
         source: Source,
         arrival: Arrival,
@@ -162,7 +162,7 @@ impl Inlet {
             wall_ns: self.clock.host_wall_ns(),
         };
         if let Some(tap) = &self.tap {
-            tap.hear(self.source, arrival, key, attachment, payload);
+            tap.receive(self.source, arrival, key, attachment, payload);
         }
         let writer = match self.settings.bus.scheme {
             Scheme::Ros2Dds => None,
@@ -177,7 +177,7 @@ impl Inlet {
         };
         let mut watched = self.watched.lock().unwrap_or_else(PoisonError::into_inner);
         let order = writer
-            .map(|message| watched.writer.look(&message, arrival.monotonic))
+            .map(|message| watched.writer.check(&message, arrival.monotonic))
             .transpose()?;
         let at = if matches!(content, Content::Battery(_)) {
             arrival.monotonic
@@ -186,7 +186,7 @@ impl Inlet {
             let leaps = watched.stamps.leaps();
             let placed = watched.stamps.place(stamp_ns, arrival)?;
             if watched.stamps.leaps() > leaps {
-                self.counts.note(self.source, Notice::ClockLeapt);
+                self.counts.record(self.source, Notice::ClockLeapt);
             }
             placed
         };
@@ -196,7 +196,7 @@ impl Inlet {
             watched.writer.follow(&message, order, arrival.monotonic);
             match order {
                 Order::Continues => {}
-                Order::Restarted => self.counts.note(self.source, Notice::Restarted),
+                Order::Restarted => self.counts.record(self.source, Notice::Restarted),
                 Order::MayHaveRestarted => return Err(Refusal::OutOfOrder),
             }
         }

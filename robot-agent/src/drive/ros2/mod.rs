@@ -13,11 +13,11 @@
 pub mod assemble;
 pub mod bus;
 mod command;
+pub mod command_compliance;
 mod command_watch;
 pub mod frames;
 pub mod inlet;
 pub mod notices;
-pub mod obedience;
 pub mod outlet;
 pub(crate) mod outward;
 pub mod reading;
@@ -34,9 +34,9 @@ use tread_control::measured::WheelSpeeds;
 
 use self::assemble::{Arrived, Assembler};
 use self::bus::Bus;
+use self::command_compliance::{CommandCompliance, Verdict};
 use self::command_watch::Contest;
 use self::inlet::{Inlet, Tap, WAITING_MAX, topic_of};
-use self::obedience::{Obedience, Verdict};
 use self::outlet::Outlet;
 use self::refusal::{Counts, Refusal, Source};
 use self::settings::Ros2Settings;
@@ -54,14 +54,14 @@ pub struct Ros2Drive {
     arrived: Receiver<Arrived>,
     arrivals: Arc<Arrivals>,
     assembler: Assembler,
-    obedience: Obedience,
+    command_compliance: CommandCompliance,
     counts: Arc<Counts>,
     outlet: Arc<Outlet>,
     now: Duration,
     /// When the last whole sample was measured.
     heard_at: Option<Duration>,
     /// The base was silent, and the loop has not come to rest since.
-    must_rest: bool,
+    is_rest_required: bool,
     /// Whether wheels are believed whatever they do.
     is_examined: bool,
     contest: Contest,
@@ -112,14 +112,14 @@ impl Ros2Drive {
             contest: Contest::default(),
             drives: false,
             assembler: Assembler::new(&settings),
-            obedience: Obedience::default(),
+            command_compliance: CommandCompliance::default(),
             arrived,
             arrivals,
             counts,
             outlet: Arc::clone(&outlet),
             now: Duration::ZERO,
             heard_at: None,
-            must_rest: false,
+            is_rest_required: false,
             settings: Arc::clone(&settings),
         };
         let counts = Arc::clone(&drive.counts);
@@ -133,8 +133,8 @@ impl Ros2Drive {
     }
 
     /// Whether the base is commanded to rest, whatever the loop commands.
-    pub fn must_rest(&self) -> bool {
-        self.must_rest
+    pub fn is_rest_required(&self) -> bool {
+        self.is_rest_required
     }
 
     fn pace_source(&self) -> Source {
@@ -151,7 +151,7 @@ impl Drive for Ros2Drive {
         self.now = now;
         let mut feedback = Feedback::default();
         let (foreign, drives) = (self.counts.foreign_commands(), self.drives);
-        let is_contested = self.contest.look(now, foreign, drives);
+        let is_contested = self.contest.check(now, foreign, drives);
         // Bounded by the channel's room.
         for _ in 0..WAITING_MAX {
             let Ok(arrived) = self.arrived.try_recv() else {
@@ -160,7 +160,7 @@ impl Drive for Ros2Drive {
             let Some(measured) = self.assembler.take(&arrived, &mut feedback) else {
                 continue;
             };
-            let refusal = match self.obedience.judge(now, measured) {
+            let refusal = match self.command_compliance.judge(now, measured) {
                 _ if is_contested => Some(Refusal::Contested),
                 Verdict::Obeys => None,
                 Verdict::Stands => Some(Refusal::Disobedient),
@@ -186,10 +186,10 @@ impl Drive for Ros2Drive {
 
     fn write(&mut self, command: WheelSpeeds) {
         let rest = WheelSpeeds::default();
-        self.must_rest = self.is_silent() || (self.must_rest && command != rest);
-        let written = if self.must_rest { rest } else { command };
+        self.is_rest_required = self.is_silent() || (self.is_rest_required && command != rest);
+        let written = if self.is_rest_required { rest } else { command };
         self.drives = written != rest;
-        self.obedience.command(self.now, written);
+        self.command_compliance.command(self.now, written);
         self.outlet.leave(written);
     }
 

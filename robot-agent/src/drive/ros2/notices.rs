@@ -5,15 +5,15 @@ use super::refusal::{Counts, Notice, QUIET_LOOKS, Source};
 
 /// Detects recent events by comparing the counts at intervals.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct Noticing {
+pub struct RecentNotices {
     before: [[u64; Notice::ALL.len()]; Source::ALL.len()],
     /// Number of further checks for which the event is reported.
     left: [[u32; Notice::ALL.len()]; Source::ALL.len()],
 }
 
-impl Noticing {
+impl RecentNotices {
     /// Runs one check; returns a description of the topics with recent events, for people.
-    pub fn look(&mut self, counts: &Counts, notice: Notice) -> Option<String> {
+    pub fn check(&mut self, counts: &Counts, notice: Notice) -> Option<String> {
         let mut sections = Vec::new();
         for source in Source::ALL {
             let times = counts.noted(source, notice);
@@ -43,7 +43,7 @@ pub struct ForeignCommands {
 
 impl ForeignCommands {
     /// Runs one check; returns a description while another node has commanded the base recently.
-    pub fn look(&mut self, counts: &Counts) -> Option<String> {
+    pub fn check(&mut self, counts: &Counts) -> Option<String> {
         let times = counts.foreign_commands();
         self.left = if times > std::mem::replace(&mut self.before, times) {
             QUIET_LOOKS
@@ -62,33 +62,38 @@ mod tests {
 
     #[test]
     fn what_happened_is_said_by_topic_until_it_is_over() {
-        let (counts, mut noticing) = (Counts::default(), Noticing::default());
-        assert_eq!(noticing.look(&counts, Notice::Restarted), None);
-        counts.note(Source::Imu, Notice::Restarted);
-        counts.note(Source::Joints, Notice::Restarted);
-        counts.note(Source::Joints, Notice::ClockLeapt);
-        let text = noticing.look(&counts, Notice::Restarted).unwrap();
+        let (counts, mut recent_notices) = (Counts::default(), RecentNotices::default());
+        assert_eq!(recent_notices.check(&counts, Notice::Restarted), None);
+        counts.record(Source::Imu, Notice::Restarted);
+        counts.record(Source::Joints, Notice::Restarted);
+        counts.record(Source::Joints, Notice::ClockLeapt);
+        let text = recent_notices.check(&counts, Notice::Restarted).unwrap();
         assert_eq!(
             text,
             "what writes imu (1 so far), joints (1 so far) started again and is heard again"
         );
-        let text = noticing.look(&counts, Notice::ClockLeapt).unwrap();
+        let text = recent_notices.check(&counts, Notice::ClockLeapt).unwrap();
         assert!(text.contains("joints (1 so far) set its clock"), "{text}");
         for _ in 1..QUIET_LOOKS {
-            assert!(noticing.look(&counts, Notice::Restarted).is_some());
+            assert!(recent_notices.check(&counts, Notice::Restarted).is_some());
         }
-        assert_eq!(noticing.look(&counts, Notice::Restarted), None);
+        assert_eq!(recent_notices.check(&counts, Notice::Restarted), None);
     }
 
     #[test]
     fn commands_of_others_are_said_until_they_cease() {
         let (counts, mut foreign) = (Counts::default(), ForeignCommands::default());
-        assert_eq!(foreign.look(&counts), None);
-        counts.note_foreign_command();
-        assert!(foreign.look(&counts).unwrap().contains("1 commands so far"));
+        assert_eq!(foreign.check(&counts), None);
+        counts.count_foreign_command();
+        assert!(
+            foreign
+                .check(&counts)
+                .unwrap()
+                .contains("1 commands so far")
+        );
         for _ in 1..QUIET_LOOKS {
-            assert!(foreign.look(&counts).is_some());
+            assert!(foreign.check(&counts).is_some());
         }
-        assert_eq!(foreign.look(&counts), None);
+        assert_eq!(foreign.check(&counts), None);
     }
 }

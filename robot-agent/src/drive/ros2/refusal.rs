@@ -286,7 +286,7 @@ impl Counts {
     }
 
     /// Counts an event on a topic.
-    pub fn note(&self, source: Source, notice: Notice) {
+    pub fn record(&self, source: Source, notice: Notice) {
         self.noted[source as usize][notice as usize].fetch_add(1, Ordering::Relaxed);
     }
 
@@ -296,7 +296,7 @@ impl Counts {
     }
 
     /// Counts a command of another node.
-    pub fn note_foreign_command(&self) {
+    pub fn count_foreign_command(&self) {
         self.foreign_commands.fetch_add(1, Ordering::Relaxed);
     }
 
@@ -329,7 +329,7 @@ pub struct Dropping {
 impl Dropping {
     /// Runs one check; returns the most frequent recent reason and its description for people,
     /// `None` if nothing was dropped recently.
-    pub fn look(&mut self, counts: &Counts) -> Option<(Refusal, String)> {
+    pub fn check(&mut self, counts: &Counts) -> Option<(Refusal, String)> {
         let mut most = 0;
         for (source, refusal, times) in counts.drops() {
             let before = &mut self.before[source as usize][refusal as usize];
@@ -362,23 +362,23 @@ mod tests {
     #[test]
     fn what_is_dropped_most_of_late_is_said_until_it_is_over() {
         let (counts, mut dropping) = (Counts::default(), Dropping::default());
-        assert_eq!(dropping.look(&counts), None);
+        assert_eq!(dropping.check(&counts), None);
         for _ in 0..3 {
             counts.refuse(Source::Imu, Refusal::Late);
         }
         counts.refuse(Source::Odometry, Refusal::Value);
-        let (_, text) = dropping.look(&counts).unwrap();
+        let (_, text) = dropping.check(&counts).unwrap();
         assert_eq!(text, "messages that came late are dropped (imu, 3 so far)");
         counts.refuse(Source::Odometry, Refusal::Value);
-        let (_, text) = dropping.look(&counts).unwrap();
+        let (_, text) = dropping.check(&counts).unwrap();
         assert_eq!(
             text,
             "messages with impossible values are dropped (odometry, 2 so far)"
         );
         for _ in 0..QUIET_LOOKS {
-            assert!(dropping.look(&counts).is_some());
+            assert!(dropping.check(&counts).is_some());
         }
-        assert_eq!(dropping.look(&counts), None);
+        assert_eq!(dropping.check(&counts), None);
         assert_eq!(counts.drops().count(), 2);
     }
 }

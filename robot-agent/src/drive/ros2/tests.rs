@@ -205,7 +205,7 @@ impl Talk {
     }
 
     /// Commands the base; what is sent to it.
-    fn tell(&mut self, command: WheelSpeeds) -> WheelSpeeds {
+    fn command(&mut self, command: WheelSpeeds) -> WheelSpeeds {
         self.drive.write(command);
         let (number, command) = self.drive.outlet.newer_than(self.number).unwrap();
         self.number = number;
@@ -350,19 +350,23 @@ fn every_bad_message_is_counted_by_its_reason_and_is_no_word_of_the_base() {
         let mut talk = Talk::new();
         for _ in 0..5 {
             talk.say(&GOOD);
-            assert_eq!(talk.tell(COMMANDED), COMMANDED);
+            assert_eq!(talk.command(COMMANDED), COMMANDED);
         }
         let counts = talk.drive.counts();
         for _ in 0..12 {
             talk.say(&bad);
-            talk.tell(COMMANDED);
+            talk.command(COMMANDED);
         }
         let count = |source| counts.dropped(source, refusal);
         assert!(
             count(Source::Imu) + count(Source::Joints) >= 12,
             "{refusal:?}"
         );
-        assert_eq!(talk.tell(COMMANDED), WheelSpeeds::default(), "{refusal:?}");
+        assert_eq!(
+            talk.command(COMMANDED),
+            WheelSpeeds::default(),
+            "{refusal:?}"
+        );
     }
 }
 
@@ -377,7 +381,7 @@ fn the_frame_for_which_messages_are_dropped_is_named_with_the_configured_one() {
             ..GOOD
         });
     }
-    let (refusal, text) = dropping.look(&counts).unwrap();
+    let (refusal, text) = dropping.check(&counts).unwrap();
     assert_eq!(refusal, Refusal::WrongFrame);
     assert_eq!(
         text,
@@ -389,27 +393,27 @@ fn the_frame_for_which_messages_are_dropped_is_named_with_the_configured_one() {
 fn a_silent_base_rests_in_time_and_hears_nothing_until_the_loop_has_come_to_rest() {
     let mut talk = Talk::new();
     assert_eq!(
-        talk.tell(COMMANDED),
+        talk.command(COMMANDED),
         WheelSpeeds::default(),
         "it has not been heard yet"
     );
     talk.say(&GOOD);
-    talk.tell(WheelSpeeds::default());
-    assert_eq!(talk.tell(COMMANDED), COMMANDED);
+    talk.command(WheelSpeeds::default());
+    assert_eq!(talk.command(COMMANDED), COMMANDED);
     let heard_at = talk.clock.monotonic();
-    while talk.tell(COMMANDED) == COMMANDED {
+    while talk.command(COMMANDED) == COMMANDED {
         talk.pass();
     }
     let silence = talk.clock.monotonic().saturating_sub(heard_at);
     assert!(silence <= Duration::from_millis(110), "{silence:?}");
     talk.say(&GOOD);
     assert_eq!(
-        talk.tell(COMMANDED),
+        talk.command(COMMANDED),
         WheelSpeeds::default(),
         "the command must not leap"
     );
-    talk.tell(WheelSpeeds::default());
-    assert_eq!(talk.tell(COMMANDED), COMMANDED);
+    talk.command(WheelSpeeds::default());
+    assert_eq!(talk.command(COMMANDED), COMMANDED);
 }
 
 #[test]
@@ -451,7 +455,7 @@ fn wheels_that_do_not_follow_their_command_are_not_believed() {
     };
     talk.say(&GOOD);
     let began = talk.clock.monotonic();
-    while talk.tell(COMMANDED) == COMMANDED {
+    while talk.command(COMMANDED) == COMMANDED {
         talk.say(&stuck);
         assert!(talk.clock.monotonic() < began + Duration::from_secs(2));
     }
@@ -468,29 +472,29 @@ fn a_base_that_another_node_commands_too_rests_until_that_ceases() {
     let mut talk = Talk::new();
     for _ in 0..5 {
         talk.say(&GOOD);
-        assert_eq!(talk.tell(COMMANDED), COMMANDED);
+        assert_eq!(talk.command(COMMANDED), COMMANDED);
     }
     let counts = talk.drive.counts();
     let rest = WheelSpeeds::default();
     let mut ticks = 0;
-    while talk.tell(COMMANDED) == COMMANDED {
-        counts.note_foreign_command();
+    while talk.command(COMMANDED) == COMMANDED {
+        counts.count_foreign_command();
         talk.say(&GOOD);
         ticks += 1;
         assert!(ticks < 20, "it is driven on");
     }
     for _ in 0..100 {
-        counts.note_foreign_command();
+        counts.count_foreign_command();
         talk.say(&GOOD);
-        assert_eq!(talk.tell(rest), rest);
+        assert_eq!(talk.command(rest), rest);
     }
     assert!(counts.dropped(Source::Joints, Refusal::Contested) > 100);
     // The other falls silent.
     for _ in 0..60 {
         talk.say(&GOOD);
-        talk.tell(rest);
+        talk.command(rest);
     }
-    assert_eq!(talk.tell(COMMANDED), COMMANDED);
+    assert_eq!(talk.command(COMMANDED), COMMANDED);
 }
 
 #[test]

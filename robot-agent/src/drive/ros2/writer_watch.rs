@@ -79,7 +79,7 @@ impl WriterWatch {
     /// # Errors
     /// [`Refusal::OutOfOrder`] for a repeated or older message, [`Refusal::SecondWriter`] for one
     /// of another writer while the topic's writer is active.
-    pub fn look(&self, message: &Attachment, now: Duration) -> Result<Order, Refusal> {
+    pub fn check(&self, message: &Attachment, now: Duration) -> Result<Order, Refusal> {
         let Some(heard) = &self.writer else {
             return Ok(Order::Continues);
         };
@@ -176,7 +176,7 @@ mod tests {
     /// Whether a message is taken; one that may be of a writer that started again is not.
     fn take(watch: &mut WriterWatch, message: &Attachment, now_ms: i64) -> Result<Order, Refusal> {
         let now = Duration::from_millis(now_ms.unsigned_abs());
-        let order = watch.look(message, now)?;
+        let order = watch.check(message, now)?;
         watch.follow(message, order, now);
         Ok(order)
     }

@@ -84,21 +84,21 @@ struct Shared {
     ready: Mutex<Option<Connection>>,
     /// Permits for the session's connections.
     places: Semaphore,
-    strangers: StrangersLog,
+    strangers: UnknownClientLog,
     stale: CancellationToken,
 }
 
 /// Counts other programs at the local port, and logs the number at intervals.
 #[derive(Default)]
-struct StrangersLog(std::sync::Mutex<StrangersCount>);
+struct UnknownClientLog(std::sync::Mutex<UnknownClientCount>);
 
 #[derive(Default)]
-struct StrangersCount {
+struct UnknownClientCount {
     count: u64,
     logged_at: Option<tokio::time::Instant>,
 }
 
-impl StrangersLog {
+impl UnknownClientLog {
     /// Counts one more; returns the number since the last log line if one is due.
     fn came(&self, now: tokio::time::Instant) -> Option<u64> {
         let mut counted = self.0.lock().unwrap_or_else(PoisonError::into_inner);
@@ -113,7 +113,7 @@ impl StrangersLog {
         Some(std::mem::take(&mut counted.count))
     }
 
-    fn note(&self) {
+    fn record(&self) {
         if let Some(count) = self.came(tokio::time::Instant::now()) {
             warn!(
                 count,
@@ -213,7 +213,7 @@ impl Tunnel {
             session_id: number.to_le_bytes(),
             ready: Mutex::new(Some(connection)),
             places: Semaphore::new(CONNECTIONS_MAX),
-            strangers: StrangersLog::default(),
+            strangers: UnknownClientLog::default(),
             stale: stale.clone(),
         });
         let mut tasks = JoinSet::new();
@@ -231,7 +231,7 @@ impl Tunnel {
     /// # Errors
     /// [`LinkError`] if zenoh refuses a setting.
     pub fn session_config(&self) -> Result<zenoh::Config, LinkError> {
-        session::through_tunnel(self.local, &self.user)
+        session::tunnel_config(self.local, &self.user)
     }
 
     /// Waits until a session through this tunnel can no longer connect: the server has other
@@ -305,13 +305,13 @@ async fn take(mut local: TcpStream, shared: Arc<Shared>, known: CancellationToke
     let reading = tokio::time::timeout(FIRST_MESSAGE_TIMEOUT, read_message(&mut local));
     let read = tokio::select! {
         read = reading => read,
-        () = known.cancelled() => return shared.strangers.note(),
+        () = known.cancelled() => return shared.strangers.record(),
     };
     known.cancel();
     let has_id = |bytes: &[u8]| *bytes == shared.session_id;
     let first = match read {
         Ok(Ok(first)) if first.windows(shared.session_id.len()).any(has_id) => first,
-        Ok(_) | Err(_) => return shared.strangers.note(),
+        Ok(_) | Err(_) => return shared.strangers.record(),
     };
     let Ok(_place) = shared.places.try_acquire() else {
         return warn!("the session has too many connections");

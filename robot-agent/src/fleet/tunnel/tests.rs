@@ -195,7 +195,7 @@ async fn programs_that_say_nothing_take_no_place_of_the_session() {
 
 #[test]
 fn other_programs_are_logged_now_and_then_with_their_count() {
-    let log = StrangersLog::default();
+    let log = UnknownClientLog::default();
     let begun = tokio::time::Instant::now();
     assert_eq!(log.came(begun), Some(1));
     for _ in 0..1_000 {

@@ -48,7 +48,7 @@ export function saidOf(error: unknown): Said {
 }
 
 /** A sentence in the language of the page by the problem's type, with the server's own words after it. */
-export function tell(body: ProblemBody): string {
+export function describe(body: ProblemBody): string {
   const title = texts.problem.title(body.type, body.title);
   return withDetail(`${title.charAt(0).toUpperCase()}${title.slice(1)}.`, body.detail);
 }
@@ -93,7 +93,7 @@ export async function ask<T>(path: string, asked: Asked = {}): Promise<T> {
   if (response.status === 401) {
     for (const listener of ended) listener();
   }
-  throw new Problem(() => tell(problem), response.status, problem);
+  throw new Problem(() => describe(problem), response.status, problem);
 }
 
 const ended = new Set<() => void>();

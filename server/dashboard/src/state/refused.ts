@@ -1,5 +1,5 @@
 // What the page says when the server refuses a draft, with the numbers that points have in the table.
-import { Problem, sentence, tell } from '../api/client';
+import { Problem, sentence, describe } from '../api/client';
 import { COORDINATE_MAX_M } from '../map/draft';
 import type { Shape } from '../map/shape';
 import { refusalOf, type Refusal } from '../refusal';
@@ -29,6 +29,6 @@ export function refusalText(error: unknown, hasPoints: boolean, shape: Shape | n
     case 'far':
       return refused.far(first, about('length', COORDINATE_MAX_M));
     case null:
-      return tell({ ...error.body, detail: refusal.detail });
+      return describe({ ...error.body, detail: refusal.detail });
   }
 }

@@ -80,7 +80,7 @@ pub async fn run(app: App, schedule: Option<Schedule>, stop: CancellationToken) 
     while !stop.is_cancelled() {
         tokio::select! {
             () = stop.cancelled() => return,
-            () = scheduler.look() => {}
+            () = scheduler.poll() => {}
         }
         tokio::select! {
             () = stop.cancelled() => {}
@@ -113,7 +113,7 @@ struct Scheduler {
 }
 
 impl Scheduler {
-    async fn look(&mut self) {
+    async fn poll(&mut self) {
         let now = self.app.clock().elapsed();
         let since = |at: Duration| now.saturating_sub(at);
         if self.listed_at.is_none_or(|at| since(at) >= LIST_EVERY) {
@@ -129,7 +129,7 @@ impl Scheduler {
                 Err(cause) => {
                     // Counted from the end of the attempt, which may have taken long.
                     self.failed_at = Some(self.app.clock().elapsed());
-                    self.note_failure(&cause);
+                    self.record_failure(&cause);
                 }
             }
             self.list().await;
@@ -213,7 +213,7 @@ impl Scheduler {
         Ok(())
     }
 
-    fn note_failure(&self, cause: &BackupError) {
+    fn record_failure(&self, cause: &BackupError) {
         let mut text = cause.to_string();
         let mut source = std::error::Error::source(cause);
         while let Some(error) = source {

@@ -75,7 +75,7 @@ impl App {
     /// Returns whether a secret is that of a join token, valid or not. Other secrets do not wait
     /// for the writing connection.
     async fn is_join_token(&self, secret: &Secret) -> Result<bool, AppError> {
-        let _turn = self.look_up_turn(Purpose::Other).await?;
+        let _turn = self.lookup_permit(Purpose::Other).await?;
         let mut tx = self.db().read("enrolment").await?;
         let fingerprint = secret.fingerprint();
         let kept = db::join_tokens::by_lookup(&mut tx, &fingerprint).await?;

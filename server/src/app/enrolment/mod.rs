@@ -195,10 +195,10 @@ impl App {
     ///
     /// # Errors
     /// The database failed.
-    pub async fn know_enrolments(&self) -> Result<(), AppError> {
+    pub async fn load_enrolments(&self) -> Result<(), AppError> {
         let mut tx = self.db().read("enrolment").await?;
         for enrolment in db::enrolments::all_newest(&mut tx).await? {
-            self.enrolment_registry().note(&enrolment);
+            self.enrolment_registry().record(&enrolment);
         }
         Ok(())
     }
@@ -249,7 +249,7 @@ impl App {
         };
         db::join_tokens::insert(&mut tx, &join_token, &secret.fingerprint()).await?;
         if let Ok(before) = now.checked_sub(DEAD_KEPT) {
-            db::join_tokens::forget_dead(&mut tx, before, FORGET_MAX).await?;
+            db::join_tokens::delete_ended(&mut tx, before, FORGET_MAX).await?;
         }
         tx.commit().await?;
         Ok(CreatedJoinToken {
@@ -342,7 +342,7 @@ impl App {
         let (app, enrolment) = (self.clone(), enrolment.clone());
         tx.commit_then(move |outcome| {
             if outcome == Outcome::Written {
-                app.enrolment_registry().note(&enrolment);
+                app.enrolment_registry().record(&enrolment);
                 app.show_alerts(&alerts);
             }
         })
@@ -369,7 +369,7 @@ impl App {
         proven.map_err(EnrolError::Certificate)?;
         let name = present.name();
         if present.is_retired() {
-            self.note_retired(name);
+            self.alert_retired_authority(name);
             return Err(EnrolError::Retired(name.clone()));
         }
         let (certificate, next) =
@@ -381,7 +381,7 @@ impl App {
             Counting::None => {
                 drop(tx);
                 let key = (name.site.clone(), name.robot.clone());
-                self.note_outsider(&key);
+                self.alert_revoked(&key);
                 return Err(EnrolError::Ended(name.clone()));
             }
             Counting::Any => {
@@ -392,7 +392,7 @@ impl App {
         };
         let Some(issued) = counting.renewed(&shown, next) else {
             drop(tx);
-            self.note_unissued(name);
+            self.alert_unissued_certificate(name);
             return Err(EnrolError::NotIssued(name.clone()));
         };
         let renewal = Renewal {
@@ -405,7 +405,7 @@ impl App {
         self.commit_alerts(tx, ended).await?;
         self.membership()
             .shown
-            .forget(&(name.site.clone(), name.robot.clone()));
+            .remove(&(name.site.clone(), name.robot.clone()));
         self.counters().certificates_renewed.one();
         Ok(certificate)
     }

@@ -53,7 +53,7 @@ impl EnrolmentRegistry {
 
     /// Records an enrolment read from the database; ignored if a newer one, or its end, is recorded
     /// already.
-    pub(crate) fn note(&self, enrolment: &Enrolment) {
+    pub(crate) fn record(&self, enrolment: &Enrolment) {
         let status = match enrolment.revoked_at {
             None => EnrolmentStatus::Enrolled(enrolment.number),
             Some(_) => EnrolmentStatus::Revoked(enrolment.number),
@@ -137,7 +137,7 @@ mod tests {
                 order.rotate_left(turn);
                 order.swap(0, first);
                 for (number, is_revoked) in order {
-                    registry.note(&enrolment(number, is_revoked));
+                    registry.record(&enrolment(number, is_revoked));
                 }
                 assert_eq!(registry.status(&key), Some(EnrolmentStatus::Revoked(2)));
                 assert!(!registry.may_speak(&key));
@@ -153,7 +153,7 @@ mod tests {
         registry.close();
         assert!(!registry.may_speak(&key));
         let changes = registry.changes();
-        registry.note(&enrolment(1, false));
+        registry.record(&enrolment(1, false));
         assert!(changes.has_changed().unwrap());
         assert!(
             registry.may_speak(&key)

@@ -40,7 +40,7 @@ impl RevokedRobots {
         is_due
     }
 
-    fn forget(&self, key: &RobotKey) {
+    fn remove(&self, key: &RobotKey) {
         let mut noted = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         noted.remove(key);
     }
@@ -56,7 +56,7 @@ impl App {
         match self.enrolment_registry().status(key) {
             Some(_) => {
                 self.counters().refused_revoked_robot.one();
-                self.note_outsider(key);
+                self.alert_revoked(key);
             }
             None => self.counters().refused_unenrolled_robot.one(),
         }
@@ -64,38 +64,38 @@ impl App {
     }
 
     /// Raises an alert if the robot is revoked and still tries to connect.
-    pub fn note_outsider(&self, key: &RobotKey) {
+    pub fn alert_revoked(&self, key: &RobotKey) {
         let is_out = matches!(
             self.enrolment_registry().status(key),
             Some(EnrolmentStatus::Revoked(_))
         );
         if is_out {
             let text = "it was put out of the fleet and still tries to connect".to_owned();
-            self.tell(key, REVOKED_ALERT, text);
+            self.warn_and_alert(key, REVOKED_ALERT, text);
         }
     }
 
     /// Raises an alert that the robot's certificate was signed by a retired authority.
-    pub(super) fn note_retired(&self, name: &RobotName) {
+    pub(super) fn alert_retired_authority(&self, name: &RobotName) {
         let key = (name.site.clone(), name.robot.clone());
         if self.enrolment_registry().is_in_force(&key, name.enrolment) {
             let text =
                 "its certificate is of an authority that was retired; it must join again by a \
                         join token that names it"
                     .to_owned();
-            self.tell(&key, RETIRED_ALERT, text);
+            self.warn_and_alert(&key, RETIRED_ALERT, text);
         }
     }
 
     /// Raises an alert about a certificate that this server did not issue: somebody else has the
     /// authority's key, or an old copy of the robot's data is in use.
-    pub(super) fn note_unissued(&self, name: &RobotName) {
+    pub(super) fn alert_unissued_certificate(&self, name: &RobotName) {
         let key = (name.site.clone(), name.robot.clone());
         let text = "a certificate was shown for a renewal that this server did not give, or gave long ago: \
                     the authority's key may be stolen, or an old copy of the robot's disk or of the \
                     server's database is in use"
             .to_owned();
-        self.tell(&key, UNISSUED_ALERT, text);
+        self.warn_and_alert(&key, UNISSUED_ALERT, text);
     }
 
     /// Clears a robot's alert about an unissued certificate.
@@ -114,7 +114,7 @@ impl App {
 
     /// Logs a warning about a robot and raises its alert in the background, at most once per
     /// interval.
-    fn tell(&self, key: &RobotKey, code: &'static str, text: String) {
+    fn warn_and_alert(&self, key: &RobotKey, code: &'static str, text: String) {
         let revoked_robots = &self.membership().revoked_robots;
         if !revoked_robots.is_due(key, self.clock().elapsed()) {
             return;
@@ -158,7 +158,7 @@ impl App {
         enrolment: &Enrolment,
     ) -> Result<Vec<Alert>, AppError> {
         let key = (enrolment.site.clone(), enrolment.robot.clone());
-        self.membership().revoked_robots.forget(&key);
+        self.membership().revoked_robots.remove(&key);
         let Some(robot_pk) = robot_pk(tx, &key).await? else {
             return Ok(Vec::new());
         };

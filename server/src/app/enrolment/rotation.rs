@@ -46,7 +46,7 @@ impl Shown {
     }
 
     /// Forgets a robot, because its row was changed otherwise.
-    pub(super) fn forget(&self, robot: &RobotKey) {
+    pub(super) fn remove(&self, robot: &RobotKey) {
         let mut shown = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         shown.remove(robot);
     }
@@ -240,7 +240,12 @@ impl App {
     }
 
     /// Records whose certificate a robot has shown at the robots' port, once there was a rotation.
-    pub async fn note_shown(&self, robot: &RobotKey, enrolment: u32, authority: &str) {
+    pub async fn record_shown_certificate(
+        &self,
+        robot: &RobotKey,
+        enrolment: u32,
+        authority: &str,
+    ) {
         let matters = self.authorities().is_ok_and(|authorities| {
             let present = authorities.present();
             present.retiring().is_some() || present.has_retired()
@@ -260,7 +265,7 @@ impl App {
                 return Ok(());
             }
             let mut tx = self.db().write("enrolment").await?;
-            db::enrolments::note_authority(&mut tx, one, authority).await?;
+            db::enrolments::record_authority(&mut tx, one, authority).await?;
             tx.commit().await?;
             Ok(())
         };

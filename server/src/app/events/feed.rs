@@ -32,7 +32,7 @@ pub async fn run(app: App, stop: CancellationToken) {
         rows_of: (0, None),
     };
     loop {
-        if let Err(error) = db::limited(feed.look()).await {
+        if let Err(error) = db::limited(feed.poll()).await {
             app.log_failure("read what is new", &error);
         }
         tokio::select! {
@@ -60,7 +60,7 @@ struct Feed {
 }
 
 impl Feed {
-    async fn look(&mut self) -> Result<(), AppError> {
+    async fn poll(&mut self) -> Result<(), AppError> {
         let now = self.app.clock().elapsed();
         // Live states of robots are published also while the database fails.
         let steps = self.steps().await;
@@ -147,7 +147,7 @@ impl Feed {
             };
             self.rows_of = (read, Some(now));
         }
-        news.extend(self.app.presences().take_news(now));
+        news.extend(self.app.presences().take_changed(now));
         if self.app.hub().client_count() == 0 {
             return failed.map_or(Ok(()), Err);
         }

@@ -81,7 +81,7 @@ impl App {
             ..grid
         };
         let bounds = area.cells(&coarse)?;
-        let stamp = self.maps().look(&row, SiteMap::stamp);
+        let stamp = self.maps().with_map(&row, SiteMap::stamp);
         reading.of_site(self, &row).await?;
         // Read before any chunk is made, so that later changes give another state.
         let state = self.state_of(&row, &reading, asked);

@@ -139,7 +139,7 @@ impl App {
     ) -> Result<Vec<FrictionAt>, AppError> {
         let shared = Arc::new((reading, times, models));
         for _ in 0..READS_MAX {
-            let stamp = self.maps().look(&view.row, SiteMap::stamp);
+            let stamp = self.maps().with_map(&view.row, SiteMap::stamp);
             let timelines = self.timelines_of(view, &shared.1).await?;
             let (view_then, shared) = (Arc::clone(view), Arc::clone(&shared));
             let looking = move |reader: &MapReader<'_>| {
@@ -148,7 +148,7 @@ impl App {
                 known_at(reader, &view_then, reading, times, &timelines, models)
             };
             let known = self.with_map_reader(looking).await?;
-            if self.maps().look(&view.row, SiteMap::stamp) == stamp {
+            if self.maps().with_map(&view.row, SiteMap::stamp) == stamp {
                 return Ok(known);
             }
         }
@@ -162,7 +162,7 @@ impl App {
         times: &Checked,
     ) -> Result<BTreeMap<Epoch, Arc<Timeline>>, AppError> {
         let row = &view.row;
-        let (divided, count) = self.maps().look(row, |map| {
+        let (divided, count) = self.maps().with_map(row, |map| {
             let past = times.times.iter().copied().take(times.past_count());
             let epochs = past.map(|at| (at, map.epoch_at(at)));
             let divided = epochs.filter(|&(at, epoch)| Reading::divides(at, epoch));

@@ -27,9 +27,9 @@ const WAITING_MAX: usize = 64;
 
 /// Channel for messages about maps to subscribers other than the feed of events.
 #[derive(Debug)]
-pub(in crate::app) struct MapNews(broadcast::Sender<MapChange>);
+pub(in crate::app) struct MapUpdates(broadcast::Sender<MapChange>);
 
-impl Default for MapNews {
+impl Default for MapUpdates {
     fn default() -> Self {
         Self(broadcast::channel(WAITING_MAX).0)
     }
@@ -46,7 +46,7 @@ struct Announced {
 pub async fn run(app: App, stop: CancellationToken) {
     let mut announced = HashMap::new();
     loop {
-        if let Err(cause) = db::limited(app.tell_changes(&mut announced)).await {
+        if let Err(cause) = db::limited(app.publish_changes(&mut announced)).await {
             app.log_failure("tell where the map has changed", &cause);
         }
         tokio::select! {
@@ -59,16 +59,19 @@ pub async fn run(app: App, stop: CancellationToken) {
 impl App {
     /// Subscribes to changes of maps from now on.
     pub fn map_news(&self) -> broadcast::Receiver<MapChange> {
-        self.news().0.subscribe()
+        self.map_updates().0.subscribe()
     }
 
-    async fn tell_changes(&self, announced: &mut HashMap<i64, Announced>) -> Result<(), AppError> {
+    async fn publish_changes(
+        &self,
+        announced: &mut HashMap<i64, Announced>,
+    ) -> Result<(), AppError> {
         let mut tx = self.db().read("friction").await?;
         let rows = db::sites::list(&mut tx, &Scope::EVERYWHERE, "", SITES_MAX).await?;
         drop(tx);
         for row in rows {
             let present = Announced {
-                change: self.maps().look(&row, |map| map.changes().newest()),
+                change: self.maps().with_map(&row, |map| map.changes().newest()),
                 terrain_revision: row.site.terrain_revision,
             };
             let Some(before) = announced.insert(row.pk, present) else {
@@ -78,14 +81,14 @@ impl App {
                 let change = self.change_since(&row, before);
                 self.hub().map(&change);
                 // Fails only without subscribers.
-                let _ = self.news().0.send(change);
+                let _ = self.map_updates().0.send(change);
             }
         }
         Ok(())
     }
 
     fn change_since(&self, row: &SiteRow, before: Announced) -> MapChange {
-        let mut boxes: Vec<CellBox> = self.maps().look(row, |map| {
+        let mut boxes: Vec<CellBox> = self.maps().with_map(row, |map| {
             let changed = map.changes().blocks();
             let changed = changed.filter(|(_, newest)| *newest > before.change);
             let boxes = changed.map(|(block, _)| CellBox {

@@ -76,7 +76,7 @@ impl<'app> MapReader<'app> {
 
     /// Reads a site's map without its cells.
     pub(super) fn map<T>(&self, row: &SiteRow, read: impl FnOnce(&SiteMap) -> T) -> T {
-        self.app.maps().look(row, read)
+        self.app.maps().with_map(row, read)
     }
 
     /// Reads the cells of a site's map. `read` is called again after blocks were loaded that it

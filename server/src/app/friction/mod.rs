@@ -34,7 +34,7 @@ pub(crate) use self::area::AreaBounds;
 pub use self::cells::{CELLS_MAX, CellsAsked};
 pub use self::export::{CellExport, SegmentExport};
 pub use self::history::Times;
-pub(super) use self::live::MapNews;
+pub(super) use self::live::MapUpdates;
 use self::map_reader::MapReader;
 pub(super) use self::map_reader::ReaderSlots;
 pub use self::pictures::Picture;
@@ -126,7 +126,7 @@ impl App {
         let is_past = readings.iter().any(|reading| reading.as_of.is_some());
         let work = Arc::new(work);
         for _ in 0..READS_MAX {
-            let stamp = self.maps().look(row, SiteMap::stamp);
+            let stamp = self.maps().with_map(row, SiteMap::stamp);
             let mut readings = readings.clone();
             for reading in &mut readings {
                 reading.of_site(self, row).await?;
@@ -139,7 +139,7 @@ impl App {
                 work(reader, &readings)
             };
             let answer = self.with_map_reader(looking).await?;
-            if !is_past || self.maps().look(row, SiteMap::stamp) == stamp {
+            if !is_past || self.maps().with_map(row, SiteMap::stamp) == stamp {
                 return Ok(answer);
             }
         }
@@ -206,7 +206,7 @@ impl App {
         terrain: &Terrain,
     ) -> Vec<ModelFriction> {
         let is_wanted = |found: &TerrainRef| found.id == terrain.id && view.is_present(found);
-        self.maps().look(&view.row, |map| {
+        self.maps().with_map(&view.row, |map| {
             let groups = map.terrain(is_wanted, reading.choice());
             let models = groups.into_iter().map(|group| ModelFriction {
                 configuration: group.configuration,

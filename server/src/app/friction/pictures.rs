@@ -135,7 +135,7 @@ impl App {
         let grid = row.site.grid;
         let bounds = asked.area.and_then(|area| area.cells(&grid).ok());
         let bounds = bounds.map(|cells| Block::of(cells.min)..=Block::of(cells.max));
-        self.maps().look(row, |map| State {
+        self.maps().with_map(row, |map| State {
             change: match bounds {
                 // The default model, the one driven most, depends on the whole map.
                 Some(blocks) if reading.reference().is_some() => map.changes().newest_in(blocks),

@@ -80,7 +80,7 @@ impl Reading {
         let Some(as_of) = self.as_of else {
             return Ok(());
         };
-        let epoch = app.maps().look(row, |map| map.epoch_at(as_of));
+        let epoch = app.maps().with_map(row, |map| map.epoch_at(as_of));
         let timeline = if Self::divides(as_of, epoch) {
             app.timeline(row, epoch).await?
         } else {

@@ -110,7 +110,7 @@ impl App {
     ) -> Result<Option<Arc<Timeline>>, AppError> {
         let looked = |map: &SiteMap| (map.measurements_of(epoch), map.stamp());
         // Read before the database, which is never behind the map.
-        let (wanted, stamp) = self.maps().look(row, looked);
+        let (wanted, stamp) = self.maps().with_map(row, looked);
         let wanted = usize::try_from(wanted).unwrap_or(usize::MAX);
         if wanted == 0 {
             return Ok(Some(Arc::new(Timeline::new(epoch))));

@@ -351,7 +351,7 @@ impl App {
         }
     }
 
-    pub(super) fn note_use(&self, used: Used, at: Timestamp) {
+    pub(super) fn record_use(&self, used: Used, at: Timestamp) {
         let log = &self.identity().audit;
         log.lock().uses.insert(used, at);
         log.added.notify_one();
@@ -395,7 +395,7 @@ impl App {
                 since,
                 newest_max: ENTRIES_MAX,
             };
-            db::audit::forget(&mut tx, kept, FORGET_MAX).await?;
+            db::audit::prune(&mut tx, kept, FORGET_MAX).await?;
         }
         tx.commit().await?;
         if self.identity().audit.is_logged {

@@ -38,7 +38,7 @@ impl IdTokens {
     }
 
     /// Forgets the ID tokens of sessions that have ended.
-    pub(super) fn forget(&self, sessions: &[SessionId]) {
+    pub(super) fn remove(&self, sessions: &[SessionId]) {
         let mut kept = self.lock();
         for session in sessions {
             kept.of.remove(session);

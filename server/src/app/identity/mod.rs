@@ -155,7 +155,7 @@ impl App {
         );
         let found = match &secret {
             Some(secret) => {
-                let _turn = self.look_up_turn(purpose).await?;
+                let _turn = self.lookup_permit(purpose).await?;
                 self.look_up(secret).await
             }
             None => Err(SignInError::Malformed),
@@ -177,7 +177,7 @@ impl App {
     }
 
     /// Waits for permission to look up a secret that is not cached.
-    pub(super) async fn look_up_turn(
+    pub(super) async fn lookup_permit(
         &self,
         purpose: Purpose,
     ) -> Result<SemaphorePermit<'_>, DbError> {
@@ -195,7 +195,7 @@ impl App {
     ///
     /// # Errors
     /// The database failed; the cache is unchanged.
-    pub async fn know_tokens(&self) -> Result<(), AppError> {
+    pub async fn load_tokens(&self) -> Result<(), AppError> {
         let known = &self.identity().known;
         let (generation, began_at) = (known.generation(), self.clock().elapsed());
         let asked_at = Instant::now();
@@ -323,7 +323,7 @@ impl App {
                 (SubjectId::Person(_), Some(session)) => Used::Session(session),
                 (SubjectId::Person(_), None) => return,
             };
-            self.note_use(used, now);
+            self.record_use(used, now);
         }
     }
 
@@ -366,7 +366,7 @@ pub async fn run(app: App, every: Duration, stop: CancellationToken) {
             () = stop.cancelled() => return,
             () = tokio::time::sleep(every) => {}
         }
-        if let Err(error) = db::limited(app.know_tokens()).await {
+        if let Err(error) = db::limited(app.load_tokens()).await {
             app.log_failure("read the valid tokens", &error);
         }
     }

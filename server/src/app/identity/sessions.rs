@@ -64,7 +64,7 @@ impl App {
                 return Ok(None);
             }
         }
-        db::sessions::forget_expired(&mut tx, now).await?;
+        db::sessions::delete_expired(&mut tx, now).await?;
         db::sessions::insert(&mut tx, &session).await?;
         let surplus = db::sessions::surplus(&mut tx, (token, person), SESSIONS_EACH_MAX).await?;
         for &id in &surplus {
@@ -116,7 +116,7 @@ impl App {
         let known = &self.identity().known;
         known.end(|known| known.session.is_some_and(is_ended));
         if let Some(people) = self.people() {
-            people.id_tokens.forget(ids);
+            people.id_tokens.remove(ids);
         }
     }
 

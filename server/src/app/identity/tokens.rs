@@ -238,7 +238,7 @@ impl App {
         };
         db::tokens::insert(tx, &token, &secret.fingerprint()).await?;
         if let Ok(before) = now.checked_sub(DEAD_KEPT) {
-            db::tokens::forget_dead(tx, before, FORGET_MAX).await?;
+            db::tokens::delete_ended(tx, before, FORGET_MAX).await?;
         }
         Ok(CreatedToken {
             token,

@@ -32,7 +32,7 @@ impl Deduplication {
         for (boot_pk, span) in spans {
             let newest = keys.newest_seq(tx, boot_pk).await?;
             let seq = span.1;
-            keys.note_seq(RecordKey { boot_pk, seq });
+            keys.record_seq(RecordKey { boot_pk, seq });
             if newest.is_none_or(|newest| newest < span.0) {
                 continue;
             }

@@ -48,7 +48,7 @@ pub(super) struct RobotKeys {
 }
 
 impl Keys {
-    pub(super) fn forget(&mut self) {
+    pub(super) fn clear(&mut self) {
         *self = Self::default();
     }
 
@@ -60,7 +60,7 @@ impl Keys {
             self.newest_seqs.len(),
         ];
         if maps.into_iter().sum::<usize>() > KEYS_MAX {
-            self.forget();
+            self.clear();
         }
     }
 
@@ -129,7 +129,7 @@ impl Keys {
     }
 
     /// Notes that segments of a run up to this one are about to be stored.
-    pub(super) fn note_seq(&mut self, last: RecordKey) {
+    pub(super) fn record_seq(&mut self, last: RecordKey) {
         let newest = self.newest_seqs.entry(last.boot_pk).or_default();
         *newest = (*newest).max(Some(last.seq));
     }
@@ -151,7 +151,7 @@ impl Keys {
                 return Ok(Configured::Never);
             }
             None if !app.may_change_configuration(named) => return Ok(Configured::Later),
-            None => db::robots::note_measured(tx, robot_pk, id).await?,
+            None => db::robots::record_measured(tx, robot_pk, id).await?,
         };
         self.configurations.insert((robot_pk, id), key);
         Ok(Configured::As(key))

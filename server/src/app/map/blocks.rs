@@ -108,7 +108,7 @@ impl Maps {
         read: impl FnOnce(Cells<'_>) -> T,
     ) -> T {
         let number = self.memory.tick();
-        self.look(row, |map| read(map.cells(absent, number)))
+        self.with_map(row, |map| read(map.cells(absent, number)))
     }
 
     /// Takes blocks out of memory if all together need too much of it.
@@ -147,7 +147,7 @@ impl Maps {
 
     /// Keeps those of the blocks that are in memory there, and returns the absent ones.
     fn pin(&self, row: &SiteRow, blocks: &[Block], pins: &mut Pins) -> Vec<Block> {
-        self.look(row, |map| {
+        self.with_map(row, |map| {
             let absent = blocks.iter().filter(|&&block| !pins.add(map, block));
             absent.copied().collect()
         })
@@ -284,7 +284,7 @@ impl App {
         let _reading = maps.begin_read();
         let snapshot = match maps.follower() {
             None => {
-                let stamp = maps.look(row, SiteMap::stamp);
+                let stamp = maps.with_map(row, SiteMap::stamp);
                 let mut tx = self.db().read("map block").await?;
                 self.snapshot_of(&mut tx, (row, stamp), absent).await?
             }
@@ -294,7 +294,7 @@ impl App {
                 if !self.follow_in(&mut tx, &mut turn).await? {
                     return Err(DbError::Unsettled);
                 }
-                let stamp = maps.look(row, SiteMap::stamp);
+                let stamp = maps.with_map(row, SiteMap::stamp);
                 let snapshot = self.snapshot_of(&mut tx, (row, stamp), absent).await?;
                 if maps.unwritten().is_divided_by(&snapshot.watermarks) {
                     return Err(DbError::Unsettled);

@@ -147,7 +147,7 @@ impl App {
         let now = self.clock().elapsed();
         if now.saturating_sub(read.watermarks_at) >= FORGET_EVERY {
             read.watermarks_at = now;
-            if !self.forget_stored(db::watermarks::all(tx).await?, read) {
+            if !self.remove_stored(db::watermarks::all(tx).await?, read) {
                 return Ok(false);
             }
         }
@@ -184,7 +184,7 @@ impl App {
         }
         for site in sites {
             let horizons = site.horizons;
-            if self.maps().look(&site, SiteMap::horizons) != horizons {
+            if self.maps().with_map(&site, SiteMap::horizons) != horizons {
                 self.apply(MapChange::MergeBefore(Box::new(site), horizons));
             }
         }
@@ -239,7 +239,7 @@ impl App {
     }
 
     /// Removes sums from the unwritten ones that are stored now; `false` if this process is the server now.
-    fn forget_stored(&self, watermarks: HashMap<i64, i64>, read: &mut Read) -> bool {
+    fn remove_stored(&self, watermarks: HashMap<i64, i64>, read: &mut Read) -> bool {
         let step = |(&robot_pk, &to_pk): (&i64, &i64)| {
             let from_pk = read.watermarks.get(&robot_pk).copied().unwrap_or_default();
             (to_pk > from_pk).then_some(WatermarkStep {
@@ -250,7 +250,7 @@ impl App {
         };
         let steps: Vec<WatermarkStep> = watermarks.iter().filter_map(step).collect();
         read.watermarks = watermarks;
-        self.maps().forget_followed(&steps)
+        self.maps().remove_followed(&steps)
     }
 
     /// Returns the number of standbys that follow the database of this server; `None` for a database that has
@@ -272,7 +272,7 @@ impl App {
     ///
     /// # Errors
     /// The database failed.
-    pub async fn take_map(&self) -> Result<bool, DbError> {
+    pub async fn take_over_map(&self) -> Result<bool, DbError> {
         let maps = self.maps();
         let Some(follower) = maps.follower() else {
             return Ok(false);
@@ -304,7 +304,7 @@ impl App {
         if self.maps().unwritten().is_divided_by(&watermarks) {
             return Ok(false);
         }
-        if !self.forget_stored(watermarks, read) {
+        if !self.remove_stored(watermarks, read) {
             return Ok(false);
         }
         self.removed().extend(db::removed::boots(&mut tx).await?);
@@ -315,7 +315,7 @@ impl App {
     ///
     /// # Errors
     /// The database failed.
-    pub async fn know_leader(&self) -> Result<(), DbError> {
+    pub async fn load_leader(&self) -> Result<(), DbError> {
         if let Some(follower) = self.maps().follower() {
             let mut tx = self.db().read("follow").await?;
             follower.seen().leader = db::leader::get(&mut tx).await?;

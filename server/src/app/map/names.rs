@@ -19,7 +19,7 @@ pub(super) struct KeyNames {
 }
 
 impl KeyNames {
-    pub(super) fn note(&mut self, folded: &Folded) {
+    pub(super) fn record(&mut self, folded: &Folded) {
         let key = &folded.key;
         let robot = self.robots.entry(key.robot_pk);
         robot.or_insert_with(|| folded.robot.clone());

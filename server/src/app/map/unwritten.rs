@@ -52,7 +52,7 @@ pub(super) struct Unwritten {
     next_read: u64,
     /// Generations that were stored while blocks were read, in the order in which they were: the
     /// snapshots of those reads may lack them.
-    stored_meanwhile: VecDeque<StoredMeanwhile>,
+    stored_during_read: VecDeque<StoredDuringRead>,
 }
 
 /// Sums of some segments of one robot.
@@ -69,7 +69,7 @@ struct Generation {
 
 /// A generation that was stored while blocks were read.
 #[derive(Debug)]
-pub(super) struct StoredMeanwhile {
+pub(super) struct StoredDuringRead {
     robot_pk: i64,
     generation: Generation,
     /// Number of the first read that began after it was stored.
@@ -106,7 +106,7 @@ impl Default for Unwritten {
             additions: 0,
             reads: BTreeSet::new(),
             next_read: 0,
-            stored_meanwhile: VecDeque::new(),
+            stored_during_read: VecDeque::new(),
         }
     }
 }
@@ -276,7 +276,7 @@ impl Unwritten {
                 self.sums -= stored.sums.len();
                 self.segments -= stored.segments();
                 if !self.reads.is_empty() {
-                    self.stored_meanwhile.push_back(StoredMeanwhile {
+                    self.stored_during_read.push_back(StoredDuringRead {
                         robot_pk: step.robot_pk,
                         generation: stored,
                         until_read: self.next_read,
@@ -299,11 +299,11 @@ impl Unwritten {
     }
 
     /// Ends a read of blocks. Returns what was kept for it alone.
-    pub(super) fn end_read(&mut self, number: u64) -> Vec<StoredMeanwhile> {
+    pub(super) fn end_read(&mut self, number: u64) -> Vec<StoredDuringRead> {
         self.reads.remove(&number);
         let oldest = self.reads.first().copied().unwrap_or(self.next_read);
-        let is_over = |stored: &mut StoredMeanwhile| stored.until_read <= oldest;
-        let over = std::iter::from_fn(|| self.stored_meanwhile.pop_front_if(is_over));
+        let is_over = |stored: &mut StoredDuringRead| stored.until_read <= oldest;
+        let over = std::iter::from_fn(|| self.stored_during_read.pop_front_if(is_over));
         over.collect()
     }
 
@@ -322,7 +322,7 @@ impl Unwritten {
         site_pk: i64,
         block: Block,
     ) -> impl Iterator<Item = (&'all SumKey, &'all Sums)> {
-        let stored = self.stored_meanwhile.iter();
+        let stored = self.stored_during_read.iter();
         let stored = stored.map(|stored| (stored.robot_pk, &stored.generation));
         let unwritten = self.robots.iter().flat_map(|(&robot_pk, generations)| {
             generations

@@ -14,7 +14,7 @@ use tread_api::mission::{
 use tread_api::wire::command::Offer;
 
 use super::transitions::Change;
-use super::{Step, add_note, check_limits, take_step};
+use super::{Step, add_note, apply_transition, check_limits};
 use crate::app::check::StartPlace;
 use crate::app::{App, AppError};
 use crate::db::missions::{Facts, MissionRow};
@@ -35,7 +35,7 @@ impl App {
                 at: self.clock().now(),
                 facts: Facts::default(),
             };
-            take_step(&mut tx, &(&row.mission).into(), step).await?;
+            apply_transition(&mut tx, &(&row.mission).into(), step).await?;
         }
         self.written(tx, id).await
     }

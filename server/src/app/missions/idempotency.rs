@@ -138,7 +138,7 @@ impl App {
         db::idempotency::insert(&mut tx, key, &stored, now).await?;
         let kept = SignedDuration::try_from(KEPT).unwrap_or(SignedDuration::MAX);
         if let Ok(before) = now.checked_sub(kept) {
-            db::idempotency::forget_before(&mut tx, before, FORGET_MAX).await?;
+            db::idempotency::delete_before(&mut tx, before, FORGET_MAX).await?;
         }
         tx.commit().await?;
         Ok(Once::Now(enqueued))

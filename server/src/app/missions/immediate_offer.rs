@@ -1,7 +1,7 @@
 //! The offer of a mission in the transaction that inserts it.
 //!
 //! The reconciler would set the mission to `offered` in a transaction of its own, with a write to the
-//! disk that the robot waits for. It still sends the offer: at once, from [`JustOffered`], or as of every
+//! disk that the robot waits for. It still sends the offer: at once, from [`NewOffers`], or as of every
 //! mission that it reads as offered.
 
 use std::collections::VecDeque;
@@ -20,7 +20,7 @@ use crate::db::{self, Tx};
 /// Maximum time for reading the map beside the commit of a mission: blocks that are not in memory may
 /// take longer, and then the reconciler reads them.
 const EARLY_PRIOR_MAX: Duration = Duration::from_millis(500);
-/// Maximum number of missions in [`JustOffered`]; the reconciler reads the others from the database.
+/// Maximum number of missions in [`NewOffers`]; the reconciler reads the others from the database.
 const JUST_OFFERED_MAX: usize = 64;
 
 /// A mission that is to be offered now.
@@ -35,11 +35,11 @@ pub(in crate::app) struct OfferedNow {
 
 /// Missions whose creation and offer are committed, for the reconciler.
 #[derive(Debug, Default)]
-pub(in crate::app) struct JustOffered {
+pub(in crate::app) struct NewOffers {
     missions: Mutex<VecDeque<OfferedNow>>,
 }
 
-impl JustOffered {
+impl NewOffers {
     fn lock(&self) -> MutexGuard<'_, VecDeque<OfferedNow>> {
         self.missions.lock().unwrap_or_else(PoisonError::into_inner)
     }

@@ -72,7 +72,7 @@ impl App {
                 prior,
                 recalls,
             };
-            self.just_offered().add(offered);
+            self.new_offers().add(offered);
         }
         if enqueued.has_ended_others {
             self.recall();
@@ -364,7 +364,7 @@ async fn end_each(
             at,
             facts: Facts::default(),
         };
-        take_step(tx, mission, step).await?;
+        apply_transition(tx, mission, step).await?;
     }
     Ok(())
 }
@@ -410,7 +410,7 @@ pub(super) struct Step<'step> {
 /// Applies a transition if the table allows it and the mission is still in the state that was read.
 ///
 /// Returns the new state; `None` if nothing changed.
-pub(super) async fn take_step(
+pub(super) async fn apply_transition(
     tx: &mut Tx,
     open: &OpenMission,
     step: Step<'_>,
@@ -456,7 +456,7 @@ pub(super) async fn take_step(
 }
 
 /// Adds a note to a mission's history without a transition.
-pub(super) async fn note(
+pub(super) async fn record_note(
     tx: &mut Tx,
     row: &MissionRow,
     actor: Actor,

@@ -9,7 +9,7 @@ use tread_api::robot::MissionProgress;
 use tread_api::wire::ingest::{MissionPhase, MissionReport};
 
 use super::transitions::Change;
-use super::{EVENTS_MAX, Step, bounded, note, take_step};
+use super::{EVENTS_MAX, Step, apply_transition, bounded, record_note};
 use crate::db::missions::{Facts, MissionRow};
 use crate::db::{self, DbError, Tx};
 
@@ -52,7 +52,7 @@ pub(crate) struct Foreign(pub(crate) String);
 /// the present one. An end under an earlier revision ends the mission all the same: the robot had
 /// finished before the new one arrived. So does an end under a later revision that a restoration
 /// from a backup has taken from the server.
-pub(crate) async fn take_report(
+pub(crate) async fn apply_mission_report(
     tx: &mut Tx,
     reporting: Reporting,
     report: &MissionReport,
@@ -81,12 +81,12 @@ pub(crate) async fn take_report(
                 "the robot reported of revision {}, which was lost with a restoration",
                 report.revision
             );
-            note(tx, &row, Actor::Robot, reporting.now, &text).await?;
+            record_note(tx, &row, Actor::Robot, reporting.now, &text).await?;
             return Ok(Ok(NOTED));
         }
         Content::Earlier => {
             let text = format!("the robot reported late of revision {}", report.revision);
-            note(tx, &row, Actor::Robot, reporting.now, &text).await?;
+            record_note(tx, &row, Actor::Robot, reporting.now, &text).await?;
             return Ok(Ok(NOTED));
         }
         Content::Other => {
@@ -94,7 +94,7 @@ pub(crate) async fn take_report(
             return Ok(Err(Foreign(reason)));
         }
     };
-    let ended = take_phase(tx, reporting, report, &row).await?;
+    let ended = apply_phase(tx, reporting, report, &row).await?;
     if is_end(report.phase) {
         let (quality, driven) = (report.quality.as_ref(), report.driven.as_ref());
         db::missions::add_outcome(tx, id, quality, driven).await?;
@@ -177,7 +177,7 @@ fn impossible(report: &MissionReport) -> Option<String> {
     }
 }
 
-async fn take_phase(
+async fn apply_phase(
     tx: &mut Tx,
     reporting: Reporting,
     report: &MissionReport,
@@ -219,7 +219,7 @@ async fn take_phase(
         at: reporting.now,
         facts,
     };
-    if let Some(state) = take_step(tx, &mission.into(), step).await? {
+    if let Some(state) = apply_transition(tx, &mission.into(), step).await? {
         let why = reason.unwrap_or(change.reason()).to_owned();
         return Ok(state.is_terminal().then_some((state, why)));
     }
@@ -227,7 +227,7 @@ async fn take_phase(
     if started && open && mission.started_at.is_none() {
         db::missions::add_facts(tx, mission.id, facts).await?;
         let text = "the robot began to drive";
-        note(tx, row, Actor::Robot, reporting.now, text).await?;
+        record_note(tx, row, Actor::Robot, reporting.now, text).await?;
         return Ok(None);
     }
     // The robot's answer to the command has caused this transition already.
@@ -241,7 +241,7 @@ async fn take_phase(
         .map(|reason| format!(": {reason}"))
         .unwrap_or_default();
     let text = format!("the robot reported late that it {name}{reason}");
-    note(tx, row, Actor::Robot, reporting.now, &text).await?;
+    record_note(tx, row, Actor::Robot, reporting.now, &text).await?;
     Ok(None)
 }
 

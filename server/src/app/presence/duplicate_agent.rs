@@ -45,13 +45,13 @@ pub(super) struct OtherRun {
 }
 
 impl Presence {
-    pub(super) fn forget_other(&mut self) {
+    pub(super) fn remove_other(&mut self) {
         let other = self.other.take();
         self.alerts_changed |= other.is_some_and(|other| other.is_duplicate);
     }
 
     /// Records a state of another run, while the present one is on the network.
-    pub(super) fn note_other(&mut self, state: &RobotState, now: Duration) {
+    pub(super) fn record_other(&mut self, state: &RobotState, now: Duration) {
         let ticks = state.control_loop.ticks;
         let fresh = OtherRun {
             boot: state.boot,
@@ -106,7 +106,7 @@ impl Presences {
                 continue;
             };
             if now.saturating_sub(other.heard_at) > DUPLICATE_GONE {
-                presence.forget_other();
+                presence.remove_other();
             } else if other.is_duplicate {
                 duplicates.push(DuplicateAgent {
                     key: key.clone(),

@@ -42,7 +42,7 @@ pub(super) struct LinkCounts {
 impl LinkCounts {
     fn minute(&mut self, now: Duration) -> &mut Minute {
         let number = now.as_secs() / MINUTE_S;
-        self.forget(number);
+        self.drop_expired(number);
         if self.minutes.back().is_none_or(|last| last.number < number) {
             self.minutes.push_back(Minute {
                 number,
@@ -54,7 +54,7 @@ impl LinkCounts {
     }
 
     /// Drops the minutes that ended an hour ago.
-    fn forget(&mut self, number: u64) {
+    fn drop_expired(&mut self, number: u64) {
         while self
             .minutes
             .front()

@@ -244,7 +244,7 @@ impl Presence {
             self.friction = None;
             self.clock_offsets_ms.clear();
             if self.other.is_some_and(|other| other.boot == boot) {
-                self.forget_other();
+                self.remove_other();
             }
             self.monotonic_offsets_us.clear();
         }
@@ -328,7 +328,7 @@ impl Presences {
     }
 
     /// Records a robot that sent a hello to an earlier run of this server.
-    pub fn know(&self, key: RobotKey) {
+    pub fn register(&self, key: RobotKey) {
         self.lock().entry(key).or_default().welcomed = true;
     }
 
@@ -382,7 +382,7 @@ impl Presences {
         };
         let was_online = presence.link(now) == LinkState::Online;
         if !presence.takes(state.boot, now) {
-            presence.note_other(&state, now);
+            presence.record_other(&state, now);
             return Heard::Other;
         }
         let news = presence.state().is_none_or(|before| {

@@ -59,7 +59,7 @@ impl Presences {
     ///
     /// At most [`NEWS_MAX`] per call, so that clients are not overloaded; the others follow in
     /// later calls.
-    pub fn take_news(&self, now: Duration) -> Vec<RobotKey> {
+    pub fn take_changed(&self, now: Duration) -> Vec<RobotKey> {
         let mut robots = self.lock();
         let mut news = Vec::new();
         for (key, presence) in robots.iter_mut() {

@@ -123,7 +123,7 @@ fn robot_off_link_down_and_a_loop_that_stands_still_are_distinguished() {
     let presences = Presences::default();
     let cause = |now| presences.get(&key()).link_cause(now);
     assert_eq!(cause(SECOND), Some(LinkCause::ServerRestarted));
-    presences.know(key());
+    presences.register(key());
     presences.token_appeared(key(), boot(1), SECOND);
     presences.state(&key(), state(boot(1), 1), SECOND, wall());
     assert_eq!(cause(SECOND), None);
@@ -145,7 +145,7 @@ fn robot_off_link_down_and_a_loop_that_stands_still_are_distinguished() {
 #[test]
 fn the_clock_offset_is_that_of_the_state_with_the_shortest_way() {
     let presences = Presences::default();
-    presences.know(key());
+    presences.register(key());
     let said = |seq, late_ms: i64| {
         let heard_at = wall() + jiff::SignedDuration::from_millis(late_ms - 3_000);
         presences.state(&key(), state(boot(1), seq), SECOND, heard_at);
@@ -159,7 +159,7 @@ fn the_clock_offset_is_that_of_the_state_with_the_shortest_way() {
 #[test]
 fn an_older_state_that_comes_late_is_not_shown() {
     let presences = Presences::default();
-    presences.know(key());
+    presences.register(key());
     presences.state(&key(), state(boot(1), 5), SECOND, wall());
     presences.state(&key(), state(boot(1), 4), SECOND, wall());
     assert_eq!(presences.get(&key()).state().unwrap().seq, 5);

@@ -108,7 +108,7 @@ impl Attendance {
     ///
     /// # Errors
     /// The database failed; the next check repeats this one.
-    pub(super) async fn look(&mut self, app: &App) -> Result<(), AppError> {
+    pub(super) async fn check(&mut self, app: &App) -> Result<(), AppError> {
         let elapsed = app.clock().elapsed();
         let is_early = |looked_at: Duration| elapsed.saturating_sub(looked_at) < LOOK_EVERY;
         if self.looked_at.is_some_and(is_early) {

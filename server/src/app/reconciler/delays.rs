@@ -72,7 +72,7 @@ impl Delays {
     ///
     /// # Errors
     /// The database failed; the next check repeats this one.
-    pub(super) async fn look(&mut self, app: &App, open: &[OpenMission]) -> Result<(), AppError> {
+    pub(super) async fn check(&mut self, app: &App, open: &[OpenMission]) -> Result<(), AppError> {
         let now = app.clock().elapsed();
         let robots = match &mut self.robots {
             Some(robots) => robots,

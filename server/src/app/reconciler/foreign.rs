@@ -10,7 +10,7 @@ use crate::app::{App, AppError};
 use crate::db;
 
 /// Commands a robot to end a mission that is not among its open ones in the database.
-pub(super) async fn disown(
+pub(super) async fn cancel_foreign_mission(
     app: App,
     key: RobotKey,
     mission: MissionId,

@@ -15,7 +15,7 @@ use tread_telemetry::Place;
 use crate::app::missions::immediate_offer::OfferedNow;
 use crate::app::missions::reports::{adopt, was_resumed_since};
 use crate::app::missions::transitions::Change;
-use crate::app::missions::{Step, add_note, take_step};
+use crate::app::missions::{Step, add_note, apply_transition};
 use crate::app::presence::RobotKey;
 use crate::app::stops::{StopDelivery, send_stop};
 use crate::app::terrains::site_definition;
@@ -57,7 +57,7 @@ pub(super) async fn settle(
     let mut tx = app.db().write_uncounted("reconciler").await?;
     let step = server_step(app, change, None, facts);
     let mut alerts = Vec::new();
-    let moved = take_step(&mut tx, mission, step).await?;
+    let moved = apply_transition(&mut tx, mission, step).await?;
     let is_for_safety = |shown: MissionProgress| shown.is_paused_for_safety();
     if moved == Some(MissionState::Paused) && facts.progress.is_some_and(is_for_safety) {
         let shown_for = SignedDuration::try_from(shown_for).unwrap_or_default();
@@ -124,7 +124,7 @@ pub(super) async fn offer(app: App, open: OpenMission) -> Result<Finished, AppEr
     if open.state == MissionState::Queued {
         let mut tx = app.db().write_uncounted("reconciler").await?;
         let step = server_step(&app, Change::Offer, None, Facts::default());
-        match take_step(&mut tx, &open, step).await {
+        match apply_transition(&mut tx, &open, step).await {
             Ok(Some(_)) => {
                 tx.commit().await?;
                 app.announce();
@@ -201,10 +201,10 @@ pub(super) async fn send_offer(app: App, offered: OfferedNow) -> Result<Finished
     let Ok(answer) = answer else {
         return Ok(Finished::Again);
     };
-    take_offer_answer(&app, mission.id, &answer).await
+    handle_offer_reply(&app, mission.id, &answer).await
 }
 
-async fn take_offer_answer(
+async fn handle_offer_reply(
     app: &App,
     id: MissionId,
     answer: &Answer<OfferReply>,
@@ -241,7 +241,7 @@ async fn take_offer_answer(
             actor: Actor::Robot,
             ..server_step(app, change, reason, facts)
         };
-        let moved = take_step(&mut tx, &(&row.mission).into(), step).await?;
+        let moved = apply_transition(&mut tx, &(&row.mission).into(), step).await?;
         if moved.is_none() && change == Change::Accept && !row.mission.state.is_terminal() {
             db::missions::add_facts(&mut tx, id, facts).await?;
         }
@@ -325,7 +325,7 @@ pub(super) async fn replace(app: App, open: OpenMission) -> Result<Finished, App
 }
 
 /// Makes the revision that the robot shows the present one.
-pub(super) async fn adopt_shown(app: &App, open: &OpenMission) -> Result<(), AppError> {
+pub(super) async fn adopt_reported_revision(app: &App, open: &OpenMission) -> Result<(), AppError> {
     let mut tx = app.db().write_uncounted("reconciler").await?;
     if let Some(row) = db::missions::find(&mut tx, open.id).await? {
         adopt(&mut tx, &row, Actor::Robot, app.clock().now()).await?;
@@ -420,7 +420,7 @@ pub(super) async fn cancel(app: App, mission: OpenMission) -> Result<Finished, A
             ..Facts::default()
         };
         let step = server_step(&app, Change::Cancel, reason, facts);
-        take_step(
+        apply_transition(
             &mut tx,
             &open,
             Step {
@@ -440,11 +440,11 @@ pub(super) async fn stop_again(app: App, stop: Stop) -> Result<Finished, AppErro
     match send_stop(&app, &stop).await {
         StopDelivery::Confirmed => {
             let confirmed = (stop.id, app.clock().now());
-            app.note_confirmed(&[stop], &[confirmed]).await?;
+            app.record_confirmed(&[stop], &[confirmed]).await?;
         }
-        StopDelivery::Over => app.note_over(&stop).await?,
+        StopDelivery::Over => app.record_over(&stop).await?,
         StopDelivery::Unconfirmed => {
-            app.note_unconfirmed(&[&stop]).await?;
+            app.alert_unconfirmed(&[&stop]).await?;
             return Ok(Finished::Again);
         }
     }

@@ -14,7 +14,7 @@ mod foreign;
 mod jobs;
 pub mod needs;
 mod outcomes;
-mod upkeep;
+mod periodic_checks;
 
 use std::collections::{HashMap, HashSet};
 use std::sync::atomic::Ordering;
@@ -32,9 +32,9 @@ use tread_api::stop::Stop;
 use self::attendance::Attendance;
 use self::conditions::Conditions;
 use self::delays::Delays;
-use self::foreign::disown;
+use self::foreign::cancel_foreign_mission;
 use self::jobs::{
-    Finished, adopt_shown, cancel, hold, offer, replace, send_offer, settle, stop_again,
+    Finished, adopt_reported_revision, cancel, hold, offer, replace, send_offer, settle, stop_again,
 };
 use self::needs::{Memory, Need, Now, Silence, decide, is_absent, is_heard, is_held_otherwise};
 use super::missions::transitions::Change;
@@ -103,11 +103,11 @@ pub async fn run(app: App, stop: CancellationToken) {
         tokio::select! {
             biased;
             () = stop.cancelled() => break,
-            Some((job, how)) = reconciler.finishing.recv() => reconciler.note(job, how),
+            Some((job, how)) = reconciler.finishing.recv() => reconciler.record(job, how),
             () = app.changed() => {}
             () = tokio::time::sleep(pause) => {}
         }
-        reconciler.note_all();
+        reconciler.record_all();
     }
 }
 
@@ -142,9 +142,9 @@ pub struct Reconciler {
     answering_since: Duration,
     /// Time of the first delay of those that have followed each other.
     delayed_since: Option<Duration>,
-    /// Time from which the upkeep may run again, and whether a pass has left it out.
-    upkeep_due: Duration,
-    is_upkeep_owed: bool,
+    /// Time from which the periodic checks may run again, and whether a pass has left it out.
+    checks_due: Duration,
+    are_checks_owed: bool,
 }
 
 impl Reconciler {
@@ -168,8 +168,8 @@ impl Reconciler {
             asked: HashMap::new(),
             answering_since: Duration::ZERO,
             delayed_since: None,
-            upkeep_due: Duration::ZERO,
-            is_upkeep_owed: false,
+            checks_due: Duration::ZERO,
+            are_checks_owed: false,
         }
     }
 
@@ -177,15 +177,15 @@ impl Reconciler {
     pub async fn rest(&mut self) {
         while !self.under_way.is_empty() {
             match self.finishing.recv().await {
-                Some((job, how)) => self.note(job, how),
+                Some((job, how)) => self.record(job, how),
                 None => break,
             }
         }
     }
 
-    fn note_all(&mut self) {
+    fn record_all(&mut self) {
         while let Ok((job, how)) = self.finishing.try_recv() {
-            self.note(job, how);
+            self.record(job, how);
         }
     }
 
@@ -206,12 +206,12 @@ impl Reconciler {
             .map(until)
             .filter(|wait| !wait.is_zero())
             .min();
-        let upkeep = self.upkeep_due.saturating_sub(now);
-        let most = if self.is_upkeep_owed { upkeep } else { PERIOD };
+        let checks = self.checks_due.saturating_sub(now);
+        let most = if self.are_checks_owed { checks } else { PERIOD };
         soonest.unwrap_or(PERIOD).min(most)
     }
 
-    fn note(&mut self, job: Job, how: Finished) {
+    fn record(&mut self, job: Job, how: Finished) {
         self.under_way.remove(&job);
         let now = self.app.clock().elapsed();
         if let (
@@ -262,28 +262,28 @@ impl Reconciler {
     /// # Errors
     /// The database failed; the next pass repeats this one.
     pub async fn pass(&mut self) -> Result<(), AppError> {
-        self.send_just_offered();
+        self.send_new_offers();
         let served = self.serve_missions().await;
         self.stop_again().await;
         let alerts = self.app.sync_alerts().await;
         let now = self.app.clock().elapsed();
-        if self.upkeep_due > now {
-            self.is_upkeep_owed = true;
+        if self.checks_due > now {
+            self.are_checks_owed = true;
             return served.map(|_open| ()).and(alerts);
         }
-        self.upkeep_due = now + UPKEEP_EVERY;
-        self.is_upkeep_owed = false;
+        self.checks_due = now + UPKEEP_EVERY;
+        self.are_checks_owed = false;
         let (open, served) = match served {
             Ok(open) => (Some(open), Ok(())),
             Err(error) => (None, Err(error)),
         };
-        let upkeep = self.upkeep(open.as_deref()).await;
-        served.and(alerts).and(upkeep)
+        let checks = self.run_periodic_checks(open.as_deref()).await;
+        served.and(alerts).and(checks)
     }
 
     /// Sends the offers of missions that were created just now, without reading them again.
-    fn send_just_offered(&mut self) {
-        for mission in self.app.just_offered().take() {
+    fn send_new_offers(&mut self) {
+        for mission in self.app.new_offers().take() {
             let job = Job::Offer(mission.row.mission.id);
             if self.is_due(&job) {
                 self.start(job, send_offer(self.app.clone(), mission));
@@ -299,15 +299,15 @@ impl Reconciler {
         let before = std::mem::replace(&mut self.answering_since, NEVER);
         let read = self.read_missions().await;
         let is_prompt = read.is_ok() && begun.elapsed() <= ANSWER_DELAY && before != NEVER;
-        self.note_answer(is_prompt, before);
+        self.record_answer(is_prompt, before);
         let (restrained, open) = read?;
         // Before a mission of a robot that was released is offered, so that nobody sees it driven while
         // its robot counts as one that awaits its release.
         self.app.show_awaiting(&restrained);
         let by_key = restrained.into_iter().map(|it| (key_of(&it), it));
         self.restrained = by_key.collect();
-        self.forget_all_but(&open);
-        self.disown_foreign(&open);
+        self.retain_open(&open);
+        self.cancel_foreign_missions(&open);
         for mission in &open {
             self.serve(mission.clone()).await?;
         }
@@ -315,7 +315,7 @@ impl Reconciler {
     }
 
     /// Notes whether the database answered without delay; `before` is [`Reconciler::answering_since`].
-    fn note_answer(&mut self, is_prompt: bool, before: Duration) {
+    fn record_answer(&mut self, is_prompt: bool, before: Duration) {
         let now = self.app.clock().elapsed();
         if is_prompt {
             self.answering_since = before;
@@ -340,7 +340,7 @@ impl Reconciler {
 
     /// Sends unconfirmed stops again. Continues even if everything else fails.
     async fn stop_again(&mut self) {
-        match self.app.tend_stops().await {
+        match self.app.reconcile_stops().await {
             Ok(again) => self.stops = again,
             // The stops read before are still sent.
             Err(error) => self.app.log_failure("look after stops", &error),
@@ -380,7 +380,7 @@ impl Reconciler {
     }
 
     /// Forgets everything about missions that are no longer open.
-    fn forget_all_but(&mut self, missions: &[OpenMission]) {
+    fn retain_open(&mut self, missions: &[OpenMission]) {
         let open: HashSet<MissionId> = missions.iter().map(|mission| mission.id).collect();
         self.memories.retain(|id, _| open.contains(id));
         self.retries.retain(|job, _| match job {
@@ -397,7 +397,7 @@ impl Reconciler {
 
     /// Finds robots that drive a mission that is not among their open ones, and commands them to
     /// end it.
-    fn disown_foreign(&mut self, open: &[OpenMission]) {
+    fn cancel_foreign_missions(&mut self, open: &[OpenMission]) {
         let now = self.app.clock().elapsed();
         let shown = self.app.presences().shown_missions(now);
         let mut own: HashMap<MissionId, (&SiteId, &tread_api::ids::RobotId)> = HashMap::new();
@@ -424,7 +424,7 @@ impl Reconciler {
             let job = Job::Disown(key.clone());
             if self.is_due(&job) {
                 let app = self.app.clone();
-                self.start(job, disown(app, key, id));
+                self.start(job, cancel_foreign_mission(app, key, id));
             }
         }
         let foreign = &self.foreign;
@@ -442,7 +442,7 @@ impl Reconciler {
     }
 
     /// Stores since when a mission's robot has not been heard.
-    async fn note_silence(&self, mission: &mut OpenMission, heard: bool) -> Result<(), AppError> {
+    async fn record_silence(&self, mission: &mut OpenMission, heard: bool) -> Result<(), AppError> {
         if heard == mission.silent_since.is_none() || mission.state == MissionState::Queued {
             return Ok(());
         }
@@ -467,7 +467,7 @@ impl Reconciler {
             answering_since: self.answering_since,
         };
         let heard = is_heard(&presence, now.elapsed);
-        self.note_silence(&mut mission, heard).await?;
+        self.record_silence(&mut mission, heard).await?;
         let memory = self.memories.entry(mission.id).or_default();
         memory.absent_since = is_absent(&mission, &presence, now.elapsed)
             .then(|| memory.absent_since.unwrap_or(now.elapsed));
@@ -491,7 +491,7 @@ impl Reconciler {
                 let shown_for = now.elapsed.saturating_sub(shown_since);
                 settle(&self.app, &mission, change, shown_for).await?;
             }
-            Need::Adopt => adopt_shown(&self.app, &mission).await?,
+            Need::Adopt => adopt_reported_revision(&self.app, &mission).await?,
             Need::Replace => {
                 let job = Job::Replace(mission.id);
                 if self.is_due(&job) {

@@ -12,7 +12,7 @@ use tread_api::wire::reply::{MissionOutcomes, OutcomesReply};
 
 use super::jobs::Finished;
 use crate::app::missions::transitions::Change;
-use crate::app::missions::{Step, take_step};
+use crate::app::missions::{Step, apply_transition};
 use crate::app::{App, AppError};
 use crate::db::missions::{Facts, OpenMission};
 use crate::db::restorations::Restrained;
@@ -98,7 +98,7 @@ async fn take(
             }
         };
         let step = step(app, change, Some(reason), Facts::default());
-        if let Some(state) = take_step(&mut tx, &mission, step).await? {
+        if let Some(state) = apply_transition(&mut tx, &mission, step).await? {
             closed += 1;
             let end = (mission.id, state, reason);
             alerts.extend(app.alert_mission_end(&mut tx, robot.pk, end).await?);
@@ -107,7 +107,7 @@ async fn take(
     if let Some(mission) = begun {
         begin(app, &mut tx, mission, boot).await?;
     }
-    db::restorations::note_outcomes(&mut tx, robot.pk).await?;
+    db::restorations::record_outcomes(&mut tx, robot.pk).await?;
     app.commit_alerts(tx, alerts).await?;
     info!(
         robot.id = %robot.robot,
@@ -135,7 +135,8 @@ async fn begin(
         (MissionState::Offered, Change::Accept),
     ] {
         if mission.state == state
-            && let Some(next) = take_step(tx, &mission, step(app, change, None, facts)).await?
+            && let Some(next) =
+                apply_transition(tx, &mission, step(app, change, None, facts)).await?
         {
             mission.state = next;
         }

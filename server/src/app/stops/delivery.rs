@@ -141,20 +141,20 @@ impl Settling {
             }
         };
         let ((), confirmed) = tokio::join!(recording, collecting);
-        self.note(&confirmed).await;
+        self.record_confirmations(&confirmed).await;
         let is_open = |stop: &&Stop| !confirmed.iter().any(|(id, _)| *id == stop.id);
         let open: Vec<&Stop> = self.stops.iter().filter(is_open).collect();
         if !open.is_empty() {
             warn!("{} robots have not confirmed a stop", open.len());
             self.app.counters().stops_unconfirmed.add(open.len() as u64);
-            if let Err(error) = db::limited(self.app.note_unconfirmed(&open)).await {
+            if let Err(error) = db::limited(self.app.alert_unconfirmed(&open)).await {
                 self.app
                     .log_failure("write down that stops are unconfirmed", &error);
             }
         }
         self.app.wake();
         while let Some(late) = confirmations.recv().await {
-            self.note(&[late]).await;
+            self.record_confirmations(&[late]).await;
         }
     }
 
@@ -202,13 +202,13 @@ impl Settling {
         confirmed
     }
 
-    async fn note(&self, confirmed: &[(StopId, Timestamp)]) {
+    async fn record_confirmations(&self, confirmed: &[(StopId, Timestamp)]) {
         if confirmed.is_empty() {
             return;
         }
         self.app.unrecorded().confirm(confirmed);
-        let noting = self.app.note_confirmed(&self.stops, confirmed);
-        if let Err(error) = db::limited(noting).await {
+        let recording = self.app.record_confirmed(&self.stops, confirmed);
+        if let Err(error) = db::limited(recording).await {
             // The reconciler sends it again, and the robot gives the same answer.
             self.app
                 .log_failure("write down that stops are confirmed", &error);

@@ -16,7 +16,7 @@ pub(super) struct Growth(VecDeque<(Duration, u64)>);
 impl Growth {
     /// Takes in a size, and returns the growth in bytes per hour if it has been measured for long
     /// enough.
-    pub(super) fn note(&mut self, now: Duration, bytes: u64) -> Option<i64> {
+    pub(super) fn record(&mut self, now: Duration, bytes: u64) -> Option<i64> {
         let is_old = |&(at, _): &(Duration, u64)| now.saturating_sub(at) > GROWTH_SPAN;
         while self.0.front().is_some_and(is_old) {
             self.0.pop_front();
@@ -45,13 +45,13 @@ mod tests {
         let mut growth = Growth::default();
         let at = |minute: u64| Duration::from_secs(60 * minute);
         for minute in 0..10 {
-            assert_eq!(growth.note(at(minute), 1_000 + minute), None, "{minute}");
+            assert_eq!(growth.record(at(minute), 1_000 + minute), None, "{minute}");
         }
-        assert_eq!(growth.note(at(10), 1_010), Some(60));
+        assert_eq!(growth.record(at(10), 1_010), Some(60));
         for minute in 11..200 {
-            growth.note(at(minute), 5_000);
+            growth.record(at(minute), 5_000);
             assert!(growth.0.len() <= 62, "{}", growth.0.len());
         }
-        assert_eq!(growth.note(at(200), 4_000), Some(-1_000));
+        assert_eq!(growth.record(at(200), 4_000), Some(-1_000));
     }
 }

@@ -32,7 +32,7 @@ struct Logged {
 
 impl Repeats {
     /// Returns how many failures like this were left out since the last entry if it is to be logged now.
-    pub(super) fn note(&mut self, now: Duration, failure: Failure<'_>) -> Option<u64> {
+    pub(super) fn record(&mut self, now: Duration, failure: Failure<'_>) -> Option<u64> {
         let Failure { what, reason } = failure;
         let is_recent = |one: &Logged| now.saturating_sub(one.at) < LOG_EVERY;
         let known = self
@@ -92,14 +92,14 @@ mod tests {
     #[test]
     fn each_reason_is_logged_at_once_and_its_repeats_are_counted() {
         let mut repeats = Repeats::default();
-        assert_eq!(repeats.note(SECOND, CLOCK), Some(0));
+        assert_eq!(repeats.record(SECOND, CLOCK), Some(0));
         for _ in 0..5 {
-            assert_eq!(repeats.note(2 * SECOND, CLOCK), None);
+            assert_eq!(repeats.record(2 * SECOND, CLOCK), None);
         }
-        assert_eq!(repeats.note(2 * SECOND, SECRET), Some(0));
-        assert_eq!(repeats.note(2 * SECOND, READ), Some(0));
-        assert_eq!(repeats.note(31 * SECOND, CLOCK), Some(5));
-        assert_eq!(repeats.note(32 * SECOND, CLOCK), None);
+        assert_eq!(repeats.record(2 * SECOND, SECRET), Some(0));
+        assert_eq!(repeats.record(2 * SECOND, READ), Some(0));
+        assert_eq!(repeats.record(31 * SECOND, CLOCK), Some(5));
+        assert_eq!(repeats.record(32 * SECOND, CLOCK), None);
     }
 
     #[test]
@@ -112,7 +112,7 @@ mod tests {
                 reason: &failure.to_string(),
                 ..CLOCK
             };
-            if let Some(count) = repeats.note(now, failure) {
+            if let Some(count) = repeats.record(now, failure) {
                 logged += 1;
                 left_out += count;
             }

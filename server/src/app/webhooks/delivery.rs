@@ -87,13 +87,13 @@ pub async fn run(app: App, sender: Sender, stop: CancellationToken) {
             tokio::select! {
                 biased;
                 () = stop.cancelled() => break,
-                Some(done) = dispatcher.finishing.recv() => dispatcher.note(done),
+                Some(done) = dispatcher.finishing.recv() => dispatcher.record(done),
                 () = app.webhooks().woken.notified() => {}
                 () = tokio::time::sleep(LOOK_EVERY) => {}
             }
         }
         while let Ok(done) = dispatcher.finishing.try_recv() {
-            dispatcher.note(done);
+            dispatcher.record(done);
         }
     }
 }
@@ -147,7 +147,7 @@ impl Dispatcher {
         drop(tx);
         if has_older {
             let mut tx = self.app.db().write_uncounted("webhooks").await?;
-            let count = db::webhooks::give_up_older(&mut tx, AgeLimit { now, oldest }).await?;
+            let count = db::webhooks::abandon_oldest(&mut tx, AgeLimit { now, oldest }).await?;
             tx.commit().await?;
             self.app.counters().webhook_given_up.add(count);
         }
@@ -211,7 +211,7 @@ impl Dispatcher {
     }
 
     /// Notes how an attempt ended.
-    fn note(&mut self, done: Done) {
+    fn record(&mut self, done: Done) {
         let Done {
             webhook,
             id,
@@ -274,9 +274,9 @@ impl Dispatcher {
         }
         let mut tx = self.app.db().write_uncounted("webhooks").await?;
         for outcome in &self.outcomes {
-            db::webhooks::note_attempt(&mut tx, outcome).await?;
+            db::webhooks::record_attempt(&mut tx, outcome).await?;
             if outcome.state != DeliveryState::Pending {
-                db::webhooks::forget(&mut tx, outcome.webhook, LOG_MAX).await?;
+                db::webhooks::prune(&mut tx, outcome.webhook, LOG_MAX).await?;
             }
         }
         tx.commit().await?;
@@ -298,7 +298,7 @@ impl Dispatcher {
                 }
                 let known = change.ids.get(&webhook).copied();
                 let id = known.unwrap_or_else(|| self.app.clock().new_id());
-                self.keep_id(&change, webhook, id);
+                self.store_id(&change, webhook, id);
                 let notice = self.app.notice(id, change.event, &change.alert);
                 let outgoing = OutgoingDelivery {
                     id,
@@ -314,7 +314,7 @@ impl Dispatcher {
     }
 
     /// Keeps the identifier of a delivery for its next attempts.
-    fn keep_id(&self, of: &super::ServerChange, webhook: WebhookId, id: DeliveryId) {
+    fn store_id(&self, of: &super::ServerChange, webhook: WebhookId, id: DeliveryId) {
         for change in self.app.webhooks().server_changes().iter_mut() {
             if (change.alert.id, change.event) == (of.alert.id, of.event) {
                 change.ids.insert(webhook, id);

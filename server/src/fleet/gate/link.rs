@@ -96,7 +96,7 @@ impl Link {
         if let Err(error) = set {
             debug!("cannot send at once: {error}");
         }
-        let Some(admitted) = self.let_in(stream).await else {
+        let Some(admitted) = self.authenticate_client(stream).await else {
             return;
         };
         let (robot, name, issuer) = (&admitted.robot, &admitted.name, &admitted.issuer);
@@ -107,7 +107,9 @@ impl Link {
         let entry = self.links.enter(robot.clone(), admitted.certificate, now);
         let mut outside = admitted.stream;
         let joined = async {
-            self.app.note_shown(robot, name.enrolment, issuer).await;
+            self.app
+                .record_shown_certificate(robot, name.enrolment, issuer)
+                .await;
             let Some(inside) = self.open(robot, &entry, &mut outside).await else {
                 return;
             };
@@ -146,7 +148,7 @@ impl Link {
     }
 
     /// Authenticates the client; `None` if it is rejected.
-    async fn let_in(&self, stream: TcpStream) -> Option<Admitted> {
+    async fn authenticate_client(&self, stream: TcpStream) -> Option<Admitted> {
         let counters = self.app.counters();
         let mut begin = [0; LOOKED_AT_BYTES];
         let first = tokio::time::timeout(FIRST_BYTE_TIMEOUT, stream.peek(&mut begin)).await;
@@ -225,7 +227,7 @@ impl Link {
             if self.app.enrolment_registry().status(&robot)
                 == Some(EnrolmentStatus::Revoked(name.enrolment))
             {
-                self.app.note_outsider(&robot);
+                self.app.alert_revoked(&robot);
             }
             return None;
         }

@@ -224,7 +224,7 @@ impl Blocks {
 pub struct Absent(RefCell<BTreeSet<Block>>);
 
 impl Absent {
-    fn note(&self, block: Block) {
+    fn record(&self, block: Block) {
         self.0.borrow_mut().insert(block);
     }
 
@@ -279,7 +279,7 @@ impl<'map> Cells<'map> {
             return Some(&found.cells);
         }
         if self.map.changes.contains(block) {
-            self.absent.note(block);
+            self.absent.record(block);
         }
         None
     }
@@ -358,7 +358,7 @@ impl<'map> Cells<'map> {
             blocks.flat_map(move |block| {
                 let cells = self.of_block(block);
                 if cells.is_none() {
-                    self.note_from(block, (columns, last.row));
+                    self.record_absent_from(block, (columns, last.row));
                 }
                 let from = block.first().ix.max(min.ix);
                 let to = block.last().ix.min(max.ix);
@@ -375,7 +375,7 @@ impl<'map> Cells<'map> {
     }
 
     /// Notes absent blocks from one on in its row, and in the rows below up to `last_row`.
-    fn note_from(self, from: Block, (columns, last_row): ((i32, i32), i32)) {
+    fn record_absent_from(self, from: Block, (columns, last_row): ((i32, i32), i32)) {
         let rest = self.map.changes.row(from.row, (from.column, columns.1));
         let below = from.row.checked_add(1).filter(|&row| row <= last_row);
         let below = self.map.changes.rows(below.map(|row| (row, last_row)));
@@ -384,7 +384,7 @@ impl<'map> Cells<'map> {
             .chain(below)
             .filter(|&block| !self.map.blocks.contains(block));
         for block in absent.take(NOTED_MAX) {
-            self.absent.note(block);
+            self.absent.record(block);
         }
     }
 

@@ -77,7 +77,7 @@ struct OfBlock {
 
 impl OfBlock {
     /// Makes `newest` the number of the newest change, of which it is not known which cells it was of.
-    fn forget_until(&mut self, newest: u64) {
+    fn discard_until(&mut self, newest: u64) {
         self.newest = newest;
         self.kept_after = newest;
         self.kept = VecDeque::new();
@@ -97,7 +97,7 @@ pub struct Changes {
 }
 
 impl Changes {
-    pub(super) fn note(&mut self, cell: Cell) {
+    pub(super) fn record(&mut self, cell: Cell) {
         self.newest += 1;
         let block = self.blocks.entry(Block::of(cell)).or_default();
         block.lines |= line(cell.iy);
@@ -111,25 +111,25 @@ impl Changes {
     }
 
     /// Records a change of all cells.
-    pub(super) fn note_all(&mut self) {
+    pub(super) fn record_all(&mut self) {
         self.newest += 1;
         for block in self.blocks.values_mut() {
-            block.forget_until(self.newest);
+            block.discard_until(self.newest);
         }
     }
 
     /// Records a change of any cell of the block of this one, in which something was measured.
-    pub(super) fn note_block_of(&mut self, cell: Cell) {
+    pub(super) fn record_block_of(&mut self, cell: Cell) {
         self.newest += 1;
         let block = self.blocks.entry(Block::of(cell)).or_default();
         block.lines |= line(cell.iy);
-        block.forget_until(self.newest);
+        block.discard_until(self.newest);
     }
 
     /// Forgets which cells of a block have changed until now.
-    pub(super) fn forget(&mut self, block: Block) {
+    pub(super) fn discard(&mut self, block: Block) {
         if let Some(found) = self.blocks.get_mut(&block) {
-            found.forget_until(found.newest);
+            found.discard_until(found.newest);
         }
     }
 
@@ -191,7 +191,7 @@ impl Changes {
         for &block in before.blocks.keys() {
             self.blocks.entry(block).or_default();
         }
-        self.note_all();
+        self.record_all();
     }
 
     /// Returns the number of the newest change; 0 without changes.
@@ -260,7 +260,7 @@ mod tests {
             let mut changes = Changes::default();
             let cells: Vec<Cell> = cells.iter().map(|&(ix, iy)| Cell { ix, iy }).collect();
             for &cell in &cells {
-                changes.note(cell);
+                changes.record(cell);
             }
             #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss, reason = "a share of a few thousand")]
             let since = (share * cells.len() as f64) as usize;
@@ -283,10 +283,10 @@ mod tests {
         let (here, gone) = (Cell { ix: 1, iy: 1 }, Cell { ix: 999, iy: 1 });
         let mut before = Changes::default();
         for cell in [here, gone, here] {
-            before.note(cell);
+            before.record(cell);
         }
         let mut after = Changes::default();
-        after.note(here);
+        after.record(here);
         after.follow(&before);
         for cell in [here, gone] {
             assert!(after.newest_of(Block::of(cell)) > before.newest());
@@ -297,9 +297,9 @@ mod tests {
     #[test]
     fn a_change_of_everything_is_one_of_each_block() {
         let mut changes = Changes::default();
-        changes.note(Cell { ix: 1, iy: 1 });
+        changes.record(Cell { ix: 1, iy: 1 });
         let before = changes.newest();
-        changes.note_all();
+        changes.record_all();
         let block = Block::of(Cell { ix: 1, iy: 1 });
         assert_eq!(changes.since(block, before), None);
         assert_eq!(changes.since(block, changes.newest()), Some(Vec::new()));

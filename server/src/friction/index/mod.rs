@@ -181,16 +181,16 @@ impl SiteMap {
 
     /// Adds sums that agree in all labels but their cells; `labelled.cell` is ignored.
     pub fn add_cells(&mut self, labelled: Labelled<'_>, cells: &[(Cell, Sums)]) {
-        self.add_noting(labelled, cells, Changes::note);
+        self.add_recording(labelled, cells, Changes::record);
     }
 
     /// The same for sums that were measured before the map is looked at for the first time: which cells
     /// have changed is not recorded.
     pub fn load_cells(&mut self, labelled: Labelled<'_>, cells: &[(Cell, Sums)]) {
-        self.add_noting(labelled, cells, Changes::note_block_of);
+        self.add_recording(labelled, cells, Changes::record_block_of);
     }
 
-    fn add_noting(
+    fn add_recording(
         &mut self,
         labelled: Labelled<'_>,
         cells: &[(Cell, Sums)],
@@ -207,7 +207,7 @@ impl SiteMap {
                 note(&mut self.changes, *cell);
             } else if self.changes.contains(block) {
                 // Absent: it is read with these sums when it is needed.
-                self.changes.note_block_of(*cell);
+                self.changes.record_block_of(*cell);
             } else {
                 // Nothing is stored of a block that was never driven on, so this is all of it.
                 self.blocks
@@ -297,7 +297,7 @@ impl SiteMap {
     /// Takes the cells of a block out of memory, unless it is pinned.
     pub fn evict(&mut self, block: Block) -> Option<BlockCells> {
         let evicted = self.blocks.take(block)?;
-        self.changes.forget(block);
+        self.changes.discard(block);
         Some(evicted)
     }
 
@@ -319,7 +319,7 @@ impl SiteMap {
         self.totals.retain(|key, _sums| !goes(key));
         self.count_segments();
         // A block may have been absent, or been read after the removal from the database.
-        self.changes.note_all();
+        self.changes.record_all();
     }
 
     /// Merges the epochs before these horizons; none is ever divided again.
@@ -344,7 +344,7 @@ impl SiteMap {
         }
         self.totals = totals;
         self.count_segments();
-        self.changes.note_all();
+        self.changes.record_all();
     }
 
     /// Continues the numbering of changes of `before`, an older map of the site that this one

@@ -264,7 +264,7 @@ pub(in crate::http) async fn map(
             let (state, as_of) = ((query.format, export.state()), export.as_of());
             let begun = streamed(media_type, export, CellExport::next);
             let response = etag::streamed(&headers, media_type, state, begun).await?;
-            Ok(say_as_of(response, as_of))
+            Ok(add_as_of_header(response, as_of))
         }
     }
 }
@@ -292,7 +292,7 @@ fn list_writer(
 }
 
 /// Adds the header with the time of the map, if the request gave one.
-pub(super) fn say_as_of(mut response: Response, as_of: Option<Timestamp>) -> Response {
+pub(super) fn add_as_of_header(mut response: Response, as_of: Option<Timestamp>) -> Response {
     let as_of = as_of.and_then(|as_of| HeaderValue::try_from(as_of.to_string()).ok());
     if let Some(as_of) = as_of {
         response.headers_mut().insert(AS_OF, as_of);

@@ -19,7 +19,7 @@ use tread_api::page::Page;
 use tread_api::problem::ProblemBody;
 use utoipa::IntoParams;
 
-use self::map::say_as_of;
+use self::map::add_as_of_header;
 use self::streamed::{CSV_MEDIA_TYPE, JSON_MEDIA_TYPE, PARQUET_MEDIA_TYPE, streamed};
 use super::etag;
 use super::extract::{Path, Query, cursor, page_limit};
@@ -86,7 +86,7 @@ pub(super) async fn terrains(
         .friction_of_terrains(&site, &asked, cursor, limit)
         .await?;
     let as_of = found.items.first().and_then(|terrain| terrain.as_of);
-    Ok(say_as_of(etag::json(&headers, &found), as_of))
+    Ok(add_as_of_header(etag::json(&headers, &found), as_of))
 }
 
 /// What is asked for of one terrain.
@@ -119,7 +119,7 @@ pub(super) async fn terrain(
 ) -> Result<Response, Problem> {
     let asked = asked(query.as_of, query.configuration, query.normalisation);
     let found = app.friction_of_terrain(&site, &terrain, &asked).await?;
-    Ok(say_as_of(etag::json(&headers, &found), found.as_of))
+    Ok(add_as_of_header(etag::json(&headers, &found), found.as_of))
 }
 
 /// List what each robot contributed to the map.

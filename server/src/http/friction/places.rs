@@ -15,7 +15,7 @@ use tread_api::problem::ProblemBody;
 use utoipa::IntoParams;
 
 use super::asked;
-use super::map::say_as_of;
+use super::map::add_as_of_header;
 use crate::app::App;
 use crate::app::friction::{Area, AreaBounds, CellsAsked};
 use crate::http::etag;
@@ -79,7 +79,7 @@ pub(in crate::http) async fn cells(
         limit: page_limit(query.limit)?,
     };
     let found = app.friction_of_cells(&site, &asked, cells).await?;
-    Ok(say_as_of(etag::json(&headers, &found), found.as_of))
+    Ok(add_as_of_header(etag::json(&headers, &found), found.as_of))
 }
 
 /// Which point.
@@ -119,13 +119,13 @@ pub(in crate::http) async fn point(
         y_m: query.y_m,
     };
     let found = app.friction_at(&site, &asked, point).await?;
-    Ok(say_as_of(etag::json(&headers, &found), found.as_of))
+    Ok(add_as_of_header(etag::json(&headers, &found), found.as_of))
 }
 
 /// Get friction along a path, its uncertainty, and the speed that follows for a robot.
 #[utoipa::path(post, path = "/v1/sites/{site}/friction/path", tag = "friction",
     security(("token" = ["read"])),
-    operation_id = "ask_path_friction", params(("site" = SiteId, Path)),
+    operation_id = "get_path_friction", params(("site" = SiteId, Path)),
     request_body = AskPath,
     responses((status = 200, body = PathFriction), (status = 304),
         (status = 404, body = ProblemBody), (status = 422, body = ProblemBody)))]
@@ -138,7 +138,7 @@ pub(in crate::http) async fn path(
 ) -> Result<Response, Problem> {
     subject.check_robot(&site, &request.robot)?;
     let found = app.friction_along(&site, request).await?;
-    Ok(say_as_of(etag::json(&headers, &found), found.as_of))
+    Ok(add_as_of_header(etag::json(&headers, &found), found.as_of))
 }
 
 /// Which times and cells.
@@ -196,7 +196,7 @@ pub(in crate::http) async fn difference(
     };
     let times = (query.from, query.to);
     let found = app.friction_difference(&site, &asked, times, cells).await?;
-    Ok(say_as_of(etag::json(&headers, &found), found.as_of))
+    Ok(add_as_of_header(etag::json(&headers, &found), found.as_of))
 }
 
 /// Where to look for visits that teach.
@@ -245,5 +245,5 @@ pub(in crate::http) async fn visits(
     })?;
     let limit = page_limit(query.limit)?;
     let found = app.visits_worth_most(&site, &asked, area, limit).await?;
-    Ok(say_as_of(etag::json(&headers, &found), found.as_of))
+    Ok(add_as_of_header(etag::json(&headers, &found), found.as_of))
 }

@@ -45,24 +45,24 @@ fn cookie((name, same_site): (&str, &str), is_tls: bool, value: &str, lasts_s: i
 }
 
 /// Sets the session cookie, for `lasts_s` seconds.
-pub(super) fn give_cookie(headers: &mut HeaderMap, is_tls: bool, secret: &str, lasts_s: i64) {
+pub(super) fn set_session_cookie(
+    headers: &mut HeaderMap,
+    is_tls: bool,
+    secret: &str,
+    lasts_s: i64,
+) {
     let session = cookie((COOKIE, "Strict"), is_tls, secret, lasts_s);
     headers.append(header::SET_COOKIE, session);
 }
 
 /// Removes the session cookie.
-pub(super) fn take_cookie(headers: &mut HeaderMap, is_tls: bool) {
-    give_cookie(headers, is_tls, "", 0);
+pub(super) fn remove_session_cookie(headers: &mut HeaderMap, is_tls: bool) {
+    set_session_cookie(headers, is_tls, "", 0);
 }
 
 /// Sets the cookie of a pending sign-in. The browser returns from the provider by a navigation from
 /// another site, with which `Strict` cookies are not sent.
-pub(super) fn give_sign_in_cookie(
-    headers: &mut HeaderMap,
-    is_tls: bool,
-    value: &str,
-    lasts_s: i64,
-) {
+pub(super) fn set_sign_in_cookie(headers: &mut HeaderMap, is_tls: bool, value: &str, lasts_s: i64) {
     let pending = cookie((SIGN_IN_COOKIE, "Lax"), is_tls, value, lasts_s);
     headers.append(header::SET_COOKIE, pending);
 }
@@ -173,7 +173,7 @@ mod tests {
     fn a_cookie_that_was_given_is_found_among_others() {
         for is_tls in [false, true] {
             let mut given = HeaderMap::new();
-            give_cookie(&mut given, is_tls, "tread_s_1", 60);
+            set_session_cookie(&mut given, is_tls, "tread_s_1", 60);
             let text = given[header::SET_COOKIE].to_str().unwrap();
             assert!(
                 text.contains("HttpOnly") && text.contains("SameSite=Strict"),

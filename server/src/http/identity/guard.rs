@@ -153,7 +153,7 @@ impl Guard {
             let mut refusal = Refusal::counted(&counters.refused_no_token, unauthenticated());
             // Whoever shows nothing has tried nothing.
             refusal.is_audited = false;
-            say_how(&mut refusal.response);
+            add_challenge(&mut refusal.response);
             return Err(refusal);
         };
         self.check_origin(method, headers, Some(shown))?;
@@ -162,7 +162,7 @@ impl Guard {
             let mut response = sign_in_problem(&self.app, &error);
             if shown == Shown::Session && response.status() == 401 {
                 // Makes the browser drop a cookie that is no longer valid.
-                browser::take_cookie(response.headers_mut(), self.names.is_tls);
+                browser::remove_session_cookie(response.headers_mut(), self.names.is_tls);
             }
             Refusal::of(response)
         })?;
@@ -213,7 +213,7 @@ impl Guard {
         }
     }
 
-    fn note(&self, asked: Asked, response: &Response, who: Option<&Arc<Credential>>) {
+    fn record(&self, asked: Asked, response: &Response, who: Option<&Arc<Credential>>) {
         let said = response.extensions().get::<Audited>();
         let said = said.map(|Audited(what)| what.clone());
         let left = asked.slot.left().cloned();
@@ -288,7 +288,7 @@ pub(in crate::http) async fn stand(
         Ok(subject) => subject,
         Err(refusal) => {
             if refusal.is_audited {
-                guard.note(asked, &refusal.response, refusal.who.as_ref());
+                guard.record(asked, &refusal.response, refusal.who.as_ref());
             }
             return *refusal.response;
         }
@@ -308,7 +308,7 @@ pub(in crate::http) async fn stand(
     if is_change || is_audited {
         let signed_in = response.extensions().get::<SignedIn>().cloned();
         let who = subject.clone().or(signed_in.map(|SignedIn(who)| who));
-        guard.note(asked, &response, who.as_ref());
+        guard.record(asked, &response, who.as_ref());
     }
     match subject {
         Some(subject) => end_with(&guard.app, subject, cut, response),
@@ -424,7 +424,7 @@ pub(super) fn sign_in_problem(app: &App, error: &SignInError) -> Response {
     };
     counter.one();
     let mut response = unauthenticated().into_response();
-    say_how(&mut response);
+    add_challenge(&mut response);
     response
 }
 
@@ -443,7 +443,7 @@ pub(super) fn unauthenticated() -> Problem {
         .detail("send a valid token as `authorization: Bearer …`, or sign in at /v1/session")
 }
 
-fn say_how(response: &mut Response) {
+fn add_challenge(response: &mut Response) {
     let how = HeaderValue::from_static("Bearer realm=\"tread\"");
     response.headers_mut().insert(header::WWW_AUTHENTICATE, how);
 }

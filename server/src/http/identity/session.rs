@@ -51,7 +51,7 @@ pub(in crate::http) async fn create(
     let answer = (StatusCode::CREATED, Json(credential.session()));
     let mut response = answer.into_response();
     let lasts_s = left.as_secs();
-    browser::give_cookie(
+    browser::set_session_cookie(
         response.headers_mut(),
         names.is_tls,
         secret.reveal(),
@@ -88,6 +88,6 @@ pub(in crate::http) async fn end(
         Some(provider) => Json(SignedOut { provider }).into_response(),
         None => StatusCode::NO_CONTENT.into_response(),
     };
-    browser::take_cookie(response.headers_mut(), names.is_tls);
+    browser::remove_session_cookie(response.headers_mut(), names.is_tls);
     Ok(response)
 }

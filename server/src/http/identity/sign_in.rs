@@ -53,7 +53,7 @@ pub(in crate::http) async fn begin(
     let mut response = see_other(&begun.location);
     if let Some(cookie) = &begun.cookie {
         let (headers, lasts_s) = (response.headers_mut(), SIGN_IN_LASTS.as_secs());
-        browser::give_sign_in_cookie(headers, names.is_tls, cookie, lasts_s);
+        browser::set_sign_in_cookie(headers, names.is_tls, cookie, lasts_s);
     }
     response
 }
@@ -103,7 +103,7 @@ pub(in crate::http) async fn finish(
             let left = credential.expires_at.duration_since(app.clock().now());
             let mut response = see_other(SIGNED_IN);
             let headers = response.headers_mut();
-            browser::give_cookie(headers, names.is_tls, secret.reveal(), left.as_secs());
+            browser::set_session_cookie(headers, names.is_tls, secret.reveal(), left.as_secs());
             let session = credential.session;
             response.extensions_mut().insert(SignedIn(credential));
             (response, json!({"sign_in": "oidc", "session": session}))
@@ -132,7 +132,7 @@ pub(in crate::http) async fn finish(
     );
     if cookie.is_some() && !is_to_be_tried_again {
         // It counts once.
-        browser::give_sign_in_cookie(response.headers_mut(), names.is_tls, "", 0);
+        browser::set_sign_in_cookie(response.headers_mut(), names.is_tls, "", 0);
     }
     response.extensions_mut().insert(Audited(what));
     response

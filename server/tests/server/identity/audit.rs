@@ -248,7 +248,7 @@ async fn whoever_changes_a_row_of_the_database_is_found_by_its_number() {
         since: Timestamp::UNIX_EPOCH,
         newest_max: 10,
     };
-    db::audit::forget(&mut tx, kept, 100).await.unwrap();
+    db::audit::prune(&mut tx, kept, 100).await.unwrap();
     tx.commit().await.unwrap();
     assert_eq!(verified(&yard).await, Ok(10));
 

@@ -398,7 +398,9 @@ async fn after_a_backup_was_restored_the_next_certificate_of_each_robot_can_be_m
 
     // As `tread-server forget-certificates` does, beside the server.
     let mut tx = db.write("test").await.unwrap();
-    let count = db::enrolments::forget_certificates(&mut tx).await.unwrap();
+    let count = db::enrolments::delete_issued_certificates(&mut tx)
+        .await
+        .unwrap();
     tx.commit().await.unwrap();
     assert_eq!(count, 1);
     assert_eq!(renew(&yard, &next, &next_key).await.0, StatusCode::OK);

@@ -91,10 +91,14 @@ async fn main() -> anyhow::Result<ExitCode> {
             }
         }
     }
-    tell(&arguments, reports, broken)
+    print_report(&arguments, reports, broken)
 }
 
-fn tell(arguments: &Arguments, reports: Vec<RunReport>, broken: u64) -> anyhow::Result<ExitCode> {
+fn print_report(
+    arguments: &Arguments,
+    reports: Vec<RunReport>,
+    broken: u64,
+) -> anyhow::Result<ExitCode> {
     let total = |pick: fn(&RunReport) -> u64| reports.iter().map(pick).sum::<u64>();
     let mut ends = BTreeMap::new();
     for end in reports.iter().flat_map(|report| &report.ends) {
@@ -140,5 +144,5 @@ fn tell(arguments: &Arguments, reports: Vec<RunReport>, broken: u64) -> anyhow::
         details.requests,
         details.ends
     );
-    report::tell_with(arguments.json, &details, words, &checks)
+    report::print_with(arguments.json, &details, words, &checks)
 }

@@ -234,7 +234,7 @@ async fn main() -> anyhow::Result<ExitCode> {
         missions: missions.len(),
         failures,
     };
-    report::tell_with(arguments.json, &details, words, &checks)
+    report::print_with(arguments.json, &details, words, &checks)
 }
 
 fn worst(seen_s: &mut [f64]) -> f64 {

@@ -249,10 +249,10 @@ async fn measure(arguments: Arguments, attacker: &Handle) -> anyhow::Result<Exit
             drop(open);
         }
     }
-    tell(&arguments, reopened.load(Ordering::Relaxed), &kept, &new)
+    print_report(&arguments, reopened.load(Ordering::Relaxed), &kept, &new)
 }
 
-fn tell(
+fn print_report(
     arguments: &Arguments,
     reopened: u64,
     kept: &[Answers; 2],
@@ -283,5 +283,5 @@ fn tell(
          {new_disturbed:.2} ms\n",
         details.connections, details.reopened, details.requests
     );
-    report::tell_with(arguments.json, &details, words, &checks)
+    report::print_with(arguments.json, &details, words, &checks)
 }

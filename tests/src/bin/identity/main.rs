@@ -45,5 +45,5 @@ async fn main() -> anyhow::Result<ExitCode> {
     drop(fleet);
     let mut fleet = Fleet::start_secure_with(&node, CERTIFICATE_S).await;
     checks.extend(join::measure(&arguments, &mut fleet).await?);
-    report::tell(arguments.json, &checks)
+    report::print(arguments.json, &checks)
 }

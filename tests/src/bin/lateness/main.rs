@@ -227,5 +227,5 @@ async fn main() -> anyhow::Result<ExitCode> {
         load_threads: load,
         not_measured,
     };
-    report::tell_with(arguments.json, &details, words, &checks_of_all)
+    report::print_with(arguments.json, &details, words, &checks_of_all)
 }

@@ -168,5 +168,5 @@ async fn main() -> anyhow::Result<ExitCode> {
         trials: arguments.trials,
         not_measured,
     };
-    report::tell_with(arguments.json, &details, "", &checks)
+    report::print_with(arguments.json, &details, "", &checks)
 }

@@ -32,13 +32,13 @@ pub(crate) struct Details {
 }
 
 impl Details {
-    pub(crate) fn tell(&self, arguments: &Arguments) -> anyhow::Result<ExitCode> {
+    pub(crate) fn print(&self, arguments: &Arguments) -> anyhow::Result<ExitCode> {
         if arguments.markdown {
             let (ingest, dispatch) = (self.ingest.words(), self.dispatch_table().markdown());
             let tables = format!("{} light robots; {ingest}\n\n{dispatch}", self.robots);
-            return report::tell_markdown(&tables, &self.checks());
+            return report::print_markdown(&tables, &self.checks());
         }
-        report::tell_with(arguments.json, self, self.words(), &self.checks())
+        report::print_with(arguments.json, self, self.words(), &self.checks())
     }
 
     /// Returns the parts of the time of a dispatch, and what it cannot be shorter than.

@@ -112,21 +112,21 @@ async fn main() -> anyhow::Result<ExitCode> {
         let saturation = saturation::measure(&arguments, &node).await?;
         let checks = saturation.checks();
         if arguments.markdown {
-            return report::tell_markdown(&saturation.table().markdown(), &checks);
+            return report::print_markdown(&saturation.table().markdown(), &checks);
         }
-        return report::tell_with(arguments.json, &saturation, saturation.words(), &checks);
+        return report::print_with(arguments.json, &saturation, saturation.words(), &checks);
     }
     if arguments.states {
         let states = states::measure(&arguments, &node).await?;
         let checks = states.checks();
         if arguments.markdown {
-            return report::tell_markdown(&states.table().markdown(), &checks);
+            return report::print_markdown(&states.table().markdown(), &checks);
         }
-        return report::tell_with(arguments.json, &states, states.words(), &checks);
+        return report::print_with(arguments.json, &states, states.words(), &checks);
     }
     if arguments.sizes {
         let sizes = sizes::measure(&node).await?;
-        return report::tell_with(arguments.json, &sizes, sizes.words(), &sizes.checks());
+        return report::print_with(arguments.json, &sizes, sizes.words(), &sizes.checks());
     }
     let collector = Collector::default();
     let mut fleet = start_traced_fleet(&node, arguments.tls, &collector).await?;
@@ -141,7 +141,7 @@ async fn main() -> anyhow::Result<ExitCode> {
         dispatch,
         query,
     };
-    details.tell(&arguments)
+    details.print(&arguments)
 }
 
 /// Starts a server, whose robots show certificates if they connect by TLS.

@@ -32,7 +32,7 @@ use tread_api::ids::{MissionId, RobotId};
 use tread_api::mission::MissionState;
 use tread_tests::fleet::{Fleet, SITE};
 use tread_tests::process::node;
-use tread_tests::report::{Check, figure, tell_with};
+use tread_tests::report::{Check, figure, print_with};
 use tread_tests::stored;
 use tread_tests::wait::{DRIVE, eventually};
 
@@ -146,7 +146,7 @@ async fn main() -> anyhow::Result<ExitCode> {
         fleet.upgrade_server_to(other);
     }
     measure_upgrade(&arguments, &mut fleet, (&mut details, &mut checks)).await?;
-    tell_with(arguments.json, &details, &details, &checks)
+    print_with(arguments.json, &details, &details, &checks)
 }
 
 #[expect(

@@ -146,7 +146,7 @@ pub(crate) async fn measure(
 impl Trial<'_> {
     async fn of(&self, fault: &Fault, base: &mut PythonRobot) -> anyhow::Result<Vec<Check>> {
         let name = fault.name;
-        self.observer.forget_commands();
+        self.observer.clear_commands();
         let switched_at = Instant::now();
         base.switch(name, fault.value)?;
         // The base is mended in time however long an answer takes: without a position a mission fails.

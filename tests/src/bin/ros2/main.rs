@@ -87,7 +87,7 @@ async fn main() -> anyhow::Result<ExitCode> {
         // One after the other: the times of one are not to be those of both.
         [driven.await?, examined.await?].concat()
     };
-    report::tell(arguments.json, &checks)
+    report::print(arguments.json, &checks)
 }
 
 /// Drives a robot on missions, then into faults.

@@ -123,7 +123,7 @@ impl Observer {
     }
 
     /// Forgets the commands so far.
-    pub(crate) fn forget_commands(&self) {
+    pub(crate) fn clear_commands(&self) {
         lock(&self.seen).commands.clear();
     }
 

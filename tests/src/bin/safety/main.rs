@@ -82,7 +82,7 @@ async fn main() -> anyhow::Result<ExitCode> {
     drop(fleet);
     let fleet = Fleet::start_secure_with(&node, CERTIFICATE_S).await;
     checks.extend(link::measure_tls(&arguments, &fleet).await?);
-    report::tell(arguments.json, &checks)
+    report::print(arguments.json, &checks)
 }
 
 fn on_the_bench(run: TrialRun, model: LeaseModelRun) -> anyhow::Result<Vec<Check>> {

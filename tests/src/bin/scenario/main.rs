@@ -97,7 +97,7 @@ fn main() -> anyhow::Result<ExitCode> {
                 visits,
                 arrivals_per_model: arrivals,
             }))?;
-            tell(
+            print_report(
                 Form::of(json, markdown),
                 &report,
                 &Tables::of_map(&report),
@@ -116,7 +116,7 @@ fn main() -> anyhow::Result<ExitCode> {
                 grounds,
                 robots,
             })?;
-            tell(
+            print_report(
                 Form::of(json, markdown),
                 &report,
                 &Tables::of_cells(&report),
@@ -144,16 +144,16 @@ impl Form {
     }
 }
 
-fn tell(
+fn print_report(
     form: Form,
     report: &impl Serialize,
     tables: &Tables,
     checks: &[Check],
 ) -> anyhow::Result<ExitCode> {
     if form == Form::Markdown {
-        return report::tell_markdown(&tables.markdown(), checks);
+        return report::print_markdown(&tables.markdown(), checks);
     }
-    report::tell_with(form == Form::Json, &Details { report }, tables, checks)
+    report::print_with(form == Form::Json, &Details { report }, tables, checks)
 }
 
 #[derive(Debug, Serialize)]

@@ -288,10 +288,10 @@ async fn run(arguments: &Arguments) -> anyhow::Result<ExitCode> {
         eprintln!("{}", fleet.log_tail("server").join("\n"));
     }
     robots.abort_all();
-    tell(arguments, &fleet, &counts, seconds, survived, &took_ms)
+    print_report(arguments, &fleet, &counts, seconds, survived, &took_ms)
 }
 
-fn tell(
+fn print_report(
     arguments: &Arguments,
     fleet: &Fleet,
     counts: &Counts,
@@ -340,7 +340,7 @@ fn tell(
         details.server_cpu_s,
         details.server_memory_peak_mib,
     );
-    report::tell_with(arguments.json, &details, words, &checks)
+    report::print_with(arguments.json, &details, words, &checks)
 }
 
 #[tokio::main]

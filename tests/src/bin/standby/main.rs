@@ -211,5 +211,5 @@ async fn main() -> anyhow::Result<ExitCode> {
         robots: arguments.robots,
         reads: arguments.reads,
     };
-    report::tell_with(arguments.json, &details, String::new(), &checks)
+    report::print_with(arguments.json, &details, String::new(), &checks)
 }

@@ -55,7 +55,7 @@ impl MissionStage {
             self.replacement_until = None;
             return;
         };
-        if active.minds_silence(input.demands.server_silence) {
+        if active.is_server_silent_too_long(input.demands.server_silence) {
             active.stop(EndReason::ServerSilent);
         }
         if self.replacement_until.is_some_and(|until| now > until) {

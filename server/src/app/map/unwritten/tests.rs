@@ -245,7 +245,7 @@ impl Server {
         self.unwritten.end_read(number);
         // What the other reader needs is kept, and nothing without one.
         let other = self.reads[1 - of];
-        let kept = self.unwritten.stored_meanwhile.iter();
+        let kept = self.unwritten.stored_during_read.iter();
         let mut needed = kept.map(|stored| other.is_some_and(|other| stored.until_read > other));
         assert!(needed.all(|is_needed| is_needed));
     }

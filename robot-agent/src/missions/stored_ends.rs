@@ -17,12 +17,12 @@ pub const UNRECORDED_ENDS_MAX: usize = 16;
 /// the file do not depend on it.
 #[derive(Debug, Clone, PartialEq, Default, Deserialize)]
 #[serde(from = "Value")]
-pub(super) struct KeptEnds {
+pub(super) struct StoredEnds {
     reports: VecDeque<MissionReport>,
     unreadable: usize,
 }
 
-impl KeptEnds {
+impl StoredEnds {
     /// Keeps a report, in place of an earlier one of the same mission.
     pub(super) fn keep(&mut self, report: MissionReport) {
         self.reports.retain(|kept| kept.mission != report.mission);
@@ -48,13 +48,13 @@ impl KeptEnds {
     }
 }
 
-impl Serialize for KeptEnds {
+impl Serialize for StoredEnds {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         self.reports.serialize(serializer)
     }
 }
 
-impl From<Value> for KeptEnds {
+impl From<Value> for StoredEnds {
     fn from(value: Value) -> Self {
         let written = if let Value::Array(reports) = value {
             reports

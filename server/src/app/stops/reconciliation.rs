@@ -18,7 +18,7 @@ use crate::db::{self, Tx};
 
 /// Actions for all stops.
 #[derive(Debug, Default)]
-struct Tending {
+struct StopActions {
     again: Vec<Stop>,
     /// Those in `again` that their robots had confirmed.
     lost: Vec<Stop>,
@@ -32,8 +32,8 @@ struct Tending {
 
 impl App {
     /// Compares open stops with those that robots show; returns the ones to be sent again.
-    pub(in crate::app) async fn tend_stops(&self) -> Result<Vec<Stop>, AppError> {
-        let Tending {
+    pub(in crate::app) async fn reconcile_stops(&self) -> Result<Vec<Stop>, AppError> {
+        let StopActions {
             lost,
             cleared,
             standing,
@@ -60,7 +60,7 @@ impl App {
             }
             let holds_missions = !adopted.is_empty();
             for key in adopted {
-                self.adopt_shown_stop(&mut tx, &key).await?;
+                self.adopt_reported_stop(&mut tx, &key).await?;
             }
             let mut shown = Vec::new();
             for key in alerts {
@@ -84,7 +84,7 @@ impl App {
         Ok(again)
     }
 
-    async fn check_stops(&self) -> Result<Tending, AppError> {
+    async fn check_stops(&self) -> Result<StopActions, AppError> {
         let mut tx = self.db().read("stops").await?;
         let mut robots: BTreeMap<RobotKey, Option<Stop>> = BTreeMap::new();
         for (key, _latch) in self.presences().shown_stops() {
@@ -94,7 +94,7 @@ impl App {
             robots.insert(key_of(&stop), Some(self.with_confirmation(stop)));
         }
         let mut alerted = alerted(&mut tx).await?;
-        let mut tending = Tending::default();
+        let mut actions = StopActions::default();
         for (key, stop) in robots {
             let presence = self.presences().get(&key);
             let shown = match presence.state() {
@@ -104,7 +104,7 @@ impl App {
             let is_alerted = alerted.remove(&key);
             let is_unconfirmed = |stop: &Stop| stop.confirmed_at.is_none();
             if is_alerted && !stop.as_ref().is_some_and(is_unconfirmed) {
-                tending.alerts.push(key.clone());
+                actions.alerts.push(key.clone());
             }
             let open = stop.as_ref().map(|stop| Open {
                 id: stop.id,
@@ -115,7 +115,7 @@ impl App {
             let verdict = judge(open, shown);
             let Some(stop) = stop else {
                 if verdict == Verdict::Adopt && self.may_adopt(&key) {
-                    tending.adopted.push(key);
+                    actions.adopted.push(key);
                 }
                 continue;
             };
@@ -123,30 +123,30 @@ impl App {
             let standing = presence.state().and_then(|state| state.safety.standing);
             let stands = standing.is_some_and(|seen| seen.state == StandingState::Standing);
             if is_shown && stands && stop.standing_at.is_none() {
-                tending.standing.push(stop.id);
+                actions.standing.push(stop.id);
             }
             match verdict {
                 Verdict::Tell => {
                     // A robot that is on the network gets the stop, and an alert if it does not
                     // confirm.
                     if !is_alerted && !presence.is_there(self.clock().elapsed()) {
-                        tending.alerts.push(key);
+                        actions.alerts.push(key);
                     }
-                    tending.again.push(stop);
+                    actions.again.push(stop);
                 }
                 Verdict::Lost => {
-                    tending.again.push(stop.clone());
-                    tending.lost.push(stop);
+                    actions.again.push(stop.clone());
+                    actions.lost.push(stop);
                 }
-                Verdict::Cleared => tending.cleared.push(stop.id),
-                Verdict::Adopt if self.may_adopt(&key) => tending.adopted.push(key),
+                Verdict::Cleared => actions.cleared.push(stop.id),
+                Verdict::Adopt if self.may_adopt(&key) => actions.adopted.push(key),
                 Verdict::Nothing | Verdict::Adopt => {}
             }
         }
         // Robots without an open stop.
-        tending.alerts.extend(alerted);
-        tending.again.sort_by_key(|stop| (stop.wanted_at, stop.id));
-        Ok(tending)
+        actions.alerts.extend(alerted);
+        actions.again.sort_by_key(|stop| (stop.wanted_at, stop.id));
+        Ok(actions)
     }
 
     fn may_adopt(&self, key: &RobotKey) -> bool {

@@ -31,15 +31,18 @@ const OUTBOX_PATIENCE: Duration = Duration::from_secs(10);
 impl Reconciler {
     /// Looks at everything that is not a step of a mission; `open` are the open missions, if they
     /// could be read.
-    pub(super) async fn upkeep(&mut self, open: Option<&[OpenMission]>) -> Result<(), AppError> {
-        self.ask_restrained();
+    pub(super) async fn run_periodic_checks(
+        &mut self,
+        open: Option<&[OpenMission]>,
+    ) -> Result<(), AppError> {
+        self.query_restrained();
         self.expire().await?;
         self.end_duplicate_agents();
-        self.attendance.look(&self.app).await?;
-        self.conditions.look(&self.app).await?;
+        self.attendance.check(&self.app).await?;
+        self.conditions.check(&self.app).await?;
         if let Some(open) = open {
             self.conditions.end_of_absent(&self.app, open).await?;
-            self.delays.look(&self.app, open).await?;
+            self.delays.check(&self.app, open).await?;
         }
         self.push_sites().await
     }
@@ -75,7 +78,7 @@ impl Reconciler {
     }
 
     /// Asks robots that are restrained since a restoration how their missions ended.
-    fn ask_restrained(&mut self) {
+    fn query_restrained(&mut self) {
         let restrained: Vec<Restrained> = self.restrained.values().cloned().collect();
         let wanted = |key: &RobotKey| {
             let found = self.restrained.get(key);

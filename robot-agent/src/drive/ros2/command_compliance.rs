@@ -19,9 +19,9 @@ use tread_control::measured::WheelSpeeds;
 const MEMORY: Duration = Duration::from_millis(600);
 /// Number of spans into which [`MEMORY`] is divided.
 const SPANS: usize = 12;
-/// Summed time without obedience after which the wheels are refused.
+/// Summed time without compliance after which the wheels are refused.
 const FOR: Duration = Duration::from_millis(500);
-/// Fraction of the time of obedience that is subtracted: the wheels may disobey a third of the
+/// Fraction of the time of compliance that is subtracted: the wheels may disobey a third of the
 /// time.
 const PARDON: f64 = 0.5;
 /// Longest time that one sample of the wheels accounts for.
@@ -31,7 +31,7 @@ const WORD_MAX: Duration = Duration::from_millis(100);
 const STANDS_FOR: Duration = Duration::from_millis(350);
 /// Ratio to its command below which a wheel's speed counts as standstill.
 const STANDING_SHARE: f64 = 0.1;
-/// Time of obedience after which the wheels are accepted again.
+/// Time of compliance after which the wheels are accepted again.
 const AGAIN_FOR: Duration = Duration::from_secs(1);
 /// Tolerance of a wheel's speed: absolute, rad/s, and relative to the command.
 const TOLERANCE: (f64, f64) = (1.0, 0.25);
@@ -127,11 +127,11 @@ pub enum Verdict {
 
 /// State of the check.
 #[derive(Debug, Clone, Copy)]
-pub struct Obedience {
+pub struct CommandCompliance {
     spans: [Envelope; SPANS],
     /// Index and begin of the span that is being filled.
     present: (usize, Duration),
-    /// Summed time without obedience, reduced by obedience.
+    /// Summed time without compliance, reduced by compliance.
     disobeyed: Duration,
     /// Time of uninterrupted standstill.
     stood: Duration,
@@ -141,7 +141,7 @@ pub struct Obedience {
     verdict: Verdict,
 }
 
-impl Default for Obedience {
+impl Default for CommandCompliance {
     fn default() -> Self {
         Self {
             spans: [Envelope::NONE; SPANS],
@@ -155,7 +155,7 @@ impl Default for Obedience {
     }
 }
 
-impl Obedience {
+impl CommandCompliance {
     /// Records a command.
     pub fn command(&mut self, now: Duration, command: WheelSpeeds) {
         let span = MEMORY / u32::try_from(SPANS).unwrap_or(1);
@@ -238,10 +238,10 @@ mod tests {
         commanded: impl Fn(f64) -> WheelSpeeds,
         mut measured: impl FnMut(f64) -> WheelSpeeds,
     ) -> Option<(Duration, Verdict)> {
-        let mut obedience = Obedience::default();
+        let mut compliance = CommandCompliance::default();
         (0..ticks).map(|tick| tick * STEP).find_map(|now| {
-            obedience.command(now, commanded(now.as_secs_f64()));
-            let verdict = obedience.judge(now, measured(now.as_secs_f64()));
+            compliance.command(now, commanded(now.as_secs_f64()));
+            let verdict = compliance.judge(now, measured(now.as_secs_f64()));
             (verdict != Verdict::Obeys).then_some((now, verdict))
         })
     }
@@ -312,7 +312,7 @@ mod tests {
     #[test]
     fn encoders_that_get_stuck_are_named_whatever_the_wheels_did_before() {
         for before in [0, 10, 20] {
-            let mut obedience = Obedience::default();
+            let mut compliance = CommandCompliance::default();
             let mut verdict = Verdict::Obeys;
             // They obey, are blocked for a moment, obey for another, and get stuck.
             for tick in 0..100 + before + 16 + 60 {
@@ -324,8 +324,8 @@ mod tests {
                     _ if tick < 100 + before + 16 => commanded,
                     _ => speeds(0.0, 0.0),
                 };
-                obedience.command(now, commanded);
-                verdict = obedience.judge(now, measured);
+                compliance.command(now, commanded);
+                verdict = compliance.judge(now, measured);
             }
             assert_eq!(
                 verdict,
@@ -371,19 +371,19 @@ mod tests {
 
     #[test]
     fn wheels_that_obey_again_are_trusted_again() {
-        let mut obedience = Obedience::default();
+        let mut compliance = CommandCompliance::default();
         let mut trusted = Vec::new();
         for tick in 0..400 {
             let now = tick * STEP;
             let is_stuck = tick < 100;
             let commanded = speeds(5.0, 5.0);
-            obedience.command(now, commanded);
+            compliance.command(now, commanded);
             let measured = if is_stuck {
                 speeds(0.0, 0.0)
             } else {
                 commanded
             };
-            trusted.push(obedience.judge(now, measured) == Verdict::Obeys);
+            trusted.push(compliance.judge(now, measured) == Verdict::Obeys);
         }
         assert!(!trusted[99] && !trusted[199 - 5] && trusted[205]);
     }
