@@ -5,6 +5,7 @@
 
 mod alerts;
 
+mod description;
 mod drive;
 mod etag;
 mod events;
@@ -47,9 +48,9 @@ use tower_http::request_id::{
     MakeRequestUuid, PropagateRequestIdLayer, RequestId, SetRequestIdLayer,
 };
 use tower_http::trace::TraceLayer;
-use tread_api::problem::{PROBLEM_MEDIA_TYPE, ProblemType};
+use tread_api::problem::ProblemType;
 use utoipa::OpenApi as _;
-use utoipa::openapi::{Content, OpenApi, Ref, RefOr, ResponseBuilder};
+use utoipa::openapi::OpenApi;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 use utoipa_swagger_ui::SwaggerUi;
@@ -183,7 +184,7 @@ fn map_routes() -> OpenApiRouter<App> {
 
 /// Returns the OpenAPI description.
 pub fn openapi() -> OpenApi {
-    with_problems(routes().to_openapi())
+    description::complete(routes().to_openapi())
 }
 
 /// Returns the requirements of every route, from the description.
@@ -191,44 +192,10 @@ pub fn access() -> Access {
     Access::of(&openapi())
 }
 
-/// Says of every operation that its errors are problems, and how to show who asks.
-fn with_problems(mut openapi: OpenApi) -> OpenApi {
-    identity::access::describe(&mut openapi);
-    for item in openapi.paths.paths.values_mut() {
-        let operations = [
-            &mut item.get,
-            &mut item.put,
-            &mut item.post,
-            &mut item.delete,
-            &mut item.patch,
-        ];
-        for operation in operations.into_iter().flatten() {
-            let problem = ResponseBuilder::new()
-                .description("What is wrong; `type` is one of the closed list")
-                .content(
-                    PROBLEM_MEDIA_TYPE,
-                    Content::new(Some(Ref::from_schema_name("ProblemBody"))),
-                );
-            let responses = &mut operation.responses.responses;
-            responses.insert("default".to_owned(), problem.into());
-            for (status, response) in responses {
-                if let (true, RefOr::T(response)) = (status.starts_with(['4', '5']), response)
-                    && let Some(content) = response.content.swap_remove("application/json")
-                {
-                    response
-                        .content
-                        .insert(PROBLEM_MEDIA_TYPE.to_owned(), content);
-                }
-            }
-        }
-    }
-    openapi
-}
-
 /// Creates the router of the whole API, for a server with these host names.
 pub fn router(app: App, names: Names) -> Router {
     let (router, openapi) = routes().split_for_parts();
-    let openapi = with_problems(openapi);
+    let openapi = description::complete(openapi);
     let access = Access::of(&openapi);
     let router = router
         .merge(page::routes())
