@@ -191,7 +191,7 @@ pub fn access() -> Access {
     Access::of(&openapi())
 }
 
-/// Says of every operation that its errors are problems, and how to show who asks.
+/// Adds to every operation that its errors are problems, and how to authenticate.
 fn with_problems(mut openapi: OpenApi) -> OpenApi {
     identity::access::describe(&mut openapi);
     for item in openapi.paths.paths.values_mut() {
@@ -204,7 +204,7 @@ fn with_problems(mut openapi: OpenApi) -> OpenApi {
         ];
         for operation in operations.into_iter().flatten() {
             let problem = ResponseBuilder::new()
-                .description("What is wrong; `type` is one of the closed list")
+                .description("Problem details; `type` is one of the problem types")
                 .content(
                     PROBLEM_MEDIA_TYPE,
                     Content::new(Some(Ref::from_schema_name("ProblemBody"))),

@@ -28,7 +28,7 @@ use crate::http::subject::Subject;
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(in crate::http) struct CellQuery {
-    /// Lowest x of the area in the site frame, metres; the whole map when no bound is given.
+    /// Lowest x of the area in the site frame, metres; that of the whole map when absent.
     x_min_m: Option<f64>,
     /// Lowest y of the area in the site frame, metres.
     y_min_m: Option<f64>,
@@ -150,7 +150,7 @@ pub(in crate::http) struct DifferenceQuery {
     from: Timestamp,
     /// Second time; the present when absent.
     to: Option<Timestamp>,
-    /// Lowest x of the area in the site frame, metres; the whole map when no bound is given.
+    /// Lowest x of the area in the site frame, metres; that of the whole map when absent.
     x_min_m: Option<f64>,
     /// Lowest y of the area in the site frame, metres.
     y_min_m: Option<f64>,
