@@ -206,7 +206,7 @@ pub(super) enum BadFrame {
     #[error("{0}")]
     Parser(serde_json::Error),
     /// It has a list in place of an object, which the parser would accept.
-    #[error("the body has a list where an object is required")]
+    #[error("a list was given where an object is required")]
     List,
 }
 
@@ -218,7 +218,7 @@ fn refuse_lists_for_objects<T: Serialize>(parsed: &T, body: &[u8]) -> Result<(),
         None => Ok(()),
         Some(place) => {
             let problem = Problem::new(ProblemType::InvalidBody)
-                .detail("the body has a list where an object is required");
+                .detail("a list was given where an object is required");
             Err(if place.is_empty() {
                 problem
             } else {
@@ -367,7 +367,7 @@ mod tests {
     fn a_list_is_no_object_however_deep() {
         let said = problem(r#"["a","b",{"circle":[{"x_m":0,"y_m":0},3,0.5]},null]"#).to_string();
         assert!(
-            said.contains("InvalidBody") && said.contains("a list stands"),
+            said.contains("InvalidBody") && said.contains("a list was given"),
             "{said}"
         );
         let text = r#"{"site":"a","robot":"b","trajectory":{"circle":
