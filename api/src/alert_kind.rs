@@ -1,10 +1,10 @@
-//! Kinds of alerts: the codes that this version raises. Clients offer them, and a webhook that is
-//! limited to a kind of no alert is refused.
+//! Kinds of alerts: the codes that this version raises. Clients offer them for selection. The
+//! server refuses a webhook that is limited to an unknown kind.
 
 use crate::ids::AlertCode;
 
-/// Codes that servers and agents of this version raise, in alphabetical order. Those about the
-/// messages of a robot's base are named by [`BASE_PREFIX`] alone, but for the ones listed here.
+/// Codes that servers and agents of this version raise, in alphabetical order. Codes about dropped
+/// messages of a robot's base begin with [`BASE_PREFIX`] and are not listed, except those below.
 pub const ALERT_KINDS: [&str; 42] = [
     "archive-failed",
     "backup-failed",
@@ -49,7 +49,7 @@ pub const ALERT_KINDS: [&str; 42] = [
     "wheel-locked",
     "wheels-and-motion-disagree",
 ];
-/// Begins the codes about dropped messages of a robot's base; the reason follows.
+/// Prefix of the codes about dropped messages of a robot's base; the reason follows it.
 pub const BASE_PREFIX: &str = "base-";
 
 /// Returns whether agents or servers of this version raise alerts of this kind.

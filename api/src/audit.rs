@@ -125,7 +125,7 @@ pub enum Broken {
     #[error("entry {0} was changed after it was written")]
     Changed(u64),
     /// The newest entries are missing, or there are more entries than the server recorded.
-    #[error("the log ends with entry {found}, and the server's record says {expected}")]
+    #[error("the log ends with entry {found}, but by the server's record with entry {expected}")]
     Ends {
         /// Number of the newest entry in the log.
         found: u64,
@@ -133,7 +133,7 @@ pub enum Broken {
         expected: u64,
     },
     /// The hash of the newest entry differs from the server's record.
-    #[error("entry {0} is another one than the server's record says")]
+    #[error("the hash of entry {0} differs from the server's record")]
     LastReplaced(u64),
 }
 

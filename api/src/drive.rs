@@ -75,8 +75,7 @@ pub struct Drive {
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct StopReason {
-    /// Name of the person who stops, put behind the token's name; the token's name alone when
-    /// absent.
+    /// Name of the person who requests the stop; the server puts the token's name before it.
     #[serde(
         default,
         skip_serializing_if = "Option::is_none",
@@ -175,7 +174,7 @@ pub struct DriveView {
     pub twist: Option<Aged<Twist>>,
     /// Progress of the robot's active mission; `null` without one.
     pub mission: Option<MissionProgress>,
-    /// Stop, lease, and whatever reduces the robot's speed.
+    /// Stops, leases, limits and everything else that reduces the robot's speed.
     pub safety: SafetyStatus,
     /// Age of drive commands at the robot, as the robot reports it, plus this socket's round-trip
     /// time, milliseconds; `null` while one of the two is unknown.

@@ -66,7 +66,7 @@ pub struct CreateJoinToken {
     pub valid_minutes: Option<u32>,
 }
 
-/// New join token with its secret, which no other answer contains.
+/// New join token with its secret, which no other response contains.
 #[derive(Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct CreatedJoinToken {
     /// The join token.
@@ -119,7 +119,7 @@ pub struct RenewCertificate {
     pub proof: String,
 }
 
-/// Certificate of a robot, answered to each enrolment and renewal.
+/// Certificate of a robot, the response to each enrolment and renewal.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct RobotCertificate {
     /// Site of the robot.
@@ -166,8 +166,8 @@ pub struct Enrolment {
     /// Name of the token or person that revoked or replaced it; `null` while it is valid.
     pub revoked_by: Option<String>,
     /// SHA-256 fingerprint of the authority that signed the certificate which the robot presented
-    /// last. During a rotation it tells which robots use the new authority. `null` if the robot has
-    /// not presented a certificate since the server records this.
+    /// last. During a rotation it shows which robots use the new authority. `null` if the server
+    /// has not recorded a certificate of the robot yet.
     #[serde(default)]
     pub authority: Option<String>,
 }
@@ -283,7 +283,7 @@ pub struct RobotLeft {
 /// Request to finish a rotation.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct FinishRotation {
-    /// Identifier of the rotation: `id` in the answer to its start.
+    /// Identifier of the rotation: `id` in the response to its start.
     #[schema(value_type = String)]
     pub rotation: TrustId,
     /// Whether to retire the former authority although robots still hold certificates of it; these
@@ -296,7 +296,7 @@ pub struct FinishRotation {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct ReplaceAuthority {
     /// SHA-256 fingerprint of the authority to replace: `signing` of the present authority. The
-    /// request is refused if another authority signs by then.
+    /// request is refused if another authority signs meanwhile.
     pub signing: String,
 }
 

@@ -5,8 +5,9 @@
 //! line the value that a client sends as `Last-Event-ID` to resume. A stream begins with a
 //! snapshot: `snapshot_begin`, the present state of everything that matches the filters,
 //! `snapshot_end`. If the server still keeps the events since the given `Last-Event-ID`, the stream
-//! begins with those events instead. After an event of another server, or of one that was restarted since, it
-//! begins with the steps of missions that have followed it, and then has the snapshot. Before the server ends a stream it sends [`Event::End`].
+//! begins with those events instead. If that event is from another server, or from before a restart
+//! of the server, the stream begins with the mission steps that followed it, and the snapshot comes
+//! after them. Before the server ends a stream it sends [`Event::End`].
 
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
@@ -54,7 +55,7 @@ impl Topic {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Event {
-    /// Begin of the snapshot; the client discards all state from before.
+    /// Start of the snapshot; the client discards all earlier state.
     SnapshotBegin,
     /// End of the snapshot.
     SnapshotEnd,
@@ -68,7 +69,7 @@ pub enum Event {
     Alert(Box<Alert>),
     /// Region in which the friction map has changed.
     Map(Box<MapChange>),
-    /// End of the stream by the server.
+    /// The server ends the stream.
     End(StreamEnd),
 }
 
@@ -108,6 +109,6 @@ pub enum StreamEnd {
     /// The client reads too slowly. It misses events unless it resumes while the server still keeps
     /// them.
     TooSlow,
-    /// The server shuts down.
+    /// The server is shutting down.
     Stopping,
 }

@@ -62,7 +62,7 @@ pub struct Segment {
     /// Mission during which it was measured; absent if there was none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mission: Option<MissionId>,
-    /// Begin of the measurement, by the robot's clock.
+    /// Start of the measurement, by the robot's clock.
     pub started_at: Timestamp,
     /// End of the measurement, by the robot's clock.
     pub ended_at: Timestamp,
@@ -88,7 +88,7 @@ pub struct Segment {
     /// torque.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rolling_resistance: Option<Information>,
-    /// Largest friction coefficient that the ground demonstrably gave, 0 to 1.5; a lower bound of
+    /// Largest friction coefficient that this measurement demonstrated, 0 to 1.5; a lower bound of
     /// the peak.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mu_peak_lower_bound: Option<f64>,
@@ -306,7 +306,7 @@ pub struct FusedFriction {
     pub effective_track_ratio: Option<ValueEstimate>,
     /// Rolling resistance coefficient; `null` where it was not measured, for lack of wheel torque.
     pub rolling_resistance: Option<ValueEstimate>,
-    /// Number of all segments ever measured here, including segments without information on θ and
+    /// Number of all segments measured here so far, including segments without information on θ and
     /// those from before the ground changed.
     pub segments: u64,
     /// Number of robots whose measurements contribute.
@@ -317,7 +317,7 @@ pub struct FusedFriction {
     pub age_s: f64,
     /// Whether the measurements differ by more than their noise and the robots' biases explain.
     pub disputed: bool,
-    /// Time since when the ground has its present friction; earlier measurements are ignored.
+    /// Time since which the ground has had its present friction; earlier measurements are ignored.
     /// `null` if no change was detected.
     pub changed_at: Option<Timestamp>,
 }
@@ -332,8 +332,8 @@ pub struct FrictionBounds {
     pub theta_upper_95: f64,
     /// 5 % quantile of K, 1 / `theta_upper_95`.
     pub stiffness_lower_5: f64,
-    /// 95 % quantile of K, above which K is with a probability of 5 %; `null` when the measurements
-    /// do not bound K from above.
+    /// 95 % quantile of K: K is above it with a probability of 5 %; `null` when the measurements do
+    /// not bound K from above.
     pub stiffness_upper_95: Option<f64>,
 }
 
@@ -424,7 +424,7 @@ pub struct FrictionAt {
     /// Requested time.
     pub at: Timestamp,
     /// Time up to which measurements are included: `at` rounded down to a minute, or to the end of
-    /// an epoch whose raw measurements are missing or too many; `at` itself where that is the
+    /// an epoch whose raw measurements are missing or too many; equal to `at` if that is the
     /// present.
     pub as_of: Timestamp,
     /// Friction for each robot model.
@@ -465,7 +465,7 @@ pub struct AskPath {
     pub normalisation: Option<String>,
 }
 
-/// Friction along a path, with the speed that follows from it.
+/// Friction along a path, with the speed that it permits the robot.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct PathFriction {
     /// Time up to which measurements are included: the requested time rounded down to a minute, or
@@ -488,7 +488,7 @@ pub struct PathFriction {
 /// Friction on one section of a path.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct PathPiece {
-    /// Begin of the section, metres along the path.
+    /// Start of the section, metres along the path.
     pub from_m: f64,
     /// Cell of the section.
     pub cell: Cell,
@@ -506,7 +506,7 @@ pub struct PathPiece {
     /// cautious default, but not above the one at which the wheels' slip leaves the linear range
     /// for `theta_upper_95`.
     pub traction_limit_mu: f64,
-    /// Permitted speed at the begin of the section, m/s, from curvature, traction limit and the
+    /// Permitted speed at the start of the section, m/s, from curvature, traction limit and the
     /// robot's limits; the robot comes to rest at the end of the path.
     pub speed_m_s: f64,
 }
@@ -541,8 +541,8 @@ pub struct VisitSuggestion {
     /// Terrain at the centre; `null` where none is drawn.
     pub terrain: Option<TerrainRef>,
     /// Expected gain of a visit: natural logarithm of the ratio of the standard deviation of θ
-    /// before the visit to that after it. Where nothing was measured, the one before is that of the
-    /// prior.
+    /// before the visit to that after it. Where nothing was measured, the standard deviation before
+    /// the visit is that of the prior.
     pub gain: f64,
     /// Present standard deviation of θ over θ; `null` when nothing was measured.
     pub relative_std_dev: Option<f64>,
@@ -562,7 +562,7 @@ pub struct RobotContribution {
     pub cells: u64,
     /// Number of its segments.
     pub segments: u64,
-    /// Begin of the epoch (hour, day or month) of its first measurement.
+    /// Start of the epoch (hour, day or month) of its first measurement.
     pub first_at: Timestamp,
     /// End of its newest measurement.
     pub newest_at: Timestamp,
@@ -578,8 +578,8 @@ pub struct CellFriction {
     pub cell: Cell,
     /// Side of the square, metres.
     pub size_m: f64,
-    /// Terrain; `null` where none was drawn. A cell across a border is listed once for each
-    /// terrain.
+    /// Terrain; `null` where none was drawn. A cell on a border is listed once for each of its
+    /// terrains.
     pub terrain: Option<TerrainRef>,
     /// Configuration: robot model and tyres.
     pub configuration: ConfigurationId,
@@ -628,7 +628,7 @@ pub struct Withdrawal {
     pub id: i64,
     /// Robot whose measurements are withdrawn.
     pub robot: RobotId,
-    /// Begin of the first withdrawn hour.
+    /// Start of the first withdrawn hour.
     pub from: Timestamp,
     /// End of the last withdrawn hour.
     pub before: Timestamp,

@@ -118,7 +118,7 @@ impl CreateToken {
     }
 }
 
-/// New token with its secret, which no other answer contains.
+/// New token with its secret, which no other response contains.
 #[derive(Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct CreatedToken {
     /// The token.
@@ -248,13 +248,13 @@ pub struct SignInMethods {
 pub struct OidcSignIn {
     /// Name of the provider, for people.
     pub label: String,
-    /// Path on this server at which a browser begins the sign-in.
+    /// Path on this server at which a browser starts the sign-in.
     pub path: String,
     /// Whether the provider has answered; the server keeps retrying otherwise.
     pub available: bool,
 }
 
-/// Answer to the end of a session.
+/// Response to the end of a session.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct SignedOut {
     /// Address at which a browser signs out at the provider too.
@@ -282,17 +282,17 @@ pub struct PersonSession {
     pub last_used_at: Option<Timestamp>,
 }
 
-/// Entry of the audit log: a change, or a request that was refused.
+/// Entry of the audit log: a change, or a refused request.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct AuditEntry {
     /// Number of the entry; consecutive in the order of time.
     pub id: u64,
-    /// Time of the answer; that of the last one if the entry stands for several requests.
+    /// Time of the response; that of the last one if the entry stands for several requests.
     pub at: Timestamp,
-    /// Time of the first answer if the entry stands for several requests; `null` for a single one.
+    /// Time of the first response if the entry stands for several requests; else `null`.
     pub since: Option<Timestamp>,
     /// Number of requests. When an author sends very many, repetitions of a request with the same
-    /// answer share one entry.
+    /// response share one entry.
     pub count: u64,
     /// Name of the token or of the person; `null` for a request without valid credentials.
     pub who: Option<String>,
@@ -312,10 +312,10 @@ pub struct AuditEntry {
     pub route: String,
     /// Requested path, without its query.
     pub path: String,
-    /// HTTP status of the answer.
+    /// HTTP status of the response.
     pub status: u16,
-    /// `x-request-id` of the answer, of the newest one if the entry stands for several requests; it is in
-    /// the server's log too.
+    /// `x-request-id` of the response; that of the last one if the entry stands for several
+    /// requests. The server's log contains it too.
     pub request_id: String,
     /// Body of the request without secrets, shortened if it was long; `null` without one.
     pub what: Option<serde_json::Value>,

@@ -93,12 +93,12 @@ slug! {
 }
 
 slug! {
-    /// Identifier of an external program that limits a robot, such as an obstacle detection.
+    /// Identifier of an external program that limits a robot, such as obstacle detection.
     OwnerId
 }
 
 slug! {
-    /// Tag of a robot, by which people sort out a fleet.
+    /// Tag of a robot, by which people group a fleet.
     Tag
 }
 
@@ -212,7 +212,7 @@ uuid_id! {
     PlanHash
 }
 
-/// Whom an OpenID provider names: its issuer, and the subject there.
+/// Identity of a person at an OpenID provider: its issuer, and the subject there.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct OidcSubject<'text> {
     /// The provider's issuer.

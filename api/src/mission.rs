@@ -25,9 +25,9 @@ pub const LINK_SILENCE_MIN_S: f64 = 1.0;
 /// Maximum silence of the server in [`LinkPolicy::StopAfter`], and maximum `lost_after_s` of a
 /// mission, seconds.
 pub const LINK_SILENCE_MAX_S: f64 = 86_400.0;
-/// Maximum number of points of a driven path; a longer path is simplified out further.
+/// Maximum number of points of a driven path; a longer path is simplified further.
 pub const DRIVEN_POINTS_MAX: usize = 2_000;
-/// Maximum number of samples of θ in a quality report; more samples are simplified out.
+/// Maximum number of samples of θ in a quality report; a longer series is thinned out.
 pub const THETA_SAMPLES_MAX: usize = 64;
 
 /// State of a mission. The last five states are terminal: a mission never leaves them.
@@ -171,7 +171,7 @@ impl LinkPolicy {
 /// Body of `POST /v1/missions/{mission}/replace`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct ReplaceMission {
-    /// Trajectory to drive instead, from the place at which the robot is then.
+    /// New trajectory, which the robot drives from its position at that time.
     pub trajectory: Trajectory,
 }
 
@@ -326,8 +326,8 @@ pub struct ThetaSample {
 /// Path that a robot drove during a mission, as it measured it.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, ToSchema)]
 pub struct DrivenPath {
-    /// Tolerance of the thinning, metres: the maximum distance of the full path from the polyline
-    /// through `points`.
+    /// Tolerance of the simplification, metres: the maximum distance of the full path from the
+    /// polyline through `points`.
     pub tolerance_m: f64,
     /// Points in driving order, in the site frame; at most 2 000.
     pub points: Vec<Point>,

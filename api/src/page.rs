@@ -1,4 +1,4 @@
-//! Envelopes of lists, which are answered in pages.
+//! Envelopes of lists, which the API returns in pages.
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -39,12 +39,12 @@ pub struct DifferencePage<T> {
     pub items: Vec<T>,
     /// Value of `cursor` for the request of the next page; `null` on the last page.
     pub next_cursor: Option<String>,
-    /// Time up to which measurements are included before: the requested first time rounded down to
-    /// a minute, or to the end of an epoch whose raw measurements are missing or too many.
+    /// Time up to which measurements are included in `before`: the requested first time rounded
+    /// down to a minute, or to the end of an epoch whose raw measurements are missing or too many.
     #[serde(default)]
     pub from: Option<Timestamp>,
-    /// Time up to which measurements are included after: the requested second time, rounded down
-    /// likewise; `null` if none was requested, and all measurements are included then.
+    /// Time up to which measurements are included in `after`: the requested second time, rounded
+    /// down likewise; `null` if none was requested, and all measurements are included then.
     #[serde(default)]
     pub as_of: Option<Timestamp>,
 }

@@ -9,7 +9,7 @@ use crate::trajectory::Place;
 /// Media type of a problem.
 pub const PROBLEM_MEDIA_TYPE: &str = "application/problem+json";
 
-/// Type of a problem with which the API answers.
+/// Type of a problem that the API reports.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 #[expect(missing_docs, reason = "titles say it")]
 pub enum ProblemType {
@@ -239,7 +239,7 @@ impl ProblemType {
     }
 }
 
-/// Error answer, a problem by RFC 9457.
+/// Error response: problem details by RFC 9457.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct ProblemBody {
     /// Type of the problem, a stable URI reference for programs.
@@ -247,7 +247,7 @@ pub struct ProblemBody {
     pub kind: ProblemType,
     /// Title of the problem type, for people.
     pub title: String,
-    /// HTTP status of the answer.
+    /// HTTP status of the response.
     pub status: u16,
     /// What is wrong with this request, and how to correct it, for people.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -258,7 +258,7 @@ pub struct ProblemBody {
     /// Present state of the mission, if it does not allow the request.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub state: Option<MissionState>,
-    /// Place along the path from which on it cannot be driven.
+    /// Place along the path beyond which the robot cannot drive it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub place: Option<Place>,
 }

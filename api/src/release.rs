@@ -82,7 +82,7 @@ impl fmt::Display for Peer {
             Self::Supported => "is supported",
             Self::TooOld => "is more than one release older: update it",
             Self::TooNew => "is more than one release newer: update the server first",
-            Self::Unknown => "is of no release",
+            Self::Unknown => "is not a release",
         })
     }
 }

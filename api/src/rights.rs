@@ -265,8 +265,8 @@ pub struct SiteScope {
 #[serde(try_from = "Option<Vec<SiteScope>>", into = "Option<Vec<SiteScope>>")]
 pub struct Scope(Option<BTreeMap<SiteId, Option<BTreeSet<RobotId>>>>);
 
-/// Rights with the sites and robots for which they hold. Of several grants, a request needs one
-/// that has both its right and its place.
+/// Rights with the sites and robots for which they hold. A request is allowed if one of the
+/// caller's grants includes both its right and its site or robot.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 pub struct Grant {
     /// Rights that are granted.

@@ -280,7 +280,7 @@ pub struct UpdateRobot {
     pub tags: Option<Vec<Tag>>,
 }
 
-/// Value with its age at the time of the answer.
+/// Value with its age at the time of the message.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Aged<T> {
     /// The value.
@@ -307,13 +307,14 @@ pub struct Robot {
     pub id: RobotId,
     /// Name for people; equal to the identifier until the robot is renamed.
     pub name: String,
-    /// Tags by which people sort out the fleet, in alphabetical order.
+    /// Tags by which people group the fleet, in alphabetical order.
     #[serde(default)]
     pub tags: Vec<Tag>,
     /// Time when it was retired; `null` if it is not retired.
     pub retired_at: Option<Timestamp>,
     /// Time since which no mission is sent to it, because the server was restored from a backup and
-    /// does not know what happened since; an operator releases it. `null` if that is not so.
+    /// does not know what happened since; an operator releases it. `null` if missions are sent to
+    /// it.
     #[serde(default)]
     pub awaits_release_since: Option<Timestamp>,
     /// Site of the robot.
@@ -328,7 +329,7 @@ pub struct Robot {
     pub agent_version: String,
     /// Time of its first connection.
     pub first_seen_at: Timestamp,
-    /// Time of its newest connection.
+    /// Time of its latest connection.
     pub last_hello_at: Timestamp,
     /// Measurements that the server has not put on the friction map.
     pub measurements: UnmappedMeasurements,
@@ -477,7 +478,7 @@ pub struct LoopStatus {
     /// tick.
     #[serde(default)]
     pub lost_samples: u64,
-    /// Number of server commands lost since the start for lack of room in the queue; the server
+    /// Number of server commands lost since the start because the queue was full; the server
     /// repeats them.
     #[serde(default)]
     pub lost_commands: u64,

@@ -1,4 +1,4 @@
-//! Means that only reduce a robot's motion: stops, teleoperation leases, external limits,
+//! Functions that only reduce a robot's motion: stops, teleoperation leases, external limits,
 //! geofences.
 //!
 //! The types are the same over REST and on zenoh. The robot is the authority on all of them, except
@@ -80,7 +80,7 @@ pub enum GateCause {
     CommandAge,
     /// An external limit reduces the speed.
     ExternalLimit,
-    /// A fence is near, or was crossed.
+    /// The robot is near the geofence, or has crossed it.
     Fence,
     /// The command was not a finite number.
     NotFinite,
@@ -204,7 +204,7 @@ pub enum StandingState {
     Other,
 }
 
-/// Everything on a robot that only reduces its motion.
+/// State of all functions that only reduce a robot's motion.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, ToSchema)]
 pub struct SafetyStatus {
     /// Stop in force; absent without one.

@@ -181,7 +181,7 @@ pub struct CreateSite {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(minimum = 0.1, maximum = 100.0)]
     pub cell_m: Option<f64>,
-    /// Position of the site in WGS 84; it can be set later when absent.
+    /// Position of the site in WGS 84; it can also be set later.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub origin: Option<GeoOrigin>,
 }

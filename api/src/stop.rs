@@ -19,7 +19,7 @@ pub const STOP_TEXT_MAX: usize = 200;
 /// the robot too.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 pub struct StopRobot {
-    /// Name of the person who stops; the token's name is put before it.
+    /// Name of the person who requests the stop; the server puts the token's name before it.
     #[serde(
         default,
         skip_serializing_if = "Option::is_none",
@@ -42,7 +42,7 @@ pub struct StopFleet {
     /// Site whose robots are stopped; the robots of all sites when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub site: Option<SiteId>,
-    /// Name of the person who stops; the token's name is put before it.
+    /// Name of the person who requests the stop; the server puts the token's name before it.
     #[serde(
         default,
         skip_serializing_if = "Option::is_none",
@@ -64,7 +64,7 @@ pub struct ClearStop {
     /// Newest stop of the robot. The request is refused if there is a newer one, so that no unseen
     /// stop is cleared.
     pub stop: StopId,
-    /// Name of the person who clears; the token's name is put before it.
+    /// Name of the person who clears the stop; the server puts the token's name before it.
     #[serde(
         default,
         skip_serializing_if = "Option::is_none",
@@ -91,18 +91,18 @@ pub struct Stop {
     /// Time when the robot confirmed the stop: its wheels are commanded to rest, and the stop
     /// survives a restart of the robot. `null` before that.
     pub confirmed_at: Option<Timestamp>,
-    /// Time when the server was informed that the robot is at standstill, measured by wheels,
-    /// odometry, gyro and position; `null` before that. A robot that does not come to rest in time
-    /// raises the alert `does-not-stand`.
+    /// Time when the server received the robot's report that it is at standstill, measured by
+    /// wheels, odometry, gyro and position; `null` before that. A robot that does not come to rest
+    /// in time raises the alert `does-not-stand`.
     pub standing_at: Option<Timestamp>,
     /// Whether the robot has not confirmed the stop within 300 ms. The server repeats the stop
     /// until it is confirmed.
     pub unconfirmed: bool,
-    /// Name of the person who asked last to clear the stop; `null` if nobody did.
+    /// Name of the person who last requested to clear the stop; `null` if nobody did.
     pub clear_asked_by: Option<String>,
     /// Time of that request; `null` if there was none.
     pub clear_asked_at: Option<Timestamp>,
-    /// Time when the robot had cleared it; `null` before that.
+    /// Time when the robot cleared it; `null` before that.
     pub cleared_at: Option<Timestamp>,
     /// Newer stop of the same robot that replaced this one, since a robot has at most one stop in
     /// force; `null` for the newest stop.
@@ -113,9 +113,9 @@ pub struct Stop {
 /// Answer to `POST /v1/stop`: one stop per robot.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct FleetStop {
-    /// Number of robots that had confirmed when the answer was made.
+    /// Number of robots that had confirmed the stop when the response was sent.
     pub confirmed: usize,
-    /// Number of robots that had not confirmed; the server repeats the stop until they do.
+    /// Number of robots that had not confirmed it; the server repeats the stop until they do.
     pub unconfirmed: usize,
     /// Stops of all robots concerned.
     pub stops: Vec<Stop>,

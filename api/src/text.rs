@@ -27,10 +27,10 @@ pub fn is_printable(letter: char) -> bool {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum InvalidText {
     /// The text is empty or too long; contains the maximum length, characters.
-    #[error("it has 1 to {0} characters")]
+    #[error("it must have 1 to {0} characters")]
     Length(usize),
     /// The text contains a character that is not printable by [`is_printable`].
-    #[error("it has the character U+{:04X}, which cannot be seen", u32::from(*.0))]
+    #[error("it has the character U+{:04X}, which is not printable", u32::from(*.0))]
     NotPrintable(char),
 }
 

@@ -63,7 +63,7 @@ pub struct TileSquare {
     pub theta: f64,
     /// Standard deviation of θ.
     pub std_dev: f64,
-    /// Number of all segments ever measured here.
+    /// Number of all segments measured here so far.
     pub segments: u32,
 }
 
@@ -95,10 +95,10 @@ pub struct Tile {
 pub enum InvalidTile {
     /// The bytes do not begin with the magic number, end within the header, or contain an invalid
     /// name.
-    #[error("this is no friction tile")]
+    #[error("this is not a friction tile")]
     NotATile,
     /// The version of the format is unknown.
-    #[error("version {0} of friction tiles is not known")]
+    #[error("version {0} of friction tiles is not supported")]
     Version(u16),
     /// The number of bytes differs from the one that the header implies.
     #[error("a tile of this size has {expected} bytes, not {found}")]

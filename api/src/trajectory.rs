@@ -38,9 +38,9 @@ pub const EXCITATION_DEPTH_MAX: f64 = 0.8;
 pub const EXCITATION_PERIOD_MIN_S: f64 = 1.0;
 /// Maximum period of an excitation, seconds.
 pub const EXCITATION_PERIOD_MAX_S: f64 = 20.0;
-/// Maximum distance of a robot from the expected start of its trajectory from which it plans, metres.
+/// Maximum distance from the expected start at which a robot plans from it, metres.
 pub const START_TOLERANCE_M: f64 = 0.05;
-/// Maximum difference of its heading from that of the expected start, radians.
+/// Maximum heading difference from the expected start at which a robot plans from it, rad.
 pub const START_TOLERANCE_RAD: f64 = 0.1;
 
 /// Trajectory to drive, as a user requests it.
@@ -88,7 +88,7 @@ pub struct Circle {
     #[serde(default = "one_turn")]
     #[schema(minimum = 0.05, maximum = 1000.0, default = 1.0)]
     pub turns: f64,
-    /// Approach speed and excitation; see there for the defaults.
+    /// Approach speed, excitation and expected start; none is required.
     #[serde(default, skip_serializing_if = "TrajectoryOptions::is_none")]
     pub options: TrajectoryOptions,
 }
@@ -116,7 +116,7 @@ pub struct Waypoints {
     /// Speed where a point has none of its own, m/s.
     #[schema(minimum = 0.01, maximum = 50.0, example = 0.6)]
     pub speed_m_s: f64,
-    /// Approach speed and excitation; see there for the defaults.
+    /// Approach speed, excitation and expected start; none is required.
     #[serde(default, skip_serializing_if = "TrajectoryOptions::is_none")]
     pub options: TrajectoryOptions,
 }
@@ -136,10 +136,10 @@ pub struct TrajectoryOptions {
     /// torque sensing. No excitation when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub excitation: Option<Excitation>,
-    /// Pose from which a dry run planned this trajectory, the `start` of its answer. A robot that
-    /// stands within 5 cm and 0.1 rad of it plans from it, so that the plan is that of the dry run:
-    /// of two approaches of similar length, millimetres decide otherwise. No effect when absent, or
-    /// if the robot stands elsewhere.
+    /// Pose from which a dry run planned this trajectory, the `start` of its response. A robot that
+    /// stands within 5 cm and 0.1 rad of this pose plans from it, so that its plan equals that of
+    /// the dry run. Otherwise a difference of millimetres could lead to another approach of similar
+    /// length. No effect when absent, or if the robot stands elsewhere.
     #[serde(
         default,
         skip_serializing_if = "Option::is_none",
@@ -219,7 +219,7 @@ impl TrajectoryOptions {
     }
 }
 
-/// Point of a path in the site frame.
+/// Point of a path, in the site frame.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Waypoint {
     /// East-like coordinate, metres.

@@ -20,7 +20,7 @@ pub const WEBHOOK_URL_MAX: usize = 2_000;
 pub const WEBHOOK_KINDS_MAX: usize = 100;
 /// Maximum number of sites to which a webhook is limited.
 pub const WEBHOOK_SITES_MAX: usize = 100;
-/// Version of the body of a delivery; another meaning gets another number.
+/// Version of the body of a delivery; an incompatible change increases it.
 pub const NOTICE_VERSION: u32 = 1;
 /// Kind of a delivery that was requested to test a webhook.
 pub const TEST_KIND: &str = "test";
@@ -38,7 +38,7 @@ pub struct WebhookSettings {
     pub name: String,
     /// URL to which alerts are sent, `https` unless the server's configuration allows `http`.
     pub url: String,
-    /// Kinds of alerts that are sent, at most 100; all when absent. A kind of no alert is refused.
+    /// Kinds of alerts that are sent, at most 100; all when absent. An unknown kind is refused.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub kinds: Option<Vec<AlertCode>>,
     /// Sites whose alerts are sent, at most 100; all when absent. Alerts about the server itself
@@ -90,7 +90,7 @@ impl Webhook {
     }
 }
 
-/// Webhook with a new secret, which no other answer contains.
+/// Webhook with a new secret, which no other response contains.
 #[derive(Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct CreatedWebhook {
     /// The webhook.
@@ -116,7 +116,7 @@ pub enum NoticeEvent {
     Opened,
     /// The cause of an alert ended.
     Ended,
-    /// Nothing: somebody tests the webhook.
+    /// No event: a user tests the webhook.
     Test,
 }
 
@@ -144,11 +144,11 @@ impl NoticeEvent {
 pub enum DeliveryState {
     /// It waits to be sent, or to be sent again.
     Pending,
-    /// The receiver answered with a status of success.
+    /// The receiver answered with a 2xx status.
     Delivered,
-    /// It was given up after the last attempt, or because it became too old.
+    /// The server gave it up after the last attempt, or because it became too old.
     Failed,
-    /// It was left out because too many others were waiting.
+    /// The server discarded it because too many others were waiting.
     Dropped,
 }
 
@@ -232,13 +232,13 @@ pub struct AlertNotice {
     pub opened_at: Option<Timestamp>,
     /// Time when its cause ended; `null` before that.
     pub ended_at: Option<Timestamp>,
-    /// Address at which the page shows the alert: absolute if the server's configuration has
+    /// Address at which the dashboard shows the alert: absolute if the server's configuration has
     /// `webhooks.public_url`, else a path; `null` for a test.
     pub link: Option<String>,
 }
 
 impl AlertNotice {
-    /// Returns what is to be said of an alert that was raised or has ended.
+    /// Returns the notice of an alert that was raised or has ended.
     pub fn of_alert(delivery: DeliveryId, event: NoticeEvent, alert: &Alert, link: String) -> Self {
         let ended_at = alert.cleared_at.filter(|_| event == NoticeEvent::Ended);
         Self {

@@ -168,8 +168,8 @@ impl ForwardedArguments {
 pub(crate) enum RemoteCommand {
     /// Show version, uptime and counters of the server
     Status(PlainArguments),
-    /// Say what is wrong with the server, the token, clocks, robots and their links; exits with 1 if
-    /// anything is
+    /// Check the server, the token, clocks, robots and their links, and print what is wrong; exits
+    /// with 1 if anything is
     Doctor(PlainArguments),
     /// List sites, create one, or set its position in WGS 84
     Sites(SitesArguments),
@@ -203,7 +203,7 @@ pub(crate) enum RemoteCommand {
     Geofence(GeofenceArguments),
     /// Show robots, missions and alerts live, until interrupted
     Watch(WatchArguments),
-    /// Sign in to a server: read a token from the input or `--token-file` and store it
+    /// Sign in to a server: read a token from standard input or `--token-file` and store it
     Login(PlainArguments),
     /// Delete the stored token of a server; the token stays valid
     Logout(PlainArguments),
@@ -293,7 +293,7 @@ pub(crate) struct RobotsArguments {
     pub(crate) action: Option<RobotsAction>,
     /// Show only this robot, with the age of every value
     pub(crate) robot: Option<RobotId>,
-    /// List retired robots too
+    /// Include retired robots
     #[arg(long, conflicts_with = "robot")]
     pub(crate) retired: bool,
     #[command(flatten)]
@@ -317,7 +317,7 @@ pub(crate) struct DemoArguments {
     /// Scenario file to use instead of the built-in one
     #[arg(long, value_name = "FILE")]
     pub(crate) scenario: Option<PathBuf>,
-    /// End when all missions have ended, at the latest after this time; without it, run until
+    /// End when all missions have ended, or after this time at the latest; if absent, run until
     /// Ctrl-C, which prints the results so far
     #[arg(long, value_name = "TIME", value_parser = wait_time)]
     pub(crate) exit_after: Option<Duration>,

@@ -30,16 +30,16 @@ pub(crate) struct EnrollArgs {
     /// SHA-256 of the REST API's own certificate, or of its authority's if the API sends that too
     #[arg(long, value_name = "SHA256")]
     ca_fingerprint: Option<Fingerprint>,
-    /// Configuration file, for the robot's name and its folder
+    /// Configuration file, for the robot's identifier and folder
     #[arg(long, env = "TREAD_AGENT_CONFIG")]
     config: Option<PathBuf>,
-    /// The robot; not needed if the token names it
+    /// Identifier of the robot; not needed if the token names it
     #[arg(long)]
     robot: Option<RobotId>,
-    /// The robot's folder, to which certificate and key are written
+    /// Folder of the robot, to which certificate and key are written
     #[arg(long)]
     data_dir: Option<PathBuf>,
-    /// The robots' port, such as `tls/tread.example:7447`, if it differs from the server's answer
+    /// Endpoint for robots, such as `tls/tread.example:7447`, if not the one that the server names
     #[arg(long, value_name = "ENDPOINT")]
     endpoint: Option<String>,
 }
@@ -71,7 +71,7 @@ pub(crate) async fn run(args: EnrollArgs) -> anyhow::Result<()> {
     let joined = membership::enrol(&enrolment, SystemClock::new().wall()).await?;
     joined.save(&place.data_dir)?;
     eprintln!(
-        "`{}` has joined site `{}`; its certificate is good for {} s and renews itself",
+        "`{}` has joined site `{}`; its certificate is valid for {} s and is renewed automatically",
         joined.robot, joined.site, joined.lifetime_s
     );
     Ok(())

@@ -37,7 +37,7 @@ enum Action {
     Enroll(EnrollArgs),
     /// Check the installation on a ROS 2 robot and print what is wrong
     Doctor(DoctorArgs),
-    /// Run controller and estimator on a record again and print the differences
+    /// Run controller and estimator again on a record and print the differences
     Replay(ReplayArgs),
     /// Copy the readable part of a damaged or truncated record into a valid one
     Recover(RecoverArgs),

@@ -56,15 +56,15 @@ pub struct ServerArgs {
     /// Database: a file, created when missing, or the address `postgres://…` of a PostgreSQL database
     #[arg(long, value_name = "FILE")]
     pub database: Option<PathBuf>,
-    /// Wait while another server uses the PostgreSQL database, and take over when that one ends or is
+    /// Wait while another server uses the PostgreSQL database, and take over when it ends or falls
     /// silent
     #[arg(long)]
     pub standby: bool,
-    /// Site that is created when missing
+    /// Site to create if it does not exist
     #[arg(long)]
     pub site: Option<SiteId>,
-    /// Log filter, such as `info` or `tread_server=debug`; `RUST_LOG` when absent. Of zenoh only
-    /// errors are logged unless it names zenoh, as `info,zenoh=warn`
+    /// Log filter, such as `info` or `tread_server=debug`; `RUST_LOG` when absent. zenoh logs only
+    /// errors unless the filter names it, as in `info,zenoh=warn`
     #[arg(long, value_name = "FILTER")]
     pub log: Option<String>,
     /// Format of log lines
@@ -481,7 +481,7 @@ pub enum ConfigError {
         cause: std::io::Error,
     },
     /// The file is not text.
-    #[error("configuration file `{}` is not text in UTF-8: save it as that", path.display())]
+    #[error("configuration file `{}` is not text in UTF-8: save it as UTF-8", path.display())]
     NotText {
         /// Path of the file.
         path: PathBuf,

@@ -22,8 +22,8 @@ pub(crate) struct HealthArgs {
     /// Address of the REST API
     #[arg(long, value_name = "ADDRESS")]
     http: Option<SocketAddr>,
-    /// Ask whether the server can work too: whether its database takes a write. A restart mends
-    /// nothing of what this finds
+    /// Also check that the server is ready: that its database accepts a write. A restart does not
+    /// fix what this check finds
     #[arg(long)]
     ready: bool,
 }

@@ -26,8 +26,8 @@ use crate::setup::{self, Given, SetupArgs};
 /// Arguments of `tread-server init`.
 #[derive(Debug, Clone, Args)]
 pub(crate) struct InitArgs {
-    /// Configuration file of the server, TOML. One that does not exist is written: with --yes or
-    /// other flags below, or by questions in a terminal
+    /// Configuration file of the server, TOML. If it does not exist, it is created: with --yes or
+    /// other flags below, or from answers in a terminal
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
     /// Database file, created when missing
@@ -44,7 +44,7 @@ pub(crate) struct InitArgs {
     #[arg(long, value_name = "FILE")]
     token_file: Option<PathBuf>,
     /// Create a token even if an admin exists, and revoke a valid token of the same name; replace
-    /// files that exist
+    /// existing files
     #[arg(long)]
     force: bool,
     #[command(flatten)]
@@ -83,7 +83,7 @@ pub(crate) async fn delete_certificate_records(args: ForgetArgs) -> anyhow::Resu
     let forgotten = forgetting.await;
     database.close().await;
     let count = forgotten.context("cannot write the database")?;
-    eprintln!("of {count} robots the next certificate that they show for a renewal counts");
+    eprintln!("{count} robots: the next certificate that each presents for renewal is accepted");
     Ok(())
 }
 
@@ -147,18 +147,18 @@ async fn make(config: &Config, first: FirstAdmin, token_file: Option<&Path>) -> 
     let created = app.create_first_admin(first).await;
     app.db().close().await;
     if let (true, Err(AppError::AlreadyExists { .. })) = (made_authority, &created) {
-        eprintln!("there is an admin already, so no token was made");
+        eprintln!("an admin exists already, so no token was created");
         return Ok(());
     }
     let created = created
-        .context("cannot make the first admin's token (with --force another one is made)")?;
+        .context("cannot create the first admin's token (--force creates another one)")?;
     match token_file {
         Some(file) => write_secret(file, &created.secret)
             .with_context(|| format!("cannot write {}", file.display()))?,
         None => writeln!(io::stdout().lock(), "{}", created.secret).context("cannot print")?,
     }
     let (name, expires_at) = (&created.token.name, created.token.expires_at);
-    eprintln!("admin's token `{name}`, valid until {expires_at}; it is shown this once");
+    eprintln!("admin's token `{name}`, valid until {expires_at}; it is shown only once");
     Ok(())
 }
 

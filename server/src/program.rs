@@ -20,7 +20,7 @@ const NICE_LOWEST: i32 = 19;
 /// Maximum wait for blocking threads after all tasks have stopped; then they are abandoned.
 const RUNTIME_STOP_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// Tread's server: missions to robots, friction from robots, one REST API.
+/// Server of Tread: sends missions to robots, maps the friction that they measure, has a REST API.
 #[derive(Debug, clap::Parser)]
 #[command(name = "tread-server", version = build::long_version(), args_conflicts_with_subcommands = true)]
 struct Command {
@@ -34,19 +34,19 @@ struct Command {
 enum Action {
     /// Exit with 0 if the server on this machine answers, for health checks of containers
     Health(health::HealthArgs),
-    /// Write a configuration where there is none, and create the first admin's token
+    /// Write a configuration if there is none, and create the first admin's token
     Init(Box<init::InitArgs>),
-    /// Say what is wrong with configuration, files, database, certificates, ports, clock and limits
+    /// Check configuration, files, database, certificates, ports, clock and limits
     Doctor(doctor::DoctorArgs),
     /// Accept the next certificate that each robot presents, for use after restoring a backup of
     /// the database
     ForgetCertificates(init::ForgetArgs),
-    /// Back the database and the fleet's authority up into one file, beside a running server
+    /// Back up the database and the fleet's authority to one file, also while the server runs
     Backup(maintenance::backup::BackupArgs),
     /// Restore a backup; no server may run on the database
     Restore(maintenance::restore::RestoreArgs),
-    /// Hold robots and list what to review after the tools of the database have restored it; `restore` does
-    /// this by itself
+    /// Hold robots and list what to review, after the database was restored with its own tools;
+    /// `restore` does this itself
     MarkRestored(maintenance::mark_restored::MarkRestoredArgs),
     /// Copy everything into a new database, from SQLite to PostgreSQL or back, and compare both; no
     /// server may run on either

@@ -129,7 +129,7 @@ pub const BINDINGS_MAX: usize = 1_000;
 pub struct Binding {
     /// Limit that determines the speed.
     pub limit: BindingLimit,
-    /// Begin of the section.
+    /// Start of the section.
     pub from: Place,
     /// End of the section.
     pub to: Place,

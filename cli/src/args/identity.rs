@@ -27,9 +27,9 @@ pub(crate) struct Showing {
     /// PEM file with the certificate of the authority to trust, instead of those of the system
     #[arg(long, global = true, env = "TREAD_CA", value_name = "FILE")]
     pub(crate) ca: Option<PathBuf>,
-    /// SHA-256 of the server's certificate, or of its authority's if the server shows that too, to
-    /// trust instead of those of the system; `tread login` keeps it for the server. `--ca` counts
-    /// before it
+    /// SHA-256 fingerprint of the certificate to trust instead of those of the system: the server's
+    /// own, or its authority's if the server sends that too. `tread login` stores it for the
+    /// server; `--ca` takes precedence
     #[arg(
         long,
         global = true,
@@ -227,7 +227,7 @@ pub(crate) enum RobotsAction {
     Enrolments(PlainArguments),
     /// Change the name of a robot for people
     Rename(RenameArguments),
-    /// Replace the tags of a robot, by which the fleet is sorted out
+    /// Replace the tags of a robot, which group the robots of a fleet
     Tag(TagArguments),
     /// Retire a robot: its missions are cancelled, it gets no new ones and is not listed
     Retire(RobotArguments),

@@ -291,7 +291,7 @@ pub(crate) enum FrictionAction {
         /// Merge cells into squares of this side, metres
         #[arg(long, value_name = "M", value_parser = positive)]
         resolution: Option<f64>,
-        /// Side of a square in pixels; chosen for a picture of usual size if absent
+        /// Side of a square, pixels; chosen for a picture of about 768 pixels if absent
         #[arg(long, value_parser = clap::value_parser!(u32).range(1..=32))]
         scale: Option<u32>,
         #[command(flatten)]

@@ -51,10 +51,10 @@ pub(crate) struct Order {
     /// Priority, -100 to 100; missions of a higher priority are driven first
     #[arg(long, default_value_t = 0, allow_hyphen_values = true)]
     pub(crate) priority: i32,
-    /// Stop the robot when the server was silent for this time; it continues the mission if absent
+    /// Stop the robot when the server has been silent for this time; if absent, it drives on
     #[arg(long, value_name = "TIME", value_parser = silence)]
     pub(crate) stop_after_silence: Option<Duration>,
-    /// Let the mission fail when the robot was offline for this time
+    /// Let the mission fail when the robot has been offline for this time
     #[arg(long, value_name = "TIME", value_parser = silence)]
     pub(crate) lost_after: Option<Duration>,
     /// Speed of the approach to the trajectory, metres per second; that of the trajectory if absent
@@ -84,11 +84,11 @@ pub(crate) struct Order {
 /// Effect of a new mission on the robot's other missions.
 #[derive(Debug, Clone, Copy, ValueEnum)]
 pub(crate) enum Start {
-    /// The new mission waits behind them
+    /// The new mission waits behind the others
     Append,
-    /// They are cancelled
+    /// The other missions are cancelled
     Replace,
-    /// The new mission is refused if there are any
+    /// The new mission is refused if there are others
     Refuse,
 }
 

@@ -18,7 +18,7 @@ pub(crate) struct WatchArguments {
     /// Show only this robot
     #[arg(long)]
     pub(crate) robot: Option<RobotId>,
-    /// Print a line for each change, also in a terminal
+    /// Print a line for each change, even in a terminal
     #[arg(long)]
     pub(crate) lines: bool,
     #[command(flatten)]
@@ -33,7 +33,7 @@ pub(crate) struct StopArguments {
     /// Stop every robot of every site
     #[arg(long, conflicts_with = "robots")]
     pub(crate) all: bool,
-    /// Name of the person who stops, shown to others
+    /// Name of the person who stops the robots, shown to others
     #[arg(long, env = "USER")]
     pub(crate) by: Option<String>,
     /// Reason, for people
@@ -50,7 +50,7 @@ pub(crate) struct ClearArguments {
     /// Identifier of the stop; if absent, the stop is shown with its reason and not cleared
     #[arg(value_parser = identifier::<StopId>(STOPS))]
     pub(crate) stop: Option<StopId>,
-    /// Name of the person who clears, shown to others
+    /// Name of the person who clears the stop, shown to others
     #[arg(long, env = "USER")]
     pub(crate) by: Option<String>,
     #[command(flatten)]
@@ -125,7 +125,7 @@ pub(crate) struct DriveArguments {
 
 #[derive(Debug, Args)]
 pub(crate) struct LimitsArguments {
-    /// Robot whose limits are used
+    /// Robot whose limits are listed, set or ended
     pub(crate) robot: RobotId,
     #[command(subcommand)]
     pub(crate) action: Option<LimitsAction>,
@@ -158,8 +158,8 @@ pub(crate) enum LimitsAction {
 
 #[derive(Debug, Args)]
 pub(crate) struct GeofenceArguments {
-    /// File with the new geofence, or `-` for the input: JSON `{"keep_in": [[{"x_m": …, "y_m": …},
-    /// …], …], "keep_out": […]}`, as `--json` prints it
+    /// File with the new geofence, or `-` for standard input: JSON `{"keep_in": [[{"x_m": …, "y_m":
+    /// …}, …], …], "keep_out": […]}`, as `--json` prints it
     #[arg(long, value_name = "FILE")]
     pub(crate) set: Option<PathBuf>,
     /// Replace the geofence only if it is still at this revision

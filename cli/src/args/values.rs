@@ -78,7 +78,7 @@ pub(super) fn moment(text: &str) -> Result<Timestamp, String> {
     if let Ok(at) = text.parse::<Timestamp>() {
         return Ok(at);
     }
-    let wrong = || format!("`{text}` is no time: give 2026-11-21T08:00:00Z, or 2h for 2 hours ago");
+    let wrong = || format!("`{text}` is not a time: give 2026-11-21T08:00:00Z, or 2h for 2 h ago");
     let ago = duration(text).map_err(|_| wrong())?;
     let ago = SignedDuration::try_from(ago).map_err(|_| wrong())?;
     Timestamp::now().checked_sub(ago).map_err(|_| wrong())
@@ -118,7 +118,7 @@ pub(super) fn identifier<T: FromStr>(
 ) -> impl Fn(&str) -> Result<T, String> + Clone + Send + Sync + 'static {
     let Identified { object, listing } = of;
     move |text| {
-        let wrong = |_| format!("this is no identifier of {object}: `{listing}` lists them");
+        let wrong = |_| format!("this is not the identifier of {object}: `{listing}` lists them");
         text.parse().map_err(wrong)
     }
 }
@@ -127,7 +127,7 @@ pub(super) fn identifier<T: FromStr>(
 pub(super) fn mission_state() -> impl TypedValueParser<Value = MissionState> {
     let names = MissionState::ALL.map(MissionState::as_str);
     PossibleValuesParser::new(names)
-        .try_map(|name| MissionState::from_name(&name).ok_or("is no state"))
+        .try_map(|name| MissionState::from_name(&name).ok_or("is not a mission state"))
 }
 
 /// Terrain classes as the API names them.
@@ -259,7 +259,7 @@ mod tests {
         ];
         for (refused, listing) in refused.iter().zip(listings) {
             assert!(
-                refused.starts_with("this is no identifier of "),
+                refused.starts_with("this is not the identifier of "),
                 "{refused}"
             );
             assert!(refused.contains(listing), "{refused}");

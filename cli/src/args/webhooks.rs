@@ -44,24 +44,24 @@ pub(crate) enum WebhooksAction {
         #[arg(long)]
         disabled: bool,
     },
-    /// Remove a webhook with its deliveries, also those that wait
+    /// Remove a webhook and its deliveries, including pending ones
     Remove(NamedWebhook),
     /// Send a test to a webhook and wait for its outcome; exits with 1 if it did not arrive
     Test(NamedWebhook),
-    /// Show what was sent to a webhook, and what waits, newest first
+    /// List the deliveries to a webhook, pending ones included, newest first
     Deliveries {
         #[command(flatten)]
         webhook: NamedWebhook,
-        /// Number of deliveries
+        /// Maximum number of deliveries
         #[arg(long, default_value_t = DELIVERIES_DEFAULT,
             value_parser = clap::value_parser!(u32).range(1..=1_000))]
         limit: u32,
     },
-    /// Enable a webhook: alerts are sent, also those that wait
+    /// Enable a webhook: alerts are sent to it, including pending ones
     Enable(NamedWebhook),
-    /// Disable a webhook: no further alerts are queued, and what waits is kept for a day
+    /// Disable a webhook: no further alerts are queued, and pending ones are kept for a day
     Disable(NamedWebhook),
-    /// Give a webhook a new secret, with which everything is signed from now on; it is printed
-    /// only once
+    /// Rotate the secret of a webhook: deliveries are signed with the new one from now on; it is
+    /// printed only once
     Rotate(NamedWebhook),
 }

@@ -149,7 +149,7 @@ async fn a_server_that_is_lost_ends_the_drive_lets_the_robot_stand_and_restores_
         !terminal.is_raw(),
         "the server's stop left the terminal raw"
     );
-    terminal.shows("the server stops").await;
+    terminal.shows("the server is shutting down").await;
     eventually("it stands", || {
         let twist = yard.agent.state().twist;
         twist.is_none_or(|twist| twist.value.linear_m_s.abs() < 0.02)

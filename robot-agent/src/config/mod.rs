@@ -68,7 +68,7 @@ pub enum ConfigError {
         source: std::io::Error,
     },
     /// The file is not text.
-    #[error("the configuration `{file}` is not text in UTF-8: save it as that")]
+    #[error("the configuration `{file}` is not text in UTF-8: save it as UTF-8")]
     NotText {
         /// The file.
         file: String,
@@ -107,7 +107,7 @@ pub enum ConfigError {
     #[error("the robot has joined the fleet as `{0}`: give that name, or join again")]
     OtherRobot(String),
     /// The endpoint requires a certificate, and the robot has none.
-    #[error("`{0}` wants a certificate: join the fleet with `tread-agent enroll`")]
+    #[error("`{0}` requires a certificate: join the fleet with `tread-agent enroll`")]
     NotEnrolled(String),
     /// The endpoint is a URL of the REST API.
     #[error(
@@ -131,16 +131,16 @@ pub enum ConfigError {
     about = "Drives one robot and measures the friction of the ground"
 )]
 pub struct Flags {
-    /// The configuration file
+    /// Configuration file
     #[arg(long, env = "TREAD_AGENT_CONFIG")]
     pub config: Option<PathBuf>,
-    /// The site that the robot belongs to
+    /// Site of the robot
     #[arg(long)]
     pub site: Option<SiteId>,
-    /// The robot's identifier within its site
+    /// Identifier of the robot within its site
     #[arg(long)]
     pub robot: Option<RobotId>,
-    /// The server's zenoh endpoint, or several of one fleet separated by commas, the preferred one
+    /// zenoh endpoint of the server, or several of one fleet separated by commas, the preferred one
     /// first [default: that of `enroll`, or tcp/127.0.0.1:7447]
     #[arg(long, value_delimiter = ',')]
     pub server: Vec<String>,
@@ -150,7 +150,7 @@ pub struct Flags {
     /// Rate of the control loop, 20 to 200 Hz [default: 100]
     #[arg(long)]
     pub rate_hz: Option<f64>,
-    /// The scenario of the simulated base: a file, or `yard` for the built-in one
+    /// Scenario of the simulated base: a file, or `yard` for the built-in one
     #[arg(long)]
     pub scenario: Option<PathBuf>,
     /// Start of the simulated base: x, y in metres and heading in radians, separated by commas
@@ -165,12 +165,12 @@ pub struct Flags {
     /// Error of the simulated robot's wall clock, seconds, positive if it is ahead [default: 0]
     #[arg(long, allow_hyphen_values = true)]
     pub clock_ahead_s: Option<i64>,
-    /// Simulated fault of the base, two numbers separated by a comma: seconds until its reading
-    /// blocks, and for how many seconds it blocks
+    /// Simulated fault of the base, two numbers separated by a comma: seconds until reading from it
+    /// blocks, and duration of the block in seconds
     #[arg(long, value_parser = parse_stall)]
     pub stall_s: Option<Stall>,
-    /// Log filter, such as `info,tread_agent=debug`; of zenoh only errors are logged unless it names
-    /// zenoh, as `info,zenoh=warn`
+    /// Log filter, such as `info,tread_agent=debug`; zenoh logs only errors unless the filter names
+    /// it, as in `info,zenoh=warn`
     #[arg(long, env = "RUST_LOG", default_value = LOG_FILTER_DEFAULT)]
     pub log: String,
     /// Format of log lines
@@ -396,7 +396,7 @@ fn parse_stall(text: &str) -> Result<Stall, String> {
         let number: f64 = part
             .trim()
             .parse()
-            .map_err(|_| format!("`{part}` is no number"))?;
+            .map_err(|_| format!("`{part}` is not a number"))?;
         let in_range = (0.0..=3_600.0).contains(&number);
         let outside = || format!("{number} is not within 0 to 3600 s");
         in_range

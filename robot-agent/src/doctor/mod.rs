@@ -5,7 +5,7 @@
 //! ([`moving`]): frozen sensors ([`frozen`]), sides and signs ([`signs`]), the frame of the
 //! odometry's twist ([`twist_frame`]), the tracks ([`track`]), and how the wheels pull with the
 //! robot's mass ([`pulling`]). It estimates mass, inertia and centre of mass ([`parameters`]). Each
-//! finding names the key of `robot.toml` to look at, and the lines that mend it where there are such.
+//! finding names the key of `robot.toml` to check and, if there are any, the lines that correct it.
 
 mod drove;
 mod finding;
@@ -73,11 +73,11 @@ const RIM_M_S: f64 = 0.2;
 /// Arguments of `tread-agent doctor`.
 #[derive(Debug, Clone, Args)]
 pub(crate) struct DoctorArgs {
-    /// The configuration file of the robot
+    /// Configuration file of the robot
     #[arg(long, env = "TREAD_AGENT_CONFIG")]
     config: PathBuf,
-    /// Move the robot at 0.2 m/s: it turns on the spot and drives a metre forward, two if the base falls
-    /// silent meanwhile and the motion is repeated
+    /// Move the robot at 0.2 m/s: it turns on the spot and drives 1 m forward, or 2 m if the base
+    /// falls silent and the motion is repeated
     #[arg(long = "move")]
     moves: bool,
     /// Print one JSON object
@@ -108,7 +108,7 @@ pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<bool> {
         if !robot_toml.is_empty() {
             writeln!(
                 out,
-                "\n# These lines in robot.toml mend that:\n{robot_toml}"
+                "\n# These lines in robot.toml correct that:\n{robot_toml}"
             )?;
         }
     }
@@ -128,7 +128,7 @@ fn examine(args: &DoctorArgs) -> Vec<Finding> {
         }
     };
     let DriveConfig::Ros2(settings) = &config.drive else {
-        let text = "the robot of this configuration is simulated: nothing is to be examined";
+        let text = "the robot of this configuration is simulated: there is nothing to examine";
         return vec![Finding::on("configuration").unexaminable(text)];
     };
     examine_base(args, &config, settings)
@@ -214,7 +214,7 @@ impl ExaminedDrive {
         let is_unusable =
             self.drive.is_rest_required() && findings.iter().any(|finding| !finding.holds);
         if is_unusable || self.other_commander(settings).is_some() {
-            let text = "the robot was not moved: mend the findings above first";
+            let text = "the robot was not moved: correct the findings above first";
             findings.push(Finding::on("moving").skipped(text));
             return findings;
         }

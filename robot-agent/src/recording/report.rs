@@ -13,7 +13,7 @@ use super::replay::{DifferingTick, Replayed, replay};
 /// Arguments of `tread-agent replay`.
 #[derive(Debug, Clone, Args)]
 pub(crate) struct ReplayArgs {
-    /// All files of one run, from its first part on
+    /// All files of one run, starting with its first part
     #[arg(required = true)]
     files: Vec<PathBuf>,
     /// Print one JSON object

@@ -19,10 +19,10 @@ pub enum AppError {
     #[error("site `{0}` is not known")]
     UnknownSite(SiteId),
     /// No robot of that name in the site.
-    #[error("robot `{1}` has never said hello in site `{0}`")]
+    #[error("robot `{1}` has never connected to site `{0}`")]
     UnknownRobot(SiteId, RobotId),
     /// No terrain of that name in the site.
-    #[error("terrain `{1}` is not drawn in site `{0}`")]
+    #[error("terrain `{1}` does not exist in site `{0}`")]
     UnknownTerrain(SiteId, TerrainId),
     /// No mission of that identifier.
     #[error("mission `{0}` is not known")]
@@ -77,7 +77,7 @@ pub enum AppError {
     #[error("robot `{0}` is retired and gets no missions")]
     RobotRetired(RobotId),
     /// The robot lacks a capability.
-    #[error("robot `{robot}` does not say that it can {what}")]
+    #[error("robot `{robot}` does not report that it can {what}")]
     RobotCannot {
         /// The robot.
         robot: RobotId,
@@ -135,8 +135,8 @@ pub enum AppError {
     Rotation(RotationRefused),
     /// Robots still hold certificates of the authority that is to be retired.
     #[error(
-        "{count} robots still hold certificates of the former authority: {first}; wait until they were \
-         on the network, or force it, and each of them must join again"
+        "{count} robots still hold certificates of the former authority: {first}; wait until they \
+         have connected, or force it; then each of them must join again"
     )]
     RobotsLeft {
         /// How many.
@@ -148,7 +148,7 @@ pub enum AppError {
     #[error("the files of the fleet's authority cannot be written: {}", .0.effect_clause())]
     AuthorityFiles(#[source] AuthorityError),
     /// The operating system provides no random numbers.
-    #[error("the operating system gives no random numbers: {0}")]
+    #[error("the operating system provides no random numbers: {0}")]
     NoRandomness(String),
     /// No stop of that identifier.
     #[error("stop `{0}` is not known for this robot")]
@@ -162,7 +162,7 @@ pub enum AppError {
         detail: String,
     },
     /// The robot does not answer.
-    #[error("robot `{0}` does not answer; nobody knows whether it has heard")]
+    #[error("robot `{0}` does not answer; it is unknown whether it received the command")]
     RobotUnreachable(RobotId),
     /// The robot refused the command.
     #[error("robot `{robot}` refuses: {detail}")]
@@ -212,13 +212,13 @@ pub enum AppError {
         expected: Vec<u64>,
     },
     /// A request with the same idempotency key is being answered.
-    #[error("a request with this idempotency key is being answered; ask again in a moment")]
+    #[error("a request with this idempotency key is in progress; try again in a moment")]
     KeyInFlight,
     /// The idempotency key was used for another request.
-    #[error("this idempotency key was used for another request; take a new one")]
+    #[error("this idempotency key was used for another request; use a new one")]
     KeyReused,
     /// A limit on a number is reached.
-    #[error("there are already {count} {what}; that is the most")]
+    #[error("there are already {count} {what}, which is the maximum")]
     TooMany {
         /// What is counted.
         what: &'static str,
@@ -243,18 +243,18 @@ pub enum AppError {
     },
     /// An answer needs more of the map in memory at once than one request may have.
     #[error(
-        "this would need more than {mib_max} MiB of the map at once: ask for less ground, or raise \
-         `memory_max_mib` in the server's `[map]`"
+        "this would need more than {mib_max} MiB of the map at once: request a smaller area, or \
+         raise `memory_max_mib` in the server's `[map]`"
     )]
     MapReadTooLarge {
         /// What one request may have, MiB.
         mib_max: usize,
     },
     /// Nobody waits for the answer any more.
-    #[error("nobody waits for the answer")]
+    #[error("the client no longer waits for the response")]
     Abandoned,
     /// The answer cannot be encoded in the requested format.
-    #[error("the answer cannot be written: {0}")]
+    #[error("the response cannot be written: {0}")]
     Unwritable(String),
     /// Archived measurements cannot be read or written.
     #[error("the archive of measurements failed: {0}")]

@@ -404,7 +404,7 @@ async fn check_named(
     within: &Scope,
 ) -> Result<(), AppError> {
     let unknown = |parameter, name: &str| {
-        let detail = format!("`{name}` names nothing that is known here");
+        let detail = format!("`{name}` is unknown, or outside the scope of the token");
         Err(AppError::InvalidQuery { parameter, detail })
     };
     if let Some(site) = site
@@ -483,7 +483,7 @@ fn people_line(field: PeopleField, given: &str, length_max: usize) -> Result<Str
     let line = tread_api::text::line(given, length_max);
     line.map(str::to_owned).map_err(|wrong| AppError::Invalid {
         field,
-        detail: format!("the {field} cannot be taken: {wrong}"),
+        detail: format!("the {field} is invalid: {wrong}"),
     })
 }
 
@@ -491,6 +491,6 @@ fn bad_cursor(cursor: &str) -> AppError {
     let cursor: String = cursor.chars().take(80).collect();
     AppError::InvalidQuery {
         parameter: "cursor",
-        detail: format!("`{cursor}` is no cursor; take `next_cursor` of the page before"),
+        detail: format!("`{cursor}` is not a cursor; use `next_cursor` of the previous page"),
     }
 }

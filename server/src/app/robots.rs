@@ -285,7 +285,7 @@ fn check_model(hello: &Hello) -> Result<(), String> {
         if let Some(letter) = text.chars().find(|letter| !is_printable(*letter)) {
             let code = u32::from(letter);
             return Err(format!(
-                "{field} has the character U+{code:04X}, which cannot be seen"
+                "{field} has the character U+{code:04X}, which is not printable"
             ));
         }
     }

@@ -14,27 +14,27 @@ use super::subject::Subject;
 use crate::app::App;
 use crate::app::alerts::AlertFilter;
 
-/// Which alerts, and which page of them.
+/// Query parameters of the list of alerts.
 #[derive(Debug, Clone, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(super) struct AlertQuery {
-    /// Only those of this site.
+    /// Only alerts of this site.
     #[param(value_type = Option<String>)]
     site: Option<SiteId>,
-    /// Only those of this robot.
+    /// Only alerts of this robot.
     #[param(value_type = Option<String>)]
     robot: Option<RobotId>,
-    /// Only those of this kind, such as `robot-lost`.
+    /// Only alerts of this kind, such as `robot-lost`.
     #[param(value_type = Option<String>)]
     kind: Option<AlertCode>,
-    /// Only those that have not cleared.
+    /// Only alerts that have not cleared.
     #[serde(default)]
     #[param(required = false)]
     raised: bool,
-    /// `next_cursor` of the page before.
+    /// `next_cursor` of the previous page.
     cursor: Option<String>,
-    /// Most entries of the page, 1 to 1000; 100 when absent.
+    /// Maximum number of entries of the page, 1 to 1000; 100 when absent.
     limit: Option<u32>,
 }
 

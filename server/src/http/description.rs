@@ -32,7 +32,7 @@ pub(super) fn complete(mut openapi: OpenApi) -> OpenApi {
 
 fn describe_responses(operation: &mut Operation) {
     let problem = ResponseBuilder::new()
-        .description("Any error; `type` is one of the closed list")
+        .description("Problem details; `type` is one of the problem types")
         .content(
             PROBLEM_MEDIA_TYPE,
             Content::new(Some(Ref::from_schema_name("ProblemBody"))),

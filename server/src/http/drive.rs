@@ -1,14 +1,14 @@
 //! `GET /v1/sites/{site}/robots/{robot}/drive`: a WebSocket to watch a robot and to drive it.
 //!
-//! One JSON object in each text frame ([`DriveRequest`] in, [`DriveUpdate`] out). A frame that is
-//! none closes the socket with a code, and a driver's robot stands:
+//! One JSON object in each text frame ([`DriveRequest`] in, [`DriveUpdate`] out). Any other frame
+//! closes the socket with a code, and stops the robot if the socket has its lease:
 //!
 //! | code | |
 //! |---|---|
-//! | 1001 | the server stops |
+//! | 1001 | the server is shutting down |
 //! | 1003 | a binary frame |
-//! | 1007 | a text that is not JSON |
-//! | 1008 | JSON that says nothing known, too few pongs, or a token that has ended |
+//! | 1007 | a text frame that is not JSON |
+//! | 1008 | JSON that is not a `DriveRequest`, missing pongs, or a token that has ended |
 //! | 1009 | a frame above [`DRIVE_FRAME_MAX`] bytes |
 
 use std::error::Error as _;
@@ -60,7 +60,8 @@ const REFUSAL_PERIOD: Duration = Duration::from_millis(500);
 /// Watch and drive a robot over a WebSocket.
 ///
 /// Each text frame holds one JSON object: `DriveRequest` from the client, `DriveUpdate` from the
-/// server. With the right to read a client may watch and stop; driving needs the right `drive`.
+/// server. A client with the right `read` may watch and stop the robot; driving requires the right
+/// `drive`.
 #[utoipa::path(get, path = "/v1/sites/{site}/robots/{robot}/drive", tag = "safety",
     security(("token" = ["read"])),
     operation_id = "drive_robot", params(("site" = SiteId, Path), ("robot" = RobotId, Path)),
@@ -142,7 +143,7 @@ impl Connection {
                 biased;
                 () = stop.cancelled() => Err(End::Closed {
                     code: close_code::AWAY,
-                    detail: "the server stops".to_owned(),
+                    detail: "the server is shutting down".to_owned(),
                 }),
                 () = ended.cancelled() => Err(signed_out()),
                 frame = self.socket.recv() => self.receive(frame).await,
@@ -240,7 +241,7 @@ impl Connection {
                 }
             },
             Message::Binary(_) => {
-                let detail = "text frames with JSON, please".to_owned();
+                let detail = "send JSON in text frames".to_owned();
                 refused(close_code::UNSUPPORTED, detail)
             }
             Message::Pong(_) => {
@@ -257,7 +258,7 @@ impl Connection {
         if !self.subject.may_at(Right::Drive, site, robot) {
             let refused = DriveUpdate::Refused {
                 cause: DriveRefusal::Forbidden,
-                detail: "to drive takes a token with the right `drive`".to_owned(),
+                detail: "driving requires a token with the right `drive`".to_owned(),
             };
             return self.send(&refused).await;
         }
@@ -313,7 +314,7 @@ impl Connection {
         if self.heard_at.elapsed() > SILENCE_MAX {
             return Err(End::Closed {
                 code: close_code::POLICY,
-                detail: "nothing was heard of this socket, not even a pong".to_owned(),
+                detail: "the server received no frame on this socket, not even a pong".to_owned(),
             });
         }
         if self.app.clock().now() >= self.subject.expires_at {
@@ -410,10 +411,10 @@ fn fault(error: &axum::Error) -> Option<(u16, String)> {
     use tokio_tungstenite::tungstenite::Error;
     let cause = error.source()?.downcast_ref::<Error>()?;
     if let Error::Capacity(_) = cause {
-        let detail = format!("a frame has at most {DRIVE_FRAME_MAX} bytes");
+        let detail = format!("a frame may have at most {DRIVE_FRAME_MAX} bytes");
         Some((close_code::SIZE, detail))
     } else if let Error::Utf8(_) = cause {
-        Some((close_code::INVALID, "a text is UTF-8".to_owned()))
+        Some((close_code::INVALID, "a text frame must be UTF-8".to_owned()))
     } else if let Error::Protocol(broken) = cause {
         Some((close_code::PROTOCOL, broken.to_string()))
     } else {

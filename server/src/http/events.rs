@@ -29,27 +29,27 @@ use crate::app::shares::Place;
 #[derive(Debug, Clone, Default)]
 pub(in crate::http) struct Cut(pub(in crate::http) CancellationToken);
 
-/// What a client wants to hear of.
+/// Query parameters of the stream of events.
 #[derive(Debug, Clone, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(super) struct EventQuery {
-    /// Only these topics, with commas between them: `missions`, `robots`, `alerts`, `map`.
+    /// Only these topics, separated by commas: `missions`, `robots`, `alerts`, `map`.
     topics: Option<String>,
-    /// Only this site.
+    /// Only events of this site.
     #[param(value_type = Option<String>)]
     site: Option<SiteId>,
-    /// Only these robots, with commas between them.
+    /// Only events of these robots, separated by commas.
     robots: Option<String>,
 }
 
 /// Stream events.
 ///
-/// Starts with a snapshot, or after the event that `Last-Event-ID` names.
+/// The stream starts with a snapshot, or with the events after the one that `Last-Event-ID` names.
 #[utoipa::path(get, path = "/v1/events", tag = "events", operation_id = "stream_events",
     security(("token" = ["read"])),
     params(EventQuery, ("last-event-id" = Option<String>, Header,
-        description = "The id of the last event that was read")),
+        description = "Identifier of the last event that the client has read")),
     responses((status = 200, content_type = "text/event-stream", body = event::Event),
         (status = 400, body = ProblemBody), (status = 409, body = ProblemBody)))]
 pub(super) async fn stream(
@@ -93,7 +93,7 @@ async fn filter(
         let known: Vec<&str> = Topic::ALL.map(Topic::as_str).into();
         Topic::from_name(name).ok_or_else(|| {
             let known = known.join("`, `");
-            format!("there is no topic `{}`, only `{known}`", short(name))
+            format!("`{}` is not a topic; the topics are `{known}`", short(name))
         })
     })?;
     let robots = listed("robots", query.robots.as_deref(), |name| {
@@ -108,7 +108,7 @@ async fn filter(
     match app.unknown_in(&filter).await? {
         Some((field, name)) => Err(refused(
             field,
-            format!("`{name}` names nothing that is known here"),
+            format!("`{name}` is unknown, or outside the scope of the token"),
         )),
         None => Ok(filter),
     }

@@ -51,7 +51,7 @@ impl<S: Send + Sync, T: DeserializeOwned + Serialize> FromRequest<S> for Json<T>
         }
         if is_encoded(request.headers()) {
             return Err(Problem::new(ProblemType::UnsupportedMediaType)
-                .detail("send the body as it is, without `content-encoding`"));
+                .detail("send the body uncompressed, without `content-encoding`"));
         }
         let limit = request.extensions().get::<BodyLimit>().copied();
         let limit = limit.unwrap_or(BodyLimit(super::BODY_MAX));
@@ -64,12 +64,12 @@ impl<S: Send + Sync, T: DeserializeOwned + Serialize> FromRequest<S> for Json<T>
         let reading = read(request.into_body(), limit);
         let body = tokio::time::timeout(within, reading).await;
         let body = body.map_err(|_elapsed| {
-            let detail = format!("a body may take {} s to arrive here", within.as_secs());
+            let detail = format!("the body did not arrive within {} s", within.as_secs());
             Problem::new(ProblemType::BodyTimeout).detail(detail)
         })??;
         if subject.is_some_and(|Subject(subject)| subject.ended().is_cancelled()) {
             return Err(Problem::new(ProblemType::Unauthenticated)
-                .detail("the token was revoked, or the session ended, before the body was here"));
+                .detail("the token was revoked, or the session ended, before the body arrived"));
         }
         let parsed = parse(&body)?;
         if let Some(slot) = slot {
@@ -114,7 +114,8 @@ pub(super) async fn read(body: Body, BodyLimit(limit): BodyLimit) -> Result<Vec<
     let mut discarded = 0;
     while let Some(chunk) = chunks.next().await {
         let chunk = chunk.map_err(|_broken| {
-            Problem::new(ProblemType::MalformedBody).detail("the body broke off")
+            Problem::new(ProblemType::MalformedBody)
+                .detail("the connection broke before the body was complete")
         })?;
         if discarded == 0 && text.len() + chunk.len() <= limit {
             text.extend_from_slice(&chunk);
@@ -129,7 +130,7 @@ pub(super) async fn read(body: Body, BodyLimit(limit): BodyLimit) -> Result<Vec<
     if discarded == 0 {
         return Ok(text);
     }
-    let detail = format!("a body may have at most {limit} bytes here");
+    let detail = format!("the body of this request may have at most {limit} bytes");
     Err(Problem::new(ProblemType::BodyTooLarge).detail(detail))
 }
 
@@ -172,7 +173,7 @@ fn parse<T: DeserializeOwned + Serialize>(body: &[u8]) -> Result<T, Problem> {
         return Ok(parsed);
     }
     let unknown: Vec<String> = unknown.iter().map(|path| spelt_out(path, body)).collect();
-    let detail = format!("not known: `{}`", unknown.join("`, `"));
+    let detail = format!("unknown fields: `{}`", unknown.join("`, `"));
     let problem = Problem::new(ProblemType::UnknownField).detail(detail);
     Err(match unknown.into_iter().next() {
         Some(first) => problem.field(first),
@@ -205,7 +206,7 @@ pub(super) enum BadFrame {
     #[error("{0}")]
     Parser(serde_json::Error),
     /// It has a list in place of an object, which the parser would accept.
-    #[error("a list stands where an object belongs")]
+    #[error("a list was given where an object is required")]
     List,
 }
 
@@ -217,7 +218,7 @@ fn refuse_lists_for_objects<T: Serialize>(parsed: &T, body: &[u8]) -> Result<(),
         None => Ok(()),
         Some(place) => {
             let problem = Problem::new(ProblemType::InvalidBody)
-                .detail("a list stands where an object belongs");
+                .detail("a list was given where an object is required");
             Err(if place.is_empty() {
                 problem
             } else {
@@ -345,7 +346,7 @@ pub(super) fn page_limit(limit: Option<u32>) -> Result<u32, Problem> {
 pub(super) fn cursor<T: std::str::FromStr>(cursor: Option<&str>) -> Result<Option<T>, Problem> {
     let bad = |_error| {
         Problem::new(ProblemType::InvalidQuery)
-            .detail("this is no cursor; take `next_cursor` of the page before")
+            .detail("this is not a cursor; use `next_cursor` of the previous page")
             .field("cursor")
     };
     cursor.map(|cursor| cursor.parse().map_err(bad)).transpose()
@@ -366,7 +367,7 @@ mod tests {
     fn a_list_is_no_object_however_deep() {
         let said = problem(r#"["a","b",{"circle":[{"x_m":0,"y_m":0},3,0.5]},null]"#).to_string();
         assert!(
-            said.contains("InvalidBody") && said.contains("a list stands"),
+            said.contains("InvalidBody") && said.contains("a list was given"),
             "{said}"
         );
         let text = r#"{"site":"a","robot":"b","trajectory":{"circle":

@@ -63,27 +63,27 @@ const OF_CONNECTION: [HeaderName; 7] = [
 pub enum ForwardError {
     /// The other server has not said where it is.
     #[error(
-        "this server is a standby, and the one that has the database says no `[web] advertise_url` at which it \
-         can be asked"
+        "this server is a standby, and the active server has no `[web] advertise_url` at which it can be \
+         reached"
     )]
     NoAddress,
     /// The other server is a standby too, so that nobody has the database at the moment.
     #[error(
-        "this server is a standby, and so is the one that is said to have the database; try again"
+        "this server is a standby, and so is the server to which it forwards requests; try again"
     )]
     Loop,
     /// The other server does not answer a change that it may have received.
     #[error(
-        "the server that has the database does not answer, and may have done this: see whether it has before \
-         you try again"
+        "the active server does not answer, and may have executed the request: check that before you \
+         try again"
     )]
     Uncertain,
     /// The path is written in an unusual way.
-    #[error("this path cannot be forwarded: write it without `..`, `\\` and the like")]
+    #[error("this path cannot be forwarded: write it without `..`, `\\` and similar sequences")]
     Path,
     /// The other server does not answer.
     #[error(
-        "this server is a standby, and the one that has the database does not answer; try again"
+        "this server is a standby, and the active server does not answer; try again"
     )]
     NoAnswer,
 }

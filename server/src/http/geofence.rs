@@ -28,11 +28,11 @@ pub(super) async fn get(
 
 /// Replace the geofence of a site.
 ///
-/// With `If-Match`, only if the revision is still that one.
+/// With `If-Match`, the request is refused unless the revision is still the given one.
 #[utoipa::path(put, path = "/v1/sites/{site}/geofence", tag = "safety",
     security(("token" = ["configure"])),
     operation_id = "replace_geofence", params(("site" = SiteId, Path),
-        ("if-match" = Option<String>, Header, description = "The revision that is replaced")),
+        ("if-match" = Option<String>, Header, description = "Revision that the request may replace")),
     request_body = ReplaceGeofence,
     responses((status = 200, body = Geofence), (status = 404, body = ProblemBody),
         (status = 412, body = ProblemBody), (status = 422, body = ProblemBody)))]

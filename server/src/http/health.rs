@@ -1,4 +1,4 @@
-//! Whether the server lives, is ready, and what it counts.
+//! Liveness, readiness, status and counters of the server.
 
 use std::time::Duration;
 
@@ -18,41 +18,41 @@ use crate::build;
 use crate::counters::CounterValues;
 use crate::metrics::SLOW_AFTER;
 
-/// The server is there.
+/// Result of a health check.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct Health {
     /// Always `ok`.
     pub status: String,
 }
 
-/// The storage as it was checked last, at most a few seconds ago.
+/// State of the storage at its last check, a few seconds ago at most.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct StorageStatus {
-    /// Whether everything works.
+    /// Whether the storage is writable and undamaged.
     pub ok: bool,
-    /// Why nothing can be stored, if that is so.
+    /// Reason why nothing can be stored; `null` if the storage is writable.
     pub unwritable: Option<String>,
-    /// What is damaged, if anything is.
+    /// Description of the damage; `null` if there is none.
     pub damaged: Option<String>,
     /// Free bytes on the disk of the database; `null` if the operating system does not report them.
     pub disk_free_bytes: Option<u64>,
-    /// Whether that is below `storage.disk_free_min_mib`.
+    /// Whether `disk_free_bytes` is below the configured `storage.disk_free_min_mib`.
     pub disk_low: bool,
     /// Size of the database file, bytes; `null` if the operating system does not report it.
     pub database_bytes: Option<u64>,
-    /// Size of its write-ahead log, bytes; `null` if the operating system does not report it.
+    /// Size of the write-ahead log, bytes; `null` if the operating system does not report it.
     pub log_bytes: Option<u64>,
     /// Growth of the database file over the last hour, bytes per hour; `null` in the first ten
     /// minutes of a run of the server.
     pub growth_bytes_per_hour: Option<i64>,
 }
 
-/// What waits in a queue.
+/// Number of waiting entries of a queue.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct QueueDepth {
     /// Name of the queue.
     pub name: String,
-    /// Number of entries.
+    /// Number of waiting entries.
     pub depth: u64,
 }
 
@@ -63,7 +63,7 @@ pub struct SlowTransactions {
     pub threshold_ms: u64,
     /// Number of slow transactions.
     pub count: u64,
-    /// Use cases with the slowest ones, the slowest first, at most 10.
+    /// Use cases with the slowest transactions, the slowest first, at most 10.
     pub slowest: Vec<SlowUseCase>,
 }
 
@@ -74,9 +74,9 @@ pub struct SlowUseCase {
     pub kind: String,
     /// Whether its transactions write.
     pub writes: bool,
-    /// Number of slow ones.
+    /// Number of slow transactions.
     pub count: u64,
-    /// Duration of the longest, milliseconds.
+    /// Duration of the longest transaction, milliseconds.
     pub longest_ms: u64,
 }
 
@@ -118,14 +118,14 @@ impl From<StorageCondition> for StorageStatus {
     }
 }
 
-/// The last backup that the server made by itself, or that was put into the folder of backups.
+/// Last backup in the folder of backups, usually made by the server itself.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct BackupStatus {
     /// Time of the last complete backup; `null` without one.
     pub last_at: Option<Timestamp>,
-    /// Its size, bytes.
+    /// Size of that backup, bytes; `null` without one.
     pub last_bytes: Option<u64>,
-    /// Why the last attempt failed, if it did.
+    /// Reason why the last attempt failed; `null` if it did not.
     pub failure: Option<String>,
 }
 
@@ -139,7 +139,7 @@ impl From<BackupState> for BackupStatus {
     }
 }
 
-/// The last restoration of the database from a backup.
+/// Last restoration of the database from a backup.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct RestorationStatus {
     /// Time of the restoration.
@@ -148,51 +148,52 @@ pub struct RestorationStatus {
     pub backup_taken_at: Timestamp,
     /// Version of the server that made the backup.
     pub backup_version: String,
-    /// Robots that await their release.
+    /// Number of robots that await their release.
     pub robots_awaiting_release: u64,
 }
 
-/// The server about itself.
+/// Status of the server.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct ServerStatus {
     /// Version of the server.
     pub version: String,
-    /// Commit that it was built from; `null` if the build did not say.
+    /// Commit from which it was built; `null` if the build did not record it.
     pub commit: Option<String>,
-    /// Schema of its database: the newest migration.
+    /// Schema of the database: the number of its newest migration.
     pub schema: i64,
     /// Time since the start, milliseconds.
     pub uptime_ms: u64,
-    /// Its database.
+    /// State of the database.
     pub database: DatabaseStatus,
-    /// The storage as it was checked last.
+    /// State of the storage at its last check.
     pub storage: StorageStatus,
-    /// What waits in each queue: messages of robots (`hellos`, `presence`, `states`,
+    /// Number of waiting entries of each queue: messages of robots (`hellos`, `presence`, `states`,
     /// `uploads`), uploads to be stored (`ingest`), commands of the reconciler (`reconciler`),
     /// deliveries to webhooks (`webhooks`), events for the slowest client (`events`).
     pub queues: Vec<QueueDepth>,
     /// Slow transactions of the database.
     pub slow_transactions: SlowTransactions,
-    /// Its backups; `null` if it makes none by itself.
+    /// State of the backups; `null` if the server makes none by itself.
     pub backup: Option<BackupStatus>,
-    /// The last restoration from a backup; `null` if there was none.
+    /// Last restoration from a backup; `null` if there was none.
     pub restoration: Option<RestorationStatus>,
-    /// Robots that are on the network now, of those that the token is for.
+    /// Number of connected robots within the scope of the token.
     pub robots_present: usize,
-    /// Whether robots can join with a join token: the server has `[robots]`, and so an authority.
+    /// Whether robots can join with a join token, which requires `[robots]` in the configuration.
     pub robots_can_join: bool,
-    /// What it has counted since the start.
+    /// Counters since the start of the server.
     pub counters: CounterValues,
 }
 
-/// The engine of the database.
+/// Engine of the database and its standbys.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct DatabaseStatus {
-    /// Name of the engine: `SQLite`.
+    /// Name of the engine: `SQLite` or `PostgreSQL`.
     pub engine: String,
     /// Version of the engine.
     pub version: String,
-    /// Standbys that follow the database; `null` for one that has one server, and while it does not answer.
+    /// Number of standbys that follow the database; `null` for a database file, and while it does
+    /// not answer.
     pub standbys: Option<u64>,
 }
 
@@ -208,9 +209,10 @@ pub(super) async fn healthz() -> Json<Health> {
     ok()
 }
 
-/// Check that the server can work.
+/// Check that the server is ready.
 ///
-/// The database takes a write, and no damage of it is known. The answer may be a second old.
+/// It is ready if the database accepts a write and has no known damage. The result may be one
+/// second old.
 #[utoipa::path(get, path = "/readyz", tag = "server",
     responses((status = 200, body = Health), (status = 503, body = ProblemBody)))]
 pub(super) async fn readyz(State(app): State<App>) -> Result<Json<Health>, Problem> {

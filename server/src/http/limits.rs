@@ -1,4 +1,4 @@
-//! `/v1/sites/{site}/robots/{robot}/limits`: what other programs hold or slow a robot by.
+//! `/v1/sites/{site}/robots/{robot}/limits`: limits by which other programs hold or slow a robot.
 
 use axum::extract::State;
 use axum::http::StatusCode;
@@ -23,7 +23,7 @@ pub(super) async fn list(
     Ok(Json(app.limits(&site, &robot).await?))
 }
 
-/// Hold or slow a robot for a while.
+/// Hold or slow a robot for a limited time.
 ///
 /// Repeat the request before the limit expires to keep it.
 #[utoipa::path(put, path = "/v1/sites/{site}/robots/{robot}/limits/{owner}", tag = "safety",
@@ -31,7 +31,7 @@ pub(super) async fn list(
     operation_id = "set_limit", params(("site" = SiteId, Path), ("robot" = RobotId, Path),
         ("owner" = OwnerId, Path)),
     request_body = SetLimit,
-    responses((status = 204, description = "The robot has taken it"),
+    responses((status = 204, description = "The robot has accepted the limit"),
         (status = 404, body = ProblemBody), (status = 409, body = ProblemBody),
         (status = 422, body = ProblemBody), (status = 503, body = ProblemBody)))]
 pub(super) async fn set(
@@ -45,12 +45,12 @@ pub(super) async fn set(
 
 /// End an external limit.
 ///
-/// A required owner of a limit that falls silent holds the robot from then on.
+/// If the robot's configuration requires this owner, the robot is on hold from then on.
 #[utoipa::path(delete, path = "/v1/sites/{site}/robots/{robot}/limits/{owner}", tag = "safety",
     security(("token" = ["hold"])),
     operation_id = "end_limit", params(("site" = SiteId, Path), ("robot" = RobotId, Path),
         ("owner" = OwnerId, Path)),
-    responses((status = 204, description = "The robot has ended it"),
+    responses((status = 204, description = "The robot has ended the limit"),
         (status = 404, body = ProblemBody), (status = 409, body = ProblemBody),
         (status = 503, body = ProblemBody)))]
 pub(super) async fn end(

@@ -17,22 +17,22 @@ use crate::app::App;
 use crate::app::missions::MissionFilter;
 use crate::app::missions::idempotency::KEY_LENGTH_MAX;
 
-/// Which missions, and which page of them.
+/// Query parameters of the list of missions.
 #[derive(Debug, Clone, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(super) struct MissionQuery {
-    /// Only those of this site.
+    /// Only missions of this site.
     #[param(value_type = Option<String>)]
     site: Option<SiteId>,
-    /// Only those of this robot.
+    /// Only missions of this robot.
     #[param(value_type = Option<String>)]
     robot: Option<RobotId>,
-    /// Only those in this state.
+    /// Only missions in this state.
     state: Option<MissionState>,
-    /// `next_cursor` of the page before.
+    /// `next_cursor` of the previous page.
     cursor: Option<String>,
-    /// Most entries of the page, 1 to 1000; 100 when absent.
+    /// Maximum number of entries of the page, 1 to 1000; 100 when absent.
     limit: Option<u32>,
 }
 
@@ -61,14 +61,14 @@ pub(super) async fn list(
     Ok(Json(app.missions(&filter, limit).await?))
 }
 
-/// Create a mission: a robot drives a circle or waypoints.
+/// Create a mission, in which a robot drives a circle or waypoints.
 ///
-/// It waits in the robot's queue.
+/// The mission waits in the robot's queue until the robot is ready for it.
 #[utoipa::path(post, path = "/v1/missions", tag = "missions", operation_id = "create_mission",
     security(("token" = ["dispatch"])),
     request_body = CreateMission,
     params(("idempotency-key" = Option<String>, Header,
-        description = "The same request with the same token under the same key is answered the same, and done once")),
+        description = "Key chosen by the client. A repetition with the same token and key gets the same response, and has no further effect")),
     responses((status = 201, body = Mission), (status = 404, body = ProblemBody),
         (status = 409, body = ProblemBody), (status = 413, body = ProblemBody),
         (status = 415, body = ProblemBody), (status = 422, body = ProblemBody)))]
@@ -96,7 +96,7 @@ fn idempotency_key(headers: &HeaderMap) -> Result<Option<&str>, Problem> {
     let key = value.to_str().ok().map(str::trim);
     let usable = key.filter(|key| (1..=KEY_LENGTH_MAX).contains(&key.len()));
     usable.map(Some).ok_or_else(|| {
-        let detail = format!("idempotency-key has 1 to {KEY_LENGTH_MAX} visible characters");
+        let detail = format!("idempotency-key must have 1 to {KEY_LENGTH_MAX} visible characters");
         Problem::new(ProblemType::InvalidHeader)
             .detail(detail)
             .field("idempotency-key")
@@ -117,8 +117,8 @@ pub(super) async fn get(
 
 /// Get the planned path of a mission.
 ///
-/// It starts where the robot planned it once the robot has accepted the mission, before that at the
-/// start of the trajectory.
+/// Once the robot has accepted the mission, the path starts at the pose from which the robot
+/// planned. Until then it starts at the start of the trajectory.
 #[utoipa::path(get, path = "/v1/missions/{mission}/path", tag = "missions",
     security(("token" = ["read"])),
     operation_id = "get_planned_path", params(("mission" = MissionId, Path)),
@@ -133,7 +133,7 @@ pub(super) async fn path(
 
 /// Cancel a mission.
 ///
-/// A queued mission ends at once, an active one when its robot has answered.
+/// A queued mission ends at once, an active one when its robot has confirmed.
 #[utoipa::path(post, path = "/v1/missions/{mission}/cancel", tag = "missions",
     security(("token" = ["dispatch"])),
     operation_id = "cancel_mission", params(("mission" = MissionId, Path)),
@@ -149,7 +149,7 @@ pub(super) async fn cancel(
     ))
 }
 
-/// Pause an active mission; the robot stands.
+/// Pause an active mission; the robot brakes and stays at rest.
 #[utoipa::path(post, path = "/v1/missions/{mission}/pause", tag = "missions",
     security(("token" = ["dispatch"])),
     operation_id = "pause_mission", params(("mission" = MissionId, Path)),

@@ -25,7 +25,7 @@ pub(super) fn choose<T: ResponseFormat>(
         let found = offered.iter().find(|(name, _)| *name == format);
         return found.map(|(_, format)| *format).ok_or_else(|| {
             let short: String = format.chars().take(40).collect();
-            let detail = format!("there is no format `{short}` here, only `{}`", names());
+            let detail = format!("this route has no format `{short}`, only `{}`", names());
             Problem::new(ProblemType::InvalidQuery)
                 .detail(detail)
                 .field("format")
@@ -47,7 +47,7 @@ pub(super) fn choose<T: ResponseFormat>(
             Some(_) | None => Some(next),
         });
     best.map(|(format, _)| format).ok_or_else(|| {
-        let detail = format!("take one of these with `format=`: `{}`", names());
+        let detail = format!("request one of these formats with `format=`: `{}`", names());
         Problem::new(ProblemType::NotAcceptable).detail(detail)
     })
 }

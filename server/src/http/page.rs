@@ -141,7 +141,7 @@ async fn file(request: Request) -> Response {
     found.map_or_else(
         || {
             Problem::new(ProblemType::NotFound)
-                .detail("the page has no file of that name; it begins at /")
+                .detail("the dashboard has no file of that name; it is at /")
                 .into_response()
         },
         |file| file.answer(request.headers()),

@@ -44,11 +44,11 @@ impl Problem {
         error!("a request failed: {cause:?}");
         match cause.failure() {
             Some(failure) => Self::new(ProblemType::Unavailable).detail(format!(
-                "{}; ask again later, with the same idempotency key if there is one",
+                "{}; try again later, with the same idempotency key if there is one",
                 failure.explanation()
             )),
             None => Self::new(ProblemType::Internal)
-                .detail("the cause is in the server's log, under the id of this request"),
+                .detail("the cause is in the server's log, under this response's `x-request-id`"),
         }
     }
 

@@ -35,7 +35,7 @@ pub(super) fn expected(headers: &HeaderMap) -> Result<Precondition, Problem> {
     let tags = strong_tags(&list).ok_or_else(|| {
         Problem::new(ProblemType::InvalidHeader)
             .detail(
-                "If-Match is `*` or a list of revisions as in the ETag, in quotation marks: \"3\"",
+                "If-Match must be `*` or a list of revisions as in ETag, in quotation marks: \"3\"",
             )
             .field("if-match")
     })?;

@@ -13,18 +13,18 @@ use super::problem::Problem;
 use super::subject::Subject;
 use crate::app::App;
 
-/// Which robots, and which page of them.
+/// Query parameters of the list of robots.
 #[derive(Debug, Clone, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(super) struct RobotQuery {
-    /// Retired ones too.
+    /// Whether to include retired robots; false when absent.
     #[serde(default)]
     #[param(required = false)]
     retired: bool,
-    /// `next_cursor` of the page before.
+    /// `next_cursor` of the previous page.
     cursor: Option<String>,
-    /// Most entries of the page, 1 to 1000; 100 when absent.
+    /// Maximum number of entries of the page, 1 to 1000; 100 when absent.
     limit: Option<u32>,
 }
 
@@ -58,8 +58,8 @@ pub(super) async fn get(
 
 /// Release a robot after the server was restored from a backup.
 ///
-/// What happened after the backup is unknown, so no mission is sent to a robot until it is released.
-/// Does nothing to one that does not await that.
+/// What happened after the backup is unknown, so no mission is sent to a robot until it is
+/// released. The request has no effect on a robot that does not await its release.
 #[utoipa::path(post, path = "/v1/sites/{site}/robots/{robot}/release", tag = "robots",
     security(("token" = ["dispatch"])),
     operation_id = "release_robot", params(("site" = SiteId, Path), ("robot" = RobotId, Path)),
@@ -73,7 +73,7 @@ pub(super) async fn release(
 
 /// Rename, tag, retire or restore a robot.
 ///
-/// Retiring cancels all its missions.
+/// Retiring a robot cancels all its missions.
 #[utoipa::path(patch, path = "/v1/sites/{site}/robots/{robot}", tag = "robots",
     security(("token" = ["configure"])),
     operation_id = "update_robot", params(("site" = SiteId, Path), ("robot" = RobotId, Path)),

@@ -14,14 +14,14 @@ use super::problem::Problem;
 use super::subject::Subject;
 use crate::app::App;
 
-/// Which page of a list.
+/// Query parameters of a list.
 #[derive(Debug, Clone, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(super) struct PageQuery {
-    /// `next_cursor` of the page before.
+    /// `next_cursor` of the previous page.
     pub(super) cursor: Option<String>,
-    /// Most entries of the page, 1 to 1000; 100 when absent.
+    /// Maximum number of entries of the page, 1 to 1000; 100 when absent.
     pub(super) limit: Option<u32>,
 }
 
@@ -65,7 +65,7 @@ pub(super) async fn create(
     Ok((StatusCode::CREATED, Json(app.create_site(request).await?)))
 }
 
-/// Set the position of a site's origin on the earth, so that its map can be given in WGS 84.
+/// Set the position of a site's origin in WGS 84, which exports of its map in WGS 84 need.
 #[utoipa::path(put, path = "/v1/sites/{site}/origin", tag = "sites", operation_id = "set_site_origin",
     security(("token" = ["configure"])),
     params(("site" = SiteId, Path)), request_body = GeoOrigin,
@@ -79,7 +79,7 @@ pub(super) async fn set_origin(
     Ok(Json(app.set_site_origin(&site, Some(origin)).await?))
 }
 
-/// Remove the position of a site's origin on the earth.
+/// Remove the position of a site's origin in WGS 84.
 #[utoipa::path(delete, path = "/v1/sites/{site}/origin", tag = "sites",
     operation_id = "remove_site_origin", security(("token" = ["configure"])),
     params(("site" = SiteId, Path)),

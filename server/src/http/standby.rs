@@ -149,9 +149,9 @@ fn ready(app: &App, forwarder: &Forwarder) -> Result<Json<Health>, Problem> {
         Some(age) if age <= MAP_AGE_MAX => {}
         Some(age) => {
             let seconds = age.as_secs();
-            return unavailable(format!("standby: its map was up to date {seconds} s ago"));
+            return unavailable(format!("standby: its map was last up to date {seconds} s ago"));
         }
-        None => return unavailable("standby: it reads the map".to_owned()),
+        None => return unavailable("standby: it is still reading the map".to_owned()),
     }
     if app.leader_url().is_none() {
         return unavailable(ForwardError::NoAddress.to_string());

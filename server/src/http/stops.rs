@@ -1,7 +1,7 @@
 //! Stops: of one robot, of all, their list and their clearing.
 //!
-//! A stop is the one request whose body may be missing or wrong: it stops all the same. What can be
-//! read of it counts, whatever the rest is, and whatever its `content-type`:
+//! A stop is the only request that is executed with a missing or invalid body. Any part of the body
+//! that can be parsed applies, whatever the rest and the `content-type` are:
 //!
 //! | the body | stops |
 //! |---|---|
@@ -10,12 +10,12 @@
 //! | an object with a `site` that can be one | the robots of that site; 404 if it is not known, 403 if it is not the token's |
 //! | an object with any other `site` | none: 422 at once |
 //!
-//! All robots are those that the token is for.
+//! "All robots" are those within the scope of the token.
 //!
-//! Whoever wrote a `site` meant some robots and not all, and nobody can tell which: to stop all of
-//! them would take the yards of others away, to stop none and say nothing would be worse. So the request
-//! is refused at once, as with a site that is not known. Everything else that cannot be read
-//! may be a cry for help, and stops everything.
+//! A `site` that cannot be parsed shows that the caller meant some robots, but not which. To stop
+//! all robots would stop those of other sites; to stop none without an error would be worse. So the
+//! request is refused at once, as with an unknown site. Any other body that cannot be parsed may
+//! come from an emergency, and stops all robots.
 
 use std::time::Duration;
 
@@ -91,31 +91,31 @@ impl StopBody {
     }
 }
 
-/// Which stops, and which page of them.
+/// Query parameters of the list of stops.
 #[derive(Debug, Clone, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(super) struct StopQuery {
-    /// Only those of this site.
+    /// Only stops of this site.
     #[param(value_type = Option<String>)]
     site: Option<SiteId>,
-    /// Only those of robots of this name.
+    /// Only stops of robots with this identifier.
     #[param(value_type = Option<String>)]
     robot: Option<RobotId>,
-    /// Only those that are not cleared.
+    /// Only stops that are not cleared.
     #[serde(default)]
     #[param(required = false)]
     in_force: bool,
-    /// `next_cursor` of the page before.
+    /// `next_cursor` of the previous page.
     cursor: Option<String>,
-    /// Most entries of the page, 1 to 1000; 100 when absent.
+    /// Maximum number of entries of the page, 1 to 1000; 100 when absent.
     limit: Option<u32>,
 }
 
-/// Stop a robot, in any state and whoever drives it.
+/// Stop a robot, whatever its state and whoever drives it.
 ///
-/// Answers when the robot has confirmed, or after 300 ms; the server then repeats the stop until
-/// the robot confirms.
+/// The response is sent when the robot has confirmed the stop, or after 300 ms. The server then
+/// repeats the stop until the robot confirms it.
 #[utoipa::path(post, path = "/v1/sites/{site}/robots/{robot}/stop", tag = "safety",
     security(("token" = ["stop"])),
     operation_id = "stop_robot", params(("site" = SiteId, Path), ("robot" = RobotId, Path)),
@@ -153,9 +153,9 @@ pub(super) async fn stop_fleet(
     Ok(Json(stopped.await?))
 }
 
-/// Clear a robot's newest stop, if the robot stands.
+/// Clear a robot's newest stop, if the robot is at rest.
 ///
-/// Nothing starts: its active and queued missions stay on hold until they are resumed.
+/// The robot stays at rest: its active and queued missions stay on hold until they are resumed.
 #[utoipa::path(post, path = "/v1/sites/{site}/robots/{robot}/stop/clear", tag = "safety",
     security(("token" = ["clear_stop"])),
     operation_id = "clear_stop", params(("site" = SiteId, Path), ("robot" = RobotId, Path)),

@@ -61,12 +61,12 @@ pub(super) async fn create(
 
 /// Replace a terrain.
 ///
-/// With `If-Match`, only if the revision is still that one.
+/// With `If-Match`, the request is refused unless the revision is still the given one.
 #[utoipa::path(put, path = "/v1/sites/{site}/terrains/{terrain}", tag = "terrains",
     security(("token" = ["configure"])),
     operation_id = "replace_terrain",
     params(("site" = SiteId, Path), ("terrain" = TerrainId, Path),
-        ("if-match" = Option<String>, Header, description = "The revision that is replaced")),
+        ("if-match" = Option<String>, Header, description = "Revision that the request may replace")),
     request_body = ReplaceTerrain,
     responses((status = 200, body = Terrain), (status = 404, body = ProblemBody),
         (status = 412, body = ProblemBody), (status = 422, body = ProblemBody)))]
@@ -83,12 +83,12 @@ pub(super) async fn replace(
 
 /// Delete a terrain; its measurements stay.
 ///
-/// With `If-Match`, only if the revision is still that one.
+/// With `If-Match`, the request is refused unless the revision is still the given one.
 #[utoipa::path(delete, path = "/v1/sites/{site}/terrains/{terrain}", tag = "terrains",
     security(("token" = ["configure"])),
     operation_id = "delete_terrain",
     params(("site" = SiteId, Path), ("terrain" = TerrainId, Path),
-        ("if-match" = Option<String>, Header, description = "The revision that is deleted")),
+        ("if-match" = Option<String>, Header, description = "Revision that the request may delete")),
     responses((status = 204), (status = 404, body = ProblemBody),
         (status = 412, body = ProblemBody)))]
 pub(super) async fn delete(

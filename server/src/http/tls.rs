@@ -31,7 +31,7 @@ pub enum TlsError {
          must be able to read it"
     )]
     Unreadable {
-        /// What it should hold.
+        /// Expected content.
         what: &'static str,
         /// The file.
         file: String,

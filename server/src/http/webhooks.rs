@@ -28,7 +28,7 @@ pub(super) async fn list(
 
 /// Create a webhook, to which alerts are sent.
 ///
-/// The answer is the only place that has its secret.
+/// Only this response contains its secret.
 #[utoipa::path(post, path = "/v1/webhooks", tag = "webhooks", operation_id = "create_webhook",
     security(("token" = ["administer"])), request_body = WebhookSettings,
     responses((status = 201, body = CreatedWebhook), (status = 409, body = ProblemBody),
@@ -68,7 +68,7 @@ pub(super) async fn replace(
     Ok(Json(app.change_webhook(webhook, settings).await?))
 }
 
-/// Delete a webhook with its deliveries, also those that wait.
+/// Delete a webhook and its deliveries, including pending ones.
 #[utoipa::path(delete, path = "/v1/webhooks/{webhook}", tag = "webhooks",
     operation_id = "delete_webhook", security(("token" = ["administer"])),
     params(("webhook" = WebhookId, Path)),
@@ -80,9 +80,9 @@ pub(super) async fn delete(
     Ok(Json(app.delete_webhook(webhook).await?))
 }
 
-/// Give a webhook a new secret, with which everything is signed from now on.
+/// Rotate the secret of a webhook.
 ///
-/// The answer is the only place that has it.
+/// From now on deliveries are signed with the new secret. Only this response contains it.
 #[utoipa::path(post, path = "/v1/webhooks/{webhook}/secret", tag = "webhooks",
     operation_id = "rotate_webhook_secret", security(("token" = ["administer"])),
     params(("webhook" = WebhookId, Path)),
@@ -96,7 +96,7 @@ pub(super) async fn rotate(
 
 /// Send a test to a webhook, whether or not it is enabled.
 ///
-/// The answer is the queued delivery; the log of deliveries says what becomes of it.
+/// The response is the queued delivery; the log of deliveries shows its result.
 #[utoipa::path(post, path = "/v1/webhooks/{webhook}/test", tag = "webhooks",
     operation_id = "test_webhook", security(("token" = ["administer"])),
     params(("webhook" = WebhookId, Path)),
@@ -109,7 +109,7 @@ pub(super) async fn test(
     Ok((StatusCode::ACCEPTED, Json(queued)))
 }
 
-/// List the deliveries of a webhook, newest first: those that wait, and the last thousand others.
+/// List the deliveries of a webhook, newest first: pending ones and the last thousand others.
 #[utoipa::path(get, path = "/v1/webhooks/{webhook}/deliveries", tag = "webhooks",
     operation_id = "list_webhook_deliveries", security(("token" = ["administer"])),
     params(("webhook" = WebhookId, Path), PageQuery),

@@ -26,8 +26,8 @@ const NEWER: u8 = 4;
 pub(crate) struct MigrateArgs {
     #[command(flatten)]
     files: ServerFiles,
-    /// Only show the due migrations: exit code 0 if there are none, 3 if there are some, 4 if the
-    /// database is of a newer version
+    /// Only show the pending migrations: exit code 0 if there are none, 3 if there are any, 4 if
+    /// the database is of a newer version
     #[arg(long)]
     check: bool,
 }

@@ -45,7 +45,7 @@ pub(crate) enum TlsChoice {
     Authority,
     /// By TLS with certificate and key from files
     Files,
-    /// By a proxy on this machine that ends TLS
+    /// By a proxy on this machine that terminates TLS
     Proxy,
     /// From this machine alone, without TLS
     Loopback,
@@ -55,7 +55,7 @@ pub(crate) enum TlsChoice {
 #[derive(Debug, Clone, Default, Args)]
 #[command(next_help_heading = "Writing a configuration")]
 pub(crate) struct SetupArgs {
-    /// Write a configuration without questions, with defaults for all flags that are not given
+    /// Write a configuration without asking questions, with defaults for all absent flags
     #[arg(long)]
     pub(crate) yes: bool,
     /// Then enable and start the service `tread-server` of the package

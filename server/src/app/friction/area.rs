@@ -58,15 +58,13 @@ impl Area {
             if !bounds.contains(&low) || !bounds.contains(&high) {
                 return Err(AppError::InvalidQuery {
                     parameter,
-                    detail: format!(
-                        "a box lies on the map, within {COORDINATE_MAX_M} m of the origin"
-                    ),
+                    detail: format!("the box must be within {COORDINATE_MAX_M} m of the origin"),
                 });
             }
             if low > high {
                 return Err(AppError::InvalidQuery {
                     parameter,
-                    detail: format!("the box is inside out: {low} m to {high} m"),
+                    detail: format!("the lower bound, {low} m, is above the upper one, {high} m"),
                 });
             }
         }

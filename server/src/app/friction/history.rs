@@ -56,7 +56,7 @@ impl Times {
         let steps = to.duration_since(from).as_secs() / step.as_secs().max(1);
         if steps >= TIMES_MAX {
             let detail = format!(
-                "this would give {} times; at most {TIMES_MAX}",
+                "the history would have {} times; at most {TIMES_MAX} are allowed",
                 steps.saturating_add(1)
             );
             return Err(invalid("step_s", detail));

@@ -37,25 +37,25 @@ fn times(from: Timestamp, to: Option<Timestamp>, step_s: Option<i64>) -> Result<
     Ok(Times { from, to, step })
 }
 
-/// Which times of a terrain's history.
+/// Query parameters of the history of a terrain.
 #[derive(Debug, Clone, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(in crate::http) struct HistoryQuery {
-    /// The oldest time.
+    /// First time.
     from: Timestamp,
-    /// The newest time; now when absent.
+    /// Last time; the present when absent.
     to: Option<Timestamp>,
-    /// Seconds from one time to the next, at least 60; an hour when absent. At most 1000 times.
+    /// Seconds between two times, at least 60; 3600 when absent. At most 1000 times are allowed.
     step_s: Option<i64>,
-    /// Only measurements of this robot model and tyres.
+    /// Include only measurements of this configuration (robot model and tyres).
     #[param(value_type = Option<String>)]
     configuration: Option<ConfigurationId>,
-    /// A declared normalisation that joins robot models.
+    /// Include other robot models too, by this normalisation of the server's configuration.
     normalisation: Option<String>,
 }
 
-/// Get the history of a terrain's friction at equally spaced times.
+/// Get the friction of a terrain at equally spaced times.
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/terrains/{terrain}/history",
     tag = "friction", security(("token" = ["read"])),
     operation_id = "get_terrain_history",
@@ -74,29 +74,29 @@ pub(in crate::http) async fn terrain_history(
     Ok(etag::json(&headers, &found.await?))
 }
 
-/// Which point, and which times of its history.
+/// Query parameters of the history of a point.
 #[derive(Debug, Clone, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(in crate::http) struct PointHistoryQuery {
-    /// East-like coordinate, metres.
+    /// East-like coordinate in the site frame, metres.
     x_m: f64,
-    /// North-like coordinate, metres.
+    /// North-like coordinate in the site frame, metres.
     y_m: f64,
-    /// The oldest time.
+    /// First time.
     from: Timestamp,
-    /// The newest time; now when absent.
+    /// Last time; the present when absent.
     to: Option<Timestamp>,
-    /// Seconds from one time to the next, at least 60; an hour when absent. At most 1000 times.
+    /// Seconds between two times, at least 60; 3600 when absent. At most 1000 times are allowed.
     step_s: Option<i64>,
-    /// Only measurements of this robot model and tyres.
+    /// Include only measurements of this configuration (robot model and tyres).
     #[param(value_type = Option<String>)]
     configuration: Option<ConfigurationId>,
-    /// A declared normalisation that joins robot models.
+    /// Include other robot models too, by this normalisation of the server's configuration.
     normalisation: Option<String>,
 }
 
-/// Get the history of friction at a point at equally spaced times, of the terrain there only.
+/// Get the friction at a point, on the terrain there, at equally spaced times.
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/point/history", tag = "friction",
     security(("token" = ["read"])),
     operation_id = "get_point_history", params(("site" = SiteId, Path), PointHistoryQuery),

@@ -90,37 +90,37 @@ impl ResponseFormat for Format {
     }
 }
 
-/// What of the map, and in which format.
+/// Query parameters of the map.
 #[derive(Debug, Clone, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(in crate::http) struct MapQuery {
     /// `png`, `tile` (compact binary), `nav2` (YAML of a speed mask), `pgm` (its picture), or with
-    /// all that is known of every cell: `json`, `geojson`, `csv`, `parquet`. What `Accept` asks
-    /// for when absent.
+    /// all values of every cell: `json`, `geojson`, `csv`, `parquet`. When absent, `Accept` selects
+    /// the format.
     format: Option<String>,
-    /// Lowest x of the area, metres; everywhere that anybody has driven when no bound is given.
+    /// Lowest x of the area in the site frame, metres; that of the measured area when absent.
     x_min_m: Option<f64>,
-    /// Lowest y of the area, metres.
+    /// Lowest y of the area in the site frame, metres.
     y_min_m: Option<f64>,
-    /// Highest x of the area, metres.
+    /// Highest x of the area in the site frame, metres.
     x_max_m: Option<f64>,
-    /// Highest y of the area, metres.
+    /// Highest y of the area in the site frame, metres.
     y_max_m: Option<f64>,
-    /// Side of the squares, metres, a multiple of the grid's; the grid's own when absent. There
-    /// may be 1 048 576 squares.
+    /// Side of the squares, metres, a multiple of the grid's; the grid's own when absent. The area
+    /// may have at most 1 048 576 squares.
     resolution_m: Option<f64>,
-    /// As of when, rounded down to a minute, or to the end of an epoch whose raw measurements are
-    /// missing or too many; all that has come when absent.
+    /// Time up to which measurements are included, rounded down to a minute, or to the end of an
+    /// epoch whose raw measurements are missing or too many; all measurements when absent.
     as_of: Option<Timestamp>,
-    /// The robot model and tyres whose θ it is; the one with most measurements when absent.
+    /// Configuration (robot model and tyres) of θ; the one with most measurements when absent.
     #[param(value_type = Option<String>)]
     configuration: Option<ConfigurationId>,
-    /// A declared normalisation that joins robot models.
+    /// Include other robot models too, by this normalisation of the server's configuration.
     normalisation: Option<String>,
-    /// Pixels of a square's side in a PNG, 1 to 32; as many as make a picture of 768 when absent.
+    /// Side of a square in a PNG, pixels, 1 to 32; when absent, for a picture of about 768 pixels.
     scale: Option<usize>,
-    /// Highest speed of a speed mask, metres per second, 0.01 to 50; 2 when absent.
+    /// Speed of the value 100 in a speed mask, m/s, 0.01 to 50; 2 when absent.
     speed_max_m_s: Option<f64>,
     /// Distance within which a robot must be able to stop, metres, 0.01 to 1000; 1 when absent.
     stopping_m: Option<f64>,
@@ -228,15 +228,15 @@ fn refused(error: PngError) -> AppError {
 
 /// Get the friction map.
 ///
-/// As a picture with a legend, a compact binary tile or a speed mask for Nav2, each for one robot
-/// model; or as a list of everything known of every cell, per ground and robot model, without
-/// pages, sent while it is made. Headers say for which robot model θ is (`tread-configuration`) and
-/// how it was normalised (`tread-normalisation`), both for pictures only, and the time of the map
-/// (`tread-as-of`).
+/// The formats `png`, `tile` and the speed mask for Nav2 show one robot model. The others list all
+/// values of every cell, for each terrain and robot model, without pages; the server streams them.
+/// With the first ones, the header `tread-configuration` names the robot model for which θ holds,
+/// and `tread-normalisation` the applied normalisation. The header `tread-as-of` has the time of
+/// the map.
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/map", tag = "friction",
     security(("token" = ["read"])),
     operation_id = "get_friction_map", params(("site" = SiteId, Path), MapQuery),
-    responses((status = 200, description = "The map in that format", content(
+    responses((status = 200, description = "The map in the selected format", content(
             (Vec<u8> = "image/png"), (MapPage<CellFriction> = "application/json"),
             (Vec<u8> = "application/vnd.tread.friction-tile"), (Value = "application/geo+json"),
             (String = "application/yaml"), (Vec<u8> = "image/x-portable-graymap"),

@@ -1,7 +1,7 @@
 //! `/v1/sites/{site}/friction` and `/v1/sites/{site}/segments`.
 //!
-//! Every answer about the map has an `ETag` and takes `as_of`: the map as it was known then, with the
-//! ages of then. The answer says as of when it is.
+//! Every route of the map returns an `ETag` and has the parameter `as_of`, which selects the map as
+//! it was known at that time, with the ages at that time. The response contains that time.
 
 pub(super) mod history;
 pub(super) mod map;
@@ -32,22 +32,22 @@ use crate::app::segments::SegmentFilter;
 use crate::app::{App, AppError};
 use crate::formats::table::{self, segments};
 
-/// What is asked for of a terrain.
+/// Query parameters of the list of terrains' friction.
 #[derive(Debug, Clone, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(super) struct ReadingQuery {
-    /// As of when, rounded down to a minute, or to the end of an epoch whose raw measurements are
-    /// missing or too many; all that has come when absent.
+    /// Time up to which measurements are included, rounded down to a minute, or to the end of an
+    /// epoch whose raw measurements are missing or too many; all measurements when absent.
     as_of: Option<Timestamp>,
-    /// Only measurements of this robot model and tyres.
+    /// Include only measurements of this configuration (robot model and tyres).
     #[param(value_type = Option<String>)]
     configuration: Option<ConfigurationId>,
-    /// A declared normalisation that joins robot models.
+    /// Include other robot models too, by this normalisation of the server's configuration.
     normalisation: Option<String>,
-    /// `next_cursor` of the page before.
+    /// `next_cursor` of the previous page.
     cursor: Option<String>,
-    /// Most entries of the page, 1 to 1000; 100 when absent.
+    /// Maximum number of entries of the page, 1 to 1000; 100 when absent.
     limit: Option<u32>,
 }
 
@@ -67,7 +67,7 @@ fn asked(
     }
 }
 
-/// List friction of every terrain of a site.
+/// List the friction of every terrain of a site.
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/terrains", tag = "friction",
     security(("token" = ["read"])),
     operation_id = "list_terrain_friction", params(("site" = SiteId, Path), ReadingQuery),
@@ -89,22 +89,22 @@ pub(super) async fn terrains(
     Ok(add_as_of_header(etag::json(&headers, &found), as_of))
 }
 
-/// What is asked for of one terrain.
+/// Query parameters of the friction of one terrain.
 #[derive(Debug, Clone, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(super) struct OneQuery {
-    /// As of when, rounded down to a minute, or to the end of an epoch whose raw measurements are
-    /// missing or too many; all that has come when absent.
+    /// Time up to which measurements are included, rounded down to a minute, or to the end of an
+    /// epoch whose raw measurements are missing or too many; all measurements when absent.
     as_of: Option<Timestamp>,
-    /// Only measurements of this robot model and tyres.
+    /// Include only measurements of this configuration (robot model and tyres).
     #[param(value_type = Option<String>)]
     configuration: Option<ConfigurationId>,
-    /// A declared normalisation that joins robot models.
+    /// Include other robot models too, by this normalisation of the server's configuration.
     normalisation: Option<String>,
 }
 
-/// Get friction of a terrain, per robot model.
+/// Get the friction of a terrain for each robot model.
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/terrains/{terrain}", tag = "friction",
     security(("token" = ["read"])),
     operation_id = "get_terrain_friction",
@@ -122,7 +122,7 @@ pub(super) async fn terrain(
     Ok(add_as_of_header(etag::json(&headers, &found), found.as_of))
 }
 
-/// List what each robot contributed to the map.
+/// List the contribution of each robot to the friction map.
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/robots", tag = "friction",
     security(("token" = ["read"])),
     operation_id = "list_contributions", params(("site" = SiteId, Path), PageQuery),
@@ -140,27 +140,27 @@ pub(super) async fn robots(
     Ok(etag::json(&headers, &found.await?))
 }
 
-/// Which raw measurements, and which page of them.
+/// Query parameters of the list of raw measurements.
 #[derive(Debug, Clone, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(super) struct SegmentQuery {
-    /// Only those of this robot.
+    /// Only measurements of this robot.
     #[param(value_type = Option<String>)]
     robot: Option<RobotId>,
-    /// Only those on this terrain.
+    /// Only measurements on this terrain.
     #[param(value_type = Option<String>)]
     terrain: Option<TerrainId>,
-    /// `next_cursor` of the page before.
+    /// `next_cursor` of the previous page.
     cursor: Option<String>,
-    /// Most entries of the page, 1 to 1000; 100 when absent. CSV and Parquet have no pages.
+    /// Maximum number of entries of the page, 1 to 1000; 100 when absent; not for CSV and Parquet.
     limit: Option<u32>,
-    /// `json`, or everything after the cursor as `csv` or `parquet`; what `Accept` asks for when
-    /// absent.
+    /// `json`, or everything after the cursor as `csv` or `parquet`; when absent, `Accept` selects
+    /// the format.
     format: Option<String>,
 }
 
-/// What measurements can be given as.
+/// Formats of raw measurements.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum SegmentFormat {
     Json,
@@ -184,7 +184,7 @@ impl ResponseFormat for SegmentFormat {
     }
 }
 
-/// List raw measurements in the order of their commits.
+/// List raw measurements in the order in which the server stored them.
 #[utoipa::path(get, path = "/v1/sites/{site}/segments", tag = "friction",
     security(("token" = ["read"])),
     operation_id = "list_segments", params(("site" = SiteId, Path), SegmentQuery),

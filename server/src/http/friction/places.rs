@@ -23,38 +23,38 @@ use crate::http::extract::{Json, Path, Query, page_limit};
 use crate::http::problem::Problem;
 use crate::http::subject::Subject;
 
-/// Which cells, and which page of them.
+/// Query parameters of the friction of cells.
 #[derive(Debug, Clone, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(in crate::http) struct CellQuery {
-    /// Lowest x of the area, metres; the whole map when absent.
+    /// Lowest x of the area in the site frame, metres; that of the whole map when absent.
     x_min_m: Option<f64>,
-    /// Lowest y of the area, metres.
+    /// Lowest y of the area in the site frame, metres.
     y_min_m: Option<f64>,
-    /// Highest x of the area, metres.
+    /// Highest x of the area in the site frame, metres.
     x_max_m: Option<f64>,
-    /// Highest y of the area, metres.
+    /// Highest y of the area in the site frame, metres.
     y_max_m: Option<f64>,
-    /// Side of the squares that cells are put together to, metres, a multiple of the grid's; the
-    /// box may have 4 194 304 of them. Different ground is never put together.
+    /// Side of the squares into which cells are merged, metres, a multiple of the grid's; the area
+    /// may have at most 4 194 304 squares. Cells on different terrains are never merged.
     resolution_m: Option<f64>,
-    /// As of when, rounded down to a minute, or to the end of an epoch whose raw measurements are
-    /// missing or too many; all that has come when absent.
+    /// Time up to which measurements are included, rounded down to a minute, or to the end of an
+    /// epoch whose raw measurements are missing or too many; all measurements when absent.
     as_of: Option<Timestamp>,
-    /// Only measurements of this robot model and tyres.
+    /// Include only measurements of this configuration (robot model and tyres).
     #[param(value_type = Option<String>)]
     configuration: Option<ConfigurationId>,
-    /// A declared normalisation that joins robot models.
+    /// Include other robot models too, by this normalisation of the server's configuration.
     normalisation: Option<String>,
-    /// `next_cursor` of the page before.
+    /// `next_cursor` of the previous page.
     cursor: Option<String>,
-    /// Most cells of the page, 1 to 1000; 100 when absent. A cell has one entry per terrain and
-    /// robot model.
+    /// Maximum number of cells of the page, 1 to 1000; 100 when absent. A cell has one entry per
+    /// terrain and robot model.
     limit: Option<u32>,
 }
 
-/// List friction per cell.
+/// List the friction of cells.
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/cells", tag = "friction",
     security(("token" = ["read"])),
     operation_id = "list_cell_friction", params(("site" = SiteId, Path), CellQuery),
@@ -82,26 +82,26 @@ pub(in crate::http) async fn cells(
     Ok(add_as_of_header(etag::json(&headers, &found), found.as_of))
 }
 
-/// Which point.
+/// Query parameters of the friction at a point.
 #[derive(Debug, Clone, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(in crate::http) struct PointQuery {
-    /// East-like coordinate, metres.
+    /// East-like coordinate in the site frame, metres.
     x_m: f64,
-    /// North-like coordinate, metres.
+    /// North-like coordinate in the site frame, metres.
     y_m: f64,
-    /// As of when, rounded down to a minute, or to the end of an epoch whose raw measurements are
-    /// missing or too many; all that has come when absent.
+    /// Time up to which measurements are included, rounded down to a minute, or to the end of an
+    /// epoch whose raw measurements are missing or too many; all measurements when absent.
     as_of: Option<Timestamp>,
-    /// Only measurements of this robot model and tyres.
+    /// Include only measurements of this configuration (robot model and tyres).
     #[param(value_type = Option<String>)]
     configuration: Option<ConfigurationId>,
-    /// A declared normalisation that joins robot models.
+    /// Include other robot models too, by this normalisation of the server's configuration.
     normalisation: Option<String>,
 }
 
-/// Get friction at a point, of the terrain there only.
+/// Get the friction at a point, on the terrain there.
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/point", tag = "friction",
     security(("token" = ["read"])),
     operation_id = "get_point_friction", params(("site" = SiteId, Path), PointQuery),
@@ -122,7 +122,7 @@ pub(in crate::http) async fn point(
     Ok(add_as_of_header(etag::json(&headers, &found), found.as_of))
 }
 
-/// Get friction along a path, its uncertainty, and the speed that follows for a robot.
+/// Get the friction along a path, with the speed that it permits a robot.
 #[utoipa::path(post, path = "/v1/sites/{site}/friction/path", tag = "friction",
     security(("token" = ["read"])),
     operation_id = "get_path_friction", params(("site" = SiteId, Path)),
@@ -141,35 +141,35 @@ pub(in crate::http) async fn path(
     Ok(add_as_of_header(etag::json(&headers, &found), found.as_of))
 }
 
-/// Which times and cells.
+/// Query parameters of a comparison of two times.
 #[derive(Debug, Clone, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(in crate::http) struct DifferenceQuery {
-    /// The first time.
+    /// First time.
     from: Timestamp,
-    /// The second time; now when absent.
+    /// Second time; the present when absent.
     to: Option<Timestamp>,
-    /// Lowest x of the area, metres; the whole map when absent.
+    /// Lowest x of the area in the site frame, metres; that of the whole map when absent.
     x_min_m: Option<f64>,
-    /// Lowest y of the area, metres.
+    /// Lowest y of the area in the site frame, metres.
     y_min_m: Option<f64>,
-    /// Highest x of the area, metres.
+    /// Highest x of the area in the site frame, metres.
     x_max_m: Option<f64>,
-    /// Highest y of the area, metres.
+    /// Highest y of the area in the site frame, metres.
     y_max_m: Option<f64>,
-    /// Only measurements of this robot model and tyres.
+    /// Include only measurements of this configuration (robot model and tyres).
     #[param(value_type = Option<String>)]
     configuration: Option<ConfigurationId>,
-    /// A declared normalisation that joins robot models.
+    /// Include other robot models too, by this normalisation of the server's configuration.
     normalisation: Option<String>,
-    /// `next_cursor` of the page before.
+    /// `next_cursor` of the previous page.
     cursor: Option<String>,
-    /// Most cells of the page, 1 to 1000; 100 when absent.
+    /// Maximum number of cells of the page, 1 to 1000; 100 when absent.
     limit: Option<u32>,
 }
 
-/// List how friction per cell differs between two times.
+/// Compare the friction of cells at two times.
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/difference", tag = "friction",
     security(("token" = ["read"])),
     operation_id = "list_friction_differences",
@@ -199,32 +199,32 @@ pub(in crate::http) async fn difference(
     Ok(add_as_of_header(etag::json(&headers, &found), found.as_of))
 }
 
-/// Where to look for visits that teach.
+/// Query parameters of the suggestions of visits.
 #[derive(Debug, Clone, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(in crate::http) struct VisitQuery {
-    /// Lowest x of the area, metres. It may have 262 144 cells.
+    /// Lowest x of the area in the site frame, metres. The area may have at most 262 144 cells.
     x_min_m: f64,
-    /// Lowest y of the area, metres.
+    /// Lowest y of the area in the site frame, metres.
     y_min_m: f64,
-    /// Highest x of the area, metres.
+    /// Highest x of the area in the site frame, metres.
     x_max_m: f64,
-    /// Highest y of the area, metres.
+    /// Highest y of the area in the site frame, metres.
     y_max_m: f64,
-    /// As of when, rounded down to a minute, or to the end of an epoch whose raw measurements are
-    /// missing or too many; all that has come when absent.
+    /// Time up to which measurements are included, rounded down to a minute, or to the end of an
+    /// epoch whose raw measurements are missing or too many; all measurements when absent.
     as_of: Option<Timestamp>,
-    /// Only measurements of this robot model and tyres.
+    /// Include only measurements of this configuration (robot model and tyres).
     #[param(value_type = Option<String>)]
     configuration: Option<ConfigurationId>,
-    /// A declared normalisation that joins robot models.
+    /// Include other robot models too, by this normalisation of the server's configuration.
     normalisation: Option<String>,
-    /// Most cells, 1 to 1000; 100 when absent.
+    /// Maximum number of cells, 1 to 1000; 100 when absent.
     limit: Option<u32>,
 }
 
-/// List the cells in which a visit would improve θ most, best first.
+/// List the cells whose measurement would reduce the uncertainty of θ most, best first.
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/visits", tag = "friction",
     security(("token" = ["read"])),
     operation_id = "list_visit_suggestions", params(("site" = SiteId, Path), VisitQuery),

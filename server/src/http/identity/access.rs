@@ -132,15 +132,15 @@ pub(in crate::http) fn describe(openapi: &mut OpenApi) {
     let bearer = HttpBuilder::new()
         .scheme(HttpAuthScheme::Bearer)
         .description(Some(
-            "A token: `authorization: Bearer tread_…`. The right that a route names is the one that \
-             it takes; a token has those of its role, or rights of its own, everywhere or for \
-             some sites and robots.",
+            "A token: `authorization: Bearer tread_…`. Each route names the right that it \
+             requires. A token has the rights of its role, or a list of rights, for all or some \
+             sites and robots.",
         ))
         .build();
     let cookie = ApiKeyValue::with_description(
         COOKIE,
-        "A browser's session, from `POST /v1/session` or a sign-in at the provider; `__Host-` stands \
-         before its name under TLS.",
+        "A browser's session, from `POST /v1/session` or a sign-in at the provider. Under TLS the \
+         name of the cookie has the prefix `__Host-`.",
     );
     let components = openapi.components.get_or_insert_default();
     components.add_security_scheme(TOKEN_SCHEME, SecurityScheme::Http(bearer));

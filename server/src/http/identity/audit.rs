@@ -13,28 +13,28 @@ use crate::app::identity::audit::AuditFilter;
 use crate::http::extract::{Json, Query, cursor, page_limit};
 use crate::http::problem::Problem;
 
-/// Which entries, and which page of them.
+/// Query parameters of the list of entries.
 #[derive(Debug, Clone, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(in crate::http) struct AuditQuery {
-    /// Only those of the token of this name.
+    /// Only entries of the token or person of this name.
     who: Option<String>,
-    /// Only what was refused or failed.
+    /// Only requests that were refused or failed.
     #[serde(default)]
     #[param(required = false)]
     refused: bool,
-    /// Which come first: `newest` when absent.
+    /// Order of the entries; `newest` when absent.
     #[serde(default)]
     #[param(required = false)]
     order: AuditOrder,
-    /// `next_cursor` of the page before, which is the number of its last entry.
+    /// `next_cursor` of the previous page, which is the number of its last entry.
     cursor: Option<String>,
-    /// Most entries of the page, 1 to 1000; 100 when absent.
+    /// Maximum number of entries of the page, 1 to 1000; 100 when absent.
     limit: Option<u32>,
 }
 
-/// List the audit log: who changed what, from where, and who was refused.
+/// List the entries of the audit log: changes and refused requests.
 #[utoipa::path(get, path = "/v1/audit", tag = "identity", operation_id = "list_audit",
     security(("token" = ["administer"])), params(AuditQuery),
     responses((status = 200, body = Page<AuditEntry>), (status = 400, body = ProblemBody)))]
@@ -54,12 +54,12 @@ pub(in crate::http) async fn list(
 
 /// Get the ends of the audit log's hash chain.
 ///
-/// To verify the chain, compute the hashes of the entries again and compare them.
+/// To verify the chain, recompute the hashes of the entries and compare them.
 #[utoipa::path(get, path = "/v1/audit/chain", tag = "identity", operation_id = "get_audit_chain",
     security(("token" = ["administer"])),
     responses((status = 200, body = AuditChain), (status = 404, body = ProblemBody)))]
 pub(in crate::http) async fn chain(State(app): State<App>) -> Result<Json<AuditChain>, Problem> {
     let chain = app.audit_chain().await?;
-    let gone = || Problem::new(ProblemType::NotFound).detail("the record of the chain is gone");
+    let gone = || Problem::new(ProblemType::NotFound).detail("the hash chain has no record");
     Ok(Json(chain.ok_or_else(gone)?))
 }

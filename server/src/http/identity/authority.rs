@@ -12,7 +12,7 @@ use crate::http::subject::Subject;
 
 /// Get the fleet's certificate authority.
 ///
-/// During a rotation the answer names the robots that still hold certificates of the former
+/// During a rotation the response names the robots that still hold certificates of the former
 /// authority, and those that must join again.
 #[utoipa::path(get, path = "/v1/authority", tag = "identity", operation_id = "get_authority",
     security(("token" = ["read"])),
@@ -23,8 +23,8 @@ pub(in crate::http) async fn get(State(app): State<App>) -> Result<Json<FleetAut
 
 /// Start a rotation of the certificate authority.
 ///
-/// The new authority signs from now on, both are trusted, and robots get certificates of the new
-/// one while they are connected. The answer names the rotation.
+/// From now on the new authority signs certificates. Both authorities are trusted, and connected
+/// robots get certificates of the new one. The response contains the identifier of the rotation.
 #[utoipa::path(post, path = "/v1/authority/rotation", tag = "identity",
     operation_id = "start_authority_rotation", security(("token" = ["administer"])),
     responses((status = 201, body = FleetAuthority), (status = 409, body = ProblemBody)))]
@@ -56,8 +56,8 @@ pub(in crate::http) async fn finish(
 
 /// Replace a certificate authority whose key was stolen.
 ///
-/// A new authority signs from now on. No earlier certificate opens a connection or is renewed, and
-/// every robot must join again.
+/// From now on a new authority signs certificates. Earlier certificates are refused, also for
+/// renewal, and every robot must join again.
 #[utoipa::path(post, path = "/v1/authority/replace", tag = "identity",
     operation_id = "replace_authority", security(("token" = ["administer"])),
     request_body = ReplaceAuthority,

@@ -23,18 +23,18 @@ use crate::http::extract::{Json, Path, Query, cursor, page_limit};
 use crate::http::problem::Problem;
 use crate::http::subject::Subject;
 
-/// Which page of a list.
+/// Query parameters of a list.
 #[derive(Debug, Clone, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(in crate::http) struct PageQuery {
-    /// `next_cursor` of the page before.
+    /// `next_cursor` of the previous page.
     cursor: Option<String>,
-    /// Most entries of the page, 1 to 1000; 100 when absent.
+    /// Maximum number of entries of the page, 1 to 1000; 100 when absent.
     limit: Option<u32>,
 }
 
-/// List join tokens, newest first, with those that are no longer valid.
+/// List join tokens, newest first, including used, expired and revoked ones.
 ///
 /// Secrets are shown only when a token is created.
 #[utoipa::path(get, path = "/v1/join-tokens", tag = "identity", operation_id = "list_join_tokens",
@@ -50,9 +50,9 @@ pub(in crate::http) async fn list_tokens(
     Ok(Json(app.join_tokens(&subject.scope, before, limit).await?))
 }
 
-/// Create a join token, with which one robot may join once.
+/// Create a join token, which is valid for one robot once.
 ///
-/// The answer is the only place that has its secret.
+/// Only this response contains its secret.
 #[utoipa::path(post, path = "/v1/join-tokens", tag = "identity",
     operation_id = "create_join_token",
     security(("token" = ["administer"])), request_body = CreateJoinToken,
@@ -119,8 +119,8 @@ pub(in crate::http) async fn revoke(
 
 /// Enrol a robot with a join token.
 ///
-/// The token is used up. Needs no credentials; a token that is wrong, expired, used, revoked or for
-/// another robot gets the same answer, byte for byte.
+/// The join token cannot be used again. The request needs no credentials. The response is the same,
+/// byte for byte, whether the token is wrong, expired, used, revoked or for another robot.
 #[utoipa::path(post, path = "/v1/enrolments", tag = "identity", operation_id = "enrol_robot",
     request_body = EnrolRobot,
     responses((status = 201, body = RobotCertificate), (status = 401, body = ProblemBody),
@@ -154,8 +154,8 @@ pub(in crate::http) async fn enrol(
 
 /// Renew a robot's certificate.
 ///
-/// The request proves that the robot has the keys of its present and of its next certificate. Needs
-/// no credentials; every refusal gets the same answer, byte for byte.
+/// The request proves that the robot has the keys of its present and of its next certificate. It
+/// needs no credentials; every refusal has the same response, byte for byte.
 #[utoipa::path(post, path = "/v1/enrolments/renew", tag = "identity",
     operation_id = "renew_certificate", request_body = RenewCertificate,
     responses((status = 200, body = RobotCertificate), (status = 401, body = ProblemBody),
@@ -190,7 +190,7 @@ fn audited(mut response: Response, what: Value) -> Response {
     response
 }
 
-/// The answer to what gets no certificate; counts the cause.
+/// Returns the response to a refused request for a certificate; counts the cause.
 fn refusal(app: &App, error: EnrolError) -> Response {
     let counters = app.counters();
     let said = error.to_string();
@@ -217,6 +217,6 @@ fn refusal(app: &App, error: EnrolError) -> Response {
     };
     counter.one();
     Problem::new(ProblemType::Unauthenticated)
-        .detail("this lets no robot in: ask an administrator for a join token")
+        .detail("the request was refused: ask an administrator for a join token")
         .into_response()
 }

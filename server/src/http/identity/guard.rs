@@ -96,7 +96,7 @@ impl Guard {
         let uri = request.uri();
         let query_length = uri.query().map_or(0, str::len);
         if query_length > QUERY_MAX || uri.path().len() > PATH_MAX {
-            let detail = format!("at most {PATH_MAX} bytes of path and {QUERY_MAX} of query");
+            let detail = format!("a path may have at most {PATH_MAX} bytes, a query {QUERY_MAX}");
             let problem = Problem::new(ProblemType::RequestTooLong).detail(detail);
             return Err(Refusal::counted(&counters.refused_too_long, problem));
         }
@@ -132,8 +132,8 @@ impl Guard {
         if may {
             return Ok(());
         }
-        let detail = "ask from this server's own page, or with a token and from an origin of \
-                      `allowed_origins` in its configuration";
+        let detail = "send the request from this server's dashboard, or with a token from an \
+                      origin in `allowed_origins` of its configuration";
         let problem = Problem::new(ProblemType::ForeignOrigin).detail(detail);
         Err(Refusal::counted(
             &self.app.counters().refused_origin,
@@ -170,7 +170,7 @@ impl Guard {
             return Ok(credential);
         }
         let detail = format!(
-            "this needs the right `{needed}`, and `{}` has {}",
+            "this request needs the right `{needed}`, and `{}` has {}",
             credential.name,
             credential.all_rights()
         );

@@ -20,7 +20,7 @@ use crate::identity::origin::Names;
 
 /// Sign a browser in with a token.
 ///
-/// The answer sets a cookie and contains the identity.
+/// The response sets a cookie and contains the identity.
 #[utoipa::path(post, path = "/v1/session", tag = "identity", operation_id = "create_session",
     request_body = CreateSession,
     responses((status = 201, body = Session), (status = 401, body = ProblemBody),
@@ -71,7 +71,7 @@ pub(in crate::http) async fn get(Subject(subject): Subject) -> Json<Session> {
 /// Sign a browser out.
 ///
 /// The token stays valid until an admin revokes it. For a session of the OpenID provider, the
-/// answer contains the provider's sign-out address, if it has one.
+/// response contains the provider's sign-out address, if it has one.
 #[utoipa::path(delete, path = "/v1/session", tag = "identity", operation_id = "end_session",
     security(("token" = ["stop"])),
     responses((status = 200, body = SignedOut), (status = 204)))]

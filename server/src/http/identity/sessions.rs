@@ -14,14 +14,14 @@ use crate::http::extract::{Json, Path, Query, cursor, page_limit};
 use crate::http::problem::Problem;
 use crate::http::subject::Subject;
 
-/// Which page of the sessions.
+/// Query parameters of the list of sessions.
 #[derive(Debug, Clone, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(in crate::http) struct SessionQuery {
-    /// `next_cursor` of the page before.
+    /// `next_cursor` of the previous page.
     cursor: Option<String>,
-    /// Most entries of the page, 1 to 1000; 100 when absent.
+    /// Maximum number of entries of the page, 1 to 1000; 100 when absent.
     limit: Option<u32>,
 }
 

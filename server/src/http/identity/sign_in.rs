@@ -28,7 +28,7 @@ use crate::identity::pending::SIGN_IN_LASTS;
 /// Where a browser is sent that has signed in: the mark tells the page to ask who it is.
 const SIGNED_IN: &str = "/#signed-in";
 
-/// Get the ways to sign in.
+/// Get the available sign-in methods.
 #[utoipa::path(get, path = "/v1/sign-in", tag = "identity", operation_id = "get_sign_in_methods",
     responses((status = 200, body = SignInMethods)))]
 pub(in crate::http) async fn methods(State(app): State<App>) -> Json<SignInMethods> {
@@ -58,25 +58,25 @@ pub(in crate::http) async fn begin(
     response
 }
 
-/// What the provider sends a browser back with. What else it says is left out of account.
+/// Query parameters with which the provider redirects a browser back. Others are ignored.
 #[derive(Debug, Default, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
 pub(in crate::http) struct AnswerQuery {
-    /// The state of the sign-in.
+    /// State of the sign-in, from the redirect to the provider.
     #[serde(default)]
     #[param(required = false)]
     state: String,
-    /// The code, if the provider has signed the person in.
+    /// Authorisation code; absent if the provider has not signed the person in.
     code: Option<String>,
-    /// Why not, if it has not.
+    /// Error of the provider; absent if it has signed the person in.
     error: Option<String>,
-    /// Issuer of the provider that answers.
+    /// Issuer of the provider that redirects.
     iss: Option<String>,
 }
 
 /// Finish a sign-in at the OpenID provider.
 ///
-/// Starts a session and sends the browser to the page.
+/// Starts a session and redirects the browser to the dashboard.
 #[utoipa::path(get, path = "/v1/sign-in/oidc/callback", tag = "identity",
     operation_id = "finish_sign_in", params(AnswerQuery),
     responses((status = 303), (status = 400, body = ProblemBody), (status = 403, body = ProblemBody),
@@ -146,7 +146,7 @@ fn see_other(location: &str) -> Response {
     response
 }
 
-/// Says why somebody is not signed in: to people as a page, to programs as a problem.
+/// Returns the reason why a sign-in was refused: as a page for browsers, as a problem for programs.
 fn refused(error: PersonError, headers: &HeaderMap) -> Response {
     let detail = error.to_string();
     let kind = match error {

@@ -14,18 +14,18 @@ use crate::http::extract::{Json, Path, Query, cursor, page_limit};
 use crate::http::problem::Problem;
 use crate::http::subject::Subject;
 
-/// Which page of the tokens.
+/// Query parameters of the list of tokens.
 #[derive(Debug, Clone, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(in crate::http) struct TokenQuery {
-    /// `next_cursor` of the page before.
+    /// `next_cursor` of the previous page.
     cursor: Option<String>,
-    /// Most entries of the page, 1 to 1000; 100 when absent.
+    /// Maximum number of entries of the page, 1 to 1000; 100 when absent.
     limit: Option<u32>,
 }
 
-/// List tokens, newest first, with those that are no longer valid.
+/// List tokens, newest first, including expired and revoked ones.
 ///
 /// Contains only tokens whose rights are within the caller's. Secrets are shown only when a token
 /// is created.
@@ -42,10 +42,9 @@ pub(in crate::http) async fn list(
     Ok(Json(app.tokens(&subject.scope, before, limit).await?))
 }
 
-/// Create a token with a role or with rights of its own, everywhere or for some sites and robots.
+/// Create a token with a role or a list of rights, for all or some sites and robots.
 ///
-/// A token never has more rights than its creator. The answer is the only place that has its
-/// secret.
+/// A token never has more rights than its creator. Only this response contains its secret.
 #[utoipa::path(post, path = "/v1/tokens", tag = "identity", operation_id = "create_token",
     security(("token" = ["administer"])), request_body = CreateToken,
     responses((status = 201, body = CreatedToken), (status = 409, body = ProblemBody),

@@ -371,7 +371,7 @@ async fn a_request_that_a_standby_has_forwarded_already_is_not_forwarded_again()
     let (status, body) = pair.send(asking).await;
     assert_eq!(status, StatusCode::SERVICE_UNAVAILABLE, "{body}");
     let said = body["detail"].as_str().unwrap();
-    assert!(said.contains("so is the one"), "{said}");
+    assert!(said.contains("so is the server"), "{said}");
     for path in ["/v1/../v1/missions", "/v1/%2e%2e/metrics"] {
         let raw = raw_get(pair.config.http, path).await;
         assert!(raw.starts_with("HTTP/1.1 400 "), "{path}: {raw}");
