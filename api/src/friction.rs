@@ -450,7 +450,7 @@ pub struct PointFriction {
 
 /// Body of `POST /v1/sites/{site}/friction/path`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
-pub struct AskPath {
+pub struct PathFrictionRequest {
     /// Corners of the path in the site frame, 2 to 10 000; at most 10 km long.
     pub points: Vec<Point>,
     /// Robot that is to drive the path. Its model selects the measurements, its limits bound the

@@ -150,8 +150,8 @@ async fn make(config: &Config, first: FirstAdmin, token_file: Option<&Path>) -> 
         eprintln!("an admin exists already, so no token was created");
         return Ok(());
     }
-    let created = created
-        .context("cannot create the first admin's token (--force creates another one)")?;
+    let created =
+        created.context("cannot create the first admin's token (--force creates another one)")?;
     match token_file {
         Some(file) => write_secret(file, &created.secret)
             .with_context(|| format!("cannot write {}", file.display()))?,

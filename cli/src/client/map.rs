@@ -4,8 +4,9 @@ use jiff::Timestamp;
 use reqwest::Method;
 use serde::Serialize;
 use tread_api::friction::{
-    AskPath, CellDifference, CellFriction, CreateWithdrawal, PathFriction, PointFriction,
-    PointHistory, RobotContribution, TerrainFriction, TerrainHistory, VisitSuggestion, Withdrawal,
+    CellDifference, CellFriction, CreateWithdrawal, PathFriction, PathFrictionRequest,
+    PointFriction, PointHistory, RobotContribution, TerrainFriction, TerrainHistory,
+    VisitSuggestion, Withdrawal,
 };
 use tread_api::geometry::Point;
 use tread_api::ids::{ConfigurationId, RobotId, SiteId, TerrainId};
@@ -225,7 +226,7 @@ impl Client {
     pub(crate) async fn path_friction(
         &self,
         site: &SiteId,
-        path: &AskPath,
+        path: &PathFrictionRequest,
     ) -> Result<PathFriction, ClientError> {
         self.post(&format!("/v1/sites/{site}/friction/path"), path)
             .await

@@ -20,13 +20,10 @@ use crate::app::alerts::AlertFilter;
 #[serde(deny_unknown_fields)]
 pub(super) struct AlertQuery {
     /// Only alerts of this site.
-    #[param(value_type = Option<String>)]
     site: Option<SiteId>,
     /// Only alerts of this robot.
-    #[param(value_type = Option<String>)]
     robot: Option<RobotId>,
     /// Only alerts of this kind, such as `robot-lost`.
-    #[param(value_type = Option<String>)]
     kind: Option<AlertCode>,
     /// Only alerts that have not cleared.
     #[serde(default)]

@@ -1,33 +1,115 @@
 //! Completes the OpenAPI description, so that other programs can generate clients from it.
 
+use std::collections::{BTreeMap, BTreeSet};
+
 use axum::http::StatusCode;
+use serde::Serialize;
+use serde_json::Value;
+use tread_api::page::PAGE_LIMIT_MAX;
 use tread_api::problem::PROBLEM_MEDIA_TYPE;
-use utoipa::openapi::path::Operation;
-use utoipa::openapi::schema::Schema;
+use utoipa::openapi::path::{Operation, PathItem};
+use utoipa::openapi::schema::{AdditionalProperties, Schema};
 use utoipa::openapi::{Components, Content, OpenApi, Ref, RefOr, Response, ResponseBuilder};
 
 use super::identity;
 
-/// Returns the description with problems as the responses to errors, credentials, a description of
-/// each response and named schemas for the content of variants.
+/// Requests that are accepted with any body: a stop is never refused for its form.
+const LENIENT_REQUESTS: [&str; 2] = ["StopFleet", "StopRobot"];
+
+/// Completes the description: problems as the responses to errors, credentials, a description of each
+/// response, the range of `limit`, named schemas for the content of variants, and requests without
+/// unknown fields.
 pub(super) fn complete(mut openapi: OpenApi) -> OpenApi {
     identity::access::describe(&mut openapi);
+    let (mut sent, mut received) = (BTreeSet::new(), BTreeSet::new());
     for item in openapi.paths.paths.values_mut() {
-        let operations = [
-            &mut item.get,
-            &mut item.put,
-            &mut item.post,
-            &mut item.delete,
-            &mut item.patch,
-        ];
-        for operation in operations.into_iter().flatten() {
+        for operation in operations(item) {
             describe_responses(operation);
+            bound_limit(operation);
+            add_references(&operation.request_body, &mut received);
+            add_references(&operation.responses, &mut sent);
         }
     }
     if let Some(components) = &mut openapi.components {
         name_variants(components);
+        let sent = closure(&components.schemas, sent);
+        for name in closure(&components.schemas, received) {
+            // A client may get fields that a newer server has added.
+            if !sent.contains(&name) && !LENIENT_REQUESTS.contains(&name.as_str()) {
+                refuse_unknown_fields(components.schemas.get_mut(&name));
+            }
+        }
     }
     openapi
+}
+
+fn operations(item: &mut PathItem) -> impl Iterator<Item = &mut Operation> {
+    let operations = [
+        &mut item.get,
+        &mut item.put,
+        &mut item.post,
+        &mut item.delete,
+        &mut item.patch,
+    ];
+    operations.into_iter().flatten()
+}
+
+/// Adds the names of the schemas to which a part of the description refers.
+fn add_references(part: &impl Serialize, names: &mut BTreeSet<String>) {
+    fn visit(value: &Value, names: &mut BTreeSet<String>) {
+        match value {
+            Value::Object(fields) => {
+                let reference = fields.get("$ref").and_then(Value::as_str);
+                let name = reference.and_then(|reference| reference.rsplit('/').next());
+                names.extend(name.map(str::to_owned));
+                fields.values().for_each(|field| visit(field, names));
+            }
+            Value::Array(items) => items.iter().for_each(|item| visit(item, names)),
+            Value::Null | Value::Bool(_) | Value::Number(_) | Value::String(_) => {}
+        }
+    }
+    if let Ok(value) = serde_json::to_value(part) {
+        visit(&value, names);
+    }
+}
+
+/// Returns these schemas and all to which they refer.
+fn closure(schemas: &BTreeMap<String, RefOr<Schema>>, names: BTreeSet<String>) -> BTreeSet<String> {
+    let mut open: Vec<String> = names.into_iter().collect();
+    let mut closed = BTreeSet::new();
+    while let Some(name) = open.pop() {
+        if closed.insert(name.clone()) {
+            let mut next = BTreeSet::new();
+            if let Some(schema) = schemas.get(&name) {
+                add_references(schema, &mut next);
+            }
+            open.extend(next);
+        }
+    }
+    closed
+}
+
+/// States that a request with other fields is refused.
+fn refuse_unknown_fields(schema: Option<&mut RefOr<Schema>>) {
+    if let Some(RefOr::T(Schema::Object(object))) = schema
+        && !object.properties.is_empty()
+        && object.additional_properties.is_none()
+    {
+        object.additional_properties = Some(Box::new(AdditionalProperties::FreeForm(false)));
+    }
+}
+
+/// Adds the range of the number of entries of a page.
+fn bound_limit(operation: &mut Operation) {
+    for parameter in operation.parameters.iter_mut().flatten() {
+        if let RefOr::T(parameter) = parameter
+            && parameter.name == "limit"
+            && let Some(RefOr::T(Schema::Object(schema))) = &mut parameter.schema
+        {
+            schema.minimum = Some(1.into());
+            schema.maximum = Some(PAGE_LIMIT_MAX.into());
+        }
+    }
 }
 
 fn describe_responses(operation: &mut Operation) {

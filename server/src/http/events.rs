@@ -37,7 +37,6 @@ pub(super) struct EventQuery {
     /// Only these topics, separated by commas: `missions`, `robots`, `alerts`, `map`.
     topics: Option<String>,
     /// Only events of this site.
-    #[param(value_type = Option<String>)]
     site: Option<SiteId>,
     /// Only events of these robots, separated by commas.
     robots: Option<String>,

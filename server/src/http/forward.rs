@@ -82,9 +82,7 @@ pub enum ForwardError {
     #[error("this path cannot be forwarded: write it without `..`, `\\` and similar sequences")]
     Path,
     /// The other server does not answer.
-    #[error(
-        "this server is a standby, and the active server does not answer; try again"
-    )]
+    #[error("this server is a standby, and the active server does not answer; try again")]
     NoAnswer,
 }
 

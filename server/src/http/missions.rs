@@ -23,10 +23,8 @@ use crate::app::missions::idempotency::KEY_LENGTH_MAX;
 #[serde(deny_unknown_fields)]
 pub(super) struct MissionQuery {
     /// Only missions of this site.
-    #[param(value_type = Option<String>)]
     site: Option<SiteId>,
     /// Only missions of this robot.
-    #[param(value_type = Option<String>)]
     robot: Option<RobotId>,
     /// Only missions in this state.
     state: Option<MissionState>,

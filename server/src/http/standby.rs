@@ -149,7 +149,9 @@ fn ready(app: &App, forwarder: &Forwarder) -> Result<Json<Health>, Problem> {
         Some(age) if age <= MAP_AGE_MAX => {}
         Some(age) => {
             let seconds = age.as_secs();
-            return unavailable(format!("standby: its map was last up to date {seconds} s ago"));
+            return unavailable(format!(
+                "standby: its map was last up to date {seconds} s ago"
+            ));
         }
         None => return unavailable("standby: it is still reading the map".to_owned()),
     }

@@ -97,10 +97,8 @@ impl StopBody {
 #[serde(deny_unknown_fields)]
 pub(super) struct StopQuery {
     /// Only stops of this site.
-    #[param(value_type = Option<String>)]
     site: Option<SiteId>,
     /// Only stops of robots with this identifier.
-    #[param(value_type = Option<String>)]
     robot: Option<RobotId>,
     /// Only stops that are not cleared.
     #[serde(default)]

@@ -530,8 +530,16 @@ async fn an_answer_that_is_still_the_same_is_not_sent_again() {
 async fn a_bad_question_is_refused_with_the_bound_that_it_breaks() {
     let yard = measured_yard().await;
     for (path, field, said_of) in [
-        ("cells?x_min_m=5&x_max_m=1", "x_max_m", "is above the upper one"),
-        ("cells?y_min_m=5&y_max_m=1", "y_max_m", "is above the upper one"),
+        (
+            "cells?x_min_m=5&x_max_m=1",
+            "x_max_m",
+            "is above the upper one",
+        ),
+        (
+            "cells?y_min_m=5&y_max_m=1",
+            "y_max_m",
+            "is above the upper one",
+        ),
         ("cells?x_min_m=NaN", "x_max_m", "1000000"),
         ("cells?x_max_m=inf", "x_max_m", "1000000"),
         ("cells?y_min_m=-2e6", "y_max_m", "1000000"),

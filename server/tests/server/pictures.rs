@@ -290,7 +290,11 @@ async fn a_bad_question_for_a_picture_is_refused_with_the_bound_that_it_breaks()
     let (yard, _robot) = driven_yard().await;
     for (query, field, said_of) in [
         ("format=gif", "format", "`png`"),
-        ("format=png&x_min_m=5&x_max_m=1", "x_max_m", "is above the upper one"),
+        (
+            "format=png&x_min_m=5&x_max_m=1",
+            "x_max_m",
+            "is above the upper one",
+        ),
         ("format=tile&y_min_m=NaN&y_max_m=1", "y_max_m", "1000000"),
         ("format=tile&x_max_m=inf", "x_max_m", "1000000"),
         (

@@ -8,7 +8,7 @@ use std::process::ExitCode;
 
 use anyhow::Context as _;
 use serde_json::json;
-use tread_api::friction::{AskPath, CreateWithdrawal};
+use tread_api::friction::{CreateWithdrawal, PathFrictionRequest};
 use tread_api::ids::SiteId;
 
 use super::points::read_corners;
@@ -86,7 +86,7 @@ pub(super) async fn run(
             as_of,
             normalisation,
         }) => {
-            let request = AskPath {
+            let request = PathFrictionRequest {
                 points: read_corners(file.as_deref(), points)?,
                 robot,
                 as_of,

@@ -5,7 +5,7 @@
 //! accelerations are the fractions of the segment's traction limit (a lower bound) that the robot's
 //! own planner uses.
 
-use tread_api::friction::{AskPath, FusedFriction, PathFriction, PathPiece};
+use tread_api::friction::{FusedFriction, PathFriction, PathFrictionRequest, PathPiece};
 use tread_api::geometry::Point;
 use tread_api::ids::SiteId;
 use tread_api::robot::RobotModel;
@@ -39,9 +39,9 @@ impl App {
     pub async fn friction_along(
         &self,
         site: &SiteId,
-        request: AskPath,
+        request: PathFrictionRequest,
     ) -> Result<PathFriction, AppError> {
-        let AskPath {
+        let PathFrictionRequest {
             points,
             robot,
             as_of,

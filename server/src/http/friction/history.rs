@@ -49,7 +49,6 @@ pub(in crate::http) struct HistoryQuery {
     /// Seconds between two times, at least 60; 3600 when absent. At most 1000 times are allowed.
     step_s: Option<i64>,
     /// Include only measurements of this configuration (robot model and tyres).
-    #[param(value_type = Option<String>)]
     configuration: Option<ConfigurationId>,
     /// Include other robot models too, by this normalisation of the server's configuration.
     normalisation: Option<String>,
@@ -90,7 +89,6 @@ pub(in crate::http) struct PointHistoryQuery {
     /// Seconds between two times, at least 60; 3600 when absent. At most 1000 times are allowed.
     step_s: Option<i64>,
     /// Include only measurements of this configuration (robot model and tyres).
-    #[param(value_type = Option<String>)]
     configuration: Option<ConfigurationId>,
     /// Include other robot models too, by this normalisation of the server's configuration.
     normalisation: Option<String>,

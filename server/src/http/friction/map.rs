@@ -114,7 +114,6 @@ pub(in crate::http) struct MapQuery {
     /// epoch whose raw measurements are missing or too many; all measurements when absent.
     as_of: Option<Timestamp>,
     /// Configuration (robot model and tyres) of θ; the one with most measurements when absent.
-    #[param(value_type = Option<String>)]
     configuration: Option<ConfigurationId>,
     /// Include other robot models too, by this normalisation of the server's configuration.
     normalisation: Option<String>,

@@ -41,7 +41,6 @@ pub(super) struct ReadingQuery {
     /// epoch whose raw measurements are missing or too many; all measurements when absent.
     as_of: Option<Timestamp>,
     /// Include only measurements of this configuration (robot model and tyres).
-    #[param(value_type = Option<String>)]
     configuration: Option<ConfigurationId>,
     /// Include other robot models too, by this normalisation of the server's configuration.
     normalisation: Option<String>,
@@ -98,7 +97,6 @@ pub(super) struct OneQuery {
     /// epoch whose raw measurements are missing or too many; all measurements when absent.
     as_of: Option<Timestamp>,
     /// Include only measurements of this configuration (robot model and tyres).
-    #[param(value_type = Option<String>)]
     configuration: Option<ConfigurationId>,
     /// Include other robot models too, by this normalisation of the server's configuration.
     normalisation: Option<String>,
@@ -146,10 +144,8 @@ pub(super) async fn robots(
 #[serde(deny_unknown_fields)]
 pub(super) struct SegmentQuery {
     /// Only measurements of this robot.
-    #[param(value_type = Option<String>)]
     robot: Option<RobotId>,
     /// Only measurements on this terrain.
-    #[param(value_type = Option<String>)]
     terrain: Option<TerrainId>,
     /// `next_cursor` of the previous page.
     cursor: Option<String>,

@@ -6,7 +6,7 @@ use axum::response::Response;
 use jiff::Timestamp;
 use serde::Deserialize;
 use tread_api::friction::{
-    AskPath, CellDifference, CellFriction, PathFriction, PointFriction, VisitSuggestion,
+    CellDifference, CellFriction, PathFriction, PathFrictionRequest, PointFriction, VisitSuggestion,
 };
 use tread_api::geometry::Point;
 use tread_api::ids::{ConfigurationId, SiteId};
@@ -43,7 +43,6 @@ pub(in crate::http) struct CellQuery {
     /// epoch whose raw measurements are missing or too many; all measurements when absent.
     as_of: Option<Timestamp>,
     /// Include only measurements of this configuration (robot model and tyres).
-    #[param(value_type = Option<String>)]
     configuration: Option<ConfigurationId>,
     /// Include other robot models too, by this normalisation of the server's configuration.
     normalisation: Option<String>,
@@ -95,7 +94,6 @@ pub(in crate::http) struct PointQuery {
     /// epoch whose raw measurements are missing or too many; all measurements when absent.
     as_of: Option<Timestamp>,
     /// Include only measurements of this configuration (robot model and tyres).
-    #[param(value_type = Option<String>)]
     configuration: Option<ConfigurationId>,
     /// Include other robot models too, by this normalisation of the server's configuration.
     normalisation: Option<String>,
@@ -126,7 +124,7 @@ pub(in crate::http) async fn point(
 #[utoipa::path(post, path = "/v1/sites/{site}/friction/path", tag = "friction",
     security(("token" = ["read"])),
     operation_id = "get_path_friction", params(("site" = SiteId, Path)),
-    request_body = AskPath,
+    request_body = PathFrictionRequest,
     responses((status = 200, body = PathFriction), (status = 304),
         (status = 404, body = ProblemBody), (status = 422, body = ProblemBody)))]
 pub(in crate::http) async fn path(
@@ -134,7 +132,7 @@ pub(in crate::http) async fn path(
     Path(site): Path<SiteId>,
     Subject(subject): Subject,
     headers: HeaderMap,
-    Json(request): Json<AskPath>,
+    Json(request): Json<PathFrictionRequest>,
 ) -> Result<Response, Problem> {
     subject.check_robot(&site, &request.robot)?;
     let found = app.friction_along(&site, request).await?;
@@ -159,7 +157,6 @@ pub(in crate::http) struct DifferenceQuery {
     /// Highest y of the area in the site frame, metres.
     y_max_m: Option<f64>,
     /// Include only measurements of this configuration (robot model and tyres).
-    #[param(value_type = Option<String>)]
     configuration: Option<ConfigurationId>,
     /// Include other robot models too, by this normalisation of the server's configuration.
     normalisation: Option<String>,
@@ -216,7 +213,6 @@ pub(in crate::http) struct VisitQuery {
     /// epoch whose raw measurements are missing or too many; all measurements when absent.
     as_of: Option<Timestamp>,
     /// Include only measurements of this configuration (robot model and tyres).
-    #[param(value_type = Option<String>)]
     configuration: Option<ConfigurationId>,
     /// Include other robot models too, by this normalisation of the server's configuration.
     normalisation: Option<String>,
