@@ -13,7 +13,7 @@
 //! ḃ = 0 + random walk                    `gyro_offset_walk`
 //! ```
 //!
-//! **Measurement model**: a fix is `(x, y, φ) + noise` at an earlier time. It is pose over
+//! **Measurement model**: a fix is `(x, y, φ) + noise` at an earlier time. It is propagated over
 //! its age with the present twist. Its covariance is the stated one, or else estimated from the
 //! differences of consecutive fixes (`fix_noise.rs`), starting with the configured one. A χ² gate
 //! on the Mahalanobis distance refuses outliers and counts them; after [`REFUSED_MAX`] in a row the
