@@ -180,13 +180,14 @@ impl RobotModel {
     /// Only fractions of `μg` are used along and across the path: the rest serves turning of the
     /// body and feedback.
     pub(crate) fn within_traction_limit(&self, mu_peak: f64) -> Self {
-        let along_m_s2 = Self::longitudinal_traction_m_s2(mu_peak);
-        let across_m_s2 = Self::lateral_traction_m_s2(mu_peak);
+        let longitudinal_m_s2 = Self::longitudinal_traction_m_s2(mu_peak);
+        let lateral_m_s2 = Self::lateral_traction_m_s2(mu_peak);
         let mut spec = self.spec;
         let limits = &mut spec.limits;
-        limits.linear_acceleration_max_m_s2 = limits.linear_acceleration_max_m_s2.min(along_m_s2);
+        limits.linear_acceleration_max_m_s2 =
+            limits.linear_acceleration_max_m_s2.min(longitudinal_m_s2);
         limits.lateral_acceleration_max_m_s2 =
-            limits.lateral_acceleration_max_m_s2.min(across_m_s2);
+            limits.lateral_acceleration_max_m_s2.min(lateral_m_s2);
         Self { spec }
     }
 

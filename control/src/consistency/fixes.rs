@@ -76,7 +76,7 @@ impl Fix {
     }
 
     /// Propagates this fix to the time of `to` by dead reckoning. Returns the pose in the site
-    /// frame, and the distance between both dead-reckoned positions, metres.
+    /// frame, and the distance between both positions by dead reckoning, metres.
     fn propagated(&self, to: &Self) -> (Pose, f64) {
         let offset_rad = self.pose.heading_rad - self.integrated_rad;
         let (sin, cos) = offset_rad.sin_cos();

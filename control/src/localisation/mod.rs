@@ -211,8 +211,8 @@ impl Localisation {
     }
 
     /// Predicts the state over `dt_s` seconds, at most 0.5, with the rates of gyro and wheels; call
-    /// [`Self::widen_without_measurements`] first after a longer gap. An invalid rate is counted, and
-    /// the last valid one is used; an invalid `dt_s` is counted, and nothing else changes.
+    /// [`Self::widen_without_measurements`] first after a longer gap. An invalid rate is counted,
+    /// and the last valid one is used; an invalid `dt_s` is counted, and nothing else changes.
     pub fn predict(&mut self, sample: &SensorSample, dt_s: f64) {
         if !(dt_s.is_finite() && dt_s > 0.0) {
             self.invalid += 1;
