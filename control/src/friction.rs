@@ -114,7 +114,8 @@ impl FrictionCurve {
         self.spec.stiffness * self.spec.peak_slip
     }
 
-    /// Returns the friction coefficient at a slip: an odd function, constant beyond a slip of ±1.
+    /// Returns the friction coefficient μ(λ) of (7) at a slip of either sign: an odd function,
+    /// constant beyond a slip of ±1.
     pub fn mu(&self, slip: f64) -> f64 {
         (self.mu_over_slip(slip.abs()) * slip).clamp(-self.mu_peak(), self.mu_peak())
     }

@@ -321,7 +321,8 @@ impl Governor {
         self.reference(&plan.sample(self.clock_s))
     }
 
-    /// Predicts the pose in which the reference stops if it is paused from now on.
+    /// Predicts the pose, in the site frame, in which the reference stops if it is paused from now
+    /// on.
     pub fn rest(mut self, plan: &Plan) -> Pose {
         self.set_rate_cap(0.0);
         let input = GovernorInput::default();

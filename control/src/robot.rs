@@ -169,7 +169,8 @@ impl RobotModel {
         &self.spec.limits
     }
 
-    /// Returns the normal force on the two wheels of one side at standstill, newtons.
+    /// Returns the normal force on the two wheels of one side at standstill on level ground,
+    /// `mg/2`, newtons.
     pub fn side_load_n(&self) -> f64 {
         self.spec.mass_kg * GRAVITY_M_S2 / 2.0
     }
@@ -192,13 +193,13 @@ impl RobotModel {
     }
 
     /// Returns the acceleration along the path that a plan may use on ground with a peak friction
-    /// coefficient, metres per second squared.
+    /// coefficient, a fixed fraction of `μg`, metres per second squared.
     pub fn longitudinal_traction_m_s2(mu_peak: f64) -> f64 {
         TRACTION_SHARE_LONGITUDINAL * mu_peak * GRAVITY_M_S2
     }
 
     /// Returns the lateral acceleration that a plan may use on ground with a peak friction
-    /// coefficient, metres per second squared.
+    /// coefficient, a fixed fraction of `μg`, metres per second squared.
     pub fn lateral_traction_m_s2(mu_peak: f64) -> f64 {
         TRACTION_SHARE_LATERAL * mu_peak * GRAVITY_M_S2
     }
@@ -224,7 +225,8 @@ impl RobotModel {
         limits.linear_acceleration_max_m_s2.min(rim_max_m_s2) / (0.5 * self.effective_track_m())
     }
 
-    /// Returns the wheel speeds for a twist by the low-speed kinematics with `W_eff`.
+    /// Returns the wheel speeds for a twist by the low-speed kinematics, `ω_l = (v − ½ W_eff φ̇)/r`
+    /// and `ω_r = (v + ½ W_eff φ̇)/r`; not limited.
     pub fn wheel_speeds_from_twist(&self, twist: Twist) -> WheelSpeeds {
         let half_m_s = 0.5 * self.effective_track_m() * twist.angular_rad_s;
         WheelSpeeds {
@@ -233,7 +235,8 @@ impl RobotModel {
         }
     }
 
-    /// Returns the twist of wheel speeds by the low-speed kinematics with `W_eff`.
+    /// Returns the twist of wheel speeds by the low-speed kinematics, `v = r (ω_l + ω_r)/2` and
+    /// `φ̇ = r (ω_r − ω_l)/W_eff`.
     pub fn twist_from_wheel_speeds(&self, wheels: WheelSpeeds) -> Twist {
         let radius_m = self.spec.wheel_radius_m;
         Twist {

@@ -132,6 +132,7 @@ pub(super) struct Accelerometer {
 }
 
 impl Accelerometer {
+    /// Discards all measurements, because the motion since is unknown.
     pub(super) fn restart(&mut self) {
         *self = Self::default();
     }

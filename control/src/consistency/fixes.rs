@@ -138,6 +138,7 @@ pub(super) struct FixResidual {
 }
 
 impl FixResidual {
+    /// Returns the span over which it was computed.
     pub(super) fn span(&self) -> Span {
         Span {
             from_s: self.from_s,

@@ -129,16 +129,19 @@ impl History {
         self.push();
     }
 
+    /// Ends the bin: keeps the present integrals as its edge.
     fn push(&mut self) {
         self.newest = (self.newest + 1) % EDGES;
         self.edges[self.newest] = self.now;
         self.count = (self.count + 1).min(EDGES);
     }
 
+    /// Sets the twist commanded from now on.
     pub(super) fn command(&mut self, command: Twist) {
         self.now.command = command;
     }
 
+    /// Sets the forward speed by odometry, which applies for [`ODOMETRY_AGE_MAX_S`].
     pub(super) fn odometry(&mut self, forward_m_s: f64) {
         self.odometry = Some((forward_m_s, self.now.at_s));
     }
@@ -168,6 +171,7 @@ impl History {
         is_due
     }
 
+    /// Returns the integrals up to the last measurement.
     pub(super) fn now(&self) -> Edge {
         self.now
     }

@@ -315,6 +315,7 @@ pub(super) struct BlockContext<'robot> {
 }
 
 impl BlockBuilder {
+    /// Returns whether the block's time is over.
     pub(super) fn is_full(&self) -> bool {
         self.duration_s >= BLOCK_S - 1.0e-6
     }

@@ -130,6 +130,7 @@ pub(super) struct LongitudinalFilter {
 pub(super) type Rows = [Option<Row>; 3];
 
 impl LongitudinalFilter {
+    /// Creates a filter that starts at the rim speed of the first step.
     pub(super) fn new() -> Self {
         Self {
             step: Step::default(),

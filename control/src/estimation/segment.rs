@@ -131,6 +131,9 @@ impl SegmentStatistics {
         (self.theta_information > 0.0).then(|| self.theta_weighted / self.theta_information)
     }
 
+    /// Returns the statistics of the blocks in `sums`; without `theta` those on θ are 0.
+    /// `accelerometer_offset_mu` is the standard deviation of the accelerometer's offset over
+    /// gravity.
     pub(super) fn of(
         sums: &Sums,
         offsets: &OffsetKnowledge,

@@ -276,9 +276,9 @@ pub struct ThetaMeasurement {
 /// Estimate of one parameter of the robot.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct IdentifiedValue {
-    /// Estimated value.
+    /// Estimated value, in the parameter's unit.
     pub value: f64,
-    /// Standard deviation of its error.
+    /// Standard deviation of its error, in the same unit.
     pub std_dev: f64,
     /// Whether the estimate is prior-dominated: its variance is more than half of the prior
     /// variance.
@@ -349,9 +349,9 @@ pub struct Estimate {
 /// An estimated value with its standard deviation.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct ValueWithStdDev {
-    /// Estimated value.
+    /// Estimated value, in the unit of the estimated quantity.
     pub value: f64,
-    /// Standard deviation of its error.
+    /// Standard deviation of its error, in the same unit.
     pub std_dev: f64,
 }
 

@@ -139,6 +139,7 @@ pub(super) struct Polygon {
 }
 
 impl Polygon {
+    /// Creates the closed polygon of these corners; one without corners contains no point.
     pub(super) fn new(corners: &[Point]) -> Self {
         let next = corners.iter().cycle().skip(1);
         let side = |(&from, &to): (&Point, &Point)| Side {

@@ -56,7 +56,8 @@ const GRID_MIN: usize = 16;
 /// Options of a plan; none by default.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct PlanOptions<'map> {
-    /// Speed on the approach to the trajectory, metres per second; None for the trajectory's own.
+    /// Speed on the approach to the trajectory, metres per second, above 0 and within the robot's
+    /// limits; None for the trajectory's own.
     pub approach_speed_m_s: Option<f64>,
     /// Variation of the speed, so that θ can be measured without torque sensing.
     pub excitation: Option<ExcitationSpec>,
@@ -122,7 +123,7 @@ struct Models<'a> {
 }
 
 impl Plan {
-    /// Plans a trajectory from the pose of a stopped robot.
+    /// Plans a trajectory from the pose of a stopped robot in the site frame, without options.
     ///
     /// # Errors
     /// [`PlanError`] names the invalid value or the sharp turn, with the waypoint's index.
@@ -134,7 +135,7 @@ impl Plan {
         Self::with_options(trajectory, start, model, &PlanOptions::default())
     }
 
-    /// Plans a trajectory from the pose of a stopped robot, with options.
+    /// Plans a trajectory from the pose of a stopped robot in the site frame, with options.
     ///
     /// # Errors
     /// [`PlanError`] names the invalid value or the sharp turn, with the waypoint's index.

@@ -7,7 +7,7 @@ use crate::profile::ProfileSample;
 pub enum SlowedBy {
     /// Lateral acceleration.
     LateralAcceleration,
-    /// Yaw rate.
+    /// Turn rate of the body.
     AngularSpeed,
     /// Wheel speed.
     WheelSpeed,

@@ -46,13 +46,13 @@ pub struct TrackerConfig {
     /// Gains across the path for a noisy pose on a path of constant sideslip.
     pub steady: CrossGains,
     /// Change of the sideslip over the last metres at which `noisy` and `steady` have equal weight,
-    /// radians.
+    /// radians, above 0.
     pub steady_middle_rad: f64,
     /// Pose noise at which both gain sets have equal weight, as amplitude density `σ√T` of white
-    /// noise, m·√s.
+    /// noise, m·√s, above 0.
     pub noise_middle_m_sqrt_s: f64,
-    /// Standard deviation of the position at which both gain sets have equal weight, metres; it
-    /// covers filtered noise, which is not white.
+    /// Standard deviation of the position at which both gain sets have equal weight, metres, above
+    /// 0; it covers filtered noise, which is not white.
     pub position_middle_m: f64,
     /// Maximum magnitude of the integral term, as curvature, per metre, at least 0.
     pub integral_max_1_m: f64,

@@ -60,6 +60,7 @@ pub(super) enum Axis {
 }
 
 impl Rates {
+    /// Returns the magnitude of the difference.
     pub(super) fn difference(self) -> f64 {
         (self.body - self.wheels).abs()
     }
@@ -150,6 +151,7 @@ impl Axis {
     }
 }
 
+/// Creates a finding about a subject from the compared rates, in the unit of the axis.
 pub(super) fn finding(subject: Subject, kind: Kind, comparison: Comparison, axis: Axis) -> Finding {
     let Comparison {
         observed,

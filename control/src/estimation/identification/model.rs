@@ -106,6 +106,7 @@ pub(super) struct Output<T> {
 }
 
 impl<T: Real> Output<T> {
+    /// Returns an output of zeros, to which others are added.
     pub(super) fn zero() -> Self {
         let zero = T::constant(0.0);
         Self {
