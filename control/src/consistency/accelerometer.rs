@@ -137,8 +137,8 @@ impl Accelerometer {
         *self = Self::default();
     }
 
-    /// Adds a measurement of the present bin; `is_specific_force` says whether it contains gravity
-    /// on a slope.
+    /// Adds a measurement of the present bin; `is_specific_force` states whether it contains
+    /// gravity on a slope.
     pub(super) fn take(&mut self, measured: BodyAcceleration, is_specific_force: bool) {
         self.is_specific_force = is_specific_force;
         self.sum.forward_m_s2 += measured.forward_m_s2;

@@ -16,7 +16,8 @@ use crate::localisation::FixNoise;
 
 /// Number of fixes kept: the longest span and [`BEFORE_S`] at 20 Hz.
 const FIXES: usize = 52;
-/// Minimum number of fixes in a span, and together with those before it.
+/// Minimum number of fixes in a span, and minimum number of these and those in [`BEFORE_S`]
+/// together.
 const FIXES_MIN: (usize, usize) = (3, 5);
 /// Time before a span whose fixes are used too, seconds.
 const BEFORE_S: f64 = 0.6;

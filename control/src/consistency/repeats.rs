@@ -22,7 +22,7 @@ pub(super) struct Repeats {
 }
 
 impl Repeats {
-    /// Adds the next value.
+    /// Adds the next measurement of the channel: up to three values, the others 0.
     pub(super) fn take(&mut self, at: Duration, values: [f64; 3]) {
         let words = values.map(f64::to_bits);
         if self.since.is_none() || words != self.words {

@@ -119,7 +119,7 @@ pub(crate) fn join_circle(
 /// None if the start is too near, or every leg is too tight or slower than `bound_s`.
 ///
 /// A leg is one curve, or two: one to a point straight behind the path's start and one from there.
-/// One long curve into a tight bend would swing far out.
+/// One long curve into a tight bend would leave the direct line by far.
 pub(crate) fn join(
     start: Pose,
     end: &Derivatives,

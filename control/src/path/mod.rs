@@ -78,7 +78,7 @@ pub struct PathSample {
     pub pose: Pose,
     /// Curvature, per metre, positive to the left.
     pub curvature_1_m: f64,
-    /// Derivative of curvature by arc length, per metre squared.
+    /// Derivative of the curvature with respect to arc length, per metre squared.
     pub curvature_slope_1_m2: f64,
 }
 

@@ -30,7 +30,8 @@ const ABOVE: Tolerance = Tolerance {
 /// Maximum excess of the body over the command, as a fraction of the wheels' excess, for a fault of
 /// their sensor.
 const NEARER_ABOVE: f64 = 0.4;
-/// Maximum deviation of the body from the command, forward, as a fraction of the wheels' deviation.
+/// Maximum deviation of the body's forward speed from the command, as a fraction of the wheels'
+/// deviation, for a fault of the wheels' sensor.
 const NEARER_FORWARD: f64 = 0.9;
 /// Ratio of the differences from two values below which the one with the smaller difference is
 /// favoured.

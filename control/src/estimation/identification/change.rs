@@ -16,8 +16,8 @@ use crate::robot::RobotModel;
 /// Differences of ln K of the other grounds.
 const OFFSETS: [f64; 2] = [-1.0, 1.0];
 /// Threshold h of the CUSUM, without and with measured torque, and its drift k: squares of standard
-/// deviations. Without torque less is known of the robot, so that what the model misses lasts
-/// longer.
+/// deviations. Without torque the robot's parameters are less certain, and residuals by errors of
+/// the model last longer.
 const THRESHOLDS: [f64; 2] = [220.0, 125.0];
 const DRIFT: f64 = 2.0;
 /// Limit of one channel's squared standardised residual.

@@ -1,7 +1,7 @@
 //! Estimates which part of the fast changes of an output is noise of the wheel speeds.
 //!
 //! The model is driven by the measured wheel speeds, and its accelerations y follow their fast
-//! changes whether these are true motion or noise. The accelerometer m feels true motion alone.
+//! changes whether these are true motion or noise. The accelerometer m measures true motion alone.
 //! Where the model has the right parameters, `y = y₀ + e` and `m = y₀ + s`, with the error e that
 //! noise of the wheel speeds causes and the noise s of the accelerometer, which are independent. So
 //! the mean of `(y − m) y` is the variance of e, whatever the variance of s is (the reliability
@@ -10,8 +10,8 @@
 //!
 //! Third differences of successive means are taken, which pass next to nothing of a manoeuvre, and
 //! most of what is near the resonance of the contacts, 5 to 10 Hz. An accelerometer that is late by
-//! 30 ms or more, or filtered below 5 Hz, does not feel such motion at its time, so that it counts
-//! as noise.
+//! 30 ms or more, or filtered below 5 Hz, does not measure such motion at the same time, so that
+//! the motion counts as noise.
 
 use super::recent::RecentBlocks;
 
@@ -20,7 +20,7 @@ const THIRD: [f64; 4] = [-1.0, 3.0, -3.0, 1.0];
 const THIRD_SQUARE: f64 = 20.0;
 /// Accelerations: forward and to the left.
 const ACCELERATIONS: usize = 2;
-/// Share of noise in the output's fast changes from which it is taken into account. Wrong
+/// Share of noise in the output's fast changes from which noise is taken into account. Wrong
 /// parameters of the model look like noise of a smaller share once they have settled.
 const SHARE_MIN: f64 = 0.6;
 /// Standard errors by which the noise must exceed that share: the accelerometer's own noise and
@@ -29,7 +29,7 @@ const SIGNIFICANT: f64 = 3.0;
 /// Variance of the output's error, relative to the assumed one of the residual, from which the
 /// noise is taken into account.
 const VARIANCE_MIN: f64 = 0.004;
-/// Minimum number of blocks before it is.
+/// Minimum number of blocks before noise is taken into account.
 const BLOCKS_MIN: usize = 6;
 /// Minimum number of products in a block that counts.
 const PRODUCTS_MIN: f64 = 10.0;
@@ -68,8 +68,8 @@ impl FastChanges {
         }
     }
 
-    /// Adds the next values of an acceleration: measured, output, and what the added noise changes,
-    /// each over the assumed standard deviation of the residual.
+    /// Adds the next values of an acceleration: measured, output, and change of the output by the
+    /// added noise, each over the assumed standard deviation of the residual.
     pub(super) fn add(&mut self, acceleration: usize, values: [f64; 3]) {
         let newest = &mut self.newest[acceleration];
         for (values, value) in newest.iter_mut().zip(values) {
@@ -93,7 +93,7 @@ impl FastChanges {
         self.count += 1.0;
     }
 
-    /// Ends the open block; one with few values counts for nothing.
+    /// Ends the open block; one with fewer than [`PRODUCTS_MIN`] products is not used.
     pub(super) fn end_block(&mut self) {
         if self.count >= PRODUCTS_MIN {
             let [error, added, excess] = self.open.map(|sum| sum / self.count);

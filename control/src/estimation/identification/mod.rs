@@ -561,7 +561,8 @@ impl Identification {
     }
 
     /// Returns the largest of the channels' mean squares of the best hypothesis's standardised
-    /// residuals, at least 1. Where no hypothesis fits, a difference of cost says less.
+    /// residuals, at least 1. Differences of cost are relative to it, because they are less
+    /// significant where no hypothesis fits.
     fn residual_square(&self) -> f64 {
         self.best().map_or(1.0, Hypothesis::worst_square).max(1.0)
     }

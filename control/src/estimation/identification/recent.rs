@@ -33,7 +33,7 @@ impl RecentBlocks {
         }
     }
 
-    /// Adds the value of a block; the oldest of more than 31 is forgotten. A value that is not
+    /// Adds the value of a block; the oldest of more than 31 is dropped. A value that is not
     /// finite is ignored.
     pub(super) fn add(&mut self, value: f64) {
         if !value.is_finite() {

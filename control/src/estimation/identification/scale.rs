@@ -13,7 +13,7 @@ use super::parameters::{Prior, Square, Values, index};
 
 /// Fraction of its information that a block loses with each later block, because sensor offsets
 /// drift.
-const BLOCK_FORGETS: f64 = 0.002;
+const BLOCK_DECAY: f64 = 0.002;
 /// Standardised residual above which Huber's weight falls below 1.
 const HUBER: f64 = 3.0;
 /// Weight of each new squared residual in the exponentially weighted mean square of its channel.
@@ -21,7 +21,7 @@ const SQUARE_GAIN: f64 = 0.005;
 /// Maximum squared standardised residual in that mean.
 const SQUARE_MAX: f64 = 100.0;
 /// Maximum difference of the estimates of two scales that agree, in its standard deviations.
-const DIFFERENT: f64 = 2.0;
+const AGREEMENT_STD_DEVS: f64 = 2.0;
 /// Minimum variance of that difference, relative to the variance at the longer scale.
 const DIFFERENCE_MIN: f64 = 0.2;
 
@@ -284,7 +284,7 @@ impl TimeScale {
         if self.compared > 0 {
             self.end_mean();
         }
-        let keeps = 1.0 - BLOCK_FORGETS;
+        let keeps = 1.0 - BLOCK_DECAY;
         self.segment
             .combine(&self.last, |own, last| (own + last) * keeps);
         let last = &mut self.last;
@@ -321,7 +321,7 @@ impl TimeScale {
         let (own, of_other) = (self.variances(prior).0, other.variances(prior).0);
         // That of the difference to an efficient estimate is the difference of the variances.
         let variance = (of_other - own).max(DIFFERENCE_MIN * of_other);
-        (self.ln_stiffness - other.ln_stiffness).powi(2) <= DIFFERENT.powi(2) * variance
+        (self.ln_stiffness - other.ln_stiffness).powi(2) <= AGREEMENT_STD_DEVS.powi(2) * variance
     }
 
     /// Multiplies the weights of all complete blocks.

@@ -13,7 +13,7 @@
 //! sums: its spectrum rises as `x = 4 sin²(ω/2)`, of which the filters see the means 1.75 and 3.6,
 //! while white noise has the same power in both. So the two are distinguished by extrapolation to x
 //! = 0. Wheels that truly move at 10 Hz, as behind noisy positions, count as noise here; the
-//! accelerometer feels them too, by which the module `fast_changes` tells the two apart.
+//! accelerometer measures such motion too, by which the module `fast_changes` distinguishes it.
 
 use super::recent::RecentBlocks;
 
@@ -152,7 +152,7 @@ impl WheelNoise {
         }
     }
 
-    /// Ends a block; one in which the robot stood counts for nothing.
+    /// Ends a block; one in which the robot stood is not used.
     pub(super) fn end_block(&mut self, is_moving: bool) {
         let (sum, count) = std::mem::take(&mut self.open);
         if !is_moving || count < 1.0 {
