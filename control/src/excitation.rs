@@ -56,7 +56,7 @@ pub enum ExcitationError {
 
 /// Limits of plan and robot that bound an excitation.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Room {
+pub(crate) struct ExcitationLimits {
     /// Maximum speed of the plan, metres per second.
     pub(crate) speed_m_s: f64,
     /// Minimum of the acceleration limit along the path, metres per second squared.
@@ -74,13 +74,13 @@ pub struct Excitation {
 
 /// Plan time and its derivatives at one time.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Warp {
+pub(crate) struct PlanTime {
     /// τ, plan seconds.
     pub(crate) plan_s: f64,
     /// w = dτ/dt, plan seconds per second.
-    pub(crate) pace: f64,
+    pub(crate) rate: f64,
     /// ẇ, per second.
-    pub(crate) pace_rate_1_s: f64,
+    pub(crate) rate_slope_1_s: f64,
 }
 
 impl Excitation {
@@ -88,7 +88,10 @@ impl Excitation {
     ///
     /// # Errors
     /// [`ExcitationError`] if depth or period is out of its range.
-    pub(crate) fn within(spec: ExcitationSpec, room: Room) -> Result<Self, ExcitationError> {
+    pub(crate) fn within(
+        spec: ExcitationSpec,
+        limits: ExcitationLimits,
+    ) -> Result<Self, ExcitationError> {
         if !(spec.depth_ratio > 0.0 && spec.depth_ratio <= DEPTH_MAX) {
             return Err(ExcitationError::Depth(spec.depth_ratio));
         }
@@ -98,9 +101,9 @@ impl Excitation {
         let rate = TAU / spec.period_s;
         let depth = spec
             .depth_ratio
-            .min(ACCELERATION_SHARE * room.acceleration_m_s2 / (0.5 * rate * room.speed_m_s))
-            .min(JERK_SHARE * room.jerk_m_s3 / (0.5 * rate * rate * room.speed_m_s))
-            .min(CROSS_JERK_SHARE * room.jerk_m_s3 / (1.5 * rate * room.acceleration_m_s2));
+            .min(ACCELERATION_SHARE * limits.acceleration_m_s2 / (0.5 * rate * limits.speed_m_s))
+            .min(JERK_SHARE * limits.jerk_m_s3 / (0.5 * rate * rate * limits.speed_m_s))
+            .min(CROSS_JERK_SHARE * limits.jerk_m_s3 / (1.5 * rate * limits.acceleration_m_s2));
         Ok(Self {
             depth,
             rate_rad_s: rate,
@@ -129,12 +132,12 @@ impl Excitation {
     }
 
     /// Returns τ, w and ẇ at a time since the start, seconds.
-    pub(crate) fn warp(&self, time_s: f64) -> Warp {
+    pub(crate) fn plan_time(&self, time_s: f64) -> PlanTime {
         let (sin, cos) = (self.rate_rad_s * time_s).sin_cos();
-        Warp {
+        PlanTime {
             plan_s: (1.0 - 0.5 * self.depth) * time_s + 0.5 * self.depth / self.rate_rad_s * sin,
-            pace: 1.0 - 0.5 * self.depth * (1.0 - cos),
-            pace_rate_1_s: -0.5 * self.depth * self.rate_rad_s * sin,
+            rate: 1.0 - 0.5 * self.depth * (1.0 - cos),
+            rate_slope_1_s: -0.5 * self.depth * self.rate_rad_s * sin,
         }
     }
 
@@ -144,7 +147,7 @@ impl Excitation {
         let (mut early_s, mut late_s) = (0.0, plan_s / (1.0 - self.depth));
         for _ in 0..BISECTIONS {
             let middle_s = 0.5 * (early_s + late_s);
-            if self.warp(middle_s).plan_s < plan_s {
+            if self.plan_time(middle_s).plan_s < plan_s {
                 early_s = middle_s;
             } else {
                 late_s = middle_s;
@@ -162,27 +165,32 @@ mod tests {
 
     proptest! {
         #[test]
-        fn plan_time_grows_at_the_stated_pace_and_is_found_again(
+        fn plan_time_grows_at_the_stated_rate_and_is_found_again(
             depth_ratio in 0.01..DEPTH_MAX, period_s in PERIOD_MIN_S..PERIOD_MAX_S,
             time_s in 0.0..500.0_f64,
         ) {
-            let room = Room { speed_m_s: 0.6, acceleration_m_s2: 50.0, jerk_m_s3: 5_000.0 };
+            let limits = ExcitationLimits {
+                speed_m_s: 0.6,
+                acceleration_m_s2: 50.0,
+                jerk_m_s3: 5_000.0,
+            };
             let spec = ExcitationSpec { depth_ratio, period_s };
-            let excitation = Excitation::within(spec, room).unwrap();
+            let excitation = Excitation::within(spec, limits).unwrap();
             let slope = |value: &dyn Fn(f64) -> f64| {
                 (value(time_s + 1.0e-4) - value(time_s - 1.0e-4)) / 2.0e-4
             };
-            let found = excitation.warp(time_s);
-            prop_assert!(found.pace > 1.0 - DEPTH_MAX - 1.0e-9 && found.pace <= 1.0 + 1.0e-12);
-            prop_assert!((slope(&|t| excitation.warp(t).plan_s) - found.pace).abs() < 1.0e-6);
-            prop_assert!((slope(&|t| excitation.warp(t).pace) - found.pace_rate_1_s).abs() < 1.0e-4);
+            let found = excitation.plan_time(time_s);
+            prop_assert!(found.rate > 1.0 - DEPTH_MAX - 1.0e-9 && found.rate <= 1.0 + 1.0e-12);
+            prop_assert!((slope(&|t| excitation.plan_time(t).plan_s) - found.rate).abs() < 1.0e-6);
+            let rate_slope_1_s = slope(&|t| excitation.plan_time(t).rate);
+            prop_assert!((rate_slope_1_s - found.rate_slope_1_s).abs() < 1.0e-4);
             prop_assert!((excitation.time_s(found.plan_s) - time_s).abs() < 1.0e-6);
         }
     }
 
     #[test]
     fn an_excitation_out_of_range_is_refused_by_name() {
-        let room = Room {
+        let limits = ExcitationLimits {
             speed_m_s: 0.6,
             acceleration_m_s2: 0.8,
             jerk_m_s3: 4.0,
@@ -192,13 +200,13 @@ mod tests {
                 depth_ratio: bad,
                 ..ExcitationSpec::default()
             };
-            let error = Excitation::within(spec, room).unwrap_err();
+            let error = Excitation::within(spec, limits).unwrap_err();
             assert!(error.to_string().contains("depth_ratio"), "{error}");
         }
         let spec = ExcitationSpec {
             period_s: f64::NAN,
             ..ExcitationSpec::default()
         };
-        assert!(Excitation::within(spec, room).is_err());
+        assert!(Excitation::within(spec, limits).is_err());
     }
 }

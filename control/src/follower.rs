@@ -174,16 +174,22 @@ pub struct Follower {
     /// Slide detector; only on an approach over ground of unknown friction.
     sliding: Option<Sliding>,
     status: FollowerStatus,
+    /// Whether the robot still turns on the spot at the start.
     aligning: bool,
+    /// Commanded turn rate on the spot.
     align_rate_rad_s: f64,
+    /// Time in the present state.
     phase_s: f64,
+    /// Time for which the robot has been at the end and stopped.
     hold_s: f64,
+    /// Time for which the cross-track error has been too large.
     off_path_s: f64,
     monitor: ProgressMonitor,
     is_stuck: bool,
     best_arc_m: f64,
     /// Fraction of the plan's speed set by the operator; 0 pauses.
     rate_cap: f64,
+    /// Time for which there has been no usable pose.
     invalid_s: f64,
     last_errors: TrackingErrors,
     saturated: bool,
@@ -259,7 +265,7 @@ impl Follower {
         }
     }
 
-    /// Limits the speed to a fraction of the plan's, clamped to 0 to 1: 0 pauses, 1 resumes fully.
+    /// Limits the speed to a fraction of the plan's, clamped to 0 to 1: 0 pauses, 1 ends the limit.
     /// A non-finite value pauses.
     pub fn set_pace(&mut self, share: f64) {
         self.rate_cap = if share.is_finite() {
@@ -274,7 +280,8 @@ impl Follower {
         self.governor.set_speed_limit(limit_m_s);
     }
 
-    /// Sets the last command to the base if it differs from this mission's own.
+    /// Sets the last command to the base if it differs from this mission's own; the next tick's
+    /// acceleration limits start from it.
     pub fn set_commanded(&mut self, commanded: WheelSpeeds) {
         self.tracker.set_commanded(commanded);
     }

@@ -114,7 +114,8 @@ impl FrictionCurve {
         self.spec.stiffness * self.spec.peak_slip
     }
 
-    /// Returns the friction coefficient at a slip: an odd function, constant beyond a slip of ±1.
+    /// Returns the friction coefficient μ(λ) of (7) at a slip of either sign: an odd function,
+    /// constant beyond a slip of ±1.
     pub fn mu(&self, slip: f64) -> f64 {
         (self.mu_over_slip(slip.abs()) * slip).clamp(-self.mu_peak(), self.mu_peak())
     }
@@ -146,8 +147,8 @@ mod tests {
             stiffness in 0.1..50.0_f64, peak_slip in 0.01..0.99_f64,
             sliding_ratio in 0.0..=1.0_f64, slip in -3.0..3.0_f64,
         ) {
-            let curve =
-                FrictionCurve::try_from(FrictionSpec { stiffness, peak_slip, sliding_ratio }).unwrap();
+            let spec = FrictionSpec { stiffness, peak_slip, sliding_ratio };
+            let curve = FrictionCurve::try_from(spec).unwrap();
             let mu = curve.mu(slip);
             prop_assert!((mu + curve.mu(-slip)).abs() < 1.0e-12);
             prop_assert!(mu.abs() <= curve.mu_peak() + 1.0e-12);
@@ -159,8 +160,8 @@ mod tests {
             stiffness in 0.1..50.0_f64, peak_slip in 0.01..0.99_f64,
             sliding_ratio in 0.0..=1.0_f64, slip in 0.0..1.0_f64,
         ) {
-            let curve =
-                FrictionCurve::try_from(FrictionSpec { stiffness, peak_slip, sliding_ratio }).unwrap();
+            let spec = FrictionSpec { stiffness, peak_slip, sliding_ratio };
+            let curve = FrictionCurve::try_from(spec).unwrap();
             // Equations (8) and (9).
             let (sigma_1, sigma_2) = if slip < peak_slip {
                 (0.0, 1.0)

@@ -41,7 +41,8 @@ impl WheelTorques {
     }
 }
 
-/// Acceleration of the body without gravity, in the body frame.
+/// Acceleration of the body along the ground, in the body frame: without gravity, unless the user
+/// of this type states that it is the specific force.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct BodyAcceleration {
     /// Forward, metres per second squared.

@@ -74,16 +74,16 @@ pub(crate) struct ProfileInput<'a> {
     pub(crate) length_m: f64,
     /// Limits at the nodes of an even grid along the path, at least two.
     pub(crate) limits: &'a [NodeLimits],
-    /// Number of nodes at the start that keep to the limits within time T; the others keep to those
-    /// within distance D (see module).
-    pub(crate) brisk: usize,
+    /// Number of nodes at the start that keep to the limits within time T only, which is quicker;
+    /// the others keep to those within distance D (see module).
+    pub(crate) time_limited_nodes: usize,
     /// Maximum jerk, metres per second cubed.
     pub(crate) jerk_max_m_s3: f64,
 }
 
-/// Time T and distance D, see module.
+/// Window of the mean: time T and distance D, see module.
 #[derive(Debug, Clone, Copy)]
-struct Reach {
+struct AveragingWindow {
     window_s: f64,
     /// D as a number of cells.
     cells: usize,
@@ -95,7 +95,7 @@ impl SpeedProfile {
         let &ProfileInput {
             length_m,
             limits,
-            brisk,
+            time_limited_nodes,
             jerk_max_m_s3,
         } = input;
         let cells = limits.len().saturating_sub(1).max(1);
@@ -107,11 +107,11 @@ impl SpeedProfile {
         let fastest_m_s = limits.iter().map(|node| node.speed_m_s).fold(0.0, f64::max);
         let window_s = 2.0 * hardest_m_s2 / jerk_max_m_s3;
         // One cell more than the distance, to cover limits between nodes.
-        let reach = Reach {
+        let averaging = AveragingWindow {
             window_s,
             cells: ((window_s * fastest_m_s / cell_m).ceil() + 1.0).min(cells as f64) as usize,
         };
-        let spans = spans(limits, cell_m, reach, brisk);
+        let spans = spans(limits, cell_m, averaging, time_limited_nodes);
         let speeds = lowest_within(limits, &spans, |node| node.speed_m_s);
         let accelerations = lowest_within(limits, &spans, |node| node.acceleration_m_s2);
         let lowest = speeds.into_iter().zip(accelerations);
@@ -137,7 +137,10 @@ impl SpeedProfile {
     /// Returns the timing at a time since the start, seconds; before 0 and after the end the speed
     /// is zero.
     pub fn sample(&self, time_s: f64) -> ProfileSample {
-        let (late, early) = (self.raw(time_s), self.raw(time_s - self.window_s));
+        let (late, early) = (
+            self.unaveraged(time_s),
+            self.unaveraged(time_s - self.window_s),
+        );
         ProfileSample {
             arc_m: ((late.arc_integral_m_s - early.arc_integral_m_s) / self.window_s)
                 .clamp(0.0, self.length_m),
@@ -147,7 +150,7 @@ impl SpeedProfile {
     }
 
     /// Returns the timing `s₀` before the mean.
-    fn raw(&self, time_s: f64) -> Node {
+    fn unaveraged(&self, time_s: f64) -> Node {
         let after = self.nodes.partition_point(|node| node.time_s <= time_s);
         let rest = Node {
             time_s,
@@ -191,22 +194,27 @@ fn quickest(limits: &[NodeLimits], cell_m: f64) -> Vec<f64> {
     energies
 }
 
-/// Returns, for each node, the first and last node whose limits it keeps to; both are
-/// non-decreasing.
-fn spans(limits: &[NodeLimits], cell_m: f64, reach: Reach, brisk: usize) -> Vec<(usize, usize)> {
-    let Reach { window_s, cells } = reach;
+/// Returns, for each node, the indices of the first and the last node whose limits it keeps to;
+/// both are non-decreasing.
+fn spans(
+    limits: &[NodeLimits],
+    cell_m: f64,
+    averaging: AveragingWindow,
+    time_limited_nodes: usize,
+) -> Vec<(usize, usize)> {
+    let AveragingWindow { window_s, cells } = averaging;
     let last = limits.len() - 1;
-    let within_reach = |index: usize| (index.saturating_sub(cells), (index + cells).min(last));
-    if brisk == 0 {
-        return (0..=last).map(within_reach).collect();
+    let within_distance = |index: usize| (index.saturating_sub(cells), (index + cells).min(last));
+    if time_limited_nodes == 0 {
+        return (0..=last).map(within_distance).collect();
     }
     let timed = time_nodes(&quickest(limits, cell_m), cell_m);
     let (mut before, mut after) = (0, 0);
     let mut first = 0;
     (0..=last)
         .map(|index| {
-            let (mut from, mut to) = within_reach(index);
-            if index < brisk {
+            let (mut from, mut to) = within_distance(index);
+            if index < time_limited_nodes {
                 let time_s = timed[index].time_s;
                 while timed[before].time_s < time_s - window_s {
                     before += 1;
@@ -224,6 +232,7 @@ fn spans(limits: &[NodeLimits], cell_m: f64, reach: Reach, brisk: usize) -> Vec<
         .collect()
 }
 
+/// Converts `E = v²/2` at the nodes to the timing `s₀`.
 fn time_nodes(energies: &[f64], cell_m: f64) -> Vec<Node> {
     let mut nodes = Vec::with_capacity(energies.len());
     let mut node = Node {
@@ -292,9 +301,9 @@ mod tests {
 
     proptest! {
         #[test]
-        fn brisk_or_not_no_limit_is_passed_and_brisk_is_never_slower(
+        fn no_window_passes_a_limit_and_that_of_time_is_never_slower(
             stretches in prop::collection::vec((1..60_usize, 0.05..1.0_f64, 0.1..1.0_f64), 2..12),
-            brisk_share in 0.0..=1.0_f64, jerk_m_s3 in 1.0..8.0_f64,
+            time_limited_share in 0.0..=1.0_f64, jerk_m_s3 in 1.0..8.0_f64,
         ) {
             let limits: Vec<NodeLimits> = stretches
                 .iter()
@@ -305,14 +314,14 @@ mod tests {
                 .collect();
             let cells = limits.len() - 1;
             let length_m = CELL_M * cells as f64;
-            let brisk = (brisk_share * limits.len() as f64) as usize;
-            let profile = |brisk: usize| SpeedProfile::new(&ProfileInput {
+            let time_limited_nodes = (time_limited_share * limits.len() as f64) as usize;
+            let profile = |time_limited_nodes: usize| SpeedProfile::new(&ProfileInput {
                 length_m,
                 limits: &limits,
-                brisk,
+                time_limited_nodes,
                 jerk_max_m_s3: jerk_m_s3,
             });
-            let (cautious, quick) = (profile(0), profile(brisk));
+            let (cautious, quick) = (profile(0), profile(time_limited_nodes));
             prop_assert!(quick.duration_s() <= cautious.duration_s() + 1.0e-9);
             let (mut time_s, mut before_m_s2) = (0.0, 0.0);
             while time_s < quick.duration_s() {

@@ -20,14 +20,14 @@ const REST_STEP_S: f64 = 0.02;
 const REST_STEPS_MAX: u32 = 1_000;
 /// Gain from the error of σ to σ̇, per second.
 const RATE_GAIN_1_S: f64 = 3.0;
-/// Maximum σ̇, per second.
+/// Maximum σ̇ where σ rises, per second.
 const RISE_MAX_1_S: f64 = 1.0;
 /// Distance between robot and reference up to which the reference is not slowed, metres.
 const LAG_FREE_M: f64 = 0.10;
 /// Distance between robot and reference from which the reference waits (σ target 0), metres.
 const LAG_FULL_M: f64 = 0.40;
-/// Minimum σ beside the path, however large the cross-track error: the robot must drive to come back
-/// to its path.
+/// Minimum σ beside the path, however large the cross-track error: the robot must drive to come
+/// back to its path.
 const CROSS_TRACK_RATE_MIN: f64 = 0.3;
 /// Target of σ while the wheels are saturated.
 const SATURATED_RATE: f64 = 0.5;
@@ -96,8 +96,8 @@ pub struct GovernorInput {
     /// Distance between the robot and its reference, metres; a non-finite value makes the reference
     /// wait.
     pub lag_m: f64,
-    /// Part of this distance along the path, metres, of either sign. The reference waits for a robot
-    /// that is behind or ahead, and only slows down for one that is beside it.
+    /// Part of this distance along the path, metres, of either sign. The reference waits for a
+    /// robot that is behind or ahead, and only slows down for one that is beside it.
     pub along_track_m: f64,
     /// Whether the wheels cannot follow their commands.
     pub saturated: bool,
@@ -118,7 +118,7 @@ impl GovernorInput {
 
 /// Acceleration bounds of a robot that slides, and its heading error to the path in radians.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Slide {
+struct SlidingState {
     bounds: SlidingBounds,
     heading_rad: f64,
 }
@@ -126,12 +126,16 @@ struct Slide {
 /// Reference generator of one plan.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Governor {
+    /// τ.
     clock_s: f64,
+    /// σ.
     rate: f64,
+    /// σ̇.
     rate_slope_1_s: f64,
+    /// Upper bound of σ.
     rate_cap: f64,
     speed_limit_m_s: Option<f64>,
-    sliding: Option<Slide>,
+    sliding: Option<SlidingState>,
     stopping: bool,
     brake_m_s2: f64,
     jerk_m_s3: f64,
@@ -201,7 +205,7 @@ impl Governor {
     /// Sets acceleration bounds on sliding ground and the heading error in radians; None removes
     /// the bounds.
     pub(crate) fn set_sliding(&mut self, bounds: Option<SlidingBounds>, heading_rad: f64) {
-        self.sliding = bounds.map(|bounds| Slide {
+        self.sliding = bounds.map(|bounds| SlidingState {
             bounds,
             heading_rad,
         });
@@ -211,7 +215,7 @@ impl Governor {
     /// and yaw bound of every bend within [`SLIDING_AHEAD_S`], and σ is smaller while the heading
     /// error is large.
     fn rate_on_sliding_ground(&self, plan: &Plan, planned: &PlanSample) -> f64 {
-        let Some(Slide {
+        let Some(SlidingState {
             bounds,
             heading_rad,
         }) = self.sliding
@@ -224,9 +228,9 @@ impl Governor {
             let there = plan.sample(self.clock_s + ahead_s);
             let bend_1_m = there.path.curvature_1_m.abs().max(f64::MIN_POSITIVE);
             let slope_1_m2 = there.path.curvature_slope_1_m2.abs().max(f64::MIN_POSITIVE);
-            let square = (bounds.across_m_s2 / bend_1_m).min(bounds.yaw_rad_s2 / slope_1_m2);
+            let square = (bounds.lateral_m_s2 / bend_1_m).min(bounds.yaw_rad_s2 / slope_1_m2);
             let distance_m = there.arc_m - planned.arc_m;
-            energy = energy.min(0.5 * square + bounds.along_m_s2 * distance_m);
+            energy = energy.min(0.5 * square + bounds.longitudinal_m_s2 * distance_m);
         }
         let turned = (HEADING_FULL_RAD - heading_rad.abs()) / (HEADING_FULL_RAD - HEADING_FREE_RAD);
         ((2.0 * energy).sqrt() / planned.speed_m_s.max(f64::MIN_POSITIVE))
@@ -265,7 +269,7 @@ impl Governor {
             && (self.rate <= 0.0 || plan.sample(self.clock_s).speed_m_s * self.rate < REST_M_S)
     }
 
-    /// Advances the clock by `dt_s` seconds and returns the new reference.
+    /// Advances the clock by `dt_s` seconds, at least 0 and finite, and returns the new reference.
     pub fn step(&mut self, plan: &Plan, input: &GovernorInput, dt_s: f64) -> ReferenceSample {
         let planned = plan.sample(self.clock_s);
         let floor_m_s = planned.speed_m_s.max(SPEED_FLOOR_M_S);
@@ -317,7 +321,8 @@ impl Governor {
         self.reference(&plan.sample(self.clock_s))
     }
 
-    /// Predicts the pose in which the reference stops if it is paused from now on.
+    /// Predicts the pose, in the site frame, in which the reference stops if it is paused from now
+    /// on.
     pub fn rest(mut self, plan: &Plan) -> Pose {
         self.set_rate_cap(0.0);
         let input = GovernorInput::default();
@@ -361,7 +366,8 @@ mod tests {
         #![proptest_config(ProptestConfig { cases: 32, ..ProptestConfig::default() })]
         #[test]
         fn sliding_ground_slows_the_reference_without_a_jump_and_lets_it_arrive(
-            from_s in 0.0..4.0_f64, shown_m_s2 in 0.27..0.8_f64, heading_rad in -3.0..3.0_f64,
+            from_s in 0.0..4.0_f64, demonstrated_m_s2 in 0.27..0.8_f64,
+            heading_rad in -3.0..3.0_f64,
         ) {
             let model = RobotModel::yi2007();
             let circle = Trajectory::Circle(CircleSpec {
@@ -375,9 +381,9 @@ mod tests {
             let plan = Plan::new(&circle, start, &model).unwrap();
             let mut governor = Governor::new(&model);
             let bounds = SlidingBounds {
-                along_m_s2: 0.5 * shown_m_s2,
-                across_m_s2: 0.5 * shown_m_s2,
-                yaw_rad_s2: shown_m_s2,
+                longitudinal_m_s2: 0.5 * demonstrated_m_s2,
+                lateral_m_s2: 0.5 * demonstrated_m_s2,
+                yaw_rad_s2: demonstrated_m_s2,
             };
             let dt_s = 0.01;
             let mut before = governor.sample(&plan);
@@ -391,8 +397,8 @@ mod tests {
                 let most_m_s2 = 2.0 * model.limits().linear_acceleration_max_m_s2;
                 prop_assert!(change_m_s2 < most_m_s2, "{change_m_s2} m/s²");
                 if f64::from(tick) * dt_s >= from_s + BRAKED_S {
-                    let across_m_s2 = now.speed_m_s.powi(2) * now.curvature_1_m.abs();
-                    prop_assert!(across_m_s2 < 1.1 * bounds.across_m_s2, "{across_m_s2} m/s²");
+                    let lateral_m_s2 = now.speed_m_s.powi(2) * now.curvature_1_m.abs();
+                    prop_assert!(lateral_m_s2 < 1.1 * bounds.lateral_m_s2, "{lateral_m_s2} m/s²");
                 }
                 before = now;
             }

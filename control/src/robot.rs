@@ -169,7 +169,8 @@ impl RobotModel {
         &self.spec.limits
     }
 
-    /// Returns the normal force on the two wheels of one side at standstill, newtons.
+    /// Returns the normal force on the two wheels of one side at standstill on level ground,
+    /// `mg/2`, newtons.
     pub fn side_load_n(&self) -> f64 {
         self.spec.mass_kg * GRAVITY_M_S2 / 2.0
     }
@@ -180,24 +181,25 @@ impl RobotModel {
     /// Only fractions of `μg` are used along and across the path: the rest serves turning of the
     /// body and feedback.
     pub(crate) fn within_traction_limit(&self, mu_peak: f64) -> Self {
-        let along_m_s2 = Self::longitudinal_traction_m_s2(mu_peak);
-        let across_m_s2 = Self::lateral_traction_m_s2(mu_peak);
+        let longitudinal_m_s2 = Self::longitudinal_traction_m_s2(mu_peak);
+        let lateral_m_s2 = Self::lateral_traction_m_s2(mu_peak);
         let mut spec = self.spec;
         let limits = &mut spec.limits;
-        limits.linear_acceleration_max_m_s2 = limits.linear_acceleration_max_m_s2.min(along_m_s2);
+        limits.linear_acceleration_max_m_s2 =
+            limits.linear_acceleration_max_m_s2.min(longitudinal_m_s2);
         limits.lateral_acceleration_max_m_s2 =
-            limits.lateral_acceleration_max_m_s2.min(across_m_s2);
+            limits.lateral_acceleration_max_m_s2.min(lateral_m_s2);
         Self { spec }
     }
 
     /// Returns the acceleration along the path that a plan may use on ground with a peak friction
-    /// coefficient, metres per second squared.
+    /// coefficient, a fixed fraction of `μg`, metres per second squared.
     pub fn longitudinal_traction_m_s2(mu_peak: f64) -> f64 {
         TRACTION_SHARE_LONGITUDINAL * mu_peak * GRAVITY_M_S2
     }
 
     /// Returns the lateral acceleration that a plan may use on ground with a peak friction
-    /// coefficient, metres per second squared.
+    /// coefficient, a fixed fraction of `μg`, metres per second squared.
     pub fn lateral_traction_m_s2(mu_peak: f64) -> f64 {
         TRACTION_SHARE_LATERAL * mu_peak * GRAVITY_M_S2
     }
@@ -223,7 +225,8 @@ impl RobotModel {
         limits.linear_acceleration_max_m_s2.min(rim_max_m_s2) / (0.5 * self.effective_track_m())
     }
 
-    /// Returns the wheel speeds for a twist by the low-speed kinematics with `W_eff`.
+    /// Returns the wheel speeds for a twist by the low-speed kinematics, `ω_l = (v − ½ W_eff φ̇)/r`
+    /// and `ω_r = (v + ½ W_eff φ̇)/r`; not limited.
     pub fn wheel_speeds_from_twist(&self, twist: Twist) -> WheelSpeeds {
         let half_m_s = 0.5 * self.effective_track_m() * twist.angular_rad_s;
         WheelSpeeds {
@@ -232,7 +235,8 @@ impl RobotModel {
         }
     }
 
-    /// Returns the twist of wheel speeds by the low-speed kinematics with `W_eff`.
+    /// Returns the twist of wheel speeds by the low-speed kinematics, `v = r (ω_l + ω_r)/2` and
+    /// `φ̇ = r (ω_r − ω_l)/W_eff`.
     pub fn twist_from_wheel_speeds(&self, wheels: WheelSpeeds) -> Twist {
         let radius_m = self.spec.wheel_radius_m;
         Twist {

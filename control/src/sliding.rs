@@ -12,10 +12,10 @@
 //! The motion of the body gives a lower bound of friction: four wheels of equal load that
 //! accelerate the body with `a_y = vω` and turn it with `I_G ω̇` have a mean square of at least
 //! `a_y² + (2 I_G ω̇/(m √(W² + L²)))²`, so at least one wheel had its root over g as friction
-//! coefficient μ. A hit gives the same for an instant. So the sustained acceleration rises to that of
-//! the body at a limited rate and falls with it at once, and the demonstrated acceleration is the
-//! largest sustained one: hits do not add up. The bound is too high where the heading turns without the
-//! course, or where turn rates are noisy. The result only ever slows the robot.
+//! coefficient μ. A hit gives the same for an instant. So the sustained acceleration rises to that
+//! of the body at a limited rate and falls with it at once, and the demonstrated acceleration is
+//! the largest sustained one: hits do not add up. The bound is too high where the heading turns
+//! without the course, or where turn rates are noisy. The result only ever slows the robot.
 
 use crate::friction::SLIP_LINEAR;
 use crate::measured::Measured;
@@ -25,13 +25,13 @@ use crate::robot::{GRAVITY_M_S2, RobotModel};
 const SMOOTHING_S: f64 = 0.05;
 /// Shortest time in which the sustained acceleration rises to what the plan needs along the path,
 /// seconds. A hit shows for about 0.1 s after the low-pass filter, a bend for longer.
-const SHOWN_S: f64 = 0.3;
+const SUSTAINED_S: f64 = 0.3;
 /// Factor by which the lead that linear slip explains is enlarged.
 const EXPLAINED_RATIO: f64 = 1.2;
 /// Tolerated relative difference of left and right rolling radius before it is measured.
 const RADII_RATIO: f64 = 0.04;
 /// Tolerated relative difference of left and right rolling radius after it is measured.
-const RADII_LEFT_RATIO: f64 = 0.004;
+const RADII_MEASURED_RATIO: f64 = 0.004;
 /// Turn rate below which driving counts as straight and measures the rolling radii, radians per
 /// second.
 const STRAIGHT_RAD_S: f64 = 0.03;
@@ -53,7 +53,7 @@ const SHARE: f64 = 0.5;
 /// scrub.
 const SHARE_YAW: f64 = 0.35;
 /// Lower bound of the demonstrated acceleration, as a fraction of the assumed `μg`.
-const SHOWN_RATIO_MIN: f64 = 0.2;
+const DEMONSTRATED_RATIO_MIN: f64 = 0.2;
 
 /// Maximum accelerations on ground where the robot slides.
 #[expect(
@@ -63,9 +63,9 @@ const SHOWN_RATIO_MIN: f64 = 0.2;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct SlidingBounds {
     /// Deceleration along the path before a bend, metres per second squared.
-    pub(crate) along_m_s2: f64,
+    pub(crate) longitudinal_m_s2: f64,
     /// Acceleration across the path, metres per second squared.
-    pub(crate) across_m_s2: f64,
+    pub(crate) lateral_m_s2: f64,
     /// Acceleration in yaw, radians per second squared.
     pub(crate) yaw_rad_s2: f64,
 }
@@ -73,9 +73,9 @@ pub(crate) struct SlidingBounds {
 /// Turn rate of the body, and turn rate of the wheels minus that of the body, both low-pass
 /// filtered.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Smoothed {
+struct FilteredRates {
     turn_rad_s: f64,
-    forward_rad_s: f64,
+    lead_rad_s: f64,
 }
 
 /// Slide detector of one robot on its approach to a trajectory.
@@ -83,13 +83,15 @@ struct Smoothed {
 pub(crate) struct Sliding {
     model: RobotModel,
     assumed_mu: f64,
-    smoothed: Option<Smoothed>,
+    filtered: Option<FilteredRates>,
     /// `∫ (ω of the wheels − ω of the body) u dt` and `∫ u² dt` over straight driving.
     straight: [f64; 2],
-    /// The acceleration that is sustained at present, and the largest one that was.
+    /// Acceleration that is sustained at present, and the largest one so far: the demonstrated one.
     sustained_m_s2: f64,
-    shown_m_s2: f64,
-    left_over_rad: f64,
+    demonstrated_m_s2: f64,
+    /// Integral of the unexplained lead of the wheels' turn rate, at least 0.
+    unexplained_rad: f64,
+    /// Whether the robot counts as sliding; never reset.
     slides: bool,
 }
 
@@ -100,11 +102,11 @@ impl Sliding {
         Self {
             model,
             assumed_mu,
-            smoothed: None,
+            filtered: None,
             straight: [0.0; 2],
             sustained_m_s2: 0.0,
-            shown_m_s2: 0.0,
-            left_over_rad: 0.0,
+            demonstrated_m_s2: 0.0,
+            unexplained_rad: 0.0,
             slides: false,
         }
     }
@@ -114,30 +116,30 @@ impl Sliding {
         let model = &self.model;
         let turn_rad_s = measured.twist.angular_rad_s;
         let wheels = measured.wheel_speeds;
-        let forward_rad_s = model.twist_from_wheel_speeds(wheels).angular_rad_s - turn_rad_s;
-        let before = self.smoothed.unwrap_or(Smoothed {
+        let lead_rad_s = model.twist_from_wheel_speeds(wheels).angular_rad_s - turn_rad_s;
+        let before = self.filtered.unwrap_or(FilteredRates {
             turn_rad_s,
-            forward_rad_s,
+            lead_rad_s,
         });
         let share = (dt_s / SMOOTHING_S).min(1.0);
         let change_rad_s = turn_rad_s - before.turn_rad_s;
-        let smoothed = Smoothed {
+        let filtered = FilteredRates {
             turn_rad_s: before.turn_rad_s + share * change_rad_s,
-            forward_rad_s: before.forward_rad_s + share * (forward_rad_s - before.forward_rad_s),
+            lead_rad_s: before.lead_rad_s + share * (lead_rad_s - before.lead_rad_s),
         };
-        self.smoothed = Some(smoothed);
+        self.filtered = Some(filtered);
         let yaw_rad_s2 = change_rad_s / SMOOTHING_S;
-        let across_m_s2 = measured.twist.linear_m_s * smoothed.turn_rad_s;
-        let used_m_s2 = across_m_s2.hypot(yaw_rad_s2 * Self::lever_m(model));
+        let lateral_m_s2 = measured.twist.linear_m_s * filtered.turn_rad_s;
+        let used_m_s2 = lateral_m_s2.hypot(yaw_rad_s2 * Self::lever_m(model));
         let enough_m_s2 = RobotModel::longitudinal_traction_m_s2(self.assumed_mu);
-        let rise_m_s2 = enough_m_s2 * dt_s / SHOWN_S;
+        let rise_m_s2 = enough_m_s2 * dt_s / SUSTAINED_S;
         self.sustained_m_s2 = used_m_s2.min(self.sustained_m_s2 + rise_m_s2);
-        self.shown_m_s2 = self.shown_m_s2.max(self.sustained_m_s2);
+        self.demonstrated_m_s2 = self.demonstrated_m_s2.max(self.sustained_m_s2);
 
         let rim_m_s =
             0.5 * model.wheel_radius_m() * (wheels.left_rad_s.abs() + wheels.right_rad_s.abs());
         if turn_rad_s.abs() < STRAIGHT_RAD_S {
-            self.straight[0] += forward_rad_s * rim_m_s * dt_s;
+            self.straight[0] += lead_rad_s * rim_m_s * dt_s;
             self.straight[1] += rim_m_s * rim_m_s * dt_s;
         }
         let known_m2_s = RADII_MIDDLE_M2_S + self.straight[1];
@@ -145,7 +147,7 @@ impl Sliding {
         let radii_most_rad_s = RADII_RATIO * rim_m_s / model.effective_track_m();
         let radii_rad_s =
             (self.straight[0] / known_m2_s * rim_m_s).clamp(-radii_most_rad_s, radii_most_rad_s);
-        let radii_ratio = RADII_RATIO * RADII_MIDDLE_M2_S / known_m2_s + RADII_LEFT_RATIO;
+        let radii_ratio = RADII_RATIO * RADII_MIDDLE_M2_S / known_m2_s + RADII_MEASURED_RATIO;
         let square_m2 = model.track_width_m().powi(2) + model.wheelbase_m().powi(2);
         let inertia_ratio = 4.0 * model.yaw_inertia_kg_m2() / (model.mass_kg() * square_m2);
         let theta = SLIP_LINEAR / self.assumed_mu;
@@ -154,22 +156,22 @@ impl Sliding {
             + radii_ratio * rim_m_s / model.effective_track_m()
             + TRACK_RATIO * turn_rad_s.abs()
             + NOISE_RAD_S;
-        let left_over_rad_s = (smoothed.forward_rad_s - radii_rad_s).abs() - explained_rad_s;
-        self.left_over_rad = (self.left_over_rad + left_over_rad_s * dt_s).max(0.0);
+        let unexplained_rad_s = (filtered.lead_rad_s - radii_rad_s).abs() - explained_rad_s;
+        self.unexplained_rad = (self.unexplained_rad + unexplained_rad_s * dt_s).max(0.0);
         // The ground has given what the plan needs along the path, so it is as good as assumed.
-        let is_enough = self.shown_m_s2 >= enough_m_s2;
-        self.slides |= self.left_over_rad > SLIDING_RAD && !is_enough;
+        let is_enough = self.demonstrated_m_s2 >= enough_m_s2;
+        self.slides |= self.unexplained_rad > SLIDING_RAD && !is_enough;
     }
 
     /// Returns the acceleration bounds if the robot slides, else None. They grow with the
     /// demonstrated acceleration.
     pub(crate) fn bounds(&self) -> Option<SlidingBounds> {
-        let least_m_s2 = SHOWN_RATIO_MIN * self.assumed_mu * GRAVITY_M_S2;
-        let shown_m_s2 = self.shown_m_s2.max(least_m_s2);
+        let least_m_s2 = DEMONSTRATED_RATIO_MIN * self.assumed_mu * GRAVITY_M_S2;
+        let demonstrated_m_s2 = self.demonstrated_m_s2.max(least_m_s2);
         self.slides.then(|| SlidingBounds {
-            along_m_s2: SHARE * shown_m_s2,
-            across_m_s2: SHARE * shown_m_s2,
-            yaw_rad_s2: SHARE_YAW * shown_m_s2 / Self::lever_m(&self.model),
+            longitudinal_m_s2: SHARE * demonstrated_m_s2,
+            lateral_m_s2: SHARE * demonstrated_m_s2,
+            yaw_rad_s2: SHARE_YAW * demonstrated_m_s2 / Self::lever_m(&self.model),
         })
     }
 
@@ -246,8 +248,8 @@ mod tests {
             for tick in driven(swing_rad_s, pace_1_s, lag_s, [1.0; 2]) {
                 sliding.step(&tick, DT_S);
                 if let Some(bounds) = sliding.bounds() {
-                    prop_assert!(bounds.across_m_s2 >= before_m_s2 && bounds.yaw_rad_s2 > 0.0);
-                    before_m_s2 = bounds.across_m_s2;
+                    prop_assert!(bounds.lateral_m_s2 >= before_m_s2 && bounds.yaw_rad_s2 > 0.0);
+                    before_m_s2 = bounds.lateral_m_s2;
                 } else {
                     prop_assert!(before_m_s2 <= 0.0, "a robot that slides stays one that slides");
                 }
@@ -274,7 +276,7 @@ mod tests {
         }
         let with = bounds(&drive);
         assert!(
-            with.across_m_s2 < 1.5 * without.across_m_s2,
+            with.lateral_m_s2 < 1.5 * without.lateral_m_s2,
             "{with:?}, without the hit {without:?}"
         );
     }
@@ -286,6 +288,6 @@ mod tests {
             sliding.step(&tick, DT_S);
         }
         let bounds = sliding.bounds().unwrap();
-        assert!(bounds.across_m_s2 < 0.5, "{bounds:?}");
+        assert!(bounds.lateral_m_s2 < 0.5, "{bounds:?}");
     }
 }

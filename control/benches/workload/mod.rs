@@ -182,7 +182,7 @@ impl Robot {
             mu_lower: None,
         };
         let reasons = Reasons {
-            fence_max_m_s: self.fence.judge(&fence, &self.model).speed_max_m_s,
+            fence_max_m_s: self.fence.limit_speed(&fence, &self.model).speed_max_m_s,
             ..Reasons::default()
         };
         self.command = gate_with(&input, &reasons, &self.limits).wheel_speeds;

@@ -19,20 +19,20 @@ const HIGH_PASS_S: f64 = 3.0;
 const TILT_INFORMATION: f64 = 0.1;
 /// Time constant of the regression's memory, seconds.
 const MEMORY_S: f64 = 1.5;
-/// Minimum excitation `∫ expected² dt` for a gain, metres squared per second cubed.
+/// Minimum excitation `∫ predicted² dt` for a gain, metres squared per second cubed.
 const EXCITATION_MIN: f64 = 0.04;
 /// Gain above which the accelerometer is inconsistent. A low gain is no fault: slip and noise of
 /// the prediction cause one.
 const GAIN_MAX: f64 = 1.6;
-/// Gain from which the accelerometer agrees.
-const GAIN_AGREES: f64 = 0.5;
+/// Gain from which the accelerometer counts as healthy.
+const GAIN_MIN: f64 = 0.5;
 /// Gain of the regression below which the accelerometer is inverted.
 const GAIN_INVERTED: f64 = -0.3;
-/// Lower limit of gains that ice can cause: wheels that slip speed up while the body slows down,
+/// Lowest gain that slip can cause, on ice: wheels that slip speed up while the body slows down,
 /// but by less.
-const GAIN_OF_ICE: f64 = -0.5;
-/// Cumulative evidence from which the accelerometer is inverted, seconds; longer than the lag of
-/// the wheels.
+const SLIP_GAIN_MIN: f64 = -0.5;
+/// Alarm threshold of the cumulative sum of evidence that the accelerometer is inverted, seconds;
+/// longer than the lag of the wheels.
 const INVERTED_S: f64 = 0.35;
 /// Minimum squared predicted acceleration for evidence on the sign, (m/s²)².
 const SIGN_MIN: f64 = 0.06;
@@ -49,12 +49,12 @@ const FROZEN_CHANGE_M_S2: f64 = 0.3;
 /// squared.
 const IMPOSSIBLE_M_S2: f64 = 5.0;
 
-/// Separates changes of the measured and the predicted acceleration from what tilts add.
+/// High-pass filter that removes the gravity that tilts add to accelerations.
 ///
-/// A tilt relative to the robot adds a constant `b` in the body frame, a slope of the ground a constant
-/// `G` in a frame that does not turn, in which the body has the heading ψ. Both are fitted by least
-/// squares with exponential forgetting, `a = b + R(−ψ) G`, and subtracted. Without slope this is a
-/// first-order high-pass filter.
+/// A tilt relative to the robot adds a constant `b` in the body frame, a slope of the ground a
+/// constant `G` in a frame that does not turn, in which the body has the heading ψ. Both are fitted
+/// by least squares with exponential forgetting, `a = b + R(−ψ) G`, and subtracted. Without slope
+/// this is a first-order high-pass filter.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Tilts {
     information: Matrix4<f64>,
@@ -72,8 +72,8 @@ impl Default for Tilts {
 }
 
 impl Tilts {
-    /// Returns the accelerations `[measured, predicted]` without tilts, each forward and left. A slope
-    /// is subtracted if there is a `heading_rad`.
+    /// Adds the accelerations `[measured, predicted]` of one bin, each `[forward, left]`, m/s², and
+    /// returns them without gravity. That of a slope is removed only if there is a `heading_rad`.
     fn remove(
         &mut self,
         accelerations: [Vector2<f64>; 2],
@@ -103,7 +103,8 @@ impl Tilts {
     }
 }
 
-/// State of the comparison.
+/// Comparison of the accelerometer with wheels and gyro: measurements of the present bin, filter
+/// and regression.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Accelerometer {
     sum: BodyAcceleration,
@@ -116,10 +117,11 @@ pub(super) struct Accelerometer {
     /// Heading since the last restart, radians.
     heading_rad: f64,
     tilts: Tilts,
-    /// Filtered measured and predicted acceleration.
+    /// Measured and predicted acceleration of the last bin without gravity, m/s².
     forward: Comparison,
     left: Comparison,
-    /// `∫ felt·expected`, `∫ expected²`, `∫ residual²` and `∫ 1`, with exponential forgetting.
+    /// `∫ measured·predicted`, `∫ predicted²`, `∫ residual²` and `∫ 1`, with exponential
+    /// forgetting.
     sums: [f64; 4],
     /// Predicted acceleration, `[forward, left]`, when the measurement froze.
     frozen_from: Option<[f64; 2]>,
@@ -130,18 +132,21 @@ pub(super) struct Accelerometer {
 }
 
 impl Accelerometer {
+    /// Discards all measurements, because the motion since is unknown.
     pub(super) fn restart(&mut self) {
         *self = Self::default();
     }
 
-    /// Adds a measurement; `is_specific_force` says whether it contains gravity on a slope.
-    pub(super) fn take(&mut self, felt: BodyAcceleration, is_specific_force: bool) {
+    /// Adds a measurement of the present bin; `is_specific_force` states whether it contains
+    /// gravity on a slope.
+    pub(super) fn take(&mut self, measured: BodyAcceleration, is_specific_force: bool) {
         self.is_specific_force = is_specific_force;
-        self.sum.forward_m_s2 += felt.forward_m_s2;
-        self.sum.left_m_s2 += felt.left_m_s2;
+        self.sum.forward_m_s2 += measured.forward_m_s2;
+        self.sum.left_m_s2 += measured.left_m_s2;
         self.count += 1.0;
     }
 
+    /// Returns the contradiction found in the last bin.
     pub(super) fn verdict(&self) -> Option<Finding> {
         self.verdict
     }
@@ -175,13 +180,16 @@ impl Accelerometer {
         }
         #[expect(clippy::cast_precision_loss, reason = "there are few bins")]
         let bins = BINS as f64;
-        let expected = [
+        let predicted = [
             (self.speeds_m_s[BINS] - self.speeds_m_s[0]) / (bins * BIN_S),
             speed_m_s * motion.gyro_rad_s,
         ];
         let mean = |of: fn(&BodyAcceleration) -> f64| self.means.iter().map(of).sum::<f64>() / bins;
-        let felt = [mean(|felt| felt.forward_m_s2), mean(|felt| felt.left_m_s2)];
-        let accelerations = [felt.into(), expected.into()];
+        let measured = [
+            mean(|measured| measured.forward_m_s2),
+            mean(|measured| measured.left_m_s2),
+        ];
+        let accelerations = [measured.into(), predicted.into()];
         let axes = comparisons(accelerations);
         let middle_rad = self.heading_rad - 0.5 * bins * BIN_S * motion.gyro_rad_s;
         let heading_rad = self.is_specific_force.then_some(middle_rad);
@@ -197,10 +205,11 @@ impl Accelerometer {
             .or_else(|| self.scaled(gain));
         self.is_healthy = self.verdict.is_none()
             && !repeats.is_frozen()
-            && gain.is_some_and(|(gain, _)| (GAIN_AGREES..=GAIN_MAX).contains(&gain));
+            && gain.is_some_and(|(gain, _)| (GAIN_MIN..=GAIN_MAX).contains(&gain));
     }
 
-    /// Returns the gain and its standard deviation; None without enough excitation.
+    /// Updates the regression of measured on predicted accelerations. Returns its gain and the
+    /// gain's standard deviation; None without enough excitation.
     fn regress(&mut self) -> Option<(f64, f64)> {
         let keep = (-BIN_S / MEMORY_S).exp();
         let before = if self.sums[1] > 0.0 {
@@ -248,7 +257,7 @@ impl Accelerometer {
         } else {
             1.0
         };
-        let evidence_s = weight * BIN_S * (GAIN_OF_ICE - gain);
+        let evidence_s = weight * BIN_S * (SLIP_GAIN_MIN - gain);
         self.inverted_s = (self.inverted_s + evidence_s).clamp(0.0, 1.0);
     }
 
@@ -370,15 +379,15 @@ mod tests {
                 last_m_s = motion.linear_m_s;
                 let of_motion = [forward_m_s2, motion.linear_m_s * motion.angular_rad_s];
                 let of_slope = [x * cos + y * sin, y * cos - x * sin];
-                let felt = [0, 1].map(|axis: usize| {
+                let measured = [0, 1].map(|axis: usize| {
                     self.gain * (of_motion[axis] + GRAVITY_M_S2 * of_slope[axis])
                         + self.offset_m_s2[axis]
                 });
-                let felt = BodyAcceleration {
-                    forward_m_s2: felt[0],
-                    left_m_s2: felt[1],
+                let measured = BodyAcceleration {
+                    forward_m_s2: measured[0],
+                    left_m_s2: measured[1],
                 };
-                own.take(felt, true);
+                own.take(measured, true);
                 let means = Means {
                     gyro_rad_s: motion.angular_rad_s,
                     wheels: motion,

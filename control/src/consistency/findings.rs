@@ -53,14 +53,15 @@ impl Subject {
         }
     }
 
-    /// Returns whether dead reckoning by wheels and gyro may be right if this subject is wrong.
-    pub(super) fn is_beside_dead_reckoning(self) -> bool {
+    /// Returns whether dead reckoning by wheels and gyro does not use this subject, so that it may
+    /// be right while the subject is wrong.
+    pub(super) fn is_outside_dead_reckoning(self) -> bool {
         matches!(self, Self::Odometry | Self::Position)
     }
 
     /// Returns whether the robot's position may be wrong under this finding. A robot that must not
     /// move without a position cannot show by motion that the finding is over.
-    pub(super) fn is_of_place(self) -> bool {
+    pub(super) fn concerns_position(self) -> bool {
         matches!(self, Self::Position | Self::Motion)
     }
 
@@ -79,7 +80,7 @@ impl Subject {
     }
 }
 
-/// Restriction under a finding; later ones are stricter and include the earlier.
+/// Restriction of the robot under a finding; later ones are stricter and include the earlier.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Consequence {
     /// Friction is not estimated.
@@ -136,7 +137,7 @@ impl Unit {
 /// Contradiction between one subject and the other channels.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Finding {
-    /// Subject that is wrong.
+    /// Sensor channel or group of channels that contradicts the others.
     pub subject: Subject,
     /// Type of fault.
     pub kind: Kind,
@@ -157,7 +158,7 @@ pub(super) struct Comparison {
 }
 
 impl Comparison {
-    /// Returns the comparison with the other channel as the doubtful one.
+    /// Returns the comparison from the other channel's view: observed and predicted swapped.
     pub(super) fn reversed(self) -> Self {
         Self {
             observed: self.predicted,
@@ -166,21 +167,21 @@ impl Comparison {
     }
 }
 
-/// Active findings, in the order of [`Subject::ALL`].
+/// Active findings of the monitor, at most one per subject.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Findings {
-    pub(super) standing: [Option<Finding>; Subject::ALL.len()],
+    pub(super) active: [Option<Finding>; Subject::ALL.len()],
 }
 
 impl Findings {
-    /// Returns all active findings.
+    /// Returns all active findings, in the order of [`Subject::ALL`].
     pub fn iter(&self) -> impl Iterator<Item = &Finding> {
-        self.standing.iter().flatten()
+        self.active.iter().flatten()
     }
 
     /// Returns the active finding about a subject, if there is one.
     pub fn about(&self, subject: Subject) -> Option<&Finding> {
-        self.standing[subject as usize].as_ref()
+        self.active[subject as usize].as_ref()
     }
 
     /// Returns the strictest restriction of all active findings; None without findings.

@@ -16,7 +16,8 @@ use crate::localisation::FixNoise;
 
 /// Number of fixes kept: the longest span and [`BEFORE_S`] at 20 Hz.
 const FIXES: usize = 52;
-/// Minimum number of fixes in a span, and together with those before it.
+/// Minimum number of fixes in a span, and minimum number of these and those in [`BEFORE_S`]
+/// together.
 const FIXES_MIN: (usize, usize) = (3, 5);
 /// Time before a span whose fixes are used too, seconds.
 const BEFORE_S: f64 = 0.6;
@@ -27,14 +28,14 @@ const USUAL: (f64, f64) = (0.06, 0.03);
 /// noise is correlated.
 const DRIFT: (f64, f64) = (0.01, 0.002);
 /// Number of standard deviations from both neighbours above which a fix is an outlier.
-const WILD_STD_DEVS: f64 = 6.0;
+const OUTLIER_STD_DEVS: f64 = 6.0;
 /// Minimum standard deviation of a fix, metres and radians.
 const STD_DEV_MIN: (f64, f64) = (0.02, 0.008);
 /// Number of standard deviations of noise that are tolerated; spans overlap, so few are
 /// independent.
 const STD_DEVS: f64 = 4.3;
 /// Number of standard deviations that are tolerated in spans shorter than [`SHORT_S`] seconds.
-const DEVIATIONS_SHORT: f64 = 5.0;
+const STD_DEVS_SHORT: f64 = 5.0;
 const SHORT_S: f64 = 0.5;
 /// Minimum jump of the position, metres; smaller ones are left to localisation.
 const JUMP_M: f64 = 0.5;
@@ -54,11 +55,12 @@ const BACK_AFTER_S: f64 = 1.0;
 struct Fix {
     at_s: f64,
     pose: Pose,
+    /// Position and heading by dead reckoning with wheels and gyro.
     integrated: Point,
     integrated_rad: f64,
-    /// Heading by wheels minus heading by gyro, radians; distance by odometry minus distance by
-    /// wheels, metres.
+    /// Heading by wheels minus heading by gyro, radians.
     wheels_lead_rad: f64,
+    /// Distance by odometry minus distance by wheels, metres.
     odometry_lead_m: f64,
 }
 
@@ -75,8 +77,8 @@ impl Fix {
     }
 
     /// Propagates this fix to the time of `to` by dead reckoning. Returns the pose in the site
-    /// frame and the distance travelled, metres.
-    fn carried(&self, to: &Self) -> (Pose, f64) {
+    /// frame, and the distance between both positions by dead reckoning, metres.
+    fn propagated(&self, to: &Self) -> (Pose, f64) {
         let offset_rad = self.pose.heading_rad - self.integrated_rad;
         let (sin, cos) = offset_rad.sin_cos();
         let (x_m, y_m) = (
@@ -91,10 +93,10 @@ impl Fix {
         (pose, x_m.hypot(y_m))
     }
 
-    /// Returns the difference of `other` to the pose propagated from this fix: distance in metres,
-    /// heading in radians, and the distance travelled in metres.
+    /// Compares `other` with the pose propagated from this fix. Returns the distance, metres, the
+    /// heading difference, radians, and the distance travelled by dead reckoning, metres.
     fn error(&self, other: &Self) -> (f64, f64, f64) {
-        let (expected, driven_m) = self.carried(other);
+        let (expected, driven_m) = self.propagated(other);
         let by_gyro_rad = wrap_angle_rad(other.pose.heading_rad - expected.heading_rad);
         let by_wheels_rad =
             wrap_angle_rad(by_gyro_rad - (other.wheels_lead_rad - self.wheels_lead_rad));
@@ -112,10 +114,10 @@ impl Fix {
     }
 }
 
-/// Motion by fixes minus motion by dead reckoning over a span.
+/// Residual of fixes over a span: motion by fixes minus motion by dead reckoning.
 #[expect(clippy::struct_field_names, reason = "units stand last")]
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Seen {
+pub(super) struct FixResidual {
     /// Start and end of the span, seconds.
     pub(super) from_s: f64,
     pub(super) to_s: f64,
@@ -136,7 +138,8 @@ pub(super) struct Seen {
     pub(super) wheels_noise_rad_s: f64,
 }
 
-impl Seen {
+impl FixResidual {
+    /// Returns the span over which it was computed.
     pub(super) fn span(&self) -> Span {
         Span {
             from_s: self.from_s,
@@ -145,17 +148,17 @@ impl Seen {
     }
 }
 
-/// Jump of the position, in metres and radians.
+/// Jump of the fixes relative to dead reckoning: distance and heading difference.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Jump {
     pub(super) by_m: f64,
     pub(super) by_rad: f64,
 }
 
-/// Recent fixes.
+/// Recent fixes in a ring buffer, and the state of a jump.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Fixes {
-    ring: [Fix; FIXES],
+    recent: [Fix; FIXES],
     count: usize,
     newest: usize,
     std_devs: (f64, f64),
@@ -176,7 +179,7 @@ pub(super) struct Fixes {
 impl Default for Fixes {
     fn default() -> Self {
         Self {
-            ring: [Fix::default(); FIXES],
+            recent: [Fix::default(); FIXES],
             count: 0,
             newest: 0,
             std_devs: STD_DEV_MIN,
@@ -212,7 +215,7 @@ impl Fixes {
 
     /// Returns the newest fix that is used.
     pub(super) fn newest(&self) -> Option<Pose> {
-        (self.count > 0).then(|| self.ring[self.newest].pose)
+        (self.count > 0).then(|| self.recent[self.newest].pose)
     }
 
     /// Returns the standard deviations of a fix, metres and radians.
@@ -225,7 +228,8 @@ impl Fixes {
         self.jump
     }
 
-    /// Adds a fix; returns whether it is used.
+    /// Adds a fix measured at `at_s`, site frame; returns whether it is used. It is not if the
+    /// history does not reach back to it, if it is older than the last one, or during a jump.
     pub(super) fn take(
         &mut self,
         at_s: f64,
@@ -249,7 +253,7 @@ impl Fixes {
         let fix = Fix::new(pose, &edge);
         if self.is_expected(fix) {
             self.newest = (self.newest + 1) % FIXES;
-            self.ring[self.newest] = fix;
+            self.recent[self.newest] = fix;
             self.count = (self.count + 1).min(FIXES);
             true
         } else {
@@ -319,10 +323,11 @@ impl Fixes {
         self.back_since_s = None;
     }
 
-    /// Returns the difference of motion over the last `span_s` seconds; None with too few fixes.
-    pub(super) fn seen(&self, span_s: f64) -> Option<Seen> {
-        let newest = self.ring[self.newest];
-        let fix = |places: usize| &self.ring[(self.newest + FIXES - places) % FIXES];
+    /// Fits the residual over the last `span_s` seconds; None with too few fixes, or if the fit is
+    /// singular.
+    pub(super) fn residual(&self, span_s: f64) -> Option<FixResidual> {
+        let newest = self.recent[self.newest];
+        let fix = |places: usize| &self.recent[(self.newest + FIXES - places) % FIXES];
         let age_s = |places: usize| newest.at_s - fix(places).at_s;
         let within = |most_s: f64| {
             (0..self.count)
@@ -374,8 +379,8 @@ impl Fixes {
             };
             let points = (0..used).map(|places| (times_s[places], errors[places][column]));
             let away = |one: usize, other: usize| errors[one][column] - errors[other][column];
-            let most = WILD_STD_DEVS * std_dev;
-            let wild = |places: usize| match places {
+            let most = OUTLIER_STD_DEVS * std_dev;
+            let is_outlier = |places: usize| match places {
                 // The newest fix has one neighbour only; the next fix decides.
                 0 => away(0, 1).abs() > most && away(1, 2).abs() < 0.5 * most,
                 _ if places + 1 == used => false,
@@ -386,7 +391,7 @@ impl Fixes {
             };
             let points = points
                 .enumerate()
-                .filter(|(places, _)| !wild(*places))
+                .filter(|(places, _)| !is_outlier(*places))
                 .map(|(_, point)| point);
             let bend = Bend {
                 begin_s: -span_s,
@@ -402,11 +407,11 @@ impl Fixes {
         let (turn, wheels_turn) = (turn?, wheels_turn?);
         // A short span has few fixes, and there are many short spans.
         let std_devs = if span_s < SHORT_S {
-            DEVIATIONS_SHORT
+            STD_DEVS_SHORT
         } else {
             STD_DEVS
         };
-        Some(Seen {
+        Some(FixResidual {
             from_s: newest.at_s - span_s,
             to_s: newest.at_s,
             forward_error_m_s: forward.0,
@@ -426,10 +431,11 @@ impl Fixes {
 const COLUMNS: usize = 5;
 const HEADING: usize = 3;
 
-/// Line with a bend at `begin_s`.
+/// Fit of a line that bends at `begin_s`.
 #[derive(Debug, Clone, Copy)]
 struct Bend {
     begin_s: f64,
+    /// Minimum standard deviation of a point.
     std_dev: f64,
     /// Standard deviation of the slope before the bend.
     usual: f64,

@@ -11,17 +11,20 @@ pub(super) const BIN_S: f64 = 0.05;
 const EDGES: usize = 64;
 /// Maximum age of odometry that is used, seconds.
 const ODOMETRY_AGE_MAX_S: f64 = 0.25;
-/// Minimum fraction of a span with odometry.
+/// Minimum fraction of a span in which there was odometry, for a mean of odometry over it.
 const ODOMETRY_SHARE_MIN: f64 = 0.8;
 
-/// Integrals up to one time.
+/// Integrals of the measurements from the last restart up to one time, the edge of a bin.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Edge {
     pub(super) at_s: f64,
+    /// Heading by gyro and by wheels.
     gyro_rad: f64,
     wheels_rad: f64,
+    /// Distance by wheels and by odometry.
     wheels_m: f64,
     odometry_m: f64,
+    /// Time with odometry.
     odometry_s: f64,
     /// Position by dead reckoning with wheels and gyro, metres.
     pub(super) at: Point,
@@ -45,7 +48,8 @@ impl Edge {
         self.odometry_m - self.wheels_m
     }
 
-    fn toward(&self, later: &Self, at_s: f64) -> Self {
+    /// Interpolates linearly to a time between this edge and a later one.
+    fn interpolated(&self, later: &Self, at_s: f64) -> Self {
         let span_s = later.at_s - self.at_s;
         let share = if span_s > 0.0 {
             ((at_s - self.at_s) / span_s).clamp(0.0, 1.0)
@@ -91,7 +95,7 @@ pub(super) struct Commanded {
     pub(super) most: Twist,
 }
 
-/// Integrals over the last seconds.
+/// Integrals of wheels, gyro and odometry at the edges of the last bins, in a ring buffer.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct History {
     now: Edge,
@@ -99,6 +103,7 @@ pub(super) struct History {
     /// Number of edges, and index of the newest.
     count: usize,
     newest: usize,
+    /// Last odometry, metres per second, and its time, seconds.
     odometry: Option<(f64, f64)>,
 }
 
@@ -124,16 +129,19 @@ impl History {
         self.push();
     }
 
+    /// Ends the bin: keeps the present integrals as its edge.
     fn push(&mut self) {
         self.newest = (self.newest + 1) % EDGES;
         self.edges[self.newest] = self.now;
         self.count = (self.count + 1).min(EDGES);
     }
 
+    /// Sets the twist commanded from now on.
     pub(super) fn command(&mut self, command: Twist) {
         self.now.command = command;
     }
 
+    /// Sets the forward speed by odometry, which applies for [`ODOMETRY_AGE_MAX_S`].
     pub(super) fn odometry(&mut self, forward_m_s: f64) {
         self.odometry = Some((forward_m_s, self.now.at_s));
     }
@@ -163,11 +171,12 @@ impl History {
         is_due
     }
 
+    /// Returns the integrals up to the last measurement.
     pub(super) fn now(&self) -> Edge {
         self.now
     }
 
-    /// The span of this length that ends now.
+    /// Returns the span of a length in seconds that ends now.
     pub(super) fn last(&self, length_s: f64) -> Span {
         let to_s = self.now.at_s;
         Span {
@@ -188,7 +197,7 @@ impl History {
         for places in 0..self.count {
             let edge = self.before(places)?;
             if edge.at_s <= at_s {
-                return Some(edge.toward(&later, at_s));
+                return Some(edge.interpolated(&later, at_s));
             }
             later = *edge;
         }

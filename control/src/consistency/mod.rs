@@ -37,7 +37,7 @@ use crate::robot::RobotModel;
 use accelerometer::Accelerometer;
 use findings::Comparison;
 pub use findings::{Consequence, Finding, Findings, Kind, Subject, Unit};
-use fixes::{Fixes, Seen};
+use fixes::{FixResidual, Fixes};
 use history::{BIN_S, History, Span};
 use repeats::Repeats;
 use track::Track;
@@ -72,7 +72,7 @@ pub struct Sample {
     pub position_noise: Option<FixNoise>,
 }
 
-/// Repeated values by channel.
+/// Consecutive equal values of each channel.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct AllRepeats {
     gyro: Repeats,
@@ -82,14 +82,14 @@ struct AllRepeats {
     position: Repeats,
 }
 
-/// Consistency monitor of one robot.
+/// Consistency monitor of one robot. Does not allocate.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Monitor {
     model: RobotModel,
     history: History,
     fixes: Fixes,
-    /// Difference of motion by fixes for each span, computed at the last fix.
-    seen: [Option<Seen>; SPANS_S.len()],
+    /// Motion by fixes minus dead reckoning for each of [`SPANS_S`], computed at the last fix.
+    residuals: [Option<FixResidual>; SPANS_S.len()],
     last_fix: Option<Duration>,
     last: Option<Duration>,
     repeats: AllRepeats,
@@ -107,7 +107,7 @@ impl Monitor {
             model,
             history: History::default(),
             fixes: Fixes::default(),
-            seen: [None; SPANS_S.len()],
+            residuals: [None; SPANS_S.len()],
             last_fix: None,
             last: None,
             repeats: AllRepeats::default(),
@@ -121,7 +121,7 @@ impl Monitor {
     /// Returns the active findings.
     pub fn findings(&self) -> Findings {
         Findings {
-            standing: self.tracks.map(|track| track.standing),
+            active: self.tracks.map(|track| track.active),
         }
     }
 
@@ -133,27 +133,29 @@ impl Monitor {
         }
     }
 
-    /// Adds a sample; samples come in the order of their arrival. Non-finite values are ignored.
+    /// Adds a sample and evaluates all channels whenever a bin of 50 ms has ended. Samples come in
+    /// the order of their arrival. Non-finite values are ignored.
     pub fn take(&mut self, sample: &Sample) {
         let at = sample.at;
         if let Some(odometry_m_s) = finite(sample.odometry_m_s) {
             self.repeats.odometry.take(at, [odometry_m_s, 0.0, 0.0]);
             self.history.odometry(odometry_m_s);
         }
-        if let Some(felt) = sample.acceleration
-            && felt.forward_m_s2.is_finite()
-            && felt.left_m_s2.is_finite()
+        if let Some(acceleration) = sample.acceleration
+            && acceleration.forward_m_s2.is_finite()
+            && acceleration.left_m_s2.is_finite()
         {
-            let words = [felt.forward_m_s2, felt.left_m_s2, 0.0];
+            let words = [acceleration.forward_m_s2, acceleration.left_m_s2, 0.0];
             self.repeats.acceleration.take(at, words);
-            self.accelerometer.take(felt, sample.is_specific_force);
+            self.accelerometer
+                .take(acceleration, sample.is_specific_force);
         }
         let wheels = sample.wheel_speeds.filter(|wheels| wheels.is_finite());
         if let (Some(gyro_rad_s), Some(wheels)) = (finite(sample.gyro_rad_s), wheels) {
             self.repeats.gyro.take(at, [gyro_rad_s, 0.0, 0.0]);
             let words = [wheels.left_rad_s, wheels.right_rad_s, 0.0];
             self.repeats.wheels.take(at, words);
-            self.follow(at, gyro_rad_s, self.model.twist_from_wheel_speeds(wheels));
+            self.add_motion(at, gyro_rad_s, self.model.twist_from_wheel_speeds(wheels));
         }
         if let Some(pose) = sample.position.filter(|pose| pose.is_finite()) {
             let words = [pose.x_m, pose.y_m, pose.heading_rad];
@@ -165,13 +167,14 @@ impl Monitor {
                     .take(at.as_secs_f64(), pose, noise, &self.history);
                 if is_used {
                     self.last_fix = Some(at);
-                    self.seen = SPANS_S.map(|span_s| self.fixes.seen(span_s));
+                    self.residuals = SPANS_S.map(|span_s| self.fixes.residual(span_s));
                 }
             }
         }
     }
 
-    fn follow(&mut self, at: Duration, gyro_rad_s: f64, wheels: Twist) {
+    /// Adds gyro and wheels at a time; after a gap, restarts everything that integrates motion.
+    fn add_motion(&mut self, at: Duration, gyro_rad_s: f64, wheels: Twist) {
         let is_gap = self
             .last
             .is_none_or(|last| at.saturating_sub(last) > GAP_MAX);
@@ -180,22 +183,22 @@ impl Monitor {
             // The motion during the gap is unknown.
             self.history.restart(at);
             self.fixes.restart();
-            self.seen = [None; SPANS_S.len()];
+            self.residuals = [None; SPANS_S.len()];
             self.last_fix = None;
             self.accelerometer.restart();
             for track in &mut self.tracks {
-                track.against_s = 0.0;
+                track.contradicting_s = 0.0;
                 track.rested_s = 0.0;
             }
             return;
         }
         if self.history.add(at, gyro_rad_s, wheels) {
-            self.judge();
+            self.evaluate();
         }
     }
 
     /// Evaluates all channels at the end of a bin.
-    fn judge(&mut self) {
+    fn evaluate(&mut self) {
         let now_s = self.history.now().at_s;
         if let Some(recent) = self.history.means(self.history.last(BIN_S)) {
             self.accelerometer.step(&recent, &self.repeats.acceleration);
@@ -203,26 +206,26 @@ impl Monitor {
         let fix_age_s = self
             .last_fix
             .map_or(f64::INFINITY, |fix| now_s - fix.as_secs_f64());
-        let seen = if fix_age_s <= FIX_AGE_MAX_S {
-            self.seen
+        let residuals = if fix_age_s <= FIX_AGE_MAX_S {
+            self.residuals
         } else {
             [None; SPANS_S.len()]
         };
         let mut verdicts = Verdicts::default();
-        let stands = self.stands();
+        let is_standing = self.update_standing();
         let view = verdict::View {
             model: &self.model,
             history: &self.history,
-            seen: &seen,
+            residuals: &residuals,
             jump: self.fixes.jump(),
             repeats: &self.repeats,
             tracks: &self.tracks,
             turn_gain: self.turn_gain,
-            stands,
-            uses: verdict::Uses::default(),
+            is_standing,
+            channels: verdict::Channels::default(),
         }
-        .with_believed();
-        verdict::judge(&view, &mut verdicts);
+        .with_trusted();
+        verdict::evaluate(&view, &mut verdicts);
         // Motion of the wheels that is not the body's would appear as a wrong gain of the
         // accelerometer.
         let is_quiet = self
@@ -231,11 +234,11 @@ impl Monitor {
             .zip(Subject::ALL)
             .all(|(track, subject)| {
                 subject == Subject::Accelerometer
-                    || track.against_s <= 0.0
-                    || (track.standing.is_some() && subject.is_beside_dead_reckoning())
+                    || track.contradicting_s <= 0.0
+                    || (track.active.is_some() && subject.is_outside_dead_reckoning())
             });
         if is_quiet && verdicts.is_consistent() {
-            if seen.iter().any(Option::is_some)
+            if residuals.iter().any(Option::is_some)
                 && let Some(recent) = self.history.means(Span {
                     from_s: now_s - LEARN_FROM_S,
                     to_s: now_s - LEARN_TO_S,
@@ -257,7 +260,7 @@ impl Monitor {
         let is_on_probation = self.is_on_probation();
         for (track, subject) in self.tracks.iter_mut().zip(Subject::ALL) {
             let verdict = verdicts.of(subject);
-            let is_at_once = is_on_probation && !stands && subject.is_of_place();
+            let is_at_once = is_on_probation && !is_standing && subject.concerns_position();
             track.step(if is_at_once {
                 verdict.at_once()
             } else {
@@ -266,11 +269,11 @@ impl Monitor {
         }
         let has_relapsed = is_on_probation
             && Subject::ALL.into_iter().any(|subject| {
-                subject.is_of_place() && self.tracks[subject as usize].standing.is_some()
+                subject.concerns_position() && self.tracks[subject as usize].active.is_some()
             });
         if has_relapsed {
             for (track, subject) in self.tracks.iter_mut().zip(Subject::ALL) {
-                if subject.is_of_place() {
+                if subject.concerns_position() {
                     track.reactivate();
                 }
             }
@@ -283,9 +286,9 @@ impl Monitor {
         self.tracks.iter().any(|track| track.is_on_probation)
     }
 
-    /// Returns whether command and wheels are at zero speed, and the fixes stay where they were
-    /// when the robot stopped.
-    fn stands(&mut self) -> bool {
+    /// Returns whether the robot stands: command and wheels are at zero speed, and the fixes stay
+    /// where they were when the robot stopped. Records or clears the position of that stop.
+    fn update_standing(&mut self) -> bool {
         let commanded = self.history.commanded(self.history.last(REST_SPAN_S));
         let is_commanded = [commanded.least, commanded.most]
             .iter()
@@ -308,8 +311,8 @@ impl Monitor {
         let turned_rad = wrap_angle_rad(newest.heading_rad - rest_at.heading_rad);
         let (position_m, heading_rad) = self.fixes.std_devs();
         let stays = rest_at.point().distance_m(newest.point())
-            <= REST_DISTANCE_MAX_M.max(REST_DEVIATIONS * position_m)
-            && turned_rad.abs() <= REST_TURN_MAX_RAD.max(REST_DEVIATIONS * heading_rad);
+            <= REST_DISTANCE_MAX_M.max(REST_STD_DEVS * position_m)
+            && turned_rad.abs() <= REST_TURN_MAX_RAD.max(REST_STD_DEVS * heading_rad);
         if !stays {
             self.rest_at = None;
         }
@@ -326,7 +329,7 @@ const REST_RAD_S: f64 = 0.05;
 /// standard deviations of a fix if that is more.
 const REST_DISTANCE_MAX_M: f64 = 0.3;
 const REST_TURN_MAX_RAD: f64 = 0.1;
-const REST_DEVIATIONS: f64 = 7.0;
+const REST_STD_DEVS: f64 = 7.0;
 
 /// Window in which the turn gain is learned, seconds ago: a fault is found sooner than that.
 const LEARN_FROM_S: f64 = 2.3;

@@ -18,11 +18,11 @@ pub(super) struct Repeats {
     words: [u64; 3],
     since: Option<Duration>,
     count: u32,
-    for_long: Duration,
+    duration: Duration,
 }
 
 impl Repeats {
-    /// Adds the next value.
+    /// Adds the next measurement of the channel: up to three values, the others 0.
     pub(super) fn take(&mut self, at: Duration, values: [f64; 3]) {
         let words = values.map(f64::to_bits);
         if self.since.is_none() || words != self.words {
@@ -30,23 +30,23 @@ impl Repeats {
                 words,
                 since: Some(at),
                 count: 1,
-                for_long: Duration::ZERO,
+                duration: Duration::ZERO,
             };
         } else {
             self.count = self.count.saturating_add(1);
-            self.for_long = at.saturating_sub(self.since.unwrap_or(at));
+            self.duration = at.saturating_sub(self.since.unwrap_or(at));
         }
     }
 
     /// Returns whether the values have been equal for [`FROZEN_AFTER`].
     pub(super) fn is_frozen(&self) -> bool {
-        self.count >= FROZEN_COUNT && self.for_long >= FROZEN_AFTER
+        self.count >= FROZEN_COUNT && self.duration >= FROZEN_AFTER
     }
 
     /// Returns whether the values have been equal for [`REPEATING_AFTER`], and may prove to be
     /// frozen.
     pub(super) fn is_repeating(&self) -> bool {
-        self.count >= REPEATING_COUNT && self.for_long >= REPEATING_AFTER
+        self.count >= REPEATING_COUNT && self.duration >= REPEATING_AFTER
     }
 
     /// Returns the time of the first of the equal values.

@@ -4,7 +4,7 @@
 //! finding about the position may forbid the robot to move, so it also ends at standstill, when
 //! fixes agree with each other and with a stopped robot for [`REST_CLEAR_S`]. That does not prove
 //! the channel right in motion: until motion does, the track is on probation, and the first
-//! contradiction makes the finding active again. Each such reactivate doubles the time required at
+//! contradiction makes the finding active again. Each such relapse doubles the time required at
 //! standstill.
 
 use super::Finding;
@@ -15,7 +15,7 @@ use super::verdict::Verdict;
 const CLEAR_S: f64 = 2.0;
 
 /// Time for which fixes must agree with each other and with a stopped robot until a finding about
-/// them ends at standstill, seconds; it doubles with each reactivate, up to the second value.
+/// them ends at standstill, seconds; it doubles with each relapse, up to the second value.
 const REST_CLEAR_S: f64 = 10.0;
 const REST_CLEAR_MAX_S: f64 = 600.0;
 /// Maximum number of relapses that are counted.
@@ -24,32 +24,37 @@ const RELAPSES_MAX: u32 = 16;
 /// Evidence on one subject.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Track {
-    pub(super) against_s: f64,
+    /// Time for which the subject has contradicted the others, less twice the time since, seconds.
+    pub(super) contradicting_s: f64,
+    /// Time for which it has agreed in motion, seconds.
     agreeing_s: f64,
-    /// Time for which it has agreed at standstill, seconds, and number of relapses.
+    /// Time for which it has agreed at standstill, seconds.
     pub(super) rested_s: f64,
+    /// Number of findings that ended at standstill and became active again.
     relapses: u32,
     /// Whether its finding ended at standstill and no motion has confirmed that since.
     pub(super) is_on_probation: bool,
-    pub(super) standing: Option<Finding>,
+    /// Active finding.
+    pub(super) active: Option<Finding>,
     /// Last finding, kept until motion has shown that it is over.
     pub(super) found: Option<Finding>,
 }
 
 impl Track {
+    /// Adds the result of one bin; starts or ends the finding.
     pub(super) fn step(&mut self, verdict: Verdict) {
         match verdict {
-            Verdict::Against(finding, raise_s) => {
+            Verdict::Contradicts(finding, raise_s) => {
                 self.agreeing_s = 0.0;
                 self.rested_s = 0.0;
-                self.against_s += BIN_S;
-                if self.against_s >= raise_s - 0.5 * BIN_S && self.standing.is_none() {
-                    self.standing = Some(finding);
+                self.contradicting_s += BIN_S;
+                if self.contradicting_s >= raise_s - 0.5 * BIN_S && self.active.is_none() {
+                    self.active = Some(finding);
                     self.found = Some(finding);
                 }
                 return;
             }
-            Verdict::StillAgainst => {
+            Verdict::StillContradicts => {
                 self.agreeing_s = 0.0;
                 // A short contradiction by noise reduces the time at standstill only in part.
                 self.rested_s = (self.rested_s - 5.0 * BIN_S).max(0.0);
@@ -58,21 +63,21 @@ impl Track {
             Verdict::Agrees => self.agreeing_s += BIN_S,
             Verdict::AgreesAtRest => {
                 self.rested_s += BIN_S;
-                if self.standing.is_some() && self.rested_s >= self.rest_s() {
-                    self.standing = None;
+                if self.active.is_some() && self.rested_s >= self.rest_s() {
+                    self.active = None;
                     self.is_on_probation = true;
                     self.rested_s = 0.0;
                 }
             }
             Verdict::Nothing => self.rested_s = 0.0,
         }
-        self.against_s = (self.against_s - 2.0 * BIN_S).max(0.0);
+        self.contradicting_s = (self.contradicting_s - 2.0 * BIN_S).max(0.0);
         if self.agreeing_s >= CLEAR_S {
             *self = Self::default();
         }
     }
 
-    /// Returns the required time of agreement at standstill, seconds, doubled with each reactivate.
+    /// Returns the required time of agreement at standstill, seconds, doubled with each relapse.
     fn rest_s(&self) -> f64 {
         (REST_CLEAR_S * 2.0_f64.powi(self.relapses.cast_signed())).min(REST_CLEAR_MAX_S)
     }

@@ -35,7 +35,7 @@ impl TurnGain {
         self.square = keep * self.square + BIN_S * wheels_rad_s * wheels_rad_s;
     }
 
-    /// Returns the gain, once the robot has turned enough.
+    /// Returns the gain, 0.7 to 1.3; None until the robot has turned enough.
     pub(super) fn known(&self) -> Option<f64> {
         (self.square >= KNOWN_MIN)
             .then(|| (self.product / self.square).clamp(*GAIN.start(), *GAIN.end()))

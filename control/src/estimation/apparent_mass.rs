@@ -10,7 +10,7 @@
 //! and inertia j of rotors and wheels at the rim. c₀ is the rolling resistance coefficient, c₁ and
 //! c₂ are the slope in the directions of heading ψ = 0 and π/2; with the specific force as a, which
 //! contains the slope, both are 0. Each row is a mean over a block.
-//! c₀, c₁ and c₂ are eliminated in each window, because the slope may change between windows, and
+//! c₀, c₁ and c₂ are marginalised in each window, because the slope may change between windows, and
 //! the information on q is summed. Measured torques are relative to the model's mass, so q is also
 //! the factor that corrects θ from torques, except for j.
 
@@ -21,7 +21,7 @@ use crate::robot::{GRAVITY_M_S2, RobotModel};
 
 /// Number of blocks of a window, over whose path the slope is assumed constant.
 const WINDOW_BLOCKS: u32 = 25;
-/// Prior mean and standard deviation of the rolling resistance coefficient.
+/// Prior mean of the rolling resistance coefficient, and also its standard deviation.
 const ROLLING_STD_DEV: f64 = 0.02;
 /// Prior standard deviation of the slope, radians.
 const SLOPE_STD_DEV_RAD: f64 = 0.05;
@@ -34,12 +34,14 @@ const UNEVEN_MU: f64 = 0.002;
 
 /// Sums over the samples of the current block.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-struct Means {
+struct BlockSums {
     duration_s: f64,
     samples: f64,
     mu: f64,
     forward_m_s2: f64,
+    /// Sign of the rim speeds.
     sign: f64,
+    /// Whether a sample without torque or acceleration, or at low speed, makes the block unusable.
     is_broken: bool,
 }
 
@@ -57,15 +59,16 @@ struct Window {
 /// Estimator of the apparent mass.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct ApparentMass {
-    block: Means,
+    block: BlockSums,
     window: Window,
     heading_rad: f64,
+    /// Information on q of the closed windows, and its product with q.
     information: f64,
     weighted: f64,
 }
 
 impl ApparentMass {
-    /// Takes a sample, `dt_s` after the one before. Returns whether it ended a window.
+    /// Adds a sample, `dt_s` seconds after the one before. Returns whether it ended a window.
     pub(super) fn add(
         &mut self,
         sample: &SensorSample,
@@ -98,11 +101,11 @@ impl ApparentMass {
             return false;
         }
         let block = std::mem::take(&mut self.block);
-        !block.is_broken && self.take(&block, noise)
+        !block.is_broken && self.add_block(&block, noise)
     }
 
-    /// Takes a block. Returns whether it ended a window.
-    fn take(&mut self, block: &Means, noise: &SensorNoise) -> bool {
+    /// Adds a block to the window. Returns whether it ended the window.
+    fn add_block(&mut self, block: &BlockSums, noise: &SensorNoise) -> bool {
         let force = block.forward_m_s2 / block.samples / GRAVITY_M_S2;
         let (sin, cos) = self.heading_rad.sin_cos();
         let others = Vector3::new(block.sign, cos, sin);
@@ -118,7 +121,7 @@ impl ApparentMass {
         window.others_response += others * (response / variance);
         window.blocks += 1;
         if window.blocks >= WINDOW_BLOCKS {
-            let (information, weighted) = self.window.eliminated();
+            let (information, weighted) = self.window.marginalised();
             self.information += information;
             self.weighted += weighted;
             self.window = Window::default();
@@ -129,12 +132,12 @@ impl ApparentMass {
 
     /// Restarts the current block after a gap between samples.
     pub(super) fn interrupt(&mut self) {
-        self.block = Means::default();
+        self.block = BlockSums::default();
     }
 
     /// Returns q with the standard deviation of its noise; `None` before the robot has accelerated.
     pub(super) fn value(&self) -> Option<ValueWithStdDev> {
-        let (information, weighted) = self.window.eliminated();
+        let (information, weighted) = self.window.marginalised();
         let information = self.information + information;
         (information > 0.0).then(|| ValueWithStdDev {
             value: (self.weighted + weighted) / information,
@@ -144,8 +147,8 @@ impl ApparentMass {
 }
 
 impl Window {
-    /// Returns the information on q and its product with q, with the other unknowns eliminated.
-    fn eliminated(&self) -> (f64, f64) {
+    /// Returns the information on q and its product with q, with the other unknowns marginalised.
+    fn marginalised(&self) -> (f64, f64) {
         let known = Vector3::new(
             ROLLING_STD_DEV.powi(-2),
             SLOPE_STD_DEV_RAD.powi(-2),
@@ -183,15 +186,15 @@ mod tests {
         rolling: f64,
         slope: f64,
         turn_rad_s: f64,
-        swing: f64,
+        variation: f64,
     ) -> ApparentMass {
         let (model, noise) = (RobotModel::yi2007(), SensorNoise::default());
         let mut found = ApparentMass::default();
         let newton_metres = model.wheel_radius_m() * model.side_load_n();
         for tick in 0..2_000 {
             let time_s = DT_S * f64::from(tick);
-            let forward_m_s2 = 0.6 * swing * (3.0 * time_s).cos();
-            let rim_m_s = 0.6 + 0.2 * swing * (3.0 * time_s).sin();
+            let forward_m_s2 = 0.6 * variation * (3.0 * time_s).cos();
+            let rim_m_s = 0.6 + 0.2 * variation * (3.0 * time_s).sin();
             let mu = apparent * forward_m_s2 / GRAVITY_M_S2
                 + rolling
                 + slope * (turn_rad_s * time_s).cos();

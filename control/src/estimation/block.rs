@@ -1,7 +1,7 @@
 //! Averages samples over blocks of [`BLOCK_S`], and forms the regression rows of a block.
 
-use super::contacts::{BendInput, Loss, MeanSlip};
-use super::curved::{Curvatures, ForceAtSlip, SideSlips, Turn};
+use super::contacts::{CurvatureInput, MeanSlip, StiffnessLoss};
+use super::curved::{Curvatures, ForceAtSlip, SlipBySide, Turn};
 use super::rows::{Regressors, Row, index};
 use super::types::Curvature;
 use super::window::{SampleSpan, TurnMeans, TurnWindow};
@@ -33,7 +33,7 @@ pub(super) struct Force {
     difference_curvature: [f64; 2],
     mean_curvature: [f64; 2],
     /// Ratios of the regressors of θκ and θκ² to the force; they share its noise.
-    bend: [f64; 2],
+    curvature_ratio: [f64; 2],
     /// Covariances of the regressors `difference_curvature` with the response.
     slip_noise: [f64; 2],
     rate: Rate,
@@ -89,6 +89,8 @@ impl Ends {
         }
     }
 
+    /// Returns the rates between both ends of a block; `torque_mu` is the noise of a sample's
+    /// friction coefficient, `sides_m_s` the mean rim speeds. Zero without samples at both ends.
     fn rate(&self, torque_mu: f64, sides_m_s: [f64; 2]) -> Rate {
         let [first, last] = self.samples;
         let apart_s = self.time_s[1] / last - self.time_s[0] / first;
@@ -161,8 +163,8 @@ pub(super) struct Block {
     /// `Wφ̇`, metres per second, and its variance.
     pub(super) turn_m_s: f64,
     pub(super) turn_noise: f64,
-    /// Friction coefficient that was used, minus two standard deviations.
-    pub(super) mu_seen: f64,
+    /// Friction coefficient of the more loaded side, minus two standard deviations, at least 0.
+    pub(super) mu_demonstrated: f64,
     pub(super) rolling_resistance: Option<ValueWithStdDev>,
 }
 
@@ -223,14 +225,14 @@ impl Block {
             response: self.difference_m_s,
             innovation_variance: self.difference_noise,
             force_noise: force.difference_noise,
-            bend: [force.bend[0], force.bend[1], 0.0],
+            curvature_ratio: [force.curvature_ratio[0], force.curvature_ratio[1], 0.0],
             common_noise,
             ramp_noise: 0.0,
             rate_noise: force.rate.difference_noise,
         })
     }
 
-    /// The moment balance, where no torque is measured.
+    /// Returns the row of the moment balance; `None` where torque is measured.
     pub(super) fn turning_row(&self) -> Option<Row> {
         self.turning.filter(|_| self.force.is_none())
     }
@@ -257,7 +259,7 @@ impl Block {
             response: slip_m_s,
             innovation_variance: self.slip_noise,
             force_noise: 0.25 * force.difference_noise,
-            bend: [force.bend[0], force.bend[1], 0.0],
+            curvature_ratio: [force.curvature_ratio[0], force.curvature_ratio[1], 0.0],
             common_noise: Regressors::zeros(),
             ramp_noise: 0.0,
             rate_noise: 0.25 * force.rate.difference_noise,
@@ -313,6 +315,7 @@ pub(super) struct BlockContext<'robot> {
 }
 
 impl BlockBuilder {
+    /// Returns whether the block's time is over.
     pub(super) fn is_full(&self) -> bool {
         self.duration_s >= BLOCK_S - 1.0e-6
     }
@@ -330,6 +333,7 @@ impl BlockBuilder {
         }
     }
 
+    /// Adds a sample, `dt_s` seconds after the one before.
     pub(super) fn add(&mut self, sample: &SensorSample, model: &RobotModel, dt_s: f64) {
         let radius_m = model.wheel_radius_m();
         let left_m_s = sample.wheel_speeds.left_rad_s * radius_m;
@@ -446,7 +450,7 @@ impl BlockBuilder {
             track_width_m: model.track_width_m(),
             turn_m_s: model.track_width_m() * gyro_rad_s,
             turn_noise: (model.track_width_m() * noise.gyro_rad_s).powi(2) / count,
-            mu_seen: (side_mu.hypot(lateral_mu) - mu_noise).max(0.0),
+            mu_demonstrated: (side_mu.hypot(lateral_mu) - mu_noise).max(0.0),
             rolling_resistance: resistance,
         })
     }
@@ -479,7 +483,7 @@ impl BlockBuilder {
             mean_force_m_s
         };
         let rolling_m_s = mean_force_m_s - contact_m_s;
-        let sides = SideSlips::of(&turn, theta * contact_m_s / mean_m_s, model);
+        let sides = SlipBySide::of(&turn, theta * contact_m_s / mean_m_s, model);
         // In reverse the model is that of the mirrored robot.
         let (left_slip, right_slip) = if mean_m_s < 0.0 {
             (sides.right, sides.left)
@@ -508,7 +512,7 @@ impl BlockBuilder {
                 right.curvature_regressor_slope(curvature),
             ];
             let longitudinal = |by: [f64; 2]| slopes[0] * by[order[0]] + slopes[1] * by[order[1]];
-            longitudinal(sides.by_apart) / mean_m_s.abs()
+            longitudinal(sides.by_slip_difference) / mean_m_s.abs()
                 * (rim_noise + model.track_width_m() * turn_noise)
                 - longitudinal(sides.by_turn_s) * turn_noise
         };
@@ -525,7 +529,8 @@ impl BlockBuilder {
             difference_curvature: curvatures.split(of_curvature.map(|[left, right]| right - left)),
             mean_curvature: curvatures
                 .split(of_curvature.map(|[left, right]| 0.5 * (left + right))),
-            bend: curvatures.split(nodes.map(|curvature| unit.curvature_regressor(curvature))),
+            curvature_ratio: curvatures
+                .split(nodes.map(|curvature| unit.curvature_regressor(curvature))),
             slip_noise: curvatures.split(nodes.map(slip_noise)),
             rate: self.ends.rate(noise.torque_mu, [left_m_s, right_m_s]),
         }
@@ -568,26 +573,26 @@ fn turning_row(means: &TurnMeans, context: BlockContext<'_>) -> Row {
         radius_difference: radius_difference * means.rim_mean_m_s.signum(),
     };
     // Control on noisy poses varies the slip within a window; remove the sensor noise from it.
-    let swing = means.swing.without_noise(
+    let variation = means.variation.without_noise(
         (2.0 * rim_noise_m_s.powi(2) + track_m * track_m * gyro_noise) / means.harmonic_m_s.powi(2),
     );
     regressors[index::THETA] = force_m_s;
     let gap = means.rim_difference_m_s / means.harmonic_m_s;
-    let input = BendInput {
+    let input = CurvatureInput {
         turn: &turn,
-        swing: &swing,
+        variation: &variation,
         mu: MeanSlip {
             forward: means.longitudinal_mu,
             lateral: means.harmonic_m_s * means.turn_rad_s / GRAVITY_M_S2,
         },
         theta,
         force_m_s,
-        uneven_m_s: |loss: &Loss| {
+        uneven_m_s: |loss: &StiffnessLoss| {
             means.harmonic_m_s * (4.0 * loss.moment_m / track_m + gap * loss.forward)
         },
     };
-    let (bends, bend) = input.bends(model, curvature);
-    bends.put(&mut regressors);
+    let (curvature_regressors, curvature_ratio) = input.regressors(model, curvature);
+    curvature_regressors.write_to(&mut regressors);
     let difference_noise = 2.0 * rim_noise_m_s.powi(2) / means.samples;
     let mut common_noise = Regressors::zeros();
     common_noise[index::RADIUS_OFFSET] = difference_noise;
@@ -606,7 +611,7 @@ fn turning_row(means: &TurnMeans, context: BlockContext<'_>) -> Row {
         force_noise: ramp_noise
             + (means.rim_difference_m_s * noise.accelerometer_m_s2 / GRAVITY_M_S2).powi(2)
                 / means.samples,
-        bend,
+        curvature_ratio,
         common_noise,
         ramp_noise,
         rate_noise: jerk_noise,
@@ -622,7 +627,8 @@ mod tests {
     proptest! {
         #[test]
         fn the_rate_of_a_straight_rise_is_its_slope(
-            samples in 8_u32..80, from in -0.5..0.5_f64, slope in -2.0..2.0_f64, rim in 0.2..2.0_f64,
+            samples in 8_u32..80, from in -0.5..0.5_f64, slope in -2.0..2.0_f64,
+            rim in 0.2..2.0_f64,
         ) {
             let mut ends = Ends::default();
             let dt_s = BLOCK_S / f64::from(samples);
@@ -635,7 +641,8 @@ mod tests {
                 }
             }
             let rate = ends.rate(0.01, [rim, rim]);
-            prop_assert!((rate.mu[0] - slope).abs() < 1.0e-9 && (rate.mu[1] + slope).abs() < 1.0e-9);
+            prop_assert!((rate.mu[0] - slope).abs() < 1.0e-9);
+            prop_assert!((rate.mu[1] + slope).abs() < 1.0e-9);
             prop_assert!(rate.rim_m_s[0].abs() < 1.0e-9);
             prop_assert!((rate.rim_m_s[1] - slope / GRAVITY_M_S2 * rim).abs() < 1.0e-9);
             prop_assert!(rate.difference_noise > 0.0);

@@ -8,12 +8,13 @@
 //! ```text
 //! Σ m_i = (θF + κ Σ (ℓ_i − ℓ̄) m_i) / w̄
 //! ```
-//! Slip that varies within the time of a row is represented by several moments ([`Moment`]).
+//! Slip that varies within the time of a row is represented by its deviations in several intervals
+//! ([`IntervalDeviation`]).
 
 use super::curved::{Curvatures, Turn};
-use super::rows::Bends;
+use super::rows::CurvatureRegressors;
 use super::types::Curvature;
-use super::window::Moment;
+use super::window::IntervalDeviation;
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
 /// Number of iterations for the slip that the forces cause.
@@ -21,9 +22,9 @@ const ROUNDS: usize = 3;
 /// Lower bound of `w̄`.
 const STIFFNESS_LEFT_MIN: f64 = 0.2;
 
-/// Loss of stiffness of the contacts, over κ.
+/// Loss of the contacts' stiffness by the tyres' curvature, over κ; symbols as in the module.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub(super) struct Loss {
+pub(super) struct StiffnessLoss {
     /// `ℓ̄`.
     pub(super) mean: f64,
     /// `w̄`.
@@ -52,20 +53,20 @@ pub(super) struct TyreCurve {
     pub(super) curvature: f64,
 }
 
-impl Loss {
+impl StiffnessLoss {
     /// Computes the loss at a mean rim speed above zero, for a robot that drives forward. `slip` is
     /// the mean slip of linear tyres of the same θ.
     pub(super) fn of(
         turn: &Turn,
-        swing: &[Moment],
+        variation: &[IntervalDeviation],
         slip: MeanSlip,
         tyres: TyreCurve,
         model: &RobotModel,
     ) -> Self {
         let TyreCurve { theta, curvature } = tyres;
-        let apart = (turn.rim_difference_m_s - model.track_width_m() * turn.yaw_rate_rad_s)
-            / turn.rim_m_s
-            - turn.radius_difference;
+        let slip_difference =
+            (turn.rim_difference_m_s - model.track_width_m() * turn.yaw_rate_rad_s) / turn.rim_m_s
+                - turn.radius_difference;
         let sides_m_s = [
             turn.rim_m_s - 0.5 * turn.rim_difference_m_s,
             turn.rim_m_s + 0.5 * turn.rim_difference_m_s,
@@ -81,23 +82,23 @@ impl Loss {
             // Sums of ℓ, of ℓ times each slip, of the slips themselves.
             let (mut loss, mut forward, mut lateral, mut turning) = (0.0, 0.0, 0.0, 0.0);
             let (mut longitudinal_sum, mut lateral_sum, mut sum_moment) = (0.0, 0.0, 0.0);
-            for moment in swing {
-                let share = 0.25 * moment.weight;
-                let gap = apart + moment.apart;
-                let turn_rad_s = turn.yaw_rate_rad_s + moment.turn_rad_s;
-                let common = now.forward + theta * moment.longitudinal_mu;
-                let drift = now.lateral + theta * turn.rim_m_s * moment.turn_rad_s / GRAVITY_M_S2;
+            for interval in variation {
+                let share = 0.25 * interval.weight;
+                let gap = slip_difference + interval.slip_difference;
+                let turn_rad_s = turn.yaw_rate_rad_s + interval.turn_rad_s;
+                let common = now.forward + theta * interval.longitudinal_mu;
+                let drift = now.lateral + theta * turn.rim_m_s * interval.turn_rad_s / GRAVITY_M_S2;
                 for (side, sign) in [-1.0, 1.0].into_iter().enumerate() {
                     let longitudinal_slip = common + 0.5 * sign * gap;
                     for x_m in [half_base_m, -half_base_m] {
                         let lateral_slip = drift - x_m * turn_rad_s / sides_m_s[side];
                         let slip = longitudinal_slip.hypot(lateral_slip);
-                        let kept_back = share * slip * (1.0 - curvature * slip / 3.0);
+                        let loss_share = share * slip * (1.0 - curvature * slip / 3.0);
                         let lever = sign * half_track_m * longitudinal_slip + x_m * lateral_slip;
-                        loss += kept_back;
-                        forward += kept_back * longitudinal_slip;
-                        lateral += kept_back * lateral_slip;
-                        turning += kept_back * lever;
+                        loss += loss_share;
+                        forward += loss_share * longitudinal_slip;
+                        lateral += loss_share * lateral_slip;
+                        turning += loss_share * lever;
                         longitudinal_sum += share * longitudinal_slip;
                         lateral_sum += share * lateral_slip;
                         sum_moment += share * lever;
@@ -126,11 +127,11 @@ impl Loss {
 const THETA_STEP: f64 = 1.5;
 
 /// Input for the regressors of curvature in a row with the force `force_m_s`. `uneven_m_s` computes
-/// the effect of unequal contacts from their [`Loss`], before division by `w̄`. `theta` must be
-/// above zero.
-pub(super) struct BendInput<'of, F: Fn(&Loss) -> f64> {
+/// the effect of unequal contacts from their [`StiffnessLoss`], before division by `w̄`. `theta`
+/// must be above zero.
+pub(super) struct CurvatureInput<'of, F: Fn(&StiffnessLoss) -> f64> {
     pub(super) turn: &'of Turn,
-    pub(super) swing: &'of [Moment],
+    pub(super) variation: &'of [IntervalDeviation],
     /// Mean forces over load.
     pub(super) mu: MeanSlip,
     pub(super) theta: f64,
@@ -138,19 +139,23 @@ pub(super) struct BendInput<'of, F: Fn(&Loss) -> f64> {
     pub(super) uneven_m_s: F,
 }
 
-impl<F: Fn(&Loss) -> f64> BendInput<'_, F> {
+impl<F: Fn(&StiffnessLoss) -> f64> CurvatureInput<'_, F> {
     /// Returns the curvature regressors of the row, and the ratios of the regressors of θκ, θκ² and
     /// θ²κ to the force.
-    pub(super) fn bends(&self, model: &RobotModel, prior: Curvature) -> (Bends, [f64; 3]) {
+    pub(super) fn regressors(
+        &self,
+        model: &RobotModel,
+        prior: Curvature,
+    ) -> (CurvatureRegressors, [f64; 3]) {
         if prior.mean <= 0.0 && prior.std_dev <= 0.0 {
-            return (Bends::default(), [0.0; 3]);
+            return (CurvatureRegressors::default(), [0.0; 3]);
         }
         let at = |tyres: TyreCurve| {
             let slip = MeanSlip {
                 forward: tyres.theta * self.mu.forward,
                 lateral: tyres.theta * self.mu.lateral,
             };
-            let loss = Loss::of(self.turn, self.swing, slip, tyres, model);
+            let loss = StiffnessLoss::of(self.turn, self.variation, slip, tyres, model);
             [loss.mean / loss.left, (self.uneven_m_s)(&loss) / loss.left]
         };
         let theta = self.theta;
@@ -159,7 +164,7 @@ impl<F: Fn(&Loss) -> f64> BendInput<'_, F> {
             .nodes()
             .map(|curvature| at(TyreCurve { theta, curvature }));
         let [share, square_share] = curvatures.split(known.map(|[share, _]| share));
-        let bends = curvatures
+        let by_curvature = curvatures
             .split(known.map(|[share, uneven_m_s]| self.force_m_s * share + uneven_m_s / theta));
         // Linear in θ between the two values, at the mean κ.
         let at_mean = |theta: f64| {
@@ -170,10 +175,10 @@ impl<F: Fn(&Loss) -> f64> BendInput<'_, F> {
         let slope = [0, 1].map(|part| (there[part] - here[part]) / ((THETA_STEP - 1.0) * theta));
         let alone_m_s = here[1] - slope[1] * theta;
         let of_theta_m_s = slope[0] * self.force_m_s;
-        let found = Bends {
+        let found = CurvatureRegressors {
             curvature: [
-                bends[0] - alone_m_s / theta - of_theta_m_s * theta,
-                bends[1],
+                by_curvature[0] - alone_m_s / theta - of_theta_m_s * theta,
+                by_curvature[1],
             ],
             theta: [alone_m_s, of_theta_m_s],
         };
@@ -196,18 +201,19 @@ mod tests {
     proptest! {
         #[test]
         fn what_contacts_lose_is_that_of_four_brushes(
-            curvature in 0.3..3.0_f64, forward in -0.04..0.04_f64, apart in -0.06..0.06_f64,
+            curvature in 0.3..3.0_f64, forward in -0.04..0.04_f64,
+            slip_difference in -0.06..0.06_f64,
             turn_rad_s in -0.3..0.3_f64, lateral in -0.01..0.01_f64,
         ) {
             let model = RobotModel::yi2007();
             let rim_m_s = 0.6;
             let turn = Turn {
                 rim_m_s,
-                rim_difference_m_s: apart * rim_m_s + model.track_width_m() * turn_rad_s,
+                rim_difference_m_s: slip_difference * rim_m_s + model.track_width_m() * turn_rad_s,
                 yaw_rate_rad_s: turn_rad_s,
                 radius_difference: 0.0,
             };
-            let still = [Moment { weight: 1.0, ..Moment::default() }];
+            let still = [IntervalDeviation { weight: 1.0, ..IntervalDeviation::default() }];
             // Forces that these slips cause.
             let (mut longitudinal_force, mut lateral_force, mut moment_m) = (0.0, 0.0, 0.0);
             let mut straight_moment_m = 0.0;
@@ -215,9 +221,10 @@ mod tests {
                 for end in [-0.5, 0.5] {
                     let x_m = end * model.wheelbase_m();
                     let side_m_s = rim_m_s + 0.5 * sign * turn.rim_difference_m_s;
-                    let longitudinal_slip = forward + 0.5 * sign * apart;
+                    let longitudinal_slip = forward + 0.5 * sign * slip_difference;
                     let lateral_slip = lateral - x_m * turn_rad_s / side_m_s;
-                    let lever_m = 0.5 * sign * model.track_width_m() * longitudinal_slip + x_m * lateral_slip;
+                    let half_track_m = 0.5 * model.track_width_m();
+                    let lever_m = sign * half_track_m * longitudinal_slip + x_m * lateral_slip;
                     let stiffness = left(longitudinal_slip.hypot(lateral_slip), curvature);
                     longitudinal_force += 0.25 * stiffness * longitudinal_slip;
                     lateral_force += 0.25 * stiffness * lateral_slip;
@@ -227,7 +234,7 @@ mod tests {
             }
             let forces = MeanSlip { forward: longitudinal_force, lateral: lateral_force };
             let tyres = TyreCurve { theta: 0.2, curvature };
-            let loss = Loss::of(&turn, &still, forces, tyres, &model);
+            let loss = StiffnessLoss::of(&turn, &still, forces, tyres, &model);
             let found_m = (moment_m + curvature * loss.moment_m) / loss.left;
             prop_assert!((found_m - straight_moment_m).abs() < 2.0e-5);
             let found_longitudinal = (longitudinal_force + curvature * loss.forward) / loss.left;

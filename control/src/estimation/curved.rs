@@ -39,7 +39,7 @@ impl ForceAtSlip {
     }
 }
 
-/// The two values of κ at which a regressor of θκ, which depends on κ itself, is evaluated.
+/// The two values of κ at which a regressor of θκ is evaluated, because it depends on κ itself.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Curvatures {
     low: f64,
@@ -63,11 +63,11 @@ impl Curvatures {
     /// Returns the regressors of θκ and θκ² whose sum equals the given regressor of θκ at both
     /// values of κ.
     pub(super) fn split(self, [at_low, at_high]: [f64; 2]) -> [f64; 2] {
-        let apart = self.high - self.low;
-        if apart <= 0.0 {
+        let width = self.high - self.low;
+        if width <= 0.0 {
             return [at_low, 0.0];
         }
-        let slope = (at_high - at_low) / apart;
+        let slope = (at_high - at_low) / width;
         [at_low - slope * self.low, slope]
     }
 }
@@ -94,13 +94,13 @@ pub(super) struct Turn {
     pub(super) rim_m_s: f64,
     pub(super) rim_difference_m_s: f64,
     pub(super) yaw_rate_rad_s: f64,
-    /// Estimated `δ_d`; with the opposite sign in reverse.
+    /// Estimated `δ_d`, the right minus left relative error of the radii; negated in reverse.
     pub(super) radius_difference: f64,
 }
 
 /// Slips of the two sides in a turn.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct SideSlips {
+pub(super) struct SlipBySide {
     /// Combined slip of the left wheels.
     pub(super) left: f64,
     /// Combined slip of the right wheels.
@@ -110,14 +110,14 @@ pub(super) struct SideSlips {
     /// Left minus right combined slip.
     pub(super) unequal: f64,
     /// Right minus left longitudinal slip.
-    pub(super) apart: f64,
-    /// Derivatives of left and right combined slip with respect to `apart`.
-    pub(super) by_apart: [f64; 2],
+    pub(super) slip_difference: f64,
+    /// Derivatives of left and right combined slip with respect to `slip_difference`.
+    pub(super) by_slip_difference: [f64; 2],
     /// Derivatives of left and right combined slip with respect to the turn rate, seconds.
     pub(super) by_turn_s: [f64; 2],
 }
 
-impl SideSlips {
+impl SlipBySide {
     /// Computes the slips at a mean rim speed above zero, for a robot that drives forward. `common`
     /// is the mean longitudinal slip of both sides.
     pub(super) fn of(turn: &Turn, common: f64, model: &RobotModel) -> Self {
@@ -127,7 +127,8 @@ impl SideSlips {
             yaw_rate_rad_s,
             radius_difference,
         } = *turn;
-        let apart = (rim_difference_m_s - model.track_width_m() * yaw_rate_rad_s) / rim_m_s
+        let slip_difference = (rim_difference_m_s - model.track_width_m() * yaw_rate_rad_s)
+            / rim_m_s
             - radius_difference;
         let combined = |forward: f64, side_m_s: f64| {
             let arm_s = 0.5 * model.wheelbase_m() / side_m_s;
@@ -136,18 +137,22 @@ impl SideSlips {
             let inverse = slip.max(SLIP_MIN).recip();
             (slip, 0.5 * forward * inverse, arm_s * lateral * inverse)
         };
-        let (left, left_by_apart, left_by_turn_s) =
-            combined(common - 0.5 * apart, rim_m_s - 0.5 * rim_difference_m_s);
-        let (right, right_by_apart, right_by_turn_s) =
-            combined(common + 0.5 * apart, rim_m_s + 0.5 * rim_difference_m_s);
+        let (left, left_by_difference, left_by_turn_s) = combined(
+            common - 0.5 * slip_difference,
+            rim_m_s - 0.5 * rim_difference_m_s,
+        );
+        let (right, right_by_difference, right_by_turn_s) = combined(
+            common + 0.5 * slip_difference,
+            rim_m_s + 0.5 * rim_difference_m_s,
+        );
         Self {
-            by_apart: [-left_by_apart, right_by_apart],
+            by_slip_difference: [-left_by_difference, right_by_difference],
             by_turn_s: [left_by_turn_s, right_by_turn_s],
             left,
             right,
             mean: 0.5 * (left + right),
             unequal: left - right,
-            apart,
+            slip_difference,
         }
     }
 }

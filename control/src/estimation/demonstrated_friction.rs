@@ -24,7 +24,7 @@ impl DemonstratedFriction {
         }
     }
 
-    /// Returns the friction of the blocks of both.
+    /// Returns the largest friction coefficients of the blocks of both operands.
     pub(super) fn plus(&self, other: &Self) -> Self {
         let mut both = *self;
         for mu in other.largest {
@@ -33,8 +33,8 @@ impl DemonstratedFriction {
         both
     }
 
-    /// Returns the friction coefficient that [`BLOCKS`] blocks used at least, or all while there are
-    /// fewer; `None` before any used one.
+    /// Returns the largest friction coefficient that at least [`BLOCKS`] blocks reached; with fewer
+    /// blocks that used friction, the smallest of theirs; `None` without any.
     pub(super) fn lower_bound(&self) -> Option<f64> {
         self.largest.into_iter().rev().find(|mu| *mu > 0.0)
     }

@@ -15,7 +15,7 @@ const SAMPLE_S: f64 = 0.005;
 /// Number of samples per measured body speed.
 const SAMPLES_PER_BODY_SPEED: u32 = 20;
 /// Maximum evaluated duration of a plan, seconds; a longer plan is at least as accurate.
-const LOOKED_AT_MAX_S: f64 = 300.0;
+const EVALUATED_MAX_S: f64 = 300.0;
 
 /// Predicted accuracy of θ.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -30,7 +30,7 @@ pub struct ExpectedAccuracy {
 /// Predicts the accuracy of θ after driving `plan` on ground of slip compliance `theta`.
 ///
 /// `has_torque` states whether the base measures wheel torques. If `theta` is not positive and
-/// finite, both values of the result are `None`.
+/// finite, both values of the result are `None`. At most the first 300 s of the plan are evaluated.
 pub fn expected_accuracy(
     plan: &Plan,
     model: &RobotModel,
@@ -46,7 +46,7 @@ pub fn expected_accuracy(
         return expected;
     }
     let mut estimator = Estimator::new(*model, noise);
-    let end_s = plan.duration_s().min(LOOKED_AT_MAX_S);
+    let end_s = plan.duration_s().min(EVALUATED_MAX_S);
     let (mut time_s, mut count) = (0.0, 0_u32);
     while time_s < end_s {
         let at = plan.sample(time_s);

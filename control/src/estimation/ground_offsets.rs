@@ -3,7 +3,7 @@
 use nalgebra::{SMatrix, SVector};
 
 use super::offsets::OffsetKnowledge;
-use super::regression::{Normal, Solution, drive_known, inflation};
+use super::regression::{Normal, Solution, drivetrain_priors, inflation};
 use super::rows::{OFFSETS, ParameterMatrix, Parameters, Tangent, index};
 use super::sums::Sums;
 use super::{THETA_FIRST, THETA_RANGE, TyrePrior};
@@ -45,7 +45,7 @@ impl OffsetKnowledge {
         parameters.fixed_rows_mut::<OFFSETS>(1).copy_from(&offsets);
         parameters[index::THETA] = theta;
         parameters[index::CURVATURE] = found.curvature;
-        for (parameter, mean, _) in drive_known(tyres) {
+        for (parameter, mean, _) in drivetrain_priors(tyres) {
             parameters[parameter] = theta * mean;
         }
         let inflation = inflation(&channels, &parameters, theta, tangent);

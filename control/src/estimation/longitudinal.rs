@@ -15,11 +15,13 @@
 
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
-use super::contacts::{BendInput, Loss, MeanSlip, TyreCurve};
-use super::curved::{CurvatureAtSlip, Curvatures, SLIP_MIN, SideSlips, Turn, stiffness_difference};
+use super::contacts::{CurvatureInput, MeanSlip, StiffnessLoss, TyreCurve};
+use super::curved::{
+    CurvatureAtSlip, Curvatures, SLIP_MIN, SlipBySide, Turn, stiffness_difference,
+};
 use super::rows::{Regressors, Row, index};
 use super::types::Curvature;
-use super::window::Moment;
+use super::window::IntervalDeviation;
 use super::{SensorNoise, SensorSample, signed_rims};
 
 /// Duration of a step, over which samples are averaged, seconds.
@@ -38,9 +40,9 @@ const STANDING_RAD_S: f64 = 0.05;
 /// Number of consecutive steps with stopped wheels after which the body counts as stopped.
 const STANDING_STEPS: u32 = 3;
 
-/// Moment of a row without variation of slip.
-const STILL: Moment = Moment {
-    apart: 0.0,
+/// Variation of slip in a row that has none: one interval without deviation.
+const STILL: IntervalDeviation = IntervalDeviation {
+    slip_difference: 0.0,
     turn_rad_s: 0.0,
     longitudinal_mu: 0.0,
     weight: 1.0,
@@ -86,13 +88,13 @@ pub(super) struct SlipBound {
     pub(super) curvature: Curvature,
 }
 
-/// Assumed parameters of the sideslip in a turn.
+/// Parameters with which the sideslip in a turn is computed.
 #[derive(Debug, Clone, Copy)]
-struct Sideways {
+struct SideslipParameters {
     /// Estimated or assumed θ.
     theta: f64,
     /// Increase of the sideslip by curvature, per θκ and θκ², relative to that of linear tyres.
-    bend: [f64; 2],
+    curvature_ratio: [f64; 2],
 }
 
 /// Measurement of the forward speed, linear in the parameters.
@@ -104,7 +106,7 @@ struct SpeedMeasurement {
     speed_m_s: f64,
     /// Variance of the measured speed.
     variance: f64,
-    /// Variance of the force regressor.
+    /// Variance of the noise of the force, the regressor of θ, (m/s)².
     force_noise: f64,
 }
 
@@ -119,7 +121,7 @@ pub(super) struct LongitudinalFilter {
     last_share_m_s: f64,
     last_duration_s: f64,
     last_gyro_rad_s: f64,
-    last_ahead_m_s2: f64,
+    last_forward_m_s2: f64,
     standing: u32,
     started: bool,
 }
@@ -128,6 +130,7 @@ pub(super) struct LongitudinalFilter {
 pub(super) type Rows = [Option<Row>; 3];
 
 impl LongitudinalFilter {
+    /// Creates a filter that starts at the rim speed of the first step.
     pub(super) fn new() -> Self {
         Self {
             step: Step::default(),
@@ -137,13 +140,14 @@ impl LongitudinalFilter {
             last_share_m_s: 0.0,
             last_duration_s: 0.0,
             last_gyro_rad_s: 0.0,
-            last_ahead_m_s2: 0.0,
+            last_forward_m_s2: 0.0,
             standing: 0,
             started: false,
         }
     }
 
-    /// Adds a sample. Returns the rows of a step when it is complete.
+    /// Adds a sample, `dt_s` seconds after the one before. Returns the rows of the step that it
+    /// completes; None within a step, and for a sample without acceleration, which is not used.
     pub(super) fn add(
         &mut self,
         sample: &SensorSample,
@@ -189,13 +193,14 @@ impl LongitudinalFilter {
         let count = step.samples;
         let forward_m_s2 = step.forward_m_s2 / count;
         let gyro_rad_s = step.gyro_rad_s / count;
-        let sideways = Sideways {
+        let sideslip = SideslipParameters {
             theta: bound.theta,
-            bend: sideways_bend(&step, gyro_rad_s, model, bound),
+            curvature_ratio: sideslip_curvature(&step, gyro_rad_s, model, bound),
         };
-        self.predict(&step, gyro_rad_s, noise, sideways);
+        self.predict(&step, gyro_rad_s, noise, sideslip);
         let mut rows: Rows = [None; 3];
-        let gained_m_s2 = forward_m_s2 - std::mem::replace(&mut self.last_ahead_m_s2, forward_m_s2);
+        let gained_m_s2 =
+            forward_m_s2 - std::mem::replace(&mut self.last_forward_m_s2, forward_m_s2);
         // When turning on the spot, the mean of the rim speeds is zero, so check both sides.
         let [left_m_s, right_m_s] = step.sides_m_s.map(|sum| (sum / count).abs());
         let is_standing =
@@ -243,7 +248,13 @@ impl LongitudinalFilter {
 
     /// Propagates the speed from the mean of the last step to that of this one, by the acceleration
     /// with a triangular weight that rises over the last step and falls over this one.
-    fn predict(&mut self, step: &Step, gyro_rad_s: f64, noise: &SensorNoise, sideways: Sideways) {
+    fn predict(
+        &mut self,
+        step: &Step,
+        gyro_rad_s: f64,
+        noise: &SensorNoise,
+        sideslip: SideslipParameters,
+    ) {
         let forward_m_s2 = step.forward_m_s2 / step.samples;
         let late_m_s = step.forward_late_m_s / step.samples;
         let early_m_s = forward_m_s2 * step.duration_s - late_m_s;
@@ -265,18 +276,20 @@ impl LongitudinalFilter {
         let turn_rad_s = 0.5 * (gyro_rad_s + last_gyro_rad_s);
         let turn_rad_s2 = (gyro_rad_s - last_gyro_rad_s) / span_s;
         let forward_m_s2 = gained_m_s / span_s;
-        let drift_s = sideways.theta * self.speed_m_s / GRAVITY_M_S2;
-        let across_m_s2 = self.speed_m_s * turn_rad_s
+        let drift_s = sideslip.theta * self.speed_m_s / GRAVITY_M_S2;
+        let lateral_m_s2 = self.speed_m_s * turn_rad_s
             - drift_s * (self.speed_m_s * turn_rad_s2 + 2.0 * forward_m_s2 * turn_rad_s);
-        let sideways_m_s = span_s * self.speed_m_s * turn_rad_s * across_m_s2 / GRAVITY_M_S2;
-        self.sensitivity[index::THETA] -= sideways_m_s;
-        self.sensitivity[index::CURVATURE] -= sideways_m_s * sideways.bend[0];
-        self.sensitivity[index::CURVATURE_SQUARE] -= sideways_m_s * sideways.bend[1];
+        let sideslip_m_s = span_s * self.speed_m_s * turn_rad_s * lateral_m_s2 / GRAVITY_M_S2;
+        self.sensitivity[index::THETA] -= sideslip_m_s;
+        self.sensitivity[index::CURVATURE] -= sideslip_m_s * sideslip.curvature_ratio[0];
+        self.sensitivity[index::CURVATURE_SQUARE] -= sideslip_m_s * sideslip.curvature_ratio[1];
         self.variance = (self.variance
             + (span_s * noise.accelerometer_m_s2).powi(2) / step.samples)
             .min(UNKNOWN_M2_S2);
     }
 
+    /// Updates the filter by the wheel speeds of a step, and returns the innovation as a row; None
+    /// if a wheel may slip beyond the valid range.
     fn wheels(
         &mut self,
         step: &Step,
@@ -311,32 +324,34 @@ impl LongitudinalFilter {
             radius_difference: bound.radius_difference * harmonic_m_s.signum(),
         };
         let longitudinal_mu = forward_m_s2 / GRAVITY_M_S2 * harmonic_m_s.signum();
-        let input = BendInput {
+        let input = CurvatureInput {
             turn: &turn,
-            swing: &[STILL],
+            variation: &[STILL],
             mu: MeanSlip {
                 forward: longitudinal_mu,
                 lateral: harmonic_m_s.abs() * gyro_rad_s / GRAVITY_M_S2,
             },
             theta: bound.theta,
             force_m_s,
-            uneven_m_s: |loss: &Loss| harmonic_m_s * loss.forward,
+            uneven_m_s: |loss: &StiffnessLoss| harmonic_m_s * loss.forward,
         };
-        let (bends, mut bend) = input.bends(model, bound.curvature);
-        bends.put(&mut regressors);
+        let (curvature_regressors, mut curvature_ratio) = input.regressors(model, bound.curvature);
+        curvature_regressors.write_to(&mut regressors);
         // Noise of the mean acceleration over the step; its offset is a regressor.
-        let felt_noise = (harmonic_m_s * noise.accelerometer_m_s2 / GRAVITY_M_S2).powi(2) / count;
+        let acceleration_noise =
+            (harmonic_m_s * noise.accelerometer_m_s2 / GRAVITY_M_S2).powi(2) / count;
         let rim_noise = 0.5 * (noise.wheel_speed_rad_s * model.wheel_radius_m()).powi(2) / count;
         regressors[index::LONGITUDINAL_OFFSET] = -bound.theta * harmonic_m_s.abs() / GRAVITY_M_S2;
         let mut row = self.observe(SpeedMeasurement {
             regressors,
             speed_m_s: step.wheels_m_s / count,
-            variance: rim_noise + bound.theta.powi(2) * felt_noise,
-            force_noise: felt_noise,
+            variance: rim_noise + bound.theta.powi(2) * acceleration_noise,
+            force_noise: acceleration_noise,
         });
         // The force, with its noise, also makes the slips of the sides unequal.
-        let sides = SideSlips::of(&turn, bound.theta * longitudinal_mu, model);
-        let unequal_by_force = 0.25 * sides.apart * sides.apart / sides.mean.max(SLIP_MIN);
+        let sides = SlipBySide::of(&turn, bound.theta * longitudinal_mu, model);
+        let unequal_by_force =
+            0.25 * sides.slip_difference * sides.slip_difference / sides.mean.max(SLIP_MIN);
         let curvatures = Curvatures::of(bound.curvature);
         let more = curvatures.split(curvatures.nodes().map(|curvature| {
             let at = CurvatureAtSlip {
@@ -345,9 +360,9 @@ impl LongitudinalFilter {
             };
             unequal_by_force * stiffness_difference(at)
         }));
-        bend[0] += more[0];
-        bend[1] += more[1];
-        row.bend = bend;
+        curvature_ratio[0] += more[0];
+        curvature_ratio[1] += more[1];
+        row.curvature_ratio = curvature_ratio;
         row.rate_noise =
             2.0 * (noise.accelerometer_m_s2 / GRAVITY_M_S2 / step.duration_s).powi(2) / count;
         Some(row)
@@ -382,7 +397,12 @@ impl LongitudinalFilter {
 
 /// Returns the increase of the sideslip by curvature in a step, per θκ and θκ², relative to that of
 /// linear tyres; zero when driving straight.
-fn sideways_bend(step: &Step, gyro_rad_s: f64, model: &RobotModel, bound: &SlipBound) -> [f64; 2] {
+fn sideslip_curvature(
+    step: &Step,
+    gyro_rad_s: f64,
+    model: &RobotModel,
+    bound: &SlipBound,
+) -> [f64; 2] {
     let theta = bound.theta;
     let rim_m_s = step.harmonic_m_s.abs() / step.samples;
     if step.usable < step.samples || gyro_rad_s.abs() < TURNING_MIN_RAD_S {
@@ -397,7 +417,7 @@ fn sideways_bend(step: &Step, gyro_rad_s: f64, model: &RobotModel, bound: &SlipB
     let lateral = theta * rim_m_s * gyro_rad_s / GRAVITY_M_S2;
     let curvatures = Curvatures::of(bound.curvature);
     curvatures.split(curvatures.nodes().map(|curvature| {
-        let loss = Loss::of(
+        let loss = StiffnessLoss::of(
             &turn,
             &[STILL],
             MeanSlip {

@@ -62,10 +62,10 @@ use identification::{Identification, Identified};
 use longitudinal::{LongitudinalFilter, SlipBound};
 use offsets::OffsetKnowledge;
 use payload::PayloadMonitor;
-use regression::{Shared, Solution, SolveInput, solve};
+use regression::{SharedCovariance, Solution, SolveInput, solve};
 use rows::Row;
 pub use segment::SegmentStatistics;
-use segment::{Claims, SegmentTheta, SegmentVariance};
+use segment::{SegmentTheta, SegmentVariance, StatedInformation};
 use sums::Sums;
 pub use types::{
     CommonError, Estimate, EstimatorPrior, IdentifiedRobot, IdentifiedValue, ModelUncertainty,
@@ -99,7 +99,8 @@ const THETA_MOST_FIRST: f64 = 2.0;
 /// parameters that are still being estimated. It is common to all of a robot's segments; with
 /// torque the error of the torque constants takes its place.
 pub const MODEL_RATIO: f64 = 1.5e-3;
-/// Maximum fraction of a segment's own variance that counts as shared with earlier segments.
+/// Maximum fraction of a segment's own variance that counts as an error that it shares with earlier
+/// segments.
 const OFFSETS_SHARE_MAX: f64 = 0.9;
 /// Half-width of a 95 % interval, in standard deviations.
 pub const NORMAL_95: f64 = 1.959_963_984_540_054;
@@ -107,11 +108,11 @@ pub const NORMAL_95: f64 = 1.959_963_984_540_054;
 const SCALE_STD_DEV_MIN: f64 = 1.0e-3;
 /// Maximum time between two samples; after a longer gap all averages restart, seconds.
 const GAP_MAX_S: f64 = 0.1;
-/// Maximum number of consecutive samples dropped because the wheel speeds jumped; then the new
-/// speeds are accepted.
-const LEAPS_MAX: u32 = 5;
+/// Maximum number of consecutive samples that are dropped because the wheel speeds jumped; then the
+/// new speeds are accepted.
+const JUMPS_MAX: u32 = 5;
 /// Maximum plausible wheel acceleration, as a multiple of the robot's limit.
-const LEAP_SHARE: f64 = 10.0;
+const JUMP_ACCELERATION_RATIO: f64 = 10.0;
 
 /// Estimator of θ and of the robot's parameters from samples of the robot's own sensors.
 #[derive(Debug, Clone, PartialEq)]
@@ -125,8 +126,8 @@ pub struct Estimator {
     offsets: OffsetKnowledge,
     /// Sums over the blocks of this ground's closed segments.
     ground: Sums,
-    /// Information on θ that these segments state together, including the tyres' error.
-    claims: Claims,
+    /// Information on θ that these segments state together; its variance includes the tyres' error.
+    stated: StatedInformation,
     /// Sums over the open segment's blocks that are certainly of this ground.
     segment: Sums,
     /// Sums over the blocks since the change detector's sums were last zero; they may be of the
@@ -140,15 +141,15 @@ pub struct Estimator {
     estimate: Estimate,
     /// Solution from all blocks of this ground, if it is a measurement.
     measured: Option<Solution>,
-    /// Newest solution, as long as radii and track are not computed with it, and whether they are
-    /// due.
+    /// Newest solution until radii and track are computed with it, and whether that is due.
     solution: Option<Solution>,
     are_offsets_due: bool,
     /// Moment balance of the last block, if the block was used.
     turning_before: Option<Row>,
     last_wheels: Option<WheelSpeeds>,
+    /// Time of the samples dropped since the last used one, seconds.
     skipped_s: f64,
-    leaps_in_a_row: u32,
+    jumps_in_a_row: u32,
     dropped_samples: u64,
     /// Source of θ if the robot's model is not exact; None if it is.
     identification: Option<Box<Identification>>,
@@ -176,7 +177,7 @@ impl Estimator {
             longitudinal: LongitudinalFilter::new(),
             offsets: OffsetKnowledge::unknown(&noise, &tyres),
             ground: Sums::default(),
-            claims: Claims::default(),
+            stated: StatedInformation::default(),
             segment: Sums::default(),
             pending: Sums::default(),
             change: ChangeDetector::default(),
@@ -196,7 +197,7 @@ impl Estimator {
             turning_before: None,
             last_wheels: None,
             skipped_s: 0.0,
-            leaps_in_a_row: 0,
+            jumps_in_a_row: 0,
             dropped_samples: 0,
             identification: Identification::new(model, &noise, &prior).map(Box::new),
         };
@@ -204,7 +205,7 @@ impl Estimator {
         estimator
     }
 
-    /// Replaces the standard deviations of sensor noise for all later samples.
+    /// Replaces the standard deviations of the sensors' noise for all later samples.
     pub fn set_noise(&mut self, noise: SensorNoise) {
         self.noise = noise;
     }
@@ -213,7 +214,9 @@ impl Estimator {
     /// if it is not finite or not plausible, if the wheel speeds jump, or if `dt_s` is not above 0.
     pub fn update(&mut self, sample: &SensorSample, dt_s: f64) -> UpdateOutcome {
         let is_in_order = dt_s.is_finite() && dt_s > 0.0;
-        if !(is_in_order && is_possible(sample, &self.model)) || self.leaps(sample, dt_s) {
+        if !(is_in_order && is_possible(sample, &self.model))
+            || self.wheel_speeds_jump(sample, dt_s)
+        {
             self.dropped_samples += 1;
             self.estimate.dropped_samples = self.dropped_samples;
             if is_in_order {
@@ -279,7 +282,7 @@ impl Estimator {
         if block.is_none() {
             self.turning_before = None;
         }
-        let (of_rows, slips) = block.map_or((false, false), |block| self.take(block));
+        let (of_rows, slips) = block.map_or((false, false), |block| self.add_block(block));
         self.excitation.end_block();
         let solution = self.refresh_theta();
         if self.identification.is_some() {
@@ -296,20 +299,20 @@ impl Estimator {
 
     /// Returns whether the wheel speeds differ from the last ones by more than a wheel can
     /// accelerate.
-    fn leaps(&mut self, sample: &SensorSample, dt_s: f64) -> bool {
+    fn wheel_speeds_jump(&mut self, sample: &SensorSample, dt_s: f64) -> bool {
         let Some(last) = self.last_wheels else {
             return false;
         };
         let span_s = dt_s + self.skipped_s;
-        let most_rad_s = LEAP_SHARE
+        let most_rad_s = JUMP_ACCELERATION_RATIO
             * (self.model.limits().wheel_acceleration_max_rad_s2 * span_s
                 + self.noise.wheel_speed_rad_s);
-        let leap_rad_s = (sample.wheel_speeds.left_rad_s - last.left_rad_s)
+        let jump_rad_s = (sample.wheel_speeds.left_rad_s - last.left_rad_s)
             .abs()
             .max((sample.wheel_speeds.right_rad_s - last.right_rad_s).abs());
-        let is_leap = leap_rad_s > most_rad_s && self.leaps_in_a_row < LEAPS_MAX;
-        self.leaps_in_a_row = if is_leap { self.leaps_in_a_row + 1 } else { 0 };
-        is_leap
+        let is_jump = jump_rad_s > most_rad_s && self.jumps_in_a_row < JUMPS_MAX;
+        self.jumps_in_a_row = if is_jump { self.jumps_in_a_row + 1 } else { 0 };
+        is_jump
     }
 
     /// Updates the filter of the forward speed; without measured torque its innovations are rows.
@@ -333,11 +336,11 @@ impl Estimator {
         }
     }
 
-    /// Adds a block. Returns whether the ground has changed, and whether a wheel slips beyond the
-    /// linear range.
-    fn take(&mut self, mut block: Block) -> (bool, bool) {
+    /// Adds a block to the pending sums. Returns whether the ground has changed, and whether a
+    /// wheel slips beyond the linear range.
+    fn add_block(&mut self, mut block: Block) -> (bool, bool) {
         block.check_slip(&self.bound);
-        block.mu_seen /= self.torque_scale_upper_bound();
+        block.mu_demonstrated /= self.torque_scale_upper_bound();
         self.pending.add(&block);
         let row = block.turning_row().filter(|_| block.is_linear);
         if let (Some(row), Some(before)) = (row, self.turning_before) {
@@ -531,9 +534,9 @@ impl Estimator {
         }
     }
 
-    /// Returns the upper end of the 95 % interval of the torque scale: the ground gives at least the
-    /// measured friction coefficient divided by it. What the accelerometer shows does not depend on the
-    /// load, and is divided all the same.
+    /// Returns the upper end of the 95 % interval of the torque scale: the ground gives at least
+    /// the measured friction coefficient divided by it. What the accelerometer shows does not
+    /// depend on the load, and is divided all the same.
     fn torque_scale_upper_bound(&self) -> f64 {
         let scale = self.torque_scale();
         (scale.value + NORMAL_95 * scale.std_dev).max(1.0)
@@ -593,7 +596,7 @@ impl Estimator {
         let theta = match &mut self.identification {
             Some(identification) => identification
                 .close_segment()
-                .map(|found| self.claims.identified(&found)),
+                .map(|found| self.stated.identified(&found)),
             None => self.segment_of_rows(&segment, before.as_ref(), (&offsets, &tyres)),
         };
         let statistics = SegmentStatistics::of(
@@ -627,7 +630,7 @@ impl Estimator {
             theta_start: ground.theta,
         };
         let found = solve(segment, input).filter(|found| found.is_informative(ground.theta))?;
-        let shared = before.map_or_else(Shared::default, |before| {
+        let shared = before.map_or_else(SharedCovariance::default, |before| {
             before.shared_with(&found, offsets, tyres)
         });
         let scale = self.load_scale(segment);
@@ -645,7 +648,7 @@ impl Estimator {
         };
         Some(SegmentTheta {
             theta: scale * found.theta,
-            information: self.claims.add(SegmentVariance {
+            information: self.stated.add(SegmentVariance {
                 total: square * found.variance,
                 shared: square * shared.all,
             }),
@@ -664,7 +667,7 @@ impl Estimator {
             .with_ground(&self.ground, &self.tyres, found.as_ref())
             .on_new_ground();
         self.ground = Sums::default();
-        self.claims = Claims::default();
+        self.stated = StatedInformation::default();
         self.segment = Sums::default();
         self.pending = Sums::default();
         self.change = ChangeDetector::default();

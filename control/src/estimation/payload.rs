@@ -8,7 +8,7 @@ use super::apparent_mass::ApparentMass;
 use super::{PayloadChange, SensorNoise, SensorSample, ValueWithStdDev};
 use crate::robot::RobotModel;
 
-/// Minimum duration of a standstill in which a robot may be loaded, seconds.
+/// Minimum duration of a standstill after which the payload may have changed, seconds.
 const STANDSTILL_MIN_S: f64 = 5.0;
 /// Rim speed of the faster side below which the robot counts as standing, metres per second.
 const STANDING_M_S: f64 = 0.02;

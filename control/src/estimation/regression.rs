@@ -30,10 +30,10 @@ const INFLATION_ROWS: f64 = 15.0;
 const ROLLING_STD_DEV: f64 = 0.02;
 /// Relative model error of the effect of curvature in rows on accelerations, which use the measured
 /// variation of slip within their time, and κ to second order.
-const BEND_SHARE: f64 = 0.04;
+const CURVATURE_SHARE: f64 = 0.04;
 /// Relative model error of the effect of curvature in rows on torques, which use the mean slip
 /// only.
-const BEND_SHARE_TORQUE: f64 = 0.05;
+const CURVATURE_SHARE_TORQUE: f64 = 0.05;
 /// Maximum fraction of a variance that the correlation of neighbouring rows may subtract.
 const NEIGHBOURS_SHARE_MAX: f64 = 0.9;
 /// Relative change of the inflation of residuals below which its iteration ends.
@@ -94,7 +94,7 @@ impl Normal {
         let known = normal.curvature_weight;
         normal.matrix[(index::CURVATURE, index::CURVATURE)] += known;
         normal.right[index::CURVATURE] += known * tyres.curvature;
-        for (parameter, mean, std_dev) in drive_known(tyres) {
+        for (parameter, mean, std_dev) in drivetrain_priors(tyres) {
             let known = (theta * std_dev).powi(-2);
             normal.matrix[(parameter, parameter)] += known;
             normal.right[parameter] += known * theta * mean;
@@ -123,7 +123,7 @@ impl Normal {
 
 /// Returns the priors of relaxation length, rotor inertia and load difference: the index of the
 /// parameter, and mean and standard deviation of the parameter over θ.
-pub(super) fn drive_known(tyres: &TyrePrior) -> [(usize, f64, f64); 3] {
+pub(super) fn drivetrain_priors(tyres: &TyrePrior) -> [(usize, f64, f64); 3] {
     [
         (
             index::RELAXATION,
@@ -186,10 +186,10 @@ fn neighbours(channels: &[&Channel], direction: &Parameters, theta: f64, tangent
 }
 
 /// Returns the ratio of the effect of curvature to that of θ alone.
-fn bend_ratio(channels: &[&Channel], tangent: Tangent, curvature: f64) -> f64 {
+fn curvature_effect_ratio(channels: &[&Channel], tangent: Tangent, curvature: f64) -> f64 {
     let mut sums = [0.0; 2];
     for channel in channels {
-        let squares = channel.force_and_bend(tangent, curvature);
+        let squares = channel.force_and_curvature(tangent, curvature);
         sums[0] += squares[0];
         sums[1] += squares[1];
     }
@@ -265,34 +265,35 @@ pub(super) fn solve(sums: &Sums, input: SolveInput<'_>) -> Option<Solution> {
                 .max(-NEIGHBOURS_SHARE_MAX * base);
             let curvature = parameters[index::CURVATURE] / parameters[index::THETA];
             let share = if sums.has_torque() {
-                BEND_SHARE_TORQUE
+                CURVATURE_SHARE_TORQUE
             } else {
-                BEND_SHARE
+                CURVATURE_SHARE
             };
-            let of_curvature =
-                share * parameters[index::THETA] * bend_ratio(&channels, tangent, curvature);
+            let of_curvature = share
+                * parameters[index::THETA]
+                * curvature_effect_ratio(&channels, tangent, curvature);
             // Residuals beyond the noise are model errors, which do not average out.
             let unexplained = input.tyres.unexplained_ratio
                 * parameters[index::THETA]
                 * (1.0 - inflated.recip()).sqrt();
             // With an exact model, larger residuals mean that the noise is larger than assumed.
-            let noisier = if is_exact { inflation } else { 1.0 };
-            let missed = of_curvature.hypot(unexplained);
+            let noise_inflation = if is_exact { inflation } else { 1.0 };
+            let model_error = of_curvature.hypot(unexplained);
             return Some(Solution {
                 theta,
                 parameters,
-                covariance: covariance * noisier,
-                noisier,
+                covariance: covariance * noise_inflation,
+                noise_inflation,
                 of_theta,
                 tangent,
-                variance: (base + scaled + neighbours * inflated) * noisier
+                variance: (base + scaled + neighbours * inflated) * noise_inflation
                     + base * base * normal.excess
-                    + missed * missed,
-                missed,
+                    + model_error * model_error,
+                model_error,
                 tyre_variance: (direction[index::CURVATURE] * normal.curvature_weight.sqrt())
                     .powi(2)
-                    * noisier
-                    + missed * missed,
+                    * noise_inflation
+                    + model_error * model_error,
                 significance: 1.0 / (base * normal.noise_std_dev.max(f64::MIN_POSITIVE)),
             });
         }
@@ -333,21 +334,21 @@ pub(super) struct Solution {
     parameters: Parameters,
     covariance: ParameterMatrix,
     /// Factor by which the covariance was inflated.
-    noisier: f64,
+    noise_inflation: f64,
     /// Derivative of θ with respect to the parameters.
     of_theta: Parameters,
     /// Linearisation of products of θ and κ that was used.
     tangent: Tangent,
     /// Model error of θ by curvature and by unexplained residuals, equal in all solutions of a
     /// ground.
-    missed: f64,
+    model_error: f64,
     /// Part of the variance that is due to the tyres.
     tyre_variance: f64,
 }
 
 /// Covariance of the errors of two estimates of θ.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub(super) struct Shared {
+pub(super) struct SharedCovariance {
     /// Total covariance.
     pub(super) all: f64,
     /// Covariance without the part that a common error of the tyres explains.
@@ -365,24 +366,24 @@ impl Solution {
         later: &Self,
         offsets: &OffsetKnowledge,
         tyres: &TyrePrior,
-    ) -> Shared {
+    ) -> SharedCovariance {
         let mine = self.covariance * self.of_theta;
-        let its = later.covariance * later.of_theta / later.noisier;
+        let its = later.covariance * later.of_theta / later.noise_inflation;
         let followed = offsets.information * its.fixed_rows::<OFFSETS>(1);
         let of_offsets = followed.dot(&mine.fixed_rows::<OFFSETS>(1));
         // An error of θκ changes the later θ by the weight of its prior.
         let width = tyres.curvature_std_dev.max(CURVATURE_STD_DEV_MIN);
         let of_curvature = its[index::CURVATURE] / (width * width) * mine[index::CURVATURE];
-        let of_drive: f64 = drive_known(tyres)
+        let of_drive: f64 = drivetrain_priors(tyres)
             .iter()
             .map(|&(parameter, _, std_dev)| {
                 its[parameter] / (self.theta * std_dev).powi(2) * mine[parameter]
             })
             .sum();
         let of_offsets = of_offsets + of_drive;
-        let of_tyres = of_curvature + self.missed * later.missed;
+        let of_tyres = of_curvature + self.model_error * later.model_error;
         let explained = self.tyre_std_dev() * later.tyre_std_dev();
-        Shared {
+        SharedCovariance {
             all: of_offsets + of_tyres,
             own: of_offsets + (of_tyres - explained).max(0.0),
         }
@@ -433,11 +434,11 @@ impl Solution {
         let force = row.regressors[index::THETA];
         let regressors = self.tangent.of_parameters(&row.regressors);
         let error = row.response - regressors.dot(&self.parameters);
-        let missed = MODEL_SHARE * self.theta * (force.abs() + block.mean_force_m_s());
+        let model_error = MODEL_SHARE * self.theta * (force.abs() + block.mean_force_m_s());
         let variance = row.innovation_variance
             + self.theta.powi(2) * row.force_noise
             + (self.covariance * regressors).dot(&regressors)
-            + missed * missed;
+            + model_error * model_error;
         Some(error * force.signum() / variance.sqrt())
     }
 }

@@ -87,15 +87,15 @@ impl Tangent {
         }
     }
 
-    /// Returns whether κ differs by less than the convergence limit.
+    /// Returns whether κ of both linearisations differs by less than the convergence limit.
     pub(super) fn is_near(self, other: Self) -> bool {
         (self.square_by_curvature - other.square_by_curvature).abs() < SETTLED
             && (self.square_by_theta - other.square_by_theta).abs() < SETTLED
     }
 
-    /// Returns the linear dependences of regressor-only products: index of the product, index of
-    /// the parameter, coefficient.
-    fn followers(self) -> [(usize, usize, f64); 4] {
+    /// Returns the products of θ and κ as linear combinations of the parameters: index of the
+    /// product, index of the parameter, coefficient.
+    fn product_terms(self) -> [(usize, usize, f64); 4] {
         [
             (index::CURVATURE_SQUARE, index::THETA, self.square_by_theta),
             (
@@ -111,7 +111,7 @@ impl Tangent {
     /// Reduces regressors to those of the parameters.
     pub(super) fn of_parameters(self, regressors: &Regressors) -> Parameters {
         let mut found = regressors.fixed_rows::<PARAMETERS>(0).into_owned();
-        for (from, to, by) in self.followers() {
+        for (from, to, by) in self.product_terms() {
             found[to] += by * regressors[from];
         }
         found
@@ -122,7 +122,7 @@ impl Tangent {
     pub(super) fn of_regressors(self, parameters: &Parameters) -> Regressors {
         let mut found = Regressors::zeros();
         found.fixed_rows_mut::<PARAMETERS>(0).copy_from(parameters);
-        for (from, to, by) in self.followers() {
+        for (from, to, by) in self.product_terms() {
             found[from] += by * parameters[to];
         }
         found
@@ -131,7 +131,7 @@ impl Tangent {
     /// Reduces a matrix over pairs of regressors to one over pairs of parameters.
     pub(super) fn of_pairs(self, square: &RegressorMatrix) -> ParameterMatrix {
         let mut columns = *square;
-        for (from, to, by) in self.followers() {
+        for (from, to, by) in self.product_terms() {
             for row in 0..REGRESSORS {
                 columns[(row, to)] += by * square[(row, from)];
             }
@@ -140,7 +140,7 @@ impl Tangent {
             .fixed_view::<PARAMETERS, PARAMETERS>(0, 0)
             .into_owned();
         for column in 0..PARAMETERS {
-            for (from, to, by) in self.followers() {
+            for (from, to, by) in self.product_terms() {
                 found[(to, column)] += by * columns[(from, column)];
             }
         }
@@ -150,16 +150,16 @@ impl Tangent {
 
 /// Regressors of a row that involve the curvature.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub(super) struct Bends {
+pub(super) struct CurvatureRegressors {
     /// Regressors of θκ and θκ².
     pub(super) curvature: [f64; 2],
     /// Regressors of κ and θ²κ.
     pub(super) theta: [f64; 2],
 }
 
-impl Bends {
+impl CurvatureRegressors {
     /// Writes the regressors to their indices.
-    pub(super) fn put(&self, regressors: &mut Regressors) {
+    pub(super) fn write_to(&self, regressors: &mut Regressors) {
         regressors[index::CURVATURE] = self.curvature[0];
         regressors[index::CURVATURE_SQUARE] = self.curvature[1];
         regressors[index::CURVATURE_ALONE] = self.theta[0];
@@ -172,13 +172,15 @@ impl Bends {
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Row {
     pub(super) regressors: Regressors,
+    /// Slip, or innovation of the forward speed, metres per second.
     pub(super) response: f64,
-    /// Variance of the response; in rows of the forward speed it includes that of the force.
+    /// Variance of the noise of the response, (m/s)²; in rows of the forward speed it includes that
+    /// of the force.
     pub(super) innovation_variance: f64,
-    /// Variance of the force regressor.
+    /// Variance of the noise of the force, the regressor of θ, (m/s)².
     pub(super) force_noise: f64,
     /// Ratios of the regressors of θκ, θκ² and θ²κ to the force; they share its noise.
-    pub(super) bend: [f64; 3],
+    pub(super) curvature_ratio: [f64; 3],
     /// Covariance of the other regressors' noise with that of the response: both contain rim speeds
     /// and turn rate.
     pub(super) common_noise: Regressors,
@@ -192,9 +194,13 @@ pub(super) struct Row {
 /// Sums over the rows of one kind.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Channel {
+    /// Number of rows.
     pub(super) count: f64,
+    /// `Σ xxᵀ` of the regressors x.
     square: RegressorMatrix,
+    /// `Σ xy` with the response y.
     product: Regressors,
+    /// `Σ y²`.
     pub(super) response: f64,
     /// Sum of the covariances of the regressors [`FORCED`] by the noise of the force.
     force_noise: SMatrix<f64, 4, 4>,
@@ -230,7 +236,12 @@ impl Channel {
         self.square += row.regressors * row.regressors.transpose();
         self.product += row.regressors * row.response;
         self.response += row.response * row.response;
-        let shares = SVector::from([1.0, row.bend[0], row.bend[1], row.bend[2]]);
+        let shares = SVector::from([
+            1.0,
+            row.curvature_ratio[0],
+            row.curvature_ratio[1],
+            row.curvature_ratio[2],
+        ]);
         self.force_noise += shares * shares.transpose() * row.force_noise;
         self.common_noise += row.common_noise;
         self.response_noise += row.innovation_variance;
@@ -255,13 +266,13 @@ impl Channel {
             response: row.response * scale,
             innovation_variance: (1.0 - theta * theta * force_noise).max(0.1),
             force_noise,
-            bend: row.bend,
+            curvature_ratio: row.curvature_ratio,
             ramp_noise: 0.0,
             rate_noise: row.rate_noise * (scale * scale),
         });
     }
 
-    /// Returns the sums over the rows of both.
+    /// Returns the sums over the rows of both operands.
     pub(super) fn plus(&self, other: &Self) -> Self {
         if other.count == 0.0 {
             return *self;
@@ -279,7 +290,7 @@ impl Channel {
         }
     }
 
-    /// Returns `s² = σ_y² + θ²σ_x²`.
+    /// Returns the mean innovation variance of the rows at a θ, `s² = σ_y² + θ²σ_x²`.
     pub(super) fn innovation_variance(&self, theta: f64) -> f64 {
         self.response_noise / self.count + theta * theta * self.force_variance()
     }
@@ -316,22 +327,22 @@ impl Channel {
         *product += (self.product - self.common_noise) * weight;
     }
 
-    /// Returns the variance of a linear function of the regressors, given its coefficients, that the
-    /// covariances of neighbouring rows contribute.
+    /// Returns the variance of a linear function of the regressors, given its coefficients, that
+    /// the covariances of neighbouring rows contribute.
     pub(super) fn neighbours(&self, coefficients: &Regressors) -> f64 {
         (self.neighbours * coefficients).dot(coefficients)
     }
 
     /// Returns the squared effects of the forces by θ alone and by the curvature κ, over the
     /// variance of the response.
-    pub(super) fn force_and_bend(&self, tangent: Tangent, curvature: f64) -> [f64; 2] {
+    pub(super) fn force_and_curvature(&self, tangent: Tangent, curvature: f64) -> [f64; 2] {
         let noise = (self.response_noise / self.count.max(1.0)).max(f64::MIN_POSITIVE);
-        let mut bend = Regressors::zeros();
-        bend[index::CURVATURE] = curvature;
-        bend[index::CURVATURE_SQUARE] = curvature * curvature;
-        bend[index::CURVATURE_ALONE] = curvature / tangent.theta;
-        bend[index::THETA_CURVATURE] = curvature * tangent.theta;
-        let square = (self.square * bend).dot(&bend);
+        let mut coefficients = Regressors::zeros();
+        coefficients[index::CURVATURE] = curvature;
+        coefficients[index::CURVATURE_SQUARE] = curvature * curvature;
+        coefficients[index::CURVATURE_ALONE] = curvature / tangent.theta;
+        coefficients[index::THETA_CURVATURE] = curvature * tangent.theta;
+        let square = (self.square * coefficients).dot(&coefficients);
         [
             self.square[(index::THETA, index::THETA)] / noise,
             square / noise,

@@ -40,11 +40,11 @@ pub struct SegmentStatistics {
     pub saturation_ratio: f64,
 }
 
-/// Minimum ratio of a segment's information to its own information, so that it is not dropped as
-/// empty.
-const CLAIM_MIN_RATIO: f64 = 1.0e-6;
+/// Minimum ratio of the information that a segment states to its own information, so that it is not
+/// dropped as empty.
+const STATED_MIN_RATIO: f64 = 1.0e-6;
 
-/// θ of one segment alone, with the information that it states.
+/// θ of one segment alone, with its information.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct SegmentTheta {
     /// θ of the segment.
@@ -71,14 +71,14 @@ pub(super) struct SegmentVariance {
 
 /// Information that the segments of one ground state together.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub(super) struct Claims {
+pub(super) struct StatedInformation {
     /// Sum W of the stated information.
     information: f64,
     /// True variance of θ fused from these segments, V ≤ 1/W.
     variance: f64,
 }
 
-impl Claims {
+impl StatedInformation {
     /// Returns the information w that the next segment states: the largest one for which the
     /// variance of the fused θ is at most `1/(W + w)`.
     ///
@@ -90,18 +90,18 @@ impl Claims {
             shared,
         } = segment;
         let (sum, own) = (self.information, variance.recip());
-        let room = 1.0 - 2.0 * sum * shared;
-        let slack = sum * (1.0 - sum * self.variance).max(0.0);
-        let most = 0.5 * own * (room + (room * room + 4.0 * variance * slack).sqrt());
-        let claimed = most.clamp(0.0, own);
-        let together = sum + claimed;
+        let linear = 1.0 - 2.0 * sum * shared;
+        let constant = sum * (1.0 - sum * self.variance).max(0.0);
+        let most = 0.5 * own * (linear + (linear * linear + 4.0 * variance * constant).sqrt());
+        let information = most.clamp(0.0, own);
+        let together = sum + information;
         if together > 0.0 {
             self.variance = (sum * sum * self.variance
-                + claimed * (claimed * variance + 2.0 * sum * shared))
+                + information * (information * variance + 2.0 * sum * shared))
                 / (together * together);
         }
         self.information = together;
-        claimed
+        information
     }
 
     /// Returns θ of an identified segment with the information that it states. Its own error is
@@ -131,6 +131,9 @@ impl SegmentStatistics {
         (self.theta_information > 0.0).then(|| self.theta_weighted / self.theta_information)
     }
 
+    /// Returns the statistics of the blocks in `sums`; without `theta` those on θ are 0.
+    /// `accelerometer_offset_mu` is the standard deviation of the accelerometer's offset over
+    /// gravity.
     pub(super) fn of(
         sums: &Sums,
         offsets: &OffsetKnowledge,
@@ -140,7 +143,7 @@ impl SegmentStatistics {
         let information = theta.map_or(0.0, |found| {
             found
                 .information
-                .max(CLAIM_MIN_RATIO * found.own_information)
+                .max(STATED_MIN_RATIO * found.own_information)
         });
         let duration_s = theta.map_or(0.0, |found| found.duration_s);
         #[expect(
@@ -182,12 +185,12 @@ mod tests {
         fn segments_with_a_common_error_never_claim_more_than_their_sum_keeps(
             segments in prop::collection::vec((0.1..10.0_f64, 0.0..1.0_f64), 1..20),
         ) {
-            let mut claims = Claims::default();
+            let mut stated = StatedInformation::default();
             let mut weights: Vec<f64> = Vec::new();
             let mut variance_sum = 0.0;
             for (variance, correlation) in segments {
                 let shared = 0.1 * correlation;
-                let weight = claims.add(SegmentVariance { total: variance, shared });
+                let weight = stated.add(SegmentVariance { total: variance, shared });
                 prop_assert!((0.0..=variance.recip()).contains(&weight));
                 let before: f64 = weights.iter().sum();
                 variance_sum += weight * (weight * variance + 2.0 * before * shared);
@@ -201,10 +204,10 @@ mod tests {
         fn segments_that_share_nothing_claim_all_they_have(
             variances in prop::collection::vec(0.1..10.0_f64, 1..20),
         ) {
-            let mut claims = Claims::default();
+            let mut stated = StatedInformation::default();
             for variance in variances {
                 let alone = SegmentVariance { total: variance, shared: 0.0 };
-                prop_assert!((claims.add(alone) * variance - 1.0).abs() < 1.0e-9);
+                prop_assert!((stated.add(alone) * variance - 1.0).abs() < 1.0e-9);
             }
         }
     }

@@ -17,26 +17,31 @@ pub(super) struct Sums {
     /// Number of blocks in the linear range with a row.
     pub(super) blocks: u64,
     pub(super) duration_s: f64,
-    /// Rows of the sides' difference, from measured torques.
+    /// Sums of the rows of the sides' difference, from measured torques.
     difference: Channel,
-    /// Rows of the sides' mean, from measured torques.
+    /// Sums of the rows of the sides' mean, from measured torques.
     mean: Channel,
-    /// Rows of the moment balance, from measured accelerations.
+    /// Sums of the rows of the moment balance, from measured accelerations.
     turning: Channel,
-    /// Innovations of the forward speed, scaled to unit variance.
+    /// Sums of the innovations of the forward speed, scaled to unit variance.
     longitudinal: Channel,
+    /// Sums of the rows' squared force over their variance, and of the square of that.
     signal: f64,
     signal_2: f64,
+    /// Number of blocks with sufficient speed, and of those beyond the linear range.
     fast_blocks: f64,
     saturated_blocks: f64,
     friction: DemonstratedFriction,
     /// Sum of the squares of the blocks' slip.
     slip_square: f64,
+    /// Regression of `u_R − u_L` on Wφ̇: square and product, products with the regressors of `δ_c`
+    /// and `δ_d`, noise variance, and number of blocks.
     track_square: f64,
     track_product: f64,
     track_offset: [f64; 2],
     track_noise: f64,
     track_count: f64,
+    /// Sums of the rolling resistance coefficients, their number, and their variances.
     resistance: f64,
     resistance_count: f64,
     resistance_noise: f64,
@@ -47,7 +52,7 @@ impl Sums {
     pub(super) fn add(&mut self, block: &Block) {
         self.fast_blocks += 1.0;
         if block.force.is_some() {
-            self.friction.add(block.mu_seen);
+            self.friction.add(block.mu_demonstrated);
         }
         if !block.is_linear {
             self.saturated_blocks += 1.0;
@@ -99,7 +104,7 @@ impl Sums {
         self.signal_2 += signal * signal;
     }
 
-    /// Returns the sums over the blocks of both.
+    /// Returns the sums over the blocks of both operands.
     pub(super) fn plus(&self, other: &Self) -> Self {
         Self {
             blocks: self.blocks + other.blocks,

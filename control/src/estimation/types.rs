@@ -20,7 +20,8 @@ pub struct SensorNoise {
     pub wheel_speed_rad_s: f64,
     /// Noise of the body speed, metres per second.
     pub body_speed_m_s: f64,
-    /// Noise of the wheel torque, as friction coefficient of one side.
+    /// Noise of a side's wheel torque, over wheel radius and the side's load: as a friction
+    /// coefficient.
     pub torque_mu: f64,
     /// Standard deviation of the relative error of each side's torque constant.
     pub torque_gain_ratio: f64,
@@ -87,8 +88,8 @@ pub struct TyrePrior {
 
 /// Prior of the robot's mass and yaw inertia, relative to those of the model.
 ///
-/// The estimator corrects it by the apparent mass and the identification, as far as the sensors show
-/// them. What remains is an error that all measurements of the robot have in common.
+/// The estimator corrects it by the apparent mass and the identification, as far as the sensors
+/// show them. What remains is an error that all measurements of the robot have in common.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ModelUncertainty {
     /// Standard deviation of the mass, relative to the model's. An error of the mass scales θ from
@@ -164,9 +165,9 @@ pub(super) struct Curvature {
 
 impl TyrePrior {
     /// Returns the prior of unknown tyres: from linear to as curved as a `LuGre` tyre with a peak
-    /// of 0.5, with the relaxation lengths of small tyres, the wheels and rotors of geared motors and
-    /// an eccentric load. The largest friction coefficient is below the peak on wet grass or loose
-    /// gravel (0.3), because slip beyond a peak looks like a small stiffness.
+    /// of 0.5, with the relaxation lengths of small tyres, the wheels and rotors of geared motors
+    /// and an eccentric load. The largest friction coefficient is below the peak on wet grass or
+    /// loose gravel (0.3), because slip beyond a peak looks like a small stiffness.
     pub fn unknown() -> Self {
         Self {
             curvature: 1.0,
@@ -223,7 +224,7 @@ impl Default for TyrePrior {
 pub struct SensorSample {
     /// Measured wheel speeds.
     pub wheel_speeds: WheelSpeeds,
-    /// Turn rate, radians per second.
+    /// Turn rate, radians per second, counter-clockwise positive.
     pub gyro_rad_s: f64,
     /// Acceleration along the ground, body frame, if measured.
     pub acceleration: Option<BodyAcceleration>,
@@ -232,7 +233,7 @@ pub struct SensorSample {
     pub is_specific_force: bool,
     /// Forward speed, metres per second; only in samples with a new measurement.
     pub body_speed_m_s: Option<f64>,
-    /// Drive torques per side, if the base measures them.
+    /// Drive torques at the wheels per side, if the base measures them.
     pub wheel_torques: Option<WheelTorques>,
 }
 
@@ -257,7 +258,7 @@ impl CommonError {
 /// Measurement of θ of the ground under the robot.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ThetaMeasurement {
-    /// θ = 1/K.
+    /// Slip compliance θ = 1/K, without a unit, above 0.
     pub theta: f64,
     /// Standard deviation of θ, including offsets and all common errors.
     pub std_dev: f64,
@@ -265,7 +266,8 @@ pub struct ThetaMeasurement {
     pub own_std_dev: f64,
     /// Common errors of θ.
     pub common: CommonError,
-    /// Effective number of blocks, weighted by their information.
+    /// Effective number of blocks of 0.2 s: fewer than all if few of them have most of the
+    /// information.
     pub effective_samples: f64,
     /// Duration of the blocks used, seconds.
     pub duration_s: f64,
@@ -274,9 +276,9 @@ pub struct ThetaMeasurement {
 /// Estimate of one parameter of the robot.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct IdentifiedValue {
-    /// Estimated value.
+    /// Estimated value, in the parameter's unit.
     pub value: f64,
-    /// Standard deviation of its error.
+    /// Standard deviation of its error, in the same unit.
     pub std_dev: f64,
     /// Whether the estimate is prior-dominated: its variance is more than half of the prior
     /// variance.
@@ -317,10 +319,10 @@ pub struct PayloadChange {
 pub struct Estimate {
     /// θ of the present ground; `None` without excitation.
     pub theta: Option<ThetaMeasurement>,
-    /// Whether the last block brought no new information on θ.
+    /// Whether the motion of about the last two seconds did not excite θ.
     pub no_new_information: bool,
-    /// Lower bound of the peak friction coefficient: what several blocks used, for the heaviest load
-    /// that the torques allow; `None` before any force.
+    /// Lower bound of the peak friction coefficient: what several blocks used, for the heaviest
+    /// load that the torques allow; `None` before any force.
     pub mu_peak_lower_bound: Option<f64>,
     /// Ratio of effective to geometric track width; `None` before enough turning.
     pub effective_track_ratio: Option<f64>,
@@ -332,8 +334,9 @@ pub struct Estimate {
     pub radius_difference: ValueWithStdDev,
     /// Fraction of blocks beyond the linear range of slip, among those with sufficient speed.
     pub saturation_share: f64,
-    /// Root mean square of the residuals of the worst channel, in their assumed standard deviations,
-    /// where it is so large that the model does not describe the robot and there is no θ.
+    /// Root mean square of the residuals of the worst channel, in their assumed standard
+    /// deviations, where it is so large that the model does not describe the robot and there is no
+    /// θ.
     pub misfit_ratio: Option<f64>,
     /// Number of samples dropped because they were not finite or not plausible.
     pub dropped_samples: u64,
@@ -346,9 +349,9 @@ pub struct Estimate {
 /// An estimated value with its standard deviation.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct ValueWithStdDev {
-    /// Estimated value.
+    /// Estimated value, in the unit of the estimated quantity.
     pub value: f64,
-    /// Standard deviation of its error.
+    /// Standard deviation of its error, in the same unit.
     pub std_dev: f64,
 }
 

@@ -15,18 +15,18 @@ use super::{BLOCK_S, SensorSample, signed_rims};
 use crate::robot::{GRAVITY_M_S2, RobotModel};
 
 /// Maximum factor by which the variation of slip is scaled up to compensate for averaging.
-const SWING_SCALE_MAX: f64 = 1.5;
+const VARIATION_SCALE_MAX: f64 = 1.5;
 /// Duration of a ramp, seconds.
 const RAMP_S: f64 = 0.05;
 
 /// Number of intervals of a window in which the variation of slip is recorded.
-pub(super) const MOMENTS: usize = 10;
+pub(super) const INTERVALS: usize = 10;
 
 /// Deviation from the means of the window in one interval.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub(super) struct Moment {
+pub(super) struct IntervalDeviation {
     /// Right minus left longitudinal slip.
-    pub(super) apart: f64,
+    pub(super) slip_difference: f64,
     pub(super) turn_rad_s: f64,
     /// Forward acceleration over gravity.
     pub(super) longitudinal_mu: f64,
@@ -38,27 +38,30 @@ pub(super) struct Moment {
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct MotionVariation {
     /// Means over short intervals.
-    moments: [Moment; MOMENTS],
-    /// Variance of the samples' `apart`, including sensor noise.
-    apart_variance: f64,
+    intervals: [IntervalDeviation; INTERVALS],
+    /// Variance of the samples' `slip_difference`, including sensor noise.
+    slip_difference_variance: f64,
 }
 
 impl MotionVariation {
-    /// Returns the intervals with `apart` scaled to the variance of the samples minus that of their
-    /// noise, `apart_noise`.
-    pub(super) fn without_noise(&self, apart_noise: f64) -> [Moment; MOMENTS] {
+    /// Returns the intervals with `slip_difference` scaled to the variance of the samples minus
+    /// that of their noise, `slip_difference_noise`.
+    pub(super) fn without_noise(
+        &self,
+        slip_difference_noise: f64,
+    ) -> [IntervalDeviation; INTERVALS] {
         let seen = self
-            .moments
+            .intervals
             .iter()
-            .map(|moment| moment.weight * moment.apart * moment.apart)
+            .map(|interval| interval.weight * interval.slip_difference * interval.slip_difference)
             .sum::<f64>();
-        let clean = (self.apart_variance - apart_noise).max(0.0);
+        let clean = (self.slip_difference_variance - slip_difference_noise).max(0.0);
         let scale = (clean / seen.max(f64::MIN_POSITIVE))
             .sqrt()
-            .min(SWING_SCALE_MAX);
-        self.moments.map(|moment| Moment {
-            apart: moment.apart * scale,
-            ..moment
+            .min(VARIATION_SCALE_MAX);
+        self.intervals.map(|interval| IntervalDeviation {
+            slip_difference: interval.slip_difference * scale,
+            ..interval
         })
     }
 }
@@ -84,7 +87,7 @@ impl SampleSpan {
 
 /// Weighted sums over one window.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-struct Part {
+struct WindowSums {
     weight_s: f64,
     samples: f64,
     is_broken: bool,
@@ -96,9 +99,9 @@ struct Part {
     rim_difference: f64,
     rim_mean: f64,
     /// Sums of right minus left longitudinal slip and of its square.
-    apart: [f64; 2],
+    slip_difference: [f64; 2],
     /// Sums over intervals of the time since the window's start.
-    moments: [Moment; MOMENTS],
+    intervals: [IntervalDeviation; INTERVALS],
     /// Weighted gyro over the ramps `[first, last]`, radians per second, with the covered fractions
     /// of the ramps in `ramp_share`.
     ramp: [f64; 2],
@@ -129,7 +132,7 @@ pub(super) struct TurnMeans {
     pub(super) rim_difference_m_s: f64,
     /// `(u_R + u_L)/2`, metres per second, negative in reverse.
     pub(super) rim_mean_m_s: f64,
-    pub(super) swing: MotionVariation,
+    pub(super) variation: MotionVariation,
     pub(super) duration_s: f64,
     pub(super) samples: f64,
     pub(super) ramp_samples: f64,
@@ -138,8 +141,8 @@ pub(super) struct TurnMeans {
 /// The window that ends with the current block, and the one that begins in it.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct TurnWindow {
-    ending: Part,
-    beginning: Part,
+    ending: WindowSums,
+    beginning: WindowSums,
 }
 
 impl TurnWindow {
@@ -147,7 +150,7 @@ impl TurnWindow {
     pub(super) fn next(&self) -> Self {
         Self {
             ending: self.beginning,
-            beginning: Part::default(),
+            beginning: WindowSums::default(),
         }
     }
 
@@ -172,60 +175,60 @@ impl TurnWindow {
 
     /// Returns the means over the window that ends; `None` if it is incomplete.
     pub(super) fn means(&self, block_s: f64) -> Option<TurnMeans> {
-        let part = &self.ending;
+        let sums = &self.ending;
         // The first window of a drive has no rising ramp.
-        let is_whole = !part.is_broken
-            && part.ramp_share.iter().all(|share| *share > 0.5)
-            && part.weight_s > 0.5 * block_s;
+        let is_whole = !sums.is_broken
+            && sums.ramp_share.iter().all(|share| *share > 0.5)
+            && sums.weight_s > 0.5 * block_s;
         if !is_whole {
             return None;
         }
-        let mean = |sum: f64| sum / part.weight_s;
-        let rates = [0, 1].map(|end| part.ramp[end] / part.ramp_share[end]);
+        let mean = |sum: f64| sum / sums.weight_s;
+        let rates = [0, 1].map(|end| sums.ramp[end] / sums.ramp_share[end]);
         Some(TurnMeans {
-            slip_m_s: mean(part.slip),
-            harmonic_m_s: mean(part.harmonic),
-            longitudinal_force_m_s: mean(part.longitudinal_force),
-            longitudinal_mu: mean(part.longitudinal_mu),
-            turn_rad_s: mean(part.turn),
+            slip_m_s: mean(sums.slip),
+            harmonic_m_s: mean(sums.harmonic),
+            longitudinal_force_m_s: mean(sums.longitudinal_force),
+            longitudinal_mu: mean(sums.longitudinal_mu),
+            turn_rad_s: mean(sums.turn),
             turn_acceleration_rad_s2: (rates[1] - rates[0]) / block_s,
-            turn_jerk_rad_s3: if part.middle[1] > 0.0 {
-                4.0 * (rates[0] + rates[1] - 2.0 * part.middle[0] / part.middle[1])
+            turn_jerk_rad_s3: if sums.middle[1] > 0.0 {
+                4.0 * (rates[0] + rates[1] - 2.0 * sums.middle[0] / sums.middle[1])
                     / (block_s * block_s)
             } else {
                 0.0
             },
-            middle_samples: part.middle[1].max(1.0),
-            rim_difference_m_s: mean(part.rim_difference),
-            rim_mean_m_s: mean(part.rim_mean),
-            swing: part.swing(),
+            middle_samples: sums.middle[1].max(1.0),
+            rim_difference_m_s: mean(sums.rim_difference),
+            rim_mean_m_s: mean(sums.rim_mean),
+            variation: sums.variation(),
             duration_s: block_s,
-            samples: part.samples,
-            ramp_samples: part.ramp_samples.max(1.0),
+            samples: sums.samples,
+            ramp_samples: sums.ramp_samples.max(1.0),
         })
     }
 }
 
-impl Part {
-    fn swing(&self) -> MotionVariation {
-        let [apart, square] = self.apart.map(|sum| sum / self.weight_s);
+impl WindowSums {
+    fn variation(&self) -> MotionVariation {
+        let [slip_difference, square] = self.slip_difference.map(|sum| sum / self.weight_s);
         let (turn_rad_s, longitudinal_mu) = (
             self.turn / self.weight_s,
             self.longitudinal_mu / self.weight_s,
         );
         MotionVariation {
-            moments: self.moments.map(|sum| {
+            intervals: self.intervals.map(|sum| {
                 if sum.weight <= 0.0 {
-                    return Moment::default();
+                    return IntervalDeviation::default();
                 }
-                Moment {
-                    apart: sum.apart / sum.weight - apart,
+                IntervalDeviation {
+                    slip_difference: sum.slip_difference / sum.weight - slip_difference,
                     turn_rad_s: sum.turn_rad_s / sum.weight - turn_rad_s,
                     longitudinal_mu: sum.longitudinal_mu / sum.weight - longitudinal_mu,
                     weight: sum.weight / self.weight_s,
                 }
             }),
-            apart_variance: square - apart * apart,
+            slip_difference_variance: square - slip_difference * slip_difference,
         }
     }
 
@@ -257,21 +260,22 @@ impl Part {
         self.longitudinal_mu += weight_s * forward_m_s2 / GRAVITY_M_S2;
         self.turn += weight_s * sample.gyro_rad_s;
         self.rim_difference += weight_s * (rims.right_m_s - rims.left_m_s);
-        let apart = (rims.right_m_s - rims.left_m_s - track_m * sample.gyro_rad_s) * half_sum;
-        self.apart[0] += weight_s * apart;
-        self.apart[1] += weight_s * apart * apart;
+        let slip_difference =
+            (rims.right_m_s - rims.left_m_s - track_m * sample.gyro_rad_s) * half_sum;
+        self.slip_difference[0] += weight_s * slip_difference;
+        self.slip_difference[1] += weight_s * slip_difference * slip_difference;
         #[expect(
             clippy::cast_possible_truncation,
             clippy::cast_sign_loss,
             clippy::cast_precision_loss,
-            reason = "a share of a few moments, not below zero"
+            reason = "a share of a few intervals, not below zero"
         )]
-        let moment = (middle_s.max(0.0) * MOMENTS as f64 / (BLOCK_S + RAMP_S)) as usize;
-        let moment = &mut self.moments[moment.min(MOMENTS - 1)];
-        moment.apart += weight_s * apart;
-        moment.turn_rad_s += weight_s * sample.gyro_rad_s;
-        moment.longitudinal_mu += weight_s * forward_m_s2 / GRAVITY_M_S2;
-        moment.weight += weight_s;
+        let interval = (middle_s.max(0.0) * INTERVALS as f64 / (BLOCK_S + RAMP_S)) as usize;
+        let interval = &mut self.intervals[interval.min(INTERVALS - 1)];
+        interval.slip_difference += weight_s * slip_difference;
+        interval.turn_rad_s += weight_s * sample.gyro_rad_s;
+        interval.longitudinal_mu += weight_s * forward_m_s2 / GRAVITY_M_S2;
+        interval.weight += weight_s;
         self.rim_mean += weight_s * rims.sign * 0.5 * (rims.right_m_s + rims.left_m_s);
     }
 }

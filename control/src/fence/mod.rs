@@ -7,18 +7,18 @@
 //! 1, so a path can be sampled in steps as long as the clearance of the last sample: a few samples
 //! give the free distance along an arc, whatever the shape of the fence.
 //!
-//! [`Fence::judge`] limits the speed so that the robot stops within that distance. Nothing here
-//! allocates after [`Fence::new`].
+//! [`Fence::limit_speed`] limits the speed so that the robot stops within that distance. Nothing
+//! here allocates after [`Fence::new`].
 
-mod ring;
+mod polygon;
 mod speed;
 
 use crate::geometry::Point;
 use crate::plan::Plan;
 use crate::robot::RobotModel;
-use ring::Ring;
+use polygon::Polygon;
 pub use speed::{
-    Braking, FenceInput, FenceVerdict, MARGIN_STD_DEVS, MU_UNKNOWN, REACTION_S, RETURN_MAX_M_S,
+    Braking, FenceInput, FenceLimit, MARGIN_STD_DEVS, MU_UNKNOWN, REACTION_S, RETURN_MAX_M_S,
 };
 
 /// Distance from the robot's disc to the fence that is kept free, metres.
@@ -30,8 +30,8 @@ const BREACH_STEP_M: f64 = 0.02;
 /// of them).
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Fence {
-    keep_in: Vec<Ring>,
-    keep_out: Vec<Ring>,
+    keep_in: Vec<Polygon>,
+    keep_out: Vec<Polygon>,
 }
 
 /// Polygons of a fence; each is a list of corners in order, in the site frame.
@@ -91,20 +91,25 @@ pub fn disc_radius_m(model: &RobotModel) -> f64 {
 }
 
 impl Fence {
-    /// Creates a fence.
+    /// Creates a fence. Corners may be in either order; the even-odd rule gives what is inside of a
+    /// polygon.
     pub fn new(spec: &FenceSpec) -> Self {
-        let rings =
-            |polygons: &[Vec<Point>]| polygons.iter().map(|corners| Ring::new(corners)).collect();
+        let prepared = |polygons: &[Vec<Point>]| {
+            polygons
+                .iter()
+                .map(|corners| Polygon::new(corners))
+                .collect()
+        };
         Self {
-            keep_in: rings(&spec.keep_in),
-            keep_out: rings(&spec.keep_out),
+            keep_in: prepared(&spec.keep_in),
+            keep_out: prepared(&spec.keep_out),
         }
     }
 
     /// Creates a fence without any allowed ground, in place of one that is invalid.
-    pub fn without_room() -> Self {
+    pub fn without_allowed_ground() -> Self {
         Self {
-            keep_in: vec![Ring::new(&[])],
+            keep_in: vec![Polygon::new(&[])],
             keep_out: Vec::new(),
         }
     }
@@ -114,44 +119,44 @@ impl Fence {
         self.keep_in.is_empty() && self.keep_out.is_empty()
     }
 
-    /// Returns the clearance of a point, metres: positive inside the allowed ground, negative
-    /// outside, infinite without any polygon, −∞ for a point that is not finite.
+    /// Returns the clearance of a point of the site frame, metres: positive inside the allowed
+    /// ground, negative outside, infinite without any polygon, −∞ for a point that is not finite.
     pub fn clearance_m(&self, point: Point) -> f64 {
         if !point.is_finite() {
             return f64::NEG_INFINITY;
         }
-        let depths = self.keep_in.iter().map(|ring| ring.depth_m(point));
+        let depths = self.keep_in.iter().map(|polygon| polygon.depth_m(point));
         let inside_m = if self.keep_in.is_empty() {
             f64::INFINITY
         } else {
             depths.fold(f64::NEG_INFINITY, f64::max)
         };
         let mut clearance_m = inside_m;
-        for ring in &self.keep_out {
+        for polygon in &self.keep_out {
             // A polygon farther away than the present clearance cannot reduce it.
-            if ring.outside_at_least_m(point) < clearance_m {
-                clearance_m = clearance_m.min(-ring.depth_m(point));
+            if polygon.outside_distance_min_m(point) < clearance_m {
+                clearance_m = clearance_m.min(-polygon.depth_m(point));
             }
         }
         clearance_m
     }
 
-    /// Returns the forbidden overlap of a disc with the largest depth, or None if the whole disc is
-    /// on allowed ground.
+    /// Returns the deepest overlap of a disc with forbidden ground; None if the whole disc is on
+    /// allowed ground. `center` is in the site frame.
     pub fn overlap(&self, center: Point, radius_m: f64) -> Option<Overlap> {
-        let of = |polygon: FencePolygon, ring: &Ring, depth_m: f64| Overlap {
-            polygon,
-            border: ring.border_near(center),
+        let of = |index: FencePolygon, polygon: &Polygon, depth_m: f64| Overlap {
+            polygon: index,
+            border: polygon.nearest_border_point(center),
             depth_m,
         };
-        let inside = self.keep_in.iter().enumerate().map(|(index, ring)| {
-            let depth_m = radius_m - ring.depth_m(center);
-            of(FencePolygon::KeepIn(index), ring, depth_m)
+        let inside = self.keep_in.iter().enumerate().map(|(index, polygon)| {
+            let depth_m = radius_m - polygon.depth_m(center);
+            of(FencePolygon::KeepIn(index), polygon, depth_m)
         });
         let inside = inside.min_by(|one, other| one.depth_m.total_cmp(&other.depth_m));
-        let outside = self.keep_out.iter().enumerate().map(|(index, ring)| {
-            let depth_m = radius_m + ring.depth_m(center);
-            of(FencePolygon::KeepOut(index), ring, depth_m)
+        let outside = self.keep_out.iter().enumerate().map(|(index, polygon)| {
+            let depth_m = radius_m + polygon.depth_m(center);
+            of(FencePolygon::KeepOut(index), polygon, depth_m)
         });
         inside
             .into_iter()

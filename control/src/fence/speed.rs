@@ -25,45 +25,46 @@ const STEP_MIN_M: f64 = 0.005;
 /// Distance ahead at which a robot outside checks that its clearance increases, metres.
 const RETURN_STEP_M: f64 = 0.05;
 
-/// Input of [`Fence::judge`].
+/// Input of [`Fence::limit_speed`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FenceInput {
     /// Robot pose in the site frame.
     pub pose: Pose,
     /// Standard deviation of the position per axis, metres; a non-finite value stops the robot.
     pub position_std_dev_m: f64,
-    /// Present twist.
+    /// Measured twist, body frame.
     pub present: Twist,
-    /// Commanded twist before the limit.
+    /// Commanded twist before the limit, body frame.
     pub wanted: Twist,
     /// Lower bound of the ground's friction coefficient; None, or a value not above zero, acts as
     /// [`MU_UNKNOWN`].
     pub mu_lower: Option<f64>,
 }
 
-/// Clearance and speed limit of a robot.
+/// Clearance of a robot, and the speed limit of its fence.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct FenceVerdict {
-    /// Distance from the robot's disc, enlarged by the margin and twice the standard deviation of the
-    /// position, to the fence, metres; negative outside, ∞ without a fence, −∞ for input that is not
-    /// finite.
+pub struct FenceLimit {
+    /// Distance from the robot's disc, enlarged by the margin and twice the standard deviation of
+    /// the position, to the fence, metres; negative outside, ∞ without a fence, −∞ for input that
+    /// is not finite.
     pub clearance_m: f64,
-    /// Maximum speed along the robot's arc, metres per second; None while the fence is out of
-    /// reach.
+    /// Maximum magnitude of the forward speed, metres per second; None if the robot stops before
+    /// the fence anyway.
     pub speed_max_m_s: Option<f64>,
 }
 
-/// Guaranteed deceleration of a robot.
+/// Braking of a robot with a deceleration that the ground certainly allows.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Braking {
-    /// Deceleration, metres per second squared.
+    /// Deceleration, metres per second squared, above 0.
     pub deceleration_m_s2: f64,
 }
 
 impl Braking {
-    /// Returns the smaller of the robot's acceleration limit and half of `μg`; the other half is
-    /// left for steering.
-    pub fn sure(model: &RobotModel, mu_lower: Option<f64>) -> Self {
+    /// Returns the deceleration that is certain with `mu_lower`, the lower bound of the ground's
+    /// friction coefficient μ: the smaller of the robot's acceleration limit and half of `μg`; the
+    /// other half is left for steering. None, or a value not above zero, acts as [`MU_UNKNOWN`].
+    pub fn guaranteed(model: &RobotModel, mu_lower: Option<f64>) -> Self {
         let mu = mu_lower
             .filter(|mu| mu.is_finite() && *mu > 0.0)
             .unwrap_or(MU_UNKNOWN);
@@ -73,13 +74,15 @@ impl Braking {
         }
     }
 
-    /// Returns the distance from a decision to zero speed, `v t + v²/2a`, metres.
+    /// Returns the distance from a decision at a speed of either sign until the robot stands, with
+    /// the reaction time t = [`REACTION_S`]: `v t + v²/2a`, metres.
     pub fn stopping_distance_m(self, speed_m_s: f64) -> f64 {
         let speed_m_s = speed_m_s.abs();
         speed_m_s * REACTION_S + speed_m_s * speed_m_s / (2.0 * self.deceleration_m_s2)
     }
 
-    /// Returns the maximum speed from which the robot stops within a distance, metres per second.
+    /// Returns the maximum speed from which the robot stops within a distance, metres per second:
+    /// the inverse of [`Self::stopping_distance_m`]. A negative distance counts as 0.
     pub fn speed_within_m_s(self, distance_m: f64) -> f64 {
         let delay_m_s = self.deceleration_m_s2 * REACTION_S;
         let free_m2_s2 = 2.0 * self.deceleration_m_s2 * distance_m.max(0.0);
@@ -87,14 +90,14 @@ impl Braking {
     }
 }
 
-/// A stretch of an arc; a negative distance goes backwards.
+/// Arc of constant curvature, positive to the left; a negative distance is driven backwards.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Arc {
     pub(super) curvature_1_m: f64,
     pub(super) distance_m: f64,
 }
 
-/// Returns the pose after a distance along an arc; a negative distance goes backwards.
+/// Returns the pose at the end of an arc that starts at `pose`.
 pub(super) fn along_arc(pose: Pose, arc: Arc) -> Pose {
     let Arc {
         curvature_1_m,
@@ -124,7 +127,9 @@ struct Disc {
 }
 
 impl Fence {
-    /// Returns the free distance of a disc along its arc, metres, at most `most_m`; 0 outside.
+    /// Returns the free distance of a disc along the arc of a twist, metres, at most `most_m`; 0
+    /// outside. Steps as far as the clearance, which falls by at most the distance driven (sphere
+    /// tracing).
     fn free_distance_m(&self, disc: Disc, twist: Twist, most_m: f64) -> f64 {
         if twist.linear_m_s.abs() < 1.0e-6 {
             return most_m;
@@ -152,7 +157,8 @@ impl Fence {
         distance_m
     }
 
-    /// Returns whether a motion from outside increases the clearance, or leaves the disc in place.
+    /// Returns whether a motion of a robot outside increases the clearance of its centre, which is
+    /// `clearance_m`, or leaves the disc in place.
     fn leads_back(&self, pose: Pose, twist: Twist, clearance_m: f64) -> bool {
         if twist.linear_m_s.abs() < 1.0e-6 {
             // Turning on the spot leaves the disc where it is.
@@ -167,41 +173,45 @@ impl Fence {
         self.clearance_m(next.point()) > clearance_m + 0.1 * RETURN_STEP_M
     }
 
-    /// Computes the speed limit from the free distance along both the present and the wanted arc.
-    /// Input that is not finite gives a limit of 0; an empty fence gives none.
-    pub fn judge(&self, input: &FenceInput, model: &RobotModel) -> FenceVerdict {
+    /// Computes the clearance, and the speed limit from the free distance along both the present
+    /// and the wanted arc. A robot outside is limited to [`RETURN_MAX_M_S`] where its motion
+    /// increases the clearance, else to 0. Input that is not finite gives a limit of 0; an empty
+    /// fence gives none.
+    pub fn limit_speed(&self, input: &FenceInput, model: &RobotModel) -> FenceLimit {
         if self.is_empty() {
-            return FenceVerdict {
+            return FenceLimit {
                 clearance_m: f64::INFINITY,
                 speed_max_m_s: None,
             };
         }
-        let all_stop = FenceVerdict {
+        let stop = FenceLimit {
             clearance_m: f64::NEG_INFINITY,
             speed_max_m_s: Some(0.0),
         };
         if !(input.pose.is_finite() && input.present.is_finite() && input.wanted.is_finite()) {
-            return all_stop;
+            return stop;
         }
         if !input.position_std_dev_m.is_finite() {
-            return all_stop;
+            return stop;
         }
         let radius_m =
             disc_radius_m(model) + MARGIN_M + MARGIN_STD_DEVS * input.position_std_dev_m.max(0.0);
-        let here_m = self.clearance_m(input.pose.point());
-        let clearance_m = here_m - radius_m;
-        let cap = |most_m_s: f64| FenceVerdict {
+        let centre_clearance_m = self.clearance_m(input.pose.point());
+        let clearance_m = centre_clearance_m - radius_m;
+        let cap = |most_m_s: f64| FenceLimit {
             clearance_m,
             speed_max_m_s: Some(most_m_s),
         };
         if clearance_m < STEP_MIN_M {
-            return cap(if self.leads_back(input.pose, input.wanted, here_m) {
-                RETURN_MAX_M_S
-            } else {
-                0.0
-            });
+            return cap(
+                if self.leads_back(input.pose, input.wanted, centre_clearance_m) {
+                    RETURN_MAX_M_S
+                } else {
+                    0.0
+                },
+            );
         }
-        let braking = Braking::sure(model, input.mu_lower);
+        let braking = Braking::guaranteed(model, input.mu_lower);
         let fastest_m_s = input
             .present
             .linear_m_s
@@ -209,9 +219,9 @@ impl Fence {
             .max(input.wanted.linear_m_s.abs());
         // Farther than the stopping distance, so that the limit does not switch on and off at its
         // edge.
-        let reach_m = 1.2 * braking.stopping_distance_m(fastest_m_s);
-        if clearance_m >= reach_m {
-            return FenceVerdict {
+        let lookahead_m = 1.2 * braking.stopping_distance_m(fastest_m_s);
+        if clearance_m >= lookahead_m {
+            return FenceLimit {
                 clearance_m,
                 speed_max_m_s: None,
             };
@@ -222,10 +232,10 @@ impl Fence {
         };
         let free_m = [input.present, input.wanted]
             .into_iter()
-            .map(|twist| self.free_distance_m(disc, twist, reach_m))
-            .fold(reach_m, f64::min);
-        if free_m >= reach_m {
-            return FenceVerdict {
+            .map(|twist| self.free_distance_m(disc, twist, lookahead_m))
+            .fold(lookahead_m, f64::min);
+        if free_m >= lookahead_m {
+            return FenceLimit {
                 clearance_m,
                 speed_max_m_s: None,
             };

@@ -55,7 +55,7 @@ proptest! {
         let mut pose = Pose { x_m, y_m, heading_rad };
         let radius_m = disc_radius_m(&model);
         prop_assume!(fence.clearance_m(pose.point()) > radius_m + MARGIN_M);
-        let braking = Braking::sure(&model, mu);
+        let braking = Braking::guaranteed(&model, mu);
         let dt_s = 0.02;
         let mut present = Twist::default();
         // Decisions reach the wheels after this delay.
@@ -66,7 +66,7 @@ proptest! {
                 let input = FenceInput {
                     pose, position_std_dev_m: 0.0, present, wanted, mu_lower: mu,
                 };
-                let most_m_s = fence.judge(&input, &model).speed_max_m_s;
+                let most_m_s = fence.limit_speed(&input, &model).speed_max_m_s;
                 let share = most_m_s.map_or(1.0, |most_m_s| {
                     (most_m_s / linear_m_s.abs().max(1.0e-9)).min(1.0)
                 });
@@ -157,7 +157,7 @@ fn along_a_fence_is_free_and_towards_it_is_slow() {
         },
         mu_lower: None,
     };
-    let cap = |heading_rad| fence.judge(&at(heading_rad), &model).speed_max_m_s;
+    let cap = |heading_rad| fence.limit_speed(&at(heading_rad), &model).speed_max_m_s;
     assert!(cap(0.0).unwrap() < 0.2);
     assert!(cap(1.57).is_none_or(|most_m_s| most_m_s > 0.5));
     assert!(cap(PI).is_none_or(|most_m_s| most_m_s > 0.5));
@@ -181,7 +181,7 @@ fn from_outside_only_the_way_back_is_open() {
             },
             mu_lower: None,
         };
-        fence.judge(&input, &model).speed_max_m_s
+        fence.limit_speed(&input, &model).speed_max_m_s
     };
     assert_eq!(at(0.0, 0.5), Some(RETURN_MAX_M_S));
     assert_eq!(at(0.0, -0.5), Some(0.0));
@@ -227,7 +227,7 @@ fn a_pose_that_is_no_number_stops() {
         wanted: Twist::default(),
         mu_lower: None,
     };
-    let verdict = yard().judge(&input, &RobotModel::yi2007());
+    let verdict = yard().limit_speed(&input, &RobotModel::yi2007());
     assert_eq!(verdict.speed_max_m_s, Some(0.0));
 }
 
@@ -250,7 +250,7 @@ fn an_overlap_names_the_polygon_and_the_nearest_point_of_its_border() {
 
 #[test]
 fn a_fence_without_room_stops_every_way_of_driving() {
-    let (fence, model) = (Fence::without_room(), RobotModel::yi2007());
+    let (fence, model) = (Fence::without_allowed_ground(), RobotModel::yi2007());
     assert!(!fence.is_empty());
     for linear_m_s in [-0.5, 0.5] {
         let input = FenceInput {
@@ -263,7 +263,7 @@ fn a_fence_without_room_stops_every_way_of_driving() {
             },
             mu_lower: None,
         };
-        assert_eq!(fence.judge(&input, &model).speed_max_m_s, Some(0.0));
+        assert_eq!(fence.limit_speed(&input, &model).speed_max_m_s, Some(0.0));
     }
     let path = CentrePath {
         point_at: |_: f64| Point::default(),

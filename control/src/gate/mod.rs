@@ -118,14 +118,14 @@ pub struct Reasons {
 }
 
 impl Reasons {
-    /// Returns the strictest reason to stop, or None.
+    /// Returns the strictest cause that requires zero speed, or None.
     fn hold(&self, limits: &GateLimits) -> Option<GateCause> {
-        let leans = self
+        let is_tilted = self
             .tilt_rad
             .is_some_and(|tilt_rad| tilt_rad.is_nan() || tilt_rad.abs() > limits.tilt_max_rad);
         [
             (self.is_stopped, GateCause::Stop),
-            (leans, GateCause::Tilt),
+            (is_tilted, GateCause::Tilt),
             (self.is_position_lost, GateCause::StalePosition),
             (self.is_sensor_wrong, GateCause::SensorFault),
             (self.is_loop_late, GateCause::LoopOverrun),
@@ -134,7 +134,7 @@ impl Reasons {
             (self.is_driver_silent, GateCause::Lease),
         ]
         .into_iter()
-        .find_map(|(is_so, cause)| is_so.then_some(cause))
+        .find_map(|(holds, cause)| holds.then_some(cause))
     }
 
     /// Returns the lowest speed cap and its cause, or None; of equal caps the stricter cause.
@@ -190,8 +190,9 @@ const ROUNDING_SHARE: f64 = 1.0e-9;
 const SLIP_LEAST_M_S: f64 = 0.01;
 
 impl GateLimits {
-    /// Returns the limits of a robot. Its braking along the path is at most twice its planned
-    /// deceleration, so that a turn can be ended at the same time.
+    /// Returns the limits of a robot, with defaults for tilt and feedback age. Its braking along
+    /// the path is at most twice its planned deceleration, so that a turn can be ended at the same
+    /// time.
     pub fn of(model: &RobotModel) -> Self {
         let limits = model.limits();
         let braking = 2.0 * limits.linear_acceleration_max_m_s2 / model.wheel_radius_m();
@@ -210,7 +211,7 @@ impl GateLimits {
 /// Input of the gate in one tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GateInput {
-    /// Wanted wheel speeds; None requires zero speed.
+    /// Commanded wheel speeds; None requires zero speed.
     pub command: Option<WheelSpeeds>,
     /// Last output of the gate.
     pub previous: WheelSpeeds,
@@ -225,9 +226,10 @@ pub struct GateInput {
 /// Output of the gate in one tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GateOutput {
-    /// Wheel speeds for the base.
+    /// Wheel speeds to command to the base, within all limits.
     pub wheel_speeds: WheelSpeeds,
-    /// Wheel speeds after reductions, towards which the acceleration limits lead.
+    /// Wheel speeds after all reductions but those of the acceleration limits, within which
+    /// `wheel_speeds` approaches them.
     pub target: WheelSpeeds,
     /// Strictest cause of a reduction; None if the command passed unchanged.
     pub cause: Option<GateCause>,
@@ -241,15 +243,15 @@ pub fn gate(input: &GateInput, limits: &GateLimits) -> GateOutput {
 /// Reduces a command for the reasons in the input and in `reasons`, within the limits.
 pub fn gate_with(input: &GateInput, reasons: &Reasons, limits: &GateLimits) -> GateOutput {
     let mut cause: Option<GateCause> = None;
-    let mut note = |new: GateCause| cause = cause.max(Some(new));
+    let mut record = |new: GateCause| cause = cause.max(Some(new));
     let rest = WheelSpeeds::default();
     let mut target = match input.command {
         None => {
-            note(GateCause::NoCommand);
+            record(GateCause::NoCommand);
             rest
         }
         Some(command) if !command.is_finite() => {
-            note(GateCause::NotFinite);
+            record(GateCause::NotFinite);
             rest
         }
         Some(command) => command,
@@ -258,14 +260,14 @@ pub fn gate_with(input: &GateInput, reasons: &Reasons, limits: &GateLimits) -> G
     let dt_s = if input.dt_s.is_finite() && input.dt_s >= 0.0 {
         input.dt_s
     } else {
-        note(GateCause::NotFinite);
+        record(GateCause::NotFinite);
         target = rest;
         TICK_USUAL_S
     };
     let previous = if input.previous.is_finite() {
         input.previous
     } else {
-        note(GateCause::NotFinite);
+        record(GateCause::NotFinite);
         target = rest;
         rest
     };
@@ -278,7 +280,7 @@ pub fn gate_with(input: &GateInput, reasons: &Reasons, limits: &GateLimits) -> G
         stale.max(reasons.hold(limits))
     };
     if let Some(hold) = hold {
-        note(hold);
+        record(hold);
         target = rest;
     }
     let share =
@@ -286,7 +288,7 @@ pub fn gate_with(input: &GateInput, reasons: &Reasons, limits: &GateLimits) -> G
     if share < 1.0 {
         // Rounding between wheel speeds and twists is not reported.
         if share < 1.0 - ROUNDING_SHARE {
-            note(GateCause::Speed);
+            record(GateCause::Speed);
         }
         target = scaled(target, share);
     }
@@ -295,7 +297,7 @@ pub fn gate_with(input: &GateInput, reasons: &Reasons, limits: &GateLimits) -> G
         let forward_m_s =
             0.5 * limits.wheel_radius_m * (target.left_rad_s + target.right_rad_s).abs();
         if forward_m_s > most_m_s {
-            note(capped_by);
+            record(capped_by);
             is_capped = true;
             target = scaled(target, most_m_s / forward_m_s);
         }
@@ -310,7 +312,7 @@ pub fn gate_with(input: &GateInput, reasons: &Reasons, limits: &GateLimits) -> G
         let steady = teleoperation::no_faster(change);
         if steady != change.to {
             target = model.wheel_speeds_from_twist(steady);
-            note(GateCause::Acceleration);
+            record(GateCause::Acceleration);
         }
     }
     let step = Step {
@@ -327,7 +329,7 @@ pub fn gate_with(input: &GateInput, reasons: &Reasons, limits: &GateLimits) -> G
     if is_short(wheel_speeds.left_rad_s, target.left_rad_s)
         || is_short(wheel_speeds.right_rad_s, target.right_rad_s)
     {
-        note(GateCause::Acceleration);
+        record(GateCause::Acceleration);
     }
     GateOutput {
         wheel_speeds,
@@ -340,7 +342,7 @@ pub fn gate_with(input: &GateInput, reasons: &Reasons, limits: &GateLimits) -> G
 ///
 /// The centre decelerates at the braking limit, also in a turn, where one side must decelerate
 /// faster than the centre: by at most twice the limit.
-fn rest_share(previous: WheelSpeeds, step: Step, limits: &GateLimits) -> f64 {
+fn stopping_share(previous: WheelSpeeds, step: Step, limits: &GateLimits) -> f64 {
     let up = limits.wheel_acceleration_max_rad_s2 * step.dt_s;
     let braking = limits.wheel_braking_max_rad_s2 * step.dt_s;
     let fastest_rad_s = previous.magnitude_max_rad_s();
@@ -355,9 +357,9 @@ fn rest_share(previous: WheelSpeeds, step: Step, limits: &GateLimits) -> f64 {
         .min(1.0)
 }
 
-/// Returns the fraction by which the wheels exceed the robot's measured speed, at most what they
-/// may change in a tick. Without this reduction a robot that gains speed by slip would be
-/// accelerated while it brakes.
+/// Returns the fraction of the wheels' speed by which it exceeds the robot's measured speed, at
+/// most what they may change in a tick. Without this reduction a robot that gains speed by slip
+/// would be accelerated while it brakes.
 fn slip_share(previous: WheelSpeeds, step: Step, limits: &GateLimits) -> f64 {
     let up = limits.wheel_acceleration_max_rad_s2 * step.dt_s;
     let centre_m_s = 0.5 * limits.wheel_radius_m * (previous.left_rad_s + previous.right_rad_s);
@@ -395,7 +397,7 @@ fn scaled(speeds: WheelSpeeds, share: f64) -> WheelSpeeds {
 /// both sides are reduced by the same fraction, so that the robot stays on its arc.
 fn ramped(change: Change<WheelSpeeds>, step: Step, limits: &GateLimits) -> WheelSpeeds {
     if change.to == WheelSpeeds::default() {
-        let share = rest_share(change.from, step, limits);
+        let share = stopping_share(change.from, step, limits);
         let slip = slip_share(change.from, step, limits);
         return scaled(change.from, 1.0 - share.max(slip));
     }

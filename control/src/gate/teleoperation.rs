@@ -24,7 +24,7 @@ pub const BLIND_MAX_M_S: f64 = 0.3;
 /// Time before the end of a command in which it no longer accelerates the robot, seconds: twice the
 /// lag of a wheel servo, so that robot and wheels have the same speed when it ends.
 pub const STEADY_BEFORE_END_S: f64 = 0.1;
-/// Fraction of the difference to the worst age that each earlier command removes.
+/// Fraction of the difference to the worst age by which each command of a smaller age lowers it.
 const FORGOTTEN_SHARE: f64 = 0.05;
 
 /// Worst recent age of commands: rises at once, decays with each command of a smaller age.
@@ -69,8 +69,9 @@ pub fn speed_share(age_s: f64) -> f64 {
     (1.0 - late * (1.0 - SHARE_LEAST)).max(SHARE_LEAST)
 }
 
-/// Scales a twist to within the robot's limits, keeping its curvature; true if it was above one. A
-/// twist that is not finite becomes zero, with true.
+/// Scales a twist down to the robot's limits of forward speed, turn rate, lateral acceleration and
+/// wheel speed, keeping its curvature. Returns it, and whether it exceeded a limit. A twist that is
+/// not finite becomes zero and counts as exceeding one.
 pub fn within_limits(twist: Twist, model: &RobotModel) -> (Twist, bool) {
     if !twist.is_finite() {
         return (Twist::default(), true);
@@ -86,8 +87,8 @@ pub fn within_limits(twist: Twist, model: &RobotModel) -> (Twist, bool) {
     let mut over_ratio = over(twist.linear_m_s, limits.linear_max_m_s)
         .max(over(twist.angular_rad_s, limits.angular_max_rad_s));
     // Lateral acceleration v·ω scales with the square of the factor.
-    let across_m_s2 = twist.linear_m_s * twist.angular_rad_s;
-    over_ratio = over_ratio.max(over(across_m_s2, limits.lateral_acceleration_max_m_s2).sqrt());
+    let lateral_m_s2 = twist.linear_m_s * twist.angular_rad_s;
+    over_ratio = over_ratio.max(over(lateral_m_s2, limits.lateral_acceleration_max_m_s2).sqrt());
     let wheels = model.wheel_speeds_from_twist(twist).magnitude_max_rad_s();
     over_ratio = over_ratio.max(over(wheels, limits.wheel_speed_max_rad_s));
     let within = Twist {
@@ -97,8 +98,8 @@ pub fn within_limits(twist: Twist, model: &RobotModel) -> (Twist, bool) {
     (within, over_ratio > 1.0)
 }
 
-/// Returns the twist after one tick of `dt_s` seconds of a change within the robot's acceleration
-/// limits; decelerations may be twice as large.
+/// Returns the twist one tick of `dt_s` seconds after `change.from` on the way to `change.to`,
+/// within the robot's acceleration limits; decelerations may be twice as large.
 pub fn approach(change: Change<Twist>, model: &RobotModel, dt_s: f64) -> Twist {
     let dt_s = if dt_s.is_finite() { dt_s.max(0.0) } else { 0.0 };
     let slowing = Slowing {
@@ -108,7 +109,8 @@ pub fn approach(change: Change<Twist>, model: &RobotModel, dt_s: f64) -> Twist {
     TwistLimits::of(model).step(change, slowing, dt_s)
 }
 
-/// Limits the wanted command to the magnitude and direction of the present one, per component.
+/// Returns `change.to` with each component limited to the magnitude of that of `change.from`; 0
+/// where the signs differ.
 ///
 /// Used near the end of a command: a robot that still gains speed when its driver falls silent
 /// would otherwise continue to accelerate.
@@ -156,8 +158,8 @@ mod tests {
             prop_assert_eq!(was_over, within != asked);
             prop_assert!(within.linear_m_s.abs() <= asked.linear_m_s.abs().min(1.0) + 1.0e-12);
             prop_assert!(within.angular_rad_s.abs() <= asked.angular_rad_s.abs().min(2.0) + 1.0e-12);
-            let across_m_s2 = (within.linear_m_s * within.angular_rad_s).abs();
-            prop_assert!(across_m_s2 <= 1.0 + 1.0e-9);
+            let lateral_m_s2 = (within.linear_m_s * within.angular_rad_s).abs();
+            prop_assert!(lateral_m_s2 <= 1.0 + 1.0e-9);
             let cross = within.linear_m_s * angular_rad_s - within.angular_rad_s * linear_m_s;
             prop_assert!(cross.abs() < 1.0e-9);
         }

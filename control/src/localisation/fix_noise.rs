@@ -11,7 +11,7 @@ use crate::geometry::{Pose, wrap_angle_rad};
 
 /// Weight of the configured noise, as a number of fixes.
 const CONFIGURED_FIXES: f64 = 5.0;
-/// Number of fixes over which is averaged.
+/// Maximum weight of the running mean, as a number of fixes.
 const MEMORY_FIXES: f64 = 50.0;
 /// Maximum difference that counts, in standard deviations, so that one outlier is not taken as
 /// noise.
@@ -30,7 +30,7 @@ pub(super) struct PosePair {
     pub(super) filter: Pose,
 }
 
-/// Fix, and the pose of the filter after it.
+/// Last fix that was used, with the pose of the filter after it, and its age.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Anchor {
     poses: PosePair,
@@ -41,6 +41,7 @@ struct Anchor {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct FixNoiseEstimate {
     anchor: Option<Anchor>,
+    /// Weight of the running mean, as a number of fixes.
     fixes: f64,
     /// Variances: position per axis, metres squared, and heading, radians squared.
     position_m2: f64,
@@ -58,7 +59,7 @@ impl FixNoiseEstimate {
         }
     }
 
-    /// Returns the standard deviations of a fix.
+    /// Returns the estimated standard deviations of a fix.
     pub(super) fn noise(&self) -> FixNoise {
         FixNoise {
             position_m: self.position_m2.sqrt(),
@@ -67,7 +68,7 @@ impl FixNoiseEstimate {
     }
 
     /// Adds to the age of the last fix.
-    pub(super) fn wait(&mut self, dt_s: f64) {
+    pub(super) fn advance(&mut self, dt_s: f64) {
         if let Some(anchor) = &mut self.anchor {
             anchor.age_s += dt_s;
         }
@@ -78,8 +79,8 @@ impl FixNoiseEstimate {
         self.anchor = None;
     }
 
-    /// Compares a fix with the previous one; the pose of the filter is the one that it predicts
-    /// from the previous one.
+    /// Updates the variances with the difference of a fix from the previous one. The pose of the
+    /// filter in `now` is the one that it predicts from the previous fix.
     pub(super) fn compare(&mut self, now: PosePair) {
         let Some(anchor) = self.anchor.filter(|anchor| anchor.age_s <= APART_MAX_S) else {
             return;

@@ -17,8 +17,8 @@
 //! its age with the present twist. Its covariance is the stated one, or else estimated from the
 //! differences of consecutive fixes (`fix_noise.rs`), starting with the configured one. A χ² gate
 //! on the Mahalanobis distance refuses outliers and counts them; after [`REFUSED_MAX`] in a row the
-//! robot has been moved, and the filter restarts from the fix. The covariance update is Joseph's
-//! form. See Bar-Shalom, Li and Kirubarajan, *Estimation with Applications to Tracking and
+//! robot has been moved, and the filter restarts from the fix. The covariance update is
+//! Joseph's form. See Bar-Shalom, Li and Kirubarajan, *Estimation with Applications to Tracking and
 //! Navigation*, 2001, chapters 5 and 10.
 
 mod fix_noise;
@@ -34,9 +34,9 @@ use fix_noise::{FixNoiseEstimate, PosePair};
 pub const REFUSED_MAX: u32 = 20;
 /// Squared Mahalanobis distance beyond which a fix is refused (χ² with three degrees of freedom;
 /// one in 10⁶ correct fixes exceeds it).
-const GATE: f64 = 30.7;
+const VALIDATION_GATE: f64 = 30.7;
 /// Standard deviation of the path's curvature while no measurements arrive, 1/m.
-const UNHEARD_CURVATURE_PER_M: f64 = 1.0;
+const GAP_CURVATURE_PER_M: f64 = 1.0;
 /// Maximum time of prediction in one call, seconds.
 const STEP_MAX_S: f64 = 0.5;
 /// Maximum age of a fix that is used, seconds.
@@ -119,7 +119,7 @@ pub enum FixOutcome {
     Restarted,
 }
 
-/// Extended Kalman filter of one robot.
+/// Extended Kalman filter of one robot's pose.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Localisation {
     model: RobotModel,
@@ -210,17 +210,16 @@ impl Localisation {
         self.restarts
     }
 
-    /// Predicts the state over `dt_s` seconds with the measured rates of gyro and wheels.
-    ///
-    /// The motion is that of at most 0.5 s; call [`Self::widen_without_measurements`] after a longer gap. An invalid rate
-    /// is counted, and the last valid one is used; if `dt_s` is not above 0, nothing else changes.
+    /// Predicts the state over `dt_s` seconds, at most 0.5, with the rates of gyro and wheels; call
+    /// [`Self::widen_without_measurements`] first after a longer gap. An invalid rate is counted,
+    /// and the last valid one is used; an invalid `dt_s` is counted, and nothing else changes.
     pub fn predict(&mut self, sample: &SensorSample, dt_s: f64) {
         if !(dt_s.is_finite() && dt_s > 0.0) {
             self.invalid += 1;
             return;
         }
         self.fix_age_s += dt_s;
-        self.fix_noise.wait(dt_s);
+        self.fix_noise.advance(dt_s);
         let (gyro_rad_s, wheels) = (sample.gyro_rad_s, sample.wheel_speeds);
         let wheel_m_s =
             0.5 * self.model.wheel_radius_m() * (wheels.left_rad_s + wheels.right_rad_s);
@@ -268,16 +267,16 @@ impl Localisation {
         self.covariance[(5, 5)] += dt_s * self.noise.gyro_offset_walk.powi(2);
     }
 
-    /// Enlarges the covariance after `unheard_s` seconds without measurements: the robot may have
+    /// Enlarges the covariance after `gap_s` seconds without measurements: the robot may have
     /// stopped, or continued at its last speeds on any curve. Must be called before the prediction
     /// that ends the gap, which replaces these speeds.
-    pub fn widen_without_measurements(&mut self, unheard_s: f64) {
-        if !self.started || !unheard_s.is_finite() || unheard_s <= 0.0 {
+    pub fn widen_without_measurements(&mut self, gap_s: f64) {
+        if !self.started || !gap_s.is_finite() || gap_s <= 0.0 {
             return;
         }
         let (forward_m_s, left_m_s) = (self.forward_m_s + self.state[3], self.state[4]);
-        let distance_m = forward_m_s.hypot(left_m_s) * unheard_s;
-        let turn_rad = (self.turn_rad_s * unheard_s).hypot(UNHEARD_CURVATURE_PER_M * distance_m);
+        let distance_m = forward_m_s.hypot(left_m_s) * gap_s;
+        let turn_rad = (self.turn_rad_s * gap_s).hypot(GAP_CURVATURE_PER_M * distance_m);
         let turn_rad = turn_rad.min(std::f64::consts::PI);
         self.fix_noise.discard_last_fix();
         for (index, std_dev) in [distance_m, distance_m, turn_rad].into_iter().enumerate() {
@@ -285,7 +284,8 @@ impl Localisation {
         }
     }
 
-    /// Fuses a position fix, unless it is invalid or an outlier.
+    /// Fuses a position fix, unless it is invalid or an outlier. Restarts from the last of
+    /// [`REFUSED_MAX`] outliers in a row.
     pub fn correct(&mut self, fix: &PositionFix) -> FixOutcome {
         let is_in_time = (0.0..=FIX_AGE_MAX_S).contains(&fix.age_s);
         let is_possible = fix.noise.is_none_or(FixNoise::is_possible);
@@ -293,19 +293,19 @@ impl Localisation {
             self.invalid += 1;
             return FixOutcome::Invalid;
         }
-        let moved = self.carried(fix);
+        let pose = self.propagated(fix);
         if let Some(filter) = self.pose().filter(|_| fix.noise.is_none()) {
-            self.fix_noise.compare(PosePair { fix: moved, filter });
+            self.fix_noise.compare(PosePair { fix: pose, filter });
         }
         let fix_noise = fix.noise.unwrap_or_else(|| self.fix_noise.noise());
         if !self.started {
-            self.start(moved, fix.age_s, fix_noise);
+            self.start(pose, fix.age_s, fix_noise);
             return FixOutcome::Started;
         }
         let innovation = Vector3::new(
-            moved.x_m - self.state[0],
-            moved.y_m - self.state[1],
-            wrap_angle_rad(moved.heading_rad - self.state[2]),
+            pose.x_m - self.state[0],
+            pose.y_m - self.state[1],
+            wrap_angle_rad(pose.heading_rad - self.state[2]),
         );
         let observe = Matrix3x6::identity();
         let position = fix_noise.position_m.powi(2);
@@ -320,14 +320,14 @@ impl Localisation {
             self.invalid += 1;
             return FixOutcome::Invalid;
         };
-        if (innovation.transpose() * inverse * innovation)[(0, 0)] > GATE {
+        if (innovation.transpose() * inverse * innovation)[(0, 0)] > VALIDATION_GATE {
             self.outliers += 1;
             self.refused_in_a_row += 1;
             if self.refused_in_a_row < REFUSED_MAX {
                 return FixOutcome::Outlier;
             }
             self.restarts += 1;
-            self.start(moved, fix.age_s, fix_noise);
+            self.start(pose, fix.age_s, fix_noise);
             return FixOutcome::Restarted;
         }
         let gain = self.covariance * observe.transpose() * inverse;
@@ -338,7 +338,7 @@ impl Localisation {
             keep * self.covariance * keep.transpose() + gain * noise * gain.transpose();
         self.refused_in_a_row = 0;
         self.fix_age_s = fix.age_s;
-        self.anchor(moved);
+        self.anchor(pose);
         FixOutcome::Fused
     }
 
@@ -349,7 +349,7 @@ impl Localisation {
     }
 
     /// Propagates the fix over its age with the present motion.
-    fn carried(&self, fix: &PositionFix) -> Pose {
+    fn propagated(&self, fix: &PositionFix) -> Pose {
         let turn_rad = self.turn_rad_s * fix.age_s;
         let (sin, cos) = (fix.pose.heading_rad + 0.5 * turn_rad).sin_cos();
         let forward_m = (self.forward_m_s + self.state[3]) * fix.age_s;

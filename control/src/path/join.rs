@@ -2,7 +2,7 @@
 
 use std::f64::consts::{FRAC_PI_2, TAU};
 
-use super::leg_time::{LegTime, Ring};
+use super::leg_time::{LegTime, TargetCircle};
 use super::polynomial::{Derivatives, Ends};
 use super::{Path, Piece, Polynomial};
 use crate::geometry::{Point, Pose, wrap_angle_rad};
@@ -13,7 +13,7 @@ const ON_CIRCLE_M: f64 = 0.05;
 /// Heading difference to the path below which a robot need not turn on the spot, radians.
 const ALIGNED_RAD: f64 = 0.1;
 /// Number of join points on the circle that are tried.
-const PLACES: u32 = 36;
+const JOIN_POINTS: u32 = 36;
 /// Minimum distance from the start to the end of a leg, metres.
 const LEG_MIN_M: f64 = 0.2;
 /// Parameter lengths of a leg that are tried, relative to its chord.
@@ -22,8 +22,8 @@ const STRETCHES: [f64; 5] = [1.0, 1.15, 1.35, 1.7, 2.4];
 const RUN_INS_M: [f64; 3] = [0.5, 1.0, 2.0];
 /// Start headings that are tried, radians relative to the bearing of the leg's end.
 const TURNS_RAD: [f64; 5] = [-1.0, -0.5, 0.0, 0.5, 1.0];
-/// Parameter speeds at a leg's start that are tried, relative to that at its end: a low one bends
-/// early, while the robot still accelerates.
+/// Parameter speeds at a leg's start that are tried, relative to that at its end. A low one puts
+/// the bend near the start, where the robot is still slow.
 const START_PACES: [f64; 2] = [1.0, 0.4];
 /// Turn rate assumed for turning on the spot, as a fraction of the limit.
 const SPOT_TURN_SHARE: f64 = 0.4;
@@ -95,14 +95,14 @@ pub(crate) fn join_circle(
     let timing = LegTime {
         speed_m_s: target.speed_m_s,
         model,
-        ring: Some(Ring {
+        circle: Some(TargetCircle {
             center: target.center,
             radius_m: target.radius_m,
         }),
     };
     // Start with the nearest point, in driving direction, so that a tight bound is found early.
-    for place in 0..PLACES {
-        let place_rad = nearest_rad + target.sign * TAU * f64::from(place) / f64::from(PLACES);
+    for place in 0..JOIN_POINTS {
+        let place_rad = nearest_rad + target.sign * TAU * f64::from(place) / f64::from(JOIN_POINTS);
         let end = target.derivatives(place_rad);
         let bound_s = best.as_ref().map_or(f64::INFINITY, |(best_s, ..)| *best_s);
         // The remaining circle does not count: turns are counted from the join.
@@ -119,7 +119,7 @@ pub(crate) fn join_circle(
 /// None if the start is too near, or every leg is too tight or slower than `bound_s`.
 ///
 /// A leg is one curve, or two: one to a point straight behind the path's start and one from there.
-/// One long curve into a tight bend would swing far out.
+/// One long curve into a tight bend would leave the direct line by far.
 pub(crate) fn join(
     start: Pose,
     end: &Derivatives,
@@ -154,13 +154,13 @@ pub(crate) fn join(
         let Some(last) = leg(last_start, end, shape) else {
             continue;
         };
-        let Some(last_s) = timing.of_leg_s(&last, false, bound_s) else {
+        let Some(last_s) = timing.leg_time_s(&last, false, bound_s) else {
             continue;
         };
         let entry = [behind, forward, still, still, still];
         let before = LegTime {
             // If any of the second curve is off the circle, all of the first one counts.
-            ring: timing.ring.filter(|_| last_s <= 0.0),
+            circle: timing.circle.filter(|_| last_s <= 0.0),
             ..*timing
         };
         let Some((first_s, first)) = curve(start, &entry, bound_s - last_s, &before) else {
@@ -191,9 +191,9 @@ fn curve(
     let mut best: Option<(f64, Polynomial)> = None;
     for heading_rad in std::iter::once(start.heading_rad).chain(aimed) {
         let turn_s = spot_turn_s(start, heading_rad, timing.model);
-        let least_m = timing
-            .ring
-            .map_or(chord_m, |ring| ring.distance_m(start.point()).min(chord_m));
+        let least_m = timing.circle.map_or(chord_m, |circle| {
+            circle.distance_m(start.point()).min(chord_m)
+        });
         if turn_s + least_m / timing.speed_m_s > bound_s {
             continue;
         }
@@ -210,7 +210,7 @@ fn curve(
         for shape in shapes {
             let timed = leg(turned, end, shape).and_then(|leg| {
                 timing
-                    .of_leg_s(&leg, true, bound_s - turn_s)
+                    .leg_time_s(&leg, true, bound_s - turn_s)
                     .map(|time_s| (time_s + turn_s, leg))
             });
             if let Some((time_s, leg)) = timed

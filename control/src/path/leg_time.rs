@@ -12,7 +12,7 @@ use crate::robot::RobotModel;
 /// Number of steps in summing a leg's time.
 const TIME_STEPS: usize = 48;
 /// Minimum parameter speed of a curve relative to that at its end; below it a cusp is near.
-const ADVANCE_SHARE_MIN: f64 = 0.05;
+const PARAMETER_SPEED_SHARE_MIN: f64 = 0.05;
 /// How the time of a leg is summed.
 const LEG: Timing = Timing {
     steps: TIME_STEPS,
@@ -27,7 +27,7 @@ const PIECE: Timing = Timing {
     limit_share: 0.5,
 };
 /// Distance to its circle below which a leg counts as on it, metres.
-const ON_RING_M: f64 = 0.03;
+const ON_TARGET_M: f64 = 0.03;
 
 /// How the time of a curve is summed.
 #[derive(Debug, Clone, Copy)]
@@ -42,12 +42,12 @@ struct Timing {
 
 /// Circle to join; the part of a leg on it counts no time.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Ring {
+pub(super) struct TargetCircle {
     pub(super) center: Point,
     pub(super) radius_m: f64,
 }
 
-impl Ring {
+impl TargetCircle {
     /// Returns the distance of a point from the circle, metres.
     pub(super) fn distance_m(&self, point: Point) -> f64 {
         (self.center.distance_m(point) - self.radius_m).abs()
@@ -60,34 +60,40 @@ pub(super) struct LegTime<'robot> {
     /// Desired speed on the leg, metres per second.
     pub(super) speed_m_s: f64,
     pub(super) model: &'robot RobotModel,
-    pub(super) ring: Option<Ring>,
+    pub(super) circle: Option<TargetCircle>,
 }
 
-/// One step of a leg.
+/// One step in summing the time of a leg.
 #[derive(Debug, Clone, Copy, Default)]
-struct Part {
+struct LegStep {
     length_m: f64,
     /// Maximum `v²/2`, metres squared per second squared.
     energy: f64,
 }
 
 impl LegTime<'_> {
-    /// Returns the estimated time of a leg in seconds until it stays on its ring, starting from
-    /// zero speed or not; None if it is too tight to drive, or slower than `bound_s`.
-    pub(super) fn of_leg_s(&self, leg: &Polynomial, from_rest: bool, bound_s: f64) -> Option<f64> {
-        let mut parts = [Part::default(); TIME_STEPS];
+    /// Returns the estimated time of a leg until it stays on its target circle, seconds;
+    /// `from_rest` if it starts from zero speed. None if it is too tight to drive, or slower than
+    /// `bound_s`.
+    pub(super) fn leg_time_s(
+        &self,
+        leg: &Polynomial,
+        from_rest: bool,
+        bound_s: f64,
+    ) -> Option<f64> {
+        let mut leg_steps = [LegStep::default(); TIME_STEPS];
         let (mut least_s, mut counted, mut off_m) = (0.0, 0, 0.0);
-        for (step, part) in parts.iter_mut().enumerate() {
+        for (step, leg_step) in leg_steps.iter_mut().enumerate() {
             let (fastest_m_s, length_m, place) = LEG.step_of(leg, step, self.model)?;
             let fastest_m_s = fastest_m_s.min(self.speed_m_s);
-            *part = Part {
+            *leg_step = LegStep {
                 length_m,
                 energy: 0.5 * fastest_m_s * fastest_m_s,
             };
             least_s += length_m / fastest_m_s;
             if self
-                .ring
-                .is_none_or(|ring| ring.distance_m(place) > ON_RING_M)
+                .circle
+                .is_none_or(|circle| circle.distance_m(place) > ON_TARGET_M)
             {
                 counted = step + 1;
                 off_m = least_s;
@@ -96,31 +102,31 @@ impl LegTime<'_> {
                 return None;
             }
         }
-        self.keep_distance(&mut parts);
-        self.gather(&mut parts, from_rest);
-        let time_s = parts[..counted]
+        self.apply_averaging_window(&mut leg_steps);
+        self.limit_accelerations(&mut leg_steps, from_rest);
+        let time_s = leg_steps[..counted]
             .iter()
-            .map(|part| part.length_m / (2.0 * part.energy).sqrt())
+            .map(|leg_step| leg_step.length_m / (2.0 * leg_step.energy).sqrt())
             .sum();
         (time_s <= bound_s).then_some(time_s)
     }
 
     /// Lowers each step's speed to the minimum within the distance over which the plan's timing
     /// averages speeds.
-    fn keep_distance(&self, parts: &mut [Part; TIME_STEPS]) {
+    fn apply_averaging_window(&self, leg_steps: &mut [LegStep; TIME_STEPS]) {
         let limits = self.model.limits();
         let reach_m = self.speed_m_s * 2.0 * limits.linear_acceleration_max_m_s2
             / limits.linear_jerk_max_m_s3;
-        let bends = *parts;
-        for (index, part) in parts.iter_mut().enumerate() {
-            let mut lower = |others: &mut dyn Iterator<Item = &Part>| {
+        let bends = *leg_steps;
+        for (index, leg_step) in leg_steps.iter_mut().enumerate() {
+            let mut lower = |others: &mut dyn Iterator<Item = &LegStep>| {
                 let mut away_m = 0.0;
                 for other in others {
                     away_m += other.length_m;
                     if away_m > reach_m {
                         break;
                     }
-                    part.energy = part.energy.min(other.energy);
+                    leg_step.energy = leg_step.energy.min(other.energy);
                 }
             };
             lower(&mut bends[index + 1..].iter());
@@ -130,17 +136,17 @@ impl LegTime<'_> {
 
     /// Limits the change of `v²/2` between neighbouring steps to the acceleration limit times the
     /// distance of their middles.
-    fn gather(&self, parts: &mut [Part; TIME_STEPS], from_rest: bool) {
+    fn limit_accelerations(&self, leg_steps: &mut [LegStep; TIME_STEPS], from_rest: bool) {
         let half_m_s2 = 0.5 * self.model.limits().linear_acceleration_max_m_s2;
         let mut energy = if from_rest { 0.0 } else { f64::INFINITY };
-        for part in parts.iter_mut() {
-            part.energy = part.energy.min(energy + half_m_s2 * part.length_m);
-            energy = part.energy + half_m_s2 * part.length_m;
+        for leg_step in leg_steps.iter_mut() {
+            leg_step.energy = leg_step.energy.min(energy + half_m_s2 * leg_step.length_m);
+            energy = leg_step.energy + half_m_s2 * leg_step.length_m;
         }
         energy = f64::INFINITY;
-        for part in parts.iter_mut().rev() {
-            part.energy = part.energy.min(energy + half_m_s2 * part.length_m);
-            energy = part.energy + half_m_s2 * part.length_m;
+        for leg_step in leg_steps.iter_mut().rev() {
+            leg_step.energy = leg_step.energy.min(energy + half_m_s2 * leg_step.length_m);
+            energy = leg_step.energy + half_m_s2 * leg_step.length_m;
         }
     }
 }
@@ -168,14 +174,15 @@ impl Timing {
         let parameter = (step as f64 + 0.5) * width;
         let at = curve.sample(parameter);
         let bend = at.curvature_1_m.abs().max(1.0e-6);
-        let advance = curve.advance(parameter);
-        let is_cusp_near = advance < ADVANCE_SHARE_MIN * curve.advance(curve.span());
+        let parameter_speed = curve.parameter_speed(parameter);
+        let is_cusp_near =
+            parameter_speed < PARAMETER_SPEED_SHARE_MIN * curve.parameter_speed(curve.span());
         if bend > self.radius_min_m.recip() || is_cusp_near {
             return None;
         }
         let fastest_m_s = (self.limit_share * limits.lateral_acceleration_max_m_s2 / bend)
             .sqrt()
             .min(self.limit_share * limits.angular_max_rad_s / bend);
-        Some((fastest_m_s, advance * width, at.pose.point()))
+        Some((fastest_m_s, parameter_speed * width, at.pose.point()))
     }
 }

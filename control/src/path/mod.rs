@@ -21,7 +21,7 @@ use crate::geometry::{Point, Pose};
 
 pub(crate) use join::{CircleTarget, join_circle};
 pub(crate) use polynomial::Polynomial;
-pub(crate) use route::{from_here, joined_from_afar};
+pub(crate) use route::{leg_and_spline, spline_from_robot};
 pub(crate) use spline::Knot;
 
 /// Minimum radius of curvature of a path, metres.
@@ -36,7 +36,7 @@ const INTERVAL_M: f64 = 0.1;
 const NEWTON_STEPS: usize = 4;
 /// Minimum parameter speed of a polynomial, metres per parameter unit; below it the path has a
 /// cusp.
-const ADVANCE_MIN: f64 = 1.0e-3;
+const PARAMETER_SPEED_MIN: f64 = 1.0e-3;
 
 /// Maximum turn of the heading over a quarter of a parameter interval, radians; more counts as a
 /// cusp.
@@ -78,7 +78,7 @@ pub struct PathSample {
     pub pose: Pose,
     /// Curvature, per metre, positive to the left.
     pub curvature_1_m: f64,
-    /// Derivative of curvature by arc length, per metre squared.
+    /// Derivative of the curvature with respect to arc length, per metre squared.
     pub curvature_slope_1_m2: f64,
 }
 
@@ -208,7 +208,10 @@ impl Path {
                 let mut parameter = node.parameter + width * (beyond_m / whole_m).min(1.0);
                 for _ in 0..NEWTON_STEPS {
                     let excess_m = polynomial.length_m(node.parameter..parameter) - beyond_m;
-                    parameter -= excess_m / polynomial.advance(parameter).max(ADVANCE_MIN);
+                    parameter -= excess_m
+                        / polynomial
+                            .parameter_speed(parameter)
+                            .max(PARAMETER_SPEED_MIN);
                     parameter = parameter.clamp(node.parameter, node.parameter_end);
                     if excess_m.abs() < 1.0e-12 {
                         break;
@@ -248,7 +251,8 @@ fn check_turn(
         let turned_rad = before_rad.replace(pose.heading_rad).map_or(0.0, |before| {
             crate::geometry::wrap_angle_rad(pose.heading_rad - before)
         });
-        let cusp = polynomial.advance(parameter) < ADVANCE_MIN || turned_rad.abs() > TURN_MAX_RAD;
+        let cusp = polynomial.parameter_speed(parameter) < PARAMETER_SPEED_MIN
+            || turned_rad.abs() > TURN_MAX_RAD;
         if cusp || !curvature_1_m.is_finite() || curvature_1_m.abs() > RADIUS_MIN_M.recip() {
             return Err(PathError::TooTight { piece });
         }

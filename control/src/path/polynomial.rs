@@ -18,17 +18,18 @@ const GAUSS: [(f64, f64); 5] = [
     (-0.906_179_845_938_664, 0.236_926_885_056_189_08),
 ];
 
-/// Position and its first four derivatives by the parameter.
+/// Position, and its first four derivatives with respect to the parameter.
 pub(crate) type Derivatives = [Point; 5];
 
-/// Position and `N` − 1 derivatives by the parameter at both ends of a curve.
+/// Position, and `N` − 1 derivatives with respect to the parameter, at both ends of a curve.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Ends<const N: usize> {
     pub(crate) start: [Point; N],
     pub(crate) end: [Point; N],
 }
 
-/// Curve over the parameter range 0 to `span`.
+/// Planar curve, polynomial in a parameter of 0 to `span`. Coefficients are in metres, lowest power
+/// first.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Polynomial {
     x: [f64; COEFFICIENTS],
@@ -130,7 +131,7 @@ impl Polynomial {
     }
 
     /// Returns the parameter speed `|p'|` at a parameter, metres per parameter unit.
-    pub(crate) fn advance(&self, parameter: f64) -> f64 {
+    pub(crate) fn parameter_speed(&self, parameter: f64) -> f64 {
         // Horner's rule on both coordinates at once: most of a reference's computing time is spent
         // here.
         let (mut x, mut y) = (0.0, 0.0);
@@ -167,7 +168,7 @@ impl Polynomial {
         let (middle, half) = (0.5 * (start + end), 0.5 * (end - start));
         GAUSS
             .iter()
-            .map(|(node, weight)| weight * self.advance(middle + half * node))
+            .map(|(node, weight)| weight * self.parameter_speed(middle + half * node))
             .sum::<f64>()
             * half
     }
@@ -175,8 +176,9 @@ impl Polynomial {
     /// Returns pose, curvature and slope of curvature at a parameter.
     pub(crate) fn sample(&self, parameter: f64) -> PathSample {
         let [position, first, second, third] = self.jet(parameter);
-        let advance_2 = (first.x_m * first.x_m + first.y_m * first.y_m).max(f64::MIN_POSITIVE);
-        let advance = advance_2.sqrt();
+        let parameter_speed_2 =
+            (first.x_m * first.x_m + first.y_m * first.y_m).max(f64::MIN_POSITIVE);
+        let parameter_speed = parameter_speed_2.sqrt();
         let cross_2 = first.x_m * second.y_m - first.y_m * second.x_m;
         let cross_3 = first.x_m * third.y_m - first.y_m * third.x_m;
         let along_2 = first.x_m * second.x_m + first.y_m * second.y_m;
@@ -186,9 +188,9 @@ impl Polynomial {
                 y_m: position.y_m,
                 heading_rad: first.y_m.atan2(first.x_m),
             },
-            curvature_1_m: cross_2 / (advance_2 * advance),
-            curvature_slope_1_m2: (cross_3 * advance_2 - 3.0 * cross_2 * along_2)
-                / (advance_2 * advance_2 * advance_2),
+            curvature_1_m: cross_2 / (parameter_speed_2 * parameter_speed),
+            curvature_slope_1_m2: (cross_3 * parameter_speed_2 - 3.0 * cross_2 * along_2)
+                / (parameter_speed_2 * parameter_speed_2 * parameter_speed_2),
         }
     }
 }

@@ -134,8 +134,8 @@ struct System {
 }
 
 impl System {
-    /// Replaces the unknown tangents of knots with given headings; their length is the mean parameter
-    /// speed of the adjacent chords.
+    /// Replaces the unknown tangents of knots with given headings; their length is the mean
+    /// parameter speed of the adjacent chords.
     fn fix_tangents(&mut self, knots: &[Knot], pace: impl Fn(usize) -> f64) {
         let Self {
             diagonal,
@@ -160,8 +160,8 @@ impl System {
                     }
                 }
             }
-            // The row becomes `tangent = value`. Rows already replaced are zero here, so that a fixed
-            // neighbour stays fixed.
+            // The row becomes `tangent = value`. Rows already replaced are zero here, so that a
+            // fixed neighbour stays fixed.
             diagonal[index][(0, 0)] = 1.0;
             diagonal[index][(0, 1)] = 0.0;
             diagonal[index][(1, 0)] = 0.0;

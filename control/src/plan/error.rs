@@ -96,7 +96,8 @@ pub enum PlanError {
     /// The path would turn tighter than [`RADIUS_MIN_M`].
     #[error("the path turns too sharply {}", near(*waypoint))]
     TooTight {
-        /// Index of the waypoint at the start of the sharp turn; `None` on the approach to a circle.
+        /// Index of the waypoint at the start of the sharp turn; `None` on the approach to a
+        /// circle.
         waypoint: Option<usize>,
     },
     /// The path is longer than [`LENGTH_MAX_M`]; the value is its length, metres.

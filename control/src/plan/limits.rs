@@ -1,7 +1,7 @@
 //! Speed and acceleration limits at each node of a path.
 
 use super::{PlanError, SlowedBy};
-use crate::excitation::{Excitation, ExcitationSpec, Room};
+use crate::excitation::{Excitation, ExcitationLimits, ExcitationSpec};
 use crate::path::PathSample;
 use crate::profile::NodeLimits;
 use crate::robot::RobotModel;
@@ -51,26 +51,29 @@ impl Shares {
 
 /// Returns the excitation that the limits allow, and subtracts its share from `nodes` and
 /// `jerk_m_s3`.
+///
+/// # Errors
+/// [`PlanError::Excitation`] if depth or period is out of its range.
 pub(super) fn with_excitation(
     spec: ExcitationSpec,
     nodes: &mut [NodeLimits],
     jerk_m_s3: &mut f64,
 ) -> Result<Excitation, PlanError> {
-    let room = nodes.iter().fold(
-        Room {
+    let limits = nodes.iter().fold(
+        ExcitationLimits {
             speed_m_s: 0.0,
             acceleration_m_s2: f64::INFINITY,
             jerk_m_s3: *jerk_m_s3,
         },
-        |room, node| Room {
-            speed_m_s: room.speed_m_s.max(node.speed_m_s),
-            acceleration_m_s2: room.acceleration_m_s2.min(node.acceleration_m_s2),
-            ..room
+        |limits, node| ExcitationLimits {
+            speed_m_s: limits.speed_m_s.max(node.speed_m_s),
+            acceleration_m_s2: limits.acceleration_m_s2.min(node.acceleration_m_s2),
+            ..limits
         },
     );
-    let excitation = Excitation::within(spec, room)?;
+    let excitation = Excitation::within(spec, limits)?;
     for node in nodes {
-        node.acceleration_m_s2 -= excitation.acceleration_m_s2(room.speed_m_s);
+        node.acceleration_m_s2 -= excitation.acceleration_m_s2(limits.speed_m_s);
     }
     *jerk_m_s3 *= Excitation::jerk_left_ratio();
     Ok(excitation)
@@ -78,20 +81,20 @@ pub(super) fn with_excitation(
 
 /// Names of the limits that bound the accelerations: the robot's own, or the ground's traction.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Blame {
+pub(super) struct BindingLimits {
     pub(super) longitudinal: SlowedBy,
     pub(super) lateral: SlowedBy,
 }
 
-impl Blame {
-    /// `model` must already be limited to the traction limit.
+impl BindingLimits {
+    /// Returns which limits bind. `model` must already be limited to the traction limit.
     pub(super) fn of(model: &RobotModel, traction_limit_mu: Option<f64>) -> Self {
         let limits = model.limits();
-        let gives = |at_m_s2: fn(f64) -> f64, limit_m_s2: f64| {
+        let binds = |at_m_s2: fn(f64) -> f64, limit_m_s2: f64| {
             traction_limit_mu.is_some_and(|mu| at_m_s2(mu) <= limit_m_s2)
         };
         Self {
-            longitudinal: if gives(
+            longitudinal: if binds(
                 RobotModel::longitudinal_traction_m_s2,
                 limits.linear_acceleration_max_m_s2,
             ) {
@@ -99,7 +102,7 @@ impl Blame {
             } else {
                 SlowedBy::LinearAcceleration
             },
-            lateral: if gives(
+            lateral: if binds(
                 RobotModel::lateral_traction_m_s2,
                 limits.lateral_acceleration_max_m_s2,
             ) {
@@ -115,6 +118,7 @@ impl Blame {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct NodeBounds {
     pub(super) limits: NodeLimits,
+    /// Limit that keeps the speed below the requested one; None if there is none.
     pub(super) by: Option<SlowedBy>,
     /// Limit of the acceleration along the path.
     pub(super) longitudinal: SlowedBy,
@@ -139,13 +143,13 @@ impl NodeBounds {
     }
 }
 
-/// Returns the limits at a point of the path with its curvature. `blame` names the causes of the
+/// Returns the limits at a point of the path with its curvature. `binding` names the causes of the
 /// acceleration limits.
 pub(super) fn node_limits(
     path: &PathSample,
-    asked_m_s: f64,
+    requested_m_s: f64,
     model: &RobotModel,
-    blame: Blame,
+    binding: BindingLimits,
     shares: &Shares,
 ) -> NodeBounds {
     let limits = model.limits();
@@ -164,7 +168,7 @@ pub(super) fn node_limits(
     let floor = f64::MIN_POSITIVE;
     let bounds_m_s = [
         (
-            blame.lateral,
+            binding.lateral,
             (limits.lateral_acceleration_max_m_s2 / bend.max(floor)).sqrt(),
         ),
         (
@@ -181,7 +185,7 @@ pub(super) fn node_limits(
             ((1.0 - YAW_LEFT_MIN) * yaw_max_rad_s2 / slope.max(floor)).sqrt(),
         ),
     ];
-    let mut speed_m_s = asked_m_s.min(shares.linear_speed * limits.linear_max_m_s);
+    let mut speed_m_s = requested_m_s.min(shares.linear_speed * limits.linear_max_m_s);
     let mut slowed_by = None;
     for (by, bound_m_s) in bounds_m_s {
         if bound_m_s < speed_m_s {
@@ -198,6 +202,6 @@ pub(super) fn node_limits(
                 .min(yaw_left_rad_s2 / bend.max(floor)),
         },
         by: slowed_by,
-        longitudinal: blame.longitudinal,
+        longitudinal: binding.longitudinal,
     }
 }

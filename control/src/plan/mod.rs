@@ -11,11 +11,11 @@ mod limits;
 mod slowed;
 mod traction_limit;
 
-use crate::excitation::{Excitation, ExcitationSpec, Warp};
+use crate::excitation::{Excitation, ExcitationSpec, PlanTime};
 use crate::geometry::{Point, Pose};
 use crate::path::{
-    CircleTarget, Knot, Path, PathError, PathSample, Piece, RADIUS_MIN_M, from_here, join_circle,
-    joined_from_afar,
+    CircleTarget, Knot, Path, PathError, PathSample, Piece, RADIUS_MIN_M, join_circle,
+    leg_and_spline, spline_from_robot,
 };
 use crate::profile::{NodeLimits, ProfileInput, SpeedProfile};
 use crate::robot::RobotModel;
@@ -25,7 +25,7 @@ pub use error::{PlanError, PlanValue};
 pub use slowed::{SLOWED_MAX, Slowed, SlowedBy};
 pub use traction_limit::{TractionLimitCell, TractionLimitMap, TractionLimitMapSpec};
 
-use limits::{Blame, NodeBounds, Shares, WHEEL_SHARE, node_limits, with_excitation};
+use limits::{BindingLimits, NodeBounds, Shares, WHEEL_SHARE, node_limits, with_excitation};
 use slowed::{CellBounds, Stretches};
 
 /// Maximum number of waypoints of a path.
@@ -44,10 +44,11 @@ const GRID_M: f64 = 0.02;
 /// Maximum number of cells of the timing.
 const GRID_MAX: usize = 1_000_000;
 /// Curvature above which a cell of the timing is subdivided, per metre.
-const BEND_LOOKED_INTO_1_M: f64 = 1.0;
+const SUBDIVIDED_CURVATURE_1_M: f64 = 1.0;
 /// Number of parts of a subdivided cell.
-const PARTS_LOOKED_INTO: u8 = 8;
-/// Peak friction coefficient assumed on the approach to the trajectory while the ground is unknown.
+const SUBDIVISIONS: u8 = 8;
+/// Lower bound of the peak friction coefficient that is assumed on the approach to the trajectory
+/// on unknown ground.
 pub const TRACTION_LIMIT_UNKNOWN_MU: f64 = 0.14;
 /// Minimum number of cells of the timing.
 const GRID_MIN: usize = 16;
@@ -55,7 +56,8 @@ const GRID_MIN: usize = 16;
 /// Options of a plan; none by default.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct PlanOptions<'map> {
-    /// Speed on the approach to the trajectory, metres per second; None for the trajectory's own.
+    /// Speed on the approach to the trajectory, metres per second, above 0 and within the robot's
+    /// limits; None for the trajectory's own.
     pub approach_speed_m_s: Option<f64>,
     /// Variation of the speed, so that θ can be measured without torque sensing.
     pub excitation: Option<ExcitationSpec>,
@@ -121,7 +123,7 @@ struct Models<'a> {
 }
 
 impl Plan {
-    /// Plans a trajectory from the pose of a stopped robot.
+    /// Plans a trajectory from the pose of a stopped robot in the site frame, without options.
     ///
     /// # Errors
     /// [`PlanError`] names the invalid value or the sharp turn, with the waypoint's index.
@@ -133,7 +135,7 @@ impl Plan {
         Self::with_options(trajectory, start, model, &PlanOptions::default())
     }
 
-    /// Plans a trajectory from the pose of a stopped robot, with options.
+    /// Plans a trajectory from the pose of a stopped robot in the site frame, with options.
     ///
     /// # Errors
     /// [`PlanError`] names the invalid value or the sharp turn, with the waypoint's index.
@@ -286,7 +288,7 @@ impl Plan {
         let mut approach_pieces = usize::from(first == 0);
         let path = if first == 0
             && let Some((path, legs)) =
-                joined_from_afar(&knots, start, spec.speed_m_s, &on_approach(model, options))
+                leg_and_spline(&knots, start, spec.speed_m_s, &on_approach(model, options))
         {
             approach_pieces = legs;
             path
@@ -302,7 +304,7 @@ impl Plan {
                     heading_rad: behind,
                 },
             );
-            from_here(&mut knots, start, spec.speed_m_s, model).map_err(too_tight)?
+            spline_from_robot(&mut knots, start, spec.speed_m_s, model).map_err(too_tight)?
         };
         // Index of the waypoint at which a piece starts; 0 for the approach.
         let place_of = |piece: usize| (piece + first).saturating_sub(approach_pieces.max(1));
@@ -311,14 +313,14 @@ impl Plan {
             speed_m_s: spec.speed_m_s,
         }];
         for piece in 0..path.piece_count() {
-            let asked = if piece >= approach_pieces {
+            let requested = if piece >= approach_pieces {
                 points[place_of(piece)].speed_m_s
             } else {
                 options.approach_speed_m_s
             };
             speeds.push(SpeedFrom {
                 arc_m: path.piece_start_m(piece),
-                speed_m_s: asked.unwrap_or(spec.speed_m_s),
+                speed_m_s: requested.unwrap_or(spec.speed_m_s),
             });
         }
         Self::timed(path, &speeds, approach_pieces, models, options)
@@ -346,56 +348,56 @@ impl Plan {
         }
         let cells = ((length_m / GRID_M).ceil() as usize).clamp(GRID_MIN, GRID_MAX);
         let cell_m = length_m / cells as f64;
-        let mut asked = 0;
-        let blame = Blame::of(model, options.traction_limit_mu);
+        let mut requested = 0;
+        let binding = BindingLimits::of(model, options.traction_limit_mu);
         let mut bounds: Vec<NodeBounds> = Vec::with_capacity(cells + 1);
-        let mut asked_m_s = Vec::with_capacity(cells + 1);
+        let mut requested_m_s = Vec::with_capacity(cells + 1);
         let mut bend_before_1_m = 0.0;
         let approach_end_m = path.piece_start_m(approach_pieces);
-        let careful = on_approach(model, options);
-        let careful_mu = options
+        let cautious = on_approach(model, options);
+        let cautious_mu = options
             .traction_limit_mu
             .unwrap_or(TRACTION_LIMIT_UNKNOWN_MU);
-        let careful_blame = Blame::of(&careful, Some(careful_mu));
+        let cautious_binding = BindingLimits::of(&cautious, Some(cautious_mu));
         for index in 0..=cells {
             let arc_m = cell_m * index as f64;
             while speeds
-                .get(asked + 1)
+                .get(requested + 1)
                 .is_some_and(|next| next.arc_m <= arc_m)
             {
-                asked += 1;
+                requested += 1;
             }
-            let speed_m_s = speeds[asked].speed_m_s;
+            let speed_m_s = speeds[requested].speed_m_s;
             let here = path.sample(arc_m);
             let placed;
-            let (model, blame) = if let Some(traction_limit) = options.traction_limits {
+            let (model, binding) = if let Some(traction_limit) = options.traction_limits {
                 let mu = traction_limit.at(here.pose.point());
                 placed = unlimited.within_traction_limit(mu);
-                (&placed, Blame::of(&placed, Some(mu)))
+                (&placed, BindingLimits::of(&placed, Some(mu)))
             } else if arc_m < approach_end_m {
-                (&careful, careful_blame)
+                (&cautious, cautious_binding)
             } else {
-                (model, blame)
+                (model, binding)
             };
             let shares = Shares::on(arc_m < approach_end_m);
-            let mut node = node_limits(&here, speed_m_s, model, blame, shares);
+            let mut node = node_limits(&here, speed_m_s, model, binding, shares);
             let bend_1_m = here.curvature_1_m.abs();
             // A sharp bend may have its peak between two nodes: the limits in between apply to
             // both.
-            if bend_1_m.max(bend_before_1_m) > BEND_LOOKED_INTO_1_M
+            if bend_1_m.max(bend_before_1_m) > SUBDIVIDED_CURVATURE_1_M
                 && let Some(before) = bounds.last_mut()
             {
-                for part in 1..PARTS_LOOKED_INTO {
-                    let back_m = cell_m * f64::from(part) / f64::from(PARTS_LOOKED_INTO);
+                for part in 1..SUBDIVISIONS {
+                    let back_m = cell_m * f64::from(part) / f64::from(SUBDIVISIONS);
                     let between = path.sample(arc_m - back_m);
-                    let between = node_limits(&between, speed_m_s, model, blame, shares);
+                    let between = node_limits(&between, speed_m_s, model, binding, shares);
                     *before = before.stricter(&between);
                     node = node.stricter(&between);
                 }
             }
             bend_before_1_m = bend_1_m;
             bounds.push(node);
-            asked_m_s.push(speed_m_s);
+            requested_m_s.push(speed_m_s);
         }
         let mut nodes: Vec<NodeLimits> = bounds.iter().map(|node| node.limits).collect();
         let mut jerk_m_s3 = model.limits().linear_jerk_max_m_s3;
@@ -405,14 +407,14 @@ impl Plan {
         };
         // On unknown ground the approach is already bounded by a cautious traction limit, so its
         // limits apply within the averaging time T only (see `profile`).
-        let brisk = match options.least_traction_limit_mu() {
+        let time_limited_nodes = match options.least_traction_limit_mu() {
             Some(_) => 0,
             None => (approach_end_m / cell_m).ceil() as usize,
         };
         let profile = SpeedProfile::new(&ProfileInput {
             length_m,
             limits: &nodes,
-            brisk,
+            time_limited_nodes,
             jerk_max_m_s3: jerk_m_s3,
         });
         let mut plan = Self {
@@ -436,8 +438,8 @@ impl Plan {
             let timing = plan.profile.sample(plan.profile.duration_s() * share);
             let node = ((timing.arc_m / cell_m) as usize).min(cells);
             let cell = CellBounds {
-                asked_m_s: asked_m_s[node],
-                left_m_s: nodes[node].speed_m_s,
+                requested_m_s: requested_m_s[node],
+                allowed_m_s: nodes[node].speed_m_s,
                 by: bounds[node].by,
                 longitudinal: bounds[node].longitudinal,
             };
@@ -461,21 +463,21 @@ impl Plan {
     /// Returns the plan at a time since its start, seconds; before 0 and after the end the speed is
     /// zero.
     pub fn sample(&self, time_s: f64) -> PlanSample {
-        let warp = self.excitation.map_or(
-            Warp {
+        let plan_time = self.excitation.map_or(
+            PlanTime {
                 plan_s: time_s,
-                pace: 1.0,
-                pace_rate_1_s: 0.0,
+                rate: 1.0,
+                rate_slope_1_s: 0.0,
             },
-            |excitation| excitation.warp(time_s),
+            |excitation| excitation.plan_time(time_s),
         );
-        let timing = self.profile.sample(warp.plan_s);
+        let timing = self.profile.sample(plan_time.plan_s);
         PlanSample {
             path: self.path.sample(timing.arc_m),
             arc_m: timing.arc_m,
-            speed_m_s: warp.pace * timing.speed_m_s,
-            acceleration_m_s2: warp.pace * warp.pace * timing.acceleration_m_s2
-                + warp.pace_rate_1_s * timing.speed_m_s,
+            speed_m_s: plan_time.rate * timing.speed_m_s,
+            acceleration_m_s2: plan_time.rate * plan_time.rate * timing.acceleration_m_s2
+                + plan_time.rate_slope_1_s * timing.speed_m_s,
         }
     }
 
@@ -511,7 +513,8 @@ impl Plan {
         (!self.traction_limit_is_known).then_some(TRACTION_LIMIT_UNKNOWN_MU)
     }
 
-    /// Returns the time from start to end without any delay or initial turn on the spot, seconds.
+    /// Returns the time from start to end, seconds, with excitation but without an initial turn on
+    /// the spot, and without any delay by the governor.
     pub fn duration_s(&self) -> f64 {
         let own_s = self.profile.duration_s();
         self.excitation

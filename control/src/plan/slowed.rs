@@ -7,7 +7,7 @@ use crate::profile::ProfileSample;
 pub enum SlowedBy {
     /// Lateral acceleration.
     LateralAcceleration,
-    /// Yaw rate.
+    /// Turn rate of the body.
     AngularSpeed,
     /// Wheel speed.
     WheelSpeed,
@@ -35,7 +35,7 @@ pub struct Slowed {
 /// Maximum number of stretches that a plan reports; further ones are dropped.
 pub const SLOWED_MAX: usize = 1_000;
 /// Ratio of planned to requested speed from which the plan counts as not slowed.
-const AS_ASKED: f64 = 0.98;
+const UNSLOWED_RATIO: f64 = 0.98;
 /// Distance below which stretches of the same cause are merged, at zero speed, metres.
 const STRETCH_GAP_M: f64 = 0.08;
 /// Addition to [`STRETCH_GAP_M`] per speed, seconds.
@@ -45,9 +45,9 @@ const STRETCH_GAP_S: f64 = 0.2;
 #[derive(Debug, Clone, Copy)]
 pub(super) struct CellBounds {
     /// Requested speed, metres per second.
-    pub asked_m_s: f64,
+    pub requested_m_s: f64,
     /// Speed that the limits at this cell allow, metres per second.
-    pub left_m_s: f64,
+    pub allowed_m_s: f64,
     /// Limit that keeps the allowed speed below the requested one; None if there is none.
     pub by: Option<SlowedBy>,
     /// Cause to report where the plan is slower than this cell allows, because the robot
@@ -67,19 +67,19 @@ impl Stretches {
         let ProfileSample {
             arc_m, speed_m_s, ..
         } = *timing;
-        if speed_m_s >= AS_ASKED * cell.asked_m_s {
+        if speed_m_s >= UNSLOWED_RATIO * cell.requested_m_s {
             return;
         }
-        let is_near = speed_m_s >= AS_ASKED * AS_ASKED * cell.left_m_s;
+        let is_near = speed_m_s >= UNSLOWED_RATIO * UNSLOWED_RATIO * cell.allowed_m_s;
         let by = cell.by.filter(|_| is_near).unwrap_or(cell.longitudinal);
-        let reach_m = STRETCH_GAP_M + STRETCH_GAP_S * speed_m_s;
-        let has_room = self.slowed.len() < SLOWED_MAX;
+        let gap_max_m = STRETCH_GAP_M + STRETCH_GAP_S * speed_m_s;
+        let has_space = self.slowed.len() < SLOWED_MAX;
         match self.slowed.last_mut() {
-            Some(last) if last.by == by && arc_m - last.to_m <= reach_m => {
+            Some(last) if last.by == by && arc_m - last.to_m <= gap_max_m => {
                 last.to_m = arc_m;
                 last.speed_min_m_s = last.speed_min_m_s.min(speed_m_s);
             }
-            _ if has_room => self.slowed.push(Slowed {
+            _ if has_space => self.slowed.push(Slowed {
                 by,
                 from_m: arc_m,
                 to_m: arc_m,

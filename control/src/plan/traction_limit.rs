@@ -90,7 +90,9 @@ mod tests {
             x_m in -8.0..8.0_f64, y_m in -8.0..8.0_f64, square_m in 0.5..2.0_f64,
         ) {
             let list = squares.iter().map(|(&(ix, iy), &mu)| TractionLimitCell { ix, iy, mu });
-            let spec = TractionLimitMapSpec { square_m, squares: list.collect(), elsewhere_mu: 0.14 };
+            let squares_list = list.collect();
+            let spec =
+                TractionLimitMapSpec { square_m, squares: squares_list, elsewhere_mu: 0.14 };
             let map = TractionLimitMap::new(spec).unwrap();
             let (ix, iy) = ((x_m / square_m).floor(), (y_m / square_m).floor());
             let near = squares.iter().filter(|((column, row), _)| {

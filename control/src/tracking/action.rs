@@ -2,10 +2,10 @@
 //!
 //! Every adapted value moves the modelled sideslip by the integral of the cross-track error over
 //! the distance driven: `dβ̂/ds = −Γ e_y`, with `Γ = Σ γ_i (∂β/∂p_i)²` over the adapted values
-//! `p_i` of gains `γ_i`. Through the heading gain that is an integral term of gain `k_θ Γ`. On a path
-//! of constant curvature all of them and the integral do the same, and their sum is what noise and
-//! slow tyres see. So `k_I` is the gain of all together: the adaptation gets its gains up to the
-//! share [`TrackerConfig::adaptation_share_max`] of `k_I`, and the integral gets what is left.
+//! `p_i` of gains `γ_i`. Through the heading gain that is an integral term of gain `k_θ Γ`. On a
+//! path of constant curvature all of them and the integral do the same, and their sum is what noise
+//! and slow tyres see. So `k_I` is the gain of all together: the adaptation gets its gains up to
+//! the share [`TrackerConfig::adaptation_share_max`] of `k_I`, and the integral gets what is left.
 
 use crate::reference::ReferenceSample;
 
@@ -13,7 +13,8 @@ use super::config::{CrossGains, TrackerConfig};
 use super::drift::DriftSideslip;
 use super::sideslip::Sideslip;
 
-/// Minimum speed in dividing drifts by it, metres per second. Nothing is adapted at lower speeds.
+/// Lower bound of the speed by which drifts are divided, metres per second. Nothing is adapted at
+/// lower speeds.
 const SPEED_MIN_M_S: f64 = 0.05;
 
 /// Which values can follow the present error. One at its bound, or one that is returning to its

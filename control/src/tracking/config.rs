@@ -21,7 +21,8 @@ pub struct CrossGains {
 }
 
 impl CrossGains {
-    /// Returns the mean with another set, of weight `share`; this one has the weight 1 − `share`.
+    /// Returns the weighted mean with another set, which has the weight `share`, 0 to 1; this one
+    /// has the weight 1 − `share`.
     pub(super) fn towards(self, other: Self, share: f64) -> Self {
         let mix = |own: f64, other: f64| own + share * (other - own);
         Self {
@@ -45,29 +46,29 @@ pub struct TrackerConfig {
     /// Gains across the path for a noisy pose on a path of constant sideslip.
     pub steady: CrossGains,
     /// Change of the sideslip over the last metres at which `noisy` and `steady` have equal weight,
-    /// radians.
+    /// radians, above 0.
     pub steady_middle_rad: f64,
     /// Pose noise at which both gain sets have equal weight, as amplitude density `σ√T` of white
-    /// noise, m·√s.
+    /// noise, m·√s, above 0.
     pub noise_middle_m_sqrt_s: f64,
-    /// Standard deviation of the position at which both gain sets have equal weight, metres; it
-    /// covers filtered noise, which is not white.
+    /// Standard deviation of the position at which both gain sets have equal weight, metres, above
+    /// 0; it covers filtered noise, which is not white.
     pub position_middle_m: f64,
-    /// Maximum magnitude of the integral term, as curvature, per metre.
+    /// Maximum magnitude of the integral term, as curvature, per metre, at least 0.
     pub integral_max_1_m: f64,
-    /// First-order lag of the wheel servo that the law compensates, seconds.
+    /// First-order lag of the wheel servo that the law compensates, seconds, at least 0.
     pub servo_lag_s: f64,
-    /// Adaptation gain ρ of θ̂, per metre squared.
+    /// Adaptation gain ρ of θ̂, per metre squared, at least 0.
     pub adaptation_gain: f64,
     /// Friction curve that gives the loss beyond the peak. Only its shape (`λ_m`, α) is used, not
     /// its stiffness.
     pub friction_curve: FrictionCurve,
     /// Adaptation gain `ρ_χ` of χ̂, the fraction of that loss that shows, per metre squared.
     pub beyond_gain: f64,
-    /// Maximum magnitude of θ̂̇ by the gradient, per second.
+    /// Maximum magnitude of θ̂̇ by the gradient, per second, at least 0.
     pub adaptation_rate_max_1_s: f64,
-    /// Rate p of the pull of θ̂ to a known θ, per second: `c p (c θ − θ̂)` for 2 s with the confidence c. Which
-    /// θ pulls is decided when knowledge is applied.
+    /// Rate p of the pull of θ̂ to a known θ, per second: `c p (c θ − θ̂)` for 2 s with the
+    /// confidence c. Which θ pulls is decided when knowledge is applied.
     pub adaptation_pull_1_s: f64,
     /// Maximum θ̂, above 0.
     pub theta_max: f64,
@@ -82,7 +83,7 @@ pub struct TrackerConfig {
     /// Maximum part of the integral action `k_I` that the adaptation of all values together has, 0
     /// to 1. The adaptation gains are scaled down to it, and the integral has the rest.
     pub adaptation_share_max: f64,
-    /// Pose age above which adaptation and integral are held, seconds.
+    /// Pose age above which adaptation and integral are held, seconds, above 0.
     pub pose_age_max_s: f64,
 }
 

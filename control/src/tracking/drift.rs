@@ -3,18 +3,17 @@
 //! On ground that falls by s (fall over run, a vector in the site frame that points downhill)
 //! gravity drives the robot downhill: it has the sideslip `β = d·n`, with `d = θs` and n the unit
 //! vector to its left. A robot that rotates about a point `x_c` ahead of the middle of its wheels
-//! has the sideslip `β = −κ x_c` there. Both are linear in what is not known, so both are adapted by
-//! the gradient of the law's Lyapunov function, as θ̂ is: `ḋ̂ = −γ_d e_y v n` and
+//! has the sideslip `β = −κ x_c` there. Both are linear in what is not known, so both are adapted
+//! by the gradient of the law's Lyapunov function, as θ̂ is: `ḋ̂ = −γ_d e_y v n` and
 //! `x̂̇_c = γ_c e_y v κ`. An error by a slope changes its sign with the heading; the integral would
-//! have to follow it, d̂ need not. The product of θ and s is adapted as one, so that a wrong θ̂ does
-//! not disturb it.
+//! have to follow it, d̂ need not. The product of θ and s is adapted as one, so that a wrong θ̂
+//! does not disturb it.
 
 use crate::reference::ReferenceSample;
 
 use super::config::TrackerConfig;
 
-/// Minimum speed in computing the rate of the curvature from that of the turn rate, metres per
-/// second.
+/// Lower bound of the speed by which the rate of the curvature is divided, metres per second.
 const SPEED_MIN_M_S: f64 = 0.05;
 /// Maximum magnitude of d̂'s rate of change, radians per second.
 const SLOPE_RATE_MAX_RAD_S: f64 = 0.1;

@@ -9,21 +9,22 @@ const SAME_GROUND_RATIO: f64 = 1.5;
 /// Slip compliance θ with its standard deviation, from the map or measured by this robot.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ThetaKnowledge {
-    /// Slip compliance θ = 1/K.
+    /// Slip compliance θ = 1/K, without a unit, above 0.
     pub theta: f64,
-    /// Standard deviation of θ.
+    /// Standard deviation of θ, without a unit, at least 0.
     pub std_dev: f64,
 }
 
 impl ThetaKnowledge {
-    /// Returns whether both values are unlikely to hold for the same ground.
+    /// Returns whether this θ and `other` are unlikely to be of the same ground: they differ by
+    /// more than [`CONTRADICTION`] standard deviations and by more than [`SAME_GROUND_RATIO`].
     pub(super) fn contradicts(self, other: Self) -> bool {
         let apart = (self.theta - other.theta).abs();
-        apart > CONTRADICTION * self.std_dev.hypot(other.std_dev) && self.is_apart(other)
+        apart > CONTRADICTION * self.std_dev.hypot(other.std_dev) && self.differs_by_ground(other)
     }
 
-    /// Returns whether the values differ by more than estimates of the same ground do.
-    pub(super) fn is_apart(self, other: Self) -> bool {
+    /// Returns whether the larger value is above [`SAME_GROUND_RATIO`] times the smaller one.
+    pub(super) fn differs_by_ground(self, other: Self) -> bool {
         self.theta.max(other.theta) > SAME_GROUND_RATIO * self.theta.min(other.theta)
     }
 

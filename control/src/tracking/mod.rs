@@ -24,11 +24,11 @@
 //! by the same function (`drift`). All that is adapted integrates the cross-track error, as the
 //! integral does; their gains are shares of one integral gain (`action`).
 //!
-//! θ̂ starts at zero, which means no sideslip. A θ that is known from the start pulls it, weighted by
-//! its confidence, and so does one that contradicts the previous one; after that errors lead θ̂. χ̂
-//! starts at one, and returns to one when a known θ contradicts the previous one. All are bounded
-//! in range and rate, and held while the wheels saturate, a later stage reduces the command, or the
-//! pose is stale. They serve this loop only; the map uses [`crate::estimation`].
+//! θ̂ starts at zero, which means no sideslip. A θ that is known from the start pulls it, weighted
+//! by its confidence, and so does one that contradicts the previous one; after that errors lead θ̂.
+//! χ̂ starts at one, and returns to one when a known θ contradicts the previous one. All are
+//! bounded in range and rate, and held while the wheels saturate, a later stage reduces the
+//! command, or the pose is stale. They serve this loop only; the map uses [`crate::estimation`].
 
 mod action;
 mod config;
@@ -71,16 +71,17 @@ const INTEGRAL_SPEED_MIN_M_S: f64 = 0.05;
 const HEADING_SPEED_MIN_M_S: f64 = 0.15;
 /// Cross-track error below which nothing is adapted, metres.
 const ADAPTATION_DEAD_ZONE_M: f64 = 5.0e-4;
-/// Maximum part of the command cut by the acceleration limits that is added to the next tick's.
-/// Without it noise would be cut on the side of speeding up only, and the mean speed and turn rate
-/// would be too low.
-const CARRIED_MAX: Twist = Twist {
+/// Maximum part that the acceleration limits cut off a command and that is added to the next
+/// tick's. Without this noise would be cut on the side of speeding up only, and the mean speed and
+/// turn rate would be too low.
+const REMAINDER_MAX: Twist = Twist {
     linear_m_s: 0.05,
     angular_rad_s: 0.3,
 };
 
-/// Ratio of standard deviations below which a new θ replaces the one under which χ̂ was adapted.
-const BETTER_WORD: f64 = 0.6;
+/// Ratio of the standard deviations of a new θ and of the one under which χ̂ was adapted, below
+/// which the new one replaces it.
+const MORE_PRECISE_RATIO: f64 = 0.6;
 /// Time for which a newly known θ pulls θ̂, seconds.
 const PULL_TIME_S: f64 = 2.0;
 /// Distance driven while adapting up to which a first known θ pulls θ̂, metres.
@@ -88,9 +89,9 @@ const KNOWN_FROM_START_M: f64 = 1.0;
 /// Maximum magnitude of χ̂'s rate of change, per second.
 const BEYOND_RATE_MAX_1_S: f64 = 1.0;
 
-/// Speed limits that cut a command.
+/// Speed limits that a wanted command exceeds.
 #[derive(Debug, Clone, Copy)]
-struct Cut {
+struct Saturation {
     /// A wheel speed limit.
     by_wheels: bool,
     /// The turn rate limit.
@@ -105,7 +106,7 @@ struct Pull {
     /// Whether there was a pull before.
     has_acted: bool,
     /// Whether slope and rotation centre return to zero during the pull.
-    forgets_drift: bool,
+    resets_drift: bool,
 }
 
 /// Tracking law with its state.
@@ -113,7 +114,9 @@ struct Pull {
 pub struct Tracker {
     model: RobotModel,
     config: TrackerConfig,
+    /// Integral term, as curvature.
     integral_1_m: f64,
+    /// θ̂.
     theta: f64,
     /// χ̂, the fraction of the loss beyond the peak of the friction curve.
     beyond: f64,
@@ -122,16 +125,18 @@ pub struct Tracker {
     known: Option<ThetaKnowledge>,
     last: Option<ThetaKnowledge>,
     /// Whether χ̂ is returning to one.
-    forgets: bool,
+    resets_beyond: bool,
     pull: Pull,
     /// Distance driven while adapting, metres.
     adapted_m: f64,
     noise: NoiseLevel,
     steadiness: Steadiness,
-    was_cut: bool,
-    held_from_outside: bool,
-    /// Part of the last command cut by the acceleration limits.
-    carried: Twist,
+    /// Whether a speed limit cut the last command.
+    was_saturated: bool,
+    /// Whether [`Tracker::hold_adaptation`] holds all that is adapted.
+    is_held_externally: bool,
+    /// Part that the acceleration limits cut off the last command.
+    remainder: Twist,
     /// Last commanded twist; None before the first tick.
     commanded: Option<Twist>,
 }
@@ -152,21 +157,22 @@ impl Tracker {
             drift: Drift::default(),
             known: None,
             last: None,
-            forgets: false,
+            resets_beyond: false,
             pull: Pull::default(),
             adapted_m: 0.0,
             noise: NoiseLevel::default(),
             steadiness: Steadiness::default(),
-            was_cut: false,
-            held_from_outside: false,
-            carried: Twist::default(),
+            was_saturated: false,
+            is_held_externally: false,
+            remainder: Twist::default(),
             commanded: None,
         })
     }
 
-    /// Holds all that is adapted, and the integral, while another stage, such as the gate, reduces the command.
+    /// Holds all that is adapted, and the integral, while another stage, such as the gate, reduces
+    /// the command.
     pub fn hold_adaptation(&mut self, held: bool) {
-        self.held_from_outside = held;
+        self.is_held_externally = held;
     }
 
     /// Sets the last command to the base if it differs from this law's own; the next tick's
@@ -184,13 +190,13 @@ impl Tracker {
         }
     }
 
-    /// Returns the adapted θ̂; not a measurement of θ.
+    /// Returns the adapted θ̂, 0 to [`TrackerConfig::theta_max`]; not a measurement of θ.
     pub fn theta_loop(&self) -> f64 {
         self.theta
     }
 
-    /// Computes the command of one tick of `dt_s` seconds. `knowledge` with zero confidence counts
-    /// as None.
+    /// Computes the command of one tick of `dt_s` seconds, above 0 and finite, and adapts.
+    /// `knowledge` with zero confidence counts as None.
     pub fn step(
         &mut self,
         reference: &ReferenceSample,
@@ -237,14 +243,14 @@ impl Tracker {
         let cross_max_m = 0.8 * gains.heading_1_m / gains.cross_1_m2;
         let cross_track_m = forward.y_m.clamp(-cross_max_m, cross_max_m);
 
-        let held = self.was_cut
-            || self.held_from_outside
+        let held = self.was_saturated
+            || self.is_held_externally
             || measured.pose_age_s > config.pose_age_max_s
             || speed_m_s < INTEGRAL_SPEED_MIN_M_S;
         let confidence = knowledge.map_or(0.0, |known| known.confidence());
         if !held {
             self.adapted_m += speed_m_s * dt_s;
-            let free = self.free(&sideslip, cross_track_m);
+            let free = self.adaptable(&sideslip, cross_track_m);
             let action =
                 IntegralAction::divide(&gains, &config, reference, (&sideslip, &drift), free);
             self.integrate(action.integral_1_m3 * cross_track_m * speed_m_s * dt_s);
@@ -288,9 +294,9 @@ impl Tracker {
                 angular_rad_s,
             },
         };
-        let (wheel_speeds, cut) = self.within_limits(change, dt_s);
+        let (wheel_speeds, saturation) = self.within_limits(change, dt_s);
         self.commanded = Some(self.model.twist_from_wheel_speeds(wheel_speeds));
-        self.was_cut = cut.by_wheels || cut.in_yaw;
+        self.was_saturated = saturation.by_wheels || saturation.in_yaw;
         TrackerOutput {
             wheel_speeds,
             twist: self.model.twist_from_wheel_speeds(wheel_speeds),
@@ -300,53 +306,54 @@ impl Tracker {
             slope_loop_rad: self.drift.slope_rad,
             center_loop_m: self.drift.center_forward_m,
             confidence,
-            saturated: cut.by_wheels,
+            saturated: saturation.by_wheels,
         }
     }
 
-    /// Lets a known θ act if it is new: θ̂ is pulled to it if it is known from the start, refines or
-    /// corrects one that pulled, or jumps to another value, as on other ground. What was adapted
-    /// under another θ is forgotten: χ̂ moves back to one, slope and rotation centre to zero.
+    /// Starts a pull of θ̂ to a known θ that is new: one that is known from the start, that refines
+    /// or corrects one that pulled, or that jumps to another value, as on other ground. What was
+    /// adapted under another θ is forgotten: χ̂ moves back to one, slope and rotation centre to
+    /// zero.
     fn apply_knowledge(&mut self, knowledge: Option<ThetaKnowledge>, dt_s: f64) {
         if let Some(now) = knowledge {
             let is_first = self.known.is_none();
             let anchor = *self.known.get_or_insert(now);
             let is_contradicted = anchor.contradicts(now);
-            // An estimate that drifts away was wrong before, which matters only if it pulled. On other
-            // ground it jumps.
+            // An estimate that drifts away was wrong before, which matters only if it pulled. On
+            // other ground it jumps.
             let has_jumped = self.last.is_some_and(|last| last.contradicts(now));
             let is_corrected = is_contradicted && (has_jumped || self.pull.has_acted);
             // A much better value for the same ground replaces the stored one; replacing it by many
             // slightly better ones would let it follow a θ that changes.
-            let is_better = now.std_dev < BETTER_WORD * anchor.std_dev;
+            let is_better = now.std_dev < MORE_PRECISE_RATIO * anchor.std_dev;
             let is_refined = self.pull.has_acted && is_better;
-            let is_other = is_corrected || is_refined && anchor.is_apart(now);
-            self.forgets |= is_other;
-            // Errors that were driven through know better what the loop needs.
+            let is_other = is_corrected || is_refined && anchor.differs_by_ground(now);
+            self.resets_beyond |= is_other;
+            // After that distance the adaptation to tracking errors is more accurate than θ.
             let is_from_start = is_first && self.adapted_m < KNOWN_FROM_START_M;
             if is_corrected || is_refined || is_from_start {
                 self.pull.left_s = PULL_TIME_S;
                 self.pull.has_acted = true;
-                self.pull.forgets_drift = is_other;
+                self.pull.resets_drift = is_other;
             }
             if is_contradicted || is_better {
                 self.known = Some(now);
             }
             self.last = Some(now);
-            if self.pull.left_s > 0.0 && self.pull.forgets_drift {
+            if self.pull.left_s > 0.0 && self.pull.resets_drift {
                 let share = now.confidence() * self.config.adaptation_pull_1_s * dt_s;
                 self.drift.decay(share.min(1.0));
             }
         }
         self.pull.left_s = (self.pull.left_s - dt_s).max(0.0);
-        if self.forgets {
+        if self.resets_beyond {
             self.beyond = (self.beyond + BEYOND_RATE_MAX_1_S * dt_s).min(1.0);
-            self.forgets = self.beyond < 1.0;
+            self.resets_beyond = self.beyond < 1.0;
         }
     }
 
-    /// Returns which adapted values can follow a cross-track error.
-    fn free(&self, sideslip: &Sideslip, cross_track_m: f64) -> CanFollow {
+    /// Returns which adapted values can follow the present cross-track error.
+    fn adaptable(&self, sideslip: &Sideslip, cross_track_m: f64) -> CanFollow {
         let within = |value: f64, most: f64, drift_m_s: f64| {
             let rises = cross_track_m * drift_m_s > 0.0;
             if rises { value < most } else { value > 0.0 }
@@ -357,9 +364,9 @@ impl Tracker {
                 self.config.theta_max,
                 sideslip.drift_per_theta_m_s,
             ),
-            beyond: !self.forgets && within(self.beyond, 1.0, sideslip.drift_per_beyond_m_s),
+            beyond: !self.resets_beyond && within(self.beyond, 1.0, sideslip.drift_per_beyond_m_s),
             // Slope and rotation centre are not adapted while they return to zero.
-            drift: self.pull.left_s <= 0.0 || !self.pull.forgets_drift,
+            drift: self.pull.left_s <= 0.0 || !self.pull.resets_drift,
         }
     }
 
@@ -380,7 +387,7 @@ impl Tracker {
         let AdaptationTick { error_m, dt_s } = tick;
         let config = &self.config;
         // At the bound of the modelled sideslip a larger θ̂ or χ̂ has no effect and would wind up.
-        let most = if sideslip.is_at_end {
+        let most = if sideslip.is_at_bound {
             0.0
         } else {
             f64::INFINITY
@@ -397,7 +404,7 @@ impl Tracker {
         let rate = gradient.clamp(-bound, bound) + pull;
         self.theta = (self.theta + rate * dt_s).clamp(0.0, config.theta_max);
         // χ̂ is not adapted while it returns to one.
-        if !self.forgets {
+        if !self.resets_beyond {
             let gradient = (config.beyond_gain * error_m * sideslip.drift_per_beyond_m_s).min(most);
             let rate = gradient.clamp(-BEYOND_RATE_MAX_1_S, BEYOND_RATE_MAX_1_S);
             self.beyond = (self.beyond + rate * dt_s).clamp(0.0, 1.0);
@@ -406,15 +413,15 @@ impl Tracker {
 
     /// Returns the wheel speeds nearest to the wanted twist within every limit, and which speed
     /// limit cut it.
-    fn within_limits(&mut self, change: Change<Twist>, dt_s: f64) -> (WheelSpeeds, Cut) {
+    fn within_limits(&mut self, change: Change<Twist>, dt_s: f64) -> (WheelSpeeds, Saturation) {
         let Change { from, to: wanted } = change;
         let limits = self.model.limits();
         let reverse_max_m_s = REVERSE_MAX_M_S.min(limits.linear_max_m_s);
         let angular_max_rad_s = limits.angular_max_rad_s;
         let bounded = Twist {
-            linear_m_s: (wanted.linear_m_s + self.carried.linear_m_s)
+            linear_m_s: (wanted.linear_m_s + self.remainder.linear_m_s)
                 .clamp(-reverse_max_m_s, limits.linear_max_m_s),
-            angular_rad_s: (wanted.angular_rad_s + self.carried.angular_rad_s)
+            angular_rad_s: (wanted.angular_rad_s + self.remainder.angular_rad_s)
                 .clamp(-angular_max_rad_s, angular_max_rad_s),
         };
         let turns_too_fast = wanted.angular_rad_s.abs() > angular_max_rad_s;
@@ -422,15 +429,15 @@ impl Tracker {
         let to = self.model.twist_from_wheel_speeds(wheels);
         let twist_limits = TwistLimits::of(&self.model);
         let next = twist_limits.step(Change { from, to }, twist_limits.slowing_by_wheels(), dt_s);
-        let most = CARRIED_MAX;
-        self.carried = Twist {
+        let most = REMAINDER_MAX;
+        self.remainder = Twist {
             linear_m_s: (to.linear_m_s - next.linear_m_s).clamp(-most.linear_m_s, most.linear_m_s),
             angular_rad_s: (to.angular_rad_s - next.angular_rad_s)
                 .clamp(-most.angular_rad_s, most.angular_rad_s),
         };
         (
             self.model.wheel_speeds_from_twist(next),
-            Cut {
+            Saturation {
                 by_wheels: saturated,
                 in_yaw: turns_too_fast,
             },
@@ -438,8 +445,9 @@ impl Tracker {
     }
 }
 
-/// Returns wheel speeds for a twist within the wheel speed limit, and whether it cut the command.
-/// The turn rate is kept and the forward speed reduced.
+/// Returns the wheel speeds for a twist within the wheel speed limit, and whether that limit
+/// changed the command. The turn rate is kept as far as the limit allows, and the forward speed
+/// reduced.
 pub fn desaturated(model: &RobotModel, twist: Twist) -> (WheelSpeeds, bool) {
     let limit_rad_s = model.limits().wheel_speed_max_rad_s;
     let free = model.wheel_speeds_from_twist(twist);

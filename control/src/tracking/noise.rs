@@ -8,8 +8,8 @@ const NOISE_MEMORY_S: f64 = 2.0;
 /// Bound of a single jump of the pose, metres.
 const NOISE_JUMP_MAX_M: f64 = 0.1;
 
-/// Lateral noise of the pose: its difference to the pose propagated from the previous tick by the
-/// measured motion.
+/// Running estimate of the pose's lateral noise, from the difference of each pose to the pose that
+/// is propagated from the previous tick by the measured motion.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct NoiseLevel {
     before: Option<Measured>,

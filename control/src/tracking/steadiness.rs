@@ -1,9 +1,9 @@
 //! How steady the sideslip of the path is.
 //!
-//! The law rejects what its model of the sideslip does not explain. That is a share of the sideslip,
-//! so it changes where the sideslip changes: where a path bends, and across a slope. On a path of
-//! constant sideslip the adapted values and the integral have it after a few metres; what is left
-//! there is the noise of the pose, which soft gains follow least.
+//! The law rejects what its model of the sideslip does not explain. That is a share of the
+//! sideslip, so it changes where the sideslip changes: where a path bends, and across a slope. On a
+//! path of constant sideslip the adapted values and the integral have it after a few metres; what
+//! is left there is the noise of the pose, which soft gains follow least.
 
 use crate::reference::ReferenceSample;
 use crate::robot::GRAVITY_M_S2;

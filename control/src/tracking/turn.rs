@@ -24,7 +24,7 @@ const SHARE_MIN: f64 = 0.05;
 /// Bounds of the rim speeds over the forward speed.
 const RIMS: std::ops::RangeInclusive<f64> = 0.05..=20.0;
 /// Bound of the curvature, as a fraction of that at which the inner rims stop by kinematics alone.
-const TIGHT_MAX: f64 = 0.7;
+const CURVATURE_SHARE_MAX: f64 = 0.7;
 
 /// Steady turn, all speeds relative to the forward speed.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -41,11 +41,13 @@ pub(super) struct SteadyTurn {
 pub(super) struct Turn {
     /// Curvature after its bound, 1/m.
     pub(super) curvature_1_m: f64,
+    /// With every wheel in the linear range.
     pub(super) linear: SteadyTurn,
+    /// With the friction loss beyond the peak.
     pub(super) beyond: SteadyTurn,
 }
 
-/// Which turn is driven.
+/// Turn to compute.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct TurnSpec {
     /// Curvature, 1/m, finite.
@@ -62,7 +64,7 @@ impl Turn {
         friction_curve: &FrictionCurve,
         spec: TurnSpec,
     ) -> Self {
-        let bound_1_m = TIGHT_MAX * 2.0 / model.effective_track_m();
+        let bound_1_m = CURVATURE_SHARE_MAX * 2.0 / model.effective_track_m();
         let curvature_1_m = spec.curvature_1_m.clamp(-bound_1_m, bound_1_m);
         let bounded = TurnSpec {
             curvature_1_m,
@@ -74,7 +76,7 @@ impl Turn {
         }
         let linear = wheels.turn();
         for _ in 0..SHARE_ROUNDS {
-            if !wheels.lose(friction_curve) {
+            if !wheels.update_shares(friction_curve) {
                 break;
             }
             wheels.balance();
@@ -90,8 +92,9 @@ impl Turn {
 /// State of the iteration over four wheels.
 struct Wheels {
     curvature_1_m: f64,
-    /// `4θv²/g`, metres: slip per curvature of one wheel that carries the lateral force of all.
-    slip_of_all_m: f64,
+    /// `4θv²/g`, metres: the lateral slip, over the curvature, of a single wheel if it carried the
+    /// robot's whole lateral force.
+    wheel_compliance_m: f64,
     /// Wheelbase over track width, L/W.
     slenderness: f64,
     /// Forward speed of the ground contacts, `[left, right]`.
@@ -116,7 +119,7 @@ impl Wheels {
         let outward = curvature_1_m * half_track_m;
         Self {
             curvature_1_m,
-            slip_of_all_m: 4.0 * compliance_m,
+            wheel_compliance_m: 4.0 * compliance_m,
             slenderness: half_base_m / half_track_m,
             ground: [1.0 - outward, 1.0 + outward],
             lateral: curvature_1_m * half_base_m,
@@ -133,14 +136,16 @@ impl Wheels {
         }
     }
 
-    /// Solves the balances for the present fractions of stiffness.
+    /// Solves the balances of longitudinal force, moment and lateral force for the present
+    /// fractions of stiffness; sets rim speeds and sideslip.
     fn balance(&mut self) {
         let sums = self.shares.map(|[front, rear]| front + rear);
         let gaps = self.shares.map(|[front, rear]| front - rear);
         // Longitudinal force: equals mass times −v²κ times sideslip, the acceleration along the
         // robot.
         let longitudinal = [sums[0] * self.ground[0], sums[1] * self.ground[1]];
-        let force = sums[0] + sums[1] + self.slip_of_all_m * self.sideslip * self.curvature_1_m;
+        let force =
+            sums[0] + sums[1] + self.wheel_compliance_m * self.sideslip * self.curvature_1_m;
         // Moment over half the track width: difference of the sides' longitudinal forces less the
         // axles' scrubbing.
         let scrubs = [0, 1].map(|side| {
@@ -158,12 +163,12 @@ impl Wheels {
         let stiffness = self.per_rim[0] * sums[0] + self.per_rim[1] * sums[1];
         let unequal = self.per_rim[0] * gaps[0] + self.per_rim[1] * gaps[1];
         let sideslip =
-            -(self.slip_of_all_m * self.curvature_1_m + unequal * self.lateral) / stiffness;
+            -(self.wheel_compliance_m * self.curvature_1_m + unequal * self.lateral) / stiffness;
         self.sideslip = sideslip.clamp(-SIDESLIP_MAX, SIDESLIP_MAX);
     }
 
     /// Computes the fractions of stiffness from the present slip; returns whether any has changed.
-    fn lose(&mut self, friction_curve: &FrictionCurve) -> bool {
+    fn update_shares(&mut self, friction_curve: &FrictionCurve) -> bool {
         let mut has_moved = false;
         for side in [0, 1] {
             let forward = self.ground[side] * self.per_rim[side] - 1.0;
@@ -237,13 +242,16 @@ mod tests {
             let curve = friction_curve(stiffness, peak_slip);
             let compliance_m = speed_m_s * speed_m_s / (stiffness * GRAVITY_M_S2);
             // Excludes ground that cannot hold the turn at all.
-            prop_assume!(speed_m_s * speed_m_s * curvature.abs() < 0.5 * curve.mu_peak() * GRAVITY_M_S2);
+            let lateral_m_s2 = speed_m_s * speed_m_s * curvature.abs();
+            prop_assume!(lateral_m_s2 < 0.5 * curve.mu_peak() * GRAVITY_M_S2);
             let model = RobotModel::yi2007();
-            let turn = Turn::steady(&model, &curve, TurnSpec { curvature_1_m: curvature, compliance_m });
+            let spec = TurnSpec { curvature_1_m: curvature, compliance_m };
+            let turn = Turn::steady(&model, &curve, spec);
             prop_assume!(turn.beyond.sideslip.abs() < SIDESLIP_MAX);
             let rims = turn.beyond.rims.map(|rim| rim * speed_m_s);
             let (forward_m_s, sideslip, driven) = driven(curve, rims);
-            prop_assert!((forward_m_s / speed_m_s - 1.0).abs() < 0.02, "{forward_m_s} of {speed_m_s}");
+            let speed_ratio = forward_m_s / speed_m_s;
+            prop_assert!((speed_ratio - 1.0).abs() < 0.02, "{forward_m_s} of {speed_m_s}");
             prop_assert!((driven - curvature).abs() < 0.03, "{driven} of {curvature}");
             let off = (sideslip - turn.beyond.sideslip).abs();
             prop_assert!(off < 2.0e-3 + 0.1 * turn.beyond.sideslip.abs(), "{sideslip} of {turn:?}");
@@ -255,8 +263,12 @@ mod tests {
             sliding_ratio in 0.0..=1.0_f64,
         ) {
             let model = RobotModel::yi2007();
-            let friction_curve = FrictionSpec { stiffness: 1.0, peak_slip, sliding_ratio }.try_into().unwrap();
-            let turn = |curvature_1_m| Turn::steady(&model, &friction_curve, TurnSpec { curvature_1_m, compliance_m });
+            let spec = FrictionSpec { stiffness: 1.0, peak_slip, sliding_ratio };
+            let friction_curve = spec.try_into().unwrap();
+            let turn = |curvature_1_m| {
+                let spec = TurnSpec { curvature_1_m, compliance_m };
+                Turn::steady(&model, &friction_curve, spec)
+            };
             let (one, other) = (turn(curvature), turn(-curvature));
             for (one, other) in [(one.linear, other.linear), (one.beyond, other.beyond)] {
                 prop_assert!((one.sideslip + other.sideslip).abs() < 1.0e-9);

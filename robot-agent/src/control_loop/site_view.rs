@@ -102,7 +102,7 @@ impl SiteView {
         let revision = std::mem::take(&mut definition.geofence).revision;
         let mut view = Self::new(definition);
         view.definition.geofence.revision = revision;
-        view.fence = Fence::without_room();
+        view.fence = Fence::without_allowed_ground();
         view.is_without_room = true;
         view
     }

@@ -6,21 +6,21 @@ use crate::geometry::Twist;
 
 /// Minimum magnitude of both values for an inverted sign, radians per second or metres per second.
 const SIGN_MIN: f64 = 0.12;
-/// Tolerance within which body or wheels follow a command.
-const OBEYS: Tolerance = Tolerance {
+/// Tolerated difference from the commands up to which body or wheels follow them.
+const FOLLOWS_COMMAND: Tolerance = Tolerance {
     own_rad_s: 0.15,
     own_m_s: 0.08,
     share_turn: 0.2,
     forward_share: 0.2,
 };
-/// Tolerance beyond which wheels do not follow their command, if the body does.
-const DISOBEYS: Tolerance = Tolerance {
+/// Difference from the commands above which wheels do not follow them, if the body does.
+const DEVIATES_FROM_COMMAND: Tolerance = Tolerance {
     own_rad_s: 0.08,
     own_m_s: 0.05,
     share_turn: 0.15,
     forward_share: 0.15,
 };
-/// Tolerance beyond which measured wheel speeds are above their command.
+/// Difference above which measured wheel speeds exceed their command.
 const ABOVE: Tolerance = Tolerance {
     own_rad_s: 0.1,
     own_m_s: 0.05,
@@ -30,9 +30,11 @@ const ABOVE: Tolerance = Tolerance {
 /// Maximum excess of the body over the command, as a fraction of the wheels' excess, for a fault of
 /// their sensor.
 const NEARER_ABOVE: f64 = 0.4;
-/// Maximum deviation of the body from the command, forward, as a fraction of the wheels' deviation.
+/// Maximum deviation of the body's forward speed from the command, as a fraction of the wheels'
+/// deviation, for a fault of the wheels' sensor.
 const NEARER_FORWARD: f64 = 0.9;
-/// Ratio of distances below which a value is nearer to one than to the other.
+/// Ratio of the differences from two values below which the one with the smaller difference is
+/// favoured.
 pub(super) const NEARER: f64 = 0.6;
 
 /// Tolerated difference of two motions: an absolute part plus a fraction of the larger one.
@@ -59,6 +61,7 @@ pub(super) enum Axis {
 }
 
 impl Rates {
+    /// Returns the magnitude of the difference.
     pub(super) fn difference(self) -> f64 {
         (self.body - self.wheels).abs()
     }
@@ -78,6 +81,7 @@ impl Rates {
 }
 
 impl Axis {
+    /// Returns the twist's component on this axis, m/s or rad/s.
     pub(super) fn of(self, twist: Twist) -> f64 {
         match self {
             Self::Turn => twist.angular_rad_s,
@@ -102,37 +106,38 @@ impl Axis {
         own + share * one.abs().max(other.abs())
     }
 
-    /// Returns the distance of a motion from the range of commands; 0 within.
-    pub(super) fn off_command(self, motion: f64, commanded: &Commanded) -> f64 {
+    /// Returns the distance of a motion from the range of commands, m/s or rad/s; 0 within.
+    pub(super) fn command_distance(self, motion: f64, commanded: &Commanded) -> f64 {
         let (least, most) = (self.of(commanded.least), self.of(commanded.most));
         (least - motion).max(motion - most).max(0.0)
     }
 
-    pub(super) fn obeys(self, motion: f64, commanded: &Commanded) -> bool {
+    /// Returns whether a motion, m/s or rad/s, is within the tolerance of the commands.
+    pub(super) fn follows_command(self, motion: f64, commanded: &Commanded) -> bool {
         let (least, most) = (self.of(commanded.least), self.of(commanded.most));
-        self.off_command(motion, commanded) <= self.slack(OBEYS, least, most)
+        self.command_distance(motion, commanded) <= self.slack(FOLLOWS_COMMAND, least, most)
     }
 
     /// Returns whether wheels contradict their command and the body follows it, which no slip
     /// causes.
-    pub(super) fn is_of_sensor(self, rates: Rates, commanded: &Commanded) -> bool {
-        if self.is_above(rates, commanded) {
+    pub(super) fn is_sensor_fault(self, rates: Rates, commanded: &Commanded) -> bool {
+        if self.exceeds_command(rates, commanded) {
             return true;
         }
         let (least, most) = (self.of(commanded.least), self.of(commanded.most));
-        let off = self.off_command(rates.wheels, commanded);
+        let off = self.command_distance(rates.wheels, commanded);
         let nearer = match self {
             Self::Turn => NEARER,
             // Forward, nothing makes the body faster than driven wheels.
             Self::Forward => NEARER_FORWARD,
         };
-        off > self.slack(DISOBEYS, least, most)
-            && self.off_command(rates.body, commanded) < nearer * off
+        off > self.slack(DEVIATES_FROM_COMMAND, least, most)
+            && self.command_distance(rates.body, commanded) < nearer * off
     }
 
     /// Returns whether wheels measure more than commanded and the body does not follow: saturated
     /// motors and slipping wheels give less than commanded, never more.
-    pub(super) fn is_above(self, rates: Rates, commanded: &Commanded) -> bool {
+    pub(super) fn exceeds_command(self, rates: Rates, commanded: &Commanded) -> bool {
         let Rates { wheels, body } = rates;
         let (least, most) = (self.of(commanded.least), self.of(commanded.most));
         let (most, least) = if wheels < 0.0 {
@@ -147,6 +152,7 @@ impl Axis {
     }
 }
 
+/// Creates a finding about a subject from the compared rates, in the unit of the axis.
 pub(super) fn finding(subject: Subject, kind: Kind, comparison: Comparison, axis: Axis) -> Finding {
     let Comparison {
         observed,
@@ -161,7 +167,8 @@ pub(super) fn finding(subject: Subject, kind: Kind, comparison: Comparison, axis
     }
 }
 
-/// Returns the type of fault of a channel.
+/// Returns the type of fault of the observed channel: frozen if `is_frozen`, inverted if the signs
+/// differ and the magnitudes are similar, else inconsistent.
 pub(super) fn kind_of(comparison: Comparison, is_frozen: bool) -> Kind {
     let Comparison {
         observed,

@@ -1,28 +1,28 @@
 //! Forward and lateral speed: wheels, odometry over ground, and position fixes.
 
 use super::axis::{Axis, Rates, Tolerance, finding, kind_of};
-use super::wheels::{self, WHEELS, WITNESSED};
-use super::witnesses::{Nearer, Witnesses};
+use super::vote::{Favoured, Vote};
+use super::wheels::{self, CORROBORATED, WHEELS};
 use super::{BODY, RAISE_FIX_S, RAISE_FROZEN_S, RAISE_SLIP_S, Recent, Verdicts, View};
-use crate::consistency::fixes::Seen;
+use crate::consistency::fixes::FixResidual;
 use crate::consistency::history::{Means, Span};
 use crate::consistency::{Comparison, Kind, Subject};
 
 const AXIS: Axis = Axis::Forward;
-/// Tolerated difference of the position to odometry, wheels and command where these three agree.
+/// Tolerated difference of the fixes from odometry, where odometry and wheels agree.
 const ALONE: Tolerance = Tolerance {
     forward_share: 0.08,
-    ..WITNESSED
+    ..CORROBORATED
 };
 /// Minimum distance by which wheels must be nearer to the fixes than odometry is, in addition to
 /// noise, metres per second.
-const WITNESSED_MIN_M_S: f64 = 0.03;
+const NEARER_TO_FIXES_MIN_M_S: f64 = 0.03;
 /// Fraction of the fixes' noise that is tolerated with [`ALONE`].
 const ALONE_NOISE_RATIO: f64 = 0.75;
-/// Span over which the present speed is taken, seconds.
+/// Span of the mean that counts as the speed at one time, seconds.
 const INSTANT_S: f64 = 0.1;
 /// Minimum fraction of odometry's excess over the wheels that fixes must show to confirm it.
-const SECONDED: f64 = 0.4;
+const CORROBORATED_RATIO_MIN: f64 = 0.4;
 /// Tolerated delay of odometry, seconds.
 const ODOMETRY_LAG_S: f64 = 0.1;
 /// Tolerated lateral speed by fixes, in addition to noise: metres per second, fraction of the
@@ -40,48 +40,49 @@ pub(super) fn check(
     is_turn_clean: bool,
     verdicts: &mut Verdicts,
 ) -> bool {
-    let mut is_seen = false;
+    let mut has_residual = false;
     let mut error_m_s = None;
     // Dead reckoning with a wrong gyro gives no forward direction.
-    for seen in view.seen().filter(|_| view.uses.gyro) {
-        let Some(means) = view.history.means(seen.span()) else {
+    for residual in view.residuals().filter(|_| view.channels.gyro) {
+        let Some(means) = view.history.means(residual.span()) else {
             continue;
         };
-        is_seen = true;
-        error_m_s = error_m_s.or(Some(seen.forward_error_m_s));
+        has_residual = true;
+        error_m_s = error_m_s.or(Some(residual.forward_error_m_s));
         let wheels = means.wheels.linear_m_s;
-        let position = wheels + seen.forward_error_m_s;
-        if let Some(odometry) = means.odometry_m_s.filter(|_| view.uses.odometry)
-            && !agrees_with_position(view, recent, seen, &means, odometry)
+        let position = wheels + residual.forward_error_m_s;
+        if let Some(odometry) = means.odometry_m_s.filter(|_| view.channels.odometry)
+            && !agrees_with_position(view, recent, residual, &means, odometry)
         {
-            isolate_fault(view, seen, &means, odometry, verdicts);
+            isolate_fault(view, residual, &means, odometry, verdicts);
             return false;
         }
-        if !view.uses.wheels {
+        if !view.channels.wheels {
             continue;
         }
-        let commanded = view.commanded(seen);
+        let commanded = view.commanded(residual);
         let rates = Rates {
             wheels,
             body: position,
         };
         let (slack, share) = wheels::slack(view, AXIS, rates, &commanded);
-        let noise = share * seen.noise_m_s + 0.3 * recent.forward_change;
-        if seen.forward_error_m_s.abs() > slack + noise {
-            let odometry = means.odometry_m_s.filter(|_| view.uses.odometry);
-            let is_seconded = odometry
-                .is_some_and(|said| (said - wheels).abs() <= AXIS.slack(WITNESSED, said, wheels));
-            if is_seconded {
+        let noise = share * residual.noise_m_s + 0.3 * recent.forward_change;
+        if residual.forward_error_m_s.abs() > slack + noise {
+            let odometry = means.odometry_m_s.filter(|_| view.channels.odometry);
+            let is_corroborated = odometry.is_some_and(|said| {
+                (said - wheels).abs() <= AXIS.slack(CORROBORATED, said, wheels)
+            });
+            if is_corroborated {
                 // The wheels are right: odometry and fixes are distinguished later.
                 return false;
             }
-            wheels::against_body(view, rates, &commanded, AXIS, verdicts);
+            wheels::record_contradiction(view, rates, &commanded, AXIS, verdicts);
             return false;
         }
-        if is_turn_clean && moves_laterally(seen, &means) {
+        if is_turn_clean && moves_laterally(residual, &means) {
             let lateral = Comparison {
                 observed: 0.0,
-                predicted: seen.left_error_m_s,
+                predicted: residual.left_error_m_s,
             };
             let found = finding(Subject::WheelsAndMotion, Kind::Inconsistent, lateral, AXIS);
             verdicts.contradict(found, RAISE_SLIP_S);
@@ -89,7 +90,7 @@ pub(super) fn check(
         }
     }
     let odometry = recent.means.odometry_m_s;
-    let Some(odometry) = odometry.filter(|_| view.uses.odometry && view.uses.wheels) else {
+    let Some(odometry) = odometry.filter(|_| view.channels.odometry && view.channels.wheels) else {
         return true;
     };
     let (wheels, commanded) = (recent.means.wheels.linear_m_s, &recent.commanded);
@@ -101,24 +102,25 @@ pub(super) fn check(
     if (odometry - wheels).abs() <= slack + recent.forward_change {
         return true;
     }
-    if AXIS.obeys(wheels, commanded) {
+    if AXIS.follows_command(wheels, commanded) {
         if view.repeats.odometry.is_frozen() {
             let found = finding(Subject::Odometry, Kind::Frozen, rates.of_body(), AXIS);
             verdicts.contradict(found, RAISE_FROZEN_S);
             return false;
         }
-        if is_seen {
+        if has_residual {
             // Slip, or odometry: the fixes will distinguish them.
             return false;
         }
     }
     // Saturated motors with odometry that reads too high look like wheels that read too low.
     let off = odometry - wheels;
-    let is_seconded = error_m_s.is_none_or(|error| error * off.signum() > SECONDED * off.abs());
-    if view.is_saturated(recent.means.wheels, commanded) && !is_seconded {
+    let is_corroborated =
+        error_m_s.is_none_or(|error| error * off.signum() > CORROBORATED_RATIO_MIN * off.abs());
+    if view.is_saturated(recent.means.wheels, commanded) && !is_corroborated {
         return false;
     }
-    wheels::against_body(view, rates, commanded, AXIS, verdicts);
+    wheels::record_contradiction(view, rates, commanded, AXIS, verdicts);
     false
 }
 
@@ -126,12 +128,12 @@ pub(super) fn check(
 fn agrees_with_position(
     view: &View<'_>,
     recent: &Recent,
-    seen: &Seen,
+    residual: &FixResidual,
     means: &Means,
     odometry: f64,
 ) -> bool {
     let wheels = means.wheels.linear_m_s;
-    let position = wheels + seen.forward_error_m_s;
+    let position = wheels + residual.forward_error_m_s;
     let at = |at_s: f64| {
         let means = view.history.means(Span {
             from_s: at_s - INSTANT_S,
@@ -139,52 +141,52 @@ fn agrees_with_position(
         });
         means.map_or(wheels, |means| means.wheels.linear_m_s)
     };
-    let span_s = seen.to_s - seen.from_s;
-    let lag = ODOMETRY_LAG_S * (at(seen.to_s) - at(seen.from_s)).abs() / span_s;
+    let span_s = residual.to_s - residual.from_s;
+    let lag = ODOMETRY_LAG_S * (at(residual.to_s) - at(residual.from_s)).abs() / span_s;
     let change = 0.3 * recent.forward_change;
     // While a robot slides and turns, earlier lateral motion appears as forward motion.
     let turned = (means.gyro_rad_s.abs() * span_s).min(1.0);
-    let noise_m_s = seen.odometry_noise_m_s + turned * seen.left_error_m_s.abs();
+    let noise_m_s = residual.odometry_noise_m_s + turned * residual.left_error_m_s.abs();
     let most = AXIS.slack(BODY, odometry, position) + noise_m_s + change + lag;
-    if seen.odometry_error_m_s.abs() > most {
+    if residual.odometry_error_m_s.abs() > most {
         return false;
     }
-    if !view.uses.wheels {
+    if !view.channels.wheels {
         return true;
     }
     // Wheels agree with odometry and the position shows more: no slip causes that.
     let is_alone = (odometry - wheels).abs() <= AXIS.slack(ALONE, odometry, wheels) + change
         && position.abs() > odometry.abs()
-        && seen.odometry_error_m_s.abs()
+        && residual.odometry_error_m_s.abs()
             > AXIS.slack(ALONE, odometry, position) + ALONE_NOISE_RATIO * noise_m_s + change + lag;
-    let is_witnessed = (odometry - wheels).abs()
-        > AXIS.slack(WITNESSED, odometry, wheels) + change + lag
-        && seen.odometry_error_m_s.abs() - seen.forward_error_m_s.abs()
-            > WITNESSED_MIN_M_S + noise_m_s;
-    !(is_witnessed || is_alone)
+    let is_contradicted_by_wheels = (odometry - wheels).abs()
+        > AXIS.slack(CORROBORATED, odometry, wheels) + change + lag
+        && residual.odometry_error_m_s.abs() - residual.forward_error_m_s.abs()
+            > NEARER_TO_FIXES_MIN_M_S + noise_m_s;
+    !(is_contradicted_by_wheels || is_alone)
 }
 
 /// Names the wrong one of odometry and fixes, or [`Subject::Motion`] if neither can be excluded.
 fn isolate_fault(
     view: &View<'_>,
-    seen: &Seen,
+    residual: &FixResidual,
     means: &Means,
     odometry: f64,
     verdicts: &mut Verdicts,
 ) {
     let wheels = means.wheels.linear_m_s;
-    let position = wheels + seen.forward_error_m_s;
-    let commanded = view.commanded(seen);
-    let witnesses = Witnesses {
-        by_wheels: view.uses.wheels.then_some((
-            (seen.odometry_error_m_s - seen.forward_error_m_s).abs(),
-            seen.forward_error_m_s.abs(),
+    let position = wheels + residual.forward_error_m_s;
+    let commanded = view.commanded(residual);
+    let vote = Vote {
+        by_wheels: view.channels.wheels.then_some((
+            (residual.odometry_error_m_s - residual.forward_error_m_s).abs(),
+            residual.forward_error_m_s.abs(),
         )),
         slack: AXIS.slack(WHEELS, wheels, odometry.abs().min(position.abs())),
-        noise: seen.noise_m_s,
+        noise: residual.noise_m_s,
         by_command: (!view.is_saturated(means.wheels, &commanded)).then_some((
-            AXIS.off_command(odometry, &commanded),
-            AXIS.off_command(position, &commanded),
+            AXIS.command_distance(odometry, &commanded),
+            AXIS.command_distance(position, &commanded),
         )),
     };
     let repeats = view.repeats;
@@ -193,12 +195,12 @@ fn isolate_fault(
         predicted: position,
     };
     let of_position = of_odometry.reversed();
-    let found = match witnesses.side() {
-        Some(Nearer::First) => {
+    let found = match vote.favoured() {
+        Some(Favoured::Fast) => {
             let kind = kind_of(of_position, repeats.position.is_frozen());
             finding(Subject::Position, kind, of_position, AXIS)
         }
-        Some(Nearer::Second) => {
+        Some(Favoured::Fixes) => {
             let kind = kind_of(of_odometry, repeats.odometry.is_frozen());
             finding(Subject::Odometry, kind, of_odometry, AXIS)
         }
@@ -211,11 +213,11 @@ fn isolate_fault(
 }
 
 /// Returns whether fixes show lateral motion beyond the tolerance.
-fn moves_laterally(seen: &Seen, means: &Means) -> bool {
+fn moves_laterally(residual: &FixResidual, means: &Means) -> bool {
     let wheels_m_s = means.wheels.linear_m_s;
-    let position_m_s = wheels_m_s + seen.forward_error_m_s;
+    let position_m_s = wheels_m_s + residual.forward_error_m_s;
     let (own_m_s, share, lever_m) = LEFT;
     let speed_m_s = position_m_s.abs().max(wheels_m_s.abs());
-    let slack = own_m_s + share * speed_m_s + lever_m * means.gyro_rad_s.abs() + seen.noise_m_s;
-    seen.left_error_m_s.abs() > slack
+    let slack = own_m_s + share * speed_m_s + lever_m * means.gyro_rad_s.abs() + residual.noise_m_s;
+    residual.left_error_m_s.abs() > slack
 }

@@ -11,32 +11,35 @@ const EXCITED_PLACE: f64 = 0.2;
 
 /// Records which channels agree; called only while nothing contradicts.
 pub(super) fn check(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) {
-    let standing = |subject: Subject| view.tracks[subject as usize].standing;
+    let active = |subject: Subject| view.tracks[subject as usize].active;
     let means = &recent.means;
     let (gyro, wheels) = (means.gyro_rad_s, means.wheels);
     let turns = gyro.abs() >= EXCITED && wheels.angular_rad_s.abs() >= EXCITED;
     let goes = wheels.linear_m_s.abs() >= EXCITED;
-    let has_fixes = view.seen().next().is_some();
+    let has_fixes = view.residuals().next().is_some();
     // A fault found at standstill is over if the channel agrees at standstill.
     let was_at_rest = |subject: Subject| {
-        standing(subject).is_some_and(|found| {
+        active(subject).is_some_and(|found| {
             found.kind == Kind::Inconsistent && found.predicted.abs() < EXCITED
         })
     };
     let was_frozen =
-        |subject: Subject| standing(subject).is_some_and(|found| found.kind == Kind::Frozen);
-    let (repeats, uses) = (view.repeats, &view.uses);
+        |subject: Subject| active(subject).is_some_and(|found| found.kind == Kind::Frozen);
+    let (repeats, channels) = (view.repeats, &view.channels);
     let gyro_lives = was_frozen(Subject::Gyro) && !repeats.gyro.is_frozen();
-    if uses.gyro && (turns || gyro_lives || was_at_rest(Subject::Gyro)) {
+    if channels.gyro && (turns || gyro_lives || was_at_rest(Subject::Gyro)) {
         verdicts.agree(Subject::Gyro);
     }
-    let obeys = Axis::Forward.obeys(wheels.linear_m_s, &recent.commanded)
-        && Axis::Turn.obeys(wheels.angular_rad_s, &recent.commanded);
+    let follows_command = Axis::Forward.follows_command(wheels.linear_m_s, &recent.commanded)
+        && Axis::Turn.follows_command(wheels.angular_rad_s, &recent.commanded);
     let wheels_live = was_frozen(Subject::Wheels) && !repeats.wheels.is_frozen();
-    if uses.wheels && obeys && (goes || turns || wheels_live || was_at_rest(Subject::Wheels)) {
+    if channels.wheels
+        && follows_command
+        && (goes || turns || wheels_live || was_at_rest(Subject::Wheels))
+    {
         verdicts.agree(Subject::Wheels);
     }
-    let position = standing(Subject::Position);
+    let position = active(Subject::Position);
     let has_jumped = position.is_some_and(|found| found.kind == Kind::Jumped);
     let position_lives = was_frozen(Subject::Position) && !repeats.position.is_frozen();
     // Motion of the kind in which the fault was found confirms the position; turning does not
@@ -57,7 +60,7 @@ pub(super) fn check(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) {
         verdicts.agree(Subject::Position);
     }
     let odometry_lives = was_frozen(Subject::Odometry) && !repeats.odometry.is_frozen();
-    if uses.odometry
+    if channels.odometry
         && means.odometry_m_s.is_some()
         && (goes || odometry_lives || was_at_rest(Subject::Odometry))
     {
@@ -69,8 +72,8 @@ pub(super) fn check(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) {
     verdicts.agree(Subject::WheelsAndMotion);
     // Standstill does not confirm a frozen source that still repeats. A source that repeats only
     // while the robot stands may be right; motion will show it immediately.
-    let is_heard = uses.position && view.seen.iter().any(Option::is_some);
-    if is_heard && view.stands {
+    let is_heard = channels.position && view.residuals.iter().any(Option::is_some);
+    if is_heard && view.is_standing {
         if !(was_frozen(Subject::Position) && repeats.position.is_repeating()) {
             verdicts.agree_at_rest(Subject::Position);
         }

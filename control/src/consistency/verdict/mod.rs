@@ -8,10 +8,10 @@ mod forward;
 mod healthy;
 mod position;
 mod turn;
+mod vote;
 mod wheels;
-mod witnesses;
 
-use super::fixes::{Jump, Seen};
+use super::fixes::{FixResidual, Jump};
 use super::history::{Commanded, History, Means, Span};
 use super::turn_gain::TurnGain;
 use super::{AllRepeats, Finding, Subject, Track};
@@ -23,8 +23,9 @@ use axis::{Axis, Tolerance};
 const RECENT_S: f64 = 0.3;
 /// Maximum delay from a command to its effect, seconds.
 const COMMAND_LAG_S: f64 = 0.3;
-/// Fraction of the fixes' noise by which one channel must be nearer to them than another.
-const WITNESS_NOISE_RATIO: f64 = 0.8;
+/// Fraction of the fixes' noise by which the wheels must be nearer to the fixes than the gyro is,
+/// to contradict the gyro.
+const NEARER_TO_FIXES_NOISE_RATIO: f64 = 0.8;
 /// Tolerated difference of two channels of the body's motion, in addition to noise.
 const BODY: Tolerance = Tolerance {
     own_rad_s: 0.02,
@@ -44,17 +45,17 @@ const RAISE_FROZEN_S: f64 = 0.1;
 /// Channels that are compared.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[expect(clippy::struct_excessive_bools, reason = "each is one channel")]
-pub(super) struct Uses {
+pub(super) struct Channels {
     gyro: bool,
     wheels: bool,
     odometry: bool,
     position: bool,
 }
 
-impl Uses {
-    /// Returns the channels that no finding names.
-    fn believed(tracks: &[Track]) -> Self {
-        let is_right = |subject: Subject| tracks[subject as usize].standing.is_none();
+impl Channels {
+    /// Returns the channels that no active finding names.
+    fn trusted(tracks: &[Track]) -> Self {
+        let is_right = |subject: Subject| tracks[subject as usize].active.is_none();
         Self {
             gyro: is_right(Subject::Gyro),
             wheels: is_right(Subject::Wheels),
@@ -87,34 +88,34 @@ impl Uses {
 pub(super) struct View<'a> {
     pub(super) model: &'a RobotModel,
     pub(super) history: &'a History,
-    pub(super) seen: &'a [Option<Seen>],
+    pub(super) residuals: &'a [Option<FixResidual>],
     pub(super) jump: Option<Jump>,
     pub(super) repeats: &'a AllRepeats,
     pub(super) tracks: &'a [Track],
     pub(super) turn_gain: TurnGain,
-    /// Whether the robot has stopped by command and wheels, and the fixes do not move.
-    pub(super) stands: bool,
-    pub(super) uses: Uses,
+    /// Whether the robot stands, by command, wheels and fixes.
+    pub(super) is_standing: bool,
+    pub(super) channels: Channels,
 }
 
 impl<'a> View<'a> {
-    /// Returns this view with the channels that no finding names.
-    pub(super) fn with_believed(self) -> Self {
-        let uses = Uses::believed(self.tracks);
-        Self { uses, ..self }
+    /// Returns this view with the channels that no active finding names.
+    pub(super) fn with_trusted(self) -> Self {
+        let channels = Channels::trusted(self.tracks);
+        Self { channels, ..self }
     }
 
     /// Returns the motion by fixes for each span, the shortest first; empty while fixes repeat.
-    fn seen(&self) -> impl Iterator<Item = &'a Seen> {
-        let is_used = self.uses.position && !self.repeats.position.is_repeating();
-        self.seen.iter().flatten().filter(move |_| is_used)
+    fn residuals(&self) -> impl Iterator<Item = &'a FixResidual> {
+        let is_used = self.channels.position && !self.repeats.position.is_repeating();
+        self.residuals.iter().flatten().filter(move |_| is_used)
     }
 
     /// Returns the range of commands for a span, including their delay.
-    fn commanded(&self, seen: &Seen) -> Commanded {
+    fn commanded(&self, residual: &FixResidual) -> Commanded {
         self.history.commanded(Span {
-            from_s: seen.from_s - COMMAND_LAG_S,
-            to_s: seen.to_s,
+            from_s: residual.from_s - COMMAND_LAG_S,
+            to_s: residual.to_s,
         })
     }
 
@@ -133,40 +134,47 @@ impl<'a> View<'a> {
     }
 }
 
-/// Results of one bin, by subject.
+/// Results of one bin, each indexed by [`Subject`].
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Verdicts {
-    against: [Option<(Finding, f64)>; Subject::ALL.len()],
+    /// New contradiction, and the seconds until it becomes a finding.
+    contradictions: [Option<(Finding, f64)>; Subject::ALL.len()],
     agrees: [bool; Subject::ALL.len()],
-    rests: [bool; Subject::ALL.len()],
-    still: [bool; Subject::ALL.len()],
+    /// Whether it agrees at standstill.
+    agrees_at_rest: [bool; Subject::ALL.len()],
+    /// Whether a subject with an active finding still contradicts.
+    still_contradicts: [bool; Subject::ALL.len()],
 }
 
 impl Verdicts {
+    /// Records a contradiction, which becomes a finding after `raise_s` seconds; the first one of a
+    /// subject in a bin counts.
     pub(super) fn contradict(&mut self, finding: Finding, raise_s: f64) {
-        self.against[finding.subject as usize].get_or_insert((finding, raise_s));
+        self.contradictions[finding.subject as usize].get_or_insert((finding, raise_s));
     }
 
+    /// Records that a subject is confirmed to be right.
     pub(super) fn agree(&mut self, subject: Subject) {
         self.agrees[subject as usize] = true;
     }
 
     fn agree_at_rest(&mut self, subject: Subject) {
-        self.rests[subject as usize] = true;
+        self.agrees_at_rest[subject as usize] = true;
     }
 
     /// Returns whether there is no contradiction.
     pub(super) fn is_consistent(&self) -> bool {
-        self.against.iter().all(Option::is_none)
+        self.contradictions.iter().all(Option::is_none)
     }
 
+    /// Returns the result of a subject; a contradiction precedes an agreement.
     pub(super) fn of(&self, subject: Subject) -> Verdict {
         let at = subject as usize;
-        match self.against[at] {
-            Some((finding, raise_s)) => Verdict::Against(finding, raise_s),
-            None if self.still[at] => Verdict::StillAgainst,
+        match self.contradictions[at] {
+            Some((finding, raise_s)) => Verdict::Contradicts(finding, raise_s),
+            None if self.still_contradicts[at] => Verdict::StillContradicts,
             None if self.agrees[at] => Verdict::Agrees,
-            None if self.rests[at] => Verdict::AgreesAtRest,
+            None if self.agrees_at_rest[at] => Verdict::AgreesAtRest,
             None => Verdict::Nothing,
         }
     }
@@ -175,10 +183,10 @@ impl Verdicts {
 /// Result for one subject in one bin.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Verdict {
-    /// It contradicts; the finding becomes active after the given number of seconds.
-    Against(Finding, f64),
+    /// It contradicts; the finding becomes active once that has lasted the given number of seconds.
+    Contradicts(Finding, f64),
     /// It contradicts, and a finding is active already.
-    StillAgainst,
+    StillContradicts,
     /// It is confirmed to be right.
     Agrees,
     /// It agrees with a stopped robot.
@@ -191,20 +199,25 @@ impl Verdict {
     /// Returns this result with a duration of 0 until the finding becomes active.
     pub(super) fn at_once(self) -> Self {
         match self {
-            Self::Against(finding, _) => Self::Against(finding, 0.0),
-            Self::StillAgainst | Self::Agrees | Self::AgreesAtRest | Self::Nothing => self,
+            Self::Contradicts(finding, _) => Self::Contradicts(finding, 0.0),
+            Self::StillContradicts | Self::Agrees | Self::AgreesAtRest | Self::Nothing => self,
         }
     }
 }
 
+/// Fast channels over the last [`RECENT_S`].
 struct Recent {
     means: Means,
+    /// Change of the wheels' turn rate between the two halves of the span, rad/s, ≥ 0.
     turn_change: f64,
+    /// Change of the wheels' forward speed between the two halves of the span, m/s, ≥ 0.
     forward_change: f64,
+    /// Range of the commands that may act in the span.
     commanded: Commanded,
 }
 
 impl Recent {
+    /// Returns None if the history does not reach back.
     fn of(view: &View<'_>) -> Option<Self> {
         let now_s = view.history.now().at_s;
         let middle_s = now_s - 0.5 * RECENT_S;
@@ -235,35 +248,35 @@ impl Recent {
 }
 
 /// Compares all channels, then each one that a finding names.
-pub(super) fn judge(view: &View<'_>, verdicts: &mut Verdicts) {
+pub(super) fn evaluate(view: &View<'_>, verdicts: &mut Verdicts) {
     let Some(recent) = Recent::of(view) else {
         return;
     };
     compare(view, &recent, verdicts);
     for subject in Subject::ALL {
-        let Some(uses) = view.uses.with(subject) else {
+        let Some(channels) = view.channels.with(subject) else {
             continue;
         };
         let mut own = Verdicts::default();
-        let view = View { uses, ..*view };
+        let view = View { channels, ..*view };
         compare(&view, &recent, &mut own);
         if own.is_consistent() {
             verdicts.agrees[subject as usize] = own.agrees[subject as usize];
-            verdicts.rests[subject as usize] = own.rests[subject as usize];
+            verdicts.agrees_at_rest[subject as usize] = own.agrees_at_rest[subject as usize];
         } else {
-            verdicts.still[subject as usize] = true;
+            verdicts.still_contradicts[subject as usize] = true;
         }
     }
 }
 
 /// Compares the channels in use.
 fn compare(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) {
-    if view.uses.position {
+    if view.channels.position {
         position::jumped(view, verdicts);
         position::frozen(view, recent, verdicts);
     }
     wheels::frozen_base(view, recent, verdicts);
-    if view.uses.wheels {
+    if view.channels.wheels {
         wheels::locked(view, verdicts);
     }
     let is_turn_clean = turn::check(view, recent, verdicts);

@@ -10,6 +10,7 @@ const FROZEN_PATH: (f64, f64) = (0.08, 0.12);
 /// Maximum time over which distance and turn are taken, seconds.
 const FROZEN_SPAN_MAX_S: f64 = 2.0;
 
+/// Records a jump of the fixes.
 pub(super) fn jumped(view: &View<'_>, verdicts: &mut Verdicts) {
     let Some(jump) = view.jump else {
         return;
@@ -47,14 +48,14 @@ pub(super) fn frozen(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) 
     };
     let path_m = means.wheels.linear_m_s.abs() * span_s;
     let turn_rad = means.gyro_rad_s.abs() * span_s;
-    let odometry_m_s = means.odometry_m_s.filter(|_| view.uses.odometry);
+    let odometry_m_s = means.odometry_m_s.filter(|_| view.channels.odometry);
     let odometry_stands = odometry_m_s.is_some_and(|forward_m_s| {
         !view.repeats.odometry.is_frozen()
             && forward_m_s.abs() < 0.25 * means.wheels.linear_m_s.abs()
     });
-    let moves = view.uses.wheels && path_m >= FROZEN_PATH.0 && !odometry_stands;
+    let moves = view.channels.wheels && path_m >= FROZEN_PATH.0 && !odometry_stands;
     // A gyro that is frozen too is no evidence.
-    let turns = view.uses.gyro
+    let turns = view.channels.gyro
         && turn_rad >= FROZEN_PATH.1
         && !view.repeats.gyro.is_frozen()
         && recent.means.gyro_rad_s * recent.means.wheels.angular_rad_s > 0.0;

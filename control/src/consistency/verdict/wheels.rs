@@ -15,7 +15,7 @@ pub(super) const WHEELS: Tolerance = Tolerance {
     forward_share: 0.16,
 };
 /// Tolerated difference where the command, or another channel of the body, also indicates a fault.
-pub(super) const WITNESSED: Tolerance = Tolerance {
+pub(super) const CORROBORATED: Tolerance = Tolerance {
     own_rad_s: 0.06,
     own_m_s: 0.05,
     share_turn: 0.15,
@@ -54,14 +54,14 @@ const RAISE_REPEATING_S: f64 = 0.5;
 /// Detects a base whose wheels and gyro both repeat while the wheels are commanded otherwise. A
 /// gyro with noise does not repeat.
 pub(super) fn frozen_base(view: &View<'_>, recent: &Recent, verdicts: &mut Verdicts) {
-    let are_used = view.uses.wheels && view.uses.gyro;
+    let are_used = view.channels.wheels && view.channels.gyro;
     if !(are_used && view.repeats.wheels.is_frozen() && view.repeats.gyro.is_frozen()) {
         return;
     }
     for axis in [Axis::Forward, Axis::Turn] {
         let wheels = axis.of(recent.means.wheels);
         let commanded = &recent.commanded;
-        if !axis.obeys(wheels, commanded) {
+        if !axis.follows_command(wheels, commanded) {
             let (least, most) = (axis.of(commanded.least), axis.of(commanded.most));
             let predicted = if wheels < least { least } else { most };
             let comparison = Comparison {
@@ -85,10 +85,10 @@ pub(super) fn slack(
     commanded: &Commanded,
 ) -> (f64, f64) {
     let Rates { wheels, body } = rates;
-    if axis.is_above(rates, commanded) {
+    if axis.exceeds_command(rates, commanded) {
         (axis.slack(ABOVE, wheels, body), ABOVE_NOISE_RATIO)
-    } else if axis.is_of_sensor(rates, commanded) || is_held(view, axis) {
-        (axis.slack(WITNESSED, wheels, body), SENSOR_NOISE_RATIO)
+    } else if axis.is_sensor_fault(rates, commanded) || is_held(view, axis) {
+        (axis.slack(CORROBORATED, wheels, body), SENSOR_NOISE_RATIO)
     } else {
         (axis.slack(WHEELS, wheels, body), 1.0)
     }
@@ -126,8 +126,8 @@ fn sensor_raise_s(view: &View<'_>) -> f64 {
     }
 }
 
-/// Records wheels that contradict the body as a faulty sensor or as slip.
-pub(super) fn against_body(
+/// Records a contradiction of wheels and body: a faulty sensor of the wheels, or slip.
+pub(super) fn record_contradiction(
     view: &View<'_>,
     rates: Rates,
     commanded: &Commanded,
@@ -145,8 +145,8 @@ pub(super) fn against_body(
             .is_some_and(|recent| view.is_saturated(recent.wheels, commanded));
     let comparison = rates.of_wheels();
     let kind = kind_of(comparison, is_frozen);
-    let is_of_sensor = axis.is_of_sensor(rates, commanded) && !is_saturated;
-    if is_of_sensor || is_held(view, axis) {
+    let is_sensor_fault = axis.is_sensor_fault(rates, commanded) && !is_saturated;
+    if is_sensor_fault || is_held(view, axis) {
         let found = finding(Subject::Wheels, kind, comparison, axis);
         verdicts.contradict(found, sensor_raise_s(view));
     } else {
@@ -203,7 +203,7 @@ pub(super) fn locked(view: &View<'_>, verdicts: &mut Verdicts) {
         let is_commanded = commanded.abs() >= least_rad_s;
         let other_goes =
             other.1.abs() < least_rad_s || other.0 * other.1.signum() >= goes * other.1.abs();
-        let is_shown = other_goes && view.uses.gyro && !view.repeats.gyro.is_frozen();
+        let is_shown = other_goes && view.channels.gyro && !view.repeats.gyro.is_frozen();
         if is_commanded && is_shown && measured.abs() <= stands * commanded.abs() {
             let lever_m = if subject == Subject::LeftWheels {
                 -model.effective_track_m()
@@ -212,7 +212,7 @@ pub(super) fn locked(view: &View<'_>, verdicts: &mut Verdicts) {
             };
             let by_wheels = means.wheels.angular_rad_s;
             let missing = (commanded - measured) * model.wheel_radius_m() / lever_m;
-            let (off_wheels, off_command) = (
+            let (wheels_distance, command_distance) = (
                 (means.gyro_rad_s - by_wheels).abs(),
                 (means.gyro_rad_s - by_wheels - missing).abs(),
             );
@@ -223,9 +223,9 @@ pub(super) fn locked(view: &View<'_>, verdicts: &mut Verdicts) {
                 predicted: commanded,
                 unit: Unit::RadiansPerSecond,
             };
-            if off_wheels < NEARER * off_command {
+            if wheels_distance < NEARER * command_distance {
                 verdicts.contradict(finding, RAISE_LOCKED_S);
-            } else if off_command < NEARER * off_wheels {
+            } else if command_distance < NEARER * wheels_distance {
                 let is_frozen = view.repeats.wheels.is_frozen();
                 let found = Finding {
                     subject: Subject::Wheels,

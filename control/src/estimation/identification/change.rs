@@ -16,14 +16,15 @@ use crate::robot::RobotModel;
 /// Differences of ln K of the other grounds.
 const OFFSETS: [f64; 2] = [-1.0, 1.0];
 /// Threshold h of the CUSUM, without and with measured torque, and its drift k: squares of standard
-/// deviations. Without torque less is known of the robot, so that what the model misses lasts longer.
+/// deviations. Without torque the robot's parameters are less certain, and residuals by errors of
+/// the model last longer.
 const THRESHOLDS: [f64; 2] = [220.0, 125.0];
 const DRIFT: f64 = 2.0;
 /// Limit of one channel's squared standardised residual.
 const SQUARE_MAX: f64 = 25.0;
 /// Limit of what one comparison adds: a jerk in all channels is no change of the ground.
 const GAIN_MAX: f64 = 25.0;
-/// Number of comparisons that are ignored after the robot stood: one second.
+/// Number of comparisons that are ignored after standstill: one second.
 const STARTS_FOR: u32 = 20;
 /// Number of comparisons that are ignored after one side was slow.
 const RESUMES_FOR: u32 = 12;
@@ -37,13 +38,13 @@ const TORQUES_FROM: usize = 3;
 /// A measurement of one channel, with the output of the best hypothesis and the standard deviation
 /// of their difference, in the channel's unit.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Explained {
+pub(super) struct ChannelComparison {
     pub(super) measured: f64,
     pub(super) output: f64,
     pub(super) std_dev: f64,
 }
 
-impl Explained {
+impl ChannelComparison {
     /// Returns the limited squared residual of an output.
     fn square(&self, output: f64) -> f64 {
         let residual = (self.measured - output) / self.std_dev;
@@ -51,7 +52,7 @@ impl Explained {
     }
 }
 
-/// The robot on another ground.
+/// The robot simulated on another ground, with the CUSUM of the evidence for that ground.
 #[derive(Debug, Clone, PartialEq)]
 struct OtherGround {
     robot: Robot<f64>,
@@ -70,7 +71,7 @@ pub(super) enum Motion {
     Standing,
 }
 
-/// State of the detector. It detects nothing before [`ChangeMonitor::follow`].
+/// State of the detector. It detects nothing before [`ChangeMonitor::set_best`].
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct ChangeMonitor {
     others: Option<[OtherGround; OFFSETS.len()]>,
@@ -97,9 +98,9 @@ impl Default for ChangeMonitor {
 }
 
 impl ChangeMonitor {
-    /// Takes the parameters of the best hypothesis, in the units of [`index`]. The first call begins
-    /// with the robots in the motion `state`.
-    pub(super) fn follow(&mut self, values: &Values, model: &RobotModel, state: State<f64>) {
+    /// Sets the parameters of the best hypothesis, in the units of [`index`]. The first call starts
+    /// the robots on the other grounds in the motion `state`.
+    pub(super) fn set_best(&mut self, values: &Values, model: &RobotModel, state: State<f64>) {
         let robot = |offset: f64| {
             let mut values = *values;
             values[index::STIFFNESS] += offset;
@@ -126,8 +127,8 @@ impl ChangeMonitor {
         }
     }
 
-    /// Takes the motion during a comparison. Returns whether the comparison counts. Evidence is kept
-    /// while one side is slow for a short time, and is dropped at standstill.
+    /// Records the motion during a comparison. Returns whether the comparison counts. Evidence is
+    /// kept while one side is slow for a short time, and is dropped at standstill.
     fn record(&mut self, motion: Motion) -> bool {
         if motion == Motion::Rolling {
             if std::mem::take(&mut self.slow) > 0 {
@@ -147,18 +148,18 @@ impl ChangeMonitor {
         false
     }
 
-    /// Adds one comparison of the means over `compared_s` seconds, since the last call. While the robot
-    /// does not roll there is no evidence.
+    /// Adds one comparison of the means over `compared_s` seconds, since the last call. While the
+    /// robot does not roll there is no evidence.
     ///
     /// Returns whether the ground has changed; after an alarm the detector is reset.
     pub(super) fn compare(
         &mut self,
-        explained: &[Option<Explained>; COMPARED],
+        compared: &[Option<ChannelComparison>; COMPARED],
         compared_s: f64,
         motion: Motion,
     ) -> bool {
         let counts = self.record(motion);
-        self.has_torque |= explained[TORQUES_FROM..].iter().any(Option::is_some);
+        self.has_torque |= compared[TORQUES_FROM..].iter().any(Option::is_some);
         let threshold = THRESHOLDS[usize::from(self.has_torque)];
         let mut has_changed = false;
         for other in self.others.iter_mut().flatten() {
@@ -167,9 +168,9 @@ impl ChangeMonitor {
             if !counts {
                 continue;
             }
-            let gains = explained.iter().zip(outputs).map(|(explained, output)| {
-                explained.map_or(0.0, |explained| {
-                    explained.square(explained.output) - explained.square(output)
+            let gains = compared.iter().zip(outputs).map(|(compared, output)| {
+                compared.map_or(0.0, |compared| {
+                    compared.square(compared.output) - compared.square(output)
                 })
             });
             let gain: f64 = gains.sum();
@@ -227,7 +228,7 @@ mod tests {
             values[index::STIFFNESS] = 3.0_f64.ln();
             let state = State::rolling(Twist::default());
             let mut monitor = ChangeMonitor::default();
-            monitor.follow(&values, &model, state);
+            monitor.set_best(&values, &model, state);
             Self {
                 model,
                 values,
@@ -239,8 +240,8 @@ mod tests {
             }
         }
 
-        /// Drives one comparison on ground of a stiffness, with `scaled` torques. Returns whether the
-        /// monitor raises an alarm.
+        /// Drives one comparison on ground of a stiffness, with `scaled` torques. Returns whether
+        /// the monitor raises an alarm.
         fn compare(&mut self, stiffness: f64, scaled: f64, motion: Motion) -> bool {
             let mut values = self.values;
             let believed = robot_of(&values, &self.model);
@@ -265,16 +266,16 @@ mod tests {
             }
             let truth = self.robot.take_outputs(COMPARED_S).means;
             let outputs = self.believed.take_outputs(COMPARED_S).means;
-            let explained = std::array::from_fn(|channel| {
+            let compared = std::array::from_fn(|channel| {
                 let of_12 = (0..12).map(|_| self.random.random::<f64>() - 0.5);
                 let factor = if channel > 2 { scaled } else { 1.0 };
-                Some(Explained {
+                Some(ChannelComparison {
                     measured: factor * truth[channel] + STD_DEVS[channel] * of_12.sum::<f64>(),
                     output: outputs[channel],
                     std_dev: STD_DEVS[channel],
                 })
             });
-            self.monitor.compare(&explained, COMPARED_S, motion)
+            self.monitor.compare(&compared, COMPARED_S, motion)
         }
     }
 

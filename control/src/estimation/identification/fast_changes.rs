@@ -1,15 +1,17 @@
-//! Which part of the fast changes of an output is noise of the wheel speeds.
+//! Estimates which part of the fast changes of an output is noise of the wheel speeds.
 //!
-//! The model is driven by the measured wheel speeds, and its accelerations y follow their fast changes
-//! whether these are true motion or noise. The accelerometer m feels true motion alone. Where the
-//! model has the right parameters, `y = y₀ + e` and `m = y₀ + s`, with the error e that noise of the
-//! wheel speeds causes and the noise s of the accelerometer, which are independent. So the mean of
-//! `(y − m) y` is the variance of e, whatever the variance of s is (the reliability ratio of
-//! regressions with errors in the variables: Fuller, Measurement Error Models, 1987, ch. 1).
+//! The model is driven by the measured wheel speeds, and its accelerations y follow their fast
+//! changes whether these are true motion or noise. The accelerometer m measures true motion alone.
+//! Where the model has the right parameters, `y = y₀ + e` and `m = y₀ + s`, with the error e that
+//! noise of the wheel speeds causes and the noise s of the accelerometer, which are independent. So
+//! the mean of `(y − m) y` is the variance of e, whatever the variance of s is (the reliability
+//! ratio of regressions with errors in the variables: Fuller, Measurement Error Models, 1987, ch.
+//! 1).
 //!
-//! Third differences of successive means are taken, which pass next to nothing of a manoeuvre, and most
-//! of what is near the resonance of the contacts, 5 to 10 Hz. An accelerometer that is late by 30 ms or
-//! more, or filtered below 5 Hz, does not feel such motion at its time, so that it counts as noise.
+//! Third differences of successive means are taken, which pass next to nothing of a manoeuvre, and
+//! most of what is near the resonance of the contacts, 5 to 10 Hz. An accelerometer that is late by
+//! 30 ms or more, or filtered below 5 Hz, does not measure such motion at the same time, so that
+//! the motion counts as noise.
 
 use super::recent::RecentBlocks;
 
@@ -18,16 +20,16 @@ const THIRD: [f64; 4] = [-1.0, 3.0, -3.0, 1.0];
 const THIRD_SQUARE: f64 = 20.0;
 /// Accelerations: forward and to the left.
 const ACCELERATIONS: usize = 2;
-/// Share of noise in the output's fast changes from which it is taken into account. Wrong parameters
-/// of the model look like noise of a smaller share once they have settled.
+/// Share of noise in the output's fast changes from which noise is taken into account. Wrong
+/// parameters of the model look like noise of a smaller share once they have settled.
 const SHARE_MIN: f64 = 0.6;
-/// Standard errors by which the noise must exceed that share: the accelerometer's own noise and bumps
-/// make the share of few blocks uncertain where the wheels are smooth.
+/// Standard errors by which the noise must exceed that share: the accelerometer's own noise and
+/// bumps make the share of few blocks uncertain where the wheels are smooth.
 const SIGNIFICANT: f64 = 3.0;
-/// Variance of the output's error, relative to the assumed one of the residual, from which the noise is
-/// taken into account.
+/// Variance of the output's error, relative to the assumed one of the residual, from which the
+/// noise is taken into account.
 const VARIANCE_MIN: f64 = 0.004;
-/// Minimum number of blocks before it is.
+/// Minimum number of blocks before noise is taken into account.
 const BLOCKS_MIN: usize = 6;
 /// Minimum number of products in a block that counts.
 const PRODUCTS_MIN: f64 = 10.0;
@@ -42,11 +44,11 @@ pub(super) struct FastChanges {
     newest: [Newest; ACCELERATIONS],
     /// Number of values of each acceleration since the last gap, as far as it matters.
     known: [usize; ACCELERATIONS],
-    /// Sums over the open block of `(y − m) y`, of the square of what the added noise adds, and of what
-    /// the first one exceeds the share [`SHARE_MIN`] of y² by; and their number.
+    /// Sums over the open block of `(y − m) y`, of the square of what the added noise adds, and of
+    /// `(y − m) y − s y²` with s = [`SHARE_MIN`]; and number of terms.
     open: [f64; 3],
     count: f64,
-    /// Means of the blocks.
+    /// Means of these three over each of the last blocks.
     error: RecentBlocks,
     added: RecentBlocks,
     excess: RecentBlocks,
@@ -66,8 +68,8 @@ impl FastChanges {
         }
     }
 
-    /// Adds the next values of an acceleration: measured, output, and what the added noise changes,
-    /// each over the assumed standard deviation of the residual.
+    /// Adds the next values of an acceleration: measured, output, and change of the output by the
+    /// added noise, each over the assumed standard deviation of the residual.
     pub(super) fn add(&mut self, acceleration: usize, values: [f64; 3]) {
         let newest = &mut self.newest[acceleration];
         for (values, value) in newest.iter_mut().zip(values) {
@@ -91,7 +93,7 @@ impl FastChanges {
         self.count += 1.0;
     }
 
-    /// Ends the open block; one with few values counts for nothing.
+    /// Ends the open block; one with fewer than [`PRODUCTS_MIN`] products is not used.
     pub(super) fn end_block(&mut self) {
         if self.count >= PRODUCTS_MIN {
             let [error, added, excess] = self.open.map(|sum| sum / self.count);
@@ -110,7 +112,7 @@ impl FastChanges {
         self.count = 0.0;
     }
 
-    /// Forgets all blocks, whose outputs were those of other parameters.
+    /// Deletes all blocks, whose outputs were those of other parameters.
     pub(super) fn clear(&mut self) {
         let newest = self.newest;
         *self = Self {
@@ -132,8 +134,8 @@ impl FastChanges {
         self.excess.count() >= BLOCKS_MIN && is_large && is_most
     }
 
-    /// Returns the standard deviation of the output's noise over that of the added noise, 0 to 1; of the
-    /// open block before the first one, and 0 before that.
+    /// Returns the standard deviation of the output's noise over that of the added noise, 0 to 1;
+    /// of the open block before the first one, and 0 before that.
     pub(super) fn noise_ratio(&self) -> f64 {
         let [error, added, _] = self.open;
         let error = self.error.median().unwrap_or(error);
@@ -153,8 +155,8 @@ mod tests {
 
     use super::*;
 
-    /// Sixty seconds of outputs whose noise and true fast motion have these standard deviations, of an
-    /// accelerometer with noise of 0.5, and of added noise with twice the standard deviation.
+    /// Sixty seconds of outputs whose noise and true fast motion have these standard deviations, of
+    /// an accelerometer with noise of 0.5, and of added noise with twice the standard deviation.
     fn after(noise: f64, motion: f64) -> FastChanges {
         after_seed(noise, motion, 9)
     }

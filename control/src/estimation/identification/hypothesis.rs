@@ -10,12 +10,12 @@
 //! exp(−3 Δ² / (R² + σ²/2))      R = LINEAR_RANGE, σ² = variance of ln K before the step
 //! ```
 //!
-//! R is the range in which the expansion is accurate. σ belongs beside it: the truth is expected at
-//! the squared distance `σ² + Δ²` from `p_b`, and at σ² from the new values. As long as Δ is below σ,
-//! the old expansion is nearly as close to the truth as a new one, and to forget it loses its
-//! information for nothing. With R alone an estimate with little information, as on tyres that slide
-//! most of the time, never gets more: each block moves it by more than R, which deletes all earlier
-//! blocks, so that the next one moves it as far.
+//! R is the range in which the expansion is accurate. σ is added because the true ln K is expected
+//! at the squared distance `σ² + Δ²` from `p_b`, and at σ² from the new value. As long as Δ is
+//! below σ, the old expansion is nearly as close to the truth as a new one, and its information is
+//! worth keeping. With R alone an estimate with little information, as on tyres that slide most of
+//! the time, would never converge: each block would move it by more than R, which would delete all
+//! earlier blocks, and so would the next one.
 //!
 //! With `C = (Σ Jᵀ W J + prior information)⁻¹` the covariance is the
 //! robust one, `C (Σ g gᵀ + prior information) C`: the empirical scatter of the blocks' scores
@@ -24,7 +24,7 @@
 use super::fast_changes::FastChanges;
 use super::model::{CHANNELS, Input, State};
 use super::parameters::{Number, Prior, Robot, Values, index};
-use super::scale::{Compared, Residual, Scale, ln_stiffness_gradient};
+use super::scale::{ChannelResidual, Residual, TimeScale, ln_stiffness_gradient};
 use super::simulation::{Predicted, Simulation, delays_s};
 use crate::robot::RobotModel;
 
@@ -32,33 +32,34 @@ use crate::robot::RobotModel;
 const SCALES: [u32; 3] = [1, 4, 10];
 /// Channels of the accelerations.
 const ACCELERATIONS: std::ops::RangeInclusive<usize> = 1..=2;
-/// Change of a well-known ln K that makes older linearisations count e⁻³ times as much.
+/// R, the change of a precisely known ln K that multiplies the weights of older blocks by e⁻³.
 const LINEAR_RANGE: f64 = 0.1;
-/// Number of blocks in which a starting value may move to the true one; noise of the wheel speeds moves
-/// it later as well.
-const SETTLES_BLOCKS: u32 = 6;
-/// Fraction of the variance of ln K that is added to the square of that range. With all of it, noise
-/// of the wheel speeds that the first expansions took for slip is kept as well.
-const DOUBT_SHARE: f64 = 0.5;
-/// Factors of the blocks' weights below which the variance of ln K is computed again, and the number of
-/// blocks in which the first one applies. A new expansion within the linear range of the last one says
-/// nearly the same, and the next block adds what is missing; the first expansions can be far from each
-/// other, and what is left of them says little about the truth.
-const KEPT_NEARLY_ALL: f64 = 0.9;
-const KEPT_LITTLE: f64 = 0.01;
+/// Number of blocks in which a large step of ln K is that of a starting value to the true one;
+/// later ones are due to noise of the wheel speeds.
+const SETTLING_BLOCKS: u32 = 6;
+/// Fraction of the variance σ² that is added to R². With all of it, first expansions would be kept
+/// that took noise of the wheel speeds for slip.
+const VARIANCE_SHARE: f64 = 0.5;
+/// Factors of the blocks' weights below which the variance of ln K is computed again, and the
+/// number of blocks in which the first one applies. Later expansions are close to each other, so
+/// that the variance hardly changes and can wait for the next block; the first ones can be far
+/// apart.
+const REFRESH_BELOW_EARLY: f64 = 0.9;
+const REFRESH_BELOW: f64 = 0.01;
 const CONVERGES_BLOCKS: u32 = 15;
-/// Minimum factor by which the last block changed the weights of the others for these to be restored.
-const KEPT_MIN: f64 = 1.0e-3;
+/// Factor of the last step on the weights of the blocks, from which the former weights can be
+/// restored.
+const RESTORE_ABOVE: f64 = 1.0e-3;
 /// Maximum magnitude of the change of ln K at the end of one block.
 const STEP_MAX: f64 = 0.4;
 /// Maximum squared standardised residual in the cost.
 const COST_MAX: f64 = 25.0;
 /// Factor by which each later block multiplies the cost so far.
-const COST_KEEPS: f64 = 0.95;
+const COST_DECAY: f64 = 0.95;
 
 /// Estimate of ln K from one segment, and the two parts of its variance.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct OfSegment {
+pub(super) struct SegmentEstimate {
     /// Estimate of ln K.
     pub(super) ln_stiffness: f64,
     /// Variance of ln K from the measurement noise of the segment's own blocks; independent between
@@ -107,19 +108,19 @@ pub(super) struct Hypothesis {
     /// The same with noise added to the wheel speeds; None if they have none.
     perturbed: Option<Simulation<Number>>,
     /// The normal equations at each time scale, and the one that is used.
-    scales: [Scale; SCALES.len()],
+    scales: [TimeScale; SCALES.len()],
     used: usize,
-    /// Fast changes of the accelerations: what is measured, the output, and what the added noise adds.
+    /// Fast changes of the accelerations: measured, in the output, and by the added noise.
     fast: FastChanges,
     cost: f64,
-    /// Factor by which the step after the last block changed the weights of all blocks.
-    last_kept: f64,
+    /// Factor by which the step after the last block multiplied the weights of all blocks.
+    last_weight_factor: f64,
     /// Variance of ln K with the weights that the blocks had before that step.
     variance_before_step: f64,
     /// Number of complete blocks.
     age: u32,
-    /// Whether the last normal equations could be solved at any time scale: otherwise noise hides
-    /// what the measurements tell.
+    /// Whether the last normal equations had a solution at a time scale that the next longer one
+    /// confirms; otherwise noise of the wheel speeds dominates the measurements.
     is_determined: bool,
 }
 
@@ -133,12 +134,12 @@ impl Hypothesis {
             robot: None,
             model: Simulation::new(state.constants()),
             perturbed: None,
-            scales: SCALES.map(Scale::new),
+            scales: SCALES.map(TimeScale::new),
             used: 0,
             fast: FastChanges::new(),
             is_determined: true,
             cost: 0.0,
-            last_kept: 1.0,
+            last_weight_factor: 1.0,
             variance_before_step: f64::INFINITY,
             age: 0,
         }
@@ -165,10 +166,10 @@ impl Hypothesis {
     /// Drops the measurements of the open block.
     pub(super) fn drop_block(&mut self) {
         self.fast.drop_block();
-        self.scales.iter_mut().for_each(Scale::drop_block);
+        self.scales.iter_mut().for_each(TimeScale::drop_block);
     }
 
-    fn scale(&self) -> &Scale {
+    fn scale(&self) -> &TimeScale {
         &self.scales[self.used]
     }
 
@@ -193,10 +194,10 @@ impl Hypothesis {
         self.age
     }
 
-    /// Returns the factor by which the last step changed the weights of all blocks.
+    /// Returns the factor by which the last step multiplied the weights of all blocks.
     #[cfg(test)]
-    pub(super) fn kept(&self) -> f64 {
-        self.last_kept
+    pub(super) fn weight_factor(&self) -> f64 {
+        self.last_weight_factor
     }
 
     /// Returns the largest of the channels' mean squares of standardised residuals; about 1 if
@@ -283,7 +284,7 @@ impl Hypothesis {
             noise.slopes = (perturbed.slopes - residual.slopes) * ratio;
             self.cost -= ratio * ratio * off;
         }
-        let compared = Compared {
+        let compared = ChannelResidual {
             residual,
             noise,
             std_dev,
@@ -297,22 +298,22 @@ impl Hypothesis {
 
     /// Ends a comparison of the means since the last call.
     pub(super) fn end_comparison(&mut self) {
-        self.scales.iter_mut().for_each(Scale::end_comparison);
+        self.scales.iter_mut().for_each(TimeScale::end_comparison);
     }
 
     /// Ends the open block and takes a bounded Gauss–Newton step from all blocks of the ground and
     /// the prior. Returns false if a parameter is not finite.
     pub(super) fn end_block(&mut self, prior: &Prior) -> bool {
         let values = self.values;
-        self.last_kept = 1.0;
+        self.last_weight_factor = 1.0;
         self.fast.end_block();
         self.scales
             .iter_mut()
             .for_each(|scale| scale.end_block(&values));
         self.age = self.age.saturating_add(1);
-        self.cost *= COST_KEEPS;
+        self.cost *= COST_DECAY;
         let Some(wanted) = self.solve(prior) else {
-            // It goes on from the same values until the measurements tell more.
+            // The same values are used until the equations can be solved.
             return true;
         };
         let mut step = wanted - self.values;
@@ -328,22 +329,22 @@ impl Hypothesis {
         for own in std::iter::once(&mut self.model).chain(&mut self.perturbed) {
             own.shift(&step);
         }
-        let range_square = LINEAR_RANGE.powi(2) + DOUBT_SHARE * self.scale().nominal_variance();
-        let keeps = (-3.0 * step[index::STIFFNESS].powi(2) / range_square).exp();
+        let range_square = LINEAR_RANGE.powi(2) + VARIANCE_SHARE * self.scale().nominal_variance();
+        let weight_factor = (-3.0 * step[index::STIFFNESS].powi(2) / range_square).exp();
         self.variance_before_step = self.variances(prior).0;
         for scale in &mut self.scales {
-            scale.weaken(keeps);
+            scale.scale_weights(weight_factor);
         }
         let limit = if self.age <= CONVERGES_BLOCKS {
-            KEPT_NEARLY_ALL
+            REFRESH_BELOW_EARLY
         } else {
-            KEPT_LITTLE
+            REFRESH_BELOW
         };
-        if keeps < limit {
+        if weight_factor < limit {
             self.scales[self.used].update_variances(prior);
         }
-        self.last_kept = keeps;
-        if self.age <= SETTLES_BLOCKS && step[index::STIFFNESS].abs() > LINEAR_RANGE {
+        self.last_weight_factor = weight_factor;
+        if self.age <= SETTLING_BLOCKS && step[index::STIFFNESS].abs() > LINEAR_RANGE {
             self.fast.clear();
         }
         self.values.iter().all(|value| value.is_finite())
@@ -368,13 +369,14 @@ impl Hypothesis {
         solutions[self.used]
     }
 
-    /// Returns whether the measurements tell more than noise of the wheel speeds would.
+    /// Returns whether the last solution can be trusted: that of one time scale agrees with that of
+    /// the next longer one.
     pub(super) fn is_determined(&self) -> bool {
         self.is_determined
     }
 
-    /// Returns whether fast changes of the output are for the most part none that the accelerometer
-    /// feels: noise of the wheel speeds.
+    /// Returns whether most of the output's fast changes are noise of the wheel speeds, which the
+    /// accelerometer does not measure.
     pub(super) fn is_noisy(&self) -> bool {
         self.fast.is_noise()
     }
@@ -385,9 +387,9 @@ impl Hypothesis {
         self.scale().variances(prior)
     }
 
-    /// Returns the variance of ln K before the step at the end of the last block, infinite before the
-    /// first one. A block of new ground makes a step that leaves little of the blocks before, and what
-    /// was known of the old ground is what the new one is noticed by.
+    /// Returns the variance of ln K before the step at the end of the last block, infinite before
+    /// the first one. The detection of changes needs it: the step by a block of new ground deletes
+    /// most information on the old one.
     pub(super) fn variance_before_step(&self) -> f64 {
         self.variance_before_step
     }
@@ -410,18 +412,18 @@ impl Hypothesis {
         }))
     }
 
-    /// Drops the last block and the open one, which may contain samples of two grounds, and takes the
-    /// parameters from the others with their former weights: those that the last block led to may have
-    /// followed the next ground.
+    /// Drops the last block and the open one, which may contain samples of two grounds, and takes
+    /// the parameters from the other blocks with their former weights, because those after the last
+    /// block may be of the next ground.
     pub(super) fn drop_last_block(&mut self, prior: &Prior) {
-        self.scales.iter_mut().for_each(Scale::drop_last_block);
+        self.scales.iter_mut().for_each(TimeScale::drop_last_block);
         self.drop_block();
-        if self.last_kept >= KEPT_MIN {
-            let restored = self.last_kept.recip();
+        if self.last_weight_factor >= RESTORE_ABOVE {
+            let restored = self.last_weight_factor.recip();
             self.scales
                 .iter_mut()
-                .for_each(|scale| scale.weaken(restored));
-            self.last_kept = 1.0;
+                .for_each(|scale| scale.scale_weights(restored));
+            self.last_weight_factor = 1.0;
         }
         if let Some(values) = self.solve(prior) {
             self.set_values(prior.in_range(values));
@@ -433,8 +435,8 @@ impl Hypothesis {
     /// The ground's other blocks and the prior contribute the other parameters only: ln K is
     /// marginalised from them. So K may differ between segments, and the segments' own errors are
     /// independent. None if the segment has no blocks, or its normal equations cannot be solved.
-    pub(super) fn close_segment(&mut self, prior: &Prior) -> Option<OfSegment> {
-        let segments = self.scales.each_mut().map(Scale::take_segment);
+    pub(super) fn close_segment(&mut self, prior: &Prior) -> Option<SegmentEstimate> {
+        let segments = self.scales.each_mut().map(TimeScale::take_segment);
         let (segment, scale) = (&segments[self.used], self.scale());
         let ground = &scale.ground;
         if segment.count <= 0.0 {
@@ -452,10 +454,11 @@ impl Hypothesis {
         let of_stiffness = cholesky.solve(&ln_stiffness_gradient());
         // The segment has too few blocks for a scatter of its own: that of the whole ground is
         // used.
-        let whole = (ground.information * scale.of_stiffness).dot(&scale.of_stiffness);
+        let whole =
+            (ground.information * scale.stiffness_covariance).dot(&scale.stiffness_covariance);
         let scatter = (scale.scattered() / whole).max(1.0);
         let own = scatter * (segment.information * of_stiffness).dot(&of_stiffness);
-        let found = OfSegment {
+        let found = SegmentEstimate {
             ln_stiffness: values[index::STIFFNESS],
             own,
             known: (others * of_stiffness).dot(&of_stiffness).max(0.0),

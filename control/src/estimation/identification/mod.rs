@@ -31,7 +31,7 @@ use crate::geometry::Twist;
 use crate::measured::BodyAcceleration;
 use crate::robot::RobotModel;
 
-use change::{COMPARED, ChangeMonitor, Explained, Motion};
+use change::{COMPARED, ChangeMonitor, ChannelComparison, Motion};
 use hypothesis::{Hypothesis, Measured};
 use model::{CHANNELS, Input, State, gravity_m_s2};
 use parameters::{Prior, index};
@@ -45,12 +45,12 @@ const COMPARED_S: f64 = 0.05;
 const BLOCK_S: f64 = 1.0;
 /// Minimum number of blocks before a hypothesis is discarded or an estimate is returned.
 const BLOCKS_MIN: u32 = 5;
-/// Excess of a hypothesis's cost over the lowest one from which it is discarded, relative to the mean
-/// square of the best one's residuals.
+/// Excess of a hypothesis's cost over the lowest one from which it is discarded, relative to the
+/// mean square of the best one's residuals.
 const COST_MARGIN: f64 = 60.0;
 /// Excess of cost over the lowest one that reduces a hypothesis's weight to e⁻¹, relative likewise.
 const COST_SCALE: f64 = 10.0;
-/// Difference of ln K below which two hypotheses are merged.
+/// Difference of ln K below which two hypotheses agree, so that the worse one is discarded.
 const SAME: f64 = 0.03;
 /// Rim speed of the slower side below which torques are not compared, because friction at rest is
 /// undetermined, metres per second.
@@ -74,14 +74,15 @@ const MODEL_ACCELERATION_M_S2: f64 = 0.075;
 const MODEL_TORQUE_MU: f64 = 0.025;
 /// Standard deviations of the error that all estimates share because real contacts do not follow
 /// the model's equations: a relative one, of ln θ, and an absolute one, of θ, which is a slip per
-/// friction coefficient and dominates where θ is small: without and with measured torque, which shows
-/// some of what the equations miss.
+/// friction coefficient and dominates where θ is small: without and with measured torque, which
+/// shows some of what the equations miss.
 const MODEL_LN_THETA_STD_DEV: f64 = 0.04;
 const MODEL_THETA_STD_DEVS: [f64; 2] = [0.020, 0.014];
 /// Minimum duration of the block with which a segment ends, seconds; a shorter one is not used.
 const SHORT_BLOCK_S: f64 = 0.5;
-/// Minimum of the mean square of a channel's standardised residuals in its weights, without and with
-/// noise of the wheel speeds: that biases θ, and the more the less the assumed model errors count.
+/// Minimum of the mean square of a channel's standardised residuals in its weights, without and
+/// with noise of the wheel speeds: that biases θ, and the more the less the assumed model errors
+/// count.
 const WEIGHT_SQUARE_MINS: [f64; 2] = [0.3, 1.0];
 /// Mean square of standardised residuals above which the model does not describe the robot and no
 /// estimate is returned.
@@ -113,15 +114,17 @@ pub(super) struct Identification {
     heading_rad: f64,
     gyro_offset_rad_s: f64,
     acceleration_m_s2: [f64; 2],
-    /// The sample that waits for the next one, and the wheel speeds before it.
-    waiting: Option<Waiting>,
-    /// Sums of measurements by time since the last comparison, and for how long each channel.
+    /// The newest sample, which needs its successor for the wheels' acceleration.
+    pending: Option<PendingSample>,
+    /// Integrals of the measurements over time since the last comparison, and the time with
+    /// measurements, seconds, by channel.
     sums: [f64; CHANNELS - 1],
     measured_s: [f64; CHANNELS - 1],
+    /// Samples and time since the last comparison, and time of the open block, seconds.
     samples: f64,
     compared_s: f64,
     block_s: f64,
-    /// Time of the open segment's blocks, and of the last one of them, seconds.
+    /// Duration of the open segment's complete blocks together, seconds, and of the last block.
     segment_s: f64,
     last_block_s: f64,
     is_moving: bool,
@@ -133,10 +136,13 @@ pub(super) struct Identification {
     has_torque: bool,
 }
 
+/// A sample that is used when its successor has come.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Waiting {
+struct PendingSample {
     sample: SensorSample,
+    /// Time since the sample before, seconds.
     time_s: f64,
+    /// Wheel speeds of the sample before, `[left, right]`, and the time that they are means over.
     before_rad_s: Option<([f64; 2], f64)>,
 }
 
@@ -160,7 +166,7 @@ impl Identification {
             heading_rad: 0.0,
             gyro_offset_rad_s: 0.0,
             acceleration_m_s2: [0.0; 2],
-            waiting: None,
+            pending: None,
             sums: [0.0; CHANNELS - 1],
             measured_s: [0.0; CHANNELS - 1],
             samples: 0.0,
@@ -179,6 +185,7 @@ impl Identification {
         Some(identification)
     }
 
+    /// Replaces all hypotheses by new ones at the prior, which move as in `state`.
     fn begin(&mut self, state: &State<f64>) {
         self.hypotheses.clear();
         self.change = ChangeMonitor::default();
@@ -201,6 +208,7 @@ impl Identification {
         self.begin_without(&parameters::OF_LOAD_AND_GROUND);
     }
 
+    /// Begins with the posterior as the prior, in which the parameters `changed` are reset.
     fn begin_without(&mut self, changed: &[usize]) {
         let best = self.best().filter(|best| best.age() >= BLOCKS_MIN);
         if let Some(prior) = best.and_then(|best| best.prior_without(&self.prior, changed)) {
@@ -213,15 +221,15 @@ impl Identification {
         self.last_block_s = 0.0;
     }
 
-    /// Returns the state of motion of a robot without slip at the waiting sample; at rest if there
-    /// is none.
+    /// Returns the state of motion of a robot that rolls without slip as in the pending sample; at
+    /// rest if there is none.
     fn state(&self) -> State<f64> {
-        let twist = self.waiting.map_or_else(Twist::default, |waiting| {
-            let wheels = waiting.sample.wheel_speeds;
+        let twist = self.pending.map_or_else(Twist::default, |pending| {
+            let wheels = pending.sample.wheel_speeds;
             let mean_rad_s = 0.5 * (wheels.left_rad_s + wheels.right_rad_s);
             Twist {
                 linear_m_s: mean_rad_s * self.model.wheel_radius_m(),
-                angular_rad_s: waiting.sample.gyro_rad_s,
+                angular_rad_s: pending.sample.gyro_rad_s,
             }
         });
         State::rolling(twist)
@@ -234,7 +242,7 @@ impl Identification {
         for hypothesis in &mut self.hypotheses {
             hypothesis.restart(state);
         }
-        self.waiting = None;
+        self.pending = None;
         self.wheel_noise.interrupt();
         self.change = ChangeMonitor::default();
         self.clear_sums();
@@ -249,9 +257,9 @@ impl Identification {
         });
         let [forward_m_s2, left_m_s2] = gravity_m_s2(slope, self.heading_rad);
         SensorSample {
-            acceleration: sample.acceleration.map(|felt| BodyAcceleration {
-                forward_m_s2: felt.forward_m_s2 + forward_m_s2,
-                left_m_s2: felt.left_m_s2 + left_m_s2,
+            acceleration: sample.acceleration.map(|measured| BodyAcceleration {
+                forward_m_s2: measured.forward_m_s2 + forward_m_s2,
+                left_m_s2: measured.left_m_s2 + left_m_s2,
             }),
             is_specific_force: false,
             ..*sample
@@ -276,29 +284,31 @@ impl Identification {
         if time_s > GAP_MAX_S {
             self.interrupt();
         } else {
-            self.wheel_noise.add(rates(sample), time_s);
+            self.wheel_noise.add(wheel_speeds_rad_s(sample), time_s);
         }
         let before_rad_s = self
-            .waiting
-            .map(|waiting| (rates(&waiting.sample), waiting.time_s));
-        let waiting = self.waiting.replace(Waiting {
+            .pending
+            .map(|pending| (wheel_speeds_rad_s(&pending.sample), pending.time_s));
+        let pending = self.pending.replace(PendingSample {
             sample: *sample,
             time_s,
             before_rad_s,
         });
-        waiting.is_some_and(|waiting| self.advance(&waiting, (rates(sample), time_s), noise))
+        pending.is_some_and(|pending| {
+            self.advance(&pending, (wheel_speeds_rad_s(sample), time_s), noise)
+        })
     }
 
     /// Advances the models by the sample that waited for its successor. Returns whether the ground
     /// has changed.
     fn advance(
         &mut self,
-        now: &Waiting,
+        now: &PendingSample,
         (after_rad_s, after_s): ([f64; 2], f64),
         noise: &SensorNoise,
     ) -> bool {
         let (sample, time_s) = (&now.sample, now.time_s);
-        let wheels_rad_s = rates(sample);
+        let wheels_rad_s = wheel_speeds_rad_s(sample);
         // Central difference of means over neighbouring samples.
         let (before_rad_s, before_s) = now.before_rad_s.unwrap_or((wheels_rad_s, time_s));
         let apart_s = 0.5 * (before_s + after_s) + time_s;
@@ -321,7 +331,7 @@ impl Identification {
             is_specific_force: sample.is_specific_force,
             time_s,
         };
-        let noise_of_wheels = self.wheel_noise.excess(apart_s);
+        let noise_of_wheels = self.wheel_noise.added_noise(apart_s);
         let perturbed = noise_of_wheels.map(|(speeds, rises)| Input {
             wheels_rad_s: [0, 1].map(|side| wheels_rad_s[side] + speeds[side]),
             wheels_rad_s2: [0, 1].map(|side| wheels_rad_s2[side] + rises[side]),
@@ -375,8 +385,8 @@ impl Identification {
         }
     }
 
-    /// Compares the means over [`COMPARED_S`], and ends the block where it is full. Returns whether the
-    /// ground has changed.
+    /// Compares the means over [`COMPARED_S`], and ends the block where it is full. Returns whether
+    /// the ground has changed.
     fn compare(&mut self, noise: &SensorNoise) -> bool {
         let torque_n_m = self.model.side_load_n() * self.model.wheel_radius_m();
         let root = self.samples.max(1.0).sqrt();
@@ -393,7 +403,7 @@ impl Identification {
         let (sums, measured_s, compared_s) = (self.sums, self.measured_s, self.compared_s);
         let least = self.least_cost();
         let square_min = self.weight_square_min();
-        let mut explained = [None; COMPARED];
+        let mut compared = [None; COMPARED];
         for hypothesis in &mut self.hypotheses {
             let is_best = hypothesis.cost() <= least;
             let outputs = hypothesis.take_outputs(compared_s);
@@ -403,7 +413,7 @@ impl Identification {
                     continue;
                 }
                 if is_best {
-                    explained[channel] = Some(Explained {
+                    compared[channel] = Some(ChannelComparison {
                         measured: sums[channel] / compared_s,
                         output: output.value(),
                         std_dev: std_devs[channel] * hypothesis.residual_ratio(channel),
@@ -424,7 +434,7 @@ impl Identification {
         self.block_s += compared_s;
         self.clear_sums();
         let motion = self.motion();
-        let changed = self.change.compare(&explained, compared_s, motion);
+        let changed = self.change.compare(&compared, compared_s, motion);
         if self.block_s >= BLOCK_S - 1.0e-6 {
             self.end_block();
             self.is_robot_due = true;
@@ -435,16 +445,16 @@ impl Identification {
         changed
     }
 
-    /// Returns the minimum of the mean square of a channel's standardised residuals in its weights.
+    /// Returns the present one of [`WEIGHT_SQUARE_MINS`].
     fn weight_square_min(&self) -> f64 {
-        WEIGHT_SQUARE_MINS[usize::from(self.wheel_noise.is_excess_given)]
+        WEIGHT_SQUARE_MINS[usize::from(self.wheel_noise.is_noise_added)]
     }
 
-    /// Returns the motion at the waiting sample.
+    /// Returns the motion at the pending sample.
     fn motion(&self) -> Motion {
         let radius_m = self.model.wheel_radius_m();
-        let [left_m_s, right_m_s] = self.waiting.map_or([0.0; 2], |waiting| {
-            rates(&waiting.sample).map(|rate| rate.abs() * radius_m)
+        let [left_m_s, right_m_s] = self.pending.map_or([0.0; 2], |pending| {
+            wheel_speeds_rad_s(&pending.sample).map(|rate| rate.abs() * radius_m)
         });
         if left_m_s.min(right_m_s) > ROLLING_M_S {
             Motion::Rolling
@@ -455,6 +465,7 @@ impl Identification {
         }
     }
 
+    /// Ends the open block: every hypothesis takes a step, unless the robot stood.
     fn end_block(&mut self) {
         let block_s = std::mem::take(&mut self.block_s);
         let is_moving = std::mem::take(&mut self.is_moving);
@@ -475,16 +486,17 @@ impl Identification {
             self.begin(&state);
             return;
         }
-        self.discard();
+        self.discard_hypotheses();
         if let Some(best) = self.best() {
             self.gyro_offset_rad_s = best.values()[index::GYRO_OFFSET];
         }
         self.restart_with_wheel_noise();
-        self.watch_ground();
+        self.update_change_monitor();
     }
 
-    /// Gives the change monitor the best hypothesis, if its ln K is known well enough.
-    fn watch_ground(&mut self) {
+    /// Gives the change monitor the best hypothesis, if its ln K is known well enough; otherwise
+    /// resets the monitor.
+    fn update_change_monitor(&mut self) {
         let most = CHANGES_STD_DEVS_MAX[usize::from(self.has_torque)];
         let is_known = |best: &&Hypothesis| {
             let std_dev = best.variance_before_step().sqrt();
@@ -492,7 +504,7 @@ impl Identification {
         };
         let known = self.best().filter(is_known);
         match known.map(|best| (*best.values(), best.motion())) {
-            Some((values, state)) => self.change.follow(&values, &self.model, state),
+            Some((values, state)) => self.change.set_best(&values, &self.model, state),
             None => self.change = ChangeMonitor::default(),
         }
     }
@@ -501,10 +513,10 @@ impl Identification {
     fn restart_with_wheel_noise(&mut self) {
         let is_noisy = self.best().is_some_and(Hypothesis::is_noisy);
         let is_measured = self.wheel_noise.significant_density().is_some();
-        if !is_noisy || !is_measured || self.wheel_noise.is_excess_given {
+        if !is_noisy || !is_measured || self.wheel_noise.is_noise_added {
             return;
         }
-        self.wheel_noise.is_excess_given = true;
+        self.wheel_noise.is_noise_added = true;
         // What was identified so far took the noise for slip.
         self.prior.reset();
         self.robot = None;
@@ -515,7 +527,7 @@ impl Identification {
     }
 
     /// Discards hypotheses that fit worse than the best one, and all but one of those that agree.
-    fn discard(&mut self) {
+    fn discard_hypotheses(&mut self) {
         let most = self.least_cost() + COST_MARGIN * self.residual_square();
         self.hypotheses
             .retain(|hypothesis| hypothesis.age() < BLOCKS_MIN || hypothesis.cost() < most);
@@ -542,17 +554,20 @@ impl Identification {
         }
     }
 
+    /// Returns the lowest cost of all hypotheses.
     fn least_cost(&self) -> f64 {
         let costs = self.hypotheses.iter().map(Hypothesis::cost);
         costs.fold(f64::INFINITY, f64::min)
     }
 
     /// Returns the largest of the channels' mean squares of the best hypothesis's standardised
-    /// residuals, at least 1. Where no hypothesis fits, a difference of cost says less.
+    /// residuals, at least 1. Differences of cost are relative to it, because they are less
+    /// significant where no hypothesis fits.
     fn residual_square(&self) -> f64 {
         self.best().map_or(1.0, Hypothesis::worst_square).max(1.0)
     }
 
+    /// Returns the hypothesis with the lowest cost.
     fn best(&self) -> Option<&Hypothesis> {
         self.hypotheses
             .iter()
@@ -608,7 +623,7 @@ impl Identification {
 }
 
 /// Returns the wheel speeds, left and right, radians per second.
-fn rates(sample: &SensorSample) -> [f64; 2] {
+fn wheel_speeds_rad_s(sample: &SensorSample) -> [f64; 2] {
     let wheels = sample.wheel_speeds;
     [wheels.left_rad_s, wheels.right_rad_s]
 }

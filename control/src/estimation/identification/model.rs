@@ -27,9 +27,9 @@ const SLOW_M_S: f64 = 0.1;
 const DAMPING_RATIO: f64 = 0.2;
 /// Maximum deflection of a slow contact, relative to `μ_p/K`.
 const STANDING_DEFLECTION_MAX: f64 = 5.0;
-/// Width of the smoothed change of sign of rolling resistance and gear loss, as a rim speed, metres
-/// per second.
-const RESISTANCE_TURNS_M_S: f64 = 0.01;
+/// Rim speed over which rolling resistance and gear loss smoothly change their sign (`tanh`),
+/// metres per second.
+const RESISTANCE_SIGN_WIDTH_M_S: f64 = 0.01;
 /// Added to the square of slip, so that the root has a finite slope at zero.
 const SLIP_SQUARE_MIN: f64 = 1.0e-10;
 // Arrays of numbers are written out below: `map` copies them, and a copy of numbers with their
@@ -39,7 +39,7 @@ const SLIP_SQUARE_MIN: f64 = 1.0e-10;
 /// wheelbase and track width; the first two are on the left.
 const CONTACTS: [(f64, f64); 4] = [(0.5, 0.5), (-0.5, 0.5), (0.5, -0.5), (-0.5, -0.5)];
 
-/// The state of motion.
+/// State of the model: motion of the centre of mass, and deflections of the contacts.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct State<T> {
     /// Velocity of the centre of mass in the body frame, forward and left, metres per second.
@@ -83,8 +83,8 @@ pub(super) struct Input {
     pub(super) wheels_rad_s2: [f64; 2],
     /// Heading relative to the start of identification, radians.
     pub(super) heading_rad: f64,
-    /// Low-pass filtered measured acceleration, forward and left, metres per second squared; only for
-    /// the contacts' loads.
+    /// Low-pass filtered measured acceleration, forward and left, metres per second squared; only
+    /// for the contacts' loads.
     pub(super) acceleration_m_s2: [f64; 2],
     /// Whether measured accelerations are the specific force; otherwise they are without gravity.
     pub(super) is_specific_force: bool,
@@ -106,6 +106,7 @@ pub(super) struct Output<T> {
 }
 
 impl<T: Real> Output<T> {
+    /// Returns an output of zeros, to which others are added.
     pub(super) fn zero() -> Self {
         let zero = T::constant(0.0);
         Self {
@@ -134,8 +135,9 @@ struct Forces<T> {
     sides_n: [T; 2],
 }
 
-/// Returns gravity's component along ground of this slope, along the axes of the frame in which the
-/// body has this heading, in the body frame, forward and left, metres per second squared.
+/// Returns the acceleration by gravity along sloped ground in the body frame, forward and left,
+/// metres per second squared. The slope is the rise per distance along the x and y axes of a frame
+/// on the ground, in which the body has the heading `heading_rad`, counter-clockwise from x.
 pub(super) fn gravity_m_s2<T: Real>([x, y]: [T; 2], heading_rad: f64) -> [T; 2] {
     let (sin, cos) = heading_rad.sin_cos();
     [
@@ -213,11 +215,11 @@ impl<T: Real> Robot<T> {
             for (part, slip_m_s) in deflection.iter_mut().zip(slips_m_s) {
                 *part = (*part * keeps + rate * slip_m_s) * over;
             }
-            let [ahead, aside] = *deflection;
-            let slip = (ahead * ahead + aside * aside + SLIP_SQUARE_MIN).sqrt();
+            let [forward, left] = *deflection;
+            let slip = (forward * forward + left * left + SLIP_SQUARE_MIN).sqrt();
             let mu_over_slip = self.mu_over_slip(slip);
             let per_slip_n = mu_over_slip * contact.load_n;
-            let mut force_n = [per_slip_n * ahead, per_slip_n * aside];
+            let mut force_n = [per_slip_n * forward, per_slip_n * left];
             let slow = 1.0 - rim_m_s.value().abs() / SLOW_M_S;
             if slow > 0.0 {
                 let (stiffness, length_m) = (self.stiffness.value(), self.relaxation_m.value());
@@ -231,9 +233,9 @@ impl<T: Real> Robot<T> {
                 }
                 let most = STANDING_DEFLECTION_MAX * self.peak.value() / stiffness;
                 if slip.value() > most {
-                    let [ahead, aside] = deflection;
-                    *ahead = *ahead * (most / slip.value());
-                    *aside = *aside * (most / slip.value());
+                    let [forward, left] = deflection;
+                    *forward = *forward * (most / slip.value());
+                    *left = *left * (most / slip.value());
                 }
             }
             let [longitudinal_n, lateral_n] = force_n;
@@ -288,15 +290,15 @@ impl<T: Real> Robot<T> {
                 };
                 output.acceleration_m_s2[side] = output.acceleration_m_s2[side] + measured * share;
                 let load_n = contacts[2 * side].load_n + contacts[2 * side + 1].load_n;
-                let turns = (rims_m_s[side].value() / RESISTANCE_TURNS_M_S).tanh();
+                let turns = (rims_m_s[side].value() / RESISTANCE_SIGN_WIDTH_M_S).tanh();
                 let side_n = forces.sides_n[side];
-                let taken_n =
+                let driving_n =
                     side_n + (self.resistance * load_n + self.gear_loss * side_n.abs()) * turns;
                 let nominal_m = self.nominal_radius_m;
                 let rotors_n_m =
                     self.rotors_kg * (nominal_m * nominal_m * input.wheels_rad_s2[side]);
                 output.torques_n_m[side] = output.torques_n_m[side]
-                    + (taken_n * self.radius_m[side] + rotors_n_m)
+                    + (driving_n * self.radius_m[side] + rotors_n_m)
                         * self.torque_scale[side]
                         * share;
             }

@@ -8,8 +8,8 @@ use crate::robot::RobotModel;
 
 /// Number of parameters.
 pub(super) const PARAMETERS: usize = 25;
-/// Number of parameters of the equations of motion and of the sensors' scales and offsets: all but the
-/// delays, which are the last ones.
+/// Number of parameters of the equations of motion and of the sensors' scales and offsets: all but
+/// the delays, which are the last ones.
 pub(super) const MODELLED: usize = 23;
 /// Values of all parameters.
 pub(super) type Values = SVector<f64, PARAMETERS>;
@@ -64,8 +64,8 @@ pub(super) mod index {
     pub(in super::super) const HEIGHT: usize = 21;
     /// Offset of the measured body speed, metres per second.
     pub(in super::super) const SPEED_OFFSET: usize = 22;
-    /// Delay of the gyro relative to the wheel speeds, and of the accelerometer relative to the gyro,
-    /// seconds.
+    /// Delay of the gyro relative to the wheel speeds, and of the accelerometer relative to the
+    /// gyro, seconds.
     pub(in super::super) const GYRO_DELAY: usize = 23;
     pub(in super::super) const ACCELEROMETER_DELAY: usize = 24;
 }

@@ -5,7 +5,7 @@
 //! see them (Huber, Robust Statistics, 1981, ch. 5).
 
 /// Number of blocks that are remembered; odd, so that the median is one of them.
-const REMEMBERED: usize = 31;
+const BLOCKS_MAX: usize = 31;
 /// Standard deviation over the median absolute deviation of normal values.
 const NORMAL_MAD: f64 = 1.4826;
 /// Variance of the median over that of the mean of normal values.
@@ -14,7 +14,7 @@ const MEDIAN_VARIANCE: f64 = 1.57;
 /// The newest values, one for each block.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct RecentBlocks {
-    values: [f64; REMEMBERED],
+    values: [f64; BLOCKS_MAX],
     count: usize,
     next: usize,
     median: f64,
@@ -25,7 +25,7 @@ impl RecentBlocks {
     /// Creates the memory without values.
     pub(super) const fn new() -> Self {
         Self {
-            values: [0.0; REMEMBERED],
+            values: [0.0; BLOCKS_MAX],
             count: 0,
             next: 0,
             median: 0.0,
@@ -33,15 +33,15 @@ impl RecentBlocks {
         }
     }
 
-    /// Adds the value of a block; the oldest of more than 31 is forgotten. A value that is not finite
-    /// is ignored.
+    /// Adds the value of a block; the oldest of more than 31 is dropped. A value that is not
+    /// finite is ignored.
     pub(super) fn add(&mut self, value: f64) {
         if !value.is_finite() {
             return;
         }
         self.values[self.next] = value;
-        self.next = (self.next + 1) % REMEMBERED;
-        self.count = (self.count + 1).min(REMEMBERED);
+        self.next = (self.next + 1) % BLOCKS_MAX;
+        self.count = (self.count + 1).min(BLOCKS_MAX);
         let known = &self.values[..self.count];
         self.median = median(known.iter().copied(), self.count);
         let off = known.iter().map(|value| (value - self.median).abs());
@@ -72,9 +72,9 @@ impl RecentBlocks {
     }
 }
 
-/// Returns the median of `count` values, of which there are 1 to [`REMEMBERED`].
+/// Returns the median of `count` values, of which there are 1 to [`BLOCKS_MAX`].
 fn median(values: impl Iterator<Item = f64>, count: usize) -> f64 {
-    let mut sorted = [f64::INFINITY; REMEMBERED];
+    let mut sorted = [f64::INFINITY; BLOCKS_MAX];
     for (place, value) in sorted.iter_mut().zip(values) {
         *place = value;
     }
@@ -118,7 +118,7 @@ mod tests {
             recent.add(spread(place));
         }
         assert!(recent.std_error() < of_ten);
-        for _ in 0..REMEMBERED {
+        for _ in 0..BLOCKS_MAX {
             recent.add(7.0);
         }
         assert_eq!((recent.median(), recent.std_error()), (Some(7.0), 0.0));

@@ -14,7 +14,7 @@ const MODEL_CENTRE_RATIO: f64 = 0.006;
 const PRIOR_SHARE_MAX: f64 = 0.5;
 
 impl Identification {
-    /// Returns the robot's own parameters by the hypothesis with the lowest cost; variances are
+    /// Returns the robot's own parameters from the hypothesis with the lowest cost; variances are
     /// propagated to first order. None before [`BLOCKS_MIN`] blocks, or if residuals are too large
     /// for the model.
     pub(super) fn identify_robot(&self) -> Option<IdentifiedRobot> {

@@ -1,27 +1,27 @@
 //! Normal equations of one time scale.
 //!
 //! The residuals of all channels are compared as means over a number of comparisons. Short means
-//! hold the most information. Noise of the wheel speeds, by which the model is driven, and vibration
-//! disturb them the most: the noise of an output is correlated with that of its slopes, which
-//! biases the estimates (errors in the variables: Söderström, Errors-in-Variables Methods in System
-//! Identification, 2018). In longer means both average out. So the same equations are kept at more
-//! than one scale, and the shorter scale is used only as long as its estimate agrees with that of
-//! the longer one (the specification test of Hausman, Econometrica 46, 1978).
+//! hold the most information. Noise of the wheel speeds, by which the model is driven, and
+//! vibration disturb them the most: the noise of an output is correlated with that of its slopes,
+//! which biases the estimates (errors in the variables: Söderström, Errors-in-Variables Methods in
+//! System Identification, 2018). In longer means both average out. So the same equations are kept
+//! at more than one scale, and the shorter scale is used only as long as its estimate agrees with
+//! that of the longer one (the specification test of Hausman, Econometrica 46, 1978).
 
 use super::model::CHANNELS;
 use super::parameters::{Prior, Square, Values, index};
 
 /// Fraction of its information that a block loses with each later block, because sensor offsets
 /// drift.
-const BLOCK_FORGETS: f64 = 0.002;
+const BLOCK_DECAY: f64 = 0.002;
 /// Standardised residual above which Huber's weight falls below 1.
 const HUBER: f64 = 3.0;
 /// Weight of each new squared residual in the exponentially weighted mean square of its channel.
 const SQUARE_GAIN: f64 = 0.005;
 /// Maximum squared standardised residual in that mean.
 const SQUARE_MAX: f64 = 100.0;
-/// Standard deviations of their difference by which the estimates of two scales may differ.
-const DIFFERENT: f64 = 2.0;
+/// Maximum difference of the estimates of two scales that agree, in its standard deviations.
+const AGREEMENT_STD_DEVS: f64 = 2.0;
 /// Minimum variance of that difference, relative to the variance at the longer scale.
 const DIFFERENCE_MIN: f64 = 0.2;
 
@@ -39,6 +39,7 @@ pub(super) struct Blocks {
 }
 
 impl Blocks {
+    /// Returns the sums over no blocks.
     fn none() -> Self {
         Self {
             information: Square::zeros(),
@@ -48,11 +49,12 @@ impl Blocks {
         }
     }
 
-    fn scale(&mut self, ratio: f64) {
-        let scale = |values: &mut [f64]| values.iter_mut().for_each(|value| *value *= ratio);
-        scale(self.information.as_mut_slice());
-        scale(self.preferred.as_mut_slice());
-        scale(self.scores.as_mut_slice());
+    /// Multiplies the weights of all blocks.
+    fn multiply(&mut self, ratio: f64) {
+        let multiply = |values: &mut [f64]| values.iter_mut().for_each(|value| *value *= ratio);
+        multiply(self.information.as_mut_slice());
+        multiply(self.preferred.as_mut_slice());
+        multiply(self.scores.as_mut_slice());
         self.count *= ratio;
     }
 
@@ -110,18 +112,19 @@ impl Residual {
     }
 }
 
-/// A comparison of one channel.
+/// Residual of one channel in one comparison, with what weights it.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Compared {
+pub(super) struct ChannelResidual {
     /// Measurement minus output.
     pub(super) residual: Residual,
-    /// What added noise of the wheel speeds changed, multiplied by the square root of the noise's
-    /// variance over that of the added noise; 0 without noise.
+    /// Change of the output by the noise added to the wheel speeds, multiplied by the square root
+    /// of the noise's variance over that of the added noise; 0 without noise.
     pub(super) noise: Residual,
     /// Standard deviation of the residual without that noise.
     pub(super) std_dev: f64,
-    /// Minimum of the mean square of standardised residuals in the weights: residuals that are smaller
-    /// than sensors and model errors are assumed to make them get more weight, but not without bound.
+    /// Minimum of the mean square of standardised residuals in the weights: residuals that are
+    /// smaller than sensors and model errors are assumed to make them get more weight, but not
+    /// without bound.
     pub(super) square_min: f64,
 }
 
@@ -149,7 +152,7 @@ impl Mean {
 
 /// The normal equations of all blocks at one time scale.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Scale {
+pub(super) struct TimeScale {
     /// Number of comparisons in one mean.
     length: u32,
     means: [Mean; CHANNELS],
@@ -165,13 +168,14 @@ pub(super) struct Scale {
     last: Blocks,
     /// Mean square of each channel's standardised residuals.
     squares: [f64; CHANNELS],
-    /// Column of C for ln K: covariances of ln K with all parameters.
-    pub(super) of_stiffness: Values,
+    /// Nominal covariances of ln K with all parameters: the column of C for ln K, with C as in the
+    /// module `hypothesis`.
+    pub(super) stiffness_covariance: Values,
     /// Solution of the normal equations for ln K.
     ln_stiffness: f64,
 }
 
-impl Scale {
+impl TimeScale {
     /// Creates the equations without measurements, for means over `length` comparisons.
     pub(super) fn new(length: u32) -> Self {
         Self {
@@ -184,7 +188,7 @@ impl Scale {
             segment: Blocks::none(),
             last: Blocks::none(),
             squares: [1.0; CHANNELS],
-            of_stiffness: Values::zeros(),
+            stiffness_covariance: Values::zeros(),
             ln_stiffness: 0.0,
         }
     }
@@ -202,7 +206,7 @@ impl Scale {
     }
 
     /// Adds a comparison to the open mean of its channel.
-    pub(super) fn add(&mut self, channel: usize, compared: &Compared) {
+    pub(super) fn add(&mut self, channel: usize, compared: &ChannelResidual) {
         if self.length == 1 || channel == CHANNELS - 1 {
             // The body speed is no mean.
             self.compare(channel, compared);
@@ -224,15 +228,15 @@ impl Scale {
         }
     }
 
-    /// Adds the means of the channels to the open block. One that was not measured all the time is
-    /// none.
+    /// Adds the means of the channels to the open block, except those of channels that were not
+    /// measured in every comparison.
     fn end_mean(&mut self) {
         let compared = std::mem::take(&mut self.compared);
         for channel in 0..CHANNELS - 1 {
             let mean = std::mem::replace(&mut self.means[channel], Mean::none());
             if mean.count > 0 && mean.count == compared {
                 let share = f64::from(compared).recip();
-                let compared = Compared {
+                let compared = ChannelResidual {
                     residual: mean.residual.times(share),
                     noise: mean.noise.times(share),
                     std_dev: mean.std_dev,
@@ -243,11 +247,12 @@ impl Scale {
         }
     }
 
-    /// Adds a comparison to the open block, with Huber's weight relative to the channel's residuals.
+    /// Adds a comparison to the open block, with Huber's weight relative to the channel's
+    /// residuals.
     ///
     /// The noise e of an output and its slopes ∂e/∂p are correlated, which adds the mean of
     /// −e ∂e/∂p to the score. That of the added noise, which is independent, cancels it.
-    fn compare(&mut self, channel: usize, compared: &Compared) {
+    fn compare(&mut self, channel: usize, compared: &ChannelResidual) {
         let Residual { value, slopes } = &compared.residual;
         let square = (value / compared.std_dev).powi(2);
         let seen = &mut self.squares[channel];
@@ -279,7 +284,7 @@ impl Scale {
         if self.compared > 0 {
             self.end_mean();
         }
-        let keeps = 1.0 - BLOCK_FORGETS;
+        let keeps = 1.0 - BLOCK_DECAY;
         self.segment
             .combine(&self.last, |own, last| (own + last) * keeps);
         let last = &mut self.last;
@@ -297,17 +302,17 @@ impl Scale {
     /// None if they cannot be solved.
     pub(super) fn solve(&mut self, prior: &Prior) -> Option<Values> {
         let cholesky = (self.ground.information + prior.information).cholesky()?;
-        self.of_stiffness = cholesky.solve(&ln_stiffness_gradient());
+        self.stiffness_covariance = cholesky.solve(&ln_stiffness_gradient());
         let wanted = cholesky.solve(&(self.ground.preferred + prior.information * prior.mean));
         self.ln_stiffness = wanted[index::STIFFNESS];
         Some(wanted)
     }
 
-    /// Computes the variances of ln K again, from the weights that the blocks have now. They stay if
-    /// the normal equations cannot be solved.
+    /// Computes the variances of ln K again, from the weights that the blocks have now. They stay
+    /// if the normal equations cannot be solved.
     pub(super) fn update_variances(&mut self, prior: &Prior) {
         if let Some(cholesky) = (self.ground.information + prior.information).cholesky() {
-            self.of_stiffness = cholesky.solve(&ln_stiffness_gradient());
+            self.stiffness_covariance = cholesky.solve(&ln_stiffness_gradient());
         }
     }
 
@@ -316,35 +321,35 @@ impl Scale {
         let (own, of_other) = (self.variances(prior).0, other.variances(prior).0);
         // That of the difference to an efficient estimate is the difference of the variances.
         let variance = (of_other - own).max(DIFFERENCE_MIN * of_other);
-        (self.ln_stiffness - other.ln_stiffness).powi(2) <= DIFFERENT.powi(2) * variance
+        (self.ln_stiffness - other.ln_stiffness).powi(2) <= AGREEMENT_STD_DEVS.powi(2) * variance
     }
 
     /// Multiplies the weights of all complete blocks.
-    pub(super) fn weaken(&mut self, ratio: f64) {
-        self.ground.scale(ratio);
-        self.segment.scale(ratio);
-        self.last.scale(ratio);
+    pub(super) fn scale_weights(&mut self, ratio: f64) {
+        self.ground.multiply(ratio);
+        self.segment.multiply(ratio);
+        self.last.multiply(ratio);
     }
 
     /// Returns the variance of ln K, and the part of it that the prior contributes. The first is at
     /// least the nominal variance, the diagonal element of C.
     pub(super) fn variances(&self, prior: &Prior) -> (f64, f64) {
-        let of_stiffness = self.of_stiffness;
-        let known = (prior.information * of_stiffness).dot(&of_stiffness);
+        let stiffness_covariance = self.stiffness_covariance;
+        let known = (prior.information * stiffness_covariance).dot(&stiffness_covariance);
         let nominal = self.nominal_variance();
         ((self.scattered() + known).max(nominal), known)
     }
 
     /// Returns the nominal variance of ln K at the last solution, the diagonal element of C.
     pub(super) fn nominal_variance(&self) -> f64 {
-        self.of_stiffness[index::STIFFNESS].max(0.0)
+        self.stiffness_covariance[index::STIFFNESS].max(0.0)
     }
 
     /// Returns the part of ln K's variance that the scatter of the blocks' scores contributes.
     pub(super) fn scattered(&self) -> f64 {
         // The scatter of few scores underestimates their variance.
         let few = 1.0 + 2.0 / self.ground.count.max(1.0);
-        few * (self.ground.scores * self.of_stiffness).dot(&self.of_stiffness)
+        few * (self.ground.scores * self.stiffness_covariance).dot(&self.stiffness_covariance)
     }
 
     /// Drops the last block, which may contain samples of two grounds.

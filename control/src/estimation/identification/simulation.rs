@@ -40,7 +40,8 @@ pub(super) struct Outputs<T> {
 }
 
 impl<T: Real> Outputs<T> {
-    /// Returns a channel's mean as its sensor gives it with a delay of `delay_s`, to first order.
+    /// Returns a channel's mean as a sensor with a delay of `delay_s` would measure it, to first
+    /// order.
     fn late(&self, channel: usize, delay_s: f64) -> T {
         self.means[channel] - self.rates[channel] * delay_s
     }
@@ -123,8 +124,8 @@ impl<T: Real> Simulation<T> {
         self.newest.as_ref().map(|output| &output.forward_m_s)
     }
 
-    /// Returns the outputs since the last call, `compared_s` seconds ago, and begins anew. They were
-    /// weighted by [`COMPARED_S`].
+    /// Returns the outputs since the last call, `compared_s` seconds ago, and begins anew. They
+    /// were weighted by [`COMPARED_S`].
     pub(super) fn take_outputs(&mut self, compared_s: f64) -> Outputs<T> {
         let newest = self.newest.as_ref().map(|output| {
             let [forward, left] = output.acceleration_m_s2;

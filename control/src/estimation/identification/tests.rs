@@ -332,7 +332,7 @@ fn the_variance_of_an_estimate_that_moved_far_is_that_of_the_blocks_that_are_lef
                         ratio > 0.9,
                         "K {stiffness}, {tick}: {ratio} of what is left"
                     );
-                    moved += u32::from(hypothesis.kept() < 0.5);
+                    moved += u32::from(hypothesis.weight_factor() < 0.5);
                 }
             }
         }
@@ -365,8 +365,9 @@ fn noisy(samples: [SensorSample; 2], std_dev_rad_s: f64, random: &mut impl RngEx
     }
 }
 
-/// Returns ln of the estimated over the true θ after 40 s with white noise of the wheel speeds, and its
-/// standard deviation; None without an estimate. `samples` are averaged in each of the sensor's.
+/// Returns ln of the estimated over the true θ after 40 s with white noise of the wheel speeds, and
+/// its standard deviation; None without an estimate. `samples` are averaged in each of the
+/// sensor's.
 fn error_with_noise(
     stiffness: f64,
     (samples, std_dev_rad_s): (u16, f64),

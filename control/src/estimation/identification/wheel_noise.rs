@@ -3,17 +3,17 @@
 //! The model is driven by the measured wheel speeds, and their noise looks like slip: the output
 //! has an error e whose slope ∂e/∂p is correlated with it, which biases the estimates as in any
 //! regression with errors in the variables (Söderström, Errors-in-Variables Methods in System
-//! Identification, 2018, ch. 3). This module gives independent noise of about the same density, from
-//! which the module `hypothesis` learns the bias and subtracts it (simulation extrapolation: Cook
-//! and Stefanski, Journal of the American Statistical Association 89, 1994).
+//! Identification, 2018, ch. 3). This module gives independent noise of about the same density,
+//! from which the module `hypothesis` learns the bias and subtracts it (simulation extrapolation:
+//! Cook and Stefanski, Journal of the American Statistical Association 89, 1994).
 //!
-//! The density is estimated from wheel speeds alone, by the power of two filters:
-//! third differences of sums of two values, around 10 Hz, and fourth differences, at higher
-//! frequencies. A smooth motion passes neither. Speeds that are differences of encoder counts have
-//! noise that cancels in sums: its spectrum rises as `x = 4 sin²(ω/2)`, of which the filters see the
-//! means 1.75 and 3.6, while white noise has the same power in both. So the two are distinguished by
-//! extrapolation to x = 0. Wheels that truly move at 10 Hz, as behind noisy positions, count as noise
-//! here; the accelerometer feels them too, by which the module `fast_changes` tells the two apart.
+//! The density is estimated from wheel speeds alone, by the power of two filters: third differences
+//! of sums of two values, around 10 Hz, and fourth differences, at higher frequencies. A smooth
+//! motion passes neither. Speeds that are differences of encoder counts have noise that cancels in
+//! sums: its spectrum rises as `x = 4 sin²(ω/2)`, of which the filters see the means 1.75 and 3.6,
+//! while white noise has the same power in both. So the two are distinguished by extrapolation to x
+//! = 0. Wheels that truly move at 10 Hz, as behind noisy positions, count as noise here; the
+//! accelerometer measures such motion too, by which the module `fast_changes` distinguishes it.
 
 use super::recent::RecentBlocks;
 
@@ -38,26 +38,26 @@ const SAMPLE_MIN_S: f64 = 1.0e-3;
 /// Estimate of the density of the noise of the wheel speeds.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct WheelNoise {
-    sides: [Means; 2],
+    sides: [SpeedMeans; 2],
     sum_rad: [f64; 2],
     time_s: f64,
     /// Sum over the open block, (rad/s)²·s, and the number of values in it.
     open: (f64, f64),
     /// The blocks' densities, (rad/s)²·s.
     blocks: RecentBlocks,
-    excess: Excess,
-    /// Whether [`WheelNoise::excess`] gives noise.
-    pub(super) is_excess_given: bool,
+    added: AddedNoise,
+    /// Whether [`WheelNoise::added_noise`] gives noise.
+    pub(super) is_noise_added: bool,
 }
 
 /// The newest means of one wheel's speed, the newest last.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-struct Means {
+struct SpeedMeans {
     means_rad_s: [f64; MIDDLE.len()],
     known: usize,
 }
 
-impl Means {
+impl SpeedMeans {
     /// Adds a mean speed. Returns an estimate of the variance of white noise, (rad/s)², negative as
     /// often as not if there is none; None before enough means.
     fn add(&mut self, mean_rad_s: f64) -> Option<f64> {
@@ -80,7 +80,7 @@ impl Means {
 
 /// Independent noise that is added to the wheel speeds: values of either sign.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Excess {
+struct AddedNoise {
     /// State of a xorshift generator (Marsaglia 2003), never 0.
     bits: u32,
     /// At the samples before, now and after, left and right, radians per second.
@@ -89,7 +89,7 @@ struct Excess {
     after_rad_s: [f64; 2],
 }
 
-impl Excess {
+impl AddedNoise {
     fn sign(&mut self) -> f64 {
         self.bits ^= self.bits << 13;
         self.bits ^= self.bits >> 17;
@@ -108,24 +108,24 @@ impl WheelNoise {
     /// Creates the estimate without noise.
     pub(super) fn new() -> Self {
         Self {
-            sides: [Means::default(); 2],
+            sides: [SpeedMeans::default(); 2],
             sum_rad: [0.0; 2],
             time_s: 0.0,
             open: (0.0, 0.0),
             blocks: RecentBlocks::new(),
-            excess: Excess {
+            added: AddedNoise {
                 bits: 0x9e37_79b9,
                 before_rad_s: [0.0; 2],
                 now_rad_s: [0.0; 2],
                 after_rad_s: [0.0; 2],
             },
-            is_excess_given: false,
+            is_noise_added: false,
         }
     }
 
     /// Begins anew after a gap; the density stays.
     pub(super) fn interrupt(&mut self) {
-        self.sides = [Means::default(); 2];
+        self.sides = [SpeedMeans::default(); 2];
         self.sum_rad = [0.0; 2];
         self.time_s = 0.0;
         self.open = (0.0, 0.0);
@@ -134,8 +134,7 @@ impl WheelNoise {
     /// Adds a sample, whose mean speeds are those of `time_s` seconds.
     pub(super) fn add(&mut self, wheels_rad_s: [f64; 2], time_s: f64) {
         let density = self.density().unwrap_or(0.0);
-        self.excess
-            .next((density / time_s.max(SAMPLE_MIN_S)).sqrt());
+        self.added.next((density / time_s.max(SAMPLE_MIN_S)).sqrt());
         self.time_s += time_s;
         for (sum_rad, wheel_rad_s) in self.sum_rad.iter_mut().zip(wheels_rad_s) {
             *sum_rad += wheel_rad_s * time_s;
@@ -153,7 +152,7 @@ impl WheelNoise {
         }
     }
 
-    /// Ends a block; one in which the robot stood counts for nothing.
+    /// Ends a block; one in which the robot stood is not used.
     pub(super) fn end_block(&mut self, is_moving: bool) {
         let (sum, count) = std::mem::take(&mut self.open);
         if !is_moving || count < 1.0 {
@@ -162,8 +161,8 @@ impl WheelNoise {
         self.blocks.add(sum / count);
     }
 
-    /// Returns the noise's density if all fast changes are noise, (rad/s)²·s; None before it is known, and if
-    /// the speeds have no such noise.
+    /// Returns the power density of the noise, (rad/s)²·s, if all fast changes are noise; None
+    /// before it is known, and if the speeds have no such noise.
     fn density(&self) -> Option<f64> {
         let known = self
             .blocks
@@ -172,8 +171,8 @@ impl WheelNoise {
         known.filter(|density| *density > 0.0)
     }
 
-    /// Returns that density if it is more than chance: of smooth speeds and of differences of encoder
-    /// counts, whose noise cancels in sums, it is as often below 0 as above.
+    /// Returns that density if it is more than chance: of smooth speeds and of differences of
+    /// encoder counts, whose noise cancels in sums, it is as often below 0 as above.
     pub(super) fn significant_density(&self) -> Option<f64> {
         let least = SIGNIFICANT * self.blocks.std_error();
         self.density().filter(|density| *density > least)
@@ -182,11 +181,11 @@ impl WheelNoise {
     /// Returns noise of the sample before the newest, left and right: of its wheel speeds, radians
     /// per second, and of their central difference over `apart_s` seconds, radians per second
     /// squared. None without noise.
-    pub(super) fn excess(&self, apart_s: f64) -> Option<([f64; 2], [f64; 2])> {
-        let (before, after) = (self.excess.before_rad_s, self.excess.after_rad_s);
-        self.density().filter(|_| self.is_excess_given).map(|_| {
+    pub(super) fn added_noise(&self, apart_s: f64) -> Option<([f64; 2], [f64; 2])> {
+        let (before, after) = (self.added.before_rad_s, self.added.after_rad_s);
+        self.density().filter(|_| self.is_noise_added).map(|_| {
             let rise = |side: usize| (after[side] - before[side]) / apart_s;
-            (self.excess.now_rad_s, [rise(0), rise(1)])
+            (self.added.now_rad_s, [rise(0), rise(1)])
         })
     }
 }
@@ -260,12 +259,12 @@ mod tests {
         let mut noise = fed(0.01, |_, speed| {
             speed + 0.1 * (random.random::<f64>() - 0.5)
         });
-        noise.is_excess_given = true;
+        noise.is_noise_added = true;
         let density = noise.density().expect("noise is there");
         let (mut sum, mut square) = (0.0, 0.0);
         for _ in 0..10_000 {
             noise.add([6.0; 2], 0.01);
-            let ([left, right], _) = noise.excess(0.02).expect("noise is there");
+            let ([left, right], _) = noise.added_noise(0.02).expect("noise is there");
             sum += left + right;
             square += left * left + right * right;
         }

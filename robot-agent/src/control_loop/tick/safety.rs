@@ -187,7 +187,7 @@ impl Safety {
             wanted,
             mu_lower,
         };
-        site.fence().judge(&input, &self.model).speed_max_m_s
+        site.fence().limit_speed(&input, &self.model).speed_max_m_s
     }
 
     /// Returns whether the robot must stop because its position is unknown, and otherwise the speed

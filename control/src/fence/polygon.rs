@@ -49,16 +49,17 @@ impl Bounds {
     }
 
     /// Returns the distance of a point from the box along each axis, `(x, y)`, metres; 0 within.
-    fn off(&self, point: Point) -> (f64, f64) {
-        let off = |value: f64, low: f64, high: f64| (low - value).max(value - high).max(0.0);
+    fn axis_distances_m(&self, point: Point) -> (f64, f64) {
+        let distance_m = |value: f64, low: f64, high: f64| (low - value).max(value - high).max(0.0);
         (
-            off(point.x_m, self.low.x_m, self.high.x_m),
-            off(point.y_m, self.low.y_m, self.high.y_m),
+            distance_m(point.x_m, self.low.x_m, self.high.x_m),
+            distance_m(point.y_m, self.low.y_m, self.high.y_m),
         )
     }
 
+    /// Returns the squared distance of a point from the box; 0 within.
     fn distance_m2(&self, point: Point) -> f64 {
-        let (x_m, y_m) = self.off(point);
+        let (x_m, y_m) = self.axis_distances_m(point);
         x_m * x_m + y_m * y_m
     }
 
@@ -68,6 +69,7 @@ impl Bounds {
     }
 }
 
+/// Neighbouring sides with their bounding box.
 #[derive(Debug, Clone, PartialEq)]
 struct Group {
     bounds: Bounds,
@@ -90,20 +92,22 @@ impl Group {
         }
     }
 
+    /// Replaces `nearest` if a side of this group has a point nearer to `point`.
     fn refine(&self, point: Point, nearest: &mut Nearest) {
         for side in &self.sides {
             let (from, to) = (side.from, side.to);
             let (side_x, side_y) = (to.x_m - from.x_m, to.y_m - from.y_m);
             let (x_m, y_m) = (point.x_m - from.x_m, point.y_m - from.y_m);
-            let share = ((x_m * side_x + y_m * side_y) * side.inverse_length_1_m2).clamp(0.0, 1.0);
-            let (off_x, off_y) = (x_m - share * side_x, y_m - share * side_y);
-            let distance_m2 = off_x * off_x + off_y * off_y;
+            let fraction =
+                ((x_m * side_x + y_m * side_y) * side.inverse_length_1_m2).clamp(0.0, 1.0);
+            let (away_x, away_y) = (x_m - fraction * side_x, y_m - fraction * side_y);
+            let distance_m2 = away_x * away_x + away_y * away_y;
             if distance_m2 < nearest.distance_m2 {
                 *nearest = Nearest {
                     distance_m2,
                     point: Point {
-                        x_m: from.x_m + share * side_x,
-                        y_m: from.y_m + share * side_y,
+                        x_m: from.x_m + fraction * side_x,
+                        y_m: from.y_m + fraction * side_y,
                     },
                 };
             }
@@ -127,14 +131,15 @@ impl Group {
     }
 }
 
-/// Closed polygon.
+/// Closed polygon in the site frame; its corners may be in either order.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Ring {
+pub(super) struct Polygon {
     groups: Vec<Group>,
     bounds: Bounds,
 }
 
-impl Ring {
+impl Polygon {
+    /// Creates the closed polygon of these corners; one without corners contains no point.
     pub(super) fn new(corners: &[Point]) -> Self {
         let next = corners.iter().cycle().skip(1);
         let side = |(&from, &to): (&Point, &Point)| Side {
@@ -149,14 +154,15 @@ impl Ring {
         }
     }
 
-    /// Returns a lower bound of the distance from a point outside the polygon to it, metres: how
-    /// far the point is off the bounding box on one axis; 0 within the box.
-    pub(super) fn outside_at_least_m(&self, point: Point) -> f64 {
-        let (x_m, y_m) = self.bounds.off(point);
+    /// Returns a lower bound of the distance from a point outside the polygon to it, metres: the
+    /// larger of the distances from the bounding box along the axes; 0 within the box.
+    pub(super) fn outside_distance_min_m(&self, point: Point) -> f64 {
+        let (x_m, y_m) = self.bounds.axis_distances_m(point);
         x_m.max(y_m)
     }
 
-    /// Returns the signed distance to the border, metres: positive inside, negative outside.
+    /// Returns the signed distance to the border, metres: positive inside, negative outside, −∞ for
+    /// a polygon without corners.
     pub(super) fn depth_m(&self, point: Point) -> f64 {
         let mut is_inside = false;
         for group in &self.groups {
@@ -169,7 +175,7 @@ impl Ring {
     }
 
     /// Returns the point of the border that is nearest to `point`.
-    pub(super) fn border_near(&self, point: Point) -> Point {
+    pub(super) fn nearest_border_point(&self, point: Point) -> Point {
         self.nearest(point).point
     }
 
@@ -202,7 +208,7 @@ mod tests {
 
     use super::*;
 
-    /// Computes [`Ring::depth_m`] without groups.
+    /// Computes [`Polygon::depth_m`] without groups.
     fn plain(corners: &[Point], point: Point) -> f64 {
         let next = corners.iter().cycle().skip(1);
         let side = |(&from, &to): (&Point, &Point)| Side {
@@ -236,16 +242,17 @@ mod tests {
                 let angle_rad = std::f64::consts::TAU * f64::from(index) / count;
                 Point { x_m: radius_m * angle_rad.cos(), y_m: radius_m * angle_rad.sin() }
             }).collect();
-            let ring = Ring::new(&corners);
+            let polygon = Polygon::new(&corners);
             // At the height of a corner, where a ray meets two sides at once.
             let y_m = if is_on_a_corner { corners[0].y_m } else { y_m };
             let point = Point { x_m, y_m };
-            let depth_m = ring.depth_m(point);
+            let depth_m = polygon.depth_m(point);
             prop_assert!((depth_m - plain(&corners, point)).abs() < 1.0e-12);
-            let border = ring.border_near(point);
+            let border = polygon.nearest_border_point(point);
             prop_assert!((border.distance_m(point) - depth_m.abs()).abs() < 1.0e-9);
-            prop_assert!(ring.depth_m(border).abs() < 1.0e-9);
-            prop_assert!(depth_m > 0.0 || ring.outside_at_least_m(point) <= -depth_m + 1.0e-9);
+            prop_assert!(polygon.depth_m(border).abs() < 1.0e-9);
+            let least_m = polygon.outside_distance_min_m(point);
+            prop_assert!(depth_m > 0.0 || least_m <= -depth_m + 1.0e-9);
         }
     }
 }
