@@ -199,7 +199,7 @@ impl Trial<'_> {
                 },
                 Some(_) | None => {}
             }
-            if self.under_way.is_empty() && self.bench.target_rests() && self.bench.stands() {
+            if self.under_way.is_empty() && self.bench.target_rests() && self.bench.is_standing() {
                 if let Some((_, speed_m_s, distance_m)) = since {
                     let allowed_m = speed_m_s * speed_m_s / (2.0 * braking_m_s2) + speed_m_s * 0.25;
                     let report = &mut *self.report;

@@ -19,7 +19,7 @@ use crate::control_loop::channels::{Shared, Snapshot};
 use crate::control_loop::standing::StandingReport;
 use crate::drive::ros2::notices::{ForeignCommands, RecentNotices};
 use crate::drive::ros2::refusal::Notice;
-use crate::drive::ros2::refusal::{Counts, Dropping, Source};
+use crate::drive::ros2::refusal::{Counts, DropMonitor, Source};
 use crate::fleet::{FleetLink, Identity};
 use crate::geometry::{wire_pose, wire_twist};
 use crate::knowledge::SiteCell;
@@ -237,7 +237,7 @@ pub(crate) async fn log_losses(
     base: Option<Arc<Counts>>,
     stop: CancellationToken,
 ) {
-    let (mut dropping, mut said) = (Dropping::default(), None);
+    let (mut drop_monitor, mut said) = (DropMonitor::default(), None);
     let (mut segments, mut blocks) = (0, 0);
     let mut recent_notices = [RecentNotices::default(); Notice::ALL.len()];
     let mut noticed = [const { None }; Notice::ALL.len()];
@@ -248,7 +248,7 @@ pub(crate) async fn log_losses(
             () = tokio::time::sleep(LOSSES_EVERY) => {}
             () = stop.cancelled() => return,
         }
-        let dropped = base.as_deref().and_then(|base| dropping.check(base));
+        let dropped = base.as_deref().and_then(|base| drop_monitor.check(base));
         // The count in it grows as long as there is something new.
         if let Some((_, text)) = dropped.as_ref().filter(|_| dropped != said) {
             warn!("{text}");

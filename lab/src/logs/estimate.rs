@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::time::Duration;
 
 use tread_agent::drive::{Feedback, SAMPLES_MAX};
-use tread_agent::testing::{Heard, Listener};
+use tread_agent::testing::{Listener, ListenerOutput};
 use tread_control::estimation::{Estimate, EstimatorPrior, NORMAL_95, ThetaMeasurement};
 use tread_control::robot::RobotModel;
 
@@ -64,20 +64,20 @@ impl Run<'_> {
     /// Runs one tick on the samples that wait.
     fn tick(&mut self, now: Duration, fed: &Fed) {
         let feedback = std::mem::take(&mut self.feedback);
-        let heard = self.listener.step(now, &feedback, fed.noise);
-        self.record(now, &heard);
+        let output = self.listener.step(now, &feedback, fed.noise);
+        self.record(now, &output);
     }
 
-    fn record(&mut self, now: Duration, heard: &Heard) {
+    fn record(&mut self, now: Duration, output: &ListenerOutput) {
         let outcome = &mut self.outcome;
-        outcome.estimate = heard.estimate;
-        outcome.ground_changes = heard.ground_changes;
-        if heard.findings.consequence().is_some() {
+        outcome.estimate = output.estimate;
+        outcome.ground_changes = output.ground_changes;
+        if output.findings.consequence().is_some() {
             outcome.contradicted_s += self.feeding.period.as_secs_f64();
-            let subjects = heard.findings.iter().map(|finding| finding.subject.text());
+            let subjects = output.findings.iter().map(|finding| finding.subject.text());
             outcome.contradicting.extend(subjects);
         }
-        if let Some(found) = heard.estimate.theta {
+        if let Some(found) = output.estimate.theta {
             let ratio = found.std_dev / found.theta;
             let (least, most) = outcome.std_dev_ratios.unwrap_or((ratio, ratio));
             outcome.std_dev_ratios = Some((least.min(ratio), most.max(ratio)));

@@ -7,7 +7,7 @@ use tread_control::estimation::ValueWithStdDev;
 use tread_control::tracking::ThetaKnowledge;
 
 use super::*;
-use crate::drive::ros2::inlet::topic_of;
+use crate::drive::ros2::topic_receiver::topic_of;
 
 fn codes(alerts: &[AlertReport]) -> Vec<&str> {
     alerts.iter().map(|alert| alert.code.as_str()).collect()
@@ -239,7 +239,7 @@ fn a_robot_that_does_not_stand_is_the_first_alert() {
         is_stopped: true,
         standing: StandingReport {
             is_to_stand: true,
-            does_not_stand: Some(Shown::Speed(0.59)),
+            does_not_stand: Some(MotionEvidence::Speed(0.59)),
             ..StandingReport::default()
         },
         ..Causes::default()
@@ -249,7 +249,7 @@ fn a_robot_that_does_not_stand_is_the_first_alert() {
     assert!(said[0].text.contains("0.59 m/s"), "{}", said[0].text);
     assert_eq!(said[0].severity, Severity::Critical);
     causes.standing.does_not_stand = None;
-    causes.standing.moves = Some(Shown::Distance(0.6));
+    causes.standing.moves = Some(MotionEvidence::Distance(0.6));
     let said = Alerts::default().judge(&causes);
     assert_eq!(codes(&said), ["moves-while-stopped", "stopped"]);
 }

@@ -103,7 +103,7 @@ pub(super) struct Ground {
 
 /// Effects of this tick's samples.
 #[derive(Debug, Default)]
-struct Taken {
+struct SampleEffects {
     ground_changed: bool,
     has_new_block: bool,
     unplaced_blocks: u64,
@@ -171,11 +171,11 @@ impl Estimation {
         let (tick, sensed) = (input.tick, input.sensed);
         let now = tick.now.monotonic;
         self.apply_noise(input.noise);
-        let taken = self.process_samples(sensed.samples());
+        let effects = self.process_samples(sensed.samples());
         self.measure_slip(sensed, tick);
         let retired = input.site.and_then(|site| self.replace_site(site));
         let ground_at_begin = self.ground();
-        let segment = self.cut_segment(tick, input.mission, taken.ground_changed);
+        let segment = self.cut_segment(tick, input.mission, effects.ground_changed);
         let pose = self.localisation.pose();
         let twist = self.localisation.twist();
         let closed = segment.as_ref().map(|segment| {
@@ -198,7 +198,7 @@ impl Estimation {
             estimate: self.estimate,
             ground: self.ground(),
             ground_at_begin,
-            ground_changed: taken.ground_changed,
+            ground_changed: effects.ground_changed,
             ground_changes: self.ground_changes,
             slips: self.slips,
             slip: self.slip.slip(),
@@ -209,7 +209,7 @@ impl Estimation {
                 Some(GroundUnderWheels::Mixed) | None => None,
             },
             closed,
-            unplaced_blocks: taken.unplaced_blocks,
+            unplaced_blocks: effects.unplaced_blocks,
             site: self.site.as_deref(),
         };
         let released = Released {
@@ -238,13 +238,13 @@ impl Estimation {
         });
     }
 
-    fn process_samples(&mut self, samples: &[CheckedSample]) -> Taken {
-        let mut taken = Taken::default();
+    fn process_samples(&mut self, samples: &[CheckedSample]) -> SampleEffects {
+        let mut effects = SampleEffects::default();
         for sample in samples {
             if !sample.shows_progress {
                 self.progress.suspend();
             }
-            self.process_motion(sample, &mut taken);
+            self.process_motion(sample, &mut effects);
             let Some(fix) = sample.fix else {
                 continue;
             };
@@ -259,13 +259,13 @@ impl Estimation {
                 FixOutcome::Invalid | FixOutcome::Outlier => {}
             }
         }
-        if taken.has_new_block {
+        if effects.has_new_block {
             self.estimate = self.estimator.estimate();
         }
-        taken
+        effects
     }
 
-    fn process_motion(&mut self, sample: &CheckedSample, taken: &mut Taken) {
+    fn process_motion(&mut self, sample: &CheckedSample, effects: &mut SampleEffects) {
         let Some((motion, dt_s)) = sample.motion else {
             return;
         };
@@ -282,12 +282,12 @@ impl Estimation {
             return;
         }
         let outcome = self.estimator.update(&motion, dt_s);
-        taken.ground_changed |= outcome.ground_changed;
+        effects.ground_changed |= outcome.ground_changed;
         self.ground_changes += u64::from(outcome.ground_changed);
-        taken.has_new_block |= outcome.block_done;
+        effects.has_new_block |= outcome.block_done;
         if outcome.block_done {
             self.slips = outcome.slips;
-            taken.unplaced_blocks += u64::from(self.cutter.cell().is_none());
+            effects.unplaced_blocks += u64::from(self.cutter.cell().is_none());
         }
     }
 

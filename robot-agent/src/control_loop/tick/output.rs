@@ -74,7 +74,7 @@ impl Output {
     }
 
     /// Whether the last tick commanded the wheels to zero and measured them near zero.
-    pub(super) fn stands(&self) -> bool {
+    pub(super) fn is_standing(&self) -> bool {
         self.stands
     }
 

@@ -195,7 +195,11 @@ impl Safety {
     ///
     /// A mission needs a position. A teleoperator sees the robot and may drive it slowly, inside a
     /// fence only if the agent's configuration allows it.
-    fn blindness(&self, input: &SafetyInput<'_>, wanted: &Wanted) -> (bool, Option<f64>) {
+    fn position_restriction(
+        &self,
+        input: &SafetyInput<'_>,
+        wanted: &Wanted,
+    ) -> (bool, Option<f64>) {
         let estimated = input.estimated;
         let is_lost = estimated.fault == Some(Fault::PositionLost)
             || estimated.pose.is_none()
@@ -226,7 +230,7 @@ impl Safety {
         };
         let is_driving = is_moving || input.followed.is_active || wanted.is_teleoperated;
         let (is_position_lost, blind_max_m_s) = if is_driving {
-            self.blindness(input, wanted)
+            self.position_restriction(input, wanted)
         } else {
             (false, None)
         };

@@ -41,12 +41,12 @@ pub enum Order {
 /// The writer of one topic.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct WriterWatch {
-    writer: Option<Heard>,
+    writer: Option<WriterState>,
     restart: Option<Restart>,
 }
 
 #[derive(Debug, Clone, Copy)]
-struct Heard {
+struct WriterState {
     gid: [u8; GID_BYTES],
     sequence: i64,
     /// Newest source time of all its messages, nanoseconds.
@@ -66,7 +66,7 @@ struct Restart {
     count: u32,
 }
 
-impl Heard {
+impl WriterState {
     fn knows(&self, message: &Attachment) -> bool {
         let known = &self.recent[..self.count.min(REMEMBERED)];
         known.contains(&(message.sequence, message.source_time_ns))
@@ -80,22 +80,22 @@ impl WriterWatch {
     /// [`Refusal::OutOfOrder`] for a repeated or older message, [`Refusal::SecondWriter`] for one
     /// of another writer while the topic's writer is active.
     pub fn check(&self, message: &Attachment, now: Duration) -> Result<Order, Refusal> {
-        let Some(heard) = &self.writer else {
+        let Some(state) = &self.writer else {
             return Ok(Order::Continues);
         };
-        let is_silent = now.saturating_sub(heard.at) >= SILENT_AFTER;
-        if heard.gid != message.gid {
+        let is_silent = now.saturating_sub(state.at) >= SILENT_AFTER;
+        if state.gid != message.gid {
             return if is_silent {
                 Ok(Order::Restarted)
             } else {
                 Err(Refusal::SecondWriter)
             };
         }
-        if message.sequence > heard.sequence {
+        if message.sequence > state.sequence {
             return Ok(Order::Continues);
         }
-        let went_on = message.source_time_ns > heard.source_time_ns;
-        if heard.knows(message) || !(went_on || is_silent) {
+        let went_on = message.source_time_ns > state.source_time_ns;
+        if state.knows(message) || !(went_on || is_silent) {
             return Err(Refusal::OutOfOrder);
         }
         let before = match &self.restart {
@@ -135,7 +135,7 @@ impl WriterWatch {
             gid,
         } = *message;
         let former = self.writer.filter(|_| order == Order::Continues);
-        let mut heard = former.unwrap_or(Heard {
+        let mut state = former.unwrap_or(WriterState {
             gid,
             sequence,
             source_time_ns,
@@ -143,13 +143,13 @@ impl WriterWatch {
             recent: [(0, 0); REMEMBERED],
             count: 0,
         });
-        heard.recent[heard.count % REMEMBERED] = (sequence, source_time_ns);
-        self.writer = Some(Heard {
+        state.recent[state.count % REMEMBERED] = (sequence, source_time_ns);
+        self.writer = Some(WriterState {
             sequence,
-            source_time_ns: heard.source_time_ns.max(source_time_ns),
+            source_time_ns: state.source_time_ns.max(source_time_ns),
             at: now,
-            count: heard.count + 1,
-            ..heard
+            count: state.count + 1,
+            ..state
         });
     }
 }

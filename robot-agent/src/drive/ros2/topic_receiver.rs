@@ -25,8 +25,8 @@ use crate::drive::Arrivals;
 /// topic.
 pub const WAITING_MAX: usize = 128;
 
-/// Receiver of every message as it arrived, besides the loop; must not block.
-pub trait Tap: std::fmt::Debug + Send + Sync {
+/// Observes every message as it arrived, in addition to the loop. Must not block.
+pub trait MessageObserver: std::fmt::Debug + Send + Sync {
     /// Called for each message, before any check.
     fn receive(
         &self,
@@ -45,9 +45,9 @@ struct Watched {
     stamps: Stamps,
 }
 
-/// The receiving end of one topic.
+/// Receiver of the messages of one topic.
 #[derive(Debug)]
-pub struct Inlet {
+pub struct TopicReceiver {
     source: Source,
     settings: Arc<Ros2Settings>,
     watched: Mutex<Watched>,
@@ -57,11 +57,11 @@ pub struct Inlet {
     /// Whether the topic's messages trigger the loop's ticks.
     is_pace: bool,
     clock: SharedClock,
-    tap: Option<Arc<dyn Tap>>,
+    observer: Option<Arc<dyn MessageObserver>>,
 }
 
-impl Inlet {
-    /// Creates the inlets of all topics that the settings name.
+impl TopicReceiver {
+    /// Creates the receivers of all topics that the settings name.
     pub fn all(
         settings: &Arc<Ros2Settings>,
         counts: &Arc<Counts>,
@@ -74,7 +74,7 @@ impl Inlet {
             .joints
             .as_ref()
             .map_or(Source::Odometry, |_| Source::Joints);
-        let inlet = |source| Self {
+        let receiver = |source| Self {
             source,
             settings: Arc::clone(settings),
             watched: Mutex::new(Watched {
@@ -94,19 +94,19 @@ impl Inlet {
             arrivals: Arc::clone(arrivals),
             is_pace: source == pace,
             clock: Arc::clone(clock),
-            tap: None,
+            observer: None,
         };
         Source::ALL
             .into_iter()
             .filter(|source| topic_of(settings, *source).is_some())
-            .map(inlet)
+            .map(receiver)
             .collect()
     }
 
-    /// Sets a receiver of every message.
+    /// Sets an observer of every message.
     #[must_use]
-    pub fn with_tap(mut self, tap: Option<Arc<dyn Tap>>) -> Self {
-        self.tap = tap;
+    pub fn with_observer(mut self, observer: Option<Arc<dyn MessageObserver>>) -> Self {
+        self.observer = observer;
         self
     }
 
@@ -137,7 +137,7 @@ impl Inlet {
                 if self.to_loop.try_send(arrived).is_err() {
                     self.counts.refuse(self.source, Refusal::Overflow);
                 } else if self.is_pace {
-                    self.arrivals.ring();
+                    self.arrivals.notify();
                 }
             }
             Err(refusal) => {
@@ -161,8 +161,8 @@ impl Inlet {
             monotonic: self.clock.monotonic(),
             wall_ns: self.clock.host_wall_ns(),
         };
-        if let Some(tap) = &self.tap {
-            tap.receive(self.source, arrival, key, attachment, payload);
+        if let Some(observer) = &self.observer {
+            observer.receive(self.source, arrival, key, attachment, payload);
         }
         let writer = match self.settings.bus.scheme {
             Scheme::Ros2Dds => None,
