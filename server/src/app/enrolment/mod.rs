@@ -32,7 +32,7 @@ use tread_api::robot::Alert;
 use self::registry::EnrolmentRegistry;
 use self::revoked_robots::RevokedRobots;
 pub(super) use self::revoked_robots::{RETIRED_ALERT, REVOKED_ALERT, UNISSUED_ALERT};
-use self::rotation::Shown;
+use self::rotation::RecordedCertificates;
 use super::identity::new_secret;
 use super::identity::quota::{Count, Quota};
 use super::identity::tokens::{DEAD_KEPT, FORGET_MAX};
@@ -69,7 +69,7 @@ pub(super) struct Membership {
     pub(super) registry: Arc<EnrolmentRegistry>,
     service: Option<EnrolmentService>,
     revoked_robots: RevokedRobots,
-    shown: Shown,
+    shown: RecordedCertificates,
 }
 
 impl Membership {
@@ -83,7 +83,7 @@ impl Membership {
             registry,
             service,
             revoked_robots: RevokedRobots::default(),
-            shown: Shown::default(),
+            shown: RecordedCertificates::default(),
         }
     }
 }

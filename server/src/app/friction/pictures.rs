@@ -38,7 +38,7 @@ pub(super) struct State {
 }
 
 #[derive(Debug, Clone)]
-struct Kept {
+struct CachedPicture {
     state: State,
     picture: Picture,
     used: u64,
@@ -48,7 +48,7 @@ struct Kept {
 struct PictureCache {
     clock: u64,
     bytes: usize,
-    kept: HashMap<String, Kept>,
+    kept: HashMap<String, CachedPicture>,
 }
 
 /// Cache of pictures and of fused blocks.
@@ -75,7 +75,7 @@ impl Pictures {
         }
         let mut held = self.cache.lock().unwrap_or_else(PoisonError::into_inner);
         let used = held.clock;
-        let kept = Kept {
+        let kept = CachedPicture {
             state,
             picture,
             used,

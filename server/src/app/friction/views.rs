@@ -18,17 +18,17 @@ const KEPT_MAX: usize = 1_000;
 /// The cache.
 #[derive(Debug, Default)]
 pub(in crate::app) struct Views {
-    sites: Kept<SiteId, SiteView>,
-    robots: Kept<(i64, RobotId), RobotRow>,
+    sites: GenerationCache<SiteId, SiteView>,
+    robots: GenerationCache<(i64, RobotId), RobotRow>,
 }
 
 /// Values read at one generation of the database.
 #[derive(Debug)]
-struct Kept<K, V> {
+struct GenerationCache<K, V> {
     of: Mutex<(u64, HashMap<K, Arc<V>>)>,
 }
 
-impl<K, V> Default for Kept<K, V> {
+impl<K, V> Default for GenerationCache<K, V> {
     fn default() -> Self {
         Self {
             of: Mutex::default(),
@@ -36,7 +36,7 @@ impl<K, V> Default for Kept<K, V> {
     }
 }
 
-impl<K: Eq + Hash, V> Kept<K, V> {
+impl<K: Eq + Hash, V> GenerationCache<K, V> {
     fn find(&self, generation: u64, key: &K) -> Option<Arc<V>> {
         let of = self.of.lock().unwrap_or_else(PoisonError::into_inner);
         (of.0 == generation).then(|| of.1.get(key).cloned())?

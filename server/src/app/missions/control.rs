@@ -42,15 +42,15 @@ impl App {
 
     /// Requests that an active mission is paused, with the robot stopped.
     pub async fn pause_mission(&self, id: MissionId) -> Result<MissionDetail, AppError> {
-        self.want_pause(id, true).await
+        self.request_pause(id, true).await
     }
 
     /// Requests that a paused mission is resumed.
     pub async fn resume_mission(&self, id: MissionId) -> Result<MissionDetail, AppError> {
-        self.want_pause(id, false).await
+        self.request_pause(id, false).await
     }
 
-    async fn want_pause(&self, id: MissionId, wanted: bool) -> Result<MissionDetail, AppError> {
+    async fn request_pause(&self, id: MissionId, wanted: bool) -> Result<MissionDetail, AppError> {
         let (asked, cause) = if wanted {
             ("paused", Cause::PauseRequested)
         } else {

@@ -10,11 +10,11 @@
 pub(super) mod attendance;
 pub(super) mod conditions;
 pub(super) mod delays;
-mod foreign;
 mod jobs;
 pub mod needs;
 mod outcomes;
 mod periodic_checks;
+mod unknown_missions;
 
 use std::collections::{HashMap, HashSet};
 use std::sync::atomic::Ordering;
@@ -32,11 +32,11 @@ use tread_api::stop::Stop;
 use self::attendance::Attendance;
 use self::conditions::Conditions;
 use self::delays::Delays;
-use self::foreign::cancel_foreign_mission;
 use self::jobs::{
     Finished, adopt_reported_revision, cancel, hold, offer, replace, send_offer, settle, stop_again,
 };
 use self::needs::{Memory, Need, Now, Silence, decide, is_absent, is_heard, is_held_otherwise};
+use self::unknown_missions::cancel_foreign_mission;
 use super::missions::transitions::Change;
 use super::{App, AppError};
 use crate::app::presence::RobotKey;
@@ -362,8 +362,8 @@ impl Reconciler {
         }
     }
 
-    /// Returns what may be decided about a mission of a robot that is restrained.
-    fn restrain(&self, key: &RobotKey, heard: bool, need: Need) -> Need {
+    /// Returns the action for a mission; [`Need::Wait`] in place of one that a restoration forbids.
+    fn defer_if_restricted(&self, key: &RobotKey, heard: bool, need: Need) -> Need {
         let Some(restrained) = self.restrained.get(key) else {
             return need;
         };
@@ -477,7 +477,7 @@ impl Reconciler {
         let memory = *memory;
         let app = self.app.clone();
         let need = decide(&mission, &presence, memory, now);
-        let need = self.restrain(&key, heard, need);
+        let need = self.defer_if_restricted(&key, heard, need);
         // A command that is wanted again later does not inherit the back-off of the earlier one.
         for (held, wanted) in [(true, Need::Pause), (false, Need::Resume)] {
             if need != wanted {

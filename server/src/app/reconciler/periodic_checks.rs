@@ -7,9 +7,9 @@ use std::time::Duration;
 use tread_api::ids::SiteId;
 use tread_api::rights::Scope;
 
-use super::foreign::end_duplicate_agent;
 use super::jobs::{push_site, settle};
 use super::needs::{Need, is_heard};
+use super::unknown_missions::end_duplicate_agent;
 use super::{Job, Reconciler, key_of, outcomes};
 use crate::app::AppError;
 use crate::app::missions::transitions::Change;
@@ -116,7 +116,7 @@ impl Reconciler {
             let key = (mission.site.clone(), mission.robot.clone());
             let heard = is_heard(&self.app.presences().get(&key), self.app.clock().elapsed());
             let expires = Need::Settle(Change::Expire);
-            if self.restrain(&key, heard, expires) != expires {
+            if self.defer_if_restricted(&key, heard, expires) != expires {
                 continue;
             }
             settle(&self.app, &mission, Change::Expire, Duration::ZERO).await?;
