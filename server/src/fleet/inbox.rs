@@ -15,7 +15,7 @@ use zenoh::sample::SampleKind;
 use zenoh::{Session, Wait as _};
 
 use super::gate::{CUT_OFF, Links};
-use super::rate_limits::{Appeared, Kind, Place, RateLimits};
+use super::rate_limits::{Kind, Place, RateLimits, TokenVerdict};
 use super::received::{
     LimitedQuery, RefusedMessage, count_refusal, explained, log_refusal, next, refuse_key,
 };
@@ -164,9 +164,9 @@ impl Channels {
         let (place, now) = ((key.to_owned(), router), self.app.clock().elapsed());
         let is_taken = if appeared {
             match self.limits.token_appeared(&robot, place, now) {
-                Appeared::Taken => true,
-                Appeared::Refused => false,
-                Appeared::Excessive => {
+                TokenVerdict::Accepted => true,
+                TokenVerdict::Refused => false,
+                TokenVerdict::Excessive => {
                     self.cut_off(&robot, now);
                     false
                 }

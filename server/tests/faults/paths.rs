@@ -25,7 +25,7 @@ use tread_server::db::idempotency::StoredAnswer;
 use tread_server::db::missions::{Facts, Transition};
 use tread_server::db::restorations::Restoration;
 use tread_server::db::robots::Introduction;
-use tread_server::db::sessions::{NewSession, OfPeople, Owner, SignedIn};
+use tread_server::db::sessions::{NewSession, Owner, PeopleSessionFilter, SignedIn};
 use tread_server::db::webhooks::{AgeLimit, NewDelivery, Outcome};
 use tread_server::db::withdrawals::{Hours, WithdrawalRow};
 use tread_server::db::{self, RecordKey};
@@ -486,7 +486,7 @@ pub(crate) const PATHS: &[WritePath] = &[
                     created_at: now(),
                     expires_at: later(),
                 };
-                let filter = OfPeople {
+                let filter = PeopleSessionFilter {
                     issuer,
                     within: &["operators"],
                     elsewhere: &[],

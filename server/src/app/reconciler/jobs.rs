@@ -38,7 +38,7 @@ pub(super) enum Finished {
 
 /// Changes a mission's state without a report of its robot, which has shown that state for a time if it is
 /// the robot's.
-pub(super) async fn settle(
+pub(super) async fn apply_change(
     app: &App,
     mission: &OpenMission,
     change: Change,
