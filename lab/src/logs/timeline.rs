@@ -54,7 +54,7 @@ impl Clock {
 
 /// A sample of the loop, and the noise that covariances state at its time.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Fed {
+pub struct LoopInput {
     /// The sample.
     pub sample: SensorSample,
     /// Stated noise.
@@ -65,7 +65,7 @@ pub struct Fed {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Timeline {
     /// The samples.
-    pub fed: Vec<Fed>,
+    pub fed: Vec<LoopInput>,
     /// The clock of each topic.
     pub clocks: Vec<(Source, Clock)>,
     /// Wheel speeds that were interpolated.
@@ -151,7 +151,7 @@ pub fn assemble(
     }
 }
 
-fn samples(arrived: &[Arrived], settings: &Ros2Settings) -> Vec<Fed> {
+fn samples(arrived: &[Arrived], settings: &Ros2Settings) -> Vec<LoopInput> {
     let mut assembler = Assembler::new(settings);
     let mut fed = Vec::with_capacity(arrived.len());
     for one in arrived {
@@ -162,7 +162,7 @@ fn samples(arrived: &[Arrived], settings: &Ros2Settings) -> Vec<Fed> {
             feedback
                 .samples()
                 .iter()
-                .map(|&sample| Fed { sample, noise }),
+                .map(|&sample| LoopInput { sample, noise }),
         );
     }
     fed
