@@ -294,11 +294,11 @@ async fn alerts_and_stops_are_the_same() {
         both!(both, stops::insert(&[stop(6, "yard", "rover-1", 9), stop(7, "yard", "rover-2", 9)], 3));
         both!(both, stops::in_force());
         both!(both, stops::confirm(&[id(6), id(7)], at(1)));
-        both!(both, stops::stand(id(6), at(1)));
+        both!(both, stops::record_standstill(id(6), at(1)));
         both!(both, stops::unconfirm(id(7)));
-        both!(both, stops::ask_clear(id(6), "ben", at(2)));
+        both!(both, stops::request_clear(id(6), "ben", at(2)));
         both!(both, stops::refuse_clear(id(6)));
-        both!(both, stops::ask_clear(id(6), "ben", at(20)));
+        both!(both, stops::request_clear(id(6), "ben", at(20)));
         both!(both, stops::clear(id(6), at(3)));
         both!(both, stops::end(id(7), at(3)));
         both!(both, stops::adopt(1, &stop(3, "yard", "rover-1", 7), 2));
@@ -391,7 +391,7 @@ async fn missions_and_restorations_are_the_same() {
         };
         both!(both, missions::add_facts(id(2), facts));
         both!(both, missions::set_silence(id(2), Some(at(3))));
-        both!(both, missions::want_pause(id(1), true));
+        both!(both, missions::set_pause_wanted(id(1), true));
         both_in_any_order!(both, missions::in_progress());
         both!(both, missions::open_of_robot(1));
         assert!(both!(both, missions::swap_content(id(2), 1, &replacement)));
@@ -534,8 +534,8 @@ async fn identities_are_the_same() {
                 "revoked_at": null}));
             both!(both, join_tokens::insert(&token, &secret(number)));
         }
-        assert!(both!(both, join_tokens::use_up(id(1), &robot("rover-1"), at(-1))));
-        assert!(!both!(both, join_tokens::use_up(id(1), &robot("rover-1"), at(1))));
+        assert!(both!(both, join_tokens::consume(id(1), &robot("rover-1"), at(-1))));
+        assert!(!both!(both, join_tokens::consume(id(1), &robot("rover-1"), at(1))));
         both!(both, join_tokens::revoke(id(2), at(-1)));
         for scope in scopes() {
             both!(both, join_tokens::list(&scope, Some(id(3)), 10));

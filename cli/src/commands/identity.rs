@@ -35,10 +35,10 @@ pub(super) async fn login(connection: &Connection, output: Output) -> anyhow::Re
     let session = client.session().await?;
     let store = store()?;
     let key = client.address();
-    store.keep(Entry { key, value: &token })?;
+    store.save(Entry { key, value: &token })?;
     if let Some(fingerprint) = authentication.ca_fingerprint {
         let value = &fingerprint.to_string();
-        store.fingerprints().keep(Entry { key, value })?;
+        store.fingerprints().save(Entry { key, value })?;
     }
     store.keep_last_server(client.address())?;
     print_note(&format!(

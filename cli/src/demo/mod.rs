@@ -138,7 +138,7 @@ impl SignedIn {
             key: client.address(),
             value: &token,
         };
-        let store = Store::of_user().filter(|store| match store.keep(entry) {
+        let store = Store::of_user().filter(|store| match store.save(entry) {
             Ok(()) => true,
             Err(error) => {
                 print_note(&format!("other commands need --token-file: {error:#}"));

@@ -240,7 +240,7 @@ impl App {
         found
             .filter(|stop| (&stop.site, &stop.robot) == (site, robot))
             .ok_or(AppError::UnknownStop(id))?;
-        db::stops::ask_clear(&mut tx, id, &by, self.clock().now()).await?;
+        db::stops::request_clear(&mut tx, id, &by, self.clock().now()).await?;
         self.commit_recalling(tx).await?;
         let unreachable = || AppError::RobotUnreachable(robot.clone());
         let command = ClearStop { stop: id, by };

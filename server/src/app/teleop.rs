@@ -169,7 +169,7 @@ impl App {
         self.known_robot(site, robot).await?;
         Ok(Session {
             app: self.clone(),
-            _attended: self.supervisor().attend(),
+            _attended: self.supervisor().task_token(),
             _watch: self.watched().begin((site.clone(), robot.clone())),
             key: (site.clone(), robot.clone()),
             client: Uuid::new_v4(),

@@ -251,11 +251,11 @@ impl Provider {
         if let Some(url) = endpoints.into_iter().flatten().find(in_the_clear) {
             return Err(DiscoverError::ClearText(url.to_string()));
         }
-        self.keep(found);
+        self.set_metadata(found);
         Ok(())
     }
 
-    fn keep(&self, found: ProviderMetadataWithLogout) {
+    fn set_metadata(&self, found: ProviderMetadataWithLogout) {
         let mut known = self.known.write().unwrap_or_else(PoisonError::into_inner);
         *known = Some(Arc::new(found));
     }
@@ -425,7 +425,7 @@ impl Provider {
             ExchangeError::KeysUnknown
         })?;
         *asked = KeysAsked(Some((now, true)));
-        self.keep((*present).clone().set_jwks(keys));
+        self.set_metadata((*present).clone().set_jwks(keys));
         Ok(self.metadata())
     }
 }

@@ -58,7 +58,7 @@ pub async fn run(app: App, stop: CancellationToken) {
 
 impl App {
     /// Subscribes to changes of maps from now on.
-    pub fn map_news(&self) -> broadcast::Receiver<MapChange> {
+    pub fn map_changes(&self) -> broadcast::Receiver<MapChange> {
         self.map_updates().0.subscribe()
     }
 

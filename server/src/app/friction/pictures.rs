@@ -68,7 +68,7 @@ impl Pictures {
         (found.state == state).then(|| found.picture.clone())
     }
 
-    fn keep(&self, key: String, state: State, picture: Picture) {
+    fn insert(&self, key: String, state: State, picture: Picture) {
         let size = picture.bytes.len();
         if size > KEPT_BYTES_MAX / 4 {
             return;
@@ -125,7 +125,7 @@ impl App {
             raster.squares = Vec::new();
             let of = Arc::new(raster);
             let picture = Picture { bytes, of };
-            app.pictures().keep(key, state, picture.clone());
+            app.pictures().insert(key, state, picture.clone());
             Ok(picture)
         };
         self.read_map(&row, [reading], drawing).await

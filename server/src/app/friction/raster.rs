@@ -75,7 +75,7 @@ impl Blocks {
         Some(found.clone())
     }
 
-    fn keep(&self, key: BlockKey, kept: CachedBlock) {
+    fn insert(&self, key: BlockKey, kept: CachedBlock) {
         let mut inner = self.inner.lock().unwrap_or_else(PoisonError::into_inner);
         let (_, blocks) = &mut *inner;
         if blocks.len() >= BLOCKS_MAX && !blocks.contains_key(&key) {
@@ -170,7 +170,7 @@ impl Frame<'_> {
                 squares: Arc::clone(&squares),
                 used: 0,
             };
-            app.pictures().blocks.keep(key, kept);
+            app.pictures().blocks.insert(key, kept);
         }
         Ok(squares)
     }

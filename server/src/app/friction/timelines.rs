@@ -67,7 +67,7 @@ impl Timelines {
         Some(found)
     }
 
-    fn keep(&self, new: CachedTimeline) {
+    fn insert(&self, new: CachedTimeline) {
         let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
         let same = |kept: &CachedTimeline| {
             (kept.of.site_pk, kept.of.epoch) == (new.of.site_pk, new.of.epoch)
@@ -159,11 +159,11 @@ impl App {
             let adding = move || kept.with(&rows, &withdrawals);
             kept = self.compute(adding).await;
             if batch % KEPT_EVERY == 0 {
-                self.timelines().keep(kept.clone());
+                self.timelines().insert(kept.clone());
             }
         }
         drop(tx);
-        self.timelines().keep(kept.clone());
+        self.timelines().insert(kept.clone());
         Ok(is_whole(&kept).then_some(kept.timeline))
     }
 }

@@ -413,7 +413,7 @@ impl CredentialCache {
 
     /// Caches a credential looked up at `generation`. Returns `None` if the generation has changed
     /// since; the look-up must be repeated.
-    pub(super) fn keep(
+    pub(super) fn insert(
         &self,
         secret: Fingerprint,
         credential: Credential,

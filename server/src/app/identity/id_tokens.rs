@@ -26,7 +26,7 @@ impl IdTokens {
     }
 
     /// Keeps a session's ID token; beyond the maximum the oldest is dropped.
-    pub(super) fn keep(&self, session: SessionId, id_token: String) {
+    pub(super) fn insert(&self, session: SessionId, id_token: String) {
         let mut kept = self.lock();
         kept.of.insert(session, id_token);
         kept.order.push_back(session);

@@ -351,7 +351,7 @@ impl App {
             let generation = known.generation();
             let credential = self.kept(secret).await?;
             let now = self.clock().now();
-            if let Some(kept) = known.keep(fingerprint, credential, generation, now) {
+            if let Some(kept) = known.insert(fingerprint, credential, generation, now) {
                 return Ok(kept);
             }
         }

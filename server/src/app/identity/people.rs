@@ -249,7 +249,7 @@ impl People {
     }
 
     /// Records a completed sign-in; returns false if its state was used before.
-    fn use_up(&self, state: &str) -> bool {
+    fn consume_state(&self, state: &str) -> bool {
         let mut used = self.used.lock().unwrap_or_else(PoisonError::into_inner);
         if !used.states.insert(state.to_owned()) {
             return false;
@@ -400,7 +400,7 @@ impl App {
                 PersonError::NotBelieved
             }
         })?;
-        if !people.use_up(&pending.state) {
+        if !people.consume_state(&pending.state) {
             return Err(PersonError::NotBegun);
         }
         let mut signed_in = people.signed_in(&there)?;
@@ -410,7 +410,7 @@ impl App {
         let opened = self.open_session_of(Owner::Person(signed_in), expires_at);
         let (credential, secret) = opened.await?.ok_or(PersonError::NotBelieved)?;
         if let (Some(session), Some(id_token)) = (credential.session, there.id_token) {
-            people.id_tokens.keep(session, id_token);
+            people.id_tokens.insert(session, id_token);
         }
         Ok((credential, secret))
     }

@@ -79,7 +79,9 @@ impl App {
                 what: "pause a mission",
             });
         }
-        if mission.pause_wanted != wanted && db::missions::want_pause(&mut tx, id, wanted).await? {
+        if mission.pause_wanted != wanted
+            && db::missions::set_pause_wanted(&mut tx, id, wanted).await?
+        {
             let why = (Actor::Client, cause);
             let reason = format!("to be {asked}");
             add_note(&mut tx, mission, why, self.clock().now(), &reason).await?;
@@ -176,7 +178,7 @@ pub(in crate::app) async fn hold_all(
     at: Timestamp,
 ) -> Result<(), DbError> {
     for open in db::missions::open_of_robot(tx, robot_pk).await? {
-        if !open.pause_wanted && db::missions::want_pause(tx, open.id, true).await? {
+        if !open.pause_wanted && db::missions::set_pause_wanted(tx, open.id, true).await? {
             let event = MissionEvent {
                 at,
                 actor: Actor::Server,

@@ -64,7 +64,7 @@ pub(super) async fn apply_change(
         let since = app.clock().now() - shown_for;
         // Only a person resumes it, or has done so already.
         if !was_resumed_since(&mut tx, mission.id, since).await? {
-            db::missions::want_pause(&mut tx, mission.id, true).await?;
+            db::missions::set_pause_wanted(&mut tx, mission.id, true).await?;
         }
     }
     if let Some(state) = moved

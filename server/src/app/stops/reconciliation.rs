@@ -53,7 +53,7 @@ impl App {
                 db::stops::unconfirm(&mut tx, stop.id).await?;
             }
             for id in standing {
-                db::stops::stand(&mut tx, id, now).await?;
+                db::stops::record_standstill(&mut tx, id, now).await?;
             }
             for id in cleared {
                 db::stops::clear(&mut tx, id, now).await?;

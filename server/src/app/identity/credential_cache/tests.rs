@@ -32,7 +32,7 @@ fn a_look_up_that_began_before_an_end_is_not_kept_after_it() {
     let known = CredentialCache::default();
     let generation = known.generation();
     known.end(|_| false);
-    let late = known.keep(secret(1), credential(time(9)), generation, time(1));
+    let late = known.insert(secret(1), credential(time(9)), generation, time(1));
     assert!(late.is_none());
     assert!(known.find(&secret(1), time(1)).is_none());
 }
@@ -43,7 +43,7 @@ fn a_credential_that_expires_or_is_ended_is_gone_and_its_requests_are_cancelled(
     let keep = |byte| {
         let generation = known.generation();
         known
-            .keep(secret(byte), credential(time(9)), generation, time(1))
+            .insert(secret(byte), credential(time(9)), generation, time(1))
             .unwrap()
     };
     let (first, second) = (keep(1), keep(2));
@@ -59,7 +59,7 @@ fn a_credential_that_expires_or_is_ended_is_gone_and_its_requests_are_cancelled(
 fn what_is_no_longer_valid_ends_and_what_is_valid_is_known_without_being_shown() {
     let known = CredentialCache::default();
     let generation = known.generation();
-    let gone = known.keep(secret(1), credential(time(9)), generation, time(1));
+    let gone = known.insert(secret(1), credential(time(9)), generation, time(1));
     let later = Duration::from_secs(1);
     let valid = || {
         let credential = credential(time(9));
