@@ -28,7 +28,7 @@ const OUTBOX_LONG: (u64, u64) = (50_000, 25_000);
 
 /// Inputs of the alerts.
 #[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct Causes<'a> {
+pub(crate) struct AlertInputs<'a> {
     pub(crate) battery: Option<Battery>,
     pub(crate) fault: Option<Fault>,
     pub(crate) is_stopped: bool,
@@ -209,7 +209,7 @@ fn fault_alert(fault: Fault, base: Option<&Counts>) -> Option<AlertReport> {
 
 impl Alerts {
     /// Returns the alerts that are raised now.
-    pub(crate) fn judge(&mut self, causes: &Causes<'_>) -> Vec<AlertReport> {
+    pub(crate) fn judge(&mut self, causes: &AlertInputs<'_>) -> Vec<AlertReport> {
         let charge = causes.battery.map(|battery| battery.charge_ratio);
         self.battery_low =
             charge.is_some_and(|charge| is_below(charge, self.battery_low, BATTERY_LOW));

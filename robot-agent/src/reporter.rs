@@ -13,7 +13,7 @@ use tread_api::safety::{self, GateCount, GateStatus, SafetyStatus, StandingState
 use tread_api::wire::state::{FrictionReport, RobotState};
 use tread_control::gate::GateCause;
 
-use crate::alerts::{Alerts, Causes};
+use crate::alerts::{AlertInputs, Alerts};
 use crate::clock::SharedClock;
 use crate::control_loop::channels::{Shared, Snapshot};
 use crate::control_loop::standing::StandingReport;
@@ -103,7 +103,7 @@ impl Reporter {
         let snapshot = self.shared.snapshot();
         let now = self.clock.monotonic();
         let (outbox, outbox_damage) = (self.outbox.status(), self.outbox.damage());
-        let causes = Causes {
+        let causes = AlertInputs {
             battery: snapshot.battery,
             fault: snapshot.fault,
             is_stopped: self.shared.safety.stop() != 0,

@@ -47,12 +47,12 @@ const NAME: (&str, &str) = ("tread-", ".mcap");
 
 /// A file that counts the bytes written to it.
 #[derive(Debug)]
-struct Counted {
+struct CountingFile {
     file: BufWriter<File>,
     bytes: Arc<AtomicU64>,
 }
 
-impl Write for Counted {
+impl Write for CountingFile {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let written = self.file.write(bytes)?;
         self.bytes.fetch_add(written as u64, Ordering::Relaxed);
@@ -66,7 +66,7 @@ impl Write for Counted {
 
 /// A record that is being written.
 struct OpenRecord {
-    writer: Writer<NoSeek<Counted>>,
+    writer: Writer<NoSeek<CountingFile>>,
     channels: BTreeMap<&'static str, (u16, u32)>,
     bytes: Arc<AtomicU64>,
     flushed: Duration,
@@ -149,7 +149,7 @@ pub(super) fn ros_channel<W: Write + Seek>(
 impl OpenRecord {
     fn create(path: &Path, now: Duration) -> Result<Self, McapError> {
         let bytes = Arc::new(AtomicU64::new(0));
-        let counted = Counted {
+        let counted = CountingFile {
             file: BufWriter::new(File::create_new(path)?),
             bytes: Arc::clone(&bytes),
         };

@@ -14,7 +14,7 @@ use tread_control::robot::RobotModel;
 use tread_control::slip::BodyVelocity;
 use tread_control::tracking::ThetaKnowledge;
 
-use super::sensing::{CheckedSample, Sensed};
+use super::sensing::{CheckedSample, SensingOutput};
 use super::{Tick, age_s};
 use crate::control_loop::channels::{ClosedSegment, Fault};
 use crate::control_loop::gain::GroundRecord;
@@ -36,7 +36,7 @@ const POSITION_LOST_AFTER: Duration = Duration::from_secs(3);
 #[derive(Debug)]
 pub(super) struct EstimationInput<'tick> {
     pub(super) tick: Tick,
-    pub(super) sensed: &'tick Sensed,
+    pub(super) sensed: &'tick SensingOutput,
     /// Noise that the base states for its sensors.
     pub(super) noise: StatedNoise,
     /// A new definition of the site.
@@ -47,7 +47,7 @@ pub(super) struct EstimationInput<'tick> {
 
 /// Output of the stage.
 #[derive(Debug)]
-pub(super) struct Estimated<'tick> {
+pub(super) struct EstimationOutput<'tick> {
     pub(super) pose: Option<Pose>,
     pub(super) twist: Twist,
     pub(super) position_std_dev_m: f64,
@@ -167,7 +167,7 @@ impl Estimation {
     }
 
     /// Localises the robot, updates the estimator, and closes the segment where required.
-    pub(super) fn step(&mut self, input: EstimationInput<'_>) -> (Estimated<'_>, Released) {
+    pub(super) fn step(&mut self, input: EstimationInput<'_>) -> (EstimationOutput<'_>, Released) {
         let (tick, sensed) = (input.tick, input.sensed);
         let now = tick.now.monotonic;
         self.apply_noise(input.noise);
@@ -182,7 +182,7 @@ impl Estimation {
             let statistics = &segment.statistics;
             (statistics.theta_information, statistics.theta_weighted)
         });
-        let estimated = Estimated {
+        let estimated = EstimationOutput {
             pose,
             twist,
             position_std_dev_m: self.localisation.position_std_dev_m(),
@@ -306,7 +306,7 @@ impl Estimation {
     }
 
     /// Updates the slip of each side; undefined while the base is silent.
-    fn measure_slip(&mut self, sensed: &Sensed, tick: Tick) {
+    fn measure_slip(&mut self, sensed: &SensingOutput, tick: Tick) {
         let now = tick.now.monotonic;
         let is_silent = sensed.is_base_silent
             || age_s(now, sensed.last_sample) > self.silent_after.as_secs_f64();
@@ -381,7 +381,7 @@ impl Estimation {
         cut.segment
     }
 
-    fn fault(&self, sensed: &Sensed, now: Duration) -> Option<Fault> {
+    fn fault(&self, sensed: &SensingOutput, now: Duration) -> Option<Fault> {
         let is_older = |at: Option<Duration>, most: Duration| {
             at.is_some_and(|at| now.saturating_sub(at) > most)
         };
@@ -418,6 +418,6 @@ impl Ground {
 /// Returns the best known speed along the path, m/s: odometry over ground if recent and
 /// uncontradicted, otherwise the localisation's, which is wrong under slip until position fixes
 /// correct it.
-pub(super) fn real_m_s(sensed: &Sensed, twist: Twist, now: Duration) -> f64 {
+pub(super) fn real_m_s(sensed: &SensingOutput, twist: Twist, now: Duration) -> f64 {
     sensed.odometry_m_s(now).unwrap_or(twist.linear_m_s)
 }

@@ -17,8 +17,8 @@ use tread_control::tracking::{ThetaKnowledge, TrackingErrors};
 
 use super::Tick;
 use super::demands::Demands;
-use super::estimation::{Estimated, Released};
-use super::sensing::Sensed;
+use super::estimation::{EstimationOutput, Released};
+use super::sensing::SensingOutput;
 use crate::control_loop::BRAKING_MAX;
 use crate::control_loop::active::{Active, PauseChange, progress_of};
 use crate::control_loop::channels::{ClosedSegment, EndReason, Hold, LoopCommand, LoopEvent};
@@ -45,8 +45,8 @@ pub(super) struct CommandEffects {
 #[derive(Debug)]
 pub(super) struct MissionInput<'tick> {
     pub(super) tick: Tick,
-    pub(super) sensed: &'tick Sensed,
-    pub(super) estimated: &'tick Estimated<'tick>,
+    pub(super) sensed: &'tick SensingOutput,
+    pub(super) estimated: &'tick EstimationOutput<'tick>,
     pub(super) demands: &'tick Demands,
     /// Whether the mission began in this tick.
     pub(super) has_begun: bool,
@@ -56,7 +56,7 @@ pub(super) struct MissionInput<'tick> {
 
 /// Output of the stage.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Followed {
+pub(super) struct MissionOutput {
     /// Wheel speeds of the mission; `None` without a mission or while the base is silent.
     pub(super) wanted: Option<WheelSpeeds>,
     /// Whether there is a mission.
@@ -71,8 +71,8 @@ pub(super) struct Followed {
 #[derive(Debug)]
 pub(super) struct RecordInput<'tick> {
     pub(super) tick: Tick,
-    pub(super) sensed: &'tick Sensed,
-    pub(super) estimated: &'tick Estimated<'tick>,
+    pub(super) sensed: &'tick SensingOutput,
+    pub(super) estimated: &'tick EstimationOutput<'tick>,
     /// Cause for which the gate reduced the command.
     pub(super) gate: Option<GateCause>,
 }
@@ -220,7 +220,7 @@ impl MissionStage {
         input: &MissionInput<'_>,
         released: Released,
         events: &mut Outgoing,
-    ) -> Followed {
+    ) -> MissionOutput {
         let (tick, estimated) = (input.tick, input.estimated);
         let now = tick.now.monotonic;
         let server_silence = input.demands.server_silence;
@@ -235,7 +235,7 @@ impl MissionStage {
         let wanted = self.follow(input, events);
         let active = self.active.as_ref();
         let beyond_braking = server_silence.saturating_sub(BRAKING_MAX);
-        Followed {
+        MissionOutput {
             wanted,
             is_active: active.is_some(),
             rests: active.is_none_or(Active::rests),
@@ -245,7 +245,7 @@ impl MissionStage {
     }
 
     /// Initialises the tracking law with the knowledge of the ground where the mission begins.
-    fn warm_start(&mut self, estimated: &Estimated<'_>) {
+    fn warm_start(&mut self, estimated: &EstimationOutput<'_>) {
         if let Some(active) = &mut self.active
             && let Some(knowledge) = estimated.ground_at_begin.with(&active.job.prior).given
         {

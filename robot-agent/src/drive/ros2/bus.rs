@@ -50,7 +50,7 @@ pub struct Bus {
 
 /// Declarations that live as long as the session.
 #[derive(Debug)]
-struct Declared {
+struct Declarations {
     commands: Writer,
     outward_topics: Vec<(PublishedTopic, Writer)>,
     _tokens: Vec<LivelinessToken>,
@@ -167,7 +167,11 @@ impl Bus {
         }
     }
 
-    fn declare(&self, session: &zenoh::Session, tells: bool) -> Result<Declared, LinkError> {
+    fn declare(
+        &self,
+        session: &zenoh::Session,
+        publishes_state: bool,
+    ) -> Result<Declarations, LinkError> {
         let bus = &self.settings.bus;
         let node = Node {
             domain: bus.domain,
@@ -219,7 +223,7 @@ impl Bus {
         self.command_watch.write_as(commands.gid);
         self.watch_commands(session)?;
         let mut outward_topics = Vec::new();
-        if let Some(outward) = self.settings.outward.as_ref().filter(|_| tells) {
+        if let Some(outward) = self.settings.outward.as_ref().filter(|_| publishes_state) {
             for outward_topic in PublishedTopic::ALL {
                 number += 1;
                 let message_type = outward_topic.message_type();
@@ -239,7 +243,7 @@ impl Bus {
                 outward_topics.push((outward_topic, writer));
             }
         }
-        Ok(Declared {
+        Ok(Declarations {
             commands,
             outward_topics,
             _tokens: tokens,
@@ -336,7 +340,7 @@ impl Bus {
     /// waits for a path of hundreds of points.
     fn run_publishers(
         &self,
-        declared: &Declared,
+        declared: &Declarations,
         outward: Option<&mut (dyn StatePublisher + 'static)>,
     ) {
         std::thread::scope(|scope| {

@@ -33,7 +33,7 @@ use std::time::Duration;
 
 use tread_control::measured::WheelSpeeds;
 
-use self::assemble::{Arrived, Assembler};
+use self::assemble::{Assembler, QueuedMessage};
 use self::bus::Bus;
 use self::command_cell::CommandCell;
 use self::command_compliance::{CommandCompliance, Verdict};
@@ -52,7 +52,7 @@ pub(crate) mod tests;
 #[derive(Debug)]
 pub struct Ros2Drive {
     settings: Arc<Ros2Settings>,
-    arrived: Receiver<Arrived>,
+    arrived: Receiver<QueuedMessage>,
     arrivals: Arc<Arrivals>,
     assembler: Assembler,
     command_compliance: CommandCompliance,

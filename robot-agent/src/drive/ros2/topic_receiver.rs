@@ -11,13 +11,13 @@ use tread_ros2::messages::{
 use tread_ros2::names::Name;
 use tread_ros2::rmw::{Attachment, check_key};
 
-use super::assemble::Arrived;
+use super::assemble::QueuedMessage;
 use super::frames;
 use super::reading::{self, Content, Reading};
 use super::refusal::{Counts, Notice, Refusal, Source};
 use super::settings::{Ros2Settings, Scheme};
 use super::stamps::{Arrival, Stamps};
-use super::writer_watch::{Order, WriterWatch};
+use super::writer_watch::{MessageOrder, WriterWatch};
 use crate::clock::SharedClock;
 use crate::drive::Arrivals;
 
@@ -40,7 +40,7 @@ pub trait MessageObserver: std::fmt::Debug + Send + Sync {
 
 /// State of a topic between two messages.
 #[derive(Debug, Clone, Copy)]
-struct Watched {
+struct TopicState {
     writer: WriterWatch,
     stamps: Stamps,
 }
@@ -50,9 +50,9 @@ struct Watched {
 pub struct TopicReceiver {
     source: Source,
     settings: Arc<Ros2Settings>,
-    watched: Mutex<Watched>,
+    topic_state: Mutex<TopicState>,
     counts: Arc<Counts>,
-    to_loop: SyncSender<Arrived>,
+    to_loop: SyncSender<QueuedMessage>,
     arrivals: Arc<Arrivals>,
     /// Whether the topic's messages trigger the loop's ticks.
     is_pace: bool,
@@ -65,7 +65,7 @@ impl TopicReceiver {
     pub fn all(
         settings: &Arc<Ros2Settings>,
         counts: &Arc<Counts>,
-        to_loop: &SyncSender<Arrived>,
+        to_loop: &SyncSender<QueuedMessage>,
         arrivals: &Arc<Arrivals>,
         clock: &SharedClock,
     ) -> Vec<Self> {
@@ -77,7 +77,7 @@ impl TopicReceiver {
         let receiver = |source| Self {
             source,
             settings: Arc::clone(settings),
-            watched: Mutex::new(Watched {
+            topic_state: Mutex::new(TopicState {
                 writer: WriterWatch::default(),
                 stamps: Stamps::new(
                     timing.stamps,
@@ -156,7 +156,7 @@ impl TopicReceiver {
         key: &str,
         attachment: Option<&[u8]>,
         payload: &[u8],
-    ) -> Result<Option<Arrived>, Refusal> {
+    ) -> Result<Option<QueuedMessage>, Refusal> {
         let arrival = Arrival {
             monotonic: self.clock.monotonic(),
             wall_ns: self.clock.host_wall_ns(),
@@ -175,17 +175,20 @@ impl TopicReceiver {
         let Some((stamp, content)) = decoded(&self.settings, self.source, payload)? else {
             return Ok(None);
         };
-        let mut watched = self.watched.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut topic_state = self
+            .topic_state
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
         let order = writer
-            .map(|message| watched.writer.check(&message, arrival.monotonic))
+            .map(|message| topic_state.writer.check(&message, arrival.monotonic))
             .transpose()?;
         let at = if matches!(content, Content::Battery(_)) {
             arrival.monotonic
         } else {
             let stamp_ns = stamp.nanoseconds().ok_or(Refusal::Stamp)?;
-            let leaps = watched.stamps.leaps();
-            let placed = watched.stamps.place(stamp_ns, arrival)?;
-            if watched.stamps.leaps() > leaps {
+            let leaps = topic_state.stamps.leaps();
+            let placed = topic_state.stamps.place(stamp_ns, arrival)?;
+            if topic_state.stamps.leaps() > leaps {
                 self.counts.record(self.source, Notice::ClockLeapt);
             }
             placed
@@ -193,14 +196,16 @@ impl TopicReceiver {
         // The watch follows only valid messages, so that repeated data never count as a restarted
         // writer.
         if let Some((message, order)) = writer.zip(order) {
-            watched.writer.follow(&message, order, arrival.monotonic);
+            topic_state
+                .writer
+                .follow(&message, order, arrival.monotonic);
             match order {
-                Order::Continues => {}
-                Order::Restarted => self.counts.record(self.source, Notice::Restarted),
-                Order::MayHaveRestarted => return Err(Refusal::OutOfOrder),
+                MessageOrder::Continues => {}
+                MessageOrder::Restarted => self.counts.record(self.source, Notice::Restarted),
+                MessageOrder::MayHaveRestarted => return Err(Refusal::OutOfOrder),
             }
         }
-        Ok(Some(Arrived { at, content }))
+        Ok(Some(QueuedMessage { at, content }))
     }
 }
 
