@@ -3,8 +3,8 @@
 //! The doctor listens to the stopped robot ([`listening`]). With `--move` it turns the robot slowly
 //! on the spot, drives it forward for a metre, and compares commands with measurements
 //! ([`moving`]): frozen sensors ([`frozen`]), sides and signs ([`signs`]), the frame of the
-//! odometry's twist ([`twist_frame`]), the tracks ([`track`]), and how the wheels pull with the
-//! robot's mass ([`effort`]). It estimates mass, inertia and centre of mass ([`parameters`]). Each
+//! odometry's twist ([`twist_frame`]), the tracks ([`track`]), and the joints' effort against
+//! the robot's mass ([`effort`]). It estimates mass, inertia and centre of mass ([`parameters`]). Each
 //! finding names the key of `robot.toml` to look at, and the lines that mend it where there are such.
 
 mod drive_summary;

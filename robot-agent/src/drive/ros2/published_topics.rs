@@ -1,5 +1,5 @@
-//! Topics on which the agent publishes its state to the rest of the robot, and the source of their
-//! messages.
+//! Topics on which the agent publishes its state to the rest of the robot, and the trait of their
+//! publisher.
 
 use std::time::Duration;
 
@@ -48,7 +48,7 @@ impl PublishedTopic {
     }
 }
 
-/// Source of the messages. Runs on a thread of its own.
+/// Publishes the agent's state. Runs on a thread of its own.
 pub(crate) trait StatePublisher: std::fmt::Debug + Send + Sync {
     /// Calls `say` with each message that is due, encoded.
     fn step(&mut self, now: Duration, wall_ns: i64, say: &mut dyn FnMut(PublishedTopic, &[u8]));
