@@ -26,11 +26,11 @@ use tread_server::config::SITE_DEFAULT;
 
 pub(crate) use self::durations::format_duration;
 use self::durations::wait_time;
-use self::identity::Showing;
+use self::identity::AuthenticationOptions;
 pub(crate) use self::identity::{
     AuditAction, AuditArguments, AuthorityAction, AuthorityArguments, JoinTokenAction,
-    JoinTokenArguments, Noted, PlainArguments, ReleaseArguments, RobotArguments, RobotsAction,
-    SessionsAction, SessionsArguments, TokensAction, TokensArguments,
+    JoinTokenArguments, PlainArguments, RecordedEntry, ReleaseArguments, RobotArguments,
+    RobotsAction, SessionsAction, SessionsArguments, TokensAction, TokensArguments,
 };
 pub(crate) use self::map::{
     FrictionAction, FrictionArguments, HistoryArguments, SitesAction, SitesArguments,
@@ -38,7 +38,7 @@ pub(crate) use self::map::{
 };
 pub(crate) use self::mission_name::MissionName;
 pub(crate) use self::missions::{
-    MissionsAction, MissionsArguments, Order, SendArguments, SendCircle, SendTrajectory,
+    MissionOptions, MissionsAction, MissionsArguments, SendArguments, SendCircle, SendTrajectory,
     SendWaypoints,
 };
 pub(crate) use self::safety::{
@@ -75,7 +75,7 @@ impl Arguments {
     /// Parses the arguments. On an error, prints it and exits the process.
     pub(crate) fn read(words: impl Iterator<Item = OsString>) -> Self {
         let whole = Self::whole();
-        let words = leading::behind_the_command(words.collect(), &whole);
+        let words = leading::options_after_command(words.collect(), &whole);
         let is_for_programs = words.iter().any(|word| word == "--json");
         let read = whole
             .try_get_matches_from(words)
@@ -262,7 +262,7 @@ pub(crate) struct Connection {
     #[arg(long, global = true, env = "TREAD_SERVER", value_name = "URL")]
     pub(crate) server: Option<String>,
     #[command(flatten)]
-    pub(crate) showing: Showing,
+    pub(crate) authentication: AuthenticationOptions,
     /// Site to use
     #[arg(long, global = true, env = "TREAD_SITE", default_value = SITE_DEFAULT)]
     pub(crate) site: SiteId,

@@ -107,7 +107,7 @@ impl Store {
 
     /// Stores the server of the last login.
     pub(crate) fn keep_last_server(&self, address: &str) -> anyhow::Result<()> {
-        self.last_login().keep(Entry {
+        self.last_login().save(Entry {
             key: LAST_SERVER,
             value: address,
         })
@@ -128,7 +128,7 @@ impl Store {
     }
 
     /// Stores an entry.
-    pub(crate) fn keep(&self, entry: Entry<'_>) -> anyhow::Result<()> {
+    pub(crate) fn save(&self, entry: Entry<'_>) -> anyhow::Result<()> {
         self.change(|kept| {
             kept.insert(entry.key.to_owned(), entry.value.to_owned());
             true
@@ -213,7 +213,7 @@ mod tests {
 
     fn keep(store: &Store, key: &str) {
         let entry = Entry { key, value: "one" };
-        store.keep(entry).unwrap();
+        store.save(entry).unwrap();
     }
 
     #[test]
@@ -222,7 +222,7 @@ mod tests {
         assert_eq!(store.find("http://a").unwrap(), None);
         keep(&store, "http://a");
         store
-            .keep(Entry {
+            .save(Entry {
                 key: "http://b",
                 value: "two",
             })

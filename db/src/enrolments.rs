@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use tread_api::enrolment::Enrolment;
 use tread_api::ids::{RobotId, SiteId};
 use tread_store::Issued;
-pub use tread_store::enrolments::{Counting, Renewal};
+pub use tread_store::enrolments::{AcceptedCertificates, Renewal};
 
 use super::{DbError, Tx, forward};
 
@@ -16,7 +16,7 @@ forward! {
     fn newest(site: &SiteId, robot: &RobotId) -> Option<Enrolment>;
     fn robot_count() -> i64;
     fn insert(enrolment: &Enrolment, issued: &Issued) -> ();
-    fn counting(enrolment: (&SiteId, &RobotId, u32)) -> Counting;
+    fn accepted_certificates(enrolment: (&SiteId, &RobotId, u32)) -> AcceptedCertificates;
     fn delete_issued_certificates() -> u64;
     fn renew(enrolment: (&SiteId, &RobotId, u32), renewal: Renewal<'_>) -> bool;
     fn record_authority(enrolment: (&SiteId, &RobotId, u32), authority: &str) -> ();

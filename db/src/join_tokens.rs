@@ -18,7 +18,7 @@ forward! {
     fn valid_count(at: Timestamp) -> i64;
     fn valid_count_within(within: &Scope, at: Timestamp) -> i64;
     fn insert(token: &JoinToken, fingerprint: &Fingerprint) -> ();
-    fn use_up(id: JoinTokenId, by: &RobotId, at: Timestamp) -> bool;
+    fn consume(id: JoinTokenId, by: &RobotId, at: Timestamp) -> bool;
     fn revoke(id: JoinTokenId, at: Timestamp) -> ();
     fn delete_ended(before: Timestamp, limit: u32) -> ();
 }

@@ -4,7 +4,7 @@
 use jiff::Timestamp;
 use tread_api::ids::{PersonId, SessionId, TokenId};
 use tread_store::Fingerprint;
-pub use tread_store::sessions::{NewSession, OfPeople, Owner, SessionRow, SignedIn};
+pub use tread_store::sessions::{NewSession, Owner, PeopleSessionFilter, SessionRow, SignedIn};
 
 use super::{DbError, Tx, forward};
 
@@ -13,7 +13,7 @@ forward! {
     fn insert(session: &NewSession) -> ();
     fn by_lookup(fingerprint: &Fingerprint) -> Option<SessionRow>;
     fn find(id: SessionId) -> Option<SessionRow>;
-    fn list(filter: &OfPeople<'_>, limit: u32) -> Vec<SessionRow>;
+    fn list(filter: &PeopleSessionFilter<'_>, limit: u32) -> Vec<SessionRow>;
     fn count_of_people(at: Timestamp) -> i64;
     fn all_valid(at: Timestamp) -> Vec<SessionId>;
     fn touch(id: SessionId, at: Timestamp) -> ();

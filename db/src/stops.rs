@@ -17,9 +17,9 @@ forward! {
     fn insert(stops: &[Stop], kept: u32) -> ();
     fn adopt(robot_pk: i64, stop: &Stop, kept: u32) -> ();
     fn confirm(ids: &[StopId], at: Timestamp) -> ();
-    fn stand(id: StopId, at: Timestamp) -> ();
+    fn record_standstill(id: StopId, at: Timestamp) -> ();
     fn unconfirm(id: StopId) -> ();
-    fn ask_clear(id: StopId, by: &str, at: Timestamp) -> ();
+    fn request_clear(id: StopId, by: &str, at: Timestamp) -> ();
     fn refuse_clear(id: StopId) -> ();
     fn clear(id: StopId, at: Timestamp) -> ();
     fn end(id: StopId, at: Timestamp) -> ();

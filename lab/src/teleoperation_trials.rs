@@ -48,7 +48,7 @@ pub struct TeleoperationReport {
     pub worst_distance_share: f64,
 }
 
-struct UnderWay {
+struct PendingCommand {
     arrives_us: u64,
     until_us: u64,
     payload: Vec<u8>,
@@ -58,7 +58,7 @@ struct Trial<'bench> {
     bench: &'bench mut Bench,
     random: &'bench mut ChaCha8Rng,
     report: &'bench mut TeleoperationReport,
-    under_way: Vec<UnderWay>,
+    under_way: Vec<PendingCommand>,
     /// Number of the last command.
     seq: u64,
     /// The end of the command that was taken last, and whether its silence was counted.
@@ -86,7 +86,7 @@ impl Trial<'_> {
         }
         let copies = if self.random.random_bool(0.1) { 2 } else { 1 };
         for _ in 0..copies {
-            self.under_way.push(UnderWay {
+            self.under_way.push(PendingCommand {
                 arrives_us: now_us + self.random.random_range(1_000..400_000_u64),
                 until_us,
                 payload: payload.clone(),
@@ -199,7 +199,7 @@ impl Trial<'_> {
                 },
                 Some(_) | None => {}
             }
-            if self.under_way.is_empty() && self.bench.target_rests() && self.bench.stands() {
+            if self.under_way.is_empty() && self.bench.target_rests() && self.bench.is_standing() {
                 if let Some((_, speed_m_s, distance_m)) = since {
                     let allowed_m = speed_m_s * speed_m_s / (2.0 * braking_m_s2) + speed_m_s * 0.25;
                     let report = &mut *self.report;

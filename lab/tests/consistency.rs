@@ -11,7 +11,7 @@ use std::alloc::System;
 use std::time::Duration;
 
 use figures::{CASES, quiet, trial};
-use generator::{Fault, Kit, Make, Robot};
+use generator::{Equipment, Fault, Make, Robot};
 use stats_alloc::{INSTRUMENTED_SYSTEM, Region, StatsAlloc};
 use tread_control::consistency::{Consequence, Monitor, Sample, Subject};
 use tread_control::geometry::Pose;
@@ -24,7 +24,7 @@ static ALLOCATOR: &StatsAlloc<System> = &INSTRUMENTED_SYSTEM;
 /// Trials of each fault; the report program runs more.
 const TRIALS: u64 = 12;
 
-const KIT: Kit = Kit {
+const KIT: Equipment = Equipment {
     has_odometry: true,
     has_accelerometer: true,
     meets_ice: false,
@@ -53,7 +53,7 @@ fn every_fault_is_named_and_no_other_channel_is_blamed() {
 #[test]
 fn an_hour_with_ice_low_batteries_and_wild_fixes_blames_nothing() {
     for has_odometry in [false, true] {
-        let kit = Kit {
+        let kit = Equipment {
             has_odometry,
             meets_ice: true,
             ..KIT
@@ -115,7 +115,7 @@ fn drive_for(robot: &mut Robot, steps: u32) {
 
 #[test]
 fn a_finding_on_the_position_ends_at_rest_and_is_back_at_once_if_motion_shows_it() {
-    let kit = Kit {
+    let kit = Equipment {
         has_odometry: true,
         ..KIT
     };
@@ -205,7 +205,7 @@ fn a_position_that_is_still_frozen_or_creeps_is_not_believed_for_standing_still(
 
 #[test]
 fn while_odometry_is_wrong_the_findings_about_others_end_and_its_own_does_not() {
-    let kit = Kit {
+    let kit = Equipment {
         has_odometry: true,
         ..KIT
     };

@@ -7,7 +7,7 @@ use tread_control::tracking::TrackerConfig;
 use tread_control::trajectory::{CircleSpec, Direction, Trajectory};
 use tread_lab::bench::Law;
 use tread_lab::rough::spec::{MAKES, Make};
-use tread_lab::rough::tracking::{Errors, Knowing, Poses, Trial, World, run};
+use tread_lab::rough::tracking::{Errors, Poses, ThetaSource, Trial, World, run};
 
 /// Two thirds of a circle of 3 m at 0.6 m/s.
 fn circle() -> Plan {
@@ -32,7 +32,7 @@ fn ours(make: Make, world: World, poses: Poses, stiffness: f64, seed: u64) -> Er
         seed,
         law: Law::Shipped(None),
         config: TrackerConfig::default(),
-        knowing: Knowing::Nothing,
+        knowing: ThetaSource::Nothing,
     })
     .expect("robot, ground and gains are possible")
 }

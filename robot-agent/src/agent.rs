@@ -100,7 +100,7 @@ impl Agent {
         let outbox_folder = config.data_dir.join("outbox");
         let outbox = Outbox::open(&outbox_folder, config.outbox, config.robot.clone(), boot)?;
         let memory = Memory::new(&config.data_dir);
-        let missions = Missions::recall(memory, &outbox, clock.wall())?;
+        let missions = Missions::restore(memory, &outbox, clock.wall())?;
         let identity = identity_of(&config, boot);
         let (loop_ends, ends) = loop_channels();
         let AgentEnds {

@@ -11,12 +11,12 @@ use tread_control::geometry::Point;
 
 use crate::control_loop::channels::Fault;
 use crate::control_loop::overrun::{Overrun, WINDOW_TICKS};
-use crate::control_loop::standing::{Shown, StandingReport};
+use crate::control_loop::standing::{MotionEvidence, StandingReport};
 use crate::control_loop::surface::Comparison;
 use crate::drive::Battery;
 use crate::drive::ros2::notices::{ForeignCommands, RecentNotices};
 use crate::drive::ros2::refusal::Notice;
-use crate::drive::ros2::refusal::{Counts, Dropping, Source};
+use crate::drive::ros2::refusal::{Counts, DropMonitor, Source};
 use crate::outbox::OutboxDamage;
 
 /// Charge below which the battery is low, and charge above which it no longer is.
@@ -28,7 +28,7 @@ const OUTBOX_LONG: (u64, u64) = (50_000, 25_000);
 
 /// Inputs of the alerts.
 #[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct Causes<'a> {
+pub(crate) struct AlertInputs<'a> {
     pub(crate) battery: Option<Battery>,
     pub(crate) fault: Option<Fault>,
     pub(crate) is_stopped: bool,
@@ -57,7 +57,7 @@ pub(crate) struct Alerts {
     battery_low: bool,
     battery_critical: bool,
     outbox_long: bool,
-    dropping: Dropping,
+    drop_monitor: DropMonitor,
     recent_notices: [RecentNotices; Notice::ALL.len()],
     foreign_commands: ForeignCommands,
 }
@@ -171,10 +171,10 @@ fn sensor_alerts<'a>(findings: impl IntoIterator<Item = &'a Finding>) -> Vec<Ale
 
 /// Returns the alert for a robot that moves although commanded to zero.
 fn standing_alert(report: &StandingReport) -> Option<AlertReport> {
-    let measured = |shown: Shown| match shown {
-        Shown::Speed(speed_m_s) => format!("{speed_m_s:.2} m/s"),
-        Shown::Turn(turn_rad_s) => format!("{turn_rad_s:.2} rad/s"),
-        Shown::Distance(distance_m) => format!("{distance_m:.1} m from where it stood"),
+    let measured = |shown: MotionEvidence| match shown {
+        MotionEvidence::Speed(speed_m_s) => format!("{speed_m_s:.2} m/s"),
+        MotionEvidence::Turn(turn_rad_s) => format!("{turn_rad_s:.2} rad/s"),
+        MotionEvidence::Distance(distance_m) => format!("{distance_m:.1} m from where it stood"),
     };
     let (code, text) = if let Some(shown) = report.does_not_stand {
         let text = format!(
@@ -209,7 +209,7 @@ fn fault_alert(fault: Fault, base: Option<&Counts>) -> Option<AlertReport> {
 
 impl Alerts {
     /// Returns the alerts that are raised now.
-    pub(crate) fn judge(&mut self, causes: &Causes<'_>) -> Vec<AlertReport> {
+    pub(crate) fn judge(&mut self, causes: &AlertInputs<'_>) -> Vec<AlertReport> {
         let charge = causes.battery.map(|battery| battery.charge_ratio);
         self.battery_low =
             charge.is_some_and(|charge| is_below(charge, self.battery_low, BATTERY_LOW));
@@ -232,7 +232,7 @@ impl Alerts {
             .fault
             .and_then(|fault| fault_alert(fault, causes.base));
         let dropped = causes.base.and_then(|base| {
-            let (refusal, text) = self.dropping.check(base)?;
+            let (refusal, text) = self.drop_monitor.check(base)?;
             let code = format!("base-{}", refusal.code());
             alert(&code, Severity::Warning, format!("the base: {text}"))
         });

@@ -18,7 +18,7 @@ use crate::drive::ros2::Ros2Drive;
 use crate::drive::ros2::bus::Bus;
 use crate::drive::ros2::refusal::Counts;
 use crate::realtime::raise_priority;
-use crate::ros2_status::Outward;
+use crate::ros2_status::AgentStatePublisher;
 use crate::sim::drive::{SimMode, SimulatedDrive, SimulatedDriveError};
 use crate::start_error::StartError;
 use crate::supervisor::Supervisor;
@@ -87,7 +87,9 @@ impl Base {
             if let Some(settings) = bus.outward_settings().cloned() {
                 let (shared, counts) = (Arc::clone(shared), self.counts.unwrap_or_default());
                 let robot = config.robot.to_string();
-                bus.publish(Box::new(Outward::new(settings, shared, counts, robot)));
+                bus.publish(Box::new(AgentStatePublisher::new(
+                    settings, shared, counts, robot,
+                )));
             }
             // It ends when the loop drops its drive.
             let running = supervisor.spawn_thread("robot's bus", move || bus.run());

@@ -38,7 +38,7 @@ impl Missions {
     ///
     /// # Errors
     /// [`StartError`] if the memory cannot be read or the outbox does not take the report.
-    pub(crate) fn recall(
+    pub(crate) fn restore(
         memory: Memory,
         outbox: &Outbox,
         now: Timestamp,
@@ -207,7 +207,7 @@ mod tests {
             outbox.append(&content).unwrap();
         }
         for _ in 0..2 {
-            let missions = Missions::recall(memory.clone(), &outbox, NOW).unwrap();
+            let missions = Missions::restore(memory.clone(), &outbox, NOW).unwrap();
             let slot = missions.slot().clone();
             assert_eq!(slot.active(), None);
             assert_eq!(slot.unrecorded_ends().count(), 0);
@@ -266,7 +266,7 @@ mod tests {
         memory.save(&slot).unwrap();
         let outbox = outbox(folder.path());
         for _ in 0..2 {
-            let missions = Missions::recall(memory.clone(), &outbox, NOW).unwrap();
+            let missions = Missions::restore(memory.clone(), &outbox, NOW).unwrap();
             assert_eq!(missions.slot().unrecorded_ends().count(), 0);
         }
         assert_eq!(reports(&outbox), expected);
@@ -289,7 +289,7 @@ mod tests {
         assert_eq!(memory.load().unwrap().unreadable_ends(), 1);
         let outbox = outbox(folder.path());
         for _ in 0..2 {
-            let missions = Missions::recall(memory.clone(), &outbox, NOW).unwrap();
+            let missions = Missions::restore(memory.clone(), &outbox, NOW).unwrap();
             assert_eq!(missions.slot().active(), None);
             assert_eq!(memory.load().unwrap(), *missions.slot());
         }
@@ -312,7 +312,7 @@ mod tests {
         assert_eq!(slot.unrecorded_ends().collect::<Vec<_>>(), [&succeeded()]);
         assert_eq!(slot.unreadable_ends(), 0);
         let outbox = outbox(folder.path());
-        let missions = Missions::recall(memory, &outbox, NOW).unwrap();
+        let missions = Missions::restore(memory, &outbox, NOW).unwrap();
         assert_eq!(missions.slot().active(), None);
         assert_eq!(reports(&outbox), [succeeded()]);
     }

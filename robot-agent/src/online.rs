@@ -21,8 +21,8 @@ use crate::control_loop::channels::Shared;
 use crate::dispatcher::Dispatcher;
 use crate::fleet::uploader::{self, Backoff};
 use crate::fleet::{
-    self, Attempt, COMMANDS_MAX, FleetLink, Identity, LinkError, Listeners, Note, Noted, Rotation,
-    Server,
+    self, Attempt, COMMANDS_MAX, FleetLink, Identity, LinkError, LinkEvent, LinkEventHandler,
+    Listeners, Rotation, Server,
 };
 use crate::membership::{Membership, ServerTrust};
 use crate::outbox::Outbox;
@@ -94,18 +94,18 @@ impl Online {
         let publish_rate = Arc::clone(&self.reporter.publish_rate);
         let is_lost = Arc::new(AtomicBool::new(false));
         let lost = Arc::clone(&is_lost);
-        let note: Note = Arc::new(move |noted| match noted {
-            Noted::ServerHeard => {
+        let on_event: LinkEventHandler = Arc::new(move |event| match event {
+            LinkEvent::ServerHeard => {
                 lost.store(false, Ordering::Relaxed);
                 shared.record_server_message(clock.monotonic());
             }
-            Noted::CommandLost => Shared::count(&shared.lost_commands),
-            Noted::ServerLost => {
+            LinkEvent::CommandLost => Shared::count(&shared.lost_commands),
+            LinkEvent::ServerLost => {
                 lost.store(true, Ordering::Relaxed);
                 publish_rate.end_request();
             }
-            Noted::Trust(trust) => set_trust(&heard, ServerTrust::Is(trust)),
-            Noted::Distrusted => set_trust(&heard, ServerTrust::Distrusted),
+            LinkEvent::Trust(trust) => set_trust(&heard, ServerTrust::Is(trust)),
+            LinkEvent::Distrusted => set_trust(&heard, ServerTrust::Distrusted),
         });
         tokio::select! {
             // Spreads the connections of robots that are switched on together.
@@ -114,7 +114,7 @@ impl Online {
         }
         let (commands, commands_in) = mpsc::channel(COMMANDS_MAX);
         let listeners = Listeners {
-            note,
+            on_event,
             urgent: {
                 let safety = Arc::clone(&self.dispatcher.safety);
                 Arc::new(move |urgent| safety.handle_urgent(urgent))

@@ -24,7 +24,7 @@ const USAGE: u8 = 2;
 /// Drives one robot and measures the friction of the ground.
 #[derive(Debug, Parser)]
 #[command(name = "tread-agent", version = tread_api::release::long_version(), args_conflicts_with_subcommands = true)]
-struct Words {
+struct Arguments {
     #[command(subcommand)]
     action: Option<Action>,
     #[command(flatten)]
@@ -45,7 +45,7 @@ enum Action {
 
 /// Returns the definition of the program's command line.
 pub fn command_line() -> clap::Command {
-    <Words as clap::CommandFactory>::command()
+    <Arguments as clap::CommandFactory>::command()
 }
 
 /// Runs an agent until SIGTERM or ctrl-c stops it; the first argument is the
@@ -56,25 +56,25 @@ pub fn command_line() -> clap::Command {
 pub fn run_from_args(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
     // The first call counts; all install the same provider.
     let _first = rustls::crypto::ring::default_provider().install_default();
-    let words = match Words::try_parse_from(arguments) {
-        Ok(words) => words,
+    let arguments = match Arguments::try_parse_from(arguments) {
+        Ok(arguments) => arguments,
         Err(message) => {
             // Help and version are printed here too; a failure to print cannot be reported.
             let _ = message.print();
             return ExitCode::from(u8::try_from(message.exit_code()).unwrap_or(USAGE));
         }
     };
-    if let Err(cause) = init_logging(&words.flags) {
+    if let Err(cause) = init_logging(&arguments.flags) {
         eprintln!("error: {cause:#}");
         return ExitCode::from(USAGE);
     }
     // Whether the result is good, where a command prints a result.
-    let ended = match words.action {
+    let ended = match arguments.action {
         Some(Action::Enroll(args)) => run_enroll(args).map(|()| true),
         Some(Action::Doctor(args)) => doctor::run(&args),
         Some(Action::Replay(args)) => report::run(&args),
         Some(Action::Recover(args)) => salvage::run(&args),
-        None => run(&words.flags).map(|()| true),
+        None => run(&arguments.flags).map(|()| true),
     };
     match ended {
         Ok(true) => ExitCode::SUCCESS,

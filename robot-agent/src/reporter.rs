@@ -13,13 +13,13 @@ use tread_api::safety::{self, GateCount, GateStatus, SafetyStatus, StandingState
 use tread_api::wire::state::{FrictionReport, RobotState};
 use tread_control::gate::GateCause;
 
-use crate::alerts::{Alerts, Causes};
+use crate::alerts::{AlertInputs, Alerts};
 use crate::clock::SharedClock;
 use crate::control_loop::channels::{Shared, Snapshot};
 use crate::control_loop::standing::StandingReport;
 use crate::drive::ros2::notices::{ForeignCommands, RecentNotices};
 use crate::drive::ros2::refusal::Notice;
-use crate::drive::ros2::refusal::{Counts, Dropping, Source};
+use crate::drive::ros2::refusal::{Counts, DropMonitor, Source};
 use crate::fleet::{FleetLink, Identity};
 use crate::geometry::{wire_pose, wire_twist};
 use crate::knowledge::SiteCell;
@@ -103,7 +103,7 @@ impl Reporter {
         let snapshot = self.shared.snapshot();
         let now = self.clock.monotonic();
         let (outbox, outbox_damage) = (self.outbox.status(), self.outbox.damage());
-        let causes = Causes {
+        let causes = AlertInputs {
             battery: snapshot.battery,
             fault: snapshot.fault,
             is_stopped: self.shared.safety.stop() != 0,
@@ -237,7 +237,7 @@ pub(crate) async fn log_losses(
     base: Option<Arc<Counts>>,
     stop: CancellationToken,
 ) {
-    let (mut dropping, mut said) = (Dropping::default(), None);
+    let (mut drop_monitor, mut said) = (DropMonitor::default(), None);
     let (mut segments, mut blocks) = (0, 0);
     let mut recent_notices = [RecentNotices::default(); Notice::ALL.len()];
     let mut noticed = [const { None }; Notice::ALL.len()];
@@ -248,7 +248,7 @@ pub(crate) async fn log_losses(
             () = tokio::time::sleep(LOSSES_EVERY) => {}
             () = stop.cancelled() => return,
         }
-        let dropped = base.as_deref().and_then(|base| dropping.check(base));
+        let dropped = base.as_deref().and_then(|base| drop_monitor.check(base));
         // The count in it grows as long as there is something new.
         if let Some((_, text)) = dropped.as_ref().filter(|_| dropped != said) {
             warn!("{text}");

@@ -16,7 +16,7 @@ use tread_ros2::messages::{
 };
 
 use crate::control_loop::channels::{GivenPlan, Shared, Snapshot};
-use crate::drive::ros2::outward::{OutwardSource, OutwardTopic};
+use crate::drive::ros2::published_topics::{PublishedTopic, StatePublisher};
 use crate::drive::ros2::refusal::Counts;
 use crate::drive::ros2::settings::OutwardSettings;
 use crate::recording::views::{PATH_POINTS_MAX, header, path, poses_of, state};
@@ -41,7 +41,7 @@ struct Part {
 
 /// Publisher of the agent's state on the robot's bus.
 #[derive(Debug)]
-pub(crate) struct Outward {
+pub(crate) struct AgentStatePublisher {
     settings: OutwardSettings,
     shared: Arc<Shared>,
     counts: Arc<Counts>,
@@ -59,8 +59,8 @@ pub(crate) struct Outward {
     foreign_commands: u64,
 }
 
-impl OutwardSource for Outward {
-    fn step(&mut self, now: Duration, wall_ns: i64, say: &mut dyn FnMut(OutwardTopic, &[u8])) {
+impl StatePublisher for AgentStatePublisher {
+    fn step(&mut self, now: Duration, wall_ns: i64, say: &mut dyn FnMut(PublishedTopic, &[u8])) {
         let snapshot = self.shared.snapshot();
         let is_new = self.update_mission(&snapshot);
         self.update_place(&snapshot);
@@ -71,18 +71,18 @@ impl OutwardSource for Outward {
         self.said = Some(now);
         let (frame, mut bytes) = (self.settings.frame.as_str(), Vec::new());
         path(&self.plan, frame, wall_ns, &mut bytes);
-        say(OutwardTopic::Plan, &bytes);
+        say(PublishedTopic::Plan, &bytes);
         path(&self.driven, frame, wall_ns, &mut bytes);
-        say(OutwardTopic::Driven, &bytes);
+        say(PublishedTopic::Driven, &bytes);
         theta(&snapshot, &mut bytes);
-        say(OutwardTopic::Theta, &bytes);
+        say(PublishedTopic::Theta, &bytes);
         let parts = self.parts(now, &snapshot);
         diagnostics(&parts, &self.robot, wall_ns, &mut bytes);
-        say(OutwardTopic::Diagnostics, &bytes);
+        say(PublishedTopic::Diagnostics, &bytes);
     }
 }
 
-impl Outward {
+impl AgentStatePublisher {
     pub(crate) fn new(
         settings: OutwardSettings,
         shared: Arc<Shared>,

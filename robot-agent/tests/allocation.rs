@@ -118,5 +118,5 @@ fn no_tick_of_teleoperation_to_a_fence_and_into_silence_allocates() {
         assert_eq!(region.change(), Stats::default(), "tick {tick}");
         bench.collect();
     }
-    assert!(bench.stands());
+    assert!(bench.is_standing());
 }

@@ -21,7 +21,7 @@ use crate::authority::{Authority, AuthorityError, NEXT_CERTIFICATE_FILE};
 use crate::clock::Clock;
 use crate::config::{Config, ServerArgs};
 use crate::db::{self, Db, DbError};
-use crate::setup::{self, Given, SetupArgs};
+use crate::setup::{self, InitOptions, SetupArgs};
 
 /// Arguments of `tread-server init`.
 #[derive(Debug, Clone, Args)]
@@ -93,7 +93,7 @@ pub(crate) async fn delete_certificate_records(args: ForgetArgs) -> anyhow::Resu
 /// # Errors
 /// An admin exists and `--force` is not given, or the database or a file cannot be written.
 pub(crate) async fn run(args: InitArgs) -> anyhow::Result<()> {
-    let given = Given {
+    let given = InitOptions {
         config: args.config.as_deref(),
         database: args.database.as_deref(),
         token_file: args.token_file.as_deref(),

@@ -56,7 +56,7 @@ pub struct AnsweredRequest<'request> {
 
 /// Labels of an HTTP request.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
-struct OfRequest {
+struct RequestLabels {
     method: &'static str,
     route: String,
     status: u16,
@@ -74,7 +74,7 @@ pub struct Refusal {
 /// Metrics of the use cases and of the REST API.
 #[derive(Debug, Clone)]
 pub struct Metrics {
-    requests: Durations<OfRequest>,
+    requests: Durations<RequestLabels>,
     missions: Durations<[(&'static str, &'static str); 1]>,
     refusals: Family<Refusal, Counter>,
     queues: Queues,
@@ -103,7 +103,7 @@ impl Default for Metrics {
 impl Metrics {
     /// Records a request.
     pub fn request(&self, answered: &AnsweredRequest<'_>) {
-        let of = OfRequest {
+        let of = RequestLabels {
             // Clients choose the method, so unknown ones share a label.
             method: METHODS
                 .into_iter()

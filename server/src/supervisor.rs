@@ -104,7 +104,7 @@ impl Supervisor {
 
     /// Returns a token for a task spawned elsewhere, such as a `WebSocket` by axum. [`Self::stop`]
     /// waits until the token is dropped.
-    pub fn attend(&self) -> TaskTrackerToken {
+    pub fn task_token(&self) -> TaskTrackerToken {
         self.tracker.token()
     }
 
@@ -159,7 +159,7 @@ mod tests {
     #[tokio::test]
     async fn the_stop_waits_for_tasks_that_others_have_spawned_and_what_they_spawn_last() {
         let supervisor = Supervisor::new();
-        let (attended, ending) = (supervisor.attend(), supervisor.clone());
+        let (attended, ending) = (supervisor.task_token(), supervisor.clone());
         let (done, mut is_done) = tokio::sync::oneshot::channel();
         let mut foreign = tokio::task::JoinSet::new();
         foreign.spawn(async move {

@@ -166,7 +166,7 @@ impl Connections {
     pub(super) async fn open_first(&self, count: usize) {
         let open = async |_| {
             if let Ok(opened) = self.inner.connect().await {
-                self.inner.give_back(opened);
+                self.inner.return_idle(opened);
             }
         };
         join_all((0..count).map(open)).await;
@@ -217,7 +217,7 @@ impl Inner {
     }
 
     /// Takes back a connection that works.
-    fn give_back(&self, opened: Opened) {
+    fn return_idle(&self, opened: Opened) {
         if !self.permits.is_closed() {
             self.idle().push(opened);
         }
@@ -263,7 +263,7 @@ impl TransactionConnection {
         timeout(self.inner.commit_max, committing)
             .await
             .unwrap_or_else(|_elapsed| Err(no_answer()))?;
-        self.inner.give_back(opened);
+        self.inner.return_idle(opened);
         Ok(())
     }
 }
@@ -282,7 +282,7 @@ impl Drop for TransactionConnection {
             let rolling_back = sqlx::raw_sql("ROLLBACK").execute(&mut opened.connection);
             let is_over = matches!(timeout(ROLLBACK_TIMEOUT, rolling_back).await, Ok(Ok(_)));
             if is_over && !opened.is_spoiled() {
-                inner.give_back(opened);
+                inner.return_idle(opened);
             } else {
                 drop(opened);
             }

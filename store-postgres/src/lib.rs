@@ -103,7 +103,7 @@ use self::connections::{Bounds, COMMIT_TIMEOUT, Connections, TransactionConnecti
 pub use self::error::EngineError;
 pub use self::open::{OpenError, refuse_newer};
 pub use self::transaction::Tx;
-use self::transaction::{Commits, Noted};
+use self::transaction::{Commits, DurationRecorder};
 use self::values::{
     corrupt, from_json, from_us, parse, robots_text, scope_text, to_json, to_us, unsigned,
 };
@@ -322,7 +322,7 @@ impl Db {
     }
 
     fn timed(&self, inner: TransactionConnection, kind: &'static str, writes: bool) -> Tx {
-        let noted = Noted {
+        let duration_recorder = DurationRecorder {
             metrics: self.metrics.clone(),
             kind,
             writes,
@@ -330,7 +330,7 @@ impl Db {
         };
         Tx {
             inner,
-            noted,
+            duration_recorder,
             commits: Arc::clone(&self.commits),
             is_counted: false,
         }

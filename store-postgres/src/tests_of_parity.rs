@@ -18,7 +18,7 @@ use crate::{
 };
 
 /// A transaction of each engine.
-struct Both {
+struct EnginePair {
     sqlite: tread_store_sqlite::Tx,
     postgres: crate::Tx,
 }
@@ -92,13 +92,13 @@ fn robot(name: &str) -> RobotId {
 
 /// Runs a test on both engines, with the sites 1 (`yard`) and 2 (`field`, whose name has letters that a
 /// collation of a language would sort otherwise), and the robots 1 to 3.
-async fn with_both(test: &str, body: impl AsyncFnOnce(&mut Both)) {
+async fn with_both(test: &str, body: impl AsyncFnOnce(&mut EnginePair)) {
     with_database(test, async |database| {
         let file = std::env::temp_dir().join(format!("tread-parity-{}", uuid::Uuid::new_v4()));
         std::fs::create_dir(&file).unwrap();
         let sqlite = tread_store_sqlite::Db::open(Path::new(&file.join("tread.db"))).await.unwrap();
         let postgres = database.open().await;
-        let mut both = Both {
+        let mut both = EnginePair {
             sqlite: sqlite.write("db").await.unwrap(),
             postgres: postgres.write("db").await.unwrap(),
         };
@@ -294,11 +294,11 @@ async fn alerts_and_stops_are_the_same() {
         both!(both, stops::insert(&[stop(6, "yard", "rover-1", 9), stop(7, "yard", "rover-2", 9)], 3));
         both!(both, stops::in_force());
         both!(both, stops::confirm(&[id(6), id(7)], at(1)));
-        both!(both, stops::stand(id(6), at(1)));
+        both!(both, stops::record_standstill(id(6), at(1)));
         both!(both, stops::unconfirm(id(7)));
-        both!(both, stops::ask_clear(id(6), "ben", at(2)));
+        both!(both, stops::request_clear(id(6), "ben", at(2)));
         both!(both, stops::refuse_clear(id(6)));
-        both!(both, stops::ask_clear(id(6), "ben", at(20)));
+        both!(both, stops::request_clear(id(6), "ben", at(20)));
         both!(both, stops::clear(id(6), at(3)));
         both!(both, stops::end(id(7), at(3)));
         both!(both, stops::adopt(1, &stop(3, "yard", "rover-1", 7), 2));
@@ -391,7 +391,7 @@ async fn missions_and_restorations_are_the_same() {
         };
         both!(both, missions::add_facts(id(2), facts));
         both!(both, missions::set_silence(id(2), Some(at(3))));
-        both!(both, missions::want_pause(id(1), true));
+        both!(both, missions::set_pause_wanted(id(1), true));
         both_in_any_order!(both, missions::in_progress());
         both!(both, missions::open_of_robot(1));
         assert!(both!(both, missions::swap_content(id(2), 1, &replacement)));
@@ -428,7 +428,7 @@ async fn missions_and_restorations_are_the_same() {
         both!(both, restorations::release(2));
         both!(both, restorations::release(2));
         both!(both, restorations::awaiting_count());
-        both_in_any_order!(both, restorations::restrained());
+        both_in_any_order!(both, restorations::restricted());
         both!(both, geofences::present(1));
         let row = withdrawals::WithdrawalRow {
             pk: 0,
@@ -502,7 +502,7 @@ async fn identities_are_the_same() {
             (&["yard"], &["admins"], false),
             (&[], &["yard"], true),
         ] {
-            let filter = sessions::OfPeople {
+            let filter = sessions::PeopleSessionFilter {
                 issuer: "https://id",
                 within,
                 elsewhere,
@@ -534,8 +534,8 @@ async fn identities_are_the_same() {
                 "revoked_at": null}));
             both!(both, join_tokens::insert(&token, &secret(number)));
         }
-        assert!(both!(both, join_tokens::use_up(id(1), &robot("rover-1"), at(-1))));
-        assert!(!both!(both, join_tokens::use_up(id(1), &robot("rover-1"), at(1))));
+        assert!(both!(both, join_tokens::consume(id(1), &robot("rover-1"), at(-1))));
+        assert!(!both!(both, join_tokens::consume(id(1), &robot("rover-1"), at(1))));
         both!(both, join_tokens::revoke(id(2), at(-1)));
         for scope in scopes() {
             both!(both, join_tokens::list(&scope, Some(id(3)), 10));
@@ -562,8 +562,8 @@ async fn identities_are_the_same() {
         assert!(both!(both, enrolments::renew((&yard, &rover, 2), renewal)));
         assert!(!both!(both, enrolments::renew((&yard, &rover, 1), renewal)));
         both!(both, enrolments::record_authority((&yard, &rover, 2), "two"));
-        both!(both, enrolments::counting((&yard, &rover, 2)));
-        both!(both, enrolments::counting((&yard, &rover, 1)));
+        both!(both, enrolments::accepted_certificates((&yard, &rover, 2)));
+        both!(both, enrolments::accepted_certificates((&yard, &rover, 1)));
         let named = BTreeSet::from([robot("rover-2")]);
         both!(both, enrolments::list((&yard, None), "", 10));
         both!(both, enrolments::list((&yard, Some(&named)), "", 10));
@@ -571,7 +571,7 @@ async fn identities_are_the_same() {
         both!(both, enrolments::all_newest());
         both!(both, enrolments::robot_count());
         both!(both, enrolments::delete_issued_certificates());
-        both!(both, enrolments::counting((&yard, &rover, 2)));
+        both!(both, enrolments::accepted_certificates((&yard, &rover, 2)));
     })
     .await;
 }

@@ -178,13 +178,13 @@ impl Connections {
         let ran = running.await;
         // SQLite has answered, so the connection can be used further.
         if matches!(ran, Ok(_) | Err(sqlx::Error::Database(_))) {
-            self.inner.give_back(opened);
+            self.inner.return_idle(opened);
         } else if !is_new {
             // The connection's thread had ended after the statement before.
             let mut opened = self.inner.connect().await?;
             let row = sqlx::query_as(statement).fetch_one(opened.connection()?);
             let row = row.await?;
-            self.inner.give_back(opened);
+            self.inner.return_idle(opened);
             return Ok(row);
         }
         ran
@@ -213,7 +213,7 @@ impl Connections {
             None => self.inner.connect().await?,
         };
         let worked = work(opened.connection()?).await;
-        self.inner.give_back(opened);
+        self.inner.return_idle(opened);
         Ok(worked)
     }
 
@@ -251,7 +251,7 @@ impl Inner {
     }
 
     /// Takes back a connection that works.
-    fn give_back(&self, opened: Opened) {
+    fn return_idle(&self, opened: Opened) {
         if !self.permits.is_closed() {
             self.idle().push(opened);
         }
@@ -299,7 +299,7 @@ impl TransactionConnection {
         timeout(self.inner.commit_max, committing)
             .await
             .map_err(|_elapsed| sqlx::Error::WorkerCrashed)??;
-        self.inner.give_back(opened);
+        self.inner.return_idle(opened);
         Ok(())
     }
 }
@@ -323,7 +323,7 @@ impl Drop for TransactionConnection {
                 Err(_gone) => false,
             };
             if is_over && !opened.is_spoiled() {
-                inner.give_back(opened);
+                inner.return_idle(opened);
             } else {
                 drop(opened);
             }

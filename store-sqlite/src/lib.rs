@@ -101,7 +101,7 @@ use tread_store::{DbError, Disk};
 use self::connections::{COMMIT_TIMEOUT, Connections, TransactionConnection};
 pub use self::error::EngineError;
 pub use self::transaction::Tx;
-use self::transaction::{Commits, Noted};
+use self::transaction::{Commits, DurationRecorder};
 use self::values::{
     corrupt, from_json, from_us, parse, robots_text, scope_text, to_json, to_us, unsigned,
 };
@@ -377,7 +377,7 @@ impl Db {
     }
 
     fn timed(&self, inner: TransactionConnection, kind: &'static str, writes: bool) -> Tx {
-        let noted = Noted {
+        let duration_recorder = DurationRecorder {
             metrics: self.metrics.clone(),
             kind,
             writes,
@@ -385,7 +385,7 @@ impl Db {
         };
         Tx {
             inner,
-            noted,
+            duration_recorder,
             commits: Arc::clone(&self.commits),
             is_counted: false,
         }

@@ -6,7 +6,7 @@ use tread_api::identity::Person;
 use tread_api::ids::{OidcSubject, PersonId};
 use tread_store::Fingerprint;
 
-use crate::sessions::{NewSession, OfPeople, Owner, SignedIn, find, insert, list};
+use crate::sessions::{NewSession, Owner, PeopleSessionFilter, SignedIn, find, insert, list};
 use crate::{Db, schema};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -86,7 +86,7 @@ async fn somebody_whose_group_gives_nothing_any_more_is_listed_by_the_others() {
         (&["yard"], &["admins"], false, &[3]),
         (&[], &["admins", "yard"], false, &[]),
     ] {
-        let filter = OfPeople {
+        let filter = PeopleSessionFilter {
             issuer,
             within,
             elsewhere,

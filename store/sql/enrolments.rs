@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use jiff::Timestamp;
 use tread_api::enrolment::Enrolment;
 use tread_api::ids::{RobotId, SiteId};
-pub use tread_store::enrolments::{Counting, Renewal};
+pub use tread_store::enrolments::{AcceptedCertificates, Renewal};
 
 use super::{Connection, EngineError, from_json, from_us, parse, robots_text, to_json, to_us};
 use tread_store::Issued;
@@ -151,10 +151,10 @@ pub async fn insert(
 }
 
 /// Returns which certificates of an enrolment are accepted for a renewal.
-pub async fn counting(
+pub async fn accepted_certificates(
     db: &mut Connection,
     (site, robot, number): (&SiteId, &RobotId, u32),
-) -> Result<Counting, EngineError> {
+) -> Result<AcceptedCertificates, EngineError> {
     let (site, robot) = (site.as_str(), robot.as_str());
     let row = sqlx::query!(
         "SELECT certificates FROM enrolments
@@ -166,9 +166,9 @@ pub async fn counting(
     .fetch_optional(db)
     .await?;
     Ok(match row.map(|row| row.certificates) {
-        None => Counting::None,
-        Some(None) => Counting::Any,
-        Some(Some(text)) => Counting::These(from_json("certificates", &text)?),
+        None => AcceptedCertificates::None,
+        Some(None) => AcceptedCertificates::Any,
+        Some(Some(text)) => AcceptedCertificates::These(from_json("certificates", &text)?),
     })
 }
 

@@ -149,7 +149,7 @@ pub async fn insert(
 }
 
 /// Marks a join token as used; false if it was used before.
-pub async fn use_up(
+pub async fn consume(
     db: &mut Connection,
     id: JoinTokenId,
     by: &RobotId,

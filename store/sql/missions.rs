@@ -267,7 +267,7 @@ pub async fn add_facts(
 }
 
 /// Sets whether an open mission is to be paused; `false` if it has ended.
-pub async fn want_pause(
+pub async fn set_pause_wanted(
     db: &mut Connection,
     id: MissionId,
     wanted: bool,

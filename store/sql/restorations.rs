@@ -1,7 +1,7 @@
 //! Restorations of backups, and the robots that await what follows from one.
 
 pub use tread_store::restorations::{
-    Changed, ENROLMENTS_SKIPPED, REVISIONS_SKIPPED, Restoration, Restrained,
+    Changed, ENROLMENTS_SKIPPED, REVISIONS_SKIPPED, Restoration, RestrictedRobot,
 };
 
 use super::{Connection, EngineError, from_us, parse, to_us, unsigned};
@@ -104,8 +104,8 @@ pub async fn enrolment_floor(db: &mut Connection) -> Result<u32, EngineError> {
     unsigned("number", floor.fetch_one(db).await?)
 }
 
-/// Returns all robots that are restrained since a restoration; retired ones too.
-pub async fn restrained(db: &mut Connection) -> Result<Vec<Restrained>, EngineError> {
+/// Returns all robots that are restricted since a restoration; retired ones too.
+pub async fn restricted(db: &mut Connection) -> Result<Vec<RestrictedRobot>, EngineError> {
     let rows = sqlx::query!(
         r#"SELECT robots.pk AS "pk!", sites.id AS site, robots.id AS robot,
                robots.awaits_release_since_us IS NOT NULL AND robots.retired_at_us IS NULL
@@ -116,7 +116,7 @@ pub async fn restrained(db: &mut Connection) -> Result<Vec<Restrained>, EngineEr
     );
     let rows = rows.fetch_all(db).await?;
     let read = rows.into_iter().map(|row| {
-        Ok(Restrained {
+        Ok(RestrictedRobot {
             pk: row.pk,
             site: parse("site", &row.site)?,
             robot: parse("robot", &row.robot)?,

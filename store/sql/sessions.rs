@@ -4,7 +4,7 @@
 use jiff::Timestamp;
 use tread_api::identity::Person;
 use tread_api::ids::{PersonId, SessionId, TokenId};
-pub use tread_store::sessions::{NewSession, OfPeople, Owner, SessionRow, SignedIn};
+pub use tread_store::sessions::{NewSession, Owner, PeopleSessionFilter, SessionRow, SignedIn};
 
 use super::{Connection, EngineError, corrupt, from_json, from_us, parse, to_json, to_us};
 use tread_store::Fingerprint;
@@ -125,7 +125,7 @@ pub async fn find(db: &mut Connection, id: SessionId) -> Result<Option<SessionRo
 /// Returns sessions of people, newest first.
 pub async fn list(
     db: &mut Connection,
-    filter: &OfPeople<'_>,
+    filter: &PeopleSessionFilter<'_>,
     limit: u32,
 ) -> Result<Vec<SessionRow>, EngineError> {
     let at_us = to_us(filter.at);

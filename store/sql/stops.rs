@@ -288,7 +288,11 @@ pub async fn confirm(
 
 /// Stores that a robot was measured to be stopped, with a time not before its confirmation; only
 /// the first time counts.
-pub async fn stand(db: &mut Connection, id: StopId, at: Timestamp) -> Result<(), EngineError> {
+pub async fn record_standstill(
+    db: &mut Connection,
+    id: StopId,
+    at: Timestamp,
+) -> Result<(), EngineError> {
     let (id, at_us) = (id.to_string(), to_us(at));
     sqlx::query!(
         "UPDATE stops SET standing_at_us = COALESCE(standing_at_us,
@@ -316,7 +320,7 @@ pub async fn unconfirm(db: &mut Connection, id: StopId) -> Result<(), EngineErro
 }
 
 /// Stores a request to clear a stop.
-pub async fn ask_clear(
+pub async fn request_clear(
     db: &mut Connection,
     id: StopId,
     by: &str,

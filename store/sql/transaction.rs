@@ -16,7 +16,7 @@ use super::{Connection, EngineError};
 #[derive(Debug)]
 pub struct Tx {
     pub(super) inner: TransactionConnection,
-    pub(super) noted: Noted,
+    pub(super) duration_recorder: DurationRecorder,
     pub(super) commits: Arc<Commits>,
     /// Whether its commit increments the generation.
     pub(super) is_counted: bool,
@@ -32,14 +32,14 @@ pub(super) struct Commits {
 
 /// Records the duration of a transaction when it ends.
 #[derive(Debug)]
-pub(super) struct Noted {
+pub(super) struct DurationRecorder {
     pub(super) metrics: DatabaseMetrics,
     pub(super) kind: &'static str,
     pub(super) writes: bool,
     pub(super) began_at: Instant,
 }
 
-impl Drop for Noted {
+impl Drop for DurationRecorder {
     fn drop(&mut self) {
         let took = self.began_at.elapsed();
         self.metrics.transaction(self.kind, self.writes, took);
@@ -66,7 +66,7 @@ impl Tx {
     ) -> Result<(), DbError> {
         let Self {
             inner,
-            noted,
+            duration_recorder,
             commits,
             is_counted,
         } = self;
@@ -87,7 +87,7 @@ impl Tx {
             if outcome == Outcome::Unknown {
                 commits.became_unknown.notify_one();
             }
-            drop(noted);
+            drop(duration_recorder);
             committed
         });
         committing

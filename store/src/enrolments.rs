@@ -6,7 +6,7 @@ use crate::Issued;
 
 /// Certificates of an enrolment that are accepted for a renewal.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Counting {
+pub enum AcceptedCertificates {
     /// None: the enrolment is not in force.
     None,
     /// Any certificate of a trusted authority: none are recorded.

@@ -17,15 +17,15 @@ pub const SLOW_AFTER: Duration = Duration::from_millis(500);
 
 /// Labels of a database transaction: the use case, and whether it writes.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
-struct OfTransaction {
+struct TransactionLabels {
     kind: &'static str,
-    writes: Flag,
+    writes: BoolLabel,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-struct Flag(bool);
+struct BoolLabel(bool);
 
-impl EncodeLabelValue for Flag {
+impl EncodeLabelValue for BoolLabel {
     fn encode(&self, encoder: &mut LabelValueEncoder<'_>) -> fmt::Result {
         fmt::Write::write_str(encoder, if self.0 { "true" } else { "false" })
     }
@@ -50,7 +50,7 @@ type Slow = Arc<Mutex<Vec<SlowUseCase>>>;
 /// Metrics of the database.
 #[derive(Debug, Clone)]
 pub struct DatabaseMetrics {
-    transactions: Family<OfTransaction, Histogram, fn() -> Histogram>,
+    transactions: Family<TransactionLabels, Histogram, fn() -> Histogram>,
     write_waits: Histogram,
     slow: Slow,
 }
@@ -68,9 +68,9 @@ impl Default for DatabaseMetrics {
 impl DatabaseMetrics {
     /// Records a transaction: its use case, whether it writes, and its duration from begin to end.
     pub fn transaction(&self, kind: &'static str, writes: bool, took: Duration) {
-        let of = OfTransaction {
+        let of = TransactionLabels {
             kind,
-            writes: Flag(writes),
+            writes: BoolLabel(writes),
         };
         let histogram = self.transactions.get_or_create(&of);
         histogram.observe(took.as_secs_f64());

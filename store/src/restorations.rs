@@ -36,9 +36,9 @@ pub struct Changed {
     pub certificates: u64,
 }
 
-/// A robot that is restrained since a restoration.
+/// A robot that is restricted since a restoration.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Restrained {
+pub struct RestrictedRobot {
     /// Its key.
     pub pk: i64,
     /// Its site.

@@ -60,7 +60,7 @@ pub struct NewSession {
 
 /// Filter of a list of people's sessions.
 #[derive(Debug, Clone)]
-pub struct OfPeople<'filter> {
+pub struct PeopleSessionFilter<'filter> {
     /// Those of this provider.
     pub issuer: &'filter str,
     /// Groups whose grants are within the requested scope.

@@ -3,7 +3,7 @@
 
 /// A command with its arguments.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Typed {
+pub struct ShellCommand {
     /// Its line in the script, from 1.
     pub line: usize,
     /// Its words, without their quotes.
@@ -14,7 +14,7 @@ pub struct Typed {
 const SEPARATORS: [char; 5] = ['\n', ';', '|', '&', '}'];
 
 /// The commands of a script, those within `$(…)` after the one that holds them.
-pub fn commands(script: &str) -> Vec<Typed> {
+pub fn commands(script: &str) -> Vec<ShellCommand> {
     let mut reader = Reader {
         line: 1,
         ..Reader::default()
@@ -50,7 +50,7 @@ pub fn commands(script: &str) -> Vec<Typed> {
                     })
                     .collect();
                 let line = reader.line;
-                let nested = commands(&within).into_iter().map(|typed| Typed {
+                let nested = commands(&within).into_iter().map(|typed| ShellCommand {
                     line: line + typed.line - 1,
                     ..typed
                 });
@@ -89,8 +89,8 @@ struct Reader {
     /// The next word is the file of a redirection.
     is_redirected: bool,
     begin: Option<usize>,
-    nested: Vec<Typed>,
-    commands: Vec<Typed>,
+    nested: Vec<ShellCommand>,
+    commands: Vec<ShellCommand>,
 }
 
 impl Reader {
@@ -112,7 +112,7 @@ impl Reader {
         let begin = self.begin.take().unwrap_or(self.line);
         let words = std::mem::take(&mut self.words);
         if !words.is_empty() {
-            self.commands.push(Typed { line: begin, words });
+            self.commands.push(ShellCommand { line: begin, words });
         }
         self.commands.append(&mut self.nested);
     }

@@ -33,7 +33,7 @@ fn program(name: &str) -> Option<clap::Command> {
 
 /// Returns the arguments of a command of one of our programs, with values for placeholders; `None`
 /// for any other command. `cargo run --` counts as `tread`.
-fn ours(mut words: Vec<String>) -> Option<Vec<String>> {
+fn program_arguments(mut words: Vec<String>) -> Option<Vec<String>> {
     if words.starts_with(&["cargo".to_owned(), "run".to_owned()]) {
         let is_other = words
             .iter()
@@ -118,7 +118,7 @@ fn every_command_of_the_documentation_is_understood() {
             .filter(|block| block.language == "sh")
         {
             for typed in commands(&block.text) {
-                let Some(words) = ours(typed.words) else {
+                let Some(words) = program_arguments(typed.words) else {
                     continue;
                 };
                 looked_at += 1;
@@ -130,7 +130,7 @@ fn every_command_of_the_documentation_is_understood() {
         }
         for code in &document.codes {
             let words: Vec<String> = code.text.split_whitespace().map(str::to_owned).collect();
-            let words = ours(words).unwrap_or_default();
+            let words = program_arguments(words).unwrap_or_default();
             let words: Vec<&str> = words.iter().map(String::as_str).collect();
             if words.len() < 2 {
                 continue;
@@ -193,7 +193,7 @@ fn every_program_that_the_docs_run_by_cargo_is_there() {
 fn commands_that_are_gone_are_found() {
     let whole = |line: &str| {
         let typed = commands(line).remove(0);
-        ours(typed.words).and_then(|words| fault(&words))
+        program_arguments(typed.words).and_then(|words| fault(&words))
     };
     for good in [
         "tread send circle --robot rover-1 --center 8,6 --radius 3",

@@ -15,11 +15,11 @@ use tread_api::rights::Right;
 use super::Connection;
 use super::durations::within;
 use super::values::{JOIN_TOKENS, SESSIONS, TOKENS, identifier};
-use crate::client::Trusted;
+use crate::client::TrustAnchor;
 
 /// Options for authentication and for the trust in the server.
 #[derive(Debug, Clone, Default, Args)]
-pub(crate) struct Showing {
+pub(crate) struct AuthenticationOptions {
     /// File with the token; if absent, `TREAD_TOKEN`, else the token that `tread login` stored for
     /// the server
     #[arg(long, global = true, value_name = "FILE")]
@@ -39,13 +39,13 @@ pub(crate) struct Showing {
     pub(crate) ca_fingerprint: Option<Fingerprint>,
 }
 
-impl Showing {
+impl AuthenticationOptions {
     /// Returns which certificates of a server to trust.
-    pub(crate) fn trusted(&self, kept: Option<Fingerprint>) -> Trusted<'_> {
+    pub(crate) fn trusted(&self, kept: Option<Fingerprint>) -> TrustAnchor<'_> {
         match (&self.ca, self.ca_fingerprint.or(kept)) {
-            (Some(file), _) => Trusted::Authority(file),
-            (None, Some(fingerprint)) => Trusted::Fingerprint(fingerprint),
-            (None, None) => Trusted::System,
+            (Some(file), _) => TrustAnchor::Authority(file),
+            (None, Some(fingerprint)) => TrustAnchor::Fingerprint(fingerprint),
+            (None, None) => TrustAnchor::System,
         }
     }
 }
@@ -192,18 +192,18 @@ pub(crate) enum AuditAction {
         file: Option<PathBuf>,
         /// Number and hash from an earlier `verify`; fails if that entry has changed since
         #[arg(long, value_name = "NUMBER:HASH")]
-        noted: Option<Noted>,
+        noted: Option<RecordedEntry>,
     },
 }
 
 /// Number and hash of an entry that were recorded earlier.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Noted {
+pub(crate) struct RecordedEntry {
     pub(crate) id: u64,
     pub(crate) hash: String,
 }
 
-impl FromStr for Noted {
+impl FromStr for RecordedEntry {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {

@@ -19,7 +19,7 @@ const LEADING: [(&str, bool); 6] = [
 
 /// Moves options of the connection from before the command to behind it. Anything else stays as it
 /// is, for clap to judge.
-pub(super) fn behind_the_command(words: Vec<OsString>, command: &Command) -> Vec<OsString> {
+pub(super) fn options_after_command(words: Vec<OsString>, command: &Command) -> Vec<OsString> {
     let mut at = 1;
     while let Some(has_value) = words.get(at).and_then(|word| leading(word)) {
         at += if has_value { 2 } else { 1 };
@@ -65,7 +65,7 @@ mod tests {
 
     fn moved(line: &str) -> String {
         let words = line.split(' ').map(OsString::from).collect();
-        let moved = behind_the_command(words, &Arguments::whole());
+        let moved = options_after_command(words, &Arguments::whole());
         let words: Vec<&str> = moved.iter().filter_map(|word| word.to_str()).collect();
         words.join(" ")
     }
@@ -108,7 +108,7 @@ mod tests {
         ] {
             let words = line.split(' ').map(OsString::from).collect();
             let whole = Arguments::whole();
-            let words = behind_the_command(words, &whole);
+            let words = options_after_command(words, &whole);
             if let Err(refused) = whole.try_get_matches_from(words) {
                 panic!("`{line}` was refused: {refused}");
             }

@@ -38,7 +38,7 @@ pub(crate) enum SendTrajectory {
 
 /// Options that circles and waypoints have in common.
 #[derive(Debug, Args)]
-pub(crate) struct Order {
+pub(crate) struct MissionOptions {
     /// Robot that is to drive
     #[arg(long)]
     pub(crate) robot: RobotId,
@@ -92,7 +92,7 @@ pub(crate) enum Start {
     Refuse,
 }
 
-impl Order {
+impl MissionOptions {
     pub(crate) fn start_policy(&self) -> StartPolicy {
         match self.start {
             Start::Append => StartPolicy::Append,
@@ -129,7 +129,7 @@ pub(crate) struct SendCircle {
     #[arg(long)]
     pub(crate) clockwise: bool,
     #[command(flatten)]
-    pub(crate) order: Order,
+    pub(crate) order: MissionOptions,
 }
 
 #[derive(Debug, Args)]
@@ -148,7 +148,7 @@ pub(crate) struct SendWaypoints {
     #[arg(long, value_name = "M/S", default_value_t = 0.5, value_parser = finite, allow_negative_numbers = true)]
     pub(crate) speed: f64,
     #[command(flatten)]
-    pub(crate) order: Order,
+    pub(crate) order: MissionOptions,
 }
 
 #[derive(Debug, Args)]

@@ -86,37 +86,37 @@ pub(super) fn moment(text: &str) -> Result<Timestamp, String> {
 
 /// Objects to which a server gives identifiers, and the command that lists them.
 #[derive(Clone, Copy)]
-pub(super) struct Identified {
+pub(super) struct ObjectKind {
     object: &'static str,
     listing: &'static str,
 }
 
-pub(super) const TOKENS: Identified = Identified {
+pub(super) const TOKENS: ObjectKind = ObjectKind {
     object: "a token",
     listing: "tread tokens",
 };
-pub(super) const JOIN_TOKENS: Identified = Identified {
+pub(super) const JOIN_TOKENS: ObjectKind = ObjectKind {
     object: "a join token",
     listing: "tread robots join-token list",
 };
-pub(super) const SESSIONS: Identified = Identified {
+pub(super) const SESSIONS: ObjectKind = ObjectKind {
     object: "a session",
     listing: "tread sessions",
 };
-pub(super) const ALERTS: Identified = Identified {
+pub(super) const ALERTS: ObjectKind = ObjectKind {
     object: "an alert",
     listing: "tread alerts",
 };
-pub(super) const STOPS: Identified = Identified {
+pub(super) const STOPS: ObjectKind = ObjectKind {
     object: "a stop",
     listing: "tread stops",
 };
 
 /// Returns the parser of the identifiers of such objects.
 pub(super) fn identifier<T: FromStr>(
-    of: Identified,
+    of: ObjectKind,
 ) -> impl Fn(&str) -> Result<T, String> + Clone + Send + Sync + 'static {
-    let Identified { object, listing } = of;
+    let ObjectKind { object, listing } = of;
     move |text| {
         let wrong = |_| format!("this is not the identifier of {object}: `{listing}` lists them");
         text.parse().map_err(wrong)

@@ -27,7 +27,7 @@ pub(crate) enum ClientError {
     #[error("TLS cannot be set up")]
     Tls(#[source] rustls::Error),
     /// The server's certificate is not accepted.
-    #[error("the certificate of {address} is not accepted: {}", why_not(.cause))]
+    #[error("the certificate of {address} is not accepted: {}", failure_reason(.cause))]
     Untrusted {
         address: String,
         cause: rustls::Error,
@@ -88,7 +88,7 @@ pub(crate) enum ClientError {
     clippy::wildcard_enum_match_arm,
     reason = "the library's own words serve for all other causes"
 )]
-fn why_not(cause: &rustls::Error) -> String {
+fn failure_reason(cause: &rustls::Error) -> String {
     use rustls::CertificateError as Cause;
     match cause {
         rustls::Error::InvalidCertificate(Cause::Expired | Cause::ExpiredContext { .. }) => {

@@ -54,7 +54,7 @@ impl MapTimes {
 /// Entries of the map with the times to which they refer; JSON contains the entries alone.
 #[derive(Debug, Serialize)]
 #[serde(transparent)]
-pub(crate) struct Known<T> {
+pub(crate) struct TimedEntries<T> {
     pub(crate) items: Vec<T>,
     #[serde(skip)]
     pub(crate) of: MapTimes,
@@ -203,7 +203,7 @@ impl Client {
         area: Option<Area>,
         resolution_m: Option<f64>,
         reading: Reading,
-    ) -> Result<Known<CellFriction>, ClientError> {
+    ) -> Result<TimedEntries<CellFriction>, ClientError> {
         let mut query = reading.query();
         query.extend(area.map(Area::query).unwrap_or_default());
         query.extend(resolution_m.map(|side_m| ("resolution_m", side_m.to_string())));
@@ -239,7 +239,7 @@ impl Client {
         (from, to): (Timestamp, Option<Timestamp>),
         area: Option<Area>,
         reading: Reading,
-    ) -> Result<Known<CellDifference>, ClientError> {
+    ) -> Result<TimedEntries<CellDifference>, ClientError> {
         let mut query = reading.query();
         query.push(("from", from.to_string()));
         query.extend(to.map(|to| ("to", to.to_string())));

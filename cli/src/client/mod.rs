@@ -24,7 +24,7 @@ use tread_api::page::{DifferencePage, PAGE_LIMIT_MAX};
 use tread_api::text;
 
 pub(crate) use self::error::ClientError;
-pub(crate) use self::map::{Area, HistoryTimes, Known, MapTimes, Reading};
+pub(crate) use self::map::{Area, HistoryTimes, MapTimes, Reading, TimedEntries};
 
 /// Maximum time for an answer; planning the longest path takes several seconds.
 const ANSWER_WAIT_MAX: Duration = Duration::from_secs(30);
@@ -59,7 +59,7 @@ fn is_here(url: &Url) -> bool {
 
 /// Which certificates of a server are trusted.
 #[derive(Debug, Clone, Copy)]
-pub(crate) enum Trusted<'a> {
+pub(crate) enum TrustAnchor<'a> {
     /// Those of the system's authorities.
     System,
     /// Those of the authorities in a PEM file.
@@ -93,7 +93,7 @@ impl Client {
     pub(crate) fn new(
         address: &str,
         token: Option<&str>,
-        trusted: Trusted<'_>,
+        trusted: TrustAnchor<'_>,
     ) -> Result<Self, ClientError> {
         let invalid = || ClientError::Address {
             address: address.to_owned(),
@@ -112,12 +112,14 @@ impl Client {
             .connect_timeout(CONNECT_WAIT_MAX)
             .user_agent(concat!("tread/", env!("CARGO_PKG_VERSION")));
         builder = match trusted {
-            Trusted::Authority(file) => builder.tls_certs_only(certificates(file)?),
+            TrustAnchor::Authority(file) => builder.tls_certs_only(certificates(file)?),
             // Without TLS no authority is trusted, so that the system's certificates are not
             // loaded.
-            Trusted::System | Trusted::Fingerprint(_) if !is_tls => builder.tls_certs_only([]),
-            Trusted::System => builder,
-            Trusted::Fingerprint(fingerprint) => {
+            TrustAnchor::System | TrustAnchor::Fingerprint(_) if !is_tls => {
+                builder.tls_certs_only([])
+            }
+            TrustAnchor::System => builder,
+            TrustAnchor::Fingerprint(fingerprint) => {
                 let config = Trust::Fingerprint(fingerprint).client_config(None);
                 match config.map_err(ClientError::Tls)? {
                     Some(config) => builder.tls_backend_preconfigured(config),
@@ -279,7 +281,7 @@ impl Client {
         &self,
         path: &str,
         query: &Query,
-    ) -> Result<Known<T>, ClientError> {
+    ) -> Result<TimedEntries<T>, ClientError> {
         let mut items = Vec::new();
         let mut of = MapTimes::default();
         let mut cursor: Option<String> = None;
@@ -298,7 +300,7 @@ impl Client {
                 break;
             }
         }
-        Ok(Known { items, of })
+        Ok(TimedEntries { items, of })
     }
 
     /// Whether the server is ready: `/readyz` answers with success.
@@ -335,7 +337,7 @@ mod tests {
     #[test]
     fn a_token_goes_over_the_network_only_by_tls() {
         let _first = rustls::crypto::ring::default_provider().install_default();
-        let to = |address| Client::new(address, Some("t"), Trusted::System).map(|_| ());
+        let to = |address| Client::new(address, Some("t"), TrustAnchor::System).map(|_| ());
         for here in [
             "http://127.0.0.1:8420/",
             "http://[::1]:8420",
@@ -352,9 +354,9 @@ mod tests {
                 matches!(to(away), Err(ClientError::ClearText { .. })),
                 "{away}"
             );
-            assert!(Client::new(away, None, Trusted::System).is_ok());
+            assert!(Client::new(away, None, TrustAnchor::System).is_ok());
         }
-        let client = Client::new("http://127.0.0.1:1", None, Trusted::System).unwrap();
+        let client = Client::new("http://127.0.0.1:1", None, TrustAnchor::System).unwrap();
         let sent = r#"{"a\u001b": ["x\ny", "\u202ee\u009b", "ü"], "n": 1.5}"#.as_bytes();
         let shown: Value = client.clone().for_people(true).read(sent).unwrap();
         let said = serde_json::json!({"a\\u{1b}": ["x\\ny", "\\u{202e}e\\u{9b}", "ü"], "n": 1.5});

@@ -11,7 +11,7 @@ use tread_api::audit::{AuditChain, Broken, Verifier};
 use tread_api::identity::AuditEntry;
 use tread_api::page::Page;
 
-use crate::args::{AuditAction, AuditArguments, Noted};
+use crate::args::{AuditAction, AuditArguments, RecordedEntry};
 use crate::client::Client;
 use crate::output::{Output, or_dash, print_note, render, table};
 
@@ -131,7 +131,7 @@ struct Verified {
 }
 
 /// Computes the hashes of all entries on the server and verifies the chain.
-async fn verify(client: &Client, noted: Option<&Noted>) -> anyhow::Result<Verified> {
+async fn verify(client: &Client, noted: Option<&RecordedEntry>) -> anyhow::Result<Verified> {
     for _ in 0..TRIES {
         let chain = client.audit_chain().await?;
         match follow(client, &chain, noted).await {
@@ -157,7 +157,7 @@ async fn verify(client: &Client, noted: Option<&Noted>) -> anyhow::Result<Verifi
 async fn follow(
     client: &Client,
     chain: &AuditChain,
-    noted: Option<&Noted>,
+    noted: Option<&RecordedEntry>,
 ) -> anyhow::Result<Verifier> {
     let mut verifier = Verifier::after(chain.before_id, &chain.before_hash);
     let mut is_found = noted.map(|noted| is_noted(noted, chain.before_id, &chain.before_hash));
@@ -180,7 +180,7 @@ async fn follow(
 fn take(
     verifier: &mut Verifier,
     entry: &AuditEntry,
-    noted: Option<&Noted>,
+    noted: Option<&RecordedEntry>,
     is_found: &mut Option<bool>,
 ) -> anyhow::Result<()> {
     verifier.take(entry)?;
@@ -195,11 +195,11 @@ fn take(
     Ok(())
 }
 
-fn is_noted(noted: &Noted, id: u64, hash: &str) -> bool {
+fn is_noted(noted: &RecordedEntry, id: u64, hash: &str) -> bool {
     (noted.id, noted.hash.as_str()) == (id, hash)
 }
 
-fn found(noted: Option<&Noted>, is_found: Option<bool>) -> anyhow::Result<()> {
+fn found(noted: Option<&RecordedEntry>, is_found: Option<bool>) -> anyhow::Result<()> {
     if let (Some(noted), Some(false)) = (noted, is_found) {
         bail!(
             "entry {} is not in the log, so it cannot be compared with the recorded one",
@@ -210,7 +210,7 @@ fn found(noted: Option<&Noted>, is_found: Option<bool>) -> anyhow::Result<()> {
 }
 
 /// Verifies the chain of exported entries.
-fn verify_file(file: &Path, noted: Option<&Noted>) -> anyhow::Result<Verified> {
+fn verify_file(file: &Path, noted: Option<&RecordedEntry>) -> anyhow::Result<Verified> {
     let named = || format!("cannot read {}", file.display());
     let lines = BufReader::new(std::fs::File::open(file).with_context(named)?).lines();
     let mut verified: Option<Verified> = None;

@@ -83,7 +83,7 @@ impl Drop for RawTerminal {
 
 /// Effect of a key.
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum Meaning {
+enum KeyEffect {
     /// Fractions of the full speed and of the full yaw rate, -1 to 1.
     Move(f64, f64),
     Stop,
@@ -95,24 +95,24 @@ enum Meaning {
     clippy::wildcard_enum_match_arm,
     reason = "all other keys mean nothing"
 )]
-fn meaning(key: KeyEvent) -> Meaning {
+fn key_effect(key: KeyEvent) -> KeyEffect {
     if key.kind == KeyEventKind::Release {
-        return Meaning::Nothing;
+        return KeyEffect::Nothing;
     }
     if key.modifiers.contains(KeyModifiers::CONTROL) {
         return match key.code {
-            KeyCode::Char('c' | 'd') => Meaning::Quit,
-            _ => Meaning::Nothing,
+            KeyCode::Char('c' | 'd') => KeyEffect::Quit,
+            _ => KeyEffect::Nothing,
         };
     }
     match key.code {
-        KeyCode::Up | KeyCode::Char('w' | 'W') => Meaning::Move(1.0, 0.0),
-        KeyCode::Down | KeyCode::Char('s' | 'S') => Meaning::Move(-1.0, 0.0),
-        KeyCode::Left | KeyCode::Char('a' | 'A') => Meaning::Move(0.0, 1.0),
-        KeyCode::Right | KeyCode::Char('d' | 'D') => Meaning::Move(0.0, -1.0),
-        KeyCode::Char(' ' | 'x' | 'X') => Meaning::Stop,
-        KeyCode::Char('q' | 'Q') | KeyCode::Esc => Meaning::Quit,
-        _ => Meaning::Nothing,
+        KeyCode::Up | KeyCode::Char('w' | 'W') => KeyEffect::Move(1.0, 0.0),
+        KeyCode::Down | KeyCode::Char('s' | 'S') => KeyEffect::Move(-1.0, 0.0),
+        KeyCode::Left | KeyCode::Char('a' | 'A') => KeyEffect::Move(0.0, 1.0),
+        KeyCode::Right | KeyCode::Char('d' | 'D') => KeyEffect::Move(0.0, -1.0),
+        KeyCode::Char(' ' | 'x' | 'X') => KeyEffect::Stop,
+        KeyCode::Char('q' | 'Q') | KeyCode::Esc => KeyEffect::Quit,
+        _ => KeyEffect::Nothing,
     }
 }
 
@@ -247,9 +247,9 @@ impl Driving<'_> {
 
     /// Handles a key; returns false to quit.
     async fn press(&mut self, socket: &mut Socket, key: KeyEvent) -> anyhow::Result<bool> {
-        match meaning(key) {
-            Meaning::Move(linear, around) => self.keys.press((linear, around), Instant::now()),
-            Meaning::Stop => {
+        match key_effect(key) {
+            KeyEffect::Move(linear, around) => self.keys.press((linear, around), Instant::now()),
+            KeyEffect::Stop => {
                 self.keys = Keys::default();
                 let words = StopReason {
                     by: Some(self.arguments.name.clone()),
@@ -257,8 +257,8 @@ impl Driving<'_> {
                 };
                 send(socket, &DriveRequest::Stop(words)).await?;
             }
-            Meaning::Quit => return Ok(false),
-            Meaning::Nothing => {}
+            KeyEffect::Quit => return Ok(false),
+            KeyEffect::Nothing => {}
         }
         Ok(true)
     }
@@ -415,18 +415,24 @@ mod tests {
 
     #[test]
     fn every_key_means_what_the_help_says() {
-        assert_eq!(meaning(key(KeyCode::Up)), Meaning::Move(1.0, 0.0));
-        assert_eq!(meaning(key(KeyCode::Char('a'))), Meaning::Move(0.0, 1.0));
-        assert_eq!(meaning(key(KeyCode::Char(' '))), Meaning::Stop);
+        assert_eq!(key_effect(key(KeyCode::Up)), KeyEffect::Move(1.0, 0.0));
+        assert_eq!(
+            key_effect(key(KeyCode::Char('a'))),
+            KeyEffect::Move(0.0, 1.0)
+        );
+        assert_eq!(key_effect(key(KeyCode::Char(' '))), KeyEffect::Stop);
         assert!(HELP.contains("space or x stops and latches"));
-        assert_eq!(meaning(key(KeyCode::Char('x'))), Meaning::Stop);
-        assert_eq!(meaning(key(KeyCode::Esc)), Meaning::Quit);
-        assert_eq!(meaning(key(KeyCode::Char('d'))), Meaning::Move(0.0, -1.0));
+        assert_eq!(key_effect(key(KeyCode::Char('x'))), KeyEffect::Stop);
+        assert_eq!(key_effect(key(KeyCode::Esc)), KeyEffect::Quit);
+        assert_eq!(
+            key_effect(key(KeyCode::Char('d'))),
+            KeyEffect::Move(0.0, -1.0)
+        );
         let control_c = KeyEvent::new(KeyCode::Char('c'), KeyModifiers::CONTROL);
-        assert_eq!(meaning(control_c), Meaning::Quit);
+        assert_eq!(key_effect(control_c), KeyEffect::Quit);
         let mut released = key(KeyCode::Up);
         released.kind = KeyEventKind::Release;
-        assert_eq!(meaning(released), Meaning::Nothing);
-        assert_eq!(meaning(key(KeyCode::F(1))), Meaning::Nothing);
+        assert_eq!(key_effect(released), KeyEffect::Nothing);
+        assert_eq!(key_effect(key(KeyCode::F(1))), KeyEffect::Nothing);
     }
 }

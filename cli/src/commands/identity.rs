@@ -23,22 +23,22 @@ fn store() -> anyhow::Result<Store> {
 
 /// Reads a token, verifies it at the server, and stores it for that server.
 pub(super) async fn login(connection: &Connection, output: Output) -> anyhow::Result<ExitCode> {
-    let token = match &connection.showing.token_file {
+    let token = match &connection.authentication.token_file {
         Some(file) => credentials::read_token(file)?,
         None => tokio::task::spawn_blocking(read_from_input).await??,
     };
-    let showing = &connection.showing;
+    let authentication = &connection.authentication;
     let server = connection.server()?;
     let kept = credentials::fingerprint(address_of(&server))?;
-    let client = Client::new(&server, Some(&token), showing.trusted(kept))?;
+    let client = Client::new(&server, Some(&token), authentication.trusted(kept))?;
     let client = client.for_people(!output.is_json());
     let session = client.session().await?;
     let store = store()?;
     let key = client.address();
-    store.keep(Entry { key, value: &token })?;
-    if let Some(fingerprint) = showing.ca_fingerprint {
+    store.save(Entry { key, value: &token })?;
+    if let Some(fingerprint) = authentication.ca_fingerprint {
         let value = &fingerprint.to_string();
-        store.fingerprints().keep(Entry { key, value })?;
+        store.fingerprints().save(Entry { key, value })?;
     }
     store.keep_last_server(client.address())?;
     print_note(&format!(
@@ -46,7 +46,7 @@ pub(super) async fn login(connection: &Connection, output: Output) -> anyhow::Re
         store.path().display(),
         client.address()
     ));
-    output.show(&session, who)?;
+    output.show(&session, subject_text)?;
     Ok(ExitCode::SUCCESS)
 }
 
@@ -81,7 +81,7 @@ pub(super) fn logout(client: &Client, output: Output) -> anyhow::Result<ExitCode
 }
 
 pub(super) async fn whoami(client: &Client, output: Output) -> anyhow::Result<ExitCode> {
-    output.show(&client.session().await?, who)?;
+    output.show(&client.session().await?, subject_text)?;
     Ok(ExitCode::SUCCESS)
 }
 
@@ -94,16 +94,16 @@ pub(super) fn token(client: &Client) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-fn who(session: &Session) -> String {
-    let (what, place) = (what(session.role, session.rights), &session.sites);
+fn subject_text(session: &Session) -> String {
+    let (granted, place) = (rights_text(session.role, session.rights), &session.sites);
     format!(
-        "{}, {what}, {place}, until {}",
+        "{}, {granted}, {place}, until {}",
         session.name, session.expires_at
     )
 }
 
 /// Returns the role, or the rights if there is no role.
-fn what(role: Option<Role>, rights: Rights) -> String {
+fn rights_text(role: Option<Role>, rights: Rights) -> String {
     role.map_or_else(|| rights.to_string(), |role| role.to_string())
 }
 
@@ -144,9 +144,9 @@ pub(super) async fn tokens(
                     expires_at,
                     ..
                 } = &created.token;
-                let what = what(*role, *rights);
+                let granted = rights_text(*role, *rights);
                 print_note(&format!(
-                    "token `{name}`: {what}, {sites}, valid until {expires_at}; it is shown only once:"
+                    "token `{name}`: {granted}, {sites}, valid until {expires_at}; it is shown only once:"
                 ));
             }
             output.show(&created, |created| created.secret.clone())?;
@@ -174,7 +174,7 @@ fn list(tokens: &[Token]) -> String {
         table.add_row([
             token.id.to_string(),
             token.name.clone(),
-            what(token.role, token.rights),
+            rights_text(token.role, token.rights),
             token.sites.to_string(),
             token.created_by.clone(),
             format!("{:.0}", token.expires_at),
@@ -223,7 +223,7 @@ fn signed_in(sessions: &[PersonSession]) -> String {
             let role = Role::ALL
                 .into_iter()
                 .find(|&role| Rights::from(role) == *rights);
-            format!("{} for {sites}", what(role, *rights))
+            format!("{} for {sites}", rights_text(role, *rights))
         });
         table.add_row([
             session.id.to_string(),

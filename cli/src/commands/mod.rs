@@ -38,11 +38,11 @@ pub(crate) async fn run(command: RemoteCommand, output: Output) -> anyhow::Resul
     if let RemoteCommand::Login(_) = command {
         return identity::login(&connection, output).await;
     }
-    let showing = &connection.showing;
+    let authentication = &connection.authentication;
     let server = connection.server()?;
     let address = address_of(&server);
-    let token = credentials::find(address, showing.token_file.as_deref())?;
-    let trusted = showing.trusted(credentials::fingerprint(address)?);
+    let token = credentials::find(address, authentication.token_file.as_deref())?;
+    let trusted = authentication.trusted(credentials::fingerprint(address)?);
     let client = Client::new(address, token.as_deref(), trusted)?;
     let client = client.for_people(!output.is_json());
     let site = &connection.site;

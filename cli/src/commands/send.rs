@@ -15,7 +15,7 @@ use super::mission_text::summary;
 use super::naming::mission_id;
 use super::points::read_waypoints;
 use super::waiting::{have_succeeded, wait};
-use crate::args::{Order, SendArguments, SendCircle, SendTrajectory, SendWaypoints};
+use crate::args::{MissionOptions, SendArguments, SendCircle, SendTrajectory, SendWaypoints};
 use crate::client::Client;
 use crate::output::{Output, fixed};
 
@@ -67,7 +67,7 @@ pub(super) async fn run(
 /// Checks a trajectory and prints its plan.
 async fn check(
     trajectory: Trajectory,
-    order: &Order,
+    order: &MissionOptions,
     client: &Client,
     output: Output,
 ) -> anyhow::Result<ExitCode> {
@@ -152,7 +152,7 @@ fn demands(checked: &TrajectoryCheck) -> String {
 }
 
 /// Returns the options of the trajectory that the flags select.
-fn options(order: &Order) -> TrajectoryOptions {
+fn options(order: &MissionOptions) -> TrajectoryOptions {
     TrajectoryOptions {
         expected_start: None,
         approach_speed_m_s: order.approach_speed,
@@ -160,7 +160,7 @@ fn options(order: &Order) -> TrajectoryOptions {
     }
 }
 
-fn circle(send: SendCircle) -> (Trajectory, Order) {
+fn circle(send: SendCircle) -> (Trajectory, MissionOptions) {
     let direction = if send.clockwise {
         Direction::Clockwise
     } else {
@@ -178,7 +178,7 @@ fn circle(send: SendCircle) -> (Trajectory, Order) {
     (Trajectory::Circle(circle), send.order)
 }
 
-fn waypoints(send: SendWaypoints) -> anyhow::Result<(Trajectory, Order)> {
+fn waypoints(send: SendWaypoints) -> anyhow::Result<(Trajectory, MissionOptions)> {
     let points = match &send.file {
         Some(file) => read_waypoints(file)?,
         None => send.points,

@@ -26,7 +26,7 @@ use self::processes::Processes;
 use self::progress::Progress;
 use self::report::Report;
 use crate::args::DemoArguments;
-use crate::client::{Client, ClientError, Reading, Trusted};
+use crate::client::{Client, ClientError, Reading, TrustAnchor};
 use crate::credentials::{self, Entry, Store};
 use crate::output::{json_line, line, print_note};
 use crate::signals::ShutdownSignals;
@@ -59,7 +59,7 @@ pub(crate) async fn run(arguments: DemoArguments) -> anyhow::Result<ExitCode> {
     tell("starting server, database and router …");
     let mut processes = Processes::start_server(folder.path(), arguments.port, &scenario.site)?;
     let token = credentials::read_token(&processes.token_file())?;
-    let client = Client::new(&processes.api_address(), Some(&token), Trusted::System)?;
+    let client = Client::new(&processes.api_address(), Some(&token), TrustAnchor::System)?;
     let _signed_in = SignedIn::keep(&client, token);
     let demo = Demo {
         scenario: &scenario,
@@ -138,7 +138,7 @@ impl SignedIn {
             key: client.address(),
             value: &token,
         };
-        let store = Store::of_user().filter(|store| match store.keep(entry) {
+        let store = Store::of_user().filter(|store| match store.save(entry) {
             Ok(()) => true,
             Err(error) => {
                 print_note(&format!("other commands need --token-file: {error:#}"));

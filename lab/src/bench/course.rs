@@ -88,7 +88,7 @@ impl Figure8 {
 
 /// Point of a course nearest to a robot.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Nearest {
+pub struct ClosestPoint {
     /// Time of this point on the course, seconds.
     pub time_s: f64,
     /// Distance of the robot to the left of the course, metres.
@@ -122,7 +122,7 @@ impl Course {
     }
 
     /// Returns the point nearest to a robot, searched from `guess_s` over a bounded distance.
-    pub fn nearest(&self, point: Point, guess_s: f64) -> Nearest {
+    pub fn nearest(&self, point: Point, guess_s: f64) -> ClosestPoint {
         let mut time_s = guess_s;
         for _ in 0..NEWTON_STEPS {
             let sample = self.sample(time_s);
@@ -132,7 +132,7 @@ impl Course {
             let step_s = forward.x_m / (bend * sample.speed_m_s.max(SPEED_FLOOR_M_S));
             time_s = (time_s + step_s.clamp(-MOVE_MAX_S, MOVE_MAX_S)).clamp(0.0, self.duration_s());
         }
-        Nearest {
+        ClosestPoint {
             time_s,
             cross_track_m: self.sample(time_s).pose.body_from_site(point).y_m,
         }

@@ -12,7 +12,7 @@ mod pursuit;
 mod robots;
 mod run;
 
-pub use course::{CLOSED_PATH_M, Course, Figure8, Nearest};
+pub use course::{CLOSED_PATH_M, ClosestPoint, Course, Figure8};
 pub use driver::{Driver, LawInput};
 pub use kanayama::{Kanayama, KanayamaGains, Track};
 pub use paper_law::PaperLaw;

@@ -59,7 +59,7 @@ struct Arguments {
 
 /// Drives without a change.
 #[derive(Debug, Serialize)]
-struct Quiet {
+struct UnchangedDrives {
     has_torque: bool,
     hours: f64,
     false_alarms: u64,
@@ -110,11 +110,11 @@ fn trial(seed: u64, has_torque: bool) -> ChangeTrial {
     trial
 }
 
-fn quiet(arguments: &Arguments, has_torque: bool) -> anyhow::Result<Quiet> {
+fn quiet(arguments: &Arguments, has_torque: bool) -> anyhow::Result<UnchangedDrives> {
     let drives = arguments.hours * QUIET_PER_HOUR / 2;
     let seeds = (arguments.seed..).take(drives as usize);
     let trials: Vec<ChangeTrial> = seeds.map(|seed| trial(seed, has_torque)).collect();
-    let mut line = Quiet {
+    let mut line = UnchangedDrives {
         has_torque,
         hours: f64::from(drives) / f64::from(QUIET_PER_HOUR),
         false_alarms: 0,
@@ -180,7 +180,7 @@ fn with_or_without(has_torque: bool) -> &'static str {
     }
 }
 
-fn quiet_table(lines: &[Quiet]) -> Table {
+fn quiet_table(lines: &[UnchangedDrives]) -> Table {
     let mut table = Table::new(["no change", "hours", "false alarms", "per hour"]);
     for line in lines {
         table.row([
@@ -218,7 +218,7 @@ fn change_table(lines: &[Changed]) -> Table {
 }
 
 #[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
-fn false_per_hour(line: &Quiet) -> f64 {
+fn false_per_hour(line: &UnchangedDrives) -> f64 {
     line.false_alarms as f64 / line.hours
 }
 

@@ -21,7 +21,7 @@ use tread_lab::bench::{CLOSED_PATH_M, KanayamaGains, Law, PursuitConfig, Track};
 use tread_lab::parallel::in_parallel;
 use tread_lab::report::{Check, checks_json};
 use tread_lab::rough::spec::MAKES;
-use tread_lab::rough::tracking::{Errors, Knowing, Poses, Trial, World, run};
+use tread_lab::rough::tracking::{Errors, Poses, ThetaSource, Trial, World, run};
 
 /// Stiffnesses K of the grounds.
 const GROUNDS: [f64; 3] = [0.7, 3.0, 12.0];
@@ -154,7 +154,7 @@ fn drive(
     arguments: &Arguments,
     law: Law,
     config: TrackerConfig,
-    knowing: Knowing,
+    knowing: ThetaSource,
 ) -> anyhow::Result<Errors> {
     let mut sum = Errors {
         rms_m: 0.0,
@@ -256,7 +256,7 @@ fn mean_log_error<P: Gains>(
 ) -> anyhow::Result<f64> {
     let (law, config) = peer.law();
     let errors = in_parallel(places, |place| {
-        drive(place, arguments, law, config, Knowing::Nothing)
+        drive(place, arguments, law, config, ThetaSource::Nothing)
     });
     let errors = errors
         .into_iter()
@@ -301,7 +301,7 @@ fn millimetres(value_m: f64) -> Option<f64> {
 
 fn line(
     place: &Place<'_>,
-    laws: &[(&'static str, (Law, TrackerConfig), Knowing)],
+    laws: &[(&'static str, (Law, TrackerConfig), ThetaSource)],
     arguments: &Arguments,
 ) -> anyhow::Result<Line> {
     let mut found = Vec::new();
@@ -413,10 +413,10 @@ fn main() -> anyhow::Result<ExitCode> {
         pursuit = tuned(&places, &arguments, pursuit)?;
     }
     let laws = [
-        ("Kanayama, integral", kanayama.law(), Knowing::Nothing),
-        ("pure pursuit", pursuit.law(), Knowing::Nothing),
-        ("ours", ours.law(), Knowing::Nothing),
-        ("ours, own θ", ours.law(), Knowing::Own),
+        ("Kanayama, integral", kanayama.law(), ThetaSource::Nothing),
+        ("pure pursuit", pursuit.law(), ThetaSource::Nothing),
+        ("ours", ours.law(), ThetaSource::Nothing),
+        ("ours, own θ", ours.law(), ThetaSource::Own),
     ];
     let lines = in_parallel(&places, |place| line(place, &laws, &arguments));
     let lines = lines.into_iter().collect::<anyhow::Result<Vec<Line>>>()?;

@@ -10,14 +10,14 @@ use tread_api::friction::ThetaEstimate;
 use tread_control::estimation::{EstimatorPrior, ThetaMeasurement};
 
 use super::decode::{Decoder, Refusals, Timed};
-use super::estimate::{Feeding, Outcome, estimate};
+use super::estimate::{EstimationSetup, Outcome, estimate};
 use super::mapping::Mapping;
 use super::reasons::{Reason, reasons};
 use super::recording::{Recording, RecordingError};
 use super::robot::Robot;
 use super::statistics::{EffectiveTrack, Pair, effective_track, mean_chi_square, pairs};
 use super::stretches::{Motion, drives, motion, parts, passes};
-use super::timeline::{Fed, Timeline, assemble, since_begin_s};
+use super::timeline::{LoopInput, Timeline, assemble, since_begin_s};
 use crate::parallel::in_parallel;
 use crate::report::Check;
 
@@ -122,9 +122,9 @@ pub struct Verdict {
 }
 
 impl Verdict {
-    fn new(fed: &[Fed], feeding: &Feeding, outcome: &Outcome) -> Self {
+    fn new(fed: &[LoopInput], feeding: &EstimationSetup, outcome: &Outcome) -> Self {
         let motion = motion(fed, &feeding.model);
-        let at_s = |fed: Option<&Fed>| fed.map_or(0.0, |fed| since_begin_s(fed.sample.at));
+        let at_s = |fed: Option<&LoopInput>| fed.map_or(0.0, |fed| since_begin_s(fed.sample.at));
         let theta = outcome.theta().map(Theta::from);
         Self {
             from_s: at_s(fed.first()),
@@ -257,7 +257,7 @@ pub fn analyse(
         options.interpolates,
     );
     let fed = &timeline.fed;
-    let feeding = Feeding {
+    let feeding = EstimationSetup {
         model: robot.model,
         prior: options.prior.unwrap_or(robot.prior),
         period: Duration::from_secs_f64(robot.rate_hz.recip()),

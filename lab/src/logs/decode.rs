@@ -1,9 +1,9 @@
 //! Messages to values, by the readers that the agent has for a ROS 2 robot.
 
-use tread_agent::drive::ros2::inlet::decoded;
 use tread_agent::drive::ros2::reading::Content;
 use tread_agent::drive::ros2::refusal::{Refusal, Source};
 use tread_agent::drive::ros2::settings::{JointSettings, Ros2Settings};
+use tread_agent::drive::ros2::topic_receiver::decoded;
 use tread_ros2::cdr::{Sequence, decode, encode};
 use tread_ros2::messages::{
     Imu, JointState, Odometry, PoseStamped, PoseWithCovariance, PoseWithCovarianceStamped,

@@ -4,11 +4,11 @@ use std::collections::BTreeSet;
 use std::time::Duration;
 
 use tread_agent::drive::{Feedback, SAMPLES_MAX};
-use tread_agent::testing::{Heard, Listener};
+use tread_agent::testing::{Listener, ListenerOutput};
 use tread_control::estimation::{Estimate, EstimatorPrior, NORMAL_95, ThetaMeasurement};
 use tread_control::robot::RobotModel;
 
-use super::timeline::Fed;
+use super::timeline::LoopInput;
 use crate::report::WIDE_RATIO;
 
 /// Time without samples that is skipped instead of run tick by tick.
@@ -16,7 +16,7 @@ const SKIPPED: Duration = Duration::from_secs(1);
 
 /// How samples are fed.
 #[derive(Debug, Clone, Copy)]
-pub struct Feeding {
+pub struct EstimationSetup {
     /// The robot's model.
     pub model: RobotModel,
     /// What the estimator assumes of the robot and its tyres.
@@ -53,7 +53,7 @@ impl Outcome {
 
 /// State of a run.
 struct Run<'f> {
-    feeding: &'f Feeding,
+    feeding: &'f EstimationSetup,
     listener: Listener,
     begin: Duration,
     feedback: Feedback,
@@ -62,22 +62,22 @@ struct Run<'f> {
 
 impl Run<'_> {
     /// Runs one tick on the samples that wait.
-    fn tick(&mut self, now: Duration, fed: &Fed) {
+    fn tick(&mut self, now: Duration, fed: &LoopInput) {
         let feedback = std::mem::take(&mut self.feedback);
-        let heard = self.listener.step(now, &feedback, fed.noise);
-        self.record(now, &heard);
+        let output = self.listener.step(now, &feedback, fed.noise);
+        self.record(now, &output);
     }
 
-    fn record(&mut self, now: Duration, heard: &Heard) {
+    fn record(&mut self, now: Duration, output: &ListenerOutput) {
         let outcome = &mut self.outcome;
-        outcome.estimate = heard.estimate;
-        outcome.ground_changes = heard.ground_changes;
-        if heard.findings.consequence().is_some() {
+        outcome.estimate = output.estimate;
+        outcome.ground_changes = output.ground_changes;
+        if output.findings.consequence().is_some() {
             outcome.contradicted_s += self.feeding.period.as_secs_f64();
-            let subjects = heard.findings.iter().map(|finding| finding.subject.text());
+            let subjects = output.findings.iter().map(|finding| finding.subject.text());
             outcome.contradicting.extend(subjects);
         }
-        if let Some(found) = heard.estimate.theta {
+        if let Some(found) = output.estimate.theta {
             let ratio = found.std_dev / found.theta;
             let (least, most) = outcome.std_dev_ratios.unwrap_or((ratio, ratio));
             outcome.std_dev_ratios = Some((least.min(ratio), most.max(ratio)));
@@ -88,7 +88,7 @@ impl Run<'_> {
 }
 
 /// Feeds samples to the loop's stages as the loop does: each tick takes those since the tick before.
-pub fn estimate(fed: &[Fed], feeding: &Feeding) -> Outcome {
+pub fn estimate(fed: &[LoopInput], feeding: &EstimationSetup) -> Outcome {
     let begin = fed.first().map(|first| first.sample.at).unwrap_or_default();
     let listener = Listener::new(feeding.model, feeding.prior);
     let mut run = Run {

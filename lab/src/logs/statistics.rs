@@ -6,7 +6,7 @@ use tread_api::friction::NORMAL_95;
 use tread_control::estimation::{SensorNoise, ThetaMeasurement};
 use tread_control::robot::RobotModel;
 
-use super::timeline::Fed;
+use super::timeline::LoopInput;
 
 /// Length of the bins over which turns are averaged, seconds.
 const BIN_S: f64 = 1.0;
@@ -125,7 +125,7 @@ impl Sums {
 
 /// Returns the means of all steady turns. A sample's values count for the time since the sample
 /// before.
-fn steady_turns(fed: &[Fed], model: &RobotModel) -> Vec<Steady> {
+fn steady_turns(fed: &[LoopInput], model: &RobotModel) -> Vec<Steady> {
     let (radius_m, track_m) = (model.wheel_radius_m(), model.track_width_m());
     let mut found = Vec::new();
     let (mut sums, mut bin) = (Sums::default(), None);
@@ -158,7 +158,7 @@ fn steady_turns(fed: &[Fed], model: &RobotModel) -> Vec<Steady> {
 /// squares, with the gyro's offset b and the difference δ of the radii as far as turns to both sides
 /// tell them. `None` with fewer than five steady turns of a second.
 #[expect(clippy::cast_precision_loss, reason = "a number of bins")]
-pub fn effective_track(fed: &[Fed], model: &RobotModel) -> Option<EffectiveTrack> {
+pub fn effective_track(fed: &[LoopInput], model: &RobotModel) -> Option<EffectiveTrack> {
     let turns = steady_turns(fed, model);
     if turns.len() < BINS_MIN {
         return None;

@@ -12,7 +12,7 @@ use std::time::Duration;
 use serde::Serialize;
 use tread_control::robot::RobotModel;
 
-use super::timeline::Fed;
+use super::timeline::LoopInput;
 
 /// Gap between two samples of wheels and gyro above which a new part begins.
 pub const PART_GAP: Duration = Duration::from_secs(1);
@@ -69,13 +69,13 @@ pub struct Motion {
 }
 
 /// Whole samples, by which gaps and motion are judged.
-fn whole(fed: &[Fed]) -> impl Iterator<Item = (usize, &Fed)> {
+fn whole(fed: &[LoopInput]) -> impl Iterator<Item = (usize, &LoopInput)> {
     let whole =
-        |fed: &Fed| fed.sample.wheel_speeds.is_some() && fed.sample.yaw_rate_rad_s.is_some();
+        |fed: &LoopInput| fed.sample.wheel_speeds.is_some() && fed.sample.yaw_rate_rad_s.is_some();
     fed.iter().enumerate().filter(move |(_, fed)| whole(fed))
 }
 
-fn rims_m_s(fed: &Fed, radius_m: f64) -> Option<[f64; 2]> {
+fn rims_m_s(fed: &LoopInput, radius_m: f64) -> Option<[f64; 2]> {
     let speeds = fed.sample.wheel_speeds?;
     Some([speeds.left_rad_s * radius_m, speeds.right_rad_s * radius_m])
 }
@@ -85,7 +85,7 @@ fn faster(rims_m_s: [f64; 2]) -> f64 {
 }
 
 /// Divides samples into parts. A sample that is not whole belongs to the part before it.
-pub fn parts(fed: &[Fed]) -> Vec<Range<usize>> {
+pub fn parts(fed: &[LoopInput]) -> Vec<Range<usize>> {
     let mut parts = Vec::new();
     let mut begin = None;
     let mut last: Option<Duration> = None;
@@ -102,7 +102,7 @@ pub fn parts(fed: &[Fed]) -> Vec<Range<usize>> {
 }
 
 /// Returns the drives of a part, however short.
-pub fn drives(fed: &[Fed], part: Range<usize>, model: &RobotModel) -> Vec<Range<usize>> {
+pub fn drives(fed: &[LoopInput], part: Range<usize>, model: &RobotModel) -> Vec<Range<usize>> {
     let mut drives: Vec<Range<usize>> = Vec::new();
     let mut last: Option<Duration> = None;
     for (index, one) in whole(&fed[part.clone()]) {
@@ -124,7 +124,7 @@ pub fn drives(fed: &[Fed], part: Range<usize>, model: &RobotModel) -> Vec<Range<
 }
 
 /// Divides a drive into passes of about the wanted length; none if it is too short for one.
-pub fn passes(fed: &[Fed], drive: Range<usize>, wanted: Duration) -> Vec<Range<usize>> {
+pub fn passes(fed: &[LoopInput], drive: Range<usize>, wanted: Duration) -> Vec<Range<usize>> {
     let (Some(first), Some(last)) = (fed.get(drive.start), fed.get(drive.end.saturating_sub(1)))
     else {
         return Vec::new();
@@ -161,7 +161,7 @@ pub fn passes(fed: &[Fed], drive: Range<usize>, wanted: Duration) -> Vec<Range<u
 
 /// Returns how the robot moved.
 #[expect(clippy::cast_precision_loss, reason = "counts of samples")]
-pub fn motion(fed: &[Fed], model: &RobotModel) -> Motion {
+pub fn motion(fed: &[LoopInput], model: &RobotModel) -> Motion {
     let radius_m = model.wheel_radius_m();
     let mut motion = Motion::default();
     let (mut intervals_s, mut last_wheels): (Vec<f64>, Option<Duration>) = (Vec::new(), None);

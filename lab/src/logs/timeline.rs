@@ -8,7 +8,7 @@
 
 use std::time::Duration;
 
-use tread_agent::drive::ros2::assemble::{Arrived, Assembler};
+use tread_agent::drive::ros2::assemble::{Assembler, QueuedMessage};
 use tread_agent::drive::ros2::reading::{Content, Wheels};
 use tread_agent::drive::ros2::refusal::Source;
 use tread_agent::drive::ros2::settings::{Ros2Settings, StampClock};
@@ -54,7 +54,7 @@ impl Clock {
 
 /// A sample of the loop, and the noise that covariances state at its time.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Fed {
+pub struct LoopInput {
     /// The sample.
     pub sample: SensorSample,
     /// Stated noise.
@@ -65,7 +65,7 @@ pub struct Fed {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Timeline {
     /// The samples.
-    pub fed: Vec<Fed>,
+    pub fed: Vec<LoopInput>,
     /// The clock of each topic.
     pub clocks: Vec<(Source, Clock)>,
     /// Wheel speeds that were interpolated.
@@ -131,7 +131,7 @@ pub fn assemble(
                 wall_ns: timed.logged_ns,
             };
             match stamps.place(stamp_ns, arrival) {
-                Ok(at) => arrived.push(Arrived {
+                Ok(at) => arrived.push(QueuedMessage {
                     at,
                     content: timed.content,
                 }),
@@ -151,7 +151,7 @@ pub fn assemble(
     }
 }
 
-fn samples(arrived: &[Arrived], settings: &Ros2Settings) -> Vec<Fed> {
+fn samples(arrived: &[QueuedMessage], settings: &Ros2Settings) -> Vec<LoopInput> {
     let mut assembler = Assembler::new(settings);
     let mut fed = Vec::with_capacity(arrived.len());
     for one in arrived {
@@ -162,7 +162,7 @@ fn samples(arrived: &[Arrived], settings: &Ros2Settings) -> Vec<Fed> {
             feedback
                 .samples()
                 .iter()
-                .map(|&sample| Fed { sample, noise }),
+                .map(|&sample| LoopInput { sample, noise }),
         );
     }
     fed
@@ -195,8 +195,9 @@ impl Interpolation {
 }
 
 /// Adds wheel speeds between those that are far apart, on a straight line.
-fn interpolate(arrived: Vec<Arrived>) -> Vec<Arrived> {
-    let (mut added, mut last): (Vec<Arrived>, Option<(Duration, Wheels)>) = (Vec::new(), None);
+fn interpolate(arrived: Vec<QueuedMessage>) -> Vec<QueuedMessage> {
+    let (mut added, mut last): (Vec<QueuedMessage>, Option<(Duration, Wheels)>) =
+        (Vec::new(), None);
     for one in &arrived {
         let Content::Wheels(wheels) = one.content else {
             continue;
@@ -215,7 +216,7 @@ fn interpolate(arrived: Vec<Arrived>) -> Vec<Arrived> {
                     before,
                     after: wheels,
                 };
-                added.extend((1..steps).map(|step| Arrived {
+                added.extend((1..steps).map(|step| QueuedMessage {
                     at: before_at + gap * step / steps,
                     content: Content::Wheels(line.at(f64::from(step) / f64::from(steps))),
                 }));

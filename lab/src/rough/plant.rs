@@ -187,7 +187,7 @@ impl Plant {
             blend: None,
             spec,
         };
-        plant.bear(1.0);
+        plant.update_loads(1.0);
         Some(plant)
     }
 
@@ -196,7 +196,7 @@ impl Plant {
         self.spec.payload_ratio = payload_ratio;
         self.mass_kg = model.mass_kg() * (1.0 + payload_ratio);
         self.inertia_kg_m2 = self.mass_kg * inertia_over_mass_m2(model, &self.spec);
-        self.bear(1.0);
+        self.update_loads(1.0);
     }
 
     /// Changes the stiffness of the ground under all wheels.
@@ -259,7 +259,7 @@ impl Plant {
 
     /// Moves the wheel loads towards equilibrium with the moments of the contact forces, by the
     /// fraction `share` of the difference.
-    fn bear(&mut self, share: f64) {
+    fn update_loads(&mut self, share: f64) {
         let height_m = self.center_m[2];
         let weight_n = self.mass_kg * self.gravity_m_s2()[2];
         let moments = Vector3::new(
@@ -360,7 +360,7 @@ impl Plant {
         for (slow_n, now_n) in self.load_force_n.iter_mut().zip(force) {
             *slow_n += share * (now_n - *slow_n);
         }
-        self.bear(share);
+        self.update_loads(share);
         let gravity = self.gravity_m_s2();
         let acceleration = [
             force[0] / self.mass_kg + gravity[0],

@@ -95,7 +95,7 @@ impl Poses {
 
 /// Estimate of θ that the shipped law receives during the drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Knowing {
+pub enum ThetaSource {
     /// No estimate.
     Nothing,
     /// The estimate of the robot's own estimator, from wheel torques.
@@ -122,7 +122,7 @@ pub struct Trial<'a> {
     /// Gains of the shipped law.
     pub config: TrackerConfig,
     /// Estimate of θ that the law receives.
-    pub knowing: Knowing,
+    pub knowing: ThetaSource,
 }
 
 /// Errors of a drive from [`COUNTED_FROM_S`] on, metres; infinite if the robot was lost.
@@ -365,8 +365,8 @@ pub fn run(trial: &Trial<'_>) -> anyhow::Result<Errors> {
             count += 1.0;
         }
         let knowledge = match trial.knowing {
-            Knowing::Nothing => None,
-            Knowing::Own => known.theta(),
+            ThetaSource::Nothing => None,
+            ThetaSource::Own => known.theta(),
         };
         let reference = governor.step(trial.plan, &governed, dt_s);
         // Pure pursuit follows the path without a time reference.

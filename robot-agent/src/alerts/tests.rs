@@ -7,7 +7,7 @@ use tread_control::estimation::ValueWithStdDev;
 use tread_control::tracking::ThetaKnowledge;
 
 use super::*;
-use crate::drive::ros2::inlet::topic_of;
+use crate::drive::ros2::topic_receiver::topic_of;
 
 fn codes(alerts: &[AlertReport]) -> Vec<&str> {
     alerts.iter().map(|alert| alert.code.as_str()).collect()
@@ -21,9 +21,9 @@ fn a_battery_that_wavers_does_not_make_its_alert_flicker() {
             charge_ratio,
             voltage_v: 22.0,
         });
-        alerts.judge(&Causes {
+        alerts.judge(&AlertInputs {
             battery,
-            ..Causes::default()
+            ..AlertInputs::default()
         })
     };
     assert!(at(0.21).is_empty());
@@ -38,14 +38,14 @@ fn a_battery_that_wavers_does_not_make_its_alert_flicker() {
 #[test]
 fn faults_and_losses_are_alerts_each_code_once() {
     let mut alerts = Alerts::default();
-    let mut causes = Causes {
+    let mut causes = AlertInputs {
         fault: Some(Fault::BaseSilent),
         outbox: OutboxStatus {
             pending: 60_000,
             dropped: 1,
             refused: 0,
         },
-        ..Causes::default()
+        ..AlertInputs::default()
     };
     let first = alerts.judge(&causes);
     assert_eq!(
@@ -60,12 +60,12 @@ fn faults_and_losses_are_alerts_each_code_once() {
 
 #[test]
 fn a_loop_that_is_late_is_an_alert_with_its_figures() {
-    let causes = Causes {
+    let causes = AlertInputs {
         overrun: Some(Overrun {
             late: Duration::from_millis(310),
             late_ticks: 5,
         }),
-        ..Causes::default()
+        ..AlertInputs::default()
     };
     let said = Alerts::default().judge(&causes);
     assert_eq!(codes(&said), ["loop-overrun"]);
@@ -79,14 +79,14 @@ fn records_lost_by_damage_are_an_alert_of_their_own_with_their_number() {
         lost_records: 34,
         kept_in: Some("/data/outbox/damaged.bin".into()),
     };
-    let mut causes = Causes {
+    let mut causes = AlertInputs {
         outbox: OutboxStatus {
             pending: 34,
             dropped: 34,
             refused: 0,
         },
         outbox_damage: Some(&damage),
-        ..Causes::default()
+        ..AlertInputs::default()
     };
     let mut alerts = Alerts::default();
     let said = alerts.judge(&causes);
@@ -116,9 +116,9 @@ fn a_base_that_started_again_and_a_second_commander_are_alerts() {
     let counts = Counts::default();
     let (mut alerts, causes) = (
         Alerts::default(),
-        Causes {
+        AlertInputs {
             base: Some(&counts),
-            ..Causes::default()
+            ..AlertInputs::default()
         },
     );
     assert!(alerts.judge(&causes).is_empty());
@@ -135,10 +135,10 @@ fn a_base_that_is_not_heard_is_an_alert_with_the_topics_that_never_came() {
     let settings = crate::drive::ros2::tests::settings();
     let counts = Counts::of(|source| Some(topic_of(&settings, source)?.to_string()));
     counts.receive(Source::Imu);
-    let said = Alerts::default().judge(&Causes {
+    let said = Alerts::default().judge(&AlertInputs {
         base: Some(&counts),
         fault: Some(Fault::BaseSilent),
-        ..Causes::default()
+        ..AlertInputs::default()
     });
     assert_eq!(codes(&said), ["base-silent"]);
     let text = &said[0].text;
@@ -154,12 +154,12 @@ fn a_robot_that_was_unloaded_is_an_alert_with_both_masses() {
         value,
         std_dev: 0.012,
     };
-    let said = Alerts::default().judge(&Causes {
+    let said = Alerts::default().judge(&AlertInputs {
         payload_change: Some(PayloadChange {
             before: apparent(1.25),
             after: apparent(1.05),
         }),
-        ..Causes::default()
+        ..AlertInputs::default()
     });
     assert_eq!(codes(&said), ["payload-changed"]);
     let text = &said[0].text;
@@ -172,7 +172,7 @@ fn a_robot_that_was_unloaded_is_an_alert_with_both_masses() {
 #[test]
 fn other_ground_and_wheels_that_dig_are_alerts_with_their_words() {
     let known = |theta, std_dev| ThetaKnowledge { theta, std_dev };
-    let causes = Causes {
+    let causes = AlertInputs {
         surface_change: Some(Comparison {
             cell: Cell { ix: -3, iy: 12 },
             measured: known(1.43, 0.05),
@@ -183,7 +183,7 @@ fn other_ground_and_wheels_that_dig_are_alerts_with_their_words() {
             x_m: 3.04,
             y_m: -1.0,
         }),
-        ..Causes::default()
+        ..AlertInputs::default()
     };
     let said = Alerts::default().judge(&causes);
     assert_eq!(codes(&said), ["dug-in", "surface-change"]);
@@ -235,21 +235,21 @@ fn sensors_that_contradict_are_alerts_by_code_with_channel_and_both_values() {
 
 #[test]
 fn a_robot_that_does_not_stand_is_the_first_alert() {
-    let mut causes = Causes {
+    let mut causes = AlertInputs {
         is_stopped: true,
         standing: StandingReport {
             is_to_stand: true,
-            does_not_stand: Some(Shown::Speed(0.59)),
+            does_not_stand: Some(MotionEvidence::Speed(0.59)),
             ..StandingReport::default()
         },
-        ..Causes::default()
+        ..AlertInputs::default()
     };
     let said = Alerts::default().judge(&causes);
     assert_eq!(codes(&said), ["does-not-stand", "stopped"]);
     assert!(said[0].text.contains("0.59 m/s"), "{}", said[0].text);
     assert_eq!(said[0].severity, Severity::Critical);
     causes.standing.does_not_stand = None;
-    causes.standing.moves = Some(Shown::Distance(0.6));
+    causes.standing.moves = Some(MotionEvidence::Distance(0.6));
     let said = Alerts::default().judge(&causes);
     assert_eq!(codes(&said), ["moves-while-stopped", "stopped"]);
 }

@@ -37,14 +37,14 @@ pub(super) struct Step {
     /// Reason of the mission's end, if it ended in this tick.
     pub(super) end: Option<EndReason>,
     /// Begin or end of a pause in this tick.
-    pub(super) news: Option<News>,
+    pub(super) pause_change: Option<PauseChange>,
     /// θ̂ of the tracking law.
     pub(super) theta_loop: Option<f64>,
 }
 
-/// A change that is reported to the server.
+/// Begin or end of a pause, which the agent reports to the server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum News {
+pub(super) enum PauseChange {
     Paused,
     Resumed,
 }
@@ -191,7 +191,7 @@ impl Active {
     /// Whether the mission does not command the wheels: the robot is stopped on hold and the
     /// mission is not being ended.
     pub(super) fn rests(&self) -> bool {
-        self.stands_held() && self.job.follower.status() != FollowerStatus::Stopping
+        self.is_standing_on_hold() && self.job.follower.status() != FollowerStatus::Stopping
     }
 
     /// Limits the speed along the path, metres per second.
@@ -204,7 +204,7 @@ impl Active {
         self.job.follower.hold_adaptation(is_on_hold);
     }
 
-    fn stands_held(&self) -> bool {
+    fn is_standing_on_hold(&self) -> bool {
         self.is_on_hold() && self.standing_ticks >= STANDING_TICKS
     }
 
@@ -236,7 +236,7 @@ impl Active {
         let status = self.job.follower.status();
         let is_stopping = status == FollowerStatus::Stopping;
         let is_over = status == FollowerStatus::Done;
-        self.next.is_some() && !is_stopping && (is_over || self.stands_held())
+        self.next.is_some() && !is_stopping && (is_over || self.is_standing_on_hold())
     }
 
     /// Replaces the active revision by the waiting one and returns the old one. The record of the
@@ -286,15 +286,15 @@ impl Active {
         dt_s: f64,
     ) -> Step {
         self.record_standstill(measured, model, command);
-        let news = self.take_change();
+        let pause_change = self.take_pause_change();
         let status = self.job.follower.status();
         let is_on_the_way = matches!(status, FollowerStatus::Approach | FollowerStatus::Tracking);
-        if self.stands_held() && is_on_the_way {
+        if self.is_standing_on_hold() && is_on_the_way {
             self.tracked = None;
             return Step {
                 wanted: WheelSpeeds::default(),
                 end: None,
-                news,
+                pause_change,
                 theta_loop: None,
             };
         }
@@ -317,7 +317,7 @@ impl Active {
         Step {
             wanted: output.wheel_speeds,
             end,
-            news,
+            pause_change,
             theta_loop: Some(output.theta_loop),
         }
     }
@@ -328,24 +328,24 @@ impl Active {
             && command_m_s < HELD_STANDING
             && measured.twist.linear_m_s.abs() < HELD_STANDING
             && measured.twist.angular_rad_s.abs() < 2.0 * HELD_STANDING;
-        self.standing_ticks = if stands || self.stands_held() {
+        self.standing_ticks = if stands || self.is_standing_on_hold() {
             self.standing_ticks.saturating_add(1)
         } else {
             0
         };
     }
 
-    fn take_change(&mut self) -> Option<News> {
-        let is_paused = self.holds.pause && self.stands_held();
+    fn take_pause_change(&mut self) -> Option<PauseChange> {
+        let is_paused = self.holds.pause && self.is_standing_on_hold();
         if is_paused == self.is_pause_reported || (self.is_pause_reported && self.holds.pause) {
             return None;
         }
         self.is_pause_reported = is_paused;
         self.progress.paused = is_paused;
         Some(if is_paused {
-            News::Paused
+            PauseChange::Paused
         } else {
-            News::Resumed
+            PauseChange::Resumed
         })
     }
 

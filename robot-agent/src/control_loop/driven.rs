@@ -35,7 +35,7 @@ const RESOLUTION_S: f64 = 1.0e-2;
 
 /// A position in the site frame, and its time since the begin of the mission, seconds.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Passed {
+struct PathPosition {
     at: Point,
     time_s: f64,
 }
@@ -69,11 +69,11 @@ pub(crate) struct TickRecord {
 /// The record of one mission.
 #[derive(Debug, Clone)]
 pub(crate) struct Driven {
-    points: Vec<Passed>,
+    points: Vec<PathPosition>,
     spacing_m: f64,
     /// Largest distance of the driven path to the polyline of the recorded points, metres.
     tolerance_m: f64,
-    last: Option<Passed>,
+    last: Option<PathPosition>,
     since_point_m: f64,
     theta: Vec<ThetaSample>,
     theta_spacing_m: f64,
@@ -162,14 +162,14 @@ impl Driven {
         self.distance_m += driven_m;
         if let Some(at) = tick.at.filter(|at| at.is_finite()) {
             let time_s = self.duration_s;
-            self.add_point(Passed { at, time_s });
+            self.add_point(PathPosition { at, time_s });
         }
         self.add_theta(tick);
         self.gain
             .add(&tick.ground, (tick.dt_s, driven_m), self.duration_s);
     }
 
-    fn add_point(&mut self, passed: Passed) {
+    fn add_point(&mut self, passed: PathPosition) {
         let Some(last) = self.last.replace(passed) else {
             self.points.push(passed);
             return;
@@ -270,11 +270,11 @@ impl Driven {
             whole.push(last);
         }
         let passed = simplified(&whole);
-        let wire = |passed: &Passed| WirePoint {
+        let wire = |passed: &PathPosition| WirePoint {
             x_m: (passed.at.x_m / RESOLUTION_M).round() * RESOLUTION_M,
             y_m: (passed.at.y_m / RESOLUTION_M).round() * RESOLUTION_M,
         };
-        let time_s = |passed: &Passed| (passed.time_s / RESOLUTION_S).round() * RESOLUTION_S;
+        let time_s = |passed: &PathPosition| (passed.time_s / RESOLUTION_S).round() * RESOLUTION_S;
         DrivenPath {
             tolerance_m: self.tolerance_m.max(0.5 * self.since_point_m)
                 + LINE_TOLERANCE_M
@@ -287,7 +287,7 @@ impl Driven {
 
 /// Returns the points without those within tolerance of the rest (Douglas–Peucker with
 /// [`Stretch::shortfall`] as the distance).
-fn simplified(points: &[Passed]) -> Vec<Passed> {
+fn simplified(points: &[PathPosition]) -> Vec<PathPosition> {
     let Some(last) = points.len().checked_sub(1) else {
         return Vec::new();
     };
@@ -334,7 +334,7 @@ mod tests {
     }
 
     fn distance_from_path_m(point: Point, path: &DrivenPath) -> f64 {
-        let passed = |point: &WirePoint| Passed {
+        let passed = |point: &WirePoint| PathPosition {
             at: Point {
                 x_m: point.x_m,
                 y_m: point.y_m,

@@ -65,11 +65,11 @@ fn a_paused_mission_stands_still_on_its_path_and_goes_on_from_there() {
     bench.pause(mission, true).unwrap();
     bench.pause(mission, true).unwrap();
     let began = bench.now;
-    while bench.news.is_empty() {
+    while bench.phase_changes.is_empty() {
         bench.tick();
         assert!(bench.now < began + 5 * SECOND, "it did not come to stand");
     }
-    assert_eq!(bench.news, [MissionPhase::Paused]);
+    assert_eq!(bench.phase_changes, [MissionPhase::Paused]);
     bench.run_for(SECOND / 2);
     let stood_at = bench.drive.truth().pose;
     let before = bench.ends.shared.snapshot().mission.unwrap();
@@ -86,7 +86,10 @@ fn a_paused_mission_stands_still_on_its_path_and_goes_on_from_there() {
 
     bench.pause(mission, false).unwrap();
     assert_eq!(run_to_end(&mut bench), EndReason::Reached);
-    assert_eq!(bench.news, [MissionPhase::Paused, MissionPhase::Resumed]);
+    assert_eq!(
+        bench.phase_changes,
+        [MissionPhase::Paused, MissionPhase::Resumed]
+    );
     let end = bench.drive.truth().pose;
     assert!(
         (end.x_m - 11.0).hypot(end.y_m - 4.5) < 0.15,
@@ -112,10 +115,10 @@ fn a_paused_mission_can_be_cancelled_and_a_resumption_before_it_stands_is_no_pau
     bench.run_for(SECOND / 5);
     bench.pause(mission, false).unwrap();
     bench.run_for(SECOND);
-    assert!(bench.news.is_empty());
+    assert!(bench.phase_changes.is_empty());
     bench.pause(mission, true).unwrap();
     bench.run_for(5 * SECOND);
-    assert_eq!(bench.news, [MissionPhase::Paused]);
+    assert_eq!(bench.phase_changes, [MissionPhase::Paused]);
     bench
         .ends
         .commands
@@ -133,7 +136,7 @@ fn a_new_revision_takes_over_where_the_robot_comes_to_stand() {
         }
         bench.replace(1, 2, &plan, &trajectory(OTHER)).unwrap();
         let began = bench.now;
-        while !bench.news.contains(&MissionPhase::Replaced) {
+        while !bench.phase_changes.contains(&MissionPhase::Replaced) {
             bench.tick();
             assert!(bench.now < began + 5 * SECOND, "it was not replaced");
         }
@@ -186,7 +189,7 @@ fn a_revision_that_comes_at_the_very_end_is_driven_and_one_that_does_not_come_ho
     bench.run_for(5 * SECOND);
     assert!(bench.drive.truth().twist().linear_m_s.abs() < 0.01);
     assert_eq!(run_to_end(&mut bench), EndReason::Reached);
-    assert!(bench.news.is_empty());
+    assert!(bench.phase_changes.is_empty());
 }
 
 #[test]

@@ -69,7 +69,11 @@ pub(crate) fn run(
         core.record_tick_time(ended.saturating_sub(began));
         if stop {
             let since = *stop_requested_at.get_or_insert(began);
-            standing_ticks = if core.stands() { standing_ticks + 1 } else { 0 };
+            standing_ticks = if core.is_standing() {
+                standing_ticks + 1
+            } else {
+                0
+            };
             let has_stopped = standing_ticks >= STANDING_TICKS && core.flush();
             let is_overdue = began.saturating_sub(since) > BRAKING_MAX;
             if has_stopped {

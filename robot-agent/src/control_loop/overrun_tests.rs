@@ -81,7 +81,7 @@ fn a_late_loop_holds_the_robot_with_its_figures_and_lets_its_mission_go_on_after
     let mut bench = bench();
     let mission = bench.start(1, LINE, None);
     bench.run_for(3_000 * MILLISECOND);
-    assert!(!bench.stands() && cause(&bench) != Some(GateCause::LoopOverrun));
+    assert!(!bench.is_standing() && cause(&bench) != Some(GateCause::LoopOverrun));
     late_tick(&mut bench, LATE_MAX);
     let snapshot = bench.ends.shared.snapshot();
     assert_eq!(snapshot.gate.cause, Some(GateCause::LoopOverrun));
@@ -89,7 +89,7 @@ fn a_late_loop_holds_the_robot_with_its_figures_and_lets_its_mission_go_on_after
     assert_eq!(overrun(&bench).unwrap().late, LATE_MAX);
     // It brakes on its ramp, stands, and stays until the loop has kept its rate for a while.
     bench.run_for(RELEASE_AFTER.saturating_sub(2 * PERIOD));
-    assert!(bench.stands());
+    assert!(bench.is_standing());
     assert_eq!(cause(&bench), Some(GateCause::LoopOverrun));
     late_tick(&mut bench, LATE_MAX);
     bench.run_for(RELEASE_AFTER / 2);
@@ -157,14 +157,14 @@ fn a_command_that_ends_while_a_tick_is_interrupted_moves_nothing_any_more() {
     assert_eq!(cause(&bench), Some(GateCause::Lease));
 }
 
-/// A base that notes when each tick began and what it was commanded then.
-struct Noted {
+/// Drive that records the begin and the command of each tick.
+struct RecordingDrive {
     base: SimulatedDrive,
     began: Duration,
     ticks: Arc<Mutex<Vec<(Duration, WheelSpeeds)>>>,
 }
 
-impl Drive for Noted {
+impl Drive for RecordingDrive {
     fn read(&mut self, now: Duration) -> Feedback {
         self.began = now;
         self.base.read(now)
@@ -201,7 +201,7 @@ fn a_loop_on_a_busy_machine_obeys_in_its_next_tick_and_notices_each_late_one() {
     let ticks = Arc::new(Mutex::new(Vec::with_capacity(10_000)));
     let individual = Individual::of_seed(1);
     let scenario = one_ground(2.5);
-    let drive = Noted {
+    let drive = RecordingDrive {
         base: SimulatedDrive::new(&scenario, model, ORIGIN, individual, SimMode::Auto).unwrap(),
         began: Duration::ZERO,
         ticks: Arc::clone(&ticks),

@@ -36,7 +36,7 @@ impl Pace {
         clock: &SharedClock,
     ) -> Self {
         if let Some(arrivals) = &arrivals {
-            arrivals.attend();
+            arrivals.register_thread();
         }
         Self {
             period,
@@ -117,7 +117,7 @@ mod tests {
         // One that is there already is waited for only as long as the rate wants it.
         pace.begin(clock.monotonic());
         let began = clock.monotonic();
-        arrivals.ring();
+        arrivals.notify();
         pace.wait(&clock);
         assert!(clock.monotonic().saturating_sub(began) >= PERIOD.mul_f64(0.45));
         // None at all: the loop goes on.
@@ -138,7 +138,7 @@ mod tests {
         std::thread::scope(|scope| {
             scope.spawn(|| {
                 std::thread::sleep(slow.mul_f64(0.8));
-                arrivals.ring();
+                arrivals.notify();
             });
             pace.wait(&clock);
         });

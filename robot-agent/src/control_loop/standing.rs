@@ -64,7 +64,7 @@ impl Motion {
 
 /// The channel that shows motion, with its value.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) enum Shown {
+pub(crate) enum MotionEvidence {
     /// Wheels or odometry, m/s.
     Speed(f64),
     /// Gyro, rad/s.
@@ -81,9 +81,9 @@ pub(crate) struct StandingReport {
     /// Begin of the standstill by the monotonic clock, and its delay after the command.
     pub(crate) stands: Option<(Duration, Duration)>,
     /// Motion beyond the assumed braking time, if the robot has not stopped.
-    pub(crate) does_not_stand: Option<Shown>,
+    pub(crate) does_not_stand: Option<MotionEvidence>,
     /// Motion after the robot had stopped.
-    pub(crate) moves: Option<Shown>,
+    pub(crate) moves: Option<MotionEvidence>,
 }
 
 /// Watches a robot that is commanded to zero velocity.
@@ -98,8 +98,8 @@ pub(crate) struct StandingWatch {
     stands: Option<(Duration, Duration)>,
     anchor: Option<Point>,
     away: u32,
-    does_not_stand: Option<Shown>,
-    moves: Option<Shown>,
+    does_not_stand: Option<MotionEvidence>,
+    moves: Option<MotionEvidence>,
 }
 
 impl StandingWatch {
@@ -117,7 +117,7 @@ impl StandingWatch {
             });
             (now, now + braking + MARGIN)
         });
-        let Some(shown) = self.shown(motion) else {
+        let Some(evidence) = self.detect_motion(motion) else {
             self.moving_since = None;
             // Without trustworthy wheels or odometry only fixes show standstill.
             let since = if motion.speed_m_s().is_some() {
@@ -144,10 +144,10 @@ impl StandingWatch {
         let lasts = now.saturating_sub(since) >= MOVES_FOR;
         if self.stands.is_some() {
             if lasts {
-                self.moves = Some(shown);
+                self.moves = Some(evidence);
             }
         } else if now >= due && lasts {
-            self.does_not_stand = Some(shown);
+            self.does_not_stand = Some(evidence);
         }
     }
 
@@ -173,7 +173,7 @@ impl StandingWatch {
     }
 
     /// Returns the channel that shows motion in this tick, if any.
-    fn shown(&mut self, motion: &Motion) -> Option<Shown> {
+    fn detect_motion(&mut self, motion: &Motion) -> Option<MotionEvidence> {
         if let (Some(anchor), Some(fix)) = (self.anchor, motion.fix) {
             let is_away = anchor.distance_m(fix) > DISTANCE_MIN_M;
             self.away = if is_away { self.away + 1 } else { 0 };
@@ -181,12 +181,12 @@ impl StandingWatch {
         if let Some(speed_m_s) = motion.speed_m_s()
             && speed_m_s > SPEED_MIN_M_S
         {
-            return Some(Shown::Speed(speed_m_s));
+            return Some(MotionEvidence::Speed(speed_m_s));
         }
         if let Some(turn_rad_s) = motion.turn_rad_s
             && turn_rad_s.abs() > TURN_MIN_RAD_S
         {
-            return Some(Shown::Turn(turn_rad_s));
+            return Some(MotionEvidence::Turn(turn_rad_s));
         }
         if self.away >= FIXES {
             // The new position becomes the anchor; otherwise one push would count as motion for
@@ -198,8 +198,8 @@ impl StandingWatch {
             if let Some(distance_m) = distance_m {
                 self.anchor = motion.fix;
                 self.away = 0;
-                self.moves = Some(Shown::Distance(distance_m));
-                return Some(Shown::Distance(distance_m));
+                self.moves = Some(MotionEvidence::Distance(distance_m));
+                return Some(MotionEvidence::Distance(distance_m));
             }
         }
         None

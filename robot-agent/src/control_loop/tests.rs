@@ -259,7 +259,7 @@ fn the_word_to_stop_brings_the_robot_to_rest_within_its_braking_time() {
     let speed_m_s = bench.drive.truth().forward_m_s;
     assert!(speed_m_s > 0.5, "{speed_m_s}");
     let stop_requested_at = bench.now;
-    while !bench.core.stands() {
+    while !bench.core.is_standing() {
         bench.simulate();
         bench.tick_loop(true);
         bench.collect();

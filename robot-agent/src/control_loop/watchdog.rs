@@ -15,7 +15,7 @@ use crate::clock::SharedClock;
 use crate::control_loop::channels::Shared;
 
 /// Interval of the checks.
-pub(crate) const LOOK_EVERY: Duration = Duration::from_millis(100);
+pub(crate) const CHECK_EVERY: Duration = Duration::from_millis(100);
 /// Time without a tick after which it is logged.
 pub(crate) const SAY_AFTER: Duration = Duration::from_millis(500);
 /// Time without a tick after which the agent ends.
@@ -94,7 +94,7 @@ impl TickWatch {
 pub(crate) fn run(shared: &Arc<Shared>, clock: &SharedClock) {
     let mut watch = TickWatch::new(clock.monotonic());
     while !shared.stop.load(Ordering::Relaxed) {
-        std::thread::sleep(LOOK_EVERY);
+        std::thread::sleep(CHECK_EVERY);
         let ticks = shared.ticks.load(Ordering::Relaxed);
         match watch.check(ticks, clock.monotonic()) {
             Finding::Fine => {}

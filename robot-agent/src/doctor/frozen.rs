@@ -4,7 +4,7 @@
 //! The robot turned and drove, so every value that depends on motion must have changed. A frozen
 //! sensor differs from a robot that did not move in that another sensor measured the motion.
 
-use super::drove::{DriveSummary, Drives, Ranges};
+use super::drive_summary::{DriveSummary, Drives, Ranges};
 use super::finding::{Finding, Key};
 use crate::drive::ros2::settings::Ros2Settings;
 

@@ -7,13 +7,13 @@ use tread_ros2::messages::JointState;
 use tread_ros2::rmw::{KeyMismatch, check_key};
 
 use super::finding::{Finding, Key};
-use super::heard::Message;
 use super::joint_names::JointNames;
+use super::message_buffer::Message;
 use crate::drive::ros2::frames;
-use crate::drive::ros2::inlet::{decoded, topic_of, type_of};
 use crate::drive::ros2::reading::Content;
 use crate::drive::ros2::refusal::{Refusal, Source};
 use crate::drive::ros2::settings::{Effort, Ros2Settings, Scheme, StampClock};
+use crate::drive::ros2::topic_receiver::{decoded, topic_of, type_of};
 
 /// Smallest rate of the messages of wheels and inertial unit, Hz.
 const RATE_MIN_HZ: f64 = 20.0;

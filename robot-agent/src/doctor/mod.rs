@@ -3,19 +3,19 @@
 //! The doctor listens to the stopped robot ([`listening`]). With `--move` it turns the robot slowly
 //! on the spot, drives it forward for a metre, and compares commands with measurements
 //! ([`moving`]): frozen sensors ([`frozen`]), sides and signs ([`signs`]), the frame of the
-//! odometry's twist ([`twist_frame`]), the tracks ([`track`]), and how the wheels pull with the
-//! robot's mass ([`pulling`]). It estimates mass, inertia and centre of mass ([`parameters`]). Each
+//! odometry's twist ([`twist_frame`]), the tracks ([`track`]), and the joints' effort against the
+//! robot's mass ([`effort`]). It estimates mass, inertia and centre of mass ([`parameters`]). Each
 //! finding names the key of `robot.toml` to check and, if there are any, the lines that correct it.
 
-mod drove;
+mod drive_summary;
+mod effort;
 mod finding;
 mod frozen;
-mod heard;
 mod joint_names;
 mod listening;
+mod message_buffer;
 mod moving;
 mod parameters;
-mod pulling;
 mod signs;
 mod track;
 mod twist_frame;
@@ -32,16 +32,16 @@ use tread_control::measured::WheelSpeeds;
 use tread_control::robot::RobotModel;
 use tread_control::twist_limits::TwistLimits;
 
-use self::drove::{DriveSummary, Drives, MotionMessages};
+use self::drive_summary::{DriveSummary, Drives, MotionMessages};
 use self::finding::{Finding, Key};
-use self::heard::Heard;
+use self::message_buffer::MessageBuffer;
 use self::parameters::Parameters;
 use crate::clock::{SharedClock, SystemClock};
 use crate::config::{AgentConfig, DriveConfig, Flags};
 use crate::drive::Drive as _;
 use crate::drive::ros2::Ros2Drive;
-use crate::drive::ros2::inlet::Tap;
 use crate::drive::ros2::settings::Ros2Settings;
+use crate::drive::ros2::topic_receiver::MessageObserver;
 use crate::geometry::control_model;
 
 /// Time for which the doctor listens to the stopped robot.
@@ -142,9 +142,9 @@ fn examine_base(
 ) -> anyhow::Result<Vec<Finding>> {
     let model = control_model(&config.model)?;
     let clock = SystemClock::shared();
-    let heard = Arc::new(Heard::default());
-    let tap: Arc<dyn Tap> = Arc::<Heard>::clone(&heard);
-    let (drive, bus) = Ros2Drive::examined(settings.clone(), &clock, &tap)?;
+    let buffer = Arc::new(MessageBuffer::default());
+    let observer: Arc<dyn MessageObserver> = Arc::<MessageBuffer>::clone(&buffer);
+    let (drive, bus) = Ros2Drive::examined(settings.clone(), &clock, &observer)?;
     let speaking = std::thread::Builder::new()
         .name("robot's bus".to_owned())
         .spawn(move || bus.run())
@@ -157,17 +157,17 @@ fn examine_base(
         parameters: Parameters::new(model, config.prior),
     };
     let until = examined.clock.monotonic() + FIRST_WORD_MAX;
-    while heard.is_empty() && examined.clock.monotonic() < until {
+    while buffer.is_empty() && examined.clock.monotonic() < until {
         examined.hold(WheelSpeeds::default(), PERIOD);
     }
-    heard.clear();
+    buffer.clear();
     examined.hold(WheelSpeeds::default(), LISTEN_FOR);
-    let at_rest = heard.taken();
+    let at_rest = buffer.drain();
     let mut findings = listening::findings(settings, &at_rest, LISTEN_FOR);
     findings.extend(examined.other_commander(settings));
     if args.moves {
         let bias_rad_s = listening::gyro_at_rest_rad_s(settings, &at_rest).unwrap_or(0.0);
-        findings = examined.move_about(settings, &model, &heard, bias_rad_s, findings);
+        findings = examined.examine_in_motion(settings, &model, &buffer, bias_rad_s, findings);
     }
     let until = examined.clock.monotonic() + CLOSE_MAX;
     let clock = Arc::clone(&examined.clock);
@@ -203,11 +203,11 @@ impl ExaminedDrive {
     }
 
     /// Turns and drives the robot, unless a finding forbids it; returns all findings.
-    fn move_about(
+    fn examine_in_motion(
         &mut self,
         settings: &Ros2Settings,
         model: &RobotModel,
-        heard: &Heard,
+        buffer: &MessageBuffer,
         bias_rad_s: f64,
         mut findings: Vec<Finding>,
     ) -> Vec<Finding> {
@@ -231,14 +231,14 @@ impl ExaminedDrive {
                 right_rad_s: share * asked.right_rad_s,
             }
         };
-        heard.clear();
-        let mut turned = self.drive_for(speeds(-1.0, 1.0), settings, heard);
+        buffer.clear();
+        let mut turned = self.drive_for(speeds(-1.0, 1.0), settings, buffer);
         // Along the x axis of the odometry's frame, a twist in that frame equals one in the robot
         // frame.
-        if turned.twist.is_some() && heads_along_x(settings, heard) {
-            turned = self.drive_for(speeds(-1.0, 1.0), settings, heard);
+        if turned.twist.is_some() && heads_along_x(settings, buffer) {
+            turned = self.drive_for(speeds(-1.0, 1.0), settings, buffer);
         }
-        let forward = self.drive_for(speeds(1.0, 1.0), settings, heard);
+        let forward = self.drive_for(speeds(1.0, 1.0), settings, buffer);
         // Motion commanded by two nodes shows nothing about signs and tracks.
         if let Some(finding) = self.other_commander(settings) {
             findings.push(finding);
@@ -256,15 +256,15 @@ impl ExaminedDrive {
 
     /// Commands these wheel speeds for `span`, even if the base is silent.
     fn hold(&mut self, command: WheelSpeeds, span: Duration) {
-        self.go(command, span, |_| true);
+        self.command_while(command, span, |_| true);
     }
 
     /// Commands these wheel speeds for `span`; returns false at once if the base falls silent.
-    fn hold_heard(&mut self, command: WheelSpeeds, span: Duration) -> bool {
-        self.go(command, span, |drive| !drive.is_rest_required())
+    fn hold_unless_silent(&mut self, command: WheelSpeeds, span: Duration) -> bool {
+        self.command_while(command, span, |drive| !drive.is_rest_required())
     }
 
-    fn go(
+    fn command_while(
         &mut self,
         command: WheelSpeeds,
         span: Duration,
@@ -303,7 +303,7 @@ impl ExaminedDrive {
                 left_rad_s: between(from.left_rad_s, to.left_rad_s),
                 right_rad_s: between(from.right_rad_s, to.right_rad_s),
             };
-            self.hold_heard(command, PERIOD)
+            self.hold_unless_silent(command, PERIOD)
         })
     }
 
@@ -314,7 +314,7 @@ impl ExaminedDrive {
         &mut self,
         command: WheelSpeeds,
         settings: &Ros2Settings,
-        heard: &Heard,
+        buffer: &MessageBuffer,
     ) -> DriveSummary {
         let mut driven_m = 0.0;
         for _ in 0..TRIES_MAX {
@@ -322,13 +322,13 @@ impl ExaminedDrive {
                 break;
             }
             let began = self.clock.monotonic();
-            let messages = self.try_to_drive(command, heard);
+            let messages = self.try_to_drive(command, buffer);
             self.ramp(WheelSpeeds::default());
             let moved = self.clock.monotonic().saturating_sub(began);
             driven_m += RIM_M_S * moved.as_secs_f64();
             self.hold(WheelSpeeds::default(), REST);
             if let Some(messages) = messages {
-                return drove::drove(command, settings, &messages);
+                return drive_summary::summarise(command, settings, &messages);
             }
         }
         DriveSummary::default()
@@ -336,16 +336,20 @@ impl ExaminedDrive {
 
     /// Returns the messages of the acceleration and of the steady motion; `None` if the base fell
     /// silent.
-    fn try_to_drive(&mut self, command: WheelSpeeds, heard: &Heard) -> Option<MotionMessages> {
-        heard.clear();
-        let mut is_heard = self.ramp(command) && self.hold_heard(command, SETTLE);
-        let starting = heard.taken();
-        is_heard = is_heard && self.hold_heard(command, STEADY_AFTER);
-        heard.clear();
-        is_heard = is_heard && self.hold_heard(command, STEADY_FOR);
+    fn try_to_drive(
+        &mut self,
+        command: WheelSpeeds,
+        buffer: &MessageBuffer,
+    ) -> Option<MotionMessages> {
+        buffer.clear();
+        let mut is_heard = self.ramp(command) && self.hold_unless_silent(command, SETTLE);
+        let starting = buffer.drain();
+        is_heard = is_heard && self.hold_unless_silent(command, STEADY_AFTER);
+        buffer.clear();
+        is_heard = is_heard && self.hold_unless_silent(command, STEADY_FOR);
         is_heard.then(|| MotionMessages {
             starting,
-            steady: heard.taken(),
+            steady: buffer.drain(),
         })
     }
 }
@@ -357,8 +361,8 @@ fn has_room(driven_m: f64) -> bool {
 }
 
 /// Whether the newest odometry pose heads along the x axis of its frame.
-fn heads_along_x(settings: &Ros2Settings, heard: &Heard) -> bool {
-    let heading_rad = drove::newest_heading_rad(settings, &heard.taken());
+fn heads_along_x(settings: &Ros2Settings, buffer: &MessageBuffer) -> bool {
+    let heading_rad = drive_summary::newest_heading_rad(settings, &buffer.drain());
     heading_rad.is_some_and(twist_frame::is_along_x)
 }
 

@@ -7,11 +7,11 @@
 use tread_control::measured::WheelSpeeds;
 use tread_control::robot::RobotModel;
 
-use super::drove::{DriveSummary, Drives};
+use super::drive_summary::{DriveSummary, Drives};
 use super::finding::{Finding, Key};
 use super::frozen::Frozen;
 use super::signs::{self, Answers};
-use super::{pulling, track, twist_frame};
+use super::{effort, track, twist_frame};
 use crate::drive::ros2::settings::Ros2Settings;
 
 /// Ratio to its command below which a wheel's speed counts as standstill.
@@ -121,7 +121,7 @@ pub(super) fn findings(
             gyro_bias_rad_s,
         },
     ));
-    findings.extend(pulling::findings(settings, model, drives));
+    findings.extend(effort::findings(settings, model, drives));
     findings
 }
 
@@ -188,7 +188,7 @@ fn of_radius(model: &RobotModel, radius_m: f64) -> Finding {
 
 #[cfg(test)]
 mod tests {
-    use super::super::drove::{PlanarTwist, Range, Ranges, TurnBlock};
+    use super::super::drive_summary::{PlanarTwist, Range, Ranges, TurnBlock};
     use super::*;
     use crate::drive::ros2::tests::settings;
 

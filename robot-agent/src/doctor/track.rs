@@ -15,7 +15,7 @@
 //! cannot be distinguished from another ground: the finding states the range, for comparison with a
 //! tape measure.
 
-use super::drove::{Drives, TurnBlock};
+use super::drive_summary::{Drives, TurnBlock};
 use super::finding::{Finding, Key};
 use crate::drive::ros2::settings::{CommandKind, Ros2Settings};
 use tread_control::robot::RobotModel;

@@ -8,7 +8,7 @@ use std::f64::consts::PI;
 
 use tread_control::geometry::wrap_angle_rad;
 
-use super::drove::PlanarTwist;
+use super::drive_summary::PlanarTwist;
 use super::finding::{Finding, Key};
 
 /// Angle up to which a motion counts as straight forward, radians.

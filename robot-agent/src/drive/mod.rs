@@ -78,14 +78,14 @@ pub struct Arrivals {
 }
 
 impl Arrivals {
-    /// Makes [`Arrivals::ring`] wake the calling thread.
-    pub fn attend(&self) {
+    /// Makes [`Arrivals::notify`] wake the calling thread.
+    pub fn register_thread(&self) {
         // A second thread would be a programming error; the first one stays registered.
         let _ = self.waiting.set(std::thread::current());
     }
 
     /// Counts a new sample and wakes the waiting thread.
-    pub fn ring(&self) {
+    pub fn notify(&self) {
         self.count.fetch_add(1, Ordering::Release);
         if let Some(waiting) = self.waiting.get() {
             waiting.unpark();

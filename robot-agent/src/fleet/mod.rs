@@ -71,7 +71,7 @@ pub struct Identity {
 
 /// An event on the link, for counters and watches.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Noted {
+pub enum LinkEvent {
     /// A message of the server arrived: its pulse, or a command.
     ServerHeard,
     /// A command was dropped because the queue was full; the server repeats it.
@@ -85,7 +85,7 @@ pub enum Noted {
 }
 
 /// Callback for events on the link; must not block.
-pub type Note = Arc<dyn Fn(Noted) + Send + Sync>;
+pub type LinkEventHandler = Arc<dyn Fn(LinkEvent) + Send + Sync>;
 
 /// A message that must not wait in any queue, with its payload as received.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -105,7 +105,7 @@ pub type HandleUrgent = Arc<dyn Fn(Urgent<'_>) + Send + Sync>;
 #[derive(Clone)]
 pub struct Listeners {
     /// Called for each event on the link.
-    pub note: Note,
+    pub on_event: LinkEventHandler,
     /// Called for each urgent message.
     pub urgent: HandleUrgent,
     /// Receives commands; a command that finds the queue full is dropped, and the server repeats
@@ -116,12 +116,12 @@ pub struct Listeners {
 impl Listeners {
     /// Returns listeners that take nothing but stops after the agent has left the server.
     fn until(&self, left: &CancellationToken) -> Self {
-        let (note, urgent) = (Arc::clone(&self.note), Arc::clone(&self.urgent));
+        let (on_event, urgent) = (Arc::clone(&self.on_event), Arc::clone(&self.urgent));
         let (no_note, no_drive) = (left.clone(), left.clone());
         Self {
-            note: Arc::new(move |noted| {
+            on_event: Arc::new(move |event| {
                 if !no_note.is_cancelled() {
-                    note(noted);
+                    on_event(event);
                 }
             }),
             urgent: Arc::new(move |message| match message {
@@ -253,7 +253,7 @@ impl FleetLink {
         let mut config = match membership {
             None => session_config(endpoint)?,
             Some(membership) => {
-                match Tunnel::open_once(endpoint, membership, &listeners.note, logged).await? {
+                match Tunnel::open_once(endpoint, membership, &listeners.on_event, logged).await? {
                     Ok(opened) => tunnel.insert(opened).session_config()?,
                     Err(cause) => {
                         return Ok(Attempt::Failed {
@@ -304,7 +304,10 @@ impl FleetLink {
         let left = CancellationToken::new();
         let listeners = &listeners.until(&left);
         let command_sender = listeners.commands.clone();
-        let (noted, urgent) = (Arc::clone(&listeners.note), Arc::clone(&listeners.urgent));
+        let (on_event, urgent) = (
+            Arc::clone(&listeners.on_event),
+            Arc::clone(&listeners.urgent),
+        );
         let is_left = left.clone();
         let own_run = identity.boot.to_string();
         let take_query = move |query: Query| {
@@ -316,7 +319,7 @@ impl FleetLink {
             {
                 return;
             }
-            noted(Noted::ServerHeard);
+            on_event(LinkEvent::ServerHeard);
             let Some(Key::Command(_, _, verb)) = Key::parse(query.key_expr().as_str()) else {
                 // A wildcard or an unknown verb: no reply, which means not delivered.
                 return;
@@ -340,7 +343,7 @@ impl FleetLink {
             };
             // Queue full: the query is dropped, the server gets no reply and repeats it.
             if command_sender.try_send(command).is_err() {
-                noted(Noted::CommandLost);
+                on_event(LinkEvent::CommandLost);
             }
         };
         session
@@ -351,7 +354,7 @@ impl FleetLink {
             .wait()
             .map_err(zenoh_failed("declare the commands"))?;
         Self::listen_urgently(&session, site, robot, &listeners.urgent)?;
-        Self::listen_to_pulse(&session, site, &listeners.note)?;
+        Self::listen_to_pulse(&session, site, &listeners.on_event)?;
         // The state has priority over everything else that the robot sends, records have the least.
         let publisher = |key: String, priority: Priority| {
             let publisher = session.declare_publisher(key).priority(priority);
@@ -373,14 +376,14 @@ impl FleetLink {
         let hello = querier(keys::hello(site, robot), HELLO_TIMEOUT, Priority::DataHigh)
             .map_err(zenoh_failed("declare `hello`"))?;
         let (seen_sender, server_seen) = watch::channel(0_u64);
-        let lost = Arc::clone(&listeners.note);
+        let on_event = Arc::clone(&listeners.on_event);
         hello
             .matching_listener()
             .callback(move |status| {
                 if status.matching() {
                     seen_sender.send_modify(|count| *count += 1);
                 } else {
-                    lost(Noted::ServerLost);
+                    on_event(LinkEvent::ServerLost);
                 }
             })
             .background()
@@ -411,16 +414,16 @@ impl FleetLink {
     fn listen_to_pulse(
         session: &zenoh::Session,
         site: &SiteId,
-        note: &Note,
+        on_event: &LinkEventHandler,
     ) -> Result<(), LinkError> {
-        let noted = Arc::clone(note);
+        let on_event = Arc::clone(on_event);
         session
             .declare_subscriber(keys::pulse(site))
             .callback(move |sample| {
-                noted(Noted::ServerHeard);
+                on_event(LinkEvent::ServerHeard);
                 let pulse = wire::decode::<ServerPulse>(&small(sample.payload()));
                 if let Ok(Some(trust)) = pulse.map(|pulse| pulse.trust) {
-                    noted(Noted::Trust(trust));
+                    on_event(LinkEvent::Trust(trust));
                 }
             })
             .background()

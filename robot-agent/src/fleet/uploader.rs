@@ -55,7 +55,7 @@ impl BatchSize {
     }
 
     /// Adapts the size to a batch that was answered after `took`.
-    fn settled(&mut self, took: Duration) {
+    fn record_success(&mut self, took: Duration) {
         if took > 2 * UPLOAD_AIM {
             self.halve();
         } else if took < UPLOAD_AIM {
@@ -65,7 +65,7 @@ impl BatchSize {
 
     /// Adapts the size to a batch that was not answered: an absent server fails at once, a slow
     /// link late.
-    fn failed(&mut self, took: Duration) {
+    fn record_failure(&mut self, took: Duration) {
         if took > UPLOAD_AIM {
             self.halve();
         }
@@ -99,11 +99,11 @@ pub async fn run(
                 Ok(Next::Empty) => outbox.arrived().await,
                 Ok(Next::Settled) => {
                     backoff = Backoff::new();
-                    size.settled(took);
+                    size.record_success(took);
                 }
                 Ok(Next::TryFewer(fewer)) => size.records_max = fewer,
                 Ok(Next::TryLater) => {
-                    size.failed(took);
+                    size.record_failure(took);
                     tokio::select! {
                         () = tokio::time::sleep(backoff.grow()) => {}
                         // The server is reachable again: the pause ends.
@@ -229,9 +229,9 @@ mod tests {
                 let is_answered = took <= UPLOAD_TIMEOUT;
                 prop_assert!(is_answered || upload < 12, "upload {upload} takes {took:?}");
                 if is_answered {
-                    size.settled(took);
+                    size.record_success(took);
                 } else {
-                    size.failed(UPLOAD_TIMEOUT);
+                    size.record_failure(UPLOAD_TIMEOUT);
                 }
             }
             prop_assert!(took <= 4 * UPLOAD_AIM || size.records_max == 1);
@@ -244,7 +244,7 @@ mod tests {
     fn an_absent_server_makes_batches_no_smaller() {
         let mut size = BatchSize::new();
         for _ in 0..100 {
-            size.failed(Duration::from_millis(1));
+            size.record_failure(Duration::from_millis(1));
         }
         assert_eq!(size.records_max, BATCH_RECORDS_MAX);
     }

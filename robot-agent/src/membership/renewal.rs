@@ -19,7 +19,7 @@ const RETRY_FIRST: Duration = Duration::from_secs(1);
 /// Longest pause between two attempts, also for a robot that was removed from the fleet.
 const RETRY_MAX: Duration = Duration::from_mins(5);
 /// Longest uninterrupted wait, since the wall clock may be set meanwhile.
-const LOOK_EVERY: Duration = Duration::from_mins(10);
+const CHECK_EVERY: Duration = Duration::from_mins(10);
 /// Time over which the renewals of a fleet are spread when all robots must renew at once.
 const JITTER_MAX: Duration = Duration::from_secs(5);
 
@@ -97,7 +97,7 @@ impl Renewal {
                 Due::In(left) => {
                     (pause, is_first) = (RETRY_FIRST, true);
                     tokio::select! {
-                        () = tokio::time::sleep(left.min(LOOK_EVERY)) => {}
+                        () = tokio::time::sleep(left.min(CHECK_EVERY)) => {}
                         _ = news.changed() => {}
                     }
                     continue;

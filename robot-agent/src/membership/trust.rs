@@ -133,7 +133,7 @@ impl Trust {
                 builder.with_root_certificates(roots)
             }
             Self::Fingerprint(fingerprint) => {
-                let verifier = Pinned {
+                let verifier = PinnedVerifier {
                     fingerprint: *fingerprint,
                     fleet: of_fleet,
                     algorithms: provider().signature_verification_algorithms,
@@ -149,13 +149,13 @@ impl Trust {
 
 /// Accepts one certificate, or those that one authority or an authority of the fleet has signed.
 #[derive(Debug)]
-struct Pinned {
+struct PinnedVerifier {
     fingerprint: Fingerprint,
     fleet: RootCertStore,
     algorithms: WebPkiSupportedAlgorithms,
 }
 
-impl ServerCertVerifier for Pinned {
+impl ServerCertVerifier for PinnedVerifier {
     fn verify_server_cert(
         &self,
         leaf: &CertificateDer<'_>,
@@ -262,7 +262,7 @@ mod tests {
         let now = UnixTime::since_unix_epoch(std::time::Duration::from_secs(1_790_000_000));
         let takes =
             |pinned: Fingerprint, leaf: &rcgen::Certificate, chain: &[CertificateDer<'_>]| {
-                let verifier = Pinned {
+                let verifier = PinnedVerifier {
                     fingerprint: pinned,
                     fleet: RootCertStore::empty(),
                     algorithms: provider().signature_verification_algorithms,
@@ -281,7 +281,7 @@ mod tests {
         );
         assert!(!takes(of(&mine), &other, &chain));
         let after_a_rotation = |fleet: &str| {
-            let verifier = Pinned {
+            let verifier = PinnedVerifier {
                 fingerprint: Fingerprint::of(&CertificateDer::from(b"former".to_vec())),
                 fleet: roots_of(fleet),
                 algorithms: provider().signature_verification_algorithms,

@@ -82,7 +82,7 @@ fn a_replaced_mission_runs_again_to_the_bit() {
     recorded(|bench, _, plan| {
         bench.replace(1, 2, plan, &trajectory(OTHER)).unwrap();
         assert_eq!(run_to_end(bench), EndReason::Reached);
-        assert_eq!(bench.news, [MissionPhase::Replaced]);
+        assert_eq!(bench.phase_changes, [MissionPhase::Replaced]);
     });
 }
 
@@ -93,7 +93,10 @@ fn a_paused_mission_runs_again_to_the_bit() {
         bench.run_for(5 * SECOND);
         bench.pause(mission, false).unwrap();
         assert_eq!(run_to_end(bench), EndReason::Reached);
-        assert_eq!(bench.news, [MissionPhase::Paused, MissionPhase::Resumed]);
+        assert_eq!(
+            bench.phase_changes,
+            [MissionPhase::Paused, MissionPhase::Resumed]
+        );
     });
 }
 
@@ -107,7 +110,7 @@ fn a_stop_in_the_middle_of_a_mission_runs_again_to_the_bit() {
             at: Timestamp::UNIX_EPOCH,
         });
         bench.run_for(3 * SECOND);
-        assert!(bench.stands());
+        assert!(bench.is_standing());
         assert!(bench.drive.truth().twist().linear_m_s.abs() < 0.01);
     });
 }

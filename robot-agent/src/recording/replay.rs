@@ -107,8 +107,8 @@ impl Drive for RecordedBase {
     }
 }
 
-/// A loop that replays a record.
-struct Player {
+/// Replays a record through a control loop.
+struct Replayer {
     model: RobotModel,
     core: LoopCore,
     ends: AgentEnds,
@@ -128,20 +128,20 @@ struct Player {
 /// [`ReplayError`] if the record cannot be read, its model is impossible, or a tick is malformed.
 pub(crate) fn replay(files: &[PathBuf]) -> Result<Replayed, ReplayError> {
     let mut run = Run::open(files)?;
-    let mut player = Player::new(run.head.clone())?;
-    while player.found.gap.is_none() {
+    let mut replayer = Replayer::new(run.head.clone())?;
+    while replayer.found.gap.is_none() {
         match run.next()? {
             None => break,
-            Some(Entry::Command(command)) => player.waiting.push(*command),
-            Some(Entry::Safety(message)) => player.view = message.view,
-            Some(Entry::Tick(bytes)) => player.take(&bytes)?,
+            Some(Entry::Command(command)) => replayer.waiting.push(*command),
+            Some(Entry::Safety(message)) => replayer.view = message.view,
+            Some(Entry::Tick(bytes)) => replayer.take(&bytes)?,
         }
     }
-    player.found.torn = run.torn;
-    Ok(player.found)
+    replayer.found.torn = run.torn;
+    Ok(replayer.found)
 }
 
-impl Player {
+impl Replayer {
     fn new(head: RunHead) -> Result<Self, ReplayError> {
         let model = control_model(&head.model)?;
         let (loop_ends, ends) = loop_channels();

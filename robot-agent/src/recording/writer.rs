@@ -47,12 +47,12 @@ const NAME: (&str, &str) = ("tread-", ".mcap");
 
 /// A file that counts the bytes written to it.
 #[derive(Debug)]
-struct Counted {
+struct CountingFile {
     file: BufWriter<File>,
     bytes: Arc<AtomicU64>,
 }
 
-impl Write for Counted {
+impl Write for CountingFile {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let written = self.file.write(bytes)?;
         self.bytes.fetch_add(written as u64, Ordering::Relaxed);
@@ -66,7 +66,7 @@ impl Write for Counted {
 
 /// A record that is being written.
 struct OpenRecord {
-    writer: Writer<NoSeek<Counted>>,
+    writer: Writer<NoSeek<CountingFile>>,
     channels: BTreeMap<&'static str, (u16, u32)>,
     bytes: Arc<AtomicU64>,
     flushed: Duration,
@@ -149,7 +149,7 @@ pub(super) fn ros_channel<W: Write + Seek>(
 impl OpenRecord {
     fn create(path: &Path, now: Duration) -> Result<Self, McapError> {
         let bytes = Arc::new(AtomicU64::new(0));
-        let counted = Counted {
+        let counted = CountingFile {
             file: BufWriter::new(File::create_new(path)?),
             bytes: Arc::clone(&bytes),
         };
@@ -284,28 +284,31 @@ impl RecordWriter {
             self.said_lost_at = Some(self.clock.monotonic());
             self.lost = lost;
         }
-        self.guarded(|writer, open| writer.take(open, note, lost));
-        self.turn_over();
+        self.with_open_record(|writer, open| writer.take(open, note, lost));
+        self.rotate_if_full();
     }
 
     /// Runs `work` on the open record, opening one if necessary; closes it after an error.
-    fn guarded(&mut self, work: impl FnOnce(&mut Self, &mut OpenRecord) -> Result<(), McapError>) {
+    fn with_open_record(
+        &mut self,
+        work: impl FnOnce(&mut Self, &mut OpenRecord) -> Result<(), McapError>,
+    ) {
         let now = self.clock.monotonic();
         let mut open = match self.open.take() {
             Some(open) => open,
             None if now < self.retry_at => return,
             None => match self.begin(now) {
                 Ok(open) => open,
-                Err(cause) => return self.give_up(now, &cause),
+                Err(cause) => return self.suspend(now, &cause),
             },
         };
         match work(self, &mut open) {
             Ok(()) => self.open = Some(open),
-            Err(cause) => self.give_up(now, &cause),
+            Err(cause) => self.suspend(now, &cause),
         }
     }
 
-    fn give_up(&mut self, now: Duration, cause: &McapError) {
+    fn suspend(&mut self, now: Duration, cause: &McapError) {
         let folder = self.config.folder.display();
         error!("nothing is recorded for a while, `{folder}` refuses: {cause}");
         self.retry_at = now.saturating_add(RETRY_EVERY);
@@ -451,7 +454,7 @@ impl RecordWriter {
         let now = self.clock.monotonic();
         let is_due = |open: &OpenRecord| now.saturating_sub(open.flushed) >= FLUSH_EVERY;
         if self.open.as_ref().is_some_and(is_due) {
-            self.guarded(|_, open| {
+            self.with_open_record(|_, open| {
                 open.flushed = now;
                 open.writer.flush()
             });
@@ -459,7 +462,7 @@ impl RecordWriter {
     }
 
     /// Closes a file that has reached its size; the next note begins another.
-    fn turn_over(&mut self) {
+    fn rotate_if_full(&mut self) {
         let is_full =
             |open: &OpenRecord| open.bytes.load(Ordering::Relaxed) >= self.config.file_bytes;
         if self.open.as_ref().is_some_and(is_full) {

@@ -16,7 +16,7 @@ use crate::clock::{SharedClock, SystemClock};
 use crate::control_loop::channels::Fault;
 use crate::control_loop::hold_tests::driving;
 use crate::drive::ros2::Ros2Drive;
-use crate::drive::ros2::bus::session_config;
+use crate::drive::ros2::bus_config::session_config;
 use crate::drive::ros2::refusal::{Refusal, Source};
 use crate::drive::ros2::settings::{BusMode, Ros2Settings};
 use crate::drive::ros2::tests as drive_tests;
@@ -42,15 +42,15 @@ fn settings() -> OutwardSettings {
     }
 }
 
-fn outward(shared: &Arc<Shared>) -> Outward {
+fn outward(shared: &Arc<Shared>) -> AgentStatePublisher {
     let robot = "rover-1".to_owned();
-    Outward::new(settings(), Arc::clone(shared), Arc::default(), robot)
+    AgentStatePublisher::new(settings(), Arc::clone(shared), Arc::default(), robot)
 }
 
-type Messages = BTreeMap<OutwardTopic, Vec<u8>>;
+type Messages = BTreeMap<PublishedTopic, Vec<u8>>;
 
 /// What is said at that moment.
-fn said(outward: &mut Outward, now: Duration) -> Messages {
+fn said(outward: &mut AgentStatePublisher, now: Duration) -> Messages {
     let mut messages = Messages::new();
     outward.step(now, 1_500_000_000, &mut |topic, bytes| {
         let again = messages.insert(topic, bytes.to_vec());
@@ -59,7 +59,7 @@ fn said(outward: &mut Outward, now: Duration) -> Messages {
     messages
 }
 
-fn points(messages: &Messages, topic: OutwardTopic) -> Vec<Point> {
+fn points(messages: &Messages, topic: PublishedTopic) -> Vec<Point> {
     let path: Path<'_> = decode(&messages[&topic]).unwrap();
     assert_eq!(path.header.frame_id, "map");
     assert_eq!(path.header.stamp.nanoseconds(), Some(1_500_000_000));
@@ -73,7 +73,7 @@ fn points(messages: &Messages, topic: OutwardTopic) -> Vec<Point> {
 }
 
 fn numbers(messages: &Messages) -> Vec<f64> {
-    let theta: Float64MultiArray<'_> = decode(&messages[&OutwardTopic::Theta]).unwrap();
+    let theta: Float64MultiArray<'_> = decode(&messages[&PublishedTopic::Theta]).unwrap();
     let dimension = theta.layout.dim.get(0).unwrap();
     assert_eq!((dimension.label, dimension.size), (THETA_LABEL, 3));
     theta.data.iter().collect()
@@ -81,7 +81,7 @@ fn numbers(messages: &Messages) -> Vec<f64> {
 
 /// Level, sentence and figures of a part.
 fn part(messages: &Messages, name: &str) -> (u8, String, BTreeMap<String, String>) {
-    let array: DiagnosticArray<'_> = decode(&messages[&OutwardTopic::Diagnostics]).unwrap();
+    let array: DiagnosticArray<'_> = decode(&messages[&PublishedTopic::Diagnostics]).unwrap();
     let mut parts = array.status.iter();
     let part = parts.find(|part| part.name == name).unwrap();
     assert_eq!(part.hardware_id, "rover-1");
@@ -101,7 +101,7 @@ fn a_mission_is_shown_from_its_plan_to_the_way_driven_in_the_robots_frame() {
     let mut outward = outward(&shared);
     let messages = said(&mut outward, bench.now);
     assert_eq!(
-        points(&messages, OutwardTopic::Plan),
+        points(&messages, PublishedTopic::Plan),
         [],
         "it was not given yet"
     );
@@ -114,7 +114,7 @@ fn a_mission_is_shown_from_its_plan_to_the_way_driven_in_the_robots_frame() {
         plan: Arc::new(plan),
     });
     let messages = said(&mut outward, bench.now);
-    let shown = points(&messages, OutwardTopic::Plan);
+    let shown = points(&messages, PublishedTopic::Plan);
     let in_map = |pose: Pose| SITE_FROM_MAP.body_from_site(pose.point());
     assert!(near(shown[0], in_map(start)), "{shown:?}");
     assert!(near(*shown.last().unwrap(), in_map(end)), "{shown:?}");
@@ -127,7 +127,7 @@ fn a_mission_is_shown_from_its_plan_to_the_way_driven_in_the_robots_frame() {
     assert!((2..=3).contains(&times), "{times} times in three seconds");
 
     let messages = said(&mut outward, bench.now + SAY_EVERY);
-    let driven = points(&messages, OutwardTopic::Driven);
+    let driven = points(&messages, PublishedTopic::Driven);
     let snapshot = shared.snapshot();
     let (pose, _) = snapshot.pose.unwrap();
     let behind_m = driven.last().unwrap().distance_m(in_map(pose));
@@ -170,7 +170,7 @@ fn a_path_keeps_its_newest_points_and_no_more_than_it_may() {
         outward.update_place(&snapshot);
     }
     let messages = said(&mut outward, Duration::ZERO);
-    let driven = points(&messages, OutwardTopic::Driven);
+    let driven = points(&messages, PublishedTopic::Driven);
     assert_eq!(driven.len(), PATH_POINTS_MAX as usize);
     let last = at(f64::from(3 * PATH_POINTS_MAX - 1));
     let newest = SITE_FROM_MAP.body_from_site(last.point());
@@ -299,7 +299,8 @@ fn heard_by_another(tells: bool, look: impl FnOnce(&OutwardSettings, &Observer))
         let shared = Arc::new(Shared::default());
         shared.record_server_message(clock.monotonic());
         let settings = bus.outward_settings().cloned().unwrap();
-        let outward = Outward::new(settings, shared, drive.counts(), "rover-1".to_owned());
+        let outward =
+            AgentStatePublisher::new(settings, shared, drive.counts(), "rover-1".to_owned());
         bus.publish(Box::new(outward));
     }
     let running = std::thread::spawn(move || bus.run());
@@ -314,11 +315,11 @@ fn heard_by_another(tells: bool, look: impl FnOnce(&OutwardSettings, &Observer))
 fn another_node_on_the_bus_hears_every_topic_by_its_key_and_sees_who_publishes_it() {
     heard_by_another(true, |settings, observer| {
         // Rest is commanded as well.
-        let found = observer.first_of(OutwardTopic::ALL.len() + 1);
+        let found = observer.first_of(PublishedTopic::ALL.len() + 1);
         let tokens = observer.publishers();
-        assert_eq!(tokens.len(), OutwardTopic::ALL.len() + 1, "{tokens:?}");
+        assert_eq!(tokens.len(), PublishedTopic::ALL.len() + 1, "{tokens:?}");
         let mut messages = Messages::new();
-        for topic in OutwardTopic::ALL {
+        for topic in PublishedTopic::ALL {
             let message_type = topic.message_type();
             let key = topic_key(0, topic.topic(settings), &message_type, Generation::Hashed);
             assert!(key.ends_with(message_type.hash), "{key}");
@@ -329,7 +330,7 @@ fn another_node_on_the_bus_hears_every_topic_by_its_key_and_sees_who_publishes_i
             assert!(token.contains(message_type.hash), "{token}");
             messages.insert(topic, bytes.clone());
         }
-        for topic in [OutwardTopic::Plan, OutwardTopic::Driven] {
+        for topic in [PublishedTopic::Plan, PublishedTopic::Driven] {
             let path: Path<'_> = decode(&messages[&topic]).unwrap();
             assert_eq!((path.header.frame_id, path.poses.len()), ("map", 0));
         }

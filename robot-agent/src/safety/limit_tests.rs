@@ -232,7 +232,7 @@ fn teleoperation_keeps_every_limit_when_the_commands_reverse() {
         bench.tick();
         watch.look(&bench);
     }
-    assert!(bench.stands());
+    assert!(bench.is_standing());
     assert!(watch.fastest_m_s > 0.95);
     assert_eq!(PERIOD, Duration::from_millis(10));
 }

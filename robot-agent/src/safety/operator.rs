@@ -119,23 +119,23 @@ impl Operator {
         }
     }
 
-    fn free_if_silent(&mut self, now_us: u64) {
+    fn expire_if_silent(&mut self, now_us: u64) {
         let is_silent = self
             .active
             .as_ref()
             .is_some_and(|active| now_us >= active.heard_us.saturating_add(LEASE_SILENCE_MAX_US));
         if is_silent {
-            self.free();
+            self.clear_lease();
         }
     }
 
-    fn free(&mut self) {
+    fn clear_lease(&mut self) {
         self.active = None;
         self.wanted = None;
     }
 
     fn grant(&mut self, driver: &Driver, now_us: u64) -> u64 {
-        self.free();
+        self.clear_lease();
         self.epoch += 1;
         let driver = Driver {
             client: driver.client,
@@ -176,7 +176,7 @@ impl Operator {
         command: &AcquireLease,
         now_us: u64,
     ) -> Result<u64, LeaseRefusal> {
-        self.free_if_silent(now_us);
+        self.expire_if_silent(now_us);
         let own = self.active.as_ref().map(|active| active.lease.epoch);
         let known = self.answered.iter().find_map(|(request, granted)| {
             let epoch = match granted {
@@ -207,7 +207,7 @@ impl Operator {
     /// # Errors
     /// The driver who has the lease, if it is another one.
     pub(crate) fn release(&mut self, command: &ReleaseLease, now_us: u64) -> Result<(), Driver> {
-        self.free_if_silent(now_us);
+        self.expire_if_silent(now_us);
         let answer = (command.request, Granted::Release);
         if self.answered.contains(&answer) {
             return Ok(());
@@ -215,14 +215,14 @@ impl Operator {
         if let Some(other) = self.other_driver(&command.holder) {
             return Err(other.clone());
         }
-        self.free();
+        self.clear_lease();
         self.remember(command.request, Granted::Release);
         Ok(())
     }
 
     /// Checks a drive command, and applies it if accepted.
     pub(crate) fn drive(&mut self, command: &DriveCommand, now_us: u64) -> Verdict {
-        self.free_if_silent(now_us);
+        self.expire_if_silent(now_us);
         let verdict = self.judge(command, now_us);
         let count = match verdict {
             Verdict::Accepted => &mut self.counts.accepted,

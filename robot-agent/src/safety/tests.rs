@@ -91,7 +91,7 @@ fn clear(bench: &Bench) {
 
 fn until_standing(bench: &mut Bench) {
     let until = bench.now + 5 * SECOND;
-    while !bench.stands() {
+    while !bench.is_standing() {
         bench.tick();
         assert!(bench.now < until, "it did not come to stand");
     }
@@ -210,7 +210,7 @@ fn a_stop_zeroes_the_target_in_the_next_tick_and_nothing_starts_by_itself_after_
     until_standing(&mut bench);
     bench.run_for(SECOND);
     assert_eq!(paused_by(&bench), Some(PauseCause::Stop));
-    assert_eq!(bench.news, [MissionPhase::Paused]);
+    assert_eq!(bench.phase_changes, [MissionPhase::Paused]);
     // It had to brake first; the stop's own time is what is reported.
     let paused_for = bench.paused_for.unwrap();
     assert!(paused_for.as_millis() >= 100, "{paused_for:?}");
@@ -218,10 +218,10 @@ fn a_stop_zeroes_the_target_in_the_next_tick_and_nothing_starts_by_itself_after_
     // Asking for it to go on changes nothing while the stop is in force.
     bench.pause(mission, false).unwrap();
     bench.run_for(SECOND);
-    assert!(bench.stands() && paused_by(&bench) == Some(PauseCause::Stop));
+    assert!(bench.is_standing() && paused_by(&bench) == Some(PauseCause::Stop));
     clear(&bench);
     bench.run_for(3 * SECOND);
-    assert!(bench.stands(), "it moved by itself after the clear");
+    assert!(bench.is_standing(), "it moved by itself after the clear");
     assert_eq!(mode(&bench), RobotMode::Tracking);
     bench.pause(mission, false).unwrap();
     bench.run_for(30 * SECOND);
@@ -240,7 +240,7 @@ fn a_stop_counts_while_the_base_is_silent_and_is_still_there_afterwards() {
     assert_eq!(cause(&bench), Some(GateCause::Stop));
     assert_eq!(mode(&bench), RobotMode::Stopped);
     bench.run_for(2 * SECOND);
-    assert!(bench.stands() && mode(&bench) == RobotMode::Stopped);
+    assert!(bench.is_standing() && mode(&bench) == RobotMode::Stopped);
 }
 
 #[test]
@@ -250,7 +250,7 @@ fn the_operator_watchdog_stops_a_robot_whose_driver_is_silent() {
     teleoperator.drive(&mut bench, 0.0, 0.0, 3 * SECOND);
     assert_eq!(mode(&bench), RobotMode::Teleoperated);
     assert_eq!(paused_by(&bench), Some(PauseCause::Teleoperation));
-    assert!(bench.stands());
+    assert!(bench.is_standing());
     teleoperator.drive(&mut bench, 0.5, 0.0, 2 * SECOND);
     assert!((speed_m_s(&bench) - 0.5).abs() < 0.05);
     let silent_at = bench.now;
@@ -267,7 +267,7 @@ fn the_operator_watchdog_stops_a_robot_whose_driver_is_silent() {
         "the lease frees itself"
     );
     bench.run_for(3 * SECOND);
-    assert!(bench.stands() && bench.end_of(mission).is_none());
+    assert!(bench.is_standing() && bench.end_of(mission).is_none());
     let off_m = bench.ends.shared.snapshot().off_path_m.unwrap();
     assert!(off_m > 0.5, "it was driven away from its path by {off_m} m");
 }
@@ -289,7 +289,7 @@ fn a_teleoperator_stays_within_limits_and_ramps() {
     // Teleoperated and stopped: a stop needs no lease, and teleoperation no longer counts.
     bench.safety.stop_now(&stop(1));
     teleoperator.drive(&mut bench, 0.5, 0.0, 3 * SECOND);
-    assert!(bench.stands());
+    assert!(bench.is_standing());
     assert_eq!(cause(&bench), Some(GateCause::Stop));
 }
 
@@ -322,7 +322,7 @@ fn a_robot_that_leans_too_far_or_says_nonsense_stops() {
     let (mut bench, _) = driving();
     bench.drive.lean(0.6);
     bench.run_for(2 * SECOND);
-    assert!(bench.stands());
+    assert!(bench.is_standing());
     assert_eq!(cause(&bench), Some(GateCause::Tilt));
 
     let (mut bench, _) = driving();
@@ -481,7 +481,7 @@ fn a_command_that_is_about_to_end_does_not_speed_the_robot_up() {
         teleoperator.say_for(&mut bench, 0.8, 0.0, 10_000, 90_000);
         bench.run_for(Duration::from_millis(50));
     }
-    assert!(bench.stands(), "{} m/s", speed_m_s(&bench));
+    assert!(bench.is_standing(), "{} m/s", speed_m_s(&bench));
     // The same with commands that last longer.
     teleoperator.drive(&mut bench, 0.8, 0.0, SECOND);
     assert!(speed_m_s(&bench) > 0.5);
@@ -525,5 +525,5 @@ fn commands_that_do_not_parse_are_counted_and_change_nothing() {
     bench.run_for(SECOND);
     let counts = bench.safety.drive_status().unwrap().counts;
     assert_eq!((counts.malformed, counts.accepted), (4, 0));
-    assert!(bench.stands());
+    assert!(bench.is_standing());
 }

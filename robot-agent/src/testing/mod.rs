@@ -42,7 +42,7 @@ use crate::control_loop::job::{Job, JobOrigin};
 use crate::control_loop::segments::Moment;
 use crate::control_loop::site_view::SiteView;
 use crate::control_loop::tick::LoopCore;
-pub use crate::control_loop::tick::listener::{Heard, Listener};
+pub use crate::control_loop::tick::listener::{Listener, ListenerOutput};
 use crate::dispatcher::answers;
 use crate::drive::{Drive, Feedback, SILENT_AFTER_MAX, SensorSample};
 use crate::geometry::paper_robot;
@@ -110,7 +110,7 @@ pub struct Bench<D = SimulatedDrive> {
     pub(crate) starts: Vec<MissionId>,
     pub(crate) ended: Vec<(MissionId, EndReason)>,
     /// Reported pauses, resumptions and new revisions of missions.
-    pub(crate) news: Vec<MissionPhase>,
+    pub(crate) phase_changes: Vec<MissionPhase>,
     /// Time from the start of the last safety pause until the robot stopped.
     pub(crate) paused_for: Option<jiff::SignedDuration>,
     /// Maximum silence of the server for missions planned from now on.
@@ -179,9 +179,9 @@ impl Drive for NonFiniteDrive {
 }
 
 /// Drive without position fixes.
-struct Blind<'base, D>(&'base mut D);
+struct WithoutPosition<'base, D>(&'base mut D);
 
-impl<D: Drive> Drive for Blind<'_, D> {
+impl<D: Drive> Drive for WithoutPosition<'_, D> {
     fn read(&mut self, now: Duration) -> Feedback {
         let mut feedback = Feedback::default();
         for &sample in self.0.read(now).samples() {
@@ -199,9 +199,9 @@ impl<D: Drive> Drive for Blind<'_, D> {
 }
 
 /// Drive that receives commands but whose messages are lost.
-struct Unheard<'base, D>(&'base mut D);
+struct LostFeedback<'base, D>(&'base mut D);
 
-impl<D: Drive> Drive for Unheard<'_, D> {
+impl<D: Drive> Drive for LostFeedback<'_, D> {
     fn read(&mut self, now: Duration) -> Feedback {
         self.0.read(now);
         Feedback::default()
@@ -317,7 +317,7 @@ impl<D: SteppedDrive> Bench<D> {
             segments: Vec::new(),
             starts: Vec::new(),
             ended: Vec::new(),
-            news: Vec::new(),
+            phase_changes: Vec::new(),
             paused_for: None,
             silence_max: None,
             prior: None,
@@ -522,8 +522,8 @@ impl<D: SteppedDrive> Bench<D> {
     }
 
     /// Returns whether the robot is stopped.
-    pub fn stands(&self) -> bool {
-        self.core.stands()
+    pub fn is_standing(&self) -> bool {
+        self.core.is_standing()
     }
 
     fn moment(&self) -> Moment {
@@ -560,7 +560,8 @@ impl<D: SteppedDrive> Bench<D> {
     pub fn tick_without_position(&mut self) {
         self.simulate();
         let now = self.moment();
-        self.core.tick(now, false, &mut Blind(&mut self.drive));
+        self.core
+            .tick(now, false, &mut WithoutPosition(&mut self.drive));
         self.collect();
     }
 
@@ -568,7 +569,8 @@ impl<D: SteppedDrive> Bench<D> {
     pub fn tick_unheard(&mut self) {
         self.simulate();
         let now = self.moment();
-        self.core.tick(now, false, &mut Unheard(&mut self.drive));
+        self.core
+            .tick(now, false, &mut LostFeedback(&mut self.drive));
         self.collect();
     }
 
@@ -613,11 +615,11 @@ impl<D: SteppedDrive> Bench<D> {
                 }
                 LoopEvent::Segment(segment) => self.segments.push(segment),
                 LoopEvent::Paused { at, since, .. } => {
-                    self.news.push(MissionPhase::Paused);
+                    self.phase_changes.push(MissionPhase::Paused);
                     self.paused_for = since.map(|since| at.duration_since(since));
                 }
-                LoopEvent::Resumed { .. } => self.news.push(MissionPhase::Resumed),
-                LoopEvent::Replaced { .. } => self.news.push(MissionPhase::Replaced),
+                LoopEvent::Resumed { .. } => self.phase_changes.push(MissionPhase::Resumed),
+                LoopEvent::Replaced { .. } => self.phase_changes.push(MissionPhase::Replaced),
                 LoopEvent::CameTooLate(_) | LoopEvent::Retired(_) => {}
             }
         }

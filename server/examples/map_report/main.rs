@@ -35,7 +35,7 @@ use tread_server::app::{App, BlockCounts, Dependencies, map_blocks, sums};
 use tread_server::clock::Clock;
 use tread_server::config::MapConfig;
 use tread_server::db::Db;
-use tread_server::friction::index::{CELLS_PER_BLOCK, CellSummary, Labelled, SiteMap};
+use tread_server::friction::index::{CELLS_PER_BLOCK, CellSummary, LabelledSum, SiteMap};
 use tread_server::friction::{Horizons, Sums, epoch_h};
 use tread_server::http;
 use tread_server::identity::origin::Names;
@@ -110,7 +110,7 @@ fn bytes_per_sum(robots: &[RobotId]) -> anyhow::Result<(f64, f64)> {
         };
         for (number, robot) in (0..).zip(robots) {
             let segment = segment(model().configuration(), cell, number, at);
-            let labelled = Labelled {
+            let labelled = LabelledSum {
                 cell,
                 grid_revision: 1,
                 terrain: &None,

@@ -12,7 +12,7 @@ use tread_api::webhook::NoticeEvent;
 use tread_api::wire::ingest::MissionReport;
 
 use super::enrolment::{RETIRED_ALERT, REVOKED_ALERT, UNISSUED_ALERT};
-use super::missions::reports::Taken;
+use super::missions::reports::ReportEffect;
 use super::own_alert::OwnAlert;
 use super::reconciler::attendance::ROBOT_LOST_ALERT;
 use super::reconciler::conditions::{CLOCK_WRONG_ALERT, ROBOT_WAITING_ALERT};
@@ -242,7 +242,7 @@ impl App {
         tx: &mut db::Tx,
         robot_pk: i64,
         report: &MissionReport,
-        taken: &Taken,
+        taken: &ReportEffect,
     ) -> Result<Vec<Alert>, DbError> {
         let Some((state, reason)) = &taken.ended else {
             return Ok(Vec::new());

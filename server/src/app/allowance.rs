@@ -49,17 +49,17 @@ impl Kind {
 }
 
 #[derive(Debug, Default)]
-struct Taken {
+struct UsedAllowances {
     by_kind: HashMap<(RobotKey, Kind), Bucket>,
     by_code: HashMap<(RobotKey, AlertCode), Bucket>,
 }
 
 /// Allowances used so far, by robot.
 #[derive(Debug, Default)]
-pub(super) struct Allowances(Mutex<Taken>);
+pub(super) struct Allowances(Mutex<UsedAllowances>);
 
 impl Allowances {
-    fn lock(&self) -> MutexGuard<'_, Taken> {
+    fn lock(&self) -> MutexGuard<'_, UsedAllowances> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 

@@ -30,8 +30,8 @@ use tread_api::robot::Severity;
 use super::sites::SITES_MAX;
 use super::{App, AppError};
 use crate::archive::{
-    ArchivedSegment, Finished, Found, KeyRange, SegmentArchive, SegmentArchiveError, Selection,
-    Writer,
+    ArchivedSegment, Finished, KeyRange, SearchResult, SegmentArchive, SegmentArchiveError,
+    Selection, Writer,
 };
 use crate::db;
 use crate::error_text::chain;
@@ -360,7 +360,7 @@ impl App {
         archive: &Archive,
         selection: Selection,
         limit: usize,
-    ) -> Result<Found, AppError> {
+    ) -> Result<SearchResult, AppError> {
         let mark = self.stored_mark().await?;
         let found = archive
             .read_in_turn(move |files| files.read(&selection, mark, limit))

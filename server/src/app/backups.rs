@@ -100,7 +100,7 @@ pub struct Order {
 
 /// A backup that was made.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Made {
+pub struct CompletedBackup {
     /// The file.
     pub path: PathBuf,
     /// Its size, bytes.
@@ -210,7 +210,7 @@ fn check_all_space(order: &Order, target: &Path, size: u64) -> Result<(), Backup
 pub async fn make(
     order: Order,
     progress: impl Fn(Progress) + Send + Sync + 'static,
-) -> Result<Made, BackupError> {
+) -> Result<CompletedBackup, BackupError> {
     let target = if order.target.is_dir() {
         let name = folder::name(order.now, order.encryption.is_some());
         order.target.join(name)
@@ -266,7 +266,7 @@ pub async fn make(
         let of = manifest.database.bytes;
         let mut tell = |bytes| progress(Progress::Writing { bytes, of });
         let archived = archive::write(&target, &source, order.encryption.as_ref(), &mut tell)?;
-        Ok(Made {
+        Ok(CompletedBackup {
             path: target,
             bytes: archived.bytes,
             manifest,

@@ -15,17 +15,17 @@ impl App {
         let now = self.clock().machine_time();
         let ends = certificate.map(|certificate| certificate.not_after);
         self.storage().record_certificate_expiry(ends);
-        let trouble = certificate.and_then(|certificate| trouble(certificate, origin, now));
-        let severity = trouble
+        let problem = certificate.and_then(|certificate| problem(certificate, origin, now));
+        let severity = problem
             .as_ref()
             .map_or(Severity::Warning, |(severity, _)| *severity);
-        let text = trouble.map(|(_, text)| text);
+        let text = problem.map(|(_, text)| text);
         self.set_server_alert(CERTIFICATE_ALERT, severity, text);
     }
 }
 
 /// Returns what is wrong with a certificate, for people; `None` if nothing is.
-fn trouble(
+fn problem(
     certificate: &Certificate,
     origin: &str,
     now: jiff::Timestamp,

@@ -29,7 +29,7 @@ use self::conversion::{control_trajectory, plan_options};
 pub(super) use self::drawn::drawn;
 pub(super) use self::refused::Refused;
 pub(super) use self::start::Place as StartPlace;
-use self::start::{Earlier, Start, after, earlier};
+use self::start::{PrecedingMission, Start, after, earlier};
 use self::traction::Traction;
 use super::{App, AppError, site_row};
 use crate::db;
@@ -213,8 +213,8 @@ impl App {
         &self,
         named: (&SiteId, &RobotId),
         grid: &Grid,
-        missions: Vec<Earlier>,
-    ) -> Result<Vec<(Earlier, Traction)>, AppError> {
+        missions: Vec<PrecedingMission>,
+    ) -> Result<Vec<(PrecedingMission, Traction)>, AppError> {
         let mut with = Vec::with_capacity(missions.len());
         for mission in missions {
             let traction = self

@@ -232,7 +232,7 @@ impl App {
                 ..unnumbered(&event, Some(Topic::Missions), about)
             }
         });
-        let wanted = |step: &Sent| filter.lets_through(step.topic, step.about.as_ref());
+        let wanted = |step: &Sent| filter.matches(step.topic, step.about.as_ref());
         Ok(missed.filter(wanted).map(Arc::new).collect())
     }
 

@@ -35,7 +35,7 @@ pub(super) use self::prepared::SKEW_MIN;
 use self::prepared::{Prepared, Ready, Skew, prepared, us_of};
 use super::App;
 use super::map::{Folded, MapChange};
-use super::missions::reports::{Foreign, Reporting, Taken, apply_mission_report};
+use super::missions::reports::{Foreign, ReportEffect, Reporting, apply_mission_report};
 use crate::db::deferred_segments::{DeferredFilter, Origin};
 use crate::db::segments::{Added, NewSegment};
 use crate::db::sums::SumKey;
@@ -154,7 +154,7 @@ type Outcome = Result<Receipt, Refusal>;
 
 /// Counts of a transaction, for the server's counters.
 #[derive(Debug, Default)]
-struct Tally {
+struct TransactionCounts {
     segments: u64,
     reports: u64,
     foreign: u64,
@@ -163,10 +163,10 @@ struct Tally {
     alerts: Vec<Alert>,
 }
 
-impl Tally {
+impl TransactionCounts {
     fn record_report(
         &mut self,
-        taken: Option<Result<Taken, Foreign>>,
+        taken: Option<Result<ReportEffect, Foreign>>,
         seq: u64,
         receipt: &mut Receipt,
     ) {
@@ -273,7 +273,7 @@ impl Writer {
         report: &MissionReport,
         (now, skew): (Timestamp, Skew),
     ) -> Reporting {
-        let at = skew.put_right(report.at);
+        let at = skew.corrected(report.at);
         let since = report.since.and_then(|since| self.heard_of(upload, since));
         let key = (upload.site.clone(), upload.batch.robot.clone());
         Reporting {
@@ -287,13 +287,16 @@ impl Writer {
         }
     }
 
-    async fn commit_once(&mut self, group: &[Upload]) -> Result<(Vec<Outcome>, Tally), DbError> {
+    async fn commit_once(
+        &mut self,
+        group: &[Upload],
+    ) -> Result<(Vec<Outcome>, TransactionCounts), DbError> {
         let mut outcomes: Vec<Outcome> = Vec::with_capacity(group.len());
         let records = group.iter().map(|upload| upload.batch.records.len());
         let mut candidates = Vec::with_capacity(records.sum());
-        let (mut tally, app) = (Tally::default(), self.app.clone());
+        let (mut tally, app) = (TransactionCounts::default(), self.app.clone());
         app.bound_unwritten_sums().await?;
-        let turn = app.map_turn_to_change().await?;
+        let turn = app.lock_map_for_write().await?;
         let mut tx = app.db().write_uncounted("ingest").await?;
         // One look for deferred segments of the whole group: there are hardly ever some.
         let is_any_deferred = db::deferred_segments::is_any(&mut tx).await?;
@@ -395,8 +398,8 @@ impl Writer {
         of: Reporting,
         key: RecordKey,
         report: &MissionReport,
-        tally: &mut Tally,
-    ) -> Result<Option<Result<Taken, Foreign>>, DbError> {
+        tally: &mut TransactionCounts,
+    ) -> Result<Option<Result<ReportEffect, Foreign>>, DbError> {
         let robot_pk = of.robot_pk;
         let taken = apply_new_report(tx, of, key, report).await?;
         if let Some(Ok(taken)) = &taken {
@@ -453,7 +456,7 @@ impl Writer {
         candidates: &[Candidate<'_>],
         now: Timestamp,
         outcomes: &mut [Outcome],
-        tally: &mut Tally,
+        tally: &mut TransactionCounts,
     ) -> Result<(Vec<Folded>, Added), DbError> {
         let removed = self.app.removed();
         let keys = &mut self.keys;
@@ -631,7 +634,7 @@ async fn apply_new_report(
     reporting: Reporting,
     key: RecordKey,
     report: &MissionReport,
-) -> Result<Option<Result<Taken, Foreign>>, DbError> {
+) -> Result<Option<Result<ReportEffect, Foreign>>, DbError> {
     if db::history::has_report(tx, key).await? {
         return Ok(None);
     }

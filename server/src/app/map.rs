@@ -2,10 +2,10 @@
 //! ([`unwritten`]). It is loaded at the start and changed with each commit. The cells of some blocks
 //! are in memory, as far as `[map] memory_max_mib` allows ([`blocks`]).
 //!
-//! To change sums, a task takes the [`MapTurn`], writes, and commits with [`MapTurn::commit`]:
-//! commit and change in memory are one task, which cancellation of the caller does not interrupt.
-//! After a commit of unknown outcome no turn is given until memory was read again (see
-//! [`super::memory`]).
+//! To change sums, a task takes the [`MapWriteGuard`], writes, and commits with
+//! [`MapWriteGuard::commit`]: commit and change in memory are one task, which cancellation of the
+//! caller does not interrupt. After a commit of unknown outcome no task gets the guard until memory
+//! was read again (see [`super::memory`]).
 
 mod block_memory;
 pub mod blocks;
@@ -38,7 +38,7 @@ use crate::db::sums::SumKey;
 use crate::db::watermarks::WatermarkStep;
 use crate::db::withdrawals::Hours;
 use crate::db::{DbError, Outcome, Tx};
-use crate::friction::index::{Labelled, SiteMap};
+use crate::friction::index::{LabelledSum, SiteMap};
 use crate::friction::{Horizons, Sums};
 
 /// The maps of all sites.
@@ -63,9 +63,9 @@ struct Sites {
     names: KeyNames,
 }
 
-/// Exclusive right to change sums, in the database and then in memory.
+/// Guard of the exclusive right to change sums, in the database and then in memory.
 #[derive(Debug)]
-pub(super) struct MapTurn {
+pub(super) struct MapWriteGuard {
     app: App,
     order: OwnedMutexGuard<u64>,
 }
@@ -106,7 +106,7 @@ pub(super) struct Withdrawn {
     pub(super) hours: Hours,
 }
 
-impl MapTurn {
+impl MapWriteGuard {
     /// Commits, and then changes memory and publishes the alerts that were written. After an
     /// outcome that is unknown, memory is read again.
     ///
@@ -240,7 +240,7 @@ impl Sites {
     fn add(
         &mut self,
         folded: &[Folded],
-        add: impl Fn(&mut SiteMap, Labelled<'_>, &[(Cell, Sums)]),
+        add: impl Fn(&mut SiteMap, LabelledSum<'_>, &[(Cell, Sums)]),
     ) {
         for part in folded {
             let Folded {
@@ -262,8 +262,8 @@ fn labelled<'names>(
     key: &'names SumKey,
     robot: &'names RobotId,
     configuration: ConfigurationId,
-) -> Labelled<'names> {
-    Labelled {
+) -> LabelledSum<'names> {
+    LabelledSum {
         cell: key.cell,
         grid_revision: key.grid_revision,
         terrain: &key.terrain,
@@ -278,13 +278,13 @@ impl App {
     ///
     /// # Errors
     /// [`DbError::Unsettled`] after a commit of unknown outcome, until memory was read again.
-    pub(super) async fn map_turn_to_change(&self) -> Result<MapTurn, DbError> {
+    pub(super) async fn lock_map_for_write(&self) -> Result<MapWriteGuard, DbError> {
         let order = Arc::clone(&self.maps().order).lock_owned().await;
         if *order != self.db().unknown_outcomes() {
             return Err(DbError::Unsettled);
         }
         let app = self.clone();
-        Ok(MapTurn { app, order })
+        Ok(MapWriteGuard { app, order })
     }
 
     fn apply(&self, change: MapChange) {

@@ -64,7 +64,7 @@ impl App {
             if horizons == site.horizons {
                 continue;
             }
-            let turn = self.map_turn_to_change().await?;
+            let turn = self.lock_map_for_write().await?;
             let mut tx = self.db().write("merging").await?;
             db::sites::set_horizons(&mut tx, site.pk, horizons).await?;
             let change = MapChange::MergeBefore(Box::new(site), horizons);
@@ -94,7 +94,7 @@ impl App {
     /// hours of which no row is left.
     async fn merge_rows(&self, hours: &[StoredHour], limit: u32) -> Result<usize, AppError> {
         let limit = limit as usize;
-        let turn = self.map_turn_to_change().await?;
+        let turn = self.lock_map_for_write().await?;
         let mut tx = self.db().write("merging").await?;
         let mut merged: BTreeMap<SumKey, Sums> = BTreeMap::new();
         let (mut taken, mut done) = (0, 0);

@@ -54,7 +54,7 @@ type Counts = Family<[(&'static str, &'static str); 1], Counter>;
 
 /// Labels of a terrain and a robot model.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
-struct OfTerrain {
+struct TerrainLabels {
     site: String,
     terrain: String,
     configuration: String,
@@ -62,15 +62,15 @@ struct OfTerrain {
 
 /// Labels of a robot.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
-struct OfRobot {
+struct RobotLabels {
     site: String,
     robot: String,
 }
 
 /// Selects one value of a link's quality.
-type LinkNumber = fn(&LinkQuality) -> Option<f64>;
+type LinkValue = fn(&LinkQuality) -> Option<f64>;
 /// Selects one value of a terrain's friction.
-type NumberOf = fn(&KnownGround) -> f64;
+type TerrainValue = fn(&KnownGround) -> f64;
 
 #[expect(clippy::cast_precision_loss, reason = "counts of an hour")]
 fn as_f64(count: u64) -> f64 {
@@ -343,7 +343,7 @@ impl App {
     fn register_links(&self, registry: &mut Registry) {
         let now = self.clock().elapsed();
         let (links, left_out) = self.presences().link_qualities(now, ROBOT_SERIES_MAX);
-        let gauges: [(&str, LinkNumber, &str); 4] = [
+        let gauges: [(&str, LinkValue, &str); 4] = [
             (
                 "tread_robot_round_trip_seconds",
                 |link| link.round_trip_ms.map(|round_trip_ms| round_trip_ms / 1e3),
@@ -366,10 +366,10 @@ impl App {
             ),
         ];
         for (name, value_of, help) in gauges {
-            let family = Family::<OfRobot, Gauge<f64, AtomicU64>>::default();
+            let family = Family::<RobotLabels, Gauge<f64, AtomicU64>>::default();
             for ((site, robot), link) in &links {
                 if let Some(value) = value_of(link) {
-                    let of = OfRobot {
+                    let of = RobotLabels {
                         site: site.to_string(),
                         robot: robot.to_string(),
                     };
@@ -386,7 +386,7 @@ impl App {
     /// Registers the friction of terrains.
     async fn register_terrains(&self, registry: &mut Registry) -> Result<(), AppError> {
         let (known, left_out) = self.known_of_terrains(TERRAIN_SERIES_MAX).await?;
-        let gauges: [(&str, NumberOf, &str); 3] = [
+        let gauges: [(&str, TerrainValue, &str); 3] = [
             (
                 "tread_terrain_theta",
                 |known| known.theta,
@@ -404,9 +404,9 @@ impl App {
             ),
         ];
         for (name, value_of, help) in gauges {
-            let family = Family::<OfTerrain, Gauge<f64, AtomicU64>>::default();
+            let family = Family::<TerrainLabels, Gauge<f64, AtomicU64>>::default();
             for known in &known {
-                let of = OfTerrain {
+                let of = TerrainLabels {
                     site: known.site.to_string(),
                     terrain: known.terrain.to_string(),
                     configuration: known.configuration.to_string(),

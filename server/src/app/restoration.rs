@@ -9,7 +9,7 @@ use tread_api::robot::{Robot, Severity};
 
 use super::{App, AppError, site_row};
 use crate::db;
-use crate::db::restorations::{Restoration, Restrained};
+use crate::db::restorations::{Restoration, RestrictedRobot};
 
 /// Code of the alert about robots that await their release.
 pub const AWAITING_RELEASE_ALERT: &str = "robots-await-release";
@@ -68,8 +68,8 @@ impl App {
     }
 
     /// Raises and clears the alert about robots that await their release.
-    pub(super) fn show_awaiting(&self, restrained: &[Restrained]) {
-        let mut awaiting = restrained.iter().filter(|robot| robot.awaits_release);
+    pub(super) fn show_awaiting(&self, restricted: &[RestrictedRobot]) {
+        let mut awaiting = restricted.iter().filter(|robot| robot.awaits_release);
         let first = awaiting.next();
         let count = first.map_or(0, |_first| 1 + awaiting.count() as u64);
         self.restored().awaiting.store(count, Ordering::Relaxed);

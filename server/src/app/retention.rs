@@ -184,7 +184,7 @@ impl App {
             self.write_sums().await?;
         }
         // Uploads wait meanwhile: none is between checking the names and its commit.
-        let turn = self.map_turn_to_change().await?;
+        let turn = self.lock_map_for_write().await?;
         let unwritten = self.first_unwritten_key();
         let until = unwritten.map_or(until, |unwritten| until.min(unwritten - 1));
         if until < first {

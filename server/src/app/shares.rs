@@ -22,7 +22,7 @@ pub struct Bounds {
 }
 
 #[derive(Debug, Default)]
-struct Taken {
+struct Usage {
     all: usize,
     viewers: usize,
     by_subject: HashMap<SubjectId, usize>,
@@ -32,7 +32,7 @@ struct Taken {
 #[derive(Debug, Clone)]
 pub struct Shares {
     bounds: Bounds,
-    taken: Arc<Mutex<Taken>>,
+    taken: Arc<Mutex<Usage>>,
 }
 
 impl Shares {
@@ -42,7 +42,7 @@ impl Shares {
         Self { bounds, taken }
     }
 
-    fn lock(&self) -> MutexGuard<'_, Taken> {
+    fn lock(&self) -> MutexGuard<'_, Usage> {
         self.taken.lock().unwrap_or_else(PoisonError::into_inner)
     }
 

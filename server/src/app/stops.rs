@@ -14,11 +14,11 @@
 //!
 //! The robot decides which stop is in force, in the order in which stops reached it: clearing the
 //! last one ends those before. A robot that no longer shows a stop that it had confirmed, and that
-//! nobody cleared, gets it again, and may answer that it was cleared (`judge`). All active and
+//! nobody cleared, gets it again, and may answer that it was cleared (`decision`). All active and
 //! queued missions of a stopped robot are held, and only a person resumes them.
 
+mod decision;
 mod delivery;
-mod judge;
 mod reconciliation;
 mod unrecorded;
 
@@ -37,7 +37,7 @@ use tread_api::stop::{FleetStop, STOP_CONFIRM_MAX_MS, STOP_TEXT_MAX, Stop};
 use tread_api::wire::reply::Acknowledgement;
 use tread_api::wire::safety::ClearStop;
 
-use self::delivery::{Outgoing, Settling};
+use self::delivery::{Outgoing, StopRecorder};
 pub(super) use self::delivery::{StopDelivery, send_stop};
 pub(super) use self::unrecorded::Unrecorded;
 use super::missions::control::hold_all;
@@ -71,7 +71,7 @@ fn key_of(stop: &Stop) -> RobotKey {
     (stop.site.clone(), stop.robot.clone())
 }
 
-fn words(text: Option<String>, otherwise: &str) -> String {
+fn text_or(text: Option<String>, otherwise: &str) -> String {
     let text: String = text
         .unwrap_or_default()
         .chars()
@@ -105,7 +105,7 @@ impl App {
         &self,
         site: &SiteId,
         robot: &RobotId,
-        words: StopReason,
+        reason: StopReason,
     ) -> Result<Stop, AppError> {
         let key = (site.clone(), robot.clone());
         // Memory decides, so that a slow database does not delay a stop.
@@ -119,7 +119,7 @@ impl App {
             };
             looked_up(looking_up).await?;
         }
-        let stops = self.stop_all(vec![key], words).await;
+        let stops = self.stop_all(vec![key], reason).await;
         let unknown = || AppError::UnknownRobot(site.clone(), robot.clone());
         stops.into_iter().next().ok_or_else(unknown)
     }
@@ -132,7 +132,7 @@ impl App {
         &self,
         within: &Scope,
         site: Option<&SiteId>,
-        words: StopReason,
+        reason: StopReason,
     ) -> Result<FleetStop, AppError> {
         let known = self.presences().known();
         let wanted = |key: &RobotKey| {
@@ -146,7 +146,7 @@ impl App {
             };
             looked_up(looking_up).await?;
         }
-        let stops = self.stop_all(keys, words).await;
+        let stops = self.stop_all(keys, reason).await;
         let confirmed = stops
             .iter()
             .filter(|stop| stop.confirmed_at.is_some())
@@ -160,8 +160,8 @@ impl App {
 
     async fn stop_all(&self, keys: Vec<RobotKey>, said: StopReason) -> Vec<Stop> {
         let wanted_at = self.clock().now();
-        let by = words(said.by, SOMEBODY);
-        let reason = words(said.reason, "no reason was given");
+        let by = text_or(said.by, SOMEBODY);
+        let reason = text_or(said.reason, "no reason was given");
         let stop = |(site, robot): RobotKey| Stop {
             id: self.clock().new_id::<StopId>(),
             site,
@@ -193,7 +193,7 @@ impl App {
         drop(tell);
         warn!("{by} stops {} robots: {reason}", stops.len());
         let (shown, seen) = oneshot::channel();
-        let settling = Settling {
+        let settling = StopRecorder {
             app: self.clone(),
             stops: stops.clone(),
             stop: self.supervisor().stop_token(),
@@ -223,7 +223,7 @@ impl App {
         id: StopId,
         by: Option<String>,
     ) -> Result<Stop, AppError> {
-        let by = words(by, SOMEBODY);
+        let by = text_or(by, SOMEBODY);
         let key = (site.clone(), robot.clone());
         let mut tx = self.db().write("stops").await?;
         let site_pk = site_row(&mut tx, site).await?.pk;
@@ -240,7 +240,7 @@ impl App {
         found
             .filter(|stop| (&stop.site, &stop.robot) == (site, robot))
             .ok_or(AppError::UnknownStop(id))?;
-        db::stops::ask_clear(&mut tx, id, &by, self.clock().now()).await?;
+        db::stops::request_clear(&mut tx, id, &by, self.clock().now()).await?;
         self.commit_recalling(tx).await?;
         let unreachable = || AppError::RobotUnreachable(robot.clone());
         let command = ClearStop { stop: id, by };
@@ -327,8 +327,8 @@ impl App {
             id: latch.id,
             site: key.0.clone(),
             robot: key.1.clone(),
-            by: words(Some(latch.by), SOMEBODY),
-            reason: words(Some(latch.reason), "the robot did not say why"),
+            by: text_or(Some(latch.by), SOMEBODY),
+            reason: text_or(Some(latch.reason), "the robot did not say why"),
             wanted_at: now,
             confirmed_at: Some(now),
             standing_at: None,

@@ -169,7 +169,7 @@ impl App {
         self.known_robot(site, robot).await?;
         Ok(Session {
             app: self.clone(),
-            _attended: self.supervisor().attend(),
+            _attended: self.supervisor().task_token(),
             _watch: self.watched().begin((site.clone(), robot.clone())),
             key: (site.clone(), robot.clone()),
             client: Uuid::new_v4(),
@@ -267,7 +267,7 @@ impl Session {
         };
         let publisher = self.app.robot_link().drive.open(&self.key).await;
         let Some(publisher) = publisher else {
-            self.give_back(lease, granted);
+            self.return_lease(lease, granted);
             let detail = "the network to the robot is not open";
             return Err(refused(DriveRefusal::Unreachable, detail));
         };
@@ -372,7 +372,7 @@ impl Session {
         let _ = self.send(Twist::default(), STAND_FOR);
         match self.active.take() {
             Some(active) => {
-                self.give_back(active.lease, active.granted);
+                self.return_lease(active.lease, active.granted);
                 true
             }
             None => false,
@@ -380,7 +380,7 @@ impl Session {
     }
 
     /// Releases a lease on the robot in the background; it is over when the robot has answered.
-    fn give_back(&self, lease: Lease, granted: LeaseGuard) {
+    fn return_lease(&self, lease: Lease, granted: LeaseGuard) {
         let (app, key) = (self.app.clone(), self.key.clone());
         let ending = app.supervisor().stop_token();
         let supervisor = app.supervisor().clone();

@@ -35,7 +35,7 @@ impl App {
         let CreateWithdrawal { from, to, reason } = request;
         let reason = people_line(PeopleField::Reason, &reason, REASON_LENGTH_MAX)?;
         let now = self.clock().now();
-        let turn = self.map_turn_to_change().await?;
+        let turn = self.lock_map_for_write().await?;
         let mut tx = self.db().write("withdrawals").await?;
         let site_row = site_row(&mut tx, site).await?;
         let unknown = || AppError::UnknownRobot(site.clone(), robot.clone());

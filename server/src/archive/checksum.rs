@@ -25,13 +25,13 @@ const FOOTER_MAX_BYTES: u64 = 16 * 1024 * 1024;
 
 /// A file whose written bytes are summed.
 #[derive(Debug)]
-pub(super) struct Summed {
+pub(super) struct ChecksumWriter {
     file: File,
     crc: Crc,
     written: u64,
 }
 
-impl Summed {
+impl ChecksumWriter {
     pub(super) fn new(file: File) -> Self {
         Self {
             file,
@@ -56,7 +56,7 @@ impl Summed {
     }
 }
 
-impl Write for Summed {
+impl Write for ChecksumWriter {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let count = self.file.write(bytes)?;
         self.crc.update(&bytes[..count]);

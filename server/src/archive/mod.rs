@@ -103,7 +103,7 @@ pub struct Selection {
 
 /// Measurements that were read.
 #[derive(Debug, Default)]
-pub struct Found {
+pub struct SearchResult {
     /// The measurements, by their keys.
     pub segments: Vec<ArchivedSegment>,
     /// All archived measurements up to this key were searched.
@@ -365,8 +365,8 @@ impl SegmentArchive {
         Ok(self.shown().join(target))
     }
 
-    /// Reads at most `limit` measurements by their keys. The search ends earlier after
-    /// [`SEARCHED_ROWS_MAX`] rows, [`SEARCHED_FILES_MAX`] files or [`SEARCH_MAX`]; [`Found::searched_to`] says where.
+    /// Reads at most `limit` measurements by their keys. The search ends at [`SEARCHED_ROWS_MAX`],
+    /// [`SEARCHED_FILES_MAX`] or [`SEARCH_MAX`]; [`SearchResult::searched_to`] says where.
     ///
     /// # Errors
     /// A file cannot be read, is damaged or missing.
@@ -375,10 +375,10 @@ impl SegmentArchive {
         selection: &Selection,
         mark: Option<KeyRange>,
         limit: usize,
-    ) -> Result<Found, SegmentArchiveError> {
+    ) -> Result<SearchResult, SegmentArchiveError> {
         let listing = self.list()?;
         self.check_end(&listing, mark, selection.before)?;
-        let mut found = Found {
+        let mut found = SearchResult {
             segments: Vec::new(),
             searched_to: selection.after,
         };
@@ -460,7 +460,7 @@ struct Budget {
 
 impl Budget {
     /// Returns whether the time is over and something was searched.
-    fn is_over(&self, selection: &Selection, found: &Found) -> bool {
+    fn is_over(&self, selection: &Selection, found: &SearchResult) -> bool {
         let is_late = self.ends_at.is_some_and(|end| end <= Instant::now());
         is_late && found.searched_to > selection.after
     }
@@ -490,7 +490,7 @@ fn read_all(
         after,
         before: i64::MAX,
     };
-    let mut found = Found::default();
+    let mut found = SearchResult::default();
     let mut budget = Budget {
         rows: usize::MAX,
         ends_at: None,

@@ -14,7 +14,8 @@ use super::fault::{Fault, fault, guarded};
 use super::rows::{Columns, Names, Values};
 use super::source::{Source, Window};
 use super::{
-    ArchivedSegment, Budget, Found, KeyRange, SegmentArchiveError, Selection, checksum, schema,
+    ArchivedSegment, Budget, KeyRange, SearchResult, SegmentArchiveError, Selection, checksum,
+    schema,
 };
 
 /// A row group: its keys, its bytes in the file, and their checksum.
@@ -109,7 +110,7 @@ impl OpenFile {
         selection: &Selection,
         limit: usize,
         budget: &mut Budget,
-        found: &mut Found,
+        found: &mut SearchResult,
     ) -> Result<bool, SegmentArchiveError> {
         for (index, group) in self.groups.iter().enumerate() {
             let first = group.keys.first.max(selection.after.saturating_add(1));

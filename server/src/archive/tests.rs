@@ -32,7 +32,11 @@ impl Marked {
         self.shown()
     }
 
-    fn read(&self, selection: &Selection, limit: usize) -> Result<Found, SegmentArchiveError> {
+    fn read(
+        &self,
+        selection: &Selection,
+        limit: usize,
+    ) -> Result<SearchResult, SegmentArchiveError> {
         self.files.read(selection, self.mark.get(), limit)
     }
 

@@ -12,7 +12,7 @@ use parquet::file::metadata::KeyValue;
 use parquet::file::writer::{SerializedFileWriter, SerializedRowGroupWriter};
 use tread_api::friction::{Information, Segment};
 
-use super::checksum::{self, Summed};
+use super::checksum::{self, ChecksumWriter};
 use super::fault::guarded;
 use super::source::Source;
 use super::{ArchivedSegment, KeyRange, ROW_GROUP_ROWS, SegmentArchiveError, read_source, schema};
@@ -22,7 +22,7 @@ use crate::file_error::FileError;
 pub struct Writer {
     keys: KeyRange,
     partial: Partial,
-    file: SerializedFileWriter<Summed>,
+    file: SerializedFileWriter<ChecksumWriter>,
     /// Rows of the next row group.
     waiting: Vec<ArchivedSegment>,
     /// End and checksum of each row group.
@@ -114,7 +114,7 @@ impl Writer {
         let written = |file| {
             let columns = Arc::new(schema::columns()?);
             let properties = Arc::new(schema::properties(follows, checksum::placeholder())?);
-            SerializedFileWriter::new(Summed::new(file), columns, properties)
+            SerializedFileWriter::new(ChecksumWriter::new(file), columns, properties)
         };
         let file = written(file).map_err(encoding(&partial.path))?;
         Ok(Self {
@@ -202,7 +202,7 @@ fn encoding(path: &Path) -> impl FnOnce(ParquetError) -> SegmentArchiveError + u
 
 /// Writes the columns of a row group one after the other.
 struct Columns<'group, 'file> {
-    group: &'group mut SerializedRowGroupWriter<'file, Summed>,
+    group: &'group mut SerializedRowGroupWriter<'file, ChecksumWriter>,
     rows: &'group [ArchivedSegment],
 }
 

@@ -207,7 +207,7 @@ pub(super) struct Started {
 }
 
 /// Contents of the authority's folder.
-pub(super) struct Kept {
+pub(super) struct AuthorityFiles {
     pub(super) present: Authority,
     /// New authority, during a rotation.
     pub(super) next: Option<(Authority, Started)>,
@@ -216,11 +216,11 @@ pub(super) struct Kept {
 
 /// Whether the last step is durable on the disk.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Settled {
+pub(super) enum Durability {
     /// The step is durable.
-    Yes,
-    /// A power failure may undo the step; [`Folder::settle`] retries.
-    NotYet,
+    Durable,
+    /// A power failure may undo the step; [`Folder::retry_sync`] retries.
+    Pending,
 }
 
 /// Function that makes the changes of a folder durable (`fsync`).
@@ -407,7 +407,7 @@ impl Folder {
 
     /// Completes earlier changes whose last steps failed, and removes new authorities that are not
     /// in the trusted set because their start failed.
-    fn tidy(&self, is_trusted: impl Fn(&str) -> bool) -> Result<(), AuthorityError> {
+    fn clean_up(&self, is_trusted: impl Fn(&str) -> bool) -> Result<(), AuthorityError> {
         for name in [REPLACING_CERTIFICATE_FILE, NEXT_CERTIFICATE_FILE] {
             let known = self.fingerprint_in(name).is_some_and(|it| is_trusted(&it));
             if self.has(name) && !known {
@@ -428,7 +428,7 @@ impl Folder {
         started: &Started,
         is_trusted: impl Fn(&str) -> bool,
     ) -> Result<(), AuthorityError> {
-        self.tidy(is_trusted)?;
+        self.clean_up(is_trusted)?;
         let steps = starting(next, started).map_err(self.unwritable(ROTATION_FILE))?;
         self.begin(&steps)
     }
@@ -438,10 +438,10 @@ impl Folder {
     ///
     /// # Errors
     /// The first step failed; the folder is unchanged.
-    pub(super) fn finish(&self, former: &Authority) -> Result<Settled, AuthorityError> {
+    pub(super) fn finish(&self, former: &Authority) -> Result<Durability, AuthorityError> {
         let steps = finishing(former);
         let Some((deciding, rest)) = steps.split_first() else {
-            return Ok(Settled::Yes);
+            return Ok(Durability::Durable);
         };
         let decided = deciding.take(&self.path);
         decided.map_err(self.unwritable(deciding.name()))?;
@@ -449,10 +449,10 @@ impl Folder {
             // The other steps must not become durable before this one: after a power failure key
             // and certificate would not belong together.
             error!("the disk has not confirmed that the former authority is retired: {cause}");
-            return Ok(Settled::NotYet);
+            return Ok(Durability::Pending);
         }
         self.complete(rest);
-        Ok(Settled::Yes)
+        Ok(Durability::Durable)
     }
 
     /// Replaces all authorities by `next`.
@@ -465,7 +465,7 @@ impl Folder {
         next: &Authority,
         is_trusted: impl Fn(&str) -> bool,
     ) -> Result<(), AuthorityError> {
-        self.tidy(is_trusted)?;
+        self.clean_up(is_trusted)?;
         self.begin(&replacing(next))?;
         self.complete(&self.rest_of_replacement());
         Ok(())
@@ -482,7 +482,7 @@ impl Folder {
     ///
     /// # Errors
     /// The step does not become durable, or another one fails.
-    pub(super) fn settle(&self) -> Result<(), AuthorityError> {
+    pub(super) fn retry_sync(&self) -> Result<(), AuthorityError> {
         (self.sync)(&self.path).map_err(unwritable(&self.path))?;
         self.recover()
     }
@@ -520,12 +520,12 @@ impl Folder {
     ///
     /// # Errors
     /// As [`Authority::load`].
-    pub(super) fn read(&self) -> Result<Kept, AuthorityError> {
+    pub(super) fn read(&self) -> Result<AuthorityFiles, AuthorityError> {
         read(&self.path)
     }
 }
 
-fn read(folder: &Path) -> Result<Kept, AuthorityError> {
+fn read(folder: &Path) -> Result<AuthorityFiles, AuthorityError> {
     let present = Authority::load(folder)?;
     let next = if folder.join(NEXT_CERTIFICATE_FILE).exists() {
         let names = FileNames {
@@ -537,7 +537,7 @@ fn read(folder: &Path) -> Result<Kept, AuthorityError> {
         None
     };
     let retired = read_retired(folder).map_err(unreadable(folder))?;
-    Ok(Kept {
+    Ok(AuthorityFiles {
         present,
         next,
         retired,

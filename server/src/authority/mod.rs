@@ -108,7 +108,7 @@ pub enum CertificateError {
 
 /// A robot's certificate that was just signed.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Signed {
+pub struct SignedCertificate {
     /// Certificate, PEM.
     pub certificate: String,
     /// SHA-256 of the certificate, in hexadecimal digits.
@@ -230,7 +230,7 @@ impl Authority {
         name: &RobotName,
         now: Timestamp,
         lifetime: SignedDuration,
-    ) -> Result<Signed, CertificateError> {
+    ) -> Result<SignedCertificate, CertificateError> {
         // Certificates have whole seconds.
         let until = later(now, lifetime).as_second();
         let expires_at = Timestamp::from_second(until).unwrap_or(Timestamp::MAX);
@@ -245,7 +245,7 @@ impl Authority {
         let signed = params
             .signed_by(&request.0.public_key, &self.issuer)
             .map_err(CertificateError::Signing)?;
-        Ok(Signed {
+        Ok(SignedCertificate {
             certificate: signed.pem(),
             fingerprint: fingerprint(signed.der()),
             expires_at,

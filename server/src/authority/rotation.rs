@@ -27,7 +27,7 @@ use tokio::sync::watch;
 use tread_api::enrolment::TrustId;
 use webpki::EndEntityCert;
 
-use super::file::{Folder, Settled, Started};
+use super::file::{Durability, Folder, Started};
 use super::{
     Authority, AuthorityError, CertificateError, PresentCertificate, RENEWAL_GRACE, fingerprint,
     is_signed_by, later, named_in,
@@ -281,7 +281,7 @@ pub struct Authorities {
     /// Held during a change, so that changes do not overlap.
     turn: Mutex<()>,
     /// Whether the retirement of an authority is not yet confirmed to be on the disk.
-    is_unsettled: AtomicBool,
+    is_sync_pending: AtomicBool,
 }
 
 impl Authorities {
@@ -295,7 +295,7 @@ impl Authorities {
             folder,
             present: watch::Sender::new(Arc::new(trusted)),
             turn: Mutex::new(()),
-            is_unsettled: AtomicBool::new(false),
+            is_sync_pending: AtomicBool::new(false),
         }
     }
 
@@ -372,13 +372,13 @@ impl Authorities {
         if let Some(folder) = &self.folder {
             let is_trusted = |fingerprint: &str| present.is_trusted(fingerprint);
             folder.start(&next, &started, is_trusted)?;
-            self.record_settled(Settled::Yes);
+            self.record_durability(Durability::Durable);
         }
         Ok(self.show(trusted))
     }
 
     /// Finishes a rotation: the former authority is no longer trusted, and its key is deleted. This
-    /// takes effect even if the disk has not confirmed it yet ([`Self::is_settled`]). Blocks on the
+    /// takes effect even if the disk has not confirmed it yet ([`Self::is_durable`]). Blocks on the
     /// disk.
     ///
     /// # Errors
@@ -388,7 +388,7 @@ impl Authorities {
         let present = self.present();
         let trusted = present.finished(rotation)?;
         if let (Some(folder), Some(retiring)) = (&self.folder, present.retiring()) {
-            self.record_settled(folder.finish(&retiring.authority)?);
+            self.record_durability(folder.finish(&retiring.authority)?);
         }
         Ok(self.show(trusted))
     }
@@ -407,30 +407,31 @@ impl Authorities {
         let trusted = present.replaced(Arc::clone(&next));
         if let Some(folder) = &self.folder {
             folder.replace(&next, |fingerprint| present.is_trusted(fingerprint))?;
-            self.record_settled(Settled::Yes);
+            self.record_durability(Durability::Durable);
         }
         Ok(self.show(trusted))
     }
 
     /// Returns whether the disk has confirmed all changes.
-    pub fn is_settled(&self) -> bool {
-        !self.is_unsettled.load(Ordering::Relaxed)
+    pub fn is_durable(&self) -> bool {
+        !self.is_sync_pending.load(Ordering::Relaxed)
     }
 
-    fn record_settled(&self, settled: Settled) {
-        let is_unsettled = settled == Settled::NotYet;
-        self.is_unsettled.store(is_unsettled, Ordering::Relaxed);
+    fn record_durability(&self, settled: Durability) {
+        let is_sync_pending = settled == Durability::Pending;
+        self.is_sync_pending
+            .store(is_sync_pending, Ordering::Relaxed);
     }
 
     /// Retries to write unconfirmed changes to the disk. Blocks on the disk.
     ///
     /// # Errors
     /// The disk still does not confirm them.
-    pub fn settle(&self) -> Result<(), AuthorityError> {
+    pub fn retry_sync(&self) -> Result<(), AuthorityError> {
         let _turn = self.wait_for_turn();
-        if let Some(folder) = self.folder.as_ref().filter(|_| !self.is_settled()) {
-            folder.settle()?;
-            self.record_settled(Settled::Yes);
+        if let Some(folder) = self.folder.as_ref().filter(|_| !self.is_durable()) {
+            folder.retry_sync()?;
+            self.record_durability(Durability::Durable);
         }
         Ok(())
     }

@@ -339,7 +339,7 @@ fn pack<W: Write>(
     }
     let copy = source.database;
     let opened = File::open(copy).map_err(FileError::of("read", copy))?;
-    let counting = Counting {
+    let counting = ProgressReader {
         inner: BufReader::with_capacity(PIECE_BYTES, opened),
         bytes: 0,
         progress,
@@ -353,13 +353,13 @@ fn pack<W: Write>(
 }
 
 /// Reader that reports its progress.
-struct Counting<'progress, R> {
+struct ProgressReader<'progress, R> {
     inner: R,
     bytes: u64,
     progress: &'progress mut dyn FnMut(u64),
 }
 
-impl<R: Read> Read for Counting<'_, R> {
+impl<R: Read> Read for ProgressReader<'_, R> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         let read = self.inner.read(buffer)?;
         self.bytes += read as u64;

@@ -19,7 +19,7 @@ const ENCRYPTED_ENDING: &str = ".tar.encrypted";
 
 /// A complete backup in a folder.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Stored {
+pub struct StoredBackup {
     /// Its file.
     pub path: PathBuf,
     /// Its time, from its name.
@@ -51,7 +51,7 @@ fn time_in(name: &str) -> Option<Timestamp> {
 ///
 /// # Errors
 /// The folder cannot be read.
-pub fn list(folder: &Path) -> io::Result<Vec<Stored>> {
+pub fn list(folder: &Path) -> io::Result<Vec<StoredBackup>> {
     let mut found = Vec::new();
     for entry in fs::read_dir(folder)? {
         let entry = entry?;
@@ -61,7 +61,7 @@ pub fn list(folder: &Path) -> io::Result<Vec<Stored>> {
         };
         let about = entry.metadata()?;
         if about.is_file() {
-            found.push(Stored {
+            found.push(StoredBackup {
                 path: entry.path(),
                 taken_at,
                 bytes: about.len(),

@@ -68,7 +68,7 @@ pub const STOPS_PER_IDENTITY_MAX: usize = 32;
 
 /// Error: a limit of busy connections is reached, and no idle connection can be closed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub enum Full {
+pub enum ConnectionLimitError {
     /// The identity has [`PER_IDENTITY_MAX`] busy connections.
     #[error("this token has {PER_IDENTITY_MAX} connections at work; end some of them")]
     Identity,
@@ -205,7 +205,7 @@ pub struct Slot {
 impl Slot {
     /// Marks the connection as authenticated and busy until the result is dropped. Closes it if its
     /// address has reached [`Bounds::per_address`].
-    pub fn work(self: &Arc<Self>) -> AtWork {
+    pub fn work(self: &Arc<Self>) -> RequestGuard {
         let at_work = self.hold();
         let mut table = self.connections.lock();
         if table.has_share_of_address(self.id, &self.connections.bounds) {
@@ -217,12 +217,12 @@ impl Slot {
     }
 
     /// Keeps the connection in its phase until the result is dropped, for example as a `WebSocket`.
-    pub fn hold(self: &Arc<Self>) -> AtWork {
+    pub fn hold(self: &Arc<Self>) -> RequestGuard {
         let mut table = self.connections.lock();
         if let Some(entry) = table.entries.get_mut(&self.id) {
             entry.requests += 1;
         }
-        AtWork(Arc::clone(self))
+        RequestGuard(Arc::clone(self))
     }
 
     /// Returns the delay of a request whose head has arrived at `now`. An identity that the last
@@ -237,7 +237,7 @@ impl Slot {
     /// Starts a request whose head has arrived; the connection is unproven until [`Self::prove`].
     /// `client` is the client's address if a trusted proxy reports one. Returns the number of
     /// connections that were closed to make room.
-    pub fn begin(self: &Arc<Self>, client: Option<IpAddr>) -> (AtWork, usize) {
+    pub fn begin(self: &Arc<Self>, client: Option<IpAddr>) -> (RequestGuard, usize) {
         let at_work = self.hold();
         let mut table = self.connections.lock();
         let mut displaced = 0;
@@ -260,10 +260,10 @@ impl Slot {
     /// busy until the request is answered.
     ///
     /// # Errors
-    /// [`Full`] if a limit is reached and no idle connection can be closed; for a Stop only if
-    /// [`STOPS_MAX`] reserved connections, or [`STOPS_PER_IDENTITY_MAX`] of this identity, are in
-    /// use.
-    pub fn prove(&self, identity: SubjectId, purpose: Purpose) -> Result<(), Full> {
+    /// [`ConnectionLimitError`] if a limit is reached and no idle connection can be closed; for a
+    /// Stop only if [`STOPS_MAX`] reserved connections, or [`STOPS_PER_IDENTITY_MAX`] of this
+    /// identity, are in use.
+    pub fn prove(&self, identity: SubjectId, purpose: Purpose) -> Result<(), ConnectionLimitError> {
         let mut table = self.connections.lock();
         if !table.entries.contains_key(&self.id) {
             // The connection was closed, so nobody reads the answer.
@@ -300,9 +300,9 @@ impl Drop for Slot {
 /// Guard of a connection that processes a request; dropping the last one makes a busy connection
 /// idle.
 #[derive(Debug)]
-pub struct AtWork(Arc<Slot>);
+pub struct RequestGuard(Arc<Slot>);
 
-impl Drop for AtWork {
+impl Drop for RequestGuard {
     fn drop(&mut self) {
         let mut table = self.0.connections.lock();
         let Some(entry) = table.entries.get_mut(&self.0.id) else {

@@ -7,7 +7,9 @@ use std::time::Duration;
 
 use tokio_util::sync::CancellationToken;
 
-use super::{Bounds, Full, PER_IDENTITY_MAX, Purpose, STOPS_MAX, STOPS_PER_IDENTITY_MAX};
+use super::{
+    Bounds, ConnectionLimitError, PER_IDENTITY_MAX, Purpose, STOPS_MAX, STOPS_PER_IDENTITY_MAX,
+};
 use crate::identity::subject::SubjectId;
 use crate::rate_limit::{Bucket, RateLimit};
 
@@ -229,26 +231,26 @@ impl Table {
     /// Makes room for a busy connection of `identity` by closing idle ones.
     ///
     /// # Errors
-    /// [`Full`] if a limit is reached and no idle connection can be closed.
+    /// [`ConnectionLimitError`] if a limit is reached and no idle connection can be closed.
     pub(super) fn room_for(
         &mut self,
         id: u64,
         identity: SubjectId,
         bounds: &Bounds,
-    ) -> Result<(), Full> {
+    ) -> Result<(), ConnectionLimitError> {
         let share = self.proven_per_identity.get(&identity);
         if share.is_some_and(|&count| count >= PER_IDENTITY_MAX) {
             let idle = self.oldest_idle(|entry| entry.identity == Some(identity));
-            self.cut(idle.ok_or(Full::Identity)?);
+            self.cut(idle.ok_or(ConnectionLimitError::Identity)?);
         }
         if self.has_share_of_address(id, bounds) {
             let address = self.entries.get(&id).map(|entry| entry.address);
             let idle = self.oldest_idle(|entry| Some(entry.address) == address);
-            self.cut(idle.ok_or(Full::Address(bounds.per_address))?);
+            self.cut(idle.ok_or(ConnectionLimitError::Address(bounds.per_address))?);
         }
         if self.proven >= bounds.all - bounds.unproven {
             let idle = self.oldest_idle(|_| true);
-            self.cut(idle.ok_or(Full::Server)?);
+            self.cut(idle.ok_or(ConnectionLimitError::Server)?);
         }
         Ok(())
     }

@@ -76,7 +76,10 @@ fn a_stop_has_room_when_all_are_at_work_and_others_have_none() {
     }
     let (other, _) = open(&connections, 90).unwrap();
     let _other_at_work = other.begin(None);
-    assert_eq!(other.prove(token(9), Purpose::Other), Err(Full::Server));
+    assert_eq!(
+        other.prove(token(9), Purpose::Other),
+        Err(ConnectionLimitError::Server)
+    );
     assert_eq!(other.prove(token(9), Purpose::Stop), Ok(()));
     // An idle connection is closed to make room.
     drop(working.remove(0).0);
@@ -102,7 +105,7 @@ fn each_identity_has_its_share() {
     };
     let held: Vec<_> = (0..PER_IDENTITY_MAX).map(|_| prove(token(1))).collect();
     assert!(held.iter().all(|(proven, ..)| proven.is_ok()));
-    assert_eq!(prove(token(1)).0, Err(Full::Identity));
+    assert_eq!(prove(token(1)).0, Err(ConnectionLimitError::Identity));
     assert_eq!(prove(token(2)).0, Ok(()));
     drop(held);
     assert_eq!(prove(token(1)).0, Ok(()));
@@ -191,7 +194,10 @@ fn an_address_that_is_full_of_work_still_stops() {
     };
     let busy: Vec<_> = (0..FEW.per_address).map(|_| ask(Purpose::Other)).collect();
     assert!(busy.iter().all(|(proven, ..)| proven.is_ok()));
-    assert_eq!(ask(Purpose::Other).0, Err(Full::Address(FEW.per_address)));
+    assert_eq!(
+        ask(Purpose::Other).0,
+        Err(ConnectionLimitError::Address(FEW.per_address))
+    );
     let stops: Vec<_> = (0..2).map(|_| ask(Purpose::Stop)).collect();
     for (proven, .., cut) in busy.iter().chain(&stops) {
         assert!(proven.is_ok() && !cut.is_cancelled());
@@ -245,7 +251,7 @@ fn one_identity_does_not_fill_the_room_of_stops() {
     // The first connection takes the only place of the address.
     let viewer: Vec<_> = (0..=STOPS_PER_IDENTITY_MAX).map(|_| stop(1)).collect();
     assert!(viewer.iter().all(|(proven, ..)| proven.is_ok()));
-    assert_eq!(stop(1).0, Err(Full::Address(1)));
+    assert_eq!(stop(1).0, Err(ConnectionLimitError::Address(1)));
     let operator = stop(2);
     assert_eq!(operator.0, Ok(()));
     drop(viewer);
@@ -258,7 +264,7 @@ proptest! {
         steps in prop::collection::vec((0_u8..7, 0_u8..5, 0_usize..12), 1..200),
     ) {
         let connections = Connections::new(FEW);
-        let mut slots: Vec<(Arc<Slot>, Vec<AtWork>)> = Vec::new();
+        let mut slots: Vec<(Arc<Slot>, Vec<RequestGuard>)> = Vec::new();
         for (what, from, which) in steps {
             let chosen = which % slots.len().max(1);
             match what {

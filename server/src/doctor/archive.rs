@@ -7,7 +7,7 @@ use nix::errno::Errno;
 use nix::unistd::{AccessFlags, access};
 use tread_api::diagnosis::{Finding, NextStep};
 
-use super::Examined;
+use super::DoctorInput;
 use super::files::try_to_write;
 use crate::archive::{ArchiveLocation, KeyRange, SegmentArchive, SegmentArchiveError};
 use crate::error_text::chain;
@@ -19,7 +19,7 @@ const KEEPS: &str = "until then old measurements stay in the database";
 
 /// Returns the findings; none without an archive. `archived` has the first and the last key of the
 /// measurements that were archived by the database.
-pub(super) async fn finding(examined: &Examined, archived: Option<(i64, i64)>) -> Vec<Finding> {
+pub(super) async fn finding(examined: &DoctorInput, archived: Option<(i64, i64)>) -> Vec<Finding> {
     let Some(location) = examined.config.retention.archive.clone() else {
         return Vec::new();
     };

@@ -6,7 +6,7 @@ use rustls::pki_types::{CertificateDer, TrustAnchor};
 use tread_api::diagnosis::{Finding, NextStep};
 use webpki::EndEntityCert;
 
-use super::Examined;
+use super::DoctorInput;
 use crate::authority::{Authority, NEXT_CERTIFICATE_FILE};
 use crate::certificate::{Certificate, Condition, is_for};
 use crate::config::credentials::is_passed;
@@ -14,7 +14,7 @@ use crate::config::{TlsFiles, TlsSource};
 use crate::error_text::chain;
 use crate::http::tls::{Tls, read_files};
 
-pub(super) fn findings(examined: &Examined) -> Vec<Finding> {
+pub(super) fn findings(examined: &DoctorInput) -> Vec<Finding> {
     let mut findings = Vec::new();
     if let Some(robots) = &examined.config.robots {
         findings.push(authority(examined, &robots.authority));
@@ -38,7 +38,7 @@ pub(super) fn findings(examined: &Examined) -> Vec<Finding> {
     findings
 }
 
-fn authority(examined: &Examined, folder: &Path) -> Finding {
+fn authority(examined: &DoctorInput, folder: &Path) -> Finding {
     let shown = folder.display();
     if folder.join(NEXT_CERTIFICATE_FILE).exists() {
         return Finding::on("authority").warning(
@@ -86,7 +86,7 @@ fn authority(examined: &Examined, folder: &Path) -> Finding {
     }
 }
 
-fn of_files(examined: &Examined, files: &TlsFiles) -> Vec<Finding> {
+fn of_files(examined: &DoctorInput, files: &TlsFiles) -> Vec<Finding> {
     let step = if is_passed(&files.certificate) || is_passed(&files.key) {
         "run this as root, who alone reads credentials, and see that certificate and key are \
          there, PEM, and belong together"
@@ -121,7 +121,7 @@ fn of_files(examined: &Examined, files: &TlsFiles) -> Vec<Finding> {
     ]
 }
 
-fn validity(examined: &Examined, shown: &str, certificate: &Certificate) -> Finding {
+fn validity(examined: &DoctorInput, shown: &str, certificate: &Certificate) -> Finding {
     let now = examined.clock.machine_time();
     let (from, until) = (certificate.not_before, certificate.not_after);
     match certificate.condition(now) {
@@ -145,7 +145,7 @@ fn validity(examined: &Examined, shown: &str, certificate: &Certificate) -> Find
 }
 
 fn names(
-    examined: &Examined,
+    examined: &DoctorInput,
     shown: &str,
     leaf: &CertificateDer<'_>,
     certificate: &Certificate,

@@ -7,7 +7,7 @@ use std::process::{Command, Stdio};
 use jiff::{SignedDuration, Timestamp};
 use tread_api::diagnosis::{Finding, NextStep};
 
-use super::Examined;
+use super::DoctorInput;
 
 /// File that systemd-timesyncd creates after its first synchronisation.
 const TIMESYNC_FILE: &str = "/run/systemd/timesync/synchronized";
@@ -17,7 +17,7 @@ const AHEAD_MAX: SignedDuration = SignedDuration::from_secs(5);
 const SYNCHRONISE: &str = "set the clock, and have it synchronised: `apt-get install chrony`, or \
                            `timedatectl set-ntp true`";
 
-pub(super) fn findings(examined: &Examined, newest: Option<Timestamp>) -> Vec<Finding> {
+pub(super) fn findings(examined: &DoctorInput, newest: Option<Timestamp>) -> Vec<Finding> {
     let now = examined.clock.machine_time();
     let mut findings = vec![match is_synchronised() {
         Some(true) => Finding::on("clock").ok(format!("it is synchronised, and says {now:.0}")),

@@ -2,7 +2,7 @@
 
 use tread_api::diagnosis::{Finding, NextStep};
 
-use super::Examined;
+use super::DoctorInput;
 use crate::db::failure::StorageFailure;
 use crate::db::inspection::{InspectError, InspectOptions, Inspection, Schema, inspect};
 use crate::error_text::chain;
@@ -11,7 +11,7 @@ const RESTORE: &str = "stop the server, keep the file, and restore a backup; or 
                        read into a new file: `sqlite3 FILE .recover | sqlite3 NEW`";
 
 /// Returns the findings, and what the database says.
-pub(super) async fn findings(examined: &Examined) -> (Vec<Finding>, Option<Inspection>) {
+pub(super) async fn findings(examined: &DoctorInput) -> (Vec<Finding>, Option<Inspection>) {
     let location = &examined.config.database;
     let shown = location;
     let options = InspectOptions {

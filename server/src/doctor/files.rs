@@ -9,7 +9,7 @@ use nix::sys::statvfs::{FsFlags, statvfs};
 use nix::unistd::Uid;
 use tread_api::diagnosis::{Finding, NextStep};
 
-use super::Examined;
+use super::DoctorInput;
 use crate::config::TlsSource;
 use crate::config::credentials::is_passed;
 use crate::paths::folder_of;
@@ -22,7 +22,7 @@ const OF_OTHERS: u32 = 0o077;
 /// Permissions of others.
 const OF_ALL: u32 = 0o007;
 
-pub(super) fn findings(examined: &Examined) -> Vec<Finding> {
+pub(super) fn findings(examined: &DoctorInput) -> Vec<Finding> {
     let mut findings = Vec::new();
     if let Some(database) = examined.config.database.file() {
         let folder = folder_of(database);
@@ -100,7 +100,7 @@ pub(super) fn try_to_write(folder: &Path) -> io::Result<()> {
     written
 }
 
-fn disk(examined: &Examined, folder: &Path) -> Finding {
+fn disk(examined: &DoctorInput, folder: &Path) -> Finding {
     let found = match statvfs(folder) {
         Ok(found) => found,
         Err(error) => {
@@ -141,7 +141,7 @@ fn disk(examined: &Examined, folder: &Path) -> Finding {
 }
 
 /// Examines who may read the secrets.
-fn secrets(examined: &Examined) -> Vec<Finding> {
+fn secrets(examined: &DoctorInput) -> Vec<Finding> {
     let config = &examined.config;
     let mut secret: Vec<PathBuf> = Vec::new();
     if let Some(database) = config.database.file() {
@@ -187,7 +187,7 @@ fn secrets(examined: &Examined) -> Vec<Finding> {
 }
 
 /// Examines whether the files belong to the user who runs the doctor, and are readable.
-fn owners(examined: &Examined) -> Finding {
+fn owners(examined: &DoctorInput) -> Finding {
     let config = &examined.config;
     let mut files: Vec<PathBuf> = examined.config_file.iter().cloned().collect();
     if let Some(database) = config.database.file() {

@@ -43,7 +43,7 @@ pub(crate) struct DoctorArgs {
 }
 
 /// Input of every check.
-struct Examined {
+struct DoctorInput {
     config: Config,
     config_file: Option<PathBuf>,
     clock: Clock,
@@ -96,7 +96,7 @@ async fn examine(args: DoctorArgs) -> Vec<Finding> {
         Some(file) => format!("`{}` can be used", file.display()),
         None => "the built-in values are used, since no --config is given".to_owned(),
     };
-    let examined = Examined {
+    let examined = DoctorInput {
         server_process: lock::holder_of(&config.database),
         config,
         config_file: args.config,

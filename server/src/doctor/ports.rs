@@ -7,7 +7,7 @@ use jiff::SignedDuration;
 use jiff::fmt::rfc2822;
 use tread_api::diagnosis::{Finding, NextStep};
 
-use super::Examined;
+use super::DoctorInput;
 use super::probe::{self, Answer};
 use crate::authority::Authority;
 use crate::certificate::{Certificate, Condition};
@@ -43,7 +43,7 @@ fn probe(address: SocketAddr) -> Port {
     }
 }
 
-pub(super) async fn findings(examined: &Examined) -> Vec<Finding> {
+pub(super) async fn findings(examined: &DoctorInput) -> Vec<Finding> {
     let config = &examined.config;
     let mut findings = rest(examined).await;
     findings.push(robots(examined).await);
@@ -67,7 +67,7 @@ pub(super) async fn findings(examined: &Examined) -> Vec<Finding> {
 }
 
 /// Examines the port of the REST API.
-async fn rest(examined: &Examined) -> Vec<Finding> {
+async fn rest(examined: &DoctorInput) -> Vec<Finding> {
     let address = examined.config.http;
     let port = Configured {
         name: "port of REST",
@@ -116,7 +116,7 @@ async fn readiness(address: SocketAddr, is_tls: bool) -> Option<Finding> {
 }
 
 /// Compares the clock with the server's.
-fn clock_of(examined: &Examined, answer: &Answer) -> Option<Finding> {
+fn clock_of(examined: &DoctorInput, answer: &Answer) -> Option<Finding> {
     let said = rfc2822::parse(answer.header("date")?).ok()?.timestamp();
     let difference = examined.clock.machine_time().duration_since(said);
     (difference.abs() > CLOCK_DIFFERENCE_MAX).then(|| {
@@ -128,7 +128,7 @@ fn clock_of(examined: &Examined, answer: &Answer) -> Option<Finding> {
 }
 
 /// Compares the served certificate with the file.
-fn served(examined: &Examined, answer: &Answer) -> Option<Finding> {
+fn served(examined: &DoctorInput, answer: &Answer) -> Option<Finding> {
     let leaf = answer.leaf.as_ref()?;
     let read = Certificate::read(leaf)?;
     if let Some(TlsSource::Files(files)) = &examined.config.tls
@@ -160,7 +160,7 @@ fn served(examined: &Examined, answer: &Answer) -> Option<Finding> {
 }
 
 /// Examines the robots' port.
-async fn robots(examined: &Examined) -> Finding {
+async fn robots(examined: &DoctorInput) -> Finding {
     let address = examined.config.zenoh;
     let port = Configured {
         name: "port of robots",
@@ -217,7 +217,7 @@ impl Configured {
         clippy::wildcard_enum_match_arm,
         reason = "of all other errors the message says enough"
     )]
-    fn not_taken(self, examined: &Examined, port: Port) -> Finding {
+    fn not_taken(self, examined: &DoctorInput, port: Port) -> Finding {
         let Self { name, key, address } = self;
         match (port, examined.server_process) {
             (Port::Taken, _) => self.taken(),

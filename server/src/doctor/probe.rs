@@ -103,7 +103,7 @@ type OverTls = (
 
 async fn handshake(stream: TcpStream) -> Option<OverTls> {
     let provider = Arc::new(rustls::crypto::ring::default_provider());
-    let shown = Arc::new(Shown {
+    let shown = Arc::new(CapturingVerifier {
         leaf: Mutex::default(),
         algorithms: provider.signature_verification_algorithms,
     });
@@ -111,7 +111,7 @@ async fn handshake(stream: TcpStream) -> Option<OverTls> {
         .with_safe_default_protocol_versions()
         .ok()?
         .dangerous()
-        .with_custom_certificate_verifier(Arc::<Shown>::clone(&shown))
+        .with_custom_certificate_verifier(Arc::<CapturingVerifier>::clone(&shown))
         .with_no_client_auth();
     let name = ServerName::try_from("localhost").ok()?;
     let stream = TlsConnector::from(Arc::new(config)).connect(name, stream);
@@ -122,12 +122,12 @@ async fn handshake(stream: TcpStream) -> Option<OverTls> {
 
 /// Keeps the presented certificate, and accepts it, since the request contains no secret.
 #[derive(Debug)]
-struct Shown {
+struct CapturingVerifier {
     leaf: Mutex<Option<CertificateDer<'static>>>,
     algorithms: WebPkiSupportedAlgorithms,
 }
 
-impl ServerCertVerifier for Shown {
+impl ServerCertVerifier for CapturingVerifier {
     fn verify_server_cert(
         &self,
         leaf: &CertificateDer<'_>,

@@ -22,7 +22,7 @@ use zenoh::qos::CongestionControl;
 use zenoh::query::{ConsolidationMode, QueryTarget};
 use zenoh::{Session, Wait as _};
 
-use super::test_client::{Shown, TestClient, TestSession, until};
+use super::test_client::{ClientOverrides, TestClient, TestSession, until};
 use super::{Fleet, Security};
 use crate::app::enrolment::EnrolmentService;
 use crate::app::{App, Dependencies};
@@ -198,7 +198,9 @@ impl Rig {
 
     /// Connects with a certificate, if the gate lets it.
     pub(super) async fn connect(&self, who: Who, wait_ms: u32) -> Option<TestSession> {
-        self.client(who).open(&Shown::default(), wait_ms).await
+        self.client(who)
+            .open(&ClientOverrides::default(), wait_ms)
+            .await
     }
 }
 
@@ -463,71 +465,71 @@ async fn every_key_with_every_certificate_allows_what_the_table_says_and_nothing
 }
 
 /// What `rover-2` shows to pass for `rover-1`, whose password and session id it has learned.
-async fn impersonations(rig: &Rig) -> Vec<(&'static str, Shown)> {
+async fn impersonations(rig: &Rig) -> Vec<(&'static str, ClientOverrides)> {
     let learned = rig.client(Who::Own).credentials().await.unwrap();
     let own = rig.client(Who::Foreign).credentials().await.unwrap();
     assert_ne!(learned.password, own.password);
-    let user = || Shown {
+    let user = || ClientOverrides {
         user: Some(learned.user.clone()),
         password: Some(learned.password.clone()),
-        ..Shown::default()
+        ..ClientOverrides::default()
     };
     vec![
         ("user and password", user()),
         (
             "user, password and session id",
-            Shown {
+            ClientOverrides {
                 session_id: Some(learned.session_prefix.session_id(1)),
                 ..user()
             },
         ),
         (
             "session id",
-            Shown {
+            ClientOverrides {
                 session_id: Some(learned.session_prefix.session_id(1)),
-                ..Shown::default()
+                ..ClientOverrides::default()
             },
         ),
         (
             "password alone",
-            Shown {
+            ClientOverrides {
                 password: Some(learned.password.clone()),
-                ..Shown::default()
+                ..ClientOverrides::default()
             },
         ),
         (
             "the user of the server's own look",
-            Shown {
+            ClientOverrides {
                 user: Some(super::credentials::PROBE_USER.to_owned()),
-                ..Shown::default()
+                ..ClientOverrides::default()
             },
         ),
         (
             "no user at all",
-            Shown {
+            ClientOverrides {
                 is_anonymous: true,
-                ..Shown::default()
+                ..ClientOverrides::default()
             },
         ),
         (
             "another session's id",
-            Shown {
+            ClientOverrides {
                 session_id: Some("8000000000000000deadbeefdeadbeef".to_owned()),
-                ..Shown::default()
+                ..ClientOverrides::default()
             },
         ),
         (
             "the mode of a peer",
-            Shown {
+            ClientOverrides {
                 mode: Some("peer"),
-                ..Shown::default()
+                ..ClientOverrides::default()
             },
         ),
         (
             "the mode of a router",
-            Shown {
+            ClientOverrides {
                 mode: Some("router"),
-                ..Shown::default()
+                ..ClientOverrides::default()
             },
         ),
     ]

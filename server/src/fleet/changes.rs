@@ -23,7 +23,7 @@ pub(super) async fn run(
     republisher: Option<Republisher>,
     stop: CancellationToken,
 ) {
-    let mut news = app.map_news();
+    let mut changes = app.map_changes();
     let mut publishers = Publishers::new(keys::map);
     // Number of changes that were missed, and number published by site.
     let mut missed: u64 = 0;
@@ -32,7 +32,7 @@ pub(super) async fn run(
         let heard = tokio::select! {
             biased;
             () = stop.cancelled() => return,
-            heard = news.recv() => heard,
+            heard = changes.recv() => heard,
         };
         let mut change = match heard {
             Ok(change) => change,

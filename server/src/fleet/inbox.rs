@@ -15,15 +15,15 @@ use zenoh::sample::SampleKind;
 use zenoh::{Session, Wait as _};
 
 use super::gate::{CUT_OFF, Links};
-use super::rate_limits::{Appeared, Kind, Place, RateLimits};
+use super::rate_limits::{Kind, Place, RateLimits, TokenVerdict};
 use super::received::{
-    Asked, RefusedMessage, count_refusal, explained, log_refusal, next, refuse_key,
+    LimitedQuery, RefusedMessage, count_refusal, explained, log_refusal, next, refuse_key,
 };
 use super::republish::Republisher;
 use super::{requests, tokens};
 use crate::app::App;
 use crate::app::ingest::Upload;
-use crate::app::presence::{Heard, RobotKey};
+use crate::app::presence::{MessageEffect, RobotKey};
 use crate::counters::Counter;
 use crate::supervisor::Supervisor;
 
@@ -51,8 +51,8 @@ pub(super) struct Channels {
     app: App,
     presence: mpsc::Sender<TokenChange>,
     states: mpsc::Sender<Published>,
-    hellos: mpsc::Sender<Asked>,
-    uploads: mpsc::Sender<Asked>,
+    hellos: mpsc::Sender<LimitedQuery>,
+    uploads: mpsc::Sender<LimitedQuery>,
     limits: RateLimits,
     /// Links of the robots; `None` without a gate.
     links: Option<Links>,
@@ -164,9 +164,9 @@ impl Channels {
         let (place, now) = ((key.to_owned(), router), self.app.clock().elapsed());
         let is_taken = if appeared {
             match self.limits.token_appeared(&robot, place, now) {
-                Appeared::Taken => true,
-                Appeared::Refused => false,
-                Appeared::Excessive => {
+                TokenVerdict::Accepted => true,
+                TokenVerdict::Refused => false,
+                TokenVerdict::Excessive => {
                     self.cut_off(&robot, now);
                     false
                 }
@@ -228,7 +228,7 @@ pub(super) fn declare(session: &Session, channels: &Channels, router: u64) -> ze
         .complete(true)
         .callback(move |query| {
             if let Some(place) = to.admit(query.key_expr().as_str(), Kind::Hello) {
-                let asked = Asked { query, place };
+                let asked = LimitedQuery { query, place };
                 deliver(&to.hellos, asked, &to.app.counters().hellos_dropped);
             }
         })
@@ -240,7 +240,7 @@ pub(super) fn declare(session: &Session, channels: &Channels, router: u64) -> ze
         .complete(true)
         .callback(move |query| {
             if let Some(place) = to.admit(query.key_expr().as_str(), Kind::Upload) {
-                let asked = Asked { query, place };
+                let asked = LimitedQuery { query, place };
                 deliver(&to.uploads, asked, &to.app.counters().ingest_dropped_busy);
             }
         })
@@ -414,13 +414,13 @@ fn process(app: &App, limits: &RateLimits, message: &Published) -> bool {
         presences.state(key, state, at.monotonic, at.wall)
     };
     match heard {
-        Heard::News => app.wake(),
-        Heard::Nothing => {}
-        Heard::Stranger => {
+        MessageEffect::Changed => app.wake(),
+        MessageEffect::Unchanged => {}
+        MessageEffect::NotWelcomed => {
             refuse_stranger(app, key);
             return false;
         }
-        Heard::Other => {
+        MessageEffect::OtherRun => {
             app.counters().refused_other_run.one();
             return false;
         }

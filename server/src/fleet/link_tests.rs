@@ -16,7 +16,7 @@ use super::access_tests::{Rig, Who, enrolment, put, robot, site};
 use super::gate::LINKS_PER_ROBOT_MAX;
 use super::inbox::STATE_BYTES_MAX;
 use super::routers::Router;
-use super::test_client::{POLL_INTERVAL, Shown, TestSession, until};
+use super::test_client::{ClientOverrides, POLL_INTERVAL, TestSession, until};
 use crate::rate_limit::RateLimit;
 
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -37,9 +37,9 @@ async fn sessions_on(router: &Arc<Router>) -> usize {
 async fn open_as(rig: &Rig, who: Who, lower: u64) -> Option<TestSession> {
     let client = rig.client(who);
     let prefix: SessionPrefix = client.credentials().await?.session_prefix;
-    let shown = Shown {
+    let shown = ClientOverrides {
         session_id: Some(prefix.session_id(lower)),
-        ..Shown::default()
+        ..ClientOverrides::default()
     };
     client.open(&shown, OPEN_MS).await
 }
@@ -151,16 +151,22 @@ async fn an_authority_that_is_retired_takes_its_links_passwords_and_routers_with
 async fn a_session_comes_back_while_its_former_link_still_stands() {
     let rig = Rig::start().await;
     let client = rig.client(Who::Own);
-    let mut first = client.open(&Shown::default(), 10_000).await.unwrap();
+    let mut first = client
+        .open(&ClientOverrides::default(), 10_000)
+        .await
+        .unwrap();
     // Its network is gone, and nobody has noticed: it does not close. The id is the same.
     let begun = Instant::now();
-    let second = client.open(&Shown::default(), OPEN_MS).await;
+    let second = client.open(&ClientOverrides::default(), OPEN_MS).await;
     let second = second.expect("the router takes it");
     assert!(begun.elapsed() < CUT_MAX, "it took {:?}", begun.elapsed());
     let ended = tokio::time::timeout(CUT_MAX, first.link_ended()).await;
     assert!(ended.is_ok(), "the former link ends");
     // Another certificate of the same robot takes nothing over, whatever it says.
-    let stranger = rig.client(Who::Own).open(&Shown::default(), 300).await;
+    let stranger = rig
+        .client(Who::Own)
+        .open(&ClientOverrides::default(), 300)
+        .await;
     assert!(stranger.is_none());
     let key = keys::state(&site(), &robot("rover-1"));
     let received = rig.app.counters().refused_malformed.get();

@@ -66,7 +66,7 @@ impl Opener {
             // The file of passwords must exist until the router has read it.
             let (config, _dictionary) = match &needed {
                 Some(credentials) => {
-                    let (config, dictionary) = demanding(&config, credentials, &known)?;
+                    let (config, dictionary) = with_access_control(&config, credentials, &known)?;
                     (config, Some(dictionary))
                 }
                 None => (config, None),
@@ -142,7 +142,7 @@ pub(super) fn with_free_port(address: SocketAddr) -> Result<SocketAddr, FleetErr
 
 /// Returns a configuration whose router demands passwords and restricts robots to their own keys. The
 /// rules are not inserted as text: parsing takes three times as long and 90 KB a robot.
-fn demanding(
+fn with_access_control(
     config: &Config,
     credentials: &CredentialDerivation,
     robots: &[RobotKey],

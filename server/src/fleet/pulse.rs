@@ -38,7 +38,7 @@ pub(super) async fn run(app: App, routers: Arc<Routers>, stop: CancellationToken
             }
         }
     };
-    let beating = beat(&app, &routers, (&mut sites, &again));
+    let beating = publish_heartbeats(&app, &routers, (&mut sites, &again));
     tokio::select! {
         () = stop.cancelled() => {}
         () = reading => {}
@@ -47,7 +47,7 @@ pub(super) async fn run(app: App, routers: Arc<Routers>, stop: CancellationToken
 }
 
 /// Publishes heartbeats for the sites that are listed, and asks for the list when there are new routers.
-async fn beat(
+async fn publish_heartbeats(
     app: &App,
     routers: &Routers,
     (sites, again): (&mut watch::Receiver<Vec<SiteId>>, &Notify),

@@ -107,11 +107,11 @@ impl Used {
 /// A token (its key) on a router (its number).
 pub(super) type TokenPlace = (String, u64);
 
-/// Result for a token that appeared.
+/// Decision on a liveliness token that appeared.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Appeared {
+pub(super) enum TokenVerdict {
     /// Processed.
-    Taken,
+    Accepted,
     /// Not processed, or only later.
     Refused,
     /// Not processed, and its robot has so many that others are affected: its links must be cut.
@@ -242,28 +242,28 @@ impl RateLimits {
         robot: &RobotKey,
         place: TokenPlace,
         now: Duration,
-    ) -> Appeared {
+    ) -> TokenVerdict {
         let closed = self.closed.lock().unwrap_or_else(PoisonError::into_inner);
         if closed.contains(&place.1) {
             // It was under way when the router closed, and would otherwise stay for ever.
-            return Appeared::Refused;
+            return TokenVerdict::Refused;
         }
         let appeared = self.with(robot, now, |known| {
             let is_excessive = known.declared(place.1, now);
             if known.tokens.contains(&place) || known.handle_token(&place, now) {
-                return Appeared::Taken;
+                return TokenVerdict::Accepted;
             }
             if known.late.len() >= LATE_TOKENS_MAX {
                 known.late.pop_front();
             }
             known.late.push_back(place);
             if is_excessive {
-                Appeared::Excessive
+                TokenVerdict::Excessive
             } else {
-                Appeared::Refused
+                TokenVerdict::Refused
             }
         });
-        appeared.unwrap_or(Appeared::Refused)
+        appeared.unwrap_or(TokenVerdict::Refused)
     }
 
     /// Handles a robot's token that vanished; returns whether it had been processed.

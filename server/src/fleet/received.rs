@@ -13,7 +13,7 @@ use crate::app::presence::RobotKey;
 
 /// A query with its place in the robot's limits, held until it is answered.
 #[derive(Debug)]
-pub(super) struct Asked {
+pub(super) struct LimitedQuery {
     pub(super) query: Query,
     pub(super) place: Place,
 }

@@ -18,7 +18,7 @@ use zenoh::query::Query;
 
 use super::rate_limits::RateLimits;
 use super::received::{
-    Asked, RefusedMessage, count_refusal, explained, log_refusal, next, refuse_key,
+    LimitedQuery, RefusedMessage, count_refusal, explained, log_refusal, next, refuse_key,
 };
 use crate::app::App;
 use crate::app::ingest::Upload;
@@ -48,7 +48,7 @@ impl Replies {
 
     /// Awaits the answer in a task and sends it. Without a free slot the query is dropped: its
     /// robot gets no reply and asks again.
-    fn answer<T, F>(&self, Asked { query, place }: Asked, answering: F)
+    fn answer<T, F>(&self, LimitedQuery { query, place }: LimitedQuery, answering: F)
     where
         T: Serialize + Send + 'static,
         F: Future<Output = Result<T, Refusal>> + Send + 'static,
@@ -146,7 +146,7 @@ fn send<T: Serialize>(query: &Query, answer: &Result<T, Refusal>) {
 /// Answers hellos until the stop.
 pub(super) async fn serve_hellos(
     replies: Replies,
-    mut queries: mpsc::Receiver<Asked>,
+    mut queries: mpsc::Receiver<LimitedQuery>,
     stop: CancellationToken,
 ) {
     while let Some(asked) = next(&mut queries, &stop).await {
@@ -165,7 +165,7 @@ pub(super) async fn serve_hellos(
 /// Passes uploads to the writer and its answers to the robots, until the stop.
 pub(super) async fn serve_uploads(
     replies: Replies,
-    mut queries: mpsc::Receiver<Asked>,
+    mut queries: mpsc::Receiver<LimitedQuery>,
     writer: mpsc::Sender<Upload>,
     stop: CancellationToken,
 ) {

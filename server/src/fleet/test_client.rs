@@ -36,9 +36,9 @@ pub(super) async fn until(what: &str, mut holds: impl AsyncFnMut() -> bool) {
     assert!(waited.is_ok(), "not within {STATE_TIMEOUT:?}: {what}");
 }
 
-/// Values that a session shows instead of its own.
+/// Credentials that a session presents instead of its own.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Shown {
+pub(super) struct ClientOverrides {
     pub(super) user: Option<String>,
     pub(super) password: Option<String>,
     pub(super) session_id: Option<String>,
@@ -139,7 +139,7 @@ impl TestClient {
     }
 
     /// Opens a session; `None` if the gate or router rejects it.
-    pub(super) async fn open(&self, shown: &Shown, wait_ms: u32) -> Option<TestSession> {
+    pub(super) async fn open(&self, shown: &ClientOverrides, wait_ms: u32) -> Option<TestSession> {
         let (mut remote, credentials) = self.dial().await?;
         let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).await.unwrap();
         let config = config(listener.local_addr().unwrap(), &credentials, shown, wait_ms);
@@ -157,7 +157,7 @@ impl TestClient {
 fn config(
     local: SocketAddr,
     credentials: &RouterCredentials,
-    shown: &Shown,
+    shown: &ClientOverrides,
     wait_ms: u32,
 ) -> Config {
     let text = |text: &str| serde_json::Value::from(text).to_string();

@@ -130,10 +130,10 @@ fn one_robot_of_three_or_more_gains_nothing_by_what_it_says_of_its_errors() {
 fn sums_keep_the_independent_information_and_mean_shares_of_what_is_common() {
     let mut sums = sums_of(THETA, 0, [0.1, 0.2]);
     sums.add(&sums_of(THETA, 1, [0.3, 0.0]));
-    let seen = Seen::of(1_u8, 0, &sums).unwrap();
+    let seen = EpochMeasurement::of(1_u8, 0, &sums).unwrap();
     assert!((seen.robot_ratio - 0.2).abs() < 1e-6 && (seen.tyre_ratio - 0.1).abs() < 1e-6);
     // A robot that does not state its common errors has none in the sums.
-    let silent = Seen::of(1_u8, 0, &measured(THETA, OWN_STD_DEV, 0)).unwrap();
+    let silent = EpochMeasurement::of(1_u8, 0, &measured(THETA, OWN_STD_DEV, 0)).unwrap();
     assert!(silent.robot_ratio <= 0.0 && silent.tyre_ratio <= 0.0);
     assert!(
         fuse(

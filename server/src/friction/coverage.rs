@@ -67,7 +67,7 @@ fn coverage(Fleet { robots, visits }: Fleet) -> [f64; 3] {
                     None => sums = Some(pass),
                 }
             }
-            seen.extend(Seen::of(robot, 0, &sums.unwrap()));
+            seen.extend(EpochMeasurement::of(robot, 0, &sums.unwrap()));
         }
         for (held, ground) in held.iter_mut().zip([Ground::Cell, Ground::Area]) {
             let fused = fuse(&mut seen.clone(), ground, &config, at_us(0)).unwrap();

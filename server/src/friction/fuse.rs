@@ -24,8 +24,10 @@
 
 use tread_api::friction::TYRE_DIFFERENCE_SHARE;
 
-use super::joined::{EpochValue, Room, joined};
-use super::seen::{CHANGE_DEVIATIONS, Estimate, Ground, Seen, age_s, seconds};
+use super::epoch_measurement::{
+    CHANGE_DEVIATIONS, EpochMeasurement, Estimate, Ground, age_s, seconds,
+};
+use super::joined::{EpochValue, JoinBuffers, joined};
 use super::sums::Known;
 use super::weights::FrictionConfig;
 
@@ -77,7 +79,7 @@ impl Fused {
 /// Returns `None` without measurements, or if the standard deviation exceeds [`THETA_STD_DEV_MAX`].
 /// Sorts `seen`, and for a cell removes the entries from before a change.
 pub fn fuse<R: Ord + Copy>(
-    seen: &mut Vec<Seen<R>>,
+    seen: &mut Vec<EpochMeasurement<R>>,
     ground: Ground,
     config: &FrictionConfig,
     now_us: i64,
@@ -88,15 +90,15 @@ pub fn fuse<R: Ord + Copy>(
 /// Reusable buffers to fuse many pieces of ground without allocation.
 #[derive(Debug)]
 pub struct Fuser<R> {
-    before: Vec<Seen<R>>,
-    room: Room,
+    before: Vec<EpochMeasurement<R>>,
+    room: JoinBuffers,
 }
 
 impl<R> Default for Fuser<R> {
     fn default() -> Self {
         Self {
             before: Vec::new(),
-            room: Room::default(),
+            room: JoinBuffers::default(),
         }
     }
 }
@@ -105,7 +107,7 @@ impl<R: Ord + Copy> Fuser<R> {
     /// Fuses measurements as [`fuse()`] does.
     pub fn fuse(
         &mut self,
-        seen: &mut Vec<Seen<R>>,
+        seen: &mut Vec<EpochMeasurement<R>>,
         ground: Ground,
         config: &FrictionConfig,
         now_us: i64,
@@ -116,7 +118,7 @@ impl<R: Ord + Copy> Fuser<R> {
 
 fn fuse_in<R: Ord + Copy>(
     room: &mut Fuser<R>,
-    seen: &mut Vec<Seen<R>>,
+    seen: &mut Vec<EpochMeasurement<R>>,
     ground: Ground,
     config: &FrictionConfig,
     now_us: i64,
@@ -143,7 +145,7 @@ fn fuse_in<R: Ord + Copy>(
     });
     let drift = config.drift_variance_per_s;
     let words = &mut room.room;
-    let said = |one: &Seen<R>| {
+    let said = |one: &EpochMeasurement<R>| {
         Some(EpochValue {
             known: one.theta,
             bias_ratio: one.bias_ratio(config),
@@ -155,9 +157,9 @@ fn fuse_in<R: Ord + Copy>(
     if std_dev > THETA_STD_DEV_MAX {
         return None;
     }
-    let mut layer = |value_of: fn(&Seen<R>) -> Option<Known>| {
+    let mut layer = |value_of: fn(&EpochMeasurement<R>) -> Option<Known>| {
         let is_known = seen.iter().any(|one| value_of(one).is_some());
-        let said = |one: &Seen<R>| {
+        let said = |one: &EpochMeasurement<R>| {
             value_of(one).map(|known| EpochValue {
                 known,
                 bias_ratio: config.robot_bias_ratio,
@@ -168,7 +170,7 @@ fn fuse_in<R: Ord + Copy>(
         joined.flatten().map(|joined| joined.0)
     };
     let (track, rolling) = (layer(|one| one.track), layer(|one| one.rolling));
-    let recent = |one: &&Seen<R>| age_s(one, now_us) <= config.mu_peak_age_max_s;
+    let recent = |one: &&EpochMeasurement<R>| age_s(one, now_us) <= config.mu_peak_age_max_s;
     Some(Fused {
         theta: Estimate {
             value: theta.value.max(THETA_MIN),
@@ -188,7 +190,7 @@ fn fuse_in<R: Ord + Copy>(
 /// Returns the peak friction coefficient that two robots have shown, or one alone up to
 /// [`MU_ALONE_MAX`]. `seen` must be sorted by robot.
 fn mu_shown<'seen, R: Ord + Copy + 'seen>(
-    seen: impl Iterator<Item = &'seen Seen<R>>,
+    seen: impl Iterator<Item = &'seen EpochMeasurement<R>>,
 ) -> Option<f64> {
     let (mut largest, mut second): (Option<f64>, Option<f64>) = (None, None);
     let mut of_robot: Option<(R, f64)> = None;
@@ -226,7 +228,7 @@ impl Present {
     /// Removes from `seen`, which is sorted newest first, the entries from before the last change
     /// of the ground.
     fn of<R: Ord + Copy>(
-        seen: &mut Vec<Seen<R>>,
+        seen: &mut Vec<EpochMeasurement<R>>,
         room: &mut Fuser<R>,
         config: &FrictionConfig,
     ) -> Self {
@@ -239,11 +241,11 @@ impl Present {
             return Self::default();
         };
         let witnesses: u64 = seen.iter().map(|one| one.passes).sum();
-        let divided = Divided {
+        let divided = SplitEntries {
             kept: seen,
             contradicted: &older[kept..],
         };
-        let lone = lone_witness(divided, config);
+        let lone = single_robot(divided, config);
         if witnesses > 1 && lone.is_none() {
             return Self {
                 is_unconfirmed: false,
@@ -288,16 +290,16 @@ impl Present {
 
 /// Entries on both sides of a change of the ground.
 #[derive(Clone, Copy)]
-struct Divided<'seen, R> {
-    kept: &'seen [Seen<R>],
-    contradicted: &'seen [Seen<R>],
+struct SplitEntries<'seen, R> {
+    kept: &'seen [EpochMeasurement<R>],
+    contradicted: &'seen [EpochMeasurement<R>],
 }
 
 /// Returns the only robot that measured less slip while several others measured more; `None` if
 /// there is no such robot. Repeated measurements of it do not confirm the change, so all of its
 /// entries are ignored.
-fn lone_witness<R: Ord + Copy>(
-    Divided { kept, contradicted }: Divided<'_, R>,
+fn single_robot<R: Ord + Copy>(
+    SplitEntries { kept, contradicted }: SplitEntries<'_, R>,
     config: &FrictionConfig,
 ) -> Option<R> {
     let mut now = WeightedTheta::default();
@@ -334,7 +336,7 @@ struct WeightedTheta {
 }
 
 impl WeightedTheta {
-    fn of<R>(one: &Seen<R>, theta: Known, config: &FrictionConfig) -> Self {
+    fn of<R>(one: &EpochMeasurement<R>, theta: Known, config: &FrictionConfig) -> Self {
         Self {
             information: theta.information,
             weighted: theta.information * theta.value,
@@ -381,7 +383,7 @@ impl WeightedTheta {
 /// change if there is one, microseconds since 1970. Entries with a change within their epoch are
 /// reduced to their newest pass.
 fn keep_present<R: Ord + Copy>(
-    seen: &mut [Seen<R>],
+    seen: &mut [EpochMeasurement<R>],
     config: &FrictionConfig,
 ) -> (usize, Option<i64>) {
     let mut changed_at_us = None;

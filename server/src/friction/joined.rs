@@ -8,7 +8,7 @@
 
 use tread_api::friction::NORMAL_95;
 
-use super::seen::{Estimate, Ground, Seen, age_s};
+use super::epoch_measurement::{EpochMeasurement, Estimate, Ground, age_s};
 use super::sums::Known;
 
 /// Maximum number of iterations for the common θ; it converges within about ten.
@@ -22,7 +22,7 @@ const DISPUTE_QUANTILE: f64 = 3.090_232_306_167_813;
 const GROUP_CHI_SQUARE_MAX: f64 = 4.0;
 /// Reusable buffers of [`joined`].
 #[derive(Debug, Default)]
-pub(super) struct Room {
+pub(super) struct JoinBuffers {
     robots: Vec<RobotValue>,
     groups: Vec<Group>,
     ratios: Vec<f64>,
@@ -113,13 +113,13 @@ fn as_f64(count: u64) -> f64 {
 /// any value. `said_of` extracts the value of an epoch; `drift` is the growth of a measurement's
 /// variance with its age, per second.
 pub(super) fn joined<R: Ord + Copy>(
-    seen: &[Seen<R>],
-    Room {
+    seen: &[EpochMeasurement<R>],
+    JoinBuffers {
         robots,
         groups,
         ratios,
-    }: &mut Room,
-    said_of: impl Fn(&Seen<R>) -> Option<EpochValue>,
+    }: &mut JoinBuffers,
+    said_of: impl Fn(&EpochMeasurement<R>) -> Option<EpochValue>,
     (now_us, drift): (i64, f64),
 ) -> Option<(Estimate, Heterogeneity)> {
     robots.clear();

@@ -5,11 +5,11 @@
 //! Ageing therefore changes no stored value, and estimates do not depend on the order or number of
 //! uploads. [`index`] holds the statistics in memory.
 
+mod epoch_measurement;
 pub mod fuse;
 pub mod index;
 mod joined;
 pub mod raster;
-mod seen;
 pub mod traction_limit;
 pub mod weights;
 
@@ -17,9 +17,9 @@ use jiff::Timestamp;
 use tread_api::friction::{FrictionBounds, FusedFriction, NORMAL_90, ValueEstimate};
 pub use tread_store::friction::{Epoch, Horizons, Sums, epoch_h, epoch_h_at, epochs, fixed, sums};
 
+pub use self::epoch_measurement::{EpochMeasurement, Estimate, Ground};
 pub use self::fuse::{Fused, Fuser, fuse};
 pub use self::raster::Raster;
-pub use self::seen::{Estimate, Ground, Seen};
 
 impl Fused {
     /// Converts the estimate to its API type, with its age at `now_us`, microseconds since 1970.
@@ -51,7 +51,7 @@ impl Fused {
             segments: self.passes,
             robots: self.robots,
             newest_at: time(self.newest_at_us),
-            age_s: seen::seconds(now_us - self.newest_at_us).max(0.0),
+            age_s: epoch_measurement::seconds(now_us - self.newest_at_us).max(0.0),
             disputed: self.is_disputed,
             changed_at: self.changed_at_us.map(time),
         }
@@ -63,6 +63,6 @@ mod common;
 #[cfg(test)]
 mod coverage;
 #[cfg(test)]
-mod liars;
+mod faulty_robot_tests;
 #[cfg(test)]
 mod tests;

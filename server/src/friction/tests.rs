@@ -74,9 +74,9 @@ pub(super) fn fused_as(
             .and_modify(|present| present.add(&part))
             .or_insert(part);
     }
-    let mut seen: Vec<Seen<u8>> = sums
+    let mut seen: Vec<EpochMeasurement<u8>> = sums
         .iter()
-        .filter_map(|(&(robot, epoch), sums)| Seen::of(robot, epoch, sums))
+        .filter_map(|(&(robot, epoch), sums)| EpochMeasurement::of(robot, epoch, sums))
         .collect();
     fuse(&mut seen, ground, config, at_us(0))
 }
@@ -379,8 +379,10 @@ proptest! {
             sums.entry(key).and_modify(|present| present.add(part)).or_insert(*part);
         }
         sums.retain(|&(robot, _), _| robot != 2);
-        let mut seen: Vec<_> =
-            sums.iter().filter_map(|(&(robot, epoch), sums)| Seen::of(robot, epoch, sums)).collect();
+        let mut seen: Vec<_> = sums
+            .iter()
+            .filter_map(|(&(robot, epoch), sums)| EpochMeasurement::of(robot, epoch, sums))
+            .collect();
         let withdrawn = fuse(&mut seen, Ground::Cell, &config, at_us(0));
         prop_assert_eq!(withdrawn, fused_as(others, Ground::Cell, &config));
     }

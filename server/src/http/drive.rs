@@ -196,7 +196,7 @@ impl Connection {
                 DriveRequest::Release(_) => self.release().await?,
                 DriveRequest::Stop(words) => {
                     let words = StopReason {
-                        by: Some(self.subject.said_by(words.by.as_deref())),
+                        by: Some(self.subject.author(words.by.as_deref())),
                         reason: words.reason,
                     };
                     self.stop(words).await?;
@@ -264,7 +264,7 @@ impl Connection {
         }
         let name = match name.trim() {
             "" => String::new(),
-            name => self.subject.said_by(Some(name)),
+            name => self.subject.author(Some(name)),
         };
         let update = match self.session.acquire(&name, take).await {
             Ok(lease) => DriveUpdate::Leased(lease),

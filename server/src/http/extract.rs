@@ -189,19 +189,19 @@ fn without_place(message: &str) -> &str {
 /// Parses a frame of a socket; as in bodies, a list in place of an object is refused.
 ///
 /// # Errors
-/// [`BadFrame`].
-pub(super) fn parse_frame<T: DeserializeOwned + Serialize>(text: &str) -> Result<T, BadFrame> {
-    let parsed: T = serde_json::from_str(text).map_err(BadFrame::Parser)?;
+/// [`FrameError`].
+pub(super) fn parse_frame<T: DeserializeOwned + Serialize>(text: &str) -> Result<T, FrameError> {
+    let parsed: T = serde_json::from_str(text).map_err(FrameError::Parser)?;
     let meant = to_raw_value(&parsed).unwrap_or_default();
     match list_for_object(text.as_bytes(), &meant) {
         None => Ok(parsed),
-        Some(_place) => Err(BadFrame::List),
+        Some(_place) => Err(FrameError::List),
     }
 }
 
 /// Reason why a frame is refused.
 #[derive(Debug, thiserror::Error)]
-pub(super) enum BadFrame {
+pub(super) enum FrameError {
     /// It cannot be parsed.
     #[error("{0}")]
     Parser(serde_json::Error),

@@ -24,7 +24,7 @@ use super::identity::guard::Peer;
 use super::problem::Problem;
 use super::serve::FORWARDED_FOR;
 use crate::app::App;
-use crate::connections::{AtWork, Slot};
+use crate::connections::{RequestGuard, Slot};
 use crate::error_text;
 
 /// Maximum time for a connection, TLS included.
@@ -376,7 +376,7 @@ pub async fn run(
 /// as that lasts.
 fn join(
     app: &App,
-    (upgrade, at_work): (Option<OnUpgrade>, Option<AtWork>),
+    (upgrade, at_work): (Option<OnUpgrade>, Option<RequestGuard>),
     answer: reqwest::Response,
 ) -> Response<Body> {
     let Some(upgrade) = upgrade else {

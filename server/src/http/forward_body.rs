@@ -19,7 +19,7 @@ pub(crate) struct EndTokens {
 /// Cause of a body that breaks off.
 #[derive(Debug, thiserror::Error)]
 #[error("the server that has the database does not answer any more")]
-struct GivenUp;
+struct ForwardTimeout;
 
 /// Ends the body of an answer when the other server is given up, and a stream of events also at the stop:
 /// its client goes on at another server. Other bodies break off, so that no part passes for the whole.
@@ -43,7 +43,7 @@ pub(super) fn cut_short(answer: Response<Body>, tokens: EndTokens) -> Response<B
     } else {
         let is_given_up = given_up.clone();
         let broken = move |()| {
-            let cause = is_given_up.is_cancelled().then_some(GivenUp);
+            let cause = is_given_up.is_cancelled().then_some(ForwardTimeout);
             ready(cause.map(|cause| Err(axum::Error::new(cause))))
         };
         let rest = stream::once(ready(())).filter_map(broken);

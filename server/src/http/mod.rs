@@ -56,7 +56,7 @@ use utoipa_axum::routes;
 use utoipa_swagger_ui::SwaggerUi;
 
 use self::extract::BodyLimit;
-pub use self::identity::access::{Access, Needed, PUBLIC};
+pub use self::identity::access::{Access, PUBLIC, RouteRequirement};
 use self::identity::guard::{self, Guard};
 use self::identity::{audit, authority, browser, enrolment, session, sessions, sign_in, tokens};
 use self::problem::{Problem, Refused};
@@ -219,7 +219,7 @@ fn behind_guard(
 ) -> Router<App> {
     let guard = Guard::new(app.clone(), access, Arc::clone(&names));
     let router = router
-        .layer(from_fn_with_state(guard, guard::stand))
+        .layer(from_fn_with_state(guard, guard::authorize))
         .layer(Extension(Arc::clone(&names)));
     let router = match browser::foreign_pages(&names.allowed_origins) {
         Some(foreign_pages) => router.layer(foreign_pages),
@@ -247,7 +247,7 @@ pub fn metrics_router(app: App) -> Router {
     Router::new()
         .route("/metrics", axum::routing::get(metrics))
         .fallback(not_found)
-        .layer(from_fn_with_state(guard, guard::stand))
+        .layer(from_fn_with_state(guard, guard::authorize))
         .layer(from_fn(bound_time))
         .with_state(app)
 }

@@ -68,9 +68,9 @@ impl StopBody {
     }
 
     /// Returns author and reason; the token's name precedes any name given in the body.
-    fn words(&self, subject: &Credential) -> StopReason {
+    fn stop_reason(&self, subject: &Credential) -> StopReason {
         StopReason {
-            by: Some(subject.said_by(self.text("by").as_deref())),
+            by: Some(subject.author(self.text("by").as_deref())),
             reason: self.text("reason"),
         }
     }
@@ -125,8 +125,8 @@ pub(super) async fn stop(
     Path((site, robot)): Path<(SiteId, RobotId)>,
     body: StopBody,
 ) -> Result<Json<Stop>, Problem> {
-    let words = body.words(&subject);
-    Ok(Json(app.stop_robot(&site, &robot, words).await?))
+    let stop_reason = body.stop_reason(&subject);
+    Ok(Json(app.stop_robot(&site, &robot, stop_reason).await?))
 }
 
 /// Stop all robots, of one site or of all sites within the token's scope.
@@ -143,11 +143,11 @@ pub(super) async fn stop_fleet(
     Subject(subject): Subject,
     body: StopBody,
 ) -> Result<Json<FleetStop>, Problem> {
-    let (site, words) = (body.site()?, body.words(&subject));
+    let (site, stop_reason) = (body.site()?, body.stop_reason(&subject));
     if let Some(site) = &site {
         subject.check_site(site)?;
     }
-    let stopped = app.stop_fleet(&subject.scope, site.as_ref(), words);
+    let stopped = app.stop_fleet(&subject.scope, site.as_ref(), stop_reason);
     Ok(Json(stopped.await?))
 }
 
@@ -167,7 +167,7 @@ pub(super) async fn clear(
     Json(request): Json<ClearStop>,
 ) -> Result<Json<Stop>, Problem> {
     let ClearStop { stop, by } = request;
-    let by = subject.said_by(by.as_deref());
+    let by = subject.author(by.as_deref());
     Ok(Json(app.clear_stop(&site, &robot, stop, Some(by)).await?))
 }
 

@@ -183,14 +183,14 @@ impl Tls {
 
 /// Keeps the certificate up to date until the stop, and raises an alert before it expires.
 pub async fn watch(tls: Arc<Tls>, app: App, stop: CancellationToken) {
-    keep(&tls, stop, |tls| {
+    reload_periodically(&tls, stop, |tls| {
         app.update_certificate_alert(tls.certificate().as_ref(), &tls.origin());
     })
     .await;
 }
 
 /// Keeps the certificate up to date until the stop, and calls `looked` after each look at it.
-pub async fn keep(tls: &Tls, stop: CancellationToken, looked: impl Fn(&Tls)) {
+pub async fn reload_periodically(tls: &Tls, stop: CancellationToken, looked: impl Fn(&Tls)) {
     let mut seen = tls.changed_at();
     loop {
         looked(tls);

@@ -59,7 +59,7 @@ pub(crate) async fn run(args: BackupArgs) -> anyhow::Result<()> {
         now: Clock::system().now(),
     };
     let is_quiet = args.quiet;
-    let shown = Mutex::new(Shown::default());
+    let shown = Mutex::new(ProgressPrinter::default());
     let made = backups::make(order, move |progress| {
         if !is_quiet && let Ok(mut shown) = shown.lock() {
             shown.show(progress);
@@ -101,11 +101,11 @@ pub(crate) async fn run(args: BackupArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The last printed progress.
+/// Prints the progress; contains the last printed one.
 #[derive(Default)]
-struct Shown(Option<(&'static str, u64)>);
+struct ProgressPrinter(Option<(&'static str, u64)>);
 
-impl Shown {
+impl ProgressPrinter {
     fn show(&mut self, progress: Progress) {
         let (what, bytes, of) = match progress {
             Progress::Copying { bytes, of } => ("copying", bytes, of),

@@ -147,7 +147,7 @@ async fn interruption() -> anyhow::Error {
 
 async fn into(source: &Db, to: &Location, quiet: bool) -> anyhow::Result<Vec<Copied>> {
     let target = Db::open_with(to, COMMIT_TIMEOUT).await?;
-    let mut shown = Shown::new(quiet);
+    let mut shown = ProgressPrinter::new(quiet);
     let databases = Databases {
         from: source,
         to: &target,
@@ -186,14 +186,14 @@ async fn into_file(source: &Db, path: &Path, quiet: bool) -> anyhow::Result<Vec<
     Ok(copied)
 }
 
-/// Shows how far the copy is.
-struct Shown {
+/// Prints the progress of the copy.
+struct ProgressPrinter {
     interval: Option<Duration>,
     is_terminal: bool,
     at: Instant,
 }
 
-impl Shown {
+impl ProgressPrinter {
     fn new(quiet: bool) -> Self {
         let is_terminal = io::stderr().is_terminal();
         let interval = if is_terminal {

@@ -34,7 +34,7 @@ pub(crate) struct MigrateArgs {
 
 /// Comparison of the schemas of file and program.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Compared {
+pub(crate) enum SchemaComparison {
     /// They are the same, possibly after migrations.
     Same,
     /// Migrations are due, and were not applied.
@@ -44,11 +44,11 @@ pub(crate) enum Compared {
 }
 
 /// Returns the exit code for a result.
-pub(crate) fn exit_code(ended: anyhow::Result<Compared>) -> ExitCode {
+pub(crate) fn exit_code(ended: anyhow::Result<SchemaComparison>) -> ExitCode {
     match ended {
-        Ok(Compared::Same) => ExitCode::SUCCESS,
-        Ok(Compared::Due) => ExitCode::from(DUE),
-        Ok(Compared::Newer) => ExitCode::from(NEWER),
+        Ok(SchemaComparison::Same) => ExitCode::SUCCESS,
+        Ok(SchemaComparison::Due) => ExitCode::from(DUE),
+        Ok(SchemaComparison::Newer) => ExitCode::from(NEWER),
         Err(error) => {
             eprintln!("error: {error:#}");
             ExitCode::FAILURE
@@ -61,7 +61,7 @@ pub(crate) fn exit_code(ended: anyhow::Result<Compared>) -> ExitCode {
 /// # Errors
 /// The configuration is invalid, the file cannot be read, a server runs on it, or a migration
 /// failed.
-pub(crate) async fn run(args: MigrateArgs) -> anyhow::Result<Compared> {
+pub(crate) async fn run(args: MigrateArgs) -> anyhow::Result<SchemaComparison> {
     let location = args.files.load()?.database;
     ensure!(
         location.file().is_none_or(Path::exists),
@@ -86,11 +86,11 @@ pub(crate) async fn run(args: MigrateArgs) -> anyhow::Result<Compared> {
     let missing = schema::missing_after(&location, found.schema);
     if let Err(newer) = refuse_newer(&location, &found) {
         eprintln!("error: {newer}");
-        return Ok(Compared::Newer);
+        return Ok(SchemaComparison::Newer);
     }
     if missing.is_empty() {
         writeln!(out, "no migrations are pending")?;
-        return Ok(Compared::Same);
+        return Ok(SchemaComparison::Same);
     }
     for (version, description) in &missing {
         writeln!(out, "due: {version} {description}")?;
@@ -101,7 +101,7 @@ pub(crate) async fn run(args: MigrateArgs) -> anyhow::Result<Compared> {
             "`tread-server migrate`, or a start of the server, applies them; make a backup first: \
              only a backup leads back to the present schema"
         )?;
-        return Ok(Compared::Due);
+        return Ok(SchemaComparison::Due);
     }
     let lock = DatabaseLock::take(&location).await?;
     let database = Db::open(&location).await?;
@@ -119,5 +119,5 @@ pub(crate) async fn run(args: MigrateArgs) -> anyhow::Result<Compared> {
         file_owner::chown_database(path)?;
     }
     writeln!(out, "applied {} migrations", missing.len())?;
-    Ok(Compared::Same)
+    Ok(SchemaComparison::Same)
 }

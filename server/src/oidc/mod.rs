@@ -30,7 +30,7 @@ use openidconnect::{
 };
 
 use self::http::{HttpClient, HttpError};
-use self::verify::{Expected, InvalidIdToken};
+use self::verify::{ExpectedClaims, InvalidIdToken};
 use crate::clock::Clock;
 use crate::config::oidc::OidcConfig;
 use crate::identity::claims::{Claims, claim};
@@ -124,7 +124,7 @@ pub enum ExchangeError {
 
 /// A person whom the provider has authenticated.
 #[derive(Clone, PartialEq)]
-pub struct SignedInThere {
+pub struct AuthenticatedPerson {
     /// Subject (`sub`): the person's identifier at the provider.
     pub subject: String,
     /// Claims of the ID token, with those of the user info if it was fetched.
@@ -251,11 +251,11 @@ impl Provider {
         if let Some(url) = endpoints.into_iter().flatten().find(in_the_clear) {
             return Err(DiscoverError::ClearText(url.to_string()));
         }
-        self.keep(found);
+        self.set_metadata(found);
         Ok(())
     }
 
-    fn keep(&self, found: ProviderMetadataWithLogout) {
+    fn set_metadata(&self, found: ProviderMetadataWithLogout) {
         let mut known = self.known.write().unwrap_or_else(PoisonError::into_inner);
         *known = Some(Arc::new(found));
     }
@@ -337,7 +337,7 @@ impl Provider {
         &self,
         code: &str,
         pending: &Pending,
-    ) -> Result<SignedInThere, ExchangeError> {
+    ) -> Result<AuthenticatedPerson, ExchangeError> {
         let metadata = self.metadata().ok_or(ExchangeError::Unknown)?;
         let client = self.client(&metadata);
         let asked = client
@@ -350,7 +350,7 @@ impl Provider {
             .ok_or(ExchangeError::Invalid(InvalidIdToken::Missing))?;
         let access_token = answer.access_token();
         let looked_at = |keys: &JsonWebKeySet<CoreJsonWebKey>| {
-            let expected = Expected {
+            let expected = ExpectedClaims {
                 issuer: &self.issuer,
                 client_id: &self.client_id,
                 nonce: &pending.nonce,
@@ -390,7 +390,7 @@ impl Provider {
             claims = with_user_info((claims, said), &self.groups_claim)?;
         }
         let id_token = id_token.to_string();
-        Ok(SignedInThere {
+        Ok(AuthenticatedPerson {
             subject,
             claims,
             id_token: (id_token.len() <= ID_TOKEN_MAX).then_some(id_token),
@@ -425,7 +425,7 @@ impl Provider {
             ExchangeError::KeysUnknown
         })?;
         *asked = KeysAsked(Some((now, true)));
-        self.keep((*present).clone().set_jwks(keys));
+        self.set_metadata((*present).clone().set_jwks(keys));
         Ok(self.metadata())
     }
 }

@@ -37,7 +37,7 @@ pub type IdToken = openidconnect::IdToken<
 
 /// Values against which an ID token is validated.
 #[derive(Debug, Clone, Copy)]
-pub struct Expected<'expected> {
+pub struct ExpectedClaims<'expected> {
     /// Issuer identifier of the provider.
     pub issuer: &'expected IssuerUrl,
     /// Client identifier of this server.
@@ -99,7 +99,7 @@ const ALGORITHMS: [CoreJwsSigningAlgorithm; 9] = [
 /// [`InvalidIdToken`] with the requirement that is not met.
 pub fn claims(
     id_token: &IdToken,
-    expected: &Expected<'_>,
+    expected: &ExpectedClaims<'_>,
 ) -> Result<(String, Claims), InvalidIdToken> {
     let at = |time: Timestamp| {
         let time = DateTime::from_timestamp(time.as_second(), 0);
@@ -187,7 +187,7 @@ mod tests {
         let keys = JsonWebKeySet::new(vec![signer.public.clone()]);
         claims(
             token,
-            &Expected {
+            &ExpectedClaims {
                 issuer: &IssuerUrl::new(ISSUER.to_owned()).unwrap(),
                 client_id: &ClientId::new("tread".to_owned()),
                 nonce: "n",

@@ -23,7 +23,7 @@ const TOKEN_FILE: &str = "admin.token";
 
 /// How the REST API gets its certificate.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) enum Web {
+pub(crate) enum CertificateSource {
     /// From the fleet's own authority.
     Authority,
     /// From files.
@@ -52,7 +52,7 @@ pub(crate) struct Choices {
     /// Address of the robots' port.
     pub(crate) zenoh: SocketAddr,
     /// Certificate of the REST API.
-    pub(crate) web: Web,
+    pub(crate) web: CertificateSource,
 }
 
 /// Values for choices that neither a flag nor an answer gives.
@@ -122,7 +122,7 @@ impl Choices {
 
     /// Returns whether robots join by certificates of the fleet's authority.
     pub(crate) fn has_authority(&self) -> bool {
-        self.web != Web::Loopback || !self.zenoh.ip().is_loopback()
+        self.web != CertificateSource::Loopback || !self.zenoh.ip().is_loopback()
     }
 
     /// Returns the folder of the fleet's authority.
@@ -138,13 +138,16 @@ impl Choices {
         for name in &self.names {
             check_name(name).map_err(anyhow::Error::msg)?;
         }
-        if self.web != Web::Loopback && self.names.is_empty() {
+        if self.web != CertificateSource::Loopback && self.names.is_empty() {
             bail!(
                 "other machines need a name or an address of this server: give --names, such as \
                  --names tread.example.org,192.0.2.1"
             );
         }
-        let is_tls = matches!(self.web, Web::Authority | Web::Files(_));
+        let is_tls = matches!(
+            self.web,
+            CertificateSource::Authority | CertificateSource::Files(_)
+        );
         ensure!(
             is_tls || self.http.ip().is_loopback(),
             "--http {} would be reached by other machines without TLS: take an address of this \
@@ -163,7 +166,7 @@ impl Choices {
                 path.display()
             );
         }
-        if let Web::Files(files) = &self.web {
+        if let CertificateSource::Files(files) = &self.web {
             check_files(files, &self.names)?;
         }
         Ok(())
@@ -193,15 +196,15 @@ pub(super) fn files(args: &SetupArgs) -> Option<TlsFiles> {
 ///
 /// # Errors
 /// The choice needs files that no flag names, or flags name files that the choice does not use.
-pub(super) fn web(tls: TlsChoice, files: Option<TlsFiles>) -> anyhow::Result<Web> {
+pub(super) fn web(tls: TlsChoice, files: Option<TlsFiles>) -> anyhow::Result<CertificateSource> {
     Ok(match (tls, files) {
-        (TlsChoice::Files, Some(files)) => Web::Files(files),
+        (TlsChoice::Files, Some(files)) => CertificateSource::Files(files),
         (TlsChoice::Files, None) => {
             bail!("--tls files needs --tls-certificate and --tls-key")
         }
-        (TlsChoice::Authority, None) => Web::Authority,
-        (TlsChoice::Proxy, None) => Web::Proxy,
-        (TlsChoice::Loopback, None) => Web::Loopback,
+        (TlsChoice::Authority, None) => CertificateSource::Authority,
+        (TlsChoice::Proxy, None) => CertificateSource::Proxy,
+        (TlsChoice::Loopback, None) => CertificateSource::Loopback,
         (_, Some(_)) => bail!("--tls-certificate and --tls-key are for --tls files alone"),
     })
 }

@@ -116,7 +116,7 @@ impl SetupArgs {
 
 /// Arguments of `init` besides [`SetupArgs`].
 #[derive(Debug)]
-pub(crate) struct Given<'a> {
+pub(crate) struct InitOptions<'a> {
     /// The configuration file.
     pub(crate) config: Option<&'a Path>,
     /// The database file.
@@ -153,7 +153,10 @@ pub(crate) fn config_default(is_root: bool) -> PathBuf {
 /// # Errors
 /// A choice is impossible, the file exists and `--force` is not given, nobody answers, or a folder
 /// cannot be written.
-pub(crate) fn prepare(args: &SetupArgs, given: &Given<'_>) -> anyhow::Result<Option<Prepared>> {
+pub(crate) fn prepare(
+    args: &SetupArgs,
+    given: &InitOptions<'_>,
+) -> anyhow::Result<Option<Prepared>> {
     let is_root = Uid::effective().is_root();
     let has_terminal = io::stdin().is_terminal() && io::stderr().is_terminal();
     let file = given

@@ -96,7 +96,7 @@ fn names(text: &str) -> Result<Vec<String>, String> {
     Ok(names)
 }
 
-fn way(text: &str) -> Result<TlsChoice, String> {
+fn parse_tls_choice(text: &str) -> Result<TlsChoice, String> {
     match text {
         "1" => Ok(TlsChoice::Authority),
         "2" => Ok(TlsChoice::Files),
@@ -156,7 +156,7 @@ pub(super) fn ask(
                  3  by a proxy on this machine that ends TLS\n  \
                  4  from this machine alone, without TLS",
             )?;
-            questions.ask("One of 1 to 4", DefaultAnswer("1"), way)?
+            questions.ask("One of 1 to 4", DefaultAnswer("1"), parse_tls_choice)?
         }
     };
     let names = if tls == TlsChoice::Loopback || !args.names.is_empty() {

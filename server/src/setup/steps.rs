@@ -2,11 +2,11 @@
 
 use std::fmt::Write as _;
 
-use super::choices::{Choices, Web};
+use super::choices::{CertificateSource, Choices};
 use super::service::check_service;
 
-/// Returns a word, quoted for a shell if necessary.
-fn word(text: &str) -> String {
+/// Returns an argument, quoted for a shell if necessary.
+fn shell_quoted(text: &str) -> String {
     let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b"-_./:,@%+=".contains(&byte);
     if !text.is_empty() && text.bytes().all(is_plain) {
         return text.to_owned();
@@ -24,20 +24,24 @@ fn server(choices: &Choices) -> String {
         host.to_owned()
     };
     match choices.web {
-        Web::Authority | Web::Files(_) => format!("https://{host}:{port}"),
-        Web::Proxy => format!("https://{host}"),
-        Web::Loopback => format!("http://{}", choices.http),
+        CertificateSource::Authority | CertificateSource::Files(_) => {
+            format!("https://{host}:{port}")
+        }
+        CertificateSource::Proxy => format!("https://{host}"),
+        CertificateSource::Loopback => format!("http://{}", choices.http),
     }
 }
 
 /// Returns a list of the created files and the next commands. `fingerprint` is that of the fleet's
 /// authority, `is_started` whether the server runs.
 pub(crate) fn next_steps(choices: &Choices, fingerprint: Option<&str>, is_started: bool) -> String {
-    let config = word(&choices.config.display().to_string());
-    let token = word(&choices.token_file.display().to_string());
+    let config = shell_quoted(&choices.config.display().to_string());
+    let token = shell_quoted(&choices.token_file.display().to_string());
     let server = server(choices);
     let trust = match (&choices.web, fingerprint) {
-        (Web::Authority, Some(fingerprint)) => format!(" --ca-fingerprint {fingerprint}"),
+        (CertificateSource::Authority, Some(fingerprint)) => {
+            format!(" --ca-fingerprint {fingerprint}")
+        }
         (_, _) => String::new(),
     };
     let start = if is_started {
@@ -54,7 +58,7 @@ pub(crate) fn next_steps(choices: &Choices, fingerprint: Option<&str>, is_starte
         "configuration  {config}\n\
          data           {}\n\
          admin's token  {token} (mode 0600)\n",
-        word(&choices.data_dir.display().to_string()),
+        shell_quoted(&choices.data_dir.display().to_string()),
     );
     if let Some(fingerprint) = fingerprint {
         let _ = writeln!(text, "authority      SHA-256 {fingerprint}");

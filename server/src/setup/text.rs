@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 use std::path::Path;
 
-use super::choices::{Choices, Web};
+use super::choices::{CertificateSource, Choices};
 
 /// Returns a text as a basic string of TOML, which has the same escapes as JSON.
 fn quoted(text: &str) -> String {
@@ -35,11 +35,11 @@ pub(super) fn toml(choices: &Choices) -> String {
         quoted(choices.site.as_str()),
     );
     match &choices.web {
-        Web::Authority => text.push_str(
+        CertificateSource::Authority => text.push_str(
             "\n[tls]\n# The fleet's authority issues the certificate, and another one in time.\n\
              authority = true\n",
         ),
-        Web::Files(files) => {
+        CertificateSource::Files(files) => {
             let _ = write!(
                 text,
                 "\n[tls]\ncertificate = {}\nkey = {}\n",
@@ -47,20 +47,20 @@ pub(super) fn toml(choices: &Choices) -> String {
                 path(&files.key)
             );
         }
-        Web::Proxy | Web::Loopback => {}
+        CertificateSource::Proxy | CertificateSource::Loopback => {}
     }
     match &choices.web {
-        Web::Proxy => {
+        CertificateSource::Proxy => {
             let _ = write!(
                 text,
                 "\n[web]\nhosts = {}\nbehind_https = true\ntrusted_proxies = [\"127.0.0.1\", \"::1\"]\n",
                 list(&choices.names)
             );
         }
-        Web::Authority | Web::Files(_) => {
+        CertificateSource::Authority | CertificateSource::Files(_) => {
             let _ = write!(text, "\n[web]\nhosts = {}\n", list(&choices.names));
         }
-        Web::Loopback => {}
+        CertificateSource::Loopback => {}
     }
     if choices.has_authority() {
         let _ = write!(

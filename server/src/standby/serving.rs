@@ -199,7 +199,7 @@ async fn serve_with(
     let run = |serving| http::serve::run(serving, app.clone(), supervisor.clone(), stop());
     if let Some(tls) = tls {
         let stop = stop();
-        let keeping = async move { http::tls::keep(&tls, stop, |_tls| {}).await };
+        let keeping = async move { http::tls::reload_periodically(&tls, stop, |_tls| {}).await };
         supervisor.spawn_vital_unwatched("certificate", keeping);
     }
     let of_other = config.clone();

@@ -154,7 +154,7 @@ impl Sender {
         };
         match request.send().await {
             Ok(answer) => judge(answer).await,
-            Err(error) => Attempt::without_answer(&why(error)),
+            Err(error) => Attempt::without_answer(&failure_text(error)),
         }
     }
 
@@ -228,7 +228,7 @@ impl Sender {
         let built = tokio::task::spawn_blocking(move || builder.build()).await;
         match built {
             Ok(Ok(client)) => Ok(client),
-            Ok(Err(error)) => Err(why(error)),
+            Ok(Err(error)) => Err(failure_text(error)),
             Err(_panic) => Err("the HTTP client cannot be created".to_owned()),
         }
     }
@@ -274,7 +274,7 @@ async fn said(status: StatusCode, mut answer: Response) -> String {
 }
 
 /// Returns why a request failed, with all causes and without the URL, whose path may be secret.
-fn why(error: reqwest::Error) -> String {
+fn failure_text(error: reqwest::Error) -> String {
     let is_timeout = error.is_timeout();
     let error = error.without_url();
     let mut text = error.to_string();

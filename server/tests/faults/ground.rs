@@ -16,7 +16,7 @@ use tread_api::wire::hello::Hello;
 use tread_api::wire::ingest::{Batch, Receipt, Record, RecordContent};
 use tread_api::wire::{Refusal, RefusalCode};
 use tread_samples::rover;
-use tread_server::app::friction::{Area, Asked, CellsAsked};
+use tread_server::app::friction::{Area, CellsAsked, ReadingParameters};
 use tread_server::app::ingest::{Upload, Writer};
 use tread_server::app::{App, AppError};
 use tread_server::clock::Clock;
@@ -206,9 +206,9 @@ impl Ground {
                 cursor: None,
                 limit: 1_000,
             };
-            let asked = Asked {
+            let asked = ReadingParameters {
                 as_of,
-                ..Asked::default()
+                ..ReadingParameters::default()
             };
             let page = app.friction_of_cells(&self.site, &asked, cells).await;
             said.push(page.unwrap().items);

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use futures_util::future::join_all;
 use tread_api::identity::{CreateToken, Role};
-use tread_server::app::identity::Shown;
+use tread_server::app::identity::CredentialKind;
 use tread_server::connections::Purpose;
 
 use crate::ground::Ground;
@@ -34,7 +34,7 @@ pub(crate) fn disk(interposer: &Interposer) -> Pin<Box<dyn Future<Output = ()> +
         let request = CreateToken::of_role("desk", Role::Operator);
         let created = app.create_token(request, "a test").await.unwrap();
         let ask = async || {
-            app.authenticate(HERE, &created.secret, Shown::Token, Purpose::Other)
+            app.authenticate(HERE, &created.secret, CredentialKind::Token, Purpose::Other)
                 .await
         };
         ask().await.unwrap();

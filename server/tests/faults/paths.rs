@@ -25,7 +25,7 @@ use tread_server::db::idempotency::StoredAnswer;
 use tread_server::db::missions::{Facts, Transition};
 use tread_server::db::restorations::Restoration;
 use tread_server::db::robots::Introduction;
-use tread_server::db::sessions::{NewSession, OfPeople, Owner, SignedIn};
+use tread_server::db::sessions::{NewSession, Owner, PeopleSessionFilter, SignedIn};
 use tread_server::db::webhooks::{AgeLimit, NewDelivery, Outcome};
 use tread_server::db::withdrawals::{Hours, WithdrawalRow};
 use tread_server::db::{self, RecordKey};
@@ -216,7 +216,7 @@ pub(crate) const PATHS: &[WritePath] = &[
                     plan_hash: of(json!(format!("{number:032x}"))),
                     trajectory: mission(&ground.site, &ground.robot).trajectory,
                 };
-                db::missions::want_pause(tx, id, number % 2 == 0).await?;
+                db::missions::set_pause_wanted(tx, id, number % 2 == 0).await?;
                 db::missions::set_replacement(tx, id, Some(&replacement)).await?;
                 db::missions::swap_content(tx, id, 1, &replacement).await?;
                 db::missions::set_silence(tx, id, Some(now())).await?;
@@ -422,9 +422,9 @@ pub(crate) const PATHS: &[WritePath] = &[
                 db::stops::insert(tx, std::slice::from_ref(&stop), STOPS_KEPT).await?;
                 db::stops::adopt(tx, ground.robot_pk, &stop, STOPS_KEPT).await?;
                 db::stops::confirm(tx, &[stop.id], now()).await?;
-                db::stops::stand(tx, stop.id, now()).await?;
+                db::stops::record_standstill(tx, stop.id, now()).await?;
                 db::stops::unconfirm(tx, stop.id).await?;
-                db::stops::ask_clear(tx, stop.id, "a test", now()).await?;
+                db::stops::request_clear(tx, stop.id, "a test", now()).await?;
                 db::stops::refuse_clear(tx, stop.id).await?;
                 db::stops::clear(tx, stop.id, now()).await?;
                 db::stops::end(tx, stop.id, now()).await
@@ -486,7 +486,7 @@ pub(crate) const PATHS: &[WritePath] = &[
                     created_at: now(),
                     expires_at: later(),
                 };
-                let filter = OfPeople {
+                let filter = PeopleSessionFilter {
                     issuer,
                     within: &["operators"],
                     elsewhere: &[],
@@ -537,7 +537,7 @@ pub(crate) const PATHS: &[WritePath] = &[
                 }));
                 let secret = fingerprint(Kind::Join, number);
                 db::join_tokens::insert(tx, &token, &secret).await?;
-                db::join_tokens::use_up(tx, token.id, &ground.robot, now()).await?;
+                db::join_tokens::consume(tx, token.id, &ground.robot, now()).await?;
                 db::join_tokens::revoke(tx, token.id, now()).await?;
                 db::join_tokens::delete_ended(tx, LONG_AGO, 10).await?;
                 let enrolment = of(json!({

@@ -8,7 +8,7 @@ use std::time::Duration;
 use tread_api::friction::CreateWithdrawal;
 use tread_api::identity::{CreateToken, Role};
 use tread_server::app::AppError;
-use tread_server::app::identity::{Shown, SignInError};
+use tread_server::app::identity::{CredentialKind, SignInError};
 use tread_server::config::RetentionConfig;
 use tread_server::connections::Purpose;
 
@@ -172,7 +172,7 @@ pub(crate) fn revoked(interposer: &Interposer) -> Pin<Box<dyn Future<Output = ()
             let request = CreateToken::of_role("desk", Role::Operator);
             let created = app.create_token(request, "a test").await.unwrap();
             let ask = async || {
-                app.authenticate(HERE, &created.secret, Shown::Token, Purpose::Other)
+                app.authenticate(HERE, &created.secret, CredentialKind::Token, Purpose::Other)
                     .await
             };
             let known = ask().await.unwrap();

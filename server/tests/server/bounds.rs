@@ -417,7 +417,9 @@ async fn a_stop_does_not_stand_before_it_was_confirmed_in_whatever_order_that_is
     db::stops::confirm(&mut tx, &[stop.id], at("09"))
         .await
         .unwrap();
-    db::stops::stand(&mut tx, stop.id, at("05")).await.unwrap();
+    db::stops::record_standstill(&mut tx, stop.id, at("05"))
+        .await
+        .unwrap();
     let kept = db::stops::find(&mut tx, stop.id).await.unwrap().unwrap();
     assert_eq!(kept.standing_at, Some(at("09")));
 }

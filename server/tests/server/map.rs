@@ -11,7 +11,7 @@ use tread_api::page::{MapPage, Page};
 use tread_api::robot::Robot as ShownRobot;
 use tread_api::wire::ingest::{Batch, Receipt, Record};
 use tread_server::app::App;
-use tread_server::app::friction::{Area, Asked, CellsAsked};
+use tread_server::app::friction::{Area, CellsAsked, ReadingParameters};
 use tread_server::app::ingest::Upload;
 use tread_server::config::{FrictionConfig, StorageConfig};
 use tread_server::friction::epoch_h;
@@ -262,7 +262,7 @@ pub(crate) async fn said(app: &App) -> MapPage<CellFriction> {
         cursor: None,
         limit: 1_000,
     };
-    let asked = Asked::default();
+    let asked = ReadingParameters::default();
     app.friction_of_cells(&site(), &asked, cells).await.unwrap()
 }
 

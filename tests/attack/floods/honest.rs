@@ -142,7 +142,7 @@ impl Honest {
     }
 }
 
-type Begun = (Shared, Arc<AtomicBool>);
+type SharedState = (Shared, Arc<AtomicBool>);
 
 /// When something is to be done again, until it is over.
 struct Rounds {
@@ -186,7 +186,7 @@ async fn ask_anew(http: SocketAddr, request: &str) -> anyhow::Result<(u16, Value
 }
 
 /// The operator stops the honest robot, each time over a new connection.
-async fn stop(http: SocketAddr, operator: String, (worked, is_over): Begun) {
+async fn stop(http: SocketAddr, operator: String, (worked, is_over): SharedState) {
     let request = format!(
         "POST /v1/sites/{SITE}/robots/{HONEST_ROBOT}/stop HTTP/1.1\r\nhost: {http}\r\n\
          authorization: Bearer {operator}\r\nconnection: close\r\ncontent-length: 0\r\n\r\n"
@@ -216,7 +216,7 @@ async fn stop(http: SocketAddr, operator: String, (worked, is_over): Begun) {
 }
 
 /// The operator looks at the honest robot.
-async fn look(rest: Rest, (worked, is_over): Begun) {
+async fn look(rest: Rest, (worked, is_over): SharedState) {
     let path = format!("/v1/sites/{SITE}/robots/{HONEST_ROBOT}");
     let mut rounds = Rounds::new(LOOK_EVERY, is_over);
     while rounds.next().await.is_some() {
@@ -232,7 +232,7 @@ async fn look(rest: Rest, (worked, is_over): Begun) {
 }
 
 /// The operator's other work: missions, lists, a drive socket.
-async fn work(http: SocketAddr, operator: String, (worked, is_over): Begun) {
+async fn work(http: SocketAddr, operator: String, (worked, is_over): SharedState) {
     let rest = Rest::new(format!("http://{http}"), &operator);
     let mut rounds = Rounds::new(WORK_EVERY, is_over);
     while let Some(number) = rounds.next().await {
@@ -287,7 +287,7 @@ async fn do_work(http: SocketAddr, operator: &str, rest: &Rest, number: u64) -> 
 }
 
 /// The quiet robot introduces itself.
-async fn say_hello(robot: Arc<LightRobot>, (worked, is_over): Begun) {
+async fn say_hello(robot: Arc<LightRobot>, (worked, is_over): SharedState) {
     let mut rounds = Rounds::new(HELLO_EVERY, is_over);
     while rounds.next().await.is_some() {
         let begun = Instant::now();
@@ -302,7 +302,7 @@ async fn say_hello(robot: Arc<LightRobot>, (worked, is_over): Begun) {
 }
 
 /// The admin makes tokens and revokes them, each another one.
-async fn change(rest: Rest, every: Duration, (worked, is_over): Begun) {
+async fn change(rest: Rest, every: Duration, (worked, is_over): SharedState) {
     let mut rounds = Rounds::new(every, is_over);
     let mut made: Option<String> = None;
     while let Some(number) = rounds.next().await {

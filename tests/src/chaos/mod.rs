@@ -18,7 +18,7 @@ use crate::fleet::Fleet;
 use crate::light_robot::now;
 use crate::random::Random;
 use crate::relay::Relay;
-use plan::{Action, Asked, RunPlan};
+use plan::{Action, PlannedMission, RunPlan};
 
 /// Longest time for every mission to end once nothing is broken any more.
 const END_WAIT_MAX: Duration = Duration::from_secs(90);
@@ -68,7 +68,7 @@ pub struct RunReport {
 /// A mission of a run and what was asked of it.
 #[derive(Debug)]
 struct Followed {
-    asked: Asked,
+    asked: PlannedMission,
     id: MissionId,
     is_cancel_asked: bool,
 }

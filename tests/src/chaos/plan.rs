@@ -19,7 +19,7 @@ pub(super) const LOST_AFTER_S: f64 = 2.0;
 
 /// A mission of a run.
 #[derive(Debug, Clone)]
-pub(super) struct Asked {
+pub(super) struct PlannedMission {
     /// The body of its request.
     pub(super) body: Value,
     /// Whether its robot stops when the server is silent.
@@ -55,7 +55,7 @@ pub(super) enum Action {
 /// A whole run.
 #[derive(Debug, Clone)]
 pub(super) struct RunPlan {
-    pub(super) missions: Vec<Asked>,
+    pub(super) missions: Vec<PlannedMission>,
     /// By their times from the first request.
     pub(super) actions: Vec<(Duration, Action)>,
 }
@@ -72,7 +72,7 @@ pub(super) fn path(random: &mut Random) -> Value {
     ]}})
 }
 
-fn asked(random: &mut Random, robot: &str, now: jiff::Timestamp) -> Asked {
+fn asked(random: &mut Random, robot: &str, now: jiff::Timestamp) -> PlannedMission {
     let mut body = json!({
         "site": crate::fleet::SITE, "robot": robot, "trajectory": path(random),
     });
@@ -89,7 +89,7 @@ fn asked(random: &mut Random, robot: &str, now: jiff::Timestamp) -> Asked {
         let latest = now + Duration::from_secs_f64(random.between(2.5..12.0));
         body["latest_start"] = json!(latest);
     }
-    Asked {
+    PlannedMission {
         body,
         is_server_silent_too_long,
         is_soon_lost,

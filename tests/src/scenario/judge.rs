@@ -79,7 +79,7 @@ pub fn holds(known: &FusedFriction, truth: f64) -> bool {
 
 /// A terrain's estimate as a whole.
 #[derive(Debug, Clone)]
-pub struct Whole {
+pub struct TerrainEstimate {
     /// The terrain.
     pub terrain: String,
     /// The robot model.
@@ -93,7 +93,7 @@ pub fn map_figures(
     scenario: &Scenario,
     at: Duration,
     cells: &[(&'static str, CellFriction)],
-    wholes: &[Whole],
+    wholes: &[TerrainEstimate],
 ) -> MapFigures {
     let mut grounds: BTreeMap<(String, &'static str), Vec<&FusedFriction>> = BTreeMap::new();
     for (model, cell) in cells {
@@ -131,7 +131,7 @@ pub fn map_figures(
         let whole = wholes
             .iter()
             .find(|whole| (&whole.terrain, whole.model) == (&line.terrain, line.model));
-        if let Some(Whole { friction, .. }) = whole {
+        if let Some(TerrainEstimate { friction, .. }) = whole {
             line.theta = Some(friction.theta);
             line.low_95 = Some(friction.theta_low_95);
             line.high_95 = Some(friction.theta_high_95);

@@ -24,8 +24,10 @@ use tread_api::robot::Alert;
 use tread_api::site::Cell;
 use tread_control::geometry::Pose;
 
-use super::judge::{MapFigures, Stopping, Tracking, Whole, map_figures, stopping, tracking};
-use super::report::{Arrival, IcePass, Learned, Report, Size};
+use super::judge::{
+    MapFigures, Stopping, TerrainEstimate, Tracking, map_figures, stopping, tracking,
+};
+use super::report::{Arrival, FleetMap, IcePass, Report, Size};
 use super::world::{Entry, PACE, World};
 use super::yard::{self, FORD, ICE_AFTER_S, Kind, Row};
 use crate::random::Random;
@@ -61,7 +63,10 @@ pub async fn run(size: Size) -> anyhow::Result<Report> {
 ///
 /// # Errors
 /// Something did not come to its end.
-pub async fn learn_and_arrive(size: Size, torque: bool) -> anyhow::Result<(Learned, Vec<Arrival>)> {
+pub async fn learn_and_arrive(
+    size: Size,
+    torque: bool,
+) -> anyhow::Result<(FleetMap, Vec<Arrival>)> {
     let mut random = Random::new(size.seed);
     let home: SiteId = SITE.parse()?;
     let mut scenario = yard::ground(&home)?;
@@ -120,7 +125,7 @@ async fn learn(
     scenario: &Scenario,
     fleet: &[(Kind, Entry)],
     (size, torque): (Size, bool),
-) -> anyhow::Result<Learned> {
+) -> anyhow::Result<FleetMap> {
     let began = world.now();
     let mut missions = Vec::new();
     let mut number = 0;
@@ -143,7 +148,7 @@ async fn learn(
         "the fleet was still driving when the ford froze, {now:?} after the begin"
     );
     let gains = ended.iter().filter_map(gain_of);
-    Ok(Learned {
+    Ok(FleetMap {
         torque,
         before: figures_of(world, scenario, |_| true).await,
         driven_s: now.saturating_sub(began).as_secs_f64(),
@@ -195,14 +200,14 @@ async fn figures_of(
         terrain.models.into_iter().filter_map(move |known| {
             let mut kinds = Kind::ALL.into_iter();
             let kind = kinds.find(|kind| kind.model().configuration() == known.configuration)?;
-            Some(Whole {
+            Some(TerrainEstimate {
                 terrain: id.clone(),
                 model: kind.name(),
                 friction: known.friction?,
             })
         })
     });
-    let wholes: Vec<Whole> = wholes.collect();
+    let wholes: Vec<TerrainEstimate> = wholes.collect();
     map_figures(scenario, world.now(), &cells, &wholes)
 }
 
@@ -221,7 +226,7 @@ async fn freeze(
     world: &World,
     scenario: &Scenario,
     fleet: &[(Kind, Entry)],
-    learned: &mut Learned,
+    learned: &mut FleetMap,
 ) -> anyhow::Result<()> {
     world
         .pass_until(Duration::from_secs_f64(ICE_AFTER_S) + Duration::from_secs(1))

@@ -39,7 +39,7 @@ pub struct IcePass {
 
 /// What one fleet has made of the site.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Learned {
+pub struct FleetMap {
     /// Whether its robots measure wheel torque.
     pub torque: bool,
     /// The map before the ice.
@@ -77,7 +77,7 @@ pub struct Report {
     /// How large it was.
     pub size: Size,
     /// With wheel torque, and without.
-    pub learned: Vec<Learned>,
+    pub learned: Vec<FleetMap>,
     /// Robots that arrived.
     pub arrivals: Vec<Arrival>,
 }
@@ -156,7 +156,7 @@ impl Report {
     }
 }
 
-impl Learned {
+impl FleetMap {
     /// What must hold of one fleet's map.
     pub fn checks(&self) -> Vec<Check> {
         let (cells, alarms) = if self.torque {

@@ -53,7 +53,7 @@ pub struct Entry {
 
 /// A robot at work.
 #[derive(Debug)]
-struct AtWork {
+struct ActiveRobot {
     agent: RunningAgent,
     trace: Trace,
 }
@@ -66,7 +66,7 @@ pub struct World {
     time: PacedTime,
     folder: TempDir,
     server: RunningServer,
-    robots: BTreeMap<(SiteId, RobotId), AtWork>,
+    robots: BTreeMap<(SiteId, RobotId), ActiveRobot>,
 }
 
 impl World {
@@ -181,7 +181,7 @@ impl World {
             let agent = Agent::start_with_clock(config, clock)
                 .with_context(|| format!("the agent of {robot}"))?;
             let key = (site.clone(), robot.clone());
-            self.robots.insert(key, AtWork { agent, trace });
+            self.robots.insert(key, ActiveRobot { agent, trace });
         }
         for Entry { robot, .. } in entries {
             let path = format!("/v1/sites/{}/robots/{robot}", scenario.site);

@@ -10,7 +10,7 @@ use tread_api::friction::{
 use tread_api::site::Cell;
 use tread_api::terrain::TerrainRef;
 
-use crate::client::{Known, MapTimes};
+use crate::client::{MapTimes, TimedEntries};
 use crate::commands::terrains::class_name;
 use crate::output::{age, fixed, or_dash, render, signed, table};
 
@@ -162,7 +162,7 @@ fn ground_at(Cell { ix, iy }: Cell, terrain: Option<&TerrainRef>) -> String {
     format!("cell {ix}, {iy}; {ground}")
 }
 
-pub(super) fn cells(Known { items, of }: &Known<CellFriction>) -> String {
+pub(super) fn cells(TimedEntries { items, of }: &TimedEntries<CellFriction>) -> String {
     if items.is_empty() {
         return of_time(*of, "no cell has been measured there yet");
     }
@@ -233,7 +233,7 @@ fn is_sure(friction: &FusedFriction) -> bool {
     friction.std_dev < friction.theta
 }
 
-pub(super) fn differences(Known { items, of }: &Known<CellDifference>) -> String {
+pub(super) fn differences(TimedEntries { items, of }: &TimedEntries<CellDifference>) -> String {
     if items.is_empty() {
         return of_time(*of, "no measurements there between these times");
     }
@@ -365,7 +365,7 @@ mod tests {
             "configuration": "8c8722f3-7240-59d0-bde2-495b2d9205b8", "z_score": null,
         }))
         .unwrap();
-        let known = Known {
+        let known = TimedEntries {
             items: vec![cell],
             of: MapTimes::default(),
         };

@@ -11,7 +11,7 @@ use tread_api::ids::{RobotId, SiteId};
 use crate::client::{Client, ClientError};
 
 /// Maximum number of news in the queue; while it is full, the stream is not read.
-pub(super) const NEWS_MAX: usize = 256;
+pub(super) const MESSAGES_MAX: usize = 256;
 /// Time before the stream is reopened.
 const REOPEN_REST: Duration = Duration::from_secs(1);
 /// Silence after which a stream counts as interrupted; the server sends something every 15 s.
@@ -20,9 +20,9 @@ const SILENCE_MAX: Duration = Duration::from_secs(45);
 /// number of waypoints. A longer event interrupts the stream.
 const LINE_MAX: usize = 32 * 1024 * 1024;
 
-/// News from the event stream.
+/// Message from the event stream.
 #[derive(Debug)]
-pub(super) enum News {
+pub(super) enum FeedMessage {
     /// The stream is open.
     Opened,
     /// An event was received.
@@ -60,7 +60,7 @@ impl<'client> Feed<'client> {
     ///
     /// # Errors
     /// The stream could not be opened at the first attempt, or the server refused it.
-    pub(super) async fn run(mut self, to: mpsc::Sender<News>) -> anyhow::Result<()> {
+    pub(super) async fn run(mut self, to: mpsc::Sender<FeedMessage>) -> anyhow::Result<()> {
         while !to.is_closed() {
             match self.follow(&to).await {
                 Ok(()) => {}
@@ -71,7 +71,7 @@ impl<'client> Feed<'client> {
                         return Err(error);
                     }
                     // The receiver may be dropped by now.
-                    _ = to.send(News::Lost(format!("{error:#}"))).await;
+                    _ = to.send(FeedMessage::Lost(format!("{error:#}"))).await;
                 }
             }
             tokio::time::sleep(REOPEN_REST).await;
@@ -80,12 +80,12 @@ impl<'client> Feed<'client> {
     }
 
     /// Receives the events of one stream until it is interrupted. Returns only with an error.
-    async fn follow(&mut self, to: &mpsc::Sender<News>) -> anyhow::Result<()> {
+    async fn follow(&mut self, to: &mpsc::Sender<FeedMessage>) -> anyhow::Result<()> {
         let last = self.last.clone();
         let opening = self.client.events(self.site, self.robot, last.as_deref());
         let mut stream = opening.await?;
         self.was_open = true;
-        _ = to.send(News::Opened).await;
+        _ = to.send(FeedMessage::Opened).await;
         let mut text = Vec::new();
         loop {
             let chunk = timeout(SILENCE_MAX, stream.chunk()).await;
@@ -104,7 +104,7 @@ impl<'client> Feed<'client> {
                     self.last = id;
                 }
                 if let Some(event) = event {
-                    _ = to.send(News::Event(event)).await;
+                    _ = to.send(FeedMessage::Event(event)).await;
                 }
             }
         }
@@ -122,12 +122,12 @@ fn read(client: &Client, block: &str) -> (Option<String>, Option<Box<Event>>) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::client::Trusted;
+    use crate::client::TrustAnchor;
 
     #[test]
     fn an_event_is_read_with_its_id_and_what_is_not_known_is_passed_over() {
         let _first = rustls::crypto::ring::default_provider().install_default();
-        let client = Client::new("http://127.0.0.1:1", None, Trusted::System).unwrap();
+        let client = Client::new("http://127.0.0.1:1", None, TrustAnchor::System).unwrap();
         let end = "event: snapshot_end\ndata: \"snapshot_end\"\nid: 5-7\n\n";
         let (id, event) = read(&client, end);
         assert_eq!(id.as_deref(), Some("5-7"));

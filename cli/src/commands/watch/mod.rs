@@ -5,10 +5,10 @@
 //! where it ended, so that no event is missed; the interruption is reported.
 
 mod feed;
-mod known;
 mod lines;
 mod picture;
 mod screen;
+mod site_state;
 mod view;
 
 use std::io::{self, IsTerminal as _};
@@ -17,7 +17,7 @@ use std::process::ExitCode;
 use tokio::sync::mpsc;
 use tread_api::event::{Event, StreamEnd};
 
-use self::feed::{Feed, NEWS_MAX, News};
+use self::feed::{Feed, FeedMessage, MESSAGES_MAX};
 use self::lines::Lines;
 use self::screen::Screen;
 use crate::args::WatchArguments;
@@ -32,14 +32,14 @@ pub(super) async fn run(
 ) -> anyhow::Result<ExitCode> {
     let site = &arguments.connection.site;
     let feed = Feed::new(client, site, arguments.robot.as_ref());
-    let (to, news) = mpsc::channel(NEWS_MAX);
+    let (to, messages) = mpsc::channel(MESSAGES_MAX);
     let in_terminal = io::stdout().is_terminal() && io::stdin().is_terminal();
     let mut signals = ShutdownSignals::listen()?;
     let shown = async {
         if output.is_json() || arguments.lines || !in_terminal {
-            print(news, output).await
+            print(messages, output).await
         } else {
-            Screen::new(arguments, client).run(news).await
+            Screen::new(arguments, client).run(messages).await
         }
     };
     tokio::select! {
@@ -51,13 +51,13 @@ pub(super) async fn run(
 }
 
 /// Prints news until the sender is dropped.
-async fn print(mut news: mpsc::Receiver<News>, output: Output) -> anyhow::Result<()> {
+async fn print(mut messages: mpsc::Receiver<FeedMessage>, output: Output) -> anyhow::Result<()> {
     let mut lines = Lines::default();
-    while let Some(news) = news.recv().await {
-        match news {
-            News::Opened => {}
-            News::Lost(why) => print_note(&format!("{why}; trying again")),
-            News::Event(event) => {
+    while let Some(message) = messages.recv().await {
+        match message {
+            FeedMessage::Opened => {}
+            FeedMessage::Lost(why) => print_note(&format!("{why}; trying again")),
+            FeedMessage::Event(event) => {
                 if let Event::End(end) = &*event {
                     print_note(ended(*end));
                 }

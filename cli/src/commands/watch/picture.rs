@@ -10,7 +10,7 @@ use tread_api::mission::{Mission, MissionState};
 use tread_api::robot::{LinkState, MissionProgress, Robot, RobotLive, RobotMode, Severity};
 use tread_api::safety::StandingState;
 
-use super::known::Known;
+use super::site_state::SiteState;
 use super::view::{Order, Section, View};
 use crate::commands::mission_text::{state, trajectory};
 use crate::commands::robots::{details, link_name, mode_name, steps_come, theta};
@@ -38,7 +38,7 @@ const KEYS: &str =
 pub(super) struct Picture<'screen> {
     pub(super) site: &'screen SiteId,
     pub(super) address: &'screen str,
-    pub(super) known: &'screen Known,
+    pub(super) known: &'screen SiteState,
     pub(super) shown: &'screen View,
 }
 
@@ -406,7 +406,7 @@ mod tests {
         serde_json::from_value(robot).expect("a robot")
     }
 
-    fn picture(known: &Known, width: u16, height: u16) -> String {
+    fn picture(known: &SiteState, width: u16, height: u16) -> String {
         let mut terminal = Terminal::new(TestBackend::new(width, height)).expect("a screen");
         let site = "yard".parse().expect("a site");
         let picture = Picture {
@@ -423,7 +423,7 @@ mod tests {
 
     #[test]
     fn every_robot_is_shown_on_any_screen_and_a_tiny_one_breaks_nothing() {
-        let mut known = Known::default();
+        let mut known = SiteState::default();
         known.take(robot("rover-1", "online"));
         known.take(robot("rover-2", "offline"));
         assert!(picture(&known, 100, 20).contains("reading"));

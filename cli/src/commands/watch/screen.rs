@@ -15,9 +15,9 @@ use tread_api::ids::{AlertId, RobotId, SiteId};
 use tread_api::stop::StopRobot;
 
 use super::ended;
-use super::feed::News;
-use super::known::Known;
+use super::feed::FeedMessage;
 use super::picture::{Picture, draw};
+use super::site_state::SiteState;
 use super::view::{Order, Section, View};
 use crate::args::WatchArguments;
 use crate::client::Client;
@@ -39,7 +39,7 @@ pub(super) struct Screen<'client> {
     client: &'client Client,
     site: &'client SiteId,
     every: Duration,
-    known: Known,
+    known: SiteState,
     shown: View,
     /// Requests without an answer yet.
     asked: FuturesUnordered<BoxFuture<'client, String>>,
@@ -60,17 +60,20 @@ impl<'client> Screen<'client> {
             client,
             site: &arguments.connection.site,
             every: arguments.every,
-            known: Known::default(),
+            known: SiteState::default(),
             shown: View::default(),
             asked: FuturesUnordered::new(),
         }
     }
 
     /// Shows news and handles keys until the user quits.
-    pub(super) async fn run(mut self, mut news: mpsc::Receiver<News>) -> anyhow::Result<()> {
+    pub(super) async fn run(
+        mut self,
+        mut messages: mpsc::Receiver<FeedMessage>,
+    ) -> anyhow::Result<()> {
         // The screen begins with the first news, so that a connection error is printed in the
         // normal terminal.
-        let Some(first) = news.recv().await else {
+        let Some(first) = messages.recv().await else {
             return Ok(());
         };
         self.take(first);
@@ -81,7 +84,7 @@ impl<'client> Screen<'client> {
         ticks.set_missed_tick_behavior(MissedTickBehavior::Skip);
         let ended = loop {
             tokio::select! {
-                next = news.recv() => match next {
+                next = messages.recv() => match next {
                     Some(next) => self.take(next),
                     None => break Ok(()),
                 },
@@ -117,11 +120,11 @@ impl<'client> Screen<'client> {
         ended
     }
 
-    fn take(&mut self, news: News) {
-        match news {
-            News::Opened => self.shown.lost = None,
-            News::Lost(why) => self.shown.lost = Some(why),
-            News::Event(event) => {
+    fn take(&mut self, message: FeedMessage) {
+        match message {
+            FeedMessage::Opened => self.shown.lost = None,
+            FeedMessage::Lost(why) => self.shown.lost = Some(why),
+            FeedMessage::Event(event) => {
                 if let Event::End(end) = &*event {
                     self.shown.lost = Some(ended(*end).to_owned());
                 }

@@ -2,7 +2,7 @@
 
 use tread_api::robot::{Alert, LinkState, Robot};
 
-use super::known::Known;
+use super::site_state::SiteState;
 
 /// Table to which the keys apply.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -49,7 +49,7 @@ pub(super) struct View {
 
 impl View {
     /// Returns the identifiers in a section, in their order.
-    fn listed(&self, known: &Known, section: Section) -> Vec<String> {
+    fn listed(&self, known: &SiteState, section: Section) -> Vec<String> {
         match section {
             Section::Robots => {
                 let robots = self.robots(known).into_iter();
@@ -67,14 +67,14 @@ impl View {
     }
 
     /// Returns the selected row of a section; the first one if nothing is selected.
-    pub(super) fn row(&self, known: &Known, section: Section) -> usize {
+    pub(super) fn row(&self, known: &SiteState, section: Section) -> usize {
         let selected = self.selected[section as usize].as_ref();
         let listed = self.listed(known, section);
         let at = listed.iter().position(|id| Some(id) == selected);
         at.unwrap_or_default()
     }
 
-    pub(super) fn move_by(&mut self, known: &Known, rows: isize) {
+    pub(super) fn move_by(&mut self, known: &SiteState, rows: isize) {
         let listed = self.listed(known, self.section);
         let row = self.row(known, self.section).saturating_add_signed(rows);
         let row = row.min(listed.len().saturating_sub(1));
@@ -83,7 +83,7 @@ impl View {
 
     /// Fixes the selection to the objects that are drawn as selected, so that it follows them when
     /// rows move.
-    pub(super) fn mark(&mut self, known: &Known) {
+    pub(super) fn mark(&mut self, known: &SiteState) {
         if !known.is_whole() {
             // Rows are still missing.
             return;
@@ -96,16 +96,16 @@ impl View {
     }
 
     /// Returns the robots in the chosen order.
-    pub(super) fn robots<'known>(&self, known: &'known Known) -> Vec<&'known Robot> {
+    pub(super) fn robots<'known>(&self, known: &'known SiteState) -> Vec<&'known Robot> {
         let mut robots: Vec<&Robot> = known.robots().collect();
         if self.order == Order::Trouble {
-            robots.sort_by_key(|robot| std::cmp::Reverse(trouble(robot)));
+            robots.sort_by_key(|robot| std::cmp::Reverse(severity_rank(robot)));
         }
         robots
     }
 
     /// Returns the selected robot.
-    pub(super) fn robot<'known>(&self, known: &'known Known) -> Option<&'known Robot> {
+    pub(super) fn robot<'known>(&self, known: &'known SiteState) -> Option<&'known Robot> {
         let selected = self.selected[Section::Robots as usize].as_deref();
         known
             .robots()
@@ -118,7 +118,7 @@ impl View {
     }
 
     /// Returns the selected alert.
-    pub(super) fn alert<'known>(&self, known: &'known Known) -> Option<&'known Alert> {
+    pub(super) fn alert<'known>(&self, known: &'known SiteState) -> Option<&'known Alert> {
         let selected = self.selected[Section::Alerts as usize].as_deref();
         let mut alerts = known.alerts().into_iter();
         alerts.find(|alert| Some(alert.id.to_string().as_str()) == selected)
@@ -126,7 +126,7 @@ impl View {
 }
 
 /// Returns a score of how much a robot needs attention; higher comes first.
-fn trouble(robot: &Robot) -> u8 {
+fn severity_rank(robot: &Robot) -> u8 {
     let live = robot.live.as_ref();
     let is_stopped = live.is_some_and(|live| live.safety.stop.is_some() || live.fault.is_some());
     let link = match robot.link {

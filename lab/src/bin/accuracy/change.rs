@@ -22,7 +22,7 @@ const QUIET_S: f64 = 300.0;
 const CHANGES_PER_QUIET: u32 = 4;
 
 /// A change from one ground to another, with the goal of its detection.
-struct Border {
+struct GroundTransition {
     theta_before: f64,
     theta_after: f64,
     has_torque: bool,
@@ -50,18 +50,23 @@ fn twist(time_s: f64) -> Twist {
 
 /// Result of one run.
 #[derive(Debug, Clone, Copy, Default)]
-struct Noticed {
+struct DetectionResult {
     false_alarms: u32,
     /// Time from the change to the alarm, seconds; `None` if the change was missed.
     delay_s: Option<f64>,
 }
 
-fn drive(spec: &RobotSpec, change: Option<FrictionCurve>, duration_s: f64, seed: u64) -> Noticed {
+fn drive(
+    spec: &RobotSpec,
+    change: Option<FrictionCurve>,
+    duration_s: f64,
+    seed: u64,
+) -> DetectionResult {
     let mut robot = SeededRobot::new(*spec, Pose::default(), seed);
     let model = RobotModel::yi2007();
     // The border comes at another place of the bend in each run.
     let border_s = BEFORE_S + 0.37 * f64::from(u32::try_from(seed % 64).unwrap_or(0));
-    let mut found = Noticed::default();
+    let mut found = DetectionResult::default();
     let mut time_s = 0.0;
     while time_s
         < duration_s.max(if change.is_some() {
@@ -99,7 +104,7 @@ pub(crate) fn run(options: &Options) -> Section {
         (0.2, 0.4, false, None),
     ]
     .map(
-        |(theta_before, theta_after, has_torque, delay_max_s)| Border {
+        |(theta_before, theta_after, has_torque, delay_max_s)| GroundTransition {
             theta_before,
             theta_after,
             has_torque,
@@ -143,7 +148,7 @@ fn channel(has_torque: bool) -> &'static str {
 }
 
 fn changes(
-    border: &Border,
+    border: &GroundTransition,
     options: &Options,
     text: &mut String,
     lines: &mut Vec<Value>,

@@ -15,7 +15,7 @@ use tread_control::robot::RobotModel;
 use tread_control::tracking::TrackerConfig;
 
 use crate::report::{Options, Section};
-use simulate::{Case, Knowing, Terrain, simulate};
+use simulate::{Case, Terrain, ThetaSource, simulate};
 
 /// Stiffnesses K of the table.
 const STIFFNESSES: [f64; 5] = [0.5, 1.0, 2.0, 5.0, 20.0];
@@ -99,7 +99,7 @@ fn tuned(heading_1_m: f64) -> Law {
 
 /// Returns the root mean square over `seeds` seeds, from the case's own on, and the maximum of the
 /// cross-track error of one law, metres.
-fn score(case: &Case, seeds: u64, law: Law, knowing: Knowing) -> (f64, f64) {
+fn score(case: &Case, seeds: u64, law: Law, knowing: ThetaSource) -> (f64, f64) {
     let (mut sum, mut most_m) = (0.0, 0.0_f64);
     for seed in case.seed..case.seed + seeds {
         let trace = simulate(
@@ -121,7 +121,7 @@ fn score(case: &Case, seeds: u64, law: Law, knowing: Knowing) -> (f64, f64) {
 /// Returns the scores of the peer with the best of its heading gains for this line.
 fn peer(case: &Case, seeds: u64) -> (f64, f64) {
     PEER_HEADING_GAINS
-        .map(|gain| score(case, seeds, tuned(gain), Knowing::Nothing))
+        .map(|gain| score(case, seeds, tuned(gain), ThetaSource::Nothing))
         .into_iter()
         .fold((f64::INFINITY, f64::INFINITY), |best, found| {
             if found.0 < best.0 { found } else { best }
@@ -135,13 +135,13 @@ fn line(course: &'static str, case: &Case, seeds: u64) -> Line {
     };
     let others = |law, knowing| score(case, seeds, law, knowing);
     let found = [
-        others(Law::Kanayama(raw), Knowing::Nothing),
-        others(Law::Kanayama(KanayamaGains::usual()), Knowing::Nothing),
+        others(Law::Kanayama(raw), ThetaSource::Nothing),
+        others(Law::Kanayama(KanayamaGains::usual()), ThetaSource::Nothing),
         peer(case, seeds),
-        others(Law::Pursuit(PursuitConfig::default()), Knowing::Nothing),
-        others(Law::Yi2007, Knowing::Nothing),
-        others(Law::Shipped(None), Knowing::Nothing),
-        others(Law::Shipped(None), Knowing::Own),
+        others(Law::Pursuit(PursuitConfig::default()), ThetaSource::Nothing),
+        others(Law::Yi2007, ThetaSource::Nothing),
+        others(Law::Shipped(None), ThetaSource::Nothing),
+        others(Law::Shipped(None), ThetaSource::Own),
     ];
     Line {
         course,

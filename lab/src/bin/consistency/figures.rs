@@ -3,7 +3,7 @@
 use tread_control::consistency::{Kind, Subject};
 use tread_lab::report::Check;
 
-use crate::generator::{Fault, Kit, Make, Robot, STEP_S};
+use crate::generator::{Equipment, Fault, Make, Robot, STEP_S};
 
 /// Goal: motion that shows a fault until it is named, in 95 % of the trials, seconds.
 const NAMED_WITHIN_S: f64 = 1.0;
@@ -345,7 +345,7 @@ pub(crate) struct Trial {
 pub(crate) fn trial(case: &Case, make: Make, seed: u64) -> Trial {
     let mut robot = Robot::new(
         seed,
-        Kit {
+        Equipment {
             has_odometry: case.has_odometry,
             has_accelerometer: true,
             meets_ice: false,
@@ -389,7 +389,7 @@ pub(crate) fn trial(case: &Case, make: Make, seed: u64) -> Trial {
 
 /// Findings on a robot without a fault.
 #[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct Quiet {
+pub(crate) struct FaultlessRun {
     /// Number of findings that blame a channel.
     pub(crate) blamed: u32,
     /// Number of findings that wheels and motion disagree, off the ice.
@@ -399,9 +399,9 @@ pub(crate) struct Quiet {
 }
 
 /// Drives without a fault.
-pub(crate) fn quiet(seconds: f64, seed: u64, kit: Kit) -> Quiet {
+pub(crate) fn quiet(seconds: f64, seed: u64, kit: Equipment) -> FaultlessRun {
     let mut robot = Robot::new(seed, kit);
-    let mut quiet = Quiet::default();
+    let mut quiet = FaultlessRun::default();
     let mut standing = [false; Subject::ALL.len()];
     while robot.time_s() < seconds {
         robot.step();
@@ -498,10 +498,10 @@ pub(crate) fn checks(options: &Options) -> Vec<Check> {
         .iter()
         .flat_map(|case| case_checks(case, options))
         .collect();
-    let mut all = Quiet::default();
+    let mut all = FaultlessRun::default();
     let mut ice = 0;
     for hour in 0..options.hours {
-        let kit = Kit {
+        let kit = Equipment {
             has_odometry: hour % 2 == 1,
             has_accelerometer: hour % 4 < 3,
             meets_ice: true,

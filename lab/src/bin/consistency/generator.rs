@@ -52,7 +52,7 @@ pub(crate) enum Fault {
 
 /// Equipment and environment of a robot.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Kit {
+pub(crate) struct Equipment {
     pub(crate) has_odometry: bool,
     pub(crate) has_accelerometer: bool,
     /// Whether it drives onto ice at times.
@@ -72,7 +72,7 @@ pub(crate) enum Make {
 
 /// Parameters of a robot's base, its sensors and its courses.
 #[derive(Debug, Clone, Copy)]
-struct Build {
+struct RobotParameters {
     /// Encoder counts per revolution of a wheel.
     encoder_counts: f64,
     /// Time constant of the base's low-pass filter of the wheel speeds, seconds.
@@ -102,7 +102,7 @@ struct Build {
     low_rad_s: f64,
 }
 
-impl Build {
+impl RobotParameters {
     const USUAL: Self = Self {
         encoder_counts: 2_048.0,
         wheels_filter_s: 0.0,
@@ -183,8 +183,8 @@ const WANDER_S: f64 = 4.0;
 pub(crate) struct Robot {
     pub(crate) model: RobotModel,
     pub(crate) monitor: Monitor,
-    kit: Kit,
-    build: Build,
+    kit: Equipment,
+    build: RobotParameters,
     random: ChaCha8Rng,
     step: u64,
     // What is true.
@@ -222,12 +222,12 @@ pub(crate) struct Robot {
 }
 
 impl Robot {
-    pub(crate) fn new(seed: u64, kit: Kit) -> Self {
+    pub(crate) fn new(seed: u64, kit: Equipment) -> Self {
         let model = RobotModel::yi2007();
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         let build = match kit.make {
-            Make::Usual => Build::USUAL,
-            Make::Other => Build::other(&mut random),
+            Make::Usual => RobotParameters::USUAL,
+            Make::Other => RobotParameters::other(&mut random),
         };
         let mut within = |most: f64| most * (2.0 * random.random::<f64>() - 1.0);
         let track_ratio = 1.0 + within(0.12);

@@ -8,7 +8,7 @@ use std::path::Path;
 use mcap::io::MessageReader;
 use mcap::sans_io::LinearReaderOptions;
 
-use super::{Ended, RawMessage, RecordingError, Take, Topic, unreadable};
+use super::{Ended, MessageHandler, RawMessage, RecordingError, Topic, unreadable};
 
 /// Largest MCAP record that is read, bytes.
 const RECORD_BYTES_MAX: usize = 1 << 30;
@@ -76,7 +76,7 @@ pub(super) fn topics(file: &Path) -> Result<(Vec<Topic>, Option<String>), Record
 pub(super) fn read(
     file: &Path,
     topics: &[&str],
-    take: &mut Take<'_>,
+    take: &mut MessageHandler<'_>,
 ) -> Result<Ended, RecordingError> {
     for message in open(file)? {
         let message = match message {

@@ -130,7 +130,7 @@ pub struct RawMessage<'a> {
 }
 
 /// What a reader does with a message; it may end the reading.
-pub type Take<'t> = dyn FnMut(RawMessage<'_>) -> ControlFlow<()> + 't;
+pub type MessageHandler<'t> = dyn FnMut(RawMessage<'_>) -> ControlFlow<()> + 't;
 
 /// How the reading of a file ended.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -253,7 +253,7 @@ impl Recording {
     pub fn read(
         &self,
         topics: &[&str],
-        take: &mut Take<'_>,
+        take: &mut MessageHandler<'_>,
     ) -> Result<Vec<String>, RecordingError> {
         let mut torn = Vec::new();
         for (file, kind) in &self.files {

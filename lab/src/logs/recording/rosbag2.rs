@@ -6,7 +6,7 @@ use futures_util::TryStreamExt as _;
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 use sqlx::{ConnectOptions as _, Connection as _};
 
-use super::{Ended, RawMessage, RecordingError, Take, Topic};
+use super::{Ended, MessageHandler, RawMessage, RecordingError, Topic};
 
 /// First bytes of a message that was compressed by itself.
 const ZSTD: [u8; 4] = [0x28, 0xb5, 0x2f, 0xfd];
@@ -82,7 +82,7 @@ pub(super) fn topics(file: &Path) -> Result<Vec<Topic>, RecordingError> {
 pub(super) fn read(
     file: &Path,
     topics: &[&str],
-    take: &mut Take<'_>,
+    take: &mut MessageHandler<'_>,
 ) -> Result<Ended, RecordingError> {
     let names = serde_json::to_string(topics).map_err(|problem| refused(file)(&problem))?;
     with_database(file, async |connection| {

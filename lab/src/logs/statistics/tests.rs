@@ -69,14 +69,14 @@ fn turning(
     turn: impl Fn(u32) -> (f64, f64),
     gyro_offset_rad_s: f64,
     noise: &mut Random,
-) -> Vec<Fed> {
+) -> Vec<LoopInput> {
     let model = RobotModel::yi2007();
     let (radius_m, track_m) = (model.wheel_radius_m(), model.track_width_m());
     let fed = (0..3_000_u32).map(|index| {
         let (turn_rad_s, forward_m_s) = turn(index);
         let half_m_s = 0.5 * ratio * track_m * turn_rad_s;
         let mut rim = |rim_m_s: f64| rim_m_s / radius_m + noise.normal(0.01);
-        Fed {
+        LoopInput {
             sample: SensorSample {
                 at: Duration::from_millis(20) * index,
                 yaw_rate_rad_s: Some(turn_rad_s + gyro_offset_rad_s),

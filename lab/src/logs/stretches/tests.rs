@@ -4,8 +4,8 @@ use tread_control::measured::WheelSpeeds;
 
 use super::*;
 
-fn sample(at_s: f64, left_rad_s: f64, right_rad_s: f64, turn_rad_s: Option<f64>) -> Fed {
-    Fed {
+fn sample(at_s: f64, left_rad_s: f64, right_rad_s: f64, turn_rad_s: Option<f64>) -> LoopInput {
+    LoopInput {
         sample: SensorSample {
             at: Duration::from_secs_f64(at_s),
             yaw_rate_rad_s: turn_rad_s,
@@ -20,7 +20,7 @@ fn sample(at_s: f64, left_rad_s: f64, right_rad_s: f64, turn_rad_s: Option<f64>)
 }
 
 /// Samples at 50 Hz, each moving or not.
-fn driven(is_moving: impl Fn(f64) -> bool, length_s: f64) -> Vec<Fed> {
+fn driven(is_moving: impl Fn(f64) -> bool, length_s: f64) -> Vec<LoopInput> {
     let times = (0..).map(|index| f64::from(index) * 0.02);
     let samples = times.take_while(|at_s| *at_s < length_s).map(|at_s| {
         let speed = if is_moving(at_s) { 5.0 } else { 0.0 };
@@ -29,7 +29,7 @@ fn driven(is_moving: impl Fn(f64) -> bool, length_s: f64) -> Vec<Fed> {
     samples.collect()
 }
 
-fn all_passes(fed: &[Fed], wanted_s: u32) -> Vec<Range<usize>> {
+fn all_passes(fed: &[LoopInput], wanted_s: u32) -> Vec<Range<usize>> {
     let model = RobotModel::yi2007();
     let mut found = Vec::new();
     for part in parts(fed) {
@@ -40,7 +40,7 @@ fn all_passes(fed: &[Fed], wanted_s: u32) -> Vec<Range<usize>> {
     found
 }
 
-fn times_s(fed: &[Fed], range: &Range<usize>) -> (f64, f64) {
+fn times_s(fed: &[LoopInput], range: &Range<usize>) -> (f64, f64) {
     let at_s = |index: usize| fed[index].sample.at.as_secs_f64();
     (at_s(range.start), at_s(range.end - 1))
 }
@@ -106,7 +106,7 @@ fn motion_tells_turns_by_their_side_and_the_rate_of_the_wheels() {
     assert!((found.wheel_interval_s - 0.02).abs() < 1.0e-6 && found.long_interval_ratio < 1.0e-9);
     // The speed changes once, where turns on the spot begin.
     assert!(found.accelerating_s < 1.1, "{found:?}");
-    let seldom: Vec<Fed> = fed.iter().step_by(10).copied().collect();
+    let seldom: Vec<LoopInput> = fed.iter().step_by(10).copied().collect();
     let found = motion(&seldom, &model);
     assert!(
         (found.long_interval_ratio - 1.0).abs() < 1.0e-9,

@@ -5,7 +5,7 @@ use tread_control::geometry::Pose;
 use super::file::OutwardFile;
 use super::{Key, TopicSetting, Topics, refused};
 use crate::config::ConfigError;
-use crate::drive::ros2::outward::OutwardTopic;
+use crate::drive::ros2::published_topics::PublishedTopic;
 use crate::drive::ros2::settings::{OutwardSettings, Ros2Settings};
 
 /// Returns the frame of the topic that gives the position, and its pose in the site.
@@ -37,16 +37,20 @@ impl OutwardFile {
             topics.name(&setting, given.as_deref())
         };
         let settings = OutwardSettings {
-            plan: name(OutwardTopic::Plan, &self.plan, "tread/plan")?,
-            driven: name(OutwardTopic::Driven, &self.driven, "tread/driven")?,
-            theta: name(OutwardTopic::Theta, &self.theta, "tread/theta")?,
-            diagnostics: name(OutwardTopic::Diagnostics, &self.diagnostics, "/diagnostics")?,
+            plan: name(PublishedTopic::Plan, &self.plan, "tread/plan")?,
+            driven: name(PublishedTopic::Driven, &self.driven, "tread/driven")?,
+            theta: name(PublishedTopic::Theta, &self.theta, "tread/theta")?,
+            diagnostics: name(
+                PublishedTopic::Diagnostics,
+                &self.diagnostics,
+                "/diagnostics",
+            )?,
             frame,
             site_from_frame,
         };
         // A base commanded by lists of numbers would execute θ as a command.
         let mut taken = others.topics();
-        for topic in OutwardTopic::ALL {
+        for topic in PublishedTopic::ALL {
             let name = topic.topic(&settings);
             if taken.contains(&name) {
                 return Err(refused(
@@ -60,12 +64,12 @@ impl OutwardFile {
     }
 }
 
-fn key(topic: OutwardTopic) -> &'static str {
+fn key(topic: PublishedTopic) -> &'static str {
     match topic {
-        OutwardTopic::Plan => "drive.ros2.outward.plan",
-        OutwardTopic::Driven => "drive.ros2.outward.driven",
-        OutwardTopic::Theta => "drive.ros2.outward.theta",
-        OutwardTopic::Diagnostics => "drive.ros2.outward.diagnostics",
+        PublishedTopic::Plan => "drive.ros2.outward.plan",
+        PublishedTopic::Driven => "drive.ros2.outward.driven",
+        PublishedTopic::Theta => "drive.ros2.outward.theta",
+        PublishedTopic::Diagnostics => "drive.ros2.outward.diagnostics",
     }
 }
 
@@ -87,7 +91,7 @@ mod tests {
     fn it_speaks_unless_it_is_switched_off() {
         let text = "namespace = \"/robot7\"\n[odometry]\ngives_position = true\nsite_x_m = 2.0\n";
         let settings = checked(text).unwrap().unwrap();
-        let names = OutwardTopic::ALL.map(|topic| topic.topic(&settings).to_string());
+        let names = PublishedTopic::ALL.map(|topic| topic.topic(&settings).to_string());
         let expected = [
             "/robot7/tread/plan",
             "/robot7/tread/driven",

@@ -2,13 +2,13 @@
 
 use tread_control::geometry::Point;
 
-use super::{LINE_TOLERANCE_M, MOTION_TOLERANCE_M, Passed};
+use super::{LINE_TOLERANCE_M, MOTION_TOLERANCE_M, PathPosition};
 
 /// Straight line between two positions, passed at uniform speed.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Stretch {
-    pub(super) from: Passed,
-    pub(super) to: Passed,
+    pub(super) from: PathPosition,
+    pub(super) to: PathPosition,
 }
 
 impl Stretch {
@@ -32,7 +32,7 @@ impl Stretch {
     /// Returns the error of dropping a position between the two, as a multiple of the tolerance: the
     /// larger of its distance from the line over [`LINE_TOLERANCE_M`] and of its distance from
     /// uniform motion over [`MOTION_TOLERANCE_M`]. Above 1 the position must be kept.
-    pub(super) fn shortfall(self, passed: Passed) -> f64 {
+    pub(super) fn shortfall(self, passed: PathPosition) -> f64 {
         let Self { from, to } = self;
         let off_line = self.distance_m(passed.at) / LINE_TOLERANCE_M;
         let lasted_s = to.time_s - from.time_s;

@@ -14,7 +14,7 @@ use tread_control::robot::RobotModel;
 use tread_control::slip::BodyVelocity;
 use tread_control::tracking::ThetaKnowledge;
 
-use super::sensing::{CheckedSample, Sensed};
+use super::sensing::{CheckedSample, SensingOutput};
 use super::{Tick, age_s};
 use crate::control_loop::channels::{ClosedSegment, Fault};
 use crate::control_loop::gain::GroundRecord;
@@ -36,7 +36,7 @@ const POSITION_LOST_AFTER: Duration = Duration::from_secs(3);
 #[derive(Debug)]
 pub(super) struct EstimationInput<'tick> {
     pub(super) tick: Tick,
-    pub(super) sensed: &'tick Sensed,
+    pub(super) sensed: &'tick SensingOutput,
     /// Noise that the base states for its sensors.
     pub(super) noise: StatedNoise,
     /// A new definition of the site.
@@ -47,7 +47,7 @@ pub(super) struct EstimationInput<'tick> {
 
 /// Output of the stage.
 #[derive(Debug)]
-pub(super) struct Estimated<'tick> {
+pub(super) struct EstimationOutput<'tick> {
     pub(super) pose: Option<Pose>,
     pub(super) twist: Twist,
     pub(super) position_std_dev_m: f64,
@@ -103,7 +103,7 @@ pub(super) struct Ground {
 
 /// Effects of this tick's samples.
 #[derive(Debug, Default)]
-struct Taken {
+struct SampleEffects {
     ground_changed: bool,
     has_new_block: bool,
     unplaced_blocks: u64,
@@ -167,22 +167,22 @@ impl Estimation {
     }
 
     /// Localises the robot, updates the estimator, and closes the segment where required.
-    pub(super) fn step(&mut self, input: EstimationInput<'_>) -> (Estimated<'_>, Released) {
+    pub(super) fn step(&mut self, input: EstimationInput<'_>) -> (EstimationOutput<'_>, Released) {
         let (tick, sensed) = (input.tick, input.sensed);
         let now = tick.now.monotonic;
         self.apply_noise(input.noise);
-        let taken = self.process_samples(sensed.samples());
+        let effects = self.process_samples(sensed.samples());
         self.measure_slip(sensed, tick);
         let retired = input.site.and_then(|site| self.replace_site(site));
         let ground_at_begin = self.ground();
-        let segment = self.cut_segment(tick, input.mission, taken.ground_changed);
+        let segment = self.cut_segment(tick, input.mission, effects.ground_changed);
         let pose = self.localisation.pose();
         let twist = self.localisation.twist();
         let closed = segment.as_ref().map(|segment| {
             let statistics = &segment.statistics;
             (statistics.theta_information, statistics.theta_weighted)
         });
-        let estimated = Estimated {
+        let estimated = EstimationOutput {
             pose,
             twist,
             position_std_dev_m: self.localisation.position_std_dev_m(),
@@ -198,7 +198,7 @@ impl Estimation {
             estimate: self.estimate,
             ground: self.ground(),
             ground_at_begin,
-            ground_changed: taken.ground_changed,
+            ground_changed: effects.ground_changed,
             ground_changes: self.ground_changes,
             slips: self.slips,
             slip: self.slip.slip(),
@@ -209,7 +209,7 @@ impl Estimation {
                 Some(GroundUnderWheels::Mixed) | None => None,
             },
             closed,
-            unplaced_blocks: taken.unplaced_blocks,
+            unplaced_blocks: effects.unplaced_blocks,
             site: self.site.as_deref(),
         };
         let released = Released {
@@ -238,13 +238,13 @@ impl Estimation {
         });
     }
 
-    fn process_samples(&mut self, samples: &[CheckedSample]) -> Taken {
-        let mut taken = Taken::default();
+    fn process_samples(&mut self, samples: &[CheckedSample]) -> SampleEffects {
+        let mut effects = SampleEffects::default();
         for sample in samples {
             if !sample.shows_progress {
                 self.progress.suspend();
             }
-            self.process_motion(sample, &mut taken);
+            self.process_motion(sample, &mut effects);
             let Some(fix) = sample.fix else {
                 continue;
             };
@@ -259,13 +259,13 @@ impl Estimation {
                 FixOutcome::Invalid | FixOutcome::Outlier => {}
             }
         }
-        if taken.has_new_block {
+        if effects.has_new_block {
             self.estimate = self.estimator.estimate();
         }
-        taken
+        effects
     }
 
-    fn process_motion(&mut self, sample: &CheckedSample, taken: &mut Taken) {
+    fn process_motion(&mut self, sample: &CheckedSample, effects: &mut SampleEffects) {
         let Some((motion, dt_s)) = sample.motion else {
             return;
         };
@@ -282,12 +282,12 @@ impl Estimation {
             return;
         }
         let outcome = self.estimator.update(&motion, dt_s);
-        taken.ground_changed |= outcome.ground_changed;
+        effects.ground_changed |= outcome.ground_changed;
         self.ground_changes += u64::from(outcome.ground_changed);
-        taken.has_new_block |= outcome.block_done;
+        effects.has_new_block |= outcome.block_done;
         if outcome.block_done {
             self.slips = outcome.slips;
-            taken.unplaced_blocks += u64::from(self.cutter.cell().is_none());
+            effects.unplaced_blocks += u64::from(self.cutter.cell().is_none());
         }
     }
 
@@ -306,7 +306,7 @@ impl Estimation {
     }
 
     /// Updates the slip of each side; undefined while the base is silent.
-    fn measure_slip(&mut self, sensed: &Sensed, tick: Tick) {
+    fn measure_slip(&mut self, sensed: &SensingOutput, tick: Tick) {
         let now = tick.now.monotonic;
         let is_silent = sensed.is_base_silent
             || age_s(now, sensed.last_sample) > self.silent_after.as_secs_f64();
@@ -381,7 +381,7 @@ impl Estimation {
         cut.segment
     }
 
-    fn fault(&self, sensed: &Sensed, now: Duration) -> Option<Fault> {
+    fn fault(&self, sensed: &SensingOutput, now: Duration) -> Option<Fault> {
         let is_older = |at: Option<Duration>, most: Duration| {
             at.is_some_and(|at| now.saturating_sub(at) > most)
         };
@@ -418,6 +418,6 @@ impl Ground {
 /// Returns the best known speed along the path, m/s: odometry over ground if recent and
 /// uncontradicted, otherwise the localisation's, which is wrong under slip until position fixes
 /// correct it.
-pub(super) fn real_m_s(sensed: &Sensed, twist: Twist, now: Duration) -> f64 {
+pub(super) fn real_m_s(sensed: &SensingOutput, twist: Twist, now: Duration) -> f64 {
     sensed.odometry_m_s(now).unwrap_or(twist.linear_m_s)
 }

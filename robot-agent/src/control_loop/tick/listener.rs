@@ -17,7 +17,7 @@ use crate::drive::{Feedback, StatedNoise};
 
 /// Output of one tick.
 #[derive(Debug, Clone, Copy)]
-pub struct Heard {
+pub struct ListenerOutput {
     /// State of the estimator.
     pub estimate: Estimate,
     /// Sensors that contradict each other; while there are any, nothing is learned.
@@ -53,7 +53,12 @@ impl Listener {
     }
 
     /// Runs one tick at `now` on the samples since the tick before.
-    pub fn step(&mut self, now: Duration, feedback: &Feedback, noise: StatedNoise) -> Heard {
+    pub fn step(
+        &mut self,
+        now: Duration,
+        feedback: &Feedback,
+        noise: StatedNoise,
+    ) -> ListenerOutput {
         let before = self.last_tick.replace(now).unwrap_or(now);
         let tick = Tick {
             now: Moment {
@@ -78,7 +83,7 @@ impl Listener {
             site: None,
             mission: None,
         });
-        Heard {
+        ListenerOutput {
             estimate: estimated.estimate,
             findings: sensed.findings,
             ground_changes: estimated.ground_changes,

@@ -17,10 +17,10 @@ use tread_control::tracking::{ThetaKnowledge, TrackingErrors};
 
 use super::Tick;
 use super::demands::Demands;
-use super::estimation::{Estimated, Released};
-use super::sensing::Sensed;
+use super::estimation::{EstimationOutput, Released};
+use super::sensing::SensingOutput;
 use crate::control_loop::BRAKING_MAX;
-use crate::control_loop::active::{Active, News, progress_of};
+use crate::control_loop::active::{Active, PauseChange, progress_of};
 use crate::control_loop::channels::{ClosedSegment, EndReason, Hold, LoopCommand, LoopEvent};
 use crate::control_loop::driven::TickRecord;
 use crate::control_loop::gain::GroundRecord;
@@ -34,7 +34,7 @@ use crate::control_loop::surface::{Comparison, SurfaceWatch};
 const REPLACEMENT_MAX: Duration = Duration::from_secs(10);
 /// Effects of a tick's commands on the other stages.
 #[derive(Debug, Default)]
-pub(super) struct Orders {
+pub(super) struct CommandEffects {
     /// A new definition of the site.
     pub(super) site: Option<Arc<SiteView>>,
     /// Whether a mission begins in this tick.
@@ -45,8 +45,8 @@ pub(super) struct Orders {
 #[derive(Debug)]
 pub(super) struct MissionInput<'tick> {
     pub(super) tick: Tick,
-    pub(super) sensed: &'tick Sensed,
-    pub(super) estimated: &'tick Estimated<'tick>,
+    pub(super) sensed: &'tick SensingOutput,
+    pub(super) estimated: &'tick EstimationOutput<'tick>,
     pub(super) demands: &'tick Demands,
     /// Whether the mission began in this tick.
     pub(super) has_begun: bool,
@@ -56,7 +56,7 @@ pub(super) struct MissionInput<'tick> {
 
 /// Output of the stage.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Followed {
+pub(super) struct MissionOutput {
     /// Wheel speeds of the mission; `None` without a mission or while the base is silent.
     pub(super) wanted: Option<WheelSpeeds>,
     /// Whether there is a mission.
@@ -71,8 +71,8 @@ pub(super) struct Followed {
 #[derive(Debug)]
 pub(super) struct RecordInput<'tick> {
     pub(super) tick: Tick,
-    pub(super) sensed: &'tick Sensed,
-    pub(super) estimated: &'tick Estimated<'tick>,
+    pub(super) sensed: &'tick SensingOutput,
+    pub(super) estimated: &'tick EstimationOutput<'tick>,
     /// Cause for which the gate reduced the command.
     pub(super) gate: Option<GateCause>,
 }
@@ -128,11 +128,11 @@ impl MissionStage {
         &mut self,
         command: LoopCommand,
         tick: Tick,
-        orders: &mut Orders,
+        effects: &mut CommandEffects,
         events: &mut Outgoing,
     ) {
         match command {
-            LoopCommand::Start(job) => orders.has_begun |= self.begin(tick, job, events),
+            LoopCommand::Start(job) => effects.has_begun |= self.begin(tick, job, events),
             LoopCommand::Cancel(mission) => {
                 if let Some(active) = self.of(mission) {
                     active.stop(EndReason::Cancelled);
@@ -169,7 +169,7 @@ impl MissionStage {
                 None => events.send(LoopEvent::CameTooLate(job)),
             },
             LoopCommand::Site(site) => {
-                if let Some(unused) = orders.site.replace(site) {
+                if let Some(unused) = effects.site.replace(site) {
                     events.send(LoopEvent::Retired(unused));
                 }
             }
@@ -220,14 +220,14 @@ impl MissionStage {
         input: &MissionInput<'_>,
         released: Released,
         events: &mut Outgoing,
-    ) -> Followed {
+    ) -> MissionOutput {
         let (tick, estimated) = (input.tick, input.estimated);
         let now = tick.now.monotonic;
         let server_silence = input.demands.server_silence;
         if input.has_begun {
             self.warm_start(estimated);
         }
-        self.hand_on(released, events);
+        self.send_released(released, events);
         self.hold_for_demands(input);
         self.check_bounds(input);
         self.hold_for_base(now, estimated.fault);
@@ -235,7 +235,7 @@ impl MissionStage {
         let wanted = self.follow(input, events);
         let active = self.active.as_ref();
         let beyond_braking = server_silence.saturating_sub(BRAKING_MAX);
-        Followed {
+        MissionOutput {
             wanted,
             is_active: active.is_some(),
             rests: active.is_none_or(Active::rests),
@@ -245,7 +245,7 @@ impl MissionStage {
     }
 
     /// Initialises the tracking law with the knowledge of the ground where the mission begins.
-    fn warm_start(&mut self, estimated: &Estimated<'_>) {
+    fn warm_start(&mut self, estimated: &EstimationOutput<'_>) {
         if let Some(active) = &mut self.active
             && let Some(knowledge) = estimated.ground_at_begin.with(&active.job.prior).given
         {
@@ -253,7 +253,7 @@ impl MissionStage {
         }
     }
 
-    fn hand_on(&mut self, released: Released, events: &mut Outgoing) {
+    fn send_released(&mut self, released: Released, events: &mut Outgoing) {
         if let Some(site) = released.site {
             events.send(LoopEvent::Retired(site));
         }
@@ -317,8 +317,8 @@ impl MissionStage {
             self.theta_loop = Some(theta);
         }
         let (at, progress) = (now.wall, active.progress);
-        match step.news {
-            Some(News::Paused) => {
+        match step.pause_change {
+            Some(PauseChange::Paused) => {
                 let paused_for = active.paused_for(now.monotonic);
                 let since = paused_for.and_then(|lasting| at.checked_sub(lasting).ok());
                 events.send(LoopEvent::Paused {
@@ -327,7 +327,7 @@ impl MissionStage {
                     progress,
                 });
             }
-            Some(News::Resumed) => events.send(LoopEvent::Resumed { at, progress }),
+            Some(PauseChange::Resumed) => events.send(LoopEvent::Resumed { at, progress }),
             None => {}
         }
         if let Some(reason) = step.end {

@@ -40,7 +40,7 @@ use crate::control_loop::frame::RecordSender;
 use crate::drive::{Drive, SILENT_AFTER_MAX};
 use demands::DemandReader;
 use estimation::{Estimation, EstimationInput};
-use mission::{MissionInput, MissionStage, Orders, RecordInput};
+use mission::{CommandEffects, MissionInput, MissionStage, RecordInput};
 use output::{Output, OutputInput};
 use safety::{Safety, SafetyInput};
 use sensing::{Sensing, SensingInput};
@@ -132,8 +132,8 @@ impl LoopCore {
     }
 
     /// Whether the wheels are commanded to zero and are measured near zero.
-    pub(crate) fn stands(&self) -> bool {
-        self.output.stands()
+    pub(crate) fn is_standing(&self) -> bool {
+        self.output.is_standing()
     }
 
     /// Runs one tick that begins at `now`. With `stop`, the robot brakes and its mission ends.
@@ -157,12 +157,12 @@ impl LoopCore {
             is_base_silent: drive.is_silent(),
             commanded,
         });
-        let orders = self.receive_commands(tick);
+        let effects = self.receive_commands(tick);
         let (estimated, released) = self.estimation.step(EstimationInput {
             tick,
             sensed: &sensed,
             noise,
-            site: orders.site,
+            site: effects.site,
             mission: self.mission.active(),
         });
         let demands = self.demands.read(now.monotonic, &self.ends.shared);
@@ -171,7 +171,7 @@ impl LoopCore {
             sensed: &sensed,
             estimated: &estimated,
             demands: &demands,
-            has_begun: orders.has_begun,
+            has_begun: effects.has_begun,
             commanded: commanded.unwrap_or_default(),
         };
         let followed = self.mission.step(&following, released, &mut self.events);
@@ -214,8 +214,8 @@ impl LoopCore {
     }
 
     /// Takes the commands of the rest of the agent.
-    fn receive_commands(&mut self, tick: Tick) -> Orders {
-        let mut orders = Orders::default();
+    fn receive_commands(&mut self, tick: Tick) -> CommandEffects {
+        let mut effects = CommandEffects::default();
         // Bounded: a tick takes at most the capacity of the channel.
         for _ in 0..COMMANDS_MAX {
             let Ok(command) = self.ends.commands.try_recv() else {
@@ -223,9 +223,9 @@ impl LoopCore {
             };
             self.output.record_command(&command);
             self.mission
-                .take(command, tick, &mut orders, &mut self.events);
+                .take(command, tick, &mut effects, &mut self.events);
         }
-        orders
+        effects
     }
 
     /// Records the computing time of a tick.

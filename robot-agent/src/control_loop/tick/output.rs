@@ -15,10 +15,10 @@ use tread_control::measured::WheelSpeeds;
 use tread_control::robot::RobotModel;
 
 use super::demands::Demands;
-use super::estimation::Estimated;
+use super::estimation::EstimationOutput;
 use super::mission::MissionStatus;
-use super::safety::Gated;
-use super::sensing::Sensed;
+use super::safety::SafetyOutput;
+use super::sensing::SensingOutput;
 use super::{STANDING, Tick};
 use crate::control_loop::channels::{LoopCommand, Shared, Snapshot};
 use crate::control_loop::frame::{RecordSender, TickFrame, TickInputs, TickOutputs};
@@ -33,10 +33,10 @@ pub(super) struct OutputInput<'tick> {
     pub(super) feedback: &'tick Feedback,
     pub(super) noise: StatedNoise,
     pub(super) battery: Option<Battery>,
-    pub(super) sensed: &'tick Sensed,
-    pub(super) estimated: &'tick Estimated<'tick>,
+    pub(super) sensed: &'tick SensingOutput,
+    pub(super) estimated: &'tick EstimationOutput<'tick>,
     pub(super) demands: &'tick Demands,
-    pub(super) gated: &'tick Gated,
+    pub(super) gated: &'tick SafetyOutput,
     pub(super) mission: &'tick MissionStatus,
 }
 
@@ -74,7 +74,7 @@ impl Output {
     }
 
     /// Whether the last tick commanded the wheels to zero and measured them near zero.
-    pub(super) fn stands(&self) -> bool {
+    pub(super) fn is_standing(&self) -> bool {
         self.stands
     }
 

@@ -11,9 +11,9 @@ use tread_control::robot::RobotModel;
 use tread_control::twist_limits::Change;
 
 use super::demands::Demands;
-use super::estimation::{Estimated, real_m_s};
-use super::mission::Followed;
-use super::sensing::Sensed;
+use super::estimation::{EstimationOutput, real_m_s};
+use super::mission::MissionOutput;
+use super::sensing::SensingOutput;
 use super::{Tick, age_s};
 use crate::control_loop::channels::{Fault, GateSnapshot};
 use crate::safety::microseconds;
@@ -24,15 +24,15 @@ pub(super) struct SafetyInput<'tick> {
     pub(super) tick: Tick,
     /// Time by which inputs with an expiry are judged, by the monotonic clock.
     pub(super) judged: Duration,
-    pub(super) sensed: &'tick Sensed,
-    pub(super) estimated: &'tick Estimated<'tick>,
+    pub(super) sensed: &'tick SensingOutput,
+    pub(super) estimated: &'tick EstimationOutput<'tick>,
     pub(super) demands: &'tick Demands,
-    pub(super) followed: Followed,
+    pub(super) followed: MissionOutput,
 }
 
 /// Output of the stage.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Gated {
+pub(super) struct SafetyOutput {
     /// Time by which inputs with an expiry were judged, by the monotonic clock.
     pub(super) judged: Duration,
     /// Wheel speeds of the mission or the teleoperator, before the gate.
@@ -47,7 +47,7 @@ pub(super) struct Gated {
 
 /// Wheel speeds before the gate, and their source.
 #[derive(Debug, Clone, Copy)]
-struct Wanted {
+struct RequestedSpeeds {
     wheels: WheelSpeeds,
     is_teleoperated: bool,
     is_driver_silent: bool,
@@ -94,7 +94,7 @@ impl Safety {
     }
 
     /// Chooses mission or teleoperator, and passes the wheel speeds through the gate.
-    pub(super) fn step(&mut self, input: &SafetyInput<'_>) -> Gated {
+    pub(super) fn step(&mut self, input: &SafetyInput<'_>) -> SafetyOutput {
         let wanted = self.choose(input);
         let reasons = self.reasons(input, &wanted);
         let sensed = input.sensed;
@@ -116,7 +116,7 @@ impl Safety {
         );
         self.count(&output);
         self.command = Some(output.wheel_speeds);
-        Gated {
+        SafetyOutput {
             judged: input.judged,
             wanted: wanted.wheels,
             output,
@@ -137,12 +137,12 @@ impl Safety {
     }
 
     /// Returns the wheel speeds of the teleoperator or of the mission.
-    fn choose(&self, input: &SafetyInput<'_>) -> Wanted {
+    fn choose(&self, input: &SafetyInput<'_>) -> RequestedSpeeds {
         let judged_us = microseconds(input.judged);
         let teleoperation = &input.demands.view.teleoperation;
         // A mission that is still braking for the lease stops first.
         if !(teleoperation.is_leased(judged_us) && input.followed.rests) {
-            return Wanted {
+            return RequestedSpeeds {
                 wheels: input.followed.wanted.unwrap_or_default(),
                 is_teleoperated: false,
                 is_driver_silent: false,
@@ -162,7 +162,7 @@ impl Safety {
         if ends_soon {
             twist = no_faster_than_real(twist, input.real_m_s());
         }
-        Wanted {
+        RequestedSpeeds {
             wheels: self.model.wheel_speeds_from_twist(twist),
             is_teleoperated: true,
             is_driver_silent: wanted.is_none(),
@@ -170,7 +170,7 @@ impl Safety {
     }
 
     /// Returns the largest speed allowed by the fence, m/s; `None` without a fence or a pose.
-    fn fence_max_m_s(&self, estimated: &Estimated<'_>, wanted: Twist) -> Option<f64> {
+    fn fence_max_m_s(&self, estimated: &EstimationOutput<'_>, wanted: Twist) -> Option<f64> {
         let site = estimated.site.filter(|site| !site.fence().is_empty())?;
         let pose = estimated.pose?;
         let seen = estimated.estimate.mu_peak_lower_bound;
@@ -195,7 +195,11 @@ impl Safety {
     ///
     /// A mission needs a position. A teleoperator sees the robot and may drive it slowly, inside a
     /// fence only if the agent's configuration allows it.
-    fn blindness(&self, input: &SafetyInput<'_>, wanted: &Wanted) -> (bool, Option<f64>) {
+    fn position_restriction(
+        &self,
+        input: &SafetyInput<'_>,
+        wanted: &RequestedSpeeds,
+    ) -> (bool, Option<f64>) {
         let estimated = input.estimated;
         let is_lost = estimated.fault == Some(Fault::PositionLost)
             || estimated.pose.is_none()
@@ -212,7 +216,7 @@ impl Safety {
         (must_stand, wanted.is_teleoperated.then_some(BLIND_MAX_M_S))
     }
 
-    fn reasons(&self, input: &SafetyInput<'_>, wanted: &Wanted) -> Reasons {
+    fn reasons(&self, input: &SafetyInput<'_>, wanted: &RequestedSpeeds) -> Reasons {
         let demands = input.demands;
         let limits = &demands.view.limits;
         let judged_us = microseconds(input.judged);
@@ -226,7 +230,7 @@ impl Safety {
         };
         let is_driving = is_moving || input.followed.is_active || wanted.is_teleoperated;
         let (is_position_lost, blind_max_m_s) = if is_driving {
-            self.blindness(input, wanted)
+            self.position_restriction(input, wanted)
         } else {
             (false, None)
         };

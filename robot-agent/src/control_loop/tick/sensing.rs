@@ -51,7 +51,7 @@ pub(super) struct CheckedSample {
 
 /// Output of the stage.
 #[derive(Debug)]
-pub(super) struct Sensed {
+pub(super) struct SensingOutput {
     samples: [CheckedSample; SAMPLES_MAX],
     count: usize,
     /// Samples that newer ones replaced before this tick.
@@ -98,7 +98,7 @@ impl Sensing {
     }
 
     /// Reads and checks the samples of this tick.
-    pub(super) fn step(&mut self, input: &SensingInput<'_>) -> Sensed {
+    pub(super) fn step(&mut self, input: &SensingInput<'_>) -> SensingOutput {
         if let Some(commanded) = input.commanded {
             self.monitor.command(commanded);
         }
@@ -112,7 +112,7 @@ impl Sensing {
                 fix = Some(pose.point());
             }
         }
-        Sensed {
+        SensingOutput {
             samples,
             count: heard.len(),
             lost_samples: input.feedback.lost(),
@@ -181,7 +181,7 @@ impl Sensing {
     }
 }
 
-impl Sensed {
+impl SensingOutput {
     /// Returns the samples of this tick, oldest first.
     pub(super) fn samples(&self) -> &[CheckedSample] {
         &self.samples[..self.count]

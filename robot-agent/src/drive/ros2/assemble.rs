@@ -16,7 +16,7 @@ const COMPANION_AGE_MAX: Duration = Duration::from_millis(60);
 
 /// A message in the queue to the loop.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Arrived {
+pub struct QueuedMessage {
     /// Time of measurement, by the agent's monotonic clock.
     pub at: Duration,
     /// Content of the message.
@@ -87,7 +87,11 @@ impl Assembler {
     }
 
     /// Processes a message; returns the wheel speeds if it completes a sample of them.
-    pub fn take(&mut self, arrived: &Arrived, feedback: &mut Feedback) -> Option<WheelSpeeds> {
+    pub fn take(
+        &mut self,
+        arrived: &QueuedMessage,
+        feedback: &mut Feedback,
+    ) -> Option<WheelSpeeds> {
         match arrived.content {
             Content::Battery(battery) => self.battery = Some(battery),
             Content::Position(position) => feedback.push(fix(arrived.at, &position)),

@@ -4,7 +4,6 @@
 //! opens the session, retrying until it succeeds, announces the agent's node in the ROS graph,
 //! subscribes, and writes the loop's commands; a second one publishes the agent's state.
 
-use std::str::FromStr as _;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -19,91 +18,41 @@ use zenoh::pubsub::Publisher;
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::sample::Locality;
 
+use super::bus_config::session_config;
 use super::command;
+use super::command_cell::{COMMAND_SILENCE_MAX, CommandCell};
 use super::command_watch::CommandWatch;
-use super::inlet::{Inlet, Numbering};
-use super::outlet::{COMMAND_SILENCE_MAX, Outlet};
-use super::outward::{LOOK_EVERY, OutwardSource, OutwardTopic};
+use super::published_topics::{CHECK_EVERY, PublishedTopic, StatePublisher};
 use super::refusal::Counts;
-use super::settings::{BusMode, BusSettings, OutwardSettings, Ros2Settings, Scheme};
+use super::settings::{OutwardSettings, Ros2Settings, Scheme};
+use super::topic_receiver::{Numbering, TopicReceiver};
 use crate::clock::SharedClock;
 use crate::fleet::{LinkError, zenoh_failed};
 
-/// Timeout of a series of attempts to connect, after which the thread checks whether it shall end,
-/// milliseconds.
-const CONNECT_TIMEOUT_MS: u32 = 1_000;
-/// First and longest pause between attempts, milliseconds; short, to find a restarted router at
-/// once.
-const RETRY_MS: (u32, u32) = (50, 200);
 /// Pause after a failed series of attempts.
 const OPEN_REST: Duration = Duration::from_millis(100);
-/// Silence after which a router drops the agent's session, milliseconds.
-const BUS_LEASE_MS: u32 = 3_000;
 /// Largest payload that is read, bytes.
 const PAYLOAD_BYTES_MAX: usize = tread_ros2::cdr::MESSAGE_BYTES_MAX;
 /// Number of the agent's only node.
 const NODE_NUMBER: u32 = 0;
 
-/// Creates the configuration of the session on the bus.
-///
-/// # Errors
-/// [`LinkError::Endpoint`] for an invalid endpoint.
-pub fn session_config(bus: &BusSettings) -> Result<zenoh::Config, LinkError> {
-    zenoh::config::EndPoint::from_str(&bus.endpoint).map_err(|problem| LinkError::Endpoint {
-        endpoint: bus.endpoint.clone(),
-        problem: problem.to_string(),
-    })?;
-    let endpoints = serde_json::json!([bus.endpoint]).to_string();
-    let none = || "[]".to_owned();
-    let (mode, connect, listen) = match bus.mode {
-        BusMode::Client => ("\"client\"", endpoints, none()),
-        BusMode::Router => ("\"router\"", none(), endpoints),
-    };
-    let (first_ms, longest_ms) = RETRY_MS;
-    let retry = serde_json::json!({
-        "period_init_ms": first_ms,
-        "period_max_ms": longest_ms,
-        "period_increase_factor": 2.0,
-    });
-    let settings = [
-        ("mode", mode.to_owned()),
-        ("connect/endpoints", connect),
-        ("connect/timeout_ms", CONNECT_TIMEOUT_MS.to_string()),
-        ("connect/retry", retry.to_string()),
-        ("listen/endpoints", listen),
-        ("scouting/multicast/enabled", "false".to_owned()),
-        ("scouting/gossip/enabled", "false".to_owned()),
-        ("transport/link/tx/lease", BUS_LEASE_MS.to_string()),
-        // A router with timestamping compares the time of every message with its clock, and logs an
-        // error for each one once the machine's clock was set back. Stamps are in the messages.
-        ("timestamping/enabled", "false".to_owned()),
-    ];
-    let mut config = zenoh::Config::default();
-    for (key, value) in settings {
-        config
-            .insert_json5(key, &value)
-            .map_err(zenoh_failed("take its configuration"))?;
-    }
-    Ok(config)
-}
-
-/// The bus's session, its inlets and its outlet.
+/// The bus's session, its receivers and its command cell.
 #[derive(Debug)]
 pub struct Bus {
     config: zenoh::Config,
     settings: Arc<Ros2Settings>,
-    pub(super) inlets: Vec<Arc<Inlet>>,
-    outlet: Arc<Outlet>,
+    pub(super) receivers: Vec<Arc<TopicReceiver>>,
+    command_cell: Arc<CommandCell>,
     clock: SharedClock,
-    outward: Option<Box<dyn OutwardSource>>,
+    outward: Option<Box<dyn StatePublisher>>,
     command_watch: Arc<CommandWatch>,
 }
 
 /// Declarations that live as long as the session.
 #[derive(Debug)]
-struct Declared {
+struct Declarations {
     commands: Writer,
-    outward_topics: Vec<(OutwardTopic, Writer)>,
+    outward_topics: Vec<(PublishedTopic, Writer)>,
     _tokens: Vec<LivelinessToken>,
 }
 
@@ -149,8 +98,8 @@ impl Bus {
     /// [`LinkError::Endpoint`] for an invalid endpoint.
     pub fn new(
         settings: Arc<Ros2Settings>,
-        inlets: Vec<Inlet>,
-        outlet: Arc<Outlet>,
+        receivers: Vec<TopicReceiver>,
+        command_cell: Arc<CommandCell>,
         clock: SharedClock,
         counts: Arc<Counts>,
     ) -> Result<Self, LinkError> {
@@ -159,8 +108,8 @@ impl Bus {
             config: session_config(&settings.bus)?,
             command_watch: Arc::new(CommandWatch::new(settings.bus.scheme, command_type, counts)),
             settings,
-            inlets: inlets.into_iter().map(Arc::new).collect(),
-            outlet,
+            receivers: receivers.into_iter().map(Arc::new).collect(),
+            command_cell,
             clock,
             outward: None,
         })
@@ -172,18 +121,18 @@ impl Bus {
     }
 
     /// Publishes the messages of this source.
-    pub(crate) fn publish(&mut self, source: Box<dyn OutwardSource>) {
+    pub(crate) fn publish(&mut self, source: Box<dyn StatePublisher>) {
         self.outward = Some(source);
     }
 
-    /// Runs the session until the loop's end of the outlet is closed. For a thread of its own.
+    /// Runs the session until the loop closes the command cell. For a thread of its own.
     pub fn run(mut self) {
-        self.outlet.attend();
+        self.command_cell.register_thread();
         let (mut outward, endpoint) = (self.outward.take(), &self.settings.bus.endpoint);
         while let Some(session) = self.open() {
             info!(endpoint, "on the robot's bus at `{endpoint}`");
             match self.declare(&session, outward.is_some()) {
-                Ok(declared) => self.speak(&declared, outward.as_deref_mut()),
+                Ok(declared) => self.run_publishers(&declared, outward.as_deref_mut()),
                 Err(cause) => {
                     let cause = &cause as &dyn std::error::Error;
                     warn!(error = cause, "the robot's bus cannot be used");
@@ -196,7 +145,7 @@ impl Bus {
 
     fn open(&self) -> Option<zenoh::Session> {
         let mut is_reported = false;
-        while !self.outlet.is_closed() {
+        while !self.command_cell.is_closed() {
             match zenoh::open(self.config.clone()).wait() {
                 Ok(session) => return Some(session),
                 Err(cause) if is_reported => debug!("the robot's bus is not reached: {cause}"),
@@ -218,7 +167,11 @@ impl Bus {
         }
     }
 
-    fn declare(&self, session: &zenoh::Session, tells: bool) -> Result<Declared, LinkError> {
+    fn declare(
+        &self,
+        session: &zenoh::Session,
+        publishes_state: bool,
+    ) -> Result<Declarations, LinkError> {
         let bus = &self.settings.bus;
         let node = Node {
             domain: bus.domain,
@@ -232,12 +185,12 @@ impl Bus {
             tokens.push(declare_token(session, node.token())?);
         }
         let mut number = NODE_NUMBER;
-        for inlet in &self.inlets {
-            let Some(name) = inlet.topic() else {
+        for receiver in &self.receivers {
+            let Some(name) = receiver.topic() else {
                 continue;
             };
             number += 1;
-            let message_type = inlet.message_type();
+            let message_type = receiver.message_type();
             let topic = Topic {
                 role: Role::Subscriber,
                 number,
@@ -251,7 +204,7 @@ impl Bus {
             if let Some(token) = self.token(&node, &topic) {
                 tokens.push(declare_token(session, token)?);
             }
-            self.listen(session, inlet, name)?;
+            self.listen(session, receiver, name)?;
         }
         let command = &self.settings.command;
         let message_type = command::message_type(command.kind);
@@ -270,8 +223,8 @@ impl Bus {
         self.command_watch.write_as(commands.gid);
         self.watch_commands(session)?;
         let mut outward_topics = Vec::new();
-        if let Some(outward) = self.settings.outward.as_ref().filter(|_| tells) {
-            for outward_topic in OutwardTopic::ALL {
+        if let Some(outward) = self.settings.outward.as_ref().filter(|_| publishes_state) {
+            for outward_topic in PublishedTopic::ALL {
                 number += 1;
                 let message_type = outward_topic.message_type();
                 let topic = Topic {
@@ -290,7 +243,7 @@ impl Bus {
                 outward_topics.push((outward_topic, writer));
             }
         }
-        Ok(Declared {
+        Ok(Declarations {
             commands,
             outward_topics,
             _tokens: tokens,
@@ -347,14 +300,14 @@ impl Bus {
     fn listen(
         &self,
         session: &zenoh::Session,
-        inlet: &Arc<Inlet>,
+        receiver: &Arc<TopicReceiver>,
         topic: &Name,
     ) -> Result<(), LinkError> {
-        let inlet = Arc::clone(inlet);
+        let receiver = Arc::clone(receiver);
         session
             .declare_subscriber(self.key_to_hear(topic))
             .callback(move |sample| {
-                deliver(&sample, |key, with, said| inlet.take(key, with, said));
+                deliver(&sample, |key, with, said| receiver.take(key, with, said));
             })
             .background()
             .wait()
@@ -385,9 +338,13 @@ impl Bus {
 
     /// Writes commands, and publishes the agent's state on a thread of its own, so that no command
     /// waits for a path of hundreds of points.
-    fn speak(&self, declared: &Declared, outward: Option<&mut (dyn OutwardSource + 'static)>) {
+    fn run_publishers(
+        &self,
+        declared: &Declarations,
+        outward: Option<&mut (dyn StatePublisher + 'static)>,
+    ) {
         std::thread::scope(|scope| {
-            let telling = outward.and_then(|outward| {
+            let publisher = outward.and_then(|outward| {
                 let body = || self.publish_states(&declared.outward_topics, outward);
                 let named = std::thread::Builder::new().name("to the robot".to_owned());
                 let spawned = named.spawn_scoped(scope, body);
@@ -396,19 +353,19 @@ impl Bus {
                     .ok()
             });
             self.write_commands(&declared.commands);
-            if let Some(telling) = telling {
-                telling.thread().unpark();
+            if let Some(publisher) = publisher {
+                publisher.thread().unpark();
             }
         });
     }
 
-    /// Publishes the agent's state when due, until the loop's end of the outlet is closed.
+    /// Publishes the agent's state when due, until the loop closes the command cell.
     fn publish_states(
         &self,
-        outward_topics: &[(OutwardTopic, Writer)],
-        outward: &mut dyn OutwardSource,
+        outward_topics: &[(PublishedTopic, Writer)],
+        outward: &mut dyn StatePublisher,
     ) {
-        while !self.outlet.is_closed() {
+        while !self.command_cell.is_closed() {
             let (now, wall_ns) = (self.clock.monotonic(), self.clock.host_wall_ns());
             outward.step(now, wall_ns, &mut |topic, bytes| {
                 let writer = outward_topics.iter().find(|(known, _)| *known == topic);
@@ -416,7 +373,7 @@ impl Bus {
                     debug!("cannot publish {topic:?}: {cause}");
                 }
             });
-            std::thread::park_timeout(LOOK_EVERY);
+            std::thread::park_timeout(CHECK_EVERY);
         }
     }
 
@@ -425,9 +382,9 @@ impl Bus {
         let (mut number, mut written_at) = (0, self.clock.monotonic());
         let mut bytes = Vec::new();
         loop {
-            let is_closed = self.outlet.is_closed();
+            let is_closed = self.command_cell.is_closed();
             let now = self.clock.monotonic();
-            let newer = self.outlet.newer_than(number);
+            let newer = self.command_cell.newer_than(number);
             let is_silent = now.saturating_sub(written_at) >= COMMAND_SILENCE_MAX;
             if is_closed || newer.is_some() || is_silent {
                 let command = match newer {
@@ -477,27 +434,5 @@ fn small(attachment: &zenoh::bytes::ZBytes) -> std::borrow::Cow<'_, [u8]> {
         attachment.to_bytes()
     } else {
         std::borrow::Cow::Borrowed(&[])
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_bus_holds_no_messages_time_against_its_own_clock() {
-        for mode in [BusMode::Client, BusMode::Router] {
-            let bus = BusSettings {
-                scheme: Scheme::Ros2Dds,
-                mode,
-                endpoint: "tcp/127.0.0.1:7447".to_owned(),
-                domain: 0,
-                namespace: Name::namespace("/rover").unwrap(),
-                node: Name::node("tread_agent").unwrap(),
-            };
-            let config = session_config(&bus).unwrap();
-            let is_stamping = config.get_json("timestamping/enabled").unwrap();
-            assert_eq!(is_stamping, "false", "{mode:?}");
-        }
     }
 }

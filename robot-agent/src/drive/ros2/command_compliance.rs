@@ -88,7 +88,7 @@ impl Envelope {
     }
 
     /// Whether both sides stand still although commanded to turn.
-    fn stands(&self, measured: WheelSpeeds) -> bool {
+    fn is_standing(&self, measured: WheelSpeeds) -> bool {
         let stands = |measured: f64, least: f64, most: f64| {
             measured.abs() <= STANDING_SHARE * least.abs().max(most.abs())
         };
@@ -187,7 +187,7 @@ impl CommandCompliance {
         let obeys = all.is_rest() || all.holds(measured);
         let judged_at = self.judged_at.replace(now).unwrap_or(now);
         let span = now.saturating_sub(judged_at).min(WORD_MAX);
-        let stands = !obeys && all.stands(measured);
+        let stands = !obeys && all.is_standing(measured);
         self.stood = if stands {
             self.stood + span
         } else {

@@ -5,8 +5,8 @@
 //! is another's. The bridge never returns what it wrote on DDS itself, and a foreign command that
 //! equals a recent one of the agent, such as zero while the agent commands zero, is harmless.
 //!
-//! A base that follows two nodes tracks neither path, so while others write ([`Contest`]) the
-//! samples of the wheels are refused and only zero is commanded.
+//! A base that follows two nodes tracks neither path. So while others write
+//! ([`ForeignCommandWatch`]), samples of the wheels are refused and only zero is commanded.
 
 use std::hash::{DefaultHasher, Hash as _, Hasher as _};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -30,14 +30,14 @@ const CONTEST_SPAN: Duration = Duration::from_millis(500);
 
 /// Detects whether another node commands the base while the agent drives it. Pure.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Contest {
+pub(super) struct ForeignCommandWatch {
     heard: u64,
     /// Times of the newest foreign commands, oldest first.
     newest: [Option<Duration>; CONTEST_MIN],
     is_contested: bool,
 }
 
-impl Contest {
+impl ForeignCommandWatch {
     /// Updates the state with the total number of foreign commands and whether the agent drives;
     /// returns whether the base is contested.
     pub(super) fn check(&mut self, now: Duration, foreign_commands: u64, drives: bool) -> bool {
@@ -153,7 +153,8 @@ mod tests {
         foreign: impl Fn(u64) -> u64,
         drives: impl Fn(u64) -> bool,
     ) -> (Option<u64>, Option<u64>) {
-        let (mut contest, mut began, mut ended, mut was) = (Contest::default(), None, None, false);
+        let (mut contest, mut began, mut ended, mut was) =
+            (ForeignCommandWatch::default(), None, None, false);
         for now_ms in (0..span_ms).step_by(10) {
             let now = Duration::from_millis(now_ms);
             let is = contest.check(now, foreign(now_ms), drives(now_ms));

@@ -2,9 +2,9 @@
 //! side.
 //!
 //! ```text
-//! bus ─callback─► inlet (key, attachment, CDR, values, stamp) ─channel─► assemble ─► loop
-//! bus ◄─thread─── command ◄──────────── outlet ◄──────────────────────────────────── loop
-//! bus ◄─thread─── outward (plan, driven path, θ, diagnostics) ◄─── newest snapshot ◄─── loop
+//! bus ─callback─► topic_receiver (key, attachment, CDR, values, stamp) ─channel─► assemble ─► loop
+//! bus ◄─thread─── command ◄──────────── command_cell ◄─────────────────────────── loop
+//! bus ◄─thread─── published_topics (plan, driven path, θ, diagnostics) ◄── newest snapshot ◄── loop
 //! ```
 //! A message that is not entirely valid is dropped and counted by its reason. A base without a
 //! valid sample for [`Timing::silent_after`](settings::Timing) is commanded to zero at once, and
@@ -12,18 +12,19 @@
 
 pub mod assemble;
 pub mod bus;
+pub mod bus_config;
 mod command;
+pub mod command_cell;
 pub mod command_compliance;
 mod command_watch;
 pub mod frames;
-pub mod inlet;
 pub mod notices;
-pub mod outlet;
-pub(crate) mod outward;
+pub(crate) mod published_topics;
 pub mod reading;
 pub mod refusal;
 pub mod settings;
 pub mod stamps;
+pub mod topic_receiver;
 pub mod writer_watch;
 
 use std::sync::Arc;
@@ -32,14 +33,14 @@ use std::time::Duration;
 
 use tread_control::measured::WheelSpeeds;
 
-use self::assemble::{Arrived, Assembler};
+use self::assemble::{Assembler, QueuedMessage};
 use self::bus::Bus;
+use self::command_cell::CommandCell;
 use self::command_compliance::{CommandCompliance, Verdict};
-use self::command_watch::Contest;
-use self::inlet::{Inlet, Tap, WAITING_MAX, topic_of};
-use self::outlet::Outlet;
+use self::command_watch::ForeignCommandWatch;
 use self::refusal::{Counts, Refusal, Source};
 use self::settings::Ros2Settings;
+use self::topic_receiver::{MessageObserver, TopicReceiver, WAITING_MAX, topic_of};
 use super::{Arrivals, Battery, Drive, Feedback, StatedNoise};
 use crate::clock::SharedClock;
 use crate::fleet::LinkError;
@@ -51,12 +52,12 @@ pub(crate) mod tests;
 #[derive(Debug)]
 pub struct Ros2Drive {
     settings: Arc<Ros2Settings>,
-    arrived: Receiver<Arrived>,
+    arrived: Receiver<QueuedMessage>,
     arrivals: Arc<Arrivals>,
     assembler: Assembler,
     command_compliance: CommandCompliance,
     counts: Arc<Counts>,
-    outlet: Arc<Outlet>,
+    command_cell: Arc<CommandCell>,
     now: Duration,
     /// When the last whole sample was measured.
     heard_at: Option<Duration>,
@@ -64,7 +65,7 @@ pub struct Ros2Drive {
     is_rest_required: bool,
     /// Whether wheels are believed whatever they do.
     is_examined: bool,
-    contest: Contest,
+    foreign_command_watch: ForeignCommandWatch,
     /// Whether the newest command was to move.
     drives: bool,
 }
@@ -75,7 +76,7 @@ impl Ros2Drive {
     /// # Errors
     /// [`LinkError::Endpoint`].
     pub fn new(settings: Ros2Settings, clock: &SharedClock) -> Result<(Self, Bus), LinkError> {
-        Self::with_tap(settings, clock, None)
+        Self::with_observer(settings, clock, None)
     }
 
     /// A drive of a base that is being examined: somebody else hears every message, and wheels that
@@ -86,44 +87,47 @@ impl Ros2Drive {
     pub fn examined(
         settings: Ros2Settings,
         clock: &SharedClock,
-        tap: &Arc<dyn Tap>,
+        observer: &Arc<dyn MessageObserver>,
     ) -> Result<(Self, Bus), LinkError> {
-        Self::with_tap(settings, clock, Some(tap))
+        Self::with_observer(settings, clock, Some(observer))
     }
 
-    fn with_tap(
+    fn with_observer(
         settings: Ros2Settings,
         clock: &SharedClock,
-        tap: Option<&Arc<dyn Tap>>,
+        observer: Option<&Arc<dyn MessageObserver>>,
     ) -> Result<(Self, Bus), LinkError> {
         let settings = Arc::new(settings);
         let topic = |source| Some(topic_of(&settings, source)?.to_string());
-        let (counts, outlet) = (Arc::new(Counts::of(topic)), Arc::new(Outlet::default()));
+        let (counts, command_cell) = (
+            Arc::new(Counts::of(topic)),
+            Arc::new(CommandCell::default()),
+        );
         let arrivals = Arc::new(Arrivals::default());
         let (to_loop, arrived) = sync_channel(WAITING_MAX);
-        let inlets = Inlet::all(&settings, &counts, &to_loop, &arrivals, clock);
-        let is_examined = tap.is_some();
-        let inlets = inlets
+        let receivers = TopicReceiver::all(&settings, &counts, &to_loop, &arrivals, clock);
+        let is_examined = observer.is_some();
+        let receivers = receivers
             .into_iter()
-            .map(|inlet| inlet.with_tap(tap.cloned()))
+            .map(|receiver| receiver.with_observer(observer.cloned()))
             .collect();
         let drive = Self {
             is_examined,
-            contest: Contest::default(),
+            foreign_command_watch: ForeignCommandWatch::default(),
             drives: false,
             assembler: Assembler::new(&settings),
             command_compliance: CommandCompliance::default(),
             arrived,
             arrivals,
             counts,
-            outlet: Arc::clone(&outlet),
+            command_cell: Arc::clone(&command_cell),
             now: Duration::ZERO,
             heard_at: None,
             is_rest_required: false,
             settings: Arc::clone(&settings),
         };
         let counts = Arc::clone(&drive.counts);
-        let bus = Bus::new(settings, inlets, outlet, Arc::clone(clock), counts)?;
+        let bus = Bus::new(settings, receivers, command_cell, Arc::clone(clock), counts)?;
         Ok((drive, bus))
     }
 
@@ -151,7 +155,7 @@ impl Drive for Ros2Drive {
         self.now = now;
         let mut feedback = Feedback::default();
         let (foreign, drives) = (self.counts.foreign_commands(), self.drives);
-        let is_contested = self.contest.check(now, foreign, drives);
+        let is_contested = self.foreign_command_watch.check(now, foreign, drives);
         // Bounded by the channel's room.
         for _ in 0..WAITING_MAX {
             let Ok(arrived) = self.arrived.try_recv() else {
@@ -190,7 +194,7 @@ impl Drive for Ros2Drive {
         let written = if self.is_rest_required { rest } else { command };
         self.drives = written != rest;
         self.command_compliance.command(self.now, written);
-        self.outlet.leave(written);
+        self.command_cell.store(written);
     }
 
     fn battery(&self) -> Option<Battery> {
@@ -219,6 +223,6 @@ impl Drive for Ros2Drive {
 impl Drop for Ros2Drive {
     /// The bus's thread tells the base to rest, and ends.
     fn drop(&mut self) {
-        self.outlet.close();
+        self.command_cell.close();
     }
 }

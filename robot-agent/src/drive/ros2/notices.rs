@@ -1,7 +1,7 @@
 //! Reports events on the bus that need no action: restarted writers, clock jumps, and commands
 //! written by other nodes.
 
-use super::refusal::{Counts, Notice, QUIET_LOOKS, Source};
+use super::refusal::{Counts, Notice, QUIET_CHECKS, Source};
 
 /// Detects recent events by comparing the counts at intervals.
 #[derive(Debug, Clone, Copy, Default)]
@@ -21,7 +21,7 @@ impl RecentNotices {
             let left = &mut self.left[source as usize][notice as usize];
             let is_new = times > std::mem::replace(before, times);
             *left = if is_new {
-                QUIET_LOOKS
+                QUIET_CHECKS
             } else {
                 left.saturating_sub(1)
             };
@@ -46,7 +46,7 @@ impl ForeignCommands {
     pub fn check(&mut self, counts: &Counts) -> Option<String> {
         let times = counts.foreign_commands();
         self.left = if times > std::mem::replace(&mut self.before, times) {
-            QUIET_LOOKS
+            QUIET_CHECKS
         } else {
             self.left.saturating_sub(1)
         };
@@ -74,7 +74,7 @@ mod tests {
         );
         let text = recent_notices.check(&counts, Notice::ClockLeapt).unwrap();
         assert!(text.contains("joints (1 so far) set its clock"), "{text}");
-        for _ in 1..QUIET_LOOKS {
+        for _ in 1..QUIET_CHECKS {
             assert!(recent_notices.check(&counts, Notice::Restarted).is_some());
         }
         assert_eq!(recent_notices.check(&counts, Notice::Restarted), None);
@@ -91,7 +91,7 @@ mod tests {
                 .unwrap()
                 .contains("1 commands so far")
         );
-        for _ in 1..QUIET_LOOKS {
+        for _ in 1..QUIET_CHECKS {
             assert!(foreign.check(&counts).is_some());
         }
         assert_eq!(foreign.check(&counts), None);

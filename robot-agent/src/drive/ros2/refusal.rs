@@ -316,17 +316,17 @@ impl Counts {
 }
 
 /// Number of checks without a new event after which it is no longer reported.
-pub(super) const QUIET_LOOKS: u32 = 10;
+pub(super) const QUIET_CHECKS: u32 = 10;
 
 /// Detects recently dropped messages by comparing the counts at intervals.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct Dropping {
+pub struct DropMonitor {
     before: [[u64; Refusal::ALL.len()]; Source::ALL.len()],
     worst: Option<(Source, Refusal)>,
-    quiet_looks: u32,
+    quiet_checks: u32,
 }
 
-impl Dropping {
+impl DropMonitor {
     /// Runs one check; returns the most frequent recent reason and its description for people,
     /// `None` if nothing was dropped recently.
     pub fn check(&mut self, counts: &Counts) -> Option<(Refusal, String)> {
@@ -338,8 +338,8 @@ impl Dropping {
                 (most, self.worst) = (new, Some((source, refusal)));
             }
         }
-        self.quiet_looks = if most > 0 { 0 } else { self.quiet_looks + 1 };
-        if self.quiet_looks > QUIET_LOOKS {
+        self.quiet_checks = if most > 0 { 0 } else { self.quiet_checks + 1 };
+        if self.quiet_checks > QUIET_CHECKS {
             self.worst = None;
         }
         let (source, refusal) = self.worst?;
@@ -361,24 +361,24 @@ mod tests {
 
     #[test]
     fn what_is_dropped_most_of_late_is_said_until_it_is_over() {
-        let (counts, mut dropping) = (Counts::default(), Dropping::default());
-        assert_eq!(dropping.check(&counts), None);
+        let (counts, mut drop_monitor) = (Counts::default(), DropMonitor::default());
+        assert_eq!(drop_monitor.check(&counts), None);
         for _ in 0..3 {
             counts.refuse(Source::Imu, Refusal::Late);
         }
         counts.refuse(Source::Odometry, Refusal::Value);
-        let (_, text) = dropping.check(&counts).unwrap();
+        let (_, text) = drop_monitor.check(&counts).unwrap();
         assert_eq!(text, "messages that came late are dropped (imu, 3 so far)");
         counts.refuse(Source::Odometry, Refusal::Value);
-        let (_, text) = dropping.check(&counts).unwrap();
+        let (_, text) = drop_monitor.check(&counts).unwrap();
         assert_eq!(
             text,
             "messages with impossible values are dropped (odometry, 2 so far)"
         );
-        for _ in 0..QUIET_LOOKS {
-            assert!(dropping.check(&counts).is_some());
+        for _ in 0..QUIET_CHECKS {
+            assert!(drop_monitor.check(&counts).is_some());
         }
-        assert_eq!(dropping.check(&counts), None);
+        assert_eq!(drop_monitor.check(&counts), None);
         assert_eq!(counts.drops().count(), 2);
     }
 }

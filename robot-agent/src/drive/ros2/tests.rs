@@ -7,7 +7,7 @@ use tread_ros2::messages::{Header, Imu, JointState, Quaternion, Time, Vector3};
 use tread_ros2::names::Name;
 use tread_ros2::rmw::{Attachment, Generation, topic_key};
 
-use super::refusal::{Dropping, Notice};
+use super::refusal::{DropMonitor, Notice};
 use super::settings::*;
 use super::*;
 use crate::clock::{Clock as _, ManualClock};
@@ -75,8 +75,8 @@ pub(crate) fn settings() -> Ros2Settings {
     }
 }
 
-/// A drive and a base that speaks to it without a network.
-struct Talk {
+/// A drive with a base that sends it messages without a network.
+struct BaseRig {
     clock: Arc<ManualClock>,
     drive: Ros2Drive,
     bus: Bus,
@@ -84,9 +84,9 @@ struct Talk {
     number: u64,
 }
 
-/// What a base says, each field as a good one has it.
+/// Content of a message of the base; the fields of [`GOOD`] are valid.
 #[derive(Clone, Copy)]
-struct Said {
+struct BaseMessage {
     joints: [f64; 2],
     frame: &'static str,
     stamp_behind_ns: i64,
@@ -99,7 +99,7 @@ struct Said {
     gravity_m_s2: f64,
 }
 
-const GOOD: Said = Said {
+const GOOD: BaseMessage = BaseMessage {
     joints: [8.0, 10.0],
     frame: "imu_link",
     stamp_behind_ns: 2_000_000,
@@ -120,7 +120,7 @@ const YAW_ONLY: Quaternion = Quaternion {
     w: 0.988_771_077_936_042_4,
 };
 
-impl Talk {
+impl BaseRig {
     fn new() -> Self {
         let clock = Arc::new(ManualClock::new(Timestamp::UNIX_EPOCH));
         clock.advance(Duration::from_secs(100));
@@ -135,7 +135,7 @@ impl Talk {
         }
     }
 
-    fn put(&mut self, source: Source, said: &Said, bytes: &[u8]) {
+    fn put(&mut self, source: Source, said: &BaseMessage, bytes: &[u8]) {
         self.sequence += 1;
         let attachment = Attachment {
             sequence: self.sequence,
@@ -143,24 +143,29 @@ impl Talk {
             gid: said.gid,
         };
         let attachment = attachment.to_bytes();
-        let inlet = self
+        let receiver = self
             .bus
-            .inlets
+            .receivers
             .iter()
-            .find(|inlet| inlet.source() == source);
-        let inlet = inlet.unwrap();
+            .find(|receiver| receiver.source() == source);
+        let receiver = receiver.unwrap();
         let generation = if said.is_hashed {
             Generation::Hashed
         } else {
             Generation::Humble
         };
-        let key = topic_key(0, inlet.topic().unwrap(), &inlet.message_type(), generation);
+        let key = topic_key(
+            0,
+            receiver.topic().unwrap(),
+            &receiver.message_type(),
+            generation,
+        );
         let attachment = said.has_attachment.then_some(attachment.as_slice());
-        inlet.take(&key, attachment, &bytes[..bytes.len() - said.cut]);
+        receiver.take(&key, attachment, &bytes[..bytes.len() - said.cut]);
     }
 
     /// Lets a period pass, in which the base says this.
-    fn say(&mut self, said: &Said) -> Feedback {
+    fn say(&mut self, said: &BaseMessage) -> Feedback {
         self.clock.advance(STEP);
         let stamp_ns = self.clock.host_wall_ns() - said.stamp_behind_ns;
         let header = |frame_id| Header {
@@ -207,7 +212,7 @@ impl Talk {
     /// Commands the base; what is sent to it.
     fn command(&mut self, command: WheelSpeeds) -> WheelSpeeds {
         self.drive.write(command);
-        let (number, command) = self.drive.outlet.newer_than(self.number).unwrap();
+        let (number, command) = self.drive.command_cell.newer_than(self.number).unwrap();
         self.number = number;
         command
     }
@@ -215,12 +220,12 @@ impl Talk {
 
 #[test]
 fn a_good_message_is_a_whole_sample_by_its_stamp() {
-    let mut talk = Talk::new();
-    let feedback = talk.say(&GOOD);
+    let mut rig = BaseRig::new();
+    let feedback = rig.say(&GOOD);
     let [sample] = feedback.samples() else {
         panic!("{feedback:?}");
     };
-    let age = talk.clock.monotonic().abs_diff(sample.at);
+    let age = rig.clock.monotonic().abs_diff(sample.at);
     assert!(
         age.abs_diff(Duration::from_millis(2)) < Duration::from_micros(1),
         "{age:?}"
@@ -235,7 +240,7 @@ fn a_good_message_is_a_whole_sample_by_its_stamp() {
     assert!((felt.forward_m_s2 - 0.5).abs() < 1.0e-9 && felt.left_m_s2.abs() < 1.0e-9);
     assert!((sample.yaw_rate_rad_s.unwrap() - 0.2).abs() < 1.0e-12);
     assert!(sample.tilt_rad.unwrap() < 1.0e-6);
-    assert_eq!(talk.drive.noise().gyro_rad_s, Some(0.01));
+    assert_eq!(rig.drive.noise().gyro_rad_s, Some(0.01));
 }
 
 #[test]
@@ -247,7 +252,7 @@ fn an_acceleration_is_without_gravity_only_if_an_attitude_says_how_much_that_is(
         w: (1.0_f64 - 0.05 * 0.05).sqrt(),
     };
     let sample = |orientation: Quaternion, gravity_m_s2: f64| {
-        let feedback = Talk::new().say(&Said {
+        let feedback = BaseRig::new().say(&BaseMessage {
             orientation,
             gravity_m_s2,
             ..GOOD
@@ -269,93 +274,93 @@ fn every_bad_message_is_counted_by_its_reason_and_is_no_word_of_the_base() {
     let cases = [
         (
             Refusal::WrongHash,
-            Said {
+            BaseMessage {
                 is_hashed: false,
                 ..GOOD
             },
         ),
         (
             Refusal::NoAttachment,
-            Said {
+            BaseMessage {
                 has_attachment: false,
                 ..GOOD
             },
         ),
-        (Refusal::Malformed, Said { cut: 9, ..GOOD }),
+        (Refusal::Malformed, BaseMessage { cut: 9, ..GOOD }),
         (
             Refusal::WrongFrame,
-            Said {
+            BaseMessage {
                 frame: "camera",
                 ..GOOD
             },
         ),
         (
             Refusal::Value,
-            Said {
+            BaseMessage {
                 joints: [f64::NAN, 1.0],
                 ..GOOD
             },
         ),
         (
             Refusal::Value,
-            Said {
+            BaseMessage {
                 joints: [1.0e6, 1.0],
                 ..GOOD
             },
         ),
         (
             Refusal::Covariance,
-            Said {
+            BaseMessage {
                 covariance: -0.5,
                 ..GOOD
             },
         ),
         (
             Refusal::Covariance,
-            Said {
+            BaseMessage {
                 covariance: f64::NAN,
                 ..GOOD
             },
         ),
         (
             Refusal::Covariance,
-            Said {
+            BaseMessage {
                 covariance: 1.0e9,
                 ..GOOD
             },
         ),
         (
             Refusal::Late,
-            Said {
+            BaseMessage {
                 stamp_behind_ns: 500_000_000,
                 ..GOOD
             },
         ),
         (
             Refusal::Stamp,
-            Said {
+            BaseMessage {
                 stamp_behind_ns: -60_000_000_000,
                 ..GOOD
             },
         ),
         (
             Refusal::SecondWriter,
-            Said {
+            BaseMessage {
                 gid: [2; 16],
                 ..GOOD
             },
         ),
     ];
     for (refusal, bad) in cases {
-        let mut talk = Talk::new();
+        let mut rig = BaseRig::new();
         for _ in 0..5 {
-            talk.say(&GOOD);
-            assert_eq!(talk.command(COMMANDED), COMMANDED);
+            rig.say(&GOOD);
+            assert_eq!(rig.command(COMMANDED), COMMANDED);
         }
-        let counts = talk.drive.counts();
+        let counts = rig.drive.counts();
         for _ in 0..12 {
-            talk.say(&bad);
-            talk.command(COMMANDED);
+            rig.say(&bad);
+            rig.command(COMMANDED);
         }
         let count = |source| counts.dropped(source, refusal);
         assert!(
@@ -363,7 +368,7 @@ fn every_bad_message_is_counted_by_its_reason_and_is_no_word_of_the_base() {
             "{refusal:?}"
         );
         assert_eq!(
-            talk.command(COMMANDED),
+            rig.command(COMMANDED),
             WheelSpeeds::default(),
             "{refusal:?}"
         );
@@ -372,16 +377,16 @@ fn every_bad_message_is_counted_by_its_reason_and_is_no_word_of_the_base() {
 
 #[test]
 fn the_frame_for_which_messages_are_dropped_is_named_with_the_configured_one() {
-    let mut talk = Talk::new();
-    let counts = talk.drive.counts();
-    let mut dropping = Dropping::default();
+    let mut rig = BaseRig::new();
+    let counts = rig.drive.counts();
+    let mut drop_monitor = DropMonitor::default();
     for _ in 0..3 {
-        talk.say(&Said {
+        rig.say(&BaseMessage {
             frame: "camera",
             ..GOOD
         });
     }
-    let (refusal, text) = dropping.check(&counts).unwrap();
+    let (refusal, text) = drop_monitor.check(&counts).unwrap();
     assert_eq!(refusal, Refusal::WrongFrame);
     assert_eq!(
         text,
@@ -391,76 +396,76 @@ fn the_frame_for_which_messages_are_dropped_is_named_with_the_configured_one() {
 
 #[test]
 fn a_silent_base_rests_in_time_and_hears_nothing_until_the_loop_has_come_to_rest() {
-    let mut talk = Talk::new();
+    let mut rig = BaseRig::new();
     assert_eq!(
-        talk.command(COMMANDED),
+        rig.command(COMMANDED),
         WheelSpeeds::default(),
         "it has not been heard yet"
     );
-    talk.say(&GOOD);
-    talk.command(WheelSpeeds::default());
-    assert_eq!(talk.command(COMMANDED), COMMANDED);
-    let heard_at = talk.clock.monotonic();
-    while talk.command(COMMANDED) == COMMANDED {
-        talk.pass();
+    rig.say(&GOOD);
+    rig.command(WheelSpeeds::default());
+    assert_eq!(rig.command(COMMANDED), COMMANDED);
+    let heard_at = rig.clock.monotonic();
+    while rig.command(COMMANDED) == COMMANDED {
+        rig.pass();
     }
-    let silence = talk.clock.monotonic().saturating_sub(heard_at);
+    let silence = rig.clock.monotonic().saturating_sub(heard_at);
     assert!(silence <= Duration::from_millis(110), "{silence:?}");
-    talk.say(&GOOD);
+    rig.say(&GOOD);
     assert_eq!(
-        talk.command(COMMANDED),
+        rig.command(COMMANDED),
         WheelSpeeds::default(),
         "the command must not leap"
     );
-    talk.command(WheelSpeeds::default());
-    assert_eq!(talk.command(COMMANDED), COMMANDED);
+    rig.command(WheelSpeeds::default());
+    assert_eq!(rig.command(COMMANDED), COMMANDED);
 }
 
 #[test]
 fn a_base_that_starts_again_under_its_identifier_is_heard_and_old_messages_are_not() {
-    let mut talk = Talk::new();
+    let mut rig = BaseRig::new();
     for _ in 0..300 {
-        assert!(!talk.say(&GOOD).samples().is_empty());
+        assert!(!rig.say(&GOOD).samples().is_empty());
     }
-    let counts = talk.drive.counts();
+    let counts = rig.drive.counts();
     let restarts = || counts.noted(Source::Joints, Notice::Restarted);
     // It falls silent, and what it said three seconds ago is said again, as it was.
     for _ in 0..50 {
-        talk.pass();
+        rig.pass();
     }
-    let old = Said {
+    let old = BaseMessage {
         stamp_behind_ns: 3_500_000_000,
         ..GOOD
     };
-    talk.sequence = 0;
+    rig.sequence = 0;
     for _ in 0..100 {
-        assert!(talk.say(&old).samples().is_empty());
+        assert!(rig.say(&old).samples().is_empty());
     }
     assert_eq!(restarts(), 0);
     // It starts again, with the first number.
-    talk.sequence = 0;
-    let silent = (0..10).take_while(|_| talk.say(&GOOD).samples().is_empty());
+    rig.sequence = 0;
+    let silent = (0..10).take_while(|_| rig.say(&GOOD).samples().is_empty());
     let silent = u32::try_from(silent.count()).unwrap();
     assert!(silent < super::writer_watch::AGREE_MIN, "{silent} messages");
     assert_eq!(restarts(), 1);
-    assert!(!talk.say(&GOOD).samples().is_empty());
+    assert!(!rig.say(&GOOD).samples().is_empty());
 }
 
 #[test]
 fn wheels_that_do_not_follow_their_command_are_not_believed() {
-    let mut talk = Talk::new();
-    let stuck = Said {
+    let mut rig = BaseRig::new();
+    let stuck = BaseMessage {
         joints: [0.0, 0.0],
         ..GOOD
     };
-    talk.say(&GOOD);
-    let began = talk.clock.monotonic();
-    while talk.command(COMMANDED) == COMMANDED {
-        talk.say(&stuck);
-        assert!(talk.clock.monotonic() < began + Duration::from_secs(2));
+    rig.say(&GOOD);
+    let began = rig.clock.monotonic();
+    while rig.command(COMMANDED) == COMMANDED {
+        rig.say(&stuck);
+        assert!(rig.clock.monotonic() < began + Duration::from_secs(2));
     }
     assert!(
-        talk.drive
+        rig.drive
             .counts()
             .dropped(Source::Joints, Refusal::Disobedient)
             > 0
@@ -469,58 +474,58 @@ fn wheels_that_do_not_follow_their_command_are_not_believed() {
 
 #[test]
 fn a_base_that_another_node_commands_too_rests_until_that_ceases() {
-    let mut talk = Talk::new();
+    let mut rig = BaseRig::new();
     for _ in 0..5 {
-        talk.say(&GOOD);
-        assert_eq!(talk.command(COMMANDED), COMMANDED);
+        rig.say(&GOOD);
+        assert_eq!(rig.command(COMMANDED), COMMANDED);
     }
-    let counts = talk.drive.counts();
+    let counts = rig.drive.counts();
     let rest = WheelSpeeds::default();
     let mut ticks = 0;
-    while talk.command(COMMANDED) == COMMANDED {
+    while rig.command(COMMANDED) == COMMANDED {
         counts.count_foreign_command();
-        talk.say(&GOOD);
+        rig.say(&GOOD);
         ticks += 1;
         assert!(ticks < 20, "it is driven on");
     }
     for _ in 0..100 {
         counts.count_foreign_command();
-        talk.say(&GOOD);
-        assert_eq!(talk.command(rest), rest);
+        rig.say(&GOOD);
+        assert_eq!(rig.command(rest), rest);
     }
     assert!(counts.dropped(Source::Joints, Refusal::Contested) > 100);
     // The other falls silent.
     for _ in 0..60 {
-        talk.say(&GOOD);
-        talk.command(rest);
+        rig.say(&GOOD);
+        rig.command(rest);
     }
-    assert_eq!(talk.command(COMMANDED), COMMANDED);
+    assert_eq!(rig.command(COMMANDED), COMMANDED);
 }
 
 #[test]
 fn more_than_the_loop_takes_is_counted_and_the_newest_is_not_waited_for() {
-    let mut talk = Talk::new();
+    let mut rig = BaseRig::new();
     let joints = JointState {
         name: Sequence::from(&NAMES),
         velocity: Sequence::from(&[1.0, 1.0]),
         ..JointState::default()
     };
     for _ in 0..2 * WAITING_MAX {
-        talk.clock.advance(Duration::from_millis(1));
-        let stamp = Time::from_nanoseconds(talk.clock.host_wall_ns());
+        rig.clock.advance(Duration::from_millis(1));
+        let stamp = Time::from_nanoseconds(rig.clock.host_wall_ns());
         let header = Header {
             stamp,
             frame_id: "",
         };
         let mut bytes = Vec::new();
         encode(&JointState { header, ..joints }, &mut bytes);
-        talk.put(Source::Joints, &GOOD, &bytes);
+        rig.put(Source::Joints, &GOOD, &bytes);
     }
-    let overflow = talk
+    let overflow = rig
         .drive
         .counts()
         .dropped(Source::Joints, Refusal::Overflow);
     assert_eq!(overflow, u64::try_from(WAITING_MAX).unwrap());
-    let feedback = talk.drive.read(talk.clock.monotonic());
+    let feedback = rig.drive.read(rig.clock.monotonic());
     assert!(feedback.lost() > 0);
 }

@@ -29,7 +29,7 @@ const REMEMBERED: usize = 64;
 
 /// Relation of a message to those before it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Order {
+pub enum MessageOrder {
     /// The first message, or a later one of the same writer.
     Continues,
     /// The writer restarted, or another one replaced a silent one.
@@ -41,12 +41,12 @@ pub enum Order {
 /// The writer of one topic.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct WriterWatch {
-    writer: Option<Heard>,
+    writer: Option<WriterState>,
     restart: Option<Restart>,
 }
 
 #[derive(Debug, Clone, Copy)]
-struct Heard {
+struct WriterState {
     gid: [u8; GID_BYTES],
     sequence: i64,
     /// Newest source time of all its messages, nanoseconds.
@@ -66,7 +66,7 @@ struct Restart {
     count: u32,
 }
 
-impl Heard {
+impl WriterState {
     fn knows(&self, message: &Attachment) -> bool {
         let known = &self.recent[..self.count.min(REMEMBERED)];
         known.contains(&(message.sequence, message.source_time_ns))
@@ -79,23 +79,23 @@ impl WriterWatch {
     /// # Errors
     /// [`Refusal::OutOfOrder`] for a repeated or older message, [`Refusal::SecondWriter`] for one
     /// of another writer while the topic's writer is active.
-    pub fn check(&self, message: &Attachment, now: Duration) -> Result<Order, Refusal> {
-        let Some(heard) = &self.writer else {
-            return Ok(Order::Continues);
+    pub fn check(&self, message: &Attachment, now: Duration) -> Result<MessageOrder, Refusal> {
+        let Some(state) = &self.writer else {
+            return Ok(MessageOrder::Continues);
         };
-        let is_silent = now.saturating_sub(heard.at) >= SILENT_AFTER;
-        if heard.gid != message.gid {
+        let is_silent = now.saturating_sub(state.at) >= SILENT_AFTER;
+        if state.gid != message.gid {
             return if is_silent {
-                Ok(Order::Restarted)
+                Ok(MessageOrder::Restarted)
             } else {
                 Err(Refusal::SecondWriter)
             };
         }
-        if message.sequence > heard.sequence {
-            return Ok(Order::Continues);
+        if message.sequence > state.sequence {
+            return Ok(MessageOrder::Continues);
         }
-        let went_on = message.source_time_ns > heard.source_time_ns;
-        if heard.knows(message) || !(went_on || is_silent) {
+        let went_on = message.source_time_ns > state.source_time_ns;
+        if state.knows(message) || !(went_on || is_silent) {
             return Err(Refusal::OutOfOrder);
         }
         let before = match &self.restart {
@@ -111,15 +111,15 @@ impl WriterWatch {
             AGREE_WITHOUT_CLOCK_MIN
         };
         Ok(if before + 1 >= enough {
-            Order::Restarted
+            MessageOrder::Restarted
         } else {
-            Order::MayHaveRestarted
+            MessageOrder::MayHaveRestarted
         })
     }
 
     /// Records a message that was checked and has valid content.
-    pub fn follow(&mut self, message: &Attachment, order: Order, now: Duration) {
-        if order == Order::MayHaveRestarted {
+    pub fn follow(&mut self, message: &Attachment, order: MessageOrder, now: Duration) {
+        if order == MessageOrder::MayHaveRestarted {
             let before = self.restart.filter(|restart| is_after(message, restart));
             self.restart = Some(Restart {
                 sequence: message.sequence,
@@ -134,8 +134,8 @@ impl WriterWatch {
             source_time_ns,
             gid,
         } = *message;
-        let former = self.writer.filter(|_| order == Order::Continues);
-        let mut heard = former.unwrap_or(Heard {
+        let former = self.writer.filter(|_| order == MessageOrder::Continues);
+        let mut state = former.unwrap_or(WriterState {
             gid,
             sequence,
             source_time_ns,
@@ -143,13 +143,13 @@ impl WriterWatch {
             recent: [(0, 0); REMEMBERED],
             count: 0,
         });
-        heard.recent[heard.count % REMEMBERED] = (sequence, source_time_ns);
-        self.writer = Some(Heard {
+        state.recent[state.count % REMEMBERED] = (sequence, source_time_ns);
+        self.writer = Some(WriterState {
             sequence,
-            source_time_ns: heard.source_time_ns.max(source_time_ns),
+            source_time_ns: state.source_time_ns.max(source_time_ns),
             at: now,
-            count: heard.count + 1,
-            ..heard
+            count: state.count + 1,
+            ..state
         });
     }
 }
@@ -174,7 +174,11 @@ mod tests {
     }
 
     /// Whether a message is taken; one that may be of a writer that started again is not.
-    fn take(watch: &mut WriterWatch, message: &Attachment, now_ms: i64) -> Result<Order, Refusal> {
+    fn take(
+        watch: &mut WriterWatch,
+        message: &Attachment,
+        now_ms: i64,
+    ) -> Result<MessageOrder, Refusal> {
         let now = Duration::from_millis(now_ms.unsigned_abs());
         let order = watch.check(message, now)?;
         watch.follow(message, order, now);
@@ -187,7 +191,7 @@ mod tests {
         for index in 1..=count {
             let now_ms = index * PERIOD_MS;
             let taken = take(&mut watch, &message(1, index, now_ms), now_ms);
-            assert_eq!(taken, Ok(Order::Continues));
+            assert_eq!(taken, Ok(MessageOrder::Continues));
         }
         (watch, count * PERIOD_MS)
     }
@@ -198,12 +202,12 @@ mod tests {
         let mut check = |writer: u8, sequence: i64, now_ms: i64| {
             take(&mut watch, &message(writer, sequence, now_ms), now_ms)
         };
-        assert_eq!(check(1, 7, 0), Ok(Order::Continues));
-        assert_eq!(check(1, 9, 10), Ok(Order::Continues));
+        assert_eq!(check(1, 7, 0), Ok(MessageOrder::Continues));
+        assert_eq!(check(1, 9, 10), Ok(MessageOrder::Continues));
         assert_eq!(check(1, 9, 10), Err(Refusal::OutOfOrder));
         assert_eq!(check(2, 1, 20), Err(Refusal::SecondWriter));
-        assert_eq!(check(2, 2, 210), Ok(Order::Restarted));
-        assert_eq!(check(2, 3, 213), Ok(Order::Continues));
+        assert_eq!(check(2, 2, 210), Ok(MessageOrder::Restarted));
+        assert_eq!(check(2, 3, 213), Ok(MessageOrder::Continues));
         assert_eq!(check(1, 10, 215), Err(Refusal::SecondWriter));
     }
 
@@ -223,12 +227,12 @@ mod tests {
             assert_eq!(
                 [*first, *second, *third],
                 [
-                    Order::MayHaveRestarted,
-                    Order::MayHaveRestarted,
-                    Order::Restarted
+                    MessageOrder::MayHaveRestarted,
+                    MessageOrder::MayHaveRestarted,
+                    MessageOrder::Restarted
                 ]
             );
-            assert!(rest.iter().all(|order| *order == Order::Continues));
+            assert!(rest.iter().all(|order| *order == MessageOrder::Continues));
         }
     }
 
@@ -242,11 +246,11 @@ mod tests {
             let mut again = message(1, index, index * PERIOD_MS);
             again.source_time_ns += 500_000;
             match take(&mut watch, &again, now_ms) {
-                Ok(Order::Restarted) => {
+                Ok(MessageOrder::Restarted) => {
                     restarted = Some(now_ms - last_ms);
                     break;
                 }
-                Ok(order) => assert_eq!(order, Order::MayHaveRestarted),
+                Ok(order) => assert_eq!(order, MessageOrder::MayHaveRestarted),
                 Err(refusal) => assert_eq!(refusal, Refusal::OutOfOrder),
             }
         }
@@ -273,7 +277,7 @@ mod tests {
         for index in 501..700 {
             let now_ms = last_ms + 20_000 + index * PERIOD_MS;
             let next = message(1, index, index * PERIOD_MS);
-            assert_eq!(take(&mut watch, &next, now_ms), Ok(Order::Continues));
+            assert_eq!(take(&mut watch, &next, now_ms), Ok(MessageOrder::Continues));
             let old = message(1, index - 300, (index - 300) * PERIOD_MS);
             for again in [next, old] {
                 assert_eq!(
@@ -290,9 +294,9 @@ mod tests {
         for index in 1..200 {
             let now_ms = last_ms + index * PERIOD_MS;
             let live = message(1, 500 + index, now_ms);
-            assert_eq!(take(&mut watch, &live, now_ms), Ok(Order::Continues));
+            assert_eq!(take(&mut watch, &live, now_ms), Ok(MessageOrder::Continues));
             let other = take(&mut watch, &message(1, index, now_ms + 1), now_ms + 1);
-            assert_eq!(other, Ok(Order::MayHaveRestarted));
+            assert_eq!(other, Ok(MessageOrder::MayHaveRestarted));
         }
     }
 }

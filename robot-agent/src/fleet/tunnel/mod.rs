@@ -33,7 +33,7 @@ pub use self::dial::DialError;
 use self::dial::{Connection, Dialer};
 use super::rotation::Logged;
 use super::session::{self, SessionUser};
-use super::{LinkError, Note, Noted};
+use super::{LinkError, LinkEvent, LinkEventHandler};
 use crate::membership::Membership;
 
 /// Timeout of the first message on a local connection; zenoh sends it at once.
@@ -100,7 +100,7 @@ struct UnknownClientCount {
 
 impl UnknownClientLog {
     /// Counts one more; returns the number since the last log line if one is due.
-    fn came(&self, now: tokio::time::Instant) -> Option<u64> {
+    fn count_client(&self, now: tokio::time::Instant) -> Option<u64> {
         let mut counted = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         counted.count += 1;
         let is_due = counted
@@ -114,7 +114,7 @@ impl UnknownClientLog {
     }
 
     fn record(&self) {
-        if let Some(count) = self.came(tokio::time::Instant::now()) {
+        if let Some(count) = self.count_client(tokio::time::Instant::now()) {
             warn!(
                 count,
                 "other programs connected to the tunnel's local port; they were closed"
@@ -139,7 +139,7 @@ impl Tunnel {
     /// [`LinkError`] at once, without a retry: the endpoint is invalid, the certificate cannot be
     /// used, or no local port can be opened.
     pub async fn open(endpoint: &str, membership: &Membership) -> Result<Self, LinkError> {
-        let nobody: Note = Arc::new(|_noted| {});
+        let nobody: LinkEventHandler = Arc::new(|_event| {});
         let mut pause = RETRY_FIRST;
         let mut logged = Logged::default();
         loop {
@@ -153,15 +153,16 @@ impl Tunnel {
         }
     }
 
-    /// Makes one attempt to open a tunnel. Logs, and reports as [`Noted::Distrusted`], that the server's
-    /// certificate is by an authority that the robot does not trust, unless that was logged before.
+    /// Makes one attempt to open a tunnel. If an authority that the robot does not trust issued the
+    /// server's certificate, logs it and reports [`LinkEvent::Distrusted`], unless that was logged
+    /// before.
     ///
     /// # Errors
     /// As [`Tunnel::open`]; the inner error if the server could not be reached.
     pub(super) async fn open_once(
         endpoint: &str,
         membership: &Membership,
-        note: &Note,
+        on_event: &LinkEventHandler,
         logged: &mut Logged,
     ) -> Result<Result<Self, DialError>, LinkError> {
         let dialer = Dialer::new(endpoint, membership)?;
@@ -178,7 +179,7 @@ impl Tunnel {
                         "the server at {endpoint} shows a certificate of another authority than \
                          this robot trusts; it is tried again"
                     );
-                    note(Noted::Distrusted);
+                    on_event(LinkEvent::Distrusted);
                 }
                 if cause.is_about_validity() && !logged.invalid {
                     logged.invalid = true;

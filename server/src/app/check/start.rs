@@ -36,7 +36,7 @@ pub(in crate::app) struct Place {
 
 /// A mission that the robot drives before the new one.
 #[derive(Debug)]
-pub(super) struct Earlier {
+pub(super) struct PrecedingMission {
     id: MissionId,
     trajectory: Trajectory,
     /// Pose from which its robot planned it; `None` until the robot has accepted it.
@@ -79,14 +79,14 @@ pub(super) async fn earlier(
     tx: &mut Tx,
     robot_pk: i64,
     place: Place,
-) -> Result<Vec<Earlier>, AppError> {
+) -> Result<Vec<PrecedingMission>, AppError> {
     let open = db::missions::open_of_robot(tx, robot_pk).await?;
     let mut chain = Vec::new();
     for id in before(&open, place).into_iter().rev().take(CHAIN_MAX) {
         let Some(row) = db::missions::find(tx, id).await? else {
             continue;
         };
-        let earlier = Earlier::of(row.mission);
+        let earlier = PrecedingMission::of(row.mission);
         let says_its_end = matches!(earlier.trajectory, Trajectory::Waypoints(_));
         chain.push(earlier);
         if says_its_end {
@@ -97,7 +97,7 @@ pub(super) async fn earlier(
     Ok(chain)
 }
 
-impl Earlier {
+impl PrecedingMission {
     pub(super) fn trajectory(&self) -> &Trajectory {
         &self.trajectory
     }
@@ -122,7 +122,11 @@ impl Earlier {
 
 /// Returns the pose after those missions. Missions that cannot be planned are skipped: the robot
 /// will refuse them and stay where it is.
-pub(super) fn after(first: Start, earlier: &[(Earlier, Traction)], model: &RobotModel) -> Start {
+pub(super) fn after(
+    first: Start,
+    earlier: &[(PrecedingMission, Traction)],
+    model: &RobotModel,
+) -> Start {
     earlier.iter().fold(first, |start, (mission, traction)| {
         let from = mission.begin.unwrap_or(start.pose);
         let asked = Planning {

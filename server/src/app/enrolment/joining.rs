@@ -136,7 +136,7 @@ impl App {
         let trusted = service.authorities.present();
         let (certificate, fingerprint) =
             service.sign(&trusted, key, &name, self.clock().machine_time())?;
-        if !db::join_tokens::use_up(&mut tx, token.id, &robot, now).await? {
+        if !db::join_tokens::consume(&mut tx, token.id, &robot, now).await? {
             return Err(EnrolError::Used(token.id));
         }
         db::enrolments::revoke(&mut tx, (&token.site, &robot), "a new enrolment", now).await?;
@@ -153,7 +153,7 @@ impl App {
             authority: Some(trusted.signing().fingerprint().to_owned()),
         };
         db::enrolments::insert(&mut tx, &enrolment, &Issued::one(fingerprint)).await?;
-        let ended = self.end_outsider(&mut tx, &enrolment).await?;
+        let ended = self.end_credential_alerts(&mut tx, &enrolment).await?;
         self.commit_enrolment(tx, &enrolment, ended).await?;
         self.counters().robots_enrolled.one();
         let (site, robot) = (&enrolment.site, &enrolment.robot);

@@ -32,13 +32,13 @@ use tread_api::robot::Alert;
 use self::registry::EnrolmentRegistry;
 use self::revoked_robots::RevokedRobots;
 pub(super) use self::revoked_robots::{RETIRED_ALERT, REVOKED_ALERT, UNISSUED_ALERT};
-use self::rotation::Shown;
+use self::rotation::RecordedCertificates;
 use super::identity::new_secret;
 use super::identity::quota::{Count, Quota};
 use super::identity::tokens::{DEAD_KEPT, FORGET_MAX};
 use super::{App, AppError, page, site_row};
 use crate::authority::{Authorities, CertificateError, Issued, RobotName, RobotRequest};
-use crate::db::enrolments::{Counting, Renewal};
+use crate::db::enrolments::{AcceptedCertificates, Renewal};
 use crate::db::{self, DbError, Outcome, Tx};
 use crate::identity::secret::Kind;
 
@@ -69,7 +69,7 @@ pub(super) struct Membership {
     pub(super) registry: Arc<EnrolmentRegistry>,
     service: Option<EnrolmentService>,
     revoked_robots: RevokedRobots,
-    shown: Shown,
+    shown: RecordedCertificates,
 }
 
 impl Membership {
@@ -83,7 +83,7 @@ impl Membership {
             registry,
             service,
             revoked_robots: RevokedRobots::default(),
-            shown: Shown::default(),
+            shown: RecordedCertificates::default(),
         }
     }
 }
@@ -377,20 +377,21 @@ impl App {
         let mut tx = self.db().write("enrolment").await?;
         let enrolment = (&name.site, &name.robot, name.enrolment);
         let (shown, mut ended) = (present.fingerprint(), Vec::new());
-        let counting = match db::enrolments::counting(&mut tx, enrolment).await? {
-            Counting::None => {
-                drop(tx);
-                let key = (name.site.clone(), name.robot.clone());
-                self.alert_revoked(&key);
-                return Err(EnrolError::Ended(name.clone()));
-            }
-            Counting::Any => {
-                ended = self.end_unissued(&mut tx, name).await?;
-                Issued::one(shown.clone())
-            }
-            Counting::These(issued) => issued,
-        };
-        let Some(issued) = counting.renewed(&shown, next) else {
+        let accepted_certificates =
+            match db::enrolments::accepted_certificates(&mut tx, enrolment).await? {
+                AcceptedCertificates::None => {
+                    drop(tx);
+                    let key = (name.site.clone(), name.robot.clone());
+                    self.alert_revoked(&key);
+                    return Err(EnrolError::Ended(name.clone()));
+                }
+                AcceptedCertificates::Any => {
+                    ended = self.end_unissued(&mut tx, name).await?;
+                    Issued::one(shown.clone())
+                }
+                AcceptedCertificates::These(issued) => issued,
+            };
+        let Some(issued) = accepted_certificates.renewed(&shown, next) else {
             drop(tx);
             self.alert_unissued_certificate(name);
             return Err(EnrolError::NotIssued(name.clone()));

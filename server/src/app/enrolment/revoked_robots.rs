@@ -123,7 +123,7 @@ impl App {
         tracing::warn!(robot.id = %robot, "robot `{robot}` of site `{site}`: {text}");
         let (app, key) = (self.clone(), key.clone());
         let raising = async move {
-            if let Err(error) = db::limited(app.raise_outsider(&key, code, text)).await {
+            if let Err(error) = db::limited(app.raise_credential_alert(&key, code, text)).await {
                 app.log_failure("raise an alert about a robot that may not connect", &error);
             }
         };
@@ -131,7 +131,7 @@ impl App {
         self.supervisor().spawn_passing("revoked robot", raising);
     }
 
-    async fn raise_outsider(
+    async fn raise_credential_alert(
         &self,
         key: &RobotKey,
         code: &'static str,
@@ -152,7 +152,7 @@ impl App {
     }
 
     /// Clears the alerts of a robot that has joined again.
-    pub(super) async fn end_outsider(
+    pub(super) async fn end_credential_alerts(
         &self,
         tx: &mut Tx,
         enrolment: &Enrolment,

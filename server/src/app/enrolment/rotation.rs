@@ -28,12 +28,12 @@ const LEFT_NAMED_MAX: usize = 10;
 /// Interval at which an unconfirmed write of the authorities' files is tried again.
 const SETTLE_EVERY: Duration = Duration::from_secs(5);
 
-/// Enrolment and authority of the certificate that each robot showed last, as stored; avoids
-/// writing the same again.
+/// Stored enrolment and authority of the certificate that each robot showed last. Avoids repeated
+/// writes of the same values.
 #[derive(Debug, Default)]
-pub(super) struct Shown(Mutex<HashMap<RobotKey, (u32, String)>>);
+pub(super) struct RecordedCertificates(Mutex<HashMap<RobotKey, (u32, String)>>);
 
-impl Shown {
+impl RecordedCertificates {
     fn is_written(&self, robot: &RobotKey, enrolment: u32, authority: &str) -> bool {
         let shown = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let written = shown.get(robot);
@@ -78,7 +78,7 @@ impl App {
         let mut described = FleetAuthority {
             signing,
             rotation: None,
-            on_disk: self.authorities()?.is_settled(),
+            on_disk: self.authorities()?.is_durable(),
             robots_to_join: 0,
             to_join: Vec::new(),
         };
@@ -181,7 +181,7 @@ impl App {
         let finishing = tokio::task::spawn_blocking(move || authorities.finish(rotation));
         let trusted = ended(finishing.await)?;
         warn!("{by} has finished the rotation of the fleet's authority; the former one is retired");
-        self.settle_authorities();
+        self.retry_authority_sync();
         self.describe(&trusted).await
     }
 
@@ -209,22 +209,22 @@ impl App {
     }
 
     /// Retries the write of the authorities' files in the background until the disk confirms it.
-    fn settle_authorities(&self) {
+    fn retry_authority_sync(&self) {
         let Ok(authorities) = self.authorities() else {
             return;
         };
-        if authorities.is_settled() {
+        if authorities.is_durable() {
             return;
         }
         let (authorities, stop) = (Arc::clone(authorities), self.supervisor().stop_token());
         self.supervisor().spawn_passing("authorities", async move {
-            while !authorities.is_settled() {
+            while !authorities.is_durable() {
                 tokio::select! {
                     () = stop.cancelled() => return,
                     () = tokio::time::sleep(SETTLE_EVERY) => {}
                 }
                 let asked = Arc::clone(&authorities);
-                let settling = tokio::task::spawn_blocking(move || asked.settle());
+                let settling = tokio::task::spawn_blocking(move || asked.retry_sync());
                 match settling.await {
                     Ok(Ok(())) => {
                         info!("the disk has confirmed that the former authority is retired");

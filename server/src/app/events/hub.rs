@@ -13,7 +13,7 @@ use tread_api::event::{Event, Topic};
 use tread_api::friction::MapChange;
 use tread_api::robot::Alert;
 
-use super::sent::{About, EventFilter, Position, Sent, unnumbered};
+use super::sent::{EventFilter, EventSubject, Position, Sent, unnumbered};
 use super::snapshot::{SNAPSHOT_READ_MAX, Snapshots};
 use crate::app::presence::RobotKey;
 
@@ -199,7 +199,7 @@ impl Hub {
         &self,
         event: &Event,
         (topic, step): (Topic, Option<i64>),
-        about: Option<About>,
+        about: Option<EventSubject>,
     ) {
         let mut state = self.lock();
         state.seq += 1;
@@ -220,7 +220,7 @@ impl Hub {
         }
         let mut slow = Vec::new();
         for (&id, client) in &state.clients {
-            let wanted = client.filter.lets_through(sent.topic, sent.about.as_ref());
+            let wanted = client.filter.matches(sent.topic, sent.about.as_ref());
             if wanted && !client.take(&sent) {
                 slow.push(id);
             }
@@ -285,7 +285,7 @@ impl Hub {
             return None;
         }
         let missed = state.kept.iter().filter(|event| event.seq > seq);
-        let wanted = missed.filter(|event| filter.lets_through(event.topic, event.about.as_ref()));
+        let wanted = missed.filter(|event| filter.matches(event.topic, event.about.as_ref()));
         Some(wanted.cloned().collect())
     }
 }

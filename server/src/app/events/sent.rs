@@ -27,11 +27,11 @@ pub struct Sent {
     pub text: Box<str>,
     pub(super) seq: u64,
     pub(super) topic: Option<Topic>,
-    pub(super) about: Option<About>,
+    pub(super) about: Option<EventSubject>,
 }
 
 /// Subject of an event: a robot of a site, or, with `None`, the site as a whole.
-pub(super) type About = (SiteId, Option<RobotId>);
+pub(super) type EventSubject = (SiteId, Option<RobotId>);
 
 /// Filter of a client; an empty field lets everything through.
 #[derive(Debug, Clone, Default)]
@@ -47,9 +47,9 @@ pub struct EventFilter {
 }
 
 impl EventFilter {
-    pub(super) fn lets_through(&self, topic: Option<Topic>, about: Option<&About>) -> bool {
+    pub(super) fn matches(&self, topic: Option<Topic>, about: Option<&EventSubject>) -> bool {
         let of_topic = topic.is_none_or(|topic| self.wants(topic));
-        let is_about = |about: &About| match about {
+        let is_about = |about: &EventSubject| match about {
             (site, Some(robot)) => self.wants_robot(site, robot),
             // A filter on robots does not exclude events about a whole site.
             (site, None) => {
@@ -71,7 +71,7 @@ impl EventFilter {
     }
 }
 
-pub(super) fn unnumbered(event: &Event, topic: Option<Topic>, about: Option<About>) -> Sent {
+pub(super) fn unnumbered(event: &Event, topic: Option<Topic>, about: Option<EventSubject>) -> Sent {
     Sent {
         id: None,
         name: event.name(),

@@ -61,8 +61,7 @@ impl Reading {
     /// Returns the next event that passes the client's filter; `None` after the last.
     pub(super) fn next(&mut self) -> Option<Arc<Sent>> {
         let rest = self.snapshot.events.get(self.next..)?;
-        let wanted =
-            |event: &Arc<Sent>| self.filter.lets_through(event.topic, event.about.as_ref());
+        let wanted = |event: &Arc<Sent>| self.filter.matches(event.topic, event.about.as_ref());
         let skipped = rest.iter().position(wanted)?;
         self.next += skipped + 1;
         rest.get(skipped).cloned()

@@ -12,8 +12,8 @@ use tread_api::rights::Scope;
 use tread_api::site::Cell;
 
 use super::area::Area;
-use super::drawn::Drawn;
-use super::{App, AppError, Asked, MapReader, Reading, SiteView, page, terrain_ref};
+use super::present_terrains::PresentTerrains;
+use super::{App, AppError, MapReader, Reading, ReadingParameters, SiteView, page, terrain_ref};
 use crate::db::sites::SiteRow;
 use crate::friction::Ground;
 use crate::friction::epochs::HOUR_S;
@@ -34,7 +34,7 @@ impl App {
     pub async fn visits_worth_most(
         &self,
         site: &SiteId,
-        asked: &Asked,
+        asked: &ReadingParameters,
         area: Area,
         limit: u32,
     ) -> Result<MapPage<VisitSuggestion>, AppError> {
@@ -51,7 +51,7 @@ impl App {
         }
         let CellBox { min, max } = area.cells(&grid)?;
         let looking = move |reader: &MapReader<'_>, [reading]: &[Reading; 1]| {
-            let drawn = Drawn::new(&view.terrains);
+            let drawn = PresentTerrains::new(&view.terrains);
             let (low, high) = (Block::of(min), Block::of(max));
             let rows = low.row..=high.row;
             let blocks = rows.flat_map(|row| {
@@ -97,7 +97,7 @@ impl App {
         cursor: Option<&str>,
         limit: u32,
     ) -> Result<Page<RobotContribution>, AppError> {
-        let reading = Reading::new(self, &Asked::default())?;
+        let reading = Reading::new(self, &ReadingParameters::default())?;
         let view = self.site_view(site).await?;
         let (after, named) = (cursor.map(str::to_owned), within.limit_of(site));
         let looking = move |reader: &MapReader<'_>| {
@@ -134,18 +134,18 @@ impl App {
 /// Number of cells that each robot has measured, of each block of each site. Only blocks that have
 /// changed since are counted again.
 #[derive(Debug, Default)]
-pub(in crate::app) struct CellCounts(Mutex<HashMap<(i64, Block), Counted>>);
+pub(in crate::app) struct CellCounts(Mutex<HashMap<(i64, Block), RobotCells>>);
 
 /// Cells of a block by robot.
 #[derive(Debug, Clone)]
-struct Counted {
+struct RobotCells {
     /// Number of the newest change when they were counted.
     change: u64,
     cells: BTreeMap<RobotId, u64>,
 }
 
 impl CellCounts {
-    fn lock(&self) -> MutexGuard<'_, HashMap<(i64, Block), Counted>> {
+    fn lock(&self) -> MutexGuard<'_, HashMap<(i64, Block), RobotCells>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -167,7 +167,7 @@ impl CellCounts {
                     let mut cells = BTreeMap::new();
                     map.count_cells(block, &mut cells);
                     let change = map.map().changes().newest_of(block);
-                    Counted { change, cells }
+                    RobotCells { change, cells }
                 })?;
                 self.lock().insert(key, counted.clone());
                 counted
@@ -182,7 +182,7 @@ impl CellCounts {
 
 fn suggested(
     map: Cells<'_>,
-    drawn: &Drawn<'_>,
+    drawn: &PresentTerrains<'_>,
     reading: &Reading,
     cell: Cell,
     center: Point,

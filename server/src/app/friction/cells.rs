@@ -11,9 +11,9 @@ use tread_api::site::{CELL_MAX_M, Cell, Grid};
 use tread_api::terrain::{Terrain, TerrainRef};
 
 use super::area::Area;
-use super::drawn::{Drawn, is_here};
 use super::map_reader::smaller;
-use super::{App, AppError, Asked, MapReader, Reading, SiteView, page, terrain_ref};
+use super::present_terrains::{PresentTerrains, is_here};
+use super::{App, AppError, MapReader, Reading, ReadingParameters, SiteView, page, terrain_ref};
 use crate::friction::Ground;
 use crate::friction::index::{Block, Cells, Group};
 
@@ -43,7 +43,7 @@ impl App {
     pub async fn friction_of_cells(
         &self,
         site: &SiteId,
-        asked: &Asked,
+        asked: &ReadingParameters,
         cells: CellsAsked<'_>,
     ) -> Result<MapPage<CellFriction>, AppError> {
         let CellsAsked {
@@ -111,7 +111,7 @@ impl App {
     pub async fn friction_at(
         &self,
         site: &SiteId,
-        asked: &Asked,
+        asked: &ReadingParameters,
         point: Point,
     ) -> Result<PointFriction, AppError> {
         let reading = Reading::new(self, asked)?;
@@ -129,11 +129,11 @@ impl App {
     pub async fn friction_difference(
         &self,
         site: &SiteId,
-        asked: &Asked,
+        asked: &ReadingParameters,
         (from, to): (Timestamp, Option<Timestamp>),
         cells: CellsAsked<'_>,
     ) -> Result<DifferencePage<CellDifference>, AppError> {
-        let asked = Asked {
+        let asked = ReadingParameters {
             as_of: to,
             ..asked.clone()
         };
@@ -154,7 +154,7 @@ impl App {
         let looking = move |reader: &MapReader<'_>, [early, late]: &[Reading; 2]| {
             let (mut found, mut after) = (Vec::new(), after);
             let mut at_once = CELLS_AT_ONCE;
-            let compared = Compared { early, late };
+            let compared = ReadingPair { early, late };
             while found.len() <= wanted {
                 let (some, last) = smaller(&mut at_once, |at_once| {
                     reader.cells(&row, |map| {
@@ -193,7 +193,7 @@ fn known_at_point(
     reading: &Reading,
     (cell, point): (Cell, Point),
 ) -> Result<PointFriction, AppError> {
-    let drawn = Drawn::new(&view.terrains);
+    let drawn = PresentTerrains::new(&view.terrains);
     let terrain = drawn.at(point);
     let measured = measured_at_point(reader, view, reading, cell, terrain)?;
     // The prior of the terrain's class is needed only where nothing was measured.
@@ -267,12 +267,12 @@ pub(super) fn of_square(
 
 /// Readings of the map as of two times.
 #[derive(Clone, Copy)]
-struct Compared<'reading> {
+struct ReadingPair<'reading> {
     early: &'reading Reading,
     late: &'reading Reading,
 }
 
-impl Compared<'_> {
+impl ReadingPair<'_> {
     /// Returns the differences of friction in a cell, per terrain and configuration.
     fn differences(self, map: Cells<'_>, cell: Cell) -> Vec<CellDifference> {
         type Key = (Option<TerrainRef>, ConfigurationId);

@@ -9,9 +9,11 @@ use tread_api::geometry::Point;
 use tread_api::ids::{SiteId, TerrainId};
 
 use super::cells::measured_at_point;
-use super::drawn::Drawn;
+use super::present_terrains::PresentTerrains;
 use super::timelines::MEASUREMENTS_MAX;
-use super::{App, AppError, Asked, MOVED, MapReader, READS_MAX, Reading, SiteView, terrain_ref};
+use super::{
+    App, AppError, MOVED, MapReader, READS_MAX, Reading, ReadingParameters, SiteView, terrain_ref,
+};
 use crate::friction::Epoch;
 use crate::friction::index::{SiteMap, Timeline};
 
@@ -82,7 +84,7 @@ impl App {
     pub async fn history_of_terrain(
         &self,
         (site, id): (&SiteId, &TerrainId),
-        asked: &Asked,
+        asked: &ReadingParameters,
         times: Times,
     ) -> Result<TerrainHistory, AppError> {
         let times = times.checked(self)?;
@@ -105,7 +107,7 @@ impl App {
     pub async fn history_of_point(
         &self,
         site: &SiteId,
-        asked: &Asked,
+        asked: &ReadingParameters,
         point: Point,
         times: Times,
     ) -> Result<PointHistory, AppError> {
@@ -113,7 +115,7 @@ impl App {
         let reading = Reading::new(self, asked)?;
         let view = self.site_view(site).await?;
         let cell = view.cell_at(point)?;
-        let terrain = Drawn::new(&view.terrains).at(point).cloned();
+        let terrain = PresentTerrains::new(&view.terrains).at(point).cloned();
         let of_terrain = terrain.as_ref().map(terrain_ref);
         let known = move |reader: &MapReader<'_>, view: &SiteView, reading: &Reading| {
             measured_at_point(reader, view, reading, cell, terrain.as_ref())

@@ -37,7 +37,7 @@ impl Default for MapUpdates {
 
 /// State of a site's map that was published last.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Announced {
+struct PublishedVersion {
     change: u64,
     terrain_revision: u64,
 }
@@ -58,19 +58,19 @@ pub async fn run(app: App, stop: CancellationToken) {
 
 impl App {
     /// Subscribes to changes of maps from now on.
-    pub fn map_news(&self) -> broadcast::Receiver<MapChange> {
+    pub fn map_changes(&self) -> broadcast::Receiver<MapChange> {
         self.map_updates().0.subscribe()
     }
 
     async fn publish_changes(
         &self,
-        announced: &mut HashMap<i64, Announced>,
+        announced: &mut HashMap<i64, PublishedVersion>,
     ) -> Result<(), AppError> {
         let mut tx = self.db().read("friction").await?;
         let rows = db::sites::list(&mut tx, &Scope::EVERYWHERE, "", SITES_MAX).await?;
         drop(tx);
         for row in rows {
-            let present = Announced {
+            let present = PublishedVersion {
                 change: self.maps().with_map(&row, |map| map.changes().newest()),
                 terrain_revision: row.site.terrain_revision,
             };
@@ -87,7 +87,7 @@ impl App {
         Ok(())
     }
 
-    fn change_since(&self, row: &SiteRow, before: Announced) -> MapChange {
+    fn change_since(&self, row: &SiteRow, before: PublishedVersion) -> MapChange {
         let mut boxes: Vec<CellBox> = self.maps().with_map(row, |map| {
             let changed = map.changes().blocks();
             let changed = changed.filter(|(_, newest)| *newest > before.change);

@@ -13,7 +13,7 @@ use tokio_util::sync::CancellationToken;
 use super::{App, AppError};
 use crate::app::map::Pins;
 use crate::db::sites::SiteRow;
-use crate::friction::index::{Absent, Cells, SiteMap};
+use crate::friction::index::{Cells, MissingBlocks, SiteMap};
 
 /// Maximum number of answers that are computed at once.
 const COMPUTING_MAX: usize = 4;
@@ -107,7 +107,7 @@ impl<'app> MapReader<'app> {
     ) -> Result<T, AppError> {
         let mut turn = None;
         loop {
-            let absent = Absent::default();
+            let absent = MissingBlocks::default();
             let answer = self.app.maps().read_cells(row, &absent, &read);
             let absent = absent.into_blocks();
             if absent.is_empty() {

@@ -3,7 +3,6 @@
 mod advice;
 mod area;
 mod cells;
-mod drawn;
 mod export;
 mod history;
 pub mod live;
@@ -11,6 +10,7 @@ mod map_reader;
 mod path;
 mod path_prior;
 mod pictures;
+mod present_terrains;
 mod prior;
 mod raster;
 mod reading;
@@ -41,8 +41,8 @@ pub use self::pictures::Picture;
 pub(super) use self::pictures::Pictures;
 use self::prior::Classes;
 pub use self::raster::{PictureAsked, SQUARES_MAX};
-pub use self::reading::Asked;
 pub(super) use self::reading::Reading;
+pub use self::reading::ReadingParameters;
 pub(super) use self::timelines::Timelines;
 pub(super) use self::views::Views;
 use super::{App, AppError, page, site_row};
@@ -150,7 +150,7 @@ impl App {
     pub async fn friction_of_terrains(
         &self,
         site: &SiteId,
-        asked: &Asked,
+        asked: &ReadingParameters,
         cursor: Option<&str>,
         limit: u32,
     ) -> Result<Page<TerrainFriction>, AppError> {
@@ -184,7 +184,7 @@ impl App {
         &self,
         site: &SiteId,
         id: &TerrainId,
-        asked: &Asked,
+        asked: &ReadingParameters,
     ) -> Result<TerrainFriction, AppError> {
         let reading = Reading::new(self, asked)?;
         let view = self.site_view(site).await?;
@@ -255,7 +255,7 @@ impl App {
         &self,
         limit: usize,
     ) -> Result<(Vec<KnownGround>, usize), AppError> {
-        let reading = Reading::new(self, &Asked::default())?;
+        let reading = Reading::new(self, &ReadingParameters::default())?;
         let (mut found, mut left_out) = (Vec::new(), 0);
         for site in self.all_sites().await? {
             let view = self.site_view(&site).await?;

@@ -13,10 +13,10 @@ use tread_api::site::{Cell, Grid};
 use tread_control::robot::RobotModel as PlannedModel;
 
 use super::area::Area;
-use super::drawn::{Drawn, Near};
 use super::map_reader::in_parts;
-use super::{App, AppError, Asked, MapReader, Reading, SiteView};
-use crate::friction::index::{Cells, CompiledFilter, Room};
+use super::present_terrains::{NearbyTerrains, PresentTerrains};
+use super::{App, AppError, MapReader, Reading, ReadingParameters, SiteView};
+use crate::friction::index::{Cells, CompiledFilter, FusionBuffers};
 use crate::friction::traction_limit::{self, TractionEstimate};
 
 /// Maximum length of a path, metres.
@@ -50,7 +50,7 @@ impl App {
         let view = self.site_view(site).await?;
         let found = self.robot_of(view.row.pk, &robot).await?;
         let found = found.ok_or_else(|| AppError::UnknownRobot(site.clone(), robot.clone()))?;
-        let asked = Asked {
+        let asked = ReadingParameters {
             as_of,
             configuration: Some(found.configuration),
             normalisation,
@@ -60,7 +60,7 @@ impl App {
         let cut = cut(&points, &view.row.site.grid)?;
         let row = view.row.clone();
         let looking = move |reader: &MapReader<'_>, [reading]: &[Reading; 1]| {
-            let drawn = Drawn::new(&view.terrains);
+            let drawn = PresentTerrains::new(&view.terrains);
             let near = drawn_near(&drawn, &cut);
             let mut pieces: Vec<PathPiece> = in_parts(&cut, PLACES_AT_ONCE, |some| {
                 reader.cells(&view.row, |map| {
@@ -239,9 +239,9 @@ fn curvature(points: &[Point], corner: usize) -> f64 {
 
 /// Returns the terrains whose bounding boxes touch that of the places.
 pub(super) fn drawn_near<'view, 'cut>(
-    drawn: &Drawn<'view>,
+    drawn: &PresentTerrains<'view>,
     places: impl IntoIterator<Item = &'cut Cut>,
-) -> Near<'view> {
+) -> NearbyTerrains<'view> {
     let (mut min, mut max) = (
         Point {
             x_m: f64::INFINITY,
@@ -262,16 +262,20 @@ pub(super) fn drawn_near<'view, 'cut>(
 /// Reads the map at one place after another.
 pub(super) struct CellReader<'map> {
     map: Cells<'map>,
-    near: &'map Near<'map>,
+    near: &'map NearbyTerrains<'map>,
     filter: CompiledFilter<'map>,
     reading: &'map Reading,
-    room: Room,
+    room: FusionBuffers,
 }
 
 impl<'map> CellReader<'map> {
     pub(super) fn new(
         map: Cells<'map>,
-        (view, drawn, near): (&'map SiteView, &Drawn<'_>, &'map Near<'map>),
+        (view, drawn, near): (
+            &'map SiteView,
+            &PresentTerrains<'_>,
+            &'map NearbyTerrains<'map>,
+        ),
         reading: &'map Reading,
     ) -> Self {
         let filter = map
@@ -282,7 +286,7 @@ impl<'map> CellReader<'map> {
             near,
             filter,
             reading,
-            room: Room::default(),
+            room: FusionBuffers::default(),
         }
     }
 

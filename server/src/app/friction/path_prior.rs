@@ -9,13 +9,13 @@ use tread_api::site::{Cell, Grid};
 use tread_api::trajectory::{Trajectory, Waypoint};
 use tread_api::wire::command::{CellPrior, CellTractionLimit, PRIOR_CELLS_MAX, PathPrior};
 
-use super::drawn::Drawn;
 use super::map_reader::in_parts;
 use super::path::{
     CellReader, Cut, PLACES_AT_ONCE, checked_length, cut, drawn_near, is_measured,
     traction_limit_mu,
 };
-use super::{App, AppError, Asked, MapReader, Reading, SiteView};
+use super::present_terrains::PresentTerrains;
+use super::{App, AppError, MapReader, Reading, ReadingParameters, SiteView};
 
 /// Number of sides of the polygon by which a circle is approximated.
 const CIRCLE_CORNERS: u32 = 256;
@@ -40,9 +40,9 @@ impl App {
         let view = self.site_view(site).await?;
         let found = self.robot_of(view.row.pk, robot).await?;
         let Some(found) = found else { return Ok(None) };
-        let asked = Asked {
+        let asked = ReadingParameters {
             configuration: Some(found.configuration),
-            ..Asked::default()
+            ..ReadingParameters::default()
         };
         let reading = Reading::new(self, &asked)?;
         let points = corners(trajectory);
@@ -72,7 +72,7 @@ fn prior_of(
     reading: &Reading,
     cut: &[Cut],
 ) -> Result<Option<PathPrior>, AppError> {
-    let drawn = Drawn::new(&view.terrains);
+    let drawn = PresentTerrains::new(&view.terrains);
     let places: Vec<Cut> = {
         let near = near(cut, &view.row.site.grid);
         cut.iter().copied().chain(near).collect()

@@ -38,7 +38,7 @@ pub(super) struct State {
 }
 
 #[derive(Debug, Clone)]
-struct Kept {
+struct CachedPicture {
     state: State,
     picture: Picture,
     used: u64,
@@ -48,7 +48,7 @@ struct Kept {
 struct PictureCache {
     clock: u64,
     bytes: usize,
-    kept: HashMap<String, Kept>,
+    kept: HashMap<String, CachedPicture>,
 }
 
 /// Cache of pictures and of fused blocks.
@@ -68,14 +68,14 @@ impl Pictures {
         (found.state == state).then(|| found.picture.clone())
     }
 
-    fn keep(&self, key: String, state: State, picture: Picture) {
+    fn insert(&self, key: String, state: State, picture: Picture) {
         let size = picture.bytes.len();
         if size > KEPT_BYTES_MAX / 4 {
             return;
         }
         let mut held = self.cache.lock().unwrap_or_else(PoisonError::into_inner);
         let used = held.clock;
-        let kept = Kept {
+        let kept = CachedPicture {
             state,
             picture,
             used,
@@ -125,7 +125,7 @@ impl App {
             raster.squares = Vec::new();
             let of = Arc::new(raster);
             let picture = Picture { bytes, of };
-            app.pictures().keep(key, state, picture.clone());
+            app.pictures().insert(key, state, picture.clone());
             Ok(picture)
         };
         self.read_map(&row, [reading], drawing).await

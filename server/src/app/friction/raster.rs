@@ -13,11 +13,13 @@ use tread_api::site::{Cell, Grid};
 
 use super::area::Area;
 use super::cells::factor;
-use super::drawn::Drawn;
 use super::map_reader::in_parts;
-use super::{AppError, Asked, MapReader, Reading, SiteView};
+use super::present_terrains::PresentTerrains;
+use super::{AppError, MapReader, Reading, ReadingParameters, SiteView};
 use crate::friction::Raster;
-use crate::friction::index::{Block, CELLS_PER_BLOCK, CellSummary, Cells, CompiledFilter, Room};
+use crate::friction::index::{
+    Block, CELLS_PER_BLOCK, CellSummary, Cells, CompiledFilter, FusionBuffers,
+};
 
 /// Maximum number of squares in one picture.
 pub const SQUARES_MAX: u64 = 1 << 20;
@@ -30,7 +32,7 @@ const CELLS_PER_READ: i32 = 2_048;
 #[derive(Debug, Clone, Default)]
 pub struct PictureAsked {
     /// Configuration, normalisation and time.
-    pub asked: Asked,
+    pub asked: ReadingParameters,
     /// The area; `None` for everything that was driven on.
     pub area: Option<Area>,
     /// Side of the squares, metres; `None` for the grid's own cells.
@@ -48,7 +50,7 @@ struct BlockKey {
 
 /// A cached block.
 #[derive(Debug, Clone)]
-struct Kept {
+struct CachedBlock {
     change: u64,
     terrain_revision: u64,
     now_us: i64,
@@ -60,11 +62,11 @@ struct Kept {
 /// Cache of fused blocks.
 #[derive(Debug, Default)]
 pub(in crate::app) struct Blocks {
-    inner: Mutex<(u64, HashMap<BlockKey, Kept>)>,
+    inner: Mutex<(u64, HashMap<BlockKey, CachedBlock>)>,
 }
 
 impl Blocks {
-    fn find(&self, key: &BlockKey) -> Option<Kept> {
+    fn find(&self, key: &BlockKey) -> Option<CachedBlock> {
         let mut inner = self.inner.lock().unwrap_or_else(PoisonError::into_inner);
         inner.0 += 1;
         let now = inner.0;
@@ -73,7 +75,7 @@ impl Blocks {
         Some(found.clone())
     }
 
-    fn keep(&self, key: BlockKey, kept: Kept) {
+    fn insert(&self, key: BlockKey, kept: CachedBlock) {
         let mut inner = self.inner.lock().unwrap_or_else(PoisonError::into_inner);
         let (_, blocks) = &mut *inner;
         if blocks.len() >= BLOCKS_MAX && !blocks.contains_key(&key) {
@@ -91,7 +93,7 @@ impl Blocks {
 pub(super) struct Frame<'view> {
     view: &'view SiteView,
     reading: &'view Reading,
-    drawn: Drawn<'view>,
+    drawn: PresentTerrains<'view>,
     configuration: ConfigurationId,
 }
 
@@ -160,7 +162,7 @@ impl Frame<'_> {
             (newest, squares)
         })?;
         if let Some(key) = key {
-            let kept = Kept {
+            let kept = CachedBlock {
                 change,
                 terrain_revision,
                 now_us: reading.now_us,
@@ -168,7 +170,7 @@ impl Frame<'_> {
                 squares: Arc::clone(&squares),
                 used: 0,
             };
-            app.pictures().blocks.keep(key, kept);
+            app.pictures().blocks.insert(key, kept);
         }
         Ok(squares)
     }
@@ -227,7 +229,7 @@ impl Frame<'_> {
             squares.extend(in_parts(&columns, at_once, |some| {
                 reader.cells(&self.view.row, |map| {
                     let filter = self.filter(map);
-                    let mut room = Room::default();
+                    let mut room = FusionBuffers::default();
                     let square = |&ix: &i32| {
                         let ground = near.ground_at(coarse.center_of(Cell { ix, iy }));
                         let min = Cell {
@@ -320,7 +322,7 @@ pub(super) fn raster(
             let frame = Frame {
                 view,
                 reading,
-                drawn: Drawn::new(&view.terrains),
+                drawn: PresentTerrains::new(&view.terrains),
                 configuration,
             };
             if factor == 1 {

@@ -9,7 +9,7 @@ use tread_api::ids::ConfigurationId;
 use crate::app::{App, AppError};
 use crate::config::FrictionConfig;
 use crate::db::sites::SiteRow;
-use crate::friction::index::{At, Choice, Group, Normalisation, PartialEpoch, Timeline};
+use crate::friction::index::{Choice, FusionContext, Group, Normalisation, PartialEpoch, Timeline};
 use crate::friction::{Epoch, Ground, fuse};
 
 /// Seconds of a minute.
@@ -17,7 +17,7 @@ const MINUTE_S: i64 = 60;
 
 /// Parameters of a map request besides the place.
 #[derive(Debug, Clone, Default)]
-pub struct Asked {
+pub struct ReadingParameters {
     /// Only measurements made before this time; `None` for all.
     pub as_of: Option<Timestamp>,
     /// Only measurements of this configuration.
@@ -44,7 +44,7 @@ pub(in crate::app) struct Reading {
 }
 
 impl Reading {
-    pub(in crate::app) fn new(app: &App, asked: &Asked) -> Result<Self, AppError> {
+    pub(in crate::app) fn new(app: &App, asked: &ReadingParameters) -> Result<Self, AppError> {
         let now = app.clock().now();
         if let Some(as_of) = asked.as_of.filter(|&as_of| as_of > now) {
             return Err(AppError::InvalidQuery {
@@ -168,8 +168,8 @@ impl Reading {
     }
 
     /// Returns the fusion's settings and the time to which ages refer.
-    pub(in crate::app) fn fused_at(&self) -> At<'_> {
-        At {
+    pub(in crate::app) fn fused_at(&self) -> FusionContext<'_> {
+        FusionContext {
             config: &self.config,
             now_us: self.now_us,
         }

@@ -34,7 +34,7 @@ const KEPT_EVERY: usize = 16;
 #[derive(Debug, Default)]
 pub(in crate::app) struct Timelines {
     /// The least recently used first.
-    kept: Mutex<Vec<Kept>>,
+    kept: Mutex<Vec<CachedTimeline>>,
     /// The newest partial epochs, the oldest first: pages and frames of one map share theirs.
     partials: Mutex<Vec<(i64, Arc<PartialEpoch>)>>,
     /// Held while measurements are read, so that one request at a time does.
@@ -42,7 +42,7 @@ pub(in crate::app) struct Timelines {
 }
 
 #[derive(Debug, Clone)]
-struct Kept {
+struct CachedTimeline {
     of: Identity,
     /// Key of the last measurement that was read.
     read_to: i64,
@@ -59,7 +59,7 @@ struct Identity {
 }
 
 impl Timelines {
-    fn find(&self, of: Identity) -> Option<Kept> {
+    fn find(&self, of: Identity) -> Option<CachedTimeline> {
         let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
         let index = kept.iter().position(|kept| kept.of == of)?;
         let found = kept.remove(index);
@@ -67,12 +67,16 @@ impl Timelines {
         Some(found)
     }
 
-    fn keep(&self, new: Kept) {
+    fn insert(&self, new: CachedTimeline) {
         let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
-        let same = |kept: &Kept| (kept.of.site_pk, kept.of.epoch) == (new.of.site_pk, new.of.epoch);
+        let same = |kept: &CachedTimeline| {
+            (kept.of.site_pk, kept.of.epoch) == (new.of.site_pk, new.of.epoch)
+        };
         kept.retain(|kept| !same(kept));
         kept.push(new);
-        let count = |kept: &Vec<Kept>| kept.iter().map(|kept| kept.timeline.count()).sum::<usize>();
+        let count = |kept: &Vec<CachedTimeline>| {
+            kept.iter().map(|kept| kept.timeline.count()).sum::<usize>()
+        };
         while kept.len() > KEPT_MAX || (kept.len() > 1 && count(&kept) > MEASUREMENTS_MAX) {
             kept.remove(0);
         }
@@ -124,7 +128,7 @@ impl App {
             grid_revision: row.site.grid.revision,
             stamp,
         };
-        let is_whole = |kept: &Kept| kept.timeline.count() >= wanted;
+        let is_whole = |kept: &CachedTimeline| kept.timeline.count() >= wanted;
         if let Some(found) = self.timelines().find(of).filter(is_whole) {
             return Ok(Some(found.timeline));
         }
@@ -155,29 +159,29 @@ impl App {
             let adding = move || kept.with(&rows, &withdrawals);
             kept = self.compute(adding).await;
             if batch % KEPT_EVERY == 0 {
-                self.timelines().keep(kept.clone());
+                self.timelines().insert(kept.clone());
             }
         }
         drop(tx);
-        self.timelines().keep(kept.clone());
+        self.timelines().insert(kept.clone());
         Ok(is_whole(&kept).then_some(kept.timeline))
     }
 }
 
 /// Returns an empty timeline from before the first measurement of an epoch; `None` if some were
 /// removed.
-async fn begun(tx: &mut Tx, of: Identity) -> Result<Option<Kept>, AppError> {
+async fn begun(tx: &mut Tx, of: Identity) -> Result<Option<CachedTimeline>, AppError> {
     let begin = of.epoch.begin();
     let since = begin.checked_sub(SKEW_MIN).unwrap_or(Timestamp::MIN);
     let first = db::segments::first_since(tx, since).await?;
-    Ok(first.map(|first| Kept {
+    Ok(first.map(|first| CachedTimeline {
         of,
         read_to: first - 1,
         timeline: Arc::new(Timeline::new(of.epoch)),
     }))
 }
 
-impl Kept {
+impl CachedTimeline {
     /// Adds those of the given measurements that are of this epoch and on the map.
     fn with(mut self, rows: &[KeyedSegment], withdrawals: &[WithdrawalRow]) -> Self {
         let found = rows

@@ -18,17 +18,17 @@ const KEPT_MAX: usize = 1_000;
 /// The cache.
 #[derive(Debug, Default)]
 pub(in crate::app) struct Views {
-    sites: Kept<SiteId, SiteView>,
-    robots: Kept<(i64, RobotId), RobotRow>,
+    sites: GenerationCache<SiteId, SiteView>,
+    robots: GenerationCache<(i64, RobotId), RobotRow>,
 }
 
 /// Values read at one generation of the database.
 #[derive(Debug)]
-struct Kept<K, V> {
+struct GenerationCache<K, V> {
     of: Mutex<(u64, HashMap<K, Arc<V>>)>,
 }
 
-impl<K, V> Default for Kept<K, V> {
+impl<K, V> Default for GenerationCache<K, V> {
     fn default() -> Self {
         Self {
             of: Mutex::default(),
@@ -36,14 +36,14 @@ impl<K, V> Default for Kept<K, V> {
     }
 }
 
-impl<K: Eq + Hash, V> Kept<K, V> {
+impl<K: Eq + Hash, V> GenerationCache<K, V> {
     fn find(&self, generation: u64, key: &K) -> Option<Arc<V>> {
         let of = self.of.lock().unwrap_or_else(PoisonError::into_inner);
         (of.0 == generation).then(|| of.1.get(key).cloned())?
     }
 
     /// Caches a value read at `generation`, unless values of a later generation are cached.
-    fn keep(&self, generation: u64, key: K, value: V) -> Arc<V> {
+    fn insert(&self, generation: u64, key: K, value: V) -> Arc<V> {
         let value = Arc::new(value);
         let mut of = self.of.lock().unwrap_or_else(PoisonError::into_inner);
         if of.0 < generation || of.1.len() >= KEPT_MAX {
@@ -65,7 +65,7 @@ impl App {
             return Ok(view);
         }
         let view = SiteView::read(&mut self.db().read("friction").await?, site).await?;
-        Ok(self.views().sites.keep(generation, site.clone(), view))
+        Ok(self.views().sites.insert(generation, site.clone(), view))
     }
 
     /// Returns a robot of a site; `None` if there is none.
@@ -81,6 +81,6 @@ impl App {
         }
         let found =
             db::robots::find(&mut self.db().read("friction").await?, site_pk, robot).await?;
-        Ok(found.map(|row| self.views().robots.keep(generation, key, row)))
+        Ok(found.map(|row| self.views().robots.insert(generation, key, row)))
     }
 }

@@ -194,29 +194,29 @@ impl Share {
 
 /// A token or session whose last use is stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub(super) enum Used {
+pub(super) enum UsedCredential {
     Token(TokenId),
     Session(SessionId),
 }
 
 /// Entries that wait for the writer, and repeats that are being counted.
 #[derive(Debug, Default)]
-struct Waiting {
+struct AuditQueue {
     entries: VecDeque<AuditEntry>,
     repeats: HashMap<RequestKind, Repeats>,
     shares: HashMap<Author, Share>,
-    uses: HashMap<Used, Timestamp>,
+    uses: HashMap<UsedCredential, Timestamp>,
 }
 
 /// What was done with an entry.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Taken {
+enum EntryOutcome {
     Own,
     Counted,
     Dropped,
 }
 
-impl Waiting {
+impl AuditQueue {
     fn share(&mut self, author: Author) -> &mut Share {
         if self.shares.len() >= AUTHORS_MAX && !self.shares.contains_key(&author) {
             let has_none = |share: &Share| share.waiting == 0 && share.kinds == 0;
@@ -229,20 +229,20 @@ impl Waiting {
         self.shares.entry(author).or_default()
     }
 
-    fn add(&mut self, entry: AuditEntry, now: Duration) -> Taken {
+    fn add(&mut self, entry: AuditEntry, now: Duration) -> EntryOutcome {
         let author = Author::of(&entry);
         let has_room = self.entries.len() < WAITING_MAX;
         let share = self.share(author);
         if has_room && share.take(author.limit(), now) {
             share.waiting += 1;
             self.entries.push_back(entry);
-            return Taken::Own;
+            return EntryOutcome::Own;
         }
         self.count(entry, author, now)
     }
 
     /// Counts an entry as a repeat of its kind.
-    fn count(&mut self, entry: AuditEntry, author: Author, now: Duration) -> Taken {
+    fn count(&mut self, entry: AuditEntry, author: Author, now: Duration) -> EntryOutcome {
         let mut kind = RequestKind::of(&entry);
         let is_new = !self.repeats.contains_key(&kind);
         if is_new && self.share(author).kinds >= KINDS_PER_AUTHOR_MAX {
@@ -254,10 +254,10 @@ impl Waiting {
             }
             repeats.count += entry.count;
             repeats.newest = entry;
-            return Taken::Counted;
+            return EntryOutcome::Counted;
         }
         if self.repeats.len() >= KINDS_MAX {
-            return Taken::Dropped;
+            return EntryOutcome::Dropped;
         }
         self.share(author).kinds += 1;
         let repeats = Repeats {
@@ -268,7 +268,7 @@ impl Waiting {
             span: REPEATS_FIRST,
         };
         self.repeats.insert(kind, repeats);
-        Taken::Counted
+        EntryOutcome::Counted
     }
 
     /// Takes the next entries to write: those waiting, then repeats that are due, or with `all`
@@ -316,7 +316,7 @@ impl Waiting {
 /// Queue of entries for the writer.
 #[derive(Debug, Default)]
 pub(super) struct AuditLog {
-    waiting: Mutex<Waiting>,
+    waiting: Mutex<AuditQueue>,
     added: Notify,
     /// Whether each written entry is also a line of the server's log.
     is_logged: bool,
@@ -330,7 +330,7 @@ impl AuditLog {
         }
     }
 
-    fn lock(&self) -> MutexGuard<'_, Waiting> {
+    fn lock(&self) -> MutexGuard<'_, AuditQueue> {
         self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -345,13 +345,13 @@ impl App {
         let log = &self.identity().audit;
         let taken = log.lock().add(entry, self.clock().elapsed());
         match taken {
-            Taken::Own => log.added.notify_one(),
-            Taken::Counted => self.counters().audit_repeats.one(),
-            Taken::Dropped => self.counters().audit_dropped.one(),
+            EntryOutcome::Own => log.added.notify_one(),
+            EntryOutcome::Counted => self.counters().audit_repeats.one(),
+            EntryOutcome::Dropped => self.counters().audit_dropped.one(),
         }
     }
 
-    pub(super) fn record_use(&self, used: Used, at: Timestamp) {
+    pub(super) fn record_use(&self, used: UsedCredential, at: Timestamp) {
         let log = &self.identity().audit;
         log.lock().uses.insert(used, at);
         log.added.notify_one();
@@ -377,7 +377,7 @@ impl App {
     async fn write_audit(
         &self,
         entries: &[AuditEntry],
-        uses: &HashMap<Used, Timestamp>,
+        uses: &HashMap<UsedCredential, Timestamp>,
     ) -> Result<(), AppError> {
         let mut tx = self.db().write_uncounted("identity").await?;
         let mut written = Vec::new();
@@ -386,8 +386,10 @@ impl App {
         }
         for (used, at) in uses {
             match *used {
-                Used::Token(token) => db::tokens::touch(&mut tx, token, *at).await?,
-                Used::Session(session) => db::sessions::touch(&mut tx, session, *at).await?,
+                UsedCredential::Token(token) => db::tokens::touch(&mut tx, token, *at).await?,
+                UsedCredential::Session(session) => {
+                    db::sessions::touch(&mut tx, session, *at).await?
+                }
             }
         }
         if let Ok(since) = self.clock().now().checked_sub(KEPT) {

@@ -11,22 +11,22 @@ const ID_TOKENS_MAX: usize = 1_000;
 
 /// ID tokens by session.
 #[derive(Debug, Default)]
-pub(super) struct IdTokens(Mutex<Kept>);
+pub(super) struct IdTokens(Mutex<TokenTable>);
 
 #[derive(Debug, Default)]
-struct Kept {
+struct TokenTable {
     of: HashMap<SessionId, String>,
     /// Sessions, oldest first.
     order: VecDeque<SessionId>,
 }
 
 impl IdTokens {
-    fn lock(&self) -> MutexGuard<'_, Kept> {
+    fn lock(&self) -> MutexGuard<'_, TokenTable> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Keeps a session's ID token; beyond the maximum the oldest is dropped.
-    pub(super) fn keep(&self, session: SessionId, id_token: String) {
+    pub(super) fn insert(&self, session: SessionId, id_token: String) {
         let mut kept = self.lock();
         kept.of.insert(session, id_token);
         kept.order.push_back(session);

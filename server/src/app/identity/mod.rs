@@ -15,8 +15,8 @@
 //! limit for Stop requests.
 
 pub mod audit;
+mod credential_cache;
 mod id_tokens;
-mod known;
 pub mod people;
 pub(super) mod quota;
 pub mod sessions;
@@ -33,9 +33,9 @@ use tokio_util::sync::CancellationToken;
 use tread_api::identity::Token;
 use tread_api::ids::SessionId;
 
-use self::audit::{AuditLog, Used};
-pub use self::known::Credential;
-use self::known::{Known, Valid};
+use self::audit::{AuditLog, UsedCredential};
+pub use self::credential_cache::Credential;
+use self::credential_cache::{CredentialCache, Valid};
 use self::people::People;
 use super::{App, AppError};
 use crate::config::AuditConfig;
@@ -68,7 +68,7 @@ pub const READ_AGAIN_BY_STANDBY: Duration = Duration::from_millis(500);
 /// State of authentication in memory.
 #[derive(Debug)]
 pub(super) struct Identity {
-    known: Known,
+    known: CredentialCache,
     attempts: Mutex<Attempts>,
     audit: AuditLog,
     turns: Semaphore,
@@ -81,7 +81,7 @@ pub(super) struct Identity {
 impl Identity {
     pub(super) fn new(people: Option<People>, audit: AuditConfig) -> Self {
         Self {
-            known: Known::default(),
+            known: CredentialCache::default(),
             attempts: Mutex::default(),
             audit: AuditLog::new(audit),
             turns: Semaphore::new(LOOK_UP_TURNS),
@@ -92,9 +92,9 @@ impl Identity {
     }
 }
 
-/// How a secret was shown.
+/// How a request presents its secret.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Shown {
+pub enum CredentialKind {
     /// As a token, in a header or at the sign-in.
     Token,
     /// As a browser's session, in a cookie.
@@ -133,12 +133,12 @@ impl App {
         &self,
         address: IpAddr,
         text: &str,
-        shown: Shown,
+        shown: CredentialKind,
         purpose: Purpose,
     ) -> Result<Arc<Credential>, SignInError> {
         let secret = Secret::read(text).filter(|secret| match secret.kind() {
-            Kind::Token(_) => shown == Shown::Token,
-            Kind::Session => shown == Shown::Session,
+            Kind::Token(_) => shown == CredentialKind::Token,
+            Kind::Session => shown == CredentialKind::Session,
             Kind::Join | Kind::Webhook => false,
         });
         if let Some(secret) = &secret
@@ -319,8 +319,8 @@ impl App {
         let now = self.clock().now();
         if credential.touch(now) {
             let used = match (credential.subject, credential.session) {
-                (SubjectId::Token(token), _) => Used::Token(token),
-                (SubjectId::Person(_), Some(session)) => Used::Session(session),
+                (SubjectId::Token(token), _) => UsedCredential::Token(token),
+                (SubjectId::Person(_), Some(session)) => UsedCredential::Session(session),
                 (SubjectId::Person(_), None) => return,
             };
             self.record_use(used, now);
@@ -351,7 +351,7 @@ impl App {
             let generation = known.generation();
             let credential = self.kept(secret).await?;
             let now = self.clock().now();
-            if let Some(kept) = known.keep(fingerprint, credential, generation, now) {
+            if let Some(kept) = known.insert(fingerprint, credential, generation, now) {
                 return Ok(kept);
             }
         }

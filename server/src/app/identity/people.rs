@@ -38,7 +38,7 @@ use crate::identity::origin::{Origin, Provenance};
 use crate::identity::pending::{Pending, PendingKey, Presented, SIGN_IN_RANDOM_BYTES};
 use crate::identity::secret::Secret;
 use crate::identity::subject::name_of_person;
-use crate::oidc::{ExchangeError, Provider, SignedInThere};
+use crate::oidc::{AuthenticatedPerson, ExchangeError, Provider};
 
 /// Path at which a browser begins a sign-in.
 pub const BEGIN: &str = "/v1/sign-in/oidc";
@@ -114,7 +114,7 @@ struct OtherHost {
 
 /// Response to a browser that begins a sign-in.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Begun {
+pub struct SignInRedirect {
     /// URL to which the browser is redirected.
     pub location: String,
     /// Cookie of the pending sign-in; `None` if the browser is redirected to the page first.
@@ -148,7 +148,7 @@ pub struct People {
     key: PendingKey,
     turns: Arc<Semaphore>,
     networks: Mutex<HashMap<IpAddr, Arc<Semaphore>>>,
-    used: Mutex<Used>,
+    used: Mutex<CompletedSignIns>,
     pub(super) id_tokens: IdTokens,
     /// Notified when somebody wants to sign in while the provider is not known.
     wanted: Notify,
@@ -156,7 +156,7 @@ pub struct People {
 
 /// States of completed sign-ins, with the oldest first in `order`.
 #[derive(Debug, Default)]
-struct Used {
+struct CompletedSignIns {
     states: HashSet<String>,
     order: VecDeque<String>,
 }
@@ -249,7 +249,7 @@ impl People {
     }
 
     /// Records a completed sign-in; returns false if its state was used before.
-    fn use_up(&self, state: &str) -> bool {
+    fn consume_state(&self, state: &str) -> bool {
         let mut used = self.used.lock().unwrap_or_else(PoisonError::into_inner);
         if !used.states.insert(state.to_owned()) {
             return false;
@@ -263,7 +263,7 @@ impl People {
         true
     }
 
-    fn signed_in(&self, there: &SignedInThere) -> Result<SignedIn, PersonError> {
+    fn signed_in(&self, there: &AuthenticatedPerson) -> Result<SignedIn, PersonError> {
         let (subject, claims) = (&there.subject, &there.claims);
         let issuer = self.issuer().to_owned();
         let person = Person {
@@ -327,7 +327,7 @@ impl App {
     ///
     /// # Errors
     /// No provider is configured, or it is not known yet.
-    pub fn begin_sign_in(&self, asked: &Provenance<'_>) -> Result<Begun, PersonError> {
+    pub fn begin_sign_in(&self, asked: &Provenance<'_>) -> Result<SignInRedirect, PersonError> {
         let people = self.people().ok_or(PersonError::NotConfigured)?;
         let is_at_home = asked.is_at(&people.home);
         if !is_at_home {
@@ -338,7 +338,7 @@ impl App {
             self.log_failure("begin a sign-in", &error);
         }
         if !is_at_home || !asked.is_no_foreign_page() {
-            return Ok(Begun {
+            return Ok(SignInRedirect {
                 location: format!("{}/", people.home),
                 cookie: None,
             });
@@ -352,7 +352,7 @@ impl App {
             return Err(PersonError::Unavailable);
         };
         let cookie = Some(pending.cookie().to_owned());
-        Ok(Begun { location, cookie })
+        Ok(SignInRedirect { location, cookie })
     }
 
     /// Completes a sign-in when the provider redirects the browser back with its cookie.
@@ -400,7 +400,7 @@ impl App {
                 PersonError::NotBelieved
             }
         })?;
-        if !people.use_up(&pending.state) {
+        if !people.consume_state(&pending.state) {
             return Err(PersonError::NotBegun);
         }
         let mut signed_in = people.signed_in(&there)?;
@@ -410,7 +410,7 @@ impl App {
         let opened = self.open_session_of(Owner::Person(signed_in), expires_at);
         let (credential, secret) = opened.await?.ok_or(PersonError::NotBelieved)?;
         if let (Some(session), Some(id_token)) = (credential.session, there.id_token) {
-            people.id_tokens.keep(session, id_token);
+            people.id_tokens.insert(session, id_token);
         }
         Ok((credential, secret))
     }

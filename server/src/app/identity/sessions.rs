@@ -10,7 +10,7 @@ use tread_api::rights::Scope;
 
 use super::{Credential, SESSION_LASTS, SESSIONS_EACH_MAX, SignInError, new_secret};
 use crate::app::{App, AppError, page};
-use crate::db::sessions::{NewSession, OfPeople, Owner, SessionRow};
+use crate::db::sessions::{NewSession, Owner, PeopleSessionFilter, SessionRow};
 use crate::db::{self, DbError, Tx};
 use crate::identity::secret::{Kind, Secret};
 use crate::identity::subject::SubjectId;
@@ -131,7 +131,7 @@ impl App {
             return Ok(page(Vec::new(), limit, |_: &PersonSession| String::new()));
         };
         let (groups, elsewhere) = people.groups_by_scope(within);
-        let filter = OfPeople {
+        let filter = PeopleSessionFilter {
             issuer: people.issuer(),
             within: &groups,
             elsewhere: &elsewhere,

@@ -60,7 +60,7 @@ impl App {
     /// # Errors
     /// The token would have rights or a scope that its creator does not have; and the errors of
     /// [`Self::create_token`].
-    pub async fn give_token(
+    pub async fn create_token_as(
         &self,
         request: CreateToken,
         giver: &Credential,

@@ -40,7 +40,7 @@ impl Skew {
 
     /// Corrects the time of a mission report. A time that is still in the future is of an earlier
     /// run with a wrong clock; it is replaced by the present.
-    pub(super) fn put_right(self, at: Timestamp) -> Timestamp {
+    pub(super) fn corrected(self, at: Timestamp) -> Timestamp {
         let at = self.shifted(at);
         if at.duration_since(self.now) > SKEW_MIN {
             self.now

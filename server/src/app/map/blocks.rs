@@ -5,11 +5,11 @@
 //! stored sums ──snapshot──► cells of a block ──with the unwritten sums──► map ──► evicted
 //! ```
 //!
-//! A block is read without the [`super::MapTurn`], so that uploads never wait for it. The watermarks
-//! that are read in the same snapshot tell which of the unwritten sums are not in the stored ones:
-//! those of generations that end after the watermark of their robot. Generations that are stored
-//! meanwhile are kept until the read is over ([`super::unwritten`]). If sums were removed or merged in
-//! the map meanwhile, the block is read again.
+//! A block is read without the [`super::MapWriteGuard`], so that uploads never wait for it. The
+//! watermarks that are read in the same snapshot tell which of the unwritten sums are not in the
+//! stored ones: those of generations that end after the watermark of their robot. Generations that
+//! are stored meanwhile are kept until the read is over ([`super::unwritten`]). If sums were
+//! removed or merged in the map meanwhile, the block is read again.
 
 use std::collections::{BTreeSet, HashMap};
 use std::sync::PoisonError;
@@ -25,7 +25,9 @@ use crate::app::{App, AppError};
 use crate::db::sites::SiteRow;
 use crate::db::sums::SumRow;
 use crate::db::{self, DbError, Tx};
-use crate::friction::index::{Absent, Block, BlockBuilder, BlockCells, Cells, Pin, SiteMap, Stamp};
+use crate::friction::index::{
+    Block, BlockBuilder, BlockCells, Cells, MissingBlocks, Pin, SiteMap, Stamp,
+};
 
 /// One read may have so many blocks, however large: with fewer none could go from one to the next.
 const READ_BLOCKS_MIN: usize = 4;
@@ -104,7 +106,7 @@ impl Maps {
     pub(in crate::app) fn read_cells<T>(
         &self,
         row: &SiteRow,
-        absent: &Absent,
+        absent: &MissingBlocks,
         read: impl FnOnce(Cells<'_>) -> T,
     ) -> T {
         let number = self.memory.tick();

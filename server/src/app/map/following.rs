@@ -44,15 +44,15 @@ const SEGMENTS_AT_ONCE: u32 = 10_000;
 /// What a standby has read of the database.
 #[derive(Debug, Default)]
 pub(super) struct Follower {
-    read: Mutex<Read>,
-    seen: StdMutex<Seen>,
+    read: Mutex<ReadPosition>,
+    seen: StdMutex<LeaderView>,
     /// Whether the process is the server now; set under the lock of the maps.
     is_over: AtomicBool,
 }
 
-/// Up to where the database was read.
+/// Position up to which the database was read.
 #[derive(Debug, Default)]
-pub(super) struct Read {
+pub(super) struct ReadPosition {
     /// Key of the last segment on the map.
     last_pk: i64,
     /// Number of the last withdrawal on the map.
@@ -66,14 +66,14 @@ pub(super) struct Read {
     watermarks_at: Duration,
 }
 
-/// What was seen of the server that has the database, and when the map was up to date.
+/// State of the server that has the database, and the time when the map was up to date.
 #[derive(Debug, Default)]
-struct Seen {
+struct LeaderView {
     leader: Leader,
     at: Option<Instant>,
 }
 
-impl Read {
+impl ReadPosition {
     /// Begins after a map that was just read.
     pub(super) fn begin(
         &mut self,
@@ -94,7 +94,7 @@ impl Read {
 
 impl Follower {
     /// Waits for the right to bring the map up to date.
-    pub(super) async fn turn(&self) -> MutexGuard<'_, Read> {
+    pub(super) async fn turn(&self) -> MutexGuard<'_, ReadPosition> {
         self.read.lock().await
     }
 
@@ -106,7 +106,7 @@ impl Follower {
         self.is_over.store(true, Ordering::Release);
     }
 
-    fn seen(&self) -> std::sync::MutexGuard<'_, Seen> {
+    fn seen(&self) -> std::sync::MutexGuard<'_, LeaderView> {
         self.seen.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -127,7 +127,11 @@ impl App {
     }
 
     /// Brings the map up to what a snapshot contains; `false` if it cannot.
-    pub(super) async fn follow_in(&self, tx: &mut Tx, read: &mut Read) -> Result<bool, DbError> {
+    pub(super) async fn follow_in(
+        &self,
+        tx: &mut Tx,
+        read: &mut ReadPosition,
+    ) -> Result<bool, DbError> {
         let (Some(follower), Some(before)) = (self.maps().follower(), read.leader.clone()) else {
             return Ok(false);
         };
@@ -151,7 +155,7 @@ impl App {
                 return Ok(false);
             }
         }
-        *follower.seen() = Seen {
+        *follower.seen() = LeaderView {
             leader,
             at: Some(Instant::now()),
         };
@@ -159,7 +163,7 @@ impl App {
     }
 
     /// Adds new sites, and removes and merges what was removed and merged.
-    async fn follow_sites(&self, tx: &mut Tx, read: &mut Read) -> Result<(), DbError> {
+    async fn follow_sites(&self, tx: &mut Tx, read: &mut ReadPosition) -> Result<(), DbError> {
         read.names = Names::read(tx).await?;
         let sites = db::sites::list(tx, &Scope::EVERYWHERE, "", SITES_MAX).await?;
         for site in &sites {
@@ -192,7 +196,7 @@ impl App {
     }
 
     /// Adds the segments after the last one.
-    async fn follow_segments(&self, tx: &mut Tx, read: &mut Read) -> Result<bool, DbError> {
+    async fn follow_segments(&self, tx: &mut Tx, read: &mut ReadPosition) -> Result<bool, DbError> {
         loop {
             let rows = db::segments::after(tx, read.last_pk, SEGMENTS_AT_ONCE).await?;
             let Some(first) = rows.first() else {
@@ -215,7 +219,11 @@ impl App {
     }
 
     /// Adds segments range by range; `false` if this process is the server now.
-    fn add_segments(&self, rows: Vec<KeyedSegment>, read: &mut Read) -> Result<bool, DbError> {
+    fn add_segments(
+        &self,
+        rows: Vec<KeyedSegment>,
+        read: &mut ReadPosition,
+    ) -> Result<bool, DbError> {
         let now = self.clock().elapsed();
         let mut rows = rows.into_iter().peekable();
         while let Some(first) = rows.next() {
@@ -239,7 +247,7 @@ impl App {
     }
 
     /// Removes sums from the unwritten ones that are stored now; `false` if this process is the server now.
-    fn remove_stored(&self, watermarks: HashMap<i64, i64>, read: &mut Read) -> bool {
+    fn remove_stored(&self, watermarks: HashMap<i64, i64>, read: &mut ReadPosition) -> bool {
         let step = |(&robot_pk, &to_pk): (&i64, &i64)| {
             let from_pk = read.watermarks.get(&robot_pk).copied().unwrap_or_default();
             (to_pk > from_pk).then_some(WatermarkStep {
@@ -281,7 +289,7 @@ impl App {
         let ended = self.db().unknown_outcomes();
         // A read may hang on a connection to a machine that is gone.
         let taken = match tokio::time::timeout(TURN_MAX, follower.turn()).await {
-            Ok(mut turn) => self.bring_up(&mut turn).await,
+            Ok(mut turn) => self.catch_up(&mut turn).await,
             Err(_elapsed) => Ok(false),
         };
         maps.end_following();
@@ -290,7 +298,7 @@ impl App {
     }
 
     /// Brings the map of a standby up to date as the server that has the database now.
-    async fn bring_up(&self, read: &mut Read) -> Result<bool, DbError> {
+    async fn catch_up(&self, read: &mut ReadPosition) -> Result<bool, DbError> {
         let mut tx = self.db().read("map").await?;
         let Some(leader) = &mut read.leader else {
             return Ok(false);

@@ -20,8 +20,8 @@ use crate::friction::index::SiteMap;
 /// Number of sums after which cells leave memory if all together need too much of it.
 const EVICT_EVERY: usize = 10_000;
 
-/// What was read.
-struct Read {
+/// Sums that were read, with what they refer to.
+struct LoadedSums {
     sites: Sites,
     unwritten: Unwritten,
     names: Names,
@@ -97,7 +97,7 @@ async fn read(
     tx: &mut Tx,
     now: Duration,
     (memory, mut unwritten): (&BlockMemory, Unwritten),
-) -> Result<Read, DbError> {
+) -> Result<LoadedSums, DbError> {
     let mut sites = Sites::default();
     let mut after = String::new();
     loop {
@@ -153,7 +153,7 @@ async fn read(
         }
     }
     memory.evict(&mut sites);
-    Ok(Read {
+    Ok(LoadedSums {
         sites,
         unwritten,
         names,

@@ -89,7 +89,7 @@ pub struct UnwrittenCounts {
 
 /// Sums that are stored in one transaction: the oldest generations of some robots.
 #[derive(Debug, Default)]
-pub(super) struct Portion {
+pub(super) struct StoreBatch {
     /// In the order of the table, so that neighbours share database pages.
     pub(super) sums: Vec<(SumKey, Sums)>,
     pub(super) steps: Vec<WatermarkStep>,
@@ -236,8 +236,8 @@ impl Unwritten {
 
     /// Returns the oldest generations that began before addition `until` ended, with the steps of their
     /// robots' watermarks: as many as have `limit` sums, and at least one.
-    pub(super) fn portion(&self, until: u64, limit: usize) -> Portion {
-        let mut portion = Portion::default();
+    pub(super) fn portion(&self, until: u64, limit: usize) -> StoreBatch {
+        let mut portion = StoreBatch::default();
         'robots: for (&robot_pk, generations) in &self.robots {
             let mut step = None;
             for generation in generations.iter().take_while(|it| it.began.0 <= until) {

@@ -48,7 +48,7 @@ impl App {
     /// Stores some of the sums that have been unwritten since the addition `until`, which is the last
     /// one if it is `None`. Returns whether there may be more.
     async fn write_some_sums(&self, until: &mut Option<u64>) -> Result<bool, DbError> {
-        let turn = self.map_turn_to_change().await?;
+        let turn = self.lock_map_for_write().await?;
         let portion = {
             let unwritten = self.maps().unwritten();
             let until = *until.get_or_insert(unwritten.additions());

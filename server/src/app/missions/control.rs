@@ -42,15 +42,15 @@ impl App {
 
     /// Requests that an active mission is paused, with the robot stopped.
     pub async fn pause_mission(&self, id: MissionId) -> Result<MissionDetail, AppError> {
-        self.want_pause(id, true).await
+        self.request_pause(id, true).await
     }
 
     /// Requests that a paused mission is resumed.
     pub async fn resume_mission(&self, id: MissionId) -> Result<MissionDetail, AppError> {
-        self.want_pause(id, false).await
+        self.request_pause(id, false).await
     }
 
-    async fn want_pause(&self, id: MissionId, wanted: bool) -> Result<MissionDetail, AppError> {
+    async fn request_pause(&self, id: MissionId, wanted: bool) -> Result<MissionDetail, AppError> {
         let (asked, cause) = if wanted {
             ("paused", Cause::PauseRequested)
         } else {
@@ -79,7 +79,9 @@ impl App {
                 what: "pause a mission",
             });
         }
-        if mission.pause_wanted != wanted && db::missions::want_pause(&mut tx, id, wanted).await? {
+        if mission.pause_wanted != wanted
+            && db::missions::set_pause_wanted(&mut tx, id, wanted).await?
+        {
             let why = (Actor::Client, cause);
             let reason = format!("to be {asked}");
             add_note(&mut tx, mission, why, self.clock().now(), &reason).await?;
@@ -176,7 +178,7 @@ pub(in crate::app) async fn hold_all(
     at: Timestamp,
 ) -> Result<(), DbError> {
     for open in db::missions::open_of_robot(tx, robot_pk).await? {
-        if !open.pause_wanted && db::missions::want_pause(tx, open.id, true).await? {
+        if !open.pause_wanted && db::missions::set_pause_wanted(tx, open.id, true).await? {
             let event = MissionEvent {
                 at,
                 actor: Actor::Server,

@@ -11,7 +11,7 @@ use jiff::SignedDuration;
 use tread_api::mission::{CreateMission, Mission};
 use uuid::Uuid;
 
-use super::Enqueued;
+use super::InsertedMission;
 use crate::app::{App, AppError};
 use crate::db;
 use crate::db::idempotency::{OwnKey, StoredAnswer};
@@ -39,12 +39,12 @@ impl InFlight {
 }
 
 /// Marks a key as in use while its request is processed; dropping it ends that.
-struct Holding<'app> {
+struct KeyReservation<'app> {
     in_flight: &'app InFlight,
     key: (SubjectId, String),
 }
 
-impl<'app> Holding<'app> {
+impl<'app> KeyReservation<'app> {
     fn of(in_flight: &'app InFlight, (owner, key): OwnKey<'_>) -> Option<Self> {
         let key = (owner, key.to_owned());
         let is_first = in_flight.lock().insert(key.clone());
@@ -52,18 +52,18 @@ impl<'app> Holding<'app> {
     }
 }
 
-impl Drop for Holding<'_> {
+impl Drop for KeyReservation<'_> {
     fn drop(&mut self) {
         self.in_flight.lock().remove(&self.key);
     }
 }
 
-/// What became of a request with a key.
-enum Once {
+/// Outcome of a request with a key.
+enum KeyedOutcome {
     /// The key has an answer from before.
     Before(Mission),
     /// The mission is stored.
-    Now(Enqueued),
+    Now(InsertedMission),
 }
 
 impl App {
@@ -78,7 +78,7 @@ impl App {
         key: OwnKey<'_>,
         request: CreateMission,
     ) -> Result<Mission, AppError> {
-        let Some(_holding) = Holding::of(self.keys_in_flight(), key) else {
+        let Some(_holding) = KeyReservation::of(self.keys_in_flight(), key) else {
             return Err(AppError::KeyInFlight);
         };
         let written = serde_json::to_vec(&request).unwrap_or_default();
@@ -103,8 +103,8 @@ impl App {
         let storing = self.store_once(key, request_hash, request);
         let (prior, stored) = tokio::join!(early_prior, storing);
         Ok(match stored? {
-            Once::Before(answer) => answer,
-            Once::Now(enqueued) => self.enqueued(enqueued, prior),
+            KeyedOutcome::Before(answer) => answer,
+            KeyedOutcome::Now(enqueued) => self.enqueued(enqueued, prior),
         })
     }
 
@@ -114,7 +114,7 @@ impl App {
         key: OwnKey<'_>,
         request_hash: Uuid,
         request: CreateMission,
-    ) -> Result<Once, AppError> {
+    ) -> Result<KeyedOutcome, AppError> {
         let mut tx = self.db().write_uncounted("missions").await?;
         if let Some(stored) = db::idempotency::find(&mut tx, key, request_hash).await? {
             if stored.request_hash != request_hash {
@@ -125,7 +125,7 @@ impl App {
                 value: stored.answer.clone(),
             };
             let answer = serde_json::from_str(&stored.answer).map_err(corrupt)?;
-            return Ok(Once::Before(answer));
+            return Ok(KeyedOutcome::Before(answer));
         }
         let enqueued = self.enqueue(&mut tx, request).await?;
         let answer = serde_json::to_string(&enqueued.row.mission)
@@ -141,6 +141,6 @@ impl App {
             db::idempotency::delete_before(&mut tx, before, FORGET_MAX).await?;
         }
         tx.commit().await?;
-        Ok(Once::Now(enqueued))
+        Ok(KeyedOutcome::Now(enqueued))
     }
 }

@@ -80,7 +80,7 @@ impl App {
     }
 
     /// Returns whether the reconciler would offer a new mission at once, as the only open one of its
-    /// robot: the robot is heard, is not stopped or teleoperated, and not restrained since a
+    /// robot: the robot is heard, is not stopped or teleoperated, and not restricted since a
     /// restoration.
     pub(super) async fn may_offer_immediately(
         &self,
@@ -93,11 +93,11 @@ impl App {
         if mission.pause_wanted || link == LinkState::Offline {
             return Ok(false);
         }
-        // Robots of a database that was never restored are not restrained.
+        // Robots of a database that was never restored are not restricted.
         if self.restoration().is_none() {
             return Ok(true);
         }
-        let restrained = db::restorations::restrained(tx).await?;
-        Ok(restrained.iter().all(|robot| robot.pk != row.robot_pk))
+        let restricted = db::restorations::restricted(tx).await?;
+        Ok(restricted.iter().all(|robot| robot.pk != row.robot_pk))
     }
 }

@@ -36,7 +36,7 @@ pub const QUEUE_MAX: usize = 1_000;
 const EVENTS_MAX: u32 = 1_000;
 
 /// A mission as it was inserted.
-struct Enqueued {
+struct InsertedMission {
     row: MissionRow,
     /// Whether the same transaction set it to `offered`.
     is_offered: bool,
@@ -56,15 +56,15 @@ impl App {
             let mut tx = self.db().write_uncounted("missions").await?;
             let enqueued = self.enqueue(&mut tx, request).await?;
             tx.commit().await?;
-            Ok::<Enqueued, AppError>(enqueued)
+            Ok::<InsertedMission, AppError>(enqueued)
         };
         let (prior, enqueued) = tokio::join!(self.early_prior(&key, &trajectory), storing);
         Ok(self.enqueued(enqueued?, prior))
     }
 
     /// Sends what follows the commit of a new mission on its way.
-    fn enqueued(&self, enqueued: Enqueued, prior: Option<EarlyPrior>) -> Mission {
-        let Enqueued { row, recalls, .. } = enqueued;
+    fn enqueued(&self, enqueued: InsertedMission, prior: Option<EarlyPrior>) -> Mission {
+        let InsertedMission { row, recalls, .. } = enqueued;
         let mission = row.mission.clone();
         if let Some(EarlyPrior(prior)) = prior.filter(|_| enqueued.is_offered) {
             let offered = OfferedNow {
@@ -96,7 +96,11 @@ impl App {
     }
 
     /// Inserts a mission into its robot's queue, according to its start policy.
-    async fn enqueue(&self, tx: &mut Tx, request: CreateMission) -> Result<Enqueued, AppError> {
+    async fn enqueue(
+        &self,
+        tx: &mut Tx,
+        request: CreateMission,
+    ) -> Result<InsertedMission, AppError> {
         check_figures(&request)?;
         let recalls = self.recalls();
         let CreateMission {
@@ -182,7 +186,7 @@ impl App {
         row.mission.pause_wanted = self.is_operator_controlled(tx, &row.mission).await?;
         let is_offered = open.is_empty() && self.may_offer_immediately(tx, &row).await?;
         insert(tx, &row, is_offered).await?;
-        Ok(Enqueued {
+        Ok(InsertedMission {
             row,
             is_offered,
             has_ended_others,

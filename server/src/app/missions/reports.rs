@@ -34,12 +34,12 @@ pub(crate) struct Reporting {
 
 /// Effect of an accepted report: the state in which it ended the mission and the reason, if it did.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Taken {
+pub(crate) struct ReportEffect {
     pub(crate) ended: Option<(MissionState, String)>,
 }
 
 /// A report that did not end the mission.
-const NOTED: Taken = Taken { ended: None };
+const NOTED: ReportEffect = ReportEffect { ended: None };
 
 /// Reason why a report is refused for ever.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -56,7 +56,7 @@ pub(crate) async fn apply_mission_report(
     tx: &mut Tx,
     reporting: Reporting,
     report: &MissionReport,
-) -> Result<Result<Taken, Foreign>, DbError> {
+) -> Result<Result<ReportEffect, Foreign>, DbError> {
     let id = report.mission;
     let row = db::missions::find(tx, id).await?;
     let Some(row) = row.filter(|row| row.robot_pk == reporting.robot_pk) else {
@@ -107,7 +107,7 @@ pub(crate) async fn apply_mission_report(
             db::missions::add_facts(tx, id, facts).await?;
         }
     }
-    Ok(Ok(Taken { ended }))
+    Ok(Ok(ReportEffect { ended }))
 }
 
 enum Content {
@@ -209,7 +209,7 @@ async fn apply_phase(
     let is_safety_pause =
         report.phase == MissionPhase::Paused && report.progress.as_ref().is_some_and(is_for_safety);
     if is_safety_pause && !was_resumed_since(tx, mission.id, reporting.since).await? {
-        db::missions::want_pause(tx, mission.id, true).await?;
+        db::missions::set_pause_wanted(tx, mission.id, true).await?;
     }
     let reason = report.reason.as_deref();
     let step = Step {

@@ -121,7 +121,7 @@ impl Presences {
 
 #[cfg(test)]
 mod tests {
-    use super::super::Heard;
+    use super::super::MessageEffect;
     use super::super::tests::{SECOND, boot, key, state, wall};
     use super::*;
 
@@ -135,11 +135,11 @@ mod tests {
         }
         says(2, 1, SECOND);
         presences.take_alert_changes();
-        assert_eq!(says(1, 8, SECOND), Heard::Other);
+        assert_eq!(says(1, 8, SECOND), MessageEffect::OtherRun);
         // A repeated late message is no second agent.
-        assert_eq!(says(1, 8, 3 * SECOND), Heard::Other);
+        assert_eq!(says(1, 8, 3 * SECOND), MessageEffect::OtherRun);
         assert!(presences.take_duplicate_agents(3 * SECOND).is_empty());
-        assert_eq!(says(1, 9, 3 * SECOND), Heard::Other);
+        assert_eq!(says(1, 9, 3 * SECOND), MessageEffect::OtherRun);
         let duplicates = presences.take_duplicate_agents(3 * SECOND);
         assert_eq!(duplicates.len(), 1);
         assert_eq!(duplicates[0].boot, boot(1));

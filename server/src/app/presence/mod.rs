@@ -1,11 +1,11 @@
 //! Presence of robots on the network, with each robot's last messages. In memory; ages are by the
 //! server's monotonic clock.
 
+mod changes;
 mod duplicate_agent;
 mod link_quality;
-mod looks;
-mod news;
 mod offsets;
+mod queries;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -20,12 +20,12 @@ use tread_api::safety::StandingState;
 use tread_api::wire::state::{FrictionReport, RobotState};
 use uuid::Uuid;
 
+use self::changes::PublishedState;
 pub use self::duplicate_agent::DuplicateAgent;
 use self::duplicate_agent::OtherRun;
 use self::link_quality::LinkCounts;
-pub use self::looks::{Attending, Held, Showing};
-use self::news::Shown;
 use self::offsets::Offsets;
+pub use self::queries::{LinkStatus, ReportedCondition, ReportedRevisions};
 
 /// Maximum age of the last heartbeat of an online robot: three periods at 5 Hz, the rate at which a
 /// robot publishes that nobody watches.
@@ -40,18 +40,18 @@ const SUDDEN: Duration = Duration::from_secs(1);
 /// Maximum number of robots in memory; beyond it no further robot is added for its token alone.
 const STRANGERS_MAX: usize = 20_000;
 
-/// Result of a robot's message.
+/// Effect of a robot's message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Heard {
-    /// Nothing that could let a mission proceed.
-    Nothing,
+pub enum MessageEffect {
+    /// No change that may let a mission proceed.
+    Unchanged,
     /// A change that may let a mission proceed: of mode, mission, stop, lease or revisions, an
     /// outbox that became empty, or a robot that is online again.
-    News,
+    Changed,
     /// The robot has sent no hello; the message is dropped.
-    Stranger,
+    NotWelcomed,
     /// The message is of another run of the agent than the present one; it is not shown.
-    Other,
+    OtherRun,
 }
 
 /// A robot's name with its site.
@@ -78,7 +78,7 @@ pub struct Presence {
     monotonic_offsets_us: Offsets,
     alerts_changed: bool,
     other: Option<OtherRun>,
-    shown: Option<Shown>,
+    shown: Option<PublishedState>,
     state: Option<(RobotState, Duration)>,
     /// Progress of the mission that it showed last, of any run of the agent.
     progress: Option<MissionProgress>,
@@ -375,17 +375,17 @@ impl Presences {
         state: RobotState,
         now: Duration,
         wall: Timestamp,
-    ) -> Heard {
+    ) -> MessageEffect {
         let mut robots = self.lock();
         let Some(presence) = robots.get_mut(key).filter(|presence| presence.welcomed) else {
-            return Heard::Stranger;
+            return MessageEffect::NotWelcomed;
         };
         let was_online = presence.link(now) == LinkState::Online;
         if !presence.takes(state.boot, now) {
             presence.record_other(&state, now);
-            return Heard::Other;
+            return MessageEffect::OtherRun;
         }
-        let news = presence.state().is_none_or(|before| {
+        let has_changed = presence.state().is_none_or(|before| {
             before.mode != state.mode
                 || content(before) != content(&state)
                 || stop_of(before) != stop_of(&state)
@@ -413,7 +413,11 @@ impl Presences {
             {
                 presence.link_counts.late_state(now);
             }
-            return if news { Heard::News } else { Heard::Nothing };
+            return if has_changed {
+                MessageEffect::Changed
+            } else {
+                MessageEffect::Unchanged
+            };
         }
         let before = presence.state().map(|before| before.seq);
         presence.link_counts.state(now, before, state.seq);
@@ -427,24 +431,29 @@ impl Presences {
         presence.alerts_changed |= said != Some(&state.alerts);
         presence.progress = state.mission.or(presence.progress);
         presence.state = Some((state, now));
-        if news || !was_online {
-            Heard::News
+        if has_changed || !was_online {
+            MessageEffect::Changed
         } else {
-            Heard::Nothing
+            MessageEffect::Unchanged
         }
     }
 
     /// Records a robot's adapted and measured θ.
-    pub fn friction(&self, key: &RobotKey, report: &FrictionReport, now: Duration) -> Heard {
+    pub fn friction(
+        &self,
+        key: &RobotKey,
+        report: &FrictionReport,
+        now: Duration,
+    ) -> MessageEffect {
         let mut robots = self.lock();
         let Some(presence) = robots.get_mut(key).filter(|presence| presence.welcomed) else {
-            return Heard::Stranger;
+            return MessageEffect::NotWelcomed;
         };
         if !presence.takes(report.boot, now) {
-            return Heard::Other;
+            return MessageEffect::OtherRun;
         }
         presence.friction = Some((report.friction, now));
-        Heard::Nothing
+        MessageEffect::Unchanged
     }
 }
 

@@ -85,7 +85,7 @@ fn a_blip_of_the_token_is_no_restart_and_a_straggler_of_the_old_run_changes_noth
     assert!(presences.get(&key()).state().is_none());
     assert_eq!(
         presences.state(&key(), state(boot(1), 8), 3 * SECOND, wall()),
-        Heard::Other
+        MessageEffect::OtherRun
     );
     assert_eq!(presences.get(&key()).boot(), Some((boot(2), 3 * SECOND)));
     assert!(presences.take_duplicate_agents(4 * SECOND).is_empty());
@@ -104,7 +104,7 @@ fn ages_grow_until_the_robot_speaks_again() {
 fn of_a_robot_that_said_no_hello_nothing_is_kept() {
     let presences = Presences::default();
     let heard = presences.state(&key(), state(boot(1), 0), SECOND, wall());
-    assert_eq!(heard, Heard::Stranger);
+    assert_eq!(heard, MessageEffect::NotWelcomed);
     presences.token_appeared(key(), boot(1), SECOND);
     assert_eq!(
         presences.present_count(&tread_api::rights::Scope::EVERYWHERE),
@@ -112,7 +112,7 @@ fn of_a_robot_that_said_no_hello_nothing_is_kept() {
     );
     assert_eq!(
         presences.state(&key(), state(boot(1), 0), SECOND, wall()),
-        Heard::Stranger
+        MessageEffect::NotWelcomed
     );
     presences.token_gone(&key(), boot(1), SECOND);
     assert!(presences.lock().is_empty());

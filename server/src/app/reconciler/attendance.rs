@@ -37,7 +37,7 @@ pub(in crate::app) const START_GRACE: Duration = Duration::from_secs(30);
 
 /// Attendance of one robot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-struct Seen {
+struct RobotAttendance {
     is_present: bool,
     is_lost: bool,
     /// Time since which it has been heard without interruption.
@@ -55,7 +55,7 @@ enum Turn {
 
 /// Link of a robot at a check.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Look {
+struct ObservedLink {
     is_heard: bool,
     has_left: bool,
     silent: Duration,
@@ -68,9 +68,9 @@ struct Now {
     uptime: Duration,
 }
 
-impl Seen {
+impl RobotAttendance {
     /// Returns the transition that follows from a check; the caller applies it once it is stored.
-    fn judge(&mut self, look: Look, now: Now) -> Option<Turn> {
+    fn judge(&mut self, look: ObservedLink, now: Now) -> Option<Turn> {
         if !look.is_heard {
             self.heard_since = None;
             if look.has_left {
@@ -99,7 +99,7 @@ impl Seen {
 /// Attendance of all robots, as stored in the database.
 #[derive(Debug, Default)]
 pub(super) struct Attendance {
-    robots: Option<HashMap<RobotKey, Seen>>,
+    robots: Option<HashMap<RobotKey, RobotAttendance>>,
     looked_at: Option<Duration>,
 }
 
@@ -124,7 +124,7 @@ impl Attendance {
         };
         for (key, attending) in app.presences().attending(elapsed) {
             let seen = robots.entry(key.clone()).or_default();
-            let look = Look {
+            let look = ObservedLink {
                 is_heard: attending.is_heard,
                 has_left: attending.has_left,
                 // A robot that was never heard has been silent at least since the start.
@@ -140,11 +140,11 @@ impl Attendance {
     }
 }
 
-async fn expected(app: &App) -> Result<HashMap<RobotKey, Seen>, AppError> {
+async fn expected(app: &App) -> Result<HashMap<RobotKey, RobotAttendance>, AppError> {
     let mut tx = app.db().read("reconciler").await?;
     let expected = db::attendance::all(&mut tx, ROBOT_LOST_ALERT).await?;
     let seen = |robot: db::attendance::Expected| {
-        let seen = Seen {
+        let seen = RobotAttendance {
             is_present: robot.is_present,
             is_lost: robot.is_alerted,
             heard_since: None,
@@ -205,14 +205,14 @@ fn lost_text(cause: Option<LinkCause>) -> String {
 mod tests {
     use super::*;
 
-    const HEARD: Look = Look {
+    const HEARD: ObservedLink = ObservedLink {
         is_heard: true,
         has_left: false,
         silent: Duration::ZERO,
     };
 
-    fn silent(seconds: u64) -> Look {
-        Look {
+    fn silent(seconds: u64) -> ObservedLink {
+        ObservedLink {
             is_heard: false,
             has_left: false,
             silent: Duration::from_secs(seconds),
@@ -227,7 +227,7 @@ mod tests {
         }
     }
 
-    fn step(seen: &mut Seen, look: Look, now: Now) -> Option<Turn> {
+    fn step(seen: &mut RobotAttendance, look: ObservedLink, now: Now) -> Option<Turn> {
         let turn = seen.judge(look, now);
         if let Some(turn) = turn {
             seen.apply(turn);
@@ -237,7 +237,7 @@ mod tests {
 
     #[test]
     fn a_robot_that_goes_away_is_lost_after_the_bound_once_and_back_when_it_is_heard_on() {
-        let mut seen = Seen::default();
+        let mut seen = RobotAttendance::default();
         assert_eq!(step(&mut seen, HEARD, at(100)), Some(Turn::Came));
         assert_eq!(step(&mut seen, silent(14), at(114)), None);
         assert_eq!(step(&mut seen, silent(15), at(115)), Some(Turn::Lost));
@@ -255,18 +255,18 @@ mod tests {
 
     #[test]
     fn nobody_is_lost_who_left_by_itself_or_while_the_server_has_just_started() {
-        let mut seen = Seen::default();
+        let mut seen = RobotAttendance::default();
         step(&mut seen, HEARD, at(100));
-        let left = Look {
+        let left = ObservedLink {
             has_left: true,
             ..silent(1)
         };
         assert_eq!(step(&mut seen, left, at(101)), Some(Turn::Left));
         assert_eq!(step(&mut seen, silent(60), at(160)), None);
         // After a restart of the server: the robot was present before.
-        let mut seen = Seen {
+        let mut seen = RobotAttendance {
             is_present: true,
-            ..Seen::default()
+            ..RobotAttendance::default()
         };
         assert_eq!(step(&mut seen, silent(29), at(29)), None);
         assert_eq!(step(&mut seen, silent(30), at(30)), Some(Turn::Lost));

@@ -13,7 +13,7 @@ use tread_api::mission::MissionState;
 use tread_api::robot::{Alert, LinkState, Severity};
 
 use crate::app::own_alert::OwnAlert;
-use crate::app::presence::{RobotKey, Showing};
+use crate::app::presence::{ReportedCondition, RobotKey};
 use crate::app::{App, AppError};
 use crate::db;
 use crate::db::missions::OpenMission;
@@ -51,7 +51,7 @@ struct Memory {
 
 impl Memory {
     /// Takes in what the robot shows; `is_waiting` and `is_clock_wrong` are right afterwards.
-    fn judge(&mut self, shown: Showing, now: Duration) {
+    fn judge(&mut self, shown: ReportedCondition, now: Duration) {
         match (shown.mission, self.standing) {
             (None, _) => {
                 self.standing = None;
@@ -143,7 +143,7 @@ impl Conditions {
                 standing: None,
                 ..*memory
             };
-            let shown = Showing {
+            let shown = ReportedCondition {
                 mission: None,
                 clock_offset_ms: 0,
             };
@@ -183,7 +183,7 @@ async fn write_down(
     app: &App,
     (site, robot): &RobotKey,
     (before, after): (Memory, Memory),
-    shown: Showing,
+    shown: ReportedCondition,
 ) -> Result<(), AppError> {
     let mut tx = app.db().write("reconciler").await?;
     let Some(robot_pk) = db::robots::pk_of(&mut tx, site, robot).await? else {
@@ -221,7 +221,7 @@ async fn write_down(
     Ok(app.commit_alerts(tx, alerts).await?)
 }
 
-fn waiting_text(shown: Showing) -> String {
+fn waiting_text(shown: ReportedCondition) -> String {
     let minutes = WAITED_AFTER.as_secs() / 60;
     let how = match shown.mission {
         Some(progress) if progress.paused => "it is paused",
@@ -247,20 +247,20 @@ mod tests {
 
     use super::*;
 
-    fn shown(mission: u8, driven_m: f64) -> Showing {
+    fn shown(mission: u8, driven_m: f64) -> ReportedCondition {
         let progress = json!({
             "id": format!("0192f0c1-2b3c-7d4e-8f50-6172839400{mission:02x}"), "revision": 1,
             "plan_hash": "0192f0c1-2b3c-5d4e-8f50-617283940a1b", "driven_m": driven_m,
             "length_m": 100.0, "cross_track_m": 0.0,
         });
-        Showing {
+        ReportedCondition {
             mission: Some(serde_json::from_value(progress).unwrap()),
             clock_offset_ms: 0,
         }
     }
 
-    fn off_by(clock_offset_ms: i64) -> Showing {
-        Showing {
+    fn off_by(clock_offset_ms: i64) -> ReportedCondition {
+        ReportedCondition {
             mission: None,
             clock_offset_ms,
         }

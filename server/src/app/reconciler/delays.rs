@@ -24,14 +24,14 @@ pub(in crate::app) const MISSION_WAITING_ALERT: &str = "mission-waiting";
 
 /// What is remembered of a robot whose next mission has not begun.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Waiting {
+struct DelayedRobot {
     /// The mission with the time since which it is the next; `None` until the first check after a
     /// start of the server.
     next: Option<(MissionId, Duration)>,
     is_raised: bool,
 }
 
-impl Waiting {
+impl DelayedRobot {
     const fn raised() -> Self {
         Self {
             next: None,
@@ -64,7 +64,7 @@ impl Waiting {
 /// Next missions of all robots that drive none.
 #[derive(Debug, Default)]
 pub(super) struct Delays {
-    robots: Option<HashMap<RobotKey, Waiting>>,
+    robots: Option<HashMap<RobotKey, DelayedRobot>>,
 }
 
 impl Delays {
@@ -86,7 +86,7 @@ impl Delays {
                 continue;
             }
             let before = robots.get(&key).copied();
-            let fresh = Waiting {
+            let fresh = DelayedRobot {
                 next: None,
                 is_raised: false,
             };
@@ -122,12 +122,12 @@ fn is_next(mission: &OpenMission) -> bool {
     matches!(mission.state, MissionState::Queued | MissionState::Offered)
 }
 
-async fn raised(app: &App) -> Result<HashMap<RobotKey, Waiting>, AppError> {
+async fn raised(app: &App) -> Result<HashMap<RobotKey, DelayedRobot>, AppError> {
     let mut tx = app.db().read("reconciler").await?;
     let found = db::alerts::raised_about(&mut tx, MISSION_WAITING_ALERT).await?;
     Ok(found
         .into_iter()
-        .map(|key| (key, Waiting::raised()))
+        .map(|key| (key, DelayedRobot::raised()))
         .collect())
 }
 
@@ -162,14 +162,14 @@ async fn write_down(
 fn waiting_text(app: &App, key: &RobotKey, mission: &OpenMission) -> String {
     let minutes = WAITED_AFTER.as_secs() / 60;
     let presence = app.presences().get(key);
-    let why = why(&presence, presence.link(app.clock().elapsed()));
+    let delay_cause = delay_cause(&presence, presence.link(app.clock().elapsed()));
     format!(
-        "mission `{}` has not begun for {minutes} min: {why}",
+        "mission `{}` has not begun for {minutes} min: {delay_cause}",
         mission.id
     )
 }
 
-fn why(presence: &Presence, link: LinkState) -> &'static str {
+fn delay_cause(presence: &Presence, link: LinkState) -> &'static str {
     let Some(state) = presence.state().filter(|_| link != LinkState::Offline) else {
         return "the robot is not heard";
     };
@@ -201,7 +201,7 @@ mod tests {
 
     #[test]
     fn a_mission_is_late_once_it_was_the_next_for_five_minutes() {
-        let fresh = Waiting {
+        let fresh = DelayedRobot {
             next: None,
             is_raised: false,
         };
@@ -215,7 +215,7 @@ mod tests {
 
     #[test]
     fn an_alert_stays_raised_over_a_restart_and_ends_with_another_mission() {
-        let known = Waiting::raised().seen(mission(1), at(1));
+        let known = DelayedRobot::raised().seen(mission(1), at(1));
         assert!(known.is_raised);
         assert!(!known.seen(mission(2), at(2)).is_raised);
     }

@@ -38,7 +38,7 @@ pub(super) enum Finished {
 
 /// Changes a mission's state without a report of its robot, which has shown that state for a time if it is
 /// the robot's.
-pub(super) async fn settle(
+pub(super) async fn apply_change(
     app: &App,
     mission: &OpenMission,
     change: Change,
@@ -64,7 +64,7 @@ pub(super) async fn settle(
         let since = app.clock().now() - shown_for;
         // Only a person resumes it, or has done so already.
         if !was_resumed_since(&mut tx, mission.id, since).await? {
-            db::missions::want_pause(&mut tx, mission.id, true).await?;
+            db::missions::set_pause_wanted(&mut tx, mission.id, true).await?;
         }
     }
     if let Some(state) = moved

@@ -10,11 +10,11 @@
 pub(super) mod attendance;
 pub(super) mod conditions;
 pub(super) mod delays;
-mod foreign;
 mod jobs;
 pub mod needs;
 mod outcomes;
 mod periodic_checks;
+mod unknown_missions;
 
 use std::collections::{HashMap, HashSet};
 use std::sync::atomic::Ordering;
@@ -32,17 +32,18 @@ use tread_api::stop::Stop;
 use self::attendance::Attendance;
 use self::conditions::Conditions;
 use self::delays::Delays;
-use self::foreign::cancel_foreign_mission;
 use self::jobs::{
-    Finished, adopt_reported_revision, cancel, hold, offer, replace, send_offer, settle, stop_again,
+    Finished, adopt_reported_revision, apply_change, cancel, hold, offer, replace, send_offer,
+    stop_again,
 };
 use self::needs::{Memory, Need, Now, Silence, decide, is_absent, is_heard, is_held_otherwise};
+use self::unknown_missions::cancel_foreign_mission;
 use super::missions::transitions::Change;
 use super::{App, AppError};
 use crate::app::presence::RobotKey;
 use crate::db;
 use crate::db::missions::OpenMission;
-use crate::db::restorations::Restrained;
+use crate::db::restorations::RestrictedRobot;
 
 /// Interval between passes when nothing wakes it.
 pub const PERIOD: Duration = Duration::from_millis(500);
@@ -111,7 +112,7 @@ pub async fn run(app: App, stop: CancellationToken) {
     }
 }
 
-fn key_of(robot: &Restrained) -> RobotKey {
+fn key_of(robot: &RestrictedRobot) -> RobotKey {
     (robot.site.clone(), robot.robot.clone())
 }
 
@@ -133,8 +134,8 @@ pub struct Reconciler {
     attendance: Attendance,
     conditions: Conditions,
     delays: Delays,
-    /// Robots that are restrained since a restoration, as read last.
-    restrained: HashMap<RobotKey, Restrained>,
+    /// Robots that are restricted since a restoration, as read last.
+    restricted: HashMap<RobotKey, RestrictedRobot>,
     /// Since when each of those that are to say how their missions ended is heard, and how often it
     /// was asked.
     asked: HashMap<RobotKey, (Duration, u32)>,
@@ -164,7 +165,7 @@ impl Reconciler {
             attendance: Attendance::default(),
             conditions: Conditions::default(),
             delays: Delays::default(),
-            restrained: HashMap::new(),
+            restricted: HashMap::new(),
             asked: HashMap::new(),
             answering_since: Duration::ZERO,
             delayed_since: None,
@@ -300,12 +301,12 @@ impl Reconciler {
         let read = self.read_missions().await;
         let is_prompt = read.is_ok() && begun.elapsed() <= ANSWER_DELAY && before != NEVER;
         self.record_answer(is_prompt, before);
-        let (restrained, open) = read?;
+        let (restricted, open) = read?;
         // Before a mission of a robot that was released is offered, so that nobody sees it driven while
         // its robot counts as one that awaits its release.
-        self.app.show_awaiting(&restrained);
-        let by_key = restrained.into_iter().map(|it| (key_of(&it), it));
-        self.restrained = by_key.collect();
+        self.app.show_awaiting(&restricted);
+        let by_key = restricted.into_iter().map(|it| (key_of(&it), it));
+        self.restricted = by_key.collect();
         self.retain_open(&open);
         self.cancel_foreign_missions(&open);
         for mission in &open {
@@ -329,13 +330,13 @@ impl Reconciler {
         self.answering_since = if is_excused { now } else { before.min(now) };
     }
 
-    /// Reads the robots that are restrained, and the missions that may need something.
-    async fn read_missions(&self) -> Result<(Vec<Restrained>, Vec<OpenMission>), AppError> {
+    /// Reads the robots that are restricted, and the missions that may need something.
+    async fn read_missions(&self) -> Result<(Vec<RestrictedRobot>, Vec<OpenMission>), AppError> {
         let mut tx = self.app.db().read("reconciler").await?;
-        let restrained = db::restorations::restrained(&mut tx).await?;
+        let restricted = db::restorations::restricted(&mut tx).await?;
         let mut open = db::missions::in_progress(&mut tx).await?;
         open.extend(db::missions::next_in_queues(&mut tx).await?);
-        Ok((restrained, open))
+        Ok((restricted, open))
     }
 
     /// Sends unconfirmed stops again. Continues even if everything else fails.
@@ -362,17 +363,17 @@ impl Reconciler {
         }
     }
 
-    /// Returns what may be decided about a mission of a robot that is restrained.
-    fn restrain(&self, key: &RobotKey, heard: bool, need: Need) -> Need {
-        let Some(restrained) = self.restrained.get(key) else {
+    /// Returns the action for a mission; [`Need::Wait`] in place of one that a restoration forbids.
+    fn defer_if_restricted(&self, key: &RobotKey, heard: bool, need: Need) -> Need {
+        let Some(restricted) = self.restricted.get(key) else {
             return need;
         };
         // A robot that was released, and does not come back, is lost as any other.
-        let is_unknown = restrained.outcomes_wanted && (restrained.awaits_release || heard);
+        let is_unknown = restricted.outcomes_wanted && (restricted.awaits_release || heard);
         let is_dispatch = matches!(need, Need::Offer | Need::Replace | Need::Resume);
         let is_seen = |change| matches!(change, Change::Accept | Change::Pause | Change::Resume);
-        let is_guess = matches!(need, Need::Settle(change) if !is_seen(change));
-        if is_dispatch && (is_unknown || restrained.awaits_release) || is_guess && is_unknown {
+        let is_guess = matches!(need, Need::Apply(change) if !is_seen(change));
+        if is_dispatch && (is_unknown || restricted.awaits_release) || is_guess && is_unknown {
             Need::Wait
         } else {
             need
@@ -477,7 +478,7 @@ impl Reconciler {
         let memory = *memory;
         let app = self.app.clone();
         let need = decide(&mission, &presence, memory, now);
-        let need = self.restrain(&key, heard, need);
+        let need = self.defer_if_restricted(&key, heard, need);
         // A command that is wanted again later does not inherit the back-off of the earlier one.
         for (held, wanted) in [(true, Need::Pause), (false, Need::Resume)] {
             if need != wanted {
@@ -486,10 +487,10 @@ impl Reconciler {
         }
         match need {
             Need::Wait => {}
-            Need::Settle(change) => {
+            Need::Apply(change) => {
                 let shown_since = memory.differs_from.unwrap_or(now.elapsed);
                 let shown_for = now.elapsed.saturating_sub(shown_since);
-                settle(&self.app, &mission, change, shown_for).await?;
+                apply_change(&self.app, &mission, change, shown_for).await?;
             }
             Need::Adopt => adopt_reported_revision(&self.app, &mission).await?,
             Need::Replace => {

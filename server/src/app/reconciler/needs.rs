@@ -44,7 +44,7 @@ pub(super) enum Need {
     /// Command its robot to end it.
     Cancel,
     /// Change its state without its robot.
-    Settle(Change),
+    Apply(Change),
 }
 
 /// What the reconciler remembers of an open mission; it may be lost in a restart without harm.
@@ -160,9 +160,9 @@ pub(super) fn decide(mission: &OpenMission, presence: &Presence, memory: Memory,
     let heard = is_heard(presence, now.elapsed);
     if !heard && mission.state != MissionState::Queued {
         return if is_lost(mission, presence, memory, now) {
-            Need::Settle(Change::LoseRobot)
+            Need::Apply(Change::LoseRobot)
         } else if is_lost_by_restart(mission, presence, false, now) {
-            Need::Settle(Change::LoseRun)
+            Need::Apply(Change::LoseRun)
         } else {
             Need::Wait
         };
@@ -175,20 +175,20 @@ pub(super) fn decide(mission: &OpenMission, presence: &Presence, memory: Memory,
     match mission.state {
         MissionState::Queued | MissionState::Offered if heard => {
             if mission.state == MissionState::Offered && said.is_some_and(of_present(mission)) {
-                Need::Settle(Change::Accept)
+                Need::Apply(Change::Accept)
             } else if ended_there {
-                Need::Settle(Change::Forget)
+                Need::Apply(Change::Forget)
             } else {
                 Need::Offer
             }
         }
         MissionState::Active | MissionState::Paused | MissionState::Cancelling if restarted => {
-            Need::Settle(Change::LoseRun)
+            Need::Apply(Change::LoseRun)
         }
         MissionState::Active | MissionState::Paused | MissionState::Cancelling
             if ended_there || forgotten =>
         {
-            Need::Settle(Change::Forget)
+            Need::Apply(Change::Forget)
         }
         MissionState::Active | MissionState::Paused => {
             let differs = memory.differs_from.is_some_and(longer_than(HOLD_GRACE));
@@ -229,8 +229,8 @@ fn in_progress(mission: &OpenMission, said: Option<MissionProgress>, differs: bo
     }
     match (mission.state == MissionState::Paused, mission.pause_wanted) {
         // The robot's record normally comes first; its state counts if the record is slow.
-        (false, true) if differs => Need::Settle(Change::Pause),
-        (true, false) if differs => Need::Settle(Change::Resume),
+        (false, true) if differs => Need::Apply(Change::Pause),
+        (true, false) if differs => Need::Apply(Change::Resume),
         (false, true) => Need::Pause,
         (true, false) => Need::Resume,
         // The robot paused it because of a stop or a teleoperation: only a person resumes it. The
@@ -238,7 +238,7 @@ fn in_progress(mission: &OpenMission, said: Option<MissionProgress>, differs: bo
         // is slow, or was of an earlier revision.
         (false, false) if said.is_some_and(|said| said.is_paused_for_safety()) => {
             if differs {
-                Need::Settle(Change::Pause)
+                Need::Apply(Change::Pause)
             } else {
                 Need::Wait
             }

@@ -15,7 +15,7 @@ use crate::app::missions::transitions::Change;
 use crate::app::missions::{Step, apply_transition};
 use crate::app::{App, AppError};
 use crate::db::missions::{Facts, OpenMission};
-use crate::db::restorations::Restrained;
+use crate::db::restorations::RestrictedRobot;
 use crate::db::{self, Tx};
 
 /// Reason of the end of a mission that its robot has reported.
@@ -25,7 +25,11 @@ const FORGOTTEN: &str = "this server was restored from a backup, and the robot n
                          whether it drove this mission: send it again if it did not";
 
 /// Asks a robot, and stores its answer. The last attempt gives up without one.
-pub(super) async fn ask(app: App, robot: Restrained, is_last: bool) -> Result<Finished, AppError> {
+pub(super) async fn ask(
+    app: App,
+    robot: RestrictedRobot,
+    is_last: bool,
+) -> Result<Finished, AppError> {
     let mut tx = app.db().read("restoration").await?;
     let open = db::missions::open_of_robot(&mut tx, robot.pk).await?;
     drop(tx);
@@ -69,7 +73,7 @@ pub(super) async fn ask(app: App, robot: Restrained, is_last: bool) -> Result<Fi
 
 async fn take(
     app: &App,
-    robot: &Restrained,
+    robot: &RestrictedRobot,
     (outcomes, boot): (&MissionOutcomes, Option<BootId>),
 ) -> Result<(), AppError> {
     let ended = outcomes.ended.iter().map(|it| (it.mission, it.phase));

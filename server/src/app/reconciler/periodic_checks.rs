@@ -1,5 +1,5 @@
-//! What no mission waits for: robots that are restrained since a restoration, expiry, second agents,
-//! the alerts of the server, and definitions of sites that robots lack.
+//! Checks that no mission triggers: robots that are restricted since a restoration, expiry, second
+//! agents, the alerts of the server, and definitions of sites that robots lack.
 
 use std::collections::HashMap;
 use std::time::Duration;
@@ -7,9 +7,9 @@ use std::time::Duration;
 use tread_api::ids::SiteId;
 use tread_api::rights::Scope;
 
-use super::foreign::end_duplicate_agent;
-use super::jobs::{push_site, settle};
+use super::jobs::{apply_change, push_site};
 use super::needs::{Need, is_heard};
+use super::unknown_missions::end_duplicate_agent;
 use super::{Job, Reconciler, key_of, outcomes};
 use crate::app::AppError;
 use crate::app::missions::transitions::Change;
@@ -17,7 +17,7 @@ use crate::app::presence::{DuplicateAgent, RobotKey};
 use crate::app::sites::SITES_MAX;
 use crate::db;
 use crate::db::missions::OpenMission;
-use crate::db::restorations::Restrained;
+use crate::db::restorations::RestrictedRobot;
 
 /// Maximum number of missions that expire in one pass.
 const EXPIRE_MAX: u32 = 1_000;
@@ -35,7 +35,7 @@ impl Reconciler {
         &mut self,
         open: Option<&[OpenMission]>,
     ) -> Result<(), AppError> {
-        self.query_restrained();
+        self.query_restricted_robots();
         self.expire().await?;
         self.end_duplicate_agents();
         self.attendance.check(&self.app).await?;
@@ -77,18 +77,18 @@ impl Reconciler {
         Ok(())
     }
 
-    /// Asks robots that are restrained since a restoration how their missions ended.
-    fn query_restrained(&mut self) {
-        let restrained: Vec<Restrained> = self.restrained.values().cloned().collect();
+    /// Asks robots that are restricted since a restoration how their missions ended.
+    fn query_restricted_robots(&mut self) {
+        let restricted: Vec<RestrictedRobot> = self.restricted.values().cloned().collect();
         let wanted = |key: &RobotKey| {
-            let found = self.restrained.get(key);
+            let found = self.restricted.get(key);
             found.is_some_and(|found| found.outcomes_wanted)
         };
         self.asked.retain(|key, _| wanted(key));
         self.retries
             .retain(|job, _| !matches!(job, Job::Outcomes(key) if !wanted(key)));
         let now = self.app.clock().elapsed();
-        for robot in restrained.into_iter().filter(|it| it.outcomes_wanted) {
+        for robot in restricted.into_iter().filter(|it| it.outcomes_wanted) {
             let key = key_of(&robot);
             let presence = self.app.presences().get(&key);
             if !is_heard(&presence, now) {
@@ -115,11 +115,11 @@ impl Reconciler {
         for mission in overdue {
             let key = (mission.site.clone(), mission.robot.clone());
             let heard = is_heard(&self.app.presences().get(&key), self.app.clock().elapsed());
-            let expires = Need::Settle(Change::Expire);
-            if self.restrain(&key, heard, expires) != expires {
+            let expires = Need::Apply(Change::Expire);
+            if self.defer_if_restricted(&key, heard, expires) != expires {
                 continue;
             }
-            settle(&self.app, &mission, Change::Expire, Duration::ZERO).await?;
+            apply_change(&self.app, &mission, Change::Expire, Duration::ZERO).await?;
         }
         Ok(())
     }

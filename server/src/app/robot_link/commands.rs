@@ -11,7 +11,7 @@ use tread_api::wire;
 use tread_api::wire::reply::{Answer, Command};
 use tread_api::wire::trace::TraceParent;
 
-use super::Unconnected;
+use super::NullTransport;
 use crate::app::presence::{Presences, RobotKey};
 use crate::counters::Counters;
 
@@ -45,7 +45,7 @@ pub trait CommandTransport: std::fmt::Debug + Send + Sync {
     ) -> Answering;
 }
 
-impl CommandTransport for Unconnected {
+impl CommandTransport for NullTransport {
     fn send(&self, _: &RobotKey, _: Option<BootId>, _: Verb, _: Vec<u8>) -> Answering {
         Box::pin(std::future::ready(Err(Undelivered::Unreachable)))
     }

@@ -4,7 +4,7 @@ use std::pin::Pin;
 
 use tread_api::wire::safety::DriveCommand;
 
-use super::Unconnected;
+use super::NullTransport;
 use crate::app::presence::RobotKey;
 
 /// A publisher that is being opened; `None` if the network refuses.
@@ -22,7 +22,7 @@ pub trait DrivePublisher: std::fmt::Debug + Send + Sync {
     fn publish(&self, command: &DriveCommand) -> bool;
 }
 
-impl DriveTransport for Unconnected {
+impl DriveTransport for NullTransport {
     fn open(&self, _: &RobotKey) -> Opening {
         Box::pin(std::future::ready(None))
     }

@@ -30,8 +30,8 @@ impl RobotLink {
     /// Creates a link that reaches no robot, for programs that work on the database alone.
     pub fn unconnected(supervisor: Supervisor) -> Self {
         Self {
-            commands: Arc::new(Unconnected),
-            drive: Arc::new(Unconnected),
+            commands: Arc::new(NullTransport),
+            drive: Arc::new(NullTransport),
             supervisor,
             stop_confirm_max: STOP_CONFIRM_MAX,
         }
@@ -40,4 +40,4 @@ impl RobotLink {
 
 /// A transport that delivers nothing.
 #[derive(Debug)]
-pub struct Unconnected;
+pub struct NullTransport;

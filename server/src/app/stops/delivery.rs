@@ -92,15 +92,15 @@ impl Outgoing {
     }
 }
 
-/// Stops that were sent, to be confirmed and stored.
-pub(super) struct Settling {
+/// Awaits the confirmations of sent stops and stores both.
+pub(super) struct StopRecorder {
     pub(super) app: App,
     pub(super) stops: Vec<Stop>,
     pub(super) stop: CancellationToken,
     pub(super) confirm_max: Duration,
 }
 
-impl Settling {
+impl StopRecorder {
     pub(super) async fn run(
         self,
         mut confirmations: mpsc::Receiver<(StopId, Timestamp)>,

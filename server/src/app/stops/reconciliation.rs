@@ -9,7 +9,7 @@ use tread_api::safety::StandingState;
 use tread_api::stop::Stop;
 use tread_api::wire::state::RobotState;
 
-use super::judge::{Open, Shown, Verdict, judge};
+use super::decision::{Open, ReportedStop, StopDecision, decide};
 use super::{alerted, key_of};
 use crate::app::allowance::Kind;
 use crate::app::presence::{Presence, RobotKey};
@@ -53,7 +53,7 @@ impl App {
                 db::stops::unconfirm(&mut tx, stop.id).await?;
             }
             for id in standing {
-                db::stops::stand(&mut tx, id, now).await?;
+                db::stops::record_standstill(&mut tx, id, now).await?;
             }
             for id in cleared {
                 db::stops::clear(&mut tx, id, now).await?;
@@ -112,9 +112,9 @@ impl App {
                 confirmed_at: stop.confirmed_at,
                 clear_asked_at: stop.clear_asked_at,
             });
-            let verdict = judge(open, shown);
+            let decision = decide(open, shown);
             let Some(stop) = stop else {
-                if verdict == Verdict::Adopt && self.may_adopt(&key) {
+                if decision == StopDecision::Adopt && self.may_adopt(&key) {
                     actions.adopted.push(key);
                 }
                 continue;
@@ -125,8 +125,8 @@ impl App {
             if is_shown && stands && stop.standing_at.is_none() {
                 actions.standing.push(stop.id);
             }
-            match verdict {
-                Verdict::Tell => {
+            match decision {
+                StopDecision::Send => {
                     // A robot that is on the network gets the stop, and an alert if it does not
                     // confirm.
                     if !is_alerted && !presence.is_there(self.clock().elapsed()) {
@@ -134,13 +134,13 @@ impl App {
                     }
                     actions.again.push(stop);
                 }
-                Verdict::Lost => {
+                StopDecision::Resend => {
                     actions.again.push(stop.clone());
                     actions.lost.push(stop);
                 }
-                Verdict::Cleared => actions.cleared.push(stop.id),
-                Verdict::Adopt if self.may_adopt(&key) => actions.adopted.push(key),
-                Verdict::Nothing | Verdict::Adopt => {}
+                StopDecision::Cleared => actions.cleared.push(stop.id),
+                StopDecision::Adopt if self.may_adopt(&key) => actions.adopted.push(key),
+                StopDecision::Nothing | StopDecision::Adopt => {}
             }
         }
         // Robots without an open stop.
@@ -161,7 +161,7 @@ impl App {
         state: &RobotState,
         presence: &Presence,
         open: Option<&Stop>,
-    ) -> Result<Option<Shown>, AppError> {
+    ) -> Result<Option<ReportedStop>, AppError> {
         let age = presence.state_age(self.clock().elapsed());
         let age = SignedDuration::try_from(age.unwrap_or_default());
         let age = age.unwrap_or(SignedDuration::MAX);
@@ -177,7 +177,7 @@ impl App {
         if known.as_ref().is_some_and(is_open) {
             return Ok(None);
         }
-        Ok(Some(Shown {
+        Ok(Some(ReportedStop {
             latch,
             ended_at: known.and_then(|stop| stop.cleared_at),
             at: at.unwrap_or(Timestamp::MIN),

@@ -51,9 +51,9 @@ pub const RETRY_MAX: Duration = Duration::from_hours(2);
 /// Time for which a webhook rests after an attempt that failed, whatever else waits for it.
 pub const REST_AFTER_FAILURE: Duration = Duration::from_secs(5);
 
-/// What an attempt was about.
+/// Origin of a delivery.
 #[derive(Debug, Clone, PartialEq, Eq)]
-enum What {
+enum DeliverySource {
     /// A row of the outbox: number of attempts before, and the time when it was queued.
     Queued {
         attempts: u32,
@@ -63,12 +63,12 @@ enum What {
     Unwritten,
 }
 
-/// An attempt that has ended.
+/// A completed attempt.
 #[derive(Debug)]
-struct Done {
+struct CompletedAttempt {
     webhook: WebhookId,
     id: DeliveryId,
-    what: What,
+    what: DeliverySource,
     at: Timestamp,
     attempt: Attempt,
 }
@@ -104,8 +104,8 @@ struct Dispatcher {
     app: App,
     sender: Arc<Sender>,
     stop: CancellationToken,
-    finished: mpsc::Sender<Done>,
-    finishing: mpsc::Receiver<Done>,
+    finished: mpsc::Sender<CompletedAttempt>,
+    finishing: mpsc::Receiver<CompletedAttempt>,
     /// Webhooks with an attempt whose outcome is not stored.
     under_way: HashSet<WebhookId>,
     /// Outcomes that are not stored, at most one per webhook.
@@ -172,7 +172,7 @@ impl Dispatcher {
                 body,
                 at: now,
             };
-            let what = What::Queued {
+            let what = DeliverySource::Queued {
                 attempts,
                 created_at,
             };
@@ -187,7 +187,7 @@ impl Dispatcher {
             && !self.resting.contains_key(&webhook)
     }
 
-    fn start(&mut self, webhook: WebhookId, outgoing: OutgoingDelivery, what: What) {
+    fn start(&mut self, webhook: WebhookId, outgoing: OutgoingDelivery, what: DeliverySource) {
         self.under_way.insert(webhook);
         let (sender, finished) = (Arc::clone(&self.sender), self.finished.clone());
         let stop = self.stop.clone();
@@ -197,7 +197,7 @@ impl Dispatcher {
                 () = stop.cancelled() => return,
                 attempt = sender.send(&outgoing) => attempt,
             };
-            let done = Done {
+            let done = CompletedAttempt {
                 webhook,
                 id: outgoing.id,
                 what,
@@ -211,8 +211,8 @@ impl Dispatcher {
     }
 
     /// Notes how an attempt ended.
-    fn record(&mut self, done: Done) {
-        let Done {
+    fn record(&mut self, done: CompletedAttempt) {
+        let CompletedAttempt {
             webhook,
             id,
             what,
@@ -228,7 +228,7 @@ impl Dispatcher {
             let until = self.app.clock().elapsed() + REST_AFTER_FAILURE;
             self.resting.insert(webhook, until);
         }
-        let What::Queued {
+        let DeliverySource::Queued {
             attempts,
             created_at,
         } = what
@@ -307,7 +307,7 @@ impl Dispatcher {
                     body: body(&notice)?,
                     at: self.app.clock().now(),
                 };
-                self.start(webhook, outgoing, What::Unwritten);
+                self.start(webhook, outgoing, DeliverySource::Unwritten);
             }
         }
         Ok(())

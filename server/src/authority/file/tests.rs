@@ -152,7 +152,7 @@ fn a_finish_that_the_disk_does_not_confirm_counts_says_so_and_is_completed_later
     let next = during.signing().fingerprint();
     let after = authorities.finish(during.id()).unwrap();
     assert!(!after.is_trusted(former.fingerprint()) && after.is_trusted(next));
-    assert!(!authorities.is_settled());
+    assert!(!authorities.is_durable());
     // After a power failure that undoes the rename, key and certificate must belong together.
     let undone = tempfile::tempdir().unwrap();
     for name in names(&path) {
@@ -163,10 +163,10 @@ fn a_finish_that_the_disk_does_not_confirm_counts_says_so_and_is_completed_later
     let undone = Authorities::load(undone.path()).unwrap().present();
     assert_eq!(undone.id(), during.id());
 
-    assert!(authorities.settle().is_err());
-    assert!(!authorities.is_settled());
-    authorities.settle().unwrap();
-    assert!(authorities.is_settled());
+    assert!(authorities.retry_sync().is_err());
+    assert!(!authorities.is_durable());
+    authorities.retry_sync().unwrap();
+    assert!(authorities.is_durable());
     let mut expected = vec![KEY_FILE.to_owned(), CERTIFICATE_FILE.to_owned()];
     expected.push(retired_name(former.fingerprint()));
     assert_eq!(names(&path), expected);
@@ -194,7 +194,7 @@ fn what_begins_and_is_not_confirmed_is_taken_back_and_can_be_asked_for_again() {
                 RotationError::Files(AuthorityError::NotTakenBack { .. })
             );
             assert_eq!(is_taken_back, failures == 1, "{refused:?}");
-            assert!(authorities.is_settled());
+            assert!(authorities.is_durable());
             let trusted = authorities.present();
             assert_eq!(trusted.signing().fingerprint(), former.fingerprint());
             // The folder contains the same authorities.

@@ -4,13 +4,13 @@ use jiff::Timestamp;
 
 use super::*;
 
-struct Made {
+struct TestArchive {
     folder: tempfile::TempDir,
     archive: PathBuf,
     database: Vec<u8>,
 }
 
-fn make(encryption: Option<&Filter>) -> Made {
+fn make(encryption: Option<&Filter>) -> TestArchive {
     let folder = tempfile::tempdir().unwrap();
     let copy = folder.path().join("copy.db");
     let database: Vec<u8> = (0..300_000_u32).flat_map(u32::to_le_bytes).collect();
@@ -42,14 +42,14 @@ fn make(encryption: Option<&Filter>) -> Made {
     let archived = write(&archive, &source, encryption, &mut |bytes| shown = bytes).unwrap();
     assert_eq!(shown, database.len() as u64);
     assert_eq!(archived.bytes, fs::metadata(&archive).unwrap().len());
-    Made {
+    TestArchive {
         folder,
         archive,
         database,
     }
 }
 
-fn extracted(made: &Made, key: Option<&Filter>) -> Result<Extracted, ArchiveError> {
+fn extracted(made: &TestArchive, key: Option<&Filter>) -> Result<Extracted, ArchiveError> {
     let target = made.folder.path().join("restored.db");
     let _ = fs::remove_file(&target);
     let extraction = Extraction {

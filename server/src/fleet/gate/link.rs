@@ -136,7 +136,7 @@ impl Link {
                 counters.gate_expired.one();
                 info!(robot.id = %robot.1, "the certificate of robot `{}` is over", robot.1);
             }
-            () = self.put_out(robot, name.enrolment) => {
+            () = self.wait_for_revocation(robot, name.enrolment) => {
                 counters.gate_revoked.one();
                 warn!(robot.id = %robot.1, "the link of robot `{}` was cut: it was put out", robot.1);
             }
@@ -316,7 +316,7 @@ impl Link {
     }
 
     /// Waits until the robot is revoked or has joined again.
-    async fn put_out(&self, robot: &RobotKey, enrolment: u32) {
+    async fn wait_for_revocation(&self, robot: &RobotKey, enrolment: u32) {
         let mut changes = self.app.enrolment_registry().changes();
         while self.app.enrolment_registry().is_in_force(robot, enrolment) {
             if changes.changed().await.is_err() {

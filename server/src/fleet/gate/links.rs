@@ -25,7 +25,7 @@ pub(in crate::fleet) const CUT_OFF: Duration = Duration::from_secs(10);
 /// The SHA-256 of a certificate.
 pub(super) type CertificateHash = [u8; 32];
 
-type OfRobots = HashMap<RobotKey, VecDeque<OneLink>>;
+type LinksByRobot = HashMap<RobotKey, VecDeque<LinkEntry>>;
 
 /// All robots' links.
 #[derive(Debug, Clone)]
@@ -38,7 +38,7 @@ struct Table {
     /// Byte rates by robot; a new link continues the rate of the earlier ones. Only robots that
     /// have joined are in it, so its size is bounded.
     byte_rates: HashMap<RobotKey, Arc<ByteRate>>,
-    of_robots: OfRobots,
+    of_robots: LinksByRobot,
     /// Robots that are cut off, with the time at which that ends.
     cut_off: HashMap<RobotKey, Duration>,
 }
@@ -50,7 +50,7 @@ impl Default for Links {
 }
 
 #[derive(Debug)]
-struct OneLink {
+struct LinkEntry {
     number: u64,
     certificate: CertificateHash,
     /// The zenoh session on this link; `None` until it begins to open.
@@ -115,7 +115,7 @@ impl Links {
         table.next += 1;
         let (number, byte_limit) = (table.next, table.byte_limit);
         let own = table.of_robots.entry(robot.clone()).or_default();
-        own.push_back(OneLink {
+        own.push_back(LinkEntry {
             number,
             certificate,
             session_id: None,
@@ -123,7 +123,7 @@ impl Links {
             cut_off: cut_off.clone(),
             ended: ended.clone(),
         });
-        let staying = |link: &&OneLink| !link.displaced.is_cancelled();
+        let staying = |link: &&LinkEntry| !link.displaced.is_cancelled();
         if own.iter().filter(staying).count() > LINKS_PER_ROBOT_MAX
             && let Some(oldest) = own.iter().find(staying)
         {

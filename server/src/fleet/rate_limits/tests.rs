@@ -60,11 +60,11 @@ fn of_a_flood_of_tokens_few_are_taken_up_and_the_newest_later() {
     let rover = robot("rover-1");
     let place = |number: u32| (number.to_string(), 0);
     let appear = |number, at| limits.token_appeared(&rover, place(number), at);
-    let appeared: Vec<Appeared> = (0..23_000).map(|number| appear(number, ms(0))).collect();
+    let appeared: Vec<TokenVerdict> = (0..23_000).map(|number| appear(number, ms(0))).collect();
     let count = |which| appeared.iter().filter(|&&one| one == which).count();
-    assert_eq!(count(Appeared::Taken), TOKENS_MAX);
+    assert_eq!(count(TokenVerdict::Accepted), TOKENS_MAX);
     assert_eq!(
-        count(Appeared::Excessive),
+        count(TokenVerdict::Excessive),
         23_000 - DECLARED_TOKENS_MAX as usize
     );
     assert!(
@@ -77,7 +77,7 @@ fn of_a_flood_of_tokens_few_are_taken_up_and_the_newest_later() {
     assert_eq!(limits.late_tokens(ms(60_001)).len(), LATE_TOKENS_MAX);
     assert!(limits.token_gone(&rover, &place(22_999)));
     let other = limits.token_appeared(&robot("rover-2"), place(1), ms(0));
-    assert_eq!(other, Appeared::Taken);
+    assert_eq!(other, TokenVerdict::Accepted);
 }
 
 proptest! {
@@ -96,7 +96,7 @@ proptest! {
             }
             let place = (number.to_string(), router);
             let appeared = limits.token_appeared(&rover, place.clone(), now);
-            prop_assert_ne!(appeared, Appeared::Excessive);
+            prop_assert_ne!(appeared, TokenVerdict::Excessive);
             let latest = there.back().map_or(0, |&(until, _)| until);
             there.push_back((latest.max(number as u64 + seconds), place));
         }
@@ -111,7 +111,7 @@ proptest! {
             let place = (number.to_string(), 0);
             let appeared = limits.token_appeared(&robot("rover-1"), place, ms(1_000 * gap_s * number));
             let is_beyond = number == u64::from(DECLARED_TOKENS_MAX);
-            prop_assert_eq!(appeared == Appeared::Excessive, is_beyond);
+            prop_assert_eq!(appeared == TokenVerdict::Excessive, is_beyond);
         }
     }
 }
@@ -128,7 +128,7 @@ fn a_run_that_starts_over_and_over_is_seen_when_it_calms_down() {
             limits.token_gone(&rover, &place);
         }
     }
-    assert_eq!(last, Some(Appeared::Excessive), "it came too fast");
+    assert_eq!(last, Some(TokenVerdict::Excessive), "it came too fast");
     assert!(limits.late_tokens(ms(500)).is_empty());
     assert_eq!(limits.late_tokens(ms(1_500)), [("199".to_owned(), 0)]);
     assert!(limits.token_gone(&rover, &("199".to_owned(), 0)));
@@ -142,11 +142,11 @@ fn tokens_that_come_after_their_router_has_closed_take_no_place() {
     limits.router_closed(0);
     for number in 0..100 {
         let appeared = limits.token_appeared(&rover, (number.to_string(), 0), ms(0));
-        assert_eq!(appeared, Appeared::Refused);
+        assert_eq!(appeared, TokenVerdict::Refused);
     }
     assert!(limits.late_tokens(ms(60_000)).is_empty());
     let present = limits.token_appeared(&rover, ("present".to_owned(), 1), ms(60_000));
-    assert_eq!(present, Appeared::Taken);
+    assert_eq!(present, TokenVerdict::Accepted);
 }
 
 #[test]

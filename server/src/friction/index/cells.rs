@@ -2,7 +2,7 @@
 //!
 //! All sums are stored as well, or are among those that are stored behind the receipts. So a block
 //! can leave memory at any time, and be read again. A reader notes the blocks that it needs and
-//! that are absent ([`Absent`]); the caller reads these and repeats it.
+//! that are absent ([`MissingBlocks`]); the caller reads these and repeats it.
 
 use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet};
@@ -16,8 +16,8 @@ use tread_api::site::Cell;
 use super::changes::Block;
 use super::names::Number;
 use super::part::{Part, PartKey};
-use super::partial::When;
-use super::{Choice, Group, Labelled, SiteMap, Sums, place};
+use super::partial::ReadTime;
+use super::{Choice, Group, LabelledSum, SiteMap, Sums, place};
 
 /// Approximate memory of a cell beside its sums: its share of the tree, and the allocator's.
 const CELL_BYTES: usize = 64;
@@ -121,7 +121,7 @@ pub struct BlockBuilder {
 impl BlockBuilder {
     /// Adds a sum, unless it is of another grid revision than the map's; `false` if a name is new to
     /// the map.
-    pub fn add(&mut self, map: &SiteMap, labelled: Labelled<'_>, sums: &Sums) -> bool {
+    pub fn add(&mut self, map: &SiteMap, labelled: LabelledSum<'_>, sums: &Sums) -> bool {
         if labelled.grid_revision != map.grid_revision {
             return true;
         }
@@ -221,9 +221,9 @@ impl Blocks {
 
 /// The blocks that a reader of a map needed and that were not in memory.
 #[derive(Debug, Default)]
-pub struct Absent(RefCell<BTreeSet<Block>>);
+pub struct MissingBlocks(RefCell<BTreeSet<Block>>);
 
-impl Absent {
+impl MissingBlocks {
     fn record(&self, block: Block) {
         self.0.borrow_mut().insert(block);
     }
@@ -243,7 +243,7 @@ impl Absent {
 #[derive(Debug, Clone, Copy)]
 pub struct Cells<'map> {
     map: &'map SiteMap,
-    absent: &'map Absent,
+    absent: &'map MissingBlocks,
     /// Time of this read.
     time: u64,
 }
@@ -251,7 +251,7 @@ pub struct Cells<'map> {
 impl SiteMap {
     /// Returns the cells for a read at a time of any clock that never goes back; absent blocks are noted
     /// in `absent`.
-    pub fn cells<'map>(&'map self, absent: &'map Absent, time: u64) -> Cells<'map> {
+    pub fn cells<'map>(&'map self, absent: &'map MissingBlocks, time: u64) -> Cells<'map> {
         Cells {
             map: self,
             absent,
@@ -406,7 +406,7 @@ impl<'map> Cells<'map> {
     }
 
     /// Returns the parts of a cell that count at a time.
-    pub(super) fn parts_at(self, cell: Cell, when: When<'_>) -> std::borrow::Cow<'map, [Part]> {
+    pub(super) fn parts_at(self, cell: Cell, when: ReadTime<'_>) -> std::borrow::Cow<'map, [Part]> {
         self.map.parts_then((place(cell), self.parts(cell)), when)
     }
 }

@@ -65,7 +65,7 @@ impl Block {
 
 /// Recorded changes of one block.
 #[derive(Debug, Default)]
-struct OfBlock {
+struct BlockChanges {
     /// One bit for each line of cells in which anything was ever measured.
     lines: u64,
     newest: u64,
@@ -75,7 +75,7 @@ struct OfBlock {
     kept: VecDeque<(u64, u16)>,
 }
 
-impl OfBlock {
+impl BlockChanges {
     /// Makes `newest` the number of the newest change, of which it is not known which cells it was of.
     fn discard_until(&mut self, newest: u64) {
         self.newest = newest;
@@ -93,7 +93,7 @@ fn line(iy: i32) -> u64 {
 #[derive(Debug, Default)]
 pub struct Changes {
     newest: u64,
-    blocks: BTreeMap<Block, OfBlock>,
+    blocks: BTreeMap<Block, BlockChanges>,
 }
 
 impl Changes {
@@ -179,7 +179,11 @@ impl Changes {
         self.range(row, columns).map(|(&block, _)| block)
     }
 
-    fn range(&self, row: i32, (low, high): (i32, i32)) -> impl Iterator<Item = (&Block, &OfBlock)> {
+    fn range(
+        &self,
+        row: i32,
+        (low, high): (i32, i32),
+    ) -> impl Iterator<Item = (&Block, &BlockChanges)> {
         let at = |column| Block { row, column };
         let found = (low <= high).then(|| self.blocks.range(at(low)..=at(high)));
         found.into_iter().flatten()

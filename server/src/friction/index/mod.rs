@@ -21,20 +21,21 @@ use tread_api::terrain::TerrainRef;
 use tread_store::withdrawals::Hours;
 
 use self::cells::Blocks;
-pub use self::cells::{Absent, BlockBuilder, BlockCells, Cells, Pin};
+pub use self::cells::{BlockBuilder, BlockCells, Cells, MissingBlocks, Pin};
 pub use self::changes::{BLOCK_CELLS, Block, Changes};
 use self::names::{Names, Number};
 use self::part::{Part, PartKey};
-use self::partial::When;
+use self::partial::ReadTime;
 pub use self::partial::{Measurement, PartialEpoch, Timeline};
 pub use self::summaries::{
-    At, CELLS_PER_BLOCK, CellSummary, CompiledFilter, GROUND_NONE, KnownCell, Room,
+    CELLS_PER_BLOCK, CellSummary, CompiledFilter, FusionBuffers, FusionContext, GROUND_NONE,
+    KnownCell,
 };
-use super::{Horizons, Seen, Sums};
+use super::{EpochMeasurement, Horizons, Sums};
 
 /// Labels of a sum.
 #[derive(Debug, Clone, Copy)]
-pub struct Labelled<'names> {
+pub struct LabelledSum<'names> {
     /// Cell of the measurements.
     pub cell: Cell,
     /// Revision of the grid of `cell`; sums of another revision than the map's are ignored.
@@ -97,8 +98,8 @@ pub struct Choice<'choice> {
 }
 
 impl<'choice> Choice<'choice> {
-    fn when(&self) -> When<'choice> {
-        When {
+    fn when(&self) -> ReadTime<'choice> {
+        ReadTime {
             as_of: self.as_of,
             partial: self.partial,
         }
@@ -107,7 +108,7 @@ impl<'choice> Choice<'choice> {
     /// Returns the configuration to whose θ the measurements of `found` are converted, and the
     /// divisor for that; `None` if they are filtered out. Configurations of the normalisation are
     /// converted to the chosen configuration, or to the reference if none is chosen.
-    fn brought_to(&self, found: ConfigurationId) -> Option<(ConfigurationId, f64)> {
+    fn converted_to(&self, found: ConfigurationId) -> Option<(ConfigurationId, f64)> {
         let ratio = |of: ConfigurationId| self.normalisation.and_then(|joined| joined.ratio(of));
         let reference = self.normalisation.map(|joined| joined.reference);
         match (self.configuration, reference) {
@@ -152,7 +153,7 @@ pub struct Group<'map> {
     /// Configuration for which θ is stated.
     pub configuration: ConfigurationId,
     /// Measurements of each robot in each epoch; a robot is given by the rank of its name.
-    pub seen: Vec<Seen<u32>>,
+    pub seen: Vec<EpochMeasurement<u32>>,
     /// Number of passes whose information is below the resolution of the sums.
     pub uninformative_passes: u64,
 }
@@ -175,24 +176,24 @@ impl SiteMap {
     }
 
     /// Adds sums to the map; ignores those of another grid revision.
-    pub fn add(&mut self, labelled: Labelled<'_>, sums: &Sums) {
+    pub fn add(&mut self, labelled: LabelledSum<'_>, sums: &Sums) {
         self.add_cells(labelled, &[(labelled.cell, *sums)]);
     }
 
     /// Adds sums that agree in all labels but their cells; `labelled.cell` is ignored.
-    pub fn add_cells(&mut self, labelled: Labelled<'_>, cells: &[(Cell, Sums)]) {
+    pub fn add_cells(&mut self, labelled: LabelledSum<'_>, cells: &[(Cell, Sums)]) {
         self.add_recording(labelled, cells, Changes::record);
     }
 
     /// The same for sums that were measured before the map is looked at for the first time: which cells
     /// have changed is not recorded.
-    pub fn load_cells(&mut self, labelled: Labelled<'_>, cells: &[(Cell, Sums)]) {
+    pub fn load_cells(&mut self, labelled: LabelledSum<'_>, cells: &[(Cell, Sums)]) {
         self.add_recording(labelled, cells, Changes::record_block_of);
     }
 
     fn add_recording(
         &mut self,
-        labelled: Labelled<'_>,
+        labelled: LabelledSum<'_>,
         cells: &[(Cell, Sums)],
         note: impl Fn(&mut Changes, Cell),
     ) {
@@ -230,7 +231,7 @@ impl SiteMap {
     }
 
     /// Returns the key of sums with these labels.
-    fn key(&mut self, labelled: Labelled<'_>) -> PartKey {
+    fn key(&mut self, labelled: LabelledSum<'_>) -> PartKey {
         PartKey {
             terrain: self.names.terrains.number(labelled.terrain),
             configuration: self.names.configurations.number(&labelled.configuration),
@@ -240,7 +241,7 @@ impl SiteMap {
     }
 
     /// Returns the same; `None` if a name is new to the map.
-    fn found_key(&self, labelled: Labelled<'_>) -> Option<PartKey> {
+    fn found_key(&self, labelled: LabelledSum<'_>) -> Option<PartKey> {
         Some(PartKey {
             terrain: self.names.terrains.find(labelled.terrain)?,
             configuration: self.names.configurations.find(&labelled.configuration)?,
@@ -261,7 +262,7 @@ impl SiteMap {
         &mut self,
         block: Block,
         cells: BlockCells,
-        lacking: impl IntoIterator<Item = (Labelled<'sums>, &'sums Sums)>,
+        lacking: impl IntoIterator<Item = (LabelledSum<'sums>, &'sums Sums)>,
     ) {
         self.blocks.insert(block, cells, self.lru_time);
         for (labelled, sums) in lacking {
@@ -408,7 +409,7 @@ impl SiteMap {
         }
         let mut groups: BTreeMap<ConfigurationId, Group<'_>> = BTreeMap::new();
         for ((configuration, rank, epoch_h), sums) in sums {
-            let Some((configuration, ratio)) = choice.brought_to(configuration) else {
+            let Some((configuration, ratio)) = choice.converted_to(configuration) else {
                 continue;
             };
             let group = groups.entry(configuration).or_insert_with(|| Group {
@@ -417,7 +418,7 @@ impl SiteMap {
                 seen: Vec::new(),
                 uninformative_passes: 0,
             });
-            match Seen::of(rank, i64::from(epoch_h), &sums) {
+            match EpochMeasurement::of(rank, i64::from(epoch_h), &sums) {
                 Some(seen) => group.seen.push(seen.scaled(ratio)),
                 None => group.uninformative_passes += sums.segments,
             }
@@ -432,7 +433,7 @@ impl SiteMap {
             .robot
             .is_none_or(|robot| names.robots.name(key.robot) == robot)
             && choice
-                .brought_to(*names.configurations.name(key.configuration))
+                .converted_to(*names.configurations.name(key.configuration))
                 .is_some()
     }
 
@@ -450,7 +451,7 @@ impl SiteMap {
             let seen = part.seen(rank);
             let configuration = *self.names.configurations.name(configuration);
             let terrain = self.names.terrains.name(terrain).as_ref();
-            let Some((configuration, ratio)) = choice.brought_to(configuration) else {
+            let Some((configuration, ratio)) = choice.converted_to(configuration) else {
                 continue;
             };
             let is_same = |group: &Group<'_>| {

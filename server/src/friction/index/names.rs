@@ -11,20 +11,20 @@ pub(super) type Number = u32;
 /// Interned names of robots, configurations and terrains.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Names {
-    pub(super) robots: Interned<RobotId>,
-    pub(super) configurations: Interned<ConfigurationId>,
-    pub(super) terrains: Interned<Option<TerrainRef>>,
+    pub(super) robots: Interner<RobotId>,
+    pub(super) configurations: Interner<ConfigurationId>,
+    pub(super) terrains: Interner<Option<TerrainRef>>,
 }
 
 #[derive(Debug, Clone)]
-pub(super) struct Interned<T> {
+pub(super) struct Interner<T> {
     pub(super) numbers: BTreeMap<T, Number>,
     pub(super) names: Vec<T>,
     /// Rank of each number in the order of names, which does not depend on the order of insertion.
     ranks: Vec<u32>,
 }
 
-impl<T> Default for Interned<T> {
+impl<T> Default for Interner<T> {
     fn default() -> Self {
         Self {
             numbers: BTreeMap::new(),
@@ -34,7 +34,7 @@ impl<T> Default for Interned<T> {
     }
 }
 
-impl<T: Ord + Clone> Interned<T> {
+impl<T: Ord + Clone> Interner<T> {
     pub(super) fn number(&mut self, name: &T) -> Number {
         if let Some(&number) = self.numbers.get(name) {
             return number;

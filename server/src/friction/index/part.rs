@@ -5,7 +5,7 @@ use tread_api::friction::Information;
 use super::names::Number;
 use crate::friction::fixed::Fixed;
 use crate::friction::sums::{Known, Pair, Pass};
-use crate::friction::{Seen, Sums};
+use crate::friction::{EpochMeasurement, Sums};
 
 /// Steps per unit of a stored friction coefficient.
 const MU_STEPS: f64 = 1.0e6;
@@ -121,8 +121,8 @@ impl Part {
         u64::from(self.segments)
     }
 
-    /// Returns [`Seen::of`] of [`Self::sums`], identical to the bit but faster.
-    pub(super) fn seen<R>(&self, robot: R) -> Option<Seen<R>> {
+    /// Returns [`EpochMeasurement::of`] of [`Self::sums`], identical to the bit but faster.
+    pub(super) fn seen<R>(&self, robot: R) -> Option<EpochMeasurement<R>> {
         let number = |index: usize| {
             let (hi, lo) = (self.hi[index], self.lo[index]);
             // Both halves are exact, so their sum is rounded once, like the whole.
@@ -146,7 +146,7 @@ impl Part {
             information: self.newest_information,
             value: self.newest_weighted / self.newest_information,
         });
-        Some(Seen {
+        Some(EpochMeasurement {
             robot,
             epoch_h: i64::from(self.key.epoch_h),
             theta,
@@ -211,7 +211,7 @@ mod tests {
             };
             let key = PartKey { terrain: 0, configuration: 0, robot: 3, epoch_h: 11 };
             let part = Part::new(key, &sums);
-            prop_assert_eq!(part.seen(3), Seen::of(3, 11, &part.sums()));
+            prop_assert_eq!(part.seen(3), EpochMeasurement::of(3, 11, &part.sums()));
         }
     }
 }

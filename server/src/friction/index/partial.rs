@@ -133,7 +133,7 @@ impl PartialEpoch {
 
 /// Time as of which the map is read.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct When<'partial> {
+pub(super) struct ReadTime<'partial> {
     /// Only epochs that were over by this time; `None` for all.
     pub(super) as_of: Option<Timestamp>,
     /// What was measured before that time in the epoch that it lies within.
@@ -156,7 +156,7 @@ impl SiteMap {
     pub(super) fn parts_then<'map>(
         &'map self,
         (place, parts): (u64, &'map [Part]),
-        when: When<'_>,
+        when: ReadTime<'_>,
     ) -> Cow<'map, [Part]> {
         let Some(as_of) = when.as_of else {
             return Cow::Borrowed(parts);
@@ -175,7 +175,7 @@ impl SiteMap {
     pub(super) fn totals_at<'map>(
         &'map self,
         terrain: Number,
-        when: When<'map>,
+        when: ReadTime<'map>,
     ) -> impl Iterator<Item = (PartKey, &'map Sums)> {
         let first = PartKey {
             terrain,
@@ -220,9 +220,9 @@ mod tests {
     use proptest::prelude::*;
     use uuid::Uuid;
 
-    use super::super::{Absent, At, Choice, Group, Labelled, Room};
+    use super::super::{Choice, FusionBuffers, FusionContext, Group, LabelledSum, MissingBlocks};
     use super::*;
-    use crate::friction::Seen;
+    use crate::friction::EpochMeasurement;
     use crate::friction::epochs::{DAY_H, Horizons};
     use crate::friction::tests::{at_us, measured};
     use crate::friction::weights::FrictionConfig;
@@ -257,7 +257,7 @@ mod tests {
 
     fn add(map: &mut SiteMap, measurement: &Measurement) {
         let at = Timestamp::from_microsecond(measurement.ended_at_us).unwrap();
-        let labelled = Labelled {
+        let labelled = LabelledSum {
             cell: measurement.cell,
             grid_revision: 1,
             terrain: &measurement.terrain,
@@ -280,12 +280,15 @@ mod tests {
     }
 
     /// Returns the groups with the names of robots in the place of their ranks.
-    fn named(map: &SiteMap, groups: Vec<Group<'_>>) -> Vec<(String, Vec<Seen<String>>)> {
+    fn named(
+        map: &SiteMap,
+        groups: Vec<Group<'_>>,
+    ) -> Vec<(String, Vec<EpochMeasurement<String>>)> {
         let of_group = |group: Group<'_>| {
-            let mut seen: Vec<Seen<String>> = group
+            let mut seen: Vec<EpochMeasurement<String>> = group
                 .seen
                 .iter()
-                .map(|seen| Seen {
+                .map(|seen| EpochMeasurement {
                     robot: map.robot_of_rank(seen.robot).unwrap().to_string(),
                     epoch_h: seen.epoch_h,
                     theta: seen.theta,
@@ -353,7 +356,7 @@ mod tests {
                 ..Choice::default()
             };
             let present = Choice { as_of: None, partial: None, ..choice };
-            let absent = Absent::default();
+            let absent = MissingBlocks::default();
             let cells = [0, 1, 2].map(|ix| Cell { ix, iy: 0 });
             let is_lawn = |_: &TerrainRef| true;
             prop_assert_eq!(
@@ -365,7 +368,7 @@ mod tests {
                 named(&expected, expected.cells(&absent, 1).area(&cells, present))
             );
             let config = FrictionConfig::default();
-            let at = At { config: &config, now_us: as_of_us };
+            let at = FusionContext { config: &config, now_us: as_of_us };
             let ground_of = |found: Option<&TerrainRef>| Some(found.map_or(0, |_| 1));
             for cell in cells {
                 prop_assert_eq!(
@@ -375,7 +378,8 @@ mod tests {
                 prop_assert_eq!(map.cells(&absent, 1).newest_at_us(cell, choice), expected.cells(&absent, 1).newest_at_us(cell, present));
                 let seen = |map: &SiteMap, choice| {
                     let filter = map.filter(choice, ground_of);
-                    map.cells(&absent, 1).fuse_cell(cell, (1, &filter), at, &mut Room::default())
+                    let mut buffers = FusionBuffers::default();
+                    map.cells(&absent, 1).fuse_cell(cell, (1, &filter), at, &mut buffers)
                 };
                 prop_assert_eq!(seen(&map, choice), seen(&expected, present));
             }

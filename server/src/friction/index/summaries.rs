@@ -7,10 +7,10 @@ use tread_api::terrain::TerrainRef;
 
 use super::changes::{BLOCK_CELLS, Block};
 use super::part::{Part, PartKey};
-use super::partial::When;
+use super::partial::ReadTime;
 use super::{Cells, Choice, SiteMap, Sums};
 use crate::friction::weights::FrictionConfig;
-use crate::friction::{Fused, Fuser, Ground, Seen};
+use crate::friction::{EpochMeasurement, Fused, Fuser, Ground};
 
 /// Number of the ground outside of all terrains.
 pub const GROUND_NONE: u16 = 0;
@@ -82,7 +82,7 @@ pub struct CompiledFilter<'choice> {
     grounds: Vec<u16>,
     /// Divisor of θ of each configuration; `None` for configurations that are filtered out.
     ratios: Vec<Option<f64>>,
-    when: When<'choice>,
+    when: ReadTime<'choice>,
 }
 
 impl CompiledFilter<'_> {
@@ -97,7 +97,7 @@ impl CompiledFilter<'_> {
 
 /// Time and settings of a fusion.
 #[derive(Debug, Clone, Copy)]
-pub struct At<'config> {
+pub struct FusionContext<'config> {
     /// Weights of measurements.
     pub config: &'config FrictionConfig,
     /// Time to which ages refer, microseconds since 1970.
@@ -106,9 +106,9 @@ pub struct At<'config> {
 
 /// Buffers that are reused for each square of the picture.
 #[derive(Debug, Default)]
-pub struct Room {
+pub struct FusionBuffers {
     fuser: Fuser<u32>,
-    seen: Vec<Seen<u32>>,
+    seen: Vec<EpochMeasurement<u32>>,
     /// Number of passes without information.
     uninformative_passes: u64,
 }
@@ -130,7 +130,7 @@ impl SiteMap {
                 .collect(),
             ratios: configurations
                 .map(|&found| {
-                    let (reference, ratio) = choice.brought_to(found)?;
+                    let (reference, ratio) = choice.converted_to(found)?;
                     (Some(reference) == choice.configuration).then_some(ratio)
                 })
                 .collect(),
@@ -142,7 +142,7 @@ impl SiteMap {
         &self,
         parts: &[Part],
         (ground, filter): (u16, &CompiledFilter<'_>),
-        room: &mut Room,
+        room: &mut FusionBuffers,
     ) {
         room.seen.clear();
         room.uninformative_passes = 0;
@@ -197,13 +197,13 @@ impl Cells<'_> {
         (block, places): (Block, Option<&[u16]>),
         grounds: &[u16],
         filter: &CompiledFilter<'_>,
-        at: At<'_>,
+        at: FusionContext<'_>,
         squares: &mut [CellSummary],
     ) {
         if places.is_none() {
             squares.fill(CellSummary::default());
         }
-        let mut room = Room::default();
+        let mut room = FusionBuffers::default();
         let mut put = |place: u16, parts: &[Part]| {
             let index = usize::from(place);
             if let (Some(&ground), Some(square)) = (grounds.get(index), squares.get_mut(index)) {
@@ -227,8 +227,8 @@ impl Cells<'_> {
         self,
         area: CellBox,
         (ground, filter): (u16, &CompiledFilter<'_>),
-        at: At<'_>,
-        room: &mut Room,
+        at: FusionContext<'_>,
+        room: &mut FusionBuffers,
     ) -> CellSummary {
         let mut sums: std::collections::BTreeMap<PartKey, Sums> = std::collections::BTreeMap::new();
         for cell in self.cells_in(area, None) {
@@ -258,8 +258,8 @@ impl Cells<'_> {
         self,
         cell: Cell,
         which: (u16, &CompiledFilter<'_>),
-        at: At<'_>,
-        room: &mut Room,
+        at: FusionContext<'_>,
+        room: &mut FusionBuffers,
     ) -> Option<Fused> {
         let parts = self.parts_at(cell, which.1.when);
         self.fuse_parts(&parts, which, at, room)
@@ -269,8 +269,8 @@ impl Cells<'_> {
         self,
         parts: &[Part],
         which: (u16, &CompiledFilter<'_>),
-        at: At<'_>,
-        room: &mut Room,
+        at: FusionContext<'_>,
+        room: &mut FusionBuffers,
     ) -> Option<Fused> {
         self.map().gather(parts, which, room);
         let (fuser, seen) = (&mut room.fuser, &mut room.seen);
@@ -282,8 +282,8 @@ impl Cells<'_> {
         self,
         parts: &[Part],
         which: (u16, &CompiledFilter<'_>),
-        at: At<'_>,
-        room: &mut Room,
+        at: FusionContext<'_>,
+        room: &mut FusionBuffers,
     ) -> CellSummary {
         let fused = self.fuse_parts(parts, which, at, room);
         fused.map_or_else(CellSummary::default, |fused| CellSummary::of(&fused))

@@ -14,7 +14,9 @@ use tread_api::site::Site;
 use utoipa::IntoParams;
 
 use super::streamed::{CSV_MEDIA_TYPE, JSON_MEDIA_TYPE, PARQUET_MEDIA_TYPE, streamed};
-use crate::app::friction::{Area, AreaBounds, Asked, CellExport, Picture, PictureAsked};
+use crate::app::friction::{
+    Area, AreaBounds, CellExport, Picture, PictureAsked, ReadingParameters,
+};
 use crate::app::{App, AppError};
 use crate::formats::nav2::{self, SpeedScale};
 use crate::formats::png::{self, PngError};
@@ -157,7 +159,7 @@ impl MapQuery {
             Some(Area::new(bounds)?)
         };
         Ok(PictureAsked {
-            asked: Asked {
+            asked: ReadingParameters {
                 as_of: self.as_of,
                 configuration: self.configuration,
                 normalisation: self.normalisation.clone(),
@@ -271,7 +273,7 @@ pub(in crate::http) async fn map(
 fn list_writer(
     format: ListFormat,
     site: &Site,
-    (asked, as_of): (&Asked, Option<Timestamp>),
+    (asked, as_of): (&ReadingParameters, Option<Timestamp>),
 ) -> Result<Box<dyn Writer<CellFriction>>, TableError> {
     Ok(match format {
         ListFormat::Json => json::page(as_of),

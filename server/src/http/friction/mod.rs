@@ -27,7 +27,7 @@ use super::negotiate::{ResponseFormat, choose};
 use super::problem::Problem;
 use super::sites::PageQuery;
 use super::subject::Subject;
-use crate::app::friction::{Asked, SegmentExport};
+use crate::app::friction::{ReadingParameters, SegmentExport};
 use crate::app::segments::SegmentFilter;
 use crate::app::{App, AppError};
 use crate::formats::table::{self, segments};
@@ -58,8 +58,8 @@ fn asked(
     as_of: Option<Timestamp>,
     configuration: Option<ConfigurationId>,
     normalisation: Option<String>,
-) -> Asked {
-    Asked {
+) -> ReadingParameters {
+    ReadingParameters {
         as_of,
         configuration,
         normalisation,
@@ -92,7 +92,7 @@ pub(super) async fn terrains(
 #[derive(Debug, Clone, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
-pub(super) struct OneQuery {
+pub(super) struct TerrainReadingQuery {
     /// Time up to which measurements are included, rounded down to a minute, or to the end of an
     /// epoch whose raw measurements are missing or too many; all measurements when absent.
     as_of: Option<Timestamp>,
@@ -106,13 +106,13 @@ pub(super) struct OneQuery {
 #[utoipa::path(get, path = "/v1/sites/{site}/friction/terrains/{terrain}", tag = "friction",
     security(("token" = ["read"])),
     operation_id = "get_terrain_friction",
-    params(("site" = SiteId, Path), ("terrain" = TerrainId, Path), OneQuery),
+    params(("site" = SiteId, Path), ("terrain" = TerrainId, Path), TerrainReadingQuery),
     responses((status = 200, body = TerrainFriction), (status = 304),
         (status = 400, body = ProblemBody), (status = 404, body = ProblemBody)))]
 pub(super) async fn terrain(
     State(app): State<App>,
     Path((site, terrain)): Path<(SiteId, TerrainId)>,
-    Query(query): Query<OneQuery>,
+    Query(query): Query<TerrainReadingQuery>,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let asked = asked(query.as_of, query.configuration, query.normalisation);

@@ -35,7 +35,7 @@ const SESSION_SCHEME: &str = "session";
 
 /// Requirement of a route.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Needed {
+pub enum RouteRequirement {
     /// No credential.
     Nothing,
     /// A token with this right.
@@ -45,7 +45,7 @@ pub enum Needed {
 /// Requirements of all routes.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Access {
-    routes: HashMap<String, Vec<(Method, Needed)>>,
+    routes: HashMap<String, Vec<(Method, RouteRequirement)>>,
 }
 
 impl Access {
@@ -54,7 +54,7 @@ impl Access {
     pub fn of(openapi: &OpenApi) -> Self {
         let mut access = Self::default();
         for (method, path) in PUBLIC {
-            access.insert(path, method, Needed::Nothing);
+            access.insert(path, method, RouteRequirement::Nothing);
         }
         let description = serde_json::to_value(openapi).unwrap_or_default();
         let paths = description["paths"].as_object();
@@ -67,7 +67,7 @@ impl Access {
                     continue;
                 }
                 if let Some(right) = right_of(operation) {
-                    access.insert(path, method, Needed::Right(right));
+                    access.insert(path, method, RouteRequirement::Right(right));
                 } else {
                     tracing::error!("{method} {path} names no right and is refused");
                 }
@@ -79,17 +79,17 @@ impl Access {
     /// Returns a table of one route that needs no credential.
     pub(in crate::http) fn open(path: &str) -> Self {
         let mut access = Self::default();
-        access.insert(path, Method::GET, Needed::Nothing);
+        access.insert(path, Method::GET, RouteRequirement::Nothing);
         access
     }
 
-    fn insert(&mut self, path: &str, method: Method, needed: Needed) {
+    fn insert(&mut self, path: &str, method: Method, needed: RouteRequirement) {
         let methods = self.routes.entry(path.to_owned()).or_default();
         methods.push((method, needed));
     }
 
     /// Returns the requirement of a route; `None` for a method that it does not have.
-    pub fn needed(&self, method: &Method, route: &str) -> Option<Needed> {
+    pub fn needed(&self, method: &Method, route: &str) -> Option<RouteRequirement> {
         // HEAD needs the same right as GET.
         let method = if method == Method::HEAD {
             &Method::GET
@@ -209,7 +209,7 @@ mod tests {
         assert_eq!(access.needed(&Method::GET, "/v1/forgotten"), None);
         assert_eq!(
             access.needed(&Method::HEAD, "/healthz"),
-            Some(Needed::Nothing)
+            Some(RouteRequirement::Nothing)
         );
         assert_eq!(access.needed(&Method::POST, "/healthz"), None);
         assert_eq!(access.methods("/healthz").as_deref(), Some("GET,HEAD"));

@@ -18,9 +18,9 @@ use tread_api::identity::AuditEntry;
 use tread_api::problem::ProblemType;
 use tread_api::rights::Right;
 
-use super::access::{Access, Needed};
+use super::access::{Access, RouteRequirement};
 use super::{browser, place};
-use crate::app::identity::{Credential, Shown, SignInError};
+use crate::app::identity::{Credential, CredentialKind, SignInError};
 use crate::app::{App, AppError};
 use crate::connections::{Purpose, Slot};
 use crate::counters::Counter;
@@ -114,14 +114,14 @@ impl Guard {
         &self,
         method: &Method,
         headers: &HeaderMap,
-        by: Option<Shown>,
+        by: Option<CredentialKind>,
     ) -> Result<(), Refusal> {
         let from = provenance(headers);
         let is_browser = from.origin.is_some() || from.fetch_site.is_some();
         let is_upgrade = headers.contains_key(header::UPGRADE);
         let may = match by {
             // A browser sends its cookie with requests of any page.
-            Some(Shown::Session) if is_upgrade || is_change(method) => {
+            Some(CredentialKind::Session) if is_upgrade || is_change(method) => {
                 self.names.is_own_page(&from)
             }
             _ if is_upgrade => self.names.may_open_socket(&from),
@@ -160,7 +160,7 @@ impl Guard {
         let found = self.app.authenticate(address, text, shown, purpose).await;
         let credential = found.map_err(|error| {
             let mut response = sign_in_problem(&self.app, &error);
-            if shown == Shown::Session && response.status() == 401 {
+            if shown == CredentialKind::Session && response.status() == 401 {
                 // Makes the browser drop a cookie that is no longer valid.
                 browser::remove_session_cookie(response.headers_mut(), self.names.is_tls);
             }
@@ -213,7 +213,7 @@ impl Guard {
         }
     }
 
-    fn record(&self, asked: Asked, response: &Response, who: Option<&Arc<Credential>>) {
+    fn record(&self, asked: AuditedRequest, response: &Response, who: Option<&Arc<Credential>>) {
         let said = response.extensions().get::<Audited>();
         let said = said.map(|Audited(what)| what.clone());
         let left = asked.slot.left().cloned();
@@ -240,8 +240,8 @@ impl Guard {
     }
 }
 
-/// What the audit log says of a request.
-struct Asked {
+/// Description of a request for the audit log.
+struct AuditedRequest {
     address: IpAddr,
     method: String,
     route: String,
@@ -250,10 +250,10 @@ struct Asked {
     slot: AuditSlot,
 }
 
-fn asked(request: &Request, route: &str) -> Asked {
+fn asked(request: &Request, route: &str) -> AuditedRequest {
     let short = |text: &str| text.chars().take(AUDIT_TEXT_MAX).collect();
     let request_id = request.headers().get(REQUEST_ID);
-    Asked {
+    AuditedRequest {
         address: address(request),
         method: short(request.method().as_str()),
         route: route.to_owned(),
@@ -268,7 +268,7 @@ fn asked(request: &Request, route: &str) -> Asked {
 }
 
 /// Middleware that lets permitted requests through.
-pub(in crate::http) async fn stand(
+pub(in crate::http) async fn authorize(
     State(guard): State<Guard>,
     mut request: Request,
     next: Next,
@@ -324,11 +324,11 @@ impl Guard {
         route: &str,
     ) -> Result<Option<Arc<Credential>>, Refusal> {
         match self.access.needed(request.method(), route) {
-            Some(Needed::Nothing) => {
+            Some(RouteRequirement::Nothing) => {
                 self.check_origin(request.method(), request.headers(), None)?;
                 Ok(None)
             }
-            Some(Needed::Right(needed)) => {
+            Some(RouteRequirement::Right(needed)) => {
                 let address = address(request);
                 let (method, headers) = (request.method(), request.headers());
                 let purpose = purpose(method, route);
@@ -449,15 +449,15 @@ fn add_challenge(response: &mut Response) {
 }
 
 /// Returns the secret in a request, and how it was shown; a header takes precedence over a cookie.
-pub(in crate::http) fn shown(headers: &HeaderMap, is_tls: bool) -> Option<(&str, Shown)> {
+pub(in crate::http) fn shown(headers: &HeaderMap, is_tls: bool) -> Option<(&str, CredentialKind)> {
     if let Some(value) = headers.get(header::AUTHORIZATION) {
         let text = value.to_str().unwrap_or_default();
         let (scheme, secret) = text.split_once(' ').unwrap_or_default();
         let is_bearer = scheme.eq_ignore_ascii_case("bearer");
         let secret = if is_bearer { secret.trim() } else { "" };
-        return Some((secret, Shown::Token));
+        return Some((secret, CredentialKind::Token));
     }
-    browser::shown_cookie(headers, is_tls).map(|secret| (secret, Shown::Session))
+    browser::shown_cookie(headers, is_tls).map(|secret| (secret, CredentialKind::Session))
 }
 
 /// Returns the source address of a request.

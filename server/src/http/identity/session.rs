@@ -10,7 +10,7 @@ use tread_api::problem::ProblemBody;
 
 use super::browser;
 use super::guard::{Peer, SignedIn, sign_in_problem, unauthenticated};
-use crate::app::identity::Shown;
+use crate::app::identity::CredentialKind;
 use crate::app::{App, AppError};
 use crate::connections::Purpose;
 use crate::http::extract::Json;
@@ -33,7 +33,12 @@ pub(in crate::http) async fn create(
 ) -> Result<Response, Problem> {
     let address = peer.map_or([0, 0, 0, 0].into(), |Extension(Peer(address))| address);
     let found = app
-        .authenticate(address, request.token.trim(), Shown::Token, Purpose::Other)
+        .authenticate(
+            address,
+            request.token.trim(),
+            CredentialKind::Token,
+            Purpose::Other,
+        )
         .await;
     let credential = match found {
         Ok(credential) => credential,

@@ -54,7 +54,7 @@ pub(in crate::http) async fn create(
     Subject(subject): Subject,
     Json(request): Json<CreateToken>,
 ) -> Result<(StatusCode, Json<CreatedToken>), Problem> {
-    let created = app.give_token(request, &subject).await?;
+    let created = app.create_token_as(request, &subject).await?;
     Ok((StatusCode::CREATED, Json(created)))
 }
 

@@ -7,7 +7,7 @@ use reqwest::{Method, StatusCode};
 use serde_json::{Value, json};
 use tread_api::identity::Role;
 use tread_api::rights::{Right, Rights};
-use tread_server::http::{Access, Needed, PUBLIC};
+use tread_server::http::{Access, PUBLIC, RouteRequirement};
 use tread_server::identity::secret::{Kind, Secret};
 
 use crate::harness::{Yard, client};
@@ -148,7 +148,11 @@ fn every_operation_names_one_right_or_is_on_the_named_list() {
             "{method} {path} takes {right}"
         );
         let needed = access.needed(&method, &path);
-        assert_eq!(needed, Some(Needed::Right(right)), "{method} {path}");
+        assert_eq!(
+            needed,
+            Some(RouteRequirement::Right(right)),
+            "{method} {path}"
+        );
         let reads = method == Method::GET || path.ends_with("/friction/path");
         let is_anybodys = path == "/v1/session" || path.ends_with("/stop");
         if reads {
@@ -211,8 +215,8 @@ async fn every_route_answers_every_role_and_right_as_its_description_says() {
             let method: Method = method.parse().unwrap();
             let needed = needed_by.needed(&method, &path).unwrap();
             let may = match needed {
-                Needed::Nothing => true,
-                Needed::Right(needed) => rights.includes(needed),
+                RouteRequirement::Nothing => true,
+                RouteRequirement::Right(needed) => rights.includes(needed),
             };
             let refused = status == StatusCode::FORBIDDEN || status == StatusCode::UNAUTHORIZED;
             if is_open(&method, &path) {

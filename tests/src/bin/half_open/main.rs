@@ -93,17 +93,17 @@ struct Details {
 
 /// Which connection a request takes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum By {
+enum ConnectionMode {
     Kept,
     New,
 }
 
-struct Asker {
+struct Requester {
     address: SocketAddr,
     request: String,
 }
 
-impl Asker {
+impl Requester {
     /// One request on a connection, and the whole answer.
     async fn ask(&self, stream: &mut TcpStream) -> anyhow::Result<()> {
         stream.write_all(self.request.as_bytes()).await?;
@@ -137,7 +137,7 @@ impl Asker {
     /// Asks at a fixed rate and notes how long each answer took.
     async fn ask_for(
         &self,
-        by: By,
+        by: ConnectionMode,
         rate_hz: u64,
         span: Duration,
         answers: &mut Answers,
@@ -151,16 +151,16 @@ impl Asker {
             let began = Instant::now();
             let asking = async {
                 match (by, kept.take()) {
-                    (By::Kept, Some(mut stream)) => {
+                    (ConnectionMode::Kept, Some(mut stream)) => {
                         self.ask(&mut stream).await?;
                         Ok(stream)
                     }
-                    (By::Kept, None) | (By::New, _) => self.on_new().await,
+                    (ConnectionMode::Kept, None) | (ConnectionMode::New, _) => self.on_new().await,
                 }
             };
             let answer = tokio::time::timeout(ANSWER_WAIT_MAX, asking).await;
             match answer.map_err(anyhow::Error::from).flatten() {
-                Ok(stream) => kept = (by == By::Kept).then_some(stream),
+                Ok(stream) => kept = (by == ConnectionMode::Kept).then_some(stream),
                 Err(_) => answers.failed += 1,
             }
             let took_us = u64::try_from(began.elapsed().as_micros())?;
@@ -225,7 +225,7 @@ async fn measure(arguments: Arguments, attacker: &Handle) -> anyhow::Result<Exit
         "GET /v1/sites HTTP/1.1\r\nhost: {address}\r\nauthorization: Bearer {}\r\n\r\n",
         fleet.token()
     );
-    let asker = Asker { address, request };
+    let asker = Requester { address, request };
     let reopened = Arc::new(AtomicU64::new(0));
     let span = Duration::from_secs(arguments.seconds);
     let (mut kept, mut new) = (
@@ -243,8 +243,8 @@ async fn measure(arguments: Arguments, attacker: &Handle) -> anyhow::Result<Exit
             tokio::time::sleep(SETTLE).await;
             let rate_hz = arguments.rate_hz / 2;
             tokio::try_join!(
-                asker.ask_for(By::Kept, rate_hz, span, &mut kept[disturbed]),
-                asker.ask_for(By::New, rate_hz, span, &mut new[disturbed]),
+                asker.ask_for(ConnectionMode::Kept, rate_hz, span, &mut kept[disturbed]),
+                asker.ask_for(ConnectionMode::New, rate_hz, span, &mut new[disturbed]),
             )?;
             drop(open);
         }

@@ -45,7 +45,7 @@ const SETTLING: Duration = Duration::from_secs(5);
 
 /// What one server, or a router alone, used.
 #[derive(Debug, Serialize)]
-pub(crate) struct Used {
+pub(crate) struct ResourceUsage {
     states_per_second: f64,
     cpu_us_per_state: f64,
     memory_peak_mb: f64,
@@ -53,7 +53,7 @@ pub(crate) struct Used {
     dispatch: Option<Dispatch>,
 }
 
-impl Used {
+impl ResourceUsage {
     fn words(&self) -> String {
         format!(
             "{:.0} states/s, {:.1} us CPU each, {:.0} MB",
@@ -64,11 +64,11 @@ impl Used {
 
 /// What was measured of a fleet.
 #[derive(Debug, Serialize)]
-pub(crate) struct OfFleet {
+pub(crate) struct FleetMeasurement {
     robots: u32,
     state_rate_hz: f64,
-    router: Used,
-    server: Used,
+    router: ResourceUsage,
+    server: ResourceUsage,
     /// The same with certificates.
     #[serde(skip_serializing_if = "Option::is_none")]
     tls: Option<WithCertificates>,
@@ -80,13 +80,13 @@ struct WithCertificates {
     /// Robots, fewer than those without certificates if the limit of open files allows no more.
     robots: u32,
     #[serde(flatten)]
-    used: Used,
+    used: ResourceUsage,
 }
 
 /// What was measured.
 #[derive(Debug, Serialize)]
 pub(crate) struct States {
-    fleets: Vec<OfFleet>,
+    fleets: Vec<FleetMeasurement>,
 }
 
 pub(crate) async fn measure(arguments: &Arguments, node: &Path) -> anyhow::Result<States> {
@@ -94,7 +94,7 @@ pub(crate) async fn measure(arguments: &Arguments, node: &Path) -> anyhow::Resul
     for (robots, state_rate_hz) in FLEETS {
         let period = period_of(state_rate_hz);
         let seconds = arguments.seconds;
-        let say = |what: &str, used: &Used| {
+        let say = |what: &str, used: &ResourceUsage| {
             eprintln!(
                 "{robots} robots at {state_rate_hz} Hz: {what}: {}",
                 used.words()
@@ -127,7 +127,7 @@ pub(crate) async fn measure(arguments: &Arguments, node: &Path) -> anyhow::Resul
             say(&what, &used);
             tls = Some(WithCertificates { robots, used });
         }
-        fleets.push(OfFleet {
+        fleets.push(FleetMeasurement {
             robots,
             state_rate_hz,
             router,
@@ -147,13 +147,13 @@ fn certificates_max() -> anyhow::Result<u32> {
 }
 
 /// Robots that publish until this is dropped.
-pub(crate) struct Publishing {
+pub(crate) struct PublishGuard {
     published: Arc<AtomicU64>,
     _tasks: JoinSet<()>,
 }
 
 /// Lets robots publish their states, evenly spread over the period.
-pub(crate) fn publish(robots: Vec<LightRobot>, period: Duration) -> Publishing {
+pub(crate) fn publish(robots: Vec<LightRobot>, period: Duration) -> PublishGuard {
     let published = Arc::new(AtomicU64::new(0));
     let mut tasks = JoinSet::new();
     let (begin, count) = (Instant::now(), robots.len().max(1));
@@ -172,7 +172,7 @@ pub(crate) fn publish(robots: Vec<LightRobot>, period: Duration) -> Publishing {
             }
         });
     }
-    Publishing {
+    PublishGuard {
         published,
         _tasks: tasks,
     }
@@ -181,9 +181,9 @@ pub(crate) fn publish(robots: Vec<LightRobot>, period: Duration) -> Publishing {
 /// Measures a process while robots publish to it.
 async fn used(
     usage: impl Fn() -> Option<Usage>,
-    publishing: &Publishing,
+    publishing: &PublishGuard,
     seconds: u64,
-) -> anyhow::Result<Used> {
+) -> anyhow::Result<ResourceUsage> {
     let usage = || usage().context("the process that was measured is gone");
     sleep(SETTLING).await;
     let (before, published) = (usage()?, publishing.published.load(Ordering::Relaxed));
@@ -191,7 +191,7 @@ async fn used(
     sleep(Duration::from_secs(seconds)).await;
     let (after, took) = (usage()?, begin.elapsed().as_secs_f64());
     let states = figure(publishing.published.load(Ordering::Relaxed) - published);
-    Ok(Used {
+    Ok(ResourceUsage {
         states_per_second: states / took,
         cpu_us_per_state: 1e6 * (after.cpu_s - before.cpu_s) / states.max(1.0),
         memory_peak_mb: figure(after.memory_peak_bytes) / 1e6,
@@ -224,7 +224,7 @@ async fn bare_router(
     node: &Path,
     (count, period): (u32, Duration),
     seconds: u64,
-) -> anyhow::Result<Used> {
+) -> anyhow::Result<ResourceUsage> {
     let (welcome, site) = welcome_of(node).await?;
     let router = BareRouter::start(node)?;
     let endpoint = format!("tcp/{}", router.address);
@@ -256,8 +256,8 @@ pub(crate) async fn welcome_of(node: &Path) -> anyhow::Result<(Welcome, SiteId)>
 
 impl States {
     pub(crate) fn checks(&self) -> Vec<Check> {
-        let of_fleet = |fleet: &OfFleet| {
-            let OfFleet {
+        let of_fleet = |fleet: &FleetMeasurement| {
+            let FleetMeasurement {
                 robots,
                 state_rate_hz,
                 router,

@@ -346,7 +346,7 @@ async fn measure_upgrade(
     for (_, mission) in &missions {
         fleet.rest.mission_reaches(*mission, &running, DRIVE).await;
     }
-    let away = Away::watch(fleet);
+    let away = Downtime::watch(fleet);
     fleet.stop_server().await?;
     fleet.start_server().await;
     tokio::time::sleep(Duration::from_secs(1)).await;
@@ -397,12 +397,12 @@ async fn ended(fleet: &Fleet, mission: MissionId) -> MissionState {
 }
 
 /// How long the REST API is away at a stretch.
-struct Away {
+struct Downtime {
     longest_us: Arc<AtomicU64>,
     _looking: JoinSet<()>,
 }
 
-impl Away {
+impl Downtime {
     fn watch(fleet: &Fleet) -> Self {
         let url = format!("http://{}/readyz", fleet.http_address());
         let longest_us = Arc::new(AtomicU64::new(0));

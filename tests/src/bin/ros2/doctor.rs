@@ -15,7 +15,7 @@ const AT_ONCE: usize = 2;
 
 /// A planted fault, and how it must be named.
 #[derive(Clone, Copy)]
-struct Planted {
+struct PlantedFault {
     name: &'static str,
     flags: &'static [&'static str],
     /// A fault that is switched on, and its value.
@@ -31,7 +31,7 @@ struct Planted {
     lines: &'static [&'static str],
 }
 
-const HEALTHY: Planted = Planted {
+const HEALTHY: PlantedFault = PlantedFault {
     name: "healthy",
     flags: &[],
     switched: None,
@@ -46,8 +46,8 @@ const fn switched(
     name: &'static str,
     fault: (&'static str, &'static str),
     key: &'static str,
-) -> Planted {
-    Planted {
+) -> PlantedFault {
+    PlantedFault {
         name,
         switched: Some(fault),
         key: Some(key),
@@ -74,21 +74,21 @@ const WIDE_MODEL: &str = "[model]\nname = \"yi2007\"\ntyres = \"standard\"\nmass
     linear_jerk_max_m_s3 = 4.0\nwheel_speed_max_rad_s = 20.0\n\
     wheel_acceleration_max_rad_s2 = 60.0\n";
 
-const ROBOTS: [Planted; 25] = [
+const ROBOTS: [PlantedFault; 25] = [
     HEALTHY,
-    Planted {
+    PlantedFault {
         name: "healthy behind a bridge",
         flags: &["--scheme=ros2dds"],
         configuration: BRIDGED,
         moves: false,
         ..HEALTHY
     },
-    Planted {
+    PlantedFault {
         says: "are swapped",
         lines: &["left = [\"front_right_wheel\", \"rear_right_wheel\"]"],
         ..switched("swapped sides", ("swapped", "on"), "drive.ros2.joints.left")
     },
-    Planted {
+    PlantedFault {
         lines: &["left_sign = -1"],
         ..switched(
             "one side inverted",
@@ -96,7 +96,7 @@ const ROBOTS: [Planted; 25] = [
             "drive.ros2.joints.left_sign",
         )
     },
-    Planted {
+    PlantedFault {
         says: "the base takes backwards for positive",
         lines: &["turn_sign = -1", "forward_sign = -1"],
         ..switched(
@@ -105,14 +105,14 @@ const ROBOTS: [Planted; 25] = [
             "drive.ros2.command.turn_sign",
         )
     },
-    Planted {
+    PlantedFault {
         name: "wrong radius",
         flags: &["--radius=0.1"],
         key: Some("model.wheel_radius_m"),
         ..HEALTHY
     },
     // The command takes the model's track, so the base turns too slowly as well.
-    Planted {
+    PlantedFault {
         name: "wrong track of the model",
         configuration: Configuration {
             model: WIDE_MODEL,
@@ -123,7 +123,7 @@ const ROBOTS: [Planted; 25] = [
         lines: &["track_width_m = 0.43"],
         ..HEALTHY
     },
-    Planted {
+    PlantedFault {
         name: "wrong track of the model behind a right command",
         configuration: Configuration {
             model: WIDE_MODEL,
@@ -135,7 +135,7 @@ const ROBOTS: [Planted; 25] = [
         lines: &["track_width_m = 0.4"],
         ..HEALTHY
     },
-    Planted {
+    PlantedFault {
         name: "wrong track of the command",
         configuration: Configuration {
             command: "track_width_m = 0.6\n",
@@ -147,7 +147,7 @@ const ROBOTS: [Planted; 25] = [
         ..HEALTHY
     },
     switched("delayed odometry", ("delay", "0.15"), "drive.ros2.stamps"),
-    Planted {
+    PlantedFault {
         moves: false,
         lines: &["effort = \"none\""],
         ..switched(
@@ -156,11 +156,11 @@ const ROBOTS: [Planted; 25] = [
             "drive.ros2.joints.effort",
         )
     },
-    Planted {
+    PlantedFault {
         lines: &["frame = \"camera\""],
         ..switched("wrong frame", ("frame", "on"), "drive.ros2.imu.frame")
     },
-    Planted {
+    PlantedFault {
         says: "`fl_wheel_joint`, `fr_wheel_joint`, `rl_wheel_joint`, `rr_wheel_joint`",
         lines: &[
             "left = [\"fl_wheel_joint\", \"rl_wheel_joint\"]",
@@ -172,7 +172,7 @@ const ROBOTS: [Planted; 25] = [
             "drive.ros2.joints.left",
         )
     },
-    Planted {
+    PlantedFault {
         says: "though the robot moved",
         ..switched(
             "frozen joints",
@@ -180,7 +180,7 @@ const ROBOTS: [Planted; 25] = [
             "drive.ros2.joints.topic",
         )
     },
-    Planted {
+    PlantedFault {
         configuration: WITHOUT_POSE,
         says: "the odometry says the same motion",
         ..switched(
@@ -189,15 +189,15 @@ const ROBOTS: [Planted; 25] = [
             "drive.ros2.odometry.topic",
         )
     },
-    Planted {
+    PlantedFault {
         says: "the gyro says the same turn rate",
         ..switched("frozen gyro", ("frozen_imu", "on"), "drive.ros2.imu.topic")
     },
-    Planted {
+    PlantedFault {
         says: "it has a bias",
         ..switched("biased gyro", ("bias", "0.05"), "drive.ros2.imu.topic")
     },
-    Planted {
+    PlantedFault {
         configuration: WITHOUT_POSE,
         says: "in the frame of the pose",
         ..switched(
@@ -206,12 +206,12 @@ const ROBOTS: [Planted; 25] = [
             "drive.ros2.odometry.child_frame",
         )
     },
-    Planted {
+    PlantedFault {
         says: "nodes write on it",
         moves: false,
         ..switched("two writers", ("two_imus", "on"), "drive.ros2.imu.topic")
     },
-    Planted {
+    PlantedFault {
         says: "another node writes on",
         ..switched(
             "another node that commands",
@@ -219,7 +219,7 @@ const ROBOTS: [Planted; 25] = [
             "drive.ros2.command.topic",
         )
     },
-    Planted {
+    PlantedFault {
         name: "another node that commands behind a bridge",
         flags: &["--scheme=ros2dds"],
         switched: Some(("rival", "0.3")),
@@ -229,7 +229,7 @@ const ROBOTS: [Planted; 25] = [
         ..HEALTHY
     },
     // It says amperes, of which each is 0.05 N·m.
-    Planted {
+    PlantedFault {
         name: "right torque constant",
         switched: Some(("effort", "20")),
         configuration: Configuration {
@@ -238,7 +238,7 @@ const ROBOTS: [Planted; 25] = [
         },
         ..HEALTHY
     },
-    Planted {
+    PlantedFault {
         name: "torque constant ten times too great",
         switched: Some(("effort", "20")),
         configuration: Configuration {
@@ -253,7 +253,7 @@ const ROBOTS: [Planted; 25] = [
         ("effort", "0.1"),
         "drive.ros2.joints.effort",
     ),
-    Planted {
+    PlantedFault {
         lines: &["left_effort_sign = -1", "right_effort_sign = -1"],
         ..switched(
             "effort against the motion",
@@ -264,7 +264,7 @@ const ROBOTS: [Planted; 25] = [
 ];
 
 /// A robot on which every message comes twice: each topic is named, so it is judged apart.
-const TWICE: Planted = Planted {
+const TWICE: PlantedFault = PlantedFault {
     name: "every message comes twice",
     switched: Some(("twice", "on")),
     moves: false,
@@ -294,7 +294,7 @@ pub(crate) async fn measure(python: &Path, node: &Path) -> anyhow::Result<Vec<Ch
 }
 
 /// Whether the fault is named by its key and by no other, in its words and with its lines.
-fn judged(planted: &Planted, report: &Value) -> Check {
+fn judged(planted: &PlantedFault, report: &Value) -> Check {
     let found = report["checks"].as_array();
     let wrong: Vec<&Value> = found
         .into_iter()
@@ -332,7 +332,7 @@ fn judged(planted: &Planted, report: &Value) -> Check {
 }
 
 /// What the doctor finds on that robot.
-fn examine(planted: &Planted, python: &Path, node: &Path) -> anyhow::Result<Value> {
+fn examine(planted: &PlantedFault, python: &Path, node: &Path) -> anyhow::Result<Value> {
     let mut base = PythonRobot::start(python, planted.flags)?;
     if let Some((fault, value)) = planted.switched {
         base.switch(fault, value)?;

@@ -98,7 +98,7 @@ fn main() -> anyhow::Result<ExitCode> {
                 arrivals_per_model: arrivals,
             }))?;
             print_report(
-                Form::of(json, markdown),
+                OutputFormat::of(json, markdown),
                 &report,
                 &Tables::of_map(&report),
                 &report.checks(),
@@ -117,7 +117,7 @@ fn main() -> anyhow::Result<ExitCode> {
                 robots,
             })?;
             print_report(
-                Form::of(json, markdown),
+                OutputFormat::of(json, markdown),
                 &report,
                 &Tables::of_cells(&report),
                 &report.checks(),
@@ -128,13 +128,13 @@ fn main() -> anyhow::Result<ExitCode> {
 
 /// In what form a report is printed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Form {
+enum OutputFormat {
     People,
     Json,
     Markdown,
 }
 
-impl Form {
+impl OutputFormat {
     fn of(json: bool, markdown: bool) -> Self {
         match (json, markdown) {
             (true, _) => Self::Json,
@@ -145,15 +145,20 @@ impl Form {
 }
 
 fn print_report(
-    form: Form,
+    form: OutputFormat,
     report: &impl Serialize,
     tables: &Tables,
     checks: &[Check],
 ) -> anyhow::Result<ExitCode> {
-    if form == Form::Markdown {
+    if form == OutputFormat::Markdown {
         return report::print_markdown(&tables.markdown(), checks);
     }
-    report::print_with(form == Form::Json, &Details { report }, tables, checks)
+    report::print_with(
+        form == OutputFormat::Json,
+        &Details { report },
+        tables,
+        checks,
+    )
 }
 
 #[derive(Debug, Serialize)]

@@ -4,7 +4,7 @@ use std::fmt::{self, Display, Formatter, Write as _};
 
 use tread_lab::report::{Table, percent};
 use tread_tests::scenario::cells;
-use tread_tests::scenario::report::{Arrival, Learned, Report};
+use tread_tests::scenario::report::{Arrival, FleetMap, Report};
 
 /// Tables with what is said above each, and lines below them.
 #[derive(Debug, Default)]
@@ -62,7 +62,7 @@ impl Tables {
         all
     }
 
-    fn learned(&mut self, learned: &Learned) {
+    fn learned(&mut self, learned: &FleetMap) {
         let how = if learned.torque { "With" } else { "Without" };
         let title = format!(
             "{how} wheel torque, {:.0} s of driving, {} false alarms",

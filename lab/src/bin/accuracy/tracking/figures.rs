@@ -16,7 +16,7 @@ use tread_control::tracking::{ThetaKnowledge, TrackerConfig};
 use tread_lab::bench::{Course, Figure8, Law};
 use tread_lab::parallel::in_parallel;
 
-use super::simulate::{Case, Knowing, PRIOR_DEVIATION, Terrain, Trace, simulate};
+use super::simulate::{Case, PRIOR_DEVIATION, Terrain, ThetaSource, Trace, simulate};
 use super::{Courses, Line, OWN, PEER, STIFFNESSES, UNKNOWN, courses};
 use crate::report::Check;
 use crate::robot::LOOP_S;
@@ -110,7 +110,7 @@ fn before_theta_is_known(courses: &Courses, found: &mut Found) {
     }
     let ratios = in_parallel(&items, |&(name, course, stiffness)| {
         let case = case(course, Terrain::Uniform(stiffness));
-        let whole = |law| simulate(&case, law, Knowing::Nothing).rms_m(0.0..f64::INFINITY);
+        let whole = |law| simulate(&case, law, ThetaSource::Nothing).rms_m(0.0..f64::INFINITY);
         let best = super::PEER_HEADING_GAINS
             .map(|gain| whole(super::tuned(gain)))
             .into_iter()
@@ -146,12 +146,12 @@ fn with_a_prior(found: &mut Found) {
     let (course, lap_s) = (Course::Figure8(shape), shape.lap_s());
     let ratios = in_parallel(&STIFFNESSES, |&stiffness| {
         let case = case(&course, Terrain::Uniform(stiffness));
-        let converged = simulate(&case, Law::Shipped(None), Knowing::Own);
+        let converged = simulate(&case, Law::Shipped(None), ThetaSource::Own);
         let prior = ThetaKnowledge {
             theta: 1.0 / stiffness,
             std_dev: PRIOR_DEVIATION / stiffness,
         };
-        let mapped = simulate(&case, Law::Shipped(Some(prior)), Knowing::Map);
+        let mapped = simulate(&case, Law::Shipped(Some(prior)), ThetaSource::Map);
         (
             stiffness,
             mapped.rms_m(0.0..lap_s) / converged.rms_m(2.0 * lap_s..3.0 * lap_s),
@@ -203,9 +203,9 @@ fn at_a_border(courses: &Courses, found: &mut Found) {
             let case = case(course, terrain);
             let run = |law, knowing| after_entries(&simulate(&case, law, knowing), at_m);
             [
-                run(Law::Shipped(None), Knowing::Map),
-                run(Law::Shipped(None), Knowing::Own),
-                run(super::tuned(6.0), Knowing::Nothing),
+                run(Law::Shipped(None), ThetaSource::Map),
+                run(Law::Shipped(None), ThetaSource::Own),
+                run(super::tuned(6.0), ThetaSource::Nothing),
             ]
         });
         let rms_m = [0, 1, 2].map(|column| {
@@ -249,12 +249,12 @@ fn with_a_wrong_theta(found: &mut Found) {
             theta: factor / stiffness,
             std_dev: PRIOR_DEVIATION * factor / stiffness,
         };
-        let wrong = Knowing::Wrong {
+        let wrong = ThetaSource::Wrong {
             factor,
             until_s: lap_s,
         };
         let trace = simulate(&case, Law::Shipped(Some(claim)), wrong);
-        let converged = simulate(&case, Law::Shipped(None), Knowing::Own);
+        let converged = simulate(&case, Law::Shipped(None), ThetaSource::Own);
         let (from_s, to_s) = (lap_s + 10.0, 2.0 * lap_s + 10.0);
         (
             stiffness,

@@ -11,7 +11,7 @@ use tread_lab::bench::{Course, Figure8, Law};
 use tread_lab::parallel::in_parallel;
 
 use super::courses::plan;
-use super::simulate::{Case, Knowing, Terrain};
+use super::simulate::{Case, Terrain, ThetaSource};
 use super::{millimetres, peer, score};
 use crate::held_out::{FIRST_SEED, STIFFNESSES, robots};
 use crate::report::{Check, Options, Section};
@@ -57,8 +57,8 @@ pub(crate) fn run(options: &Options) -> Section {
         let seeds = if *noisy { seeds } else { 1 };
         [
             peer(&case, seeds).0,
-            score(&case, seeds, Law::Shipped(None), Knowing::Nothing).0,
-            score(&case, seeds, Law::Shipped(None), Knowing::Own).0,
+            score(&case, seeds, Law::Shipped(None), ThetaSource::Nothing).0,
+            score(&case, seeds, Law::Shipped(None), ThetaSource::Own).0,
         ]
     });
     let mut text = format!(

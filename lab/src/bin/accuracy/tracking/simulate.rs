@@ -54,7 +54,7 @@ impl Terrain {
 
 /// Source of the θ given to the shipped law.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) enum Knowing {
+pub(crate) enum ThetaSource {
     /// No θ.
     Nothing,
     /// θ measured from wheel torques; none at the start.
@@ -185,7 +185,7 @@ impl Sensors {
 }
 
 /// Simulates one law until the end of the course, or until the robot is lost.
-pub(crate) fn simulate(case: &Case, law: Law, knowing: Knowing) -> Trace {
+pub(crate) fn simulate(case: &Case, law: Law, knowing: ThetaSource) -> Trace {
     let model = case.model;
     let start_pose = case.course.sample(0.0).pose;
     let first = curve(case.terrain.stiffness(0.0, start_pose));
@@ -215,7 +215,7 @@ pub(crate) fn simulate(case: &Case, law: Law, knowing: Knowing) -> Trace {
         let (time_s, pose) = (run.time_s(), run.plant().state().pose);
         let here = curve(case.terrain.stiffness(time_s, pose));
         // A border that the map knows begins a new ground; one it does not must be noticed.
-        if knowing == Knowing::Map && here != before {
+        if knowing == ThetaSource::Map && here != before {
             estimator.close_segment();
             estimator.begin_ground();
         }
@@ -232,15 +232,15 @@ pub(crate) fn simulate(case: &Case, law: Law, knowing: Knowing) -> Trace {
             std_dev: std_dev * factor * here.theta(),
         };
         let knowledge = match knowing {
-            Knowing::Nothing => None,
-            Knowing::Map => {
+            ThetaSource::Nothing => None,
+            ThetaSource::Map => {
                 let prior = claim(1.0, PRIOR_DEVIATION);
                 Some(own.map_or(prior, |own| own.fused(prior)))
             }
-            Knowing::Wrong { factor, until_s } if time_s < until_s => {
+            ThetaSource::Wrong { factor, until_s } if time_s < until_s => {
                 Some(claim(factor, PRIOR_DEVIATION))
             }
-            Knowing::Own | Knowing::Wrong { .. } => own,
+            ThetaSource::Own | ThetaSource::Wrong { .. } => own,
         };
         let mut gauss = |std_dev: f64| {
             let drawn = normal(&mut pose_rng);

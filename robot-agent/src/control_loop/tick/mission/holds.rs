@@ -11,7 +11,7 @@ use crate::control_loop::channels::{EndReason, Fault};
 use crate::control_loop::outgoing::Outgoing;
 use crate::control_loop::segments::Moment;
 use crate::control_loop::tick::STANDING;
-use crate::control_loop::tick::sensing::Sensed;
+use crate::control_loop::tick::sensing::SensingOutput;
 use crate::safety::microseconds;
 
 /// Time for which a base that was silent must be heard before its mission goes on.
@@ -85,7 +85,12 @@ impl MissionStage {
     ///
     /// The mission ends without braking along the path, since a faulty base may never be measured
     /// at standstill.
-    pub(super) fn hold_for_sensors(&mut self, at: Moment, sensed: &Sensed, events: &mut Outgoing) {
+    pub(super) fn hold_for_sensors(
+        &mut self,
+        at: Moment,
+        sensed: &SensingOutput,
+        events: &mut Outgoing,
+    ) {
         let now = at.monotonic;
         let is_on_hold = sensed.must_hold() && self.active.is_some();
         self.sensors_hold_since = is_on_hold.then(|| self.sensors_hold_since.unwrap_or(now));

@@ -13,7 +13,7 @@ fn entry(token: Option<u128>, method: &str, path: &str, status: u16) -> AuditEnt
     .unwrap()
 }
 
-fn written(waiting: &mut Waiting, now: Duration, all: bool) -> Vec<AuditEntry> {
+fn written(waiting: &mut AuditQueue, now: Duration, all: bool) -> Vec<AuditEntry> {
     let mut written = Vec::new();
     loop {
         let next = waiting.next(now, all);
@@ -26,7 +26,7 @@ fn written(waiting: &mut Waiting, now: Duration, all: bool) -> Vec<AuditEntry> {
 
 #[test]
 fn a_flood_of_one_author_is_counted_and_costs_others_nothing() {
-    let mut waiting = Waiting::default();
+    let mut waiting = AuditQueue::default();
     let mut log = Vec::new();
     let mut changes = 0_u32;
     let sign_out = entry(Some(7), "DELETE", "/v1/session", 204);
@@ -37,7 +37,7 @@ fn a_flood_of_one_author_is_counted_and_costs_others_nothing() {
         if ms % 1_000 == 0 {
             let mut change = entry(Some(1), "POST", "/v1/tokens", 201);
             change.what = Some(json!({"name": format!("desk-{changes}")}));
-            assert_ne!(waiting.add(change, now), Taken::Dropped);
+            assert_ne!(waiting.add(change, now), EntryOutcome::Dropped);
             changes += 1;
         }
         if ms % 100 == 0 {
@@ -60,7 +60,7 @@ fn a_flood_of_one_author_is_counted_and_costs_others_nothing() {
 
 #[test]
 fn strangers_share_little_and_repeats_are_written_ever_more_rarely() {
-    let mut waiting = Waiting::default();
+    let mut waiting = AuditQueue::default();
     let mut rows = 0;
     let guess = entry(None, "GET", "/v1/sites", 401);
     for second in 0..24 * 3_600 {
@@ -76,13 +76,13 @@ fn strangers_share_little_and_repeats_are_written_ever_more_rarely() {
 
 #[test]
 fn while_nothing_is_written_different_changes_are_kept_apart() {
-    let mut waiting = Waiting::default();
+    let mut waiting = AuditQueue::default();
     let robots = KINDS_PER_AUTHOR_MAX + 50 + WAITING_PER_AUTHOR_MAX;
     for number in 0..robots {
         let path = format!("/v1/sites/yard/robots/rover-{number}/stop");
         let mut stop = entry(Some(7), "POST", &path, 200);
         "/v1/sites/{site}/robots/{robot}/stop".clone_into(&mut stop.route);
-        assert_ne!(waiting.add(stop, Duration::ZERO), Taken::Dropped);
+        assert_ne!(waiting.add(stop, Duration::ZERO), EntryOutcome::Dropped);
     }
     let log = written(&mut waiting, Duration::ZERO, true);
     let asked: u64 = log.iter().map(|entry| entry.count).sum();
@@ -92,7 +92,7 @@ fn while_nothing_is_written_different_changes_are_kept_apart() {
 
 #[test]
 fn what_is_not_asked_again_is_forgotten() {
-    let mut waiting = Waiting::default();
+    let mut waiting = AuditQueue::default();
     for _ in 0..100 {
         waiting.add(entry(None, "GET", "/v1/sites", 401), Duration::ZERO);
     }

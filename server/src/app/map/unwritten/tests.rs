@@ -317,7 +317,7 @@ fn a_portion_has_whole_generations_and_none_that_began_later() {
     let until = unwritten.additions();
     let later: Table = [(key(7, 0, 0), one(1.0))].into();
     add(&mut unwritten, &later, added);
-    let robots = |portion: &Portion| -> Vec<i64> {
+    let robots = |portion: &StoreBatch| -> Vec<i64> {
         portion.steps.iter().map(|step| step.robot_pk).collect()
     };
     let first = unwritten.portion(until, 1);

@@ -140,7 +140,7 @@ fn an_offer_whose_answer_was_lost_is_repeated_until_the_robot_shows_it() {
     };
     let settled = need(MissionState::Offered, None, &driving);
     assert!(
-        matches!(settled, Need::Settle(Change::Accept)),
+        matches!(settled, Need::Apply(Change::Accept)),
         "{settled:?}"
     );
 }
@@ -167,14 +167,14 @@ fn a_restart_loses_a_mission_only_after_the_old_records_had_their_say() {
             pending: 0,
             ..restarted
         }),
-        Need::Settle(Change::LoseRun)
+        Need::Apply(Change::LoseRun)
     ));
     let patient = Said {
         since: LONG_AGO,
         pending: 9,
         ..restarted
     };
-    assert!(matches!(active(&patient), Need::Settle(Change::LoseRun)));
+    assert!(matches!(active(&patient), Need::Apply(Change::LoseRun)));
     let resumed = Said {
         drives: true,
         pending: 0,
@@ -190,7 +190,7 @@ fn a_cancellation_is_sent_until_answered_and_ends_with_a_restart() {
     let restarted = Said { boot: 2, ..IDLE };
     let settled = need(MissionState::Cancelling, Some(1), &restarted);
     assert!(
-        matches!(settled, Need::Settle(Change::LoseRun)),
+        matches!(settled, Need::Apply(Change::LoseRun)),
         "{settled:?}"
     );
 }
@@ -206,7 +206,7 @@ fn a_mission_that_ended_on_the_robot_without_a_record_does_not_stay_open() {
     assert_eq!(decide(&offered, &robot, since(JUST), now()), Need::Offer);
     let settled = decide(&offered, &robot, since(LONG_AGO), now());
     assert!(
-        matches!(settled, Need::Settle(Change::Forget)),
+        matches!(settled, Need::Apply(Change::Forget)),
         "{settled:?}"
     );
 }
@@ -222,7 +222,7 @@ fn a_robot_is_not_blamed_for_reports_that_wait_for_the_database() {
     let robot = presence(&IDLE);
     let settled = decide(&active, &robot, ended, now());
     assert!(
-        matches!(settled, Need::Settle(Change::Forget)),
+        matches!(settled, Need::Apply(Change::Forget)),
         "{settled:?}"
     );
     let delayed = Now {
@@ -271,10 +271,10 @@ fn what_is_wanted_of_a_mission_in_progress_is_sent_until_the_robot_has_done_it()
     assert_eq!(needs(paused, false, &holding, LONG_AGO), Need::Resume);
     // The record of it is on its way, or was lost.
     assert_eq!(needs(active, true, &holding, JUST), Need::Pause);
-    let pause = Need::Settle(Change::Pause);
+    let pause = Need::Apply(Change::Pause);
     assert_eq!(needs(active, true, &holding, LONG_AGO), pause);
     assert_eq!(needs(paused, false, &driving, JUST), Need::Resume);
-    let resume = Need::Settle(Change::Resume);
+    let resume = Need::Apply(Change::Resume);
     assert_eq!(needs(paused, false, &driving, LONG_AGO), resume);
     // A command that came twice or late had its way.
     assert_eq!(needs(active, false, &holding, JUST), Need::Wait);
@@ -333,7 +333,7 @@ fn a_robot_that_stays_away_past_its_bound_loses_its_mission_in_progress() {
     ] {
         // The plan takes 100 s, and a margin of a minute.
         assert_eq!(away_s(state, 150), Need::Wait, "{state:?}");
-        let lost = Need::Settle(Change::LoseRobot);
+        let lost = Need::Apply(Change::LoseRobot);
         assert_eq!(away_s(state, 170), lost, "{state:?}");
     }
     assert_eq!(away_s(MissionState::Queued, 1_000_000), Need::Wait);
@@ -361,7 +361,7 @@ fn a_step_of_the_wall_clock_loses_no_robot_and_keeps_none() {
             wall: now().wall + jiff::SignedDuration::from_hours(hours),
         };
         assert_eq!(decided(now(), after(150)), Need::Wait, "{hours} h");
-        let lost = Need::Settle(Change::LoseRobot);
+        let lost = Need::Apply(Change::LoseRobot);
         assert_eq!(decided(now(), after(170)), lost, "{hours} h");
     }
 }
@@ -408,5 +408,5 @@ fn a_robot_that_is_there_without_its_mission_has_forgotten_it_after_a_while() {
     };
     assert_eq!(decide(&active, &idle, since(JUST), now()), Need::Wait);
     let forgotten = decide(&active, &idle, since(LONG_AGO), now());
-    assert_eq!(forgotten, Need::Settle(Change::Forget));
+    assert_eq!(forgotten, Need::Apply(Change::Forget));
 }

@@ -7,7 +7,9 @@ use tread_api::terrain::TerrainRef;
 use tread_store::withdrawals::Hours;
 use uuid::Uuid;
 
-use super::super::{At, CELLS_PER_BLOCK, CellSummary, Horizons, Labelled, Room};
+use super::super::{
+    CELLS_PER_BLOCK, CellSummary, FusionBuffers, FusionContext, Horizons, LabelledSum,
+};
 use super::*;
 use crate::friction::epoch_h;
 use crate::friction::epochs::{DAY_H, HOUR_S};
@@ -84,8 +86,8 @@ impl Named {
         Self(robot(key.0), terrain(key.4))
     }
 
-    fn labelled(&self, key: Key) -> Labelled<'_> {
-        Labelled {
+    fn labelled(&self, key: Key) -> LabelledSum<'_> {
+        LabelledSum {
             cell: Cell {
                 ix: key.2,
                 iy: key.3,
@@ -119,7 +121,7 @@ fn load(map: &mut SiteMap, stored: &BTreeMap<Key, Sums>, block: Block) {
 /// Looks until all blocks are there.
 fn look<T>(map: &mut SiteMap, stored: &BTreeMap<Key, Sums>, look: impl Fn(Cells<'_>) -> T) -> T {
     loop {
-        let absent = Absent::default();
+        let absent = MissingBlocks::default();
         let found = look(map.cells(&absent, 1));
         let absent = absent.into_blocks();
         if absent.is_empty() {
@@ -188,7 +190,7 @@ proptest! {
         for step in &steps {
             take(step, &mut kept, &mut evicting, &mut stored);
         }
-        let never = Absent::default();
+        let never = MissingBlocks::default();
         let all = kept.cells(&never, 1);
         let area = CellBox { min: Cell { ix: -70, iy: -70 }, max: Cell { ix: 70, iy: 70 } };
         let cells: Vec<Cell> = all.cells_in(area, None).collect();
@@ -201,7 +203,7 @@ proptest! {
             prop_assert_eq!(of_cell, format!("{:?}", all.cell(cell, choice)));
         }
         let config = FrictionConfig::default();
-        let at = At { config: &config, now_us: at_us(0) };
+        let at = FusionContext { config: &config, now_us: at_us(0) };
         let of_one = Choice { configuration: Some(configuration(0)), ..choice };
         let squares = |map: Cells<'_>| {
             let filter = map.map().filter(of_one, |ground| Some(u16::from(ground.is_some())));
@@ -211,7 +213,7 @@ proptest! {
                 map.fuse_block((block, None), &[0; CELLS_PER_BLOCK], &filter, at, &mut of_block);
                 made.extend(of_block);
             }
-            made.push(map.fuse_square(area, (1, &filter), at, &mut Room::default()));
+            made.push(map.fuse_square(area, (1, &filter), at, &mut FusionBuffers::default()));
             made
         };
         prop_assert_eq!(look(&mut evicting, &stored, squares), squares(all));
@@ -242,7 +244,7 @@ proptest! {
         let area = CellBox { min: Cell { ix: x.0, iy: y.0 }, max: Cell { ix: x.1, iy: y.1 } };
         let CellBox { min, max } = area;
         let after = after.map(|(ix, iy)| Cell { ix, iy });
-        let absent = Absent::default();
+        let absent = MissingBlocks::default();
         let found: Vec<(i32, i32)> = map
             .cells(&absent, 1)
             .cells_in(area, after)
@@ -295,7 +297,7 @@ fn a_pinned_block_stays_and_one_that_was_never_driven_on_is_not_absent() {
     assert_eq!(map.idle_blocks().count(), 1);
     map.evict(block);
     assert_eq!(map.size(), (0, 0));
-    let absent = Absent::default();
+    let absent = MissingBlocks::default();
     let elsewhere = Cell { ix: 900, iy: 5 };
     assert!(
         map.cells(&absent, 1)
@@ -303,7 +305,7 @@ fn a_pinned_block_stays_and_one_that_was_never_driven_on_is_not_absent() {
             .is_empty()
     );
     assert!(absent.into_blocks().is_empty());
-    let absent = Absent::default();
+    let absent = MissingBlocks::default();
     let here = Cell { ix: 7, iy: 7 };
     assert!(
         map.cells(&absent, 1)

@@ -16,7 +16,7 @@ pub const COMMAND_SILENCE_MAX: Duration = Duration::from_millis(100);
 
 /// Cell of the newest command.
 #[derive(Debug, Default)]
-pub struct Outlet {
+pub struct CommandCell {
     /// Left and right speed as single-precision numbers in one word, so that both are read
     /// consistently.
     speeds: AtomicU64,
@@ -25,9 +25,9 @@ pub struct Outlet {
     thread: OnceLock<Thread>,
 }
 
-impl Outlet {
+impl CommandCell {
     /// Makes each command wake the calling thread.
-    pub fn attend(&self) {
+    pub fn register_thread(&self) {
         // A second thread would be a programming error; the first one stays registered.
         let _ = self.thread.set(std::thread::current());
     }
@@ -37,7 +37,7 @@ impl Outlet {
         clippy::cast_possible_truncation,
         reason = "a wheel's speed needs no more than seven digits"
     )]
-    pub fn leave(&self, command: WheelSpeeds) {
+    pub fn store(&self, command: WheelSpeeds) {
         let left = u64::from((command.left_rad_s as f32).to_bits());
         let right = u64::from((command.right_rad_s as f32).to_bits());
         self.speeds.store(left << 32 | right, Ordering::Relaxed);
@@ -45,7 +45,7 @@ impl Outlet {
         self.wake();
     }
 
-    /// Closes the outlet: no more commands follow.
+    /// Closes the cell: no more commands follow.
     pub fn close(&self) {
         self.is_closed.store(true, Ordering::Release);
         self.wake();
@@ -57,7 +57,7 @@ impl Outlet {
         }
     }
 
-    /// Whether the outlet is closed.
+    /// Whether the cell is closed.
     pub fn is_closed(&self) -> bool {
         self.is_closed.load(Ordering::Acquire)
     }
@@ -84,22 +84,22 @@ mod tests {
 
     #[test]
     fn the_newest_command_is_found_once() {
-        let outlet = Outlet::default();
-        assert!(outlet.newer_than(0).is_none());
+        let command_cell = CommandCell::default();
+        assert!(command_cell.newer_than(0).is_none());
         for speed in [1.0, -2.5] {
-            outlet.leave(WheelSpeeds {
+            command_cell.store(WheelSpeeds {
                 left_rad_s: speed,
                 right_rad_s: 0.5,
             });
         }
-        let (number, command) = outlet.newer_than(0).unwrap();
+        let (number, command) = command_cell.newer_than(0).unwrap();
         assert_eq!(
             (number, command.left_rad_s, command.right_rad_s),
             (2, -2.5, 0.5)
         );
-        assert!(outlet.newer_than(number).is_none());
-        assert!(!outlet.is_closed());
-        outlet.close();
-        assert!(outlet.is_closed());
+        assert!(command_cell.newer_than(number).is_none());
+        assert!(!command_cell.is_closed());
+        command_cell.close();
+        assert!(command_cell.is_closed());
     }
 }

@@ -12,7 +12,7 @@ use super::{Presence, Presences, RobotKey, stop_of};
 
 /// Revisions of a site's data that a robot reports.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Held {
+pub struct ReportedRevisions {
     /// Revision of the terrains.
     pub terrains: Option<u64>,
     /// Revision of the geofence; `None` also for a robot without support for geofences.
@@ -21,7 +21,7 @@ pub struct Held {
 
 /// Link of one robot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Attending {
+pub struct LinkStatus {
     /// Whether its link is online or stale.
     pub is_heard: bool,
     /// Whether its agent reported that it leaves.
@@ -32,9 +32,9 @@ pub struct Attending {
     pub cause: Option<LinkCause>,
 }
 
-/// What a robot shows of itself while it is heard.
+/// Mission and clock of a robot that is heard.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Showing {
+pub struct ReportedCondition {
     /// Progress of its mission.
     pub mission: Option<MissionProgress>,
     /// Offset of its clock, milliseconds, positive if it is ahead of the server's.
@@ -50,10 +50,10 @@ impl Presences {
     }
 
     /// Returns the link of every robot that has ever sent a hello.
-    pub fn attending(&self, now: Duration) -> Vec<(RobotKey, Attending)> {
+    pub fn attending(&self, now: Duration) -> Vec<(RobotKey, LinkStatus)> {
         let robots = self.lock();
         let known = robots.iter().filter(|(_, presence)| presence.welcomed);
-        let attending = |presence: &Presence| Attending {
+        let attending = |presence: &Presence| LinkStatus {
             is_heard: presence.link(now) != LinkState::Offline,
             has_left: presence.has_left(),
             silent_for: presence.silent_for(now),
@@ -66,7 +66,7 @@ impl Presences {
 
     /// Returns mission and clock of every robot that is heard at `now`. The clock of a robot without
     /// enough states counts as right.
-    pub fn conditions(&self, now: Duration) -> Vec<(RobotKey, Showing)> {
+    pub fn conditions(&self, now: Duration) -> Vec<(RobotKey, ReportedCondition)> {
         let robots = self.lock();
         let heard = robots
             .iter()
@@ -74,7 +74,7 @@ impl Presences {
         let shown = |presence: &Presence| {
             let offset_ms = presence.clock_offsets_ms.has_enough();
             let offset_ms = offset_ms.then(|| presence.clock_offset_ms());
-            Some(Showing {
+            Some(ReportedCondition {
                 mission: presence.state()?.mission,
                 clock_offset_ms: offset_ms.unwrap_or(0),
             })
@@ -95,14 +95,14 @@ impl Presences {
 
     /// Returns the robots online at `now`, with the revisions of terrains and geofence that each
     /// reports.
-    pub fn online(&self, now: Duration) -> Vec<(RobotKey, Held)> {
+    pub fn online(&self, now: Duration) -> Vec<(RobotKey, ReportedRevisions)> {
         let robots = self.lock();
         let online = robots
             .iter()
             .filter(|(_, presence)| presence.link(now) == LinkState::Online);
         let held = |presence: &Presence| {
             let state = presence.state();
-            Held {
+            ReportedRevisions {
                 terrains: state.and_then(|state| state.terrain_revision),
                 fence: state.and_then(|state| state.safety.fence_revision),
             }

@@ -23,12 +23,12 @@ pub(super) fn is_here(
 }
 
 /// The terrains in their present shape, for finding the one at a point.
-pub(super) struct Drawn<'view> {
+pub(super) struct PresentTerrains<'view> {
     pub(super) terrains: &'view [Terrain],
     shapes: Vec<TerrainShape>,
 }
 
-impl<'view> Drawn<'view> {
+impl<'view> PresentTerrains<'view> {
     pub(super) fn new(terrains: &'view [Terrain]) -> Self {
         let shape = |terrain: &Terrain| TerrainShape {
             terrain: terrain_ref(terrain),
@@ -65,7 +65,7 @@ impl<'view> Drawn<'view> {
     }
 
     /// Returns the terrains whose bounding boxes touch an area.
-    pub(super) fn near(&self, area: Area) -> Near<'view> {
+    pub(super) fn near(&self, area: Area) -> NearbyTerrains<'view> {
         let Area { min, max } = area;
         let touches = |terrain: &Terrain| {
             let corners = terrain.polygon.corners();
@@ -86,16 +86,16 @@ impl<'view> Drawn<'view> {
             let by_layer = right.layer.cmp(&left.layer);
             by_layer.then_with(|| left.id.cmp(&right.id))
         });
-        Near { found }
+        NearbyTerrains { found }
     }
 }
 
 /// Terrains whose bounding boxes touch an area, in order of precedence.
-pub(super) struct Near<'view> {
+pub(super) struct NearbyTerrains<'view> {
     found: Vec<(u16, &'view Terrain)>,
 }
 
-impl Near<'_> {
+impl NearbyTerrains<'_> {
     /// Returns the number of the ground at a point.
     pub(super) fn ground_at(&self, point: Point) -> u16 {
         let mut here = self.found.iter();

@@ -265,7 +265,7 @@ impl Credential {
 
     /// Returns the author of a request, for display: this credential's name, followed by the name
     /// claimed in the request if that differs. A claimed name never stands alone.
-    pub fn said_by(&self, claimed: Option<&str>) -> String {
+    pub fn author(&self, claimed: Option<&str>) -> String {
         match claimed.map(str::trim) {
             None | Some("") => self.name.clone(),
             Some(claimed) if claimed == self.name => self.name.clone(),
@@ -320,7 +320,7 @@ impl Valid {
 
 /// Cache of credentials.
 #[derive(Debug, Default)]
-pub(super) struct Known {
+pub(super) struct CredentialCache {
     inner: Mutex<Inner>,
     rechecks: Mutex<Rechecks>,
 }
@@ -337,7 +337,7 @@ struct Rechecks {
 /// [`Recheck::succeeded`] was called.
 #[derive(Debug)]
 pub(super) struct Recheck<'known> {
-    known: &'known Known,
+    known: &'known CredentialCache,
     began_at: Duration,
     has_succeeded: bool,
 }
@@ -371,7 +371,7 @@ struct Inner {
     generation: u64,
 }
 
-impl Known {
+impl CredentialCache {
     fn lock(&self) -> MutexGuard<'_, Inner> {
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -413,7 +413,7 @@ impl Known {
 
     /// Caches a credential looked up at `generation`. Returns `None` if the generation has changed
     /// since; the look-up must be repeated.
-    pub(super) fn keep(
+    pub(super) fn insert(
         &self,
         secret: Fingerprint,
         credential: Credential,

@@ -27,15 +27,19 @@ fn coverage(honest: u8, wrong: Option<Sums>, ground: Ground) -> (f64, f64) {
         ..FrictionConfig::default()
     };
     for _ in 0..FLEETS {
-        let mut seen: Vec<Seen<u8>> = (1..=honest)
+        let mut seen: Vec<EpochMeasurement<u8>> = (1..=honest)
             .filter_map(|robot| {
                 let own = THETA * (1.0 + ROBOT_BIAS_RATIO * normal.next());
                 let theta = own + OWN_STD_DEV * normal.next();
-                Seen::of(robot, 0, &measured(theta, OWN_STD_DEV, i64::from(robot)))
+                EpochMeasurement::of(robot, 0, &measured(theta, OWN_STD_DEV, i64::from(robot)))
             })
             .collect();
         // Older than the others, because newer measurements of more slip count until contradicted.
-        seen.extend(wrong.as_ref().and_then(|sums| Seen::of(0, 0, sums)));
+        seen.extend(
+            wrong
+                .as_ref()
+                .and_then(|sums| EpochMeasurement::of(0, 0, sums)),
+        );
         let fused = fuse(&mut seen, ground, &config, at_us(0)).unwrap();
         let (low, high) = fused.theta.interval_95();
         held += u32::from((low..=high).contains(&THETA));

@@ -12,7 +12,7 @@ const MISSIONS_KEPT: usize = 1_000;
 
 /// State of a site, accumulated from its events.
 #[derive(Debug, Default)]
-pub(super) struct Known {
+pub(super) struct SiteState {
     robots: BTreeMap<RobotId, Robot>,
     missions: BTreeMap<MissionId, Mission>,
     /// Alerts about the server itself that have not cleared.
@@ -32,7 +32,7 @@ pub(super) struct Counts {
     pub(super) alerts: usize,
 }
 
-impl Known {
+impl SiteState {
     pub(super) fn take(&mut self, event: Event) {
         match event {
             Event::SnapshotBegin => *self = Self::default(),

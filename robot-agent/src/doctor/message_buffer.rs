@@ -4,9 +4,9 @@ use std::sync::{Mutex, PoisonError};
 
 use tread_ros2::rmw::Attachment;
 
-use crate::drive::ros2::inlet::Tap;
 use crate::drive::ros2::refusal::Source;
 use crate::drive::ros2::stamps::Arrival;
+use crate::drive::ros2::topic_receiver::MessageObserver;
 
 /// Largest number of stored messages: five topics of 200 Hz for ten seconds.
 const MESSAGES_MAX: usize = 10_000;
@@ -23,9 +23,9 @@ pub(super) struct Message {
 
 /// The stored messages.
 #[derive(Debug, Default)]
-pub(super) struct Heard(Mutex<Vec<Message>>);
+pub(super) struct MessageBuffer(Mutex<Vec<Message>>);
 
-impl Heard {
+impl MessageBuffer {
     fn messages(&self) -> std::sync::MutexGuard<'_, Vec<Message>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -41,12 +41,12 @@ impl Heard {
     }
 
     /// Returns all messages and removes them.
-    pub(super) fn taken(&self) -> Vec<Message> {
+    pub(super) fn drain(&self) -> Vec<Message> {
         std::mem::take(&mut self.messages())
     }
 }
 
-impl Tap for Heard {
+impl MessageObserver for MessageBuffer {
     fn receive(
         &self,
         source: Source,

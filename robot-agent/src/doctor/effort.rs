@@ -11,7 +11,7 @@
 
 use tread_control::robot::RobotModel;
 
-use super::drove::{AccelerationPhase, DriveSummary, Drives};
+use super::drive_summary::{AccelerationPhase, DriveSummary, Drives};
 use super::finding::{Finding, Key};
 use crate::drive::ros2::settings::{Effort, JointSettings, Ros2Settings};
 
@@ -29,7 +29,7 @@ const GAINED_MIN: f64 = 0.5;
 
 /// Measured effort, expressed in the quantities that are bounded.
 #[derive(Debug, Clone, Copy)]
-struct Pull {
+struct MeasuredEffort {
     /// Friction coefficients that correspond to each side's force in the turn, `[left, right]`;
     /// negative against the motion.
     friction: [f64; 2],
@@ -46,7 +46,7 @@ pub(super) fn findings(
     let joints = settings.joints.as_ref()?;
     let effort = joints.effort;
     (effort != Effort::None).then_some(())?;
-    let pull = Pull {
+    let measured = MeasuredEffort {
         friction: friction(model, turned)?,
         momentum_ratio: forward.acceleration.and_then(|acceleration| {
             let steady = forward.torques?;
@@ -58,13 +58,13 @@ pub(super) fn findings(
             )
         }),
     };
-    let found = of_zero(&pull).or_else(|| of_signs(&pull, joints));
-    Some(found.unwrap_or_else(|| of_size(&pull, effort, model)))
+    let found = of_zero(&measured).or_else(|| of_signs(&measured, joints));
+    Some(found.unwrap_or_else(|| of_size(&measured, effort, model)))
 }
 
 /// Returns the finding on joints whose effort is zero while their wheels scrub.
-fn of_zero(pull: &Pull) -> Option<Finding> {
-    let is_zero = pull
+fn of_zero(measured: &MeasuredEffort) -> Option<Finding> {
+    let is_zero = measured
         .friction
         .iter()
         .all(|friction| friction.abs() <= ZERO_MAX);
@@ -103,8 +103,8 @@ fn momentum_ratio(
 }
 
 /// Returns the finding on an effort with the wrong sign.
-fn of_signs(pull: &Pull, joints: &JointSettings) -> Option<Finding> {
-    let [is_left, is_right] = pull.friction.map(|friction| friction < -AGAINST_MIN);
+fn of_signs(measured: &MeasuredEffort, joints: &JointSettings) -> Option<Finding> {
+    let [is_left, is_right] = measured.friction.map(|friction| friction < -AGAINST_MIN);
     let (key, text) = match (is_left, is_right) {
         (true, true) => (
             "drive.ros2.joints.left_effort_sign",
@@ -146,22 +146,22 @@ fn of_signs(pull: &Pull, joints: &JointSettings) -> Option<Finding> {
 }
 
 /// Returns the finding on the size of the effort.
-fn of_size(pull: &Pull, effort: Effort, model: &RobotModel) -> Finding {
+fn of_size(measured: &MeasuredEffort, effort: Effort, model: &RobotModel) -> Finding {
     let [least, most] = [
-        pull.friction.into_iter().fold(f64::INFINITY, f64::min),
-        pull.friction.into_iter().fold(0.0, f64::max),
+        measured.friction.into_iter().fold(f64::INFINITY, f64::min),
+        measured.friction.into_iter().fold(0.0, f64::max),
     ];
     let turn = format!(
         "a turn on the spot pulls as on ground with a friction coefficient of {least:.2} to {most:.2}"
     );
-    let setting_off = pull.momentum_ratio.map_or_else(String::new, |ratio| {
+    let setting_off = measured.momentum_ratio.map_or_else(String::new, |ratio| {
         let mass_kg = model.mass_kg();
         format!(
             ", setting off as with {:.1} kg where the model says {mass_kg:.1} kg",
             ratio * mass_kg
         )
     });
-    let ratio = pull.momentum_ratio;
+    let ratio = measured.momentum_ratio;
     let verdict = if most > *FRICTION.end() || ratio.is_some_and(|it| it > *MOMENTUM_RATIO.end()) {
         "too much"
     } else if least < *FRICTION.start() || ratio.is_some_and(|it| it < *MOMENTUM_RATIO.start()) {

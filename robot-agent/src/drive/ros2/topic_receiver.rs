@@ -11,13 +11,13 @@ use tread_ros2::messages::{
 use tread_ros2::names::Name;
 use tread_ros2::rmw::{Attachment, check_key};
 
-use super::assemble::Arrived;
+use super::assemble::QueuedMessage;
 use super::frames;
 use super::reading::{self, Content, Reading};
 use super::refusal::{Counts, Notice, Refusal, Source};
 use super::settings::{Ros2Settings, Scheme};
 use super::stamps::{Arrival, Stamps};
-use super::writer_watch::{Order, WriterWatch};
+use super::writer_watch::{MessageOrder, WriterWatch};
 use crate::clock::SharedClock;
 use crate::drive::Arrivals;
 
@@ -25,8 +25,8 @@ use crate::drive::Arrivals;
 /// topic.
 pub const WAITING_MAX: usize = 128;
 
-/// Receiver of every message as it arrived, besides the loop; must not block.
-pub trait Tap: std::fmt::Debug + Send + Sync {
+/// Observes every message as it arrived, in addition to the loop. Must not block.
+pub trait MessageObserver: std::fmt::Debug + Send + Sync {
     /// Called for each message, before any check.
     fn receive(
         &self,
@@ -40,32 +40,32 @@ pub trait Tap: std::fmt::Debug + Send + Sync {
 
 /// State of a topic between two messages.
 #[derive(Debug, Clone, Copy)]
-struct Watched {
+struct TopicState {
     writer: WriterWatch,
     stamps: Stamps,
 }
 
-/// The receiving end of one topic.
+/// Receiver of the messages of one topic.
 #[derive(Debug)]
-pub struct Inlet {
+pub struct TopicReceiver {
     source: Source,
     settings: Arc<Ros2Settings>,
-    watched: Mutex<Watched>,
+    topic_state: Mutex<TopicState>,
     counts: Arc<Counts>,
-    to_loop: SyncSender<Arrived>,
+    to_loop: SyncSender<QueuedMessage>,
     arrivals: Arc<Arrivals>,
     /// Whether the topic's messages trigger the loop's ticks.
     is_pace: bool,
     clock: SharedClock,
-    tap: Option<Arc<dyn Tap>>,
+    observer: Option<Arc<dyn MessageObserver>>,
 }
 
-impl Inlet {
-    /// Creates the inlets of all topics that the settings name.
+impl TopicReceiver {
+    /// Creates the receivers of all topics that the settings name.
     pub fn all(
         settings: &Arc<Ros2Settings>,
         counts: &Arc<Counts>,
-        to_loop: &SyncSender<Arrived>,
+        to_loop: &SyncSender<QueuedMessage>,
         arrivals: &Arc<Arrivals>,
         clock: &SharedClock,
     ) -> Vec<Self> {
@@ -74,10 +74,10 @@ impl Inlet {
             .joints
             .as_ref()
             .map_or(Source::Odometry, |_| Source::Joints);
-        let inlet = |source| Self {
+        let receiver = |source| Self {
             source,
             settings: Arc::clone(settings),
-            watched: Mutex::new(Watched {
+            topic_state: Mutex::new(TopicState {
                 writer: WriterWatch::default(),
                 stamps: Stamps::new(
                     timing.stamps,
@@ -94,19 +94,19 @@ impl Inlet {
             arrivals: Arc::clone(arrivals),
             is_pace: source == pace,
             clock: Arc::clone(clock),
-            tap: None,
+            observer: None,
         };
         Source::ALL
             .into_iter()
             .filter(|source| topic_of(settings, *source).is_some())
-            .map(inlet)
+            .map(receiver)
             .collect()
     }
 
-    /// Sets a receiver of every message.
+    /// Sets an observer of every message.
     #[must_use]
-    pub fn with_tap(mut self, tap: Option<Arc<dyn Tap>>) -> Self {
-        self.tap = tap;
+    pub fn with_observer(mut self, observer: Option<Arc<dyn MessageObserver>>) -> Self {
+        self.observer = observer;
         self
     }
 
@@ -137,7 +137,7 @@ impl Inlet {
                 if self.to_loop.try_send(arrived).is_err() {
                     self.counts.refuse(self.source, Refusal::Overflow);
                 } else if self.is_pace {
-                    self.arrivals.ring();
+                    self.arrivals.notify();
                 }
             }
             Err(refusal) => {
@@ -156,13 +156,13 @@ impl Inlet {
         key: &str,
         attachment: Option<&[u8]>,
         payload: &[u8],
-    ) -> Result<Option<Arrived>, Refusal> {
+    ) -> Result<Option<QueuedMessage>, Refusal> {
         let arrival = Arrival {
             monotonic: self.clock.monotonic(),
             wall_ns: self.clock.host_wall_ns(),
         };
-        if let Some(tap) = &self.tap {
-            tap.receive(self.source, arrival, key, attachment, payload);
+        if let Some(observer) = &self.observer {
+            observer.receive(self.source, arrival, key, attachment, payload);
         }
         let writer = match self.settings.bus.scheme {
             Scheme::Ros2Dds => None,
@@ -175,17 +175,20 @@ impl Inlet {
         let Some((stamp, content)) = decoded(&self.settings, self.source, payload)? else {
             return Ok(None);
         };
-        let mut watched = self.watched.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut topic_state = self
+            .topic_state
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
         let order = writer
-            .map(|message| watched.writer.check(&message, arrival.monotonic))
+            .map(|message| topic_state.writer.check(&message, arrival.monotonic))
             .transpose()?;
         let at = if matches!(content, Content::Battery(_)) {
             arrival.monotonic
         } else {
             let stamp_ns = stamp.nanoseconds().ok_or(Refusal::Stamp)?;
-            let leaps = watched.stamps.leaps();
-            let placed = watched.stamps.place(stamp_ns, arrival)?;
-            if watched.stamps.leaps() > leaps {
+            let leaps = topic_state.stamps.leaps();
+            let placed = topic_state.stamps.place(stamp_ns, arrival)?;
+            if topic_state.stamps.leaps() > leaps {
                 self.counts.record(self.source, Notice::ClockLeapt);
             }
             placed
@@ -193,14 +196,16 @@ impl Inlet {
         // The watch follows only valid messages, so that repeated data never count as a restarted
         // writer.
         if let Some((message, order)) = writer.zip(order) {
-            watched.writer.follow(&message, order, arrival.monotonic);
+            topic_state
+                .writer
+                .follow(&message, order, arrival.monotonic);
             match order {
-                Order::Continues => {}
-                Order::Restarted => self.counts.record(self.source, Notice::Restarted),
-                Order::MayHaveRestarted => return Err(Refusal::OutOfOrder),
+                MessageOrder::Continues => {}
+                MessageOrder::Restarted => self.counts.record(self.source, Notice::Restarted),
+                MessageOrder::MayHaveRestarted => return Err(Refusal::OutOfOrder),
             }
         }
-        Ok(Some(Arrived { at, content }))
+        Ok(Some(QueuedMessage { at, content }))
     }
 }
 

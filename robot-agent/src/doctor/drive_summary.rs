@@ -5,11 +5,11 @@ use tread_control::measured::{WheelSpeeds, WheelTorques};
 use tread_ros2::cdr::decode;
 use tread_ros2::messages::{Odometry, Time};
 
-use super::heard::Message;
-use crate::drive::ros2::inlet::decoded;
+use super::message_buffer::Message;
 use crate::drive::ros2::reading::{Content, Position, Wheels, wheels_of};
 use crate::drive::ros2::refusal::Source;
 use crate::drive::ros2::settings::{MotionOf, Ros2Settings};
+use crate::drive::ros2::topic_receiver::decoded;
 
 /// Smallest sum of squared deviations of the positions' times for a speed, s²: ten fixes in a
 /// second.
@@ -227,7 +227,7 @@ impl Mean {
 }
 
 /// Summarises a motion.
-pub(super) fn drove(
+pub(super) fn summarise(
     commanded: WheelSpeeds,
     settings: &Ros2Settings,
     messages: &MotionMessages,

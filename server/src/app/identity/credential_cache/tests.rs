@@ -29,21 +29,21 @@ fn secret(byte: u8) -> Fingerprint {
 
 #[test]
 fn a_look_up_that_began_before_an_end_is_not_kept_after_it() {
-    let known = Known::default();
+    let known = CredentialCache::default();
     let generation = known.generation();
     known.end(|_| false);
-    let late = known.keep(secret(1), credential(time(9)), generation, time(1));
+    let late = known.insert(secret(1), credential(time(9)), generation, time(1));
     assert!(late.is_none());
     assert!(known.find(&secret(1), time(1)).is_none());
 }
 
 #[test]
 fn a_credential_that_expires_or_is_ended_is_gone_and_its_requests_are_cancelled() {
-    let known = Known::default();
+    let known = CredentialCache::default();
     let keep = |byte| {
         let generation = known.generation();
         known
-            .keep(secret(byte), credential(time(9)), generation, time(1))
+            .insert(secret(byte), credential(time(9)), generation, time(1))
             .unwrap()
     };
     let (first, second) = (keep(1), keep(2));
@@ -57,9 +57,9 @@ fn a_credential_that_expires_or_is_ended_is_gone_and_its_requests_are_cancelled(
 
 #[test]
 fn what_is_no_longer_valid_ends_and_what_is_valid_is_known_without_being_shown() {
-    let known = Known::default();
+    let known = CredentialCache::default();
     let generation = known.generation();
-    let gone = known.keep(secret(1), credential(time(9)), generation, time(1));
+    let gone = known.insert(secret(1), credential(time(9)), generation, time(1));
     let later = Duration::from_secs(1);
     let valid = || {
         let credential = credential(time(9));
@@ -104,7 +104,7 @@ fn who_is_known_is_looked_up_again_after_a_while() {
 
 #[test]
 fn one_is_looked_up_again_at_a_time_and_less_often_while_that_fails() {
-    let known = Known::default();
+    let known = CredentialCache::default();
     let first = known.recheck(Duration::ZERO).unwrap();
     assert!(known.recheck(Duration::ZERO).is_none());
     first.succeeded();
@@ -120,10 +120,10 @@ fn one_is_looked_up_again_at_a_time_and_less_often_while_that_fails() {
 #[test]
 fn whatever_name_is_given_the_tokens_stands_before_it() {
     let desk = credential(time(9));
-    assert_eq!(desk.said_by(None), "desk");
-    assert_eq!(desk.said_by(Some(" ")), "desk");
-    assert_eq!(desk.said_by(Some("desk")), "desk");
-    assert_eq!(desk.said_by(Some("admin")), "desk: admin");
+    assert_eq!(desk.author(None), "desk");
+    assert_eq!(desk.author(Some(" ")), "desk");
+    assert_eq!(desk.author(Some("desk")), "desk");
+    assert_eq!(desk.author(Some("admin")), "desk: admin");
 }
 
 #[test]

@@ -1,5 +1,5 @@
-//! Topics on which the agent publishes its state to the rest of the robot, and the source of their
-//! messages.
+//! Topics on which the agent publishes its state to the rest of the robot, and the trait of their
+//! publisher.
 
 use std::time::Duration;
 
@@ -9,11 +9,11 @@ use tread_ros2::names::Name;
 use super::settings::OutwardSettings;
 
 /// Interval of the checks.
-pub(crate) const LOOK_EVERY: Duration = Duration::from_millis(100);
+pub(crate) const CHECK_EVERY: Duration = Duration::from_millis(100);
 
 /// A published topic.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) enum OutwardTopic {
+pub(crate) enum PublishedTopic {
     /// Plan of the active mission; empty without one.
     Plan,
     /// Driven path since the last mission began, the newest some hundred points.
@@ -24,7 +24,7 @@ pub(crate) enum OutwardTopic {
     Diagnostics,
 }
 
-impl OutwardTopic {
+impl PublishedTopic {
     /// All topics.
     pub(crate) const ALL: [Self; 4] = [Self::Plan, Self::Driven, Self::Theta, Self::Diagnostics];
 
@@ -48,8 +48,8 @@ impl OutwardTopic {
     }
 }
 
-/// Source of the messages. Runs on a thread of its own.
-pub(crate) trait OutwardSource: std::fmt::Debug + Send + Sync {
+/// Publishes the agent's state. Runs on a thread of its own.
+pub(crate) trait StatePublisher: std::fmt::Debug + Send + Sync {
     /// Calls `say` with each message that is due, encoded.
-    fn step(&mut self, now: Duration, wall_ns: i64, say: &mut dyn FnMut(OutwardTopic, &[u8]));
+    fn step(&mut self, now: Duration, wall_ns: i64, say: &mut dyn FnMut(PublishedTopic, &[u8]));
 }

@@ -7,9 +7,9 @@ use tread_api::robot::{AlertReport, LinkCause, LinkState, RobotMode};
 
 use super::{Presences, RobotKey, content, lease_of, stop_of};
 
-/// What event clients were shown last of a robot.
+/// State of a robot that was published last to event clients.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Shown {
+pub(super) struct PublishedState {
     at: Duration,
     link: LinkState,
     cause: Option<LinkCause>,
@@ -24,7 +24,7 @@ pub(super) struct Shown {
 const SHOW_PERIOD: Duration = Duration::from_secs(1);
 
 /// Maximum number of robots per call.
-const NEWS_MAX: usize = 500;
+const CHANGES_MAX: usize = 500;
 
 impl Presences {
     /// Returns the alerts of each robot whose alerts changed since the last call.
@@ -57,17 +57,17 @@ impl Presences {
     /// Returns the robots whose present state event clients have not seen: at once after a change
     /// of link, mode, mission, stop or lease, and once a second while only measured values change.
     ///
-    /// At most [`NEWS_MAX`] per call, so that clients are not overloaded; the others follow in
+    /// At most [`CHANGES_MAX`] per call, so that clients are not overloaded; the others follow in
     /// later calls.
     pub fn take_changed(&self, now: Duration) -> Vec<RobotKey> {
         let mut robots = self.lock();
-        let mut news = Vec::new();
+        let mut changed = Vec::new();
         for (key, presence) in robots.iter_mut() {
             if !presence.welcomed {
                 continue;
             }
             let state = presence.state();
-            let shown = Shown {
+            let shown = PublishedState {
                 at: now,
                 link: presence.link(now),
                 cause: presence.link_cause(now),
@@ -80,7 +80,7 @@ impl Presences {
             let is_new = presence.shown.is_none_or(|before| {
                 let elapsed = now.saturating_sub(before.at) >= SHOW_PERIOD;
                 let moved = before.seq != shown.seq && elapsed;
-                let same = Shown {
+                let same = PublishedState {
                     at: before.at,
                     seq: before.seq,
                     ..shown
@@ -89,12 +89,12 @@ impl Presences {
             });
             if is_new {
                 presence.shown = Some(shown);
-                news.push(key.clone());
+                changed.push(key.clone());
             }
-            if news.len() >= NEWS_MAX {
+            if changed.len() >= CHANGES_MAX {
                 break;
             }
         }
-        news
+        changed
     }
 }

@@ -31,9 +31,9 @@ pub(super) struct Open {
     pub(super) clear_asked_at: Option<Timestamp>,
 }
 
-/// The stop that a robot showed last.
+/// The stop that a robot reported last.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Shown {
+pub(super) struct ReportedStop {
     pub(super) latch: Option<StopId>,
     /// Time at which the shown latch was cleared, as far as the server knows.
     pub(super) ended_at: Option<Timestamp>,
@@ -41,49 +41,50 @@ pub(super) struct Shown {
     pub(super) at: Timestamp,
 }
 
-/// Action for a robot's stop.
+/// Next action for a robot's stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Verdict {
+pub(super) enum StopDecision {
     Nothing,
     /// Send the stop.
-    Tell,
+    Send,
     /// Send the stop again: the robot does not show what it confirmed.
-    Lost,
+    Resend,
     /// Record that the robot has cleared it, as requested.
     Cleared,
     /// Make the stop that the robot shows its open one.
     Adopt,
 }
 
-pub(super) fn judge(open: Option<Open>, shown: Option<Shown>) -> Verdict {
-    let is_later = |shown: &Shown, than: Timestamp| shown.at.duration_since(than) > SHOWN_GRACE;
+pub(super) fn decide(open: Option<Open>, shown: Option<ReportedStop>) -> StopDecision {
+    let is_later =
+        |shown: &ReportedStop, than: Timestamp| shown.at.duration_since(than) > SHOWN_GRACE;
     let Some(open) = open else {
-        let counts = |shown: &Shown| {
+        let counts = |shown: &ReportedStop| {
             let is_new = shown.ended_at.is_none_or(|ended| is_later(shown, ended));
             shown.latch.is_some() && is_new
         };
         return if shown.as_ref().is_some_and(counts) {
-            Verdict::Adopt
+            StopDecision::Adopt
         } else {
-            Verdict::Nothing
+            StopDecision::Nothing
         };
     };
     let Some(confirmed_at) = open.confirmed_at else {
         return if open.is_overdue {
-            Verdict::Tell
+            StopDecision::Send
         } else {
-            Verdict::Nothing
+            StopDecision::Nothing
         };
     };
     let since = open.clear_asked_at.unwrap_or(confirmed_at);
     let Some(shown) = shown.filter(|shown| is_later(shown, since)) else {
-        return Verdict::Nothing;
+        return StopDecision::Nothing;
     };
     match (shown.latch, open.clear_asked_at) {
-        (None, None) => Verdict::Lost,
-        (None, Some(_)) => Verdict::Cleared,
-        (Some(latch), _) if latch != open.id => Verdict::Adopt,
-        (Some(_), _) => Verdict::Nothing,
+        (None, None) => StopDecision::Resend,
+        (None, Some(_)) => StopDecision::Cleared,
+        (Some(latch), _) if latch != open.id => StopDecision::Adopt,
+        (Some(_), _) => StopDecision::Nothing,
     }
 }
 
@@ -241,21 +242,21 @@ mod tests {
                 is_overdue: true,
                 ..open
             });
-            let shown = self.shown.map(|(latch, at)| Shown {
+            let shown = self.shown.map(|(latch, at)| ReportedStop {
                 latch,
                 ended_at: latch.and_then(|latch| self.ended.get(&latch).copied()),
                 at,
             });
-            match judge(open, shown) {
-                Verdict::Nothing => {}
-                Verdict::Tell | Verdict::Lost => {
+            match decide(open, shown) {
+                StopDecision::Nothing => {}
+                StopDecision::Send | StopDecision::Resend => {
                     if let Some(open) = &mut self.open {
                         open.confirmed_at = None;
                         self.under_way.push(Message::Stop(open.id));
                     }
                 }
-                Verdict::Cleared => self.end(open.unwrap().id),
-                Verdict::Adopt => {
+                StopDecision::Cleared => self.end(open.unwrap().id),
+                StopDecision::Adopt => {
                     let id = shown.unwrap().latch.unwrap();
                     self.ended.remove(&id);
                     self.open = Some(Open {

@@ -13,7 +13,7 @@ const SECOND_US: f64 = 1.0e6;
 
 /// Measurements of one robot in one epoch.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Seen<R> {
+pub struct EpochMeasurement<R> {
     /// Robot. Its order determines the order of summation, so it must not depend on the order of
     /// arrival.
     pub robot: R,
@@ -45,7 +45,7 @@ pub struct Seen<R> {
     pub rolling: Option<Known>,
 }
 
-impl<R> Seen<R> {
+impl<R> EpochMeasurement<R> {
     /// Returns the measurements of `sums`; `None` if they have no information on θ.
     pub fn of(robot: R, epoch_h: i64, sums: &Sums) -> Option<Self> {
         let theta = sums.theta.known()?;
@@ -183,6 +183,6 @@ pub(super) fn seconds(span_us: i64) -> f64 {
 }
 
 /// Returns the age of the newest pass in seconds; 0 if a robot's clock is ahead.
-pub(super) fn age_s<R>(one: &Seen<R>, now_us: i64) -> f64 {
+pub(super) fn age_s<R>(one: &EpochMeasurement<R>, now_us: i64) -> f64 {
     seconds(now_us - one.newest_at_us).max(0.0)
 }
