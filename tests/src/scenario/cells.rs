@@ -27,7 +27,7 @@ use tread_lab::rough::run::Course;
 use tread_lab::rough::sensors::SensorSpec;
 use tread_lab::rough::spec::{Deviations, MAKES};
 use tread_server::config::FrictionConfig;
-use tread_server::friction::{Ground, Seen, Sums, fuse};
+use tread_server::friction::{EpochMeasurement, Ground, Sums, fuse};
 use uuid::Uuid;
 
 use crate::report::{Check, figure, quantile};
@@ -181,8 +181,8 @@ impl GroundMap {
     fn judge(&mut self, sums: &[(u32, Sums)], now_us: i64) {
         self.cells += 1;
         let seen = sums.iter();
-        let mut seen: Vec<Seen<u32>> = seen
-            .filter_map(|(robot, sums)| Seen::of(*robot, 0, sums))
+        let mut seen: Vec<EpochMeasurement<u32>> = seen
+            .filter_map(|(robot, sums)| EpochMeasurement::of(*robot, 0, sums))
             .collect();
         let config = FrictionConfig::default();
         let Some(fused) = fuse(&mut seen, Ground::Cell, &config, now_us) else {
