@@ -21,7 +21,7 @@ pub struct RobotModel {
     pub name: String,
     /// Name of the tyres; measurements with different tyres are never combined.
     pub tyres: String,
-    /// Mass including payload, kg.
+    /// Configured mass, usually that of the data sheet, kg; payload comes on top of it.
     pub mass_kg: f64,
     /// Track width W: lateral distance between the wheels' contact points, metres.
     pub track_width_m: f64,

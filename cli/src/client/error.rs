@@ -267,11 +267,11 @@ const NEXT_STEPS: &[(ProblemType, &str)] = &[
     ),
     (
         ProblemType::BeyondLimits,
-        "change the trajectory; the same command with --check shows its plan",
+        "reduce the speed or enlarge the radius; `tread robots ROBOT --json` shows the limits",
     ),
     (
         ProblemType::TurnTooSharp,
-        "move the points apart, or enlarge the radius; the same command with --check shows its plan",
+        "move the points apart, or enlarge the radius",
     ),
     (
         ProblemType::CrossesGeofence,
