@@ -288,12 +288,15 @@ pub struct PriorGain {
     pub known_ratio: f64,
     /// Time for which θ was known, from the prior and the robot's measurements, with a relative
     /// standard deviation of at most 20 %, seconds.
-    pub sure_s: f64,
+    #[serde(alias = "sure_s")]
+    pub known_s: f64,
     /// Time for which θ was known that accurately from the robot's own measurements alone, seconds.
-    pub sure_alone_s: f64,
+    #[serde(alias = "sure_alone_s")]
+    pub known_alone_s: f64,
     /// Time from the start until the robot's own measurement reached that accuracy, seconds; `null`
     /// if it never did.
-    pub first_sure_alone_s: Option<f64>,
+    #[serde(alias = "first_sure_alone_s")]
+    pub first_known_alone_s: Option<f64>,
     /// Number of cells with θ from the map in which the robot measured θ too.
     pub cells_compared: u32,
     /// Number of compared cells in which the measurement contradicted the map.
@@ -386,5 +389,24 @@ mod tests {
         assert!(LinkPolicy::StopAfter { silence_s: 5.0 }.validate().is_ok());
         let said: LinkPolicy = serde_json::from_str("\"continue\"").unwrap();
         assert_eq!(said, LinkPolicy::default());
+    }
+
+    /// Missions that ended before the fields were renamed are stored with the former names.
+    #[test]
+    fn a_gain_that_is_stored_under_former_names_is_read() {
+        let stored = r#"{"grip_mu": 0.2, "known_ratio": 0.5, "sure_s": 3.0, "sure_alone_s": 1.0,
+            "first_sure_alone_s": 2.0, "cells_compared": 4, "cells_contradicted": 1}"#;
+        let read: PriorGain = serde_json::from_str(stored).unwrap();
+        let expected = PriorGain {
+            traction_limit_mu: 0.2,
+            known_ratio: 0.5,
+            known_s: 3.0,
+            known_alone_s: 1.0,
+            first_known_alone_s: Some(2.0),
+            cells_compared: 4,
+            cells_contradicted: 1,
+            ..PriorGain::default()
+        };
+        assert_eq!(read, expected);
     }
 }

@@ -73,8 +73,8 @@ pub enum ProblemType {
     CrossesGeofence,
     #[serde(rename = "/problems/robot-outside-geofence")]
     RobotOutsideGeofence,
-    #[serde(rename = "/problems/changed-meanwhile")]
-    ChangedMeanwhile,
+    #[serde(rename = "/problems/precondition-failed")]
+    PreconditionFailed,
     #[serde(rename = "/problems/idempotency-key-in-flight")]
     IdempotencyKeyInFlight,
     #[serde(rename = "/problems/idempotency-key-reused")]
@@ -105,8 +105,8 @@ pub enum ProblemType {
     SignInRefused,
     #[serde(rename = "/problems/request-too-long")]
     RequestTooLong,
-    #[serde(rename = "/problems/robots-do-not-join")]
-    RobotsDoNotJoin,
+    #[serde(rename = "/problems/enrolment-disabled")]
+    EnrolmentDisabled,
     #[serde(rename = "/problems/authority-rotation")]
     AuthorityRotation,
     #[serde(rename = "/problems/robots-left")]
@@ -154,7 +154,7 @@ impl ProblemType {
         Self::RobotRefused,
         Self::CrossesGeofence,
         Self::RobotOutsideGeofence,
-        Self::ChangedMeanwhile,
+        Self::PreconditionFailed,
         Self::IdempotencyKeyInFlight,
         Self::IdempotencyKeyReused,
         Self::InvalidHeader,
@@ -170,7 +170,7 @@ impl ProblemType {
         Self::SignInFailed,
         Self::SignInRefused,
         Self::RequestTooLong,
-        Self::RobotsDoNotJoin,
+        Self::EnrolmentDisabled,
         Self::AuthorityRotation,
         Self::RobotsLeft,
         Self::TooMany,
@@ -212,7 +212,7 @@ impl ProblemType {
             Self::RobotRefused => "The robot refused the command",
             Self::CrossesGeofence => "The path leaves the geofence",
             Self::RobotOutsideGeofence => "A robot would be outside the geofence",
-            Self::ChangedMeanwhile => "The resource has been changed meanwhile",
+            Self::PreconditionFailed => "The resource has been changed meanwhile",
             Self::IdempotencyKeyInFlight => "A request with this idempotency key is in progress",
             Self::IdempotencyKeyReused => "The idempotency key was used for another request",
             Self::InvalidHeader => "A header has an invalid value",
@@ -228,7 +228,7 @@ impl ProblemType {
             Self::SignInFailed => "The sign-in has failed",
             Self::SignInRefused => "You have no rights on this server",
             Self::RequestTooLong => "The path or query is too long",
-            Self::RobotsDoNotJoin => "This server does not enrol robots",
+            Self::EnrolmentDisabled => "This server does not enrol robots",
             Self::AuthorityRotation => "The authority's rotation does not allow this",
             Self::RobotsLeft => "Robots still hold certificates of the former authority",
             Self::TooMany => "The maximum number of these objects is reached",

@@ -353,7 +353,7 @@ pub struct UnmappedMeasurements {
     /// Number of measurements refused for good, because they are implausible.
     pub refused: u64,
     /// Reason of the last refusal, for people; `null` if there was none.
-    pub refused_why: Option<String>,
+    pub refusal_reason: Option<String>,
     /// Number of measurements with times in the future, kept until the clock of their run is known.
     pub deferred: u64,
 }

@@ -55,7 +55,7 @@ impl TryFrom<Raw> for RobotRow {
             last_hello_at: from_us(raw.last_hello_at_us)?,
             measurements: UnmappedMeasurements {
                 refused: unsigned("count", raw.segments_refused)?,
-                refused_why: raw.segments_refused_why,
+                refusal_reason: raw.segments_refused_why,
                 deferred: unsigned("count", raw.segments_deferred)?,
             },
         })

@@ -294,11 +294,11 @@ const NEXT_STEPS: &[(ProblemType, &str)] = &[
         "choose another identifier, or change the existing object",
     ),
     (
-        ProblemType::ChangedMeanwhile,
+        ProblemType::PreconditionFailed,
         "read the object again, and give its new revision with --revision",
     ),
     (
-        ProblemType::RobotsDoNotJoin,
+        ProblemType::EnrolmentDisabled,
         "add `[robots]` to the server's configuration, run `tread-server init` with it, and restart the server",
     ),
     (
@@ -442,8 +442,8 @@ mod tests {
             (ProblemType::UnknownSession, 404, Exit::NotFound),
             (ProblemType::UnknownWebhook, 404, Exit::NotFound),
             (ProblemType::RobotBusy, 409, Exit::Conflict),
-            (ProblemType::ChangedMeanwhile, 412, Exit::Conflict),
-            (ProblemType::RobotsDoNotJoin, 409, Exit::Conflict),
+            (ProblemType::PreconditionFailed, 412, Exit::Conflict),
+            (ProblemType::EnrolmentDisabled, 409, Exit::Conflict),
             (ProblemType::BeyondLimits, 422, Exit::Refused),
             (ProblemType::TurnTooSharp, 422, Exit::Refused),
             (ProblemType::RobotUnreachable, 503, Exit::Unreachable),

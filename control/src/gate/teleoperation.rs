@@ -1,7 +1,7 @@
 //! Teleoperation commands before the gate: limited to the robot's speeds and accelerations.
 //!
 //! Late commands slow the robot down: above an age of [`AGE_FULL_S`] the allowed fraction of speed
-//! falls linearly to [`SHARE_LEAST`] at [`AGE_LEAST_S`]. [`AgeMeter`] keeps the worst recent age,
+//! falls linearly to [`RATIO_MIN`] at [`AGE_LEAST_S`]. [`AgeMeter`] keeps the worst recent age,
 //! so that one quick command does not make up for many late ones.
 //!
 //! In the last [`STEADY_BEFORE_END_S`] of a command the robot gains no more speed, and wheels that
@@ -15,10 +15,10 @@ use crate::twist_limits::{Change, Slowing, TwistLimits};
 
 /// Age of commands up to which the full speed is allowed, seconds.
 pub const AGE_FULL_S: f64 = 0.15;
-/// Age of commands from which only [`SHARE_LEAST`] is allowed, seconds.
+/// Age of commands from which only [`RATIO_MIN`] is allowed, seconds.
 pub const AGE_LEAST_S: f64 = 0.5;
 /// Minimum fraction of the speed that late commands allow.
-pub const SHARE_LEAST: f64 = 0.2;
+pub const RATIO_MIN: f64 = 0.2;
 /// Maximum speed of teleoperating a robot without a position, metres per second.
 pub const BLIND_MAX_M_S: f64 = 0.3;
 /// Time before the end of a command in which it no longer accelerates the robot, seconds: twice the
@@ -54,19 +54,19 @@ impl AgeMeter {
         self.worst_s
     }
 
-    /// Returns the allowed fraction of the speed, [`SHARE_LEAST`] to 1; 1 before the first command.
-    pub fn speed_share(&self) -> f64 {
-        self.worst_s.map_or(1.0, speed_share)
+    /// Returns the allowed fraction of the speed, [`RATIO_MIN`] to 1; 1 before the first command.
+    pub fn speed_ratio(&self) -> f64 {
+        self.worst_s.map_or(1.0, speed_ratio)
     }
 }
 
-/// Returns the fraction of the speed allowed for an age of commands, [`SHARE_LEAST`] to 1.
-pub fn speed_share(age_s: f64) -> f64 {
+/// Returns the fraction of the speed allowed for an age of commands, [`RATIO_MIN`] to 1.
+pub fn speed_ratio(age_s: f64) -> f64 {
     if !age_s.is_finite() {
-        return SHARE_LEAST;
+        return RATIO_MIN;
     }
     let late = ((age_s - AGE_FULL_S) / (AGE_LEAST_S - AGE_FULL_S)).clamp(0.0, 1.0);
-    (1.0 - late * (1.0 - SHARE_LEAST)).max(SHARE_LEAST)
+    (1.0 - late * (1.0 - RATIO_MIN)).max(RATIO_MIN)
 }
 
 /// Scales a twist down to the robot's limits of forward speed, turn rate, lateral acceleration and
@@ -166,8 +166,8 @@ mod tests {
 
         #[test]
         fn an_older_command_never_allows_more(age_s in 0.0..2.0_f64, more_s in 0.0..1.0_f64) {
-            prop_assert!(speed_share(age_s + more_s) <= speed_share(age_s));
-            prop_assert!((SHARE_LEAST..=1.0).contains(&speed_share(age_s)));
+            prop_assert!(speed_ratio(age_s + more_s) <= speed_ratio(age_s));
+            prop_assert!((RATIO_MIN..=1.0).contains(&speed_ratio(age_s)));
         }
 
         #[test]
@@ -214,17 +214,17 @@ mod tests {
     #[test]
     fn one_quick_command_does_not_make_up_for_late_ones() {
         let mut meter = AgeMeter::default();
-        assert!((meter.speed_share() - 1.0).abs() < 1.0e-12);
+        assert!((meter.speed_ratio() - 1.0).abs() < 1.0e-12);
         meter.record(0.5);
-        assert!((meter.speed_share() - SHARE_LEAST).abs() < 1.0e-12);
+        assert!((meter.speed_ratio() - RATIO_MIN).abs() < 1.0e-12);
         meter.record(0.01);
-        assert!(meter.speed_share() < 0.3);
+        assert!(meter.speed_ratio() < 0.3);
         for _ in 0..100 {
             meter.record(0.01);
         }
-        assert!((meter.speed_share() - 1.0).abs() < 1.0e-12);
+        assert!((meter.speed_ratio() - 1.0).abs() < 1.0e-12);
         meter.record(f64::NAN);
-        assert!(meter.speed_share() < 0.3, "no number is a bad age");
+        assert!(meter.speed_ratio() < 0.3, "no number is a bad age");
     }
 
     #[test]

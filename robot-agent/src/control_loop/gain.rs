@@ -28,9 +28,9 @@ fn is_sure(known: Option<ThetaKnowledge>) -> bool {
 pub(super) struct Gain {
     traction_limit_mu: Option<f64>,
     known_m: f64,
-    sure_s: f64,
-    sure_alone_s: f64,
-    first_sure_alone_s: Option<f64>,
+    known_s: f64,
+    known_alone_s: f64,
+    first_known_alone_s: Option<f64>,
     compared: u32,
     contradicted: u32,
     difference_sum: f64,
@@ -51,11 +51,11 @@ impl Gain {
             self.known_m += driven_m;
         }
         if is_sure(ground.given) {
-            self.sure_s += dt_s;
+            self.known_s += dt_s;
         }
         if is_sure(ground.measured) {
-            self.sure_alone_s += dt_s;
-            self.first_sure_alone_s.get_or_insert(since_start_s);
+            self.known_alone_s += dt_s;
+            self.first_known_alone_s.get_or_insert(since_start_s);
         }
     }
 
@@ -84,9 +84,9 @@ impl Gain {
             } else {
                 0.0
             },
-            sure_s: self.sure_s,
-            sure_alone_s: self.sure_alone_s,
-            first_sure_alone_s: self.first_sure_alone_s,
+            known_s: self.known_s,
+            known_alone_s: self.known_alone_s,
+            first_known_alone_s: self.first_known_alone_s,
             cells_compared: self.compared,
             cells_contradicted: self.contradicted,
             difference_ratio: mean(self.difference_sum),

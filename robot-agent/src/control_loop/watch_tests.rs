@@ -79,8 +79,8 @@ fn ground_that_is_not_as_the_map_says_is_reported_while_it_is_so_and_no_longer()
         );
         assert!((gain.traction_limit_mu - HIGH_MU).abs() < 1.0e-12);
         // It knew its ground from the start, and would not have known it alone.
-        assert!(gain.sure_s > gain.sure_alone_s + 1.0, "{gain:?}");
-        let first_s = gain.first_sure_alone_s.unwrap();
+        assert!(gain.known_s > gain.known_alone_s + 1.0, "{gain:?}");
+        let first_s = gain.first_known_alone_s.unwrap();
         assert!((0.5..15.0).contains(&first_s), "{gain:?}");
         if !is_other {
             assert!(gain.difference_ratio.unwrap().abs() < 0.1, "{gain:?}");

@@ -69,7 +69,7 @@ pub(crate) struct TeleoperationView {
     /// Commanded twist, and its expiry, microseconds.
     pub(crate) wanted: Option<(Twist, u64)>,
     /// Fraction of the maximum speed that the age of the commands allows, 0 to 1.
-    pub(crate) speed_share: f64,
+    pub(crate) speed_ratio: f64,
 }
 
 impl TeleoperationView {
@@ -284,7 +284,7 @@ impl Operator {
                 (active.lease.epoch, until_us)
             }),
             wanted: self.wanted,
-            speed_share: self.meter.speed_share(),
+            speed_ratio: self.meter.speed_ratio(),
         }
     }
 
@@ -300,7 +300,7 @@ impl Operator {
         let is_silent = self.counts == DriveCounts::default();
         (self.epoch > 0 || !is_silent).then(|| DriveStatus {
             command_age_ms: self.meter.worst_s().map(|age_s| 1_000.0 * age_s),
-            speed_share: self.meter.speed_share(),
+            speed_ratio: self.meter.speed_ratio(),
             counts: self.counts,
         })
     }

@@ -145,7 +145,7 @@ for (const theme of ['light', 'dark'] as const) {
       await page.getByRole('tab', { name: 'Terrains' }).click();
       await page.route('**/geofence', (route) =>
         route.request().method() === 'PUT'
-          ? route.fulfill({ status: 412, contentType: 'application/problem+json', body: JSON.stringify({ type: '/problems/changed-meanwhile', title: 'It was changed', status: 412 }) })
+          ? route.fulfill({ status: 412, contentType: 'application/problem+json', body: JSON.stringify({ type: '/problems/precondition-failed', title: 'It was changed', status: 412 }) })
           : route.fallback(),
       );
       await page.getByRole('button', { name: 'Area to stay out of' }).click();

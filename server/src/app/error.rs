@@ -203,7 +203,7 @@ pub enum AppError {
     },
     /// The object was changed meanwhile: its revision is not the expected one.
     #[error("the {what} is at revision {present} now, not {}", one_of(.expected))]
-    ChangedMeanwhile {
+    PreconditionFailed {
         /// The kind of object.
         what: &'static str,
         /// Its revision.
@@ -329,7 +329,7 @@ impl AppError {
             | Self::RobotRefused { .. }
             | Self::CrossesGeofence { .. }
             | Self::OutsideGeofence { .. }
-            | Self::ChangedMeanwhile { .. }
+            | Self::PreconditionFailed { .. }
             | Self::KeyInFlight
             | Self::KeyReused
             | Self::TooMany { .. }

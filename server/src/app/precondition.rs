@@ -15,11 +15,11 @@ impl Precondition {
     /// Checks the present revision of an object; `what` is its kind.
     ///
     /// # Errors
-    /// [`AppError::ChangedMeanwhile`] if the request may not change this revision.
+    /// [`AppError::PreconditionFailed`] if the request may not change this revision.
     pub(super) fn check(&self, what: &'static str, present: u64) -> Result<(), AppError> {
         match self {
             Self::OneOf(expected) if !expected.contains(&present) => {
-                Err(AppError::ChangedMeanwhile {
+                Err(AppError::PreconditionFailed {
                     what,
                     present,
                     expected: expected.clone(),

@@ -81,7 +81,7 @@ impl App {
     /// revision: measurements on the same ground belong together.
     ///
     /// # Errors
-    /// [`AppError::ChangedMeanwhile`] if its revision is none of `expected`.
+    /// [`AppError::PreconditionFailed`] if its revision is none of `expected`.
     pub async fn replace_terrain(
         &self,
         site: &SiteId,
@@ -141,7 +141,7 @@ impl App {
     /// Deletes a terrain; measurements made on it are kept.
     ///
     /// # Errors
-    /// [`AppError::ChangedMeanwhile`] if its revision is none of `expected`.
+    /// [`AppError::PreconditionFailed`] if its revision is none of `expected`.
     pub async fn delete_terrain(
         &self,
         site: &SiteId,

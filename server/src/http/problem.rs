@@ -111,7 +111,7 @@ const fn status(kind: ProblemType) -> StatusCode {
         | ProblemType::RobotRefused
         | ProblemType::StopNotCleared
         | ProblemType::IdempotencyKeyInFlight
-        | ProblemType::RobotsDoNotJoin
+        | ProblemType::EnrolmentDisabled
         | ProblemType::AuthorityRotation
         | ProblemType::RobotsLeft
         | ProblemType::TooMany => StatusCode::CONFLICT,
@@ -124,7 +124,7 @@ const fn status(kind: ProblemType) -> StatusCode {
         }
         ProblemType::UnknownHost => StatusCode::MISDIRECTED_REQUEST,
         ProblemType::RequestTooLong => StatusCode::URI_TOO_LONG,
-        ProblemType::ChangedMeanwhile => StatusCode::PRECONDITION_FAILED,
+        ProblemType::PreconditionFailed => StatusCode::PRECONDITION_FAILED,
         ProblemType::Unavailable | ProblemType::Timeout | ProblemType::RobotUnreachable => {
             StatusCode::SERVICE_UNAVAILABLE
         }
@@ -154,7 +154,7 @@ impl From<AppError> for Problem {
             AppError::UnknownSession(_) => ProblemType::UnknownSession,
             AppError::UnknownWebhook(_) => ProblemType::UnknownWebhook,
             AppError::OutsideScope(_) | AppError::BeyondRights(_) => ProblemType::Forbidden,
-            AppError::NoAuthority => ProblemType::RobotsDoNotJoin,
+            AppError::NoAuthority => ProblemType::EnrolmentDisabled,
             AppError::Rotation(_) => ProblemType::AuthorityRotation,
             AppError::RobotsLeft { .. } => ProblemType::RobotsLeft,
             AppError::UnknownStop(_) => ProblemType::UnknownStop,
@@ -163,7 +163,7 @@ impl From<AppError> for Problem {
             AppError::RobotRefused { .. } => ProblemType::RobotRefused,
             AppError::CrossesGeofence { .. } => ProblemType::CrossesGeofence,
             AppError::OutsideGeofence { .. } => ProblemType::RobotOutsideGeofence,
-            AppError::ChangedMeanwhile { .. } => ProblemType::ChangedMeanwhile,
+            AppError::PreconditionFailed { .. } => ProblemType::PreconditionFailed,
             AppError::KeyInFlight => ProblemType::IdempotencyKeyInFlight,
             AppError::KeyReused => ProblemType::IdempotencyKeyReused,
             AppError::TooMany { .. } => ProblemType::TooMany,

@@ -120,7 +120,13 @@ async fn what_is_impossible_is_refused_counted_and_shown_and_its_neighbours_are_
     assert_eq!(cells_of(&cells.items), [7, 8]);
     let shown: ShownRobot = yard.get("/v1/sites/yard/robots/rover-1").await;
     assert_eq!(shown.measurements.refused, 7);
-    assert!(shown.measurements.refused_why.unwrap().contains("ended_at"));
+    assert!(
+        shown
+            .measurements
+            .refusal_reason
+            .unwrap()
+            .contains("ended_at")
+    );
     assert_eq!(yard.counters().await.records_refused, 7);
     yard.server.stop().await.unwrap();
 }

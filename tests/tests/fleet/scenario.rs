@@ -112,7 +112,7 @@ async fn the_next_robot_starts_with_what_the_one_before_has_measured() {
     let next = drive(&world, "next").await.quality.unwrap();
     let gain = next.prior.expect("the map knew its path");
     assert!(gain.known_ratio > 0.6, "{gain:?}");
-    assert!(gain.sure_s > gain.sure_alone_s, "{gain:?}");
+    assert!(gain.known_s > gain.known_alone_s, "{gain:?}");
     assert!(gain.cells_compared >= 5, "{gain:?}");
     assert_eq!(gain.cells_contradicted, 0, "{gain:?}");
     assert!(gain.difference_ratio.unwrap().abs() < 0.1, "{gain:?}");

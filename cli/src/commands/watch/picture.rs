@@ -400,7 +400,7 @@ mod tests {
             "configuration": "0192f0c1-2b3c-7d4e-8f50-617283940a1b",
             "capabilities": {"wheel_torque": false, "yaw_rate": false, "teleop": false},
             "agent_version": "1", "first_seen_at": at, "last_hello_at": at,
-            "measurements": {"refused": 0, "refused_why": null, "deferred": 0},
+            "measurements": {"refused": 0, "refusal_reason": null, "deferred": 0},
             "link": link, "link_cause": null, "alerts": [], "live": null,
         }});
         serde_json::from_value(robot).expect("a robot")

@@ -234,7 +234,7 @@ impl Safety {
         } else {
             (false, None)
         };
-        let share = demands.view.teleoperation.speed_share;
+        let share = demands.view.teleoperation.speed_ratio;
         let linear_max_m_s = self.model.limits().linear_max_m_s;
         Reasons {
             is_stopped: demands.is_stopped(),

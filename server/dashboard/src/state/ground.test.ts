@@ -26,7 +26,7 @@ function server(stored: { terrain: Terrain; fence: Geofence }) {
     const present = stored[what];
     if (method === 'GET') return reply(present);
     if (ifMatch !== undefined && ifMatch !== `"${present.revision}"`) {
-      return reply({ type: '/problems/changed-meanwhile', title: 'it was changed', status: 412 }, 412);
+      return reply({ type: '/problems/precondition-failed', title: 'it was changed', status: 412 }, 412);
     }
     if (method === 'DELETE') return reply(null, 204);
     const next = { ...present, ...JSON.parse(String(init.body)), revision: present.revision + 1 };

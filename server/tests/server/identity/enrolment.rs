@@ -413,11 +413,11 @@ async fn where_robots_connect_in_the_clear_none_joins() {
     let yard = Yard::start().await;
     let (status, answer) = yard.post("/v1/join-tokens", &json!({"site": "yard"})).await;
     assert_eq!(status, StatusCode::CONFLICT);
-    assert_eq!(answer["type"], "/problems/robots-do-not-join");
+    assert_eq!(answer["type"], "/problems/enrolment-disabled");
     let key = KeyPair::generate().unwrap();
     let (status, answer) = enrol(&yard, "nonsense", "rover-1", &key).await;
     assert_eq!(
         (status, &answer["type"]),
-        (StatusCode::CONFLICT, &json!("/problems/robots-do-not-join"))
+        (StatusCode::CONFLICT, &json!("/problems/enrolment-disabled"))
     );
 }
