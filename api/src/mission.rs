@@ -394,7 +394,7 @@ mod tests {
     /// Missions that ended before the fields were renamed are stored with the former names.
     #[test]
     fn a_gain_that_is_stored_under_former_names_is_read() {
-        let stored = r#"{"grip_mu": 0.2, "known_ratio": 0.5, "sure_s": 3.0, "sure_alone_s": 1.0,
+        let stored = r#"{"traction_limit_mu": 0.2, "known_ratio": 0.5, "sure_s": 3.0, "sure_alone_s": 1.0,
             "first_sure_alone_s": 2.0, "cells_compared": 4, "cells_contradicted": 1}"#;
         let read: PriorGain = serde_json::from_str(stored).unwrap();
         let expected = PriorGain {
