@@ -7,7 +7,7 @@ use std::process::ExitCode;
 #[repr(u8)]
 pub(crate) enum Exit {
     /// The command was carried out with an unwanted result, or an internal error occurred.
-    WentWrong = 1,
+    BadResult = 1,
     /// The arguments are invalid; clap uses the same code.
     Usage = 2,
     /// No server answers, or the server cannot reach the robot.
@@ -25,14 +25,14 @@ pub(crate) enum Exit {
 /// Description of the exit codes, below the help.
 pub(crate) const EXIT_CODES: &str = "\
 Exit codes:
-  0  done
-  1  done, and it went wrong: a mission failed, a robot has not confirmed its stop
-  2  wrong words on the command line
+  0  success
+  1  executed with a bad result: a mission failed, a robot has not confirmed its stop; or a local error
+  2  invalid arguments
   3  no server answers, or the server cannot reach the robot
-  4  the server refused: token, rights, or what was asked for
-  5  what was named is not there
-  6  the present state does not allow it, or somebody was faster
-  7  it took too long";
+  4  the server refused the token, the rights or the request
+  5  the named object does not exist
+  6  the present state does not permit the request, or another request was faster
+  7  timed out";
 
 impl From<Exit> for ExitCode {
     fn from(exit: Exit) -> Self {

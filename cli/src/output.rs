@@ -55,7 +55,7 @@ impl Output {
         let exit = match (client_error, error.downcast_ref::<WaitTimeout>()) {
             (Some(client_error), _) => client_error.exit(),
             (None, Some(_)) => Exit::TimedOut,
-            (None, None) => Exit::WentWrong,
+            (None, None) => Exit::BadResult,
         };
         let next_step = client_error.and_then(ClientError::next_step);
         let message = match client_error {

@@ -323,7 +323,7 @@ impl ClientError {
             Self::Silent { .. } => Exit::TimedOut,
             Self::Refused { problem } => exit_of(problem),
             Self::ClearText { .. } => Exit::Refused,
-            Self::Authority { .. } | Self::Tls(_) | Self::NotUnderstood { .. } => Exit::WentWrong,
+            Self::Authority { .. } | Self::Tls(_) | Self::NotUnderstood { .. } => Exit::BadResult,
         }
     }
 
