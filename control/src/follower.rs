@@ -180,7 +180,7 @@ pub struct Follower {
     align_rate_rad_s: f64,
     /// Time in the present state.
     phase_s: f64,
-    /// Time for which the robot has been at the end and stopped.
+    /// Time for which the robot has stood at the end, or the reference has stood after a stop.
     hold_s: f64,
     /// Time for which the cross-track error has been too large.
     off_path_s: f64,

@@ -72,8 +72,9 @@ impl Default for Tilts {
 }
 
 impl Tilts {
-    /// Adds the accelerations `[measured, predicted]` of one bin, each `[forward, left]`, m/s², and
-    /// returns them without gravity. That of a slope is removed only if there is a `heading_rad`.
+    /// Adds the accelerations `[measured, predicted]` at the end of a bin, each `[forward, left]`,
+    /// m/s², and returns them without gravity. That of a slope is removed only if there is a
+    /// `heading_rad`.
     fn remove(
         &mut self,
         accelerations: [Vector2<f64>; 2],
@@ -117,7 +118,7 @@ pub(super) struct Accelerometer {
     /// Heading since the last restart, radians.
     heading_rad: f64,
     tilts: Tilts,
-    /// Measured and predicted acceleration of the last bin without gravity, m/s².
+    /// Measured and predicted acceleration without gravity over the last [`BINS`] bins, m/s².
     forward: Comparison,
     left: Comparison,
     /// `∫ measured·predicted`, `∫ predicted²`, `∫ residual²` and `∫ 1`, with exponential

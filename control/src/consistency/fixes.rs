@@ -93,8 +93,8 @@ impl Fix {
         (pose, x_m.hypot(y_m))
     }
 
-    /// Compares `other` with the pose propagated from this fix. Returns the distance, metres, the
-    /// heading difference, radians, and the distance travelled by dead reckoning, metres.
+    /// Compares `other` with the pose propagated from this fix. Returns distance, metres, heading
+    /// difference, radians, and the distance between both positions by dead reckoning, metres.
     fn error(&self, other: &Self) -> (f64, f64, f64) {
         let (expected, driven_m) = self.propagated(other);
         let by_gyro_rad = wrap_angle_rad(other.pose.heading_rad - expected.heading_rad);
@@ -229,7 +229,8 @@ impl Fixes {
     }
 
     /// Adds a fix measured at `at_s`, site frame; returns whether it is used. It is not if the
-    /// history does not reach back to it, if it is older than the last one, or during a jump.
+    /// history does not reach back to it, if it is not newer than the last one, if it is off the
+    /// expected position, or until a jump is over.
     pub(super) fn take(
         &mut self,
         at_s: f64,

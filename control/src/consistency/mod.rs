@@ -274,7 +274,7 @@ impl Monitor {
         if has_relapsed {
             for (track, subject) in self.tracks.iter_mut().zip(Subject::ALL) {
                 if subject.concerns_position() {
-                    track.reactivate();
+                    track.record_relapse();
                 }
             }
         }

@@ -26,7 +26,7 @@ const RELAPSES_MAX: u32 = 16;
 pub(super) struct Track {
     /// Time for which the subject has contradicted the others, less twice the time since, seconds.
     pub(super) contradicting_s: f64,
-    /// Time for which it has agreed in motion, seconds.
+    /// Time for which it has been confirmed to be right, seconds.
     agreeing_s: f64,
     /// Time for which it has agreed at standstill, seconds.
     pub(super) rested_s: f64,
@@ -83,7 +83,7 @@ impl Track {
     }
 
     /// Records that a finding that ended at standstill is active again.
-    pub(super) fn reactivate(&mut self) {
+    pub(super) fn record_relapse(&mut self) {
         self.is_on_probation = false;
         self.relapses = (self.relapses + 1).min(RELAPSES_MAX);
     }

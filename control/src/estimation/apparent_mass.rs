@@ -41,7 +41,8 @@ struct BlockSums {
     forward_m_s2: f64,
     /// Sign of the rim speeds.
     sign: f64,
-    /// Whether a sample without torque or acceleration, or at low speed, makes the block unusable.
+    /// Whether the block is unusable, by a sample without torque or acceleration, at low speed, or
+    /// with rim speeds of different signs.
     is_broken: bool,
 }
 

@@ -163,7 +163,8 @@ pub(super) struct Block {
     /// `Wφ̇`, metres per second, and its variance.
     pub(super) turn_m_s: f64,
     pub(super) turn_noise: f64,
-    /// Friction coefficient of the more loaded side, minus two standard deviations, at least 0.
+    /// Friction coefficient that the ground has given: of the side with the larger torque, combined
+    /// with the lateral one, minus two standard deviations, at least 0.
     pub(super) mu_demonstrated: f64,
     pub(super) rolling_resistance: Option<ValueWithStdDev>,
 }

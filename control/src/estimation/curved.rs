@@ -94,7 +94,7 @@ pub(super) struct Turn {
     pub(super) rim_m_s: f64,
     pub(super) rim_difference_m_s: f64,
     pub(super) yaw_rate_rad_s: f64,
-    /// Estimated `δ_d`, the right minus left relative error of the radii; negated in reverse.
+    /// Estimated `δ_d`, right minus left relative error of the nominal radii; negated in reverse.
     pub(super) radius_difference: f64,
 }
 

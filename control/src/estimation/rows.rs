@@ -172,10 +172,11 @@ impl CurvatureRegressors {
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Row {
     pub(super) regressors: Regressors,
-    /// Slip, or innovation of the forward speed, metres per second.
+    /// Slip, or innovation of the forward speed, metres per second; turn rate of a stopped robot,
+    /// radians per second.
     pub(super) response: f64,
-    /// Variance of the noise of the response, (m/s)²; in rows of the forward speed it includes that
-    /// of the force.
+    /// Variance of the noise of the response, in its unit squared; in rows of the forward speed it
+    /// includes that of the force.
     pub(super) innovation_variance: f64,
     /// Variance of the noise of the force, the regressor of θ, (m/s)².
     pub(super) force_noise: f64,

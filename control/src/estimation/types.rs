@@ -266,8 +266,8 @@ pub struct ThetaMeasurement {
     pub own_std_dev: f64,
     /// Common errors of θ.
     pub common: CommonError,
-    /// Effective number of blocks of 0.2 s: fewer than all if few of them have most of the
-    /// information.
+    /// Effective number of rows, blocks and forward speeds, weighted by their information; for a
+    /// robot without an exact model, the number of blocks of 0.2 s.
     pub effective_samples: f64,
     /// Duration of the blocks used, seconds.
     pub duration_s: f64,

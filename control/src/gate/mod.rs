@@ -226,10 +226,9 @@ pub struct GateInput {
 /// Output of the gate in one tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GateOutput {
-    /// Wheel speeds to command to the base, within all limits.
+    /// Wheel speeds to command to the base: `target`, as far as the acceleration limits allow.
     pub wheel_speeds: WheelSpeeds,
-    /// Wheel speeds after all reductions but those of the acceleration limits, within which
-    /// `wheel_speeds` approaches them.
+    /// Wheel speeds after all reductions but those of the acceleration limits.
     pub target: WheelSpeeds,
     /// Strictest cause of a reduction; None if the command passed unchanged.
     pub cause: Option<GateCause>,

@@ -15,8 +15,8 @@ const BESIDE_START_M: f64 = 0.25;
 const HEADING_KEPT_RAD: f64 = 0.6;
 /// Turn angles above which a waypoint's heading is fixed half-way through the turn, radians; tried
 /// in this order. The path is C³ where the heading is fixed, else C⁴.
-const HALF_TURN_FROM_RAD: [f64; 4] = [2.6, 1.7, 0.8, 0.0];
-/// Maximum number of knots for which every angle of [`HALF_TURN_FROM_RAD`] is tried.
+const HALFWAY_FROM_RAD: [f64; 4] = [2.6, 1.7, 0.8, 0.0];
+/// Maximum number of knots for which every angle of [`HALFWAY_FROM_RAD`] is tried.
 const ALL_SPLINES_MAX: usize = 500;
 /// Exponents α of the spline's parameter `chord^α` that are tried.
 const SPLINE_EXPONENTS: [f64; 3] = [1.0, 0.75, 0.5];
@@ -100,12 +100,12 @@ fn best_spline(
 ) -> Result<(Vec<Polynomial>, f64), PathError> {
     let mut best: Option<(Vec<Polynomial>, f64)> = None;
     let mut refused = None;
-    for turn_rad in HALF_TURN_FROM_RAD {
+    for turn_rad in HALFWAY_FROM_RAD {
         // Long paths use the first drivable angle, short ones the quickest of all.
         if best.is_some() && knots.len() > ALL_SPLINES_MAX {
             break;
         }
-        let knots = with_half_turn_headings(knots, turn_rad);
+        let knots = with_halfway_headings(knots, turn_rad);
         for exponent in SPLINE_EXPONENTS {
             let pieces = min_jerk_spline(&knots, exponent);
             let mut time_s = 0.0;
@@ -126,7 +126,7 @@ fn best_spline(
 
 /// Fixes the heading of knots at which the path turns by more than `from_rad` to half-way through
 /// the turn, so that the path swings through them without a cusp.
-fn with_half_turn_headings(knots: &[Knot], from_rad: f64) -> Vec<Knot> {
+fn with_halfway_headings(knots: &[Knot], from_rad: f64) -> Vec<Knot> {
     let mut turned = knots.to_vec();
     for index in 1..knots.len().saturating_sub(1) {
         let come_rad = knots[index - 1].point.bearing_rad(knots[index].point);

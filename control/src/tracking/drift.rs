@@ -13,7 +13,7 @@ use crate::reference::ReferenceSample;
 
 use super::config::TrackerConfig;
 
-/// Lower bound of the speed by which the rate of the curvature is divided, metres per second.
+/// Lower bound of the speed in the denominator of the curvature's rate, metres per second.
 const SPEED_MIN_M_S: f64 = 0.05;
 /// Maximum magnitude of d̂'s rate of change, radians per second.
 const SLOPE_RATE_MAX_RAD_S: f64 = 0.1;

@@ -329,7 +329,7 @@ impl Tracker {
             let is_refined = self.pull.has_acted && is_better;
             let is_other = is_corrected || is_refined && anchor.differs_by_ground(now);
             self.resets_beyond |= is_other;
-            // After that distance the adaptation to tracking errors is more accurate than θ.
+            // After that distance θ̂ has adapted to the tracking errors, which suits the loop more.
             let is_from_start = is_first && self.adapted_m < KNOWN_FROM_START_M;
             if is_corrected || is_refined || is_from_start {
                 self.pull.left_s = PULL_TIME_S;

@@ -19,7 +19,7 @@ pub(super) enum Favoured {
 /// Differences of two channels of the body from wheels and command, `(fast channel, fixes)`,
 /// magnitudes in m/s or rad/s.
 pub(super) struct Vote {
-    /// Differences from the wheels; None if a finding names the wheels.
+    /// Differences from the wheels; None if the wheels are not compared.
     pub(super) by_wheels: Option<(f64, f64)>,
     /// Tolerated difference from the wheels.
     pub(super) slack: f64,

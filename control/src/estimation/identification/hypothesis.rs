@@ -119,8 +119,8 @@ pub(super) struct Hypothesis {
     variance_before_step: f64,
     /// Number of complete blocks.
     age: u32,
-    /// Whether the last normal equations had a solution at a time scale that the next longer one
-    /// confirms; otherwise noise of the wheel speeds dominates the measurements.
+    /// Whether the last normal equations could be solved at any time scale; otherwise noise of the
+    /// wheel speeds dominates the measurements.
     is_determined: bool,
 }
 
@@ -351,7 +351,7 @@ impl Hypothesis {
     }
 
     /// Solves the normal equations of all time scales and chooses the shortest one that agrees with
-    /// the next longer one. Returns its solution.
+    /// the next longer one, or for which that one has no solution. Returns its solution.
     fn solve(&mut self, prior: &Prior) -> Option<Values> {
         let mut solutions = [None; SCALES.len()];
         for (scale, solution) in self.scales.iter_mut().zip(&mut solutions) {
@@ -369,8 +369,7 @@ impl Hypothesis {
         solutions[self.used]
     }
 
-    /// Returns whether the last solution can be trusted: that of one time scale agrees with that of
-    /// the next longer one.
+    /// Returns whether the last normal equations could be solved at any time scale.
     pub(super) fn is_determined(&self) -> bool {
         self.is_determined
     }

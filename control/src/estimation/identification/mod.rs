@@ -185,7 +185,8 @@ impl Identification {
         Some(identification)
     }
 
-    /// Replaces all hypotheses by new ones at the prior, which move as in `state`.
+    /// Replaces all hypotheses by new ones from the prior and the starting values of ln K, in the
+    /// motion `state`.
     fn begin(&mut self, state: &State<f64>) {
         self.hypotheses.clear();
         self.change = ChangeMonitor::default();
@@ -208,7 +209,8 @@ impl Identification {
         self.begin_without(&parameters::OF_LOAD_AND_GROUND);
     }
 
-    /// Begins with the posterior as the prior, in which the parameters `changed` are reset.
+    /// Begins with the posterior as the prior, in which the parameters `changed` are reset; keeps
+    /// the prior if the best hypothesis is younger than [`BLOCKS_MIN`] blocks.
     fn begin_without(&mut self, changed: &[usize]) {
         let best = self.best().filter(|best| best.age() >= BLOCKS_MIN);
         if let Some(prior) = best.and_then(|best| best.prior_without(&self.prior, changed)) {

@@ -308,7 +308,7 @@ impl Robot {
     /// Nothing is wrong any more.
     #[cfg_attr(
         not(test),
-        expect(dead_code, reason = "the report program never mends, a test does")
+        expect(dead_code, reason = "the report program never repairs, a test does")
     )]
     pub(crate) fn repair(&mut self) {
         self.fault = None;
