@@ -154,6 +154,7 @@ pub struct DriveStatus {
     /// command.
     pub command_age_ms: Option<f64>,
     /// Fraction of the robot's speed limit that this age permits, 0 to 1.
+    #[serde(alias = "speed_share")]
     pub speed_ratio: f64,
     /// Number of commands by result.
     pub counts: DriveCounts,
