@@ -154,6 +154,7 @@ pub struct DriveStatus {
     /// command.
     pub command_age_ms: Option<f64>,
     /// Fraction of the robot's speed limit that this age permits, 0 to 1.
+    #[serde(alias = "speed_share")]
     pub speed_ratio: f64,
     /// Number of commands by result.
     pub counts: DriveCounts,
@@ -337,5 +338,18 @@ mod tests {
         let newer = r#"{"gate":{"cause":"meteor","reduced_ticks":3,"counts":[]}}"#;
         let status: SafetyStatus = serde_json::from_str(newer).unwrap();
         assert_eq!(status.gate.cause, Some(GateCause::Other));
+    }
+
+    #[test]
+    fn a_teleoperation_state_of_an_older_agent_is_read_under_its_former_name() {
+        let counts = serde_json::to_string(&DriveCounts::default()).unwrap();
+        let older = format!(r#"{{"command_age_ms":180.0,"speed_share":0.5,"counts":{counts}}}"#);
+        let status: DriveStatus = serde_json::from_str(&older).unwrap();
+        let expected = DriveStatus {
+            command_age_ms: Some(180.0),
+            speed_ratio: 0.5,
+            counts: DriveCounts::default(),
+        };
+        assert_eq!(status, expected);
     }
 }
