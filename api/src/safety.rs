@@ -339,4 +339,17 @@ mod tests {
         let status: SafetyStatus = serde_json::from_str(newer).unwrap();
         assert_eq!(status.gate.cause, Some(GateCause::Other));
     }
+
+    #[test]
+    fn a_teleoperation_state_of_an_older_agent_is_read_under_its_former_name() {
+        let counts = serde_json::to_string(&DriveCounts::default()).unwrap();
+        let older = format!(r#"{{"command_age_ms":180.0,"speed_share":0.5,"counts":{counts}}}"#);
+        let status: DriveStatus = serde_json::from_str(&older).unwrap();
+        let expected = DriveStatus {
+            command_age_ms: Some(180.0),
+            speed_ratio: 0.5,
+            counts: DriveCounts::default(),
+        };
+        assert_eq!(status, expected);
+    }
 }

@@ -4,8 +4,9 @@
 
 OPENAPI is the committed description, `server/openapi.json`. A validator reads it, a generator writes a
 client in Python from it, and every module of that client is imported. With a server, the generated client
-lists its sites, and Schemathesis sends requests that the description allows or forbids: no response may be
-a 5xx or differ from its schema. The server must be one for tests, since the requests change it.
+lists its sites, and Schemathesis sends requests that the description allows or forbids: no response may have
+a status of 500 to 599, or a status, content type or body that the description does not have. The server must
+be one for tests, since the requests change it.
 """
 
 import argparse
@@ -35,7 +36,10 @@ def parsed():
     arguments.add_argument("--seconds", type=int, default=60, help="time for requests to the server")
     arguments.add_argument("--seed", type=int, default=1)
     arguments.add_argument("--json", action="store_true", help="print one object")
-    return arguments.parse_args()
+    found = arguments.parse_args()
+    if found.server is not None and (not found.server or found.token is None):
+        arguments.error("--server needs a URL, and the file --token")
+    return found
 
 
 def check(name, goal, value, holds):
@@ -52,7 +56,7 @@ def validated(openapi):
 
 
 def generated(openapi, folder):
-    """Returns the name of the client's package, or None, and the number of warnings."""
+    """Returns the name of the client's package, or None if the generator failed, and the number of warnings."""
     binaries = Path(sys.executable).parent
     command = [binaries / "openapi-python-client", "generate", "--path", openapi, "--output-path", folder, "--overwrite"]
     path = {"PATH": f"{binaries}:/usr/bin:/bin"}
@@ -60,9 +64,10 @@ def generated(openapi, folder):
     output = ended.stdout + ended.stderr
     warnings = output.count("Unable to") + output.count("WARNING")
     packages = [found.parent.name for found in folder.glob("*/client.py")]
-    if ended.returncode != 0 or warnings > 0 or len(packages) != 1:
+    is_generated = ended.returncode == 0 and len(packages) == 1
+    if not is_generated or warnings > 0:
         print(output, file=sys.stderr)
-    return (packages[0] if len(packages) == 1 else None), warnings
+    return (packages[0] if is_generated else None), warnings
 
 
 def imported(package):
@@ -72,7 +77,7 @@ def imported(package):
         try:
             importlib.import_module(module.name)
             counts[True] += 1
-        except ImportError as error:
+        except (ImportError, SyntaxError, NameError, TypeError) as error:
             print(f"{module.name}: {error}", file=sys.stderr)
             counts[False] += 1
     return counts[True], counts[False]
@@ -97,10 +102,11 @@ def fuzzed(arguments, token, folder):
     if not report.exists():
         sys.exit(f"clients.py: Schemathesis ended with {ended.returncode}: {ended.stdout}{ended.stderr}")
     found = json.loads(report.read_text())
-    failures = len(found["failures"]) + len(found["errors"])
+    # A run that ended early has no operations, and is a failure too.
+    failures = len(found["failures"]) + len(found["errors"]) + (0 if found["complete"] else 1)
     if failures > 0:
-        print(ended.stdout, file=sys.stderr)
-    return found["operations"]["tested"], found["test_cases"]["generated"], failures
+        print(ended.stdout, ended.stderr, file=sys.stderr)
+    return (found["operations"] or {"tested": 0})["tested"], found["test_cases"]["generated"], failures
 
 
 def main():
@@ -110,7 +116,8 @@ def main():
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         package, warnings = generated(arguments.openapi, folder / "client")
-        checks.append(check("warnings of the generator of clients", "= 0", warnings, package is not None and warnings == 0))
+        checks.append(check("a client was generated", True, package is not None, package is not None))
+        checks.append(check("warnings of the generator of clients", "= 0", warnings, warnings == 0))
         if package is not None:
             sys.path.insert(0, str(folder / "client"))
             modules, broken = imported(package)

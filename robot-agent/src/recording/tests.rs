@@ -1,4 +1,4 @@
-//! Records on the bench: run again to the bit, changed, torn, simplified out, and on a disk that
+//! Records on the bench: run again to the bit, changed, torn, thinned out, and on a disk that
 //! refuses.
 
 use std::collections::BTreeMap;

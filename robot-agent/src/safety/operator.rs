@@ -69,6 +69,7 @@ pub(crate) struct TeleoperationView {
     /// Commanded twist, and its expiry, microseconds.
     pub(crate) wanted: Option<(Twist, u64)>,
     /// Fraction of the maximum speed that the age of the commands allows, 0 to 1.
+    // Older records name the field `speed_share`.
     #[serde(alias = "speed_share")]
     pub(crate) speed_ratio: f64,
 }

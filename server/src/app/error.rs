@@ -136,7 +136,7 @@ pub enum AppError {
     /// Robots still hold certificates of the authority that is to be retired.
     #[error(
         "{count} robots still hold certificates of the former authority: {first}; wait until they \
-         have connected, or force it; then each of them must join again"
+         have connected; if you force it, each of them must join again"
     )]
     RobotsLeft {
         /// How many.

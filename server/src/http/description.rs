@@ -13,7 +13,7 @@ use utoipa::openapi::{Components, Content, OpenApi, Ref, RefOr, Response, Respon
 
 use super::identity;
 
-/// Requests that are accepted with any body: a stop is never refused for its form.
+/// Requests whose body may have any form: a stop is refused only for a wrong `site`.
 const LENIENT_REQUESTS: [&str; 2] = ["StopFleet", "StopRobot"];
 
 /// Completes the description: problems as the responses to errors, credentials, a description of each

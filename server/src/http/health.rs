@@ -36,7 +36,8 @@ pub struct StorageStatus {
     pub damaged: Option<String>,
     /// Free bytes on the disk of the database; `null` if the operating system does not report them.
     pub disk_free_bytes: Option<u64>,
-    /// Whether `disk_free_bytes` is below the configured `storage.disk_free_min_mib`.
+    /// Whether `disk_free_bytes` is below the configured `storage.disk_free_min_mib`; then true until
+    /// it exceeds that by 10 %.
     pub disk_low: bool,
     /// Size of the database file, bytes; `null` if the operating system does not report it.
     pub database_bytes: Option<u64>,

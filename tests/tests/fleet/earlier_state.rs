@@ -35,7 +35,13 @@ const MEANS: [&str; 2] = [".effective_track_ratio.value", ".friction.theta"];
 /// Largest difference of a mean, as a share.
 const MEAN_DIFFERENCE_MAX: f64 = 0.02;
 /// Keys that were renamed since, by their earlier names.
-const RENAMED: [(&str, &str); 1] = [("theta_sd", "theta_std_dev")];
+const RENAMED: [(&str, &str); 5] = [
+    ("first_sure_alone_s", "first_known_alone_s"),
+    ("refused_why", "refusal_reason"),
+    ("sure_alone_s", "known_alone_s"),
+    ("sure_s", "known_s"),
+    ("theta_sd", "theta_std_dev"),
+];
 /// Days for which the server surely keeps audit entries, and tokens that are over.
 const KEPT_DAYS: i64 = 390;
 /// What it removes then.

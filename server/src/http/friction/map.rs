@@ -101,7 +101,8 @@ pub(in crate::http) struct MapQuery {
     /// all values of every cell: `json`, `geojson`, `csv`, `parquet`. When absent, `Accept` selects
     /// the format.
     format: Option<String>,
-    /// Lowest x of the area in the site frame, metres; that of the measured area when absent.
+    /// Lowest x of the area in the site frame, metres; that of the measured area when no bound is
+    /// given, else that of the whole map when absent.
     x_min_m: Option<f64>,
     /// Lowest y of the area in the site frame, metres.
     y_min_m: Option<f64>,
