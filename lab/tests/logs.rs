@@ -79,7 +79,7 @@ fn record(
 
 fn analysed(
     file: &Path,
-    requested_topics: &RequestedTopics,
+    requested: &RequestedTopics,
     options: &Options,
 ) -> anyhow::Result<Analysis> {
     let recording = Recording::open(&[file.to_owned()])?;
@@ -90,7 +90,7 @@ fn analysed(
         settings: None,
         rate_hz: 100.0,
     };
-    let mapping = choose(&recording, &contents, &robot, requested_topics)?;
+    let mapping = choose(&recording, &contents, &robot, requested)?;
     let begin_ns = contents.topics.iter().map(|topic| topic.first_ns).min();
     let begin_ns = begin_ns.context("it has messages")?;
     Ok(analyse(&recording, &mapping, &robot, options, begin_ns)?)
@@ -101,11 +101,11 @@ fn a_recording_of_the_agent_gives_what_the_agent_said() {
     let folder = tempfile::tempdir().unwrap();
     let (file, said) = record(folder.path(), EstimatorPrior::default()).unwrap();
     let said = said.expect("the robot measures torque");
-    let requested_topics = RequestedTopics {
+    let requested = RequestedTopics {
         effort: Some(Effort::Torque),
         ..RequestedTopics::default()
     };
-    let analysis = analysed(&file, &requested_topics, &OPTIONS).unwrap();
+    let analysis = analysed(&file, &requested, &OPTIONS).unwrap();
     assert!(
         analysis.checks.iter().all(|check| check.holds),
         "{:?}",

@@ -254,13 +254,8 @@ impl Tracker {
             let action =
                 IntegralAction::divide(&gains, &config, reference, (&sideslip, &drift), free);
             self.integrate(action.integral_1_m3 * cross_track_m * speed_m_s * dt_s);
-            let error_m = if cross_track_m.abs() < ADAPTATION_DEAD_ZONE_M {
-                0.0
-            } else {
-                cross_track_m
-            };
             let tick = AdaptationTick {
-                error_m: action.adaptation_share * error_m,
+                error_m: action.adaptation_share * outside_dead_zone(cross_track_m),
                 dt_s,
             };
             self.adapt(&sideslip, knowledge, tick);
@@ -466,4 +461,13 @@ pub fn desaturated(model: &RobotModel, twist: Twist) -> (WheelSpeeds, bool) {
         },
         true,
     )
+}
+
+/// Returns the cross-track error that adapts, metres: 0 within [`ADAPTATION_DEAD_ZONE_M`].
+fn outside_dead_zone(cross_track_m: f64) -> f64 {
+    if cross_track_m.abs() < ADAPTATION_DEAD_ZONE_M {
+        0.0
+    } else {
+        cross_track_m
+    }
 }

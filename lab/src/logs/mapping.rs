@@ -297,7 +297,7 @@ pub fn choose(
     recording: &Recording,
     contents: &Contents,
     robot: &Robot,
-    requested_topics: &RequestedTopics,
+    requested: &RequestedTopics,
 ) -> Result<Mapping, MappingError> {
     let mut choice = Choice {
         contents,
@@ -309,10 +309,7 @@ pub fn choose(
         asked.clone().or(named)
     };
     let joints_of = configured.and_then(|settings| settings.joints.as_ref());
-    let asked = topic_of(
-        &requested_topics.wheels,
-        joints_of.map(|joints| &joints.topic),
-    );
+    let asked = topic_of(&requested.wheels, joints_of.map(|joints| &joints.topic));
     let joints = choice.unambiguous(
         asked.as_deref(),
         TopicType {
@@ -321,7 +318,7 @@ pub fn choose(
         },
     )?;
     let imu_of = configured.and_then(|settings| settings.imu.as_ref());
-    let asked = topic_of(&requested_topics.imu, imu_of.map(|imu| &imu.topic));
+    let asked = topic_of(&requested.imu, imu_of.map(|imu| &imu.topic));
     let imu = choice.unambiguous(
         asked.as_deref(),
         TopicType {
@@ -331,10 +328,10 @@ pub fn choose(
     )?;
     let odometry_of = configured.and_then(|settings| settings.odometry.as_ref());
     let asked = topic_of(
-        &requested_topics.odometry,
+        &requested.odometry,
         odometry_of.map(|odometry| &odometry.topic),
     );
-    let is_odometry_of_use = joints.is_none() || requested_topics.is_over_ground || asked.is_some();
+    let is_odometry_of_use = joints.is_none() || requested.is_over_ground || asked.is_some();
     let odometry = if is_odometry_of_use {
         choice.unambiguous(
             asked.as_deref(),
@@ -347,9 +344,9 @@ pub fn choose(
         None
     };
     let pose_of = configured.and_then(|settings| settings.pose.as_ref());
-    let asked = topic_of(&requested_topics.pose, pose_of.map(|pose| &pose.topic));
+    let asked = topic_of(&requested.pose, pose_of.map(|pose| &pose.topic));
     let pose = choice.optional(asked.as_deref(), &[COVARIANT_POSE, POSE], "--pose")?;
-    let is_over_ground = requested_topics.is_over_ground
+    let is_over_ground = requested.is_over_ground
         || odometry_of.is_some_and(|odometry| odometry.motion_of == MotionOf::Ground);
     let chosen = Chosen {
         joints: joints.as_deref(),
@@ -358,26 +355,19 @@ pub fn choose(
     };
     check_whole(&choice, chosen, is_over_ground)?;
     if let Some(topic) = odometry.as_deref().filter(|_| joints.is_none())
-        && requested_topics.odometry_track_m.is_none()
+        && requested.odometry_track_m.is_none()
         && configured.is_none()
     {
         return Err(MappingError::OdometryTrack(topic.to_owned()));
     }
     let joint_settings = match &joints {
-        Some(topic) => Some(joint_settings(
-            recording,
-            topic,
-            joints_of,
-            requested_topics,
-        )?),
+        Some(topic) => Some(joint_settings(recording, topic, joints_of, requested)?),
         None => None,
     };
     let mut settings = configured
         .cloned()
-        .unwrap_or_else(|| settings_of(&robot.model, requested_topics.odometry_track_m));
-    settings.imu = imu
-        .is_some()
-        .then(|| imu_settings(imu_of, requested_topics));
+        .unwrap_or_else(|| settings_of(&robot.model, requested.odometry_track_m));
+    settings.imu = imu.is_some().then(|| imu_settings(imu_of, requested));
     settings.odometry = odometry.is_some().then(|| OdometrySettings {
         topic: Name::default(),
         frame: String::new(),
@@ -433,18 +423,13 @@ fn check_whole(
     }
 }
 
-fn imu_settings(
-    configured: Option<&ImuSettings>,
-    requested_topics: &RequestedTopics,
-) -> ImuSettings {
-    let yaw_rad = requested_topics
-        .imu_yaw_rad
-        .or(configured.map(|imu| imu.yaw_rad));
+fn imu_settings(configured: Option<&ImuSettings>, requested: &RequestedTopics) -> ImuSettings {
+    let yaw_rad = requested.imu_yaw_rad.or(configured.map(|imu| imu.yaw_rad));
     ImuSettings {
         topic: Name::default(),
         frame: String::new(),
         yaw_rad: yaw_rad.unwrap_or(0.0),
-        is_upside_down: requested_topics.is_imu_upside_down
+        is_upside_down: requested.is_imu_upside_down
             || configured.is_some_and(|imu| imu.is_upside_down),
     }
 }

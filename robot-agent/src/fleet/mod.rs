@@ -304,19 +304,14 @@ impl FleetLink {
         let left = CancellationToken::new();
         let listeners = &listeners.until(&left);
         let command_sender = listeners.commands.clone();
-        let (on_event, urgent) = (
-            Arc::clone(&listeners.on_event),
-            Arc::clone(&listeners.urgent),
-        );
+        let on_event = Arc::clone(&listeners.on_event);
+        let urgent = Arc::clone(&listeners.urgent);
         let is_left = left.clone();
         let own_run = identity.boot.to_string();
         let take_query = move |query: Query| {
             // Addressed to another run of the agent: no reply.
-            if query
-                .parameters()
-                .get(keys::RUN)
-                .is_some_and(|run| run != own_run)
-            {
+            let run = query.parameters().get(keys::RUN);
+            if run.is_some_and(|run| run != own_run) {
                 return;
             }
             on_event(LinkEvent::ServerHeard);

@@ -8,7 +8,7 @@ use serde_json::Value;
 use tread_api::page::PAGE_LIMIT_MAX;
 use tread_api::problem::PROBLEM_MEDIA_TYPE;
 use utoipa::openapi::path::{Operation, PathItem};
-use utoipa::openapi::schema::{AdditionalProperties, Schema};
+use utoipa::openapi::schema::{AdditionalProperties, Object, Schema};
 use utoipa::openapi::{Components, Content, OpenApi, Ref, RefOr, Response, ResponseBuilder};
 
 use super::identity;
@@ -35,8 +35,11 @@ pub(super) fn complete(mut openapi: OpenApi) -> OpenApi {
         let sent = closure(&components.schemas, sent);
         for name in closure(&components.schemas, received) {
             // A client may get fields that a newer server has added.
-            if !sent.contains(&name) && !LENIENT_REQUESTS.contains(&name.as_str()) {
-                refuse_unknown_fields(components.schemas.get_mut(&name));
+            if !sent.contains(&name)
+                && !LENIENT_REQUESTS.contains(&name.as_str())
+                && let Some(RefOr::T(Schema::Object(request))) = components.schemas.get_mut(&name)
+            {
+                refuse_unknown_fields(request);
             }
         }
     }
@@ -90,12 +93,9 @@ fn closure(schemas: &BTreeMap<String, RefOr<Schema>>, names: BTreeSet<String>) -
 }
 
 /// States that a request with other fields is refused.
-fn refuse_unknown_fields(schema: Option<&mut RefOr<Schema>>) {
-    if let Some(RefOr::T(Schema::Object(object))) = schema
-        && !object.properties.is_empty()
-        && object.additional_properties.is_none()
-    {
-        object.additional_properties = Some(Box::new(AdditionalProperties::FreeForm(false)));
+fn refuse_unknown_fields(request: &mut Object) {
+    if !request.properties.is_empty() && request.additional_properties.is_none() {
+        request.additional_properties = Some(Box::new(AdditionalProperties::FreeForm(false)));
     }
 }
 

@@ -1,4 +1,4 @@
-//! RequestedTopics of people that come between the decision for a command and its sending.
+//! Requests of people that come between the decision for a command and its sending.
 
 use tread_api::mission::{CreateMission, LinkPolicy, MissionState, StartPolicy};
 use tread_server::db::Location;

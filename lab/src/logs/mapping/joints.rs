@@ -93,7 +93,7 @@ pub(super) fn joint_settings(
     recording: &Recording,
     topic: &str,
     configured: Option<&JointSettings>,
-    requested_topics: &RequestedTopics,
+    requested: &RequestedTopics,
 ) -> Result<JointSettings, MappingError> {
     let names = names_of(recording, topic)?;
     let listed = || {
@@ -104,7 +104,7 @@ pub(super) fn joint_settings(
         left: joints.left.names.clone(),
         right: joints.right.names.clone(),
     });
-    let chosen = requested_topics.joints.clone().or(of_configuration);
+    let chosen = requested.joints.clone().or(of_configuration);
     let chosen = chosen.or_else(|| sides_of(&names));
     let chosen = chosen.ok_or_else(|| MappingError::Joints {
         topic: topic.to_owned(),
@@ -128,13 +128,11 @@ pub(super) fn joint_settings(
             },
             effort_sign: configured.map_or(1.0, |side| side.effort_sign),
         };
-    let [is_left_reversed, is_right_reversed] = requested_topics.reversed;
-    let ratio = requested_topics
+    let [is_left_reversed, is_right_reversed] = requested.reversed;
+    let ratio = requested
         .gear_ratio
         .or(configured.map(|joints| joints.gear_ratio));
-    let effort = requested_topics
-        .effort
-        .or(configured.map(|joints| joints.effort));
+    let effort = requested.effort.or(configured.map(|joints| joints.effort));
     Ok(JointSettings {
         topic: Name::default(),
         left: side(

@@ -17,7 +17,7 @@ fn topic(name: &str, kind: &str) -> Topic {
 }
 
 /// Chooses among topics that have no joints to be read.
-fn chosen(topics: Vec<Topic>, requested_topics: &RequestedTopics) -> Result<Mapping, MappingError> {
+fn chosen(topics: Vec<Topic>, requested: &RequestedTopics) -> Result<Mapping, MappingError> {
     let contents = Contents {
         topics,
         torn: Vec::new(),
@@ -29,7 +29,7 @@ fn chosen(topics: Vec<Topic>, requested_topics: &RequestedTopics) -> Result<Mapp
         rate_hz: 100.0,
     };
     let recording = Recording::open(&[]).unwrap();
-    choose(&recording, &contents, &robot, requested_topics)
+    choose(&recording, &contents, &robot, requested)
 }
 
 #[test]
@@ -37,46 +37,45 @@ fn what_is_missing_or_ambiguous_is_said_with_the_topics_that_there_are() {
     let wheels = || topic("/joint_states", JOINT_STATE);
     let imus = || vec![topic("/a/imu", IMU), topic("/b/imu", IMU), wheels()];
     let none = RequestedTopics::default();
-    let refused = |topics, requested_topics: &RequestedTopics| {
-        chosen(topics, requested_topics).unwrap_err().to_string()
-    };
+    let refused =
+        |topics, requested: &RequestedTopics| chosen(topics, requested).unwrap_err().to_string();
     let two = refused(imus(), &none);
     assert!(
         two.contains("--imu") && two.contains("/b/imu  sensor_msgs/msg/Imu"),
         "{two}"
     );
-    let requested_topics = RequestedTopics {
+    let requested = RequestedTopics {
         imu: Some("b/imu".to_owned()),
         ..RequestedTopics::default()
     };
     // The topics are found, and the next question is which joints are whose.
-    let next = refused(imus(), &requested_topics);
+    let next = refused(imus(), &requested);
     assert!(next.contains("--joints"), "{next}");
-    let requested_topics = RequestedTopics {
+    let requested = RequestedTopics {
         imu: Some("/joint_states".to_owned()),
         ..RequestedTopics::default()
     };
-    let wrong = refused(imus(), &requested_topics);
+    let wrong = refused(imus(), &requested);
     assert!(
         wrong.contains(JOINT_STATE) && wrong.contains("is needed"),
         "{wrong}"
     );
-    let requested_topics = RequestedTopics {
+    let requested = RequestedTopics {
         wheels: Some("/wheels".to_owned()),
         ..RequestedTopics::default()
     };
-    assert!(refused(imus(), &requested_topics).contains("there is no topic `/wheels`"));
+    assert!(refused(imus(), &requested).contains("there is no topic `/wheels`"));
     assert!(refused(vec![wheels()], &none).contains("yaw rate"));
     assert!(refused(vec![topic("/imu", IMU)], &none).contains("wheel speeds"));
     let odometry = || topic("/odom", ODOMETRY);
     assert!(refused(vec![odometry()], &none).contains("θ needs a gyro"));
     let both = || vec![odometry(), topic("/imu", IMU)];
     assert!(refused(both(), &none).contains("--odometry-track-m"));
-    let requested_topics = RequestedTopics {
+    let requested = RequestedTopics {
         odometry_track_m: Some(0.8),
         ..RequestedTopics::default()
     };
-    let mapping = chosen(both(), &requested_topics).unwrap();
+    let mapping = chosen(both(), &requested).unwrap();
     assert_eq!(mapping.topics(), ["/imu", "/odom"]);
     assert!((mapping.settings.command.base_track_m - 0.8).abs() < 1.0e-12);
 }
@@ -89,19 +88,19 @@ fn several_poses_are_left_out_and_that_is_said() {
         topic("/amcl", COVARIANT_POSE),
         topic("/mocap", POSE),
     ];
-    let mut requested_topics = RequestedTopics {
+    let mut requested = RequestedTopics {
         odometry_track_m: Some(0.8),
         ..RequestedTopics::default()
     };
-    let mapping = chosen(topics.clone(), &requested_topics).unwrap();
+    let mapping = chosen(topics.clone(), &requested).unwrap();
     assert_eq!(mapping.pose, None);
     assert!(
         mapping.notices[0].contains("/amcl, /mocap"),
         "{:?}",
         mapping.notices
     );
-    requested_topics.pose = Some("/mocap".to_owned());
-    let mapping = chosen(topics, &requested_topics).unwrap();
+    requested.pose = Some("/mocap".to_owned());
+    let mapping = chosen(topics, &requested).unwrap();
     assert_eq!(mapping.pose, Some(("/mocap".to_owned(), POSE)));
 }
 

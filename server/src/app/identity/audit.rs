@@ -388,7 +388,7 @@ impl App {
             match *used {
                 UsedCredential::Token(token) => db::tokens::touch(&mut tx, token, *at).await?,
                 UsedCredential::Session(session) => {
-                    db::sessions::touch(&mut tx, session, *at).await?
+                    db::sessions::touch(&mut tx, session, *at).await?;
                 }
             }
         }
