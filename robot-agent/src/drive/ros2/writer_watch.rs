@@ -9,7 +9,7 @@
 //! * its clock restarted too, the writer had been silent for [`SILENT_AFTER`], and
 //!   [`AGREE_WITHOUT_CLOCK_MIN`] consecutive messages are none of the last [`REMEMBERED`].
 //!
-//! The caller checks a message by [`WriterWatch::look`], and calls [`WriterWatch::follow`] only if
+//! The caller checks a message by [`WriterWatch::check`], and calls [`WriterWatch::follow`] only if
 //! its content is valid, so that repeated old data never count as a restarted writer.
 
 use std::time::Duration;
