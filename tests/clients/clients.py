@@ -92,7 +92,7 @@ def listed_sites(package, server, token):
 def fuzzed(arguments, token, folder):
     """Returns the numbers of operations that were tested, of requests and of failures."""
     report = folder / "report.json"
-    command = [Path(sys.executable).parent / "schemathesis", "run", arguments.openapi, "--url", arguments.server]
+    command = [Path(sys.executable).parent / "schemathesis", "run", arguments.openapi.resolve(), "--url", arguments.server]
     command += ["--header", f"authorization: Bearer {token}", "--checks", ",".join(CHECKS)]
     command += ["--phases", "examples,coverage,fuzzing", "--max-time", str(arguments.seconds), "--seed", str(arguments.seed)]
     command += ["--continue-on-failure", "--report", "json", "--report-json-path", report]
