@@ -84,6 +84,23 @@ fn the_content_of_each_variant_is_a_schema_with_a_name() {
     }
 }
 
+/// A request with an unknown field is refused; a response may have fields that a newer server adds.
+#[test]
+fn requests_refuse_unknown_fields_and_responses_do_not() {
+    let description = serde_json::to_value(tread_server::http::openapi()).unwrap();
+    let is_closed = |name: &str| {
+        let schema = &description["components"]["schemas"][name];
+        assert!(schema.is_object(), "{name}");
+        schema["additionalProperties"] == false
+    };
+    for request in ["CreateMission", "ReplaceGeofence", "UpdateRobot"] {
+        assert!(is_closed(request), "{request}");
+    }
+    for other in ["Mission", "Waypoints", "StopRobot", "StopFleet"] {
+        assert!(!is_closed(other), "{other}");
+    }
+}
+
 #[test]
 fn every_operation_has_a_name_of_its_own() {
     let description = serde_json::to_value(tread_server::http::openapi()).unwrap();
