@@ -40,6 +40,7 @@ pub use self::command::IncomingCommand;
 pub(crate) use self::error::zenoh_failed;
 pub use self::error::{AskError, LinkError, may_pass_later};
 pub use self::rotation::{ParallelAttempt, Rotation, Server};
+pub(crate) use self::session::config_of;
 pub use self::session::{session_config, start_jitter};
 pub use self::tunnel::{DialError, Tunnel};
 use crate::membership::Membership;

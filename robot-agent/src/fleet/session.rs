@@ -123,6 +123,16 @@ pub fn session_config(server: &str) -> Result<zenoh::Config, LinkError> {
             OPEN_TIMEOUT_MS.to_string(),
         ),
     ];
+    config_of(settings)
+}
+
+/// Creates a configuration of zenoh from settings, each a key and its value as JSON.
+///
+/// # Errors
+/// [`LinkError`] if zenoh refuses a setting.
+pub(crate) fn config_of(
+    settings: impl IntoIterator<Item = (&'static str, String)>,
+) -> Result<zenoh::Config, LinkError> {
     let mut config = zenoh::Config::default();
     for (key, value) in settings {
         config

@@ -3,7 +3,7 @@
 use std::str::FromStr as _;
 
 use super::settings::{BusMode, BusSettings};
-use crate::fleet::{LinkError, zenoh_failed};
+use crate::fleet::{LinkError, config_of};
 
 /// Timeout of a series of attempts to connect, after which the thread checks whether it shall end,
 /// milliseconds.
@@ -17,7 +17,7 @@ const BUS_LEASE_MS: u32 = 3_000;
 /// Creates the configuration of the session on the bus.
 ///
 /// # Errors
-/// [`LinkError::Endpoint`] for an invalid endpoint.
+/// [`LinkError::Endpoint`] for an invalid endpoint; [`LinkError`] if zenoh refuses a setting.
 pub fn session_config(bus: &BusSettings) -> Result<zenoh::Config, LinkError> {
     zenoh::config::EndPoint::from_str(&bus.endpoint).map_err(|problem| LinkError::Endpoint {
         endpoint: bus.endpoint.clone(),
@@ -48,13 +48,7 @@ pub fn session_config(bus: &BusSettings) -> Result<zenoh::Config, LinkError> {
         // error for each one once the machine's clock was set back. Stamps are in the messages.
         ("timestamping/enabled", "false".to_owned()),
     ];
-    let mut config = zenoh::Config::default();
-    for (key, value) in settings {
-        config
-            .insert_json5(key, &value)
-            .map_err(zenoh_failed("take its configuration"))?;
-    }
-    Ok(config)
+    config_of(settings)
 }
 
 #[cfg(test)]
