@@ -7,7 +7,7 @@
 //! ended first: a server does not stop because of itself. Programs that only read do not take the lock.
 //!
 //! A standby waits for the lock ([`DatabaseLock::wait`]). The session that holds it asks something every
-//! [`LOOK_INTERVAL`], so a server that is frozen, or cut off, shows as a process whose sessions were all silent
+//! [`CHECK_INTERVAL`], so a server that is frozen, or cut off, shows as a process whose sessions were all silent
 //! for longer: the standby ends all sessions of that server then, also one in the middle of a write. A server
 //! that wakes up writes no more, since the new one has claimed the database ([`super::Db::claim`]).
 
@@ -25,18 +25,18 @@ use tracing::warn;
 
 use super::{OpenError, connections, open};
 
-/// Interval at which a server looks whether it still has the lock.
-const LOOK_INTERVAL: Duration = Duration::from_millis(100);
+/// Interval at which a server checks that it still has the lock.
+const CHECK_INTERVAL: Duration = Duration::from_millis(100);
 /// Interval at which a standby tries to take the lock.
 const STANDBY_INTERVAL: Duration = Duration::from_millis(100);
 /// Interval at which a standby tries to reach PostgreSQL.
 const RETRY_INTERVAL: Duration = Duration::from_millis(250);
 /// Maximum time for an answer about it.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
-/// Maximum time between two looks of a standby at a silent server: PostgreSQL may have stood still itself.
-const LOOK_GAP_MAX: Duration = Duration::from_millis(500);
-/// Number of late looks in a row after which it is said that a silent server would not be noticed.
-const LATE_LOOKS_MAX: u32 = 20;
+/// Maximum time between two checks of a silent server by a standby: PostgreSQL may have stood still itself.
+const CHECK_GAP_MAX: Duration = Duration::from_millis(500);
+/// Number of late checks in a row after which it is said that a silent server would not be noticed.
+const LATE_CHECKS_MAX: u32 = 20;
 /// Maximum time for an attempt to take the lock: that for a connection and an answer.
 const ATTEMPT_TIMEOUT: Duration = Duration::from_secs(15);
 /// Interval at which the lock is tried while a session ends that holds it.
@@ -209,7 +209,7 @@ impl Drop for DatabaseLock {
     }
 }
 
-/// Looks whether the lock is held, and takes it again when its connection was lost. Returns when
+/// Checks that the lock is held, and takes it again when its connection was lost. Returns when
 /// another server has it.
 async fn keep(
     mut connection: PgConnection,
@@ -218,9 +218,9 @@ async fn keep(
     epoch: &OnceLock<i64>,
 ) -> LockError {
     loop {
-        sleep(LOOK_INTERVAL).await;
-        let looking = sqlx::query("SELECT 1").execute(&mut connection);
-        if matches!(timeout(ANSWER_TIMEOUT, looking).await, Ok(Ok(_))) {
+        sleep(CHECK_INTERVAL).await;
+        let checking = sqlx::query("SELECT 1").execute(&mut connection);
+        if matches!(timeout(ANSWER_TIMEOUT, checking).await, Ok(Ok(_))) {
             continue;
         }
         warn!("the connection that holds the lock of the database is lost");
@@ -230,7 +230,7 @@ async fn keep(
                 Ok(locked) => break locked,
                 Err(in_use @ LockError::InUse { .. }) => return in_use,
                 // PostgreSQL is away, as every transaction notices too.
-                Err(LockError::Open(_)) => sleep(LOOK_INTERVAL).await,
+                Err(LockError::Open(_)) => sleep(CHECK_INTERVAL).await,
             }
         };
     }
@@ -256,10 +256,10 @@ struct Watch {
     /// The session that holds the lock, and since when this standby has seen nothing newer of it, by its own
     /// clock.
     seen: Option<(Session, Instant)>,
-    /// When it looked last: a look that comes late says nothing about the time before.
-    looked_at: Option<Instant>,
-    /// Number of looks in a row that came late.
-    late_looks: u32,
+    /// Time of its last check: a check that comes late says nothing about the time before.
+    checked_at: Option<Instant>,
+    /// Number of checks in a row that came late.
+    late_checks: u32,
     has_warned: bool,
 }
 
@@ -337,10 +337,10 @@ impl Watch {
     /// Returns whether the server that has the lock has asked nothing for longer than permitted. A step of any
     /// clock changes nothing: only whether there was a statement counts.
     fn is_silent(&mut self, session: Option<&Session>, silence_max: Duration) -> bool {
-        let before = self.looked_at.replace(Instant::now());
-        let is_late = before.is_none_or(|before| before.elapsed() > LOOK_GAP_MAX);
-        self.late_looks = if is_late { self.late_looks + 1 } else { 0 };
-        if self.late_looks > LATE_LOOKS_MAX {
+        let before = self.checked_at.replace(Instant::now());
+        let is_late = before.is_none_or(|before| before.elapsed() > CHECK_GAP_MAX);
+        self.late_checks = if is_late { self.late_checks + 1 } else { 0 };
+        if self.late_checks > LATE_CHECKS_MAX {
             self.warn_once(&"PostgreSQL answers too slowly");
         }
         match (&self.seen, session) {
@@ -436,7 +436,7 @@ async fn locked_again(
         if try_lock(&mut connection).await.map_err(refused)? {
             return Ok(connection);
         }
-        sleep(LOOK_INTERVAL).await;
+        sleep(CHECK_INTERVAL).await;
     }
     let holder = holder(&mut connection).await.ok().flatten();
     Err(in_use(address, holder))
