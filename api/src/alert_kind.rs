@@ -1,6 +1,8 @@
 //! Kinds of alerts: the codes that this version raises. Clients offer them for selection. The
 //! server refuses a webhook that is limited to an unknown kind.
 
+use serde::{Deserialize as _, Deserializer};
+
 use crate::ids::AlertCode;
 
 /// Codes that servers and agents of this version raise, in alphabetical order. Codes about dropped
@@ -19,7 +21,6 @@ pub const ALERT_KINDS: [&str; 42] = [
     "command-second-writer",
     "database-damaged",
     "disk-low",
-    "does-not-stand",
     "dug-in",
     "loop-overrun",
     "mission-expired",
@@ -40,6 +41,7 @@ pub const ALERT_KINDS: [&str; 42] = [
     "sensor-frozen",
     "sensor-inconsistent",
     "server-restarted",
+    "standstill-not-reached",
     "stop-unconfirmed",
     "stopped",
     "storage-unwritable",
@@ -51,9 +53,34 @@ pub const ALERT_KINDS: [&str; 42] = [
 ];
 /// Prefix of the codes about dropped messages of a robot's base; the reason follows it.
 pub const BASE_PREFIX: &str = "base-";
+/// Former codes of earlier versions, each with the present one.
+const RENAMED: [(&str, &str); 1] = [("does-not-stand", "standstill-not-reached")];
 
-/// Returns whether agents or servers of this version raise alerts of this kind.
+/// Returns whether agents or servers of this version raise alerts of this kind, also by its former
+/// code, because webhooks that were stored by an earlier version have it.
 pub fn is_known(code: &AlertCode) -> bool {
     let code = code.as_str();
-    ALERT_KINDS.contains(&code) || code.starts_with(BASE_PREFIX)
+    ALERT_KINDS.contains(&code)
+        || code.starts_with(BASE_PREFIX)
+        || RENAMED.iter().any(|(former, _)| *former == code)
+}
+
+/// Returns the former code of a kind; `None` if the kind was not renamed.
+pub fn former(code: &AlertCode) -> Option<AlertCode> {
+    let renamed = RENAMED
+        .iter()
+        .find(|(_, present)| *present == code.as_str());
+    renamed.and_then(|(former, _)| former.parse().ok())
+}
+
+/// Deserialises the code of a report; a former code of an earlier version becomes the present one.
+pub(crate) fn deserialize_present<'de, D>(deserializer: D) -> Result<AlertCode, D::Error>
+where
+    D: Deserializer<'de>,
+{
+    let code = AlertCode::deserialize(deserializer)?;
+    let renamed = RENAMED.iter().find(|(former, _)| *former == code.as_str());
+    Ok(renamed
+        .and_then(|(_, present)| present.parse().ok())
+        .unwrap_or(code))
 }

@@ -35,7 +35,7 @@ pub enum DriveRequest {
     /// Takes the lease, also from another socket that has it.
     Take(DriverName),
     /// Gives the lease back; the robot's target velocity is zero at once.
-    Release(Nothing),
+    Release(EmptyBody),
     /// Commands a velocity for a limited time. A newer command replaces an older one.
     Drive(Drive),
     /// Stops the robot and latches the stop. Needs no lease.
@@ -45,7 +45,7 @@ pub enum DriveRequest {
 /// Object without fields.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
-pub struct Nothing {}
+pub struct EmptyBody {}
 
 /// Person who asks for the lease.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
@@ -165,7 +165,8 @@ pub struct DriveView {
     pub link: LinkState,
     /// Time since the server received the robot's last state, milliseconds; `null` before the first
     /// one.
-    pub heard_age_ms: Option<u64>,
+    #[serde(alias = "heard_age_ms")]
+    pub state_age_ms: Option<u64>,
     /// Operating mode; `null` before the first state.
     pub mode: Option<RobotMode>,
     /// Pose in the site frame; `null` if unknown.

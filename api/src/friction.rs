@@ -656,7 +656,8 @@ pub struct MapChange {
     /// friction of any cell may have changed.
     pub terrain_revision: u64,
     /// Whether any part of the map may have changed; `boxes` is empty then.
-    pub everything: bool,
+    #[serde(alias = "everything")]
+    pub entire_map: bool,
     /// Changed boxes of cells, at most 256.
     pub boxes: Vec<CellBox>,
 }

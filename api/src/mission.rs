@@ -203,7 +203,8 @@ pub struct Mission {
     pub cause: Cause,
     /// Whether a pause is requested. While this differs from `state`, the robot has not confirmed
     /// it yet.
-    pub pause_wanted: bool,
+    #[serde(alias = "pause_wanted")]
+    pub pause_requested: bool,
     /// Number of the present revision of the trajectory.
     pub revision: u32,
     /// Hash of the trajectory with its revision.
@@ -374,6 +375,16 @@ mod tests {
             let name = serde_json::to_value(cause).unwrap();
             assert_eq!(name, cause.as_str());
             assert_eq!(Cause::from_name(cause.as_str()), Some(cause));
+        }
+        for (former, cause) in [
+            ("robot_forgot", Cause::RobotLostMission),
+            ("noted", Cause::Recorded),
+        ] {
+            assert_eq!(Cause::from_name(former), Some(cause));
+            assert_eq!(
+                serde_json::from_value::<Cause>(former.into()).unwrap(),
+                cause
+            );
         }
         for state in MissionState::ALL {
             assert_eq!(serde_json::to_value(state).unwrap(), state.as_str());

@@ -213,6 +213,7 @@ impl Severity {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct AlertReport {
     /// Kind of the alert, for programs: `[a-z0-9-]{1,63}`, such as `battery-low`.
+    #[serde(deserialize_with = "crate::alert_kind::deserialize_present")]
     pub code: AlertCode,
     /// Severity.
     pub severity: Severity,
@@ -364,7 +365,8 @@ pub struct RobotLive {
     /// Run of the agent.
     pub boot: BootId,
     /// Time since the server received the last state, milliseconds.
-    pub heard_age_ms: u64,
+    #[serde(alias = "heard_age_ms")]
+    pub state_age_ms: u64,
     /// Wall clock of the robot in that state; it may be wrong.
     pub robot_time: Timestamp,
     /// Offset of the robot's wall clock from the server's, milliseconds, positive if the robot's is
@@ -472,8 +474,8 @@ pub struct LoopStatus {
     pub lost_segments: u64,
     /// Number of measurements since the start that could not be assigned to a cell, because the
     /// site or the position was unknown.
-    #[serde(default)]
-    pub unplaced_blocks: u64,
+    #[serde(default, alias = "unplaced_blocks")]
+    pub unmapped_blocks: u64,
     /// Number of samples of the base lost since the start, because newer ones arrived before a
     /// tick.
     #[serde(default)]

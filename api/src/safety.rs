@@ -115,7 +115,8 @@ pub struct GateCount {
     /// The cause.
     pub cause: GateCause,
     /// Number of times that it began to be the strictest cause, since the start of the agent.
-    pub times: u64,
+    #[serde(alias = "times")]
+    pub count: u64,
 }
 
 /// State of the gate, the last stage of the control loop, which can only reduce a command.
@@ -180,26 +181,30 @@ pub struct LimitStatus {
 /// Whether a robot that is commanded to rest is at standstill, measured by wheels, odometry, gyro
 /// and position.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
-pub struct StandingStatus {
+pub struct StandstillStatus {
     /// Measured state.
-    pub state: StandingState,
+    pub state: StandstillState,
     /// Time from the command to rest until standstill, milliseconds; `null` before standstill.
-    pub took_ms: Option<u64>,
+    #[serde(alias = "took_ms")]
+    pub stopping_time_ms: Option<u64>,
 }
 
 /// Measured state of a robot that is commanded to rest.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
-pub enum StandingState {
+pub enum StandstillState {
     /// Braking, or not yet at rest for long enough to be certain.
     #[default]
     Stopping,
     /// At standstill.
-    Standing,
+    #[serde(alias = "standing")]
+    Standstill,
     /// Still moving after the time in which it should have stopped: its base does not obey.
-    DoesNotStand,
+    #[serde(alias = "does_not_stand")]
+    StandstillNotReached,
     /// Moving again after standstill: it is pushed, rolls, or another program commands it.
-    Moves,
+    #[serde(alias = "moves")]
+    UnexpectedMotion,
     /// State that this version does not know, from a newer peer.
     #[serde(other)]
     Other,
@@ -227,8 +232,8 @@ pub struct SafetyStatus {
     #[serde(default)]
     pub limits_refused: u64,
     /// Whether the robot is at standstill, as measured; absent while it is permitted to drive.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub standing: Option<StandingStatus>,
+    #[serde(default, alias = "standing", skip_serializing_if = "Option::is_none")]
+    pub standstill: Option<StandstillStatus>,
     /// Revision of the geofence on the robot; absent before the robot has its site's definition.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fence_revision: Option<u64>,

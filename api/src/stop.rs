@@ -87,21 +87,25 @@ pub struct Stop {
     /// Reason, for people.
     pub reason: String,
     /// Time when the server received the request.
-    pub wanted_at: Timestamp,
+    #[serde(alias = "wanted_at")]
+    pub requested_at: Timestamp,
     /// Time when the robot confirmed the stop: its wheels are commanded to rest, and the stop
     /// survives a restart of the robot. `null` before that.
     pub confirmed_at: Option<Timestamp>,
     /// Time when the server received the robot's report that it is at standstill, measured by
     /// wheels, odometry, gyro and position; `null` before that. A robot that does not come to rest
-    /// in time raises the alert `does-not-stand`.
-    pub standing_at: Option<Timestamp>,
+    /// in time raises the alert `standstill-not-reached`.
+    #[serde(alias = "standing_at")]
+    pub standstill_at: Option<Timestamp>,
     /// Whether the robot has not confirmed the stop within 300 ms. The server repeats the stop
     /// until it is confirmed.
     pub unconfirmed: bool,
     /// Name of the person who last requested to clear the stop; `null` if nobody did.
-    pub clear_asked_by: Option<String>,
+    #[serde(alias = "clear_asked_by")]
+    pub clear_requested_by: Option<String>,
     /// Time of that request; `null` if there was none.
-    pub clear_asked_at: Option<Timestamp>,
+    #[serde(alias = "clear_asked_at")]
+    pub clear_requested_at: Option<Timestamp>,
     /// Time when the robot cleared it; `null` before that.
     pub cleared_at: Option<Timestamp>,
     /// Newer stop of the same robot that replaced this one, since a robot has at most one stop in

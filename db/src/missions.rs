@@ -15,7 +15,7 @@ forward! {
     fn list(filter: &MissionFilter, limit: u32, bytes_max: usize) -> (Vec<MissionRow>, bool);
     fn compare_and_set(id: MissionId, transition: Transition<'_>) -> bool;
     fn add_facts(id: MissionId, facts: Facts) -> ();
-    fn set_pause_wanted(id: MissionId, wanted: bool) -> bool;
+    fn set_pause_requested(id: MissionId, requested: bool) -> bool;
     fn set_replacement(id: MissionId, replacement: Option<&Replacement>) -> ();
     fn swap_content(id: MissionId, from: u32, to: &Replacement) -> bool;
     fn set_silence(id: MissionId, since: Option<Timestamp>) -> ();

@@ -11,7 +11,7 @@ use tread_control::geometry::Point;
 
 use crate::control_loop::channels::Fault;
 use crate::control_loop::overrun::{Overrun, WINDOW_TICKS};
-use crate::control_loop::standing::{MotionEvidence, StandingReport};
+use crate::control_loop::standstill::{MotionEvidence, StandstillReport};
 use crate::control_loop::surface::Comparison;
 use crate::drive::Battery;
 use crate::drive::ros2::notices::{ForeignCommands, RecentNotices};
@@ -48,7 +48,7 @@ pub(crate) struct AlertInputs<'a> {
     /// Contradictions between sensors.
     pub(crate) findings: Findings,
     /// Result of the standstill watch.
-    pub(crate) standing: StandingReport,
+    pub(crate) standstill: StandstillReport,
 }
 
 /// State of the alerts with hysteresis.
@@ -170,22 +170,22 @@ fn sensor_alerts<'a>(findings: impl IntoIterator<Item = &'a Finding>) -> Vec<Ale
 }
 
 /// Returns the alert for a robot that moves although commanded to zero.
-fn standing_alert(report: &StandingReport) -> Option<AlertReport> {
+fn standstill_alert(report: &StandstillReport) -> Option<AlertReport> {
     let measured = |shown: MotionEvidence| match shown {
         MotionEvidence::Speed(speed_m_s) => format!("{speed_m_s:.2} m/s"),
         MotionEvidence::Turn(turn_rad_s) => format!("{turn_rad_s:.2} rad/s"),
         MotionEvidence::Distance(distance_m) => format!("{distance_m:.1} m from where it stood"),
     };
-    let (code, text) = if let Some(shown) = report.does_not_stand {
+    let (code, text) = if let Some(shown) = report.standstill_not_reached {
         let text = format!(
-            "the robot is commanded to rest and does not stand: {}; its base does not obey",
+            "the robot is commanded to rest and has not come to rest: {}; its base does not obey",
             measured(shown)
         );
-        ("does-not-stand", text)
+        ("standstill-not-reached", text)
     } else {
         let text = format!(
             "the robot stood and moves again: {}; it is pushed, rolls, or is driven by another program",
-            measured(report.moves?)
+            measured(report.unexpected_motion?)
         );
         ("moves-while-stopped", text)
     };
@@ -280,7 +280,7 @@ impl Alerts {
             alert("loop-overrun", Severity::Critical, text)
         });
         let mut alerts: Vec<AlertReport> = [
-            standing_alert(&causes.standing),
+            standstill_alert(&causes.standstill),
             battery,
             overrun,
             fault,

@@ -9,14 +9,16 @@ use tokio_util::sync::CancellationToken;
 use tracing::{info, warn};
 use tread_api::friction::LiveFriction;
 use tread_api::robot::{Aged, Battery, LoopStatus};
-use tread_api::safety::{self, GateCount, GateStatus, SafetyStatus, StandingState, StandingStatus};
+use tread_api::safety::{
+    self, GateCount, GateStatus, SafetyStatus, StandstillState, StandstillStatus,
+};
 use tread_api::wire::state::{FrictionReport, RobotState};
 use tread_control::gate::GateCause;
 
 use crate::alerts::{AlertInputs, Alerts};
 use crate::clock::SharedClock;
 use crate::control_loop::channels::{Shared, Snapshot};
-use crate::control_loop::standing::StandingReport;
+use crate::control_loop::standstill::StandstillReport;
 use crate::drive::ros2::notices::{ForeignCommands, RecentNotices};
 use crate::drive::ros2::refusal::Notice;
 use crate::drive::ros2::refusal::{Counts, DropMonitor, Source};
@@ -73,20 +75,20 @@ fn wire_cause(cause: GateCause) -> safety::GateCause {
 }
 
 /// Converts the result of the standstill watch to the wire's; `None` unless zero is commanded.
-fn wire_standing(report: &StandingReport) -> Option<StandingStatus> {
-    let state = if report.does_not_stand.is_some() {
-        StandingState::DoesNotStand
-    } else if report.moves.is_some() {
-        StandingState::Moves
-    } else if report.stands.is_some() {
-        StandingState::Standing
+fn wire_standstill(report: &StandstillReport) -> Option<StandstillStatus> {
+    let state = if report.standstill_not_reached.is_some() {
+        StandstillState::StandstillNotReached
+    } else if report.unexpected_motion.is_some() {
+        StandstillState::UnexpectedMotion
+    } else if report.standstill.is_some() {
+        StandstillState::Standstill
     } else {
-        StandingState::Stopping
+        StandstillState::Stopping
     };
-    let took = report.stands.map(|(_, took)| took.as_millis());
-    report.is_to_stand.then(|| StandingStatus {
+    let took = report.standstill.map(|(_, took)| took.as_millis());
+    report.is_rest_commanded.then(|| StandstillStatus {
         state,
-        took_ms: took.map(|took| u64::try_from(took).unwrap_or(u64::MAX)),
+        stopping_time_ms: took.map(|took| u64::try_from(took).unwrap_or(u64::MAX)),
     })
 }
 
@@ -115,7 +117,7 @@ impl Reporter {
             dug_in_at: snapshot.dug_in_at,
             overrun: snapshot.overrun,
             findings: snapshot.findings,
-            standing: snapshot.standing,
+            standstill: snapshot.standstill,
         };
         let counted = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
         RobotState {
@@ -141,7 +143,7 @@ impl Reporter {
                 ticks: snapshot.ticks,
                 overruns: counted(&self.shared.overruns),
                 lost_segments: counted(&self.shared.lost_segments),
-                unplaced_blocks: counted(&self.shared.unplaced_blocks),
+                unmapped_blocks: counted(&self.shared.unmapped_blocks),
                 lost_samples: counted(&self.shared.lost_samples),
                 lost_commands: counted(&self.shared.lost_commands),
                 tick_max_us: self.shared.tick_max_us.swap(0, Ordering::Relaxed),
@@ -173,16 +175,16 @@ impl Reporter {
                 cause: gate.cause.map(wire_cause),
                 reduced_ticks: gate.reduced_ticks,
                 counts: counts
-                    .filter(|(_, times)| *times > 0)
-                    .map(|(cause, times)| GateCount {
+                    .filter(|(_, count)| *count > 0)
+                    .map(|(cause, count)| GateCount {
                         cause: wire_cause(cause),
-                        times,
+                        count,
                     })
                     .collect(),
             },
             limits,
             limits_refused,
-            standing: wire_standing(&snapshot.standing),
+            standstill: wire_standstill(&snapshot.standstill),
             fence_revision: snapshot.fence_revision,
         }
     }
@@ -281,14 +283,14 @@ pub(crate) async fn log_losses(
             );
             segments = lost;
         }
-        let unplaced = shared.unplaced_blocks.load(Ordering::Relaxed);
-        if unplaced > blocks {
+        let unmapped = shared.unmapped_blocks.load(Ordering::Relaxed);
+        if unmapped > blocks {
             info!(
-                unplaced,
-                "{unplaced} measurements belong to no cell: site or pose was not known, the robot \
+                unmapped,
+                "{unmapped} measurements belong to no cell: site or pose was not known, the robot \
                  was outside of the grid, or its wheels were on two kinds of ground"
             );
-            blocks = unplaced;
+            blocks = unmapped;
         }
     }
 }

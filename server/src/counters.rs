@@ -103,7 +103,7 @@ counters! {
     /// Connections accepted on the robots' port.
     gate_connections,
     /// Connections to the robots' port closed because they did not begin with a TLS handshake.
-    gate_garbage,
+    gate_not_tls,
     /// Connections to the robots' port closed because no data arrived in time.
     gate_silent,
     /// Connections to the robots' port whose TLS handshake failed, for example without a
@@ -128,7 +128,7 @@ counters! {
     gate_retired,
     /// Connections to the robots' port closed by the robot because it does not trust the port's
     /// authority: a robot of another fleet, or one that missed a change of the authority.
-    gate_distrusted,
+    gate_untrusted,
     /// Connections of robots that could not be forwarded to a router.
     gate_router_failed,
     /// Sessions of robots that did not open: the link closed, a timeout expired, the session was
@@ -150,7 +150,7 @@ counters! {
     /// Mission reports ignored because the mission is of another robot or has other content.
     reports_foreign,
     /// Commands to end a mission that a robot reported and the server does not have as open.
-    missions_disowned,
+    missions_unknown,
     /// Routers reopened because they no longer answered.
     router_reopened,
     /// Health checks of a router that it did not answer.
@@ -160,7 +160,7 @@ counters! {
     /// Commands that their robot did not answer in time.
     commands_unanswered,
     /// Requests for states at a higher rate sent to watched robots, with repetitions.
-    state_rates_asked,
+    state_rates_requested,
     /// Stop commands sent to robots, with repetitions.
     stops_sent,
     /// Stop commands not confirmed by their robot within 300 ms.

@@ -283,9 +283,9 @@ async fn alerts_and_stops_are_the_same() {
         let stop = |number: u8, place: &str, name: &str, second: i64| {
             of::<tread_api::stop::Stop>(json!({
                 "id": id::<String>(number), "site": place, "robot": name, "by": "anna's", "reason": "\"Ä\"",
-                "wanted_at": at(second), "confirmed_at": (number == 2).then(|| at(second)),
-                "standing_at": null, "unconfirmed": false, "clear_asked_by": null,
-                "clear_asked_at": null, "cleared_at": null,
+                "requested_at": at(second), "confirmed_at": (number == 2).then(|| at(second)),
+                "standstill_at": null, "unconfirmed": false, "clear_requested_by": null,
+                "clear_requested_at": null, "cleared_at": null,
             }))
         };
         both!(both, stops::insert(&[stop(1, "yard", "rover-1", 5), stop(2, "field", "rover-1", 5)], 3));
@@ -338,7 +338,7 @@ async fn missions_and_restorations_are_the_same() {
         for (number, robot_pk, priority) in [(1, 1, 0), (2, 1, 5), (3, 2, 0), (4, 3, -1)] {
             let mission: tread_api::mission::Mission = of(json!({
                 "id": id::<String>(number), "site": "yard", "robot": "rover-1", "state": "queued",
-                "reason": null, "cause": "requested", "pause_wanted": number == 4, "revision": 1,
+                "reason": null, "cause": "requested", "pause_requested": number == 4, "revision": 1,
                 "plan_hash": hash, "trajectory": trajectory, "replacement": null,
                 "latest_start": at(100), "priority": priority, "link_policy": "continue",
                 "lost_after_s": 2.5, "boot": null, "plan": null, "progress": null,
@@ -391,7 +391,7 @@ async fn missions_and_restorations_are_the_same() {
         };
         both!(both, missions::add_facts(id(2), facts));
         both!(both, missions::set_silence(id(2), Some(at(3))));
-        both!(both, missions::set_pause_wanted(id(1), true));
+        both!(both, missions::set_pause_requested(id(1), true));
         both_in_any_order!(both, missions::in_progress());
         both!(both, missions::open_of_robot(1));
         assert!(both!(both, missions::swap_content(id(2), 1, &replacement)));
@@ -581,17 +581,17 @@ async fn records_and_webhooks_are_the_same() {
     with_both("records_and_webhooks_are_the_same", async |both| {
         let entry = |second: i64, status: u16| {
             of::<tread_api::identity::AuditEntry>(json!({"id": 0, "at": at(second), "since": at(-1), "count": 2,
-                "who": "Ä", "token": id::<String>(1), "role": "viewer", "address": "::1", "method": "PUT",
-                "route": "/v1", "path": "/v1", "status": status, "request_id": "r", "what": {"b": 0.1, "a": [1]},
+                "actor": "Ä", "token": id::<String>(1), "role": "viewer", "address": "::1", "method": "PUT",
+                "route": "/v1", "path": "/v1", "status": status, "request_id": "r", "request": {"b": 0.1, "a": [1]},
                 "previous_hash": null, "hash": null}))
         };
         both!(both, audit::append(&[entry(5, 200), entry(3, 403)]));
         both!(both, audit::append(&[entry(4, 500)]));
         both!(both, audit::chain());
-        for (refused, beyond, who) in [(false, None, None), (true, Some(2), Some("Ä")), (false, None, Some("b"))] {
+        for (refused, beyond, actor) in [(false, None, None), (true, Some(2), Some("Ä")), (false, None, Some("b"))] {
             for order in ["newest", "oldest"] {
                 let filter = audit::AuditFilter {
-                    who: who.map(str::to_owned),
+                    actor: actor.map(str::to_owned),
                     refused,
                     order: of(json!(order)),
                     beyond,

@@ -52,7 +52,7 @@ impl TryFrom<Raw> for MissionRow {
             state: state(&raw.state)?,
             reason: raw.reason,
             cause: cause(&raw.cause)?,
-            pause_wanted: raw.pause_wanted,
+            pause_requested: raw.pause_wanted,
             revision: unsigned("mission revision", raw.revision)?,
             plan_hash: from_json("plan hash", &format!("\"{}\"", raw.plan_hash))?,
             trajectory: from_json("trajectory", &raw.trajectory)?,
@@ -143,7 +143,7 @@ pub async fn insert(
         state,
         cause,
         inserted.reason,
-        mission.pause_wanted,
+        mission.pause_requested,
         revision,
         plan_hash,
         trajectory,
@@ -267,16 +267,16 @@ pub async fn add_facts(
 }
 
 /// Sets whether an open mission is to be paused; `false` if it has ended.
-pub async fn set_pause_wanted(
+pub async fn set_pause_requested(
     db: &mut Connection,
     id: MissionId,
-    wanted: bool,
+    requested: bool,
 ) -> Result<bool, EngineError> {
     let id = id.to_string();
     let result = sqlx::query!(
         "UPDATE missions SET pause_wanted = $1 WHERE id = $2 AND state IN
              ('queued', 'offered', 'active', 'paused')",
-        wanted,
+        requested,
         id,
     )
     .execute(db)

@@ -35,13 +35,13 @@ impl TryFrom<Raw> for Stop {
             robot: parse("robot", &raw.robot)?,
             by: raw.stopped_by,
             reason: raw.reason,
-            wanted_at: from_us(raw.wanted_at_us)?,
+            requested_at: from_us(raw.wanted_at_us)?,
             confirmed_at: raw.confirmed_at_us.map(from_us).transpose()?,
-            standing_at: raw.standing_at_us.map(from_us).transpose()?,
+            standstill_at: raw.standing_at_us.map(from_us).transpose()?,
             // Derived from the present time when it is shown.
             unconfirmed: false,
-            clear_asked_by: raw.clear_asked_by,
-            clear_asked_at: raw.clear_asked_at_us.map(from_us).transpose()?,
+            clear_requested_by: raw.clear_asked_by,
+            clear_requested_at: raw.clear_asked_at_us.map(from_us).transpose()?,
             cleared_at: raw.cleared_at_us.map(from_us).transpose()?,
             replaced_by: raw.replaced_by.map(|id| parse("stop", &id)).transpose()?,
         })
@@ -166,7 +166,7 @@ pub async fn insert(db: &mut Connection, stops: &[Stop], kept: u32) -> Result<()
             stop.robot.to_string(),
             stop.by.clone(),
             stop.reason.clone(),
-            to_us(stop.wanted_at),
+            to_us(stop.requested_at),
             stop.confirmed_at.map(to_us),
         )
     };
@@ -237,7 +237,7 @@ pub async fn adopt(
     kept: u32,
 ) -> Result<(), EngineError> {
     let id = stop.id.to_string();
-    let (wanted_at_us, confirmed_at_us) = (to_us(stop.wanted_at), stop.confirmed_at.map(to_us));
+    let (wanted_at_us, confirmed_at_us) = (to_us(stop.requested_at), stop.confirmed_at.map(to_us));
     sqlx::query!(
         "UPDATE stops SET replaced_by = $1
          WHERE robot_pk = $2 AND cleared_at_us IS NULL AND replaced_by IS NULL AND id <> $1

@@ -1,6 +1,7 @@
 //! Webhooks, and their deliveries: outbox and log in one table.
 
 use jiff::Timestamp;
+use tread_api::alert_kind;
 use tread_api::ids::{AlertCode, DeliveryId, SiteId, WebhookId};
 use tread_api::webhook::{Delivery, DeliveryState, NoticeEvent, Webhook, WebhookSettings};
 pub use tread_store::webhooks::{AgeLimit, Due, DueTimes, NewDelivery, Outcome, Receiver};
@@ -186,6 +187,26 @@ pub async fn delete(db: &mut Connection, id: WebhookId) -> Result<bool, EngineEr
 /// Returns the enabled webhooks that are to be sent alerts of a kind, of a site or, without one,
 /// about the server itself.
 pub async fn interested(
+    db: &mut Connection,
+    kind: &AlertCode,
+    site: Option<&SiteId>,
+) -> Result<Vec<Receiver>, EngineError> {
+    let mut receivers: Vec<Receiver> = Vec::new();
+    // A webhook that an earlier version stored has the former code of the kind.
+    for kind in [Some(kind.clone()), alert_kind::former(kind)]
+        .into_iter()
+        .flatten()
+    {
+        for receiver in interested_in(db, &kind, site).await? {
+            if receivers.iter().all(|known| known.id != receiver.id) {
+                receivers.push(receiver);
+            }
+        }
+    }
+    Ok(receivers)
+}
+
+async fn interested_in(
     db: &mut Connection,
     kind: &AlertCode,
     site: Option<&SiteId>,

@@ -85,7 +85,7 @@ pub struct OpenMission {
     /// Run of the agent that accepted it.
     pub boot: Option<BootId>,
     /// Whether it is to be paused.
-    pub pause_wanted: bool,
+    pub pause_requested: bool,
     /// Priority; higher ones are driven first.
     pub priority: i32,
     /// Present revision and its plan hash.
@@ -112,7 +112,7 @@ impl From<&Mission> for OpenMission {
             state: mission.state,
             reason: mission.reason.clone(),
             boot: mission.boot,
-            pause_wanted: mission.pause_wanted,
+            pause_requested: mission.pause_requested,
             priority: mission.priority,
             content: (mission.revision, mission.plan_hash),
             replacement: mission

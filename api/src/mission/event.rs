@@ -53,11 +53,13 @@ pub enum Cause {
     /// The agent restarted and no longer has the mission.
     AgentRestarted,
     /// The robot is online, does not have the mission, and has not reported its end.
-    RobotForgot,
+    #[serde(alias = "robot_forgot")]
+    RobotLostMission,
     /// The robot was retired.
     RobotRetired,
-    /// Only a note, without a change of state, such as a report that came too late.
-    Noted,
+    /// Only a record, without a change of state, such as a report that came too late.
+    #[serde(alias = "noted")]
+    Recorded,
 }
 
 impl Cause {
@@ -83,9 +85,9 @@ impl Cause {
         Self::Expired,
         Self::RobotLost,
         Self::AgentRestarted,
-        Self::RobotForgot,
+        Self::RobotLostMission,
         Self::RobotRetired,
-        Self::Noted,
+        Self::Recorded,
     ];
 
     /// Returns the cause's name on the wire and in the database.
@@ -111,14 +113,20 @@ impl Cause {
             Self::Expired => "expired",
             Self::RobotLost => "robot_lost",
             Self::AgentRestarted => "agent_restarted",
-            Self::RobotForgot => "robot_forgot",
+            Self::RobotLostMission => "robot_lost_mission",
             Self::RobotRetired => "robot_retired",
-            Self::Noted => "noted",
+            Self::Recorded => "recorded",
         }
     }
 
-    /// Returns the cause with this name; `None` if there is none.
+    /// Returns the cause with this name, or with the former name by which a database of an earlier
+    /// version has it; `None` if there is none.
     pub fn from_name(name: &str) -> Option<Self> {
+        let name = match name {
+            "robot_forgot" => Self::RobotLostMission.as_str(),
+            "noted" => Self::Recorded.as_str(),
+            present => present,
+        };
         Self::ALL.into_iter().find(|cause| cause.as_str() == name)
     }
 }

@@ -203,9 +203,31 @@ pub struct FrictionReport {
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
+    use serde_json::json;
 
     use super::*;
+    use crate::safety::{StandstillState, StandstillStatus};
     use crate::wire;
+
+    #[test]
+    fn a_state_with_the_names_of_an_earlier_agent_is_read() {
+        let safety: SafetyStatus = serde_json::from_value(json!({
+            "gate": {"cause": null, "reduced_ticks": 3, "counts": [{"cause": "stop", "times": 2}]},
+            "standing": {"state": "does_not_stand", "took_ms": 700},
+        }))
+        .unwrap();
+        let standstill = StandstillStatus {
+            state: StandstillState::StandstillNotReached,
+            stopping_time_ms: Some(700),
+        };
+        assert_eq!(safety.standstill, Some(standstill));
+        assert_eq!(safety.gate.counts[0].count, 2);
+        let report: AlertReport = serde_json::from_value(json!({
+            "code": "does-not-stand", "severity": "critical", "text": "0.59 m/s",
+        }))
+        .unwrap();
+        assert_eq!(report.code.as_str(), "standstill-not-reached");
+    }
 
     proptest! {
         #[test]

@@ -17,7 +17,7 @@ use tokio::sync::mpsc;
 use tokio::time::{Instant, MissedTickBehavior};
 use tokio_tungstenite::tungstenite::{Error, Message};
 use tread_api::drive::{
-    Drive, DriveRequest, DriveUpdate, DriveView, DriverName, Nothing, StopReason,
+    Drive, DriveRequest, DriveUpdate, DriveView, DriverName, EmptyBody, StopReason,
 };
 use tread_api::safety::GateCause;
 use tread_api::text::escaped;
@@ -171,7 +171,7 @@ pub(super) async fn run(arguments: &DriveArguments, client: &Client) -> anyhow::
     .await;
     drop(terminal);
     // The server stops the robot when the socket closes, whether or not this message arrives.
-    let _ = send(&mut socket, &DriveRequest::Release(Nothing {})).await;
+    let _ = send(&mut socket, &DriveRequest::Release(EmptyBody {})).await;
     let _ = tokio::time::timeout(CONNECT_MAX, socket.close(None)).await;
     keyboard.end(pressed).await;
     ended
@@ -334,7 +334,7 @@ fn status(view: &DriveView) -> String {
         || "-".to_owned(),
         |latency_ms| format!("{latency_ms:.0} ms"),
     );
-    let heard = view.heard_age_ms.map_or_else(|| "-".to_owned(), age);
+    let heard = view.state_age_ms.map_or_else(|| "-".to_owned(), age);
     let driver = view.safety.lease.as_ref();
     let driver = driver.map_or("nobody", |lease| lease.driver.name.as_str());
     // A narrow terminal cuts the line at its end, so the most important parts come first.
@@ -379,7 +379,7 @@ mod tests {
     #[test]
     fn a_narrow_terminal_shows_first_that_the_robot_is_stopped_and_why_it_is_slow() {
         let mut view: DriveView = serde_json::from_value(serde_json::json!({
-            "link": "online", "heard_age_ms": 20, "mode": "stopped", "pose": null, "twist": null,
+            "link": "online", "state_age_ms": 20, "mode": "stopped", "pose": null, "twist": null,
             "mission": null, "latency_ms": 12.0, "socket_ms": 1.0,
             "safety": {
                 "stop": {"id": "00000000-0000-0000-0000-000000000001", "by": "Ann",

@@ -26,7 +26,7 @@ pub(super) fn state(mission: &Mission) -> String {
         return word.to_owned();
     }
     let is_paused = mission.state == MissionState::Paused;
-    let under_way = match (mission.pause_wanted, is_paused) {
+    let under_way = match (mission.pause_requested, is_paused) {
         (true, false) => Some("pausing"),
         (false, true) => Some("resuming"),
         (true, true) | (false, false) => mission.replacement.as_ref().map(|_next| "replacing"),

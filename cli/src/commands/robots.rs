@@ -104,7 +104,7 @@ pub(super) fn list(robots: &[Robot]) -> String {
             or_dash(mission.map(|mission| mission.id)),
             or_dash(mission.map(percent)),
             or_dash(live.and_then(theta)),
-            or_dash(live.map(|live| format!("{} ago", age(live.heard_age_ms)))),
+            or_dash(live.map(|live| format!("{} ago", age(live.state_age_ms)))),
         ]);
     }
     render(&table)
@@ -152,7 +152,7 @@ pub(super) fn details(robot: &Robot) -> String {
 fn live_lines(live: &RobotLive) -> Vec<String> {
     let mut lines = vec![
         format!("boot           {}", live.boot),
-        format!("heard          {} ago", age(live.heard_age_ms)),
+        format!("heard          {} ago", age(live.state_age_ms)),
         format!("mode           {}", mode_name(live.mode)),
     ];
     lines.extend(

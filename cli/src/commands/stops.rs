@@ -105,25 +105,25 @@ fn past(stops: &[Stop]) -> String {
     let mut table = table([
         "STOP",
         "ROBOT",
-        "WANTED",
+        "REQUESTED",
         "CONFIRMED",
-        "STOOD",
+        "STANDSTILL",
         "CLEARED",
         "BY",
         "REASON",
     ]);
     for stop in stops {
         let after = stop.confirmed_at.map(|at| {
-            let after = at.duration_since(stop.wanted_at);
+            let after = at.duration_since(stop.requested_at);
             format!("after {} ms", after.as_millis())
         });
         table.add_row([
             stop.id.to_string(),
             stop.robot.to_string(),
-            format!("{:.0}", stop.wanted_at),
+            format!("{:.0}", stop.requested_at),
             after.unwrap_or_else(|| "NOT YET".to_owned()),
-            or_dash(stop.standing_at.map(|at| {
-                let after = at.duration_since(stop.wanted_at);
+            or_dash(stop.standstill_at.map(|at| {
+                let after = at.duration_since(stop.requested_at);
                 format!("after {:.1} s", after.as_secs_f64())
             })),
             or_dash(stop.cleared_at.map(|at| format!("{at:.0}"))),

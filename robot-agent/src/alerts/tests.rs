@@ -234,22 +234,22 @@ fn sensors_that_contradict_are_alerts_by_code_with_channel_and_both_values() {
 }
 
 #[test]
-fn a_robot_that_does_not_stand_is_the_first_alert() {
+fn standstill_that_is_not_reached_is_the_first_alert() {
     let mut causes = AlertInputs {
         is_stopped: true,
-        standing: StandingReport {
-            is_to_stand: true,
-            does_not_stand: Some(MotionEvidence::Speed(0.59)),
-            ..StandingReport::default()
+        standstill: StandstillReport {
+            is_rest_commanded: true,
+            standstill_not_reached: Some(MotionEvidence::Speed(0.59)),
+            ..StandstillReport::default()
         },
         ..AlertInputs::default()
     };
     let said = Alerts::default().judge(&causes);
-    assert_eq!(codes(&said), ["does-not-stand", "stopped"]);
+    assert_eq!(codes(&said), ["standstill-not-reached", "stopped"]);
     assert!(said[0].text.contains("0.59 m/s"), "{}", said[0].text);
     assert_eq!(said[0].severity, Severity::Critical);
-    causes.standing.does_not_stand = None;
-    causes.standing.moves = Some(MotionEvidence::Distance(0.6));
+    causes.standstill.standstill_not_reached = None;
+    causes.standstill.unexpected_motion = Some(MotionEvidence::Distance(0.6));
     let said = Alerts::default().judge(&causes);
     assert_eq!(codes(&said), ["moves-while-stopped", "stopped"]);
 }

@@ -27,7 +27,7 @@ use tread_control::reference::Governor;
 use super::job::Job;
 use super::overrun::Overrun;
 use super::site_view::SiteView;
-use super::standing::StandingReport;
+use super::standstill::StandstillReport;
 use super::surface::Comparison;
 use crate::drive::Battery;
 use crate::safety::SafetyCell;
@@ -254,7 +254,7 @@ pub(crate) struct Snapshot {
     /// Contradictions between sensors.
     pub(crate) findings: Findings,
     /// Result of the standstill watch.
-    pub(crate) standing: StandingReport,
+    pub(crate) standstill: StandstillReport,
     /// Longitudinal slip of each side, while it is defined.
     pub slip: Option<SideSlip>,
     /// Cell of the open segment.
@@ -293,7 +293,7 @@ impl Default for Snapshot {
             dug_in_at: None,
             overrun: None,
             findings: Findings::default(),
-            standing: StandingReport::default(),
+            standstill: StandstillReport::default(),
             slip: None,
             cell: None,
             terrain: None,
@@ -330,7 +330,7 @@ pub(crate) struct Shared {
     /// Segments that were dropped because the event channel was full.
     pub(crate) lost_segments: AtomicU64,
     /// Estimator blocks that belong to no cell, because the site or the position was unknown.
-    pub(crate) unplaced_blocks: AtomicU64,
+    pub(crate) unmapped_blocks: AtomicU64,
     /// Samples of the base that newer ones replaced before a tick read them.
     pub(crate) lost_samples: AtomicU64,
     /// Server commands that were dropped because the command channel was full.

@@ -18,7 +18,7 @@ mod progress;
 pub(crate) mod segments;
 pub(crate) mod site_view;
 pub(crate) mod slip;
-pub(crate) mod standing;
+pub(crate) mod standstill;
 pub(crate) mod surface;
 pub(crate) mod tick;
 pub(crate) mod watchdog;

@@ -2,12 +2,12 @@
 //!
 //! ```text
 //!              moved to a cell on one ground                 wheels on two grounds, no cell
-//! unplaced ────────────────────────────────► measuring(cell, terrain) ───────► unplaced
+//! unmapped ────────────────────────────────► measuring(cell, terrain) ───────► unmapped
 //!                                              └ next cell, other terrain, changed ground,
 //!                                                other mission, SEGMENT_MAX over: close, reopen
 //! ```
 //! A segment holds what was measured since the estimator's last close; what was measured while
-//! unplaced is discarded. A segment without information on θ is discarded too.
+//! unmapped is discarded. A segment without information on θ is discarded too.
 
 use std::sync::Arc;
 use std::time::Duration;

@@ -269,11 +269,15 @@ fn a_base_that_ignores_a_stop_is_said_not_to_stand_and_one_that_obeys_to_stand()
         assert!(speed_m_s > 0.5, "{speed_m_s} m/s");
         stop_now(&bench);
         bench.run_for(3 * SECOND);
-        let standing = bench.ends.shared.snapshot().standing;
-        assert!(standing.is_to_stand);
-        assert_eq!(standing.does_not_stand.is_some(), ignores, "{standing:?}");
-        assert_eq!(standing.stands.is_none(), ignores, "{standing:?}");
-        if let Some((_, took)) = standing.stands {
+        let report = bench.ends.shared.snapshot().standstill;
+        assert!(report.is_rest_commanded);
+        assert_eq!(
+            report.standstill_not_reached.is_some(),
+            ignores,
+            "{report:?}"
+        );
+        assert_eq!(report.standstill.is_none(), ignores, "{report:?}");
+        if let Some((_, took)) = report.standstill {
             assert!(took < 2 * SECOND && !took.is_zero(), "{took:?}");
         }
     }

@@ -7,7 +7,7 @@ const DURATION_S = 120;
 
 function mission(changes: object = {}): Mission {
   const plan = { length_m: LENGTH_M, duration_s: DURATION_S, speed_peak_m_s: 0.6 };
-  const asked = { id: 'm-1', robot: 'rover-1', state: 'active', pause_wanted: false, priority: 0, revision: 1, plan };
+  const asked = { id: 'm-1', robot: 'rover-1', state: 'active', pause_requested: false, priority: 0, revision: 1, plan };
   return { ...asked, ...changes } as unknown as Mission;
 }
 
@@ -72,7 +72,7 @@ test('nothing is said where the end cannot be known', () => {
     { state: 'paused' },
     { state: 'cancelling' },
     { state: 'queued' },
-    { pause_wanted: true },
+    { pause_requested: true },
     { plan: null },
     { replacement: { revision: 2 } },
     { revision: 2 },

@@ -62,7 +62,7 @@ export function remainingS(mission: Mission, robot: Robot | undefined, age_s: nu
   const { plan } = mission;
   const live = robot?.live;
   const progress = live?.mission;
-  if (mission.state !== 'active' || mission.pause_wanted || mission.replacement || !plan) return null;
+  if (mission.state !== 'active' || mission.pause_requested || mission.replacement || !plan) return null;
   if (!live || !progress || robot.link !== 'online' || age_s > OLD_S) return null;
   if (progress.id !== mission.id || progress.revision !== mission.revision) return null;
   if (live.mode !== 'tracking' || live.safety.stop || progress.paused || progress.paused_by) return null;
@@ -85,13 +85,13 @@ function isBefore(a: Mission, b: Mission): boolean {
  * of them is not known.
  */
 export function startsInS(mission: Mission, open: readonly Mission[], remaining: (mission: Mission) => number | null): number | null {
-  if (mission.state !== 'queued' || mission.pause_wanted) return null;
+  if (mission.state !== 'queued' || mission.pause_requested) return null;
   const before = open.filter((other) => other.robot === mission.robot && other !== mission && isBefore(other, mission));
   // Why one waits for which no other is driven, nobody says.
   if (before.length === 0) return null;
   let total_s = 0;
   for (const other of before) {
-    const lasts_s = other.state === 'queued' && !other.pause_wanted ? other.plan?.duration_s : remaining(other);
+    const lasts_s = other.state === 'queued' && !other.pause_requested ? other.plan?.duration_s : remaining(other);
     if (lasts_s === null || lasts_s === undefined) return null;
     total_s += lasts_s;
   }

@@ -28,8 +28,8 @@ test('steps that came once each stay lines of their own', () => {
   expect(shape(events).map(([, times]) => times)).toEqual([1, 1, 1, 1]);
 });
 
-test('what a robot noted several times in a row is one line, and nothing is lost', () => {
-  const events = steps('active accepted', 'active noted', 'active noted', 'active noted', 'paused paused', 'active resumed');
+test('what a robot recorded several times in a row is one line, and nothing is lost', () => {
+  const events = steps('active accepted', 'active recorded', 'active recorded', 'active recorded', 'paused paused', 'active resumed');
   expect(shape(events)).toEqual([
     ['active', 1, '00'],
     ['active', 3, '03'],

@@ -6,7 +6,7 @@ interface Made {
   mode?: string;
   link?: string;
   stop?: boolean;
-  standing?: string;
+  standstill?: string;
   model?: string;
   name?: string;
   tags?: string[];
@@ -22,7 +22,7 @@ function robot(id: string, made: Made = {}): Robot {
     live: {
       mode: made.mode ?? 'idle',
       fault: null,
-      safety: { stop: made.stop ? { id: 's' } : null, standing: made.standing ? { state: made.standing } : null },
+      safety: { stop: made.stop ? { id: 's' } : null, standstill: made.standstill ? { state: made.standstill } : null },
     },
   } as unknown as Robot;
 }
@@ -38,7 +38,7 @@ const fleet = [
   robot('rover-3', { mode: 'fault' }),
   robot('rover-4', { link: 'offline', mode: 'fault' }),
   robot('rover-5', { mode: 'stopped', stop: true }),
-  robot('rover-6', { mode: 'stopped', stop: true, standing: 'moves' }),
+  robot('rover-6', { mode: 'stopped', stop: true, standstill: 'unexpected_motion' }),
   robot('mule-1', { mode: 'teleoperated', model: 'mule', name: 'Old Betsy' }),
 ];
 
@@ -57,7 +57,7 @@ test('trouble comes first: fault, lost, stopped, moving, idle, and then as peopl
 });
 
 test('a robot that moves though it is stopped is a fault, and one that nobody hears is lost whatever it said', () => {
-  expect(groupOf(robot('a', { mode: 'stopped', standing: 'does_not_stand' }))).toBe('fault');
+  expect(groupOf(robot('a', { mode: 'stopped', standstill: 'standstill_not_reached' }))).toBe('fault');
   expect(groupOf(robot('a', { link: 'offline', mode: 'tracking' }))).toBe('lost');
   expect(groupOf({ ...robot('a'), live: null })).toBe('lost');
   expect(countsOf(fleet)).toEqual({ unconfirmed: 0, fault: 2, lost: 1, stopped: 1, moving: 2, idle: 2 });

@@ -1,6 +1,6 @@
 // Which robots of a fleet are listed, in which order, and which a choice means. Pure.
 import type { Robot } from './api/schema';
-import { doing, hasFault } from './standing';
+import { doing, hasFault } from './standstill';
 
 /**
  * What a robot is up to, as far as it concerns whoever supervises it: trouble first, and first of all robots that are

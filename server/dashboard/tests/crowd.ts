@@ -39,9 +39,9 @@ function wordsOf(model: Robot, index: number, count: number, kinds: Record<keyof
   if (!live?.pose || !live.twist) throw new Error('the model does not say where it is');
   live.mode = (['fault', 'idle', 'stopped', 'tracking'] as const)[kind] ?? 'idle';
   live.fault = kind === 0 ? 'a motor is too hot' : null;
-  live.heard_age_ms = 20;
+  live.state_age_ms = 20;
   live.mission = null;
-  Object.assign(live.safety, { stop: null, standing: null });
+  Object.assign(live.safety, { stop: null, standstill: null });
   Object.assign(live.pose, { value: { ...live.pose.value, x_m: X, y_m: Y, heading_rad: HEADING }, age_ms: 20 });
   live.twist.value = {
     linear_m_s: isMoving ? CIRCLE.radius_m * CIRCLE.angular_rad_s : 0,

@@ -23,7 +23,7 @@ const BAR_MAX = 0.6;
 function stopOf(robot: string, index: number, confirmed: boolean): Stop {
   const at = '2026-01-31T14:05:09Z';
   const id = `0192f0c1-2b3c-7d4e-8f50-${String(index).padStart(12, '0')}`;
-  const times = { wanted_at: at, confirmed_at: confirmed ? at : null, standing_at: confirmed ? at : null };
+  const times = { requested_at: at, confirmed_at: confirmed ? at : null, standstill_at: confirmed ? at : null };
   return { id, site: 'yard', robot, by: 'demo', reason: 'test', unconfirmed: !confirmed, ...times } as Stop;
 }
 
@@ -94,7 +94,7 @@ for (const theme of ['light', 'dark'] as const) {
       await unconfirmed.waitFor();
       // What is red comes first.
       const states = page.locator('[data-state]');
-      expect(await states.evaluateAll((all) => all.map((one) => one.getAttribute('data-state')))).toEqual(['unconfirmed', 'standing']);
+      expect(await states.evaluateAll((all) => all.map((one) => one.getAttribute('data-state')))).toEqual(['unconfirmed', 'standstill']);
       expect(await violations(page), 'closed').toEqual([]);
       await shot(page, `stops-${theme}-${name}`);
       await standing.click();

@@ -462,7 +462,7 @@ impl App {
             let name = format!("tread_{counter}");
             registry.register(name, "See GET /v1/server", ConstCounter::new(value));
             let of_message = counter.strip_prefix("refused_");
-            let of_record = ["records_refused", "reports_foreign", "missions_disowned"];
+            let of_record = ["records_refused", "reports_foreign", "missions_unknown"];
             let listed = of_record
                 .contains(&counter.as_str())
                 .then_some(counter.as_str());

@@ -4,7 +4,7 @@
 //! asked ─┬─► every robot at once ─► confirmed ──────────────┐
 //!        └─► the database, beside ─► not confirmed in 300 ms: shown, an alert, ─► sent again
 //!                                    by the reconciler until the robot confirms, over restarts
-//! the robot's state ─► standing, measured: noted by the reconciler
+//! the robot's state ─► standstill, measured: recorded by the reconciler
 //! clear ──► the database ─► the robot ─► cleared, or refused: a newer stop, or it still moves
 //! ```
 //!
@@ -159,7 +159,7 @@ impl App {
     }
 
     async fn stop_all(&self, keys: Vec<RobotKey>, said: StopReason) -> Vec<Stop> {
-        let wanted_at = self.clock().now();
+        let requested_at = self.clock().now();
         let by = text_or(said.by, SOMEBODY);
         let reason = text_or(said.reason, "no reason was given");
         let stop = |(site, robot): RobotKey| Stop {
@@ -168,12 +168,12 @@ impl App {
             robot,
             by: by.clone(),
             reason: reason.clone(),
-            wanted_at,
+            requested_at,
             confirmed_at: None,
-            standing_at: None,
+            standstill_at: None,
             unconfirmed: false,
-            clear_asked_by: None,
-            clear_asked_at: None,
+            clear_requested_by: None,
+            clear_requested_at: None,
             cleared_at: None,
             replaced_by: None,
         };
@@ -277,7 +277,7 @@ impl App {
                 stops.push(stop);
             }
         }
-        stops.sort_by_key(|stop| std::cmp::Reverse((stop.wanted_at, stop.id)));
+        stops.sort_by_key(|stop| std::cmp::Reverse((stop.requested_at, stop.id)));
         let shown = stops.into_iter().map(|stop| self.with_confirmation(stop));
         Ok(page(shown.collect(), limit, |stop: &Stop| {
             stop.id.to_string()
@@ -293,7 +293,7 @@ impl App {
     }
 
     fn with_confirmation(&self, mut stop: Stop) -> Stop {
-        let age = self.clock().now().duration_since(stop.wanted_at);
+        let age = self.clock().now().duration_since(stop.requested_at);
         let bound = SignedDuration::try_from(STOP_CONFIRM_MAX).unwrap_or(SignedDuration::MAX);
         let is_open = stop.cleared_at.is_none() && stop.replaced_by.is_none();
         stop.unconfirmed = stop.confirmed_at.is_none() && is_open && age > bound;
@@ -329,12 +329,12 @@ impl App {
             robot: key.1.clone(),
             by: text_or(Some(latch.by), SOMEBODY),
             reason: text_or(Some(latch.reason), "the robot did not say why"),
-            wanted_at: now,
+            requested_at: now,
             confirmed_at: Some(now),
-            standing_at: None,
+            standstill_at: None,
             unconfirmed: false,
-            clear_asked_by: None,
-            clear_asked_at: None,
+            clear_requested_by: None,
+            clear_requested_at: None,
             cleared_at: None,
             replaced_by: None,
         };

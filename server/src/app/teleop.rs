@@ -459,7 +459,7 @@ impl Session {
         let command_age_ms = safety.drive.and_then(|drive| drive.command_age_ms);
         DriveView {
             link: presence.link(now),
-            heard_age_ms: live.as_ref().map(|live| live.heard_age_ms),
+            state_age_ms: live.as_ref().map(|live| live.state_age_ms),
             mode: live.as_ref().map(|live| live.mode),
             pose: live.as_ref().and_then(|live| live.pose),
             twist: live.as_ref().and_then(|live| live.twist),

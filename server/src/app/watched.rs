@@ -233,7 +233,7 @@ impl App {
             rate_hz: WATCHED_STATE_RATE_HZ,
             for_ms: u64::try_from(ASK_FOR.as_millis()).unwrap_or(u64::MAX),
         };
-        self.counters().state_rates_asked.one();
+        self.counters().state_rates_requested.one();
         let answer = self.commands().send_to(key, Some(*boot), &command).await;
         let outcome = match answer.map(|answer| answer.reply.into_result()) {
             Ok(Ok(())) => Outcome::Done,

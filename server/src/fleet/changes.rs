@@ -46,7 +46,7 @@ pub(super) async fn run(
             }
         };
         if announced.insert(change.site.clone(), missed).unwrap_or(0) < missed {
-            change.everything = true;
+            change.entire_map = true;
             change.boxes.clear();
         }
         publishers.refresh(&routers);

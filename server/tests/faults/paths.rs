@@ -216,7 +216,7 @@ pub(crate) const PATHS: &[WritePath] = &[
                     plan_hash: of(json!(format!("{number:032x}"))),
                     trajectory: mission(&ground.site, &ground.robot).trajectory,
                 };
-                db::missions::set_pause_wanted(tx, id, number % 2 == 0).await?;
+                db::missions::set_pause_requested(tx, id, number % 2 == 0).await?;
                 db::missions::set_replacement(tx, id, Some(&replacement)).await?;
                 db::missions::swap_content(tx, id, 1, &replacement).await?;
                 db::missions::set_silence(tx, id, Some(now())).await?;
@@ -230,7 +230,7 @@ pub(crate) const PATHS: &[WritePath] = &[
                 };
                 db::missions::compare_and_set(tx, id, transition).await?;
                 let event = of(json!({"at": now(), "actor": "server", "from": "queued",
-                    "to": "queued", "cause": "noted", "reason": "a test"}));
+                    "to": "queued", "cause": "recorded", "reason": "a test"}));
                 db::history::add_event(tx, id, &event).await?;
                 let boot_pk = db::robots::boot_key(tx, ground.robot_pk, boot(), RUNS_KEPT).await?;
                 let seq = i64::try_from(number).unwrap_or_default();
@@ -415,8 +415,8 @@ pub(crate) const PATHS: &[WritePath] = &[
             Box::pin(ground.write(async move |tx| {
                 let stop: tread_api::stop::Stop = of(json!({
                     "id": uuid(number), "site": ground.site, "robot": ground.robot, "by": "a test",
-                    "reason": "a test", "wanted_at": now(), "confirmed_at": null,
-                    "unconfirmed": false, "clear_asked_by": null, "clear_asked_at": null,
+                    "reason": "a test", "requested_at": now(), "confirmed_at": null,
+                    "unconfirmed": false, "clear_requested_by": null, "clear_requested_at": null,
                     "cleared_at": null, "replaced_by": null,
                 }));
                 db::stops::insert(tx, std::slice::from_ref(&stop), STOPS_KEPT).await?;
@@ -509,9 +509,9 @@ pub(crate) const PATHS: &[WritePath] = &[
         act: |ground, _number| {
             Box::pin(ground.write(async move |tx| {
                 let entry = of(json!({
-                    "id": 0, "at": now(), "since": null, "count": 1, "who": "a test", "token": null, "role": null,
+                    "id": 0, "at": now(), "since": null, "count": 1, "actor": "a test", "token": null, "role": null,
                     "address": "127.0.0.1", "method": "GET", "route": "/", "path": "/",
-                    "status": 200, "request_id": "1", "what": null,
+                    "status": 200, "request_id": "1", "request": null,
                     "previous_hash": null, "hash": null,
                 }));
                 let entries = [entry];

@@ -406,8 +406,8 @@ async fn a_stop_does_not_stand_before_it_was_confirmed_in_whatever_order_that_is
     let at = |second: &str| time(&format!("2026-11-01T00:00:{second}Z"));
     let stop: Stop = serde_json::from_value(json!({
         "id": Uuid::from_u128(7), "site": "yard", "robot": "rover-1", "by": "Ann", "reason": "a test",
-        "wanted_at": at("01"), "confirmed_at": null, "standing_at": null, "unconfirmed": false,
-        "clear_asked_by": null, "clear_asked_at": null, "cleared_at": null,
+        "requested_at": at("01"), "confirmed_at": null, "standstill_at": null, "unconfirmed": false,
+        "clear_requested_by": null, "clear_requested_at": null, "cleared_at": null,
     }))
     .unwrap();
     let mut tx = writer.app.db().write("test").await.unwrap();
@@ -421,7 +421,7 @@ async fn a_stop_does_not_stand_before_it_was_confirmed_in_whatever_order_that_is
         .await
         .unwrap();
     let kept = db::stops::find(&mut tx, stop.id).await.unwrap().unwrap();
-    assert_eq!(kept.standing_at, Some(at("09")));
+    assert_eq!(kept.standstill_at, Some(at("09")));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -431,9 +431,9 @@ async fn a_stop_that_is_written_down_late_is_history_and_of_history_the_newest_i
     let stop = |number: u32, second: u32| -> Stop {
         serde_json::from_value(json!({
             "id": Uuid::from_u128(u128::from(number)), "site": "yard", "robot": "rover-1",
-            "by": "Ann", "reason": "a test", "confirmed_at": null, "standing_at": null,
-            "wanted_at": time(&format!("2026-11-01T00:00:{second:02}Z")), "unconfirmed": false,
-            "clear_asked_by": null, "clear_asked_at": null, "cleared_at": null,
+            "by": "Ann", "reason": "a test", "confirmed_at": null, "standstill_at": null,
+            "requested_at": time(&format!("2026-11-01T00:00:{second:02}Z")), "unconfirmed": false,
+            "clear_requested_by": null, "clear_requested_at": null, "cleared_at": null,
         }))
         .unwrap()
     };

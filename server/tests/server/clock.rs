@@ -109,7 +109,12 @@ async fn no_alert_stop_or_audit_entry_goes_back_with_the_machines_clock() {
         let path = format!("/v1/sites/yard/robots/{}/stop/clear", robot.id);
         let (status, cleared) = yard.post(&path, &clearing).await;
         assert_eq!(status, StatusCode::OK, "{cleared}");
-        let names = ["wanted_at", "confirmed_at", "clear_asked_at", "cleared_at"];
+        let names = [
+            "requested_at",
+            "confirmed_at",
+            "clear_requested_at",
+            "cleared_at",
+        ];
         let times = times_of(&cleared, &names);
         assert!(times.iter().all(Option::is_some), "{cleared}");
         assert!(is_sorted(&times), "{cleared}");

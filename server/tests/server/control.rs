@@ -39,7 +39,7 @@ async fn a_mission_is_paused_and_resumed_when_its_robot_says_so() {
     let (status, body) = act(&yard, &mission, "pause", &json!({})).await;
     assert_eq!(status, StatusCode::ACCEPTED, "{body}");
     assert_eq!(
-        (&body["state"], &body["pause_wanted"]),
+        (&body["state"], &body["pause_requested"]),
         (&json!("active"), &json!(true))
     );
     yard.mission_becomes(mission.id, MissionState::Paused).await;
@@ -87,7 +87,7 @@ async fn a_mission_is_paused_when_its_robot_stands_and_not_when_it_was_commanded
     tokio::time::sleep(Duration::from_millis(1_500)).await;
     let braking = yard.mission(mission.id).await;
     assert_eq!(braking.mission.state, MissionState::Active);
-    assert!(braking.mission.pause_wanted);
+    assert!(braking.mission.pause_requested);
     assert_eq!(robot.holds(), [Verb::Pause], "once is enough for a while");
     robot.report(0, &mission, MissionPhase::Paused).await;
     assert_eq!(
@@ -373,7 +373,7 @@ async fn a_robot_that_stays_away_loses_its_mission_and_gets_a_cancel_when_it_com
         (after.mission.state, after.mission.cause),
         (MissionState::Failed, Cause::RobotLost)
     );
-    assert_eq!(causes(&after).last(), Some(&Cause::Noted));
-    assert!(yard.counters().await.missions_disowned >= 1);
+    assert_eq!(causes(&after).last(), Some(&Cause::Recorded));
+    assert!(yard.counters().await.missions_unknown >= 1);
     yard.server.stop().await.unwrap();
 }

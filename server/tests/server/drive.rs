@@ -112,7 +112,7 @@ impl Socket {
 
     pub(crate) async fn acquire(&mut self, name: &str) -> Lease {
         // End times are in the robot's time, which its states carry.
-        self.view(|view| view.heard_age_ms.is_some()).await;
+        self.view(|view| view.state_age_ms.is_some()).await;
         self.send(&json!({"acquire": {"name": name}})).await;
         let update = self.update().await;
         let DriveUpdate::Leased(lease) = update else {
@@ -163,7 +163,7 @@ async fn a_driver_drives_in_robot_time_and_losing_the_driver_lets_the_robot_stan
     yard.mission_becomes(mission.id, MissionState::Active).await;
     let mut observer = Socket::open(&yard, "rover-1").await;
     let mut driver = Socket::open(&yard, "rover-1").await;
-    driver.view(|view| view.heard_age_ms.is_some()).await;
+    driver.view(|view| view.state_age_ms.is_some()).await;
     let lease = driver.acquire("Ann").await;
     assert_eq!((lease.epoch, lease.driver.name.as_str()), (1, "tests: Ann"));
     driver.drive(0.4).await;
@@ -186,7 +186,7 @@ async fn a_driver_drives_in_robot_time_and_losing_the_driver_lets_the_robot_stan
     assert!(robot.drives().last().unwrap().seq > command.seq);
     // The active mission is held.
     let held = yard.mission_becomes(mission.id, MissionState::Paused).await;
-    assert!(held.mission.pause_wanted);
+    assert!(held.mission.pause_requested);
     let resume = format!("/v1/missions/{}/resume", mission.id);
     let (status, body) = yard.post(&resume, &Value::Null).await;
     assert_eq!(status, 409, "{body}");
@@ -467,7 +467,11 @@ async fn a_lease_holds_missions_from_its_grant_not_from_the_first_state_that_sho
     driver.acquire("Ann").await;
     eventually("the mission is held", async || {
         let held = yard.mission(first.id).await.mission;
-        if held.pause_wanted { Ok(()) } else { Err(held) }
+        if held.pause_requested {
+            Ok(())
+        } else {
+            Err(held)
+        }
     })
     .await;
     let resume = format!("/v1/missions/{}/resume", first.id);
@@ -475,7 +479,7 @@ async fn a_lease_holds_missions_from_its_grant_not_from_the_first_state_that_sho
     assert_eq!(status, 409, "{body}");
     assert!(body["detail"].as_str().unwrap().contains("Ann"), "{body}");
     let second = yard.create_mission(&robot.id).await;
-    assert!(second.pause_wanted);
+    assert!(second.pause_requested);
     assert_eq!(second.state, MissionState::Queued);
 
     // With the lease ends what it prevented.
@@ -490,8 +494,8 @@ async fn a_lease_holds_missions_from_its_grant_not_from_the_first_state_that_sho
         }
     })
     .await;
-    assert!(!yard.mission(first.id).await.mission.pause_wanted);
-    assert!(yard.mission(second.id).await.mission.pause_wanted);
+    assert!(!yard.mission(first.id).await.mission.pause_requested);
+    assert!(yard.mission(second.id).await.mission.pause_requested);
     yard.server.stop().await.unwrap();
 }
 
@@ -512,11 +516,11 @@ async fn missions_are_held_for_a_driver_also_if_that_cannot_be_written_down_at_f
         .unwrap();
     socket.acquire("desk").await;
     tokio::time::sleep(LOCKED_FOR).await;
-    assert!(!yard.mission(mission.id).await.mission.pause_wanted);
+    assert!(!yard.mission(mission.id).await.mission.pause_requested);
     sqlx::query("ROLLBACK").execute(&mut other).await.unwrap();
     eventually("the mission is held", async || {
         let detail = yard.mission(mission.id).await;
-        if detail.mission.pause_wanted {
+        if detail.mission.pause_requested {
             Ok(())
         } else {
             Err(detail)

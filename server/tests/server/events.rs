@@ -188,7 +188,7 @@ async fn a_mission_that_does_not_read_keeps_no_other_from_being_sent() {
         .unwrap();
     let step: MissionEvent = serde_json::from_value(json!({
         "at": time("2026-11-01T00:00:00Z"), "actor": "server", "from": "queued", "to": "queued",
-        "cause": "noted", "reason": "all of them move at once",
+        "cause": "recorded", "reason": "all of them move at once",
     }))
     .unwrap();
     for &id in missions.iter().chain([&damaged]) {

@@ -75,7 +75,7 @@ async fn a_change_of_the_map_is_sent_to_clients_and_programs_on_the_network() {
         assert!(seq < 30, "nothing was published on the network");
     };
     assert_eq!(
-        (published.site.as_str(), published.everything),
+        (published.site.as_str(), published.entire_map),
         ("yard", false)
     );
     let corners: Vec<(i32, i32)> = published
@@ -97,7 +97,7 @@ async fn a_change_of_the_map_is_sent_to_clients_and_programs_on_the_network() {
     let (status, said) = yard.post("/v1/sites/yard/terrains", &body).await;
     assert_eq!(status, StatusCode::CREATED, "{said}");
     let body = read_event(&mut stream, &mut text, "map", |body| {
-        body["map"]["everything"] == json!(true)
+        body["map"]["entire_map"] == json!(true)
     })
     .await;
     assert_eq!(body["map"]["terrain_revision"], json!(1));

@@ -190,7 +190,7 @@ async fn a_robot_shows_with_its_link_and_a_new_terrain_reaches_it() {
     .await;
     let live = online.live.unwrap();
     assert_eq!(live.boot, robot.boot);
-    assert!(live.heard_age_ms <= 1_500, "{live:?}");
+    assert!(live.state_age_ms <= 1_500, "{live:?}");
 
     yard.post("/v1/sites/yard/terrains", &square("lawn", "grass"))
         .await;

@@ -12,7 +12,7 @@ use tread_api::keys::Verb;
 use tread_api::mission::{Mission, MissionState};
 use tread_api::page::Page;
 use tread_api::robot::{Alert, AlertReport, FAULT_TEXT_MAX, MissionProgress, PauseCause, Severity};
-use tread_api::safety::{StandingState, StandingStatus};
+use tread_api::safety::{StandstillState, StandstillStatus};
 use tread_api::stop::{FleetStop, Stop};
 use tread_api::wire::ingest::{MissionPhase, Record, RecordContent};
 
@@ -72,7 +72,7 @@ async fn a_stop_is_confirmed_shown_and_cleared_and_nothing_goes_on_by_itself() {
             yard.mission(driven.id).await,
             yard.mission(waiting.id).await,
         );
-        let both = held.0.mission.pause_wanted && held.1.mission.pause_wanted;
+        let both = held.0.mission.pause_requested && held.1.mission.pause_requested;
         let paused = held.0.mission.state == MissionState::Paused;
         if both && paused { Ok(held) } else { Err(held) }
     })
@@ -80,7 +80,7 @@ async fn a_stop_is_confirmed_shown_and_cleared_and_nothing_goes_on_by_itself() {
     assert_eq!(held.1.mission.state, MissionState::Queued);
     // What is asked for now must wait too, and nothing can be resumed.
     let later = yard.create_mission(&robot.id).await;
-    assert!(later.pause_wanted);
+    assert!(later.pause_requested);
     let resume = format!("/v1/missions/{}/resume", driven.id);
     let (status, body) = yard.post(&resume, &Value::Null).await;
     assert_eq!(
@@ -95,7 +95,7 @@ async fn a_stop_is_confirmed_shown_and_cleared_and_nothing_goes_on_by_itself() {
     assert_eq!(status, StatusCode::OK, "{body}");
     let cleared: Stop = serde_json::from_value(body).unwrap();
     assert!(cleared.cleared_at.is_some());
-    assert_eq!(cleared.clear_asked_by.as_deref(), Some("tests: Bob"));
+    assert_eq!(cleared.clear_requested_by.as_deref(), Some("tests: Bob"));
 
     // The active mission ends; the queue does not move until somebody says so.
     robot.report(0, &driven, MissionPhase::Failed).await;
@@ -127,39 +127,44 @@ async fn a_stop_says_when_it_was_commanded_and_when_the_robot_stood() {
     let yard = Yard::start().await;
     let robot = Robot::join(&yard, "rover-1").await;
     let stop = yard.stop_robot(&Value::Null).await;
-    assert!(stop.confirmed_at.is_some() && stop.standing_at.is_none());
-    let stands = |state, took_ms| Some(StandingStatus { state, took_ms });
+    assert!(stop.confirmed_at.is_some() && stop.standstill_at.is_none());
+    let status = |state, stopping_time_ms| {
+        Some(StandstillStatus {
+            state,
+            stopping_time_ms,
+        })
+    };
     robot.say(|said| {
-        said.safety.standing = stands(StandingState::DoesNotStand, None);
+        said.safety.standstill = status(StandstillState::StandstillNotReached, None);
         said.alerts = vec![AlertReport {
-            code: "does-not-stand".parse().unwrap(),
+            code: "standstill-not-reached".parse().unwrap(),
             severity: Severity::Critical,
             text: "0.59 m/s".to_owned(),
         }];
     });
     eventually("the alert is raised", async || {
         let raised = yard.raised().await;
-        let is_raised = raised.iter().any(|code| code == "does-not-stand");
+        let is_raised = raised.iter().any(|code| code == "standstill-not-reached");
         if is_raised { Ok(()) } else { Err(raised) }
     })
     .await;
     let shown: Page<Stop> = yard.get("/v1/stops").await;
-    assert_eq!(shown.items[0].standing_at, None, "it was only commanded");
+    assert_eq!(shown.items[0].standstill_at, None, "it was only commanded");
     robot.say(|said| {
-        said.safety.standing = stands(StandingState::Standing, Some(4_200));
+        said.safety.standstill = status(StandstillState::Standstill, Some(4_200));
         said.alerts.clear();
     });
     let stood = yard
-        .stop_becomes("the robot stands", |stop| stop.standing_at.is_some())
+        .stop_becomes("the robot stands", |stop| stop.standstill_at.is_some())
         .await;
-    assert!(stood.standing_at >= stood.confirmed_at, "{stood:?}");
+    assert!(stood.standstill_at >= stood.confirmed_at, "{stood:?}");
     // The first time counts: it may be pushed afterwards.
-    robot.say(|said| said.safety.standing = stands(StandingState::Moves, None));
-    robot.say(|said| said.safety.standing = stands(StandingState::Standing, Some(4_200)));
+    robot.say(|said| said.safety.standstill = status(StandstillState::UnexpectedMotion, None));
+    robot.say(|said| said.safety.standstill = status(StandstillState::Standstill, Some(4_200)));
     let again = yard
         .stop_becomes("it is the same stop", |stop| stop.id == stood.id)
         .await;
-    assert_eq!(again.standing_at, stood.standing_at);
+    assert_eq!(again.standstill_at, stood.standstill_at);
     yard.server.stop().await.unwrap();
 }
 
@@ -198,11 +203,11 @@ async fn a_pause_that_is_reported_after_a_person_resumed_the_mission_does_not_ho
         .await
         .unwrap();
     let detail = yard.mission(mission.id).await;
-    assert!(!detail.mission.pause_wanted, "{detail:?}");
+    assert!(!detail.mission.pause_requested, "{detail:?}");
     yard.server.stop().await.unwrap();
 }
 
-/// What a robot reports of a stop that came in force then, by its clock, and of standing now.
+/// What a robot reports of a stop that came in force then, by its clock, and of standstill now.
 fn stopped_since(robot: &Robot, mission: &Mission, since: Timestamp) -> RecordContent {
     let RecordContent::Mission(mut paused) = safety_pause(mission, PauseCause::Stop) else {
         panic!("a report on a mission");
@@ -241,7 +246,7 @@ async fn when_the_stop_began_decides_whether_a_person_resumed_the_mission_since(
         .await
         .unwrap();
     let detail = yard.mission(mission.id).await;
-    assert!(!detail.mission.pause_wanted, "{detail:?}");
+    assert!(!detail.mission.pause_requested, "{detail:?}");
     // A stop that began afterwards is another one.
     let content = stopped_since(&robot, &mission, later);
     robot
@@ -249,7 +254,7 @@ async fn when_the_stop_began_decides_whether_a_person_resumed_the_mission_since(
         .await
         .unwrap();
     let detail = yard.mission(mission.id).await;
-    assert!(detail.mission.pause_wanted, "{detail:?}");
+    assert!(detail.mission.pause_requested, "{detail:?}");
     yard.server.stop().await.unwrap();
 }
 
@@ -264,7 +269,7 @@ async fn a_pause_that_the_robot_reports_for_its_safety_is_what_is_wanted_from_th
         let content = safety_pause(&mission, paused_by);
         robot.upload(vec![Record { seq, content }]).await.unwrap();
         let held = yard.mission_becomes(mission.id, MissionState::Paused).await;
-        assert!(held.mission.pause_wanted, "{paused_by:?}: {held:?}");
+        assert!(held.mission.pause_requested, "{paused_by:?}: {held:?}");
         // The reconciler does not let it go on by itself.
         tokio::time::sleep(Duration::from_millis(1_200)).await;
         let holds = robot.holds();

@@ -237,7 +237,7 @@ impl Storm {
         };
         let made = self.app.create_mission(request).await;
         if let Ok(mission) = &made
-            && mission.pause_wanted
+            && mission.pause_requested
         {
             with(&self.world, |world| world.held.insert(mission.id));
         }
@@ -469,7 +469,7 @@ impl Storm {
                     cause,
                     Cause::RobotLost
                         | Cause::AgentRestarted
-                        | Cause::RobotForgot
+                        | Cause::RobotLostMission
                         | Cause::Rejected
                         | Cause::Expired
                 ) || self.reference.cancelled_in_queue.contains(id);

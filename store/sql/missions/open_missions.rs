@@ -40,7 +40,7 @@ impl TryFrom<RawOpenMission> for OpenMission {
                 .as_deref()
                 .map(|boot| parse("boot", boot))
                 .transpose()?,
-            pause_wanted: raw.pause_wanted,
+            pause_requested: raw.pause_wanted,
             priority: i32::try_from(raw.priority)
                 .map_err(|_range| corrupt("priority", raw.priority))?,
             content: (

@@ -222,7 +222,7 @@ async fn look(rest: Rest, (worked, is_over): SharedState) {
     while rounds.next().await.is_some() {
         let asked = timeout(ANSWER_MAX, rest.call(Method::GET, &path, None)).await;
         record(&worked, |worked| match asked {
-            Ok(Some((status, robot))) => match robot["live"]["heard_age_ms"].as_f64() {
+            Ok(Some((status, robot))) => match robot["live"]["state_age_ms"].as_f64() {
                 Some(age_ms) => worked.ages_ms.push(age_ms),
                 None => worked.failed_looks.push(format!("{status} {robot}")),
             },

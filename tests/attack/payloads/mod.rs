@@ -102,7 +102,7 @@ pub(crate) async fn run(arguments: &Arguments, json: bool) -> anyhow::Result<Exi
     while Instant::now() < until && !fleet.has_server_ended() {
         let seen = fleet.rest.robot(&honest).await;
         match seen.and_then(|robot| robot.live) {
-            Some(live) => ages_ms.push(figure(live.heard_age_ms)),
+            Some(live) => ages_ms.push(figure(live.state_age_ms)),
             None => failed += 1,
         }
         let begun = Instant::now();

@@ -96,7 +96,7 @@ fn against_policy(
         (MissionState::Failed, Cause::RobotLost) => {
             asked.is_soon_lost || asked.is_server_silent_too_long
         }
-        (MissionState::Failed, Cause::AgentRestarted | Cause::RobotForgot) => agent_was_killed,
+        (MissionState::Failed, Cause::AgentRestarted | Cause::RobotLostMission) => agent_was_killed,
         (MissionState::Failed, Cause::Failed) => {
             let is_silence = asked.is_server_silent_too_long && reason.contains("silent");
             is_silence || (agent_was_killed && reason.contains("restart"))
@@ -136,7 +136,7 @@ fn disagreement(detail: &MissionDetail, memory: &MissionSlot) -> Option<String> 
     }
     let given_up = matches!(
         detail.mission.cause,
-        Cause::RobotLost | Cause::AgentRestarted | Cause::RobotForgot
+        Cause::RobotLost | Cause::AgentRestarted | Cause::RobotLostMission
     );
     let end = detail
         .events

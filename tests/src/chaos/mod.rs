@@ -376,7 +376,7 @@ async fn await_quiet(fleet: &mut Fleet, robot: &RobotId) {
         fleet.tend_pair().await;
         let live = fleet.rest.robot(robot).await.and_then(|robot| robot.live);
         let is_quiet = live.is_some_and(|live| {
-            live.heard_age_ms < 1_000 && live.outbox.pending == 0 && live.mission.is_none()
+            live.state_age_ms < 1_000 && live.outbox.pending == 0 && live.mission.is_none()
         });
         if is_quiet || Instant::now() > deadline {
             return;

@@ -35,12 +35,24 @@ const MEANS: [&str; 2] = [".effective_track_ratio.value", ".friction.theta"];
 /// Largest difference of a mean, as a share.
 const MEAN_DIFFERENCE_MAX: f64 = 0.02;
 /// Keys that were renamed since, by their earlier names.
-const RENAMED: [(&str, &str); 5] = [
+const RENAMED: [(&str, &str); 12] = [
+    ("clear_asked_at", "clear_requested_at"),
+    ("clear_asked_by", "clear_requested_by"),
     ("first_sure_alone_s", "first_known_alone_s"),
+    ("pause_wanted", "pause_requested"),
     ("refused_why", "refusal_reason"),
+    ("standing_at", "standstill_at"),
     ("sure_alone_s", "known_alone_s"),
     ("sure_s", "known_s"),
     ("theta_sd", "theta_std_dev"),
+    ("wanted_at", "requested_at"),
+    ("what", "request"),
+    ("who", "actor"),
+];
+/// Causes of steps that were renamed since, by their earlier names.
+const RENAMED_CAUSES: [(&str, &str); 2] = [
+    ("noted", "recorded"),
+    ("robot_forgot", "robot_lost_mission"),
 ];
 /// Days for which the server surely keeps audit entries, and tokens that are over.
 const KEPT_DAYS: i64 = 390;
@@ -129,6 +141,10 @@ fn losses(place: &str, earlier: &Value, present: &Value, found: &mut Vec<String>
             }
         }
         _ if earlier == present => {}
+        _ if place.ends_with(".cause")
+            && RENAMED_CAUSES
+                .iter()
+                .any(|(former, now)| earlier == former && present == now) => {}
         _ if MEANS.iter().any(|end| place.ends_with(end)) && is_near(earlier, present) => {}
         _ => found.push(format!("{place}: {earlier} became {present}")),
     }

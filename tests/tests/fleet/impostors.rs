@@ -56,7 +56,7 @@ async fn of_two_agents_under_one_name_the_newest_counts_and_the_other_ends_its_m
     .await;
     let status: Value = fleet.rest.get("/v1/server").await;
     let counted = |name: &str| status["counters"][name].as_u64().unwrap();
-    assert!(counted("refused_other_run") > 0 && counted("missions_disowned") > 0);
+    assert!(counted("refused_other_run") > 0 && counted("missions_unknown") > 0);
     // Commands reach the newer one, and it alone.
     let next = fleet.rest.send(&robot, bend(5.0)).await;
     let driven = fleet

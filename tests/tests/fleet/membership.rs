@@ -244,7 +244,7 @@ async fn a_robot_that_comes_back_after_its_authority_was_retired_raises_an_alert
         log.contains("Join again, by `tread-agent enroll`")
     })
     .await;
-    assert!(fleet.counter("gate_distrusted").await > 0);
+    assert!(fleet.counter("gate_untrusted").await > 0);
     assert!(fleet.counter("renewals_retired").await > 0);
     fleet.robot_is_online(&there).await;
 
@@ -290,7 +290,7 @@ async fn after_a_replacement_no_robot_of_before_gets_in_until_it_has_joined_agai
     let after: FleetAuthority = fleet.rest.get("/v1/authority").await;
     assert_ne!(after.signing, before.signing);
     assert!(after.rotation.is_none() && after.on_disk);
-    assert!(fleet.counter("gate_distrusted").await > 0);
+    assert!(fleet.counter("gate_untrusted").await > 0);
     assert!(fleet.counter("renewals_retired").await > 0);
     // Whoever has looked at the same does not replace the next one too.
     let refused = ProblemType::AuthorityRotation;

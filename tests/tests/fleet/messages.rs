@@ -112,7 +112,7 @@ async fn a_state_that_makes_no_sense_changes_nothing() {
     // And the server still listens.
     robot.publish_state().await.unwrap();
     eventually("a good state is heard", SHORT, heard, |live| {
-        live.as_ref().is_some_and(|live| live.heard_age_ms < 1_000)
+        live.as_ref().is_some_and(|live| live.state_age_ms < 1_000)
     })
     .await;
 }

@@ -18,7 +18,7 @@ async fn everything_is_uploaded(fleet: &Fleet, robot: &RobotId) {
     let look = || async { fleet.rest.robot(robot).await.and_then(|robot| robot.live) };
     eventually("the outbox is empty", DRIVE, look, |live| {
         live.as_ref()
-            .is_some_and(|live| live.heard_age_ms < 1_000 && live.outbox.pending == 0)
+            .is_some_and(|live| live.state_age_ms < 1_000 && live.outbox.pending == 0)
     })
     .await;
 }

@@ -70,7 +70,7 @@ async fn a_stop_outlives_its_agent_and_its_clear_starts_nothing() {
     );
     let detail = fleet.rest.mission(waiting).await;
     assert_eq!(detail.mission.state, MissionState::Queued);
-    assert!(detail.mission.pause_wanted);
+    assert!(detail.mission.pause_requested);
     let resume = format!("/v1/missions/{waiting}/resume");
     fleet.rest.post(&resume, &Value::Null).await;
     fleet

@@ -20,7 +20,7 @@ const RECONNECTS_MAX: u64 = 6;
 pub(super) fn of_robot(robot: &Robot, server_version: Option<&str>) -> Vec<Finding> {
     let name = format!("robot {}", robot.id);
     let mut findings = Vec::new();
-    let heard = robot.live.as_ref().map(|live| live.heard_age_ms);
+    let heard = robot.live.as_ref().map(|live| live.state_age_ms);
     match robot.link {
         LinkState::Online => {}
         LinkState::Stale => findings.push(Finding::on(&name).warning(

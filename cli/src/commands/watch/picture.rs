@@ -8,7 +8,7 @@ use ratatui::widgets::{Block, Borders, Paragraph, Row, Table, TableState, Wrap};
 use tread_api::ids::SiteId;
 use tread_api::mission::{Mission, MissionState};
 use tread_api::robot::{LinkState, MissionProgress, Robot, RobotLive, RobotMode, Severity};
-use tread_api::safety::StandingState;
+use tread_api::safety::StandstillState;
 
 use super::site_state::SiteState;
 use super::view::{Order, Section, View};
@@ -158,10 +158,10 @@ fn bar(progress: Option<MissionProgress>) -> String {
 fn robot_style(robot: &Robot) -> Style {
     let live = robot.live.as_ref();
     let is_down = live.is_some_and(|live| {
-        let standing = live.safety.standing.map(|standing| standing.state);
+        let standstill = live.safety.standstill.map(|standstill| standstill.state);
         let runs = matches!(
-            standing,
-            Some(StandingState::DoesNotStand | StandingState::Moves)
+            standstill,
+            Some(StandstillState::StandstillNotReached | StandstillState::UnexpectedMotion)
         );
         runs || live.safety.stop.is_some()
             || matches!(live.mode, RobotMode::Fault | RobotMode::Stopped)
@@ -176,16 +176,15 @@ fn robot_style(robot: &Robot) -> Style {
 
 /// Returns the mode: `stopping` until a stopped robot is at standstill, and a warning if it moves
 /// although it should be at rest.
-fn mode_and_standing(live: &RobotLive) -> String {
+fn mode_and_standstill(live: &RobotLive) -> String {
     let mode = mode_name(live.mode);
-    let standing = live.safety.standing.map(|standing| standing.state);
-    match standing {
-        Some(StandingState::DoesNotStand) => "DOES NOT STAND".to_owned(),
-        Some(StandingState::Moves) => "MOVES".to_owned(),
-        Some(StandingState::Stopping) if live.mode == RobotMode::Stopped => "stopping".to_owned(),
-        Some(StandingState::Stopping | StandingState::Standing | StandingState::Other) | None => {
-            mode.to_owned()
-        }
+    let standstill = live.safety.standstill.map(|standstill| standstill.state);
+    match standstill {
+        Some(StandstillState::StandstillNotReached) => "DOES NOT STAND".to_owned(),
+        Some(StandstillState::UnexpectedMotion) => "MOVES".to_owned(),
+        Some(StandstillState::Stopping) if live.mode == RobotMode::Stopped => "stopping".to_owned(),
+        Some(StandstillState::Stopping | StandstillState::Standstill | StandstillState::Other)
+        | None => mode.to_owned(),
     }
 }
 
@@ -198,12 +197,12 @@ fn robot_row(robot: &Robot, is_wide: bool) -> Row<'static> {
     let mut cells = vec![
         robot.id.to_string(),
         link_name(robot.link).to_owned(),
-        or_dash(live.map(mode_and_standing)),
+        or_dash(live.map(mode_and_standstill)),
         bar(mission),
         or_dash(twist.map(|twist| fixed(twist.value.linear_m_s, 2))),
         or_dash(off),
         or_dash(live.and_then(theta)),
-        or_dash(live.map(|live| age(live.heard_age_ms))),
+        or_dash(live.map(|live| age(live.state_age_ms))),
     ];
     if is_wide {
         let pose = live.and_then(|live| live.pose).map(|pose| pose.value);

@@ -81,7 +81,7 @@ pub(super) struct EstimationOutput<'tick> {
     /// θ information and θ-weighted sum of the segment that was closed.
     pub(super) closed: Option<(f64, f64)>,
     /// Estimator blocks of this tick that belong to no cell.
-    pub(super) unplaced_blocks: u64,
+    pub(super) unmapped_blocks: u64,
 }
 
 /// Objects that leave the loop after this stage.
@@ -106,7 +106,7 @@ pub(super) struct Ground {
 struct SampleEffects {
     ground_changed: bool,
     has_new_block: bool,
-    unplaced_blocks: u64,
+    unmapped_blocks: u64,
 }
 
 /// The stage's state.
@@ -209,7 +209,7 @@ impl Estimation {
                 Some(GroundUnderWheels::Mixed) | None => None,
             },
             closed,
-            unplaced_blocks: effects.unplaced_blocks,
+            unmapped_blocks: effects.unmapped_blocks,
             site: self.site.as_deref(),
         };
         let released = Released {
@@ -287,7 +287,7 @@ impl Estimation {
         effects.has_new_block |= outcome.block_done;
         if outcome.block_done {
             self.slips = outcome.slips;
-            effects.unplaced_blocks += u64::from(self.cutter.cell().is_none());
+            effects.unmapped_blocks += u64::from(self.cutter.cell().is_none());
         }
     }
 

@@ -1,6 +1,6 @@
 //! Last stage: checks standstill, publishes the snapshot, and records the tick.
 //!
-//! Standstill is detected by [`crate::control_loop::standing`]. A record holds the inputs and
+//! Standstill is detected by [`crate::control_loop::standstill`]. A record holds the inputs and
 //! outputs of a tick, so that the tick can be run again and the results compared.
 
 use std::sync::Arc;
@@ -23,7 +23,7 @@ use super::{STANDING, Tick};
 use crate::control_loop::channels::{LoopCommand, Shared, Snapshot};
 use crate::control_loop::frame::{RecordSender, TickFrame, TickInputs, TickOutputs};
 use crate::control_loop::site_view::SiteView;
-use crate::control_loop::standing::{Motion, StandingWatch};
+use crate::control_loop::standstill::{Motion, StandstillWatch};
 use crate::drive::{Battery, Feedback, StatedNoise};
 
 /// Input of the stage.
@@ -45,7 +45,7 @@ pub(super) struct OutputInput<'tick> {
 pub(super) struct Output {
     model: RobotModel,
     shared: Arc<Shared>,
-    standing: StandingWatch,
+    standstill: StandstillWatch,
     /// Latest measurements for the standstill watch.
     motion: Motion,
     /// Whether the wheels are commanded to zero and are measured near zero.
@@ -60,7 +60,7 @@ impl Output {
         Self {
             model,
             shared,
-            standing: StandingWatch::default(),
+            standstill: StandstillWatch::default(),
             motion: Motion::default(),
             stands: true,
             ticks: 0,
@@ -107,8 +107,8 @@ impl Output {
         let shared = &self.shared;
         shared.lost_samples.fetch_add(lost, Ordering::Relaxed);
         shared
-            .unplaced_blocks
-            .fetch_add(input.estimated.unplaced_blocks, Ordering::Relaxed);
+            .unmapped_blocks
+            .fetch_add(input.estimated.unmapped_blocks, Ordering::Relaxed);
         shared.ticks.store(self.ticks, Ordering::Relaxed);
     }
 
@@ -127,13 +127,13 @@ impl Output {
         self.motion.odometry_m_s = sensed.odometry_m_s(now);
         self.motion.fix = sensed.fix.filter(|_| !sensed.is_position_doubted());
         // Without any measurement it is unknown whether the robot has stopped.
-        let is_to_stand = input.gated.output.target == WheelSpeeds::default();
+        let is_rest_commanded = input.gated.output.target == WheelSpeeds::default();
         if is_heard || self.motion.odometry_m_s.is_some() || self.motion.fix.is_some() {
-            self.standing.step(now, is_to_stand, &self.motion);
-        } else if is_to_stand {
-            self.standing.reset();
+            self.standstill.step(now, is_rest_commanded, &self.motion);
+        } else if is_rest_commanded {
+            self.standstill.reset();
         } else {
-            self.standing.step(now, false, &self.motion);
+            self.standstill.step(now, false, &self.motion);
         }
     }
 
@@ -170,7 +170,7 @@ impl Output {
             dug_in_at: estimated.dug_in_at,
             overrun: input.demands.overrun,
             findings: sensed.findings,
-            standing: self.standing.report(),
+            standstill: self.standstill.report(),
             slip: estimated.slip,
             cell: estimated.cell,
             terrain: estimated.terrain,

@@ -7,7 +7,7 @@ import { texts } from '../texts';
 import type { Camera } from './camera';
 import type { Scene } from './draw';
 import { Kept } from './kept';
-import { doing, hasFault } from '../standing';
+import { doing, hasFault } from '../standstill';
 import { Labels, crowdOf, shortened, type Box, type Wanted } from './labels';
 import type { Shown } from './motion';
 import type { Palette } from './palette';

@@ -2,7 +2,7 @@
 import type { Mission, Stop } from '../api/schema';
 import { Failure, ask, saidOf } from '../api/client';
 import type { Said } from '../message';
-import { stopState, stopWord } from '../standing';
+import { stopState, stopWord } from '../standstill';
 import { texts } from '../texts';
 import { hasEnded, type Fleet } from './fleet.svelte';
 
@@ -110,12 +110,12 @@ export class Bulk {
   async pause(ids: string[]): Promise<void> {
     await this.#missions('pause', ids, (mission) => {
       const isDriving = mission.state === 'active' || mission.state === 'offered';
-      return isDriving && !mission.pause_wanted;
+      return isDriving && !mission.pause_requested;
     });
   }
 
   async resume(ids: string[]): Promise<void> {
-    await this.#missions('resume', ids, (mission) => mission.pause_wanted);
+    await this.#missions('resume', ids, (mission) => mission.pause_requested);
   }
 
   async cancel(ids: string[]): Promise<void> {

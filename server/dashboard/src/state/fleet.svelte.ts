@@ -7,7 +7,7 @@ import { Stream, type Listener } from '../api/stream';
 import { serverClock } from '../server_clock';
 import { signedIn } from './session.svelte';
 import { nameRanks, type NameRanks } from '../roster';
-import { doing } from '../standing';
+import { doing } from '../standstill';
 import { texts } from '../texts';
 import { Pace, remainingS, startsInS } from '../eta';
 import { LatePlans } from './late_plans';
@@ -187,8 +187,8 @@ export class Fleet implements Listener {
   remainingS(mission: Mission): number | null {
     const entry = this.byId.get(mission.robot);
     if (!entry || this.lostAt !== null || this.stops.inForce.has(mission.robot)) return null;
-    const heard_age_ms = entry.robot.live?.heard_age_ms ?? 0;
-    const age_s = (heard_age_ms + Math.max(0, this.now - entry.receivedAt)) / 1000;
+    const state_age_ms = entry.robot.live?.state_age_ms ?? 0;
+    const age_s = (state_age_ms + Math.max(0, this.now - entry.receivedAt)) / 1000;
     return remainingS(mission, entry.robot, age_s, this.#pace);
   }
 
@@ -337,7 +337,7 @@ export class Fleet implements Listener {
       this.tracked.set(robot.id, new Tracked(robot, now));
       this.#order = null;
     }
-    this.#pace.note(robot.id, robot.live?.mission, now - (robot.live?.heard_age_ms ?? 0));
+    this.#pace.note(robot.id, robot.live?.mission, now - (robot.live?.state_age_ms ?? 0));
     this.stops.heard(robot);
     if (looksNew) this.wake();
     this.#listsSoon();

@@ -9,7 +9,7 @@ function robot(x_m: number, speed_m_s: number, link = 'online'): Robot {
     name: 'rover-1',
     link,
     live: {
-      heard_age_ms: 0,
+      state_age_ms: 0,
       pose: { value: { x_m, y_m: 0, heading_rad: 0 }, age_ms: 0 },
       twist: { value: { linear_m_s: speed_m_s, angular_rad_s: 0 }, age_ms: 0 },
       safety: {},

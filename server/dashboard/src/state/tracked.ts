@@ -1,7 +1,7 @@
 // What is kept of one robot: its last words, where it was, and its curves.
 import type { DriveView, Robot, RobotLive } from '../api/schema';
 import { Motion, type Shown } from '../map/motion';
-import { doing, hasFault } from '../standing';
+import { doing, hasFault } from '../standstill';
 
 /** Most points of a trail. */
 export const TRAIL_POINTS = 200;
@@ -87,7 +87,7 @@ export class Tracked {
   ageS(now: number): number | null {
     const live = this.robot.live;
     if (!live) return null;
-    return (live.heard_age_ms + now - this.receivedAt) / 1000;
+    return (live.state_age_ms + now - this.receivedAt) / 1000;
   }
 
   #note(apartMs: number): void {

@@ -3,7 +3,7 @@ import { rightsOf } from '../rights';
 import type { Texts } from './en';
 import { fleet } from './de_fleet';
 import { ground } from './de_ground';
-import { limit, problemTitles, right, role, standing } from './de_words';
+import { limit, problemTitles, right, role, standstill } from './de_words';
 
 export const de: Texts = {
   name: 'Tread',
@@ -18,7 +18,7 @@ export const de: Texts = {
       : rightsOf(session)
           .map((one) => right[one])
           .join(', '),
-  standing,
+  standstill,
   limitNames: limit,
   ...fleet,
   ...ground,

@@ -97,7 +97,7 @@ export const fleet: Pick<Texts, Areas> = {
       unconfirmed: (robot, by) =>
         `${robot} hat den Stopp NICHT bestätigt. Der Stopp von ${by} wird gesendet, bis die Bestätigung da ist.`,
       stopping: (robot, by) => `${robot}: gestoppt von ${by}. Der Roboter hält an.`,
-      standing: (robot, by) => `${robot}: gestoppt von ${by}. Der Roboter steht still.`,
+      standstill: (robot, by) => `${robot}: gestoppt von ${by}. Der Roboter steht still.`,
     },
     counted: {
       failed: (count) => `${count} Stopps sind FEHLGESCHLAGEN`,
@@ -106,7 +106,7 @@ export const fleet: Pick<Texts, Areas> = {
       unconfirmed: (count) => `${count} Roboter haben den Stopp NICHT bestätigt`,
       sending: (count) => `${count} Stopps werden gesendet …`,
       stopping: (count) => `${count} Roboter halten an`,
-      standing: (count) => `${count} Roboter sind gestoppt und stehen still`,
+      standstill: (count) => `${count} Roboter sind gestoppt und stehen still`,
     },
     problems: { unconfirmed: 'Stopp NICHT bestätigt', failed: 'Stopp FEHLGESCHLAGEN' },
     by: (name) => `von ${name}`,

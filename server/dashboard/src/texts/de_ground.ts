@@ -27,7 +27,7 @@ export const ground: Pick<Texts, Areas> = {
       offered: 'Der Roboter hat die Mission und hat noch nicht geantwortet.',
       cancelling: 'Der Roboter soll sie beenden und hat es noch nicht bestätigt.',
     },
-    pauseWanted: 'Pause angefordert',
+    pauseRequested: 'Pause angefordert',
     pausedBy,
     waitsForStop: (robot) => `${robot} ist gestoppt: Heben Sie den Stopp auf und setzen Sie dann fort.`,
     show: 'Zeigen',

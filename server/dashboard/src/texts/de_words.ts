@@ -12,7 +12,7 @@ import type {
   Right,
   RobotMode,
   Role,
-  StandingState,
+  StandstillState,
   TerrainClass,
 } from '../api/schema';
 import type { AlertKind } from './en_words';
@@ -58,9 +58,9 @@ export const cause: Record<Cause, string> = {
   expired: 'zu lange gewartet',
   robot_lost: 'kein Kontakt zum Roboter',
   agent_restarted: 'der Roboter wurde neu gestartet',
-  robot_forgot: 'der Roboter kennt sie nicht mehr',
+  robot_lost_mission: 'der Roboter kennt sie nicht mehr',
   robot_retired: 'der Roboter ist ausgemustert',
-  noted: 'vermerkt',
+  recorded: 'vermerkt',
 };
 export const limit: Record<BindingLimit, string> = {
   lateral_acceleration: 'Querbeschleunigung',
@@ -124,11 +124,11 @@ export const right: Record<Right, string> = {
   administer: 'verwalten',
 };
 
-export const standing: Record<StandingState, string> = {
+export const standstill: Record<StandstillState, string> = {
   stopping: 'hält an',
-  standing: 'gestoppt, steht still',
-  does_not_stand: 'STEHT NICHT',
-  moves: 'BEWEGT SICH TROTZ STOPP',
+  standstill: 'gestoppt, steht still',
+  standstill_not_reached: 'STEHT NICHT',
+  unexpected_motion: 'BEWEGT SICH TROTZ STOPP',
   other: 'gestoppt',
 };
 
@@ -170,7 +170,7 @@ export const alertTitles: Readonly<Record<AlertKind, string>> = {
   'revoked-robot': 'Gesperrter Roboter meldet sich',
   'retired-authority': 'Zertifikat einer abgelösten Stelle',
   'unknown-certificate': 'Unbekanntes Zertifikat',
-  'does-not-stand': 'Der Roboter steht nicht',
+  'standstill-not-reached': 'Der Roboter steht nicht',
   'moves-while-stopped': 'Der Roboter bewegt sich trotz Stopp',
   stopped: 'Der Roboter ist gestoppt',
   'dug-in': 'Der Roboter hat sich festgefahren',
@@ -217,7 +217,7 @@ export const alertSentences: Readonly<Record<AlertKind, (robot: string) => strin
   'revoked-robot': (robot) => `${robot} ist gesperrt und versucht, sich zu verbinden.`,
   'retired-authority': (robot) => `${robot} hat ein Zertifikat einer abgelösten Stelle und muss neu beitreten.`,
   'unknown-certificate': (robot) => `Der Server kennt ein Zertifikat von ${robot} nicht. Der Roboter muss neu beitreten.`,
-  'does-not-stand': (robot) => `${robot} soll stillstehen, steht aber nicht.`,
+  'standstill-not-reached': (robot) => `${robot} soll stillstehen, steht aber nicht.`,
   'moves-while-stopped': (robot) => `${robot} soll stillstehen und stand schon, bewegt sich aber wieder.`,
   stopped: (robot) => `Für ${robot} gilt ein Stopp.`,
   'dug-in': (robot) => `Die Räder von ${robot} drehen sich, aber der Roboter bewegt sich nicht.`,

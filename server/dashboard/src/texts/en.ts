@@ -3,7 +3,7 @@ import type { ProblemType, Session } from '../api/schema';
 import { rightsOf } from '../rights';
 import { fleet } from './en_fleet';
 import { ground } from './en_ground';
-import { limit, right, role, standing } from './en_words';
+import { limit, right, role, standstill } from './en_words';
 
 export const en = {
   name: 'Tread',
@@ -19,7 +19,7 @@ export const en = {
       : rightsOf(session)
           .map((one) => right[one])
           .join(', '),
-  standing,
+  standstill,
   limitNames: limit,
   ...fleet,
   ...ground,

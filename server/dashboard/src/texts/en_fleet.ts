@@ -96,7 +96,7 @@ export const fleet = {
       unconfirmed: (robot: string, by: string) =>
         `${robot} has NOT confirmed its stop. The stop by ${by} is sent again until the robot confirms it.`,
       stopping: (robot: string, by: string) => `${robot}: stopped by ${by}. The robot is coming to a standstill.`,
-      standing: (robot: string, by: string) => `${robot}: stopped by ${by}. The robot stands still.`,
+      standstill: (robot: string, by: string) => `${robot}: stopped by ${by}. The robot stands still.`,
     },
     /** Several stops that go on alike. */
     counted: {
@@ -106,7 +106,7 @@ export const fleet = {
       unconfirmed: (count: number) => `${count} robots have NOT confirmed their stop`,
       sending: (count: number) => `${count} stops are being sent …`,
       stopping: (count: number) => `${count} robots are stopping`,
-      standing: (count: number) => `${count} robots are stopped and stand still`,
+      standstill: (count: number) => `${count} robots are stopped and stand still`,
     },
     /** What is wrong with the stop of a robot, on its card. */
     problems: { unconfirmed: 'stop NOT confirmed', failed: 'stop FAILED' } as const,

@@ -26,7 +26,7 @@ export const ground = {
       offered: 'The robot has the mission and has not answered yet.',
       cancelling: 'The robot is asked to end it and has not confirmed yet.',
     },
-    pauseWanted: 'pause wanted',
+    pauseRequested: 'pause requested',
     pausedBy,
     waitsForStop: (robot: string) => `${robot} is stopped: clear the stop, then resume.`,
     show: 'Show',

@@ -9,7 +9,7 @@ import type {
   RobotMode,
   Right,
   Role,
-  StandingState,
+  StandstillState,
   TerrainClass,
 } from '../api/schema';
 
@@ -54,9 +54,9 @@ export const cause: Record<Cause, string> = {
   expired: 'waited too long',
   robot_lost: 'the robot is not heard',
   agent_restarted: 'the robot started afresh',
-  robot_forgot: 'the robot no longer knows it',
+  robot_lost_mission: 'the robot no longer knows it',
   robot_retired: 'the robot is retired',
-  noted: 'noted',
+  recorded: 'recorded',
 };
 export const limit: Record<BindingLimit, string> = {
   lateral_acceleration: 'lateral acceleration',
@@ -121,11 +121,11 @@ export const right: Record<Right, string> = {
   administer: 'administer',
 };
 
-export const standing: Record<StandingState, string> = {
+export const standstill: Record<StandstillState, string> = {
   stopping: 'stopping',
-  standing: 'stopped, stands still',
-  does_not_stand: 'DOES NOT STAND',
-  moves: 'MOVES WHILE STOPPED',
+  standstill: 'stopped, stands still',
+  standstill_not_reached: 'DOES NOT STAND',
+  unexpected_motion: 'MOVES WHILE STOPPED',
   other: 'stopped',
 };
 
@@ -152,7 +152,7 @@ export const alertTitles = {
   'revoked-robot': 'Revoked robot reports',
   'retired-authority': 'Certificate of a retired authority',
   'unknown-certificate': 'Unknown certificate',
-  'does-not-stand': 'Robot does not stand',
+  'standstill-not-reached': 'Robot does not stand',
   'moves-while-stopped': 'Robot moves while it is stopped',
   stopped: 'Robot is stopped',
   'dug-in': 'Robot is dug in',
@@ -199,7 +199,7 @@ export const alertSentences: Readonly<Record<AlertKind, (robot: string) => strin
   'revoked-robot': (robot) => `${robot} is revoked and tries to connect.`,
   'retired-authority': (robot) => `${robot} has a certificate of a retired authority and has to join again.`,
   'unknown-certificate': (robot) => `A certificate of ${robot} is not known to the server. The robot has to join again.`,
-  'does-not-stand': (robot) => `${robot} is commanded to rest, but it does not stand.`,
+  'standstill-not-reached': (robot) => `${robot} is commanded to rest, but it does not stand.`,
   'moves-while-stopped': (robot) => `${robot} is commanded to rest and stood, but it moves again.`,
   stopped: (robot) => `A stop of ${robot} is in force.`,
   'dug-in': (robot) => `The wheels of ${robot} turn, but the robot does not move.`,

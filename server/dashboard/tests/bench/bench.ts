@@ -28,7 +28,7 @@ function stateAt(index: number, at_ms: number): Robot {
     link: index % 10 === 0 ? 'offline' : 'online',
     model: { wheelbase_m: 0.28, track_width_m: 0.43, wheel_radius_m: 0.08 },
     live: {
-      heard_age_ms: 10,
+      state_age_ms: 10,
       pose: { value: { x_m, y_m, heading_rad }, age_ms: 10 },
       twist: { value: twist, age_ms: 10 },
       safety: {},

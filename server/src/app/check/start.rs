@@ -49,7 +49,7 @@ fn is_before(open: &OpenMission, place: Place) -> bool {
         MissionState::Offered | MissionState::Active | MissionState::Paused => true,
         // A mission that is held in the queue is skipped.
         MissionState::Queued => {
-            !open.pause_wanted && (place.replaces.is_some() || open.priority >= place.priority)
+            !open.pause_requested && (place.replaces.is_some() || open.priority >= place.priority)
         }
         // A mission that is being cancelled ends where the robot stops now.
         MissionState::Cancelling
@@ -158,7 +158,12 @@ mod tests {
 
     use super::*;
 
-    fn open(number: u128, state: MissionState, priority: i32, pause_wanted: bool) -> OpenMission {
+    fn open(
+        number: u128,
+        state: MissionState,
+        priority: i32,
+        pause_requested: bool,
+    ) -> OpenMission {
         OpenMission {
             id: MissionId::from_uuid(Uuid::from_u128(number)),
             site: "yard".parse().unwrap(),
@@ -166,7 +171,7 @@ mod tests {
             state,
             reason: None,
             boot: None,
-            pause_wanted,
+            pause_requested,
             priority,
             content: (1, PlanHash::from_uuid(Uuid::from_u128(1))),
             replacement: None,

@@ -98,8 +98,8 @@ impl App {
             boxes.take(BOXES_MAX + 1).collect()
         });
         let is_drawn_anew = row.site.terrain_revision != before.terrain_revision;
-        let everything = is_drawn_anew || boxes.len() > BOXES_MAX;
-        if everything {
+        let entire_map = is_drawn_anew || boxes.len() > BOXES_MAX;
+        if entire_map {
             boxes.clear();
         }
         MapChange {
@@ -107,7 +107,7 @@ impl App {
             at: self.clock().now(),
             grid_revision: row.site.grid.revision,
             terrain_revision: row.site.terrain_revision,
-            everything,
+            entire_map,
             boxes,
         }
     }

@@ -151,7 +151,7 @@ impl App {
             at: now,
             since: None,
             count: 1,
-            who: Some("init".to_owned()),
+            actor: Some("init".to_owned()),
             token: None,
             person: None,
             role: None,
@@ -161,7 +161,7 @@ impl App {
             path: "tread-server init".to_owned(),
             status: 201,
             request_id: String::new(),
-            what: Some(serde_json::json!({"name": created.token.name, "role": "admin"})),
+            request: Some(serde_json::json!({"name": created.token.name, "role": "admin"})),
             previous_hash: None,
             hash: None,
         };

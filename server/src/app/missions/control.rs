@@ -50,8 +50,12 @@ impl App {
         self.request_pause(id, false).await
     }
 
-    async fn request_pause(&self, id: MissionId, wanted: bool) -> Result<MissionDetail, AppError> {
-        let (asked, cause) = if wanted {
+    async fn request_pause(
+        &self,
+        id: MissionId,
+        requested: bool,
+    ) -> Result<MissionDetail, AppError> {
+        let (asked, cause) = if requested {
             ("paused", Cause::PauseRequested)
         } else {
             ("resumed", Cause::ResumeRequested)
@@ -62,7 +66,7 @@ impl App {
         let state = mission.state;
         // A queued mission that was held because its robot was stopped or teleoperated can be
         // resumed.
-        let held_in_queue = state == MissionState::Queued && mission.pause_wanted && !wanted;
+        let held_in_queue = state == MissionState::Queued && mission.pause_requested && !requested;
         let in_progress = matches!(
             state,
             MissionState::Offered | MissionState::Active | MissionState::Paused
@@ -70,17 +74,17 @@ impl App {
         if !in_progress && !held_in_queue {
             return Err(AppError::MissionState { id, state, asked });
         }
-        if !wanted {
+        if !requested {
             self.check_free(&mut tx, mission).await?;
         }
-        if wanted && !robot_of(&mut tx, &row).await?.capabilities.pause {
+        if requested && !robot_of(&mut tx, &row).await?.capabilities.pause {
             return Err(AppError::RobotCannot {
                 robot: mission.robot.clone(),
                 what: "pause a mission",
             });
         }
-        if mission.pause_wanted != wanted
-            && db::missions::set_pause_wanted(&mut tx, id, wanted).await?
+        if mission.pause_requested != requested
+            && db::missions::set_pause_requested(&mut tx, id, requested).await?
         {
             let why = (Actor::Client, cause);
             let reason = format!("to be {asked}");
@@ -178,7 +182,7 @@ pub(in crate::app) async fn hold_all(
     at: Timestamp,
 ) -> Result<(), DbError> {
     for open in db::missions::open_of_robot(tx, robot_pk).await? {
-        if !open.pause_wanted && db::missions::set_pause_wanted(tx, open.id, true).await? {
+        if !open.pause_requested && db::missions::set_pause_requested(tx, open.id, true).await? {
             let event = MissionEvent {
                 at,
                 actor: Actor::Server,

@@ -90,7 +90,7 @@ impl App {
         let mission = &row.mission;
         let key = (mission.site.clone(), mission.robot.clone());
         let link = self.presences().get(&key).link(self.clock().elapsed());
-        if mission.pause_wanted || link == LinkState::Offline {
+        if mission.pause_requested || link == LinkState::Offline {
             return Ok(false);
         }
         // Robots of a database that was never restored are not restricted.

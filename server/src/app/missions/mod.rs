@@ -162,7 +162,7 @@ impl App {
             state: MissionState::Queued,
             reason: None,
             cause: Cause::Requested,
-            pause_wanted: false,
+            pause_requested: false,
             revision,
             plan_hash: Offer::plan_hash_of(id, revision, &trajectory),
             trajectory,
@@ -183,7 +183,7 @@ impl App {
             mission,
         };
         // It would start by itself once the robot is free again.
-        row.mission.pause_wanted = self.is_operator_controlled(tx, &row.mission).await?;
+        row.mission.pause_requested = self.is_operator_controlled(tx, &row.mission).await?;
         let is_offered = open.is_empty() && self.may_offer_immediately(tx, &row).await?;
         insert(tx, &row, is_offered).await?;
         Ok(InsertedMission {
@@ -467,7 +467,7 @@ pub(super) async fn record_note(
     at: Timestamp,
     reason: &str,
 ) -> Result<(), DbError> {
-    add_note(tx, &row.mission, (actor, Cause::Noted), at, reason).await
+    add_note(tx, &row.mission, (actor, Cause::Recorded), at, reason).await
 }
 
 /// Adds a note with its cause.

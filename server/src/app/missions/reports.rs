@@ -209,7 +209,7 @@ async fn apply_phase(
     let is_safety_pause =
         report.phase == MissionPhase::Paused && report.progress.as_ref().is_some_and(is_for_safety);
     if is_safety_pause && !was_resumed_since(tx, mission.id, reporting.since).await? {
-        db::missions::set_pause_wanted(tx, mission.id, true).await?;
+        db::missions::set_pause_requested(tx, mission.id, true).await?;
     }
     let reason = report.reason.as_deref();
     let step = Step {

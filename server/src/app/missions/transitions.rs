@@ -103,7 +103,7 @@ impl Change {
             Self::Expire => Cause::Expired,
             Self::LoseRobot => Cause::RobotLost,
             Self::LoseRun => Cause::AgentRestarted,
-            Self::Forget => Cause::RobotForgot,
+            Self::Forget => Cause::RobotLostMission,
         }
     }
 

@@ -16,7 +16,7 @@ use tread_api::friction::LiveFriction;
 use tread_api::ids::{BootId, MissionId, RobotId, SiteId, StopId};
 use tread_api::link::LinkQuality;
 use tread_api::robot::{Aged, LinkCause, LinkState, MissionProgress, RobotLive};
-use tread_api::safety::StandingState;
+use tread_api::safety::StandstillState;
 use tread_api::wire::state::{FrictionReport, RobotState};
 use uuid::Uuid;
 
@@ -208,7 +208,7 @@ impl Presence {
         let friction = self.friction.as_ref();
         Some(RobotLive {
             boot: state.boot,
-            heard_age_ms: elapsed_ms,
+            state_age_ms: elapsed_ms,
             robot_time: state.robot_time,
             clock_offset_ms: self.clock_offset_ms(),
             mode: state.mode,
@@ -389,7 +389,7 @@ impl Presences {
             before.mode != state.mode
                 || content(before) != content(&state)
                 || stop_of(before) != stop_of(&state)
-                || standing_of(before) != standing_of(&state)
+                || standstill_of(before) != standstill_of(&state)
                 || lease_of(before) != lease_of(&state)
                 || before.safety.fence_revision != state.safety.fence_revision
                 || before.terrain_revision != state.terrain_revision
@@ -465,8 +465,8 @@ fn monotonic_offset_us(state: &RobotState, now: Duration) -> Option<i64> {
     Some(robot_us - now_us)
 }
 
-fn standing_of(state: &RobotState) -> Option<StandingState> {
-    state.safety.standing.map(|standing| standing.state)
+fn standstill_of(state: &RobotState) -> Option<StandstillState> {
+    state.safety.standstill.map(|standstill| standstill.state)
 }
 
 fn stop_of(state: &RobotState) -> Option<StopId> {

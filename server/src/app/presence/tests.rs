@@ -97,7 +97,7 @@ fn ages_grow_until_the_robot_speaks_again() {
     presences.hello(key(), boot(1), SECOND);
     presences.state(&key(), state(boot(1), 0), SECOND, wall());
     let live = presences.get(&key()).live(4 * SECOND).unwrap();
-    assert_eq!(live.heard_age_ms, 3_000);
+    assert_eq!(live.state_age_ms, 3_000);
 }
 
 #[test]

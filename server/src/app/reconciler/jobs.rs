@@ -64,7 +64,7 @@ pub(super) async fn apply_change(
         let since = app.clock().now() - shown_for;
         // Only a person resumes it, or has done so already.
         if !was_resumed_since(&mut tx, mission.id, since).await? {
-            db::missions::set_pause_wanted(&mut tx, mission.id, true).await?;
+            db::missions::set_pause_requested(&mut tx, mission.id, true).await?;
         }
     }
     if let Some(state) = moved
@@ -187,7 +187,7 @@ pub(super) async fn send_offer(app: App, offered: OfferedNow) -> Result<Finished
         trajectory: mission.trajectory.clone(),
         start_within_ms,
         link_policy: mission.link_policy,
-        on_hold: mission.pause_wanted,
+        on_hold: mission.pause_requested,
     };
     app.counters().offers_sent.one();
     let key = (mission.site.clone(), mission.robot.clone());
@@ -280,7 +280,7 @@ pub(super) async fn replace(app: App, open: OpenMission) -> Result<Finished, App
         // It has begun, so its latest start no longer applies.
         start_within_ms: None,
         link_policy: row.mission.link_policy,
-        on_hold: row.mission.pause_wanted,
+        on_hold: row.mission.pause_requested,
     };
     if app.recalls() != recalls {
         return Ok(Finished::Again);
@@ -352,7 +352,7 @@ pub(super) async fn hold(
         let is_to_be_driven = row.is_some_and(|row| {
             let state = row.mission.state;
             matches!(state, MissionState::Active | MissionState::Paused)
-                && !row.mission.pause_wanted
+                && !row.mission.pause_requested
                 && row.mission.revision == revision
         });
         if !is_to_be_driven {

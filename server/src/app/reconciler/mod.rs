@@ -500,7 +500,7 @@ impl Reconciler {
                 }
             }
             Need::Pause | Need::Resume => {
-                let held = mission.pause_wanted;
+                let held = mission.pause_requested;
                 let job = Job::Hold(mission.id, held);
                 if self.is_due(&job) {
                     self.start(job, hold(app, mission, held, self.recalls));

@@ -227,7 +227,10 @@ fn in_progress(mission: &OpenMission, said: Option<MissionProgress>, differs: bo
             Need::Replace
         };
     }
-    match (mission.state == MissionState::Paused, mission.pause_wanted) {
+    match (
+        mission.state == MissionState::Paused,
+        mission.pause_requested,
+    ) {
         // The robot's record normally comes first; its state counts if the record is slow.
         (false, true) if differs => Need::Apply(Change::Pause),
         (true, false) if differs => Need::Apply(Change::Resume),

@@ -32,7 +32,7 @@ pub(super) async fn cancel_foreign_mission(
         mission.id = %mission, robot.id = %key.1,
         "robot `{}` drives mission `{mission}`, and gets a cancel: {reason}", key.1
     );
-    app.counters().missions_disowned.one();
+    app.counters().missions_unknown.one();
     let command = Cancel { mission, reason };
     // The answer is ignored: the robot's next states show whether it has ended; if not, the cancel
     // is sent again.
@@ -52,7 +52,7 @@ pub(super) async fn end_duplicate_agent(app: App, duplicate: DuplicateAgent) -> 
         "a second agent drives mission `{mission}` under the name of robot `{}`, as boot {boot}, \
          and gets a cancel", key.1
     );
-    app.counters().missions_disowned.one();
+    app.counters().missions_unknown.one();
     let reason = "another agent has taken this robot's name".to_owned();
     let command = Cancel { mission, reason };
     // The answer is ignored: the agent's next states show whether it has ended; if not, the cancel

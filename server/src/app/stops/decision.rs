@@ -28,7 +28,7 @@ pub(super) struct Open {
     /// Whether the robot's time to confirm has passed.
     pub(super) is_overdue: bool,
     pub(super) confirmed_at: Option<Timestamp>,
-    pub(super) clear_asked_at: Option<Timestamp>,
+    pub(super) clear_requested_at: Option<Timestamp>,
 }
 
 /// The stop that a robot reported last.
@@ -76,11 +76,11 @@ pub(super) fn decide(open: Option<Open>, shown: Option<ReportedStop>) -> StopDec
             StopDecision::Nothing
         };
     };
-    let since = open.clear_asked_at.unwrap_or(confirmed_at);
+    let since = open.clear_requested_at.unwrap_or(confirmed_at);
     let Some(shown) = shown.filter(|shown| is_later(shown, since)) else {
         return StopDecision::Nothing;
     };
-    match (shown.latch, open.clear_asked_at) {
+    match (shown.latch, open.clear_requested_at) {
         (None, None) => StopDecision::Resend,
         (None, Some(_)) => StopDecision::Cleared,
         (Some(latch), _) if latch != open.id => StopDecision::Adopt,
@@ -160,7 +160,7 @@ mod tests {
                         id,
                         is_overdue: false,
                         confirmed_at: None,
-                        clear_asked_at: None,
+                        clear_requested_at: None,
                     });
                     self.under_way.push(Message::Stop(id));
                     let clears = |message: &Message| matches!(message, Message::Clear(_));
@@ -174,7 +174,7 @@ mod tests {
                 Step::Clear => {
                     let now = self.now();
                     if let Some(open) = &mut self.open {
-                        open.clear_asked_at = Some(now.max(open.confirmed_at.unwrap_or(now)));
+                        open.clear_requested_at = Some(now.max(open.confirmed_at.unwrap_or(now)));
                         self.under_way.push(Message::Clear(open.id));
                         self.must_hold = false;
                     }
@@ -230,7 +230,7 @@ mod tests {
                 }
                 Message::Refused(id) => {
                     if let Some(open) = self.open.as_mut().filter(|open| open.id == id) {
-                        open.clear_asked_at = None;
+                        open.clear_requested_at = None;
                     }
                 }
             }
@@ -263,7 +263,7 @@ mod tests {
                         id,
                         is_overdue: true,
                         confirmed_at: Some(now),
-                        clear_asked_at: None,
+                        clear_requested_at: None,
                     });
                 }
             }

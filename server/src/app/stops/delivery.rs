@@ -31,7 +31,7 @@ pub(in crate::app) async fn send_stop(app: &App, stop: &Stop) -> StopDelivery {
         stop: stop.id,
         by: stop.by.clone(),
         reason: stop.reason.clone(),
-        at: stop.wanted_at,
+        at: stop.requested_at,
     };
     let key = (stop.site.clone(), stop.robot.clone());
     app.counters().stops_sent.one();

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use jiff::{SignedDuration, Timestamp};
 use tracing::warn;
 use tread_api::ids::StopId;
-use tread_api::safety::StandingState;
+use tread_api::safety::StandstillState;
 use tread_api::stop::Stop;
 use tread_api::wire::state::RobotState;
 
@@ -23,7 +23,7 @@ struct StopActions {
     /// Those in `again` that their robots had confirmed.
     lost: Vec<Stop>,
     cleared: Vec<StopId>,
-    standing: Vec<StopId>,
+    standstill: Vec<StopId>,
     /// Robots whose own stop becomes the open one.
     adopted: Vec<RobotKey>,
     /// Robots whose alert may have to be raised or cleared.
@@ -36,12 +36,12 @@ impl App {
         let StopActions {
             lost,
             cleared,
-            standing,
+            standstill,
             adopted,
             alerts,
             again,
         } = self.check_stops().await?;
-        let is_idle = lost.is_empty() && cleared.is_empty() && standing.is_empty();
+        let is_idle = lost.is_empty() && cleared.is_empty() && standstill.is_empty();
         if is_idle && adopted.is_empty() && alerts.is_empty() {
             return Ok(again);
         }
@@ -52,7 +52,7 @@ impl App {
             for stop in &lost {
                 db::stops::unconfirm(&mut tx, stop.id).await?;
             }
-            for id in standing {
+            for id in standstill {
                 db::stops::record_standstill(&mut tx, id, now).await?;
             }
             for id in cleared {
@@ -110,7 +110,7 @@ impl App {
                 id: stop.id,
                 is_overdue: stop.unconfirmed,
                 confirmed_at: stop.confirmed_at,
-                clear_asked_at: stop.clear_asked_at,
+                clear_requested_at: stop.clear_requested_at,
             });
             let decision = decide(open, shown);
             let Some(stop) = stop else {
@@ -120,10 +120,11 @@ impl App {
                 continue;
             };
             let is_shown = shown.is_some_and(|shown| shown.latch == Some(stop.id));
-            let standing = presence.state().and_then(|state| state.safety.standing);
-            let stands = standing.is_some_and(|seen| seen.state == StandingState::Standing);
-            if is_shown && stands && stop.standing_at.is_none() {
-                actions.standing.push(stop.id);
+            let standstill = presence.state().and_then(|state| state.safety.standstill);
+            let is_at_standstill =
+                standstill.is_some_and(|seen| seen.state == StandstillState::Standstill);
+            if is_shown && is_at_standstill && stop.standstill_at.is_none() {
+                actions.standstill.push(stop.id);
             }
             match decision {
                 StopDecision::Send => {
@@ -145,7 +146,9 @@ impl App {
         }
         // Robots without an open stop.
         actions.alerts.extend(alerted);
-        actions.again.sort_by_key(|stop| (stop.wanted_at, stop.id));
+        actions
+            .again
+            .sort_by_key(|stop| (stop.requested_at, stop.id));
         Ok(actions)
     }
 

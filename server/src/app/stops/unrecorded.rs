@@ -50,7 +50,7 @@ impl Unrecorded {
     pub(super) fn successor_of(&self, stop: &Stop) -> Option<StopId> {
         let kept = self.lock();
         let newest = kept.get(&key_of(stop))?;
-        let is_newer = (newest.wanted_at, newest.id) > (stop.wanted_at, stop.id);
+        let is_newer = (newest.requested_at, newest.id) > (stop.requested_at, stop.id);
         is_newer.then_some(newest.id)
     }
 
@@ -78,7 +78,7 @@ impl Unrecorded {
     /// Returns the stops that a filter lets through. All are newer than a stop that is recorded.
     pub(super) fn list(&self, filter: &StopFilter) -> Vec<Stop> {
         let kept = self.lock();
-        let order_of = |stop: &Stop| (stop.wanted_at, stop.id);
+        let order_of = |stop: &Stop| (stop.requested_at, stop.id);
         let named = |id: StopId| kept.values().find(|stop| stop.id == id);
         let is_before = |stop: &Stop, id: StopId| {
             named(id).is_some_and(|named| order_of(stop) < order_of(named))
@@ -109,12 +109,12 @@ mod tests {
             robot: robot.parse().unwrap(),
             by: "test".to_owned(),
             reason: "test".to_owned(),
-            wanted_at: Timestamp::UNIX_EPOCH,
+            requested_at: Timestamp::UNIX_EPOCH,
             confirmed_at: None,
-            standing_at: None,
+            standstill_at: None,
             unconfirmed: false,
-            clear_asked_by: None,
-            clear_asked_at: None,
+            clear_requested_by: None,
+            clear_requested_at: None,
             cleared_at: None,
             replaced_by: None,
         }

@@ -158,7 +158,7 @@ impl Link {
             return None;
         };
         if !may_be_tls(&begin[..length]) {
-            counters.gate_garbage.one();
+            counters.gate_not_tls.one();
             self.failed();
             return None;
         }
@@ -170,7 +170,7 @@ impl Link {
             Ok(Err((error, stream))) => {
                 counters.gate_tls_failed.one();
                 if is_distrust(&error) {
-                    counters.gate_distrusted.one();
+                    counters.gate_untrusted.one();
                 }
                 if is_expired(&error) {
                     counters.gate_expired.one();

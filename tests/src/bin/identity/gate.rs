@@ -37,7 +37,7 @@ const KINDS: [&[u8]; 5] = [
 ];
 /// The counters of what the gate refuses.
 const REFUSALS: [&str; 6] = [
-    "gate_garbage",
+    "gate_not_tls",
     "gate_silent",
     "gate_tls_failed",
     "gate_rate_limited",

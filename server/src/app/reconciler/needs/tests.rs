@@ -32,7 +32,7 @@ fn mission(state: MissionState, boot: Option<BootId>) -> OpenMission {
         state,
         reason: None,
         boot,
-        pause_wanted: false,
+        pause_requested: false,
         priority: 0,
         content: (1, hash(1)),
         replacement: None,
@@ -252,9 +252,9 @@ fn what_is_wanted_of_a_mission_in_progress_is_sent_until_the_robot_has_done_it()
         paused: true,
         ..driving
     };
-    let needs = |state, pause_wanted, said: &Said, differs_from| {
+    let needs = |state, pause_requested, said: &Said, differs_from| {
         let mission = OpenMission {
-            pause_wanted,
+            pause_requested,
             ..mission(state, Some(boot(1)))
         };
         let presence = presence(said);

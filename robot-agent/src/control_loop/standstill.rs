@@ -2,11 +2,11 @@
 //! stopped when zero velocity is commanded.
 //!
 //! ```text
-//!            zero is commanded              at zero velocity for STANDS_FOR
-//! driving ───────────────────────► stopping ────────────────────────────────► stopped
-//!    ▲                                │ braking time and MARGIN are over          │ moves for MOVES_FOR
-//!    │                                ▼                                          ▼
-//!    └─ zero is not commanded ─ does not stand ◄────────────────────────── moves while stopped
+//!            zero is commanded            at zero velocity for STANDSTILL_MIN
+//! driving ─────────────────────► stopping ────────────────────────────────────► standstill
+//!    ▲                              │ braking time and MARGIN are over             │ moves for
+//!    │                              ▼                                              ▼ MOTION_MIN
+//!    └─ zero is not commanded ─ standstill not reached ◄───────────────── unexpected motion
 //! ```
 //! Both alerts end when the robot has stopped, or when zero velocity is no longer commanded.
 
@@ -25,12 +25,12 @@ const DISTANCE_MIN_M: f64 = 0.3;
 /// Number of consecutive fixes beyond [`DISTANCE_MIN_M`] that shows motion.
 const FIXES: u32 = 3;
 /// Time without motion after which the robot counts as stopped.
-const STANDS_FOR: Duration = Duration::from_millis(300);
+const STANDSTILL_MIN: Duration = Duration::from_millis(300);
 /// Time for which fixes must stay within [`DISTANCE_MIN_M`] where they are the only evidence of
 /// standstill: a creeping robot leaves that circle meanwhile.
-const FIXES_STAY_FOR: Duration = Duration::from_secs(3);
+const FIXES_STAY_MIN: Duration = Duration::from_secs(3);
 /// Duration of motion from which it is reported.
-const MOVES_FOR: Duration = Duration::from_millis(300);
+const MOTION_MIN: Duration = Duration::from_millis(300);
 /// Smallest deceleration assumed for the braking time, m/s²: half of that on unknown ground.
 const BRAKING_M_S2: f64 = 0.7;
 /// Upper bound of the assumed braking time.
@@ -75,37 +75,37 @@ pub(crate) enum MotionEvidence {
 
 /// Result of the standstill watch.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub(crate) struct StandingReport {
+pub(crate) struct StandstillReport {
     /// Whether zero velocity is commanded.
-    pub(crate) is_to_stand: bool,
+    pub(crate) is_rest_commanded: bool,
     /// Begin of the standstill by the monotonic clock, and its delay after the command.
-    pub(crate) stands: Option<(Duration, Duration)>,
+    pub(crate) standstill: Option<(Duration, Duration)>,
     /// Motion beyond the assumed braking time, if the robot has not stopped.
-    pub(crate) does_not_stand: Option<MotionEvidence>,
+    pub(crate) standstill_not_reached: Option<MotionEvidence>,
     /// Motion after the robot had stopped.
-    pub(crate) moves: Option<MotionEvidence>,
+    pub(crate) unexpected_motion: Option<MotionEvidence>,
 }
 
 /// Watches a robot that is commanded to zero velocity.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub(crate) struct StandingWatch {
+pub(crate) struct StandstillWatch {
     /// Time of the command of zero velocity, and the time by which the robot shall have stopped.
     commanded: Option<(Duration, Duration)>,
     still_since: Option<Duration>,
     /// First of the fixes that stay within [`DISTANCE_MIN_M`], with its time.
     first_fix: Option<(Duration, Point)>,
     moving_since: Option<Duration>,
-    stands: Option<(Duration, Duration)>,
+    standstill: Option<(Duration, Duration)>,
     anchor: Option<Point>,
     away: u32,
-    does_not_stand: Option<MotionEvidence>,
-    moves: Option<MotionEvidence>,
+    standstill_not_reached: Option<MotionEvidence>,
+    unexpected_motion: Option<MotionEvidence>,
 }
 
-impl StandingWatch {
-    /// Processes one tick. `is_to_stand` is whether zero velocity is commanded.
-    pub(crate) fn step(&mut self, now: Duration, is_to_stand: bool, motion: &Motion) {
-        if !is_to_stand {
+impl StandstillWatch {
+    /// Processes one tick. `is_rest_commanded` is whether zero velocity is commanded.
+    pub(crate) fn step(&mut self, now: Duration, is_rest_commanded: bool, motion: &Motion) {
+        if !is_rest_commanded {
             *self = Self::default();
             return;
         }
@@ -129,30 +129,30 @@ impl StandingWatch {
                 };
                 since
             };
-            if now.saturating_sub(since) >= STANDS_FOR {
+            if now.saturating_sub(since) >= STANDSTILL_MIN {
                 let took = since.saturating_sub(commanded_at);
-                self.stands.get_or_insert((since, took));
+                self.standstill.get_or_insert((since, took));
                 if self.anchor.is_none() {
                     self.anchor = motion.fix;
                 }
-                (self.does_not_stand, self.moves) = (None, None);
+                (self.standstill_not_reached, self.unexpected_motion) = (None, None);
             }
             return;
         };
         (self.still_since, self.first_fix) = (None, None);
         let since = *self.moving_since.get_or_insert(now);
-        let lasts = now.saturating_sub(since) >= MOVES_FOR;
-        if self.stands.is_some() {
+        let lasts = now.saturating_sub(since) >= MOTION_MIN;
+        if self.standstill.is_some() {
             if lasts {
-                self.moves = Some(evidence);
+                self.unexpected_motion = Some(evidence);
             }
         } else if now >= due && lasts {
-            self.does_not_stand = Some(evidence);
+            self.standstill_not_reached = Some(evidence);
         }
     }
 
     /// Returns since when position fixes have stayed within [`DISTANCE_MIN_M`], once that has
-    /// lasted [`FIXES_STAY_FOR`].
+    /// lasted [`FIXES_STAY_MIN`].
     fn stays_since(&mut self, now: Duration, fix: Option<Point>) -> Option<Duration> {
         let fix = fix?;
         let (since, first) = *self.first_fix.get_or_insert((now, fix));
@@ -160,7 +160,7 @@ impl StandingWatch {
             self.first_fix = Some((now, fix));
             return None;
         }
-        (now.saturating_sub(since) >= FIXES_STAY_FOR).then_some(since)
+        (now.saturating_sub(since) >= FIXES_STAY_MIN).then_some(since)
     }
 
     /// Resets the watch except for the time of the command, because no sensor is heard: whether the
@@ -198,7 +198,7 @@ impl StandingWatch {
             if let Some(distance_m) = distance_m {
                 self.anchor = motion.fix;
                 self.away = 0;
-                self.moves = Some(MotionEvidence::Distance(distance_m));
+                self.unexpected_motion = Some(MotionEvidence::Distance(distance_m));
                 return Some(MotionEvidence::Distance(distance_m));
             }
         }
@@ -206,12 +206,12 @@ impl StandingWatch {
     }
 
     /// Returns the result of the watch.
-    pub(crate) fn report(&self) -> StandingReport {
-        StandingReport {
-            is_to_stand: self.commanded.is_some(),
-            stands: self.stands.filter(|_| self.moves.is_none()),
-            does_not_stand: self.does_not_stand,
-            moves: self.moves,
+    pub(crate) fn report(&self) -> StandstillReport {
+        StandstillReport {
+            is_rest_commanded: self.commanded.is_some(),
+            standstill: self.standstill.filter(|_| self.unexpected_motion.is_none()),
+            standstill_not_reached: self.standstill_not_reached,
+            unexpected_motion: self.unexpected_motion,
         }
     }
 }
@@ -231,10 +231,10 @@ mod tests {
 
     /// Ticks until something is true.
     fn until(
-        watch: &mut StandingWatch,
+        watch: &mut StandstillWatch,
         from: u32,
         motion: impl Fn(f64) -> Motion,
-        is_so: impl Fn(&StandingReport) -> bool,
+        is_so: impl Fn(&StandstillReport) -> bool,
     ) -> Option<u32> {
         (0..2_000).find(|tick| {
             let now = TICK * (from + tick);
@@ -245,61 +245,64 @@ mod tests {
 
     #[test]
     fn a_robot_that_brakes_stands_and_the_time_it_took_is_said() {
-        let mut watch = StandingWatch::default();
+        let mut watch = StandstillWatch::default();
         let braking = |at_s: f64| rolling((0.9 - 1.2 * at_s).max(0.0));
-        until(&mut watch, 0, braking, |report| report.stands.is_some()).unwrap();
+        until(&mut watch, 0, braking, |report| report.standstill.is_some()).unwrap();
         let report = watch.report();
-        let (_, took) = report.stands.unwrap();
+        let (_, took) = report.standstill.unwrap();
         assert!((600..800).contains(&took.as_millis()), "{took:?}");
-        assert_eq!(report.does_not_stand, None);
+        assert_eq!(report.standstill_not_reached, None);
     }
 
     #[test]
     fn a_base_that_ignores_rest_is_noticed_after_its_braking_time_and_no_sooner() {
-        let mut watch = StandingWatch::default();
+        let mut watch = StandstillWatch::default();
         let ticks = until(
             &mut watch,
             0,
             |_| rolling(0.59),
-            |report| report.does_not_stand.is_some(),
+            |report| report.standstill_not_reached.is_some(),
         );
         let ticks = ticks.unwrap();
         assert!((120..200).contains(&ticks), "after {ticks} ticks");
-        assert_eq!(watch.report().stands, None);
-        let stands = until(
+        assert_eq!(watch.report().standstill, None);
+        let standstill = until(
             &mut watch,
             ticks,
             |_| rolling(0.0),
-            |report| report.stands.is_some(),
+            |report| report.standstill.is_some(),
         );
-        assert!(stands.unwrap() <= 31);
-        assert_eq!(watch.report().does_not_stand, None);
+        assert!(standstill.unwrap() <= 31);
+        assert_eq!(watch.report().standstill_not_reached, None);
     }
 
     #[test]
     fn a_robot_that_stood_and_is_pushed_moves_while_stopped_until_it_is_left_alone() {
-        let mut watch = StandingWatch::default();
+        let mut watch = StandstillWatch::default();
         until(
             &mut watch,
             0,
             |_| rolling(0.0),
-            |report| report.stands.is_some(),
+            |report| report.standstill.is_some(),
         )
         .unwrap();
         let pushed = until(
             &mut watch,
             100,
             |_| rolling(0.3),
-            |report| report.moves.is_some(),
+            |report| report.unexpected_motion.is_some(),
         );
         assert!(pushed.unwrap() <= 31);
         let report = watch.report();
-        assert_eq!((report.does_not_stand, report.stands), (None, None));
+        assert_eq!(
+            (report.standstill_not_reached, report.standstill),
+            (None, None)
+        );
         until(
             &mut watch,
             200,
             |_| rolling(0.0),
-            |report| report.moves.is_none(),
+            |report| report.unexpected_motion.is_none(),
         )
         .unwrap();
     }
@@ -316,16 +319,16 @@ mod tests {
                 ..Motion::default()
             },
         ] {
-            let mut watch = StandingWatch::default();
+            let mut watch = StandstillWatch::default();
             until(
                 &mut watch,
                 0,
                 |_| motion,
-                |report| report.does_not_stand.is_some(),
+                |report| report.standstill_not_reached.is_some(),
             )
             .unwrap();
         }
-        let mut watch = StandingWatch::default();
+        let mut watch = StandstillWatch::default();
         let at = |x_m| Motion {
             fix: Some(Point { x_m, y_m: 0.0 }),
             ..Motion::default()
@@ -334,17 +337,22 @@ mod tests {
             &mut watch,
             0,
             |_| at(0.01),
-            |report| report.stands.is_some(),
+            |report| report.standstill.is_some(),
         )
         .unwrap();
         let wild = |at_s: f64| at(if at_s < 0.015 { 4.0 } else { 0.02 });
         assert_eq!(
-            until(&mut watch, 100, wild, |report| report.moves.is_some()),
+            until(&mut watch, 100, wild, |report| report
+                .unexpected_motion
+                .is_some()),
             None,
             "two wild fixes are no motion"
         );
         let gone = |at_s: f64| at(0.5 * at_s);
-        until(&mut watch, 3_000, gone, |report| report.moves.is_some()).unwrap();
+        until(&mut watch, 3_000, gone, |report| {
+            report.unexpected_motion.is_some()
+        })
+        .unwrap();
     }
 
     #[test]
@@ -357,28 +365,28 @@ mod tests {
             }),
             ..Motion::default()
         };
-        let mut watch = StandingWatch::default();
-        let stands = |report: &StandingReport| report.stands.is_some();
-        assert_eq!(until(&mut watch, 0, nothing, stands), None);
-        let mut watch = StandingWatch::default();
-        assert_eq!(until(&mut watch, 0, creeping, stands), None);
+        let mut watch = StandstillWatch::default();
+        let standstill = |report: &StandstillReport| report.standstill.is_some();
+        assert_eq!(until(&mut watch, 0, nothing, standstill), None);
+        let mut watch = StandstillWatch::default();
+        assert_eq!(until(&mut watch, 0, creeping, standstill), None);
     }
 
     #[test]
     fn a_robot_that_is_not_heard_is_no_longer_said_to_stand() {
-        let mut watch = StandingWatch::default();
-        let stands = |report: &StandingReport| report.stands.is_some();
-        until(&mut watch, 0, |_| rolling(0.0), stands).unwrap();
+        let mut watch = StandstillWatch::default();
+        let standstill = |report: &StandstillReport| report.standstill.is_some();
+        until(&mut watch, 0, |_| rolling(0.0), standstill).unwrap();
         watch.reset();
         let report = watch.report();
-        assert!(report.is_to_stand && report.stands.is_none());
-        let again = until(&mut watch, 9_000, |_| rolling(0.0), stands);
+        assert!(report.is_rest_commanded && report.standstill.is_none());
+        let again = until(&mut watch, 9_000, |_| rolling(0.0), standstill);
         assert!(again.unwrap() >= 30, "rest counts from when it is heard");
     }
 
     #[test]
     fn noise_of_a_standing_robot_is_no_motion_and_driving_ends_it_all() {
-        let mut watch = StandingWatch::default();
+        let mut watch = StandstillWatch::default();
         for tick in 0..20_000_u32 {
             let noise = f64::from(tick % 13) - 6.0;
             let motion = Motion {
@@ -393,12 +401,12 @@ mod tests {
             watch.step(TICK * tick, true, &motion);
             let report = watch.report();
             assert_eq!(
-                (report.does_not_stand, report.moves),
+                (report.standstill_not_reached, report.unexpected_motion),
                 (None, None),
                 "{tick}"
             );
         }
         watch.step(TICK * 20_000, false, &rolling(0.5));
-        assert_eq!(watch.report(), StandingReport::default());
+        assert_eq!(watch.report(), StandstillReport::default());
     }
 }
